@@ -1,0 +1,106 @@
+"""Values caught at the border: converters for the fields of scenes and materials.
+
+A converter turns what the user gave into a float64 array and refuses what cannot be one. Values that JAX already
+holds (arrays and tracers of a transformation) keep their type; only their shape is checked.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from brdf.errors import InputError
+
+
+def _array(name: str, value: Any, shape_words: str) -> Any:
+    if isinstance(value, jax.Array):
+        return value
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(name, f"must be {shape_words}, got {_shown(value)}", "Give plain numbers") from None
+    if not np.all(np.isfinite(array)):
+        raise InputError(name, f"must be finite, got {_shown(value)}", "Give finite numbers")
+    return array
+
+
+def _shown(value: Any) -> str:
+    text = repr(value.tolist() if isinstance(value, np.ndarray) else value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def vector(name: str) -> Callable[[Any], Any]:
+    """A converter for a position or an edge: three finite numbers."""
+
+    def convert(value: Any) -> Any:
+        array = _array(name, value, "three numbers")
+        if array.shape != (3,):
+            raise InputError(name, f"must be three numbers, got {_shown(value)}", "Give [x, y, z]")
+        return array
+
+    return convert
+
+
+def direction_value(name: str) -> Callable[[Any], Any]:
+    """A converter for a direction of any length: three finite numbers, not all zero."""
+    to_vector = vector(name)
+
+    def convert(value: Any) -> Any:
+        array = to_vector(value)
+        if isinstance(array, np.ndarray) and not np.any(array):
+            raise InputError(name, "must not have zero length, got [0, 0, 0]", "Give a direction")
+        return array
+
+    return convert
+
+
+def number(
+    name: str, low: float = -np.inf, high: float = np.inf, *, above: float = -np.inf, below: float = np.inf
+) -> Callable[[Any], Any]:
+    """A converter for one number with ``low`` <= x <= ``high`` and ``above`` < x < ``below``."""
+
+    def convert(value: Any) -> Any:
+        array = _array(name, value, "a number")
+        if array.shape != ():
+            raise InputError(name, f"must be one number, got {_shown(value)}", "Give a single number")
+        if isinstance(array, np.ndarray):
+            _within(name, float(array), low, high, above, below)
+        return array
+
+    return convert
+
+
+def _within(name: str, value: float, low: float, high: float, above: float, below: float) -> None:
+    limits = [
+        (value < low, f"at least {low:g}"),
+        (value > high, f"at most {high:g}"),
+        (value <= above, f"greater than {above:g}"),
+        (value >= below, f"less than {below:g}"),
+    ]
+    broken = [words for is_broken, words in limits if is_broken]
+    if broken:
+        raise InputError(name, f"must be {broken[0]}, got {value:g}", "Correct the value")
+
+
+def positive(name: str) -> Callable[[Any], Any]:
+    """A converter for one number greater than 0."""
+    return number(name, above=0.0)
+
+
+def spectrum(name: str) -> Callable[[Any], Any]:
+    """A converter for one value per channel, at least 0; a single number becomes one channel."""
+
+    def convert(value: Any) -> Any:
+        array = _array(name, value, "a number per channel")
+        if array.ndim == 0:
+            array = array.reshape(1)
+        if array.ndim != 1 or array.shape[0] == 0:
+            raise InputError(name, f"must be a number per channel, got {_shown(value)}", "Give a list of numbers")
+        if isinstance(array, np.ndarray) and np.any(array < 0):
+            channel = int(np.argmax(array < 0))
+            came = f"must be at least 0, got {array[channel]:g} in channel {channel}"
+            raise InputError(name, came, "Give values of 0 or more")
+        return array
+
+    return convert

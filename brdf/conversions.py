@@ -1,0 +1,190 @@
+"""From one description of gloss to another: exponent, slope, glTF roughness; classic and normalised forms.
+
+Plain numbers are converted in float64, whatever JAX is set to; what JAX is tracing keeps its type.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import ArrayLike, Float
+
+from brdf import vectors
+from brdf.albedo import lobe_albedo, normalized_form
+from brdf.errors import InputError
+from brdf.models import BlinnPhong, Lambert, Material, NormalizedPhong, Phong, SpecularMaterial
+from brdf.precision import working_precision
+from brdf.vectors import Numbers, Scalars
+
+_NODES = (
+    400  # over the angle of the light; the integrands have at worst a boundary layer 1 / sqrt(n) wide at 90 degrees
+)
+
+
+def slope_from_exponent(n: Numbers) -> Scalars:
+    """Microfacet slope alpha = sqrt(2 / (n+2)) of a half-vector exponent.
+
+    Args:
+        n: half-vector exponent, at least 0, (...).
+
+    Returns:
+        (...), above 0 to 1. Source: Walter et al., "Microfacet models for refraction", EGSR 2007, section 5.2.
+    """
+    _check("n", n, low=0.0)
+    return _converted(lambda n: vectors.square_root(2.0 / (n + 2.0)), n)
+
+
+def exponent_from_slope(alpha: Numbers) -> Scalars:
+    """Half-vector exponent n = 2 / alpha^2 - 2 of a microfacet slope.
+
+    Args:
+        alpha: microfacet slope, above 0 to 1, (...).
+
+    Returns:
+        (...), at least 0.
+    """
+    _check("alpha", alpha, above=0.0, high=1.0)
+    return _converted(lambda alpha: 2.0 * (1.0 - alpha) * (1.0 + alpha) / (alpha * alpha), alpha)
+
+
+def roughness_from_exponent(n: Numbers) -> Scalars:
+    """Perceptual roughness of glTF, sqrt(alpha) = (2 / (n+2))^(1/4), of a half-vector exponent.
+
+    Args:
+        n: half-vector exponent, at least 0, (...).
+
+    Returns:
+        (...), above 0 to 1. Source: glTF 2.0 specification, appendix B: alpha = roughness^2.
+    """
+    return _converted(vectors.square_root, slope_from_exponent(n))
+
+
+def exponent_from_roughness(roughness: Numbers) -> Scalars:
+    """Half-vector exponent n = 2 / roughness^4 - 2 of the perceptual roughness of glTF.
+
+    Args:
+        roughness: above 0 to 1, (...).
+
+    Returns:
+        (...), at least 0.
+    """
+    _check("roughness", roughness, above=0.0, high=1.0)
+    return exponent_from_slope(_converted(lambda roughness: roughness * roughness, roughness))
+
+
+def half_from_mirror(n: Numbers) -> Scalars:
+    """Half-vector exponent of nearly the same highlight as a mirror exponent: 4 n.
+
+    The angle of the half vector is half the angle of the mirror direction in the plane of incidence, so that lobes of
+    the two agree to second order about their peak there; across it the half-vector lobe is narrower at grazing angles.
+
+    Args:
+        n: mirror exponent (R.V), at least 0, (...).
+
+    Returns:
+        (...), at least 0.
+    """
+    _check("n", n, low=0.0)
+    return _converted(lambda n: 4.0 * n, n)
+
+
+def mirror_from_half(n: Numbers) -> Scalars:
+    """Mirror exponent of nearly the same highlight as a half-vector exponent: n / 4; see ``half_from_mirror``.
+
+    Args:
+        n: half-vector exponent (N.H), at least 0, (...).
+
+    Returns:
+        (...), at least 0.
+    """
+    _check("n", n, low=0.0)
+    return _converted(lambda n: 0.25 * n, n)
+
+
+def nearest_normalized(material: Material) -> Material:
+    """The nearest plausible material: normalised, with k_d + k_s <= 1 in every channel.
+
+    Nearest means: of the same lobe and exponent, with the least mean square difference of radiance over the pixels of a
+    sphere, averaged over all directions of light. Ambient light is kept. A Lambert material stays one.
+
+    Args:
+        material: one of the five models, of known numbers.
+
+    Returns:
+        ``NormalizedPhong``, ``NormalizedBlinnPhong`` or ``Lambert``.
+    """
+    if not isinstance(material, SpecularMaterial):
+        return Lambert(k_a=material.k_a, k_d=np.clip(np.asarray(material.k_d), 0.0, 1.0))
+    return _nearest(material, normalized_form(type(material)), bounded=True)
+
+
+def nearest_classic(material: Material) -> Material:
+    """The nearest material of classic form; nearest as in ``nearest_normalized``, without the bound on k_d + k_s.
+
+    Args:
+        material: one of the five models, of known numbers.
+
+    Returns:
+        ``Phong``, ``BlinnPhong`` or ``Lambert``.
+    """
+    if not isinstance(material, SpecularMaterial):
+        return material
+    model = Phong if normalized_form(type(material)) is NormalizedPhong else BlinnPhong
+    return _nearest(material, model, bounded=False)
+
+
+def _nearest(material: SpecularMaterial, model: type[SpecularMaterial], *, bounded: bool) -> SpecularMaterial:
+    # Light is uniform over the hemisphere, the view in proportion to N.V, as a sphere shows it to a far camera. Then
+    # every entry of the normal equations is an integral over the light's angle of an albedo of exponent n or 2 n.
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    theta = 0.25 * np.pi * (nodes + 1)
+    weights = weights * np.sin(theta)
+    cosine = np.cos(theta)
+    old = type(material)
+    n = float(np.asarray(material.n))
+    plain = Phong if normalized_form(old) is NormalizedPhong else BlinnPhong
+    with working_precision("float64"):
+        lobe, lobe_squared = (np.asarray(lobe_albedo(plain, m, theta)) for m in (n, 2 * n))
+        to, of = (float(m.scale(n)) * (cosine if m.cosine_weighted else 1.0) for m in (model, old))
+    gram = np.array(
+        [
+            [np.sum(weights * cosine**2), np.sum(weights * cosine * to * lobe)],
+            [np.sum(weights * cosine * to * lobe), np.sum(weights * to * to * lobe_squared)],
+        ]
+    )
+    cross = np.array([np.sum(weights * cosine * of * lobe), np.sum(weights * to * of * lobe_squared)])
+    k_d, k_s = np.asarray(material.k_d, np.float64), np.asarray(material.k_s, np.float64)
+    pairs = np.array([_constrained(gram, gram[:, 0] * d + cross * s, bounded) for d, s in zip(k_d, k_s, strict=True)])
+    return model(k_a=material.k_a, k_d=pairs[:, 0], k_s=pairs[:, 1], n=n)
+
+
+def _constrained(gram: Float[np.ndarray, "2 2"], right: Float[np.ndarray, " 2"], bounded: bool) -> np.ndarray:
+    """The x >= 0 (with sum <= 1 if bounded) of least x' gram x / 2 - right' x: the best of all active sets."""
+    candidates = [np.linalg.solve(gram, right), np.zeros(2)]
+    candidates += [np.array([right[0] / gram[0, 0], 0.0]), np.array([0.0, right[1] / gram[1, 1]])]
+    if bounded:
+        along = np.array([1.0, -1.0])
+        start = np.array([0.0, 1.0])
+        step = along @ (right - gram @ start) / (along @ gram @ along)
+        candidates += [start, np.array([1.0, 0.0]), np.array([step, 1.0 - step])]
+    feasible = [x for x in candidates if np.all(x >= 0) and (not bounded or x.sum() <= 1 + 1e-15)]
+    return min(feasible, key=lambda x: 0.5 * x @ gram @ x - right @ x)
+
+
+def _converted(formula: Callable[[Any], Any], value: Any) -> Any:
+    if isinstance(value, Tracer):
+        return formula(value)
+    with working_precision("float64"):
+        return np.asarray(formula(jnp.asarray(value, jnp.float64)))
+
+
+def _check(name: str, value: ArrayLike, low: float = -np.inf, above: float = -np.inf, high: float = np.inf) -> None:
+    if isinstance(value, Tracer):
+        return
+    numbers = np.asarray(value, np.float64)
+    wrong = ~((numbers >= low) & (numbers > above) & (numbers <= high) & np.isfinite(numbers))
+    if np.any(wrong):
+        wanted = "at least 0" if above == -np.inf else f"above {above:g} and at most {high:g}"
+        raise InputError(name, f"must be {wanted}, got {numbers[wrong].flat[0]:g}")

@@ -1,0 +1,31 @@
+"""The one error that bad input raises."""
+
+
+class InputError(ValueError):
+    """Something the user gave cannot be used.
+
+    The message is one line, ``<file or argument>: <what is wrong, what came>. <what to do>``; the command prints it
+    after ``error:`` and exits with status 2.
+    """
+
+    def __init__(self, where: object, what: str, remedy: str = ""):
+        """Build the message.
+
+        Args:
+            where: the file or argument at fault.
+            what: what is wrong with it and what came, without a full stop.
+            remedy: what to do about it, a sentence without its full stop.
+        """
+        self.where, self.what, self.remedy = str(where), what, remedy
+        message = f"{where}: {what}." + (f" {remedy}." if remedy else "")
+        printable = "".join(letter if letter.isprintable() else " " for letter in message)
+        super().__init__(" ".join(printable.split()))
+
+    def inside(self, place: object) -> "InputError":
+        """The same error, with the file or table that the value stood in.
+
+        Args:
+            place: the file or table.
+        """
+        separator = "." if ": " in str(place) else ": "
+        return InputError(f"{place}{separator}{self.where}", self.what, self.remedy)

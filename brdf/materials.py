@@ -1,0 +1,233 @@
+"""Material files: JSON, which carries everything, and Wavefront MTL, which other programs load.
+
+In JSON a value that a picture could not determine is ``null``; it reads back as 0, which changes no picture.
+"""
+
+import dataclasses
+import json
+import math
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from brdf.errors import InputError
+from brdf.files import read_text, write_text
+from brdf.models import MODELS, BlinnPhong, Lambert, Material, SpecularMaterial
+
+# Says in a comment, which other readers skip, what MTL has no word for.
+MTL_MODEL = "# brdf model:"
+SPECTRAL = {"ka": "k_a", "kd": "k_d", "ks": "k_s"}
+
+
+def load_material(path: str | Path, name: str | None = None) -> Material:
+    """Read one material.
+
+    Args:
+        path: a ``.json`` or ``.mtl`` file.
+        name: which one, where an MTL file holds several.
+
+    Raises:
+        InputError: naming file and key, or where the file holds several materials and no name is given.
+    """
+    materials = load_materials(path)
+    if name is not None:
+        if name not in materials:
+            raise InputError(path, f"has no material {name!r}", f"It holds {', '.join(materials)}")
+        return materials[name]
+    if len(materials) > 1:
+        raise InputError(path, f"holds {len(materials)} materials", f"Name one of {', '.join(materials)}")
+    return next(iter(materials.values()))
+
+
+def load_materials(path: str | Path) -> dict[str, Material]:
+    """Read all materials of a file, by name; the one in a JSON file bears the file's name.
+
+    Args:
+        path: a ``.json`` or ``.mtl`` file.
+
+    Raises:
+        InputError: naming file and key.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix == ".json":
+        return {path.stem: _from_json(path, read_text(path))}
+    if suffix == ".mtl":
+        return _from_mtl(path, read_text(path))
+    raise InputError(path, f"is no material file, got {suffix or 'no suffix'}", "Give a .json or .mtl file")
+
+
+def save_material(material: Material, path: str | Path, *, undetermined: Collection[str] = ()) -> None:
+    """Write a material that `load_material` reads back.
+
+    Args:
+        material: any of the models; MTL holds three channels, so one channel is written three times.
+        path: a ``.json`` or ``.mtl`` file.
+        undetermined: what a picture could not determine, written as ``null``: "n", "k_s" or "k_s[2]" for one channel.
+
+    Raises:
+        InputError: where the file cannot be written or cannot hold the material.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix == ".json":
+        write_text(path, json.dumps(material_to_dict(material, undetermined=undetermined), indent=2) + "\n")
+    elif suffix == ".mtl":
+        write_text(path, _to_mtl(material, path, undetermined))
+    else:
+        raise InputError(path, f"is no material file, got {suffix or 'no suffix'}", "Name it .json or .mtl")
+
+
+def material_to_dict(material: Material, *, undetermined: Collection[str] = ()) -> dict[str, Any]:
+    """The material as JSON holds it.
+
+    Args:
+        material: any of the models.
+        undetermined: see `save_material`.
+    """
+    values: dict[str, Any] = {"model": material.name}
+    for key in _parameters(type(material)):
+        array = np.asarray(getattr(material, key), dtype=np.float64)
+        if array.ndim == 0:
+            values[key] = None if key in undetermined else float(array)
+            continue
+        values[key] = [
+            None if key in undetermined or f"{key}[{channel}]" in undetermined else float(value)
+            for channel, value in enumerate(array)
+        ]
+    return values
+
+
+def material_from_dict(values: Any) -> Material:
+    """The material that JSON holds. Keys that are no parameter of the model are left alone.
+
+    Args:
+        values: what `material_to_dict` gives.
+
+    Raises:
+        InputError: naming the key.
+    """
+    if not isinstance(values, dict):
+        raise InputError("material", "must be a JSON object", 'Write {"model": ..., "k_d": ...}')
+    name = values.get("model")
+    if not isinstance(name, str) or name not in MODELS:
+        raise InputError("model", f"is unknown, got {name!r}", f"Use one of {', '.join(MODELS)}")
+    model = MODELS[name]
+    found = {key: values[key] for key in _parameters(model) if key in values}
+    missing = [key for key in _parameters(model) if key not in values and key != "k_a"]
+    if missing:
+        raise InputError(missing[0], "is missing", f"{name} needs {', '.join(_parameters(model))}")
+    for key, value in found.items():
+        for number in value if isinstance(value, list) else [value]:
+            if number is not None and (isinstance(number, bool) or not isinstance(number, int | float)):
+                raise InputError(key, f"must be a number, got {json.dumps(number)[:40]}", "Give numbers or null")
+    known = {key: _nulls_as_zero(value) for key, value in found.items()}
+    if found.get("n", 0) is None and np.any(np.asarray(known["k_s"]) != 0):
+        raise InputError("n", "is null (not determined) although k_s is not 0", "Give n, or k_s = 0")
+    return model(**known)
+
+
+def _nulls_as_zero(value: Any) -> Any:
+    if isinstance(value, list):
+        return [0.0 if number is None else number for number in value]
+    return 0.0 if value is None else value
+
+
+def _parameters(model: type[Material]) -> list[str]:
+    return [field.name for field in dataclasses.fields(model)]
+
+
+def _from_json(path: Path, text: str) -> Material:
+    try:
+        return material_from_dict(json.loads(text))
+    except InputError as error:
+        raise error.inside(path) from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(path, f"is not JSON ({error})", "Correct the file") from None
+
+
+def _to_mtl(material: Material, path: Path, undetermined: Collection[str]) -> str:
+    channels = material.k_d.shape[0]
+    if channels not in (1, 3):
+        raise InputError(path, f"cannot hold {channels} channels, MTL knows RGB alone", "Save the material as .json")
+    lines = ["# Wavefront material, linear values"]
+    if type(material) is not BlinnPhong:
+        lines.append(f"{MTL_MODEL} {material.name}")
+    if undetermined:
+        lines.append(f"# not determined by the picture: {', '.join(undetermined)}")
+    lines.append("newmtl fitted")
+    scale = 1.0
+    if isinstance(material, SpecularMaterial):
+        scale = float(material.scale(np.float64(material.n)))
+        lines.append(f"Ns {float(material.n)!r}")
+    factors = {"k_a": 1.0, "k_d": 1.0, "k_s": scale}
+    for key, factor in factors.items():
+        values = np.asarray(getattr(material, key, 0.0), dtype=np.float64) * factor
+        red, green, blue = np.broadcast_to(values, (3,)).tolist()
+        lines.append(f"K{key[-1]} {red!r} {green!r} {blue!r}")
+    lines.append(f"illum {2 if isinstance(material, SpecularMaterial) else 1}")
+    return "\n".join(lines) + "\n"
+
+
+def _from_mtl(path: Path, text: str) -> dict[str, Material]:
+    entries: dict[str, dict[str, Any]] = {}
+    current: dict[str, Any] | None = None
+    model_comment = None
+    for number, line in enumerate(text.splitlines(), start=1):
+        place = f"{path}: line {number}"
+        stripped = line.strip()
+        if stripped.startswith(MTL_MODEL):
+            model_comment = stripped.removeprefix(MTL_MODEL).strip()
+            continue
+        words = stripped.partition("#")[0].split()
+        if not words:
+            continue
+        key = words[0].lower()
+        if key == "newmtl":
+            current = entries.setdefault(stripped[len("newmtl") :].strip() or "unnamed", {})
+            current["model"] = model_comment
+            continue
+        if key not in (*SPECTRAL, "ns", "illum"):
+            continue
+        if current is None:
+            raise InputError(place, f"has {words[0]} before any newmtl", "Start the material with newmtl NAME")
+        current[key] = _mtl_numbers(place, words)
+    if not entries:
+        raise InputError(path, "holds no material", "Give a file with a newmtl line")
+    try:
+        return {name: _mtl_material(entry) for name, entry in entries.items()}
+    except InputError as error:
+        raise error.inside(path) from None
+
+
+def _mtl_numbers(place: str, words: list[str]) -> list[float]:
+    try:
+        numbers = [float(word) for word in words[1:]]
+    except ValueError:
+        came = f"{words[0]} must be numbers, got {' '.join(words[1:])[:40]!r}"
+        raise InputError(place, came, "Give RGB values; spectral curves and XYZ are not read") from None
+    if not numbers or not all(map(math.isfinite, numbers)):
+        raise InputError(place, f"{words[0]} must be finite numbers, got {words[1:]}", "Give finite numbers")
+    wanted = (1, 3) if words[0].lower() in SPECTRAL else (1,)
+    if len(numbers) not in wanted:
+        raise InputError(place, f"{words[0]} has {len(numbers)} values", f"Give {' or '.join(map(str, wanted))}")
+    return numbers * 3 if words[0].lower() in SPECTRAL and len(numbers) == 1 else numbers
+
+
+def _mtl_material(entry: dict[str, Any]) -> Material:
+    values = {name: entry.get(key, [0.0, 0.0, 0.0]) for key, name in SPECTRAL.items()}
+    name = entry["model"]
+    if name is not None and name not in MODELS:
+        raise InputError("model", f"is unknown, got {name!r}", f"Use one of {', '.join(MODELS)}")
+    illum = entry.get("illum", [2.0])[0]
+    if name == Lambert.name or illum < 2 or (name is None and "ks" not in entry):
+        return Lambert(k_a=values["k_a"], k_d=values["k_d"])
+    model = BlinnPhong if name is None else MODELS[name]
+    assert issubclass(model, SpecularMaterial)
+    n = entry.get("ns", [1.0])[0]
+    if n < 0:
+        raise InputError("Ns", f"must be at least 0, got {n:g}", "Correct the value")
+    scale = float(model.scale(np.float64(n)))
+    return model(k_a=values["k_a"], k_d=values["k_d"], k_s=np.asarray(values["k_s"]) / scale, n=n)

@@ -1,0 +1,333 @@
+"""The five models: what one point of a surface reflects.
+
+The radiance of a point is ``k_a I_a + sum_i I_i [k_d (N.L_i)+ + k_s S(L_i, V)]``; the models differ in the specular
+term
+
+    S = scale(n) * (N.L)+^w * cos^n     where N.L > 0 and N.V > 0, else 0,
+
+with w = 0 (classic) or 1 (normalised) and cos = R.V (Phong) or N.H (Blinn-Phong). What remains when cosine and light
+are divided out is the BRDF, f_r = [k_d + k_s S / (N.L)] / pi in 1/sr; the ambient term stands in for indirect light
+and is no part of it.
+
+A material is a frozen dataclass and a JAX pytree whose leaves are its numbers: differentiate, vmap and optimise it as
+it is. Numbers given as plain values are checked once, here, and kept in float64; a formula runs in the precision JAX
+has at the call.
+"""
+
+import math
+from abc import abstractmethod
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Float
+
+from brdf import vectors
+from brdf.errors import InputError
+from brdf.vectors import Directions, Numbers, Scalars
+
+Parameter = Array | np.ndarray
+
+
+class Material(eqx.Module):
+    """What the five models share: ambient and diffuse coefficients, and how to ask for the reflection.
+
+    Attributes:
+        k_a: ambient coefficient, (C,), at least 0.
+        k_d: diffuse coefficient, (C,), at least 0: the diffuse albedo.
+    """
+
+    k_a: eqx.AbstractVar[Float[Parameter, " C"]]
+    k_d: eqx.AbstractVar[Float[Parameter, " C"]]
+    name: ClassVar[str]
+
+    @abstractmethod
+    def specular(self, normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
+        """The specular term S of the shading equation, without k_s.
+
+        Args:
+            normal: unit vectors, (..., 3).
+            to_light: unit vectors, (..., 3).
+            to_view: unit vectors, (..., 3).
+
+        Returns:
+            (...), at least 0; 0 where N.L <= 0 or N.V <= 0.
+        """
+
+    @abstractmethod
+    def reflectance(self, to_light: Directions, to_view: Directions) -> Float[Array, "*batch C"]:
+        """The BRDF f_r in 1/sr, in the local frame whose +z axis is the normal.
+
+        Args:
+            to_light: unit vectors, (..., 3).
+            to_view: unit vectors, (..., 3).
+
+        Returns:
+            (..., C), at least 0; 0 where either direction is not above the horizon.
+        """
+
+    def __repr__(self) -> str:
+        """Model and numbers, as one would write them."""
+        return f"{type(self).__name__}({', '.join(f'{k}={_text(v)}' for k, v in vars(self).items())})"
+
+
+class SpecularMaterial(Material):
+    """What the four models with a lobe share. The lobe is ``scale(n) (N.L)+^w exp(n log_cosine)``; see the module.
+
+    Attributes:
+        k_a: ambient coefficient, (C,), at least 0.
+        k_d: diffuse coefficient, (C,), at least 0.
+        k_s: specular coefficient, (C,), at least 0.
+        n: exponent, a scalar, at least 0.
+        cosine_weighted: whether the lobe is multiplied by N.L (class variable).
+    """
+
+    k_a: Float[Parameter, " C"]
+    k_d: Float[Parameter, " C"]
+    k_s: Float[Parameter, " C"]
+    n: Float[Parameter, ""]
+    cosine_weighted: ClassVar[bool]
+
+    def __init__(self, *, k_d: ArrayLike, k_s: ArrayLike, n: ArrayLike, k_a: ArrayLike = 0.0):
+        """Check the numbers and give the coefficients one number of channels.
+
+        Args:
+            k_d: diffuse coefficient, a scalar or (C,), at least 0.
+            k_s: specular coefficient, a scalar or (C,), at least 0.
+            n: exponent, a scalar, at least 0.
+            k_a: ambient coefficient, a scalar or (C,), at least 0.
+
+        Raises:
+            InputError: a number is negative or not finite, or the shapes do not fit.
+        """
+        self.k_a, self.k_d, self.k_s = _coefficients(k_a=k_a, k_d=k_d, k_s=k_s)
+        self.n = _exponent(n)
+
+    @staticmethod
+    @abstractmethod
+    def log_cosine(normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
+        """Logarithm of the cosine that is raised to n; ``vectors.BELOW_HORIZON`` where it is not positive.
+
+        Args:
+            normal: unit vectors, (..., 3).
+            to_light: unit vectors, (..., 3).
+            to_view: unit vectors, (..., 3).
+
+        Returns:
+            (...), at most 0.
+        """
+
+    @staticmethod
+    @abstractmethod
+    def scale(n: Numbers) -> Scalars:
+        """The constant in front of the lobe: 1 in the classic forms.
+
+        Args:
+            n: exponent, at least 0, (...).
+
+        Returns:
+            (...), at least 1.
+        """
+
+    def specular(self, normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
+        """The specular term S; see ``Material.specular``."""
+        lobe = self._lobe(normal, to_light, to_view)
+        return lobe * vectors.dot(normal, to_light) if self.cosine_weighted else lobe
+
+    def reflectance(self, to_light: Directions, to_view: Directions) -> Float[Array, "*batch C"]:
+        """The BRDF f_r in 1/sr; see ``Material.reflectance``."""
+        to_light, to_view = jnp.asarray(to_light), jnp.asarray(to_view)
+        lobe = self._lobe(jnp.array([0.0, 0.0, 1.0], to_light.dtype), to_light, to_view)
+        if not self.cosine_weighted:
+            lobe = vectors.divide(lobe, to_light[..., 2])
+        above = (to_light[..., 2] > 0) & (to_view[..., 2] > 0)
+        return jnp.where(above[..., None], self.k_d + self.k_s * lobe[..., None], 0.0) / math.pi
+
+    def _lobe(self, normal: ArrayLike, to_light: ArrayLike, to_view: ArrayLike) -> Array:
+        """scale(n) cos^n, gated: light does not come through the surface."""
+        above = (vectors.dot(normal, to_light) > 0) & (vectors.dot(normal, to_view) > 0)
+        lobe = vectors.lobe(self.log_cosine(normal, to_light, to_view), self.n)
+        return jnp.where(above, self.scale(self.n) * lobe, 0.0)
+
+
+class Lambert(Material):
+    """A perfectly matt surface: S = 0, f_r = k_d / pi.
+
+    Reciprocal. Conserves energy when k_d <= 1. Source: J. H. Lambert, Photometria, 1760.
+
+    Attributes:
+        k_a: ambient coefficient, (C,), at least 0.
+        k_d: diffuse coefficient, (C,), at least 0.
+    """
+
+    k_a: Float[Parameter, " C"]
+    k_d: Float[Parameter, " C"]
+    name: ClassVar[str] = "lambert"
+
+    def __init__(self, *, k_d: ArrayLike, k_a: ArrayLike = 0.0):
+        """Check the numbers and give the coefficients one number of channels.
+
+        Args:
+            k_d: diffuse coefficient, a scalar or (C,), at least 0.
+            k_a: ambient coefficient, a scalar or (C,), at least 0.
+
+        Raises:
+            InputError: a number is negative or not finite, or the shapes do not fit.
+        """
+        self.k_a, self.k_d = _coefficients(k_a=k_a, k_d=k_d)
+
+    def specular(self, normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
+        """The specular term S, which is 0; see ``Material.specular``."""
+        return jnp.zeros_like(vectors.dot(normal, to_light) + vectors.dot(normal, to_view))
+
+    def reflectance(self, to_light: Directions, to_view: Directions) -> Float[Array, "*batch C"]:
+        """The BRDF f_r in 1/sr; see ``Material.reflectance``."""
+        above = (jnp.asarray(to_light)[..., 2] > 0) & (jnp.asarray(to_view)[..., 2] > 0)
+        return jnp.where(above[..., None], self.k_d, 0.0) / math.pi
+
+
+class Phong(SpecularMaterial):
+    """A glossy surface as VTK and PyTorch3D draw it: S = (R.V)+^n, R the mirror direction of the light.
+
+    k_a, k_d, k_s at least 0, n at least 0. Not reciprocal and not energy conserving for k_s > 0: the albedo diverges
+    at grazing light. Source: B. T. Phong, "Illumination for computer generated pictures", CACM 18 (1975) 311-317.
+    """
+
+    name: ClassVar[str] = "phong"
+    cosine_weighted: ClassVar[bool] = False
+
+    @staticmethod
+    def log_cosine(normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
+        """Logarithm of R.V; see ``SpecularMaterial.log_cosine``."""
+        return vectors.mirror_log_cosine(normal, to_light, to_view)
+
+    @staticmethod
+    def scale(n: Numbers) -> Scalars:
+        """1: the classic form is not normalised."""
+        return jnp.ones_like(n)
+
+
+class BlinnPhong(SpecularMaterial):
+    """A glossy surface as OpenGL's fixed function and Wavefront's MTL (illum 2) draw it: S = (N.H)+^n.
+
+    k_a, k_d, k_s at least 0, n at least 0. Not reciprocal and not energy conserving for k_s > 0: the albedo diverges
+    at grazing light. Source: J. F. Blinn, "Models of light reflection for computer synthesized pictures", SIGGRAPH
+    1977, 192-198.
+    """
+
+    name: ClassVar[str] = "blinn-phong"
+    cosine_weighted: ClassVar[bool] = False
+
+    @staticmethod
+    def log_cosine(normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
+        """Logarithm of N.H; see ``SpecularMaterial.log_cosine``."""
+        return vectors.half_log_cosine(normal, to_light, to_view)
+
+    @staticmethod
+    def scale(n: Numbers) -> Scalars:
+        """1: the classic form is not normalised."""
+        return jnp.ones_like(n)
+
+
+class NormalizedPhong(SpecularMaterial):
+    """Phong made physically plausible: S = (n+2)/2 (R.V)+^n (N.L)+.
+
+    k_a, k_d, k_s at least 0, n at least 0. Reciprocal. Conserves energy when k_d + k_s <= 1: the lobe alone reflects
+    all light at normal incidence and less at grazing angles, where the surface cuts it. Source: R. R. Lewis, "Making
+    shaders more physically plausible", Computer Graphics Forum 13 (1994) 109-120; E. P. Lafortune and Y. D. Willems,
+    "Using the modified Phong reflectance model for physically based rendering", Report CW 197, K.U. Leuven, 1994.
+    """
+
+    name: ClassVar[str] = "normalized-phong"
+    cosine_weighted: ClassVar[bool] = True
+
+    @staticmethod
+    def log_cosine(normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
+        """Logarithm of R.V; see ``SpecularMaterial.log_cosine``."""
+        return vectors.mirror_log_cosine(normal, to_light, to_view)
+
+    @staticmethod
+    def scale(n: Numbers) -> Scalars:
+        """(n+2)/2: the albedo of the lobe at normal incidence is 1."""
+        return 0.5 * (jnp.asarray(n) + 2.0)
+
+
+class NormalizedBlinnPhong(SpecularMaterial):
+    """Blinn-Phong made physically plausible: S = (n+2)(n+4) / (8 (2^(-n/2) + n)) (N.H)+^n (N.L)+.
+
+    k_a, k_d, k_s at least 0, n at least 0. Reciprocal. Conserves energy when k_d + k_s <= 1: the lobe alone reflects
+    all light at normal incidence and less at grazing angles. Source: F. Giesen, "Phong normalization factor
+    derivation", 2009; the lobe is Blinn's of 1977.
+    """
+
+    name: ClassVar[str] = "normalized-blinn-phong"
+    cosine_weighted: ClassVar[bool] = True
+
+    @staticmethod
+    def log_cosine(normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
+        """Logarithm of N.H; see ``SpecularMaterial.log_cosine``."""
+        return vectors.half_log_cosine(normal, to_light, to_view)
+
+    @staticmethod
+    def scale(n: Numbers) -> Scalars:
+        """(n+2)(n+4) / (8 (2^(-n/2) + n)): the albedo of the lobe at normal incidence is 1."""
+        n = jnp.asarray(n)
+        return 0.125 * (n + 2.0) * ((n + 4.0) / (jnp.exp(-0.5 * math.log(2.0) * n) + n))
+
+
+MODELS: dict[str, type[Material]] = {
+    model.name: model for model in (Lambert, Phong, BlinnPhong, NormalizedPhong, NormalizedBlinnPhong)
+}
+"""The models by the names that files and the command line use."""
+
+
+def _coefficients(**given: Any) -> list[Parameter]:
+    """The coefficients, checked, at one common number of channels."""
+    checked = [_numbers(name, value) for name, value in given.items()]
+    for name, value in zip(given, checked, strict=True):
+        if value.ndim > 1 or value.size == 0:
+            raise InputError(name, f"must be one number or one number per channel, got shape {value.shape}")
+    channels = max(value.size for value in checked)
+    for name, value in zip(given, checked, strict=True):
+        if value.size not in (1, channels):
+            sizes = ", ".join(f"{n} {v.size}" for n, v in zip(given, checked, strict=True))
+            raise InputError(
+                name, f"the coefficients differ in their number of channels ({sizes})", "Give each the same"
+            )
+    return [(np if isinstance(value, np.ndarray) else jnp).broadcast_to(value, (channels,)).copy() for value in checked]
+
+
+def _exponent(given: Any) -> Parameter:
+    value = _numbers("n", given)
+    if value.size != 1:
+        raise InputError("n", f"must be one number, got shape {value.shape}", "All channels share one exponent")
+    return value.reshape(())
+
+
+def _numbers(name: str, given: Any) -> Any:
+    """As float64 numpy if the values are known, after checking them; what JAX is tracing passes through."""
+    if isinstance(given, list | tuple) and any(isinstance(v, Tracer) for v in given):
+        given = jnp.stack([jnp.asarray(v) for v in given])
+    if isinstance(given, Tracer):
+        return given
+    try:
+        value = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(name, f"must be numbers, got {given!r}") from None
+    for channel, number in enumerate(value.ravel()):
+        where = f" in channel {channel}" if value.size > 1 else ""
+        if not math.isfinite(number):
+            raise InputError(name, f"must be finite, got {number}{where}")
+        if number < 0:
+            raise InputError(name, f"must be at least 0, got {number:g}{where}")
+    return value
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, np.ndarray) or (isinstance(value, jax.Array) and not isinstance(value, Tracer)):
+        value = np.asarray(value)
+        return f"{value:.6g}" if value.ndim == 0 else f"[{', '.join(f'{v:.6g}' for v in value)}]"
+    return str(value)

@@ -1,0 +1,31 @@
+"""Fitting reflectance models to pictures: one call, no guess, the global optimum, and how sure it is.
+
+Names load when first used, so that the command's help does not import JAX.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from fitting.picture_fit import fit
+    from fitting.joint import fit_jointly
+    from fitting.result import FitResult, Parameter
+
+_ROOM_OF = {
+    "FitResult": "result",
+    "Parameter": "result",
+    "fit": "picture_fit",
+    "fit_jointly": "joint",
+}
+
+__all__ = sorted(_ROOM_OF)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _ROOM_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_ROOM_OF[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

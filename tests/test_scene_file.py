@@ -1,0 +1,192 @@
+"""scene.toml: what is written reads back the same, and what is wrong is one line that names file, table and key."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import brdf
+
+FULL = """
+[camera]
+type = "perspective"
+position = [0.0, 0.5, 4.0]
+target = [0.0, 0.0, 0.0]
+up = [0.0, 1.0, 0.0]
+fov = 36.0
+resolution = [40, 30]
+viewer = "infinite"
+
+[[shapes]]
+type = "sphere"
+center = [0.0, 0.0, 0.0]
+radius = 1.0
+
+[[shapes]]
+type = "rectangle"
+center = [0.0, 0.0, -2.0]
+edge_u = [2.0, 0.0, 0.0]
+edge_v = [0.0, 2.0, 0.0]
+fitted = false
+
+[ambient]
+intensity = [0.2, 0.3, 0.4]
+
+[[lights]]
+type = "directional"
+direction = [0.5, 0.6, 0.7]
+intensity = [1.0, 0.9, 0.8]
+
+[[lights]]
+type = "point"
+position = [1.0, 2.0, 3.0]
+intensity = [5.0, 5.0, 5.0]
+attenuation = [1.0, 0.1, 0.01]
+"""
+
+SHORT = """
+[camera]
+type = "orthographic"
+position = [0, 0, 4]
+target = [0, 0, 0]
+up = [0, 1, 0]
+width = 2.2
+resolution = [16, 16]
+
+[[shapes]]
+type = "sphere"
+center = [0, 0, 0]
+radius = 1
+
+[ambient]
+intensity = [0.1, 0.1, 0.1]
+
+[[lights]]
+type = "directional"
+direction = [0, 0, 1]
+intensity = [1, 1, 1]
+"""
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "scene.toml"
+    path.write_text(text)
+    return path
+
+
+def same(a: brdf.Scene, b: brdf.Scene) -> bool:
+    leaves_a, structure_a = jax.tree.flatten(a)
+    leaves_b, structure_b = jax.tree.flatten(b)
+    return structure_a == structure_b and all(map(np.array_equal, leaves_a, leaves_b))
+
+
+@pytest.mark.parametrize("text", [FULL, SHORT], ids=["full", "short"])
+def test_a_saved_scene_reads_back_the_same(tmp_path: Path, text: str):
+    scene = brdf.Scene.load(write(tmp_path, text))
+    scene.save(tmp_path / "again.toml")
+    assert same(scene, brdf.Scene.load(tmp_path / "again.toml"))
+
+
+def test_values_are_read_as_written(tmp_path: Path):
+    scene = brdf.Scene.load(write(tmp_path, FULL))
+    assert isinstance(scene.camera, brdf.PerspectiveCamera)
+    assert scene.camera.viewer == "infinite"
+    assert scene.resolution == (40, 30)
+    assert [shape.fitted for shape in scene.shapes] == [True, False]
+    np.testing.assert_array_equal(scene.ambient, [0.2, 0.3, 0.4])
+    point = scene.lights[1]
+    assert isinstance(point, brdf.PointLight)
+    np.testing.assert_array_equal(point.attenuation, [1.0, 0.1, 0.01])
+
+
+def test_surface_points_travel_through_an_aov_file(tmp_path: Path):
+    rng = np.random.default_rng(1)
+    normal = rng.normal(size=(6, 5, 3))
+    normal[2, 3] = 0.0
+    position = rng.normal(size=(6, 5, 3))
+    points = brdf.SurfacePoints.from_normals(normal, position=position, to_view=(0.1, 0.2, 1.0))
+    light = brdf.DirectionalLight(direction=[0, 0, 1], intensity=[1.0])
+    brdf.Scene(points=points, lights=[light]).save(tmp_path / "scene.toml")
+    again = brdf.Scene.load(tmp_path / "scene.toml").surface_points()
+    assert not again.mask[2, 3]
+    assert np.count_nonzero(~again.mask) == 1
+    for name in ("position", "normal", "to_view"):
+        expected, got = (np.asarray(getattr(p, name))[points.mask] for p in (points, again))
+        np.testing.assert_allclose(got, expected, atol=1e-6)  # the file holds float32
+
+
+def test_layers_of_an_aov_file_can_be_named(tmp_path: Path):
+    from brdf.images import write_layers
+
+    normal = np.zeros((3, 4, 3), np.float32)
+    normal[..., 2] = 2.0
+    write_layers(tmp_path / "aovs.exr", {"shading": normal, "where": normal})
+    text = '[aov]\nfile = "aovs.exr"\nnormal = "shading"\nposition = "where"\n'
+    points = brdf.Scene.load(write(tmp_path, text)).surface_points()
+    np.testing.assert_array_equal(points.normal[0, 0], [0, 0, 1])
+    np.testing.assert_array_equal(points.position[0, 0], [0, 0, 2])
+
+
+WRONG = {
+    "unknown key": (SHORT + "colour = 3\n", "lights[0].colour: is not a known key"),
+    "unknown table": (SHORT + "[sky]\n", "sky: is not a known key"),
+    "unknown camera": (SHORT.replace("orthographic", "fisheye"), "camera.type: is unknown, got 'fisheye'"),
+    "no type": (SHORT.replace('type = "sphere"\n', ""), "shapes[0]: has no type"),
+    "missing key": (SHORT.replace("radius = 1\n", ""), "shapes[0]: has no radius"),
+    "text for a number": (SHORT.replace("radius = 1", 'radius = "1"'), "shapes[0].radius: must be a number, got '1'"),
+    "truth for a number": (
+        SHORT.replace("radius = 1", "radius = true"),
+        "shapes[0].radius: must be a number, got true",
+    ),
+    "negative radius": (SHORT.replace("radius = 1", "radius = -1"), "shapes[0].radius: must be greater than 0, got -1"),
+    "not a number": (SHORT.replace("radius = 1", "radius = nan"), "shapes[0].radius: must be finite"),
+    "two coordinates": (SHORT.replace("[0, 0, 4]", "[0, 4]"), "camera.position: must be three numbers"),
+    "zero direction": (
+        SHORT.replace("direction = [0, 0, 1]", "direction = [0, 0, 0]"),
+        "lights[0].direction: must not",
+    ),
+    "negative light": (SHORT.replace("[1, 1, 1]", "[1, -1, 1]"), "intensity: must be at least 0, got -1 in channel 1"),
+    "channels differ": (SHORT.replace("[1, 1, 1]", "[1, 1]"), "intensity: lights have 2 and 3 channels"),
+    "camera in its target": (
+        SHORT.replace("position = [0, 0, 4]", "position = [0, 0, 0]"),
+        "camera.target: must differ",
+    ),
+    "up along the view": (SHORT.replace("up = [0, 1, 0]", "up = [0, 0, 1]"), "camera.up: must not be parallel"),
+    "half a pixel": (SHORT.replace("[16, 16]", "[16.5, 16]"), "camera.resolution: must be two whole numbers"),
+    "no pixel": (SHORT.replace("[16, 16]", "[0, 16]"), "camera.resolution: must be between 1 and"),
+    "many pixels": (SHORT.replace("[16, 16]", "[16, 1000000]"), "camera.resolution: must be between 1 and"),
+    "nothing to see": (
+        SHORT.replace("radius = 1", "radius = 1\nfitted = false"),
+        "shapes: has no shape that is fitted",
+    ),
+    "fitted as text": (
+        SHORT.replace("radius = 1", 'radius = 1\nfitted = "no"'),
+        "shapes[0].fitted: must be true or false",
+    ),
+    "shapes as a table": ("[shapes]\ntype = 'sphere'\n", "shapes: must be a list of tables"),
+    "lights as numbers": ("lights = [1, 2]\n", "lights[0]: must be a table"),
+    "ambient without intensity": (SHORT.replace("intensity = [0.1, 0.1, 0.1]", ""), "ambient: has no intensity"),
+    "empty": ("# nothing\n", "scene: must have a camera or surface points"),
+    "no toml": ("[camera", "is not TOML"),
+    "path out of the folder": ('[aov]\nfile = "../aovs.exr"\n', "aov.file: must stay within the scene's folder"),
+    "number for a path": ("[aov]\nfile = 3\n", "aov.file: must be a path, got 3"),
+    "missing aov": ('[aov]\nfile = "none.exr"\n', "none.exr: there is no such file"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG, ids=WRONG)
+def test_what_is_wrong_is_said_in_one_line(tmp_path: Path, case: str):
+    text, words = WRONG[case]
+    path = write(tmp_path, text)
+    with pytest.raises(brdf.InputError) as caught:
+        brdf.Scene.load(path)
+    message = str(caught.value)
+    assert message.startswith(str(tmp_path))
+    assert words in message
+    assert "\n" not in message
+
+
+def test_a_missing_scene_is_said(tmp_path: Path):
+    with pytest.raises(brdf.InputError, match="there is no such file"):
+        brdf.Scene.load(tmp_path / "none.toml")
