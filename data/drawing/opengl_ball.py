@@ -5,8 +5,10 @@ What OpenGL computes per vertex (OpenGL 2.1 specification, section 2.14.1), with
     colour = k_a I_a + sum_i attenuation_i spot_i I_i [ k_d (N.L_i)+ + k_s (N.H_i)+^n ],  no highlight where N.L_i <= 0
 
 It then **clamps the colour to [0, 1]** and interpolates it over the face: keep pictures below 1 (or let the fit leave
-the saturated pixels out), and faces small. Faces here are half a pixel wide: interpolation flattens a lobe by less than
-n / (32 R^2) of its height, R the ball's radius in pixels, and blurs the edge of a spot's cone over half a pixel.
+the saturated pixels out), and faces small. Faces here are a quarter of a pixel wide: interpolation flattens a lobe by
+less than n / (128 R^2) of its height, R the ball's radius in pixels, and blurs over a face the edge of a spot's cone,
+the edge of a saturated area, and the highlight's jump to zero where N.L = 0. Points with N.V <= 0 keep their highlight;
+only a local viewer in an orthographic picture sees such points, near the silhouette, and only lobes of n < 10 show it.
 Shininess is limited to 128, the number of lights to 8, and nothing casts a shadow.
 """
 
@@ -24,7 +26,7 @@ from OpenGL import GL, osmesa
 
 __all__ = ["draw_ball"]
 
-FACE_PIXELS = 0.5
+FACE_PIXELS = 0.25
 
 
 def draw_ball(scene: Mapping[str, Any], material: Mapping[str, Any]) -> np.ndarray:

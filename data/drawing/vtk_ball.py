@@ -30,7 +30,7 @@ def draw_ball(scene: Mapping[str, Any], material: Mapping[str, Any], eight_bit: 
 
     Args:
         scene: A parsed ``scene.toml``: either camera, spheres, ``ambient``, directional, point and spot lights.
-        material: ``k_a``, ``k_d``, ``k_s`` (three numbers each, in [0, 1]) and ``n``, Phong.
+        material: ``k_a``, ``k_d``, ``k_s`` (three numbers each, in [0, 1]) and ``n`` in [0, 128], Phong.
         eight_bit: Take a screenshot as VTK saves it, in steps of 1/255 and clamped at 1, instead of the float
             framebuffer.
 
@@ -40,6 +40,8 @@ def draw_ball(scene: Mapping[str, Any], material: Mapping[str, Any], eight_bit: 
     Raises:
         ValueError: The scene holds what is not drawn here.
     """
+    if not 0 <= material["n"] <= 128:
+        raise ValueError(f"n: VTK cuts it off at 128, got {material['n']}")
     renderer = vtkRenderer()
     renderer.SetBackground(0.0, 0.0, 0.0)
     renderer.AutomaticLightCreationOff()

@@ -1,0 +1,255 @@
+"""The general road: any leaf of material and scenes freed and fitted through the differentiable renderer.
+
+The separable fit is faster and needs no start, but knows only k_a, k_d, k_s and n. Here a light's direction, a position
+or an intensity can be freed as well. It starts from a material and scenes that are near, usually the separable optimum.
+
+Which solver: Levenberg-Marquardt (Levenberg 1944, Marquardt 1963) while the Jacobian of pixels x freed numbers fits into
+`LARGEST_JACOBIAN`, since it needs some ten steps; BFGS beyond, which keeps no Jacobian and needs some hundred.
+
+Bounds: coefficients and emittances may not be negative. A number that leaves its range is held at the bound and the rest
+fitted again; it is let go where the cost falls inwards. So a solution at a bound is exactly there.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Bool, Float
+
+import brdf
+from fitting.observation import Observation, observe
+
+LARGEST_JACOBIAN = 1 << 27
+ROUNDS = 8
+
+# What freed leaves may not go below. A direction or a position has no bound, n is searched by its logarithm.
+_NOT_NEGATIVE = ("k_a", "k_d", "k_s", "intensity", "radiance", "ambient", "attenuation")
+
+
+@dataclass(frozen=True)
+class JointResult:
+    """The outcome of a joint fit.
+
+    Attributes:
+        material: the material, fitted where it was freed.
+        scenes: the scenes, likewise.
+        values: of the freed leaves.
+        errors: their standard errors; infinite where only a combination of the freed numbers is determined.
+        residual: root mean square of the residual over that of the pictures.
+        steps: of the solver.
+        converged: whether the solver said so.
+        solver: "lm" or "bfgs".
+    """
+
+    material: brdf.Material
+    scenes: list[brdf.Scene]
+    values: tuple[np.ndarray, ...]
+    errors: tuple[np.ndarray, ...]
+    residual: float
+    steps: int
+    converged: bool
+    solver: str
+
+
+def fit_jointly(
+    target: Any,
+    scene: brdf.Scene | Sequence[brdf.Scene],
+    material: brdf.Material,
+    free: Callable[[brdf.Material, list[brdf.Scene]], Sequence[Any]],
+    *,
+    solver: Literal["lm", "bfgs"] | None = None,
+    precision: brdf.Precision = "float64",
+    mask: Any = None,
+    saturation: float | None = None,
+    tolerance: float = 1e-10,
+    max_steps: int = 256,
+) -> JointResult:
+    """Fit any leaves of material and scenes to pictures.
+
+    Args:
+        target: linear values, (H, W, C), or a list of pictures.
+        scene: what the picture shows, or a list of as many.
+        material: to start from, usually ``fitting.fit(target, scene).material``.
+        free: from material and list of scenes to the leaves to fit, for example
+            ``lambda m, s: (m.k_d, m.n, s[0].lights[0].direction)``.
+        solver: "lm", "bfgs", or None to choose by size.
+        precision: "float32" or "float64".
+        mask: (H, W), pixels to look at, or a list.
+        saturation: see `fitting.fit`.
+        tolerance: relative and absolute, on the freed numbers and the cost.
+        max_steps: of the solver.
+
+    Returns:
+        The result. A factor that only scales light and material against each other is not determined by any picture:
+        its error is infinite.
+
+    Raises:
+        InputError: where target or scene cannot be used, or ``free`` names no leaf.
+    """
+    several = isinstance(target, list | tuple)
+    targets = list(target) if several else [target]
+    scenes = [scene] * len(targets) if isinstance(scene, brdf.Scene) else list(scene)
+    masks = list(mask) if several and isinstance(mask, list | tuple) else [mask] * len(targets)
+    with brdf.working_precision(precision):
+        dtype = np.dtype(precision)
+        seen = [
+            observe(picture, place, dtype=dtype, mask=one, saturation=saturation)
+            for picture, place, one in zip(targets, scenes, masks, strict=True)
+        ]
+        start = brdf.cast((material, scenes), precision)
+        leaves = tuple(free(*start))
+        if not leaves:
+            raise brdf.InputError("free", "names no leaf", "Return the leaves to fit")
+        problem = _Problem(start, free, seen)
+        size = sum(leaf.size for leaf in leaves)
+        values = sum(observation.target.size for observation in seen)
+        chosen = solver or ("lm" if values * size <= LARGEST_JACOBIAN else "bfgs")
+        return _solve(problem, leaves, chosen, tolerance, max_steps)
+
+
+class _Problem:
+    """From a vector of freed numbers to weighted residuals."""
+
+    def __init__(self, start: Any, free: Callable[..., Sequence[Any]], seen: list[Observation]):
+        self.start, self.free, self.seen = start, free, seen
+        leaves = tuple(free(*start))
+        names = _names(start, free)
+        self.is_n = [name == "n" for name in names]
+        self.bounded = [name in _NOT_NEGATIVE for name in names]
+        coded = tuple(jnp.log(leaf) if is_n else leaf for leaf, is_n in zip(leaves, self.is_n, strict=True))
+        self.origin, self._unravel = jax.flatten_util.ravel_pytree(coded)
+        low = [np.full(leaf.shape, 0.0 if one else -np.inf) for leaf, one in zip(leaves, self.bounded, strict=True)]
+        self.lower = np.concatenate([bound.ravel() for bound in low])
+
+    def decode(self, vector: Float[Array, " K"]) -> tuple[Array, ...]:
+        """The freed leaves."""
+        return tuple(
+            jnp.exp(leaf) if is_n else leaf for leaf, is_n in zip(self._unravel(vector), self.is_n, strict=True)
+        )
+
+    def put(self, vector: Float[Array, " K"]) -> Any:
+        """Material and scenes with the freed leaves in place."""
+        return eqx.tree_at(lambda tree: tuple(self.free(*tree)), self.start, self.decode(vector))
+
+    def residuals(self, vector: Float[Array, " K"], seen: list[Observation]) -> list[Array]:
+        """Weighted residuals of each picture."""
+        material, scenes = self.put(vector)
+        found = []
+        for observation, scene in zip(seen, scenes, strict=True):
+            residual = brdf.render(material, scene).reshape(observation.target.shape) - observation.target
+            if observation.weight is not None:
+                counts = observation.weight[:, None] > 0
+                residual = jnp.where(counts, residual * jnp.where(counts, observation.weight[:, None], 1) ** 0.5, 0)
+            found.append(residual)
+        return found
+
+
+def _names(start: Any, free: Callable[..., Sequence[Any]]) -> list[str]:
+    """The field that each freed leaf is, read off the path of a marker put there."""
+    leaves = tuple(free(*start))
+    marked = eqx.tree_at(lambda tree: tuple(free(*tree)), start, [_Marker(index) for index in range(len(leaves))])
+    paths = jax.tree_util.tree_leaves_with_path(marked, is_leaf=lambda leaf: isinstance(leaf, _Marker))
+    found = {leaf.index: path[-1].name for path, leaf in paths if isinstance(leaf, _Marker)}
+    return [found[index] for index in range(len(leaves))]
+
+
+@dataclass(frozen=True)
+class _Marker:
+    index: int
+
+
+def _solve(problem: _Problem, leaves: tuple[Any, ...], solver: str, tolerance: float, max_steps: int) -> JointResult:
+    @eqx.filter_jit
+    def run(vector: Array, held: Bool[Array, " K"], seen: list[Observation]) -> Any:
+        def residuals(free: Array, _: Any) -> list[Array]:
+            return problem.residuals(jnp.where(held, vector, free), seen)
+
+        if solver == "lm":
+            method = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
+            return optx.least_squares(residuals, method, vector, max_steps=max_steps, throw=False)
+
+        def cost(free: Array, args: Any) -> Array:
+            return 0.5 * sum(jnp.sum(residual * residual) for residual in residuals(free, args))
+
+        method = optx.BFGS(rtol=tolerance, atol=tolerance)
+        return optx.minimise(cost, method, vector, max_steps=max_steps, throw=False)
+
+    gradient = eqx.filter_jit(
+        jax.grad(lambda vector, seen: 0.5 * sum(jnp.sum(r * r) for r in problem.residuals(vector, seen)))
+    )
+    vector, lower = problem.origin, problem.lower
+    held = np.zeros(lower.shape, bool)
+    steps = 0
+    for _ in range(ROUNDS):
+        solution = run(vector, jnp.asarray(held), problem.seen)
+        steps += int(solution.stats["num_steps"])
+        vector = jnp.where(held, vector, solution.value)
+        below = np.asarray(vector) < lower
+        vector = jnp.maximum(vector, lower.astype(vector.dtype))
+        inwards = held & (np.asarray(gradient(vector, problem.seen)) < 0)
+        if not below.any() and not inwards.any():
+            break
+        held = (held | below) & ~inwards
+    material, scenes = problem.put(vector)
+    errors, residual = _errors(problem, vector, held)
+    return JointResult(
+        material=jax.tree.map(np.asarray, material),
+        scenes=[jax.tree.map(np.asarray, scene) for scene in scenes],
+        values=tuple(np.asarray(leaf) for leaf in problem.decode(vector)),
+        errors=errors,
+        residual=residual,
+        steps=steps,
+        converged=bool(solution.result == optx.RESULTS.successful),
+        solver=solver,
+    )
+
+
+def _errors(problem: _Problem, vector: Array, held: np.ndarray) -> tuple[tuple[np.ndarray, ...], float]:
+    """Standard errors from the Gauss-Newton Hessian, one column of the Jacobian at a time."""
+
+    @eqx.filter_jit
+    def column(direction: Array, seen: list[Observation]) -> Array:
+        tangents = jax.jvp(lambda v: problem.residuals(v, seen), (vector,), (direction,))[1]
+        return jnp.concatenate([tangent.ravel() for tangent in tangents])
+
+    @eqx.filter_jit
+    def values(seen: list[Observation]) -> Array:
+        return jnp.concatenate([residual.ravel() for residual in problem.residuals(vector, seen)])
+
+    size = vector.size
+    columns = [np.asarray(column(direction, problem.seen), np.float64) for direction in jnp.eye(size)]
+    gram = np.array([[left @ right for right in columns] for left in columns])
+    residual = np.asarray(values(problem.seen), np.float64)
+    square = sum(float(np.sum(np.square(np.asarray(_counted(o)), dtype=np.float64))) for o in problem.seen)
+    pixels = sum(int(_counted(o).size) for o in problem.seen)
+    variance = float(residual @ residual) / max(pixels - size, 1)
+    active = ~held & (np.diag(gram) > 0)
+    scale = np.sqrt(np.where(active, np.diag(gram), 1.0))
+    covariance = np.full(size, np.inf)
+    if active.any():
+        normed = (gram / np.outer(scale, scale))[np.ix_(active, active)]
+        eigenvalue, eigenvector = np.linalg.eigh(normed)
+        known = eigenvalue > 1e-12 * eigenvalue[-1]
+        spread = np.sum(eigenvector[:, known] ** 2 / eigenvalue[known], axis=1)
+        # A number that takes part in an undetermined combination is itself undetermined.
+        spread[np.any(np.abs(eigenvector[:, ~known]) > 1e-3, axis=1)] = np.inf
+        covariance[active] = variance * spread / scale[active] ** 2
+    covariance[held] = 0.0
+    errors = problem._unravel(jnp.asarray(np.sqrt(covariance), vector.dtype))
+    leaves = problem.decode(vector)
+    found = tuple(
+        np.asarray(error * leaf if is_n else error)
+        for error, leaf, is_n in zip(errors, leaves, problem.is_n, strict=True)
+    )
+    return found, float(np.sqrt(residual @ residual / square))
+
+
+def _counted(observation: Observation) -> np.ndarray:
+    target = np.asarray(observation.target)
+    return target if observation.weight is None else target[np.asarray(observation.weight) > 0]
