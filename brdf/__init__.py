@@ -7,9 +7,20 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from brdf.albedo import absorbed_fraction, directional_albedo
     from brdf.camera import Camera, OrthographicCamera, PerspectiveCamera
+    from brdf.conversions import (
+        exponent_from_roughness,
+        exponent_from_slope,
+        half_from_mirror,
+        mirror_from_half,
+        nearest_classic,
+        nearest_normalized,
+        roughness_from_exponent,
+        slope_from_exponent,
+    )
     from brdf.errors import InputError
-    from brdf.files import atomic_folder, write_text
+    from brdf.files import atomic_folder, atomic_path, write_text
     from brdf.images import ImageReader, Picture, read_image, read_layers, read_mask, read_picture, write_image
     from brdf.lights import DirectionalLight, Light, PointLight
     from brdf.materials import load_material, load_materials, material_from_dict, material_to_dict, save_material
@@ -23,15 +34,30 @@ if TYPE_CHECKING:
         Phong,
         SpecularMaterial,
     )
+    from brdf.plausibility import check
     from brdf.precision import Precision, cast, working_precision
     from brdf.rendering import Basis, BasisImages, Lobe, basis, basis_images, render
+    from brdf.report import Finding, Report
     from brdf.scene import Scene, SurfacePoints
     from brdf.shapes import Rectangle, Shape, Sphere
 
 _ROOMS = {
+    "report": ["Finding", "Report"],
+    "plausibility": ["check"],
+    "conversions": [
+        "exponent_from_roughness",
+        "exponent_from_slope",
+        "half_from_mirror",
+        "mirror_from_half",
+        "nearest_classic",
+        "nearest_normalized",
+        "roughness_from_exponent",
+        "slope_from_exponent",
+    ],
+    "albedo": ["absorbed_fraction", "directional_albedo"],
     "camera": ["Camera", "OrthographicCamera", "PerspectiveCamera"],
     "errors": ["InputError"],
-    "files": ["atomic_folder", "write_text"],
+    "files": ["atomic_folder", "atomic_path", "write_text"],
     "images": ["ImageReader", "Picture", "read_image", "read_layers", "read_mask", "read_picture", "write_image"],
     "lights": ["DirectionalLight", "Light", "PointLight"],
     "materials": ["load_material", "load_materials", "material_from_dict", "material_to_dict", "save_material"],

@@ -7,8 +7,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from fitting.picture_fit import fit
     from fitting.joint import fit_jointly
+    from fitting.picture_fit import fit
     from fitting.result import FitResult, Parameter
 
 _ROOM_OF = {

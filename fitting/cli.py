@@ -46,7 +46,8 @@ def fit(
     target, scene = _target_and_scene(target, scene)
     if plot and out is None:
         raise _input_error("--plot", "needs a folder to draw into", "Add --out DIR")
-    with _waiting("fitting"):
+    arguments = {"target": target, "mask": mask, "model": "--model", "precision": "--precision"}
+    with _waiting("fitting"), _named_as(arguments):
         _use_compilation_cache()
         import brdf
         import fitting
@@ -75,7 +76,7 @@ def render(
     precision: Annotated[str, typer.Option(help="float32 or float64.")] = "float32",
 ) -> None:
     """Render a material in a scene."""
-    with _waiting("rendering"):
+    with _waiting("rendering"), _named_as({"material": material, "precision": "--precision"}):
         _use_compilation_cache()
         import numpy as np
 
@@ -85,6 +86,50 @@ def render(
         image = brdf.render(loaded, brdf.Scene.load(scene), precision=precision)  # pyright: ignore[reportArgumentType]
         brdf.write_image(out, np.asarray(image))
     _print(f"wrote {out}")
+
+
+@app.command(
+    epilog="Example: [bold]brdf check material.json[/bold]    or in CI: [bold]brdf check scene.mtl --json[/bold]"
+)
+def check(
+    material: Annotated[Path, typer.Argument(help="A .json or .mtl file; of the latter every material is checked.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")] = False,
+    plot: Annotated[Path | None, typer.Option(help="A picture of albedo, lobe and reciprocity to write.")] = None,
+) -> int:
+    """Is a material plausible: positive, reciprocal, energy conserving? Exit 0 if so, 1 if not, 2 if it cannot tell."""
+    with _waiting("checking"):
+        _use_compilation_cache()
+        import brdf
+
+        materials = brdf.load_materials(material)
+        reports = {name: brdf.check(one, name=name) for name, one in materials.items()}
+        if plot is not None:
+            if len(materials) > 1:
+                raise _input_error("--plot", f"draws one material, {material} holds {len(materials)}", "Give one")
+            from fitting.material_plots import overview
+
+            with brdf.atomic_path(plot) as path:
+                overview(next(iter(materials.values()))).savefig(path)
+    if as_json:
+        _print(json.dumps({name: report.to_json() for name, report in reports.items()}, indent=2))
+    else:
+        _print("\n\n".join(map(str, reports.values())))
+    verdicts = [report.plausible for report in reports.values()]
+    return 1 if False in verdicts else 2 if None in verdicts else 0
+
+
+@contextlib.contextmanager
+def _named_as(arguments: dict[str, Any]) -> Iterator[None]:
+    """Let an error name the file or option that a person typed, not the argument of the function behind it."""
+    from brdf.errors import InputError
+
+    try:
+        yield
+    except InputError as error:
+        typed = arguments.get(error.where)
+        if typed is None:
+            raise
+        raise InputError(typed, error.what, error.remedy) from None
 
 
 def _target_and_scene(target: Path, scene: Path | None) -> tuple[Path, Path]:

@@ -3,11 +3,11 @@
 The separable fit is faster and needs no start, but knows only k_a, k_d, k_s and n. Here a light's direction, a position
 or an intensity can be freed as well. It starts from a material and scenes that are near, usually the separable optimum.
 
-Which solver: Levenberg-Marquardt (Levenberg 1944, Marquardt 1963) while the Jacobian of pixels x freed numbers fits into
-`LARGEST_JACOBIAN`, since it needs some ten steps; BFGS beyond, which keeps no Jacobian and needs some hundred.
+Which solver: Levenberg-Marquardt (Levenberg 1944, Marquardt 1963) while the Jacobian of pixels x freed numbers fits
+into `LARGEST_JACOBIAN`, since it needs some ten steps; BFGS beyond, which keeps no Jacobian and needs some hundred.
 
-Bounds: coefficients and emittances may not be negative. A number that leaves its range is held at the bound and the rest
-fitted again; it is let go where the cost falls inwards. So a solution at a bound is exactly there.
+Bounds: coefficients and emittances may not be negative. A number that leaves its range is held at the bound and the
+rest fitted again; it is let go where the cost falls inwards. So a solution at a bound is exactly there.
 """
 
 from collections.abc import Callable, Sequence
