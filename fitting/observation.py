@@ -1,5 +1,6 @@
 """What a fit looks at: the pixels that count, and the light's colour taken out of them."""
 
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -29,6 +30,7 @@ class Observation(NamedTuple):
         points: what the pixels see, (H, W).
         left_out: how many pixels were left out, by reason.
         noise: standard deviation of the error that rounding puts into a value; (C,).
+        brightest: largest size of a value that counts; (C,).
     """
 
     target: Float[Array, "P C"]
@@ -36,6 +38,7 @@ class Observation(NamedTuple):
     points: brdf.SurfacePoints
     left_out: dict[str, int]
     noise: Float[np.ndarray, " C"]
+    brightest: Float[np.ndarray, " C"]
 
 
 def observe(
@@ -67,42 +70,93 @@ def observe(
         came = f"has {channels} channels, the scene's light {scene.channels}"
         raise InputError("target", came, "Give both the same number of channels")
     points = brdf.cast(scene, dtype.name).surface_points()
-    seen = np.asarray(points.mask)
-    left_out = {"outside the fitted shapes": int(seen.size - np.count_nonzero(seen))}
-    if not seen.any():
-        raise InputError("target", "has no pixel that sees a fitted shape", "Check camera, shapes and mask")
+    left_out: dict[str, int] = {}
+    values = jnp.asarray(pixels.reshape(-1, channels), dtype)
+    seen = jnp.ravel(points.mask)
+    looked_at = seen
     if mask is not None:
         mask = np.asarray(mask, dtype=bool)
-        if mask.shape != seen.shape:
-            raise InputError("mask", f"is of shape {mask.shape}, the target {seen.shape}", "Give a value per pixel")
-        left_out["masked"] = int(np.count_nonzero(seen & ~mask))
-        seen = seen & mask
-        if not seen.any():
+        if mask.shape != (height, width):
+            came = f"is of shape {mask.shape}, the target {(height, width)}"
+            raise InputError("mask", came, "Give a value per pixel")
+        looked_at = seen & mask.ravel()
+    survey = jax.device_get(_survey(values, seen, looked_at))
+    left_out["outside the fitted shapes"] = int(seen.size - survey.seen)
+    if not survey.seen:
+        raise InputError("target", "has no pixel that sees a fitted shape", "Check camera, shapes and mask")
+    if mask is not None:
+        left_out["masked"] = int(survey.seen - survey.looked_at)
+        if not survey.looked_at:
             raise InputError("mask", "leaves no pixel that sees a fitted shape", "Check the mask")
-    finite = np.isfinite(pixels.sum(axis=-1))
-    left_out["not finite"] = int(np.count_nonzero(seen & ~finite))
-    good = seen & finite
-    if not good.any():
+    left_out["not finite"] = int(survey.looked_at - survey.count)
+    if not survey.count:
         raise InputError("target", "has no finite value on the object", "Give a picture with values")
-    level = known_saturation if saturation is None else saturation
-    brightest = np.max(pixels, axis=-1)
-    largest = float(np.max(brightest, where=good, initial=-np.inf))
-    if not np.any(pixels[good] != 0):
+    if not survey.scale.any():
         raise InputError("target", "is black on the object", "Give a picture with light in it")
-    if level is None:
-        level = _plateau(brightest, largest, good, points, scene)
-    if level is not None:
-        clipped = good & (brightest >= level)
-        left_out["clipped"] = int(np.count_nonzero(clipped))
-        good &= ~clipped
-        if not good.any():
+    level = known_saturation if saturation is None else saturation
+    good, scale, count = survey.good, survey.scale, int(survey.count)
+    if level is None and survey.top > SYMMETRIC_PIXELS:
+        brightest = np.max(np.asarray(values), axis=-1).reshape(height, width)
+        level = _plateau(brightest, float(survey.largest), good.reshape(height, width), points, scene)
+    if level is not None and survey.largest >= level:
+        good, scale, below = jax.device_get(_unclipped(values, good, level))
+        left_out["clipped"] = count - int(below)
+        count = int(below)
+        if not count:
             came = f"is clipped at {level:g} wherever it sees the object"
             raise InputError("target", came, "Give a darker exposure or a higher saturation")
-    weight = None if good.all() else jnp.asarray(good.ravel(), dtype)
-    scale = np.max(np.abs(pixels), axis=(0, 1), where=good[..., None], initial=0.0)
+    elif level is not None:
+        left_out["clipped"] = 0
+    weight = None if count == good.size else jnp.asarray(good, dtype)
     rounding = max(float(np.finfo(dtype).eps), float(np.finfo(pixels.dtype).eps))
-    noise = np.maximum(scale * rounding, step / np.sqrt(12.0))
-    return Observation(jnp.asarray(pixels.reshape(-1, channels), dtype), weight, points, left_out, noise)
+    noise = np.maximum(scale.astype(np.float64) * rounding, step / np.sqrt(12.0))
+    return Observation(values, weight, points, left_out, noise, scale.astype(np.float64))
+
+
+class _Survey(NamedTuple):
+    """What there is to know of the pixels before they are chosen.
+
+    Attributes:
+        good: which see a fitted shape, are not masked and are finite, (P,).
+        seen: how many see a fitted shape.
+        looked_at: how many of these are not masked.
+        count: how many are good.
+        largest: value of any channel among the good ones.
+        top: how many of these share it.
+        scale: largest size of a value, (C,).
+    """
+
+    good: Any
+    seen: Any
+    looked_at: Any
+    count: Any
+    largest: Any
+    top: Any
+    scale: Any
+
+
+@jax.jit
+def _survey(values: Float[Array, "P C"], seen: Bool[Array, " P"], looked_at: Bool[Array, " P"]) -> _Survey:
+    brightest = _over_channels(jnp.maximum, values)
+    good = looked_at & jnp.isfinite(_over_channels(jnp.add, values))
+    largest = jnp.max(jnp.where(good, brightest, -jnp.inf))
+    top = jnp.count_nonzero(good & (brightest >= largest * TOP))
+    count = jnp.count_nonzero
+    return _Survey(good, count(seen), count(looked_at), count(good), largest, top, _scale(values, good))
+
+
+@jax.jit
+def _unclipped(values: Float[Array, "P C"], good: Bool[Array, " P"], level: float) -> tuple[Any, Any, Any]:
+    good = good & (_over_channels(jnp.maximum, values) < level)
+    return good, _scale(values, good), jnp.count_nonzero(good)
+
+
+def _over_channels(combine: Any, values: Float[Array, "P C"]) -> Float[Array, " P"]:
+    return functools.reduce(combine, [values[:, channel] for channel in range(values.shape[1])])
+
+
+def _scale(values: Float[Array, "P C"], good: Bool[Array, " P"]) -> Float[Array, " C"]:
+    return jnp.max(jnp.where(good[:, None], jnp.abs(values), 0), axis=0)
 
 
 def _pixels(target: Any) -> tuple[np.ndarray, float | None, float]:
