@@ -123,14 +123,14 @@ class _Problem:
         self.is_n = [name == "n" for name in names]
         self.bounded = [name in _NOT_NEGATIVE for name in names]
         coded = tuple(jnp.log(leaf) if is_n else leaf for leaf, is_n in zip(leaves, self.is_n, strict=True))
-        self.origin, self._unravel = jax.flatten_util.ravel_pytree(coded)
+        self.origin, self.unravel = jax.flatten_util.ravel_pytree(coded)
         low = [np.full(leaf.shape, 0.0 if one else -np.inf) for leaf, one in zip(leaves, self.bounded, strict=True)]
         self.lower = np.concatenate([bound.ravel() for bound in low])
 
     def decode(self, vector: Float[Array, " K"]) -> tuple[Array, ...]:
         """The freed leaves."""
         return tuple(
-            jnp.exp(leaf) if is_n else leaf for leaf, is_n in zip(self._unravel(vector), self.is_n, strict=True)
+            jnp.exp(leaf) if is_n else leaf for leaf, is_n in zip(self.unravel(vector), self.is_n, strict=True)
         )
 
     def put(self, vector: Float[Array, " K"]) -> Any:
@@ -241,7 +241,7 @@ def _errors(problem: _Problem, vector: Array, held: np.ndarray) -> tuple[tuple[n
         spread[np.any(np.abs(eigenvector[:, ~known]) > 1e-3, axis=1)] = np.inf
         covariance[active] = variance * spread / scale[active] ** 2
     covariance[held] = 0.0
-    errors = problem._unravel(jnp.asarray(np.sqrt(covariance), vector.dtype))
+    errors = problem.unravel(jnp.asarray(np.sqrt(covariance), vector.dtype))
     leaves = problem.decode(vector)
     found = tuple(
         np.asarray(error * leaf if is_n else error)

@@ -1,0 +1,92 @@
+"""The general road: freed lights are found again, bounds are met exactly, and what no picture determines is said."""
+
+import numpy as np
+import pytest
+
+import brdf
+import fitting
+
+CAMERA = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=(40, 40))
+BALL = brdf.Sphere(center=[0, 0, 0], radius=1)
+TRUE_DIRECTION = np.array([0.5, 0.6, 0.7]) / np.linalg.norm([0.5, 0.6, 0.7])
+MATERIAL = brdf.BlinnPhong(k_a=[0.1, 0.2, 0.0], k_d=[0.5, 0.4, 0.3], k_s=[0.3, 0.2, 0.0], n=25)
+
+
+def scene(direction, intensity) -> brdf.Scene:
+    """Two lights: the known one fixes the factor between light and material."""
+    lights = [
+        brdf.DirectionalLight(direction=direction, intensity=intensity),
+        brdf.DirectionalLight(direction=[-1, 0.2, 0.6], intensity=[0.5, 0.5, 0.5]),
+    ]
+    return brdf.Scene(camera=CAMERA, shapes=[BALL], ambient=[0.2, 0.2, 0.2], lights=lights)
+
+
+def angle(a, b) -> float:
+    """Degrees between two directions."""
+    a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
+
+
+@pytest.fixture(scope="module")
+def target() -> np.ndarray:
+    return np.asarray(brdf.render(MATERIAL, scene(TRUE_DIRECTION, [1.0, 0.9, 0.8]), precision="float64"))
+
+
+@pytest.mark.parametrize("solver", ["lm", "bfgs"])
+def test_light_and_material_are_found_together(target: np.ndarray, solver):
+    away = TRUE_DIRECTION + 0.18 * np.array([0.6, -0.5, 0.0])
+    assert angle(away, TRUE_DIRECTION) > 7.9
+    known = scene(away, [0.8, 1.0, 0.7])
+    start = fitting.fit(target, known, model="blinn-phong", precision="float64").material
+    result = fitting.fit_jointly(
+        target,
+        known,
+        start,
+        lambda m, s: (m.k_a, m.k_d, m.k_s, m.n, s[0].lights[0].direction, s[0].lights[0].intensity),
+        solver=solver,
+    )
+    light = result.scenes[0].lights[0]
+    assert result.converged
+    # The picture has no noise: what is left is where the solver stops, its tolerance being 1e-10.
+    assert angle(light.direction, TRUE_DIRECTION) < 1e-5
+    np.testing.assert_allclose(light.intensity, [1.0, 0.9, 0.8], rtol=1e-7)
+    np.testing.assert_allclose(result.material.n, 25, rtol=1e-7)
+    np.testing.assert_allclose(result.material.k_s, [0.3, 0.2, 0.0], atol=1e-8)
+
+
+def test_a_solution_at_a_bound_is_exactly_there():
+    dark = scene(TRUE_DIRECTION, [1.0, 1.0, 1.0])
+    target = np.asarray(brdf.render(brdf.Lambert(k_d=[0.5, 0.4, 0.3]), dark, precision="float64")) - 0.01
+    start = brdf.Lambert(k_a=[0.1, 0.1, 0.1], k_d=[0.2, 0.2, 0.2])
+    result = fitting.fit_jointly(target, dark, start, lambda m, s: (m.k_a, m.k_d))
+    np.testing.assert_array_equal(result.material.k_a, 0.0)
+    separable = fitting.fit(target, dark, model="lambert", precision="float64")
+    np.testing.assert_allclose(result.material.k_d, separable.material.k_d, rtol=1e-8)
+    np.testing.assert_allclose(result.residual, separable.residual, rtol=1e-8)
+
+
+def test_both_roads_meet(target: np.ndarray):
+    noisy = target + np.random.default_rng(7).normal(0, 0.01, target.shape)
+    known = scene(TRUE_DIRECTION, [1.0, 0.9, 0.8])
+    separable = fitting.fit(noisy, known, model="blinn-phong", precision="float64")
+    joint = fitting.fit_jointly(noisy, known, separable.material, lambda m, s: (m.k_a, m.k_d, m.k_s, m.n))
+    np.testing.assert_allclose(joint.material.n, separable.material.n, rtol=1e-6)
+    np.testing.assert_allclose(joint.material.k_d, separable.material.k_d, rtol=1e-6)
+    np.testing.assert_allclose(joint.residual, separable.residual, rtol=1e-9)
+
+
+def test_the_factor_between_light_and_material_is_not_determined():
+    light = brdf.DirectionalLight(direction=TRUE_DIRECTION, intensity=[1.0])
+    alone = brdf.Scene(camera=CAMERA, shapes=[BALL], lights=[light])
+    target = np.asarray(brdf.render(brdf.Lambert(k_d=[0.5]), alone, precision="float64"))
+    target = target + np.random.default_rng(3).normal(0, 1e-3, target.shape)
+    result = fitting.fit_jointly(target, alone, brdf.Lambert(k_d=[0.4]), lambda m, s: (m.k_d, s[0].lights[0].intensity))
+    assert np.isinf(result.errors[0]).all()
+    assert np.isinf(result.errors[1]).all()
+    np.testing.assert_allclose(result.values[0] * result.values[1], 0.5, rtol=1e-3)
+
+
+def test_nothing_to_free_is_an_error(target: np.ndarray):
+    known = scene(TRUE_DIRECTION, [1.0, 0.9, 0.8])
+    with pytest.raises(brdf.InputError, match="names no leaf"):
+        fitting.fit_jointly(target, known, MATERIAL, lambda m, s: ())
