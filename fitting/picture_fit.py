@@ -5,20 +5,24 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Bool, Float
 
 import brdf
 from brdf.errors import InputError
+from fitting.interpretation import Interpretation, ModelFit, coefficient_factors, interpret
+from fitting.losses import LOSSES, Loss, reweight
+from fitting.normal import fit_tied
 from fitting.observation import LightColour, Observation, fitted_pixels, observe, take_colour_out
-from fitting.result import Candidate, FitResult, Parameter
+from fitting.result import FitResult, free_parameters
+from fitting.selection import Choice, choose
 from fitting.separable import Optimum, Picture, fit_linear, search
-from fitting.uncertainty import Uncertainty, uncertainty
+from fitting.structure import structure
+from fitting.uncertainty import TERMS, residual_noise
 
 N_RANGE = (0.1, 1e6)
-AUTO = ("lambert", "phong", "blinn-phong")
+AUTO = ("phong", "blinn-phong")
 
 
 def fit(
@@ -30,6 +34,7 @@ def fit(
     mask: Any = None,
     saturation: float | None = None,
     n_range: tuple[float, float] = N_RANGE,
+    loss: Loss = "squared",
 ) -> FitResult:
     """Fit a material to a picture, or to several pictures of one material: the global optimum, with no start to give.
 
@@ -42,6 +47,8 @@ def fit(
         saturation: linear value from which on pixels are clipped and do not count. None takes the largest code of an
             integer file, or the largest value where many pixels share it exactly.
         n_range: bounds of the exponent, 0 < lower < upper.
+        loss: "squared"; "relative" or "log" for high dynamic range; "huber" or "cauchy" where some pixels show what the
+            scene does not know. See `fitting.losses` for what to use when.
 
     Returns:
         The result.
@@ -55,6 +62,8 @@ def fit(
     targets, scenes, masks = _pictures(target, scene, mask)
     if model != "auto" and model not in brdf.MODELS:
         raise InputError("model", f"is unknown, got {model!r}", f"Use auto or one of {', '.join(brdf.MODELS)}")
+    if loss not in LOSSES:
+        raise InputError("loss", f"is unknown, got {loss!r}", f"Use one of {', '.join(LOSSES)}")
     low, high = n_range
     if not 0 < low < high < np.inf:
         raise InputError("n_range", f"must be 0 < lower < upper, got {n_range}", "Correct the bounds")
@@ -68,12 +77,13 @@ def fit(
         if len(counts) > 1:
             raise InputError("target", f"pictures have {counts} channels", "Give pictures with the same number")
         light = take_colour_out(scenes, counts.pop())
-        names = AUTO if model == "auto" else (model,)
-        if not any(scene.lights for scene in scenes):
-            names = ("lambert",) if model == "auto" else names
-        fits = [_fit_model(brdf.MODELS[name], observations, light, n_range) for name in names]
-    chosen, candidates = _choose(fits)
-    return _result(fits[chosen], candidates, observations, targets, scenes, precision, time.perf_counter() - start)
+        job = _Job(observations, light, n_range, loss)
+        if model == "auto":
+            fitted, choice = _fit_auto(job)
+        else:
+            fitted, choice = _fit_model(brdf.MODELS[model], job), None
+        told = _interpret(fitted, job, choice)
+    return _result(fitted, told, choice, job, targets, scenes, precision, time.perf_counter() - start)
 
 
 def _pictures(target: Any, scene: Any, mask: Any) -> tuple[list[Any], list[brdf.Scene], list[Any]]:
@@ -91,177 +101,168 @@ def _pictures(target: Any, scene: Any, mask: Any) -> tuple[list[Any], list[brdf.
     return targets, scenes, masks
 
 
-class ModelFit(NamedTuple):
-    """One model fitted to the pictures.
+class _Job(NamedTuple):
+    """What stays the same for every model.
 
     Attributes:
-        material: in the units of the user.
-        optimum: in the units of the engine.
-        sure: errors of the engine's numbers.
-        factors: what a coefficient of the engine is divided by, (3, C).
-        unknowns: how many numbers were free.
+        observations: the pictures.
+        light: and their lights, colour taken out.
+        n_range: bounds of the exponent.
+        loss: what is minimised.
     """
 
-    material: brdf.Material
-    optimum: Optimum
-    sure: Uncertainty
-    factors: Float[np.ndarray, "3 C"]
-    unknowns: int
+    observations: list[Observation]
+    light: LightColour
+    n_range: tuple[float, float]
+    loss: Loss
+
+    @property
+    def shapes(self) -> list[tuple[int, int]]:
+        """Height and width of each picture."""
+        return [observation.points.mask.shape for observation in self.observations]
+
+    @property
+    def rounding(self) -> Float[np.ndarray, " C"]:
+        """Standard deviation of a value's rounding."""
+        return np.max([observation.noise for observation in self.observations], axis=0)
+
+    @property
+    def lit(self) -> Bool[np.ndarray, "2 C"]:
+        """Which channels have ambient light, and which have lights."""
+        channels = self.observations[0].target.shape[1]
+        ambient, direct = np.zeros(channels, bool), np.zeros(channels, bool)
+        for scene in self.light.scenes:
+            if scene.ambient is not None:
+                ambient |= np.asarray(scene.ambient) > 0
+            for one in scene.lights:
+                direct |= np.asarray(one.emittance) * self.light.colour > 0
+        return np.stack([ambient, direct])
 
 
-def _fit_model(
-    model: type[brdf.Material],
-    observations: list[Observation],
-    light: LightColour,
-    n_range: tuple[float, float],
-) -> ModelFit:
-    pictures, channels = [], observations[0].target.shape[1]
-    ambient_light = np.zeros(channels)
-    lit = np.zeros(channels, bool)
-    for observation, scene in zip(observations, light.scenes, strict=True):
+def _free(model: type[brdf.Material], job: _Job) -> Bool[np.ndarray, "3 C"]:
+    ambient, direct = job.lit
+    return np.stack([ambient, direct, direct & issubclass(model, brdf.SpecularMaterial)])
+
+
+def _engine_pictures(model: type[brdf.Material], job: _Job) -> list[Picture]:
+    pictures = []
+    for observation, scene in zip(job.observations, job.light.scenes, strict=True):
         dtype = observation.target.dtype
         ambient = np.zeros(1) if scene.ambient is None else np.asarray(scene.ambient, np.float64)
-        ambient_light = np.maximum(ambient_light, ambient)
         basis = brdf.basis(model, brdf.cast(scene, dtype.name), points=observation.points)
         diffuse = jnp.zeros((observation.target.shape[0], 1), dtype) if basis.diffuse is None else basis.diffuse
-        for one in scene.lights:
-            lit |= np.asarray(one.emittance) * light.colour > 0
         pictures.append(Picture(observation.target, diffuse, basis.lobe, observation.weight, ambient))
-    specular = issubclass(model, brdf.SpecularMaterial)
-    free = np.stack([ambient_light > 0, lit, lit & specular])
-    if specular and lit.any():
-        optimum = search(pictures, n_min=n_range[0], n_max=n_range[1], free=free)
-    else:
-        optimum = fit_linear(pictures, free=free)
-    return _interpret(model, optimum, free, observations, pictures, light.colour, n_range)
+    return pictures
 
 
-def _interpret(
-    model: type[brdf.Material],
-    optimum: Optimum,
-    free: np.ndarray,
-    observations: list[Observation],
-    pictures: list[Picture],
-    colour: np.ndarray,
-    n_range: tuple[float, float],
-) -> ModelFit:
-    """From the engine's numbers to a material and its errors."""
-    specular = issubclass(model, brdf.SpecularMaterial)
-    colour = np.where(colour > 0, colour, 1.0)
-    factors = np.stack([np.ones_like(colour), colour, colour])
-    if specular:
-        with jax.enable_x64(True):
-            factors[2] *= float(model.scale(np.float64(optimum.n)))
-    rounding = np.max([observation.noise for observation in observations], axis=0)
-    brightest = np.max([_brightest(observation) for observation in observations], axis=0)
-    visible = 0.0
-    if specular and not optimum.flat:
-        highlight = max(float(_highlight(picture, optimum.n)) for picture in pictures if picture.lobe is not None)
-        visible = float(np.max(optimum.x[2]) * highlight / max(np.max(brightest), np.finfo(float).tiny))
-    sure = uncertainty(optimum, free, rounding, brightest, specular=specular, n_range=n_range, visible=visible)
-    k = optimum.x / factors
-    for name in sure.undetermined:
-        key, _, channel = name.removesuffix("]").partition("[")
-        if key != "n":
-            k[("k_a", "k_d", "k_s").index(key), int(channel) if channel else slice(None)] = 0.0
-    if specular:
-        material = model(k_a=k[0], k_d=k[1], k_s=k[2], n=0.0 if not k[2].any() else optimum.n)
-    else:
-        material = model(k_a=k[0], k_d=k[1])
-    active = optimum.x > 0
-    unknowns = int(np.count_nonzero(active)) + int(specular and bool(active[2].any()))
-    return ModelFit(material, optimum, sure, factors, unknowns)
+def _optimise(pictures: Sequence[Picture], free: np.ndarray, n_range: tuple[float, float]) -> Optimum:
+    if free[2].any():
+        return search(pictures, n_min=n_range[0], n_max=n_range[1], free=free)
+    return fit_linear(pictures, free=free)
 
 
-@eqx.filter_jit
-def _highlight(picture: Picture, n: float) -> Array:
-    assert picture.lobe is not None
-    value, _ = picture.lobe(jnp.asarray(n))
-    seen = value if picture.weight is None else jnp.where(picture.weight[:, None] > 0, value, 0)
-    return jnp.max(seen)
-
-
-def _brightest(observation: Observation) -> np.ndarray:
-    pixels = np.asarray(observation.target)
-    if observation.weight is None:
-        return np.max(pixels, axis=0)
-    counted = (np.asarray(observation.weight) > 0)[:, None]
-    return np.max(pixels, axis=0, where=counted, initial=0.0)
-
-
-def _choose(fits: list[ModelFit]) -> tuple[int, tuple[Candidate, ...]]:
-    """The simplest adequate model: the smallest Bayesian information criterion (Schwarz 1978)."""
-    count = float(np.sum(fits[0].optimum.pixels))
-    floor = np.min([fit.sure.noise for fit in fits], axis=0)
-    values = []
-    for fit in fits:
-        squares = np.sum(np.maximum(fit.optimum.cost, 0.0) / floor**2)
-        values.append(squares + fit.unknowns * np.log(count))
-    chosen = int(np.argmin(values))
-    candidates = tuple(
-        Candidate(
-            model=fit.material.name,
-            unknowns=fit.unknowns,
-            rms=float(np.sqrt(np.sum(fit.optimum.cost) / count)),
-            bic=float(value - values[chosen]),
-            chosen=index == chosen,
-        )
-        for index, (fit, value) in enumerate(zip(fits, values, strict=True))
+def _fit_model(model: type[brdf.Material], job: _Job) -> ModelFit:
+    free = _free(model, job)
+    found = reweight(
+        _engine_pictures(model, job), lambda some: _optimise(some, free, job.n_range), job.loss, job.rounding
     )
-    return chosen, candidates
+    return ModelFit(model, found.pictures, found.optimum, free, None, found.noise_factor)
 
 
-def _parameters(fit: ModelFit) -> tuple[Parameter, ...]:
-    found = []
-    undetermined = fit.sure.undetermined
-    specular = isinstance(fit.material, brdf.SpecularMaterial)
-    for term, name in enumerate(("k_a", "k_d", "k_s") if specular else ("k_a", "k_d")):
-        for channel, value in enumerate(np.asarray(getattr(fit.material, name))):
-            reason = undetermined.get(name) or undetermined.get(f"{name}[{channel}]")
-            if reason:
-                found.append(Parameter(name, channel, None, None, reason=reason))
-                continue
-            error = float(fit.sure.x_error[term, channel] / fit.factors[term, channel])
-            found.append(Parameter(name, channel, float(value), error, at_bound=bool(value == 0)))
-    if specular:
-        reason = undetermined.get("n", "")
-        if reason:
-            found.append(Parameter("n", None, None, None, reason=reason))
-        else:
-            found.append(Parameter("n", None, float(fit.optimum.n), fit.sure.n_error))
-    return tuple(found)
+def _fit_auto(job: _Job) -> tuple[ModelFit, Choice]:
+    """All families, then the simplest adequate candidate on its own."""
+    names = AUTO if job.lit[1].any() else ("lambert",)
+    fits = {name: _fit_model(brdf.MODELS[name], job) for name in names}
+    if job.loss != "squared":
+        # Weights are part of what is minimised: those of the better family serve all, or costs could not be compared.
+        name = min(fits, key=lambda name: float(np.sum(residual_noise(fits[name].optimum, job.rounding))))
+        weights = [picture.weight for picture in fits[name].pictures]
+        fits = {name: _with_weights(fit, weights, job.n_range) for name, fit in fits.items()}
+    grey = {name: coefficient_factors(fit.model, fit.optimum.n, job.light.colour)[2] for name, fit in fits.items()}
+    best = min(fits.values(), key=lambda fit: float(np.sum(fit.optimum.cost)))
+    noise = residual_noise(best.optimum, job.rounding)
+    known = structure(best.pictures, job.shapes, best.optimum, job.rounding)
+    free = next(iter(fits.values())).free
+    optima = {name: fit.optimum for name, fit in fits.items()}
+    choice = choose(optima, free, grey, noise, known.inflation)
+    return _alone(choice, fits, grey, job.n_range), choice
+
+
+def _with_weights(fit: ModelFit, weights: list[Any], n_range: tuple[float, float]) -> ModelFit:
+    pictures = [
+        eqx.tree_at(lambda p: p.weight, picture, weight) for picture, weight in zip(fit.pictures, weights, strict=True)
+    ]
+    return fit._replace(pictures=pictures, optimum=_optimise(pictures, fit.free, n_range))
+
+
+def _alone(
+    choice: Choice, fits: dict[str, ModelFit], grey: dict[str, np.ndarray], n_range: tuple[float, float]
+) -> ModelFit:
+    """The chosen candidate, fitted to the pixels without what it leaves out."""
+    if choice.model not in AUTO:
+        fit = next(iter(fits.values()))
+        pictures = [Picture(p.target, p.diffuse, None, p.weight, p.ambient) for p in fit.pictures]
+        optimum = fit_linear(pictures, free=choice.free)
+        return ModelFit(brdf.Lambert, pictures, optimum, choice.free, None, fit.noise_factor)
+    fit = fits[choice.model]
+    optimum = fit.optimum
+    if not np.array_equal(choice.free, fit.free):
+        optimum = search(fit.pictures, n_min=n_range[0], n_max=n_range[1], free=choice.free)
+    tied = grey[choice.model] if choice.grey else None
+    if tied is not None:
+        single = np.dtype(fit.pictures[0].target.dtype) == np.float32
+        optimum = fit_tied(fit.pictures, optimum, choice.free, tied, n_range, single=single)
+    return fit._replace(optimum=optimum, free=choice.free, tied=tied)
+
+
+def _interpret(fit: ModelFit, job: _Job, choice: Choice | None) -> Interpretation:
+    brightest = np.max([observation.brightest for observation in job.observations], axis=0)
+    # What the light reaches but the simplest model does without is 0, with the error that it would have.
+    told = interpret(fit, job.light.colour, job.rounding, brightest, job.shapes, job.n_range, _free(fit.model, job))
+    if choice is None or not choice.rivals:
+        return told
+    names = " and ".join(choice.rivals)
+    rival = f"{names} fits as well as {fit.model.name}: the picture does not tell the two highlights apart"
+    return told._replace(warnings=(*told.warnings, rival))
 
 
 def _result(
     fit: ModelFit,
-    candidates: tuple[Candidate, ...],
-    observations: list[Observation],
+    told: Interpretation,
+    choice: Choice | None,
+    job: _Job,
     targets: list[Any],
     scenes: list[brdf.Scene],
     precision: brdf.Precision,
     seconds: float,
 ) -> FitResult:
-    optimum = fit.optimum
+    optimum, observations = fit.optimum, job.observations
     left_out: dict[str, int] = {}
     for observation in observations:
         for reason, count in observation.left_out.items():
             left_out[reason] = left_out.get(reason, 0) + count
-    shapes = [observation.points.mask.shape for observation in observations]
+    channels = optimum.x.shape[1]
+    free = free_parameters(told.parameters)
+    index = [3 * channels if p.channel is None else TERMS.index(p.name) * channels + p.channel for p in free]
     return FitResult(
-        material=fit.material,
-        parameters=_parameters(fit),
-        noise=fit.sure.noise,
+        material=told.material,
+        parameters=told.parameters,
+        noise=told.sure.noise,
+        structure=told.structure.correlation,
+        highlight_pixels=None if told.highlight is None else told.highlight.pixels,
         residual=float(np.sqrt(np.sum(optimum.cost) / np.sum(optimum.square))),
         pixels=int(optimum.pixels[0]),
         left_out=left_out,
-        warnings=(),
-        candidates=candidates,
+        warnings=told.warnings,
+        candidates=() if choice is None else choice.candidates,
+        correlation=told.sure.correlation[np.ix_(index, index)],
         optimum=optimum,
+        loss=job.loss,
         precision=precision,
         seconds=seconds,
         targets=[
             np.asarray(observation.target).reshape(*shape, -1)
-            for observation, shape in zip(observations, shapes, strict=True)
+            for observation, shape in zip(observations, job.shapes, strict=True)
         ],
         scenes=scenes,
         counted=[fitted_pixels(observation) for observation in observations],

@@ -11,9 +11,14 @@ import numpy as np
 from jaxtyping import Float
 
 import brdf
+from fitting.selection import Candidate
 from fitting.separable import Optimum
 
 NOT_DETERMINED = "not determined"
+# Beyond this relative error an interval of n is told: it is no longer symmetric.
+LOPSIDED = 0.01
+# Correlations above this are told, so many at most.
+STRONG, MOST_CORRELATIONS = 0.9, 3
 
 
 @dataclass(frozen=True)
@@ -25,7 +30,9 @@ class Parameter:
         channel: of the picture; None for n.
         value: None where the picture does not determine it.
         error: standard error; where `at_bound`, that which the value would have without the bound.
-        at_bound: the value is 0 because it may not be negative.
+        interval: lower and upper end of the 95 % interval; one-sided at a bound, infinite where there is no end; for n
+            from the profile likelihood, also where n is not determined but bounded on one side.
+        at_bound: the value is 0 because it may not be negative, or because the picture does not require it.
         reason: why it is not determined.
     """
 
@@ -33,6 +40,7 @@ class Parameter:
     channel: int | None
     value: float | None
     error: float | None
+    interval: tuple[float, float] | None = None
     at_bound: bool = False
     reason: str = ""
 
@@ -41,10 +49,17 @@ class Parameter:
         if self.value is None:
             return f"{NOT_DETERMINED}: {self.reason}"
         if self.at_bound:
-            return f"0 (at its bound; below {1.645 * self.error:.2g} with 95 %)"
+            return "0 (at its bound" + (f"; below {self.interval[1]:.2g} with 95 %)" if self.interval else ")")
         if not self.error:
             return f"{self.value:.6g}"
-        return f"{_rounded(self.value, self.error)} ± {self.error:.2g} ({self.error / self.value:.2g})"
+        text = f"{_rounded(self.value, self.error)} ± {self.error:.2g} ({_percent(self.error / self.value)})"
+        if self.interval and self.channel is None and self.error > LOPSIDED * self.value:
+            text += f", 95 %: {self.interval[0]:.4g} to {self.interval[1]:.4g}"
+        return text
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %"
 
 
 def _rounded(value: float, error: float) -> str:
@@ -56,38 +71,23 @@ def _rounded(value: float, error: float) -> str:
 
 
 @dataclass(frozen=True)
-class Candidate:
-    """A model that was tried.
-
-    Attributes:
-        model: its name.
-        unknowns: how many numbers it has.
-        rms: root mean square of its residual, in the unit of the picture.
-        bic: Bayesian information criterion, up to a constant of the picture; the smallest is the best.
-        chosen: whether the fit chose it.
-    """
-
-    model: str
-    unknowns: int
-    rms: float
-    bic: float
-    chosen: bool
-
-
-@dataclass(frozen=True)
 class FitResult:
     """The outcome of a fit.
 
     Attributes:
         material: the fitted material; what is not determined is 0 in it, which changes no picture.
         parameters: value and error of each number, or why it has none.
-        noise: standard deviation of the residual, (C,).
+        noise: standard deviation of the residual, (C,); under a loss with weights, in the unit of the weighted residual.
+        structure: correlation of neighbouring residuals.
+        highlight_pixels: how many pixels carry the highlight; None without one.
         residual: root mean square of the residual over that of the picture.
         pixels: how many pixels counted.
         left_out: how many did not, by reason.
         warnings: what a user should know before using the numbers.
-        candidates: the models that were compared; one where the user named it.
+        candidates: the models that were compared, simplest first; empty where the user named it.
+        correlation: of the parameters that are determined and not at a bound, in the order of `free_parameters`.
         optimum: the engine's own result, in its units.
+        loss: "squared" or one of the others.
         precision: "float32" or "float64".
         seconds: how long the fit took.
         targets: the pictures, (H, W, C) each.
@@ -98,12 +98,16 @@ class FitResult:
     material: brdf.Material
     parameters: tuple[Parameter, ...]
     noise: Float[np.ndarray, " C"]
+    structure: float
+    highlight_pixels: float | None
     residual: float
     pixels: int
     left_out: dict[str, int]
     warnings: tuple[str, ...]
     candidates: tuple[Candidate, ...]
+    correlation: Float[np.ndarray, "F F"]
     optimum: Optimum
+    loss: str
     precision: str
     seconds: float
     targets: Sequence[np.ndarray] = field(repr=False)
@@ -114,6 +118,11 @@ class FitResult:
     def undetermined(self) -> dict[str, str]:
         """What the picture does not determine, and why: "n", or "k_s[2]" for one channel."""
         return {_key(parameter): parameter.reason for parameter in self.parameters if parameter.value is None}
+
+    @property
+    def free_parameters(self) -> tuple[Parameter, ...]:
+        """Those that the picture determines and no bound holds."""
+        return free_parameters(self.parameters)
 
     def fitted(self, picture: int = 0) -> Float[np.ndarray, "H W C"]:
         """The picture that the fitted material makes.
@@ -137,6 +146,7 @@ class FitResult:
                     "channel": parameter.channel,
                     "value": parameter.value,
                     "error": parameter.error,
+                    "interval": None if parameter.interval is None else [_finite(end) for end in parameter.interval],
                     "at_bound": parameter.at_bound,
                     "reason": parameter.reason or None,
                 }
@@ -144,10 +154,17 @@ class FitResult:
             ],
             "residual": self.residual,
             "noise": self.noise.tolist(),
+            "structure": self.structure,
+            "highlight_pixels": self.highlight_pixels,
             "pixels": self.pixels,
             "left_out": self.left_out,
             "warnings": list(self.warnings),
             "candidates": [vars(candidate) for candidate in self.candidates],
+            "correlation": {
+                "parameters": [_key(parameter) for parameter in self.free_parameters],
+                "matrix": self.correlation.tolist(),
+            },
+            "loss": self.loss,
             "precision": self.precision,
             "seconds": self.seconds,
         }
@@ -186,6 +203,19 @@ class FitResult:
         return comparison(self, picture)
 
 
+def free_parameters(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
+    """Those of a material's parameters that are determined and at no bound.
+
+    Args:
+        parameters: all of them.
+    """
+    return tuple(one for one in parameters if one.value is not None and not one.at_bound)
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
 def _key(parameter: Parameter) -> str:
     return parameter.name if parameter.channel is None else f"{parameter.name}[{parameter.channel}]"
 
@@ -201,7 +231,7 @@ def report(result: FitResult) -> str:
     plural = "channel" if channels == 1 else "channels"
     lines = [
         f"{result.material.name} fitted to {count}{result.pixels} pixels x {channels} {plural} "
-        f"in {result.seconds:.2g} s ({result.precision})"
+        f"in {result.seconds:.2g} s ({result.precision}{'' if result.loss == 'squared' else ', ' + result.loss + ' loss'})"
     ]
     labels = ["red", "green", "blue"] if channels == 3 else [str(channel) for channel in range(channels)]
     for parameter in result.parameters:
@@ -211,13 +241,34 @@ def report(result: FitResult) -> str:
     for reason, pixels in result.left_out.items():
         if pixels:
             lines.append(f"  left out    {pixels} pixels {reason}")
-    if len(result.candidates) > 1:
-        lines.append("  what the scene requires:")
-        for candidate in result.candidates:
-            chosen = "<- chosen" if candidate.chosen else ""
-            lines.append(
-                f"    {candidate.model:<24}{candidate.unknowns:>3} unknowns   rms {candidate.rms:.3e}   "
-                f"BIC {candidate.bic:>12.1f}   {chosen}".rstrip()
-            )
+    if result.highlight_pixels is not None:
+        lines.append(f"  highlight   on {result.highlight_pixels:.3g} pixels")
+    lines += _correlations(result)
+    if result.candidates:
+        lines += _candidates(result.candidates)
     lines += [f"  warning: {warning}" for warning in result.warnings]
     return "\n".join(lines)
+
+
+def _correlations(result: FitResult) -> list[str]:
+    """The strongest correlations, as far as they are worth a line."""
+    free = result.free_parameters
+    pairs = [(abs(result.correlation[i, j]), i, j) for i in range(len(free)) for j in range(i)]
+    strong = sorted((pair for pair in pairs if pair[0] > STRONG), reverse=True)[:MOST_CORRELATIONS]
+    words = [f"{_key(free[j])} and {_key(free[i])} {result.correlation[i, j]:+.2f}" for _, i, j in strong]
+    return [f"  correlated  {', '.join(words)}"] if words else []
+
+
+def _candidates(candidates: Sequence[Candidate]) -> list[str]:
+    lines = [
+        "  what the scene requires (squared error expected on held-out pixels, over the best, in noise variances):",
+        f"    {'model':<40}{'unknowns':>9}{'rms':>11}{'held out':>11}{'excess ± its error':>26}{'BIC':>12}",
+    ]
+    for one in candidates:
+        mark = "  <- chosen" if one.chosen else "  adequate" if one.excess <= one.excess_error else ""
+        excess = f"{one.excess:.1f} ± {one.excess_error:.1f}" if one.excess < 1e6 else f"{one.excess:.2e}"
+        bic = f"{one.bic:.1f}" if one.bic < 1e6 else f"{one.bic:.2e}"
+        lines.append(
+            f"    {one.name:<40}{one.unknowns:>9}{one.rms:>11.3e}{one.held_out:>11.3e}{excess:>26}{bic:>12}{mark}"
+        )
+    return lines

@@ -1,67 +1,88 @@
-"""How sure a fit is: standard errors from the Gauss-Newton Hessian, and which parameters the picture does not determine."""
+"""How sure a fit is: covariance from the Gauss-Newton Hessian, intervals, and which parameters the picture leaves open."""
 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
+from fitting.intervals import NORMAL_95, above_zero
 from fitting.separable import Optimum
 
 # A squared column keeps less than this of itself when the others are taken out: the two tell the same story.
-DEPENDENT = 1e-10
+# Float32 sums leave some 1e-7 of a column that depends on the others.
+DEPENDENT_SINGLE, DEPENDENT_DOUBLE = 1e-6, 1e-10
 # A term that moves no pixel by more than this share of the brightest one leaves no trace.
 NO_TRACE = 1e-6
 # A specular term counts when leaving it out raises the cost by so many noise variances for each of its unknowns.
 SIGNIFICANT = 10.0
-# An exponent whose relative standard error is larger says nothing but its order of magnitude.
-LOOSEST = 1.0
 
 TERMS = ("k_a", "k_d", "k_s")
 
 
 class Uncertainty(NamedTuple):
-    """Standard errors, and what is not determined.
+    """Errors, and what is not determined.
 
     Attributes:
         noise: standard deviation of the residual, (C,), never below what rounding alone gives.
         x_error: of the engine's coefficients x_a, x_d, x_s, (3, C); for one at its bound, that which it would have if
             the bound were not there. Infinite where the picture does not determine it.
+        x_interval: 95 % interval of each, lower and upper end, (3, C, 2).
         n_error: of n; infinite where the picture does not determine it.
+        correlation: of x_a, x_d, x_s (channel after channel each) and n, (3C + 1, 3C + 1); 0 for what is at its bound
+            or not determined.
+        rise: by how much the cost, summed over channels, rises at the ends of a 95 % interval of n.
         undetermined: why, by parameter: "n", "k_s", or "k_d[2]" for one channel.
     """
 
     noise: Float[np.ndarray, " C"]
     x_error: Float[np.ndarray, "3 C"]
+    x_interval: Float[np.ndarray, "3 C 2"]
     n_error: float
+    correlation: Float[np.ndarray, "P P"]
+    rise: float
     undetermined: dict[str, str]
+
+
+def residual_noise(optimum: Optimum, rounding: Float[np.ndarray, " C"]) -> Float[np.ndarray, " C"]:
+    """Standard deviation of the residual, never below that of rounding.
+
+    Args:
+        optimum: of the engine.
+        rounding: standard deviation of a value's rounding, (C,).
+    """
+    degrees = np.maximum(optimum.pixels - np.count_nonzero(optimum.x > 0, axis=0), 1)
+    return np.sqrt(np.maximum(optimum.cost / degrees, np.maximum(rounding**2, np.finfo(float).tiny)))
 
 
 def uncertainty(
     optimum: Optimum,
-    free: np.ndarray,
-    rounding: np.ndarray,
-    brightest: np.ndarray,
+    free: Bool[np.ndarray, "3 C"],
+    noise: Float[np.ndarray, " C"],
+    brightest: Float[np.ndarray, " C"],
     *,
     specular: bool,
-    n_range: tuple[float, float],
     visible: float,
+    single: bool,
+    tied: Float[np.ndarray, " C"] | None = None,
 ) -> Uncertainty:
     """Errors of an optimum.
 
-    The covariance is H⁻¹ (Σ_c σ_c² J_cᵀJ_c) H⁻¹ with the noise σ_c of each channel: channels share n but not their noise.
+    The covariance is H⁻¹ (Σ_c σ_c² J_cᵀJ_c) H⁻¹ with the noise σ_c of each channel: channels share n but not their
+    noise. Coefficients at their bound are held there: given that, the others are estimated as if it were known, and
+    their intervals cover as they should (the score of the bound coefficient is uncorrelated with them).
 
     Args:
         optimum: of the engine.
         free: which coefficients the light reaches, (3, C).
-        rounding: standard deviation of a value's rounding, (C,).
+        noise: standard deviation of the residual, (C,).
         brightest: largest value of the picture, (C,).
         specular: whether the model has a lobe.
-        n_range: bounds of the search.
         visible: largest value of the specular term in the picture, over that of the picture.
+        single: whether the pixels were float32.
+        tied: x_s is a common factor times this, (C,); None where the channels are independent.
     """
     channels = optimum.x.shape[1]
-    degrees = np.maximum(optimum.pixels - np.count_nonzero(optimum.x > 0, axis=0), 1)
-    noise = np.sqrt(np.maximum(optimum.cost / degrees, rounding**2))
+    dependent = DEPENDENT_SINGLE if single else DEPENDENT_DOUBLE
     undetermined: dict[str, str] = {}
     if specular:
         reason = _without_trace(optimum, noise, visible)
@@ -70,28 +91,22 @@ def uncertainty(
     known = free.copy()
     known[2] &= specular and "k_s" not in undetermined
     _name_unlit(free, specular, undetermined)
-    _name_dependent(optimum, known, undetermined)
-    x_error, n_error = _errors(optimum, known, noise)
+    _name_dependent(optimum, known, undetermined, dependent)
+    system = _System(optimum, known, noise, tied, dependent)
+    x_error, x_interval, n_error = system.errors()
     for term, channel in np.argwhere(known):
-        loose = x_error[term, channel] ** 2 * optimum.gram[channel, term, term] > _square(optimum, channel, brightest)
-        if loose:
+        largest = max(optimum.square[channel], brightest[channel] ** 2)
+        if x_error[term, channel] ** 2 * optimum.gram[channel, term, term] > largest:
             name = f"{TERMS[term]}[{channel}]"
             undetermined.setdefault(name, "its error is larger than the whole picture")
             x_error[term, channel] = np.inf
-    if specular and "n" not in undetermined:
-        if n_error > LOOSEST * optimum.n:
-            undetermined["n"] = "the highlight fits as well with any exponent near"
-        elif optimum.n >= n_range[1] * (1 - 1e-9):
-            undetermined["n"] = f"the highlight is narrower than a pixel shows, n is {n_range[1]:g} or more"
+    if specular and "n" not in undetermined and not np.isfinite(n_error):
+        undetermined["n"] = "the highlight fits as well with other exponents and another k_s"
     if "n" in undetermined:
         n_error = np.inf
     if channels == 1:
         undetermined = {name.removesuffix("[0]"): reason for name, reason in undetermined.items()}
-    return Uncertainty(noise, x_error, n_error, undetermined)
-
-
-def _square(optimum: Optimum, channel: int, brightest: np.ndarray) -> float:
-    return float(max(optimum.square[channel], brightest[channel] ** 2))
+    return Uncertainty(noise, x_error, x_interval, n_error, system.correlation(), system.rise, undetermined)
 
 
 def _without_trace(optimum: Optimum, noise: np.ndarray, visible: float) -> str:
@@ -107,7 +122,7 @@ def _without_trace(optimum: Optimum, noise: np.ndarray, visible: float) -> str:
         left = gram[2, 2]
         if others:
             cross = gram[np.ix_(others, [2])][:, 0]
-            left -= cross @ np.linalg.lstsq(gram[np.ix_(others, others)], cross, rcond=DEPENDENT)[0]
+            left -= cross @ np.linalg.lstsq(gram[np.ix_(others, others)], cross, rcond=DEPENDENT_DOUBLE)[0]
         gain += optimum.x[2, channel] ** 2 * max(left, 0.0) / noise[channel] ** 2
     unknowns = 1 + np.count_nonzero(optimum.x[2] > 0)
     return "" if gain > SIGNIFICANT * unknowns else "the highlight does not stand out of the noise"
@@ -125,7 +140,7 @@ def _name_unlit(free: np.ndarray, specular: bool, undetermined: dict[str, str]) 
             undetermined[f"{TERMS[term]}[{channel}]"] = f"{words[term]} in this channel"
 
 
-def _name_dependent(optimum: Optimum, known: np.ndarray, undetermined: dict[str, str]) -> None:
+def _name_dependent(optimum: Optimum, known: np.ndarray, undetermined: dict[str, str], dependent: float) -> None:
     """Find terms that the others reproduce; takes them out of ``known``."""
     for channel in range(known.shape[1]):
         gram = optimum.gram[channel, :3, :3]
@@ -140,7 +155,7 @@ def _name_dependent(optimum: Optimum, known: np.ndarray, undetermined: dict[str,
             continue
         normed = gram[np.ix_(terms, terms)] / np.outer(scale[terms], scale[terms])
         value, vector = np.linalg.eigh(normed)
-        if value[0] > DEPENDENT:
+        if value[0] > dependent:
             continue
         tied = [terms[i] for i in np.flatnonzero(np.abs(vector[:, 0]) > 0.1)]
         names = " and ".join(TERMS[term] for term in tied)
@@ -149,35 +164,88 @@ def _name_dependent(optimum: Optimum, known: np.ndarray, undetermined: dict[str,
             undetermined[f"{TERMS[term]}[{channel}]"] = f"only a sum of {names} is determined"
 
 
-def _errors(optimum: Optimum, known: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, float]:
-    """Standard errors of x and n, each channel's coefficients eliminated from the shared n."""
-    channels = known.shape[1]
-    x_error = np.full((3, channels), np.inf)
-    hessian = optimum.gauss_newton
-    information, spread = 0.0, 0.0
-    along, inverses = [], []
-    for channel in range(channels):
-        active = [term for term in range(3) if known[term, channel] and optimum.x[term, channel] > 0]
-        gram = hessian[channel][np.ix_(active, active)]
-        inverse = np.linalg.pinv(gram, rcond=1e-14, hermitian=True) if active else np.zeros((0, 0))
-        cross = hessian[channel][active, 3]
-        along.append((active, inverse @ cross))
-        inverses.append(inverse)
-        left = max(hessian[channel][3, 3] - cross @ inverse @ cross, 0.0)
-        information += left
-        spread += noise[channel] ** 2 * left
-    has_n = information > DEPENDENT * np.sum(hessian[:, 3, 3]) and information > 0
-    n_variance = spread / information**2 if has_n else np.inf
-    for channel in range(channels):
-        active, slope = along[channel]
-        for i, term in enumerate(active):
-            variance = noise[channel] ** 2 * inverses[channel][i, i]
-            if optimum.x[2, channel] > 0 and slope[i] != 0:
-                variance += slope[i] ** 2 * n_variance
-            x_error[term, channel] = np.sqrt(variance)
-        for term in np.flatnonzero(known[:, channel] & (optimum.x[:, channel] == 0)):
-            both = [*active, term]
-            gram = hessian[channel][np.ix_(both, both)]
-            inverse = np.linalg.pinv(gram, rcond=1e-14, hermitian=True)
-            x_error[term, channel] = noise[channel] * np.sqrt(max(inverse[-1, -1], 0.0))
-    return x_error, float(np.sqrt(n_variance))
+class _System:
+    """The normal equations of all unknowns: x_a, x_d, x_s channel after channel, then n."""
+
+    def __init__(
+        self, optimum: Optimum, known: np.ndarray, noise: np.ndarray, tied: np.ndarray | None, dependent: float
+    ):
+        channels = noise.size
+        size = 3 * channels + 1
+        self.optimum, self.known, self.dependent = optimum, known, dependent
+        self.hessian, self.spread = np.zeros((size, size)), np.zeros((size, size))
+        for channel, block in enumerate(optimum.gauss_newton):
+            place = np.ix_(*2 * [[channel, channels + channel, 2 * channels + channel, size - 1]])
+            self.hessian[place] += block
+            self.spread[place] += noise[channel] ** 2 * block
+        active = known & (optimum.x > 0)
+        self.has_n = bool(active[2].any())
+        columns = [row for row in np.eye(size)[:-1][active.ravel()]]
+        if tied is not None and self.has_n:
+            columns = [row for row in np.eye(size)[:-1][np.concatenate([active[:2].ravel(), np.zeros(channels, bool)])]]
+            columns.append(np.concatenate([np.zeros(2 * channels), tied * active[2], [0.0]]))
+        self.with_n = False
+        self._reduce(columns)
+        if self.has_n:
+            n = np.eye(size)[-1]
+            cross = self.basis.T @ self.hessian @ n
+            self.along = self.basis @ self.inverse @ cross
+            left = self.hessian[-1, -1] - cross @ self.inverse @ cross
+            self.with_n = bool(left > dependent * self.hessian[-1, -1])
+            if self.with_n:
+                self._reduce([*columns, n])
+        self.covariance = self.basis @ self.inverse @ self._middle() @ self.inverse @ self.basis.T
+
+    def _reduce(self, columns: list[np.ndarray]) -> None:
+        self.basis = np.stack(columns, axis=1) if columns else np.zeros((self.hessian.shape[0], 0))
+        reduced = self.basis.T @ self.hessian @ self.basis
+        scale = np.sqrt(np.maximum(np.diag(reduced), np.finfo(float).tiny))
+        normed = reduced / np.outer(scale, scale)
+        inverse = np.linalg.pinv(normed, rcond=1e-14, hermitian=True) if columns else normed
+        self.inverse = inverse / np.outer(scale, scale)
+
+    def _middle(self) -> np.ndarray:
+        return self.basis.T @ self.spread @ self.basis
+
+    @property
+    def rise(self) -> float:
+        """The noise variance, averaged over channels as n feels it, times the 95 % quantile of chi squared."""
+        if not self.with_n:
+            return 0.0
+        return float(NORMAL_95**2 * self.covariance[-1, -1] / (self.basis @ self.inverse @ self.basis.T)[-1, -1])
+
+    def correlation(self) -> np.ndarray:
+        """Of the unknowns; 0 for those that are not free."""
+        deviation = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        inverse = np.where(deviation > 0, 1 / np.where(deviation > 0, deviation, 1.0), 0.0)
+        return self.covariance * np.outer(inverse, inverse)
+
+    def errors(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """Standard errors and 95 % intervals of x, standard error of n."""
+        x, channels = self.optimum.x, self.known.shape[1]
+        error, interval = np.full((3, channels), np.inf), np.zeros((3, channels, 2))
+        interval[..., 1] = np.inf
+        for term, channel in np.argwhere(self.known):
+            index = term * channels + channel
+            if x[term, channel] > 0:
+                value, deviation = x[term, channel], np.sqrt(max(self.covariance[index, index], 0.0))
+                # Where n is open, what moves along with it is open too.
+                if self.has_n and not self.with_n and abs(self.along[index]) * self.optimum.n > deviation:
+                    deviation = np.inf
+            else:
+                value, deviation = self._released(term, channel, index)
+            error[term, channel] = deviation
+            interval[term, channel] = above_zero(value, deviation)
+        n_variance = self.covariance[-1, -1] if self.with_n else np.inf
+        return error, interval, float(np.sqrt(n_variance))
+
+    def _released(self, term: int, channel: int, index: int) -> tuple[float, float]:
+        """Value and error that a coefficient at its bound would have without the bound."""
+        gram, x = self.optimum.gram[channel], self.optimum.x[:, channel]
+        score = self.optimum.product[channel, term] - gram[term, :3] @ x
+        direction = -self.basis @ self.inverse @ (self.basis.T @ self.hessian[:, index])
+        direction[index] += 1.0
+        left = direction @ self.hessian @ direction
+        if left <= self.dependent * self.hessian[index, index]:
+            return 0.0, np.inf
+        return float(score / left), float(np.sqrt(direction @ self.spread @ direction) / left)

@@ -1,0 +1,214 @@
+"""The simplest adequate model: nothing, ambient light, Lambert, a highlight; grey or coloured; all from the same sums.
+
+A candidate is a choice of terms. Its least squares need no pixel: the Gram matrix of the largest model at its optimum
+holds that of every smaller one, and the exponent of a smaller one follows in the linearised model.
+
+The criterion. Each candidate is judged by the squared error it is to be expected to show on pixels that were held out. For
+least squares that has a closed form, no pixel is touched again: leaving each pixel out in turn gives the residual sum of
+squares plus twice the noise variance for each unknown (Mallows 1973; Stone 1977). An exponent counts `SEARCHED`
+unknowns, because the best of a whole range was searched for: on a matt ball with noise, the best of all highlights gains that
+much. Candidates within one standard error of the best are adequate (Breiman et al. 1984), and of these the simplest
+family is taken, in it the fewest unknowns. The standard error is that of the difference of two candidates on the same
+pixels, 2 σ times the distance of their pictures. Where neighbouring residuals go together, pixels count for less.
+
+At the boundary: a coefficient that comes out as 0 is no unknown of that candidate. Next to the expected error the table shows the
+Bayesian information criterion (Schwarz 1978), which asks more of large pictures.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from fitting.normal import Normal, design_of, nonnegative_minimum, normal_equations
+from fitting.separable import Optimum
+
+# How many unknowns a searched exponent counts; measured: python -m benchmarks.selection --optimism
+SEARCHED = 4.0
+FAMILIES = ("none", "ambient", "lambert")
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A model that was tried.
+
+    Attributes:
+        model: "none", "ambient", "lambert" or the name of a model with a highlight.
+        ambient: whether it has an ambient term.
+        highlight: "", "grey" (one k_s for all channels) or "coloured".
+        unknowns: how many numbers are not 0 in it.
+        rms: root mean square of its residual, in the unit of the picture.
+        held_out: what that is to be expected on pixels that were held out.
+        excess: squared error expected there, over that of the best candidate, in noise variances.
+        excess_error: its standard error; where the excess is no larger, the candidate is adequate.
+        bic: Bayesian information criterion over that of the best; the smallest is the best.
+        chosen: whether the fit chose it.
+    """
+
+    model: str
+    ambient: bool
+    highlight: str
+    unknowns: int
+    rms: float
+    held_out: float
+    excess: float
+    excess_error: float
+    bic: float
+    chosen: bool
+
+    @property
+    def name(self) -> str:
+        """Model and terms in words."""
+        words = [] if self.model in FAMILIES[:2] else ["with ambient" if self.ambient else "without ambient"]
+        words += [f"{self.highlight} k_s"] if self.highlight else []
+        return f"{self.model} {', '.join(words)}".strip()
+
+
+class Choice(NamedTuple):
+    """What the scene requires.
+
+    Attributes:
+        candidates: all that were tried, simplest first.
+        model: of the chosen one.
+        free: which coefficients it has, (3, C).
+        grey: whether its k_s is the same in all channels.
+        rivals: models with a highlight that the picture does not tell from the chosen one.
+    """
+
+    candidates: tuple[Candidate, ...]
+    model: str
+    free: Bool[np.ndarray, "3 C"]
+    grey: bool
+    rivals: tuple[str, ...]
+
+
+class _Trial(NamedTuple):
+    model: str
+    free: np.ndarray
+    grey: bool
+    unknowns: int
+    effective: float
+    solution: np.ndarray
+    cost: float
+    squares: float
+
+
+def _try(model: str, free: np.ndarray, tied: np.ndarray | None, normal: Normal, plain: Normal) -> _Trial:
+    design = design_of(free, tied)
+    signed = np.zeros(design.shape[1], bool)
+    specular = bool(free[2].any())
+    signed[-1:] = specular
+    gram, product = design.T @ normal.gram @ design, design.T @ normal.product
+    x = nonnegative_minimum(gram, product, signed)
+    solution = design @ x
+    cost = _squares(normal, solution)
+    has_lobe = bool(np.any(solution[2 * free.shape[1] : -1] > 0))
+    unknowns = int(np.count_nonzero(x[~signed] > 0)) + int(has_lobe)
+    return _Trial(
+        model,
+        free,
+        tied is not None,
+        unknowns,
+        unknowns + (SEARCHED - 1) * has_lobe,
+        solution,
+        cost,
+        _squares(plain, solution),
+    )
+
+
+def _squares(normal: Normal, solution: np.ndarray) -> float:
+    return float(max(normal.square - 2 * normal.product @ solution + solution @ normal.gram @ solution, 0.0))
+
+
+def choose(
+    fits: dict[str, Optimum],
+    free: Bool[np.ndarray, "3 C"],
+    grey: dict[str, Float[np.ndarray, " C"]],
+    noise: Float[np.ndarray, " C"],
+    inflation: float,
+) -> Choice:
+    """Choose the simplest adequate model.
+
+    Args:
+        fits: the optimum of each model with a highlight; or that of Lambert alone.
+        free: which coefficients the light reaches, (3, C).
+        grey: for each model, the engine's x_s of a grey k_s, up to a factor; (C,).
+        noise: standard deviation of the residual of the best fit, (C,).
+        inflation: by what factor the structure of its residual makes errors larger; at least 1.
+    """
+    channels = free.shape[1]
+    no = np.zeros(channels, bool)
+    variance = (noise * inflation) ** 2
+    count = float(sum(next(iter(fits.values())).pixels))
+    trials: list[_Trial] = []
+    normals, plain = (
+        {name: normal_equations(fit.gram, fit.product, fit.square, fit.x[2], v) for name, fit in fits.items()}
+        for v in (variance, np.ones(channels))
+    )
+    first = next(iter(normals.values())), next(iter(plain.values()))
+    for name, terms in zip(FAMILIES, ([no, no], [free[0], no], [no, free[1]]), strict=True):
+        if name != "ambient" or free[0].any():
+            trials.append(_try(name, np.stack([*terms, no]), None, *first))
+    if free[0].any():
+        trials.append(_try("lambert", np.stack([free[0], free[1], no]), None, *first))
+    for name, normal in normals.items():
+        if name == "lambert" or fits[name].flat:
+            continue
+        for ambient in (no, free[0]) if free[0].any() else (no,):
+            terms = np.stack([ambient, free[1], free[2]])
+            if channels > 1:
+                trials.append(_try(name, terms, np.where(free[2], grey[name], 0.0), normal, plain[name]))
+            trials.append(_try(name, terms, None, normal, plain[name]))
+    return _decide(trials, normals, variance, count)
+
+
+def _decide(trials: list[_Trial], normals: dict[str, Normal], variance: np.ndarray, count: float) -> Choice:
+    expected = np.array([trial.cost + 2 * trial.effective for trial in trials])
+    bic = np.array([trial.cost + trial.unknowns * np.log(count) for trial in trials])
+    best = int(np.argmin(expected))
+    error = np.array([2 * np.sqrt(_distance(trial, trials[best], normals)) for trial in trials])
+    adequate = expected - expected[best] <= error
+    ranks = [FAMILIES.index(trial.model) if trial.model in FAMILIES else len(FAMILIES) for trial in trials]
+    keys = [(ranks[i], trials[i].unknowns, expected[i]) for i in range(len(trials))]
+    chosen = min(np.flatnonzero(adequate), key=lambda i: keys[i])
+    count = max(count, 1.0)
+    candidates = tuple(
+        Candidate(
+            model=trial.model,
+            ambient=bool(trial.free[0].any()),
+            highlight="" if not trial.free[2].any() else "grey" if trial.grey else "coloured",
+            unknowns=trial.unknowns,
+            rms=float(np.sqrt(trial.squares / count)),
+            held_out=float(np.sqrt((trial.squares + 2 * trial.effective * np.mean(variance)) / count)),
+            excess=float(expected[i] - expected[best]),
+            excess_error=float(error[i]),
+            bic=float(bic[i] - bic.min()),
+            chosen=i == chosen,
+        )
+        for i, trial in enumerate(trials)
+    )
+    order = sorted(range(len(trials)), key=lambda i: (ranks[i], trials[i].model, trials[i].unknowns))
+    winner = trials[chosen]
+    rivals = {trials[i].model for i in np.flatnonzero(adequate) if ranks[i] == len(FAMILIES)} - {winner.model}
+    return Choice(
+        tuple(candidates[i] for i in order),
+        winner.model,
+        winner.free,
+        winner.grey,
+        tuple(sorted(rivals)) if ranks[chosen] == len(FAMILIES) else (),
+    )
+
+
+def _distance(one: _Trial, other: _Trial, normals: dict[str, Normal]) -> float:
+    """Squared distance of two candidates' pictures, in noise variances.
+
+    Two models with different highlights share no Gram matrix; there the difference of their costs stands in, which it is
+    where one holds the other.
+    """
+    specular = [trial.model for trial in (one, other) if trial.model in normals and trial.model not in FAMILIES]
+    if len(set(specular)) > 1:
+        return abs(one.cost - other.cost)
+    gram = normals[specular[0]].gram if specular else next(iter(normals.values())).gram
+    step = one.solution - other.solution
+    return max(float(step @ gram @ step), 0.0)
