@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from brdf.albedo import absorbed_fraction, directional_albedo
+    from brdf.area_lights import PolygonLight, RectangleLight, SphereLight
     from brdf.camera import Camera, OrthographicCamera, PerspectiveCamera
     from brdf.conversions import (
         exponent_from_roughness,
@@ -19,11 +20,18 @@ if TYPE_CHECKING:
         roughness_from_exponent,
         slope_from_exponent,
     )
+    from brdf.encodings import encode
+    from brdf.environment import ConstantEnvironment, EnvironmentMap
     from brdf.errors import InputError
-    from brdf.files import atomic_folder, atomic_path, write_text
+    from brdf.exports import EXPORTS, Export, export_material, mitsuba_dict, save_export
+    from brdf.files import atomic_folder, atomic_path, input_file, read_text, write_text
     from brdf.images import ImageReader, Picture, read_image, read_layers, read_mask, read_picture, write_image
-    from brdf.lights import DirectionalLight, Light, PointLight
+    from brdf.light_images import relight, render_lights
+    from brdf.lights import DirectionalLight, Light, PointLight, SpotLight
     from brdf.materials import load_material, load_materials, material_from_dict, material_to_dict, save_material
+    from brdf.measured import MeasuredBRDF, is_measured, load_measured
+    from brdf.measured_merl import merl_table
+    from brdf.meshes import Mesh, Triangles, load_mesh
     from brdf.models import (
         MODELS,
         BlinnPhong,
@@ -36,12 +44,16 @@ if TYPE_CHECKING:
     )
     from brdf.plausibility import check
     from brdf.precision import Precision, cast, working_precision
+    from brdf.presets import PRESETS, preset
     from brdf.rendering import Basis, BasisImages, Lobe, basis, basis_images, render
     from brdf.report import Finding, Report
-    from brdf.scene import Scene, SurfacePoints
+    from brdf.scene import Scene
     from brdf.shapes import Rectangle, Shape, Sphere
+    from brdf.surface_points import SurfacePoints
 
 _ROOMS = {
+    "measured": ["MeasuredBRDF", "is_measured", "load_measured"],
+    "measured_merl": ["merl_table"],
     "report": ["Finding", "Report"],
     "plausibility": ["check"],
     "conversions": [
@@ -55,11 +67,18 @@ _ROOMS = {
         "slope_from_exponent",
     ],
     "albedo": ["absorbed_fraction", "directional_albedo"],
+    "area_lights": ["PolygonLight", "RectangleLight", "SphereLight"],
     "camera": ["Camera", "OrthographicCamera", "PerspectiveCamera"],
+    "environment": ["ConstantEnvironment", "EnvironmentMap"],
+    "encodings": ["encode"],
     "errors": ["InputError"],
-    "files": ["atomic_folder", "atomic_path", "write_text"],
+    "exports": ["EXPORTS", "Export", "export_material", "mitsuba_dict", "save_export"],
+    "presets": ["PRESETS", "preset"],
+    "files": ["atomic_folder", "atomic_path", "input_file", "read_text", "write_text"],
     "images": ["ImageReader", "Picture", "read_image", "read_layers", "read_mask", "read_picture", "write_image"],
-    "lights": ["DirectionalLight", "Light", "PointLight"],
+    "light_images": ["relight", "render_lights"],
+    "lights": ["DirectionalLight", "Light", "PointLight", "SpotLight"],
+    "meshes": ["Mesh", "Triangles", "load_mesh"],
     "materials": ["load_material", "load_materials", "material_from_dict", "material_to_dict", "save_material"],
     "models": [
         "MODELS",
@@ -73,8 +92,9 @@ _ROOMS = {
     ],
     "precision": ["Precision", "cast", "working_precision"],
     "rendering": ["Basis", "BasisImages", "Lobe", "basis", "basis_images", "render"],
-    "scene": ["Scene", "SurfacePoints"],
+    "scene": ["Scene"],
     "shapes": ["Rectangle", "Shape", "Sphere"],
+    "surface_points": ["SurfacePoints"],
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 

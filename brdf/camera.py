@@ -6,13 +6,14 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from brdf.checks import direction_value, number, positive, vector
 from brdf.errors import InputError
 from brdf.vectors import normalize
 
 MAX_RESOLUTION = 1 << 16
+MAX_SAMPLES = 256
 
 
 def _resolution(value: Any) -> tuple[int, int]:
@@ -37,6 +38,16 @@ def _viewer(value: Any) -> str | None:
     return value
 
 
+def _samples(value: Any) -> int:
+    """Samples along each side of a pixel."""
+    remedy = "Give a whole number"
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise InputError("samples", f"must be a whole number, got {value!r}", remedy)
+    if not 1 <= value <= MAX_SAMPLES:
+        raise InputError("samples", f"must be between 1 and {MAX_SAMPLES}, got {value}", remedy)
+    return int(value)
+
+
 class Camera(eqx.Module):
     """Where the picture is taken from. Pixel centres lie at half-integers, row 0 is the top.
 
@@ -48,6 +59,8 @@ class Camera(eqx.Module):
         viewer: "local" takes the eye to be at ``position`` for every point, "infinite" takes it to be infinitely far
             behind the camera, as OpenGL's infinite viewer does. None means local for a perspective camera and
             infinite for an orthographic one. (VTK always puts the eye at the camera.)
+        samples: k, so that a pixel where that matters is the average over its area by k × k points; see
+            `brdf.pixel_area`. 1 looks at the pixel's centre only.
     """
 
     position: Float[Array, "3"] = eqx.field(converter=vector("position"), kw_only=True)
@@ -55,12 +68,38 @@ class Camera(eqx.Module):
     up: Float[Array, "3"] = eqx.field(converter=direction_value("up"), kw_only=True)
     resolution: tuple[int, int] = eqx.field(static=True, converter=_resolution, kw_only=True)
     viewer: str | None = eqx.field(static=True, default=None, converter=_viewer, kw_only=True)
+    samples: int = eqx.field(static=True, converter=_samples, default=1, kw_only=True)
     type_name: ClassVar[str]
     default_viewer: ClassVar[str]
 
     @abc.abstractmethod
+    def rays_through(
+        self, x: Float[Array, "*#batch"], y: Float[Array, "*#batch"]
+    ) -> tuple[Float[Array, "*batch 3"], Float[Array, "*batch 3"]]:
+        """Origin and unit direction of the rays through places of the picture.
+
+        Args:
+            x: to the right of the picture's middle, in units of half its width.
+            y: up from it, in the same unit.
+        """
+
     def rays(self) -> tuple[Float[Array, "height width 3"], Float[Array, "height width 3"]]:
         """Origin and unit direction of the ray through each pixel's centre."""
+        return self.rays_through(*self.picture_plane())
+
+    def rays_in_pixels(
+        self, pixel: Int[Array, " K"], right: Float[Array, " M"], down: Float[Array, " M"]
+    ) -> tuple[Float[Array, "K M 3"], Float[Array, "K M 3"]]:
+        """Origin and unit direction of rays through several places of some pixels.
+
+        Args:
+            pixel: indices, row by row.
+            right: places in each pixel, from 0 at its left edge to 1.
+            down: from 0 at its upper edge to 1.
+        """
+        width, height = self.resolution
+        column, row = (pixel % width)[:, None] + right, (pixel // width)[:, None] + down
+        return self.rays_through(column * 2.0 / width - 1.0, height / width - row * 2.0 / width)
 
     def __check_init__(self):
         """Refuse a camera without a picture plane."""
@@ -101,7 +140,7 @@ class OrthographicCamera(Camera):
     """Parallel rays.
 
     Args:
-        position, target, up, resolution, viewer: see `Camera`.
+        position, target, up, resolution, viewer, samples: see `Camera`.
         width: of the picture, in world units, greater than 0.
 
     Raises:
@@ -112,10 +151,11 @@ class OrthographicCamera(Camera):
     type_name: ClassVar[str] = "orthographic"
     default_viewer: ClassVar[str] = "infinite"
 
-    def rays(self) -> tuple[Float[Array, "height width 3"], Float[Array, "height width 3"]]:
+    def rays_through(
+        self, x: Float[Array, "*#batch"], y: Float[Array, "*#batch"]
+    ) -> tuple[Float[Array, "*batch 3"], Float[Array, "*batch 3"]]:
         """Origins on the plane through ``position``, one direction."""
         right, up, forward = self.axes()
-        x, y = self.picture_plane()
         half_width = self.width / 2
         origins = self.position + half_width * (x[..., None] * right + y[..., None] * up)
         return origins, jnp.broadcast_to(forward, origins.shape)
@@ -125,7 +165,7 @@ class PerspectiveCamera(Camera):
     """Rays from one point.
 
     Args:
-        position, target, up, resolution, viewer: see `Camera`.
+        position, target, up, resolution, viewer, samples: see `Camera`.
         fov: the vertical angle of the picture in degrees, between 0 and 180.
 
     Raises:
@@ -136,10 +176,11 @@ class PerspectiveCamera(Camera):
     type_name: ClassVar[str] = "perspective"
     default_viewer: ClassVar[str] = "local"
 
-    def rays(self) -> tuple[Float[Array, "height width 3"], Float[Array, "height width 3"]]:
-        """One origin, a direction per pixel."""
+    def rays_through(
+        self, x: Float[Array, "*#batch"], y: Float[Array, "*#batch"]
+    ) -> tuple[Float[Array, "*batch 3"], Float[Array, "*batch 3"]]:
+        """One origin, a direction per place."""
         right, up, forward = self.axes()
-        x, y = self.picture_plane()
         width, height = self.resolution
         half_width = jnp.tan(jnp.deg2rad(self.fov) / 2) * (width / height)
         directions = normalize(forward + half_width * (x[..., None] * right + y[..., None] * up))

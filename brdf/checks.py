@@ -104,3 +104,28 @@ def spectrum(name: str) -> Callable[[Any], Any]:
         return array
 
     return convert
+
+
+MAX_SAMPLES = 1 << 20
+
+
+def sample_number(value: Any) -> int:
+    """A converter for a light's number of samples: a whole number from 1 to ``MAX_SAMPLES``."""
+    remedy = "Give a whole number"
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise InputError("samples", f"must be a whole number, got {value!r}", remedy)
+    if not 1 <= value <= MAX_SAMPLES:
+        raise InputError("samples", f"must be between 1 and {MAX_SAMPLES}, got {value}", remedy)
+    return int(value)
+
+
+def vertex_list(name: str) -> Callable[[Any], Any]:
+    """A converter for corners of a polygon: three points or more."""
+
+    def convert(value: Any) -> Any:
+        array = _array(name, value, "a list of points")
+        if array.ndim != 2 or array.shape[0] < 3 or array.shape[1] != 3:
+            raise InputError(name, f"must be three points or more, got {_shown(value)}", "Give [[x, y, z], ...]")
+        return array
+
+    return convert

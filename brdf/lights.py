@@ -1,8 +1,12 @@
 """Lights: each turns into light samples (a direction and an intensity) at a surface point.
 
 Intensity means what the classic shading equation means by it: the radiance that a white Lambertian surface facing the
-light would show. A light's emittance has C channels. Each light answers for one point and one of its nodes; batching
-over points and the sum over nodes are outside.
+light would show. Irradiance is π times that, and a sample of radiance L over the solid angle dω has the intensity
+L dω / π. A light's emittance has C channels and the picture is linear in it. Each light answers for one point and one
+of its nodes; batching over points and the sum over nodes are outside.
+
+Here are the lights without extent; `brdf.area_lights` has rectangle, polygon and sphere, `brdf.environment` what
+surrounds the scene.
 """
 
 import abc
@@ -13,9 +17,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from brdf.checks import direction_value, spectrum, vector
+from brdf.checks import direction_value, number, spectrum, vector
 from brdf.errors import InputError
-from brdf.vectors import divide, norm, normalize
+from brdf.vectors import cosine_lobe, divide, dot, norm, normalize
+
+
+class Moments(NamedTuple):
+    """How the light of a sample that stands for a patch of the sky spreads around its direction.
+
+    Attributes:
+        mean: of the directions, weighted by radiance, (3,); shorter than 1.
+        covariance: of the directions, (3, 3).
+    """
+
+    mean: Float[Array, "3"]
+    covariance: Float[Array, "3 3"]
 
 
 class LightSample(NamedTuple):
@@ -25,11 +41,13 @@ class LightSample(NamedTuple):
         to_light: unit direction towards the light, (3,).
         intensity: what arrives, (C,), without the cosine at the surface.
         distance: to the light, in world units; infinite for a light at infinity.
+        moments: where the sample stands for a patch of the sky, how that spreads; None for a single direction.
     """
 
     to_light: Float[Array, "3"]
     intensity: Float[Array, " C"]
     distance: Float[Array, ""]
+    moments: Moments | None = None
 
 
 class Light(eqx.Module):
@@ -48,12 +66,13 @@ class Light(eqx.Module):
         """The quadrature nodes: a pytree of arrays with one leading axis, as long as the light has samples."""
 
     @abc.abstractmethod
-    def illuminate(self, node: Any, position: Float[Array, "3"]) -> LightSample:
+    def illuminate(self, node: Any, position: Float[Array, "3"], normal: Float[Array, "3"]) -> LightSample:
         """What one node sends to one point.
 
         Args:
             node: one row of ``nodes()``.
             position: the surface point, (3,), world units.
+            normal: the unit normal there, (3,): lights with an extent put their samples above its horizon.
         """
 
     @property
@@ -82,9 +101,36 @@ class DirectionalLight(Light):
         """One sample, and nothing to say of it."""
         return jnp.zeros((1, 0))
 
-    def illuminate(self, node: Any, position: Float[Array, "3"]) -> LightSample:
+    def illuminate(self, node: Any, position: Float[Array, "3"], normal: Float[Array, "3"]) -> LightSample:
         """The same at every point."""
         return LightSample(normalize(jnp.asarray(self.direction)), jnp.asarray(self.intensity), jnp.asarray(jnp.inf))
+
+
+def attenuated(
+    position: Float[Array, "3"], intensity: Float[Array, " C"], attenuation: Float[Array, "3"], at: Float[Array, "3"]
+) -> LightSample:
+    """The light of one point, falling off as 1 / (a + b d + c d²) at distance d.
+
+    Args:
+        position: of the light, (3,).
+        intensity: (C,).
+        attenuation: (a, b, c).
+        at: the surface point, (3,).
+
+    Source: OpenGL 1.5 specification, section 2.14.1.
+    """
+    offset = position - at
+    distance = norm(offset)
+    a, b, c = attenuation
+    falloff = divide(1.0, a + b * distance + c * distance * distance)
+    return LightSample(normalize(offset), intensity * falloff, distance)
+
+
+def _check_attenuation(attenuation: Any) -> None:
+    """Refuse a falloff that could turn negative."""
+    if isinstance(attenuation, np.ndarray) and np.any(attenuation < 0):
+        came = f"must be at least 0, got {attenuation.tolist()}"
+        raise InputError("attenuation", came, "Give three values of 0 or more")
 
 
 class PointLight(Light):
@@ -109,21 +155,62 @@ class PointLight(Light):
 
     def __check_init__(self):
         """Refuse a falloff that could turn negative."""
-        if isinstance(self.attenuation, np.ndarray) and np.any(self.attenuation < 0):
-            came = f"must be at least 0, got {self.attenuation.tolist()}"
-            raise InputError("attenuation", came, "Give three values of 0 or more")
+        _check_attenuation(self.attenuation)
 
     def nodes(self) -> Any:
         """One sample, and nothing to say of it."""
         return jnp.zeros((1, 0))
 
-    def illuminate(self, node: Any, position: Float[Array, "3"]) -> LightSample:
+    def illuminate(self, node: Any, position: Float[Array, "3"], normal: Float[Array, "3"]) -> LightSample:
         """From the point's distance and direction."""
-        offset = self.position - position
-        distance = norm(offset)
-        a, b, c = self.attenuation
-        falloff = divide(1.0, a + b * distance + c * distance * distance)
-        return LightSample(normalize(offset), self.intensity * falloff, distance)
+        return attenuated(self.position, self.intensity, self.attenuation, position)
 
 
-LIGHTS: dict[str, type[Light]] = {light.type_name: light for light in (DirectionalLight, PointLight)}
+class SpotLight(Light):
+    """A point light that shines into a cone: attenuation times cos^exponent of the angle to the axis.
+
+    Outside the cutoff there is no light at all. That edge has no derivative: the gradient by ``cutoff_angle`` is 0, and
+    those by position and direction leave out what the moving edge adds.
+
+    Args:
+        position: (3,), world units.
+        direction: the way it shines, (3,), any length but 0.
+        intensity: (C,), on the axis at distance 1 with the default attenuation.
+        cutoff_angle: between axis and edge, in degrees, 0 to 90, or 180 for no cutoff.
+        exponent: at least 0; 0 is the same brightness over the whole cone.
+        attenuation: (a, b, c), as for `PointLight`.
+
+    Raises:
+        InputError: where a value is not finite or out of its range.
+
+    Source: OpenGL 1.5 specification, section 2.14.1; there the exponent ends at 128, here it does not.
+    """
+
+    position: Float[Array, "3"] = eqx.field(converter=vector("position"))
+    direction: Float[Array, "3"] = eqx.field(converter=direction_value("direction"))
+    intensity: Float[Array, " C"] = eqx.field(converter=spectrum("intensity"))
+    cutoff_angle: Float[Array, ""] = eqx.field(converter=number("cutoff_angle", 0.0, 180.0), default=180.0)
+    exponent: Float[Array, ""] = eqx.field(converter=number("exponent", 0.0), default=0.0)
+    attenuation: Float[Array, "3"] = eqx.field(converter=direction_value("attenuation"), default=(0.0, 0.0, 1.0))
+    type_name: ClassVar[str] = "spot"
+    emittance_name: ClassVar[str] = "intensity"
+
+    def __check_init__(self):
+        """Refuse what OpenGL does not define."""
+        _check_attenuation(self.attenuation)
+        if isinstance(self.cutoff_angle, np.ndarray) and 90 < self.cutoff_angle < 180:
+            came = f"must be 0 to 90 degrees, or 180, got {float(self.cutoff_angle):g}"
+            raise InputError("cutoff_angle", came, "A spot of more than 90 degrees is a point light")
+
+    def nodes(self) -> Any:
+        """One sample, and nothing to say of it."""
+        return jnp.zeros((1, 0))
+
+    def illuminate(self, node: Any, position: Float[Array, "3"], normal: Float[Array, "3"]) -> LightSample:
+        """A point light's, times the spot's factor."""
+        sample = attenuated(self.position, self.intensity, self.attenuation, position)
+        axis = normalize(jnp.asarray(self.direction))
+        everywhere = jnp.asarray(self.cutoff_angle) >= 180
+        inside = everywhere | (-dot(sample.to_light, axis) >= jnp.cos(jnp.deg2rad(self.cutoff_angle)))
+        aligned = jnp.where(jnp.asarray(self.exponent) > 0, cosine_lobe(-sample.to_light, axis, self.exponent), 1.0)
+        return sample._replace(intensity=jnp.where(inside, aligned, 0.0) * sample.intensity)

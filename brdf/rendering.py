@@ -1,217 +1,27 @@
 """Basis images and pictures: image = k_a B_a + k_d B_d + k_s B_s(n).
 
 A picture is linear in k_a, k_d, k_s and in the light, so rendering, fitting and relighting all read the same basis
-images. This is the one pass over light samples that makes them. What a scene lacks is not compiled: without ambient
-light, lights or a specular term there is no arithmetic for it.
+images. They come from the one pass over light samples of `brdf.shading`. What a scene lacks is not compiled: without
+ambient light, lights, a specular term or occluders there is no arithmetic for it.
 """
 
-from collections.abc import Callable, Iterator
+import contextlib
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from brdf.errors import InputError
-from brdf.lights import Light, LightSample
+from brdf.lobes import AveragedLobe, Lobe, StoredLobe, StreamedLobe, average
 from brdf.models import Material, SpecularMaterial
 from brdf.precision import Precision, cast, working_precision
-from brdf.scene import Scene, SurfacePoints
-from brdf.vectors import BELOW_HORIZON, dot
-
-STORED_SAMPLES = 4
-"""Up to so many light samples the fit keeps their terms as arrays; beyond, it makes them anew at each exponent."""
-
-NO_LOBE = -1e9
-"""The peak of a pixel without a lobe: exp(n * this) = 0 for every n that a fit visits."""
-
-
-class LightTerms(eqx.Module):
-    """What one light sample adds to the basis images at one point.
-
-    Attributes:
-        diffuse: I (N·L)+, (C,).
-        weight: I, times N·L where the model says so, 0 where the lobe is gated, (C,).
-        log_cosine: logarithm of the lobe's cosine; 0 where the lobe is gated.
-    """
-
-    diffuse: Float[Array, "*pixels C"]
-    weight: Float[Array, "*pixels C"]
-    log_cosine: Float[Array, "*pixels"]
-
-
-def light_terms(model: type[Material], point: SurfacePoints, sample: LightSample) -> LightTerms:
-    """The terms of one light sample at one point.
-
-    Args:
-        model: the class of the material; its values are not needed.
-        point: one surface point.
-        sample: what the light sends there.
-    """
-    cosine = dot(point.normal, sample.to_light)
-    lit = point.mask & (cosine > 0)
-    diffuse = sample.intensity * jnp.where(lit, cosine, 0)
-    if not issubclass(model, SpecularMaterial):
-        return LightTerms(diffuse, jnp.zeros_like(diffuse), jnp.zeros_like(cosine))
-    log_cosine = model.log_cosine(point.normal, sample.to_light, point.to_view)
-    above = lit & (dot(point.normal, point.to_view) > 0) & (log_cosine > 0.5 * BELOW_HORIZON)
-    factor = cosine if model.cosine_weighted else jnp.ones_like(cosine)
-    weight = sample.intensity * jnp.where(above, factor, 0)
-    return LightTerms(diffuse, weight, jnp.where(above, log_cosine, 0))
-
-
-def _terms_of_node(model: type[Material], points: SurfacePoints, light: Light, node: Any) -> LightTerms:
-    def at_point(point: SurfacePoints) -> LightTerms:
-        return light_terms(model, point, light.illuminate(node, point.position))
-
-    return jax.vmap(at_point)(points)
-
-
-def _each_node(model: type[Material], points: SurfacePoints, lights: tuple[Light, ...]) -> Iterator[LightTerms]:
-    for light in lights:
-        nodes = light.nodes()
-        for index in range(sample_count(light)):
-            yield _terms_of_node(model, points, light, jax.tree.map(lambda leaf, i=index: leaf[i], nodes))
-
-
-def sample_count(light: Light) -> int:
-    """The number of samples of a light.
-
-    Args:
-        light: any light.
-    """
-    nodes = jax.eval_shape(light.nodes)
-    return jax.tree.leaves(nodes)[0].shape[0]
-
-
-def _power(weight: Array, log_cosine: Array, n: Array) -> tuple[Array, Array]:
-    value = weight * jnp.exp(jnp.asarray(n, log_cosine.dtype) * log_cosine)[:, None]
-    return value, value * log_cosine[:, None]
-
-
-def _peak(weight: Array, log_cosine: Array) -> Array:
-    return jnp.where(jnp.max(weight, axis=-1) > 0, log_cosine, NO_LOBE)
-
-
-class StoredLobe(eqx.Module):
-    """The specular basis of few light samples, kept as arrays: each evaluation costs an exponential per sample.
-
-    Attributes:
-        weights: of each sample, (P, C).
-        log_cosines: of each sample, (P,).
-    """
-
-    weights: tuple[Float[Array, "P C"], ...]
-    log_cosines: tuple[Float[Array, " P"], ...]
-
-    def __call__(self, n: Float[Array, ""]) -> tuple[Float[Array, "P C"], Float[Array, "P C"]]:
-        """The basis image without the model's scale, and its derivative in n.
-
-        Args:
-            n: the exponent.
-        """
-        value, slope = _power(self.weights[0], self.log_cosines[0], n)
-        for weight, log_cosine in zip(self.weights[1:], self.log_cosines[1:], strict=True):
-            more = _power(weight, log_cosine, n)
-            value, slope = value + more[0], slope + more[1]
-        return value, slope
-
-    def peak(self) -> Float[Array, " P"]:
-        """The largest logarithm of the lobe's cosine over the samples, `NO_LOBE` where no sample has one."""
-        peaks = [_peak(*sample) for sample in zip(self.weights, self.log_cosines, strict=True)]
-        return jnp.max(jnp.stack(peaks), axis=0)
-
-    def pixels(self, choose: Callable[[Array], Array]) -> "StoredLobe":
-        """The same for some of the pixels.
-
-        Args:
-            choose: applied to each array whose first axis is the pixels.
-        """
-        return jax.tree.map(choose, self)
-
-
-class StreamedLobe(eqx.Module):
-    """The specular basis of many light samples, made anew at each evaluation in bounded memory.
-
-    Attributes:
-        points: (P,) surface points.
-        lights: the lights.
-        model: the class of the material.
-    """
-
-    points: SurfacePoints
-    lights: tuple[Light, ...]
-    model: type[Material] = eqx.field(static=True)
-
-    def __call__(self, n: Float[Array, ""]) -> tuple[Float[Array, "P C"], Float[Array, "P C"]]:
-        """The basis image without the model's scale, and its derivative in n.
-
-        Args:
-            n: the exponent.
-        """
-
-        def of_terms(terms: LightTerms) -> tuple[Array, Array]:
-            return _power(terms.weight, terms.log_cosine, n)
-
-        return sum_over_samples(self.model, self.points, self.lights, of_terms)
-
-    def peak(self) -> Float[Array, " P"]:
-        """The largest logarithm of the lobe's cosine over the samples, `NO_LOBE` where no sample has one."""
-
-        def of_terms(terms: LightTerms) -> Array:
-            return _peak(terms.weight, terms.log_cosine)
-
-        return sum_over_samples(self.model, self.points, self.lights, of_terms, combine=jnp.maximum, start=NO_LOBE)
-
-    def pixels(self, choose: Callable[[Array], Array]) -> "StreamedLobe":
-        """The same for some of the pixels.
-
-        Args:
-            choose: applied to each array whose first axis is the pixels.
-        """
-        return StreamedLobe(jax.tree.map(choose, self.points), self.lights, self.model)
-
-
-Lobe = StoredLobe | StreamedLobe
-
-
-def sum_over_samples(
-    model: type[Material],
-    points: SurfacePoints,
-    lights: tuple[Light, ...],
-    of_terms: Any,
-    *,
-    combine: Any = jnp.add,
-    start: float = 0.0,
-) -> Any:
-    """Combine a function of the light terms over all samples, never holding more than one sample's images.
-
-    Args:
-        model: the class of the material.
-        points: (P,) surface points.
-        lights: the lights.
-        of_terms: from the `LightTerms` of one sample to a pytree of (P, ...) arrays.
-        combine: how two values become one.
-        start: what `combine` starts from.
-    """
-    total = None
-    for light in lights:
-        nodes = light.nodes()
-        first = jax.tree.map(lambda leaf: leaf[0], nodes)
-
-        def of_node(node: Any, light: Light = light) -> Any:
-            return of_terms(_terms_of_node(model, points, light, node))
-
-        if sample_count(light) == 1:
-            value = of_node(first)
-            total = value if total is None else jax.tree.map(combine, total, value)
-            continue
-        if total is None:
-            total = jax.tree.map(lambda leaf: jnp.full(leaf.shape, start, leaf.dtype), jax.eval_shape(of_node, first))
-        step = jax.checkpoint(lambda carry, node: (jax.tree.map(combine, carry, of_node(node)), None))
-        total, _ = jax.lax.scan(step, total, nodes)
-    return total
+from brdf.scene import Scene
+from brdf.shading import STORED_SAMPLES, LightTerms, each_sample, sample_count, sum_over_samples
+from brdf.surface_points import SurfacePoints
+from brdf.visibility import Lighting
 
 
 class Basis(eqx.Module):
@@ -231,7 +41,8 @@ class Basis(eqx.Module):
 
 
 def _flat(points: SurfacePoints) -> SurfacePoints:
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf).reshape(-1, *leaf.shape[2:]), points)
+    centres = eqx.tree_at(lambda p: p.area, points, None, is_leaf=lambda leaf: leaf is None)
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf).reshape(-1, *leaf.shape[2:]), centres)
 
 
 def basis(model: type[Material], scene: Scene, *, points: SurfacePoints | None = None) -> Basis:
@@ -243,22 +54,34 @@ def basis(model: type[Material], scene: Scene, *, points: SurfacePoints | None =
         points: what the pixels see, where that is known already.
     """
     points = scene.surface_points() if points is None else points
-    return _basis(model, points, scene.ambient, scene.lights)
+    return _basis(model, points, scene.ambient, scene.lighting)
 
 
 @eqx.filter_jit
-def _basis(model: type[Material], points: SurfacePoints, ambient: Any, lights: tuple[Light, ...]) -> Basis:
-    points = _flat(points)
-    if not lights:
-        return Basis(points, ambient, None, None)
+def _basis(model: type[Material], points: SurfacePoints, ambient: Any, lighting: Lighting) -> Basis:
+    centres = _flat(points)
+    if not lighting.lights:
+        return Basis(centres, ambient, None, None)
+    diffuse, lobe = _diffuse_and_lobe(model, centres, lighting)
+    if points.area is not None:
+        fine_diffuse, fine_lobe = _diffuse_and_lobe(model, _flat(points.area.points), lighting)
+        diffuse = diffuse.at[points.area.pixel].set(average(points.area.weight, fine_diffuse), mode="drop")
+        if lobe is not None and fine_lobe is not None:
+            lobe = AveragedLobe(lobe, fine_lobe, points.area.weight, points.area.slot.ravel())
+    return Basis(centres, ambient, diffuse, lobe)
+
+
+def _diffuse_and_lobe(
+    model: type[Material], points: SurfacePoints, lighting: Lighting
+) -> tuple[Float[Array, "P C"], StoredLobe | StreamedLobe | None]:
     specular = issubclass(model, SpecularMaterial)
-    if sum(map(sample_count, lights)) <= STORED_SAMPLES:
-        terms = list(_each_node(model, points, lights))
+    if sum(map(sample_count, lighting.lights)) <= STORED_SAMPLES:
+        terms = list(each_sample(model, points, lighting))
         diffuse = sum((term.diffuse for term in terms[1:]), start=terms[0].diffuse)
         lobe = StoredLobe(tuple(t.weight for t in terms), tuple(t.log_cosine for t in terms))
-        return Basis(points, ambient, diffuse, lobe if specular else None)
-    diffuse = sum_over_samples(model, points, lights, lambda terms: terms.diffuse)
-    return Basis(points, ambient, diffuse, StreamedLobe(points, lights, model) if specular else None)
+        return diffuse, lobe if specular else None
+    diffuse = sum_over_samples(model, points, lighting, lambda terms: terms.diffuse)
+    return diffuse, StreamedLobe(points, lighting, model) if specular else None
 
 
 class BasisImages(eqx.Module):
@@ -287,7 +110,7 @@ def basis_images(
         points: what the pixels see, where that is known already.
     """
     points = scene.surface_points() if points is None else points
-    return _basis_images(model, points, scene.ambient, scene.lights, jnp.asarray(n))
+    return _basis_images(model, points, scene.ambient, scene.lighting, jnp.asarray(n))
 
 
 @eqx.filter_jit
@@ -295,25 +118,36 @@ def _basis_images(
     model: type[Material],
     points: SurfacePoints,
     ambient: Float[Array, " C"] | None,
-    lights: tuple[Light, ...],
+    lighting: Lighting,
     n: Float[Array, ""],
 ) -> BasisImages:
-    shape = points.mask.shape
-
-    def picture(flat: Float[Array, "P C"] | None) -> Float[Array, "H W C"] | None:
-        return None if flat is None else flat.reshape(*shape, -1)
+    shape, area = points.mask.shape, points.area
 
     def of_terms(terms: LightTerms) -> tuple[Array, Array | None]:
         if not issubclass(model, SpecularMaterial):
             return terms.diffuse, None
         return terms.diffuse, terms.weight * (model.scale(n) * jnp.exp(n * terms.log_cosine))[:, None]
 
-    ambient = None if ambient is None else jnp.where(points.mask[..., None], ambient, 0)
-    diffuse, specular = sum_over_samples(model, _flat(points), lights, of_terms) if lights else (None, None)
-    return BasisImages(ambient, picture(diffuse), picture(specular))
+    def lit(points: SurfacePoints) -> tuple[Array | None, Array | None]:
+        return sum_over_samples(model, points, lighting, of_terms) if lighting.lights else (None, None)
+
+    def averaged(centre: Array | None, fine: Array | None) -> Float[Array, "H W C"] | None:
+        if centre is not None and fine is not None and area is not None:
+            centre = centre.at[area.pixel].set(average(area.weight, fine), mode="drop")
+        return None if centre is None else centre.reshape(*shape, -1)
+
+    def seen(points: SurfacePoints) -> Array | None:
+        return None if ambient is None else jnp.where(points.mask[:, None], ambient, 0)
+
+    centres = _flat(points)
+    images = (seen(centres), *lit(centres))
+    if area is None:
+        return BasisImages(*(averaged(image, None) for image in images))
+    fine = _flat(area.points)
+    return BasisImages(*map(averaged, images, (seen(fine), *lit(fine))))
 
 
-def combine(material: Material, images: BasisImages) -> Float[Array, "H W C"] | None:
+def combine(material: Material, images: BasisImages) -> Any:
     """The picture k_a B_a + k_d B_d + k_s B_s; None where there is no light at all.
 
     Args:
@@ -328,9 +162,17 @@ def combine(material: Material, images: BasisImages) -> Float[Array, "H W C"] | 
 
 
 @eqx.filter_jit
-def _shade(material: Material, points: SurfacePoints, ambient: Any, lights: tuple[Light, ...]) -> Any:
+def shade(material: Material, points: SurfacePoints, ambient: Any, lighting: Lighting) -> Any:
+    """The picture of a material at given points; None where there is no light at all.
+
+    Args:
+        material: what the points are made of.
+        points: what the pixels see.
+        ambient: intensity of the ambient light, (C,), or None.
+        lighting: lights and occluders.
+    """
     n = material.n if isinstance(material, SpecularMaterial) else jnp.ones(())
-    return combine(material, _basis_images(type(material), points, ambient, lights, jnp.asarray(n)))
+    return combine(material, _basis_images(type(material), points, ambient, lighting, jnp.asarray(n)))
 
 
 def render(material: Material, scene: Scene, *, precision: Precision | None = None) -> Float[Array, "H W C"]:
@@ -350,13 +192,42 @@ def render(material: Material, scene: Scene, *, precision: Precision | None = No
     Raises:
         InputError: where material and light differ in their channels.
     """
+    with working_precision(precision):
+        channels = channels_of(material, scene)
+        points = seen(scene, precision)
+        material, scene = cast((material, scene), precision)
+        image = shade(material, points, scene.ambient, scene.lighting)
+        width, height = scene.resolution
+        return jnp.zeros((height, width, channels)) if image is None else image
+
+
+def seen(scene: Scene, precision: Precision | None) -> SurfacePoints:
+    """What each pixel sees, in a precision.
+
+    Args:
+        scene: the scene; where pixels are averaged over their area, and nothing of it is being traced, the pixels that
+            need it are found at once, also inside a transformation of the material.
+        precision: "float32", "float64" or None.
+    """
+    samples = 1 if scene.camera is None else scene.camera.samples
+    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(scene))
+    now = jax.ensure_compile_time_eval() if samples > 1 and not traced else contextlib.nullcontext()
+    with now:
+        return cast(scene, precision).surface_points()
+
+
+def channels_of(material: Material, scene: Scene) -> int:
+    """The number of channels of a material's picture.
+
+    Args:
+        material: with as many channels as the light, or one of the two with 1.
+        scene: with the light.
+
+    Raises:
+        InputError: where they differ.
+    """
     counts = {scene.channels, material.k_d.shape[0]} - {1}
     if len(counts) > 1:
         came = f"has {material.k_d.shape[0]} channels, the light has {scene.channels}"
         raise InputError("material", came, "Give both the same number, or one of them a single channel")
-    with working_precision(precision):
-        material, scene = cast((material, scene), precision)
-        image = _shade(material, scene.surface_points(), scene.ambient, scene.lights)
-        width, height = scene.resolution
-        channels = max(scene.channels, material.k_d.shape[0])
-        return jnp.zeros((height, width, channels)) if image is None else image
+    return max(scene.channels, material.k_d.shape[0])

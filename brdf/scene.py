@@ -4,82 +4,21 @@ from pathlib import Path
 from typing import Any
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from brdf.camera import Camera
-from brdf.checks import direction_value, spectrum
+from brdf.checks import spectrum
 from brdf.errors import InputError
 from brdf.lights import Light
-from brdf.precision import apart
+from brdf.pixel_area import with_area
 from brdf.shapes import Shape
+from brdf.surface_points import SurfacePoints
+from brdf.tracing import look
+from brdf.visibility import Lighting, given_visibility, occluders
 
 
-class SurfacePoints(eqx.Module):
-    """What the pixels see: one surface point each.
-
-    Attributes:
-        position: (..., 3), world units.
-        normal: (..., 3), unit.
-        to_view: (..., 3), unit, towards the eye.
-        mask: (...), whether the pixel sees a fitted surface; elsewhere the other values are finite and mean nothing.
-    """
-
-    position: Float[Array, "*pixels 3"]
-    normal: Float[Array, "*pixels 3"]
-    to_view: Float[Array, "*pixels 3"]
-    mask: Bool[Array, "*pixels"]
-
-    @classmethod
-    def from_normals(
-        cls,
-        normal: Any,
-        *,
-        position: Any = None,
-        mask: Any = None,
-        to_view: Any = (0.0, 0.0, 1.0),
-    ) -> "SurfacePoints":
-        """Surface points from a normal map, as a scanner, a renderer or photometric stereo gives it.
-
-        Args:
-            normal: (H, W, 3), any length; zero or not finite where the pixel sees no surface.
-            position: (H, W, 3), world units; may be left out where every light is directional.
-            mask: (H, W), bool; further pixels to leave out.
-            to_view: direction towards the eye, (3,) for an orthographic picture or (H, W, 3).
-
-        Raises:
-            InputError: where the shapes do not belong together.
-        """
-        normal = np.asarray(normal, dtype=np.float64)
-        if normal.ndim != 3 or normal.shape[-1] != 3:
-            raise InputError("normal", f"must be of shape (H, W, 3), got {normal.shape}", "Give a normal map")
-        length = np.sqrt(np.sum(normal * normal, axis=-1))
-        seen = np.isfinite(length) & (length > 0)
-        if position is None:
-            position = np.zeros(normal.shape)
-        position = np.asarray(position, dtype=np.float64)
-        to_view = np.asarray(to_view, dtype=np.float64)
-        if to_view.shape == (3,):
-            to_view = np.broadcast_to(direction_value("to_view")(to_view), normal.shape)
-        for name, value in (("position", position), ("to_view", to_view)):
-            if value.shape != normal.shape:
-                raise InputError(name, f"must be of shape {normal.shape}, got {value.shape}", "Give a value per pixel")
-            seen &= np.all(np.isfinite(value), axis=-1)
-        if mask is not None:
-            mask = np.asarray(mask, dtype=bool)
-            if mask.shape != seen.shape:
-                raise InputError("mask", f"must be of shape {seen.shape}, got {mask.shape}", "Give a value per pixel")
-            seen &= mask
-        view_length = np.sqrt(np.sum(to_view * to_view, axis=-1, keepdims=True))
-        upward = np.array([0.0, 0.0, 1.0])
-        return cls(
-            position=np.where(seen[..., None], position, 0.0),
-            normal=np.where(seen[..., None], normal / np.where(seen, length, 1.0)[..., None], upward),
-            to_view=np.where(seen[..., None], to_view / np.where(view_length > 0, view_length, 1.0), upward),
-            mask=seen,
-        )
+def _is_none(value: Any) -> bool:
+    return value is None
 
 
 def _ambient(value: Any) -> Any:
@@ -98,6 +37,8 @@ class Scene(eqx.Module):
         points: (H, W) surface points from elsewhere, instead of camera and shapes.
         ambient: intensity of the ambient light, (C,), or None.
         lights: the lights.
+        visibility: for each light (H, W) values from 0 to 1, how much of it each pixel sees, where that is known, or
+            None where the shapes tell; () where they tell for all. It multiplies whatever shadows the shapes cast.
 
     Raises:
         InputError: where the parts do not belong together.
@@ -108,6 +49,7 @@ class Scene(eqx.Module):
     points: SurfacePoints | None = None
     ambient: Float[Array, " C"] | None = eqx.field(converter=_ambient, default=None)
     lights: tuple[Light, ...] = eqx.field(converter=tuple, default=())
+    visibility: tuple[Float[Array, "H W"] | None, ...] = eqx.field(converter=given_visibility, default=())
 
     def __check_init__(self):
         """Refuse parts that do not belong together."""
@@ -119,6 +61,14 @@ class Scene(eqx.Module):
         if self.points is not None and self.shapes and all(shape.fitted for shape in self.shapes):
             remedy = "Set fitted = false: beside surface points, shapes are occluders only"
             raise InputError("shapes", "must not be fitted where surface points are given", remedy)
+        if self.visibility and len(self.visibility) != len(self.lights):
+            came = f"has {len(self.visibility)} entries for {len(self.lights)} lights"
+            raise InputError("visibility", came, "Give one for each light, None where the shapes tell")
+        width, height = self.resolution
+        for mask in self.visibility:
+            if mask is not None and mask.shape != (height, width):
+                came = f"must be of shape {(height, width)}, got {mask.shape}"
+                raise InputError("visibility", came, "Give a value per pixel")
         counts = sorted({emittance.shape[0] for emittance in self.emittances()})
         if len([count for count in counts if count != 1]) > 1:
             came = f"lights have {' and '.join(map(str, counts))} channels"
@@ -145,10 +95,17 @@ class Scene(eqx.Module):
 
     def surface_points(self) -> SurfacePoints:
         """What each pixel sees, (H, W): traced by the camera, or as given."""
+        visibility = self.visibility or None
         if self.points is not None:
-            return self.points
+            return eqx.tree_at(lambda points: points.visibility, self.points, visibility, is_leaf=_is_none)
         assert self.camera is not None
-        return _surface_points(self.camera, self.shapes)
+        points = look(self.camera, self.shapes, visibility)
+        return points if self.camera.samples == 1 else with_area(points, self.camera, self.shapes, self.lighting)
+
+    @property
+    def lighting(self) -> Lighting:
+        """The lights, and the shapes that stand in their way."""
+        return Lighting(self.lights, occluders(self.shapes, traced=self.camera is not None))
 
     @classmethod
     def load(cls, path: str | Path) -> "Scene":
@@ -168,32 +125,12 @@ class Scene(eqx.Module):
         """Write a scene file that `load` reads back to the same scene.
 
         Args:
-            path: a ``.toml`` file; geometry given as surface points is written beside it as ``<name>.aov.exr``.
+            path: a ``.toml`` file; surface points, meshes, environment maps and shadow masks are written beside it, as
+                ``<name>.aov.exr`` and so on.
 
         Raises:
             InputError: where the file cannot be written.
         """
-        from brdf.scene_file import save_scene
+        from brdf.scene_writer import save_scene
 
         save_scene(self, path)
-
-
-@eqx.filter_jit
-def _surface_points(camera: Camera, shapes: tuple[Shape, ...]) -> SurfacePoints:
-    return apart(_trace, camera, shapes)
-
-
-def _trace(camera: Camera, shapes: tuple[Shape, ...]) -> SurfacePoints:
-    origins, directions = camera.rays()
-    distance = jnp.full(origins.shape[:-1], jnp.inf)
-    mask = jnp.zeros(origins.shape[:-1], bool)
-    position, normal = origins, -directions
-    for shape in shapes:
-        hit = jax.vmap(jax.vmap(shape.intersect))(origins, directions)
-        nearer = hit.hit & (hit.distance < distance)
-        distance = jnp.where(nearer, hit.distance, distance)
-        mask = jnp.where(nearer, shape.fitted, mask)
-        position = jnp.where(nearer[..., None], hit.position, position)
-        normal = jnp.where(nearer[..., None], hit.normal, normal)
-    to_view = jnp.where(mask[..., None], camera.to_view(position), normal)
-    return SurfacePoints(position, normal, to_view, mask)

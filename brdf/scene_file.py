@@ -1,22 +1,37 @@
-"""scene.toml in and out. Strict: an unknown key, a wrong type or a missing value names file, table and key."""
+"""scene.toml as an object. Strict: an unknown key, a wrong type or a missing value names file, table and key."""
 
 import dataclasses
 import json
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from brdf.camera import CAMERAS, Camera
+from brdf.area_lights import PolygonLight, RectangleLight, SphereLight
+from brdf.camera import CAMERAS
+from brdf.environment import ConstantEnvironment, EnvironmentMap
 from brdf.errors import InputError
-from brdf.files import read_text, write_text
-from brdf.images import read_layers, write_layers
-from brdf.lights import LIGHTS
-from brdf.scene import Scene, SurfacePoints
+from brdf.files import read_text
+from brdf.images import read_image, read_layers
+from brdf.lights import DirectionalLight, Light, PointLight, SpotLight
+from brdf.meshes import Triangles, load_mesh
+from brdf.scene import Scene
 from brdf.shapes import Rectangle, Shape, Sphere
+from brdf.surface_points import SurfacePoints
 
-SHAPES: dict[str, type[Shape]] = {"sphere": Sphere, "rectangle": Rectangle}
+SHAPES: dict[str, type[Shape]] = {"sphere": Sphere, "rectangle": Rectangle, "triangles": Triangles}
+LIGHTS: dict[str, type[Light]] = {
+    light.type_name: light
+    for light in (
+        DirectionalLight,
+        PointLight,
+        SpotLight,
+        RectangleLight,
+        PolygonLight,
+        SphereLight,
+        ConstantEnvironment,
+    )
+}
 POSITION_LAYERS = ("position", "P")
 NORMAL_LAYERS = ("normal", "sh_normal", "N")
 VIEW_LAYERS = ("to_view",)
@@ -51,7 +66,7 @@ class _Table:
 
     def build(self, cls: type) -> Any:
         """An object from the keys that bear its fields' names."""
-        fields = {field.name: field for field in dataclasses.fields(cls)}
+        fields = {field.name: field for field in dataclasses.fields(cls) if field.init}
         values = {name: _plain(f"{self.place}.{name}", self.pop(name)) for name in fields if name in self.values}
         self.done(list(fields))
         missing = [name for name, field in fields.items() if name not in values and not _has_default(field)]
@@ -67,14 +82,22 @@ def _has_default(field: Any) -> bool:
     return field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
 
 
+def _flatten(value: Any) -> Iterator[Any]:
+    if isinstance(value, list):
+        for item in value:
+            yield from _flatten(item)
+    else:
+        yield value
+
+
 def _plain(place: str, value: Any) -> Any:
     """A value of the file, refused where Python would silently read a truth value or text as a number."""
-    numbers = value if isinstance(value, list) else [value]
+    numbers = list(_flatten(value))
     if any(isinstance(number, bool) for number in numbers) and not place.endswith(".fitted"):
         raise InputError(place, f"must be a number, got {json.dumps(value)}", "Give numbers")
     if place.endswith(".fitted") and not isinstance(value, bool):
         raise InputError(place, f"must be true or false, got {value!r}", "Correct the value")
-    if isinstance(value, list) and any(isinstance(number, str) for number in value):
+    if isinstance(value, list) and any(isinstance(number, str) for number in numbers):
         raise InputError(place, f"must be numbers, got {value!r}", "Give numbers without quotes")
     if isinstance(value, str) and not place.endswith((".viewer", ".file")):
         raise InputError(place, f"must be a number, got {value!r}", "Give numbers without quotes")
@@ -93,12 +116,12 @@ def load_scene(path: str | Path) -> Scene:
     values = _read_toml(path)
     root = _Table(str(path), values)
     place = f"{path}: "
-    camera, shapes, points, ambient, lights = None, [], None, None, []
+    camera, shapes, points, ambient, lights, masks = None, [], None, None, [], []
     if "camera" in root.values:
         table = _Table(place + "camera", root.pop("camera"))
         camera = table.build(table.choose("type", CAMERAS))
     for table in _tables(place + "shapes", root.pop("shapes", [])):
-        shapes.append(table.build(table.choose("type", SHAPES)))
+        shapes.append(_load_shape(table, path.parent))
     if "aov" in root.values:
         points = _load_points(_Table(place + "aov", root.pop("aov")), path.parent)
     if "ambient" in root.values:
@@ -108,12 +131,14 @@ def load_scene(path: str | Path) -> Scene:
         ambient = _plain(f"{table.place}.intensity", table.pop("intensity"))
         table.done(["intensity"])
     for table in _tables(place + "lights", root.pop("lights", [])):
-        lights.append(table.build(table.choose("type", LIGHTS)))
+        masks.append(_load_mask(table, path.parent))
+        lights.append(_load_light(table, path.parent))
     if root.values:
         known = "camera, shapes, aov, ambient, lights"
         raise InputError(f"{path}: {next(iter(root.values))}", "is not a known key", f"Known here: {known}")
     try:
-        return Scene(camera=camera, shapes=shapes, points=points, ambient=ambient, lights=lights)
+        visibility = () if all(mask is None for mask in masks) else masks
+        return Scene(camera=camera, shapes=shapes, points=points, ambient=ambient, lights=lights, visibility=visibility)
     except InputError as error:
         raise error.inside(str(path)) from None
 
@@ -125,17 +150,59 @@ def _read_toml(path: Path) -> dict[str, Any]:
         raise InputError(path, f"is not TOML ({error})", "Correct the file") from None
 
 
+def _file(table: _Table, key: str, folder: Path, example: str) -> Path:
+    """The file that a key names."""
+    if key not in table.values:
+        raise InputError(table.place, f"has no {key}", f'Add {key} = "{example}"')
+    name = table.pop(key)
+    if not isinstance(name, str):
+        raise InputError(f"{table.place}.{key}", f"must be a path, got {name!r}", f'Give a path like "{example}"')
+    return inside(folder, name, f"{table.place}.{key}")
+
+
+def _load_shape(table: _Table, folder: Path) -> Shape:
+    cls = table.choose("type", SHAPES)
+    if cls is not Triangles:
+        return table.build(cls)
+    mesh = load_mesh(_file(table, "file", folder, "mesh.obj"))
+    fitted = _plain(f"{table.place}.fitted", table.pop("fitted", True))
+    table.done(["type", "file", "fitted"])
+    return Triangles(mesh, fitted=fitted)
+
+
+def _load_light(table: _Table, folder: Path) -> Light:
+    cls = table.choose("type", LIGHTS)
+    if cls is not ConstantEnvironment or "file" not in table.values:
+        return table.build(cls)
+    path = _file(table, "file", folder, "sky.exr")
+    values = {
+        key: _plain(f"{table.place}.{key}", table.pop(key)) for key in ("radiance", "samples") if key in table.values
+    }
+    table.done(["type", "file", "radiance", "samples", "visibility", "visibility_layer"])
+    pixels = read_image(path)
+    try:
+        return EnvironmentMap(pixels, **values)
+    except InputError as error:
+        raise error.inside(table.place) from None
+
+
+def _load_mask(table: _Table, folder: Path) -> Any:
+    """How much of the light each pixel sees, where a file tells; the first channel of the picture or layer."""
+    if "visibility" not in table.values:
+        return None
+    path = _file(table, "visibility", folder, "shadow.exr")
+    layer = table.pop("visibility_layer")
+    if layer is None:
+        return read_image(path, encoding="linear")[..., 0]
+    return _layer(read_layers(path), layer, (), path)[..., 0]
+
+
 def _load_points(table: _Table, folder: Path) -> SurfacePoints:
     """Surface points from the layers of an image file."""
-    if "file" not in table.values:
-        raise InputError(table.place, "has no file", 'Add file = "aovs.exr"')
-    name = _plain(f"{table.place}.file", table.pop("file"))
-    if not isinstance(name, str):
-        raise InputError(f"{table.place}.file", f"must be a path, got {name!r}", "Give the path of an EXR file")
+    path = _file(table, "file", folder, "aovs.exr")
     to_view = table.pop("to_view")
     names = {key: table.pop(key) for key in ("position", "normal")}
     table.done(["file", "position", "normal", "to_view"])
-    path = inside(folder, name, f"{table.place}.file")
     layers = read_layers(path)
     normal = _layer(layers, names["normal"], NORMAL_LAYERS, path)
     if normal is None:
@@ -173,51 +240,3 @@ def inside(folder: Path, name: str, place: str) -> Path:
     if not path.resolve().is_relative_to(folder.resolve()):
         raise InputError(place, f"must stay within the scene's folder, got {name!r}", "Move the file there")
     return path
-
-
-def _toml(value: Any) -> str:
-    """A TOML value: what JSON and TOML write alike."""
-    if hasattr(value, "shape"):
-        value = np.asarray(value, dtype=np.float64).tolist()
-    return json.dumps(value)
-
-
-def _section(header: str, values: dict[str, Any]) -> str:
-    return "\n".join([header] + [f"{key} = {_toml(value)}" for key, value in values.items()]) + "\n"
-
-
-def _fields(item: Any, kind: str | None) -> dict[str, Any]:
-    values = {} if kind is None else {"type": kind}
-    for field in dataclasses.fields(item):
-        name, value = field.name, getattr(item, field.name)
-        if value is not None and not (name == "fitted" and value):
-            values[name] = list(value) if isinstance(value, tuple) else value
-    return values
-
-
-def save_scene(scene: Scene, path: str | Path) -> None:
-    """Write a scene file; see `Scene.save`."""
-    path = Path(path)
-    sections = []
-    if scene.camera is not None:
-        sections.append(_section("[camera]", _fields(scene.camera, scene.camera.type_name)))
-    if scene.points is not None:
-        name = path.stem + ".aov.exr"
-        _save_points(scene.points, path.with_name(name))
-        sections.append(_section("[aov]", {"file": name}))
-    names = {cls: name for name, cls in SHAPES.items()}
-    sections += [_section("[[shapes]]", _fields(shape, names[type(shape)])) for shape in scene.shapes]
-    if scene.ambient is not None:
-        sections.append(_section("[ambient]", {"intensity": scene.ambient}))
-    sections += [_section("[[lights]]", _fields(light, light.type_name)) for light in scene.lights]
-    write_text(path, "\n".join(sections))
-
-
-def _save_points(points: SurfacePoints, path: Path) -> None:
-    mask = np.asarray(points.mask)[..., None]
-    layers = {
-        "position": np.asarray(points.position),
-        "normal": np.where(mask, np.asarray(points.normal), 0.0),
-        "to_view": np.asarray(points.to_view),
-    }
-    write_layers(path, layers)

@@ -41,6 +41,15 @@ class Shape(eqx.Module):
 
     fitted: bool = eqx.field(static=True, default=True, kw_only=True)
 
+    @property
+    def convex(self) -> bool:
+        """Whether it cannot cast a shadow on its own lit side."""
+        return True
+
+    @abc.abstractmethod
+    def extent(self) -> Float[Array, ""]:
+        """A length of the order of the shape: rounding moves its surface by some 1e-7 of this and its position."""
+
     @abc.abstractmethod
     def intersect(self, origin: Float[Array, "3"], direction: Float[Array, "3"]) -> Hit:
         """The nearest hit in front of ``origin``.
@@ -65,6 +74,10 @@ class Sphere(Shape):
 
     center: Float[Array, "3"] = eqx.field(converter=vector("center"))
     radius: Float[Array, ""] = eqx.field(converter=positive("radius"))
+
+    def extent(self) -> Float[Array, ""]:
+        """The radius."""
+        return jnp.asarray(self.radius)
 
     def intersect(self, origin: Float[Array, "3"], direction: Float[Array, "3"]) -> Hit:
         """The nearest hit in front of ``origin``.
@@ -105,6 +118,10 @@ class Rectangle(Shape):
     def __check_init__(self):
         """Refuse edges that span no area."""
         check_spans_area(self.edge_u, self.edge_v)
+
+    def extent(self) -> Float[Array, ""]:
+        """The larger half-edge's largest component."""
+        return jnp.maximum(jnp.max(jnp.abs(self.edge_u)), jnp.max(jnp.abs(self.edge_v)))
 
     def intersect(self, origin: Float[Array, "3"], direction: Float[Array, "3"]) -> Hit:
         """The hit, from either side; the normal always is that of the front side."""

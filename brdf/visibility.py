@@ -1,0 +1,87 @@
+"""Which lights a point sees: shadow rays against the scene's shapes, or masks that are given.
+
+Shadows are hard for each light sample; an area light's many samples make them soft. What casts a shadow is decided when
+the program is compiled: a scene whose shapes cannot shadow anything (one sphere, one rectangle) has no shadow rays.
+
+A shadow edge has no derivative: visibility counts as constant, so gradients by positions of lights and shapes leave out
+what a moving edge adds. They are exact for pixels that no edge passes, and for intensities everywhere.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool
+
+from brdf.errors import InputError
+from brdf.lights import Light, LightSample
+from brdf.shapes import Shape
+from brdf.surface_points import SurfacePoints
+
+OFFSET = 300
+"""Shadow rays start this many rounding errors above the surface: 4e-5 of the coordinates in float32."""
+
+
+class Lighting(eqx.Module):
+    """The lights, and the shapes that stand in their way.
+
+    Attributes:
+        lights: the lights.
+        occluders: the scene's shapes in its order; none where they cannot shadow anything that is seen.
+    """
+
+    lights: tuple[Light, ...]
+    occluders: tuple[Shape, ...] = ()
+
+
+def occluders(shapes: tuple[Shape, ...], *, traced: bool) -> tuple[Shape, ...]:
+    """The shapes that can cast a shadow on what is seen.
+
+    Args:
+        shapes: of the scene.
+        traced: whether the surface points lie on them.
+    """
+    return () if traced and len(shapes) == 1 and shapes[0].convex else tuple(shapes)
+
+
+def blocked(occluders: tuple[Shape, ...], point: SurfacePoints, sample: LightSample) -> Bool[Array, ""]:
+    """Whether a shape stands between a point and a light sample.
+
+    Args:
+        occluders: at least one; all shapes of the scene, in its order.
+        point: one surface point.
+        sample: what the light sends there.
+    """
+    found = jnp.asarray(False)
+    position, normal, to_light, distance = jax.lax.stop_gradient(
+        (point.position, point.normal, sample.to_light, sample.distance)
+    )
+    size = jnp.max(jnp.abs(position))
+    rounding = OFFSET * jnp.finfo(jnp.result_type(position)).eps
+    for index, shape in enumerate(jax.lax.stop_gradient(occluders)):
+        start = position + rounding * jnp.maximum(size, shape.extent()) * normal
+        hit = shape.intersect(start, to_light)
+        between = hit.hit & (hit.distance < distance * (1 - 4 * rounding))
+        if shape.convex and point.shape is not None:
+            between &= point.shape != index  # the horizon has dealt with that
+        found |= between
+    return found
+
+
+def given_visibility(value: Any) -> tuple[Any, ...]:
+    """A converter for given shadow masks: (H, W) values from 0 to 1, or None, one for each light."""
+    return tuple(None if mask is None else _mask(mask) for mask in value)
+
+
+def _mask(mask: Any) -> Any:
+    if isinstance(mask, jax.Array):
+        return mask
+    array = np.asarray(mask, dtype=np.float64)
+    if array.ndim != 2:
+        raise InputError("visibility", f"must be of shape (H, W), got {array.shape}", "Give a value per pixel")
+    if not np.all((array >= 0) & (array <= 1)):
+        came = f"must lie between 0 and 1, got {np.min(array):g} to {np.max(array):g}"
+        raise InputError("visibility", came, "Give the share of the light that each pixel sees")
+    return array
