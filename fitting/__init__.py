@@ -7,14 +7,18 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from fitting.brdf_fit import fit_brdf
+    from fitting.brdf_result import BrdfFitResult
     from fitting.joint import fit_jointly
     from fitting.picture_fit import fit
     from fitting.result import FitResult, Parameter
 
 _ROOM_OF = {
+    "BrdfFitResult": "brdf_result",
     "FitResult": "result",
     "Parameter": "result",
     "fit": "picture_fit",
+    "fit_brdf": "brdf_fit",
     "fit_jointly": "joint",
 }
 
