@@ -72,7 +72,8 @@ def _from_patch(radiance: Array, point: Array, area: Array, light_normal: Array,
     squared = dot(offset, offset)
     to_light = normalize(offset)
     facing = jnp.maximum(-dot(to_light, light_normal), 0.0)
-    return LightSample(to_light, radiance * divide(area * facing, np.pi * squared), norm(offset))
+    squared_radius = divide(area * facing, np.pi * squared)
+    return LightSample(to_light, radiance * squared_radius, norm(offset), square_root(squared_radius))
 
 
 class RectangleLight(Light):
@@ -138,6 +139,8 @@ class PolygonLight(Light):
 
     def __post_init__(self):
         """Cut it into triangles, once."""
+        self.vertices = vertex_list("vertices")(self.vertices)  # a field's converter would run after this
+        self.samples = sample_number(self.samples)
         self.triangles = triangulate(self.vertices)
         if self.samples < len(self.triangles):
             came = f"must be at least {len(self.triangles)} for {len(self.vertices)} vertices, got {self.samples}"
@@ -198,10 +201,13 @@ class SphereLight(Light):
         share = low + node.s * (high - low)
         below_axis = share * height  # 1 - cos of the angle to the axis
         to_light = (1.0 - below_axis) * axis + square_root(below_axis * (2.0 - below_axis)) * outward
-        intensity = self.radiance * (2.0 * height * (high - low) * node.weight)
+        squared_radius = 2.0 * height * (high - low) * node.weight
         along_ray = distance * (1.0 - below_axis)
         half_chord = square_root(along_ray * along_ray - (distance * distance - self.radius * self.radius))
-        return LightSample(normalize(to_light), intensity, along_ray - half_chord)
+        visible_side = along_ray - half_chord
+        return LightSample(
+            normalize(to_light), self.radiance * squared_radius, visible_side, square_root(squared_radius)
+        )
 
 
 def _above_horizon(axial: Array, outward: Array, height: Array) -> tuple[Array, Array]:

@@ -66,7 +66,9 @@ class ConstantEnvironment(Light):
         turn = 2 * np.pi * node.t
         outward = jnp.cos(turn) * across + jnp.sin(turn) * along
         to_light = node.s * normal + square_root(1.0 - node.s * node.s) * outward
-        return LightSample(normalize(to_light), self.radiance * (2.0 * node.weight), jnp.asarray(jnp.inf))
+        squared_radius = 2.0 * node.weight
+        intensity = self.radiance * squared_radius
+        return LightSample(normalize(to_light), intensity, jnp.asarray(jnp.inf), square_root(squared_radius))
 
 
 Box = tuple[int, int, int, int]
@@ -130,7 +132,8 @@ class EnvironmentMap(Light):
     def illuminate(self, node: Any, position: Float[Array, "3"], normal: Float[Array, "3"]) -> LightSample:
         """The same at every point: the light of one rectangle of the map."""
         moments = Moments(node.mean, node.covariance)
-        return LightSample(normalize(node.mean), self.radiance * node.intensity, jnp.asarray(jnp.inf), moments)
+        radius = square_root(2.0 * jnp.trace(node.covariance))  # that of a disc of the same variance
+        return LightSample(normalize(node.mean), self.radiance * node.intensity, jnp.asarray(jnp.inf), radius, moments)
 
 
 def _checked(pixels: Any) -> np.ndarray:

@@ -41,12 +41,15 @@ class LightSample(NamedTuple):
         to_light: unit direction towards the light, (3,).
         intensity: what arrives, (C,), without the cosine at the surface.
         distance: to the light, in world units; infinite for a light at infinity.
+        radius: angular radius, in radians, of a disc as large as the patch that the sample stands for: shadow edges
+            sweep over it. None for light without extent, whose shadows are hard.
         moments: where the sample stands for a patch of the sky, how that spreads; None for a single direction.
     """
 
     to_light: Float[Array, "3"]
     intensity: Float[Array, " C"]
     distance: Float[Array, ""]
+    radius: Float[Array, ""] | None = None
     moments: Moments | None = None
 
 

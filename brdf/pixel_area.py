@@ -30,7 +30,7 @@ from brdf.shapes import Shape
 from brdf.surface_points import PixelArea, SurfacePoints
 from brdf.tracing import NO_SHAPE, shapes_met, trace
 from brdf.vectors import dot, half_log_cosine
-from brdf.visibility import Lighting, blocked
+from brdf.visibility import Lighting, share_seen
 
 NARROW = 0.15
 """Pixel size over distance from a lobe's centre from which on a pixel is averaged: 0.1 % of the lobe's peak."""
@@ -100,7 +100,7 @@ def _light_matters(points: SurfacePoints, lighting: Lighting, index: int) -> Boo
         sample = light.illuminate(node, point.position, point.normal)
         lit = (dot(point.normal, sample.to_light) > 0) & jnp.any(sample.intensity > 0)
         if lighting.occluders:
-            lit &= ~blocked(lighting.occluders, point, sample)
+            lit &= share_seen(lighting.occluders, point, sample) > 0
         return lit, half_log_cosine(point.normal, sample.to_light, point.to_view)
 
     lit, log_cosine = jax.vmap(jax.vmap(at_point))(eqx.tree_at(lambda p: p.visibility, points, None, is_leaf=_is_none))

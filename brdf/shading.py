@@ -17,7 +17,7 @@ from brdf.lights import Light, LightSample, Moments
 from brdf.models import Material, SpecularMaterial
 from brdf.surface_points import SurfacePoints
 from brdf.vectors import BELOW_HORIZON, divide, dot, square_root
-from brdf.visibility import Lighting, blocked
+from brdf.visibility import Lighting, share_seen
 
 STORED_SAMPLES = 4
 """Up to so many light samples the fit keeps their terms as arrays; beyond, it makes them anew at each exponent."""
@@ -54,10 +54,11 @@ def light_terms(
     """
     cosine, above = _cosine(point, sample)
     lit = point.mask & (cosine > 0)
+    intensity = sample.intensity
     if lighting.occluders:
-        lit &= ~blocked(lighting.occluders, point, sample)
-    given = None if point.visibility is None else point.visibility[index]
-    intensity = sample.intensity if given is None else sample.intensity * given
+        intensity = intensity * share_seen(lighting.occluders, point, sample)
+    if point.visibility is not None and point.visibility[index] is not None:
+        intensity = intensity * point.visibility[index]
     diffuse = intensity * jnp.where(lit, cosine, 0)
     if not issubclass(model, SpecularMaterial):
         return LightTerms(diffuse, jnp.zeros_like(diffuse), jnp.zeros_like(cosine))

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from brdf.checks import direction_value, positive, vector
 from brdf.errors import InputError
-from brdf.vectors import divide, dot, normalize, square_root
+from brdf.vectors import divide, dot, norm, normalize, square_root
 
 
 class Hit(NamedTuple):
@@ -59,6 +59,31 @@ class Shape(eqx.Module):
             direction: its unit direction, (3,).
         """
 
+    def cover(
+        self, origin: Float[Array, "3"], direction: Float[Array, "3"], distance: Float[Array, ""], radius: Array | None
+    ) -> Float[Array, ""]:
+        """The share of a patch of light that the shape hides, 0 or 1 where it cannot tell more.
+
+        Args:
+            origin: the point that the light falls on, (3,).
+            direction: towards the middle of the patch, unit, (3,).
+            distance: of the patch.
+            radius: angular radius of the patch; None for a point.
+        """
+        hit = self.intersect(origin, direction)
+        return jnp.where(hit.hit & (hit.distance < distance), 1.0, 0.0)
+
+
+def share_beyond(sine: Float[Array, ""], radius: Float[Array, ""]) -> Float[Array, ""]:
+    """The share of a patch of light beyond an edge, of a parabola 3/4 (1 - x²) with the variance of a disc.
+
+    Args:
+        sine: of the angle by which the patch's middle is beyond the edge.
+        radius: angular radius of the patch; below a millionth of a radian it counts as that.
+    """
+    x = jnp.clip(sine / (1.118 * jnp.maximum(radius, 1e-6)), -1.0, 1.0)  # √5/2
+    return 0.5 + x * (0.75 - 0.25 * x * x)
+
 
 class Sphere(Shape):
     """A sphere with outward normals.
@@ -96,6 +121,21 @@ class Sphere(Shape):
         hit = crosses & (signed - along > 0)
         normal = normalize(nearest + signed * direction)
         return Hit(hit, jnp.where(hit, signed - along, jnp.inf), self.center + self.radius * normal, normal)
+
+    def cover(
+        self, origin: Float[Array, "3"], direction: Float[Array, "3"], distance: Float[Array, ""], radius: Array | None
+    ) -> Float[Array, ""]:
+        """The share of the patch within the cone that the sphere fills; see `Shape.cover`."""
+        if radius is None:
+            return super().cover(origin, direction, distance, radius)
+        to_center = jnp.asarray(self.center - origin)
+        along = dot(to_center, direction)
+        miss = norm(to_center - along * direction)
+        # of the angle between the direction and the sphere's rim
+        tangent = square_root(dot(to_center, to_center) - self.radius * self.radius)
+        sine = divide(self.radius * along - miss * tangent, dot(to_center, to_center))
+        in_front = (along > 0) & (along < distance)
+        return jnp.where(in_front, share_beyond(sine, radius), 0.0)
 
 
 class Rectangle(Shape):
@@ -136,6 +176,31 @@ class Rectangle(Shape):
         v = dot(jnp.cross(self.edge_u, offset), area_vector) / squared_area
         hit = (slope != 0) & (distance > 0) & (jnp.abs(u) <= 1) & (jnp.abs(v) <= 1)
         return Hit(hit, jnp.where(hit, distance, jnp.inf), position, normal)
+
+    def cover(
+        self, origin: Float[Array, "3"], direction: Float[Array, "3"], distance: Float[Array, ""], radius: Array | None
+    ) -> Float[Array, ""]:
+        """The share of the patch within the pyramid over the rectangle; see `Shape.cover`."""
+        if radius is None:
+            return super().cover(origin, direction, distance, radius)
+        to_center = jnp.asarray(self.center - origin)
+        normal = normalize(jnp.cross(self.edge_u, self.edge_v))
+        height = dot(to_center, normal)
+        side = jnp.where(height < 0, -1.0, 1.0)
+
+        def beyond(edge: Array, rim: Array, inner: Array) -> Array:
+            """Beyond the plane through the origin and an edge, to the side on which the rectangle lies."""
+            plane = normalize(jnp.cross(edge, rim))
+            return share_beyond(jnp.sign(dot(plane, inner)) * dot(plane, direction), radius)
+
+        def between(edge: Array, across: Array) -> Array:
+            """Between the two edges along ``edge``."""
+            one, other = to_center + across, to_center - across
+            return jnp.maximum(beyond(edge, one, other) + beyond(edge, other, one) - 1.0, 0.0)
+
+        edge_u, edge_v = jnp.asarray(self.edge_u), jnp.asarray(self.edge_v)
+        before = height * side < distance * dot(direction, normal) * side
+        return jnp.where(before, between(edge_u, edge_v) * between(edge_v, edge_u), 0.0)
 
 
 def check_spans_area(edge_u: object, edge_v: object) -> None:

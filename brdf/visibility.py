@@ -1,10 +1,12 @@
 """Which lights a point sees: shadow rays against the scene's shapes, or masks that are given.
 
-Shadows are hard for each light sample; an area light's many samples make them soft. What casts a shadow is decided when
-the program is compiled: a scene whose shapes cannot shadow anything (one sphere, one rectangle) has no shadow rays.
+Light without extent casts hard shadows. A sample of an area light or environment stands for a patch of light, and the
+edge of a sphere or rectangle sweeps over it: its light fades out over the patch's width, so a soft shadow needs few
+samples and shows no steps. A mesh hides a sample or does not. What can cast a shadow is decided when the program is
+compiled: a scene whose shapes cannot shadow anything (one sphere, one rectangle) has no shadow rays.
 
-A shadow edge has no derivative: visibility counts as constant, so gradients by positions of lights and shapes leave out
-what a moving edge adds. They are exact for pixels that no edge passes, and for intensities everywhere.
+A hard shadow edge has no derivative: gradients by positions of lights and shapes leave out what a moving edge adds.
+They are exact for pixels that no edge passes, for soft shadows of spheres and rectangles, and by intensities.
 """
 
 from typing import Any
@@ -13,7 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Float
 
 from brdf.errors import InputError
 from brdf.lights import Light, LightSample
@@ -46,28 +48,25 @@ def occluders(shapes: tuple[Shape, ...], *, traced: bool) -> tuple[Shape, ...]:
     return () if traced and len(shapes) == 1 and shapes[0].convex else tuple(shapes)
 
 
-def blocked(occluders: tuple[Shape, ...], point: SurfacePoints, sample: LightSample) -> Bool[Array, ""]:
-    """Whether a shape stands between a point and a light sample.
+def share_seen(occluders: tuple[Shape, ...], point: SurfacePoints, sample: LightSample) -> Float[Array, ""]:
+    """The share of a light sample that a point sees between the shapes: 0 or 1 for a sample without extent.
 
     Args:
         occluders: at least one; all shapes of the scene, in its order.
         point: one surface point.
         sample: what the light sends there.
     """
-    found = jnp.asarray(False)
-    position, normal, to_light, distance = jax.lax.stop_gradient(
-        (point.position, point.normal, sample.to_light, sample.distance)
-    )
+    position, normal = point.position, point.normal
     size = jnp.max(jnp.abs(position))
     rounding = OFFSET * jnp.finfo(jnp.result_type(position)).eps
-    for index, shape in enumerate(jax.lax.stop_gradient(occluders)):
-        start = position + rounding * jnp.maximum(size, shape.extent()) * normal
-        hit = shape.intersect(start, to_light)
-        between = hit.hit & (hit.distance < distance * (1 - 4 * rounding))
+    seen = jnp.ones_like(size)
+    for index, shape in enumerate(occluders):
+        start = position + jax.lax.stop_gradient(rounding * jnp.maximum(size, shape.extent())) * normal
+        covered = shape.cover(start, sample.to_light, sample.distance * (1 - 4 * rounding), sample.radius)
         if shape.convex and point.shape is not None:
-            between &= point.shape != index  # the horizon has dealt with that
-        found |= between
-    return found
+            covered = jnp.where(point.shape == index, 0.0, covered)  # the horizon has dealt with that
+        seen *= 1.0 - covered
+    return seen
 
 
 def given_visibility(value: Any) -> tuple[Any, ...]:
