@@ -33,8 +33,8 @@ def render_lights(material: Material, scene: Scene, *, precision: Precision | No
     """
     with working_precision(precision):
         channels = channels_of(material, scene)
-        points = seen(scene, precision)
-        material, scene = cast((material, scene), precision)
+        scene, points = seen(scene, precision)
+        material = cast(material, precision)
         lighting, images = scene.lighting, []
         for index, light in enumerate(lighting.lights):
             # the light's own mask comes first where masks are given

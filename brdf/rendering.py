@@ -194,15 +194,15 @@ def render(material: Material, scene: Scene, *, precision: Precision | None = No
     """
     with working_precision(precision):
         channels = channels_of(material, scene)
-        points = seen(scene, precision)
-        material, scene = cast((material, scene), precision)
+        scene, points = seen(scene, precision)
+        material = cast(material, precision)
         image = shade(material, points, scene.ambient, scene.lighting)
         width, height = scene.resolution
         return jnp.zeros((height, width, channels)) if image is None else image
 
 
-def seen(scene: Scene, precision: Precision | None) -> SurfacePoints:
-    """What each pixel sees, in a precision.
+def seen(scene: Scene, precision: Precision | None) -> tuple[Scene, SurfacePoints]:
+    """A scene in a precision, and what each pixel sees.
 
     Args:
         scene: the scene; where pixels are averaged over their area, and nothing of it is being traced, the pixels that
@@ -213,7 +213,8 @@ def seen(scene: Scene, precision: Precision | None) -> SurfacePoints:
     traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(scene))
     now = jax.ensure_compile_time_eval() if samples > 1 and not traced else contextlib.nullcontext()
     with now:
-        return cast(scene, precision).surface_points()
+        scene = cast(scene, precision)
+        return scene, scene.surface_points()
 
 
 def channels_of(material: Material, scene: Scene) -> int:
