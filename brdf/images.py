@@ -48,7 +48,9 @@ class Picture:
         encoding: how the file holds the values: "linear", "srgb" or a gamma.
         source: who says so: "given" (the user), "file", "format" (it knows no other), or "assumed".
         bits: bits per value in the file.
-        saturation: the linear value of the largest code, where an integer file ends; None for floats.
+        saturation: the linear value of the largest code, where an integer file ends; None for floats. Infinite where
+            the clipped pixels were taken out, see `scaled`.
+        factor: what the linear values of the file were multiplied by, a number or (C,).
     """
 
     pixels: Float32[Array, "height width channels"]
@@ -57,6 +59,23 @@ class Picture:
     source: EncodingSource
     bits: int
     saturation: float | None
+    factor: float | Array = 1.0
+
+    def scaled(self, factor: float | Array) -> "Picture":
+        """The picture in another unit: of another exposure, or under light of another intensity.
+
+        Args:
+            factor: what to multiply the values by, above 0, a number or (C,). Where channels differ in it, they clip at
+                different levels: clipped pixels become NaN.
+        """
+        factors = np.asarray(factor, np.float32)
+        pixels, saturation = self.pixels * factors, self.saturation
+        if saturation is not None and factors.size == 1:
+            saturation = saturation * float(factors.reshape(()))
+        elif saturation is not None:
+            clipped = np.any(self.pixels >= saturation * (1 - 1e-6), axis=-1, keepdims=True)
+            pixels, saturation = np.where(clipped, np.float32(np.nan), pixels), np.inf
+        return dataclasses.replace(self, pixels=pixels, saturation=saturation, factor=self.factor * factors)
 
     @property
     def code_step(self) -> float | None:
@@ -71,9 +90,9 @@ class Picture:
         if self.code_step is None:
             return None
         if self.encoding == "linear":
-            return np.full(self.pixels.shape, self.code_step, np.float32)
+            return np.broadcast_to(np.float32(self.code_step) * np.float32(self.factor), self.pixels.shape)
         table = decode_table(self.encoding, min(self.bits, 16))
-        return np.interp(self.pixels, table, np.gradient(table)).astype(np.float32)
+        return (np.interp(self.pixels / self.factor, table, np.gradient(table)) * self.factor).astype(np.float32)
 
 
 def read_image(

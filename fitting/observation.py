@@ -17,7 +17,7 @@ from brdf.errors import InputError
 SYMMETRIC_PIXELS = 8
 # Where the diffuse basis varies by less than this over the plateau, the surface is flat there and nothing is clipped.
 FLAT = 1e-3
-# What counts as the largest value: a few units in the last place of float32 below it, for the arithmetic after clamping.
+# What counts as the largest value: a few units in the last place of float32 below it, for what follows clamping.
 TOP = 1 - 1e-6
 
 
@@ -48,6 +48,8 @@ def observe(
     dtype: Any,
     mask: Any = None,
     saturation: float | None = None,
+    dark: float | None = None,
+    noise: tuple[float, float] | None = None,
 ) -> Observation:
     """Decide which pixels of a picture count.
 
@@ -57,10 +59,13 @@ def observe(
         dtype: float32 or float64.
         mask: (H, W), pixels to look at.
         saturation: linear value from which on pixels are clipped; None finds out.
+        dark: linear value up to which pixels are too dark to count: none of their channels exceeds it.
+        noise: of the camera, (read, shot): the variance of a value is read² + shot · value, and pixels weigh by it.
 
     Raises:
         InputError: where nothing is left to fit.
     """
+    _check_levels(saturation, dark, noise)
     pixels, known_saturation, step = _pixels(target)
     height, width, channels = pixels.shape
     if (width, height) != scene.resolution:
@@ -99,7 +104,7 @@ def observe(
         brightest = np.max(np.asarray(values), axis=-1).reshape(height, width)
         level = _plateau(brightest, float(survey.largest), good.reshape(height, width), points, scene)
     if level is not None and survey.largest >= level:
-        good, scale, below = jax.device_get(_unclipped(values, good, level))
+        good, scale, below = jax.device_get(_between(values, good, -jnp.inf, level))
         left_out["clipped"] = count - int(below)
         count = int(below)
         if not count:
@@ -107,10 +112,19 @@ def observe(
             raise InputError("target", came, "Give a darker exposure or a higher saturation")
     elif level is not None:
         left_out["clipped"] = 0
+    if dark is not None:
+        good, scale, above = jax.device_get(_between(values, good, dark, jnp.inf))
+        left_out["dark"] = count - int(above)
+        count = int(above)
+        if not count:
+            came = f"is no brighter than {dark:g} wherever it counts"
+            raise InputError("target", came, "Give a brighter picture or a lower dark level")
     weight = None if count == good.size else jnp.asarray(good, dtype)
+    if noise is not None:
+        weight = _weigh(values, jnp.asarray(good), (height, width), *noise, step)
     rounding = max(float(np.finfo(dtype).eps), float(np.finfo(pixels.dtype).eps))
-    noise = np.maximum(scale.astype(np.float64) * rounding, step / np.sqrt(12.0))
-    return Observation(values, weight, points, left_out, noise, scale.astype(np.float64))
+    error = np.maximum(scale.astype(np.float64) * rounding, step / np.sqrt(12.0))
+    return Observation(values, weight, points, left_out, error, scale.astype(np.float64))
 
 
 class _Survey(NamedTuple):
@@ -146,9 +160,48 @@ def _survey(values: Float[Array, "P C"], seen: Bool[Array, " P"], looked_at: Boo
 
 
 @jax.jit
-def _unclipped(values: Float[Array, "P C"], good: Bool[Array, " P"], level: float) -> tuple[Any, Any, Any]:
-    good = good & (_over_channels(jnp.maximum, values) < level)
+def _between(values: Float[Array, "P C"], good: Bool[Array, " P"], dark: float, level: float) -> tuple[Any, Any, Any]:
+    brightest = _over_channels(jnp.maximum, values)
+    good = good & (brightest > dark) & (brightest < level)
     return good, _scale(values, good), jnp.count_nonzero(good)
+
+
+def _check_levels(saturation: Any, dark: Any, noise: Any) -> None:
+    for name, value in (("saturation", saturation), ("dark", dark)):
+        if value is not None and (isinstance(value, bool) or not isinstance(value, int | float) or not value == value):
+            raise InputError(name, f"must be a linear value, got {value!r}", "Give a number")
+    if noise is None:
+        return
+    words = "Give (read, shot): the variance of a value is read² + shot · value"
+    try:
+        read, shot = (float(part) for part in noise)
+    except (TypeError, ValueError):
+        raise InputError("noise", f"must be two numbers, got {noise!r}", words) from None
+    if not (0 <= read < np.inf and 0 <= shot < np.inf and read + shot > 0):
+        raise InputError("noise", f"must be two numbers of 0 or more, not both 0, got {noise!r}", words)
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _weigh(
+    values: Float[Array, "P C"], good: Bool[Array, " P"], shape: tuple[int, int], read: float, shot: float, step: float
+) -> Float[Array, " P"]:
+    """Inverse variances over their mean; a pixel's channels share the variance of their mean value.
+
+    The value is the mean of 5 x 5 pixels: taken from the pixel itself, weights would favour what noise made darker.
+    """
+    mean = jnp.where(good, _over_channels(jnp.add, values) / values.shape[1], 0.0)
+    count = good.astype(values.dtype)
+    total, known = _boxed(mean.reshape(shape)).ravel(), _boxed(count.reshape(shape)).ravel()
+    smooth = jnp.maximum(total / jnp.maximum(known, 1.0), 0.0)
+    # Without read noise a black pixel would weigh infinitely much: quantisation, or a millionth of the mean, stands in.
+    least = 1e-6 * shot * jnp.sum(mean) / jnp.maximum(jnp.sum(count), 1.0) + jnp.finfo(values.dtype).tiny
+    variance = jnp.maximum(read * read + shot * smooth + step * step / 12.0, least)
+    weight = jnp.where(good, jnp.min(jnp.where(good, variance, jnp.inf)) / variance, 0.0)
+    return (weight * (jnp.sum(count) / jnp.sum(weight))).astype(values.dtype)
+
+
+def _boxed(image: Float[Array, "H W"]) -> Float[Array, "H W"]:
+    return jax.lax.reduce_window(image, np.zeros((), image.dtype), jax.lax.add, (5, 5), (1, 1), "SAME")
 
 
 def _over_channels(combine: Any, values: Float[Array, "P C"]) -> Float[Array, " P"]:
@@ -163,7 +216,7 @@ def _pixels(target: Any) -> tuple[np.ndarray, float | None, float]:
     """Values (H, W, C), the largest code where it is known, and the distance of two codes."""
     saturation, step = None, 0.0
     if isinstance(target, brdf.Picture):
-        step = float(np.max(target.quantisation())) if target.saturation is not None else 0.0
+        step = float(np.nanmax(target.quantisation())) if target.saturation is not None else 0.0
         saturation = None if target.saturation is None else target.saturation * TOP
         target = target.pixels
     if isinstance(target, str | bytes) or not hasattr(target, "__array__"):
@@ -184,7 +237,7 @@ def _pixels(target: Any) -> tuple[np.ndarray, float | None, float]:
 def _plateau(
     brightest: np.ndarray, largest: float, good: np.ndarray, points: brdf.SurfacePoints, scene: brdf.Scene
 ) -> float | None:
-    """The level at which a picture is clipped: many pixels at exactly the largest value, on a surface that is lit unevenly."""
+    """The level at which a picture is clipped: many pixels at exactly the largest value, on a surface lit unevenly."""
     top = good & (brightest >= largest * TOP)
     if np.count_nonzero(top) <= SYMMETRIC_PIXELS or not scene.lights:
         return None

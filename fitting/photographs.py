@@ -19,6 +19,8 @@ from fitting.light_files import parse_numbers
 
 # A mask whose outline is further from a circle than this share of its radius, rms, is no ball.
 ROUND = 0.05
+# So much of the outline has to be on it; the rest may be specks.
+OUTLINE = 0.8
 SMALLEST_RADIUS = 4.0
 # What belongs to a highlight: its core is looked for above one share of the brightest pixel; it reaches down to half of
 # the brightest, within a share of the radius around it.
@@ -96,26 +98,30 @@ def find_circle(mask: Any) -> Circle:
     bottom = height - np.argmax(inside[::-1, columns], axis=0) - 0.5
     x = np.concatenate([left, right, columns, columns]).astype(float)
     y = np.concatenate([rows, rows, top, bottom]).astype(float)
-    circle, distance = _circle_through(x, y)
-    for _ in range(5):
-        near = distance <= max(1.0, 3 * float(np.median(distance)))
-        circle, _ = _circle_through(x[near], y[near])
+    # Area and centroid are the start, which holes and specks hardly move.
+    centre_y, centre_x = (float(np.mean(index)) for index in np.nonzero(inside))
+    circle = Circle(centre_x, centre_y, float(np.sqrt(np.count_nonzero(inside) / np.pi)))
+    near = np.ones(x.size, bool)
+    for _ in range(10):
         distance = np.abs(np.hypot(x - circle.x, y - circle.y) - circle.radius)
-    off = float(np.sqrt(np.mean(np.minimum(distance, circle.radius) ** 2))) / max(circle.radius, 1e-9)
+        near = distance <= max(1.0, 3 * float(np.median(distance)))
+        circle = _circle_through(x[near], y[near])
+    distance = np.abs(np.hypot(x - circle.x, y - circle.y) - circle.radius)
+    off = float(np.sqrt(np.mean(distance[near] ** 2))) / max(circle.radius, 1e-9)
+    if np.mean(near) < OUTLINE:
+        off = float(np.sqrt(np.mean(distance**2))) / max(circle.radius, 1e-9)
     if off > ROUND:
         came = f"is no ball: its outline is {100 * off:.0f} % of the radius off a circle"
         raise InputError("mask", came, "Give the mask of a whole ball, or its circle")
     return check_circle(circle, "mask")
 
 
-def _circle_through(x: Float[np.ndarray, " K"], y: Float[np.ndarray, " K"]) -> tuple[Circle, Float[np.ndarray, " K"]]:
-    """The circle of least algebraic distance (Kåsa 1976), and the distance of each point from it."""
+def _circle_through(x: Float[np.ndarray, " K"], y: Float[np.ndarray, " K"]) -> Circle:
+    """The circle of least algebraic distance (Kåsa 1976)."""
     columns = np.stack([x, y, np.ones_like(x)], axis=1)
     a, b, c = np.linalg.lstsq(columns, x * x + y * y, rcond=None)[0]
     centre = 0.5 * a, 0.5 * b
-    radius = float(np.sqrt(max(c + centre[0] ** 2 + centre[1] ** 2, 0.0)))
-    distance = np.abs(np.hypot(x - centre[0], y - centre[1]) - radius)
-    return Circle(float(centre[0]), float(centre[1]), radius), distance
+    return Circle(float(centre[0]), float(centre[1]), float(np.sqrt(max(c + centre[0] ** 2 + centre[1] ** 2, 0.0))))
 
 
 def ball_points(shape: tuple[int, int], circle: Circle) -> brdf.SurfacePoints:

@@ -23,6 +23,8 @@ from fitting.uncertainty import TERMS, residual_noise
 
 N_RANGE = (0.1, 1e6)
 AUTO = ("phong", "blinn-phong")
+# An exponent up to this multiple of the lower bound is at the bound.
+WIDEST = 1.01
 
 
 def fit(
@@ -35,6 +37,8 @@ def fit(
     saturation: float | None = None,
     n_range: tuple[float, float] = N_RANGE,
     loss: Loss = "squared",
+    dark: float | None = None,
+    noise: tuple[float, float] | None = None,
 ) -> FitResult:
     """Fit a material to a picture, or to several pictures of one material: the global optimum, with no start to give.
 
@@ -49,6 +53,9 @@ def fit(
         n_range: bounds of the exponent, 0 < lower < upper.
         loss: "squared"; "relative" or "log" for high dynamic range; "huber" or "cauchy" where some pixels show what the
             scene does not know. See `fitting.losses` for what to use when.
+        dark: linear value up to which pixels are too dark to count.
+        noise: of the camera, (read, shot): the variance of a value is read² + shot · value, and pixels weigh by its
+            inverse. None weighs all alike.
 
     Returns:
         The result.
@@ -70,7 +77,7 @@ def fit(
     with brdf.working_precision(precision):
         dtype = np.dtype(precision)
         observations = [
-            observe(picture, place, dtype=dtype, mask=one, saturation=saturation)
+            observe(picture, place, dtype=dtype, mask=one, saturation=saturation, dark=dark, noise=noise)
             for picture, place, one in zip(targets, scenes, masks, strict=True)
         ]
         counts = {observation.target.shape[1] for observation in observations}
@@ -173,6 +180,9 @@ def _fit_auto(job: _Job) -> tuple[ModelFit, Choice]:
     """All families, then the simplest adequate candidate on its own."""
     names = AUTO if job.lit[1].any() else ("lambert",)
     fits = {name: _fit_model(brdf.MODELS[name], job) for name in names}
+    # A lobe that would be wider than the search allows is no highlight: it mends what Lambert's law leaves at the rim.
+    fits = {name: fit for name, fit in fits.items() if fit.optimum.flat or fit.optimum.n > WIDEST * job.n_range[0]}
+    fits = fits or {"lambert": _fit_model(brdf.Lambert, job)}
     if job.loss != "squared":
         # Weights are part of what is minimised: those of the better family serve all, or costs could not be compared.
         name = min(fits, key=lambda name: float(np.sum(residual_noise(fits[name].optimum, job.rounding))))

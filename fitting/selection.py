@@ -184,7 +184,7 @@ def _decide(trials: list[_Trial], normals: dict[str, Normal], variance: np.ndarr
             excess=float(expected[i] - expected[best]),
             excess_error=float(error[i]),
             bic=float(bic[i] - bic.min()),
-            chosen=i == chosen,
+            chosen=bool(i == chosen),
         )
         for i, trial in enumerate(trials)
     )

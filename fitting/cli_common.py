@@ -1,0 +1,62 @@
+"""What the commands share: a spinner, output, errors that name what was typed, the compiler's cache."""
+
+import contextlib
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+
+@contextlib.contextmanager
+def named_as(arguments: dict[str, Any]) -> Iterator[None]:
+    """Let an error name the file or option that a person typed, not the argument of the function behind it.
+
+    Args:
+        arguments: what was typed, by argument.
+    """
+    from brdf.errors import InputError
+
+    try:
+        yield
+    except InputError as error:
+        typed = arguments.get(error.where)
+        if typed is None:
+            raise
+        raise InputError(typed, error.what, error.remedy) from None
+
+
+def use_compilation_cache() -> None:
+    """Keep compiled programs in the user's cache folder: the second run of the same kind skips the compiler."""
+    import jax
+
+    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    if jax.config.jax_compilation_cache_dir is None:
+        jax.config.update("jax_compilation_cache_dir", str(Path(base) / "brdf" / "jax"))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+@contextlib.contextmanager
+def waiting(what: str) -> Iterator[None]:
+    """A spinner where a person waits; nothing where standard error is no terminal.
+
+    Args:
+        what: is being done.
+    """
+    if not sys.stderr.isatty():
+        yield
+        return
+    from rich.console import Console
+
+    with Console(stderr=True).status(f"{what} ..."):
+        yield
+
+
+def show(text: str) -> None:
+    """Print the command's output.
+
+    Args:
+        text: to print.
+    """
+    print(text)  # noqa: T201  # this is the command's output
