@@ -7,11 +7,13 @@ exponent. Everything is differentiable in n and in the angle, because the integr
 
 import functools
 import math
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from brdf import vectors
@@ -36,13 +38,12 @@ def directional_albedo(
     Args:
         material: one of the five models.
         theta: angle of incidence in radians, 0 to pi/2, (...).
-        precision: "float32" or "float64"; None leaves JAX as it is.
+        precision: "float32" or "float64"; None leaves JAX as it is. What JAX cannot hold comes as a NumPy array.
 
     Returns:
         (..., C), at least 0, accurate to ``ACCURACY`` times k_s (classic forms: times k_s / (scale(n) cos theta)).
     """
-    with working_precision(precision):
-        return _albedo(cast(material, precision), jnp.asarray(theta, jnp.result_type(float)))
+    return _outside(_albedo, material, theta, precision)
 
 
 def absorbed_fraction(
@@ -58,7 +59,15 @@ def absorbed_fraction(
     Returns:
         (..., C); negative where the material reflects more light than arrives.
     """
-    return 1.0 - directional_albedo(material, theta, precision=precision)
+    return _outside(lambda m, angle: 1.0 - _albedo(m, angle), material, theta, precision)
+
+
+def _outside(function: Callable[..., Array], material: Material, theta: Numbers, precision: Precision | None) -> Any:
+    with working_precision(precision):
+        result = function(cast(material, precision), jnp.asarray(theta, jnp.result_type(float)))
+    # a float64 array of JAX would be cut to float32, with a warning, by the first thing done to it outside the context
+    kept = isinstance(result, Tracer) or result.dtype == jnp.result_type(float)
+    return result if kept else np.asarray(result)
 
 
 @jax.jit
@@ -69,7 +78,7 @@ def _albedo(material: Material, theta: Array) -> Array:
     lobe = lobe_albedo(type(material), material.n, theta)
     if not material.cosine_weighted:
         cosine = jnp.cos(theta)
-        above = cosine > 1e-7 * theta  # what rounding leaves of cos(pi / 2) is zero
+        above = cosine > jnp.finfo(theta.dtype).eps  # what rounding leaves of cos(pi / 2) is zero
         lobe = jnp.where(above, lobe / jnp.where(above, cosine, 1.0), jnp.inf)
         lobe = jnp.where(material.k_s > 0, lobe[..., None], 0.0)
         return diffuse + material.k_s * lobe

@@ -6,6 +6,7 @@ Plain numbers are converted in float64, whatever JAX is set to; what JAX is trac
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -146,8 +147,10 @@ def _nearest(material: SpecularMaterial, model: type[SpecularMaterial], *, bound
     n = float(np.asarray(material.n))
     plain = Phong if normalized_form(old) is NormalizedPhong else BlinnPhong
     with working_precision("float64"):
-        lobe, lobe_squared = (np.asarray(lobe_albedo(plain, m, theta)) for m in (n, 2 * n))
-        to, of = (float(m.scale(n)) * (cosine if m.cosine_weighted else 1.0) for m in (model, old))
+        lobe, lobe_squared = (
+            np.asarray(lobe_albedo(plain, jnp.asarray(m, jnp.float64), jnp.asarray(theta))) for m in (n, 2 * n)
+        )
+        to, of = (float(jax.jit(m.scale)(n)) * (cosine if m.cosine_weighted else 1.0) for m in (model, old))
     gram = np.array(
         [
             [np.sum(weights * cosine**2), np.sum(weights * cosine * to * lobe)],

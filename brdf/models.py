@@ -142,7 +142,9 @@ class SpecularMaterial(Material):
         to_light, to_view = jnp.asarray(to_light), jnp.asarray(to_view)
         lobe = self._lobe(jnp.array([0.0, 0.0, 1.0], to_light.dtype), to_light, to_view)
         if not self.cosine_weighted:
-            lobe = vectors.divide(lobe, to_light[..., 2])
+            # eps^2 is zero for a direction, whose horizon is known to eps; below, derivatives would overflow
+            cosine = to_light[..., 2]
+            lobe = vectors.divide(lobe, jnp.where(cosine > jnp.finfo(cosine.dtype).eps ** 2, cosine, 0.0))
         above = (to_light[..., 2] > 0) & (to_view[..., 2] > 0)
         return jnp.where(above[..., None], self.k_d + self.k_s * lobe[..., None], 0.0) / math.pi
 

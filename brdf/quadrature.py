@@ -1,12 +1,12 @@
 """Integrals over the hemisphere of any function, with a bound on their error.
 
-The hemisphere is the upper half of a cube seen from its centre: five faces, each cut into squares that are halved again and
-again where the function asks for it. Each square is integrated by a Gauss-Legendre product rule; a square whose integral
-differs from the sum over its four quarters by more than its share is refined. The sum of those differences bounds the
-error, very much on the safe side where the function is smooth: it is the error of the coarser rule.
+The hemisphere is the upper half of a cube seen from its centre: five faces, each cut into squares that are halved again
+and again where the function asks for it. Each square is integrated by a Gauss-Legendre product rule; a square whose
+integral differs from the sum over its four quarters by more than a tolerance is refined. The sum of those differences
+bounds the error, far on the safe side where the function is smooth: it is the error of the coarser rule.
 
-A rule sees only what its nodes see. A narrow lobe must therefore be announced by its centre: squares around it are refined
-down to ``FINEST`` before any difference is believed.
+A rule sees only what its nodes see. A narrow lobe must therefore be announced by its centre: squares around it are
+refined down to ``FINEST`` before any difference is believed.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ FINEST = 2.0**-13
 """Size of the squares around an announced centre, about 1e-4 rad: a lobe of n = 1e7 is 3e-4 wide."""
 
 _NODES = 5
-_CELLS = 8  # squares along the edge of a face at the start
+_CELLS = 4  # squares along the edge of a face at the start
 _DEEPEST = 22  # times a square may be halved
 
 Evaluate = Callable[[Int[np.ndarray, " m"], Float[np.ndarray, "m 3"]], Float[np.ndarray, "m C"]]
@@ -76,7 +76,7 @@ def integrate(
     centres: list[Float[np.ndarray, "_ 3"]],
     *,
     tolerance: float,
-    budget: int = 3_000_000,
+    budget: int,
 ) -> Integral:
     """Integrals of several functions over the hemisphere about +z.
 

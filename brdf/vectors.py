@@ -122,7 +122,7 @@ def divide(numerator: ArrayLike, denominator: ArrayLike) -> Array:
     """
     denominator = _floating(denominator)
     positive = denominator > _smallest(denominator.dtype)
-    return jnp.where(positive, numerator / jnp.where(positive, denominator, 1.0), 0.0)
+    return jnp.where(positive, jnp.asarray(numerator) / jnp.where(positive, denominator, 1.0), 0.0)
 
 
 def square_root(x: ArrayLike) -> Array:
@@ -258,7 +258,8 @@ def _log1p_ratio(p: Array, q: Array) -> Array:
 def _log1p_ratio_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
     # by hand, because the chain rule through p / q squares q and underflows in float32 near the horizon
     (p, q), (dp, dq) = primals, tangents
-    ratio, inverse = p / q, 1.0 / (p + q)
+    # p + q = |L + V|^2 vanishes where L = -V; the floor keeps n times its inverse, and that over N.L, finite there
+    ratio, inverse = p / q, 1.0 / jnp.maximum(p + q, 1e-12 if q.dtype == jnp.float32 else 1e-100)
     return jnp.log1p(ratio), (dp - ratio * dq) * inverse
 
 

@@ -1,0 +1,149 @@
+"""What a plausibility check says: three findings, each with its worst case, its margin and its own error bound."""
+
+import dataclasses
+import math
+from typing import Any, Literal
+
+Verdict = Literal["pass", "fail", "cannot tell"]
+
+ENERGY_LIMIT = 1.0 + 1e-6
+"""The largest albedo that passes: exactly 1 is legal, so rounding must be."""
+
+RECIPROCITY_LIMIT = 1e-6
+"""The largest relative difference of f_r when light and view change places."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Angles:
+    """A direction in the local frame.
+
+    Attributes:
+        polar: angle from the normal in degrees, 0 to 90.
+        azimuth: angle about the normal from +x towards +y in degrees, 0 to 360.
+    """
+
+    polar: float
+    azimuth: float = 0.0
+
+    def __str__(self) -> str:
+        """The angles with a degree sign, the azimuth only where it is not zero."""
+        return f"{self.polar:.4g}°" + (f" azimuth {self.azimuth:.4g}°" if round(self.azimuth, 3) % 360 else "")
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """The outcome of one test.
+
+    Attributes:
+        verdict: "pass", "fail", or "cannot tell" where the error bound is wider than the margin.
+        value: the worst value found: the least f_r in 1/sr (positivity), the largest relative difference of f_r when
+            light and view change places (reciprocity), the largest albedo (energy).
+        limit: what the value is held against.
+        margin: how far the value lies on the right side of the limit; negative on the wrong side.
+        error_bound: bound on the numerical error of the value.
+        to_light: where the light of the worst case stands.
+        to_view: where its view stands; None for the energy, which counts all views.
+        channel: its channel, from 0.
+        sentence: the finding in words.
+        crossing: energy only: the angle of the light in degrees from which on the albedo exceeds 1, where there is one.
+    """
+
+    verdict: Verdict
+    value: float
+    limit: float
+    margin: float
+    error_bound: float
+    to_light: Angles
+    to_view: Angles | None
+    channel: int
+    sentence: str
+    crossing: float | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """The finding as plain numbers, strings and dictionaries; what is not finite is None."""
+        return _plain(dataclasses.asdict(self))
+
+
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """Whether a BRDF is physically plausible, and why.
+
+    Attributes:
+        subject: what was checked.
+        positivity: whether f_r is nowhere negative.
+        reciprocity: whether f_r stays the same when light and view change places.
+        energy: whether from no direction more light is reflected than arrives.
+        nearest: the nearest plausible material, where one is known and the material is not plausible itself.
+    """
+
+    subject: str
+    positivity: Finding
+    reciprocity: Finding
+    energy: Finding
+    nearest: Any = None
+
+    @property
+    def findings(self) -> dict[str, Finding]:
+        """The three findings by name."""
+        return {"positivity": self.positivity, "reciprocity": self.reciprocity, "energy": self.energy}
+
+    @property
+    def plausible(self) -> bool | None:
+        """True if all three pass, False if one fails, None if that cannot be told."""
+        verdicts = {finding.verdict for finding in self.findings.values()}
+        return False if "fail" in verdicts else None if "cannot tell" in verdicts else True
+
+    def __str__(self) -> str:
+        """A line for the whole, a sentence for each test."""
+        word = {True: "plausible", False: "not plausible", None: "cannot tell"}[self.plausible]
+        lines = [f"{self.subject}: {word}"]
+        for name, finding in self.findings.items():
+            lines.append(f"  {name + ':':<13}{finding.verdict}; {finding.sentence}.")
+            lines.append(f"{'':15}margin {finding.margin:.3g}, known to within {finding.error_bound:.1g}")
+        if self.nearest is not None:
+            lines.append(f"  Its nearest plausible form is {self.nearest!r}.")
+        return "\n".join(lines)
+
+    def to_json(self) -> dict[str, Any]:
+        """The report as plain numbers, strings and dictionaries, for ``json.dumps``."""
+        nearest = None
+        if self.nearest is not None:
+            nearest = {"model": self.nearest.name} | {k: _plain(v) for k, v in vars(self.nearest).items()}
+        findings = {name: finding.to_json() for name, finding in self.findings.items()}
+        return {"subject": self.subject, "plausible": self.plausible, **findings, "nearest": nearest}
+
+
+def not_finite(finding: Finding, to_light: Angles, to_view: Angles) -> Finding:
+    """The finding, after f_r turned out not to be a number somewhere: nothing can be told."""
+    nan = math.nan
+    sentence = f"f_r is not a finite number for light {to_light}, view {to_view}"
+    return Finding("cannot tell", nan, finding.limit, nan, nan, to_light, to_view, 0, sentence)
+
+
+def verdict(margin: float, error_bound: float) -> Verdict:
+    """What a margin known to within an error bound allows to say."""
+    if math.isnan(margin) or math.isnan(error_bound):
+        return "cannot tell"
+    if margin >= error_bound:
+        return "pass"
+    return "fail" if -margin > error_bound else "cannot tell"
+
+
+def times(ratio: float) -> str:
+    """A ratio in words, with as many digits as tell it from 1."""
+    digits = 2 if ratio >= 1.1 else 2 + math.ceil(-math.log10(max(ratio - 1.0, 1e-12)))
+    return (
+        f"{ratio:.{digits}g} times"
+        if ratio < 100
+        else f"{ratio:.0f} times"
+        if ratio < 1e6
+        else "a million times and more"
+    )
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value.tolist() if hasattr(value, "tolist") else value

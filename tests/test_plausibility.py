@@ -1,0 +1,152 @@
+"""The plausibility check: verdicts on BRDFs of known standing, worst cases, bounds, words."""
+
+import json
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from labelled_brdfs import FUNCTIONS, MATERIALS, constant, dented, direction
+
+from brdf.albedo import directional_albedo
+from brdf.black_box import check_black_box
+from brdf.errors import InputError
+from brdf.models import BlinnPhong, Lambert, NormalizedBlinnPhong, NormalizedPhong, Phong
+from brdf.plausibility import check
+from brdf.quadrature import integrate
+from brdf.report import ENERGY_LIMIT, verdict
+
+WORD = {True: "pass", False: "fail"}
+
+
+def test_the_labelled_set_is_large():
+    assert len(MATERIALS) + len(FUNCTIONS) >= 60
+
+
+@pytest.mark.parametrize("case", [pytest.param(case, id=case[0]) for case in MATERIALS + FUNCTIONS])
+def test_verdicts_on_brdfs_of_known_standing(case):
+    name, brdf, *labels = case
+    report = check(brdf, name=name)
+    for (test, finding), label in zip(report.findings.items(), labels, strict=True):
+        assert finding.verdict == WORD[label], f"{test}\n{report}"
+        assert abs(finding.margin) >= finding.error_bound
+    assert report.plausible is all(labels)
+    json.dumps(report.to_json(), allow_nan=False)
+
+
+@pytest.mark.parametrize("model", [Phong, BlinnPhong, NormalizedPhong, NormalizedBlinnPhong])
+@pytest.mark.parametrize(("k_d", "k_s", "n"), [(0.4, 0.3, 2.0), (0.7, 0.8, 300.0)])
+def test_what_is_known_on_paper_is_what_the_search_finds(model, k_d, k_s, n):
+    material = model(k_d=k_d, k_s=k_s, n=n)
+    known, found = check(material), check_black_box(material.reflectance, "same")
+    for name, finding in known.findings.items():
+        assert finding.verdict == found.findings[name].verdict, name
+    if material.cosine_weighted:
+        np.testing.assert_allclose(known.energy.value, found.energy.value, atol=1e-6)
+        assert found.energy.to_light.polar < 0.2
+    else:
+        np.testing.assert_allclose(known.reciprocity.value, found.reciprocity.value, atol=2e-3)
+    np.testing.assert_allclose(known.positivity.value, found.positivity.value, rtol=1e-4)
+
+
+@pytest.mark.parametrize("model", [Phong, BlinnPhong])
+@pytest.mark.parametrize(("k_d", "k_s", "n"), [(0.3, 0.5, 50.0), (0.9, 0.4, 3.0), (0.5, 1e-6, 100.0), (1.2, 0.1, 5.0)])
+def test_classic_forms_say_where_the_albedo_crosses_one(model, k_d, k_s, n):
+    material = model(k_d=k_d, k_s=k_s, n=n)
+    energy = check(material).energy
+    assert energy.crossing is not None
+    crossing = math.radians(energy.crossing)
+    if k_d >= 0.9:  # even light from above is too much
+        assert crossing == 0
+    else:
+        np.testing.assert_allclose(directional_albedo(material, crossing, precision="float64"), 1, rtol=1e-6)
+    assert energy.value > 1
+    np.testing.assert_allclose(
+        directional_albedo(material, math.radians(energy.to_light.polar), precision="float64"), energy.value, rtol=1e-4
+    )
+
+
+def test_words_for_opengls_blinn_phong():
+    text = str(check(BlinnPhong(k_d=[0.3, 0.3, 0.2], k_s=[0.5, 0.5, 0.5], n=50.0)))
+    assert "not plausible" in text
+    assert "not reciprocal: the specular term is not multiplied by N·L; f_r(89.99°→" in text
+    assert "does not conserve energy: the albedo exceeds 1 for light beyond 89.88° and grows without bound" in text
+    assert "Its nearest plausible form is NormalizedBlinnPhong(" in text
+
+
+def test_the_reported_pair_shows_the_reported_ratio():
+    material = Phong(k_d=0.1, k_s=0.4, n=7.0)
+    finding = check(material).reciprocity
+    light, view = (direction(a.polar, a.azimuth) for a in (finding.to_light, finding.to_view))
+    with jax.enable_x64(True):
+        there, back = (float(material.reflectance(*pair)[0]) for pair in ((light, view), (view, light)))
+    np.testing.assert_allclose(1 - back / there, finding.value, rtol=1e-6)
+
+
+def test_worst_case_of_a_hole_is_in_the_hole():
+    where = (37.0, 112.0)
+    finding = check(dented(where, "half"), name="hole").positivity
+    light, view = (direction(a.polar, a.azimuth) for a in (finding.to_light, finding.to_view))
+    total = light + view
+    assert total @ direction(*where) / np.linalg.norm(total) > math.cos(math.radians(0.25))
+    np.testing.assert_allclose(finding.value, 0.3 / np.pi - 0.2, rtol=1e-12)
+
+
+def test_cannot_tell_where_the_bound_is_wider_than_the_margin():
+    assert verdict(1e-9, 1e-8) == "cannot tell"
+    assert verdict(-1e-9, 1e-8) == "cannot tell"
+    assert verdict(math.nan, 1e-8) == "cannot tell"
+    assert verdict(1e-7, 1e-8) == "pass"
+    assert verdict(-1e-7, 1e-8) == "fail"
+    edge = check(NormalizedPhong(k_d=0.5, k_s=0.5 + 1e-6, n=10.0)).energy
+    assert edge.verdict == "cannot tell"
+    assert abs(edge.margin) < edge.error_bound
+
+
+def test_a_function_that_is_not_finite_cannot_be_judged():
+    report = check(lambda light, view: jnp.where(view[2] > 0.9, jnp.nan, 0.1)[None], name="broken")
+    assert report.plausible is None
+    assert all(finding.verdict == "cannot tell" for finding in report.findings.values())
+    assert "not a finite number" in str(report)
+    json.dumps(report.to_json(), allow_nan=False)
+
+
+@pytest.mark.parametrize(
+    ("brdf", "message"),
+    [
+        (3.0, "must be a material or a function, got float"),
+        (lambda light, view: jnp.ones((2, 2)), r"must return one real number per channel, got float64\[2, 2\]"),
+        (lambda light, view: float(light[0]), "cannot be called with two vectors"),
+        (lambda light: light, "cannot be called with two vectors"),
+    ],
+)
+def test_what_cannot_be_checked(brdf, message):
+    with pytest.raises(InputError, match=message):
+        check(brdf)
+
+
+def test_checking_leaves_jax_as_it_was():
+    check(constant(0.5), name="grey")
+    check(Lambert(k_d=0.5))
+    assert jnp.ones(()).dtype == jnp.float32
+
+
+@pytest.mark.parametrize("n", [0.0, 12.0, 1e4, 1e6])
+def test_quadrature_bounds_its_error(n):
+    """Any mean of lobes anywhere, against the closed form of the integral of cos^n over its hemisphere."""
+    axes = np.array([[0.0, 0.0, 1.0], direction(40, 70)])
+
+    def evaluate(which, directions):
+        cosine = np.sum(axes[which] * directions, axis=1)
+        return np.where(cosine > 0, np.maximum(cosine, 1e-300) ** n, 0.0)[:, None]
+
+    result = integrate(evaluate, 2, [axes[:1], axes[1:]], tolerance=1e-9 / (n + 1), budget=3_000_000)
+    np.testing.assert_allclose(result.value[0], 2 * np.pi / (n + 1), rtol=0, atol=float(result.error_bound[0, 0]))
+    assert result.error_bound[0] < 1e-5 / (n + 1)
+    if n >= 1e4:  # the second lobe is whole
+        np.testing.assert_allclose(result.value[1], 2 * np.pi / (n + 1), rtol=0, atol=float(result.error_bound[1, 0]))
+
+
+def test_limit_leaves_room_for_a_lossless_material():
+    assert check(NormalizedPhong(k_d=0.3, k_s=0.7, n=1e6)).energy.value <= ENERGY_LIMIT
