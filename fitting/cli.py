@@ -23,6 +23,7 @@ app = typer.Typer(
     rich_markup_mode="rich",
 )
 
+INTERRUPTED = 130  # what shells expect after Ctrl-C
 USAGE_ERROR = typer.BadParameter.__mro__[2]  # what a wrong option raises, wherever typer keeps its parser
 
 
@@ -102,11 +103,13 @@ def main(arguments: list[str] | None = None) -> Any:
     except USAGE_ERROR as error:
         _fail(f"{_words(error)} Try brdf --help.")
     except KeyboardInterrupt:
-        _fail("interrupted.", status=130)
+        _fail("interrupted.", status=INTERRUPTED)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     else:
+        if status == INTERRUPTED:  # typer turns Ctrl-C into a number
+            _fail("interrupted.", status=INTERRUPTED)
         sys.exit(status if isinstance(status, int) else 0)
 
 
