@@ -11,15 +11,19 @@ if TYPE_CHECKING:
     from fitting.brdf_result import BrdfFitResult
     from fitting.joint import fit_jointly
     from fitting.picture_fit import fit
+    from fitting.relighting import LightFit, fit_lights, fit_lights_and_material
     from fitting.result import FitResult, Parameter
 
 _ROOM_OF = {
     "BrdfFitResult": "brdf_result",
     "FitResult": "result",
+    "LightFit": "relighting",
     "Parameter": "result",
     "fit": "picture_fit",
     "fit_brdf": "brdf_fit",
     "fit_jointly": "joint",
+    "fit_lights": "relighting",
+    "fit_lights_and_material": "relighting",
 }
 
 __all__ = sorted(_ROOM_OF)

@@ -1,0 +1,279 @@
+"""Intensities and colours of the lights from a picture, given the material or together with it: light is linear.
+
+A picture is a sum of one picture per light, so with the material known its lights are a non-negative linear problem in
+each channel. With the material unknown too the picture is linear in the products of every light's intensity with k_d
+and with k_s. Those products say everything but one thing: lights twice as bright on a surface half as bright look the
+same. That factor, one for each channel, no picture can determine; here the mean of the lights' intensities keeps the
+value it has in the scene, and the result says so.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Float
+
+import brdf
+from brdf.errors import InputError
+from fitting.active_set import DEPENDENT, non_negative
+
+UNKNOWN_FACTOR = (
+    "one factor per channel between material and lights: the lights' mean intensity was kept at that of the scene"
+)
+N_RANGE = (0.5, 1e5)
+GRID_STEP = 0.35
+_ROUNDS = 200
+
+
+@dataclass(frozen=True)
+class LightFit:
+    """Lights found in a picture.
+
+    Attributes:
+        scene: the scene with the emittances found.
+        material: the one that was given, or found.
+        emittances: of each light, then of the ambient light where the scene has any, (L, C).
+        factors: the same over those of the scene, (L, C).
+        errors: standard errors of the factors, (L, C); infinite where the picture does not determine one. Those of a
+            fit of both hold for the material found.
+        residual: root mean square of the residual over that of the picture.
+        undetermined: what the picture cannot tell, in words; empty where it tells all.
+    """
+
+    scene: brdf.Scene
+    material: brdf.Material
+    emittances: Float[np.ndarray, "L C"]
+    factors: Float[np.ndarray, "L C"]
+    errors: Float[np.ndarray, "L C"]
+    residual: float
+    undetermined: tuple[str, ...]
+
+    def __str__(self) -> str:
+        """The report."""
+        names = [light.type_name for light in self.scene.lights]
+        names += ["ambient"] * (len(self.emittances) - len(names))
+        lines = [f"light of {len(names)} sources on {self.material.name}"]
+        for index, name in enumerate(names):
+            values = (f"{v:.6g} ± {v * e / f if f > 0 else e:.2g}" for v, f, e in self._numbers(index))
+            lines.append(f"  {name:<12} {', '.join(values)}")
+        lines.append(f"  residual     {100 * self.residual:.3g} % of the picture (rms)")
+        return "\n".join(lines + [f"  not determined: {what}" for what in self.undetermined])
+
+    def _numbers(self, index: int) -> list[tuple[float, float, float]]:
+        return list(zip(self.emittances[index], self.factors[index], self.errors[index], strict=True))
+
+
+def fit_lights(
+    target: Any, scene: brdf.Scene, material: brdf.Material, *, precision: brdf.Precision = "float32", mask: Any = None
+) -> LightFit:
+    """Fit intensity and colour of every light, given the material.
+
+    Args:
+        target: linear values, (H, W, C), or a `brdf.Picture`.
+        scene: what it shows; where its lights have an emittance of 0 in a channel that stays 0.
+        material: of the surface.
+        precision: "float32" or "float64" of the pictures; sums are in float64.
+        mask: (H, W), pixels to look at.
+
+    Returns:
+        The emittances, at least 0, with their errors.
+
+    Raises:
+        InputError: where the picture does not fit the scene.
+    """
+    pixels, seen = _pixels(target, scene, mask)
+    images = np.asarray(brdf.render_lights(material, scene, precision=precision), np.float64)[:, seen]
+    columns = np.broadcast_to(images, (*images.shape[:2], pixels.shape[1]))
+    factors, errors = _intensities(columns, pixels)
+    return _result(scene, material, columns, pixels, factors, errors, ())
+
+
+def fit_lights_and_material(
+    target: Any,
+    scene: brdf.Scene,
+    *,
+    model: str = "blinn-phong",
+    precision: brdf.Precision = "float32",
+    mask: Any = None,
+    n_range: tuple[float, float] = N_RANGE,
+) -> LightFit:
+    """Fit the lights and the material together, up to the one factor per channel that no picture determines.
+
+    For each exponent of a grid, and then by golden section around the best, the intensities and the coefficients are
+    found in turn, each a non-negative linear problem, until the residual stands still. The ambient coefficient cannot
+    be told from the ambient intensity: it is that of the scene, and k_a takes the rest.
+
+    Args:
+        target: linear values, (H, W, C), or a `brdf.Picture`.
+        scene: what it shows; its lights are the start, and their mean stays what it is.
+        model: the name of the model.
+        precision: as for `fit_lights`.
+        mask: (H, W), pixels to look at.
+        n_range: bounds of the exponent.
+
+    Returns:
+        Lights and material; ``undetermined`` names the factor.
+
+    Raises:
+        InputError: where the picture does not fit the scene, the model is unknown, or there is no light.
+    """
+    if model not in brdf.MODELS:
+        raise InputError("model", f"is unknown, got {model!r}", f"Use one of {', '.join(brdf.MODELS)}")
+    if not scene.lights:
+        raise InputError("scene", "has no lights", "Add a [[lights]] table")
+    pixels, seen = _pixels(target, scene, mask)
+    channels = pixels.shape[1]
+    cls: Any = brdf.MODELS[model]
+    specular = issubclass(cls, brdf.SpecularMaterial)
+
+    def terms(n: float) -> Float[np.ndarray, "L T P C"]:
+        """One picture per light for k_d = 1, and for k_s = 1."""
+        unit = [cls(k_d=1.0, k_s=0.0, n=n), cls(k_d=0.0, k_s=1.0, n=n)] if specular else [cls(k_d=1.0)]
+        lit = eqx.tree_at(lambda s: s.ambient, scene, None, is_leaf=lambda leaf: leaf is None)
+        images = [np.asarray(brdf.render_lights(one, lit, precision=precision), np.float64)[:, seen] for one in unit]
+        stacked = np.stack(images, axis=1)
+        return np.broadcast_to(stacked, (*stacked.shape[:3], channels))
+
+    ambient = np.zeros(channels) if scene.ambient is None else np.broadcast_to(scene.ambient, channels)
+    best = (
+        _search(lambda n: _in_turn(terms(n), ambient, pixels), n_range)
+        if specular
+        else (
+            1.0,
+            _in_turn(terms(1.0), ambient, pixels),
+        )
+    )
+    n, (_, factors, k) = best
+    mean = factors.mean(axis=0)
+    scale = np.where(mean > 0, mean, 1.0)
+    factors, k = factors / scale, np.concatenate([k[:1], k[1:] * scale])
+    material = cls(k_a=k[0], k_d=k[1], k_s=k[2], n=n) if specular else cls(k_a=k[0], k_d=k[1])
+    columns = np.einsum("ltpc,tc->lpc", terms(n), k[1:])
+    if scene.ambient is not None:
+        columns = np.concatenate([columns, np.broadcast_to(k[0] * ambient, (1, *pixels.shape))])
+        factors = np.concatenate([factors, np.ones((1, channels))])
+    _, errors = _intensities(columns, pixels)
+    return _result(scene, material, columns, pixels, factors, errors, (UNKNOWN_FACTOR,))
+
+
+def _pixels(target: Any, scene: brdf.Scene, mask: Any) -> tuple[Float[np.ndarray, "P C"], Bool[np.ndarray, "H W"]]:
+    values = np.asarray(target.pixels if isinstance(target, brdf.Picture) else target, np.float64)
+    values = values[..., None] if values.ndim == 2 else values
+    if values.ndim != 3 or values.shape[1::-1] != scene.resolution:
+        came = f"is of shape {values.shape}, the scene {scene.resolution[0]} x {scene.resolution[1]} pixels"
+        raise InputError("target", came, "Give a picture and a camera of the same resolution")
+    if scene.channels not in (1, values.shape[2]):
+        came = f"has {values.shape[2]} channels, the scene's light {scene.channels}"
+        raise InputError("target", came, "Give both the same number of channels")
+    seen = np.asarray(scene.surface_points().mask) & np.all(np.isfinite(values), axis=-1)
+    if mask is not None:
+        seen &= np.asarray(mask, bool)
+    if not seen.any():
+        raise InputError("target", "has no finite pixel that sees a fitted shape", "Check camera, shapes and mask")
+    return values[seen], seen
+
+
+def _intensities(
+    columns: Float[np.ndarray, "L P C"], pixels: Float[np.ndarray, "P C"]
+) -> tuple[Float[np.ndarray, "L C"], Float[np.ndarray, "L C"]]:
+    """Factors and their standard errors, channel by channel."""
+    lights, count, channels = columns.shape
+    factors, errors = np.zeros((lights, channels)), np.full((lights, channels), np.inf)
+    for c in range(channels):
+        gram = columns[..., c] @ columns[..., c].T
+        factors[:, c] = non_negative(gram, columns[..., c] @ pixels[:, c])
+        residual = pixels[:, c] - factors[:, c] @ columns[..., c]
+        lit = np.diag(gram) > 0
+        scale = np.diag(gram)[lit] ** 0.5
+        value, vector = np.linalg.eigh(gram[np.ix_(lit, lit)] / np.outer(scale, scale))
+        told = value > DEPENDENT
+        inverse = np.sum(vector[:, told] ** 2 / value[told], axis=1)
+        inverse[np.any(np.abs(vector[:, ~told]) > 1e-3, axis=1)] = np.inf
+        noise = max(float(np.sum(residual**2)), np.finfo(float).tiny) / max(count - lights, 1)
+        errors[lit, c] = (noise * inverse) ** 0.5 / scale
+    return factors, errors
+
+
+Turn = tuple[float, Float[np.ndarray, "L C"], Float[np.ndarray, "T C"]]
+
+
+def _in_turn(terms: Float[np.ndarray, "L T P C"], ambient: np.ndarray, pixels: Float[np.ndarray, "P C"]) -> Turn:
+    """Least cost at one exponent, the lights' factors, and coefficients with k_a first."""
+    lights, parts, count, channels = terms.shape
+    cost, factors, k = 0.0, np.ones((lights, channels)), np.zeros((parts + 1, channels))
+    for c in range(channels):
+        columns = np.concatenate([terms[..., c].reshape(-1, count), np.full((1, count), ambient[c])])
+        gram, product = columns @ columns.T, columns @ pixels[:, c]
+        square, last = float(pixels[:, c] @ pixels[:, c]), np.inf
+        light, now, coefficients = np.ones(lights), square, np.zeros(parts + 1)
+        for _ in range(_ROUNDS):
+            by_k = _fold(np.kron(light[:, None], np.eye(parts)))
+            coefficients = non_negative(by_k.T @ gram @ by_k, by_k.T @ product)
+            by_light = _fold(np.kron(np.eye(lights), coefficients[:-1, None]))
+            found = non_negative(by_light.T @ gram @ by_light, by_light.T @ product)
+            light, whole = found[:-1], by_light @ found
+            coefficients[-1] = found[-1]
+            now = max(float(square - 2 * whole @ product + whole @ gram @ whole), 0.0)
+            if last - now <= 1e-12 * square:
+                break
+            last = now
+        cost, factors[:, c] = cost + now, light
+        k[1:, c], k[0, c] = coefficients[:-1], coefficients[-1]
+    return cost, factors, k
+
+
+def _fold(matrix: np.ndarray) -> np.ndarray:
+    """Beside the terms of the lights, the ambient term as it is."""
+    wide = np.zeros((matrix.shape[0] + 1, matrix.shape[1] + 1))
+    wide[:-1, :-1], wide[-1, -1] = matrix, 1.0
+    return wide
+
+
+def _search(at: Any, n_range: tuple[float, float]) -> tuple[float, Turn]:
+    """The exponent of least cost: a grid over log n, then golden section in the best cell's neighbourhood."""
+    low, high = (float(np.log(n)) for n in n_range)
+    grid = np.linspace(low, high, 2 + int((high - low) / GRID_STEP))
+    best = int(np.argmin([at(float(np.exp(x)))[0] for x in grid]))
+    low, high = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
+    ratio = (5**0.5 - 1) / 2
+    left, right = high - ratio * (high - low), low + ratio * (high - low)
+    at_left, at_right = (at(float(np.exp(x))) for x in (left, right))
+    while high - low > 1e-5:
+        if at_left[0] < at_right[0]:
+            high, right, at_right = right, left, at_left
+            left = high - ratio * (high - low)
+            at_left = at(float(np.exp(left)))
+        else:
+            low, left, at_left = left, right, at_right
+            right = low + ratio * (high - low)
+            at_right = at(float(np.exp(right)))
+    return (float(np.exp(left)), at_left) if at_left[0] < at_right[0] else (float(np.exp(right)), at_right)
+
+
+def _result(
+    scene: brdf.Scene,
+    material: brdf.Material,
+    columns: Float[np.ndarray, "L P C"],
+    pixels: Float[np.ndarray, "P C"],
+    factors: Float[np.ndarray, "L C"],
+    errors: Float[np.ndarray, "L C"],
+    undetermined: tuple[str, ...],
+) -> LightFit:
+    channels = pixels.shape[1]
+    before = np.stack([np.broadcast_to(np.asarray(one, float), channels) for one in scene.emittances()])
+    emittances = before * factors
+    lights = tuple(
+        eqx.tree_at(lambda one: one.emittance, light, emittance)
+        for light, emittance in zip(scene.lights, emittances, strict=False)
+    )
+    found = eqx.tree_at(lambda s: s.lights, scene, lights)
+    if scene.ambient is not None:
+        found = eqx.tree_at(lambda s: s.ambient, found, emittances[-1])
+    residual = pixels - np.einsum("lc,lpc->pc", factors, columns)
+    share = float((np.sum(residual**2) / max(np.sum(pixels**2), np.finfo(float).tiny)) ** 0.5)
+    dark = [
+        f"intensity of light {index} in channel {channel}: another light or none would look the same"
+        for index, channel in np.argwhere(~np.isfinite(errors))
+    ]
+    return LightFit(found, material, emittances, factors, errors, share, (*undetermined, *dark))

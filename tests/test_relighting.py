@@ -1,0 +1,67 @@
+"""Light is linear: recolouring pictures, and finding the lights in them."""
+
+import numpy as np
+import pytest
+
+import brdf
+import fitting
+
+CAMERA = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=[32, 32])
+BALL = [brdf.Sphere(center=[0, 0, 0], radius=1)]
+MATERIAL = brdf.BlinnPhong(k_a=[0.1, 0.2, 0.1], k_d=[0.5, 0.3, 0.2], k_s=[0.4, 0.4, 0.5], n=30)
+INTENSITIES = np.array([[1.0, 0.9, 0.8], [0.3, 0.5, 0.7], [0.2, 0.1, 0.2]])
+
+
+def scene(intensities: np.ndarray) -> brdf.Scene:
+    lights = [
+        brdf.DirectionalLight(direction=[0.5, 0.6, 0.7], intensity=intensities[0]),
+        brdf.SphereLight(center=[-2, 0.5, 2], radius=0.5, radiance=20 * intensities[1], samples=16),
+    ]
+    return brdf.Scene(camera=CAMERA, shapes=BALL, lights=lights, ambient=intensities[2])
+
+
+def test_one_picture_per_light_adds_up_to_the_picture():
+    images = np.asarray(brdf.render_lights(MATERIAL, scene(INTENSITIES), precision="float32"))
+    assert images.shape == (3, 32, 32, 3)
+    whole = np.asarray(brdf.render(MATERIAL, scene(INTENSITIES), precision="float32"))
+    np.testing.assert_allclose(images.sum(axis=0), whole, atol=1e-6)
+
+
+def test_recoloured_pictures_are_those_of_recoloured_lights():
+    factors = np.array([[2.0, 0.5, 0.0], [1.0, 3.0, 1.0], [0.0, 1.0, 2.0]])
+    images = brdf.render_lights(MATERIAL, scene(INTENSITIES), precision="float32")
+    recoloured = brdf.render(MATERIAL, scene(INTENSITIES * factors), precision="float32")
+    np.testing.assert_allclose(brdf.relight(images, factors), recoloured, atol=2e-6)  # a few roundings of float32
+    with pytest.raises(brdf.InputError, match="factors: must be of shape"):
+        brdf.relight(images, [1.0, 2.0])
+
+
+def test_lights_are_found_given_the_material():
+    target = np.asarray(brdf.render(MATERIAL, scene(INTENSITIES), precision="float32"))
+    found = fitting.fit_lights(target, scene(np.ones((3, 3))), MATERIAL)
+    expected = INTENSITIES * np.array([[1.0], [20.0], [1.0]])
+    np.testing.assert_allclose(found.emittances, expected, rtol=1e-4)
+    assert not found.undetermined
+    assert found.residual < 1e-5
+
+
+def test_lights_that_look_alike_are_not_told_apart():
+    light = brdf.DirectionalLight(direction=[0, 0, 1], intensity=[1, 1, 1])
+    twice = brdf.Scene(camera=CAMERA, shapes=BALL, lights=[light, light])
+    found = fitting.fit_lights(np.asarray(brdf.render(MATERIAL, twice)), twice, MATERIAL)
+    assert len(found.undetermined) == 6
+    assert "another light or none" in str(found)
+
+
+def test_lights_and_material_are_found_up_to_one_factor():
+    target = np.asarray(brdf.render(MATERIAL, scene(INTENSITIES), precision="float32"))
+    found = fitting.fit_lights_and_material(target, scene(np.ones((3, 3))), n_range=(5.0, 200.0))
+    assert isinstance(found.material, brdf.BlinnPhong)
+    np.testing.assert_allclose(found.material.n, 30, rtol=1e-3)
+    # what one factor per channel cannot change: the ratio of the lights and of the coefficients
+    np.testing.assert_allclose(
+        found.emittances[1] / found.emittances[0], 20 * INTENSITIES[1] / INTENSITIES[0], rtol=1e-3
+    )
+    np.testing.assert_allclose(found.material.k_s / found.material.k_d, MATERIAL.k_s / MATERIAL.k_d, rtol=1e-3)
+    assert any("one factor per channel" in what for what in found.undetermined)
+    np.testing.assert_allclose(brdf.render(found.material, found.scene, precision="float32"), target, atol=1e-4)
