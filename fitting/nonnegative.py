@@ -6,18 +6,21 @@ entries instead of in small matrices, it compiles to a single loop.
 """
 
 import itertools
+from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-# Which of ambient, diffuse, specular are above zero. A linear bound (x_d u + x_s v <= 1) would add the sets that lie on it.
+from fitting.pictures import AnyArray
+
+# Which of ambient, diffuse, specular are above zero. A linear bound, x_d u + x_s v <= 1, would add the sets that lie on
+# it.
 ACTIVE_SETS = np.array(list(itertools.product([False, True], repeat=3)))
 
 
-class Linear(eqx.Module):
+class Linear(NamedTuple):
     """The best coefficients at a fixed exponent.
 
     Attributes:
@@ -37,16 +40,16 @@ def _divide(numerator: Float[Array, "*K"], pivot: Float[Array, "*K"]) -> Float[A
 
 
 def solve(
-    gram: Float[Array, "*K C 4 4"],
-    product: Float[Array, "*K C 4"],
-    square: Float[Array, "*K C"],
-    reference: Float[Array, "C 3"],
-    free: Bool[Array, "C 3"],
-    tolerance: Float[Array, ""],
+    gram: Float[AnyArray, "*K C 4 4"],
+    product: Float[AnyArray, "*K C 4"],
+    square: Float[AnyArray, "*K C"],
+    reference: Float[AnyArray, "C 3"],
+    free: Bool[AnyArray, "C 3"],
+    tolerance: Float[AnyArray, ""],
 ) -> Linear:
     """The non-negative coefficients that minimise the weighted squared residual, and the slope of that minimum.
 
-    By the envelope theorem the coefficients may be held for the slope: -2 x_s <S', r>, r the residual of the best model.
+    By the envelope theorem the coefficients may be held for the slope: -2 x_s <S', r>, r the best residual.
 
     Args:
         gram: Products of ambient, diffuse, lobe S and its derivative S' by log n.
@@ -54,8 +57,8 @@ def solve(
         square: Squares of that residual.
         reference: Coefficients of the reference model.
         free: Which coefficients may be above 0.
-        tolerance: Share of a diagonal entry below which what elimination leaves of it counts as rounding: the column then
-            depends on the others, and a smaller active set does as well.
+        tolerance: Share of a diagonal entry below which what elimination leaves of it counts as rounding: the column
+            then depends on the others, and a smaller active set does as well.
 
     Returns:
         Coefficients, cost and slope.
@@ -89,9 +92,7 @@ def solve(
         feasible = feasible & (~active[i] | allowed)
     # Relative to the reference, hence exact where the two models nearly agree: near the optimum.
     step = [x[i] - start[i] for i in range(3)]
-    change = sum(
-        step[i] * (sum(gram[..., i, j] * step[j] for j in range(3)) - 2 * product[..., i]) for i in range(3)
-    )
+    change = sum(step[i] * (sum(gram[..., i, j] * step[j] for j in range(3)) - 2 * product[..., i]) for i in range(3))
     zero = np.zeros((), square.dtype)
     change, *x = jax.lax.reduce(
         (jnp.where(feasible, change, jnp.inf), *x),

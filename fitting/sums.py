@@ -1,27 +1,29 @@
 """What the fit needs of the pixels: Gram matrices of a few basis images, summed in one pass.
 
-The image is linear in ``k_a``, ``k_d``, ``k_s``, so a least-squares fit sees the pixels only through the products of the
-basis images with each other and with the target. This module computes those, for a :class:`Picture`, and nothing else.
+The image is linear in ``k_a``, ``k_d``, ``k_s``, so a least-squares fit sees the pixels only through the products of
+the basis images with each other and with the target. This module computes those, for a :class:`Picture`, and nothing
+else.
 
-How a pass is made. XLA emits one loop per reduction, so some thirty separate sums would evaluate the lobe thirty times or
-store it; one variadic ``lax.reduce`` over all products evaluates it once and keeps every sum in a register. Its loop is
-vectorised only when the compiler may reorder the additions, which ``xla_cpu_enable_fast_math`` allows; the ``honor`` flags
-keep NaN, infinity and division as IEEE has them. Measured at 512 x 512 by ``python -m benchmarks.engine --kernels``.
+How a pass is made. XLA emits one loop per reduction, so some thirty separate sums would evaluate the lobe thirty times
+or store it; one variadic ``lax.reduce`` over all products evaluates it once and keeps every sum in a register. Its loop
+is vectorised only when the compiler may reorder the additions, which ``xla_cpu_enable_fast_math`` allows; the ``honor``
+flags keep NaN, infinity and division as IEEE has them. ``python -m benchmarks.engine`` prints what a pass costs.
 
-Precision. Products are formed in the pixels' own dtype and summed within a block; blocks are added in float64. The target
-enters as the residual against a reference model, and the references are put back in float64, hence the rounding of a
-float32 pass scales with the residual and not with the picture.
+Precision. Products are formed in the pixels' own dtype and summed within a block; blocks are added in float64. The
+target enters as the residual against a reference model, and the reference is put back in float64, hence the rounding of
+a float32 pass scales with the residual and not with the picture.
 """
 
-from collections.abc import Callable, Iterable, Sequence
-from functools import partial
-from typing import Protocol, Self, runtime_checkable
+from collections.abc import Iterable, Sequence
+from functools import cache, partial
+from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+
+from fitting.pictures import Lobe, Picture, relative_lobe
 
 # 32768 pixels of the six or seven arrays a pass reads stay in the second-level cache.
 BLOCK = 32768
@@ -38,78 +40,7 @@ COMPILER_OPTIONS: dict[str, bool | int | float | str] = {
 }
 
 
-@runtime_checkable
-class Lobe(Protocol):
-    """The specular basis image as a function of the exponent; an Equinox module."""
-
-    def __call__(self, n: Float[Array, ""]) -> tuple[Float[Array, "P Cb"], Float[Array, "P Cb"]]:
-        """The basis image and its derivative by ``n``, in the pixels' dtype; finite for every ``n`` in the search."""
-        ...
-
-    def peak(self) -> Float[Array, " P"]:
-        """The largest ``log(cos)`` over the light samples of each pixel, at most 0; it says how early a lobe dies out."""
-        ...
-
-    def pixels(self, choose: Callable[[Array], Array]) -> Self:
-        """The same lobe for some of the pixels: ``choose`` applied to each array whose first axis is the pixels."""
-        ...
-
-
-class OneLightLobe(eqx.Module):
-    """The lobe of one light sample per pixel: ``weight * exp(n * log_cos)``.
-
-    Attributes:
-        log_cos: Logarithm of the lobe's cosine, at most 0, finite.
-        weight: What multiplies the lobe: light intensity, visibility, ``(N.L)+`` if the model has it; 0 where gated.
-    """
-
-    log_cos: Float[Array, " P"]
-    weight: Float[Array, "P Cb"]
-
-    def __call__(self, n: Float[Array, ""]) -> tuple[Float[Array, "P Cb"], Float[Array, "P Cb"]]:
-        """The basis image and its derivative by ``n``."""
-        value = self.weight * jnp.exp(n.astype(self.log_cos.dtype) * self.log_cos)[:, None]
-        return value, value * self.log_cos[:, None]
-
-    def peak(self) -> Float[Array, " P"]:
-        """The logarithm of the cosine itself, there being one light."""
-        return self.log_cos
-
-    def pixels(self, choose: Callable[[Array], Array]) -> "OneLightLobe":
-        """The lobe of the chosen pixels."""
-        return OneLightLobe(log_cos=choose(self.log_cos), weight=choose(self.weight))
-
-
-class Picture(eqx.Module):
-    """One picture, or one tile of one: ``target ~ x_a * ambient + x_d * diffuse + x_s * lobe(n)``.
-
-    Attributes:
-        target: Linear radiance; its dtype is the dtype of the pass.
-        diffuse: Diffuse basis image; ``Cb`` is 1 where it is the same for all channels, else ``C``.
-        lobe: Specular basis image, ``None`` for a model without one.
-        weight: Weight of each squared residual, at least 0; a target of weight 0 may be anything, NaN too. ``None``
-            weighs every pixel 1 and costs nothing.
-        ambient: What multiplies ``x_a``, the same for all pixels; 0 in a picture without ambient light.
-    """
-
-    target: Float[Array, "P C"]
-    diffuse: Float[Array, "P Cb"]
-    lobe: Lobe | None = None
-    weight: Float[Array, " P"] | Float[Array, "P C"] | None = None
-    ambient: Float[Array, " Ca"] = eqx.field(default_factory=lambda: np.ones(1))  # pyright: ignore[reportAssignmentType]
-
-    def pixels(self, choose: Callable[[Array], Array]) -> "Picture":
-        """The same picture, some of its pixels."""
-        return Picture(
-            target=choose(self.target),
-            diffuse=choose(self.diffuse),
-            lobe=None if self.lobe is None else self.lobe.pixels(choose),
-            weight=None if self.weight is None else choose(self.weight),
-            ambient=self.ambient,
-        )
-
-
-class Sums(eqx.Module):
+class Sums(NamedTuple):
     """Sums over pixels, float64: all that a least-squares fit needs of pictures.
 
     The columns are stated by :func:`sums`.
@@ -138,19 +69,18 @@ class Sums(eqx.Module):
 
 
 def _columns(
-    lobe: Lobe | None, diffuse: Float[Array, "P Cb"], log_n: Float[Array, " N"]
+    lobe: Lobe | None, diffuse: Float[Array, "P Cb"], log_n: Float[Array, " N"], peak: Float[Array, ""]
 ) -> tuple[Float[Array, "P Cb"], ...]:
     """Diffuse, lobe, derivative by log n, and for a bracket what Hermite's cubic adds to the straight line."""
-    if lobe is None or log_n.shape[0] == 0:
+    if log_n.shape[0] == 0:
         return (diffuse,)
-    n = jnp.exp(log_n)
-    value, slope = lobe(n[0])
-    slope = slope * n[0].astype(slope.dtype)
+    if lobe is None:
+        return (diffuse,) + (jnp.zeros_like(diffuse),) * (2 * log_n.shape[0])
+    value, slope = relative_lobe(lobe, log_n[0], peak, diffuse.dtype)
     if log_n.shape[0] == 1:
         return diffuse, value, slope
-    end_value, end_slope = lobe(n[1])
-    end_slope = end_slope * n[1].astype(slope.dtype)
-    step = (log_n[1] - log_n[0]).astype(slope.dtype)
+    end_value, end_slope = relative_lobe(lobe, log_n[1], peak, diffuse.dtype)
+    step = (log_n[1] - log_n[0]).astype(diffuse.dtype)
     # Differences are taken per pixel: taken between sums they would lose the digits that a narrow bracket lives on.
     return diffuse, value, slope, end_value - value - step * slope, end_slope - slope
 
@@ -181,33 +111,47 @@ def _products(
     return [*products, one if weight is None else jnp.where(weight > 0, one, 0)]
 
 
-def _unpack(packed: Float[np.ndarray, "*K S"], columns: int, residuals: int) -> Sums:
-    """Undo the packing of :func:`_products`."""
-    triangle = columns * (columns + 1) // 2
+@cache
+def _places(columns: int) -> Int[np.ndarray, "R R"]:
+    """Where each entry of a Gram matrix lies in its packed upper triangle."""
     place = np.zeros((columns, columns), int)
-    place[np.triu_indices(columns)] = np.arange(triangle)
-    gram = packed[..., np.maximum(place, place.T)]
-    product = packed[..., triangle : triangle + residuals * columns].reshape(*packed.shape[:-1], residuals, columns)
-    square = packed[..., triangle + residuals * columns : -1]
-    shape = (*packed.shape[:-1], residuals)
-    return Sums(
-        np.broadcast_to(gram[..., None, :, :], (*shape, columns, columns)),
-        product,
-        square,
-        np.broadcast_to(packed[..., -1:], shape),
-    )
+    place[np.triu_indices(columns)] = np.arange(columns * (columns + 1) // 2)
+    return np.maximum(place, place.T)
+
+
+def _unpack(packed: Float[np.ndarray, "*K S"], picture: Picture, columns: int, leading: int) -> Sums:
+    """Undo the packing of :func:`_products`, and scale the ambient column, which is constant and was summed as 1."""
+    channels = picture.target.shape[1]
+    if packed.ndim == leading + 1:
+        packed = packed[..., None, :]
+        residuals = channels
+    else:
+        residuals = 1
+    triangle = columns * (columns + 1) // 2
+    last = triangle + residuals * columns
+    scale = np.ones((channels, columns))
+    scale[:, 0] = picture.ambient
+    gram = packed[..., _places(columns)] * (scale[:, :, None] * scale[:, None, :])
+    product = packed[..., triangle:last].reshape(*packed.shape[:leading], channels, columns) * scale
+    square = packed[..., last:-1].reshape(*packed.shape[:leading], channels)
+    return Sums(gram, product, square, np.broadcast_to(packed[..., -1], square.shape))
 
 
 def _block_sums(
-    picture: Picture, log_n: Float[Array, " N"], reference: Float[Array, "3 C"], inside: Bool[Array, " B"] | None
+    picture: Picture,
+    log_n: Float[Array, " N"],
+    reference: Float[Array, "3 C"],
+    peak: Float[Array, ""],
+    inside: Bool[Array, " B"] | None,
 ) -> Float[Array, "..."]:
     """Packed sums of one block: (S,) where all channels share basis and weight, else (C, S)."""
     target, dtype = picture.target, picture.target.dtype
     weight = picture.weight
-    if inside is not None:
-        one = jnp.ones((), dtype) if weight is None else weight
-        weight = jnp.where(inside if jnp.ndim(one) < 2 else inside[:, None], one, 0)
-    lit = _columns(picture.lobe, picture.diffuse, log_n)
+    if inside is not None and weight is None:
+        weight = inside.astype(dtype)
+    elif inside is not None and weight is not None:
+        weight = jnp.where(inside if weight.ndim < 2 else inside[:, None], weight, 0)
+    lit = _columns(picture.lobe, picture.diffuse, log_n, peak)
     channels = target.shape[1]
     ambient = jnp.broadcast_to(picture.ambient, channels) * reference[0]
     reference = jnp.stack([ambient, reference[1], reference[2]]).astype(dtype)
@@ -227,7 +171,11 @@ def _block_sums(
             residuals.append(residual if weight is None else jnp.where(weight > 0, residual, 0))
         return _reduce(_products([jnp.ones_like(columns[0]), *columns], residuals, weight))
 
-    if len({column.shape[1] for column in lit} | {1}) == 1 and jnp.ndim(weight) < 2 and channels <= UNROLLED_CHANNELS:
+    if (
+        len({column.shape[1] for column in lit} | {1}) == 1
+        and (weight is None or weight.ndim < 2)
+        and channels <= UNROLLED_CHANNELS
+    ):
         return one_group([column[:, 0] for column in lit], target.T, weight, reference)
     columns = [jnp.broadcast_to(column, target.shape).T for column in lit]
     weights = None if weight is None else jnp.broadcast_to(weight.T, target.T.shape)
@@ -236,23 +184,23 @@ def _block_sums(
 
 
 def _all_blocks(
-    picture: Picture, log_n: Float[Array, " N"], reference: Float[Array, "3 C"]
+    picture: Picture, log_n: Float[Array, " N"], reference: Float[Array, "3 C"], peak: Float[Array, ""]
 ) -> Float[Array, " S"] | Float[Array, "C S"]:
     """Packed sums of one picture, block after block."""
     count = picture.target.shape[0]
     blocks = max(1, -(-count // BLOCK))
     size = -(-count // blocks)
     if blocks == 1:
-        return _block_sums(picture, log_n, reference, None)
+        return _block_sums(picture, log_n, reference, peak, None)
 
     def add(block: Int[Array, ""], packed: Float[Array, "..."]) -> Float[Array, "..."]:
         # The last block starts early enough to be whole; what it shares with the one before counts once.
         start = jnp.minimum(block * size, count - size)
         part = picture.pixels(lambda a: jax.lax.dynamic_slice_in_dim(a, start, size))
         inside = None if count % size == 0 else start + jnp.arange(size) >= block * size
-        return packed + _block_sums(part, log_n, reference, inside)
+        return packed + _block_sums(part, log_n, reference, peak, inside)
 
-    shape = jax.eval_shape(lambda: _block_sums(picture, log_n, reference, None))
+    shape = jax.eval_shape(lambda: _block_sums(picture, log_n, reference, peak, None))
     return jax.lax.fori_loop(0, blocks, add, jnp.zeros(shape.shape, shape.dtype))
 
 
@@ -261,28 +209,18 @@ _one_exponent = jax.jit(_all_blocks, compiler_options=COMPILER_OPTIONS)
 
 @partial(jax.jit, compiler_options=COMPILER_OPTIONS)
 def _many_exponents(
-    picture: Picture, log_n: Float[Array, " N"], reference: Float[Array, "3 C"]
+    picture: Picture, log_n: Float[Array, " N"], reference: Float[Array, "3 C"], peak: Float[Array, ""]
 ) -> Float[Array, "N S"] | Float[Array, "N C S"]:
-    return jax.lax.map(lambda one: _all_blocks(picture, one[None], reference), log_n)
-
-
-def _finish(picture: Picture, packed: Array, columns: int, leading: int) -> Sums:
-    """Unpack, and scale the ambient column, which is constant and was summed as 1."""
-    channels = picture.target.shape[1]
-    if packed.ndim == leading + 1:
-        result = _unpack(np.asarray(packed), columns, channels)
-    else:
-        each = _unpack(np.asarray(packed), columns, 1)
-        result = jax.tree.map(lambda a: np.squeeze(a, axis=leading + 1), each)
-    scale = np.ones((channels, columns))
-    scale[:, 0] = picture.ambient
-    return Sums(
-        result.gram * (scale[:, :, None] * scale[:, None, :]), result.product * scale, result.square, result.pixels
-    )
+    return jax.lax.map(lambda one: _all_blocks(picture, one[None], reference, peak), log_n)
 
 
 def sums(
-    pictures: Iterable[Picture], log_n: Float[np.ndarray, " N"], reference: Float[np.ndarray, "C 3"], *, grid: bool = False
+    pictures: Iterable[Picture],
+    log_n: Float[np.ndarray, " N"],
+    reference: Float[np.ndarray, "C 3"],
+    *,
+    grid: bool = False,
+    peak: float | Float[np.ndarray, ""] = 0.0,
 ) -> Sums:
     """One pass over the pixels of one or many pictures, each let go before the next is asked for.
 
@@ -293,6 +231,7 @@ def sums(
             columns are ``s_1 - s_0 - (log n_1 - log n_0) s_0'`` and ``s_1' - s_0'``.
         reference: Coefficients x_a, x_d, x_s of the reference model; the lobe is that of the first exponent.
         grid: Treat each of ``log_n`` on its own; the sums have a leading axis N.
+        peak: Take ``S exp(-n peak)`` for the lobe, its derivative and the reference; see :func:`relative_lobe`.
 
     Returns:
         The sums over all pixels.
@@ -301,7 +240,7 @@ def sums(
     columns = 4 if grid else 2 + 2 * log_n.size
     result: Sums | None = None
     for picture in pictures:
-        part = _finish(picture, run(picture, log_n, reference.T), columns, int(grid))
-        result = part if result is None else jax.tree.map(np.add, result, part)
+        part = _unpack(np.asarray(run(picture, log_n, reference.T, np.float64(peak))), picture, columns, int(grid))
+        result = part if result is None else Sums(*map(np.add, result, part))
     assert result is not None
     return result

@@ -1,102 +1,137 @@
 """A stratified subsample of a picture: a few thousand pixels that see every exponent.
 
-A lobe of exponent n lights the pixels with ``-log_cos`` below about 1 / n, so at n = 1e5 it covers a handful. A pixel is kept
-with probability ``min(1, limit / -log_cos)``: all of the innermost octaves of ``-log_cos``, and about equally many of each
-octave further out, since a highlight's pixels multiply by two per octave. Weights are the inverse probabilities.
+A lobe of exponent n lights the pixels with ``-log_cos`` below about 1 / n: at n = 1e5 a handful around the peak, while
+an n below 1 is told from another by the few that are nearly at 90 degrees from it. So each octave of ``-log_cos`` is a
+stratum; sparse ones are kept whole, the others thinned to about equal numbers. Weights are the inverse probabilities.
 """
 
+import math
 from functools import partial
+from typing import NamedTuple, cast
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, UInt8
 
-from fitting.sums import COMPILER_OPTIONS, Picture
+from fitting.pictures import AnyArray, Picture, relative_lobe
+from fitting.sums import COMPILER_OPTIONS, UNROLLED_CHANNELS
 
-# Beyond -log_cos = 1 the lobe of every exponent above 1 is dark, and all that is left to see is ambient and diffuse.
-_WIDEST = 1.0
-
-# The limit is read off every 16th pixel, so that no 16 Mpixel array has to be sorted.
+# The strata are counted on every 16th pixel.
 _PREVIEW_STRIDE = 16
 
+# Down to exp(-60) of its value at the centre a lobe is well inside float32.
+_LARGEST_DECAY = 60.0
 
-class Thinned(eqx.Module):
+# A pixel of weight 0 is in no stratum.
+_EXCLUDED = 255
+
+
+class Thinned(NamedTuple):
     """Some pixels of a picture.
 
     Attributes:
         picture: The pixels kept, their weights times ``factor``.
         factor: How many pixels each stands for, at least 1; 0 for padding. None where all pixels were kept.
+        nearest: The smallest ``-log_cos`` of all pixels that count; infinite without a lobe.
     """
 
     picture: Picture
-    factor: Float[Array, " M"] | None
+    factor: Float[AnyArray, " M"] | None
+    nearest: float
 
 
-def _distance(picture: Picture) -> Float[Array, " P"]:
+@jax.jit
+def _octaves(picture: Picture) -> tuple[UInt8[Array, " P"], Float[Array, ""]]:
+    """The octave of ``-log_cos``, which is its binary exponent, 0 at the peak itself; and the smallest ``-log_cos``."""
     assert picture.lobe is not None
-    return jnp.clip(-picture.lobe.peak().astype(jnp.float32), 0.0, _WIDEST)
+    distance = -picture.lobe.peak()
+    octave = (jax.lax.bitcast_convert_type(distance.astype(jnp.float32), jnp.int32) >> 23) & 0xFF
+    if picture.weight is not None:
+        weight = picture.weight if picture.weight.ndim == 1 else jnp.max(picture.weight, axis=1)
+        octave = jnp.where(weight > 0, octave, _EXCLUDED)
+        distance = jnp.where(weight > 0, distance, jnp.inf)
+    return octave.astype(jnp.uint8), jnp.min(distance)
 
 
 @jax.jit
-def _priority(picture: Picture) -> Float[Array, " P"]:
-    """Distance from the lobe's centre times a number in [0, 1) that steps evenly through the pixels; least come first."""
-    distance = _distance(picture)
+def _chosen(octaves: UInt8[Array, " P"], share: Float[Array, "256"]) -> Bool[Array, " P"]:
+    """Which pixels are kept, given the share of each octave."""
     # Multiples of the golden ratio modulo 1 spread evenly over any run of pixels, without a regular pattern.
-    even = (jnp.arange(distance.shape[0], dtype=jnp.uint32) * jnp.uint32(2654435769)).astype(jnp.float32) * 2.0**-32
-    priority = distance * even
-    if picture.weight is None:
-        return priority
-    weight = picture.weight if picture.weight.ndim == 1 else jnp.max(picture.weight, axis=1)
-    return jnp.where(weight > 0, priority, jnp.inf)
+    step = jnp.arange(octaves.shape[0], dtype=jnp.uint32) * jnp.uint32(2654435769)
+    return step.astype(jnp.float32) * 2.0**-32 < share[octaves]
 
 
-@jax.jit
-def _keep(picture: Picture, index: Int[Array, " M"], valid: Int[Array, ""], limit: Float[Array, ""]) -> Thinned:
-    kept = picture.pixels(lambda a: jnp.take(a, index, axis=0, mode="clip"))
-    factor = jnp.where(jnp.arange(index.shape[0]) < valid, jnp.maximum(1.0, _distance(kept) / limit), 0.0)
-    factor = factor.astype(picture.target.dtype)
-    weight = factor
-    if kept.weight is not None:
-        weight = kept.weight * (factor if kept.weight.ndim == 1 else factor[:, None])
-    weighted = Picture(kept.target, kept.diffuse, kept.lobe, weight, kept.ambient)
-    return Thinned(weighted, factor)
+def _shares(octaves: UInt8[np.ndarray, " P"], size: int) -> Float[np.ndarray, "256"]:
+    """Which share of each octave to keep, so that about ``size`` pixels remain."""
+    preview = octaves[::_PREVIEW_STRIDE]
+    count = np.bincount(preview, minlength=256) * (octaves.size / preview.size)
+    count[_EXCLUDED] = 0
+    # The largest number per octave that fits: the sparse ones leave their part to the others.
+    rest, most = float(size), 0.0
+    ordered = np.sort(count[count > 0])
+    for i, here in enumerate(ordered):
+        most = rest / (ordered.size - i)
+        if here > most:
+            break
+        rest -= here
+    share = np.minimum(1.0, most / np.maximum(count, 1.0))
+    share[_EXCLUDED] = 0.0
+    return share.astype(np.float32)
 
 
-def thin(picture: Picture, size: int) -> Thinned:
+def thin(picture: Picture, size: int, n_max: float) -> Thinned:
     """Thin a picture to about ``size`` pixels.
 
     Args:
-        picture: The picture, with a lobe.
+        picture: The picture.
         size: How many pixels are wanted.
+        n_max: Largest exponent that they are to be used with.
 
     Returns:
-        The pixels kept: all of them where there are no more than a quarter over ``size``.
+        The pixels kept: all of them where there is no lobe, or no more than a quarter over ``size``.
     """
     count = picture.target.shape[0]
     capacity = size + size // 4
+    if picture.lobe is None:
+        return Thinned(picture, None, math.inf)
+    octaves, nearest = _octaves(picture)
+    nearest = float(nearest)
     if count <= capacity:
-        return Thinned(picture, None)
-    priority = np.asarray(_priority(picture))
-    preview = priority[::_PREVIEW_STRIDE]
-    rank = min(max(1, round(size * preview.size / count)), preview.size - 1)
-    limit = float(np.partition(preview, rank)[rank])
-    index = np.flatnonzero(priority < limit)
-    if index.size > capacity:
-        chosen = priority[index]
-        order = np.argpartition(chosen, capacity)
-        limit = float(chosen[order[capacity]])
-        index = np.sort(index[order[:capacity]])
-    padded = np.zeros(capacity, np.int32)
+        return Thinned(picture, None, nearest)
+    share = _shares(np.asarray(octaves), size)
+    index = np.flatnonzero(np.asarray(_chosen(octaves, share)))
+    while index.size > capacity:
+        share = share * np.float32(0.9 * capacity / index.size)
+        index = np.flatnonzero(np.asarray(_chosen(octaves, share)))
+    # Bracketing needs no more than float32, unless the lobe leaves its range.
+    single = n_max * nearest < _LARGEST_DECAY
+    # Padding repeats the first pixel with weight 0, for one shape means one compilation.
+    padded = np.zeros(capacity, np.intp)
     padded[: index.size] = index
-    # A limit of 0 leaves the pixels at the very centre only; any positive number keeps their factor at 1.
-    return _keep(picture, padded, np.int32(index.size), np.float32(max(limit, np.finfo(np.float32).tiny)))
+
+    def choose(a: Array) -> Array:
+        # Through NumPy: an XLA gather is ten times slower.
+        kept = np.take(np.asarray(a), padded, axis=0)
+        return cast(Array, kept.astype(np.float32) if single and kept.dtype == np.float64 else kept)
+
+    factor = np.zeros(capacity, np.float32)
+    factor[: index.size] = 1 / share[np.asarray(octaves)[index]]
+    kept = picture.pixels(choose)
+    weight = cast(Array, factor)
+    if kept.weight is not None:
+        weight = kept.weight * (factor if kept.weight.ndim == 1 else factor[:, None])
+    return Thinned(Picture(kept.target, kept.diffuse, kept.lobe, weight, kept.ambient), factor, nearest)
 
 
 @partial(jax.jit, compiler_options=COMPILER_OPTIONS)
 def spread(
-    thinned: Thinned, log_n: Float[Array, " N"], x: Float[Array, "N C 3"], best: Int[Array, ""]
+    thinned: Thinned,
+    log_n: Float[AnyArray, " N"],
+    x: Float[AnyArray, "N C 3"],
+    best_log_n: Float[AnyArray, ""],
+    best_x: Float[AnyArray, "C 3"],
+    peak: Float[AnyArray, ""],
 ) -> tuple[Float[Array, " N"], Float[Array, " N"]]:
     """How far the subsample's profile may be from that of all pixels.
 
@@ -104,38 +139,52 @@ def spread(
         thinned: The subsample of one picture.
         log_n: Natural logarithms of the exponents.
         x: Best coefficients at each.
-        best: Which of them is to be compared with.
+        best_log_n: Natural logarithm of the exponent to compare with.
+        best_x: Best coefficients there.
+        peak: See :func:`fitting.sums.relative_lobe`.
 
     Returns:
-        Horvitz-Thompson variances of the cost at each exponent minus that at ``best``, and of the profile's slope by
+        Horvitz-Thompson variances of the cost at each exponent minus that at the best, and of the profile's slope by
         log n. They add up over pictures.
     """
     picture, factor = thinned.picture, thinned.factor
     lobe, weight = picture.lobe, picture.weight
-    assert lobe is not None and weight is not None and factor is not None
-    # Channels first: the loops over pixels are then contiguous.
-    target = picture.target.T
-    weight = jnp.broadcast_to(weight.T, target.shape)
-    diffuse = picture.diffuse.T
-    ambient = jnp.broadcast_to(picture.ambient, target.shape[0]).astype(target.dtype)
+    assert lobe is not None
+    assert weight is not None
+    assert factor is not None
+    shape = picture.target.shape
+    dtype = picture.target.dtype
+    # Channels first, and one at a time: the loops over pixels are then contiguous and evaluate the lobe once.
+    channels = (
+        picture.target.T,
+        jnp.broadcast_to(weight if weight.ndim == 2 else weight[:, None], shape).T,
+        jnp.broadcast_to(picture.diffuse, shape).T,
+        jnp.broadcast_to(picture.ambient, shape[1:]).astype(dtype),
+    )
+    unroll = min(shape[1], UNROLLED_CHANNELS)
 
-    def residual(at: Float[Array, ""], x: Float[Array, "C 3"]) -> tuple[Float[Array, "C M"], Float[Array, "C M"]]:
-        n = jnp.exp(at)
-        value, by_n = lobe(n)
-        x = x.astype(target.dtype)
-        model = (x[:, 0] * ambient)[:, None] + x[:, 1:2] * diffuse + x[:, 2:] * value.T
-        return jnp.where(weight > 0, target - model, 0.0), x[:, 2:] * (by_n.T * n.astype(by_n.dtype))
+    def lit(at: Float[Array, ""]) -> tuple[Float[Array, "C M"], Float[Array, "C M"]]:
+        value, by_log_n = relative_lobe(lobe, at, jnp.asarray(peak), dtype)
+        return jnp.broadcast_to(value, shape).T, jnp.broadcast_to(by_log_n, shape).T
 
-    reference = residual(log_n[best], x[best])[0]
     # A pixel that was sure to be kept adds nothing to the uncertainty.
     chance = jnp.where(factor > 0, 1 - 1 / jnp.maximum(factor, 1), 0.0)
-    zero = np.zeros((), target.dtype)
+    zero = np.zeros((), dtype)
+    model, _ = lit(jnp.asarray(best_log_n))
 
     def one(at: tuple[Float[Array, ""], Float[Array, "C 3"]]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        mine, sensitivity = residual(*at)
-        change = jnp.sum(weight * (mine - reference) * (mine + reference), axis=0)
-        score = jnp.sum(2 * weight * mine * sensitivity, axis=0)
+        def channel(carry: tuple, each: tuple) -> tuple[tuple, None]:
+            (target, weight, diffuse, ambient), value, by_log_n, best_value, x, best_x = each
+            mine = target - x[0] * ambient - x[1] * diffuse - x[2] * value
+            other = target - best_x[0] * ambient - best_x[1] * diffuse - best_x[2] * best_value
+            change = jnp.where(weight > 0, weight * (mine - other) * (mine + other), 0.0)
+            score = jnp.where(weight > 0, 2 * weight * mine * x[2] * by_log_n, 0.0)
+            return (carry[0] + change, carry[1] + score), None
+
+        nothing = jnp.zeros(shape[0], dtype)
+        each = (channels, *lit(at[0]), model, at[1], best_x.astype(dtype))
+        (change, score), _ = jax.lax.scan(channel, (nothing, nothing), each, unroll=unroll)
         pair = (chance * change * change, chance * score * score)
         return jax.lax.reduce(pair, (zero, zero), lambda a, b: (a[0] + b[0], a[1] + b[1]), (0,))
 
-    return jax.lax.map(one, (log_n, x))
+    return jax.lax.map(one, (log_n, x.astype(dtype)))
