@@ -246,6 +246,27 @@ def _plateau(
     return None if np.ptp(light) <= FLAT * np.max(light) else largest * TOP
 
 
+def weighted(observation: Observation, weight: Any) -> Observation:
+    """An observation whose pixels count as much as is said.
+
+    Args:
+        observation: a picture.
+        weight: (H, W), at least 0; None leaves it as it is.
+
+    Raises:
+        InputError: where it has another shape, or is negative or not finite.
+    """
+    if weight is None:
+        return observation
+    weight, shape = np.asarray(weight), observation.points.mask.shape
+    if weight.shape != shape:
+        raise InputError("weight", f"is of shape {weight.shape}, the target {shape}", "Give a value per pixel")
+    if not np.all(np.isfinite(weight) & (weight >= 0)):
+        raise InputError("weight", "holds values that are negative or not finite", "Give values of 0 or more")
+    values = jnp.asarray(weight.ravel(), observation.target.dtype)
+    return observation._replace(weight=values if observation.weight is None else values * observation.weight)
+
+
 class LightColour(NamedTuple):
     """The colour that all lights of some scenes share, and the scenes with grey lights in their place.
 

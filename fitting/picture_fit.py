@@ -14,7 +14,7 @@ from brdf.errors import InputError
 from fitting.interpretation import Interpretation, ModelFit, coefficient_factors, interpret
 from fitting.losses import LOSSES, Loss, reweight
 from fitting.normal import fit_tied
-from fitting.observation import LightColour, Observation, fitted_pixels, observe, take_colour_out
+from fitting.observation import LightColour, Observation, fitted_pixels, observe, take_colour_out, weighted
 from fitting.result import FitResult, free_parameters
 from fitting.selection import Choice, choose
 from fitting.separable import Optimum, Picture, fit_linear, search
@@ -39,6 +39,9 @@ def fit(
     loss: Loss = "squared",
     dark: float | None = None,
     noise: tuple[float, float] | None = None,
+    weight: Any = None,
+    accuracy: float | None = None,
+    seconds: float | None = None,
 ) -> FitResult:
     """Fit a material to a picture, or to several pictures of one material: the global optimum, with no start to give.
 
@@ -56,6 +59,11 @@ def fit(
         dark: linear value up to which pixels are too dark to count.
         noise: of the camera, (read, shot): the variance of a value is read² + shot · value, and pixels weigh by its
             inverse. None weighs all alike.
+        weight: (H, W), how much each pixel counts beside that, at least 0; a list where there are several pictures.
+        accuracy: relative error that is good enough: the cheapest number of pixels and light samples and the cheapest
+            precision that keep it are chosen, see `fitting.budget`; the result's ``choice`` says which and why. None
+            looks at all pixels under the lights as they are.
+        seconds: the same for the time to spend; what it buys is the most accurate fit.
 
     Returns:
         The result.
@@ -67,6 +75,12 @@ def fit(
     """
     start = time.perf_counter()
     targets, scenes, masks = _pictures(target, scene, mask)
+    if accuracy is not None or seconds is not None:
+        from fitting.budget import fit_within
+
+        how = {"mask": masks, "saturation": saturation, "n_range": n_range, "dark": dark}
+        beside = {"loss": loss != "squared", "noise": noise is not None, "weight": weight is not None}
+        return fit_within(targets, scenes, model, precision, how, beside, accuracy=accuracy, seconds=seconds)
     if model != "auto" and model not in brdf.MODELS:
         raise InputError("model", f"is unknown, got {model!r}", f"Use auto or one of {', '.join(brdf.MODELS)}")
     if loss not in LOSSES:
@@ -80,6 +94,9 @@ def fit(
             observe(picture, place, dtype=dtype, mask=one, saturation=saturation, dark=dark, noise=noise)
             for picture, place, one in zip(targets, scenes, masks, strict=True)
         ]
+        if weight is not None:
+            weights = weight if isinstance(target, list | tuple) else [weight]
+            observations = [weighted(*each) for each in zip(observations, weights, strict=True)]
         counts = {observation.target.shape[1] for observation in observations}
         if len(counts) > 1:
             raise InputError("target", f"pictures have {counts} channels", "Give pictures with the same number")

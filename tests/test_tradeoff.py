@@ -1,0 +1,128 @@
+"""Fits to an accuracy, and the table of speed against accuracy."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import brdf
+import fitting
+from fitting.deviation import deviation
+from fitting.lamps import Lamps, with_samples
+from fitting.pixel_sampling import sample_pixels
+
+MATERIAL = brdf.BlinnPhong(k_a=[0.2, 0.3, 0.1], k_d=[0.5, 0.3, 0.2], k_s=[0.4, 0.4, 0.4], n=60.0)
+
+
+def ball(size=192, lights=None, shapes=None):
+    camera = brdf.OrthographicCamera(
+        position=(0, 0, 4), target=(0, 0, 0), up=(0, 1, 0), width=2.2, resolution=(size, size)
+    )
+    lights = lights or (brdf.DirectionalLight(direction=(0.5, 0.6, 0.7), intensity=1.0),)
+    shapes = shapes or (brdf.Sphere(center=(0, 0, 0), radius=1.0),)
+    return brdf.Scene(camera=camera, shapes=shapes, ambient=[0.2], lights=lights)
+
+
+def noisy(scene, share=0.0, material=MATERIAL):
+    picture = np.asarray(brdf.render(material, scene, precision="float64"))
+    return picture + share * picture.mean() * np.random.default_rng(7).standard_normal(picture.shape)
+
+
+@pytest.mark.parametrize("kind", ["one ball", "two shapes", "points", "area"])
+def test_some_pixels_see_what_the_whole_picture_shows_there(kind):
+    scene = ball(32)
+    if kind == "two shapes":
+        floor = brdf.Rectangle(center=(0, -0.5, 0), edge_u=(3, 0, 0), edge_v=(0, 0.4, -3))
+        scene = ball(32, shapes=(*scene.shapes, floor))
+    if kind == "points":
+        scene = dataclasses.replace(scene, camera=None, shapes=(), points=scene.surface_points())
+    if kind == "area":
+        scene = dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, samples=3))
+    pixel = np.random.default_rng(0).choice(32 * 32, 200, replace=False)
+    whole = np.asarray(brdf.render(MATERIAL, scene, precision="float64")).reshape(-1, 3)[pixel]
+    some = brdf.render(MATERIAL, brdf.some_pixels(scene, pixel, precision="float64"), precision="float64")
+    # The same arithmetic in another order.
+    np.testing.assert_allclose(np.asarray(some)[0], whole, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize(("height", "width"), [(192, 192), (100, 333)])
+def test_a_sample_stands_for_every_pixel_once(height, width):
+    camera = dataclasses.replace(ball().camera, resolution=(width, height))
+    sample = sample_pixels(dataclasses.replace(ball(), camera=camera), brdf.BlinnPhong, 1024)
+    assert sample is not None
+    assert sample.stands_for.sum() == height * width
+    assert np.unique(sample.pixel).size == sample.pixel.size
+    assert sample.pixel.max() < height * width
+
+
+def test_a_sample_crowds_where_the_highlight_is():
+    scene = ball(1024)
+    sample = sample_pixels(scene, brdf.BlinnPhong, 1024)
+    half = np.array([0.5, 0.6, 0.7]) / np.sqrt(1.1) + np.array([0, 0, 1])
+    half /= np.linalg.norm(half)
+    column, row = half[0] * 1024 / 2.2 + 512, 512 - half[1] * 1024 / 2.2
+    distance = np.hypot(sample.pixel % 1024 + 0.5 - column, sample.pixel // 1024 + 0.5 - row)
+    assert np.all(sample.stands_for[distance < 4] == 1)
+    assert np.median(sample.stands_for[distance > 300]) >= 64
+
+
+def test_a_light_map_keeps_its_light_with_other_samples():
+    pixels = np.random.default_rng(1).random((16, 32, 3))
+    scene = ball(8, (brdf.EnvironmentMap(pixels, radiance=[1.0, 2.0, 3.0], samples=64),))
+    lamps = Lamps()
+    light = lamps.with_samples(scene, 16).lights[0]
+    assert light.samples == 16
+    assert lamps.with_samples(scene, 16).lights[0] is light
+    np.testing.assert_allclose(light.radiance, scene.lights[0].radiance, rtol=1e-12)
+    assert with_samples(ball(8), 4).lights == ball(8).lights
+
+
+@pytest.mark.parametrize("share", [0.0, 0.03])
+def test_the_accuracy_holds_and_is_foretold(share):
+    scene = ball()
+    picture = noisy(scene, share)
+    reference = fitting.fit(picture, scene, model="blinn-phong", precision="float64")
+    for accuracy in (1e-1, 1e-2, 1e-4):
+        result = fitting.fit(picture, scene, model="blinn-phong", accuracy=accuracy)
+        assert result.choice is not None
+        assert result.choice.met
+        actual = max(deviation(result, reference)[:2])
+        assert actual <= accuracy
+        # A random error is known to a factor.
+        assert actual / 4 < result.choice.chosen.error < actual * 4
+
+
+def test_an_accuracy_of_noisy_pixels_takes_more_of_them():
+    scene = ball(256)
+    picture = noisy(scene, 0.1)
+    coarse, fine = (fitting.fit(picture, scene, model="blinn-phong", accuracy=a).choice for a in (0.3, 1e-3))
+    assert coarse is not None
+    assert fine is not None
+    assert coarse.pixels < fine.pixels == fine.of_pixels
+
+
+def test_the_time_to_spend_ends_the_search():
+    result = fitting.fit(noisy(ball(), 0.1), ball(), model="blinn-phong", seconds=1e-6)
+    assert result.choice is not None
+    assert len(result.choice.attempts) == 1
+    assert "chosen" in str(result)
+    assert result.to_dict()["choice"]["seconds"] == 1e-6
+
+
+@pytest.mark.parametrize("accuracy", [0, -1.0, "fine", True, float("nan")])
+def test_what_is_no_accuracy_is_refused(accuracy):
+    with pytest.raises(brdf.InputError, match="accuracy: must be a number above 0"):
+        fitting.fit(noisy(ball(32)), ball(32), accuracy=accuracy)
+
+
+def test_weights_count():
+    scene = ball(48)
+    picture = noisy(scene)
+    picture[:, :24] *= 2.0
+    weight = np.ones((48, 48))
+    weight[:, :24] = 0.0
+    result = fitting.fit(picture, scene, model="blinn-phong", precision="float64", weight=weight)
+    # The right half is exact.
+    np.testing.assert_allclose(result.material.k_d, MATERIAL.k_d, rtol=1e-9)
+    with pytest.raises(brdf.InputError, match="weight"):
+        fitting.fit(picture, scene, weight=weight[:3])
