@@ -317,8 +317,8 @@ def _numbers(name: str, given: Any) -> Any:
         return given
     try:
         value = np.asarray(given, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(name, f"must be numbers, got {given!r}") from None
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(name, f"must be numbers, got {given!r:.60}") from None
     for channel, number in enumerate(value.ravel()):
         where = f" in channel {channel}" if value.size > 1 else ""
         if not math.isfinite(number):

@@ -108,18 +108,19 @@ class Scene(eqx.Module):
         return Lighting(self.lights, occluders(self.shapes, traced=self.camera is not None))
 
     @classmethod
-    def load(cls, path: str | Path) -> "Scene":
+    def load(cls, path: str | Path, *, within: str | Path | None = None) -> "Scene":
         """Read a scene file.
 
         Args:
             path: a ``scene.toml``; the paths in it are relative to its folder.
+            within: a folder that these paths may not leave; None takes the scene's own.
 
         Raises:
             InputError: naming file, table and key.
         """
         from brdf.scene_file import load_scene
 
-        return load_scene(path)
+        return load_scene(path, within)
 
     def save(self, path: str | Path) -> None:
         """Write a scene file that `load` reads back to the same scene.

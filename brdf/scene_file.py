@@ -5,7 +5,7 @@ import json
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from brdf.area_lights import PolygonLight, RectangleLight, SphereLight
 from brdf.camera import CAMERAS
@@ -35,6 +35,18 @@ LIGHTS: dict[str, type[Light]] = {
 POSITION_LAYERS = ("position", "P")
 NORMAL_LAYERS = ("normal", "sh_normal", "N")
 VIEW_LAYERS = ("to_view",)
+
+
+class Folder(NamedTuple):
+    """Where a scene file stands, and what its paths may reach.
+
+    Attributes:
+        path: its folder.
+        within: the folder that no path may leave.
+    """
+
+    path: Path
+    within: Path
 
 
 class _Table:
@@ -110,9 +122,10 @@ def _tables(place: str, values: Any) -> list[_Table]:
     return [_Table(f"{place}[{index}]", value) for index, value in enumerate(values)]
 
 
-def load_scene(path: str | Path) -> Scene:
+def load_scene(path: str | Path, within: str | Path | None = None) -> Scene:
     """Read a scene file; see `Scene.load`."""
     path = Path(path)
+    folder = Folder(path.parent, path.parent if within is None else Path(within))
     values = _read_toml(path)
     root = _Table(str(path), values)
     place = f"{path}: "
@@ -121,9 +134,9 @@ def load_scene(path: str | Path) -> Scene:
         table = _Table(place + "camera", root.pop("camera"))
         camera = table.build(table.choose("type", CAMERAS))
     for table in _tables(place + "shapes", root.pop("shapes", [])):
-        shapes.append(_load_shape(table, path.parent))
+        shapes.append(_load_shape(table, folder))
     if "aov" in root.values:
-        points = _load_points(_Table(place + "aov", root.pop("aov")), path.parent)
+        points = _load_points(_Table(place + "aov", root.pop("aov")), folder)
     if "ambient" in root.values:
         table = _Table(place + "ambient", root.pop("ambient"))
         if "intensity" not in table.values:
@@ -131,8 +144,8 @@ def load_scene(path: str | Path) -> Scene:
         ambient = _plain(f"{table.place}.intensity", table.pop("intensity"))
         table.done(["intensity"])
     for table in _tables(place + "lights", root.pop("lights", [])):
-        masks.append(_load_mask(table, path.parent))
-        lights.append(_load_light(table, path.parent))
+        masks.append(_load_mask(table, folder))
+        lights.append(_load_light(table, folder))
     if root.values:
         known = "camera, shapes, aov, ambient, lights"
         raise InputError(f"{path}: {next(iter(root.values))}", "is not a known key", f"Known here: {known}")
@@ -150,7 +163,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
         raise InputError(path, f"is not TOML ({error})", "Correct the file") from None
 
 
-def _file(table: _Table, key: str, folder: Path, example: str) -> Path:
+def _file(table: _Table, key: str, folder: Folder, example: str) -> Path:
     """The file that a key names."""
     if key not in table.values:
         raise InputError(table.place, f"has no {key}", f'Add {key} = "{example}"')
@@ -160,7 +173,7 @@ def _file(table: _Table, key: str, folder: Path, example: str) -> Path:
     return inside(folder, name, f"{table.place}.{key}")
 
 
-def _load_shape(table: _Table, folder: Path) -> Shape:
+def _load_shape(table: _Table, folder: Folder) -> Shape:
     cls = table.choose("type", SHAPES)
     if cls is not Triangles:
         return table.build(cls)
@@ -170,7 +183,7 @@ def _load_shape(table: _Table, folder: Path) -> Shape:
     return Triangles(mesh, fitted=fitted)
 
 
-def _load_light(table: _Table, folder: Path) -> Light:
+def _load_light(table: _Table, folder: Folder) -> Light:
     cls = table.choose("type", LIGHTS)
     if cls is not ConstantEnvironment or "file" not in table.values:
         return table.build(cls)
@@ -186,7 +199,7 @@ def _load_light(table: _Table, folder: Path) -> Light:
         raise error.inside(table.place) from None
 
 
-def _load_mask(table: _Table, folder: Path) -> Any:
+def _load_mask(table: _Table, folder: Folder) -> Any:
     """How much of the light each pixel sees, where a file tells; the first channel of the picture or layer."""
     if "visibility" not in table.values:
         return None
@@ -197,7 +210,7 @@ def _load_mask(table: _Table, folder: Path) -> Any:
     return _layer(read_layers(path), layer, (), path)[..., 0]
 
 
-def _load_points(table: _Table, folder: Path) -> SurfacePoints:
+def _load_points(table: _Table, folder: Folder) -> SurfacePoints:
     """Surface points from the layers of an image file."""
     path = _file(table, "file", folder, "aovs.exr")
     to_view = table.pop("to_view")
@@ -225,8 +238,8 @@ def _layer(layers: dict[str, Any], name: Any, known: tuple[str, ...], path: Path
     return next((layers[candidate] for candidate in known if candidate in layers), None)
 
 
-def inside(folder: Path, name: str, place: str) -> Path:
-    """A file that a scene file names, which must lie within the scene's folder.
+def inside(folder: Folder, name: str, place: str) -> Path:
+    """A file that a scene file names, which must lie within a folder.
 
     Args:
         folder: of the scene file.
@@ -236,7 +249,14 @@ def inside(folder: Path, name: str, place: str) -> Path:
     Raises:
         InputError: where the path leaves the folder.
     """
-    path = folder / name
-    if not path.resolve().is_relative_to(folder.resolve()):
-        raise InputError(place, f"must stay within the scene's folder, got {name!r}", "Move the file there")
+    path = folder.path / name
+    try:
+        stays = path.resolve().is_relative_to(folder.within.resolve())
+    except (ValueError, OSError, RuntimeError):
+        raise InputError(place, f"is no path, got {name!r}", "Correct the path") from None
+    if not stays:
+        own = folder.within == folder.path
+        where = "the scene's folder" if own else str(folder.within)
+        remedy = "Move the file there, or allow more with within" if own else "Move the file there"
+        raise InputError(place, f"must stay within {where}, got {name!r}", remedy)
     return path

@@ -1,6 +1,7 @@
 """``brdf fit`` and ``brdf lights``: pictures, photographs of a ball, archives and measured BRDFs."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,6 +26,7 @@ def fit(
         typer.Argument(help="A picture; a folder with target.* and scene.toml; photographs; an .npz; a measured BRDF."),
     ],
     scene: Annotated[Path | None, typer.Option(help="The scene file; in a folder, scene.toml.")] = None,
+    within: Annotated[Path | None, typer.Option(help="The folder that paths in the scene file may not leave.")] = None,
     model: Annotated[str, typer.Option(help=f"One of {', '.join(MODEL_NAMES)}.")] = "auto",
     out: Annotated[Path | None, typer.Option(help="A folder for material.json, material.mtl, fitted.exr, ...")] = None,
     precision: Annotated[str, typer.Option(help="float32 or float64.")] = "float32",
@@ -59,10 +61,11 @@ def fit(
 
     if plot and out is None:
         raise brdf.InputError("--plot", "needs a folder to draw into", "Add --out DIR")
-    with waiting("fitting"):
+    with waiting("fitting") as tell:
         if len(target) == 1 and brdf.is_measured(target[0]):
             given = (
                 scene,
+                within,
                 encoding,
                 saturation,
                 dark,
@@ -79,7 +82,14 @@ def fit(
             if out is not None:
                 result.save(out)
         else:
-            options = {"scene": scene, "sphere": sphere, "normals": normals, "light": light, "lights": lights}
+            options = {
+                "scene": scene,
+                "within": within,
+                "sphere": sphere,
+                "normals": normals,
+                "light": light,
+                "lights": lights,
+            }
             options |= {"intensities": intensities, "encoding": _encoding(encoding), "exposure": exposure, "mask": mask}
             names = {"model": "--model", "precision": "--precision", "dark": "--dark", "noise": "--noise"}
             names |= {"mask": mask, "loss": "--loss", "saturation": "--saturation"}
@@ -87,6 +97,7 @@ def fit(
                 result = _fit_pictures(
                     target,
                     options,
+                    tell,
                     model=model,
                     precision=precision,
                     saturation=saturation,
@@ -115,14 +126,18 @@ def _fit_table(path: Path, model: str, loss: str | None, has_picture_options: bo
         return fitting.fit_brdf(table, model, loss=loss or "cosine")  # pyright: ignore[reportArgumentType]  # refused there
 
 
-def _fit_pictures(target: list[Path], options: dict[str, Any], *, noise: str | None, **how: Any) -> Any:
+def _fit_pictures(
+    target: list[Path], options: dict[str, Any], tell: Callable[[str], None], *, noise: str | None, **how: Any
+) -> Any:
     import brdf
 
     # Pictures are read before JAX is imported: a damaged one is told at once.
     read = {}
-    for path in target:
+    for index, path in enumerate(target, start=1):
         if not path.is_dir() and path.suffix.lower() != ".npz":
+            tell(f"reading {index} of {len(target)}")
             read[path] = brdf.read_picture(path, encoding=options["encoding"])
+    tell("fitting")
     use_compilation_cache()
     import fitting
     from fitting.cli_inputs import Options, collect

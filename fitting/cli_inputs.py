@@ -35,6 +35,7 @@ class Options(NamedTuple):
 
     Attributes:
         scene: a scene file.
+        within: the folder that its paths may not leave.
         sphere: "x,y,radius" of a ball in the picture, or "mask": found in the mask.
         normals: an image of normals, or an .npy file.
         light: "x,y,z" towards the light, or "fit": from the shading.
@@ -46,6 +47,7 @@ class Options(NamedTuple):
     """
 
     scene: Path | None = None
+    within: Path | None = None
     sphere: str | None = None
     normals: Path | None = None
     light: str | None = None
@@ -86,7 +88,7 @@ def collect(targets: list[Path], options: Options, read: dict[Path, brdf.Picture
     target, scene = _target_and_scene(targets[0], options.scene)
     picture = read.get(target) or brdf.read_picture(target, encoding=options.encoding)
     mask = None if options.mask is None else brdf.read_mask(options.mask)
-    return Job(_exposed([picture], options.exposure), [brdf.Scene.load(scene)], mask, target)
+    return Job(_exposed([picture], options.exposure), [brdf.Scene.load(scene, within=options.within)], mask, target)
 
 
 def _target_and_scene(target: Path, scene: Path | None) -> tuple[Path, Path]:

@@ -220,3 +220,32 @@ def test_the_sentence_that_a_person_needs(name, sentence):
     if name.startswith("rgl"):
         pytest.importorskip("mitsuba", reason="the optional extra 'measured' is not installed")
     assert fitting.fit_brdf(brdf.load_measured(REAL / name)).verdict.startswith(sentence)
+
+
+def test_the_command_fits_and_checks_tables(tmp_path, capsys):
+    from fitting.cli import main
+
+    light, view = directions(200)
+    values = f_r("phong", [0.3, 0.2], [0.5, 0.5], 20.0, light, view)
+    angles = [
+        np.arccos(light[:, 2]),
+        np.arctan2(light[:, 1], light[:, 0]),
+        np.arccos(view[:, 2]),
+        np.arctan2(view[:, 1], view[:, 0]),
+    ]
+    rows = np.column_stack([*angles, values])
+    text = "2\n450 650\n" + "\n".join(" ".join(f"{number:.17g}" for number in row) for row in rows)
+    (tmp_path / "paint.brdf").write_text(text)
+    words = ["fit", str(tmp_path / "paint.brdf"), "--json", "--out", str(tmp_path / "out"), "--loss", "log"]
+    with pytest.raises(SystemExit) as done:
+        main(words)
+    assert done.value.code == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["material"]["model"] == "phong"
+    assert said["material"]["n"] == pytest.approx(20.0, rel=1e-4)
+    assert said["channels"] == ["450 nm", "650 nm"]
+    assert (tmp_path / "out" / "fit.json").exists()
+    with pytest.raises(SystemExit) as done:
+        main(["check", str(tmp_path / "paint.brdf")])
+    assert done.value.code == 2  # scattered samples tell no energy
+    assert "cannot tell" in capsys.readouterr().out

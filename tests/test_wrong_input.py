@@ -115,6 +115,7 @@ MATERIALS = {
     "null n": (json.dumps(MATERIAL | {"n": None}), r"n: is null"),
     "a list": ("[1, 2]", r"must be a JSON object"),
     "not JSON": ("{", r"is not JSON"),
+    "found by fuzzing": (json.dumps(MATERIAL | {"k_s": [10**400]}), r"k_s: must be numbers"),
     "deep": ("[" * 100_000, r"is not JSON"),
     "huge number": ('{"model": "lambert", "k_d": [' + "9" * 5000 + "]}", r"not JSON|must be"),
 }
@@ -246,6 +247,20 @@ def test_paths_without_permission(place, capsys):
 
 def test_enough_kinds_of_input_are_tried():
     assert len(SCENES) + len(MATERIALS) + len(MTL) + len(OPTIONS) >= 80
+
+
+def test_a_scene_may_be_allowed_to_reach_further(tmp_path):
+    (tmp_path / "deep").mkdir()
+    normal = np.ones((8, 8, 3), np.float32)
+    brdf.write_image(tmp_path / "aovs.exr", normal)
+    (tmp_path / "deep" / "scene.toml").write_text('[aov]\nfile = "../aovs.exr"\n' + LIGHT)
+    with pytest.raises(InputError, match="or allow more with within"):
+        brdf.Scene.load(tmp_path / "deep" / "scene.toml")
+    with pytest.raises(InputError, match="has no layer of normals"):  # it was opened
+        brdf.Scene.load(tmp_path / "deep" / "scene.toml", within=tmp_path)
+    (tmp_path / "deep" / "scene.toml").write_text('[aov]\nfile = "a\\u0000b.exr"\n' + LIGHT)
+    with pytest.raises(InputError, match=r"aov\.file: is no path"):
+        brdf.Scene.load(tmp_path / "deep" / "scene.toml")
 
 
 def test_the_library_says_the_same_words(place):
