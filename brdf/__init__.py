@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from brdf.report import Finding, Report
     from brdf.scene import Scene
     from brdf.shapes import Rectangle, Shape, Sphere
+    from brdf.pixel_choice import some_pixels
     from brdf.surface_points import SurfacePoints
 
 _ROOMS = {
@@ -94,6 +95,7 @@ _ROOMS = {
     "rendering": ["Basis", "BasisImages", "Lobe", "basis", "basis_images", "render"],
     "scene": ["Scene"],
     "shapes": ["Rectangle", "Shape", "Sphere"],
+    "pixel_choice": ["some_pixels"],
     "surface_points": ["SurfacePoints"],
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}

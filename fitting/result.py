@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 import brdf
+from fitting.budget_choice import BudgetChoice
 from fitting.selection import Candidate
 from fitting.separable import Optimum
 
@@ -93,6 +94,7 @@ class FitResult:
         targets: the pictures, (H, W, C) each.
         scenes: their scenes.
         counted: which pixels counted, (H, W) each.
+        choice: what an accuracy or a time to spend made of the fit; None without one.
     """
 
     material: brdf.Material
@@ -113,6 +115,7 @@ class FitResult:
     targets: Sequence[np.ndarray] = field(repr=False)
     scenes: Sequence[brdf.Scene] = field(repr=False)
     counted: Sequence[np.ndarray] = field(repr=False)
+    choice: BudgetChoice | None = None
 
     @property
     def undetermined(self) -> dict[str, str]:
@@ -167,6 +170,7 @@ class FitResult:
             "loss": self.loss,
             "precision": self.precision,
             "seconds": self.seconds,
+            "choice": None if self.choice is None else self.choice.to_dict(),
         }
 
     def save(self, folder: str | Path, *, plot: bool = False) -> None:
@@ -243,6 +247,7 @@ def report(result: FitResult) -> str:
             lines.append(f"  left out    {pixels} pixels {reason}")
     if result.highlight_pixels is not None:
         lines.append(f"  highlight   on {result.highlight_pixels:.3g} pixels")
+    lines += [] if result.choice is None else result.choice.lines()
     lines += _correlations(result)
     if result.candidates:
         lines += _candidates(result.candidates)
