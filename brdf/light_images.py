@@ -3,7 +3,8 @@
 Source: P. Haeberli, Synthetic lighting for photography, Grafica Obscura, 1992.
 """
 
-import equinox as eqx
+import dataclasses
+
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
@@ -49,13 +50,11 @@ def render_lights(material: Material, scene: Scene, *, precision: Precision | No
 
 def _with_mask(points: SurfacePoints, index: int) -> SurfacePoints:
     """The points with the given mask of one light only."""
-
-    def masks(points: SurfacePoints) -> list:
-        found = [points.visibility]
-        return found if points.area is None else [*found, points.area.points.visibility]
-
-    chosen = [None if each is None else (each[index],) for each in masks(points)]
-    return eqx.tree_at(masks, points, chosen, is_leaf=lambda leaf: leaf is None)
+    masks, area = points.visibility, points.area
+    assert masks is not None
+    if area is not None:
+        area = dataclasses.replace(area, points=_with_mask(area.points, index))
+    return dataclasses.replace(points, visibility=(masks[index],), area=area)
 
 
 def relight(images: Float[ArrayLike, "L H W C"], factors: ArrayLike) -> Float[Array, "H W C"]:

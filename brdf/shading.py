@@ -57,8 +57,9 @@ def light_terms(
     intensity = sample.intensity
     if lighting.occluders:
         intensity = intensity * share_seen(lighting.occluders, point, sample)
-    if point.visibility is not None and point.visibility[index] is not None:
-        intensity = intensity * point.visibility[index]
+    given = None if point.visibility is None else point.visibility[index]
+    if given is not None:
+        intensity = intensity * given
     diffuse = intensity * jnp.where(lit, cosine, 0)
     if not issubclass(model, SpecularMaterial):
         return LightTerms(diffuse, jnp.zeros_like(diffuse), jnp.zeros_like(cosine))

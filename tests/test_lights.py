@@ -1,6 +1,7 @@
 """Lights against closed forms, and their gradients against central differences."""
 
 import dataclasses
+import itertools
 import math
 
 import equinox as eqx
@@ -80,7 +81,7 @@ def test_error_falls_with_the_number_of_samples():
         np.max(np.abs(radiance(brdf.PolygonLight(vertices=QUAD, radiance=1, samples=2 * k * k)) / exact - 1))
         for k in (1, 2, 3, 4)
     ]
-    assert all(finer < 0.3 * coarser for coarser, finer in zip(errors, errors[1:], strict=False))
+    assert all(finer < 0.3 * coarser for coarser, finer in itertools.pairwise(errors))
 
 
 def test_rectangles_and_polygons_shine_from_their_front_only():

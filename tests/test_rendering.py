@@ -1,0 +1,119 @@
+"""The pass over light samples, and pixels averaged over their area."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import brdf
+import fitting
+
+SIZE = 128
+TO_LIGHT = np.array([0.5, 0.6, 0.7]) / np.linalg.norm([0.5, 0.6, 0.7])
+
+
+def ball(samples: int, size: int = SIZE, **more) -> brdf.Scene:
+    camera = brdf.OrthographicCamera(
+        position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=[size, size], samples=samples
+    )
+    light = brdf.DirectionalLight(direction=TO_LIGHT, intensity=1)
+    return brdf.Scene(camera=camera, shapes=[brdf.Sphere(center=[0, 0, 0], radius=1)], **({"lights": [light]} | more))
+
+
+def glossy(n: float) -> brdf.BlinnPhong:
+    return brdf.BlinnPhong(k_a=0.1, k_d=0.5, k_s=0.5, n=n)
+
+
+@functools.cache
+def pixel_averages(n: float, samples: int = 64) -> np.ndarray:
+    """The ball in plain NumPy, samples × samples midpoints per pixel."""
+    half = TO_LIGHT + np.array([0, 0, 1])
+    half /= np.linalg.norm(half)
+    at = (np.arange(SIZE * samples) + 0.5) / (SIZE * samples) * 2.2 - 1.1
+    rows = []
+    for row in range(SIZE):
+        x, y = at[None, :], -at[row * samples : (row + 1) * samples, None]
+        squared = 1 - x * x - y * y
+        z = np.sqrt(np.maximum(squared, 0))
+        lit = x * TO_LIGHT[0] + y * TO_LIGHT[1] + z * TO_LIGHT[2]
+        cosine = np.maximum(x * half[0] + y * half[1] + z * half[2], 1e-9)
+        value = np.where(squared > 0, 0.02 + np.where(lit > 0, 0.5 * lit + 0.5 * cosine**n, 0), 0)
+        rows.append(value.reshape(samples, SIZE, samples).mean(axis=(0, 2)))
+    return np.stack(rows)
+
+
+@pytest.mark.parametrize("n", [1e3, 1e4])
+def test_a_pixel_is_an_area(n: float):
+    expected = pixel_averages(n)
+    got = np.asarray(brdf.render(glossy(n), ball(4, ambient=0.2), precision="float32"))[..., 0]
+    assert np.max(np.abs(got - expected)) < 0.01 * expected.max()
+    centres = np.asarray(brdf.render(glossy(n), ball(1, ambient=0.2), precision="float32"))[..., 0]
+    assert np.max(np.abs(centres - expected)) > 0.1 * expected.max()
+
+
+def test_few_pixels_cost_more_than_one_sample():
+    area = ball(4).surface_points().area
+    assert area is not None
+    assert area.weight.shape[1] == 16
+    assert np.count_nonzero(np.asarray(area.slot) >= 0) < 0.08 * SIZE * SIZE
+
+
+def test_a_fit_to_pixel_averages_needs_them():
+    n = 1e4
+    target = pixel_averages(n)[..., None].astype(np.float32)
+    by_area = fitting.fit(target, ball(4, ambient=0.2), model="blinn-phong").material
+    by_centres = fitting.fit(target, ball(1, ambient=0.2), model="blinn-phong").material
+    assert isinstance(by_area, brdf.BlinnPhong)
+    assert isinstance(by_centres, brdf.BlinnPhong)
+    np.testing.assert_allclose(by_area.n, n, rtol=0.01)
+    np.testing.assert_allclose(by_area.k_s, 0.5, rtol=0.01)
+    assert abs(float(by_centres.n) / n - 1) > 0.05
+
+
+def test_gradients_pass_through_pixel_areas():
+    scene = ball(2, size=24)
+
+    def value(n: jax.Array) -> jax.Array:
+        return jnp.sum(brdf.render(brdf.BlinnPhong(k_d=0.5, k_s=0.5, n=n), scene) ** 2)
+
+    with jax.enable_x64(True):
+        expected = float(value(jnp.asarray(50.01)) - value(jnp.asarray(49.99))) / 0.02
+        np.testing.assert_allclose(jax.grad(value)(jnp.asarray(50.0)), expected, rtol=1e-5)
+        np.testing.assert_allclose(jax.jit(value)(jnp.asarray(50.0)), value(jnp.asarray(50.0)), rtol=1e-12)
+
+        def by_radius(radius: jax.Array) -> jax.Array:
+            moved = ball(2, size=24)
+            shape = brdf.Sphere(center=np.zeros(3), radius=radius)
+            moved = brdf.Scene(camera=moved.camera, shapes=[shape], lights=moved.lights)
+            return jnp.sum(brdf.render(glossy(5), moved)[8:16, 8:16])
+
+        # traced, like the gradient: then every pixel is averaged
+        traced = jax.jit(by_radius)
+        expected = float(traced(jnp.asarray(1.00001)) - traced(jnp.asarray(0.99999))) / 2e-5
+        np.testing.assert_allclose(jax.grad(by_radius)(jnp.asarray(1.0)), expected, rtol=1e-5)
+
+
+def test_many_samples_pass_tile_by_tile(monkeypatch: pytest.MonkeyPatch):
+    from brdf import shading
+
+    light = brdf.SphereLight(center=[1, 1, 3], radius=0.5, radiance=5, samples=16)
+    whole = np.asarray(brdf.render(glossy(20), ball(1, size=40, lights=[light]), precision="float32"))
+    monkeypatch.setattr(shading, "TILE", 300)  # 1600 pixels: not a multiple
+    jax.clear_caches()
+    tiled = np.asarray(brdf.render(glossy(20), ball(1, size=40, lights=[light]), precision="float32"))
+    np.testing.assert_allclose(tiled, whole, atol=1e-6)
+
+
+def test_an_averaged_basis_makes_the_averaged_picture():
+    scene, material = ball(3, size=32), glossy(200.0)
+    basis = brdf.basis(brdf.BlinnPhong, scene)
+    assert basis.diffuse is not None
+    assert basis.lobe is not None
+    value, _ = basis.lobe(jnp.asarray(200.0))
+    picture = 0.5 * basis.diffuse + 0.5 * value
+    expected = np.asarray(brdf.render(material, scene))
+    np.testing.assert_allclose(np.asarray(picture).reshape(expected.shape), expected, atol=1e-6)
+    few = basis.lobe.pixels(lambda a: a[100:200])
+    np.testing.assert_allclose(few(jnp.asarray(200.0))[0], value[100:200], atol=1e-7)
