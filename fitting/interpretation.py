@@ -31,6 +31,7 @@ class ModelFit(NamedTuple):
         free: which coefficients could be above 0, (3, C).
         tied: x_s is a common factor times this, (C,); None where the channels are independent.
         noise_factor: see `fitting.losses.Reweighted`.
+        capped: k_d + k_s is held at 1 in some channel.
     """
 
     model: type[brdf.Material]
@@ -39,6 +40,7 @@ class ModelFit(NamedTuple):
     free: Bool[np.ndarray, "3 C"]
     tied: Float[np.ndarray, " C"] | None = None
     noise_factor: float = 1.0
+    capped: bool = False
 
 
 class Interpretation(NamedTuple):
@@ -96,9 +98,18 @@ def interpret(
         optimum, required, noise, brightest, specular=specular, visible=visible, single=single, tied=fit.tied
     )
     interval: tuple[float, float] | None = None
-    if specular and "n" not in sure.undetermined:
+    # At k_d + k_s = 1 the cost still falls across the bound: a profile that does not know it has its least elsewhere.
+    if specular and "n" not in sure.undetermined and not fit.capped:
         interval = exponent_interval(
-            pictures, optimum, fit.free, sure.n_error, sure.rise, n_range, single=single, tied=fit.tied
+            pictures,
+            optimum,
+            fit.free,
+            sure.n_error,
+            sure.rise,
+            n_range,
+            single=single,
+            peak=seen.peak if seen else 0.0,
+            tied=fit.tied,
         )
         reason = _open_exponent(interval)
         if reason:
@@ -115,6 +126,10 @@ def interpret(
         material = fit.model(k_a=k[0], k_d=k[1])  # pyright: ignore[reportCallIssue]
     parameters = _parameters(material, sure, factors, interval, optimum.n)
     warnings = _warnings(known, seen if "k_s" not in sure.undetermined else None, sure, parameters, material)
+    if fit.capped:
+        channels = ", ".join(str(channel) for channel in np.flatnonzero(k[1] + k[2] >= 1 - 1e-6))
+        words = f"k_d + k_s is held at 1 in channel {channels}: a brighter material fits better, but is not plausible; "
+        warnings = (words + "the errors do not know of that bound", *warnings)
     return Interpretation(material, parameters, sure, known, seen, warnings)
 
 
@@ -212,8 +227,8 @@ def _warnings(
             else f"the nearest pixel shows {100 * seen.centre:.2g} % of its peak"
         )
         found.append(
-            f"the highlight is smaller than a pixel, or nearly so ({amount}): k_s and n hang on each pixel being sampled "
-            "at its centre; a camera averages over pixels. A larger picture, or a larger or nearer light, would tell"
+            f"the highlight is smaller than a pixel, or nearly so ({amount}): k_s and n hang on each pixel being "
+            "sampled at its centre, and a camera averages over pixels. A larger picture or a larger light would tell"
         )
     found += _hard_to_tell(sure, parameters, material)
     return tuple(found)

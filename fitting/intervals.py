@@ -49,8 +49,8 @@ def above_zero(value: float, error: float) -> tuple[float, float]:
     """The 95 % interval of a coefficient that cannot be negative.
 
     It covers the truth in 95 % of draws wherever the truth lies, at 0 too, where it is one-sided; far from 0 it is
-    value ± 1.96 errors. Source: G. J. Feldman and R. D. Cousins, "Unified approach to the classical statistical analysis
-    of small signals", Phys. Rev. D 57 (1998) 3873-3889.
+    value ± 1.96 errors. Source: G. J. Feldman and R. D. Cousins, "Unified approach to the classical statistical
+    analysis of small signals", Phys. Rev. D 57 (1998) 3873-3889.
 
     Args:
         value: estimate without the bound; may be negative.
@@ -117,12 +117,13 @@ def exponent_interval(
     n_range: tuple[float, float],
     *,
     single: bool,
+    peak: float = 0.0,
     tied: Float[np.ndarray, " C"] | None = None,
 ) -> tuple[float, float]:
     """The 95 % profile-likelihood interval of n: where the least cost rises by ``rise``.
 
-    A relative error below a hundredth needs no pixel: there the profile is a parabola in log n. Else the cost is followed
-    outwards from the optimum, two brackets of pixels' sums in the ordinary case.
+    A relative error below a hundredth needs no pixel: there the profile is a parabola in log n. Else the cost is
+    followed outwards from the optimum, two brackets of pixels' sums in the ordinary case.
 
     Args:
         pictures: as they were searched.
@@ -132,6 +133,7 @@ def exponent_interval(
         rise: of the cost; see `fitting.uncertainty.Uncertainty`.
         n_range: bounds of the search.
         single: whether the pixels are float32.
+        peak: logarithm of the lobe's cosine in the pixel nearest to its centre.
         tied: x_s is a common factor times this, (C,); None where the channels are independent.
 
     Returns:
@@ -147,23 +149,24 @@ def exponent_interval(
     limit = float(np.sum(optimum.cost)) + rise
     tolerance = np.float64(2e-7 if single else 1e-14)
 
-    def solve(parts: Sums, width: float) -> np.ndarray:
-        if tied is not None:
-            return _tied_profile(parts, width, optimum.x.T, free, tied)
+    # Relative to the nearest pixel the lobe keeps its size where no pixel sees the centre; see `fitting.sums`.
+    reference = optimum.x.T * [1.0, 1.0, math.exp(optimum.n * peak)]
+
+    def costs(low: float, high: float) -> np.ndarray:
         with jax.enable_x64(True):
-            return np.asarray(_profile(parts, np.float64(width), optimum.x.T, free.T, tolerance))
+            parts = sums(pictures, np.array([low, high]), reference, peak=peak)
+            if tied is not None:
+                return _tied_profile(parts, high - low, reference, free, tied)
+            return np.asarray(_profile(parts, np.float64(high - low), reference, free.T, tolerance))
 
     ends = []
     for sign, bound in zip((-1, 1), bounds, strict=True):
-        crossing = _follow(pictures, optimum, solve, centre, sign, bound, first, limit)
-        ends.append(crossing)
+        ends.append(_follow(costs, centre, sign, bound, first, limit))
     return (0.0 if ends[0] is None else math.exp(ends[0])), (math.inf if ends[1] is None else math.exp(ends[1]))
 
 
 def _follow(
-    pictures: Collection[Picture],
-    optimum: Optimum,
-    solve: Callable[[Sums, float], np.ndarray],
+    costs: Callable[[float, float], np.ndarray],
     centre: float,
     sign: int,
     bound: float,
@@ -175,9 +178,7 @@ def _follow(
     while (bound - start) * sign > 1e-9:
         end = bound if (bound - start) * sign < width else start + sign * width
         low, high = min(start, end), max(start, end)
-        with jax.enable_x64(True):
-            parts = sums(pictures, np.array([low, high]), optimum.x.T)
-        cost = solve(parts, high - low)
+        cost = costs(low, high)
         position = low + SHARES * (high - low)
         if sign < 0:
             cost, position = cost[::-1], position[::-1]

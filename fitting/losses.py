@@ -7,15 +7,15 @@ What to use when:
 | squared | noise of one size everywhere: renders, photographs of middling range | the bright parts |
 | relative | high dynamic range; noise in proportion to the value | all parts by the share they are off |
 | log | as relative, and values that are off by factors | ratios; twice as bright is as bad as half |
-| huber | a few per cent of pixels are wrong: interreflection, a shadow that the scene does not know | good pixels, bad ones a little |
+| huber | a few per cent are wrong: interreflection, a shadow the scene does not know | good pixels, bad ones a little |
 | cauchy | a good part of the pixels is far off: specks, foreign objects | good pixels only |
 
-Squared error on a sharp highlight drowns the diffuse part; relative and log bring it back. Pixels darker than `DARKEST` of the
-picture's mean are taken as if they were that bright, or their noise would rule.
+Squared error on a sharp highlight drowns the diffuse part; relative and log bring it back. Pixels darker than `DARKEST`
+of the picture's mean are taken as if they were that bright, or their noise would rule.
 
 The reweighting. Minimising the sum of rho(r) is solved by weights rho'(r) / r, fixed in each round (Holland and Welsch
-1977, Commun. Stat. A6, 813). Huber (1964) and Cauchy cut at the usual 95 % efficiency under normal noise; what is cut is
-the residual of all channels of a pixel together, in units of a scale taken from the median.
+1977, Commun. Stat. A6, 813). Huber (1964) and Cauchy cut at the usual 95 % efficiency under normal noise; what is cut
+is the residual of all channels of a pixel together, in units of a scale taken from the median.
 """
 
 from collections.abc import Callable, Sequence
@@ -126,7 +126,7 @@ def _counted(picture: Picture) -> Array:
 
 
 @eqx.filter_jit
-def _model(picture: Picture, n: float, x: Float[Array, "3 C"]) -> Float[Array, "P C"]:
+def _model(picture: Picture, n: Float[Array, ""], x: Float[Array, "3 C"]) -> Float[Array, "P C"]:
     dtype = picture.target.dtype
     x = jnp.asarray(x).astype(dtype)
     model = x[0] * jnp.asarray(picture.ambient).astype(dtype) + x[1] * picture.diffuse
@@ -149,7 +149,7 @@ def _scale(pictures: Sequence[Picture], optimum: Optimum, rounding: np.ndarray) 
     sizes = []
     for picture in pictures:
         stride = max(1, picture.target.shape[0] * len(pictures) // _MEDIAN_VALUES)
-        residual = np.abs(np.asarray(picture.target - _model(picture, optimum.n, optimum.x)))
+        residual = np.abs(np.asarray(picture.target - _model(picture, np.asarray(optimum.n), optimum.x)))
         weight = np.broadcast_to(np.asarray(_counted(picture)), residual.shape)
         rows = np.flatnonzero(weight.min(axis=1) > 0)[::stride]
         sizes.append(residual[rows] * np.sqrt(weight[rows]))
@@ -157,7 +157,7 @@ def _scale(pictures: Sequence[Picture], optimum: Optimum, rounding: np.ndarray) 
 
 
 def _with_weight(picture: Picture, optimum: Optimum, scale: np.ndarray, loss: str) -> Picture:
-    model = np.asarray(_model(picture, optimum.n, optimum.x))
+    model = np.asarray(_model(picture, np.asarray(optimum.n), optimum.x))
     weight = weights(loss, np.asarray(picture.target), model, np.asarray(_counted(picture)), scale)
     weight = jnp.asarray(weight, picture.target.dtype)
     return eqx.tree_at(lambda p: p.weight, picture, weight, is_leaf=lambda leaf: leaf is None)
@@ -201,7 +201,7 @@ def _noise_factor(now: list[Picture], base: Sequence[Picture], optimum: Optimum,
     """
     psi, slope, weights, squares, count = 0.0, 0.0, 0.0, 0.0, 0.0
     for picture, original in zip(now, base, strict=True):
-        residual = np.asarray(picture.target - _model(picture, optimum.n, optimum.x), np.float64)
+        residual = np.asarray(picture.target - _model(picture, np.asarray(optimum.n), optimum.x), np.float64)
         start = np.broadcast_to(np.asarray(_counted(original), np.float64), residual.shape)
         weight = np.broadcast_to(np.asarray(_counted(picture), np.float64), residual.shape)
         good = start > 0

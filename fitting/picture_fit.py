@@ -15,6 +15,7 @@ from fitting.interpretation import Interpretation, ModelFit, coefficient_factors
 from fitting.losses import LOSSES, Loss, reweight
 from fitting.normal import fit_tied
 from fitting.observation import LightColour, Observation, fitted_pixels, observe, take_colour_out, weighted
+from fitting.plausible import fit_plausible, is_plausible
 from fitting.result import FitResult, free_parameters
 from fitting.selection import Choice, choose
 from fitting.separable import Optimum, Picture, fit_linear, search
@@ -23,6 +24,7 @@ from fitting.uncertainty import TERMS, residual_noise
 
 N_RANGE = (0.1, 1e6)
 AUTO = ("phong", "blinn-phong")
+PLAUSIBLE = ("normalized-phong", "normalized-blinn-phong")
 # An exponent up to this multiple of the lower bound is at the bound.
 WIDEST = 1.01
 
@@ -40,6 +42,7 @@ def fit(
     dark: float | None = None,
     noise: tuple[float, float] | None = None,
     weight: Any = None,
+    plausible: bool = False,
     accuracy: float | None = None,
     seconds: float | None = None,
 ) -> FitResult:
@@ -60,6 +63,8 @@ def fit(
         noise: of the camera, (read, shot): the variance of a value is read² + shot · value, and pixels weigh by its
             inverse. None weighs all alike.
         weight: (H, W), how much each pixel counts beside that, at least 0; a list where there are several pictures.
+        plausible: hold k_d + k_s <= 1 inside the fit, with a normalised form or Lambert, so that `brdf.check` passes;
+            see `fitting.plausible`.
         accuracy: relative error that is good enough: the cheapest number of pixels and light samples and the cheapest
             precision that keep it are chosen, see `fitting.budget`; the result's ``choice`` says which and why. None
             looks at all pixels under the lights as they are.
@@ -83,6 +88,9 @@ def fit(
         return fit_within(targets, scenes, model, precision, how, beside, accuracy=accuracy, seconds=seconds)
     if model != "auto" and model not in brdf.MODELS:
         raise InputError("model", f"is unknown, got {model!r}", f"Use auto or one of {', '.join(brdf.MODELS)}")
+    if plausible and model in AUTO:
+        remedy = f"Use auto, normalized-{model}, or a normalised form of your choice"
+        raise InputError("model", f"{model} is neither reciprocal nor energy conserving, so never plausible", remedy)
     if loss not in LOSSES:
         raise InputError("loss", f"is unknown, got {loss!r}", f"Use one of {', '.join(LOSSES)}")
     low, high = n_range
@@ -101,11 +109,13 @@ def fit(
         if len(counts) > 1:
             raise InputError("target", f"pictures have {counts} channels", "Give pictures with the same number")
         light = take_colour_out(scenes, counts.pop())
-        job = _Job(observations, light, n_range, loss)
+        job = _Job(observations, light, n_range, loss, PLAUSIBLE if plausible else AUTO)
         if model == "auto":
             fitted, choice = _fit_auto(job)
         else:
             fitted, choice = _fit_model(brdf.MODELS[model], job), None
+        if plausible:
+            fitted = _held_plausible(fitted, job)
         told = _interpret(fitted, job, choice)
     return _result(fitted, told, choice, job, targets, scenes, precision, time.perf_counter() - start)
 
@@ -133,12 +143,14 @@ class _Job(NamedTuple):
         light: and their lights, colour taken out.
         n_range: bounds of the exponent.
         loss: what is minimised.
+        families: models with a highlight that are compared.
     """
 
     observations: list[Observation]
     light: LightColour
     n_range: tuple[float, float]
     loss: Loss
+    families: tuple[str, ...] = AUTO
 
     @property
     def shapes(self) -> list[tuple[int, int]]:
@@ -195,7 +207,7 @@ def _fit_model(model: type[brdf.Material], job: _Job) -> ModelFit:
 
 def _fit_auto(job: _Job) -> tuple[ModelFit, Choice]:
     """All families, then the simplest adequate candidate on its own."""
-    names = AUTO if job.lit[1].any() else ("lambert",)
+    names = job.families if job.lit[1].any() else ("lambert",)
     fits = {name: _fit_model(brdf.MODELS[name], job) for name in names}
     # A lobe that would be wider than the search allows is no highlight: it mends what Lambert's law leaves at the rim.
     fits = {name: fit for name, fit in fits.items() if fit.optimum.flat or fit.optimum.n > WIDEST * job.n_range[0]}
@@ -215,6 +227,14 @@ def _fit_auto(job: _Job) -> tuple[ModelFit, Choice]:
     return _alone(choice, fits, grey, job.n_range), choice
 
 
+def _held_plausible(fit: ModelFit, job: _Job) -> ModelFit:
+    colour = job.light.colour
+    if is_plausible(fit.optimum, fit.model, colour):
+        return fit
+    optimum = fit_plausible(fit.pictures, fit.optimum, fit.free, fit.model, colour, job.n_range)
+    return fit._replace(optimum=optimum, tied=None, capped=True)
+
+
 def _with_weights(fit: ModelFit, weights: list[Any], n_range: tuple[float, float]) -> ModelFit:
     pictures = [
         eqx.tree_at(lambda p: p.weight, picture, weight) for picture, weight in zip(fit.pictures, weights, strict=True)
@@ -226,7 +246,7 @@ def _alone(
     choice: Choice, fits: dict[str, ModelFit], grey: dict[str, np.ndarray], n_range: tuple[float, float]
 ) -> ModelFit:
     """The chosen candidate, fitted to the pixels without what it leaves out."""
-    if choice.model not in AUTO:
+    if choice.model not in fits:
         fit = next(iter(fits.values()))
         pictures = [Picture(p.target, p.diffuse, None, p.weight, p.ambient) for p in fit.pictures]
         optimum = fit_linear(pictures, free=choice.free)

@@ -78,7 +78,7 @@ class FitResult:
     Attributes:
         material: the fitted material; what is not determined is 0 in it, which changes no picture.
         parameters: value and error of each number, or why it has none.
-        noise: standard deviation of the residual, (C,); under a loss with weights, in the unit of the weighted residual.
+        noise: standard deviation of the residual, (C,); with weights, that of the weighted residual.
         structure: correlation of neighbouring residuals.
         highlight_pixels: how many pixels carry the highlight; None without one.
         residual: root mean square of the residual over that of the picture.
@@ -233,9 +233,10 @@ def report(result: FitResult) -> str:
     channels = result.material.k_d.shape[0]
     count = f"{len(result.targets)} pictures, " if len(result.targets) > 1 else ""
     plural = "channel" if channels == 1 else "channels"
+    loss = "" if result.loss == "squared" else f", {result.loss} loss"
     lines = [
         f"{result.material.name} fitted to {count}{result.pixels} pixels x {channels} {plural} "
-        f"in {result.seconds:.2g} s ({result.precision}{'' if result.loss == 'squared' else ', ' + result.loss + ' loss'})"
+        f"in {result.seconds:.2g} s ({result.precision}{loss})"
     ]
     labels = ["red", "green", "blue"] if channels == 3 else [str(channel) for channel in range(channels)]
     for parameter in result.parameters:

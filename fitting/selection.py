@@ -3,16 +3,17 @@
 A candidate is a choice of terms. Its least squares need no pixel: the Gram matrix of the largest model at its optimum
 holds that of every smaller one, and the exponent of a smaller one follows in the linearised model.
 
-The criterion. Each candidate is judged by the squared error it is to be expected to show on pixels that were held out. For
-least squares that has a closed form, no pixel is touched again: leaving each pixel out in turn gives the residual sum of
-squares plus twice the noise variance for each unknown (Mallows 1973; Stone 1977). An exponent counts `SEARCHED`
-unknowns, because the best of a whole range was searched for: on a matt ball with noise, the best of all highlights gains that
-much. Candidates within one standard error of the best are adequate (Breiman et al. 1984), and of these the simplest
-family is taken, in it the fewest unknowns. The standard error is that of the difference of two candidates on the same
-pixels, 2 σ times the distance of their pictures. Where neighbouring residuals go together, pixels count for less.
+The criterion. Each candidate is judged by the squared error it is to be expected to show on pixels that were held out.
+For least squares that has a closed form, no pixel is touched again: leaving each pixel out in turn gives the residual
+sum of squares plus twice the noise variance for each unknown (Mallows 1973; Stone 1977). An exponent counts `SEARCHED`
+unknowns, because the best of a whole range was searched for: on a matt ball with noise, the best of all highlights
+gains that much. Candidates within one standard error of the best are adequate (Breiman et al. 1984), and of these the
+simplest family is taken, in it the fewest unknowns. The standard error is that of the difference of two candidates on
+the same pixels, 2 σ times the distance of their pictures. Where neighbouring residuals go together, pixels count for
+less.
 
-At the boundary: a coefficient that comes out as 0 is no unknown of that candidate. Next to the expected error the table shows the
-Bayesian information criterion (Schwarz 1978), which asks more of large pictures.
+At the boundary: a coefficient that comes out as 0 is no unknown of that candidate. Next to the expected error the table
+shows the Bayesian information criterion (Schwarz 1978), which asks more of large pictures.
 """
 
 from dataclasses import dataclass
@@ -203,8 +204,8 @@ def _decide(trials: list[_Trial], normals: dict[str, Normal], variance: np.ndarr
 def _distance(one: _Trial, other: _Trial, normals: dict[str, Normal]) -> float:
     """Squared distance of two candidates' pictures, in noise variances.
 
-    Two models with different highlights share no Gram matrix; there the difference of their costs stands in, which it is
-    where one holds the other.
+    Two models with different highlights share no Gram matrix; there the difference of their costs stands in, which is
+    the same where one model holds the other.
     """
     specular = [trial.model for trial in (one, other) if trial.model in normals and trial.model not in FAMILIES]
     if len(set(specular)) > 1:

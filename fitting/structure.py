@@ -1,5 +1,6 @@
 """What a residual gives away: neighbours that err alike, and a highlight that few pixels carry."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -78,7 +79,7 @@ def structure(
         count += first.size
         pad = (0, each - first.size)
         pairs = np.stack([np.pad(first, pad), np.pad(second, pad)]).astype(np.int32)
-        products += _products(*_residuals(picture, pairs, optimum.n, optimum.x), first.size)
+        products += _products(*_residuals(picture, pairs, np.asarray(optimum.n), optimum.x), first.size)
     scale = np.where(channels, noise, np.inf) ** -2.0
     cross, left, right = products @ scale
     correlation = float(cross / max(np.sqrt(left * right), np.finfo(float).tiny))
@@ -107,7 +108,7 @@ def _neighbours(counted: Bool[np.ndarray, "H W"], most: int) -> tuple[Int[np.nda
 
 @eqx.filter_jit
 def _residuals(
-    picture: Picture, pairs: Int[Array, "2 M"], n: float, x: Float[Array, "3 C"]
+    picture: Picture, pairs: Int[Array, "2 M"], n: Float[Array, ""], x: Float[Array, "3 C"]
 ) -> tuple[Float[Array, "M2 C"], Float[Array, "M2 Cw"]]:
     some = picture.pixels(lambda a: jnp.take(a, pairs.ravel(), axis=0))
     dtype = some.target.dtype
@@ -132,12 +133,19 @@ class Highlight(NamedTuple):
     Attributes:
         largest: value of the lobe in any pixel.
         pixels: how many carry it: the sum of its squares over the largest square, added up over pictures.
-        centre: how much of its peak the nearest pixel shows, 0 to 1.
+        n: its exponent.
+        peak: logarithm of the lobe's cosine in the pixel nearest to its centre.
     """
 
     largest: float
     pixels: float
-    centre: float
+    n: float
+    peak: float
+
+    @property
+    def centre(self) -> float:
+        """How much of its peak the nearest pixel shows, 0 to 1."""
+        return math.exp(self.n * self.peak)
 
     @property
     def smaller_than_pixel(self) -> bool:
@@ -152,21 +160,22 @@ def highlight(pictures: Sequence[Picture], n: float) -> Highlight:
         pictures: with a lobe.
         n: exponent.
     """
-    largest, pixels, centre = 0.0, 0.0, 0.0
+    largest, pixels, peak = 0.0, 0.0, -math.inf
     for picture in pictures:
         if picture.lobe is not None:
-            value, squares, peak = (float(v) for v in _highlight(picture, n))
-            largest, centre = max(largest, value), max(centre, peak)
-            pixels += squares / value**2 if value > 0 else 0.0
-    return Highlight(largest, pixels, centre)
+            value, squares, nearest = (float(v) for v in _highlight(picture, np.asarray(n)))
+            largest, peak = max(largest, value), max(peak, nearest)
+            # Squares of a highlight that no pixel sees fall below the smallest number.
+            pixels += squares / value**2 if squares > 0 and value**2 > 0 else 0.0
+    return Highlight(largest, pixels, n, min(peak, 0.0))
 
 
 @eqx.filter_jit
-def _highlight(picture: Picture, n: float) -> tuple[Array, Array, Array]:
+def _highlight(picture: Picture, n: Float[Array, ""]) -> tuple[Array, Array, Array]:
     assert picture.lobe is not None
     value = jnp.max(picture.lobe(jnp.asarray(n))[0], axis=1)
     peak = picture.lobe.peak()
     if picture.weight is not None:
         counted = picture.weight > 0 if picture.weight.ndim == 1 else jnp.any(picture.weight > 0, axis=1)
         value, peak = jnp.where(counted, value, 0), jnp.where(counted, peak, -jnp.inf)
-    return jnp.max(value), jnp.sum(value * value), jnp.exp(n * jnp.max(peak))
+    return jnp.max(value), jnp.sum(value * value), jnp.max(peak)

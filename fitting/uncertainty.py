@@ -1,4 +1,4 @@
-"""How sure a fit is: covariance from the Gauss-Newton Hessian, intervals, and which parameters the picture leaves open."""
+"""How sure a fit is: covariance from the Gauss-Newton Hessian, intervals, and what the picture leaves open."""
 
 from typing import NamedTuple
 
