@@ -18,6 +18,7 @@ from brdf.models import MODELS, BlinnPhong, Lambert, Material, SpecularMaterial
 
 # Says in a comment, which other readers skip, what MTL has no word for.
 MTL_MODEL = "# brdf model:"
+_MTL_EXPONENT = {"phong": 4.0, "normalized-phong": 4.0}
 SPECTRAL = {"ka": "k_a", "kd": "k_d", "ks": "k_s"}
 
 
@@ -75,7 +76,12 @@ def save_material(material: Material, path: str | Path, *, undetermined: Collect
     if suffix == ".json":
         write_text(path, json.dumps(material_to_dict(material, undetermined=undetermined), indent=2) + "\n")
     elif suffix == ".mtl":
-        write_text(path, _to_mtl(material, path, undetermined))
+        channels = material.k_d.shape[0]
+        if channels not in (1, 3):
+            raise InputError(
+                path, f"cannot hold {channels} channels, MTL knows RGB alone", "Save the material as .json"
+            )
+        write_text(path, to_mtl(material, undetermined=undetermined))
     else:
         raise InputError(path, f"is no material file, got {suffix or 'no suffix'}", "Name it .json or .mtl")
 
@@ -148,20 +154,27 @@ def _from_json(path: Path, text: str) -> Material:
         raise InputError(path, f"is not JSON ({error})", "Correct the file") from None
 
 
-def _to_mtl(material: Material, path: Path, undetermined: Collection[str]) -> str:
-    channels = material.k_d.shape[0]
-    if channels not in (1, 3):
-        raise InputError(path, f"cannot hold {channels} channels, MTL knows RGB alone", "Save the material as .json")
+def to_mtl(material: Material, *, name: str = "fitted", undetermined: Collection[str] = ()) -> str:
+    """The material as MTL holds it: illum 2 is Blinn-Phong, (N·H)^Ns.
+
+    The Ns of a mirror lobe (R·V)^n is 4 n, of nearly the same highlight (see `half_from_mirror`); a comment names the
+    model, so that `load_material` gives back what was saved.
+
+    Args:
+        material: any of the models, with 1 or 3 channels.
+        name: what ``newmtl`` calls it.
+        undetermined: see `save_material`.
+    """
     lines = ["# Wavefront material, linear values"]
     if type(material) is not BlinnPhong:
         lines.append(f"{MTL_MODEL} {material.name}")
     if undetermined:
         lines.append(f"# not determined by the picture: {', '.join(undetermined)}")
-    lines.append("newmtl fitted")
+    lines.append(f"newmtl {name}")
     scale = 1.0
     if isinstance(material, SpecularMaterial):
         scale = float(material.scale(np.float64(material.n)))
-        lines.append(f"Ns {float(material.n)!r}")
+        lines.append(f"Ns {float(material.n) * _MTL_EXPONENT.get(material.name, 1.0)!r}")
     factors = {"k_a": 1.0, "k_d": 1.0, "k_s": scale}
     for key, factor in factors.items():
         values = np.asarray(getattr(material, key, 0.0), dtype=np.float64) * factor
@@ -226,7 +239,7 @@ def _mtl_material(entry: dict[str, Any]) -> Material:
         return Lambert(k_a=values["k_a"], k_d=values["k_d"])
     model = BlinnPhong if name is None else MODELS[name]
     assert issubclass(model, SpecularMaterial)
-    n = entry.get("ns", [1.0])[0]
+    n = entry.get("ns", [1.0])[0] / _MTL_EXPONENT.get(model.name, 1.0)
     if n < 0:
         raise InputError("Ns", f"must be at least 0, got {n:g}", "Correct the value")
     scale = float(model.scale(np.float64(n)))

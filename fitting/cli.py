@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from fitting import cli_fit
+from fitting import cli_convert, cli_fit
 from fitting.cli_common import named_as, show, use_compilation_cache, waiting
 
 app = typer.Typer(
@@ -80,6 +80,9 @@ def check(
         show("\n\n".join(map(str, reports.values())))
     verdicts = [report.plausible for report in reports.values()]
     return 1 if False in verdicts else 2 if None in verdicts else 0
+
+
+app.command(epilog=cli_convert.EXAMPLE)(cli_convert.convert)
 
 
 def _input_error(where: str, what: str, remedy: str) -> Exception:

@@ -24,7 +24,7 @@ os.environ.setdefault("PYOPENGL_PLATFORM", "osmesa")  # read when OpenGL is firs
 
 from OpenGL import GL, osmesa
 
-__all__ = ["draw_ball"]
+__all__ = ["draw_ball", "float_context"]
 
 FACE_PIXELS = 0.25
 
@@ -56,7 +56,7 @@ def draw_ball(scene: Mapping[str, Any], material: Mapping[str, Any]) -> np.ndarr
     world_to_eye = _look_at(camera)
     eye_centres = [(world_to_eye @ [*sphere["center"], 1.0])[:3] for sphere in spheres]
     radii = [float(sphere["radius"]) for sphere in spheres]
-    with _context(width, height) as picture:
+    with float_context(width, height) as picture:
         GL.glViewport(0, 0, width, height)
         GL.glEnable(GL.GL_DEPTH_TEST)
         GL.glDisable(GL.GL_DITHER)
@@ -76,7 +76,7 @@ def draw_ball(scene: Mapping[str, Any], material: Mapping[str, Any]) -> np.ndarr
 
 
 @contextlib.contextmanager
-def _context(width: int, height: int) -> Iterator[np.ndarray]:
+def float_context(width: int, height: int) -> Iterator[np.ndarray]:
     """A context that draws float32 RGBA into the array it yields (row 0 at the bottom, OpenGL's order)."""
     context = osmesa.OSMesaCreateContextExt(osmesa.OSMESA_RGBA, 24, 0, 0, None)
     picture = np.zeros((height, width, 4), np.float32)

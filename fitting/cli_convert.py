@@ -1,0 +1,39 @@
+"""``brdf convert``: a material for another program."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+EXAMPLE = (
+    "Example: [bold]brdf convert material.json material.gltf[/bold]    or, from the classic table: "
+    "[bold]brdf convert emerald emerald.json --to three[/bold]"
+)
+
+
+def convert(
+    material: Annotated[str, typer.Argument(help="A .json or .mtl file, or a name of the classic table: emerald.")],
+    out: Annotated[
+        Path, typer.Argument(help="The file to write: .json .mtl .gltf .xml (Mitsuba) .glsl .py (PyTorch3D).")
+    ],
+    to: Annotated[
+        str | None,
+        typer.Option(help="json, mtl, three, gltf, mitsuba, mitsuba-dict, pytorch3d, glsl; default: by the suffix."),
+    ] = None,
+    name: Annotated[str | None, typer.Option(help="Which material, where an MTL file holds several.")] = None,
+) -> None:
+    """Write a material as three.js, glTF, Mitsuba, PyTorch3D, GLSL or Wavefront read it, and say what is lost."""
+    import brdf
+
+    if material.lower().replace(" ", "_") in brdf.PRESETS and not Path(material).exists():
+        loaded, called = brdf.preset(material), material.lower().replace(" ", "_")
+    else:
+        loaded, called = brdf.load_material(material, name), name or Path(material).stem
+    try:
+        export = brdf.save_export(loaded, out, to=to, name="_".join(called.split()))
+    except brdf.InputError as error:
+        if error.where == "to":
+            raise brdf.InputError("--to", error.what, error.remedy) from None
+        raise
+    for line in (f"wrote {out}", *(f"  not carried: {loss}" for loss in export.losses)):
+        print(line)  # noqa: T201  # this is the command's output

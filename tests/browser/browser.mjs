@@ -1,0 +1,14 @@
+// A headless Chromium that draws in software and reaches nothing but what a test hands it.
+
+import { existsSync } from "node:fs";
+import { chromium } from "playwright-core";
+
+export function executable() {
+  const found = [process.env.CHROMIUM, "/usr/bin/chromium", "/usr/bin/chromium-browser", "/usr/bin/google-chrome"];
+  return found.find((path) => path && existsSync(path));
+}
+
+export function launch() {
+  const args = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"];
+  return chromium.launch({ executablePath: executable(), args });
+}
