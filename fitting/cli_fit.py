@@ -52,6 +52,9 @@ def fit(
     noise: Annotated[
         str | None, typer.Option(help="READ,SHOT of the camera: the variance is READ² + SHOT·value.")
     ] = None,
+    plausible: Annotated[
+        bool, typer.Option("--plausible", help="Hold k_d + k_s <= 1 with a normalised form: brdf check then passes.")
+    ] = False,
     loss: Annotated[str | None, typer.Option(help=f"{LOSS_NAMES}.")] = None,
     plot: Annotated[bool, typer.Option("--plot", help="Also draw comparison.png into --out.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")] = False,
@@ -104,6 +107,7 @@ def fit(
                     dark=dark,
                     noise=noise,
                     loss=loss or "squared",
+                    plausible=plausible,
                 )
             if out is not None:
                 result.save(out, plot=plot)

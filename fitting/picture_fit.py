@@ -17,7 +17,7 @@ from fitting.normal import fit_tied
 from fitting.observation import LightColour, Observation, fitted_pixels, observe, take_colour_out, weighted
 from fitting.plausible import fit_plausible, is_plausible
 from fitting.result import FitResult, free_parameters
-from fitting.selection import Choice, choose
+from fitting.selection import FAMILIES, Choice, choose
 from fitting.separable import Optimum, Picture, fit_linear, search
 from fitting.structure import structure
 from fitting.uncertainty import TERMS, residual_noise
@@ -246,7 +246,7 @@ def _alone(
     choice: Choice, fits: dict[str, ModelFit], grey: dict[str, np.ndarray], n_range: tuple[float, float]
 ) -> ModelFit:
     """The chosen candidate, fitted to the pixels without what it leaves out."""
-    if choice.model not in fits:
+    if choice.model in FAMILIES:
         fit = next(iter(fits.values()))
         pictures = [Picture(p.target, p.diffuse, None, p.weight, p.ambient) for p in fit.pictures]
         optimum = fit_linear(pictures, free=choice.free)
