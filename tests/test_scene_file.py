@@ -69,6 +69,55 @@ intensity = [1, 1, 1]
 """
 
 
+LIT = """
+[camera]
+type = "orthographic"
+position = [0, 0, 4]
+target = [0, 0, 0]
+up = [0, 1, 0]
+width = 2.2
+resolution = [16, 16]
+samples = 3
+
+[[shapes]]
+type = "sphere"
+center = [0, 0, 0]
+radius = 1
+
+[[lights]]
+type = "spot"
+position = [0, 0, 3]
+direction = [0, 0, -1]
+cutoff_angle = 30
+exponent = 5
+intensity = [1, 1, 1]
+
+[[lights]]
+type = "rectangle"
+center = [0, 0, 3]
+edge_u = [0, 1, 0]
+edge_v = [1, 0, 0]
+radiance = [1, 1, 1]
+samples = 25
+
+[[lights]]
+type = "polygon"
+vertices = [[0, 0, 3], [0, 1, 3], [1, 0, 3]]
+radiance = [1, 1, 1]
+
+[[lights]]
+type = "sphere"
+center = [0, 0, 3]
+radius = 0.5
+radiance = [1, 1, 1]
+
+[[lights]]
+type = "environment"
+radiance = [0.1, 0.1, 0.2]
+samples = 32
+"""
+
+
 def write(folder: Path, text: str) -> Path:
     path = folder / "scene.toml"
     path.write_text(text)
@@ -81,7 +130,7 @@ def same(a: brdf.Scene, b: brdf.Scene) -> bool:
     return structure_a == structure_b and all(map(np.array_equal, leaves_a, leaves_b))
 
 
-@pytest.mark.parametrize("text", [FULL, SHORT], ids=["full", "short"])
+@pytest.mark.parametrize("text", [FULL, SHORT, LIT], ids=["full", "short", "lit"])
 def test_a_saved_scene_reads_back_the_same(tmp_path: Path, text: str):
     scene = brdf.Scene.load(write(tmp_path, text))
     scene.save(tmp_path / "again.toml")
@@ -98,6 +147,22 @@ def test_values_are_read_as_written(tmp_path: Path):
     point = scene.lights[1]
     assert isinstance(point, brdf.PointLight)
     np.testing.assert_array_equal(point.attenuation, [1.0, 0.1, 0.01])
+
+
+def test_a_map_travels_with_the_scene(tmp_path: Path):
+    pixels = np.random.default_rng(0).uniform(size=(8, 16, 3)).astype(np.float32)
+    brdf.write_image(tmp_path / "sky.exr", pixels)
+    lit = SHORT + '\n[[lights]]\ntype = "environment"\nfile = "sky.exr"\nradiance = 2\nsamples = 20\n'
+    scene = brdf.Scene.load(write(tmp_path, lit))
+    assert isinstance(scene.lights[1], brdf.EnvironmentMap)
+    (tmp_path / "copy").mkdir()
+    scene.save(tmp_path / "copy" / "scene.toml")
+    again = brdf.Scene.load(tmp_path / "copy" / "scene.toml")
+    white = brdf.Lambert(k_d=1.0)
+    expected = brdf.render(white, scene, precision="float64")
+    np.testing.assert_allclose(
+        brdf.render(white, again, precision="float64"), expected, rtol=1e-6
+    )  # float32 in the file
 
 
 def test_surface_points_travel_through_an_aov_file(tmp_path: Path):
@@ -169,6 +234,11 @@ WRONG = {
     "ambient without intensity": (SHORT.replace("intensity = [0.1, 0.1, 0.1]", ""), "ambient: has no intensity"),
     "empty": ("# nothing\n", "scene: must have a camera or surface points"),
     "no toml": ("[camera", "is not TOML"),
+    "samples as text": (LIT.replace("samples = 25", "samples = 2.5"), "lights[1].samples: must be a whole number"),
+    "camera samples": (LIT.replace("samples = 3\n", "samples = 0\n"), "camera.samples: must be between 1 and"),
+    "truth in a vertex": (LIT.replace("[0, 1, 3]", "[0, true, 3]"), "lights[2].vertices: must be a number"),
+    "missing map": (SHORT + "[[lights]]\ntype = 'environment'\nfile = 'none.exr'\n", "none.exr: there is no such"),
+    "missing mesh": (SHORT + "[[shapes]]\ntype = 'triangles'\nfile = 'none.obj'\n", "none.obj: there is no such"),
     "path out of the folder": ('[aov]\nfile = "../aovs.exr"\n', "aov.file: must stay within the scene's folder"),
     "number for a path": ("[aov]\nfile = 3\n", "aov.file: must be a path, got 3"),
     "missing aov": ('[aov]\nfile = "none.exr"\n', "none.exr: there is no such file"),
