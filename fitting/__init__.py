@@ -13,17 +13,24 @@ if TYPE_CHECKING:
     from fitting.picture_fit import fit
     from fitting.relighting import LightFit, fit_lights, fit_lights_and_material
     from fitting.result import FitResult, Parameter
+    from fitting.speed_accuracy import tradeoff
+    from fitting.speed_table import Tradeoff
+    from fitting.implicit import Sensitivity, sensitivity
 
 _ROOM_OF = {
     "BrdfFitResult": "brdf_result",
     "FitResult": "result",
     "LightFit": "relighting",
     "Parameter": "result",
+    "Tradeoff": "speed_table",
+    "Sensitivity": "implicit",
     "fit": "picture_fit",
     "fit_brdf": "brdf_fit",
     "fit_jointly": "joint",
     "fit_lights": "relighting",
     "fit_lights_and_material": "relighting",
+    "sensitivity": "implicit",
+    "tradeoff": "speed_accuracy",
 }
 
 __all__ = sorted(_ROOM_OF)

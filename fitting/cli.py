@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from fitting import cli_convert, cli_fit
+from fitting import cli_convert, cli_fit, cli_tradeoff
 from fitting.cli_common import named_as, show, use_compilation_cache, waiting
 
 app = typer.Typer(
@@ -83,6 +83,7 @@ def check(
 
 
 app.command(epilog=cli_convert.EXAMPLE)(cli_convert.convert)
+app.command(epilog=cli_tradeoff.EXAMPLE)(cli_tradeoff.tradeoff)
 
 
 def _input_error(where: str, what: str, remedy: str) -> Exception:

@@ -1,15 +1,20 @@
 """Fits to an accuracy, and the table of speed against accuracy."""
 
+import csv
 import dataclasses
+import io
+import json
 
 import numpy as np
 import pytest
 
 import brdf
 import fitting
+from fitting.configurations import Configuration
 from fitting.deviation import deviation
 from fitting.lamps import Lamps, with_samples
 from fitting.pixel_sampling import sample_pixels
+from fitting.speed_table import Row, Tradeoff
 
 MATERIAL = brdf.BlinnPhong(k_a=[0.2, 0.3, 0.1], k_d=[0.5, 0.3, 0.2], k_s=[0.4, 0.4, 0.4], n=60.0)
 
@@ -126,3 +131,76 @@ def test_weights_count():
     np.testing.assert_allclose(result.material.k_d, MATERIAL.k_d, rtol=1e-9)
     with pytest.raises(brdf.InputError, match="weight"):
         fitting.fit(picture, scene, weight=weight[:3])
+
+
+def row(name, seconds, error, work, **changes):
+    values = {
+        "axis": "pixels",
+        "configuration": Configuration(),
+        "name": name,
+        "compile_seconds": 1.0,
+        "seconds": seconds,
+        "spread": 0.0,
+        "runs": 9,
+        "peak": None,
+        "rms": error,
+        "worst": error,
+        "parameters": 0.0,
+        "work": work,
+    }
+    return Row(**(values | changes))
+
+
+def table(*rows, accuracy=1e-3):
+    return Tradeoff(rows, "float64", 0.0, accuracy, True, 1.0)
+
+
+def test_the_front_holds_what_nothing_beats_in_both():
+    rows = row("a", 1.0, 1e-1, 1), row("b", 2.0, 1e-3, 2), row("c", 3.0, 1e-2, 3), row("d", 4.0, 1e-5, 4)
+    assert [one.name for one in table(*rows).front] == ["a", "b", "d"]
+
+
+def test_the_recommendation_is_the_least_work_whatever_the_times_jitter():
+    for times in ((1.0, 1.4), (1.4, 1.0)):
+        found = table(row("little", times[0], 5e-4, 1), row("much", times[1], 1e-6, 9)).recommended
+        assert found is not None
+        assert found.name == "little"
+    slow = table(row("little", 9.0, 5e-4, 1), row("much", 1.0, 1e-6, 9)).recommended
+    assert slow is not None
+    assert slow.name == "much"
+
+
+def test_where_nothing_keeps_the_accuracy_the_closest_is_recommended():
+    found = table(row("a", 1.0, 1e-2, 1), row("b", 2.0, 1e-1, 2), row("c", 1.0, np.inf, 0)).recommended
+    assert found is not None
+    assert found.name == "a"
+
+
+def test_only_the_axes_that_a_scene_has_are_tried(tmp_path):
+    scene = ball(64)
+    found = fitting.tradeoff(noisy(scene, 0.01), scene, seconds=60.0)
+    axes = {one.axis for one in found.rows}
+    assert {"default", "precision", "model", "solver"} <= axes
+    assert not axes & {"samples", "shadows", "render"}
+    assert found.recommended in found.rows
+    assert found.default is not None
+    assert found.default.error < 1e-5
+    found.save(tmp_path / "out")
+    lines = list(csv.DictReader(io.StringIO((tmp_path / "out" / "tradeoff.csv").read_text())))
+    assert [line["name"] for line in lines] == [one.name for one in found.rows]
+    assert len(json.loads((tmp_path / "out" / "tradeoff.json").read_text())["rows"]) == len(lines)
+    assert (tmp_path / "out" / "tradeoff.png").stat().st_size > 10000
+    assert "recommended" in str(found)
+
+
+def test_ctrl_c_keeps_what_was_measured():
+    scene = ball(48)
+
+    def interrupt(done, total):
+        assert total > done
+        if done == 4:
+            raise KeyboardInterrupt
+
+    found = fitting.tradeoff(noisy(scene), scene, progress=interrupt)
+    assert not found.complete
+    assert len(found.rows) == 2
