@@ -1,0 +1,89 @@
+"""The derivative of a fit by what it took as known, against fits at shifted lights."""
+
+import numpy as np
+import pytest
+
+import brdf
+import fitting
+
+DIRECTION = np.array([0.4, 0.5, 0.8])
+SIZE = 64
+
+
+def scene(direction: np.ndarray = DIRECTION, intensity: float = 0.9, ambient: float | None = 0.3) -> brdf.Scene:
+    camera = brdf.OrthographicCamera(
+        position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=(SIZE, SIZE)
+    )
+    return brdf.Scene(
+        camera=camera,
+        shapes=(brdf.Sphere(center=[0, 0, 0], radius=1),),
+        lights=(brdf.DirectionalLight(direction=direction, intensity=[intensity] * 3),),
+        ambient=None if ambient is None else [ambient] * 3,
+    )
+
+
+def picture(case: str) -> np.ndarray:
+    """Explained by the model but for noise, or not explained: the residual then takes part in the derivative."""
+    kind = brdf.Phong if case == "another model" else brdf.BlinnPhong
+    material = kind(k_a=[0.2, 0.1, 0.3], k_d=[0.5, 0.4, 0.1], k_s=[0.4, 0.3, 0.6], n=20.0)
+    clean = np.asarray(brdf.render(material, scene(), precision="float64"))
+    return clean + np.random.default_rng(7).normal(0, 0.01, clean.shape)
+
+
+def numbers(material: brdf.Material) -> np.ndarray:
+    return np.concatenate([np.ravel(getattr(material, key)) for key in ("k_a", "k_d", "k_s", "n")])
+
+
+def fitted(target: np.ndarray, **lamp: object) -> np.ndarray:
+    return numbers(fitting.fit(target, scene(**lamp), model="blinn-phong", precision="float64").material)
+
+
+def row(found: fitting.Sensitivity, *place: int) -> np.ndarray:
+    return np.array([*found.k_a[:, *place], *found.k_d[:, *place], *found.k_s[:, *place], found.n[place]])
+
+
+@pytest.mark.parametrize("case", ["noise", "another model"])
+def test_light_direction_moves_the_fit_as_fits_at_shifted_lights_say(case: str):
+    target = picture(case)
+    result = fitting.fit(target, scene(), model="blinn-phong", precision="float64")
+    found = fitting.sensitivity(result, lambda scenes: (scenes[0].lights[0].direction,))[0]
+    step = 1e-4
+    for axis in range(3):
+        shift = step * np.eye(3)[axis]
+        expected = (fitted(target, direction=DIRECTION + shift) - fitted(target, direction=DIRECTION - shift)) / (
+            2 * step
+        )
+        # The central difference is off by step², the fits by 1e-10 / step.
+        np.testing.assert_allclose(row(found, axis), expected, rtol=1e-3, atol=1e-3 * np.abs(expected).max() * 1e-2)
+    np.testing.assert_allclose(found.n @ DIRECTION, 0, atol=1e-8 * np.abs(found.n).max())
+
+
+def test_several_leaves_and_a_fit_in_float32():
+    target = picture("noise")
+    result = fitting.fit(target.astype(np.float32), scene(), model="blinn-phong")
+    by_light, by_ambient = fitting.sensitivity(result, lambda s: (s[0].lights[0].intensity, s[0].ambient))
+    k_d, k_a = np.asarray(result.material.k_d), np.asarray(result.material.k_a)
+    # Twice the light is half the coefficient, channel by channel.
+    np.testing.assert_allclose(by_light.k_d, np.diag(-k_d / 0.9), atol=2e-5)
+    np.testing.assert_allclose(by_ambient.k_a, np.diag(-k_a / 0.3), atol=2e-5)
+    np.testing.assert_allclose(by_ambient.n, 0, atol=1e-6)
+
+
+def test_numbers_at_their_bound_stay_there():
+    target = np.asarray(brdf.render(brdf.Lambert(k_d=[0.5, 0.4, 0.3]), scene(), precision="float64"))
+    target = target + np.random.default_rng(3).normal(0, 1e-3, target.shape)
+    result = fitting.fit(target, scene(), model="lambert", precision="float64")
+    bound = [parameter.channel for parameter in result.parameters if parameter.name == "k_a" and parameter.at_bound]
+    found = fitting.sensitivity(result, lambda s: (s[0].lights[0].direction,))[0]
+    assert bound
+    assert not np.any(found.k_a[bound])
+    assert not np.any(found.n)
+
+
+def test_what_cannot_be_differentiated_is_named():
+    result = fitting.fit(picture("noise"), scene(), model="blinn-phong", loss="huber")
+    with pytest.raises(brdf.InputError, match="must be of the squared loss, got huber"):
+        fitting.sensitivity(result, lambda s: (s[0].ambient,))
+    result = fitting.fit(picture("noise"), scene(), model="blinn-phong")
+    with pytest.raises(brdf.InputError, match="by: names no leaf"):
+        fitting.sensitivity(result, lambda s: ())
