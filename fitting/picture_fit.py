@@ -232,7 +232,9 @@ def _held_plausible(fit: ModelFit, job: _Job) -> ModelFit:
     if is_plausible(fit.optimum, fit.model, colour):
         return fit
     optimum = fit_plausible(fit.pictures, fit.optimum, fit.free, fit.model, colour, job.n_range)
-    return fit._replace(optimum=optimum, tied=None, capped=True)
+    # What the bound adds to the residual is no noise: that of the fit without it says what stands out.
+    noise = fit.noise_factor * float(np.sqrt(np.sum(fit.optimum.cost) / np.sum(optimum.cost)))
+    return fit._replace(optimum=optimum, tied=None, capped=True, noise_factor=noise)
 
 
 def _with_weights(fit: ModelFit, weights: list[Any], n_range: tuple[float, float]) -> ModelFit:
