@@ -19,7 +19,7 @@ from fitting.reference import reference
 
 ACCURACIES = (1e-1, 1e-2, 1e-3, 1e-4)
 OPTIONS = {"n_range": (0.1, 1e6), "mask": None, "saturation": None}
-SIZE, SMALL = 256, 48
+SIZE, SMALL = 512, 48
 REPEATS = 5
 SUN = brdf.DirectionalLight(direction=(0.5, 0.6, 0.7), intensity=1.0)
 
@@ -65,17 +65,18 @@ def scenes():
     panel = brdf.RectangleLight(center=(2, 2, 3), edge_u=(0, 0.8, -0.5), edge_v=(0.7, 0, -0.7), radiance=3.0)
     bulb = brdf.SphereLight(center=(2, 2, 3), radius=0.6, radiance=6.0)
     dome = brdf.ConstantEnvironment(radiance=0.8)
-    yield "clean", scene(), material(), "blinn-phong", 0.0
+    little = camera(256)
+    yield "clean", scene(look=little), material(), "blinn-phong", 0.0
     yield "noise 1 %", scene(), material(), "blinn-phong", 0.01
-    yield "noise 5 %", scene(), material(), "blinn-phong", 0.05
+    yield "noise 5 %", scene(look=little), material(), "blinn-phong", 0.05
     yield "noise 20 %", scene(), material(), "blinn-phong", 0.2
     yield "broad", scene(), material(4.0), "blinn-phong", 0.01
     yield "narrow", scene(), material(2000.0), "blinn-phong", 0.01
     yield "narrow, clean", scene(), material(20000.0), "blinn-phong", 0.0
-    yield "other model", scene(), material(30.0, brdf.Phong), "blinn-phong", 0.0
+    yield "other model", scene(look=little), material(30.0, brdf.Phong), "blinn-phong", 0.0
     yield "phong", scene(), material(30.0, brdf.Phong), "phong", 0.02
     yield "normalised", scene(), material(40.0, brdf.NormalizedPhong, 0.3), "normalized-phong", 0.02
-    yield "lambert", scene(), material(40.0), "lambert", 0.02
+    yield "lambert", scene(look=little), material(40.0), "lambert", 0.02
     yield "point light", scene(point), material(), "blinn-phong", 0.02
     yield "two colours", scene(red, blue), material(), "blinn-phong", 0.02
     yield "perspective", scene(look=near), material(), "blinn-phong", 0.02
@@ -89,7 +90,7 @@ def scenes():
 
 def configurations(place, model):
     """The grid of plain configurations that the price is compared with."""
-    pixels = (1024, 4096, 16384, None) if place.resolution[0] >= SIZE else (None,)
+    pixels = (1024, 4096, 16384, None) if place.resolution[0] > SMALL else (None,)
     samples = (16, 64, 256, 1024) if extended(place) else (None,)
     found = [Configuration(model, "float32", p, s) for p in pixels for s in samples]
     return found if extended(place) else [*found, Configuration(model, "float64")]

@@ -1,11 +1,11 @@
 """``fit(accuracy=...)`` and ``fit(seconds=...)``: the cheapest fit that is good enough, the best that is quick enough.
 
-The first attempt is cheap: some 2000 pixels of a picture, 16 samples of a light with an extent, float32. From its own
-pixels it tells its error and what makes it (`fitting.sampling_error`), so the next attempt changes just that: more
-pixels by the square of what is missing, more light samples as far as four times as many still change the answer,
-float64 where rounding counts. Mostly one or two attempts do. The error is that against a fit of all pixels in float64
-with `MOST_SAMPLES` samples of each light, and is the larger one of what `fitting.deviation` says of the
-parameters and of the picture.
+The first attempt is cheap: some 1000 pixels of a picture, or all of a small one; 16 samples of a light with an extent;
+float32. From its own pixels it tells its error and what makes it (`fitting.sampling_error`), so the next attempt
+changes just that: more pixels by the square of what is missing, more light samples as far as four times as many still
+change the answer, float64 where rounding counts. Mostly one or two attempts do. The error is that against a fit of all
+pixels in float64 with `MOST_SAMPLES` samples of each light, and is the larger one of what `fitting.deviation` says of
+the parameters and of the picture.
 """
 
 import dataclasses
@@ -18,12 +18,17 @@ import numpy as np
 import brdf
 from brdf.errors import InputError
 from fitting.budget_choice import Attempt, BudgetChoice
-from fitting.configurations import Configuration, Run, run, target_size
+from fitting.configurations import Configuration, Run, casts_shadows, run, target_size
 from fitting.lamps import Lamps, extended
 from fitting.result import FitResult
-from fitting.sampling_error import STEP, Estimate, System
+from fitting.sampling_error import STEP, Estimate, System, rounding_by_rule
 
-FIRST_PIXELS, FIRST_SAMPLES, MOST_SAMPLES = 2048, 16, 4096
+FIRST_PIXELS, FIRST_SAMPLES, MOST_SAMPLES = 1024, 16, 4096
+# Pictures under single lights that are fitted whole at once: choosing among so few pixels takes as long as looking at
+# them. Where little error is allowed, a sample of the larger ones would hardly do.
+SMALL, SMALL_IF_FINE, FINE = 1 << 16, 1 << 18, 1e-2
+# Down to this accuracy the order of magnitude of rounding is enough to know.
+COARSE = 1e-4
 # An attempt aims at this share of the accuracy in each of the parts that its error has.
 AIM = 0.6
 # A sample of more than this share of the pixels is not worth the weighing: all are taken.
@@ -35,7 +40,7 @@ NEAR, NEAR_AUTO = 4.0, 16.0
 
 class _Step(NamedTuple):
     run: Run
-    system: System
+    system: System | None
     estimate: Estimate
 
 
@@ -77,11 +82,13 @@ def fit_within(
             raise InputError(name, came, "Leave one of them out")
     lamps, attempts = Lamps(), []
     has_samples = any(extended(scene) for scene in scenes)
-    now = Configuration(model, precision, FIRST_PIXELS, FIRST_SAMPLES if has_samples else None)
+    small = SMALL_IF_FINE if accuracy is not None and accuracy < FINE else SMALL
+    whole = not has_samples and max(map(target_size, targets)) <= small
+    now = Configuration(model, precision, None if whole else FIRST_PIXELS, FIRST_SAMPLES if has_samples else None)
     n_range = None
     while True:
         begun = time.perf_counter()
-        step = _attempt(targets, scenes, now, options, lamps, n_range)
+        step = _attempt(targets, scenes, now, options, lamps, n_range, accuracy)
         took = time.perf_counter() - begun
         attempts.append(Attempt(str(now), *step.estimate, took))
         if accuracy is not None and step.estimate.bound <= accuracy:
@@ -112,8 +119,14 @@ def _attempt(
     options: Mapping[str, Any],
     lamps: Lamps,
     n_range: tuple[float, float] | None,
+    accuracy: float | None,
 ) -> _Step:
     done = run(targets, scenes, configuration, options, lamps, n_range)
+    if configuration.pixels is None and configuration.samples is None and accuracy is not None:
+        shadows = any(map(casts_shadows, scenes))
+        rule = rounding_by_rule(done.result.optimum.n, configuration.precision, shadows=shadows)
+        if accuracy >= COARSE and (3 * rule < accuracy or shadows):
+            return _Step(done, None, Estimate(rule, 3 * rule, 0.0, 0.0, rule))
     system = System(done, targets, dict(options), lamps)
     return _Step(done, system, system.estimate(_finer(configuration.samples)))
 
@@ -131,7 +144,7 @@ def _better(now: Configuration, step: _Step, targets: Sequence[Any], accuracy: f
     after = now
     if now.pixels is not None and estimate.pixels > aim:
         after = dataclasses.replace(after, pixels=_more_pixels(now.pixels, (estimate.pixels / aim) ** 2, targets))
-    if now.samples is not None and estimate.light > aim / 2 and now.samples < MOST_SAMPLES:
+    if step.system is not None and now.samples is not None and estimate.light > aim / 2 and now.samples < MOST_SAMPLES:
         samples = now.samples * STEP
         while samples < MOST_SAMPLES and step.system.light_error(samples, min(STEP * samples, MOST_SAMPLES)) > aim / 2:
             samples *= STEP

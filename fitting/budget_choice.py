@@ -56,7 +56,7 @@ class BudgetChoice:
     def basis(self) -> str:
         """What the estimate rests on."""
         one = self.chosen
-        parts = [f"rounding {one.rounding:.1g} (by float64)" if one.rounding else "float64"]
+        parts = [f"rounding {one.rounding:.1g}" if one.rounding else "float64"]
         if self.pixels < self.of_pixels:
             parts.insert(0, f"pixels left out {one.pixels:.1g} (information matrix)")
         if one.light:

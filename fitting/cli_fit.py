@@ -56,6 +56,10 @@ def fit(
         bool, typer.Option("--plausible", help="Hold k_d + k_s <= 1 with a normalised form: brdf check then passes.")
     ] = False,
     loss: Annotated[str | None, typer.Option(help=f"{LOSS_NAMES}.")] = None,
+    accuracy: Annotated[
+        float | None, typer.Option(help="Relative error that is good enough: as few pixels and samples as keep it.")
+    ] = None,
+    seconds: Annotated[float | None, typer.Option(help="Time to spend: the most accurate fit that it buys.")] = None,
     plot: Annotated[bool, typer.Option("--plot", help="Also draw comparison.png into --out.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")] = False,
 ) -> None:
@@ -80,6 +84,8 @@ def fit(
                 intensities,
                 exposure,
                 noise,
+                accuracy,
+                seconds,
             )
             result = _fit_table(target[0], model, loss, any(option is not None for option in given) or plot)
             if out is not None:
@@ -95,7 +101,8 @@ def fit(
             }
             options |= {"intensities": intensities, "encoding": _encoding(encoding), "exposure": exposure, "mask": mask}
             names = {"model": "--model", "precision": "--precision", "dark": "--dark", "noise": "--noise"}
-            names |= {"mask": mask, "loss": "--loss", "saturation": "--saturation"}
+            names |= {"mask": mask, "loss": "--loss", "saturation": "--saturation", "accuracy": "--accuracy"}
+            names |= {"seconds": "--seconds"}
             with named_as(names):
                 result = _fit_pictures(
                     target,
@@ -108,6 +115,8 @@ def fit(
                     noise=noise,
                     loss=loss or "squared",
                     plausible=plausible,
+                    accuracy=accuracy,
+                    seconds=seconds,
                 )
             if out is not None:
                 result.save(out, plot=plot)

@@ -85,6 +85,7 @@ def fit(
 
         how = {"mask": masks, "saturation": saturation, "n_range": n_range, "dark": dark}
         beside = {"loss": loss != "squared", "noise": noise is not None, "weight": weight is not None}
+        beside["plausible"] = plausible
         return fit_within(targets, scenes, model, precision, how, beside, accuracy=accuracy, seconds=seconds)
     if model != "auto" and model not in brdf.MODELS:
         raise InputError("model", f"is unknown, got {model!r}", f"Use auto or one of {', '.join(brdf.MODELS)}")

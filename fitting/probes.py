@@ -80,13 +80,18 @@ def difference(
 
 
 @eqx.filter_jit
-def columns_in(model: type[brdf.Material], scene: brdf.Scene, n: Any, shape: tuple[int, int]) -> Any:
+def columns_in(
+    model: type[brdf.Material], scene: brdf.Scene, pixel: Any, n: Any, shape: tuple[int, int], precision: brdf.Precision
+) -> tuple[Float[Array, "M C 4"], Any]:
     """The columns, and which pixels see the object, compiled.
 
     Args:
         model: the class of the material.
-        scene: of some pixels.
+        scene: the whole picture's, or that of some pixels.
+        pixel: which pixels of the whole picture, or None.
         n: exponent.
         shape: how many pixels and channels.
+        precision: in which the pixels are traced.
     """
+    scene = scene if pixel is None else brdf.some_pixels(scene, pixel, precision=precision)
     return _columns(model, scene, n, shape)

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float
 
 import brdf
-from fitting.configurations import Run, some_of_target, target_size
+from fitting.configurations import Run, casts_shadows, some_of_target, target_size
 from fitting.deviation import SMALLEST
 from fitting.interpretation import coefficient_factors
 from fitting.lamps import Lamps
@@ -32,8 +32,10 @@ from fitting.probes import Probe, columns_in, difference, probe
 from fitting.uncertainty import TERMS
 
 DRAWS = 512
-# Pixels that are looked at under lights of many samples, and under lights of few.
-PROBES, MOST_PROBES = 256, 8192
+# Pixels that are looked at: under lights of many samples, of a sample under lights of few, and of a whole picture.
+PROBES, MOST_PROBES, WHOLE_PROBES = 2048, 4096, 1024
+# What float32 shadow rays make of the pixels at a shadow's edge, some of which fall on its other side.
+AT_SHADOWS = 1e-4
 # What a sum of so many samples is compared with: the next step, as a factor.
 STEP = 4
 
@@ -78,6 +80,20 @@ def _some(sample: PixelSample, most: int) -> tuple[PixelSample, float]:
     return PixelSample(sample.pixel[::stride], sample.stands_for[::stride] * stride), float(stride)
 
 
+def rounding_by_rule(n: float, precision: brdf.Precision, *, shadows: bool) -> float:
+    """What rounding does to a fit of all pixels, of no more account than its order of magnitude.
+
+    A few units in the last place, more for a lobe so narrow that the rounding of directions counts against its width.
+
+    Args:
+        n: exponent.
+        precision: of the fit.
+        shadows: whether shapes cast any.
+    """
+    rule = float(np.finfo(precision).eps * (2 + 0.05 * np.sqrt(max(n, 0.0))))
+    return max(rule, AT_SHADOWS) if shadows and precision == "float32" else rule
+
+
 class System:
     """The linear system of a fit's parameters, gathered over its pictures.
 
@@ -100,6 +116,7 @@ class System:
         self.channels = self.optimum.x.shape[1]
         self.many = any(sum(getattr(light, "samples", 1) for light in scene.lights) > 4 for scene in run.scenes)
         self.light = take_colour_out(run.scenes, self.channels)
+        self.shadows = any(map(casts_shadows, run.scenes))
         masks = options.get("mask")
         masks = masks if isinstance(masks, list | tuple) else [masks] * len(targets)
         most = max(64, probes or (PROBES if self.many else MOST_PROBES) // len(targets))
@@ -107,7 +124,8 @@ class System:
         self.skipped = False
         self.parts: list[tuple[PixelSample, np.ndarray, bool, float]] = []
         for index, (target, mask, sample) in enumerate(zip(targets, masks, run.samples, strict=True)):
-            whole = sample if sample is not None else _every(run.scenes[index], self.model, most)
+            fewer = most if probes or self.many else WHOLE_PROBES
+            whole = sample if sample is not None else _every(run.scenes[index], self.model, fewer)
             some, stride = _some(whole, most)
             values = some_of_target(target, some)
             values = np.asarray(getattr(values, "pixels", values), np.float64).reshape(-1, self.channels)
@@ -232,7 +250,8 @@ class System:
                 many = self._place(index, fine, after)
                 n, x = jnp.asarray(max(self.optimum.n, 1e-3)), jnp.asarray(self.optimum.x)
                 if few is None:
-                    return total + self._of_single(index, weight)
+                    total += self._of_single(index, weight)
+                    continue
                 found = np.asarray(difference(self.model, few, many, jnp.asarray(weight), n, x))
             for channel, place in enumerate(self.places):
                 total[place] += found[channel] * np.array([1.0, 1.0, 1.0, self.optimum.x[2, channel]])
@@ -243,12 +262,13 @@ class System:
         found = []
         for precision in ("float64", "float32"):
             with brdf.working_precision(precision):
-                place = self._place(index, None, precision)
-                x = jnp.asarray(self.optimum.x, precision)
-                n = jnp.asarray(max(self.optimum.n, 1e-3), precision)
+                scene, pixel = self.light.scenes[index], self.parts[index][0].pixel.astype(np.int32)
+                if not traceable(scene):
+                    scene, pixel = self._place(index, None, precision), None
+                n = np.float64(max(self.optimum.n, 1e-3))
                 shape = (weight.size, self.channels)
-                columns, seen = jax.device_get(columns_in(self.model, place, n, shape))
-            picture = np.einsum("mck,kc->mc", columns[..., :3].astype(np.float64), np.asarray(x, np.float64))
+                columns, seen = jax.device_get(columns_in(self.model, scene, pixel, n, shape, precision))
+            picture = np.einsum("mck,kc->mc", columns[..., :3].astype(np.float64), self.optimum.x)
             found.append((columns.astype(np.float64), picture, seen))
         (columns, double, seen), (_, single, _) = found
         products = np.einsum("m,mci,mc->ci", np.where(seen, weight, 0.0), columns, single - double)
@@ -294,6 +314,8 @@ class System:
         alone = self.relative(shifts.drawn)
         together = self.relative(shifts.drawn + shifts.light + shifts.rounding)
         light, rounding = float(self.relative(shifts.light)), float(self.relative(shifts.rounding))
+        if self.shadows and self.run.result.precision == "float32":
+            together, rounding = np.hypot(together, AT_SHADOWS), max(rounding, AT_SHADOWS)
         pixels = float(np.quantile(alone, 0.95))
         return Estimate(float(np.median(together)), float(np.quantile(together, 0.95)), pixels, light, rounding)
 
