@@ -62,6 +62,40 @@ class StoredLobe(eqx.Module):
         return jax.tree.map(choose, self)
 
 
+class StackedLobe(eqx.Module):
+    """The specular basis of many light samples and so few pixels that their terms fit into memory.
+
+    Attributes:
+        weights: of each sample, (P, S, C).
+        log_cosines: of each sample, (P, S).
+    """
+
+    weights: Float[Array, "P S C"]
+    log_cosines: Float[Array, "P S"]
+
+    def __call__(self, n: Float[Array, ""]) -> tuple[Float[Array, "P C"], Float[Array, "P C"]]:
+        """The basis image without the model's scale, and its derivative in n.
+
+        Args:
+            n: the exponent.
+        """
+        log_cosines = self.log_cosines[..., None]
+        values = self.weights * jnp.exp(jnp.asarray(n, log_cosines.dtype) * log_cosines)
+        return jnp.sum(values, axis=1), jnp.sum(values * log_cosines, axis=1)
+
+    def peak(self) -> Float[Array, " P"]:
+        """The largest logarithm of the lobe's cosine over the samples, `NO_LOBE` where no sample has one."""
+        return jnp.max(jnp.where(jnp.max(self.weights, axis=-1) > 0, self.log_cosines, NO_LOBE), axis=1)
+
+    def pixels(self, choose: Callable[[Array], Array]) -> "StackedLobe":
+        """The same for some of the pixels.
+
+        Args:
+            choose: applied to each array whose first axis is the pixels.
+        """
+        return jax.tree.map(choose, self)
+
+
 class StreamedLobe(eqx.Module):
     """The specular basis of many light samples, made anew at each evaluation in bounded memory.
 
@@ -114,8 +148,8 @@ class AveragedLobe(eqx.Module):
         slot: for every pixel its row in ``weight``, or -1, (P,).
     """
 
-    centre: StoredLobe | StreamedLobe
-    fine: StoredLobe | StreamedLobe
+    centre: StoredLobe | StackedLobe | StreamedLobe
+    fine: StoredLobe | StackedLobe | StreamedLobe
     weight: Float[Array, "K M"]
     slot: Int[Array, " P"]
 
@@ -158,4 +192,4 @@ def average(weight: Float[Array, "K M"], values: Float[Array, "K*M C"]) -> Float
     return jnp.sum(weight[..., None] * values.reshape(*weight.shape, -1), axis=1)
 
 
-Lobe = StoredLobe | StreamedLobe | AveragedLobe
+Lobe = StoredLobe | StackedLobe | StreamedLobe | AveragedLobe

@@ -15,11 +15,20 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from brdf.errors import InputError
-from brdf.lobes import AveragedLobe, Lobe, StoredLobe, StreamedLobe, average
+from brdf.lobes import AveragedLobe, Lobe, StackedLobe, StoredLobe, StreamedLobe, average
 from brdf.models import Material, SpecularMaterial
 from brdf.precision import Precision, cast, working_precision
 from brdf.scene import Scene
-from brdf.shading import STORED_SAMPLES, LightTerms, each_sample, sample_count, sum_over_samples
+from brdf.shading import (
+    STACKED_VALUES,
+    STORED_SAMPLES,
+    LightTerms,
+    each_sample,
+    light_channels,
+    sample_count,
+    stacked_terms,
+    sum_over_samples,
+)
 from brdf.surface_points import SurfacePoints
 from brdf.visibility import Lighting
 
@@ -73,13 +82,18 @@ def _basis(model: type[Material], points: SurfacePoints, ambient: Any, lighting:
 
 def _diffuse_and_lobe(
     model: type[Material], points: SurfacePoints, lighting: Lighting
-) -> tuple[Float[Array, "P C"], StoredLobe | StreamedLobe | None]:
+) -> tuple[Float[Array, "P C"], StoredLobe | StackedLobe | StreamedLobe | None]:
     specular = issubclass(model, SpecularMaterial)
-    if sum(map(sample_count, lighting.lights)) <= STORED_SAMPLES:
+    samples = sum(map(sample_count, lighting.lights))
+    if samples <= STORED_SAMPLES:
         terms = list(each_sample(model, points, lighting))
         diffuse = sum((term.diffuse for term in terms[1:]), start=terms[0].diffuse)
         lobe = StoredLobe(tuple(t.weight for t in terms), tuple(t.log_cosine for t in terms))
         return diffuse, lobe if specular else None
+    values = samples * points.mask.size * (1 + max(light_channels(light) for light in lighting.lights))
+    if specular and values <= STACKED_VALUES:
+        diffuse, weights, log_cosines = stacked_terms(model, points, lighting)
+        return diffuse, StackedLobe(weights, log_cosines)
     diffuse = sum_over_samples(model, points, lighting, lambda terms: terms.diffuse)
     return diffuse, StreamedLobe(points, lighting, model) if specular else None
 

@@ -25,6 +25,9 @@ STORED_SAMPLES = 4
 TILE = 8192
 """Pixels that many samples pass over at a time."""
 
+STACKED_VALUES = 1 << 26
+"""Up to so many values the fit keeps the terms of many samples, too, for few pixels: 256 MiB in float32."""
+
 
 class LightTerms(eqx.Module):
     """What one light sample adds to the basis images at one point.
@@ -145,6 +148,20 @@ def sample_count(light: Light) -> int:
     return jax.tree.leaves(nodes)[0].shape[0]
 
 
+def light_channels(light: Light) -> int:
+    """The number of channels that a light shines in: a map may have more than its emittance.
+
+    Args:
+        light: any light.
+    """
+    at = jnp.zeros(3)
+
+    def sample() -> Array:
+        return light.illuminate(jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], light.nodes()), at, at).intensity
+
+    return jax.eval_shape(sample).shape[0]
+
+
 def sum_over_samples(
     model: type[Material],
     points: SurfacePoints,
@@ -170,6 +187,34 @@ def sum_over_samples(
 
     few = sum(map(sample_count, lighting.lights)) <= STORED_SAMPLES
     return of_tile(points) if few else over_tiles(of_tile, points)
+
+
+def stacked_terms(
+    model: type[Material], points: SurfacePoints, lighting: Lighting
+) -> tuple[Float[Array, "P C"], Float[Array, "P S C"], Float[Array, "P S"]]:
+    """The terms of all samples at once: the sum of the diffuse ones, and weights and cosines of the lobe.
+
+    Args:
+        model: the class of the material.
+        points: (P,) surface points.
+        lighting: lights, at least one, and occluders.
+    """
+
+    def of_tile(points: SurfacePoints) -> tuple[Array, Array, Array]:
+        each = []
+        for index, light in enumerate(lighting.lights):
+
+            def of_node(carry: None, node: Any, index: int = index) -> tuple[None, LightTerms]:
+                return carry, _terms_of_node(model, points, lighting, index, node)
+
+            each.append(jax.lax.scan(of_node, None, nodes_of(light, points))[1])
+        channels = max(terms.weight.shape[-1] for terms in each)
+        wide = [jnp.broadcast_to(terms.weight, (*terms.weight.shape[:-1], channels)) for terms in each]
+        diffuse = sum((jnp.sum(terms.diffuse, axis=0) for terms in each[1:]), start=jnp.sum(each[0].diffuse, axis=0))
+        log_cosine = jnp.concatenate([terms.log_cosine for terms in each])
+        return diffuse, jnp.moveaxis(jnp.concatenate(wide), 0, 1), log_cosine.T
+
+    return over_tiles(of_tile, points)
 
 
 def over_tiles(function: Callable[[Any], Any], tree: Any) -> Any:
