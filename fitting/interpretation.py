@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 
 import brdf
 from fitting.intervals import exponent_interval
+from fitting.noise_model import weighted_sums
 from fitting.result import Parameter
 from fitting.separable import Optimum
 from fitting.structure import Highlight, Structure, highlight, structure
@@ -94,8 +95,20 @@ def interpret(
     visible = 0.0
     if seen is not None:
         visible = float(np.max(optimum.x[2]) * seen.largest / max(np.max(brightest), np.finfo(float).tiny))
+    known = structure(pictures, shapes, optimum, rounding)
+    spread = None
+    if known.noise is not None:
+        spread = fit.noise_factor**2 * weighted_sums(pictures, optimum, known.noise, inverse=False).gram
     sure = uncertainty(
-        optimum, required, noise, brightest, specular=specular, visible=visible, single=single, tied=fit.tied
+        optimum,
+        required,
+        noise,
+        brightest,
+        specular=specular,
+        visible=visible,
+        single=single,
+        tied=fit.tied,
+        spread=spread,
     )
     interval: tuple[float, float] | None = None
     # At k_d + k_s = 1 the cost still falls across the bound: a profile that does not know it has its least elsewhere.
@@ -114,7 +127,6 @@ def interpret(
         reason = _open_exponent(interval)
         if reason:
             sure.undetermined["n"] = reason
-    known = structure(pictures, shapes, optimum, rounding)
     k = optimum.x / factors
     for name in sure.undetermined:
         key, _, channel = name.removesuffix("]").partition("[")
@@ -219,6 +231,11 @@ def _warnings(
             f"the residual has structure: neighbouring pixels err alike (correlation {known.correlation:.2f}), so the "
             "model is not the whole truth, or the picture was smoothed. The errors come from a formula for independent "
             f"noise and are too small, by a factor of {known.inflation:.2g} or more"
+        )
+    if known.noise is not None:
+        found.append(
+            "the noise grows with brightness; the errors allow for it, but pixels are weighed alike: told of the "
+            "camera's noise, or with the relative loss, the same picture says more"
         )
     if seen is not None and seen.smaller_than_pixel:
         amount = (

@@ -13,6 +13,7 @@ import brdf
 from brdf.errors import InputError
 from fitting.interpretation import Interpretation, ModelFit, coefficient_factors, interpret
 from fitting.losses import LOSSES, Loss, reweight
+from fitting.noise_model import weighted_sums
 from fitting.normal import fit_tied
 from fitting.observation import LightColour, Observation, fitted_pixels, observe, take_colour_out, weighted
 from fitting.plausible import fit_plausible, is_plausible
@@ -224,7 +225,13 @@ def _fit_auto(job: _Job) -> tuple[ModelFit, Choice]:
     known = structure(best.pictures, job.shapes, best.optimum, job.rounding)
     free = next(iter(fits.values())).free
     optima = {name: fit.optimum for name, fit in fits.items()}
-    choice = choose(optima, free, grey, noise, known.inflation)
+    whitened = {}
+    if known.noise is not None:
+        # Each pixel by its own variance, or noise in bright pixels would pass for a highlight.
+        whitened = {
+            name: weighted_sums(fit.pictures, fit.optimum, known.noise, inverse=True) for name, fit in fits.items()
+        }
+    choice = choose(optima, free, grey, noise, known.inflation, whitened)
     return _alone(choice, fits, grey, job.n_range), choice
 
 

@@ -16,6 +16,7 @@ At the boundary: a coefficient that comes out as 0 is no unknown of that candida
 shows the Bayesian information criterion (Schwarz 1978), which asks more of large pictures.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -24,6 +25,7 @@ from jaxtyping import Bool, Float
 
 from fitting.normal import Normal, design_of, nonnegative_minimum, normal_equations
 from fitting.separable import Optimum
+from fitting.sums import Sums
 
 # How many unknowns a searched exponent counts; measured: python -m benchmarks.selection --optimism
 SEARCHED = 4.0
@@ -128,6 +130,7 @@ def choose(
     grey: dict[str, Float[np.ndarray, " C"]],
     noise: Float[np.ndarray, " C"],
     inflation: float,
+    whitened: Mapping[str, Sums],
 ) -> Choice:
     """Choose the simplest adequate model.
 
@@ -137,16 +140,20 @@ def choose(
         grey: for each model, the engine's x_s of a grey k_s, up to a factor; (C,).
         noise: standard deviation of the residual of the best fit, (C,).
         inflation: by what factor the structure of its residual makes errors larger; at least 1.
+        whitened: for each model the sums at its optimum with each pixel divided by its variance; empty where the
+            variance is the same in all.
     """
     channels = free.shape[1]
     no = np.zeros(channels, bool)
     variance = (noise * inflation) ** 2
     count = float(sum(next(iter(fits.values())).pixels))
     trials: list[_Trial] = []
-    normals, plain = (
-        {name: normal_equations(fit.gram, fit.product, fit.square, fit.x[2], v) for name, fit in fits.items()}
-        for v in (variance, np.ones(channels))
-    )
+    normals, plain = {}, {}
+    for name, fit in fits.items():
+        parts = whitened.get(name, fit)
+        unit = np.full(channels, inflation**2) if whitened else variance
+        normals[name] = normal_equations(parts.gram, parts.product, parts.square, fit.x[2], unit)
+        plain[name] = normal_equations(fit.gram, fit.product, fit.square, fit.x[2], np.ones(channels))
     first = next(iter(normals.values())), next(iter(plain.values()))
     for name, terms in zip(FAMILIES, ([no, no], [free[0], no], [no, free[1]]), strict=True):
         if name != "ambient" or free[0].any():

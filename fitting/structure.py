@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from fitting.noise_model import NoiseModel, noise_model
+from fitting.pictures import AnyArray, Picture
 from fitting.separable import Optimum
-from fitting.sums import Picture
 
 # Pairs of neighbours that are looked at in all: a correlation is then known to 1 %.
 PAIRS = 8192
@@ -30,10 +31,12 @@ class Structure(NamedTuple):
     Attributes:
         correlation: of neighbours, over all channels.
         significant: it is too large for chance, and large enough to matter.
+        noise: how the noise grows with brightness; None where it does not.
     """
 
     correlation: float
     significant: bool
+    noise: NoiseModel | None = None
 
     @property
     def inflation(self) -> float:
@@ -68,7 +71,7 @@ def structure(
     stride = -(-len(pictures) // MOST_PICTURES)
     some = range(0, len(pictures), stride)
     each = max(FEWEST_PAIRS, PAIRS // len(some))
-    products, count = np.zeros((3, noise.size)), 0
+    products, count, samples = np.zeros((3, noise.size)), 0, []
     for index in some:
         picture = pictures[index]
         weight = None if picture.weight is None else np.asarray(picture.weight)
@@ -79,12 +82,15 @@ def structure(
         count += first.size
         pad = (0, each - first.size)
         pairs = np.stack([np.pad(first, pad), np.pad(second, pad)]).astype(np.int32)
-        products += _products(*_residuals(picture, pairs, np.asarray(optimum.n), optimum.x), first.size)
+        scaled, value = _scaled(*_residuals(picture, pairs, np.asarray(optimum.n), optimum.x), first.size)
+        products += np.stack([np.sum(scaled[i] * scaled[j], axis=0) for i, j in ((0, 1), (0, 0), (1, 1))])
+        samples.append((scaled[0], value[0]))
     scale = np.where(channels, noise, np.inf) ** -2.0
     cross, left, right = products @ scale
     correlation = float(cross / max(np.sqrt(left * right), np.finfo(float).tiny))
     least = max(CORRELATED, DEVIATIONS / np.sqrt(max(count, 1)))
-    return Structure(correlation, correlation > least)
+    residual, value = (np.concatenate(each) for each in zip(*samples, strict=True))
+    return Structure(correlation, correlation > least, noise_model(residual, value, rounding))
 
 
 def _neighbours(counted: Bool[np.ndarray, "H W"], most: int) -> tuple[Int[np.ndarray, " M"], Int[np.ndarray, " M"]]:
@@ -108,8 +114,8 @@ def _neighbours(counted: Bool[np.ndarray, "H W"], most: int) -> tuple[Int[np.nda
 
 @eqx.filter_jit
 def _residuals(
-    picture: Picture, pairs: Int[Array, "2 M"], n: Float[Array, ""], x: Float[Array, "3 C"]
-) -> tuple[Float[Array, "M2 C"], Float[Array, "M2 Cw"]]:
+    picture: Picture, pairs: Int[AnyArray, "2 M"], n: Float[AnyArray, ""], x: Float[AnyArray, "3 C"]
+) -> tuple[Float[Array, "M2 C"], Float[Array, "M2 Cw"], Float[Array, "M2 C"]]:
     some = picture.pixels(lambda a: jnp.take(a, pairs.ravel(), axis=0))
     dtype = some.target.dtype
     x = jnp.asarray(x).astype(dtype)
@@ -117,14 +123,16 @@ def _residuals(
     if some.lobe is not None:
         model = model + x[2] * some.lobe(jnp.asarray(n))[0]
     weight = jnp.ones((1, 1), dtype) if some.weight is None else some.weight.reshape(pairs.size, -1)
-    return jnp.where(weight > 0, some.target - model, 0), weight
+    return jnp.where(weight > 0, some.target - model, 0), weight, jnp.broadcast_to(model, some.target.shape)
 
 
-def _products(residual: Array, weight: Array, valid: int) -> Float[np.ndarray, "3 C"]:
-    """Sums of first x second, first x first, second x second, over the pairs."""
+def _scaled(
+    residual: Array, weight: Array, model: Array, valid: int
+) -> tuple[Float[np.ndarray, "2 M C"], Float[np.ndarray, "2 M C"]]:
+    """Residuals times the root of their weight, and what was fitted; of the first and the second of each pair."""
     scaled = np.asarray(residual, np.float64) * np.sqrt(np.asarray(weight, np.float64))
-    first, second = scaled.reshape(2, -1, scaled.shape[-1])[:, :valid]
-    return np.stack([np.sum(a * b, axis=0) for a, b in ((first, second), (first, first), (second, second))])
+    shape = (2, -1, scaled.shape[-1])
+    return scaled.reshape(shape)[:, :valid], np.asarray(model, np.float64).reshape(shape)[:, :valid]
 
 
 class Highlight(NamedTuple):
@@ -171,7 +179,7 @@ def highlight(pictures: Sequence[Picture], n: float) -> Highlight:
 
 
 @eqx.filter_jit
-def _highlight(picture: Picture, n: Float[Array, ""]) -> tuple[Array, Array, Array]:
+def _highlight(picture: Picture, n: Float[AnyArray, ""]) -> tuple[Array, Array, Array]:
     assert picture.lobe is not None
     value = jnp.max(picture.lobe(jnp.asarray(n))[0], axis=1)
     peak = picture.lobe.peak()

@@ -1,5 +1,6 @@
 """How sure a fit is: covariance from the Gauss-Newton Hessian, intervals, and what the picture leaves open."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -64,6 +65,7 @@ def uncertainty(
     visible: float,
     single: bool,
     tied: Float[np.ndarray, " C"] | None = None,
+    spread: Float[np.ndarray, "C 4 4"] | None = None,
 ) -> Uncertainty:
     """Errors of an optimum.
 
@@ -80,6 +82,7 @@ def uncertainty(
         visible: largest value of the specular term in the picture, over that of the picture.
         single: whether the pixels were float32.
         tied: x_s is a common factor times this, (C,); None where the channels are independent.
+        spread: sums of the columns' products times the variance of each pixel, where it is not the same in all.
     """
     channels = optimum.x.shape[1]
     dependent = DEPENDENT_SINGLE if single else DEPENDENT_DOUBLE
@@ -92,7 +95,7 @@ def uncertainty(
     known[2] &= specular and "k_s" not in undetermined
     _name_unlit(free, specular, undetermined)
     _name_dependent(optimum, known, undetermined, dependent)
-    system = _System(optimum, known, noise, tied, dependent)
+    system = _System(optimum, known, noise, tied, spread, dependent)
     x_error, x_interval, n_error = system.errors()
     for term, channel in np.argwhere(known):
         largest = max(optimum.square[channel], brightest[channel] ** 2)
@@ -168,7 +171,13 @@ class _System:
     """The normal equations of all unknowns: x_a, x_d, x_s channel after channel, then n."""
 
     def __init__(
-        self, optimum: Optimum, known: np.ndarray, noise: np.ndarray, tied: np.ndarray | None, dependent: float
+        self,
+        optimum: Optimum,
+        known: np.ndarray,
+        noise: np.ndarray,
+        tied: np.ndarray | None,
+        spread: np.ndarray | None,
+        dependent: float,
     ):
         channels = noise.size
         size = 3 * channels + 1
@@ -177,7 +186,11 @@ class _System:
         for channel, block in enumerate(optimum.gauss_newton):
             place = np.ix_(*2 * [[channel, channels + channel, 2 * channels + channel, size - 1]])
             self.hessian[place] += block
-            self.spread[place] += noise[channel] ** 2 * block
+            if spread is None:
+                self.spread[place] += noise[channel] ** 2 * block
+            else:
+                scale = np.array([1.0, 1.0, 1.0, optimum.x[2, channel]])
+                self.spread[place] += spread[channel] * np.outer(scale, scale)
         active = known & (optimum.x > 0)
         self.has_n = bool(active[2].any())
         columns = [row for row in np.eye(size)[:-1][active.ravel()]]
@@ -228,10 +241,11 @@ class _System:
         for term, channel in np.argwhere(self.known):
             index = term * channels + channel
             if x[term, channel] > 0:
-                value, deviation = x[term, channel], np.sqrt(max(self.covariance[index, index], 0.0))
+                value = float(x[term, channel])
+                deviation = math.sqrt(max(float(self.covariance[index, index]), 0.0))
                 # Where n is open, what moves along with it is open too.
                 if self.has_n and not self.with_n and abs(self.along[index]) * self.optimum.n > deviation:
-                    deviation = np.inf
+                    deviation = math.inf
             else:
                 value, deviation = self._released(term, channel, index)
             error[term, channel] = deviation
