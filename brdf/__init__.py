@@ -20,6 +20,7 @@ if TYPE_CHECKING:
         roughness_from_exponent,
         slope_from_exponent,
     )
+    from brdf.display import displayed, lit_sphere, material_html, png_address, report_html
     from brdf.encodings import encode
     from brdf.environment import ConstantEnvironment, EnvironmentMap
     from brdf.errors import InputError
@@ -71,6 +72,7 @@ _ROOMS = {
     "area_lights": ["PolygonLight", "RectangleLight", "SphereLight"],
     "camera": ["Camera", "OrthographicCamera", "PerspectiveCamera"],
     "environment": ["ConstantEnvironment", "EnvironmentMap"],
+    "display": ["displayed", "lit_sphere", "material_html", "png_address", "report_html"],
     "encodings": ["encode"],
     "errors": ["InputError"],
     "exports": ["EXPORTS", "Export", "export_material", "mitsuba_dict", "save_export"],

@@ -73,6 +73,14 @@ class Material(eqx.Module):
         """Model and numbers, as one would write them."""
         return f"{type(self).__name__}({', '.join(f'{k}={_text(v)}' for k, v in vars(self).items())})"
 
+    def _repr_html_(self) -> str | None:
+        """For Jupyter: a lit sphere and the numbers; nothing while JAX traces them."""
+        if any(isinstance(value, Tracer) for value in vars(self).values()):
+            return None
+        from brdf.display import material_html
+
+        return material_html(self)
+
 
 class SpecularMaterial(Material):
     """What the four models with a lobe share. The lobe is ``scale(n) (N.L)+^w exp(n log_cosine)``; see the module.

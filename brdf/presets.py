@@ -4,6 +4,8 @@ Source: M. J. Kilgard, ``teapots.c`` of the OpenGL Programming Guide's examples 
 gives shininess from 0 to 1; the exponent is 128 times that.
 """
 
+import numpy as np
+
 from brdf.errors import InputError
 from brdf.models import BlinnPhong
 
@@ -63,5 +65,5 @@ def preset(name: str) -> BlinnPhong:
     key = str(name).strip().lower().replace(" ", "_").replace("-", "_")
     if key not in PRESETS:
         raise InputError("preset", f"is unknown, got {name!r}", f"Use one of {', '.join(PRESETS)}")
-    k_a, k_d, k_s, shininess = PRESETS[key]
-    return BlinnPhong(k_a=k_a, k_d=k_d, k_s=k_s, n=LARGEST_SHININESS * shininess)
+    k_a, k_d, k_s = map(np.array, PRESETS[key][:3])
+    return BlinnPhong(k_a=k_a, k_d=k_d, k_s=k_s, n=np.array(LARGEST_SHININESS * PRESETS[key][3]))

@@ -104,6 +104,12 @@ class Report:
             lines.append(f"  Its nearest plausible form is {self.nearest!r}.")
         return "\n".join(lines)
 
+    def _repr_html_(self) -> str:
+        """For Jupyter."""
+        from brdf.display import report_html
+
+        return report_html(self)
+
     def to_json(self) -> dict[str, Any]:
         """The report as plain numbers, strings and dictionaries, for ``json.dumps``."""
         nearest = None

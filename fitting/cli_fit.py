@@ -1,6 +1,8 @@
 """``brdf fit`` and ``brdf lights``: pictures, photographs of a ball, archives and measured BRDFs."""
 
 import json
+import shlex
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
@@ -61,6 +63,7 @@ def fit(
     ] = None,
     seconds: Annotated[float | None, typer.Option(help="Time to spend: the most accurate fit that it buys.")] = None,
     plot: Annotated[bool, typer.Option("--plot", help="Also draw comparison.png into --out.")] = False,
+    report: Annotated[Path | None, typer.Option(help="One .html page with everything, to keep or to send.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")] = False,
 ) -> None:
     """Fit a model to a picture: value ± error of every parameter, with no guess to give."""
@@ -87,7 +90,7 @@ def fit(
                 accuracy,
                 seconds,
             )
-            result = _fit_table(target[0], model, loss, any(option is not None for option in given) or plot)
+            result = _fit_table(target[0], model, loss, any(option is not None for option in given) or plot or report)
             if out is not None:
                 result.save(out)
         else:
@@ -120,12 +123,19 @@ def fit(
                 )
             if out is not None:
                 result.save(out, plot=plot)
+            if report is not None:
+                from fitting.html_report import report_page
+
+                command = shlex.join(["brdf", *sys.argv[1:]])
+                brdf.write_text(report, report_page(result, source=target[0].name, command=command))
     show(json.dumps(result.to_dict(), indent=2) if as_json else str(result))
     if out is not None and not as_json:
         show(f"saved in {out}")
+    if report is not None and not as_json:
+        show(f"wrote {report}")
 
 
-def _fit_table(path: Path, model: str, loss: str | None, has_picture_options: bool) -> Any:
+def _fit_table(path: Path, model: str, loss: str | None, has_picture_options: Any) -> Any:
     import brdf
 
     if has_picture_options:

@@ -1,51 +1,153 @@
-"""Pictures of a fit, for print: colour-blind-safe, linear values shown through the sRGB encoding."""
+"""Pictures of a fit, for print: colour-blind-safe, readable in grey, linear values shown through the sRGB encoding.
+
+Every function returns a matplotlib figure and shows nothing.
+"""
 
 from typing import Any
 
+import matplotlib
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 
+import brdf
 from fitting.result import FitResult
 
+PRINT = {"font.size": 8, "axes.titlesize": 9, "axes.labelsize": 8, "legend.fontsize": 7, "figure.dpi": 120}
+"""Sizes in points for a figure as wide as a page, 7.2 inches."""
 
-def display(linear: Float[np.ndarray, "H W C"], white: float) -> Float[np.ndarray, "H W 3"]:
-    """Values for a screen: one or three channels through the sRGB encoding (IEC 61966-2-1), the rest as their mean.
+CHANNEL_COLOURS = ("#D55E00", "#009E73", "#0072B2", "#CC79A7", "#E69F00", "#56B4E9")
+"""Vermilion, green, blue, purple, orange, sky blue (Okabe and Ito 2008): told apart by the colour-blind."""
 
-    Args:
-        linear: radiance.
-        white: the radiance that is shown as white.
-    """
-    if linear.shape[-1] != 3:
-        linear = np.repeat(linear.mean(axis=-1, keepdims=True), 3, axis=-1)
-    value = np.clip(np.nan_to_num(linear) / white, 0, 1)
-    return np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
+CHANNEL_STYLES = ("-", "--", "-.", ":")
+
+SIGNED = "cividis"
+"""For signed values: blue, grey at zero, yellow; lightness only grows, so that the sign survives printing in grey."""
 
 
 def comparison(result: FitResult, picture: int = 0) -> Figure:
-    """Target, fit and signed residual, the pixels left out in grey.
+    """Target, fit and signed residual; the highlight enlarged, a scanline through it, and the profile of n.
+
+    Pixels left out are grey in the residual. Without a specular term the second row is the scanline alone.
 
     Args:
         result: of a fit.
         picture: which of its pictures.
     """
     target, fitted = np.asarray(result.targets[picture]), result.fitted(picture)
-    counted = result.counted[picture]
+    counted = np.asarray(result.counted[picture])
     values = target[counted]
-    white = float(np.quantile(values, 0.999)) if values.size else 1.0
-    residual = np.where(counted, (fitted - target).mean(axis=-1), np.nan)
-    limit = max(float(np.nanquantile(np.abs(residual), 0.995)), 1e-12)
-    figure = Figure(figsize=(10.5, 3.6), layout="constrained")
-    axes: Any = figure.subplots(1, 3)
-    axes[0].imshow(display(target, white))
-    axes[0].set_title("target")
-    axes[1].imshow(display(fitted, white))
-    axes[1].set_title(f"fit, {result.material.name}")
-    axes[2].set_facecolor("0.8")
-    image = axes[2].imshow(residual, cmap="PuOr_r", vmin=-limit, vmax=limit)
-    axes[2].set_title("fit − target, mean of channels")
-    figure.colorbar(image, ax=axes[2], label="radiance")
-    for axis in axes:
-        axis.set_xticks([])
-        axis.set_yticks([])
+    white = max(float(np.quantile(values, 0.999)), 1e-12) if values.size else 1.0
+    box = _highlight(result, picture, target, counted)
+    specular = isinstance(result.material, brdf.SpecularMaterial) and bool(np.any(np.asarray(result.material.k_s)))
+    with matplotlib.rc_context(PRINT):
+        figure = Figure(figsize=(7.2, 4.9), layout="constrained")
+        grid = figure.add_gridspec(2, 3)
+        above = [figure.add_subplot(grid[0, column]) for column in range(3)]
+        for axes, image, title in zip(
+            above, (target, fitted), ("target", f"fit, {result.material.name}"), strict=False
+        ):
+            axes.imshow(brdf.displayed(image, white))
+            axes.set_title(title)
+            axes.axhline(box.row, color="white", linewidth=0.6, linestyle=(0, (4, 4)))
+        _residual(figure, above[2], target, fitted, counted)
+        for axes in above:
+            axes.set(xticks=[], yticks=[])
+        if specular:
+            _enlarged(figure.add_subplot(grid[1, 0]), target, fitted, box, white)
+            _scanline(figure.add_subplot(grid[1, 1]), target, fitted, counted, box.row, box.columns)
+            _profile(figure.add_subplot(grid[1, 2]), result)
+        else:
+            _scanline(figure.add_subplot(grid[1, :]), target, fitted, counted, box.row, slice(0, target.shape[1]))
     return figure
+
+
+class _Box:
+    """Where the highlight is: its row, and the rows and columns worth enlarging."""
+
+    def __init__(self, image: Float[np.ndarray, "H W"]):
+        height, width = image.shape
+        self.row, column = (int(i) for i in np.unravel_index(np.argmax(image), image.shape))
+        bright = np.argwhere(image > 0.05 * image.max()) if image.max() > 0 else np.array([[0, 0]])
+        reach = int(np.max(np.abs(bright - [self.row, column]))) + 2
+        reach = min(max(reach, 8), max(height, width) // 2)
+        self.rows = slice(max(self.row - reach, 0), min(self.row + reach + 1, height))
+        self.columns = slice(max(column - reach, 0), min(column + reach + 1, width))
+
+
+def _highlight(result: FitResult, picture: int, target: np.ndarray, counted: Bool[np.ndarray, "H W"]) -> _Box:
+    material, scene = result.material, result.scenes[picture]
+    image = np.nan_to_num(target).max(axis=-1)
+    if isinstance(material, brdf.SpecularMaterial) and np.any(np.asarray(material.k_s)):
+        dark = type(material)(k_d=0.0 * np.asarray(material.k_d), k_s=material.k_s, n=material.n)
+        image = np.asarray(brdf.render(dark, scene, precision=result.precision)).max(axis=-1)
+    return _Box(np.where(counted, image, 0.0))
+
+
+def _residual(figure: Figure, axes: Any, target: np.ndarray, fitted: np.ndarray, counted: np.ndarray) -> None:
+    """At each pixel the channel that is farthest off, with its sign: a mean could hide a wrong colour."""
+    difference = np.where(counted[..., None], fitted - np.nan_to_num(target), 0.0)
+    farthest = np.argmax(np.abs(difference), axis=-1)[..., None]
+    signed = np.where(counted, np.take_along_axis(difference, farthest, axis=-1)[..., 0], np.nan)
+    limit = max(float(np.nanquantile(np.abs(signed), 0.999)), 1e-12) if counted.any() else 1.0
+    axes.set_facecolor("0.85")
+    image = axes.imshow(signed, cmap=SIGNED, vmin=-limit, vmax=limit)
+    axes.set_title("fit − target" + (", largest channel" if target.shape[-1] > 1 else ""))
+    bar = figure.colorbar(image, ax=axes, label="radiance", extend="both")
+    bar.formatter.set_powerlimits((-2, 3))
+
+
+def _enlarged(axes: Any, target: np.ndarray, fitted: np.ndarray, box: _Box, white: float) -> None:
+    crop = np.concatenate([image[box.rows, box.columns] for image in (target, fitted)], axis=1)
+    axes.imshow(brdf.displayed(crop, max(white, float(np.nanmax(crop)))), interpolation="nearest")
+    half = box.columns.stop - box.columns.start
+    axes.axvline(half - 0.5, color="white", linewidth=1)
+    axes.set(xticks=[0.5 * half, 1.5 * half], xticklabels=["target", "fit"], yticks=[])
+    axes.tick_params(length=0)
+    axes.set_title(f"highlight, {half} pixels wide")
+
+
+def _scanline(axes: Any, target: np.ndarray, fitted: np.ndarray, counted: np.ndarray, row: int, columns: slice) -> None:
+    place = np.arange(columns.start, columns.stop)
+    names = ("red", "green", "blue") if target.shape[-1] == 3 else tuple(map(str, range(target.shape[-1])))
+    step = max(1, len(place) // 30)
+    for channel in range(min(target.shape[-1], len(CHANNEL_COLOURS))):
+        colour = CHANNEL_COLOURS[channel]
+        known = np.where(counted[row, columns], target[row, columns, channel], np.nan)
+        style = CHANNEL_STYLES[channel % len(CHANNEL_STYLES)]
+        axes.plot(place[::step], known[::step], "o", color=colour, markersize=2.5, markerfacecolor="none")
+        axes.plot(place, fitted[row, columns, channel], style, color=colour, linewidth=1.2, label=names[channel])
+    axes.plot([], [], "o", color="0.3", markersize=2.5, markerfacecolor="none", label="target")
+    axes.set(xlabel=f"column, in row {row}", ylabel="radiance (linear)", title="scanline")
+    axes.legend(frameon=False, handlelength=2.2, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.2))
+
+
+def _profile(axes: Any, result: FitResult) -> None:
+    """The least residual at each exponent: how deep the minimum is, and whether there are others."""
+    optimum = result.optimum
+    order = np.argsort([*optimum.grid, optimum.n])
+    grid = np.array([*optimum.grid, optimum.n])[order]
+    profile = np.array([*optimum.profile, np.sum(optimum.cost)])[order]  # the grid may step over a sharp minimum
+    found = next((parameter for parameter in result.parameters if parameter.name == "n"), None)
+    axes.set(xscale="log", xlabel="exponent n", title="profile of n")
+    if grid.size > 1:
+        axes.plot(grid, 100 * np.sqrt(np.maximum(profile, 0.0) / np.sum(optimum.square)), color="black", linewidth=1.2)
+        axes.set(ylabel="least residual, % of the picture", yscale="log", xlim=(grid[0], grid[-1]))
+    if found is None or found.value is None:
+        axes.set_title("profile of n: not determined")
+        return
+    axes.axvline(found.value, color=CHANNEL_COLOURS[0], linewidth=1)
+    interval = getattr(found, "interval", None)
+    text = f"n = {found.value:.5g}"
+    if interval is not None:
+        low, high = max(interval[0], 1e-3), min(interval[1], 1e9)
+        axes.axvspan(low, high, color=CHANNEL_COLOURS[5], alpha=0.5, linewidth=0)
+        text += f"\n95 %: {interval[0]:.6g}\nto {interval[1]:.6g}"
+    right = found.value < 300
+    axes.annotate(
+        text,
+        (0.97 if right else 0.03, 0.05),
+        xycoords="axes fraction",
+        ha="right" if right else "left",
+        fontsize=7,
+    )

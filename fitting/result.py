@@ -139,6 +139,12 @@ class FitResult:
         """The report."""
         return report(self)
 
+    def _repr_html_(self) -> str:
+        """For Jupyter."""
+        from fitting.html_report import result_html
+
+        return result_html(self)
+
     def to_dict(self) -> dict[str, Any]:
         """The report as JSON holds it: what is not determined is None."""
         return {

@@ -1,0 +1,106 @@
+"""How materials and reports show themselves: pictures for a screen, and HTML for Jupyter and report files.
+
+The HTML needs nothing from a network and takes its colours from the page it stands in.
+"""
+
+import base64
+import html
+import io
+
+import numpy as np
+from jaxtyping import Float
+
+from brdf.camera import OrthographicCamera
+from brdf.encodings import encode
+from brdf.lights import DirectionalLight
+from brdf.models import Material, SpecularMaterial
+from brdf.rendering import render
+from brdf.report import Report
+from brdf.scene import Scene
+from brdf.shapes import Sphere
+
+_CELL = "padding:0.15em 0.8em;text-align:right;white-space:nowrap"
+_MARKS = {"pass": "✓ pass", "fail": "✗ fail", "cannot tell": "? cannot tell"}
+
+
+def displayed(linear: Float[np.ndarray, "H W C"], white: float = 1.0) -> Float[np.ndarray, "H W 3"]:
+    """Values for a screen, 0 to 1: linear radiance through the sRGB encoding (IEC 61966-2-1).
+
+    Args:
+        linear: radiance; one or three channels are shown as they are, others as their mean, NaN as black.
+        white: the radiance that is shown as white.
+    """
+    linear = np.nan_to_num(np.asarray(linear, np.float32))
+    if linear.shape[-1] != 3:
+        linear = np.repeat(linear.mean(axis=-1, keepdims=True), 3, axis=-1)
+    value = np.clip(linear / white, 0.0, 1.0).astype(np.float32)
+    return np.clip(encode(value, "srgb"), 0.0, 1.0)
+
+
+def lit_sphere(material: Material, size: int = 128) -> Float[np.ndarray, "H W 3"]:
+    """A sphere of the material in one light from above left, as a screen shows it, on white.
+
+    Args:
+        material: any of the models, of known numbers.
+        size: pixels on a side.
+    """
+    camera = OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.06, resolution=(size, size))
+    light = DirectionalLight(direction=[-0.5, 0.6, 0.8], intensity=[0.9])
+    scene = Scene(camera=camera, shapes=(Sphere(center=[0, 0, 0], radius=1),), ambient=[0.2], lights=(light,))
+    image = displayed(np.asarray(render(material, scene, precision="float32")))
+    return np.where(np.asarray(scene.surface_points().mask)[..., None], image, 1.0)
+
+
+def png_address(picture: Float[np.ndarray, "H W 3"]) -> str:
+    """A picture as a ``data:`` address that an ``<img>`` can show.
+
+    Args:
+        picture: values for a screen, 0 to 1.
+    """
+    import matplotlib.image  # only where something is shown
+
+    file = io.BytesIO()
+    matplotlib.image.imsave(file, np.asarray(picture), format="png")
+    return "data:image/png;base64," + base64.b64encode(file.getvalue()).decode()
+
+
+def material_html(material: Material) -> str:
+    """A material as HTML: a lit sphere and its numbers.
+
+    Args:
+        material: any of the models, of known numbers.
+    """
+    channels = np.asarray(material.k_d).size
+    labels = {1: [""], 3: ["red", "green", "blue"]}.get(channels, [str(index) for index in range(channels)])
+    head = "".join(f'<th style="{_CELL}">{label}</th>' for label in ["", *labels])
+    rows = []
+    for key in ("k_a", "k_d", "k_s") if isinstance(material, SpecularMaterial) else ("k_a", "k_d"):
+        cells = "".join(f'<td style="{_CELL}">{value:.4g}</td>' for value in np.asarray(getattr(material, key)))
+        rows.append(f'<tr><th style="{_CELL}">{key}</th>{cells}</tr>')
+    if isinstance(material, SpecularMaterial):
+        rows.append(f'<tr><th style="{_CELL}">n</th><td style="{_CELL}">{float(material.n):.5g}</td></tr>')
+    picture = f'<img alt="a lit sphere" width="128" height="128" src="{png_address(lit_sphere(material))}">'
+    table = f"<table><tr>{head}</tr>{''.join(rows)}</table>"
+    name = html.escape(material.name)
+    style = "display:flex;flex-wrap:wrap;gap:1em;align-items:center"
+    return f'<div style="{style}">{picture}<div><b>{name}</b>{table}</div></div>'
+
+
+def report_html(report: Report) -> str:
+    """A plausibility report as HTML.
+
+    Args:
+        report: of `brdf.check`.
+    """
+    word = {True: "plausible", False: "not plausible", None: "cannot tell"}[report.plausible]
+    rows = "".join(
+        f'<tr><th style="{_CELL}">{name}</th><td style="{_CELL}">{_MARKS[finding.verdict]}</td>'
+        f'<td style="padding:0.15em 0.8em;text-align:left">{html.escape(finding.sentence)}</td></tr>'
+        for name, finding in report.findings.items()
+    )
+    nearest = (
+        "" if report.nearest is None else f"<p>Its nearest plausible form is {html.escape(repr(report.nearest))}.</p>"
+    )
+    subject = html.escape(report.subject)
+    style = "overflow-x:auto;overflow-wrap:anywhere"
+    return f'<div style="{style}"><b>{subject}: {word}</b><table>{rows}</table>{nearest}</div>'

@@ -1,0 +1,152 @@
+"""A fit as HTML: a table for Jupyter, and a page of its own that needs no network.
+
+The page holds numbers with their intervals, warnings, pictures, plausibility, and how it was made. A content policy in
+its head forbids it to load anything, so that it shows the same in twenty years and may be opened from a mail.
+"""
+
+import base64
+import datetime
+import html
+import importlib.metadata
+import io
+import math
+import platform
+from typing import Any
+
+import brdf
+from fitting.result import FitResult, Parameter
+
+_STYLE = """
+:root { color-scheme: light dark; }
+body { font: 16px/1.45 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; }
+h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2rem; border-bottom: 1px solid #8888; }
+.wide { overflow-x: auto; } table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
+th, td { padding: 0.15em 0.8em; text-align: right; border-bottom: 1px solid #8884; }
+img { max-width: 100%; height: auto; background: white; }
+.warning { border-left: 4px solid #d55e00; padding: 0.3em 0.8em; margin: 0.6em 0; }
+pre { overflow-x: auto; background: #8882; padding: 0.6em; }
+"""
+_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+
+
+def result_html(result: FitResult) -> str:
+    """What Jupyter shows of a fit: the material, value, error and 95 % interval of each number, and the warnings.
+
+    Args:
+        result: of a fit.
+    """
+    residual = f"residual {100 * result.residual:.3g} % of the picture, {result.pixels} pixels"
+    parts = [brdf.material_html(result.material), f"<p>{residual}, {result.seconds:.2g} s, {result.precision}</p>"]
+    return "".join([*parts, _numbers(result), *_warnings(result)])
+
+
+def report_page(result: FitResult, *, source: str = "", command: str = "") -> str:
+    """One self-contained HTML page about a fit.
+
+    Args:
+        result: of a fit; of several pictures the first is shown.
+        source: what was fitted, for the title.
+        command: how it was made.
+
+    Returns:
+        The page's text; it loads nothing and runs no program.
+    """
+    from fitting.material_plots import overview
+
+    check = brdf.check(result.material, name=result.material.name)
+    title = html.escape(f"{result.material.name} fitted to {source or 'a picture'}")
+    left_out = [f"{count} pixels {reason}" for reason, count in result.left_out.items() if count]
+    summary = f"Residual {100 * result.residual:.3g} % of the picture (rms) over {result.pixels} pixels."
+    summary += f" Left out: {', '.join(left_out)}." if left_out else ""
+    several = f" The first of {len(result.targets)} pictures is shown." if len(result.targets) > 1 else ""
+    alternative = "target, fit, residual, the highlight enlarged, a scanline through it, and the profile of n"
+    made = {
+        "command": command,
+        "made": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        "time of the fit": f"{result.seconds:.3g} s, {result.precision}, {result.loss} loss",
+        "with": _versions(),
+    }
+    body = [
+        f"<h1>{title}</h1>",
+        brdf.material_html(result.material),
+        f"<p>{html.escape(summary + several)}</p>",
+        *_warnings(result),
+        "<h2>Numbers</h2>",
+        _numbers(result),
+        "<h2>Pictures</h2>",
+        _picture(result.plot(), alternative),
+        *_candidates(result),
+        "<h2>Is it plausible?</h2>",
+        brdf.report_html(check),
+        _picture(overview(result.material, check), "a lit sphere, the lobe, the albedo and the reciprocity error"),
+        "<h2>How it was made</h2>",
+        _table([[key, value] for key, value in made.items() if value], "left"),
+        f'<details><summary>The report as text</summary><pre class="wide">{html.escape(str(result))}</pre></details>',
+    ]
+    head = f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
+    head += '<meta name="viewport" content="width=device-width, initial-scale=1">'
+    head += f"<title>{title}</title><style>{_STYLE}</style>"
+    return f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>\n' + "\n".join(body) + "\n</body></html>\n"
+
+
+def _numbers(result: FitResult) -> str:
+    rows = [_row(parameter, result) for parameter in result.parameters]
+    return _table(rows, head=["", "channel", "value", "± error", "95 % interval", ""])
+
+
+def _row(parameter: Parameter, result: FitResult) -> list[str]:
+    channels = result.material.k_d.shape[0]
+    names = {1: ("",), 3: ("red", "green", "blue")}.get(channels, tuple(map(str, range(channels))))
+    channel = "" if parameter.channel is None else names[parameter.channel]
+    interval = getattr(parameter, "interval", None)
+    ends = "" if interval is None else " to ".join("∞" if math.isinf(end) else f"{end:.6g}" for end in interval)
+    if parameter.value is None:
+        return [parameter.name, channel, "not determined", "", ends, parameter.reason]
+    error = "" if not parameter.error else f"{parameter.error:.2g}"
+    return [
+        parameter.name,
+        channel,
+        f"{parameter.value:.6g}",
+        error,
+        ends,
+        "at its bound" if parameter.at_bound else "",
+    ]
+
+
+def _candidates(result: FitResult) -> list[str]:
+    if len(result.candidates) < 2:
+        return []
+    rows = []
+    for one in result.candidates:
+        name = getattr(one, "name", one.model)
+        rows.append([name, str(one.unknowns), f"{one.rms:.3e}", f"{one.bic:.4g}", "chosen" if one.chosen else ""])
+    head = ["model", "unknowns", "rms", "BIC, over the best", ""]
+    return ["<h2>What the scene requires</h2>", _table(rows, head=head)]
+
+
+def _warnings(result: FitResult) -> list[str]:
+    return [f'<p class="warning">⚠ {html.escape(warning)}</p>' for warning in result.warnings]
+
+
+def _table(rows: list[list[str]], align: str = "right", head: list[str] | None = None) -> str:
+    lines = [] if head is None else ["".join(f"<th>{html.escape(cell)}</th>" for cell in head)]
+    for row in rows:
+        lines.append("".join(f'<td style="text-align:{align}">{html.escape(cell)}</td>' for cell in row))
+    return f'<div class="wide"><table>{"".join(f"<tr>{line}</tr>" for line in lines)}</table></div>'
+
+
+def _picture(figure: Any, alternative: str) -> str:
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=150)
+    data = base64.b64encode(file.getvalue()).decode()
+    return f'<p><img alt="{html.escape(alternative)}" src="data:image/png;base64,{data}"></p>'
+
+
+def _versions() -> str:
+    found = [f"Python {platform.python_version()}"]
+    for name in ("brdf-fitting", "jax", "optimistix", "numpy"):
+        try:
+            found.append(f"{name} {importlib.metadata.version(name)}")
+        except importlib.metadata.PackageNotFoundError:  # run from a source tree
+            continue
+    return ", ".join(found)
