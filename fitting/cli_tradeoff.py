@@ -17,7 +17,7 @@ def tradeoff(
     out: Annotated[Path | None, typer.Option(help="A folder for tradeoff.csv, .json, .png and .pdf.")] = None,
     model: Annotated[str, typer.Option(help="The name of a model, or auto.")] = "blinn-phong",
     accuracy: Annotated[float, typer.Option(help="Relative error that the recommendation is to keep.")] = 1e-3,
-    seconds: Annotated[float, typer.Option(help="Time that the measuring may take.")] = 40.0,
+    seconds: Annotated[float, typer.Option(help="Time that the measuring may take.")] = 30.0,
     render: Annotated[bool, typer.Option("--render", help="Also measure the renderer alone.")] = False,
     mask: Annotated[Path | None, typer.Option(help="An image: pixels that are 0 there are left out.")] = None,
     saturation: Annotated[float | None, typer.Option(help="Linear values from here on are clipped, not data.")] = None,
@@ -58,7 +58,8 @@ def tradeoff(
     _print_table(found)
     best = found.recommended
     if best is not None:
-        show(f"recommended: {best.name} ({1e3 * best.seconds:.3g} ms, error {best.error:.1g})")
+        took = f"{1e3 * best.seconds:.3g} ms, " if best.runs else ""
+        show(f"recommended: {best.name} ({took}error {best.error:.1g})")
     if not found.complete:
         show("not everything was measured")
     if out is not None:

@@ -90,7 +90,7 @@ def rounding_by_rule(n: float, precision: brdf.Precision, *, shadows: bool) -> f
         precision: of the fit.
         shadows: whether shapes cast any.
     """
-    rule = float(np.finfo(precision).eps * (2 + 0.05 * np.sqrt(max(n, 0.0))))
+    rule = float(np.finfo(precision).eps * (2 + 0.02 * np.sqrt(max(n, 0.0))))
     return max(rule, AT_SHADOWS) if shadows and precision == "float32" else rule
 
 

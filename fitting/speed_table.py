@@ -136,9 +136,9 @@ class Tradeoff:
             table.add_row(
                 row.axis,
                 row.name,
-                f"{row.compile_seconds:.2f}",
-                f"{1e3 * row.seconds:.1f}",
-                f"{1e3 * row.spread:.1f}",
+                f"{row.compile_seconds if row.runs else row.seconds:.2f}",
+                f"{1e3 * row.seconds:.1f}" if row.runs else "not run",
+                f"{1e3 * row.spread:.1f}" if row.runs else "",
                 memory,
                 f"{row.rms:.1e}",
                 f"{row.worst:.1e}",
