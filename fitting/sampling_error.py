@@ -33,9 +33,11 @@ from fitting.uncertainty import TERMS
 
 DRAWS = 512
 # Pixels that are looked at: under lights of many samples, of a sample under lights of few, and of a whole picture.
-PROBES, MOST_PROBES, WHOLE_PROBES = 2048, 4096, 1024
+PROBES, MOST_PROBES, WHOLE_PROBES = 640, 4096, 1024
 # What float32 shadow rays make of the pixels at a shadow's edge, some of which fall on its other side.
 AT_SHADOWS = 1e-4
+# What light samples leave out is told to first order only: the bound allows for this factor.
+MARGIN = 2.0
 # What a sum of so many samples is compared with: the next step, as a factor.
 STEP = 4
 
@@ -317,7 +319,8 @@ class System:
         if self.shadows and self.run.result.precision == "float32":
             together, rounding = np.hypot(together, AT_SHADOWS), max(rounding, AT_SHADOWS)
         pixels = float(np.quantile(alone, 0.95))
-        return Estimate(float(np.median(together)), float(np.quantile(together, 0.95)), pixels, light, rounding)
+        bound = float(np.quantile(together, 0.95)) + (MARGIN - 1) * light
+        return Estimate(float(np.median(together)), bound, pixels, light, rounding)
 
 
 def _every(scene: brdf.Scene, model: type[brdf.Material], most: int) -> PixelSample:

@@ -69,6 +69,7 @@ def error_against_time(tradeoff: Tradeoff) -> Any:
         va="bottom",
         fontsize=8,
         color="0.3",
+        zorder=0,
     )
     if tradeoff.floor > 0:
         axes.axhspan(LEAST / 10, tradeoff.floor, color="0.93", zorder=-1, linewidth=0, label="error of the reference")
@@ -105,5 +106,7 @@ def _mark(axes: Any, row: Row | None, word: str, offset: tuple[int, int]) -> Non
         xytext=offset,
         textcoords="offset points",
         fontsize=9,
+        bbox={"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none"},
+        zorder=5,
         arrowprops={"arrowstyle": "-", "linewidth": 0.6, "shrinkB": 5},
     )

@@ -98,7 +98,7 @@ def test_the_accuracy_holds_and_is_foretold(share):
 
 
 def test_an_accuracy_of_noisy_pixels_takes_more_of_them():
-    scene = ball(256)
+    scene = ball(300)
     picture = noisy(scene, 0.1)
     coarse, fine = (fitting.fit(picture, scene, model="blinn-phong", accuracy=a).choice for a in (0.3, 1e-3))
     assert coarse is not None
