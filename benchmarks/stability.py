@@ -1,6 +1,6 @@
 """The stability map: how far float32 is from float64, and whether every derivative is finite, over n and angle.
 
-    python -m benchmarks.stability stability.png
+python -m benchmarks.stability stability.png
 """
 
 import sys
@@ -20,7 +20,9 @@ def main(path: Path) -> None:
     """
     maps = stability_maps()
     for one in maps:
-        print(f"{one.model:<24} largest error {one.error.max():.1e} of the peak, {np.count_nonzero(~one.finite)} not finite")
+        print(
+            f"{one.model:<24} largest error {one.error.max():.1e} of the peak, {np.count_nonzero(~one.finite)} not finite"
+        )
     plot_stability(maps).savefig(path, dpi=120)
 
 

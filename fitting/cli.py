@@ -24,7 +24,7 @@ app = typer.Typer(
 )
 
 INTERRUPTED = 130  # what shells expect after Ctrl-C
-USAGE_ERROR = typer.BadParameter.__mro__[2]  # what a wrong option raises, wherever typer keeps its parser
+USAGE_ERROR: type[BaseException] = typer.BadParameter.__mro__[2]  # what a wrong option raises, wherever typer keeps its parser
 
 
 app.command(epilog=cli_fit.EXAMPLE)(cli_fit.fit)

@@ -31,7 +31,7 @@ def use_compilation_cache() -> None:
     import jax
 
     base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    if jax.config.jax_compilation_cache_dir is None:
+    if jax.config.values["jax_compilation_cache_dir"] is None:
         jax.config.update("jax_compilation_cache_dir", str(Path(base) / "brdf" / "jax"))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)

@@ -175,20 +175,19 @@ def _solve(problem: _Problem, leaves: tuple[Any, ...], solver: str, tolerance: f
             return optx.least_squares(residuals, method, vector, max_steps=max_steps, throw=False)
 
         def cost(free: Array, args: Any) -> Array:
-            return 0.5 * sum(jnp.sum(residual * residual) for residual in residuals(free, args))
+            return _half_square(residuals(free, args))
 
         method = optx.BFGS(rtol=tolerance, atol=tolerance)
         return optx.minimise(cost, method, vector, max_steps=max_steps, throw=False)
 
-    gradient = eqx.filter_jit(
-        jax.grad(lambda vector, seen: 0.5 * sum(jnp.sum(r * r) for r in problem.residuals(vector, seen)))
-    )
+    gradient = eqx.filter_jit(jax.grad(lambda vector, seen: _half_square(problem.residuals(vector, seen))))
     vector, lower = problem.origin, problem.lower
     held = np.zeros(lower.shape, bool)
-    steps = 0
+    steps, converged = 0, False
     for _ in range(ROUNDS):
         solution = run(vector, jnp.asarray(held), problem.seen)
         steps += int(solution.stats["num_steps"])
+        converged = bool(solution.result == optx.RESULTS.successful)
         vector = jnp.where(held, vector, solution.value)
         below = np.asarray(vector) < lower
         vector = jnp.maximum(vector, lower.astype(vector.dtype))
@@ -205,9 +204,13 @@ def _solve(problem: _Problem, leaves: tuple[Any, ...], solver: str, tolerance: f
         errors=errors,
         residual=residual,
         steps=steps,
-        converged=bool(solution.result == optx.RESULTS.successful),
+        converged=converged,
         solver=solver,
     )
+
+
+def _half_square(residuals: list[Array]) -> Array:
+    return 0.5 * jnp.sum(jnp.stack([jnp.sum(residual * residual) for residual in residuals]))
 
 
 def _errors(problem: _Problem, vector: Array, held: np.ndarray) -> tuple[tuple[np.ndarray, ...], float]:

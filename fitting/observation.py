@@ -216,7 +216,8 @@ def _pixels(target: Any) -> tuple[np.ndarray, float | None, float]:
     """Values (H, W, C), the largest code where it is known, and the distance of two codes."""
     saturation, step = None, 0.0
     if isinstance(target, brdf.Picture):
-        step = float(np.nanmax(target.quantisation())) if target.saturation is not None else 0.0
+        steps = target.quantisation()
+        step = 0.0 if steps is None else float(np.nanmax(steps))
         saturation = None if target.saturation is None else target.saturation * TOP
         target = target.pixels
     if isinstance(target, str | bytes) or not hasattr(target, "__array__"):

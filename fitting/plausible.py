@@ -142,11 +142,10 @@ def _at(pictures: Collection[Picture], optimum: Optimum, log_n: float | None, bo
     """The bounded optimum at an exponent: two passes, the second in residual form for the exact cost."""
     n = optimum.n if log_n is None else math.exp(log_n)
     exponents = np.zeros(0) if log_n is None else np.array([log_n])
-    x = np.zeros((optimum.x.shape[1], 3))
-    for _ in range(2):
-        parts = sums(pictures, exponents, x)
-        reference = x
-        x, cost = _solve(parts, reference, bound, n)
+    nothing = np.zeros((optimum.x.shape[1], 3))
+    reference, _ = _solve(sums(pictures, exponents, nothing), nothing, bound, n)
+    parts = sums(pictures, exponents, reference)
+    x, cost = _solve(parts, reference, bound, n)
     columns = parts.gram.shape[-1]
     about = parts.about(np.pad(reference, [(0, 0), (0, columns - 3)]) if columns > 3 else reference[:, :columns])
     missing = 4 - columns
