@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Array, Int
 
 from brdf.camera import Camera
 from brdf.precision import Precision, cast, working_precision
@@ -17,7 +17,9 @@ from brdf.surface_points import PixelArea, SurfacePoints
 from brdf.tracing import trace
 
 
-def some_pixels(scene: Scene, pixel: Int[np.ndarray, " K"], *, precision: Precision = "float32") -> Scene:
+def some_pixels(
+    scene: Scene, pixel: Int[np.ndarray, " K"] | Int[Array, " K"], *, precision: Precision = "float32"
+) -> Scene:
     """The scene of a picture of one row, (1, K), that shows some pixels of another.
 
     Only those are traced, unless pixels are averaged over their area: which ones need that, their neighbours tell.
@@ -41,7 +43,8 @@ def some_pixels(scene: Scene, pixel: Int[np.ndarray, " K"], *, precision: Precis
         casting = scene.lighting.occluders
         hiding = tuple(dataclasses.replace(shape, fitted=False) for shape in casting)
         visibility = tuple(
-            None if mask is None else np.asarray(mask, np.float64).ravel()[pixel][None] for mask in scene.visibility
+            None if mask is None else np.asarray(mask, np.float64).ravel()[np.asarray(pixel)][None]
+            for mask in scene.visibility
         )
         return Scene(points=points, shapes=hiding, ambient=scene.ambient, lights=scene.lights, visibility=visibility)
 
@@ -78,5 +81,6 @@ def _chosen(points: Any, pixel: Any) -> SurfacePoints:
     fine = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], area.points)
     fine = eqx.tree_at(lambda p: p.visibility, fine, None, is_leaf=lambda leaf: leaf is None)
     weight = np.asarray(area.weight)[rows]
-    found = PixelArea(place.astype(np.int32), new[None], fine, weight)
+    entries: tuple[Any, ...] = (place.astype(np.int32), new[None], fine, weight)
+    found = PixelArea(*entries)
     return eqx.tree_at(lambda p: p.area, some, found, is_leaf=lambda leaf: leaf is None)

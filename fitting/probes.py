@@ -49,7 +49,8 @@ def _direct_probe(
     x: Float[Array, "3 C"],
 ) -> Probe:
     scene = scene if pixel is None else brdf.some_pixels(scene, pixel, precision="float64")
-    columns, seen = _columns(model, scene, n, target.shape)
+    count, channels = target.shape
+    columns, seen = _columns(model, scene, n, (count, channels))
     counted = seen & (weight > 0)
     weight = jnp.where(counted, weight, 0)
     residual = jnp.where(counted[:, None], target - jnp.einsum("mck,kc->mc", columns[..., :3], x), 0)
@@ -58,7 +59,7 @@ def _direct_probe(
     return Probe(gram, jnp.sum(scores, axis=0), scores)
 
 
-probe = eqx.filter_jit(_direct_probe)
+probe: Any = eqx.filter_jit(_direct_probe)
 
 
 @eqx.filter_jit

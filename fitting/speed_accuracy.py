@@ -134,7 +134,7 @@ class _Bench:
     def __init__(self, target: Any, scene: brdf.Scene, model: str, options: dict[str, Any]):
         self.target, self.scene, self.options, self.lamps = target, scene, options, Lamps()
         self.has_samples, self.pixels = extended(scene), target_size(target)
-        samples = max((light.samples for light in scene.lights if hasattr(light, "samples")), default=1)
+        samples = max((getattr(light, "samples", 1) for light in scene.lights), default=1)
         self.samples = samples
         pixels = REFERENCE_PIXELS if self.has_samples and self.pixels > 2 * REFERENCE_PIXELS else None
         self.best = reference(
@@ -200,7 +200,10 @@ class _Bench:
 
     def _work(self, how: Configuration) -> float:
         pixels = self.pixels if how.pixels is None else how.pixels
-        samples = sum((how.samples or light.samples) if hasattr(light, "samples") else 1 for light in self.scene.lights)
+        samples = sum(
+            (how.samples or getattr(light, "samples", 1)) if hasattr(light, "samples") else 1
+            for light in self.scene.lights
+        )
         # What every fit takes whatever its size.
         return 4096 + pixels * max(samples, 1) * (2 if how.precision == "float64" else 1)
 
@@ -257,7 +260,7 @@ class _Bench:
                 trials.append(_Trial("render", None, name, lambda s=place, p=precision: self._render(s, p), work))
         return trials
 
-    def _render(self, scene: brdf.Scene, precision: brdf.Precision) -> brdf.Scene:
+    def _render(self, scene: brdf.Scene, precision: Any) -> brdf.Scene:
         np.asarray(brdf.render(self.best.material, scene, precision=precision))
         return scene
 
