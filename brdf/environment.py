@@ -27,12 +27,14 @@ from jaxtyping import Array, Float
 from brdf.area_lights import perpendicular
 from brdf.checks import sample_number, spectrum
 from brdf.errors import InputError
-from brdf.lights import Light, LightSample, Moments
-from brdf.sample_sets import hemisphere_rule
-from brdf.vectors import normalize, square_root
+from brdf.lights import Light, LightSample, Moments, Place
+from brdf.sample_sets import hemisphere_rule, ring_rule
+from brdf.vectors import dot, normalize, square_root
 
-CONSTANT_SAMPLES = 256
+CONSTANT_SAMPLES = 512
 MAP_SAMPLES = 1024
+STEEPNESS = 7.0
+"""The innermost samples of a lobe are exp(-this) times as far from its centre as the horizon."""
 LARGEST_MAP = 1 << 21
 """Texels from which on a map is averaged before it is cut: 2048 × 1024."""
 
@@ -40,15 +42,22 @@ LARGEST_MAP = 1 << 21
 class ConstantEnvironment(Light):
     """The same radiance from everywhere.
 
-    The samples are a product rule over the hemisphere above each surface point, Gauss-Legendre in the cosine and equal
-    steps around: a white Lambertian surface shows exactly the radiance. A lobe needs about 4 n samples.
+    Half of the samples serve the diffuse term, by a rule over the hemisphere above each point that is exact for
+    it. The others serve the lobe: they lie around the mirror direction, at all distances from it up to the horizon,
+    most of them near it, so that they meet a lobe of any exponent from 0 to 1e5. Their half vector H turns about the
+    normal N at the angle α, up to which light comes from above the horizon for 2 α < 90° + ψ with
+    tan ψ = V·T / N·V and T the direction of the turn; the solid angle of the light is 4 (V·H) that of H.
+
+    With 512 samples a normalised half-vector lobe is within 4e-3 of its albedo at n = 1e5, within 5e-4 up to n = 1000;
+    a mirror-vector lobe within 5e-3 for views up to 60 degrees and within 4e-2 nearer to the horizon, where it is round
+    and the rings are not.
 
     Args:
         radiance: (C,).
-        samples: how many light samples at most.
+        samples: how many light samples at most, at least 2.
 
     Raises:
-        InputError: where a radiance is negative or not finite.
+        InputError: where a radiance is negative or not finite, or the samples are too few.
     """
 
     radiance: Float[Array, " C"] = eqx.field(converter=spectrum("radiance"))
@@ -56,19 +65,37 @@ class ConstantEnvironment(Light):
     type_name: ClassVar[str] = "environment"
     emittance_name: ClassVar[str] = "radiance"
 
-    def nodes(self) -> Any:
-        """A rule over the hemisphere."""
-        return hemisphere_rule(self.samples)
+    def __check_init__(self):
+        """Refuse a single sample."""
+        if self.samples < 2:
+            raise InputError("samples", "must be at least 2 here, got 1", "Give more")
 
-    def illuminate(self, node: Any, position: Float[Array, "3"], normal: Float[Array, "3"]) -> LightSample:
+    def nodes(self) -> Any:
+        """Two rules over the hemisphere, and which of the two a node belongs to."""
+        diffuse = hemisphere_rule(max(1, self.samples // 2))
+        lobe = ring_rule(self.samples - max(1, self.samples // 2))
+        both = [np.concatenate(pair) for pair in zip(diffuse, lobe, strict=True)]
+        return type(lobe)(*both), np.repeat([0.0, 1.0], [diffuse.weight.size, lobe.weight.size])
+
+    def illuminate(self, node: Any, at: Place) -> LightSample:
         """From a patch of the hemisphere above the point."""
-        across, along = perpendicular(normal)
-        turn = 2 * np.pi * node.t
+        rule, lobe_only = node
+        across, along = perpendicular(at.normal)
+        turn = 2 * np.pi * rule.t
         outward = jnp.cos(turn) * across + jnp.sin(turn) * along
-        to_light = node.s * normal + square_root(1.0 - node.s * node.s) * outward
-        squared_radius = 2.0 * node.weight
-        intensity = self.radiance * squared_radius
-        return LightSample(normalize(to_light), intensity, jnp.asarray(jnp.inf), square_root(squared_radius))
+        even = rule.s * at.normal + square_root(1.0 - rule.s * rule.s) * outward
+        view, view_outward = jnp.maximum(dot(at.normal, at.to_view), 1e-6), dot(outward, at.to_view)
+        end = 0.25 * np.pi + 0.5 * jnp.arctan2(view_outward, view)
+        angle = end * jnp.expm1(STEEPNESS * rule.s) / np.expm1(STEEPNESS)
+        half = jnp.cos(angle) * at.normal + jnp.sin(angle) * outward
+        view_half = dot(half, at.to_view)
+        mirrored = 2.0 * view_half * half - at.to_view
+        stretch = end * STEEPNESS * jnp.exp(STEEPNESS * rule.s) / np.expm1(STEEPNESS)
+        share = 8.0 * jnp.maximum(view_half, 0.0) * jnp.sin(angle) * stretch
+        squared_radius = jnp.where(lobe_only > 0, share, 2.0) * rule.weight
+        to_light = normalize(jnp.where(lobe_only > 0, mirrored, even))
+        intensity, radius = self.radiance * squared_radius, square_root(squared_radius)
+        return LightSample(to_light, intensity, jnp.asarray(jnp.inf), radius, lobe_only=lobe_only)
 
 
 Box = tuple[int, int, int, int]
@@ -129,7 +156,7 @@ class EnvironmentMap(Light):
         """The rectangles of the map."""
         return self.patches
 
-    def illuminate(self, node: Any, position: Float[Array, "3"], normal: Float[Array, "3"]) -> LightSample:
+    def illuminate(self, node: Any, at: Place) -> LightSample:
         """The same at every point: the light of one rectangle of the map."""
         moments = Moments(node.mean, node.covariance)
         radius = square_root(2.0 * jnp.trace(node.covariance))  # that of a disc of the same variance

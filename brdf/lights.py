@@ -34,6 +34,20 @@ class Moments(NamedTuple):
     covariance: Float[Array, "3 3"]
 
 
+class Place(NamedTuple):
+    """Where light falls, and whence that is seen.
+
+    Attributes:
+        position: of the surface point, (3,), world units.
+        normal: unit, (3,).
+        to_view: unit direction towards the eye, (3,).
+    """
+
+    position: Float[Array, "3"]
+    normal: Float[Array, "3"]
+    to_view: Float[Array, "3"]
+
+
 class LightSample(NamedTuple):
     """What one node of a light sends to one surface point.
 
@@ -44,6 +58,7 @@ class LightSample(NamedTuple):
         radius: angular radius, in radians, of a disc as large as the patch that the sample stands for: shadow edges
             sweep over it. None for light without extent, whose shadows are hard.
         moments: where the sample stands for a patch of the sky, how that spreads; None for a single direction.
+        lobe_only: 1 where the sample counts for the specular term alone, 0 where for the diffuse alone; None for both.
     """
 
     to_light: Float[Array, "3"]
@@ -51,6 +66,7 @@ class LightSample(NamedTuple):
     distance: Float[Array, ""]
     radius: Float[Array, ""] | None = None
     moments: Moments | None = None
+    lobe_only: Float[Array, ""] | None = None
 
 
 class Light(eqx.Module):
@@ -69,13 +85,12 @@ class Light(eqx.Module):
         """The quadrature nodes: a pytree of arrays with one leading axis, as long as the light has samples."""
 
     @abc.abstractmethod
-    def illuminate(self, node: Any, position: Float[Array, "3"], normal: Float[Array, "3"]) -> LightSample:
+    def illuminate(self, node: Any, at: Place) -> LightSample:
         """What one node sends to one point.
 
         Args:
             node: one row of ``nodes()``.
-            position: the surface point, (3,), world units.
-            normal: the unit normal there, (3,): lights with an extent put their samples above its horizon.
+            at: where: lights with an extent put their samples above its horizon.
         """
 
     @property
@@ -104,7 +119,7 @@ class DirectionalLight(Light):
         """One sample, and nothing to say of it."""
         return jnp.zeros((1, 0))
 
-    def illuminate(self, node: Any, position: Float[Array, "3"], normal: Float[Array, "3"]) -> LightSample:
+    def illuminate(self, node: Any, at: Place) -> LightSample:
         """The same at every point."""
         return LightSample(normalize(jnp.asarray(self.direction)), jnp.asarray(self.intensity), jnp.asarray(jnp.inf))
 
@@ -164,9 +179,9 @@ class PointLight(Light):
         """One sample, and nothing to say of it."""
         return jnp.zeros((1, 0))
 
-    def illuminate(self, node: Any, position: Float[Array, "3"], normal: Float[Array, "3"]) -> LightSample:
+    def illuminate(self, node: Any, at: Place) -> LightSample:
         """From the point's distance and direction."""
-        return attenuated(self.position, self.intensity, self.attenuation, position)
+        return attenuated(self.position, self.intensity, self.attenuation, at.position)
 
 
 class SpotLight(Light):
@@ -209,9 +224,9 @@ class SpotLight(Light):
         """One sample, and nothing to say of it."""
         return jnp.zeros((1, 0))
 
-    def illuminate(self, node: Any, position: Float[Array, "3"], normal: Float[Array, "3"]) -> LightSample:
+    def illuminate(self, node: Any, at: Place) -> LightSample:
         """A point light's, times the spot's factor."""
-        sample = attenuated(self.position, self.intensity, self.attenuation, position)
+        sample = attenuated(self.position, self.intensity, self.attenuation, at.position)
         axis = normalize(jnp.asarray(self.direction))
         everywhere = jnp.asarray(self.cutoff_angle) >= 180
         inside = everywhere | (-dot(sample.to_light, axis) >= jnp.cos(jnp.deg2rad(self.cutoff_angle)))

@@ -24,6 +24,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from brdf.camera import Camera
+from brdf.lights import Place
 from brdf.precision import apart
 from brdf.sample_sets import square_rule
 from brdf.shading import STORED_SAMPLES, nodes_of, sample_count
@@ -103,7 +104,7 @@ def _light_matters(points: SurfacePoints, lighting: Lighting, index: int) -> Boo
     node = jax.tree.map(lambda leaf: leaf[0], nodes_of(light, points))
 
     def at_point(point: SurfacePoints) -> tuple[Array, Array]:
-        sample = light.illuminate(node, point.position, point.normal)
+        sample = light.illuminate(node, Place(point.position, point.normal, point.to_view))
         lit = (dot(point.normal, sample.to_light) > 0) & jnp.any(sample.intensity > 0)
         if lighting.occluders:
             lit &= share_seen(lighting.occluders, point, sample) > 0

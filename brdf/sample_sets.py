@@ -73,6 +73,20 @@ def hemisphere_rule(samples: int) -> SquareRule:
     return _product(s, s_weight, t, t_weight)
 
 
+def ring_rule(samples: int) -> SquareRule:
+    """A rule for rings around a centre: Gauss-Legendre in s, which ring, and equal steps of t, the turn.
+
+    Args:
+        samples: at least 1; the rule has at most so many nodes, four rings for every three turns.
+    """
+    rings = max(1, round(np.sqrt(samples * 4 / 3)))
+    rings = min(rings, samples)
+    s, s_weight = gauss_legendre(rings)
+    turns = samples // rings
+    t, t_weight = (np.arange(turns) + 0.5) / turns, np.full(turns, 1.0 / turns)
+    return _product(s, s_weight, t, t_weight)
+
+
 def _product(s: np.ndarray, s_weight: np.ndarray, t: np.ndarray, t_weight: np.ndarray) -> SquareRule:
     s_all, t_all = (x.ravel() for x in np.meshgrid(s, t, indexing="ij"))
     return SquareRule(s_all, t_all, np.outer(s_weight, t_weight).ravel())

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from brdf.lights import Light, LightSample, Moments
+from brdf.lights import Light, LightSample, Moments, Place
 from brdf.models import Material, SpecularMaterial
 from brdf.surface_points import SurfacePoints
 from brdf.vectors import BELOW_HORIZON, divide, dot, square_root
@@ -63,11 +63,13 @@ def light_terms(
     given = None if point.visibility is None else point.visibility[index]
     if given is not None:
         intensity = intensity * given
-    diffuse = intensity * jnp.where(lit, cosine, 0)
+    matt = lit if sample.lobe_only is None else lit & (sample.lobe_only == 0)
+    diffuse = intensity * jnp.where(matt, cosine, 0)
     if not issubclass(model, SpecularMaterial):
         return LightTerms(diffuse, jnp.zeros_like(diffuse), jnp.zeros_like(cosine))
     log_cosine = model.log_cosine(point.normal, sample.to_light, point.to_view)
-    shines = lit & (dot(point.normal, point.to_view) > 0) & (log_cosine > 0.5 * BELOW_HORIZON)
+    glossy = lit if sample.lobe_only is None else lit & (sample.lobe_only > 0)
+    shines = glossy & (dot(point.normal, point.to_view) > 0) & (log_cosine > 0.5 * BELOW_HORIZON)
     weight = intensity * jnp.where(shines, cosine if model.cosine_weighted else above, 0)
     return LightTerms(diffuse, weight, jnp.where(shines, log_cosine, 0))
 
@@ -106,7 +108,7 @@ def _terms_of_node(
     light = lighting.lights[index]
 
     def at_point(point: SurfacePoints) -> LightTerms:
-        sample = light.illuminate(node, point.position, point.normal)
+        sample = light.illuminate(node, Place(point.position, point.normal, point.to_view))
         return light_terms(model, point, sample, lighting, index)
 
     return jax.vmap(at_point)(points)
@@ -157,7 +159,9 @@ def light_channels(light: Light) -> int:
     at = jnp.zeros(3)
 
     def sample() -> Array:
-        return light.illuminate(jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], light.nodes()), at, at).intensity
+        return light.illuminate(
+            jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], light.nodes()), Place(at, at, at)
+        ).intensity
 
     return jax.eval_shape(sample).shape[0]
 

@@ -103,6 +103,16 @@ def test_white_in_a_constant_environment_shows_its_radiance():
     np.testing.assert_allclose(radiance(brdf.EnvironmentMap(np.ones((64, 128, 3)))), 1, atol=3e-4)
 
 
+@pytest.mark.parametrize("n", [1.0, 30.0, 1000.0, 1e5])
+def test_a_constant_environment_shows_the_albedo(n: float):
+    from brdf.albedo import directional_albedo
+
+    material = brdf.NormalizedBlinnPhong(k_d=0.3, k_s=0.5, n=n)  # reciprocal: light from all around, seen from one side
+    got = radiance(brdf.ConstantEnvironment(radiance=1.0, samples=1024), material)
+    expected = directional_albedo(material, np.arccos(UNIT[:, 2]), precision="float64")[:, 0]
+    np.testing.assert_allclose(got, expected, atol=2e-4)
+
+
 @pytest.mark.parametrize(
     ("row", "column", "direction"),
     [(64, 32, (1, 0, 0)), (64, 64, (0, 0, 1)), (64, 96, (-1, 0, 0)), (0, 5, (0, 1, 0)), (64, 0, (0, 0, -1))],
