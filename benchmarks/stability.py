@@ -20,9 +20,8 @@ def main(path: Path) -> None:
     """
     maps = stability_maps()
     for one in maps:
-        print(
-            f"{one.model:<24} largest error {one.error.max():.1e} of the peak, {np.count_nonzero(~one.finite)} not finite"
-        )
+        broken = np.count_nonzero(~one.finite)
+        print(f"{one.model:<24} largest error {one.error.max():.1e} of the peak, {broken} not finite")
     plot_stability(maps).savefig(path, dpi=120)
 
 

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
         Phong,
         SpecularMaterial,
     )
+    from brdf.pixel_choice import some_pixels
     from brdf.plausibility import check
     from brdf.precision import Precision, cast, working_precision
     from brdf.presets import PRESETS, preset
@@ -50,7 +51,7 @@ if TYPE_CHECKING:
     from brdf.report import Finding, Report
     from brdf.scene import Scene
     from brdf.shapes import Rectangle, Shape, Sphere
-    from brdf.pixel_choice import some_pixels
+    from brdf.stability import StabilityMap, stability_map, stability_maps
     from brdf.surface_points import SurfacePoints
 
 _ROOMS = {
@@ -96,6 +97,7 @@ _ROOMS = {
     "precision": ["Precision", "cast", "working_precision"],
     "rendering": ["Basis", "BasisImages", "Lobe", "basis", "basis_images", "render"],
     "scene": ["Scene"],
+    "stability": ["StabilityMap", "stability_map", "stability_maps"],
     "shapes": ["Rectangle", "Shape", "Sphere"],
     "pixel_choice": ["some_pixels"],
     "surface_points": ["SurfacePoints"],

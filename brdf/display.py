@@ -4,6 +4,7 @@ The HTML needs nothing from a network and takes its colours from the page it sta
 """
 
 import base64
+import functools
 import html
 import io
 
@@ -19,6 +20,7 @@ from brdf.report import Report
 from brdf.scene import Scene
 from brdf.shapes import Sphere
 
+_FINEST = 65535
 _CELL = "padding:0.15em 0.8em;text-align:right;white-space:nowrap"
 _MARKS = {"pass": "✓ pass", "fail": "✗ fail", "cannot tell": "? cannot tell"}
 
@@ -27,14 +29,22 @@ def displayed(linear: Float[np.ndarray, "H W C"], white: float = 1.0) -> Float[n
     """Values for a screen, 0 to 1: linear radiance through the sRGB encoding (IEC 61966-2-1).
 
     Args:
-        linear: radiance; one or three channels are shown as they are, others as their mean, NaN as black.
+        linear: radiance; one or three channels are shown as they are, others as their mean, NaN as black;
+            rounded to 16 bits.
         white: the radiance that is shown as white.
     """
-    linear = np.nan_to_num(np.asarray(linear, np.float32))
+    linear = np.asarray(linear, np.float32)
     if linear.shape[-1] != 3:
-        linear = np.repeat(linear.mean(axis=-1, keepdims=True), 3, axis=-1)
-    value = np.clip(linear / white, 0.0, 1.0).astype(np.float32)
-    return np.clip(encode(value, "srgb"), 0.0, 1.0)
+        linear = np.repeat(np.nan_to_num(linear).mean(axis=-1, keepdims=True), 3, axis=-1)
+    # fmax and fmin take the number where the other is NaN.
+    place = np.fmin(np.fmax(linear * np.float32(_FINEST / white), 0.0), _FINEST) + np.float32(0.5)
+    return _encoding_table()[place.astype(np.uint16)]
+
+
+@functools.cache
+def _encoding_table() -> Float[np.ndarray, " 65536"]:
+    """The curve at as many places as a screen's 8 bits could tell, and a hundred times more: a frame has 50 ms."""
+    return np.clip(encode(np.linspace(0.0, 1.0, _FINEST + 1, dtype=np.float32), "srgb"), 0.0, 1.0)
 
 
 def lit_sphere(material: Material, size: int = 128) -> Float[np.ndarray, "H W 3"]:

@@ -17,9 +17,7 @@ from brdf.surface_points import PixelArea, SurfacePoints
 from brdf.tracing import trace
 
 
-def some_pixels(
-    scene: Scene, pixel: Int[np.ndarray, " K"] | Int[Array, " K"], *, precision: Precision = "float32"
-) -> Scene:
+def some_pixels(scene: Scene, pixel: Int[np.ndarray | Array, " K"], *, precision: Precision = "float32") -> Scene:
     """The scene of a picture of one row, (1, K), that shows some pixels of another.
 
     Only those are traced, unless pixels are averaged over their area: which ones need that, their neighbours tell.

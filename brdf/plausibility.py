@@ -38,8 +38,9 @@ def check(brdf: Material | MeasuredBRDF | Callable[[Any, Any], Any], *, name: st
     """Test a material, or any BRDF, for positivity, reciprocity and energy conservation.
 
     Args:
-        brdf: one of the five models, of known numbers; a measured table, whose errors are told in units of its noise; or f_r(to_light, to_view) -> (C,), in 1/sr, of unit vectors (3,)
-            in the local frame whose +z axis is the normal, written with ``jax.numpy``.
+        brdf: one of the five models, of known numbers; a measured table, whose errors are told in units of its noise;
+            or f_r(to_light, to_view) -> (C,), in 1/sr, of unit vectors (3,) in the local frame whose +z axis is the
+            normal, written with ``jax.numpy``.
         name: what to call it in the report.
 
     Returns:

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from fitting.brdf_fit import fit_brdf
     from fitting.brdf_result import BrdfFitResult
+    from fitting.implicit import Sensitivity, sensitivity
     from fitting.joint import fit_jointly
+    from fitting.material_plots import overview, plot_albedo, plot_lobe, plot_reciprocity, plot_stability
     from fitting.picture_fit import fit
     from fitting.relighting import LightFit, fit_lights, fit_lights_and_material
     from fitting.result import FitResult, Parameter
     from fitting.speed_accuracy import tradeoff
     from fitting.speed_table import Tradeoff
-    from fitting.implicit import Sensitivity, sensitivity
 
 _ROOM_OF = {
     "BrdfFitResult": "brdf_result",
@@ -29,6 +30,11 @@ _ROOM_OF = {
     "fit_jointly": "joint",
     "fit_lights": "relighting",
     "fit_lights_and_material": "relighting",
+    "overview": "material_plots",
+    "plot_albedo": "material_plots",
+    "plot_lobe": "material_plots",
+    "plot_reciprocity": "material_plots",
+    "plot_stability": "material_plots",
     "sensitivity": "implicit",
     "tradeoff": "speed_accuracy",
 }

@@ -24,7 +24,8 @@ app = typer.Typer(
 )
 
 INTERRUPTED = 130  # what shells expect after Ctrl-C
-USAGE_ERROR: type[BaseException] = typer.BadParameter.__mro__[2]  # what a wrong option raises, wherever typer keeps its parser
+# What a wrong option raises, wherever typer keeps its parser.
+USAGE_ERROR: type[BaseException] = typer.BadParameter.__mro__[2]
 
 
 app.command(epilog=cli_fit.EXAMPLE)(cli_fit.fit)

@@ -30,6 +30,7 @@ class ModelFit(NamedTuple):
         pictures: in the units of the engine, with the weights of the fit.
         optimum: in the units of the engine.
         free: which coefficients could be above 0, (3, C).
+        n_range: between which exponents the optimum was searched.
         tied: x_s is a common factor times this, (C,); None where the channels are independent.
         noise_factor: see `fitting.losses.Reweighted`.
         capped: k_d + k_s is held at 1 in some channel.
@@ -39,6 +40,7 @@ class ModelFit(NamedTuple):
     pictures: list[Picture]
     optimum: Optimum
     free: Bool[np.ndarray, "3 C"]
+    n_range: tuple[float, float]
     tied: Float[np.ndarray, " C"] | None = None
     noise_factor: float = 1.0
     capped: bool = False
@@ -70,7 +72,6 @@ def interpret(
     rounding: Float[np.ndarray, " C"],
     brightest: Float[np.ndarray, " C"],
     shapes: Sequence[tuple[int, int]],
-    n_range: tuple[float, float],
     required: Bool[np.ndarray, "3 C"],
 ) -> Interpretation:
     """Tell what a fit says.
@@ -81,7 +82,6 @@ def interpret(
         rounding: standard deviation of a value's rounding, (C,).
         brightest: largest value of the pictures, (C,).
         shapes: of the pictures, height and width.
-        n_range: bounds of the search.
         required: coefficients that the light reaches and that were not left out as needless, (3, C).
     """
     specular = issubclass(fit.model, brdf.SpecularMaterial)
@@ -119,7 +119,7 @@ def interpret(
             fit.free,
             sure.n_error,
             sure.rise,
-            n_range,
+            fit.n_range,
             single=single,
             peak=seen.peak if seen else 0.0,
             tied=fit.tied,

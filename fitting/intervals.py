@@ -84,7 +84,7 @@ def _profile(
         product = jnp.einsum("ij,cj->ci", basis, parts.product - moved)
         square = parts.square + jnp.sum(change * (moved - 2 * parts.product), axis=1)
         gram = jnp.einsum("ij,cjk,lk->cil", basis, parts.gram, basis)
-        return jnp.sum(nonnegative.solve(gram, product, square, reference, free, tolerance).cost)
+        return jnp.sum(nonnegative.solve(gram, product, square, reference, free, jnp.asarray(tolerance)).cost)
 
     return jax.vmap(at)(jnp.asarray(SHARES))
 

@@ -26,8 +26,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fitting.pictures import AnyArray, Picture
 from fitting.separable import Optimum
-from fitting.sums import Picture
 
 Loss = Literal["squared", "huber", "cauchy", "relative", "log"]
 LOSSES: tuple[Loss, ...] = ("squared", "huber", "cauchy", "relative", "log")
@@ -126,7 +126,7 @@ def _counted(picture: Picture) -> Array:
 
 
 @eqx.filter_jit
-def _model(picture: Picture, n: Float[Array, ""], x: Float[Array, "3 C"]) -> Float[Array, "P C"]:
+def _model(picture: Picture, n: Float[AnyArray, ""], x: Float[AnyArray, "3 C"]) -> Float[Array, "P C"]:
     dtype = picture.target.dtype
     x = jnp.asarray(x).astype(dtype)
     model = x[0] * jnp.asarray(picture.ambient).astype(dtype) + x[1] * picture.diffuse

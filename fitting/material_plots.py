@@ -22,7 +22,7 @@ from brdf.report import Report
 from brdf.search import Sampler
 from brdf.stability import StabilityMap
 
-PRINT = {"font.size": 8, "axes.titlesize": 9, "legend.fontsize": 7}
+PRINT: dict[Any, Any] = {"font.size": 8, "axes.titlesize": 9, "legend.fontsize": 7}
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 """Blue, vermilion, green, purple, sky blue, orange."""
@@ -43,7 +43,8 @@ def overview(brdf: Brdf, report: Report | None = None) -> Figure:
     """
     with matplotlib.rc_context(PRINT):
         figure = Figure(figsize=(7.2, 6.0), layout="constrained")
-        first, second, third, fourth = figure.subfigures(2, 2).ravel()
+        parts: Any = figure.subfigures(2, 2)
+        first, second, third, fourth = parts.ravel()
         if isinstance(brdf, Material):
             axes = first.add_subplot()
             axes.imshow(lit_sphere(brdf, 256))

@@ -31,9 +31,9 @@ def nonnegative_minimum(
     """
     if not product.size:
         return product
-    scale = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
-    gram, product = gram / np.outer(scale, scale), product / scale
-    usable = np.diag(gram) > 0.5
+    usable = np.diag(gram) > np.finfo(float).tiny
+    scale = np.sqrt(np.where(usable, np.diag(gram), 1.0))
+    gram, product = gram / np.outer(scale, scale), np.where(usable, product / scale, 0.0)
     passive = signed & usable
     x = np.zeros(product.size)
     tolerance = 1e-13 * max(float(np.max(np.abs(product), initial=0.0)), np.finfo(float).tiny)
@@ -156,7 +156,9 @@ def fit_tied(
     log_n, x = np.log(optimum.n), optimum.x.copy()
     x[2] = tied * (x[2] @ tied) / max(tied @ tied, np.finfo(float).tiny)
     enough = 1e-5 if single else 1e-9
-    for _ in range(MOST_STEPS):
+    attempt = 0
+    while True:
+        attempt += 1
         with jax.enable_x64(True):
             parts = sums(pictures, np.array([log_n]), x.T)
         about = parts.about(np.pad(x.T, [(0, 0), (0, 1)]))
@@ -165,7 +167,7 @@ def fit_tied(
         shift = float(np.clip(solution[-1], np.log(n_range[0]) - log_n, np.log(n_range[1]) - log_n))
         reference, slope, at = x, x[2], log_n
         x, log_n = solution[:-1].reshape(3, channels), log_n + np.clip(shift, -0.5, 0.5)
-        if abs(shift) <= enough:
+        if abs(shift) <= enough or attempt == MOST_STEPS:
             break
     step = np.column_stack([(x - reference).T, (log_n - at) * slope])
     change = np.einsum("ci,cij,cj->c", step, parts.gram, step) - 2 * np.sum(step * parts.product, axis=1)

@@ -20,7 +20,7 @@ from fitting.plausible import fit_plausible, is_plausible
 from fitting.result import FitResult, free_parameters
 from fitting.selection import FAMILIES, Choice, choose
 from fitting.separable import Optimum, Picture, fit_linear, search
-from fitting.structure import structure
+from fitting.structure import nearest_peak, structure
 from fitting.uncertainty import TERMS, residual_noise
 
 N_RANGE = (0.1, 1e6)
@@ -28,6 +28,8 @@ AUTO = ("phong", "blinn-phong")
 PLAUSIBLE = ("normalized-phong", "normalized-blinn-phong")
 # An exponent up to this multiple of the lower bound is at the bound.
 WIDEST = 1.01
+# The nearest pixel shows exp(-UNSEEN) of a highlight's peak, or more, or the exponent is not looked at.
+UNSEEN = 60.0
 
 
 def fit(
@@ -157,7 +159,7 @@ class _Job(NamedTuple):
     @property
     def shapes(self) -> list[tuple[int, int]]:
         """Height and width of each picture."""
-        return [observation.points.mask.shape for observation in self.observations]
+        return [(height, width) for height, width in (one.points.mask.shape for one in self.observations)]
 
     @property
     def rounding(self) -> Float[np.ndarray, " C"]:
@@ -186,11 +188,19 @@ def _engine_pictures(model: type[brdf.Material], job: _Job) -> list[Picture]:
     pictures = []
     for observation, scene in zip(job.observations, job.light.scenes, strict=True):
         dtype = observation.target.dtype
+        precision: brdf.Precision = "float32" if dtype == np.float32 else "float64"
         ambient = np.zeros(1) if scene.ambient is None else np.asarray(scene.ambient, np.float64)
-        basis = brdf.basis(model, brdf.cast(scene, dtype.name), points=observation.points)
+        basis = brdf.basis(model, brdf.cast(scene, precision), points=observation.points)
         diffuse = jnp.zeros((observation.target.shape[0], 1), dtype) if basis.diffuse is None else basis.diffuse
         pictures.append(Picture(observation.target, diffuse, basis.lobe, observation.weight, ambient))
     return pictures
+
+
+def _visible(pictures: Sequence[Picture], n_range: tuple[float, float]) -> tuple[float, float]:
+    """Exponents of which some pixel sees at least a trace: with larger ones k_s could be anything."""
+    nearest = max((nearest_peak(picture) for picture in pictures if picture.lobe is not None), default=0.0)
+    upper = min(n_range[1], UNSEEN / max(-nearest, UNSEEN / n_range[1]))
+    return n_range[0], max(upper, WIDEST * n_range[0])
 
 
 def _optimise(pictures: Sequence[Picture], free: np.ndarray, n_range: tuple[float, float]) -> Optimum:
@@ -201,10 +211,10 @@ def _optimise(pictures: Sequence[Picture], free: np.ndarray, n_range: tuple[floa
 
 def _fit_model(model: type[brdf.Material], job: _Job) -> ModelFit:
     free = _free(model, job)
-    found = reweight(
-        _engine_pictures(model, job), lambda some: _optimise(some, free, job.n_range), job.loss, job.rounding
-    )
-    return ModelFit(model, found.pictures, found.optimum, free, None, found.noise_factor)
+    pictures = _engine_pictures(model, job)
+    n_range = _visible(pictures, job.n_range) if free[2].any() else job.n_range
+    found = reweight(pictures, lambda some: _optimise(some, free, n_range), job.loss, job.rounding)
+    return ModelFit(model, found.pictures, found.optimum, free, n_range, None, found.noise_factor)
 
 
 def _fit_auto(job: _Job) -> tuple[ModelFit, Choice]:
@@ -218,7 +228,7 @@ def _fit_auto(job: _Job) -> tuple[ModelFit, Choice]:
         # Weights are part of what is minimised: those of the better family serve all, or costs could not be compared.
         name = min(fits, key=lambda name: float(np.sum(residual_noise(fits[name].optimum, job.rounding))))
         weights = [picture.weight for picture in fits[name].pictures]
-        fits = {name: _with_weights(fit, weights, job.n_range) for name, fit in fits.items()}
+        fits = {name: _with_weights(fit, weights) for name, fit in fits.items()}
     grey = {name: coefficient_factors(fit.model, fit.optimum.n, job.light.colour)[2] for name, fit in fits.items()}
     best = min(fits.values(), key=lambda fit: float(np.sum(fit.optimum.cost)))
     noise = residual_noise(best.optimum, job.rounding)
@@ -232,50 +242,48 @@ def _fit_auto(job: _Job) -> tuple[ModelFit, Choice]:
             name: weighted_sums(fit.pictures, fit.optimum, known.noise, inverse=True) for name, fit in fits.items()
         }
     choice = choose(optima, free, grey, noise, known.inflation, whitened)
-    return _alone(choice, fits, grey, job.n_range), choice
+    return _alone(choice, fits, grey), choice
 
 
 def _held_plausible(fit: ModelFit, job: _Job) -> ModelFit:
     colour = job.light.colour
     if is_plausible(fit.optimum, fit.model, colour):
         return fit
-    optimum = fit_plausible(fit.pictures, fit.optimum, fit.free, fit.model, colour, job.n_range)
+    optimum = fit_plausible(fit.pictures, fit.optimum, fit.free, fit.model, colour, fit.n_range)
     # What the bound adds to the residual is no noise: that of the fit without it says what stands out.
     noise = fit.noise_factor * float(np.sqrt(np.sum(fit.optimum.cost) / np.sum(optimum.cost)))
     return fit._replace(optimum=optimum, tied=None, capped=True, noise_factor=noise)
 
 
-def _with_weights(fit: ModelFit, weights: list[Any], n_range: tuple[float, float]) -> ModelFit:
+def _with_weights(fit: ModelFit, weights: list[Any]) -> ModelFit:
     pictures = [
         eqx.tree_at(lambda p: p.weight, picture, weight) for picture, weight in zip(fit.pictures, weights, strict=True)
     ]
-    return fit._replace(pictures=pictures, optimum=_optimise(pictures, fit.free, n_range))
+    return fit._replace(pictures=pictures, optimum=_optimise(pictures, fit.free, fit.n_range))
 
 
-def _alone(
-    choice: Choice, fits: dict[str, ModelFit], grey: dict[str, np.ndarray], n_range: tuple[float, float]
-) -> ModelFit:
+def _alone(choice: Choice, fits: dict[str, ModelFit], grey: dict[str, np.ndarray]) -> ModelFit:
     """The chosen candidate, fitted to the pixels without what it leaves out."""
     if choice.model in FAMILIES:
         fit = next(iter(fits.values()))
         pictures = [Picture(p.target, p.diffuse, None, p.weight, p.ambient) for p in fit.pictures]
         optimum = fit_linear(pictures, free=choice.free)
-        return ModelFit(brdf.Lambert, pictures, optimum, choice.free, None, fit.noise_factor)
+        return ModelFit(brdf.Lambert, pictures, optimum, choice.free, fit.n_range, None, fit.noise_factor)
     fit = fits[choice.model]
     optimum = fit.optimum
     if not np.array_equal(choice.free, fit.free):
-        optimum = search(fit.pictures, n_min=n_range[0], n_max=n_range[1], free=choice.free)
+        optimum = _optimise(fit.pictures, choice.free, fit.n_range)
     tied = grey[choice.model] if choice.grey else None
     if tied is not None:
         single = np.dtype(fit.pictures[0].target.dtype) == np.float32
-        optimum = fit_tied(fit.pictures, optimum, choice.free, tied, n_range, single=single)
+        optimum = fit_tied(fit.pictures, optimum, choice.free, tied, fit.n_range, single=single)
     return fit._replace(optimum=optimum, free=choice.free, tied=tied)
 
 
 def _interpret(fit: ModelFit, job: _Job, choice: Choice | None) -> Interpretation:
     brightest = np.max([observation.brightest for observation in job.observations], axis=0)
     # What the light reaches but the simplest model does without is 0, with the error that it would have.
-    told = interpret(fit, job.light.colour, job.rounding, brightest, job.shapes, job.n_range, _free(fit.model, job))
+    told = interpret(fit, job.light.colour, job.rounding, brightest, job.shapes, _free(fit.model, job))
     if choice is None or not choice.rivals:
         return told
     names = " and ".join(choice.rivals)

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-# Natural logarithms of what is still well inside float32 and float64.
-_LARGEST_DECAY_SINGLE = 80.0
+# Natural logarithms of what is still well inside float32 and float64, times an exponent of 1e7 too: a compiler that may
+# reorder products multiplies the two first, and infinity times the 0 of a dark pixel is no number.
+_LARGEST_DECAY_SINGLE = 60.0
 _LARGEST_DECAY_DOUBLE = 600.0
 
 # On the host or on the device.
@@ -75,7 +76,7 @@ class Picture(eqx.Module):
     diffuse: Float[Array, "P Cb"]
     lobe: Lobe | None = None
     weight: Float[Array, " P"] | Float[Array, "P C"] | None = None
-    ambient: Float[Array, " Ca"] = eqx.field(default_factory=lambda: np.ones(1))  # pyright: ignore[reportAssignmentType]
+    ambient: Float[AnyArray, " Ca"] = eqx.field(default_factory=lambda: np.ones(1))
 
     def pixels(self, choose: Callable[[Array], Array]) -> "Picture":
         """The same picture, some of its pixels."""

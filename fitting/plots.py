@@ -13,7 +13,13 @@ from matplotlib.figure import Figure
 import brdf
 from fitting.result import FitResult
 
-PRINT = {"font.size": 8, "axes.titlesize": 9, "axes.labelsize": 8, "legend.fontsize": 7, "figure.dpi": 120}
+PRINT: dict[Any, Any] = {
+    "font.size": 8,
+    "axes.titlesize": 9,
+    "axes.labelsize": 8,
+    "legend.fontsize": 7,
+    "figure.dpi": 120,
+}
 """Sizes in points for a figure as wide as a page, 7.2 inches."""
 
 CHANNEL_COLOURS = ("#D55E00", "#009E73", "#0072B2", "#CC79A7", "#E69F00", "#56B4E9")
@@ -93,7 +99,7 @@ def _residual(figure: Figure, axes: Any, target: np.ndarray, fitted: np.ndarray,
     axes.set_facecolor("0.85")
     image = axes.imshow(signed, cmap=SIGNED, vmin=-limit, vmax=limit)
     axes.set_title("fit − target" + (", largest channel" if target.shape[-1] > 1 else ""))
-    bar = figure.colorbar(image, ax=axes, label="radiance", extend="both")
+    bar: Any = figure.colorbar(image, ax=axes, label="radiance", extend="both")
     bar.formatter.set_powerlimits((-2, 3))
 
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 import brdf
+from fitting.pictures import AnyArray
 
 
 class Probe(NamedTuple):
@@ -42,11 +43,11 @@ def _columns(
 def _direct_probe(
     model: type[brdf.Material],
     scene: brdf.Scene,
-    pixel: Int[Array, " M"] | None,
-    target: Float[Array, "M C"],
-    weight: Float[Array, " M"],
-    n: Float[Array, ""],
-    x: Float[Array, "3 C"],
+    pixel: Int[AnyArray, " M"] | None,
+    target: Float[AnyArray, "M C"],
+    weight: Float[AnyArray, " M"],
+    n: Float[AnyArray, ""],
+    x: Float[AnyArray, "3 C"],
 ) -> Probe:
     scene = scene if pixel is None else brdf.some_pixels(scene, pixel, precision="float64")
     count, channels = target.shape
@@ -67,9 +68,9 @@ def difference(
     model: type[brdf.Material],
     coarse: brdf.Scene,
     fine: brdf.Scene,
-    weight: Float[Array, " M"],
-    n: Float[Array, ""],
-    x: Float[Array, "3 C"],
+    weight: Float[AnyArray, " M"],
+    n: Float[AnyArray, ""],
+    x: Float[AnyArray, "3 C"],
 ) -> Float[Array, "C 4"]:
     """Products of the columns with what a finer model changes."""
     shape = (weight.size, x.shape[1])

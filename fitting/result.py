@@ -110,7 +110,7 @@ class FitResult:
     correlation: Float[np.ndarray, "F F"]
     optimum: Optimum
     loss: str
-    precision: str
+    precision: brdf.Precision
     seconds: float
     targets: Sequence[np.ndarray] = field(repr=False)
     scenes: Sequence[brdf.Scene] = field(repr=False)

@@ -30,6 +30,8 @@ from fitting.sums import Sums
 # How many unknowns a searched exponent counts; measured: python -m benchmarks.selection --optimism
 SEARCHED = 4.0
 FAMILIES = ("none", "ambient", "lambert")
+# So far, relative to n, the linearised model is trusted when a smaller one wants another exponent.
+FARTHEST = 0.3
 
 
 @dataclass(frozen=True)
@@ -97,13 +99,23 @@ class _Trial(NamedTuple):
     squares: float
 
 
-def _try(model: str, free: np.ndarray, tied: np.ndarray | None, normal: Normal, plain: Normal) -> _Trial:
+def _try(
+    model: str, free: np.ndarray, tied: np.ndarray | None, normal: Normal, plain: Normal, n: float = 1.0
+) -> _Trial:
     design = design_of(free, tied)
     signed = np.zeros(design.shape[1], bool)
     specular = bool(free[2].any())
     signed[-1:] = specular
     gram, product = design.T @ normal.gram @ design, design.T @ normal.product
     x = nonnegative_minimum(gram, product, signed)
+    first = 2 * free.shape[1]
+    if specular and (abs(x[-1]) > FARTHEST * n or not np.any((design @ x)[first:-1] > 0)):
+        # The lobe's derivative stands for a small change of n, not for a highlight of its own.
+        shift = np.clip(x[-1], -FARTHEST * n, FARTHEST * n)
+        at = nonnegative_minimum(gram[:-1, :-1], product[:-1] - shift * gram[:-1, -1], signed[:-1])
+        if not np.any((design[:, :-1] @ at)[first:-1] > 0):
+            shift, at = 0.0, nonnegative_minimum(gram[:-1, :-1], product[:-1], signed[:-1])
+        x = np.append(at, shift)
     solution = design @ x
     cost = _squares(normal, solution)
     has_lobe = bool(np.any(solution[2 * free.shape[1] : -1] > 0))
@@ -166,9 +178,11 @@ def choose(
         for ambient in (no, free[0]) if free[0].any() else (no,):
             terms = np.stack([ambient, free[1], free[2]])
             if channels > 1:
-                trials.append(_try(name, terms, np.where(free[2], grey[name], 0.0), normal, plain[name]))
-            trials.append(_try(name, terms, None, normal, plain[name]))
-    return _decide(trials, normals, variance, count)
+                trials.append(_try(name, terms, np.where(free[2], grey[name], 0.0), normal, plain[name], fits[name].n))
+            trials.append(_try(name, terms, None, normal, plain[name], fits[name].n))
+    # A highlight that comes out as nothing is Lambert's surface again.
+    shown = [trial for trial in trials if trial.model in FAMILIES or np.any(trial.solution[2 * channels : -1] > 0)]
+    return _decide(shown, normals, variance, count)
 
 
 def _decide(trials: list[_Trial], normals: dict[str, Normal], variance: np.ndarray, count: float) -> Choice:
@@ -180,6 +194,11 @@ def _decide(trials: list[_Trial], normals: dict[str, Normal], variance: np.ndarr
     ranks = [FAMILIES.index(trial.model) if trial.model in FAMILIES else len(FAMILIES) for trial in trials]
     keys = [(ranks[i], trials[i].unknowns, expected[i]) for i in range(len(trials))]
     chosen = min(np.flatnonzero(adequate), key=lambda i: keys[i])
+    if ranks[chosen] == len(FAMILIES):
+        # Of two kinds of highlight the likelier one, be it the one with fewer unknowns or not.
+        likelier = min(np.flatnonzero(adequate), key=lambda i: (ranks[i] < len(FAMILIES), expected[i]))
+        same = [i for i in np.flatnonzero(adequate) if trials[i].model == trials[likelier].model]
+        chosen = min(same, key=lambda i: keys[i])
     count = max(count, 1.0)
     candidates = tuple(
         Candidate(

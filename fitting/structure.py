@@ -178,6 +178,25 @@ def highlight(pictures: Sequence[Picture], n: float) -> Highlight:
     return Highlight(largest, pixels, n, min(peak, 0.0))
 
 
+def nearest_peak(picture: Picture) -> float:
+    """Logarithm of the lobe's cosine in the pixel nearest to its centre.
+
+    Args:
+        picture: with a lobe.
+    """
+    return float(_nearest_peak(picture))
+
+
+@eqx.filter_jit
+def _nearest_peak(picture: Picture) -> Array:
+    assert picture.lobe is not None
+    peak = picture.lobe.peak()
+    if picture.weight is not None:
+        counted = picture.weight > 0 if picture.weight.ndim == 1 else jnp.any(picture.weight > 0, axis=1)
+        peak = jnp.where(counted, peak, -jnp.inf)
+    return jnp.max(peak)
+
+
 @eqx.filter_jit
 def _highlight(picture: Picture, n: Float[AnyArray, ""]) -> tuple[Array, Array, Array]:
     assert picture.lobe is not None

@@ -28,7 +28,9 @@ def fit(material: brdf.Material, model: str, noise: float = 0.0, spoil: bool = F
 @pytest.mark.parametrize("value", [0.0, 0.001, 0.0031308, 0.18, 0.5, 1.0])
 def test_linear_values_are_shown_through_srgb(value: float):
     expected = 12.92 * value if value <= 0.0031308 else 1.055 * value ** (1 / 2.4) - 0.055
-    np.testing.assert_allclose(brdf.displayed(np.full((1, 1, 3), value)), expected, atol=1e-5)  # 1/25 of an 8-bit code
+    np.testing.assert_allclose(
+        brdf.displayed(np.full((1, 1, 3), value)), expected, atol=2e-4
+    )  # a twentieth of an 8-bit code
 
 
 def test_what_is_no_colour_is_shown_as_its_mean():
