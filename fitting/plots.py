@@ -131,14 +131,18 @@ def _scanline(axes: Any, target: np.ndarray, fitted: np.ndarray, counted: np.nda
 def _profile(axes: Any, result: FitResult) -> None:
     """The least residual at each exponent: how deep the minimum is, and whether there are others."""
     optimum = result.optimum
-    order = np.argsort([*optimum.grid, optimum.n])
-    grid = np.array([*optimum.grid, optimum.n])[order]
-    profile = np.array([*optimum.profile, np.sum(optimum.cost)])[order]  # the grid may step over a sharp minimum
+    grid, profile = np.asarray(optimum.grid), np.asarray(optimum.profile)
+    exact = float(np.sum(optimum.cost))
+    if grid.size and not optimum.flat and exact < profile.min():  # the grid steps over a sharp minimum
+        place = np.searchsorted(grid, optimum.n)
+        grid, profile = np.insert(grid, place, optimum.n), np.insert(profile, place, exact)
     found = next((parameter for parameter in result.parameters if parameter.name == "n"), None)
     axes.set(xscale="log", xlabel="exponent n", title="profile of n")
     if grid.size > 1:
-        axes.plot(grid, 100 * np.sqrt(np.maximum(profile, 0.0) / np.sum(optimum.square)), color="black", linewidth=1.2)
-        axes.set(ylabel="least residual, % of the picture", yscale="log", xlim=(grid[0], grid[-1]))
+        percent = 100 * np.sqrt(np.maximum(profile, 0.0) / np.sum(optimum.square))
+        axes.plot(grid, percent, color="black", linewidth=1.2)
+        axes.set(ylabel="least residual, % of the picture", xlim=(grid[0], grid[-1]))
+        axes.set_yscale("log" if percent.max() > 5 * max(percent.min(), 1e-9) else "linear")
     if found is None or found.value is None:
         axes.set_title("profile of n: not determined")
         return

@@ -153,7 +153,7 @@ class Tradeoff:
         from rich.console import Console
 
         stream = io.StringIO()
-        Console(file=stream, width=150, color_system=None).print(self.table())
+        Console(file=stream, width=150, color_system=None, force_jupyter=False).print(self.table())
         return stream.getvalue().rstrip()
 
     def to_dict(self) -> dict[str, Any]:

@@ -125,6 +125,7 @@ def frame(n, k_s=0.45, model=brdf.BlinnPhong):
 
 try:
     import ipywidgets
+    from IPython.display import display
 except ImportError:
     print("ipywidgets is not installed: the picture below stands in for the sliders")
 else:
@@ -138,7 +139,7 @@ else:
 
     for widget in (exponent, strength, which):
         widget.observe(redraw, names="value")
-    display(ipywidgets.VBox([exponent, strength, which, shown]))  # noqa: F821  # Jupyter's own
+    display(ipywidgets.VBox([exponent, strength, which, shown]))
 
 # %%
 frame(10)
@@ -166,4 +167,4 @@ for column, n in enumerate(exponents):
         axes[row, column].imshow(picture(material, scene))
         axes[row, column].set_title(f"{'Blinn-Phong' if row == 0 else 'Phong'}, n = {float(material.n):g}", fontsize=9)
         axes[row, column].set_axis_off()
-figure.suptitle("the same highlight, by N·H above and by R·V below")
+_ = figure.suptitle("the same highlight, by N·H above and by R·V below")

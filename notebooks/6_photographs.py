@@ -39,11 +39,13 @@ chosen = range(3, 96, 12)
 
 
 def real_ball():
-    """Eight photographs: linear values divided by the lamp's intensity, normals, and directions of the lamps."""
+    """Eight photographs: linear values divided by the lamp's intensity, normals, what counts, directions of the lamps."""
     with np.load(photographs) as data:
         intensity = data["light_intensities"][chosen]
-        pictures = data["images"][chosen] / 65535.0 / intensity[:, None, None, :]
-        return pictures, data["normal"], data["mask"], data["light_dirs"][chosen]
+        codes = data["images"][chosen]
+        pictures = codes / 65535.0 / intensity[:, None, None, :]
+        counts = data["mask"] & np.all(codes < 65535, axis=-1)  # the middle of the highlight is clipped
+        return pictures, data["normal"], counts, data["light_dirs"][chosen]
 
 
 def own_ball():
@@ -63,22 +65,23 @@ def own_ball():
         lit = brdf.Scene(points=points, lights=(brdf.DirectionalLight(direction=direction, intensity=[1.0]),))
         clean = sum(np.asarray(brdf.render(one, lit, precision="float64")) for one in (broad, sharp))
         pictures.append(clean + rng.normal(0, 0.003, clean.shape))
-    return np.array(pictures), normal, height > 0, directions
+    return np.array(pictures), normal, np.broadcast_to(height > 0, (8, 146, 146)), directions
 
 
-pictures, normal, mask, directions = real_ball() if photographs.exists() else own_ball()
+pictures, normal, counts, directions = real_ball() if photographs.exists() else own_ball()
 print("photographs of the DiLiGenT ball" if photographs.exists() else "no data folder: pictures of our own renderer")
 
 # %% [markdown]
 # A scene needs no camera where the normals are known: each pixel is given its own.
 
 # %%
-points = brdf.SurfacePoints.from_normals(normal, mask=mask)
+points = brdf.SurfacePoints.from_normals(normal)
 scenes = [
     brdf.Scene(points=points, lights=(brdf.DirectionalLight(direction=direction, intensity=[1.0]),))
     for direction in directions
 ]
 targets = [picture.astype(np.float32) for picture in pictures]
+masks = list(counts)
 
 # %% [markdown]
 # ## All at once, and no start to give
@@ -87,24 +90,37 @@ targets = [picture.astype(np.float32) for picture in pictures]
 # the search over all of log n does not care.
 
 # %%
-result = fitting.fit(targets, scenes)
+result = fitting.fit(targets, scenes, mask=masks)
 print(result)
+
+# %% [markdown]
+# The middle of the highlight is clipped in some photographs: those pixels say "at least", not "so much". They were left
+# out. Taken for data, these few change the answer:
+
+# %%
+clipped = sum(int(np.sum(np.any(normal != 0, axis=-1) & ~mask)) for mask in masks)
+naive = fitting.fit(targets, scenes, model=result.material.name)
+print(f"n = {float(naive.material.n):.4g} with {clipped} clipped pixels, {float(result.material.n):.4g} without them")
 
 # %% [markdown]
 # ## How sure is it?
 #
-# The standard errors come from the noise as if the model were true. The residual tells that it is not: its neighbours are
-# alike, where noise has none. The warning says so. The honest answer to "how sure" is then another one: leave a
-# photograph out, and see how far the numbers move.
+# The standard errors come from the scatter of the residual, as if the model were true. Where it is not, neighbouring
+# residuals are alike, and the report warns. Another answer to "how sure" needs no theory: leave a photograph out, and see
+# how far the numbers move.
 
 # %%
 for warning in result.warnings:
     print("warning:", warning)
+print(f"correlation of neighbouring residuals: {result.structure:.2f} (0 for noise)")
 model = result.material.name
 others = []
 for left in range(0, len(targets), 2):
-    kept = [index for index in range(len(targets)) if index != left]
-    few = fitting.fit([targets[index] for index in kept], [scenes[index] for index in kept], model=model)
+    few = fitting.fit(
+        *([*one[:left], *one[left + 1 :]] for one in (targets, scenes)),
+        model=model,
+        mask=[*masks[:left], *masks[left + 1 :]],
+    )
     others.append([float(few.material.n), *np.asarray(few.material.k_d), *np.asarray(few.material.k_s)])
 others = np.array(others)
 error = next((parameter.error for parameter in result.parameters if parameter.name == "n"), None)
@@ -121,16 +137,16 @@ print(
 
 # %%
 kinds = ["lambert", "phong", "blinn-phong"]
-residuals = [fitting.fit(targets, scenes, model=kind).residual for kind in kinds]
+residuals = [fitting.fit(targets, scenes, model=kind, mask=masks).residual for kind in kinds]
 figure, ax = plt.subplots(figsize=(5, 2.4), layout="constrained")
 ax.barh(kinds, 100 * np.array(residuals), color=["#56B4E9", "#E69F00", "#0072B2"])
-ax.set_xlabel("residual, % of the pictures (rms)")
+_ = ax.set_xlabel("residual, % of the pictures (rms)")
 
 # %% [markdown]
 # ## The picture and what is missing
 #
-# The residual has the shape of the highlight: the real one is not a power of a cosine. It has a sharp core and a wide
-# skirt, which two lobes would follow, and one cannot.
+# The residual has the shape of the highlight, so the real one is not a power of a cosine. Around its core the photograph is
+# brighter than the fit: highlights of real materials, and of real lenses, have a wider skirt than one lobe can follow.
 
 # %%
 result.plot(2)

@@ -57,15 +57,27 @@ def pictures(notebook: Any) -> list[bytes]:
     return [base64.b64decode(output.data["image/png"]) for output in outputs if "image/png" in output.get("data", {})]
 
 
+def faults(notebook: Any) -> list[str]:
+    """What is wrong with an executed notebook: a warning, or no picture at its end."""
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    found = [output.text for cell in cells for output in cell.outputs if output.get("name") == "stderr"]
+    if not any("image/png" in output.get("data", {}) for output in cells[-1].outputs):
+        found.append("does not end in a picture")
+    return found
+
+
 def main() -> None:
     """Runs those that are named, or all."""
-    names = sys.argv[1:]
+    names, wrong = sys.argv[1:], []
     for path in sorted(HERE.glob("[0-9]_*.py")):
         if names and path.stem not in names and path.stem[0] not in names:
             continue
         start = time.perf_counter()
         notebook = execute(path, ROOT / "out" / "notebooks")
+        wrong += [f"{path.name}: {fault}" for fault in faults(notebook)]
         print(f"{path.name}: {time.perf_counter() - start:.0f} s, {len(pictures(notebook))} pictures", flush=True)
+    if wrong:
+        raise SystemExit("\n".join(wrong))
 
 
 if __name__ == "__main__":
