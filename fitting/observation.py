@@ -107,7 +107,7 @@ def observe(
         good, scale, below = jax.device_get(_between(values, good, -jnp.inf, level))
         left_out["clipped"] = count - int(below)
         count = int(below)
-        if not count:
+        if not count or not scale.any():
             came = f"is clipped at {level:g} wherever it sees the object"
             raise InputError("target", came, "Give a darker exposure or a higher saturation")
     elif level is not None:

@@ -196,11 +196,11 @@ def _engine_pictures(model: type[brdf.Material], job: _Job) -> list[Picture]:
     return pictures
 
 
-def _visible(pictures: Sequence[Picture], n_range: tuple[float, float]) -> tuple[float, float]:
-    """Exponents of which some pixel sees at least a trace: with larger ones k_s could be anything."""
+def _visible(pictures: Sequence[Picture], n_range: tuple[float, float]) -> tuple[float, float] | None:
+    """Exponents of which some pixel sees at least a trace: with larger ones k_s could be anything; None without any."""
     nearest = max((nearest_peak(picture) for picture in pictures if picture.lobe is not None), default=0.0)
     upper = min(n_range[1], UNSEEN / max(-nearest, UNSEEN / n_range[1]))
-    return n_range[0], max(upper, WIDEST * n_range[0])
+    return (n_range[0], upper) if upper >= n_range[0] else None
 
 
 def _optimise(pictures: Sequence[Picture], free: np.ndarray, n_range: tuple[float, float]) -> Optimum:
@@ -212,7 +212,11 @@ def _optimise(pictures: Sequence[Picture], free: np.ndarray, n_range: tuple[floa
 def _fit_model(model: type[brdf.Material], job: _Job) -> ModelFit:
     free = _free(model, job)
     pictures = _engine_pictures(model, job)
-    n_range = _visible(pictures, job.n_range) if free[2].any() else job.n_range
+    n_range = job.n_range
+    if free[2].any():
+        visible = _visible(pictures, job.n_range)
+        n_range = visible or n_range
+        free[2] &= visible is not None
     found = reweight(pictures, lambda some: _optimise(some, free, n_range), job.loss, job.rounding)
     return ModelFit(model, found.pictures, found.optimum, free, n_range, None, found.noise_factor)
 
@@ -233,7 +237,7 @@ def _fit_auto(job: _Job) -> tuple[ModelFit, Choice]:
     best = min(fits.values(), key=lambda fit: float(np.sum(fit.optimum.cost)))
     noise = residual_noise(best.optimum, job.rounding)
     known = structure(best.pictures, job.shapes, best.optimum, job.rounding)
-    free = next(iter(fits.values())).free
+    free = np.logical_or.reduce([fit.free for fit in fits.values()])
     optima = {name: fit.optimum for name, fit in fits.items()}
     whitened = {}
     if known.noise is not None:

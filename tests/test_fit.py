@@ -1,0 +1,117 @@
+"""The front door: random materials come back, pictures combine, and what cannot be used is refused in one sentence."""
+
+import json
+
+import numpy as np
+import pytest
+
+import brdf
+import fitting
+
+CAMERA = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=(72, 72))
+BALL = brdf.Sphere(center=[0, 0, 0], radius=1)
+SUN = brdf.DirectionalLight(direction=[0.5, 0.6, 0.7], intensity=[1.0, 0.8, 0.6])
+LAMP = brdf.PointLight(position=[-2.0, 1.0, 3.0], intensity=[6.0, 6.0, 6.0])
+AMBIENT = [0.2, 0.2, 0.3]
+
+
+def scene(*lights: brdf.Light, ambient=AMBIENT) -> brdf.Scene:
+    return brdf.Scene(camera=CAMERA, shapes=[BALL], ambient=ambient, lights=lights)
+
+
+def rendered(material: brdf.Material, place: brdf.Scene) -> np.ndarray:
+    return np.asarray(brdf.render(material, place, precision="float64"))
+
+
+@pytest.mark.parametrize("model", brdf.MODELS)
+@pytest.mark.parametrize("lights", [(SUN,), (SUN, LAMP)], ids=["one light", "two lights"])
+def test_random_materials_come_back(model: str, lights: tuple[brdf.Light, ...]):
+    random = np.random.default_rng(list(brdf.MODELS).index(model))
+    for _ in range(3):
+        k = {name: random.uniform(0, 0.5, 3) for name in ("k_a", "k_d")}
+        if model != "lambert":
+            k |= {"k_s": 0.4 * random.uniform(0.1, 1, 3), "n": np.exp(random.uniform(np.log(0.5), np.log(500)))}
+        truth = brdf.MODELS[model](**k)
+        found = fitting.fit(rendered(truth, scene(*lights)), scene(*lights), model=model, precision="float64").material
+        for name, value in k.items():
+            # Noise-free float64; the engine stops at 5e-9 of n.
+            assert np.asarray(getattr(found, name)) == pytest.approx(value, rel=1e-6, abs=1e-8), name
+
+
+def test_two_pictures_tell_what_one_does_not():
+    truth = brdf.BlinnPhong(k_a=[0.3, 0.2, 0.1], k_d=[0.5, 0.4, 0.3], k_s=0.3, n=40.0)
+    dark, light = scene(SUN, ambient=None), scene(SUN)
+    one = fitting.fit(rendered(truth, dark), dark, model="blinn-phong", precision="float64")
+    assert "k_a" in one.undetermined or "k_a[0]" in one.undetermined
+    both = fitting.fit(
+        [rendered(truth, dark), rendered(truth, light)], [dark, light], model="blinn-phong", precision="float64"
+    )
+    assert both.undetermined == {}
+    assert both.material.k_a == pytest.approx(truth.k_a, rel=1e-6)
+    assert "2 pictures" in str(both)
+
+
+def test_clipped_and_missing_pixels_are_left_out_and_counted():
+    truth = brdf.BlinnPhong(k_a=0.3, k_d=[0.5, 0.4, 0.3], k_s=0.8, n=20.0)
+    picture = np.minimum(rendered(truth, scene(SUN)), 0.9)
+    picture[30, 30:34] = np.nan
+    result = fitting.fit(picture, scene(SUN), model="blinn-phong", precision="float64")
+    assert result.left_out["not finite"] == 4
+    assert result.left_out["clipped"] > 20
+    assert float(result.material.n) == pytest.approx(20.0, rel=1e-6)
+
+
+def test_the_result_as_json_is_standard_json():
+    truth = brdf.BlinnPhong(k_a=0.3, k_d=[0.5, 0.4, 0.3], k_s=0.0, n=20.0)
+    result = fitting.fit(rendered(truth, scene(SUN)), scene(SUN), model="blinn-phong")
+    values = json.loads(json.dumps(result.to_dict(), allow_nan=False))
+    assert values["material"]["n"] is None
+    assert values["material"]["k_s"] == [None] * 3
+    assert {p["name"]: p["reason"] for p in values["parameters"]}["n"]
+    named = fitting.fit(rendered(truth, scene(SUN)), scene(SUN))
+    json.dumps(named.to_dict(), allow_nan=False)
+    assert [c["chosen"] for c in named.to_dict()["candidates"]].count(True) == 1
+
+
+def test_float32_and_float64_agree():
+    truth = brdf.BlinnPhong(k_a=[0.3, 0.2, 0.1], k_d=[0.5, 0.4, 0.3], k_s=0.3, n=40.0)
+    picture = rendered(truth, scene(SUN)).astype(np.float32)
+    single, double = (
+        fitting.fit(picture, scene(SUN), model="blinn-phong", precision=p) for p in ("float32", "float64")
+    )
+    # Float32 geometry: some 1e-6 of the lobe.
+    assert float(single.material.n) == pytest.approx(float(double.material.n), rel=1e-4)
+    assert single.material.k_s == pytest.approx(double.material.k_s, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"model": "cook-torrance"}, "model: is unknown, got 'cook-torrance'"),
+        ({"precision": "float16"}, "precision: is unknown, got 'float16'"),
+        ({"n_range": (10, 1)}, "n_range: must be 0 < lower < upper"),
+        ({"mask": np.ones((3, 3), bool)}, "mask: is of shape"),
+        ({"mask": np.zeros((72, 72), bool)}, "mask: leaves no pixel"),
+        ({"saturation": 1e-9}, "target: is clipped at 1e-09"),
+    ],
+)
+def test_what_cannot_be_used_is_refused(arguments: dict, message: str):
+    picture = rendered(brdf.Lambert(k_d=0.5), scene(SUN))
+    with pytest.raises(brdf.InputError, match=message):
+        fitting.fit(picture, scene(SUN), **arguments)
+
+
+@pytest.mark.parametrize(
+    ("target", "message"),
+    [
+        ([], "target: is an empty list"),
+        (np.zeros((72, 72, 3)), "target: is black on the object"),
+        (np.full((72, 72, 3), np.nan), "target: has no finite value"),
+        (np.ones((10, 10, 3)), "target: is 10 x 10"),
+        (np.ones((72, 72, 3), int), "target: must hold linear floating-point values"),
+        ("picture.exr", "target: must be an array, got str"),
+    ],
+)
+def test_targets_that_cannot_be_used_are_refused(target, message: str):
+    with pytest.raises(brdf.InputError, match=message):
+        fitting.fit(target, scene(SUN))
