@@ -57,7 +57,7 @@ def own_ball():
     around = np.arange(8) * 2 * np.pi / 8
     directions = np.stack([0.6 * np.cos(around), 0.5 * np.sin(around), np.full(8, 0.75)], -1)
     points = brdf.SurfacePoints.from_normals(normal)
-    broad = brdf.BlinnPhong(k_d=[0.12, 0.1, 0.08], k_s=[0.15] * 3, n=25)
+    broad = brdf.BlinnPhong(k_d=[0.12, 0.1, 0.08], k_s=[0.04] * 3, n=150)
     sharp = brdf.BlinnPhong(k_d=[0.0] * 3, k_s=[0.9] * 3, n=2500)
     rng = np.random.default_rng(2)
     pictures = []
