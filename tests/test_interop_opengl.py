@@ -119,9 +119,11 @@ def test_the_bundled_ball_is_what_its_script_draws() -> None:
 def test_fit_reads_the_material_back(scene: str, numbers: tuple[Any, ...], tmp_path: Path) -> None:
     path = tmp_path / "scene.toml"
     path.write_text(scene, encoding="utf-8")
-    truth = _material(numbers)
-    target = opengl_ball.draw_ball(tomllib.loads(scene), truth)
-    found = fitting.fit(target, brdf.Scene.load(path), model="blinn-phong").material
+    truth, parsed = _material(numbers), tomllib.loads(scene)
+    target = opengl_ball.draw_ball(parsed, truth)
+    # OpenGL casts no shadows: pixels that lie in one are left out.
+    lit = numpy_shading.shade(parsed, truth, shadows=True) == numpy_shading.shade(parsed, truth)
+    found = fitting.fit(target, brdf.Scene.load(path), model="blinn-phong", mask=lit.all(axis=-1)).material
     # The drawing's own faces account for n / (64 R^2) of n, 0.03 % at n = 128, and for a few 1e-5 of the k.
     assert float(found.n) == pytest.approx(truth["n"], rel=2e-3)
     for key in ("k_a", "k_d", "k_s"):
