@@ -48,6 +48,9 @@ def fit(
     ] = None,
     lights: Annotated[Path | None, typer.Option(help="A text file with such a direction for each picture.")] = None,
     intensities: Annotated[Path | None, typer.Option(help="A text file with the light's intensity for each.")] = None,
+    ambient: Annotated[
+        bool, typer.Option("--ambient", help="A photograph is lit from all around too: find k_a for that light as 1.")
+    ] = False,
     exposure: Annotated[
         str | None, typer.Option(help="Relative exposure, one or one each: values are divided.")
     ] = None,
@@ -90,7 +93,9 @@ def fit(
                 accuracy,
                 seconds,
             )
-            result = _fit_table(target[0], model, loss, any(option is not None for option in given) or plot or report)
+            result = _fit_table(
+                target[0], model, loss, any(option is not None for option in given) or plot or report or ambient
+            )
             if out is not None:
                 result.save(out)
         else:
@@ -103,6 +108,7 @@ def fit(
                 "lights": lights,
             }
             options |= {"intensities": intensities, "encoding": _encoding(encoding), "exposure": exposure, "mask": mask}
+            options |= {"ambient": ambient}
             names = {"model": "--model", "precision": "--precision", "dark": "--dark", "noise": "--noise"}
             names |= {"mask": mask, "loss": "--loss", "saturation": "--saturation", "accuracy": "--accuracy"}
             names |= {"seconds": "--seconds"}

@@ -44,6 +44,7 @@ class Options(NamedTuple):
         encoding: of the pictures.
         exposure: one factor, or one per picture: values are divided by it.
         mask: an image.
+        ambient: whether photographs are lit from all around as well.
     """
 
     scene: Path | None = None
@@ -56,6 +57,7 @@ class Options(NamedTuple):
     encoding: Any = None
     exposure: str | None = None
     mask: Path | None = None
+    ambient: bool = False
 
 
 def collect(targets: list[Path], options: Options, read: dict[Path, brdf.Picture]) -> Job:
@@ -82,6 +84,8 @@ def collect(targets: list[Path], options: Options, read: dict[Path, brdf.Picture
             raise InputError(
                 name, "says where the light is, but nothing what the picture shows", "Add --sphere x,y,radius"
             )
+    if options.ambient:
+        raise InputError("--ambient", "is what the scene file says", "Leave it out, or add [ambient] to the scene")
     if len(targets) > 1:
         came = f"{len(targets)} pictures come without their geometry"
         raise InputError("--sphere", came, "Several pictures are fitted with --sphere or --normals, and --lights")
@@ -168,18 +172,28 @@ def _photographs(targets: list[Path], options: Options, read: dict[Path, brdf.Pi
     elif intensities.shape[1] not in (1, channels):
         came = f"has {intensities.shape[1]} numbers a line, the pictures {channels} channels"
         raise InputError(options.intensities, came, "Give one intensity per channel")
-    return Job(*_normalised(pictures, points, directions, intensities), mask, targets[0], note)
+    job = _normalised(pictures, points, directions, intensities, ambient=options.ambient)
+    return Job(*job, mask, targets[0], note)
 
 
 def _normalised(
-    pictures: list[Any], points: brdf.SurfacePoints, directions: np.ndarray, intensities: np.ndarray
+    pictures: list[Any],
+    points: brdf.SurfacePoints,
+    directions: np.ndarray,
+    intensities: np.ndarray,
+    *,
+    ambient: bool,
 ) -> tuple[list[Any], list[brdf.Scene]]:
-    """Pictures as under light of intensity 1, so that every photograph counts alike however bright its light was."""
+    """Pictures as under light of intensity 1, so that every photograph counts alike however bright its light was.
+
+    Ambient light is taken to be the same in all of them, and its intensity, which nobody knows, as 1.
+    """
+    lamps = list(zip(directions, intensities, strict=True))
     if np.any(intensities <= 0):
-        scenes = [photograph_scene(points, *light) for light in zip(directions, intensities, strict=True)]
-        return pictures, scenes
+        around = [1.0] if ambient else None
+        return pictures, [photograph_scene(points, *lamp, ambient=around) for lamp in lamps]
     scaled = [_scaled(picture, 1.0 / light) for picture, light in zip(pictures, intensities, strict=True)]
-    return scaled, [photograph_scene(points, direction) for direction in directions]
+    return scaled, [photograph_scene(points, way, ambient=1.0 / light if ambient else None) for way, light in lamps]
 
 
 def _geometry(shape: Any, mask: np.ndarray | None, options: Options) -> tuple[brdf.SurfacePoints, str]:
@@ -276,7 +290,8 @@ def _archive(path: Path, options: Options) -> Job:
             raise InputError(f"{path}: mask", f"is of shape {mask.shape}", f"Give {images.shape[1:3]}")
     points = brdf.SurfacePoints.from_normals(normal, mask=mask)
     pictures = _exposed([_as_picture(image) for image in images], options.exposure)
-    return Job(*_normalised(pictures, points, directions, intensities.astype(np.float64)), None, path)
+    job = _normalised(pictures, points, directions, intensities.astype(np.float64), ambient=options.ambient)
+    return Job(*job, None, path)
 
 
 def _as_picture(image: np.ndarray) -> Any:
