@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fitting import nonnegative
-from fitting.normal import grey_design, nonnegative_minimum, normal_equations
+from fitting.active_set import nonnegative_minimum
+from fitting.normal import grey_design, normal_equations
 from fitting.separable import Optimum
 from fitting.sums import Picture, Sums, sums
 
@@ -103,7 +104,7 @@ def _tied_profile(
         normal = normal_equations(gram, about.product @ basis.T, about.square, reference[:, 2], np.ones(tied.size))
         design = grey_design(free, tied)[:, :-1]
         gram, product = design.T @ normal.gram @ design, design.T @ normal.product
-        x = nonnegative_minimum(gram, product, np.zeros(product.size, bool))
+        x = nonnegative_minimum(gram, product)
         costs.append(normal.square - 2 * product @ x + x @ gram @ x)
     return np.array(costs)
 

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.normal import nonnegative_minimum
+from fitting.active_set import nonnegative_minimum
 from fitting.pictures import AnyArray, Picture
 from fitting.separable import Optimum
 from fitting.sums import Sums, sums
@@ -93,7 +93,7 @@ def _one_channel(squared: np.ndarray, value: np.ndarray, least: float) -> tuple[
     for _ in range(ROUNDS):
         # The variance of a squared residual is twice its mean squared; scaled, so that no digit is lost.
         scaled = columns / variance
-        coefficients = nonnegative_minimum(scaled @ scaled.T, scaled @ (squared / variance), np.zeros(3, bool))
+        coefficients = nonnegative_minimum(scaled @ scaled.T, scaled @ (squared / variance))
         coefficients[0] = max(coefficients[0], least, 1e-6 * constant)
         variance = coefficients @ columns
     rise = np.sum(np.log(constant / variance) + squared / constant - squared / variance)

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 
 import brdf
 from brdf.errors import InputError
-from fitting.active_set import DEPENDENT, non_negative
+from fitting.active_set import DEPENDENT, nonnegative_minimum
 
 UNKNOWN_FACTOR = (
     "one factor per channel between material and lights: the lights' mean intensity was kept at that of the scene"
@@ -182,7 +182,7 @@ def _intensities(
     factors, errors = np.zeros((lights, channels)), np.full((lights, channels), np.inf)
     for c in range(channels):
         gram = columns[..., c] @ columns[..., c].T
-        factors[:, c] = non_negative(gram, columns[..., c] @ pixels[:, c])
+        factors[:, c] = nonnegative_minimum(gram, columns[..., c] @ pixels[:, c])
         residual = pixels[:, c] - factors[:, c] @ columns[..., c]
         lit = np.diag(gram) > 0
         scale = np.diag(gram)[lit] ** 0.5
@@ -209,9 +209,9 @@ def _in_turn(terms: Float[np.ndarray, "L T P C"], ambient: np.ndarray, pixels: F
         light, now, coefficients = np.ones(lights), square, np.zeros(parts + 1)
         for _ in range(_ROUNDS):
             by_k = _fold(np.kron(light[:, None], np.eye(parts)))
-            coefficients = non_negative(by_k.T @ gram @ by_k, by_k.T @ product)
+            coefficients = nonnegative_minimum(by_k.T @ gram @ by_k, by_k.T @ product)
             by_light = _fold(np.kron(np.eye(lights), coefficients[:-1, None]))
-            found = non_negative(by_light.T @ gram @ by_light, by_light.T @ product)
+            found = nonnegative_minimum(by_light.T @ gram @ by_light, by_light.T @ product)
             light, whole = found[:-1], by_light @ found
             coefficients[-1] = found[-1]
             now = max(float(square - 2 * whole @ product + whole @ gram @ whole), 0.0)

@@ -24,7 +24,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from fitting.normal import Normal, design_of, nonnegative_minimum, normal_equations
+from fitting.active_set import nonnegative_minimum
+from fitting.normal import Normal, design_of, normal_equations
 from fitting.separable import Optimum
 from fitting.sums import Sums
 
