@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from fitting import nonnegative
 from fitting.active_set import nonnegative_minimum
 from fitting.normal import grey_design, normal_equations
+from fitting.polishing import solve_within
 from fitting.separable import Optimum
 from fitting.sums import Picture, Sums, sums
 
@@ -78,14 +78,7 @@ def _profile(
     """Least cost, summed over channels, at shares of a bracket, from the bracket's sums."""
 
     def at(t: Float[Array, ""]) -> Float[Array, ""]:
-        lobe = jnp.stack([jnp.ones_like(t), t * width, t * t * (3 - 2 * t), t * t * (t - 1) * width])
-        basis = jnp.eye(4, 6).at[2, 2:].set(lobe).at[3, 2:].set(0.0)
-        change = reference[:, 2:] * (basis[2] - jnp.eye(6)[2])
-        moved = jnp.sum(parts.gram * change[:, None, :], axis=2)
-        product = jnp.einsum("ij,cj->ci", basis, parts.product - moved)
-        square = parts.square + jnp.sum(change * (moved - 2 * parts.product), axis=1)
-        gram = jnp.einsum("ij,cjk,lk->cil", basis, parts.gram, basis)
-        return jnp.sum(nonnegative.solve(gram, product, square, reference, free, jnp.asarray(tolerance)).cost)
+        return jnp.sum(solve_within(parts, t, width, reference, free, jnp.asarray(tolerance)).cost)
 
     return jax.vmap(at)(jnp.asarray(SHARES))
 

@@ -11,7 +11,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from fitting import nonnegative
-from fitting.pictures import Picture
+from fitting.pictures import AnyArray, Picture
 from fitting.sums import Sums, sums
 
 # As a function of log n a lobe varies on a scale of 1 or more; steps of the coarse grid, and the widest bracket.
@@ -70,6 +70,41 @@ def solve_linear(parts: Sums, reference: Float[Array, "C 3"], problem: Problem) 
     return nonnegative.solve(parts.gram, parts.product, parts.square, reference, problem.free, problem.tolerance)
 
 
+def solve_within(
+    parts: Sums,
+    t: Float[Array, ""],
+    width: Float[Array, ""],
+    reference: Float[Array, "C 3"],
+    free: Bool[AnyArray, "C 3"],
+    tolerance: Float[AnyArray, ""],
+) -> nonnegative.Linear:
+    """The best coefficients at one exponent within a bracket, the lobe there being Hermite's cubic of its ends.
+
+    Args:
+        parts: Sums of the bracket.
+        t: Where in the bracket, from 0 to 1.
+        width: Of the bracket, in log n.
+        reference: The reference model of the sums, whose lobe is that of the lower end.
+        free: Which coefficients may be above 0.
+        tolerance: See :func:`fitting.nonnegative.solve`.
+
+    Returns:
+        Coefficients, cost and slope.
+    """
+    # Ambient, diffuse, lobe and derivative as combinations of the columns of a bracket.
+    value = jnp.stack([jnp.ones_like(t), t * width, t * t * (3 - 2 * t), t * t * (t - 1) * width])
+    slope = jnp.stack([jnp.zeros_like(t), jnp.ones_like(t), 6 * t * (1 - t) / width, t * (3 * t - 2)])
+    basis = jnp.eye(4, 6).at[2:, 2:].set(jnp.stack([value, slope]))
+    # The reference model gets the lobe of t, which changes its residual.
+    change = reference[:, 2:] * (basis[2] - jnp.eye(6)[2])
+    moved = jnp.sum(parts.gram * change[:, None, :], axis=2)
+    product = jnp.sum(basis * (parts.product - moved)[:, None, :], axis=2)
+    square = parts.square + jnp.sum(change * (moved - 2 * parts.product), axis=1)
+    half = jnp.sum(basis[None, :, None, :] * parts.gram[:, None, :, :], axis=3)
+    gram = jnp.sum(half[:, :, None, :] * basis[None, None, :, :], axis=3)
+    return nonnegative.solve(gram, product, square, reference, free, tolerance)
+
+
 @jax.jit
 def _solve_bracket(
     parts: Sums, ends: Float[Array, "2"], reference: Float[Array, "C 3"], problem: Problem
@@ -78,18 +113,7 @@ def _solve_bracket(
     step = ends[1] - ends[0]
 
     def at(t: Float[Array, ""]) -> nonnegative.Linear:
-        # Ambient, diffuse, lobe and derivative, by Hermite's cubic, as combinations of the columns of a bracket.
-        value = jnp.stack([jnp.ones_like(t), t * step, t * t * (3 - 2 * t), t * t * (t - 1) * step])
-        slope = jnp.stack([jnp.zeros_like(t), jnp.ones_like(t), 6 * t * (1 - t) / step, t * (3 * t - 2)])
-        basis = jnp.eye(4, 6).at[2:, 2:].set(jnp.stack([value, slope]))
-        # The reference model has the lobe of the lower end; here it gets that of t, which changes its residual.
-        change = reference[:, 2:] * (basis[2] - jnp.eye(6)[2])
-        moved = jnp.sum(parts.gram * change[:, None, :], axis=2)
-        product = jnp.sum(basis * (parts.product - moved)[:, None, :], axis=2)
-        square = parts.square + jnp.sum(change * (moved - 2 * parts.product), axis=1)
-        half = jnp.sum(basis[None, :, None, :] * parts.gram[:, None, :, :], axis=3)
-        gram = jnp.sum(half[:, :, None, :] * basis[None, None, :, :], axis=3)
-        return nonnegative.solve(gram, product, square, reference, problem.free, problem.tolerance)
+        return solve_within(parts, t, step, reference, problem.free, problem.tolerance)
 
     shares = jnp.linspace(0.0, 1.0, 9)
     linear = jax.vmap(at)(shares)
