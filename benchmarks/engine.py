@@ -19,9 +19,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from fitting import polishing, profile, separable, thinning
-from fitting import sums as summing
-from fitting.separable import OneLightLobe, Picture, search
+from fitting.engine import polishing, profile, separable, thinning
+from fitting.engine import sums as summing
+from fitting.engine.separable import OneLightLobe, Picture, search
 
 N = 80.0
 X = np.array([[0.05, 0.03, 0.02], [0.5, 0.3, 0.1], [0.3, 0.4, 0.5]])

@@ -17,11 +17,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from brdf import measured_merl, measured_rgl
 from brdf.errors import InputError
-from brdf.materials import load_materials
-from brdf.measured import load_measured
-from brdf.scene_file import load_scene
+from brdf.materials.files import load_materials
+from brdf.measured import merl as measured_merl
+from brdf.measured import rgl as measured_rgl
+from brdf.measured.tables import load_measured
+from brdf.scenes.file import load_scene
 
 SCENE = """[camera]
 type = "orthographic"
@@ -149,13 +150,13 @@ def tensor() -> bytes:
 
 
 def _lights(path: Path) -> Any:
-    from fitting.light_files import read_directions
+    from fitting.photographs.light_files import read_directions
 
     return read_directions(path)
 
 
 def _archive(path: Path) -> Any:
-    from fitting.archives import read_archive
+    from fitting.photographs.archives import read_archive
 
     return read_archive(path)
 

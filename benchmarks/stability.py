@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from brdf.stability import stability_maps
-from fitting.material_plots import plot_stability
+from brdf.plausibility.stability import stability_maps
+from fitting.plots.materials import plot_stability
 
 
 def main(path: Path) -> None:

@@ -12,10 +12,10 @@ import numpy as np
 
 import brdf
 import fitting
-from fitting.configurations import Configuration, run
-from fitting.deviation import deviation
-from fitting.lamps import Lamps, extended
-from fitting.reference import reference
+from fitting.accuracy.configurations import Configuration, run
+from fitting.accuracy.deviation import deviation
+from fitting.accuracy.lamps import Lamps, extended
+from fitting.accuracy.reference import reference
 
 ACCURACIES = (1e-1, 1e-2, 1e-3, 1e-4)
 OPTIONS = {"n_range": (0.1, 1e6), "mask": None, "saturation": None}

@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from brdf.albedo import absorbed_fraction, directional_albedo
-    from brdf.area_lights import PolygonLight, RectangleLight, SphereLight
-    from brdf.camera import Camera, OrthographicCamera, PerspectiveCamera
     from brdf.conversions import (
         exponent_from_roughness,
         exponent_from_slope,
@@ -21,18 +19,23 @@ if TYPE_CHECKING:
         slope_from_exponent,
     )
     from brdf.display import displayed, lit_sphere, material_html, png_address, report_html
-    from brdf.encodings import encode
-    from brdf.environment import ConstantEnvironment, EnvironmentMap
     from brdf.errors import InputError
-    from brdf.exports import EXPORTS, Export, export_material, mitsuba_dict, save_export
     from brdf.files import atomic_folder, atomic_path, input_file, read_text, write_text
-    from brdf.images import ImageReader, Picture, read_image, read_layers, read_mask, read_picture, write_image
+    from brdf.geometry.camera import Camera, OrthographicCamera, PerspectiveCamera
+    from brdf.geometry.meshes import Mesh, Triangles, load_mesh
+    from brdf.geometry.shapes import Rectangle, Shape, Sphere
+    from brdf.geometry.surface_points import SurfacePoints
+    from brdf.images.encodings import encode
+    from brdf.images.pictures import ImageReader, Picture, read_image, read_layers, read_mask, read_picture, write_image
     from brdf.light_images import relight, render_lights
-    from brdf.lights import DirectionalLight, Light, PointLight, SpotLight
-    from brdf.materials import load_material, load_materials, material_from_dict, material_to_dict, save_material
-    from brdf.measured import MeasuredBRDF, is_measured, load_measured
-    from brdf.measured_merl import merl_table
-    from brdf.meshes import Mesh, Triangles, load_mesh
+    from brdf.lights.area import PolygonLight, RectangleLight, SphereLight
+    from brdf.lights.environment import ConstantEnvironment, EnvironmentMap
+    from brdf.lights.punctual import DirectionalLight, Light, PointLight, SpotLight
+    from brdf.materials.exports import EXPORTS, Export, export_material, mitsuba_dict, save_export
+    from brdf.materials.files import load_material, load_materials, material_from_dict, material_to_dict, save_material
+    from brdf.materials.presets import PRESETS, preset
+    from brdf.measured.merl import merl_table
+    from brdf.measured.tables import MeasuredBRDF, is_measured, load_measured
     from brdf.models import (
         MODELS,
         BlinnPhong,
@@ -43,22 +46,19 @@ if TYPE_CHECKING:
         Phong,
         SpecularMaterial,
     )
-    from brdf.pixel_choice import some_pixels
-    from brdf.plausibility import check
+    from brdf.plausibility.report import Finding, Report
+    from brdf.plausibility.stability import StabilityMap, stability_map, stability_maps
+    from brdf.plausibility.verdict import check
     from brdf.precision import Precision, cast, working_precision
-    from brdf.presets import PRESETS, preset
     from brdf.rendering import Basis, BasisImages, Lobe, basis, basis_images, render
-    from brdf.report import Finding, Report
-    from brdf.scene import Scene
-    from brdf.shapes import Rectangle, Shape, Sphere
-    from brdf.stability import StabilityMap, stability_map, stability_maps
-    from brdf.surface_points import SurfacePoints
+    from brdf.scenes.pixel_choice import some_pixels
+    from brdf.scenes.scene import Scene
 
 _ROOMS = {
-    "measured": ["MeasuredBRDF", "is_measured", "load_measured"],
-    "measured_merl": ["merl_table"],
-    "report": ["Finding", "Report"],
-    "plausibility": ["check"],
+    "measured.tables": ["MeasuredBRDF", "is_measured", "load_measured"],
+    "measured.merl": ["merl_table"],
+    "plausibility.report": ["Finding", "Report"],
+    "plausibility.verdict": ["check"],
     "conversions": [
         "exponent_from_roughness",
         "exponent_from_slope",
@@ -70,20 +70,28 @@ _ROOMS = {
         "slope_from_exponent",
     ],
     "albedo": ["absorbed_fraction", "directional_albedo"],
-    "area_lights": ["PolygonLight", "RectangleLight", "SphereLight"],
-    "camera": ["Camera", "OrthographicCamera", "PerspectiveCamera"],
-    "environment": ["ConstantEnvironment", "EnvironmentMap"],
+    "lights.area": ["PolygonLight", "RectangleLight", "SphereLight"],
+    "geometry.camera": ["Camera", "OrthographicCamera", "PerspectiveCamera"],
+    "lights.environment": ["ConstantEnvironment", "EnvironmentMap"],
     "display": ["displayed", "lit_sphere", "material_html", "png_address", "report_html"],
-    "encodings": ["encode"],
+    "images.encodings": ["encode"],
     "errors": ["InputError"],
-    "exports": ["EXPORTS", "Export", "export_material", "mitsuba_dict", "save_export"],
-    "presets": ["PRESETS", "preset"],
+    "materials.exports": ["EXPORTS", "Export", "export_material", "mitsuba_dict", "save_export"],
+    "materials.presets": ["PRESETS", "preset"],
     "files": ["atomic_folder", "atomic_path", "input_file", "read_text", "write_text"],
-    "images": ["ImageReader", "Picture", "read_image", "read_layers", "read_mask", "read_picture", "write_image"],
+    "images.pictures": [
+        "ImageReader",
+        "Picture",
+        "read_image",
+        "read_layers",
+        "read_mask",
+        "read_picture",
+        "write_image",
+    ],
     "light_images": ["relight", "render_lights"],
-    "lights": ["DirectionalLight", "Light", "PointLight", "SpotLight"],
-    "meshes": ["Mesh", "Triangles", "load_mesh"],
-    "materials": ["load_material", "load_materials", "material_from_dict", "material_to_dict", "save_material"],
+    "lights.punctual": ["DirectionalLight", "Light", "PointLight", "SpotLight"],
+    "geometry.meshes": ["Mesh", "Triangles", "load_mesh"],
+    "materials.files": ["load_material", "load_materials", "material_from_dict", "material_to_dict", "save_material"],
     "models": [
         "MODELS",
         "BlinnPhong",
@@ -96,11 +104,11 @@ _ROOMS = {
     ],
     "precision": ["Precision", "cast", "working_precision"],
     "rendering": ["Basis", "BasisImages", "Lobe", "basis", "basis_images", "render"],
-    "scene": ["Scene"],
-    "stability": ["StabilityMap", "stability_map", "stability_maps"],
-    "shapes": ["Rectangle", "Shape", "Sphere"],
-    "pixel_choice": ["some_pixels"],
-    "surface_points": ["SurfacePoints"],
+    "scenes.scene": ["Scene"],
+    "plausibility.stability": ["StabilityMap", "stability_map", "stability_maps"],
+    "geometry.shapes": ["Rectangle", "Shape", "Sphere"],
+    "scenes.pixel_choice": ["some_pixels"],
+    "geometry.surface_points": ["SurfacePoints"],
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 

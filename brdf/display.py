@@ -11,14 +11,14 @@ import io
 import numpy as np
 from jaxtyping import Float
 
-from brdf.camera import OrthographicCamera
-from brdf.encodings import encode
-from brdf.lights import DirectionalLight
+from brdf.geometry.camera import OrthographicCamera
+from brdf.geometry.shapes import Sphere
+from brdf.images.encodings import encode
+from brdf.lights.punctual import DirectionalLight
 from brdf.models import Material, SpecularMaterial
+from brdf.plausibility.report import Report
 from brdf.rendering import render
-from brdf.report import Report
-from brdf.scene import Scene
-from brdf.shapes import Sphere
+from brdf.scenes.scene import Scene
 
 _FINEST = 65535
 _CELL = "padding:0.15em 0.8em;text-align:right;white-space:nowrap"

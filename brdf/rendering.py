@@ -1,8 +1,8 @@
 """Basis images and pictures: image = k_a B_a + k_d B_d + k_s B_s(n).
 
 A picture is linear in k_a, k_d, k_s and in the light, so rendering, fitting and relighting all read the same basis
-images. They come from the one pass over light samples of `brdf.shading`. What a scene lacks is not compiled: without
-ambient light, lights, a specular term or occluders there is no arithmetic for it.
+images. They come from the one pass over light samples of `brdf.shading.light_sum`. What a scene lacks is not compiled:
+without ambient light, lights, a specular term or occluders there is no arithmetic for it.
 """
 
 import contextlib
@@ -15,11 +15,11 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from brdf.errors import InputError
-from brdf.lobes import AveragedLobe, Lobe, StackedLobe, StoredLobe, StreamedLobe, average
+from brdf.geometry.surface_points import SurfacePoints
 from brdf.models import Material, SpecularMaterial
 from brdf.precision import Precision, cast, working_precision
-from brdf.scene import Scene
-from brdf.shading import (
+from brdf.scenes.scene import Scene
+from brdf.shading.light_sum import (
     STACKED_VALUES,
     STORED_SAMPLES,
     LightTerms,
@@ -29,8 +29,8 @@ from brdf.shading import (
     stacked_terms,
     sum_over_samples,
 )
-from brdf.surface_points import SurfacePoints
-from brdf.visibility import Lighting
+from brdf.shading.lobes import AveragedLobe, Lobe, StackedLobe, StoredLobe, StreamedLobe, average
+from brdf.shading.visibility import Lighting
 
 
 class Basis(eqx.Module):

@@ -7,36 +7,36 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from fitting.accuracy.speed_accuracy import tradeoff
+    from fitting.accuracy.speed_table import Tradeoff
     from fitting.brdf_fit import fit_brdf
     from fitting.brdf_result import BrdfFitResult
     from fitting.implicit import Sensitivity, sensitivity
     from fitting.joint import fit_jointly
-    from fitting.material_plots import overview, plot_albedo, plot_lobe, plot_reciprocity, plot_stability
     from fitting.picture_fit import fit
+    from fitting.plots.materials import overview, plot_albedo, plot_lobe, plot_reciprocity, plot_stability
     from fitting.relighting import LightFit, fit_lights, fit_lights_and_material
     from fitting.result import FitResult, Parameter
-    from fitting.speed_accuracy import tradeoff
-    from fitting.speed_table import Tradeoff
 
 _ROOM_OF = {
     "BrdfFitResult": "brdf_result",
     "FitResult": "result",
     "LightFit": "relighting",
     "Parameter": "result",
-    "Tradeoff": "speed_table",
+    "Tradeoff": "accuracy.speed_table",
     "Sensitivity": "implicit",
     "fit": "picture_fit",
     "fit_brdf": "brdf_fit",
     "fit_jointly": "joint",
     "fit_lights": "relighting",
     "fit_lights_and_material": "relighting",
-    "overview": "material_plots",
-    "plot_albedo": "material_plots",
-    "plot_lobe": "material_plots",
-    "plot_reciprocity": "material_plots",
-    "plot_stability": "material_plots",
+    "overview": "plots.materials",
+    "plot_albedo": "plots.materials",
+    "plot_lobe": "plots.materials",
+    "plot_reciprocity": "plots.materials",
+    "plot_stability": "plots.materials",
     "sensitivity": "implicit",
-    "tradeoff": "speed_accuracy",
+    "tradeoff": "accuracy.speed_accuracy",
 }
 
 __all__ = sorted(_ROOM_OF)

@@ -25,9 +25,9 @@ from jaxtyping import Float
 import brdf
 from brdf.errors import InputError
 from fitting.brdf_result import HALF, BrdfCandidate, BrdfFitResult, Losses
+from fitting.engine.separable import OneLightLobe, Optimum, Picture, fit_linear, search
 from fitting.result import Parameter
-from fitting.separable import OneLightLobe, Optimum, Picture, fit_linear, search
-from fitting.uncertainty import residual_noise, uncertainty
+from fitting.uncertainty.covariance import residual_noise, uncertainty
 
 Loss = Literal["cosine", "squared", "log"]
 N_RANGE = (0.1, 1e6)

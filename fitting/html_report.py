@@ -51,7 +51,7 @@ def report_page(result: FitResult, *, source: str = "", command: str = "") -> st
     Returns:
         The page's text; it loads nothing and runs no program.
     """
-    from fitting.material_plots import overview
+    from fitting.plots.materials import overview
 
     check = brdf.check(result.material, name=result.material.name)
     title = html.escape(f"{result.material.name} fitted to {source or 'a picture'}")

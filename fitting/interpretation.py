@@ -8,13 +8,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 import brdf
-from fitting.intervals import exponent_interval
-from fitting.noise_model import weighted_sums
+from fitting.engine.separable import Optimum
+from fitting.engine.sums import Picture
 from fitting.result import Parameter
-from fitting.separable import Optimum
-from fitting.structure import Highlight, Structure, highlight, structure
-from fitting.sums import Picture
-from fitting.uncertainty import TERMS, Uncertainty, residual_noise, uncertainty
+from fitting.uncertainty.covariance import TERMS, Uncertainty, residual_noise, uncertainty
+from fitting.uncertainty.intervals import exponent_interval
+from fitting.uncertainty.noise_model import weighted_sums
+from fitting.uncertainty.structure import Highlight, Structure, highlight, structure
 
 # An interval of n wider than this factor says nothing but its order of magnitude.
 WIDEST_INTERVAL = 100.0
@@ -32,7 +32,7 @@ class ModelFit(NamedTuple):
         free: which coefficients could be above 0, (3, C).
         n_range: between which exponents the optimum was searched.
         tied: x_s is a common factor times this, (C,); None where the channels are independent.
-        noise_factor: see `fitting.losses.Reweighted`.
+        noise_factor: see `fitting.engine.losses.Reweighted`.
         capped: k_d + k_s is held at 1 in some channel.
     """
 

@@ -11,17 +11,17 @@ from jaxtyping import Bool, Float
 
 import brdf
 from brdf.errors import InputError
+from fitting.engine.losses import LOSSES, Loss, reweight
+from fitting.engine.normal import fit_tied
+from fitting.engine.separable import Optimum, Picture, fit_linear, search
 from fitting.interpretation import Interpretation, ModelFit, coefficient_factors, interpret
-from fitting.losses import LOSSES, Loss, reweight
-from fitting.noise_model import weighted_sums
-from fitting.normal import fit_tied
 from fitting.observation import LightColour, Observation, fitted_pixels, observe, take_colour_out, weighted
 from fitting.plausible import fit_plausible, is_plausible
 from fitting.result import FitResult, free_parameters
 from fitting.selection import FAMILIES, Choice, choose
-from fitting.separable import Optimum, Picture, fit_linear, search
-from fitting.structure import nearest_peak, structure
-from fitting.uncertainty import TERMS, residual_noise
+from fitting.uncertainty.covariance import TERMS, residual_noise
+from fitting.uncertainty.noise_model import weighted_sums
+from fitting.uncertainty.structure import nearest_peak, structure
 
 N_RANGE = (0.1, 1e6)
 AUTO = ("phong", "blinn-phong")
@@ -61,7 +61,7 @@ def fit(
             integer file, or the largest value where many pixels share it exactly.
         n_range: bounds of the exponent, 0 < lower < upper.
         loss: "squared"; "relative" or "log" for high dynamic range; "huber" or "cauchy" where some pixels show what the
-            scene does not know. See `fitting.losses` for what to use when.
+            scene does not know. See `fitting.engine.losses` for what to use when.
         dark: linear value up to which pixels are too dark to count.
         noise: of the camera, (read, shot): the variance of a value is read² + shot · value, and pixels weigh by its
             inverse. None weighs all alike.
@@ -69,8 +69,8 @@ def fit(
         plausible: hold k_d + k_s <= 1 inside the fit, with a normalised form or Lambert, so that `brdf.check` passes;
             see `fitting.plausible`.
         accuracy: relative error that is good enough: the cheapest number of pixels and light samples and the cheapest
-            precision that keep it are chosen, see `fitting.budget`; the result's ``choice`` says which and why. None
-            looks at all pixels under the lights as they are.
+            precision that keep it are chosen, see `fitting.accuracy.budget`; the result's ``choice`` says which and
+            why. None looks at all pixels under the lights as they are.
         seconds: the same for the time to spend; what it buys is the most accurate fit.
 
     Returns:
@@ -79,12 +79,12 @@ def fit(
     Raises:
         InputError: naming the argument, where it cannot be used.
 
-    Source: Golub and Pereyra 1973, variable projection; see `fitting.separable`.
+    Source: Golub and Pereyra 1973, variable projection; see `fitting.engine.separable`.
     """
     start = time.perf_counter()
     targets, scenes, masks = _pictures(target, scene, mask)
     if accuracy is not None or seconds is not None:
-        from fitting.budget import fit_within
+        from fitting.accuracy.budget import fit_within
 
         how = {"mask": masks, "saturation": saturation, "n_range": n_range, "dark": dark}
         beside = {"loss": loss != "squared", "noise": noise is not None, "weight": weight is not None}

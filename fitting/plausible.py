@@ -17,11 +17,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 import brdf
+from fitting.engine.pictures import Picture
+from fitting.engine.separable import Optimum
+from fitting.engine.sums import Sums, sums
+from fitting.engine.thinning import thin
 from fitting.interpretation import coefficient_factors
-from fitting.pictures import Picture
-from fitting.separable import Optimum
-from fitting.sums import Sums, sums
-from fitting.thinning import thin
 
 GRID_STEP = 0.35
 # The grid looks at so many pixels of each picture, the polishing at all.

@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float
 
 import brdf
-from fitting.budget_choice import BudgetChoice
+from fitting.accuracy.budget_choice import BudgetChoice
+from fitting.engine.separable import Optimum
 from fitting.selection import Candidate
-from fitting.separable import Optimum
 
 NOT_DETERMINED = "not determined"
 # Beyond this relative error an interval of n is told: it is no longer symmetric.
@@ -208,7 +208,7 @@ class FitResult:
         Returns:
             A matplotlib figure.
         """
-        from fitting.plots import comparison
+        from fitting.plots.fits import comparison
 
         return comparison(self, picture)
 

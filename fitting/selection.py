@@ -24,10 +24,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from fitting.active_set import nonnegative_minimum
-from fitting.normal import Normal, design_of, normal_equations
-from fitting.separable import Optimum
-from fitting.sums import Sums
+from fitting.engine.active_set import nonnegative_minimum
+from fitting.engine.normal import Normal, design_of, normal_equations
+from fitting.engine.separable import Optimum
+from fitting.engine.sums import Sums
 
 # How many unknowns a searched exponent counts.
 SEARCHED = 4.0

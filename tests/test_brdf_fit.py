@@ -12,7 +12,7 @@ import scipy.optimize
 import brdf
 import fitting
 from brdf.errors import InputError
-from brdf.measured import from_angles
+from brdf.measured.tables import from_angles
 
 REAL = Path(os.environ.get("BRDF_REAL_DATA", Path(__file__).parents[1] / ".." / "shared" / "data"))
 real_data = pytest.mark.skipif(not REAL.is_dir(), reason=f"real data is missing: {REAL} (BRDF_REAL_DATA)")
@@ -223,7 +223,7 @@ def test_the_sentence_that_a_person_needs(name, sentence):
 
 
 def test_the_command_fits_and_checks_tables(tmp_path, capsys):
-    from fitting.cli import main
+    from fitting.cli.main import main
 
     light, view = directions(200)
     values = f_r("phong", [0.3, 0.2], [0.5, 0.5], 20.0, light, view)

@@ -25,7 +25,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run(cache: Path, tmp_path: Path):
     def command(*words: object, status: int = 0) -> subprocess.CompletedProcess[str]:
         done = subprocess.run(
-            [sys.executable, "-c", "from fitting.cli import main; main()", *map(str, words)],
+            [sys.executable, "-c", "from fitting.cli.main import main; main()", *map(str, words)],
             capture_output=True,
             text=True,
             cwd=tmp_path,
@@ -52,7 +52,7 @@ def folder(tmp_path: Path) -> Path:
 
 def test_help_names_the_commands_and_imports_no_jax(run):
     assert all(word in run("--help").stdout for word in ("fit", "render", "check"))
-    code = "import sys; from fitting.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
+    code = "import sys; from fitting.cli.main import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
     code += "assert not {'jax', 'numpy', 'matplotlib'} & set(sys.modules), 'help imports too much'"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

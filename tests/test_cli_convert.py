@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import brdf
-from fitting.cli import main
+from fitting.cli.main import main
 
 
 def run(capsys: pytest.CaptureFixture[str], *words: object, status: int = 0) -> str:

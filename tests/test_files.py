@@ -198,8 +198,9 @@ def test_a_folder_that_cannot_be_made(tmp_path):
 
 def test_interrupt_from_outside_leaves_nothing(tmp_path):
     code = """
-import sys, time
+import signal, sys, time
 from brdf.files import atomic_folder
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell in the background has it ignored
 with atomic_folder(sys.argv[1] + "/out") as folder:
     (folder / "a").write_text("x")
     print("ready", flush=True)

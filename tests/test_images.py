@@ -13,10 +13,10 @@ import numpy as np
 import OpenImageIO as oiio  # noqa: N813
 import pytest
 
-from brdf import image_file
-from brdf.encodings import decode, encode
 from brdf.errors import InputError
-from brdf.images import (
+from brdf.images import file as image_file
+from brdf.images.encodings import decode, encode
+from brdf.images.pictures import (
     ImageReader,
     read_image,
     read_layers,
@@ -413,7 +413,7 @@ def test_bands_are_the_picture(tmp_path, suffix, kind):
 def test_a_large_picture_is_read_in_bands(tmp_path, monkeypatch):
     values = random(200, 30, 3)
     raw_exr(tmp_path / "a.exr", values, "RGB", tile=16)
-    monkeypatch.setattr("brdf.image_reader._BAND_VALUES", 1000)
+    monkeypatch.setattr("brdf.images.reader._BAND_VALUES", 1000)
     np.testing.assert_array_equal(read_image(tmp_path / "a.exr"), values)
 
 
@@ -531,8 +531,8 @@ def test_a_full_disk_leaves_nothing(tmp_path, suffix, reserved):
 import resource, signal, sys
 import numpy as np
 from brdf.errors import InputError
-from brdf import image_writer
-from brdf.images import write_image
+from brdf.images import writer as image_writer
+from brdf.images.pictures import write_image
 if sys.argv[2] == "0":
     image_writer._reserve = lambda *_: None
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -655,7 +655,7 @@ def test_reading_in_threads(tmp_path):
 READ_AND_REPORT = """
 import sys
 from brdf.errors import InputError
-from brdf.images import read_image, read_layers
+from brdf.images.pictures import read_image, read_layers
 for path in sys.argv[1:]:
     for reader in (read_image, read_layers):
         try:

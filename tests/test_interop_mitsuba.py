@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import brdf
-from brdf.environment import map_directions
+from brdf.lights.environment import map_directions
 
 pytest.importorskip("mitsuba", reason="Mitsuba 3 renders the reference")
 sys.path.insert(0, str(Path(__file__).parents[1] / "data"))

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from brdf.models import BlinnPhong, NormalizedPhong
-from brdf.plausibility import check
-from brdf.stability import stability_map
-from fitting.material_plots import plot_albedo, plot_lobe, plot_reciprocity, plot_stability
+from brdf.plausibility.stability import stability_map
+from brdf.plausibility.verdict import check
+from fitting.plots.materials import plot_albedo, plot_lobe, plot_reciprocity, plot_stability
 
 
 def test_albedo_curves_cross_the_limit_where_the_report_says():

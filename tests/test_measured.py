@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 import brdf
-from brdf import measured_merl, measured_rgl, measured_text
 from brdf.errors import InputError
-from brdf.measured import from_angles, from_half_angles
+from brdf.measured import merl as measured_merl
+from brdf.measured import rgl as measured_rgl
+from brdf.measured import text as measured_text
+from brdf.measured.tables import from_angles, from_half_angles
 
 REAL = Path(os.environ.get("BRDF_REAL_DATA", Path(__file__).parents[1] / ".." / "shared" / "data"))
 real_data = pytest.mark.skipif(not REAL.is_dir(), reason=f"real data is missing: {REAL} (BRDF_REAL_DATA)")

@@ -11,10 +11,9 @@ import pytest
 import brdf
 import fitting
 from brdf.errors import InputError
-from fitting.archives import read_archive
-from fitting.cli import main
-from fitting.light_files import read_directions, read_intensities
-from fitting.photographs import (
+from fitting.cli.main import main
+from fitting.photographs.archives import read_archive
+from fitting.photographs.ball import (
     Circle,
     ball_points,
     find_circle,
@@ -22,6 +21,7 @@ from fitting.photographs import (
     light_from_shading,
     photograph_scene,
 )
+from fitting.photographs.light_files import read_directions, read_intensities
 
 REAL = Path(os.environ.get("BRDF_REAL_DATA", Path(__file__).parents[1] / ".." / "shared" / "data"))
 real_data = pytest.mark.skipif(not REAL.is_dir(), reason=f"real data is missing: {REAL} (BRDF_REAL_DATA)")

@@ -10,12 +10,12 @@ import pytest
 from labelled_brdfs import FUNCTIONS, MATERIALS, constant, dented, direction
 
 from brdf.albedo import directional_albedo
-from brdf.black_box import check_black_box
 from brdf.errors import InputError
 from brdf.models import BlinnPhong, Lambert, NormalizedBlinnPhong, NormalizedPhong, Phong
-from brdf.plausibility import check
-from brdf.quadrature import integrate
-from brdf.report import ENERGY_LIMIT, verdict
+from brdf.plausibility.black_box import check_black_box
+from brdf.plausibility.quadrature import integrate
+from brdf.plausibility.report import ENERGY_LIMIT, verdict
+from brdf.plausibility.verdict import check
 
 WORD = {True: "pass", False: "fail"}
 

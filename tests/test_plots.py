@@ -6,8 +6,8 @@ import pytest
 
 import brdf
 import fitting
-from fitting import plots
-from fitting.material_plots import overview
+from fitting.plots import fits as plots
+from fitting.plots.materials import overview
 
 SIZE = 40
 

@@ -20,7 +20,7 @@ def imported(path: Path) -> set[str]:
     return found
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "brdf").glob("*.py")), ids=lambda path: path.name)
+@pytest.mark.parametrize("path", sorted((ROOT / "brdf").rglob("*.py")), ids=lambda path: path.name)
 def test_brdf_imports_neither_fitting_nor_its_solvers(path: Path):
     roots = {name.partition(".")[0] for name in imported(path)}
     assert not roots & {"fitting", "optimistix", "lineax", "typer", "rich"}

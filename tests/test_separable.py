@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares, nnls
 
-from fitting.nonnegative import solve
-from fitting.separable import OneLightLobe, Picture, fit_linear, search
-from fitting.sums import sums
-from fitting.thinning import thin
+from fitting.engine.nonnegative import solve
+from fitting.engine.separable import OneLightLobe, Picture, fit_linear, search
+from fitting.engine.sums import sums
+from fitting.engine.thinning import thin
 
 X = np.array([[0.05, 0.03, 0.02], [0.5, 0.3, 0.1], [0.3, 0.4, 0.5]])
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from brdf.models import MODELS
-from brdf.stability import stability_map
+from brdf.plausibility.stability import stability_map
 
 
 @pytest.mark.parametrize("model", MODELS.values())

@@ -10,11 +10,11 @@ import pytest
 
 import brdf
 import fitting
-from fitting.configurations import Configuration
-from fitting.deviation import deviation
-from fitting.lamps import Lamps, with_samples
-from fitting.pixel_sampling import sample_pixels
-from fitting.speed_table import Row, Tradeoff
+from fitting.accuracy.configurations import Configuration
+from fitting.accuracy.deviation import deviation
+from fitting.accuracy.lamps import Lamps, with_samples
+from fitting.accuracy.pixel_sampling import sample_pixels
+from fitting.accuracy.speed_table import Row, Tradeoff
 
 MATERIAL = brdf.BlinnPhong(k_a=[0.2, 0.3, 0.1], k_d=[0.5, 0.3, 0.2], k_s=[0.4, 0.4, 0.4], n=60.0)
 

@@ -6,7 +6,7 @@ from scipy import optimize, stats
 
 import brdf
 import fitting
-from fitting.intervals import above_zero
+from fitting.uncertainty.intervals import above_zero
 
 CAMERA = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=(36, 36))
 BALL = brdf.Sphere(center=[0, 0, 0], radius=1)

@@ -13,7 +13,7 @@ import pytest
 
 import brdf
 from brdf.errors import InputError
-from fitting.cli import main
+from fitting.cli.main import main
 
 ROOT = Path(__file__).parents[1]
 REAL = Path(os.environ.get("BRDF_REAL_DATA", ROOT / ".." / "shared" / "data"))
@@ -274,7 +274,9 @@ def test_the_library_says_the_same_words(place):
 
 
 def command(*words: object, cwd: Path, prefix: str = "", **options) -> subprocess.Popen[str]:
-    code = prefix + "from fitting.cli import main; main()"
+    # A shell that runs the tests in the background has them ignore Ctrl-C, and what they start.
+    listen = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    code = listen + prefix + "from fitting.cli.main import main; main()"
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(cwd / ".cache")}
     return subprocess.Popen(
         [sys.executable, "-c", code, *map(str, words)],
@@ -308,9 +310,9 @@ def test_control_c_in_the_middle_leaves_nothing(place):
     before = {path for path in place.iterdir() if path.name != ".cache"}
     # The fit waits for a signal at the moment when the files of the result are being written.
     prefix = (
-        "import time, brdf.images\n"
+        "import time, brdf.images.pictures\n"
         "def slowly(*a, **k):\n    print('writing', flush=True)\n    time.sleep(60)\n"
-        "brdf.images.write_image = slowly\n"
+        "brdf.images.pictures.write_image = slowly\n"
     )
     with command("fit", "target.exr", "--scene", "scene.toml", "--out", "out", cwd=place, prefix=prefix) as process:
         assert process.stdout is not None

@@ -1,0 +1,1 @@
+"""Where things are: cameras, shapes, and what a ray meets."""

@@ -1,0 +1,179 @@
+"""Pictures written through OpenImageIO, whole or not at all, saying how they are encoded."""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import OpenImageIO as oiio  # noqa: N813
+from jaxtyping import Float32
+
+from brdf.errors import InputError
+from brdf.files import atomic_path
+from brdf.images.encodings import Encoding, encode, parse_encoding
+from brdf.images.file import quiet, said
+
+DataType = Literal["uint8", "uint16", "half", "float"]
+
+# Per suffix: the data types it can hold, the usual one first.
+_WRITABLE: dict[str, tuple[DataType, ...]] = {
+    ".exr": ("float", "half"),
+    ".hdr": ("float",),
+    ".png": ("uint8", "uint16"),
+    ".tif": ("float", "half", "uint8", "uint16"),
+    ".tiff": ("float", "half", "uint8", "uint16"),
+    ".jpg": ("uint8",),
+    ".jpeg": ("uint8",),
+}
+# The last bytes of formats whose writers do not report a full disk.
+_ENDINGS = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
+_LARGEST_HALF = 65504.0
+
+
+def write_image(
+    path: str | os.PathLike[str],
+    array: Any,
+    *,
+    dtype: DataType | None = None,
+    encoding: Encoding | None = None,
+    alpha: Any = None,
+) -> None:
+    """Write linear values as a picture, whole or not at all.
+
+    Args:
+        path: the file; its suffix chooses the format: .exr, .hdr, .png, .tif, .tiff, .jpg, .jpeg.
+        array: linear values, (H, W) or (H, W, C). In integer formats values are clipped to [0, 1] and NaN becomes 0.
+        dtype: "float" or "half" (EXR, TIFF), "uint8" or "uint16" (PNG, TIFF); None for float, or uint8
+            in PNG and JPEG.
+        encoding: integers only: "srgb" (the default), "linear" or a gamma. The file says which; where the format has no
+            words for it, that is an error.
+        alpha: coverage (H, W) to store beside the colour, not in JPEG and HDR.
+
+    Raises:
+        InputError: if format, data type, encoding and shape do not go together, or the file cannot be written.
+    """
+    suffix, kind = _format(path, dtype)
+    pixels = _pixels(path, array)
+    channels = pixels.shape[2]
+    names = {1: ["Y"], 3: ["R", "G", "B"]}.get(channels, [f"C{index:04d}" for index in range(channels)])
+    if suffix not in (".exr", ".tif", ".tiff") and channels not in (1, 3):
+        raise InputError(path, f"a {suffix} file holds 1 or 3 channels, got {channels}", "Write .exr or .tif instead")
+    if suffix == ".hdr" and channels == 1:
+        pixels, names = pixels.repeat(3, axis=2), ["R", "G", "B"]
+    wanted = parse_encoding("encoding", encoding)
+    encoded = wanted or ("srgb" if kind.startswith("uint") else "linear")
+    _check_encoding(path, suffix, kind, encoded)
+    if kind.startswith("uint"):
+        pixels = encode(np.clip(np.nan_to_num(pixels, nan=0.0), 0.0, 1.0), encoded)
+    elif kind == "half" and np.any(np.abs(pixels[np.isfinite(pixels)]) > _LARGEST_HALF):
+        raise InputError(path, f"half floats end at {_LARGEST_HALF:.0f}", 'Write dtype "float" instead')
+    if alpha is not None:
+        coverage = _pixels(path, alpha)
+        if suffix in (".hdr", ".jpg", ".jpeg") or coverage.shape != (*pixels.shape[:2], 1):
+            what = f"alpha of shape {coverage.shape[:2]} cannot go with a {suffix} of shape {pixels.shape[:2]}"
+            raise InputError(path, what, "Give alpha as (H, W), and a file that can hold it")
+        pixels, names = np.concatenate([pixels, np.clip(coverage, 0, 1)], axis=2), [*names, "A"]
+    _write(path, pixels, names, kind, encoded if kind.startswith("uint") else None)
+
+
+def write_layers(path: str | os.PathLike[str], layers: Mapping[str, Any], *, dtype: DataType = "float") -> None:
+    """Write layers of one size into an OpenEXR file, whole or not at all.
+
+    Args:
+        path: the file, .exr.
+        layers: layer name to (H, W) or (H, W, C) values; the layer "" is the picture.
+        dtype: "float" or "half".
+
+    Raises:
+        InputError: if sizes differ, there is no layer, or the file cannot be written.
+    """
+    suffix, kind = _format(path, dtype)
+    arrays = {layer: _pixels(path, array) for layer, array in layers.items()}
+    if suffix != ".exr" or len({array.shape[:2] for array in arrays.values()}) != 1:
+        raise InputError(path, "layers need an .exr file and one size", "Give arrays of one height and width")
+    names: list[str] = []
+    for layer, array in arrays.items():
+        count = array.shape[2]
+        usual = {1: "Y", 2: "XY", 3: "XYZ" if layer else "RGB", 4: "RGBA"}
+        endings = usual.get(count, [f"C{index:04d}" for index in range(count)])
+        names += [f"{layer}.{ending}" if layer else ending for ending in endings]
+    _write(path, np.concatenate(list(arrays.values()), axis=2), names, kind, None)
+
+
+def _format(path: str | os.PathLike[str], dtype: DataType | None) -> tuple[str, DataType]:
+    suffix = Path(path).suffix.lower()
+    if suffix not in _WRITABLE:
+        raise InputError(path, f"{suffix or 'no suffix'} is no image format", f"Use one of {' '.join(_WRITABLE)}")
+    kind = dtype or _WRITABLE[suffix][0]
+    if kind not in _WRITABLE[suffix]:
+        raise InputError(path, f"{suffix} cannot hold {kind}", f"Use {' or '.join(_WRITABLE[suffix])}")
+    return suffix, kind
+
+
+def _pixels(path: str | os.PathLike[str], array: Any) -> Float32[np.ndarray, "height width channels"]:
+    try:
+        pixels = np.asarray(array)
+        pixels = np.asarray(pixels, np.float32) if pixels.dtype.kind in "fiub" else None
+    except (TypeError, ValueError):
+        pixels = None
+    if pixels is None or pixels.ndim not in (2, 3) or 0 in pixels.shape:
+        shape = "no numbers" if pixels is None else f"shape {pixels.shape}"
+        raise InputError(path, f"a picture is (H, W) or (H, W, C) numbers, got {shape}", "Give such an array")
+    return np.ascontiguousarray(pixels[..., None] if pixels.ndim == 2 else pixels)
+
+
+def _check_encoding(path: str | os.PathLike[str], suffix: str, kind: str, encoding: Encoding) -> None:
+    """A file must be able to say how it is encoded, or reading it back would guess wrong."""
+    sayable: tuple[Encoding, ...] = ("srgb",)
+    if not kind.startswith("uint"):
+        sayable = ("linear",)
+    elif suffix == ".png":
+        sayable = ("srgb", "linear", 1.8, 2.2, 2.4)
+    elif kind == "uint16":
+        sayable = ("srgb", "linear")
+    if encoding not in sayable:
+        words = ", ".join(str(form) for form in sayable)
+        raise InputError(path, f"a {suffix} of {kind} cannot say that it is encoded as {encoding}", f"Use {words}")
+
+
+def _write(
+    path: str | os.PathLike[str], pixels: np.ndarray, names: list[str], kind: DataType, encoding: Encoding | None
+) -> None:
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
+    spec.channelnames = tuple(names)
+    spec.alpha_channel = names.index("A") if "A" in names else -1
+    spec.attribute("oiio:UnassociatedAlpha", 1)
+    if Path(path).suffix.lower() in (".jpg", ".jpeg"):
+        spec.attribute("CompressionQuality", 95)
+        spec.attribute("jpeg:subsampling", "4:4:4")
+    if encoding is not None:
+        power = "" if isinstance(encoding, str) else f"g{round(10 * encoding)}_rec709_scene"
+        spec.attribute("oiio:ColorSpace", power or {"srgb": "srgb_rec709_scene"}.get(str(encoding), "lin_rec709_scene"))
+    with atomic_path(path) as temporary:
+        _reserve(temporary, spec)
+        file = oiio.ImageOutput.create(str(temporary))
+        if file is None:
+            raise InputError(path, f"cannot be written ({said(oiio, temporary)})", "Use another format")
+        with quiet("png" if temporary.suffix.lower() == ".png" else ""):
+            ok = file.open(str(temporary), spec) and file.write_image(pixels)
+            ok = file.close() and ok
+        # A remark without a failure does not count: TIFF complains of Exif data that nobody asked for.
+        if not ok or not _is_complete(temporary):
+            what = f"cannot be written ({said(file, temporary)})"
+            raise InputError(path, what, "Check the space left and the size of the picture")
+
+
+def _reserve(temporary: Path, spec: oiio.ImageSpec) -> None:
+    """Find a full disk out before libjpeg does, which ends the program then."""
+    if temporary.suffix.lower() in _ENDINGS and hasattr(os, "posix_fallocate"):
+        with temporary.open("r+b") as file:
+            os.posix_fallocate(file.fileno(), 0, 3 * spec.image_bytes() // 2 + (1 << 16))
+
+
+def _is_complete(temporary: Path) -> bool:
+    """Whether a file ends as its format does; libpng's failures to write are not reported."""
+    ending = _ENDINGS.get(temporary.suffix.lower(), b"")
+    with temporary.open("rb") as file:
+        file.seek(max(0, file.seek(0, os.SEEK_END) - len(ending)))
+        return file.read() == ending

@@ -1,0 +1,1 @@
+"""Lights: each turns into light samples at a surface point."""

@@ -1,0 +1,1 @@
+"""Materials in files, presets, and what other programs load."""

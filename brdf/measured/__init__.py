@@ -1,0 +1,1 @@
+"""Measured BRDFs: tables of f_r and their files."""

@@ -1,0 +1,1 @@
+"""Positivity, reciprocity, energy; stability."""

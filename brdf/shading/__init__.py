@@ -1,0 +1,1 @@
+"""What the light samples at a point add up to."""

@@ -1,0 +1,191 @@
+"""``fit(accuracy=...)`` and ``fit(seconds=...)``: the cheapest fit that is good enough, the best that is quick enough.
+
+The first attempt is cheap: some 1000 pixels of a picture, or all of a small one; 16 samples of a light with an extent;
+float32. From its own pixels it tells its error and what makes it (`fitting.accuracy.sampling_error`), so the next
+attempt changes just that: more pixels by the square of what is missing, more light samples as far as four times as many
+still change the answer, float64 where rounding counts. Mostly one or two attempts do. The error is that against a fit
+of all pixels in float64 with `MOST_SAMPLES` samples of each light, and is the larger one of what
+`fitting.accuracy.deviation` says of the parameters and of the picture.
+"""
+
+import dataclasses
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import brdf
+from brdf.errors import InputError
+from fitting.accuracy.budget_choice import Attempt, BudgetChoice
+from fitting.accuracy.configurations import Configuration, Run, casts_shadows, run, target_size
+from fitting.accuracy.lamps import Lamps, extended
+from fitting.accuracy.sampling_error import STEP, Estimate, System, rounding_by_rule
+from fitting.result import FitResult
+
+FIRST_PIXELS, FIRST_SAMPLES, MOST_SAMPLES = 1024, 16, 4096
+# Pictures under single lights that are fitted whole at once: choosing among so few pixels takes as long as looking at
+# them. Where little error is allowed, a sample of the larger ones would hardly do.
+SMALL, SMALL_IF_FINE, FINE = 1 << 16, 1 << 18, 1e-2
+# Down to this accuracy the order of magnitude of rounding is enough to know.
+COARSE = 1e-4
+# An attempt aims at this share of the accuracy in each of the parts that its error has.
+AIM = 0.6
+# A sample of more than this share of the pixels is not worth the weighing: all are taken.
+WHOLE = 0.4
+MOST_ATTEMPTS = 8
+# Within this factor of the exponent found before the next attempt searches, where its 95 % interval is narrower.
+NEAR, NEAR_AUTO = 4.0, 16.0
+
+
+class _Step(NamedTuple):
+    run: Run
+    system: System | None
+    estimate: Estimate
+
+
+def fit_within(
+    targets: Sequence[Any],
+    scenes: Sequence[brdf.Scene],
+    model: str,
+    precision: brdf.Precision,
+    options: Mapping[str, Any],
+    beside: Mapping[str, bool],
+    *,
+    accuracy: float | None,
+    seconds: float | None,
+) -> FitResult:
+    """Fit to an accuracy, or within a time.
+
+    Args:
+        targets: pictures.
+        scenes: one for each.
+        model: "auto" or the name of a model.
+        precision: "float32" or "float64", the least that is used.
+        options: further arguments of `fitting.fit`.
+        beside: arguments that cannot be combined with this, and whether they were given.
+        accuracy: relative error, above 0; None for as small as the time allows.
+        seconds: time to spend, above 0; None for as long as it takes. The first attempt is always made.
+
+    Raises:
+        InputError: where one of them cannot be used.
+    """
+    start = time.perf_counter()
+    for name, value in (("accuracy", accuracy), ("seconds", seconds)):
+        if value is not None and (
+            isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < np.inf
+        ):
+            raise InputError(name, f"must be a number above 0, got {value!r}", "Give for example 0.001")
+    for name, given in beside.items():
+        if given:
+            came = "cannot be combined with an accuracy or a time to spend, whose estimate is for plain squares"
+            raise InputError(name, came, "Leave one of them out")
+    lamps, attempts = Lamps(), []
+    has_samples = any(extended(scene) for scene in scenes)
+    small = SMALL_IF_FINE if accuracy is not None and accuracy < FINE else SMALL
+    whole = not has_samples and max(map(target_size, targets)) <= small
+    now = Configuration(model, precision, None if whole else FIRST_PIXELS, FIRST_SAMPLES if has_samples else None)
+    n_range = None
+    while True:
+        begun = time.perf_counter()
+        step = _attempt(targets, scenes, now, options, lamps, n_range, accuracy)
+        took = time.perf_counter() - begun
+        attempts.append(Attempt(str(now), *step.estimate, took))
+        if accuracy is not None and step.estimate.bound <= accuracy:
+            break
+        after = _better(now, step, targets, accuracy)
+        if after is None or len(attempts) == MOST_ATTEMPTS:
+            break
+        growth = _work(after, step, targets) / _work(now, step, targets)
+        if seconds is not None and time.perf_counter() - start + took * max(growth, 1.0) > seconds:
+            break
+        now, n_range = after, _near(step.run.result, options)
+    looked = [target_size(t) if s is None else s.pixel.size for t, s in zip(targets, step.run.samples, strict=True)]
+    choice = BudgetChoice(
+        accuracy,
+        seconds,
+        tuple(attempts),
+        sum(looked),
+        sum(map(target_size, targets)),
+        None if accuracy is None else step.estimate.bound <= accuracy,
+    )
+    return dataclasses.replace(step.run.result, choice=choice, seconds=time.perf_counter() - start)
+
+
+def _attempt(
+    targets: Sequence[Any],
+    scenes: Sequence[brdf.Scene],
+    configuration: Configuration,
+    options: Mapping[str, Any],
+    lamps: Lamps,
+    n_range: tuple[float, float] | None,
+    accuracy: float | None,
+) -> _Step:
+    done = run(targets, scenes, configuration, options, lamps, n_range)
+    if configuration.pixels is None and configuration.samples is None and accuracy is not None:
+        shadows = any(map(casts_shadows, scenes))
+        rule = rounding_by_rule(done.result.optimum.n, configuration.precision, shadows=shadows)
+        if accuracy >= COARSE and (3 * rule < accuracy or shadows):
+            return _Step(done, None, Estimate(rule, 3 * rule, 0.0, 0.0, rule))
+    system = System(done, targets, dict(options), lamps)
+    return _Step(done, system, system.estimate(_finer(configuration.samples)))
+
+
+def _finer(samples: int | None) -> int | None:
+    """What so many light samples are compared with; None where there are none to choose, or as many as there may be."""
+    return None if samples is None or samples >= MOST_SAMPLES else min(STEP * samples, MOST_SAMPLES)
+
+
+def _better(now: Configuration, step: _Step, targets: Sequence[Any], accuracy: float | None) -> Configuration | None:
+    """The next configuration to try; None where nothing is left to improve."""
+    estimate = step.estimate
+    # Without an accuracy the largest part of the error is taken down, four times per attempt.
+    aim = AIM * accuracy if accuracy is not None else max(estimate.pixels, estimate.light, estimate.rounding) / 2.5
+    after = now
+    if now.pixels is not None and estimate.pixels > aim:
+        after = dataclasses.replace(after, pixels=_more_pixels(now.pixels, (estimate.pixels / aim) ** 2, targets))
+    if step.system is not None and now.samples is not None and estimate.light > aim / 2 and now.samples < MOST_SAMPLES:
+        samples = now.samples * STEP
+        while samples < MOST_SAMPLES and step.system.light_error(samples, min(STEP * samples, MOST_SAMPLES)) > aim / 2:
+            samples *= STEP
+        after = dataclasses.replace(after, samples=min(samples, MOST_SAMPLES))
+    if now.precision == "float32" and estimate.rounding > aim / 2:
+        after = dataclasses.replace(after, precision="float64")
+    if after != now:
+        return after
+    parts = {"pixels": estimate.pixels, "samples": estimate.light, "precision": estimate.rounding}
+    for name in sorted(parts, key=lambda name: -parts[name]):
+        if name == "pixels" and now.pixels is not None and parts[name] > 0:
+            return dataclasses.replace(now, pixels=_more_pixels(now.pixels, 2.0, targets))
+        if name == "samples" and now.samples is not None and now.samples < MOST_SAMPLES and parts[name] > 0:
+            return dataclasses.replace(now, samples=min(STEP * now.samples, MOST_SAMPLES))
+        if name == "precision" and now.precision == "float32" and parts[name] > 0:
+            return dataclasses.replace(now, precision="float64")
+    return None
+
+
+def _more_pixels(pixels: int, factor: float, targets: Sequence[Any]) -> int | None:
+    """More pixels by a factor, a power of two so that programs are compiled for few sizes; None for all."""
+    more = pixels * 2 ** max(1, int(np.ceil(np.log2(min(factor, 1e9)))))
+    return None if more > WHOLE * max(map(target_size, targets)) else more
+
+
+def _work(configuration: Configuration, step: _Step, targets: Sequence[Any]) -> float:
+    """Pixels times samples, with what every fit takes whatever its size."""
+    whole = max(map(target_size, targets))
+    pixels = whole if configuration.pixels is None else min(configuration.pixels, whole)
+    work = pixels * (configuration.samples or 1) * (2 if configuration.precision == "float64" else 1)
+    return work + 1e5 * len(step.run.scenes)
+
+
+def _near(result: FitResult, options: Mapping[str, Any]) -> tuple[float, float] | None:
+    """Bounds about the exponent found, where it is well known; None for those of the options."""
+    n = next((parameter for parameter in result.parameters if parameter.name == "n"), None)
+    if n is None or n.value is None or n.interval is None:
+        return None
+    factor = NEAR_AUTO if result.candidates else NEAR
+    inner = np.sqrt(factor)
+    if n.interval[0] < n.value / inner or n.interval[1] > n.value * inner:
+        return None
+    low, high = options["n_range"]
+    return max(low, n.value / factor), min(high, n.value * factor)

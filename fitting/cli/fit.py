@@ -1,0 +1,227 @@
+"""``brdf fit`` and ``brdf lights``: pictures, photographs of a ball, archives and measured BRDFs."""
+
+import json
+import shlex
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from fitting.cli.common import named_as, show, use_compilation_cache, waiting
+
+EXAMPLE = (
+    "Example: [bold]brdf fit photo.exr --scene scene.toml --out result/[/bold]    or, for a folder with "
+    "target.exr and scene.toml: [bold]brdf fit data/gold-ball[/bold]    a photo of a ball: "
+    "[bold]brdf fit ball.png --sphere 244.5,144.5,108 --light fit[/bold]    a measured BRDF: "
+    "[bold]brdf fit gold.binary[/bold]"
+)
+LIGHTS_EXAMPLE = "Example: [bold]brdf lights chrome.*.png --sphere 253.5,148,119.5 --out lights.txt[/bold]"
+MODEL_NAMES = ("auto", "lambert", "phong", "blinn-phong", "normalized-phong", "normalized-blinn-phong")
+LOSS_NAMES = "squared, relative, log, huber or cauchy; for a measured BRDF cosine (its default), squared or log"
+
+
+def fit(
+    target: Annotated[
+        list[Path],
+        typer.Argument(help="A picture; a folder with target.* and scene.toml; photographs; an .npz; a measured BRDF."),
+    ],
+    scene: Annotated[Path | None, typer.Option(help="The scene file; in a folder, scene.toml.")] = None,
+    within: Annotated[Path | None, typer.Option(help="The folder that paths in the scene file may not leave.")] = None,
+    model: Annotated[str, typer.Option(help=f"One of {', '.join(MODEL_NAMES)}.")] = "auto",
+    out: Annotated[Path | None, typer.Option(help="A folder for material.json, material.mtl, fitted.exr, ...")] = None,
+    precision: Annotated[str, typer.Option(help="float32 or float64.")] = "float32",
+    encoding: Annotated[str | None, typer.Option(help="linear, srgb or a gamma; default: what the file says.")] = None,
+    saturation: Annotated[float | None, typer.Option(help="Linear values from here on are clipped, not data.")] = None,
+    dark: Annotated[float | None, typer.Option(help="Linear values up to here are too dark to count.")] = None,
+    mask: Annotated[Path | None, typer.Option(help="An image: pixels that are 0 there are left out.")] = None,
+    sphere: Annotated[
+        str | None,
+        typer.Option(help="A ball in the photograph: x,y,radius in pixels from the upper left one, or: mask."),
+    ] = None,
+    normals: Annotated[
+        Path | None, typer.Option(help="Normals of the pixels: an image or .npy, x right, y up.")
+    ] = None,
+    light: Annotated[
+        str | None, typer.Option(help="Towards the light: x,y,z (right, up, to the camera), or fit: from the shading.")
+    ] = None,
+    lights: Annotated[Path | None, typer.Option(help="A text file with such a direction for each picture.")] = None,
+    intensities: Annotated[Path | None, typer.Option(help="A text file with the light's intensity for each.")] = None,
+    ambient: Annotated[
+        bool, typer.Option("--ambient", help="A photograph is lit from all around too: find k_a for that light as 1.")
+    ] = False,
+    exposure: Annotated[
+        str | None, typer.Option(help="Relative exposure, one or one each: values are divided.")
+    ] = None,
+    noise: Annotated[
+        str | None, typer.Option(help="READ,SHOT of the camera: the variance is READ² + SHOT·value.")
+    ] = None,
+    plausible: Annotated[
+        bool, typer.Option("--plausible", help="Hold k_d + k_s <= 1 with a normalised form: brdf check then passes.")
+    ] = False,
+    loss: Annotated[str | None, typer.Option(help=f"{LOSS_NAMES}.")] = None,
+    accuracy: Annotated[
+        float | None, typer.Option(help="Relative error that is good enough: as few pixels and samples as keep it.")
+    ] = None,
+    seconds: Annotated[float | None, typer.Option(help="Time to spend: the most accurate fit that it buys.")] = None,
+    plot: Annotated[bool, typer.Option("--plot", help="Also draw comparison.png into --out.")] = False,
+    report: Annotated[Path | None, typer.Option(help="One .html page with everything, to keep or to send.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")] = False,
+) -> None:
+    """Fit a model to a picture: value ± error of every parameter, with no guess to give."""
+    import brdf
+
+    if plot and out is None:
+        raise brdf.InputError("--plot", "needs a folder to draw into", "Add --out DIR")
+    with waiting("fitting") as tell:
+        if len(target) == 1 and brdf.is_measured(target[0]):
+            given = (
+                scene,
+                within,
+                encoding,
+                saturation,
+                dark,
+                mask,
+                sphere,
+                normals,
+                light,
+                lights,
+                intensities,
+                exposure,
+                noise,
+                accuracy,
+                seconds,
+            )
+            result = _fit_table(
+                target[0], model, loss, any(option is not None for option in given) or plot or report or ambient
+            )
+            if out is not None:
+                result.save(out)
+        else:
+            options = {
+                "scene": scene,
+                "within": within,
+                "sphere": sphere,
+                "normals": normals,
+                "light": light,
+                "lights": lights,
+            }
+            options |= {"intensities": intensities, "encoding": _encoding(encoding), "exposure": exposure, "mask": mask}
+            options |= {"ambient": ambient}
+            names = {"model": "--model", "precision": "--precision", "dark": "--dark", "noise": "--noise"}
+            names |= {"mask": mask, "loss": "--loss", "saturation": "--saturation", "accuracy": "--accuracy"}
+            names |= {"seconds": "--seconds"}
+            with named_as(names):
+                result = _fit_pictures(
+                    target,
+                    options,
+                    tell,
+                    model=model,
+                    precision=precision,
+                    saturation=saturation,
+                    dark=dark,
+                    noise=noise,
+                    loss=loss or "squared",
+                    plausible=plausible,
+                    accuracy=accuracy,
+                    seconds=seconds,
+                )
+            if out is not None:
+                result.save(out, plot=plot)
+            if report is not None:
+                from fitting.html_report import report_page
+
+                command = shlex.join(["brdf", *sys.argv[1:]])
+                brdf.write_text(report, report_page(result, source=target[0].name, command=command))
+    show(json.dumps(result.to_dict(), indent=2) if as_json else str(result))
+    if out is not None and not as_json:
+        show(f"saved in {out}")
+    if report is not None and not as_json:
+        show(f"wrote {report}")
+
+
+def _fit_table(path: Path, model: str, loss: str | None, has_picture_options: Any) -> Any:
+    import brdf
+
+    if has_picture_options:
+        came = "is a measured BRDF; of the options only --model, --loss, --out and --json concern it"
+        raise brdf.InputError(path, came, "Leave the others out")
+    table = brdf.load_measured(path)
+    with named_as({"model": "--model", "loss": "--loss"}):
+        use_compilation_cache()
+        import fitting
+
+        return fitting.fit_brdf(table, model, loss=loss or "cosine")  # pyright: ignore[reportArgumentType]  # refused there
+
+
+def _fit_pictures(
+    target: list[Path], options: dict[str, Any], tell: Callable[[str], None], *, noise: str | None, **how: Any
+) -> Any:
+    import brdf
+
+    # Pictures are read before JAX is imported: a damaged one is told at once.
+    read = {}
+    for index, path in enumerate(target, start=1):
+        if not path.is_dir() and path.suffix.lower() != ".npz":
+            tell(f"reading {index} of {len(target)}")
+            read[path] = brdf.read_picture(path, encoding=options["encoding"])
+    tell("fitting")
+    use_compilation_cache()
+    import fitting
+    from fitting.cli.inputs import Options, collect
+    from fitting.photographs.light_files import parse_numbers
+
+    numbers = None if noise is None else parse_numbers(noise, "--noise", 2, "READ,SHOT")
+    job = collect(target, Options(**options), read)
+    if job.note:
+        show(job.note.rstrip())
+    several = len(job.pictures) > 1
+    with named_as({"target": job.target}):
+        return fitting.fit(
+            job.pictures if several else job.pictures[0],
+            job.scenes if several else job.scenes[0],
+            mask=job.mask,
+            noise=None if numbers is None else (numbers[0], numbers[1]),
+            **how,
+        )
+
+
+def _encoding(text: str | None) -> Any:
+    if text is None:
+        return None
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def lights(
+    target: Annotated[list[Path], typer.Argument(help="Photographs of a mirror ball, one per light.")],
+    sphere: Annotated[str, typer.Option(help="The ball: x,y,radius in pixels from the upper left one, or: mask.")],
+    mask: Annotated[Path | None, typer.Option(help="An image that is white on the ball, for --sphere mask.")] = None,
+    out: Annotated[Path | None, typer.Option(help="A text file to write: a direction a line.")] = None,
+    encoding: Annotated[str | None, typer.Option(help="linear, srgb or a gamma; default: what the file says.")] = None,
+    matt: Annotated[bool, typer.Option("--matt", help="The ball is matt: the shading tells, not a highlight.")] = False,
+) -> None:
+    """Where the light comes from, by the highlight on a mirror ball: x right, y up, z to the camera."""
+    import brdf
+
+    pictures = [brdf.read_picture(path, encoding=_encoding(encoding)) for path in target]
+    inside = None if mask is None else brdf.read_mask(mask)
+    from fitting.cli.inputs import find_ball
+    from fitting.photographs.ball import ball_points, light_from_highlight, light_from_shading
+
+    circle, note = find_ball(sphere, inside, mask)
+    lines = []
+    for path, picture in zip(target, pictures, strict=True):
+        with named_as({"picture": path, "circle": "--sphere"}):
+            if matt:
+                direction = light_from_shading(picture, ball_points(picture.pixels.shape[:2], circle)).direction
+            else:
+                direction = light_from_highlight(picture, circle)
+        lines.append(" ".join(f"{value:.6f}" for value in direction))
+    text = "\n".join([*(f"# {line}" for line in note.splitlines()), *lines]) + "\n"
+    if out is not None:
+        brdf.write_text(out, text)
+    show(text.rstrip() if out is None else f"wrote {out}")

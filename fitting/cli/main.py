@@ -1,0 +1,129 @@
+"""The command ``brdf``: the front door for people who work with files.
+
+Help does not import JAX; each command imports what it needs.
+"""
+
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from fitting.cli import convert as cli_convert
+from fitting.cli import fit as cli_fit
+from fitting.cli import tradeoff as cli_tradeoff
+from fitting.cli.common import named_as, show, use_compilation_cache, waiting
+
+app = typer.Typer(
+    name="brdf",
+    help="Which few numbers make this surface look like that picture.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+)
+
+INTERRUPTED = 130  # what shells expect after Ctrl-C
+# What a wrong option raises, wherever typer keeps its parser.
+USAGE_ERROR: type[BaseException] = typer.BadParameter.__mro__[2]
+
+
+app.command(epilog=cli_fit.EXAMPLE)(cli_fit.fit)
+app.command(epilog=cli_fit.LIGHTS_EXAMPLE)(cli_fit.lights)
+
+
+@app.command(epilog="Example: [bold]brdf render material.json --scene scene.toml -o picture.exr[/bold]")
+def render(
+    material: Annotated[Path, typer.Argument(help="A .json or .mtl file.")],
+    scene: Annotated[Path, typer.Option(help="The scene file.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The picture to write: .exr, .hdr, .png, .tiff or .jpg.")],
+    precision: Annotated[str, typer.Option(help="float32 or float64.")] = "float32",
+) -> None:
+    """Render a material in a scene."""
+    with waiting("rendering"), named_as({"material": material, "precision": "--precision"}):
+        use_compilation_cache()
+        import numpy as np
+
+        import brdf
+
+        loaded = brdf.load_material(material)
+        image = brdf.render(loaded, brdf.Scene.load(scene), precision=precision)  # pyright: ignore[reportArgumentType]
+        brdf.write_image(out, np.asarray(image))
+    show(f"wrote {out}")
+
+
+@app.command(
+    epilog="Example: [bold]brdf check material.json[/bold]    or in CI: [bold]brdf check scene.mtl --json[/bold]"
+)
+def check(
+    material: Annotated[Path, typer.Argument(help="A .json, .mtl (every material is checked) or measured BRDF file.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")] = False,
+    plot: Annotated[Path | None, typer.Option(help="A picture of albedo, lobe and reciprocity to write.")] = None,
+) -> int:
+    """Is a material plausible: positive, reciprocal, energy conserving? Exit 0 if so, 1 if not, 2 if it cannot tell."""
+    with waiting("checking"):
+        use_compilation_cache()
+        import brdf
+
+        tables = {material.stem: brdf.load_measured(material)} if brdf.is_measured(material) else None
+        materials: dict[str, Any] = brdf.load_materials(material) if tables is None else tables
+        reports = {name: brdf.check(one, name=name) for name, one in materials.items()}
+        if plot is not None:
+            if len(materials) > 1:
+                raise _input_error("--plot", f"draws one material, {material} holds {len(materials)}", "Give one")
+            from fitting.plots.materials import overview
+
+            with brdf.atomic_path(plot) as path:
+                overview(next(iter(materials.values()))).savefig(path)
+    if as_json:
+        show(json.dumps({name: report.to_json() for name, report in reports.items()}, indent=2))
+    else:
+        show("\n\n".join(map(str, reports.values())))
+    verdicts = [report.plausible for report in reports.values()]
+    return 1 if False in verdicts else 2 if None in verdicts else 0
+
+
+app.command(epilog=cli_convert.EXAMPLE)(cli_convert.convert)
+app.command(epilog=cli_tradeoff.EXAMPLE)(cli_tradeoff.tradeoff)
+
+
+def _input_error(where: str, what: str, remedy: str) -> Exception:
+    from brdf.errors import InputError
+
+    return InputError(where, what, remedy)
+
+
+def main(arguments: list[str] | None = None) -> Any:
+    """Run the command; every failure of the user's making is one line on standard error and exit status 2.
+
+    Args:
+        arguments: the words after ``brdf``; None takes those of the process.
+    """
+    from brdf.errors import InputError
+
+    try:
+        status = app(args=arguments, prog_name="brdf", standalone_mode=False)
+    except InputError as error:
+        _fail(str(error))
+    except USAGE_ERROR as error:
+        _fail(f"{_words(error)} Try brdf --help.")
+    except KeyboardInterrupt:
+        _fail("interrupted.", status=INTERRUPTED)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    else:
+        if status == INTERRUPTED:  # typer turns Ctrl-C into a number
+            _fail("interrupted.", status=INTERRUPTED)
+        sys.exit(status if isinstance(status, int) else 0)
+
+
+def _words(error: Any) -> str:
+    return " ".join(error.format_message().split())
+
+
+def _fail(message: str, status: int = 2) -> None:
+    print(f"error: {message}", file=sys.stderr)  # noqa: T201  # this is the command's one line of failure
+    sys.exit(status)

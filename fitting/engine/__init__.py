@@ -1,0 +1,1 @@
+"""The separable fit: sums over pixels, and the global optimum from them."""

@@ -1,0 +1,246 @@
+"""What the fit needs of the pixels: Gram matrices of a few basis images, summed in one pass.
+
+The image is linear in ``k_a``, ``k_d``, ``k_s``, so a least-squares fit sees the pixels only through the products of
+the basis images with each other and with the target. This module computes those, for a :class:`Picture`, and nothing
+else.
+
+How a pass is made. XLA emits one loop per reduction, so some thirty separate sums would evaluate the lobe thirty times
+or store it; one variadic ``lax.reduce`` over all products evaluates it once and keeps every sum in a register. Its loop
+is vectorised only when the compiler may reorder the additions, which ``xla_cpu_enable_fast_math`` allows; the ``honor``
+flags keep NaN, infinity and division as IEEE has them. ``python -m benchmarks.engine`` prints what a pass costs.
+
+Precision. Products are formed in the pixels' own dtype and summed within a block; blocks are added in float64. The
+target enters as the residual against a reference model, and the reference is put back in float64, hence the rounding of
+a float32 pass scales with the residual and not with the picture.
+"""
+
+from collections.abc import Iterable, Sequence
+from functools import cache, partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from fitting.engine.pictures import Lobe, Picture, relative_lobe
+
+# 32768 pixels of the six or seven arrays a pass reads stay in the second-level cache.
+BLOCK = 32768
+
+# Beyond this many channels of one grey basis a matrix product is as fast and compiles in a fraction of the time.
+UNROLLED_CHANNELS = 4
+
+COMPILER_OPTIONS: dict[str, bool | int | float | str] = {
+    "xla_cpu_enable_fast_math": True,
+    "xla_cpu_fast_math_honor_nans": True,
+    "xla_cpu_fast_math_honor_infs": True,
+    "xla_cpu_fast_math_honor_division": True,
+    "xla_cpu_fast_math_honor_functions": True,
+}
+
+
+class Sums(NamedTuple):
+    """Sums over pixels, float64: all that a least-squares fit needs of pictures.
+
+    The columns are stated by :func:`sums`.
+
+    Attributes:
+        gram: Weighted products of the columns.
+        product: Weighted products of the columns with the residual against the reference model.
+        square: Weighted squares of that residual.
+        pixels: How many pixels have a weight above 0.
+    """
+
+    gram: Float[np.ndarray, "*K C R R"]
+    product: Float[np.ndarray, "*K C R"]
+    square: Float[np.ndarray, "*K C"]
+    pixels: Float[np.ndarray, "*K C"]
+
+    def about(self, reference: Float[np.ndarray, "C R"]) -> "Sums":
+        """The same sums with the residual against the reference model replaced by the target, or by another residual.
+
+        Args:
+            reference: What to add to the residual, as coefficients of the columns.
+        """
+        moved = np.einsum("...ij,...j->...i", self.gram, reference)
+        square = self.square + np.sum(reference * (2 * self.product + moved), axis=-1)
+        return Sums(self.gram, self.product + moved, square, self.pixels)
+
+
+def _columns(
+    lobe: Lobe | None, diffuse: Float[Array, "P Cb"], log_n: Float[Array, " N"], peak: Float[Array, ""]
+) -> tuple[Float[Array, "P Cb"], ...]:
+    """Diffuse, lobe, derivative by log n, and for a bracket what Hermite's cubic adds to the straight line."""
+    if log_n.shape[0] == 0:
+        return (diffuse,)
+    if lobe is None:
+        return (diffuse,) + (jnp.zeros_like(diffuse),) * (2 * log_n.shape[0])
+    value, slope = relative_lobe(lobe, log_n[0], peak, diffuse.dtype)
+    if log_n.shape[0] == 1:
+        return diffuse, value, slope
+    end_value, end_slope = relative_lobe(lobe, log_n[1], peak, diffuse.dtype)
+    step = (log_n[1] - log_n[0]).astype(diffuse.dtype)
+    # Differences are taken per pixel: taken between sums they would lose the digits that a narrow bracket lives on.
+    return diffuse, value, slope, end_value - value - step * slope, end_slope - slope
+
+
+def _reduce(products: Sequence[Float[Array, " B"]]) -> Float[Array, " S"]:
+    """All sums in one loop over the pixels."""
+    zero = np.zeros((), products[0].dtype)
+    totals = jax.lax.reduce(
+        tuple(products),
+        (zero,) * len(products),
+        lambda left, right: tuple(a + b for a, b in zip(left, right, strict=True)),
+        (0,),
+    )
+    return jnp.stack(totals).astype(jnp.float64)
+
+
+def _products(
+    columns: Sequence[Float[Array, " B"]],
+    residuals: Sequence[Float[Array, " B"]],
+    weight: Float[Array, " B"] | None,
+) -> list[Float[Array, " B"]]:
+    """Every product whose sum is wanted: upper triangle of the Gram, columns times residuals, squares, pixel count."""
+    weighted = columns if weight is None else [weight * column for column in columns]
+    products = [left * right for i, left in enumerate(weighted) for right in columns[i:]]
+    products += [left * residual for residual in residuals for left in weighted]
+    products += [residual * residual if weight is None else weight * residual * residual for residual in residuals]
+    one = jnp.ones_like(columns[0])
+    return [*products, one if weight is None else jnp.where(weight > 0, one, 0)]
+
+
+@cache
+def _places(columns: int) -> Int[np.ndarray, "R R"]:
+    """Where each entry of a Gram matrix lies in its packed upper triangle."""
+    place = np.zeros((columns, columns), int)
+    place[np.triu_indices(columns)] = np.arange(columns * (columns + 1) // 2)
+    return np.maximum(place, place.T)
+
+
+def _unpack(packed: Float[np.ndarray, "*K S"], picture: Picture, columns: int, leading: int) -> Sums:
+    """Undo the packing of :func:`_products`, and scale the ambient column, which is constant and was summed as 1."""
+    channels = picture.target.shape[1]
+    if packed.ndim == leading + 1:
+        packed = packed[..., None, :]
+        residuals = channels
+    else:
+        residuals = 1
+    triangle = columns * (columns + 1) // 2
+    last = triangle + residuals * columns
+    scale = np.ones((channels, columns))
+    scale[:, 0] = picture.ambient
+    gram = packed[..., _places(columns)] * (scale[:, :, None] * scale[:, None, :])
+    product = packed[..., triangle:last].reshape(*packed.shape[:leading], channels, columns) * scale
+    square = packed[..., last:-1].reshape(*packed.shape[:leading], channels)
+    return Sums(gram, product, square, np.broadcast_to(packed[..., -1], square.shape))
+
+
+def _block_sums(
+    picture: Picture,
+    log_n: Float[Array, " N"],
+    reference: Float[Array, "3 C"],
+    peak: Float[Array, ""],
+    inside: Bool[Array, " B"] | None,
+) -> Float[Array, "..."]:
+    """Packed sums of one block: (S,) where all channels share basis and weight, else (C, S)."""
+    target, dtype = picture.target, picture.target.dtype
+    weight = picture.weight
+    if inside is not None and weight is None:
+        weight = inside.astype(dtype)
+    elif inside is not None and weight is not None:
+        weight = jnp.where(inside if weight.ndim < 2 else inside[:, None], weight, 0)
+    lit = _columns(picture.lobe, picture.diffuse, log_n, peak)
+    channels = target.shape[1]
+    ambient = jnp.broadcast_to(picture.ambient, channels) * reference[0]
+    reference = jnp.stack([ambient, reference[1], reference[2]]).astype(dtype)
+
+    def one_group(
+        columns: Sequence[Float[Array, " B"]],
+        targets: Float[Array, "c B"],
+        weight: Float[Array, " B"] | None,
+        reference: Float[Array, "3 c"],
+    ) -> Float[Array, " S"]:
+        residuals = []
+        for channel, values in enumerate(targets):
+            model = reference[0, channel] + reference[1, channel] * columns[0]
+            if len(columns) > 1:
+                model = model + reference[2, channel] * columns[1]
+            residual = values - model
+            residuals.append(residual if weight is None else jnp.where(weight > 0, residual, 0))
+        return _reduce(_products([jnp.ones_like(columns[0]), *columns], residuals, weight))
+
+    if (
+        len({column.shape[1] for column in lit} | {1}) == 1
+        and (weight is None or weight.ndim < 2)
+        and channels <= UNROLLED_CHANNELS
+    ):
+        return one_group([column[:, 0] for column in lit], target.T, weight, reference)
+    columns = [jnp.broadcast_to(column, target.shape).T for column in lit]
+    weights = None if weight is None else jnp.broadcast_to(weight.T, target.T.shape)
+    each = jax.vmap(one_group, in_axes=(0, 0, None if weight is None else 0, 0))
+    return each(columns, target.T[:, None, :], weights, reference.T[:, :, None])
+
+
+def _all_blocks(
+    picture: Picture, log_n: Float[Array, " N"], reference: Float[Array, "3 C"], peak: Float[Array, ""]
+) -> Float[Array, " S"] | Float[Array, "C S"]:
+    """Packed sums of one picture, block after block."""
+    count = picture.target.shape[0]
+    blocks = max(1, -(-count // BLOCK))
+    size = -(-count // blocks)
+    if blocks == 1:
+        return _block_sums(picture, log_n, reference, peak, None)
+
+    def add(block: Int[Array, ""], packed: Float[Array, "..."]) -> Float[Array, "..."]:
+        # The last block starts early enough to be whole; what it shares with the one before counts once.
+        start = jnp.minimum(block * size, count - size)
+        part = picture.pixels(lambda a: jax.lax.dynamic_slice_in_dim(a, start, size))
+        inside = None if count % size == 0 else start + jnp.arange(size) >= block * size
+        return packed + _block_sums(part, log_n, reference, peak, inside)
+
+    shape = jax.eval_shape(lambda: _block_sums(picture, log_n, reference, peak, None))
+    return jax.lax.fori_loop(0, blocks, add, jnp.zeros(shape.shape, shape.dtype))
+
+
+_one_exponent = jax.jit(_all_blocks, compiler_options=COMPILER_OPTIONS)
+
+
+@partial(jax.jit, compiler_options=COMPILER_OPTIONS)
+def _many_exponents(
+    picture: Picture, log_n: Float[Array, " N"], reference: Float[Array, "3 C"], peak: Float[Array, ""]
+) -> Float[Array, "N S"] | Float[Array, "N C S"]:
+    return jax.lax.map(lambda one: _all_blocks(picture, one[None], reference, peak), log_n)
+
+
+def sums(
+    pictures: Iterable[Picture],
+    log_n: Float[np.ndarray, " N"],
+    reference: Float[np.ndarray, "C 3"],
+    *,
+    grid: bool = False,
+    peak: float | Float[np.ndarray, ""] = 0.0,
+) -> Sums:
+    """One pass over the pixels of one or many pictures, each let go before the next is asked for.
+
+    Args:
+        pictures: The pictures, or the tiles of one; at least one.
+        log_n: Natural logarithms of the exponent. None: the columns are ambient and diffuse. One: also the lobe and its
+            derivative by log n. Two make a bracket: beside value ``s_0`` and derivative ``s_0'`` at the first, the
+            columns are ``s_1 - s_0 - (log n_1 - log n_0) s_0'`` and ``s_1' - s_0'``.
+        reference: Coefficients x_a, x_d, x_s of the reference model; the lobe is that of the first exponent.
+        grid: Treat each of ``log_n`` on its own; the sums have a leading axis N.
+        peak: Take ``S exp(-n peak)`` for the lobe, its derivative and the reference; see :func:`relative_lobe`.
+
+    Returns:
+        The sums over all pixels.
+    """
+    run = _many_exponents if grid else _one_exponent
+    columns = 4 if grid else 2 + 2 * log_n.size
+    result: Sums | None = None
+    for picture in pictures:
+        part = _unpack(np.asarray(run(picture, log_n, reference.T, np.float64(peak))), picture, columns, int(grid))
+        result = part if result is None else Sums(*map(np.add, result, part))
+    assert result is not None
+    return result

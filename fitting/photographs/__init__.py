@@ -1,0 +1,1 @@
+"""What photographs need to become observations."""

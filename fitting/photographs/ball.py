@@ -1,0 +1,280 @@
+"""Photographs of a ball: what each pixel sees, and where the light comes from, without a camera file.
+
+A circle in the picture gives every normal on the ball. Pixel coordinates have the centre of the upper left pixel at
+(0, 0), x to the right and y down; directions have x to the right, y up and z to the camera, which is taken to be far
+away (orthographic, view = +z).
+
+The direction of a distant light comes from a mirror ball in the same place (`light_from_highlight`), or from the
+shading of the matt ball itself (`light_from_shading`).
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+import brdf
+from brdf.errors import InputError
+from fitting.photographs.light_files import parse_numbers
+
+# A mask whose outline is further from a circle than this share of its radius, rms, is no ball.
+ROUND = 0.05
+# So much of the outline has to be on it; the rest may be specks.
+OUTLINE = 0.8
+SMALLEST_RADIUS = 4.0
+# What belongs to a highlight: its core is looked for above one share of the brightest pixel; it reaches down to half of
+# the brightest, within a share of the radius around it.
+CORE, HIGHLIGHT, HIGHLIGHT_RADIUS = 0.9, 0.5, 0.12
+# Lambert's law is fitted where the light's cosine exceeds this, at first on pixels above this share of the brightest.
+LIT, BRIGHT = 0.15, 0.05
+
+
+class Circle(NamedTuple):
+    """The outline of a ball.
+
+    Attributes:
+        x: of its centre, in pixels to the right of the centre of the upper left pixel.
+        y: of its centre, in pixels below it.
+        radius: in pixels.
+    """
+
+    x: float
+    y: float
+    radius: float
+
+
+def parse_circle(text: str, where: str = "--sphere") -> Circle:
+    """A circle as a person types it.
+
+    Args:
+        text: "x,y,radius".
+        where: the option, for the message.
+
+    Raises:
+        InputError: where it is none.
+    """
+    values = parse_numbers(text, where, 3, "x,y,radius in pixels")
+    return check_circle(Circle(*values), where)
+
+
+def check_circle(circle: Circle, where: str = "circle") -> Circle:
+    """The circle, if it is one.
+
+    Args:
+        circle: to look at.
+        where: for the message.
+
+    Raises:
+        InputError: where a number is not finite or the radius is too small to tell a normal.
+    """
+    if not np.all(np.isfinite(circle)):
+        raise InputError(where, f"must be finite, got {tuple(circle)}", "Give x, y and radius in pixels")
+    if circle.radius < SMALLEST_RADIUS:
+        came = f"has a radius of {circle.radius:g} pixels, at least {SMALLEST_RADIUS:g} are needed"
+        raise InputError(where, came, "Give a ball that is larger in the picture")
+    return circle
+
+
+def find_circle(mask: Any) -> Circle:
+    """The ball in a mask: the circle through the outline, holes and specks disregarded.
+
+    Args:
+        mask: (H, W), true on the ball.
+
+    Raises:
+        InputError: where the mask is empty or its outline no circle.
+    """
+    mask = np.asarray(mask)
+    if mask.ndim != 2:
+        raise InputError("mask", f"must be of shape (H, W), got {mask.shape}", "Give a mask of one picture")
+    inside = mask.astype(bool)
+    rows, columns = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
+    if rows.size == 0:
+        raise InputError("mask", "is empty", "Give a mask that is white on the ball")
+    height, width = inside.shape
+    # The outermost pixels of every row and column; the outline is at their outer edge.
+    left, right = np.argmax(inside[rows], axis=1) - 0.5, width - np.argmax(inside[rows, ::-1], axis=1) - 0.5
+    top = np.argmax(inside[:, columns], axis=0) - 0.5
+    bottom = height - np.argmax(inside[::-1, columns], axis=0) - 0.5
+    x = np.concatenate([left, right, columns, columns]).astype(float)
+    y = np.concatenate([rows, rows, top, bottom]).astype(float)
+    # Area and centroid are the start, which holes and specks hardly move.
+    centre_y, centre_x = (float(np.mean(index)) for index in np.nonzero(inside))
+    circle = Circle(centre_x, centre_y, float(np.sqrt(np.count_nonzero(inside) / np.pi)))
+    near = np.ones(x.size, bool)
+    for _ in range(10):
+        distance = np.abs(np.hypot(x - circle.x, y - circle.y) - circle.radius)
+        near = distance <= max(1.0, 3 * float(np.median(distance)))
+        circle = _circle_through(x[near], y[near])
+    distance = np.abs(np.hypot(x - circle.x, y - circle.y) - circle.radius)
+    off = float(np.sqrt(np.mean(distance[near] ** 2))) / max(circle.radius, 1e-9)
+    if np.mean(near) < OUTLINE:
+        off = float(np.sqrt(np.mean(distance**2))) / max(circle.radius, 1e-9)
+    if off > ROUND:
+        came = f"is no ball: its outline is {100 * off:.0f} % of the radius off a circle"
+        raise InputError("mask", came, "Give the mask of a whole ball, or its circle")
+    return check_circle(circle, "mask")
+
+
+def _circle_through(x: Float[np.ndarray, " K"], y: Float[np.ndarray, " K"]) -> Circle:
+    """The circle of least algebraic distance (Kåsa 1976)."""
+    columns = np.stack([x, y, np.ones_like(x)], axis=1)
+    a, b, c = np.linalg.lstsq(columns, x * x + y * y, rcond=None)[0]
+    centre = 0.5 * a, 0.5 * b
+    return Circle(float(centre[0]), float(centre[1]), float(np.sqrt(max(c + centre[0] ** 2 + centre[1] ** 2, 0.0))))
+
+
+def ball_points(shape: tuple[int, int], circle: Circle) -> brdf.SurfacePoints:
+    """What the pixels of a photograph see of a ball.
+
+    Args:
+        shape: height and width of the picture.
+        circle: the ball's outline.
+
+    Returns:
+        Points on the unit ball, (H, W); the mask is true where the centre of a pixel is on the ball.
+
+    Raises:
+        InputError: where the circle is none or lies outside the picture.
+    """
+    check_circle(circle)
+    height, width = shape
+    x = (np.arange(width) - circle.x) / circle.radius
+    y = -(np.arange(height)[:, None] - circle.y) / circle.radius
+    squared = x * x + y * y
+    inside = squared < 1
+    if not inside.any():
+        came = f"{tuple(circle)} lies outside the picture of {width} x {height} pixels"
+        raise InputError("circle", came, "x is to the right, y down, from the upper left pixel")
+    normal = np.stack([*np.broadcast_arrays(x, y), np.sqrt(np.maximum(1 - squared, 0.0))], axis=-1)
+    normal = np.where(inside[..., None], normal, 0.0)
+    return brdf.SurfacePoints.from_normals(normal, position=normal)
+
+
+def _grey(picture: Any) -> Float[np.ndarray, "H W"]:
+    pixels = np.asarray(picture.pixels if isinstance(picture, brdf.Picture) else picture, np.float64)
+    if pixels.ndim not in (2, 3) or 0 in pixels.shape:
+        raise InputError("picture", f"must be of shape (H, W, C), got {pixels.shape}", "Read it with brdf.read_picture")
+    return pixels if pixels.ndim == 2 else pixels.mean(axis=-1)
+
+
+def light_from_highlight(picture: Any, circle: Circle) -> Float[np.ndarray, "3"]:
+    """Direction towards a distant light from its reflection in a mirror ball.
+
+    Args:
+        picture: linear values, (H, W, C) or (H, W), or a `brdf.Picture`, of the mirror ball.
+        circle: its outline.
+
+    Returns:
+        The unit direction, 2 (N.V) N - V at the middle of the highlight.
+
+    Raises:
+        InputError: where the ball is not in the picture or shows no highlight.
+    """
+    grey = _grey(picture)
+    points = ball_points((grey.shape[0], grey.shape[1]), circle)
+    inside = np.asarray(points.mask) & np.isfinite(grey)
+    largest = float(np.max(grey, where=inside, initial=-np.inf))
+    if not largest > 0:
+        raise InputError("picture", "is black on the mirror ball", "Give a picture with a highlight")
+    rows, columns = np.nonzero(inside & (grey >= CORE * largest))
+    if rows.size > 0.25 * np.count_nonzero(inside):
+        raise InputError("picture", "has no highlight: a quarter of the ball is as bright", "Give a darker exposure")
+    x, y = float(np.median(columns)), float(np.median(rows))
+    if not np.any(np.hypot(columns - x, rows - y) <= HIGHLIGHT_RADIUS * circle.radius):
+        # The median fell between two lights.
+        x, y = float(columns[0]), float(rows[0])
+    rows, columns = np.nonzero(inside & (grey >= HIGHLIGHT * largest))
+    for _ in range(20):
+        near = np.hypot(columns - x, rows - y) <= HIGHLIGHT_RADIUS * circle.radius
+        x, y = float(columns[near].mean()), float(rows[near].mean())
+    flat = np.array([(x - circle.x) / circle.radius, -(y - circle.y) / circle.radius])
+    z = np.sqrt(max(1 - flat @ flat, 0.0))
+    return np.array([2 * z * flat[0], 2 * z * flat[1], 2 * z * z - 1])
+
+
+class ShadingLight(NamedTuple):
+    """A distant light as the shading of a matt surface tells it.
+
+    Attributes:
+        direction: towards it, unit, (3,).
+        strength: what a pixel that faces it shows: diffuse albedo times intensity.
+        error: standard error of the direction in degrees, from the residual; a lower bound where Lambert's law is off.
+        pixels: how many told it.
+    """
+
+    direction: Float[np.ndarray, "3"]
+    strength: float
+    error: float
+    pixels: int
+
+
+def light_from_shading(picture: Any, points: brdf.SurfacePoints, *, saturation: float | None = None) -> ShadingLight:
+    """Direction of a distant light from the shading of a matt surface: Lambert's law where the light comes in.
+
+    Args:
+        picture: linear values, (H, W, C) or (H, W), or a `brdf.Picture`.
+        points: what each pixel sees.
+        saturation: linear value from which on pixels are clipped; None takes the largest code of an integer file.
+
+    Returns:
+        Direction and strength, found by reweighted least squares so that highlights and cast shadows do not pull.
+
+    Raises:
+        InputError: where fewer than ten pixels are lit or they do not determine a direction.
+    """
+    grey = _grey(picture)
+    if isinstance(picture, brdf.Picture) and saturation is None:
+        saturation = picture.saturation
+    normal, seen = np.asarray(points.normal, np.float64), np.asarray(points.mask)
+    if grey.shape != seen.shape:
+        raise InputError("picture", f"is of shape {grey.shape}, the points {seen.shape}", "Give points of its size")
+    good = seen & np.isfinite(grey)
+    if saturation is not None:
+        good &= grey < saturation
+    value, normal = grey[good], normal[good]
+    lit = value > BRIGHT * np.max(value, initial=0.0)
+    if np.count_nonzero(lit) < 10:
+        raise InputError("picture", "has fewer than ten lit pixels on the surface", "Give a brighter picture")
+    light = np.zeros(3)
+    for _ in range(100):
+        before, weight = light, lit.astype(float)
+        for _ in range(3):
+            gram = (normal * weight[:, None]).T @ normal
+            if np.linalg.matrix_rank(gram, tol=1e-9 * np.trace(gram)) < 3:
+                raise InputError("picture", "shows no surface curved enough to tell the light", "Give its direction")
+            light = np.linalg.solve(gram, (normal * weight[:, None]).T @ value)
+            residual = np.abs(value - normal @ light)
+            # Huber's weights, with the tuning constant that keeps 95 % efficiency on Gaussian noise.
+            scale = 1.345 * 1.4826 * float(np.median(residual[lit])) + 1e-12
+            weight = np.where(lit, np.minimum(1.0, scale / np.maximum(residual, 1e-300)), 0.0)
+        lit = normal @ light > LIT * np.linalg.norm(light)
+        if np.count_nonzero(lit) < 10:
+            raise InputError("picture", "has fewer than ten lit pixels on the surface", "Give a brighter picture")
+        if np.allclose(before, light, rtol=1e-9, atol=0):
+            break
+    strength = float(np.linalg.norm(light))
+    residual = (value - normal @ light)[lit]
+    covariance = np.linalg.inv(normal[lit].T @ normal[lit]) * float(np.mean(residual**2))
+    direction = light / strength
+    across = np.eye(3) - np.outer(direction, direction)
+    error = float(np.degrees(np.sqrt(0.5 * np.trace(across @ covariance @ across)) / strength))
+    return ShadingLight(direction, strength, error, int(np.count_nonzero(lit)))
+
+
+def photograph_scene(
+    points: brdf.SurfacePoints, direction: Any, intensity: Any = 1.0, *, ambient: Any = None
+) -> brdf.Scene:
+    """The scene of a photograph under one distant light.
+
+    Args:
+        points: what the pixels see.
+        direction: towards the light, (3,).
+        intensity: of it, a number or one per channel; where it is not known, 1: k_d then is k_d times the intensity.
+        ambient: intensity of the ambient light, or None.
+
+    Raises:
+        InputError: naming the argument.
+    """
+    light = brdf.DirectionalLight(direction=direction, intensity=intensity)
+    return brdf.Scene(points=points, lights=(light,), ambient=ambient)

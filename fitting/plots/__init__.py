@@ -1,0 +1,1 @@
+"""Pictures of fits, materials and trades."""

@@ -1,0 +1,193 @@
+"""95 % intervals: of a coefficient that cannot be negative, and of the exponent from its profile likelihood."""
+
+import functools
+import math
+from collections.abc import Callable, Collection
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from fitting.engine.active_set import nonnegative_minimum
+from fitting.engine.normal import grey_design, normal_equations
+from fitting.engine.polishing import solve_within
+from fitting.engine.separable import Optimum
+from fitting.engine.sums import Picture, Sums, sums
+
+NORMAL_95 = 1.959963984540054
+ONE_SIDED_95 = 1.6448536269514722
+# Farther below zero than this an estimate says that the model is wrong, not that the coefficient is surely tiny.
+LOWEST = -2.0
+# Below this relative error of n the profile is a parabola in log n to within a hundredth of the interval.
+PARABOLIC = 0.01
+# Hermite's cubic of the lobe over log n holds this far.
+WIDEST = 0.35
+SHARES = np.linspace(0.0, 1.0, 17)
+
+
+@functools.cache
+def _acceptance() -> tuple[Float[np.ndarray, " M"], Float[np.ndarray, " M"], Float[np.ndarray, " M"]]:
+    """Truths in units of the error, and between which estimates each is accepted, after Feldman and Cousins."""
+
+    def below(x: float) -> float:
+        return 0.5 * math.erfc(-x / math.sqrt(2.0))
+
+    truths = np.linspace(0.0, NORMAL_95, 41)
+    lower, upper = np.full(truths.size, -np.inf), np.full(truths.size, ONE_SIDED_95)
+    for i, truth in enumerate(truths[1:], start=1):
+        low, high = truth + ONE_SIDED_95, truth + NORMAL_95
+        for _ in range(40):
+            middle = 0.5 * (low + high)
+            other = (truth**2 - (middle - truth) ** 2) / (2 * truth)
+            enough = below(middle - truth) - below(other - truth) > 0.95
+            low, high = (low, middle) if enough else (middle, high)
+        upper[i], lower[i] = high, (truth**2 - (high - truth) ** 2) / (2 * truth)
+    return truths, lower, upper
+
+
+def above_zero(value: float, error: float) -> tuple[float, float]:
+    """The 95 % interval of a coefficient that cannot be negative.
+
+    It covers the truth in 95 % of draws wherever the truth lies, at 0 too, where it is one-sided; far from 0 it is
+    value ± 1.96 errors. Source: G. J. Feldman and R. D. Cousins, "Unified approach to the classical statistical
+    analysis of small signals", Phys. Rev. D 57 (1998) 3873-3889.
+
+    Args:
+        value: estimate without the bound; may be negative.
+        error: its standard error.
+
+    Returns:
+        Lower and upper end; 0 and infinity where the error is infinite.
+    """
+    if not math.isfinite(error):
+        return 0.0, math.inf
+    if error == 0 or value >= 2 * NORMAL_95 * error:
+        return value - NORMAL_95 * error, value + NORMAL_95 * error
+    truths, lower, upper = _acceptance()
+    estimate = max(value / error, LOWEST)
+    high = estimate + NORMAL_95 if estimate >= 0 else float(np.interp(estimate, lower[1:], truths[1:]))
+    low = 0.0 if estimate <= ONE_SIDED_95 else float(np.interp(estimate, upper, truths))
+    return low * error, high * error
+
+
+@jax.jit
+def _profile(
+    parts: Sums, width: Float[Array, ""], reference: Float[Array, "C 3"], free: Bool[Array, "C 3"], tolerance: float
+) -> Float[Array, " K"]:
+    """Least cost, summed over channels, at shares of a bracket, from the bracket's sums."""
+
+    def at(t: Float[Array, ""]) -> Float[Array, ""]:
+        return jnp.sum(solve_within(parts, t, width, reference, free, jnp.asarray(tolerance)).cost)
+
+    return jax.vmap(at)(jnp.asarray(SHARES))
+
+
+def _tied_profile(
+    parts: Sums, width: float, reference: np.ndarray, free: np.ndarray, tied: np.ndarray
+) -> Float[np.ndarray, " K"]:
+    """The same with one specular coefficient for all channels."""
+    about = parts.about(np.pad(reference, [(0, 0), (0, 3)]))
+    costs = []
+    for t in SHARES:
+        basis = np.eye(4, 6)
+        basis[2, 2:] = [1.0, t * width, t * t * (3 - 2 * t), t * t * (t - 1) * width]
+        basis[3] = 0.0
+        gram = basis @ about.gram @ basis.T
+        normal = normal_equations(gram, about.product @ basis.T, about.square, reference[:, 2], np.ones(tied.size))
+        design = grey_design(free, tied)[:, :-1]
+        gram, product = design.T @ normal.gram @ design, design.T @ normal.product
+        x = nonnegative_minimum(gram, product)
+        costs.append(normal.square - 2 * product @ x + x @ gram @ x)
+    return np.array(costs)
+
+
+def exponent_interval(
+    pictures: Collection[Picture],
+    optimum: Optimum,
+    free: Bool[np.ndarray, "3 C"],
+    n_error: float,
+    rise: float,
+    n_range: tuple[float, float],
+    *,
+    single: bool,
+    peak: float = 0.0,
+    tied: Float[np.ndarray, " C"] | None = None,
+) -> tuple[float, float]:
+    """The 95 % profile-likelihood interval of n: where the least cost rises by ``rise``.
+
+    A relative error below a hundredth needs no pixel: there the profile is a parabola in log n. Else the cost is
+    followed outwards from the optimum, two brackets of pixels' sums in the ordinary case.
+
+    Args:
+        pictures: as they were searched.
+        optimum: of the search.
+        free: which coefficients may be above 0, (3, C).
+        n_error: standard error of n.
+        rise: of the cost; see `fitting.uncertainty.covariance.Uncertainty`.
+        n_range: bounds of the search.
+        single: whether the pixels are float32.
+        peak: logarithm of the lobe's cosine in the pixel nearest to its centre.
+        tied: x_s is a common factor times this, (C,); None where the channels are independent.
+
+    Returns:
+        Lower and upper end; 0 and infinity where the cost does not rise before the bound of the search.
+    """
+    relative = n_error / optimum.n
+    bounds = math.log(n_range[0]), math.log(n_range[1])
+    centre = math.log(optimum.n)
+    inside = bounds[0] < centre - 3 * relative and centre + 3 * relative < bounds[1]
+    if relative < PARABOLIC and inside:
+        return optimum.n * math.exp(-NORMAL_95 * relative), optimum.n * math.exp(NORMAL_95 * relative)
+    first = min(max(1.1 * NORMAL_95 * relative, 1e-3), WIDEST)
+    limit = float(np.sum(optimum.cost)) + rise
+    tolerance = np.float64(2e-7 if single else 1e-14)
+
+    # Relative to the nearest pixel the lobe keeps its size where no pixel sees the centre; see `fitting.engine.sums`.
+    reference = optimum.x.T * [1.0, 1.0, math.exp(optimum.n * peak)]
+
+    def costs(low: float, high: float) -> np.ndarray:
+        with jax.enable_x64(True):
+            parts = sums(pictures, np.array([low, high]), reference, peak=peak)
+            if tied is not None:
+                return _tied_profile(parts, high - low, reference, free, tied)
+            return np.asarray(_profile(parts, np.float64(high - low), reference, free.T, tolerance))
+
+    ends = []
+    for sign, bound in zip((-1, 1), bounds, strict=True):
+        ends.append(_follow(costs, centre, sign, bound, first, limit))
+    return (0.0 if ends[0] is None else math.exp(ends[0])), (math.inf if ends[1] is None else math.exp(ends[1]))
+
+
+def _follow(
+    costs: Callable[[float, float], np.ndarray],
+    centre: float,
+    sign: int,
+    bound: float,
+    width: float,
+    limit: float,
+) -> float | None:
+    """Where the profile crosses the limit on one side of the optimum, in log n; None where it does not."""
+    start = centre
+    while (bound - start) * sign > 1e-9:
+        end = bound if (bound - start) * sign < width else start + sign * width
+        low, high = min(start, end), max(start, end)
+        cost = costs(low, high)
+        position = low + SHARES * (high - low)
+        if sign < 0:
+            cost, position = cost[::-1], position[::-1]
+        above = np.flatnonzero(cost > limit)
+        if above.size:
+            return _crossing(position, cost, limit, int(above[0]))
+        start, width = end, WIDEST
+    return None
+
+
+def _crossing(position: np.ndarray, cost: np.ndarray, limit: float, first: int) -> float:
+    """Interpolated in the square root of the rise, which is nearly straight."""
+    if first == 0:
+        return float(position[0])
+    least = min(float(cost[0]), limit)
+    root = np.sqrt(np.maximum(cost[first - 1 : first + 1] - least, 0.0))
+    share = (math.sqrt(limit - least) - root[0]) / max(root[1] - root[0], np.finfo(float).tiny)
+    return float(position[first - 1] + min(max(share, 0.0), 1.0) * (position[first] - position[first - 1]))

@@ -1,0 +1,146 @@
+"""Noise that grows with brightness: found in the residual, and taken into account in the errors.
+
+The formula for standard errors wants to know how large the noise is where a parameter is seen. A sharp highlight is
+seen in a few bright pixels; if noise is a share of the value, or shot noise, it is larger there than in most of it,
+and a single variance would make n and k_s look far better known than they are. So the squared residual of some
+thousand pixels is regressed on the fitted value: variance = a + b value + c value². Where that says no more than a
+constant does, nothing changes; else the covariance becomes H⁻¹ (Σ v JᵀJ) H⁻¹ with the variance v of each pixel (the
+sandwich of Eicker 1967, Huber 1967 and White 1980, but with a smooth v: squared residuals themselves are too few in a
+highlight of three pixels).
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fitting.engine.active_set import nonnegative_minimum
+from fitting.engine.pictures import AnyArray, Picture
+from fitting.engine.separable import Optimum
+from fitting.engine.sums import Sums, sums
+
+# A correlation of squared residual and value within so many of its standard errors is chance.
+CHANCE = 4.0
+# So many times the likelihood has to rise (its logarithm, twice) before the variance is taken to vary.
+RISE = 20.0
+# Below this ratio of the largest to the mean variance it makes no difference.
+EVEN = 1.2
+MOST_VALUES = 4096
+ROUNDS = 6
+
+
+class NoiseModel(NamedTuple):
+    """The variance of a channel's scaled residual: a + b value + c value², of the fitted value.
+
+    Attributes:
+        coefficients: a, b, c of each channel, (C, 3), at least 0.
+    """
+
+    coefficients: Float[np.ndarray, "C 3"]
+
+    def variance(self, value: Float[np.ndarray, "M C"]) -> Float[np.ndarray, "M C"]:
+        """Of values.
+
+        Args:
+            value: fitted ones.
+        """
+        a, b, c = self.coefficients.T
+        value = np.maximum(value, 0.0)
+        return a + value * (b + value * c)
+
+
+def noise_model(
+    residual: Float[np.ndarray, "M C"], value: Float[np.ndarray, "M C"], least: Float[np.ndarray, " C"]
+) -> NoiseModel | None:
+    """Find out whether noise grows with brightness.
+
+    Args:
+        residual: of some pixels that count, times the root of their weight.
+        value: what was fitted there.
+        least: standard deviation that rounding alone gives, (C,).
+
+    Returns:
+        The variance as a function of the value; None where a constant does as well.
+    """
+    if len(residual) < 10 * ROUNDS:
+        return None
+    squared = residual**2
+    centred, deviation = value - value.mean(axis=0), squared - squared.mean(axis=0)
+    scale = np.sqrt(np.sum(centred**2, axis=0) * np.sum(deviation**2, axis=0))
+    correlation = np.sum(centred * deviation, axis=0) / np.maximum(scale, np.finfo(float).tiny)
+    if np.max(correlation) * np.sqrt(len(value)) < CHANCE:
+        return None
+    stride = -(-len(value) // MOST_VALUES)
+    squared, value = squared[::stride], np.maximum(value[::stride], 0.0)
+    fitted = [_one_channel(squared[:, c], value[:, c], least[c] ** 2) for c in range(value.shape[1])]
+    model = NoiseModel(np.array([coefficients for coefficients, _ in fitted]))
+    variance = model.variance(value)
+    varied = np.max(variance, axis=0) > EVEN * np.mean(variance, axis=0)
+    return model if np.any(varied & (np.array([rise for _, rise in fitted]) > RISE)) else None
+
+
+def _one_channel(squared: np.ndarray, value: np.ndarray, least: float) -> tuple[np.ndarray, float]:
+    """Coefficients, and twice the rise of the logarithm of the likelihood over a constant variance."""
+    largest = max(float(np.max(value)), np.finfo(float).tiny)
+    columns = np.stack([np.ones_like(value), value / largest, (value / largest) ** 2])
+    constant = max(float(np.mean(squared)), least, np.finfo(float).tiny)
+    coefficients = np.array([constant, 0.0, 0.0])
+    variance = np.full(value.size, constant)
+    for _ in range(ROUNDS):
+        # The variance of a squared residual is twice its mean squared; scaled, so that no digit is lost.
+        scaled = columns / variance
+        coefficients = nonnegative_minimum(scaled @ scaled.T, scaled @ (squared / variance))
+        coefficients[0] = max(coefficients[0], least, 1e-6 * constant)
+        variance = coefficients @ columns
+    rise = np.sum(np.log(constant / variance) + squared / constant - squared / variance)
+    return coefficients / largest ** np.arange(3), float(rise)
+
+
+@eqx.filter_jit
+def _reweighted(
+    picture: Picture,
+    n: Float[AnyArray, ""],
+    x: Float[AnyArray, "3 C"],
+    coefficients: Float[AnyArray, "C 3"],
+    inverse: bool,
+) -> Float[Array, "P C"]:
+    dtype = picture.target.dtype
+    x, coefficients = jnp.asarray(x).astype(dtype), jnp.asarray(coefficients).astype(dtype)
+    model = x[0] * jnp.asarray(picture.ambient).astype(dtype) + x[1] * picture.diffuse
+    if picture.lobe is not None:
+        model = model + x[2] * picture.lobe(jnp.asarray(n))[0]
+    value = jnp.maximum(jnp.broadcast_to(model, picture.target.shape), 0.0)
+    variance = coefficients[:, 0] + value * (coefficients[:, 1] + value * coefficients[:, 2])
+    weight = jnp.ones((1, 1), dtype) if picture.weight is None else picture.weight.reshape(value.shape[0], -1)
+    return weight / variance if inverse else weight * variance
+
+
+def weighted_sums(pictures: Sequence[Picture], optimum: Optimum, noise: NoiseModel, *, inverse: bool) -> Sums:
+    """Sums at the optimum with each pixel's weight times its variance, or divided by it: one more pass.
+
+    Args:
+        pictures: as they were searched.
+        optimum: of the search.
+        noise: what the variance is.
+        inverse: divide.
+
+    Returns:
+        The sums, columns ambient, diffuse, lobe, derivative by n, about the target.
+    """
+    n, again = np.asarray(optimum.n), []
+    for picture in pictures:
+        weight = _reweighted(picture, n, optimum.x, noise.coefficients, inverse)
+        again.append(eqx.tree_at(lambda p: p.weight, picture, weight, is_leaf=lambda leaf: leaf is None))
+    with jax.enable_x64(True):
+        has_lobe = any(picture.lobe is not None for picture in again)
+        parts = sums(again, np.log([optimum.n]) if has_lobe else np.zeros(0), optimum.x.T)
+    parts = parts.about(np.pad(optimum.x.T, [(0, 0), (0, 1)]) if has_lobe else optimum.x.T[:, :2])
+    wide = 4 - parts.gram.shape[-1]
+    gram = np.pad(parts.gram, [(0, 0), (0, wide), (0, wide)])
+    product = np.pad(parts.product, [(0, 0), (0, wide)])
+    by_n = np.array([1.0, 1.0, 1.0, 1.0 / optimum.n])
+    return Sums(gram * by_n[:, None] * by_n, product * by_n, parts.square, parts.pixels)
