@@ -3,7 +3,10 @@
 import json
 import os
 import re
+import struct
+import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,14 +16,8 @@ import fitting
 from brdf.errors import InputError
 from fitting.cli.main import main
 from fitting.photographs.archives import read_archive
-from fitting.photographs.ball import (
-    Circle,
-    ball_points,
-    find_circle,
-    light_from_highlight,
-    light_from_shading,
-    photograph_scene,
-)
+from fitting.photographs.ball import ball_points, light_from_highlight, light_from_shading, photograph_scene
+from fitting.photographs.circle import Circle, find_circle
 from fitting.photographs.light_files import read_directions, read_intensities
 
 REAL = Path(os.environ.get("BRDF_REAL_DATA", Path(__file__).parents[1] / ".." / "shared" / "data"))
@@ -218,6 +215,19 @@ def photographs(tmp_path):
     return tmp_path
 
 
+def write_silent(path: str, pixels: np.ndarray, encoding: Any, dtype: str) -> None:
+    """A PNG file without a word about its encoding: magic, header, one block of pixels, end."""
+    largest = np.iinfo(dtype).max
+    codes = np.round(brdf.encode(pixels.astype(np.float32), encoding) * largest).astype(f">u{np.dtype(dtype).itemsize}")
+    height, width, channels = codes.shape
+    header = struct.pack(">IIBBBBB", width, height, 8 * codes.itemsize, {1: 0, 3: 2}[channels], 0, 0, 0)
+    rows = b"".join(b"\0" + row.tobytes() for row in codes)
+    content = b"\x89PNG\r\n\x1a\n"
+    for kind, data in ((b"IHDR", header), (b"IDAT", zlib.compress(rows)), (b"IEND", b"")):
+        content += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    Path(path).write_bytes(content)
+
+
 def k_d(text: str) -> float:
     values = [one for one in json.loads(text[text.index("{") :])["parameters"] if one["name"] == "k_d"]
     return values[0]["value"]
@@ -237,6 +247,39 @@ def test_several_photographs_in_one_command(photographs, capsys, monkeypatch):
     status, out, _ = run(capsys, *shared, "--sphere", "mask", "--mask", "mask.png", "--lights", "lights.txt")
     assert "ball found at 30." in out
     assert k_d(out) == pytest.approx(0.8, rel=0.02)  # the circle is known to a third of a pixel
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16"])
+@pytest.mark.parametrize("encoding", ["linear", "srgb"])
+def test_a_file_that_does_not_say_its_encoding_is_read_as_the_model_explains_it(
+    tmp_path, capsys, monkeypatch, dtype, encoding
+):
+    monkeypatch.chdir(tmp_path)
+    write_silent("ball.png", shaded((0.3, 0.4, 0.86)), encoding, dtype)
+    assert brdf.read_picture("ball.png").source == "assumed"
+    words = ["fit", "ball.png", "--sphere", f"{BALL.x},{BALL.y},{BALL.radius}", "--light", "fit"]
+    status, out, err = run(capsys, *words, "--model", "lambert", "--json")
+    assert status == 0, err
+    report = json.loads(out)
+    assert k_d(out) == pytest.approx(0.8, rel=0.01)  # 8-bit codes
+    assumed = "srgb" if dtype == "uint8" else "linear"
+    told = [one for one in report["warnings"] if "does not say how its values are encoded" in one]
+    assert len(told) == (encoding != assumed)
+    # What the user says stands, however little it explains.
+    wrong = "linear" if encoding == "srgb" else "srgb"
+    _, out, _ = run(capsys, *words, "--encoding", wrong, "--model", "lambert", "--json")
+    assert k_d(out) != pytest.approx(0.8, rel=0.05)
+    assert "encoded" not in out
+
+
+def test_a_picture_that_fits_both_ways_says_that_its_encoding_is_a_guess(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    dirt = np.random.default_rng(5).uniform(0.1, 1.0, (*SHAPE, 1))
+    write_silent("ball.png", shaded((0, 0, 1)) * dirt, "srgb", "uint8")
+    circle = f"{BALL.x},{BALL.y},{BALL.radius}"
+    status, out, err = run(capsys, "fit", "ball.png", "--sphere", circle, "--light", "0,0,1", "--model", "lambert")
+    assert status == 0, err
+    assert len(re.findall("sRGB is a guess, it leaves .* linear", out)) == 1
 
 
 def test_normals_and_archives_say_the_same(photographs, capsys, monkeypatch):

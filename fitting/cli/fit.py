@@ -74,6 +74,7 @@ def fit(
 
     if plot and out is None:
         raise brdf.InputError("--plot", "needs a folder to draw into", "Add --out DIR")
+    notes: tuple[str, ...] = ()
     with waiting("fitting") as tell:
         if len(target) == 1 and brdf.is_measured(target[0]):
             given = (
@@ -113,7 +114,7 @@ def fit(
             names |= {"mask": mask, "loss": "--loss", "saturation": "--saturation", "accuracy": "--accuracy"}
             names |= {"seconds": "--seconds"}
             with named_as(names):
-                result = _fit_pictures(
+                result, notes = _fit_pictures(
                     target,
                     options,
                     tell,
@@ -134,7 +135,10 @@ def fit(
 
                 command = shlex.join(["brdf", *sys.argv[1:]])
                 brdf.write_text(report, report_page(result, source=target[0].name, command=command))
-    show(json.dumps(result.to_dict(), indent=2) if as_json else str(result))
+    if as_json:
+        show(json.dumps(result.to_dict() | ({"notes": notes} if notes else {}), indent=2))
+    else:
+        show("\n".join([*notes, str(result)]))
     if out is not None and not as_json:
         show(f"saved in {out}")
     if report is not None and not as_json:
@@ -157,34 +161,22 @@ def _fit_table(path: Path, model: str, loss: str | None, has_picture_options: An
 
 def _fit_pictures(
     target: list[Path], options: dict[str, Any], tell: Callable[[str], None], *, noise: str | None, **how: Any
-) -> Any:
-    import brdf
+) -> tuple[Any, tuple[str, ...]]:
+    """The fit, and what was found out on the way."""
+    from fitting.cli.first_look import Options, read_first
 
     # Pictures are read before JAX is imported: a damaged one is told at once.
-    read = {}
-    for index, path in enumerate(target, start=1):
-        if not path.is_dir() and path.suffix.lower() != ".npz":
-            tell(f"reading {index} of {len(target)}")
-            read[path] = brdf.read_picture(path, encoding=options["encoding"])
+    given = Options(**options)
+    read = read_first(target, given, tell)
     tell("fitting")
     use_compilation_cache()
-    import fitting
-    from fitting.cli.inputs import Options, collect
+    from fitting.cli.encoding_trial import fit_either
+    from fitting.cli.inputs import collect
     from fitting.photographs.light_files import parse_numbers
 
     numbers = None if noise is None else parse_numbers(noise, "--noise", 2, "READ,SHOT")
-    job = collect(target, Options(**options), read)
-    if job.note:
-        show(job.note.rstrip())
-    several = len(job.pictures) > 1
-    with named_as({"target": job.target}):
-        return fitting.fit(
-            job.pictures if several else job.pictures[0],
-            job.scenes if several else job.scenes[0],
-            mask=job.mask,
-            noise=None if numbers is None else (numbers[0], numbers[1]),
-            **how,
-        )
+    how["noise"] = None if numbers is None else (numbers[0], numbers[1])
+    return fit_either(read, lambda pictures: collect(target, given, pictures), how)
 
 
 def _encoding(text: str | None) -> Any:
@@ -209,19 +201,22 @@ def lights(
 
     pictures = [brdf.read_picture(path, encoding=_encoding(encoding)) for path in target]
     inside = None if mask is None else brdf.read_mask(mask)
-    from fitting.cli.inputs import find_ball
+    from fitting.cli.first_look import check_ball, find_ball
+
+    circle, notes = find_ball(sphere, inside, mask)
+    for picture in pictures:
+        check_ball(picture.pixels.shape[:2], circle)
     from fitting.photographs.ball import ball_points, light_from_highlight, light_from_shading
 
-    circle, note = find_ball(sphere, inside, mask)
     lines = []
     for path, picture in zip(target, pictures, strict=True):
-        with named_as({"picture": path, "circle": "--sphere"}):
+        with named_as({"picture": path}):
             if matt:
                 direction = light_from_shading(picture, ball_points(picture.pixels.shape[:2], circle)).direction
             else:
                 direction = light_from_highlight(picture, circle)
         lines.append(" ".join(f"{value:.6f}" for value in direction))
-    text = "\n".join([*(f"# {line}" for line in note.splitlines()), *lines]) + "\n"
+    text = "\n".join([*(f"# {line}" for line in notes), *lines]) + "\n"
     if out is not None:
         brdf.write_text(out, text)
     show(text.rstrip() if out is None else f"wrote {out}")
