@@ -24,37 +24,50 @@ from fitting.engine import sums as summing
 from fitting.engine.separable import OneLightLobe, Picture, search
 
 N = 80.0
+TO_LIGHT = np.array([0.5, 0.6, 0.7]) / np.linalg.norm([0.5, 0.6, 0.7])
 X = np.array([[0.05, 0.03, 0.02], [0.5, 0.3, 0.1], [0.3, 0.4, 0.5]])
 
 
-def cosines(size: int) -> tuple[np.ndarray, np.ndarray]:
-    """N.L and log(N.H) of a rectangular picture full of directions: a paraboloid under one directional light."""
+def normals(size: int) -> np.ndarray:
+    """Normals of a rectangular picture full of directions, a paraboloid, (size, size, 3)."""
     at = np.linspace(-0.8, 0.8, size)
     slope_u, slope_v = np.meshgrid(at, at)
-    to_light = np.array([0.5, 0.6, 0.7]) / np.linalg.norm([0.5, 0.6, 0.7])
-    half = to_light + np.array([0.0, 0.0, 1.0])
+    return np.stack([slope_u, slope_v, np.ones_like(slope_u)], -1) / np.sqrt(1 + slope_u**2 + slope_v**2)[..., None]
+
+
+def cosines(size: int) -> tuple[np.ndarray, np.ndarray]:
+    """N.L and log(N.H) of those normals under one directional light, the view along z."""
+    half = TO_LIGHT + np.array([0.0, 0.0, 1.0])
     half /= np.linalg.norm(half)
-    length = np.sqrt(1 + slope_u**2 + slope_v**2).ravel()
-    u, v = slope_u.ravel(), slope_v.ravel()
-    n_dot_l = np.maximum((u * to_light[0] + v * to_light[1] + to_light[2]) / length, 0)
+    normal = normals(size).reshape(-1, 3)
     # |N - H|^2 / 2 = 1 - N.H without cancellation near the peak.
-    apart = (u / length - half[0]) ** 2 + (v / length - half[1]) ** 2 + (1 / length - half[2]) ** 2
-    return n_dot_l, np.log1p(-apart / 2)
+    return np.maximum(normal @ TO_LIGHT, 0), np.log1p(-np.sum((normal - half) ** 2, axis=1) / 2)
+
+
+def observe(size: int, noise: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """N.L, log(N.H) and the noisy target over the pixels, in float64."""
+    n_dot_l, log_cos = cosines(size)
+    target = (X.T @ np.stack([np.ones_like(n_dot_l), n_dot_l, np.exp(N * log_cos)])).T
+    return n_dot_l, log_cos, target + noise * np.random.default_rng(0).standard_normal(target.shape)
+
+
+def one_pass(n_dot_l: np.ndarray, log_cos: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The unit: the least that anything that looks at all pixels in NumPy can do."""
+    columns = np.stack([np.ones_like(n_dot_l), n_dot_l, np.exp(N * log_cos)])
+    return columns @ columns.T, columns @ target
+
+
+def on_device(n_dot_l: np.ndarray, log_cos: np.ndarray, target: np.ndarray, dtype: type) -> Picture:
+    """The arrays of the engine."""
+    with jax.enable_x64(True):
+        lobe = OneLightLobe(*(jax.device_put(a.astype(dtype)) for a in (log_cos, np.ones((log_cos.size, 1)))))
+        return Picture(*(jax.device_put(a.astype(dtype)) for a in (target, n_dot_l[:, None])), lobe)
 
 
 def prepare(size: int, noise: float, dtype: type) -> tuple[Picture, Callable[[], Any]]:
     """The arrays of the engine on the device, and the pass over the same pixels."""
-    n_dot_l, log_cos = cosines(size)
-    target = (X.T @ np.stack([np.ones_like(n_dot_l), n_dot_l, np.exp(N * log_cos)])).T
-    target += noise * np.random.default_rng(0).standard_normal(target.shape)
-
-    def one_pass() -> tuple[np.ndarray, np.ndarray]:
-        columns = np.stack([np.ones_like(n_dot_l), n_dot_l, np.exp(N * log_cos)])
-        return columns @ columns.T, columns @ target
-
-    with jax.enable_x64(True):
-        lobe = OneLightLobe(*(jax.device_put(a.astype(dtype)) for a in (log_cos, np.ones((log_cos.size, 1)))))
-        return Picture(*(jax.device_put(a.astype(dtype)) for a in (target, n_dot_l[:, None])), lobe), one_pass
+    arrays = observe(size, noise)
+    return on_device(*arrays, dtype), lambda: one_pass(*arrays)
 
 
 def peak_memory(*, reset: bool = False) -> float:
