@@ -4,17 +4,22 @@ import csv
 import dataclasses
 import io
 import json
+import types
 
+import jax
 import numpy as np
 import pytest
 
 import brdf
 import fitting
+from fitting.accuracy import budget
 from fitting.accuracy.configurations import Configuration
 from fitting.accuracy.deviation import deviation
 from fitting.accuracy.lamps import Lamps, with_samples
 from fitting.accuracy.pixel_sampling import sample_pixels
+from fitting.accuracy.sampling_error import Estimate
 from fitting.accuracy.speed_table import Row, Tradeoff
+from fitting.accuracy.stopwatch import take
 
 MATERIAL = brdf.BlinnPhong(k_a=[0.2, 0.3, 0.1], k_d=[0.5, 0.3, 0.2], k_s=[0.4, 0.4, 0.4], n=60.0)
 
@@ -112,6 +117,30 @@ def test_the_time_to_spend_ends_the_search():
     assert len(result.choice.attempts) == 1
     assert "chosen" in str(result)
     assert result.to_dict()["choice"]["seconds"] == 1e-6
+
+
+@pytest.mark.parametrize(("error", "narrowed"), [(0.01, (15.0, 240.0)), (1.0, None)])
+def test_the_next_search_is_narrow_only_where_the_estimate_can_be_believed(error, narrowed):
+    n = types.SimpleNamespace(name="n", value=60.0, interval=(59.0, 61.0))
+    run = types.SimpleNamespace(result=types.SimpleNamespace(parameters=[n], candidates=()))
+    step = types.SimpleNamespace(run=run, estimate=Estimate(error, error, 0.0, error, 0.0))
+    assert budget._near(step, {"n_range": (0.1, 1e6)}) == narrowed
+
+
+@pytest.mark.parametrize(
+    ("order", "error", "allowed", "samples"), [(1, 0.4, 0.01, 1024), (2, 0.1, 1e-4, 512), (1, 0.9, 0.01, 64)]
+)
+def test_light_samples_grow_as_their_error_falls(order, error, allowed, samples):
+    system = types.SimpleNamespace(light_error=lambda count, finer: error * (16 / count) ** order)
+    assert budget._more_samples(16, system, Estimate(error, error, 0.0, error, 0.0), allowed) == samples
+
+
+def test_the_compiler_is_no_part_of_a_run():
+    double = jax.jit(lambda x: 2 * x)
+    (_, first), (_, second) = take(lambda: double(1.0)), take(lambda: double(1.0))
+    assert first.compiling > 0
+    assert second.compiling == 0
+    assert first.seconds < first.compiling
 
 
 @pytest.mark.parametrize("accuracy", [0, -1.0, "fine", True, float("nan")])

@@ -20,7 +20,7 @@ from brdf.errors import InputError
 from fitting.accuracy.budget_choice import Attempt, BudgetChoice
 from fitting.accuracy.configurations import Configuration, Run, casts_shadows, run, target_size
 from fitting.accuracy.lamps import Lamps, extended
-from fitting.accuracy.sampling_error import STEP, Estimate, System, rounding_by_rule
+from fitting.accuracy.sampling_error import MARGIN, STEP, Estimate, System, rounding_by_rule
 from fitting.result import FitResult
 
 FIRST_PIXELS, FIRST_SAMPLES, MOST_SAMPLES = 1024, 16, 4096
@@ -31,9 +31,16 @@ SMALL, SMALL_IF_FINE, FINE = 1 << 16, 1 << 18, 1e-2
 COARSE = 1e-4
 # An attempt aims at this share of the accuracy in each of the parts that its error has.
 AIM = 0.6
+# The light samples may use this share of it where all pixels are looked at.
+WHOLE_AIM = 0.9
+# With N light samples their error is taken to fall no slower and no faster than N to these powers, downwards.
+RATES = 0.5, 2.0
 # A sample of more than this share of the pixels is not worth the weighing: all are taken.
 WHOLE = 0.4
 MOST_ATTEMPTS = 8
+# An estimate is of first order. Where it is larger than this the parameters may be anywhere: the next attempt goes one
+# step and searches all exponents.
+SMALL_ERROR = 0.5
 # Within this factor of the exponent found before the next attempt searches, where its 95 % interval is narrower.
 NEAR, NEAR_AUTO = 4.0, 16.0
 
@@ -99,7 +106,7 @@ def fit_within(
         growth = _work(after, step, targets) / _work(now, step, targets)
         if seconds is not None and time.perf_counter() - start + took * max(growth, 1.0) > seconds:
             break
-        now, n_range = after, _near(step.run.result, options)
+        now, n_range = after, _near(step, options)
     looked = [target_size(t) if s is None else s.pixel.size for t, s in zip(targets, step.run.samples, strict=True)]
     choice = BudgetChoice(
         accuracy,
@@ -122,13 +129,13 @@ def _attempt(
     accuracy: float | None,
 ) -> _Step:
     done = run(targets, scenes, configuration, options, lamps, n_range)
-    if configuration.pixels is None and configuration.samples is None and accuracy is not None:
-        shadows = any(map(casts_shadows, scenes))
-        rule = rounding_by_rule(done.result.optimum.n, configuration.precision, shadows=shadows)
-        if accuracy >= COARSE and (3 * rule < accuracy or shadows):
-            return _Step(done, None, Estimate(rule, 3 * rule, 0.0, 0.0, rule))
+    shadows = any(map(casts_shadows, scenes))
+    rule = rounding_by_rule(done.result.optimum.n, configuration.precision, shadows=shadows)
+    known = accuracy is not None and accuracy >= COARSE and (3 * rule < accuracy or shadows)
+    if known and configuration.pixels is None and configuration.samples is None:
+        return _Step(done, None, Estimate(rule, 3 * rule, 0.0, 0.0, rule))
     system = System(done, targets, dict(options), lamps)
-    return _Step(done, system, system.estimate(_finer(configuration.samples)))
+    return _Step(done, system, system.estimate(_finer(configuration.samples), rule=rule if known else None))
 
 
 def _finer(samples: int | None) -> int | None:
@@ -144,11 +151,10 @@ def _better(now: Configuration, step: _Step, targets: Sequence[Any], accuracy: f
     after = now
     if now.pixels is not None and estimate.pixels > aim:
         after = dataclasses.replace(after, pixels=_more_pixels(now.pixels, (estimate.pixels / aim) ** 2, targets))
-    if step.system is not None and now.samples is not None and estimate.light > aim / 2 and now.samples < MOST_SAMPLES:
-        samples = now.samples * STEP
-        while samples < MOST_SAMPLES and step.system.light_error(samples, min(STEP * samples, MOST_SAMPLES)) > aim / 2:
-            samples *= STEP
-        after = dataclasses.replace(after, samples=min(samples, MOST_SAMPLES))
+    # What the pixels left out need not share with the light samples, those may have.
+    allowed = aim / 2 if accuracy is None or after.pixels is not None else WHOLE_AIM * accuracy / MARGIN
+    if step.system is not None and now.samples is not None and estimate.light > allowed and now.samples < MOST_SAMPLES:
+        after = dataclasses.replace(after, samples=_more_samples(now.samples, step.system, estimate, allowed))
     if now.precision == "float32" and estimate.rounding > aim / 2:
         after = dataclasses.replace(after, precision="float64")
     if after != now:
@@ -164,9 +170,28 @@ def _better(now: Configuration, step: _Step, targets: Sequence[Any], accuracy: f
     return None
 
 
+def _more_samples(few: int, system: System, estimate: Estimate, allowed: float) -> int:
+    """As many light samples as leave an error that is allowed, by its fall from here to `STEP` times as many."""
+    more = STEP * few
+    if estimate.bound > SMALL_ERROR or more >= MOST_SAMPLES:
+        return min(more, MOST_SAMPLES)
+    left = max(system.light_error(more, min(STEP * more, MOST_SAMPLES)), np.finfo(float).tiny)
+    rate = np.log(estimate.light / left) / np.log(STEP)
+    if left > allowed:
+        factor = STEP * (left / allowed) ** (1 / np.clip(rate, *RATES))
+    else:
+        factor = (estimate.light / allowed) ** (1 / rate)
+    return min(few * _power_of_two(factor), MOST_SAMPLES)
+
+
+def _power_of_two(factor: float) -> int:
+    """The next one up, at least 2, so that programs are compiled for few sizes."""
+    return 2 ** max(1, int(np.ceil(np.log2(min(factor, 1e9)))))
+
+
 def _more_pixels(pixels: int, factor: float, targets: Sequence[Any]) -> int | None:
-    """More pixels by a factor, a power of two so that programs are compiled for few sizes; None for all."""
-    more = pixels * 2 ** max(1, int(np.ceil(np.log2(min(factor, 1e9)))))
+    """More pixels by a factor; None for all."""
+    more = pixels * _power_of_two(factor)
     return None if more > WHOLE * max(map(target_size, targets)) else more
 
 
@@ -178,14 +203,16 @@ def _work(configuration: Configuration, step: _Step, targets: Sequence[Any]) -> 
     return work + 1e5 * len(step.run.scenes)
 
 
-def _near(result: FitResult, options: Mapping[str, Any]) -> tuple[float, float] | None:
+def _near(step: _Step, options: Mapping[str, Any]) -> tuple[float, float] | None:
     """Bounds about the exponent found, where it is well known; None for those of the options."""
+    result = step.run.result
     n = next((parameter for parameter in result.parameters if parameter.name == "n"), None)
     if n is None or n.value is None or n.interval is None:
         return None
     factor = NEAR_AUTO if result.candidates else NEAR
     inner = np.sqrt(factor)
-    if n.interval[0] < n.value / inner or n.interval[1] > n.value * inner:
+    # The interval is of the noise alone; light samples left out can lead far away.
+    if n.interval[0] < n.value / inner or n.interval[1] > n.value * inner or step.estimate.bound > SMALL_ERROR:
         return None
     low, high = options["n_range"]
     return max(low, n.value / factor), min(high, n.value * factor)

@@ -68,11 +68,24 @@ def difference(
     model: type[brdf.Material],
     coarse: brdf.Scene,
     fine: brdf.Scene,
+    pixel: Int[AnyArray, " M"] | None,
     weight: Float[AnyArray, " M"],
     n: Float[AnyArray, ""],
     x: Float[AnyArray, "3 C"],
 ) -> Float[Array, "C 4"]:
-    """Products of the columns with what a finer model changes."""
+    """Products of the columns with what a finer model changes.
+
+    Args:
+        model: the class of the material.
+        coarse: the whole picture's scene, or that of some pixels.
+        fine: the same under more light samples.
+        pixel: which pixels of the whole picture, or None.
+        weight: of each pixel.
+        n: exponent.
+        x: coefficients.
+    """
+    if pixel is not None:
+        coarse, fine = (brdf.some_pixels(scene, pixel, precision="float64") for scene in (coarse, fine))
     shape = (weight.size, x.shape[1])
     (few, seen), (many, _) = _columns(model, coarse, n, shape), _columns(model, fine, n, shape)
     weight = jnp.where(seen, weight, 0)

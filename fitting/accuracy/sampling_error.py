@@ -17,7 +17,6 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -32,8 +31,8 @@ from fitting.observation import take_colour_out
 from fitting.uncertainty.covariance import TERMS
 
 DRAWS = 512
-# Pixels that are looked at: under lights of many samples, of a sample under lights of few, and of a whole picture.
-PROBES, MOST_PROBES, WHOLE_PROBES = 640, 4096, 1024
+# Pixels that are looked at: under lights of many samples, and under lights of few.
+PROBES, MOST_PROBES = 640, 512
 # What float32 shadow rays make of the pixels at a shadow's edge, some of which fall on its other side.
 AT_SHADOWS = 1e-4
 # What light samples leave out is told to first order only: the bound allows for this factor.
@@ -126,8 +125,7 @@ class System:
         self.skipped = False
         self.parts: list[tuple[PixelSample, np.ndarray, bool, float]] = []
         for index, (target, mask, sample) in enumerate(zip(targets, masks, run.samples, strict=True)):
-            fewer = most if probes or self.many else WHOLE_PROBES
-            whole = sample if sample is not None else _every(run.scenes[index], self.model, fewer)
+            whole = sample if sample is not None else _every(run.scenes[index], self.model, most)
             some, stride = _some(whole, most)
             values = some_of_target(target, some)
             values = np.asarray(getattr(values, "pixels", values), np.float64).reshape(-1, self.channels)
@@ -216,11 +214,12 @@ class System:
         inverse = np.linalg.pinv(reduced / np.outer(size, size), rcond=1e-13, hermitian=True) / np.outer(size, size)
         self.inverse = basis @ inverse @ basis.T
 
-    def shifts(self, finer: int | None = None) -> Shifts:
+    def shifts(self, finer: int | None = None, *, measured: bool = True) -> Shifts:
         """By how much the parameters are off.
 
         Args:
             finer: the number of light samples to compare with; None where no light has samples to choose.
+            measured: whether what rounding does is measured; 0 where not.
         """
         # What the bound held back is part of it: without it such a coefficient would be off by chance alone.
         held = np.where(self.bound, self.step, 0.0)
@@ -230,34 +229,38 @@ class System:
         draws = np.random.default_rng(0).standard_normal((DRAWS, value.size)) @ root.T
         drawn = self._settled(draws + self.inverse @ held) - self._settled((self.inverse @ held)[None])
         nothing = np.zeros(value.size)
-        light = nothing if finer is None else self.inverse @ self._products(None, finer, "float64", "float64")
-        if self.many or self.skipped:
-            rounding = self.inverse @ self._products(None, None, "float32", "float64")
+        light = nothing if finer is None else self.inverse @ self._of_light(None, finer)
+        if not measured or self.run.result.precision == "float64":
+            rounding = nothing
+        elif self.many or self.skipped:
+            rounding = self.inverse @ self._of_rounding()
         else:
             rounding = self.inverse @ np.where(self.bound, 0.0, self.step)
-        if self.run.result.precision == "float64":
-            rounding = nothing
         return Shifts(drawn, light, rounding)
 
     def _settled(self, draws: Float[np.ndarray, "D P"]) -> Float[np.ndarray, "D P"]:
         """Coefficients at their bound leave it upwards only."""
         return np.where(self.bound, np.maximum(draws, 0.0), draws)
 
-    def _products(self, coarse: int | None, fine: int | None, before: Any, after: Any) -> Float[np.ndarray, " P"]:
-        """Products of the derivatives with what a finer model changes."""
+    def _of_light(self, coarse: int | None, fine: int) -> Float[np.ndarray, " P"]:
+        """Products of the derivatives with what more light samples change."""
         total = np.zeros(3 * self.channels + 1)
-        for index, (_, weight, _, _) in enumerate(self.parts):
+        for index, (sample, weight, _, _) in enumerate(self.parts):
             with brdf.working_precision("float64"):
-                few = brdf.cast(self._place(index, coarse, before), after) if before == after else None
-                many = self._place(index, fine, after)
-                n, x = jnp.asarray(max(self.optimum.n, 1e-3)), jnp.asarray(self.optimum.x)
-                if few is None:
-                    total += self._of_single(index, weight)
-                    continue
-                found = np.asarray(difference(self.model, few, many, jnp.asarray(weight), n, x))
+                scene, pixel = self.light.scenes[index], sample.pixel.astype(np.int32)
+                if traceable(scene):
+                    few, many = (self.lamps.with_samples(scene, samples) for samples in (coarse, fine))
+                else:
+                    few, many, pixel = *(self._place(index, samples, "float64") for samples in (coarse, fine)), None
+                n, x = np.asarray(max(self.optimum.n, 1e-3)), self.optimum.x
+                found = np.asarray(difference(self.model, few, many, pixel, weight, n, x))
             for channel, place in enumerate(self.places):
                 total[place] += found[channel] * np.array([1.0, 1.0, 1.0, self.optimum.x[2, channel]])
         return total
+
+    def _of_rounding(self) -> Float[np.ndarray, " P"]:
+        """Products of the derivatives with what float64 changes."""
+        return np.sum([self._of_single(index, weight) for index, (_, weight, _, _) in enumerate(self.parts)], axis=0)
 
     def _of_single(self, index: int, weight: np.ndarray) -> Float[np.ndarray, " P"]:
         """What float32 changes, told by the products of the columns with the model in both precisions."""
@@ -304,20 +307,23 @@ class System:
             samples: of each light.
             finer: more of them.
         """
-        return float(self.relative(self.inverse @ self._products(samples, finer, "float64", "float64")))
+        return float(self.relative(self.inverse @ self._of_light(samples, finer)))
 
-    def estimate(self, finer: int | None = None) -> Estimate:
+    def estimate(self, finer: int | None = None, *, rule: float | None = None) -> Estimate:
         """The error of the fit.
 
         Args:
             finer: as for `shifts`.
+            rule: what rounding does, where its order of magnitude is enough to know; None measures it.
         """
-        shifts = self.shifts(finer)
+        shifts = self.shifts(finer, measured=rule is None)
         alone = self.relative(shifts.drawn)
         together = self.relative(shifts.drawn + shifts.light + shifts.rounding)
         light, rounding = float(self.relative(shifts.light)), float(self.relative(shifts.rounding))
-        if self.shadows and self.run.result.precision == "float32":
-            together, rounding = np.hypot(together, AT_SHADOWS), max(rounding, AT_SHADOWS)
+        if rule is None and self.shadows and self.run.result.precision == "float32":
+            rule = AT_SHADOWS
+        if rule is not None:
+            together, rounding = np.hypot(together, rule), max(rounding, rule)
         pixels = float(np.quantile(alone, 0.95))
         bound = float(np.quantile(together, 0.95)) + (MARGIN - 1) * light
         return Estimate(float(np.median(together)), bound, pixels, light, rounding)

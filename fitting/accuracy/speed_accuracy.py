@@ -1,49 +1,25 @@
 """Speed against accuracy, measured on the user's own scene.
 
-Only what the scene has is varied: pixels where there are enough of them, light samples where a light has an extent,
-shadows where a shape can cast one. A subsample of single pixels is taken rather than a smaller picture: averaged pixels
-blur a highlight, which the fit would take for a smaller exponent.
-
-Each configuration runs once for its program to be compiled and once to have a time at all, and then in rounds, every
-round in another order (fixed seed), so that a machine that grows slower or quicker favours none.
+What is tried is in `fitting.accuracy.trials`. Each configuration runs twice, the first time with cold caches, and then
+in rounds, every round in another order (fixed seed), so that a machine that grows slower or quicker favours none. The
+compiler's time is taken out of every run. What takes long, or compiles anew each time, runs once.
 """
 
-import dataclasses
 import time
-from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 import brdf
 from brdf.errors import InputError
-from fitting.accuracy.budget import MOST_SAMPLES, WHOLE
-from fitting.accuracy.configurations import Configuration, casts_shadows, run, some_of_target, target_size
-from fitting.accuracy.deviation import parameter_deviation
-from fitting.accuracy.lamps import Lamps, extended
-from fitting.accuracy.pixel_sampling import sample_pixels
-from fitting.accuracy.reference import reference
-from fitting.accuracy.sampling_error import System
-from fitting.accuracy.speed_table import Row, Tradeoff
-from fitting.result import FitResult
+from fitting.accuracy.speed_table import Tradeoff
+from fitting.accuracy.stopwatch import Taken, take
+from fitting.accuracy.trials import Bench
 
-PIXELS = (1024, 4096, 16384, 65536, 262144)
 MOST_ROUNDS = 9
-# Pixels of the reference under lights with an extent, and of the solvers that keep a Jacobian.
-REFERENCE_PIXELS, SOLVER_PIXELS = 1024, 1024
-# Pixels that pictures are compared at, under lights with an extent.
-COMPARED_PIXELS = 1024
-# Where the general solvers start.
-START = 30.0
-
-
-class _Trial(NamedTuple):
-    axis: str
-    configuration: Configuration | None
-    name: str
-    run: Callable[[], Any]
-    work: float
+# What takes longer than this is run once: beside it cold caches count for nothing.
+LONG = 1.0
 
 
 def tradeoff(
@@ -85,240 +61,31 @@ def tradeoff(
         raise InputError("model", f"is unknown, got {model!r}", f"Use auto or one of {', '.join(brdf.MODELS)}")
     # The front door says what is wrong with the picture, before anything is measured.
     options = {"mask": mask, "saturation": saturation, "n_range": (0.1, 1e6)}
-    bench = _Bench(target, scene, model, options)
+    bench = Bench(target, scene, model, options)
     trials = bench.trials()
     if render:
         trials += bench.render_trials()
-    times: dict[int, list[float]] = {}
+    taken: dict[int, list[Taken]] = {}
     found: dict[int, Any] = {}
-    peaks: dict[int, int | None] = {}
-    done, total, complete = 0, len(trials) * (2 + MOST_ROUNDS), True
+    # First from what matters most to what matters least; then every round is shuffled.
+    first = [index for index, trial in enumerate(trials) for _ in range(1 if trial.once else 2)]
+    again = [index for index, trial in enumerate(trials) if not trial.once]
     random = np.random.default_rng(0)
+    order = [*first, *(index for _ in range(MOST_ROUNDS) for index in random.permutation(again))]
+    complete = True
     try:
-        for round_ in range(1 + MOST_ROUNDS):
-            # First from what matters most to what matters least, twice each; then every round is shuffled.
-            once = list(range(len(trials)))
-            order = np.repeat(once, 2) if round_ == 0 else random.permutation(once)
-            for index in order:
-                left = seconds - (time.perf_counter() - begun)
-                # What the first run took says nothing of the next: it was compiled in it.
-                spent = times.get(int(index), [0.0])[1:] or [0.0]
-                if (left < spent[-1] or left < 0) and done > 1:
-                    continue
-                before = _start_peak()
-                start = time.perf_counter()
-                outcome = trials[index].run()
-                times.setdefault(int(index), []).append(time.perf_counter() - start)
-                peaks[int(index)] = _read_peak(before)
-                found.setdefault(int(index), outcome)
-                done += 1
-                if progress is not None:
-                    progress(done, total)
-            if time.perf_counter() - begun > seconds:
-                break
+        for done, index in enumerate(map(int, order)):
+            before = taken.get(index, [])
+            left = seconds - (time.perf_counter() - begun)
+            if (before and before[-1].seconds > min(LONG, left)) or (left < 0 and done > 0):
+                continue
+            outcome, one = take(trials[index].run)
+            taken.setdefault(index, []).append(one)
+            found.setdefault(index, outcome)
+            if progress is not None:
+                progress(done + 1, len(order))
     except KeyboardInterrupt:
         complete = False
-    rows = [
-        bench.row(trial, times[index], peaks[index], found[index])
-        for index, trial in enumerate(trials)
-        if index in times
-    ]
-    took = time.perf_counter() - begun
+    rows = [bench.row(trial, taken[i], found[i]) for i, trial in enumerate(trials) if i in taken]
     complete &= len(rows) == len(trials)
-    return Tradeoff(tuple(rows), bench.told, bench.floor, accuracy, complete, took)
-
-
-class _Bench:
-    """The configurations that a scene offers, and the measure of their errors."""
-
-    def __init__(self, target: Any, scene: brdf.Scene, model: str, options: dict[str, Any]):
-        self.target, self.scene, self.options, self.lamps = target, scene, options, Lamps()
-        self.has_samples, self.pixels = extended(scene), target_size(target)
-        samples = max((getattr(light, "samples", 1) for light in scene.lights), default=1)
-        self.samples = samples
-        pixels = REFERENCE_PIXELS if self.has_samples and self.pixels > 2 * REFERENCE_PIXELS else None
-        self.best = reference(
-            [target], [scene], model, options, self.lamps, pixels=pixels, start_samples=min(samples, 64)
-        )
-        self.model = self.best.material.name if model == "auto" else model
-        self.told = "float64, all pixels"
-        self.floor = 0.0
-        if self.has_samples:
-            self.told = f"float64, {MOST_SAMPLES} light samples, "
-            self.told += "all pixels" if pixels is None else f"a sample of {self.best.pixels} pixels"
-        if pixels is not None:
-            how = Configuration(self.model, "float64", pixels, min(samples, 64))
-            done = run([target], [scene], how, options, self.lamps)
-            self.floor = System(done, [target], options, self.lamps).estimate(None).pixels
-            self.told += f" (its own error is below {self.floor:.1g})"
-        self.compared = self._compared()
-        self.true = self._picture(self.best.material)
-
-    def _compared(self) -> tuple[brdf.Scene, np.ndarray]:
-        """Where pictures are compared: the whole one, or some pixels under many light samples; and their weights."""
-        if not self.has_samples:
-            return self.scene, np.ones((1, 1, 1))
-        fine = self.lamps.with_samples(self.scene, MOST_SAMPLES)
-        sample = sample_pixels(fine, brdf.BlinnPhong, COMPARED_PIXELS)
-        if sample is None:
-            return fine, np.ones((1, 1, 1))
-        return brdf.some_pixels(fine, sample.pixel, precision="float64"), sample.stands_for[None, :, None]
-
-    def _picture(self, material: brdf.Material) -> np.ndarray:
-        return np.asarray(brdf.render(material, self.compared[0], precision="float64"))
-
-    def trials(self) -> list[_Trial]:
-        """What there is to try, the most telling first."""
-        default = Configuration(self.model)
-        found = [("default", default)]
-        sizes = [size for size in PIXELS if size <= WHOLE * self.pixels]
-        found += [("pixels", dataclasses.replace(default, pixels=size)) for size in sizes]
-        if self.has_samples:
-            # Many samples are tried on few pixels: what they change does not hang on how many.
-            few = dataclasses.replace(default, pixels=sizes[min(1, len(sizes) - 1)] if sizes else None)
-            steps = [s for s in (4, 16, 64, 256, 1024) if s <= 4 * self.samples and s != self.samples]
-            found += [("samples", dataclasses.replace(few, samples=samples)) for samples in steps]
-            least = [s for s in (16, 64) if s < self.samples]
-            found += [("samples", dataclasses.replace(default, samples=samples)) for samples in least[:1]]
-        size = sizes[min(1, len(sizes) - 1)] if sizes else None
-        if size is not None:
-            found.append(("precision", Configuration(self.model, "float64", size)))
-        if not (self.has_samples and self.pixels * self.samples > 1e7):
-            found.append(("precision", Configuration(self.model, "float64")))
-        if casts_shadows(self.scene):
-            found.append(("shadows", dataclasses.replace(default, pixels=size, shadows=False)))
-        others = [name for name in ("lambert", "phong", "blinn-phong") if name != self.model]
-        found += [("model", dataclasses.replace(default, model=name, pixels=size)) for name in others]
-        trials = [
-            _Trial(axis, how, str(how), lambda how=how: self._fit(how), self._work(how))
-            for axis, how in dict.fromkeys(found)
-        ]
-        return trials + self._solver_trials()
-
-    def _fit(self, how: Configuration) -> FitResult:
-        return run([self.target], [self.scene], how, self.options, self.lamps).result
-
-    def _work(self, how: Configuration) -> float:
-        pixels = self.pixels if how.pixels is None else how.pixels
-        samples = sum(
-            (how.samples or getattr(light, "samples", 1)) if hasattr(light, "samples") else 1
-            for light in self.scene.lights
-        )
-        # What every fit takes whatever its size.
-        return 4096 + pixels * max(samples, 1) * (2 if how.precision == "float64" else 1)
-
-    def _solver_trials(self) -> list[_Trial]:
-        """Levenberg-Marquardt and BFGS on a few pixels, from a guess."""
-        if self.has_samples or not issubclass(type(self.best.material), brdf.SpecularMaterial):
-            return []
-        trials = []
-        for solver, tolerance in (("lm", 1e-8), ("lm", 1e-4), ("bfgs", 1e-8)):
-            how = Configuration(self.model, "float64", SOLVER_PIXELS, None, True, solver, tolerance)
-            trials.append(_Trial("solver", how, str(how), lambda how=how: self._solve(how), 100 * self._work(how)))
-        return trials
-
-    def _solve(self, how: Configuration) -> Any:
-        from fitting.joint import fit_jointly
-
-        # Evenly spread: these solvers know no weights.
-        sample = sample_pixels(self.scene, brdf.Lambert, how.pixels or SOLVER_PIXELS)
-        target, scene, mask = self.target, self.scene, self.options["mask"]
-        if sample is not None:
-            target = some_of_target(target, sample)
-            scene = brdf.some_pixels(scene, sample.pixel, precision="float64")
-            mask = None if mask is None else np.asarray(mask, bool).ravel()[sample.pixel][None]
-        channels = self.best.material.k_d.shape[0]
-        half = np.full(channels, 0.5)
-        start = brdf.MODELS[self.model](k_a=half, k_d=half, k_s=half, n=START)  # pyright: ignore[reportCallIssue]
-        free: Any = (lambda m, s: (m.k_d, m.k_s, m.n)) if scene.ambient is None else None
-        free = free or (lambda m, s: (m.k_a, m.k_d, m.k_s, m.n))
-        saturation = self.options["saturation"]
-        found = fit_jointly(
-            target,
-            scene,
-            start,
-            free,
-            solver=how.solver,  # pyright: ignore[reportArgumentType]
-            tolerance=how.tolerance or 1e-8,
-            mask=mask,
-            saturation=saturation,
-        )
-        return dataclasses.replace(self.best, material=found.material)
-
-    def render_trials(self) -> list[_Trial]:
-        """The renderer alone, in both precisions and with fewer light samples."""
-        trials = []
-        steps: Sequence[int | None] = [None]
-        if self.has_samples:
-            steps = [*steps, *(s for s in (4, 16, 64, 256) if s < self.samples)]
-        precisions: tuple[brdf.Precision, ...] = ("float32", "float64")
-        for precision in precisions:
-            for samples in steps:
-                place = self.lamps.with_samples(self.scene, samples)
-                name = f"render, {precision}" + ("" if samples is None else f", {samples} light samples")
-                work = self._work(Configuration(self.model, precision, None, samples))
-                trials.append(_Trial("render", None, name, lambda s=place, p=precision: self._render(s, p), work))
-        return trials
-
-    def _render(self, scene: brdf.Scene, precision: Any) -> brdf.Scene:
-        np.asarray(brdf.render(self.best.material, scene, precision=precision))
-        return scene
-
-    def row(self, trial: _Trial, times: list[float], peak: int | None, outcome: Any) -> Row:
-        """What was measured.
-
-        Args:
-            trial: what ran.
-            times: of its runs, the first with its compilation.
-            peak: memory of the last one.
-            outcome: of the first one.
-        """
-        if isinstance(outcome, FitResult):
-            change = self._picture(outcome.material) - self.true
-            parameters = parameter_deviation(outcome, self.best)
-        else:
-            before = self.compared[0]
-            now = outcome if before.resolution == outcome.resolution else None
-            picture = self.true if now is None else np.asarray(brdf.render(self.best.material, now))
-            change, parameters = picture - self.true, 0.0
-        weight = self.compared[1]
-        scale = float(np.sqrt(np.mean(weight * self.true**2)))
-        rms, worst = float(np.sqrt(np.mean(weight * change**2))) / scale, float(np.max(np.abs(change))) / scale
-        later = times[1:] or times[:1]
-        median = float(np.median(later))
-        low, high = np.quantile(later, [0.25, 0.75])
-        return Row(
-            axis=trial.axis,
-            configuration=trial.configuration,
-            name=trial.name,
-            compile_seconds=max(times[0] - median, 0.0),
-            seconds=median,
-            spread=float(high - low) / 2,
-            runs=len(times) - 1,
-            peak=peak,
-            rms=rms,
-            worst=worst,
-            parameters=parameters,
-            work=trial.work,
-        )
-
-
-def _start_peak() -> int | None:
-    """Bytes now resident, and the kernel's mark of the most set back to it; None where there is no such mark."""
-    try:
-        Path("/proc/self/clear_refs").write_text("5")
-        return _status("VmRSS")
-    except OSError:
-        return None
-
-
-def _read_peak(before: int | None) -> int | None:
-    """Bytes that were resident at most, beyond those before."""
-    return None if before is None else max(_status("VmHWM") - before, 0)
-
-
-def _status(name: str) -> int:
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith(name + ":"):
-            return 1024 * int(line.split()[1])
-    raise OSError(f"/proc/self/status has no {name}")
+    return Tradeoff(tuple(rows), bench.told, bench.floor, accuracy, complete, time.perf_counter() - begun)

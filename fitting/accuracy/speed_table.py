@@ -24,10 +24,10 @@ class Row:
         axis: what it was tried for: "default", "pixels", "samples", ...
         configuration: in which the fit ran; None for a row of the renderer or of the checks.
         name: the configuration in words.
-        compile_seconds: what the first run took beyond the median of the others.
-        seconds: median of the runs after the first.
+        compile_seconds: of tracing and compiling in the first run.
+        seconds: median of the runs after the first, or the only one, without the compiler.
         spread: half the distance of their quartiles.
-        runs: how many they were; 0 where only the first was made, which ``seconds`` then is.
+        runs: how many they were.
         peak: bytes of resident memory that a run took beyond what was resident before it; None where unknown.
         rms: error of the picture, root mean square over that of the reference's picture.
         worst: its largest error, in the same unit.
@@ -84,7 +84,7 @@ class Tradeoff:
         """The fits than which none is both quicker and closer, quickest first."""
         found: list[Row] = []
         for row in sorted(self._fits(), key=lambda row: (row.seconds, row.error)):
-            if row.runs and (not found or row.error < found[-1].error):
+            if not found or row.error < found[-1].error:
                 found.append(row)
         return tuple(found)
 
@@ -136,9 +136,9 @@ class Tradeoff:
             table.add_row(
                 row.axis,
                 row.name,
-                f"{row.compile_seconds if row.runs else row.seconds:.2f}",
-                f"{1e3 * row.seconds:.1f}" if row.runs else "not run",
-                f"{1e3 * row.spread:.1f}" if row.runs else "",
+                f"{row.compile_seconds:.2f}",
+                f"{1e3 * row.seconds:.1f}",
+                f"{1e3 * row.spread:.1f}" if row.runs > 1 else "",
                 memory,
                 f"{row.rms:.1e}",
                 f"{row.worst:.1e}",

@@ -58,8 +58,7 @@ def tradeoff(
     _print_table(found)
     best = found.recommended
     if best is not None:
-        took = f"{1e3 * best.seconds:.3g} ms, " if best.runs else ""
-        show(f"recommended: {best.name} ({took}error {best.error:.1g})")
+        show(f"recommended: {best.name} ({1e3 * best.seconds:.3g} ms, error {best.error:.1g})")
     if not found.complete:
         show("not everything was measured")
     if out is not None:

@@ -35,8 +35,7 @@ def error_against_time(tradeoff: Tradeoff) -> Any:
     axes = figure.add_subplot()
     axes.set_xscale("log")
     axes.set_yscale("log")
-    # A first run is mostly the compiler's time.
-    rows = [row for row in tradeoff.rows if row.configuration is not None and np.isfinite(row.error) and row.runs]
+    rows = [row for row in tradeoff.rows if row.configuration is not None and np.isfinite(row.error)]
     for axis, (colour, marker) in LOOKS.items():
         chosen = [row for row in rows if row.axis == axis]
         if not chosen:
@@ -93,7 +92,7 @@ def _place(row: Row) -> tuple[float, float]:
 
 def _mark(axes: Any, row: Row | None, word: str, offset: tuple[int, int]) -> None:
     """A ring about a mark, and a word beside it."""
-    if row is None or not np.isfinite(row.error) or not row.runs:
+    if row is None or not np.isfinite(row.error):
         return
     place = _place(row)
     size = 13 if word == "recommended" else 10
