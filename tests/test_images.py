@@ -126,6 +126,7 @@ def icc(curve):
         ([(b"sRGB", b"\0")], SRGB, "srgb", "file"),
         ([(b"gAMA", struct.pack(">I", 100000))], LINEAR, "linear", "file"),
         ([(b"gAMA", struct.pack(">I", 45455))], GAMMA_22, 2.2, "file"),
+        ([(b"gAMA", struct.pack(">I", 0))], SRGB, "srgb", "assumed"),
         ([(b"gAMA", struct.pack(">I", 45455)), (b"sRGB", b"\0")], SRGB, "srgb", "file"),
         ([(b"cICP", bytes([1, 13, 0, 1]))], SRGB, "srgb", "file"),
         ([(b"cICP", bytes([1, 8, 0, 1]))], LINEAR, "linear", "file"),

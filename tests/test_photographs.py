@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import OpenImageIO as oiio  # noqa: N813
 import pytest
 
 import brdf
@@ -228,6 +229,17 @@ def write_silent(path: str, pixels: np.ndarray, encoding: Any, dtype: str) -> No
     Path(path).write_bytes(content)
 
 
+def write_layered(path: str, pixels: np.ndarray) -> None:
+    """Grey and alpha, as they are."""
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 2, "float")
+    spec.channelnames, spec.alpha_channel = ("Y", "A"), 1
+    spec.attribute("oiio:UnassociatedAlpha", 1)
+    output = oiio.ImageOutput.create(path)
+    assert output.open(path, spec)
+    assert output.write_image(pixels)
+    output.close()
+
+
 def k_d(text: str) -> float:
     values = [one for one in json.loads(text[text.index("{") :])["parameters"] if one["name"] == "k_d"]
     return values[0]["value"]
@@ -270,6 +282,34 @@ def test_a_file_that_does_not_say_its_encoding_is_read_as_the_model_explains_it(
     _, out, _ = run(capsys, *words, "--encoding", wrong, "--model", "lambert", "--json")
     assert k_d(out) != pytest.approx(0.8, rel=0.05)
     assert "encoded" not in out
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_transparent_pixels_show_nothing_unless_all_are(tmp_path, capsys, monkeypatch, whole):
+    monkeypatch.chdir(tmp_path)
+    picture = np.concatenate([shaded((0.3, 0.4, 0.86)), np.ones((*SHAPE, 1), np.float32)], axis=-1)
+    picture[10:30, 20:30] = [5.0, 0.0]  # what a tool writes where it cut something out
+    if whole:
+        picture[:] = np.concatenate([shaded((0.3, 0.4, 0.86)), np.zeros((*SHAPE, 1), np.float32)], axis=-1)
+    write_layered("ball.exr", picture)
+    for light in ("0.3,0.4,0.86", "fit"):
+        words = ["fit", "ball.exr", "--sphere", f"{BALL.x},{BALL.y},{BALL.radius}", "--light", light]
+        status, out, err = run(capsys, *words, "--model", "lambert", "--json")
+        assert status == 0, err
+        assert k_d(out) == pytest.approx(0.8, rel=1e-5)
+        assert json.loads(out)["left_out"].get("masked", 0) == (0 if whole else 200)
+
+
+def test_what_a_mask_hides_does_not_pull_the_light(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    picture, mask = shaded((0.3, 0.4, 0.86)), np.ones((*SHAPE, 1), np.float32)
+    picture[5:30, 12:40], mask[5:30, 12:40] = 0.7, 0.0
+    brdf.write_image("ball.exr", picture)
+    brdf.write_image("mask.png", mask)
+    words = ["fit", "ball.exr", "--sphere", f"{BALL.x},{BALL.y},{BALL.radius}", "--light", "fit", "--mask", "mask.png"]
+    status, out, err = run(capsys, *words, "--model", "lambert", "--json")
+    assert status == 0, err
+    assert k_d(out) == pytest.approx(0.8, rel=1e-4)
 
 
 def test_a_picture_that_fits_both_ways_says_that_its_encoding_is_a_guess(tmp_path, capsys, monkeypatch):
@@ -351,6 +391,13 @@ def test_lights_from_a_mirror_ball_in_one_command(tmp_path, capsys, monkeypatch)
         (["bomb.npz"], "bomb.npz: claims more than can be in it"),
         (["pickled.npz"], "pickled.npz: images: holds object, not numbers"),
         (["shapes.npz"], "shapes.npz: normal: is of shape"),
+        (["signed.npz"], "signed.npz: images: holds int8, of which it is not clear what is white"),
+        (["flags.npz"], "flags.npz: images: holds bool"),
+        (["masked.npz"], "masked.npz: normal: has no normal inside the mask"),
+        (["bright.exr", "--sphere", "30,24,9", "--light", "0,0,1"], "bright.exr: has 1e[+]30 as its largest value"),
+        (["faint.exr", "--sphere", "30,24,9", "--light", "0,0,1"], "faint.exr: has .*--exposure, or use --precision"),
+        (["dark.exr", "--sphere", "30,24,9", "--light", "fit"], "dark.exr: has fewer than ten lit pixels"),
+        (["0.png", "--sphere", "30,24,9", "--light", "fit", "--saturation", "nan"], "--saturation: must be a linear"),
         (["shapes.npz", "--sphere", "1,2,9"], "--sphere: is what shapes.npz says itself"),
     ],
 )
@@ -368,6 +415,12 @@ def test_wrong_photographs(photographs, capsys, monkeypatch, words, said):
     place = bomb.rindex(b"PK\x01\x02", 0, bomb.rindex(b"normal.npy"))
     Path("bomb.npz").write_bytes(bomb[: place + 24] + (2**31 - 1).to_bytes(4, "little") + bomb[place + 28 :])
     np.savez("pickled.npz", images=np.array([{}], dtype=object), normal=[0], light_dirs=[0])
+    arrays = {"normal": np.ones((4, 5, 3)), "light_dirs": np.ones((3, 3))}
+    np.savez("signed.npz", images=np.ones((3, 4, 5), np.int8), **arrays)
+    np.savez("flags.npz", images=np.ones((3, 4, 5), bool), **arrays)
+    np.savez("masked.npz", images=np.ones((3, 4, 5)), mask=np.zeros((4, 5)), **arrays)
+    for name, factor in (("bright", 1e30), ("faint", 1e-30), ("dark", 0.0)):
+        brdf.write_image(f"{name}.exr", np.full((*SHAPE, 1), factor, np.float32))
     np.savez("shapes.npz", images=np.ones((3, 4, 5)), normal=np.ones((4, 4, 3)), light_dirs=np.ones((3, 3)))
     before = sorted(os.listdir())
     status, out, err = run(capsys, "fit", *words, "--out", "out")
@@ -403,6 +456,24 @@ def test_the_gray_sphere_is_matt_and_equally_bright_under_twelve_lights():
         scene = photograph_scene(ball_points(picture.pixels.shape[:2], GRAY), direction)
         found.append(fitting.fit(picture, scene, model="lambert").material.k_d.mean())
     assert np.max(np.abs(found / np.mean(found) - 1)) < 0.02
+
+
+@real_data
+def test_the_gray_sphere_tells_its_own_lights_and_how_bright_they_are():
+    strengths, brightest = [], []
+    for index in range(12):
+        picture = brdf.read_picture(REAL / "uw-spheres" / "gray" / f"gray.{index}.png", encoding="linear")
+        points = ball_points(picture.pixels.shape[:2], GRAY)
+        strengths.append(light_from_shading(picture, points).strength)
+        # Whatever its direction, a light shows its strength where the ball faces it; no model is needed to see that.
+        grey = np.where(points.mask, picture.pixels.mean(axis=-1), 0)
+        means = np.lib.stride_tricks.sliding_window_view(grey, (20, 20)).mean(axis=(2, 3))
+        brightest.append(means.max())
+    spread = np.array(strengths) / np.mean(strengths) - 1
+    assert np.std(spread) < 0.02
+    # The first light is the brightest by either measure: the lamps differ, one by more than 2 %.
+    assert np.argmax(strengths) == np.argmax(brightest) == 0
+    assert np.max(np.abs(np.delete(spread, 0))) < 0.02
 
 
 @real_data

@@ -219,6 +219,13 @@ OPTIONS = {
     "fit a table with a scene": (["fit", "short.binary", "--scene", "scene.toml"], "is a measured BRDF"),
     "fit a table with an unknown loss": (["fit", "ok.brdf", "--loss", "huber"], "--loss: is unknown"),
     "mask of another size": (["fit", "target.exr", "--scene", "scene.toml", "--mask", "small.exr"], "small.exr"),
+    "picture of another size": (
+        ["fit", "small.exr", "--scene", "scene.toml"],
+        "small.exr: is 2 x 2, the scene's camera 8",
+    ),
+    "no such preset": (["convert", "unobtainium", "o.json"], "unobtainium: is neither a file nor .* emerald, jade"),
+    "name of a preset": (["convert", "emerald", "o.json", "--name", "a"], "--name: chooses from a file"),
+    "plausible table": (["fit", "ok.brdf", "--plausible"], "ok.brdf: is a measured BRDF; of the options only"),
     "channels": (["fit", "two.exr", "--scene", "scene.toml"], "two.exr: has 2 channels, the scene's light 3"),
 }
 
@@ -246,7 +253,7 @@ def test_paths_without_permission(place, capsys):
 
 
 def test_enough_kinds_of_input_are_tried():
-    assert len(SCENES) + len(MATERIALS) + len(MTL) + len(OPTIONS) >= 80
+    assert len(SCENES) + len(MATERIALS) + len(MTL) + len(OPTIONS) >= 110
 
 
 def test_a_scene_may_be_allowed_to_reach_further(tmp_path):
@@ -304,6 +311,40 @@ def test_a_full_disk_leaves_nothing(place):
     assert process.returncode == 2, err
     assert err.splitlines()[-1].startswith("error: out.exr: ")
     assert {path for path in place.iterdir() if path.name != ".cache"} == before
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A disk of 48 KiB, in memory."""
+    (tmp_path / "disk").mkdir()
+    words = ["mount", "-t", "tmpfs", "-o", "size=48k", "tmpfs", str(tmp_path / "disk")]
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, check=False)
+    except OSError as error:
+        pytest.skip(f"no mount command: {error}")
+    if done.returncode:
+        pytest.skip(f"a small disk cannot be mounted here: {done.stderr.strip()}")
+    yield tmp_path / "disk"
+    subprocess.run(["umount", str(tmp_path / "disk")], check=True)
+
+
+FILLING = {
+    "render": ["render", "material.json", "--scene", "scene.toml", "-o", "disk/out.exr"],
+    "fit": ["fit", "target.exr", "--scene", "scene.toml", "--out", "disk/out"],
+    "report": ["fit", "target.exr", "--scene", "scene.toml", "--report", "disk/out.html"],
+    "convert": ["convert", "material.json", "disk/material.gltf"],
+}
+
+
+@pytest.mark.parametrize("name", FILLING)
+def test_a_disk_that_fills_up_leaves_nothing(place, capsys, monkeypatch, small_disk, name):
+    monkeypatch.chdir(place)
+    (place / "scene.toml").write_text(scene("[8, 8]", "[64, 64]"))
+    ball = brdf.render(brdf.Lambert(k_d=[0.5] * 3), brdf.Scene.load(place / "scene.toml"))
+    noise = np.random.default_rng(3).random((64, 64, 3), np.float32)
+    brdf.write_image(place / "target.exr", np.asarray(ball) + noise)
+    (small_disk / "other").write_bytes(bytes(1024 * {"convert": 48, "render": 44}.get(name, 32)))
+    refused(capsys, small_disk, "disk/(out|mat).*: there is no space left to write it", *FILLING[name])
 
 
 def test_control_c_in_the_middle_leaves_nothing(place):

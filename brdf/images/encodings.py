@@ -159,13 +159,16 @@ def _of_space(path: Path, space: str, attributes: dict[str, Any]) -> Encoding:
 
 
 def _png_chunks(path: Path) -> set[bytes]:
-    """The kinds of the chunks before the pixels."""
+    """The kinds of the chunks before the pixels; a gAMA of 0, which means nothing (PNG, 11.3.2.2), is none."""
     kinds: set[bytes] = set()
     with path.open("rb") as file:
         file.seek(8)
         while len(head := file.read(8)) == 8 and head[4:] not in (b"IDAT", b"IEND") and len(kinds) < 100:
-            kinds.add(head[4:])
-            file.seek(struct.unpack(">I", head[:4])[0] + 4, 1)
+            (length,), kind = struct.unpack(">I", head[:4]), head[4:]
+            content = file.tell()
+            if kind != b"gAMA" or any(file.read(min(length, 4))):
+                kinds.add(kind)
+            file.seek(content + length + 4)
     return kinds
 
 

@@ -161,6 +161,7 @@ def _write(
         # A remark without a failure does not count: TIFF complains of Exif data that nobody asked for.
         if not ok or not _is_complete(temporary):
             what = f"cannot be written ({said(file, temporary)})"
+            _ask_for_space(temporary, spec)
             raise InputError(path, what, "Check the space left and the size of the picture")
 
 
@@ -169,6 +170,13 @@ def _reserve(temporary: Path, spec: oiio.ImageSpec) -> None:
     if temporary.suffix.lower() in _ENDINGS and hasattr(os, "posix_fallocate"):
         with temporary.open("r+b") as file:
             os.posix_fallocate(file.fileno(), 0, 3 * spec.image_bytes() // 2 + (1 << 16))
+
+
+def _ask_for_space(temporary: Path, spec: oiio.ImageSpec) -> None:
+    """Let the system say whether a full disk, a quota or a limit stopped the writer, which does not tell."""
+    if hasattr(os, "posix_fallocate"):
+        with temporary.open("r+b") as file:
+            os.posix_fallocate(file.fileno(), file.seek(0, os.SEEK_END), spec.image_bytes() + (1 << 16))
 
 
 def _is_complete(temporary: Path) -> bool:

@@ -16,7 +16,7 @@ import brdf
 import fitting
 from brdf.errors import InputError
 from fitting.cli.common import named_as
-from fitting.cli.job import Job
+from fitting.cli.job import Job, check_range
 from fitting.result import FitResult
 
 # The other reading is believed where it leaves less than this share of the squares that the assumed one leaves.
@@ -61,9 +61,11 @@ def fit_either(
 
 def _fit(job: Job, how: dict[str, Any]) -> FitResult:
     several = len(job.pictures) > 1
-    pictures, scenes = (job.pictures, job.scenes) if several else (job.pictures[0], job.scenes[0])
+    check_range(job, how["precision"])
     with named_as({"target": job.target}):
-        return fitting.fit(pictures, scenes, mask=job.mask, **how)
+        if several:
+            return fitting.fit(job.pictures, job.scenes, mask=job.masks, **how)
+        return fitting.fit(job.pictures[0], job.scenes[0], mask=job.masks[0], **how)
 
 
 def _other(picture: brdf.Picture) -> Any:

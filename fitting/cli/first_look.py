@@ -27,6 +27,7 @@ class Options(NamedTuple):
         exposure: one factor, or one per picture: values are divided by it.
         mask: an image.
         ambient: whether photographs are lit from all around as well.
+        saturation: linear value from which on pixels are clipped.
     """
 
     scene: Path | None = None
@@ -40,6 +41,7 @@ class Options(NamedTuple):
     exposure: str | None = None
     mask: Path | None = None
     ambient: bool = False
+    saturation: float | None = None
 
 
 def is_archive(targets: list[Path]) -> bool:

@@ -95,10 +95,13 @@ def fit(
                 seconds,
             )
             result = _fit_table(
-                target[0], model, loss, any(option is not None for option in given) or plot or report or ambient
+                target[0],
+                model,
+                loss,
+                any(option is not None for option in given) or plot or report or ambient or plausible,
             )
             if out is not None:
-                result.save(out)
+                _save(result, out)
         else:
             options = {
                 "scene": scene,
@@ -109,7 +112,7 @@ def fit(
                 "lights": lights,
             }
             options |= {"intensities": intensities, "encoding": _encoding(encoding), "exposure": exposure, "mask": mask}
-            options |= {"ambient": ambient}
+            options |= {"ambient": ambient, "saturation": saturation}
             names = {"model": "--model", "precision": "--precision", "dark": "--dark", "noise": "--noise"}
             names |= {"mask": mask, "loss": "--loss", "saturation": "--saturation", "accuracy": "--accuracy"}
             names |= {"seconds": "--seconds"}
@@ -129,7 +132,7 @@ def fit(
                     seconds=seconds,
                 )
             if out is not None:
-                result.save(out, plot=plot)
+                _save(result, out, plot=plot)
             if report is not None:
                 from fitting.html_report import report_page
 
@@ -177,6 +180,16 @@ def _fit_pictures(
     numbers = None if noise is None else parse_numbers(noise, "--noise", 2, "READ,SHOT")
     how["noise"] = None if numbers is None else (numbers[0], numbers[1])
     return fit_either(read, lambda pictures: collect(target, given, pictures), how)
+
+
+def _save(result: Any, out: Path, **how: bool) -> None:
+    import brdf
+
+    try:
+        result.save(out, **how)
+    except brdf.InputError as error:
+        # What is gone by now was the place where the files wait until they are complete.
+        raise brdf.InputError(error.where if Path(error.where).exists() else out, error.what, error.remedy) from None
 
 
 def _encoding(text: str | None) -> Any:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import brdf
 from fitting.cli.first_look import Options, is_archive, is_photograph, target_and_scene
-from fitting.cli.job import Job, exposed
+from fitting.cli.job import Job, exposed, opaque
 from fitting.cli.photograph_inputs import archive, photographs
 
 
@@ -26,4 +26,5 @@ def collect(targets: list[Path], options: Options, read: dict[Path, brdf.Picture
     target, scene = target_and_scene(targets[0], options.scene)
     mask = None if options.mask is None else brdf.read_mask(options.mask)
     loaded = brdf.Scene.load(scene, within=options.within)
-    return Job(exposed([read[target]], options.exposure), [loaded], mask, target)
+    pictures = exposed([read[target]], options.exposure)
+    return Job(pictures, [loaded], opaque(mask, pictures), target)

@@ -9,6 +9,10 @@ import brdf
 from brdf.errors import InputError
 from fitting.photographs.light_files import parse_numbers
 
+# Largest value, and inverse of the least, of a picture fitted in single precision: squares of it, of rounding errors a
+# million times smaller, and sums over millions of pixels have to stay in its range of 1e-38 to 3e38.
+SINGLE = 1e12
+
 
 class Job(NamedTuple):
     """Pictures and scenes to fit.
@@ -16,14 +20,14 @@ class Job(NamedTuple):
     Attributes:
         pictures: arrays or `brdf.Picture`s.
         scenes: as many.
-        mask: pixels to look at, or None.
+        masks: pixels to look at in each, or None for all.
         target: the first picture's file, for messages.
         notes: what was found out on the way, for the person who waits.
     """
 
     pictures: list[Any]
     scenes: list[brdf.Scene]
-    mask: np.ndarray | None
+    masks: list[np.ndarray | None]
     target: Path
     notes: tuple[str, ...] = ()
 
@@ -60,3 +64,41 @@ def scaled(picture: Any, factor: Any) -> Any:
     if not isinstance(picture, brdf.Picture):
         return picture * np.float32(factor)
     return picture.scaled(factor)
+
+
+def opaque(mask: np.ndarray | None, pictures: list[Any]) -> list[np.ndarray | None]:
+    """Pixels to look at in each picture: those of the mask without the fully transparent ones, which show nothing.
+
+    Args:
+        mask: (H, W), or None.
+        pictures: arrays or `brdf.Picture`s. Where alpha is 0 everywhere it was not meant.
+    """
+    masks = []
+    for picture in pictures:
+        alpha = getattr(picture, "alpha", None)
+        visible = None if alpha is None or not alpha.any() or alpha.all() else alpha > 0
+        if visible is None or (mask is not None and mask.shape != visible.shape):
+            masks.append(mask)
+        else:
+            masks.append(visible if mask is None else visible & mask)
+    return masks
+
+
+def check_range(job: Job, precision: str) -> None:
+    """Refuse values whose squares, or those of their rounding, single precision does not hold.
+
+    Args:
+        job: pictures to fit.
+        precision: of the fit.
+
+    Raises:
+        InputError: naming the first picture.
+    """
+    if precision != "float32":
+        return
+    for picture in job.pictures:
+        pixels = np.abs(picture.pixels if isinstance(picture, brdf.Picture) else picture)
+        largest = float(np.max(pixels, where=np.isfinite(pixels), initial=0.0))
+        if largest and not 1 / SINGLE <= largest <= SINGLE:
+            came = f"has {largest:.3g} as its largest value, out of reach of single precision"
+            raise InputError(job.target, came, "Bring it nearer to 1 with --exposure, or use --precision float64")

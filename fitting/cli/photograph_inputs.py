@@ -7,8 +7,9 @@ import numpy as np
 
 import brdf
 from brdf.errors import InputError
+from fitting.cli.common import named_as
 from fitting.cli.first_look import Options, check_ball, find_ball
-from fitting.cli.job import Job, exposed, scaled
+from fitting.cli.job import Job, exposed, opaque, scaled
 from fitting.photographs.archives import ARCHIVE, read_archive, read_array
 from fitting.photographs.ball import ShadingLight, ball_points, light_from_shading, photograph_scene
 from fitting.photographs.light_files import parse_numbers, read_directions, read_intensities
@@ -41,8 +42,12 @@ def photographs(targets: list[Path], options: Options, read: dict[Path, brdf.Pic
     pictures = [read[target] for target in targets]
     points, notes = _geometry(pictures[0].pixels.shape[:2], mask, options)
     pictures = exposed(pictures, options.exposure)
+    masks = opaque(mask, pictures)
     if directions is None:
-        found = [light_from_shading(picture, points) for picture in pictures]
+        found = []
+        for target, picture, one in zip(targets, pictures, masks, strict=True):
+            with named_as({"picture": target, "mask": options.mask, "saturation": "--saturation"}):
+                found.append(light_from_shading(picture, points, saturation=options.saturation, mask=one))
         directions = np.array([one.direction for one in found])
         notes += _told(targets, found)
     channels = pictures[0].pixels.shape[2]
@@ -52,7 +57,7 @@ def photographs(targets: list[Path], options: Options, read: dict[Path, brdf.Pic
         came = f"has {intensities.shape[1]} numbers a line, the pictures {channels} channels"
         raise InputError(options.intensities, came, "Give one intensity per channel")
     job = _normalised(pictures, points, directions, intensities, ambient=options.ambient)
-    return Job(*job, mask, targets[0], notes)
+    return Job(*job, masks, targets[0], notes)
 
 
 def _told(targets: list[Path], found: list[ShadingLight]) -> tuple[str, ...]:
@@ -121,7 +126,7 @@ def _read_normals(path: Path) -> np.ndarray:
 def archive(path: Path, options: Options) -> Job:
     """Photographs with normals and lights: images (K, H, W[, C]), normal (H, W, 3), light_dirs (K, 3), ...
 
-    ... and where there are: light_intensities (K, C), mask (H, W). Integer images span their type.
+    ... and where there are: light_intensities (K, C), mask (H, W). Unsigned images span their type.
 
     Args:
         path: an .npz file.
@@ -132,6 +137,9 @@ def archive(path: Path, options: Options) -> Job:
     """
     arrays = read_archive(path)
     images, normal, directions = (arrays[name] for name in ARCHIVE)
+    if images.dtype.kind in "bi":
+        came = f"holds {images.dtype}, of which it is not clear what is white"
+        raise InputError(f"{path}: images", came, "Save unsigned integers, which span their type, or floats")
     if images.ndim == 3:
         images = images[..., None]
     count = len(images)
@@ -157,14 +165,17 @@ def archive(path: Path, options: Options) -> Job:
         if mask.shape != images.shape[1:3]:
             raise InputError(f"{path}: mask", f"is of shape {mask.shape}", f"Give {images.shape[1:3]}")
     points = brdf.SurfacePoints.from_normals(normal, mask=mask)
+    if not np.any(points.mask):
+        came = "has no normal" if mask is None else "has no normal inside the mask"
+        raise InputError(f"{path}: normal", came, "Give a direction (x, y, z) where the surface is")
     pictures = exposed([_as_picture(image) for image in images], options.exposure)
     job = _normalised(pictures, points, directions, intensities.astype(np.float64), ambient=options.ambient)
-    return Job(*job, None, path)
+    return Job(*job, [None] * count, path)
 
 
 def _as_picture(image: np.ndarray) -> Any:
     """Integers as the picture they would be in a file: linear, with its largest code and its step."""
-    if image.dtype.kind not in "ub":
+    if image.dtype.kind != "u":
         return image.astype(np.float32)
     bits = 8 * image.dtype.itemsize
     pixels = (image / float((1 << bits) - 1)).astype(np.float32)

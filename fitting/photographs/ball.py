@@ -99,13 +99,16 @@ class ShadingLight(NamedTuple):
     pixels: int
 
 
-def light_from_shading(picture: Any, points: brdf.SurfacePoints, *, saturation: float | None = None) -> ShadingLight:
+def light_from_shading(
+    picture: Any, points: brdf.SurfacePoints, *, saturation: float | None = None, mask: Any = None
+) -> ShadingLight:
     """Direction of a distant light from the shading of a matt surface: Lambert's law where the light comes in.
 
     Args:
         picture: linear values, (H, W, C) or (H, W), or a `brdf.Picture`.
         points: what each pixel sees.
         saturation: linear value from which on pixels are clipped; None takes the largest code of an integer file.
+        mask: (H, W), pixels to look at.
 
     Returns:
         Direction and strength, found by reweighted least squares so that highlights and cast shadows do not pull.
@@ -114,11 +117,17 @@ def light_from_shading(picture: Any, points: brdf.SurfacePoints, *, saturation: 
         InputError: where fewer than ten pixels are lit or they do not determine a direction.
     """
     grey = _grey(picture)
+    if saturation is not None and not saturation > 0:
+        raise InputError("saturation", f"must be a linear value above 0, got {saturation!r}", "Give a number")
     if isinstance(picture, brdf.Picture) and saturation is None:
         saturation = picture.saturation
     normal, seen = np.asarray(points.normal, np.float64), np.asarray(points.mask)
     if grey.shape != seen.shape:
         raise InputError("picture", f"is of shape {grey.shape}, the points {seen.shape}", "Give points of its size")
+    if mask is not None:
+        if np.shape(mask) != seen.shape:
+            raise InputError("mask", f"is of shape {np.shape(mask)}, the points {seen.shape}", "Give one of its size")
+        seen = seen & np.asarray(mask, bool)
     good = seen & np.isfinite(grey)
     if saturation is not None:
         good &= grey < saturation
