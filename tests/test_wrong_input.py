@@ -223,7 +223,7 @@ OPTIONS = {
         ["fit", "small.exr", "--scene", "scene.toml"],
         "small.exr: is 2 x 2, the scene's camera 8",
     ),
-    "no such preset": (["convert", "unobtainium", "o.json"], "unobtainium: is neither a file nor .* emerald, jade"),
+    "no such preset": (["convert", "unobtainium", "o.json"], "unobtainium: is no material file and no name.* emerald, jade"),
     "name of a preset": (["convert", "emerald", "o.json", "--name", "a"], "--name: chooses from a file"),
     "plausible table": (["fit", "ok.brdf", "--plausible"], "ok.brdf: is a measured BRDF; of the options only"),
     "channels": (["fit", "two.exr", "--scene", "scene.toml"], "two.exr: has 2 channels, the scene's light 3"),

@@ -47,6 +47,6 @@ def _material(material: str, name: str | None) -> tuple[Any, str]:
         return brdf.preset(key), key
     if not path.suffix and not path.exists():
         names = ", ".join(brdf.PRESETS)
-        came = "is neither a file nor a name of the classic table"
+        came = "is no material file and no name of the classic table"
         raise brdf.InputError(material, came, f"Give a .json or .mtl file, or one of {names}")
     return brdf.load_material(material, name), name or path.stem
