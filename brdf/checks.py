@@ -4,13 +4,18 @@ A converter turns what the user gave into a float64 array and refuses what canno
 holds (arrays and tracers of a transformation) keep their type; only their shape is checked.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from brdf.errors import InputError
+
+Parameter = jax.Array | np.ndarray
 
 
 def _array(name: str, value: Any, shape_words: str) -> Any:
@@ -129,3 +134,60 @@ def vertex_list(name: str) -> Callable[[Any], Any]:
         return array
 
     return convert
+
+
+def coefficients(**given: Any) -> list[Parameter]:
+    """The coefficients of a material at one common number of channels, (C,) each.
+
+    Args:
+        given: numbers or sequences, by name.
+
+    Raises:
+        InputError: naming the one that is not finite, is negative, or does not go with the others.
+    """
+    checked = [_not_negative(name, value) for name, value in given.items()]
+    for name, value in zip(given, checked, strict=True):
+        if value.ndim > 1 or value.size == 0:
+            raise InputError(name, f"must be one number or one number per channel, got shape {value.shape}")
+    channels = max(value.size for value in checked)
+    for name, value in zip(given, checked, strict=True):
+        if value.size not in (1, channels):
+            sizes = ", ".join(f"{n} {v.size}" for n, v in zip(given, checked, strict=True))
+            raise InputError(
+                name, f"the coefficients differ in their number of channels ({sizes})", "Give each the same"
+            )
+    return [(np if isinstance(value, np.ndarray) else jnp).broadcast_to(value, (channels,)).copy() for value in checked]
+
+
+def exponent(given: Any) -> Parameter:
+    """The exponent of a material.
+
+    Args:
+        given: one number.
+
+    Raises:
+        InputError: where it is not finite, or negative.
+    """
+    value = _not_negative("n", given)
+    if value.size != 1:
+        raise InputError("n", f"must be one number, got shape {value.shape}", "All channels share one exponent")
+    return value.reshape(())
+
+
+def _not_negative(name: str, given: Any) -> Any:
+    """As float64 numpy if the values are known, after checking them; what JAX is tracing passes through."""
+    if isinstance(given, list | tuple) and any(isinstance(v, Tracer) for v in given):
+        given = jnp.stack([jnp.asarray(v) for v in given])
+    if isinstance(given, Tracer):
+        return given
+    try:
+        value = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(name, f"must be numbers, got {given!r:.60}") from None
+    for channel, number in enumerate(value.ravel()):
+        where = f" in channel {channel}" if value.size > 1 else ""
+        if not math.isfinite(number):
+            raise InputError(name, f"must be finite, got {number}{where}")
+        if number < 0:
+            raise InputError(name, f"must be at least 0, got {number:g}{where}")
+    return value

@@ -26,10 +26,8 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from brdf import vectors
-from brdf.errors import InputError
+from brdf.checks import Parameter, coefficients, exponent
 from brdf.vectors import Directions, Numbers, Scalars
-
-Parameter = Array | np.ndarray
 
 
 class Material(eqx.Module):
@@ -111,8 +109,8 @@ class SpecularMaterial(Material):
         Raises:
             InputError: a number is negative or not finite, or the shapes do not fit.
         """
-        self.k_a, self.k_d, self.k_s = _coefficients(k_a=k_a, k_d=k_d, k_s=k_s)
-        self.n = _exponent(n)
+        self.k_a, self.k_d, self.k_s = coefficients(k_a=k_a, k_d=k_d, k_s=k_s)
+        self.n = exponent(n)
 
     @staticmethod
     @abstractmethod
@@ -187,7 +185,7 @@ class Lambert(Material):
         Raises:
             InputError: a number is negative or not finite, or the shapes do not fit.
         """
-        self.k_a, self.k_d = _coefficients(k_a=k_a, k_d=k_d)
+        self.k_a, self.k_d = coefficients(k_a=k_a, k_d=k_d)
 
     def specular(self, normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
         """The specular term S, which is 0; see ``Material.specular``."""
@@ -292,48 +290,6 @@ MODELS: dict[str, type[Material]] = {
     model.name: model for model in (Lambert, Phong, BlinnPhong, NormalizedPhong, NormalizedBlinnPhong)
 }
 """The models by the names that files and the command line use."""
-
-
-def _coefficients(**given: Any) -> list[Parameter]:
-    """The coefficients, checked, at one common number of channels."""
-    checked = [_numbers(name, value) for name, value in given.items()]
-    for name, value in zip(given, checked, strict=True):
-        if value.ndim > 1 or value.size == 0:
-            raise InputError(name, f"must be one number or one number per channel, got shape {value.shape}")
-    channels = max(value.size for value in checked)
-    for name, value in zip(given, checked, strict=True):
-        if value.size not in (1, channels):
-            sizes = ", ".join(f"{n} {v.size}" for n, v in zip(given, checked, strict=True))
-            raise InputError(
-                name, f"the coefficients differ in their number of channels ({sizes})", "Give each the same"
-            )
-    return [(np if isinstance(value, np.ndarray) else jnp).broadcast_to(value, (channels,)).copy() for value in checked]
-
-
-def _exponent(given: Any) -> Parameter:
-    value = _numbers("n", given)
-    if value.size != 1:
-        raise InputError("n", f"must be one number, got shape {value.shape}", "All channels share one exponent")
-    return value.reshape(())
-
-
-def _numbers(name: str, given: Any) -> Any:
-    """As float64 numpy if the values are known, after checking them; what JAX is tracing passes through."""
-    if isinstance(given, list | tuple) and any(isinstance(v, Tracer) for v in given):
-        given = jnp.stack([jnp.asarray(v) for v in given])
-    if isinstance(given, Tracer):
-        return given
-    try:
-        value = np.asarray(given, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise InputError(name, f"must be numbers, got {given!r:.60}") from None
-    for channel, number in enumerate(value.ravel()):
-        where = f" in channel {channel}" if value.size > 1 else ""
-        if not math.isfinite(number):
-            raise InputError(name, f"must be finite, got {number}{where}")
-        if number < 0:
-            raise InputError(name, f"must be at least 0, got {number:g}{where}")
-    return value
 
 
 def _text(value: Any) -> str:

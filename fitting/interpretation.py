@@ -37,7 +37,7 @@ class ModelFit(NamedTuple):
     """
 
     model: type[brdf.Material]
-    pictures: list[Picture]
+    pictures: Sequence[Picture]
     optimum: Optimum
     free: Bool[np.ndarray, "3 C"]
     n_range: tuple[float, float]

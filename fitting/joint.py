@@ -23,7 +23,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 import brdf
-from fitting.observation import Observation, observe
+from fitting.observation import Tile, observe
 
 LARGEST_JACOBIAN = 1 << 27
 ROUNDS = 8
@@ -99,7 +99,7 @@ def fit_jointly(
     with brdf.working_precision(precision):
         dtype = np.dtype(precision)
         seen = [
-            observe(picture, place, dtype=dtype, mask=one, saturation=saturation)
+            observe(picture, place, dtype=dtype, mask=one, saturation=saturation).tiles[0]
             for picture, place, one in zip(targets, scenes, masks, strict=True)
         ]
         start = brdf.cast((material, scenes), precision)
@@ -116,7 +116,7 @@ def fit_jointly(
 class _Problem:
     """From a vector of freed numbers to weighted residuals."""
 
-    def __init__(self, start: Any, free: Callable[..., Sequence[Any]], seen: list[Observation]):
+    def __init__(self, start: Any, free: Callable[..., Sequence[Any]], seen: list[Tile]):
         self.start, self.free, self.seen = start, free, seen
         leaves = tuple(free(*start))
         names = _names(start, free)
@@ -137,7 +137,7 @@ class _Problem:
         """Material and scenes with the freed leaves in place."""
         return eqx.tree_at(lambda tree: tuple(self.free(*tree)), self.start, self.decode(vector))
 
-    def residuals(self, vector: Float[Array, " K"], seen: list[Observation]) -> list[Array]:
+    def residuals(self, vector: Float[Array, " K"], seen: list[Tile]) -> list[Array]:
         """Weighted residuals of each picture."""
         material, scenes = self.put(vector)
         found = []
@@ -166,7 +166,7 @@ class _Marker:
 
 def _solve(problem: _Problem, leaves: tuple[Any, ...], solver: str, tolerance: float, max_steps: int) -> JointResult:
     @eqx.filter_jit
-    def run(vector: Array, held: Bool[Array, " K"], seen: list[Observation]) -> Any:
+    def run(vector: Array, held: Bool[Array, " K"], seen: list[Tile]) -> Any:
         def residuals(free: Array, _: Any) -> list[Array]:
             return problem.residuals(jnp.where(held, vector, free), seen)
 
@@ -217,12 +217,12 @@ def _errors(problem: _Problem, vector: Array, held: np.ndarray) -> tuple[tuple[n
     """Standard errors from the Gauss-Newton Hessian, one column of the Jacobian at a time."""
 
     @eqx.filter_jit
-    def column(direction: Array, seen: list[Observation]) -> Array:
+    def column(direction: Array, seen: list[Tile]) -> Array:
         tangents = jax.jvp(lambda v: problem.residuals(v, seen), (vector,), (direction,))[1]
         return jnp.concatenate([tangent.ravel() for tangent in tangents])
 
     @eqx.filter_jit
-    def values(seen: list[Observation]) -> Array:
+    def values(seen: list[Tile]) -> Array:
         return jnp.concatenate([residual.ravel() for residual in problem.residuals(vector, seen)])
 
     size = vector.size
@@ -253,6 +253,6 @@ def _errors(problem: _Problem, vector: Array, held: np.ndarray) -> tuple[tuple[n
     return found, float(np.sqrt(residual @ residual / square))
 
 
-def _counted(observation: Observation) -> np.ndarray:
+def _counted(observation: Tile) -> np.ndarray:
     target = np.asarray(observation.target)
     return target if observation.weight is None else target[np.asarray(observation.weight) > 0]

@@ -1,10 +1,12 @@
-"""What a fit looks at: the pixels that count, and the light's colour taken out of them."""
+"""What a fit looks at: the pixels of a picture that count.
 
-import functools
+A large picture is looked at a band of rows at a time: what its pixels see takes three times the memory of the picture,
+and what the engine needs of that a third of it. A picture in a file is not even kept itself: `fitting.engine.streams`.
+"""
+
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,33 +14,71 @@ from jaxtyping import Array, Bool, Float
 
 import brdf
 from brdf.errors import InputError
+from fitting.engine.streams import Stream, each
+from fitting.picture_inputs import check_levels, per_pixel, pixels_of
+from fitting.pixel_survey import FLAT, SYMMETRIC_PIXELS, TOP, Survey, inverse_variance, lit_at_top, survey
 
-# A plateau of exactly equal largest values has to be larger than symmetry makes it before it counts as clipping.
-SYMMETRIC_PIXELS = 8
-# Where the diffuse basis varies by less than this over the plateau, the surface is flat there and nothing is clipped.
-FLAT = 1e-3
-# What counts as the largest value: a few units in the last place of float32 below it, for what follows clamping.
-TOP = 1 - 1e-6
+# How many pixels are looked at together, in rows of which files hold whole blocks.
+TILE_PIXELS = 1 << 20
+ALIGNED_ROWS = 64
+# A file is shown by no more pixels than this along each side.
+SHOWN_PIXELS = 1024
 
 
-class Observation(NamedTuple):
-    """One picture, ready for the engine.
+class Tile(NamedTuple):
+    """A picture, or a band of its rows, ready for the engine.
 
     Attributes:
         target: (P, C), in the precision of the fit.
-        weight: (P,), 1 where the pixel counts, else 0; None where all do.
-        points: what the pixels see, (H, W).
-        left_out: how many pixels were left out, by reason.
-        noise: standard deviation of the error that rounding puts into a value; (C,).
-        brightest: largest size of a value that counts; (C,).
+        weight: (P,), 0 where the pixel does not count; None where all do, and alike.
+        points: what the pixels see, (rows, W).
     """
 
     target: Float[Array, "P C"]
     weight: Float[Array, " P"] | None
     points: brdf.SurfacePoints
+
+
+class Observation(NamedTuple):
+    """One picture.
+
+    Attributes:
+        tiles: all of it, made when asked for.
+        in_memory: the picture is; else what is made of it must not be kept either.
+        left_out: how many pixels were left out, by reason.
+        noise: standard deviation of the error that rounding puts into a value; (C,).
+        brightest: largest size of a value that counts; (C,).
+        shown: (H, W, C), the picture for people: of a large file every so many pixels.
+        scene: what ``shown`` shows.
+        counted: (H, W), which pixels of ``shown`` counted.
+    """
+
+    tiles: Sequence[Tile]
+    in_memory: bool
     left_out: dict[str, int]
     noise: Float[np.ndarray, " C"]
     brightest: Float[np.ndarray, " C"]
+    shown: Float[np.ndarray, "H W C"]
+    scene: brdf.Scene
+    counted: Bool[np.ndarray, "H W"]
+
+
+class _Band(NamedTuple):
+    """Pixels before it is decided which of them count.
+
+    Attributes:
+        first: row of the picture.
+        values: (P, C), on the host or on the device.
+        points: what they see, (rows, W).
+        seen: whether they see a fitted shape, (P,).
+        looked_at: whether they also are inside the mask, (P,).
+    """
+
+    first: int
+    values: Float[Array, "P C"]
+    points: brdf.SurfacePoints
+    seen: Bool[Array, " P"]
+    looked_at: Bool[Array, " P"]
 
 
 def observe(
@@ -50,23 +90,26 @@ def observe(
     saturation: float | None = None,
     dark: float | None = None,
     noise: tuple[float, float] | None = None,
+    weight: Any = None,
 ) -> Observation:
     """Decide which pixels of a picture count.
 
     Args:
-        target: (H, W) or (H, W, C) linear values, or a `brdf.Picture`, which knows its largest code.
+        target: (H, W) or (H, W, C) linear values; a `brdf.Picture`, which knows its largest code; or a
+            `brdf.ImageReader`, of which a band of rows is in memory at a time.
         scene: of the same resolution.
         dtype: float32 or float64.
         mask: (H, W), pixels to look at.
         saturation: linear value from which on pixels are clipped; None finds out.
         dark: linear value up to which pixels are too dark to count: none of their channels exceeds it.
         noise: of the camera, (read, shot): the variance of a value is read² + shot · value, and pixels weigh by it.
+        weight: (H, W), at least 0, how much each pixel counts beside that.
 
     Raises:
-        InputError: where nothing is left to fit.
+        InputError: where nothing is left to fit, or the arguments do not belong together.
     """
-    _check_levels(saturation, dark, noise)
-    pixels, known_saturation, step = _pixels(target)
+    check_levels(saturation, dark, noise)
+    pixels, known_saturation, step = pixels_of(target)
     height, width, channels = pixels.shape
     if (width, height) != scene.resolution:
         came = f"is {width} x {height}, the scene's camera {scene.resolution[0]} x {scene.resolution[1]}"
@@ -74,247 +117,157 @@ def observe(
     if scene.channels not in (1, channels):
         came = f"has {channels} channels, the scene's light {scene.channels}"
         raise InputError("target", came, "Give both the same number of channels")
-    points = brdf.cast(scene, dtype.name).surface_points()
-    left_out: dict[str, int] = {}
-    values = jnp.asarray(pixels.reshape(-1, channels), dtype)
-    seen = jnp.ravel(points.mask)
-    looked_at = seen
-    if mask is not None:
-        mask = np.asarray(mask, dtype=bool)
-        if mask.shape != (height, width):
-            came = f"is of shape {mask.shape}, the target {(height, width)}"
-            raise InputError("mask", came, "Give a value per pixel")
-        looked_at = seen & mask.ravel()
-    survey = jax.device_get(_survey(values, seen, looked_at))
-    left_out["outside the fitted shapes"] = int(seen.size - survey.seen)
-    if not survey.seen:
-        raise InputError("target", "has no pixel that sees a fitted shape", "Check camera, shapes and mask")
-    if mask is not None:
-        left_out["masked"] = int(survey.seen - survey.looked_at)
-        if not survey.looked_at:
-            raise InputError("mask", "leaves no pixel that sees a fitted shape", "Check the mask")
-    left_out["not finite"] = int(survey.looked_at - survey.count)
-    if not survey.count:
-        raise InputError("target", "has no finite value on the object", "Give a picture with values")
-    if not survey.scale.any():
-        raise InputError("target", "is black on the object", "Give a picture with light in it")
+    mask = None if mask is None else per_pixel("mask", mask, (height, width)).astype(bool)
+    if weight is not None:
+        weight = per_pixel("weight", weight, (height, width))
+        if not np.all(np.isfinite(weight) & (weight >= 0)):
+            raise InputError("weight", "holds values that are negative or not finite", "Give values of 0 or more")
+    streamed = isinstance(pixels, brdf.ImageReader)
+    if streamed and noise is not None:
+        remedy = "Give the picture in memory, or weight in place of noise"
+        raise InputError("noise", "needs the whole picture at once, the target is read by bands", remedy)
+    if streamed and scene.camera is not None and scene.camera.samples > 1:
+        remedy = "Take samples out of the camera, or give the picture in memory"
+        raise InputError("target", "is read by bands, where every pixel is seen at its centre", remedy)
+    whole = noise is not None or (scene.camera is not None and scene.camera.samples > 1)
+    bands = _bands(pixels, scene, dtype, mask, height if whole else max(TILE_PIXELS // width, 1))
     level = known_saturation if saturation is None else saturation
-    good, scale, count = survey.good, survey.scale, int(survey.count)
-    if level is None and survey.top > SYMMETRIC_PIXELS:
-        brightest = np.max(np.asarray(values), axis=-1).reshape(height, width)
-        level = _plateau(brightest, float(survey.largest), good.reshape(height, width), points, scene)
-    if level is not None and survey.largest >= level:
-        good, scale, below = jax.device_get(_between(values, good, -jnp.inf, level))
-        left_out["clipped"] = count - int(below)
-        count = int(below)
-        if not count or not scale.any():
+    total, goods = _look(bands, dark, level, keep=not streamed)
+    if level is None and total.largest > 0 and total.top > SYMMETRIC_PIXELS and scene.lights:
+        level = _plateau(bands, goods, total.largest, scene)
+        if level is not None:
+            total, goods = _look(bands, dark, level, keep=not streamed)
+    left_out = _left_out(total, height * width, masked=mask is not None, level=level, dark=dark)
+
+    kept: dict[int, Any] = {}
+
+    def counts(band: _Band) -> Float[Array, " P"] | None:
+        good = goods[band.first] if band.first in goods else _survey(band, dark, level)[0]
+        found = None if total.above == height * width else jnp.asarray(good, dtype)
+        if noise is not None:
+            found = inverse_variance(band.values, jnp.asarray(good), (height, width), *noise, step)
+        if weight is not None:
+            given = weight[band.first : band.first + band.points.mask.shape[0]]
+            given = jnp.asarray(given.ravel(), dtype)
+            found = given if found is None else given * found
+        return found
+
+    def tile(band: _Band) -> Tile:
+        if streamed:
+            return Tile(band.values, counts(band), band.points)
+        if band.first not in kept:
+            kept[band.first] = counts(band)
+        return Tile(band.values, kept[band.first], band.points)
+
+    tiles = each(tile, bands)
+    resolution = max(float(np.finfo(dtype).eps), 0.0 if streamed else float(np.finfo(pixels.dtype).eps))
+    scale = total.scale.astype(np.float64)
+    rounding = np.maximum(scale * resolution, step / np.sqrt(12.0))
+    if streamed:
+        shown = _shown(tiles, scene, channels)
+    else:
+        counted = np.concatenate(list(goods.values())).reshape(height, width)
+        shown = pixels.astype(dtype, copy=False), scene, counted if weight is None else counted & (weight > 0)
+    return Observation(tiles, not streamed, left_out, rounding, scale, *shown)
+
+
+def _bands(pixels: Any, scene: brdf.Scene, dtype: Any, mask: np.ndarray | None, rows: int) -> Sequence[_Band]:
+    height, _, channels = pixels.shape
+
+    place = brdf.cast(scene, dtype.name)
+    if not isinstance(pixels, brdf.ImageReader):
+        pixels = np.asarray(pixels, dtype)
+
+    def values(first: int, last: int) -> Float[Array, "P C"]:
+        if isinstance(pixels, brdf.ImageReader):
+            return jnp.asarray(pixels.rows(first, last).reshape(-1, channels), dtype)
+        # A view: on the device all bands together would be the picture once more.
+        return cast(Array, pixels[first:last].reshape(-1, channels))
+
+    def band(first: int, last: int, points: brdf.SurfacePoints) -> _Band:
+        seen = jnp.ravel(points.mask)
+        looked_at = seen if mask is None else seen & mask[first:last].ravel()
+        return _Band(first, values(first, last), points, seen, looked_at)
+
+    if rows >= height:
+        whole = band(0, height, place.surface_points())
+        return [whole._replace(values=jnp.asarray(whole.values))]
+    rows -= rows % ALIGNED_ROWS if rows > ALIGNED_ROWS else 0
+    spans = [(first, min(first + rows, height)) for first in range(0, height, rows)]
+    return Stream(lambda i: band(*spans[i], place.surface_points(spans[i])), len(spans))
+
+
+def _survey(band: _Band, dark: float | None, level: float | None) -> tuple[Any, Survey]:
+    limits = -np.inf if dark is None else dark, np.inf if level is None else level
+    return jax.device_get(survey(band.values, band.seen, band.looked_at, *limits))
+
+
+def _look(
+    bands: Sequence[_Band], dark: float | None, level: float | None, *, keep: bool
+) -> tuple[Survey, dict[int, Any]]:
+    """What there is to know of all; and which pixels count, by the first row of the band, if that is to be kept."""
+    total, goods = None, {}
+    for band in bands:
+        good, found = _survey(band, dark, level)
+        total = found if total is None else total + found
+        if keep:
+            goods[band.first] = good
+    assert total is not None
+    return total, goods
+
+
+def _plateau(bands: Sequence[_Band], goods: dict[int, Any], largest: float, scene: brdf.Scene) -> float | None:
+    """The level at which a picture is clipped: many pixels at exactly the largest value, on a surface lit unevenly."""
+    ranges = []
+    for band in bands:
+        good = goods.get(band.first)
+        found = lit_at_top(
+            band.values, _survey(band, None, None)[0] if good is None else good, largest, band.points, scene
+        )
+        ranges += [] if found is None else [found]
+    low, high = min(low for low, _ in ranges), max(high for _, high in ranges)
+    return None if high - low <= FLAT * high else largest * TOP
+
+
+def _left_out(total: Survey, pixels: int, *, masked: bool, level: float | None, dark: float | None) -> dict[str, int]:
+    """How many pixels do not count, by reason; an error where none is left."""
+    left_out = {"outside the fitted shapes": int(pixels - total.seen)}
+    if not total.seen:
+        raise InputError("target", "has no pixel that sees a fitted shape", "Check camera, shapes and mask")
+    if masked:
+        left_out["masked"] = int(total.seen - total.looked_at)
+        if not total.looked_at:
+            raise InputError("mask", "leaves no pixel that sees a fitted shape", "Check the mask")
+    left_out["not finite"] = int(total.looked_at - total.finite)
+    if not total.finite:
+        raise InputError("target", "has no finite value on the object", "Give a picture with values")
+    if level is not None:
+        left_out["clipped"] = int(total.finite - total.below)
+        if not total.below or (total.below < total.finite and total.above and not total.scale.any()):
             came = f"is clipped at {level:g} wherever it sees the object"
             raise InputError("target", came, "Give a darker exposure or a higher saturation")
-    elif level is not None:
-        left_out["clipped"] = 0
     if dark is not None:
-        good, scale, above = jax.device_get(_between(values, good, dark, jnp.inf))
-        left_out["dark"] = count - int(above)
-        count = int(above)
-        if not count:
+        left_out["dark"] = int(total.below - total.above)
+        if not total.above:
             came = f"is no brighter than {dark:g} wherever it counts"
             raise InputError("target", came, "Give a brighter picture or a lower dark level")
-    weight = None if count == good.size else jnp.asarray(good, dtype)
-    if noise is not None:
-        weight = _weigh(values, jnp.asarray(good), (height, width), *noise, step)
-    rounding = max(float(np.finfo(dtype).eps), float(np.finfo(pixels.dtype).eps))
-    error = np.maximum(scale.astype(np.float64) * rounding, step / np.sqrt(12.0))
-    return Observation(values, weight, points, left_out, error, scale.astype(np.float64))
+    if not total.scale.any():
+        raise InputError("target", "is black on the object", "Give a picture with light in it")
+    return left_out
 
 
-class _Survey(NamedTuple):
-    """What there is to know of the pixels before they are chosen.
-
-    Attributes:
-        good: which see a fitted shape, are not masked and are finite, (P,).
-        seen: how many see a fitted shape.
-        looked_at: how many of these are not masked.
-        count: how many are good.
-        largest: value of any channel among the good ones.
-        top: how many of these share it.
-        scale: largest size of a value, (C,).
-    """
-
-    good: Any
-    seen: Any
-    looked_at: Any
-    count: Any
-    largest: Any
-    top: Any
-    scale: Any
-
-
-@jax.jit
-def _survey(values: Float[Array, "P C"], seen: Bool[Array, " P"], looked_at: Bool[Array, " P"]) -> _Survey:
-    brightest = _over_channels(jnp.maximum, values)
-    good = looked_at & jnp.isfinite(_over_channels(jnp.add, values))
-    largest = jnp.max(jnp.where(good, brightest, -jnp.inf))
-    top = jnp.count_nonzero(good & (brightest >= largest * TOP))
-    count = jnp.count_nonzero
-    return _Survey(good, count(seen), count(looked_at), count(good), largest, top, _scale(values, good))
-
-
-@jax.jit
-def _between(values: Float[Array, "P C"], good: Bool[Array, " P"], dark: float, level: float) -> tuple[Any, Any, Any]:
-    brightest = _over_channels(jnp.maximum, values)
-    good = good & (brightest > dark) & (brightest < level)
-    return good, _scale(values, good), jnp.count_nonzero(good)
-
-
-def _check_levels(saturation: Any, dark: Any, noise: Any) -> None:
-    for name, value in (("saturation", saturation), ("dark", dark)):
-        if value is not None and (isinstance(value, bool) or not isinstance(value, int | float) or not value == value):
-            raise InputError(name, f"must be a linear value, got {value!r}", "Give a number")
-    if noise is None:
-        return
-    words = "Give (read, shot): the variance of a value is read² + shot · value"
-    try:
-        read, shot = (float(part) for part in noise)
-    except (TypeError, ValueError):
-        raise InputError("noise", f"must be two numbers, got {noise!r}", words) from None
-    if not (0 <= read < np.inf and 0 <= shot < np.inf and read + shot > 0):
-        raise InputError("noise", f"must be two numbers of 0 or more, not both 0, got {noise!r}", words)
-
-
-@functools.partial(jax.jit, static_argnums=2)
-def _weigh(
-    values: Float[Array, "P C"], good: Bool[Array, " P"], shape: tuple[int, int], read: float, shot: float, step: float
-) -> Float[Array, " P"]:
-    """Inverse variances over their mean; a pixel's channels share the variance of their mean value.
-
-    The value is the mean of 5 x 5 pixels: taken from the pixel itself, weights would favour what noise made darker.
-    """
-    mean = jnp.where(good, _over_channels(jnp.add, values) / values.shape[1], 0.0)
-    count = good.astype(values.dtype)
-    total, known = _boxed(mean.reshape(shape)).ravel(), _boxed(count.reshape(shape)).ravel()
-    smooth = jnp.maximum(total / jnp.maximum(known, 1.0), 0.0)
-    # Without read noise a black pixel would weigh infinitely much: quantisation, or a millionth of the mean, stands in.
-    least = 1e-6 * shot * jnp.sum(mean) / jnp.maximum(jnp.sum(count), 1.0) + jnp.finfo(values.dtype).tiny
-    variance = jnp.maximum(read * read + shot * smooth + step * step / 12.0, least)
-    weight = jnp.where(good, jnp.min(jnp.where(good, variance, jnp.inf)) / variance, 0.0)
-    return (weight * (jnp.sum(count) / jnp.sum(weight))).astype(values.dtype)
-
-
-def _boxed(image: Float[Array, "H W"]) -> Float[Array, "H W"]:
-    return jax.lax.reduce_window(image, np.zeros((), image.dtype), jax.lax.add, (5, 5), (1, 1), "SAME")
-
-
-def _over_channels(combine: Any, values: Float[Array, "P C"]) -> Float[Array, " P"]:
-    return functools.reduce(combine, [values[:, channel] for channel in range(values.shape[1])])
-
-
-def _scale(values: Float[Array, "P C"], good: Bool[Array, " P"]) -> Float[Array, " C"]:
-    return jnp.max(jnp.where(good[:, None], jnp.abs(values), 0), axis=0)
-
-
-def _pixels(target: Any) -> tuple[np.ndarray, float | None, float]:
-    """Values (H, W, C), the largest code where it is known, and the distance of two codes."""
-    saturation, step = None, 0.0
-    if isinstance(target, brdf.Picture):
-        steps = target.quantisation()
-        step = 0.0 if steps is None else float(np.nanmax(steps))
-        saturation = None if target.saturation is None else target.saturation * TOP
-        target = target.pixels
-    if isinstance(target, str | bytes) or not hasattr(target, "__array__"):
-        raise InputError("target", f"must be an array, got {type(target).__name__}", "Read it with brdf.read_image")
-    pixels = np.asarray(target)
-    if pixels.dtype.kind != "f":
-        came = f"must hold linear floating-point values, got {pixels.dtype}"
-        raise InputError("target", came, "Read it with brdf.read_image, or divide by the largest code")
-    if pixels.dtype == np.float16:
-        step, pixels = float(np.finfo(np.float16).eps), pixels.astype(np.float32)
-    if pixels.ndim == 2:
-        pixels = pixels[..., None]
-    if pixels.ndim != 3 or 0 in pixels.shape:
-        raise InputError("target", f"must be of shape (H, W, C), got {pixels.shape}", "Give one picture")
-    return pixels, saturation, step
-
-
-def _plateau(
-    brightest: np.ndarray, largest: float, good: np.ndarray, points: brdf.SurfacePoints, scene: brdf.Scene
-) -> float | None:
-    """The level at which a picture is clipped: many pixels at exactly the largest value, on a surface lit unevenly."""
-    top = good & (brightest >= largest * TOP)
-    if np.count_nonzero(top) <= SYMMETRIC_PIXELS or not scene.lights:
-        return None
-    diffuse = brdf.basis_images(brdf.Lambert, scene, points=points).diffuse
-    light = np.max(np.asarray(diffuse), axis=-1)[top]
-    return None if np.ptp(light) <= FLAT * np.max(light) else largest * TOP
-
-
-def weighted(observation: Observation, weight: Any) -> Observation:
-    """An observation whose pixels count as much as is said.
-
-    Args:
-        observation: a picture.
-        weight: (H, W), at least 0; None leaves it as it is.
-
-    Raises:
-        InputError: where it has another shape, or is negative or not finite.
-    """
-    if weight is None:
-        return observation
-    weight, shape = np.asarray(weight), observation.points.mask.shape
-    if weight.shape != shape:
-        raise InputError("weight", f"is of shape {weight.shape}, the target {shape}", "Give a value per pixel")
-    if not np.all(np.isfinite(weight) & (weight >= 0)):
-        raise InputError("weight", "holds values that are negative or not finite", "Give values of 0 or more")
-    values = jnp.asarray(weight.ravel(), observation.target.dtype)
-    return observation._replace(weight=values if observation.weight is None else values * observation.weight)
-
-
-class LightColour(NamedTuple):
-    """The colour that all lights of some scenes share, and the scenes with grey lights in their place.
-
-    Attributes:
-        colour: (C,), what to multiply the grey light by; all 1 where the lights differ in colour.
-        scenes: with lights of one channel, or as they were where the lights differ in colour.
-    """
-
-    colour: Float[np.ndarray, " C"]
-    scenes: list[brdf.Scene]
-
-
-def take_colour_out(scenes: Sequence[brdf.Scene], channels: int) -> LightColour:
-    """Split lights of one chromaticity into grey lights and a colour: then all channels share their basis images.
-
-    Args:
-        scenes: any number.
-        channels: of the picture.
-    """
-    emittances = [np.asarray(light.emittance, np.float64) for scene in scenes for light in scene.lights]
-    unchanged = LightColour(np.ones(channels), list(scenes))
-    if not emittances or all(emittance.shape[0] == 1 for emittance in emittances):
-        return unchanged
-    table = np.stack([np.broadcast_to(emittance, channels) for emittance in emittances])
-    brightest = table[np.argmax(table.sum(axis=1))]
-    if not brightest.any():
-        return unchanged
-    colour = brightest / brightest.max()
-    strength = table @ colour / (colour @ colour)
-    if np.max(np.abs(table - strength[:, None] * colour)) > 1e-12 * np.max(table):
-        return unchanged
-    each = iter(strength)
-    return LightColour(colour, [_with_strengths(scene, each) for scene in scenes])
-
-
-def _with_strengths(scene: brdf.Scene, strengths: Any) -> brdf.Scene:
-    lights = [eqx.tree_at(lambda light: light.emittance, light, np.array([next(strengths)])) for light in scene.lights]
-    return eqx.tree_at(lambda scene: scene.lights, scene, tuple(lights))
-
-
-def fitted_pixels(observation: Observation) -> Bool[np.ndarray, "H W"]:
-    """Which pixels counted, (H, W).
-
-    Args:
-        observation: a picture.
-    """
-    shape = observation.points.mask.shape
-    if observation.weight is None:
-        return np.ones(shape, bool)
-    return np.asarray(jax.device_get(observation.weight) > 0).reshape(shape)
+def _shown(tiles: Sequence[Tile], scene: brdf.Scene, channels: int) -> tuple[np.ndarray, brdf.Scene, np.ndarray]:
+    """Every so many pixels of a picture that is not in memory, what they show, and which of them counted."""
+    width, height = scene.resolution
+    stride = -(-max(width, height) // SHOWN_PIXELS)
+    pictures, counted, first = [], [], 0
+    for tile in tiles:
+        rows = tile.points.mask.shape[0]
+        some = slice(-first % stride, None, stride)
+        pictures.append(np.asarray(tile.target).reshape(rows, width, channels)[some, ::stride])
+        weight = np.ones(rows * width) if tile.weight is None else np.asarray(tile.weight)
+        counted.append((weight > 0).reshape(rows, width)[some, ::stride])
+        first += rows
+    pixel = np.arange(0, height, stride)[:, None] * width + np.arange(0, width, stride)
+    dtype = pictures[0].dtype.name
+    return np.concatenate(pictures), brdf.some_pixels(scene, pixel, precision=dtype), np.concatenate(counted)

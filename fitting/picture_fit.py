@@ -2,34 +2,33 @@
 
 import time
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
 
 import brdf
 from brdf.errors import InputError
-from fitting.engine.losses import LOSSES, Loss, reweight
+from fitting.engine.losses import LOSSES, Loss
 from fitting.engine.normal import fit_tied
-from fitting.engine.separable import Optimum, Picture, fit_linear, search
+from fitting.engine.separable import Picture, fit_linear
+from fitting.engine.streams import each
 from fitting.interpretation import Interpretation, ModelFit, coefficient_factors, interpret
-from fitting.observation import LightColour, Observation, fitted_pixels, observe, take_colour_out, weighted
+from fitting.light_colour import take_colour_out
+from fitting.model_fit import Job, fit_model, optimise, reached
+from fitting.observation import observe
 from fitting.plausible import fit_plausible, is_plausible
 from fitting.result import FitResult, free_parameters
 from fitting.selection import FAMILIES, Choice, choose
 from fitting.uncertainty.covariance import TERMS, residual_noise
 from fitting.uncertainty.noise_model import weighted_sums
-from fitting.uncertainty.structure import nearest_peak, structure
+from fitting.uncertainty.structure import structure
 
 N_RANGE = (0.1, 1e6)
 AUTO = ("phong", "blinn-phong")
 PLAUSIBLE = ("normalized-phong", "normalized-blinn-phong")
 # An exponent up to this multiple of the lower bound is at the bound.
 WIDEST = 1.01
-# The nearest pixel shows exp(-UNSEEN) of a highlight's peak, or more, or the exponent is not looked at.
-UNSEEN = 60.0
 
 
 def fit(
@@ -52,7 +51,8 @@ def fit(
     """Fit a material to a picture, or to several pictures of one material: the global optimum, with no start to give.
 
     Args:
-        target: linear values, (H, W, C) or (H, W), or a `brdf.Picture`; or a list of them.
+        target: linear values, (H, W, C) or (H, W), or a `brdf.Picture`; a `brdf.ImageReader` for a file that is larger
+            than memory, which is read by bands of rows, several times; or a list of them.
         scene: what the picture shows; a list of as many where there are several pictures.
         model: "auto" for the simplest adequate of Lambert, Phong and Blinn-Phong, or the name of a model.
         precision: "float32" or "float64".
@@ -82,10 +82,13 @@ def fit(
     Source: Golub and Pereyra 1973, variable projection; see `fitting.engine.separable`.
     """
     start = time.perf_counter()
-    targets, scenes, masks = _pictures(target, scene, mask)
+    targets, scenes, masks, weights = _pictures(target, scene, mask, weight)
     if accuracy is not None or seconds is not None:
         from fitting.accuracy.budget import fit_within
 
+        if any(isinstance(one, brdf.ImageReader) for one in targets):
+            words = "is read by bands of rows; accuracy and seconds choose among pixels in memory"
+            raise InputError("target", words, "Read it with brdf.read_image, or leave accuracy and seconds out")
         how = {"mask": masks, "saturation": saturation, "n_range": n_range, "dark": dark}
         beside = {"loss": loss != "squared", "noise": noise is not None, "weight": weight is not None}
         beside["plausible"] = plausible
@@ -102,137 +105,58 @@ def fit(
         raise InputError("n_range", f"must be 0 < lower < upper, got {n_range}", "Correct the bounds")
     with brdf.working_precision(precision):
         dtype = np.dtype(precision)
+        cuts = {"saturation": saturation, "dark": dark, "noise": noise}
         observations = [
-            observe(picture, place, dtype=dtype, mask=one, saturation=saturation, dark=dark, noise=noise)
-            for picture, place, one in zip(targets, scenes, masks, strict=True)
+            observe(picture, place, dtype=dtype, mask=one, weight=other, **cuts)
+            for picture, place, one, other in zip(targets, scenes, masks, weights, strict=True)
         ]
-        if weight is not None:
-            weights = weight if isinstance(target, list | tuple) else [weight]
-            observations = [weighted(*each) for each in zip(observations, weights, strict=True)]
-        counts = {observation.target.shape[1] for observation in observations}
+        counts = {observation.shown.shape[-1] for observation in observations}
         if len(counts) > 1:
             raise InputError("target", f"pictures have {counts} channels", "Give pictures with the same number")
         light = take_colour_out(scenes, counts.pop())
-        job = _Job(observations, light, n_range, loss, PLAUSIBLE if plausible else AUTO)
+        job = Job(observations, light, n_range, loss, PLAUSIBLE if plausible else AUTO)
         if model == "auto":
             fitted, choice = _fit_auto(job)
         else:
-            fitted, choice = _fit_model(brdf.MODELS[model], job), None
+            fitted, choice = fit_model(brdf.MODELS[model], job), None
         if plausible:
             fitted = _held_plausible(fitted, job)
         told = _interpret(fitted, job, choice)
-    return _result(fitted, told, choice, job, targets, scenes, precision, time.perf_counter() - start)
+    return _result(fitted, told, choice, job, precision, time.perf_counter() - start)
 
 
-def _pictures(target: Any, scene: Any, mask: Any) -> tuple[list[Any], list[brdf.Scene], list[Any]]:
+def _pictures(
+    target: Any, scene: Any, mask: Any, weight: Any
+) -> tuple[list[Any], list[brdf.Scene], list[Any], list[Any]]:
     several = isinstance(target, list | tuple)
     targets = list(target) if several else [target]
     scenes = list(scene) if isinstance(scene, list | tuple) else [scene] * len(targets)
-    masks = list(mask) if several and isinstance(mask, list | tuple) else [mask] * len(targets)
+    masks, weights = (
+        list(values) if several and isinstance(values, list | tuple) else [values] * len(targets)
+        for values in (mask, weight)
+    )
     if not targets:
         raise InputError("target", "is an empty list", "Give at least one picture")
-    for name, values in (("scene", scenes), ("mask", masks)):
+    for name, values in (("scene", scenes), ("mask", masks), ("weight", weights)):
         if len(values) != len(targets):
             raise InputError(name, f"has {len(values)} entries for {len(targets)} pictures", "Give one for each")
     if not all(isinstance(one, brdf.Scene) for one in scenes):
         raise InputError("scene", f"must be a brdf.Scene, got {type(scene).__name__}", "Use brdf.Scene.load")
-    return targets, scenes, masks
+    return targets, scenes, masks, weights
 
 
-class _Job(NamedTuple):
-    """What stays the same for every model.
-
-    Attributes:
-        observations: the pictures.
-        light: and their lights, colour taken out.
-        n_range: bounds of the exponent.
-        loss: what is minimised.
-        families: models with a highlight that are compared.
-    """
-
-    observations: list[Observation]
-    light: LightColour
-    n_range: tuple[float, float]
-    loss: Loss
-    families: tuple[str, ...] = AUTO
-
-    @property
-    def shapes(self) -> list[tuple[int, int]]:
-        """Height and width of each picture."""
-        return [(height, width) for height, width in (one.points.mask.shape for one in self.observations)]
-
-    @property
-    def rounding(self) -> Float[np.ndarray, " C"]:
-        """Standard deviation of a value's rounding."""
-        return np.max([observation.noise for observation in self.observations], axis=0)
-
-    @property
-    def lit(self) -> Bool[np.ndarray, "2 C"]:
-        """Which channels have ambient light, and which have lights."""
-        channels = self.observations[0].target.shape[1]
-        ambient, direct = np.zeros(channels, bool), np.zeros(channels, bool)
-        for scene in self.light.scenes:
-            if scene.ambient is not None:
-                ambient |= np.asarray(scene.ambient) > 0
-            for one in scene.lights:
-                direct |= np.asarray(one.emittance) * self.light.colour > 0
-        return np.stack([ambient, direct])
-
-
-def _free(model: type[brdf.Material], job: _Job) -> Bool[np.ndarray, "3 C"]:
-    ambient, direct = job.lit
-    return np.stack([ambient, direct, direct & issubclass(model, brdf.SpecularMaterial)])
-
-
-def _engine_pictures(model: type[brdf.Material], job: _Job) -> list[Picture]:
-    pictures = []
-    for observation, scene in zip(job.observations, job.light.scenes, strict=True):
-        dtype = observation.target.dtype
-        precision: brdf.Precision = "float32" if dtype == np.float32 else "float64"
-        ambient = np.zeros(1) if scene.ambient is None else np.asarray(scene.ambient, np.float64)
-        basis = brdf.basis(model, brdf.cast(scene, precision), points=observation.points)
-        diffuse = jnp.zeros((observation.target.shape[0], 1), dtype) if basis.diffuse is None else basis.diffuse
-        pictures.append(Picture(observation.target, diffuse, basis.lobe, observation.weight, ambient))
-    return pictures
-
-
-def _visible(pictures: Sequence[Picture], n_range: tuple[float, float]) -> tuple[float, float] | None:
-    """Exponents of which some pixel sees at least a trace: with larger ones k_s could be anything; None without any."""
-    nearest = max((nearest_peak(picture) for picture in pictures if picture.lobe is not None), default=0.0)
-    upper = min(n_range[1], UNSEEN / max(-nearest, UNSEEN / n_range[1]))
-    return (n_range[0], upper) if upper >= n_range[0] else None
-
-
-def _optimise(pictures: Sequence[Picture], free: np.ndarray, n_range: tuple[float, float]) -> Optimum:
-    if free[2].any():
-        return search(pictures, n_min=n_range[0], n_max=n_range[1], free=free)
-    return fit_linear(pictures, free=free)
-
-
-def _fit_model(model: type[brdf.Material], job: _Job) -> ModelFit:
-    free = _free(model, job)
-    pictures = _engine_pictures(model, job)
-    n_range = job.n_range
-    if free[2].any():
-        visible = _visible(pictures, job.n_range)
-        n_range = visible or n_range
-        free[2] &= visible is not None
-    found = reweight(pictures, lambda some: _optimise(some, free, n_range), job.loss, job.rounding)
-    return ModelFit(model, found.pictures, found.optimum, free, n_range, None, found.noise_factor)
-
-
-def _fit_auto(job: _Job) -> tuple[ModelFit, Choice]:
+def _fit_auto(job: Job) -> tuple[ModelFit, Choice]:
     """All families, then the simplest adequate candidate on its own."""
     names = job.families if job.lit[1].any() else ("lambert",)
-    fits = {name: _fit_model(brdf.MODELS[name], job) for name in names}
+    fits = {name: fit_model(brdf.MODELS[name], job) for name in names}
     # A lobe that would be wider than the search allows is no highlight: it mends what Lambert's law leaves at the rim.
     fits = {name: fit for name, fit in fits.items() if fit.optimum.flat or fit.optimum.n > WIDEST * job.n_range[0]}
-    fits = fits or {"lambert": _fit_model(brdf.Lambert, job)}
+    fits = fits or {"lambert": fit_model(brdf.Lambert, job)}
     if job.loss != "squared":
         # Weights are part of what is minimised: those of the better family serve all, or costs could not be compared.
         name = min(fits, key=lambda name: float(np.sum(residual_noise(fits[name].optimum, job.rounding))))
-        weights = [picture.weight for picture in fits[name].pictures]
-        fits = {name: _with_weights(fit, weights) for name, fit in fits.items()}
+        weighed = fits[name].pictures
+        fits = {name: _with_weights_of(weighed, fit) for name, fit in fits.items()}
     grey = {name: coefficient_factors(fit.model, fit.optimum.n, job.light.colour)[2] for name, fit in fits.items()}
     best = min(fits.values(), key=lambda fit: float(np.sum(fit.optimum.cost)))
     noise = residual_noise(best.optimum, job.rounding)
@@ -249,7 +173,7 @@ def _fit_auto(job: _Job) -> tuple[ModelFit, Choice]:
     return _alone(choice, fits, grey), choice
 
 
-def _held_plausible(fit: ModelFit, job: _Job) -> ModelFit:
+def _held_plausible(fit: ModelFit, job: Job) -> ModelFit:
     colour = job.light.colour
     if is_plausible(fit.optimum, fit.model, colour):
         return fit
@@ -259,24 +183,25 @@ def _held_plausible(fit: ModelFit, job: _Job) -> ModelFit:
     return fit._replace(optimum=optimum, tied=None, capped=True, noise_factor=noise)
 
 
-def _with_weights(fit: ModelFit, weights: list[Any]) -> ModelFit:
-    pictures = [
-        eqx.tree_at(lambda p: p.weight, picture, weight) for picture, weight in zip(fit.pictures, weights, strict=True)
-    ]
-    return fit._replace(pictures=pictures, optimum=_optimise(pictures, fit.free, fit.n_range))
+def _with_weights_of(weighed: Sequence[Picture], fit: ModelFit) -> ModelFit:
+    def taken_over(picture: Picture, other: Picture) -> Picture:
+        return eqx.tree_at(lambda p: p.weight, picture, other.weight)
+
+    pictures = each(taken_over, fit.pictures, weighed)
+    return fit._replace(pictures=pictures, optimum=optimise(pictures, fit.free, fit.n_range))
 
 
 def _alone(choice: Choice, fits: dict[str, ModelFit], grey: dict[str, np.ndarray]) -> ModelFit:
     """The chosen candidate, fitted to the pixels without what it leaves out."""
     if choice.model in FAMILIES:
         fit = next(iter(fits.values()))
-        pictures = [Picture(p.target, p.diffuse, None, p.weight, p.ambient) for p in fit.pictures]
+        pictures = each(lambda p: Picture(p.target, p.diffuse, None, p.weight, p.ambient), fit.pictures)
         optimum = fit_linear(pictures, free=choice.free)
         return ModelFit(brdf.Lambert, pictures, optimum, choice.free, fit.n_range, None, fit.noise_factor)
     fit = fits[choice.model]
     optimum = fit.optimum
     if not np.array_equal(choice.free, fit.free):
-        optimum = _optimise(fit.pictures, choice.free, fit.n_range)
+        optimum = optimise(fit.pictures, choice.free, fit.n_range)
     tied = grey[choice.model] if choice.grey else None
     if tied is not None:
         single = np.dtype(fit.pictures[0].target.dtype) == np.float32
@@ -284,10 +209,10 @@ def _alone(choice: Choice, fits: dict[str, ModelFit], grey: dict[str, np.ndarray
     return fit._replace(optimum=optimum, free=choice.free, tied=tied)
 
 
-def _interpret(fit: ModelFit, job: _Job, choice: Choice | None) -> Interpretation:
+def _interpret(fit: ModelFit, job: Job, choice: Choice | None) -> Interpretation:
     brightest = np.max([observation.brightest for observation in job.observations], axis=0)
     # What the light reaches but the simplest model does without is 0, with the error that it would have.
-    told = interpret(fit, job.light.colour, job.rounding, brightest, job.shapes, _free(fit.model, job))
+    told = interpret(fit, job.light.colour, job.rounding, brightest, job.shapes, reached(fit.model, job))
     if choice is None or not choice.rivals:
         return told
     names = " and ".join(choice.rivals)
@@ -299,9 +224,7 @@ def _result(
     fit: ModelFit,
     told: Interpretation,
     choice: Choice | None,
-    job: _Job,
-    targets: list[Any],
-    scenes: list[brdf.Scene],
+    job: Job,
     precision: brdf.Precision,
     seconds: float,
 ) -> FitResult:
@@ -329,10 +252,7 @@ def _result(
         loss=job.loss,
         precision=precision,
         seconds=seconds,
-        targets=[
-            np.asarray(observation.target).reshape(*shape, -1)
-            for observation, shape in zip(observations, job.shapes, strict=True)
-        ],
-        scenes=scenes,
-        counted=[fitted_pixels(observation) for observation in observations],
+        targets=[observation.shown for observation in observations],
+        scenes=[observation.scene for observation in observations],
+        counted=[observation.counted for observation in observations],
     )

@@ -96,7 +96,7 @@ def test_gradients_pass_through_pixel_areas():
 
 
 def test_many_samples_pass_tile_by_tile(monkeypatch: pytest.MonkeyPatch):
-    from brdf import shading
+    from brdf.shading import light_sum as shading
 
     light = brdf.SphereLight(center=[1, 1, 3], radius=0.5, radiance=5, samples=16)
     whole = np.asarray(brdf.render(glossy(20), ball(1, size=40, lights=[light]), precision="float32"))

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from brdf.checks import direction_value, number, positive, vector
 from brdf.errors import InputError
@@ -83,9 +83,16 @@ class Camera(eqx.Module):
             y: up from it, in the same unit.
         """
 
-    def rays(self) -> tuple[Float[Array, "height width 3"], Float[Array, "height width 3"]]:
-        """Origin and unit direction of the ray through each pixel's centre."""
-        return self.rays_through(*self.picture_plane())
+    def rays(
+        self, first: Int[ArrayLike, ""] = 0, count: int | None = None
+    ) -> tuple[Float[Array, "rows width 3"], Float[Array, "rows width 3"]]:
+        """Origin and unit direction of the ray through each pixel's centre.
+
+        Args:
+            first: row.
+            count: of rows; None for all from the first one on.
+        """
+        return self.rays_through(*self.picture_plane(first, count))
 
     def rays_in_pixels(
         self, pixel: Int[Array, " K"], right: Float[Array, " M"], down: Float[Array, " M"]
@@ -121,11 +128,13 @@ class Camera(eqx.Module):
         right = normalize(jnp.cross(forward, self.up))
         return right, jnp.cross(right, forward), forward
 
-    def picture_plane(self) -> tuple[Float[Array, "1 width"], Float[Array, "height 1"]]:
-        """Pixel centres, x to the right and y up, in units of half the picture's width."""
+    def picture_plane(
+        self, first: Int[ArrayLike, ""] = 0, count: int | None = None
+    ) -> tuple[Float[Array, "1 width"], Float[Array, "rows 1"]]:
+        """Pixel centres, x to the right and y up, in units of half the picture's width; of some rows, see `rays`."""
         width, height = self.resolution
         x = (jnp.arange(width) + 0.5) * 2.0 / width - 1.0
-        y = height / width - (jnp.arange(height) + 0.5) * 2.0 / width
+        y = height / width - (jnp.arange(height if count is None else count) + first + 0.5) * 2.0 / width
         return x[None, :], y[:, None]
 
     def to_view(self, position: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:

@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from brdf.geometry.camera import Camera
 from brdf.geometry.shapes import Shape
@@ -16,7 +16,11 @@ NO_SHAPE = -1
 
 @eqx.filter_jit
 def look(
-    camera: Camera, shapes: tuple[Shape, ...], visibility: tuple[Float[Array, "H W"] | None, ...] | None = None
+    camera: Camera,
+    shapes: tuple[Shape, ...],
+    visibility: tuple[Float[Array, "rows W"] | None, ...] | None = None,
+    first: Int[ArrayLike, ""] = 0,
+    count: int | None = None,
 ) -> SurfacePoints:
     """What the centre of each pixel sees.
 
@@ -24,12 +28,14 @@ def look(
         camera: where the picture is taken from.
         shapes: what it shows.
         visibility: of the lights, where it is given.
+        first: row of the picture.
+        count: of rows; None for all from the first one on.
     """
 
-    def centres(camera: Camera, shapes: tuple[Shape, ...]) -> SurfacePoints:
-        return trace(camera, shapes, visibility, *camera.rays())
+    def centres(camera: Camera, shapes: tuple[Shape, ...], first: Int[ArrayLike, ""]) -> SurfacePoints:
+        return trace(camera, shapes, visibility, *camera.rays(first, count))
 
-    return apart(centres, camera, shapes)
+    return apart(centres, camera, shapes, first)
 
 
 def trace(

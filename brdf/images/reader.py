@@ -68,6 +68,16 @@ class ImageReader:
         if spec.y >= spec.full_y + height or spec.y + spec.height <= spec.full_y:
             raise InputError(self.path, "has no data inside its display window", "Make the file again")
 
+    @property
+    def codes(self) -> tuple[float | None, float]:
+        """The linear value of the largest code, and the largest distance of two; None and 0 for floats."""
+        if not self.is_integer:
+            return None, 0.0
+        if self.encoding == "linear":
+            return 1.0, 1.0 / ((1 << self.bits) - 1)
+        table = decode_table(self.encoding, min(self.bits, 16))
+        return float(table[-1]), float(np.max(np.diff(table)))
+
     def __enter__(self) -> Self:
         """The reader itself."""
         return self

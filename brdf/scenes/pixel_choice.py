@@ -17,8 +17,13 @@ from brdf.precision import Precision, cast, working_precision
 from brdf.scenes.scene import Scene
 
 
-def some_pixels(scene: Scene, pixel: Int[np.ndarray | Array, " K"], *, precision: Precision = "float32") -> Scene:
-    """The scene of a picture of one row, (1, K), that shows some pixels of another.
+def some_pixels(
+    scene: Scene,
+    pixel: Int[np.ndarray | Array, " K"] | Int[np.ndarray | Array, "H W"],
+    *,
+    precision: Precision = "float32",
+) -> Scene:
+    """The scene of a picture that shows some pixels of another: of one row, (1, K), or of the shape of ``pixel``.
 
     Only those are traced, unless pixels are averaged over their area: which ones need that, their neighbours tell.
 
@@ -30,6 +35,8 @@ def some_pixels(scene: Scene, pixel: Int[np.ndarray | Array, " K"], *, precision
     Returns:
         A scene with surface points in place of the camera; what casts shadows there does so here.
     """
+    shape = (1, pixel.size) if pixel.ndim == 1 else (pixel.shape[0], pixel.shape[1])
+    pixel = pixel.reshape(-1)
     with working_precision(precision):
         if scene.camera is None:
             points = _chosen(cast(scene.points, precision), pixel)
@@ -41,9 +48,10 @@ def some_pixels(scene: Scene, pixel: Int[np.ndarray | Array, " K"], *, precision
         casting = scene.lighting.occluders
         hiding = tuple(dataclasses.replace(shape, fitted=False) for shape in casting)
         visibility = tuple(
-            None if mask is None else np.asarray(mask, np.float64).ravel()[np.asarray(pixel)][None]
+            None if mask is None else np.asarray(mask, np.float64).ravel()[np.asarray(pixel)].reshape(shape)
             for mask in scene.visibility
         )
+        points = _shaped(points, shape)
         return Scene(points=points, shapes=hiding, ambient=scene.ambient, lights=scene.lights, visibility=visibility)
 
 
@@ -53,6 +61,19 @@ def _traced(camera: Camera, shapes: tuple[Shape, ...], pixel: Any) -> SurfacePoi
     origins, directions = camera.rays_in_pixels(pixel, middle, middle)
     points = trace(camera, shapes, None, origins, directions)
     return jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), points)
+
+
+def _shaped(points: SurfacePoints, shape: tuple[int, int]) -> SurfacePoints:
+    """Points of one row, (1, K), in another shape."""
+    if points.mask.shape == shape:
+        return points
+    area = points.area
+    plain = eqx.tree_at(lambda p: p.area, points, None, is_leaf=lambda leaf: leaf is None)
+    plain = jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[2:]), plain)
+    if area is not None:
+        area = eqx.tree_at(lambda a: a.slot, area, area.slot.reshape(shape))
+        plain = eqx.tree_at(lambda p: p.area, plain, area, is_leaf=lambda leaf: leaf is None)
+    return plain
 
 
 def _chosen(points: Any, pixel: Any) -> SurfacePoints:

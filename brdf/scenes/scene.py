@@ -4,6 +4,8 @@ from pathlib import Path
 from typing import Any
 
 import equinox as eqx
+import jax
+import numpy as np
 from jaxtyping import Array, Float
 
 from brdf.checks import spectrum
@@ -93,14 +95,36 @@ class Scene(eqx.Module):
         height, width = self.points.mask.shape
         return width, height
 
-    def surface_points(self) -> SurfacePoints:
-        """What each pixel sees, (H, W): traced by the camera, or as given."""
+    def surface_points(self, rows: tuple[int, int] | None = None) -> SurfacePoints:
+        """What each pixel sees: traced by the camera, or as given.
+
+        Args:
+            rows: the first one, and the one after the last, where not all are wanted; then pixels are seen at their
+                centres, and numbers of the scene cannot be differentiated.
+
+        Returns:
+            (H, W) points, or as many rows.
+        """
+        if rows is not None:
+            return self._some_rows(*rows)
         visibility = self.visibility or None
         if self.points is not None:
             return eqx.tree_at(lambda points: points.visibility, self.points, visibility, is_leaf=_is_none)
         assert self.camera is not None
         points = look(self.camera, self.shapes, visibility)
         return points if self.camera.samples == 1 else with_area(points, self.camera, self.shapes, self.lighting)
+
+    def _some_rows(self, first: int, stop: int) -> SurfacePoints:
+        visibility = tuple(None if mask is None else mask[first:stop] for mask in self.visibility) or None
+        if self.points is None:
+            assert self.camera is not None
+            # As an array, or every band would be compiled anew.
+            return look(self.camera, self.shapes, visibility, np.asarray(first, np.int32), stop - first)
+        plain = eqx.tree_at(
+            lambda points: (points.visibility, points.area), self.points, (None, None), is_leaf=_is_none
+        )
+        some = jax.tree.map(lambda leaf: leaf[first:stop], plain)
+        return eqx.tree_at(lambda points: points.visibility, some, visibility, is_leaf=_is_none)
 
     @property
     def lighting(self) -> Lighting:

@@ -184,7 +184,7 @@ def target_size(target: Any) -> int:
 
 def _clipping(targets: Sequence[Any], pictures: Sequence[Any], samples: Sequence[Any]) -> float | None:
     """The level at which pictures are clipped, where so few pixels of a sample are that `fit` would not notice."""
-    from fitting.observation import SYMMETRIC_PIXELS, TOP
+    from fitting.pixel_survey import SYMMETRIC_PIXELS, TOP
 
     for target, picture, sample in zip(targets, pictures, samples, strict=True):
         if sample is None or isinstance(target, brdf.Picture):

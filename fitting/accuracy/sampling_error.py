@@ -27,7 +27,7 @@ from fitting.accuracy.lamps import Lamps
 from fitting.accuracy.pixel_sampling import PixelSample, sample_pixels, traceable
 from fitting.accuracy.probes import Probe, columns_in, difference, probe
 from fitting.interpretation import coefficient_factors
-from fitting.observation import take_colour_out
+from fitting.light_colour import take_colour_out
 from fitting.uncertainty.covariance import TERMS
 
 DRAWS = 512

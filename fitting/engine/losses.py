@@ -19,6 +19,7 @@ is the residual of all channels of a pixel together, in units of a scale taken f
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Literal, NamedTuple
 
 import equinox as eqx
@@ -28,6 +29,7 @@ from jaxtyping import Array, Float
 
 from fitting.engine.pictures import AnyArray, Picture
 from fitting.engine.separable import Optimum
+from fitting.engine.streams import each
 
 Loss = Literal["squared", "huber", "cauchy", "relative", "log"]
 LOSSES: tuple[Loss, ...] = ("squared", "huber", "cauchy", "relative", "log")
@@ -58,7 +60,7 @@ class Reweighted(NamedTuple):
     """
 
     optimum: Optimum
-    pictures: list[Picture]
+    pictures: Sequence[Picture]
     noise_factor: float
     settled: bool
 
@@ -80,7 +82,7 @@ def cut(channels: int) -> float:
 
 def reweight(
     pictures: Sequence[Picture],
-    optimise: Callable[[list[Picture]], Optimum],
+    optimise: Callable[[Sequence[Picture]], Optimum],
     loss: Loss,
     rounding: Float[np.ndarray, " C"],
 ) -> Reweighted:
@@ -92,7 +94,7 @@ def reweight(
         loss: one of `LOSSES`.
         rounding: standard deviation of a value's rounding, (C,); no scale is smaller.
     """
-    now = list(pictures)
+    now = pictures
     optimum = optimise(now)
     if loss == "squared":
         return Reweighted(optimum, now, 1.0, True)
@@ -102,7 +104,7 @@ def reweight(
         # Huber's loss is convex in the coefficients; the first rounds lead Cauchy's to the right one of its minima.
         rule = "huber" if loss == "cauchy" and round_ < 3 else loss
         scale = floor if loss in ("relative", "log") else _scale(pictures, optimum, rounding)
-        now = [_with_weight(picture, optimum, scale, rule) for picture in pictures]
+        now = each(partial(_with_weight, optimum=optimum, scale=scale, loss=rule), pictures)
         optimum = optimise(now)
         settled = rule == loss and _change(before, optimum) < ENOUGH
         if settled:
@@ -194,7 +196,7 @@ def weights(
     return base / (1 + distance / CAUCHY**2)
 
 
-def _noise_factor(now: list[Picture], base: Sequence[Picture], optimum: Optimum, loss: str) -> float:
+def _noise_factor(now: Sequence[Picture], base: Sequence[Picture], optimum: Optimum, loss: str) -> float:
     """Huber's (1981, section 7.6) correction: mean(psi²) / mean(psi')² in place of the weighted residual's variance.
 
     ψ = w r; its derivative is 1 where the loss is quadratic. The weighted Gram matrix is mean(w) times the plain one.

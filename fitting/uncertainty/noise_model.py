@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 from fitting.engine.active_set import nonnegative_minimum
 from fitting.engine.pictures import AnyArray, Picture
 from fitting.engine.separable import Optimum
+from fitting.engine.streams import each
 from fitting.engine.sums import Sums, sums
 
 # A correlation of squared residual and value within so many of its standard errors is chance.
@@ -131,13 +132,15 @@ def weighted_sums(pictures: Sequence[Picture], optimum: Optimum, noise: NoiseMod
     Returns:
         The sums, columns ambient, diffuse, lobe, derivative by n, about the target.
     """
-    n, again = np.asarray(optimum.n), []
-    for picture in pictures:
+    n = np.asarray(optimum.n)
+
+    def again(picture: Picture) -> Picture:
         weight = _reweighted(picture, n, optimum.x, noise.coefficients, inverse)
-        again.append(eqx.tree_at(lambda p: p.weight, picture, weight, is_leaf=lambda leaf: leaf is None))
+        return eqx.tree_at(lambda p: p.weight, picture, weight, is_leaf=lambda leaf: leaf is None)
+
     with jax.enable_x64(True):
-        has_lobe = any(picture.lobe is not None for picture in again)
-        parts = sums(again, np.log([optimum.n]) if has_lobe else np.zeros(0), optimum.x.T)
+        has_lobe = any(picture.lobe is not None for picture in pictures)
+        parts = sums(each(again, pictures), np.log([optimum.n]) if has_lobe else np.zeros(0), optimum.x.T)
     parts = parts.about(np.pad(optimum.x.T, [(0, 0), (0, 1)]) if has_lobe else optimum.x.T[:, :2])
     wide = 4 - parts.gram.shape[-1]
     gram = np.pad(parts.gram, [(0, 0), (0, wide), (0, wide)])

@@ -1,0 +1,161 @@
+"""A picture that is read by bands of rows gives the fit of the picture in memory."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import brdf
+import fitting
+from fitting import observation
+from fitting.engine.streams import Stream, each, joined
+
+MATERIAL = brdf.BlinnPhong(k_a=[0.05, 0.04, 0.03], k_d=[0.5, 0.3, 0.1], k_s=[0.3, 0.25, 0.2], n=60.0)
+SIZE = (96, 90)
+
+
+def scene(**changes) -> brdf.Scene:
+    camera = brdf.OrthographicCamera(
+        position=[0.0, 0.0, 4.0], target=[0.0, 0.0, 0.0], up=[0.0, 1.0, 0.0], width=2.4, resolution=SIZE
+    )
+    light = brdf.DirectionalLight(direction=[0.4, 0.5, 0.8], intensity=[0.9, 0.8, 0.7])
+    occluder = brdf.Sphere(center=[0.9, 0.9, 1.4], radius=0.3, fitted=False)
+    parts = {
+        "camera": camera,
+        "shapes": [brdf.Sphere(center=[0.0, 0.0, 0.0], radius=1.0), occluder],
+        "lights": [light],
+        "ambient": [0.2, 0.2, 0.2],
+    }
+    return brdf.Scene(**(parts | changes))
+
+
+def picture(noise: float = 0.01) -> np.ndarray:
+    clean = np.asarray(brdf.render(MATERIAL, scene()))
+    return (clean + noise * np.random.default_rng(3).standard_normal(clean.shape)).astype(np.float32)
+
+
+@pytest.fixture(autouse=True)
+def small_bands(monkeypatch):
+    """Seven bands, the last one shorter."""
+    monkeypatch.setattr(observation, "TILE_PIXELS", 14 * SIZE[0] + 5)
+
+
+def same(streamed: fitting.FitResult, whole: fitting.FitResult, tolerance: float = 2e-5):
+    assert type(streamed.material) is type(whole.material)
+    for mine, its in zip(streamed.parameters, whole.parameters, strict=True):
+        assert (mine.name, mine.channel, mine.reason) == (its.name, its.channel, its.reason)
+        if its.value is not None:
+            assert its.error is not None
+            np.testing.assert_allclose(mine.value, its.value, atol=0.02 * its.error + tolerance, rtol=tolerance)
+            # How the noise grows with brightness is asked of other pixels.
+            np.testing.assert_allclose(mine.error, its.error, rtol=0.2, atol=1e-7)
+    assert streamed.left_out == whole.left_out
+    assert streamed.pixels == whole.pixels
+    np.testing.assert_allclose(streamed.residual, whole.residual, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("model", ["auto", "blinn-phong", "normalized-phong", "lambert"])
+def test_file_and_memory_agree(tmp_path: Path, model: str):
+    path = tmp_path / "target.exr"
+    brdf.write_image(path, picture())
+    whole = fitting.fit(brdf.read_image(path), scene(), model=model)
+    with brdf.ImageReader(path) as reader:
+        same(fitting.fit(reader, scene(), model=model), whole)
+
+
+@pytest.mark.parametrize("options", [{"loss": "huber"}, {"loss": "relative"}, {"plausible": True}, {"dark": 0.05}])
+def test_options_agree(tmp_path: Path, options: dict):
+    path = tmp_path / "target.exr"
+    brdf.write_image(path, picture())
+    whole = fitting.fit(brdf.read_image(path), scene(), **options)
+    with brdf.ImageReader(path) as reader:
+        same(fitting.fit(reader, scene(), **options), whole, 1e-3)
+
+
+def test_mask_weight_and_several_pictures(tmp_path: Path):
+    path = tmp_path / "target.exr"
+    brdf.write_image(path, picture())
+    pixels = brdf.read_image(path)
+    mask = np.add.outer(np.arange(SIZE[1]), np.arange(SIZE[0])) % 7 > 0
+    weight = np.random.default_rng(0).uniform(0.5, 2.0, mask.shape)
+    other = np.asarray(brdf.render(MATERIAL, scene()))
+    options = {"mask": mask, "weight": weight}
+    whole = fitting.fit([pixels, other], scene(), **options)
+    with brdf.ImageReader(path) as reader:
+        same(fitting.fit([reader, other], scene(), **options), whole)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".exr"])
+def test_clipping_is_found_across_bands(tmp_path: Path, suffix: str):
+    path = tmp_path / f"target{suffix}"
+    brdf.write_image(path, np.minimum(picture() * 1.5, 1.0))
+    whole = fitting.fit(brdf.read_picture(path), scene())
+    assert whole.left_out["clipped"] > 20
+    with brdf.ImageReader(path) as reader:
+        same(fitting.fit(reader, scene()), whole, 2e-3)
+
+
+def test_surface_points_in_place_of_a_camera(tmp_path: Path):
+    path = tmp_path / "target.exr"
+    brdf.write_image(path, picture())
+    points = scene(shapes=[brdf.Sphere(center=[0.0, 0.0, 0.0], radius=1.0)]).surface_points()
+    mapped = scene(camera=None, shapes=[], points=points)
+    whole = fitting.fit(brdf.read_image(path), mapped)
+    with brdf.ImageReader(path) as reader:
+        same(fitting.fit(reader, mapped), whole)
+
+
+def test_large_file_is_shown_by_some_of_its_pixels(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(observation, "SHOWN_PIXELS", 30)
+    path = tmp_path / "target.exr"
+    brdf.write_image(path, picture(0.0))
+    with brdf.ImageReader(path) as reader:
+        result = fitting.fit(reader, scene())
+    assert result.targets[0].shape == (23, 24, 3)
+    np.testing.assert_allclose(result.targets[0], picture(0.0)[::4, ::4])
+    assert result.counted[0].shape == (23, 24)
+    fitted = result.fitted(0)
+    np.testing.assert_allclose(fitted[result.counted[0]], result.targets[0][result.counted[0]], atol=1e-4)
+    result.save(tmp_path / "out")
+    assert brdf.read_image(tmp_path / "out" / "fitted.exr").shape == (23, 24, 3)
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [({"noise": (0.01, 0.0)}, "noise"), ({"accuracy": 0.01}, "target"), ({"seconds": 1.0}, "target")],
+)
+def test_what_needs_the_whole_picture_says_so(tmp_path: Path, options: dict, name: str):
+    path = tmp_path / "target.exr"
+    brdf.write_image(path, picture())
+    with brdf.ImageReader(path) as reader, pytest.raises(brdf.InputError, match=f"^{name}: .*bands"):
+        fitting.fit(reader, scene(), **options)
+
+
+def test_pixels_as_areas_are_refused(tmp_path: Path):
+    path = tmp_path / "target.exr"
+    brdf.write_image(path, picture())
+    camera = brdf.OrthographicCamera(
+        position=[0.0, 0.0, 4.0], target=[0.0, 0.0, 0.0], up=[0.0, 1.0, 0.0], width=2.4, resolution=SIZE, samples=2
+    )
+    with brdf.ImageReader(path) as reader, pytest.raises(brdf.InputError, match="centre"):
+        fitting.fit(reader, scene(camera=camera))
+
+
+def test_a_stream_keeps_one_element():
+    made = []
+
+    def make(i: int) -> list[int]:
+        made.append(i)
+        return [i]
+
+    stream = Stream(make, 3)
+    assert [element[0] for element in stream] == [0, 1, 2]
+    assert stream[2] is stream[-1]
+    assert made == [0, 1, 2]
+    with pytest.raises(IndexError):
+        stream[3]
+    doubled = each(lambda element, factor: element[0] * factor, stream, [1, 10, 100])
+    assert isinstance(doubled, Stream)
+    assert list(doubled) == [0, 10, 200]
+    assert list(joined([doubled, [7]])) == [0, 10, 200, 7]
+    assert joined([[1], [2, 3]]) == [1, 2, 3]
