@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import brdf
-from benchmarks import fuzz
+from benchmarks import fuzz, fuzz_corpus
 from brdf.errors import InputError
 
 SETTINGS = settings(
@@ -58,7 +58,7 @@ def one_line(error: InputError, path) -> None:
     assert str(error).endswith(".")
 
 
-SCENE = tomllib.loads(fuzz.SCENE)
+SCENE = tomllib.loads(fuzz_corpus.SCENE)
 SCENE_PLACES = [path for path in places(SCENE) if path]
 
 
@@ -77,7 +77,7 @@ def test_any_value_in_any_place_of_a_scene(tmp_path, place, value):
         assert isinstance(scene, brdf.Scene)
 
 
-MATERIAL = json.loads(fuzz.JSON)
+MATERIAL = json.loads(fuzz_corpus.JSON)
 
 
 @SETTINGS
@@ -131,8 +131,8 @@ def test_damaged_files_give_a_value_or_one_error(tmp_path, seed):
 
 
 def test_the_corpus_is_sound_before_it_is_damaged(tmp_path):
-    for suffix, content, reader in fuzz.corpus(tmp_path):
-        if content in (fuzz.PERSPECTIVE.encode(),) or suffix in (".binary", ".bsdf"):
+    for suffix, content, reader in fuzz_corpus.corpus(tmp_path):
+        if content in (fuzz_corpus.PERSPECTIVE.encode(),) or suffix in (".binary", ".bsdf"):
             continue  # these name files that are missing, or hold headers alone
         path = tmp_path / f"sound{suffix}"
         path.write_bytes(content)

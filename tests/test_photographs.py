@@ -385,6 +385,7 @@ def test_lights_from_a_mirror_ball_in_one_command(tmp_path, capsys, monkeypatch)
         (["0.png", "--normals", "small.npy", "--light", "0,0,1"], "small.npy: is 2 x 2, the pictures 60 x 52"),
         (["0.png", "--normals", "pickled.npy", "--light", "0,0,1"], "pickled.npy: holds object, not numbers"),
         (["0.png", "--normals", "huge.npy", "--light", "0,0,1"], "huge.npy: claims"),
+        (["0.png", "--normals", "header.npy", "--light", "0,0,1"], "header.npy: is no array"),
         (["0.png", "--normals", "mask.png", "--light", "0,0,1"], "mask.png: has 1 channels instead of 3"),
         (["empty.npz"], "empty.npz: holds no array images"),
         (["lights.npz"], "lights.npz: is no readable archive"),
@@ -407,6 +408,9 @@ def test_wrong_photographs(photographs, capsys, monkeypatch, words, said):
     np.save("pickled.npy", np.array([{}, 1], dtype=object), allow_pickle=True)
     header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (100000, 100000, 3), }"
     Path("huge.npy").write_bytes(b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header)
+    # Found by fuzzing: NumPy tokenizes a header that is no literal, and lets the tokenizer's error pass.
+    header = b"{'descr': '<f 3 , [[]] 3) ,  }\n"
+    Path("header.npy").write_bytes(b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header)
     np.savez("empty.npz", a=np.ones(3))
     Path("lights.npz").write_text("PK\x03\x04 this is none")
     np.savez_compressed("bomb.npz", images=np.zeros((20_000, 1000), np.uint8), normal=[0], light_dirs=[0])

@@ -1,5 +1,6 @@
 """Arrays in files, ``.npy`` and ``.npz``: sizes are checked before memory is taken, and nothing is unpickled."""
 
+import tokenize
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,18 @@ from brdf.errors import InputError
 # What an archive may unpack to: 8 GiB of values, as for pictures.
 MOST_BYTES = 1 << 33
 ARCHIVE = ("images", "normal", "light_dirs")
+
+# What NumPy and zipfile raise for a header that is none: it is read as a Python literal.
+_DAMAGE = (
+    ValueError,
+    OSError,
+    EOFError,
+    TypeError,
+    OverflowError,
+    SyntaxError,
+    tokenize.TokenError,
+    zipfile.BadZipFile,
+)
 
 
 def read_array(file: Any, place: object, size: int) -> np.ndarray:
@@ -42,7 +55,7 @@ def read_array(file: Any, place: object, size: int) -> np.ndarray:
         if len(content) < count * kind.itemsize:
             raise InputError(place, "ends before its last value", "The file is damaged; make it again")
         return np.frombuffer(content, kind).reshape(shape, order="F" if fortran else "C")
-    except (ValueError, OSError, EOFError, TypeError, OverflowError, SyntaxError, zipfile.BadZipFile) as error:
+    except _DAMAGE as error:
         if isinstance(error, InputError):
             raise
         reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
