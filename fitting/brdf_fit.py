@@ -1,21 +1,12 @@
 """Fit a model to a measured BRDF: the table is the picture, each sample a pixel with its own directions.
 
 f_r = [k_d + k_s S / (N.L)] / pi is linear in k_d and k_s, so the engine that fits pictures fits tables. What differs is
-which deviations count; three losses of the literature, each over samples with light and view within 80 degrees:
-
-| loss | sum over samples of weight times | when |
-| --- | --- | --- |
-| "cosine" (default) | [(f - m) cos θ_i]² | Ngan et al. 2005: what pictures under one light show; the peak rules |
-| "squared" | (f - m)² | as the table stands; grazing angles count in full |
-| "log" | [log(1 + f cos θ_i) - log(1 + m cos θ_i)]² | Löw et al. 2012: high dynamic range, the tails count too |
-
-The weight is the solid angle that a sample stands for, where the table's grid says it. Negative values count in the
-squared losses as they are; the logarithmic one leaves them out.
+which deviations count: `fitting.brdf_losses`.
 """
 
 import math
 import time
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -24,45 +15,19 @@ from jaxtyping import Float
 
 import brdf
 from brdf.errors import InputError
-from fitting.brdf_result import HALF, BrdfCandidate, BrdfFitResult, Losses
+from fitting.brdf_losses import Loss, Samples, logarithmic, losses_of
+from fitting.brdf_result import HALF, BrdfCandidate, BrdfFitResult
 from fitting.engine.separable import OneLightLobe, Optimum, Picture, fit_linear, search
 from fitting.result import Parameter
 from fitting.uncertainty.covariance import residual_noise, uncertainty
 
-Loss = Literal["cosine", "squared", "log"]
 N_RANGE = (0.1, 1e6)
 
 # A lobe has to leave less than this share of the squares that Lambert leaves before it is worth its unknowns: half of
 # them where Lambert itself explains half of the table, else nine tenths.
 WORTH, WORTH_WITHOUT_LAMBERT = 0.5, 0.9
-# Reweighting stops when the loss changes by less than this share; it takes 2 to 10 rounds.
-_SETTLED = 1e-9
-_MOST_ROUNDS = 50
 # A cosine's logarithm below this means that the lobe does not reach the sample (see `brdf.vectors`).
 _DARK = -1e8
-
-
-class _Samples(NamedTuple):
-    """The samples that a loss looks at.
-
-    Attributes:
-        to_light: (P, 3).
-        to_view: (P, 3).
-        values: f_r, (P, C).
-        share: solid angle, mean 1, (P,).
-        positive: which values the logarithm may see, (P, C).
-    """
-
-    to_light: Float[np.ndarray, "P 3"]
-    to_view: Float[np.ndarray, "P 3"]
-    values: Float[np.ndarray, "P C"]
-    share: Float[np.ndarray, " P"]
-    positive: np.ndarray
-
-    @property
-    def cosine(self) -> Float[np.ndarray, "P 1"]:
-        """N.L of each sample."""
-        return self.to_light[:, 2:]
 
 
 def fit_brdf(
@@ -79,7 +44,7 @@ def fit_brdf(
         table: what `brdf.load_measured` reads.
         model: the name of a model, or "auto": Lambert, unless a lobe explains half of the squares that it leaves;
             (a tenth, where Lambert explains less than half of the table); then the form with the least loss.
-        loss: "cosine", "squared" or "log"; see the module.
+        loss: "cosine", "squared" or "log"; see `fitting.brdf_losses`.
         max_angle: light and view further than this from the normal are left out, in degrees, above 0 to 90.
         n_range: bounds of the exponent, 0 < lower < upper.
 
@@ -125,7 +90,7 @@ def fit_brdf(
     )
 
 
-def _samples(table: brdf.MeasuredBRDF, max_angle: float) -> tuple[_Samples, dict[str, int]]:
+def _samples(table: brdf.MeasuredBRDF, max_angle: float) -> tuple[Samples, dict[str, int]]:
     if not (isinstance(max_angle, int | float) and 0 < max_angle <= 90):
         raise InputError("max_angle", f"must be above 0 and at most 90 degrees, got {max_angle!r}", "Correct it")
     # A table's angles carry rounding: one at the limit counts.
@@ -139,7 +104,7 @@ def _samples(table: brdf.MeasuredBRDF, max_angle: float) -> tuple[_Samples, dict
     if not values.any():
         raise InputError(table.name, "is black", "Give a table with values")
     share = table.solid_angle[near]
-    samples = _Samples(table.to_light[near], table.to_view[near], values, share / np.mean(share), values >= 0)
+    samples = Samples(table.to_light[near], table.to_view[near], values, share / np.mean(share), values >= 0)
     return samples, left_out
 
 
@@ -149,7 +114,7 @@ class _Fit(NamedTuple):
     candidate: BrdfCandidate
 
 
-def _fit_model(name: str, samples: _Samples, loss: Loss, n_range: tuple[float, float]) -> _Fit:
+def _fit_model(name: str, samples: Samples, loss: Loss, n_range: tuple[float, float]) -> _Fit:
     model = brdf.MODELS[name]
     channels = samples.values.shape[1]
     specular = issubclass(model, brdf.SpecularMaterial)
@@ -173,9 +138,9 @@ def _fit_model(name: str, samples: _Samples, loss: Loss, n_range: tuple[float, f
     squared = samples.share * (samples.cosine[:, 0] ** 2 if loss != "squared" else 1.0)
     optimum = solve(squared)
     if loss == "log":
-        optimum = _logarithmic(samples, solve, modelled, optimum)
+        optimum = logarithmic(samples, solve, modelled, optimum)
     values = modelled(optimum)
-    losses = _losses(samples, values)
+    losses = losses_of(samples, values)
     brightest = np.pi * np.max(np.abs(samples.values), axis=0)
     peak = float(np.max(reach * np.exp(np.maximum(optimum.n * log_cos, -745.0)))) if specular else 0.0
     sure = uncertainty(
@@ -216,7 +181,7 @@ def _fit_model(name: str, samples: _Samples, loss: Loss, n_range: tuple[float, f
     return _Fit(material, tuple(parameters), BrdfCandidate(name, unknowns, value, losses, material))
 
 
-def _lobe(model: type[brdf.Material], samples: _Samples) -> tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]]:
+def _lobe(model: type[brdf.Material], samples: Samples) -> tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]]:
     """Logarithm of the lobe's cosine, and what multiplies the lobe: S / (N.L) without scale."""
     count = len(samples.values)
     if not issubclass(model, brdf.SpecularMaterial):
@@ -229,7 +194,7 @@ def _lobe(model: type[brdf.Material], samples: _Samples) -> tuple[Float[np.ndarr
 
 
 def _picture(
-    samples: _Samples, weight: np.ndarray, log_cos: Float[np.ndarray, " P"], reach: Float[np.ndarray, " P"]
+    samples: Samples, weight: np.ndarray, log_cos: Float[np.ndarray, " P"], reach: Float[np.ndarray, " P"]
 ) -> Picture:
     """The table as the engine's picture, padded to one of a few sizes so that few programs are compiled."""
     count = len(samples.values)
@@ -247,53 +212,6 @@ def _picture(
             weight=padded(weight),
             ambient=jnp.zeros(1),
         )
-
-
-def _logarithmic(samples: _Samples, solve: Any, modelled: Any, start: Optimum) -> Optimum:
-    """Least logarithmic loss by reweighting: the weighted squares have the gradient of the loss where they settle.
-
-    With a = log(1 + f cos), b = log(1 + m cos) the slope of the loss by m is -2 (a - b) cos / (1 + m cos), that of
-    weighted squares -2 w (f - m): equal for w = cos (a - b) / [(f - m) (1 + m cos)].
-    """
-    cosine = samples.cosine
-    clear = np.where(samples.positive, samples.values, 0.0) * cosine
-    measured = np.log1p(clear)
-    # The first round's weights are the limit for a perfect model, which sees the tails that the peak would drown.
-    weight = cosine * cosine / np.square(1 + clear)
-    best, least = start, np.inf
-    for _ in range(_MOST_ROUNDS):
-        found = solve(np.where(samples.positive, samples.share[:, None] * weight, 0.0))
-        model = modelled(found) * cosine
-        difference = np.where(samples.positive, measured - np.log1p(model), 0.0)
-        cost = float(np.sum(samples.share[:, None] * difference * difference))
-        if cost >= least * (1 - _SETTLED):
-            break
-        best, least = found, cost
-        step = clear - model
-        small = np.abs(step) < 1e-9 * (1 + model)
-        weight = cosine * cosine * np.where(small, 1 / (1 + model), difference / np.where(small, 1, step)) / (1 + model)
-    return best
-
-
-def _losses(samples: _Samples, model: Float[np.ndarray, "P C"]) -> Losses:
-    """The deviation under each loss, and the share of the light that goes elsewhere."""
-    cosine, share = samples.cosine, samples.share[:, None]
-    deviation = samples.values - model
-
-    def relative(weight: np.ndarray) -> float:
-        return float((np.sum(weight * deviation**2) / np.sum(weight * samples.values**2)) ** 0.5)
-
-    positive = samples.positive
-    logarithms = np.where(
-        positive, np.log1p(np.where(positive, samples.values, 0) * cosine) - np.log1p(model * cosine), 0
-    )
-    total = np.sum(share * positive)
-    return Losses(
-        cosine=relative(share * cosine**2),
-        squared=relative(share * np.ones_like(cosine)),
-        log=float((np.sum(share * logarithms**2) / total) ** 0.5) if total > 0 else 0.0,
-        misplaced=float(np.sum(share * cosine * np.abs(deviation)) / np.sum(share * cosine * np.abs(samples.values))),
-    )
 
 
 def _choose(candidates: list[BrdfCandidate]) -> int:

@@ -104,11 +104,19 @@ class BrdfFitResult:
             closest = f"the best, {best.model}," if several else "it"
             left = f"{_percent(best.losses.cosine)} of the table (rms)"
             return f"{subject}: {closest} leaves {left}; the brightest sample is {self._brightest()}"
-        if name == "lambert":
-            return f"Lambert is enough within {within}" if several else f"Lambert describes it within {within}"
+        name = "Lambert" if name == "lambert" else name
         alone = next((one for one in self.candidates if one.model == "lambert"), None)
-        rest = "" if alone is None else f"; Lambert alone within {_percent(alone.losses.cosine)}"
-        return f"{name} describes it within {within}{rest}"
+        rest = ""
+        if several and name == "Lambert":
+            lobe = min(self.candidates[1:], key=lambda candidate: candidate.loss)
+            rest = f"; the best lobe, {lobe.model} within {_percent(lobe.losses.cosine)}, does not halve the squares"
+        elif several and alone is not None:
+            rest = f"; Lambert alone within {_percent(alone.losses.cosine)}"
+        if self._explained() < HALF:
+            placed = f"puts {_percent(1 - self.losses.misplaced)} of the light where it belongs"
+            return f"{name} {placed}, but not the peak, and leaves {_percent(self.losses.cosine)} (rms){rest}"
+        is_enough = several and name == "Lambert"
+        return f"{name} {'is enough' if is_enough else 'describes it'} within {within}{rest}"
 
     def _brightest(self) -> str:
         values = self.table.values.sum(axis=1)

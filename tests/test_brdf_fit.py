@@ -214,6 +214,7 @@ def test_published_fits_come_back_from_tables_on_the_merl_grid():
     [
         ("alta/retro-gray-tape.dat", "none of these models fits"),
         ("rgl/colodur_napoli_4f_rgb.bsdf", "Lambert is enough within"),
+        ("rgl/satin_rosaline_rgb.bsdf", "phong puts "),
     ],
 )
 def test_the_sentence_that_a_person_needs(name, sentence):

@@ -1,6 +1,7 @@
 """Arrays in files, ``.npy`` and ``.npz``: sizes are checked before memory is taken, and nothing is unpickled."""
 
 import tokenize
+import warnings
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -43,7 +44,9 @@ def read_array(file: Any, place: object, size: int) -> np.ndarray:
         if version not in ((1, 0), (2, 0)):
             raise InputError(place, f"is of NumPy's format {version}", "Save it with numpy.save")
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, fortran, kind = read(file)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of what a damaged header looks like as Python
+            shape, fortran, kind = read(file)
         count = 1
         for length in shape:
             count *= length
