@@ -132,6 +132,14 @@ def test_pictures_that_tell_no_light():
         light_from_highlight(np.ones((*SHAPE, 1)), BALL)
 
 
+def test_the_length_of_a_direction_does_not_matter():
+    picture, points = shaded((0.3, 0.4, 0.86)), ball_points(SHAPE, BALL)
+    for length in (1e-300, 1e3, 1e308):
+        scene = photograph_scene(points, np.array([0.3, 0.4, 0.86]) * length)
+        k_d = fitting.fit(picture, scene, model="lambert").material.k_d
+        assert np.allclose(k_d, 0.8, rtol=1e-5)
+
+
 def test_light_files(tmp_path):
     (tmp_path / "a.txt").write_text("2\n0 0 1\n0.5, 0.5, 1 # two\n")
     assert read_directions(tmp_path / "a.txt", 2).tolist() == [[0, 0, 1], [0.5, 0.5, 1]]
@@ -399,6 +407,7 @@ def test_lights_from_a_mirror_ball_in_one_command(tmp_path, capsys, monkeypatch)
         (["faint.exr", "--sphere", "30,24,9", "--light", "0,0,1"], "faint.exr: has .*--exposure, or use --precision"),
         (["dark.exr", "--sphere", "30,24,9", "--light", "fit"], "dark.exr: has fewer than ten lit pixels"),
         (["0.png", "--sphere", "30,24,9", "--light", "fit", "--saturation", "nan"], "--saturation: must be a linear"),
+        (["shapes.npz", "--encoding", "srgb"], "--encoding: is what shapes.npz says itself"),
         (["shapes.npz", "--sphere", "1,2,9"], "--sphere: is what shapes.npz says itself"),
     ],
 )

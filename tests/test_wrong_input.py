@@ -200,7 +200,14 @@ OPTIONS = {
     "empty folder": (["fit", "empty"], "empty: has no file target"),
     "unknown model": (["fit", "target.exr", "--scene", "scene.toml", "--model", "ward"], "--model: is unknown"),
     "unknown precision": (["fit", "target.exr", "--scene", "scene.toml", "--precision", "half"], "--precision"),
-    "unknown encoding": (["fit", "target.exr", "--scene", "scene.toml", "--encoding", "log"], "encoding must be"),
+    "unknown encoding": (
+        ["fit", "target.exr", "--scene", "scene.toml", "--encoding", "log"],
+        "--encoding: encoding must be",
+    ),
+    "page of another kind": (
+        ["fit", "target.exr", "--scene", "scene.toml", "--report", "o.pdf"],
+        "o.pdf: is no name of",
+    ),
     "nan saturation": (["fit", "target.exr", "--scene", "scene.toml", "--saturation", "nan"], "--saturation"),
     "text saturation": (["fit", "target.exr", "--scene", "scene.toml", "--saturation", "much"], "saturation"),
     "plot without out": (["fit", "target.exr", "--scene", "scene.toml", "--plot"], "--plot: needs a folder"),
@@ -223,7 +230,10 @@ OPTIONS = {
         ["fit", "small.exr", "--scene", "scene.toml"],
         "small.exr: is 2 x 2, the scene's camera 8",
     ),
-    "no such preset": (["convert", "unobtainium", "o.json"], "unobtainium: is no material file and no name.* emerald, jade"),
+    "no such preset": (
+        ["convert", "unobtainium", "o.json"],
+        "unobtainium: is no material file and no name.* emerald, jade",
+    ),
     "name of a preset": (["convert", "emerald", "o.json", "--name", "a"], "--name: chooses from a file"),
     "plausible table": (["fit", "ok.brdf", "--plausible"], "ok.brdf: is a measured BRDF; of the options only"),
     "channels": (["fit", "two.exr", "--scene", "scene.toml"], "two.exr: has 2 channels, the scene's light 3"),
@@ -294,6 +304,19 @@ def command(*words: object, cwd: Path, prefix: str = "", **options) -> subproces
         text=True,
         **options,
     )
+
+
+@pytest.mark.parametrize("name", ["damaged.png", "small.exr"])
+def test_what_cannot_be_fitted_is_told_before_jax_is_imported(place, name):
+    """The import takes longer than all the rest, and this may be one of a thousand files."""
+    (place / "damaged.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(50))
+    brdf.write_image(place / "small.exr", np.ones((2, 2, 3), np.float32))
+    prefix = "import atexit, sys\natexit.register(lambda: print('jax' in sys.modules))\n"
+    for words in (["--scene", "scene.toml"], ["--sphere", "90,9,5", "--light", "0,0,1"]):
+        with command("fit", name, *words, cwd=place, prefix=prefix) as process:
+            out, err = process.communicate(timeout=60)
+        assert (process.returncode, out) == (2, "False\n"), err
+        assert err.startswith("error: ")
 
 
 def test_a_full_disk_leaves_nothing(place):

@@ -105,7 +105,7 @@ def judge(jobs: tuple[Job, Job], results: tuple[FitResult, FitResult]) -> tuple[
     shares = [left / total for left, total in (unexplained(*pair) for pair in zip(jobs, results, strict=True))]
     picture = next(one for one in jobs[0].pictures if one.source == "assumed")
     assumed, other = (_NAMES.get(str(one), str(one)) for one in (picture.encoding, _other(picture)))
-    left, other_left = (f"{100 * share**0.5:.2g} %" for share in shares)
+    left, other_left = (f"{100 * share**0.5:.{2 if share < 0.99 else 3}g} %" for share in shares)
     silent = f"{jobs[0].target.name} does not say how its values are encoded"
     if shares[1] < CLEARLY * shares[0]:
         told = f"{silent}: read as {other}, which leaves {other_left} where {assumed} leaves {left}; --encoding decides"

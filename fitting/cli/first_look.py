@@ -96,6 +96,7 @@ def _check_options(targets: list[Path], options: Options) -> None:
     lights = {"--light": options.light, "--lights": options.lights, "--intensities": options.intensities}
     if is_archive(targets):
         given = {"--scene": options.scene, "--sphere": options.sphere, "--normals": options.normals} | lights
+        given["--encoding"] = options.encoding
         for name, value in given.items():
             if value is not None:
                 raise InputError(name, f"is what {targets[0].name} says itself", "Leave it out")

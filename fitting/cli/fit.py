@@ -74,6 +74,8 @@ def fit(
 
     if plot and out is None:
         raise brdf.InputError("--plot", "needs a folder to draw into", "Add --out DIR")
+    if report is not None and report.suffix.lower() not in (".html", ".htm"):
+        raise brdf.InputError(report, "is no name of a page", "Name it .html")
     notes: tuple[str, ...] = ()
     with waiting("fitting") as tell:
         if len(target) == 1 and brdf.is_measured(target[0]):
@@ -115,7 +117,7 @@ def fit(
             options |= {"ambient": ambient, "saturation": saturation}
             names = {"model": "--model", "precision": "--precision", "dark": "--dark", "noise": "--noise"}
             names |= {"mask": mask, "loss": "--loss", "saturation": "--saturation", "accuracy": "--accuracy"}
-            names |= {"seconds": "--seconds"}
+            names |= {"seconds": "--seconds", "encoding": "--encoding"}
             with named_as(names):
                 result, notes = _fit_pictures(
                     target,
@@ -212,7 +214,8 @@ def lights(
     """Where the light comes from, by the highlight on a mirror ball: x right, y up, z to the camera."""
     import brdf
 
-    pictures = [brdf.read_picture(path, encoding=_encoding(encoding)) for path in target]
+    with named_as({"encoding": "--encoding"}):
+        pictures = [brdf.read_picture(path, encoding=_encoding(encoding)) for path in target]
     inside = None if mask is None else brdf.read_mask(mask)
     from fitting.cli.first_look import check_ball, find_ball
 

@@ -168,12 +168,14 @@ def photograph_scene(
 
     Args:
         points: what the pixels see.
-        direction: towards the light, (3,).
+        direction: towards the light, (3,), of any length but 0.
         intensity: of it, a number or one per channel; where it is not known, 1: k_d then is k_d times the intensity.
         ambient: intensity of the ambient light, or None.
 
     Raises:
         InputError: naming the argument.
     """
-    light = brdf.DirectionalLight(direction=direction, intensity=intensity)
+    # Any length is as good as another: one near 1 keeps within single precision.
+    direction = np.asarray(direction, np.float64)
+    light = brdf.DirectionalLight(direction=direction / np.max(np.abs(direction)), intensity=intensity)
     return brdf.Scene(points=points, lights=(light,), ambient=ambient)
