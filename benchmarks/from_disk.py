@@ -9,7 +9,6 @@ number of pixels, the largest resident memory of the process that fits, and the 
 
 import argparse
 import json
-import resource
 import subprocess
 import sys
 import tempfile
@@ -21,7 +20,7 @@ import OpenImageIO as oiio  # noqa: N813
 
 import brdf
 import fitting
-from benchmarks.engine import prepare
+from benchmarks.engine import peak_memory, prepare
 
 MATERIAL = brdf.BlinnPhong(k_a=[0.05, 0.04, 0.03], k_d=[0.5, 0.3, 0.1], k_s=[0.3, 0.25, 0.2], n=80.0)
 NOISE = 0.01
@@ -60,14 +59,14 @@ def one_fit(path: Path, size: int, model: str, *, in_memory: bool) -> None:
     """Fit the file and print what it took; in a process of its own, whose memory is measured."""
     place = scene(size)
     fitting.fit(np.asarray(brdf.render(MATERIAL, scene(64))), scene(64), model=model)
-    start_memory, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.perf_counter()
+    start_memory, start = peak_memory(), time.perf_counter()
     with brdf.ImageReader(path) as reader:
         result = fitting.fit(reader.read() if in_memory else reader, place, model=model)
-    seconds, peak = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    seconds, peak = time.perf_counter() - start, peak_memory()
     found, truth = result.material, MATERIAL
     errors = [abs(found.n / truth.n - 1)]  # pyright: ignore[reportAttributeAccessIssue]
     errors += [np.max(np.abs(getattr(found, k) / getattr(truth, k) - 1)) for k in ("k_a", "k_d", "k_s")]
-    told = {"seconds": seconds, "peak_mb": peak / 1024, "start_mb": start_memory / 1024, "error": float(max(errors))}
+    told = {"seconds": seconds, "peak_mb": peak, "start_mb": start_memory, "error": float(max(errors))}
     print(json.dumps(told | {"model": found.name, "pixels": result.pixels}))
 
 

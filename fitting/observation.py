@@ -264,9 +264,10 @@ def _shown(tiles: Sequence[Tile], scene: brdf.Scene, channels: int) -> tuple[np.
     for tile in tiles:
         rows = tile.points.mask.shape[0]
         some = slice(-first % stride, None, stride)
-        pictures.append(np.asarray(tile.target).reshape(rows, width, channels)[some, ::stride])
+        # Copies: a view would keep the whole tile.
+        pictures.append(np.asarray(tile.target).reshape(rows, width, channels)[some, ::stride].copy())
         weight = np.ones(rows * width) if tile.weight is None else np.asarray(tile.weight)
-        counted.append((weight > 0).reshape(rows, width)[some, ::stride])
+        counted.append((weight > 0).reshape(rows, width)[some, ::stride].copy())
         first += rows
     pixel = np.arange(0, height, stride)[:, None] * width + np.arange(0, width, stride)
     dtype = pictures[0].dtype.name
