@@ -1,0 +1,1 @@
+"""Time to fit the same arrays with other people's solvers: ``python -m benchmarks.peers``."""
