@@ -26,6 +26,10 @@ N_RANGE = (0.1, 1e6)
 # A lobe has to leave less than this share of the squares that Lambert leaves before it is worth its unknowns: half of
 # them where Lambert itself explains half of the table, else nine tenths.
 WORTH, WORTH_WITHOUT_LAMBERT = 0.5, 0.9
+# What Lambert leaves of a table that it describes exactly; a lobe has nothing to explain then.
+ROUNDING = 1e-12
+# Largest value in 1/sr, and inverse of the least that a table may have as its largest: squares and sums stay in range.
+FAR = 1e50
 # A cosine's logarithm below this means that the lobe does not reach the sample (see `brdf.vectors`).
 _DARK = -1e8
 
@@ -71,6 +75,10 @@ def fit_brdf(
     if loss == "log":
         left_out["values below 0, out of reach of the logarithm"] = int(np.count_nonzero(~samples.positive))
     names = tuple(brdf.MODELS) if model == "auto" else (model,)
+    names = tuple(name for name in names if samples.values.size > _unknowns(name, samples))
+    if not names:
+        came = f"has {len(samples.values)} samples that count, no more than there are numbers to find"
+        raise InputError(table.name, came, "Give a table with more samples, or a model with fewer numbers")
     fits = [_fit_model(name, samples, loss, n_range) for name in names]
     candidates = [fit.candidate for fit in fits]
     chosen = _choose(candidates)
@@ -103,9 +111,17 @@ def _samples(table: brdf.MeasuredBRDF, max_angle: float) -> tuple[Samples, dict[
     values = table.values[near]
     if not values.any():
         raise InputError(table.name, "is black", "Give a table with values")
+    largest = float(np.max(np.abs(values)))
+    if not 1 / FAR <= largest <= FAR:
+        raise InputError(table.name, f"holds values of up to {largest:.3g}/sr, as no BRDF does", "Check its unit")
     share = table.solid_angle[near]
     samples = Samples(table.to_light[near], table.to_view[near], values, share / np.mean(share), values >= 0)
     return samples, left_out
+
+
+def _unknowns(name: str, samples: Samples) -> int:
+    channels = samples.values.shape[1]
+    return 2 * channels + 1 if issubclass(brdf.MODELS[name], brdf.SpecularMaterial) else channels
 
 
 class _Fit(NamedTuple):
@@ -216,6 +232,8 @@ def _picture(
 
 def _choose(candidates: list[BrdfCandidate]) -> int:
     """Lambert, which comes first, unless a lobe explains enough of the squares that it leaves."""
+    if candidates[0].losses.cosine <= ROUNDING:
+        return 0
     best = int(np.argmin([candidate.loss for candidate in candidates]))
     lambert = candidates[0]
     worth = WORTH if 1 - lambert.losses.cosine**2 >= HALF else WORTH_WITHOUT_LAMBERT

@@ -109,7 +109,8 @@ class BrdfFitResult:
         rest = ""
         if several and name == "Lambert":
             lobe = min(self.candidates[1:], key=lambda candidate: candidate.loss)
-            rest = f"; the best lobe, {lobe.model} within {_percent(lobe.losses.cosine)}, does not halve the squares"
+            words = f"the best lobe, {lobe.model} within {_percent(lobe.losses.cosine)}, does not halve the squares"
+            rest = f"; {words}" if _percent(lobe.losses.cosine) != _percent(self.losses.cosine) else ""
         elif several and alone is not None:
             rest = f"; Lambert alone within {_percent(alone.losses.cosine)}"
         if self._explained() < HALF:

@@ -172,6 +172,34 @@ def test_a_black_table_is_refused():
         fitting.fit_brdf(brdf.MeasuredBRDF.from_samples(light, view, np.zeros((20, 1))))
 
 
+@pytest.mark.parametrize("value", [1e300, 1e-300])
+def test_values_that_no_brdf_has_are_refused(value):
+    light, view = directions(20)
+    with pytest.raises(InputError, match="as no BRDF does"):
+        fitting.fit_brdf(brdf.MeasuredBRDF.from_samples(light, view, np.full((20, 1), value)))
+
+
+def test_a_model_needs_more_samples_than_it_has_numbers():
+    light, view = directions(3)
+    values = f_r("phong", [0.5], [0.5], 3.0, light, view)
+
+    def fitted(count, model="auto"):
+        return fitting.fit_brdf(brdf.MeasuredBRDF.from_samples(light[:count], view[:count], values[:count]), model)
+
+    assert [candidate.model for candidate in fitted(3).candidates] == ["lambert"]
+    with pytest.raises(InputError, match="has 1 samples that count"):
+        fitted(1)
+    with pytest.raises(InputError, match="has 3 samples that count"):
+        fitted(3, "phong")
+
+
+def test_rounding_is_no_highlight():
+    light, view = directions(40)
+    result = fitting.fit_brdf(brdf.MeasuredBRDF.from_samples(light, view, np.full((40, 1), 0.3)))
+    assert result.material.name == "lambert"
+    assert "lobe" not in result.verdict
+
+
 def test_the_result_is_saved_whole(tmp_path):
     result = fitting.fit_brdf(noisy_table())
     result.save(tmp_path / "out")

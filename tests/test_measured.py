@@ -94,7 +94,7 @@ def test_merl_entries_that_were_not_measured_are_left_out(tmp_path):
     [
         (struct.pack("<3i", 90, 90, 180), "bytes instead of"),
         (struct.pack("<3i", 90, 90, 180) + bytes(800), "bytes instead of"),
-        (struct.pack("<3i", 2**31 - 1, 2**31 - 1, 2**31 - 1) + bytes(100), "must be a number|not UTF-8"),
+        (struct.pack("<3i", 2**31 - 1, 2**31 - 1, 2**31 - 1) + bytes(100), "says it holds 2147483647 x"),
     ],
 )
 def test_damaged_merl_files(tmp_path, content, said):
@@ -200,8 +200,10 @@ def test_alta_confidence_columns_and_cosine_factor():
         ("2\n400 500\n", "not a multiple of 6"),
         ("2\n400 500\n1 2 3", "not a multiple of 6"),
         ("1\n400\n20 0 30 0 1", "an angle of 30"),
+        ("2\n400 500\n" + "0.2 0 0.3 0 0.5\n" * 6, "line 4: holds the end of a row and the start of the next"),
+        ("1\n400 0.2 0 0.3 0 0.5\n", "line 2: holds the end of a row"),
         ("1\n400\nnan 0 0.3 0 1", "an angle of nan"),
-        ("1\n400\n0.1 0 0.3 0 inf", "no finite sample"),
+        ("1\n400\n0.1 0 0.3 0 inf", r"table.txt: has no finite sample above the horizon \(1 not finite\)"),
         ("1\n400\n2 0 0.3 0 1", "no finite sample"),
         ("#DIM 3\n1 2 3", "DIM: must be two whole numbers"),
         ("#DIM -3 1\n1 2 3", "DIM: must be two whole numbers"),

@@ -115,7 +115,9 @@ class MeasuredBRDF:
             counts[reason] = counts.get(reason, 0) + int(np.count_nonzero(~kept))
         good = above & finite
         if not good.any():
-            raise InputError(name, "has no finite sample above the horizon", "Give a table with samples")
+            gone = ", ".join(f"{count} {reason}" for reason, count in counts.items() if count)
+            came = f"has no finite sample above the horizon ({gone or 'none at all'})"
+            raise InputError(name, came, "Give a table with samples")
         return cls(
             name=name,
             to_light=light[good],
@@ -211,10 +213,13 @@ def load_measured(path: str | os.PathLike[str]) -> MeasuredBRDF:
     try:
         if head.startswith(rgl.MAGIC):
             return rgl.load(file)
-        if merl.claims(head, size):
+        # No text holds a NUL: what else is binary has MERL's layout, or is told how it differs.
+        if merl.claims(head, size) or b"\0" in head:
             return merl.load(file)
         return text.load(file)
     except InputError as error:
+        if error.where == file.stem:  # the name of the table, which is that of the file
+            raise InputError(path, error.what, error.remedy) from None
         raise error if error.where.startswith(str(path)) else error.inside(path) from None
 
 

@@ -65,6 +65,12 @@ def parse_cornell(text: str, place: str, name: str) -> MeasuredBRDF:
     if len(wavelengths) < count or len(rows) == 0 or len(rows) % (4 + count):
         came = f"has {len(rows)} numbers after {count} wavelengths, not a multiple of {4 + count}"
         raise InputError(place, came, "Give rows of theta_i phi_i theta_s phi_s and a value per wavelength")
+    lines = [line for line, _ in words[count:]]  # from the last word before the first row
+    for start in range(1, len(lines), 4 + count):
+        if lines[start] == lines[start - 1]:
+            came = f"holds the end of a row and the start of the next, as if rows had {4 + count} numbers"
+            remedy = "Give a row of theta_i phi_i theta_s phi_s and a value per wavelength on a line of its own"
+            raise InputError(f"{place}: line {lines[start]}", came, remedy)
     table = rows.reshape(-1, 4 + count)
     _check_angles(place, table[:, :4])
     light, view = from_angles(table[:, 0], table[:, 1]), from_angles(table[:, 2], table[:, 3])

@@ -157,7 +157,7 @@ def _fit_table(path: Path, model: str, loss: str | None, has_picture_options: An
         came = "is a measured BRDF; of the options only --model, --loss, --out and --json concern it"
         raise brdf.InputError(path, came, "Leave the others out")
     table = brdf.load_measured(path)
-    with named_as({"model": "--model", "loss": "--loss"}):
+    with named_as({"model": "--model", "loss": "--loss", table.name: path}):
         use_compilation_cache()
         import fitting
 
