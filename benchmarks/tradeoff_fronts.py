@@ -1,9 +1,9 @@
 """The measured fronts of three scenes: one directional light, an area light, an environment map.
 
-``python -m benchmarks.tradeoff_fronts FOLDER`` writes target and scene of each into a folder, measures and prints the
-rows of the front, the default and the recommendation, and saves table and plot.
-``python -m benchmarks.tradeoff_fronts FOLDER TRIES [SCENE]`` runs the command ``brdf tradeoff`` as often instead, each
-time in a new process, and says how long it took and how often it named the same recommendation.
+``python -m benchmarks.tradeoff_fronts FOLDER [SCENE ...]`` writes target and scene of each into a folder, measures and
+prints the rows of the front, the default and the recommendation, and saves table and plot. ``python -m
+benchmarks.tradeoff_fronts FOLDER TRIES [SCENE ...]`` runs the command ``brdf tradeoff`` as often instead, each time in
+a new process, and says how long it took and how often it named the same recommendation.
 """
 
 import collections
@@ -20,8 +20,9 @@ import fitting
 from benchmarks.tradeoff import material, sky
 from fitting.accuracy.lamps import with_samples
 
-SIZE, NOISE = 512, 0.01
+SIZE, NOISE, SECONDS = 512, 0.01, 60.0
 SCENES = ("directional", "area", "environment")
+COMMAND = "from fitting.cli.main import main; main()"
 SCENE = """
 [camera]
 type = "orthographic"
@@ -65,12 +66,14 @@ def write(folder):
         brdf.write_image(place / "target.exr", (picture + NOISE * picture.mean() * noise).astype(np.float32))
 
 
-def fronts(folder):
+def fronts(folder, names=SCENES):
     """Measure and print what is on the front."""
-    for name in SCENES:
+    for name in names:
         start = time.perf_counter()
         place = folder / name
-        found = fitting.tradeoff(brdf.read_image(place / "target.exr"), brdf.Scene.load(place / "scene.toml"))
+        found = fitting.tradeoff(
+            brdf.read_image(place / "target.exr"), brdf.Scene.load(place / "scene.toml"), seconds=SECONDS
+        )
         found.save(place / "tradeoff")
         print(f"{name}: {time.perf_counter() - start:.0f} s, {'all' if found.complete else 'not all'} measured")
         for row in found.rows:
@@ -84,7 +87,7 @@ def tries(folder, count, names):
         named, times = collections.Counter(), []
         for _ in range(count):
             start = time.perf_counter()
-            command = [sys.executable, "-m", "fitting.cli.main", "tradeoff", str(folder / name), "--json"]
+            command = [sys.executable, "-c", COMMAND, "tradeoff", str(folder / name), "--json"]
             out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
             times.append(time.perf_counter() - start)
             rows = json.loads(out)["rows"]
@@ -93,13 +96,13 @@ def tries(folder, count, names):
         print(f"{name}: {count} tries, {np.median(times):.1f} s, at most {max(times):.1f} s, {dict(named)}", flush=True)
 
 
-def main(folder, count=None, *names):
+def main(folder, *rest):
     """Write the scenes, then measure."""
     write(Path(folder))
-    if count is None:
-        fronts(Path(folder))
+    if rest and rest[0].isdigit():
+        tries(Path(folder), int(rest[0]), rest[1:] or SCENES)
     else:
-        tries(Path(folder), int(count), names or SCENES)
+        fronts(Path(folder), rest or SCENES)
 
 
 if __name__ == "__main__":

@@ -181,7 +181,7 @@ def row(name, seconds, error, work, **changes):
 
 
 def table(*rows, accuracy=1e-3):
-    return Tradeoff(rows, "float64", 0.0, accuracy, True, 1.0)
+    return Tradeoff(rows, "float64", accuracy, True, 1.0)
 
 
 def test_the_front_holds_what_nothing_beats_in_both():

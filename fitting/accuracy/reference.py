@@ -17,6 +17,7 @@ from fitting.accuracy.configurations import Configuration, Run, run, target_size
 from fitting.accuracy.lamps import Lamps, extended
 from fitting.accuracy.sampling_error import System
 from fitting.interpretation import coefficient_factors
+from fitting.light_colour import take_colour_out
 from fitting.result import FitResult
 
 # A step that changes the parameters by less than this, relative, is the last.
@@ -55,18 +56,52 @@ def reference(
     for _ in range(MOST_STEPS):
         system = System(done, targets, dict(options), lamps, probes=sum(map(target_size, targets)))
         step = np.where(system.bound, 0.0, system.inverse @ np.where(system.bound, 0.0, system.step))
-        done = done._replace(result=_moved(done.result, step, system))
+        done = done._replace(result=_moved(done.result, step, system.light.colour))
         if system.relative(step) < SETTLED:
             break
     return done.result
 
 
-def _moved(result: FitResult, step: np.ndarray, system: System) -> FitResult:
+def under_many_samples(
+    target: Any,
+    scene: brdf.Scene,
+    model: str,
+    options: Mapping[str, Any],
+    lamps: Lamps,
+    pixels: int | None,
+    few: int,
+) -> FitResult:
+    """Fit all pixels of a picture under a few light samples, and add what `MOST_SAMPLES` change at some of the pixels.
+
+    Both fits of some of the pixels see the same noise, which is not in their difference.
+
+    Args:
+        target: the picture.
+        scene: what it shows.
+        model: "auto" or the name of a model.
+        options: further arguments of `fitting.fit`.
+        lamps: the lights made so far.
+        pixels: how many; None for all.
+        few: light samples of the fit of all pixels.
+    """
+    fine = reference([target], [scene], model, options, lamps, pixels=pixels, start_samples=few)
+    if pixels is None:
+        return fine
+    name = fine.material.name
+    coarse, whole = (
+        run([target], [scene], Configuration(name, "float32", count, few), options, lamps) for count in (pixels, None)
+    )
+    before, after = coarse.result.optimum, fine.optimum
+    step = np.append((after.x - before.x).ravel(), np.log(max(after.n, 1e-3) / max(before.n, 1e-3)))
+    return _moved(whole.result, step, take_colour_out([scene], before.x.shape[1]).colour)
+
+
+def _moved(result: FitResult, step: np.ndarray, colour: np.ndarray) -> FitResult:
     """A result with other parameters."""
     optimum, model = result.optimum, type(result.material)
     n = float(optimum.n * np.exp(step[-1]))
     x = np.maximum(optimum.x + step[:-1].reshape(3, -1), 0.0)
-    k = x / coefficient_factors(model, n, system.light.colour)
+    k = x / coefficient_factors(model, n, colour)
     values: dict[str, Any] = {}
     for term, name in enumerate(("k_a", "k_d", "k_s")):
         if hasattr(result.material, name):

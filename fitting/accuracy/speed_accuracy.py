@@ -6,7 +6,7 @@ compiler's time is taken out of every run. What takes long, or compiles anew eac
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ import brdf
 from brdf.errors import InputError
 from fitting.accuracy.speed_table import Tradeoff
 from fitting.accuracy.stopwatch import Taken, take
-from fitting.accuracy.trials import Bench
+from fitting.accuracy.trials import Bench, Trial
 
 MOST_ROUNDS = 9
 # What takes longer than this is run once: beside it cold caches count for nothing.
@@ -67,19 +67,22 @@ def tradeoff(
         trials += bench.render_trials()
     taken: dict[int, list[Taken]] = {}
     found: dict[int, Any] = {}
-    # First from what matters most to what matters least; then every round is shuffled.
-    first = [index for index, trial in enumerate(trials) for _ in range(1 if trial.once else 2)]
+    # First from little to much work, so that what would take too long is known before; then every round is shuffled.
+    first = [i for i in np.argsort([trial.work for trial in trials], kind="stable") for _ in range(2)]
     again = [index for index, trial in enumerate(trials) if not trial.once]
     random = np.random.default_rng(0)
     order = [*first, *(index for _ in range(MOST_ROUNDS) for index in random.permutation(again))]
     complete = True
     try:
         for done, index in enumerate(map(int, order)):
-            before = taken.get(index, [])
+            trial, before = trials[index], taken.get(index, [])
             left = seconds - (time.perf_counter() - begun)
-            if (before and before[-1].seconds > min(LONG, left)) or (left < 0 and done > 0):
+            if before and (trial.once or before[-1].seconds > min(LONG, left)):
                 continue
-            outcome, one = take(trials[index].run)
+            if left < 0 or _expected(trial, trials, taken) > left:
+                continue
+            # The first run holds the compiler's memory too; the later ones are only timed.
+            outcome, one = take(trial.run, trimmed=len(before) < 2)
             taken.setdefault(index, []).append(one)
             found.setdefault(index, outcome)
             if progress is not None:
@@ -88,4 +91,12 @@ def tradeoff(
         complete = False
     rows = [bench.row(trial, taken[i], found[i]) for i, trial in enumerate(trials) if i in taken]
     complete &= len(rows) == len(trials)
-    return Tradeoff(tuple(rows), bench.told, bench.floor, accuracy, complete, time.perf_counter() - begun)
+    return Tradeoff(tuple(rows), bench.told, accuracy, complete, time.perf_counter() - begun)
+
+
+def _expected(trial: Trial, trials: Sequence[Trial], taken: Mapping[int, Sequence[Taken]]) -> float:
+    """Seconds that a fit may take, by the one of the most work so far; 0 where nothing is known."""
+    if trial.configuration is None or trial.once or not taken:
+        return 0.0
+    most = max(taken, key=lambda index: trials[index].work)
+    return taken[most][-1].seconds * trial.work / trials[most].work

@@ -61,7 +61,6 @@ class Tradeoff:
     Attributes:
         rows: in the order of the axes.
         reference: what the errors are measured against, in words.
-        floor: by how much the reference itself may be off.
         accuracy: the error that the recommendation keeps.
         complete: whether everything was measured; False where it was interrupted.
         seconds: that the measuring took.
@@ -69,7 +68,6 @@ class Tradeoff:
 
     rows: tuple[Row, ...]
     reference: str
-    floor: float
     accuracy: float
     complete: bool
     seconds: float
@@ -163,7 +161,7 @@ class Tradeoff:
             values = {name: _finite(value) for name, value in vars(row).items() if name != "configuration"}
             values["configuration"] = None if row.configuration is None else vars(row.configuration)
             rows.append(values | {"marks": self.marks(row)})
-        said = {name: getattr(self, name) for name in ("reference", "floor", "accuracy", "complete", "seconds")}
+        said = {name: getattr(self, name) for name in ("reference", "accuracy", "complete", "seconds")}
         return said | {"rows": rows}
 
     def to_csv(self) -> str:

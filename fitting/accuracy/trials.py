@@ -3,6 +3,10 @@
 Only what the scene has is varied: pixels where there are enough of them, light samples where a light has an extent,
 shadows where a shape can cast one. A check has nothing to choose: its albedo is closed, and of a BRDF without a closed
 one the adaptive rule tells its own error.
+
+Fewer pixels are a stratified subsample, not a level of the picture's pyramid: averaged pixels blur a highlight, which
+the fit takes for a smaller exponent. Of 36 fits (four exponents, three noises, three sizes) the subsample was closer
+in 97 %, by a factor of 37 in the median (``python -m benchmarks.tradeoff_pyramid``).
 """
 
 import dataclasses
@@ -18,8 +22,7 @@ from fitting.accuracy.configurations import Configuration, casts_shadows, run, s
 from fitting.accuracy.deviation import parameter_deviation
 from fitting.accuracy.lamps import Lamps, extended
 from fitting.accuracy.pixel_sampling import sample_pixels
-from fitting.accuracy.reference import reference
-from fitting.accuracy.sampling_error import System
+from fitting.accuracy.reference import reference, under_many_samples
 from fitting.accuracy.speed_table import Row
 from fitting.accuracy.stopwatch import Taken
 from fitting.result import FitResult
@@ -69,23 +72,17 @@ class Bench:
         """Fit the reference."""
         self.target, self.scene, self.options, self.lamps = target, scene, options, Lamps()
         self.has_samples, self.pixels = extended(scene), target_size(target)
-        samples = max((getattr(light, "samples", 1) for light in scene.lights), default=1)
-        self.samples = samples
-        pixels = REFERENCE_PIXELS if self.has_samples and self.pixels > 2 * REFERENCE_PIXELS else None
-        self.best = reference(
-            [target], [scene], model, options, self.lamps, pixels=pixels, start_samples=min(samples, 64)
-        )
-        self.model = self.best.material.name if model == "auto" else model
+        self.samples = max((getattr(light, "samples", 1) for light in scene.lights), default=1)
         self.told = "float64, all pixels"
-        self.floor = 0.0
         if self.has_samples:
-            self.told = f"float64, {MOST_SAMPLES} light samples, "
-            self.told += "all pixels" if pixels is None else f"a sample of {self.best.pixels} pixels"
-        if pixels is not None:
-            how = Configuration(self.model, "float64", pixels, min(samples, 64))
-            done = run([target], [scene], how, options, self.lamps)
-            self.floor = System(done, [target], options, self.lamps).estimate(None).pixels
-            self.told += f" (its own error is below {self.floor:.1g})"
+            pixels = REFERENCE_PIXELS if self.pixels > 2 * REFERENCE_PIXELS else None
+            self.told = f"{MOST_SAMPLES} light samples, all pixels"
+            if pixels is not None:
+                self.told += f" (what so many samples change, told by about {2 * pixels} of the pixels)"
+            self.best = under_many_samples(target, scene, model, options, self.lamps, pixels, min(self.samples, 64))
+        else:
+            self.best = reference([target], [scene], model, options, self.lamps)
+        self.model = self.best.material.name if model == "auto" else model
         self.compared = self._compared()
         self.true = self._picture(self.best.material)
 
@@ -229,7 +226,7 @@ class Bench:
             seconds=float(median),
             spread=float(high - low) / 2,
             runs=len(later),
-            peak=taken[-1].peak,
+            peak=taken[min(1, len(taken) - 1)].peak,
             rms=rms,
             worst=worst,
             parameters=parameters,
