@@ -1,11 +1,13 @@
 """Malformed input of every kind, through the command: one line that names file and key, exit 2, and no output."""
 
+import gc
 import json
 import os
 import re
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ import pytest
 
 import brdf
 from brdf.errors import InputError
+from fitting.cli.interrupts import held, interruptible
 from fitting.cli.main import main
 
 ROOT = Path(__file__).parents[1]
@@ -386,6 +389,44 @@ def test_control_c_in_the_middle_leaves_nothing(place):
     assert process.returncode == 130
     assert err == "error: interrupted.\n"
     assert {path for path in place.iterdir() if path.name != ".cache"} == before
+
+
+@pytest.fixture
+def listening():
+    """Ctrl-C as a program in the foreground has it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_control_c_is_not_lost_in_a_callback_of_the_garbage_collector(listening):
+    """What such a callback raises is printed and forgotten; JAX has one."""
+
+    def callback(phase, _):
+        if phase == "start":
+            os.kill(os.getpid(), signal.SIGINT)
+            sum(range(1000))  # the signal is handled here
+
+    gc.callbacks.append(callback)
+    try:
+        with pytest.raises(KeyboardInterrupt), interruptible():  # noqa: PT012  # the signal comes later
+            gc.collect()
+            gc.callbacks.remove(callback)
+            time.sleep(5)
+    finally:
+        if callback in gc.callbacks:
+            gc.callbacks.remove(callback)
+
+
+def test_control_c_waits_while_a_library_loads(listening):
+    seen = []
+    with pytest.raises(KeyboardInterrupt), interruptible(), held():  # noqa: PT012  # the signal comes later
+        os.kill(os.getpid(), signal.SIGINT)
+        seen.append("loaded")
+    assert seen == ["loaded"]
+    with interruptible(), held():
+        pass  # it is not remembered
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 BAD_IMAGES = REAL / "bad-images"

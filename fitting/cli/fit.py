@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from fitting.cli.common import named_as, show, use_compilation_cache, waiting
+from fitting.cli.interrupts import held, interruptible
 
 EXAMPLE = (
     "Example: [bold]brdf fit photo.exr --scene scene.toml --out result/[/bold]    or, for a folder with "
@@ -77,7 +78,9 @@ def fit(
     if report is not None and report.suffix.lower() not in (".html", ".htm"):
         raise brdf.InputError(report, "is no name of a page", "Name it .html")
     notes: tuple[str, ...] = ()
-    with waiting("fitting") as tell:
+    with interruptible(), waiting("fitting") as tell:
+        with held():
+            import brdf.images.pictures
         if len(target) == 1 and brdf.is_measured(target[0]):
             given = (
                 scene,
@@ -158,10 +161,12 @@ def _fit_table(path: Path, model: str, loss: str | None, has_picture_options: An
         raise brdf.InputError(path, came, "Leave the others out")
     table = brdf.load_measured(path)
     with named_as({"model": "--model", "loss": "--loss", table.name: path}):
-        use_compilation_cache()
-        import fitting
+        with held():
+            use_compilation_cache()
+            import fitting
 
-        return fitting.fit_brdf(table, model, loss=loss or "cosine")  # pyright: ignore[reportArgumentType]  # refused there
+            fit_brdf = fitting.fit_brdf
+        return fit_brdf(table, model, loss=loss or "cosine")  # pyright: ignore[reportArgumentType]  # refused there
 
 
 def _fit_pictures(
@@ -174,10 +179,11 @@ def _fit_pictures(
     given = Options(**options)
     read = read_first(target, given, tell)
     tell("fitting")
-    use_compilation_cache()
-    from fitting.cli.encoding_trial import fit_either
-    from fitting.cli.inputs import collect
-    from fitting.photographs.light_files import parse_numbers
+    with held():
+        use_compilation_cache()
+        from fitting.cli.encoding_trial import fit_either
+        from fitting.cli.inputs import collect
+        from fitting.photographs.light_files import parse_numbers
 
     numbers = None if noise is None else parse_numbers(noise, "--noise", 2, "READ,SHOT")
     how["noise"] = None if numbers is None else (numbers[0], numbers[1])

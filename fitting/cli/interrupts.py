@@ -1,0 +1,69 @@
+"""Ctrl-C that is neither lost nor breaks what is loading.
+
+Python raises `KeyboardInterrupt` wherever it happens to be. Inside a callback of the garbage collector (JAX has one) it
+is printed and forgotten, and the command goes on; inside a library that is loading it can end the process with a fault.
+"""
+
+import contextlib
+import gc
+import signal
+import threading
+from collections.abc import Iterator
+from types import FrameType
+
+# Callbacks of the collector take microseconds; in seconds.
+_AGAIN = 0.005
+_held = 0
+_pending = False
+
+
+@contextlib.contextmanager
+def interruptible() -> Iterator[None]:
+    """Within the block Ctrl-C ends the command, once. Where somebody else handles the signal, nothing changes."""
+    alone = threading.current_thread() is threading.main_thread()
+    if not alone or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+    alarm = signal.signal(signal.SIGALRM, _interrupt) if hasattr(signal, "SIGALRM") else None
+    signal.signal(signal.SIGINT, _interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        if alarm is not None:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+            signal.signal(signal.SIGALRM, alarm)
+
+
+@contextlib.contextmanager
+def held() -> Iterator[None]:
+    """Within the block Ctrl-C waits until its end: around imports of compiled libraries."""
+    global _held, _pending
+    _held += 1
+    try:
+        yield
+    finally:
+        _held -= 1
+    if _pending and not _held:
+        _pending = False
+        raise KeyboardInterrupt
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    global _pending
+    if _held:
+        _pending = True
+    elif _is_swallowed(frame) and hasattr(signal, "setitimer"):
+        signal.setitimer(signal.ITIMER_REAL, _AGAIN)
+    else:
+        raise KeyboardInterrupt
+
+
+def _is_swallowed(frame: FrameType | None) -> bool:
+    """Whether what is raised here is printed and forgotten."""
+    collecting = {getattr(callback, "__code__", None) for callback in gc.callbacks}
+    while frame is not None:
+        if frame.f_code in collecting or frame.f_code.co_name == "__del__":
+            return True
+        frame = frame.f_back
+    return False
