@@ -53,7 +53,7 @@ def main() -> None:
             told = row.get("missing") or row.get("stopped") or f"{duration(row['seconds'])}, {row['says']}"
             print(f"  {name} {row.get('size', '')}: {told}", flush=True)
             machine = {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count()}
-            store.write_text(json.dumps({"machine": machine, "limit": given.limit, "rows": rows}, indent=1) + "\n")
+            store.write_text(json.dumps({"machine": machine, "rows": rows}, indent=1) + "\n")
     sizes = sorted({row["size"] for row in rows if "size" in row})
     for measure in MEASURES:
         print("\n" + table(rows, measure, sizes))

@@ -16,7 +16,7 @@ from benchmarks.peers.problem import ACCURACY, Problem, Run, Trace
 
 # A fast run is repeated, and medians are taken.
 REPEATS, ENOUGH = 9, 4.0  # runs, seconds in all
-PASSES = 3  # before and after each run
+PASSES, PASSING = 3, 0.2  # before and after each run; seconds after which one is enough
 # What loading a library, drawing the problem and compiling may take beside the runs.
 PREPARATION = 120.0
 
@@ -81,9 +81,10 @@ def _serve(channel: multiprocessing.connection.Connection, name: str, limit: flo
         except EOFError:
             return
         try:
-            channel.send(_time(PEERS[name], problems.make(size), limit))
+            row = _time(PEERS[name], problems.make(size), limit)
         except Exception as error:  # whatever a peer raises is what the table says of it
-            channel.send({"stopped": f"{type(error).__name__}: {str(error).splitlines()[0][:200]}"})
+            row = {"stopped": f"{type(error).__name__}: {str(error).splitlines()[0][:200]}"}
+        channel.send(row)
 
 
 def _time(peer: Peer, problem: Problem, limit: float) -> dict[str, Any]:
@@ -129,4 +130,7 @@ def _repeat(run: Run, problem: Problem, threads: int) -> dict[str, Any]:
 def _passes(problem: Problem) -> list[float]:
     """Seconds of a few passes."""
     arrays = problem.n_dot_l, problem.log_cos, problem.target
-    return [engine.seconds(lambda: engine.one_pass(*arrays)) for _ in range(PASSES)]
+    times = [engine.seconds(lambda: engine.one_pass(*arrays))]
+    while len(times) < PASSES and times[0] < PASSING:
+        times.append(engine.seconds(lambda: engine.one_pass(*arrays)))
+    return times
