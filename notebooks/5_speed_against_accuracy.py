@@ -109,16 +109,20 @@ _ = ax.legend()
 rows, columns = np.meshgrid(np.linspace(0, np.pi, 32), np.linspace(0, 2 * np.pi, 64), indexing="ij")
 bright = np.exp(-((rows - 0.7) ** 2 + (columns - 4.0) ** 2) / 0.05)
 panel = brdf.RectangleLight(center=[1, 1.5, 2.5], edge_u=[0, 0.5, -0.3], edge_v=[0.6, 0, 0], radiance=[10.0])
-lights = {"directional light": None, "area light": panel, "sky": brdf.EnvironmentMap(0.3 + 9 * bright[..., None])}
+lights = {
+    "directional light": (None, 4.0),
+    "area light": (panel, 18.0),
+    "sky": (brdf.EnvironmentMap(0.3 + 9 * bright[..., None]), 14.0),
+}
 tables = {}
-for name, light in lights.items():
+for name, (light, seconds) in lights.items():
     place = lamp if light is None else dataclasses.replace(lit_by(1), lights=(light,))
     picture = target
     if light is not None:
         picture = np.asarray(brdf.render(material, place))
         picture = picture + np.random.default_rng(0).normal(0, 0.01 * picture.mean(), picture.shape)
     start = time.perf_counter()
-    tables[name] = fitting.tradeoff(picture, place, seconds=4)
+    tables[name] = fitting.tradeoff(picture, place, seconds=seconds)
     print(f"{name}: {time.perf_counter() - start:.0f} s")
     for row in tables[name].rows:
         if tables[name].marks(row):
@@ -134,11 +138,11 @@ tables["directional light"].plot()
 # as much again and matters for exponents above 10 000.
 #
 # **An area light.** The time is pixels times light samples. A sample of the pixels is worth more than ever, and light
-# samples matter by the narrowness of the highlight against the lamp: 16 do for n below some 50, 64 for some 400. Leave
-# the choice to `accuracy`: it doubles them only while they still change the answer.
+# samples matter by the narrowness of the highlight against the lamp: 16 left 1e-3 for n = 60, 32 left 7e-3 and 64 2e-5
+# for n = 400. Leave the choice to `accuracy`: it takes more of them only while they still change the answer.
 #
-# **A map of the sky.** Its light has no edge, so the error falls slowly: some hundred samples for 1e-2, more than a
-# thousand for 1e-3, and a thousand pixels before all of them. `accuracy=1e-2` first; then look whether it matters.
+# **A map of the sky.** Its light has no edge, so the error falls slowly: for n = 60 256 samples left 4e-2, 1024 left
+# 1e-2. Take some thousand pixels before many samples, `accuracy=1e-1` or 1e-2 first; then look whether it matters.
 
 # %% [markdown]
 # ## Stable at the extremes

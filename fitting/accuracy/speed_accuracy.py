@@ -67,8 +67,10 @@ def tradeoff(
         trials += bench.render_trials()
     taken: dict[int, list[Taken]] = {}
     found: dict[int, Any] = {}
-    # First from little to much work, so that what would take too long is known before; then every round is shuffled.
-    first = [i for i in np.argsort([trial.work for trial in trials], kind="stable") for _ in range(2)]
+    # From little to much work, so that what would take too long is known before, and what compiles anew each time
+    # last; then every round is shuffled.
+    by_work = sorted(range(len(trials)), key=lambda index: (trials[index].once, trials[index].work))
+    first = [index for index in by_work for _ in range(2)]
     again = [index for index, trial in enumerate(trials) if not trial.once]
     random = np.random.default_rng(0)
     order = [*first, *(index for _ in range(MOST_ROUNDS) for index in random.permutation(again))]
