@@ -1,6 +1,7 @@
 """From a bracket around one minimum of the profile to the minimum itself, on all pixels."""
 
 import itertools
+import math
 from collections.abc import Collection
 from typing import NamedTuple
 
@@ -217,11 +218,29 @@ class Polisher(NamedTuple):
         raise AssertionError
 
     def settle(self, point: Point) -> tuple[Point, Sums]:
-        """Residual passes with joint corrections until n stands still: exact cost, sums about the target."""
+        """Residual passes with joint corrections until n stands still: exact cost, sums about the target.
+
+        Where noise leaves n loosely determined a Gauss-Newton step may pass the minimum. A point that costs more than
+        the last is brought back, to the minimum of the parabola through both; nothing is returned on the word of the
+        quadratic model unless its step was negligible.
+        """
+        held, slope = None, 0.0
         for attempt in itertools.count(1):
-            x = point.x
-            parts = sums(self.pictures, point.log_n[None], x, peak=self.problem.peak)
-            point, left = _correct(parts, point, self.problem)
+            parts = sums(self.pictures, point.log_n[None], point.x, peak=self.problem.peak)
+            cost = float(np.sum(parts.square))
+            if held is not None and cost > (1 + float(self.problem.tolerance)) * float(np.sum(held[1].square)):
+                last = held[0]
+                rise = cost - float(np.sum(held[1].square))
+                share = np.clip(-slope / (2 * (rise - slope)), 0.1, 0.5)
+                slope *= share
+                point = jax.tree.map(lambda old, new, share=share: old + share * (new - old), last, point)
+                left = math.inf
+            else:
+                held = Point(point.log_n, point.x, parts.square), parts
+                point, left = _correct(parts, point, self.problem)
+                step = np.concatenate([point.x - held[0].x, (point.log_n - held[0].log_n) * held[0].x[:, 2:]], axis=1)
+                slope = -2 * float(np.sum(step * parts.product))
             if left <= self.problem.accuracy or attempt == _MOST_CORRECTIONS:
-                return point, parts.about(np.pad(x, [(0, 0), (0, 1)]))
+                found = point if left <= self.problem.accuracy else held[0]
+                return found, held[1].about(np.pad(held[0].x, [(0, 0), (0, 1)]))
         raise AssertionError

@@ -1,6 +1,6 @@
 """The profile, which is the least cost over the coefficients as a function of log n, and where its minimum may lie."""
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -16,6 +16,9 @@ from fitting.engine.thinning import Thinned, spread
 # Six standard deviations: one wrong rejection in 1e9, and the variance itself is an estimate.
 DEVIATIONS = 6.0
 
+# Rounding above this share of the rise from the best sample to its neighbour, and of the noise's variance, hides both.
+UNRESOLVED = 0.1
+
 # Hermite's cubic over a grid cell is within this share of the change that the steeper end's slope would make over it.
 GRID_ERROR = 0.02
 
@@ -28,12 +31,29 @@ class Profile(NamedTuple):
         linear: Best coefficients, cost and slope at each.
         error: Standard deviation of the cost relative to the best sample; 0 where all pixels were used.
         slope_error: That of the slope.
+        rounding: What single precision may put into the cost.
+        pixels: How many there are.
     """
 
     log_n: Float[np.ndarray, " G"]
     linear: Linear
     error: Float[np.ndarray, " G"]
     slope_error: Float[np.ndarray, " G"]
+    rounding: Float[np.ndarray, " G"]
+    pixels: float
+
+    def resolved(self) -> bool:
+        """Whether rounding leaves the valley, or what noise leaves of it.
+
+        Where basis images nearly add up to one another, large coefficients cancel, and with them the digits of the
+        products: then several samples may seem to fit exactly. In scenes where they do not, rounding is 1e-5 to 2e-4 of
+        the rise to the next sample (`python -m benchmarks.tradeoff`, its twenty scenes).
+        """
+        best = int(np.argmin(self.cost))
+        beside = [i for i in (best - 1, best + 1) if 0 <= i < self.cost.size]
+        rise = float(np.min(self.cost[beside])) - self.cost[best]
+        noise = self.cost[best] / max(self.pixels, 1.0)
+        return self.rounding[best] <= max(UNRESOLVED * rise, UNRESOLVED * noise)
 
     @property
     def cost(self) -> Float[np.ndarray, " G"]:
@@ -86,10 +106,13 @@ def profile_on_grid(pictures: Collection[Picture], log_n: np.ndarray, rough: np.
     """The profile on a grid."""
     parts = sums(pictures, log_n, rough, grid=True, peak=problem.peak)
     linear = jax.tree.map(np.asarray, solve_linear(parts, rough, problem))
-    return Profile(log_n, linear, np.zeros(log_n.size), np.zeros(log_n.size))
+    # What each term of the cost is rounded by, relative to the reference.
+    size = np.abs(linear.x - rough) * np.sqrt(np.diagonal(parts.gram, axis1=-2, axis2=-1)[..., :3])
+    rounding = np.finfo(np.float32).eps * np.sum(np.sum(size, axis=-1) ** 2, axis=-1)
+    return Profile(log_n, linear, np.zeros(log_n.size), np.zeros(log_n.size), rounding, float(np.max(parts.pixels)))
 
 
-def with_errors(profile: Profile, samples: list[Thinned], problem: Problem) -> Profile:
+def with_errors(profile: Profile, samples: Sequence[Thinned], problem: Problem) -> Profile:
     """How far the subsample's profile may be from that of all pixels."""
     best = np.argmin(profile.cost)
     log_n, x = profile.log_n, profile.linear.x
@@ -100,7 +123,7 @@ def with_errors(profile: Profile, samples: list[Thinned], problem: Problem) -> P
         if sample.factor is not None:
             variance = variance + np.stack(spread(sample, log_n[few], x[few], log_n[best], x[best], problem.peak))
     error, slope_error = (np.interp(log_n, log_n[few], each) for each in variance**0.5)
-    return Profile(log_n, profile.linear, error, slope_error)
+    return profile._replace(error=error, slope_error=slope_error)
 
 
 def possible_cells(profile: Profile) -> tuple[int, int]:

@@ -24,7 +24,7 @@ the solver, its 30 steps take 0.1 ms, and it is compiled once per number of chan
 """
 
 import math
-from collections.abc import Collection
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -42,6 +42,7 @@ from fitting.engine.profile import (
     starts,
     with_errors,
 )
+from fitting.engine.streams import Stream, each
 from fitting.engine.sums import Sums, sums
 from fitting.engine.thinning import Thinned, thin
 
@@ -98,7 +99,7 @@ class Optimum(eqx.Module):
 
 
 def search(
-    pictures: Collection[Picture],
+    pictures: Sequence[Picture],
     *,
     n_min: float = 0.1,
     n_max: float = 1e6,
@@ -108,7 +109,7 @@ def search(
 
     Args:
         pictures: Pictures of one material, all of one dtype and number of channels, or the tiles of a picture. They are
-            gone through once per pass over the pixels (three or four times), so an object that loads each when asked
+            gone through once per pass over the pixels (three or four times), so a stream that loads each when asked
             for keeps one in memory.
         n_min: Smallest exponent, above 0.
         n_max: Largest exponent.
@@ -137,10 +138,23 @@ def search(
         problem = problem._replace(peak=np.asarray(-nearest if nearest < math.inf else 0.0))
         if n_min == n_max:
             return _search_at_one(pictures, problem)
-        return _search_with_lobe(pictures, samples, problem)
+        found = _search_with_lobe(pictures, samples, problem, single=single)
+        if found is not None:
+            return found
+        # Sums in double precision over all pixels, one picture at a time: slow, and rarely needed.
+        exact = Stream(lambda i: _in_double(pictures[i]), len(pictures))
+        problem = problem._replace(tolerance=np.asarray(_TOLERANCE_DOUBLE))
+        samples = each(lambda picture: Thinned(picture, None, 0.0), exact)
+        found = _search_with_lobe(exact, samples, problem, single=False)
+        assert found is not None
+        return found
 
 
-def fit_linear(pictures: Collection[Picture], *, free: Bool[np.ndarray, "3 C"] | None = None) -> Optimum:
+def _in_double(picture: Picture) -> Picture:
+    return jax.tree.map(lambda leaf: leaf.astype(np.float64), picture)
+
+
+def fit_linear(pictures: Sequence[Picture], *, free: Bool[np.ndarray, "3 C"] | None = None) -> Optimum:
     """Ambient and diffuse only: one linear solve, a second in residual form for the exact cost.
 
     Args:
@@ -153,7 +167,7 @@ def fit_linear(pictures: Collection[Picture], *, free: Bool[np.ndarray, "3 C"] |
     return search(pictures, free=free)
 
 
-def _search_without_lobe(pictures: Collection[Picture], problem: Problem) -> Optimum:
+def _search_without_lobe(pictures: Sequence[Picture], problem: Problem) -> Optimum:
     """A linear solve, and a second about its answer for the exact cost."""
 
     def once(reference: Float[np.ndarray, "C 3"]) -> tuple[Point, Sums]:
@@ -168,7 +182,7 @@ def _search_without_lobe(pictures: Collection[Picture], problem: Problem) -> Opt
     return _optimum(*once(first.x), problem, None, False, [])
 
 
-def _search_at_one(pictures: Collection[Picture], problem: Problem) -> Optimum:
+def _search_at_one(pictures: Sequence[Picture], problem: Problem) -> Optimum:
     """The same with the exponent given."""
     x = np.zeros(problem.free.shape)
     parts = sums(pictures, problem.lower[None], x, peak=problem.peak)
@@ -177,8 +191,11 @@ def _search_at_one(pictures: Collection[Picture], problem: Problem) -> Optimum:
     return _optimum(*settled, problem, None, False, [])
 
 
-def _search_with_lobe(pictures: Collection[Picture], samples: list[Thinned], problem: Problem) -> Optimum:
-    few = [sample.picture for sample in samples]
+def _search_with_lobe(
+    pictures: Sequence[Picture], samples: Sequence[Thinned], problem: Problem, *, single: bool
+) -> Optimum | None:
+    """The search; nothing where it is done in single precision and that does not resolve the profile."""
+    few = each(lambda sample: sample.picture, samples)
     rough = rough_model(few)
     count = max(2, 1 + math.ceil((problem.upper - problem.lower) / GRID_STEP))
     log_n = np.linspace(problem.lower, problem.upper, count)
@@ -186,9 +203,13 @@ def _search_with_lobe(pictures: Collection[Picture], samples: list[Thinned], pro
     sampled = any(sample.factor is not None for sample in samples)
     if not sampled:
         profile = part = profile_on_grid(pictures, log_n, rough, problem)
+        if single and not profile.resolved():
+            return None
     else:
         # Most subsamples are float32.
         profile = profile_on_grid(few, log_n, rough, problem._replace(tolerance=np.asarray(_TOLERANCE_SINGLE)))
+        if single and not profile.resolved():
+            return None
         profile = with_errors(profile, samples, problem)
         start = start_from_sample(profile, problem)
         if start is not None:
