@@ -18,7 +18,11 @@ from brdf.errors import InputError
 Parameter = jax.Array | np.ndarray
 
 
-def _array(name: str, value: Any, shape_words: str) -> Any:
+LARGEST = 1e15
+"""Of any number of a scene: squares and products of a few of them stay within float32's 3e38."""
+
+
+def _array(name: str, value: Any, shape_words: str, largest: float = LARGEST) -> Any:
     if isinstance(value, jax.Array):
         return value
     try:
@@ -27,6 +31,8 @@ def _array(name: str, value: Any, shape_words: str) -> Any:
         raise InputError(name, f"must be {shape_words}, got {_shown(value)}", "Give plain numbers") from None
     if not np.all(np.isfinite(array)):
         raise InputError(name, f"must be finite, got {_shown(value)}", "Give finite numbers")
+    if np.any(np.abs(array) > largest):
+        raise InputError(name, f"must be within ± {largest:g}, got {_shown(value)}", "Use another unit")
     return array
 
 
@@ -35,11 +41,11 @@ def _shown(value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def vector(name: str) -> Callable[[Any], Any]:
-    """A converter for a position or an edge: three finite numbers."""
+def vector(name: str, largest: float = LARGEST) -> Callable[[Any], Any]:
+    """A converter for a position or an edge: three finite numbers up to ``largest``."""
 
     def convert(value: Any) -> Any:
-        array = _array(name, value, "three numbers")
+        array = _array(name, value, "three numbers", largest)
         if array.shape != (3,):
             raise InputError(name, f"must be three numbers, got {_shown(value)}", "Give [x, y, z]")
         return array
@@ -49,13 +55,17 @@ def vector(name: str) -> Callable[[Any], Any]:
 
 def direction_value(name: str) -> Callable[[Any], Any]:
     """A converter for a direction of any length: three finite numbers, not all zero."""
-    to_vector = vector(name)
+    to_vector = vector(name, np.inf)
 
     def convert(value: Any) -> Any:
         array = to_vector(value)
-        if isinstance(array, np.ndarray) and not np.any(array):
+        if not isinstance(array, np.ndarray):
+            return array
+        if not np.any(array):
             raise InputError(name, "must not have zero length, got [0, 0, 0]", "Give a direction")
-        return array
+        size = np.max(np.abs(array))
+        # Its squares must not leave float32; else it stays as it was given.
+        return array if 1e-6 <= size <= 1e6 else array / size
 
     return convert
 

@@ -212,7 +212,7 @@ def read_text(path: str | os.PathLike[str]) -> str:
     """Read a text file of at most ``MAX_TEXT_BYTES``.
 
     Args:
-        path: the file, UTF-8.
+        path: the file, UTF-8, with or without a byte-order mark.
 
     Returns:
         Its content.
@@ -225,6 +225,6 @@ def read_text(path: str | os.PathLike[str]) -> str:
     if len(content) > MAX_TEXT_BYTES:
         raise InputError(os.fspath(path), f"is larger than {MAX_TEXT_BYTES >> 20} MiB", "Give a text file")
     try:
-        return content.decode("utf-8")
+        return content.decode("utf-8-sig")  # some editors write a byte-order mark
     except UnicodeDecodeError as error:
         raise InputError(os.fspath(path), f"is not UTF-8 text ({error.reason})", "Give a text file") from None

@@ -21,6 +21,10 @@ from fitting.pixel_survey import FLAT, SYMMETRIC_PIXELS, TOP, Survey, inverse_va
 # How many pixels are looked at together, in rows of which files hold whole blocks.
 TILE_PIXELS = 1 << 20
 ALIGNED_ROWS = 64
+# Largest value, and inverse of the least, of a picture in single precision: squares of it, of rounding errors a million
+# times smaller, and sums over millions of pixels have to stay in its range of 1e-38 to 3e38; double precision reaches
+# far beyond what a file can hold.
+SINGLE, DOUBLE = 1e12, 1e100
 # A file is shown by no more pixels than this along each side.
 SHOWN_PIXELS = 1024
 
@@ -133,6 +137,10 @@ def observe(
     bands = _bands(pixels, scene, dtype, mask, height if whole else max(TILE_PIXELS // width, 1))
     level = known_saturation if saturation is None else saturation
     total, goods = _look(bands, dark, level, keep=not streamed)
+    reach = SINGLE if dtype == np.float32 else DOUBLE
+    if total.largest > 0 and not 1 / reach <= total.largest <= reach:
+        came = f"has {total.largest:.3g} as its largest value, out of reach of {dtype.name}"
+        raise InputError("target", came, "Bring it nearer to 1 (another exposure), or fit in float64")
     if level is None and total.largest > 0 and total.top > SYMMETRIC_PIXELS and scene.lights:
         level = _plateau(bands, goods, total.largest, scene)
         if level is not None:

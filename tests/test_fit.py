@@ -115,3 +115,29 @@ def test_what_cannot_be_used_is_refused(arguments: dict, message: str):
 def test_targets_that_cannot_be_used_are_refused(target, message: str):
     with pytest.raises(brdf.InputError, match=message):
         fitting.fit(target, scene(SUN))
+
+
+@pytest.mark.parametrize("factor", [1e-9, 1e9])
+def test_the_unit_of_the_picture_does_not_matter(factor: float):
+    material = brdf.BlinnPhong(k_d=[0.5, 0.3, 0.1], k_s=[0.3, 0.3, 0.3], n=40.0)
+    found = fitting.fit(rendered(material, scene(SUN)) * factor, scene(SUN), model="blinn-phong").material
+    assert isinstance(found, brdf.BlinnPhong)
+    np.testing.assert_allclose(found.n, 40.0, rtol=1e-4)
+    np.testing.assert_allclose(np.asarray(found.k_d) / factor, [0.5, 0.3, 0.1], rtol=1e-4)
+
+
+@pytest.mark.parametrize("factor", [1e-30, 1e30])
+def test_values_out_of_reach_are_refused(factor: float):
+    picture = np.asarray(rendered(brdf.Lambert(k_d=0.5), scene(SUN)), np.float64) * factor
+    with pytest.raises(brdf.InputError, match=r"^target: has .* out of reach of float32"):
+        fitting.fit(picture, scene(SUN))
+    found = fitting.fit(picture, scene(SUN), model="lambert", precision="float64").material
+    np.testing.assert_allclose(np.asarray(found.k_d) / factor, 0.5, rtol=1e-9)
+
+
+def test_the_length_of_a_direction_does_not_matter():
+    material = brdf.Lambert(k_d=0.5)
+    whole = rendered(material, scene(SUN))
+    for factor in (1e-200, 1e200):
+        light = brdf.DirectionalLight(direction=np.asarray(SUN.direction) * factor, intensity=SUN.intensity)
+        np.testing.assert_allclose(rendered(material, scene(light)), whole, rtol=1e-5, atol=1e-7)

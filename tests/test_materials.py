@@ -90,6 +90,7 @@ WRONG = {
     "empty": ('{"model": "lambert", "k_d": []}', "k_d: must be one number"),
     "two n": ('{"model": "phong", "k_d": [1], "k_s": [1], "n": [1, 2]}', "n: must be one number"),
     "channels": ('{"model": "lambert", "k_a": [1, 2], "k_d": [1, 2, 3]}', "number of channels"),
+    "twice": ('{"model": "lambert", "k_d": [1], "k_d": [0]}', "k_d: is given twice"),
     "unknown n": ('{"model": "phong", "k_d": [1], "k_s": [1], "n": null}', "n: is null (not determined) although"),
 }
 
@@ -113,6 +114,7 @@ WRONG_MTL = {
     "two": ("newmtl a\nKd 1 2\n", "line 2: Kd has 2 values"),
     "negative": ("newmtl a\nKd -1 0 0\n", "k_d: must be at least 0, got -1 in channel 0"),
     "exponent": ("newmtl a\nKs 1 1 1\nNs -3\n", "must be at least 0, got -3"),
+    "twice": ("newmtl a\nKd 1 1 1\nnewmtl a\nKd 0 0 0\n", "line 3: names the material a a second time"),
     "several": ("newmtl a\nKd 1 1 1\nnewmtl b\nKd 1 1 1\n", "holds 2 materials"),
 }
 
@@ -126,3 +128,11 @@ def test_wrong_mtl_is_one_line(tmp_path: Path, case: str):
         brdf.load_material(path)
     assert str(caught.value).startswith(str(path))
     assert words in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["m.json", "m.mtl"])
+def test_a_byte_order_mark_is_no_content(tmp_path: Path, name: str):
+    brdf.save_material(brdf.Lambert(k_d=[0.5, 0.4, 0.3]), tmp_path / name)
+    text = (tmp_path / name).read_bytes()
+    (tmp_path / name).write_bytes(b"\xef\xbb\xbf" + text)
+    np.testing.assert_allclose(brdf.load_material(tmp_path / name).k_d, [0.5, 0.4, 0.3])

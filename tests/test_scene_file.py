@@ -238,6 +238,7 @@ WRONG = {
     "camera samples": (LIT.replace("samples = 3\n", "samples = 0\n"), "camera.samples: must be between 1 and"),
     "truth in a vertex": (LIT.replace("[0, 1, 3]", "[0, true, 3]"), "lights[2].vertices: must be a number"),
     "missing map": (SHORT + "[[lights]]\ntype = 'environment'\nfile = 'none.exr'\n", "none.exr: there is no such"),
+    "light beyond float32": (SHORT.replace("radius = 1", "radius = 1e30"), "radius: must be within ± 1e+15"),
     "missing mesh": (SHORT + "[[shapes]]\ntype = 'triangles'\nfile = 'none.obj'\n", "none.obj: there is no such"),
     "path out of the folder": ('[aov]\nfile = "../aovs.exr"\n', "aov.file: must stay within the scene's folder"),
     "number for a path": ("[aov]\nfile = 3\n", "aov.file: must be a path, got 3"),

@@ -157,3 +157,14 @@ def test_a_file_without_triangles_is_refused(tmp_path: Path, text: str):
     (tmp_path / "bad.obj").write_text(text)
     with pytest.raises(brdf.InputError, match=r"bad\.obj"):
         brdf.load_mesh(tmp_path / "bad.obj")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n", "vertex 0"), ("v 0 0 1e300\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "within")],
+)
+def test_meshes_that_cannot_be_used_are_refused(tmp_path: Path, text: str, words: str):
+    pytest.importorskip("trimesh", reason="trimesh reads meshes")
+    (tmp_path / "mesh.obj").write_text(text)
+    with pytest.raises(brdf.InputError, match=words):
+        brdf.load_mesh(tmp_path / "mesh.obj")

@@ -10,6 +10,7 @@ import functools
 import hashlib
 import io
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from brdf.checks import LARGEST
 from brdf.errors import InputError
 from brdf.files import read_text
 from brdf.geometry.shapes import Hit, Shape
 from brdf.vectors import divide, dot, normalize
+
+# A corner 0 of a face, which a parser may take for the last vertex.
+_FACE_OF_NOTHING = re.compile(r"^f[ \t](?:.*[ \t])?0+(?=[/\s]|$)", re.MULTILINE)
 
 
 class Mesh:
@@ -52,6 +57,8 @@ class Mesh:
             raise InputError("faces", f"must be of shape (F, 3), got {self.faces.shape}", "Give triangles")
         if self.vertices.ndim != 2 or self.vertices.shape[1] != 3 or not np.all(np.isfinite(self.vertices)):
             raise InputError("vertices", "must be finite and of shape (V, 3)", "Give a point per vertex")
+        if np.max(np.abs(self.vertices)) > LARGEST:
+            raise InputError("vertices", f"must be within ± {LARGEST:g}", "Give the mesh in another unit")
         if self.faces.min() < 0 or self.faces.max() >= len(self.vertices):
             raise InputError("faces", "name a vertex that is not there", "Correct the indices")
         self._digest = hashlib.sha256(self.vertices.tobytes() + self.faces.tobytes()).digest()
@@ -104,6 +111,8 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
     """
     trimesh = _trimesh()
     text = read_text(path)
+    if _FACE_OF_NOTHING.search(text):
+        raise InputError(os.fspath(path), "has a face with the vertex 0; vertices count from 1", "Export it again")
     try:
         loaded = trimesh.load_mesh(
             io.StringIO(text), file_type="obj", process=False, skip_materials=True, maintain_order=True

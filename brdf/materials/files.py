@@ -145,9 +145,18 @@ def _parameters(model: type[Material]) -> list[str]:
     return [field.name for field in dataclasses.fields(model)]
 
 
+def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    entries = dict(pairs)
+    if len(entries) < len(pairs):
+        keys = [key for key, _ in pairs]
+        twice = next(key for key in keys if keys.count(key) > 1)
+        raise InputError(twice, "is given twice", "Give it once")
+    return entries
+
+
 def _from_json(path: Path, text: str) -> Material:
     try:
-        return material_from_dict(json.loads(text))
+        return material_from_dict(json.loads(text, object_pairs_hook=_without_repetition))
     except InputError as error:
         raise error.inside(path) from None
     except (ValueError, RecursionError) as error:
@@ -199,7 +208,10 @@ def _from_mtl(path: Path, text: str) -> dict[str, Material]:
             continue
         key = words[0].lower()
         if key == "newmtl":
-            current = entries.setdefault(stripped[len("newmtl") :].strip() or "unnamed", {})
+            name = stripped[len("newmtl") :].strip() or "unnamed"
+            if name in entries:
+                raise InputError(place, f"names the material {name} a second time", "Give each a name of its own")
+            current = entries[name] = {}
             current["model"] = model_comment
             continue
         if key not in (*SPECTRAL, "ns", "illum"):

@@ -16,7 +16,7 @@ import brdf
 import fitting
 from brdf.errors import InputError
 from fitting.cli.common import named_as
-from fitting.cli.job import Job, check_range
+from fitting.cli.job import Job
 from fitting.result import FitResult
 
 # The other reading is believed where it leaves less than this share of the squares that the assumed one leaves.
@@ -61,7 +61,6 @@ def fit_either(
 
 def _fit(job: Job, how: dict[str, Any]) -> FitResult:
     several = len(job.pictures) > 1
-    check_range(job, how["precision"])
     with named_as({"target": job.target}):
         if several:
             return fitting.fit(job.pictures, job.scenes, mask=job.masks, **how)

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from fitting.cli.common import named_as, show, use_compilation_cache, waiting
-from fitting.cli.interrupts import held, interruptible
+from fitting.cli.interrupts import held
 
 EXAMPLE = (
     "Example: [bold]brdf fit photo.exr --scene scene.toml --out result/[/bold]    or, for a folder with "
@@ -78,7 +78,7 @@ def fit(
     if report is not None and report.suffix.lower() not in (".html", ".htm"):
         raise brdf.InputError(report, "is no name of a page", "Name it .html")
     notes: tuple[str, ...] = ()
-    with interruptible(), waiting("fitting") as tell:
+    with waiting("fitting") as tell:
         with held():
             import brdf.images.pictures
         if len(target) == 1 and brdf.is_measured(target[0]):

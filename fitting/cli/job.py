@@ -9,10 +9,6 @@ import brdf
 from brdf.errors import InputError
 from fitting.photographs.light_files import parse_numbers
 
-# Largest value, and inverse of the least, of a picture fitted in single precision: squares of it, of rounding errors a
-# million times smaller, and sums over millions of pixels have to stay in its range of 1e-38 to 3e38.
-SINGLE = 1e12
-
 
 class Job(NamedTuple):
     """Pictures and scenes to fit.
@@ -82,23 +78,3 @@ def opaque(mask: np.ndarray | None, pictures: list[Any]) -> list[np.ndarray | No
         else:
             masks.append(visible if mask is None else visible & mask)
     return masks
-
-
-def check_range(job: Job, precision: str) -> None:
-    """Refuse values whose squares, or those of their rounding, single precision does not hold.
-
-    Args:
-        job: pictures to fit.
-        precision: of the fit.
-
-    Raises:
-        InputError: naming the first picture.
-    """
-    if precision != "float32":
-        return
-    for picture in job.pictures:
-        pixels = np.abs(picture.pixels if isinstance(picture, brdf.Picture) else picture)
-        largest = float(np.max(pixels, where=np.isfinite(pixels), initial=0.0))
-        if largest and not 1 / SINGLE <= largest <= SINGLE:
-            came = f"has {largest:.3g} as its largest value, out of reach of single precision"
-            raise InputError(job.target, came, "Bring it nearer to 1 with --exposure, or use --precision float64")

@@ -11,10 +11,12 @@ from typing import Annotated, Any
 
 import typer
 
+from brdf.errors import InputError
 from fitting.cli import convert as cli_convert
 from fitting.cli import fit as cli_fit
 from fitting.cli import tradeoff as cli_tradeoff
 from fitting.cli.common import named_as, show, use_compilation_cache, waiting
+from fitting.cli.interrupts import interruptible
 
 app = typer.Typer(
     name="brdf",
@@ -72,7 +74,7 @@ def check(
         reports = {name: brdf.check(one, name=name) for name, one in materials.items()}
         if plot is not None:
             if len(materials) > 1:
-                raise _input_error("--plot", f"draws one material, {material} holds {len(materials)}", "Give one")
+                raise InputError("--plot", f"draws one material, {material} holds {len(materials)}", "Give one")
             from fitting.plots.materials import overview
 
             with brdf.atomic_path(plot) as path:
@@ -89,26 +91,19 @@ app.command(epilog=cli_convert.EXAMPLE)(cli_convert.convert)
 app.command(epilog=cli_tradeoff.EXAMPLE)(cli_tradeoff.tradeoff)
 
 
-def _input_error(where: str, what: str, remedy: str) -> Exception:
-    from brdf.errors import InputError
-
-    return InputError(where, what, remedy)
-
-
 def main(arguments: list[str] | None = None) -> Any:
     """Run the command; every failure of the user's making is one line on standard error and exit status 2.
 
     Args:
         arguments: the words after ``brdf``; None takes those of the process.
     """
-    from brdf.errors import InputError
-
     try:
-        status = app(args=arguments, prog_name="brdf", standalone_mode=False)
+        with interruptible():
+            status = app(args=arguments, prog_name="brdf", standalone_mode=False)
     except InputError as error:
         _fail(str(error))
     except USAGE_ERROR as error:
-        _fail(f"{_words(error)} Try brdf --help.")
+        _fail(f"{_words(error).rstrip('.')}. Try brdf --help.")
     except KeyboardInterrupt:
         _fail("interrupted.", status=INTERRUPTED)
     except BrokenPipeError:
