@@ -24,7 +24,7 @@ ALIGNED_ROWS = 64
 # Largest value, and inverse of the least, of a picture in single precision: squares of it, of rounding errors a million
 # times smaller, and sums over millions of pixels have to stay in its range of 1e-38 to 3e38; double precision reaches
 # far beyond what a file can hold.
-SINGLE, DOUBLE = 1e12, 1e100
+SINGLE, DOUBLE = 1e12, 1e140
 # A file is shown by no more pixels than this along each side.
 SHOWN_PIXELS = 1024
 
