@@ -29,6 +29,8 @@ AUTO = ("phong", "blinn-phong")
 PLAUSIBLE = ("normalized-phong", "normalized-blinn-phong")
 # An exponent up to this multiple of the lower bound is at the bound.
 WIDEST = 1.01
+# A residual above this share of the picture: what the scene says is probably not what the picture shows.
+UNEXPLAINED = 0.5
 
 
 def fit(
@@ -212,7 +214,11 @@ def _alone(choice: Choice, fits: dict[str, ModelFit], grey: dict[str, np.ndarray
 def _interpret(fit: ModelFit, job: Job, choice: Choice | None) -> Interpretation:
     brightest = np.max([observation.brightest for observation in job.observations], axis=0)
     # What the light reaches but the simplest model does without is 0, with the error that it would have.
+    share = float(np.sqrt(np.sum(fit.optimum.cost) / np.sum(fit.optimum.square)))
     told = interpret(fit, job.light.colour, job.rounding, brightest, job.shapes, reached(fit.model, job))
+    if share > UNEXPLAINED:
+        words = f"the model leaves {100 * share:.0f} % of the picture: are light, camera and encoding what they were?"
+        told = told._replace(warnings=(words, *told.warnings))
     if choice is None or not choice.rivals:
         return told
     names = " and ".join(choice.rivals)

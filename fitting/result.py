@@ -266,6 +266,8 @@ def _correlations(result: FitResult) -> list[str]:
     """The strongest correlations, as far as they are worth a line."""
     free = result.free_parameters
     pairs = [(abs(result.correlation[i, j]), i, j) for i in range(len(free)) for j in range(i)]
+    # A grey k_s is one number in all channels.
+    pairs = [(size, i, j) for size, i, j in pairs if free[i].name != free[j].name or size < 1 - 1e-9]
     strong = sorted((pair for pair in pairs if pair[0] > STRONG), reverse=True)[:MOST_CORRELATIONS]
     words = [f"{_key(free[j])} and {_key(free[i])} {result.correlation[i, j]:+.2f}" for _, i, j in strong]
     return [f"  correlated  {', '.join(words)}"] if words else []

@@ -1,5 +1,6 @@
 """The command as a person runs it: a process of its own, its output, its exit status, the files it leaves."""
 
+import importlib.metadata
 import json
 import os
 import subprocess
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 import brdf
+from fitting.cli.main import main
 
 ROOT = Path(__file__).parents[1]
 EXAMPLE = ROOT / "data" / "gold-ball"
@@ -183,3 +185,27 @@ def test_check_exit_statuses(run, tmp_path: Path):
     values = json.loads(run("check", "classic.mtl", "--json", status=1).stdout)
     assert values
     assert run("check", "none.json", status=2).stderr.startswith("error: none.json: there is no such file")
+
+
+def test_no_command_shows_the_help_and_nothing_else(capsys):
+    with pytest.raises(SystemExit) as caught:
+        main([])
+    assert caught.value.code == 2
+    out, err = capsys.readouterr()
+    assert "Usage" in out + err
+    assert "error:" not in err
+
+
+def test_the_version_is_that_of_the_package(capsys):
+    with pytest.raises(SystemExit) as caught:
+        main(["--version"])
+    assert caught.value.code == 0
+    assert capsys.readouterr().out.strip() == f"brdf-fitting {importlib.metadata.version('brdf-fitting')}"
+
+
+@pytest.mark.parametrize("command", ["fit", "tradeoff"])
+def test_a_missing_picture_is_missing_whatever_else_is(command: str, tmp_path: Path, capsys):
+    with pytest.raises(SystemExit) as caught:
+        main([command, str(tmp_path / "none.png")])
+    assert caught.value.code == 2
+    assert "none.png: there is no such file" in capsys.readouterr().err

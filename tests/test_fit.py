@@ -141,3 +141,12 @@ def test_the_length_of_a_direction_does_not_matter():
     for factor in (1e-200, 1e200):
         light = brdf.DirectionalLight(direction=np.asarray(SUN.direction) * factor, intensity=SUN.intensity)
         np.testing.assert_allclose(rendered(material, scene(light)), whole, rtol=1e-5, atol=1e-7)
+
+
+def test_a_scene_that_is_not_that_of_the_picture_is_asked_about():
+    picture = rendered(brdf.Lambert(k_d=0.5), scene(SUN, ambient=None))
+    behind = brdf.DirectionalLight(direction=[-0.9, -0.4, 0.05], intensity=1.0)
+    assert any(
+        "are light, camera and encoding" in w for w in fitting.fit(picture, scene(behind, ambient=None)).warnings
+    )
+    assert not fitting.fit(picture, scene(SUN, ambient=None)).warnings

@@ -131,6 +131,7 @@ def target_and_scene(target: Path, scene: Path | None) -> tuple[Path, Path]:
         InputError: where one of them is missing.
     """
     if not target.is_dir():
+        brdf.input_file(target)
         if scene is None:
             raise InputError(
                 target, "comes without a scene", "Add --scene SCENE.toml, or --sphere for a photo of a ball"

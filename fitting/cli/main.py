@@ -3,6 +3,7 @@
 Help does not import JAX; each command imports what it needs.
 """
 
+import importlib.metadata
 import json
 import os
 import sys
@@ -26,6 +27,20 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        show(f"brdf-fitting {importlib.metadata.version('brdf-fitting')}")
+        raise typer.Exit
+
+
+@app.callback()
+def about(
+    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Say which.")] = False,
+) -> None:
+    """Which few numbers make this surface look like that picture."""
+
 
 INTERRUPTED = 130  # what shells expect after Ctrl-C
 # What a wrong option raises, wherever typer keeps its parser.
@@ -103,6 +118,8 @@ def main(arguments: list[str] | None = None) -> Any:
     except InputError as error:
         _fail(str(error))
     except USAGE_ERROR as error:
+        if not _words(error):  # no command at all: the help has been shown
+            sys.exit(2)
         _fail(f"{_words(error).rstrip('.')}. Try brdf --help.")
     except KeyboardInterrupt:
         _fail("interrupted.", status=INTERRUPTED)

@@ -30,8 +30,9 @@ def tradeoff(
     import json
 
     import brdf
+    from fitting.cli.first_look import target_and_scene
 
-    picture_file, scene_file = _files(target, scene)
+    picture_file, scene_file = target_and_scene(target, scene)
     names: dict[str, Any] = {"target": picture_file, "mask": mask, "model": "--model", "accuracy": "--accuracy"}
     with named_as(names | {"seconds": "--seconds", "saturation": "--saturation"}):
         picture = brdf.read_picture(picture_file)
@@ -70,20 +71,6 @@ def _print_table(found: Any) -> None:
     from rich.console import Console
 
     Console(width=None if sys.stdout.isatty() else 160).print(found.table())
-
-
-def _files(target: Path, scene: Path | None) -> tuple[Path, Path]:
-    import brdf
-
-    if not target.is_dir():
-        if scene is None:
-            raise brdf.InputError(target, "comes without a scene", "Add --scene SCENE.toml")
-        return target, scene
-    candidates = sorted(path for path in target.glob("target.*") if path.is_file())
-    if len(candidates) != 1:
-        came = "has no file target.*" if not candidates else f"has {len(candidates)} files target.*"
-        raise brdf.InputError(target, came, "Give the picture, and --scene")
-    return candidates[0], scene or target / "scene.toml"
 
 
 class _Progress:
