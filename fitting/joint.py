@@ -99,7 +99,7 @@ def fit_jointly(
     with brdf.working_precision(precision):
         dtype = np.dtype(precision)
         seen = [
-            observe(picture, place, dtype=dtype, mask=one, saturation=saturation).tiles[0]
+            observe(picture, place, dtype=dtype, mask=one, saturation=saturation, at_once=True).tiles[0]
             for picture, place, one in zip(targets, scenes, masks, strict=True)
         ]
         start = brdf.cast((material, scenes), precision)

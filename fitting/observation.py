@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 import brdf
 from brdf.errors import InputError
 from fitting.engine.streams import Stream, each
-from fitting.picture_inputs import check_levels, per_pixel, pixels_of
+from fitting.picture_inputs import check_levels, check_sizes, per_pixel, pixels_of
 from fitting.pixel_survey import FLAT, SYMMETRIC_PIXELS, TOP, Survey, inverse_variance, lit_at_top, survey
 
 # How many pixels are looked at together, in rows of which files hold whole blocks.
@@ -95,6 +95,7 @@ def observe(
     dark: float | None = None,
     noise: tuple[float, float] | None = None,
     weight: Any = None,
+    at_once: bool = False,
 ) -> Observation:
     """Decide which pixels of a picture count.
 
@@ -108,41 +109,42 @@ def observe(
         dark: linear value up to which pixels are too dark to count: none of their channels exceeds it.
         noise: of the camera, (read, shot): the variance of a value is read² + shot · value, and pixels weigh by it.
         weight: (H, W), at least 0, how much each pixel counts beside that.
+        at_once: make one tile of the picture, however large it is.
 
     Raises:
         InputError: where nothing is left to fit, or the arguments do not belong together.
     """
-    check_levels(saturation, dark, noise)
+    noise = check_levels(saturation, dark, noise)
     pixels, known_saturation, step = pixels_of(target)
+    check_sizes(pixels, scene)
     height, width, channels = pixels.shape
-    if (width, height) != scene.resolution:
-        came = f"is {width} x {height}, the scene's camera {scene.resolution[0]} x {scene.resolution[1]}"
-        raise InputError("target", came, "Give a picture and a camera of the same resolution")
-    if scene.channels not in (1, channels):
-        came = f"has {channels} channels, the scene's light {scene.channels}"
-        raise InputError("target", came, "Give both the same number of channels")
     mask = None if mask is None else per_pixel("mask", mask, (height, width)).astype(bool)
     if weight is not None:
         weight = per_pixel("weight", weight, (height, width))
-        if not np.all(np.isfinite(weight) & (weight >= 0)):
-            raise InputError("weight", "holds values that are negative or not finite", "Give values of 0 or more")
+        if not np.all(weight >= 0) or not np.any(weight > 0):
+            raise InputError("weight", "must be 0 or more, and more somewhere", "Give values of 0 or more")
+        # What weighs nothing says nothing of clipping or rounding either.
+        mask = weight > 0 if mask is None else mask & (weight > 0)
     streamed = isinstance(pixels, brdf.ImageReader)
     if streamed and noise is not None:
         remedy = "Give the picture in memory, or weight in place of noise"
         raise InputError("noise", "needs the whole picture at once, the target is read by bands", remedy)
-    if streamed and scene.camera is not None and scene.camera.samples > 1:
+    averaged = scene.camera is not None and scene.camera.samples > 1
+    averaged |= scene.points is not None and scene.points.area is not None
+    if streamed and averaged:
         remedy = "Take samples out of the camera, or give the picture in memory"
         raise InputError("target", "is read by bands, where every pixel is seen at its centre", remedy)
-    whole = noise is not None or (scene.camera is not None and scene.camera.samples > 1)
-    bands = _bands(pixels, scene, dtype, mask, height if whole else max(TILE_PIXELS // width, 1))
+    rows = height if at_once or noise is not None or averaged else max(TILE_PIXELS // width, 1)
+    bands = _bands(pixels, scene, dtype, mask, rows)
     level = known_saturation if saturation is None else saturation
     total, goods = _look(bands, dark, level, keep=not streamed)
     reach = SINGLE if dtype == np.float32 else DOUBLE
-    if total.largest > 0 and not 1 / reach <= total.largest <= reach:
-        came = f"has {total.largest:.3g} as its largest value, out of reach of {dtype.name}"
+    size = max(total.largest, float(np.max(total.scale)))
+    if size > 0 and not 1 / reach <= size <= reach:
+        came = f"has {size:.3g} as its largest value, out of reach of {dtype.name}"
         raise InputError("target", came, "Bring it nearer to 1 (another exposure), or fit in float64")
     if level is None and total.largest > 0 and total.top > SYMMETRIC_PIXELS and scene.lights:
-        level = _plateau(bands, goods, total.largest, scene)
+        level = _plateau(bands, goods, total.largest, scene, dark)
         if level is not None:
             total, goods = _look(bands, dark, level, keep=not streamed)
     left_out = _left_out(total, height * width, masked=mask is not None, level=level, dark=dark)
@@ -224,15 +226,19 @@ def _look(
     return total, goods
 
 
-def _plateau(bands: Sequence[_Band], goods: dict[int, Any], largest: float, scene: brdf.Scene) -> float | None:
+def _plateau(
+    bands: Sequence[_Band], goods: dict[int, Any], largest: float, scene: brdf.Scene, dark: float | None
+) -> float | None:
     """The level at which a picture is clipped: many pixels at exactly the largest value, on a surface lit unevenly."""
     ranges = []
     for band in bands:
         good = goods.get(band.first)
         found = lit_at_top(
-            band.values, _survey(band, None, None)[0] if good is None else good, largest, band.points, scene
+            band.values, _survey(band, dark, None)[0] if good is None else good, largest, band.points, scene
         )
         ranges += [] if found is None else [found]
+    if not ranges:
+        return None
     low, high = min(low for low, _ in ranges), max(high for _, high in ranges)
     return None if high - low <= FLAT * high else largest * TOP
 

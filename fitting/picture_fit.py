@@ -17,6 +17,7 @@ from fitting.interpretation import Interpretation, ModelFit, coefficient_factors
 from fitting.light_colour import take_colour_out
 from fitting.model_fit import Job, fit_model, optimise, reached
 from fitting.observation import observe
+from fitting.picture_inputs import check_levels, check_range, check_sizes, per_pixel, pixels_of, relative_weights
 from fitting.plausible import fit_plausible, is_plausible
 from fitting.result import FitResult, free_parameters
 from fitting.selection import FAMILIES, Choice, choose
@@ -85,16 +86,6 @@ def fit(
     """
     start = time.perf_counter()
     targets, scenes, masks, weights = _pictures(target, scene, mask, weight)
-    if accuracy is not None or seconds is not None:
-        from fitting.accuracy.budget import fit_within
-
-        if any(isinstance(one, brdf.ImageReader) for one in targets):
-            words = "is read by bands of rows; accuracy and seconds choose among pixels in memory"
-            raise InputError("target", words, "Read it with brdf.read_image, or leave accuracy and seconds out")
-        how = {"mask": masks, "saturation": saturation, "n_range": n_range, "dark": dark}
-        beside = {"loss": loss != "squared", "noise": noise is not None, "weight": weight is not None}
-        beside["plausible"] = plausible
-        return fit_within(targets, scenes, model, precision, how, beside, accuracy=accuracy, seconds=seconds)
     if model != "auto" and model not in brdf.MODELS:
         raise InputError("model", f"is unknown, got {model!r}", f"Use auto or one of {', '.join(brdf.MODELS)}")
     if plausible and model in AUTO:
@@ -102,15 +93,29 @@ def fit(
         raise InputError("model", f"{model} is neither reciprocal nor energy conserving, so never plausible", remedy)
     if loss not in LOSSES:
         raise InputError("loss", f"is unknown, got {loss!r}", f"Use one of {', '.join(LOSSES)}")
-    low, high = n_range
-    if not 0 < low < high < np.inf:
-        raise InputError("n_range", f"must be 0 < lower < upper, got {n_range}", "Correct the bounds")
+    check_range(n_range)
+    if accuracy is not None or seconds is not None:
+        from fitting.accuracy.budget import fit_within
+
+        if any(isinstance(one, brdf.ImageReader) for one in targets):
+            words = "is read by bands of rows; accuracy and seconds choose among pixels in memory"
+            raise InputError("target", words, "Read it with brdf.read_image, or leave accuracy and seconds out")
+        check_levels(saturation, dark, noise)
+        for picture, place, one in zip(targets, scenes, masks, strict=True):
+            pixels, _, _ = pixels_of(picture)
+            check_sizes(pixels, place)
+            if one is not None:
+                per_pixel("mask", one, pixels.shape[:2])
+        how = {"mask": masks, "saturation": saturation, "n_range": n_range, "dark": dark}
+        beside = {"loss": loss != "squared", "noise": noise is not None, "weight": weight is not None}
+        beside["plausible"] = plausible
+        return fit_within(targets, scenes, model, precision, how, beside, accuracy=accuracy, seconds=seconds)
     with brdf.working_precision(precision):
         dtype = np.dtype(precision)
         cuts = {"saturation": saturation, "dark": dark, "noise": noise}
         observations = [
             observe(picture, place, dtype=dtype, mask=one, weight=other, **cuts)
-            for picture, place, one, other in zip(targets, scenes, masks, weights, strict=True)
+            for picture, place, one, other in zip(targets, scenes, masks, relative_weights(weights), strict=True)
         ]
         counts = {observation.shown.shape[-1] for observation in observations}
         if len(counts) > 1:

@@ -1,5 +1,7 @@
 """What the fit accepts as a picture, and as numbers about it."""
 
+import math
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -9,7 +11,7 @@ from brdf.errors import InputError
 from fitting.pixel_survey import TOP
 
 
-def check_levels(saturation: Any, dark: Any, noise: Any) -> None:
+def check_levels(saturation: Any, dark: Any, noise: Any) -> tuple[float, float] | None:
     """Refuse what is no level of a picture.
 
     Args:
@@ -17,14 +19,19 @@ def check_levels(saturation: Any, dark: Any, noise: Any) -> None:
         dark: None or a linear value.
         noise: None or (read, shot).
 
+    Returns:
+        The noise, as numbers.
+
     Raises:
         InputError: naming the one that is wrong.
     """
     for name, value in (("saturation", saturation), ("dark", dark)):
-        if value is not None and (isinstance(value, bool) or not isinstance(value, int | float) or not value == value):
+        if value is not None and (isinstance(value, bool) or not isinstance(value, Real) or math.isnan(value)):
             raise InputError(name, f"must be a linear value, got {value!r}", "Give a number")
+    if saturation is not None and not saturation > 0:
+        raise InputError("saturation", f"must be above 0, got {saturation}", "Give the value of clipped pixels")
     if noise is None:
-        return
+        return None
     words = "Give (read, shot): the variance of a value is read² + shot · value"
     try:
         read, shot = (float(part) for part in noise)
@@ -32,6 +39,7 @@ def check_levels(saturation: Any, dark: Any, noise: Any) -> None:
         raise InputError("noise", f"must be two numbers, got {noise!r}", words) from None
     if not (0 <= read < np.inf and 0 <= shot < np.inf and read + shot > 0):
         raise InputError("noise", f"must be two numbers of 0 or more, not both 0, got {noise!r}", words)
+    return read, shot
 
 
 def per_pixel(name: str, values: Any, shape: tuple[int, int]) -> np.ndarray:
@@ -48,7 +56,42 @@ def per_pixel(name: str, values: Any, shape: tuple[int, int]) -> np.ndarray:
     values = np.asarray(values)
     if values.shape != shape:
         raise InputError(name, f"is of shape {values.shape}, the target {shape}", "Give a value per pixel")
+    if values.dtype.kind not in "biuf" or not np.all(np.isfinite(values)):
+        raise InputError(name, f"must hold finite numbers, got {values.dtype}", "Give a value per pixel")
     return values
+
+
+def relative_weights(weights: list[Any]) -> list[Any]:
+    """Weights of several pictures over the largest of them all, so that single precision holds them.
+
+    Args:
+        weights: an array or None for each picture; what is no array of numbers is passed on.
+    """
+    arrays = [None if weight is None else np.asarray(weight) for weight in weights]
+    numeric = [array for array in arrays if array is not None and array.dtype.kind in "biuf" and array.size]
+    largest = max((float(np.max(array)) for array in numeric), default=1.0)
+    if not 0 < largest < np.inf or len(numeric) < sum(array is not None for array in arrays):
+        return arrays
+    return [None if array is None else array / largest for array in arrays]
+
+
+def check_sizes(pixels: Any, scene: brdf.Scene) -> None:
+    """Refuse a picture that is not of its scene's size, or not of its light's channels.
+
+    Args:
+        pixels: what has a shape (H, W, C).
+        scene: what it shows.
+
+    Raises:
+        InputError: naming the target.
+    """
+    height, width, channels = pixels.shape
+    if (width, height) != scene.resolution:
+        came = f"is {width} x {height}, the scene's camera {scene.resolution[0]} x {scene.resolution[1]}"
+        raise InputError("target", came, "Give a picture and a camera of the same resolution")
+    if scene.channels not in (1, channels):
+        came = f"has {channels} channels, the scene's light {scene.channels}"
+        raise InputError("target", came, "Give both the same number of channels")
 
 
 def pixels_of(target: Any) -> tuple[Any, float | None, float]:
@@ -82,3 +125,20 @@ def pixels_of(target: Any) -> tuple[Any, float | None, float]:
     if pixels.ndim != 3 or 0 in pixels.shape:
         raise InputError("target", f"must be of shape (H, W, C), got {pixels.shape}", "Give one picture")
     return pixels, saturation, step
+
+
+def check_range(n_range: Any) -> None:
+    """Refuse what are no bounds of the exponent.
+
+    Args:
+        n_range: 0 < lower < upper.
+
+    Raises:
+        InputError: naming it.
+    """
+    try:
+        low, high = (float(bound) for bound in n_range)
+    except (TypeError, ValueError):
+        low = high = math.nan
+    if not 0 < low < high < math.inf:
+        raise InputError("n_range", f"must be 0 < lower < upper, got {n_range}", "Correct the bounds")

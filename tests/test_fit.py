@@ -150,3 +150,42 @@ def test_a_scene_that_is_not_that_of_the_picture_is_asked_about():
         "are light, camera and encoding" in w for w in fitting.fit(picture, scene(behind, ambient=None)).warnings
     )
     assert not fitting.fit(picture, scene(SUN, ambient=None)).warnings
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"weight": np.zeros((72, 72))}, "weight: must be 0 or more, and more somewhere"),
+        ({"weight": np.full((72, 72), "1")}, "weight: must hold finite numbers"),
+        ({"mask": np.full((72, 72), np.nan)}, "mask: must hold finite numbers"),
+        ({"saturation": 0.0}, "saturation: must be above 0"),
+        ({"n_range": ("a", 2)}, "n_range: must be 0 < lower < upper"),
+        ({"dark": 1e9}, "target: is no brighter than 1e[+]09"),
+        ({"model": "ward", "accuracy": 0.01}, "model: is unknown"),
+        ({"mask": np.ones((3, 3), bool), "accuracy": 0.01}, "mask: is of shape"),
+    ],
+)
+def test_more_of_what_cannot_be_used_is_refused(arguments: dict, message: str):
+    picture = np.minimum(rendered(brdf.Lambert(k_d=0.5), scene(SUN)), 0.3)
+    with pytest.raises(brdf.InputError, match=message):
+        fitting.fit(picture, scene(SUN), **arguments)
+
+
+def test_an_accuracy_looks_at_the_size_of_the_picture_too():
+    with pytest.raises(brdf.InputError, match="target: is 72 x 36"):
+        fitting.fit(rendered(brdf.Lambert(k_d=0.5), scene(SUN))[::2], scene(SUN), accuracy=0.01)
+
+
+def test_what_weighs_nothing_says_nothing():
+    material = brdf.BlinnPhong(k_d=[0.5, 0.3, 0.1], k_s=[0.3, 0.3, 0.3], n=40.0)
+    picture = rendered(material, scene(SUN)).astype(np.float32)
+    weight = np.full((72, 72), 1e30)
+    weight[36, 36], picture[36, 36] = 0.0, 1e11
+    found = fitting.fit(picture, scene(SUN), model="blinn-phong", weight=weight).material
+    assert isinstance(found, brdf.BlinnPhong)
+    np.testing.assert_allclose(found.n, 40.0, rtol=1e-4)
+
+
+def test_levels_may_be_numpy_numbers():
+    picture = rendered(brdf.Lambert(k_d=0.5), scene(SUN))
+    assert fitting.fit(picture, scene(SUN), saturation=np.float32(0.3)).left_out["clipped"] > 0

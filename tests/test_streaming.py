@@ -159,3 +159,22 @@ def test_a_stream_keeps_one_element():
     assert list(doubled) == [0, 10, 200]
     assert list(joined([doubled, [7]])) == [0, 10, 200, 7]
     assert joined([[1], [2, 3]]) == [1, 2, 3]
+
+
+def test_points_that_carry_pixel_areas_are_looked_at_whole():
+    material = brdf.BlinnPhong(k_d=[0.3, 0.3, 0.3], k_s=[0.3, 0.3, 0.3], n=20000.0)
+    camera = brdf.OrthographicCamera(
+        position=[0.0, 0.0, 4.0], target=[0.0, 0.0, 0.0], up=[0.0, 1.0, 0.0], width=2.4, resolution=SIZE, samples=3
+    )
+    place = scene(camera=camera)
+    mapped = scene(camera=None, shapes=[], points=place.surface_points())
+    pixels = np.asarray(brdf.render(material, mapped))
+    found = fitting.fit(pixels, mapped, model="blinn-phong").material
+    assert isinstance(found, brdf.BlinnPhong)
+    np.testing.assert_allclose(found.n, 20000.0, rtol=1e-3)
+
+
+def test_the_joint_road_takes_large_pictures():
+    start = brdf.BlinnPhong(k_a=MATERIAL.k_a, k_d=MATERIAL.k_d, k_s=MATERIAL.k_s, n=55.0)
+    found = fitting.fit_jointly(picture(0.0), scene(), start, free=lambda material, scenes: [material.n])
+    np.testing.assert_allclose(found.material.n, MATERIAL.n, rtol=1e-4)

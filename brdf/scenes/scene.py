@@ -120,9 +120,9 @@ class Scene(eqx.Module):
             assert self.camera is not None
             # As an array, or every band would be compiled anew.
             return look(self.camera, self.shapes, visibility, np.asarray(first, np.int32), stop - first)
-        plain = eqx.tree_at(
-            lambda points: (points.visibility, points.area), self.points, (None, None), is_leaf=_is_none
-        )
+        if self.points.area is not None:
+            raise ValueError("points that are averaged over pixels cannot be cut into rows")
+        plain = eqx.tree_at(lambda points: points.visibility, self.points, None, is_leaf=_is_none)
         some = jax.tree.map(lambda leaf: leaf[first:stop], plain)
         return eqx.tree_at(lambda points: points.visibility, some, visibility, is_leaf=_is_none)
 

@@ -11,6 +11,7 @@ of all pixels in float64 with `MOST_SAMPLES` samples of each light, and is the l
 import dataclasses
 import time
 from collections.abc import Mapping, Sequence
+from numbers import Real
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -79,9 +80,7 @@ def fit_within(
     """
     start = time.perf_counter()
     for name, value in (("accuracy", accuracy), ("seconds", seconds)):
-        if value is not None and (
-            isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < np.inf
-        ):
+        if value is not None and (isinstance(value, bool) or not isinstance(value, Real) or not 0 < value < np.inf):
             raise InputError(name, f"must be a number above 0, got {value!r}", "Give for example 0.001")
     for name, given in beside.items():
         if given:

@@ -1,15 +1,17 @@
 """Ctrl-C that is neither lost nor breaks what is loading.
 
-Python raises `KeyboardInterrupt` wherever it happens to be. Inside a callback of the garbage collector (JAX has one) it
-is printed and forgotten, and the command goes on; inside a library that is loading it can end the process with a fault.
+Python raises `KeyboardInterrupt` wherever it happens to be. Inside a callback of the garbage collector (JAX has one),
+of a weak reference or a finaliser it is printed and forgotten, and the command goes on; inside a library that is
+loading it can end the process with a fault.
 """
 
 import contextlib
-import gc
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from types import FrameType
+from typing import Any
 
 # Callbacks of the collector take microseconds; in seconds.
 _AGAIN = 0.005
@@ -26,9 +28,19 @@ def interruptible() -> Iterator[None]:
         return
     alarm = signal.signal(signal.SIGALRM, _interrupt) if hasattr(signal, "SIGALRM") else None
     signal.signal(signal.SIGINT, _interrupt)
+    forgotten = sys.unraisablehook
+
+    def again(unraisable: Any) -> None:
+        if isinstance(unraisable.exc_value, KeyboardInterrupt) and alarm is not None:
+            signal.setitimer(signal.ITIMER_REAL, _AGAIN)
+        else:
+            forgotten(unraisable)
+
+    sys.unraisablehook = again
     try:
         yield
     finally:
+        sys.unraisablehook = forgotten
         signal.signal(signal.SIGINT, signal.default_int_handler)
         if alarm is not None:
             signal.setitimer(signal.ITIMER_REAL, 0)
@@ -53,17 +65,5 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
     global _pending
     if _held:
         _pending = True
-    elif _is_swallowed(frame) and hasattr(signal, "setitimer"):
-        signal.setitimer(signal.ITIMER_REAL, _AGAIN)
     else:
         raise KeyboardInterrupt
-
-
-def _is_swallowed(frame: FrameType | None) -> bool:
-    """Whether what is raised here is printed and forgotten."""
-    collecting = {getattr(callback, "__code__", None) for callback in gc.callbacks}
-    while frame is not None:
-        if frame.f_code in collecting or frame.f_code.co_name == "__del__":
-            return True
-        frame = frame.f_back
-    return False

@@ -208,7 +208,8 @@ def _search_with_lobe(
     else:
         # Most subsamples are float32.
         profile = profile_on_grid(few, log_n, rough, problem._replace(tolerance=np.asarray(_TOLERANCE_SINGLE)))
-        if single and not profile.resolved():
+        # The subsample is in single precision whatever the pictures are.
+        if not profile.resolved():
             return None
         profile = with_errors(profile, samples, problem)
         start = start_from_sample(profile, problem)

@@ -130,7 +130,8 @@ def light_from_shading(
         seen = seen & np.asarray(mask, bool)
     good = seen & np.isfinite(grey)
     if saturation is not None:
-        good &= grey < saturation
+        values = np.asarray(getattr(picture, "pixels", picture))
+        good &= (values if values.ndim == 2 else np.max(values, axis=-1)) < saturation
     value, normal = grey[good], normal[good]
     lit = value > BRIGHT * np.max(value, initial=0.0)
     if np.count_nonzero(lit) < 10:
