@@ -89,6 +89,7 @@ def plot(rows: list[Row], path: Path) -> None:
         for panel, (measure, title) in zip(panels, MEASURES.items(), strict=True):
             for name, peer in PEERS.items():
                 own = [row for row in rows if row["peer"] == name and row.get(measure) and row["converged"]]
+                own.sort(key=lambda row: row["size"])
                 if own:
                     ours = peer in OURS
                     panel.loglog(
