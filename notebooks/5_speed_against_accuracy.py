@@ -111,8 +111,8 @@ bright = np.exp(-((rows - 0.7) ** 2 + (columns - 4.0) ** 2) / 0.05)
 panel = brdf.RectangleLight(center=[1, 1.5, 2.5], edge_u=[0, 0.5, -0.3], edge_v=[0.6, 0, 0], radiance=[10.0])
 lights = {
     "directional light": (None, 4.0),
-    "area light": (panel, 12.0),
-    "sky": (brdf.EnvironmentMap(0.3 + 9 * bright[..., None]), 9.0),
+    "area light": (panel, 8.0),
+    "sky": (brdf.EnvironmentMap(0.3 + 9 * bright[..., None]), 6.0),
 }
 tables = {}
 for name, (light, seconds) in lights.items():
