@@ -124,13 +124,13 @@ def spectrum(name: str) -> Callable[[Any], Any]:
 MAX_SAMPLES = 1 << 20
 
 
-def sample_number(value: Any) -> int:
-    """A converter for a light's number of samples: a whole number from 1 to ``MAX_SAMPLES``."""
+def sample_number(value: Any, most: int = MAX_SAMPLES) -> int:
+    """A converter for a number of samples: a whole number from 1 to ``most``."""
     remedy = "Give a whole number"
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise InputError("samples", f"must be a whole number, got {value!r}", remedy)
-    if not 1 <= value <= MAX_SAMPLES:
-        raise InputError("samples", f"must be between 1 and {MAX_SAMPLES}, got {value}", remedy)
+    if not 1 <= value <= most:
+        raise InputError("samples", f"must be between 1 and {most}, got {value}", remedy)
     return int(value)
 
 

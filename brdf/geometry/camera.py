@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from brdf.checks import direction_value, number, positive, vector
+from brdf.checks import direction_value, number, positive, sample_number, vector
 from brdf.errors import InputError
 from brdf.vectors import normalize
 
@@ -40,12 +40,7 @@ def _viewer(value: Any) -> str | None:
 
 def _samples(value: Any) -> int:
     """Samples along each side of a pixel."""
-    remedy = "Give a whole number"
-    if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise InputError("samples", f"must be a whole number, got {value!r}", remedy)
-    if not 1 <= value <= MAX_SAMPLES:
-        raise InputError("samples", f"must be between 1 and {MAX_SAMPLES}, got {value}", remedy)
-    return int(value)
+    return sample_number(value, MAX_SAMPLES)
 
 
 class Camera(eqx.Module):
