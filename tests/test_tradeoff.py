@@ -131,8 +131,8 @@ def test_the_next_search_is_narrow_only_where_the_estimate_can_be_believed(error
     ("order", "error", "allowed", "samples"), [(1, 0.4, 0.01, 1024), (2, 0.1, 1e-4, 512), (1, 0.9, 0.01, 64)]
 )
 def test_light_samples_grow_as_their_error_falls(order, error, allowed, samples):
-    system = types.SimpleNamespace(light_error=lambda count, finer: error * (16 / count) ** order)
-    assert budget._more_samples(16, system, Estimate(error, error, 0.0, error, 0.0), allowed) == samples
+    told = Estimate(error, error, 0.0, error, 0.0)
+    assert budget._more_samples(16, lambda count, _: error * (16 / count) ** order, told, allowed) == samples
 
 
 def test_the_compiler_is_no_part_of_a_run():

@@ -9,8 +9,9 @@ of all pixels in float64 with `MOST_SAMPLES` samples of each light, and is the l
 """
 
 import dataclasses
+import functools
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from numbers import Real
 from typing import Any, NamedTuple
 
@@ -21,7 +22,8 @@ from brdf.errors import InputError
 from fitting.accuracy.budget_choice import Attempt, BudgetChoice
 from fitting.accuracy.configurations import Configuration, Run, casts_shadows, run, target_size
 from fitting.accuracy.lamps import Lamps, extended
-from fitting.accuracy.sampling_error import MARGIN, STEP, Estimate, System, rounding_by_rule
+from fitting.accuracy.linear_system import System
+from fitting.accuracy.sampling_error import MARGIN, STEP, Estimate, estimate, light_error, rounding_by_rule
 from fitting.result import FitResult
 
 FIRST_PIXELS, FIRST_SAMPLES, MOST_SAMPLES = 1024, 16, 4096
@@ -134,7 +136,8 @@ def _attempt(
     if known and configuration.pixels is None and configuration.samples is None:
         return _Step(done, None, Estimate(rule, 3 * rule, 0.0, 0.0, rule))
     system = System(done, targets, dict(options), lamps)
-    return _Step(done, system, system.estimate(_finer(configuration.samples), rule=rule if known else None))
+    found = estimate(system, _finer(configuration.samples), rule=rule if known else None)
+    return _Step(done, system, found)
 
 
 def _finer(samples: int | None) -> int | None:
@@ -144,21 +147,22 @@ def _finer(samples: int | None) -> int | None:
 
 def _better(now: Configuration, step: _Step, targets: Sequence[Any], accuracy: float | None) -> Configuration | None:
     """The next configuration to try; None where nothing is left to improve."""
-    estimate = step.estimate
+    told = step.estimate
     # Without an accuracy the largest part of the error is taken down, four times per attempt.
-    aim = AIM * accuracy if accuracy is not None else max(estimate.pixels, estimate.light, estimate.rounding) / 2.5
+    aim = AIM * accuracy if accuracy is not None else max(told.pixels, told.light, told.rounding) / 2.5
     after = now
-    if now.pixels is not None and estimate.pixels > aim:
-        after = dataclasses.replace(after, pixels=_more_pixels(now.pixels, (estimate.pixels / aim) ** 2, targets))
+    if now.pixels is not None and told.pixels > aim:
+        after = dataclasses.replace(after, pixels=_more_pixels(now.pixels, (told.pixels / aim) ** 2, targets))
     # What the pixels left out need not share with the light samples, those may have.
     allowed = aim / 2 if accuracy is None or after.pixels is not None else WHOLE_AIM * accuracy / MARGIN
-    if step.system is not None and now.samples is not None and estimate.light > allowed and now.samples < MOST_SAMPLES:
-        after = dataclasses.replace(after, samples=_more_samples(now.samples, step.system, estimate, allowed))
-    if now.precision == "float32" and estimate.rounding > aim / 2:
+    if step.system is not None and now.samples is not None and told.light > allowed and now.samples < MOST_SAMPLES:
+        left = functools.partial(light_error, step.system)
+        after = dataclasses.replace(after, samples=_more_samples(now.samples, left, told, allowed))
+    if now.precision == "float32" and told.rounding > aim / 2:
         after = dataclasses.replace(after, precision="float64")
     if after != now:
         return after
-    parts = {"pixels": estimate.pixels, "samples": estimate.light, "precision": estimate.rounding}
+    parts = {"pixels": told.pixels, "samples": told.light, "precision": told.rounding}
     for name in sorted(parts, key=lambda name: -parts[name]):
         if name == "pixels" and now.pixels is not None and parts[name] > 0:
             return dataclasses.replace(now, pixels=_more_pixels(now.pixels, 2.0, targets))
@@ -169,17 +173,17 @@ def _better(now: Configuration, step: _Step, targets: Sequence[Any], accuracy: f
     return None
 
 
-def _more_samples(few: int, system: System, estimate: Estimate, allowed: float) -> int:
+def _more_samples(few: int, error: Callable[[int, int], float], told: Estimate, allowed: float) -> int:
     """As many light samples as leave an error that is allowed, by its fall from here to `STEP` times as many."""
     more = STEP * few
-    if estimate.bound > SMALL_ERROR or more >= MOST_SAMPLES:
+    if told.bound > SMALL_ERROR or more >= MOST_SAMPLES:
         return min(more, MOST_SAMPLES)
-    left = max(system.light_error(more, min(STEP * more, MOST_SAMPLES)), np.finfo(float).tiny)
-    rate = np.log(estimate.light / left) / np.log(STEP)
+    left = max(error(more, min(STEP * more, MOST_SAMPLES)), np.finfo(float).tiny)
+    rate = np.log(told.light / left) / np.log(STEP)
     if left > allowed:
         factor = STEP * (left / allowed) ** (1 / np.clip(rate, *RATES))
     else:
-        factor = (estimate.light / allowed) ** (1 / rate)
+        factor = (told.light / allowed) ** (1 / rate)
     return min(few * _power_of_two(factor), MOST_SAMPLES)
 
 

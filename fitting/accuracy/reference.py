@@ -15,7 +15,7 @@ import brdf
 from fitting.accuracy.budget import MOST_SAMPLES
 from fitting.accuracy.configurations import Configuration, Run, run, target_size
 from fitting.accuracy.lamps import Lamps, extended
-from fitting.accuracy.sampling_error import System
+from fitting.accuracy.linear_system import System
 from fitting.interpretation import coefficient_factors
 from fitting.light_colour import take_colour_out
 from fitting.result import FitResult
