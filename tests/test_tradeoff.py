@@ -20,6 +20,7 @@ from fitting.accuracy.pixel_sampling import sample_pixels
 from fitting.accuracy.sampling_error import Estimate
 from fitting.accuracy.speed_table import Row, Tradeoff
 from fitting.accuracy.stopwatch import take
+from fitting.cli.main import main
 
 MATERIAL = brdf.BlinnPhong(k_a=[0.2, 0.3, 0.1], k_d=[0.5, 0.3, 0.2], k_s=[0.4, 0.4, 0.4], n=60.0)
 
@@ -181,7 +182,7 @@ def row(name, seconds, error, work, **changes):
 
 
 def table(*rows, accuracy=1e-3):
-    return Tradeoff(rows, "float64", accuracy, True, 1.0)
+    return Tradeoff(rows, "float64", accuracy, len(rows), 1.0)
 
 
 def test_the_front_holds_what_nothing_beats_in_both():
@@ -199,10 +200,22 @@ def test_the_recommendation_is_the_least_work_whatever_the_times_jitter():
     assert slow.name == "much"
 
 
-def test_where_nothing_keeps_the_accuracy_the_closest_is_recommended():
-    found = table(row("a", 1.0, 1e-2, 1), row("b", 2.0, 1e-1, 2), row("c", 1.0, np.inf, 0)).recommended
-    assert found is not None
-    assert found.name == "a"
+def test_where_nothing_keeps_the_accuracy_nothing_is_recommended():
+    found = table(row("a", 1.0, 1e-2, 1), row("b", 2.0, 1e-1, 2), row("c", 1.0, np.inf, 0))
+    assert found.recommended is None
+    assert found.closest is not None
+    assert found.closest.name == "a"
+    assert found.advice.startswith("nothing is recommended")
+    assert "the most accurate is a (1e+03 ms, error 0.01)" in found.advice
+    assert [found.marks(one) for one in found.rows] == ["most accurate, front", "", ""]
+
+
+def test_a_table_cut_short_recommends_only_what_keeps_the_accuracy():
+    rows = row("coarse", 1.0, 1e-2, 1), row("good", 3.0, 1e-4, 9)
+    cut = dataclasses.replace(table(*rows), planned=5)
+    assert cut.recommended is rows[1]
+    assert "2 of 5 configurations were measured" in cut.advice
+    assert "measured" not in table(*rows).advice
 
 
 def test_only_the_axes_that_a_scene_has_are_tried(tmp_path):
@@ -233,3 +246,25 @@ def test_ctrl_c_keeps_what_was_measured():
     found = fitting.tradeoff(noisy(scene), scene, progress=interrupt)
     assert not found.complete
     assert len(found.rows) == 2
+
+
+def test_the_command_measures_a_photograph_of_a_ball(tmp_path, capsys):
+    scene = ball(64)
+    brdf.write_image(tmp_path / "ball.png", noisy(scene, 0.01).astype(np.float32), encoding="srgb")
+    options = ["--sphere", "31.5,31.5,29.09", "--light", "0.5,0.6,0.7", "--ambient", "--seconds", "4", "--json"]
+    with pytest.raises(SystemExit) as ended:
+        main(["tradeoff", str(tmp_path / "ball.png"), *options])
+    assert ended.value.code == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["rows"][0]["error"] < 1e-3
+    assert told["advice"].startswith("recommended")
+
+
+def test_the_command_measures_one_picture(tmp_path, capsys):
+    normal = np.zeros((8, 8, 3))
+    normal[..., 2] = 1.0
+    np.savez(tmp_path / "two.npz", images=np.ones((2, 8, 8)), normal=normal, light_dirs=np.ones((2, 3)))
+    with pytest.raises(SystemExit) as ended:
+        main(["tradeoff", str(tmp_path / "two.npz")])
+    assert ended.value.code == 2
+    assert "two.npz: holds 2 pictures, and one is measured" in capsys.readouterr().err

@@ -74,7 +74,6 @@ def tradeoff(
     again = [index for index, trial in enumerate(trials) if not trial.once]
     random = np.random.default_rng(0)
     order = [*first, *(index for _ in range(MOST_ROUNDS) for index in random.permutation(again))]
-    complete = True
     try:
         for done, index in enumerate(map(int, order)):
             trial, before = trials[index], taken.get(index, [])
@@ -90,10 +89,9 @@ def tradeoff(
             if progress is not None:
                 progress(done + 1, len(order))
     except KeyboardInterrupt:
-        complete = False
+        pass
     rows = [bench.row(trial, taken[i], found[i]) for i, trial in enumerate(trials) if i in taken]
-    complete &= len(rows) == len(trials)
-    return Tradeoff(tuple(rows), bench.told, accuracy, complete, time.perf_counter() - begun)
+    return Tradeoff(tuple(rows), bench.told, accuracy, len(trials), time.perf_counter() - begun)
 
 
 def _expected(trial: Trial, trials: Sequence[Trial], taken: Mapping[int, Sequence[Taken]]) -> float:

@@ -62,15 +62,20 @@ class Tradeoff:
         rows: in the order of the axes.
         reference: what the errors are measured against, in words.
         accuracy: the error that the recommendation keeps.
-        complete: whether everything was measured; False where it was interrupted.
+        planned: how many rows there would be, had time and patience been enough for all.
         seconds: that the measuring took.
     """
 
     rows: tuple[Row, ...]
     reference: str
     accuracy: float
-    complete: bool
+    planned: int
     seconds: float
+
+    @property
+    def complete(self) -> bool:
+        """Whether everything was measured; False where it was interrupted, or took too long."""
+        return len(self.rows) == self.planned
 
     @property
     def default(self) -> Row | None:
@@ -88,23 +93,47 @@ class Tradeoff:
 
     @property
     def recommended(self) -> Row | None:
-        """The least work that keeps the accuracy; where none does, the least error.
+        """The least work that keeps the accuracy; None where nothing that was measured does.
 
         Errors and work are the same in every run, so the machine's mood does not decide; what was measured does where
         it says that another one takes less than half the time.
         """
-        fits = self._fits()
-        if not fits:
-            return None
-        good = [row for row in fits if row.error <= self.accuracy]
+        good = [row for row in self._fits() if row.error <= self.accuracy]
         if not good:
-            least = min(row.error for row in fits)
-            return min((row for row in fits if row.error <= 1.1 * least), key=lambda row: row.work)
+            return None
         first = min(good, key=lambda row: (row.work, row.error))
         steady = [row for row in good if row.runs >= STEADY]
         quickest = min(steady, key=lambda row: row.seconds, default=first)
         clearly = quickest.seconds + quickest.spread < 0.5 * (first.seconds - first.spread)
         return quickest if clearly and first.runs >= STEADY else first
+
+    @property
+    def closest(self) -> Row | None:
+        """The least error, and of errors within a tenth of it the least work; None where nothing was measured."""
+        fits = self._fits()
+        if not fits:
+            return None
+        least = min(row.error for row in fits)
+        return min((row for row in fits if row.error <= 1.1 * least), key=lambda row: row.work)
+
+    @property
+    def advice(self) -> str:
+        """What to use, in words; where nothing keeps the accuracy that is said, and what comes closest."""
+        best, closest = self.recommended, self.closest
+        if best is not None:
+            words = f"recommended: {best.name} ({1e3 * best.seconds:.3g} ms, error {best.error:.1g})"
+        elif closest is not None:
+            words = (
+                f"nothing is recommended: no configuration that was measured keeps the accuracy of {self.accuracy:g}; "
+                f"the most accurate is {closest.name} ({1e3 * closest.seconds:.3g} ms, error {closest.error:.1g})"
+            )
+        else:
+            words = "nothing is recommended: no fit was measured"
+        if self.complete:
+            return words
+        return (
+            f"{words}\n{len(self.rows)} of {self.planned} configurations were measured; more time measures the others"
+        )
 
     def _fits(self) -> list[Row]:
         return [row for row in self.rows if row.configuration is not None and np.isfinite(row.error)]
@@ -115,7 +144,9 @@ class Tradeoff:
         Args:
             row: of the table.
         """
-        words = [word for word, one in (("default", self.default), ("recommended", self.recommended)) if one is row]
+        best = self.recommended
+        told = {"default": self.default, "recommended": best, "most accurate": self.closest if best is None else None}
+        words = [word for word, one in told.items() if one is row]
         return ", ".join([*words, *(["front"] if row in self.front else [])])
 
     def table(self) -> Any:
@@ -160,8 +191,10 @@ class Tradeoff:
         for row in self.rows:
             values = {name: _finite(value) for name, value in vars(row).items() if name != "configuration"}
             values["configuration"] = None if row.configuration is None else vars(row.configuration)
-            rows.append(values | {"marks": self.marks(row)})
-        said = {name: getattr(self, name) for name in ("reference", "accuracy", "complete", "seconds")}
+            rows.append(values | {"error": _finite(row.error), "marks": self.marks(row)})
+        said = {
+            name: getattr(self, name) for name in ("reference", "accuracy", "complete", "planned", "seconds", "advice")
+        }
         return said | {"rows": rows}
 
     def to_csv(self) -> str:

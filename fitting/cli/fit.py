@@ -11,6 +11,21 @@ import typer
 
 from fitting.cli.common import named_as, show, use_compilation_cache, waiting
 from fitting.cli.interrupts import held
+from fitting.cli.picture_options import (
+    Ambient,
+    Encoding,
+    Exposure,
+    Intensities,
+    Light,
+    Lights,
+    Mask,
+    Normals,
+    Saturation,
+    SceneFile,
+    Sphere,
+    Within,
+    encoding_of,
+)
 
 EXAMPLE = (
     "Example: [bold]brdf fit photo.exr --scene scene.toml --out result/[/bold]    or, for a folder with "
@@ -28,33 +43,22 @@ def fit(
         list[Path],
         typer.Argument(help="A picture; a folder with target.* and scene.toml; photographs; an .npz; a measured BRDF."),
     ],
-    scene: Annotated[Path | None, typer.Option(help="The scene file; in a folder, scene.toml.")] = None,
-    within: Annotated[Path | None, typer.Option(help="The folder that paths in the scene file may not leave.")] = None,
+    scene: SceneFile = None,
+    within: Within = None,
     model: Annotated[str, typer.Option(help=f"One of {', '.join(MODEL_NAMES)}.")] = "auto",
     out: Annotated[Path | None, typer.Option(help="A folder for material.json, material.mtl, fitted.exr, ...")] = None,
     precision: Annotated[str, typer.Option(help="float32 or float64.")] = "float32",
-    encoding: Annotated[str | None, typer.Option(help="linear, srgb or a gamma; default: what the file says.")] = None,
-    saturation: Annotated[float | None, typer.Option(help="Linear values from here on are clipped, not data.")] = None,
+    encoding: Encoding = None,
+    saturation: Saturation = None,
     dark: Annotated[float | None, typer.Option(help="Linear values up to here are too dark to count.")] = None,
-    mask: Annotated[Path | None, typer.Option(help="An image: pixels that are 0 there are left out.")] = None,
-    sphere: Annotated[
-        str | None,
-        typer.Option(help="A ball in the photograph: x,y,radius in pixels from the upper left one, or: mask."),
-    ] = None,
-    normals: Annotated[
-        Path | None, typer.Option(help="Normals of the pixels: an image or .npy, x right, y up.")
-    ] = None,
-    light: Annotated[
-        str | None, typer.Option(help="Towards the light: x,y,z (right, up, to the camera), or fit: from the shading.")
-    ] = None,
-    lights: Annotated[Path | None, typer.Option(help="A text file with such a direction for each picture.")] = None,
-    intensities: Annotated[Path | None, typer.Option(help="A text file with the light's intensity for each.")] = None,
-    ambient: Annotated[
-        bool, typer.Option("--ambient", help="A photograph is lit from all around too: find k_a for that light as 1.")
-    ] = False,
-    exposure: Annotated[
-        str | None, typer.Option(help="Relative exposure, one or one each: values are divided.")
-    ] = None,
+    mask: Mask = None,
+    sphere: Sphere = None,
+    normals: Normals = None,
+    light: Light = None,
+    lights: Lights = None,
+    intensities: Intensities = None,
+    ambient: Ambient = False,
+    exposure: Exposure = None,
     noise: Annotated[
         str | None, typer.Option(help="READ,SHOT of the camera: the variance is READ² + SHOT·value.")
     ] = None,
@@ -116,7 +120,12 @@ def fit(
                 "light": light,
                 "lights": lights,
             }
-            options |= {"intensities": intensities, "encoding": _encoding(encoding), "exposure": exposure, "mask": mask}
+            options |= {
+                "intensities": intensities,
+                "encoding": encoding_of(encoding),
+                "exposure": exposure,
+                "mask": mask,
+            }
             options |= {"ambient": ambient, "saturation": saturation}
             names = {"model": "--model", "precision": "--precision", "dark": "--dark", "noise": "--noise"}
             names |= {"mask": mask, "loss": "--loss", "saturation": "--saturation", "accuracy": "--accuracy"}
@@ -200,28 +209,19 @@ def _save(result: Any, out: Path, **how: bool) -> None:
         raise brdf.InputError(error.where if Path(error.where).exists() else out, error.what, error.remedy) from None
 
 
-def _encoding(text: str | None) -> Any:
-    if text is None:
-        return None
-    try:
-        return float(text)
-    except ValueError:
-        return text
-
-
 def lights(
     target: Annotated[list[Path], typer.Argument(help="Photographs of a mirror ball, one per light.")],
     sphere: Annotated[str, typer.Option(help="The ball: x,y,radius in pixels from the upper left one, or: mask.")],
     mask: Annotated[Path | None, typer.Option(help="An image that is white on the ball, for --sphere mask.")] = None,
     out: Annotated[Path | None, typer.Option(help="A text file to write: a direction a line.")] = None,
-    encoding: Annotated[str | None, typer.Option(help="linear, srgb or a gamma; default: what the file says.")] = None,
+    encoding: Encoding = None,
     matt: Annotated[bool, typer.Option("--matt", help="The ball is matt: the shading tells, not a highlight.")] = False,
 ) -> None:
     """Where the light comes from, by the highlight on a mirror ball: x right, y up, z to the camera."""
     import brdf
 
     with named_as({"encoding": "--encoding"}):
-        pictures = [brdf.read_picture(path, encoding=_encoding(encoding)) for path in target]
+        pictures = [brdf.read_picture(path, encoding=encoding_of(encoding)) for path in target]
     inside = None if mask is None else brdf.read_mask(mask)
     from fitting.cli.first_look import check_ball, find_ball
 

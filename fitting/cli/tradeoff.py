@@ -7,20 +7,49 @@ from typing import Annotated, Any
 import typer
 
 from fitting.cli.common import named_as, show, use_compilation_cache
+from fitting.cli.picture_options import (
+    Ambient,
+    Encoding,
+    Exposure,
+    Intensities,
+    Light,
+    Lights,
+    Mask,
+    Normals,
+    Saturation,
+    SceneFile,
+    Sphere,
+    Within,
+    encoding_of,
+)
 
-EXAMPLE = "Example: [bold]brdf tradeoff photo.exr --scene scene.toml --out tradeoff/[/bold]"
+EXAMPLE = (
+    "Example: [bold]brdf tradeoff photo.exr --scene scene.toml --out tradeoff/[/bold]    a photo of a ball: "
+    "[bold]brdf tradeoff ball.png --sphere 244.5,144.5,108 --light fit[/bold]"
+)
 
 
 def tradeoff(
-    target: Annotated[Path, typer.Argument(help="A picture, or a folder with target.* and scene.toml.")],
-    scene: Annotated[Path | None, typer.Option(help="The scene file; in a folder, scene.toml.")] = None,
+    target: Annotated[
+        Path, typer.Argument(help="A picture, a folder with target.* and scene.toml, or a photograph of a ball.")
+    ],
+    scene: SceneFile = None,
+    within: Within = None,
     out: Annotated[Path | None, typer.Option(help="A folder for tradeoff.csv, .json, .png and .pdf.")] = None,
     model: Annotated[str, typer.Option(help="The name of a model, or auto.")] = "blinn-phong",
     accuracy: Annotated[float, typer.Option(help="Relative error that the recommendation is to keep.")] = 1e-3,
     seconds: Annotated[float, typer.Option(help="Time that the measuring may take.")] = 30.0,
     render: Annotated[bool, typer.Option("--render", help="Also measure the renderer alone.")] = False,
-    mask: Annotated[Path | None, typer.Option(help="An image: pixels that are 0 there are left out.")] = None,
-    saturation: Annotated[float | None, typer.Option(help="Linear values from here on are clipped, not data.")] = None,
+    encoding: Encoding = None,
+    saturation: Saturation = None,
+    mask: Mask = None,
+    sphere: Sphere = None,
+    normals: Normals = None,
+    light: Light = None,
+    lights: Lights = None,
+    intensities: Intensities = None,
+    ambient: Ambient = False,
+    exposure: Exposure = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
     """Measure speed against accuracy on a scene: pixels, light samples, precision, model, solver.
@@ -29,39 +58,58 @@ def tradeoff(
     """
     import json
 
-    import brdf
-    from fitting.cli.first_look import target_and_scene
+    from brdf.errors import InputError
+    from fitting.cli.first_look import Options, read_first
 
-    picture_file, scene_file = target_and_scene(target, scene)
-    names: dict[str, Any] = {"target": picture_file, "mask": mask, "model": "--model", "accuracy": "--accuracy"}
-    with named_as(names | {"seconds": "--seconds", "saturation": "--saturation"}):
-        picture = brdf.read_picture(picture_file)
+    given = Options(
+        scene=scene,
+        within=within,
+        sphere=sphere,
+        normals=normals,
+        light=light,
+        lights=lights,
+        intensities=intensities,
+        encoding=encoding_of(encoding),
+        exposure=exposure,
+        mask=mask,
+        ambient=ambient,
+        saturation=saturation,
+    )
+    names: dict[str, Any] = {"model": "--model", "accuracy": "--accuracy", "seconds": "--seconds", "mask": mask}
+    with named_as(names | {"saturation": "--saturation", "encoding": "--encoding"}):
+        read = read_first([target], given, lambda now: None)
         use_compilation_cache()
         import fitting
+        from fitting.cli.inputs import collect
 
-        with _Progress() as progress:
+        job = collect([target], given, read)
+        if len(job.pictures) > 1:
+            came = f"holds {len(job.pictures)} pictures, and one is measured"
+            raise InputError(target, came, "Give one picture with its scene or its light")
+        with named_as({"target": job.target}), _Progress() as progress:
             found = fitting.tradeoff(
-                picture,
-                brdf.Scene.load(scene_file),
+                job.pictures[0],
+                job.scenes[0],
                 model=model,
-                mask=None if mask is None else brdf.read_mask(mask),
+                mask=job.masks[0],
                 saturation=saturation,
                 accuracy=accuracy,
                 seconds=seconds,
                 render=render,
                 progress=progress.step,
             )
+    silent = [path.name for path, picture in read.items() if picture.source == "assumed"]
+    guess = [f"{name} does not say how its values are encoded; --encoding decides" for name in silent]
+    notes = [*job.notes, *guess]
     if out is not None:
         found.save(out)
     if as_json:
-        show(json.dumps(found.to_dict(), indent=2))
+        show(json.dumps(found.to_dict() | ({"notes": notes} if notes else {}), indent=2))
         return
+    for note in notes:
+        show(note)
     _print_table(found)
-    best = found.recommended
-    if best is not None:
-        show(f"recommended: {best.name} ({1e3 * best.seconds:.3g} ms, error {best.error:.1g})")
-    if not found.complete:
-        show("not everything was measured")
+    show(found.advice)
     if out is not None:
         show(f"saved in {out}")
 

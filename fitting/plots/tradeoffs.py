@@ -61,7 +61,9 @@ def error_against_time(tradeoff: Tradeoff) -> Any:
     if len(front):
         axes.step(front[:, 0], front[:, 1], where="post", color="0.6", linewidth=1.2, zorder=1, label="Pareto front")
     words: dict[Row, str] = {}
-    for row, word in ((tradeoff.default, "default"), (tradeoff.recommended, "recommended")):
+    best = tradeoff.recommended
+    told = (best, "recommended") if best is not None else (tradeoff.closest, "most accurate")
+    for row, word in ((tradeoff.default, "default"), told):
         if row is not None and np.isfinite(row.error):
             words[row] = f"{words[row]}, {word}" if row in words else word
     for row, word in words.items():
