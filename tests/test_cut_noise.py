@@ -1,0 +1,105 @@
+"""Noise that is cut off at black or white bends a fit, unless pixels are left out by what is predicted there."""
+
+import numpy as np
+import pytest
+
+import brdf
+import fitting
+from fitting.cli.main import main
+from fitting.cut_noise import BLACK, WHITE, without_cut_noise
+from fitting.photographs.ball import ball_points, photograph_scene
+from fitting.photographs.circle import Circle
+
+SIZE = 96
+POINTS = ball_points((SIZE, SIZE), Circle(47.5, 47.5, 44.0))
+SCENE = photograph_scene(POINTS, (0.5, 0.4, 0.7), ambient=[1.0])
+DULL = brdf.BlinnPhong(k_a=[0.02], k_d=[0.5], k_s=[0.3], n=30.0)
+BRIGHT = brdf.BlinnPhong(k_a=[0.1], k_d=[1.05], k_s=[0.1], n=30.0)
+DRAWS = 6
+
+
+def seen(material: brdf.Material, noise: float, seed: int, *, low: float, bits: int | None) -> brdf.Picture:
+    """A picture whose noise is cut off below ``low`` and above 1."""
+    clean = np.asarray(brdf.render(material, SCENE))
+    values = np.clip(clean + np.random.default_rng(seed).normal(0, noise, clean.shape), low, 1.0)
+    if bits:
+        values = np.rint(values * (2**bits - 1)) / (2**bits - 1)
+    return brdf.Picture(values.astype(np.float32), None, "linear", "given", bits or 32, 1.0)
+
+
+def fitted(picture: brdf.Picture, mended: bool) -> fitting.FitResult:
+    def fit_to(masks: list) -> fitting.FitResult:
+        return fitting.fit(picture, SCENE, model="blinn-phong", mask=masks[0])
+
+    result = fit_to([None])
+    return without_cut_noise(result, [None], fit_to) if mended else result
+
+
+def deviations(result: fitting.FitResult, material: brdf.BlinnPhong) -> np.ndarray:
+    """Of k_a and k_d from the truth, in their standard errors."""
+    errors = {one.name: (one.value, one.error) for one in result.parameters}
+    return np.array(
+        [(errors[name][0] - float(getattr(material, name)[0])) / errors[name][1] for name in ("k_a", "k_d")]
+    )
+
+
+@pytest.mark.parametrize("bits", [8, None])
+@pytest.mark.parametrize(("material", "low", "reason"), [(DULL, 0.0, BLACK), (BRIGHT, -1.0, WHITE)])
+def test_cut_noise_does_not_bend_the_fit(material, low, reason, bits):
+    found = {}
+    for mended in (False, True):
+        results = [fitted(seen(material, 0.03, seed, low=low, bits=bits), mended) for seed in range(DRAWS)]
+        found[mended] = np.mean([deviations(result, material) for result in results], axis=0)
+        assert all((reason in result.left_out) == mended for result in results)
+    # The mean of six is known to 0.4 of a standard error.
+    assert np.all(np.abs(found[False]) > 1.8)
+    assert np.all(np.abs(found[True]) < 1.4)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.03])
+def test_what_is_not_cut_is_left_alone(noise):
+    # Noise that keeps its lower half; and codes without noise, of which many are 0.
+    material = brdf.BlinnPhong(k_a=[0.0], k_d=[0.5], k_s=[0.3], n=30.0)
+    picture = seen(material, noise, 0, low=-1.0 if noise else 0.0, bits=None if noise else 8)
+
+    def refused(masks: list) -> fitting.FitResult:
+        raise AssertionError("fitted again")
+
+    result = fitting.fit(picture, SCENE, model="blinn-phong")
+    assert without_cut_noise(result, [None], refused) is result
+
+
+def test_a_channel_that_is_all_noise_is_told_and_does_not_take_the_others_along():
+    clean = np.asarray(brdf.render(DULL, SCENE)) * np.array([1.0, 0.02])
+    values = np.maximum(clean + np.random.default_rng(0).normal(0, 0.03, clean.shape), 0).astype(np.float32)
+
+    def fit_to(masks: list) -> fitting.FitResult:
+        return fitting.fit(values, SCENE, model="blinn-phong", mask=masks[0])
+
+    result = without_cut_noise(fit_to([None]), [None], fit_to)
+    assert "channel 1" in result.warnings[0]
+    assert "cut off" in result.warnings[0]
+    assert 0 < result.left_out[BLACK] < 0.8 * result.pixels
+    kept = {(one.name, one.channel): one for one in result.parameters}[("k_d", 0)]
+    assert abs(kept.value - 0.5) < 4 * kept.error
+
+
+def test_the_command_says_how_many_pixels_it_left_out(tmp_path, capsys, monkeypatch):
+    picture = seen(DULL, 0.03, 0, low=0.0, bits=8)
+    brdf.write_image(tmp_path / "ball.png", picture.pixels, encoding="linear")
+    monkeypatch.chdir(tmp_path)
+    words = [
+        "fit",
+        "ball.png",
+        "--sphere",
+        "47.5,47.5,44",
+        "--light",
+        "0.5,0.4,0.7",
+        "--ambient",
+        "--encoding",
+        "linear",
+    ]
+    with pytest.raises(SystemExit) as exit_status:
+        main(words)
+    assert exit_status.value.code == 0
+    assert BLACK in capsys.readouterr().out
