@@ -93,3 +93,27 @@ def test_check_draws_its_picture(capsys, tmp_path: Path):
     said = run(capsys, "check", tmp_path / "ruby.json", "--plot", tmp_path / "ruby.png", status=1)
     assert "not plausible" in said
     assert brdf.read_image(tmp_path / "ruby.png").shape[0] > 400
+
+
+def test_every_command_knows_the_classic_table(capsys, tmp_path: Path, monkeypatch):
+    scene = Path(__file__).parents[1] / "data" / "gold-ball" / "scene.toml"
+    monkeypatch.chdir(tmp_path)
+    assert "emerald: not plausible" in run(capsys, "check", "Emerald", status=1)
+    run(capsys, "render", "cyan plastic", "--scene", scene, "-o", "a.exr")
+    brdf.save_material(brdf.preset("cyan plastic"), tmp_path / "b.json")
+    run(capsys, "render", "b.json", "--scene", scene, "-o", "b.exr")
+    np.testing.assert_array_equal(brdf.read_image(tmp_path / "a.exr"), brdf.read_image(tmp_path / "b.exr"))
+
+
+@pytest.mark.parametrize("words", [["check", "emrald"], ["convert", "emrald", "x.json"], ["render", "emrald"]])
+def test_a_misspelt_name_is_offered_the_right_one(capsys, tmp_path: Path, monkeypatch, words: list[str]):
+    monkeypatch.chdir(tmp_path)
+    more = ["--scene", "scene.toml", "-o", "x.exr"] if words[0] == "render" else []
+    message = run(capsys, *words, *more, status=2)
+    assert message == ("error: emrald: is no material file and no name of the classic table. The table has emerald.\n")
+
+
+def test_a_file_goes_before_a_name(capsys, tmp_path: Path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "gold").write_text("{}")
+    assert "gold: is no material file, got no suffix" in run(capsys, "check", "gold", status=2)

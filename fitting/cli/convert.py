@@ -1,7 +1,7 @@
 """``brdf convert``: a material for another program."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -24,8 +24,9 @@ def convert(
 ) -> None:
     """Write a material as three.js, glTF, Mitsuba, PyTorch3D, GLSL or Wavefront read it, and say what is lost."""
     import brdf
+    from fitting.cli.materials import find_material
 
-    loaded, called = _material(material, name)
+    loaded, called = find_material(material, name)
     try:
         export = brdf.save_export(loaded, out, to=to, name="_".join(called.split()))
     except brdf.InputError as error:
@@ -34,19 +35,3 @@ def convert(
         raise
     for line in (f"wrote {out}", *(f"  not carried: {loss}" for loss in export.losses)):
         print(line)  # noqa: T201  # this is the command's output
-
-
-def _material(material: str, name: str | None) -> tuple[Any, str]:
-    """A material of a file or of the classic table, and what it is called; a file goes before a name of the table."""
-    import brdf
-
-    path, key = Path(material), material.strip().lower().replace(" ", "_").replace("-", "_")
-    if key in brdf.PRESETS and not path.is_file():
-        if name is not None:
-            raise brdf.InputError("--name", f"chooses from a file, and {key} is one material", "Leave it out")
-        return brdf.preset(key), key
-    if not path.suffix and not path.exists():
-        names = ", ".join(brdf.PRESETS)
-        came = "is no material file and no name of the classic table"
-        raise brdf.InputError(material, came, f"Give a .json or .mtl file, or one of {names}")
-    return brdf.load_material(material, name), name or path.stem

@@ -51,9 +51,12 @@ app.command(epilog=cli_fit.EXAMPLE)(cli_fit.fit)
 app.command(epilog=cli_fit.LIGHTS_EXAMPLE)(cli_fit.lights)
 
 
-@app.command(epilog="Example: [bold]brdf render material.json --scene scene.toml -o picture.exr[/bold]")
+@app.command(
+    epilog="Example: [bold]brdf render material.json --scene scene.toml -o picture.exr[/bold]    or, from the classic "
+    "table: [bold]brdf render emerald --scene scene.toml -o emerald.png[/bold]"
+)
 def render(
-    material: Annotated[Path, typer.Argument(help="A .json or .mtl file.")],
+    material: Annotated[str, typer.Argument(help="A .json or .mtl file, or a name of the classic table: emerald.")],
     scene: Annotated[Path, typer.Option(help="The scene file.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="The picture to write: .exr, .hdr, .png, .tiff or .jpg.")],
     precision: Annotated[str, typer.Option(help="float32 or float64.")] = "float32",
@@ -64,18 +67,25 @@ def render(
         import numpy as np
 
         import brdf
+        from fitting.cli.materials import find_material
 
-        loaded = brdf.load_material(material)
+        loaded, _ = find_material(material)
         image = brdf.render(loaded, brdf.Scene.load(scene), precision=precision)  # pyright: ignore[reportArgumentType]
         brdf.write_image(out, np.asarray(image))
     show(f"wrote {out}")
 
 
 @app.command(
-    epilog="Example: [bold]brdf check material.json[/bold]    or in CI: [bold]brdf check scene.mtl --json[/bold]"
+    epilog="Example: [bold]brdf check material.json[/bold]    or in CI: [bold]brdf check scene.mtl --json[/bold]    "
+    "or, from the classic table: [bold]brdf check emerald[/bold]"
 )
 def check(
-    material: Annotated[Path, typer.Argument(help="A .json, .mtl (every material is checked) or measured BRDF file.")],
+    material: Annotated[
+        str,
+        typer.Argument(
+            help="A .json, .mtl (every material is checked) or measured BRDF file, or a name of the classic table."
+        ),
+    ],
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")] = False,
     plot: Annotated[Path | None, typer.Option(help="A picture of albedo, lobe and reciprocity to write.")] = None,
 ) -> int:
@@ -83,9 +93,12 @@ def check(
     with waiting("checking"):
         use_compilation_cache()
         import brdf
+        from fitting.cli.materials import find_materials
 
-        tables = {material.stem: brdf.load_measured(material)} if brdf.is_measured(material) else None
-        materials: dict[str, Any] = brdf.load_materials(material) if tables is None else tables
+        is_table = brdf.is_measured(material)
+        materials: dict[str, Any] = (
+            {Path(material).stem: brdf.load_measured(material)} if is_table else find_materials(material)
+        )
         reports = {name: brdf.check(one, name=name) for name, one in materials.items()}
         if plot is not None:
             if len(materials) > 1:
