@@ -61,6 +61,8 @@ def without_cut_noise(
         The last fit, what it left out named by its reason; the given one where nothing is cut.
     """
     whole, found, used = result, [], None
+    if not any(_may_be_cut(*picture) for picture in zip(whole.targets, whole.counted, strict=True)):
+        return result
     for _ in range(ROUNDS):
         pictures = zip(whole.targets, result.scenes, whole.counted, strict=True)
         found = [_cut(np.asarray(target), _predicted(result, scene), counted) for target, scene, counted in pictures]
@@ -73,7 +75,9 @@ def without_cut_noise(
         if left_out <= before * 1.01:
             break
         used = looked_at
-        result = again([one if mask is None else one & (mask > 0) for one, mask in zip(used, masks, strict=True)])
+        result = again(
+            [one if mask is None else one & (np.asarray(mask) > 0) for one, mask in zip(used, masks, strict=True)]
+        )
     told = dict(whole.left_out)
     if used is not None:
         gone = [counted & ~one for counted, one in zip(whole.counted, used, strict=True)]
@@ -88,6 +92,20 @@ def without_cut_noise(
     if used is None and not spared:
         return result
     return dataclasses.replace(result, left_out={reason: n for reason, n in told.items() if n}, warnings=warnings)
+
+
+def _may_be_cut(target: Float[np.ndarray, "H W C"], counted: Bool[np.ndarray, "H W"]) -> bool:
+    """A first look, without a prediction: clipped pixels, or single values at the lower end among larger ones."""
+    if not counted.any():
+        return False
+    for value in np.moveaxis(target, -1, 0):
+        if np.count_nonzero((value > np.max(value[counted])) & ~counted) >= FEWEST:
+            return True
+        above = counted & (value > np.min(value[counted]))
+        # What is dark without noise is dark in one piece.
+        if np.count_nonzero(above[:, :-2] & (counted & ~above)[:, 1:-1] & above[:, 2:]) >= FEWEST:
+            return True
+    return False
 
 
 def _predicted(result: FitResult, scene: brdf.Scene) -> Float[np.ndarray, "H W C"]:
