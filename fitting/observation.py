@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 import brdf
 from brdf.errors import InputError
 from fitting.engine.streams import Stream, each
-from fitting.picture_inputs import check_levels, check_sizes, per_pixel, pixels_of
+from fitting.picture_inputs import check_levels, check_sizes, check_weight, per_pixel, pixels_of
 from fitting.pixel_survey import FLAT, SYMMETRIC_PIXELS, TOP, Survey, inverse_variance, lit_at_top, survey
 
 # How many pixels are looked at together, in rows of which files hold whole blocks.
@@ -120,9 +120,7 @@ def observe(
     height, width, channels = pixels.shape
     mask = None if mask is None else per_pixel("mask", mask, (height, width)).astype(bool)
     if weight is not None:
-        weight = per_pixel("weight", weight, (height, width))
-        if not np.all(weight >= 0) or not np.any(weight > 0):
-            raise InputError("weight", "must be 0 or more, and more somewhere", "Give values of 0 or more")
+        weight = check_weight(weight, (height, width))
         # What weighs nothing says nothing of clipping or rounding either.
         mask = weight > 0 if mask is None else mask & (weight > 0)
     streamed = isinstance(pixels, brdf.ImageReader)

@@ -17,7 +17,15 @@ from fitting.interpretation import Interpretation, ModelFit, coefficient_factors
 from fitting.light_colour import take_colour_out
 from fitting.model_fit import Job, fit_model, optimise, reached
 from fitting.observation import observe
-from fitting.picture_inputs import check_levels, check_range, check_sizes, per_pixel, pixels_of, relative_weights
+from fitting.picture_inputs import (
+    check_levels,
+    check_range,
+    check_sizes,
+    check_weight,
+    per_pixel,
+    pixels_of,
+    relative_weights,
+)
 from fitting.plausible import fit_plausible, is_plausible
 from fitting.result import FitResult, free_parameters
 from fitting.selection import FAMILIES, Choice, choose
@@ -101,14 +109,15 @@ def fit(
             words = "is read by bands of rows; accuracy and seconds choose among pixels in memory"
             raise InputError("target", words, "Read it with brdf.read_image, or leave accuracy and seconds out")
         check_levels(saturation, dark, noise)
-        for picture, place, one in zip(targets, scenes, masks, strict=True):
+        for picture, place, one, other in zip(targets, scenes, masks, weights, strict=True):
             pixels, _, _ = pixels_of(picture)
             check_sizes(pixels, place)
             if one is not None:
                 per_pixel("mask", one, pixels.shape[:2])
-        how = {"mask": masks, "saturation": saturation, "n_range": n_range, "dark": dark}
-        beside = {"loss": loss != "squared", "noise": noise is not None, "weight": weight is not None}
-        beside["plausible"] = plausible
+            if other is not None:
+                check_weight(other, pixels.shape[:2])
+        how = {"mask": masks, "saturation": saturation, "n_range": n_range, "dark": dark, "weight": weights}
+        beside = {"loss": loss != "squared", "noise": noise is not None, "plausible": plausible}
         return fit_within(targets, scenes, model, precision, how, beside, accuracy=accuracy, seconds=seconds)
     with brdf.working_precision(precision):
         dtype = np.dtype(precision)

@@ -61,6 +61,22 @@ def per_pixel(name: str, values: Any, shape: tuple[int, int]) -> np.ndarray:
     return values
 
 
+def check_weight(weight: Any, shape: tuple[int, int]) -> np.ndarray:
+    """How much each pixel counts, as an array.
+
+    Args:
+        weight: array-like.
+        shape: height and width of the picture.
+
+    Raises:
+        InputError: where it is of another shape, or counts nothing, or less than that.
+    """
+    weight = per_pixel("weight", weight, shape)
+    if not np.all(weight >= 0) or not np.any(weight > 0):
+        raise InputError("weight", "must be 0 or more, and more somewhere", "Give values of 0 or more")
+    return weight
+
+
 def relative_weights(weights: list[Any]) -> list[Any]:
     """Weights of several pictures over the largest of them all, so that single precision holds them.
 

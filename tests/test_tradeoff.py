@@ -112,6 +112,55 @@ def test_an_accuracy_of_noisy_pixels_takes_more_of_them():
     assert coarse.pixels < fine.pixels == fine.of_pixels
 
 
+@pytest.mark.parametrize("kind", ["mask", "weight"])
+def test_the_accuracy_holds_where_only_some_pixels_count(kind):
+    scene = ball(600)
+    picture = noisy(scene, 0.02)
+    # Those that hardly count show something else.
+    picture[:, :240] *= 1.3
+    counts = np.ones((600, 600))
+    counts[:, :240] = 0.0 if kind == "mask" else 1e-4
+    given = {kind: counts}
+    reference = fitting.fit(picture, scene, model="blinn-phong", precision="float64", **given)
+    result = fitting.fit(picture, scene, model="blinn-phong", accuracy=3e-2, **given)
+    assert result.choice is not None
+    assert result.choice.met
+    assert result.choice.pixels < 10000
+    assert max(deviation(result, reference)[:2]) <= 3e-2
+
+
+def test_a_small_mask_is_looked_at_whole_and_the_result_says_why():
+    scene = ball(600)
+    counts = np.zeros((600, 600), bool)
+    counts[280:300, 300:330] = True
+    result = fitting.fit(noisy(scene), scene, model="lambert", accuracy=1e-1, mask=counts)
+    assert result.choice is not None
+    assert "all pixels: choosing among so few" in str(result)
+
+
+def test_a_process_of_one_fit_does_not_compile_what_would_choose():
+    scene = ball(300)
+    picture = noisy(scene, 0.01)
+    with budget.single_fit():
+        alone = fitting.fit(picture, scene, model="blinn-phong", accuracy=1e-1)
+    again = fitting.fit(picture, scene, model="blinn-phong", accuracy=1e-1)
+    assert alone.choice is not None
+    assert again.choice is not None
+    assert alone.choice.pixels == alone.choice.of_pixels > again.choice.pixels
+    assert "in a process of its own" in alone.choice.reason
+    assert again.choice.reason == ""
+
+
+def test_pictures_of_different_sizes_count_by_their_pixels():
+    large, small = ball(600), ball(96)
+    pictures = [noisy(large), 1.5 * noisy(small)]
+    reference = fitting.fit(pictures, [large, small], model="blinn-phong", precision="float64")
+    result = fitting.fit(pictures, [large, small], model="blinn-phong", accuracy=1e-1)
+    assert result.choice is not None
+    assert result.choice.pixels < result.choice.of_pixels
+    assert max(deviation(result, reference)[:2]) <= 1e-1
+
+
 def test_the_time_to_spend_ends_the_search():
     result = fitting.fit(noisy(ball(), 0.1), ball(), model="blinn-phong", seconds=1e-6)
     assert result.choice is not None
@@ -159,8 +208,11 @@ def test_weights_count():
     result = fitting.fit(picture, scene, model="blinn-phong", precision="float64", weight=weight)
     # The right half is exact.
     np.testing.assert_allclose(result.material.k_d, MATERIAL.k_d, rtol=1e-9)
-    with pytest.raises(brdf.InputError, match="weight"):
-        fitting.fit(picture, scene, weight=weight[:3])
+    for accuracy in (None, 1e-2):
+        with pytest.raises(brdf.InputError, match="weight"):
+            fitting.fit(picture, scene, weight=weight[:3], accuracy=accuracy)
+        with pytest.raises(brdf.InputError, match="weight: must be 0 or more"):
+            fitting.fit(picture, scene, weight=-weight, accuracy=accuracy)
 
 
 def row(name, seconds, error, work, **changes):

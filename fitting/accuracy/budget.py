@@ -8,10 +8,12 @@ of all pixels in float64 with `MOST_SAMPLES` samples of each light, and is the l
 `fitting.accuracy.deviation` says of the parameters and of the picture.
 """
 
+import contextlib
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextvars import ContextVar
 from numbers import Real
 from typing import Any, NamedTuple
 
@@ -20,7 +22,7 @@ import numpy as np
 import brdf
 from brdf.errors import InputError
 from fitting.accuracy.budget_choice import Attempt, BudgetChoice
-from fitting.accuracy.configurations import Configuration, Run, casts_shadows, run, target_size
+from fitting.accuracy.configurations import Configuration, Run, casts_shadows, one_each, run, share_counted, target_size
 from fitting.accuracy.lamps import Lamps, extended
 from fitting.accuracy.linear_system import System
 from fitting.accuracy.sampling_error import MARGIN, STEP, Estimate, estimate, light_error, rounding_by_rule
@@ -30,6 +32,10 @@ FIRST_PIXELS, FIRST_SAMPLES, MOST_SAMPLES = 1024, 16, 4096
 # Pictures under single lights that are fitted whole at once: choosing among so few pixels takes as long as looking at
 # them. Where little error is allowed, a sample of the larger ones would hardly do.
 SMALL, SMALL_IF_FINE, FINE = 1 << 16, 1 << 18, 1e-2
+# What a fit of all pixels takes, compiled: seconds for a pixel, channel, light and kind of highlight. And what choosing
+# among them takes beyond that in a process that compiled nothing of it yet, with programs from the compiler's cache;
+# without, several times that. Measured by `python -m benchmarks.tradeoff_fresh`.
+EACH_PIXEL, CHOOSING = 3e-8, 0.3
 # Down to this accuracy the order of magnitude of rounding is enough to know.
 COARSE = 1e-4
 # An attempt aims at this share of the accuracy in each of the parts that its error has.
@@ -46,6 +52,19 @@ MOST_ATTEMPTS = 8
 SMALL_ERROR = 0.5
 # Within this factor of the exponent found before the next attempt searches, where its 95 % interval is narrower.
 NEAR, NEAR_AUTO = 4.0, 16.0
+
+
+_single: ContextVar[bool] = ContextVar("single", default=False)
+
+
+@contextlib.contextmanager
+def single_fit() -> Iterator[None]:
+    """Within: the fit is the only one of its process, which therefore pays for all that is compiled."""
+    before = _single.set(True)
+    try:
+        yield
+    finally:
+        _single.reset(before)
 
 
 class _Step(NamedTuple):
@@ -90,14 +109,15 @@ def fit_within(
             raise InputError(name, came, "Leave one of them out")
     lamps, attempts = Lamps(), []
     has_samples = any(extended(scene) for scene in scenes)
-    small = SMALL_IF_FINE if accuracy is not None and accuracy < FINE else SMALL
-    whole = not has_samples and max(map(target_size, targets)) <= small
-    now = Configuration(model, precision, None if whole else FIRST_PIXELS, FIRST_SAMPLES if has_samples else None)
+    reason = "" if has_samples else _reason_for_all(targets, scenes, model, options, accuracy)
+    now = Configuration(model, precision, None if reason else FIRST_PIXELS, FIRST_SAMPLES if has_samples else None)
     n_range = None
     while True:
         begun = time.perf_counter()
         step = _attempt(targets, scenes, now, options, lamps, n_range, accuracy)
         took = time.perf_counter() - begun
+        if now.pixels is not None and all(sample is None for sample in step.run.samples):
+            now, reason = dataclasses.replace(now, pixels=None), reason or "so few would not tell enough"
         attempts.append(Attempt(str(now), *step.estimate, took))
         if accuracy is not None and step.estimate.bound <= accuracy:
             break
@@ -107,6 +127,8 @@ def fit_within(
         growth = _work(after, step, targets) / _work(now, step, targets)
         if seconds is not None and time.perf_counter() - start + took * max(growth, 1.0) > seconds:
             break
+        if now.pixels is not None and after.pixels is None:
+            reason = f"a sample would have to hold more than {WHOLE:.0%} of them"
         now, n_range = after, _near(step, options)
     looked = [target_size(t) if s is None else s.pixel.size for t, s in zip(targets, step.run.samples, strict=True)]
     choice = BudgetChoice(
@@ -116,8 +138,32 @@ def fit_within(
         sum(looked),
         sum(map(target_size, targets)),
         None if accuracy is None else step.estimate.bound <= accuracy,
+        reason,
     )
     return dataclasses.replace(step.run.result, choice=choice, seconds=time.perf_counter() - start)
+
+
+def _reason_for_all(
+    targets: Sequence[Any],
+    scenes: Sequence[brdf.Scene],
+    model: str,
+    options: Mapping[str, Any],
+    accuracy: float | None,
+) -> str:
+    """Why all pixels are looked at without choosing among them first; empty where choosing may pay."""
+    cuts = zip(*(one_each(options.get(name), len(targets)) for name in ("mask", "weight")), strict=True)
+    sizes = [target_size(target) * share_counted(*cut) for target, cut in zip(targets, cuts, strict=True)]
+    if max(sizes) <= (SMALL_IF_FINE if accuracy is not None and accuracy < FINE else SMALL):
+        return "choosing among so few takes as long as looking at them"
+    if accuracy is None or not _single.get():
+        return ""
+    work = 0.0
+    for target, scene, size in zip(targets, scenes, sizes, strict=True):
+        channels = (*np.shape(getattr(target, "pixels", target)), 1)[2]
+        work += size * channels * max(len(scene.lights), 1) * (2 if model == "auto" else 1)
+    if EACH_PIXEL * work < CHOOSING:
+        return "in a process of its own, compiling what chooses among them takes longer than looking at them"
+    return ""
 
 
 def _attempt(

@@ -38,6 +38,7 @@ class BudgetChoice:
         pixels: how many pixels were looked at, of all pictures.
         of_pixels: of how many.
         met: whether the accuracy holds by the estimate; None where none was asked for.
+        reason: why all pixels were looked at; empty where not all were.
     """
 
     accuracy: float | None
@@ -46,6 +47,7 @@ class BudgetChoice:
     pixels: int
     of_pixels: int
     met: bool | None
+    reason: str = ""
 
     @property
     def chosen(self) -> Attempt:
@@ -66,9 +68,9 @@ class BudgetChoice:
     def lines(self) -> list[str]:
         """For the report."""
         one = self.chosen
-        looked = f"{self.pixels} of {self.of_pixels} pixels" if self.pixels < self.of_pixels else "all pixels"
+        looked = f" ({self.pixels} of {self.of_pixels} pixels)" if self.pixels < self.of_pixels else ""
         lines = [
-            f"  chosen      {one.configuration} ({looked})",
+            f"  chosen      {one.configuration}{looked}{': ' if self.reason else ''}{self.reason}",
             f"  its error   {one.error:.2g} relative to the full fit, below {one.bound:.2g} with 95 %: {self.basis}",
         ]
         if self.met is False:
@@ -83,6 +85,7 @@ class BudgetChoice:
             "met": self.met,
             "pixels": self.pixels,
             "of_pixels": self.of_pixels,
+            "reason": self.reason,
             "basis": self.basis,
             "attempts": [vars(attempt) for attempt in self.attempts],
         }

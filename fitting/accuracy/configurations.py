@@ -12,6 +12,7 @@ import equinox as eqx
 import numpy as np
 
 import brdf
+from brdf.errors import InputError
 from fitting.accuracy.lamps import Lamps
 from fitting.accuracy.pixel_sampling import PixelSample, sample_pixels
 from fitting.result import FitResult
@@ -107,39 +108,47 @@ def run(
     from fitting.picture_fit import fit
 
     start = time.perf_counter()
-    options = dict(options) | ({} if n_range is None else {"n_range": n_range})
+    given, options = options, dict(options) | ({} if n_range is None else {"n_range": n_range})
     how: dict[str, Any] = {"model": configuration.model, "precision": configuration.precision}
     made = [lamps.with_samples(scene, configuration.samples) for scene in scenes]
     if not configuration.shadows:
         made = [without_shadows(scene, configuration.precision) for scene in made]
+    masks, weights = (one_each(options.pop(name, None), len(made)) for name in ("mask", "weight"))
     samples: list[PixelSample | None] = [None] * len(made)
     if configuration.pixels is not None:
         kind = brdf.BlinnPhong if configuration.model == "auto" else brdf.MODELS[configuration.model]
-        samples = [sample_pixels(scene, kind, configuration.pixels) for scene in made]
-    masks = options.pop("mask", None)
-    masks = list(masks) if isinstance(masks, list | tuple) else [masks] * len(made)
-    pictures, places, some_masks, weights = [], [], [], []
-    for target, scene, mask, sample in zip(targets, made, masks, samples, strict=True):
+        samples = [
+            sample_pixels(scene, kind, round(configuration.pixels / max(share_counted(*cut), 1e-9)))
+            for scene, *cut in zip(made, masks, weights, strict=True)
+        ]
+    pictures, places, some_masks, some_weights = [], [], [], []
+    for target, scene, mask, weight, sample in zip(targets, made, masks, weights, samples, strict=True):
         if sample is None:
-            pictures, places = [*pictures, target], [*places, scene]
-            some_masks, weights = [*some_masks, mask], [*weights, None]
+            pictures, places, some_masks = [*pictures, target], [*places, scene], [*some_masks, mask]
+            some_weights.append(weight)
             continue
         pictures.append(some_of_target(target, sample))
         places.append(brdf.some_pixels(scene, sample.pixel, precision=configuration.precision))
         some_masks.append(None if mask is None else np.asarray(mask, bool).ravel()[sample.pixel][None])
-        weights.append((sample.stands_for / sample.stands_for.mean())[None])
+        stated = 1.0 if weight is None else np.asarray(weight, np.float64).ravel()[sample.pixel]
+        some_weights.append((sample.stands_for * stated)[None])
+    if any(sample is not None for sample in samples):
+        # Beside a picture that is looked at in parts, a pixel of a whole one stands for itself.
+        some_weights = [
+            np.ones(scene.resolution[::-1]) if one is None else one
+            for scene, one in zip(made, some_weights, strict=True)
+        ]
     saturation = options.pop("saturation", None)
     if saturation is None:
         saturation = _clipping(targets, pictures, samples)
-    result = fit(
-        pictures,
-        places,
-        mask=some_masks,
-        weight=weights,
-        saturation=saturation,
-        **how,
-        **options,
-    )
+    how |= {"mask": some_masks, "weight": some_weights, "saturation": saturation, **options}
+    try:
+        result = fit(pictures, places, **how)
+    except InputError:
+        if all(sample is None for sample in samples):
+            raise
+        # Nothing to fit among so few pixels: all of them tell, or tell what is wrong.
+        return run(targets, scenes, dataclasses.replace(configuration, pixels=None), given, lamps, n_range)
     result = dataclasses.replace(
         result,
         targets=[np.asarray(getattr(target, "pixels", target)) for target in targets],
@@ -147,6 +156,27 @@ def run(
         counted=[_all_of(*each) for each in zip(result.counted, samples, scenes, strict=True)],
     )
     return Run(result, made, samples, time.perf_counter() - start)
+
+
+def one_each(values: Any, count: int) -> list[Any]:
+    """An option of several pictures: the list that was given, or the same for each.
+
+    Args:
+        values: a list, or one for all.
+        count: how many pictures.
+    """
+    return list(values) if isinstance(values, list | tuple) else [values] * count
+
+
+def share_counted(mask: Any, weight: Any) -> float:
+    """The share of a picture's pixels that mask and weight let count.
+
+    Args:
+        mask: (H, W), or None.
+        weight: (H, W), or None.
+    """
+    kept = [np.asarray(one) > 0 for one in (mask, weight) if one is not None]
+    return float(np.mean(np.logical_and.reduce(kept))) if kept else 1.0
 
 
 def _all_of(counted: np.ndarray, sample: PixelSample | None, scene: brdf.Scene) -> np.ndarray:

@@ -10,14 +10,14 @@ The variance of a stratified sum with one pixel per stratum is taken from the di
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
 import brdf
-from fitting.accuracy.configurations import Run, casts_shadows, some_of_target, target_size
+from fitting.accuracy.configurations import Run, casts_shadows, one_each, some_of_target, target_size
 from fitting.accuracy.deviation import SMALLEST
 from fitting.accuracy.lamps import Lamps
 from fitting.accuracy.pixel_sampling import PixelSample, sample_pixels, traceable
@@ -28,12 +28,27 @@ from fitting.uncertainty.covariance import TERMS
 
 # Pixels that are looked at: under lights of many samples, and under lights of few.
 PROBES, MOST_PROBES = 640, 512
+# Fewer are filled up to a multiple of this.
+FILLED = 128
 
 
-def _some(sample: PixelSample, most: int) -> tuple[PixelSample, float]:
-    """Every so many-th pixel of a sample, and how many."""
-    stride = max(1, -(-sample.pixel.size // most))
-    return PixelSample(sample.pixel[::stride], sample.stands_for[::stride] * stride), float(stride)
+class Part(NamedTuple):
+    """The pixels of one picture that are probed.
+
+    Attributes:
+        sample: which, and for how many each stands; filled up with some that weigh nothing, so that few programs are
+            compiled.
+        weight: of each, (M,).
+        real: how many are no filling.
+        complete: whether all pixels of the picture were fitted.
+        stride: for how many pixels that were fitted each stands.
+    """
+
+    sample: PixelSample
+    weight: Float[np.ndarray, " M"]
+    real: int
+    complete: bool
+    stride: float
 
 
 class System:
@@ -59,38 +74,36 @@ class System:
         self.many = any(sum(getattr(light, "samples", 1) for light in scene.lights) > 4 for scene in run.scenes)
         self.light = take_colour_out(run.scenes, self.channels)
         self.shadows = any(map(casts_shadows, run.scenes))
-        masks = options.get("mask")
-        masks = masks if isinstance(masks, list | tuple) else [masks] * len(targets)
-        most = max(64, probes or (PROBES if self.many else MOST_PROBES) // len(targets))
         self.probes: list[Probe] = []
+        self.parts: list[Part] = []
+        # Whether some of the pixels that were fitted are not probed.
         self.skipped = False
-        self.parts: list[tuple[PixelSample, np.ndarray, bool, float]] = []
-        for index, (target, mask, sample) in enumerate(zip(targets, masks, run.samples, strict=True)):
-            whole = sample if sample is not None else _every(run.scenes[index], self.model, most)
-            some, stride = _some(whole, most)
-            values = some_of_target(target, some)
+        weights = one_each(options.get("weight"), len(targets))
+        most = max(64, probes or (PROBES if self.many else MOST_PROBES) // len(targets))
+        for index, (target, given, sample) in enumerate(zip(targets, weights, run.samples, strict=True)):
+            counted = result.counted[index].ravel()
+            whole = sample
+            if whole is None:
+                whole = _every(run.scenes[index], self.model, round(most / max(float(np.mean(counted)), 1e-9)))
+            self.skipped |= sample is None and whole.pixel.size < target_size(target)
+            part = _part(whole, counted, given, most, complete=sample is None)
+            self.skipped |= part.stride > 1
+            values = some_of_target(target, part.sample)
             values = np.asarray(getattr(values, "pixels", values), np.float64).reshape(-1, self.channels)
-            counted = result.counted[index].ravel()[some.pixel]
-            if mask is not None:
-                counted = counted & np.asarray(mask, bool).ravel()[some.pixel]
-            weight = np.where(counted, some.stands_for, 0.0)
-            # Every pixel of a picture that was fitted whole is no sample at all.
-            skipped = some.pixel.size < (sample.pixel.size if sample is not None else target_size(target))
-            self.skipped |= skipped
-            self.parts.append((some, weight, sample is None, stride))
-            self._add(index, values, weight)
+            self.parts.append(part)
+            self._add(index, values, part.weight)
         self._assemble()
 
     def place(self, index: int, samples: int | None, precision: brdf.Precision) -> brdf.Scene:
         """The probed pixels of a picture under lights of so many samples."""
         scene = self.lamps.with_samples(self.light.scenes[index], samples)
-        sample = self.parts[index][0]
+        sample = self.parts[index].sample
         return brdf.cast(brdf.some_pixels(scene, sample.pixel, precision=precision), precision)
 
     def _add(self, index: int, values: np.ndarray, weight: np.ndarray) -> None:
         with brdf.working_precision("float64"):
             # What is traced pixel by pixel becomes part of one program.
-            scene, pixel = self.light.scenes[index], self.parts[index][0].pixel.astype(np.int32)
+            scene, pixel = self.light.scenes[index], self.parts[index].sample.pixel.astype(np.int32)
             if not traceable(scene):
                 scene, pixel = self.place(index, None, "float64"), None
             n, x = np.float64(max(self.optimum.n, 1e-3)), self.optimum.x
@@ -103,19 +116,19 @@ class System:
         size = 3 * channels + 1
         self.places = [[c, channels + c, 2 * channels + c, size - 1] for c in range(channels)]
         hessian, step, spread = np.zeros((size, size)), np.zeros(size), np.zeros((size, size))
-        for (sample, _, complete, stride), found in zip(self.parts, self.probes, strict=True):
-            scores = np.zeros((sample.pixel.size, size))
+        for part, found in zip(self.parts, self.probes, strict=True):
+            scores = np.zeros((part.real, size))
             for channel, place in enumerate(self.places):
                 scale = np.array([1.0, 1.0, 1.0, optimum.x[2, channel]])
                 hessian[np.ix_(place, place)] += found.gram[channel] * np.outer(scale, scale)
                 step[place] += found.step[channel] * scale
-                scores[:, place] += found.scores[:, channel] * scale
-            if complete:
+                scores[:, place] += found.scores[: part.real, channel] * scale
+            if part.complete:
                 continue
             # A pixel of a probe stands for `stride` pixels of the sample, whose own chance is what counts.
-            chance = 1 - stride / np.maximum(sample.stands_for, stride)
-            change = np.diff(scores / stride, axis=0)
-            spread += 0.5 * stride * (change * np.minimum(chance[1:], chance[:-1])[:, None]).T @ change
+            chance = 1 - part.stride / np.maximum(part.sample.stands_for[: part.real], part.stride)
+            change = np.diff(scores / part.stride, axis=0)
+            spread += 0.5 * part.stride * (change * np.minimum(chance[1:], chance[:-1])[:, None]).T @ change
         self.hessian, self.step, self.spread = hessian, step, spread
         self._scales()
 
@@ -172,6 +185,27 @@ class System:
 
     def _grams(self) -> Float[np.ndarray, "C 4 4"]:
         return np.sum([found.gram for found in self.probes], axis=0)
+
+
+def _part(sample: PixelSample, counted: np.ndarray, given: Any, most: int, *, complete: bool) -> Part:
+    """At most so many of the pixels of a sample that count, or that border on one that does in the sample's order."""
+    counts = counted[sample.pixel]
+    near = counts.copy()
+    # What the borders of the object take from a sample is part of its chance.
+    near[1:] |= counts[:-1]
+    near[:-1] |= counts[1:]
+    index = np.flatnonzero(near)
+    count, stride = index.size, 1.0
+    if count > most:
+        index, stride = index[np.arange(most) * count // most], count / most
+        count = most
+    pixel, stands_for = sample.pixel[index], sample.stands_for[index] * stride
+    weight = np.where(counts[index], stands_for, 0.0)
+    if given is not None:
+        weight = weight * np.asarray(given, np.float64).ravel()[pixel]
+    filling = -count % FILLED if count else FILLED
+    kept = PixelSample(np.pad(pixel, (0, filling)), np.pad(stands_for, (0, filling), constant_values=1.0))
+    return Part(kept, np.pad(weight, (0, filling)), count, complete, stride)
 
 
 def _every(scene: brdf.Scene, model: type[brdf.Material], most: int) -> PixelSample:

@@ -114,15 +114,15 @@ def _settled(system: System, draws: Float[np.ndarray, "D P"]) -> Float[np.ndarra
 def _of_light(system: System, coarse: int | None, fine: int) -> Float[np.ndarray, " P"]:
     """Products of the derivatives with what more light samples change."""
     total = np.zeros(3 * system.channels + 1)
-    for index, (sample, weight, _, _) in enumerate(system.parts):
+    for index, part in enumerate(system.parts):
         with brdf.working_precision("float64"):
-            scene, pixel = system.light.scenes[index], sample.pixel.astype(np.int32)
+            scene, pixel = system.light.scenes[index], part.sample.pixel.astype(np.int32)
             if traceable(scene):
                 few, many = (system.lamps.with_samples(scene, samples) for samples in (coarse, fine))
             else:
                 few, many, pixel = *(system.place(index, samples, "float64") for samples in (coarse, fine)), None
             n, x = np.asarray(max(system.optimum.n, 1e-3)), system.optimum.x
-            found = np.asarray(difference(system.model, few, many, pixel, weight, n, x))
+            found = np.asarray(difference(system.model, few, many, pixel, part.weight, n, x))
         for channel, place in enumerate(system.places):
             total[place] += found[channel] * np.array([1.0, 1.0, 1.0, system.optimum.x[2, channel]])
     return total
@@ -130,7 +130,7 @@ def _of_light(system: System, coarse: int | None, fine: int) -> Float[np.ndarray
 
 def _of_rounding(system: System) -> Float[np.ndarray, " P"]:
     """Products of the derivatives with what float64 changes."""
-    return np.sum([_of_single(system, index, weight) for index, (_, weight, _, _) in enumerate(system.parts)], axis=0)
+    return np.sum([_of_single(system, index, part.weight) for index, part in enumerate(system.parts)], axis=0)
 
 
 def _of_single(system: System, index: int, weight: np.ndarray) -> Float[np.ndarray, " P"]:
@@ -138,7 +138,7 @@ def _of_single(system: System, index: int, weight: np.ndarray) -> Float[np.ndarr
     found = []
     for precision in ("float64", "float32"):
         with brdf.working_precision(precision):
-            scene, pixel = system.light.scenes[index], system.parts[index][0].pixel.astype(np.int32)
+            scene, pixel = system.light.scenes[index], system.parts[index].sample.pixel.astype(np.int32)
             if not traceable(scene):
                 scene, pixel = system.place(index, None, precision), None
             n = np.float64(max(system.optimum.n, 1e-3))

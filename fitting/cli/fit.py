@@ -190,13 +190,15 @@ def _fit_pictures(
     tell("fitting")
     with held():
         use_compilation_cache()
+        from fitting.accuracy.budget import single_fit
         from fitting.cli.encoding_trial import fit_either
         from fitting.cli.inputs import collect
         from fitting.photographs.light_files import parse_numbers
 
     numbers = None if noise is None else parse_numbers(noise, "--noise", 2, "READ,SHOT")
     how["noise"] = None if numbers is None else (numbers[0], numbers[1])
-    return fit_either(read, lambda pictures: collect(target, given, pictures), how)
+    with single_fit():
+        return fit_either(read, lambda pictures: collect(target, given, pictures), how)
 
 
 def _save(result: Any, out: Path, **how: bool) -> None:
