@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from brdf.albedo import absorbed_fraction, directional_albedo
+    from brdf.channels import channel_names
     from brdf.conversions import (
         exponent_from_roughness,
         exponent_from_slope,
@@ -69,6 +70,7 @@ _ROOMS = {
         "roughness_from_exponent",
         "slope_from_exponent",
     ],
+    "channels": ["channel_names"],
     "albedo": ["absorbed_fraction", "directional_albedo"],
     "lights.area": ["PolygonLight", "RectangleLight", "SphereLight"],
     "geometry.camera": ["Camera", "OrthographicCamera", "PerspectiveCamera"],

@@ -11,6 +11,7 @@ import io
 import numpy as np
 from jaxtyping import Float
 
+from brdf.channels import channel_names
 from brdf.geometry.camera import OrthographicCamera
 from brdf.geometry.shapes import Sphere
 from brdf.images.encodings import encode
@@ -80,8 +81,7 @@ def material_html(material: Material) -> str:
     Args:
         material: any of the models, of known numbers.
     """
-    channels = np.asarray(material.k_d).size
-    labels = {1: [""], 3: ["red", "green", "blue"]}.get(channels, [str(index) for index in range(channels)])
+    labels = channel_names(np.asarray(material.k_d).size)
     head = "".join(f'<th style="{_CELL}">{label}</th>' for label in ["", *labels])
     rows = []
     for key in ("k_a", "k_d", "k_s") if isinstance(material, SpecularMaterial) else ("k_a", "k_d"):

@@ -54,7 +54,7 @@ def report_page(result: FitResult, *, source: str = "", command: str = "") -> st
     from fitting.plots.materials import overview
 
     check = brdf.check(result.material, name=result.material.name)
-    title = html.escape(f"{result.material.name} fitted to {source or 'a picture'}")
+    title = html.escape(f"{result.surface} fitted to {source or 'a picture'}")
     left_out = [f"{count} pixels {reason}" for reason, count in result.left_out.items() if count]
     summary = f"Residual {100 * result.residual:.3g} % of the picture (rms) over {result.pixels} pixels."
     summary += f" Left out: {', '.join(left_out)}." if left_out else ""
@@ -95,8 +95,7 @@ def _numbers(result: FitResult) -> str:
 
 
 def _row(parameter: Parameter, result: FitResult) -> list[str]:
-    channels = result.material.k_d.shape[0]
-    names = {1: ("",), 3: ("red", "green", "blue")}.get(channels, tuple(map(str, range(channels))))
+    names = brdf.channel_names(result.material.k_d.shape[0])
     channel = "" if parameter.channel is None else names[parameter.channel]
     interval = getattr(parameter, "interval", None)
     ends = "" if interval is None else " to ".join("∞" if math.isinf(end) else f"{end:.6g}" for end in interval)

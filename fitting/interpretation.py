@@ -139,8 +139,10 @@ def interpret(
     parameters = _parameters(material, sure, factors, interval, optimum.n)
     warnings = _warnings(known, seen if "k_s" not in sure.undetermined else None, sure, parameters, material)
     if fit.capped:
-        channels = ", ".join(str(channel) for channel in np.flatnonzero(k[1] + k[2] >= 1 - 1e-6))
-        words = f"k_d + k_s is held at 1 in channel {channels}: a brighter material fits better, but is not plausible; "
+        labels = brdf.channel_names(k.shape[1])
+        held = ", ".join(labels[channel] for channel in np.flatnonzero(k[1] + k[2] >= 1 - 1e-6))
+        where = f" in channel {held}" if held else ""
+        words = f"k_d + k_s is held at 1{where}: a brighter material fits better, but is not plausible; "
         warnings = (words + "the errors do not know of that bound", *warnings)
     return Interpretation(material, parameters, sure, known, seen, warnings)
 

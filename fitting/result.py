@@ -127,6 +127,12 @@ class FitResult:
         """Those that the picture determines and no bound holds."""
         return free_parameters(self.parameters)
 
+    @property
+    def surface(self) -> str:
+        """The model in words: its name, or what is left of it where the picture requires neither shape nor light."""
+        chosen = next((one.model for one in self.candidates if one.chosen), self.material.name)
+        return {"none": "none (black)", "ambient": "ambient (no shading)"}.get(chosen, chosen)
+
     def fitted(self, picture: int = 0) -> Float[np.ndarray, "H W C"]:
         """The picture that the fitted material makes.
 
@@ -241,12 +247,12 @@ def report(result: FitResult) -> str:
     plural = "channel" if channels == 1 else "channels"
     loss = "" if result.loss == "squared" else f", {result.loss} loss"
     lines = [
-        f"{result.material.name} fitted to {count}{result.pixels} pixels x {channels} {plural} "
+        f"{result.surface} fitted to {count}{result.pixels} pixels x {channels} {plural} "
         f"in {result.seconds:.2g} s ({result.precision}{loss})"
     ]
-    labels = ["red", "green", "blue"] if channels == 3 else [str(channel) for channel in range(channels)]
+    labels = brdf.channel_names(channels)
     for parameter in result.parameters:
-        label = "" if parameter.channel is None or channels == 1 else labels[parameter.channel]
+        label = "" if parameter.channel is None else labels[parameter.channel]
         lines.append(f"  {parameter.name:<4}{label:<6} {parameter}")
     lines.append(f"  residual    {100 * result.residual:.3g} % of the picture (rms)")
     for reason, pixels in result.left_out.items():
@@ -269,7 +275,9 @@ def _correlations(result: FitResult) -> list[str]:
     # A grey k_s is one number in all channels.
     pairs = [(size, i, j) for size, i, j in pairs if free[i].name != free[j].name or size < 1 - 1e-9]
     strong = sorted((pair for pair in pairs if pair[0] > STRONG), reverse=True)[:MOST_CORRELATIONS]
-    words = [f"{_key(free[j])} and {_key(free[i])} {result.correlation[i, j]:+.2f}" for _, i, j in strong]
+    labels = brdf.channel_names(result.material.k_d.shape[0])
+    names = ["n" if one.channel is None else f"{one.name} {labels[one.channel]}".rstrip() for one in free]
+    words = [f"{names[j]} and {names[i]} {result.correlation[i, j]:+.2f}" for _, i, j in strong]
     return [f"  correlated  {', '.join(words)}"] if words else []
 
 

@@ -1,6 +1,7 @@
 """What the command writes for others: materials in other programs' words, the report page, pictures."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -98,7 +99,9 @@ def test_check_draws_its_picture(capsys, tmp_path: Path):
 def test_every_command_knows_the_classic_table(capsys, tmp_path: Path, monkeypatch):
     scene = Path(__file__).parents[1] / "data" / "gold-ball" / "scene.toml"
     monkeypatch.chdir(tmp_path)
-    assert "emerald: not plausible" in run(capsys, "check", "Emerald", status=1)
+    said = run(capsys, "check", "Emerald", status=1)
+    assert "emerald: not plausible" in said
+    assert re.findall(r"channel (\w+)\.", said) == ["red", "red", "green"]  # as a fit's report names them
     run(capsys, "render", "cyan plastic", "--scene", scene, "-o", "a.exr")
     brdf.save_material(brdf.preset("cyan plastic"), tmp_path / "b.json")
     run(capsys, "render", "b.json", "--scene", scene, "-o", "b.exr")

@@ -108,7 +108,7 @@ def test_a_bright_lambertian_surface_ends_at_the_bound():
     result = fitting.fit(target, scene, model="lambert", plausible=True, precision="float64")
     assert result.material.k_d[0] == pytest.approx(1, abs=1e-12)
     np.testing.assert_allclose(result.material.k_d[1:], [0.5, 0.2], rtol=1e-9)
-    assert any("held at 1 in channel 0" in warning for warning in result.warnings)
+    assert any("held at 1 in channel red" in warning for warning in result.warnings)
 
 
 def test_a_classic_form_is_refused():

@@ -129,3 +129,11 @@ def test_an_exponent_whose_highlight_no_pixel_sees_is_not_looked_at():
         picture = np.asarray(brdf.render(brdf.Lambert(k_a=0.4, k_d=0.0), scene, precision="float32"))
         picture = picture + 0.003 * random.standard_normal(picture.shape).astype(np.float32)
         assert chosen(fitting.fit(picture, scene, saturation=np.inf)).model == "ambient"
+
+
+def test_the_first_line_names_what_was_chosen():
+    nothing = fit(brdf.Lambert(k_a=[0.0] * 3, k_d=[0.0] * 3))
+    assert str(nothing).startswith("none (black) fitted to")
+    flat = fit(brdf.Lambert(k_a=[0.5] * 3, k_d=[0.0] * 3))
+    assert str(flat).startswith("ambient (no shading) fitted to")
+    assert str(fit(brdf.Lambert(**K))).startswith("lambert fitted to")

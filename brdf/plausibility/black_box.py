@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from brdf.channels import in_channel
 from brdf.plausibility.quadrature import integrate
 from brdf.plausibility.report import (
     ENERGY_LIMIT,
@@ -230,4 +231,4 @@ def _angles(direction: np.ndarray) -> Angles:
 
 
 def _channel(sample: Sampler, channel: Any) -> str:
-    return f", channel {int(channel)}" if sample.channels > 1 else ""
+    return in_channel(int(channel), sample.channels)

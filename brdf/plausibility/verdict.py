@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from brdf.albedo import ACCURACY, directional_albedo, lobe_albedo, normalized_form
+from brdf.channels import in_channel
 from brdf.conversions import nearest_normalized
 from brdf.errors import InputError
 from brdf.measured.check import check_table
@@ -200,4 +201,4 @@ def _scale(material: SpecularMaterial) -> float:
 
 
 def _named(material: Material, channel: int) -> str:
-    return f", channel {channel}" if material.k_d.shape[-1] > 1 else ""
+    return in_channel(channel, material.k_d.shape[-1])

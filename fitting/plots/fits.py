@@ -50,9 +50,7 @@ def comparison(result: FitResult, picture: int = 0) -> Figure:
         figure = Figure(figsize=(7.2, 4.9), layout="constrained")
         grid = figure.add_gridspec(2, 3)
         above = [figure.add_subplot(grid[0, column]) for column in range(3)]
-        for axes, image, title in zip(
-            above, (target, fitted), ("target", f"fit, {result.material.name}"), strict=False
-        ):
+        for axes, image, title in zip(above, (target, fitted), ("target", f"fit, {result.surface}"), strict=False):
             axes.imshow(brdf.displayed(image, white))
             axes.set_title(title)
             axes.axhline(box.row, color="white", linewidth=0.6, linestyle=(0, (4, 4)))
@@ -115,14 +113,15 @@ def _enlarged(axes: Any, target: np.ndarray, fitted: np.ndarray, box: _Box, whit
 
 def _scanline(axes: Any, target: np.ndarray, fitted: np.ndarray, counted: np.ndarray, row: int, columns: slice) -> None:
     place = np.arange(columns.start, columns.stop)
-    names = ("red", "green", "blue") if target.shape[-1] == 3 else tuple(map(str, range(target.shape[-1])))
+    names = brdf.channel_names(target.shape[-1])
     step = max(1, len(place) // 30)
     for channel in range(min(target.shape[-1], len(CHANNEL_COLOURS))):
         colour = CHANNEL_COLOURS[channel]
         known = np.where(counted[row, columns], target[row, columns, channel], np.nan)
         style = CHANNEL_STYLES[channel % len(CHANNEL_STYLES)]
         axes.plot(place[::step], known[::step], "o", color=colour, markersize=2.5, markerfacecolor="none")
-        axes.plot(place, fitted[row, columns, channel], style, color=colour, linewidth=1.2, label=names[channel])
+        label = names[channel] or "fit"
+        axes.plot(place, fitted[row, columns, channel], style, color=colour, linewidth=1.2, label=label)
     axes.plot([], [], "o", color="0.3", markersize=2.5, markerfacecolor="none", label="target")
     axes.set(xlabel=f"column, in row {row}", ylabel="radiance (linear)", title="scanline")
     axes.legend(frameon=False, handlelength=2.2, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.2))

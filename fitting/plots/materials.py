@@ -16,6 +16,7 @@ from matplotlib.ticker import MaxNLocator
 
 from brdf import lit_sphere
 from brdf.albedo import directional_albedo
+from brdf.channels import channel_names
 from brdf.models import Material, SpecularMaterial
 from brdf.plausibility.black_box import albedo_of
 from brdf.plausibility.report import Report
@@ -78,8 +79,9 @@ def plot_albedo(brdf: Brdf, report: Report | None = None, figure: Any = None) ->
     axes.axhspan(1, 2, color="0.92", zorder=0)
     axes.axhline(1, color="black", linewidth=1)
     axes.annotate("more than arrives", (1, 1), (0, 4), textcoords="offset points", fontsize="small")
+    names = channel_names(albedo.shape[1])
     for channel in range(albedo.shape[1]):
-        axes.plot(degrees, albedo[:, channel], **_look(channel), label=f"channel {channel}")
+        axes.plot(degrees, albedo[:, channel], **_look(channel), label=names[channel])
     if albedo.shape[1] > 1:
         axes.legend(loc="best")
     if report is not None and report.energy.crossing:
