@@ -1,6 +1,7 @@
 """Noise that is cut off at black or white bends a fit, unless pixels are left out by what is predicted there."""
 
 import numpy as np
+import OpenImageIO as oiio  # noqa: N813
 import pytest
 
 import brdf
@@ -103,3 +104,26 @@ def test_the_command_says_how_many_pixels_it_left_out(tmp_path, capsys, monkeypa
         main(words)
     assert exit_status.value.code == 0
     assert BLACK in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("quality", [75, 85, 95])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_a_clipped_highlight_in_a_jpeg_file_does_not_bend_the_fit(tmp_path, quality, channels):
+    shiny = brdf.BlinnPhong(k_a=[0.05] * channels, k_d=[0.7] * channels, k_s=[0.6] * channels, n=30.0)
+    values = np.clip(np.asarray(brdf.render(shiny, SCENE)), 0, 1).astype(np.float32)
+    codes = np.rint(brdf.encode(values, "srgb") * 255).astype(np.uint8)
+    spec = oiio.ImageSpec(SIZE, SIZE, channels, "uint8")
+    spec.attribute("Compression", f"jpeg:{quality}")
+    file = oiio.ImageOutput.create("ball.jpg")
+    assert file.open(str(tmp_path / "ball.jpg"), spec)
+    assert file.write_image(codes)
+    file.close()
+    picture = brdf.read_picture(tmp_path / "ball.jpg")
+    brightest = picture.pixels[values.max(axis=-1) == 1].max(axis=-1)
+    assert brightest.min() < 1  # the plateau is none any more
+    assert np.mean(brightest >= picture.saturation) > 0.97
+    material = fitted(picture, mended=True).material
+    assert isinstance(material, brdf.BlinnPhong)
+    assert material.k_d == pytest.approx([0.7] * channels, rel=0.02)
+    assert material.k_s == pytest.approx([0.6] * channels, rel=0.05)
+    assert float(material.n) == pytest.approx(30, rel=0.05)

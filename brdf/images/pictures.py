@@ -48,8 +48,9 @@ class Picture:
         encoding: how the file holds the values: "linear", "srgb" or a gamma.
         source: who says so: "given" (the user), "file", "format" (it knows no other), or "assumed".
         bits: bits per value in the file.
-        saturation: the linear value of the largest code, where an integer file ends; None for floats. Infinite where
-            the clipped pixels were taken out, see `scaled`.
+        saturation: the linear value of the largest code, where an integer file ends; a little less where the file is
+            compressed with losses (`ImageReader.codes`); None for floats. Infinite where the clipped pixels were taken
+            out, see `scaled`.
         factor: what the linear values of the file were multiplied by, a number or (C,).
     """
 
@@ -129,7 +130,7 @@ def read_picture(path: str | os.PathLike[str], *, encoding: Encoding | None = No
         InputError: if the file cannot be read.
     """
     with ImageReader(path, encoding=encoding) as reader:
-        top = float(decode_table(reader.encoding, 8)[-1]) if reader.is_integer else None
+        top, _ = reader.codes
         return Picture(reader.read(), reader.read_alpha(), reader.encoding, reader.source, reader.bits, top)
 
 

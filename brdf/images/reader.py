@@ -14,6 +14,10 @@ from brdf.files import input_file
 from brdf.images.encodings import Encoding, EncodingSource, decode, decode_table, find_encoding, parse_encoding
 from brdf.images.file import check_header, check_memory, choose_channels, open_image, read_rows
 
+LOSSY_TOP = 250 / 255
+"""Share of the largest code from which on a file compressed with losses is clipped: at quality 75 a clipped area has
+codes between 250 and 255, but for a few at its edge."""
+
 _BAND_VALUES = 1 << 22
 _INTEGER_BITS = {oiio.UINT8: 8, oiio.UINT16: 16}
 _NATIVE_BITS = {oiio.UINT8: 8, oiio.INT8: 8, oiio.UINT16: 16, oiio.INT16: 16, oiio.HALF: 16, oiio.DOUBLE: 64}
@@ -60,6 +64,8 @@ class ImageReader:
         else:
             self.encoding, self.source = given, "given"
         self.has_alpha = self._channels.alpha is not None
+        compression = spec.get_string_attribute("compression", "")
+        self._is_lossy = self._image.format_name() in ("jpeg", "webp", "heif") or compression.startswith("jpeg")
         self._table_bits = _INTEGER_BITS.get(kind, 0) if self.encoding != "linear" else 0
         self._turn = spec.get_int_attribute("Orientation", 1)
         self._upright: dict[bool, np.ndarray] = {}
@@ -70,13 +76,15 @@ class ImageReader:
 
     @property
     def codes(self) -> tuple[float | None, float]:
-        """The linear value of the largest code, and the largest distance of two; None and 0 for floats."""
+        """The linear value from which on codes are clipped, and the largest distance of two; None and 0 for floats.
+
+        That is the largest code; after compression with losses a few codes less, among which a clipped area wobbles.
+        """
         if not self.is_integer:
             return None, 0.0
-        if self.encoding == "linear":
-            return 1.0, 1.0 / ((1 << self.bits) - 1)
-        table = decode_table(self.encoding, min(self.bits, 16))
-        return float(table[-1]), float(np.max(np.diff(table)))
+        table = decode_table(self.encoding, 8 if self.encoding == "linear" else min(self.bits, 16))
+        top = float(decode(np.array([LOSSY_TOP], np.float32), self.encoding)[0]) if self._is_lossy else float(table[-1])
+        return top, 1.0 / ((1 << self.bits) - 1) if self.encoding == "linear" else float(np.max(np.diff(table)))
 
     def __enter__(self) -> Self:
         """The reader itself."""
