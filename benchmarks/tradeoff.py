@@ -113,59 +113,66 @@ def measure(jobs):
     return {name: min(each) for name, each in times.items()}
 
 
-def study(name, place, true, model, noise):
-    """All accuracies on one scene."""
-    fine = Lamps().with_samples(place, 4096)
-    picture = np.asarray(brdf.render(true, fine, precision="float64"))
+def photograph(name, place, true, noise):
+    """What a scene shows under 4096 light samples, with noise, a share of the mean."""
+    picture = np.asarray(brdf.render(true, Lamps().with_samples(place, 4096), precision="float64"))
     random = np.random.default_rng(zlib.crc32(name.encode()))
     picture = picture + noise * picture.mean() * random.standard_normal(picture.shape)
-    picture = picture.astype(np.float32)
-    lamps = Lamps()
-    best = reference([picture], [place], model, OPTIONS, lamps, start_samples=64 if extended(place) else None)
+    return picture.astype(np.float32)
+
+
+def study(name, place, picture, model, options=OPTIONS, *, timed=True):
+    """All accuracies on one scene."""
+    lamps, given = Lamps(), {key: value for key, value in options.items() if value is not None}
+    best = reference([picture], [place], model, options, lamps, start_samples=64 if extended(place) else None)
     jobs, errors, rows = {}, {}, []
-    for how in configurations(place, model):
-        jobs[how] = lambda how=how: run([picture], [place], how, OPTIONS, lamps)
+    for how in configurations(place, model) if timed else ():
+        jobs[how] = lambda how=how: run([picture], [place], how, options, lamps)
         errors[how] = max(deviation(jobs[how]().result, best)[:2])
     for accuracy in ACCURACIES:
-        jobs[accuracy] = lambda e=accuracy: fitting.fit(picture, place, model=model, accuracy=e)
+        jobs[accuracy] = lambda e=accuracy: fitting.fit(picture, place, model=model, accuracy=e, **given)
         result = jobs[accuracy]()
-        actual = max(deviation(result, best)[:2])
-        rows.append([accuracy, actual, result.choice])
-    times = measure(jobs)
+        rows.append([accuracy, max(deviation(result, best)[:2]), result.choice])
+    times = measure(jobs) if timed else {}
     found = []
     for accuracy, actual, choice in rows:
         meeting = [times[how] for how, error in errors.items() if error <= accuracy]
-        cheapest = min(meeting) if meeting else np.nan
+        took, cheapest = times.get(accuracy, np.nan), min(meeting) if meeting else np.nan
         one = {
             "held": actual <= accuracy,
             "agrees": choice.chosen.error / 3 <= actual <= 3 * choice.chosen.error
             or max(actual, choice.chosen.error) < RESOLVED,
-            "price": times[accuracy] / cheapest,
+            "price": took / cheapest,
         }
         found.append(one)
+        price = f"price {one['price']:5.2f}  {1e3 * took:7.1f} ms  " if timed else ""
         print(
-            f"{name:<14}{accuracy:>8.0e}  error {actual:.1e}  estimate {choice.chosen.error:.1e}  "
-            f"{'held' if one['held'] else 'BROKEN':<6} price {one['price']:5.2f}  attempts {len(choice.attempts)}  "
-            f"{1e3 * times[accuracy]:7.1f} ms  {choice.chosen.configuration} ({choice.pixels} of {choice.of_pixels})",
+            f"{name:<18}{accuracy:>8.0e}  error {actual:.1e}  estimate {choice.chosen.error:.1e}  "
+            f"{'held' if one['held'] else 'BROKEN':<6} {'' if one['agrees'] else 'far off '}{price}"
+            f"attempts {len(choice.attempts)}  {choice.chosen.configuration} ({choice.pixels} of {choice.of_pixels})",
             flush=True,
         )
     return found
 
 
+def summary(found):
+    """Of the cases so far."""
+    held, agrees = (np.mean([one[name] for one in found]) for name in ("held", "agrees"))
+    words = f"  so far {len(found)} cases: held {held:.1%}, estimate within a factor of 3 {agrees:.1%}"
+    prices = np.array([one["price"] for one in found])
+    prices = prices[np.isfinite(prices)]
+    if prices.size:
+        words += f", price median {np.median(prices):.2f}, at most 1.5 in {np.mean(prices <= 1.5):.1%}"
+    print(words, flush=True)
+
+
 def main(names):
     """Run the scenes named, or all."""
     found = []
-    for name, *rest in scenes():
+    for name, place, true, model, noise in scenes():
         if not names or name in names:
-            found += study(name, *rest)
-            prices = np.array([one["price"] for one in found])
-            prices = prices[np.isfinite(prices)]
-            print(
-                f"  so far {len(found)} cases: held {np.mean([one['held'] for one in found]):.1%}, estimate within a "
-                f"factor of 3 {np.mean([one['agrees'] for one in found]):.1%}, price median {np.median(prices):.2f}, "
-                f"at most 1.5 in {np.mean(prices <= 1.5):.1%}",
-                flush=True,
-            )
+            found += study(name, place, photograph(name, place, true, noise), model)
+            summary(found)
 
 
 if __name__ == "__main__":
