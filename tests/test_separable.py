@@ -1,96 +1,15 @@
 """The separable engine against SciPy, direct normal equations and the corners."""
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from engine_pictures import SumOfLobes, X, ball, best_at, cost_of, picture
 from scipy.optimize import least_squares, nnls
 
 import brdf
 import fitting
-from fitting.engine.nonnegative import solve
 from fitting.engine.separable import OneLightLobe, Picture, fit_linear, search
 from fitting.engine.streams import Stream
-from fitting.engine.sums import sums
-from fitting.engine.thinning import thin
-
-X = np.array([[0.05, 0.03, 0.02], [0.5, 0.3, 0.1], [0.3, 0.4, 0.5]])
-
-
-class SumOfLobes(eqx.Module):
-    """Several lights, each weight and cosine (P, L)."""
-
-    log_cos: jax.Array
-    weight: jax.Array
-
-    def __call__(self, n):
-        each = self.weight * jnp.exp(n.astype(self.log_cos.dtype) * self.log_cos)
-        return jnp.sum(each, axis=1, keepdims=True), jnp.sum(each * self.log_cos, axis=1, keepdims=True)
-
-    def peak(self):
-        return jnp.max(self.log_cos, axis=1)
-
-    def pixels(self, choose):
-        return SumOfLobes(choose(self.log_cos), choose(self.weight))
-
-
-def ball(size, lights):
-    """N·L, logarithm of N·H and gate of each pixel of a sphere seen from +z, for each light; (L, P)."""
-    at = (np.arange(size) + 0.5) / size * 2.2 - 1.1
-    u, v = np.meshgrid(at, -at)
-    on = u**2 + v**2 < 1
-    normal = np.stack([u[on], v[on], np.sqrt(1 - u[on] ** 2 - v[on] ** 2)], axis=-1)
-    cosines, logs, gates = [], [], []
-    for to_light in lights:
-        to_light = np.asarray(to_light) / np.linalg.norm(to_light)
-        half = to_light + np.array([0, 0, 1])
-        half = half / np.linalg.norm(half)
-        near = np.minimum(np.sum(np.cross(normal, half) ** 2, axis=-1), 0.99)
-        cosine = normal @ half
-        logs.append(np.where(cosine > 0.5, 0.5 * np.log1p(-near), np.log(np.maximum(cosine, 1e-30))))
-        cosines.append(np.maximum(normal @ to_light, 0))
-        gates.append((normal @ to_light > 0) * 1.0)
-    return np.stack(cosines), np.stack(logs), np.stack(gates)
-
-
-def picture(size=64, n=80.0, x=X, noise=0.0, dtype=np.float64, light=(0.5, 0.6, 0.7), seed=0, **more):
-    (cosine,), (log_cos,), (gate,) = ball(size, [light])
-    basis = np.stack([np.ones_like(cosine), cosine, gate * np.exp(n * log_cos)])
-    target = basis.T @ x
-    target = target + noise * np.max(target) * np.random.default_rng(seed).standard_normal(target.shape)
-    lobe = OneLightLobe(log_cos.astype(dtype), gate[:, None].astype(dtype))
-    return Picture(target.astype(dtype), cosine[:, None].astype(dtype), lobe, **more)
-
-
-def cost_of(pictures, n, x):
-    """Sum of weighted squares of one or several pictures, channel by channel, in plain NumPy."""
-    total = np.zeros(x.shape[1])
-    for one in pictures:
-        with jax.enable_x64(True):
-            lobe = np.asarray(one.lobe(np.float64(n))[0], float)
-        weight = np.ones((1, 1)) if one.weight is None else np.asarray(one.weight, float)
-        weight = np.broadcast_to(weight if weight.ndim == 2 else weight[:, None], one.target.shape)
-        model = x[0] * one.ambient + x[1] * np.asarray(one.diffuse, float) + x[2] * lobe
-        residual = np.where(weight > 0, np.asarray(one.target, float) - model, 0)
-        total += np.sum(weight * residual**2, axis=0)
-    return total
-
-
-def best_at(pictures, n):
-    """Least cost at one exponent by SciPy's active-set solver."""
-    total = 0.0
-    for channel in range(pictures[0].target.shape[1]):
-        rows, right = [], []
-        for one in pictures:
-            with jax.enable_x64(True):
-                lobe = np.asarray(one.lobe(np.float64(n))[0], float)
-            columns = [np.broadcast_to(one.ambient, channel + 1)[channel] * np.ones(len(lobe))]
-            columns += [np.asarray(a, float)[:, min(channel, a.shape[1] - 1)] for a in (one.diffuse, lobe)]
-            rows.append(np.stack(columns, axis=1))
-            right.append(np.asarray(one.target, float)[:, channel])
-        total += nnls(np.concatenate(rows), np.concatenate(right))[1] ** 2
-    return total
 
 
 def scipy_starts(one, starts, seed):
@@ -327,74 +246,6 @@ def test_dependent_columns():
     plane = Picture(one.target, np.full_like(one.diffuse, 0.8), one.lobe)
     found = search([plane])
     np.testing.assert_allclose(np.sum(found.cost), best_at([plane], found.n), rtol=1e-9)
-
-
-@pytest.mark.parametrize("columns", [0, 1, 2])
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_sums_are_those_of_numpy(columns, dtype):
-    """Ragged blocks too; float32 products are summed in blocks, so they are good to a few 1e-7."""
-    one = picture(400, noise=0.1, dtype=dtype).pixels(lambda a: a[:100_003])
-    rng = np.random.default_rng(0)
-    one = Picture(one.target, one.diffuse, one.lobe, rng.uniform(0, 1, one.target.shape[0]).astype(dtype))
-    log_n, reference = np.log([40.0, 45.0])[:columns], rng.uniform(0, 0.3, (3, 3))
-    with jax.enable_x64(True):
-        found = sums([one], log_n, reference)
-    log_cos, gate = np.asarray(one.lobe.log_cos, float), np.asarray(one.lobe.weight, float)[:, 0]
-    lobes = [gate * np.exp(np.exp(at) * log_cos) for at in log_n]
-    slopes = [lobe * log_cos * np.exp(at) for lobe, at in zip(lobes, log_n, strict=True)]
-    basis = [np.ones_like(gate), np.asarray(one.diffuse, float)[:, 0], *lobes[:1], *slopes[:1]]
-    if columns == 2:
-        basis += [lobes[1] - lobes[0] - (log_n[1] - log_n[0]) * slopes[0], slopes[1] - slopes[0]]
-    basis = np.stack(basis)
-    known = np.stack([*basis[:2], *basis[2:3]])
-    residual = np.asarray(one.target, float).T - reference[:, : len(known)] @ known
-    weight = np.asarray(one.weight, float)
-    scale = np.sqrt(np.sum(weight * basis**2, axis=1))
-    accuracy = 1e-6 if dtype == np.float32 else 1e-12
-    gram = (weight * basis) @ basis.T / scale[:, None] / scale
-    # The two last columns of a bracket are small differences, and keep as many digits as their pixels have.
-    loose = 300 if columns == 2 else 1
-    np.testing.assert_allclose(found.gram[0] / scale[:, None] / scale, gram, atol=loose * accuracy)
-    size = np.sqrt(np.sum(weight * residual**2, axis=1))
-    product = (weight * residual) @ basis.T / scale / size[:, None]
-    np.testing.assert_allclose(found.product / scale / size[:, None], product, atol=loose * accuracy)
-    np.testing.assert_allclose(found.square, size**2, rtol=10 * accuracy)
-
-
-def test_nonnegative_solver_against_scipy():
-    rng = np.random.default_rng(0)
-    columns = rng.standard_normal((200, 20, 4))
-    columns[::4, :, 1] = columns[::4, :, 0]
-    columns[1::4, :, 2] = 0
-    right = rng.standard_normal((200, 20))
-    free = rng.random((200, 3)) < 0.8
-    gram, product = np.einsum("kpi,kpj->kij", columns, columns), np.einsum("kpi,kp->ki", columns, right)
-    with jax.enable_x64(True):
-        found = solve(gram, product, np.sum(right**2, axis=1), np.zeros((200, 3)), free, np.float64(1e-12))
-    found = jax.tree.map(np.asarray, found)
-    for k in range(200):
-        expected = nnls(columns[k, :, :3] * free[k], right[k])[1] ** 2
-        np.testing.assert_allclose(found.cost[k], expected, rtol=1e-10)
-        assert np.all(found.x[k][~free[k]] == 0)
-        assert np.all(found.x[k] >= 0)
-
-
-def test_subsample_keeps_the_innermost_pixels_and_the_totals():
-    one = picture(512, light=(0.2, 0.1, 1.0))
-    with jax.enable_x64(True):
-        thinned = thin(one, 4096, 1e6)
-    distance = -np.asarray(one.lobe.log_cos)
-    factor = np.asarray(thinned.factor)
-    assert np.count_nonzero(factor) < 5200
-    for octave in range(-16, 0):
-        here = (distance >= 2.0**octave) & (distance < 2.0 ** (octave + 1))
-        kept = -np.asarray(thinned.picture.lobe.log_cos)
-        kept = (kept >= 2.0**octave) & (kept < 2.0 ** (octave + 1)) & (factor > 0)
-        if np.count_nonzero(here) < 100:
-            assert np.count_nonzero(kept) == np.count_nonzero(here)
-        else:
-            # The strata are counted on a sixteenth of the pixels.
-            np.testing.assert_allclose(np.sum(factor[kept]), np.count_nonzero(here), rtol=0.2)
 
 
 def test_what_comes_with_the_optimum():

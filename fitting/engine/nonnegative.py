@@ -64,15 +64,19 @@ def solve(
         Coefficients, cost and slope.
     """
     start = [reference[..., i] for i in range(3)]
-    right = [product[..., i] + sum(gram[..., i, j] * start[j] for j in range(3)) for i in range(3)]
     sets = ACTIVE_SETS.reshape(8, *(1,) * square.ndim, 3)
     active = [sets[..., i] for i in range(3)]
 
     def entry(i: int, j: int) -> Float[Array, "8 *K C"]:
         return jnp.where(active[i] & active[j], gram[..., i, j], 0.0)
 
+    # The step from the reference is what is solved for, so no digits are lost where the two models nearly agree: near
+    # the optimum. An inactive coefficient steps to 0.
+    leave = [jnp.where(active[i], 0.0, start[i]) for i in range(3)]
+    b = [
+        jnp.where(active[i], product[..., i] + sum(gram[..., i, j] * leave[j] for j in range(3)), 0.0) for i in range(3)
+    ]
     # L D L' of the active columns.
-    b = [jnp.where(active[i], right[i], 0.0) for i in range(3)]
     d_0 = entry(0, 0)
     l_10, l_20 = _divide(entry(0, 1), d_0), _divide(entry(0, 2), d_0)
     d_1 = entry(1, 1) - l_10 * entry(0, 1)
@@ -81,17 +85,16 @@ def solve(
     d_2 = entry(2, 2) - l_20 * entry(0, 2) - l_21 * rest
     y_1 = b[1] - l_10 * b[0]
     y_2 = b[2] - l_20 * b[0] - l_21 * y_1
-    x_2 = _divide(y_2, d_2)
-    x_1 = _divide(y_1, d_1) - l_21 * x_2
-    x_0 = _divide(b[0], d_0) - l_10 * x_1 - l_20 * x_2
-    x = [x_0, x_1, x_2]
+    gain_2 = _divide(y_2, d_2)
+    gain_1 = _divide(y_1, d_1) - l_21 * gain_2
+    gain_0 = _divide(b[0], d_0) - l_10 * gain_1 - l_20 * gain_2
+    step = [gain - left for gain, left in zip([gain_0, gain_1, gain_2], leave, strict=True)]
+    x = [jnp.where(active[i], start[i] + step[i], 0.0) for i in range(3)]
 
-    feasible = jnp.ones_like(x_0, bool)
+    feasible = jnp.ones_like(gain_0, bool)
     for i, pivot in enumerate([d_0, d_1, d_2]):
         allowed = free[..., i] & (x[i] >= 0) & (pivot > tolerance * gram[..., i, i])
         feasible = feasible & (~active[i] | allowed)
-    # Relative to the reference, hence exact where the two models nearly agree: near the optimum.
-    step = [x[i] - start[i] for i in range(3)]
     change = sum(step[i] * (sum(gram[..., i, j] * step[j] for j in range(3)) - 2 * product[..., i]) for i in range(3))
     zero = np.zeros((), square.dtype)
     change, *x = jax.lax.reduce(

@@ -220,27 +220,32 @@ class Polisher(NamedTuple):
     def settle(self, point: Point) -> tuple[Point, Sums]:
         """Residual passes with joint corrections until n stands still: exact cost, sums about the target.
 
-        Where noise leaves n loosely determined a Gauss-Newton step may pass the minimum. A point that costs more than
-        the last is brought back, to the minimum of the parabola through both; nothing is returned on the word of the
+        At each exponent the best coefficients are found anew, so that a coefficient may leave 0 or come to it. Where
+        noise leaves n loosely determined a Gauss-Newton step may pass the minimum: a point that costs more than the
+        last is brought back, to the minimum of the parabola through both. Nothing is returned on the word of the
         quadratic model unless its step was negligible.
         """
         held, slope = None, 0.0
         for attempt in itertools.count(1):
-            parts = sums(self.pictures, point.log_n[None], point.x, peak=self.problem.peak)
-            cost = float(np.sum(parts.square))
-            if held is not None and cost > (1 + float(self.problem.tolerance)) * float(np.sum(held[1].square)):
-                last = held[0]
-                rise = cost - float(np.sum(held[1].square))
+            reference = point.x
+            parts = sums(self.pictures, point.log_n[None], reference, peak=self.problem.peak)
+            solved = jax.tree.map(np.asarray, solve_linear(parts, reference, self.problem))
+            here, before = Point(point.log_n, solved.x, solved.cost), float(np.sum(parts.square))
+            rise = 0.0 if held is None else float(np.sum(here.cost)) - float(np.sum(held.cost))
+            if held is not None and rise > float(self.problem.tolerance) * float(np.sum(held.cost)):
                 share = np.clip(-slope / (2 * (rise - slope)), 0.1, 0.5)
                 slope *= share
-                point = jax.tree.map(lambda old, new, share=share: old + share * (new - old), last, point)
+                point = jax.tree.map(lambda old, new, share=share: old + share * (new - old), held, here)
                 left = math.inf
             else:
-                held = Point(point.log_n, point.x, parts.square), parts
-                point, left = _correct(parts, point, self.problem)
-                step = np.concatenate([point.x - held[0].x, (point.log_n - held[0].log_n) * held[0].x[:, 2:]], axis=1)
-                slope = -2 * float(np.sum(step * parts.product))
+                held, told = here, parts.about(np.pad(reference, [(0, 0), (0, 1)]))
+                # The sums with the residual against the best coefficients at this exponent.
+                parts = parts.about(np.pad(reference - here.x, [(0, 0), (0, 1)]))._replace(square=here.cost)
+                point, left = _correct(parts, here, self.problem)
+                slope = -2 * float((point.log_n - here.log_n) * np.sum(here.x[:, 2] * parts.product[:, 3]))
+                if before > 2 * float(np.sum(here.cost)) + float(self.problem.tolerance) * float(np.sum(told.square)):
+                    # A difference of far larger sums: known to fewer digits than about the coefficients themselves.
+                    left = math.inf
             if left <= self.problem.accuracy or attempt == _MOST_CORRECTIONS:
-                found = point if left <= self.problem.accuracy else held[0]
-                return found, held[1].about(np.pad(held[0].x, [(0, 0), (0, 1)]))
+                return (point if left <= self.problem.accuracy else held), told
         raise AssertionError
