@@ -44,7 +44,7 @@ def report_page(result: FitResult, *, source: str = "", command: str = "") -> st
     """One self-contained HTML page about a fit.
 
     Args:
-        result: of a fit; of several pictures the first is shown.
+        result: of a fit; of several pictures the one that is explained worst is shown.
         source: what was fitted, for the title.
         command: how it was made.
 
@@ -58,7 +58,8 @@ def report_page(result: FitResult, *, source: str = "", command: str = "") -> st
     left_out = [f"{count} pixels {reason}" for reason, count in result.left_out.items() if count]
     summary = f"Residual {100 * result.residual:.3g} % of the picture (rms) over {result.pixels} pixels."
     summary += f" Left out: {', '.join(left_out)}." if left_out else ""
-    several = f" The first of {len(result.targets)} pictures is shown." if len(result.targets) > 1 else ""
+    count = len(result.targets)
+    several = f" Of {count} pictures the one that is explained worst is shown." if count > 1 else ""
     alternative = "target, fit, residual, the highlight enlarged, a scanline through it, and the profile of n"
     made = {
         "command": command,
@@ -117,10 +118,17 @@ def _candidates(result: FitResult) -> list[str]:
         return []
     rows = []
     for one in result.candidates:
-        name = getattr(one, "name", one.model)
-        rows.append([name, str(one.unknowns), f"{one.rms:.3e}", f"{one.bic:.4g}", "chosen" if one.chosen else ""])
-    head = ["model", "unknowns", "rms", "BIC, over the best", ""]
-    return ["<h2>What the scene requires</h2>", _table(rows, head=head)]
+        mark = "chosen" if one.chosen else "adequate" if one.excess <= one.excess_error else ""
+        excess = f"{one.excess:.4g} ± {one.excess_error:.2g}"
+        rows.append(
+            [one.name, str(one.unknowns), f"{one.rms:.3e}", f"{one.held_out:.3e}", excess, f"{one.bic:.4g}", mark]
+        )
+    head = ["model", "unknowns", "rms", "held out", "excess ± its error", "BIC, over the best", ""]
+    told = (
+        "<p>The simplest adequate model is chosen: its squared error expected on held-out pixels exceeds that of the "
+        "best, in noise variances, by no more than its standard error.</p>"
+    )
+    return ["<h2>What the scene requires</h2>", told, _table(rows, head=head)]
 
 
 def _warnings(result: FitResult) -> list[str]:
@@ -128,6 +136,11 @@ def _warnings(result: FitResult) -> list[str]:
 
 
 def _table(rows: list[list[str]], align: str = "right", head: list[str] | None = None) -> str:
+    """A table, without the columns that are empty in every row."""
+    filled = [any(column) for column in zip(*rows, strict=True)]
+    rows = [[cell for cell, keep in zip(row, filled, strict=True) if keep] for row in rows]
+    if head is not None:
+        head = [cell for cell, keep in zip(head, filled, strict=True) if keep]
     lines = [] if head is None else ["".join(f"<th>{html.escape(cell)}</th>" for cell in head)]
     for row in rows:
         lines.append("".join(f'<td style="text-align:{align}">{html.escape(cell)}</td>' for cell in row))

@@ -18,8 +18,6 @@ from fitting.selection import Candidate
 NOT_DETERMINED = "not determined"
 # Beyond this relative error an interval of n is told: it is no longer symmetric.
 LOPSIDED = 0.01
-# Correlations above this are told, so many at most.
-STRONG, MOST_CORRELATIONS = 0.9, 3
 
 
 @dataclass(frozen=True)
@@ -94,6 +92,7 @@ class FitResult:
         targets: the pictures, (H, W, C) each.
         scenes: their scenes.
         counted: which pixels counted, (H, W) each.
+        names: of the pictures' files; empty where they came without.
         choice: what an accuracy or a time to spend made of the fit; None without one.
     """
 
@@ -115,6 +114,7 @@ class FitResult:
     targets: Sequence[np.ndarray] = field(repr=False)
     scenes: Sequence[brdf.Scene] = field(repr=False)
     counted: Sequence[np.ndarray] = field(repr=False)
+    names: Sequence[str] = ()
     choice: BudgetChoice | None = None
 
     @property
@@ -143,6 +143,8 @@ class FitResult:
 
     def __str__(self) -> str:
         """The report."""
+        from fitting.text_report import report
+
         return report(self)
 
     def _repr_html_(self) -> str:
@@ -205,11 +207,11 @@ class FitResult:
                 figure = self.plot()
                 figure.savefig(stage / "comparison.png", dpi=150)
 
-    def plot(self, picture: int = 0) -> Any:
+    def plot(self, picture: int | None = None) -> Any:
         """Target, fit and residual side by side.
 
         Args:
-            picture: which of the pictures.
+            picture: which of the pictures, from 0; None takes the one that is explained worst. The title says which.
 
         Returns:
             A matplotlib figure.
@@ -234,63 +236,3 @@ def _finite(value: float) -> float | None:
 
 def _key(parameter: Parameter) -> str:
     return parameter.name if parameter.channel is None else f"{parameter.name}[{parameter.channel}]"
-
-
-def report(result: FitResult) -> str:
-    """The text that a person reads.
-
-    Args:
-        result: of a fit.
-    """
-    channels = result.material.k_d.shape[0]
-    count = f"{len(result.targets)} pictures, " if len(result.targets) > 1 else ""
-    plural = "channel" if channels == 1 else "channels"
-    loss = "" if result.loss == "squared" else f", {result.loss} loss"
-    lines = [
-        f"{result.surface} fitted to {count}{result.pixels} pixels x {channels} {plural} "
-        f"in {result.seconds:.2g} s ({result.precision}{loss})"
-    ]
-    labels = brdf.channel_names(channels)
-    for parameter in result.parameters:
-        label = "" if parameter.channel is None else labels[parameter.channel]
-        lines.append(f"  {parameter.name:<4}{label:<6} {parameter}")
-    lines.append(f"  residual    {100 * result.residual:.3g} % of the picture (rms)")
-    for reason, pixels in result.left_out.items():
-        if pixels:
-            lines.append(f"  left out    {pixels} pixels {reason}")
-    if result.highlight_pixels is not None:
-        lines.append(f"  highlight   on {result.highlight_pixels:.3g} pixels")
-    lines += [] if result.choice is None else result.choice.lines()
-    lines += _correlations(result)
-    if result.candidates:
-        lines += _candidates(result.candidates)
-    lines += [f"  warning: {warning}" for warning in result.warnings]
-    return "\n".join(lines)
-
-
-def _correlations(result: FitResult) -> list[str]:
-    """The strongest correlations, as far as they are worth a line."""
-    free = result.free_parameters
-    pairs = [(abs(result.correlation[i, j]), i, j) for i in range(len(free)) for j in range(i)]
-    # A grey k_s is one number in all channels.
-    pairs = [(size, i, j) for size, i, j in pairs if free[i].name != free[j].name or size < 1 - 1e-9]
-    strong = sorted((pair for pair in pairs if pair[0] > STRONG), reverse=True)[:MOST_CORRELATIONS]
-    labels = brdf.channel_names(result.material.k_d.shape[0])
-    names = ["n" if one.channel is None else f"{one.name} {labels[one.channel]}".rstrip() for one in free]
-    words = [f"{names[j]} and {names[i]} {result.correlation[i, j]:+.2f}" for _, i, j in strong]
-    return [f"  correlated  {', '.join(words)}"] if words else []
-
-
-def _candidates(candidates: Sequence[Candidate]) -> list[str]:
-    lines = [
-        "  what the scene requires (squared error expected on held-out pixels, over the best, in noise variances):",
-        f"    {'model':<40}{'unknowns':>9}{'rms':>11}{'held out':>11}{'excess ± its error':>26}{'BIC':>12}",
-    ]
-    for one in candidates:
-        mark = "  <- chosen" if one.chosen else "  adequate" if one.excess <= one.excess_error else ""
-        excess = f"{one.excess:.1f} ± {one.excess_error:.1f}" if one.excess < 1e6 else f"{one.excess:.2e}"
-        bic = f"{one.bic:.1f}" if one.bic < 1e6 else f"{one.bic:.2e}"
-        lines.append(
-            f"    {one.name:<40}{one.unknowns:>9}{one.rms:>11.3e}{one.held_out:>11.3e}{excess:>26}{bic:>12}{mark}"
-        )
-    return lines

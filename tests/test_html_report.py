@@ -1,5 +1,6 @@
 """The report page: complete, self-contained, and shown by a real browser."""
 
+import dataclasses
 import json
 import re
 import shutil
@@ -75,3 +76,17 @@ def test_chromium_shows_the_page(page: str, width: int, tmp_path: Path):
     pixels = brdf.read_image(shot)
     assert pixels.shape[0] > 800
     assert np.std(pixels) > 0.05
+
+
+def test_columns_without_content_are_not_shown(result: fitting.FitResult):
+    """One channel has no name, and without errors there is no interval."""
+    (scene,), (target,) = result.scenes, result.targets
+    lamp = brdf.DirectionalLight(direction=scene.lights[0].direction, intensity=[0.9])
+    grey_scene = brdf.Scene(camera=scene.camera, shapes=scene.shapes, lights=(lamp,))
+    grey = fitting.fit(target[..., :1], grey_scene, model="lambert")
+    parameters = tuple(dataclasses.replace(one, error=None, interval=None) for one in grey.parameters)
+    bare = report_page(dataclasses.replace(grey, parameters=parameters))
+    assert "<th>value</th>" in bare
+    for head in ("channel", "± error", "95 % interval"):
+        assert f"<th>{head}</th>" in report_page(result)
+        assert f"<th>{head}</th>" not in bare

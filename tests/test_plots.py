@@ -1,5 +1,7 @@
 """Pictures of a fit: encoded for a screen, signed, complete, and drawn for every kind of result."""
 
+import dataclasses
+
 import matplotlib
 import numpy as np
 import pytest
@@ -94,3 +96,22 @@ def test_overview_has_four_quarters(material: brdf.Material, tmp_path):
     assert any("f_r" in title for title in titles)
     assert "Light reflected, of that arriving" in titles
     assert titles[0].startswith(material.name)
+
+
+def test_of_several_pictures_the_one_explained_worst_is_drawn_and_named():
+    result = fit(brdf.Lambert(k_d=0.5), "lambert")
+    (scene,), (target,) = result.scenes, result.targets
+    noise = np.random.default_rng(1).normal(0, 0.02, target.shape).astype(np.float32)
+    both = fitting.fit([target, target + noise, target], [scene] * 3, model="lambert")
+    assert both.plot().get_suptitle() == "picture 2 of 3 (explained worst)"
+    named = dataclasses.replace(both, names=("a.png", "b.png", "c.png"))
+    assert named.plot(2).get_suptitle() == "picture 3 of 3, c.png"
+    assert result.plot().get_suptitle() == ""
+    with pytest.raises(brdf.InputError, match="picture: must be from 0 to 2, got 3"):
+        both.plot(3)
+
+
+def test_a_spectrum_is_drawn_from_its_first_channel_to_its_last():
+    figure = fit(brdf.Lambert(k_d=np.linspace(0.1, 0.9, 9)), "lambert").plot()
+    labels = [text.get_text() for text in figure.axes[-1].get_legend().get_texts()]
+    assert (labels[0], labels[-2]) == ("channel 0", "channel 8")

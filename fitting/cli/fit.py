@@ -1,5 +1,6 @@
 """``brdf fit`` and ``brdf lights``: pictures, photographs of a ball, archives and measured BRDFs."""
 
+import dataclasses
 import json
 import shlex
 import sys
@@ -198,7 +199,9 @@ def _fit_pictures(
     numbers = None if noise is None else parse_numbers(noise, "--noise", 2, "READ,SHOT")
     how["noise"] = None if numbers is None else (numbers[0], numbers[1])
     with single_fit():
-        return fit_either(read, lambda pictures: collect(target, given, pictures), how)
+        result, notes = fit_either(read, lambda pictures: collect(target, given, pictures), how)
+    names = tuple(path.name for path in read)
+    return (dataclasses.replace(result, names=names) if len(names) == len(result.targets) else result), notes
 
 
 def _save(result: Any, out: Path, **how: bool) -> None:

@@ -9,6 +9,7 @@ import matplotlib
 import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 import brdf
 from fitting.result import FitResult
@@ -31,15 +32,21 @@ SIGNED = "cividis"
 """For signed values: blue, grey at zero, yellow; lightness only grows, so that the sign survives printing in grey."""
 
 
-def comparison(result: FitResult, picture: int = 0) -> Figure:
+def comparison(result: FitResult, picture: int | None = None) -> Figure:
     """Target, fit and signed residual; the highlight enlarged, a scanline through it, and the profile of n.
 
     Pixels left out are grey in the residual. Without a specular term the second row is the scanline alone.
 
     Args:
         result: of a fit.
-        picture: which of its pictures.
+        picture: which of its pictures, from 0; None takes the one that is explained worst.
+
+    Raises:
+        InputError: where there is no such picture.
     """
+    why = " (explained worst)" if picture is None else ""
+    picture = explained_worst(result) if picture is None else picture
+    title = named_picture(result, picture, why)
     target, fitted = np.asarray(result.targets[picture]), result.fitted(picture)
     counted = np.asarray(result.counted[picture])
     values = target[counted]
@@ -48,6 +55,7 @@ def comparison(result: FitResult, picture: int = 0) -> Figure:
     specular = isinstance(result.material, brdf.SpecularMaterial) and bool(np.any(np.asarray(result.material.k_s)))
     with matplotlib.rc_context(PRINT):
         figure = Figure(figsize=(7.2, 4.9), layout="constrained")
+        figure.suptitle(title, fontsize=PRINT["axes.titlesize"])
         grid = figure.add_gridspec(2, 3)
         above = [figure.add_subplot(grid[0, column]) for column in range(3)]
         for axes, image, title in zip(above, (target, fitted), ("target", f"fit, {result.surface}"), strict=False):
@@ -66,13 +74,47 @@ def comparison(result: FitResult, picture: int = 0) -> Figure:
     return figure
 
 
+def explained_worst(result: FitResult) -> int:
+    """Which picture has the largest residual, as a share of itself.
+
+    Args:
+        result: of a fit.
+    """
+    if len(result.targets) == 1:
+        return 0
+    shares = []
+    for index, (target, counted) in enumerate(zip(result.targets, result.counted, strict=True)):
+        values, known = np.asarray(target, np.float64), np.asarray(counted)[..., None]
+        left = np.sum((result.fitted(index) - values) ** 2, where=known)
+        shares.append(left / max(float(np.sum(values**2, where=known)), np.finfo(float).tiny))
+    return int(np.argmax(shares))
+
+
+def named_picture(result: FitResult, picture: int, why: str = "") -> str:
+    """Which picture is shown, in words; its name alone, or nothing, where it is the only one.
+
+    Args:
+        result: of a fit.
+        picture: which, from 0.
+        why: it is shown, to be added where there are several.
+
+    Raises:
+        InputError: where there is no such picture.
+    """
+    count = len(result.targets)
+    if not 0 <= picture < count:
+        raise brdf.InputError("picture", f"must be from 0 to {count - 1}, got {picture}", "Count the pictures from 0")
+    name = result.names[picture] if result.names else ""
+    return name if count == 1 else f"picture {picture + 1} of {count}{', ' if name else ''}{name}{why}"
+
+
 class _Box:
     """Where the highlight is: its row, and the rows and columns worth enlarging."""
 
     def __init__(self, image: Float[np.ndarray, "H W"]):
         height, width = image.shape
         self.row, column = (int(i) for i in np.unravel_index(np.argmax(image), image.shape))
-        bright = np.argwhere(image > 0.05 * image.max()) if image.max() > 0 else np.array([[0, 0]])
+        bright = np.argwhere(image > 0.2 * image.max()) if image.max() > 0 else np.array([[0, 0]])
         reach = int(np.max(np.abs(bright - [self.row, column]))) + 2
         reach = min(max(reach, 8), max(height, width) // 2)
         self.rows = slice(max(self.row - reach, 0), min(self.row + reach + 1, height))
@@ -113,15 +155,19 @@ def _enlarged(axes: Any, target: np.ndarray, fitted: np.ndarray, box: _Box, whit
 
 def _scanline(axes: Any, target: np.ndarray, fitted: np.ndarray, counted: np.ndarray, row: int, columns: slice) -> None:
     place = np.arange(columns.start, columns.stop)
-    names = brdf.channel_names(target.shape[-1])
+    channels = target.shape[-1]
+    names = brdf.channel_names(channels)
     step = max(1, len(place) // 30)
-    for channel in range(min(target.shape[-1], len(CHANNEL_COLOURS))):
-        colour = CHANNEL_COLOURS[channel]
+    seen = counted[row, columns] | np.any(fitted[row, columns] != 0, axis=-1)
+    # Of a spectrum, as many channels as there are colours, from the first to the last.
+    shown = np.unique(np.linspace(0, channels - 1, min(channels, len(CHANNEL_COLOURS))).round().astype(int))
+    for index, channel in enumerate(shown):
+        colour, style = CHANNEL_COLOURS[index], CHANNEL_STYLES[index % len(CHANNEL_STYLES)]
         known = np.where(counted[row, columns], target[row, columns, channel], np.nan)
-        style = CHANNEL_STYLES[channel % len(CHANNEL_STYLES)]
+        line = np.where(seen, fitted[row, columns, channel], np.nan)
+        label = "fit" if channels == 1 else names[channel] if channels == 3 else f"channel {names[channel]}"
         axes.plot(place[::step], known[::step], "o", color=colour, markersize=2.5, markerfacecolor="none")
-        label = names[channel] or "fit"
-        axes.plot(place, fitted[row, columns, channel], style, color=colour, linewidth=1.2, label=label)
+        axes.plot(place, line, style, color=colour, linewidth=1.2, label=label)
     axes.plot([], [], "o", color="0.3", markersize=2.5, markerfacecolor="none", label="target")
     axes.set(xlabel=f"column, in row {row}", ylabel="radiance (linear)", title="scanline")
     axes.legend(frameon=False, handlelength=2.2, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.2))
@@ -141,22 +187,18 @@ def _profile(axes: Any, result: FitResult) -> None:
         percent = 100 * np.sqrt(np.maximum(profile, 0.0) / np.sum(optimum.square))
         axes.plot(grid, percent, color="black", linewidth=1.2)
         axes.set(ylabel="least residual, % of the picture", xlim=(grid[0], grid[-1]))
-        axes.set_yscale("log" if percent.max() > 5 * max(percent.min(), 1e-9) else "linear")
+        if percent.max() > 5 * max(percent.min(), 1e-9):
+            axes.set_yscale("log")
+            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axes.yaxis.set_major_formatter("{x:g}")
+            axes.yaxis.set_minor_formatter(NullFormatter())
     if found is None or found.value is None:
         axes.set_title("profile of n: not determined")
         return
     axes.axvline(found.value, color=CHANNEL_COLOURS[0], linewidth=1)
-    interval = getattr(found, "interval", None)
     text = f"n = {found.value:.5g}"
-    if interval is not None:
-        low, high = max(interval[0], 1e-3), min(interval[1], 1e9)
+    if found.interval is not None:
+        low, high = max(found.interval[0], 1e-3), min(found.interval[1], 1e9)
         axes.axvspan(low, high, color=CHANNEL_COLOURS[5], alpha=0.5, linewidth=0)
-        text += f"\n95 %: {interval[0]:.6g}\nto {interval[1]:.6g}"
-    right = found.value < 300
-    axes.annotate(
-        text,
-        (0.97 if right else 0.03, 0.05),
-        xycoords="axes fraction",
-        ha="right" if right else "left",
-        fontsize=7,
-    )
+        text += f", 95 %:\n{found.interval[0]:.6g} to {found.interval[1]:.6g}"
+    axes.set_xlabel(f"exponent n\n{text}")  # where no curve runs through it
