@@ -225,20 +225,23 @@ class Polisher(NamedTuple):
         last is brought back, to the minimum of the parabola through both. Nothing is returned on the word of the
         quadratic model unless its step was negligible.
         """
-        held, slope = None, 0.0
+        held: tuple[Point, Sums] | None = None
+        slope = 0.0
         for attempt in itertools.count(1):
             reference = point.x
             parts = sums(self.pictures, point.log_n[None], reference, peak=self.problem.peak)
             solved = jax.tree.map(np.asarray, solve_linear(parts, reference, self.problem))
             here, before = Point(point.log_n, solved.x, solved.cost), float(np.sum(parts.square))
-            rise = 0.0 if held is None else float(np.sum(here.cost)) - float(np.sum(held.cost))
-            if held is not None and rise > float(self.problem.tolerance) * float(np.sum(held.cost)):
+            last = math.inf if held is None else float(np.sum(held[0].cost))
+            rise = float(np.sum(here.cost)) - last
+            if held is not None and rise > float(self.problem.tolerance) * last:
                 share = np.clip(-slope / (2 * (rise - slope)), 0.1, 0.5)
                 slope *= share
-                point = jax.tree.map(lambda old, new, share=share: old + share * (new - old), held, here)
+                point = jax.tree.map(lambda old, new, share=share: old + share * (new - old), held[0], here)
                 left = math.inf
             else:
-                held, told = here, parts.about(np.pad(reference, [(0, 0), (0, 1)]))
+                told = parts.about(np.pad(reference, [(0, 0), (0, 1)]))
+                held = here, told
                 # The sums with the residual against the best coefficients at this exponent.
                 parts = parts.about(np.pad(reference - here.x, [(0, 0), (0, 1)]))._replace(square=here.cost)
                 point, left = _correct(parts, here, self.problem)
@@ -247,5 +250,5 @@ class Polisher(NamedTuple):
                     # A difference of far larger sums: known to fewer digits than about the coefficients themselves.
                     left = math.inf
             if left <= self.problem.accuracy or attempt == _MOST_CORRECTIONS:
-                return (point if left <= self.problem.accuracy else held), told
+                return (point if left <= self.problem.accuracy else held[0]), held[1]
         raise AssertionError
