@@ -120,3 +120,10 @@ def test_a_file_goes_before_a_name(capsys, tmp_path: Path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "gold").write_text("{}")
     assert "gold: is no material file, got no suffix" in run(capsys, "check", "gold", status=2)
+
+
+@pytest.mark.parametrize(
+    ("words", "help_of"), [(["fit"], "brdf fit"), (["check", "a", "b"], "brdf check"), (["nope"], "brdf")]
+)
+def test_a_usage_error_ends_with_where_help_is(capsys, words: list[str], help_of: str):
+    assert run(capsys, *words, status=2).endswith(f". See {help_of} --help.\n")

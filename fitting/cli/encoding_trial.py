@@ -112,8 +112,14 @@ def judge(jobs: tuple[Job, Job], results: tuple[FitResult, FitResult]) -> tuple[
     left, other_left = (f"{100 * share**0.5:.{2 if share < 0.99 else 3}g} %" for share in shares)
     silent = f"{jobs[0].target.name} does not say how its values are encoded"
     if shares[1] < CLEARLY * shares[0]:
-        told = f"{silent}: read as {other}, which leaves {other_left} where {assumed} leaves {left}; --encoding decides"
+        told = (
+            f"{silent}: read as {other}, under which the fit is off by {other_left} of the values in the file (rms), "
+            f"under {assumed} by {left}. Where you know better, say so with --encoding"
+        )
         return True, told
     if shares[0] < CLEARLY * shares[1]:
         return False, ""
-    return False, f"{silent}: {assumed} is a guess, it leaves {left}, {other} {other_left}; --encoding decides"
+    return False, (
+        f"{silent}: {assumed} is a guess. Under it the fit is off by {left} of the values in the file (rms), under "
+        f"{other} by {other_left}: too alike to tell. Where you know, say so with --encoding"
+    )

@@ -133,7 +133,7 @@ def main(arguments: list[str] | None = None) -> Any:
     except USAGE_ERROR as error:
         if not _words(error):  # no command at all: the help has been shown
             sys.exit(2)
-        _fail(f"{_words(error).rstrip('.')}. Try brdf --help.")
+        _fail(f"{_words(error).rstrip('.')}. See {_command(error)} --help.")
     except KeyboardInterrupt:
         _fail("interrupted.", status=INTERRUPTED)
     except BrokenPipeError:
@@ -147,6 +147,12 @@ def main(arguments: list[str] | None = None) -> Any:
 
 def _words(error: Any) -> str:
     return " ".join(error.format_message().split())
+
+
+def _command(error: Any) -> str:
+    """The command, as far as it was understood: brdf fit."""
+    context = getattr(error, "ctx", None)
+    return "brdf" if context is None else context.command_path
 
 
 def _fail(message: str, status: int = 2) -> None:
