@@ -327,7 +327,7 @@ def test_a_picture_that_fits_both_ways_says_that_its_encoding_is_a_guess(tmp_pat
     circle = f"{BALL.x},{BALL.y},{BALL.radius}"
     status, out, err = run(capsys, "fit", "ball.png", "--sphere", circle, "--light", "0,0,1", "--model", "lambert")
     assert status == 0, err
-    assert len(re.findall("sRGB is a guess\. Under it .* linear", out)) == 1
+    assert len(re.findall(r"sRGB is a guess\. Under it .* linear", out)) == 1
 
 
 def test_normals_and_archives_say_the_same(photographs, capsys, monkeypatch):
