@@ -16,20 +16,17 @@ from typing import Any, Literal
 
 import equinox as eqx
 import jax
-import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 import brdf
+from fitting.joint_problem import JointProblem
 from fitting.observation import Tile, observe
 
 LARGEST_JACOBIAN = 1 << 27
 ROUNDS = 8
-
-# What freed leaves may not go below. A direction or a position has no bound, n is searched by its logarithm.
-_NOT_NEGATIVE = ("k_a", "k_d", "k_s", "intensity", "radiance", "ambient", "attenuation")
 
 
 @dataclass(frozen=True)
@@ -103,95 +100,54 @@ def fit_jointly(
             for picture, place, one in zip(targets, scenes, masks, strict=True)
         ]
         start = brdf.cast((material, scenes), precision)
-        leaves = tuple(free(*start))
-        if not leaves:
-            raise brdf.InputError("free", "names no leaf", "Return the leaves to fit")
-        problem = _Problem(start, free, seen)
-        size = sum(leaf.size for leaf in leaves)
+        problem = JointProblem.of(start, free, seen)
         values = sum(observation.target.size for observation in seen)
-        chosen = solver or ("lm" if values * size <= LARGEST_JACOBIAN else "bfgs")
-        return _solve(problem, leaves, chosen, tolerance, max_steps)
+        chosen = solver or ("lm" if values * problem.origin.size <= LARGEST_JACOBIAN else "bfgs")
+        return _solve(problem, chosen, tolerance, max_steps)
 
 
-class _Problem:
-    """From a vector of freed numbers to weighted residuals."""
+@eqx.filter_jit
+def _run(
+    problem: JointProblem,
+    vector: Float[Array, " K"],
+    held: Bool[Array, " K"],
+    solver: str,
+    tolerance: float,
+    max_steps: int,
+) -> optx.Solution:
+    """The solver's answer with some of the freed numbers held."""
 
-    def __init__(self, start: Any, free: Callable[..., Sequence[Any]], seen: list[Tile]):
-        self.start, self.free, self.seen = start, free, seen
-        leaves = tuple(free(*start))
-        names = _names(start, free)
-        self.is_n = [name == "n" for name in names]
-        self.bounded = [name in _NOT_NEGATIVE for name in names]
-        coded = tuple(jnp.log(leaf) if is_n else leaf for leaf, is_n in zip(leaves, self.is_n, strict=True))
-        self.origin, self.unravel = jax.flatten_util.ravel_pytree(coded)
-        low = [np.full(leaf.shape, 0.0 if one else -np.inf) for leaf, one in zip(leaves, self.bounded, strict=True)]
-        self.lower = np.concatenate([bound.ravel() for bound in low])
+    def residuals(free: Array, problem: JointProblem) -> list[Array]:
+        return problem.residuals(jnp.where(held, vector, free))
 
-    def decode(self, vector: Float[Array, " K"]) -> tuple[Array, ...]:
-        """The freed leaves."""
-        return tuple(
-            jnp.exp(leaf) if is_n else leaf for leaf, is_n in zip(self.unravel(vector), self.is_n, strict=True)
-        )
+    if solver == "lm":
+        method = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
+        return optx.least_squares(residuals, method, vector, problem, max_steps=max_steps, throw=False)
 
-    def put(self, vector: Float[Array, " K"]) -> Any:
-        """Material and scenes with the freed leaves in place."""
-        return eqx.tree_at(lambda tree: tuple(self.free(*tree)), self.start, self.decode(vector))
+    def cost(free: Array, problem: JointProblem) -> Array:
+        return _half_square(residuals(free, problem))
 
-    def residuals(self, vector: Float[Array, " K"], seen: list[Tile]) -> list[Array]:
-        """Weighted residuals of each picture."""
-        material, scenes = self.put(vector)
-        found = []
-        for observation, scene in zip(seen, scenes, strict=True):
-            residual = brdf.render(material, scene).reshape(observation.target.shape) - observation.target
-            if observation.weight is not None:
-                counts = observation.weight[:, None] > 0
-                residual = jnp.where(counts, residual * jnp.where(counts, observation.weight[:, None], 1) ** 0.5, 0)
-            found.append(residual)
-        return found
+    method = optx.BFGS(rtol=tolerance, atol=tolerance)
+    return optx.minimise(cost, method, vector, problem, max_steps=max_steps, throw=False)
 
 
-def _names(start: Any, free: Callable[..., Sequence[Any]]) -> list[str]:
-    """The field that each freed leaf is, read off the path of a marker put there."""
-    leaves = tuple(free(*start))
-    marked = eqx.tree_at(lambda tree: tuple(free(*tree)), start, [_Marker(index) for index in range(len(leaves))])
-    paths = jax.tree_util.tree_leaves_with_path(marked, is_leaf=lambda leaf: isinstance(leaf, _Marker))
-    found = {leaf.index: path[-1].name for path, leaf in paths if isinstance(leaf, _Marker)}
-    return [found[index] for index in range(len(leaves))]
+@eqx.filter_jit
+def _gradient(problem: JointProblem, vector: Float[Array, " K"]) -> Float[Array, " K"]:
+    return jax.grad(lambda free: _half_square(problem.residuals(free)))(vector)
 
 
-@dataclass(frozen=True)
-class _Marker:
-    index: int
-
-
-def _solve(problem: _Problem, leaves: tuple[Any, ...], solver: str, tolerance: float, max_steps: int) -> JointResult:
-    @eqx.filter_jit
-    def run(vector: Array, held: Bool[Array, " K"], seen: list[Tile]) -> Any:
-        def residuals(free: Array, _: Any) -> list[Array]:
-            return problem.residuals(jnp.where(held, vector, free), seen)
-
-        if solver == "lm":
-            method = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
-            return optx.least_squares(residuals, method, vector, max_steps=max_steps, throw=False)
-
-        def cost(free: Array, args: Any) -> Array:
-            return _half_square(residuals(free, args))
-
-        method = optx.BFGS(rtol=tolerance, atol=tolerance)
-        return optx.minimise(cost, method, vector, max_steps=max_steps, throw=False)
-
-    gradient = eqx.filter_jit(jax.grad(lambda vector, seen: _half_square(problem.residuals(vector, seen))))
+def _solve(problem: JointProblem, solver: str, tolerance: float, max_steps: int) -> JointResult:
     vector, lower = problem.origin, problem.lower
     held = np.zeros(lower.shape, bool)
     steps, converged = 0, False
     for _ in range(ROUNDS):
-        solution = run(vector, jnp.asarray(held), problem.seen)
+        solution = _run(problem, vector, jnp.asarray(held), solver, tolerance, max_steps)
         steps += int(solution.stats["num_steps"])
         converged = bool(solution.result == optx.RESULTS.successful)
         vector = jnp.where(held, vector, solution.value)
         below = np.asarray(vector) < lower
         vector = jnp.maximum(vector, lower.astype(vector.dtype))
-        inwards = held & (np.asarray(gradient(vector, problem.seen)) < 0)
+        inwards = held & (np.asarray(_gradient(problem, vector)) < 0)
         if not below.any() and not inwards.any():
             break
         held = (held | below) & ~inwards
@@ -213,22 +169,23 @@ def _half_square(residuals: list[Array]) -> Array:
     return 0.5 * jnp.sum(jnp.stack([jnp.sum(residual * residual) for residual in residuals]))
 
 
-def _errors(problem: _Problem, vector: Array, held: np.ndarray) -> tuple[tuple[np.ndarray, ...], float]:
+@eqx.filter_jit
+def _column(problem: JointProblem, vector: Float[Array, " K"], direction: Float[Array, " K"]) -> Float[Array, " R"]:
+    tangents = jax.jvp(problem.residuals, (vector,), (direction,))[1]
+    return jnp.concatenate([tangent.ravel() for tangent in tangents])
+
+
+@eqx.filter_jit
+def _values(problem: JointProblem, vector: Float[Array, " K"]) -> Float[Array, " R"]:
+    return jnp.concatenate([residual.ravel() for residual in problem.residuals(vector)])
+
+
+def _errors(problem: JointProblem, vector: Array, held: np.ndarray) -> tuple[tuple[np.ndarray, ...], float]:
     """Standard errors from the Gauss-Newton Hessian, one column of the Jacobian at a time."""
-
-    @eqx.filter_jit
-    def column(direction: Array, seen: list[Tile]) -> Array:
-        tangents = jax.jvp(lambda v: problem.residuals(v, seen), (vector,), (direction,))[1]
-        return jnp.concatenate([tangent.ravel() for tangent in tangents])
-
-    @eqx.filter_jit
-    def values(seen: list[Tile]) -> Array:
-        return jnp.concatenate([residual.ravel() for residual in problem.residuals(vector, seen)])
-
     size = vector.size
-    columns = [np.asarray(column(direction, problem.seen), np.float64) for direction in jnp.eye(size)]
+    columns = [np.asarray(_column(problem, vector, direction), np.float64) for direction in jnp.eye(size)]
     gram = np.array([[left @ right for right in columns] for left in columns])
-    residual = np.asarray(values(problem.seen), np.float64)
+    residual = np.asarray(_values(problem, vector), np.float64)
     square = sum(float(np.sum(np.square(np.asarray(_counted(o)), dtype=np.float64))) for o in problem.seen)
     pixels = sum(int(_counted(o).size) for o in problem.seen)
     variance = float(residual @ residual) / max(pixels - size, 1)
