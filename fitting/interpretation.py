@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 import brdf
 from fitting.engine.separable import Optimum
 from fitting.engine.sums import Picture
+from fitting.missing_ambient import missing_ambient
 from fitting.result import Parameter
 from fitting.uncertainty.covariance import TERMS, Uncertainty, residual_noise, uncertainty
 from fitting.uncertainty.intervals import exponent_interval
@@ -138,6 +139,8 @@ def interpret(
         material = fit.model(k_a=k[0], k_d=k[1])  # pyright: ignore[reportCallIssue]
     parameters = _parameters(material, sure, factors, interval, optimum.n)
     warnings = _warnings(known, seen if "k_s" not in sure.undetermined else None, sure, parameters, material)
+    ambient = missing_ambient(pictures)
+    warnings = (ambient, *warnings) if ambient else warnings
     if fit.capped:
         labels = brdf.channel_names(k.shape[1])
         held = ", ".join(labels[channel] for channel in np.flatnonzero(k[1] + k[2] >= 1 - 1e-6))
