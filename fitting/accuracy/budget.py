@@ -110,6 +110,8 @@ def fit_within(
     lamps, attempts = Lamps(), []
     has_samples = any(extended(scene) for scene in scenes)
     reason = "" if has_samples else _reason_for_all(targets, scenes, model, options, accuracy)
+    if reason and accuracy is not None and accuracy <= COARSE and any(map(casts_shadows, scenes)):
+        precision = "float64"  # in float32 the pixels at a shadow's edge alone are of that order
     now = Configuration(model, precision, None if reason else FIRST_PIXELS, FIRST_SAMPLES if has_samples else None)
     n_range = None
     while True:
@@ -177,9 +179,9 @@ def _attempt(
 ) -> _Step:
     done = run(targets, scenes, configuration, options, lamps, n_range)
     shadows = any(map(casts_shadows, scenes))
-    rule = rounding_by_rule(done.result.optimum.n, configuration.precision, shadows=shadows)
-    known = accuracy is not None and accuracy >= COARSE and (3 * rule < accuracy or shadows)
-    if known and configuration.pixels is None and configuration.samples is None:
+    rule = rounding_by_rule(done.result.optimum.n, configuration.precision)
+    known = accuracy is not None and accuracy >= COARSE and 3 * rule < accuracy
+    if known and configuration.pixels is None and configuration.samples is None and not shadows:
         return _Step(done, None, Estimate(rule, 3 * rule, 0.0, 0.0, rule))
     system = System(done, targets, dict(options), lamps)
     found = estimate(system, _finer(configuration.samples), rule=rule if known else None)

@@ -46,7 +46,7 @@ def parameter_deviation(result: FitResult, reference: FitResult) -> float:
             value = np.zeros_like(true)
         else:
             value = np.asarray(getattr(one, name), np.float64)
-        off = np.abs(value - true) / max(float(true.max()), SMALLEST * largest)
+        off = np.abs(value - true) / max(float(true.max()), SMALLEST * largest, np.finfo(float).tiny)
         known = [not ({name, f"{name}[{channel}]"} & lost) for channel in range(true.size)]
         worst = max([worst, *off[known]])
     if specular and "n" not in lost:

@@ -78,34 +78,60 @@ class System:
         self.parts: list[Part] = []
         # Whether some of the pixels that were fitted are not probed.
         self.skipped = False
-        weights = one_each(options.get("weight"), len(targets))
+        self.weights = one_each(options.get("weight"), len(targets))
         most = max(64, probes or (PROBES if self.many else MOST_PROBES) // len(targets))
-        for index, (target, given, sample) in enumerate(zip(targets, weights, run.samples, strict=True)):
-            counted = result.counted[index].ravel()
-            whole = sample
-            if whole is None:
-                whole = _every(run.scenes[index], self.model, round(most / max(float(np.mean(counted)), 1e-9)))
-            self.skipped |= sample is None and whole.pixel.size < target_size(target)
-            part = _part(whole, counted, given, most, complete=sample is None)
-            self.skipped |= part.stride > 1
+        for index, (target, sample) in enumerate(zip(targets, run.samples, strict=True)):
+            part = self.part(index, most, self.model)
+            self.skipped |= part.stride > 1 or (sample is None and part.real < target_size(target))
             values = some_of_target(target, part.sample)
             values = np.asarray(getattr(values, "pixels", values), np.float64).reshape(-1, self.channels)
             self.parts.append(part)
             self._add(index, values, part.weight)
         self._assemble()
 
-    def place(self, index: int, samples: int | None, precision: brdf.Precision) -> brdf.Scene:
-        """The probed pixels of a picture under lights of so many samples."""
+    def part(self, index: int, most: int, model: type[brdf.Material]) -> Part:
+        """Some of the pixels that were fitted.
+
+        Args:
+            index: of the picture.
+            most: how many, about.
+            model: where its highlights are, they are crowded in a picture that was fitted whole.
+        """
+        counted, sample = self.run.result.counted[index].ravel(), self.run.samples[index]
+        whole = sample
+        if whole is None:
+            whole = _every(self.run.scenes[index], model, round(most / max(float(np.mean(counted)), 1e-9)))
+        return _part(whole, counted, self.weights[index], most, complete=sample is None)
+
+    def place(self, index: int, part: Part, samples: int | None, precision: brdf.Precision) -> brdf.Scene:
+        """The scene of some pixels of a picture, under lights of so many samples.
+
+        Args:
+            index: of the picture.
+            part: which pixels.
+            samples: of each light with an extent; None for those of the scene.
+            precision: in which the pixels are traced.
+        """
         scene = self.lamps.with_samples(self.light.scenes[index], samples)
-        sample = self.parts[index].sample
-        return brdf.cast(brdf.some_pixels(scene, sample.pixel, precision=precision), precision)
+        return brdf.cast(brdf.some_pixels(scene, part.sample.pixel, precision=precision), precision)
+
+    def traced(self, index: int, part: Part, precision: brdf.Precision) -> tuple[brdf.Scene, np.ndarray | None]:
+        """A scene, and which of its pixels a program is to trace; None where it is the scene of some pixels.
+
+        Args:
+            index: of the picture.
+            part: which pixels.
+            precision: in which the pixels are traced.
+        """
+        # What is traced pixel by pixel becomes part of one program.
+        scene = self.light.scenes[index]
+        if traceable(scene):
+            return scene, part.sample.pixel.astype(np.int32)
+        return self.place(index, part, None, precision), None
 
     def _add(self, index: int, values: np.ndarray, weight: np.ndarray) -> None:
         with brdf.working_precision("float64"):
-            # What is traced pixel by pixel becomes part of one program.
-            scene, pixel = self.light.scenes[index], self.parts[index].sample.pixel.astype(np.int32)
-            if not traceable(scene):
-                scene, pixel = self.place(index, None, "float64"), None
+            scene, pixel = self.traced(index, self.parts[index], "float64")
             n, x = np.float64(max(self.optimum.n, 1e-3)), self.optimum.x
             found = jax.device_get(probe(self.model, scene, pixel, values, weight, n, x))
         self.probes.append(found)

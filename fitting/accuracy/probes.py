@@ -1,5 +1,6 @@
 """What the estimate of a fit's error needs of its pixels, compiled: columns of the linear system, products, scores."""
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -92,6 +93,56 @@ def difference(
     change = jnp.einsum("mck,kc->mc", (many - few)[..., :3], x)
     # A coarser model gives more of what it lacks, hence the sign.
     return -jnp.einsum("m,mci,mc->ci", weight, few, change)
+
+
+@eqx.filter_jit
+def shadow_changes(
+    model: type[brdf.Material],
+    scene: brdf.Scene,
+    pixel: Int[AnyArray, " M"] | None,
+    lift: float,
+    weight: Float[AnyArray, " M"],
+    n: Float[AnyArray, ""],
+    x: Float[AnyArray, "3 C"],
+) -> Float[Array, "M C 4"]:
+    """Products of the columns with what changes where a surface point that is lifted crosses a shadow's edge.
+
+    Args:
+        model: the class of the material.
+        scene: the whole picture's, or that of some pixels.
+        pixel: which pixels of the whole picture, or None.
+        lift: along the normal, over the coordinates of the point or the extent of what shadows it.
+        weight: of each pixel.
+        n: exponent.
+        x: coefficients.
+    """
+    scene = scene if pixel is None else brdf.some_pixels(scene, pixel, precision="float64")
+    points = scene.surface_points()
+    extent = jnp.stack([shape.extent() for shape in scene.shapes])
+    others = jnp.broadcast_to(extent, (*points.mask.shape, extent.size))
+    if points.shape is not None:
+        others = jnp.where(points.shape[..., None] == jnp.arange(extent.size), 0.0, others)
+    size = jnp.maximum(jnp.max(jnp.abs(points.position), axis=-1), jnp.max(others, axis=-1))
+    position = points.position + (lift * size)[..., None] * points.normal
+    lifted = dataclasses.replace(scene, points=dataclasses.replace(points, position=position))
+    shape = (weight.size, x.shape[1])
+    (before, seen), (after, _) = _columns(model, scene, n, shape), _columns(model, lifted, n, shape)
+    change = jnp.einsum("mck,kc->mc", (after - before)[..., :3], x)
+    counts = jnp.where(seen & crossed(before, after), weight, 0)
+    return -jnp.einsum("m,mci,mc->mci", counts, before, change)
+
+
+def crossed(before: Any, after: Any) -> Any:
+    """Which pixels a shadow's edge has passed, told by the diffuse column, (M,).
+
+    Args:
+        before: columns, (M, C, 4).
+        after: the same with something moved a little.
+    """
+    before, after = before[..., 1], after[..., 1]
+    brightest = jnp.max(jnp.abs(before))
+    jump = jnp.abs(after - before) > 0.1 * jnp.maximum(jnp.abs(before), jnp.abs(after)) + 1e-3 * brightest
+    return jnp.any(jump, axis=1)
 
 
 @eqx.filter_jit

@@ -8,8 +8,11 @@ At the optimum θ of a cheap fit, with the normal matrix H, residual r and deriv
 * light samples left out: H⁻¹ Jᵀ (fine − coarse), the model with more light samples less the model with those used.
 * rounding: the Newton step that is left when the model is evaluated in float64, or, where few pixels are looked at,
   H⁻¹ Jᵀ (double − single).
+* shadows in float32: their rays start higher above the surface, which moves a shadow's edge over a few pixels. Which,
+  is told by lifting the points many times as far: each pixel that then crosses an edge stands for so many fewer.
 
-The first is random, and is told as the median and the 95 % quantile of what it does; the others are added to it.
+The first and the last are random, and are told as the median and the 95 % quantile of what they do; the others are
+added to them.
 """
 
 from typing import NamedTuple
@@ -21,11 +24,15 @@ from jaxtyping import Float
 import brdf
 from fitting.accuracy.linear_system import System
 from fitting.accuracy.pixel_sampling import traceable
-from fitting.accuracy.probes import columns_in, difference
+from fitting.accuracy.probes import columns_in, crossed, difference, shadow_changes
 
 DRAWS = 512
-# What float32 shadow rays make of the pixels at a shadow's edge, some of which fall on its other side.
-AT_SHADOWS = 1e-4
+# Shadow rays start so many rounding errors above the surface (`brdf.shading.visibility`), relative to coordinates.
+RAY_START = 300
+# A shift of a shadow's edge by that much is seen by few pixels: they are lifted so many times as far.
+LIFT = 512
+# Pixels among which those at the edges of shadows are looked for.
+AT_EDGES = 8192
 # What light samples leave out is told to first order only: the bound allows for this factor.
 MARGIN = 2.0
 # What a sum of so many samples is compared with: the next step, as a factor.
@@ -39,11 +46,13 @@ class Shifts(NamedTuple):
 
     Attributes:
         drawn: random shifts by the pixels left out, (D, P).
+        shadows: random shifts by the pixels at the edges of shadows, (D, P).
         light: shift by the light samples left out, (P,).
         rounding: by rounding, (P,).
     """
 
     drawn: Float[np.ndarray, "D P"]
+    shadows: Float[np.ndarray, "D P"]
     light: Float[np.ndarray, " P"]
     rounding: Float[np.ndarray, " P"]
 
@@ -66,7 +75,7 @@ class Estimate(NamedTuple):
     rounding: float
 
 
-def rounding_by_rule(n: float, precision: brdf.Precision, *, shadows: bool) -> float:
+def rounding_by_rule(n: float, precision: brdf.Precision) -> float:
     """What rounding does to a fit of all pixels, of no more account than its order of magnitude.
 
     A few units in the last place, more for a lobe so narrow that the rounding of directions counts against its width.
@@ -74,10 +83,8 @@ def rounding_by_rule(n: float, precision: brdf.Precision, *, shadows: bool) -> f
     Args:
         n: exponent.
         precision: of the fit.
-        shadows: whether shapes cast any.
     """
-    rule = float(np.finfo(precision).eps * (2 + 0.02 * np.sqrt(max(n, 0.0))))
-    return max(rule, AT_SHADOWS) if shadows and precision == "float32" else rule
+    return float(np.finfo(precision).eps * (3 + 0.03 * np.sqrt(max(n, 0.0))))
 
 
 def _shifts(system: System, finer: int | None = None, *, measured: bool = True) -> Shifts:
@@ -103,7 +110,32 @@ def _shifts(system: System, finer: int | None = None, *, measured: bool = True) 
         rounding = system.inverse @ _of_rounding(system)
     else:
         rounding = system.inverse @ np.where(system.bound, 0.0, system.step)
-    return Shifts(drawn, light, rounding)
+    return Shifts(drawn, _of_shadows(system), light, rounding)
+
+
+def _of_shadows(system: System) -> Float[np.ndarray, "D P"]:
+    """Random shifts by pixels that float32 puts on the other side of a shadow's edge."""
+    size = 3 * system.channels + 1
+    shifts = np.zeros((DRAWS, size))
+    if not system.shadows or system.run.result.precision == "float64":
+        return shifts
+    random = np.random.default_rng(1)
+    lift = LIFT * RAY_START * float(np.finfo(np.float32).eps)
+    for index in range(len(system.parts)):
+        part = system.part(index, AT_EDGES // len(system.parts), brdf.Lambert)
+        with brdf.working_precision("float64"):
+            scene, pixel = system.traced(index, part, "float64")
+            n, x = np.asarray(max(system.optimum.n, 1e-3)), system.optimum.x
+            found = np.asarray(shadow_changes(system.model, scene, pixel, lift, part.weight, n, x))
+        at_edge = np.flatnonzero(np.any(found, axis=(1, 2)))
+        # So many pixels of the fit each one of these stands for.
+        stands_for = part.sample.stands_for[at_edge] if part.complete else np.full(at_edge.size, part.stride)
+        effect = np.zeros((at_edge.size, size))
+        for channel, place in enumerate(system.places):
+            effect[:, place] += found[at_edge, channel] * np.array([1.0, 1.0, 1.0, x[2, channel]])
+        crossings = random.poisson(stands_for / LIFT, (DRAWS, at_edge.size))
+        shifts += crossings @ (effect / stands_for[:, None])
+    return shifts @ system.inverse
 
 
 def _settled(system: System, draws: Float[np.ndarray, "D P"]) -> Float[np.ndarray, "D P"]:
@@ -120,7 +152,8 @@ def _of_light(system: System, coarse: int | None, fine: int) -> Float[np.ndarray
             if traceable(scene):
                 few, many = (system.lamps.with_samples(scene, samples) for samples in (coarse, fine))
             else:
-                few, many, pixel = *(system.place(index, samples, "float64") for samples in (coarse, fine)), None
+                few, many = (system.place(index, part, samples, "float64") for samples in (coarse, fine))
+                pixel = None
             n, x = np.asarray(max(system.optimum.n, 1e-3)), system.optimum.x
             found = np.asarray(difference(system.model, few, many, pixel, part.weight, n, x))
         for channel, place in enumerate(system.places):
@@ -138,15 +171,16 @@ def _of_single(system: System, index: int, weight: np.ndarray) -> Float[np.ndarr
     found = []
     for precision in ("float64", "float32"):
         with brdf.working_precision(precision):
-            scene, pixel = system.light.scenes[index], system.parts[index].sample.pixel.astype(np.int32)
-            if not traceable(scene):
-                scene, pixel = system.place(index, None, precision), None
+            scene, pixel = system.traced(index, system.parts[index], precision)
             n = np.float64(max(system.optimum.n, 1e-3))
             shape = (weight.size, system.channels)
             columns, seen = jax.device_get(columns_in(system.model, scene, pixel, n, shape, precision))
         picture = np.einsum("mck,kc->mc", columns[..., :3].astype(np.float64), system.optimum.x)
         found.append((columns.astype(np.float64), picture, seen))
-    (columns, double, seen), (_, single, _) = found
+    (columns, double, seen), (others, single, _) = found
+    if system.shadows:
+        # A pixel that is lit in one and not in the other is told of by `_of_shadows`.
+        seen = seen & ~np.asarray(crossed(columns, others))
     products = np.einsum("m,mci,mc->ci", np.where(seen, weight, 0.0), columns, single - double)
     total = np.zeros(3 * system.channels + 1)
     for channel, place in enumerate(system.places):
@@ -175,10 +209,9 @@ def estimate(system: System, finer: int | None = None, *, rule: float | None = N
     """
     shifts = _shifts(system, finer, measured=rule is None)
     alone = system.relative(shifts.drawn)
-    together = system.relative(shifts.drawn + shifts.light + shifts.rounding)
+    together = system.relative(shifts.drawn + shifts.shadows + shifts.light + shifts.rounding)
     light, rounding = float(system.relative(shifts.light)), float(system.relative(shifts.rounding))
-    if rule is None and system.shadows and system.run.result.precision == "float32":
-        rule = AT_SHADOWS
+    rounding = max(rounding, float(np.quantile(system.relative(shifts.shadows), 0.95)))
     if rule is not None:
         together, rounding = np.hypot(together, rule), max(rounding, rule)
     pixels = float(np.quantile(alone, 0.95))
