@@ -106,6 +106,23 @@ def test_highlights_and_cast_shadows_do_not_pull():
     assert angle(plain.direction, (0.3, 0.4, 0.86)) < 1.0
 
 
+@pytest.mark.parametrize("ambient", [0.0, 0.1])
+@pytest.mark.parametrize("highlight", [(0.0, 1.0), (0.3, 100.0), (0.3, 8.0)], ids=["matt", "narrow", "broad"])
+@pytest.mark.parametrize("model", ["phong", "blinn-phong"])
+def test_ambient_light_and_highlights_do_not_pull_the_light(ambient, highlight, model):
+    points = ball_points((128, 128), Circle(63.3, 64.1, 55.0))
+    material = brdf.MODELS[model](k_a=[ambient], k_d=[0.5], k_s=[highlight[0]], n=highlight[1])  # pyright: ignore
+    shares = []
+    for seed, direction in enumerate([(0.3, 0.4, 0.9), (0.5, 0.4, 0.7), (-0.8, 0.2, 0.4), (0.6, -0.6, 0.25)]):
+        clean = np.asarray(brdf.render(material, photograph_scene(points, direction, ambient=[1.0])))
+        noisy = clean + np.random.default_rng(seed).normal(0, 0.01, clean.shape)
+        found = light_from_shading(noisy, points, ambient=ambient > 0)
+        assert found.error < 0.1
+        shares.append(angle(found.direction, direction) / found.error)
+    # In two directions across, rms; 15° at 60 times the error without the ambient light, 2° at 8 without the highlight.
+    assert np.sqrt(np.mean(np.square(shares)) / 2) < 2.2
+
+
 @pytest.mark.parametrize("direction", [(0, 0, 1), (0.5, 0.4, 0.8), (-0.8, 0.2, 0.4), (0.3, -0.9, 0.1)])
 def test_the_highlight_tells_the_light(direction):
     circle = Circle(150.2, 139.7, 120.0)

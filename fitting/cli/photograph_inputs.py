@@ -47,7 +47,8 @@ def photographs(targets: list[Path], options: Options, read: dict[Path, brdf.Pic
         found = []
         for target, picture, one in zip(targets, pictures, masks, strict=True):
             with named_as({"picture": target, "mask": options.mask, "saturation": "--saturation"}):
-                found.append(light_from_shading(picture, points, saturation=options.saturation, mask=one))
+                how = {"saturation": options.saturation, "mask": one, "ambient": options.ambient}
+                found.append(light_from_shading(picture, points, **how))
         directions = np.array([one.direction for one in found])
         notes += _told(targets, found)
     channels = pictures[0].pixels.shape[2]

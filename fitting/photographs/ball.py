@@ -16,12 +16,11 @@ from jaxtyping import Float
 import brdf
 from brdf.errors import InputError
 from fitting.photographs.circle import Circle, ball_normals
+from fitting.photographs.shading import fit_shading
 
 # What belongs to a highlight: its core is looked for above one share of the brightest pixel; it reaches down to half of
 # the brightest, within a share of the radius around it.
 CORE, HIGHLIGHT, HIGHLIGHT_RADIUS = 0.9, 0.5, 0.12
-# Lambert's law is fitted where the light's cosine exceeds this, at first on pixels above this share of the brightest.
-LIT, BRIGHT = 0.15, 0.05
 
 
 def ball_points(shape: tuple[int, int], circle: Circle) -> brdf.SurfacePoints:
@@ -89,7 +88,8 @@ class ShadingLight(NamedTuple):
     Attributes:
         direction: towards it, unit, (3,).
         strength: what a pixel that faces it shows: diffuse albedo times intensity.
-        error: standard error of the direction in degrees, from the residual; a lower bound where Lambert's law is off.
+        error: standard error of the direction in degrees, from the residual; it knows that what the model leaves goes
+            together over parts of the surface, not what it does to the direction everywhere alike.
         pixels: how many told it.
     """
 
@@ -100,18 +100,24 @@ class ShadingLight(NamedTuple):
 
 
 def light_from_shading(
-    picture: Any, points: brdf.SurfacePoints, *, saturation: float | None = None, mask: Any = None
+    picture: Any,
+    points: brdf.SurfacePoints,
+    *,
+    saturation: float | None = None,
+    mask: Any = None,
+    ambient: bool = False,
 ) -> ShadingLight:
-    """Direction of a distant light from the shading of a matt surface: Lambert's law where the light comes in.
+    """Direction of a distant light from the shading: Lambert's law and a highlight where the light comes in.
 
     Args:
         picture: linear values, (H, W, C) or (H, W), or a `brdf.Picture`.
         points: what each pixel sees.
         saturation: linear value from which on pixels are clipped; None takes the largest code of an integer file.
         mask: (H, W), pixels to look at.
+        ambient: whether the surface is lit from all around as well.
 
     Returns:
-        Direction and strength, found by reweighted least squares so that highlights and cast shadows do not pull.
+        Direction and strength, found robustly so that highlights and cast shadows do not pull.
 
     Raises:
         InputError: where fewer than ten pixels are lit or they do not determine a direction.
@@ -133,33 +139,9 @@ def light_from_shading(
         values = np.asarray(getattr(picture, "pixels", picture))
         good &= (values if values.ndim == 2 else np.max(values, axis=-1)) < saturation
     value, normal = grey[good], normal[good]
-    lit = value > BRIGHT * np.max(value, initial=0.0)
-    if np.count_nonzero(lit) < 10:
-        raise InputError("picture", "has fewer than ten lit pixels on the surface", "Give a brighter picture")
-    light = np.zeros(3)
-    for _ in range(100):
-        before, weight = light, lit.astype(float)
-        for _ in range(3):
-            gram = (normal * weight[:, None]).T @ normal
-            if np.linalg.matrix_rank(gram, tol=1e-9 * np.trace(gram)) < 3:
-                raise InputError("picture", "shows no surface curved enough to tell the light", "Give its direction")
-            light = np.linalg.solve(gram, (normal * weight[:, None]).T @ value)
-            residual = np.abs(value - normal @ light)
-            # Huber's weights, with the tuning constant that keeps 95 % efficiency on Gaussian noise.
-            scale = 1.345 * 1.4826 * float(np.median(residual[lit])) + 1e-12
-            weight = np.where(lit, np.minimum(1.0, scale / np.maximum(residual, 1e-300)), 0.0)
-        lit = normal @ light > LIT * np.linalg.norm(light)
-        if np.count_nonzero(lit) < 10:
-            raise InputError("picture", "has fewer than ten lit pixels on the surface", "Give a brighter picture")
-        if np.allclose(before, light, rtol=1e-9, atol=0):
-            break
-    strength = float(np.linalg.norm(light))
-    residual = (value - normal @ light)[lit]
-    covariance = np.linalg.inv(normal[lit].T @ normal[lit]) * float(np.mean(residual**2))
-    direction = light / strength
-    across = np.eye(3) - np.outer(direction, direction)
-    error = float(np.degrees(np.sqrt(0.5 * np.trace(across @ covariance @ across)) / strength))
-    return ShadingLight(direction, strength, error, int(np.count_nonzero(lit)))
+    found = fit_shading(value, normal, np.argwhere(good), ambient=ambient)
+    strength = float(np.linalg.norm(found.light))
+    return ShadingLight(found.light / strength, strength, found.error, found.pixels)
 
 
 def photograph_scene(
@@ -176,7 +158,5 @@ def photograph_scene(
     Raises:
         InputError: naming the argument.
     """
-    # Any length is as good as another: one near 1 keeps within single precision.
-    direction = np.asarray(direction, np.float64)
-    light = brdf.DirectionalLight(direction=direction / np.max(np.abs(direction)), intensity=intensity)
+    light = brdf.DirectionalLight(direction=direction, intensity=intensity)
     return brdf.Scene(points=points, lights=(light,), ambient=ambient)
