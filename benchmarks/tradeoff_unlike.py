@@ -69,7 +69,7 @@ def scenes(folder):
     yield plain("mesh, mask", scene(shapes=(BALL, mesh)), mask=inside)
     yield plain("far ball", scene(look=camera(width=30.0)))
     sheet = brdf.Rectangle(center=(0, 0, 0), edge_u=(1, 0, 0), edge_v=(0, 1, 0))
-    low = dataclasses.replace(view(40, 0), position=(-2, 0, 0.6), up=(0, 0, 1))
+    low = dataclasses.replace(view(40, 1), position=(-2, 0, 0.6), up=(0, 0, 1))
     grazing = plain("grazing sheet", scene(distant((0.95, 0.1, 0.3), 2.0), shapes=(sheet,), look=low), material(100.0))
     yield grazing
     rows, columns = np.mgrid[:SIZE, :SIZE]

@@ -110,9 +110,10 @@ def fit_within(
     lamps, attempts = Lamps(), []
     has_samples = any(extended(scene) for scene in scenes)
     reason = "" if has_samples else _reason_for_all(targets, scenes, model, options, accuracy)
-    if reason and accuracy is not None and accuracy <= COARSE and any(map(casts_shadows, scenes)):
-        precision = "float64"  # in float32 the pixels at a shadow's edge alone are of that order
-    now = Configuration(model, precision, None if reason else FIRST_PIXELS, FIRST_SAMPLES if has_samples else None)
+    hard = not has_samples and any(map(casts_shadows, scenes))
+    pixels = None if reason else FIRST_PIXELS
+    first = _precision(precision, pixels, accuracy, hard=hard)
+    now = Configuration(model, first, pixels, FIRST_SAMPLES if has_samples else None)
     n_range = None
     while True:
         begun = time.perf_counter()
@@ -131,6 +132,7 @@ def fit_within(
             break
         if now.pixels is not None and after.pixels is None:
             reason = f"a sample would have to hold more than {WHOLE:.0%} of them"
+            after = dataclasses.replace(after, precision=_precision(precision, None, accuracy, hard=hard))
         now, n_range = after, _near(step, options)
     looked = [target_size(t) if s is None else s.pixel.size for t, s in zip(targets, step.run.samples, strict=True)]
     choice = BudgetChoice(
@@ -166,6 +168,16 @@ def _reason_for_all(
     if EACH_PIXEL * work < CHOOSING:
         return "in a process of its own, compiling what chooses among them takes longer than looking at them"
     return ""
+
+
+def _precision(least: brdf.Precision, pixels: int | None, accuracy: float | None, *, hard: bool) -> brdf.Precision:
+    """In which to look at so many pixels.
+
+    Under hard shadows float32 puts some pixels on the other side of an edge: a few in a million, each of which weighs
+    much in a sample, and all together some 1e-4.
+    """
+    fine = pixels is not None or (accuracy is not None and accuracy <= COARSE)
+    return "float64" if hard and fine else least
 
 
 def _attempt(
