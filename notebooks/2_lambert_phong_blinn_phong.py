@@ -78,31 +78,36 @@ for ax, (name, material) in zip(axes, looks.items(), strict=True):
 #
 # Turn the viewer by a small angle $a$ away from the mirror direction. Then $R$ and $V$ are $a$ apart, but $H$ moves only
 # $a/2$ away from $N$. Near the peak $\cos^n a \approx e^{-n a^2/2}$, so half the angle needs four times the exponent for
-# the same highlight. The agreement is exact at the peak and, off the plane of light and normal, worst at grazing light,
-# where the half-vector lobe is the narrower one.
+# the same highlight, as the left picture shows. Across the plane of light and normal the two differ, the more the more
+# grazing the light: there $H$ moves by $a/(2\cos\theta)$, so that Blinn-Phong's highlight is narrower than Phong's. It is
+# why highlights on a wet road are tall and slim, and why Blinn-Phong draws them and Phong does not.
 
 # %%
 degrees = np.linspace(-40, 40, 401)
+theta = np.radians(60)
+to_light = np.array([-np.sin(theta), 0, np.cos(theta)])
+mirror = to_light * [-1, 1, 1]
 
 
-def lobe_along(material, light_angle):
-    """S in the plane of incidence: the light at an angle, the viewer at that angle and some degrees more."""
-    light, view = np.radians(light_angle), np.radians(degrees + light_angle)
-    to_light = np.array([-np.sin(light), 0, np.cos(light)])
-    to_view = np.stack([np.sin(view), 0 * view, np.cos(view)], -1)
-    return np.asarray(material.specular(np.array([0.0, 0, 1]), to_light, to_view))
+def viewers(sideways):
+    """Directions some degrees from the mirror direction: in the plane of light and normal, or across it."""
+    turn = np.array([0.0, 1, 0]) if sideways else np.array([np.cos(theta), 0, -np.sin(theta)])
+    angle = np.radians(degrees)[:, None]
+    return np.cos(angle) * mirror + np.sin(angle) * turn
 
 
 figure, axes = plt.subplots(1, 2, figsize=(8, 3), layout="constrained", sharey=True)
-for ax, angle in zip(axes, (10, 45), strict=True):
+for ax, sideways in zip(axes, (False, True), strict=True):
     for label, material, style in (
-        ("Phong, n = 10", brdf.Phong(k_d=0, k_s=1, n=10), "-"),
-        ("Blinn-Phong, n = 40", brdf.BlinnPhong(k_d=0, k_s=1, n=40), "--"),
-        ("Blinn-Phong, n = 10", brdf.BlinnPhong(k_d=0, k_s=1, n=10), ":"),
+        ("Phong, n = 10", brdf.Phong(k_d=0, k_s=1, n=10), ("-", "#0072B2")),
+        ("Blinn-Phong, n = 40", brdf.BlinnPhong(k_d=0, k_s=1, n=40), ("--", "#D55E00")),
+        ("Blinn-Phong, n = 10", brdf.BlinnPhong(k_d=0, k_s=1, n=10), (":", "#009E73")),
     ):
-        ax.plot(degrees, lobe_along(material, angle), style, label=label)
-    ax.set(title=f"light at {angle}°", xlabel="viewer, degrees from the mirror direction")
-axes[0].set_ylabel("S")
+        shown = np.asarray(material.specular(np.array([0.0, 0, 1]), to_light, viewers(sideways)))
+        ax.plot(degrees, shown, linestyle=style[0], color=style[1], label=label)
+    ax.set(title="across that plane" if sideways else "in the plane of light and normal")
+    ax.set_xlabel("viewer, degrees from the mirror direction")
+axes[0].set_ylabel("S, light at 60°")
 axes[0].legend(fontsize=8)
 
 # %% [markdown]

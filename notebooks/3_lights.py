@@ -55,13 +55,13 @@ lights = {
     "directional": brdf.DirectionalLight(direction=place, intensity=[0.9]),
     "point": brdf.PointLight(position=place, intensity=[10.0]),
     "spot": brdf.SpotLight(
-        position=place, direction=-place + [0.1, -0.1, 0], intensity=[11.0], cutoff_angle=17, exponent=20
+        position=place, direction=-place + [0.1, -0.1, 0], intensity=[11.0], cutoff_angle=25, exponent=10
     ),
     "rectangle": brdf.RectangleLight(
         center=place, edge_u=[0.2, 0.5, -0.25], edge_v=[0.55, 0, 0.35], radiance=[32.0], samples=64
     ),
     "sphere": brdf.SphereLight(center=place, radius=0.5, radiance=[40.0], samples=64),
-    "environment": brdf.EnvironmentMap(sky(), samples=256),
+    "environment": brdf.EnvironmentMap(sky(), samples=1024),
 }
 
 

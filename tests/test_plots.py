@@ -115,3 +115,10 @@ def test_a_spectrum_is_drawn_from_its_first_channel_to_its_last():
     figure = fit(brdf.Lambert(k_d=np.linspace(0.1, 0.9, 9)), "lambert").plot()
     labels = [text.get_text() for text in figure.axes[-1].get_legend().get_texts()]
     assert (labels[0], labels[-2]) == ("channel 0", "channel 8")
+
+
+def test_a_function_is_drawn_as_the_ball_of_the_material_that_it_is():
+    material = brdf.BlinnPhong(k_d=[0.5, 0.3, 0.2], k_s=[0.3] * 3, n=30)
+    ball = next(part.axes[0].images[0] for part in overview(material.reflectance).subfigs)
+    expected = brdf.lit_sphere(material, 256)
+    np.testing.assert_allclose(np.asarray(ball.get_array()), expected, atol=1e-3)  # its screen values have 16 bits

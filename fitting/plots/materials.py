@@ -11,10 +11,11 @@ from typing import Any
 import matplotlib
 import matplotlib.colors
 import numpy as np
+from jaxtyping import Float
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from brdf import lit_sphere
+from brdf import displayed, lit_sphere
 from brdf.albedo import directional_albedo
 from brdf.channels import channel_names
 from brdf.models import Material, SpecularMaterial
@@ -28,6 +29,9 @@ PRINT: dict[Any, Any] = {"font.size": 8, "axes.titlesize": 9, "legend.fontsize":
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 """Blue, vermilion, green, purple, sky blue, orange."""
 
+RGB = (1, 2, 0)
+"""Which of them stand for red, green and blue."""
+
 _STYLES = ("-", "--", "-.", ":")
 Brdf = Material | Callable[[Any, Any], Any]
 
@@ -40,17 +44,20 @@ def overview(brdf: Brdf, report: Report | None = None) -> Figure:
         report: what ``brdf.check`` said of it.
 
     Returns:
-        The figure; its first quarter is empty where it is no material with 1 or 3 channels, which have a colour.
+        The figure.
     """
     with matplotlib.rc_context(PRINT):
         figure = Figure(figsize=(7.2, 6.0), layout="constrained")
         parts: Any = figure.subfigures(2, 2)
         first, second, third, fourth = parts.ravel()
+        axes = first.add_subplot()
+        axes.set_axis_off()
         if isinstance(brdf, Material):
-            axes = first.add_subplot()
             axes.imshow(lit_sphere(brdf, 256))
-            axes.set_axis_off()
             axes.set_title(brdf.name if not isinstance(brdf, SpecularMaterial) else f"{brdf.name}, n = {brdf.n:.4g}")
+        else:
+            axes.imshow(_lit_function(_sampler(brdf)))
+            axes.set_title(getattr(brdf, "__name__", type(brdf).__name__))
         plot_lobe(brdf, figure=second)
         plot_albedo(brdf, report, figure=third)
         plot_reciprocity(brdf, figure=fourth)
@@ -81,7 +88,8 @@ def plot_albedo(brdf: Brdf, report: Report | None = None, figure: Any = None) ->
     axes.annotate("more than arrives", (1, 1), (0, 4), textcoords="offset points", fontsize="small")
     names = channel_names(albedo.shape[1])
     for channel in range(albedo.shape[1]):
-        axes.plot(degrees, albedo[:, channel], **_look(channel), label=names[channel])
+        look = _look(channel if albedo.shape[1] != 3 else RGB[channel])
+        axes.plot(degrees, albedo[:, channel], **look, label=names[channel])
     if albedo.shape[1] > 1:
         axes.legend(loc="best")
     if report is not None and report.energy.crossing:
@@ -125,7 +133,7 @@ def plot_lobe(brdf: Brdf, angles: tuple[float, ...] = (0.0, 30.0, 60.0), channel
     axes.yaxis.set_major_locator(MaxNLocator(3))
     axes.yaxis.set_major_formatter(lambda r, _: f"{r * abs(r):.3g}")
     axes.legend(loc="lower center", ncols=len(angles), bbox_to_anchor=(0.5, 0.0))
-    axes.set_title("f_r (N·V) in 1/sr against the angle of the view, root scale")
+    axes.set_title("Lobe f_r (N·V) in 1/sr, root scale")
     return figure
 
 
@@ -187,6 +195,27 @@ def plot_stability(maps: list[StabilityMap]) -> Figure:
     if image is not None:
         figure.colorbar(image, ax=list(panels), label="error of float32, of the peak", extend="both")
     return figure
+
+
+def _lit_function(sample: Sampler, size: int = 256) -> Float[np.ndarray, "H W 3"]:
+    """A sphere of any BRDF in one light from above left, as a screen shows it, on white; as `lit_sphere` lights it.
+
+    The tangent lies along the sphere's circles of latitude.
+    """
+    place = 1.03 * ((np.arange(size) + 0.5) * 2 / size - 1)
+    x, y = np.meshgrid(place, -place)
+    inside = x * x + y * y < 1
+    normal = np.stack([x, y, np.sqrt(np.maximum(1 - x * x - y * y, 0))], -1)[inside]
+    tangent = np.stack([normal[:, 2], 0 * normal[:, 0], -normal[:, 0]], -1)
+    tangent = tangent / np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
+    frame = np.stack([tangent, np.cross(normal, tangent), normal], axis=1)
+    light = np.array([-0.5, 0.6, 0.8]) / np.linalg.norm([-0.5, 0.6, 0.8])
+    to_light, to_view = frame @ light, frame[:, :, 2]
+    cosine = to_light[:, 2:]
+    radiance = 0.9 * np.pi * sample(to_light, to_view) * np.maximum(cosine, 0)
+    image = np.zeros((size, size, radiance.shape[-1]))
+    image[inside] = np.where(cosine > 0, np.nan_to_num(radiance), 0.0)
+    return np.where(inside[..., None], displayed(image), 1.0)
 
 
 def _sampler(brdf: Brdf) -> Sampler:
