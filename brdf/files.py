@@ -163,6 +163,12 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
         complete = True
     except OSError as error:
         raise file_error(path, error) from None
+    except InputError as error:
+        # Named as it would have been in its place: where it was written is gone by now.
+        staged = Path(error.where)
+        if not staged.is_relative_to(stage / "new"):
+            raise
+        raise InputError(Path(path) / staged.relative_to(stage / "new"), error.what, error.remedy) from None
     finally:
         shutil.rmtree(stage, ignore_errors=True)
         if not complete:

@@ -156,6 +156,17 @@ def test_a_set_of_files_appears_together(tmp_path, folder):
     assert len(everything(tmp_path)) == (4 if folder == "out" else 7)
 
 
+def test_what_goes_wrong_in_a_set_is_named_by_its_place(tmp_path):
+    def fail(place):
+        with atomic_folder(tmp_path / "out") as stage:
+            write_text(stage / place, "A")
+
+    with pytest.raises(InputError) as told:
+        fail("missing/a.txt")
+    assert told.value.where == str(tmp_path / "out" / "missing" / "a.txt")
+    assert everything(tmp_path) == []
+
+
 @pytest.mark.parametrize("raised", [RuntimeError, KeyboardInterrupt])
 @pytest.mark.parametrize("folder", ["out", "new/deep/out"])
 def test_a_failed_set_leaves_nothing(tmp_path, folder, raised):

@@ -340,7 +340,12 @@ def test_masks(tmp_path):
     (tmp_path / "alpha.png").write_bytes(png(np.dstack([codes(8, 9, 3), white]), colour_type=6))
     (tmp_path / "opaque.png").write_bytes(png(np.dstack([white] * 3 + [np.full_like(white, 255)]), colour_type=6))
     raw_exr(tmp_path / "float.exr", np.where(inside, 1, np.nan)[..., None].astype(np.float32), ["Y"])
-    for name in ("white.png", "one.png", "alpha.png", "opaque.png", "float.exr"):
+    for name, alpha in (("faint.png", 254), ("nothing.png", 0), ("veiled.png", np.where(inside, 255, 200))):
+        # Alpha that keeps all pixels, or none, was not meant.
+        pixels = np.dstack([white] * 3 + [np.broadcast_to(alpha, white.shape).astype(np.uint8)])
+        (tmp_path / name).write_bytes(png(pixels, colour_type=6))
+    names = ("white.png", "one.png", "alpha.png", "opaque.png", "float.exr", "faint.png", "nothing.png", "veiled.png")
+    for name in names:
         np.testing.assert_array_equal(read_mask(tmp_path / name), inside, err_msg=name)
     (tmp_path / "black.png").write_bytes(png(np.zeros((3, 3, 3), np.uint8)))
     assert not read_mask(tmp_path / "black.png").any()
@@ -699,3 +704,21 @@ def test_mutated_files_give_an_image_or_an_error(tmp_path, seed):
             (tmp_path / f"a{suffix}").write_bytes(mutated.tobytes())
             with suppress(InputError):
                 assert read_picture(tmp_path / f"a{suffix}").pixels.ndim == 3
+
+
+def test_messages_do_not_repeat_long_paths_nor_lose_the_name(tmp_path):
+    folder = tmp_path / ("a long name of a folder " * 8)
+    folder.mkdir()
+    for name in ("a picture.jpg", "a picture.xyz", "a picture.png", "a picture.tif", "a picture.exr"):
+        (folder / name).write_bytes(b"hello world")
+        with pytest.raises(InputError) as told:
+            read_image(folder / name)
+        assert str(told.value).count("a long name of a folder") == 8
+        assert str(told.value).startswith(f"{folder / name}: ".replace(" / ", "/"))
+
+
+def test_a_reader_is_an_array_for_what_takes_arrays(tmp_path):
+    (tmp_path / "a.png").write_bytes(png(codes(5, 7, 3)))
+    with ImageReader(tmp_path / "a.png") as reader:
+        np.testing.assert_array_equal(np.asarray(reader), read_image(tmp_path / "a.png"))
+        assert np.asarray(reader, np.float64).dtype == np.float64

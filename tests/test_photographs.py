@@ -136,6 +136,11 @@ def test_the_highlight_tells_the_light(direction):
     assert angle(found, direction) < 1.0
 
 
+def test_a_direction_of_no_length_is_told_as_what_came():
+    with pytest.raises(InputError, match="must not have zero length, got"):
+        photograph_scene(ball_points(SHAPE, BALL), [0, 0, 0])
+
+
 def test_pictures_that_tell_no_light():
     points = ball_points(SHAPE, BALL)
     with pytest.raises(InputError, match="fewer than ten lit pixels"):

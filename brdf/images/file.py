@@ -39,7 +39,7 @@ def said(source: Any, path: str | os.PathLike[str] = "") -> str:
         message = error.object.decode("utf-8", "replace")
     lines = [line.strip() for line in message.splitlines() if line.strip()]
     line = lines[0] if lines else "no reason given"
-    for named in (f" ({path})", f' ("{path}")', f' "{path}"') if path else ():
+    for named in (f" ({path})", f' ("{path}")', f' for "{path}"', f' "{path}"', f'"{path}" ') if path else ():
         line = line.replace(named, "")
     return (line if len(line) <= 200 else line[:197] + "...").rstrip(". ")
 

@@ -141,17 +141,23 @@ def read_mask(path: str | os.PathLike[str]) -> Bool[Array, "height width"]:
         path: a picture, white inside and black outside, or one whose alpha channel is the mask.
 
     Returns:
-        True where the mean of the channels, or alpha if it is not 1 everywhere, is over half of its largest value in
-        the file.
+        True where alpha, or if that leaves out nothing or everything the mean of the channels, is over half of its
+        largest value in the file.
 
     Raises:
         InputError: if the file cannot be read.
     """
     with ImageReader(path, encoding="linear") as reader:
         alpha = reader.read_alpha()
-        inside = reader.read().mean(axis=-1) if alpha is None or np.all(alpha == 1) else alpha
-    inside = np.nan_to_num(inside, nan=0.0)
-    return inside > 0.5 * inside.max()
+        inside = None if alpha is None else _over_half(alpha)
+        if inside is None or inside.all() or not inside.any():
+            inside = _over_half(reader.read().mean(axis=-1))
+    return inside
+
+
+def _over_half(values: Float32[Array, "height width"]) -> Bool[Array, "height width"]:
+    values = np.nan_to_num(values, nan=0.0)
+    return values > 0.5 * values.max()
 
 
 def read_layers(path: str | os.PathLike[str]) -> dict[str, Float32[Array, "height width channels"]]:

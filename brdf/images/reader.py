@@ -100,6 +100,10 @@ class ImageReader:
         """Close the file; the reader cannot be used any more."""
         self._image.close()
 
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        """The whole picture, for what takes arrays."""
+        return np.asarray(self.read(), dtype)
+
     def rows(self, start: int, stop: int) -> Float32[np.ndarray, "rows width channels"]:
         """Rows ``start`` to ``stop`` (not included) of the picture, linear.
 
