@@ -83,7 +83,7 @@ for ax, (name, material) in zip(axes, looks.items(), strict=True):
 # why highlights on a wet road are tall and slim, and why Blinn-Phong draws them and Phong does not.
 
 # %%
-degrees = np.linspace(-40, 40, 401)
+degrees = np.linspace(-29.9, 29.9, 401)  # 30 more, and the viewer is below the surface
 theta = np.radians(60)
 to_light = np.array([-np.sin(theta), 0, np.cos(theta)])
 mirror = to_light * [-1, 1, 1]
