@@ -25,7 +25,15 @@ from fitting.accuracy.budget_choice import Attempt, BudgetChoice
 from fitting.accuracy.configurations import Configuration, Run, casts_shadows, one_each, run, share_counted, target_size
 from fitting.accuracy.lamps import Lamps, extended
 from fitting.accuracy.linear_system import System
-from fitting.accuracy.sampling_error import MARGIN, STEP, Estimate, estimate, light_error, rounding_by_rule
+from fitting.accuracy.sampling_error import (
+    MARGIN,
+    STEP,
+    Estimate,
+    estimate,
+    light_error,
+    nearly_dependent,
+    rounding_by_rule,
+)
 from fitting.result import FitResult
 
 FIRST_PIXELS, FIRST_SAMPLES, MOST_SAMPLES = 1024, 16, 4096
@@ -190,6 +198,8 @@ def _attempt(
     accuracy: float | None,
 ) -> _Step:
     done = run(targets, scenes, configuration, options, lamps, n_range)
+    if configuration.precision == "float32" and nearly_dependent(done.result.optimum):
+        return _Step(done, None, Estimate(1.0, 1.0, 0.0, 0.0, 1.0))
     shadows = any(map(casts_shadows, scenes))
     rule = rounding_by_rule(done.result.optimum.n, configuration.precision)
     known = accuracy is not None and accuracy >= COARSE and 3 * rule < accuracy

@@ -25,8 +25,11 @@ import brdf
 from fitting.accuracy.linear_system import System
 from fitting.accuracy.pixel_sampling import traceable
 from fitting.accuracy.probes import columns_in, crossed, difference, shadow_changes
+from fitting.engine.separable import Optimum
 
 DRAWS = 512
+# Columns of length 1 that leave less than this of one another make float32 lose most of its digits.
+DEPENDENT = 0.01
 # Shadow rays start so many rounding errors above the surface (`brdf.shading.visibility`), relative to coordinates.
 RAY_START = 300
 # A shift of a shadow's edge by that much is seen by few pixels: they are lifted so many times as far.
@@ -85,6 +88,20 @@ def rounding_by_rule(n: float, precision: brdf.Precision) -> float:
         precision: of the fit.
     """
     return float(np.finfo(precision).eps * (3 + 0.03 * np.sqrt(max(n, 0.0))))
+
+
+def nearly_dependent(optimum: Optimum) -> bool:
+    """Whether the columns of a fit so nearly add up to one another that float32 cannot tell what they add up to.
+
+    Args:
+        optimum: of the fit.
+    """
+    for matrix in optimum.gauss_newton:
+        free = np.diag(matrix) > 0
+        size = np.sqrt(np.diag(matrix)[free])
+        if np.any(np.linalg.eigvalsh(matrix[np.ix_(free, free)] / np.outer(size, size)) < DEPENDENT**2):
+            return True
+    return False
 
 
 def _shifts(system: System, finer: int | None = None, *, measured: bool = True) -> Shifts:
