@@ -21,11 +21,12 @@ _STYLE = """
 body { font: 16px/1.45 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; }
 h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2rem; border-bottom: 1px solid #8888; }
 .wide { overflow-x: auto; } table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-th, td { padding: 0.15em 0.8em; text-align: right; border-bottom: 1px solid #8884; }
+th, td { padding: 0.15em 0.6em; text-align: right; border-bottom: 1px solid #8884; }
 img { max-width: 100%; height: auto; background: white; }
 .warning { border-left: 4px solid #d55e00; padding: 0.3em 0.8em; margin: 0.6em 0; }
 pre { overflow-x: auto; background: #8882; padding: 0.6em; }
 """
+SENTENCE = 45  # letters, from which on the text in a cell is broken over lines
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 
 
@@ -121,9 +122,9 @@ def _candidates(result: FitResult) -> list[str]:
         mark = "chosen" if one.chosen else "adequate" if one.excess <= one.excess_error else ""
         excess = f"{one.excess:.4g} ± {one.excess_error:.2g}"
         rows.append(
-            [one.name, str(one.unknowns), f"{one.rms:.3e}", f"{one.held_out:.3e}", excess, f"{one.bic:.4g}", mark]
+            [one.name, mark, str(one.unknowns), f"{one.rms:.3e}", f"{one.held_out:.3e}", excess, f"{one.bic:.4g}"]
         )
-    head = ["model", "unknowns", "rms", "held out", "excess ± its error", "BIC, over the best", ""]
+    head = ["model", "", "unknowns", "rms", "held out", "excess ± its error", "BIC"]
     told = (
         "<p>The simplest adequate model is chosen: its squared error expected on held-out pixels exceeds that of the "
         "best, in noise variances, by no more than its standard error.</p>"
@@ -136,14 +137,22 @@ def _warnings(result: FitResult) -> list[str]:
 
 
 def _table(rows: list[list[str]], align: str = "right", head: list[str] | None = None) -> str:
-    """A table, without the columns that are empty in every row."""
+    """A table, without the columns that are empty in every row; the first names the rows."""
     filled = [any(column) for column in zip(*rows, strict=True)]
     rows = [[cell for cell, keep in zip(row, filled, strict=True) if keep] for row in rows]
+    left, lines = ' style="text-align:left"', []
     if head is not None:
-        head = [cell for cell, keep in zip(head, filled, strict=True) if keep]
-    lines = [] if head is None else ["".join(f"<th>{html.escape(cell)}</th>" for cell in head)]
-    for row in rows:
-        lines.append("".join(f'<td style="text-align:{align}">{html.escape(cell)}</td>' for cell in row))
+        first, *others = [cell for cell, keep in zip(head, filled, strict=True) if keep]
+        lines.append(
+            f"<th{left}>{html.escape(first)}</th>" + "".join(f"<th>{html.escape(cell)}</th>" for cell in others)
+        )
+    for first, *others in rows:
+        cells = [f"<td{left}>{html.escape(first)}</td>"]
+        for cell in others:
+            # Numbers are not broken over lines; on a narrow screen the table is pushed sideways instead.
+            whole = ";white-space:nowrap" if head is not None and len(cell) < SENTENCE else ""
+            cells.append(f'<td style="text-align:{align}{whole}">{html.escape(cell)}</td>')
+        lines.append("".join(cells))
     return f'<div class="wide"><table>{"".join(f"<tr>{line}</tr>" for line in lines)}</table></div>'
 
 

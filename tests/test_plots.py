@@ -122,3 +122,12 @@ def test_a_function_is_drawn_as_the_ball_of_the_material_that_it_is():
     ball = next(part.axes[0].images[0] for part in overview(material.reflectance).subfigs)
     expected = brdf.lit_sphere(material, 256)
     np.testing.assert_allclose(np.asarray(ball.get_array()), expected, atol=1e-3)  # its screen values have 16 bits
+
+
+def test_margins_without_a_pixel_that_counts_are_cropped():
+    result = fit(brdf.Lambert(k_d=0.5), "lambert")
+    counted = np.zeros((SIZE, SIZE), bool)
+    counted[10:20, 5:15] = True
+    axes = dataclasses.replace(result, counted=[counted]).plot().axes[0]
+    assert axes.get_xlim() == (2.5, 16.5)  # two pixels around
+    assert axes.get_ylim() == (21.5, 7.5)

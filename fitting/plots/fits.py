@@ -35,7 +35,8 @@ SIGNED = "cividis"
 def comparison(result: FitResult, picture: int | None = None) -> Figure:
     """Target, fit and signed residual; the highlight enlarged, a scanline through it, and the profile of n.
 
-    Pixels left out are grey in the residual. Without a specular term the second row is the scanline alone.
+    Pixels left out are grey in the residual; margins without a pixel that counts are cropped. Without a specular term
+    the second row is the scanline alone.
 
     Args:
         result: of a fit.
@@ -64,7 +65,7 @@ def comparison(result: FitResult, picture: int | None = None) -> Figure:
             axes.axhline(box.row, color="white", linewidth=0.6, linestyle=(0, (4, 4)))
         _residual(figure, above[2], target, fitted, counted)
         for axes in above:
-            axes.set(xticks=[], yticks=[])
+            axes.set(xticks=[], yticks=[], **_around(counted))
         if specular:
             _enlarged(figure.add_subplot(grid[1, 0]), target, fitted, box, white)
             _scanline(figure.add_subplot(grid[1, 1]), target, fitted, counted, box.row, box.columns)
@@ -106,6 +107,19 @@ def named_picture(result: FitResult, picture: int, why: str = "") -> str:
         raise brdf.InputError("picture", f"must be from 0 to {count - 1}, got {picture}", "Count the pictures from 0")
     name = result.names[picture] if result.names else ""
     return name if count == 1 else f"picture {picture + 1} of {count}{', ' if name else ''}{name}{why}"
+
+
+def _around(counted: Bool[np.ndarray, "H W"]) -> dict[str, tuple[float, float]]:
+    """Limits of axes that show what counts, and a margin around it: a thing may be small in its picture."""
+    if not counted.any():
+        return {}
+    rows, columns = np.flatnonzero(counted.any(axis=1)), np.flatnonzero(counted.any(axis=0))
+    height, width = counted.shape
+    margin = 2 + max(np.ptp(rows), np.ptp(columns)) // 16
+    return {
+        "xlim": (max(columns[0] - margin, 0) - 0.5, min(columns[-1] + margin, width - 1) + 0.5),
+        "ylim": (min(rows[-1] + margin, height - 1) + 0.5, max(rows[0] - margin, 0) - 0.5),
+    }
 
 
 class _Box:
