@@ -1,9 +1,9 @@
 """What each feature of a scene costs: the time to compile a fit for it, the time to run it, and its arithmetic.
 
 ``python -m benchmarks.feature_cost [SIZE]`` fits a picture of SIZE x SIZE pixels with one feature after another and
-prints a table. What a scene does not require is left out of the program that is compiled for it: its floating-point
-operations are the compiler's own count for the basis images of that
-scene, in which the body of a loop over light samples counts once.
+prints a table in Markdown. What a scene does not require is left out of the program that is compiled for it: its
+floating-point operations are the compiler's own count for the basis images of that scene, in which the body of a loop
+over light samples counts once.
 """
 
 import sys
@@ -65,7 +65,7 @@ def operations(model, place):
 def main(size=512):
     """Measure and print."""
     material = brdf.BlinnPhong(k_a=[0.2, 0.3, 0.1], k_d=[0.5, 0.3, 0.2], k_s=[0.4, 0.4, 0.3], n=50.0)
-    print(f"{'scene':<36}{'compile s':>10}{'run ms':>9}{'operations per pixel':>22}")
+    print("| scene | to compile (s) | to run (ms) | operations per pixel |\n| --- | --- | --- | --- |")
     for name, model, place in scenes(size):
         true = brdf.Lambert(k_d=material.k_d) if model == "lambert" else material
         picture = np.asarray(brdf.render(true, place))
@@ -74,7 +74,7 @@ def main(size=512):
         while len(taken) < 2 or (len(taken) <= ROUNDS and sum(one.seconds for one in taken) < PATIENCE):
             taken.append(take(lambda p=picture, s=place, m=model: fitting.fit(p, s, model=m))[1])
         run = 1e3 * min(one.seconds for one in taken[1:])
-        print(f"{name:<36}{taken[0].compiling:>10.2f}{run:>9.1f}{operations(model, place):>22.0f}", flush=True)
+        print(f"| {name} | {taken[0].compiling:.1f} | {run:.3g} | {operations(model, place):.0f} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,15 +1,17 @@
 """The measured fronts of three scenes: one directional light, an area light, an environment map.
 
-``python -m benchmarks.tradeoff_fronts FOLDER [SCENE ...]`` writes target and scene of each into a folder, measures and
-prints the rows of the front, the default and the recommendation, and saves table and plot. ``python -m
-benchmarks.tradeoff_fronts FOLDER TRIES [SCENE ...]`` runs the command ``brdf tradeoff`` as often instead, each time in
-a new process, and says how long it took and how often it named the same recommendation.
+``python -m benchmarks.tradeoff_fronts FOLDER [SCENE ...]`` writes target and scene of each into a folder, measures,
+saves table and plot, and prints as Markdown what the default takes and what the quickest fit that keeps an accuracy.
+``python -m benchmarks.tradeoff_fronts FOLDER PAIRS [SCENE ...]`` runs the command ``brdf tradeoff`` in pairs instead,
+each time in a new process, the first of each pair with an empty cache of compiled programs, and says how long it took
+and how many pairs named the same recommendation.
 """
 
-import collections
 import json
+import os
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -22,6 +24,8 @@ from fitting.accuracy.lamps import with_samples
 
 SIZE, NOISE, SECONDS = 512, 0.01, 60.0
 SCENES = ("directional", "area", "environment")
+LABELS = {"directional": "one directional light", "area": "area light", "environment": "environment map"}
+ACCURACIES = (1e-1, 1e-2, 1e-3)
 COMMAND = "from fitting.cli.main import main; main()"
 SCENE = """
 [camera]
@@ -66,41 +70,62 @@ def write(folder):
         brdf.write_image(place / "target.exr", (picture + NOISE * picture.mean() * noise).astype(np.float32))
 
 
+def cell(row):
+    """A configuration without what is usual, its time and its error."""
+    if row is None:
+        return "none measured"
+    words = [word for word in row.name.split(", ") if word not in ("blinn-phong", "float32")]
+    return f"{', '.join(words)}: {1e3 * row.seconds:.3g} ms, error {row.error:.0e}"
+
+
 def fronts(folder, names=SCENES):
-    """Measure and print what is on the front."""
+    """Measure, and print what is on the front."""
+    heads = ["scene", "default", *(f"accuracy {accuracy:g}" for accuracy in ACCURACIES)]
+    lines = ["| " + " | ".join(heads) + " |", "| --- " * len(heads) + "|"]
     for name in names:
-        start = time.perf_counter()
         place = folder / name
         found = fitting.tradeoff(
             brdf.read_image(place / "target.exr"), brdf.Scene.load(place / "scene.toml"), seconds=SECONDS
         )
         found.save(place / "tradeoff")
-        print(f"{name}: {time.perf_counter() - start:.0f} s, {'all' if found.complete else 'not all'} measured")
-        for row in found.rows:
-            if found.marks(row):
-                print(f"  {row.name:<60}{1e3 * row.seconds:8.1f} ms  {row.error:.1e}  {found.marks(row)}", flush=True)
+        print(f"{name}: {found.seconds:.0f} s, {len(found.rows)} of {found.planned} measured", flush=True)
+        quickest = [next((row for row in found.front if row.error <= accuracy), None) for accuracy in ACCURACIES]
+        lines.append("| " + " | ".join([LABELS[name], *map(cell, (found.default, *quickest))]) + " |")
+    print("\n".join(lines))
 
 
-def tries(folder, count, names):
+def recommendation(place, cache):
+    """What the command recommends, and the seconds that it took."""
+    start = time.perf_counter()
+    command = [sys.executable, "-c", COMMAND, "tradeoff", str(place), "--json"]
+    environment = os.environ | {"XDG_CACHE_HOME": cache}
+    out = subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout
+    rows = json.loads(out)["rows"]
+    named = [row["name"] for row in rows if "recommended" in row["marks"]]
+    return (named or ["nothing"])[0], len(rows), time.perf_counter() - start
+
+
+def pairs(folder, count, names):
     """Run the command again and again."""
     for name in names:
-        named, times = collections.Counter(), []
+        alike, times = 0, []
         for _ in range(count):
-            start = time.perf_counter()
-            command = [sys.executable, "-c", COMMAND, "tradeoff", str(folder / name), "--json"]
-            out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-            times.append(time.perf_counter() - start)
-            rows = json.loads(out)["rows"]
-            named.update(row["name"] for row in rows if "recommended" in row["marks"])
-            print(f"{name}: {times[-1]:.1f} s, {len(rows)} rows, {named.most_common(2)}", flush=True)
-        print(f"{name}: {count} tries, {np.median(times):.1f} s, at most {max(times):.1f} s, {dict(named)}", flush=True)
+            with tempfile.TemporaryDirectory() as cache:
+                cold, warm = (recommendation(folder / name, cache) for _ in range(2))
+            alike += cold[0] == warm[0]
+            times += [cold[2], warm[2]]
+            told = "; ".join(f"{one[0]} ({one[1]} rows, {one[2]:.0f} s)" for one in (cold, warm))
+            print(f"{name}: {told}", flush=True)
+        print(
+            f"{name}: {alike} of {count} pairs alike, {np.median(times):.0f} s, at most {max(times):.0f} s", flush=True
+        )
 
 
 def main(folder, *rest):
     """Write the scenes, then measure."""
     write(Path(folder))
     if rest and rest[0].isdigit():
-        tries(Path(folder), int(rest[0]), rest[1:] or SCENES)
+        pairs(Path(folder), int(rest[0]), rest[1:] or SCENES)
     else:
         fronts(Path(folder), rest or SCENES)
 

@@ -12,7 +12,8 @@ import pytest
 
 import brdf
 import fitting
-from fitting.accuracy import budget
+from brdf.shading.visibility import OFFSET
+from fitting.accuracy import budget, sampling_error
 from fitting.accuracy.configurations import Configuration
 from fitting.accuracy.deviation import deviation
 from fitting.accuracy.lamps import Lamps, with_samples
@@ -161,6 +162,38 @@ def test_pictures_of_different_sizes_count_by_their_pixels():
     assert max(deviation(result, reference)[:2]) <= 1e-1
 
 
+def test_what_float32_does_at_the_edges_of_shadows_is_told():
+    floor = brdf.Rectangle(center=(0, -1, 0), edge_u=(100, 0, 0), edge_v=(0, 0, -100))
+    camera = brdf.PerspectiveCamera(position=(0, 2, 5), target=(0, 0, 0), up=(0, 1, 0), fov=40, resolution=(256, 256))
+    scene = dataclasses.replace(ball(shapes=(ball().shapes[0], floor)), camera=camera)
+    picture = noisy(scene)
+    reference = fitting.fit(picture, scene, model="blinn-phong", precision="float64")
+    result = fitting.fit(picture, scene, model="blinn-phong", accuracy=3e-3)
+    assert result.choice is not None
+    assert result.precision == "float32"
+    # Which pixels cross is chance; that some may, is known.
+    assert 1e-5 < result.choice.chosen.bound < 3e-3
+    assert max(deviation(result, reference)[:2]) <= result.choice.chosen.bound
+    assert fitting.fit(picture, scene, model="blinn-phong", accuracy=1e-4).precision == "float64"
+
+
+def test_shadow_rays_start_where_the_estimate_thinks():
+    assert sampling_error.RAY_START == OFFSET
+
+
+def test_columns_that_nearly_add_up_are_taken_in_float64():
+    # The light meets every point of the sheet alike, as ambient light does.
+    sheet = brdf.Rectangle(center=(0, 0, 0), edge_u=(1, 0, 0), edge_v=(0, 1, 0))
+    camera = brdf.PerspectiveCamera(
+        position=(-2, 0, 0.6), target=(0, 0, 0), up=(0, 0, 1), fov=40, resolution=(128, 128)
+    )
+    light = brdf.DirectionalLight(direction=(0.95, 0.1, 0.3), intensity=2.0)
+    scene = dataclasses.replace(ball(lights=(light,), shapes=(sheet,)), camera=camera)
+    result = fitting.fit(noisy(scene, 0.01), scene, model="blinn-phong", accuracy=1e-2)
+    assert result.precision == "float64"
+    assert result.undetermined
+
+
 def test_the_time_to_spend_ends_the_search():
     result = fitting.fit(noisy(ball(), 0.1), ball(), model="blinn-phong", seconds=1e-6)
     assert result.choice is not None
@@ -297,7 +330,8 @@ def test_ctrl_c_keeps_what_was_measured():
 
     found = fitting.tradeoff(noisy(scene), scene, progress=interrupt)
     assert not found.complete
-    assert len(found.rows) == 2
+    # Each ran once: what is not known at all comes before what is not known well.
+    assert len(found.rows) == 4
 
 
 def test_the_command_measures_a_photograph_of_a_ball(tmp_path, capsys):

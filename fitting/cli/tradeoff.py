@@ -38,7 +38,7 @@ def tradeoff(
     out: Annotated[Path | None, typer.Option(help="A folder for tradeoff.csv, .json, .png and .pdf.")] = None,
     model: Annotated[str, typer.Option(help="The name of a model, or auto.")] = "blinn-phong",
     accuracy: Annotated[float, typer.Option(help="Relative error that the recommendation is to keep.")] = 1e-3,
-    seconds: Annotated[float, typer.Option(help="Time that the measuring may take.")] = 30.0,
+    seconds: Annotated[float, typer.Option(help="Time that the measuring may take.")] = 45.0,
     render: Annotated[bool, typer.Option("--render", help="Also measure the renderer alone.")] = False,
     encoding: Encoding = None,
     saturation: Saturation = None,
