@@ -88,7 +88,9 @@ def plot_albedo(brdf: Brdf, report: Report | None = None, figure: Any = None) ->
     axes.annotate("more than arrives", (1, 1), (0, 4), textcoords="offset points", fontsize="small")
     names = channel_names(albedo.shape[1])
     for channel in range(albedo.shape[1]):
-        look = _look(channel if albedo.shape[1] != 3 else RGB[channel])
+        look = _look(channel)
+        if albedo.shape[1] == 3:
+            look["color"] = COLOURS[RGB[channel]]
         axes.plot(degrees, albedo[:, channel], **look, label=names[channel])
     if albedo.shape[1] > 1:
         axes.legend(loc="best")
