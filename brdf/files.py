@@ -102,6 +102,9 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     target = Path(os.path.realpath(_plain(path)))
     if os.path.isdir(target):
         raise InputError(os.fspath(path), "is a folder, not a file", "Give the path of a file")
+    if os.path.islink(target):
+        # What a resolved path cannot be, unless its links lead in a circle.
+        raise file_error(path, OSError(errno.ELOOP, os.strerror(errno.ELOOP)))
     if os.path.exists(target) and not os.path.isfile(target):
         raise InputError(os.fspath(path), "is not an ordinary file", "Give the path of a file")
     temporary = target.with_name(f".{secrets.token_hex(6)}{target.suffix}")
@@ -178,6 +181,8 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def _make_folders(folder: Path, made: list[Path]) -> None:
+    if folder.is_symlink():
+        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP))
     if folder.exists() and not folder.is_dir():
         raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))
     for parent in [*reversed(folder.parents), folder]:

@@ -69,6 +69,9 @@ def read_first(targets: list[Path], options: Options, tell: Callable[[str], None
         InputError: naming the file or option.
     """
     _check_options(targets, options)
+    for beside in (options.mask, options.normals, options.lights, options.intensities):
+        if beside is not None:
+            brdf.input_file(beside)
     if is_archive(targets):
         return {}
     files, scene = targets, None
