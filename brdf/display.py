@@ -93,7 +93,8 @@ def material_html(material: Material) -> str:
     table = f"<table><tr>{head}</tr>{''.join(rows)}</table>"
     name = html.escape(material.name)
     style = "display:flex;flex-wrap:wrap;gap:1em;align-items:center"
-    return f'<div style="{style}">{picture}<div><b>{name}</b>{table}</div></div>'
+    # A spectrum is wider than a page: the table scrolls, not the page.
+    return f'<div style="{style}">{picture}<div style="min-width:0;overflow-x:auto"><b>{name}</b>{table}</div></div>'
 
 
 def report_html(report: Report) -> str:

@@ -90,3 +90,15 @@ def test_columns_without_content_are_not_shown(result: fitting.FitResult):
     for head in ("channel", "± error", "95 % interval"):
         assert f"<th>{head}</th>" in report_page(result)
         assert f"<th>{head}</th>" not in bare
+
+
+@pytest.mark.skipif(
+    not (shutil.which("node") and shutil.which("chromium") and (BROWSER / "node_modules").exists()),
+    reason="needs node, Debian's chromium, and `npm ci` in tests/browser",
+)
+def test_a_spectrum_does_not_widen_the_page(tmp_path: Path):
+    shown = brdf.Lambert(k_d=np.linspace(0, 1, 31))._repr_html_()
+    (tmp_path / "page.html").write_text(f'<meta charset="utf-8">{shown}')
+    command = ["node", str(BROWSER / "open_page.mjs"), str(tmp_path / "page.html"), str(tmp_path / "shot.png"), "700"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
+    assert json.loads(done.stdout)["width"] <= 700
