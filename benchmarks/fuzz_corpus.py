@@ -1,4 +1,4 @@
-"""Small sound files of every format that is read, to be damaged by `benchmarks.fuzz`."""
+"""Small sound files of every format that is read, to be damaged by `benchmarks.fuzz` and by the tests."""
 
 import struct
 from collections.abc import Callable
@@ -11,35 +11,20 @@ from brdf.measured import rgl as measured_rgl
 from brdf.measured.tables import load_measured
 from brdf.scenes.file import load_scene
 
-SCENE = """[camera]
+CAMERA = """[camera]
 type = "orthographic"
 position = [0.0, 0.0, 4.0]
 target = [0.0, 0.0, 0.0]
 up = [0.0, 1.0, 0.0]
 width = 2.2
 resolution = [8, 8]
-[[shapes]]
-type = "sphere"
-center = [0.0, 0.0, 0.0]
-radius = 1.0
-[[shapes]]
-type = "rectangle"
-center = [0.0, 0.0, 0.0]
-edge_u = [1.0, 0.0, 0.0]
-edge_v = [0.0, 1.0, 0.0]
-fitted = false
-[ambient]
-intensity = [0.2, 0.2, 0.2]
-[[lights]]
-type = "directional"
-direction = [0.5, 0.6, 0.7]
-intensity = [1.0, 1.0, 1.0]
-[[lights]]
-type = "point"
-position = [1, 2, 3]
-intensity = [1.0]
-attenuation = [0, 0, 1]
-[[lights]]
+"""
+SPHERE = '[[shapes]]\ntype = "sphere"\ncenter = [0.0, 0.0, 0.0]\nradius = 1.0\n'
+RECTANGLE = '[[shapes]]\ntype = "rectangle"\ncenter = [0, 0, 0]\nedge_u = [1, 0, 0]\nedge_v = [0, 1, 0]\n'
+AMBIENT = "[ambient]\nintensity = [0.2, 0.2, 0.2]\n"
+LIGHT = '[[lights]]\ntype = "directional"\ndirection = [0.5, 0.6, 0.7]\nintensity = [1.0, 1.0, 1.0]\n'
+POINT = '[[lights]]\ntype = "point"\nposition = [1, 2, 3]\nintensity = [1.0]\nattenuation = [0, 0, 1]\n'
+SPOT = """[[lights]]
 type = "spot"
 position = [1, 2, 3]
 direction = [0, 0, -1]
@@ -47,6 +32,7 @@ intensity = [1.0]
 cutoff_angle = 30
 exponent = 2
 """
+SCENE = CAMERA + SPHERE + RECTANGLE + "fitted = false\n" + AMBIENT + LIGHT + POINT + SPOT
 PERSPECTIVE = """[camera]
 type = "perspective"
 position = [0, 0, 4]

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import brdf
+from benchmarks.fuzz_corpus import CAMERA, LIGHT, POINT, RECTANGLE, SPHERE
 from brdf.errors import InputError
 from fitting.cli.interrupts import held, interruptible
 from fitting.cli.main import main
@@ -21,18 +22,6 @@ from fitting.cli.main import main
 ROOT = Path(__file__).parents[1]
 REAL = Path(os.environ.get("BRDF_REAL_DATA", ROOT / ".." / "shared" / "data"))
 
-CAMERA = """[camera]
-type = "orthographic"
-position = [0.0, 0.0, 4.0]
-target = [0.0, 0.0, 0.0]
-up = [0.0, 1.0, 0.0]
-width = 2.2
-resolution = [8, 8]
-"""
-SPHERE = '[[shapes]]\ntype = "sphere"\ncenter = [0.0, 0.0, 0.0]\nradius = 1.0\n'
-LIGHT = '[[lights]]\ntype = "directional"\ndirection = [0.5, 0.6, 0.7]\nintensity = [1.0, 1.0, 1.0]\n'
-POINT = '[[lights]]\ntype = "point"\nposition = [1, 2, 3]\nintensity = [1.0]\nattenuation = [0, 0, 1]\n'
-RECTANGLE = '[[shapes]]\ntype = "rectangle"\ncenter = [0, 0, 0]\nedge_u = [1, 0, 0]\nedge_v = [0, 1, 0]\n'
 SCENE = CAMERA + SPHERE + LIGHT
 MATERIAL = {"model": "blinn-phong", "k_a": [0.1], "k_d": [0.5], "k_s": [0.3], "n": 37.5}
 
