@@ -127,3 +127,10 @@ def test_a_file_goes_before_a_name(capsys, tmp_path: Path, monkeypatch):
 )
 def test_a_usage_error_ends_with_where_help_is(capsys, words: list[str], help_of: str):
     assert run(capsys, *words, status=2).endswith(f". See {help_of} --help.\n")
+
+
+def test_a_measured_table_is_not_drawn(capsys, tmp_path: Path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "felt.alta").write_text("")
+    message = run(capsys, "check", "felt.alta", "--plot", "felt.png", status=2)
+    assert message.startswith("error: --plot: draws materials, and felt.alta is a measured table. Fit a material to it")

@@ -96,6 +96,9 @@ def check(
         from fitting.cli.materials import find_materials
 
         is_table = brdf.is_measured(material)
+        if is_table and plot is not None:
+            remedy = f"Fit a material to it with brdf fit {material} --out DIR, and check DIR/material.json"
+            raise InputError("--plot", f"draws materials, and {material} is a measured table", remedy)
         materials: dict[str, Any] = (
             {Path(material).stem: brdf.load_measured(material)} if is_table else find_materials(material)
         )
@@ -106,7 +109,8 @@ def check(
             from fitting.plots.materials import overview
 
             with brdf.atomic_path(plot) as path:
-                overview(next(iter(materials.values()))).savefig(path)
+                name, one = next(iter(materials.items()))
+                overview(one, reports[name]).savefig(path)
     if as_json:
         show(json.dumps({name: report.to_json() for name, report in reports.items()}, indent=2))
     else:
