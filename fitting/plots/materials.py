@@ -135,7 +135,7 @@ def plot_lobe(brdf: Brdf, angles: tuple[float, ...] = (0.0, 30.0, 60.0), channel
     axes.yaxis.set_major_locator(MaxNLocator(3))
     axes.yaxis.set_major_formatter(lambda r, _: f"{r * abs(r):.3g}")
     axes.legend(loc="lower center", ncols=len(angles), bbox_to_anchor=(0.5, 0.0))
-    axes.set_title("Lobe f_r (N·V) in 1/sr, root scale")
+    axes.set_title(f"Lobe f_r (N·V) in 1/sr, root scale{_of(sample, channel)}")
     return figure
 
 
@@ -164,7 +164,7 @@ def plot_reciprocity(brdf: Brdf, channel: int = 0, figure: Any = None) -> Any:
     image = axes.pcolormesh(angles, angles, difference.T, cmap="cividis", vmin=-bound, vmax=bound, rasterized=True)
     figure.colorbar(image, label="(f_r(light→view) − f_r(view→light)) / the larger")
     axes.set(xlabel="angle of the light in degrees", ylabel="angle of the view in degrees", aspect="equal")
-    axes.set_title(f"Reciprocity error, at most {np.abs(difference).max():.2g} here")
+    axes.set_title(f"Reciprocity error, at most {np.abs(difference).max():.2g}{_of(sample, channel)}")
     return figure
 
 
@@ -218,6 +218,13 @@ def _lit_function(sample: Sampler, size: int = 256) -> Float[np.ndarray, "H W 3"
     image = np.zeros((size, size, radiance.shape[-1]))
     image[inside] = np.where(cosine > 0, np.nan_to_num(radiance), 0.0)
     return np.where(inside[..., None], displayed(image), 1.0)
+
+
+def _of(sample: Sampler, channel: int) -> str:
+    """Which channel is shown, where there are several."""
+    if sample.channels == 1:
+        return ""
+    return f", {channel_names(sample.channels)[channel] if sample.channels == 3 else f'channel {channel}'}"
 
 
 def _sampler(brdf: Brdf) -> Sampler:
