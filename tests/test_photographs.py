@@ -15,6 +15,8 @@ import pytest
 import brdf
 import fitting
 from brdf.errors import InputError
+from fitting.cli import encoding_trial
+from fitting.cli.job import Job
 from fitting.cli.main import main
 from fitting.photographs.archives import read_archive
 from fitting.photographs.ball import ball_points, light_from_highlight, light_from_shading, photograph_scene
@@ -530,3 +532,15 @@ def test_lights_from_the_chrome_sphere():
         apart.append(angle(light_from_highlight(picture, CHROME), direction))
     # The file itself is off for three of the twelve.
     assert np.count_nonzero(np.array(apart) < 3) >= 9
+
+
+@pytest.mark.parametrize("share", [0.2, 0.7, 0.95])
+def test_the_reading_that_leaves_less_is_taken_and_called_a_guess_unless_it_is_clear(share, monkeypatch):
+    picture = brdf.Picture(np.ones((2, 2, 1), np.float32), None, "srgb", "assumed", 8, 1.0)
+    jobs = (Job([picture], [], [None], Path("a.png")), Job([picture], [], [None], Path("a.png")))
+    left = iter([(1.0, 100.0), (share, 100.0)])
+    monkeypatch.setattr(encoding_trial, "unexplained", lambda job, result: next(left))
+    is_other, words = encoding_trial.judge(jobs, (Any, Any))
+    assert is_other == (share < 0.9)
+    assert ("a guess" in words) == (share >= 0.5)
+    assert words.endswith("say so with --encoding")

@@ -20,7 +20,9 @@ from fitting.cli.job import Job
 from fitting.cut_noise import without_cut_noise
 from fitting.result import FitResult
 
-# The other reading is believed where it leaves less than this share of the squares that the assumed one leaves.
+# The other reading is taken where it leaves less than this share of the squares that the assumed one leaves...
+LESS = 0.9
+# ... and one of them is no guess where it leaves less than this share of what the other leaves.
 CLEARLY = 0.5
 _NAMES = {"srgb": "sRGB"}
 
@@ -111,15 +113,14 @@ def judge(jobs: tuple[Job, Job], results: tuple[FitResult, FitResult]) -> tuple[
     assumed, other = (_NAMES.get(str(one), str(one)) for one in (picture.encoding, _other(picture)))
     left, other_left = (f"{100 * share**0.5:.{2 if share < 0.99 else 3}g} %" for share in shares)
     silent = f"{jobs[0].target.name} does not say how its values are encoded"
+    leaves = "the fit is off by {} of the values in the file (rms), under {} by {}"
     if shares[1] < CLEARLY * shares[0]:
-        told = (
-            f"{silent}: read as {other}, under which the fit is off by {other_left} of the values in the file (rms), "
-            f"under {assumed} by {left}. Where you know better, say so with --encoding"
-        )
-        return True, told
+        told = leaves.format(other_left, assumed, left)
+        return True, f"{silent}: read as {other}, under which {told}. Where you know better, say so with --encoding"
+    if shares[1] < LESS * shares[0]:
+        told = leaves.format(other_left, assumed, left)
+        return True, f"{silent}: {other} is a guess. Under it {told}. Where you know, say so with --encoding"
     if shares[0] < CLEARLY * shares[1]:
         return False, ""
-    return False, (
-        f"{silent}: {assumed} is a guess. Under it the fit is off by {left} of the values in the file (rms), under "
-        f"{other} by {other_left}: too alike to tell. Where you know, say so with --encoding"
-    )
+    told = leaves.format(left, other, other_left)
+    return False, f"{silent}: {assumed} is a guess. Under it {told}. Where you know, say so with --encoding"
