@@ -87,7 +87,7 @@ def rounding_by_rule(n: float, precision: brdf.Precision) -> float:
         n: exponent.
         precision: of the fit.
     """
-    return float(np.finfo(precision).eps * (3 + 0.03 * np.sqrt(max(n, 0.0))))
+    return float(np.finfo(precision).eps * (3 + 0.01 * np.sqrt(max(n, 0.0))))
 
 
 def nearly_dependent(optimum: Optimum) -> bool:

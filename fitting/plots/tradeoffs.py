@@ -60,33 +60,83 @@ def error_against_time(tradeoff: Tradeoff) -> Any:
     front = np.array([_place(row, least) for row in tradeoff.front])
     if len(front):
         axes.step(front[:, 0], front[:, 1], where="post", color="0.6", linewidth=1.2, zorder=1, label="Pareto front")
-    words: dict[Row, str] = {}
-    best = tradeoff.recommended
-    told = (best, "recommended") if best is not None else (tradeoff.closest, "most accurate")
-    for row, word in ((tradeoff.default, "default"), told):
-        if row is not None and np.isfinite(row.error):
-            words[row] = f"{words[row]}, {word}" if row in words else word
-    for row, word in words.items():
-        _mark(axes, _place(row, least), word)
     exact = [_place(row, least) for row in rows if _error(row) == 0]
     for place in exact:
         axes.annotate(
-            "0, the reference", place, xytext=(7, -3), textcoords="offset points", fontsize=8, color="0.3", zorder=5
+            "error 0: the reference",
+            place,
+            xytext=(9, -3),
+            textcoords="offset points",
+            fontsize=8,
+            color="0.3",
+            zorder=5,
         )
     label = f"accuracy {tradeoff.accuracy:g}"
-    axes.axhline(tradeoff.accuracy, color="0.4", linewidth=0.8, linestyle=(0, (4, 3)), zorder=0, label=label)
+    axes.axhline(tradeoff.accuracy, color="0.2", linewidth=0.9, linestyle=(0, (4, 3)), zorder=1, label=label)
     if rows:
         errors = [_place(row, least)[1] for row in rows]
         axes.set_ylim(min([*errors, tradeoff.accuracy]) / 4, max([*errors, tradeoff.accuracy]) * 5)
         ends = [1e3 * end for row in rows for end in (max(row.seconds - row.spread, row.seconds / 2), row.seconds)]
-        axes.set_xlim(min(ends) / 2.5, max(ends) * 2.2)
+        # Room on the left for what the labels of the quickest fits say.
+        axes.set_xlim(min(ends) * (min(ends) / max(ends)) ** 0.45 / 2.5, max(ends) * 2.2)
     axes.set_xlabel("time of a fit, compiled (ms)")
     axes.set_ylabel("relative error of the fit")
     axes.grid(visible=True, which="major", color="0.9", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0)
+    _label(figure, axes, tradeoff, least)
     return figure
+
+
+def _label(figure: Any, axes: Any, tradeoff: Tradeoff, least: float) -> None:
+    """Rings about default and recommendation, and below and left of each fit on the front, where nothing is, its name.
+
+    A label that would meet one that matters more is left out.
+    """
+    best = tradeoff.recommended
+    told = [(best, "recommended") if best is not None else (tradeoff.closest, "most accurate")]
+    words: dict[Row, str] = {}
+    for row, word in (*told, (tradeoff.default, "default")):
+        if row is not None and np.isfinite(row.error):
+            words[row] = f"{words[row]}, {word}" if row in words else word
+    taken: list[Any] = []
+    for row in [*words, *(row for row in tradeoff.front if row not in words)]:
+        place, word = _place(row, least), words.get(row)
+        if word:
+            ring = {"markersize": 11, "markerfacecolor": "none", "markeredgecolor": "0.1", "markeredgewidth": 1.1}
+            axes.plot(*place, "o", zorder=4, **ring)
+        told_name = f"{word}: {_name(row, tradeoff)}" if word else _name(row, tradeoff)
+        look: dict[str, Any] = {"fontsize": 8, "zorder": 2} if word else {"fontsize": 7, "color": "0.35", "zorder": 2}
+        below = row in tradeoff.front
+        look |= {"ha": "right", "va": "top"} if below else {"ha": "left", "va": "bottom"}
+        offset = (-7, -5) if below else (7, 6)
+        # Lines pass behind the words.
+        look["bbox"] = {"facecolor": "white", "edgecolor": "none", "pad": 0.8, "alpha": 0.85}
+        text = axes.annotate(told_name, place, xytext=offset, textcoords="offset points", **look)
+        figure.draw_without_rendering()
+        box = text.get_window_extent()
+        if not word and any(box.overlaps(other) for other in taken):
+            text.remove()
+        else:
+            taken.append(box)
+
+
+def _name(row: Row, tradeoff: Tradeoff) -> str:
+    """What of a configuration is not usual, in a few words."""
+    how, default = row.configuration, tradeoff.default
+    if how is None:
+        return row.name
+    words = ["all pixels" if how.pixels is None else f"{how.pixels} pixels"]
+    words += [f"{how.samples} samples"] if how.samples is not None else []
+    words += [how.precision] if how.precision != "float32" and how.solver == "separable" else []
+    words += (
+        [how.model]
+        if default is not None and default.configuration and how.model != default.configuration.model
+        else []
+    )
+    words += [how.solver.upper()] if how.solver != "separable" else []
+    return ", ".join([*words, *([] if how.shadows else ["no shadows"])])
 
 
 def _error(row: Row) -> float:
@@ -95,18 +145,3 @@ def _error(row: Row) -> float:
 
 def _place(row: Row, least: float) -> tuple[float, float]:
     return 1e3 * row.seconds, max(_error(row), least)
-
-
-def _mark(axes: Any, place: tuple[float, float], word: str) -> None:
-    """A ring about a mark, and a word below it, where nothing better was found."""
-    axes.plot(*place, "o", markersize=11, markerfacecolor="none", markeredgecolor="0.1", markeredgewidth=1.1, zorder=4)
-    axes.annotate(
-        word,
-        place,
-        xytext=(-6, -26),
-        textcoords="offset points",
-        ha="center",
-        fontsize=9,
-        zorder=5,
-        arrowprops={"arrowstyle": "-", "linewidth": 0.6, "shrinkB": 5},
-    )
