@@ -153,3 +153,27 @@ def test_a_coefficient_at_its_bound_is_zero_with_a_one_sided_interval():
     assert k_a.value == 0
     assert k_a.interval[0] == 0 < k_a.interval[1]
     assert "at its bound" in str(k_a)
+
+
+@pytest.mark.parametrize("model", ["lambert", "blinn-phong"])
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_a_flat_sheet_under_a_distant_light_tells_only_a_sum_of_ambient_and_diffuse(precision, model):
+    """Its diffuse basis image is a multiple of the ambient one, which the rounding of sums must not hide."""
+    camera = brdf.PerspectiveCamera(
+        position=[0.0, 0.0, 4.0], target=[0.0, 0.0, 0.0], up=[0.0, 1.0, 0.0], fov=25.0, resolution=(128, 128)
+    )
+    sheet = brdf.Rectangle(center=[0.0, 0.0, 0.0], edge_u=[1.0, 0.0, 0.3], edge_v=[0.0, 1.0, 0.06])
+    light = brdf.DirectionalLight(direction=[0.3, 0.4, 0.8], intensity=[1.0, 0.9, 0.8])
+    scene = brdf.Scene(camera=camera, shapes=[sheet], lights=[light], ambient=[0.3, 0.3, 0.3])
+    truth = brdf.BlinnPhong(k_a=[0.5] * 3, k_d=[0.5] * 3, k_s=[0.3] * 3, n=20.0)
+    picture = np.asarray(brdf.render(truth, scene, precision="float64"))
+    picture = picture + 0.01 * np.random.default_rng(0).standard_normal(picture.shape)
+    result = fitting.fit(picture, scene, model=model, precision=precision)
+    told = {(one.name, one.channel): one for one in result.parameters}
+    for channel in range(3):
+        for name in ("k_a", "k_d"):
+            assert told[name, channel].value is None
+            assert "only a sum of k_a and k_d" in told[name, channel].reason
+    if model == "blinn-phong":
+        highlight = told["k_s", 0]
+        assert abs(highlight.value - 0.3) < 4 * highlight.error

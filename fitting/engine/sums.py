@@ -11,7 +11,9 @@ flags keep NaN, infinity and division as IEEE has them. ``python -m benchmarks.e
 
 Precision. Products are formed in the pixels' own dtype and summed within a block; blocks are added in float64. The
 target enters as the residual against a reference model, and the reference is put back in float64, hence the rounding of
-a float32 pass scales with the residual and not with the picture.
+a float32 pass scales with the residual and not with the picture. Likewise each column enters less its mean over a few
+pixels, which is put back in float64: a surface that is lit alike all over, whose diffuse column is a multiple of the
+ambient one, would else seem to differ from it by the rounding of the sums.
 """
 
 from collections.abc import Iterable, Sequence
@@ -27,6 +29,9 @@ from fitting.engine.pictures import Lobe, Picture, relative_lobe
 
 # 32768 pixels of the six or seven arrays a pass reads stay in the second-level cache.
 BLOCK = 32768
+
+# Means of the columns are taken of about this many pixels.
+_MEAN_PIXELS = 64
 
 # Beyond this many channels of one grey basis a matrix product is as fast and compiles in a fraction of the time.
 UNROLLED_CHANNELS = 4
@@ -120,21 +125,41 @@ def _places(columns: int) -> Int[np.ndarray, "R R"]:
 
 
 def _unpack(packed: Float[np.ndarray, "*K S"], picture: Picture, columns: int, leading: int) -> Sums:
-    """Undo the packing of :func:`_products`, and scale the ambient column, which is constant and was summed as 1."""
+    """Undo the packing of :func:`_products`, and of what was taken off and added to it.
+
+    The ambient column is constant and was summed as 1; the others were summed less their means, which stand at the end.
+    """
     channels = picture.target.shape[1]
     if packed.ndim == leading + 1:
         packed = packed[..., None, :]
         residuals = channels
     else:
         residuals = 1
+    packed, mean = packed[..., : 1 - columns], packed[..., 1 - columns :]
     triangle = columns * (columns + 1) // 2
     last = triangle + residuals * columns
+    # A row of it makes a column of what was summed, in units of the ambient light.
+    whole = np.zeros((*mean.shape[:-1], columns, columns)) + np.eye(columns)
+    whole[..., 1:, 0] = mean
     scale = np.ones((channels, columns))
     scale[:, 0] = picture.ambient
-    gram = packed[..., _places(columns)] * (scale[:, :, None] * scale[:, None, :])
-    product = packed[..., triangle:last].reshape(*packed.shape[:leading], channels, columns) * scale
+    gram = whole @ packed[..., _places(columns)] @ whole.swapaxes(-1, -2) * (scale[:, :, None] * scale[:, None, :])
+    product = packed[..., triangle:last].reshape(*packed.shape[:leading], channels, columns)
+    product = (whole @ product[..., None])[..., 0] * scale
     square = packed[..., last:-1].reshape(*packed.shape[:leading], channels)
     return Sums(gram, product, square, np.broadcast_to(packed[..., -1], square.shape))
+
+
+def _means(picture: Picture, log_n: Float[Array, " N"], peak: Float[Array, ""]) -> Float[Array, "R-1 Cb"]:
+    """What to take off the columns: their means over some pixels that count, in the pixels' dtype; Cb is 1 or C."""
+    stride = max(1, picture.target.shape[0] // _MEAN_PIXELS)
+    few = picture.pixels(lambda a: a[::stride])
+    columns = jnp.stack(jnp.broadcast_arrays(*_columns(few.lobe, few.diffuse, log_n, peak)))
+    if few.weight is None:
+        return jnp.mean(columns, axis=1)
+    counts = (few.weight if few.weight.ndim < 2 else jnp.max(few.weight, axis=1)) > 0
+    total = jnp.sum(jnp.where(counts[:, None], columns, 0), axis=1)
+    return total / jnp.maximum(jnp.sum(counts), 1).astype(total.dtype)
 
 
 def _block_sums(
@@ -142,6 +167,7 @@ def _block_sums(
     log_n: Float[Array, " N"],
     reference: Float[Array, "3 C"],
     peak: Float[Array, ""],
+    mean: Float[Array, "R-1 Cb"],
     inside: Bool[Array, " B"] | None,
 ) -> Float[Array, "..."]:
     """Packed sums of one block: (S,) where all channels share basis and weight, else (C, S)."""
@@ -158,6 +184,7 @@ def _block_sums(
 
     def one_group(
         columns: Sequence[Float[Array, " B"]],
+        mean: Float[Array, " R-1"],
         targets: Float[Array, "c B"],
         weight: Float[Array, " B"] | None,
         reference: Float[Array, "3 c"],
@@ -169,39 +196,49 @@ def _block_sums(
                 model = model + reference[2, channel] * columns[1]
             residual = values - model
             residuals.append(residual if weight is None else jnp.where(weight > 0, residual, 0))
-        return _reduce(_products([jnp.ones_like(columns[0]), *columns], residuals, weight))
+        less = [column - mean[i] for i, column in enumerate(columns)]
+        return _reduce(_products([jnp.ones_like(columns[0]), *less], residuals, weight))
 
     if (
         len({column.shape[1] for column in lit} | {1}) == 1
         and (weight is None or weight.ndim < 2)
         and channels <= UNROLLED_CHANNELS
     ):
-        return one_group([column[:, 0] for column in lit], target.T, weight, reference)
+        return one_group([column[:, 0] for column in lit], mean[:, 0], target.T, weight, reference)
     columns = [jnp.broadcast_to(column, target.shape).T for column in lit]
     weights = None if weight is None else jnp.broadcast_to(weight.T, target.T.shape)
-    each = jax.vmap(one_group, in_axes=(0, 0, None if weight is None else 0, 0))
-    return each(columns, target.T[:, None, :], weights, reference.T[:, :, None])
+    means = jnp.broadcast_to(mean, (len(columns), channels)).T
+    each = jax.vmap(one_group, in_axes=(0, 0, 0, None if weight is None else 0, 0))
+    return each(columns, means, target.T[:, None, :], weights, reference.T[:, :, None])
 
 
 def _all_blocks(
     picture: Picture, log_n: Float[Array, " N"], reference: Float[Array, "3 C"], peak: Float[Array, ""]
 ) -> Float[Array, " S"] | Float[Array, "C S"]:
-    """Packed sums of one picture, block after block."""
+    """Packed sums of one picture, block after block, and at the end what was taken off the columns."""
     count = picture.target.shape[0]
     blocks = max(1, -(-count // BLOCK))
     size = -(-count // blocks)
-    if blocks == 1:
-        return _block_sums(picture, log_n, reference, peak, None)
+    mean = _means(picture, log_n, peak)
+
+    def block_sums(part: Picture, inside: Bool[Array, " B"] | None) -> Float[Array, "..."]:
+        return _block_sums(part, log_n, reference, peak, mean, inside)
 
     def add(block: Int[Array, ""], packed: Float[Array, "..."]) -> Float[Array, "..."]:
         # The last block starts early enough to be whole; what it shares with the one before counts once.
         start = jnp.minimum(block * size, count - size)
         part = picture.pixels(lambda a: jax.lax.dynamic_slice_in_dim(a, start, size))
         inside = None if count % size == 0 else start + jnp.arange(size) >= block * size
-        return packed + _block_sums(part, log_n, reference, peak, inside)
+        return packed + block_sums(part, inside)
 
-    shape = jax.eval_shape(lambda: _block_sums(picture, log_n, reference, peak, None))
-    return jax.lax.fori_loop(0, blocks, add, jnp.zeros(shape.shape, shape.dtype))
+    if blocks == 1:
+        packed = block_sums(picture, None)
+    else:
+        shape = jax.eval_shape(lambda: block_sums(picture, None))
+        packed = jax.lax.fori_loop(0, blocks, add, jnp.zeros(shape.shape, shape.dtype))
+    taken = mean.T.astype(packed.dtype)
+    taken = taken[0] if packed.ndim == 1 else jnp.broadcast_to(taken, (packed.shape[0], taken.shape[1]))
+    return jnp.concatenate([packed, taken], axis=-1)
 
 
 _one_exponent = jax.jit(_all_blocks, compiler_options=COMPILER_OPTIONS)
