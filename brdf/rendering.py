@@ -11,6 +11,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
@@ -204,15 +205,24 @@ def render(material: Material, scene: Scene, *, precision: Precision | None = No
         Linear radiance, (H, W, C).
 
     Raises:
-        InputError: where material and light differ in their channels.
+        InputError: where material and light differ in their channels, or a coefficient is out of reach.
     """
     with working_precision(precision):
         channels = channels_of(material, scene)
         scene, points = seen(scene, precision)
+        _check_reach(material, np.dtype(points.normal.dtype))
         material = cast(material, precision)
         image = shade(material, points, scene.ambient, scene.lighting)
         width, height = scene.resolution
         return jnp.zeros((height, width, channels)) if image is None else image
+
+
+def _check_reach(material: Material, dtype: np.dtype) -> None:
+    for name in ("k_a", "k_d", "k_s"):
+        value = getattr(material, name, None)
+        if isinstance(value, np.ndarray) and np.any(value > np.finfo(dtype).max):
+            came = f"is out of reach of {dtype.name}, got {np.max(value):g}"
+            raise InputError(name, came, "Use another unit of light, or float64")
 
 
 def seen(scene: Scene, precision: Precision | None) -> tuple[Scene, SurfacePoints]:

@@ -30,7 +30,7 @@ KEPT = 0.2
 ROUNDS = 5
 # A window of brightness with fewer pairs of pixels tells no noise of its own.
 FEWEST_PAIRS = 50
-BLACK, WHITE = "noise cut off at black", "noise cut off at white"
+BLACK, WHITE = "whose noise is cut off at black", "whose noise is cut off at white"
 
 
 class Cut(NamedTuple):
@@ -61,7 +61,8 @@ def without_cut_noise(
         The last fit, what it left out named by its reason; the given one where nothing is cut.
     """
     whole, found, used = result, [], None
-    if not any(_may_be_cut(*picture) for picture in zip(whole.targets, whole.counted, strict=True)):
+    clipped = result.left_out.get("clipped", 0) >= FEWEST
+    if not (clipped or any(_piles_up(*picture) for picture in zip(whole.targets, whole.counted, strict=True))):
         return result
     for _ in range(ROUNDS):
         pictures = zip(whole.targets, result.scenes, whole.counted, strict=True)
@@ -94,14 +95,13 @@ def without_cut_noise(
     return dataclasses.replace(result, left_out={reason: n for reason, n in told.items() if n}, warnings=warnings)
 
 
-def _may_be_cut(target: Float[np.ndarray, "H W C"], counted: Bool[np.ndarray, "H W"]) -> bool:
-    """A first look, without a prediction: clipped pixels, or single values at the lower end among larger ones."""
-    if not counted.any():
-        return False
+def _piles_up(target: Float[np.ndarray, "H W C"], counted: Bool[np.ndarray, "H W"]) -> bool:
+    """A first look, without a prediction: single values at the lower end among larger ones."""
     for value in np.moveaxis(target, -1, 0):
-        if np.count_nonzero((value > np.max(value[counted])) & ~counted) >= FEWEST:
-            return True
-        above = counted & (value > np.min(value[counted]))
+        inside = value[counted]
+        if not inside.size or np.count_nonzero(inside == np.min(inside)) < FEWEST:
+            continue
+        above = counted & (value > np.min(inside))
         # What is dark without noise is dark in one piece.
         if np.count_nonzero(above[:, :-2] & (counted & ~above)[:, 1:-1] & above[:, 2:]) >= FEWEST:
             return True
@@ -156,6 +156,9 @@ def _near_black(
     at_end = counted & (value == floor) & (model > 0)
     above = value[counted & (value > floor)]
     if np.count_nonzero(at_end) < FEWEST or not above.size:
+        return np.zeros(counted.shape, bool)
+    # The cut half of the noise piles up at the end; where noise only thins out, each code holds fewer than the next.
+    if np.count_nonzero(at_end) <= np.count_nonzero(above == np.min(above)):
         return np.zeros(counted.shape, bool)
     near = _near(value, model, counted, floor, float(np.min(above)) - floor)
     return near if np.count_nonzero(near & at_end) >= FEWEST else np.zeros(counted.shape, bool)

@@ -9,6 +9,7 @@ import numpy as np
 
 import brdf
 from brdf.errors import InputError
+from fitting.cut_noise import without_cut_noise
 from fitting.engine.losses import LOSSES, Loss
 from fitting.engine.normal import fit_tied
 from fitting.engine.separable import Picture, fit_linear
@@ -16,7 +17,7 @@ from fitting.engine.streams import each
 from fitting.interpretation import Interpretation, ModelFit, coefficient_factors, interpret
 from fitting.light_colour import take_colour_out
 from fitting.model_fit import Job, fit_model, optimise, reached
-from fitting.observation import observe
+from fitting.observation import Observation, observe
 from fitting.picture_inputs import (
     check_levels,
     check_range,
@@ -119,25 +120,45 @@ def fit(
         how = {"mask": masks, "saturation": saturation, "n_range": n_range, "dark": dark, "weight": weights}
         beside = {"loss": loss != "squared", "noise": noise is not None, "plausible": plausible}
         return fit_within(targets, scenes, model, precision, how, beside, accuracy=accuracy, seconds=seconds)
-    with brdf.working_precision(precision):
-        dtype = np.dtype(precision)
-        cuts = {"saturation": saturation, "dark": dark, "noise": noise}
-        observations = [
-            observe(picture, place, dtype=dtype, mask=one, weight=other, **cuts)
-            for picture, place, one, other in zip(targets, scenes, masks, relative_weights(weights), strict=True)
-        ]
-        counts = {observation.shown.shape[-1] for observation in observations}
-        if len(counts) > 1:
-            raise InputError("target", f"pictures have {counts} channels", "Give pictures with the same number")
-        light = take_colour_out(scenes, counts.pop())
-        job = Job(observations, light, n_range, loss, PLAUSIBLE if plausible else AUTO)
-        if model == "auto":
-            fitted, choice = _fit_auto(job)
-        else:
-            fitted, choice = fit_model(brdf.MODELS[model], job), None
-        if plausible:
-            fitted = _held_plausible(fitted, job)
-        told = _interpret(fitted, job, choice)
+    cuts = {"saturation": saturation, "dark": dark, "noise": noise}
+    weights = relative_weights(weights)
+
+    def fit_to(masks: list[Any]) -> FitResult:
+        with brdf.working_precision(precision):
+            observations = [
+                observe(picture, place, dtype=np.dtype(precision), mask=one, weight=other, **cuts)
+                for picture, place, one, other in zip(targets, scenes, masks, weights, strict=True)
+            ]
+            return _fit_observed(observations, scenes, model, precision, n_range, loss, plausible, start)
+
+    result = fit_to(masks)
+    if any(isinstance(one, brdf.ImageReader) for one in targets):
+        return result
+    return without_cut_noise(result, masks, fit_to)
+
+
+def _fit_observed(
+    observations: list[Observation],
+    scenes: list[brdf.Scene],
+    model: str,
+    precision: brdf.Precision,
+    n_range: tuple[float, float],
+    loss: Loss,
+    plausible: bool,
+    start: float,
+) -> FitResult:
+    counts = {observation.shown.shape[-1] for observation in observations}
+    if len(counts) > 1:
+        raise InputError("target", f"pictures have {counts} channels", "Give pictures with the same number")
+    light = take_colour_out(scenes, counts.pop())
+    job = Job(observations, light, n_range, loss, PLAUSIBLE if plausible else AUTO)
+    if model == "auto":
+        fitted, choice = _fit_auto(job)
+    else:
+        fitted, choice = fit_model(brdf.MODELS[model], job), None
+    if plausible:
+        fitted = _held_plausible(fitted, job)
+    told = _interpret(fitted, job, choice)
     return _result(fitted, told, choice, job, precision, time.perf_counter() - start)
 
 

@@ -17,7 +17,6 @@ import fitting
 from brdf.errors import InputError
 from fitting.cli.common import named_as
 from fitting.cli.job import Job
-from fitting.cut_noise import without_cut_noise
 from fitting.result import FitResult
 
 # The other reading is taken where it leaves less than this share of the squares that the assumed one leaves...
@@ -63,15 +62,11 @@ def fit_either(
 
 
 def _fit(job: Job, how: dict[str, Any]) -> FitResult:
-    def fit_to(masks: list[Any]) -> FitResult:
-        if len(job.pictures) > 1:
-            return fitting.fit(job.pictures, job.scenes, mask=masks, **how)
-        return fitting.fit(job.pictures[0], job.scenes[0], mask=masks[0], **how)
-
+    several = len(job.pictures) > 1
     with named_as({"target": job.target}):
-        result = fit_to(job.masks)
-        # A second fit would not keep to the time.
-        return result if how.get("seconds") is not None else without_cut_noise(result, job.masks, fit_to)
+        if several:
+            return fitting.fit(job.pictures, job.scenes, mask=job.masks, **how)
+        return fitting.fit(job.pictures[0], job.scenes[0], mask=job.masks[0], **how)
 
 
 def _other(picture: brdf.Picture) -> Any:

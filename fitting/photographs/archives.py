@@ -23,6 +23,7 @@ _DAMAGE = (
     TypeError,
     OverflowError,
     SyntaxError,
+    SystemError,  # what Python 3.13 makes of a header with a null byte
     tokenize.TokenError,
     zipfile.BadZipFile,
 )

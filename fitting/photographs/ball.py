@@ -31,7 +31,7 @@ def ball_points(shape: tuple[int, int], circle: Circle) -> brdf.SurfacePoints:
         circle: the ball's outline.
 
     Returns:
-        Points on the unit ball, (H, W); the mask is true where the centre of a pixel is on the ball.
+        Points on the unit ball, (H, W); the mask is true where a whole pixel is on the ball.
 
     Raises:
         InputError: where the circle is none or lies outside the picture.

@@ -124,7 +124,8 @@ def ball_normals(shape: tuple[int, int], circle: Circle) -> tuple[Float[np.ndarr
         circle: the ball's outline.
 
     Returns:
-        Normals, 0 beside the ball; and where the centre of a pixel is on the ball.
+        Normals, 0 beside the ball; and which pixels show nothing but the ball. The outline runs through the others: a
+        camera mixes what lies behind into them.
 
     Raises:
         InputError: where the circle is none or lies outside the picture.
@@ -134,9 +135,10 @@ def ball_normals(shape: tuple[int, int], circle: Circle) -> tuple[Float[np.ndarr
     x = (np.arange(width) - circle.x) / circle.radius
     y = -(np.arange(height)[:, None] - circle.y) / circle.radius
     squared = x * x + y * y
-    inside = squared < 1
+    half = 0.5 / circle.radius
+    inside = (np.abs(x) + half) ** 2 + (np.abs(y) + half) ** 2 <= 1
     if not inside.any():
-        came = f"{tuple(circle)} lies outside the picture of {width} x {height} pixels"
+        came = f"{tuple(circle)} lies outside the picture of {width} x {height} pixels, or is smaller than one of them"
         raise InputError("circle", came, "x is to the right, y down, from the upper left pixel")
     normal = np.stack([*np.broadcast_arrays(x, y), np.sqrt(np.maximum(1 - squared, 0.0))], axis=-1)
     return np.where(inside[..., None], normal, 0.0), inside
