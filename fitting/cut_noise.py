@@ -87,8 +87,9 @@ def without_cut_noise(
     spared = sorted({channel for cut in found for channel in cut.spared})
     warnings = result.warnings
     if spared:
-        channels = ", ".join(map(str, spared))
-        words = f"noise is cut off at black or white almost everywhere in channel {channels}: its coefficients are bent"
+        names = brdf.channel_names(whole.targets[0].shape[-1])
+        where = f" in channel {', '.join(names[channel] for channel in spared)}" if len(names) > 1 else ""
+        words = f"noise is cut off at black or white almost everywhere{where}: the coefficients are bent there"
         warnings = (words, *warnings)
     if used is None and not spared:
         return result

@@ -28,10 +28,11 @@ def missing_ambient(pictures: Sequence[Picture]) -> str:
         if np.any(np.asarray(picture.ambient)):
             return ""
         some = slice(None, None, -(-picture.target.shape[0] // MOST_PIXELS))
-        target, diffuse = np.asarray(picture.target[some], np.float64), np.asarray(picture.diffuse[some])
+        # Through NumPy: a slice of an array on the device would be compiled.
+        target, diffuse = np.asarray(picture.target)[some].astype(np.float64), np.asarray(picture.diffuse)[some]
         counted = np.all(np.isfinite(target), axis=1)
         if picture.weight is not None:
-            counted &= np.asarray(picture.weight[some]).reshape(len(target), -1).min(axis=1) > 0
+            counted &= np.asarray(picture.weight)[some].reshape(len(target), -1).min(axis=1) > 0
         reached = np.any(diffuse > 0, axis=1)
         brightness = target.mean(axis=1)
         dark.append(brightness[counted & ~reached])
