@@ -64,7 +64,7 @@ def fit(
 
     Args:
         target: linear values, (H, W, C) or (H, W), or a `brdf.Picture`; a `brdf.ImageReader` for a file that is larger
-            than memory, which is read by bands of rows, several times; or a list of them.
+            than memory, which is read by bands of rows, several times (`fitting.cut_noise` is for others); or a list.
         scene: what the picture shows; a list of as many where there are several pictures.
         model: "auto" for the simplest adequate of Lambert, Phong and Blinn-Phong, or the name of a model.
         precision: "float32" or "float64".
