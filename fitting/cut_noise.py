@@ -48,65 +48,68 @@ class Cut(NamedTuple):
 
 
 def without_cut_noise(
-    result: FitResult, masks: Sequence[Any], again: Callable[[list[Bool[np.ndarray, "H W"]]], FitResult]
+    whole: FitResult, masks: Sequence[Any], again: Callable[[list[Bool[np.ndarray, "H W"]]], FitResult]
 ) -> FitResult:
     """The fit without pixels whose noise is cut off, where there are any.
 
     Args:
-        result: of the fit to all pixels, its pictures in memory.
+        whole: of the fit to all pixels, its pictures in memory.
         masks: pixels that it looked at in each picture, (H, W), or None.
         again: fits to the pixels of other masks.
 
     Returns:
         The last fit, what it left out named by its reason; the given one where nothing is cut.
     """
-    whole, found, used = result, [], None
-    clipped = result.left_out.get("clipped", 0) >= FEWEST
+    clipped = whole.left_out.get("clipped", 0) >= FEWEST
     if not (clipped or any(_piles_up(*picture) for picture in zip(whole.targets, whole.counted, strict=True))):
-        return result
+        return whole
+    allowed = [
+        np.ones(counted.shape, bool) if mask is None else np.asarray(mask).astype(bool)
+        for mask, counted in zip(masks, whole.counted, strict=True)
+    ]
+    # Once left out stays out: a threshold that moves to and fro would never end.
+    black = [np.zeros(counted.shape, bool) for counted in whole.counted]
+    white = [np.zeros(counted.shape, bool) for counted in whole.counted]
+    result, spared = whole, set()
     for _ in range(ROUNDS):
-        pictures = zip(whole.targets, result.scenes, whole.counted, strict=True)
-        found = [_cut(np.asarray(target), _predicted(result, scene), counted) for target, scene, counted in pictures]
-        looked_at = [~(cut.black | cut.white) for cut in found]
-        if used is not None:
-            # Once left out stays out: a threshold that moves to and fro would never end.
-            looked_at = [one & before for one, before in zip(looked_at, used, strict=True)]
-        left_out = sum(int(np.count_nonzero(~one)) for one in looked_at)
-        before = 0 if used is None else sum(int(np.count_nonzero(~one)) for one in used)
-        if left_out <= before * 1.01:
+        before = _count(black) + _count(white)
+        for i, (target, scene) in enumerate(zip(whole.targets, result.scenes, strict=True)):
+            counted = whole.counted[i]
+            cut = _cut(np.asarray(target), _predicted(result, scene), counted, allowed[i], clipped=clipped)
+            black[i] |= cut.black & counted & ~white[i]
+            white[i] |= cut.white & counted & ~black[i]
+            spared.update(cut.spared)
+        if _count(black) + _count(white) <= before * 1.01:
             break
-        used = looked_at
-        result = again(
-            [one if mask is None else one & (np.asarray(mask) > 0) for one, mask in zip(used, masks, strict=True)]
-        )
-    told = dict(whole.left_out)
-    if used is not None:
-        gone = [counted & ~one for counted, one in zip(whole.counted, used, strict=True)]
-        black = sum(int(np.count_nonzero(one & cut.black)) for one, cut in zip(gone, found, strict=True))
-        told |= {BLACK: black, WHITE: sum(int(np.count_nonzero(one)) for one in gone) - black}
-    spared = sorted({channel for cut in found for channel in cut.spared})
+        result = again([ok & ~(one | other) for ok, one, other in zip(allowed, black, white, strict=True)])
+    if result is whole and not spared:
+        return whole
+    left_out = whole.left_out | {BLACK: _count(black), WHITE: _count(white)}
     warnings = result.warnings
     if spared:
         names = brdf.channel_names(whole.targets[0].shape[-1])
-        where = f" in channel {', '.join(names[channel] for channel in spared)}" if len(names) > 1 else ""
+        where = f" in channel {', '.join(names[channel] for channel in sorted(spared))}" if len(names) > 1 else ""
         words = f"noise is cut off at black or white almost everywhere{where}: the coefficients are bent there"
         warnings = (words, *warnings)
-    if used is None and not spared:
-        return result
-    return dataclasses.replace(result, left_out={reason: n for reason, n in told.items() if n}, warnings=warnings)
+    return dataclasses.replace(result, left_out={reason: n for reason, n in left_out.items() if n}, warnings=warnings)
+
+
+def _count(masks: Sequence[Bool[np.ndarray, "H W"]]) -> int:
+    return sum(int(np.count_nonzero(mask)) for mask in masks)
 
 
 def _piles_up(target: Float[np.ndarray, "H W C"], counted: Bool[np.ndarray, "H W"]) -> bool:
-    """A first look, without a prediction: single values at the lower end among larger ones."""
-    for value in np.moveaxis(target, -1, 0):
-        inside = value[counted]
-        if not inside.size or np.count_nonzero(inside == np.min(inside)) < FEWEST:
-            continue
-        above = counted & (value > np.min(inside))
-        # What is dark without noise is dark in one piece.
-        if np.count_nonzero(above[:, :-2] & (counted & ~above)[:, 1:-1] & above[:, 2:]) >= FEWEST:
-            return True
-    return False
+    """Whether noise may be cut at black in some channel; a look that needs no prediction."""
+    return any(_single_values_at_end(value, counted) for value in np.moveaxis(target, -1, 0))
+
+
+def _single_values_at_end(value: Float[np.ndarray, "H W"], counted: Bool[np.ndarray, "H W"]) -> bool:
+    """Whether single pixels stand at the lower end among larger ones: what is dark without noise is so in one piece."""
+    inside = value[counted]
+    if not inside.size or np.count_nonzero(inside == np.min(inside)) < FEWEST:
+        return False
+    above = counted & (value > np.min(inside))
+    return int(np.count_nonzero(above[:, :-2] & (counted & ~above)[:, 1:-1] & above[:, 2:])) >= FEWEST
 
 
 def _predicted(result: FitResult, scene: brdf.Scene) -> Float[np.ndarray, "H W C"]:
@@ -114,9 +117,14 @@ def _predicted(result: FitResult, scene: brdf.Scene) -> Float[np.ndarray, "H W C
 
 
 def _cut(
-    target: Float[np.ndarray, "H W C"], predicted: Float[np.ndarray, "H W C"], counted: Bool[np.ndarray, "H W"]
+    target: Float[np.ndarray, "H W C"],
+    predicted: Float[np.ndarray, "H W C"],
+    counted: Bool[np.ndarray, "H W"],
+    allowed: Bool[np.ndarray, "H W"],
+    *,
+    clipped: bool,
 ) -> Cut:
-    """What of one picture is too near to an end, by what is predicted."""
+    """What of one picture is too near to an end, by what is predicted; to white only where pixels were clipped."""
     predicted = np.broadcast_to(predicted, target.shape)
     nowhere = np.zeros(counted.shape, bool)
     if not counted.any():
@@ -125,9 +133,9 @@ def _cut(
         brightest = np.max(target, axis=-1)
     seen = np.isfinite(brightest) & np.any(predicted > 0, axis=-1)
     level = float(np.max(brightest[counted]))
-    beyond = brightest[seen & ~counted & (brightest > level)]
+    beyond = brightest[seen & allowed & ~counted & (brightest > level)]
     # Clipped pixels do not count; where none are, white was not reached.
-    white = level if beyond.size >= FEWEST else np.inf
+    white = level if clipped and beyond.size >= FEWEST else np.inf
     step = float(np.min(beyond)) - level if beyond.size else 0.0
     lit = counted & np.any(predicted > 0, axis=-1)
     ends: list[tuple[int, np.ndarray, np.ndarray]] = []
@@ -152,7 +160,9 @@ def _cut(
 def _near_black(
     value: Float[np.ndarray, "H W"], model: Float[np.ndarray, "H W"], counted: Bool[np.ndarray, "H W"]
 ) -> Bool[np.ndarray, "H W"]:
-    """Pixels predicted so near to black that noise is cut there; none where no value stands at the end of the range."""
+    """Pixels predicted so near to black that noise is cut there; none where no single values stand at the end."""
+    if not _single_values_at_end(value, counted):
+        return np.zeros(counted.shape, bool)
     floor = float(np.min(value[counted]))
     at_end = counted & (value == floor) & (model > 0)
     above = value[counted & (value > floor)]

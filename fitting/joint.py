@@ -24,6 +24,7 @@ from jaxtyping import Array, Bool, Float
 import brdf
 from fitting.joint_problem import JointProblem
 from fitting.observation import Tile, observe
+from fitting.picture_inputs import pictures_and_scenes
 
 LARGEST_JACOBIAN = 1 << 27
 ROUNDS = 8
@@ -77,7 +78,7 @@ def fit_jointly(
             ``lambda m, s: (m.k_d, m.n, s[0].lights[0].direction)``.
         solver: "lm", "bfgs", or None to choose by size.
         precision: "float32" or "float64".
-        mask: (H, W), pixels to look at, or a list.
+        mask: (H, W), pixels to look at, or a list, such as ``fitting.fit(target, scene).counted[0]``.
         saturation: see `fitting.fit`.
         tolerance: relative and absolute, on the freed numbers and the cost.
         max_steps: of the solver.
@@ -87,12 +88,14 @@ def fit_jointly(
         its error is infinite.
 
     Raises:
-        InputError: where target or scene cannot be used, or ``free`` names no leaf.
+        InputError: where an argument cannot be used, or ``free`` does not name distinct leaves.
     """
-    several = isinstance(target, list | tuple)
-    targets = list(target) if several else [target]
-    scenes = [scene] * len(targets) if isinstance(scene, brdf.Scene) else list(scene)
-    masks = list(mask) if several and isinstance(mask, list | tuple) else [mask] * len(targets)
+    if solver not in (None, "lm", "bfgs"):
+        raise brdf.InputError("solver", f"is unknown, got {solver!r}", "Use lm, bfgs or None")
+    if not (0 < tolerance < 1 and max_steps >= 1):
+        came = f"and max_steps must be above 0, got {tolerance!r} and {max_steps!r}"
+        raise brdf.InputError("tolerance", came, "Give for example 1e-10 and 256")
+    targets, scenes, masks, _ = pictures_and_scenes(target, scene, mask, None)
     with brdf.working_precision(precision):
         dtype = np.dtype(precision)
         seen = [

@@ -38,11 +38,21 @@ class JointProblem(eqx.Module):
         """Find the freed leaves by putting markers there.
 
         Raises:
-            InputError: where ``free`` names no leaf.
+            InputError: where ``free`` does not name distinct leaves.
         """
-        count = len(tuple(free(*start)))
-        if not count:
+        remedy = "Return a tuple of leaves, such as (material.n, scenes[0].lights[0].direction)"
+        try:
+            leaves = tuple(free(*start))
+        except TypeError as error:
+            raise brdf.InputError("free", f"gives no tuple of leaves ({error})", remedy) from None
+        if not leaves:
             raise brdf.InputError("free", "names no leaf", "Return the leaves to fit")
+        own = {id(leaf) for leaf in jax.tree.leaves(start)}
+        if not all(id(leaf) in own and jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves):
+            raise brdf.InputError("free", "gives what is no number of material or scenes as a whole", remedy)
+        if len({id(leaf) for leaf in leaves}) < len(leaves):
+            raise brdf.InputError("free", "gives a leaf twice", remedy)
+        count = len(leaves)
         marked = eqx.tree_at(lambda tree: tuple(free(*tree)), start, [_Marker(index) for index in range(count)])
         paths = jax.tree_util.tree_leaves_with_path(marked, is_leaf=lambda leaf: isinstance(leaf, _Marker))
         found = {

@@ -23,7 +23,9 @@ from fitting.picture_inputs import (
     check_range,
     check_sizes,
     check_weight,
+    looked_at,
     per_pixel,
+    pictures_and_scenes,
     pixels_of,
     relative_weights,
 )
@@ -74,7 +76,8 @@ def fit(
         n_range: bounds of the exponent, 0 < lower < upper.
         loss: "squared"; "relative" or "log" for high dynamic range; "huber" or "cauchy" where some pixels show what the
             scene does not know. See `fitting.engine.losses` for what to use when.
-        dark: linear value up to which pixels are too dark to count.
+        dark: linear value up to which pixels are too dark to count. By the value itself: where noise is large that
+            leaves out what noise made darker, and ``noise`` is the better way.
         noise: of the camera, (read, shot): the variance of a value is read² + shot · value, and pixels weigh by its
             inverse. None weighs all alike.
         weight: (H, W), how much each pixel counts beside that, at least 0; a list where there are several pictures.
@@ -94,7 +97,7 @@ def fit(
     Source: Golub and Pereyra 1973, variable projection; see `fitting.engine.separable`.
     """
     start = time.perf_counter()
-    targets, scenes, masks, weights = _pictures(target, scene, mask, weight)
+    targets, scenes, masks, weights = pictures_and_scenes(target, scene, mask, weight)
     if model != "auto" and model not in brdf.MODELS:
         raise InputError("model", f"is unknown, got {model!r}", f"Use auto or one of {', '.join(brdf.MODELS)}")
     if plausible and model in AUTO:
@@ -134,7 +137,7 @@ def fit(
     result = fit_to(masks)
     if any(isinstance(one, brdf.ImageReader) for one in targets):
         return result
-    return without_cut_noise(result, masks, fit_to)
+    return without_cut_noise(result, list(map(looked_at, masks, weights)), fit_to)
 
 
 def _fit_observed(
@@ -160,26 +163,6 @@ def _fit_observed(
         fitted = _held_plausible(fitted, job)
     told = _interpret(fitted, job, choice)
     return _result(fitted, told, choice, job, precision, time.perf_counter() - start)
-
-
-def _pictures(
-    target: Any, scene: Any, mask: Any, weight: Any
-) -> tuple[list[Any], list[brdf.Scene], list[Any], list[Any]]:
-    several = isinstance(target, list | tuple)
-    targets = list(target) if several else [target]
-    scenes = list(scene) if isinstance(scene, list | tuple) else [scene] * len(targets)
-    masks, weights = (
-        list(values) if several and isinstance(values, list | tuple) else [values] * len(targets)
-        for values in (mask, weight)
-    )
-    if not targets:
-        raise InputError("target", "is an empty list", "Give at least one picture")
-    for name, values in (("scene", scenes), ("mask", masks), ("weight", weights)):
-        if len(values) != len(targets):
-            raise InputError(name, f"has {len(values)} entries for {len(targets)} pictures", "Give one for each")
-    if not all(isinstance(one, brdf.Scene) for one in scenes):
-        raise InputError("scene", f"must be a brdf.Scene, got {type(scene).__name__}", "Use brdf.Scene.load")
-    return targets, scenes, masks, weights
 
 
 def _fit_auto(job: Job) -> tuple[ModelFit, Choice]:

@@ -42,6 +42,37 @@ def check_levels(saturation: Any, dark: Any, noise: Any) -> tuple[float, float] 
     return read, shot
 
 
+def pictures_and_scenes(
+    target: Any, scene: Any, mask: Any, weight: Any
+) -> tuple[list[Any], list[brdf.Scene], list[Any], list[Any]]:
+    """What was given for one picture or for several, as lists of one length.
+
+    Args:
+        target: a picture or a list of them.
+        scene: a scene for all, or a list.
+        mask: likewise, or None.
+        weight: likewise.
+
+    Raises:
+        InputError: where they are not as many, or a scene is none.
+    """
+    several = isinstance(target, list | tuple)
+    targets = list(target) if several else [target]
+    scenes = list(scene) if isinstance(scene, list | tuple) else [scene] * len(targets)
+    masks, weights = (
+        list(values) if several and isinstance(values, list | tuple) else [values] * len(targets)
+        for values in (mask, weight)
+    )
+    if not targets:
+        raise InputError("target", "is an empty list", "Give at least one picture")
+    for name, values in (("scene", scenes), ("mask", masks), ("weight", weights)):
+        if len(values) != len(targets):
+            raise InputError(name, f"has {len(values)} entries for {len(targets)} pictures", "Give one for each")
+    if not all(isinstance(one, brdf.Scene) for one in scenes):
+        raise InputError("scene", f"must be a brdf.Scene, got {type(scene).__name__}", "Use brdf.Scene.load")
+    return targets, scenes, masks, weights
+
+
 def per_pixel(name: str, values: Any, shape: tuple[int, int]) -> np.ndarray:
     """A value per pixel as an array.
 
@@ -75,6 +106,18 @@ def check_weight(weight: Any, shape: tuple[int, int]) -> np.ndarray:
     if not np.all(weight >= 0) or not np.any(weight > 0):
         raise InputError("weight", "must be 0 or more, and more somewhere", "Give values of 0 or more")
     return weight
+
+
+def looked_at(mask: Any, weight: Any) -> Any:
+    """Pixels that a mask allows and that weigh something, (H, W); None where all do.
+
+    Args:
+        mask: as given to `fitting.fit`, checked.
+        weight: likewise.
+    """
+    given = [np.asarray(mask).astype(bool)] if mask is not None else []
+    given += [np.asarray(weight) > 0] if weight is not None else []
+    return np.logical_and.reduce(given) if given else None
 
 
 def relative_weights(weights: list[Any]) -> list[Any]:

@@ -51,6 +51,7 @@ def test_cut_noise_does_not_bend_the_fit(material, low, reason, bits):
         results = [fitted(seen(material, 0.03, seed, low=low, bits=bits), mended) for seed in range(DRAWS)]
         found[mended] = np.mean([deviations(result, material) for result in results], axis=0)
         assert all((reason in result.left_out) == mended for result in results)
+        assert all((WHITE if reason == BLACK else BLACK) not in result.left_out for result in results)
     # The mean of six is known to 0.4 of a standard error.
     assert np.all(np.abs(found[False]) > 1.8)
     assert np.all(np.abs(found[True]) < 1.4)
@@ -75,6 +76,25 @@ def test_noise_of_a_flat_dark_side_is_not_cut(bits):
     material = brdf.BlinnPhong(k_a=[0.1], k_d=[0.5], k_s=[0.3], n=30.0)
     result = fitting.fit(seen(material, 0.01, 0, low=0.0, bits=bits), SCENE, model="blinn-phong")
     assert BLACK not in result.left_out
+    assert WHITE not in result.left_out
+
+
+def test_a_dark_side_without_noise_is_kept_beside_a_clipped_highlight():
+    """A cast shadow that the scene does not know is a misfit, not noise."""
+    material = brdf.BlinnPhong(k_a=[0.02], k_d=[0.6], k_s=[0.8], n=40.0)
+    clean = np.minimum(np.asarray(brdf.render(material, SCENE)), 0.8).astype(np.float32)
+    clean[50:70, 30:45] = float(np.min(clean[np.asarray(POINTS.mask)]))
+    assert np.count_nonzero(clean == clean.max()) > 30
+    result = fitting.fit(clean, SCENE, model="blinn-phong", loss="huber")
+    assert BLACK not in result.left_out
+
+
+@pytest.mark.parametrize("by", ["mask", "weight"])
+def test_what_is_masked_is_not_clipped(by):
+    picture = seen(DULL, 0.03, 0, low=0.0, bits=None).pixels
+    wanted = np.asarray(brdf.render(DULL, SCENE))[..., 0] < 0.5
+    result = fitting.fit(picture, SCENE, model="blinn-phong", **{by: wanted.astype(float)})
+    assert result.left_out[BLACK] > 0
     assert WHITE not in result.left_out
 
 

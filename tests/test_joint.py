@@ -90,3 +90,25 @@ def test_nothing_to_free_is_an_error(target: np.ndarray):
     known = scene(TRUE_DIRECTION, [1.0, 0.9, 0.8])
     with pytest.raises(brdf.InputError, match="names no leaf"):
         fitting.fit_jointly(target, known, MATERIAL, lambda m, s: ())
+
+
+@pytest.mark.parametrize(
+    ("free", "said"),
+    [
+        (lambda m, s: (s[0].lights[0],), "no number"),
+        (lambda m, s: (m.k_d, m.k_d), "twice"),
+        (lambda m, s: (np.ones(3),), "no number"),
+        (lambda m, s: (m.k_d[0],), "no number"),
+        (None, "no tuple"),
+    ],
+)
+def test_what_names_no_leaf_is_an_error(target: np.ndarray, free, said):
+    with pytest.raises(brdf.InputError, match=said):
+        fitting.fit_jointly(target, scene(TRUE_DIRECTION, [1.0, 0.9, 0.8]), MATERIAL, free)
+
+
+@pytest.mark.parametrize("options", [{"solver": "adam"}, {"tolerance": np.nan}, {"max_steps": 0}])
+def test_options_of_the_solver_are_checked(target: np.ndarray, options):
+    known = scene(TRUE_DIRECTION, [1.0, 0.9, 0.8])
+    with pytest.raises(brdf.InputError, match=next(iter(options))):
+        fitting.fit_jointly(target, known, MATERIAL, lambda m, s: (m.n,), **options)

@@ -15,6 +15,7 @@ import brdf
 from brdf.errors import InputError
 from fitting.accuracy.lamps import Lamps
 from fitting.accuracy.pixel_sampling import PixelSample, sample_pixels
+from fitting.picture_inputs import looked_at
 from fitting.result import FitResult
 
 
@@ -175,8 +176,8 @@ def share_counted(mask: Any, weight: Any) -> float:
         mask: (H, W), or None.
         weight: (H, W), or None.
     """
-    kept = [np.asarray(one) > 0 for one in (mask, weight) if one is not None]
-    return float(np.mean(np.logical_and.reduce(kept))) if kept else 1.0
+    kept = looked_at(mask, weight)
+    return 1.0 if kept is None else float(np.mean(kept))
 
 
 def _all_of(counted: np.ndarray, sample: PixelSample | None, scene: brdf.Scene) -> np.ndarray:

@@ -54,7 +54,7 @@ def fit_either(
         other_result = _fit(other, how)
     except InputError:
         return result, job.notes  # the other reading cannot be fitted at all
-    is_other, warning = judge((job, other), (result, other_result))
+    is_other, warning = judge((job, other), _on_same_pixels(result, other_result))
     if is_other:
         job, result = other, other_result
     warnings = (*result.warnings, warning) if warning else result.warnings
@@ -91,6 +91,14 @@ def unexplained(job: Job, result: FitResult) -> tuple[float, float]:
         left += float(np.sum(deviation**2)) + deviation.size * (picture.code_step or 0.0) ** 2 / 12
         total += float(np.sum(codes.astype(np.float64) ** 2))
     return left, total
+
+
+def _on_same_pixels(one: FitResult, other: FitResult) -> tuple[FitResult, FitResult]:
+    """Both, to be compared where both count: each leaves out what its own reading calls cut off."""
+    both = [mine & its for mine, its in zip(one.counted, other.counted, strict=True)]
+    if not all(np.any(counted) for counted in both):
+        return one, other
+    return dataclasses.replace(one, counted=both), dataclasses.replace(other, counted=both)
 
 
 def judge(jobs: tuple[Job, Job], results: tuple[FitResult, FitResult]) -> tuple[bool, str]:
