@@ -10,7 +10,7 @@ from fitting.engine.pictures import Picture
 SHARE, DEVIATIONS = 0.02, 5.0
 FEWEST_PIXELS = 30
 # That many pixels of that many pictures are looked at; a mean needs no more.
-MOST_PIXELS, MOST_PICTURES = 65536, 16
+MOST_PIXELS, MOST_PICTURES = 8192, 16
 
 
 def missing_ambient(pictures: Sequence[Picture]) -> str:
