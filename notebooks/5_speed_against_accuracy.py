@@ -118,8 +118,8 @@ table.plot()
 # %%
 folder = next(path for path in (Path("benchmarks"), Path("../benchmarks")) if path.exists())
 figure, axes = plt.subplots(1, 2, figsize=(13, 4.6), layout="constrained")
-for ax, (name, file) in zip(axes, {"area light": "front_area.png", "sky": "front_environment.png"}.items(), strict=True):
-    ax.imshow(plt.imread(folder / file))
+for ax, (name, light) in zip(axes, (("area light", "area"), ("sky", "environment")), strict=True):
+    ax.imshow(plt.imread(folder / f"front_{light}.png"))
     ax.set_title(name)
     ax.set_axis_off()
 
