@@ -105,7 +105,7 @@ _ = ax.legend()
 # cheapest configuration that is accurate enough.
 
 # %%
-table = fitting.tradeoff(target, lamp, seconds=12.0)
+table = fitting.tradeoff(target, lamp, seconds=20.0)
 for row in table.rows:
     if table.marks(row):
         print(f"{row.name:<62}{1e3 * row.seconds:8.1f} ms  {row.error:.0e}  {table.marks(row)}")
