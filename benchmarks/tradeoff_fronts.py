@@ -1,7 +1,8 @@
 """The measured fronts of three scenes: one directional light, an area light, an environment map.
 
 ``python -m benchmarks.tradeoff_fronts FOLDER [SCENE ...]`` writes target and scene of each into a folder, measures,
-saves table and plot, and prints as Markdown what the default takes and what the quickest fit that keeps an accuracy.
+saves table and plot (those of area light and environment map are kept as ``benchmarks/front_*.png``), and prints as
+Markdown what the default takes and what the quickest fit that keeps an accuracy.
 ``python -m benchmarks.tradeoff_fronts FOLDER PAIRS [SCENE ...]`` runs the command ``brdf tradeoff`` in pairs instead,
 each time in a new process, the first of each pair with an empty cache of compiled programs, and says how long it took
 and how many pairs named the same recommendation.
