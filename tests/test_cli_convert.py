@@ -134,3 +134,12 @@ def test_a_measured_table_is_not_drawn(capsys, tmp_path: Path, monkeypatch):
     (tmp_path / "felt.alta").write_text("")
     message = run(capsys, "check", "felt.alta", "--plot", "felt.png", status=2)
     assert message.startswith("error: --plot: draws materials, and felt.alta is a measured table. Fit a material to it")
+
+
+def test_an_empty_name_of_a_material_is_told(capsys):
+    with pytest.raises(SystemExit) as exit_status:
+        main(["check", ""])
+    assert exit_status.value.code == 2
+    assert capsys.readouterr().err == (
+        "error: MATERIAL: is empty. Give a .json or .mtl file, or a name such as emerald.\n"
+    )

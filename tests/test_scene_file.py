@@ -231,6 +231,7 @@ WRONG = {
     ),
     "shapes as a table": ("[shapes]\ntype = 'sphere'\n", "shapes: must be a list of tables"),
     "lights as numbers": ("lights = [1, 2]\n", "lights[0]: must be a table"),
+    "ambient misspelt": (SHORT.replace("intensity = [0.1", "intensty = [0.1"), "ambient.intensty: is not a known key"),
     "ambient without intensity": (SHORT.replace("intensity = [0.1, 0.1, 0.1]", ""), "ambient: has no intensity"),
     "empty": ("# nothing\n", "scene: must have a camera or surface points"),
     "no toml": ("[camera", "is not TOML"),

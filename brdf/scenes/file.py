@@ -139,10 +139,13 @@ def load_scene(path: str | Path, within: str | Path | None = None) -> Scene:
         points = _load_points(_Table(place + "aov", root.pop("aov")), folder)
     if "ambient" in root.values:
         table = _Table(place + "ambient", root.pop("ambient"))
-        if "intensity" not in table.values:
-            raise InputError(table.place, "has no intensity", "Add intensity = [r, g, b]")
-        ambient = _plain(f"{table.place}.intensity", table.pop("intensity"))
+        given = "intensity" in table.values
+        value = table.pop("intensity") if given else None
+        # A misspelt key is named before the one that it should have been.
         table.done(["intensity"])
+        if not given:
+            raise InputError(table.place, "has no intensity", "Add intensity = [r, g, b]")
+        ambient = _plain(f"{table.place}.intensity", value)
     for table in _tables(place + "lights", root.pop("lights", [])):
         masks.append(_load_mask(table, folder))
         lights.append(_load_light(table, folder))

@@ -39,6 +39,8 @@ def find_materials(text: str) -> dict[str, brdf.Material]:
 
 def _table_name(text: str) -> str | None:
     """The name in the classic table; None where a file is meant."""
+    if not text.strip():
+        raise brdf.InputError("MATERIAL", "is empty", "Give a .json or .mtl file, or a name such as emerald")
     path, key = Path(text), text.strip().lower().replace(" ", "_").replace("-", "_")
     if key in brdf.PRESETS and not path.is_file():
         return key
