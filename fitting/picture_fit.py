@@ -1,22 +1,21 @@
 """The front door: from pictures and scenes to a material, its errors, and what they cannot tell."""
 
+import dataclasses
 import time
 from collections.abc import Sequence
 from typing import Any
 
-import equinox as eqx
 import numpy as np
 
 import brdf
 from brdf.errors import InputError
+from fitting.auto_fit import fit_simplest
 from fitting.cut_noise import without_cut_noise
 from fitting.engine.losses import LOSSES, Loss
-from fitting.engine.normal import fit_tied
-from fitting.engine.separable import Picture, fit_linear
-from fitting.engine.streams import each
-from fitting.interpretation import Interpretation, ModelFit, coefficient_factors, interpret
+from fitting.engine.separable import fit_linear
+from fitting.interpretation import Interpretation, ModelFit, interpret
 from fitting.light_colour import take_colour_out
-from fitting.model_fit import Job, fit_model, optimise, reached
+from fitting.model_fit import Job, fit_model, reached
 from fitting.observation import Observation, observe
 from fitting.picture_inputs import (
     check_levels,
@@ -31,16 +30,12 @@ from fitting.picture_inputs import (
 )
 from fitting.plausible import fit_plausible, is_plausible
 from fitting.result import FitResult, free_parameters
-from fitting.selection import FAMILIES, Choice, choose
-from fitting.uncertainty.covariance import TERMS, residual_noise
-from fitting.uncertainty.noise_model import weighted_sums
-from fitting.uncertainty.structure import structure
+from fitting.selection import Choice
+from fitting.uncertainty.covariance import TERMS
 
 N_RANGE = (0.1, 1e6)
 AUTO = ("phong", "blinn-phong")
 PLAUSIBLE = ("normalized-phong", "normalized-blinn-phong")
-# An exponent up to this multiple of the lower bound is at the bound.
-WIDEST = 1.01
 # A residual above this share of the picture: what the scene says is probably not what the picture shows.
 UNEXPLAINED = 0.5
 
@@ -156,41 +151,15 @@ def _fit_observed(
     light = take_colour_out(scenes, counts.pop())
     job = Job(observations, light, n_range, loss, PLAUSIBLE if plausible else AUTO)
     if model == "auto":
-        fitted, choice = _fit_auto(job)
+        fitted, choice = fit_simplest(job)
     else:
         fitted, choice = fit_model(brdf.MODELS[model], job), None
     if plausible:
         fitted = _held_plausible(fitted, job)
     told = _interpret(fitted, job, choice)
+    if _is_dropped(fitted, told):
+        fitted, told = _without_highlight(fitted, told, job, choice)
     return _result(fitted, told, choice, job, precision, time.perf_counter() - start)
-
-
-def _fit_auto(job: Job) -> tuple[ModelFit, Choice]:
-    """All families, then the simplest adequate candidate on its own."""
-    names = job.families if job.lit[1].any() else ("lambert",)
-    fits = {name: fit_model(brdf.MODELS[name], job) for name in names}
-    # A lobe that would be wider than the search allows is no highlight: it mends what Lambert's law leaves at the rim.
-    fits = {name: fit for name, fit in fits.items() if fit.optimum.flat or fit.optimum.n > WIDEST * job.n_range[0]}
-    fits = fits or {"lambert": fit_model(brdf.Lambert, job)}
-    if job.loss != "squared":
-        # Weights are part of what is minimised: those of the better family serve all, or costs could not be compared.
-        name = min(fits, key=lambda name: float(np.sum(residual_noise(fits[name].optimum, job.rounding))))
-        weighed = fits[name].pictures
-        fits = {name: _with_weights_of(weighed, fit) for name, fit in fits.items()}
-    grey = {name: coefficient_factors(fit.model, fit.optimum.n, job.light.colour)[2] for name, fit in fits.items()}
-    best = min(fits.values(), key=lambda fit: float(np.sum(fit.optimum.cost)))
-    noise = residual_noise(best.optimum, job.rounding)
-    known = structure(best.pictures, job.shapes, best.optimum, job.rounding)
-    free = np.logical_or.reduce([fit.free for fit in fits.values()])
-    optima = {name: fit.optimum for name, fit in fits.items()}
-    whitened = {}
-    if known.noise is not None:
-        # Each pixel by its own variance, or noise in bright pixels would pass for a highlight.
-        whitened = {
-            name: weighted_sums(fit.pictures, fit.optimum, known.noise, inverse=True) for name, fit in fits.items()
-        }
-    choice = choose(optima, free, grey, noise, known.inflation, whitened)
-    return _alone(choice, fits, grey), choice
 
 
 def _held_plausible(fit: ModelFit, job: Job) -> ModelFit:
@@ -201,32 +170,6 @@ def _held_plausible(fit: ModelFit, job: Job) -> ModelFit:
     # What the bound adds to the residual is no noise: that of the fit without it says what stands out.
     noise = fit.noise_factor * float(np.sqrt(np.sum(fit.optimum.cost) / np.sum(optimum.cost)))
     return fit._replace(optimum=optimum, tied=None, capped=True, noise_factor=noise)
-
-
-def _with_weights_of(weighed: Sequence[Picture], fit: ModelFit) -> ModelFit:
-    def taken_over(picture: Picture, other: Picture) -> Picture:
-        return eqx.tree_at(lambda p: p.weight, picture, other.weight)
-
-    pictures = each(taken_over, fit.pictures, weighed)
-    return fit._replace(pictures=pictures, optimum=optimise(pictures, fit.free, fit.n_range))
-
-
-def _alone(choice: Choice, fits: dict[str, ModelFit], grey: dict[str, np.ndarray]) -> ModelFit:
-    """The chosen candidate, fitted to the pixels without what it leaves out."""
-    if choice.model in FAMILIES:
-        fit = next(iter(fits.values()))
-        pictures = each(lambda p: Picture(p.target, p.diffuse, None, p.weight, p.ambient), fit.pictures)
-        optimum = fit_linear(pictures, free=choice.free)
-        return ModelFit(brdf.Lambert, pictures, optimum, choice.free, fit.n_range, None, fit.noise_factor)
-    fit = fits[choice.model]
-    optimum = fit.optimum
-    if not np.array_equal(choice.free, fit.free):
-        optimum = optimise(fit.pictures, choice.free, fit.n_range)
-    tied = grey[choice.model] if choice.grey else None
-    if tied is not None:
-        single = np.dtype(fit.pictures[0].target.dtype) == np.float32
-        optimum = fit_tied(fit.pictures, optimum, choice.free, tied, fit.n_range, single=single)
-    return fit._replace(optimum=optimum, free=choice.free, tied=tied)
 
 
 def _interpret(fit: ModelFit, job: Job, choice: Choice | None) -> Interpretation:
@@ -242,6 +185,26 @@ def _interpret(fit: ModelFit, job: Job, choice: Choice | None) -> Interpretation
     names = " and ".join(choice.rivals)
     rival = f"{names} fits as well as {fit.model.name}: the picture does not tell the two highlights apart"
     return told._replace(warnings=(*told.warnings, rival))
+
+
+def _is_dropped(fit: ModelFit, told: Interpretation) -> bool:
+    """Whether there is a highlight in the numbers that is left out of the material, as it does not stand out."""
+    lost = told.sure.undetermined
+    return not fit.capped and bool(fit.optimum.x[2].any()) and "n" in lost and lost.get("k_s") == lost["n"]
+
+
+def _without_highlight(
+    fit: ModelFit, told: Interpretation, job: Job, choice: Choice | None
+) -> tuple[ModelFit, Interpretation]:
+    """The same fit with ambient and diffuse alone, or these would be the ones that go with the highlight."""
+    left = fit._replace(optimum=fit_linear(fit.pictures, free=fit.free), tied=None)
+    why = told.sure.undetermined["n"]
+    again = _interpret(left, job, choice)
+    parameters = tuple(
+        dataclasses.replace(one, reason=why) if one.name in ("k_s", "n") and one.value is None else one
+        for one in again.parameters
+    )
+    return left, again._replace(parameters=parameters)
 
 
 def _result(

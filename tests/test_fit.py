@@ -1,6 +1,7 @@
 """The front door: random materials come back, pictures combine, and what cannot be used is refused in one sentence."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -189,3 +190,19 @@ def test_what_weighs_nothing_says_nothing():
 def test_levels_may_be_numpy_numbers():
     picture = rendered(brdf.Lambert(k_d=0.5), scene(SUN))
     assert fitting.fit(picture, scene(SUN), saturation=np.float32(0.3)).left_out["clipped"] > 0
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_a_highlight_that_does_not_stand_out_leaves_the_fit_of_the_matt_rest(precision):
+    scene = brdf.Scene.load(Path(__file__).parents[1] / "data" / "gold-ball" / "scene.toml")
+    faint = brdf.BlinnPhong(k_a=[0.1] * 3, k_d=[0.5] * 3, k_s=[0.001] * 3, n=50.0)
+    picture = np.asarray(brdf.render(faint, scene, precision="float64"))
+    picture = picture + 0.3 * np.random.default_rng(1).standard_normal(picture.shape)
+    result = fitting.fit(picture, scene, model="blinn-phong", precision=precision)
+    matt = fitting.fit(picture, scene, model="lambert", precision=precision)
+    assert not np.any(result.material.k_s)
+    assert {one.reason for one in result.parameters if one.name in ("k_s", "n")} == {
+        "the highlight does not stand out of the noise"
+    }
+    np.testing.assert_allclose(result.material.k_d, matt.material.k_d, rtol=1e-6)
+    np.testing.assert_allclose(result.residual, matt.residual, rtol=1e-7)

@@ -1,0 +1,78 @@
+"""The model that is fitted where none is named: every family first, then the simplest adequate candidate alone."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import numpy as np
+
+import brdf
+from fitting.engine.normal import fit_tied
+from fitting.engine.separable import Picture, fit_linear
+from fitting.engine.streams import each
+from fitting.interpretation import ModelFit, coefficient_factors
+from fitting.model_fit import Job, fit_model, optimise
+from fitting.selection import FAMILIES, Choice, choose
+from fitting.uncertainty.covariance import residual_noise
+from fitting.uncertainty.noise_model import weighted_sums
+from fitting.uncertainty.structure import structure
+
+# An exponent up to this multiple of the lower bound is at the bound.
+WIDEST = 1.01
+
+
+def fit_simplest(job: Job) -> tuple[ModelFit, Choice]:
+    """All families, then the simplest adequate candidate on its own.
+
+    Args:
+        job: the pictures.
+    """
+    names = job.families if job.lit[1].any() else ("lambert",)
+    fits = {name: fit_model(brdf.MODELS[name], job) for name in names}
+    # A lobe that would be wider than the search allows is no highlight: it mends what Lambert's law leaves at the rim.
+    fits = {name: fit for name, fit in fits.items() if fit.optimum.flat or fit.optimum.n > WIDEST * job.n_range[0]}
+    fits = fits or {"lambert": fit_model(brdf.Lambert, job)}
+    if job.loss != "squared":
+        # Weights are part of what is minimised: those of the better family serve all, or costs could not be compared.
+        name = min(fits, key=lambda name: float(np.sum(residual_noise(fits[name].optimum, job.rounding))))
+        weighed = fits[name].pictures
+        fits = {name: _with_weights_of(weighed, fit) for name, fit in fits.items()}
+    grey = {name: coefficient_factors(fit.model, fit.optimum.n, job.light.colour)[2] for name, fit in fits.items()}
+    best = min(fits.values(), key=lambda fit: float(np.sum(fit.optimum.cost)))
+    noise = residual_noise(best.optimum, job.rounding)
+    known = structure(best.pictures, job.shapes, best.optimum, job.rounding)
+    free = np.logical_or.reduce([fit.free for fit in fits.values()])
+    optima = {name: fit.optimum for name, fit in fits.items()}
+    whitened = {}
+    if known.noise is not None:
+        # Each pixel by its own variance, or noise in bright pixels would pass for a highlight.
+        whitened = {
+            name: weighted_sums(fit.pictures, fit.optimum, known.noise, inverse=True) for name, fit in fits.items()
+        }
+    choice = choose(optima, free, grey, noise, known.inflation, whitened)
+    return _alone(choice, fits, grey), choice
+
+
+def _with_weights_of(weighed: Sequence[Picture], fit: ModelFit) -> ModelFit:
+    def taken_over(picture: Picture, other: Picture) -> Picture:
+        return eqx.tree_at(lambda p: p.weight, picture, other.weight)
+
+    pictures = each(taken_over, fit.pictures, weighed)
+    return fit._replace(pictures=pictures, optimum=optimise(pictures, fit.free, fit.n_range))
+
+
+def _alone(choice: Choice, fits: dict[str, ModelFit], grey: dict[str, np.ndarray]) -> ModelFit:
+    """The chosen candidate, fitted to the pixels without what it leaves out."""
+    if choice.model in FAMILIES:
+        fit = next(iter(fits.values()))
+        pictures = each(lambda p: Picture(p.target, p.diffuse, None, p.weight, p.ambient), fit.pictures)
+        optimum = fit_linear(pictures, free=choice.free)
+        return ModelFit(brdf.Lambert, pictures, optimum, choice.free, fit.n_range, None, fit.noise_factor)
+    fit = fits[choice.model]
+    optimum = fit.optimum
+    if not np.array_equal(choice.free, fit.free):
+        optimum = optimise(fit.pictures, choice.free, fit.n_range)
+    tied = grey[choice.model] if choice.grey else None
+    if tied is not None:
+        single = np.dtype(fit.pictures[0].target.dtype) == np.float32
+        optimum = fit_tied(fit.pictures, optimum, choice.free, tied, fit.n_range, single=single)
+    return fit._replace(optimum=optimum, free=choice.free, tied=tied)
