@@ -1,15 +1,9 @@
-"""Photographs of a ball, made in plain NumPy, and where the real ones are."""
-
-import os
-from pathlib import Path
+"""Photographs of a ball, made in plain NumPy."""
 
 import numpy as np
-import pytest
 
 from fitting.photographs.circle import Circle
 
-REAL = Path(os.environ.get("BRDF_REAL_DATA", Path(__file__).parents[1] / ".." / "shared" / "data"))
-real_data = pytest.mark.skipif(not REAL.is_dir(), reason=f"real data is missing: {REAL} (BRDF_REAL_DATA)")
 BALL = Circle(30.3, 24.8, 21.6)
 SHAPE = (52, 60)
 

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from ball_pictures import BALL, REAL, SHAPE, angle, disc, real_data, shaded
+from ball_pictures import BALL, SHAPE, angle, disc, shaded
+from real_data import REAL, real_data
 
 import brdf
 import fitting
