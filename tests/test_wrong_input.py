@@ -1,35 +1,16 @@
 """Malformed input of every kind, through the command: one line that names file and key, exit 2, and no output."""
 
-import gc
 import json
 import os
 import re
-import signal
-import subprocess
-import sys
-import time
-from pathlib import Path
 
 import numpy as np
 import pytest
+from sound_files import MATERIAL, SCENE, command, refused, scene, sound_files
 
 import brdf
 from benchmarks.fuzz_corpus import CAMERA, LIGHT, POINT, RECTANGLE, SPHERE
 from brdf.errors import InputError
-from fitting.cli.interrupts import held, interruptible
-from fitting.cli.main import main
-
-ROOT = Path(__file__).parents[1]
-REAL = Path(os.environ.get("BRDF_REAL_DATA", ROOT / ".." / "shared" / "data"))
-
-SCENE = CAMERA + SPHERE + LIGHT
-MATERIAL = {"model": "blinn-phong", "k_a": [0.1], "k_d": [0.5], "k_s": [0.3], "n": 37.5}
-
-
-def scene(old: str, new: str, base: str = SCENE) -> str:
-    assert old in base
-    return base.replace(old, new)
-
 
 SCENES = {
     "nan in position": (scene("[0.0, 0.0, 4.0]", "[nan, 0.0, 4.0]"), r"camera\.position: must be finite"),
@@ -89,6 +70,8 @@ SCENES = {
     "aov missing": ('[aov]\nfile = "none.exr"\n' + LIGHT, r"none\.exr: there is no such file"),
     "aov is a number": ("[aov]\nfile = 3\n" + LIGHT, r"aov\.file: must be a path"),
 }
+
+
 MATERIALS = {
     "nan": ('{"model": "lambert", "k_d": [NaN]}', r"k_d: must be finite, got nan"),
     "inf": ('{"model": "lambert", "k_d": [1e999]}', r"k_d: must be finite, got inf"),
@@ -111,6 +94,8 @@ MATERIALS = {
     "deep": ("[" * 100_000, r"is not JSON"),
     "huge number": ('{"model": "lambert", "k_d": [' + "9" * 5000 + "]}", r"not JSON|must be"),
 }
+
+
 MTL = {
     "nothing": ("# nothing\n", r"holds no material"),
     "before newmtl": ("Kd 1 1 1\n", r"line 1: has Kd before any newmtl"),
@@ -125,31 +110,9 @@ MTL = {
 }
 
 
-def run(capsys, *words: object) -> tuple[int, str, str]:
-    with pytest.raises(SystemExit) as done:
-        main([str(word) for word in words])
-    captured = capsys.readouterr()
-    return int(done.value.code or 0), captured.out, captured.err
-
-
-def refused(capsys, folder: Path, said: str, *words: object) -> None:
-    """One line with these words, exit 2, and the folder as it was."""
-    before = sorted(folder.rglob("*"))
-    status, out, err = run(capsys, *words)
-    assert (status, out) == (2, ""), err
-    assert err.startswith("error: ")
-    assert err.count("\n") == 1
-    assert re.search(said, err), err
-    assert sorted(folder.rglob("*")) == before
-
-
 @pytest.fixture
 def place(tmp_path):
-    """Sound files, to be spoiled one at a time."""
-    (tmp_path / "scene.toml").write_text(SCENE)
-    (tmp_path / "material.json").write_text(json.dumps(MATERIAL))
-    brdf.write_image(tmp_path / "target.exr", np.linspace(0.1, 0.9, 192, dtype=np.float32).reshape(8, 8, 3))
-    return tmp_path
+    return sound_files(tmp_path)
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -258,6 +221,19 @@ def test_enough_kinds_of_input_are_tried():
     assert len(SCENES) + len(MATERIALS) + len(MTL) + len(OPTIONS) >= 110
 
 
+@pytest.mark.parametrize("name", ["damaged.png", "small.exr"])
+def test_what_cannot_be_fitted_is_told_before_jax_is_imported(place, name):
+    """The import takes longer than all the rest, and this may be one of a thousand files."""
+    (place / "damaged.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(50))
+    brdf.write_image(place / "small.exr", np.ones((2, 2, 3), np.float32))
+    prefix = "import atexit, sys\natexit.register(lambda: print('jax' in sys.modules))\n"
+    for words in (["--scene", "scene.toml"], ["--sphere", "90,9,5", "--light", "0,0,1"]):
+        with command("fit", name, *words, cwd=place, prefix=prefix) as process:
+            out, err = process.communicate(timeout=60)
+        assert (process.returncode, out) == (2, "False\n"), err
+        assert err.startswith("error: ")
+
+
 def test_a_scene_may_be_allowed_to_reach_further(tmp_path):
     (tmp_path / "deep").mkdir()
     normal = np.ones((8, 8, 3), np.float32)
@@ -277,172 +253,3 @@ def test_the_library_says_the_same_words(place):
     with pytest.raises(InputError, match=r"shapes\[0\]\.radius: must be greater than 0, got -1"):
         brdf.Scene.load(place / "scene.toml")
     assert issubclass(InputError, ValueError)
-
-
-# -- a process of its own ----------------------------------------------------------------------------------------------
-
-
-def command(*words: object, cwd: Path, prefix: str = "", **options) -> subprocess.Popen[str]:
-    # A shell that runs the tests in the background has them ignore Ctrl-C, and what they start.
-    listen = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-    code = listen + prefix + "from fitting.cli.main import main; main()"
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(cwd / ".cache")}
-    return subprocess.Popen(
-        [sys.executable, "-c", code, *map(str, words)],
-        cwd=cwd,
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        **options,
-    )
-
-
-@pytest.mark.parametrize("name", ["damaged.png", "small.exr"])
-def test_what_cannot_be_fitted_is_told_before_jax_is_imported(place, name):
-    """The import takes longer than all the rest, and this may be one of a thousand files."""
-    (place / "damaged.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(50))
-    brdf.write_image(place / "small.exr", np.ones((2, 2, 3), np.float32))
-    prefix = "import atexit, sys\natexit.register(lambda: print('jax' in sys.modules))\n"
-    for words in (["--scene", "scene.toml"], ["--sphere", "90,9,5", "--light", "0,0,1"]):
-        with command("fit", name, *words, cwd=place, prefix=prefix) as process:
-            out, err = process.communicate(timeout=60)
-        assert (process.returncode, out) == (2, "False\n"), err
-        assert err.startswith("error: ")
-
-
-def test_a_full_disk_leaves_nothing(place):
-    # A limit on the size of files is the full disk that needs no rights: writes fail half way.
-    prefix = (
-        "import resource, signal; signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))\n"
-        "import jax; jax.config.update('jax_compilation_cache_dir', '/nonexistent')\n"
-    )
-    (place / "scene.toml").write_text(scene("[8, 8]", "[64, 64]"))
-    before = {path for path in place.iterdir() if path.name != ".cache"}
-    words = ["render", "material.json", "--scene", "scene.toml", "-o", "out.exr"]
-    with command(*words, cwd=place, prefix="import warnings; warnings.simplefilter('ignore')\n" + prefix) as process:
-        _, err = process.communicate(timeout=120)
-    assert process.returncode == 2, err
-    assert err.splitlines()[-1].startswith("error: out.exr: ")
-    assert {path for path in place.iterdir() if path.name != ".cache"} == before
-
-
-@pytest.fixture
-def small_disk(tmp_path):
-    """A disk of 48 KiB, in memory."""
-    (tmp_path / "disk").mkdir()
-    words = ["mount", "-t", "tmpfs", "-o", "size=48k", "tmpfs", str(tmp_path / "disk")]
-    try:
-        done = subprocess.run(words, capture_output=True, text=True, check=False)
-    except OSError as error:
-        pytest.skip(f"no mount command: {error}")
-    if done.returncode:
-        pytest.skip(f"a small disk cannot be mounted here: {done.stderr.strip()}")
-    yield tmp_path / "disk"
-    subprocess.run(["umount", str(tmp_path / "disk")], check=True)
-
-
-FILLING = {
-    "render": ["render", "material.json", "--scene", "scene.toml", "-o", "disk/out.exr"],
-    "fit": ["fit", "target.exr", "--scene", "scene.toml", "--out", "disk/out"],
-    "report": ["fit", "target.exr", "--scene", "scene.toml", "--report", "disk/out.html"],
-    "convert": ["convert", "material.json", "disk/material.gltf"],
-}
-
-
-@pytest.mark.parametrize("name", FILLING)
-def test_a_disk_that_fills_up_leaves_nothing(place, capsys, monkeypatch, small_disk, name):
-    monkeypatch.chdir(place)
-    (place / "scene.toml").write_text(scene("[8, 8]", "[64, 64]"))
-    ball = brdf.render(brdf.Lambert(k_d=[0.5] * 3), brdf.Scene.load(place / "scene.toml"))
-    noise = np.random.default_rng(3).random((64, 64, 3), np.float32)
-    brdf.write_image(place / "target.exr", np.asarray(ball) + noise)
-    (small_disk / "other").write_bytes(bytes(1024 * {"convert": 48, "render": 44}.get(name, 32)))
-    refused(capsys, small_disk, "disk/(out|mat).*: there is no space left to write it", *FILLING[name])
-
-
-def test_control_c_in_the_middle_leaves_nothing(place):
-    before = {path for path in place.iterdir() if path.name != ".cache"}
-    # The fit waits for a signal at the moment when the files of the result are being written.
-    prefix = (
-        "import time, brdf.images.pictures\n"
-        "def slowly(*a, **k):\n    print('writing', flush=True)\n    time.sleep(60)\n"
-        "brdf.images.pictures.write_image = slowly\n"
-    )
-    with command("fit", "target.exr", "--scene", "scene.toml", "--out", "out", cwd=place, prefix=prefix) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "writing\n"
-        process.send_signal(signal.SIGINT)
-        _, err = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert err == "error: interrupted.\n"
-    assert {path for path in place.iterdir() if path.name != ".cache"} == before
-
-
-@pytest.fixture
-def listening():
-    """Ctrl-C as a program in the foreground has it."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
-def test_control_c_is_not_lost_in_a_callback_of_the_garbage_collector(listening):
-    """What such a callback raises is printed and forgotten; JAX has one."""
-
-    def callback(phase, _):
-        if phase == "start":
-            os.kill(os.getpid(), signal.SIGINT)
-            sum(range(1000))  # the signal is handled here
-
-    gc.callbacks.append(callback)
-    try:
-        with pytest.raises(KeyboardInterrupt), interruptible():  # noqa: PT012  # the signal comes later
-            gc.collect()
-            gc.callbacks.remove(callback)
-            time.sleep(5)
-    finally:
-        if callback in gc.callbacks:
-            gc.callbacks.remove(callback)
-
-
-def test_control_c_waits_while_a_library_loads(listening):
-    seen = []
-    with pytest.raises(KeyboardInterrupt), interruptible(), held():  # noqa: PT012  # the signal comes later
-        os.kill(os.getpid(), signal.SIGINT)
-        seen.append("loaded")
-    assert seen == ["loaded"]
-    with interruptible(), held():
-        pass  # it is not remembered
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-
-
-BAD_IMAGES = REAL / "bad-images"
-READ = """
-import sys
-import brdf
-for path in sys.argv[1:]:
-    try:
-        print("image", brdf.read_picture(path).pixels.shape, flush=True)
-    except brdf.InputError as error:
-        print("error:", error, flush=True)
-# The peak since the program started; getrusage would count the parent's memory at the fork.
-print(int(open("/proc/self/status").read().split("VmHWM:")[1].split()[0]) // 1024)
-"""
-
-
-@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs /proc to measure the peak of memory")
-@pytest.mark.skipif(not BAD_IMAGES.is_dir(), reason=f"real data is missing: {BAD_IMAGES} (BRDF_REAL_DATA)")
-def test_every_bad_image_is_a_picture_or_one_line():
-    files = sorted(path for path in BAD_IMAGES.iterdir() if path.suffix in (".exr", ".png", ".jpg"))
-    assert len(files) == 104
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    words = [sys.executable, "-c", READ, *map(str, files)]
-    done = subprocess.run(words, capture_output=True, env=environment, timeout=600, check=False)
-    assert done.returncode == 0, done.stderr[-500:]
-    assert done.stderr == b""
-    *lines, megabytes = done.stdout.decode().splitlines()
-    assert len(lines) == len(files)
-    assert all(line.startswith(("image (", "error: ")) for line in lines)
-    assert int(megabytes) < 500
