@@ -36,13 +36,61 @@ class Shading(NamedTuple):
 
     Attributes:
         light: towards the light, as long as what a pixel that faces it shows, (3,).
-        error: standard error of the direction, in degrees.
+        error: standard error of the direction in degrees: the root mean square of the angle to the true one.
         pixels: how many told it.
     """
 
     light: Float[np.ndarray, "3"]
     error: float
     pixels: int
+
+
+class _Look(NamedTuple):
+    """What a shiny surface shows.
+
+    Attributes:
+        light: towards the light, as long as what a matt pixel that faces it shows, (3,).
+        ambient: what light from all around adds; None where there is none.
+        specular: strength of the highlight.
+        log_n: logarithm of its exponent.
+        mirror: whether its lobe is about the mirror direction, not the half vector.
+    """
+
+    light: Float[np.ndarray, "3"]
+    ambient: float | None
+    specular: float
+    log_n: float
+    mirror: bool
+
+    def numbers(self) -> Float[np.ndarray, " K"]:
+        """What is solved for: light, ambient where there is any, specular, log_n."""
+        around = [] if self.ambient is None else [self.ambient]
+        return np.array([*self.light, *around, self.specular, self.log_n])
+
+    def with_numbers(self, numbers: Float[np.ndarray, " K"]) -> "_Look":
+        x, y, z, *around, specular, log_n = numbers
+        return _Look(np.array([x, y, z]), around[0] if around else None, specular, log_n, self.mirror)
+
+    def one_each(self, light: float, ambient: float, specular: float, log_n: float) -> Float[np.ndarray, " K"]:
+        """In the order of `numbers` one value for each kind of them."""
+        around = None if self.ambient is None else ambient
+        return _Look(np.full(3, light), around, specular, log_n, self.mirror).numbers()
+
+    def of(self, normal: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, " M"]:
+        """What pixels with these normals show, the light reaching them."""
+        direction = self.light / max(float(np.linalg.norm(self.light)), 1e-300)
+        highlight = self.specular * _lobe(direction, normal, mirror=self.mirror) ** np.exp(self.log_n)
+        return (self.ambient or 0.0) + normal @ self.light + highlight
+
+    def slopes(self, normal: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, "M K"]:
+        """Derivatives by what is solved for, by central differences."""
+        numbers = self.numbers()
+        steps = 1e-5 * np.maximum(np.abs(numbers), 1e-3 * float(np.linalg.norm(self.light)))
+        found = []
+        for step, move in zip(steps, np.diag(steps), strict=True):
+            up, down = self.with_numbers(numbers + move), self.with_numbers(numbers - move)
+            found.append((up.of(normal) - down.of(normal)) / (2 * step))
+        return np.stack(found, axis=1)
 
 
 class _Pixels(NamedTuple):
@@ -75,19 +123,20 @@ def fit_shading(
     pixels = _thinned(_Pixels(value, normal, _blocks(place)), MOST_PIXELS)
     light, lit = _linear(pixels, ambient=ambient)
     known = pixels.some(lit)
-    highlight = _highlight(known, light, ambient=ambient)
-    if highlight is None:
-        columns = _columns(known.normal, ambient=ambient)
-        unknown, weight = _robust(columns, known.value, np.ones(known.value.size, bool))
-        residual, slopes = known.value - columns @ unknown, columns
+    look = _highlight(known, light, ambient=ambient)
+    if look is None:
+        slopes = _columns(known.normal, ambient=ambient)
+        unknown, weight = _robust(slopes, known.value, np.ones(known.value.size, bool))
+        light, residual = unknown[:3], known.value - slopes @ unknown
     else:
         # Lambert's law alone may have looked at pixels that the light does not reach.
-        known = pixels.some(_reached(pixels, highlight[:3]))
-        scale = HUBER * float(np.median(np.abs(known.value - _model(highlight, known.normal)))) + 1e-12
-        unknown = _descend(known, highlight, scale, ambient=ambient)
-        residual, slopes = known.value - _model(unknown, known.normal), _slopes(unknown, known.normal, ambient=ambient)
+        reached = _reached(pixels, look.light)
+        _check_enough(reached)
+        known = pixels.some(reached)
+        scale = HUBER * float(np.median(np.abs(known.value - look.of(known.normal)))) + 1e-12
+        look = _descend(known, look, scale)
+        light, residual, slopes = look.light, known.value - look.of(known.normal), look.slopes(known.normal)
         weight = _huber(residual)
-    light = unknown[:3]
     return Shading(light, _error(light, residual, slopes, weight, known.block), known.value.size)
 
 
@@ -138,15 +187,19 @@ def _linear(pixels: _Pixels, *, ambient: bool) -> tuple[Float[np.ndarray, "3"], 
     lit = value > BRIGHT * np.max(value, initial=0.0)
     light = np.zeros(3)
     for _ in range(100):
-        if np.count_nonzero(lit) < FEWEST:
-            raise InputError("picture", "has fewer than ten lit pixels on the surface", "Give a brighter picture")
+        _check_enough(lit)
         before, light = light, _robust(columns, value, lit)[0][:3]
         lit = _reached(pixels, light)
         if np.allclose(before, light, rtol=1e-9, atol=0):
             break
-    if np.count_nonzero(lit) < FEWEST:
-        raise InputError("picture", "has fewer than ten lit pixels on the surface", "Give a brighter picture")
+    _check_enough(lit)
     return light, lit
+
+
+def _check_enough(lit: Bool[np.ndarray, " M"]) -> None:
+    if np.count_nonzero(lit) < FEWEST:
+        came = "has fewer than ten lit pixels on the surface"
+        raise InputError("picture", came, "Give a brighter picture, or the direction of the light")
 
 
 def _lobe(direction: Float[np.ndarray, "3"], normal: Float[np.ndarray, "M 3"], *, mirror: bool) -> np.ndarray:
@@ -159,42 +212,17 @@ def _lobe(direction: Float[np.ndarray, "3"], normal: Float[np.ndarray, "M 3"], *
     return np.clip(cosine, 1e-9, 1.0)
 
 
-def _model(unknown: Float[np.ndarray, " 7"], normal: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, " M"]:
-    """What a pixel shows: of the light (3), ambient light, strength, logarithm of the exponent and kind of the lobe."""
-    light, (around, specular, log_n, mirror) = unknown[:3], unknown[3:]
-    direction = light / max(float(np.linalg.norm(light)), 1e-300)
-    return around + normal @ light + specular * _lobe(direction, normal, mirror=mirror > 0) ** np.exp(log_n)
-
-
-def _slopes(
-    unknown: Float[np.ndarray, " 7"], normal: Float[np.ndarray, "M 3"], *, ambient: bool
-) -> Float[np.ndarray, "M K"]:
-    """Derivatives of the model by what was free, by central differences."""
-    free = [0, 1, 2, 3, 4, 5] if ambient else [0, 1, 2, 4, 5]
-    steps = 1e-5 * np.maximum(np.abs(unknown), 1e-3 * float(np.linalg.norm(unknown[:3])))
-    found = []
-    for index in free:
-        step = np.zeros(7)
-        step[index] = steps[index]
-        found.append((_model(unknown + step, normal) - _model(unknown - step, normal)) / (2 * steps[index]))
-    return np.stack(found, axis=1)
-
-
-def _highlight(pixels: _Pixels, light: Float[np.ndarray, "3"], *, ambient: bool) -> Float[np.ndarray, " 7"] | None:
-    """The model with a highlight; None where the picture shows none."""
+def _highlight(pixels: _Pixels, light: Float[np.ndarray, "3"], *, ambient: bool) -> _Look | None:
+    """The surface with a highlight; None where the picture shows none."""
     columns = _columns(pixels.normal, ambient=ambient)
     matt = pixels.value - columns @ _robust(columns, pixels.value, np.ones(pixels.value.size, bool))[0]
     size = float(np.linalg.norm(light))
     scale = max(HUBER * float(np.median(np.abs(matt))), 1e-9 * size)
     few = _thinned(pixels, SEARCH_PIXELS)
-    start = np.array([*light, 0.02 * size if ambient else 0.0, 0.1 * size, 0.0, 0.0])
-    found = []
-    for mirror in (0.0, 1.0):
-        for n in STARTS:
-            start[5:] = np.log(n), mirror
-            found.append(_descend(few, start, scale, ambient=ambient))
-    best = min(found, key=lambda one: _cost(few, one, scale))
-    best = _descend(pixels, best, scale, ambient=ambient)
+    around = 0.02 * size if ambient else None
+    starts = [_Look(light, around, 0.1 * size, np.log(n), mirror) for mirror in (False, True) for n in STARTS]
+    found = [_descend(few, start, scale) for start in starts]
+    best = _descend(pixels, min(found, key=lambda one: _cost(few, one, scale)), scale)
     before, after = _huber_cost(matt, scale), _cost(pixels, best, scale)
     return best if pixels.value.size * np.log(before / max(after, 1e-300)) > 2 * RISE else None
 
@@ -204,29 +232,23 @@ def _huber_cost(residual: Float[np.ndarray, " M"], scale: float) -> float:
     return float(np.sum(np.where(share <= 1, share**2, 2 * share - 1)))
 
 
-def _cost(pixels: _Pixels, unknown: Float[np.ndarray, " 7"], scale: float) -> float:
-    return _huber_cost(_model(unknown, pixels.normal) - pixels.value, scale)
+def _cost(pixels: _Pixels, look: _Look, scale: float) -> float:
+    return _huber_cost(look.of(pixels.normal) - pixels.value, scale)
 
 
-def _descend(
-    pixels: _Pixels, start: Float[np.ndarray, " 7"], scale: float, *, ambient: bool
-) -> Float[np.ndarray, " 7"]:
-    """The nearest minimum over what is free."""
-    free = [0, 1, 2, 3, 4, 5] if ambient else [0, 1, 2, 4, 5]
-    low = np.array([-np.inf, -np.inf, -np.inf, 0.0, 0.0, np.log(EXPONENTS[0])])[free]
-    high = np.array([*[np.inf] * 5, np.log(EXPONENTS[1])])[free]
-    size = float(np.linalg.norm(start[:3]))
-    unknown = start.copy()
+def _descend(pixels: _Pixels, start: _Look, scale: float) -> _Look:
+    """The nearest minimum."""
+    low = start.one_each(light=-np.inf, ambient=-np.inf, specular=0.0, log_n=np.log(EXPONENTS[0]))
+    high = start.one_each(light=np.inf, ambient=np.inf, specular=np.inf, log_n=np.log(EXPONENTS[1]))
+    size = float(np.linalg.norm(start.light))
+    units = start.one_each(light=size, ambient=size, specular=size, log_n=1.0)
 
-    def residual(values: np.ndarray) -> np.ndarray:
-        unknown[free] = values
-        return _model(unknown, pixels.normal) - pixels.value
+    def residual(numbers: np.ndarray) -> np.ndarray:
+        return start.with_numbers(numbers).of(pixels.normal) - pixels.value
 
-    inside = np.clip(start[free], low, high)
-    units = np.array([*[size] * 5, 1.0])[free]
+    inside = np.clip(start.numbers(), low, high)
     found = least_squares(residual, inside, bounds=(low, high), loss="huber", f_scale=scale, x_scale=units, max_nfev=50)
-    unknown[free] = found.x
-    return unknown
+    return start.with_numbers(found.x)
 
 
 def _error(
