@@ -200,5 +200,5 @@ def test_bands_are_the_picture(tmp_path, suffix, kind):
 def test_a_large_picture_is_read_in_bands(tmp_path, monkeypatch):
     values = random(200, 30, 3)
     raw_exr(tmp_path / "a.exr", values, "RGB", tile=16)
-    monkeypatch.setattr("brdf.images.reader._BAND_VALUES", 1000)
+    monkeypatch.setattr("brdf.images.reader.BAND_VALUES", 1000)
     np.testing.assert_array_equal(read_image(tmp_path / "a.exr"), values)

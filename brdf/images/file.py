@@ -13,13 +13,17 @@ import numpy as np
 import OpenImageIO as oiio  # noqa: N813
 
 from brdf.errors import InputError
+from brdf.images.bulk import check_bulk
 
 MAX_VALUES = 1 << 31
 """Most values (height × width × channels) of a picture in memory: 8 GiB."""
+BAND_VALUES = 1 << 22
+"""Values of a band, where nobody asks for another number: 16 MiB."""
 MAX_RATIO = 1 << 12
-"""Most bytes of pixels per byte of file, over 64 MiB; deflate reaches 1032, a small ball on black in DWAB 2077."""
+"""Most bytes of pixels per byte of file, over 32 MiB; deflate reaches 1032, a small ball on black in DWAB 2077."""
 
-_UNSUSPICIOUS_BYTES = 1 << 26
+# A frame of 4K in RGB has less; what it takes to decode stays below half a gigabyte in every format.
+_UNSUSPICIOUS_BYTES = 1 << 25
 # Remarks that libjpeg makes on sound pictures of some cameras.
 _HARMLESS = ("extraneous bytes", "Invalid SOS parameters")
 _GIVE_AN_IMAGE = "Give an EXR, HDR, PNG, TIFF or JPEG file"
@@ -56,10 +60,10 @@ def quiet(format_name: str) -> Iterator[None]:
     What others write to standard error meanwhile is written when the outermost block ends.
 
     Args:
-        format_name: the format being read or written; only "png" does anything.
+        format_name: the format being read or written; only those that libpng reads, "png" and "ico", do anything.
     """
     global _quiet_depth, _quiet_state
-    if format_name != "png":
+    if format_name not in ("png", "ico"):
         yield
         return
     with _quiet_lock:
@@ -110,7 +114,8 @@ def open_image(path: Path) -> oiio.ImageInput:
     # Colour as stored: what a half-transparent pixel shows is not darkened.
     request.attribute("oiio:UnassociatedAlpha", 1)
     with path.open("rb") as file:
-        kind = "png" if file.read(4) == b"\x89PNG" else ""
+        kind = {b"\x89PNG": "png", b"\0\0\1\0": "ico"}.get(file.read(4), "")
+    check_bulk(path)
     with quiet(kind):
         image = oiio.ImageInput.open(str(path), request)
     if image is None:
@@ -142,8 +147,13 @@ def check_header(path: Path, spec: oiio.ImageSpec) -> None:
     claimed, size = width * height * spec.pixel_bytes(native=True), path.stat().st_size
     if min(spec.width, spec.height, spec.nchannels) < 1:
         raise InputError(path, f"claims {spec.width} × {spec.height} pixels", "The file is damaged; make it again")
+    what = ""
     if claimed > max(_UNSUSPICIOUS_BYTES, MAX_RATIO * size):
         what = f"claims {width} × {height} pixels of {spec.nchannels} channels in {size} bytes"
+    # One tile is unpacked whole; rounding up makes it four times the picture at most.
+    elif spec.tile_width * spec.tile_height * spec.pixel_bytes(native=True) > max(_UNSUSPICIOUS_BYTES, 4 * claimed):
+        what = f"claims tiles of {spec.tile_width} × {spec.tile_height} for {width} × {height} pixels"
+    if what:
         raise InputError(path, what, "The file is damaged; make it again")
 
 
@@ -189,6 +199,17 @@ def parts(image: oiio.ImageInput) -> int:
 
 def _names(image: oiio.ImageInput, part: int) -> list[str]:
     return [name.lower() for name in image.spec(part).channelnames]
+
+
+def band_rows(spec: oiio.ImageSpec, values: int) -> int:
+    """How many rows make a band of about so many values: whole tiles and compressed blocks, or they are decoded twice.
+
+    Args:
+        spec: the header.
+        values: width × channels × rows.
+    """
+    block = min(spec.tile_height or max(1, spec.get_int_attribute("oiio:RowsPerChunk", 1)), spec.height)
+    return max(1, values // (spec.width * spec.nchannels * block)) * block
 
 
 def read_rows(

@@ -18,7 +18,17 @@ from jaxtyping import Bool, Float32
 
 from brdf.files import input_file
 from brdf.images.encodings import Encoding, EncodingSource, decode_table
-from brdf.images.file import MAX_RATIO, MAX_VALUES, check_header, check_memory, open_image, parts, read_rows
+from brdf.images.file import (
+    BAND_VALUES,
+    MAX_RATIO,
+    MAX_VALUES,
+    band_rows,
+    check_header,
+    check_memory,
+    open_image,
+    parts,
+    read_rows,
+)
 from brdf.images.reader import ImageReader
 from brdf.images.writer import write_image, write_layers
 
@@ -151,12 +161,21 @@ def read_mask(path: str | os.PathLike[str]) -> Bool[Array, "height width"]:
         alpha = reader.read_alpha()
         inside = None if alpha is None else _over_half(alpha)
         if inside is None or inside.all() or not inside.any():
-            inside = _over_half(reader.read().mean(axis=-1))
+            inside = _over_half(_mean_of_channels(reader))
     return inside
 
 
+def _mean_of_channels(reader: ImageReader) -> Float32[Array, "height width"]:
+    mean = np.empty(reader.shape[:2], np.float32)
+    check_memory(reader.path, mean.size)
+    with np.errstate(over="ignore", invalid="ignore"):  # NaN and infinite values are passed on
+        for first, band in reader.bands():
+            mean[first : first + len(band)] = band.mean(axis=-1)
+    return mean
+
+
 def _over_half(values: Float32[Array, "height width"]) -> Bool[Array, "height width"]:
-    values = np.nan_to_num(values, nan=0.0)
+    values = np.nan_to_num(values, copy=False, nan=0.0)
     return values > 0.5 * values.max()
 
 
@@ -187,9 +206,15 @@ def read_layers(path: str | os.PathLike[str]) -> dict[str, Float32[Array, "heigh
         groups: dict[str, list[int]] = {}
         for index, name in enumerate(spec.channelnames):
             groups.setdefault(name.rpartition(".")[0] or own, []).append(index)
-        pixels = read_rows(file, image, part, (0, spec.height), (0, spec.nchannels), "float")
-        for layer, indices in groups.items():
-            layers[layer] = np.ascontiguousarray(pixels[..., _usual_order(spec.channelnames, indices)])
+        own_layers = {layer: np.empty((spec.height, spec.width, len(groups[layer])), np.float32) for layer in groups}
+        order = {layer: _usual_order(spec.channelnames, indices) for layer, indices in groups.items()}
+        step = band_rows(spec, BAND_VALUES)
+        for start in range(0, spec.height, step):
+            rows = start, min(start + step, spec.height)
+            pixels = read_rows(file, image, part, rows, (0, spec.nchannels), "float")
+            for layer, values in own_layers.items():
+                values[rows[0] : rows[1]] = pixels[..., order[layer]]
+        layers |= own_layers
     image.close()
     return layers
 

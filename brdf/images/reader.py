@@ -12,13 +12,12 @@ from jaxtyping import Float32
 from brdf.errors import InputError
 from brdf.files import input_file
 from brdf.images.encodings import Encoding, EncodingSource, decode, decode_table, find_encoding, parse_encoding
-from brdf.images.file import check_header, check_memory, choose_channels, open_image, read_rows
+from brdf.images.file import BAND_VALUES, band_rows, check_header, check_memory, choose_channels, open_image, read_rows
 
 LOSSY_TOP = 250 / 255
 """Share of the largest code from which on a file compressed with losses is clipped: at quality 75 a clipped area has
 codes between 250 and 255, but for a few at its edge."""
 
-_BAND_VALUES = 1 << 22
 _INTEGER_BITS = {oiio.UINT8: 8, oiio.UINT16: 16}
 _NATIVE_BITS = {oiio.UINT8: 8, oiio.INT8: 8, oiio.UINT16: 16, oiio.INT16: 16, oiio.HALF: 16, oiio.DOUBLE: 64}
 
@@ -121,17 +120,11 @@ class ImageReader:
             return np.ones((stop - start, self.shape[1]), np.float32)
         return self._rows(start, stop, [self._channels.alpha], decoded=False)[..., 0]
 
-    def bands(self, values: int = _BAND_VALUES) -> Iterator[tuple[int, Float32[np.ndarray, "rows width channels"]]]:
+    def bands(self, values: int = BAND_VALUES) -> Iterator[tuple[int, Float32[np.ndarray, "rows width channels"]]]:
         """The whole picture in bands of about ``values`` values: first row and pixels of each."""
-        step = self._band_rows(values)
+        step = band_rows(self._spec, values)
         for start in range(0, self.shape[0], step):
             yield start, self.rows(start, min(start + step, self.shape[0]))
-
-    def _band_rows(self, values: int) -> int:
-        # Whole tiles and compressed blocks, or they are decoded twice.
-        block = self._spec.tile_height or max(1, self._spec.get_int_attribute("oiio:RowsPerChunk", 1))
-        block = min(block, self.shape[0])
-        return max(1, values // (self._spec.width * self._spec.nchannels * block)) * block
 
     def read(self) -> Float32[np.ndarray, "height width channels"]:
         """The whole picture, linear.
@@ -150,7 +143,7 @@ class ImageReader:
     def _whole(self, channels: int, rows: Any) -> np.ndarray:
         height, width, _ = self.shape
         check_memory(self.path, height * width * channels)
-        step = self._band_rows(_BAND_VALUES)
+        step = band_rows(self._spec, BAND_VALUES)
         if step >= height or self._turn in range(2, 9):
             return rows(0, height)
         pixels = np.empty((height, width, channels), np.float32)
