@@ -78,9 +78,30 @@ def _plain(path: str | os.PathLike[str]) -> str:
     if not isinstance(path, str | os.PathLike) or not isinstance(os.fspath(path), str):
         raise InputError(repr(path), f"a path must be text, got {type(path).__name__}", "Give the path of a file")
     text = os.fspath(path)
-    if not text or "\0" in text:
+    try:
+        is_path = bool(text) and b"\0" not in os.fsencode(text)
+    except UnicodeEncodeError:
+        is_path = False
+    if not is_path:
         raise InputError(repr(text), "is not a path", "Give the path of a file")
     return text
+
+
+def utf8_name(path: str | os.PathLike[str]) -> str:
+    """A path as text, for libraries that know names in UTF-8 alone.
+
+    Args:
+        path: a file that may bear any name that the system allows.
+
+    Raises:
+        InputError: where the name is other bytes.
+    """
+    name = os.fspath(path)
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        raise InputError(name, "has a name or folder that is not UTF-8", "Rename it") from None
+    return name
 
 
 @contextmanager

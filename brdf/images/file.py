@@ -13,6 +13,7 @@ import numpy as np
 import OpenImageIO as oiio  # noqa: N813
 
 from brdf.errors import InputError
+from brdf.files import utf8_name
 from brdf.images.bulk import check_bulk
 
 MAX_VALUES = 1 << 31
@@ -43,8 +44,10 @@ def said(source: Any, path: str | os.PathLike[str] = "") -> str:
         message = error.object.decode("utf-8", "replace")
     lines = [line.strip() for line in message.splitlines() if line.strip()]
     line = lines[0] if lines else "no reason given"
-    for named in (f" ({path})", f' ("{path}")', f' for "{path}"', f' "{path}"', f'"{path}" ') if path else ():
-        line = line.replace(named, "")
+    if path:
+        for named in (f" ({path})", f' ("{path}")', f' for "{path}"', f' "{path}"', f'"{path}" ', f'"{path}": '):
+            line = line.replace(named, "")
+        line = line.replace(str(path), "it")
     return (line if len(line) <= 200 else line[:197] + "...").rstrip(". ")
 
 
@@ -117,7 +120,7 @@ def open_image(path: Path) -> oiio.ImageInput:
         kind = {b"\x89PNG": "png", b"\0\0\1\0": "ico"}.get(file.read(4), "")
     check_bulk(path)
     with quiet(kind):
-        image = oiio.ImageInput.open(str(path), request)
+        image = oiio.ImageInput.open(utf8_name(path), request)
     if image is None:
         raise InputError(path, f"cannot be read as an image ({said(oiio, path)})", _GIVE_AN_IMAGE)
     if image.format_name() in ("null", "term"):

@@ -10,7 +10,7 @@ import OpenImageIO as oiio  # noqa: N813
 from jaxtyping import Float32
 
 from brdf.errors import InputError
-from brdf.files import atomic_path
+from brdf.files import atomic_path, utf8_name
 from brdf.images.encodings import Encoding, encode, parse_encoding
 from brdf.images.file import quiet, said
 
@@ -152,7 +152,7 @@ def _write(
         spec.attribute("oiio:ColorSpace", power or {"srgb": "srgb_rec709_scene"}.get(str(encoding), "lin_rec709_scene"))
     with atomic_path(path) as temporary:
         _reserve(temporary, spec)
-        file = oiio.ImageOutput.create(str(temporary))
+        file = oiio.ImageOutput.create(utf8_name(temporary))
         if file is None:
             raise InputError(path, f"cannot be written ({said(oiio, temporary)})", "Use another format")
         with quiet("png" if temporary.suffix.lower() == ".png" else ""):

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from brdf.errors import InputError
+from brdf.files import utf8_name
 from brdf.measured.tables import Evaluation, MeasuredBRDF, from_half_angles
 
 MAGIC = b"tensor_file\0"
@@ -190,7 +191,7 @@ def _evaluation(path: Path, channels: tuple[str, ...]) -> Evaluation:
         before = mitsuba.variant()
         try:
             mitsuba.set_variant(variant)
-            plugin: Any = mitsuba.load_dict({"type": "measured", "filename": str(path)})
+            plugin: Any = mitsuba.load_dict({"type": "measured", "filename": utf8_name(path)})
             context: Any = mitsuba.BSDFContext()
             interaction: Any = mitsuba.SurfaceInteraction3f()
             vector = mitsuba.Vector3f
