@@ -87,6 +87,16 @@ def test_several_photographs_in_one_command(photographs, capsys, monkeypatch):
     assert k_d(out) == pytest.approx(0.8, rel=0.02)  # the circle is known to a third of a pixel
 
 
+@pytest.mark.parametrize(("light", "warns"), [((0.3, 0.4, 0.86), False), ((0.5, 0.3, -0.8), True)])
+def test_a_light_from_behind_is_told_with_what_its_error_does_not_say(tmp_path, capsys, monkeypatch, light, warns):
+    monkeypatch.chdir(tmp_path)
+    brdf.write_image("ball.exr", shaded(light))
+    words = ["fit", "ball.exr", "--sphere", f"{BALL.x},{BALL.y},{BALL.radius}", "--light", "fit", "--model", "lambert"]
+    status, out, err = run(capsys, *words)
+    assert status == 0, err
+    assert ("it comes from behind" in out) == warns
+
+
 @pytest.mark.parametrize("dtype", ["uint8", "uint16"])
 @pytest.mark.parametrize("encoding", ["linear", "srgb"])
 def test_a_file_that_does_not_say_its_encoding_is_read_as_the_model_explains_it(

@@ -101,8 +101,8 @@ def test_ambient_light_and_highlights_do_not_pull_the_light(ambient, highlight, 
         found = light_from_shading(noisy, points, ambient=ambient > 0)
         assert found.error < 0.1
         shares.append(angle(found.direction, direction) / found.error)
-    # In two directions across, rms; 15° at 60 times the error without the ambient light, 2° at 8 without the highlight.
-    assert np.sqrt(np.mean(np.square(shares)) / 2) < 2.2
+    # Four angles know their mean square to 60 %; where ambient light is not looked for, it is 5 to 10 errors.
+    assert np.sqrt(np.mean(np.square(shares))) < 1.8
 
 
 @pytest.mark.parametrize("direction", [(0, 0, 1), (0.5, 0.4, 0.8), (-0.8, 0.2, 0.4), (0.3, -0.9, 0.1)])

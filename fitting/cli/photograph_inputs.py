@@ -14,6 +14,10 @@ from fitting.photographs.archives import ARCHIVE, read_archive, read_array
 from fitting.photographs.ball import ShadingLight, ball_points, light_from_shading, photograph_scene
 from fitting.photographs.light_files import parse_numbers, read_directions, read_intensities
 
+# A light from so far behind leaves a crescent of less than two fifths of the ball's radius.
+BEHIND = -0.6
+THIN_CRESCENT = "; it comes from behind, and a highlight on the thin crescent can turn it by several times that error"
+
 
 def photographs(targets: list[Path], options: Options, read: dict[Path, brdf.Picture]) -> Job:
     """Photographs under one distant light each.
@@ -62,13 +66,15 @@ def photographs(targets: list[Path], options: Options, read: dict[Path, brdf.Pic
 
 
 def _told(targets: list[Path], found: list[ShadingLight]) -> tuple[str, ...]:
-    """The lights that the shading told; of several, how bright each is beside their mean."""
+    """The lights that the shading told, and how well; of several, how bright each is beside their mean."""
     mean = sum(one.strength for one in found) / len(found)
     notes = []
     for target, one in zip(targets, found, strict=True):
         x, y, z = one.direction
         brighter = f", {100 * (one.strength / mean - 1):+.1f} % bright" if len(found) > 1 else ""
-        notes.append(f"light of {target.name} from its shading: {x:.4f},{y:.4f},{z:.4f} ± {one.error:.2g}°{brighter}")
+        behind = THIN_CRESCENT if z < BEHIND else ""
+        told = f"{x:.4f},{y:.4f},{z:.4f} ± {one.error:.2g}°{brighter}{behind}"
+        notes.append(f"light of {target.name} from its shading: {told}")
     return tuple(notes)
 
 

@@ -88,8 +88,9 @@ class ShadingLight(NamedTuple):
     Attributes:
         direction: towards it, unit, (3,).
         strength: what a pixel that faces it shows: diffuse albedo times intensity.
-        error: standard error of the direction in degrees, from the residual; it knows that what the model leaves goes
-            together over parts of the surface, not what it does to the direction everywhere alike.
+        error: standard error of the direction in degrees, the root mean square of the angle to the true one, from the
+            residual; it knows that what the model leaves goes together over parts of the surface, not what it does to
+            the direction everywhere alike.
         pixels: how many told it.
     """
 
