@@ -194,21 +194,17 @@ def _linear(pixels: _Pixels, *, ambient: bool) -> tuple[Float[np.ndarray, "3"], 
     """The light by Lambert's law alone, and which pixels it reaches."""
     value, columns = pixels.value, _columns(pixels.normal, ambient=ambient)
     lit = value > BRIGHT * np.max(value, initial=0.0)
+    if np.count_nonzero(lit) < FEWEST:
+        raise InputError("picture", "has fewer than ten lit pixels on the surface", "Give a brighter picture")
     light = np.zeros(3)
     for _ in range(100):
-        _check_enough(lit)
         before, light = light, _robust(columns, value, lit)[0][:3]
         lit = _reached(pixels, light)
+        if np.count_nonzero(lit) < FEWEST:
+            raise _too_little()
         if np.allclose(before, light, rtol=1e-9, atol=0):
             break
-    _check_enough(lit)
     return light, lit
-
-
-def _check_enough(lit: Bool[np.ndarray, " M"]) -> None:
-    if np.count_nonzero(lit) < FEWEST:
-        came = "has fewer than ten lit pixels on the surface"
-        raise InputError("picture", came, "Give a brighter picture")
 
 
 def _lobe(direction: Float[np.ndarray, "3"], normal: Float[np.ndarray, "M 3"], *, mirror: bool) -> np.ndarray:
