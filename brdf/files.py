@@ -240,11 +240,12 @@ def _move_together(stage: Path, folder: Path) -> None:
 MAX_TEXT_BYTES = 1 << 24
 
 
-def read_text(path: str | os.PathLike[str]) -> str:
-    """Read a text file of at most ``MAX_TEXT_BYTES``.
+def read_text(path: str | os.PathLike[str], most: int = MAX_TEXT_BYTES) -> str:
+    """Read a text file.
 
     Args:
         path: the file, UTF-8, with or without a byte-order mark.
+        most: how many bytes it may have.
 
     Returns:
         Its content.
@@ -253,10 +254,29 @@ def read_text(path: str | os.PathLike[str]) -> str:
         InputError: if the file cannot be read, is too large or is not text.
     """
     with input_file(path).open("rb") as file:
-        content = file.read(MAX_TEXT_BYTES + 1)
-    if len(content) > MAX_TEXT_BYTES:
-        raise InputError(os.fspath(path), f"is larger than {MAX_TEXT_BYTES >> 20} MiB", "Give a text file")
+        content = file.read(most + 1)
+    if len(content) > most:
+        raise InputError(os.fspath(path), f"is larger than {most >> 20} MiB", "Check what it is, or make it smaller")
     try:
-        return content.decode("utf-8-sig")  # some editors write a byte-order mark
+        text = content.decode("utf-8-sig")  # some editors write a byte-order mark
     except UnicodeDecodeError as error:
-        raise InputError(os.fspath(path), f"is not UTF-8 text ({error.reason})", "Give a text file") from None
+        line = content.count(b"\n", 0, error.start) + 1
+        what = f"is not UTF-8 text (line {line}: {error.reason})"
+        raise InputError(os.fspath(path), what, "Give a text file, saved as UTF-8") from None
+    if "\0" in text:
+        raise InputError(os.fspath(path), "is not UTF-8 text (it holds null bytes)", "Give a text file, saved as UTF-8")
+    return text
+
+
+def parse_number(word: str) -> float:
+    """A number as text files hold it; Python's own reading would take 1_0 and the digits of other scripts.
+
+    Args:
+        word: without white space.
+
+    Raises:
+        ValueError: if it is none.
+    """
+    if "_" in word or not word.isascii():
+        raise ValueError(word)
+    return float(word)

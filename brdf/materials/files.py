@@ -6,19 +6,26 @@ In JSON a value that a picture could not determine is ``null``; it reads back as
 import dataclasses
 import json
 import math
-from collections.abc import Collection
+from collections import Counter
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from brdf.errors import InputError
-from brdf.files import read_text, write_text
+from brdf.files import parse_number, read_text, write_text
 from brdf.models import MODELS, BlinnPhong, Lambert, Material, SpecularMaterial
 
 # Says in a comment, which other readers skip, what MTL has no word for.
 MTL_MODEL = "# brdf model:"
 _MTL_EXPONENT = {"phong": 4.0, "normalized-phong": 4.0}
+# The first letters of a word that messages show.
+_SHOWN = 40
+# As for measured tables: more are no spectrum.
+MOST_CHANNELS = 4096
+_MOST_BYTES = 1 << 22
+_TEXTURE = "map_kd"
 SPECTRAL = {"ka": "k_a", "kd": "k_d", "ks": "k_s"}
 
 
@@ -35,11 +42,17 @@ def load_material(path: str | Path, name: str | None = None) -> Material:
     materials = load_materials(path)
     if name is not None:
         if name not in materials:
-            raise InputError(path, f"has no material {name!r}", f"It holds {', '.join(materials)}")
+            raise InputError(path, f"has no material {name[:_SHOWN]!r}", f"It holds {_some(materials)}")
         return materials[name]
     if len(materials) > 1:
-        raise InputError(path, f"holds {len(materials)} materials", f"Name one of {', '.join(materials)}")
+        raise InputError(path, f"holds {len(materials)} materials", f"Name one of {_some(materials)}")
     return next(iter(materials.values()))
+
+
+def _some(names: Collection[str]) -> str:
+    """The first names, cut where they are long."""
+    first = ", ".join(name[:_SHOWN] for name in list(names)[:10])
+    return first if len(names) <= 10 else f"{first} or another"
 
 
 def load_materials(path: str | Path) -> dict[str, Material]:
@@ -54,9 +67,9 @@ def load_materials(path: str | Path) -> dict[str, Material]:
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix == ".json":
-        return {path.stem: _from_json(path, read_text(path))}
+        return {path.stem: _from_json(path, read_text(path, _MOST_BYTES))}
     if suffix == ".mtl":
-        return _from_mtl(path, read_text(path))
+        return _from_mtl(path, read_text(path, _MOST_BYTES))
     raise InputError(path, f"is no material file, got {suffix or 'no suffix'}", "Give a .json or .mtl file")
 
 
@@ -119,13 +132,15 @@ def material_from_dict(values: Any) -> Material:
         raise InputError("material", "must be a JSON object", 'Write {"model": ..., "k_d": ...}')
     name = values.get("model")
     if not isinstance(name, str) or name not in MODELS:
-        raise InputError("model", f"is unknown, got {name!r}", f"Use one of {', '.join(MODELS)}")
+        raise InputError("model", f"is unknown, got {repr(name)[:_SHOWN]}", f"Use one of {', '.join(MODELS)}")
     model = MODELS[name]
     found = {key: values[key] for key in _parameters(model) if key in values}
     missing = [key for key in _parameters(model) if key not in values and key != "k_a"]
     if missing:
         raise InputError(missing[0], "is missing", f"{name} needs {', '.join(_parameters(model))}")
     for key, value in found.items():
+        if isinstance(value, list) and len(value) > MOST_CHANNELS:
+            raise InputError(key, f"has {len(value)} channels", f"Give at most {MOST_CHANNELS}")
         for number in value if isinstance(value, list) else [value]:
             if number is not None and (isinstance(number, bool) or not isinstance(number, int | float)):
                 raise InputError(key, f"must be a number, got {json.dumps(number)[:40]}", "Give numbers or null")
@@ -148,9 +163,8 @@ def _parameters(model: type[Material]) -> list[str]:
 def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     entries = dict(pairs)
     if len(entries) < len(pairs):
-        keys = [key for key, _ in pairs]
-        twice = next(key for key in keys if keys.count(key) > 1)
-        raise InputError(twice, "is given twice", "Give it once")
+        (twice, _), *_ = Counter(key for key, _ in pairs).most_common(1)
+        raise InputError(twice[:_SHOWN], "is given twice", "Give it once")
     return entries
 
 
@@ -193,13 +207,26 @@ def to_mtl(material: Material, *, name: str = "fitted", undetermined: Collection
     return "\n".join(lines) + "\n"
 
 
+def _logical_lines(text: str) -> Iterator[tuple[int, str]]:
+    """Lines by the number of their first, those that end in a backslash joined with the next."""
+    joined, first = "", 1
+    for number, line in enumerate(text.splitlines(), start=1):
+        joined += line.strip()
+        if joined.endswith("\\") and not joined.startswith("#"):
+            joined = joined[:-1] + " "
+            continue
+        yield first, joined
+        joined, first = "", number + 1
+    if joined:
+        yield first, joined
+
+
 def _from_mtl(path: Path, text: str) -> dict[str, Material]:
     entries: dict[str, dict[str, Any]] = {}
     current: dict[str, Any] | None = None
     model_comment = None
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, stripped in _logical_lines(text):
         place = f"{path}: line {number}"
-        stripped = line.strip()
         if stripped.startswith(MTL_MODEL):
             model_comment = stripped.removeprefix(MTL_MODEL).strip()
             continue
@@ -210,17 +237,23 @@ def _from_mtl(path: Path, text: str) -> dict[str, Material]:
         if key == "newmtl":
             name = stripped[len("newmtl") :].strip() or "unnamed"
             if name in entries:
-                raise InputError(place, f"names the material {name} a second time", "Give each a name of its own")
+                raise InputError(
+                    place, f"names the material {name[:_SHOWN]} a second time", "Give each a name of its own"
+                )
             current = entries[name] = {}
             current["model"] = model_comment
             continue
-        if key not in (*SPECTRAL, "ns", "illum"):
+        if key not in (*SPECTRAL, "ns", "illum", _TEXTURE):
             continue
         if current is None:
             raise InputError(place, f"has {words[0]} before any newmtl", "Start the material with newmtl NAME")
-        current[key] = _mtl_numbers(place, words)
+        current[key] = words[-1] if key == _TEXTURE else _mtl_numbers(place, words)
     if not entries:
         raise InputError(path, "holds no material", "Give a file with a newmtl line")
+    for name, entry in entries.items():
+        if _TEXTURE in entry and "kd" not in entry:
+            came = f"the colour of {name[:_SHOWN]} is the texture {entry[_TEXTURE][:_SHOWN]}, which is not read"
+            raise InputError(path, came, "Add its mean colour as Kd")
     try:
         return {name: _mtl_material(entry) for name, entry in entries.items()}
     except InputError as error:
@@ -228,17 +261,19 @@ def _from_mtl(path: Path, text: str) -> dict[str, Material]:
 
 
 def _mtl_numbers(place: str, words: list[str]) -> list[float]:
+    key, *given = words
+    wanted, remedy = ((1, 3), "Give RGB values") if key.lower() in SPECTRAL else ((1,), "Give one number")
+    came = f"got {' '.join(given)[:_SHOWN]!r}"
     try:
-        numbers = [float(word) for word in words[1:]]
+        numbers = [parse_number(word) for word in given]
     except ValueError:
-        came = f"{words[0]} must be numbers, got {' '.join(words[1:])[:40]!r}"
-        raise InputError(place, came, "Give RGB values; spectral curves and XYZ are not read") from None
-    if not numbers or not all(map(math.isfinite, numbers)):
-        raise InputError(place, f"{words[0]} must be finite numbers, got {words[1:]}", "Give finite numbers")
-    wanted = (1, 3) if words[0].lower() in SPECTRAL else (1,)
+        more = "; spectral curves and XYZ are not read" if given[0].lower() in ("spectral", "xyz") else ""
+        raise InputError(place, f"{key} must be numbers, {came}", f"{remedy}{more}") from None
+    if not all(map(math.isfinite, numbers)):
+        raise InputError(place, f"{key} must be finite numbers, {came}", "Give finite numbers")
     if len(numbers) not in wanted:
-        raise InputError(place, f"{words[0]} has {len(numbers)} values", f"Give {' or '.join(map(str, wanted))}")
-    return numbers * 3 if words[0].lower() in SPECTRAL and len(numbers) == 1 else numbers
+        raise InputError(place, f"{key} has {len(numbers)} values", f"Give {' or '.join(map(str, wanted))}")
+    return numbers * 3 if key.lower() in SPECTRAL and len(numbers) == 1 else numbers
 
 
 def _mtl_material(entry: dict[str, Any]) -> Material:

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from brdf.errors import InputError
-from brdf.files import read_text
+from brdf.files import parse_number, read_text
 from brdf.measured.tables import LARGEST_ANGLE, MeasuredBRDF, from_angles, from_half_angles
 
 MOST_CHANNELS = 4096
@@ -124,7 +124,7 @@ def parse_alta(text: str, place: str, name: str) -> MeasuredBRDF:
 
 def _number(place: str, line: int, word: str) -> float:
     try:
-        return float(word)
+        return parse_number(word)
     except ValueError:
         raise InputError(f"{place}: line {line}", f"must be a number, got {word[:40]!r}", "Correct the file") from None
 
