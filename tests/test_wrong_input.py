@@ -191,6 +191,7 @@ OPTIONS = {
     ),
     "name of a preset": (["convert", "emerald", "o.json", "--name", "a"], "--name: chooses from a file"),
     "plausible table": (["fit", "ok.brdf", "--plausible"], "ok.brdf: is a measured BRDF; of the options only"),
+    "precision of a table": (["fit", "ok.brdf", "--precision", "float64"], "is a measured BRDF; of the options only"),
     "channels": (["fit", "two.exr", "--scene", "scene.toml"], "two.exr: has 2 channels, the scene's light 3"),
 }
 

@@ -7,6 +7,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+# As `fitting.fit` takes them; help is shown without importing it.
+MODEL_NAMES = ("auto", "lambert", "phong", "blinn-phong", "normalized-phong", "normalized-blinn-phong")
+
 
 @contextlib.contextmanager
 def named_as(arguments: dict[str, Any]) -> Iterator[None]:

@@ -5,9 +5,11 @@ from typing import Annotated
 
 import typer
 
+from fitting.cli.common import show
+
 EXAMPLE = (
-    "Example: [bold]brdf convert material.json material.gltf[/bold]    or, from the classic table: "
-    "[bold]brdf convert emerald emerald.json --to three[/bold]"
+    "Example: [bold]brdf convert material.json material.gltf[/bold]\n\n"
+    "From the classic table: [bold]brdf convert emerald emerald.json --to three[/bold]"
 )
 
 
@@ -33,5 +35,4 @@ def convert(
         if error.where == "to":
             raise brdf.InputError("--to", error.what, error.remedy) from None
         raise
-    for line in (f"wrote {out}", *(f"  not carried: {loss}" for loss in export.losses)):
-        print(line)  # noqa: T201  # this is the command's output
+    show("\n".join([f"wrote {out}", *(f"  not carried: {loss}" for loss in export.losses)]))

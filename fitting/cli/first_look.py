@@ -3,45 +3,13 @@
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 
 import brdf
 from brdf.errors import InputError
+from fitting.cli.picture_options import PictureOptions, encoding_of
 from fitting.photographs.circle import Circle, ball_normals, find_circle, parse_circle
-
-
-class Options(NamedTuple):
-    """The options of the command that say what the pictures show; None where not given.
-
-    Attributes:
-        scene: a scene file.
-        within: the folder that its paths may not leave.
-        sphere: "x,y,radius" of a ball in the picture, or "mask": found in the mask.
-        normals: an image of normals, or an .npy file.
-        light: "x,y,z" towards the light, or "fit": from the shading.
-        lights: a file with a direction per picture.
-        intensities: a file with an intensity per picture.
-        encoding: of the pictures.
-        exposure: one factor, or one per picture: values are divided by it.
-        mask: an image.
-        ambient: whether photographs are lit from all around as well.
-        saturation: linear value from which on pixels are clipped.
-    """
-
-    scene: Path | None = None
-    within: Path | None = None
-    sphere: str | None = None
-    normals: Path | None = None
-    light: str | None = None
-    lights: Path | None = None
-    intensities: Path | None = None
-    encoding: Any = None
-    exposure: str | None = None
-    mask: Path | None = None
-    ambient: bool = False
-    saturation: float | None = None
 
 
 def is_archive(targets: list[Path]) -> bool:
@@ -49,12 +17,12 @@ def is_archive(targets: list[Path]) -> bool:
     return len(targets) == 1 and targets[0].suffix.lower() == ".npz"
 
 
-def is_photograph(options: Options) -> bool:
+def is_photograph(options: PictureOptions) -> bool:
     """Whether the options say what the pictures show, instead of a scene file."""
     return options.sphere is not None or options.normals is not None
 
 
-def read_first(targets: list[Path], options: Options, tell: Callable[[str], None]) -> dict[Path, brdf.Picture]:
+def read_first(targets: list[Path], options: PictureOptions, tell: Callable[[str], None]) -> dict[Path, brdf.Picture]:
     """Read the pictures, and refuse those that cannot be what the options or the scene file say.
 
     Args:
@@ -81,7 +49,7 @@ def read_first(targets: list[Path], options: Options, tell: Callable[[str], None
     read = {}
     for index, path in enumerate(files, start=1):
         tell(f"reading {index} of {len(files)}")
-        read[path] = brdf.read_picture(path, encoding=options.encoding)
+        read[path] = brdf.read_picture(path, encoding=encoding_of(options.encoding))
     shapes = {picture.pixels.shape for picture in read.values()}
     if len(shapes) > 1:
         sizes = ", ".join(f"{shape[1]} x {shape[0]} x {shape[2]}" for shape in sorted(shapes))
@@ -94,7 +62,7 @@ def read_first(targets: list[Path], options: Options, tell: Callable[[str], None
     return read
 
 
-def _check_options(targets: list[Path], options: Options) -> None:
+def _check_options(targets: list[Path], options: PictureOptions) -> None:
     """Refuse options that do not belong together."""
     lights = {"--light": options.light, "--lights": options.lights, "--intensities": options.intensities}
     if is_archive(targets):

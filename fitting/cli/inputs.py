@@ -3,12 +3,13 @@
 from pathlib import Path
 
 import brdf
-from fitting.cli.first_look import Options, is_archive, is_photograph, target_and_scene
+from fitting.cli.first_look import is_archive, is_photograph, target_and_scene
 from fitting.cli.job import Job, exposed, opaque
 from fitting.cli.photograph_inputs import archive, photographs
+from fitting.cli.picture_options import PictureOptions
 
 
-def collect(targets: list[Path], options: Options, read: dict[Path, brdf.Picture]) -> Job:
+def collect(targets: list[Path], options: PictureOptions, read: dict[Path, brdf.Picture]) -> Job:
     """What the command was given, ready to fit.
 
     Args:

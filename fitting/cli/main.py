@@ -4,20 +4,20 @@ Help does not import JAX; each command imports what it needs.
 """
 
 import importlib.metadata
-import json
 import os
 import sys
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from brdf.errors import InputError
-from fitting.cli import convert as cli_convert
-from fitting.cli import fit as cli_fit
-from fitting.cli import tradeoff as cli_tradeoff
-from fitting.cli.common import named_as, show, use_compilation_cache, waiting
+from fitting.cli import check, convert, fit, lights, render, tradeoff
+from fitting.cli.common import show
 from fitting.cli.interrupts import interruptible
+
+INTERRUPTED = 130  # what shells expect after Ctrl-C
+# What a wrong option raises, wherever typer keeps its parser.
+USAGE_ERROR: type[BaseException] = typer.BadParameter.__mro__[2]
 
 app = typer.Typer(
     name="brdf",
@@ -37,90 +37,19 @@ def _version(wanted: bool) -> None:
 
 @app.callback()
 def about(
-    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Say which.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
 ) -> None:
     """Which few numbers make this surface look like that picture."""
 
 
-INTERRUPTED = 130  # what shells expect after Ctrl-C
-# What a wrong option raises, wherever typer keeps its parser.
-USAGE_ERROR: type[BaseException] = typer.BadParameter.__mro__[2]
-
-
-app.command(epilog=cli_fit.EXAMPLE)(cli_fit.fit)
-app.command(epilog=cli_fit.LIGHTS_EXAMPLE)(cli_fit.lights)
-
-
-@app.command(
-    epilog="Example: [bold]brdf render material.json --scene scene.toml -o picture.exr[/bold]    or, from the classic "
-    "table: [bold]brdf render emerald --scene scene.toml -o emerald.png[/bold]"
-)
-def render(
-    material: Annotated[str, typer.Argument(help="A .json or .mtl file, or a name of the classic table: emerald.")],
-    scene: Annotated[Path, typer.Option(help="The scene file.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The picture to write: .exr, .hdr, .png, .tiff or .jpg.")],
-    precision: Annotated[str, typer.Option(help="float32 or float64.")] = "float32",
-) -> None:
-    """Render a material in a scene."""
-    with waiting("rendering"), named_as({"material": material, "precision": "--precision"}):
-        use_compilation_cache()
-        import numpy as np
-
-        import brdf
-        from fitting.cli.materials import find_material
-
-        loaded, _ = find_material(material)
-        image = brdf.render(loaded, brdf.Scene.load(scene), precision=precision)  # pyright: ignore[reportArgumentType]
-        brdf.write_image(out, np.asarray(image))
-    show(f"wrote {out}")
-
-
-@app.command(
-    epilog="Example: [bold]brdf check material.json[/bold]    or in CI: [bold]brdf check scene.mtl --json[/bold]    "
-    "or, from the classic table: [bold]brdf check emerald[/bold]"
-)
-def check(
-    material: Annotated[
-        str,
-        typer.Argument(
-            help="A .json, .mtl (every material is checked) or measured BRDF file, or a name of the classic table."
-        ),
-    ],
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")] = False,
-    plot: Annotated[Path | None, typer.Option(help="A picture of albedo, lobe and reciprocity to write.")] = None,
-) -> int:
-    """Is a material plausible: positive, reciprocal, energy conserving? Exit 0 if so, 1 if not, 2 if it cannot tell."""
-    with waiting("checking"):
-        use_compilation_cache()
-        import brdf
-        from fitting.cli.materials import find_materials
-
-        is_table = brdf.is_measured(material)
-        if is_table and plot is not None:
-            remedy = f"Fit a material to it with brdf fit {material} --out DIR, and check DIR/material.json"
-            raise InputError("--plot", f"draws materials, and {material} is a measured table", remedy)
-        materials: dict[str, Any] = (
-            {Path(material).stem: brdf.load_measured(material)} if is_table else find_materials(material)
-        )
-        reports = {name: brdf.check(one, name=name) for name, one in materials.items()}
-        if plot is not None:
-            if len(materials) > 1:
-                raise InputError("--plot", f"draws one material, {material} holds {len(materials)}", "Give one")
-            from fitting.plots.materials import overview
-
-            with brdf.atomic_path(plot) as path:
-                name, one = next(iter(materials.items()))
-                overview(one, reports[name]).savefig(path)
-    if as_json:
-        show(json.dumps({name: report.to_json() for name, report in reports.items()}, indent=2))
-    else:
-        show("\n\n".join(map(str, reports.values())))
-    verdicts = [report.plausible for report in reports.values()]
-    return 1 if False in verdicts else 2 if None in verdicts else 0
-
-
-app.command(epilog=cli_convert.EXAMPLE)(cli_convert.convert)
-app.command(epilog=cli_tradeoff.EXAMPLE)(cli_tradeoff.tradeoff)
+app.command(epilog=fit.EXAMPLE)(fit.fit)
+app.command(epilog=lights.EXAMPLE)(lights.lights)
+app.command(epilog=render.EXAMPLE)(render.render)
+app.command(epilog=check.EXAMPLE)(check.check)
+app.command(epilog=convert.EXAMPLE)(convert.convert)
+app.command(epilog=tradeoff.EXAMPLE)(tradeoff.tradeoff)
 
 
 def main(arguments: list[str] | None = None) -> Any:

@@ -8,8 +8,9 @@ import numpy as np
 import brdf
 from brdf.errors import InputError
 from fitting.cli.common import named_as
-from fitting.cli.first_look import Options, check_ball, find_ball
+from fitting.cli.first_look import check_ball, find_ball
 from fitting.cli.job import Job, exposed, opaque, scaled
+from fitting.cli.picture_options import PictureOptions
 from fitting.photographs.archives import ARCHIVE, read_archive, read_array
 from fitting.photographs.ball import ShadingLight, ball_points, light_from_shading, photograph_scene
 from fitting.photographs.light_files import parse_numbers, read_directions, read_intensities
@@ -19,7 +20,7 @@ BEHIND = -0.6
 THIN_CRESCENT = "; it comes from behind, and a highlight on the thin crescent can turn it by several times that error"
 
 
-def photographs(targets: list[Path], options: Options, read: dict[Path, brdf.Picture]) -> Job:
+def photographs(targets: list[Path], options: PictureOptions, read: dict[Path, brdf.Picture]) -> Job:
     """Photographs under one distant light each.
 
     Args:
@@ -98,7 +99,9 @@ def _normalised(
     return alike, [photograph_scene(points, way, ambient=1.0 / light if ambient else None) for way, light in lamps]
 
 
-def _geometry(shape: Any, mask: np.ndarray | None, options: Options) -> tuple[brdf.SurfacePoints, tuple[str, ...]]:
+def _geometry(
+    shape: Any, mask: np.ndarray | None, options: PictureOptions
+) -> tuple[brdf.SurfacePoints, tuple[str, ...]]:
     if options.normals is not None:
         normal = _read_normals(options.normals)
         if normal.shape[:2] != tuple(shape):
@@ -130,7 +133,7 @@ def _read_normals(path: Path) -> np.ndarray:
     return np.where(empty[..., None], 0.0, normal)
 
 
-def archive(path: Path, options: Options) -> Job:
+def archive(path: Path, options: PictureOptions) -> Job:
     """Photographs with normals and lights: images (K, H, W[, C]), normal (H, W, 3), light_dirs (K, 3), ...
 
     ... and where there are: light_intensities (K, C), mask (H, W). Unsigned images span their type.

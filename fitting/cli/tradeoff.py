@@ -1,102 +1,64 @@
 """``brdf tradeoff``: what the choices that a scene offers cost, and what error they make."""
 
+import json
 import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from fitting.cli.common import named_as, show, use_compilation_cache
-from fitting.cli.picture_options import (
-    Ambient,
-    Encoding,
-    Exposure,
-    Intensities,
-    Light,
-    Lights,
-    Mask,
-    Normals,
-    Saturation,
-    SceneFile,
-    Sphere,
-    Within,
-    encoding_of,
-)
+from fitting.cli.common import MODEL_NAMES, named_as, show, use_compilation_cache
+from fitting.cli.interrupts import held
+from fitting.cli.picture_options import PictureOptions, takes_picture_options
 
 EXAMPLE = (
-    "Example: [bold]brdf tradeoff photo.exr --scene scene.toml --out tradeoff/[/bold]    a photo of a ball: "
-    "[bold]brdf tradeoff ball.png --sphere 244.5,144.5,108 --light fit[/bold]"
+    "Example: [bold]brdf tradeoff photo.exr --scene scene.toml --out tradeoff/[/bold]\n\n"
+    "A photo of a ball: [bold]brdf tradeoff ball.png --sphere 244.5,144.5,108 --light fit[/bold]"
 )
 
 
+@takes_picture_options
 def tradeoff(
     target: Annotated[
         Path, typer.Argument(help="A picture, a folder with target.* and scene.toml, or a photograph of a ball.")
     ],
-    scene: SceneFile = None,
-    within: Within = None,
+    pictures: PictureOptions,
     out: Annotated[Path | None, typer.Option(help="A folder for tradeoff.csv, .json, .png and .pdf.")] = None,
-    model: Annotated[str, typer.Option(help="The name of a model, or auto.")] = "blinn-phong",
+    model: Annotated[str, typer.Option(help=f"One of {', '.join(MODEL_NAMES)}.")] = "blinn-phong",
     accuracy: Annotated[float, typer.Option(help="Relative error that the recommendation is to keep.")] = 1e-3,
     seconds: Annotated[float, typer.Option(help="Time that the measuring may take.")] = 45.0,
     render: Annotated[bool, typer.Option("--render", help="Also measure the renderer alone.")] = False,
-    encoding: Encoding = None,
-    saturation: Saturation = None,
-    mask: Mask = None,
-    sphere: Sphere = None,
-    normals: Normals = None,
-    light: Light = None,
-    lights: Lights = None,
-    intensities: Intensities = None,
-    ambient: Ambient = False,
-    exposure: Exposure = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
     """Measure speed against accuracy on a scene: pixels, light samples, precision, model, solver.
 
     Ctrl-C ends the measuring and keeps what was measured.
     """
-    import json
-
     from brdf.errors import InputError
-    from fitting.cli.first_look import Options, read_first
+    from fitting.cli.first_look import read_first
 
-    given = Options(
-        scene=scene,
-        within=within,
-        sphere=sphere,
-        normals=normals,
-        light=light,
-        lights=lights,
-        intensities=intensities,
-        encoding=encoding_of(encoding),
-        exposure=exposure,
-        mask=mask,
-        ambient=ambient,
-        saturation=saturation,
-    )
-    names: dict[str, Any] = {"model": "--model", "accuracy": "--accuracy", "seconds": "--seconds", "mask": mask}
-    with named_as(names | {"saturation": "--saturation", "encoding": "--encoding"}):
-        read = read_first([target], given, lambda now: None)
-        use_compilation_cache()
-        import fitting
-        from fitting.cli.inputs import collect
+    options = {"model": model, "accuracy": accuracy, "seconds": seconds}
+    with named_as({name: f"--{name}" for name in options} | pictures.names()):
+        read = read_first([target], pictures, lambda now: None)
+        with held():
+            use_compilation_cache()
+            import fitting
+            from fitting.cli.inputs import collect
 
-        job = collect([target], given, read)
+            measure = fitting.tradeoff
+        job = collect([target], pictures, read)
         if len(job.pictures) > 1:
             came = f"holds {len(job.pictures)} pictures, and one is measured"
             raise InputError(target, came, "Give one picture with its scene or its light")
         with named_as({"target": job.target}), _Progress() as progress:
-            found = fitting.tradeoff(
+            found = measure(
                 job.pictures[0],
                 job.scenes[0],
-                model=model,
                 mask=job.masks[0],
-                saturation=saturation,
-                accuracy=accuracy,
-                seconds=seconds,
+                saturation=pictures.saturation,
                 render=render,
                 progress=progress.step,
+                **options,
             )
     silent = [path.name for path, picture in read.items() if picture.source == "assumed"]
     guess = [f"{name} does not say how its values are encoded; --encoding decides" for name in silent]

@@ -1,0 +1,58 @@
+"""``brdf check``: whether a material is physically plausible."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from brdf.errors import InputError
+from fitting.cli.common import show, use_compilation_cache, waiting
+from fitting.cli.interrupts import held
+
+EXAMPLE = (
+    "Example: [bold]brdf check material.json[/bold]\n\n"
+    "In CI: [bold]brdf check scene.mtl --json[/bold]\n\n"
+    "From the classic table: [bold]brdf check emerald[/bold]"
+)
+
+
+def check(
+    material: Annotated[
+        str,
+        typer.Argument(
+            help="A .json, .mtl (every material is checked) or measured BRDF file, or a name of the classic table."
+        ),
+    ],
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")] = False,
+    plot: Annotated[Path | None, typer.Option(help="A picture of albedo, lobe and reciprocity to write.")] = None,
+) -> int:
+    """Is a material plausible: positive, reciprocal, energy conserving? Exit 0 if so, 1 if not, 2 if it cannot tell."""
+    with waiting("checking"):
+        with held():
+            use_compilation_cache()
+            import brdf.plausibility
+            from fitting.cli.materials import find_materials
+
+        is_table = brdf.is_measured(material)
+        if is_table and plot is not None:
+            remedy = f"Fit a material to it with brdf fit {material} --out DIR, and check DIR/material.json"
+            raise InputError("--plot", f"draws materials, and {material} is a measured table", remedy)
+        materials: dict[str, Any] = (
+            {Path(material).stem: brdf.load_measured(material)} if is_table else find_materials(material)
+        )
+        reports = {name: brdf.check(one, name=name) for name, one in materials.items()}
+        if plot is not None:
+            if len(materials) > 1:
+                raise InputError("--plot", f"draws one material, {material} holds {len(materials)}", "Give one")
+            from fitting.plots.materials import overview
+
+            with brdf.atomic_path(plot) as path:
+                name, one = next(iter(materials.items()))
+                overview(one, reports[name]).savefig(path)
+    if as_json:
+        show(json.dumps({name: report.to_json() for name, report in reports.items()}, indent=2))
+    else:
+        show("\n\n".join(map(str, reports.values())))
+    verdicts = [report.plausible for report in reports.values()]
+    return 1 if False in verdicts else 2 if None in verdicts else 0

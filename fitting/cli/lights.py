@@ -1,0 +1,51 @@
+"""``brdf lights``: directions of distant lights from photographs of a ball."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fitting.cli.common import named_as, show
+from fitting.cli.picture_options import ENCODINGS, encoding_of
+
+EXAMPLE = "Example: [bold]brdf lights chrome.*.png --sphere 253.5,148,119.5 --out lights.txt[/bold]"
+
+
+def lights(
+    target: Annotated[
+        list[Path], typer.Argument(help="Photographs of a mirror ball, one per light; of a matt one with --matt.")
+    ],
+    sphere: Annotated[
+        str, typer.Option(help="The ball: x,y,radius in pixels from the upper left one, or mask: found in --mask.")
+    ],
+    mask: Annotated[Path | None, typer.Option(help="An image that is 0 beside the ball, for --sphere mask.")] = None,
+    out: Annotated[Path | None, typer.Option(help="A text file to write: a direction a line.")] = None,
+    encoding: Annotated[str | None, typer.Option(help=ENCODINGS)] = None,
+    matt: Annotated[
+        bool, typer.Option("--matt", help="The ball is matt: its shading tells the light, not a highlight.")
+    ] = False,
+) -> None:
+    """Find where the light comes from by its highlight on a mirror ball: x right, y up, z to the camera."""
+    import brdf
+    from fitting.cli.first_look import check_ball, find_ball
+
+    with named_as({"encoding": "--encoding"}):
+        pictures = [brdf.read_picture(path, encoding=encoding_of(encoding)) for path in target]
+    inside = None if mask is None else brdf.read_mask(mask)
+    circle, notes = find_ball(sphere, inside, mask)
+    for picture in pictures:
+        check_ball(picture.pixels.shape[:2], circle)
+    from fitting.photographs.ball import ball_points, light_from_highlight, light_from_shading
+
+    lines = []
+    for path, picture in zip(target, pictures, strict=True):
+        with named_as({"picture": path}):
+            if matt:
+                direction = light_from_shading(picture, ball_points(picture.pixels.shape[:2], circle)).direction
+            else:
+                direction = light_from_highlight(picture, circle)
+        lines.append(" ".join(f"{value:.6f}" for value in direction))
+    text = "\n".join([*(f"# {line}" for line in notes), *lines]) + "\n"
+    if out is not None:
+        brdf.write_text(out, text)
+    show(text.rstrip() if out is None else f"wrote {out}")

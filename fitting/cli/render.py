@@ -1,0 +1,35 @@
+"""``brdf render``: a picture of a material in a scene."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fitting.cli.common import named_as, show, use_compilation_cache, waiting
+from fitting.cli.interrupts import held
+
+EXAMPLE = (
+    "Example: [bold]brdf render material.json --scene scene.toml -o picture.exr[/bold]\n\n"
+    "From the classic table: [bold]brdf render emerald --scene scene.toml -o emerald.png[/bold]"
+)
+
+
+def render(
+    material: Annotated[str, typer.Argument(help="A .json or .mtl file, or a name of the classic table: emerald.")],
+    scene: Annotated[Path, typer.Option(help="The scene file.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The picture to write: .exr, .hdr, .png, .tiff or .jpg.")],
+    precision: Annotated[str, typer.Option(help="float32 or float64.")] = "float32",
+) -> None:
+    """Render a material in a scene."""
+    with waiting("rendering"), named_as({"material": material, "precision": "--precision"}):
+        with held():
+            use_compilation_cache()
+            import numpy as np
+
+            import brdf.rendering
+            from fitting.cli.materials import find_material
+
+        loaded, _ = find_material(material)
+        image = brdf.render(loaded, brdf.Scene.load(scene), precision=precision)  # pyright: ignore[reportArgumentType]
+        brdf.write_image(out, np.asarray(image))
+    show(f"wrote {out}")
