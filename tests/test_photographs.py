@@ -211,12 +211,17 @@ def test_a_picture_in_another_unit_keeps_its_clipping_and_its_step(tmp_path):
 GRAY, CHROME = Circle(244.5, 144.5, 108), Circle(253.5, 148, 119.5)
 
 
+def photographs(ball: str) -> list[brdf.Picture]:
+    """Of one ball, under twelve lights."""
+    names = [f"{ball}.{index}.png" for index in range(12)]
+    return [brdf.read_picture(REAL / "uw-spheres" / ball / name, encoding="linear") for name in names]
+
+
 @real_data
 def test_the_gray_sphere_is_matt_and_equally_bright_under_twelve_lights():
     directions = read_directions(REAL / "uw-spheres" / "lights.txt", 12)
     found = []
-    for index, direction in enumerate(directions):
-        picture = brdf.read_picture(REAL / "uw-spheres" / "gray" / f"gray.{index}.png", encoding="linear")
+    for picture, direction in zip(photographs("gray"), directions, strict=True):
         scene = photograph_scene(ball_points(picture.pixels.shape[:2], GRAY), direction)
         found.append(fitting.fit(picture, scene, model="lambert").material.k_d.mean())
     assert np.max(np.abs(found / np.mean(found) - 1)) < 0.02
@@ -225,8 +230,7 @@ def test_the_gray_sphere_is_matt_and_equally_bright_under_twelve_lights():
 @real_data
 def test_the_gray_sphere_tells_its_own_lights_and_how_bright_they_are():
     strengths, brightest = [], []
-    for index in range(12):
-        picture = brdf.read_picture(REAL / "uw-spheres" / "gray" / f"gray.{index}.png", encoding="linear")
+    for picture in photographs("gray"):
         points = ball_points(picture.pixels.shape[:2], GRAY)
         strengths.append(light_from_shading(picture, points).strength)
         # Whatever its direction, a light shows its strength where the ball faces it; no model is needed to see that.
@@ -243,8 +247,7 @@ def test_the_gray_sphere_tells_its_own_lights_and_how_bright_they_are():
 @real_data
 def test_lambert_is_chosen_for_the_gray_sphere():
     directions = read_directions(REAL / "uw-spheres" / "lights.txt", 12)
-    names = [REAL / "uw-spheres" / "gray" / f"gray.{index}.png" for index in range(12)]
-    pictures = [brdf.read_picture(name, encoding="linear") for name in names]
+    pictures = photographs("gray")
     points = ball_points(pictures[0].pixels.shape[:2], GRAY)
     result = fitting.fit(pictures, [photograph_scene(points, direction) for direction in directions])
     assert result.material.name == "lambert"
@@ -254,8 +257,7 @@ def test_lambert_is_chosen_for_the_gray_sphere():
 def test_lights_from_the_chrome_sphere():
     directions = read_directions(REAL / "uw-spheres" / "lights.txt", 12)
     apart = []
-    for index, direction in enumerate(directions):
-        picture = brdf.read_picture(REAL / "uw-spheres" / "chrome" / f"chrome.{index}.png", encoding="linear")
+    for picture, direction in zip(photographs("chrome"), directions, strict=True):
         apart.append(angle(light_from_highlight(picture, CHROME), direction))
     # The file itself is off for three of the twelve.
     assert np.count_nonzero(np.array(apart) < 3) >= 9
