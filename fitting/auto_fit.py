@@ -27,7 +27,10 @@ def fit_simplest(job: Job) -> tuple[ModelFit, Choice]:
         job: the pictures.
     """
     names = job.families if job.lit[1].any() else ("lambert",)
-    fits = {name: fit_model(brdf.MODELS[name], job) for name in names}
+    fits: dict[str, ModelFit] = {}
+    for name in names:
+        beside = next((fit.pictures for fit in fits.values()), ())
+        fits[name] = fit_model(brdf.MODELS[name], job, beside=beside)
     # A lobe that would be wider than the search allows is no highlight: it mends what Lambert's law leaves at the rim.
     fits = {name: fit for name, fit in fits.items() if fit.optimum.flat or fit.optimum.n > WIDEST * job.n_range[0]}
     fits = fits or {"lambert": fit_model(brdf.Lambert, job)}

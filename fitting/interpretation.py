@@ -1,5 +1,6 @@
 """From the engine's numbers to a material, its errors, and what a user should know of them."""
 
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -163,9 +164,15 @@ def coefficient_factors(
     colour = np.where(colour > 0, colour, 1.0)
     factors = np.stack([np.ones_like(colour), colour, colour])
     if issubclass(model, brdf.SpecularMaterial):
-        with jax.enable_x64(True):
-            factors[2] *= float(model.scale(np.float64(n)))
+        factors[2] *= _scale(model, float(n))
     return factors
+
+
+@functools.lru_cache(maxsize=64)
+def _scale(model: type[brdf.SpecularMaterial], n: float) -> float:
+    """Of the lobe; asked for several times at one exponent."""
+    with jax.enable_x64(True):
+        return float(model.scale(np.float64(n)))
 
 
 def _typical_weight(pictures: Sequence[Picture]) -> float:

@@ -2,8 +2,9 @@
 
 from collections.abc import Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
@@ -81,7 +82,7 @@ def reached(model: type[brdf.Material], job: Job) -> Bool[np.ndarray, "3 C"]:
     return np.stack([ambient, direct, direct & issubclass(model, brdf.SpecularMaterial)])
 
 
-def _engine_pictures(model: type[brdf.Material], job: Job) -> Sequence[Picture]:
+def _engine_pictures(model: type[brdf.Material], job: Job, beside: Sequence[Picture]) -> Sequence[Picture]:
     def picture(tile: Tile, scene: brdf.Scene) -> Picture:
         dtype = tile.target.dtype
         precision: brdf.Precision = "float32" if dtype == np.float32 else "float64"
@@ -93,8 +94,25 @@ def _engine_pictures(model: type[brdf.Material], job: Job) -> Sequence[Picture]:
     pictures = []
     for observation, scene in zip(job.observations, job.light.scenes, strict=True):
         some = each(partial(picture, scene=scene), observation.tiles)
-        pictures.append(list(some) if observation.in_memory else some)
+        if not observation.in_memory:
+            pictures.append(some)
+            continue
+        # Of a small picture finding out what is the same would take longer than it saves.
+        first = sum(map(len, pictures))
+        known = beside[first : first + len(some)] if len(some) > 1 else ()
+        pictures.append([_sharing(one, *known[i : i + 1]) for i, one in enumerate(some)])
     return joined(pictures)
+
+
+def _sharing(picture: Picture, other: Picture | None = None) -> Picture:
+    """The picture, its arrays those of another one where they are equal: diffuse light is the same for all models."""
+    if other is None or jax.tree.structure(picture) != jax.tree.structure(other):
+        return picture
+
+    def shared(one: Any, two: Any) -> Any:
+        return two if one is two or jnp.array_equal(one, two) else one
+
+    return jax.tree.map(shared, picture, other)
 
 
 def _visible(pictures: Sequence[Picture], n_range: tuple[float, float]) -> tuple[float, float] | None:
@@ -117,15 +135,16 @@ def optimise(pictures: Sequence[Picture], free: Bool[np.ndarray, "3 C"], n_range
     return fit_linear(pictures, free=free)
 
 
-def fit_model(model: type[brdf.Material], job: Job) -> ModelFit:
+def fit_model(model: type[brdf.Material], job: Job, *, beside: Sequence[Picture] = ()) -> ModelFit:
     """Fit one model with the loss that is asked for.
 
     Args:
         model: its class.
         job: the pictures.
+        beside: those of another model that are in memory too, to keep once what both have in common.
     """
     free = reached(model, job)
-    pictures = _engine_pictures(model, job)
+    pictures = _engine_pictures(model, job, beside)
     n_range = job.n_range
     if free[2].any():
         visible = _visible(pictures, job.n_range)

@@ -18,8 +18,8 @@ from fitting.engine.streams import Stream, each
 from fitting.picture_inputs import check_levels, check_sizes, check_weight, per_pixel, pixels_of
 from fitting.pixel_survey import FLAT, SYMMETRIC_PIXELS, TOP, Survey, inverse_variance, lit_at_top, survey
 
-# How many pixels are looked at together, in rows of which files hold whole blocks.
-TILE_PIXELS = 1 << 20
+# How many pixels are looked at together; of a file at least as many rows as its blocks hold, or these are read twice.
+TILE_PIXELS = 1 << 18
 ALIGNED_ROWS = 64
 # Largest value, and inverse of the least, of a picture in single precision: squares of it, of rounding errors a million
 # times smaller, and sums over millions of pixels have to stay in its range of 1e-38 to 3e38; double precision reaches
@@ -132,7 +132,8 @@ def observe(
     if streamed and averaged:
         remedy = "Take samples out of the camera, or give the picture in memory"
         raise InputError("target", "is read by bands, where every pixel is seen at its centre", remedy)
-    rows = height if at_once or noise is not None or averaged else max(TILE_PIXELS // width, 1)
+    rows = max(TILE_PIXELS // width, ALIGNED_ROWS if streamed else 1)
+    rows = height if at_once or noise is not None or averaged else rows
     bands = _bands(pixels, scene, dtype, mask, rows)
     level = known_saturation if saturation is None else saturation
     total, goods = _look(bands, dark, level, keep=not streamed)

@@ -56,28 +56,6 @@ def test_the_accuracy_holds_where_only_some_pixels_count(kind):
     assert max(deviation(result, reference)[:2]) <= 3e-2
 
 
-def test_a_small_mask_is_looked_at_whole_and_the_result_says_why():
-    scene = ball(600)
-    counts = np.zeros((600, 600), bool)
-    counts[280:300, 300:330] = True
-    result = fitting.fit(noisy(scene), scene, model="lambert", accuracy=1e-1, mask=counts)
-    assert result.choice is not None
-    assert "all pixels: choosing among so few" in str(result)
-
-
-def test_a_process_of_one_fit_does_not_compile_what_would_choose():
-    scene = ball(300)
-    picture = noisy(scene, 0.01)
-    with budget.single_fit():
-        alone = fitting.fit(picture, scene, model="blinn-phong", accuracy=1e-1)
-    again = fitting.fit(picture, scene, model="blinn-phong", accuracy=1e-1)
-    assert alone.choice is not None
-    assert again.choice is not None
-    assert alone.choice.pixels == alone.choice.of_pixels > again.choice.pixels
-    assert "in a process of its own" in alone.choice.reason
-    assert again.choice.reason == ""
-
-
 def test_pictures_of_different_sizes_count_by_their_pixels():
     large, small = ball(600), ball(96)
     pictures = [noisy(large), 1.5 * noisy(small)]

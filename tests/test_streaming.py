@@ -9,6 +9,7 @@ import brdf
 import fitting
 from fitting import observation
 from fitting.engine.streams import Stream, each, joined
+from fitting.model_fit import fit_model
 
 MATERIAL = brdf.BlinnPhong(k_a=[0.05, 0.04, 0.03], k_d=[0.5, 0.3, 0.1], k_s=[0.3, 0.25, 0.2], n=60.0)
 SIZE = (96, 90)
@@ -38,6 +39,7 @@ def picture(noise: float = 0.01) -> np.ndarray:
 def small_bands(monkeypatch):
     """Seven bands, the last one shorter."""
     monkeypatch.setattr(observation, "TILE_PIXELS", 14 * SIZE[0] + 5)
+    monkeypatch.setattr(observation, "ALIGNED_ROWS", 14)
 
 
 def same(streamed: fitting.FitResult, whole: fitting.FitResult, tolerance: float = 2e-5):
@@ -70,6 +72,21 @@ def test_options_agree(tmp_path: Path, options: dict):
     whole = fitting.fit(brdf.read_image(path), scene(), **options)
     with brdf.ImageReader(path) as reader:
         same(fitting.fit(reader, scene(), **options), whole, 1e-3)
+
+
+def test_families_keep_once_what_they_share(monkeypatch):
+    kept = []
+
+    def watched(model, job, *, beside=()):
+        kept.append(fit_model(model, job, beside=beside))
+        return kept[-1]
+
+    monkeypatch.setattr("fitting.auto_fit.fit_model", watched)
+    fitting.fit(picture(), scene())
+    one, other = (fit.pictures for fit in kept[:2])
+    assert len(one) == len(other) == 7
+    assert all(mine.diffuse is its.diffuse for mine, its in zip(one, other, strict=True))
+    assert not any(mine.lobe.log_cos is its.lobe.log_cos for mine, its in zip(one, other, strict=True))
 
 
 def test_mask_weight_and_several_pictures(tmp_path: Path):

@@ -89,10 +89,10 @@ class Camera(eqx.Module):
         """
         return self.rays_through(*self.picture_plane(first, count))
 
-    def rays_in_pixels(
+    def places_in_pixels(
         self, pixel: Int[Array, " K"], right: Float[Array, " M"], down: Float[Array, " M"]
-    ) -> tuple[Float[Array, "K M 3"], Float[Array, "K M 3"]]:
-        """Origin and unit direction of rays through several places of some pixels.
+    ) -> tuple[Float[Array, "K M"], Float[Array, "K M"]]:
+        """Places of the picture, for `rays_through`.
 
         Args:
             pixel: indices, row by row.
@@ -101,7 +101,7 @@ class Camera(eqx.Module):
         """
         width, height = self.resolution
         column, row = (pixel % width)[:, None] + right, (pixel // width)[:, None] + down
-        return self.rays_through(column * 2.0 / width - 1.0, height / width - row * 2.0 / width)
+        return column * 2.0 / width - 1.0, height / width - row * 2.0 / width
 
     def __check_init__(self):
         """Refuse a camera without a picture plane."""

@@ -13,7 +13,7 @@ from brdf.geometry.camera import Camera
 from brdf.geometry.shapes import Shape
 from brdf.geometry.surface_points import PixelArea, SurfacePoints
 from brdf.geometry.tracing import trace
-from brdf.precision import Precision, cast, working_precision
+from brdf.precision import Precision, apart, cast, working_precision
 from brdf.scenes.scene import Scene
 
 
@@ -57,10 +57,12 @@ def some_pixels(
 
 @eqx.filter_jit
 def _traced(camera: Camera, shapes: tuple[Shape, ...], pixel: Any) -> SurfacePoints:
+    def at(camera: Camera, shapes: tuple[Shape, ...], x: Array, y: Array) -> SurfacePoints:
+        return trace(camera, shapes, None, *camera.rays_through(x, y))
+
     middle = jnp.full(1, 0.5)
-    origins, directions = camera.rays_in_pixels(pixel, middle, middle)
-    points = trace(camera, shapes, None, origins, directions)
-    return jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), points)
+    x, y = camera.places_in_pixels(pixel, middle, middle)
+    return apart(at, camera, shapes, x.T, y.T)
 
 
 def _shaped(points: SurfacePoints, shape: tuple[int, int]) -> SurfacePoints:

@@ -131,7 +131,7 @@ def _averaged(points: SurfacePoints, camera: Camera, shapes: tuple[Shape, ...], 
     count = points.mask.size
     pixel = jnp.concatenate([edge, other])
     rule = square_rule(camera.samples**2)
-    origins, directions = camera.rays_in_pixels(pixel, jnp.asarray(rule.s), jnp.asarray(rule.t))
+    origins, directions = camera.rays_through(*camera.places_in_pixels(pixel, jnp.asarray(rule.s), jnp.asarray(rule.t)))
     visibility = points.visibility
     if visibility is not None:
         visibility = tuple(None if mask is None else _spread(mask, pixel, rule.s.size) for mask in visibility)
@@ -140,7 +140,7 @@ def _averaged(points: SurfacePoints, camera: Camera, shapes: tuple[Shape, ...], 
     side = 3 * camera.samples
     steps = (jnp.arange(side) + 0.5) / side
     right, down = (grid.ravel() for grid in jnp.meshgrid(steps, steps))
-    counted = apart(shapes_met, shapes, *camera.rays_in_pixels(jnp.asarray(edge), right, down))
+    counted = apart(shapes_met, shapes, *camera.rays_through(*camera.places_in_pixels(jnp.asarray(edge), right, down)))
     weight = jnp.broadcast_to(jnp.asarray(rule.weight, fine.position.dtype), met.shape)
     weight = jnp.concatenate(
         [_by_shares(weight[: edge.size], met[: edge.size], counted, len(shapes)), weight[edge.size :]]

@@ -1,19 +1,18 @@
 """``fit(accuracy=...)`` and ``fit(seconds=...)``: the cheapest fit that is good enough, the best that is quick enough.
 
-The first attempt is cheap: some 1000 pixels of a picture, or all of a small one; 16 samples of a light with an extent;
-float32. From its own pixels it tells its error and what makes it (`fitting.accuracy.sampling_error`), so the next
-attempt changes just that: more pixels by the square of what is missing, more light samples as far as four times as many
-still change the answer, float64 where rounding counts. Mostly one or two attempts do. The error is that against a fit
-of all pixels in float64 with `MOST_SAMPLES` samples of each light, and is the larger one of what
-`fitting.accuracy.deviation` says of the parameters and of the picture.
+The first attempt is cheap: some 1000 pixels of a picture, more where its noise asks for more
+(`fitting.accuracy.first_pixels`), all of a small one; 16 samples of a light with an extent; float32. From its own
+pixels it tells its error and what makes it (`fitting.accuracy.sampling_error`), so the next attempt changes just that:
+more pixels by the square of what is missing, more light samples as far as four times as many still change the answer,
+float64 where rounding counts. Mostly one or two attempts do. The error is that against a fit of all pixels in float64
+with `MOST_SAMPLES` samples of each light, and is the larger one of what `fitting.accuracy.deviation` says of the
+parameters and of the picture.
 """
 
-import contextlib
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextvars import ContextVar
+from collections.abc import Callable, Mapping, Sequence
 from numbers import Real
 from typing import Any, NamedTuple
 
@@ -22,7 +21,8 @@ import numpy as np
 import brdf
 from brdf.errors import InputError
 from fitting.accuracy.budget_choice import Attempt, BudgetChoice
-from fitting.accuracy.configurations import Configuration, Run, casts_shadows, one_each, run, share_counted, target_size
+from fitting.accuracy.configurations import Configuration, Run, casts_shadows, run, target_size
+from fitting.accuracy.first_pixels import TOO_MANY, pixels_for, reason_for_all
 from fitting.accuracy.lamps import Lamps, extended
 from fitting.accuracy.linear_system import System
 from fitting.accuracy.sampling_error import (
@@ -37,13 +37,6 @@ from fitting.accuracy.sampling_error import (
 from fitting.result import FitResult
 
 FIRST_PIXELS, FIRST_SAMPLES, MOST_SAMPLES = 1024, 16, 4096
-# Pictures under single lights that are fitted whole at once: choosing among so few pixels takes as long as looking at
-# them. Where little error is allowed, a sample of the larger ones would hardly do.
-SMALL, SMALL_IF_FINE, FINE = 1 << 16, 1 << 18, 1e-2
-# What a fit of all pixels takes, compiled: seconds for a pixel, channel, light and kind of highlight. And what choosing
-# among them takes beyond that in a process that compiled nothing of it yet, with programs from the compiler's cache;
-# without, several times that. Measured by `python -m benchmarks.tradeoff_fresh`.
-EACH_PIXEL, CHOOSING = 3e-8, 0.3
 # Down to this accuracy the order of magnitude of rounding is enough to know.
 COARSE = 1e-4
 # An attempt aims at this share of the accuracy in each of the parts that its error has.
@@ -52,27 +45,15 @@ AIM = 0.6
 WHOLE_AIM = 0.9
 # With N light samples their error is taken to fall no slower and no faster than N to these powers, downwards.
 RATES = 0.5, 2.0
-# A sample of more than this share of the pixels is not worth the weighing: all are taken.
-WHOLE = 0.4
+# A sample of more than this share of the pixels is not worth the choosing and weighing, and all are taken: under lights
+# of many samples, whose work is in these, and under single ones.
+WHOLE, WHOLE_IF_SINGLE = 0.4, 0.1
 MOST_ATTEMPTS = 8
 # An estimate is of first order. Where it is larger than this the parameters may be anywhere: the next attempt goes one
 # step and searches all exponents.
 SMALL_ERROR = 0.5
 # Within this factor of the exponent found before the next attempt searches, where its 95 % interval is narrower.
 NEAR, NEAR_AUTO = 4.0, 16.0
-
-
-_single: ContextVar[bool] = ContextVar("single", default=False)
-
-
-@contextlib.contextmanager
-def single_fit() -> Iterator[None]:
-    """Within: the fit is the only one of its process, which therefore pays for all that is compiled."""
-    before = _single.set(True)
-    try:
-        yield
-    finally:
-        _single.reset(before)
 
 
 class _Step(NamedTuple):
@@ -117,9 +98,15 @@ def fit_within(
             raise InputError(name, came, "Leave one of them out")
     lamps, attempts = Lamps(), []
     has_samples = any(extended(scene) for scene in scenes)
-    reason = "" if has_samples else _reason_for_all(targets, scenes, model, options, accuracy)
+    reason = "" if has_samples else reason_for_all(targets, scenes, model, options, single=accuracy is not None)
     hard = not has_samples and any(map(casts_shadows, scenes))
+    most = (WHOLE if has_samples else WHOLE_IF_SINGLE) * max(map(target_size, targets))
     pixels = None if reason else FIRST_PIXELS
+    # Where light samples are to be chosen too, or time is short, few pixels tell first.
+    if pixels is not None and accuracy is not None and seconds is None and not has_samples:
+        asked = pixels_for(targets, options.get("mask"), model, accuracy) / len(targets)
+        pixels = pixels if asked <= pixels else _more_pixels(pixels, asked / pixels, most)
+        reason = "" if pixels is not None else TOO_MANY
     first = _precision(precision, pixels, accuracy, hard=hard)
     now = Configuration(model, first, pixels, FIRST_SAMPLES if has_samples else None)
     n_range = None
@@ -132,14 +119,14 @@ def fit_within(
         attempts.append(Attempt(str(now), *step.estimate, took))
         if accuracy is not None and step.estimate.bound <= accuracy:
             break
-        after = _better(now, step, targets, accuracy)
+        after = _better(now, step, most, accuracy)
         if after is None or len(attempts) == MOST_ATTEMPTS:
             break
         growth = _work(after, step, targets) / _work(now, step, targets)
         if seconds is not None and time.perf_counter() - start + took * max(growth, 1.0) > seconds:
             break
         if now.pixels is not None and after.pixels is None:
-            reason = f"a sample would have to hold more than {WHOLE:.0%} of them"
+            reason = TOO_MANY
             after = dataclasses.replace(after, precision=_precision(precision, None, accuracy, hard=hard))
         now, n_range = after, _near(step, options)
     looked = [target_size(t) if s is None else s.pixel.size for t, s in zip(targets, step.run.samples, strict=True)]
@@ -153,29 +140,6 @@ def fit_within(
         reason,
     )
     return dataclasses.replace(step.run.result, choice=choice, seconds=time.perf_counter() - start)
-
-
-def _reason_for_all(
-    targets: Sequence[Any],
-    scenes: Sequence[brdf.Scene],
-    model: str,
-    options: Mapping[str, Any],
-    accuracy: float | None,
-) -> str:
-    """Why all pixels are looked at without choosing among them first; empty where choosing may pay."""
-    cuts = zip(*(one_each(options.get(name), len(targets)) for name in ("mask", "weight")), strict=True)
-    sizes = [target_size(target) * share_counted(*cut) for target, cut in zip(targets, cuts, strict=True)]
-    if max(sizes) <= (SMALL_IF_FINE if accuracy is not None and accuracy < FINE else SMALL):
-        return "choosing among so few takes as long as looking at them"
-    if accuracy is None or not _single.get():
-        return ""
-    work = 0.0
-    for target, scene, size in zip(targets, scenes, sizes, strict=True):
-        channels = (*np.shape(getattr(target, "pixels", target)), 1)[2]
-        work += size * channels * max(len(scene.lights), 1) * (2 if model == "auto" else 1)
-    if EACH_PIXEL * work < CHOOSING:
-        return "in a process of its own, compiling what chooses among them takes longer than looking at them"
-    return ""
 
 
 def _precision(least: brdf.Precision, pixels: int | None, accuracy: float | None, *, hard: bool) -> brdf.Precision:
@@ -215,14 +179,14 @@ def _finer(samples: int | None) -> int | None:
     return None if samples is None or samples >= MOST_SAMPLES else min(STEP * samples, MOST_SAMPLES)
 
 
-def _better(now: Configuration, step: _Step, targets: Sequence[Any], accuracy: float | None) -> Configuration | None:
+def _better(now: Configuration, step: _Step, most: float, accuracy: float | None) -> Configuration | None:
     """The next configuration to try; None where nothing is left to improve."""
     told = step.estimate
     # Without an accuracy the largest part of the error is taken down, four times per attempt.
     aim = AIM * accuracy if accuracy is not None else max(told.pixels, told.light, told.rounding) / 2.5
     after = now
     if now.pixels is not None and told.pixels > aim:
-        after = dataclasses.replace(after, pixels=_more_pixels(now.pixels, (told.pixels / aim) ** 2, targets))
+        after = dataclasses.replace(after, pixels=_more_pixels(now.pixels, (told.pixels / aim) ** 2, most))
     # What the pixels left out need not share with the light samples, those may have.
     allowed = aim / 2 if accuracy is None or after.pixels is not None else WHOLE_AIM * accuracy / MARGIN
     if step.system is not None and now.samples is not None and told.light > allowed and now.samples < MOST_SAMPLES:
@@ -235,7 +199,7 @@ def _better(now: Configuration, step: _Step, targets: Sequence[Any], accuracy: f
     parts = {"pixels": told.pixels, "samples": told.light, "precision": told.rounding}
     for name in sorted(parts, key=lambda name: -parts[name]):
         if name == "pixels" and now.pixels is not None and parts[name] > 0:
-            return dataclasses.replace(now, pixels=_more_pixels(now.pixels, 2.0, targets))
+            return dataclasses.replace(now, pixels=_more_pixels(now.pixels, 2.0, most))
         if name == "samples" and now.samples is not None and now.samples < MOST_SAMPLES and parts[name] > 0:
             return dataclasses.replace(now, samples=min(STEP * now.samples, MOST_SAMPLES))
         if name == "precision" and now.precision == "float32" and parts[name] > 0:
@@ -262,10 +226,10 @@ def _power_of_two(factor: float) -> int:
     return 2 ** max(1, int(np.ceil(np.log2(min(factor, 1e9)))))
 
 
-def _more_pixels(pixels: int, factor: float, targets: Sequence[Any]) -> int | None:
-    """More pixels by a factor; None for all."""
+def _more_pixels(pixels: int, factor: float, most: float) -> int | None:
+    """More pixels by a factor; None for all, where that is more than the most."""
     more = pixels * _power_of_two(factor)
-    return None if more > WHOLE * max(map(target_size, targets)) else more
+    return None if more > most else more
 
 
 def _work(configuration: Configuration, step: _Step, targets: Sequence[Any]) -> float:

@@ -156,6 +156,9 @@ class System:
             change = np.diff(scores / part.stride, axis=0)
             spread += 0.5 * part.stride * (change * np.minimum(chance[1:], chance[:-1])[:, None]).T @ change
         self.hessian, self.step, self.spread = hessian, step, spread
+        grams = np.sum([found.gram for found in self.probes], axis=0)[:, :3, :3]
+        # Of the picture of the fit, which errors of the picture are relative to.
+        self.square = max(float(np.einsum("kc,ckl,lc->", optimum.x, grams, optimum.x)), np.finfo(float).tiny)
         self._scales()
 
     def _scales(self) -> None:
@@ -202,15 +205,8 @@ class System:
         """
         k = shift + shift[..., -1:] * self.slope
         parameters = np.max(np.where(self.told, np.abs(k) / self.scale, 0.0), axis=-1)
-        square = np.einsum("...i,ij,...j->...", shift, self.hessian, shift)
-        picture = 0.0
-        for channel, gram in enumerate(self._grams()):
-            x = self.optimum.x[:, channel]
-            picture += x @ gram[:3, :3] @ x
-        return np.maximum(parameters, np.sqrt(np.maximum(square, 0.0) / max(picture, np.finfo(float).tiny)))
-
-    def _grams(self) -> Float[np.ndarray, "C 4 4"]:
-        return np.sum([found.gram for found in self.probes], axis=0)
+        square = np.sum((shift @ self.hessian) * shift, axis=-1)
+        return np.maximum(parameters, np.sqrt(np.maximum(square, 0.0) / self.square))
 
 
 def _part(sample: PixelSample, counted: np.ndarray, given: Any, most: int, *, complete: bool) -> Part:

@@ -225,12 +225,13 @@ def estimate(system: System, finer: int | None = None, *, rule: float | None = N
         rule: what rounding does, where its order of magnitude is enough to know; None measures it.
     """
     shifts = _shifts(system, finer, measured=rule is None)
-    alone = system.relative(shifts.drawn)
-    together = system.relative(shifts.drawn + shifts.shadows + shifts.light + shifts.rounding)
+    together = alone = system.relative(shifts.drawn)
     light, rounding = float(system.relative(shifts.light)), float(system.relative(shifts.rounding))
-    rounding = max(rounding, float(np.quantile(system.relative(shifts.shadows), 0.95)))
+    if shifts.shadows.any():
+        rounding = max(rounding, float(np.quantile(system.relative(shifts.shadows), 0.95)))
+    if light or rounding:
+        together = system.relative(shifts.drawn + shifts.shadows + shifts.light + shifts.rounding)
     if rule is not None:
         together, rounding = np.hypot(together, rule), max(rounding, rule)
-    pixels = float(np.quantile(alone, 0.95))
-    bound = float(np.quantile(together, 0.95)) + (MARGIN - 1) * light
-    return Estimate(float(np.median(together)), bound, pixels, light, rounding)
+    middle, bound = map(float, np.quantile(together, [0.5, 0.95]))
+    return Estimate(middle, bound + (MARGIN - 1) * light, float(np.quantile(alone, 0.95)), light, rounding)

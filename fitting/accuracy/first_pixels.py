@@ -1,0 +1,118 @@
+"""How many pixels to look at first: as many as the picture's noise asks for, told before anything is fitted.
+
+With M pixels of noise σ a parameter is off by some σ/√M, times a number that hangs on the scene. What else a sample may
+miss, such as what the model does not explain, only the fit itself tells.
+"""
+
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
+from contextvars import ContextVar
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+import brdf
+from fitting.accuracy.configurations import one_each, share_counted, target_size
+
+# Relative error (95 %) of the worst parameter, times √M, over noise over the picture's root mean square: with a
+# highlight and without. Medians over the noisy scenes of `python -m benchmarks.tradeoff`.
+SPECULAR, MATT = 35.0, 20.0
+# Pictures under single lights that are fitted whole at once: choosing among so few pixels takes as long as looking at
+# them.
+SMALL = 1 << 16
+# What a fit of all pixels takes, compiled: seconds for a pixel, channel, light and kind of highlight. And what choosing
+# among them takes beyond that in a process that compiled nothing of it yet, with programs from the compiler's cache;
+# without, several times that. Measured by `python -m benchmarks.tradeoff_fresh`.
+EACH_PIXEL, CHOOSING = 3e-8, 0.3
+TOO_MANY = "a sample would have to hold too many of them to be worth it"
+# So many rows, some thousand pixels of a picture of usual size, tell the noise.
+ROWS = 12
+# Of a Gaussian: its standard deviation over the median size; and the root of the sum of squares of 1, -2, 1.
+MEDIAN, SECOND = 1.4826, np.sqrt(6.0)
+
+_single: ContextVar[bool] = ContextVar("single", default=False)
+
+
+@contextlib.contextmanager
+def single_fit() -> Iterator[None]:
+    """Within: the fit is the only one of its process, which therefore pays for all that is compiled."""
+    before = _single.set(True)
+    try:
+        yield
+    finally:
+        _single.reset(before)
+
+
+def noise_share(values: Float[np.ndarray, "H W C"], mask: Bool[np.ndarray, "H W"] | None = None) -> float:
+    """Standard deviation of the noise over the picture's root mean square, in its noisiest channel.
+
+    Args:
+        values: the picture; what is black is taken for background.
+        mask: pixels to look at; None for all.
+
+    Source: second differences along rows, their median size. Immerkær 1996, "Fast noise variance estimation", does
+    the same with a mean over two axes.
+    """
+    some = slice(None, None, max(1, values.shape[0] // ROWS))
+    rows = np.asarray(values[some], np.float64)
+    lit = np.isfinite(rows).all(axis=-1) & (rows != 0).any(axis=-1)
+    if mask is not None:
+        lit &= mask[some]
+    inside = lit[:, :-2] & lit[:, 1:-1] & lit[:, 2:]
+    if not inside.any():
+        return 0.0
+    with np.errstate(invalid="ignore"):
+        change = rows[:, :-2] - 2 * rows[:, 1:-1] + rows[:, 2:]
+    deviation = MEDIAN * np.median(np.abs(change[inside]), axis=0) / SECOND
+    size = np.sqrt(np.mean(rows[lit] ** 2, axis=0))
+    return float(np.max(deviation) / max(float(np.max(size)), np.finfo(float).tiny))
+
+
+def pixels_for(targets: Sequence[Any], masks: Any, model: str, accuracy: float) -> float:
+    """How many pixels of all pictures together their noise asks for.
+
+    Args:
+        targets: the pictures, or their arrays.
+        masks: pixels to look at, (H, W), one for all or one each; None for all of them.
+        model: "auto" or the name of a model.
+        accuracy: relative error, in 95 % of cases.
+    """
+    share = 0.0
+    for target, mask in zip(targets, one_each(masks, len(targets)), strict=True):
+        values = np.atleast_3d(np.asarray(getattr(target, "pixels", target)))
+        share = max(share, noise_share(values, None if mask is None else np.asarray(mask, bool)))
+    specular = model == "auto" or issubclass(brdf.MODELS[model], brdf.SpecularMaterial)
+    return ((SPECULAR if specular else MATT) * share / accuracy) ** 2
+
+
+def reason_for_all(
+    targets: Sequence[Any],
+    scenes: Sequence[brdf.Scene],
+    model: str,
+    options: Mapping[str, Any],
+    *,
+    single: bool,
+) -> str:
+    """Why all pixels are looked at without choosing among them first; empty where choosing may pay.
+
+    Args:
+        targets: pictures.
+        scenes: one for each, under single lights.
+        model: "auto" or the name of a model.
+        options: further arguments of `fitting.fit`: masks, weights, ...
+        single: whether it counts that the fit may be the only one of its process.
+    """
+    cuts = zip(*(one_each(options.get(name), len(targets)) for name in ("mask", "weight")), strict=True)
+    sizes = [target_size(target) * share_counted(*cut) for target, cut in zip(targets, cuts, strict=True)]
+    if max(sizes) <= SMALL:
+        return "choosing among so few takes as long as looking at them"
+    if not (single and _single.get()):
+        return ""
+    work = 0.0
+    for target, scene, size in zip(targets, scenes, sizes, strict=True):
+        channels = (*np.shape(getattr(target, "pixels", target)), 1)[2]
+        work += size * channels * max(len(scene.lights), 1) * (2 if model == "auto" else 1)
+    if EACH_PIXEL * work < CHOOSING:
+        return "in a process of its own, compiling what chooses among them takes longer than looking at them"
+    return ""

@@ -1,0 +1,56 @@
+"""How many pixels a fit of a given accuracy looks at first: by noise, size, and what compiling takes."""
+
+import numpy as np
+import pytest
+from ball_scenes import MATERIAL, ball, noisy
+
+import brdf
+import fitting
+from fitting.accuracy import first_pixels
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-3, 0.03])
+def test_noise_is_told_from_the_picture_alone(noise):
+    clean = np.asarray(brdf.render(MATERIAL, ball(512)))
+    lit = clean.any(axis=-1)
+    random = np.random.default_rng(2).standard_normal(clean.shape)
+    picture = np.where(lit[..., None], clean + noise * random, 0.0)
+    size = np.sqrt(np.mean(picture[lit] ** 2, axis=0)).max()
+    assert first_pixels.noise_share(picture) == pytest.approx(noise / size, rel=0.1, abs=1e-4)
+    # What is masked may be as rough as it likes.
+    rough = np.where(lit[..., None], picture, np.abs(random))
+    assert first_pixels.noise_share(rough, lit) == pytest.approx(first_pixels.noise_share(picture), rel=0.02, abs=1e-6)
+    assert first_pixels.noise_share(np.full((8, 8, 1), np.nan)) == 0.0
+
+
+@pytest.mark.parametrize(("noise", "pixels"), [(1e-4, (1000, 2500)), (0.02, (3000, 20000)), (0.3, (262144, 262144))])
+def test_more_noise_asks_for_more_pixels_at_once(noise, pixels):
+    scene = ball(512)
+    result = fitting.fit(noisy(scene, noise), scene, model="blinn-phong", accuracy=1e-2)
+    assert result.choice is not None
+    assert len(result.choice.attempts) == 1
+    assert result.choice.met
+    assert pixels[0] <= result.choice.pixels <= pixels[1]
+    assert (first_pixels.TOO_MANY in str(result)) == (pixels[0] == 262144)
+
+
+def test_a_small_mask_is_looked_at_whole_and_the_result_says_why():
+    scene = ball(600)
+    counts = np.zeros((600, 600), bool)
+    counts[280:300, 300:330] = True
+    result = fitting.fit(noisy(scene), scene, model="lambert", accuracy=1e-1, mask=counts)
+    assert result.choice is not None
+    assert "all pixels: choosing among so few" in str(result)
+
+
+def test_a_process_of_one_fit_does_not_compile_what_would_choose():
+    scene = ball(300)
+    picture = noisy(scene, 0.01)
+    with first_pixels.single_fit():
+        alone = fitting.fit(picture, scene, model="blinn-phong", accuracy=1e-1)
+    again = fitting.fit(picture, scene, model="blinn-phong", accuracy=1e-1)
+    assert alone.choice is not None
+    assert again.choice is not None
+    assert alone.choice.pixels == alone.choice.of_pixels > again.choice.pixels
+    assert "in a process of its own" in alone.choice.reason
+    assert again.choice.reason == ""
