@@ -44,6 +44,7 @@ def test_the_error_is_that_of_theory_for_gaussian_noise(light):
         pytest.param({"ambient": 0.1}, id="matt, ambient"),
         pytest.param({"k_s": 0.4, "n": 40.0}, id="shiny"),
         pytest.param({"ambient": 0.1, "k_s": 0.4, "n": 40.0}, id="shiny, ambient"),
+        pytest.param({"k_s": 0.4, "n": 8000.0}, id="a highlight in one block"),
     ],
 )
 def test_the_light_is_as_far_off_as_the_error_says(surface):

@@ -271,16 +271,18 @@ def _error(
     Source: Huber 1981, section 7.6; Bell and McCaffrey 2002.
     """
     length = np.linalg.norm(slopes, axis=0)
-    told = length > 0
-    columns = slopes[:, told] / length[told]
+    length[length == 0] = 1.0
+    columns = slopes / length
     pull, within = columns * (weight * residual)[:, None], columns * (weight >= 1)[:, None]
     members = [block == one for one in np.unique(block)]
     hessian = np.stack([within[here].T @ within[here] for here in members])
     score = np.stack([pull[here].sum(axis=0) for here in members])
-    try:
-        moved = np.linalg.solve(hessian.sum(axis=0) - hessian, score[:, :, None])[:, :3, 0] / length[:3]
-    except np.linalg.LinAlgError:
+    others = hessian.sum(axis=0) - hessian
+    inverse = np.linalg.pinv(others, 1e-9, hermitian=True)
+    # A highlight may lie in one block; without it the others still tell the light, or they do not.
+    if not np.allclose((inverse @ others)[:, :3], np.eye(length.size)[:3], rtol=0, atol=1e-3):
         return float("inf")
+    moved = (inverse @ score[:, :, None])[:, :3, 0] / length[:3]
     size = float(np.linalg.norm(light))
     across = moved - np.outer(moved @ light, light) / size**2
     return float(np.degrees(np.sqrt((1 - 1 / len(members)) * np.sum(across**2)) / size))
