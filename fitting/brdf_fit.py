@@ -4,7 +4,6 @@ f_r = [k_d + k_s S / (N.L)] / pi is linear in k_d and k_s, so the engine that fi
 which deviations count: `fitting.brdf_losses`.
 """
 
-import math
 import time
 from typing import Any, NamedTuple, get_args
 
@@ -16,7 +15,7 @@ from jaxtyping import Float
 import brdf
 from brdf.errors import InputError
 from fitting.brdf_losses import Loss, Samples, logarithmic, losses_of
-from fitting.brdf_result import HALF, BrdfCandidate, BrdfFitResult
+from fitting.brdf_result import HALF, BrdfCandidate, BrdfFitResult, lowest_cosine
 from fitting.engine.separable import OneLightLobe, Optimum, Picture, fit_linear, search
 from fitting.result import Parameter
 from fitting.uncertainty.covariance import residual_noise, uncertainty
@@ -94,6 +93,7 @@ def fit_brdf(
         samples=len(samples.values),
         negative=int(np.count_nonzero(samples.values < 0)),
         left_out={reason: count for reason, count in left_out.items() if count},
+        max_angle=max_angle,
         seconds=time.perf_counter() - start,
     )
 
@@ -101,8 +101,7 @@ def fit_brdf(
 def _samples(table: brdf.MeasuredBRDF, max_angle: float) -> tuple[Samples, dict[str, int]]:
     if not (isinstance(max_angle, int | float) and 0 < max_angle <= 90):
         raise InputError("max_angle", f"must be above 0 and at most 90 degrees, got {max_angle!r}", "Correct it")
-    # A table's angles carry rounding: one at the limit counts.
-    lowest = math.cos(math.radians(max_angle + 1e-4)) if max_angle < 90 else 0.0
+    lowest = lowest_cosine(max_angle)
     near = (table.to_light[:, 2] > lowest) & (table.to_view[:, 2] > lowest) & (table.solid_angle > 0)
     left_out = dict(table.left_out)
     left_out[f"further than {max_angle:g}° from the normal"] = int(np.count_nonzero(~near))
@@ -111,6 +110,8 @@ def _samples(table: brdf.MeasuredBRDF, max_angle: float) -> tuple[Samples, dict[
     values = table.values[near]
     if not values.any():
         raise InputError(table.name, "is black", "Give a table with values")
+    if not np.any(values > 0):
+        raise InputError(table.name, f"has no value above 0 within {max_angle:g}° of the normal", "Check its sign")
     largest = float(np.max(np.abs(values)))
     if not 1 / FAR <= largest <= FAR:
         raise InputError(table.name, f"holds values of up to {largest:.3g}/sr, as no BRDF does", "Check its unit")
@@ -159,15 +160,17 @@ def _fit_model(name: str, samples: Samples, loss: Loss, n_range: tuple[float, fl
     losses = losses_of(samples, values)
     brightest = np.pi * np.max(np.abs(samples.values), axis=0)
     peak = float(np.max(reach * np.exp(np.maximum(optimum.n * log_cos, -745.0)))) if specular else 0.0
-    sure = uncertainty(
-        optimum,
-        free,
-        residual_noise(optimum, brightest * np.finfo(float).eps),
-        brightest,
-        specular=specular,
-        single=False,
-        visible=float(np.max(optimum.x[2]) * peak / np.max(brightest)),
-    )
+    # A lobe that hardly reaches a sample needs a k_s whose square is out of range; it is found to be undetermined.
+    with np.errstate(over="ignore", invalid="ignore"):
+        sure = uncertainty(
+            optimum,
+            free,
+            residual_noise(optimum, brightest * np.finfo(float).eps),
+            brightest,
+            specular=specular,
+            single=False,
+            visible=float(np.max(optimum.x[2]) * peak / np.max(brightest)),
+        )
     factors = np.ones((3, channels))
     if specular:
         with jax.enable_x64(True):

@@ -10,12 +10,26 @@ import numpy as np
 import brdf
 from fitting.result import Parameter
 
-# Below this share of squares explained, and above this share of light misplaced, a model does not describe the table.
+# A model that explains this share of the squares describes the peak, one that places this share of the light the body;
+# where the mean of both is below, it does not describe the table.
 HALF = 0.5
+# Shares below this are rounding.
+_ROUNDING = 1e-6
 
 
 def _percent(share: float) -> str:
+    if share < _ROUNDING:
+        return f"{100 * _ROUNDING:g} %" if share > 0 else "0 %"
     return f"{100 * share:.{2 if share < 0.995 else 3}g} %"
+
+
+def lowest_cosine(max_angle: float) -> float:
+    """The cosine above which directions count.
+
+    Args:
+        max_angle: from the normal, in degrees; a table's angles carry rounding: one at the limit counts.
+    """
+    return float(np.cos(np.radians(max_angle + 1e-4))) if max_angle < 90 else 0.0
 
 
 @dataclass(frozen=True)
@@ -69,6 +83,7 @@ class BrdfFitResult:
         samples: how many samples counted.
         negative: how many of their values are below 0.
         left_out: how many entries did not count, by reason.
+        max_angle: light and view further than this from the normal did not count, in degrees.
         seconds: how long it took.
     """
 
@@ -82,15 +97,21 @@ class BrdfFitResult:
     samples: int
     negative: int
     left_out: dict[str, int]
+    max_angle: float
     seconds: float
 
     @property
     def fits(self) -> bool:
-        """Whether the model explains at least half of the squares, or puts half of the light where it belongs."""
-        return self._explained() >= HALF or self.losses.misplaced <= HALF
+        """Whether, on average of both, half of the squares are explained and half of the light is where it belongs."""
+        return 0.5 * (self._explained + self._placed) >= HALF
 
+    @property
     def _explained(self) -> float:
         return 1 - self.losses.cosine**2
+
+    @property
+    def _placed(self) -> float:
+        return 1 - self.losses.misplaced
 
     @property
     def verdict(self) -> str:
@@ -110,18 +131,24 @@ class BrdfFitResult:
         if several and name == "Lambert":
             lobe = min(self.candidates[1:], key=lambda candidate: candidate.loss)
             words = f"the best lobe, {lobe.model} within {_percent(lobe.losses.cosine)}, does not halve the squares"
-            rest = f"; {words}" if _percent(lobe.losses.cosine) != _percent(self.losses.cosine) else ""
+            if _percent(lobe.losses.cosine) != _percent(self.losses.cosine):
+                rest = f"; {words}"
+            elif self.losses.cosine > _ROUNDING:
+                rest = "; no lobe comes closer"
         elif several and alone is not None:
             rest = f"; Lambert alone within {_percent(alone.losses.cosine)}"
-        if self._explained() < HALF:
-            placed = f"puts {_percent(1 - self.losses.misplaced)} of the light where it belongs"
+        if self._explained < HALF:
+            placed = f"puts {_percent(self._placed)} of the light where it belongs"
             return f"{name} {placed}, but not the peak, and leaves {_percent(self.losses.cosine)} (rms){rest}"
+        if self._placed < HALF:
+            elsewhere = f"{_percent(self.losses.misplaced)} of the light goes elsewhere"
+            return f"{name} comes within {_percent(self.losses.cosine)} (rms), but {elsewhere}{rest}"
         is_enough = several and name == "Lambert"
         return f"{name} {'is enough' if is_enough else 'describes it'} within {within}{rest}"
 
     def _brightest(self) -> str:
-        values = self.table.values.sum(axis=1)
-        index = int(np.argmax(values))
+        near = np.minimum(self.table.to_light[:, 2], self.table.to_view[:, 2]) > lowest_cosine(self.max_angle)
+        index = int(np.argmax(np.where(near, self.table.values.sum(axis=1), -np.inf)))
         light, view = self.table.to_light[index], self.table.to_view[index]
 
         def apart(a: Any, b: Any) -> float:

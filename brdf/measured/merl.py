@@ -68,7 +68,9 @@ def load(path: Path) -> MeasuredBRDF:
     size = path.stat().st_size
     with path.open("rb") as file:
         head = file.read(12)
-        sizes = struct.unpack("<3i", head) if len(head) == 12 else ()
+        if len(head) < 12:
+            raise InputError(path, "ends within its header", "The file is damaged; get it again")
+        sizes = struct.unpack("<3i", head)
         if sizes != SHAPE:
             came = f"says it holds {' x '.join(map(str, sizes))} entries, MERL's hold {' x '.join(map(str, SHAPE))}"
             raise InputError(path, came, "Give a file of the MERL database, or its layout")

@@ -213,9 +213,12 @@ def load_measured(path: str | os.PathLike[str]) -> MeasuredBRDF:
     try:
         if head.startswith(rgl.MAGIC):
             return rgl.load(file)
-        # No text holds a NUL: what else is binary has MERL's layout, or is told how it differs.
-        if merl.claims(head, size) or b"\0" in head:
+        # No text holds a NUL: what else is binary and named as MERL's is told how it differs.
+        if merl.claims(head, size) or (b"\0" in head and file.suffix.lower() == ".binary"):
             return merl.load(file)
+        if b"\0" in head:
+            what = "is neither text in UTF-8 nor a file of MERL or RGL"
+            raise InputError(path, what, "Give a MERL .binary, RGL .bsdf, Cornell or ALTA text file")
         return text.load(file)
     except InputError as error:
         if error.where == file.stem:  # the name of the table, which is that of the file

@@ -20,7 +20,10 @@ from brdf.files import parse_number, read_text
 from brdf.measured.tables import LARGEST_ANGLE, MeasuredBRDF, from_angles, from_half_angles
 
 MOST_CHANNELS = 4096
+_NUMBERS = "Numbers have a decimal point and spaces between them; # starts a comment"
 _Pair = tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3"]]
+# View and light from the file's name, the rows' lines and the columns, (A, P).
+_Reader = Callable[[str, list[int], np.ndarray], _Pair]
 
 
 def load(path: Path) -> MeasuredBRDF:
@@ -72,7 +75,8 @@ def parse_cornell(text: str, place: str, name: str) -> MeasuredBRDF:
             remedy = "Give a row of theta_i phi_i theta_s phi_s and a value per wavelength on a line of its own"
             raise InputError(f"{place}: line {lines[start]}", came, remedy)
     table = rows.reshape(-1, 4 + count)
-    _check_angles(place, table[:, :4])
+    row_lines = [words[1 + count + index * (4 + count)][0] for index in range(len(table))]
+    _check_angles(place, row_lines, table[:, :4].T)
     light, view = from_angles(table[:, 0], table[:, 1]), from_angles(table[:, 2], table[:, 3])
     names = tuple(f"{wavelength:g} nm" for wavelength in wavelengths)
     return MeasuredBRDF.from_samples(light, view, table[:, 4:], name=name, channels=names)
@@ -112,21 +116,22 @@ def parse_alta(text: str, place: str, name: str) -> MeasuredBRDF:
     if not rows:
         raise InputError(place, "holds no samples", "Give a table with rows of numbers")
     try:
-        view, light = directions(place, table[:, :inputs].T)
+        view, light = directions(place, [number for number, _ in rows], table[:, :inputs].T)
         values = table[:, inputs:]
         if header.get("PARAM_OUT") == "INV_STERADIAN_COSINE_FACTOR":
             values = values / np.where(view[:, 2:] > 0, view[:, 2:], 1.0)
         names = ("red", "green", "blue") if header.get("PARAM_OUT") == "RGB_COLOR" and outputs == 3 else None
         return MeasuredBRDF.from_samples(light, view, values, name=name, channels=names)
     except InputError as error:
-        raise error if error.where.startswith(place) else error.inside(place) from None
+        known = error.where == name or error.where.startswith(place)
+        raise error if known else error.inside(place) from None
 
 
 def _number(place: str, line: int, word: str) -> float:
     try:
         return parse_number(word)
     except ValueError:
-        raise InputError(f"{place}: line {line}", f"must be a number, got {word[:40]!r}", "Correct the file") from None
+        raise InputError(f"{place}: line {line}", f"must be a number, got {word[:40]!r}", _NUMBERS) from None
 
 
 def _dimensions(place: str, header: dict[str, str]) -> tuple[int, int]:
@@ -152,15 +157,19 @@ def _confidence_columns(place: str, header: dict[str, str]) -> int:
     return int(kind)
 
 
-def _check_angles(place: str, angles: Float[np.ndarray, "..."]) -> None:
-    if not np.all(np.isfinite(angles)) or np.max(np.abs(angles), initial=0.0) > LARGEST_ANGLE + 1e-6:
-        worst = angles[np.unravel_index(np.argmax(np.where(np.isfinite(angles), np.abs(angles), np.inf)), angles.shape)]
-        raise InputError(place, f"has an angle of {worst:g}", "Angles are in radians, at most 2 pi")
+def _check_angles(place: str, lines: list[int], angles: Float[np.ndarray, "A P"]) -> None:
+    wrong = ~(np.abs(angles) <= LARGEST_ANGLE + 1e-6)
+    if wrong.any():
+        row = int(np.argmax(wrong.any(axis=0)))
+        came = f"has an angle of {angles[np.argmax(wrong[:, row]), row]:g}"
+        raise InputError(f"{place}: line {lines[row]}", came, "Angles are in radians, at most 2 pi")
 
 
-def _arc_cosine(place: str, cosine: Float[np.ndarray, " P"]) -> Float[np.ndarray, " P"]:
-    if not np.all(np.abs(cosine) <= 1):
-        raise InputError(place, "has a cosine that is not within -1 and 1", "Correct the file")
+def _arc_cosine(place: str, lines: list[int], cosine: Float[np.ndarray, " P"]) -> Float[np.ndarray, " P"]:
+    wrong = ~(np.abs(cosine) <= 1)
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise InputError(f"{place}: line {lines[row]}", f"has a cosine of {cosine[row]:g}", "It is within -1 and 1")
     return 2 * np.arctan2(np.sqrt(1 - cosine), np.sqrt(1 + cosine))
 
 
@@ -168,36 +177,39 @@ def _projected(polar_x: np.ndarray, polar_y: np.ndarray) -> Float[np.ndarray, "P
     return from_angles(np.hypot(polar_x, polar_y), np.arctan2(polar_y, polar_x))
 
 
-def _checked(formula: Callable[..., _Pair], inputs: int) -> tuple[int, Callable[[str, np.ndarray], _Pair]]:
+def _checked(formula: Callable[..., _Pair], inputs: int) -> tuple[int, _Reader]:
     """Number of columns, and view and light from columns of angles."""
 
-    def directions(place: str, columns: np.ndarray) -> _Pair:
-        _check_angles(place, columns)
+    def directions(place: str, lines: list[int], columns: np.ndarray) -> _Pair:
+        _check_angles(place, lines, columns)
         return formula(*columns)
 
     return inputs, directions
 
 
-def _cosines_of_half(place: str, columns: np.ndarray) -> _Pair:
-    angles = [_arc_cosine(place, column) for column in columns]
+def _cosines_of_half(place: str, lines: list[int], columns: np.ndarray) -> _Pair:
+    angles = [_arc_cosine(place, lines, column) for column in columns]
     return from_half_angles(angles[0], angles[1] if len(angles) > 1 else 0.0 * angles[0], 0.0)
 
 
-def _cosine_about_normal(sign: float) -> Callable[[str, np.ndarray], _Pair]:
-    def directions(place: str, columns: np.ndarray) -> _Pair:
-        angle = _arc_cosine(place, columns[0])
+def _cosine_about_normal(sign: float) -> _Reader:
+    def directions(place: str, lines: list[int], columns: np.ndarray) -> _Pair:
+        angle = _arc_cosine(place, lines, columns[0])
         return from_angles(sign * angle, 0.0), from_angles(0.0 * angle, 0.0)
 
     return directions
 
 
-def _cartesian(place: str, columns: np.ndarray) -> _Pair:
-    if not np.all(np.isfinite(columns)) or not np.all(np.any(columns.reshape(2, 3, -1) != 0, axis=1)):
-        raise InputError(place, "has a direction that is zero or not finite", "Correct the file")
+def _cartesian(place: str, lines: list[int], columns: np.ndarray) -> _Pair:
+    sound = np.isfinite(columns).all(axis=0) & np.any(columns.reshape(2, 3, -1) != 0, axis=1).all(axis=0)
+    if not sound.all():
+        raise InputError(
+            f"{place}: line {lines[np.argmin(sound)]}", "has a direction that is zero or not finite", "Correct the file"
+        )
     return columns[:3].T, columns[3:].T
 
 
-_PARAMETRISATIONS: dict[str, tuple[int, Callable[[str, np.ndarray], _Pair]]] = {
+_PARAMETRISATIONS: dict[str, tuple[int, _Reader]] = {
     "COS_TH": (1, _cosines_of_half),
     "COS_TH_TD": (2, _cosines_of_half),
     "COS_TLV": (1, _cosine_about_normal(1.0)),
@@ -213,10 +225,12 @@ _PARAMETRISATIONS: dict[str, tuple[int, Callable[[str, np.ndarray], _Pair]]] = {
 }
 
 
-def _parametrisation(place: str, header: dict[str, str], inputs: int) -> Callable[[str, np.ndarray], _Pair]:
+def _parametrisation(place: str, header: dict[str, str], inputs: int) -> _Reader:
     kind = header.get("PARAM_IN", "")
+    remedy = f"Known: {', '.join(_PARAMETRISATIONS)}"
+    if not kind:
+        raise InputError(f"{place}: PARAM_IN", "is missing", remedy)
     if kind not in _PARAMETRISATIONS:
-        remedy = f"Known: {', '.join(_PARAMETRISATIONS)}"
         raise InputError(f"{place}: PARAM_IN", f"is not known, got {kind[:40]!r}", remedy)
     columns, directions = _PARAMETRISATIONS[kind]
     if columns != inputs:
