@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from brdf.errors import InputError
+
 # As `fitting.fit` takes them; help is shown without importing it.
 MODEL_NAMES = ("auto", "lambert", "phong", "blinn-phong", "normalized-phong", "normalized-blinn-phong")
 
@@ -18,8 +20,6 @@ def named_as(arguments: dict[str, Any]) -> Iterator[None]:
     Args:
         arguments: what was typed, by argument.
     """
-    from brdf.errors import InputError
-
     try:
         yield
     except InputError as error:

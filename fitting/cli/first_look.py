@@ -1,4 +1,4 @@
-"""What `brdf fit` is given, as far as it can be told without JAX, whose import takes longer than reading a picture."""
+"""What the command is given, as far as it can be told without JAX, whose import takes longer than reading a picture."""
 
 import tomllib
 from collections.abc import Callable

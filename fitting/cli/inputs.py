@@ -1,4 +1,4 @@
-"""What `brdf fit` is given: a picture with its scene, photographs of a ball, a photometric-stereo archive."""
+"""What the command is given: a picture with its scene, photographs of a ball, a photometric-stereo archive."""
 
 from pathlib import Path
 

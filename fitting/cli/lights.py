@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from fitting.cli.common import named_as, show
+from fitting.cli.interrupts import held
 from fitting.cli.picture_options import ENCODINGS, encoding_of
 
 EXAMPLE = "Example: [bold]brdf lights chrome.*.png --sphere 253.5,148,119.5 --out lights.txt[/bold]"
@@ -26,25 +27,27 @@ def lights(
     ] = False,
 ) -> None:
     """Find where the light comes from by its highlight on a mirror ball: x right, y up, z to the camera."""
-    import brdf
-    from fitting.cli.first_look import check_ball, find_ball
-
+    with held():
+        import brdf.images.pictures
+        from fitting.cli.first_look import check_ball, find_ball
+        from fitting.cli.photograph_inputs import how_sure
+        from fitting.photographs.ball import ball_points, light_from_highlight, light_from_shading
     with named_as({"encoding": "--encoding"}):
         pictures = [brdf.read_picture(path, encoding=encoding_of(encoding)) for path in target]
     inside = None if mask is None else brdf.read_mask(mask)
     circle, notes = find_ball(sphere, inside, mask)
     for picture in pictures:
         check_ball(picture.pixels.shape[:2], circle)
-    from fitting.photographs.ball import ball_points, light_from_highlight, light_from_shading
-
     lines = []
     for path, picture in zip(target, pictures, strict=True):
+        said = ""
         with named_as({"picture": path}):
             if matt:
-                direction = light_from_shading(picture, ball_points(picture.pixels.shape[:2], circle)).direction
+                light = light_from_shading(picture, ball_points(picture.pixels.shape[:2], circle))
+                direction, said = light.direction, f"  # {how_sure(light)}"
             else:
                 direction = light_from_highlight(picture, circle)
-        lines.append(" ".join(f"{value:.6f}" for value in direction))
+        lines.append(" ".join(f"{value:.6f}" for value in direction) + said)
     text = "\n".join([*(f"# {line}" for line in notes), *lines]) + "\n"
     if out is not None:
         brdf.write_text(out, text)

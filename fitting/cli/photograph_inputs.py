@@ -17,7 +17,7 @@ from fitting.photographs.light_files import parse_numbers, read_directions, read
 
 # A light from so far behind leaves a crescent of less than two fifths of the ball's radius.
 BEHIND = -0.6
-THIN_CRESCENT = "; it comes from behind, and a highlight on the thin crescent can turn it by several times that error"
+THIN_CRESCENT = " (it comes from behind: a highlight on the thin crescent can turn it by several times that)"
 
 
 def photographs(targets: list[Path], options: PictureOptions, read: dict[Path, brdf.Picture]) -> Job:
@@ -67,16 +67,23 @@ def photographs(targets: list[Path], options: PictureOptions, read: dict[Path, b
 
 
 def _told(targets: list[Path], found: list[ShadingLight]) -> tuple[str, ...]:
-    """The lights that the shading told, and how well; of several, how bright each is beside their mean."""
+    """The lights that the shading told, and how surely; of several, how bright each is beside their mean."""
     mean = sum(one.strength for one in found) / len(found)
     notes = []
     for target, one in zip(targets, found, strict=True):
         x, y, z = one.direction
         brighter = f", {100 * (one.strength / mean - 1):+.1f} % bright" if len(found) > 1 else ""
-        behind = THIN_CRESCENT if z < BEHIND else ""
-        told = f"{x:.4f},{y:.4f},{z:.4f} ± {one.error:.2g}°{brighter}{behind}"
-        notes.append(f"light of {target.name} from its shading: {told}")
+        notes.append(f"light of {target.name} from its shading: {x:.4f},{y:.4f},{z:.4f} {how_sure(one)}{brighter}")
     return tuple(notes)
+
+
+def how_sure(light: ShadingLight) -> str:
+    """What to say of the error of a light's direction.
+
+    Args:
+        light: as the shading tells it.
+    """
+    return f"± {light.error:.2g}°{THIN_CRESCENT if light.direction[2] < BEHIND else ''}"
 
 
 def _normalised(

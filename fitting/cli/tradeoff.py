@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from brdf.errors import InputError
 from fitting.cli.common import MODEL_NAMES, named_as, show, use_compilation_cache
 from fitting.cli.interrupts import held
 from fitting.cli.picture_options import PictureOptions, takes_picture_options
@@ -34,7 +35,6 @@ def tradeoff(
 
     Ctrl-C ends the measuring and keeps what was measured.
     """
-    from brdf.errors import InputError
     from fitting.cli.first_look import read_first
 
     options = {"model": model, "accuracy": accuracy, "seconds": seconds}
