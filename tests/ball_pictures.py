@@ -1,7 +1,10 @@
-"""Photographs of a ball, made in plain NumPy."""
+"""Photographs of a matt ball, made in plain NumPy."""
+
+from pathlib import Path
 
 import numpy as np
 
+import brdf
 from fitting.photographs.circle import Circle
 
 BALL = Circle(30.3, 24.8, 21.6)
@@ -26,3 +29,14 @@ def shaded(direction, k_d=0.8, circle: Circle = BALL, shape=SHAPE) -> np.ndarray
     light = np.asarray(direction) / np.linalg.norm(direction)
     value = k_d * np.maximum(normal_x * light[0] + normal_y * light[1] + normal_z * light[2], 0)
     return np.where(disc(circle, shape), value, 0.0)[..., None].astype(np.float32)
+
+
+def photographs_in(folder: Path) -> Path:
+    """Three photographs of a matt ball, of known exposure and light, 16 bit; their lights; a mask of the ball."""
+    lights = np.array([[0.3, 0.4, 0.86], [-0.5, 0.1, 0.86], [0.0, -0.5, 0.87]])
+    exposures = [1.0, 0.5, 0.8]
+    for index, (light, exposure) in enumerate(zip(lights, exposures, strict=True)):
+        brdf.write_image(folder / f"{index}.png", shaded(light) * exposure, dtype="uint16", encoding="linear")
+    np.savetxt(folder / "lights.txt", lights)
+    brdf.write_image(folder / "mask.png", disc(BALL)[..., None].astype(np.float32))
+    return folder

@@ -6,8 +6,8 @@ import sys
 from pathlib import Path
 
 import pytest
+from command_runs import ROOT
 from real_data import REAL
-from sound_files import ROOT
 
 BAD_IMAGES = REAL / "bad-images"
 

@@ -5,7 +5,8 @@ import subprocess
 
 import numpy as np
 import pytest
-from sound_files import command, refused, scene, sound_files
+from command_runs import command, refused
+from sound_files import scene, sound_files
 
 import brdf
 

@@ -6,7 +6,8 @@ import re
 
 import numpy as np
 import pytest
-from sound_files import MATERIAL, SCENE, command, refused, scene, sound_files
+from command_runs import command, refused
+from sound_files import MATERIAL, SCENE, scene, sound_files
 
 import brdf
 from benchmarks.fuzz_corpus import CAMERA, LIGHT, POINT, RECTANGLE, SPHERE
