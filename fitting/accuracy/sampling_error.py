@@ -15,6 +15,7 @@ The first and the last are random, and are told as the median and the 95 % quant
 added to them.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -117,7 +118,7 @@ def _shifts(system: System, finer: int | None = None, *, measured: bool = True) 
     covariance = system.inverse @ system.spread @ system.inverse
     value, vector = np.linalg.eigh(covariance)
     root = vector * np.sqrt(np.maximum(value, 0.0))
-    draws = np.random.default_rng(0).standard_normal((DRAWS, value.size)) @ root.T
+    draws = _normal_draws(value.size) @ root.T
     drawn = _settled(system, draws + system.inverse @ held) - _settled(system, (system.inverse @ held)[None])
     nothing = np.zeros(value.size)
     light = nothing if finer is None else system.inverse @ _of_light(system, None, finer)
@@ -128,6 +129,11 @@ def _shifts(system: System, finer: int | None = None, *, measured: bool = True) 
     else:
         rounding = system.inverse @ np.where(system.bound, 0.0, system.step)
     return Shifts(drawn, _of_shadows(system), light, rounding)
+
+
+@functools.cache
+def _normal_draws(size: int) -> Float[np.ndarray, "D P"]:
+    return np.random.default_rng(0).standard_normal((DRAWS, size))
 
 
 def _of_shadows(system: System) -> Float[np.ndarray, "D P"]:
