@@ -15,8 +15,9 @@ from fitting.photographs.archives import ARCHIVE, read_archive, read_array
 from fitting.photographs.ball import ShadingLight, ball_points, light_from_shading, photograph_scene
 from fitting.photographs.light_files import parse_numbers, read_directions, read_intensities
 
-# A light from so far behind leaves a crescent of less than two fifths of the ball's radius.
-BEHIND = -0.6
+# A light from so far behind leaves a crescent of less than three fifths of the ball's radius. Ambient light and a
+# highlight on a thin one can be taken for each other and for shading, and then the light is off by 10° and more.
+BEHIND = -0.4
 THIN_CRESCENT = " (it comes from behind: a highlight on the thin crescent can turn it by several times that)"
 
 
