@@ -18,6 +18,8 @@ from fitting.accuracy.configurations import one_each, share_counted, target_size
 # Relative error (95 %) of the worst parameter, times √M, over noise over the picture's root mean square: with a
 # highlight and without. Medians over the noisy scenes of `python -m benchmarks.tradeoff`.
 SPECULAR, MATT = 35.0, 20.0
+# A sample that is crowded where highlights are holds so many times as many pixels as it is asked for.
+CROWDED = 1.5
 # Pictures under single lights that are fitted whole at once: choosing among so few pixels takes as long as looking at
 # them.
 SMALL = 1 << 16
@@ -70,7 +72,7 @@ def noise_share(values: Float[np.ndarray, "H W C"], mask: Bool[np.ndarray, "H W"
 
 
 def pixels_for(targets: Sequence[Any], masks: Any, model: str, accuracy: float) -> float:
-    """How many pixels of all pictures together their noise asks for.
+    """How many pixels of all pictures together to ask `sample_pixels` for, by their noise.
 
     Args:
         targets: the pictures, or their arrays.
@@ -82,8 +84,9 @@ def pixels_for(targets: Sequence[Any], masks: Any, model: str, accuracy: float) 
     for target, mask in zip(targets, one_each(masks, len(targets)), strict=True):
         values = np.atleast_3d(np.asarray(getattr(target, "pixels", target)))
         share = max(share, noise_share(values, None if mask is None else np.asarray(mask, bool)))
-    specular = model == "auto" or issubclass(brdf.MODELS[model], brdf.SpecularMaterial)
-    return ((SPECULAR if specular else MATT) * share / accuracy) ** 2
+    if model == "auto" or issubclass(brdf.MODELS[model], brdf.SpecularMaterial):
+        return (SPECULAR * share / accuracy) ** 2 / CROWDED
+    return (MATT * share / accuracy) ** 2
 
 
 def reason_for_all(
