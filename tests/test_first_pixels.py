@@ -23,7 +23,7 @@ def test_noise_is_told_from_the_picture_alone(noise):
     assert first_pixels.noise_share(np.full((8, 8, 1), np.nan)) == 0.0
 
 
-@pytest.mark.parametrize(("noise", "pixels"), [(1e-4, (1000, 2500)), (0.05, (3000, 20000)), (0.3, (262144, 262144))])
+@pytest.mark.parametrize(("noise", "pixels"), [(1e-4, (1000, 2500)), (0.03, (3000, 20000)), (0.3, (262144, 262144))])
 def test_more_noise_asks_for_more_pixels_at_once(noise, pixels):
     scene = ball(512)
     result = fitting.fit(noisy(scene, noise), scene, model="blinn-phong", accuracy=1e-2)
