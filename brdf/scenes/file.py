@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from brdf.checks import direction_value
 from brdf.errors import InputError
 from brdf.files import read_text
 from brdf.geometry.camera import CAMERAS
@@ -33,6 +34,9 @@ LIGHTS: dict[str, type[Light]] = {
     )
 }
 POSITION_LAYERS = ("position", "P")
+# Longer lists are no spectrum, no polygon that anybody draws.
+MOST_NUMBERS = 4096
+_MOST_BYTES = 1 << 22
 NORMAL_LAYERS = ("normal", "sh_normal", "N")
 VIEW_LAYERS = ("to_view",)
 
@@ -104,6 +108,8 @@ def _flatten(value: Any) -> Iterator[Any]:
 
 def _plain(place: str, value: Any) -> Any:
     """A value of the file, refused where Python would silently read a truth value or text as a number."""
+    if isinstance(value, list) and len(value) > MOST_NUMBERS:
+        raise InputError(place, f"has {len(value)} entries", f"Give at most {MOST_NUMBERS}")
     numbers = list(_flatten(value))
     if any(isinstance(number, bool) for number in numbers) and not place.endswith(".fitted"):
         raise InputError(place, f"must be a number, got {json.dumps(value)}", "Give numbers")
@@ -129,14 +135,14 @@ def load_scene(path: str | Path, within: str | Path | None = None) -> Scene:
     values = _read_toml(path)
     root = _Table(str(path), values)
     place = f"{path}: "
-    camera, shapes, points, ambient, lights, masks = None, [], None, None, [], []
+    camera, shapes, points, ambient, lights, masks, has_position = None, [], None, None, [], [], True
     if "camera" in root.values:
         table = _Table(place + "camera", root.pop("camera"))
         camera = table.build(table.choose("type", CAMERAS))
     for table in _tables(place + "shapes", root.pop("shapes", [])):
         shapes.append(_load_shape(table, folder))
     if "aov" in root.values:
-        points = _load_points(_Table(place + "aov", root.pop("aov")), folder)
+        points, has_position = _load_points(_Table(place + "aov", root.pop("aov")), folder)
     if "ambient" in root.values:
         table = _Table(place + "ambient", root.pop("ambient"))
         given = "intensity" in table.values
@@ -149,6 +155,9 @@ def load_scene(path: str | Path, within: str | Path | None = None) -> Scene:
     for table in _tables(place + "lights", root.pop("lights", [])):
         masks.append(_load_mask(table, folder))
         lights.append(_load_light(table, folder))
+        if not has_position and not isinstance(lights[-1], DirectionalLight | ConstantEnvironment | EnvironmentMap):
+            came = f"stands somewhere, but {place}aov has no layer of positions"
+            raise InputError(table.place, came, "Add the layer, or use directional lights")
     if root.values:
         known = "camera, shapes, aov, ambient, lights"
         raise InputError(f"{path}: {next(iter(root.values))}", "is not a known key", f"Known here: {known}")
@@ -161,7 +170,7 @@ def load_scene(path: str | Path, within: str | Path | None = None) -> Scene:
 
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(read_text(path))
+        return tomllib.loads(read_text(path, _MOST_BYTES))
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise InputError(path, f"is not TOML ({error})", "Correct the file") from None
 
@@ -171,7 +180,7 @@ def _file(table: _Table, key: str, folder: Folder, example: str) -> Path:
     if key not in table.values:
         raise InputError(table.place, f"has no {key}", f'Add {key} = "{example}"')
     name = table.pop(key)
-    if not isinstance(name, str):
+    if not isinstance(name, str) or not name:
         raise InputError(f"{table.place}.{key}", f"must be a path, got {name!r}", f'Give a path like "{example}"')
     return inside(folder, name, f"{table.place}.{key}")
 
@@ -207,36 +216,50 @@ def _load_mask(table: _Table, folder: Folder) -> Any:
     if "visibility" not in table.values:
         return None
     path = _file(table, "visibility", folder, "shadow.exr")
-    layer = table.pop("visibility_layer")
+    layer = _layer_name(table, "visibility_layer")
     if layer is None:
         return read_image(path, encoding="linear")[..., 0]
     return _layer(read_layers(path), layer, (), path)[..., 0]
 
 
-def _load_points(table: _Table, folder: Folder) -> SurfacePoints:
-    """Surface points from the layers of an image file."""
+def _load_points(table: _Table, folder: Folder) -> tuple[SurfacePoints, bool]:
+    """Surface points from the layers of an image file, and whether their positions are among them."""
     path = _file(table, "file", folder, "aovs.exr")
-    to_view = table.pop("to_view")
-    names = {key: table.pop(key) for key in ("position", "normal")}
+    to_view = _plain(f"{table.place}.to_view", table.pop("to_view"))
+    if to_view is not None:
+        to_view = direction_value(f"{table.place}.to_view")(to_view)
+    names = {key: _layer_name(table, key) for key in ("position", "normal")}
     table.done(["file", "position", "normal", "to_view"])
     layers = read_layers(path)
     normal = _layer(layers, names["normal"], NORMAL_LAYERS, path)
     if normal is None:
         remedy = 'Name the layer: normal = "..."'
-        raise InputError(path, f"has no layer of normals, got {', '.join(layers)}", remedy)
+        raise InputError(path, f"has no layer of normals, got {_named(layers)}", remedy)
     position = _layer(layers, names["position"], POSITION_LAYERS, path)
     if to_view is None:
         to_view = _layer(layers, None, VIEW_LAYERS, path)
     try:
-        return SurfacePoints.from_normals(normal, position=position, to_view=(0, 0, 1) if to_view is None else to_view)
+        towards = (0, 0, 1) if to_view is None else to_view
+        return SurfacePoints.from_normals(normal, position=position, to_view=towards), position is not None
     except InputError as error:
         raise error.inside(str(path)) from None
+
+
+def _layer_name(table: _Table, key: str) -> str | None:
+    name = table.pop(key)
+    if not isinstance(name, str | None):
+        raise InputError(f"{table.place}.{key}", f"must be the name of a layer, got {name!r}", "Give a name in quotes")
+    return name
+
+
+def _named(layers: dict[str, Any]) -> str:
+    return ", ".join(name or "the unnamed one" for name in layers)
 
 
 def _layer(layers: dict[str, Any], name: Any, known: tuple[str, ...], path: Path) -> Any:
     if name is not None:
         if name not in layers:
-            raise InputError(path, f"has no layer {name!r}, got {', '.join(layers)}", "Correct the layer's name")
+            raise InputError(path, f"has no layer {name!r}, got {_named(layers)}", "Correct the layer's name")
         return layers[name]
     return next((layers[candidate] for candidate in known if candidate in layers), None)
 
