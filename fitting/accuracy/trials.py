@@ -155,11 +155,12 @@ class Bench:
 
         # Evenly spread: these solvers know no weights.
         sample = sample_pixels(self.scene, brdf.Lambert, how.pixels or SOLVER_PIXELS)
-        target, scene, mask = self.target, self.scene, self.options["mask"]
+        # They leave out what the reference left out, such as pixels whose noise is cut off.
+        target, scene, mask = self.target, self.scene, self.best.counted[0]
         if sample is not None:
             target = some_of_target(target, sample)
             scene = brdf.some_pixels(scene, sample.pixel, precision="float64")
-            mask = None if mask is None else np.asarray(mask, bool).ravel()[sample.pixel][None]
+            mask = mask.ravel()[sample.pixel][None]
         channels = self.best.material.k_d.shape[0]
         half = np.full(channels, 0.5)
         start = brdf.MODELS[self.model](k_a=half, k_d=half, k_s=half, n=START)  # pyright: ignore[reportCallIssue]
