@@ -94,6 +94,28 @@ def without_cut_noise(
     return dataclasses.replace(result, left_out={reason: n for reason, n in left_out.items() if n}, warnings=warnings)
 
 
+def warned_of_cut_noise(result: FitResult) -> FitResult:
+    """The fit of a picture that is not in memory, with a warning where its noise is cut off.
+
+    Args:
+        result: of the fit; what it shows are some of the pixels.
+    """
+    clipped = result.left_out.get("clipped", 0) >= FEWEST
+    share = 0.0
+    for target, scene, counted in zip(result.targets, result.scenes, result.counted, strict=True):
+        if clipped or _piles_up(target, counted):
+            everywhere = np.ones(counted.shape, bool)
+            cut = _cut(np.asarray(target), _predicted(result, scene), counted, everywhere, clipped=clipped)
+            share = max(share, float(np.mean((cut.black | cut.white)[counted])))
+    if not share:
+        return result
+    words = (
+        f"noise is cut off at black or white in {100 * share:.2g} % of the pixels, which bends the coefficients: "
+        "of a picture in memory such pixels are left out"
+    )
+    return dataclasses.replace(result, warnings=(words, *result.warnings))
+
+
 def _count(masks: Sequence[Bool[np.ndarray, "H W"]]) -> int:
     return sum(int(np.count_nonzero(mask)) for mask in masks)
 

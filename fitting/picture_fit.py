@@ -10,7 +10,7 @@ import numpy as np
 import brdf
 from brdf.errors import InputError
 from fitting.auto_fit import fit_simplest
-from fitting.cut_noise import without_cut_noise
+from fitting.cut_noise import warned_of_cut_noise, without_cut_noise
 from fitting.engine.losses import LOSSES, Loss
 from fitting.engine.separable import fit_linear
 from fitting.interpretation import Interpretation, ModelFit, interpret
@@ -61,7 +61,7 @@ def fit(
 
     Args:
         target: linear values, (H, W, C) or (H, W), or a `brdf.Picture`; a `brdf.ImageReader` for a file that is larger
-            than memory, which is read by bands of rows, several times (`fitting.cut_noise` is for others); or a list.
+            than memory, which is read by bands of rows, several times (`fitting.cut_noise` only warns then); or a list.
         scene: what the picture shows; a list of as many where there are several pictures.
         model: "auto" for the simplest adequate of Lambert, Phong and Blinn-Phong, or the name of a model.
         precision: "float32" or "float64".
@@ -131,7 +131,7 @@ def fit(
 
     result = fit_to(masks)
     if any(isinstance(one, brdf.ImageReader) for one in targets):
-        return result
+        return warned_of_cut_noise(result)
     return without_cut_noise(result, list(map(looked_at, masks, weights)), fit_to)
 
 

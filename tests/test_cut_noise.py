@@ -164,3 +164,12 @@ def test_solvers_that_are_compared_leave_out_the_same_pixels():
     # All of the fitted pixels: what is cut off bends this fit as well.
     bench.best.counted[0][:] = True
     assert parameter_deviation(solver.run(), bench.best) > 0.08
+
+
+@pytest.mark.parametrize(("low", "share"), [(0.0, True), (-1.0, False)])
+def test_a_file_read_by_bands_is_warned_of(tmp_path, low, share):
+    path = tmp_path / "target.exr"
+    brdf.write_image(path, seen(DULL, 0.03, 0, low=low, bits=None).pixels)
+    with brdf.ImageReader(path) as reader:
+        result = fitting.fit(reader, SCENE, model="blinn-phong")
+    assert any("noise is cut off at black" in warning for warning in result.warnings) == share
