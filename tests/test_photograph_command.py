@@ -173,6 +173,49 @@ def test_lights_from_a_matt_ball_in_one_command(photographs, capsys, monkeypatch
     assert len(re.findall(r"# ± [\d.e-]+°", Path("found.txt").read_text(encoding="utf-8"))) == 2
 
 
+@pytest.mark.parametrize("hidden_by", ["alpha", "--mask", "--saturation", "--ambient"])
+def test_lights_of_a_matt_ball_are_those_that_the_fit_takes(tmp_path, capsys, monkeypatch, hidden_by):
+    monkeypatch.chdir(tmp_path)
+    light, patch = (0.3, 0.4, 0.86), (slice(5, 30), slice(12, 40))
+    picture = shaded(light) + 0.002 * np.random.default_rng(8).standard_normal((*SHAPE, 1)).astype(np.float32)
+    opaque, words = np.ones((*SHAPE, 1), np.float32), []
+    if hidden_by in ("alpha", "--mask"):
+        picture[patch], opaque[patch] = 0.7, 0.0
+    if hidden_by == "--mask":
+        brdf.write_image("mask.png", opaque)
+        words, opaque = ["--mask", "mask.png"], np.ones_like(opaque)
+    elif hidden_by == "--saturation":
+        picture, words = np.minimum(picture, 0.5), ["--saturation", "0.5"]
+    elif hidden_by == "--ambient":
+        picture, words = picture + np.float32(0.2), ["--ambient"]
+    write_layered("ball.exr", np.concatenate([picture, opaque], axis=-1))
+    shared = ["ball.exr", "--sphere", f"{BALL.x},{BALL.y},{BALL.radius}"]
+    status, out, err = run(capsys, "lights", *shared, "--matt", *words)
+    assert status == 0, err
+    assert angle([float(one) for one in out.split()[:3]], light) < 0.3  # some 6 times what the noise does
+    _, told, _ = run(capsys, "fit", *shared, "--light", "fit", "--model", "lambert", *words)
+    numbers = [re.findall(r"-?\d\.\d+", text)[:4] for text in (out, told[told.index("from its shading") :])]
+    assert np.allclose(*(np.array(one, float) for one in numbers), rtol=0, atol=5e-5)  # four decimals
+    if words:
+        _, plain, _ = run(capsys, "lights", *shared, "--matt")
+        assert angle([float(one) for one in plain.split()[:3]], light) > 1.0
+
+
+@pytest.mark.parametrize("hidden_by", ["alpha", "mask"])
+def test_a_highlight_that_is_not_to_be_seen_is_none(tmp_path, capsys, monkeypatch, hidden_by):
+    monkeypatch.chdir(tmp_path)
+    rows, columns = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    picture = np.exp(-((columns - BALL.x) ** 2 + (rows - BALL.y) ** 2) / 4)[..., None]
+    opaque = np.ones_like(picture)
+    picture[15:18, 38:41], opaque[15:18, 38:41] = 2.0, 0.0
+    brdf.write_image("mask.png", opaque)
+    write_layered("ball.exr", np.concatenate([picture, opaque if hidden_by == "alpha" else opaque**0], axis=-1))
+    words = ["lights", "ball.exr", "--sphere", f"{BALL.x},{BALL.y},{BALL.radius}"]
+    status, out, err = run(capsys, *words, *(["--mask", "mask.png"] if hidden_by == "mask" else []))
+    assert status == 0, err
+    assert angle([float(one) for one in out.split()], (0, 0, 1)) < 2.6  # half a pixel
+
+
 def test_lights_from_a_mirror_ball_in_one_command(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     circle = Circle(60.0, 55.0, 50.0)

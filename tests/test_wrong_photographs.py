@@ -102,6 +102,28 @@ def test_wrong_photographs(photographs, capsys, monkeypatch, words, said):
     assert sorted(os.listdir()) == before
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--ambient"], "--ambient: says nothing of a mirror ball's highlight"),
+        (["--saturation", "0.9"], "--saturation: says nothing of a mirror ball's highlight"),
+        (["--matt", "--saturation", "nan"], "--saturation: must be a linear"),
+        (["--mask", "small.png"], "small.png: is of shape"),
+        (["--matt", "--mask", "small.png"], "small.png: is of shape"),
+        (["--matt", "--mask", "none.png"], "none.png: there is no such file"),
+    ],
+)
+def test_wrong_options_of_lights(photographs, capsys, monkeypatch, words, said):
+    monkeypatch.chdir(photographs)
+    brdf.write_image("small.png", np.ones((4, 4, 1), np.float32))
+    status, out, err = run(capsys, "lights", "0.png", "--sphere", "30,24,9", *words, "--out", "out.txt")
+    assert (status, out) == (2, "")
+    assert said in err
+    assert err.startswith("error: ")
+    assert err.count("\n") == 1
+    assert not Path("out.txt").exists()
+
+
 def test_nothing_else_of_an_archive_is_read(tmp_path):
     np.savez(
         tmp_path / "a.npz",

@@ -15,8 +15,8 @@ from fitting.photographs.archives import ARCHIVE, read_archive, read_array
 from fitting.photographs.ball import ShadingLight, ball_points, light_from_shading, photograph_scene
 from fitting.photographs.light_files import parse_numbers, read_directions, read_intensities
 
-# A light from so far behind leaves a crescent of less than three fifths of the ball's radius. Ambient light and a
-# highlight on a thin one can be taken for each other and for shading, and then the light is off by 10° and more.
+# A light from so far behind leaves a crescent of less than three fifths of the ball's radius. On a thin one ambient
+# light and a highlight can be taken for each other and for shading, and the jackknife does not see that.
 BEHIND = -0.4
 THIN_CRESCENT = " (it comes from behind: a highlight on the thin crescent can turn it by several times that)"
 
@@ -50,11 +50,8 @@ def photographs(targets: list[Path], options: PictureOptions, read: dict[Path, b
     pictures = exposed(pictures, options.exposure)
     masks = opaque(mask, pictures)
     if directions is None:
-        found = []
-        for target, picture, one in zip(targets, pictures, masks, strict=True):
-            with named_as({"picture": target, "mask": options.mask, "saturation": "--saturation"}):
-                how = {"saturation": options.saturation, "mask": one, "ambient": options.ambient}
-                found.append(light_from_shading(picture, points, **how))
+        seen = zip(targets, pictures, masks, strict=True)
+        found = [light_of(target, picture, points, one, options) for target, picture, one in seen]
         directions = np.array([one.direction for one in found])
         notes += _told(targets, found)
     channels = pictures[0].pixels.shape[2]
@@ -65,6 +62,26 @@ def photographs(targets: list[Path], options: PictureOptions, read: dict[Path, b
         raise InputError(options.intensities, came, "Give one intensity per channel")
     job = _normalised(pictures, points, directions, intensities, ambient=options.ambient)
     return Job(*job, masks, targets[0], notes)
+
+
+def light_of(
+    target: Path, picture: brdf.Picture, points: brdf.SurfacePoints, mask: np.ndarray | None, options: PictureOptions
+) -> ShadingLight:
+    """The light of a photograph from its shading.
+
+    Args:
+        target: the file.
+        picture: of it.
+        points: what its pixels see.
+        mask: pixels to look at, as `opaque` gives them, or None.
+        options: what it shows.
+
+    Raises:
+        InputError: naming the file or option.
+    """
+    with named_as({**options.names(), "picture": target}):
+        how = {"saturation": options.saturation, "mask": mask, "ambient": options.ambient}
+        return light_from_shading(picture, points, **how)
 
 
 def _told(targets: list[Path], found: list[ShadingLight]) -> tuple[str, ...]:

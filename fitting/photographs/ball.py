@@ -11,7 +11,7 @@ shading of the matt ball itself (`light_from_shading`).
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 import brdf
 from brdf.errors import InputError
@@ -47,12 +47,22 @@ def _grey(picture: Any) -> Float[np.ndarray, "H W"]:
     return pixels if pixels.ndim == 2 else pixels.mean(axis=-1)
 
 
-def light_from_highlight(picture: Any, circle: Circle) -> Float[np.ndarray, "3"]:
+def _seen(points: brdf.SurfacePoints, mask: Any) -> Bool[np.ndarray, "H W"]:
+    seen = np.asarray(points.mask)
+    if mask is None:
+        return seen
+    if np.shape(mask) != seen.shape:
+        raise InputError("mask", f"is of shape {np.shape(mask)}, the points {seen.shape}", "Give one of its size")
+    return seen & np.asarray(mask, bool)
+
+
+def light_from_highlight(picture: Any, circle: Circle, *, mask: Any = None) -> Float[np.ndarray, "3"]:
     """Direction towards a distant light from its reflection in a mirror ball.
 
     Args:
         picture: linear values, (H, W, C) or (H, W), or a `brdf.Picture`, of the mirror ball.
         circle: its outline.
+        mask: (H, W), pixels to look at.
 
     Returns:
         The unit direction, 2 (N.V) N - V at the middle of the highlight.
@@ -62,7 +72,7 @@ def light_from_highlight(picture: Any, circle: Circle) -> Float[np.ndarray, "3"]
     """
     grey = _grey(picture)
     points = ball_points((grey.shape[0], grey.shape[1]), circle)
-    inside = np.asarray(points.mask) & np.isfinite(grey)
+    inside = _seen(points, mask) & np.isfinite(grey)
     largest = float(np.max(grey, where=inside, initial=-np.inf))
     if not largest > 0:
         raise InputError("picture", "is black on the mirror ball", "Give a picture with a highlight")
@@ -128,14 +138,10 @@ def light_from_shading(
         raise InputError("saturation", f"must be a linear value above 0, got {saturation!r}", "Give a number")
     if isinstance(picture, brdf.Picture) and saturation is None:
         saturation = picture.saturation
-    normal, seen = np.asarray(points.normal, np.float64), np.asarray(points.mask)
-    if grey.shape != seen.shape:
-        raise InputError("picture", f"is of shape {grey.shape}, the points {seen.shape}", "Give points of its size")
-    if mask is not None:
-        if np.shape(mask) != seen.shape:
-            raise InputError("mask", f"is of shape {np.shape(mask)}, the points {seen.shape}", "Give one of its size")
-        seen = seen & np.asarray(mask, bool)
-    good = seen & np.isfinite(grey)
+    normal, shape = np.asarray(points.normal, np.float64), np.shape(points.mask)
+    if grey.shape != shape:
+        raise InputError("picture", f"is of shape {grey.shape}, the points {shape}", "Give points of its size")
+    good = _seen(points, mask) & np.isfinite(grey)
     if saturation is not None:
         values = np.asarray(getattr(picture, "pixels", picture))
         good &= (values if values.ndim == 2 else np.max(values, axis=-1)) < saturation
