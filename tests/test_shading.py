@@ -6,7 +6,7 @@ from ball_pictures import angle
 
 from brdf.errors import InputError
 from fitting.photographs.circle import Circle, ball_normals
-from fitting.photographs.shading import LIT, fit_shading
+from fitting.photographs.shading import GUESS, LIT, fit_shading
 
 SIDE = 90
 NORMAL, INSIDE = ball_normals((SIDE, SIDE), Circle(44.3, 44.8, 42.0))
@@ -70,6 +70,23 @@ def test_residuals_that_go_together_over_a_block_count_as_one():
             found = fit_shading(stained, NORMAL, PLACE)
             shares.append(angle(found.light, light) / found.error)
     assert 0.7 < np.sqrt(np.mean(np.square(shares))) < 1.35
+
+
+@pytest.mark.parametrize("unit", [2.0**-70, 2.0**-40, 2.0**40])
+@pytest.mark.parametrize("k_s", [0.0, 0.4])
+def test_the_unit_of_the_values_does_not_matter(unit, k_s):
+    noise = 1e-3 * np.random.default_rng(4).standard_normal(len(NORMAL))
+    value = shown(FRONT, k_s=k_s, n=40.0) + noise
+    one, other = fit_shading(value, NORMAL, PLACE), fit_shading(unit * value, NORMAL, PLACE)
+    np.testing.assert_allclose(other.light, unit * one.light, rtol=1e-9)
+    assert other.error == pytest.approx(one.error, rel=1e-9)
+
+
+def test_an_error_is_a_guess_from_that_of_random_directions_on():
+    way = np.random.default_rng(6).standard_normal((200_000, 3))
+    off = np.degrees(np.arctan2(np.linalg.norm(way[:, :2], axis=1), way[:, 2]))
+    # The squares' deviation is 1 of their mean at most: 1 / sqrt(200 000) of it, half of that of the root.
+    assert pytest.approx(np.sqrt(np.mean(off**2)), rel=4e-3) == GUESS
 
 
 def test_a_crescent_whose_highlight_takes_all_the_light_is_refused():

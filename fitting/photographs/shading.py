@@ -28,8 +28,10 @@ EXPONENTS, STARTS = (3.0, 1e4), (8.0, 60.0)
 RISE = 20.0
 # The surface is cut into so many blocks along each side; residuals of one block may go together.
 BLOCKS = 12
-# A direction that is off by more degrees is no better than one drawn at random.
-GUESS = 90.0
+# Root mean square angle in degrees of directions drawn at random: the mean of t^2 under sin(t) / 2 is pi^2 / 2 - 2.
+GUESS = float(np.degrees(np.sqrt(np.pi**2 / 2 - 2)))
+# Residuals below this share of the light are rounding.
+ROUNDING = 1e-9
 TO_VIEW = np.array([0.0, 0.0, 1.0])
 
 
@@ -124,6 +126,9 @@ def fit_shading(
     """
     pixels = _thinned(_Pixels(value, normal, _blocks(place)), MOST_PIXELS)
     light, lit = _linear(pixels, ambient=ambient)
+    # From here on in units of the light: the solver's limits are absolute.
+    unit = float(np.linalg.norm(light))
+    pixels, light = pixels._replace(value=pixels.value / unit), light / unit
     known = pixels.some(lit)
     look = _highlight(known, light, ambient=ambient)
     if look is None:
@@ -135,14 +140,13 @@ def fit_shading(
         known = pixels.some(_reached(pixels, look.light))
         if known.value.size < FEWEST:
             raise _too_little()
-        scale = HUBER * float(np.median(np.abs(known.value - look.of(known.normal)))) + 1e-12
-        look = _descend(known, look, scale)
+        look = _descend(known, look, _bound(known.value - look.of(known.normal), 1.0))
         light, residual, slopes = look.light, known.value - look.of(known.normal), look.slopes(known.normal)
-        weight = _huber(residual)
+        weight = _huber(residual, 1.0)
     error = _error(light, residual, slopes, weight, known.block)
     if not error < GUESS:
         raise _too_little()
-    return Shading(light, error, known.value.size)
+    return Shading(light * unit, error, known.value.size)
 
 
 def _too_little() -> InputError:
@@ -167,9 +171,13 @@ def _columns(normal: Float[np.ndarray, "M 3"], *, ambient: bool) -> Float[np.nda
     return np.column_stack([normal, np.ones(len(normal))]) if ambient else normal
 
 
-def _huber(residual: Float[np.ndarray, " M"]) -> Float[np.ndarray, " M"]:
-    size = np.abs(residual)
-    return np.minimum(1.0, (HUBER * np.median(size) + 1e-12) / np.maximum(size, 1e-300))
+def _bound(residual: Float[np.ndarray, " M"], size: float) -> float:
+    """Beyond which a residual's pull is constant, where the light is of this size."""
+    return max(HUBER * float(np.median(np.abs(residual))), ROUNDING * size)
+
+
+def _huber(residual: Float[np.ndarray, " M"], size: float) -> Float[np.ndarray, " M"]:
+    return np.minimum(1.0, _bound(residual, size) / np.maximum(np.abs(residual), 1e-300))
 
 
 def _robust(
@@ -182,7 +190,7 @@ def _robust(
         if np.linalg.matrix_rank(gram, tol=1e-9 * np.trace(gram)) < gram.shape[0]:
             raise InputError("picture", "shows no surface curved enough to tell the light", "Give its direction")
         unknown = np.linalg.solve(gram, (columns * weight[:, None]).T @ value)
-        weight[lit] = _huber((value - columns @ unknown)[lit])
+        weight[lit] = _huber((value - columns @ unknown)[lit], float(np.linalg.norm(unknown[:3])))
     return unknown, weight
 
 
@@ -222,7 +230,7 @@ def _highlight(pixels: _Pixels, light: Float[np.ndarray, "3"], *, ambient: bool)
     columns = _columns(pixels.normal, ambient=ambient)
     matt = pixels.value - columns @ _robust(columns, pixels.value, np.ones(pixels.value.size, bool))[0]
     size = float(np.linalg.norm(light))
-    scale = max(HUBER * float(np.median(np.abs(matt))), 1e-9 * size)
+    scale = _bound(matt, size)
     few = _thinned(pixels, SEARCH_PIXELS)
     around = 0.02 * size if ambient else None
     starts = [_Look(light, around, 0.1 * size, np.log(n), mirror) for mirror in (False, True) for n in STARTS]
