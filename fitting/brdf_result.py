@@ -130,11 +130,10 @@ class BrdfFitResult:
         rest = ""
         if several and name == "Lambert":
             lobe = min(self.candidates[1:], key=lambda candidate: candidate.loss)
-            words = f"the best lobe, {lobe.model} within {_percent(lobe.losses.cosine)}, does not halve the squares"
-            if _percent(lobe.losses.cosine) != _percent(self.losses.cosine):
-                rest = f"; {words}"
-            elif self.losses.cosine > _ROUNDING:
-                rest = "; no lobe comes closer"
+            if self.losses.cosine > _ROUNDING:
+                explained = 1 - (lobe.loss / self.candidates[0].loss) ** 2
+                what = f"the best lobe, {lobe.model}, explains {_percent(explained)} of the squares that Lambert leaves"
+                rest = f"; {what}" if explained > _ROUNDING else "; no lobe comes closer"
         elif several and alone is not None:
             rest = f"; Lambert alone within {_percent(alone.losses.cosine)}"
         if self._explained < HALF:
