@@ -63,7 +63,7 @@ def test_no_scipy_start_finds_less(seed):
     best = scipy_starts(one, 6, seed)
     found = search([one])
     assert np.all(np.isfinite(found.x))
-    # The excess the issue allows; below 1e-20 of the picture both are rounding.
+    # A millionth more counts as no more; below 1e-20 of the picture both are rounding.
     assert np.sum(found.cost) <= best * (1 + 1e-6) + 1e-20 * np.sum(one.target**2)
 
 
