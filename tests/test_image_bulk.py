@@ -11,6 +11,7 @@ from image_files import chunk, codes, png, random, raw_exr
 from brdf.errors import InputError
 from brdf.images import bulk
 from brdf.images.pictures import ImageReader, read_image, read_layers, read_mask, read_picture, write_image
+from brdf.materials import files as materials
 
 
 def attribute(name: bytes, kind: bytes, value: bytes) -> bytes:
@@ -21,10 +22,11 @@ def channel_list(count: int) -> bytes:
     return b"".join(b"c%05d\0" % index + struct.pack("<IIII", 2, 0, 1, 1) for index in range(count)) + b"\0"
 
 
-def exr_header(channels: int = 3, further: int = 0, tile: int = 0) -> bytes:
+def exr_header(channels: int = 3, further: int = 0, tile: int = 0, before: int = 0) -> bytes:
     """The attributes of one part after the file's layout, of 4 × 4 pixels."""
     window = struct.pack("<4i", 0, 0, 3, 3)
-    parts = [attribute(b"channels", b"chlist", channel_list(channels)), attribute(b"lineOrder", b"lineOrder", b"\0")]
+    parts = [attribute(b"preview", b"string", bytes(before))] if before else []
+    parts += [attribute(b"channels", b"chlist", channel_list(channels)), attribute(b"lineOrder", b"lineOrder", b"\0")]
     parts += [attribute(name, b"box2i", window) for name in (b"dataWindow", b"displayWindow")]
     parts += [attribute(name, b"float", struct.pack("<f", 1)) for name in (b"pixelAspectRatio", b"screenWindowWidth")]
     parts += [attribute(b"compression", b"compression", b"\0"), attribute(b"screenWindowCenter", b"v2f", bytes(8))]
@@ -38,8 +40,11 @@ def exr(flags: int, *headers: bytes) -> bytes:
 
 TOO_MUCH = {
     "attributes.exr": (exr(0, exr_header(further=20_000)), "holds more than 4096 attributes"),
-    "channels.exr": (exr(0, exr_header(channels=20_000)), "holds more than 1024 channels"),
+    "behind.exr": (exr(0, exr_header(before=1 << 24, further=20_000)), "holds more than 4096 attributes"),
+    "channels.exr": (exr(0, exr_header(channels=20_000)), "holds more than 4096 channels"),
     "parts.exr": (exr(0x1000, *[exr_header()] * 2_000), "holds more than 1024 parts"),
+    "all.exr": (exr(0x1000, *[exr_header(further=4_000)] * 20), "holds more than 65536 attributes"),
+    "layers.exr": (exr(0x1000, *[exr_header(channels=4_000)] * 20), "holds more than 65536 channels"),
     "second.exr": (exr(0x1000, exr_header(), exr_header(further=20_000)), "holds more than 4096 attributes"),
     "tiles.exr": (exr(0x200, exr_header(tile=20_000)), "claims tiles of 20000 × 20000 for 4 × 4 pixels"),
 }
@@ -71,11 +76,22 @@ def test_the_walk_along_headers_counts_what_is_there(tmp_path, monkeypatch):
     monkeypatch.setattr(bulk, "MOST_CHANNELS", 5)
     monkeypatch.setattr(bulk, "MOST_PARTS", 2)
     assert set(read_layers(tmp_path / "a.exr")) == {"left", "right"}
-    for limit, below in (("MOST_CHANNELS", 4), ("MOST_PARTS", 1), ("MOST_ATTRIBUTES", 5)):
+    for limit, below in (("MOST_CHANNELS", 4), ("MOST_PARTS", 1), ("MOST_ATTRIBUTES", 5), ("MOST_IN_ALL", 9)):
         with monkeypatch.context() as lowered:
             lowered.setattr(bulk, limit, below)
             with pytest.raises(InputError, match=f"holds more than {below} "):
                 read_layers(tmp_path / "a.exr")
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".tif"])
+def test_as_many_channels_are_read_as_are_written(tmp_path, suffix):
+    values = random(2, 3, bulk.MOST_CHANNELS)
+    write_image(tmp_path / f"a{suffix}", values)
+    np.testing.assert_array_equal(read_image(tmp_path / f"a{suffix}"), values)
+    for array, alpha in ((random(2, 3, bulk.MOST_CHANNELS + 1), None), (values, values[..., 0])):
+        with pytest.raises(InputError, match=r"would have 4097 channels, .*at most 4096"):
+            write_image(tmp_path / f"b{suffix}", array, alpha=alpha)
+    assert bulk.MOST_CHANNELS == materials.MOST_CHANNELS
 
 
 def test_headers_cut_anywhere_are_walked_safely(tmp_path):
@@ -93,6 +109,37 @@ def test_a_jpeg_file_with_too_many_scans(tmp_path):
     (tmp_path / "a.jpg").write_bytes(sound[:-2] + scan * 1000 + b"\xff\xd9")
     with pytest.raises(InputError, match="holds more than 500 scans"):
         read_image(tmp_path / "a.jpg")
+
+
+def test_a_jpeg_file_with_something_in_and_behind_it(tmp_path):
+    """A thumbnail in a segment, a film behind the end of the image: neither is a scan."""
+    write_image(tmp_path / "a.jpg", random(16, 16, 3))
+    sound = (tmp_path / "a.jpg").read_bytes()
+    expected = read_image(tmp_path / "a.jpg")
+    scans = b"\xff\xda\x00\x02" * 1000
+    segment = b"\xff\xe5" + struct.pack(">H", 2 + len(scans)) + scans
+    for content in (sound + scans, sound[:2] + segment + sound[2:]):
+        (tmp_path / "a.jpg").write_bytes(content)
+        np.testing.assert_array_equal(read_image(tmp_path / "a.jpg"), expected)
+    (tmp_path / "a.jpg").write_bytes(sound[:2] + b"\xff\xfe\x00\x02" * 70_000 + sound[2:])
+    with pytest.raises(InputError, match="holds more than 65536 segments"):
+        read_image(tmp_path / "a.jpg")
+
+
+@pytest.mark.parametrize("window", [4, 5, 7, 64])
+def test_scans_are_counted_wherever_a_window_ends(tmp_path, monkeypatch, window):
+    monkeypatch.setattr(bulk, "_WINDOW", window)
+    monkeypatch.setattr(bulk, "MOST_SCANS", 2)
+    scan = b"\xff\xda\x00\x06abcd" + b"data\xff\x00more\xff\xd3" * 3
+    for scans, film in ((2, b""), (2, scan), (3, b"")):
+        # Filling before a marker, a remark that holds one, an end that counts.
+        content = b"\xff\xd8\xff\xff\xff\xe0\x00\x06\xff\xda\x00\x02" + scan * scans + b"\xff\xd9" + film
+        (tmp_path / "a.jpg").write_bytes(content)
+        if scans == 2:
+            bulk.check_bulk(tmp_path / "a.jpg")
+            continue
+        with pytest.raises(InputError, match="holds more than 2 scans"):
+            bulk.check_bulk(tmp_path / "a.jpg")
 
 
 def test_a_tile_far_larger_than_the_picture(tmp_path):
@@ -145,3 +192,45 @@ def test_layers_and_masks_are_read_by_bands(tmp_path, monkeypatch):
             layers = read_layers(tmp_path / "a.exr")
         np.testing.assert_array_equal(layers[""], values[..., :3])
         np.testing.assert_array_equal(layers["N"], values[..., :2:-1])
+
+
+def white_fax(size: int) -> bytes:
+    """A TIFF file of 1-bit pixels in one strip of CCITT Group 4, where a row like the one above is a single bit."""
+    strip = b"\xff" * -(-size // 8)
+    entries = [
+        (256, size),
+        (257, size),
+        (258, 1),
+        (259, 4),
+        (262, 0),
+        (273, 8),
+        (277, 1),
+        (278, size),
+        (279, len(strip)),
+    ]
+    strip += bytes(len(strip) % 2)
+    directory = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in entries)
+    return b"II*\0" + struct.pack("<I", 8 + len(strip)) + strip + struct.pack("<H", len(entries)) + directory + bytes(4)
+
+
+def test_large_even_pictures_in_a_few_bytes(tmp_path):
+    """Masks and renderings of a small thing, 36 and 53 MB of pixels."""
+    (tmp_path / "a.tif").write_bytes(white_fax(6000))
+    raw_exr(tmp_path / "a.exr", np.zeros((2160, 4096, 3), np.float32), "RGB", kind="half", compression="dwab")
+    for name, shape, value in (("a.tif", (6000, 6000, 1), 1), ("a.exr", (2160, 4096, 3), 0)):
+        assert np.prod(shape) > 4096 * (tmp_path / name).stat().st_size
+        with ImageReader(tmp_path / name, encoding="linear") as reader:
+            assert reader.shape == shape
+            np.testing.assert_array_equal(reader.rows(shape[0] - 2, shape[0]), value)
+
+
+def test_strips_and_tiles_that_a_few_bytes_cannot_hold(tmp_path):
+    (tmp_path / "a.tif").write_bytes(white_fax(8200))
+    with pytest.raises(InputError, match="claims 8200 × 8200 pixels"):
+        read_image(tmp_path / "a.tif")
+    # Tiles are unpacked whole: they get no more than other formats, however large the picture claims to be.
+    window = struct.pack("<4i", 0, 0, 3, 3)
+    large = exr_header(tile=2600).replace(window, struct.pack("<4i", 0, 0, 2299, 2299))
+    (tmp_path / "a.exr").write_bytes(exr(0x200, large)[:-4000])
+    with pytest.raises(InputError, match="claims tiles of 2600 × 2600 for 2300 × 2300 pixels"):
+        read_image(tmp_path / "a.exr")

@@ -21,10 +21,13 @@ MAX_VALUES = 1 << 31
 BAND_VALUES = 1 << 22
 """Values of a band, where nobody asks for another number: 16 MiB."""
 MAX_RATIO = 1 << 12
-"""Most bytes of pixels per byte of file, over 32 MiB; deflate reaches 1032, a small ball on black in DWAB 2077."""
+"""Most bytes of pixels per byte of file, over 64 MiB in OpenEXR and TIFF and 32 MiB elsewhere; deflate reaches 1032, a
+small ball on black in DWAB 2077."""
 
-# A frame of 4K in RGB has less; what it takes to decode stays below half a gigabyte in every format.
+# To decode so much takes less than half a gigabyte: where all is unpacked at once, with wavelets and such, and where
+# that is done strip by strip, by compressions that leave next to nothing of an even area.
 _UNSUSPICIOUS_BYTES = 1 << 25
+_UNSUSPICIOUS_IN_STRIPS = {"openexr": 1 << 26, "tiff": 1 << 26}
 # Remarks that libjpeg makes on sound pictures of some cameras.
 _HARMLESS = ("extraneous bytes", "Invalid SOS parameters")
 _GIVE_AN_IMAGE = "Give an EXR, HDR, PNG, TIFF or JPEG file"
@@ -126,16 +129,17 @@ def open_image(path: Path) -> oiio.ImageInput:
     if image.format_name() in ("null", "term"):
         raise InputError(path, "is not an image", _GIVE_AN_IMAGE)
     said(image)  # remarks on metadata; the pixels may be sound
-    check_header(path, image.spec())
+    check_header(path, image.spec(), image.format_name())
     return image
 
 
-def check_header(path: Path, spec: oiio.ImageSpec) -> None:
+def check_header(path: Path, spec: oiio.ImageSpec, format_name: str) -> None:
     """Refuse what no picture is, before memory is taken for it.
 
     Args:
         path: the file, for its size and the message.
         spec: the header of one of its parts.
+        format_name: as OpenImageIO calls the format.
 
     Raises:
         InputError: for deep and volume data, and for sizes that the file cannot hold.
@@ -148,13 +152,16 @@ def check_header(path: Path, spec: oiio.ImageSpec) -> None:
         (spec.width, spec.height), (spec.full_width, spec.full_height), key=lambda size: size[0] * size[1]
     )
     claimed, size = width * height * spec.pixel_bytes(native=True), path.stat().st_size
+    possible = MAX_RATIO * size
     if min(spec.width, spec.height, spec.nchannels) < 1:
         raise InputError(path, f"claims {spec.width} × {spec.height} pixels", "The file is damaged; make it again")
     what = ""
-    if claimed > max(_UNSUSPICIOUS_BYTES, MAX_RATIO * size):
+    if claimed > max(_UNSUSPICIOUS_IN_STRIPS.get(format_name, _UNSUSPICIOUS_BYTES), possible):
         what = f"claims {width} × {height} pixels of {spec.nchannels} channels in {size} bytes"
     # One tile is unpacked whole; rounding up makes it four times the picture at most.
-    elif spec.tile_width * spec.tile_height * spec.pixel_bytes(native=True) > max(_UNSUSPICIOUS_BYTES, 4 * claimed):
+    elif spec.tile_width * spec.tile_height * spec.pixel_bytes(native=True) > max(
+        _UNSUSPICIOUS_BYTES, 4 * min(claimed, possible)
+    ):
         what = f"claims tiles of {spec.tile_width} × {spec.tile_height} for {width} × {height} pixels"
     if what:
         raise InputError(path, what, "The file is damaged; make it again")
@@ -185,12 +192,13 @@ def choose_channels(image: oiio.ImageInput) -> Channels:
     for main_only in (True, False):
         for part, of_part in enumerate(names):
             layers = [""] if main_only else dict.fromkeys(name.rpartition(".")[0] for name in of_part)
+            # Looked up, not searched for: there may be thousands.
+            at = {name: index for index, name in reversed(list(enumerate(of_part)))}
             for layer in layers:
                 dot = f"{layer}." if layer else ""
                 for wanted in ("rgb", "y"):
-                    if all(dot + name in of_part for name in wanted):
-                        alpha = of_part.index(dot + "a") if dot + "a" in of_part else None
-                        return Channels(part, [of_part.index(dot + name) for name in wanted], alpha)
+                    if all(dot + name in at for name in wanted):
+                        return Channels(part, [at[dot + name] for name in wanted], at.get(dot + "a"))
     rest = [index for index, name in enumerate(names[0]) if name not in ("a", "z")] or list(range(len(names[0])))
     return Channels(0, rest, names[0].index("a") if "a" in names[0] and len(names[0]) > 1 else None)
 

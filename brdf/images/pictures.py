@@ -7,7 +7,7 @@ multiplied by alpha. NaN and infinite values are passed on; who fits leaves them
 
 Sizes are checked before memory is taken: one picture in memory may have at most ``MAX_VALUES`` values and needs to fit
 into the machine's memory (:class:`ImageReader` reads larger ones by bands), and a header that claims over
-``MAX_RATIO`` times the size of its file is refused.
+``MAX_RATIO`` times the size of its file is refused, beyond a size that harms nobody.
 """
 
 import dataclasses
@@ -198,16 +198,17 @@ def read_layers(path: str | os.PathLike[str]) -> dict[str, Float32[Array, "heigh
     count = parts(image)
     specs = [image.spec(part) for part in range(count)]
     for spec in specs:
-        check_header(file, spec)
+        check_header(file, spec, image.format_name())
     check_memory(file, sum(spec.width * spec.height * spec.nchannels for spec in specs))
     layers: dict[str, Array] = {}
     for part, spec in enumerate(specs):
         own = spec.get_string_attribute("oiio:subimagename", str(part)) if count > 1 else ""
         groups: dict[str, list[int]] = {}
-        for index, name in enumerate(spec.channelnames):
+        names = spec.channelnames
+        for index, name in enumerate(names):
             groups.setdefault(name.rpartition(".")[0] or own, []).append(index)
         own_layers = {layer: np.empty((spec.height, spec.width, len(groups[layer])), np.float32) for layer in groups}
-        order = {layer: _usual_order(spec.channelnames, indices) for layer, indices in groups.items()}
+        order = {layer: _usual_order(names, indices) for layer, indices in groups.items()}
         step = band_rows(spec, BAND_VALUES)
         for start in range(0, spec.height, step):
             rows = start, min(start + step, spec.height)

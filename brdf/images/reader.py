@@ -50,7 +50,7 @@ class ImageReader:
         self._image = open_image(self.path)
         self._channels = choose_channels(self._image)
         self._spec = spec = self._image.spec(self._channels.part)
-        check_header(self.path, spec)
+        check_header(self.path, spec, self._image.format_name())
         kinds = spec.channelformats
         kind = (kinds[self._channels.colour[0]] if kinds else spec.format).basetype
         self.is_integer = kind not in (oiio.FLOAT, oiio.HALF, oiio.DOUBLE)

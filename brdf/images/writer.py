@@ -11,6 +11,7 @@ from jaxtyping import Float32
 
 from brdf.errors import InputError
 from brdf.files import atomic_path, utf8_name
+from brdf.images.bulk import MOST_CHANNELS
 from brdf.images.encodings import Encoding, encode, parse_encoding
 from brdf.images.file import quiet, said
 
@@ -140,6 +141,9 @@ def _check_encoding(path: str | os.PathLike[str], suffix: str, kind: str, encodi
 def _write(
     path: str | os.PathLike[str], pixels: np.ndarray, names: list[str], kind: DataType, encoding: Encoding | None
 ) -> None:
+    if len(names) > MOST_CHANNELS:
+        came = f"would have {len(names)} channels, which nothing reads back"
+        raise InputError(path, came, f"Write at most {MOST_CHANNELS} into a file")
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
     spec.channelnames = tuple(names)
     spec.alpha_channel = names.index("A") if "A" in names else -1
