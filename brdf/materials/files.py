@@ -7,7 +7,8 @@ import dataclasses
 import json
 import math
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,14 +40,13 @@ def load_material(path: str | Path, name: str | None = None) -> Material:
     Raises:
         InputError: naming file and key, or where the file holds several materials and no name is given.
     """
-    materials = load_materials(path)
-    if name is not None:
-        if name not in materials:
-            raise InputError(path, f"has no material {name[:_SHOWN]!r}", f"It holds {_some(materials)}")
-        return materials[name]
-    if len(materials) > 1:
+    materials = _readers(path)
+    if name is None and len(materials) > 1:
         raise InputError(path, f"holds {len(materials)} materials", f"Name one of {_some(materials)}")
-    return next(iter(materials.values()))
+    wanted = next(iter(materials)) if name is None else name
+    if wanted not in materials:
+        raise InputError(path, f"has no material {wanted[:_SHOWN]!r}", f"It holds {_some(materials)}")
+    return materials[wanted]()
 
 
 def _some(names: Collection[str]) -> str:
@@ -64,12 +64,18 @@ def load_materials(path: str | Path) -> dict[str, Material]:
     Raises:
         InputError: naming file and key.
     """
+    return {name: read() for name, read in _readers(path).items()}
+
+
+def _readers(path: str | Path) -> dict[str, Callable[[], Material]]:
+    """What makes each material of a file, by name; what is wrong with one alone keeps nobody from another."""
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix == ".json":
-        return {path.stem: _from_json(path, read_text(path, _MOST_BYTES))}
+        return {path.stem: partial(_from_json, path, read_text(path, _MOST_BYTES))}
     if suffix == ".mtl":
-        return _from_mtl(path, read_text(path, _MOST_BYTES))
+        entries = _mtl_entries(path, read_text(path, _MOST_BYTES))
+        return {name: partial(_mtl_material, path, name, entry) for name, entry in entries.items()}
     raise InputError(path, f"is no material file, got {suffix or 'no suffix'}", "Give a .json or .mtl file")
 
 
@@ -91,9 +97,8 @@ def save_material(material: Material, path: str | Path, *, undetermined: Collect
     elif suffix == ".mtl":
         channels = material.k_d.shape[0]
         if channels not in (1, 3):
-            raise InputError(
-                path, f"cannot hold {channels} channels, MTL knows RGB alone", "Save the material as .json"
-            )
+            came = f"cannot hold {channels} channels, MTL knows RGB alone"
+            raise InputError(path, came, "Save the material as .json")
         write_text(path, to_mtl(material, undetermined=undetermined))
     else:
         raise InputError(path, f"is no material file, got {suffix or 'no suffix'}", "Name it .json or .mtl")
@@ -198,8 +203,7 @@ def to_mtl(material: Material, *, name: str = "fitted", undetermined: Collection
     if isinstance(material, SpecularMaterial):
         scale = float(material.scale(np.float64(material.n)))
         lines.append(f"Ns {float(material.n) * _MTL_EXPONENT.get(material.name, 1.0)!r}")
-    factors = {"k_a": 1.0, "k_d": 1.0, "k_s": scale}
-    for key, factor in factors.items():
+    for key, factor in (("k_a", 1.0), ("k_d", 1.0), ("k_s", scale)):
         values = np.asarray(getattr(material, key, 0.0), dtype=np.float64) * factor
         red, green, blue = np.broadcast_to(values, (3,)).tolist()
         lines.append(f"K{key[-1]} {red!r} {green!r} {blue!r}")
@@ -221,7 +225,8 @@ def _logical_lines(text: str) -> Iterator[tuple[int, str]]:
         yield first, joined
 
 
-def _from_mtl(path: Path, text: str) -> dict[str, Material]:
+def _mtl_entries(path: Path, text: str) -> dict[str, dict[str, Any]]:
+    """What the lines of each material say."""
     entries: dict[str, dict[str, Any]] = {}
     current: dict[str, Any] | None = None
     model_comment = None
@@ -237,11 +242,9 @@ def _from_mtl(path: Path, text: str) -> dict[str, Material]:
         if key == "newmtl":
             name = stripped[len("newmtl") :].strip() or "unnamed"
             if name in entries:
-                raise InputError(
-                    place, f"names the material {name[:_SHOWN]} a second time", "Give each a name of its own"
-                )
-            current = entries[name] = {}
-            current["model"] = model_comment
+                came = f"names the material {name[:_SHOWN]} a second time"
+                raise InputError(place, came, "Give each a name of its own")
+            current = entries[name] = {"model": model_comment}
             continue
         if key not in (*SPECTRAL, "ns", "illum", _TEXTURE):
             continue
@@ -250,14 +253,7 @@ def _from_mtl(path: Path, text: str) -> dict[str, Material]:
         current[key] = words[-1] if key == _TEXTURE else _mtl_numbers(place, words)
     if not entries:
         raise InputError(path, "holds no material", "Give a file with a newmtl line")
-    for name, entry in entries.items():
-        if _TEXTURE in entry and "kd" not in entry:
-            came = f"the colour of {name[:_SHOWN]} is the texture {entry[_TEXTURE][:_SHOWN]}, which is not read"
-            raise InputError(path, came, "Add its mean colour as Kd")
-    try:
-        return {name: _mtl_material(entry) for name, entry in entries.items()}
-    except InputError as error:
-        raise error.inside(path) from None
+    return entries
 
 
 def _mtl_numbers(place: str, words: list[str]) -> list[float]:
@@ -276,7 +272,17 @@ def _mtl_numbers(place: str, words: list[str]) -> list[float]:
     return numbers * 3 if key.lower() in SPECTRAL and len(numbers) == 1 else numbers
 
 
-def _mtl_material(entry: dict[str, Any]) -> Material:
+def _mtl_material(path: Path, name: str, entry: dict[str, Any]) -> Material:
+    try:
+        return _material_of(entry)
+    except InputError as error:
+        raise error.inside(f"{path}: material {name[:_SHOWN]}") from None
+
+
+def _material_of(entry: dict[str, Any]) -> Material:
+    if _TEXTURE in entry and "kd" not in entry:
+        came = f"is missing beside the texture {entry[_TEXTURE][:_SHOWN]}, which is not read"
+        raise InputError("Kd", came, "Add the mean colour as Kd")
     values = {name: entry.get(key, [0.0, 0.0, 0.0]) for key, name in SPECTRAL.items()}
     name = entry["model"]
     if name is not None and name not in MODELS:
