@@ -27,6 +27,10 @@ REFUSED = {
         AOV + POINT,
         r"lights\[0\]: stands somewhere, but .*aov has no layer of positions\. Add the layer",
     ),
+    "occluders": (
+        AOV + '[[shapes]]\ntype = "sphere"\ncenter = [0, 0, 2]\nradius = 0.5\nfitted = false\n' + LIGHT,
+        r"shapes: stand somewhere, but .*aov has no layer of positions\. Add the layer",
+    ),
     "empty name": (ENVIRONMENT + 'file = ""\n', r"lights\[0\]\.file: must be a path, got ''"),
     "long list": (
         CAMERA + SPHERE + LIGHT.replace("1.0, ", "1.0, " * 3000),

@@ -143,6 +143,9 @@ def load_scene(path: str | Path, within: str | Path | None = None) -> Scene:
         shapes.append(_load_shape(table, folder))
     if "aov" in root.values:
         points, has_position = _load_points(_Table(place + "aov", root.pop("aov")), folder)
+        if shapes and not has_position:
+            came = f"stand somewhere, but {place}aov has no layer of positions"
+            raise InputError(place + "shapes", came, "Add the layer, or leave the shapes out")
     if "ambient" in root.values:
         table = _Table(place + "ambient", root.pop("ambient"))
         given = "intensity" in table.values
