@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     )
     from brdf.display import displayed, lit_sphere, material_html, png_address, report_html
     from brdf.errors import InputError
-    from brdf.files import atomic_folder, atomic_path, input_file, read_text, write_text
+    from brdf.files import atomic_folder, atomic_path, check_folder, input_file, parse_number, read_text, write_text
     from brdf.geometry.camera import Camera, OrthographicCamera, PerspectiveCamera
     from brdf.geometry.meshes import Mesh, Triangles, load_mesh
     from brdf.geometry.shapes import Rectangle, Shape, Sphere
@@ -80,7 +80,15 @@ _ROOMS = {
     "errors": ["InputError"],
     "materials.exports": ["EXPORTS", "Export", "export_material", "mitsuba_dict", "save_export"],
     "materials.presets": ["PRESETS", "preset"],
-    "files": ["atomic_folder", "atomic_path", "input_file", "read_text", "write_text"],
+    "files": [
+        "atomic_folder",
+        "atomic_path",
+        "check_folder",
+        "input_file",
+        "parse_number",
+        "read_text",
+        "write_text",
+    ],
     "images.pictures": [
         "ImageReader",
         "Picture",

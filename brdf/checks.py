@@ -176,9 +176,11 @@ def exponent(given: Any) -> Parameter:
         given: one number.
 
     Raises:
-        InputError: where it is not finite, or negative.
+        InputError: where it is not finite, negative or beyond `LARGEST`.
     """
     value = _not_negative("n", given)
+    if isinstance(value, np.ndarray) and np.any(value > LARGEST):
+        raise InputError("n", f"must be at most {LARGEST:g}, got {np.max(value):g}", "Such a lobe is a mirror")
     if value.size != 1:
         raise InputError("n", f"must be one number, got shape {value.shape}", "All channels share one exponent")
     return value.reshape(())

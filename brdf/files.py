@@ -201,6 +201,23 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
                     parent.rmdir()
 
 
+class _Enough(Exception):  # noqa: N818  # no error: the end of a trial
+    """Nothing is to be written."""
+
+
+def check_folder(path: str | os.PathLike[str]) -> None:
+    """Refuse a folder of results that cannot be made or written, before there are any; nothing of the trial stays.
+
+    Args:
+        path: the folder.
+
+    Raises:
+        InputError: if it cannot be made or written.
+    """
+    with suppress(_Enough), atomic_folder(path):
+        raise _Enough
+
+
 def _make_folders(folder: Path, made: list[Path]) -> None:
     if folder.is_symlink():
         raise OSError(errno.ELOOP, os.strerror(errno.ELOOP))

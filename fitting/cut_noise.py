@@ -101,18 +101,21 @@ def warned_of_cut_noise(result: FitResult) -> FitResult:
         result: of the fit; what it shows are some of the pixels.
     """
     clipped = result.left_out.get("clipped", 0) >= FEWEST
-    share = 0.0
+    share, everywhere = 0.0, False
     for target, scene, counted in zip(result.targets, result.scenes, result.counted, strict=True):
         if clipped or _piles_up(target, counted):
-            everywhere = np.ones(counted.shape, bool)
-            cut = _cut(np.asarray(target), _predicted(result, scene), counted, everywhere, clipped=clipped)
+            whole = np.ones(counted.shape, bool)
+            cut = _cut(np.asarray(target), _predicted(result, scene), counted, whole, clipped=clipped)
             share = max(share, float(np.mean((cut.black | cut.white)[counted])))
-    if not share:
+            everywhere |= bool(cut.spared)
+    if not (share or everywhere):
         return result
     words = (
         f"noise is cut off at black or white in {100 * share:.2g} % of the pixels, which bends the coefficients: "
         "of a picture in memory such pixels are left out"
     )
+    if everywhere:
+        words = "noise is cut off at black or white almost everywhere: the coefficients are bent"
     return dataclasses.replace(result, warnings=(words, *result.warnings))
 
 

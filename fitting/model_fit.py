@@ -15,7 +15,7 @@ from fitting.engine.separable import Optimum, Picture, fit_linear, search
 from fitting.engine.streams import each, joined
 from fitting.interpretation import ModelFit
 from fitting.light_colour import LightColour
-from fitting.observation import Observation, Tile
+from fitting.observation import TILE_PIXELS, Observation, Tile
 from fitting.uncertainty.structure import nearest_peak
 
 # The nearest pixel shows exp(-UNSEEN) of a highlight's peak, or more, or the exponent is not looked at.
@@ -53,6 +53,11 @@ class Job(NamedTuple):
     def channels(self) -> int:
         """Of the pictures."""
         return self.observations[0].shown.shape[-1]
+
+    @property
+    def pixels(self) -> int:
+        """Of all pictures that are shown."""
+        return sum(observation.counted.size for observation in self.observations)
 
     @property
     def rounding(self) -> Float[np.ndarray, " C"]:
@@ -97,9 +102,9 @@ def _engine_pictures(model: type[brdf.Material], job: Job, beside: Sequence[Pict
         if not observation.in_memory:
             pictures.append(some)
             continue
-        # Of a small picture finding out what is the same would take longer than it saves.
+        # Of few pixels finding out what is the same would take longer than it saves.
         first = sum(map(len, pictures))
-        known = beside[first : first + len(some)] if len(some) > 1 else ()
+        known = beside[first : first + len(some)] if job.pixels > TILE_PIXELS else ()
         pictures.append([_sharing(one, *known[i : i + 1]) for i, one in enumerate(some)])
     return joined(pictures)
 
@@ -152,3 +157,20 @@ def fit_model(model: type[brdf.Material], job: Job, *, beside: Sequence[Picture]
         free[2] &= visible is not None
     found = reweight(pictures, lambda some: optimise(some, free, n_range), job.loss, job.rounding)
     return ModelFit(model, found.pictures, found.optimum, free, n_range, None, found.noise_factor)
+
+
+def without_highlight(fit: ModelFit, job: Job) -> ModelFit:
+    """The fit of the same model with ambient and diffuse alone.
+
+    Args:
+        fit: of a model with a highlight.
+        job: the pictures.
+    """
+    free = fit.free.copy()
+    free[2] = False
+    # The weights of a robust loss are part of what is fitted.
+    pictures = fit.pictures if job.loss == "squared" else _engine_pictures(fit.model, job, ())
+    found = reweight(pictures, lambda some: fit_linear(some, free=free), job.loss, job.rounding)
+    return fit._replace(
+        pictures=found.pictures, optimum=found.optimum, free=free, tied=None, noise_factor=found.noise_factor
+    )

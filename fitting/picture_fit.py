@@ -12,10 +12,9 @@ from brdf.errors import InputError
 from fitting.auto_fit import fit_simplest
 from fitting.cut_noise import warned_of_cut_noise, without_cut_noise
 from fitting.engine.losses import LOSSES, Loss
-from fitting.engine.separable import fit_linear
 from fitting.interpretation import Interpretation, ModelFit, interpret
 from fitting.light_colour import take_colour_out
-from fitting.model_fit import Job, fit_model, reached
+from fitting.model_fit import Job, fit_model, reached, without_highlight
 from fitting.observation import Observation, observe
 from fitting.picture_inputs import (
     check_levels,
@@ -158,7 +157,11 @@ def _fit_observed(
         fitted = _held_plausible(fitted, job)
     told = _interpret(fitted, job, choice)
     if _is_dropped(fitted, told):
-        fitted, told = _without_highlight(fitted, told, job, choice)
+        # Or ambient and diffuse would be the ones that go with the highlight.
+        fitted, why = without_highlight(fitted, job), told.sure.undetermined["n"]
+        if plausible:
+            fitted = _held_plausible(fitted, job)
+        told = _with_reason(_interpret(fitted, job, choice), why)
     return _result(fitted, told, choice, job, precision, time.perf_counter() - start)
 
 
@@ -193,18 +196,13 @@ def _is_dropped(fit: ModelFit, told: Interpretation) -> bool:
     return not fit.capped and bool(fit.optimum.x[2].any()) and "n" in lost and lost.get("k_s") == lost["n"]
 
 
-def _without_highlight(
-    fit: ModelFit, told: Interpretation, job: Job, choice: Choice | None
-) -> tuple[ModelFit, Interpretation]:
-    """The same fit with ambient and diffuse alone, or these would be the ones that go with the highlight."""
-    left = fit._replace(optimum=fit_linear(fit.pictures, free=fit.free), tied=None)
-    why = told.sure.undetermined["n"]
-    again = _interpret(left, job, choice)
+def _with_reason(told: Interpretation, why: str) -> Interpretation:
+    """Why there is no highlight, which a fit without one does not know."""
     parameters = tuple(
         dataclasses.replace(one, reason=why) if one.name in ("k_s", "n") and one.value is None else one
-        for one in again.parameters
+        for one in told.parameters
     )
-    return left, again._replace(parameters=parameters)
+    return told._replace(parameters=parameters)
 
 
 def _result(

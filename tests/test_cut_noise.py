@@ -173,3 +173,12 @@ def test_a_file_read_by_bands_is_warned_of(tmp_path, low, share):
     with brdf.ImageReader(path) as reader:
         result = fitting.fit(reader, SCENE, model="blinn-phong")
     assert any("noise is cut off at black" in warning for warning in result.warnings) == share
+
+
+def test_a_file_whose_noise_is_cut_off_almost_everywhere_is_warned_of(tmp_path):
+    path = tmp_path / "target.exr"
+    dark = brdf.Lambert(k_a=[0.005], k_d=[0.05])
+    brdf.write_image(path, seen(dark, 0.05, 0, low=0.0, bits=None).pixels * (POINTS.mask[..., None] > 0))
+    with brdf.ImageReader(path) as reader:
+        result = fitting.fit(reader, SCENE, model="lambert")
+    assert any("almost everywhere" in warning for warning in result.warnings)

@@ -16,14 +16,15 @@ def test_noise_is_told_from_the_picture_alone(noise):
     random = np.random.default_rng(2).standard_normal(clean.shape)
     picture = np.where(lit[..., None], clean + noise * random, 0.0)
     size = np.sqrt(np.mean(picture[lit] ** 2, axis=0)).max()
-    assert first_pixels.noise_share(picture) == pytest.approx(noise / size, rel=0.1, abs=1e-4)
+    told = first_pixels.noise_and_size(picture)
+    assert told == (pytest.approx(noise, rel=0.1, abs=1e-4), pytest.approx(size, rel=0.1))
     # What is masked may be as rough as it likes.
     rough = np.where(lit[..., None], picture, np.abs(random))
-    assert first_pixels.noise_share(rough, lit) == pytest.approx(first_pixels.noise_share(picture), rel=0.02, abs=1e-6)
-    assert first_pixels.noise_share(np.full((8, 8, 1), np.nan)) == 0.0
+    assert first_pixels.noise_and_size(rough, lit) == pytest.approx(told, rel=0.02, abs=1e-6)
+    assert first_pixels.noise_and_size(np.full((8, 8, 1), np.nan)) == (0.0, 0.0)
 
 
-@pytest.mark.parametrize(("noise", "pixels"), [(1e-4, (1000, 2500)), (0.03, (3000, 20000)), (0.3, (262144, 262144))])
+@pytest.mark.parametrize(("noise", "pixels"), [(1e-4, (1000, 2500)), (0.03, (3000, 30000)), (0.3, (262144, 262144))])
 def test_more_noise_asks_for_more_pixels_at_once(noise, pixels):
     scene = ball(512)
     result = fitting.fit(noisy(scene, noise), scene, model="blinn-phong", accuracy=1e-2)
@@ -31,7 +32,34 @@ def test_more_noise_asks_for_more_pixels_at_once(noise, pixels):
     assert len(result.choice.attempts) == 1
     assert result.choice.met
     assert pixels[0] <= result.choice.pixels <= pixels[1]
-    assert (first_pixels.TOO_MANY in str(result)) == (pixels[0] == 262144)
+    assert (first_pixels.NOISY in str(result)) == (pixels[0] == 262144)
+
+
+def test_a_large_picture_is_not_fitted_whole_on_a_guess():
+    """Relief passes for noise, and a picture without noise needs few pixels however rough it is."""
+    row, column = np.mgrid[:600, :600]
+    slope = np.stack([0.3 * np.sin(2 * np.pi * at / 7) + 0.5 * (at - 300) / 600 for at in (column, row)], axis=-1)
+    normal = np.concatenate([slope, np.ones((600, 600, 1))], axis=-1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    points = brdf.SurfacePoints.from_normals(normal)
+    scene = brdf.Scene(points=points, ambient=[0.2], lights=ball().lights)
+    picture = np.asarray(brdf.render(MATERIAL, scene))
+    assert first_pixels.pixels_for([picture], {}, "blinn-phong", 1e-2) > 36000
+    result = fitting.fit(picture, scene, model="blinn-phong", accuracy=1e-2)
+    assert result.choice is not None
+    assert result.choice.pixels < 10000
+
+
+def test_noise_of_a_dim_picture_among_bright_ones_asks_for_no_more():
+    scene = ball(256)
+    bright = noisy(scene, 0.01)
+    dim = bright.mean() * 0.01 * np.abs(np.random.default_rng(0).standard_normal(bright.shape))
+    alone, both = (first_pixels.pixels_for(some, {}, "blinn-phong", 1e-2) for some in ([bright], [bright, dim]))
+    assert alone < both < 4 * alone
+    # Of what weighs nothing, nothing is asked.
+    weight = [np.ones((256, 256)), np.zeros((256, 256))]
+    weighed = first_pixels.pixels_for([bright, dim], {"weight": weight}, "blinn-phong", 1e-2)
+    assert weighed == pytest.approx(alone, rel=0.01)
 
 
 def test_a_small_mask_is_looked_at_whole_and_the_result_says_why():

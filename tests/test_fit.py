@@ -192,6 +192,9 @@ def test_levels_may_be_numpy_numbers():
     assert fitting.fit(picture, scene(SUN), saturation=np.float32(0.3)).left_out["clipped"] > 0
 
 
+MATT_PAIR = "blinn-phong", "lambert"
+
+
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_a_highlight_that_does_not_stand_out_leaves_the_fit_of_the_matt_rest(precision):
     scene = brdf.Scene.load(Path(__file__).parents[1] / "data" / "gold-ball" / "scene.toml")
@@ -206,3 +209,18 @@ def test_a_highlight_that_does_not_stand_out_leaves_the_fit_of_the_matt_rest(pre
     }
     np.testing.assert_allclose(result.material.k_d, matt.material.k_d, rtol=1e-6)
     np.testing.assert_allclose(result.residual, matt.residual, rtol=1e-7)
+    robust = [fitting.fit(picture, scene, model=name, precision=precision, loss="huber") for name in MATT_PAIR]
+    np.testing.assert_allclose(robust[0].material.k_a, robust[1].material.k_a, rtol=1e-4)
+
+
+def test_what_is_plausible_stays_so_without_its_highlight():
+    camera = brdf.OrthographicCamera(
+        position=[0.0, 0.0, 4.0], target=[0.0, 0.0, 0.0], up=[0.0, 1.0, 0.0], width=0.8, resolution=(32, 32)
+    )
+    light = brdf.DirectionalLight(direction=[0.1, 0.1, 1.0], intensity=1.0)
+    white = brdf.Scene(camera=camera, shapes=[brdf.Sphere(center=[0.0, 0.0, 0.0], radius=1.0)], lights=[light])
+    clean = np.asarray(brdf.render(brdf.Lambert(k_d=[1.0]), white))
+    for seed in range(40):
+        picture = clean + 0.02 * np.random.default_rng(seed).standard_normal(clean.shape)
+        material = fitting.fit(picture, white, model="normalized-phong", plausible=True).material
+        assert float(material.k_d[0] + material.k_s[0]) <= 1 + 1e-6

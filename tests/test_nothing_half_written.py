@@ -67,7 +67,8 @@ def test_a_disk_that_fills_up_leaves_nothing(place, capsys, monkeypatch, small_d
     refused(capsys, small_disk, "disk/(out|mat).*: there is no space left to write it", *FILLING[name])
 
 
-def test_control_c_in_the_middle_leaves_nothing(place):
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_in_the_middle_leaves_nothing(place, number, status):
     before = {path for path in place.iterdir() if path.name != ".cache"}
     # The fit waits for a signal at the moment when the files of the result are being written.
     prefix = (
@@ -78,8 +79,8 @@ def test_control_c_in_the_middle_leaves_nothing(place):
     with command("fit", "target.exr", "--scene", "scene.toml", "--out", "out", cwd=place, prefix=prefix) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "writing\n"
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         _, err = process.communicate(timeout=60)
-    assert process.returncode == 130
+    assert process.returncode == status
     assert err == "error: interrupted.\n"
     assert {path for path in place.iterdir() if path.name != ".cache"} == before

@@ -22,7 +22,7 @@ import brdf
 from brdf.errors import InputError
 from fitting.accuracy.budget_choice import Attempt, BudgetChoice
 from fitting.accuracy.configurations import Configuration, Run, casts_shadows, run, target_size
-from fitting.accuracy.first_pixels import TOO_MANY, pixels_for, reason_for_all
+from fitting.accuracy.first_pixels import FIRST_PIXELS, NOISY, TOO_MANY, first_pixels, reason_for_all
 from fitting.accuracy.lamps import Lamps, extended
 from fitting.accuracy.linear_system import System
 from fitting.accuracy.sampling_error import (
@@ -36,7 +36,7 @@ from fitting.accuracy.sampling_error import (
 )
 from fitting.result import FitResult
 
-FIRST_PIXELS, FIRST_SAMPLES, MOST_SAMPLES = 1024, 16, 4096
+FIRST_SAMPLES, MOST_SAMPLES = 16, 4096
 # Down to this accuracy the order of magnitude of rounding is enough to know.
 COARSE = 1e-4
 # An attempt aims at this share of the accuracy in each of the parts that its error has.
@@ -100,13 +100,14 @@ def fit_within(
     has_samples = any(extended(scene) for scene in scenes)
     reason = "" if has_samples else reason_for_all(targets, scenes, model, options, single=accuracy is not None)
     hard = not has_samples and any(map(casts_shadows, scenes))
-    most = (WHOLE if has_samples else WHOLE_IF_SINGLE) * max(map(target_size, targets))
+    # Where only time counts, more pixels are worth their price.
+    share = WHOLE_IF_SINGLE if accuracy is not None and not has_samples else WHOLE
+    most = share * max(map(target_size, targets))
     pixels = None if reason else FIRST_PIXELS
     # Where light samples are to be chosen too, or time is short, few pixels tell first.
     if pixels is not None and accuracy is not None and seconds is None and not has_samples:
-        asked = pixels_for(targets, options.get("mask"), model, accuracy) / len(targets)
-        pixels = pixels if asked <= pixels else _more_pixels(pixels, asked / pixels, most)
-        reason = "" if pixels is not None else TOO_MANY
+        pixels = first_pixels(targets, options, model, accuracy, most)
+        reason = "" if pixels is not None else NOISY
     first = _precision(precision, pixels, accuracy, hard=hard)
     now = Configuration(model, first, pixels, FIRST_SAMPLES if has_samples else None)
     n_range = None

@@ -1,7 +1,7 @@
-"""How many pixels to look at first: as many as the picture's noise asks for, told before anything is fitted.
+"""How many pixels to look at first: as many as the picture's noise seems to ask for, before anything is fitted.
 
 With M pixels of noise σ a parameter is off by some σ/√M, times a number that hangs on the scene. What else a sample may
-miss, such as what the model does not explain, only the fit itself tells.
+miss, such as what the model does not explain, only the fit itself tells, and whether the guess was good.
 """
 
 import contextlib
@@ -14,12 +14,18 @@ from jaxtyping import Bool, Float
 
 import brdf
 from fitting.accuracy.configurations import one_each, share_counted, target_size
+from fitting.picture_inputs import looked_at
 
-# Relative error (95 %) of the worst parameter, times √M, over noise over the picture's root mean square: with a
-# highlight and without. Medians over the noisy scenes of `python -m benchmarks.tradeoff`.
-SPECULAR, MATT = 35.0, 20.0
+FIRST_PIXELS = 1024
+# Relative error (95 %) of the worst parameter, times √M, over noise over the picture's root mean square: upper quartile
+# of `python -m benchmarks.sample_noise`, since a few pixels more cost less than a second fit.
+SPREAD = 60.0
 # A sample that is crowded where highlights are holds so many times as many pixels as it is asked for.
 CROWDED = 1.5
+# A fit of so many takes half as long again as one of the fewest.
+MOST_FIRST_PIXELS = 1 << 13
+# All pictures together, fitted whole, take about twice as long as the fewest pixels.
+QUICK = 1 << 18
 # Pictures under single lights that are fitted whole at once: choosing among so few pixels takes as long as looking at
 # them.
 SMALL = 1 << 16
@@ -28,8 +34,9 @@ SMALL = 1 << 16
 # without, several times that. Measured by `python -m benchmarks.tradeoff_fresh`.
 EACH_PIXEL, CHOOSING = 3e-8, 0.3
 TOO_MANY = "a sample would have to hold too many of them to be worth it"
-# So many rows tell the noise: of a picture of 512² that is some 1500 pixels, whose median is known to 3 %.
-ROWS = 4
+NOISY = "by their noise a sample would have to hold too many of them"
+# So many rows tell the noise: of a ball in 512² that is some 2000 pixels, whose median is known to 3 %.
+ROWS = 6
 # Of a Gaussian: its standard deviation over the median size; and the root of the sum of squares of 1, -2, 1.
 MEDIAN, SECOND = 1.4826, np.sqrt(6.0)
 
@@ -46,47 +53,77 @@ def single_fit() -> Iterator[None]:
         _single.reset(before)
 
 
-def noise_share(values: Float[np.ndarray, "H W C"], mask: Bool[np.ndarray, "H W"] | None = None) -> float:
-    """Standard deviation of the noise over the picture's root mean square, in its noisiest channel.
+def noise_and_size(
+    values: Float[np.ndarray, "H W C"], allowed: Bool[np.ndarray, "H W"] | None = None
+) -> tuple[float, float]:
+    """Standard deviation of the noise in the channel that has most of it, root mean square of the brightest one.
+
+    Fine relief and texture pass for noise.
 
     Args:
         values: the picture; what is black is taken for background.
-        mask: pixels to look at; None for all.
+        allowed: pixels to look at, (H, W); None for all.
 
     Source: second differences along rows, their median size. Immerkær 1996, "Fast noise variance estimation", does
     the same with a mean over two axes.
     """
-    some = slice(None, None, max(1, values.shape[0] // ROWS))
+    step = max(1, values.shape[0] // ROWS)
+    some = slice(step // 2, None, step)
     rows = np.asarray(values[some], np.float64)
     lit = np.isfinite(rows).all(axis=-1) & (rows != 0).any(axis=-1)
-    if mask is not None:
-        lit &= mask[some]
+    if allowed is not None:
+        lit &= allowed[some]
     inside = lit[:, :-2] & lit[:, 1:-1] & lit[:, 2:]
     if not inside.any():
-        return 0.0
+        return 0.0, 0.0
     with np.errstate(invalid="ignore"):
         change = rows[:, :-2] - 2 * rows[:, 1:-1] + rows[:, 2:]
     deviation = MEDIAN * np.median(np.abs(change[inside].T), axis=1) / SECOND
-    size = np.sqrt(np.mean(rows[lit] ** 2, axis=0))
-    return float(np.max(deviation) / max(float(np.max(size)), np.finfo(float).tiny))
+    return float(np.max(deviation)), float(np.sqrt(np.max(np.mean(rows[lit] ** 2, axis=0))))
 
 
-def pixels_for(targets: Sequence[Any], masks: Any, model: str, accuracy: float) -> float:
+def pixels_for(targets: Sequence[Any], options: Mapping[str, Any], model: str, accuracy: float) -> float:
     """How many pixels of all pictures together to ask `sample_pixels` for, by their noise.
 
     Args:
         targets: the pictures, or their arrays.
-        masks: pixels to look at, (H, W), one for all or one each; None for all of them.
+        options: further arguments of `fitting.fit`: masks, weights, ...
         model: "auto" or the name of a model.
         accuracy: relative error, in 95 % of cases.
     """
-    share = 0.0
-    for target, mask in zip(targets, one_each(masks, len(targets)), strict=True):
-        values = np.atleast_3d(np.asarray(getattr(target, "pixels", target)))
-        share = max(share, noise_share(values, None if mask is None else np.asarray(mask, bool)))
-    if model == "auto" or issubclass(brdf.MODELS[model], brdf.SpecularMaterial):
-        return (SPECULAR * share / accuracy) ** 2 / CROWDED
-    return (MATT * share / accuracy) ** 2
+    cuts = zip(*(one_each(options.get(name), len(targets)) for name in ("mask", "weight")), strict=True)
+    found = [
+        noise_and_size(np.atleast_3d(np.asarray(getattr(target, "pixels", target))), looked_at(*cut))
+        for target, cut in zip(targets, cuts, strict=True)
+    ]
+    noise, size = np.sqrt(np.mean(np.square(found), axis=0))
+    share = noise / max(size, np.finfo(float).tiny)
+    crowded = model == "auto" or issubclass(brdf.MODELS[model], brdf.SpecularMaterial)
+    return (SPREAD * share / accuracy) ** 2 / (CROWDED if crowded else 1.0)
+
+
+def first_pixels(
+    targets: Sequence[Any], options: Mapping[str, Any], model: str, accuracy: float, most: float
+) -> int | None:
+    """How many pixels of each picture to look at first; None for all.
+
+    What the noise asks for, as long as that costs little, since relief may pass for noise. Where it asks for more, a
+    picture that is quickly fitted whole is; of a larger one few pixels tell how many it takes.
+
+    Args:
+        targets: the pictures, or their arrays.
+        options: further arguments of `fitting.fit`.
+        model: "auto" or the name of a model.
+        accuracy: relative error.
+        most: pixels of a sample that is worth it.
+    """
+    asked = pixels_for(targets, options, model, accuracy) / len(targets)
+    pixels = FIRST_PIXELS
+    while pixels < min(asked, MOST_FIRST_PIXELS):
+        pixels *= 2
+    if asked <= pixels <= most:
+        return pixels
+    return None if sum(map(target_size, targets)) <= QUICK else FIRST_PIXELS
 
 
 def reason_for_all(

@@ -64,5 +64,19 @@ def show(text: str) -> None:
 
     Args:
         text: to print.
+
+    Raises:
+        InputError: where it cannot be written.
     """
-    print(text)  # noqa: T201  # this is the command's output
+    try:
+        print(text, flush=True)  # noqa: T201  # this is the command's output
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        forget_output()
+        raise InputError("output", f"cannot be written ({error.strerror})", "Send it elsewhere") from None
+
+
+def forget_output() -> None:
+    """Let what could not be written go, or Python would try once more when it ends."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -46,11 +46,8 @@ def read_first(targets: list[Path], options: PictureOptions, tell: Callable[[str
     if not is_photograph(options):
         target, scene = target_and_scene(targets[0], options.scene)
         files = [target]
-    read = {}
-    for index, path in enumerate(files, start=1):
-        tell(f"reading {index} of {len(files)}")
-        read[path] = brdf.read_picture(path, encoding=encoding_of(options.encoding))
-    shapes = {picture.pixels.shape for picture in read.values()}
+    # By their headers, before pixels are read: a wrong file may be a large one.
+    shapes = set(map(_shape, files))
     if len(shapes) > 1:
         sizes = ", ".join(f"{shape[1]} x {shape[0]} x {shape[2]}" for shape in sorted(shapes))
         raise InputError(files[0], f"and the others differ in size ({sizes})", "Give pictures of one camera")
@@ -59,7 +56,16 @@ def read_first(targets: list[Path], options: PictureOptions, tell: Callable[[str
         _check_resolution(files[0], shape, scene)
     elif options.sphere is not None and options.sphere != "mask":
         check_ball(shape, parse_circle(options.sphere))
+    read = {}
+    for index, path in enumerate(files, start=1):
+        tell(f"reading {index} of {len(files)}")
+        read[path] = brdf.read_picture(path, encoding=encoding_of(options.encoding))
     return read
+
+
+def _shape(path: Path) -> tuple[int, int, int]:
+    with brdf.ImageReader(path) as reader:
+        return reader.shape
 
 
 def _check_options(targets: list[Path], options: PictureOptions) -> None:

@@ -58,6 +58,9 @@ def fit(
         raise brdf.InputError("--plot", "needs a folder to draw into", "Add --out DIR")
     if report is not None and report.suffix.lower() not in (".html", ".htm"):
         raise brdf.InputError(report, "is no name of a page", "Name it .html")
+    if out is not None:
+        # Told now instead of after the fit.
+        brdf.check_folder(out)
     notes: tuple[str, ...] = ()
     with waiting("fitting") as tell:
         with held():

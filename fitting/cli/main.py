@@ -4,7 +4,7 @@ Help does not import JAX; each command imports what it needs.
 """
 
 import importlib.metadata
-import os
+import io
 import sys
 from typing import Annotated, Any
 
@@ -12,10 +12,11 @@ import typer
 
 from brdf.errors import InputError
 from fitting.cli import check, convert, fit, lights, render, tradeoff
-from fitting.cli.common import show
-from fitting.cli.interrupts import interruptible
+from fitting.cli.common import forget_output, show
+from fitting.cli.interrupts import exit_status, interruptible
 
-INTERRUPTED = 130  # what shells expect after Ctrl-C
+# What typer turns Ctrl-C into.
+INTERRUPTED = 130
 # What a wrong option raises, wherever typer keeps its parser.
 USAGE_ERROR: type[BaseException] = typer.BadParameter.__mro__[2]
 
@@ -58,6 +59,9 @@ def main(arguments: list[str] | None = None) -> Any:
     Args:
         arguments: the words after ``brdf``; None takes those of the process.
     """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # ± on a terminal that knows ASCII alone
     try:
         with interruptible():
             status = app(args=arguments, prog_name="brdf", standalone_mode=False)
@@ -68,13 +72,18 @@ def main(arguments: list[str] | None = None) -> Any:
             sys.exit(2)
         _fail(f"{_words(error).rstrip('.')}. See {_command(error)} --help.")
     except KeyboardInterrupt:
-        _fail("interrupted.", status=INTERRUPTED)
+        _fail("interrupted.", status=exit_status())
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        forget_output()
         sys.exit(1)
+    except (MemoryError, RuntimeError) as error:
+        # So XLA says it.
+        if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        _fail("memory: there is not enough for this. Use fewer pixels or light samples.")
     else:
-        if status == INTERRUPTED:  # typer turns Ctrl-C into a number
-            _fail("interrupted.", status=INTERRUPTED)
+        if status == INTERRUPTED:
+            _fail("interrupted.", status=exit_status())
         sys.exit(status if isinstance(status, int) else 0)
 
 

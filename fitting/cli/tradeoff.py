@@ -35,8 +35,11 @@ def tradeoff(
 
     Ctrl-C ends the measuring and keeps what was measured.
     """
+    import brdf
     from fitting.cli.first_look import read_first
 
+    if out is not None:
+        brdf.check_folder(out)
     options = {"model": model, "accuracy": accuracy, "seconds": seconds}
     with named_as({name: f"--{name}" for name in options} | pictures.names()):
         read = read_first([target], pictures, lambda now: None)

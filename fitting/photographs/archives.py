@@ -3,6 +3,7 @@
 import tokenize
 import warnings
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,17 @@ _DAMAGE = (
     SystemError,  # what Python 3.13 makes of a header with a null byte
     tokenize.TokenError,
     zipfile.BadZipFile,
+    zlib.error,
+)
+# What zipfile raises for an archive that it cannot read: RuntimeError is one with a password.
+_DAMAGED_ARCHIVE = (
+    zipfile.BadZipFile,
+    zipfile.LargeZipFile,
+    zlib.error,
+    OSError,
+    EOFError,
+    NotImplementedError,
+    RuntimeError,
 )
 
 
@@ -90,5 +102,5 @@ def read_archive(path: Path) -> dict[str, np.ndarray]:
                 with archive.open(f"{name}.npy") as file:
                     arrays[name] = read_array(file, f"{path}: {name}", sizes[f"{name}.npy"])
             return arrays
-    except (zipfile.BadZipFile, zipfile.LargeZipFile, OSError, EOFError, NotImplementedError, RuntimeError) as error:
+    except _DAMAGED_ARCHIVE as error:
         raise InputError(path, f"is no readable archive ({type(error).__name__})", "Save it with numpy.savez") from None
