@@ -1,6 +1,7 @@
 """Files with too much of something: attributes, channels, parts, scans, tiles; and what is read by bands of rows."""
 
 import struct
+import tracemalloc
 import warnings
 
 import numpy as np
@@ -222,6 +223,19 @@ def test_large_even_pictures_in_a_few_bytes(tmp_path):
         with ImageReader(tmp_path / name, encoding="linear") as reader:
             assert reader.shape == shape
             np.testing.assert_array_equal(reader.rows(shape[0] - 2, shape[0]), value)
+
+
+@pytest.mark.parametrize("reader", [read_image, read_mask])
+def test_a_picture_in_one_strip_takes_little_more_memory_than_its_values(tmp_path, reader):
+    (tmp_path / "a.tif").write_bytes(white_fax(2000))
+    reader(tmp_path / "a.tif")  # tables are made once
+    tracemalloc.start()
+    try:
+        assert reader(tmp_path / "a.tif").all()
+        _, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert most < 10 * 2000 * 2000
 
 
 def test_strips_and_tiles_that_a_few_bytes_cannot_hold(tmp_path):

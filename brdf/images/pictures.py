@@ -166,11 +166,13 @@ def read_mask(path: str | os.PathLike[str]) -> Bool[Array, "height width"]:
 
 
 def _mean_of_channels(reader: ImageReader) -> Float32[Array, "height width"]:
+    if reader.shape[2] == 1:
+        return reader.read()[..., 0]
     mean = np.empty(reader.shape[:2], np.float32)
     check_memory(reader.path, mean.size)
     with np.errstate(over="ignore", invalid="ignore"):  # NaN and infinite values are passed on
         for first, band in reader.bands():
-            mean[first : first + len(band)] = band.mean(axis=-1)
+            band.mean(axis=-1, out=mean[first : first + len(band)])
     return mean
 
 

@@ -189,9 +189,18 @@ class ImageReader:
         if high - low != len(channels) or channels != sorted(channels):
             pixels = pixels[..., [channel - low for channel in channels]]
         if table:
-            return np.take(decode_table(self.encoding, self._table_bits), pixels)
+            return _looked_up(decode_table(self.encoding, self._table_bits), pixels)
         pixels = np.ascontiguousarray(pixels)
         return decode(pixels, self.encoding) if decoded else pixels
+
+
+def _looked_up(table: np.ndarray, codes: np.ndarray) -> np.ndarray:
+    """The table's value for each code, a few rows at a time: NumPy makes eight bytes of every code."""
+    values = np.empty(codes.shape, table.dtype)
+    step = max(1, (1 << 18) // codes[0].size)
+    for first in range(0, len(codes), step):
+        values[first : first + step] = table[codes[first : first + step]]
+    return values
 
 
 def _upright(stored: np.ndarray, turn: int) -> np.ndarray:
