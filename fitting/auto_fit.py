@@ -10,7 +10,7 @@ from fitting.engine.normal import fit_tied
 from fitting.engine.separable import Picture, fit_linear
 from fitting.engine.streams import each
 from fitting.interpretation import ModelFit, coefficient_factors
-from fitting.model_fit import Job, fit_model, optimise
+from fitting.model_fit import Job, fit_model, forgotten, optimise
 from fitting.selection import FAMILIES, Choice, choose
 from fitting.uncertainty.covariance import residual_noise
 from fitting.uncertainty.noise_model import weighted_sums
@@ -29,8 +29,9 @@ def fit_simplest(job: Job) -> tuple[ModelFit, Choice]:
     names = job.families if job.lit[1].any() else ("lambert",)
     fits: dict[str, ModelFit] = {}
     for name in names:
-        beside = next((fit.pictures for fit in fits.values()), ())
-        fits[name] = fit_model(brdf.MODELS[name], job, beside=beside)
+        # The pictures of one model at a time are in memory.
+        fits = {done: forgotten(fit, job) for done, fit in fits.items()}
+        fits[name] = fit_model(brdf.MODELS[name], job)
     # A lobe that would be wider than the search allows is no highlight: it mends what Lambert's law leaves at the rim.
     fits = {name: fit for name, fit in fits.items() if fit.optimum.flat or fit.optimum.n > WIDEST * job.n_range[0]}
     fits = fits or {"lambert": fit_model(brdf.Lambert, job)}
@@ -52,7 +53,13 @@ def fit_simplest(job: Job) -> tuple[ModelFit, Choice]:
             name: weighted_sums(fit.pictures, fit.optimum, known.noise, inverse=True) for name, fit in fits.items()
         }
     choice = choose(optima, free, grey, noise, known.inflation, whitened)
-    return _alone(choice, fits, grey), choice
+    matt = choice.model in FAMILIES
+    chosen = list(fits.values())[-1] if matt else fits[choice.model]
+    del best
+    fits.clear()
+    if all(observation.in_memory for observation in job.observations):
+        chosen = chosen._replace(pictures=list(chosen.pictures))
+    return (_matt(choice, chosen) if matt else _alone(choice, chosen, grey[choice.model])), choice
 
 
 def _with_weights_of(weighed: Sequence[Picture], fit: ModelFit) -> ModelFit:
@@ -63,18 +70,19 @@ def _with_weights_of(weighed: Sequence[Picture], fit: ModelFit) -> ModelFit:
     return fit._replace(pictures=pictures, optimum=optimise(pictures, fit.free, fit.n_range))
 
 
-def _alone(choice: Choice, fits: dict[str, ModelFit], grey: dict[str, np.ndarray]) -> ModelFit:
-    """The chosen candidate, fitted to the pixels without what it leaves out."""
-    if choice.model in FAMILIES:
-        fit = next(iter(fits.values()))
-        pictures = each(lambda p: Picture(p.target, p.diffuse, None, p.weight, p.ambient), fit.pictures)
-        optimum = fit_linear(pictures, free=choice.free)
-        return ModelFit(brdf.Lambert, pictures, optimum, choice.free, fit.n_range, None, fit.noise_factor)
-    fit = fits[choice.model]
+def _matt(choice: Choice, fit: ModelFit) -> ModelFit:
+    """The chosen candidate without a highlight, fitted to the pixels without what it leaves out."""
+    pictures = each(lambda p: Picture(p.target, p.diffuse, None, p.weight, p.ambient), fit.pictures)
+    optimum = fit_linear(pictures, free=choice.free)
+    return ModelFit(brdf.Lambert, pictures, optimum, choice.free, fit.n_range, None, fit.noise_factor)
+
+
+def _alone(choice: Choice, fit: ModelFit, grey: np.ndarray) -> ModelFit:
+    """The chosen candidate with a highlight, likewise; ``grey`` is how a grey k_s is tied, (C,)."""
     optimum = fit.optimum
     if not np.array_equal(choice.free, fit.free):
         optimum = optimise(fit.pictures, choice.free, fit.n_range)
-    tied = grey[choice.model] if choice.grey else None
+    tied = grey if choice.grey else None
     if tied is not None:
         single = np.dtype(fit.pictures[0].target.dtype) == np.float32
         optimum = fit_tied(fit.pictures, optimum, choice.free, tied, fit.n_range, single=single)

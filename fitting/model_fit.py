@@ -2,9 +2,8 @@
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
@@ -87,7 +86,7 @@ def reached(model: type[brdf.Material], job: Job) -> Bool[np.ndarray, "3 C"]:
     return np.stack([ambient, direct, direct & issubclass(model, brdf.SpecularMaterial)])
 
 
-def _engine_pictures(model: type[brdf.Material], job: Job, beside: Sequence[Picture]) -> Sequence[Picture]:
+def _engine_pictures(model: type[brdf.Material], job: Job, *, keep: bool = True) -> Sequence[Picture]:
     def picture(tile: Tile, scene: brdf.Scene) -> Picture:
         dtype = tile.target.dtype
         precision: brdf.Precision = "float32" if dtype == np.float32 else "float64"
@@ -99,25 +98,8 @@ def _engine_pictures(model: type[brdf.Material], job: Job, beside: Sequence[Pict
     pictures = []
     for observation, scene in zip(job.observations, job.light.scenes, strict=True):
         some = each(partial(picture, scene=scene), observation.tiles)
-        if not observation.in_memory:
-            pictures.append(some)
-            continue
-        # Of few pixels finding out what is the same would take longer than it saves.
-        first = sum(map(len, pictures))
-        known = beside[first : first + len(some)] if job.pixels > TILE_PIXELS else ()
-        pictures.append([_sharing(one, *known[i : i + 1]) for i, one in enumerate(some)])
+        pictures.append(list(some) if keep and observation.in_memory else some)
     return joined(pictures)
-
-
-def _sharing(picture: Picture, other: Picture | None = None) -> Picture:
-    """The picture, its arrays those of another one where they are equal: diffuse light is the same for all models."""
-    if other is None or jax.tree.structure(picture) != jax.tree.structure(other):
-        return picture
-
-    def shared(one: Any, two: Any) -> Any:
-        return two if one is two or jnp.array_equal(one, two) else one
-
-    return jax.tree.map(shared, picture, other)
 
 
 def _visible(pictures: Sequence[Picture], n_range: tuple[float, float]) -> tuple[float, float] | None:
@@ -140,16 +122,15 @@ def optimise(pictures: Sequence[Picture], free: Bool[np.ndarray, "3 C"], n_range
     return fit_linear(pictures, free=free)
 
 
-def fit_model(model: type[brdf.Material], job: Job, *, beside: Sequence[Picture] = ()) -> ModelFit:
+def fit_model(model: type[brdf.Material], job: Job) -> ModelFit:
     """Fit one model with the loss that is asked for.
 
     Args:
         model: its class.
         job: the pictures.
-        beside: those of another model that are in memory too, to keep once what both have in common.
     """
     free = reached(model, job)
-    pictures = _engine_pictures(model, job, beside)
+    pictures = _engine_pictures(model, job)
     n_range = job.n_range
     if free[2].any():
         visible = _visible(pictures, job.n_range)
@@ -157,6 +138,18 @@ def fit_model(model: type[brdf.Material], job: Job, *, beside: Sequence[Picture]
         free[2] &= visible is not None
     found = reweight(pictures, lambda some: optimise(some, free, n_range), job.loss, job.rounding)
     return ModelFit(model, found.pictures, found.optimum, free, n_range, None, found.noise_factor)
+
+
+def forgotten(fit: ModelFit, job: Job) -> ModelFit:
+    """The fit, its pictures made anew when they are asked for, where they are large.
+
+    Args:
+        fit: of any model.
+        job: the pictures.
+    """
+    if job.pixels <= TILE_PIXELS or job.loss != "squared":
+        return fit
+    return fit._replace(pictures=_engine_pictures(fit.model, job, keep=False))
 
 
 def without_highlight(fit: ModelFit, job: Job) -> ModelFit:
@@ -169,7 +162,7 @@ def without_highlight(fit: ModelFit, job: Job) -> ModelFit:
     free = fit.free.copy()
     free[2] = False
     # The weights of a robust loss are part of what is fitted.
-    pictures = fit.pictures if job.loss == "squared" else _engine_pictures(fit.model, job, ())
+    pictures = fit.pictures if job.loss == "squared" else _engine_pictures(fit.model, job)
     found = reweight(pictures, lambda some: fit_linear(some, free=free), job.loss, job.rounding)
     return fit._replace(
         pictures=found.pictures, optimum=found.optimum, free=free, tied=None, noise_factor=found.noise_factor

@@ -1,8 +1,8 @@
 """A picture that is read by bands of rows gives the fit of the picture in memory."""
 
+import weakref
 from pathlib import Path
 
-import equinox as eqx
 import numpy as np
 import pytest
 
@@ -40,6 +40,7 @@ def picture(noise: float = 0.01) -> np.ndarray:
 def small_bands(monkeypatch):
     """Seven bands, the last one shorter."""
     monkeypatch.setattr(observation, "TILE_PIXELS", 14 * SIZE[0] + 5)
+    monkeypatch.setattr("fitting.model_fit.TILE_PIXELS", 14 * SIZE[0] + 5)
     monkeypatch.setattr(observation, "ALIGNED_ROWS", 14)
 
 
@@ -75,19 +76,31 @@ def test_options_agree(tmp_path: Path, options: dict):
         same(fitting.fit(reader, scene(), **options), whole, 1e-3)
 
 
-def test_families_keep_once_what_they_share(monkeypatch):
-    kept = []
+@pytest.mark.parametrize(
+    "true", [MATERIAL, brdf.Phong(k_d=[0.5] * 3, k_s=[0.3] * 3, n=20.0), brdf.Lambert(k_d=[0.5] * 3)]
+)
+def test_one_model_at_a_time_is_in_memory(monkeypatch, true):
+    """Of a large picture, what the engine needs of the model before is made anew where it is asked for again."""
+    clean = np.asarray(brdf.render(true, scene()))
+    noisy = clean + 0.01 * np.random.default_rng(0).standard_normal(clean.shape)
+    alive = []
 
-    def watched(model, job, *, beside=()):
-        kept.append(fit_model(model, job, beside=beside))
-        return kept[-1]
+    def watched(model, job):
+        alive.append(sum(reference() is not None for reference in lobes))
+        fit = fit_model(model, job)
+        lobes.extend(weakref.ref(picture.diffuse) for picture in fit.pictures)
+        return fit
 
+    lobes: list[weakref.ref] = []
     monkeypatch.setattr("fitting.auto_fit.fit_model", watched)
-    fitting.fit(picture(), scene())
-    one, other = (fit.pictures for fit in kept[:2])
-    assert len(one) == len(other) == 7
-    assert all(mine.diffuse is its.diffuse for mine, its in zip(one, other, strict=True))
-    assert not eqx.tree_equal(one[3].lobe, other[3].lobe)
+    cut = fitting.fit(noisy, scene())
+    assert alive == [0, 0]
+    monkeypatch.setattr(observation, "TILE_PIXELS", noisy[..., 0].size)
+    monkeypatch.setattr("fitting.model_fit.TILE_PIXELS", noisy[..., 0].size)
+    lobes.clear()
+    whole = fitting.fit(noisy, scene())
+    assert alive[2:] == [0, 1]
+    same(cut, whole)
 
 
 def test_mask_weight_and_several_pictures(tmp_path: Path):
