@@ -35,8 +35,8 @@ SMALL = 1 << 16
 EACH_PIXEL, CHOOSING = 3e-8, 0.3
 TOO_MANY = "a sample would have to hold too many of them to be worth it"
 NOISY = "by their noise a sample would have to hold too many of them"
-# So many rows tell the noise: of a ball in 512² that is some 2000 pixels, whose median is known to 3 %.
-ROWS = 6
+# So many rows tell the noise: of a ball in 512² that is some 1400 pixels, whose median is known to 3 %.
+ROWS = 4
 # Of a Gaussian: its standard deviation over the median size; and the root of the sum of squares of 1, -2, 1.
 MEDIAN, SECOND = 1.4826, np.sqrt(6.0)
 

@@ -226,8 +226,12 @@ def _part(sample: PixelSample, counted: np.ndarray, given: Any, most: int, *, co
     if given is not None:
         weight = weight * np.asarray(given, np.float64).ravel()[pixel]
     filling = -count % FILLED if count else FILLED
-    kept = PixelSample(np.pad(pixel, (0, filling)), np.pad(stands_for, (0, filling), constant_values=1.0))
-    return Part(kept, np.pad(weight, (0, filling)), count, complete, stride)
+    kept = PixelSample(_filled(pixel, filling), _filled(stands_for, filling, 1.0))
+    return Part(kept, _filled(weight, filling), count, complete, stride)
+
+
+def _filled(values: np.ndarray, filling: int, value: float = 0.0) -> np.ndarray:
+    return np.concatenate([values, np.full(filling, value, values.dtype)])
 
 
 def _every(scene: brdf.Scene, model: type[brdf.Material], most: int) -> PixelSample:

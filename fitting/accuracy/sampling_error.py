@@ -97,12 +97,12 @@ def nearly_dependent(optimum: Optimum) -> bool:
     Args:
         optimum: of the fit.
     """
-    for matrix in optimum.gauss_newton:
-        free = np.diag(matrix) > 0
-        size = np.sqrt(np.diag(matrix)[free])
-        if np.any(np.linalg.eigvalsh(matrix[np.ix_(free, free)] / np.outer(size, size)) < DEPENDENT**2):
-            return True
-    return False
+    matrices = optimum.gauss_newton
+    square = np.einsum("cii->ci", matrices)
+    size = np.sqrt(np.where(square > 0, square, 1.0))
+    # A column of nothing depends on none.
+    normed = matrices / (size[:, :, None] * size[:, None, :]) + np.where(square > 0, 0.0, 1.0)[:, :, None] * np.eye(4)
+    return bool(np.any(np.linalg.eigvalsh(normed) < DEPENDENT**2))
 
 
 def _shifts(system: System, finer: int | None = None, *, measured: bool = True) -> Shifts:
