@@ -102,7 +102,7 @@ CLAIMS = {
 @pytest.mark.parametrize("name", CLAIMS)
 def test_what_a_header_claims_costs_nothing(place, capsys, name):  # noqa: F811
     (place / name).write_bytes(CLAIMS[name])
-    with pytest.raises(brdf.InputError, match="is damaged|cannot be read as an image"):
+    with pytest.raises(brdf.InputError, match=r"is damaged|cannot be read as an image"):
         brdf.read_picture(place / name)
     # The command may tell first that the header's size is not the camera's.
     said = "is damaged|cannot be read as an image|the scene's camera 8 x 8"
