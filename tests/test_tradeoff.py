@@ -132,3 +132,19 @@ def test_the_command_measures_one_picture(tmp_path, capsys):
         main(["tradeoff", str(tmp_path / "two.npz")])
     assert ended.value.code == 2
     assert "two.npz: holds 2 pictures, and one is measured" in capsys.readouterr().err
+
+
+def test_labels_stay_off_the_legend():
+    few, all_pixels = Configuration("blinn-phong", "float32", 1024), Configuration("blinn-phong")
+    most = Configuration("blinn-phong", "float32", 16384)
+    rows = (
+        row("1024 pixels", 0.014, 8e-3, 1, configuration=few),
+        row("all", 0.07, 1e-7, 9, axis="default", configuration=all_pixels),
+        row("16384 pixels", 0.12, 8e-4, 3, configuration=most),
+    )
+    figure = table(*rows).plot()
+    figure.draw_without_rendering()
+    axes = figure.axes[0]
+    told = [text for text in axes.texts if text.get_text().startswith("recommended")]
+    assert len(told) == 1
+    assert told[0].get_window_extent().x1 <= axes.get_window_extent().x1

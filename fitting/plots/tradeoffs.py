@@ -115,6 +115,11 @@ def _label(figure: Any, axes: Any, tradeoff: Tradeoff, least: float) -> None:
         look["bbox"] = {"facecolor": "white", "edgecolor": "none", "pad": 0.8, "alpha": 0.85}
         text = axes.annotate(told_name, place, xytext=offset, textcoords="offset points", **look)
         figure.draw_without_rendering()
+        if text.get_window_extent().x1 > axes.get_window_extent().x1:
+            # The legend is there.
+            text.set_horizontalalignment("right")
+            text.xyann = (-abs(offset[0]), offset[1])
+            figure.draw_without_rendering()
         box = text.get_window_extent()
         if not word and any(box.overlaps(other) for other in taken):
             text.remove()
