@@ -12,7 +12,7 @@ from fitting.engine.streams import Stream
 @pytest.mark.parametrize(("dtype", "tolerance"), [(np.float32, 1e-4), (np.float64, 1e-8)])
 @pytest.mark.parametrize("n", [0.3, 1.7, 30.0, 2000.0, 40000.0])
 def test_recovers_what_was_rendered(n, dtype, tolerance):
-    """Tolerances of the issue for a worst relative error."""
+    """Tolerances for a worst relative error."""
     found = search([picture(192, n, dtype=dtype)])
     np.testing.assert_allclose(found.n, n, rtol=tolerance)
     np.testing.assert_allclose(found.x, X, rtol=tolerance)
