@@ -155,14 +155,15 @@ def _fit_observed(
         fitted, choice = fit_model(brdf.MODELS[model], job), None
     if plausible:
         fitted = _held_plausible(fitted, job)
-    told = _interpret(fitted, job, choice)
+    told, optimum = _interpret(fitted, job, choice), fitted.optimum
     if _is_dropped(fitted, told):
         # Or ambient and diffuse would be the ones that go with the highlight.
         fitted, why = without_highlight(fitted, job), told.sure.undetermined["n"]
         if plausible:
             fitted = _held_plausible(fitted, job)
         told = _with_reason(_interpret(fitted, job, choice), why)
-    return _result(fitted, told, choice, job, precision, time.perf_counter() - start)
+    result = _result(fitted, told, choice, job, precision, time.perf_counter() - start)
+    return dataclasses.replace(result, optimum=optimum)
 
 
 def _held_plausible(fit: ModelFit, job: Job) -> ModelFit:

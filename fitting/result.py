@@ -85,7 +85,8 @@ class FitResult:
         warnings: what a user should know before using the numbers.
         candidates: the models that were compared, simplest first; empty where the user named it.
         correlation: of the parameters that are determined and not at a bound, in the order of `free_parameters`.
-        optimum: the engine's own result, in its units.
+        optimum: the engine's own result, in its units; the global one, also where noise hides its highlight and the
+            material and the residual are those without it.
         loss: "squared" or one of the others.
         precision: "float32" or "float64".
         seconds: how long the fit took.

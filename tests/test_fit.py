@@ -209,6 +209,9 @@ def test_a_highlight_that_does_not_stand_out_leaves_the_fit_of_the_matt_rest(pre
     }
     np.testing.assert_allclose(result.material.k_d, matt.material.k_d, rtol=1e-6)
     np.testing.assert_allclose(result.residual, matt.residual, rtol=1e-7)
+    # The optimum of the search is told all the same.
+    assert np.any(result.optimum.x[2] > 0)
+    assert np.sum(result.optimum.cost) < np.sum(matt.optimum.cost)
     robust = [fitting.fit(picture, scene, model=name, precision=precision, loss="huber") for name in MATT_PAIR]
     np.testing.assert_allclose(robust[0].material.k_a, robust[1].material.k_a, rtol=1e-4)
 
