@@ -1,16 +1,38 @@
 """How JAX computes: float32 or float64, chosen per call without touching its global setting, and in which pieces."""
 
 import contextlib
+import warnings
 from collections.abc import Callable
 from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
+import jaxlib
 import numpy as np
 
 from brdf.errors import InputError
 
 Precision = Literal["float32", "float64"]
+
+UNSOUND = {
+    "0.10.2": "adds up wrongly on the CPU (jax-ml/jax issue 39103)",
+    "0.11.0": "crashes on the CPU (jax-ml/jax issue 40412)",
+}
+"""Versions of jaxlib that are not to be computed with, and why; pyproject.toml excludes them too."""
+
+
+def warn_of_unsound(version: str) -> None:
+    """Warn where a version of jaxlib is known to compute wrongly.
+
+    Args:
+        version: of jaxlib.
+    """
+    if version in UNSOUND:
+        message = f"jaxlib {version} {UNSOUND[version]}: install another version, such as 0.10.1"
+        warnings.warn(message, RuntimeWarning, stacklevel=2)
+
+
+warn_of_unsound(jaxlib.__version__)
 
 
 def working_precision(precision: Precision | None) -> contextlib.AbstractContextManager[Any]:

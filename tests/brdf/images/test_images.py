@@ -1,0 +1,204 @@
+"""Pictures read from files: channels, layers, masks, windows and bands."""
+
+import numpy as np
+import OpenImageIO as oiio  # noqa: N813
+import pytest
+from image_files import REAL, codes, needs, png, random, raw_exr
+
+from brdf.images.pictures import (
+    ImageReader,
+    read_image,
+    read_layers,
+    read_mask,
+    read_picture,
+    write_image,
+    write_layers,
+)
+
+# --- channels, layers, masks -------------------------------------------------------------------------------------
+
+
+def test_alpha_is_apart_and_does_not_darken(tmp_path):
+    stored = codes(6, 5, 4)
+    (tmp_path / "a.png").write_bytes(png(stored, colour_type=6))
+    (tmp_path / "b.png").write_bytes(png(stored[..., [0, 3]], colour_type=4))
+    for name, channels in (("a.png", 3), ("b.png", 1)):
+        picture = read_picture(tmp_path / name, encoding="linear")
+        np.testing.assert_allclose(picture.pixels, stored[..., :channels] / 255, rtol=1e-6)
+        np.testing.assert_allclose(picture.alpha, stored[..., 3] / 255, rtol=1e-6)
+    (tmp_path / "c.png").write_bytes(png(stored[..., :3]))
+    assert read_picture(tmp_path / "c.png").alpha is None
+
+
+def test_grey(tmp_path):
+    stored = codes(6, 5, 1)
+    (tmp_path / "a.png").write_bytes(png(stored, colour_type=0))
+    np.testing.assert_allclose(read_image(tmp_path / "a.png", encoding="linear"), stored / 255, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("names", "chosen", "alpha"),
+    [
+        (["R", "G", "B", "A", "Z"], ["R", "G", "B"], "A"),
+        (["R", "G", "B", "image.R", "image.G", "image.B", "image.A"], ["R", "G", "B"], None),
+        (["Y", "position.X", "position.Y", "position.Z"], ["Y"], None),
+        (["beauty.R", "beauty.G", "beauty.B", "beauty.A", "depth.Z"], ["beauty.R", "beauty.G", "beauty.B"], "beauty.A"),
+        (["S0", "S1", "S2", "S3", "S4"], ["S0", "S1", "S2", "S3", "S4"], None),
+        ([f"S0.{400 + 10 * k},0nm" for k in range(31)], [f"S0.{400 + 10 * k},0nm" for k in range(31)], None),
+        (["A", "W"], ["W"], "A"),
+        (["Z"], ["Z"], None),
+        ([f"C{k:03d}" for k in range(100)], [f"C{k:03d}" for k in range(100)], None),
+    ],
+)
+def test_the_picture_in_an_exr(tmp_path, names, chosen, alpha):
+    values = random(5, 4, len(names))
+    picture = read_picture(raw_exr(tmp_path / "a.exr", values, names))
+    np.testing.assert_array_equal(picture.pixels, values[..., [names.index(name) for name in chosen]])
+    if alpha is None:
+        assert picture.alpha is None
+    else:
+        np.testing.assert_array_equal(picture.alpha, values[..., names.index(alpha)])
+
+
+def test_a_tiff_with_many_bands(tmp_path):
+    values = random(5, 4, 31)
+    write_image(tmp_path / "a.tif", values)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.tif"), values)
+
+
+def test_layers_there_and_back(tmp_path):
+    layers = {"": random(6, 5, 3), "position": random(6, 5, 3, seed=1), "depth": random(6, 5, seed=2)}
+    layers["normal"] = random(6, 5, 3, seed=3)
+    write_layers(tmp_path / "a.exr", layers)
+    back = read_layers(tmp_path / "a.exr")
+    assert set(back) == set(layers)
+    for name, values in layers.items():
+        np.testing.assert_array_equal(back[name], values.reshape(6, 5, -1))
+    np.testing.assert_array_equal(read_image(tmp_path / "a.exr"), layers[""])
+
+
+@needs("aov")
+def test_layers_of_a_real_renderer():
+    layers = read_layers(REAL / "aov" / "mitsuba_multi_channels.exr")
+    shapes = {name: values.shape for name, values in layers.items()}
+    assert shapes == {
+        "": (256, 256, 3),
+        "depth": (256, 256, 1),
+        "image": (256, 256, 4),
+        "position": (256, 256, 3),
+        "sh_normal": (256, 256, 3),
+    }
+    lengths = np.linalg.norm(layers["sh_normal"], axis=-1)
+    # Averaged over a pixel's samples, lengths at edges lie between.
+    assert np.median(np.abs(lengths[lengths > 0.5] - 1)) < 1e-5
+
+
+def test_parts_of_an_exr(tmp_path):
+    values = random(4, 6, 3), random(4, 6, 1, seed=1)
+    specs = [oiio.ImageSpec(6, 4, 3, "float"), oiio.ImageSpec(6, 4, 1, "float")]
+    specs[0].attribute("oiio:subimagename", "rgb")
+    specs[1].attribute("oiio:subimagename", "depth")
+    specs[1].channelnames = ("Z",)
+    for order in ([0, 1], [1, 0]):
+        file = oiio.ImageOutput.create("a.exr")
+        assert file.open(str(tmp_path / "a.exr"), tuple(specs[index] for index in order))
+        for step, index in enumerate(order):
+            if step:
+                assert file.open(str(tmp_path / "a.exr"), specs[index], "AppendSubimage")
+            assert file.write_image(values[index])
+        assert file.close()
+        np.testing.assert_array_equal(read_image(tmp_path / "a.exr"), values[0])
+        layers = read_layers(tmp_path / "a.exr")
+        np.testing.assert_array_equal(layers["rgb"], values[0])
+        np.testing.assert_array_equal(layers["depth"], values[1])
+
+
+def test_masks(tmp_path):
+    inside = random(8, 9) > 0.5
+    white = np.where(inside, 255, 0).astype(np.uint8)
+    (tmp_path / "white.png").write_bytes(png(white[..., None].repeat(3, 2)))
+    (tmp_path / "one.png").write_bytes(png(inside.astype(np.uint8)[..., None], colour_type=0))
+    (tmp_path / "alpha.png").write_bytes(png(np.dstack([codes(8, 9, 3), white]), colour_type=6))
+    (tmp_path / "opaque.png").write_bytes(png(np.dstack([white] * 3 + [np.full_like(white, 255)]), colour_type=6))
+    raw_exr(tmp_path / "float.exr", np.where(inside, 1, np.nan)[..., None].astype(np.float32), ["Y"])
+    for name, alpha in (("faint.png", 254), ("nothing.png", 0), ("veiled.png", np.where(inside, 255, 200))):
+        # Alpha that keeps all pixels, or none, was not meant.
+        pixels = np.dstack([white] * 3 + [np.broadcast_to(alpha, white.shape).astype(np.uint8)])
+        (tmp_path / name).write_bytes(png(pixels, colour_type=6))
+    names = ("white.png", "one.png", "alpha.png", "opaque.png", "float.exr", "faint.png", "nothing.png", "veiled.png")
+    for name in names:
+        np.testing.assert_array_equal(read_mask(tmp_path / name), inside, err_msg=name)
+    (tmp_path / "black.png").write_bytes(png(np.zeros((3, 3, 3), np.uint8)))
+    assert not read_mask(tmp_path / "black.png").any()
+
+
+# --- windows, orientation, bands ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("tile", [0, 16])
+@pytest.mark.parametrize("shift", [(3, 5), (-4, -7), (0, 0)])
+def test_the_display_window_is_the_picture(tmp_path, tile, shift):
+    values = random(40, 50, 3)
+    path = raw_exr(tmp_path / "a.exr", values, "RGB", tile=tile, data_at=shift, display=(0, 0, 50, 40))
+    expected = np.full((40, 50, 3), np.nan, np.float32)
+    for y in range(40):
+        for x in range(50):
+            if 0 <= y - shift[1] < 40 and 0 <= x - shift[0] < 50:
+                expected[y, x] = values[y - shift[1], x - shift[0]]
+    np.testing.assert_array_equal(read_image(path), expected)
+    with ImageReader(path) as reader:
+        np.testing.assert_array_equal(np.concatenate([reader.rows(k, k + 8) for k in range(0, 40, 8)]), expected)
+
+
+@pytest.mark.parametrize("turn", range(1, 9))
+def test_a_photograph_comes_upright(tmp_path, turn):
+    upright = codes(4, 6, 3)
+    # Where the picture's first row and column lie as seen by a person, from the Exif table.
+    stored = {
+        1: upright,
+        2: upright[:, ::-1],
+        3: upright[::-1, ::-1],
+        4: upright[::-1],
+        5: upright.transpose(1, 0, 2),
+        6: np.rot90(upright, 1),
+        7: upright[::-1, ::-1].transpose(1, 0, 2),
+        8: np.rot90(upright, -1),
+    }[turn]
+    spec = oiio.ImageSpec(stored.shape[1], stored.shape[0], 3, "uint8")
+    spec.attribute("Orientation", turn)
+    file = oiio.ImageOutput.create("a.tif")
+    assert file.open(str(tmp_path / "a.tif"), spec)
+    assert file.write_image(np.ascontiguousarray(stored))
+    assert file.close()
+    np.testing.assert_allclose(read_image(tmp_path / "a.tif", encoding="linear"), upright / 255, rtol=1e-6)
+    with ImageReader(tmp_path / "a.tif", encoding="linear") as reader:
+        assert reader.shape == (4, 6, 3)
+        np.testing.assert_allclose(reader.rows(1, 3), upright[1:3] / 255, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "kind"), [(".exr", "float"), (".exr", "half"), (".png", "uint8"), (".png", "uint16"), (".tif", "uint16")]
+)
+def test_bands_are_the_picture(tmp_path, suffix, kind):
+    write_image(tmp_path / f"a{suffix}", random(133, 57, 3), dtype=kind, alpha=random(133, 57))
+    whole = read_picture(tmp_path / f"a{suffix}")
+    with ImageReader(tmp_path / f"a{suffix}") as reader:
+        assert reader.shape == (133, 57, 3)
+        bands = list(reader.bands(values=57 * 4 * 20))
+        np.testing.assert_array_equal(np.concatenate([pixels for _, pixels in bands]), whole.pixels)
+        starts = [start for start, _ in bands]
+        assert starts[0] == 0
+        assert len(starts) > 2
+        np.testing.assert_array_equal(reader.rows(10, 30), whole.pixels[10:30])
+        np.testing.assert_array_equal(reader.alpha_rows(7, 9), whole.alpha[7:9])
+        assert reader.rows(5, 5).shape == (0, 57, 3)
+        for wrong in ((-1, 3), (0, 134), (5, 4)):
+            with pytest.raises(IndexError):
+                reader.rows(*wrong)
+
+
+def test_a_large_picture_is_read_in_bands(tmp_path, monkeypatch):
+    values = random(200, 30, 3)
+    raw_exr(tmp_path / "a.exr", values, "RGB", tile=16)
+    monkeypatch.setattr("brdf.images.reader.BAND_VALUES", 1000)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.exr"), values)

@@ -1,0 +1,146 @@
+"""What the command writes for others: materials in other programs' words, the report page, pictures."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from project_paths import ROOT
+
+import brdf
+from fitting.cli.main import main
+
+
+def run(capsys: pytest.CaptureFixture[str], *words: object, status: int = 0) -> str:
+    """The command in this process; its output, or its one line of failure."""
+    with pytest.raises(SystemExit) as stop:
+        main([str(word) for word in words])
+    assert (stop.value.code or 0) == status
+    said = capsys.readouterr()
+    if status == 2:
+        assert said.out == ""
+        assert said.err.count("\n") == 1
+        assert said.err.startswith("error: ")
+        return said.err
+    return said.out
+
+
+@pytest.fixture
+def photograph(tmp_path: Path) -> Path:
+    """An 8-bit sRGB picture of a ball off the middle, with ambient light, made without the toolkit's renderer."""
+    x, y = np.meshgrid((np.arange(80) - 42) / 30, -(np.arange(64) - 30) / 30)
+    height = 1 - x**2 - y**2
+    normal = np.stack([x, y, np.sqrt(np.maximum(height, 0))], -1)
+    light = np.array([0.3, 0.5, 0.8]) / np.sqrt(0.98)
+    half = light + np.array([0, 0, 1])
+    half = half / np.linalg.norm(half)
+    lit = np.maximum(normal @ light, 0)[..., None]
+    lobe = np.where(lit > 0, np.maximum(normal @ half, 0)[..., None] ** 20, 0)
+    linear = np.array([0.1, 0.05, 0.02]) + np.array([0.5, 0.2, 0.1]) * lit + 0.3 * lobe
+    linear = np.where(height[..., None] > 0, linear, 0.01)
+    brdf.write_image(tmp_path / "ball.png", linear.astype(np.float32))
+    return tmp_path / "ball.png"
+
+
+def test_convert_by_suffix_says_what_is_lost(capsys, tmp_path: Path):
+    said = run(capsys, "convert", "gold", tmp_path / "gold.gltf")
+    assert f"wrote {tmp_path / 'gold.gltf'}" in said
+    assert "not carried: k_a is left out" in said
+    assert json.loads((tmp_path / "gold.gltf").read_text())["materials"][0]["name"] == "gold"
+
+
+def test_convert_reads_what_it_wrote(capsys, tmp_path: Path):
+    run(capsys, "convert", "cyan plastic", tmp_path / "a.mtl")
+    run(capsys, "convert", tmp_path / "a.mtl", tmp_path / "a.json")
+    assert repr(brdf.load_material(tmp_path / "a.json")) == repr(brdf.preset("cyan_plastic"))
+    assert "not carried" not in run(capsys, "convert", tmp_path / "a.json", tmp_path / "a.glsl")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["gold", "x.fbx"], r"x.fbx: does not say its format, got .fbx. Name it .json"),
+        (["gold", "x.json", "--to", "fbx"], "--to: is unknown, got 'fbx'. Use one of json, mtl, three"),
+        (["unobtainium", "x.json"], "unobtainium: is no material file"),
+        (["gold", "no/such/folder/x.json"], "x.json: there is no such file or folder"),
+    ],
+)
+def test_convert_names_what_is_wrong(capsys, tmp_path: Path, monkeypatch, words: list[str], message: str):
+    monkeypatch.chdir(tmp_path)
+    assert message in run(capsys, "convert", *words, status=2)
+    assert not list(tmp_path.iterdir())
+
+
+def test_photograph_with_ambient_light_gives_its_numbers_and_a_report(capsys, tmp_path: Path, photograph: Path):
+    arguments = ["fit", photograph, "--sphere", "42,30,30", "--light", "0.3,0.5,0.8", "--ambient"]
+    said = run(capsys, *arguments, "--out", tmp_path / "out", "--report", tmp_path / "report.html")
+    assert f"wrote {tmp_path / 'report.html'}" in said
+    found = brdf.load_material(tmp_path / "out" / "material.json")
+    # 8 bits: half a code is 4e-3 of a middle value, over some 2500 pixels.
+    np.testing.assert_allclose(np.asarray(found.k_a), [0.1, 0.05, 0.02], atol=1e-3)
+    np.testing.assert_allclose(np.asarray(found.k_d), [0.5, 0.2, 0.1], atol=2e-3)
+    np.testing.assert_allclose(float(found.n), 20, rtol=5e-3)
+    assert "ball.png" in (tmp_path / "report.html").read_text()
+
+
+def test_ambient_is_for_photographs(capsys, tmp_path: Path, photograph: Path):
+    scene = ROOT / "data" / "gold-ball" / "scene.toml"
+    message = run(capsys, "fit", photograph, "--scene", scene, "--ambient", status=2)
+    assert "--ambient: is what the scene file says" in message
+
+
+def test_check_draws_its_picture(capsys, tmp_path: Path):
+    brdf.save_material(brdf.preset("ruby"), tmp_path / "ruby.json")
+    said = run(capsys, "check", tmp_path / "ruby.json", "--plot", tmp_path / "ruby.png", status=1)
+    assert "not plausible" in said
+    assert brdf.read_image(tmp_path / "ruby.png").shape[0] > 400
+
+
+def test_every_command_knows_the_classic_table(capsys, tmp_path: Path, monkeypatch):
+    scene = ROOT / "data" / "gold-ball" / "scene.toml"
+    monkeypatch.chdir(tmp_path)
+    said = run(capsys, "check", "Emerald", status=1)
+    assert "emerald: not plausible" in said
+    assert re.findall(r"channel (\w+)\.", said) == ["red", "red", "green"]  # as a fit's report names them
+    run(capsys, "render", "cyan plastic", "--scene", scene, "-o", "a.exr")
+    brdf.save_material(brdf.preset("cyan plastic"), tmp_path / "b.json")
+    run(capsys, "render", "b.json", "--scene", scene, "-o", "b.exr")
+    np.testing.assert_array_equal(brdf.read_image(tmp_path / "a.exr"), brdf.read_image(tmp_path / "b.exr"))
+
+
+@pytest.mark.parametrize("words", [["check", "emrald"], ["convert", "emrald", "x.json"], ["render", "emrald"]])
+def test_a_misspelt_name_is_offered_the_right_one(capsys, tmp_path: Path, monkeypatch, words: list[str]):
+    monkeypatch.chdir(tmp_path)
+    more = ["--scene", "scene.toml", "-o", "x.exr"] if words[0] == "render" else []
+    message = run(capsys, *words, *more, status=2)
+    assert message == ("error: emrald: is no material file and no name of the classic table. The table has emerald.\n")
+
+
+def test_a_file_goes_before_a_name(capsys, tmp_path: Path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "gold").write_text("{}")
+    assert "gold: is no material file, got no suffix" in run(capsys, "check", "gold", status=2)
+
+
+@pytest.mark.parametrize(
+    ("words", "help_of"), [(["fit"], "brdf fit"), (["check", "a", "b"], "brdf check"), (["nope"], "brdf")]
+)
+def test_a_usage_error_ends_with_where_help_is(capsys, words: list[str], help_of: str):
+    assert run(capsys, *words, status=2).endswith(f". See {help_of} --help.\n")
+
+
+def test_a_measured_table_is_not_drawn(capsys, tmp_path: Path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "felt.alta").write_text("")
+    message = run(capsys, "check", "felt.alta", "--plot", "felt.png", status=2)
+    assert message.startswith("error: --plot: draws materials, and felt.alta is a measured table. Fit a material to it")
+
+
+def test_an_empty_name_of_a_material_is_told(capsys):
+    with pytest.raises(SystemExit) as exit_status:
+        main(["check", ""])
+    assert exit_status.value.code == 2
+    assert capsys.readouterr().err == (
+        "error: MATERIAL: is empty. Give a .json or .mtl file, or a name such as emerald.\n"
+    )
