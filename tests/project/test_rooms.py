@@ -26,17 +26,8 @@ def test_brdf_imports_neither_fitting_nor_its_solvers(path: Path):
 
 
 @pytest.mark.parametrize("package", ["brdf", "fitting"])
-def test_lazy_names_are_those_that_type_checkers_see(package: str):
+def test_every_public_name_loads(package: str):
     module = importlib.import_module(package)
-    tree = ast.parse((ROOT / package / "__init__.py").read_text(encoding="utf-8"))
-    blocks = [node for node in tree.body if isinstance(node, ast.If)]
-    seen = {
-        alias.asname or alias.name
-        for node in ast.walk(blocks[0])
-        if isinstance(node, ast.ImportFrom)
-        for alias in node.names
-    }
-    assert seen == set(module.__all__)
     for name in module.__all__:
         assert getattr(module, name) is not None
 

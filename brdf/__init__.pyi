@@ -1,0 +1,216 @@
+from .albedo import absorbed_fraction as absorbed_fraction
+from .albedo import directional_albedo as directional_albedo
+from .channels import channel_names as channel_names
+from .conversions import (
+    exponent_from_roughness as exponent_from_roughness,
+)
+from .conversions import (
+    exponent_from_slope as exponent_from_slope,
+)
+from .conversions import (
+    half_from_mirror as half_from_mirror,
+)
+from .conversions import (
+    mirror_from_half as mirror_from_half,
+)
+from .conversions import (
+    nearest_classic as nearest_classic,
+)
+from .conversions import (
+    nearest_normalized as nearest_normalized,
+)
+from .conversions import (
+    roughness_from_exponent as roughness_from_exponent,
+)
+from .conversions import (
+    slope_from_exponent as slope_from_exponent,
+)
+from .display import (
+    displayed as displayed,
+)
+from .display import (
+    lit_sphere as lit_sphere,
+)
+from .display import (
+    material_html as material_html,
+)
+from .display import (
+    png_address as png_address,
+)
+from .display import (
+    report_html as report_html,
+)
+from .errors import InputError as InputError
+from .files import (
+    atomic_folder as atomic_folder,
+)
+from .files import (
+    atomic_path as atomic_path,
+)
+from .files import (
+    check_folder as check_folder,
+)
+from .files import (
+    input_file as input_file,
+)
+from .files import (
+    parse_number as parse_number,
+)
+from .files import (
+    read_text as read_text,
+)
+from .files import (
+    write_text as write_text,
+)
+from .geometry.camera import (
+    Camera as Camera,
+)
+from .geometry.camera import (
+    OrthographicCamera as OrthographicCamera,
+)
+from .geometry.camera import (
+    PerspectiveCamera as PerspectiveCamera,
+)
+from .geometry.meshes import Mesh as Mesh
+from .geometry.meshes import Triangles as Triangles
+from .geometry.meshes import load_mesh as load_mesh
+from .geometry.shapes import Rectangle as Rectangle
+from .geometry.shapes import Shape as Shape
+from .geometry.shapes import Sphere as Sphere
+from .geometry.surface_points import SurfacePoints as SurfacePoints
+from .images.encodings import encode as encode
+from .images.pictures import (
+    ImageReader as ImageReader,
+)
+from .images.pictures import (
+    Picture as Picture,
+)
+from .images.pictures import (
+    read_image as read_image,
+)
+from .images.pictures import (
+    read_layers as read_layers,
+)
+from .images.pictures import (
+    read_mask as read_mask,
+)
+from .images.pictures import (
+    read_picture as read_picture,
+)
+from .images.pictures import (
+    write_image as write_image,
+)
+from .light_images import relight as relight
+from .light_images import render_lights as render_lights
+from .lights.area import PolygonLight as PolygonLight
+from .lights.area import RectangleLight as RectangleLight
+from .lights.area import SphereLight as SphereLight
+from .lights.environment import ConstantEnvironment as ConstantEnvironment
+from .lights.environment import EnvironmentMap as EnvironmentMap
+from .lights.punctual import (
+    DirectionalLight as DirectionalLight,
+)
+from .lights.punctual import (
+    Light as Light,
+)
+from .lights.punctual import (
+    PointLight as PointLight,
+)
+from .lights.punctual import (
+    SpotLight as SpotLight,
+)
+from .materials.exports import (
+    EXPORTS as EXPORTS,
+)
+from .materials.exports import (
+    Export as Export,
+)
+from .materials.exports import (
+    export_material as export_material,
+)
+from .materials.exports import (
+    mitsuba_dict as mitsuba_dict,
+)
+from .materials.exports import (
+    save_export as save_export,
+)
+from .materials.files import (
+    load_material as load_material,
+)
+from .materials.files import (
+    load_materials as load_materials,
+)
+from .materials.files import (
+    material_from_dict as material_from_dict,
+)
+from .materials.files import (
+    material_to_dict as material_to_dict,
+)
+from .materials.files import (
+    save_material as save_material,
+)
+from .materials.presets import PRESETS as PRESETS
+from .materials.presets import preset as preset
+from .measured.merl import merl_table as merl_table
+from .measured.tables import MeasuredBRDF as MeasuredBRDF
+from .measured.tables import is_measured as is_measured
+from .measured.tables import load_measured as load_measured
+from .models import (
+    MODELS as MODELS,
+)
+from .models import (
+    BlinnPhong as BlinnPhong,
+)
+from .models import (
+    Lambert as Lambert,
+)
+from .models import (
+    Material as Material,
+)
+from .models import (
+    NormalizedBlinnPhong as NormalizedBlinnPhong,
+)
+from .models import (
+    NormalizedPhong as NormalizedPhong,
+)
+from .models import (
+    Phong as Phong,
+)
+from .models import (
+    SpecularMaterial as SpecularMaterial,
+)
+from .plausibility.report import Finding as Finding
+from .plausibility.report import Report as Report
+from .plausibility.stability import (
+    StabilityMap as StabilityMap,
+)
+from .plausibility.stability import (
+    stability_map as stability_map,
+)
+from .plausibility.stability import (
+    stability_maps as stability_maps,
+)
+from .plausibility.verdict import check as check
+from .precision import Precision as Precision
+from .precision import cast as cast
+from .precision import working_precision as working_precision
+from .rendering import (
+    Basis as Basis,
+)
+from .rendering import (
+    BasisImages as BasisImages,
+)
+from .rendering import (
+    Lobe as Lobe,
+)
+from .rendering import (
+    basis as basis,
+)
+from .rendering import (
+    basis_images as basis_images,
+)
+from .rendering import (
+    render as render,
+)
+from .scenes.pixel_choice import some_pixels as some_pixels
+from .scenes.scene import Scene as Scene

@@ -1,0 +1,34 @@
+from .accuracy.speed_accuracy import tradeoff as tradeoff
+from .accuracy.speed_table import Tradeoff as Tradeoff
+from .brdf_fit import fit_brdf as fit_brdf
+from .brdf_result import BrdfFitResult as BrdfFitResult
+from .implicit import Sensitivity as Sensitivity
+from .implicit import sensitivity as sensitivity
+from .joint import fit_jointly as fit_jointly
+from .picture_fit import fit as fit
+from .plots.materials import (
+    overview as overview,
+)
+from .plots.materials import (
+    plot_albedo as plot_albedo,
+)
+from .plots.materials import (
+    plot_lobe as plot_lobe,
+)
+from .plots.materials import (
+    plot_reciprocity as plot_reciprocity,
+)
+from .plots.materials import (
+    plot_stability as plot_stability,
+)
+from .relighting import (
+    LightFit as LightFit,
+)
+from .relighting import (
+    fit_lights as fit_lights,
+)
+from .relighting import (
+    fit_lights_and_material as fit_lights_and_material,
+)
+from .result import FitResult as FitResult
+from .result import Parameter as Parameter
