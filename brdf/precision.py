@@ -1,13 +1,13 @@
 """How JAX computes: float32 or float64, chosen per call without touching its global setting, and in which pieces."""
 
 import contextlib
+import importlib.metadata
 import warnings
 from collections.abc import Callable
 from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
-import jaxlib
 import numpy as np
 
 from brdf.errors import InputError
@@ -32,7 +32,7 @@ def warn_of_unsound(version: str) -> None:
         warnings.warn(message, RuntimeWarning, stacklevel=2)
 
 
-warn_of_unsound(jaxlib.__version__)
+warn_of_unsound(importlib.metadata.version("jaxlib"))
 
 
 def working_precision(precision: Precision | None) -> contextlib.AbstractContextManager[Any]:
