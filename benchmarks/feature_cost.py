@@ -14,7 +14,7 @@ import numpy as np
 import brdf
 import fitting
 from benchmarks.tradeoff import BALL, FLOOR, camera, sky
-from fitting.accuracy.stopwatch import take
+from fitting.budget.stopwatch import take
 
 ROUNDS, PATIENCE, SAMPLES = 7, 3.0, 64
 SUN = brdf.DirectionalLight(direction=(0.5, 0.6, 0.7), intensity=1.0)

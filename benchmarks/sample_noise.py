@@ -1,4 +1,4 @@
-"""How far noise puts a fit of a sample of the pixels off: the constants of `fitting.accuracy.first_pixels`.
+"""How far noise puts a fit of a sample of the pixels off: the constants of `fitting.budget.first_pixels`.
 
 ``python -m benchmarks.sample_noise [SCENES]`` draws balls under one to three lights with random materials, shiny and
 matt ones, fits a sample of each, and prints the median and the quartiles of its error (95 %, of the worst parameter),
@@ -11,11 +11,11 @@ import numpy as np
 
 import brdf
 from benchmarks.tradeoff import OPTIONS, scene
-from fitting.accuracy.configurations import Configuration, run
-from fitting.accuracy.first_pixels import FIRST_PIXELS, noise_and_size
-from fitting.accuracy.lamps import Lamps
-from fitting.accuracy.linear_system import System
-from fitting.accuracy.sampling_error import estimate
+from fitting.budget.configurations import Configuration, run
+from fitting.budget.first_pixels import FIRST_PIXELS, noise_and_size
+from fitting.budget.lamps import Lamps
+from fitting.budget.linear_system import System
+from fitting.budget.sampling_error import estimate
 
 
 def drawn(random: np.random.Generator, *, shiny: bool) -> tuple[brdf.Scene, brdf.Material]:

@@ -13,10 +13,10 @@ import numpy as np
 
 import brdf
 import fitting
-from fitting.accuracy.configurations import Configuration, run
-from fitting.accuracy.deviation import deviation
-from fitting.accuracy.lamps import Lamps, extended
-from fitting.accuracy.reference import reference
+from fitting.budget.configurations import Configuration, run
+from fitting.budget.deviation import deviation
+from fitting.budget.lamps import Lamps, extended
+from fitting.budget.reference import reference
 
 ACCURACIES = (1e-1, 1e-2, 1e-3, 1e-4)
 OPTIONS = {"n_range": (0.1, 1e6), "mask": None, "saturation": None}

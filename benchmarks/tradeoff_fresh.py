@@ -2,7 +2,7 @@
 
 ``python -m benchmarks.tradeoff_fresh [SIZE ...]`` fits a ball of SIZE x SIZE pixels in new processes: all pixels, and
 to an accuracy of 1e-2 with the choice among the pixels forced. It prints the seconds of each fit with an empty cache of
-compiled programs and with a full one: `fitting.accuracy.budget` has its constants from their differences.
+compiled programs and with a full one: `fitting.budget.budget` has its constants from their differences.
 """
 
 import os

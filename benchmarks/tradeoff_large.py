@@ -12,7 +12,7 @@ import numpy as np
 import brdf
 import fitting
 from benchmarks.tradeoff import camera, material, scene
-from fitting.accuracy.deviation import parameter_deviation
+from fitting.budget.deviation import parameter_deviation
 
 ROUNDS, ACCURACY, NOISE = 5, 1e-2, 0.01
 

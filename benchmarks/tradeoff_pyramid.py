@@ -12,9 +12,9 @@ import numpy as np
 import brdf
 import fitting
 from benchmarks.tradeoff import OPTIONS, SIZE, camera, material, scene
-from fitting.accuracy.configurations import Configuration, run
-from fitting.accuracy.deviation import parameter_deviation
-from fitting.accuracy.lamps import Lamps
+from fitting.budget.configurations import Configuration, run
+from fitting.budget.deviation import parameter_deviation
+from fitting.budget.lamps import Lamps
 
 EXPONENTS, NOISES = (10.0, 60.0, 400.0, 2000.0), (0.0, 0.01, 0.1)
 # The subsample takes about twice the number it is asked for.

@@ -1,5 +1,3 @@
-from .accuracy.speed_accuracy import tradeoff as tradeoff
-from .accuracy.speed_table import Tradeoff as Tradeoff
 from .brdf_fit import fit_brdf as fit_brdf
 from .brdf_result import BrdfFitResult as BrdfFitResult
 from .implicit import Sensitivity as Sensitivity
@@ -32,3 +30,5 @@ from .relighting import (
 )
 from .result import FitResult as FitResult
 from .result import Parameter as Parameter
+from .speed_accuracy import tradeoff as tradeoff
+from .speed_table import Tradeoff as Tradeoff

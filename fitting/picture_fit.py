@@ -78,7 +78,7 @@ def fit(
         plausible: hold k_d + k_s <= 1 inside the fit, with a normalised form or Lambert, so that `brdf.check` passes;
             see `fitting.plausible`.
         accuracy: relative error that is good enough: the cheapest number of pixels and light samples and the cheapest
-            precision that keep it are chosen, see `fitting.accuracy.budget`; the result's ``choice`` says which and
+            precision that keep it are chosen, see `fitting.budget.budget`; the result's ``choice`` says which and
             why. None looks at all pixels under the lights as they are.
         seconds: the same for the time to spend; what it buys is the most accurate fit.
 
@@ -101,7 +101,7 @@ def fit(
         raise InputError("loss", f"is unknown, got {loss!r}", f"Use one of {', '.join(LOSSES)}")
     check_range(n_range)
     if accuracy is not None or seconds is not None:
-        from fitting.accuracy.budget import fit_within
+        from fitting.budget.budget import fit_within
 
         if any(isinstance(one, brdf.ImageReader) for one in targets):
             words = "is read by bands of rows; accuracy and seconds choose among pixels in memory"

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 import brdf
-from fitting.accuracy.budget_choice import BudgetChoice
+from fitting.budget.budget_choice import BudgetChoice
 from fitting.engine.separable import Optimum
 from fitting.selection import Candidate
 

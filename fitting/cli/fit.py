@@ -126,7 +126,7 @@ def _fit_pictures(
     tell("fitting")
     with held():
         use_compilation_cache()
-        from fitting.accuracy.first_pixels import single_fit
+        from fitting.budget.first_pixels import single_fit
         from fitting.cli.encoding_trial import fit_either
         from fitting.cli.inputs import collect
         from fitting.photographs.light_files import parse_numbers

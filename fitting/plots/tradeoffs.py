@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from fitting.accuracy.speed_table import Row, Tradeoff
+from fitting.speed_table import Row, Tradeoff
 
 # Colours that colour-blind readers tell apart (Okabe and Ito 2008), and marks that print in black and white.
 LOOKS = {

@@ -6,8 +6,8 @@ import pytest
 
 import brdf
 import fitting
-from fitting.accuracy.deviation import parameter_deviation
-from fitting.accuracy.trials import Bench
+from fitting.budget.deviation import parameter_deviation
+from fitting.budget.trials import Bench
 from fitting.cli.main import main
 from fitting.cut_noise import BLACK, WHITE, without_cut_noise
 from fitting.photographs.ball import ball_points, photograph_scene

@@ -10,9 +10,9 @@ from ball_scenes import MATERIAL, ball, noisy
 import brdf
 import fitting
 from brdf.shading.visibility import OFFSET
-from fitting.accuracy import budget, sampling_error
-from fitting.accuracy.deviation import deviation
-from fitting.accuracy.sampling_error import Estimate
+from fitting.budget import budget, sampling_error
+from fitting.budget.deviation import deviation
+from fitting.budget.sampling_error import Estimate
 
 
 @pytest.mark.parametrize("share", [0.0, 0.03])

@@ -7,8 +7,8 @@ import pytest
 from ball_scenes import MATERIAL, ball
 
 import brdf
-from fitting.accuracy.lamps import Lamps, with_samples
-from fitting.accuracy.pixel_sampling import sample_pixels
+from fitting.budget.lamps import Lamps, with_samples
+from fitting.budget.pixel_sampling import sample_pixels
 
 
 @pytest.mark.parametrize("kind", ["one ball", "two shapes", "points", "area"])

@@ -6,7 +6,7 @@ from ball_scenes import MATERIAL, ball, noisy
 
 import brdf
 import fitting
-from fitting.accuracy import first_pixels
+from fitting.budget import first_pixels
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-3, 0.03])

@@ -12,10 +12,10 @@ from ball_scenes import ball, noisy
 
 import brdf
 import fitting
-from fitting.accuracy.configurations import Configuration
-from fitting.accuracy.speed_table import Row, Tradeoff
-from fitting.accuracy.stopwatch import take
+from fitting.budget.configurations import Configuration
+from fitting.budget.stopwatch import take
 from fitting.cli.main import main
+from fitting.speed_table import Row, Tradeoff
 
 
 def row(name, seconds, error, work, **changes):

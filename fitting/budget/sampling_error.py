@@ -1,7 +1,7 @@
 """How far a cheap fit is from the dear one, told beforehand: from a few pixels of the cheap fit alone.
 
 At the optimum θ of a cheap fit, with the normal matrix H, residual r and derivatives J of its parameters
-(`fitting.accuracy.linear_system`), everything that makes the fit cheap is a shift of θ to first order:
+(`fitting.budget.linear_system`), everything that makes the fit cheap is a shift of θ to first order:
 
 * pixels left out: their scores w Jᵀr are missing. The variance V of that sum gives the covariance H⁻¹ V H⁻¹ of θ. Where
   the model is exact and there is no noise, no pixel is missed.
@@ -23,9 +23,9 @@ import numpy as np
 from jaxtyping import Float
 
 import brdf
-from fitting.accuracy.linear_system import System
-from fitting.accuracy.pixel_sampling import traceable
-from fitting.accuracy.probes import columns_in, crossed, difference, shadow_changes
+from fitting.budget.linear_system import System
+from fitting.budget.pixel_sampling import traceable
+from fitting.budget.probes import columns_in, crossed, difference, shadow_changes
 from fitting.engine.separable import Optimum
 
 DRAWS = 512
@@ -62,7 +62,7 @@ class Shifts(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """The error of a cheap fit, relative: see `fitting.accuracy.deviation`.
+    """The error of a cheap fit, relative: see `fitting.budget.deviation`.
 
     Attributes:
         error: its median.

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 import brdf
-from fitting.accuracy.lamps import with_lights, with_samples
+from fitting.budget.lamps import with_lights, with_samples
 
 # Of the squares of each size this share is cut further.
 CUT = 1 / 12

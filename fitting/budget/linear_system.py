@@ -3,7 +3,7 @@
 With the residual r and the derivatives J of the model by the parameters at some pixels of weight w: the normal matrix
 H = Σ w JᵀJ and its inverse, the Newton step's right-hand side Σ w Jᵀr, the variance of that sum by the choice of the
 pixels, and what a shift of the parameters is relative to. What is wrong with a cheap fit is told with it in
-`fitting.accuracy.sampling_error`, and a reference is refined by it in `fitting.accuracy.reference`.
+`fitting.budget.sampling_error`, and a reference is refined by it in `fitting.budget.reference`.
 
 The variance of a stratified sum with one pixel per stratum is taken from the differences of neighbouring strata
 (Cochran 1977, Sampling Techniques, section 5A.12).
@@ -17,11 +17,11 @@ import numpy as np
 from jaxtyping import Float
 
 import brdf
-from fitting.accuracy.configurations import Run, casts_shadows, one_each, some_of_target, target_size
-from fitting.accuracy.deviation import SMALLEST
-from fitting.accuracy.lamps import Lamps
-from fitting.accuracy.pixel_sampling import PixelSample, sample_pixels, traceable
-from fitting.accuracy.probes import Probe, probe
+from fitting.budget.configurations import Run, casts_shadows, one_each, some_of_target, target_size
+from fitting.budget.deviation import SMALLEST
+from fitting.budget.lamps import Lamps
+from fitting.budget.pixel_sampling import PixelSample, sample_pixels, traceable
+from fitting.budget.probes import Probe, probe
 from fitting.interpretation import coefficient_factors
 from fitting.light_colour import take_colour_out
 from fitting.uncertainty.covariance import TERMS

@@ -17,15 +17,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import brdf
-from fitting.accuracy.budget import MOST_SAMPLES, WHOLE
-from fitting.accuracy.configurations import Configuration, casts_shadows, run, some_of_target, target_size
-from fitting.accuracy.deviation import parameter_deviation
-from fitting.accuracy.lamps import Lamps, extended
-from fitting.accuracy.pixel_sampling import sample_pixels
-from fitting.accuracy.reference import reference, under_many_samples
-from fitting.accuracy.speed_table import Row
-from fitting.accuracy.stopwatch import Taken
+from fitting.budget.budget import MOST_SAMPLES, WHOLE
+from fitting.budget.configurations import Configuration, casts_shadows, run, some_of_target, target_size
+from fitting.budget.deviation import parameter_deviation
+from fitting.budget.lamps import Lamps, extended
+from fitting.budget.pixel_sampling import sample_pixels
+from fitting.budget.reference import reference, under_many_samples
+from fitting.budget.stopwatch import Taken
 from fitting.result import FitResult
+from fitting.speed_table import Row
 
 PIXELS = (1024, 4096, 16384, 65536, 262144)
 # Pixels of the reference under lights with an extent, and of the solvers that keep a Jacobian.

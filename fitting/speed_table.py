@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 import brdf
-from fitting.accuracy.configurations import Configuration
+from fitting.budget.configurations import Configuration
 
 # From so many runs on a median decides.
 STEADY = 3
@@ -31,7 +31,7 @@ class Row:
         peak: bytes of resident memory that a run took beyond what was resident before it; None where unknown.
         rms: error of the picture, root mean square over that of the reference's picture.
         worst: its largest error, in the same unit.
-        parameters: error of the parameters, see `fitting.accuracy.deviation`.
+        parameters: error of the parameters, see `fitting.budget.deviation`.
         work: pixels times light samples, twice for float64: what the time grows with.
     """
 

@@ -1,11 +1,11 @@
 """``fit(accuracy=...)`` and ``fit(seconds=...)``: the cheapest fit that is good enough, the best that is quick enough.
 
 The first attempt is cheap: some 1000 pixels of a picture, more where its noise asks for more
-(`fitting.accuracy.first_pixels`), all of a small one; 16 samples of a light with an extent; float32. From its own
-pixels it tells its error and what makes it (`fitting.accuracy.sampling_error`), so the next attempt changes just that:
+(`fitting.budget.first_pixels`), all of a small one; 16 samples of a light with an extent; float32. From its own
+pixels it tells its error and what makes it (`fitting.budget.sampling_error`), so the next attempt changes just that:
 more pixels by the square of what is missing, more light samples as far as four times as many still change the answer,
 float64 where rounding counts. Mostly one or two attempts do. The error is that against a fit of all pixels in float64
-with `MOST_SAMPLES` samples of each light, and is the larger one of what `fitting.accuracy.deviation` says of the
+with `MOST_SAMPLES` samples of each light, and is the larger one of what `fitting.budget.deviation` says of the
 parameters and of the picture.
 """
 
@@ -20,12 +20,12 @@ import numpy as np
 
 import brdf
 from brdf.errors import InputError
-from fitting.accuracy.budget_choice import Attempt, BudgetChoice
-from fitting.accuracy.configurations import Configuration, Run, casts_shadows, run, target_size
-from fitting.accuracy.first_pixels import FIRST_PIXELS, NOISY, TOO_MANY, first_pixels, reason_for_all
-from fitting.accuracy.lamps import Lamps, extended
-from fitting.accuracy.linear_system import System
-from fitting.accuracy.sampling_error import (
+from fitting.budget.budget_choice import Attempt, BudgetChoice
+from fitting.budget.configurations import Configuration, Run, casts_shadows, run, target_size
+from fitting.budget.first_pixels import FIRST_PIXELS, NOISY, TOO_MANY, first_pixels, reason_for_all
+from fitting.budget.lamps import Lamps, extended
+from fitting.budget.linear_system import System
+from fitting.budget.sampling_error import (
     MARGIN,
     STEP,
     Estimate,

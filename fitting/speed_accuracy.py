@@ -1,6 +1,6 @@
 """Speed against accuracy, measured on the user's own scene.
 
-What is tried is in `fitting.accuracy.trials`. Each configuration runs once with cold caches, once warm, and then in
+What is tried is in `fitting.budget.trials`. Each configuration runs once with cold caches, once warm, and then in
 rounds, every round in another order (fixed seed), so that a machine that grows slower or quicker favours none. The
 compiler's time is taken out of every run. What takes long, or compiles anew each time, runs once.
 """
@@ -13,9 +13,9 @@ import numpy as np
 
 import brdf
 from brdf.errors import InputError
-from fitting.accuracy.speed_table import Tradeoff
-from fitting.accuracy.stopwatch import Taken, take
-from fitting.accuracy.trials import Bench, Trial
+from fitting.budget.stopwatch import Taken, take
+from fitting.budget.trials import Bench, Trial
+from fitting.speed_table import Tradeoff
 
 MOST_ROUNDS = 9
 # What takes longer than this is run once: beside it cold caches count for nothing.

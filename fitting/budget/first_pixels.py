@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 import brdf
-from fitting.accuracy.configurations import one_each, share_counted, target_size
+from fitting.budget.configurations import one_each, share_counted, target_size
 from fitting.picture_inputs import looked_at
 
 FIRST_PIXELS = 1024

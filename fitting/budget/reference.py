@@ -12,10 +12,10 @@ import equinox as eqx
 import numpy as np
 
 import brdf
-from fitting.accuracy.budget import MOST_SAMPLES
-from fitting.accuracy.configurations import Configuration, Run, run, target_size
-from fitting.accuracy.lamps import Lamps, extended
-from fitting.accuracy.linear_system import System
+from fitting.budget.budget import MOST_SAMPLES
+from fitting.budget.configurations import Configuration, Run, run, target_size
+from fitting.budget.lamps import Lamps, extended
+from fitting.budget.linear_system import System
 from fitting.interpretation import coefficient_factors
 from fitting.light_colour import take_colour_out
 from fitting.result import FitResult

@@ -13,8 +13,8 @@ import numpy as np
 
 import brdf
 from brdf.errors import InputError
-from fitting.accuracy.lamps import Lamps
-from fitting.accuracy.pixel_sampling import PixelSample, sample_pixels
+from fitting.budget.lamps import Lamps
+from fitting.budget.pixel_sampling import PixelSample, sample_pixels
 from fitting.picture_inputs import looked_at
 from fitting.result import FitResult
 
