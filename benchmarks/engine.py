@@ -19,9 +19,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from fitting.engine import polishing, profile, separable, thinning
-from fitting.engine import sums as summing
-from fitting.engine.separable import OneLightLobe, Picture, search
+from fitting.solver import normal_equations, profile, refinement, subsample
+from fitting.solver.normal_equations import OneLightLobe, Picture
+from fitting.solver.profile import search
 
 N = 80.0
 TO_LIGHT = np.array([0.5, 0.6, 0.7]) / np.linalg.norm([0.5, 0.6, 0.7])
@@ -104,17 +104,17 @@ def parts(picture: Picture, repeats: int) -> None:
         setattr(module, name, outer)
 
     for module, name in [
-        (separable, "thin"),
-        (thinning, "_octaves"),
-        (thinning, "_chosen"),
-        (separable, "rough_model"),
-        (summing, "_many_exponents"),
-        (polishing, "_solve_bracket"),
-        (polishing, "_correct"),
+        (profile, "subsample"),
+        (subsample, "_octaves"),
+        (subsample, "_chosen"),
+        (profile, "rough_model"),
+        (normal_equations, "_many_exponents"),
+        (refinement, "_solve_bracket"),
+        (refinement, "_correct"),
         (profile, "solve_linear"),
         (profile, "spread"),
-        (summing, "_one_exponent"),
-        (summing, "_unpack"),
+        (normal_equations, "_one_exponent"),
+        (normal_equations, "_unpack"),
     ]:
         timed(module, name)
     search([picture])

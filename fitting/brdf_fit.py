@@ -16,8 +16,9 @@ import brdf
 from brdf.errors import InputError
 from fitting.brdf_losses import Loss, Samples, logarithmic, losses_of
 from fitting.brdf_result import HALF, BrdfCandidate, BrdfFitResult, lowest_cosine
-from fitting.engine.separable import OneLightLobe, Optimum, Picture, fit_linear, search
 from fitting.result import Parameter
+from fitting.solver.normal_equations import OneLightLobe, Picture
+from fitting.solver.profile import Optimum, fit_linear, search
 from fitting.uncertainty.covariance import residual_noise, uncertainty
 
 N_RANGE = (0.1, 1e6)

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitting.brdf_result import Losses
-from fitting.engine.separable import Optimum
+from fitting.solver.profile import Optimum
 
 Loss = Literal["cosine", "squared", "log"]
 

@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 import brdf
-from fitting.engine.separable import Optimum
-from fitting.engine.sums import Picture
 from fitting.missing_ambient import missing_ambient
 from fitting.result import Parameter
+from fitting.solver.normal_equations import Picture
+from fitting.solver.profile import Optimum
 from fitting.uncertainty.covariance import TERMS, Uncertainty, residual_noise, uncertainty
 from fitting.uncertainty.intervals import exponent_interval
 from fitting.uncertainty.noise_model import weighted_sums
@@ -34,7 +34,7 @@ class ModelFit(NamedTuple):
         free: which coefficients could be above 0, (3, C).
         n_range: between which exponents the optimum was searched.
         tied: x_s is a common factor times this, (C,); None where the channels are independent.
-        noise_factor: see `fitting.engine.losses.Reweighted`.
+        noise_factor: see `fitting.solver.losses.Reweighted`.
         capped: k_d + k_s is held at 1 in some channel.
     """
 

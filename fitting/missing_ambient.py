@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fitting.engine.pictures import Picture
+from fitting.solver.normal_equations import Picture
 
 # The dark side shows at least this share of the mean of the lit one, and so many of its own standard errors.
 SHARE, DEVIATIONS = 0.02, 5.0

@@ -9,12 +9,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 import brdf
-from fitting.engine.losses import Loss, reweight
-from fitting.engine.separable import Optimum, Picture, fit_linear, search
-from fitting.engine.streams import each, joined
 from fitting.interpretation import ModelFit
 from fitting.light_colour import LightColour
 from fitting.observation import TILE_PIXELS, Observation, Tile
+from fitting.solver.losses import Loss, reweight
+from fitting.solver.normal_equations import Picture
+from fitting.solver.profile import Optimum, fit_linear, search
+from fitting.solver.streams import each, joined
 from fitting.uncertainty.structure import nearest_peak
 
 # The nearest pixel shows exp(-UNSEEN) of a highlight's peak, or more, or the exponent is not looked at.

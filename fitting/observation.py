@@ -1,7 +1,7 @@
 """What a fit looks at: the pixels of a picture that count.
 
 A large picture is looked at a band of rows at a time: what its pixels see takes three times the memory of the picture,
-and what the engine needs of that a third of it. A picture in a file is not even kept itself: `fitting.engine.streams`.
+and what the engine needs of that a third of it. A picture in a file is not even kept itself: `fitting.solver.streams`.
 """
 
 from collections.abc import Sequence
@@ -14,9 +14,9 @@ from jaxtyping import Array, Bool, Float
 
 import brdf
 from brdf.errors import InputError
-from fitting.engine.streams import Stream, each
 from fitting.picture_inputs import check_levels, check_sizes, check_weight, per_pixel, pixels_of
 from fitting.pixel_survey import FLAT, SYMMETRIC_PIXELS, TOP, Survey, inverse_variance, lit_at_top, survey
+from fitting.solver.streams import Stream, each
 
 # How many pixels are looked at together; of a file at least as many rows as its blocks hold, or these are read twice.
 TILE_PIXELS = 1 << 18

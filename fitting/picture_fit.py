@@ -11,7 +11,6 @@ import brdf
 from brdf.errors import InputError
 from fitting.auto_fit import fit_simplest
 from fitting.cut_noise import warned_of_cut_noise, without_cut_noise
-from fitting.engine.losses import LOSSES, Loss
 from fitting.interpretation import Interpretation, ModelFit, interpret
 from fitting.light_colour import take_colour_out
 from fitting.model_fit import Job, fit_model, reached, without_highlight
@@ -30,6 +29,7 @@ from fitting.picture_inputs import (
 from fitting.plausible import fit_plausible, is_plausible
 from fitting.result import FitResult, free_parameters
 from fitting.selection import Choice
+from fitting.solver.losses import LOSSES, Loss
 from fitting.uncertainty.covariance import TERMS
 
 N_RANGE = (0.1, 1e6)
@@ -69,7 +69,7 @@ def fit(
             integer file, or the largest value where many pixels share it exactly.
         n_range: bounds of the exponent, 0 < lower < upper.
         loss: "squared"; "relative" or "log" for high dynamic range; "huber" or "cauchy" where some pixels show what the
-            scene does not know. See `fitting.engine.losses` for what to use when.
+            scene does not know. See `fitting.solver.losses` for what to use when.
         dark: linear value up to which pixels are too dark to count. By the value itself: where noise is large that
             leaves out what noise made darker, and ``noise`` is the better way.
         noise: of the camera, (read, shot): the variance of a value is read² + shot · value, and pixels weigh by its
@@ -88,7 +88,7 @@ def fit(
     Raises:
         InputError: naming the argument, where it cannot be used.
 
-    Source: Golub and Pereyra 1973, variable projection; see `fitting.engine.separable`.
+    Source: Golub and Pereyra 1973, variable projection; see `fitting.solver.profile`.
     """
     start = time.perf_counter()
     targets, scenes, masks, weights = pictures_and_scenes(target, scene, mask, weight)

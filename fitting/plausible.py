@@ -17,11 +17,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 import brdf
-from fitting.engine.pictures import Picture
-from fitting.engine.separable import Optimum
-from fitting.engine.sums import Sums, sums
-from fitting.engine.thinning import thin
 from fitting.interpretation import coefficient_factors
+from fitting.solver.normal_equations import Picture, Sums, sums
+from fitting.solver.profile import Optimum
+from fitting.solver.subsample import subsample
 
 GRID_STEP = 0.35
 # The grid looks at so many pixels of each picture, the polishing at all.
@@ -96,7 +95,7 @@ def _search(pictures: Collection[Picture], optimum: Optimum, bound: _Bound, n_ra
         return _at(pictures, optimum, None, bound)
     low, high = math.log(n_range[0]), math.log(n_range[1])
     grid = np.linspace(low, high, max(2, 1 + math.ceil((high - low) / GRID_STEP)))
-    sample = [thin(picture, SAMPLE_SIZE, n_range[1]).picture for picture in pictures]
+    sample = [subsample(picture, SAMPLE_SIZE, n_range[1]).picture for picture in pictures]
     reference = np.zeros((optimum.x.shape[1], 3))
     parts = sums(sample, grid, reference, grid=True)
     rough = np.array(

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 
 import brdf
 from brdf.errors import InputError
-from fitting.engine.active_set import DEPENDENT, nonnegative_minimum
+from fitting.solver.nnls import DEPENDENT, nonnegative_minimum
 
 UNKNOWN_FACTOR = (
     "one factor per channel between material and lights: the lights' mean intensity was kept at that of the scene"

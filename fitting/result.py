@@ -12,8 +12,8 @@ from jaxtyping import Float
 
 import brdf
 from fitting.budget.budget_choice import BudgetChoice
-from fitting.engine.separable import Optimum
 from fitting.selection import Candidate
+from fitting.solver.profile import Optimum
 
 NOT_DETERMINED = "not determined"
 # Beyond this relative error an interval of n is told: it is no longer symmetric.

@@ -24,10 +24,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from fitting.engine.active_set import nonnegative_minimum
-from fitting.engine.normal import Normal, design_of, normal_equations
-from fitting.engine.separable import Optimum
-from fitting.engine.sums import Sums
+from fitting.solver.nnls import nonnegative_minimum
+from fitting.solver.normal_equations import Sums
+from fitting.solver.profile import Optimum
+from fitting.solver.tied import NormalEquations, design_of, join_channels
 
 # How many unknowns a searched exponent counts.
 SEARCHED = 4.0
@@ -102,7 +102,12 @@ class _Trial(NamedTuple):
 
 
 def _try(
-    model: str, free: np.ndarray, tied: np.ndarray | None, normal: Normal, plain: Normal, n: float = 1.0
+    model: str,
+    free: np.ndarray,
+    tied: np.ndarray | None,
+    normal: NormalEquations,
+    plain: NormalEquations,
+    n: float = 1.0,
 ) -> _Trial:
     design = design_of(free, tied)
     signed = np.zeros(design.shape[1], bool)
@@ -134,7 +139,7 @@ def _try(
     )
 
 
-def _squares(normal: Normal, solution: np.ndarray) -> float:
+def _squares(normal: NormalEquations, solution: np.ndarray) -> float:
     return float(max(normal.square - 2 * normal.product @ solution + solution @ normal.gram @ solution, 0.0))
 
 
@@ -166,8 +171,8 @@ def choose(
     for name, fit in fits.items():
         parts = whitened.get(name, fit)
         unit = np.full(channels, inflation**2) if whitened else variance
-        normals[name] = normal_equations(parts.gram, parts.product, parts.square, fit.x[2], unit)
-        plain[name] = normal_equations(fit.gram, fit.product, fit.square, fit.x[2], np.ones(channels))
+        normals[name] = join_channels(parts.gram, parts.product, parts.square, fit.x[2], unit)
+        plain[name] = join_channels(fit.gram, fit.product, fit.square, fit.x[2], np.ones(channels))
     first = next(iter(normals.values())), next(iter(plain.values()))
     for name, terms in zip(FAMILIES, ([no, no], [free[0], no], [no, free[1]]), strict=True):
         if name != "ambient" or free[0].any():
@@ -187,7 +192,7 @@ def choose(
     return _decide(shown, normals, variance, count)
 
 
-def _decide(trials: list[_Trial], normals: dict[str, Normal], variance: np.ndarray, count: float) -> Choice:
+def _decide(trials: list[_Trial], normals: dict[str, NormalEquations], variance: np.ndarray, count: float) -> Choice:
     expected = np.array([trial.cost + 2 * trial.effective for trial in trials])
     bic = np.array([trial.cost + trial.unknowns * np.log(count) for trial in trials])
     best = int(np.argmin(expected))
@@ -229,7 +234,7 @@ def _decide(trials: list[_Trial], normals: dict[str, Normal], variance: np.ndarr
     )
 
 
-def _distance(one: _Trial, other: _Trial, normals: dict[str, Normal]) -> float:
+def _distance(one: _Trial, other: _Trial, normals: dict[str, NormalEquations]) -> float:
     """Squared distance of two candidates' pictures, in noise variances.
 
     Two models with different highlights share no Gram matrix; there the difference of their costs stands in, which is

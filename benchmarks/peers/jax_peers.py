@@ -13,7 +13,7 @@ import brdf
 import fitting
 from benchmarks import engine
 from benchmarks.peers.problem import NOISE, Answer, Problem, Run, Trace
-from fitting.engine.separable import search
+from fitting.solver.profile import search
 
 # Where a solver may stop: relative changes as small as sums in each precision can show.
 TOLERANCE = {"float32": 1e-6, "float64": 1e-8}

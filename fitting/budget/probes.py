@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 import brdf
-from fitting.engine.pictures import AnyArray
+from fitting.solver.normal_equations import AnyArray
 
 
 class Probe(NamedTuple):

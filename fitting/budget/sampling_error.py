@@ -26,7 +26,7 @@ import brdf
 from fitting.budget.linear_system import System
 from fitting.budget.pixel_sampling import traceable
 from fitting.budget.probes import columns_in, crossed, difference, shadow_changes
-from fitting.engine.separable import Optimum
+from fitting.solver.profile import Optimum
 
 DRAWS = 512
 # Columns of length 1 that leave less than this of one another make float32 lose most of its digits.

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from fitting.engine.separable import Optimum
+from fitting.solver.profile import Optimum
 from fitting.uncertainty.intervals import NORMAL_95, above_zero
 
 # A squared column keeps less than this of itself when the others are taken out: the two tell the same story.

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from fitting.engine.active_set import nonnegative_minimum
-from fitting.engine.normal import grey_design, normal_equations
-from fitting.engine.polishing import solve_within
-from fitting.engine.separable import Optimum
-from fitting.engine.sums import Picture, Sums, sums
+from fitting.solver.nnls import nonnegative_minimum
+from fitting.solver.normal_equations import Picture, Sums, sums
+from fitting.solver.profile import Optimum
+from fitting.solver.refinement import solve_within
+from fitting.solver.tied import grey_design, join_channels
 
 NORMAL_95 = 1.959963984540054
 ONE_SIDED_95 = 1.6448536269514722
@@ -94,7 +94,7 @@ def _tied_profile(
         basis[2, 2:] = [1.0, t * width, t * t * (3 - 2 * t), t * t * (t - 1) * width]
         basis[3] = 0.0
         gram = basis @ about.gram @ basis.T
-        normal = normal_equations(gram, about.product @ basis.T, about.square, reference[:, 2], np.ones(tied.size))
+        normal = join_channels(gram, about.product @ basis.T, about.square, reference[:, 2], np.ones(tied.size))
         design = grey_design(free, tied)[:, :-1]
         gram, product = design.T @ normal.gram @ design, design.T @ normal.product
         x = nonnegative_minimum(gram, product)
@@ -143,7 +143,7 @@ def exponent_interval(
     limit = float(np.sum(optimum.cost)) + rise
     tolerance = np.float64(2e-7 if single else 1e-14)
 
-    # Relative to the nearest pixel the lobe keeps its size where no pixel sees the centre; see `fitting.engine.sums`.
+    # Relative to the nearest pixel the lobe keeps its size where no pixel sees the centre.
     reference = optimum.x.T * [1.0, 1.0, math.exp(optimum.n * peak)]
 
     def costs(low: float, high: float) -> np.ndarray:

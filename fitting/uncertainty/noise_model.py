@@ -18,11 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.engine.active_set import nonnegative_minimum
-from fitting.engine.pictures import AnyArray, Picture
-from fitting.engine.separable import Optimum
-from fitting.engine.streams import each
-from fitting.engine.sums import Sums, sums
+from fitting.solver.nnls import nonnegative_minimum
+from fitting.solver.normal_equations import AnyArray, Picture, Sums, sums
+from fitting.solver.profile import Optimum
+from fitting.solver.streams import each
 
 # A correlation of squared residual and value within so many of its standard errors is chance.
 CHANCE = 4.0

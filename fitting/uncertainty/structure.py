@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from fitting.engine.pictures import AnyArray, Picture
-from fitting.engine.separable import Optimum
+from fitting.solver.normal_equations import AnyArray, Picture
+from fitting.solver.profile import Optimum
 from fitting.uncertainty.noise_model import NoiseModel, noise_model
 
 # Pairs of neighbours that are looked at in all: a correlation is then known to 1 %.

@@ -6,7 +6,7 @@ from scipy import optimize
 
 import brdf
 import fitting
-from fitting.engine.losses import CAUCHY, DARKEST, HUBER, weights
+from fitting.solver.losses import CAUCHY, DARKEST, HUBER, weights
 
 CAMERA = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=(48, 48))
 BALL = brdf.Sphere(center=[0, 0, 0], radius=1)

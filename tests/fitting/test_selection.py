@@ -6,7 +6,7 @@ from scipy import optimize
 
 import brdf
 import fitting
-from fitting.engine.active_set import nonnegative_minimum
+from fitting.solver.nnls import nonnegative_minimum
 
 CAMERA = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=(64, 64))
 BALL = brdf.Sphere(center=[0, 0, 0], radius=1)

@@ -9,8 +9,8 @@ import pytest
 import brdf
 import fitting
 from fitting import observation
-from fitting.engine.streams import Stream, each, joined
 from fitting.model_fit import fit_model
+from fitting.solver.streams import Stream, each, joined
 
 MATERIAL = brdf.BlinnPhong(k_a=[0.05, 0.04, 0.03], k_d=[0.5, 0.3, 0.1], k_s=[0.3, 0.25, 0.2], n=60.0)
 SIZE = (96, 90)

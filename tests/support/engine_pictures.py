@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import nnls
 
-from fitting.engine.separable import OneLightLobe, Picture
+from fitting.solver.normal_equations import OneLightLobe, Picture
 
 X = np.array([[0.05, 0.03, 0.02], [0.5, 0.3, 0.1], [0.3, 0.4, 0.5]])
 

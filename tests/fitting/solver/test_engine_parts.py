@@ -6,11 +6,10 @@ import pytest
 from engine_pictures import best_at, cost_of, picture
 from scipy.optimize import nnls
 
-from fitting.engine.nonnegative import solve
-from fitting.engine.pictures import Picture
-from fitting.engine.polishing import Point, Polisher, Problem
-from fitting.engine.sums import sums
-from fitting.engine.thinning import thin
+from fitting.solver.enumeration import solve
+from fitting.solver.normal_equations import Picture, sums
+from fitting.solver.refinement import Point, Polisher, Problem
+from fitting.solver.subsample import subsample
 
 
 @pytest.mark.parametrize("columns", [0, 1, 2])
@@ -66,13 +65,13 @@ def test_nonnegative_solver_against_scipy():
 def test_subsample_keeps_the_innermost_pixels_and_the_totals():
     one = picture(512, light=(0.2, 0.1, 1.0))
     with jax.enable_x64(True):
-        thinned = thin(one, 4096, 1e6)
+        sample = subsample(one, 4096, 1e6)
     distance = -np.asarray(one.lobe.log_cos)
-    factor = np.asarray(thinned.factor)
+    factor = np.asarray(sample.factor)
     assert np.count_nonzero(factor) < 5200
     for octave in range(-16, 0):
         here = (distance >= 2.0**octave) & (distance < 2.0 ** (octave + 1))
-        kept = -np.asarray(thinned.picture.lobe.log_cos)
+        kept = -np.asarray(sample.picture.lobe.log_cos)
         kept = (kept >= 2.0**octave) & (kept < 2.0 ** (octave + 1)) & (factor > 0)
         if np.count_nonzero(here) < 100:
             assert np.count_nonzero(kept) == np.count_nonzero(here)

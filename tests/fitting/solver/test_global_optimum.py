@@ -8,7 +8,8 @@ from scipy.optimize import least_squares, nnls
 
 import brdf
 import fitting
-from fitting.engine.separable import OneLightLobe, Picture, search
+from fitting.solver.normal_equations import OneLightLobe, Picture
+from fitting.solver.profile import search
 
 
 def scipy_starts(one, starts, seed):

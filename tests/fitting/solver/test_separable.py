@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 from engine_pictures import X, ball, best_at, cost_of, picture
 
-from fitting.engine.separable import OneLightLobe, Picture, fit_linear, search
-from fitting.engine.streams import Stream
+from fitting.solver.normal_equations import OneLightLobe, Picture
+from fitting.solver.profile import fit_linear, search
+from fitting.solver.streams import Stream
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(np.float32, 1e-4), (np.float64, 1e-8)])

@@ -2,7 +2,7 @@
 
 A lobe of exponent n lights the pixels with ``-log_cos`` below about 1 / n: at n = 1e5 a handful around the peak, while
 an n below 1 is told from another by the few that are nearly at 90 degrees from it. So each octave of ``-log_cos`` is a
-stratum; sparse ones are kept whole, the others thinned to about equal numbers. Weights are the inverse probabilities.
+stratum; sparse ones are kept whole, the others sample to about equal numbers. Weights are the inverse probabilities.
 """
 
 import math
@@ -14,8 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, UInt8
 
-from fitting.engine.pictures import AnyArray, Picture, relative_lobe
-from fitting.engine.sums import COMPILER_OPTIONS, UNROLLED_CHANNELS
+from fitting.solver.normal_equations import COMPILER_OPTIONS, UNROLLED_CHANNELS, AnyArray, Picture, relative_lobe
 
 # The strata are counted on every 16th pixel.
 _PREVIEW_STRIDE = 16
@@ -27,7 +26,7 @@ _LARGEST_DECAY = 60.0
 _EXCLUDED = 255
 
 
-class Thinned(NamedTuple):
+class Subsample(NamedTuple):
     """Some pixels of a picture.
 
     Attributes:
@@ -80,8 +79,8 @@ def _shares(octaves: UInt8[np.ndarray, " P"], size: int) -> Float[np.ndarray, "2
     return share.astype(np.float32)
 
 
-def thin(picture: Picture, size: int, n_max: float) -> Thinned:
-    """Thin a picture to about ``size`` pixels.
+def subsample(picture: Picture, size: int, n_max: float) -> Subsample:
+    """Take about ``size`` pixels.
 
     Args:
         picture: The picture.
@@ -94,11 +93,11 @@ def thin(picture: Picture, size: int, n_max: float) -> Thinned:
     count = picture.target.shape[0]
     capacity = size + size // 4
     if picture.lobe is None:
-        return Thinned(picture, None, math.inf)
+        return Subsample(picture, None, math.inf)
     octaves, nearest = _octaves(picture)
     nearest = float(nearest)
     if count <= capacity:
-        return Thinned(picture, None, nearest)
+        return Subsample(picture, None, nearest)
     share = _shares(np.asarray(octaves), size)
     index = np.flatnonzero(np.asarray(_chosen(octaves, share)))
     while index.size > capacity:
@@ -121,12 +120,12 @@ def thin(picture: Picture, size: int, n_max: float) -> Thinned:
     weight = cast(Array, factor)
     if kept.weight is not None:
         weight = kept.weight * (factor if kept.weight.ndim == 1 else factor[:, None])
-    return Thinned(Picture(kept.target, kept.diffuse, kept.lobe, weight, kept.ambient), factor, nearest)
+    return Subsample(Picture(kept.target, kept.diffuse, kept.lobe, weight, kept.ambient), factor, nearest)
 
 
 @partial(jax.jit, compiler_options=COMPILER_OPTIONS)
 def spread(
-    thinned: Thinned,
+    sample: Subsample,
     log_n: Float[AnyArray, " N"],
     x: Float[AnyArray, "N C 3"],
     best_log_n: Float[AnyArray, ""],
@@ -136,18 +135,18 @@ def spread(
     """How far the subsample's profile may be from that of all pixels.
 
     Args:
-        thinned: The subsample of one picture.
+        sample: The subsample of one picture.
         log_n: Natural logarithms of the exponents.
         x: Best coefficients at each.
         best_log_n: Natural logarithm of the exponent to compare with.
         best_x: Best coefficients there.
-        peak: See :func:`fitting.engine.sums.relative_lobe`.
+        peak: See :func:`fitting.solver.normal_equations.relative_lobe`.
 
     Returns:
         Horvitz-Thompson variances of the cost at each exponent minus that at the best, and of the profile's slope by
         log n. They add up over pictures.
     """
-    picture, factor = thinned.picture, thinned.factor
+    picture, factor = sample.picture, sample.factor
     lobe, weight = picture.lobe, picture.weight
     assert lobe is not None
     assert weight is not None

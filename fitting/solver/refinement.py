@@ -11,9 +11,8 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
-from fitting.engine import nonnegative
-from fitting.engine.pictures import AnyArray, Picture
-from fitting.engine.sums import Sums, sums
+from fitting.solver import enumeration
+from fitting.solver.normal_equations import AnyArray, Picture, Sums, sums
 
 # As a function of log n a lobe varies on a scale of 1 or more; steps of the coarse grid, and the widest bracket.
 GRID_STEP = 0.35
@@ -66,9 +65,9 @@ class Start(NamedTuple):
 
 
 @jax.jit
-def solve_linear(parts: Sums, reference: Float[Array, "C 3"], problem: Problem) -> nonnegative.Linear:
+def solve_linear(parts: Sums, reference: Float[Array, "C 3"], problem: Problem) -> enumeration.Linear:
     """The best coefficients at the exponent of the sums, or at each of a grid."""
-    return nonnegative.solve(parts.gram, parts.product, parts.square, reference, problem.free, problem.tolerance)
+    return enumeration.solve(parts.gram, parts.product, parts.square, reference, problem.free, problem.tolerance)
 
 
 def solve_within(
@@ -78,7 +77,7 @@ def solve_within(
     reference: Float[Array, "C 3"],
     free: Bool[AnyArray, "C 3"],
     tolerance: Float[AnyArray, ""],
-) -> nonnegative.Linear:
+) -> enumeration.Linear:
     """The best coefficients at one exponent within a bracket, the lobe there being Hermite's cubic of its ends.
 
     Args:
@@ -87,7 +86,7 @@ def solve_within(
         width: Of the bracket, in log n.
         reference: The reference model of the sums, whose lobe is that of the lower end.
         free: Which coefficients may be above 0.
-        tolerance: See :func:`fitting.engine.nonnegative.solve`.
+        tolerance: See :func:`fitting.solver.enumeration.solve`.
 
     Returns:
         Coefficients, cost and slope.
@@ -103,7 +102,7 @@ def solve_within(
     square = parts.square + jnp.sum(change * (moved - 2 * parts.product), axis=1)
     half = jnp.sum(basis[None, :, None, :] * parts.gram[:, None, :, :], axis=3)
     gram = jnp.sum(half[:, :, None, :] * basis[None, None, :, :], axis=3)
-    return nonnegative.solve(gram, product, square, reference, free, tolerance)
+    return enumeration.solve(gram, product, square, reference, free, tolerance)
 
 
 @jax.jit
@@ -113,7 +112,7 @@ def _solve_bracket(
     """The least cost within a bracket, and where it lies, as a share of the bracket."""
     step = ends[1] - ends[0]
 
-    def at(t: Float[Array, ""]) -> nonnegative.Linear:
+    def at(t: Float[Array, ""]) -> enumeration.Linear:
         return solve_within(parts, t, step, reference, problem.free, problem.tolerance)
 
     shares = jnp.linspace(0.0, 1.0, 9)
@@ -123,7 +122,7 @@ def _solve_bracket(
     scale = jnp.max(jnp.abs(linear.slope)) + jnp.finfo(float).tiny
     # What a share of 1e-9 is off, the last correction makes good.
 
-    def slope(t: Float[Array, ""], _: None) -> tuple[Float[Array, ""], tuple[Float[Array, ""], nonnegative.Linear]]:
+    def slope(t: Float[Array, ""], _: None) -> tuple[Float[Array, ""], tuple[Float[Array, ""], enumeration.Linear]]:
         here = at(t)
         return here.slope / scale, (t, here)
 

@@ -27,9 +27,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.engine.pictures import AnyArray, Picture
-from fitting.engine.separable import Optimum
-from fitting.engine.streams import each
+from fitting.solver.normal_equations import AnyArray, Picture
+from fitting.solver.profile import Optimum
+from fitting.solver.streams import each
 
 Loss = Literal["squared", "huber", "cauchy", "relative", "log"]
 LOSSES: tuple[Loss, ...] = ("squared", "huber", "cauchy", "relative", "log")

@@ -11,14 +11,14 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from fitting.engine.active_set import nonnegative_minimum
-from fitting.engine.separable import Optimum
-from fitting.engine.sums import Picture, sums
+from fitting.solver.nnls import nonnegative_minimum
+from fitting.solver.normal_equations import Picture, sums
+from fitting.solver.profile import Optimum
 
 MOST_STEPS = 8
 
 
-class Normal(NamedTuple):
+class NormalEquations(NamedTuple):
     """Normal equations in x_a, x_d, x_s, channel after channel, and the shift of n; channels weighed by their noise.
 
     Attributes:
@@ -32,13 +32,13 @@ class Normal(NamedTuple):
     square: float
 
 
-def normal_equations(
+def join_channels(
     gram: Float[np.ndarray, "C 4 4"],
     product: Float[np.ndarray, "C 4"],
     square: Float[np.ndarray, " C"],
     x_s: Float[np.ndarray, " C"],
     variance: Float[np.ndarray, " C"],
-) -> Normal:
+) -> NormalEquations:
     """Gather the channels.
 
     Args:
@@ -56,7 +56,7 @@ def normal_equations(
         place = [c, channels + c, 2 * channels + c, 3 * channels]
         whole[np.ix_(place, place)] += gram[c] * np.outer(scale[c], scale[c]) / variance[c]
         right[place] += product[c] * scale[c] / variance[c]
-    return Normal(whole, right, float(np.sum(square / variance)))
+    return NormalEquations(whole, right, float(np.sum(square / variance)))
 
 
 def design_of(free: Bool[np.ndarray, "3 C"], tied: Float[np.ndarray, " C"] | None) -> Float[np.ndarray, "U V"]:
@@ -118,7 +118,7 @@ def fit_tied(
         with jax.enable_x64(True):
             parts = sums(pictures, np.array([log_n]), x.T)
         about = parts.about(np.pad(x.T, [(0, 0), (0, 1)]))
-        normal = normal_equations(about.gram, about.product, about.square, x[2], np.ones(channels))
+        normal = join_channels(about.gram, about.product, about.square, x[2], np.ones(channels))
         solution = design @ nonnegative_minimum(design.T @ normal.gram @ design, design.T @ normal.product, signed)
         shift = float(np.clip(solution[-1], np.log(n_range[0]) - log_n, np.log(n_range[1]) - log_n))
         reference, slope, at = x, x[2], log_n

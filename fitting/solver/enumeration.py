@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from fitting.engine.pictures import AnyArray
+from fitting.solver.normal_equations import AnyArray
 
 # Which of ambient, diffuse, specular are above zero. A linear bound, x_d u + x_s v <= 1, would add the sets that lie on
 # it.
