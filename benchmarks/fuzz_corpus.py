@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from brdf.materials.files import load_materials
+from brdf.materials.material_file import load_materials
 from brdf.measured import merl as measured_merl
 from brdf.measured import rgl as measured_rgl
 from brdf.measured.tables import load_measured

@@ -134,19 +134,19 @@ from .materials.exports import (
 from .materials.exports import (
     save_export as save_export,
 )
-from .materials.files import (
+from .materials.material_file import (
     load_material as load_material,
 )
-from .materials.files import (
+from .materials.material_file import (
     load_materials as load_materials,
 )
-from .materials.files import (
+from .materials.material_file import (
     material_from_dict as material_from_dict,
 )
-from .materials.files import (
+from .materials.material_file import (
     material_to_dict as material_to_dict,
 )
-from .materials.files import (
+from .materials.material_file import (
     save_material as save_material,
 )
 from .materials.presets import PRESETS as PRESETS
@@ -190,7 +190,7 @@ from .plausibility.stability import (
 from .plausibility.stability import (
     stability_maps as stability_maps,
 )
-from .plausibility.verdict import check as check
+from .plausibility.verdicts import check as check
 from .precision import Precision as Precision
 from .precision import cast as cast
 from .precision import working_precision as working_precision

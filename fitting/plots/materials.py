@@ -19,9 +19,8 @@ from brdf import displayed, lit_sphere
 from brdf.albedo import directional_albedo
 from brdf.channels import channel_names
 from brdf.models import Material, SpecularMaterial
-from brdf.plausibility.black_box import albedo_of
+from brdf.plausibility.numeric import Sampler, albedo_of
 from brdf.plausibility.report import Report
-from brdf.plausibility.search import Sampler
 from brdf.plausibility.stability import StabilityMap
 
 PRINT: dict[Any, Any] = {"font.size": 8, "axes.titlesize": 9, "legend.fontsize": 7}

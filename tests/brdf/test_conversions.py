@@ -9,7 +9,7 @@ from scipy.optimize import minimize
 from brdf import conversions
 from brdf.errors import InputError
 from brdf.models import BlinnPhong, Lambert, NormalizedBlinnPhong, NormalizedPhong, Phong
-from brdf.plausibility.verdict import check
+from brdf.plausibility.verdicts import check
 
 
 def test_exponents_slopes_and_roughness():

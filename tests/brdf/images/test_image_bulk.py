@@ -12,7 +12,7 @@ from image_files import chunk, codes, png, random, raw_exr
 from brdf.errors import InputError
 from brdf.images import bulk
 from brdf.images.pictures import ImageReader, read_image, read_layers, read_mask, read_picture, write_image
-from brdf.materials import files as materials
+from brdf.materials import material_file as materials
 
 
 def attribute(name: bytes, kind: bytes, value: bytes) -> bytes:

@@ -12,10 +12,9 @@ from labelled_brdfs import FUNCTIONS, MATERIALS, constant, dented, direction
 from brdf.albedo import directional_albedo
 from brdf.errors import InputError
 from brdf.models import BlinnPhong, Lambert, NormalizedBlinnPhong, NormalizedPhong, Phong
-from brdf.plausibility.black_box import check_black_box
-from brdf.plausibility.quadrature import integrate
+from brdf.plausibility.numeric import check_black_box, integrate
 from brdf.plausibility.report import ENERGY_LIMIT, verdict
-from brdf.plausibility.verdict import check
+from brdf.plausibility.verdicts import check
 
 WORD = {True: "pass", False: "fail"}
 

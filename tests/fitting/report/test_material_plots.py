@@ -5,7 +5,7 @@ import pytest
 
 from brdf.models import BlinnPhong, NormalizedPhong
 from brdf.plausibility.stability import stability_map
-from brdf.plausibility.verdict import check
+from brdf.plausibility.verdicts import check
 from fitting.plots.materials import plot_albedo, plot_lobe, plot_reciprocity, plot_stability
 
 

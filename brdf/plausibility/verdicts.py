@@ -26,9 +26,8 @@ from brdf.errors import InputError
 from brdf.measured.check import check_table
 from brdf.measured.tables import MeasuredBRDF
 from brdf.models import MODELS, Material, SpecularMaterial
-from brdf.plausibility.black_box import check_black_box
+from brdf.plausibility.numeric import GRAZING, check_black_box
 from brdf.plausibility.report import ENERGY_LIMIT, RECIPROCITY_LIMIT, Angles, Finding, Report, times, verdict
-from brdf.plausibility.search import GRAZING
 from brdf.precision import cast, working_precision
 
 _ANGLES = np.array([*np.arange(90.0), 89.5, 89.9, GRAZING])
