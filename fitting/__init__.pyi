@@ -1,9 +1,9 @@
 from .brdf_fit import fit_brdf as fit_brdf
 from .brdf_result import BrdfFitResult as BrdfFitResult
+from .front_door import fit as fit
 from .implicit import Sensitivity as Sensitivity
 from .implicit import sensitivity as sensitivity
 from .joint import fit_jointly as fit_jointly
-from .picture_fit import fit as fit
 from .plots.materials import (
     overview as overview,
 )

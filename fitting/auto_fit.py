@@ -6,16 +6,16 @@ import equinox as eqx
 import numpy as np
 
 import brdf
-from fitting.interpretation import ModelFit, coefficient_factors
-from fitting.model_fit import Job, fit_model, forgotten, optimise
+from fitting.core import Job, fit_model, forgotten, optimise
 from fitting.selection import FAMILIES, Choice, choose
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import fit_linear
 from fitting.solver.streams import each
 from fitting.solver.tied import fit_tied
 from fitting.uncertainty.covariance import residual_noise
+from fitting.uncertainty.interpretation import ModelFit, coefficient_factors
 from fitting.uncertainty.noise_model import weighted_sums
-from fitting.uncertainty.structure import structure
+from fitting.uncertainty.residual_correlation import structure
 
 # An exponent up to this multiple of the lower bound is at the bound.
 WIDEST = 1.01

@@ -23,8 +23,8 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 import brdf
-from fitting.observation import Tile, observe
-from fitting.picture_inputs import pictures_and_scenes
+from fitting.pixels import Tile, observe
+from fitting.problem import pictures_and_scenes
 
 LARGEST_JACOBIAN = 1 << 27
 ROUNDS = 8

@@ -15,7 +15,7 @@ import brdf
 from brdf.errors import InputError
 from fitting.budget.lamps import Lamps
 from fitting.budget.pixel_sampling import PixelSample, sample_pixels
-from fitting.picture_inputs import looked_at
+from fitting.problem import looked_at
 from fitting.result import FitResult
 
 
@@ -106,7 +106,7 @@ def run(
         lamps: the lights made so far.
         n_range: bounds of the exponent, instead of those of ``options``.
     """
-    from fitting.picture_fit import fit
+    from fitting.front_door import fit
 
     start = time.perf_counter()
     given, options = options, dict(options) | ({} if n_range is None else {"n_range": n_range})
@@ -215,7 +215,7 @@ def target_size(target: Any) -> int:
 
 def _clipping(targets: Sequence[Any], pictures: Sequence[Any], samples: Sequence[Any]) -> float | None:
     """The level at which pictures are clipped, where so few pixels of a sample are that `fit` would not notice."""
-    from fitting.pixel_survey import SYMMETRIC_PIXELS, TOP
+    from fitting.pixel_statistics import SYMMETRIC_PIXELS, TOP
 
     for target, picture, sample in zip(targets, pictures, samples, strict=True):
         if sample is None or isinstance(target, brdf.Picture):

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 import brdf
 from fitting.budget.configurations import one_each, share_counted, target_size
-from fitting.picture_inputs import looked_at
+from fitting.problem import looked_at
 
 FIRST_PIXELS = 1024
 # Relative error (95 %) of the worst parameter, times √M, over noise over the picture's root mean square: upper quartile

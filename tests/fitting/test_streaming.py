@@ -8,8 +8,8 @@ import pytest
 
 import brdf
 import fitting
-from fitting import observation
-from fitting.model_fit import fit_model
+from fitting import pixels as observation
+from fitting.core import fit_model
 from fitting.solver.streams import Stream, each, joined
 
 MATERIAL = brdf.BlinnPhong(k_a=[0.05, 0.04, 0.03], k_d=[0.5, 0.3, 0.1], k_s=[0.3, 0.25, 0.2], n=60.0)
@@ -40,7 +40,7 @@ def picture(noise: float = 0.01) -> np.ndarray:
 def small_bands(monkeypatch):
     """Seven bands, the last one shorter."""
     monkeypatch.setattr(observation, "TILE_PIXELS", 14 * SIZE[0] + 5)
-    monkeypatch.setattr("fitting.model_fit.TILE_PIXELS", 14 * SIZE[0] + 5)
+    monkeypatch.setattr("fitting.core.TILE_PIXELS", 14 * SIZE[0] + 5)
     monkeypatch.setattr(observation, "ALIGNED_ROWS", 14)
 
 
@@ -96,7 +96,7 @@ def test_one_model_at_a_time_is_in_memory(monkeypatch, true):
     cut = fitting.fit(noisy, scene())
     assert alive == [0, 0]
     monkeypatch.setattr(observation, "TILE_PIXELS", noisy[..., 0].size)
-    monkeypatch.setattr("fitting.model_fit.TILE_PIXELS", noisy[..., 0].size)
+    monkeypatch.setattr("fitting.core.TILE_PIXELS", noisy[..., 0].size)
     lobes.clear()
     whole = fitting.fit(noisy, scene())
     assert alive[2:] == [0, 1]
@@ -119,7 +119,7 @@ def test_mask_weight_and_several_pictures(tmp_path: Path):
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".exr"])
 def test_clipping_is_found_across_bands(tmp_path: Path, suffix: str, monkeypatch):
     # Of a picture in memory alone.
-    monkeypatch.setattr("fitting.picture_fit.without_cut_noise", lambda result, *_: result)
+    monkeypatch.setattr("fitting.front_door.without_cut_noise", lambda result, *_: result)
     path = tmp_path / f"target{suffix}"
     brdf.write_image(path, np.minimum(picture() * 1.5, 1.0))
     whole = fitting.fit(brdf.read_picture(path), scene())

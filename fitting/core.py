@@ -9,14 +9,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 import brdf
-from fitting.interpretation import ModelFit
 from fitting.light_colour import LightColour
-from fitting.observation import TILE_PIXELS, Observation, Tile
+from fitting.pixels import TILE_PIXELS, Observation, Tile
 from fitting.solver.losses import Loss, reweight
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum, fit_linear, search
 from fitting.solver.streams import each, joined
-from fitting.uncertainty.structure import nearest_peak
+from fitting.uncertainty.interpretation import ModelFit
+from fitting.uncertainty.residual_correlation import nearest_peak
 
 # The nearest pixel shows exp(-UNSEEN) of a highlight's peak, or more, or the exponent is not looked at.
 UNSEEN = 60.0

@@ -8,7 +8,7 @@ import numpy as np
 
 import brdf
 from brdf.errors import InputError
-from fitting.pixel_survey import TOP
+from fitting.pixel_statistics import TOP
 
 
 def check_levels(saturation: Any, dark: Any, noise: Any) -> tuple[float, float] | None:

@@ -9,14 +9,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 import brdf
-from fitting.missing_ambient import missing_ambient
 from fitting.result import Parameter
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
 from fitting.uncertainty.covariance import TERMS, Uncertainty, residual_noise, uncertainty
 from fitting.uncertainty.intervals import exponent_interval
+from fitting.uncertainty.missing_ambient import missing_ambient
 from fitting.uncertainty.noise_model import weighted_sums
-from fitting.uncertainty.structure import Highlight, Structure, highlight, structure
+from fitting.uncertainty.residual_correlation import Highlight, Structure, highlight, structure
 
 # An interval of n wider than this factor says nothing but its order of magnitude.
 WIDEST_INTERVAL = 100.0

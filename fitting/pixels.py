@@ -14,8 +14,8 @@ from jaxtyping import Array, Bool, Float
 
 import brdf
 from brdf.errors import InputError
-from fitting.picture_inputs import check_levels, check_sizes, check_weight, per_pixel, pixels_of
-from fitting.pixel_survey import FLAT, SYMMETRIC_PIXELS, TOP, Survey, inverse_variance, lit_at_top, survey
+from fitting.pixel_statistics import FLAT, SYMMETRIC_PIXELS, TOP, Survey, inverse_variance, lit_at_top, survey
+from fitting.problem import check_levels, check_sizes, check_weight, per_pixel, pixels_of
 from fitting.solver.streams import Stream, each
 
 # How many pixels are looked at together; of a file at least as many rows as its blocks hold, or these are read twice.

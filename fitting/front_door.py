@@ -10,12 +10,12 @@ import numpy as np
 import brdf
 from brdf.errors import InputError
 from fitting.auto_fit import fit_simplest
-from fitting.cut_noise import warned_of_cut_noise, without_cut_noise
-from fitting.interpretation import Interpretation, ModelFit, interpret
+from fitting.censored_noise import warned_of_cut_noise, without_cut_noise
+from fitting.core import Job, fit_model, reached, without_highlight
 from fitting.light_colour import take_colour_out
-from fitting.model_fit import Job, fit_model, reached, without_highlight
-from fitting.observation import Observation, observe
-from fitting.picture_inputs import (
+from fitting.pixels import Observation, observe
+from fitting.plausible import fit_plausible, is_plausible
+from fitting.problem import (
     check_levels,
     check_range,
     check_sizes,
@@ -26,11 +26,11 @@ from fitting.picture_inputs import (
     pixels_of,
     relative_weights,
 )
-from fitting.plausible import fit_plausible, is_plausible
 from fitting.result import FitResult, free_parameters
 from fitting.selection import Choice
 from fitting.solver.losses import LOSSES, Loss
 from fitting.uncertainty.covariance import TERMS
+from fitting.uncertainty.interpretation import Interpretation, ModelFit, interpret
 
 N_RANGE = (0.1, 1e6)
 AUTO = ("phong", "blinn-phong")
@@ -60,7 +60,7 @@ def fit(
 
     Args:
         target: linear values, (H, W, C) or (H, W), or a `brdf.Picture`; a `brdf.ImageReader` for a file that is larger
-            than memory, which is read by bands of rows, several times (`fitting.cut_noise` only warns then); or a list.
+            than memory, which is read by bands of rows, several times (cut-off noise is only warned of then); or a list.
         scene: what the picture shows; a list of as many where there are several pictures.
         model: "auto" for the simplest adequate of Lambert, Phong and Blinn-Phong, or the name of a model.
         precision: "float32" or "float64".

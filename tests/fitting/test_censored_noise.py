@@ -8,8 +8,8 @@ import brdf
 import fitting
 from fitting.budget.deviation import parameter_deviation
 from fitting.budget.trials import Bench
+from fitting.censored_noise import BLACK, WHITE, without_cut_noise
 from fitting.cli.main import main
-from fitting.cut_noise import BLACK, WHITE, without_cut_noise
 from fitting.photographs.ball import ball_points, photograph_scene
 from fitting.photographs.circle import Circle
 
@@ -33,7 +33,7 @@ def seen(material: brdf.Material, noise: float, seed: int, *, low: float, bits: 
 def fitted(picture: brdf.Picture, mended: bool) -> fitting.FitResult:
     with pytest.MonkeyPatch.context() as patch:
         if not mended:
-            patch.setattr("fitting.picture_fit.without_cut_noise", lambda result, *_: result)
+            patch.setattr("fitting.front_door.without_cut_noise", lambda result, *_: result)
         return fitting.fit(picture, SCENE, model="blinn-phong")
 
 
@@ -47,7 +47,7 @@ def deviations(result: fitting.FitResult, material: brdf.BlinnPhong) -> np.ndarr
 
 @pytest.mark.parametrize("bits", [8, None])
 @pytest.mark.parametrize(("material", "low", "reason"), [(DULL, 0.0, BLACK), (BRIGHT, -1.0, WHITE)])
-def test_cut_noise_does_not_bend_the_fit(material, low, reason, bits):
+def test_censored_noise_does_not_bend_the_fit(material, low, reason, bits):
     found = {}
     for mended in (False, True):
         results = [fitted(seen(material, 0.03, seed, low=low, bits=bits), mended) for seed in range(DRAWS)]
