@@ -60,7 +60,7 @@ def fit(
 
     Args:
         target: linear values, (H, W, C) or (H, W), or a `brdf.Picture`; a `brdf.ImageReader` for a file that is larger
-            than memory, which is read by bands of rows, several times (cut-off noise is only warned of then); or a list.
+            than memory, which is read by bands of rows, several times (of censored noise it only warns); or a list.
         scene: what the picture shows; a list of as many where there are several pictures.
         model: "auto" for the simplest adequate of Lambert, Phong and Blinn-Phong, or the name of a model.
         precision: "float32" or "float64".
