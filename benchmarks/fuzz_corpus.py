@@ -8,7 +8,7 @@ from typing import Any
 from brdf.materials.material_file import load_materials
 from brdf.measured import merl as measured_merl
 from brdf.measured import rgl as measured_rgl
-from brdf.measured.tables import load_measured
+from brdf.measured.loading import load_measured
 from brdf.scenes.file import load_scene
 
 CAMERA = """[camera]

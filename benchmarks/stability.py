@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from brdf.plausibility.stability import stability_maps
-from fitting.plots.materials import plot_stability
+from fitting.report.material_plots import plot_stability
 
 
 def main(path: Path) -> None:

@@ -1,24 +1,9 @@
-from .brdf_fit import fit_brdf as fit_brdf
-from .brdf_result import BrdfFitResult as BrdfFitResult
 from .front_door import fit as fit
 from .implicit import Sensitivity as Sensitivity
 from .implicit import sensitivity as sensitivity
 from .joint import fit_jointly as fit_jointly
-from .plots.materials import (
-    overview as overview,
-)
-from .plots.materials import (
-    plot_albedo as plot_albedo,
-)
-from .plots.materials import (
-    plot_lobe as plot_lobe,
-)
-from .plots.materials import (
-    plot_reciprocity as plot_reciprocity,
-)
-from .plots.materials import (
-    plot_stability as plot_stability,
-)
+from .measured_fit import fit_brdf as fit_brdf
+from .measured_result import BrdfFitResult as BrdfFitResult
 from .relighting import (
     LightFit as LightFit,
 )
@@ -27,6 +12,21 @@ from .relighting import (
 )
 from .relighting import (
     fit_lights_and_material as fit_lights_and_material,
+)
+from .report.material_plots import (
+    overview as overview,
+)
+from .report.material_plots import (
+    plot_albedo as plot_albedo,
+)
+from .report.material_plots import (
+    plot_lobe as plot_lobe,
+)
+from .report.material_plots import (
+    plot_reciprocity as plot_reciprocity,
+)
+from .report.material_plots import (
+    plot_stability as plot_stability,
 )
 from .result import FitResult as FitResult
 from .result import Parameter as Parameter

@@ -144,13 +144,13 @@ class FitResult:
 
     def __str__(self) -> str:
         """The report."""
-        from fitting.text_report import report
+        from fitting.report.text import report
 
         return report(self)
 
     def _repr_html_(self) -> str:
         """For Jupyter."""
-        from fitting.html_report import result_html
+        from fitting.report.html import result_html
 
         return result_html(self)
 
@@ -217,7 +217,7 @@ class FitResult:
         Returns:
             A matplotlib figure.
         """
-        from fitting.plots.fits import comparison
+        from fitting.report.plots import comparison
 
         return comparison(self, picture)
 

@@ -209,7 +209,7 @@ class Tradeoff:
 
     def plot(self) -> Any:
         """Error against time, a matplotlib figure."""
-        from fitting.plots.tradeoffs import error_against_time
+        from fitting.report.tradeoff_plot import error_against_time
 
         return error_against_time(self)
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from brdf.errors import InputError
-from brdf.measured.tables import MeasuredBRDF, from_half_angles
+from brdf.measured.table import MeasuredBRDF, from_half_angles
 
 SHAPE = (90, 90, 180)
 SCALES = np.array([1.0 / 1500.0, 1.15 / 1500.0, 1.66 / 1500.0])

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from brdf.errors import InputError
 from brdf.files import utf8_name
-from brdf.measured.tables import Evaluation, MeasuredBRDF, from_half_angles
+from brdf.measured.table import Evaluation, MeasuredBRDF, from_half_angles
 
 MAGIC = b"tensor_file\0"
 

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from brdf.errors import InputError
 from brdf.files import parse_number, read_text
-from brdf.measured.tables import LARGEST_ANGLE, MeasuredBRDF, from_angles, from_half_angles
+from brdf.measured.table import LARGEST_ANGLE, MeasuredBRDF, from_angles, from_half_angles
 
 MOST_CHANNELS = 4096
 _NUMBERS = "Numbers have a decimal point and spaces between them; # starts a comment"

@@ -23,8 +23,8 @@ from brdf.albedo import ACCURACY, directional_albedo, lobe_albedo, normalized_fo
 from brdf.channels import in_channel
 from brdf.conversions import nearest_normalized
 from brdf.errors import InputError
-from brdf.measured.check import check_table
-from brdf.measured.tables import MeasuredBRDF
+from brdf.measured.table import MeasuredBRDF
+from brdf.measured.table_check import check_table
 from brdf.models import MODELS, Material, SpecularMaterial
 from brdf.plausibility.numeric import GRAZING, check_black_box
 from brdf.plausibility.report import ENERGY_LIMIT, RECIPROCITY_LIMIT, Angles, Finding, Report, times, verdict

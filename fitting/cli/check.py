@@ -45,7 +45,7 @@ def check(
         if plot is not None:
             if len(materials) > 1:
                 raise InputError("--plot", f"draws one material, {material} holds {len(materials)}", "Give one")
-            from fitting.plots.materials import overview
+            from fitting.report.material_plots import overview
 
             with brdf.atomic_path(plot) as path:
                 name, one = next(iter(materials.items()))

@@ -88,7 +88,7 @@ def fit(
         if out is not None:
             _save(result, out, **({"plot": True} if plot else {}))
         if report is not None:
-            from fitting.html_report import report_page
+            from fitting.report.html import report_page
 
             command = shlex.join(["brdf", *sys.argv[1:]])
             brdf.write_text(report, report_page(result, source=target[0].name, command=command))

@@ -9,8 +9,8 @@ import pytest
 import brdf
 import fitting
 from brdf.errors import InputError
-from brdf.measured.tables import from_angles
-from fitting.brdf_result import BrdfCandidate, Losses
+from brdf.measured.table import from_angles
+from fitting.measured_result import BrdfCandidate, Losses
 
 
 def directions(count: int = 600, seed: int = 4) -> tuple[np.ndarray, np.ndarray]:

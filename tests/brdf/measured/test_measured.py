@@ -6,7 +6,7 @@ from measured_files import degrees_between
 
 import brdf
 from brdf.errors import InputError
-from brdf.measured.tables import from_angles, from_half_angles
+from brdf.measured.table import from_angles, from_half_angles
 
 
 def test_half_angles_give_back_half_and_difference():

@@ -8,7 +8,7 @@ from project_paths import REAL, real_data
 import brdf
 from brdf.errors import InputError
 from brdf.measured import text as measured_text
-from brdf.measured.tables import from_angles
+from brdf.measured.table import from_angles
 
 CORNELL = "# paint\n2\n400 500\n# rows\n0.2 0 0.3 0 0.5 -0.25\n0.4 0.1 1.9 0 1 2\n"
 

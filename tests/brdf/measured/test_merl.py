@@ -9,7 +9,7 @@ from measured_files import write_merl
 import brdf
 from brdf.errors import InputError
 from brdf.measured import merl as measured_merl
-from brdf.measured.tables import from_angles
+from brdf.measured.table import from_angles
 
 
 @pytest.fixture(scope="module")

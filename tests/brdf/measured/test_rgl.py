@@ -8,7 +8,7 @@ from project_paths import REAL, real_data
 import brdf
 from brdf.errors import InputError
 from brdf.measured import rgl as measured_rgl
-from brdf.measured.tables import from_angles
+from brdf.measured.table import from_angles
 
 
 def test_rgl_fields_are_checked_before_mitsuba_sees_them(tmp_path):

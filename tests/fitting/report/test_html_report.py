@@ -13,7 +13,7 @@ from project_paths import BROWSER
 
 import brdf
 import fitting
-from fitting.html_report import report_page
+from fitting.report.html import report_page
 
 
 @pytest.fixture(scope="module")

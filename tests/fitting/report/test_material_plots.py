@@ -6,7 +6,7 @@ import pytest
 from brdf.models import BlinnPhong, NormalizedPhong
 from brdf.plausibility.stability import stability_map
 from brdf.plausibility.verdicts import check
-from fitting.plots.materials import plot_albedo, plot_lobe, plot_reciprocity, plot_stability
+from fitting.report.material_plots import plot_albedo, plot_lobe, plot_reciprocity, plot_stability
 
 
 def test_albedo_curves_cross_the_limit_where_the_report_says():

@@ -8,8 +8,8 @@ import pytest
 
 import brdf
 import fitting
-from fitting.plots import fits as plots
-from fitting.plots.materials import overview
+from fitting.report import plots
+from fitting.report.material_plots import overview
 
 SIZE = 40
 

@@ -16,7 +16,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from fitting.brdf_result import Losses
+from fitting.measured_result import Losses
 from fitting.solver.profile import Optimum
 
 Loss = Literal["cosine", "squared", "log"]

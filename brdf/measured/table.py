@@ -1,29 +1,17 @@
 """Measured BRDFs: tables of f_r at pairs of directions, as gonioreflectometers and material databases give them.
 
 One table holds one isotropic or anisotropic material, any number of channels, in the local frame whose +z axis is the
-normal. Readers, by what is in the file and not by its name:
-
-| format | module | what it is |
-| --- | --- | --- |
-| MERL ``.binary`` | `merl` | Matusik et al. 2003: a full grid in half and difference angles, RGB |
-| RGL ``.bsdf`` | `rgl` | Dupuy and Jakob 2018: evaluated by Mitsuba's ``measured`` plugin, an optional extra |
-| Cornell text | `text` | goniometer samples with 31 wavelengths |
-| ALTA text | `text` | samples in one of ALTA's parametrisations |
-
-Negative values are measurement noise (or colours outside a gamut) and are kept.
+normal. Negative values are measurement noise (or colours outside a gamut) and are kept.
 """
 
 import dataclasses
-import os
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from brdf.errors import InputError
-from brdf.files import input_file
 
 Evaluation = Callable[[Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3"]], Float[np.ndarray, "P C"]]
 
@@ -190,46 +178,3 @@ def from_half_angles(
     half = from_angles(theta_h, phi_h)
     view = 2 * np.sum(half * light, axis=-1, keepdims=True) * half - light
     return light, view
-
-
-def load_measured(path: str | os.PathLike[str]) -> MeasuredBRDF:
-    """Read a measured BRDF.
-
-    Args:
-        path: a MERL ``.binary``, RGL ``.bsdf``, Cornell or ALTA text file; told by its content.
-
-    Returns:
-        The table.
-
-    Raises:
-        InputError: naming the file, where it is none of these, damaged, or (RGL) Mitsuba is not installed.
-    """
-    from brdf.measured import merl, rgl, text
-
-    file = input_file(path)
-    with file.open("rb") as stream:
-        head = stream.read(16)
-    size = file.stat().st_size
-    try:
-        if head.startswith(rgl.MAGIC):
-            return rgl.load(file)
-        # No text holds a NUL: what else is binary and named as MERL's is told how it differs.
-        if merl.claims(head, size) or (b"\0" in head and file.suffix.lower() == ".binary"):
-            return merl.load(file)
-        if b"\0" in head:
-            what = "is neither text in UTF-8 nor a file of MERL or RGL"
-            raise InputError(path, what, "Give a MERL .binary, RGL .bsdf, Cornell or ALTA text file")
-        return text.load(file)
-    except InputError as error:
-        if error.where == file.stem:  # the name of the table, which is that of the file
-            raise InputError(path, error.what, error.remedy) from None
-        raise error if error.where.startswith(str(path)) else error.inside(path) from None
-
-
-def is_measured(path: str | os.PathLike[str]) -> bool:
-    """Whether a file's name says that it is a measured BRDF rather than a picture or a material.
-
-    Args:
-        path: the file.
-    """
-    return Path(path).suffix.lower() in (".binary", ".bsdf", ".brdf", ".alta", ".dat")

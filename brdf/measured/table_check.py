@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from brdf.measured.tables import Evaluation, MeasuredBRDF, from_angles
+from brdf.measured.table import Evaluation, MeasuredBRDF, from_angles
 from brdf.plausibility.report import ENERGY_LIMIT, Angles, Finding, Report, verdict
 
 # Samples whose angles agree within this many radians are one direction: half a degree.

@@ -11,7 +11,7 @@ from project_paths import REAL
 import brdf
 import fitting
 from brdf.errors import InputError
-from brdf.measured.tables import from_angles
+from brdf.measured.table import from_angles
 
 real_data = pytest.mark.skipif(not REAL.is_dir(), reason=f"real data is missing: {REAL} (BRDF_REAL_DATA)")
 

@@ -1,7 +1,7 @@
 """Fit a model to a measured BRDF: the table is the picture, each sample a pixel with its own directions.
 
 f_r = [k_d + k_s S / (N.L)] / pi is linear in k_d and k_s, so the engine that fits pictures fits tables. What differs is
-which deviations count: `fitting.brdf_losses`.
+which deviations count: `fitting.measured_losses`.
 """
 
 import time
@@ -14,8 +14,8 @@ from jaxtyping import Float
 
 import brdf
 from brdf.errors import InputError
-from fitting.brdf_losses import Loss, Samples, logarithmic, losses_of
-from fitting.brdf_result import HALF, BrdfCandidate, BrdfFitResult, lowest_cosine
+from fitting.measured_losses import Loss, Samples, logarithmic, losses_of
+from fitting.measured_result import HALF, BrdfCandidate, BrdfFitResult, lowest_cosine
 from fitting.result import Parameter
 from fitting.solver.normal_equations import OneLightLobe, Picture
 from fitting.solver.profile import Optimum, fit_linear, search
@@ -48,7 +48,7 @@ def fit_brdf(
         table: what `brdf.load_measured` reads.
         model: the name of a model, or "auto": Lambert, unless a lobe explains half of the squares that it leaves;
             (a tenth, where Lambert explains less than half of the table); then the form with the least loss.
-        loss: "cosine", "squared" or "log"; see `fitting.brdf_losses`.
+        loss: "cosine", "squared" or "log"; see `fitting.measured_losses`.
         max_angle: light and view further than this from the normal are left out, in degrees, above 0 to 90.
         n_range: bounds of the exponent, 0 < lower < upper.
 

@@ -52,7 +52,7 @@ def report_page(result: FitResult, *, source: str = "", command: str = "") -> st
     Returns:
         The page's text; it loads nothing and runs no program.
     """
-    from fitting.plots.materials import overview
+    from fitting.report.material_plots import overview
 
     check = brdf.check(result.material, name=result.material.name)
     title = html.escape(f"{result.surface} fitted to {source or 'a picture'}")
