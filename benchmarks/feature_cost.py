@@ -14,6 +14,7 @@ import numpy as np
 import brdf
 import fitting
 from benchmarks.tradeoff import BALL, FLOOR, camera, sky
+from brdf.rendering import basis
 from fitting.budget.stopwatch import take
 
 ROUNDS, PATIENCE, SAMPLES = 7, 3.0, 64
@@ -54,7 +55,7 @@ def operations(model, place):
     kind = brdf.MODELS[model]
 
     def images(scene):
-        found = brdf.basis(kind, scene)
+        found = basis(kind, scene)
         return [found.diffuse] + ([] if found.lobe is None else [found.lobe(50.0)[0]])
 
     small = brdf.some_pixels(place, np.arange(0, np.prod(place.resolution), 97))

@@ -15,6 +15,7 @@ import brdf
 import fitting
 from benchmarks.calibration import ball
 from benchmarks.engine import prepare, seconds
+from brdf.precision import Precision
 
 MATERIAL = brdf.BlinnPhong(k_a=[0.1, 0.2, 0.3], k_d=[0.5, 0.4, 0.3], k_s=[0.3, 0.35, 0.4], n=50.0)
 NOISE = 0.01
@@ -34,7 +35,7 @@ def main() -> None:
         image = image + (NOISE * np.random.default_rng(0).standard_normal(image.shape)).astype(image.dtype)
         for model in ("blinn-phong", "auto"):
 
-            def fit(image: np.ndarray = image, model: str = model, precision: brdf.Precision = precision) -> None:
+            def fit(image: np.ndarray = image, model: str = model, precision: Precision = precision) -> None:
                 fitting.fit(image, scene, model=model, precision=precision)
 
             fit()

@@ -9,7 +9,7 @@ from brdf.materials.material_file import load_materials
 from brdf.measured import merl as measured_merl
 from brdf.measured import rgl as measured_rgl
 from brdf.measured.loading import load_measured
-from brdf.scenes.file import load_scene
+from brdf.scene_file import load_scene
 
 CAMERA = """[camera]
 type = "orthographic"

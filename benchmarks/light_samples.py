@@ -8,6 +8,7 @@ Largest error over a ball of 64 × 64 pixels, relative to the brightest pixel; d
 import numpy as np
 
 import brdf
+from brdf.lights.punctual import Light
 
 CAMERA = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=[64, 64])
 BALL = [brdf.Sphere(center=[0, 0, 0], radius=1)]
@@ -28,7 +29,7 @@ LIGHTS = {
 SAMPLES = (4, 16, 36, 64, 144, 256, 576, 1024)
 
 
-def picture(light: brdf.Light, material: brdf.Material) -> np.ndarray:
+def picture(light: Light, material: brdf.Material) -> np.ndarray:
     """In float64."""
     scene = brdf.Scene(camera=CAMERA, shapes=BALL, lights=[light])
     return np.asarray(brdf.render(material, scene, precision="float64"))

@@ -15,6 +15,7 @@ import numpy as np
 
 import brdf
 import fitting
+from brdf.models.base import SpecularMaterial
 
 MODELS = ("lambert", "phong", "blinn-phong")
 NO_TRACE = 1e-6
@@ -60,7 +61,7 @@ def complaints(result: fitting.FitResult, truth: brdf.Material, scene: brdf.Scen
         truth: the material in it.
         scene: the scene of it.
     """
-    specular = isinstance(truth, brdf.SpecularMaterial)
+    specular = isinstance(truth, SpecularMaterial)
     share = 0.0
     if specular:
         alone = type(truth)(k_a=0.0, k_d=0.0, k_s=truth.k_s, n=truth.n)

@@ -16,6 +16,7 @@ import numpy as np
 
 import brdf
 import fitting
+from brdf.lights.punctual import Light
 
 FAMILIES = ("ambient", "lambert", "lambert", "phong", "blinn-phong")
 
@@ -91,7 +92,7 @@ def optimism(count: int, size: int) -> None:
     print(f"in the mean, 99 % by less than {np.quantile(gains, 0.99):.1f}; two unknowns of any other kind by 2")
 
 
-def _grey(scene: brdf.Scene) -> list[brdf.Light]:
+def _grey(scene: brdf.Scene) -> list[Light]:
     """The same lights with one channel."""
     return [eqx.tree_at(lambda one: one.emittance, light, np.asarray(light.emittance)[:1]) for light in scene.lights]
 

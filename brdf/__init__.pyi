@@ -63,21 +63,16 @@ from .files import (
     write_text as write_text,
 )
 from .geometry.camera import (
-    Camera as Camera,
-)
-from .geometry.camera import (
     OrthographicCamera as OrthographicCamera,
 )
 from .geometry.camera import (
     PerspectiveCamera as PerspectiveCamera,
 )
-from .geometry.meshes import Mesh as Mesh
-from .geometry.meshes import Triangles as Triangles
-from .geometry.meshes import load_mesh as load_mesh
-from .geometry.shapes import Rectangle as Rectangle
-from .geometry.shapes import Shape as Shape
-from .geometry.shapes import Sphere as Sphere
+from .geometry.rectangle import Rectangle as Rectangle
+from .geometry.sphere import Sphere as Sphere
 from .geometry.surface_points import SurfacePoints as SurfacePoints
+from .geometry.triangles import Triangles as Triangles
+from .geometry.triangles import load_mesh as load_mesh
 from .images.encodings import encode as encode
 from .images.pictures import (
     ImageReader as ImageReader,
@@ -109,9 +104,6 @@ from .lights.environment import ConstantEnvironment as ConstantEnvironment
 from .lights.environment import EnvironmentMap as EnvironmentMap
 from .lights.punctual import (
     DirectionalLight as DirectionalLight,
-)
-from .lights.punctual import (
-    Light as Light,
 )
 from .lights.punctual import (
     PointLight as PointLight,
@@ -176,9 +168,7 @@ from .models import (
 from .models import (
     Phong as Phong,
 )
-from .models import (
-    SpecularMaterial as SpecularMaterial,
-)
+from .pixel_choice import some_pixels as some_pixels
 from .plausibility.report import Finding as Finding
 from .plausibility.report import Report as Report
 from .plausibility.stability import (
@@ -191,26 +181,11 @@ from .plausibility.stability import (
     stability_maps as stability_maps,
 )
 from .plausibility.verdicts import check as check
-from .precision import Precision as Precision
 from .precision import cast as cast
-from .precision import working_precision as working_precision
-from .rendering import (
-    Basis as Basis,
-)
-from .rendering import (
-    BasisImages as BasisImages,
-)
-from .rendering import (
-    Lobe as Lobe,
-)
-from .rendering import (
-    basis as basis,
-)
 from .rendering import (
     basis_images as basis_images,
 )
 from .rendering import (
     render as render,
 )
-from .scenes.pixel_choice import some_pixels as some_pixels
-from .scenes.scene import Scene as Scene
+from .scene import Scene as Scene

@@ -13,13 +13,13 @@ from jaxtyping import Float
 
 from brdf.channels import channel_names
 from brdf.geometry.camera import OrthographicCamera
-from brdf.geometry.shapes import Sphere
+from brdf.geometry.sphere import Sphere
 from brdf.images.encodings import encode
 from brdf.lights.punctual import DirectionalLight
 from brdf.models import Material, SpecularMaterial
 from brdf.plausibility.report import Report
 from brdf.rendering import render
-from brdf.scenes.scene import Scene
+from brdf.scene import Scene
 
 _FINEST = 65535
 _CELL = "padding:0.15em 0.8em;text-align:right;white-space:nowrap"

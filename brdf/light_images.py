@@ -10,11 +10,11 @@ from jaxtyping import Array, ArrayLike, Float
 
 from brdf.errors import InputError
 from brdf.geometry.surface_points import SurfacePoints
+from brdf.geometry.visibility import Lighting
 from brdf.models import Material
 from brdf.precision import Precision, cast, working_precision
 from brdf.rendering import channels_of, seen, shade
-from brdf.scenes.scene import Scene
-from brdf.shading.visibility import Lighting
+from brdf.scene import Scene
 
 
 def render_lights(material: Material, scene: Scene, *, precision: Precision | None = None) -> Float[Array, "L H W C"]:

@@ -1,7 +1,7 @@
 """Basis images and pictures: image = k_a B_a + k_d B_d + k_s B_s(n).
 
 A picture is linear in k_a, k_d, k_s and in the light, so rendering, fitting and relighting all read the same basis
-images. They come from the one pass over light samples of `brdf.shading.light_sum`. What a scene lacks is not compiled:
+images. They come from the one pass over light samples of `brdf.light_sum`. What a scene lacks is not compiled:
 without ambient light, lights, a specular term or occluders there is no arithmetic for it.
 """
 
@@ -17,10 +17,8 @@ from jaxtyping import Array, ArrayLike, Float
 
 from brdf.errors import InputError
 from brdf.geometry.surface_points import SurfacePoints
-from brdf.models import Material, SpecularMaterial
-from brdf.precision import Precision, cast, working_precision
-from brdf.scenes.scene import Scene
-from brdf.shading.light_sum import (
+from brdf.geometry.visibility import Lighting
+from brdf.light_sum import (
     STACKED_VALUES,
     STORED_SAMPLES,
     LightTerms,
@@ -30,8 +28,10 @@ from brdf.shading.light_sum import (
     stacked_terms,
     sum_over_samples,
 )
-from brdf.shading.lobes import AveragedLobe, Lobe, StackedLobe, StoredLobe, StreamedLobe, average
-from brdf.shading.visibility import Lighting
+from brdf.lobes import AveragedLobe, Lobe, StackedLobe, StoredLobe, StreamedLobe, average
+from brdf.models import Material, SpecularMaterial
+from brdf.precision import Precision, cast, working_precision
+from brdf.scene import Scene
 
 
 class Basis(eqx.Module):

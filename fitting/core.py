@@ -9,6 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 import brdf
+from brdf.models.base import SpecularMaterial
+from brdf.precision import Precision
+from brdf.rendering import basis
 from fitting.light_colour import LightColour
 from fitting.pixels import TILE_PIXELS, Observation, Tile
 from fitting.solver.losses import Loss, reweight
@@ -84,17 +87,17 @@ def reached(model: type[brdf.Material], job: Job) -> Bool[np.ndarray, "3 C"]:
         job: the pictures.
     """
     ambient, direct = job.lit
-    return np.stack([ambient, direct, direct & issubclass(model, brdf.SpecularMaterial)])
+    return np.stack([ambient, direct, direct & issubclass(model, SpecularMaterial)])
 
 
 def _engine_pictures(model: type[brdf.Material], job: Job, *, keep: bool = True) -> Sequence[Picture]:
     def picture(tile: Tile, scene: brdf.Scene) -> Picture:
         dtype = tile.target.dtype
-        precision: brdf.Precision = "float32" if dtype == np.float32 else "float64"
+        precision: Precision = "float32" if dtype == np.float32 else "float64"
         ambient = np.zeros(1) if scene.ambient is None else np.asarray(scene.ambient, np.float64)
-        basis = brdf.basis(model, brdf.cast(scene, precision), points=tile.points)
-        diffuse = jnp.zeros((tile.target.shape[0], 1), dtype) if basis.diffuse is None else basis.diffuse
-        return Picture(tile.target, diffuse, basis.lobe, tile.weight, ambient)
+        images = basis(model, brdf.cast(scene, precision), points=tile.points)
+        diffuse = jnp.zeros((tile.target.shape[0], 1), dtype) if images.diffuse is None else images.diffuse
+        return Picture(tile.target, diffuse, images.lobe, tile.weight, ambient)
 
     pictures = []
     for observation, scene in zip(job.observations, job.light.scenes, strict=True):

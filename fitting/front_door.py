@@ -9,6 +9,7 @@ import numpy as np
 
 import brdf
 from brdf.errors import InputError
+from brdf.precision import Precision, working_precision
 from fitting.auto_fit import fit_simplest
 from fitting.censored_noise import warned_of_cut_noise, without_cut_noise
 from fitting.core import Job, fit_model, reached, without_highlight
@@ -44,7 +45,7 @@ def fit(
     scene: brdf.Scene | Sequence[brdf.Scene],
     *,
     model: str = "auto",
-    precision: brdf.Precision = "float32",
+    precision: Precision = "float32",
     mask: Any = None,
     saturation: float | None = None,
     n_range: tuple[float, float] = N_RANGE,
@@ -121,7 +122,7 @@ def fit(
     weights = relative_weights(weights)
 
     def fit_to(masks: list[Any]) -> FitResult:
-        with brdf.working_precision(precision):
+        with working_precision(precision):
             observations = [
                 observe(picture, place, dtype=np.dtype(precision), mask=one, weight=other, **cuts)
                 for picture, place, one, other in zip(targets, scenes, masks, weights, strict=True)
@@ -138,7 +139,7 @@ def _fit_observed(
     observations: list[Observation],
     scenes: list[brdf.Scene],
     model: str,
-    precision: brdf.Precision,
+    precision: Precision,
     n_range: tuple[float, float],
     loss: Loss,
     plausible: bool,
@@ -211,7 +212,7 @@ def _result(
     told: Interpretation,
     choice: Choice | None,
     job: Job,
-    precision: brdf.Precision,
+    precision: Precision,
     seconds: float,
 ) -> FitResult:
     optimum, observations = fit.optimum, job.observations

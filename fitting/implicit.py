@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import brdf
+from brdf.precision import working_precision
 from fitting.result import FitResult
 
 POLISHING_STEPS = 3
@@ -71,7 +72,7 @@ def sensitivity(result: FitResult, by: Callable[[list[brdf.Scene]], Sequence[Any
     if not leaves or not all(hasattr(leaf, "shape") for leaf in leaves):
         raise brdf.InputError("by", "names no leaf of the scenes", "Return the leaves to differentiate by")
     unknowns = _Unknowns(result)
-    with brdf.working_precision("float64"):
+    with working_precision("float64"):
         scenes = brdf.cast(scenes, "float64")
         seen = [_seen(target, counted) for target, counted in zip(result.targets, result.counted, strict=True)]
         known, unravel = jax.flatten_util.ravel_pytree(tuple(by(scenes)))

@@ -23,6 +23,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 import brdf
+from brdf.precision import Precision, working_precision
 from fitting.pixels import Tile, observe
 from fitting.problem import pictures_and_scenes
 
@@ -168,7 +169,7 @@ def fit_jointly(
     free: Callable[[brdf.Material, list[brdf.Scene]], Sequence[Any]],
     *,
     solver: Literal["lm", "bfgs"] | None = None,
-    precision: brdf.Precision = "float64",
+    precision: Precision = "float64",
     mask: Any = None,
     saturation: float | None = None,
     tolerance: float = 1e-10,
@@ -202,7 +203,7 @@ def fit_jointly(
         came = f"and max_steps must be above 0, got {tolerance!r} and {max_steps!r}"
         raise brdf.InputError("tolerance", came, "Give for example 1e-10 and 256")
     targets, scenes, masks, _ = pictures_and_scenes(target, scene, mask, None)
-    with brdf.working_precision(precision):
+    with working_precision(precision):
         dtype = np.dtype(precision)
         seen = [
             observe(picture, place, dtype=dtype, mask=one, saturation=saturation, at_once=True).tiles[0]

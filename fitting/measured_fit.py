@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 import brdf
 from brdf.errors import InputError
+from brdf.models.base import SpecularMaterial
 from fitting.measured_losses import Loss, Samples, logarithmic, losses_of
 from fitting.measured_result import HALF, BrdfCandidate, BrdfFitResult, lowest_cosine
 from fitting.result import Parameter
@@ -123,7 +124,7 @@ def _samples(table: brdf.MeasuredBRDF, max_angle: float) -> tuple[Samples, dict[
 
 def _unknowns(name: str, samples: Samples) -> int:
     channels = samples.values.shape[1]
-    return 2 * channels + 1 if issubclass(brdf.MODELS[name], brdf.SpecularMaterial) else channels
+    return 2 * channels + 1 if issubclass(brdf.MODELS[name], SpecularMaterial) else channels
 
 
 class _Fit(NamedTuple):
@@ -135,7 +136,7 @@ class _Fit(NamedTuple):
 def _fit_model(name: str, samples: Samples, loss: Loss, n_range: tuple[float, float]) -> _Fit:
     model = brdf.MODELS[name]
     channels = samples.values.shape[1]
-    specular = issubclass(model, brdf.SpecularMaterial)
+    specular = issubclass(model, SpecularMaterial)
     log_cos, reach = _lobe(model, samples)
     free = np.ones((3, channels), bool)
     free[0], free[2] = False, specular
@@ -204,7 +205,7 @@ def _fit_model(name: str, samples: Samples, loss: Loss, n_range: tuple[float, fl
 def _lobe(model: type[brdf.Material], samples: Samples) -> tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]]:
     """Logarithm of the lobe's cosine, and what multiplies the lobe: S / (N.L) without scale."""
     count = len(samples.values)
-    if not issubclass(model, brdf.SpecularMaterial):
+    if not issubclass(model, SpecularMaterial):
         return np.zeros(count), np.zeros(count)
     with jax.enable_x64(True):
         normal = jnp.array([0.0, 0.0, 1.0])

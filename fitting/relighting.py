@@ -16,6 +16,8 @@ from jaxtyping import Bool, Float
 
 import brdf
 from brdf.errors import InputError
+from brdf.models.base import SpecularMaterial
+from brdf.precision import Precision
 from fitting.solver.nnls import DEPENDENT, nonnegative_minimum
 
 UNKNOWN_FACTOR = (
@@ -65,7 +67,7 @@ class LightFit:
 
 
 def fit_lights(
-    target: Any, scene: brdf.Scene, material: brdf.Material, *, precision: brdf.Precision = "float32", mask: Any = None
+    target: Any, scene: brdf.Scene, material: brdf.Material, *, precision: Precision = "float32", mask: Any = None
 ) -> LightFit:
     """Fit intensity and colour of every light, given the material.
 
@@ -94,7 +96,7 @@ def fit_lights_and_material(
     scene: brdf.Scene,
     *,
     model: str = "blinn-phong",
-    precision: brdf.Precision = "float32",
+    precision: Precision = "float32",
     mask: Any = None,
     n_range: tuple[float, float] = N_RANGE,
 ) -> LightFit:
@@ -125,7 +127,7 @@ def fit_lights_and_material(
     pixels, seen = _pixels(target, scene, mask)
     channels = pixels.shape[1]
     cls: Any = brdf.MODELS[model]
-    specular = issubclass(cls, brdf.SpecularMaterial)
+    specular = issubclass(cls, SpecularMaterial)
 
     def terms(n: float) -> Float[np.ndarray, "L T P C"]:
         """One picture per light for k_d = 1, and for k_s = 1."""

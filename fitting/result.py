@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 import brdf
+from brdf.precision import Precision
 from fitting.budget.budget_choice import BudgetChoice
 from fitting.selection import Candidate
 from fitting.solver.profile import Optimum
@@ -110,7 +111,7 @@ class FitResult:
     correlation: Float[np.ndarray, "F F"]
     optimum: Optimum
     loss: str
-    precision: brdf.Precision
+    precision: Precision
     seconds: float
     targets: Sequence[np.ndarray] = field(repr=False)
     scenes: Sequence[brdf.Scene] = field(repr=False)

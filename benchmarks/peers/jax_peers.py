@@ -13,6 +13,7 @@ import brdf
 import fitting
 from benchmarks import engine
 from benchmarks.peers.problem import NOISE, Answer, Problem, Run, Trace
+from brdf.precision import Precision
 from fitting.solver.profile import search
 
 # Where a solver may stop: relative changes as small as sums in each precision can show.
@@ -123,7 +124,7 @@ def this_engine(problem: Problem, dtype: str) -> Run:
     return run
 
 
-def this_front_door(problem: Problem, dtype: brdf.Precision) -> Run:
+def this_front_door(problem: Problem, dtype: Precision) -> Run:
     """All of ``fitting.fit``, from a normal map to error bars: no start, the whole range of n."""
     normal = engine.normals(problem.size)
     scene = brdf.Scene(

@@ -55,7 +55,7 @@ class Camera(eqx.Module):
             behind the camera, as OpenGL's infinite viewer does. None means local for a perspective camera and
             infinite for an orthographic one. (VTK always puts the eye at the camera.)
         samples: k, so that a pixel where that matters is the average over its area by k × k points; see
-            `brdf.shading.pixel_area`. 1 looks at the pixel's centre only.
+            `brdf.pixel_area`. 1 looks at the pixel's centre only.
     """
 
     position: Float[Array, "3"] = eqx.field(converter=vector("position"), kw_only=True)

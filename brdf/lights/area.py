@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 
 from brdf.checks import direction_value, positive, sample_number, spectrum, vector, vertex_list
 from brdf.errors import InputError
-from brdf.geometry.shapes import check_spans_area
+from brdf.geometry.rectangle import check_spans_area
 from brdf.lights.punctual import Light, LightSample, Place
 from brdf.lights.sample_sets import disc_rule, square_rule
 from brdf.lights.triangulation import newell_normal, triangulate

@@ -20,6 +20,7 @@ import numpy as np
 
 import brdf
 from brdf.errors import InputError
+from brdf.precision import Precision
 from fitting.budget.budget_choice import Attempt, BudgetChoice
 from fitting.budget.configurations import Configuration, Run, casts_shadows, run, target_size
 from fitting.budget.first_pixels import FIRST_PIXELS, NOISY, TOO_MANY, first_pixels, reason_for_all
@@ -66,7 +67,7 @@ def fit_within(
     targets: Sequence[Any],
     scenes: Sequence[brdf.Scene],
     model: str,
-    precision: brdf.Precision,
+    precision: Precision,
     options: Mapping[str, Any],
     beside: Mapping[str, bool],
     *,
@@ -143,7 +144,7 @@ def fit_within(
     return dataclasses.replace(step.run.result, choice=choice, seconds=time.perf_counter() - start)
 
 
-def _precision(least: brdf.Precision, pixels: int | None, accuracy: float | None, *, hard: bool) -> brdf.Precision:
+def _precision(least: Precision, pixels: int | None, accuracy: float | None, *, hard: bool) -> Precision:
     """In which to look at so many pixels.
 
     Under hard shadows float32 puts some pixels on the other side of an edge: a few in a million, each of which weighs

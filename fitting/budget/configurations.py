@@ -13,6 +13,7 @@ import numpy as np
 
 import brdf
 from brdf.errors import InputError
+from brdf.precision import Precision, working_precision
 from fitting.budget.lamps import Lamps
 from fitting.budget.pixel_sampling import PixelSample, sample_pixels
 from fitting.problem import looked_at
@@ -34,7 +35,7 @@ class Configuration:
     """
 
     model: str = "auto"
-    precision: brdf.Precision = "float32"
+    precision: Precision = "float32"
     pixels: int | None = None
     samples: int | None = None
     shadows: bool = True
@@ -75,14 +76,14 @@ def casts_shadows(scene: brdf.Scene) -> bool:
     return bool(scene.lights) and bool(scene.lighting.occluders)
 
 
-def without_shadows(scene: brdf.Scene, precision: brdf.Precision) -> brdf.Scene:
+def without_shadows(scene: brdf.Scene, precision: Precision) -> brdf.Scene:
     """The scene whose shapes cast no shadows.
 
     Args:
         scene: any.
         precision: in which its pixels are traced.
     """
-    with brdf.working_precision(precision):
+    with working_precision(precision):
         points = brdf.cast(scene, precision).surface_points()
     points = eqx.tree_at(lambda p: p.visibility, points, None, is_leaf=lambda leaf: leaf is None)
     return dataclasses.replace(scene, camera=None, shapes=(), points=points)

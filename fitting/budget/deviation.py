@@ -3,6 +3,7 @@
 import numpy as np
 
 import brdf
+from brdf.models.base import SpecularMaterial
 from fitting.result import FitResult
 from fitting.uncertainty.covariance import TERMS
 
@@ -36,13 +37,13 @@ def parameter_deviation(result: FitResult, reference: FitResult) -> float:
         reference: another, of the same targets.
     """
     one, other = result.material, reference.material
-    specular = isinstance(other, brdf.SpecularMaterial) and bool(np.any(np.asarray(other.k_s) > 0))
-    terms = TERMS if isinstance(other, brdf.SpecularMaterial) else TERMS[:2]
+    specular = isinstance(other, SpecularMaterial) and bool(np.any(np.asarray(other.k_s) > 0))
+    terms = TERMS if isinstance(other, SpecularMaterial) else TERMS[:2]
     largest = max(float(np.max(getattr(other, name))) for name in terms)
     lost, worst = set(reference.undetermined), 0.0
     for name in terms:
         true = np.asarray(getattr(other, name), np.float64)
-        if name == "k_s" and not isinstance(one, brdf.SpecularMaterial):
+        if name == "k_s" and not isinstance(one, SpecularMaterial):
             value = np.zeros_like(true)
         else:
             value = np.asarray(getattr(one, name), np.float64)

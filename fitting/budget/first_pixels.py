@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 import brdf
+from brdf.models.base import SpecularMaterial
 from fitting.budget.configurations import one_each, share_counted, target_size
 from fitting.problem import looked_at
 
@@ -98,7 +99,7 @@ def pixels_for(targets: Sequence[Any], options: Mapping[str, Any], model: str, a
     ]
     noise, size = np.sqrt(np.mean(np.square(found), axis=0))
     share = noise / max(size, np.finfo(float).tiny)
-    crowded = model == "auto" or issubclass(brdf.MODELS[model], brdf.SpecularMaterial)
+    crowded = model == "auto" or issubclass(brdf.MODELS[model], SpecularMaterial)
     return (SPREAD * share / accuracy) ** 2 / (CROWDED if crowded else 1.0)
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import equinox as eqx
 
 import brdf
+from brdf.lights.punctual import Light
 
 
 def extended(scene: brdf.Scene) -> bool:
@@ -18,7 +19,7 @@ def extended(scene: brdf.Scene) -> bool:
     return any(hasattr(light, "samples") for light in scene.lights)
 
 
-def with_lights(scene: brdf.Scene, lights: Sequence[brdf.Light]) -> brdf.Scene:
+def with_lights(scene: brdf.Scene, lights: Sequence[Light]) -> brdf.Scene:
     """The scene under other lights, none of them masked.
 
     Args:
@@ -33,7 +34,7 @@ class Lamps:
 
     def __init__(self) -> None:
         """Nothing made yet."""
-        self._made: dict[tuple[int, int], tuple[brdf.Light, brdf.Light]] = {}
+        self._made: dict[tuple[int, int], tuple[Light, Light]] = {}
 
     def with_samples(self, scene: brdf.Scene, samples: int | None) -> brdf.Scene:
         """The scene with so many samples in each of its lights with an extent.

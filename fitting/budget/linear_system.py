@@ -17,6 +17,8 @@ import numpy as np
 from jaxtyping import Float
 
 import brdf
+from brdf.models.base import SpecularMaterial
+from brdf.precision import Precision, working_precision
 from fitting.budget.configurations import Run, casts_shadows, one_each, some_of_target, target_size
 from fitting.budget.deviation import SMALLEST
 from fitting.budget.lamps import Lamps
@@ -103,7 +105,7 @@ class System:
             whole = _every(self.run.scenes[index], model, round(most / max(float(np.mean(counted)), 1e-9)))
         return _part(whole, counted, self.weights[index], most, complete=sample is None)
 
-    def place(self, index: int, part: Part, samples: int | None, precision: brdf.Precision) -> brdf.Scene:
+    def place(self, index: int, part: Part, samples: int | None, precision: Precision) -> brdf.Scene:
         """The scene of some pixels of a picture, under lights of so many samples.
 
         Args:
@@ -115,7 +117,7 @@ class System:
         scene = self.lamps.with_samples(self.light.scenes[index], samples)
         return brdf.cast(brdf.some_pixels(scene, part.sample.pixel, precision=precision), precision)
 
-    def traced(self, index: int, part: Part, precision: brdf.Precision) -> tuple[brdf.Scene, np.ndarray | None]:
+    def traced(self, index: int, part: Part, precision: Precision) -> tuple[brdf.Scene, np.ndarray | None]:
         """A scene, and which of its pixels a program is to trace; None where it is the scene of some pixels.
 
         Args:
@@ -130,7 +132,7 @@ class System:
         return self.place(index, part, None, precision), None
 
     def _add(self, index: int, values: np.ndarray, weight: np.ndarray) -> None:
-        with brdf.working_precision("float64"):
+        with working_precision("float64"):
             scene, pixel = self.traced(index, self.parts[index], "float64")
             n, x = np.float64(max(self.optimum.n, 1e-3)), self.optimum.x
             found = jax.device_get(probe(self.model, scene, pixel, values, weight, n, x))
@@ -165,7 +167,7 @@ class System:
         """What a shift of each parameter is divided by, which are told, and how k_s follows x_s and n."""
         result, optimum, channels = self.run.result, self.optimum, self.channels
         factors = coefficient_factors(self.model, optimum.n, self.light.colour)
-        specular = issubclass(self.model, brdf.SpecularMaterial) and not optimum.flat
+        specular = issubclass(self.model, SpecularMaterial) and not optimum.flat
         k = optimum.x / factors
         largest = max(float(np.max(k[: 3 if specular else 2])), np.finfo(float).tiny)
         scale = np.maximum(np.max(k, axis=1), SMALLEST * largest)[:, None] * factors

@@ -14,6 +14,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 import brdf
+from brdf.models.base import SpecularMaterial
+from brdf.precision import working_precision
+from brdf.rendering import basis
 from fitting.budget.lamps import with_lights, with_samples
 
 # Of the squares of each size this share is cut further.
@@ -83,7 +86,7 @@ def sample_pixels(scene: brdf.Scene, model: type[brdf.Material], size: int) -> P
     order = _along_curve(tops[0].size, tops[1].size)
     grid = np.meshgrid(*tops, indexing="ij")
     squares = _Squares(grid[0].ravel()[order], grid[1].ravel()[order], side)
-    lobes = _few_samples(scene) if issubclass(model, brdf.SpecularMaterial) else None
+    lobes = _few_samples(scene) if issubclass(model, SpecularMaterial) else None
     kept: list[tuple[_Squares, np.ndarray]] = []
     most = max(16, 4 * round(size * CUT / 4))
     while True:
@@ -134,7 +137,7 @@ def _peaks(scene: brdf.Scene, model: type[brdf.Material], pixel: Int[np.ndarray,
     # One shape for few sizes, so that few programs are compiled.
     padded = np.zeros(1 << int(pixel.size - 1).bit_length(), np.int32)
     padded[: pixel.size] = pixel
-    with brdf.working_precision("float32"):
+    with working_precision("float32"):
         compiled = _compiled_peaks if traceable(scene) else _direct_peaks
         return np.asarray(compiled(model, scene, padded))[: pixel.size]
 
@@ -149,7 +152,7 @@ def traceable(scene: brdf.Scene) -> bool:
 
 
 def _direct_peaks(model: type[brdf.Material], scene: brdf.Scene, pixel: Any) -> Any:
-    lobe = brdf.basis(model, brdf.cast(brdf.some_pixels(scene, pixel), "float32")).lobe
+    lobe = basis(model, brdf.cast(brdf.some_pixels(scene, pixel), "float32")).lobe
     assert lobe is not None
     return lobe.peak()
 

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 import brdf
+from brdf.precision import Precision
+from brdf.rendering import basis
 from fitting.solver.normal_equations import AnyArray
 
 
@@ -29,16 +31,16 @@ def _columns(
     model: type[brdf.Material], scene: brdf.Scene, n: Any, shape: tuple[int, int]
 ) -> tuple[Float[Array, "M C 4"], Any]:
     """Ambient, diffuse, lobe and its derivative by log n, for each channel; and which pixels see the object."""
-    basis = brdf.basis(model, scene)
+    images = basis(model, scene)
     ambient = jnp.zeros(1) if scene.ambient is None else jnp.asarray(scene.ambient)
     columns = [jnp.broadcast_to(ambient, shape)]
-    columns.append(jnp.zeros(shape) if basis.diffuse is None else jnp.broadcast_to(basis.diffuse, shape))
-    if basis.lobe is None:
+    columns.append(jnp.zeros(shape) if images.diffuse is None else jnp.broadcast_to(images.diffuse, shape))
+    if images.lobe is None:
         columns += [jnp.zeros(shape)] * 2
     else:
-        value, slope = basis.lobe(n)
+        value, slope = images.lobe(n)
         columns += [jnp.broadcast_to(value, shape), jnp.broadcast_to(slope * n, shape)]
-    return jnp.stack(columns, axis=-1), basis.points.mask
+    return jnp.stack(columns, axis=-1), images.points.mask
 
 
 def _direct_probe(
@@ -147,7 +149,7 @@ def crossed(before: Any, after: Any) -> Any:
 
 @eqx.filter_jit
 def columns_in(
-    model: type[brdf.Material], scene: brdf.Scene, pixel: Any, n: Any, shape: tuple[int, int], precision: brdf.Precision
+    model: type[brdf.Material], scene: brdf.Scene, pixel: Any, n: Any, shape: tuple[int, int], precision: Precision
 ) -> tuple[Float[Array, "M C 4"], Any]:
     """The columns, and which pixels see the object, compiled.
 

@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Float
 
 import brdf
+from brdf.precision import Precision, working_precision
 from fitting.budget.linear_system import System
 from fitting.budget.pixel_sampling import traceable
 from fitting.budget.probes import columns_in, crossed, difference, shadow_changes
@@ -31,7 +32,7 @@ from fitting.solver.profile import Optimum
 DRAWS = 512
 # Columns of length 1 that leave less than this of one another make float32 lose most of its digits.
 DEPENDENT = 0.01
-# Shadow rays start so many rounding errors above the surface (`brdf.shading.visibility`), relative to coordinates.
+# Shadow rays start so many rounding errors above the surface (`brdf.geometry.visibility`), relative to coordinates.
 RAY_START = 300
 # A shift of a shadow's edge by that much is seen by few pixels: they are lifted so many times as far.
 LIFT = 512
@@ -79,7 +80,7 @@ class Estimate(NamedTuple):
     rounding: float
 
 
-def rounding_by_rule(n: float, precision: brdf.Precision) -> float:
+def rounding_by_rule(n: float, precision: Precision) -> float:
     """What rounding does to a fit of all pixels, of no more account than its order of magnitude.
 
     A few units in the last place, more for a lobe so narrow that the rounding of directions counts against its width.
@@ -146,7 +147,7 @@ def _of_shadows(system: System) -> Float[np.ndarray, "D P"]:
     lift = LIFT * RAY_START * float(np.finfo(np.float32).eps)
     for index in range(len(system.parts)):
         part = system.part(index, AT_EDGES // len(system.parts), brdf.Lambert)
-        with brdf.working_precision("float64"):
+        with working_precision("float64"):
             scene, pixel = system.traced(index, part, "float64")
             n, x = np.asarray(max(system.optimum.n, 1e-3)), system.optimum.x
             found = np.asarray(shadow_changes(system.model, scene, pixel, lift, part.weight, n, x))
@@ -170,7 +171,7 @@ def _of_light(system: System, coarse: int | None, fine: int) -> Float[np.ndarray
     """Products of the derivatives with what more light samples change."""
     total = np.zeros(3 * system.channels + 1)
     for index, part in enumerate(system.parts):
-        with brdf.working_precision("float64"):
+        with working_precision("float64"):
             scene, pixel = system.light.scenes[index], part.sample.pixel.astype(np.int32)
             if traceable(scene):
                 few, many = (system.lamps.with_samples(scene, samples) for samples in (coarse, fine))
@@ -193,7 +194,7 @@ def _of_single(system: System, index: int, weight: np.ndarray) -> Float[np.ndarr
     """What float32 changes, told by the products of the columns with the model in both precisions."""
     found = []
     for precision in ("float64", "float32"):
-        with brdf.working_precision(precision):
+        with working_precision(precision):
             scene, pixel = system.traced(index, system.parts[index], precision)
             n = np.float64(max(system.optimum.n, 1e-3))
             shape = (weight.size, system.channels)

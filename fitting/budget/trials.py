@@ -17,6 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import brdf
+from brdf.models.base import SpecularMaterial
+from brdf.precision import Precision
 from fitting.budget.budget import MOST_SAMPLES, WHOLE
 from fitting.budget.configurations import Configuration, casts_shadows, run, some_of_target, target_size
 from fitting.budget.deviation import parameter_deviation
@@ -141,7 +143,7 @@ class Bench:
 
     def _solver_trials(self) -> list[Trial]:
         """Levenberg-Marquardt and BFGS on a few pixels, from a guess."""
-        if not issubclass(type(self.best.material), brdf.SpecularMaterial):
+        if not issubclass(type(self.best.material), SpecularMaterial):
             return []
         trials = []
         for solver, tolerance in SOLVERS:
@@ -185,7 +187,7 @@ class Bench:
         steps: Sequence[int | None] = [None]
         if self.has_samples:
             steps = [*steps, *(s for s in (4, 16, 64, 256) if s < self.samples)]
-        precisions: tuple[brdf.Precision, ...] = ("float32", "float64")
+        precisions: tuple[Precision, ...] = ("float32", "float64")
         for precision in precisions:
             for samples in steps:
                 place = self.lamps.with_samples(self.scene, samples)

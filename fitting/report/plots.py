@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 import brdf
+from brdf.models.base import SpecularMaterial
 from fitting.result import FitResult
 
 PRINT: dict[Any, Any] = {
@@ -53,7 +54,7 @@ def comparison(result: FitResult, picture: int | None = None) -> Figure:
     values = target[counted]
     white = max(float(np.quantile(values, 0.999)), 1e-12) if values.size else 1.0
     box = _highlight(result, picture, target, counted)
-    specular = isinstance(result.material, brdf.SpecularMaterial) and bool(np.any(np.asarray(result.material.k_s)))
+    specular = isinstance(result.material, SpecularMaterial) and bool(np.any(np.asarray(result.material.k_s)))
     with matplotlib.rc_context(PRINT):
         figure = Figure(figsize=(7.2, 4.9), layout="constrained")
         figure.suptitle(title, fontsize=PRINT["axes.titlesize"])
@@ -138,7 +139,7 @@ class _Box:
 def _highlight(result: FitResult, picture: int, target: np.ndarray, counted: Bool[np.ndarray, "H W"]) -> _Box:
     material, scene = result.material, result.scenes[picture]
     image = np.nan_to_num(target).max(axis=-1)
-    if isinstance(material, brdf.SpecularMaterial) and np.any(np.asarray(material.k_s)):
+    if isinstance(material, SpecularMaterial) and np.any(np.asarray(material.k_s)):
         dark = type(material)(k_d=0.0 * np.asarray(material.k_d), k_s=material.k_s, n=material.n)
         image = np.asarray(brdf.render(dark, scene, precision=result.precision)).max(axis=-1)
     return _Box(np.where(counted, image, 0.0))

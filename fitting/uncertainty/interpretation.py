@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 import brdf
+from brdf.models.base import SpecularMaterial
 from fitting.result import Parameter
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
@@ -86,7 +87,7 @@ def interpret(
         shapes: of the pictures, height and width.
         required: coefficients that the light reaches and that were not left out as needless, (3, C).
     """
-    specular = issubclass(fit.model, brdf.SpecularMaterial)
+    specular = issubclass(fit.model, SpecularMaterial)
     optimum, pictures = fit.optimum, fit.pictures
     single = np.dtype(pictures[0].target.dtype) == np.float32
     factors = coefficient_factors(fit.model, optimum.n, colour)
@@ -163,13 +164,13 @@ def coefficient_factors(
     """
     colour = np.where(colour > 0, colour, 1.0)
     factors = np.stack([np.ones_like(colour), colour, colour])
-    if issubclass(model, brdf.SpecularMaterial):
+    if issubclass(model, SpecularMaterial):
         factors[2] *= _scale(model, float(n))
     return factors
 
 
 @functools.lru_cache(maxsize=64)
-def _scale(model: type[brdf.SpecularMaterial], n: float) -> float:
+def _scale(model: type[SpecularMaterial], n: float) -> float:
     """Of the lobe; asked for several times at one exponent."""
     with jax.enable_x64(True):
         return float(model.scale(np.float64(n)))
@@ -209,7 +210,7 @@ def _parameters(
 ) -> tuple[Parameter, ...]:
     found = []
     undetermined = sure.undetermined
-    specular = isinstance(material, brdf.SpecularMaterial)
+    specular = isinstance(material, SpecularMaterial)
     for term, name in enumerate(TERMS if specular else TERMS[:2]):
         for channel, value in enumerate(np.asarray(getattr(material, name))):
             reason = undetermined.get(name) or undetermined.get(f"{name}[{channel}]")

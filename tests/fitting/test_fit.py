@@ -8,6 +8,7 @@ from project_paths import ROOT
 
 import brdf
 import fitting
+from brdf.lights.punctual import Light
 
 CAMERA = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=(72, 72))
 BALL = brdf.Sphere(center=[0, 0, 0], radius=1)
@@ -16,7 +17,7 @@ LAMP = brdf.PointLight(position=[-2.0, 1.0, 3.0], intensity=[6.0, 6.0, 6.0])
 AMBIENT = [0.2, 0.2, 0.3]
 
 
-def scene(*lights: brdf.Light, ambient=AMBIENT) -> brdf.Scene:
+def scene(*lights: Light, ambient=AMBIENT) -> brdf.Scene:
     return brdf.Scene(camera=CAMERA, shapes=[BALL], ambient=ambient, lights=lights)
 
 
@@ -26,7 +27,7 @@ def rendered(material: brdf.Material, place: brdf.Scene) -> np.ndarray:
 
 @pytest.mark.parametrize("model", brdf.MODELS)
 @pytest.mark.parametrize("lights", [(SUN,), (SUN, LAMP)], ids=["one light", "two lights"])
-def test_random_materials_come_back(model: str, lights: tuple[brdf.Light, ...]):
+def test_random_materials_come_back(model: str, lights: tuple[Light, ...]):
     random = np.random.default_rng(list(brdf.MODELS).index(model))
     for _ in range(3):
         k = {name: random.uniform(0, 0.5, 3) for name in ("k_a", "k_d")}

@@ -6,6 +6,8 @@ from scipy.optimize import minimize
 
 import brdf
 import fitting
+from brdf.models.base import SpecularMaterial
+from brdf.precision import working_precision
 
 CAMERA = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=(32, 32))
 BALL = brdf.Sphere(center=[0, 0, 0], radius=1)
@@ -18,7 +20,7 @@ def random_case(seed: int) -> tuple[np.ndarray, brdf.Scene]:
     scene = brdf.Scene(camera=CAMERA, shapes=[BALL], ambient=[0.2] * 3, lights=[light])
     names = ["phong", "blinn-phong", "normalized-phong", "normalized-blinn-phong"]
     model = brdf.MODELS[names[seed % 4]]
-    assert issubclass(model, brdf.SpecularMaterial)
+    assert issubclass(model, SpecularMaterial)
     k = {name: rng.uniform(0, 1.2, 3) for name in ("k_a", "k_d", "k_s")}
     material = model(**k, n=10 ** rng.uniform(0, 3))
     picture = np.asarray(brdf.render(material, scene, precision="float64"))
@@ -60,7 +62,7 @@ def best_of_slsqp(target: np.ndarray, scene: brdf.Scene, model: type, starts: in
             total += found.fun * size + float(wanted[:, channel] @ wanted[:, channel])
         return total
 
-    with brdf.working_precision("float64"):
+    with working_precision("float64"):
         rng = np.random.default_rng(seed)
         grid = np.sort(rng.uniform(np.log(0.1), np.log(1e4), starts))
         costs = [cost(log_n) for log_n in grid]

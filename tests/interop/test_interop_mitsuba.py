@@ -11,6 +11,7 @@ from project_paths import ROOT
 
 import brdf
 from brdf.lights.environment import map_directions
+from brdf.lights.punctual import Light
 
 pytest.importorskip("mitsuba", reason="Mitsuba 3 renders the reference")
 sys.path.insert(0, str(ROOT / "data"))
@@ -56,7 +57,7 @@ LIGHTS: dict[str, dict[str, Any]] = {
 }
 
 
-def light_of(kind: str, values: dict[str, Any], folder: Path) -> tuple[dict[str, Any], brdf.Light]:
+def light_of(kind: str, values: dict[str, Any], folder: Path) -> tuple[dict[str, Any], Light]:
     if kind == "map":
         directions = map_directions(256, 512) @ np.array([0.5, 0.5, 0.707])
         pixels = np.exp(4 * (directions - 1))[..., None] * np.array(RADIANCE) + 0.2

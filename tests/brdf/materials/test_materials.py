@@ -8,11 +8,12 @@ import pytest
 from project_paths import REAL
 
 import brdf
+from brdf.models.base import SpecularMaterial
 
 K = {"k_a": [0.1, 0.2, 1 / 3], "k_d": [0.5, 0.4, 0.0], "k_s": [0.3, 0.25, 1e-7]}
 MATERIALS = [
     brdf.Lambert(k_a=K["k_a"], k_d=K["k_d"]),
-    *[model(**K, n=37.123456789012345) for model in brdf.MODELS.values() if issubclass(model, brdf.SpecularMaterial)],
+    *[model(**K, n=37.123456789012345) for model in brdf.MODELS.values() if issubclass(model, SpecularMaterial)],
 ]
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import brdf
+from brdf.lights.punctual import Light
 
 NORMALS = np.array([[[0, 0, 1.0], [0, 0.5, 0.8], [0.9, 0, 0.3], [0.3, -0.2, 0.5]]])
 POINTS = brdf.SurfacePoints.from_normals(NORMALS, position=np.zeros(NORMALS.shape))
@@ -24,7 +25,7 @@ QUAD = np.array(
 )
 
 
-def radiance(light: brdf.Light, material: brdf.Material = WHITE) -> np.ndarray:
+def radiance(light: Light, material: brdf.Material = WHITE) -> np.ndarray:
     image = brdf.render(material, brdf.Scene(points=POINTS, lights=[light]), precision="float64")
     return np.asarray(image)[0, :, 0]
 
@@ -47,7 +48,7 @@ def lambert(vertices: np.ndarray) -> np.ndarray:
     ],
     ids=["rectangle", "polygon"],
 )
-def test_flat_lights_follow_lamberts_formula(light: brdf.Light):
+def test_flat_lights_follow_lamberts_formula(light: Light):
     # twice their size away, 64 samples: 1e-4 is asked for
     np.testing.assert_allclose(radiance(light), lambert(QUAD), rtol=1e-6)
 
@@ -169,7 +170,7 @@ def test_gradients_are_central_differences(name: str):
     fields = [f.name for f in dataclasses.fields(light) if not f.metadata.get("static") and f.name != "triangles"]
     with jax.enable_x64(True):
 
-        def value(light: brdf.Light) -> jax.Array:
+        def value(light: Light) -> jax.Array:
             return jnp.sum(jnp.sin(1 + brdf.render(GLOSSY, brdf.Scene(points=POINTS, lights=[light]))))
 
         gradient = eqx.filter_grad(value)(brdf.cast(light, "float64"))

@@ -9,6 +9,7 @@ import pytest
 
 import brdf
 import fitting
+from brdf.rendering import basis
 
 SIZE = 128
 TO_LIGHT = np.array([0.5, 0.6, 0.7]) / np.linalg.norm([0.5, 0.6, 0.7])
@@ -96,7 +97,7 @@ def test_gradients_pass_through_pixel_areas():
 
 
 def test_many_samples_pass_tile_by_tile(monkeypatch: pytest.MonkeyPatch):
-    from brdf.shading import light_sum as shading
+    from brdf import light_sum as shading
 
     light = brdf.SphereLight(center=[1, 1, 3], radius=0.5, radiance=5, samples=16)
     whole = np.asarray(brdf.render(glossy(20), ball(1, size=40, lights=[light]), precision="float32"))
@@ -108,12 +109,12 @@ def test_many_samples_pass_tile_by_tile(monkeypatch: pytest.MonkeyPatch):
 
 def test_an_averaged_basis_makes_the_averaged_picture():
     scene, material = ball(3, size=32), glossy(200.0)
-    basis = brdf.basis(brdf.BlinnPhong, scene)
-    assert basis.diffuse is not None
-    assert basis.lobe is not None
-    value, _ = basis.lobe(jnp.asarray(200.0))
-    picture = 0.5 * basis.diffuse + 0.5 * value
+    images = basis(brdf.BlinnPhong, scene)
+    assert images.diffuse is not None
+    assert images.lobe is not None
+    value, _ = images.lobe(jnp.asarray(200.0))
+    picture = 0.5 * images.diffuse + 0.5 * value
     expected = np.asarray(brdf.render(material, scene))
     np.testing.assert_allclose(np.asarray(picture).reshape(expected.shape), expected, atol=1e-6)
-    few = basis.lobe.pixels(lambda a: a[100:200])
+    few = images.lobe.pixels(lambda a: a[100:200])
     np.testing.assert_allclose(few(jnp.asarray(200.0))[0], value[100:200], atol=1e-7)

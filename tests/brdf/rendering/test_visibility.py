@@ -9,6 +9,7 @@ import pytest
 from project_paths import ROOT
 
 import brdf
+from brdf.lights.punctual import Light
 from brdf.rendering import shade
 
 sys.path.insert(0, str(ROOT / "data"))
@@ -30,7 +31,7 @@ def without_type(table: dict) -> dict:
     return {key: value for key, value in table.items() if key != "type"}
 
 
-def scene(*lights: brdf.Light, shapes: list | None = None, **more) -> brdf.Scene:
+def scene(*lights: Light, shapes: list | None = None, **more) -> brdf.Scene:
     shapes = [brdf.Sphere(**without_type(BALL)), brdf.Rectangle(**without_type(WALL))] if shapes is None else shapes
     return brdf.Scene(camera=brdf.OrthographicCamera(**without_type(CAMERA)), shapes=shapes, lights=lights, **more)
 

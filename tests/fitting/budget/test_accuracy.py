@@ -9,7 +9,7 @@ from ball_scenes import MATERIAL, ball, noisy
 
 import brdf
 import fitting
-from brdf.shading.visibility import OFFSET
+from brdf.geometry.visibility import OFFSET
 from fitting.budget import budget, sampling_error
 from fitting.budget.deviation import deviation
 from fitting.budget.sampling_error import Estimate

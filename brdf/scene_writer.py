@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from brdf.files import write_text
-from brdf.geometry.meshes import Mesh, Triangles
 from brdf.geometry.surface_points import SurfacePoints
+from brdf.geometry.triangles import Mesh, Triangles
 from brdf.images.pictures import write_image, write_layers
 from brdf.lights.environment import EnvironmentMap
-from brdf.scenes.file import SHAPES
-from brdf.scenes.scene import Scene
+from brdf.scene import Scene
+from brdf.scene_file import SHAPES
 
 
 def _toml(value: Any) -> str:

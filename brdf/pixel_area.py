@@ -23,15 +23,15 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
+from brdf.geometry.base import Shape
 from brdf.geometry.camera import Camera
-from brdf.geometry.shapes import Shape
+from brdf.geometry.rays import NO_SHAPE, shapes_met, trace
 from brdf.geometry.surface_points import PixelArea, SurfacePoints
-from brdf.geometry.tracing import NO_SHAPE, shapes_met, trace
+from brdf.geometry.visibility import Lighting, share_seen
+from brdf.light_sum import STORED_SAMPLES, nodes_of, sample_count
 from brdf.lights.punctual import Place
 from brdf.lights.sample_sets import square_rule
 from brdf.precision import apart
-from brdf.shading.light_sum import STORED_SAMPLES, nodes_of, sample_count
-from brdf.shading.visibility import Lighting, share_seen
 from brdf.vectors import dot, half_log_cosine
 
 NARROW = 0.2

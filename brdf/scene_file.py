@@ -10,15 +10,17 @@ from typing import Any, NamedTuple
 from brdf.checks import direction_value
 from brdf.errors import InputError
 from brdf.files import read_text
+from brdf.geometry.base import Shape
 from brdf.geometry.camera import CAMERAS
-from brdf.geometry.meshes import Triangles, load_mesh
-from brdf.geometry.shapes import Rectangle, Shape, Sphere
+from brdf.geometry.rectangle import Rectangle
+from brdf.geometry.sphere import Sphere
 from brdf.geometry.surface_points import SurfacePoints
+from brdf.geometry.triangles import Triangles, load_mesh
 from brdf.images.pictures import read_image, read_layers
 from brdf.lights.area import PolygonLight, RectangleLight, SphereLight
 from brdf.lights.environment import ConstantEnvironment, EnvironmentMap
 from brdf.lights.punctual import DirectionalLight, Light, PointLight, SpotLight
-from brdf.scenes.scene import Scene
+from brdf.scene import Scene
 
 SHAPES: dict[str, type[Shape]] = {"sphere": Sphere, "rectangle": Rectangle, "triangles": Triangles}
 LIGHTS: dict[str, type[Light]] = {

@@ -10,13 +10,13 @@ from jaxtyping import Array, Float
 
 from brdf.checks import spectrum
 from brdf.errors import InputError
+from brdf.geometry.base import Shape
 from brdf.geometry.camera import Camera
-from brdf.geometry.shapes import Shape
+from brdf.geometry.rays import look
 from brdf.geometry.surface_points import SurfacePoints
-from brdf.geometry.tracing import look
+from brdf.geometry.visibility import Lighting, given_visibility, occluders
 from brdf.lights.punctual import Light
-from brdf.shading.pixel_area import with_area
-from brdf.shading.visibility import Lighting, given_visibility, occluders
+from brdf.pixel_area import with_area
 
 
 def _is_none(value: Any) -> bool:
@@ -142,7 +142,7 @@ class Scene(eqx.Module):
         Raises:
             InputError: naming file, table and key.
         """
-        from brdf.scenes.file import load_scene
+        from brdf.scene_file import load_scene
 
         return load_scene(path, within)
 
@@ -156,6 +156,6 @@ class Scene(eqx.Module):
         Raises:
             InputError: where the file cannot be written.
         """
-        from brdf.scenes.writer import save_scene
+        from brdf.scene_writer import save_scene
 
         save_scene(self, path)

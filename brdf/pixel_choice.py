@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
+from brdf.geometry.base import Shape
 from brdf.geometry.camera import Camera
-from brdf.geometry.shapes import Shape
+from brdf.geometry.rays import trace
 from brdf.geometry.surface_points import PixelArea, SurfacePoints
-from brdf.geometry.tracing import trace
 from brdf.precision import Precision, apart, cast, working_precision
-from brdf.scenes.scene import Scene
+from brdf.scene import Scene
 
 
 def some_pixels(

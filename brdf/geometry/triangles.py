@@ -23,7 +23,7 @@ from jaxtyping import Array, Float, Int
 from brdf.checks import LARGEST
 from brdf.errors import InputError
 from brdf.files import read_text
-from brdf.geometry.shapes import Hit, Shape
+from brdf.geometry.base import Hit, Shape
 from brdf.vectors import divide, dot, normalize
 
 # A corner 0 of a face, which a parser may take for the last vertex.

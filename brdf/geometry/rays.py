@@ -5,8 +5,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
+from brdf.geometry.base import Shape
 from brdf.geometry.camera import Camera
-from brdf.geometry.shapes import Shape
 from brdf.geometry.surface_points import SurfacePoints
 from brdf.precision import apart
 

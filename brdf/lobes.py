@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from brdf.geometry.surface_points import SurfacePoints
+from brdf.geometry.visibility import Lighting
+from brdf.light_sum import LightTerms, sum_over_samples
 from brdf.models import Material
-from brdf.shading.light_sum import LightTerms, sum_over_samples
-from brdf.shading.visibility import Lighting
 
 NO_LOBE = -1e9
 """The peak of a pixel without a lobe: exp(n * this) = 0 for every n that a fit visits."""

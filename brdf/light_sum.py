@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from brdf.geometry.surface_points import SurfacePoints
+from brdf.geometry.visibility import Lighting, share_seen
 from brdf.lights.punctual import Light, LightSample, Moments, Place
 from brdf.models import Material, SpecularMaterial
-from brdf.shading.visibility import Lighting, share_seen
 from brdf.vectors import BELOW_HORIZON, divide, dot, square_root
 
 STORED_SAMPLES = 4

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from brdf.errors import InputError
-from brdf.geometry.shapes import Shape
+from brdf.geometry.base import Shape
 from brdf.geometry.surface_points import SurfacePoints
 from brdf.lights.punctual import Light, LightSample
 

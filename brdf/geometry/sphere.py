@@ -1,0 +1,62 @@
+"""The sphere."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from brdf.checks import positive, vector
+from brdf.geometry.base import Hit, Shape, share_beyond
+from brdf.vectors import divide, dot, norm, normalize, square_root
+
+
+class Sphere(Shape):
+    """A sphere with outward normals.
+
+    Args:
+        center: (3,), world units.
+        radius: greater than 0, world units.
+        fitted: see `Shape`.
+
+    Raises:
+        InputError: where a value is not finite or the radius is not positive.
+    """
+
+    center: Float[Array, "3"] = eqx.field(converter=vector("center"))
+    radius: Float[Array, ""] = eqx.field(converter=positive("radius"))
+
+    def extent(self) -> Float[Array, ""]:
+        """The radius."""
+        return jnp.asarray(self.radius)
+
+    def intersect(self, origin: Float[Array, "3"], direction: Float[Array, "3"]) -> Hit:
+        """The nearest hit in front of ``origin``.
+
+        The half chord comes from the distance of the ray to the centre, not from the quadratic's discriminant, which
+        cancels for a small far sphere (Haines, Günther and Akenine-Möller, Ray Tracing Gems 2019, chapter 7).
+        """
+        to_origin = jnp.asarray(origin - self.center)
+        along = dot(to_origin, direction)
+        nearest = to_origin - along * direction
+        squared_half_chord = self.radius * self.radius - dot(nearest, nearest)
+        crosses = squared_half_chord > 0
+        half_chord = square_root(squared_half_chord)
+        outside = -along - half_chord > 0
+        signed = jnp.where(outside, -half_chord, half_chord)
+        hit = crosses & (signed - along > 0)
+        normal = normalize(nearest + signed * direction)
+        return Hit(hit, jnp.where(hit, signed - along, jnp.inf), self.center + self.radius * normal, normal)
+
+    def cover(
+        self, origin: Float[Array, "3"], direction: Float[Array, "3"], distance: Float[Array, ""], radius: Array | None
+    ) -> Float[Array, ""]:
+        """The share of the patch within the cone that the sphere fills; see `Shape.cover`."""
+        if radius is None:
+            return super().cover(origin, direction, distance, radius)
+        to_center = jnp.asarray(self.center - origin)
+        along = dot(to_center, direction)
+        miss = norm(to_center - along * direction)
+        # of the angle between the direction and the sphere's rim
+        tangent = square_root(dot(to_center, to_center) - self.radius * self.radius)
+        sine = divide(self.radius * along - miss * tangent, dot(to_center, to_center))
+        in_front = (along > 0) & (along < distance)
+        return jnp.where(in_front, share_beyond(sine, radius), 0.0)

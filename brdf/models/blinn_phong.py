@@ -1,0 +1,55 @@
+"""Blinn-Phong, classic and normalised."""
+
+import math
+from typing import ClassVar
+
+import jax.numpy as jnp
+
+from brdf import vectors
+from brdf.models.base import SpecularMaterial
+from brdf.vectors import Directions, Numbers, Scalars
+
+
+class BlinnPhong(SpecularMaterial):
+    """A glossy surface as OpenGL's fixed function and Wavefront's MTL (illum 2) draw it: S = (N.H)+^n.
+
+    k_a, k_d, k_s at least 0, n at least 0. Not reciprocal and not energy conserving for k_s > 0: the albedo diverges
+    at grazing light. Source: J. F. Blinn, "Models of light reflection for computer synthesized pictures", SIGGRAPH
+    1977, 192-198.
+    """
+
+    name: ClassVar[str] = "blinn-phong"
+    cosine_weighted: ClassVar[bool] = False
+
+    @staticmethod
+    def log_cosine(normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
+        """Logarithm of N.H; see ``SpecularMaterial.log_cosine``."""
+        return vectors.half_log_cosine(normal, to_light, to_view)
+
+    @staticmethod
+    def scale(n: Numbers) -> Scalars:
+        """1: the classic form is not normalised."""
+        return jnp.ones_like(n)
+
+
+class NormalizedBlinnPhong(SpecularMaterial):
+    """Blinn-Phong made physically plausible: S = (n+2)(n+4) / (8 (2^(-n/2) + n)) (N.H)+^n (N.L)+.
+
+    k_a, k_d, k_s at least 0, n at least 0. Reciprocal. Conserves energy when k_d + k_s <= 1: the lobe alone reflects
+    all light at normal incidence and less at grazing angles. Source: F. Giesen, "Phong normalization factor
+    derivation", 2009; the lobe is Blinn's of 1977.
+    """
+
+    name: ClassVar[str] = "normalized-blinn-phong"
+    cosine_weighted: ClassVar[bool] = True
+
+    @staticmethod
+    def log_cosine(normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
+        """Logarithm of N.H; see ``SpecularMaterial.log_cosine``."""
+        return vectors.half_log_cosine(normal, to_light, to_view)
+
+    @staticmethod
+    def scale(n: Numbers) -> Scalars:
+        """(n+2)(n+4) / (8 (2^(-n/2) + n)): the albedo of the lobe at normal incidence is 1."""
+        n = jnp.asarray(n)
+        return 0.125 * (n + 2.0) * ((n + 4.0) / (jnp.exp(-0.5 * math.log(2.0) * n) + n))

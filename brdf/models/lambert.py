@@ -1,0 +1,48 @@
+"""The matt model."""
+
+import math
+from typing import ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from brdf import vectors
+from brdf.checks import Parameter, coefficients
+from brdf.models.base import Material
+from brdf.vectors import Directions, Scalars
+
+
+class Lambert(Material):
+    """A perfectly matt surface: S = 0, f_r = k_d / pi.
+
+    Reciprocal. Conserves energy when k_d <= 1. Source: J. H. Lambert, Photometria, 1760.
+
+    Attributes:
+        k_a: ambient coefficient, (C,), at least 0.
+        k_d: diffuse coefficient, (C,), at least 0.
+    """
+
+    k_a: Float[Parameter, " C"]
+    k_d: Float[Parameter, " C"]
+    name: ClassVar[str] = "lambert"
+
+    def __init__(self, *, k_d: ArrayLike, k_a: ArrayLike = 0.0):
+        """Check the numbers and give the coefficients one number of channels.
+
+        Args:
+            k_d: diffuse coefficient, a scalar or (C,), at least 0.
+            k_a: ambient coefficient, a scalar or (C,), at least 0.
+
+        Raises:
+            InputError: a number is negative or not finite, or the shapes do not fit.
+        """
+        self.k_a, self.k_d = coefficients(k_a=k_a, k_d=k_d)
+
+    def specular(self, normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
+        """The specular term S, which is 0; see ``Material.specular``."""
+        return jnp.zeros_like(vectors.dot(normal, to_light) + vectors.dot(normal, to_view))
+
+    def reflectance(self, to_light: Directions, to_view: Directions) -> Float[Array, "*batch C"]:
+        """The BRDF f_r in 1/sr; see ``Material.reflectance``."""
+        above = (jnp.asarray(to_light)[..., 2] > 0) & (jnp.asarray(to_view)[..., 2] > 0)
+        return jnp.where(above[..., None], self.k_d, 0.0) / math.pi

@@ -1,1 +1,0 @@
-"""The scene, and its files."""

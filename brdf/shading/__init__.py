@@ -1,1 +1,0 @@
-"""What the light samples at a point add up to."""
