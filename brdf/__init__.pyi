@@ -1,6 +1,5 @@
 from .albedo import absorbed_fraction as absorbed_fraction
 from .albedo import directional_albedo as directional_albedo
-from .channels import channel_names as channel_names
 from .conversions import (
     exponent_from_roughness as exponent_from_roughness,
 )
@@ -41,27 +40,6 @@ from .display import (
     report_html as report_html,
 )
 from .errors import InputError as InputError
-from .files import (
-    atomic_folder as atomic_folder,
-)
-from .files import (
-    atomic_path as atomic_path,
-)
-from .files import (
-    check_folder as check_folder,
-)
-from .files import (
-    input_file as input_file,
-)
-from .files import (
-    parse_number as parse_number,
-)
-from .files import (
-    read_text as read_text,
-)
-from .files import (
-    write_text as write_text,
-)
 from .geometry.camera import (
     OrthographicCamera as OrthographicCamera,
 )
@@ -73,28 +51,13 @@ from .geometry.sphere import Sphere as Sphere
 from .geometry.surface_points import SurfacePoints as SurfacePoints
 from .geometry.triangles import Triangles as Triangles
 from .geometry.triangles import load_mesh as load_mesh
-from .images.encodings import encode as encode
-from .images.pictures import (
-    ImageReader as ImageReader,
-)
-from .images.pictures import (
-    Picture as Picture,
-)
-from .images.pictures import (
-    read_image as read_image,
-)
-from .images.pictures import (
-    read_layers as read_layers,
-)
-from .images.pictures import (
-    read_mask as read_mask,
-)
-from .images.pictures import (
-    read_picture as read_picture,
-)
-from .images.pictures import (
-    write_image as write_image,
-)
+from .images.reading import ImageReader as ImageReader
+from .images.reading import Picture as Picture
+from .images.reading import read_image as read_image
+from .images.reading import read_layers as read_layers
+from .images.reading import read_mask as read_mask
+from .images.reading import read_picture as read_picture
+from .images.writing import write_image as write_image
 from .light_images import relight as relight
 from .light_images import render_lights as render_lights
 from .lights.area import PolygonLight as PolygonLight

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from brdf.channels import channel_names
 from brdf.geometry.camera import OrthographicCamera
 from brdf.geometry.sphere import Sphere
-from brdf.images.encodings import encode
+from brdf.images.encoding import encode
 from brdf.lights.punctual import DirectionalLight
 from brdf.models import Material, SpecularMaterial
 from brdf.plausibility.report import Report

@@ -16,7 +16,7 @@ from brdf.geometry.rectangle import Rectangle
 from brdf.geometry.sphere import Sphere
 from brdf.geometry.surface_points import SurfacePoints
 from brdf.geometry.triangles import Triangles, load_mesh
-from brdf.images.pictures import read_image, read_layers
+from brdf.images.reading import read_image, read_layers
 from brdf.lights.area import PolygonLight, RectangleLight, SphereLight
 from brdf.lights.environment import ConstantEnvironment, EnvironmentMap
 from brdf.lights.punctual import DirectionalLight, Light, PointLight, SpotLight

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 import brdf
+from brdf.channels import channel_names
 from fitting.result import FitResult
 
 # Predictions within so many standard deviations of an end are bent by more than a thousandth of one.
@@ -87,7 +88,7 @@ def without_cut_noise(
     left_out = whole.left_out | {BLACK: _count(black), WHITE: _count(white)}
     warnings = result.warnings
     if spared:
-        names = brdf.channel_names(whole.targets[0].shape[-1])
+        names = channel_names(whole.targets[0].shape[-1])
         where = f" in channel {', '.join(names[channel] for channel in sorted(spared))}" if len(names) > 1 else ""
         words = f"noise is cut off at black or white almost everywhere{where}: the coefficients are bent there"
         warnings = (words, *warnings)

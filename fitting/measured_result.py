@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 import brdf
+from brdf.files import atomic_folder, write_text
 from fitting.result import Parameter
 
 # A model that explains this share of the squares describes the peak, one that places this share of the light the body;
@@ -226,8 +227,8 @@ class BrdfFitResult:
         Raises:
             InputError: where the folder cannot be written.
         """
-        with brdf.atomic_folder(folder) as stage:
+        with atomic_folder(folder) as stage:
             brdf.save_material(self.material, stage / "material.json", undetermined=self.undetermined)
             if self.material.k_d.shape[0] in (1, 3):
                 brdf.save_material(self.material, stage / "material.mtl", undetermined=self.undetermined)
-            brdf.write_text(stage / "fit.json", json.dumps(self.to_dict(), indent=2) + "\n")
+            write_text(stage / "fit.json", json.dumps(self.to_dict(), indent=2) + "\n")

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 import brdf
+from brdf.files import atomic_folder, write_text
 from brdf.precision import Precision
 from fitting.budget.budget_choice import BudgetChoice
 from fitting.selection import Candidate
@@ -199,12 +200,12 @@ class FitResult:
         Raises:
             InputError: where the folder cannot be written.
         """
-        with brdf.atomic_folder(folder) as stage:
+        with atomic_folder(folder) as stage:
             brdf.save_material(self.material, stage / "material.json", undetermined=self.undetermined)
             if self.material.k_d.shape[0] in (1, 3):
                 brdf.save_material(self.material, stage / "material.mtl", undetermined=self.undetermined)
             brdf.write_image(stage / "fitted.exr", self.fitted())
-            brdf.write_text(stage / "fit.json", json.dumps(self.to_dict(), indent=2) + "\n")
+            write_text(stage / "fit.json", json.dumps(self.to_dict(), indent=2) + "\n")
             if plot:
                 figure = self.plot()
                 figure.savefig(stage / "comparison.png", dpi=150)

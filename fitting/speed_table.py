@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-import brdf
+from brdf.files import atomic_folder, write_text
 from fitting.budget.configurations import Configuration
 
 # From so many runs on a median decides.
@@ -222,9 +222,9 @@ class Tradeoff:
         Raises:
             InputError: where the folder cannot be written.
         """
-        with brdf.atomic_folder(folder) as stage:
-            brdf.write_text(stage / "tradeoff.csv", self.to_csv())
-            brdf.write_text(stage / "tradeoff.json", json.dumps(self.to_dict(), indent=2) + "\n")
+        with atomic_folder(folder) as stage:
+            write_text(stage / "tradeoff.csv", self.to_csv())
+            write_text(stage / "tradeoff.json", json.dumps(self.to_dict(), indent=2) + "\n")
             figure = self.plot()
             figure.savefig(stage / "tradeoff.png", dpi=200)
             figure.savefig(stage / "tradeoff.pdf")

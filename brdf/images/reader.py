@@ -11,7 +11,7 @@ from jaxtyping import Float32
 
 from brdf.errors import InputError
 from brdf.files import input_file
-from brdf.images.encodings import Encoding, EncodingSource, decode, decode_table, find_encoding, parse_encoding
+from brdf.images.encoding import Encoding, EncodingSource, decode, decode_table, find_encoding, parse_encoding
 from brdf.images.file import BAND_VALUES, band_rows, check_header, check_memory, choose_channels, open_image, read_rows
 
 LOSSY_TOP = 250 / 255

@@ -31,7 +31,7 @@ from brdf.conversions import (
 )
 from brdf.errors import InputError
 from brdf.files import write_text
-from brdf.images.encodings import decode, encode
+from brdf.images.encoding import decode, encode
 from brdf.materials.material_file import material_to_dict, to_mtl
 from brdf.models import BlinnPhong, Lambert, Material, NormalizedPhong, Phong, SpecularMaterial
 

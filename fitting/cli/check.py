@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from brdf.errors import InputError
+from brdf.files import atomic_path
 from fitting.cli.common import show, use_compilation_cache, waiting
 from fitting.cli.interrupts import held
 
@@ -47,7 +48,7 @@ def check(
                 raise InputError("--plot", f"draws one material, {material} holds {len(materials)}", "Give one")
             from fitting.report.material_plots import overview
 
-            with brdf.atomic_path(plot) as path:
+            with atomic_path(plot) as path:
                 name, one = next(iter(materials.items()))
                 overview(one, reports[name]).savefig(path)
     if as_json:

@@ -1,6 +1,6 @@
 """Pictures that do not say how they are encoded: which of two readings the model explains.
 
-A silent file of 8 bits is taken as sRGB, one of more bits as linear (`brdf.images.encodings`). Neither is known, and
+A silent file of 8 bits is taken as sRGB, one of more bits as linear (`brdf.images.encoding`). Neither is known, and
 the wrong one bends every shade. Under the right one the model that is fitted leaves less, so both are tried. What each
 leaves is compared in the codes of the file, the same numbers under both, with the rounding of a code added to both.
 """
@@ -15,6 +15,7 @@ import numpy as np
 import brdf
 import fitting
 from brdf.errors import InputError
+from brdf.images.encoding import encode
 from fitting.cli.common import named_as
 from fitting.cli.job import Job
 from fitting.result import FitResult
@@ -84,7 +85,7 @@ def unexplained(job: Job, result: FitResult) -> tuple[float, float]:
     for picture, scene, counted in zip(job.pictures, result.scenes, result.counted, strict=True):
         model = np.asarray(brdf.render(result.material, scene), np.float32)
         codes, fitted = (
-            brdf.encode(np.ascontiguousarray((values / picture.factor)[counted], np.float32), picture.encoding)
+            encode(np.ascontiguousarray((values / picture.factor)[counted], np.float32), picture.encoding)
             for values in (picture.pixels, np.broadcast_to(model, picture.pixels.shape))
         )
         deviation = codes.astype(np.float64) - fitted

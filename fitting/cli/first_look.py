@@ -8,6 +8,7 @@ import numpy as np
 
 import brdf
 from brdf.errors import InputError
+from brdf.files import input_file, read_text
 from fitting.cli.picture_options import PictureOptions, encoding_of
 from fitting.photographs.circle import Circle, ball_normals, find_circle, parse_circle
 
@@ -39,7 +40,7 @@ def read_first(targets: list[Path], options: PictureOptions, tell: Callable[[str
     _check_options(targets, options)
     for beside in (options.mask, options.normals, options.lights, options.intensities):
         if beside is not None:
-            brdf.input_file(beside)
+            input_file(beside)
     if is_archive(targets):
         return {}
     files, scene = targets, None
@@ -108,7 +109,7 @@ def target_and_scene(target: Path, scene: Path | None) -> tuple[Path, Path]:
         InputError: where one of them is missing.
     """
     if not target.is_dir():
-        brdf.input_file(target)
+        input_file(target)
         if scene is None:
             raise InputError(
                 target, "comes without a scene", "Add --scene SCENE.toml, or --sphere for a photo of a ball"
@@ -126,7 +127,7 @@ def target_and_scene(target: Path, scene: Path | None) -> tuple[Path, Path]:
 def _check_resolution(target: Path, shape: tuple[int, int], scene: Path) -> None:
     """Tell early what the fit would tell: the scene's camera has another resolution."""
     try:
-        width, height = tomllib.loads(brdf.read_text(scene))["camera"]["resolution"]
+        width, height = tomllib.loads(read_text(scene))["camera"]["resolution"]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         if isinstance(error, InputError):
             raise

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
+from brdf.files import check_folder, write_text
 from fitting.cli.common import MODEL_NAMES, named_as, show, use_compilation_cache, waiting
 from fitting.cli.interrupts import held
 from fitting.cli.picture_options import PictureOptions, takes_picture_options
@@ -60,11 +61,11 @@ def fit(
         raise brdf.InputError(report, "is no name of a page", "Name it .html")
     if out is not None:
         # Told now instead of after the fit.
-        brdf.check_folder(out)
+        check_folder(out)
     notes: tuple[str, ...] = ()
     with waiting("fitting") as tell:
         with held():
-            import brdf.images.pictures
+            import brdf.images.reading
         if len(target) == 1 and brdf.is_measured(target[0]):
             given = any(option is not None for option in (dark, noise, accuracy, seconds, report))
             if given or plausible or plot or precision != "float32" or pictures != PictureOptions():
@@ -91,7 +92,7 @@ def fit(
             from fitting.report.html import report_page
 
             command = shlex.join(["brdf", *sys.argv[1:]])
-            brdf.write_text(report, report_page(result, source=target[0].name, command=command))
+            write_text(report, report_page(result, source=target[0].name, command=command))
     if as_json:
         show(json.dumps(result.to_dict() | ({"notes": notes} if notes else {}), indent=2))
         return

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from brdf.errors import InputError
+from brdf.files import write_text
 from fitting.cli.common import named_as, show
 from fitting.cli.interrupts import held
 from fitting.cli.picture_options import ENCODINGS, PictureOptions, encoding_of
@@ -41,7 +42,7 @@ def lights(
         if given and not matt:
             raise InputError(name, "says nothing of a mirror ball's highlight", "Leave it out, or add --matt")
     with held():
-        import brdf.images.pictures
+        import brdf.images.reading
         from fitting.cli.first_look import check_ball, find_ball
         from fitting.cli.job import opaque
         from fitting.cli.photograph_inputs import how_sure, light_of
@@ -65,5 +66,5 @@ def lights(
         lines.append(" ".join(f"{value:.6f}" for value in direction) + said)
     text = "\n".join([*(f"# {line}" for line in notes), *lines]) + "\n"
     if out is not None:
-        brdf.write_text(out, text)
+        write_text(out, text)
     show(text.rstrip() if out is None else f"wrote {out}")

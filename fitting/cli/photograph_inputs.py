@@ -7,6 +7,7 @@ import numpy as np
 
 import brdf
 from brdf.errors import InputError
+from brdf.files import input_file
 from fitting.cli.common import named_as
 from fitting.cli.first_look import check_ball, find_ball
 from fitting.cli.job import Job, exposed, opaque, scaled
@@ -142,7 +143,7 @@ def _geometry(
 def _read_normals(path: Path) -> np.ndarray:
     """Normals (H, W, 3) from an .npy file, or from a picture: floats as they are, codes as 2 v - 1."""
     if path.suffix.lower() == ".npy":
-        with brdf.input_file(path).open("rb") as file:
+        with input_file(path).open("rb") as file:
             normal = read_array(file, path, path.stat().st_size)
         if normal.ndim != 3 or normal.shape[2] != 3 or normal.dtype.kind not in "fiu":
             raise InputError(path, f"is of shape {normal.shape} and type {normal.dtype}", "Give normals (H, W, 3)")

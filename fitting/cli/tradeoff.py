@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from brdf.errors import InputError
+from brdf.files import check_folder
 from fitting.cli.common import MODEL_NAMES, named_as, show, use_compilation_cache
 from fitting.cli.interrupts import held
 from fitting.cli.picture_options import PictureOptions, takes_picture_options
@@ -35,11 +36,10 @@ def tradeoff(
 
     Ctrl-C ends the measuring and keeps what was measured.
     """
-    import brdf
     from fitting.cli.first_look import read_first
 
     if out is not None:
-        brdf.check_folder(out)
+        check_folder(out)
     options = {"model": model, "accuracy": accuracy, "seconds": seconds}
     with named_as({name: f"--{name}" for name in options} | pictures.names()):
         read = read_first([target], pictures, lambda now: None)

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-import brdf
 from brdf.errors import InputError
+from brdf.files import input_file
 
 # What an archive may unpack to: 8 GiB of values, as for pictures.
 MOST_BYTES = 1 << 33
@@ -88,7 +88,7 @@ def read_archive(path: Path) -> dict[str, np.ndarray]:
         InputError: where it is no archive, an array is missing, or its claims do not fit its size.
     """
     try:
-        with zipfile.ZipFile(brdf.input_file(path)) as archive:
+        with zipfile.ZipFile(input_file(path)) as archive:
             sizes = {info.filename: info.file_size for info in archive.infolist()}
             missing = [name for name in ARCHIVE if f"{name}.npy" not in sizes]
             if missing:

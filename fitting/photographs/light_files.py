@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-import brdf
 from brdf.errors import InputError
+from brdf.files import parse_number, read_text
 
 # Of a file of lights: some hundred thousand.
 MOST_BYTES = 1 << 22
@@ -25,7 +25,7 @@ def parse_numbers(text: str, where: str, count: int, words: str) -> list[float]:
         InputError: where they are not so many finite numbers.
     """
     try:
-        values = [brdf.parse_number(word) for word in text.replace(",", " ").split()]
+        values = [parse_number(word) for word in text.replace(",", " ").split()]
     except ValueError:
         values = []
     if len(values) != count or not np.all(np.isfinite(values)):
@@ -72,7 +72,7 @@ def read_intensities(path: str | Path, count: int | None = None) -> Float[np.nda
 
 def _number_rows(path: str | Path) -> list[tuple[int, list[float]]]:
     rows = []
-    for number, line in enumerate(brdf.read_text(path, MOST_BYTES).splitlines(), start=1):
+    for number, line in enumerate(read_text(path, MOST_BYTES).splitlines(), start=1):
         text = line.partition("#")[0].strip()
         if text:
             place = f"{path}: line {number}"

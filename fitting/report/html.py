@@ -14,6 +14,7 @@ import platform
 from typing import Any
 
 import brdf
+from brdf.channels import channel_names
 from fitting.result import FitResult, Parameter
 
 _STYLE = """
@@ -97,7 +98,7 @@ def _numbers(result: FitResult) -> str:
 
 
 def _row(parameter: Parameter, result: FitResult) -> list[str]:
-    names = brdf.channel_names(result.material.k_d.shape[0])
+    names = channel_names(result.material.k_d.shape[0])
     channel = "" if parameter.channel is None else names[parameter.channel]
     interval = getattr(parameter, "interval", None)
     ends = "" if interval is None else " to ".join("∞" if math.isinf(end) else f"{end:.6g}" for end in interval)

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 import brdf
+from brdf.channels import channel_names
 from brdf.models.base import SpecularMaterial
 from fitting.result import FitResult
 
@@ -171,7 +172,7 @@ def _enlarged(axes: Any, target: np.ndarray, fitted: np.ndarray, box: _Box, whit
 def _scanline(axes: Any, target: np.ndarray, fitted: np.ndarray, counted: np.ndarray, row: int, columns: slice) -> None:
     place = np.arange(columns.start, columns.stop)
     channels = target.shape[-1]
-    names = brdf.channel_names(channels)
+    names = channel_names(channels)
     step = max(1, len(place) // 30)
     seen = counted[row, columns] | np.any(fitted[row, columns] != 0, axis=-1)
     # Of a spectrum, as many channels as there are colours, from the first to the last.

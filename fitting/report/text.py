@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-import brdf
+from brdf.channels import channel_names
 from fitting.result import FitResult
 from fitting.selection import Candidate
 
@@ -24,7 +24,7 @@ def report(result: FitResult) -> str:
         f"{result.surface} fitted to {count}{result.pixels} pixels x {channels} {plural} "
         f"in {result.seconds:.2g} s ({result.precision}{loss})"
     ]
-    labels = brdf.channel_names(channels)
+    labels = channel_names(channels)
     for parameter in result.parameters:
         label = "" if parameter.channel is None else labels[parameter.channel]
         lines.append(f"  {parameter.name:<4}{label:<6} {parameter}")
@@ -49,7 +49,7 @@ def _correlations(result: FitResult) -> list[str]:
     # A grey k_s is one number in all channels.
     pairs = [(size, i, j) for size, i, j in pairs if free[i].name != free[j].name or size < 1 - 1e-9]
     strong = sorted((pair for pair in pairs if pair[0] > STRONG), reverse=True)[:MOST_CORRELATIONS]
-    labels = brdf.channel_names(result.material.k_d.shape[0])
+    labels = channel_names(result.material.k_d.shape[0])
     names = ["n" if one.channel is None else f"{one.name} {labels[one.channel]}".rstrip() for one in free]
     words = [f"{names[j]} and {names[i]} {result.correlation[i, j]:+.2f}" for _, i, j in strong]
     return [f"  correlated  {', '.join(words)}"] if words else []

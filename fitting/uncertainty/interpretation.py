@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 import brdf
+from brdf.channels import channel_names
 from brdf.models.base import SpecularMaterial
 from fitting.result import Parameter
 from fitting.solver.normal_equations import Picture
@@ -144,7 +145,7 @@ def interpret(
     ambient = missing_ambient(pictures)
     warnings = (ambient, *warnings) if ambient else warnings
     if fit.capped:
-        labels = brdf.channel_names(k.shape[1])
+        labels = channel_names(k.shape[1])
         held = ", ".join(labels[channel] for channel in np.flatnonzero(k[1] + k[2] >= 1 - 1e-6))
         where = f" in channel {held}" if held else ""
         words = f"k_d + k_s is held at 1{where}: a brighter material fits better, but is not plausible; "

@@ -6,6 +6,7 @@ import pytest
 
 import brdf
 import fitting
+from brdf.images.encoding import encode
 from fitting.budget.deviation import parameter_deviation
 from fitting.budget.trials import Bench
 from fitting.censored_noise import BLACK, WHITE, without_cut_noise
@@ -138,7 +139,7 @@ def test_the_command_says_how_many_pixels_it_left_out(tmp_path, capsys, monkeypa
 def test_a_clipped_highlight_in_a_jpeg_file_does_not_bend_the_fit(tmp_path, quality, channels):
     shiny = brdf.BlinnPhong(k_a=[0.05] * channels, k_d=[0.7] * channels, k_s=[0.6] * channels, n=30.0)
     values = np.clip(np.asarray(brdf.render(shiny, SCENE)), 0, 1).astype(np.float32)
-    codes = np.rint(brdf.encode(values, "srgb") * 255).astype(np.uint8)
+    codes = np.rint(encode(values, "srgb") * 255).astype(np.uint8)
     spec = oiio.ImageSpec(SIZE, SIZE, channels, "uint8")
     spec.attribute("Compression", f"jpeg:{quality}")
     file = oiio.ImageOutput.create("ball.jpg")

@@ -24,7 +24,7 @@ from image_files import (
 
 from brdf.errors import InputError
 from brdf.images import file as image_file
-from brdf.images.pictures import (
+from brdf.images.reading import (
     ImageReader,
     read_image,
     read_layers,
@@ -133,7 +133,7 @@ def test_reading_in_threads(tmp_path):
 READ_AND_REPORT = """
 import sys
 from brdf.errors import InputError
-from brdf.images.pictures import read_image, read_layers
+from brdf.images.reading import read_image, read_layers
 for path in sys.argv[1:]:
     for reader in (read_image, read_layers):
         try:

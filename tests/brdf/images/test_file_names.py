@@ -9,6 +9,7 @@ from image_files import REAL, codes, needs, png
 
 import brdf
 from brdf.errors import InputError
+from brdf.files import read_text, write_text
 
 ODD = os.fsdecode(b"\xff\xfe")
 encoded = pytest.mark.skipif(sys.platform != "linux", reason="other systems allow Unicode names alone")
@@ -56,11 +57,11 @@ def test_a_table_whose_name_is_not_utf8(tmp_path):
 
 @pytest.mark.parametrize("name", ["\ud800.png", "a\0b.png", ""])
 def test_what_no_system_takes_as_a_name(name):
-    for reader in (brdf.read_image, brdf.load_measured, brdf.Scene.load, brdf.read_text, brdf.read_mask):
+    for reader in (brdf.read_image, brdf.load_measured, brdf.Scene.load, read_text, brdf.read_mask):
         with pytest.raises(InputError, match=r"is not a path|no such file|is a folder"):
             reader(name)
     with pytest.raises(InputError, match="is not a path"):
-        brdf.write_text(name, "x")
+        write_text(name, "x")
 
 
 @pytest.mark.parametrize(

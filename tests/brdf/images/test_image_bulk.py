@@ -11,7 +11,7 @@ from image_files import chunk, codes, png, random, raw_exr
 
 from brdf.errors import InputError
 from brdf.images import bulk
-from brdf.images.pictures import ImageReader, read_image, read_layers, read_mask, read_picture, write_image
+from brdf.images.reading import ImageReader, read_image, read_layers, read_mask, read_picture, write_image
 from brdf.materials import material_file as materials
 
 
@@ -189,7 +189,7 @@ def test_layers_and_masks_are_read_by_bands(tmp_path, monkeypatch):
     for tile in (0, 16):
         raw_exr(tmp_path / "a.exr", values, names, tile=tile)
         with monkeypatch.context() as small:
-            small.setattr("brdf.images.pictures.BAND_VALUES", 20 * 6 * 7)
+            small.setattr("brdf.images.reading.BAND_VALUES", 20 * 6 * 7)
             layers = read_layers(tmp_path / "a.exr")
         np.testing.assert_array_equal(layers[""], values[..., :3])
         np.testing.assert_array_equal(layers["N"], values[..., :2:-1])

@@ -20,8 +20,8 @@ from image_files import (
 )
 
 from brdf.errors import InputError
-from brdf.images.encodings import decode, encode
-from brdf.images.pictures import (
+from brdf.images.encoding import decode, encode
+from brdf.images.reading import (
     read_image,
     read_picture,
 )

@@ -10,7 +10,7 @@ import pytest
 from image_files import ROOT, random
 
 from brdf.errors import InputError
-from brdf.images.pictures import (
+from brdf.images.reading import (
     read_image,
     read_picture,
     write_image,
@@ -129,8 +129,8 @@ def test_a_full_disk_leaves_nothing(tmp_path, suffix, reserved):
 import resource, signal, sys
 import numpy as np
 from brdf.errors import InputError
-from brdf.images import writer as image_writer
-from brdf.images.pictures import write_image
+from brdf.images import writing as image_writer
+from brdf.images.reading import write_image
 if sys.argv[2] == "0":
     image_writer._reserve = lambda *_: None
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)

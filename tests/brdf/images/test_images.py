@@ -5,7 +5,7 @@ import OpenImageIO as oiio  # noqa: N813
 import pytest
 from image_files import REAL, codes, needs, png, random, raw_exr
 
-from brdf.images.pictures import (
+from brdf.images.reading import (
     ImageReader,
     read_image,
     read_layers,

@@ -65,7 +65,7 @@ def test_a_picture_of_another_size_is_not_read(tmp_path, capsys, monkeypatch):
         raise AssertionError("read")
 
     (sound_files(tmp_path) / "scene.toml").write_text(scene("[8, 8]", "[9, 8]", SCENE))
-    monkeypatch.setattr("brdf.images.pictures.read_picture", read)
+    monkeypatch.setattr("brdf.images.reading.read_picture", read)
     words = "fit", tmp_path / "target.exr", "--scene", tmp_path / "scene.toml"
     refused(capsys, tmp_path, "target.exr: is 8 x 8, the scene's camera 9 x 8", *words)
 

@@ -72,9 +72,9 @@ def test_a_signal_in_the_middle_leaves_nothing(place, number, status):
     before = {path for path in place.iterdir() if path.name != ".cache"}
     # The fit waits for a signal at the moment when the files of the result are being written.
     prefix = (
-        "import time, brdf.images.pictures\n"
+        "import time, brdf.images.writing\n"
         "def slowly(*a, **k):\n    print('writing', flush=True)\n    time.sleep(60)\n"
-        "brdf.images.pictures.write_image = slowly\n"
+        "brdf.images.writing.write_image = slowly\n"
     )
     with command("fit", "target.exr", "--scene", "scene.toml", "--out", "out", cwd=place, prefix=prefix) as process:
         assert process.stdout is not None

@@ -14,6 +14,7 @@ from ball_pictures import BALL, SHAPE, angle, disc, photographs_in, shaded
 from command_runs import run
 
 import brdf
+from brdf.images.encoding import encode
 from fitting.cli import encoding_trial
 from fitting.cli.job import Job
 from fitting.photographs.ball import ball_points
@@ -29,7 +30,7 @@ def photographs(tmp_path):
 def write_silent(path: str, pixels: np.ndarray, encoding: Any, dtype: str) -> None:
     """A PNG file without a word about its encoding: magic, header, one block of pixels, end."""
     largest = np.iinfo(dtype).max
-    codes = np.round(brdf.encode(pixels.astype(np.float32), encoding) * largest).astype(f">u{np.dtype(dtype).itemsize}")
+    codes = np.round(encode(pixels.astype(np.float32), encoding) * largest).astype(f">u{np.dtype(dtype).itemsize}")
     height, width, channels = codes.shape
     header = struct.pack(">IIBBBBB", width, height, 8 * codes.itemsize, {1: 0, 3: 2}[channels], 0, 0, 0)
     rows = b"".join(b"\0" + row.tobytes() for row in codes)

@@ -1,7 +1,7 @@
 """Pixels in and out, through OpenImageIO.
 
 Every reader returns float32 values proportional to light, rows from the top, channels last; see
-:mod:`brdf.images.encodings` for how an encoding is found. What comes out is the picture that a person would see: the
+:mod:`brdf.images.encoding` for how an encoding is found. What comes out is the picture that a person would see: the
 display window of an OpenEXR file (NaN where it holds no data) and a photograph turned upright. Colour is as stored, not
 multiplied by alpha. NaN and infinite values are passed on; who fits leaves them out.
 
@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from brdf.files import input_file
-from brdf.images.encodings import Encoding, EncodingSource, decode_table
+from brdf.images.encoding import Encoding, EncodingSource, decode_table
 from brdf.images.file import (
     BAND_VALUES,
     MAX_RATIO,
@@ -30,7 +30,7 @@ from brdf.images.file import (
     read_rows,
 )
 from brdf.images.reader import ImageReader
-from brdf.images.writer import write_image, write_layers
+from brdf.images.writing import write_image, write_layers
 
 __all__ = [
     "MAX_RATIO",
@@ -113,7 +113,7 @@ def read_image(
 
     Args:
         path: an EXR, HDR, PNG, TIFF, JPEG, TGA file or whatever else OpenImageIO reads.
-        encoding: "linear", "srgb" or a gamma such as 2.2; None for what the file says (:mod:`brdf.images.encodings`).
+        encoding: "linear", "srgb" or a gamma such as 2.2; None for what the file says (:mod:`brdf.images.encoding`).
 
     Returns:
         Colour without alpha and further layers: RGB, grey, or all bands of a spectral file in the order of the file.

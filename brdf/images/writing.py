@@ -12,7 +12,7 @@ from jaxtyping import Float32
 from brdf.errors import InputError
 from brdf.files import atomic_path, utf8_name
 from brdf.images.bulk import MOST_CHANNELS
-from brdf.images.encodings import Encoding, encode, parse_encoding
+from brdf.images.encoding import Encoding, encode, parse_encoding
 from brdf.images.file import quiet, said
 
 DataType = Literal["uint8", "uint16", "half", "float"]
