@@ -13,6 +13,7 @@ from .relighting import (
 from .relighting import (
     fit_lights_and_material as fit_lights_and_material,
 )
+from .report import FitResult as FitResult
 from .report.material_plots import (
     overview as overview,
 )
@@ -28,7 +29,6 @@ from .report.material_plots import (
 from .report.material_plots import (
     plot_stability as plot_stability,
 )
-from .result import FitResult as FitResult
 from .result import Parameter as Parameter
 from .speed_accuracy import tradeoff as tradeoff
 from .speed_table import Tradeoff as Tradeoff

@@ -27,7 +27,8 @@ from fitting.problem import (
     pixels_of,
     relative_weights,
 )
-from fitting.result import FitResult, free_parameters
+from fitting.report import FitResult
+from fitting.result import free_parameters
 from fitting.selection import Choice
 from fitting.solver.losses import LOSSES, Loss
 from fitting.uncertainty.covariance import TERMS

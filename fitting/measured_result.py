@@ -1,6 +1,5 @@
 """What came out of fitting a measured BRDF, and how it is told."""
 
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -8,8 +7,9 @@ from typing import Any
 import numpy as np
 
 import brdf
-from brdf.files import atomic_folder, write_text
-from fitting.result import Parameter
+from brdf.files import atomic_folder
+from fitting.report.saving import write_report
+from fitting.result import Parameter, undetermined
 
 # A model that explains this share of the squares describes the peak, one that places this share of the light the body;
 # where the mean of both is below, it does not describe the table.
@@ -212,11 +212,7 @@ class BrdfFitResult:
     @property
     def undetermined(self) -> dict[str, str]:
         """What the table does not determine, and why."""
-        return {
-            one.name if one.channel is None else f"{one.name}[{one.channel}]": one.reason
-            for one in self.parameters
-            if one.value is None
-        }
+        return undetermined(self.parameters)
 
     def save(self, folder: str | Path) -> None:
         """Write material.json, material.mtl (1 or 3 channels) and fit.json: all of them or none.
@@ -228,7 +224,4 @@ class BrdfFitResult:
             InputError: where the folder cannot be written.
         """
         with atomic_folder(folder) as stage:
-            brdf.save_material(self.material, stage / "material.json", undetermined=self.undetermined)
-            if self.material.k_d.shape[0] in (1, 3):
-                brdf.save_material(self.material, stage / "material.mtl", undetermined=self.undetermined)
-            write_text(stage / "fit.json", json.dumps(self.to_dict(), indent=2) + "\n")
+            write_report(stage, self)

@@ -1,8 +1,7 @@
-"""What came out of a fit, how sure it is, and how it is told."""
+"""What came out of a fit, and how sure it is: plain data. `fitting.report` tells, draws and writes it."""
 
-import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,6 @@ import numpy as np
 from jaxtyping import Float
 
 import brdf
-from brdf.files import atomic_folder, write_text
 from brdf.precision import Precision
 from fitting.budget.budget_choice import BudgetChoice
 from fitting.selection import Candidate
@@ -20,6 +18,9 @@ from fitting.solver.profile import Optimum
 NOT_DETERMINED = "not determined"
 # Beyond this relative error an interval of n is told: it is no longer symmetric.
 LOPSIDED = 0.01
+
+REPORTS: dict[str, Callable[..., Any]] = {}
+"""What makes text, HTML, pictures and files of a result; `fitting.report`, which stands above, enters it here."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,11 @@ class Parameter:
     interval: tuple[float, float] | None = None
     at_bound: bool = False
     reason: str = ""
+
+    @property
+    def key(self) -> str:
+        """Its name, with the channel where it has one: "n", "k_s[2]"."""
+        return self.name if self.channel is None else f"{self.name}[{self.channel}]"
 
     def __str__(self) -> str:
         """Value ± error (relative), or why there is none."""
@@ -123,7 +129,7 @@ class FitResult:
     @property
     def undetermined(self) -> dict[str, str]:
         """What the picture does not determine, and why: "n", or "k_s[2]" for one channel."""
-        return {_key(parameter): parameter.reason for parameter in self.parameters if parameter.value is None}
+        return undetermined(self.parameters)
 
     @property
     def free_parameters(self) -> tuple[Parameter, ...]:
@@ -146,15 +152,11 @@ class FitResult:
 
     def __str__(self) -> str:
         """The report."""
-        from fitting.report.text import report
-
-        return report(self)
+        return REPORTS["text"](self)
 
     def _repr_html_(self) -> str:
         """For Jupyter."""
-        from fitting.report.html import result_html
-
-        return result_html(self)
+        return REPORTS["html"](self)
 
     def to_dict(self) -> dict[str, Any]:
         """The report as JSON holds it: what is not determined is None."""
@@ -181,7 +183,7 @@ class FitResult:
             "warnings": list(self.warnings),
             "candidates": [vars(candidate) for candidate in self.candidates],
             "correlation": {
-                "parameters": [_key(parameter) for parameter in self.free_parameters],
+                "parameters": [parameter.key for parameter in self.free_parameters],
                 "matrix": self.correlation.tolist(),
             },
             "loss": self.loss,
@@ -200,15 +202,7 @@ class FitResult:
         Raises:
             InputError: where the folder cannot be written.
         """
-        with atomic_folder(folder) as stage:
-            brdf.save_material(self.material, stage / "material.json", undetermined=self.undetermined)
-            if self.material.k_d.shape[0] in (1, 3):
-                brdf.save_material(self.material, stage / "material.mtl", undetermined=self.undetermined)
-            brdf.write_image(stage / "fitted.exr", self.fitted())
-            write_text(stage / "fit.json", json.dumps(self.to_dict(), indent=2) + "\n")
-            if plot:
-                figure = self.plot()
-                figure.savefig(stage / "comparison.png", dpi=150)
+        REPORTS["save"](self, folder, plot)
 
     def plot(self, picture: int | None = None) -> Any:
         """Target, fit and residual side by side.
@@ -219,9 +213,7 @@ class FitResult:
         Returns:
             A matplotlib figure.
         """
-        from fitting.report.plots import comparison
-
-        return comparison(self, picture)
+        return REPORTS["plot"](self, picture)
 
 
 def free_parameters(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
@@ -233,9 +225,14 @@ def free_parameters(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
     return tuple(one for one in parameters if one.value is not None and not one.at_bound)
 
 
+def undetermined(parameters: Sequence[Parameter]) -> dict[str, str]:
+    """Those that have no value, and why.
+
+    Args:
+        parameters: all of a material's.
+    """
+    return {one.key: one.reason for one in parameters if one.value is None}
+
+
 def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
-
-
-def _key(parameter: Parameter) -> str:
-    return parameter.name if parameter.channel is None else f"{parameter.name}[{parameter.channel}]"

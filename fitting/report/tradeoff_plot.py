@@ -1,10 +1,11 @@
 """The picture of a trade of speed for accuracy: error against time, both logarithmic."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fitting.speed_table import Row, Tradeoff
+if TYPE_CHECKING:
+    from fitting.speed_table import Row, Tradeoff
 
 # Colours that colour-blind readers tell apart (Okabe and Ito 2008), and marks that print in black and white.
 LOOKS = {
@@ -20,7 +21,7 @@ LOOKS = {
 BELOW = 8.0
 
 
-def error_against_time(tradeoff: Tradeoff) -> Any:
+def error_against_time(tradeoff: "Tradeoff") -> Any:
     """Draw it: one mark for each fit, the front, the default and the recommendation.
 
     Args:
@@ -89,7 +90,7 @@ def error_against_time(tradeoff: Tradeoff) -> Any:
     return figure
 
 
-def _label(figure: Any, axes: Any, tradeoff: Tradeoff, least: float) -> None:
+def _label(figure: Any, axes: Any, tradeoff: "Tradeoff", least: float) -> None:
     """Rings about default and recommendation, and below and left of each fit on the front, where nothing is, its name.
 
     A label that would meet one that matters more is left out.
@@ -127,7 +128,7 @@ def _label(figure: Any, axes: Any, tradeoff: Tradeoff, least: float) -> None:
             taken.append(box)
 
 
-def _name(row: Row, tradeoff: Tradeoff) -> str:
+def _name(row: "Row", tradeoff: "Tradeoff") -> str:
     """What of a configuration is not usual, in a few words."""
     how, default = row.configuration, tradeoff.default
     if how is None:
@@ -144,9 +145,9 @@ def _name(row: Row, tradeoff: Tradeoff) -> str:
     return ", ".join([*words, *([] if how.shadows else ["no shadows"])])
 
 
-def _error(row: Row) -> float:
+def _error(row: "Row") -> float:
     return row.error if np.isfinite(row.error) else row.rms
 
 
-def _place(row: Row, least: float) -> tuple[float, float]:
+def _place(row: "Row", least: float) -> tuple[float, float]:
     return 1e3 * row.seconds, max(_error(row), least)
