@@ -32,14 +32,15 @@ def load_measured(path: str | os.PathLike[str]) -> MeasuredBRDF:
     file = input_file(path)
     with file.open("rb") as stream:
         head = stream.read(16)
-    size = file.stat().st_size
+    is_binary = b"\0" in head  # no text holds one
+    is_merl = head.startswith(merl.HEADER) or file.stat().st_size == merl.SIZE
     try:
         if head.startswith(rgl.MAGIC):
             return rgl.load(file)
-        # No text holds a NUL: what else is binary and named as MERL's is told how it differs.
-        if merl.claims(head, size) or (b"\0" in head and file.suffix.lower() == ".binary"):
+        # What is binary and named as MERL's is told how it differs.
+        if is_merl or (is_binary and file.suffix.lower() == ".binary"):
             return merl.load(file)
-        if b"\0" in head:
+        if is_binary:
             what = "is neither text in UTF-8 nor a file of MERL or RGL"
             raise InputError(path, what, "Give a MERL .binary, RGL .bsdf, Cornell or ALTA text file")
         return text.load(file)

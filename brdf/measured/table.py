@@ -15,8 +15,6 @@ from brdf.errors import InputError
 
 Evaluation = Callable[[Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3"]], Float[np.ndarray, "P C"]]
 
-LARGEST_ANGLE = 2 * np.pi
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MeasuredBRDF:
@@ -83,39 +81,29 @@ class MeasuredBRDF:
         """
         light, view = _directions("to_light", to_light), _directions("to_view", to_view)
         numbers = _numbers("values", values)
-        if numbers.ndim == 1:
-            numbers = numbers[:, None]
+        numbers = numbers[:, None] if numbers.ndim == 1 else numbers
         if numbers.ndim != 2 or numbers.shape[1] == 0:
             raise InputError("values", f"must be of shape (P, C), got {numbers.shape}", "Give a row per sample")
-        weight = np.ones(len(numbers)) if solid_angle is None else _numbers("solid_angle", solid_angle)
+        samples, count = numbers.shape
+        weight = np.ones(samples) if solid_angle is None else _numbers("solid_angle", solid_angle)
         for what, array in (("to_light", light), ("to_view", view), ("solid_angle", weight)):
-            if len(array) != len(numbers):
-                raise InputError(what, f"has {len(array)} rows for {len(numbers)} samples", "Give one per sample")
+            if len(array) != samples:
+                raise InputError(what, f"has {len(array)} rows for {samples} samples", "Give one per sample")
         if weight.ndim != 1 or not np.all(np.isfinite(weight)) or np.any(weight < 0):
             raise InputError("solid_angle", "must be a finite number of 0 or more per sample", "Correct the values")
-        names = channels or tuple(str(channel) for channel in range(numbers.shape[1]))
-        if len(names) != numbers.shape[1]:
-            raise InputError("channels", f"names {len(names)} of {numbers.shape[1]} channels", "Name each channel")
-        counts = dict(left_out or {})
+        channels = channels or tuple(map(str, range(count)))
+        if len(channels) != count:
+            raise InputError("channels", f"names {len(channels)} of {count} channels", "Name each channel")
         above = (light[:, 2] > 0) & (view[:, 2] > 0)
-        finite = np.all(np.isfinite(numbers), axis=1)
-        for reason, kept in (("below the horizon", above), ("not finite", finite | ~above)):
-            counts[reason] = counts.get(reason, 0) + int(np.count_nonzero(~kept))
-        good = above & finite
+        good = above & np.all(np.isfinite(numbers), axis=1)
+        counts = {"below the horizon": np.count_nonzero(~above), "not finite": np.count_nonzero(above & ~good)}
+        counts = {reason: int(number) for reason, number in ((left_out or {}) | counts).items() if number}
         if not good.any():
-            gone = ", ".join(f"{count} {reason}" for reason, count in counts.items() if count)
+            gone = ", ".join(f"{number} {reason}" for reason, number in counts.items())
             came = f"has no finite sample above the horizon ({gone or 'none at all'})"
             raise InputError(name, came, "Give a table with samples")
-        return cls(
-            name=name,
-            to_light=light[good],
-            to_view=view[good],
-            values=numbers[good],
-            channels=names,
-            solid_angle=weight[good],
-            left_out={reason: count for reason, count in counts.items() if count},
-            evaluate=evaluate,
-        )
+        kept = light[good], view[good], numbers[good], channels, weight[good]
+        return cls(name, *kept, left_out=counts, evaluate=evaluate)
 
 
 def _numbers(name: str, value: Any) -> np.ndarray:
@@ -137,12 +125,7 @@ def _directions(name: str, value: Any) -> Float[np.ndarray, "P 3"]:
 
 
 def from_angles(polar: Any, azimuth: Any) -> Float[np.ndarray, "*P 3"]:
-    """Unit vectors from angles.
-
-    Args:
-        polar: angle from the normal in radians, (...).
-        azimuth: angle about the normal from +x towards +y in radians, (...).
-    """
+    """Unit vectors from angles in radians: from the normal, and about it from +x towards +y."""
     polar, azimuth = np.broadcast_arrays(np.asarray(polar, np.float64), np.asarray(azimuth, np.float64))
     sine = np.sin(polar)
     return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), np.cos(polar)], axis=-1)
@@ -161,20 +144,33 @@ def from_half_angles(
 
     Source: S. Rusinkiewicz, "A new change of variables for efficient BRDF representation", EGWR 1998.
     """
-    difference = from_angles(theta_d, phi_d)
-    cosine, sine = np.cos(theta_h), np.sin(theta_h)
-    turned = np.stack(
-        [
-            cosine * difference[..., 0] + sine * difference[..., 2],
-            difference[..., 1],
-            cosine * difference[..., 2] - sine * difference[..., 0],
-        ],
-        axis=-1,
-    )
-    c, s = np.cos(phi_h), np.sin(phi_h)
-    light = np.stack(
-        [c * turned[..., 0] - s * turned[..., 1], s * turned[..., 0] + c * turned[..., 1], turned[..., 2]], -1
-    )
-    half = from_angles(theta_h, phi_h)
-    view = 2 * np.sum(half * light, axis=-1, keepdims=True) * half - light
-    return light, view
+    half, down, across = half_frame(theta_h, phi_h)
+    x, y, z = np.moveaxis(from_angles(theta_d, phi_d)[..., None], -2, 0)
+    beside = x * down + y * across
+    return z * half + beside, z * half - beside
+
+
+def half_frame(theta_h: Any, phi_h: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The half vector, and the directions in which theta_h and phi_h grow, from these."""
+    quarter = 0.5 * np.pi
+    return from_angles(theta_h, phi_h), from_angles(theta_h + quarter, phi_h), from_angles(quarter, phi_h + quarter)
+
+
+def half_angle_grid(
+    shape: tuple[int, int, int], turn: float
+) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3"], Float[np.ndarray, " P"]]:
+    """Light and view in the middle of each cell of theta_h, theta_d and phi_d, and the solid angle that it stands for.
+
+    Args:
+        shape: how many cells; those of theta_h grow with its root, as MERL's do.
+        turn: the range of phi_d in radians.
+
+    Returns:
+        Light and view, also below the horizon, and the share of all pairs of directions, of mean 1; phi_d fastest.
+    """
+    root, theta_d, phi_d = ((np.arange(count) + 0.5) / count for count in shape)
+    theta_h, theta_d = 0.5 * np.pi * root * root, 0.5 * np.pi * theta_d
+    light, view = from_half_angles(*np.meshgrid(theta_h, theta_d, turn * phi_d, indexing="ij"))
+    # dω_light dω_view = 4 cos θ_d dω_half dω_difference, and dθ_h is in proportion to the root.
+    share = np.outer(np.sin(theta_h) * root, np.sin(theta_d) * np.cos(theta_d)).ravel().repeat(shape[2])
+    return light.reshape(-1, 3), view.reshape(-1, 3), share / np.mean(share)

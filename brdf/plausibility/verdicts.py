@@ -24,10 +24,10 @@ from brdf.channels import in_channel
 from brdf.conversions import nearest_normalized
 from brdf.errors import InputError
 from brdf.measured.table import MeasuredBRDF
-from brdf.measured.table_check import check_table
 from brdf.models import MODELS, Material, SpecularMaterial
 from brdf.plausibility.numeric import GRAZING, check_black_box
 from brdf.plausibility.report import ENERGY_LIMIT, RECIPROCITY_LIMIT, Angles, Finding, Report, times, verdict
+from brdf.plausibility.tables import check_table
 from brdf.precision import cast, working_precision
 
 _ANGLES = np.array([*np.arange(90.0), 89.5, 89.9, GRAZING])

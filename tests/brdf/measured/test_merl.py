@@ -72,21 +72,6 @@ def test_merl_entries_that_were_not_measured_are_left_out(tmp_path):
     assert table.negative == 0
 
 
-@pytest.mark.parametrize(
-    ("content", "said"),
-    [
-        (struct.pack("<3i", 90, 90, 180), "bytes instead of"),
-        (struct.pack("<3i", 90, 90, 180) + bytes(800), "bytes instead of"),
-        (struct.pack("<3i", 2**31 - 1, 2**31 - 1, 2**31 - 1) + bytes(100), "says it holds 2147483647 x"),
-    ],
-)
-def test_damaged_merl_files(tmp_path, content, said):
-    (tmp_path / "a.binary").write_bytes(content)
-    with pytest.raises(InputError, match=said) as error:
-        brdf.load_measured(tmp_path / "a.binary")
-    assert "a.binary" in str(error.value)
-
-
 def test_a_merl_file_of_the_right_size_with_a_wrong_header(tmp_path):
     path = tmp_path / "a.binary"
     with path.open("wb") as file:

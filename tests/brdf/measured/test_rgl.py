@@ -28,6 +28,11 @@ def test_rgl_fields_are_checked_before_mitsuba_sees_them(tmp_path):
         "description: must be text": tensor_file(description=None),
         "sigma: must be 2-dimensional": tensor_file(sigma=np.ones(8, "<f4")),
         "luminance: is of shape": tensor_file(luminance=np.ones((1, 4, 1, 4), "<f4")),
+        "rgb: is of shape": tensor_file(rgb=np.ones((1, 4, 3, 4, 5), "<f4")),
+        "wavelengths: does not fit": tensor_file(
+            rgb=None, spectra=np.ones((1, 4, 6, 4, 4), "<f4"), wavelengths=np.ones(6, "<f4")
+        ),
+        "phi_i: must be 1-dimensional": tensor_file(phi_i=np.ones(0, "<f4")),
     }
     for said, content in spoiled.items():
         path.write_bytes(content)
