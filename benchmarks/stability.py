@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from brdf.plausibility.stability import stability_maps
+import brdf
 from fitting.report.material_plots import plot_stability
 
 
@@ -18,7 +18,7 @@ def main(path: Path) -> None:
     Args:
         path: the picture to write.
     """
-    maps = stability_maps()
+    maps = [brdf.stability_map(model) for model in brdf.MODELS.values()]
     for one in maps:
         broken = np.count_nonzero(~one.finite)
         print(f"{one.model:<24} largest error {one.error.max():.1e} of the peak, {broken} not finite")

@@ -1,4 +1,3 @@
-from .albedo import absorbed_fraction as absorbed_fraction
 from .albedo import directional_albedo as directional_albedo
 from .conversions import (
     exponent_from_roughness as exponent_from_roughness,
@@ -75,16 +74,7 @@ from .lights.punctual import (
     SpotLight as SpotLight,
 )
 from .materials.exports import (
-    EXPORTS as EXPORTS,
-)
-from .materials.exports import (
-    Export as Export,
-)
-from .materials.exports import (
     export_material as export_material,
-)
-from .materials.exports import (
-    mitsuba_dict as mitsuba_dict,
 )
 from .materials.exports import (
     save_export as save_export,
@@ -94,12 +84,6 @@ from .materials.material_file import (
 )
 from .materials.material_file import (
     load_materials as load_materials,
-)
-from .materials.material_file import (
-    material_from_dict as material_from_dict,
-)
-from .materials.material_file import (
-    material_to_dict as material_to_dict,
 )
 from .materials.material_file import (
     save_material as save_material,
@@ -132,16 +116,9 @@ from .models import (
     Phong as Phong,
 )
 from .pixel_choice import some_pixels as some_pixels
-from .plausibility.report import Finding as Finding
 from .plausibility.report import Report as Report
 from .plausibility.stability import (
-    StabilityMap as StabilityMap,
-)
-from .plausibility.stability import (
     stability_map as stability_map,
-)
-from .plausibility.stability import (
-    stability_maps as stability_maps,
 )
 from .plausibility.verdicts import check as check
 from .precision import cast as cast

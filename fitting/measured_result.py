@@ -8,6 +8,7 @@ import numpy as np
 
 import brdf
 from brdf.files import atomic_folder
+from brdf.materials.material_file import material_to_dict
 from fitting.report.saving import write_report
 from fitting.result import Parameter, undetermined
 
@@ -187,7 +188,7 @@ class BrdfFitResult:
         return {
             "table": self.table.name,
             "channels": list(self.table.channels),
-            "material": brdf.material_to_dict(self.material, undetermined=self.undetermined),
+            "material": material_to_dict(self.material, undetermined=self.undetermined),
             "loss": self.loss,
             "parameters": [asdict(parameter) for parameter in self.parameters],
             "losses": asdict(self.losses),
@@ -196,7 +197,7 @@ class BrdfFitResult:
                     "model": candidate.model,
                     "unknowns": candidate.unknowns,
                     "losses": asdict(candidate.losses),
-                    "material": brdf.material_to_dict(candidate.material),
+                    "material": material_to_dict(candidate.material),
                     "chosen": index == self.chosen,
                 }
                 for index, candidate in enumerate(self.candidates)

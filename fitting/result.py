@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 import brdf
+from brdf.materials.material_file import material_to_dict
 from brdf.precision import Precision
 from fitting.budget.budget_choice import BudgetChoice
 from fitting.selection import Candidate
@@ -161,7 +162,7 @@ class FitResult:
     def to_dict(self) -> dict[str, Any]:
         """The report as JSON holds it: what is not determined is None."""
         return {
-            "material": brdf.material_to_dict(self.material, undetermined=self.undetermined),
+            "material": material_to_dict(self.material, undetermined=self.undetermined),
             "parameters": [
                 {
                     "name": parameter.name,

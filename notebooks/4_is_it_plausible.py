@@ -59,8 +59,8 @@ brdf.check(plausible, name="its nearest plausible form")
 
 # %%
 angles = np.radians([0, 30, 60, 85])
-for angle, lost in zip(np.degrees(angles), np.asarray(brdf.absorbed_fraction(plausible, angles)), strict=True):
-    print(f"light at {angle:2.0f}°: {100 * float(lost[0]):.1f} % absorbed")
+for angle, albedo in zip(np.degrees(angles), np.asarray(brdf.directional_albedo(plausible, angles)), strict=True):
+    print(f"light at {angle:2.0f}°: {100 * (1 - float(albedo[0])):.1f} % absorbed")
 
 # %% [markdown]
 # ## Constants that are often used, and wrong

@@ -171,7 +171,7 @@ def plot_stability(maps: list[StabilityMap]) -> Figure:
     """Error of float32 over exponent and angle, a panel for each model; a cross where a derivative is not finite.
 
     Args:
-        maps: from ``brdf.plausibility.stability.stability_maps``.
+        maps: from `brdf.stability_map`, one a model.
 
     Returns:
         The figure.

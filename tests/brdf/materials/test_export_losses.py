@@ -41,7 +41,7 @@ def shown(material: brdf.Material, degrees: float) -> np.ndarray:
 def test_mitsuba_shows_what_is_told(material: brdf.Material):
     mitsuba = pytest.importorskip("mitsuba")
     mitsuba.set_variant("scalar_rgb")
-    plugin = mitsuba.load_dict(brdf.mitsuba_dict(material))
+    plugin = mitsuba.load_dict(json.loads(brdf.export_material(material, "mitsuba-dict").text))
     interaction = mitsuba.SurfaceInteraction3f()
     for degrees, ratio in zip(
         (1e-3, 60.0), told(material, "mitsuba"), strict=True

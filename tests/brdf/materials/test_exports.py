@@ -14,6 +14,7 @@ import pytest
 from project_paths import BROWSER, REAL
 
 import brdf
+from brdf.materials.exports import EXPORTS
 
 RGB = {"k_a": [0.1, 0.2, 0.3], "k_d": [0.5, 0.4, 0.3], "k_s": [0.3, 0.35, 0.4]}
 LAMBERT = brdf.Lambert(k_a=RGB["k_a"], k_d=RGB["k_d"])
@@ -73,7 +74,7 @@ def test_presets_are_found_as_people_write_them():
 # -- what every format promises ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("to", brdf.EXPORTS)
+@pytest.mark.parametrize("to", EXPORTS)
 @pytest.mark.parametrize("material", MATERIALS, ids=lambda m: m.name)
 def test_every_export_says_what_it_loses(material: brdf.Material, to: str, tmp_path: Path):
     export = brdf.save_export(material, tmp_path / "m.any", to=to, name="a_name")
@@ -257,7 +258,7 @@ def test_mitsuba_evaluates_nearly_our_lobe(n: float):
     mitsuba = pytest.importorskip("mitsuba")
     mitsuba.set_variant("scalar_rgb")
     material = brdf.NormalizedBlinnPhong(k_d=RGB["k_d"], k_s=RGB["k_s"], n=n)
-    from_dict = mitsuba.load_dict(brdf.mitsuba_dict(material))
+    from_dict = mitsuba.load_dict(json.loads(brdf.export_material(material, "mitsuba-dict").text))
     text = brdf.export_material(material, "mitsuba").text
     from_xml = mitsuba.load_string(text).bsdf() if hasattr(mitsuba.load_string(text), "bsdf") else None
     interaction = mitsuba.SurfaceInteraction3f()
@@ -280,7 +281,7 @@ def test_mitsuba_evaluates_nearly_our_lobe(n: float):
 def test_mitsuba_reads_lambert_exactly():
     mitsuba = pytest.importorskip("mitsuba")
     mitsuba.set_variant("scalar_rgb")
-    plugin = mitsuba.load_dict(brdf.mitsuba_dict(brdf.Lambert(k_d=RGB["k_d"])))
+    plugin = mitsuba.load_dict(json.loads(brdf.export_material(brdf.Lambert(k_d=RGB["k_d"]), "mitsuba-dict").text))
     interaction = mitsuba.SurfaceInteraction3f()
     interaction.wi = mitsuba.Vector3f(0, 0, 1)
     value = plugin.eval(mitsuba.BSDFContext(), interaction, mitsuba.Vector3f(0, 0, 1))

@@ -1,0 +1,141 @@
+"""Wavefront MTL: the materials that other programs load. illum 2 is Blinn-Phong, (N·H)^Ns.
+
+A highlight that MTL has no word for is written as the nearest one it has, and a comment, which other readers skip,
+names the model, so that what was saved reads back.
+"""
+
+import math
+from collections.abc import Collection, Iterator
+from typing import Any
+
+import numpy as np
+
+from brdf.conversions import half_from_mirror, mirror_from_half
+from brdf.errors import InputError
+from brdf.files import parse_number
+from brdf.models import MODELS, BlinnPhong, Lambert, Material, NormalizedPhong, Phong, SpecularMaterial
+
+SHOWN = 40  # the first letters of a word that messages show
+_MODEL_COMMENT = "# brdf model:"
+_TEXTURE = "map_kd"
+_COEFFICIENTS = {"ka": "k_a", "kd": "k_d", "ks": "k_s"}
+
+
+def half_exponent(material: SpecularMaterial) -> float:
+    """The exponent of N·H that gives nearly the highlight of this material."""
+    n = float(material.n)
+    return float(half_from_mirror(n)) if isinstance(material, Phong | NormalizedPhong) else n
+
+
+def height(model: type[SpecularMaterial], n: Any) -> float:
+    """The constant before the lobe, 1 in the classic forms."""
+    return float(model.scale(np.float64(n)))
+
+
+def to_mtl(material: Material, *, name: str = "fitted", undetermined: Collection[str] = ()) -> str:
+    """The material as MTL holds it.
+
+    Args:
+        material: any of the models, with 1 or 3 channels.
+        name: what ``newmtl`` calls it.
+        undetermined: what a picture could not determine, told in a comment.
+    """
+    lines = ["# Wavefront material, linear values"]
+    if type(material) is not BlinnPhong:
+        lines.append(f"{_MODEL_COMMENT} {material.name}")
+    if undetermined:
+        lines.append(f"# not determined by the picture: {', '.join(undetermined)}")
+    lines.append(f"newmtl {name}")
+    colours, illum = [material.k_a, material.k_d, 0.0], 1
+    if isinstance(material, SpecularMaterial):
+        lines.append(f"Ns {half_exponent(material)!r}")
+        colours[2], illum = np.asarray(material.k_s, np.float64) * height(type(material), material.n), 2
+    for key, colour in zip("ads", colours, strict=True):
+        numbers = np.broadcast_to(np.asarray(colour, np.float64), 3).tolist()
+        lines.append(f"K{key} {' '.join(map(repr, numbers))}")
+    return "\n".join([*lines, f"illum {illum}", ""])
+
+
+def read_mtl(path: Any, text: str) -> dict[str, dict[str, Any]]:
+    """What the lines of each material say, for `material_from_mtl`, by name.
+
+    Args:
+        path: where the text stands, for messages.
+        text: what the file holds.
+
+    Raises:
+        InputError: naming the line.
+    """
+    entries: dict[str, dict[str, Any]] = {}
+    name = model = None
+    for number, line in _logical_lines(text):
+        place = f"{path}: line {number}"
+        if line.startswith(_MODEL_COMMENT):
+            model = line.removeprefix(_MODEL_COMMENT).strip()
+        words = line.partition("#")[0].split()
+        key = words[0].lower() if words else ""
+        if key == "newmtl":
+            name = line[len("newmtl") :].strip() or "unnamed"
+            if name in entries:
+                came = f"names the material {name[:SHOWN]} a second time"
+                raise InputError(place, came, "Give each a name of its own")
+            entries[name] = {"model": model}
+        elif key in (*_COEFFICIENTS, "ns", "illum", _TEXTURE):
+            if name is None:
+                raise InputError(place, f"has {words[0]} before any newmtl", "Start the material with newmtl NAME")
+            entries[name][key] = words[-1] if key == _TEXTURE else _numbers(place, words)
+    if not entries:
+        raise InputError(path, "holds no material", "Give a file with a newmtl line")
+    return entries
+
+
+def _logical_lines(text: str) -> Iterator[tuple[int, str]]:
+    """Lines by the number of their first, those that end in a backslash joined with the next."""
+    joined, first = "", 1
+    for number, line in enumerate(text.splitlines(), start=1):
+        joined += line.strip()
+        if joined.endswith("\\") and not joined.startswith("#"):
+            joined = joined[:-1] + " "
+            continue
+        yield first, joined
+        joined, first = "", number + 1
+    yield first, joined
+
+
+def _numbers(place: str, words: list[str]) -> list[float]:
+    key, *given = words
+    wanted, remedy = ((1, 3), "Give RGB values") if key.lower() in _COEFFICIENTS else ((1,), "Give one number")
+    came = f"got {' '.join(given)[:SHOWN]!r}"
+    try:
+        numbers = [parse_number(word) for word in given]
+    except ValueError:
+        more = "; spectral curves and XYZ are not read" if given[0].lower() in ("spectral", "xyz") else ""
+        raise InputError(place, f"{key} must be numbers, {came}", f"{remedy}{more}") from None
+    if not all(map(math.isfinite, numbers)):
+        raise InputError(place, f"{key} must be finite numbers, {came}", "Give finite numbers")
+    if len(numbers) not in wanted:
+        raise InputError(place, f"{key} has {len(numbers)} values", f"Give {' or '.join(map(str, wanted))}")
+    return numbers
+
+
+def material_from_mtl(entry: dict[str, Any]) -> Material:
+    """The material of which an entry of `read_mtl` tells.
+
+    Raises:
+        InputError: naming the key.
+    """
+    if _TEXTURE in entry and "kd" not in entry:
+        came = f"is missing beside the texture {entry[_TEXTURE][:SHOWN]}, which is not read"
+        raise InputError("Kd", came, "Add the mean colour as Kd")
+    name, (illum,), (exponent,) = entry["model"], entry.get("illum", [2.0]), entry.get("ns", [1.0])
+    colours = {name: np.broadcast_to(entry.get(key, [0.0]), 3) for key, name in _COEFFICIENTS.items()}
+    if name is not None and name not in MODELS:
+        raise InputError("model", f"is unknown, got {name!r}", f"Use one of {', '.join(MODELS)}")
+    model = BlinnPhong if name is None else MODELS[name]
+    if not issubclass(model, SpecularMaterial) or illum < 2 or (name is None and "ks" not in entry):
+        return Lambert(k_a=colours["k_a"], k_d=colours["k_d"])
+    if exponent < 0:
+        raise InputError("Ns", f"must be at least 0, got {exponent:g}", "Correct the value")
+    n = float(mirror_from_half(exponent)) if issubclass(model, Phong | NormalizedPhong) else exponent
+    colours["k_s"] = colours["k_s"] / height(model, n)
+    return model(**colours, n=n)
