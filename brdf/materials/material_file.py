@@ -122,6 +122,9 @@ def material_from_dict(values: Any) -> Material:
     if not isinstance(name, str) or name not in MODELS:
         raise InputError("model", f"is unknown, got {repr(name)[:SHOWN]}", f"Use one of {', '.join(MODELS)}")
     known = _parameters(MODELS[name])
+    for key in values:
+        if key not in ("model", *known):
+            raise InputError(key[:SHOWN], "is not a known key", f"Known here: model, {', '.join(known)}")
     for key in known:
         if key not in values and key != "k_a":
             raise InputError(key, "is missing", f"{name} needs {', '.join(known)}")

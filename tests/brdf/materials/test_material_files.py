@@ -133,6 +133,16 @@ MALFORMED = {
     "number of 5,000 digits": (".json", '{"model": "lambert", "k_d": %s}' % ("9" * 5000), "is not JSON"),
     "no model": (".json", "{}", "model: is unknown, got None"),
     "unknown model": (".json", '{"model": "ward"}', "model: is unknown, got 'ward'"),
+    "unknown key": (
+        ".json",
+        '{"model": "lambert", "k_d": [1], "gloss": 1}',
+        "a.json: gloss: is not a known key. Known here: model, k_a, k_d.",
+    ),
+    "key of another model": (
+        ".json",
+        '{"model": "lambert", "k_d": [1], "n": 3}',
+        "n: is not a known key. Known here: model, k_a, k_d.",
+    ),
     "missing": (".json", '{"model": "phong", "k_d": [1], "n": 3}', "k_s: is missing. phong needs k_a, k_d, k_s, n."),
     "negative": (".json", '{"model": "lambert", "k_d": [0.5, -0.2]}', "k_d: must be at least 0, got -0.2 in channel 1"),
     "not a number": (".json", '{"model": "lambert", "k_d": [NaN]}', "k_d: must be finite"),
