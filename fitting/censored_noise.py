@@ -11,12 +11,10 @@ Source: Foi, Trimeche, Katkovnik and Egiazarian 2008, section IV, "Clipping", fo
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
 
-import brdf
 from brdf.channels import channel_names
 from fitting.result import FitResult
 
@@ -34,29 +32,15 @@ FEWEST_PAIRS = 50
 BLACK, WHITE = "whose noise is cut off at black", "whose noise is cut off at white"
 
 
-class Cut(NamedTuple):
-    """Pixels of one picture that the noise's missing half bends.
-
-    Attributes:
-        black: what is left out for the noise that is cut at black, (H, W).
-        white: the same at white.
-        spared: channels in which too much would have to be left out.
-    """
-
-    black: Bool[np.ndarray, "H W"]
-    white: Bool[np.ndarray, "H W"]
-    spared: tuple[int, ...]
-
-
-def without_cut_noise(
-    whole: FitResult, masks: Sequence[Any], again: Callable[[list[Bool[np.ndarray, "H W"]]], FitResult]
+def without_censored_noise(
+    whole: FitResult, masks: Sequence[Any], again: Callable[[list[np.ndarray]], FitResult] | None
 ) -> FitResult:
     """The fit without pixels whose noise is cut off, where there are any.
 
     Args:
-        whole: of the fit to all pixels, its pictures in memory.
-        masks: pixels that it looked at in each picture, (H, W), or None.
-        again: fits to the pixels of other masks.
+        whole: of the fit to all pixels.
+        masks: pixels that it may take in each picture, (H, W), or None.
+        again: fits to the pixels of other masks; None where that cannot be, and a warning has to do.
 
     Returns:
         The last fit, what it left out named by its reason; the given one where nothing is cut.
@@ -65,7 +49,7 @@ def without_cut_noise(
     if not (clipped or any(_piles_up(*picture) for picture in zip(whole.targets, whole.counted, strict=True))):
         return whole
     allowed = [
-        np.ones(counted.shape, bool) if mask is None else np.asarray(mask).astype(bool)
+        np.ones(counted.shape, bool) if mask is None or again is None else mask
         for mask, counted in zip(masks, whole.counted, strict=True)
     ]
     # Once left out stays out: a threshold that moves to and fro would never end.
@@ -73,63 +57,52 @@ def without_cut_noise(
     white = [np.zeros(counted.shape, bool) for counted in whole.counted]
     result, spared = whole, set()
     for _ in range(ROUNDS):
-        before = _count(black) + _count(white)
-        for i, (target, scene) in enumerate(zip(whole.targets, result.scenes, strict=True)):
-            counted = whole.counted[i]
-            cut = _cut(np.asarray(target), _predicted(result, scene), counted, allowed[i], clipped=clipped)
-            black[i] |= cut.black & counted & ~white[i]
-            white[i] |= cut.white & counted & ~black[i]
-            spared.update(cut.spared)
-        if _count(black) + _count(white) <= before * 1.01:
+        before = _count(black + white)
+        for i, target in enumerate(whole.targets):
+            predicted = np.broadcast_to(result.fitted(i), target.shape)
+            at_black, at_white, lost = _censored(target, predicted, whole.counted[i], allowed[i], clipped=clipped)
+            black[i] |= at_black & ~white[i]
+            white[i] |= at_white & ~black[i]
+            spared.update(lost)
+        if again is None or _count(black + white) <= before * 1.01:
             break
-        result = again([ok & ~(one | other) for ok, one, other in zip(allowed, black, white, strict=True)])
-    if result is whole and not spared:
-        return whole
-    left_out = whole.left_out | {BLACK: _count(black), WHITE: _count(white)}
+        result = again([free & ~(dark | bright) for free, dark, bright in zip(allowed, black, white, strict=True)])
     warnings = result.warnings
+    if again is None:
+        left = zip(black, white, whole.counted, strict=True)
+        share = max(float(np.mean((dark | bright)[counted])) for dark, bright, counted in left)
+        if spared:
+            warnings = ("noise is cut off at black or white almost everywhere: the coefficients are bent", *warnings)
+        elif share:
+            words = (
+                f"noise is cut off at black or white in {100 * share:.2g} % of the pixels, which bends the "
+                "coefficients: of a picture in memory such pixels are left out"
+            )
+            warnings = (words, *warnings)
+        return dataclasses.replace(result, warnings=warnings)
+    left_out = dict(whole.left_out)
+    for reason, some in ((BLACK, black), (WHITE, white)):
+        left_out[reason] = _count(some)
     if spared:
         names = channel_names(whole.targets[0].shape[-1])
         where = f" in channel {', '.join(names[channel] for channel in sorted(spared))}" if len(names) > 1 else ""
         words = f"noise is cut off at black or white almost everywhere{where}: the coefficients are bent there"
         warnings = (words, *warnings)
+    elif result is whole:
+        return whole
     return dataclasses.replace(result, left_out={reason: n for reason, n in left_out.items() if n}, warnings=warnings)
 
 
-def warned_of_cut_noise(result: FitResult) -> FitResult:
-    """The fit of a picture that is not in memory, with a warning where its noise is cut off.
-
-    Args:
-        result: of the fit; what it shows are some of the pixels.
-    """
-    clipped = result.left_out.get("clipped", 0) >= FEWEST
-    share, everywhere = 0.0, False
-    for target, scene, counted in zip(result.targets, result.scenes, result.counted, strict=True):
-        if clipped or _piles_up(target, counted):
-            whole = np.ones(counted.shape, bool)
-            cut = _cut(np.asarray(target), _predicted(result, scene), counted, whole, clipped=clipped)
-            share = max(share, float(np.mean((cut.black | cut.white)[counted])))
-            everywhere |= bool(cut.spared)
-    if not (share or everywhere):
-        return result
-    words = (
-        f"noise is cut off at black or white in {100 * share:.2g} % of the pixels, which bends the coefficients: "
-        "of a picture in memory such pixels are left out"
-    )
-    if everywhere:
-        words = "noise is cut off at black or white almost everywhere: the coefficients are bent"
-    return dataclasses.replace(result, warnings=(words, *result.warnings))
-
-
-def _count(masks: Sequence[Bool[np.ndarray, "H W"]]) -> int:
+def _count(masks: Sequence[np.ndarray]) -> int:
     return sum(int(np.count_nonzero(mask)) for mask in masks)
 
 
-def _piles_up(target: Float[np.ndarray, "H W C"], counted: Bool[np.ndarray, "H W"]) -> bool:
+def _piles_up(target: np.ndarray, counted: np.ndarray) -> bool:
     """Whether noise may be cut at black in some channel; a look that needs no prediction."""
     return any(_single_values_at_end(value, counted) for value in np.moveaxis(target, -1, 0))
 
 
-def _single_values_at_end(value: Float[np.ndarray, "H W"], counted: Bool[np.ndarray, "H W"]) -> bool:
+def _single_values_at_end(value: np.ndarray, counted: np.ndarray) -> bool:
     """Whether single pixels stand at the lower end among larger ones: what is dark without noise is so in one piece."""
     inside = value[counted]
     if not inside.size or np.count_nonzero(inside == np.min(inside)) < FEWEST:
@@ -138,76 +111,67 @@ def _single_values_at_end(value: Float[np.ndarray, "H W"], counted: Bool[np.ndar
     return int(np.count_nonzero(above[:, :-2] & (counted & ~above)[:, 1:-1] & above[:, 2:])) >= FEWEST
 
 
-def _predicted(result: FitResult, scene: brdf.Scene) -> Float[np.ndarray, "H W C"]:
-    return np.asarray(brdf.render(result.material, scene, precision=result.precision))
+def _censored(
+    target: np.ndarray, predicted: np.ndarray, counted: np.ndarray, allowed: np.ndarray, *, clipped: bool
+) -> tuple[np.ndarray, np.ndarray, list[int]]:
+    """What of one picture is predicted too near to black, and to white where pixels were clipped.
 
+    Args:
+        target: (H, W, C).
+        predicted: likewise.
+        counted: pixels that were fitted, (H, W).
+        allowed: pixels that the mask allows.
+        clipped: whether some were.
 
-def _cut(
-    target: Float[np.ndarray, "H W C"],
-    predicted: Float[np.ndarray, "H W C"],
-    counted: Bool[np.ndarray, "H W"],
-    allowed: Bool[np.ndarray, "H W"],
-    *,
-    clipped: bool,
-) -> Cut:
-    """What of one picture is too near to an end, by what is predicted; to white only where pixels were clipped."""
-    predicted = np.broadcast_to(predicted, target.shape)
-    nowhere = np.zeros(counted.shape, bool)
+    Returns:
+        (H, W) for black, for white; and the channels in which too much would have to be left out.
+    """
+    black = white = nowhere = np.zeros(counted.shape, bool)
+    spared: list[int] = []
     if not counted.any():
-        return Cut(nowhere, nowhere, ())
+        return black, white, spared
     with np.errstate(invalid="ignore"):
         brightest = np.max(target, axis=-1)
-    seen = np.isfinite(brightest) & np.any(predicted > 0, axis=-1)
+    shown = np.any(predicted > 0, axis=-1)
     level = float(np.max(brightest[counted]))
-    beyond = brightest[seen & allowed & ~counted & (brightest > level)]
     # Clipped pixels do not count; where none are, white was not reached.
-    white = level if clipped and beyond.size >= FEWEST else np.inf
-    step = float(np.min(beyond)) - level if beyond.size else 0.0
-    lit = counted & np.any(predicted > 0, axis=-1)
-    ends: list[tuple[int, np.ndarray, np.ndarray]] = []
+    beyond = brightest[np.isfinite(brightest) & shown & allowed & ~counted & (brightest > level)]
+    reached = clipped and beyond.size >= FEWEST
+    lit = counted & shown
+    ends = []
     for channel in range(target.shape[-1]):
         value, model = target[..., channel], predicted[..., channel]
-        dark, bright = _near_black(value, model, counted), nowhere
-        if white < np.inf:
-            bright = _near(-value, -model, counted, -white, step)
-        ends.append((channel, dark, bright))
-    black, top, spared = nowhere, nowhere, []
+        bright = nowhere
+        if reached:
+            bright = _near(-value, -model, counted, -level, float(np.min(beyond)) - level)
+        ends.append((channel, _near_black(value, model, counted), bright))
     for channel, dark, bright in sorted(ends, key=lambda end: np.count_nonzero((end[1] | end[2]) & lit)):
         if not (dark.any() or bright.any()):
             continue
-        left = lit & ~(black | top | dark | bright)
-        if np.count_nonzero(left) < KEPT * np.count_nonzero(lit):
+        if np.count_nonzero(lit & ~(black | white | dark | bright)) < KEPT * np.count_nonzero(lit):
             spared.append(channel)
         else:
-            black, top = black | dark, top | bright
-    return Cut(black, top, tuple(spared))
+            black, white = black | dark, white | bright
+    return black, white, spared
 
 
-def _near_black(
-    value: Float[np.ndarray, "H W"], model: Float[np.ndarray, "H W"], counted: Bool[np.ndarray, "H W"]
-) -> Bool[np.ndarray, "H W"]:
+def _near_black(value: np.ndarray, model: np.ndarray, counted: np.ndarray) -> np.ndarray:
     """Pixels predicted so near to black that noise is cut there; none where no single values stand at the end."""
+    nowhere = np.zeros(counted.shape, bool)
     if not _single_values_at_end(value, counted):
-        return np.zeros(counted.shape, bool)
+        return nowhere
     floor = float(np.min(value[counted]))
     at_end = counted & (value == floor) & (model > 0)
     above = value[counted & (value > floor)]
-    if np.count_nonzero(at_end) < FEWEST or not above.size:
-        return np.zeros(counted.shape, bool)
+    step = float(np.min(above))
     # The cut half of the noise piles up at the end; where noise only thins out, each code holds fewer than the next.
-    if np.count_nonzero(at_end) <= np.count_nonzero(above == np.min(above)):
-        return np.zeros(counted.shape, bool)
-    near = _near(value, model, counted, floor, float(np.min(above)) - floor)
-    return near if np.count_nonzero(near & at_end) >= FEWEST else np.zeros(counted.shape, bool)
+    if np.count_nonzero(at_end) < FEWEST or np.count_nonzero(at_end) <= np.count_nonzero(above == step):
+        return nowhere
+    near = _near(value, model, counted, floor, step - floor)
+    return near if np.count_nonzero(near & at_end) >= FEWEST else nowhere
 
 
-def _near(
-    value: Float[np.ndarray, "H W"],
-    model: Float[np.ndarray, "H W"],
-    counted: Bool[np.ndarray, "H W"],
-    end: float,
-    step: float,
-) -> Bool[np.ndarray, "H W"]:
+def _near(value: np.ndarray, model: np.ndarray, counted: np.ndarray, end: float, step: float) -> np.ndarray:
     """Pixels predicted within ``REACH`` standard deviations of the lower end, the noise measured just above it."""
     nowhere = np.zeros(counted.shape, bool)
     squares, where = _noise_pairs(value - model, model, counted)
@@ -220,27 +184,20 @@ def _near(
         if np.count_nonzero(beside) < FEWEST_PAIRS:
             break
         deviation = float(np.sqrt(np.mean(squares[beside])))
-    if deviation <= ROUNDED * step:
-        return nowhere
     near = counted & (model < end + REACH * deviation)
-    return near if np.count_nonzero(near) >= FEWEST else nowhere
+    return near if deviation > ROUNDED * step and np.count_nonzero(near) >= FEWEST else nowhere
 
 
-def _noise_pairs(
-    residual: Float[np.ndarray, "H W"], model: Float[np.ndarray, "H W"], counted: Bool[np.ndarray, "H W"]
-) -> tuple[Float[np.ndarray, " M"], Float[np.ndarray, " M"]]:
+def _noise_pairs(residual: np.ndarray, model: np.ndarray, counted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The variance that each pair of near pixels shows, and the mean of what is predicted there.
 
     Differences of near pixels know nothing of what the model leaves over wide areas; direct neighbours share the noise
     that a camera or a codec smoothed.
     """
     squares, where = [], []
-    for first, second in (
-        ((slice(None), slice(None, -2)), (slice(None), slice(2, None))),
-        ((slice(None, -2), slice(None)), (slice(2, None), slice(None))),
-    ):
-        both = counted[first] & counted[second]
-        difference = (residual[first] - residual[second])[both].astype(np.float64)
+    for left, value, good in ((residual, model, counted), (residual.T, model.T, counted.T)):
+        both = good[:, :-2] & good[:, 2:]
+        difference = (left[:, :-2] - left[:, 2:])[both].astype(np.float64)
         squares.append(0.5 * difference**2)
-        where.append(0.5 * (model[first] + model[second])[both])
+        where.append(0.5 * (value[:, :-2] + value[:, 2:])[both])
     return np.concatenate(squares), np.concatenate(where)

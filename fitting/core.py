@@ -1,5 +1,8 @@
-"""One model fitted to the pictures: from observations to the engine's arrays, and the search on them."""
+"""One fit: the pictures of a problem under one model, or under the simplest adequate one."""
 
+import dataclasses
+import time
+from collections import Counter
 from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
@@ -10,164 +13,255 @@ from jaxtyping import Bool, Float
 
 import brdf
 from brdf.models.base import SpecularMaterial
-from brdf.precision import Precision
+from brdf.precision import working_precision
 from brdf.rendering import basis
-from fitting.light_colour import LightColour
-from fitting.pixels import TILE_PIXELS, Observation, Tile
-from fitting.solver.losses import Loss, reweight
+from fitting.censored_noise import without_censored_noise
+from fitting.light_colour import coefficient_factors, take_colour_out
+from fitting.pixels import Observation, Tile, observe
+from fitting.plausible import fit_plausible, is_plausible
+from fitting.problem import FitProblem
+from fitting.result import FitResult
+from fitting.selection import FAMILIES, Choice, choose
+from fitting.solver.losses import reweight
 from fitting.solver.normal_equations import Picture
-from fitting.solver.profile import Optimum, fit_linear, search
-from fitting.solver.streams import each, joined
-from fitting.uncertainty.interpretation import ModelFit
-from fitting.uncertainty.residual_correlation import nearest_peak
+from fitting.solver.profile import Optimum, search
+from fitting.solver.streams import Stream, each, joined
+from fitting.solver.tied import fit_tied
+from fitting.uncertainty.covariance import residual_noise
+from fitting.uncertainty.highlight import nearest_peak
+from fitting.uncertainty.interpretation import Interpretation, ModelFit, interpret
+from fitting.uncertainty.noise_model import weighted_sums
+from fitting.uncertainty.residual_correlation import residual_correlation
 
+# A residual above this share of the picture: what the scene says is probably not what the picture shows.
+UNEXPLAINED = 0.5
 # The nearest pixel shows exp(-UNSEEN) of a highlight's peak, or more, or the exponent is not looked at.
 UNSEEN = 60.0
+# An exponent up to this multiple of the lower bound is at the bound.
+WIDEST = 1.01
 
 
-class Job(NamedTuple):
-    """What stays the same for every model.
+class _Observed(NamedTuple):
+    """A problem whose pixels are known: what stays the same for every model.
 
     Attributes:
-        observations: the pictures.
-        light: and their lights, colour taken out.
-        n_range: bounds of the exponent.
-        loss: what is minimised.
-        families: models with a highlight that are compared.
+        problem: what is fitted.
+        observations: its pictures.
+        colour: what all lights share, taken out of the tiles' scenes, (C,).
+        tiles: of all pictures; a stream where one of them is.
+        lit: which channels have ambient light, and which have lights, (2, C).
+        rounding: standard deviation of a value's rounding, (C,).
     """
 
+    problem: FitProblem
     observations: list[Observation]
-    light: LightColour
-    n_range: tuple[float, float]
-    loss: Loss
-    families: tuple[str, ...]
+    colour: Float[np.ndarray, " C"]
+    tiles: Sequence[Tile]
+    lit: Bool[np.ndarray, "2 C"]
+    rounding: Float[np.ndarray, " C"]
 
-    @property
-    def shapes(self) -> Sequence[tuple[int, int]]:
-        """Height and width of each tile."""
-        return each(lambda tile: tile.points.mask.shape, self.tiles)
-
-    @property
-    def tiles(self) -> Sequence[Tile]:
-        """Of all pictures; a stream where one of them is."""
-        return joined([observation.tiles for observation in self.observations])
-
-    @property
-    def channels(self) -> int:
-        """Of the pictures."""
-        return self.observations[0].shown.shape[-1]
-
-    @property
-    def pixels(self) -> int:
-        """Of all pictures that are shown."""
-        return sum(observation.counted.size for observation in self.observations)
-
-    @property
-    def rounding(self) -> Float[np.ndarray, " C"]:
-        """Standard deviation of a value's rounding."""
-        return np.max([observation.noise for observation in self.observations], axis=0)
-
-    @property
-    def lit(self) -> Bool[np.ndarray, "2 C"]:
-        """Which channels have ambient light, and which have lights."""
-        ambient, direct = np.zeros(self.channels, bool), np.zeros(self.channels, bool)
-        for scene in self.light.scenes:
-            if scene.ambient is not None:
-                ambient |= np.asarray(scene.ambient) > 0
-            for one in scene.lights:
-                direct |= np.asarray(one.emittance) * self.light.colour > 0
-        return np.stack([ambient, direct])
+    def reached(self, model: type[brdf.Material]) -> Bool[np.ndarray, "3 C"]:
+        """Which coefficients of a model the light reaches."""
+        ambient, direct = self.lit
+        return np.stack([ambient, direct, direct & issubclass(model, SpecularMaterial)])
 
 
-def reached(model: type[brdf.Material], job: Job) -> Bool[np.ndarray, "3 C"]:
-    """Which coefficients of a model the light reaches.
+def fit_pictures(problem: FitProblem) -> FitResult:
+    """Fit a material: the global optimum over all pixels that count.
 
     Args:
-        model: its class.
-        job: the pictures.
+        problem: the pictures and how to fit them.
+
+    Raises:
+        InputError: where nothing is left to fit.
     """
-    ambient, direct = job.lit
-    return np.stack([ambient, direct, direct & issubclass(model, SpecularMaterial)])
+    start = time.perf_counter()
+    # Over the largest of them all, so that single precision holds them.
+    largest = max((float(np.max(weight)) for weight in problem.weights if weight is not None), default=1.0)
+    weights = [None if weight is None else weight / largest for weight in problem.weights]
+    problem = dataclasses.replace(problem, weights=weights)
+
+    def again(masks: list[np.ndarray]) -> FitResult:
+        return _fit(dataclasses.replace(problem, masks=masks))
+
+    with working_precision(problem.precision):
+        result = without_censored_noise(_fit(problem), problem.masks, None if problem.streamed else again)
+    return dataclasses.replace(result, seconds=time.perf_counter() - start)
 
 
-def _engine_pictures(model: type[brdf.Material], job: Job, *, keep: bool = True) -> Sequence[Picture]:
-    def picture(tile: Tile, scene: brdf.Scene) -> Picture:
-        dtype = tile.target.dtype
-        precision: Precision = "float32" if dtype == np.float32 else "float64"
-        ambient = np.zeros(1) if scene.ambient is None else np.asarray(scene.ambient, np.float64)
-        images = basis(model, brdf.cast(scene, precision), points=tile.points)
-        diffuse = jnp.zeros((tile.target.shape[0], 1), dtype) if images.diffuse is None else images.diffuse
-        return Picture(tile.target, diffuse, images.lobe, tile.weight, ambient)
+def _fit(problem: FitProblem) -> FitResult:
+    seen = _observed(problem)
+    if problem.model == "auto":
+        fit, choice = _fit_simplest(seen)
+    else:
+        fit, choice = _fit_model(brdf.MODELS[problem.model], seen), None
+    fit = _held_plausible(fit, seen)
+    told, optimum = _interpreted(fit, seen, choice), fit.optimum
+    hidden = told.hidden_highlight
+    if hidden and not fit.capped and optimum.x[2].any():
+        # Or ambient and diffuse would be the ones that go with the highlight. Weights of a robust loss are made anew.
+        free = fit.free & [[True], [True], [False]]
+        pictures = fit.pictures if problem.loss == "squared" else None
+        fit = _held_plausible(_fit_model(fit.model, seen, free, pictures), seen)
+        told = _interpreted(fit, seen, choice)
+        lost = [p.name in ("k_s", "n") and p.value is None for p in told.parameters]
+        parameters = [
+            dataclasses.replace(p, reason=hidden) if gone else p for p, gone in zip(told.parameters, lost, strict=True)
+        ]
+        told = told._replace(parameters=tuple(parameters))
+    left_out: Counter[str] = Counter()
+    for observation in seen.observations:
+        left_out.update(observation.left_out)
+    return FitResult(
+        material=told.material,
+        parameters=told.parameters,
+        noise=told.noise,
+        structure=told.structure,
+        highlight_pixels=told.highlight_pixels,
+        residual=_residual(fit.optimum),
+        pixels=int(fit.optimum.pixels[0]),
+        left_out=dict(left_out),
+        warnings=told.warnings,
+        candidates=() if choice is None else choice.candidates,
+        correlation=told.correlation,
+        optimum=optimum,
+        loss=problem.loss,
+        precision=problem.precision,
+        seconds=0.0,
+        targets=[observation.shown for observation in seen.observations],
+        scenes=[observation.scene for observation in seen.observations],
+        counted=[observation.counted for observation in seen.observations],
+    )
 
-    pictures = []
-    for observation, scene in zip(job.observations, job.light.scenes, strict=True):
-        some = each(partial(picture, scene=scene), observation.tiles)
-        pictures.append(list(some) if keep and observation.in_memory else some)
-    return joined(pictures)
+
+def _observed(problem: FitProblem) -> _Observed:
+    channels = problem.targets[0].pixels.shape[-1]
+    light = take_colour_out(problem.scenes, channels)
+    observations = observe(problem, light.scenes)
+    ambient, direct = np.zeros(channels, bool), np.zeros(channels, bool)
+    for scene in light.scenes:
+        if scene.ambient is not None:
+            ambient |= np.asarray(scene.ambient) > 0
+        for lamp in scene.lights:
+            direct |= np.asarray(lamp.emittance) * light.colour > 0
+    rounding = np.max([observation.rounding for observation in observations], axis=0)
+    tiles = joined([observation.tiles for observation in observations])
+    return _Observed(problem, observations, light.colour, tiles, np.stack([ambient, direct]), rounding)
 
 
-def _visible(pictures: Sequence[Picture], n_range: tuple[float, float]) -> tuple[float, float] | None:
-    """Exponents of which some pixel sees at least a trace: with larger ones k_s could be anything; None without any."""
-    nearest = max((nearest_peak(picture) for picture in pictures if picture.lobe is not None), default=0.0)
-    upper = min(n_range[1], UNSEEN / max(-nearest, UNSEEN / n_range[1]))
-    return (n_range[0], upper) if upper >= n_range[0] else None
+def _residual(optimum: Optimum) -> float:
+    return float(np.sqrt(np.sum(optimum.cost) / np.sum(optimum.square)))
 
 
-def optimise(pictures: Sequence[Picture], free: Bool[np.ndarray, "3 C"], n_range: tuple[float, float]) -> Optimum:
-    """The global optimum, over the exponent too where a highlight is free.
+def _picture(model: type[brdf.Material], tile: Tile) -> Picture:
+    ambient = np.zeros(1) if tile.scene.ambient is None else np.asarray(tile.scene.ambient, np.float64)
+    images = basis(model, tile.scene, points=tile.points)
+    diffuse = images.diffuse
+    if diffuse is None:
+        diffuse = jnp.zeros((tile.target.shape[0], 1), tile.target.dtype)
+    return Picture(tile.target, diffuse, images.lobe, tile.weight, ambient)
 
-    Args:
-        pictures: in the units of the engine.
-        free: which coefficients may be above 0.
-        n_range: bounds of the exponent.
-    """
+
+def _search(pictures: Sequence[Picture], free: Bool[np.ndarray, "3 C"], n_range: tuple[float, float]) -> Optimum:
+    return search(pictures, n_min=n_range[0], n_max=n_range[1], free=free)
+
+
+def _fit_model(
+    model: type[brdf.Material],
+    seen: _Observed,
+    free: Bool[np.ndarray, "3 C"] | None = None,
+    pictures: Sequence[Picture] | None = None,
+) -> ModelFit:
+    """One model with the loss that is asked for; all that the light reaches is free where nothing else is said."""
+    free = seen.reached(model) if free is None else free
+    if pictures is None:
+        make = partial(_picture, model)
+        pictures = each(make, seen.tiles) if seen.problem.streamed else list(map(make, seen.tiles))
+    n_range = seen.problem.n_range
     if free[2].any():
-        return search(pictures, n_min=n_range[0], n_max=n_range[1], free=free)
-    return fit_linear(pictures, free=free)
-
-
-def fit_model(model: type[brdf.Material], job: Job) -> ModelFit:
-    """Fit one model with the loss that is asked for.
-
-    Args:
-        model: its class.
-        job: the pictures.
-    """
-    free = reached(model, job)
-    pictures = _engine_pictures(model, job)
-    n_range = job.n_range
-    if free[2].any():
-        visible = _visible(pictures, job.n_range)
-        n_range = visible or n_range
-        free[2] &= visible is not None
-    found = reweight(pictures, lambda some: optimise(some, free, n_range), job.loss, job.rounding)
+        # Exponents of which some pixel sees at least a trace: with larger ones k_s could be anything.
+        upper = min(n_range[1], UNSEEN / max(-nearest_peak(pictures), UNSEEN / n_range[1]))
+        if upper >= n_range[0]:
+            n_range = n_range[0], upper
+        else:
+            free[2] = False
+    found = reweight(pictures, lambda weighed: _search(weighed, free, n_range), seen.problem.loss, seen.rounding)
     return ModelFit(model, found.pictures, found.optimum, free, n_range, None, found.noise_factor)
 
 
-def forgotten(fit: ModelFit, job: Job) -> ModelFit:
-    """The fit, its pictures made anew when they are asked for, where they are large.
+def _fit_simplest(seen: _Observed) -> tuple[ModelFit, Choice]:
+    """Every family first, then the simplest adequate candidate on its own."""
+    problem, colour = seen.problem, seen.colour
+    fits: dict[str, ModelFit] = {}
+    for name in problem.families if seen.lit[1].any() else ("lambert",):
+        if isinstance(seen.tiles, Stream) and problem.loss == "squared":
+            # The pictures of one model at a time are in memory; those of the others are made anew where asked for.
+            fits = {
+                done: fit._replace(pictures=each(partial(_picture, fit.model), seen.tiles))
+                for done, fit in fits.items()
+            }
+        fits[name] = _fit_model(brdf.MODELS[name], seen)
+    # A lobe that would be wider than the search allows is no highlight: it mends what Lambert's law leaves at the rim.
+    fits = {name: fit for name, fit in fits.items() if fit.optimum.flat or fit.optimum.n > WIDEST * problem.n_range[0]}
+    fits = fits or {"lambert": _fit_model(brdf.Lambert, seen)}
+    if problem.loss != "squared":
+        # Weights are part of what is minimised: those of the better family serve all, or costs could not be compared.
+        best = min(fits.values(), key=lambda fit: float(np.sum(residual_noise(fit.optimum, seen.rounding))))
+        for name, fit in fits.items():
+            pictures = each(_with_weight_of, fit.pictures, best.pictures)
+            fits[name] = fit._replace(pictures=pictures, optimum=_search(pictures, fit.free, fit.n_range))
+    grey = {name: coefficient_factors(fit.model, fit.optimum.n, colour)[2] for name, fit in fits.items()}
+    best = min(fits.values(), key=lambda fit: float(np.sum(fit.optimum.cost)))
+    noise = residual_noise(best.optimum, seen.rounding)
+    known = residual_correlation(best.pictures, seen.tiles, best.optimum, seen.rounding)
+    whitened = {}
+    if known.noise is not None:
+        # Each pixel by its own variance, or noise in bright pixels would pass for a highlight.
+        for name, fit in fits.items():
+            whitened[name] = weighted_sums(fit.pictures, fit.optimum, known.noise, inverse=True)
+    free = np.logical_or.reduce([fit.free for fit in fits.values()])
+    optima = {name: fit.optimum for name, fit in fits.items()}
+    choice = choose(optima, free, grey, noise, known.inflation, whitened)
+    matt = choice.model in FAMILIES
+    chosen = list(fits.values())[-1] if matt else fits[choice.model]
+    fits, best = {}, None
+    pictures = chosen.pictures if problem.streamed else list(chosen.pictures)
+    if matt:
+        pictures = each(lambda picture: dataclasses.replace(picture, lobe=None), pictures)
+        chosen = chosen._replace(model=brdf.Lambert)
+    optimum = chosen.optimum
+    if matt or not np.array_equal(choice.free, chosen.free):
+        optimum = _search(pictures, choice.free, chosen.n_range)
+    tied = grey[choice.model] if choice.grey else None
+    if tied is not None:
+        single = problem.precision == "float32"
+        optimum = fit_tied(pictures, optimum, choice.free, tied, chosen.n_range, single=single)
+    return chosen._replace(pictures=pictures, optimum=optimum, free=choice.free, tied=tied), choice
 
-    Args:
-        fit: of any model.
-        job: the pictures.
-    """
-    if job.pixels <= TILE_PIXELS or job.loss != "squared":
+
+def _with_weight_of(picture: Picture, other: Picture) -> Picture:
+    return dataclasses.replace(picture, weight=other.weight)
+
+
+def _held_plausible(fit: ModelFit, seen: _Observed) -> ModelFit:
+    if not seen.problem.plausible or is_plausible(fit.optimum, fit.model, seen.colour):
         return fit
-    return fit._replace(pictures=_engine_pictures(fit.model, job, keep=False))
+    optimum = fit_plausible(fit.pictures, fit.optimum, fit.free, fit.model, seen.colour, fit.n_range)
+    # What the bound adds to the residual is no noise: that of the fit without it says what stands out.
+    noise = fit.noise_factor * float(np.sqrt(np.sum(fit.optimum.cost) / np.sum(optimum.cost)))
+    return fit._replace(optimum=optimum, tied=None, capped=True, noise_factor=noise)
 
 
-def without_highlight(fit: ModelFit, job: Job) -> ModelFit:
-    """The fit of the same model with ambient and diffuse alone.
-
-    Args:
-        fit: of a model with a highlight.
-        job: the pictures.
-    """
-    free = fit.free.copy()
-    free[2] = False
-    # The weights of a robust loss are part of what is fitted.
-    pictures = fit.pictures if job.loss == "squared" else _engine_pictures(fit.model, job)
-    found = reweight(pictures, lambda some: fit_linear(some, free=free), job.loss, job.rounding)
-    return fit._replace(
-        pictures=found.pictures, optimum=found.optimum, free=free, tied=None, noise_factor=found.noise_factor
-    )
+def _interpreted(fit: ModelFit, seen: _Observed, choice: Choice | None) -> Interpretation:
+    brightest = np.max([observation.brightest for observation in seen.observations], axis=0)
+    # What the light reaches but the simplest model does without is 0, with the error that it would have.
+    told = interpret(fit, seen.colour, seen.rounding, brightest, seen.tiles, seen.reached(fit.model))
+    warnings, share = list(told.warnings), _residual(fit.optimum)
+    if share > UNEXPLAINED:
+        words = f"the model leaves {100 * share:.0f} % of the picture: are light, camera and encoding what they were?"
+        warnings.insert(0, words)
+    if choice is not None and choice.rivals:
+        names = " and ".join(choice.rivals)
+        words = f"{names} fits as well as {fit.model.name}: the picture does not tell the two highlights apart"
+        warnings.append(words)
+    return told._replace(warnings=tuple(warnings))

@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float
 import brdf
 from brdf.precision import Precision, working_precision
 from fitting.pixels import Tile, observe
-from fitting.problem import pictures_and_scenes
+from fitting.problem import state_problem
 
 LARGEST_JACOBIAN = 1 << 27
 ROUNDS = 8
@@ -202,14 +202,10 @@ def fit_jointly(
     if not (0 < tolerance < 1 and max_steps >= 1):
         came = f"and max_steps must be above 0, got {tolerance!r} and {max_steps!r}"
         raise brdf.InputError("tolerance", came, "Give for example 1e-10 and 256")
-    targets, scenes, masks, _ = pictures_and_scenes(target, scene, mask, None)
+    stated = state_problem(target, scene, mask, precision=precision, saturation=saturation)
     with working_precision(precision):
-        dtype = np.dtype(precision)
-        seen = [
-            observe(picture, place, dtype=dtype, mask=one, saturation=saturation, at_once=True).tiles[0]
-            for picture, place, one in zip(targets, scenes, masks, strict=True)
-        ]
-        start = brdf.cast((material, scenes), precision)
+        seen = [observation.tiles[0] for observation in observe(stated, at_once=True)]
+        start = brdf.cast((material, stated.scenes), precision)
         problem = JointProblem.of(start, free, seen)
         values = sum(observation.target.size for observation in seen)
         chosen = solver or ("lm" if values * problem.origin.size <= LARGEST_JACOBIAN else "bfgs")

@@ -1,13 +1,19 @@
-"""The colour that all lights share, taken out of the scenes: then all channels share their basis images."""
+"""Between the solver's numbers and the user's: the colour that all lights share, and the scale of the lobe.
 
+The colour is taken out of the scenes, so that all channels share their basis images.
+"""
+
+import functools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Float
 
 import brdf
+from brdf.models.base import SpecularMaterial
 
 
 class LightColour(NamedTuple):
@@ -23,7 +29,7 @@ class LightColour(NamedTuple):
 
 
 def take_colour_out(scenes: Sequence[brdf.Scene], channels: int) -> LightColour:
-    """Split lights of one chromaticity into grey lights and a colour: then all channels share their basis images.
+    """Split lights of one chromaticity into grey lights and a colour.
 
     Args:
         scenes: any number.
@@ -31,7 +37,7 @@ def take_colour_out(scenes: Sequence[brdf.Scene], channels: int) -> LightColour:
     """
     emittances = [np.asarray(light.emittance, np.float64) for scene in scenes for light in scene.lights]
     unchanged = LightColour(np.ones(channels), list(scenes))
-    if not emittances or all(emittance.shape[0] == 1 for emittance in emittances):
+    if all(emittance.shape[0] == 1 for emittance in emittances):
         return unchanged
     table = np.stack([np.broadcast_to(emittance, channels) for emittance in emittances])
     brightest = table[np.argmax(table.sum(axis=1))]
@@ -41,10 +47,35 @@ def take_colour_out(scenes: Sequence[brdf.Scene], channels: int) -> LightColour:
     strength = table @ colour / (colour @ colour)
     if np.max(np.abs(table - strength[:, None] * colour)) > 1e-12 * np.max(table):
         return unchanged
-    each = iter(strength)
-    return LightColour(colour, [_with_strengths(scene, each) for scene in scenes])
+    strengths = iter(strength)
+    grey = []
+    for scene in scenes:
+        lights = [
+            eqx.tree_at(lambda light: light.emittance, light, np.array([next(strengths)])) for light in scene.lights
+        ]
+        grey.append(eqx.tree_at(lambda scene: scene.lights, scene, tuple(lights)))
+    return LightColour(colour, grey)
 
 
-def _with_strengths(scene: brdf.Scene, strengths: Any) -> brdf.Scene:
-    lights = [eqx.tree_at(lambda light: light.emittance, light, np.array([next(strengths)])) for light in scene.lights]
-    return eqx.tree_at(lambda scene: scene.lights, scene, tuple(lights))
+def coefficient_factors(
+    model: type[brdf.Material], n: float, colour: Float[np.ndarray, " C"]
+) -> Float[np.ndarray, "3 C"]:
+    """What the solver's coefficients are divided by to give k_a, k_d, k_s.
+
+    Args:
+        model: the class of the material.
+        n: exponent.
+        colour: what was taken out of the lights, (C,).
+    """
+    colour = np.where(colour > 0, colour, 1.0)
+    factors = np.stack([np.ones_like(colour), colour, colour])
+    if issubclass(model, SpecularMaterial):
+        factors[2] *= _scale(model, float(n))
+    return factors
+
+
+@functools.lru_cache(maxsize=64)
+def _scale(model: type[SpecularMaterial], n: float) -> float:
+    """Of the lobe; asked for several times at one exponent."""
+    with jax.enable_x64(True):
+        return float(model.scale(np.float64(n)))

@@ -1,11 +1,12 @@
-"""What a fit looks at: the pixels of a picture that count.
+"""Which pixels of a picture count, and how much.
 
-A large picture is looked at a band of rows at a time: what its pixels see takes three times the memory of the picture,
-and what the engine needs of that a third of it. A picture in a file is not even kept itself: `fitting.solver.streams`.
+A large picture is taken a band of rows at a time: what its pixels see takes three times the memory of the picture, and
+what the solver needs of that a third of it. A picture in a file is not even kept itself: `fitting.solver.streams`.
 """
 
+import functools
 from collections.abc import Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,11 +15,10 @@ from jaxtyping import Array, Bool, Float
 
 import brdf
 from brdf.errors import InputError
-from fitting.pixel_statistics import FLAT, SYMMETRIC_PIXELS, TOP, Survey, inverse_variance, lit_at_top, survey
-from fitting.problem import check_levels, check_sizes, check_weight, per_pixel, pixels_of
+from fitting.problem import TOP, FitProblem, Target, has_pixel_areas
 from fitting.solver.streams import Stream, each
 
-# How many pixels are looked at together; of a file at least as many rows as its blocks hold, or these are read twice.
+# How many pixels are taken together; of a file at least as many rows as its blocks hold, or these are read twice.
 TILE_PIXELS = 1 << 18
 ALIGNED_ROWS = 64
 # Largest value, and inverse of the least, of a picture in single precision: squares of it, of rounding errors a million
@@ -27,20 +27,26 @@ ALIGNED_ROWS = 64
 SINGLE, DOUBLE = 1e12, 1e140
 # A file is shown by no more pixels than this along each side.
 SHOWN_PIXELS = 1024
+# A plateau of exactly equal largest values has to be larger than symmetry makes it before it counts as clipping.
+SYMMETRIC_PIXELS = 8
+# Where the diffuse basis varies by less than this over the plateau, the surface is flat there and nothing is clipped.
+FLAT = 1e-3
 
 
 class Tile(NamedTuple):
-    """A picture, or a band of its rows, ready for the engine.
+    """A picture, or a band of its rows, ready for the solver.
 
     Attributes:
         target: (P, C), in the precision of the fit.
         weight: (P,), 0 where the pixel does not count; None where all do, and alike.
         points: what the pixels see, (rows, W).
+        scene: of the picture, in the precision of the fit.
     """
 
     target: Float[Array, "P C"]
     weight: Float[Array, " P"] | None
     points: brdf.SurfacePoints
+    scene: brdf.Scene
 
 
 class Observation(NamedTuple):
@@ -48,9 +54,8 @@ class Observation(NamedTuple):
 
     Attributes:
         tiles: all of it, made when asked for.
-        in_memory: the picture is; else what is made of it must not be kept either.
         left_out: how many pixels were left out, by reason.
-        noise: standard deviation of the error that rounding puts into a value; (C,).
+        rounding: standard deviation of the error that rounding puts into a value; (C,).
         brightest: largest size of a value that counts; (C,).
         shown: (H, W, C), the picture for people: of a large file every so many pixels.
         scene: what ``shown`` shows.
@@ -58,9 +63,8 @@ class Observation(NamedTuple):
     """
 
     tiles: Sequence[Tile]
-    in_memory: bool
     left_out: dict[str, int]
-    noise: Float[np.ndarray, " C"]
+    rounding: Float[np.ndarray, " C"]
     brightest: Float[np.ndarray, " C"]
     shown: Float[np.ndarray, "H W C"]
     scene: brdf.Scene
@@ -68,203 +72,199 @@ class Observation(NamedTuple):
 
 
 class _Band(NamedTuple):
-    """Pixels before it is decided which of them count.
+    """Pixels before it is decided which of them count; ``values`` (P, C) lie on the host or on the device."""
+
+    rows: slice
+    values: Any
+    points: brdf.SurfacePoints
+    allowed: Any
+
+
+class Statistics(NamedTuple):
+    """What there is to know of the pixels of a picture, or of some of its bands together.
 
     Attributes:
-        first: row of the picture.
-        values: (P, C), on the host or on the device.
-        points: what they see, (rows, W).
-        seen: whether they see a fitted shape, (P,).
-        looked_at: whether they also are inside the mask, (P,).
+        counts: pixels that see a fitted shape; of these inside the mask; of these finite; of these not clipped; of
+            these not too dark.
+        largest: finite value of any channel.
+        top: how many pixels share it.
+        scale: largest size of a value that counts, (C,).
     """
 
-    first: int
-    values: Float[Array, "P C"]
-    points: brdf.SurfacePoints
-    seen: Bool[Array, " P"]
-    looked_at: Bool[Array, " P"]
+    counts: Any
+    largest: Any
+    top: Any
+    scale: Any
 
 
 def observe(
-    target: Any,
-    scene: brdf.Scene,
-    *,
-    dtype: Any,
-    mask: Any = None,
-    saturation: float | None = None,
-    dark: float | None = None,
-    noise: tuple[float, float] | None = None,
-    weight: Any = None,
-    at_once: bool = False,
-) -> Observation:
-    """Decide which pixels of a picture count.
+    problem: FitProblem, scenes: Sequence[brdf.Scene] | None = None, *, at_once: bool = False
+) -> list[Observation]:
+    """Decide which pixels of each picture count.
 
     Args:
-        target: (H, W) or (H, W, C) linear values; a `brdf.Picture`, which knows its largest code; or a
-            `brdf.ImageReader`, of which a band of rows is in memory at a time.
-        scene: of the same resolution.
-        dtype: float32 or float64.
-        mask: (H, W), pixels to look at.
-        saturation: linear value from which on pixels are clipped; None finds out.
-        dark: linear value up to which pixels are too dark to count: none of their channels exceeds it.
-        noise: of the camera, (read, shot): the variance of a value is read² + shot · value, and pixels weigh by it.
-        weight: (H, W), at least 0, how much each pixel counts beside that.
-        at_once: make one tile of the picture, however large it is.
+        problem: the pictures.
+        scenes: to give the tiles, instead of the problem's.
+        at_once: make one tile of each picture, however large it is.
 
     Raises:
-        InputError: where nothing is left to fit, or the arguments do not belong together.
+        InputError: where nothing is left to fit.
     """
-    noise = check_levels(saturation, dark, noise)
-    pixels, known_saturation, step = pixels_of(target)
-    check_sizes(pixels, scene)
-    height, width, channels = pixels.shape
-    mask = None if mask is None else per_pixel("mask", mask, (height, width)).astype(bool)
-    if weight is not None:
-        weight = check_weight(weight, (height, width))
-        # What weighs nothing says nothing of clipping or rounding either.
-        mask = weight > 0 if mask is None else mask & (weight > 0)
-    streamed = isinstance(pixels, brdf.ImageReader)
-    if streamed and noise is not None:
-        remedy = "Give the picture in memory, or weight in place of noise"
-        raise InputError("noise", "needs the whole picture at once, the target is read by bands", remedy)
-    averaged = scene.camera is not None and scene.camera.samples > 1
-    averaged |= scene.points is not None and scene.points.area is not None
-    if streamed and averaged:
-        remedy = "Take samples out of the camera, or give the picture in memory"
-        raise InputError("target", "is read by bands, where every pixel is seen at its centre", remedy)
-    rows = max(TILE_PIXELS // width, ALIGNED_ROWS if streamed else 1)
-    rows = height if at_once or noise is not None or averaged else rows
-    bands = _bands(pixels, scene, dtype, mask, rows)
-    level = known_saturation if saturation is None else saturation
-    total, goods = _look(bands, dark, level, keep=not streamed)
+    parts = problem.targets, problem.scenes, scenes or problem.scenes, problem.masks, problem.weights
+    return [_observe(problem, *part, at_once) for part in zip(*parts, strict=True)]
+
+
+def _observe(
+    problem: FitProblem,
+    target: Target,
+    scene: brdf.Scene,
+    lit_scene: brdf.Scene,
+    mask: np.ndarray | None,
+    given: np.ndarray | None,
+    at_once: bool,
+) -> Observation:
+    dtype, noise, dark = np.dtype(problem.precision), problem.noise, problem.dark
+    height, width, channels = target.pixels.shape
+    bands = _bands(target, brdf.cast(scene, problem.precision), dtype, mask, at_once or noise is not None)
+    level = target.saturation if problem.saturation is None else problem.saturation
+    found, total = _statistics(bands, level, dark, keep=not target.streamed)
     reach = SINGLE if dtype == np.float32 else DOUBLE
-    size = max(total.largest, float(np.max(total.scale)))
+    size = max(float(total.largest), float(np.max(total.scale)))
     if size > 0 and not 1 / reach <= size <= reach:
         came = f"has {size:.3g} as its largest value, out of reach of {dtype.name}"
         raise InputError("target", came, "Bring it nearer to 1 (another exposure), or fit in float64")
     if level is None and total.largest > 0 and total.top > SYMMETRIC_PIXELS and scene.lights:
-        level = _plateau(bands, goods, total.largest, scene, dark)
+        level = _plateau(bands, found, float(total.largest), scene)
         if level is not None:
-            total, goods = _look(bands, dark, level, keep=not streamed)
-    left_out = _left_out(total, height * width, masked=mask is not None, level=level, dark=dark)
+            found, total = _statistics(bands, level, dark, keep=not target.streamed)
+    left_out = _left_out(total, height * width, level, dark, masked=mask is not None)
+    lit_scene = brdf.cast(lit_scene, problem.precision)
 
-    kept: dict[int, Any] = {}
-
-    def counts(band: _Band) -> Float[Array, " P"] | None:
-        good = goods[band.first] if band.first in goods else _survey(band, dark, level)[0]
-        found = None if total.above == height * width else jnp.asarray(good, dtype)
+    def tile(band: _Band, counted: tuple[np.ndarray, Statistics]) -> Tile:
+        good, weight = counted[0], None
         if noise is not None:
-            found = inverse_variance(band.values, jnp.asarray(good), (height, width), *noise, step)
-        if weight is not None:
-            given = weight[band.first : band.first + band.points.mask.shape[0]]
-            given = jnp.asarray(given.ravel(), dtype)
-            found = given if found is None else given * found
-        return found
+            read, shot = map(float, noise)
+            weight = _inverse_variance(band.values, jnp.asarray(good), (height, width), read, shot, target.step)
+        elif total.counts[-1] < height * width:
+            weight = jnp.asarray(good, dtype)
+        if given is not None:
+            stated = jnp.asarray(given[band.rows].ravel(), dtype)
+            weight = stated if weight is None else stated * weight
+        return Tile(band.values, weight, band.points, lit_scene)
 
-    def tile(band: _Band) -> Tile:
-        if streamed:
-            return Tile(band.values, counts(band), band.points)
-        if band.first not in kept:
-            kept[band.first] = counts(band)
-        return Tile(band.values, kept[band.first], band.points)
-
-    tiles = each(tile, bands)
-    resolution = max(float(np.finfo(dtype).eps), 0.0 if streamed else float(np.finfo(pixels.dtype).eps))
-    scale = total.scale.astype(np.float64)
-    rounding = np.maximum(scale * resolution, step / np.sqrt(12.0))
-    if streamed:
+    tiles = each(tile, bands, found)
+    brightest = total.scale.astype(np.float64)
+    resolution = float(np.finfo(dtype).eps)
+    if target.streamed:
         shown = _shown(tiles, scene, channels)
     else:
-        counted = np.concatenate(list(goods.values())).reshape(height, width)
-        shown = pixels.astype(dtype, copy=False), scene, counted if weight is None else counted & (weight > 0)
-    return Observation(tiles, not streamed, left_out, rounding, scale, *shown)
+        resolution = max(resolution, float(np.finfo(target.pixels.dtype).eps))
+        counted = np.concatenate([good for good, _ in found]).reshape(height, width)
+        shown = target.pixels.astype(dtype, copy=False), scene, counted
+    rounding = np.maximum(brightest * resolution, target.step / np.sqrt(12.0))
+    return Observation(tiles, left_out, rounding, brightest, *shown)
 
 
-def _bands(pixels: Any, scene: brdf.Scene, dtype: Any, mask: np.ndarray | None, rows: int) -> Sequence[_Band]:
-    height, _, channels = pixels.shape
+def _bands(
+    target: Target, scene: brdf.Scene, dtype: np.dtype, mask: np.ndarray | None, at_once: bool
+) -> Sequence[_Band]:
+    height, width, channels = target.pixels.shape
+    pixels = target.pixels if target.streamed else np.asarray(target.pixels, dtype)
 
-    place = brdf.cast(scene, dtype.name)
-    if not isinstance(pixels, brdf.ImageReader):
-        pixels = np.asarray(pixels, dtype)
+    def band(first: int, last: int) -> _Band:
+        points = scene.surface_points(None if last - first == height else (first, last))
+        allowed = jnp.ravel(points.mask)
+        if mask is not None:
+            allowed = allowed & mask[first:last].ravel()
+        if target.streamed:
+            values = jnp.asarray(pixels.rows(first, last).reshape(-1, channels), dtype)
+        else:
+            # A view: on the device all bands together would be the picture once more.
+            values = pixels[first:last].reshape(-1, channels)
+        return _Band(slice(first, last), values, points, allowed)
 
-    def values(first: int, last: int) -> Float[Array, "P C"]:
-        if isinstance(pixels, brdf.ImageReader):
-            return jnp.asarray(pixels.rows(first, last).reshape(-1, channels), dtype)
-        # A view: on the device all bands together would be the picture once more.
-        return cast(Array, pixels[first:last].reshape(-1, channels))
-
-    def band(first: int, last: int, points: brdf.SurfacePoints) -> _Band:
-        seen = jnp.ravel(points.mask)
-        looked_at = seen if mask is None else seen & mask[first:last].ravel()
-        return _Band(first, values(first, last), points, seen, looked_at)
-
-    if rows >= height:
-        whole = band(0, height, place.surface_points())
+    rows = max(TILE_PIXELS // width, ALIGNED_ROWS if target.streamed else 1)
+    if at_once or has_pixel_areas(scene) or rows >= height:
+        whole = band(0, height)
         return [whole._replace(values=jnp.asarray(whole.values))]
     rows -= rows % ALIGNED_ROWS if rows > ALIGNED_ROWS else 0
-    spans = [(first, min(first + rows, height)) for first in range(0, height, rows)]
-    return Stream(lambda i: band(*spans[i], place.surface_points(spans[i])), len(spans))
+    return Stream(lambda i: band(i * rows, min((i + 1) * rows, height)), -(-height // rows))
 
 
-def _survey(band: _Band, dark: float | None, level: float | None) -> tuple[Any, Survey]:
-    limits = -np.inf if dark is None else dark, np.inf if level is None else level
-    return jax.device_get(survey(band.values, band.seen, band.looked_at, *limits))
+def _statistics(
+    bands: Sequence[_Band], level: float | None, dark: float | None, *, keep: bool
+) -> tuple[Sequence[tuple[np.ndarray, Statistics]], Statistics]:
+    """Which pixels of each band count and what there is to know of them, made anew where not kept; and of all."""
+    limits = np.inf if level is None else level, -np.inf if dark is None else dark
+
+    def of_band(band: _Band) -> tuple[np.ndarray, Statistics]:
+        return jax.device_get(_count(band.values, jnp.ravel(band.points.mask), band.allowed, *limits))
+
+    def together(one: Statistics, other: Statistics) -> Statistics:
+        largest = max(one.largest, other.largest)
+        top = sum(int(part.top) for part in (one, other) if part.largest >= largest * TOP)
+        return Statistics(one.counts + other.counts, largest, top, np.maximum(one.scale, other.scale))
+
+    found = each(of_band, bands)
+    found = list(found) if keep else found
+    return found, functools.reduce(together, (statistics for _, statistics in found))
 
 
-def _look(
-    bands: Sequence[_Band], dark: float | None, level: float | None, *, keep: bool
-) -> tuple[Survey, dict[int, Any]]:
-    """What there is to know of all; and which pixels count, by the first row of the band, if that is to be kept."""
-    total, goods = None, {}
-    for band in bands:
-        good, found = _survey(band, dark, level)
-        total = found if total is None else total + found
-        if keep:
-            goods[band.first] = good
-    assert total is not None
-    return total, goods
+@jax.jit
+def _count(
+    values: Float[Array, "P C"], seen: Bool[Array, " P"], allowed: Bool[Array, " P"], level: float, dark: float
+) -> tuple[Bool[Array, " P"], Statistics]:
+    brightest = _over_channels(jnp.maximum, values)
+    finite = allowed & jnp.isfinite(_over_channels(jnp.add, values))
+    largest = jnp.max(jnp.where(finite, brightest, -jnp.inf))
+    below = finite & (brightest < level)
+    good = below & (brightest > dark)
+    counts = jnp.stack([jnp.count_nonzero(some) for some in (seen, allowed, finite, below, good)])
+    top = jnp.count_nonzero(finite & (brightest >= largest * TOP))
+    return good, Statistics(counts, largest, top, jnp.max(jnp.where(good[:, None], jnp.abs(values), 0), axis=0))
 
 
 def _plateau(
-    bands: Sequence[_Band], goods: dict[int, Any], largest: float, scene: brdf.Scene, dark: float | None
+    bands: Sequence[_Band], found: Sequence[tuple[np.ndarray, Statistics]], largest: float, scene: brdf.Scene
 ) -> float | None:
     """The level at which a picture is clipped: many pixels at exactly the largest value, on a surface lit unevenly."""
-    ranges = []
-    for band in bands:
-        good = goods.get(band.first)
-        found = lit_at_top(
-            band.values, _survey(band, dark, None)[0] if good is None else good, largest, band.points, scene
-        )
-        ranges += [] if found is None else [found]
-    if not ranges:
-        return None
-    low, high = min(low for low, _ in ranges), max(high for _, high in ranges)
+    low, high = np.inf, -np.inf
+    for band, (good, _) in zip(bands, found, strict=True):
+        top = good & (np.max(np.asarray(band.values), axis=-1) >= largest * TOP)
+        if top.any():
+            diffuse = brdf.basis_images(brdf.Lambert, scene, points=band.points).diffuse
+            light = np.max(np.asarray(diffuse).reshape(top.size, -1), axis=-1)[top]
+            low, high = min(low, float(np.min(light))), max(high, float(np.max(light)))
     return None if high - low <= FLAT * high else largest * TOP
 
 
-def _left_out(total: Survey, pixels: int, *, masked: bool, level: float | None, dark: float | None) -> dict[str, int]:
+def _left_out(
+    total: Statistics, pixels: int, level: float | None, dark: float | None, *, masked: bool
+) -> dict[str, int]:
     """How many pixels do not count, by reason; an error where none is left."""
-    left_out = {"outside the fitted shapes": int(pixels - total.seen)}
-    if not total.seen:
+    seen, allowed, finite, below, counted = (int(count) for count in total.counts)
+    black = not total.scale.any()
+    left_out = {"outside the fitted shapes": pixels - seen}
+    if not seen:
         raise InputError("target", "has no pixel that sees a fitted shape", "Check camera, shapes and mask")
     if masked:
-        left_out["masked"] = int(total.seen - total.looked_at)
-        if not total.looked_at:
+        left_out["masked"] = seen - allowed
+        if not allowed:
             raise InputError("mask", "leaves no pixel that sees a fitted shape", "Check the mask")
-    left_out["not finite"] = int(total.looked_at - total.finite)
-    if not total.finite:
+    left_out["not finite"] = allowed - finite
+    if not finite:
         raise InputError("target", "has no finite value on the object", "Give a picture with values")
     if level is not None:
-        left_out["clipped"] = int(total.finite - total.below)
-        if not total.below or (total.below < total.finite and total.above and not total.scale.any()):
+        left_out["clipped"] = finite - below
+        if not below or (below < finite and counted and black):
             came = f"is clipped at {level:g} wherever it sees the object"
             raise InputError("target", came, "Give a darker exposure or a higher saturation")
     if dark is not None:
-        left_out["dark"] = int(total.below - total.above)
-        if not total.above:
+        left_out["dark"] = below - counted
+        if not counted:
             came = f"is no brighter than {dark:g} wherever it counts"
             raise InputError("target", came, "Give a brighter picture or a lower dark level")
-    if not total.scale.any():
+    if black:
         raise InputError("target", "is black on the object", "Give a picture with light in it")
     return left_out
 
@@ -283,5 +283,41 @@ def _shown(tiles: Sequence[Tile], scene: brdf.Scene, channels: int) -> tuple[np.
         counted.append((weight > 0).reshape(rows, width)[some, ::stride].copy())
         first += rows
     pixel = np.arange(0, height, stride)[:, None] * width + np.arange(0, width, stride)
-    dtype = pictures[0].dtype.name
-    return np.concatenate(pictures), brdf.some_pixels(scene, pixel, precision=dtype), np.concatenate(counted)
+    precision = pictures[0].dtype.name
+    return np.concatenate(pictures), brdf.some_pixels(scene, pixel, precision=precision), np.concatenate(counted)
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _inverse_variance(
+    values: Float[Array, "P C"], good: Bool[Array, " P"], shape: tuple[int, int], read: float, shot: float, step: float
+) -> Float[Array, " P"]:
+    """Inverse variances over their mean; a pixel's channels share the variance of their mean value.
+
+    The value is the mean of 5 x 5 pixels: taken from the pixel itself, weights would favour what noise made darker.
+
+    Args:
+        values: of each pixel.
+        good: which count; the others weigh 0.
+        shape: height and width of the picture.
+        read: standard deviation of the noise without light.
+        shot: variance over value.
+        step: distance of two codes.
+    """
+    mean = jnp.where(good, _over_channels(jnp.add, values) / values.shape[1], 0.0)
+    count = good.astype(values.dtype)
+    total, known = (
+        jax.lax.reduce_window(
+            image.reshape(shape), np.zeros((), image.dtype), jax.lax.add, (5, 5), (1, 1), "SAME"
+        ).ravel()
+        for image in (mean, count)
+    )
+    smooth = jnp.maximum(total / jnp.maximum(known, 1.0), 0.0)
+    # Without read noise a black pixel would weigh infinitely much: quantisation, or a millionth of the mean, stands in.
+    least = 1e-6 * shot * jnp.sum(mean) / jnp.maximum(jnp.sum(count), 1.0) + jnp.finfo(values.dtype).tiny
+    variance = jnp.maximum(read * read + shot * smooth + step * step / 12.0, least)
+    weight = jnp.where(good, jnp.min(jnp.where(good, variance, jnp.inf)) / variance, 0.0)
+    return (weight * (jnp.sum(count) / jnp.sum(weight))).astype(values.dtype)
+
+
+def _over_channels(combine: Any, values: Float[Array, "P C"]) -> Float[Array, " P"]:
+    return functools.reduce(combine, [values[:, channel] for channel in range(values.shape[1])])

@@ -17,10 +17,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 import brdf
+from fitting.light_colour import coefficient_factors
 from fitting.solver.normal_equations import Picture, Sums, sums
 from fitting.solver.profile import Optimum
 from fitting.solver.subsample import subsample
-from fitting.uncertainty.interpretation import coefficient_factors
 
 GRID_STEP = 0.35
 # The grid looks at so many pixels of each picture, the polishing at all.

@@ -1,111 +1,166 @@
-"""What the fit accepts as a picture, and as numbers about it."""
+"""What is to be fitted: pictures, their scenes, what counts of them, and how; checked once, where it is made."""
 
+import dataclasses
 import math
 from numbers import Real
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 import brdf
 from brdf.errors import InputError
-from fitting.pixel_statistics import TOP
+from brdf.precision import Precision
+from fitting.solver.losses import LOSSES, Loss
+
+CLASSIC = ("phong", "blinn-phong")
+PLAUSIBLE = ("normalized-phong", "normalized-blinn-phong")
+# What counts as the largest value: a few units in the last place of float32 below it, for what follows clamping.
+TOP = 1 - 1e-6
 
 
-def check_levels(saturation: Any, dark: Any, noise: Any) -> tuple[float, float] | None:
-    """Refuse what is no level of a picture.
+class Target(NamedTuple):
+    """A picture as the fit takes it.
 
-    Args:
-        saturation: None or a linear value.
-        dark: None or a linear value.
-        noise: None or (read, shot).
-
-    Returns:
-        The noise, as numbers.
-
-    Raises:
-        InputError: naming the one that is wrong.
+    Attributes:
+        pixels: linear values (H, W, C); or a `brdf.ImageReader`, of which a band of rows is in memory at a time.
+        saturation: the value of the largest code, where it is known.
+        step: the distance of two codes; 0 where there are none.
     """
-    for name, value in (("saturation", saturation), ("dark", dark)):
-        if value is not None and (isinstance(value, bool) or not isinstance(value, Real) or math.isnan(value)):
-            raise InputError(name, f"must be a linear value, got {value!r}", "Give a number")
-    if saturation is not None and not saturation > 0:
-        raise InputError("saturation", f"must be above 0, got {saturation}", "Give the value of clipped pixels")
-    if noise is None:
-        return None
-    words = "Give (read, shot): the variance of a value is read² + shot · value"
-    try:
-        read, shot = (float(part) for part in noise)
-    except (TypeError, ValueError):
-        raise InputError("noise", f"must be two numbers, got {noise!r}", words) from None
-    if not (0 <= read < np.inf and 0 <= shot < np.inf and read + shot > 0):
-        raise InputError("noise", f"must be two numbers of 0 or more, not both 0, got {noise!r}", words)
-    return read, shot
+
+    pixels: Any
+    saturation: float | None = None
+    step: float = 0.0
+
+    @property
+    def streamed(self) -> bool:
+        """Whether the picture is read by bands of rows."""
+        return isinstance(self.pixels, brdf.ImageReader)
 
 
-def pictures_and_scenes(
-    target: Any, scene: Any, mask: Any, weight: Any
-) -> tuple[list[Any], list[brdf.Scene], list[Any], list[Any]]:
-    """What was given for one picture or for several, as lists of one length.
+@dataclasses.dataclass(frozen=True)
+class FitProblem:
+    """What is to be fitted.
+
+    Attributes:
+        targets: the pictures.
+        scenes: what each shows.
+        masks: which pixels of each may count, (H, W); None for all.
+        weights: how much each pixel counts, (H, W); None for all alike.
+        model: "auto" or the name of a model; the further options are those of `fitting.fit`.
+        precision: "float32" or "float64".
+        n_range: bounds of the exponent.
+        loss: what is minimised.
+        saturation: linear value from which on pixels are clipped; None finds out.
+        dark: linear value up to which pixels are too dark to count; None for none.
+        noise: of the camera, (read, shot); None for the same everywhere.
+        plausible: hold k_d + k_s <= 1.
+    """
+
+    targets: list[Target]
+    scenes: list[brdf.Scene]
+    masks: list[np.ndarray | None]
+    weights: list[np.ndarray | None]
+    model: str = "auto"
+    precision: Precision = "float32"
+    n_range: tuple[float, float] = (0.1, 1e6)
+    loss: Loss = "squared"
+    saturation: float | None = None
+    dark: float | None = None
+    noise: tuple[float, float] | None = None
+    plausible: bool = False
+
+    @property
+    def streamed(self) -> bool:
+        """Whether a picture is read by bands of rows."""
+        return any(target.streamed for target in self.targets)
+
+    @property
+    def families(self) -> tuple[str, ...]:
+        """Models with a highlight that are compared where none is named."""
+        return PLAUSIBLE if self.plausible else CLASSIC
+
+
+def state_problem(target: Any, scene: Any, mask: Any = None, weight: Any = None, **options: Any) -> FitProblem:
+    """Check what was given for one picture or for several.
 
     Args:
         target: a picture or a list of them.
         scene: a scene for all, or a list.
         mask: likewise, or None.
         weight: likewise.
+        options: further fields of `FitProblem`.
 
     Raises:
-        InputError: where they are not as many, or a scene is none.
+        InputError: naming what cannot be used.
     """
     several = isinstance(target, list | tuple)
     targets = list(target) if several else [target]
-    scenes = list(scene) if isinstance(scene, list | tuple) else [scene] * len(targets)
-    masks, weights = (
-        list(values) if several and isinstance(values, list | tuple) else [values] * len(targets)
-        for values in (mask, weight)
-    )
     if not targets:
         raise InputError("target", "is an empty list", "Give at least one picture")
-    for name, values in (("scene", scenes), ("mask", masks), ("weight", weights)):
-        if len(values) != len(targets):
-            raise InputError(name, f"has {len(values)} entries for {len(targets)} pictures", "Give one for each")
-    if not all(isinstance(one, brdf.Scene) for one in scenes):
+    lists = []
+    for name, values in (("scene", scene), ("mask", mask), ("weight", weight)):
+        listed = isinstance(values, list | tuple) and (several or name == "scene")
+        lists.append(list(values) if listed else [values] * len(targets))
+        if len(lists[-1]) != len(targets):
+            came = f"has {len(lists[-1])} entries for {len(targets)} pictures"
+            raise InputError(name, came, "Give one for each")
+    scenes, masks, weights = lists
+    if not all(isinstance(each, brdf.Scene) for each in scenes):
         raise InputError("scene", f"must be a brdf.Scene, got {type(scene).__name__}", "Use brdf.Scene.load")
-    return targets, scenes, masks, weights
+    problem = FitProblem([as_target(picture) for picture in targets], scenes, masks, weights, **options)
+    _check_options(problem)
+    for index, (picture, place) in enumerate(zip(problem.targets, scenes, strict=True)):
+        _check_picture(picture, place, problem)
+        shape = picture.pixels.shape[:2]
+        if masks[index] is not None:
+            masks[index] = _per_pixel("mask", masks[index], shape).astype(bool)
+        if weights[index] is None:
+            continue
+        weights[index] = _per_pixel("weight", weights[index], shape)
+        if not np.all(weights[index] >= 0) or not np.any(weights[index] > 0):
+            raise InputError("weight", "must be 0 or more, and more somewhere", "Give values of 0 or more")
+        # What weighs nothing says nothing of clipping or rounding either.
+        heavy = weights[index] > 0
+        masks[index] = heavy if masks[index] is None else masks[index] & heavy
+    counts = {picture.pixels.shape[2] for picture in problem.targets}
+    if len(counts) > 1:
+        raise InputError("target", f"pictures have {counts} channels", "Give pictures with the same number")
+    return problem
 
 
-def per_pixel(name: str, values: Any, shape: tuple[int, int]) -> np.ndarray:
-    """A value per pixel as an array.
+def as_target(given: Any) -> Target:
+    """A picture as the fit takes it.
 
     Args:
-        name: of the argument.
-        values: array-like.
-        shape: height and width of the picture.
+        given: an array, a `brdf.Picture`, a `brdf.ImageReader`, or what this returned.
 
     Raises:
-        InputError: where it is of another shape.
+        InputError: where it holds no linear floating-point values.
     """
-    values = np.asarray(values)
-    if values.shape != shape:
-        raise InputError(name, f"is of shape {values.shape}, the target {shape}", "Give a value per pixel")
-    if values.dtype.kind not in "biuf" or not np.all(np.isfinite(values)):
-        raise InputError(name, f"must hold finite numbers, got {values.dtype}", "Give a value per pixel")
-    return values
-
-
-def check_weight(weight: Any, shape: tuple[int, int]) -> np.ndarray:
-    """How much each pixel counts, as an array.
-
-    Args:
-        weight: array-like.
-        shape: height and width of the picture.
-
-    Raises:
-        InputError: where it is of another shape, or counts nothing, or less than that.
-    """
-    weight = per_pixel("weight", weight, shape)
-    if not np.all(weight >= 0) or not np.any(weight > 0):
-        raise InputError("weight", "must be 0 or more, and more somewhere", "Give values of 0 or more")
-    return weight
+    if isinstance(given, Target):
+        return given
+    if isinstance(given, brdf.ImageReader):
+        largest, step = given.codes
+        return Target(given, None if largest is None else largest * TOP, step)
+    saturation, step = None, 0.0
+    if isinstance(given, brdf.Picture):
+        steps = given.quantisation()
+        step = 0.0 if steps is None else float(np.nanmax(steps))
+        saturation = None if given.saturation is None else given.saturation * TOP
+        given = given.pixels
+    if isinstance(given, str | bytes) or not hasattr(given, "__array__"):
+        raise InputError("target", f"must be an array, got {type(given).__name__}", "Read it with brdf.read_image")
+    pixels = np.asarray(given)
+    if pixels.dtype.kind != "f":
+        came = f"must hold linear floating-point values, got {pixels.dtype}"
+        raise InputError("target", came, "Read it with brdf.read_image, or divide by the largest code")
+    if pixels.dtype == np.float16:
+        step, pixels = float(np.finfo(np.float16).eps), pixels.astype(np.float32)
+    if pixels.ndim == 2:
+        pixels = pixels[..., None]
+    if pixels.ndim != 3 or 0 in pixels.shape:
+        raise InputError("target", f"must be of shape (H, W, C), got {pixels.shape}", "Give one picture")
+    return Target(pixels, saturation, step)
 
 
 def looked_at(mask: Any, weight: Any) -> Any:
@@ -120,84 +175,69 @@ def looked_at(mask: Any, weight: Any) -> Any:
     return np.logical_and.reduce(given) if given else None
 
 
-def relative_weights(weights: list[Any]) -> list[Any]:
-    """Weights of several pictures over the largest of them all, so that single precision holds them.
-
-    Args:
-        weights: an array or None for each picture; what is no array of numbers is passed on.
-    """
-    arrays = [None if weight is None else np.asarray(weight) for weight in weights]
-    numeric = [array for array in arrays if array is not None and array.dtype.kind in "biuf" and array.size]
-    largest = max((float(np.max(array)) for array in numeric), default=1.0)
-    if not 0 < largest < np.inf or len(numeric) < sum(array is not None for array in arrays):
-        return arrays
-    return [None if array is None else array / largest for array in arrays]
+def _per_pixel(name: str, values: Any, shape: tuple[int, int]) -> np.ndarray:
+    values = np.asarray(values)
+    if values.shape != shape:
+        raise InputError(name, f"is of shape {values.shape}, the target {shape}", "Give a value per pixel")
+    if values.dtype.kind not in "biuf" or not np.all(np.isfinite(values)):
+        raise InputError(name, f"must hold finite numbers, got {values.dtype}", "Give a value per pixel")
+    return values
 
 
-def check_sizes(pixels: Any, scene: brdf.Scene) -> None:
-    """Refuse a picture that is not of its scene's size, or not of its light's channels.
-
-    Args:
-        pixels: what has a shape (H, W, C).
-        scene: what it shows.
-
-    Raises:
-        InputError: naming the target.
-    """
-    height, width, channels = pixels.shape
+def _check_picture(target: Target, scene: brdf.Scene, problem: FitProblem) -> None:
+    height, width, channels = target.pixels.shape
     if (width, height) != scene.resolution:
         came = f"is {width} x {height}, the scene's camera {scene.resolution[0]} x {scene.resolution[1]}"
         raise InputError("target", came, "Give a picture and a camera of the same resolution")
     if scene.channels not in (1, channels):
         came = f"has {channels} channels, the scene's light {scene.channels}"
         raise InputError("target", came, "Give both the same number of channels")
+    if target.streamed and problem.noise is not None:
+        remedy = "Give the picture in memory, or weight in place of noise"
+        raise InputError("noise", "needs the whole picture at once, the target is read by bands", remedy)
+    if target.streamed and has_pixel_areas(scene):
+        remedy = "Take samples out of the camera, or give the picture in memory"
+        raise InputError("target", "is read by bands, where every pixel is seen at its centre", remedy)
 
 
-def pixels_of(target: Any) -> tuple[Any, float | None, float]:
-    """Values (H, W, C), the largest code where it is known, and the distance of two codes.
-
-    Args:
-        target: an array, a `brdf.Picture`, or a `brdf.ImageReader`, which comes back as it is.
-
-    Raises:
-        InputError: where it holds no linear floating-point values.
-    """
-    saturation, step = None, 0.0
-    if isinstance(target, brdf.ImageReader):
-        largest, step = target.codes
-        return target, None if largest is None else largest * TOP, step
-    if isinstance(target, brdf.Picture):
-        steps = target.quantisation()
-        step = 0.0 if steps is None else float(np.nanmax(steps))
-        saturation = None if target.saturation is None else target.saturation * TOP
-        target = target.pixels
-    if isinstance(target, str | bytes) or not hasattr(target, "__array__"):
-        raise InputError("target", f"must be an array, got {type(target).__name__}", "Read it with brdf.read_image")
-    pixels = np.asarray(target)
-    if pixels.dtype.kind != "f":
-        came = f"must hold linear floating-point values, got {pixels.dtype}"
-        raise InputError("target", came, "Read it with brdf.read_image, or divide by the largest code")
-    if pixels.dtype == np.float16:
-        step, pixels = float(np.finfo(np.float16).eps), pixels.astype(np.float32)
-    if pixels.ndim == 2:
-        pixels = pixels[..., None]
-    if pixels.ndim != 3 or 0 in pixels.shape:
-        raise InputError("target", f"must be of shape (H, W, C), got {pixels.shape}", "Give one picture")
-    return pixels, saturation, step
-
-
-def check_range(n_range: Any) -> None:
-    """Refuse what are no bounds of the exponent.
+def has_pixel_areas(scene: brdf.Scene) -> bool:
+    """Whether a pixel of a scene is more than its centre.
 
     Args:
-        n_range: 0 < lower < upper.
-
-    Raises:
-        InputError: naming it.
+        scene: any.
     """
+    if scene.camera is not None and scene.camera.samples > 1:
+        return True
+    return scene.points is not None and scene.points.area is not None
+
+
+def _check_options(problem: FitProblem) -> None:
+    model, loss, n_range = problem.model, problem.loss, problem.n_range
+    if model != "auto" and model not in brdf.MODELS:
+        raise InputError("model", f"is unknown, got {model!r}", f"Use auto or one of {', '.join(brdf.MODELS)}")
+    if problem.plausible and model in CLASSIC:
+        remedy = f"Use auto, normalized-{model}, or a normalised form of your choice"
+        raise InputError("model", f"{model} is neither reciprocal nor energy conserving, so never plausible", remedy)
+    if loss not in LOSSES:
+        raise InputError("loss", f"is unknown, got {loss!r}", f"Use one of {', '.join(LOSSES)}")
     try:
         low, high = (float(bound) for bound in n_range)
     except (TypeError, ValueError):
         low = high = math.nan
     if not 0 < low < high < math.inf:
         raise InputError("n_range", f"must be 0 < lower < upper, got {n_range}", "Correct the bounds")
+    for name in ("saturation", "dark"):
+        value = getattr(problem, name)
+        if value is not None and (isinstance(value, bool) or not isinstance(value, Real) or math.isnan(value)):
+            raise InputError(name, f"must be a linear value, got {value!r}", "Give a number")
+    if problem.saturation is not None and not problem.saturation > 0:
+        raise InputError("saturation", f"must be above 0, got {problem.saturation}", "Give the value of clipped pixels")
+    if problem.noise is None:
+        return
+    words = "Give (read, shot): the variance of a value is read² + shot · value"
+    try:
+        read, shot = (float(part) for part in problem.noise)
+    except (TypeError, ValueError):
+        raise InputError("noise", f"must be two numbers, got {problem.noise!r}", words) from None
+    if not (0 <= read < math.inf and 0 <= shot < math.inf and read + shot > 0):
+        raise InputError("noise", f"must be two numbers of 0 or more, not both 0, got {problem.noise!r}", words)

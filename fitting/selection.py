@@ -91,6 +91,8 @@ class Choice(NamedTuple):
 
 
 class _Trial(NamedTuple):
+    """A candidate solved from the sums; its unknowns are counted with `SEARCHED` in ``effective``."""
+
     model: str
     free: np.ndarray
     grey: bool
@@ -100,53 +102,48 @@ class _Trial(NamedTuple):
     cost: float
     squares: float
 
+    @property
+    def rank(self) -> int:
+        """Of its family, the simplest first."""
+        return FAMILIES.index(self.model) if self.model in FAMILIES else len(FAMILIES)
+
+    @property
+    def expected(self) -> float:
+        """Squared error on pixels that were held out, in noise variances."""
+        return self.cost + 2 * self.effective
+
 
 def _try(
-    model: str,
-    free: np.ndarray,
-    tied: np.ndarray | None,
-    normal: NormalEquations,
-    plain: NormalEquations,
-    n: float = 1.0,
+    model: str, free: np.ndarray, tied: np.ndarray | None, normal: NormalEquations, plain: NormalEquations, n: float
 ) -> _Trial:
     design = design_of(free, tied)
-    signed = np.zeros(design.shape[1], bool)
     specular = bool(free[2].any())
+    signed = np.zeros(design.shape[1], bool)
     signed[-1:] = specular
     gram, product = design.T @ normal.gram @ design, design.T @ normal.product
+    highlight = slice(2 * free.shape[1], -1)
     x = nonnegative_minimum(gram, product, signed)
-    first = 2 * free.shape[1]
-    if specular and (abs(x[-1]) > FARTHEST * n or not np.any((design @ x)[first:-1] > 0)):
+    if specular and (abs(x[-1]) > FARTHEST * n or not np.any((design @ x)[highlight] > 0)):
         # The lobe's derivative stands for a small change of n, not for a highlight of its own.
-        shift = np.clip(x[-1], -FARTHEST * n, FARTHEST * n)
-        at = nonnegative_minimum(gram[:-1, :-1], product[:-1] - shift * gram[:-1, -1], signed[:-1])
-        if not np.any((design[:, :-1] @ at)[first:-1] > 0):
-            shift, at = 0.0, nonnegative_minimum(gram[:-1, :-1], product[:-1], signed[:-1])
-        x = np.append(at, shift)
+        for shift in (np.clip(x[-1], -FARTHEST * n, FARTHEST * n), 0.0):
+            x = np.append(nonnegative_minimum(gram[:-1, :-1], product[:-1] - shift * gram[:-1, -1]), shift)
+            if np.any((design @ x)[highlight] > 0):
+                break
     solution = design @ x
-    cost = _squares(normal, solution)
-    has_lobe = bool(np.any(solution[2 * free.shape[1] : -1] > 0))
+    has_lobe = bool(np.any(solution[highlight] > 0))
     unknowns = int(np.count_nonzero(x[~signed] > 0)) + int(has_lobe)
-    return _Trial(
-        model,
-        free,
-        tied is not None,
-        unknowns,
-        unknowns + (SEARCHED - 1) * has_lobe,
-        solution,
-        cost,
-        _squares(plain, solution),
+    effective = unknowns + (SEARCHED - 1) * has_lobe
+    cost, squares = (
+        float(max(sums.square - 2 * sums.product @ solution + solution @ sums.gram @ solution, 0.0))
+        for sums in (normal, plain)
     )
-
-
-def _squares(normal: NormalEquations, solution: np.ndarray) -> float:
-    return float(max(normal.square - 2 * normal.product @ solution + solution @ normal.gram @ solution, 0.0))
+    return _Trial(model, free, tied is not None, unknowns, effective, solution, cost, squares)
 
 
 def choose(
-    fits: dict[str, Optimum],
+    fits: Mapping[str, Optimum],
     free: Bool[np.ndarray, "3 C"],
-    grey: dict[str, Float[np.ndarray, " C"]],
+    grey: Mapping[str, Float[np.ndarray, " C"]],
     noise: Float[np.ndarray, " C"],
     inflation: float,
     whitened: Mapping[str, Sums],
@@ -156,57 +153,55 @@ def choose(
     Args:
         fits: the optimum of each model with a highlight; or that of Lambert alone.
         free: which coefficients the light reaches, (3, C).
-        grey: for each model, the engine's x_s of a grey k_s, up to a factor; (C,).
+        grey: for each model, the solver's x_s of a grey k_s, up to a factor; (C,).
         noise: standard deviation of the residual of the best fit, (C,).
         inflation: by what factor the structure of its residual makes errors larger; at least 1.
         whitened: for each model the sums at its optimum with each pixel divided by its variance; empty where the
             variance is the same in all.
     """
     channels = free.shape[1]
-    no = np.zeros(channels, bool)
+    no, ambient = np.zeros(channels, bool), bool(free[0].any())
     variance = (noise * inflation) ** 2
-    count = float(sum(next(iter(fits.values())).pixels))
-    trials: list[_Trial] = []
+    unit = np.full(channels, inflation**2) if whitened else variance
     normals, plain = {}, {}
     for name, fit in fits.items():
         parts = whitened.get(name, fit)
-        unit = np.full(channels, inflation**2) if whitened else variance
         normals[name] = join_channels(parts.gram, parts.product, parts.square, fit.x[2], unit)
         plain[name] = join_channels(fit.gram, fit.product, fit.square, fit.x[2], np.ones(channels))
-    first = next(iter(normals.values())), next(iter(plain.values()))
-    for name, terms in zip(FAMILIES, ([no, no], [free[0], no], [no, free[1]]), strict=True):
-        if name != "ambient" or free[0].any():
-            trials.append(_try(name, np.stack([*terms, no]), None, *first))
-    if free[0].any():
-        trials.append(_try("lambert", np.stack([free[0], free[1], no]), None, *first))
-    for name, normal in normals.items():
-        if name == "lambert" or fits[name].flat:
+    first = next(iter(fits))
+    terms = [("none", no, no), *([("ambient", free[0], no)] if ambient else []), ("lambert", no, free[1])]
+    terms += [("lambert", free[0], free[1])] if ambient else []
+    trials = [_try(name, np.stack([*some, no]), None, normals[first], plain[first], 1.0) for name, *some in terms]
+    for name, fit in fits.items():
+        if name == "lambert" or fit.flat:
             continue
-        for ambient in (no, free[0]) if free[0].any() else (no,):
-            terms = np.stack([ambient, free[1], free[2]])
-            if channels > 1:
-                trials.append(_try(name, terms, np.where(free[2], grey[name], 0.0), normal, plain[name], fits[name].n))
-            trials.append(_try(name, terms, None, normal, plain[name], fits[name].n))
-    # A highlight that comes out as nothing is Lambert's surface again.
-    shown = [trial for trial in trials if trial.model in FAMILIES or np.any(trial.solution[2 * channels : -1] > 0)]
-    return _decide(shown, normals, variance, count)
+        for some in (no, free[0]) if ambient else (no,):
+            wanted = np.stack([some, free[1], free[2]])
+            for tied in (np.where(free[2], grey[name], 0.0), None) if channels > 1 else (None,):
+                trial = _try(name, wanted, tied, normals[name], plain[name], fit.n)
+                # A highlight that comes out as nothing is Lambert's surface again.
+                if np.any(trial.solution[2 * channels : -1] > 0):
+                    trials.append(trial)
+    return _decide(trials, normals, variance, float(np.sum(fits[first].pixels)))
 
 
-def _decide(trials: list[_Trial], normals: dict[str, NormalEquations], variance: np.ndarray, count: float) -> Choice:
-    expected = np.array([trial.cost + 2 * trial.effective for trial in trials])
-    bic = np.array([trial.cost + trial.unknowns * np.log(count) for trial in trials])
-    best = int(np.argmin(expected))
-    error = np.array([2 * np.sqrt(_distance(trial, trials[best], normals)) for trial in trials])
-    adequate = expected - expected[best] <= error
-    ranks = [FAMILIES.index(trial.model) if trial.model in FAMILIES else len(FAMILIES) for trial in trials]
-    keys = [(ranks[i], trials[i].unknowns, expected[i]) for i in range(len(trials))]
-    chosen = min(np.flatnonzero(adequate), key=lambda i: keys[i])
-    if ranks[chosen] == len(FAMILIES):
+def _decide(trials: list[_Trial], normals: Mapping[str, NormalEquations], variance: np.ndarray, count: float) -> Choice:
+    best = min(trials, key=lambda trial: trial.expected)
+    error = [2 * np.sqrt(_distance(trial, best, normals)) for trial in trials]
+    bic = [trial.cost + trial.unknowns * np.log(count) for trial in trials]
+    adequate = [trial for trial, margin in zip(trials, error, strict=True) if trial.expected - best.expected <= margin]
+
+    def simplest(some: list[_Trial]) -> _Trial:
+        return min(some, key=lambda trial: (trial.rank, trial.unknowns, trial.expected))
+
+    chosen, rivals = simplest(adequate), set()
+    if chosen.rank == len(FAMILIES):
         # Of two kinds of highlight the likelier one, be it the one with fewer unknowns or not.
-        likelier = min(np.flatnonzero(adequate), key=lambda i: (ranks[i] < len(FAMILIES), expected[i]))
-        same = [i for i in np.flatnonzero(adequate) if trials[i].model == trials[likelier].model]
-        chosen = min(same, key=lambda i: keys[i])
+        likelier = min(adequate, key=lambda trial: trial.expected).model
+        chosen = simplest([trial for trial in adequate if trial.model == likelier])
+        rivals = {trial.model for trial in adequate} - {likelier}
     count = max(count, 1.0)
+    order = sorted(range(len(trials)), key=lambda i: (trials[i].rank, trials[i].model, trials[i].unknowns))
     candidates = tuple(
         Candidate(
             model=trial.model,
@@ -215,34 +210,25 @@ def _decide(trials: list[_Trial], normals: dict[str, NormalEquations], variance:
             unknowns=trial.unknowns,
             rms=float(np.sqrt(trial.squares / count)),
             held_out=float(np.sqrt((trial.squares + 2 * trial.effective * np.mean(variance)) / count)),
-            excess=float(expected[i] - expected[best]),
+            excess=float(trial.expected - best.expected),
             excess_error=float(error[i]),
-            bic=float(bic[i] - bic.min()),
-            chosen=bool(i == chosen),
+            bic=float(bic[i] - min(bic)),
+            chosen=trial is chosen,
         )
-        for i, trial in enumerate(trials)
+        for i, trial in ((i, trials[i]) for i in order)
     )
-    order = sorted(range(len(trials)), key=lambda i: (ranks[i], trials[i].model, trials[i].unknowns))
-    winner = trials[chosen]
-    rivals = {trials[i].model for i in np.flatnonzero(adequate) if ranks[i] == len(FAMILIES)} - {winner.model}
-    return Choice(
-        tuple(candidates[i] for i in order),
-        winner.model,
-        winner.free,
-        winner.grey,
-        tuple(sorted(rivals)) if ranks[chosen] == len(FAMILIES) else (),
-    )
+    return Choice(candidates, chosen.model, chosen.free, chosen.grey, tuple(sorted(rivals)))
 
 
-def _distance(one: _Trial, other: _Trial, normals: dict[str, NormalEquations]) -> float:
+def _distance(one: _Trial, other: _Trial, normals: Mapping[str, NormalEquations]) -> float:
     """Squared distance of two candidates' pictures, in noise variances.
 
     Two models with different highlights share no Gram matrix; there the difference of their costs stands in, which is
     the same where one model holds the other.
     """
-    specular = [trial.model for trial in (one, other) if trial.model in normals and trial.model not in FAMILIES]
-    if len(set(specular)) > 1:
+    specular = {trial.model for trial in (one, other) if trial.model not in FAMILIES}
+    if len(specular) > 1:
         return abs(one.cost - other.cost)
-    gram = normals[specular[0]].gram if specular else next(iter(normals.values())).gram
+    gram = normals[specular.pop() if specular else next(iter(normals))].gram
     step = one.solution - other.solution
     return max(float(step @ gram @ step), 0.0)

@@ -16,7 +16,9 @@ from brdf.errors import InputError
 from brdf.precision import Precision, working_precision
 from fitting.budget.lamps import Lamps
 from fitting.budget.pixel_sampling import PixelSample, sample_pixels
-from fitting.problem import looked_at
+from fitting.core import fit_pictures
+from fitting.pixels import SYMMETRIC_PIXELS
+from fitting.problem import TOP, Target, as_target, looked_at, state_problem
 from fitting.result import FitResult
 
 
@@ -107,9 +109,8 @@ def run(
         lamps: the lights made so far.
         n_range: bounds of the exponent, instead of those of ``options``.
     """
-    from fitting.front_door import fit
-
     start = time.perf_counter()
+    targets = [as_target(target) for target in targets]
     given, options = options, dict(options) | ({} if n_range is None else {"n_range": n_range})
     how: dict[str, Any] = {"model": configuration.model, "precision": configuration.precision}
     made = [lamps.with_samples(scene, configuration.samples) for scene in scenes]
@@ -143,9 +144,9 @@ def run(
     saturation = options.pop("saturation", None)
     if saturation is None:
         saturation = _clipping(targets, pictures, samples)
-    how |= {"mask": some_masks, "weight": some_weights, "saturation": saturation, **options}
+    how |= {"saturation": saturation, **options}
     try:
-        result = fit(pictures, places, **how)
+        result = fit_pictures(state_problem(pictures, places, some_masks, some_weights, **how))
     except InputError:
         if all(sample is None for sample in samples):
             raise
@@ -191,17 +192,15 @@ def _all_of(counted: np.ndarray, sample: PixelSample | None, scene: brdf.Scene) 
     return whole.reshape(height, width)
 
 
-def some_of_target(target: Any, sample: PixelSample) -> Any:
+def some_of_target(target: Any, sample: PixelSample) -> Target:
     """A picture of one row that holds the pixels of a sample.
 
     Args:
-        target: (H, W) or (H, W, C), or a `brdf.Picture`.
+        target: a picture in memory.
         sample: which pixels.
     """
-    if isinstance(target, brdf.Picture):
-        return dataclasses.replace(target, pixels=some_of_target(target.pixels, sample), alpha=None)
-    pixels = np.asarray(target)
-    return pixels.reshape(-1, *pixels.shape[2:])[sample.pixel][None]
+    whole = as_target(target)
+    return whole._replace(pixels=whole.pixels.reshape(-1, whole.pixels.shape[-1])[sample.pixel][None])
 
 
 def target_size(target: Any) -> int:
@@ -216,14 +215,15 @@ def target_size(target: Any) -> int:
 
 def _clipping(targets: Sequence[Any], pictures: Sequence[Any], samples: Sequence[Any]) -> float | None:
     """The level at which pictures are clipped, where so few pixels of a sample are that `fit` would not notice."""
-    from fitting.pixel_statistics import SYMMETRIC_PIXELS, TOP
-
     for target, picture, sample in zip(targets, pictures, samples, strict=True):
-        if sample is None or isinstance(target, brdf.Picture):
+        if sample is None or target.saturation is not None:
             continue
-        some = np.asarray(picture)
+        some = np.asarray(picture.pixels)
         largest = np.max(some, initial=-np.inf, where=np.isfinite(some))
         count = np.count_nonzero(some >= largest * TOP)
-        if 2 <= count <= SYMMETRIC_PIXELS and np.count_nonzero(np.asarray(target) >= largest * TOP) > SYMMETRIC_PIXELS:
+        if (
+            2 <= count <= SYMMETRIC_PIXELS
+            and np.count_nonzero(np.asarray(target.pixels) >= largest * TOP) > SYMMETRIC_PIXELS
+        ):
             return float(largest * TOP)
     return None

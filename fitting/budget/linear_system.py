@@ -24,9 +24,8 @@ from fitting.budget.deviation import SMALLEST
 from fitting.budget.lamps import Lamps
 from fitting.budget.pixel_sampling import PixelSample, sample_pixels, traceable
 from fitting.budget.probes import Probe, probe
-from fitting.light_colour import take_colour_out
+from fitting.light_colour import coefficient_factors, take_colour_out
 from fitting.uncertainty.covariance import TERMS
-from fitting.uncertainty.interpretation import coefficient_factors
 
 # Pixels that are looked at: under lights of many samples, and under lights of few.
 PROBES, MOST_PROBES = 640, 512

@@ -16,9 +16,8 @@ from fitting.budget.budget import MOST_SAMPLES
 from fitting.budget.configurations import Configuration, Run, run, target_size
 from fitting.budget.lamps import Lamps, extended
 from fitting.budget.linear_system import System
-from fitting.light_colour import take_colour_out
+from fitting.light_colour import coefficient_factors, take_colour_out
 from fitting.result import FitResult
-from fitting.uncertainty.interpretation import coefficient_factors
 
 # A step that changes the parameters by less than this, relative, is the last.
 SETTLED = 1e-9

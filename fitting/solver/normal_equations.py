@@ -105,6 +105,15 @@ class Picture(eqx.Module):
             ambient=self.ambient,
         )
 
+    def predicted(self, n: AnyArray, x: Float[AnyArray, "3 C"]) -> Float[Array, "P C"]:
+        """What the model shows, in the dtype of the target."""
+        dtype = self.target.dtype
+        x = jnp.asarray(x).astype(dtype)
+        model = x[0] * jnp.asarray(self.ambient).astype(dtype) + x[1] * self.diffuse
+        if self.lobe is not None:
+            model = model + x[2] * self.lobe(jnp.asarray(n))[0]
+        return jnp.broadcast_to(model, self.target.shape)
+
 
 def relative_lobe(
     lobe: Lobe, log_n: Float[Array, ""], peak: Float[Array, ""], dtype: np.dtype

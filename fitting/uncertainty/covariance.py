@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from fitting.solver.profile import Optimum
+from fitting.solver.tied import grey_design
 from fitting.uncertainty.intervals import NORMAL_95, above_zero
 
 # A squared column keeps less than this of itself when the others are taken out: the two tell the same story.
@@ -24,7 +25,6 @@ class Uncertainty(NamedTuple):
     """Errors, and what is not determined.
 
     Attributes:
-        noise: standard deviation of the residual, (C,), never below what rounding alone gives.
         x_error: of the engine's coefficients x_a, x_d, x_s, (3, C); for one at its bound, that which it would have if
             the bound were not there. Infinite where the picture does not determine it.
         x_interval: 95 % interval of each, lower and upper end, (3, C, 2).
@@ -35,7 +35,6 @@ class Uncertainty(NamedTuple):
         undetermined: why, by parameter: "n", "k_s", or "k_d[2]" for one channel.
     """
 
-    noise: Float[np.ndarray, " C"]
     x_error: Float[np.ndarray, "3 C"]
     x_interval: Float[np.ndarray, "3 C 2"]
     n_error: float
@@ -95,8 +94,7 @@ def uncertainty(
     known[2] &= specular and "k_s" not in undetermined
     _name_unlit(free, specular, undetermined)
     _name_dependent(optimum, known, undetermined, dependent)
-    system = _System(optimum, known, noise, tied, spread, dependent)
-    x_error, x_interval, n_error = system.errors()
+    x_error, x_interval, n_error, correlation, rise = _errors(optimum, known, noise, tied, spread, dependent)
     for term, channel in np.argwhere(known):
         largest = max(optimum.square[channel], brightest[channel] ** 2)
         if x_error[term, channel] ** 2 * optimum.gram[channel, term, term] > largest:
@@ -109,7 +107,7 @@ def uncertainty(
         n_error = np.inf
     if channels == 1:
         undetermined = {name.removesuffix("[0]"): reason for name, reason in undetermined.items()}
-    return Uncertainty(noise, x_error, x_interval, n_error, system.correlation(), system.rise, undetermined)
+    return Uncertainty(x_error, x_interval, n_error, correlation, rise, undetermined)
 
 
 def _without_trace(optimum: Optimum, noise: np.ndarray, visible: float) -> str:
@@ -119,14 +117,12 @@ def _without_trace(optimum: Optimum, noise: np.ndarray, visible: float) -> str:
     if visible < NO_TRACE:
         return f"the highlight is below {NO_TRACE:g} of the picture"
     gain = 0.0
-    for channel in range(optimum.x.shape[1]):
-        gram = optimum.gram[channel, :3, :3]
-        others = [term for term in (0, 1) if optimum.x[term, channel] > 0]
-        left = gram[2, 2]
-        if others:
-            cross = gram[np.ix_(others, [2])][:, 0]
-            left -= cross @ np.linalg.lstsq(gram[np.ix_(others, others)], cross, rcond=DEPENDENT_DOUBLE)[0]
-        gain += optimum.x[2, channel] ** 2 * max(left, 0.0) / noise[channel] ** 2
+    for gram, x, deviation in zip(optimum.gram, optimum.x.T, noise, strict=True):
+        others = np.flatnonzero(x[:2] > 0)
+        cross = gram[others, 2]
+        block = gram[np.ix_(others, others)]
+        left = gram[2, 2] - cross @ np.linalg.lstsq(block, cross, rcond=DEPENDENT_DOUBLE)[0]
+        gain += x[2] ** 2 * max(left, 0.0) / deviation**2
     unknowns = 1 + np.count_nonzero(optimum.x[2] > 0)
     return "" if gain > SIGNIFICANT * unknowns else "the highlight does not stand out of the noise"
 
@@ -147,119 +143,88 @@ def _name_dependent(optimum: Optimum, known: np.ndarray, undetermined: dict[str,
     """Find terms that the others reproduce; takes them out of ``known``."""
     for channel in range(known.shape[1]):
         gram = optimum.gram[channel, :3, :3]
-        terms = list(np.flatnonzero(known[:, channel]))
         scale = np.sqrt(np.maximum(np.diag(gram), 0.0))
-        for term in terms:
-            if scale[term] == 0:
-                known[term, channel] = False
-                undetermined[f"{TERMS[term]}[{channel}]"] = "its light reaches no pixel that counts"
-        terms = [term for term in terms if known[term, channel]]
-        if len(terms) < 2:
+        for term in np.flatnonzero(known[:, channel] & (scale == 0)):
+            undetermined[f"{TERMS[term]}[{channel}]"] = "its light reaches no pixel that counts"
+        known[:, channel] &= scale > 0
+        terms = np.flatnonzero(known[:, channel])
+        if terms.size < 2:
             continue
-        normed = gram[np.ix_(terms, terms)] / np.outer(scale[terms], scale[terms])
-        value, vector = np.linalg.eigh(normed)
+        value, vector = np.linalg.eigh(gram[np.ix_(terms, terms)] / np.outer(scale[terms], scale[terms]))
         if value[0] > dependent:
             continue
-        tied = [terms[i] for i in np.flatnonzero(np.abs(vector[:, 0]) > 0.1)]
+        tied = terms[np.abs(vector[:, 0]) > 0.1]
         names = " and ".join(TERMS[term] for term in tied)
         for term in tied:
             known[term, channel] = False
             undetermined[f"{TERMS[term]}[{channel}]"] = f"only a sum of {names} is determined"
 
 
-class _System:
-    """The normal equations of all unknowns: x_a, x_d, x_s channel after channel, then n."""
+def _errors(
+    optimum: Optimum,
+    known: np.ndarray,
+    noise: np.ndarray,
+    tied: np.ndarray | None,
+    spread: np.ndarray | None,
+    dependent: float,
+) -> tuple[np.ndarray, np.ndarray, float, np.ndarray, float]:
+    """Errors and intervals of x, the error of n, the correlation of all unknowns, and the rise of the cost.
 
-    def __init__(
-        self,
-        optimum: Optimum,
-        known: np.ndarray,
-        noise: np.ndarray,
-        tied: np.ndarray | None,
-        spread: np.ndarray | None,
-        dependent: float,
-    ):
-        channels = noise.size
-        size = 3 * channels + 1
-        self.optimum, self.known, self.dependent = optimum, known, dependent
-        self.hessian, self.spread = np.zeros((size, size)), np.zeros((size, size))
-        for channel, block in enumerate(optimum.gauss_newton):
-            place = np.ix_(*2 * [[channel, channels + channel, 2 * channels + channel, size - 1]])
-            self.hessian[place] += block
-            if spread is None:
-                self.spread[place] += noise[channel] ** 2 * block
-            else:
-                scale = np.array([1.0, 1.0, 1.0, optimum.x[2, channel]])
-                self.spread[place] += spread[channel] * np.outer(scale, scale)
-        active = known & (optimum.x > 0)
-        self.has_n = bool(active[2].any())
-        columns = [row for row in np.eye(size)[:-1][active.ravel()]]
-        if tied is not None and self.has_n:
-            columns = [row for row in np.eye(size)[:-1][np.concatenate([active[:2].ravel(), np.zeros(channels, bool)])]]
-            columns.append(np.concatenate([np.zeros(2 * channels), tied * active[2], [0.0]]))
-        self.with_n = False
-        self._reduce(columns)
-        if self.has_n:
-            n = np.eye(size)[-1]
-            cross = self.basis.T @ self.hessian @ n
-            self.along = self.basis @ self.inverse @ cross
-            left = self.hessian[-1, -1] - cross @ self.inverse @ cross
-            self.with_n = bool(left > dependent * self.hessian[-1, -1])
-            if self.with_n:
-                self._reduce([*columns, n])
-        self.covariance = self.basis @ self.inverse @ self._middle() @ self.inverse @ self.basis.T
+    The unknowns are x_a, x_d, x_s, channel after channel each, then n.
+    """
+    x, channels = optimum.x, noise.size
+    size = 3 * channels + 1
+    hessian, middle = np.zeros((size, size)), np.zeros((size, size))
+    for channel, block in enumerate(optimum.gauss_newton):
+        place = np.ix_(*2 * [[channel, channels + channel, 2 * channels + channel, size - 1]])
+        hessian[place] += block
+        scale = np.array([1.0, 1.0, 1.0, x[2, channel]])
+        middle[place] += noise[channel] ** 2 * block if spread is None else spread[channel] * np.outer(scale, scale)
+    active = known & (x > 0)
+    has_n, with_n = bool(active[2].any()), False
+    unit = np.eye(size)
+    basis = unit[:, np.append(active.ravel(), False)]
+    if tied is not None and has_n:
+        basis = grey_design(active, tied)[:, :-1]
+    inverse = _inverse(hessian, basis)
+    along = inverse @ hessian[:, -1]
+    if has_n:
+        left = hessian[-1, -1] - hessian[-1] @ along
+        with_n = bool(left > dependent * hessian[-1, -1])
+        if with_n:
+            inverse = _inverse(hessian, np.column_stack([basis, unit[:, -1]]))
+    covariance = inverse @ middle @ inverse
+    variance = np.maximum(np.diag(covariance), 0.0)
+    error, interval = np.full((3, channels), np.inf), np.zeros((3, channels, 2))
+    interval[..., 1] = np.inf
+    for term, channel in np.argwhere(known):
+        index = term * channels + channel
+        value, deviation = float(x[term, channel]), math.sqrt(variance[index])
+        # Where n is open, what moves along with it is open too.
+        if value > 0 and has_n and not with_n and abs(along[index]) * optimum.n > deviation:
+            deviation = math.inf
+        if not value > 0:
+            # Value and error that it would have without the bound.
+            direction = unit[index] - inverse @ hessian[:, index]
+            left = direction @ hessian @ direction
+            deviation = math.inf
+            if left > dependent * hessian[index, index]:
+                score = optimum.product[channel, term] - optimum.gram[channel, term, :3] @ x[:, channel]
+                value, deviation = float(score / left), float(np.sqrt(direction @ middle @ direction) / left)
+        error[term, channel] = deviation
+        interval[term, channel] = above_zero(value, deviation)
+    scale = np.divide(1.0, np.sqrt(variance), out=np.zeros(size), where=variance > 0)
+    n_error, rise = math.inf, 0.0
+    if with_n:
+        n_error = math.sqrt(variance[-1])
+        # The noise variance, averaged over channels as n feels it, times the 95 % quantile of chi squared.
+        rise = float(NORMAL_95**2 * covariance[-1, -1] / inverse[-1, -1])
+    return error, interval, n_error, covariance * np.outer(scale, scale), rise
 
-    def _reduce(self, columns: list[np.ndarray]) -> None:
-        self.basis = np.stack(columns, axis=1) if columns else np.zeros((self.hessian.shape[0], 0))
-        reduced = self.basis.T @ self.hessian @ self.basis
-        scale = np.sqrt(np.maximum(np.diag(reduced), np.finfo(float).tiny))
-        normed = reduced / np.outer(scale, scale)
-        inverse = np.linalg.pinv(normed, rcond=1e-14, hermitian=True) if columns else normed
-        self.inverse = inverse / np.outer(scale, scale)
 
-    def _middle(self) -> np.ndarray:
-        return self.basis.T @ self.spread @ self.basis
-
-    @property
-    def rise(self) -> float:
-        """The noise variance, averaged over channels as n feels it, times the 95 % quantile of chi squared."""
-        if not self.with_n:
-            return 0.0
-        return float(NORMAL_95**2 * self.covariance[-1, -1] / (self.basis @ self.inverse @ self.basis.T)[-1, -1])
-
-    def correlation(self) -> np.ndarray:
-        """Of the unknowns; 0 for those that are not free."""
-        deviation = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
-        inverse = np.where(deviation > 0, 1 / np.where(deviation > 0, deviation, 1.0), 0.0)
-        return self.covariance * np.outer(inverse, inverse)
-
-    def errors(self) -> tuple[np.ndarray, np.ndarray, float]:
-        """Standard errors and 95 % intervals of x, standard error of n."""
-        x, channels = self.optimum.x, self.known.shape[1]
-        error, interval = np.full((3, channels), np.inf), np.zeros((3, channels, 2))
-        interval[..., 1] = np.inf
-        for term, channel in np.argwhere(self.known):
-            index = term * channels + channel
-            if x[term, channel] > 0:
-                value = float(x[term, channel])
-                deviation = math.sqrt(max(float(self.covariance[index, index]), 0.0))
-                # Where n is open, what moves along with it is open too.
-                if self.has_n and not self.with_n and abs(self.along[index]) * self.optimum.n > deviation:
-                    deviation = math.inf
-            else:
-                value, deviation = self._released(term, channel, index)
-            error[term, channel] = deviation
-            interval[term, channel] = above_zero(value, deviation)
-        n_variance = self.covariance[-1, -1] if self.with_n else np.inf
-        return error, interval, float(np.sqrt(n_variance))
-
-    def _released(self, term: int, channel: int, index: int) -> tuple[float, float]:
-        """Value and error that a coefficient at its bound would have without the bound."""
-        gram, x = self.optimum.gram[channel], self.optimum.x[:, channel]
-        score = self.optimum.product[channel, term] - gram[term, :3] @ x
-        direction = -self.basis @ self.inverse @ (self.basis.T @ self.hessian[:, index])
-        direction[index] += 1.0
-        left = direction @ self.hessian @ direction
-        if left <= self.dependent * self.hessian[index, index]:
-            return 0.0, np.inf
-        return float(score / left), float(np.sqrt(direction @ self.spread @ direction) / left)
+def _inverse(hessian: np.ndarray, basis: np.ndarray) -> np.ndarray:
+    """The inverse of the Hessian among the columns of a basis, 0 beside them."""
+    reduced = basis.T @ hessian @ basis
+    scale = np.sqrt(np.maximum(np.diag(reduced), np.finfo(float).tiny))
+    inverse = np.linalg.pinv(reduced / np.outer(scale, scale), rcond=1e-14, hermitian=True)
+    return basis @ (inverse / np.outer(scale, scale)) @ basis.T

@@ -1,29 +1,33 @@
-"""From the engine's numbers to a material, its errors, and what a user should know of them."""
+"""From the solver's numbers to a material, its errors, and what a user should know of them."""
 
-import functools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
 import brdf
 from brdf.channels import channel_names
 from brdf.models.base import SpecularMaterial
-from fitting.result import Parameter
+from fitting.light_colour import coefficient_factors
+from fitting.pixels import Tile
+from fitting.result import Parameter, free_parameters
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
 from fitting.uncertainty.covariance import TERMS, Uncertainty, residual_noise, uncertainty
+from fitting.uncertainty.highlight import OFF_CENTRE, Highlight, highlight
 from fitting.uncertainty.intervals import exponent_interval
-from fitting.uncertainty.missing_ambient import missing_ambient
 from fitting.uncertainty.noise_model import weighted_sums
-from fitting.uncertainty.residual_correlation import Highlight, Structure, highlight, structure
+from fitting.uncertainty.residual_correlation import ResidualCorrelation, residual_correlation
 
 # An interval of n wider than this factor says nothing but its order of magnitude.
 WIDEST_INTERVAL = 100.0
 # Two parameters whose errors go together more than this are hard to tell apart, if an error is also large.
 CORRELATED, LARGE_ERROR = 0.98, 0.05
+# Light is missing where the dark side shows at least this share of the mean of the lit one, and so many of its own
+# standard errors. That many pixels of that many pictures are looked at; a mean needs no more.
+SHARE, DEVIATIONS = 0.02, 5.0
+FEWEST_PIXELS, MOST_PIXELS, MOST_PICTURES = 30, 8192, 16
 
 
 class ModelFit(NamedTuple):
@@ -31,8 +35,8 @@ class ModelFit(NamedTuple):
 
     Attributes:
         model: its class.
-        pictures: in the units of the engine, with the weights of the fit.
-        optimum: in the units of the engine.
+        pictures: in the units of the solver, with the weights of the fit.
+        optimum: in the units of the solver.
         free: which coefficients could be above 0, (3, C).
         n_range: between which exponents the optimum was searched.
         tied: x_s is a common factor times this, (C,); None where the channels are independent.
@@ -56,18 +60,26 @@ class Interpretation(NamedTuple):
     Attributes:
         material: in the units of the user.
         parameters: each with its error and interval, or why it has none.
-        sure: errors of the engine's numbers.
-        structure: of the residual.
-        highlight: what the pixels see of it; None without one.
+        noise: standard deviation of the residual, (C,), never below what rounding alone gives.
+        structure: correlation of neighbouring residuals.
+        highlight_pixels: how many pixels carry the highlight; None without one.
+        correlation: of the parameters that are free.
         warnings: what a user should know before using the numbers.
     """
 
     material: brdf.Material
     parameters: tuple[Parameter, ...]
-    sure: Uncertainty
-    structure: Structure
-    highlight: Highlight | None
+    noise: Float[np.ndarray, " C"]
+    structure: float
+    highlight_pixels: float | None
+    correlation: Float[np.ndarray, "F F"]
     warnings: tuple[str, ...]
+
+    @property
+    def hidden_highlight(self) -> str:
+        """Why there is a highlight in the numbers but none in the material; empty where it is not so."""
+        reasons = {parameter.reason for parameter in self.parameters if parameter.name in ("k_s", "n")}
+        return reasons.pop() if len(reasons) == 1 else ""
 
 
 def interpret(
@@ -75,7 +87,7 @@ def interpret(
     colour: Float[np.ndarray, " C"],
     rounding: Float[np.ndarray, " C"],
     brightest: Float[np.ndarray, " C"],
-    shapes: Sequence[tuple[int, int]],
+    tiles: Sequence[Tile],
     required: Bool[np.ndarray, "3 C"],
 ) -> Interpretation:
     """Tell what a fit says.
@@ -85,21 +97,19 @@ def interpret(
         colour: what was taken out of the lights, (C,).
         rounding: standard deviation of a value's rounding, (C,).
         brightest: largest value of the pictures, (C,).
-        shapes: of the pictures, height and width.
+        tiles: of which the pictures were made.
         required: coefficients that the light reaches and that were not left out as needless, (3, C).
     """
     specular = issubclass(fit.model, SpecularMaterial)
     optimum, pictures = fit.optimum, fit.pictures
     single = np.dtype(pictures[0].target.dtype) == np.float32
-    factors = coefficient_factors(fit.model, optimum.n, colour)
     rounding = rounding * _typical_weight(pictures)
-    noise = residual_noise(optimum, rounding)
-    noise = np.maximum(noise * fit.noise_factor, rounding)
+    noise = np.maximum(residual_noise(optimum, rounding) * fit.noise_factor, rounding)
     seen = highlight(pictures, optimum.n) if specular and not optimum.flat else None
     visible = 0.0
     if seen is not None:
         visible = float(np.max(optimum.x[2]) * seen.largest / max(np.max(brightest), np.finfo(float).tiny))
-    known = structure(pictures, shapes, optimum, rounding)
+    known = residual_correlation(pictures, tiles, optimum, rounding)
     spread = None
     if known.noise is not None:
         spread = fit.noise_factor**2 * weighted_sums(pictures, optimum, known.noise, inverse=False).gram
@@ -114,7 +124,7 @@ def interpret(
         tied=fit.tied,
         spread=spread,
     )
-    interval: tuple[float, float] | None = None
+    interval = None
     # At k_d + k_s = 1 the cost still falls across the bound: a profile that does not know it has its least elsewhere.
     if specular and "n" not in sure.undetermined and not fit.capped:
         interval = exponent_interval(
@@ -131,61 +141,31 @@ def interpret(
         reason = _open_exponent(interval)
         if reason:
             sure.undetermined["n"] = reason
-    k = optimum.x / factors
-    for name in sure.undetermined:
-        key, _, channel = name.removesuffix("]").partition("[")
-        if key != "n":
-            k[TERMS.index(key), int(channel) if channel else slice(None)] = 0.0
+    factors = coefficient_factors(fit.model, optimum.n, colour)
+    parameters = _parameters(optimum, sure, factors, interval, specular=specular)
+    k = np.array([[p.value or 0.0 for p in parameters if p.name == term] for term in TERMS[: 2 + specular]])
     if specular:
-        material = fit.model(k_a=k[0], k_d=k[1], k_s=k[2], n=0.0 if not k[2].any() else optimum.n)  # pyright: ignore[reportCallIssue]
+        material = fit.model(k_a=k[0], k_d=k[1], k_s=k[2], n=optimum.n if k[2].any() else 0.0)  # pyright: ignore[reportCallIssue]
     else:
         material = fit.model(k_a=k[0], k_d=k[1])  # pyright: ignore[reportCallIssue]
-    parameters = _parameters(material, sure, factors, interval, optimum.n)
-    warnings = _warnings(known, seen if "k_s" not in sure.undetermined else None, sure, parameters, material)
-    ambient = missing_ambient(pictures)
-    warnings = (ambient, *warnings) if ambient else warnings
-    if fit.capped:
-        labels = channel_names(k.shape[1])
-        held = ", ".join(labels[channel] for channel in np.flatnonzero(k[1] + k[2] >= 1 - 1e-6))
-        where = f" in channel {held}" if held else ""
-        words = f"k_d + k_s is held at 1{where}: a brighter material fits better, but is not plausible; "
-        warnings = (words + "the errors do not know of that bound", *warnings)
-    return Interpretation(material, parameters, sure, known, seen, warnings)
-
-
-def coefficient_factors(
-    model: type[brdf.Material], n: float, colour: Float[np.ndarray, " C"]
-) -> Float[np.ndarray, "3 C"]:
-    """What the engine's coefficients are divided by to give k_a, k_d, k_s.
-
-    Args:
-        model: the class of the material.
-        n: exponent.
-        colour: what was taken out of the lights, (C,).
-    """
-    colour = np.where(colour > 0, colour, 1.0)
-    factors = np.stack([np.ones_like(colour), colour, colour])
-    if issubclass(model, SpecularMaterial):
-        factors[2] *= _scale(model, float(n))
-    return factors
-
-
-@functools.lru_cache(maxsize=64)
-def _scale(model: type[SpecularMaterial], n: float) -> float:
-    """Of the lobe; asked for several times at one exponent."""
-    with jax.enable_x64(True):
-        return float(model.scale(np.float64(n)))
+    free, channels = free_parameters(parameters), k.shape[1]
+    index = [3 * channels if p.channel is None else TERMS.index(p.name) * channels + p.channel for p in free]
+    correlation = sure.correlation[np.ix_(index, index)]
+    warnings = [_capped(k)] if fit.capped else []
+    warnings += _missing_ambient(pictures)
+    warnings += _warnings(known, None if "k_s" in sure.undetermined else seen)
+    warnings += _hard_to_tell(free, correlation)
+    pixels = None if seen is None else seen.pixels
+    return Interpretation(material, parameters, noise, known.correlation, pixels, correlation, tuple(warnings))
 
 
 def _typical_weight(pictures: Sequence[Picture]) -> float:
     """Root of the mean weight of what counts: the unit of the weighted residual."""
-    total, count = 0.0, 0.0
+    total, count = 0.0, 0
     for picture in pictures:
-        if picture.weight is None:
-            total, count = total + picture.target.shape[0], count + picture.target.shape[0]
-        else:
-            weight = np.asarray(picture.weight)
-            total, count = total + float(np.sum(weight, dtype=float)), count + np.count_nonzero(weight)
+        weight = np.ones(1) if picture.weight is None else np.asarray(picture.weight)
+        share = picture.target.shape[0] if picture.weight is None else 1
+        total, count = total + share * float(np.sum(weight, dtype=float)), count + share * np.count_nonzero(weight)
     return float(np.sqrt(total / max(count, 1)))
 
 
@@ -203,92 +183,100 @@ def _open_exponent(interval: tuple[float, float]) -> str:
 
 
 def _parameters(
-    material: brdf.Material,
-    sure: Uncertainty,
-    factors: np.ndarray,
-    interval: tuple[float, float] | None,
-    n: float,
+    optimum: Optimum, sure: Uncertainty, factors: np.ndarray, interval: tuple[float, float] | None, *, specular: bool
 ) -> tuple[Parameter, ...]:
     found = []
-    undetermined = sure.undetermined
-    specular = isinstance(material, SpecularMaterial)
-    for term, name in enumerate(TERMS if specular else TERMS[:2]):
-        for channel, value in enumerate(np.asarray(getattr(material, name))):
-            reason = undetermined.get(name) or undetermined.get(f"{name}[{channel}]")
+    for term, name in enumerate(TERMS[: 2 + specular]):
+        for channel, factor in enumerate(factors[term]):
+            reason = sure.undetermined.get(name) or sure.undetermined.get(f"{name}[{channel}]")
             if reason:
                 found.append(Parameter(name, channel, None, None, reason=reason))
                 continue
-            factor = factors[term, channel]
+            value = float(optimum.x[term, channel] / factor)
             low, high = sure.x_interval[term, channel] / factor
             error = float(sure.x_error[term, channel] / factor)
-            between = (float(low), float(high))
-            found.append(Parameter(name, channel, float(value), error, between, at_bound=bool(value == 0)))
-    if specular:
-        reason = undetermined.get("n", "")
-        if reason:
-            found.append(Parameter("n", None, None, None, interval, reason=reason))
-        else:
-            found.append(Parameter("n", None, float(n), sure.n_error, interval))
+            found.append(Parameter(name, channel, value, error, (float(low), float(high)), at_bound=value == 0))
+    reason = sure.undetermined.get("n", "")
+    if specular and reason:
+        found.append(Parameter("n", None, None, None, interval, reason=reason))
+    elif specular:
+        found.append(Parameter("n", None, float(optimum.n), sure.n_error, interval))
     return tuple(found)
 
 
-def _warnings(
-    known: Structure,
-    seen: Highlight | None,
-    sure: Uncertainty,
-    parameters: Sequence[Parameter],
-    material: brdf.Material,
-) -> tuple[str, ...]:
-    found = []
+def _capped(k: np.ndarray) -> str:
+    labels = channel_names(k.shape[1])
+    held = ", ".join(labels[channel] for channel in np.flatnonzero(k[1:].sum(axis=0) >= 1 - 1e-6))
+    where = f" in channel {held}" if held else ""
+    return (
+        f"k_d + k_s is held at 1{where}: a brighter material fits better, but is not plausible; "
+        "the errors do not know of that bound"
+    )
+
+
+def _missing_ambient(pictures: Sequence[Picture]) -> Iterator[str]:
+    """Where pixels that no light of the scene reaches are bright, although it has no ambient light."""
+    dark, lit = [], []
+    for index in range(0, len(pictures), -(-len(pictures) // MOST_PICTURES)):
+        picture = pictures[index]
+        if np.any(np.asarray(picture.ambient)):
+            return
+        some = slice(None, None, -(-picture.target.shape[0] // MOST_PIXELS))
+        # Through NumPy: a slice of an array on the device would be compiled.
+        target, diffuse = np.asarray(picture.target)[some].astype(np.float64), np.asarray(picture.diffuse)[some]
+        counted = np.all(np.isfinite(target), axis=1)
+        if picture.weight is not None:
+            counted &= np.asarray(picture.weight)[some].reshape(len(target), -1).min(axis=1) > 0
+        reached = np.any(diffuse > 0, axis=1)
+        brightness = target.mean(axis=1)
+        dark.append(brightness[counted & ~reached])
+        lit.append(brightness[counted & reached])
+    unlit, bright = np.concatenate(dark), np.concatenate(lit)
+    if min(unlit.size, bright.size) < FEWEST_PIXELS:
+        return
+    share = float(unlit.mean() / max(bright.mean(), np.finfo(float).tiny))
+    if share >= SHARE and unlit.mean() >= DEVIATIONS * unlit.std() / np.sqrt(unlit.size):
+        yield (
+            f"where no light of the scene arrives the picture still shows {100 * share:.2g} % of its lit side: give "
+            "the scene an [ambient] light, or a photograph --ambient, and k_a takes that up"
+        )
+
+
+def _warnings(known: ResidualCorrelation, seen: Highlight | None) -> Iterator[str]:
     if known.significant:
-        found.append(
+        yield (
             f"the residual has structure: neighbouring pixels err alike (correlation {known.correlation:.2f}), so the "
             "model is not the whole truth, or the picture was smoothed. The errors come from a formula for independent "
             f"noise and are too small, by a factor of {known.inflation:.2g} or more"
         )
     if known.noise is not None:
-        found.append(
+        yield (
             "the noise grows with brightness; the errors allow for it, but pixels are weighed alike: told of the "
             "camera's noise, or with the relative loss, the same picture says more"
         )
     if seen is not None and seen.smaller_than_pixel:
-        amount = (
-            f"{seen.pixels:.1f} pixels carry it"
-            if seen.centre >= OFF_CENTRE_TOLD
-            else f"the nearest pixel shows {100 * seen.centre:.2g} % of its peak"
-        )
-        found.append(
+        # Below this share of the peak the distance from the centre says more than the number of pixels.
+        amount = f"the nearest pixel shows {100 * seen.centre:.2g} % of its peak"
+        if seen.centre >= OFF_CENTRE:
+            amount = f"{seen.pixels:.1f} pixels carry it"
+        yield (
             f"the highlight is smaller than a pixel, or nearly so ({amount}): k_s and n hang on each pixel being "
             "sampled at its centre, and a camera averages over pixels. A larger picture or a larger light would tell"
         )
-    found += _hard_to_tell(sure, parameters, material)
-    return tuple(found)
 
 
-# Below this share of the peak the distance from the centre says more than the number of pixels.
-OFF_CENTRE_TOLD = 0.5
-
-
-def _hard_to_tell(sure: Uncertainty, parameters: Sequence[Parameter], material: brdf.Material) -> list[str]:
-    """Pairs whose errors go together so much that they are known worse apart than together."""
-    channels = material.k_d.shape[0]
-    place = {name: term * channels for term, name in enumerate(TERMS)} | {"n": 3 * channels}
-    pairs: dict[tuple[str, str], tuple[float, int]] = {}
-    for i, one in enumerate(parameters):
-        for other in parameters[i + 1 :]:
-            same = one.channel == other.channel or other.channel is None
-            if not (one.value and other.value and same):
-                continue
-            correlation = sure.correlation[
-                place[one.name] + (one.channel or 0), place[other.name] + (other.channel or 0)
-            ]
-            large = max((p.error or 0.0) / p.value for p in (one, other) if p.value)
-            if abs(correlation) > CORRELATED and large > LARGE_ERROR:
-                key = (one.name, other.name)
-                if abs(correlation) >= abs(pairs.get(key, (0.0, 0))[0]):
-                    pairs[key] = (float(correlation), one.channel or 0)
-    return [
-        f"{one} and {other} are hard to tell apart (correlation {correlation:.3f}): "
-        f"their {'sum' if correlation < 0 else 'difference'} is known better than either"
-        for (one, other), (correlation, _) in pairs.items()
-    ]
+def _hard_to_tell(free: Sequence[Parameter], correlation: np.ndarray) -> Iterator[str]:
+    """Pairs whose errors go together so much that they are known worse apart than together; of channels the worst."""
+    pairs: dict[tuple[str, str], float] = {}
+    for i, first in enumerate(free):
+        for j, second in enumerate(free[i + 1 :], start=i + 1):
+            large = max((p.error or 0.0) / p.value for p in (first, second) if p.value)
+            if second.channel in (None, first.channel) and abs(correlation[i, j]) > CORRELATED and large > LARGE_ERROR:
+                key = first.name, second.name
+                pairs[key] = max(pairs.get(key, 0.0), float(correlation[i, j]), key=abs)
+    for (first, second), value in pairs.items():
+        known = "sum" if value < 0 else "difference"
+        yield (
+            f"{first} and {second} are hard to tell apart (correlation {value:.3f}): "
+            f"their {known} is known better than either"
+        )

@@ -143,7 +143,7 @@ def exponent_interval(
     limit = float(np.sum(optimum.cost)) + rise
     tolerance = np.float64(2e-7 if single else 1e-14)
 
-    # Relative to the nearest pixel the lobe keeps its size where no pixel sees the centre.
+    # Relative to the nearest pixel the lobe keeps its size where no pixel sees the centre: `normal_equations`.
     reference = optimum.x.T * [1.0, 1.0, math.exp(optimum.n * peak)]
 
     def costs(low: float, high: float) -> np.ndarray:
@@ -153,41 +153,28 @@ def exponent_interval(
                 return _tied_profile(parts, high - low, reference, free, tied)
             return np.asarray(_profile(parts, np.float64(high - low), reference, free.T, tolerance))
 
-    ends = []
-    for sign, bound in zip((-1, 1), bounds, strict=True):
-        ends.append(_follow(costs, centre, sign, bound, first, limit))
-    return (0.0 if ends[0] is None else math.exp(ends[0])), (math.inf if ends[1] is None else math.exp(ends[1]))
+    low, high = (_end(costs, centre, sign, bound, first, limit) for sign, bound in zip((-1, 1), bounds, strict=True))
+    return math.exp(low), math.exp(high)
 
 
-def _follow(
-    costs: Callable[[float, float], np.ndarray],
-    centre: float,
-    sign: int,
-    bound: float,
-    width: float,
-    limit: float,
-) -> float | None:
-    """Where the profile crosses the limit on one side of the optimum, in log n; None where it does not."""
-    start = centre
+def _end(
+    costs: Callable[[float, float], np.ndarray], start: float, sign: int, bound: float, width: float, limit: float
+) -> float:
+    """Where the profile crosses the limit on one side of the optimum, in log n; infinite where it does not."""
     while (bound - start) * sign > 1e-9:
         end = bound if (bound - start) * sign < width else start + sign * width
-        low, high = min(start, end), max(start, end)
-        cost = costs(low, high)
-        position = low + SHARES * (high - low)
-        if sign < 0:
-            cost, position = cost[::-1], position[::-1]
+        cost = costs(min(start, end), max(start, end))[::sign]
+        position = start + SHARES * (end - start)
         above = np.flatnonzero(cost > limit)
-        if above.size:
-            return _crossing(position, cost, limit, int(above[0]))
-        start, width = end, WIDEST
-    return None
-
-
-def _crossing(position: np.ndarray, cost: np.ndarray, limit: float, first: int) -> float:
-    """Interpolated in the square root of the rise, which is nearly straight."""
-    if first == 0:
-        return float(position[0])
-    least = min(float(cost[0]), limit)
-    root = np.sqrt(np.maximum(cost[first - 1 : first + 1] - least, 0.0))
-    share = (math.sqrt(limit - least) - root[0]) / max(root[1] - root[0], np.finfo(float).tiny)
-    return float(position[first - 1] + min(max(share, 0.0), 1.0) * (position[first] - position[first - 1]))
+        if above.size == 0:
+            start, width = end, WIDEST
+            continue
+        first = int(above[0])
+        if first == 0:
+            return float(position[0])
+        # Interpolated in the square root of the rise, which is nearly straight.
+        least = min(float(cost[0]), limit)
+        root = np.sqrt(np.maximum(cost[first - 1 : first + 1] - least, 0.0))
+        share = (math.sqrt(limit - least) - root[0]) / max(root[1] - root[0], np.finfo(float).tiny)
+        return float(position[first - 1] + min(max(share, 0.0), 1.0) * (position[first] - position[first - 1]))
+    return sign * math.inf

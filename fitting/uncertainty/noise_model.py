@@ -9,8 +9,9 @@ sandwich of Eicker 1967, Huber 1967 and White 1980, but with a smooth v: squared
 highlight of three pixels).
 """
 
+import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -33,29 +34,9 @@ MOST_VALUES = 4096
 ROUNDS = 6
 
 
-class NoiseModel(NamedTuple):
-    """The variance of a channel's scaled residual: a + b value + c value², of the fitted value.
-
-    Attributes:
-        coefficients: a, b, c of each channel, (C, 3), at least 0.
-    """
-
-    coefficients: Float[np.ndarray, "C 3"]
-
-    def variance(self, value: Float[np.ndarray, "M C"]) -> Float[np.ndarray, "M C"]:
-        """Of values.
-
-        Args:
-            value: fitted ones.
-        """
-        a, b, c = self.coefficients.T
-        value = np.maximum(value, 0.0)
-        return a + value * (b + value * c)
-
-
 def noise_model(
     residual: Float[np.ndarray, "M C"], value: Float[np.ndarray, "M C"], least: Float[np.ndarray, " C"]
-) -> NoiseModel | None:
+) -> Float[np.ndarray, "C 3"] | None:
     """Find out whether noise grows with brightness.
 
     Args:
@@ -64,7 +45,7 @@ def noise_model(
         least: standard deviation that rounding alone gives, (C,).
 
     Returns:
-        The variance as a function of the value; None where a constant does as well.
+        a, b, c of each channel's variance, at least 0; None where a constant does as well.
     """
     if len(residual) < 10 * ROUNDS:
         return None
@@ -76,19 +57,24 @@ def noise_model(
         return None
     stride = -(-len(value) // MOST_VALUES)
     squared, value = squared[::stride], np.maximum(value[::stride], 0.0)
-    fitted = [_one_channel(squared[:, c], value[:, c], least[c] ** 2) for c in range(value.shape[1])]
-    model = NoiseModel(np.array([coefficients for coefficients, _ in fitted]))
-    variance = model.variance(value)
+    channels = range(value.shape[1])
+    found = [_one_channel(squared[:, c], value[:, c], least[c] ** 2) for c in channels]
+    coefficients = np.array([one for one, _ in found])
+    variance = _variance(coefficients, value)
     varied = np.max(variance, axis=0) > EVEN * np.mean(variance, axis=0)
-    return model if np.any(varied & (np.array([rise for _, rise in fitted]) > RISE)) else None
+    return coefficients if np.any(varied & (np.array([rise for _, rise in found]) > RISE)) else None
+
+
+def _variance(coefficients: Any, value: Any) -> Any:
+    a, b, c = coefficients.T
+    return a + value * (b + value * c)
 
 
 def _one_channel(squared: np.ndarray, value: np.ndarray, least: float) -> tuple[np.ndarray, float]:
     """Coefficients, and twice the rise of the logarithm of the likelihood over a constant variance."""
     largest = max(float(np.max(value)), np.finfo(float).tiny)
-    columns = np.stack([np.ones_like(value), value / largest, (value / largest) ** 2])
+    columns = (value / largest) ** np.arange(3)[:, None]
     constant = max(float(np.mean(squared)), least, np.finfo(float).tiny)
-    coefficients = np.array([constant, 0.0, 0.0])
     variance = np.full(value.size, constant)
     for _ in range(ROUNDS):
         # The variance of a squared residual is twice its mean squared; scaled, so that no digit is lost.
@@ -102,47 +88,40 @@ def _one_channel(squared: np.ndarray, value: np.ndarray, least: float) -> tuple[
 
 @eqx.filter_jit
 def _reweighted(
-    picture: Picture,
-    n: Float[AnyArray, ""],
-    x: Float[AnyArray, "3 C"],
-    coefficients: Float[AnyArray, "C 3"],
-    inverse: bool,
+    picture: Picture, n: AnyArray, x: Float[AnyArray, "3 C"], coefficients: Float[AnyArray, "C 3"], inverse: bool
 ) -> Float[Array, "P C"]:
     dtype = picture.target.dtype
-    x, coefficients = jnp.asarray(x).astype(dtype), jnp.asarray(coefficients).astype(dtype)
-    model = x[0] * jnp.asarray(picture.ambient).astype(dtype) + x[1] * picture.diffuse
-    if picture.lobe is not None:
-        model = model + x[2] * picture.lobe(jnp.asarray(n))[0]
-    value = jnp.maximum(jnp.broadcast_to(model, picture.target.shape), 0.0)
-    variance = coefficients[:, 0] + value * (coefficients[:, 1] + value * coefficients[:, 2])
+    value = jnp.maximum(picture.predicted(n, x), 0.0)
+    variance = _variance(jnp.asarray(coefficients).astype(dtype), value)
     weight = jnp.ones((1, 1), dtype) if picture.weight is None else picture.weight.reshape(value.shape[0], -1)
     return weight / variance if inverse else weight * variance
 
 
-def weighted_sums(pictures: Sequence[Picture], optimum: Optimum, noise: NoiseModel, *, inverse: bool) -> Sums:
+def weighted_sums(
+    pictures: Sequence[Picture], optimum: Optimum, coefficients: Float[np.ndarray, "C 3"], *, inverse: bool
+) -> Sums:
     """Sums at the optimum with each pixel's weight times its variance, or divided by it: one more pass.
 
     Args:
         pictures: as they were searched.
         optimum: of the search.
-        noise: what the variance is.
+        coefficients: of the variance.
         inverse: divide.
 
     Returns:
         The sums, columns ambient, diffuse, lobe, derivative by n, about the target.
     """
-    n = np.asarray(optimum.n)
+    n, x = np.asarray(optimum.n), optimum.x
 
     def again(picture: Picture) -> Picture:
-        weight = _reweighted(picture, n, optimum.x, noise.coefficients, inverse)
-        return eqx.tree_at(lambda p: p.weight, picture, weight, is_leaf=lambda leaf: leaf is None)
+        return dataclasses.replace(picture, weight=_reweighted(picture, n, x, coefficients, inverse))
 
     with jax.enable_x64(True):
         has_lobe = any(picture.lobe is not None for picture in pictures)
-        parts = sums(each(again, pictures), np.log([optimum.n]) if has_lobe else np.zeros(0), optimum.x.T)
-    parts = parts.about(np.pad(optimum.x.T, [(0, 0), (0, 1)]) if has_lobe else optimum.x.T[:, :2])
-    wide = 4 - parts.gram.shape[-1]
-    gram = np.pad(parts.gram, [(0, 0), (0, wide), (0, wide)])
-    product = np.pad(parts.product, [(0, 0), (0, wide)])
+        parts = sums(each(again, pictures), np.log([optimum.n]) if has_lobe else np.zeros(0), x.T)
+    missing = 4 - parts.gram.shape[-1]
+    parts = parts.about(np.pad(x.T, [(0, 0), (0, 1)])[:, : 4 - missing])
     by_n = np.array([1.0, 1.0, 1.0, 1.0 / optimum.n])
+    gram = np.pad(parts.gram, [(0, 0), (0, missing), (0, missing)])
+    product = np.pad(parts.product, [(0, 0), (0, missing)])
     return Sums(gram * by_n[:, None] * by_n, product * by_n, parts.square, parts.pixels)

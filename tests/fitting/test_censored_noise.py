@@ -9,7 +9,7 @@ import fitting
 from brdf.images.encoding import encode
 from fitting.budget.deviation import parameter_deviation
 from fitting.budget.trials import Bench
-from fitting.censored_noise import BLACK, WHITE, without_cut_noise
+from fitting.censored_noise import BLACK, WHITE, without_censored_noise
 from fitting.cli.main import main
 from fitting.photographs.ball import ball_points, photograph_scene
 from fitting.photographs.circle import Circle
@@ -34,7 +34,7 @@ def seen(material: brdf.Material, noise: float, seed: int, *, low: float, bits: 
 def fitted(picture: brdf.Picture, mended: bool) -> fitting.FitResult:
     with pytest.MonkeyPatch.context() as patch:
         if not mended:
-            patch.setattr("fitting.front_door.without_cut_noise", lambda result, *_: result)
+            patch.setattr("fitting.core.without_censored_noise", lambda result, *_: result)
         return fitting.fit(picture, SCENE, model="blinn-phong")
 
 
@@ -70,7 +70,7 @@ def test_what_is_not_cut_is_left_alone(noise):
         raise AssertionError("fitted again")
 
     result = fitting.fit(picture, SCENE, model="blinn-phong")
-    assert without_cut_noise(result, [None], refused) is result
+    assert without_censored_noise(result, [None], refused) is result
 
 
 @pytest.mark.parametrize("bits", [8, 16])

@@ -8,8 +8,7 @@ import pytest
 
 import brdf
 import fitting
-from fitting import pixels as observation
-from fitting.core import fit_model
+from fitting import core, pixels
 from fitting.solver.streams import Stream, each, joined
 
 MATERIAL = brdf.BlinnPhong(k_a=[0.05, 0.04, 0.03], k_d=[0.5, 0.3, 0.1], k_s=[0.3, 0.25, 0.2], n=60.0)
@@ -39,9 +38,8 @@ def picture(noise: float = 0.01) -> np.ndarray:
 @pytest.fixture(autouse=True)
 def small_bands(monkeypatch):
     """Seven bands, the last one shorter."""
-    monkeypatch.setattr(observation, "TILE_PIXELS", 14 * SIZE[0] + 5)
-    monkeypatch.setattr("fitting.core.TILE_PIXELS", 14 * SIZE[0] + 5)
-    monkeypatch.setattr(observation, "ALIGNED_ROWS", 14)
+    monkeypatch.setattr(pixels, "TILE_PIXELS", 14 * SIZE[0] + 5)
+    monkeypatch.setattr(pixels, "ALIGNED_ROWS", 14)
 
 
 def same(streamed: fitting.FitResult, whole: fitting.FitResult, tolerance: float = 2e-5):
@@ -85,18 +83,19 @@ def test_one_model_at_a_time_is_in_memory(monkeypatch, true):
     noisy = clean + 0.01 * np.random.default_rng(0).standard_normal(clean.shape)
     alive = []
 
-    def watched(model, job):
+    fit_model = core._fit_model
+
+    def watched(model, seen):
         alive.append(sum(reference() is not None for reference in lobes))
-        fit = fit_model(model, job)
+        fit = fit_model(model, seen)
         lobes.extend(weakref.ref(picture.diffuse) for picture in fit.pictures)
         return fit
 
     lobes: list[weakref.ref] = []
-    monkeypatch.setattr("fitting.auto_fit.fit_model", watched)
+    monkeypatch.setattr(core, "_fit_model", watched)
     cut = fitting.fit(noisy, scene())
     assert alive == [0, 0]
-    monkeypatch.setattr(observation, "TILE_PIXELS", noisy[..., 0].size)
-    monkeypatch.setattr("fitting.core.TILE_PIXELS", noisy[..., 0].size)
+    monkeypatch.setattr(pixels, "TILE_PIXELS", noisy[..., 0].size)
     lobes.clear()
     whole = fitting.fit(noisy, scene())
     assert alive[2:] == [0, 1]
@@ -106,12 +105,12 @@ def test_one_model_at_a_time_is_in_memory(monkeypatch, true):
 def test_mask_weight_and_several_pictures(tmp_path: Path):
     path = tmp_path / "target.exr"
     brdf.write_image(path, picture())
-    pixels = brdf.read_image(path)
+    values = brdf.read_image(path)
     mask = np.add.outer(np.arange(SIZE[1]), np.arange(SIZE[0])) % 7 > 0
     weight = np.random.default_rng(0).uniform(0.5, 2.0, mask.shape)
     other = np.asarray(brdf.render(MATERIAL, scene()))
     options = {"mask": mask, "weight": weight}
-    whole = fitting.fit([pixels, other], scene(), **options)
+    whole = fitting.fit([values, other], scene(), **options)
     with brdf.ImageReader(path) as reader:
         same(fitting.fit([reader, other], scene(), **options), whole)
 
@@ -119,7 +118,7 @@ def test_mask_weight_and_several_pictures(tmp_path: Path):
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".exr"])
 def test_clipping_is_found_across_bands(tmp_path: Path, suffix: str, monkeypatch):
     # Of a picture in memory alone.
-    monkeypatch.setattr("fitting.front_door.without_cut_noise", lambda result, *_: result)
+    monkeypatch.setattr(core, "without_censored_noise", lambda result, *_: result)
     path = tmp_path / f"target{suffix}"
     brdf.write_image(path, np.minimum(picture() * 1.5, 1.0))
     whole = fitting.fit(brdf.read_picture(path), scene())
@@ -139,7 +138,7 @@ def test_surface_points_in_place_of_a_camera(tmp_path: Path):
 
 
 def test_large_file_is_shown_by_some_of_its_pixels(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(observation, "SHOWN_PIXELS", 30)
+    monkeypatch.setattr(pixels, "SHOWN_PIXELS", 30)
     path = tmp_path / "target.exr"
     brdf.write_image(path, picture(0.0))
     with brdf.ImageReader(path) as reader:
@@ -201,8 +200,8 @@ def test_points_that_carry_pixel_areas_are_looked_at_whole():
     )
     place = scene(camera=camera)
     mapped = scene(camera=None, shapes=[], points=place.surface_points())
-    pixels = np.asarray(brdf.render(material, mapped))
-    found = fitting.fit(pixels, mapped, model="blinn-phong").material
+    values = np.asarray(brdf.render(material, mapped))
+    found = fitting.fit(values, mapped, model="blinn-phong").material
     assert isinstance(found, brdf.BlinnPhong)
     np.testing.assert_allclose(found.n, 20000.0, rtol=1e-3)
 

@@ -1,0 +1,84 @@
+"""What the pixels see of the highlight."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from fitting.solver.normal_equations import AnyArray, Picture
+
+# A highlight on fewer pixels, counted by the squares of its values, is sampled too coarsely to trust its shape.
+FEW_PIXELS = 4.0
+# The pixel nearest to a highlight's centre shows less than this of it: the highlight falls between pixels.
+OFF_CENTRE = 0.5
+
+
+class Highlight(NamedTuple):
+    """What the pixels see of the highlight.
+
+    Attributes:
+        largest: value of the lobe in any pixel.
+        pixels: how many carry it: the sum of its squares over the largest square, added up over pictures.
+        peak: logarithm of the lobe's cosine in the pixel nearest to its centre.
+        centre: how much of the lobe's peak that pixel shows, 0 to 1.
+    """
+
+    largest: float
+    pixels: float
+    peak: float
+    centre: float
+
+    @property
+    def smaller_than_pixel(self) -> bool:
+        """Too few pixels see it to tell its shape."""
+        return self.pixels < FEW_PIXELS or self.centre < OFF_CENTRE
+
+
+def highlight(pictures: Sequence[Picture], n: float) -> Highlight:
+    """Measure the highlight.
+
+    Args:
+        pictures: with a lobe.
+        n: exponent.
+    """
+    largest, pixels, peak = 0.0, 0.0, -math.inf
+    for picture in pictures:
+        if picture.lobe is not None:
+            value, squares, nearest = (float(v) for v in _measured(picture, np.asarray(n)))
+            largest, peak = max(largest, value), max(peak, nearest)
+            # Squares of a highlight that no pixel sees fall below the smallest number.
+            pixels += squares / value**2 if squares > 0 and value**2 > 0 else 0.0
+    peak = min(peak, 0.0)
+    return Highlight(largest, pixels, peak, math.exp(n * peak))
+
+
+def nearest_peak(pictures: Sequence[Picture]) -> float:
+    """Logarithm of the lobe's cosine in the pixel nearest to its centre; 0 without a lobe.
+
+    Args:
+        pictures: with or without a lobe.
+    """
+    return max((float(_nearest_peak(picture)) for picture in pictures if picture.lobe is not None), default=0.0)
+
+
+def _where_counted(picture: Picture, values: Array, otherwise: float) -> Array:
+    if picture.weight is None:
+        return values
+    return jnp.where(jnp.any(picture.weight.reshape(values.shape[0], -1) > 0, axis=1), values, otherwise)
+
+
+@eqx.filter_jit
+def _nearest_peak(picture: Picture) -> Array:
+    assert picture.lobe is not None
+    return jnp.max(_where_counted(picture, picture.lobe.peak(), -jnp.inf))
+
+
+@eqx.filter_jit
+def _measured(picture: Picture, n: AnyArray) -> tuple[Array, Array, Array]:
+    assert picture.lobe is not None
+    value = _where_counted(picture, jnp.max(picture.lobe(jnp.asarray(n))[0], axis=1), 0)
+    return jnp.max(value), jnp.sum(value * value), _nearest_peak(picture)
