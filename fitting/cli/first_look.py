@@ -10,7 +10,7 @@ import brdf
 from brdf.errors import InputError
 from brdf.files import input_file, read_text
 from fitting.cli.picture_options import PictureOptions, encoding_of
-from fitting.photographs.circle import Circle, ball_normals, find_circle, parse_circle
+from fitting.photographs.ball import Circle, ball_normals, find_circle, parse_circle
 
 
 def is_archive(targets: list[Path]) -> bool:

@@ -1,9 +1,8 @@
 """Arrays in files, ``.npy`` and ``.npz``: sizes are checked before memory is taken, and nothing is unpickled."""
 
-import tokenize
+import math
 import warnings
 import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -12,70 +11,42 @@ import numpy as np
 from brdf.errors import InputError
 from brdf.files import input_file
 
-# What an archive may unpack to: 8 GiB of values, as for pictures.
-MOST_BYTES = 1 << 33
-ARCHIVE = ("images", "normal", "light_dirs")
-
-# What NumPy and zipfile raise for a header that is none: it is read as a Python literal.
-_DAMAGE = (
-    ValueError,
-    OSError,
-    EOFError,
-    TypeError,
-    OverflowError,
-    SyntaxError,
-    SystemError,  # what Python 3.13 makes of a header with a null byte
-    tokenize.TokenError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
-# What zipfile raises for an archive that it cannot read: RuntimeError is one with a password.
-_DAMAGED_ARCHIVE = (
-    zipfile.BadZipFile,
-    zipfile.LargeZipFile,
-    zlib.error,
-    OSError,
-    EOFError,
-    NotImplementedError,
-    RuntimeError,
-)
+# What an archive may unpack to: 8 GiB of values, as for pictures; and how far Deflate can expand its bytes.
+MOST_BYTES, EXPANSION = 1 << 33, 1032
+REQUIRED, OPTIONAL = ("images", "normal", "light_dirs"), ("light_intensities", "mask")
 
 
-def read_array(file: Any, place: object, size: int) -> np.ndarray:
+def read_array(file: Any, where: object, size: int) -> np.ndarray:
     """An array from NumPy's format: its claims are held against the size of the file before memory is taken.
 
     Args:
         file: open for reading bytes.
-        place: the file, for messages.
+        where: the file, for messages.
         size: of the file in bytes.
 
     Raises:
         InputError: where it holds no plain numbers or is damaged.
     """
+    damaged = "The file is damaged; make it again"
     try:
+        headers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
         version = np.lib.format.read_magic(file)
-        if version not in ((1, 0), (2, 0)):
-            raise InputError(place, f"is of NumPy's format {version}", "Save it with numpy.save")
-        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        if version not in headers:
+            raise InputError(where, f"is of NumPy's format {version}", "Save it with numpy.save")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of what a damaged header looks like as Python
-            shape, fortran, kind = read(file)
-        count = 1
-        for length in shape:
-            count *= length
-        if kind.hasobject or kind.kind not in "biuf":
-            raise InputError(place, f"holds {kind}, not numbers", "Save plain arrays")
-        if not 0 <= count * kind.itemsize <= min(size, MOST_BYTES):
-            raise InputError(place, f"claims {count} values in {size} bytes", "The file is damaged; make it again")
-        content = file.read(count * kind.itemsize)
-        if len(content) < count * kind.itemsize:
-            raise InputError(place, "ends before its last value", "The file is damaged; make it again")
-        return np.frombuffer(content, kind).reshape(shape, order="F" if fortran else "C")
-    except _DAMAGE as error:
-        if isinstance(error, InputError):
-            raise
-        reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
-        raise InputError(place, f"is no array ({reason})", "The file is damaged; make it again") from None
+            shape, fortran, kind = headers[version](file)
+        if kind.kind not in "biuf":
+            raise InputError(where, f"holds {kind}, not numbers", "Save plain arrays")
+        count = math.prod(shape)
+        if not 0 <= count * kind.itemsize <= size:
+            raise InputError(where, f"claims {count} values in {size} bytes", damaged)
+        return np.frombuffer(file.read(count * kind.itemsize), kind).reshape(shape, order="F" if fortran else "C")
+    except InputError:
+        raise
+    except Exception as error:  # NumPy reads the header as Python: a damaged one raises what its parser does
+        reason = str(error).partition("\n")[0][:120] or type(error).__name__
+        raise InputError(where, f"is no array ({reason})", damaged) from None
 
 
 def read_archive(path: Path) -> dict[str, np.ndarray]:
@@ -89,18 +60,20 @@ def read_archive(path: Path) -> dict[str, np.ndarray]:
     """
     try:
         with zipfile.ZipFile(input_file(path)) as archive:
-            sizes = {info.filename: info.file_size for info in archive.infolist()}
-            missing = [name for name in ARCHIVE if f"{name}.npy" not in sizes]
+            sizes = {info.filename.removesuffix(".npy"): info.file_size for info in archive.infolist()}
+            missing = [name for name in REQUIRED if name not in sizes]
             if missing:
-                remedy = f"Photographs need {', '.join(ARCHIVE)}, and may have light_intensities and mask"
+                remedy = f"Photographs need {', '.join(REQUIRED)}, and may have {' and '.join(OPTIONAL)}"
                 raise InputError(path, f"holds no array {missing[0]}", remedy)
-            wanted = [name for name in (*ARCHIVE, "light_intensities", "mask") if f"{name}.npy" in sizes]
-            if sum(sizes[f"{name}.npy"] for name in wanted) > min(MOST_BYTES, 1032 * path.stat().st_size + (1 << 20)):
+            wanted = [name for name in (*REQUIRED, *OPTIONAL) if name in sizes]
+            if sum(sizes[name] for name in wanted) > min(MOST_BYTES, EXPANSION * path.stat().st_size + (1 << 20)):
                 raise InputError(path, "claims more than can be in it", "The file is damaged; make it again")
             arrays = {}
             for name in wanted:
                 with archive.open(f"{name}.npy") as file:
-                    arrays[name] = read_array(file, f"{path}: {name}", sizes[f"{name}.npy"])
+                    arrays[name] = read_array(file, f"{path}: {name}", sizes[name])
             return arrays
-    except _DAMAGED_ARCHIVE as error:
+    except InputError:
+        raise
+    except Exception as error:  # damaged, cut short, with a password, of an unknown method
         raise InputError(path, f"is no readable archive ({type(error).__name__})", "Save it with numpy.savez") from None

@@ -44,12 +44,12 @@ def read_directions(path: str | Path, count: int | None = None) -> Float[np.ndar
     Raises:
         InputError: naming file and line.
     """
-    rows = _number_rows(path)
-    for number, row in rows:
+    rows = _read_rows(path, count)
+    for line, row in rows.items():
         if len(row) != 3 or not any(row):
             came = f"must be three numbers that are not all 0, got {row}"
-            raise InputError(f"{path}: line {number}", came, "Give x y z of the direction towards the light")
-    return _as_many(path, [row for _, row in rows], count)
+            raise InputError(line, came, "Give x y z of the direction towards the light")
+    return np.array(list(rows.values()))
 
 
 def read_intensities(path: str | Path, count: int | None = None) -> Float[np.ndarray, "K C"]:
@@ -62,29 +62,28 @@ def read_intensities(path: str | Path, count: int | None = None) -> Float[np.nda
     Raises:
         InputError: naming file and line.
     """
-    rows = _number_rows(path)
-    for number, row in rows:
-        if len(row) != len(rows[0][1]) or min(row) < 0 or not any(row):
-            came = f"must be {len(rows[0][1])} numbers of 0 or more, got {row}"
-            raise InputError(f"{path}: line {number}", came, "Give the intensity of each channel")
-    return _as_many(path, [row for _, row in rows], count)
+    rows = _read_rows(path, count)
+    channels = len(next(iter(rows.values())))
+    for line, row in rows.items():
+        if len(row) != channels or min(row) < 0 or not any(row):
+            came = f"must be {channels} numbers of 0 or more, got {row}"
+            raise InputError(line, came, "Give the intensity of each channel")
+    return np.array(list(rows.values()))
 
 
-def _number_rows(path: str | Path) -> list[tuple[int, list[float]]]:
-    rows = []
+def _read_rows(path: str | Path, count: int | None) -> dict[str, list[float]]:
+    """The numbers of each line, by what a message calls it."""
+    rows = {}
     for number, line in enumerate(read_text(path, MOST_BYTES).splitlines(), start=1):
-        text = line.partition("#")[0].strip()
+        text = line.partition("#")[0].replace(",", " ").strip()
         if text:
-            place = f"{path}: line {number}"
-            rows.append((number, parse_numbers(text, place, len(text.replace(",", " ").split()), "plain numbers")))
-    if len(rows) > 1 and len(rows[0][1]) == 1 and len(rows[1][1]) > 1 and rows[0][1][0] == len(rows) - 1:
-        rows = rows[1:]
+            where = f"{path}: line {number}"
+            rows[where] = parse_numbers(text, where, len(text.split()), "plain numbers")
     if not rows:
         raise InputError(path, "holds no numbers", "Give a line per picture")
-    return rows
-
-
-def _as_many(path: str | Path, rows: list[list[float]], count: int | None) -> np.ndarray:
+    first, *others = rows
+    if others and len(rows[first]) == 1 < len(rows[others[0]]) and rows[first][0] == len(others):
+        del rows[first]
     if count is not None and len(rows) != count:
         raise InputError(path, f"has {len(rows)} lines for {count} pictures", "Give a line per picture")
-    return np.array(rows)
+    return rows

@@ -11,8 +11,8 @@ from fitting.budget.deviation import parameter_deviation
 from fitting.budget.trials import Bench
 from fitting.censored_noise import BLACK, WHITE, without_censored_noise
 from fitting.cli.main import main
-from fitting.photographs.ball import ball_points, photograph_scene
-from fitting.photographs.circle import Circle
+from fitting.photographs.ball import Circle, ball_points
+from fitting.photographs.distant_light import photograph_scene
 
 SIZE = 96
 POINTS = ball_points((SIZE, SIZE), Circle(47.5, 47.5, 44.0))

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 import brdf
-from fitting.photographs.circle import Circle
+from fitting.photographs.ball import Circle
 
 BALL = Circle(30.3, 24.8, 21.6)
 SHAPE = (52, 60)

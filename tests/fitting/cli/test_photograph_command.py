@@ -17,8 +17,7 @@ import brdf
 from brdf.images.encoding import encode
 from fitting.cli import encoding_trial
 from fitting.cli.job import Job
-from fitting.photographs.ball import ball_points
-from fitting.photographs.circle import Circle
+from fitting.photographs.ball import Circle, ball_points
 from fitting.photographs.light_files import read_directions
 
 

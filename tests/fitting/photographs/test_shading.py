@@ -5,12 +5,13 @@ import pytest
 from ball_pictures import angle
 
 from brdf.errors import InputError
-from fitting.photographs.circle import Circle, ball_normals
-from fitting.photographs.shading import GUESS, LIT, fit_shading
+from fitting.photographs.ball import Circle, ball_normals
+from fitting.photographs.distant_light import GUESS, LIT, fit_shading
 
 SIDE = 90
-NORMAL, INSIDE = ball_normals((SIDE, SIDE), Circle(44.3, 44.8, 42.0))
-PLACE, NORMAL = np.argwhere(INSIDE), NORMAL[INSIDE]
+NORMAL = ball_normals((SIDE, SIDE), Circle(44.3, 44.8, 42.0))
+PLACE = np.argwhere(np.any(NORMAL != 0, axis=2))
+NORMAL = NORMAL[tuple(PLACE.T)]
 FRONT, ASIDE, BEHIND = (0.4, 0.3, 0.87), (0.8, -0.6, 0.05), (-0.7, 0.5, -0.5)
 
 
@@ -55,7 +56,7 @@ def test_the_light_is_as_far_off_as_the_error_says(surface):
             found = fit_shading(
                 clean + 0.02 * rng.standard_normal(len(clean)), NORMAL, PLACE, ambient="ambient" in surface
             )
-            shares.append(angle(found.light, light) / found.error)
+            shares.append(angle(found.direction, light) / found.error)
     # 15 angles in two directions know their mean square to 30 % or so, its root to 15 %.
     assert 0.65 < np.sqrt(np.mean(np.square(shares))) < 1.4
 
@@ -68,7 +69,7 @@ def test_residuals_that_go_together_over_a_block_count_as_one():
         for _ in range(12):
             stained = shown(light) * (1 + 0.05 * rng.standard_normal((12, 12))[rows, columns])
             found = fit_shading(stained, NORMAL, PLACE)
-            shares.append(angle(found.light, light) / found.error)
+            shares.append(angle(found.direction, light) / found.error)
     assert 0.7 < np.sqrt(np.mean(np.square(shares))) < 1.35
 
 
@@ -78,7 +79,8 @@ def test_the_unit_of_the_values_does_not_matter(unit, k_s):
     noise = 1e-3 * np.random.default_rng(4).standard_normal(len(NORMAL))
     value = shown(FRONT, k_s=k_s, n=40.0) + noise
     one, other = fit_shading(value, NORMAL, PLACE), fit_shading(unit * value, NORMAL, PLACE)
-    np.testing.assert_allclose(other.light, unit * one.light, rtol=1e-9)
+    np.testing.assert_allclose(other.direction, one.direction, rtol=1e-9)
+    assert other.strength == pytest.approx(unit * one.strength, rel=1e-9)
     assert other.error == pytest.approx(one.error, rel=1e-9)
 
 
