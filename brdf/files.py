@@ -10,9 +10,11 @@ import os
 import secrets
 import shutil
 import stat
+import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from brdf.errors import InputError
 
@@ -283,6 +285,22 @@ def read_text(path: str | os.PathLike[str], most: int = MAX_TEXT_BYTES) -> str:
     if "\0" in text:
         raise InputError(os.fspath(path), "is not UTF-8 text (it holds null bytes)", "Give a text file, saved as UTF-8")
     return text
+
+
+def read_toml(path: str | os.PathLike[str], most: int = MAX_TEXT_BYTES) -> dict[str, Any]:
+    """Read a TOML file.
+
+    Args:
+        path: the file.
+        most: how many bytes it may have.
+
+    Raises:
+        InputError: if the file cannot be read, is too large or is not TOML.
+    """
+    try:
+        return tomllib.loads(read_text(path, most))
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise InputError(path, f"is not TOML ({error})", "Correct the file") from None
 
 
 def parse_number(word: str) -> float:

@@ -2,14 +2,13 @@
 
 import dataclasses
 import json
-import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from brdf.checks import direction_value
 from brdf.errors import InputError
-from brdf.files import read_text
+from brdf.files import read_toml
 from brdf.geometry.base import Shape
 from brdf.geometry.camera import CAMERAS
 from brdf.geometry.rectangle import Rectangle
@@ -38,7 +37,7 @@ LIGHTS: dict[str, type[Light]] = {
 POSITION_LAYERS = ("position", "P")
 # Longer lists are no spectrum, no polygon that anybody draws.
 MOST_NUMBERS = 4096
-_MOST_BYTES = 1 << 22
+MOST_BYTES = 1 << 22
 NORMAL_LAYERS = ("normal", "sh_normal", "N")
 VIEW_LAYERS = ("to_view",)
 
@@ -130,11 +129,11 @@ def _tables(place: str, values: Any) -> list[_Table]:
     return [_Table(f"{place}[{index}]", value) for index, value in enumerate(values)]
 
 
-def load_scene(path: str | Path, within: str | Path | None = None) -> Scene:
-    """Read a scene file; see `Scene.load`."""
+def load_scene(path: str | Path, within: str | Path | None = None, tables: dict[str, Any] | None = None) -> Scene:
+    """Read a scene file; see `Scene.load`. ``tables`` are what is in it, where it has been parsed already."""
     path = Path(path)
     folder = Folder(path.parent, path.parent if within is None else Path(within))
-    values = _read_toml(path)
+    values = read_toml(path, MOST_BYTES) if tables is None else tables
     root = _Table(str(path), values)
     place = f"{path}: "
     camera, shapes, points, ambient, lights, masks, has_position = None, [], None, None, [], [], True
@@ -171,13 +170,6 @@ def load_scene(path: str | Path, within: str | Path | None = None) -> Scene:
         return Scene(camera=camera, shapes=shapes, points=points, ambient=ambient, lights=lights, visibility=visibility)
     except InputError as error:
         raise error.inside(str(path)) from None
-
-
-def _read_toml(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(read_text(path, _MOST_BYTES))
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise InputError(path, f"is not TOML ({error})", "Correct the file") from None
 
 
 def _file(table: _Table, key: str, folder: Folder, example: str) -> Path:

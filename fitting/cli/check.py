@@ -6,10 +6,10 @@ from typing import Annotated, Any
 
 import typer
 
+import brdf
 from brdf.errors import InputError
 from brdf.files import atomic_path
-from fitting.cli.common import show, use_compilation_cache, waiting
-from fitting.cli.interrupts import held
+from fitting.cli.common import find_materials, show, use_compilation_cache, waiting
 
 EXAMPLE = (
     "Example: [bold]brdf check material.json[/bold]\n\n"
@@ -29,16 +29,14 @@ def check(
     plot: Annotated[Path | None, typer.Option(help="A picture of albedo, lobe and reciprocity to write.")] = None,
 ) -> int:
     """Is a material plausible: positive, reciprocal, energy conserving? Exit 0 if so, 1 if not, 2 if it cannot tell."""
-    with waiting("checking"):
-        with held():
-            use_compilation_cache()
-            import brdf.plausibility
-            from fitting.cli.materials import find_materials
+    from brdf.measured.loading import is_measured
 
-        is_table = brdf.is_measured(material)
+    with waiting("checking"):
+        is_table = is_measured(material)
         if is_table and plot is not None:
             remedy = f"Fit a material to it with brdf fit {material} --out DIR, and check DIR/material.json"
             raise InputError("--plot", f"draws materials, and {material} is a measured table", remedy)
+        use_compilation_cache()
         materials: dict[str, Any] = (
             {Path(material).stem: brdf.load_measured(material)} if is_table else find_materials(material)
         )
@@ -49,8 +47,8 @@ def check(
             from fitting.report.material_plots import overview
 
             with atomic_path(plot) as path:
-                name, one = next(iter(materials.items()))
-                overview(one, reports[name]).savefig(path)
+                for name, one in materials.items():
+                    overview(one, reports[name]).savefig(path)
     if as_json:
         show(json.dumps({name: report.to_json() for name, report in reports.items()}, indent=2))
     else:

@@ -1,32 +1,171 @@
-"""What the commands share: a spinner, output, errors that name what was typed, the compiler's cache."""
+"""What the commands share: options, errors that name what was typed, materials, output, the compiler's cache.
+
+Help does not import JAX or NumPy; each command imports what it needs.
+"""
 
 import contextlib
+import difflib
+import functools
+import inspect
 import os
 import sys
+import typing
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NamedTuple
 
+import typer
+
+import brdf
 from brdf.errors import InputError
 
 # As `fitting.fit` takes them; help is shown without importing it.
 MODEL_NAMES = ("auto", "lambert", "phong", "blinn-phong", "normalized-phong", "normalized-blinn-phong")
 
 
-@contextlib.contextmanager
-def named_as(arguments: dict[str, Any]) -> Iterator[None]:
-    """Let an error name the file or option that a person typed, not the argument of the function behind it.
+def _encoding(text: str) -> Any:
+    """A gamma as a number."""
+    with contextlib.suppress(ValueError):
+        return float(text)
+    return text
+
+
+Encoding = Annotated[
+    Any,
+    typer.Option(
+        help="linear, srgb or a gamma; default: what the file says.",
+        rich_help_panel="What the pictures show",
+        parser=_encoding,
+        metavar="TEXT",
+    ),
+]
+
+
+def _option(said: str, *names: str) -> Any:
+    return typer.Option(*names, help=said, rich_help_panel="What the pictures show")
+
+
+class PictureOptions(NamedTuple):
+    """What the options say of the pictures, as typed; None where not given. Their help is their description."""
+
+    scene: Annotated[Path | None, _option("The scene file; in a folder, scene.toml.")] = None
+    within: Annotated[
+        Path | None, _option("The folder that paths in the scene file may not leave; default: its own.")
+    ] = None
+    sphere: Annotated[
+        str | None,
+        _option("A ball in the photograph: x,y,radius in pixels from the upper left one, or mask: found in --mask."),
+    ] = None
+    normals: Annotated[
+        Path | None, _option("Normals of the pixels: an image or .npy; x right, y up, z to the camera.")
+    ] = None
+    light: Annotated[
+        str | None, _option("Towards the light: x,y,z (right, up, to the camera), or fit: from the shading.")
+    ] = None
+    lights: Annotated[Path | None, _option("A text file with such a direction for each picture.")] = None
+    intensities: Annotated[Path | None, _option("A text file with the light's intensity for each picture.")] = None
+    ambient: Annotated[
+        bool, _option("A photograph is lit from all around too: find k_a for that light as 1.", "--ambient")
+    ] = False
+    encoding: Encoding = None
+    exposure: Annotated[str | None, _option("Relative exposure to divide by, one or one each.")] = None
+    mask: Annotated[Path | None, _option("An image: pixels that are 0 there are left out.")] = None
+    saturation: Annotated[float | None, _option("Linear values from here on are clipped, not data.")] = None
+
+
+def as_command(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A command whose errors name the options that were typed, not the arguments of the functions behind.
+
+    In place of a parameter ``pictures`` it takes an option for each field of `PictureOptions`.
 
     Args:
-        arguments: what was typed, by argument.
+        function: what the command does.
+    """
+    parameters = {name: one.replace(kind=one.KEYWORD_ONLY) for name, one in _parameters(function).items()}
+    takes_pictures = parameters.pop("pictures", None) is not None
+    if takes_pictures:
+        hints = typing.get_type_hints(PictureOptions, include_extras=True)
+        for name, default in PictureOptions._field_defaults.items():
+            option = inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=hints[name])
+            parameters[name] = option
+
+    @functools.wraps(function)
+    def command(**given: Any) -> Any:
+        typed = {name: value if isinstance(value, Path) else f"--{name}" for name, value in given.items()}
+        typed |= {"circle": "--sphere"}
+        for argument in ("target", "material"):
+            typed.pop(argument, None)
+        if takes_pictures:
+            given["pictures"] = PictureOptions(**{name: given.pop(name) for name in PictureOptions._fields})
+        with named_as(typed):
+            return function(**given)
+
+    command.__signature__ = inspect.Signature([*parameters.values()])  # pyright: ignore[reportAttributeAccessIssue]
+    return command
+
+
+def _parameters(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
+    return dict(inspect.signature(function).parameters)
+
+
+@contextlib.contextmanager
+def named_as(typed: dict[str, Any]) -> Iterator[None]:
+    """Let an error name the file or option that a person typed.
+
+    Args:
+        typed: by the argument that the error would name.
     """
     try:
         yield
     except InputError as error:
-        typed = arguments.get(error.where)
-        if typed is None:
+        if error.where not in typed:
             raise
-        raise InputError(typed, error.what, error.remedy) from None
+        raise InputError(typed[error.where], error.what, error.remedy) from None
+
+
+def find_material(text: str, name: str | None = None) -> tuple["brdf.Material", str]:
+    """One material, and what it is called.
+
+    Args:
+        text: a file, or a name of the classic table such as emerald; a file goes before a name.
+        name: which one, where an MTL file holds several.
+
+    Raises:
+        InputError: naming the file or the option.
+    """
+    key = _table_name(text)
+    if key is None:
+        return brdf.load_material(text, name), name or Path(text).stem
+    if name is not None:
+        raise InputError("--name", f"chooses from a file, and {key} is one material", "Leave it out")
+    return brdf.preset(key), key
+
+
+def find_materials(text: str) -> dict[str, "brdf.Material"]:
+    """Every material of a file, or the one of the classic table, by name.
+
+    Args:
+        text: see `find_material`.
+
+    Raises:
+        InputError: naming the file.
+    """
+    key = _table_name(text)
+    return brdf.load_materials(text) if key is None else {key: brdf.preset(key)}
+
+
+def _table_name(text: str) -> str | None:
+    """The name in the classic table; None where a file is meant."""
+    if not text.strip():
+        raise InputError("MATERIAL", "is empty", "Give a .json or .mtl file, or a name such as emerald")
+    path, key = Path(text), text.strip().lower().replace(" ", "_").replace("-", "_")
+    if key in brdf.PRESETS and not path.is_file():
+        return key
+    if path.suffix or path.exists():
+        return None
+    close = difflib.get_close_matches(key, brdf.PRESETS)
+    remedy = f"The table has {' and '.join(close)}" if close else f"Give a file, or one of {', '.join(brdf.PRESETS)}"
+    raise InputError(text, "is no material file and no name of the classic table", remedy)
 
 
 def use_compilation_cache() -> None:
@@ -40,23 +179,17 @@ def use_compilation_cache() -> None:
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
-@contextlib.contextmanager
-def waiting(what: str) -> Iterator[Callable[[str], None]]:
+def waiting(what: str) -> contextlib.AbstractContextManager[Any]:
     """A spinner where a person waits; nothing where standard error is no terminal.
 
     Args:
         what: is being done.
-
-    Yields:
-        A function that says what is being done now.
     """
     if not sys.stderr.isatty():
-        yield lambda now: None
-        return
+        return contextlib.nullcontext()
     from rich.console import Console
 
-    with Console(stderr=True).status(f"{what} ...") as status:
-        yield lambda now: status.update(f"{now} ...")
+    return Console(stderr=True).status(f"{what} ...")
 
 
 def show(text: str) -> None:

@@ -5,7 +5,8 @@ from typing import Annotated
 
 import typer
 
-from fitting.cli.common import show
+import brdf
+from fitting.cli.common import find_material, show
 
 EXAMPLE = (
     "Example: [bold]brdf convert material.json material.gltf[/bold]\n\n"
@@ -25,14 +26,6 @@ def convert(
     name: Annotated[str | None, typer.Option(help="Which material, where an MTL file holds several.")] = None,
 ) -> None:
     """Write a material as three.js, glTF, Mitsuba, PyTorch3D, GLSL or Wavefront read it, and say what is lost."""
-    import brdf
-    from fitting.cli.materials import find_material
-
     loaded, called = find_material(material, name)
-    try:
-        export = brdf.save_export(loaded, out, to=to, name="_".join(called.split()))
-    except brdf.InputError as error:
-        if error.where == "to":
-            raise brdf.InputError("--to", error.what, error.remedy) from None
-        raise
+    export = brdf.save_export(loaded, out, to=to, name="_".join(called.split()))
     show("\n".join([f"wrote {out}", *(f"  not carried: {loss}" for loss in export.losses)]))

@@ -1,4 +1,4 @@
-"""Pictures that do not say how they are encoded: which of two readings the model explains.
+"""Pictures that do not say how they are encoded: which of two interpretations the model explains.
 
 A silent file of 8 bits is taken as sRGB, one of more bits as linear (`brdf.images.encoding`). Neither is known, and
 the wrong one bends every shade. Under the right one the model that is fitted leaves less, so both are tried. What each
@@ -6,7 +6,6 @@ leaves is compared in the codes of the file, the same numbers under both, with t
 """
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,114 +16,105 @@ import fitting
 from brdf.errors import InputError
 from brdf.images.encoding import encode
 from fitting.cli.common import named_as
-from fitting.cli.job import Job
+from fitting.cli.inputs import FitInputs, Given, collect
 from fitting.result import FitResult
 
-# The other reading is taken where it leaves less than this share of the squares that the assumed one leaves...
+# The other encoding is taken where it leaves less than this share of the squares that the assumed one leaves...
 LESS = 0.9
 # ... and one of them is no guess where it leaves less than this share of what the other leaves.
 CLEARLY = 0.5
-_NAMES = {"srgb": "sRGB"}
 
 
-def fit_either(
-    read: dict[Path, brdf.Picture], collect: Callable[[dict[Path, brdf.Picture]], Job], how: dict[str, Any]
-) -> tuple[FitResult, tuple[str, ...]]:
-    """Fit, where a file does not say how it is encoded under both readings.
+def fit_either(given: Given, how: dict[str, Any]) -> tuple[FitResult, tuple[str, ...]]:
+    """Fit, where a file does not say how it is encoded under both interpretations.
 
     Args:
-        read: pictures by file, as assumed.
-        collect: makes a job of them.
+        given: to the command.
         how: further arguments of `fitting.fit`; seconds are shared by the two fits.
 
     Returns:
-        The fit to keep, with a warning where the reading is a guess or was changed; and the notes of its job.
+        The fit to keep, with a warning where the encoding is a guess or was changed; and what to tell of its inputs.
 
     Raises:
         InputError: naming the file or option.
     """
-    silent = [path for path, picture in read.items() if picture.source == "assumed"]
+    silent = {path: picture for path, picture in given.pictures.items() if picture.source == "assumed"}
     if silent and how.get("seconds") is not None:
         how = how | {"seconds": how["seconds"] / 2}
-    job = collect(read)
-    result = _fit(job, how)
+    inputs = collect(given, given.pictures)
+    result = _fit(inputs, how)
     if not silent:
-        return result, job.notes
+        return result, inputs.notes
     try:
-        other = collect(read | {path: brdf.read_picture(path, encoding=_other(read[path])) for path in silent})
-        other_result = _fit(other, how)
+        others = {path: brdf.read_picture(path, encoding=_other(picture)) for path, picture in silent.items()}
+        other_inputs = collect(given, given.pictures | others)
+        other = _fit(other_inputs, how)
     except InputError:
-        return result, job.notes  # the other reading cannot be fitted at all
-    is_other, warning = judge((job, other), _on_same_pixels(result, other_result))
+        return result, inputs.notes  # under the other encoding it cannot be fitted at all
+    # To be compared where both count: each leaves out what under its own encoding is cut off.
+    both = [mine & its for mine, its in zip(result.counted, other.counted, strict=True)]
+    common = both if all(counted.any() for counted in both) else None
+    shares = unexplained(inputs, result, common), unexplained(other_inputs, other, common)
+    is_other, warning = judge(inputs.target, next(iter(silent.values())), shares)
     if is_other:
-        job, result = other, other_result
+        result, inputs = other, other_inputs
     warnings = (*result.warnings, warning) if warning else result.warnings
-    return dataclasses.replace(result, warnings=warnings), job.notes
+    return dataclasses.replace(result, warnings=warnings), inputs.notes
 
 
-def _fit(job: Job, how: dict[str, Any]) -> FitResult:
-    several = len(job.pictures) > 1
-    with named_as({"target": job.target}):
-        if several:
-            return fitting.fit(job.pictures, job.scenes, mask=job.masks, **how)
-        return fitting.fit(job.pictures[0], job.scenes[0], mask=job.masks[0], **how)
+def _fit(inputs: FitInputs, how: dict[str, Any]) -> FitResult:
+    with named_as({"target": inputs.target}):
+        if len(inputs.pictures) == 1:
+            return fitting.fit(inputs.pictures[0], inputs.scenes[0], mask=inputs.masks[0], **how)
+        return fitting.fit(inputs.pictures, inputs.scenes, mask=inputs.masks, **how)
 
 
 def _other(picture: brdf.Picture) -> Any:
     return "srgb" if picture.encoding == "linear" else "linear"
 
 
-def unexplained(job: Job, result: FitResult) -> tuple[float, float]:
-    """What a fit leaves of the codes in the files: sums of squares of the deviations and of the codes, full scale 1.
+def unexplained(inputs: FitInputs, result: FitResult, counted: list[np.ndarray] | None) -> float:
+    """What a fit leaves of the codes in the files: the share of their squares.
 
     Args:
-        job: what was fitted.
+        inputs: what was fitted.
         result: the fit of it.
+        counted: pixels to compare in each picture; None for those that the fit counts.
     """
     left = total = 0.0
-    for picture, scene, counted in zip(job.pictures, result.scenes, result.counted, strict=True):
-        model = np.asarray(brdf.render(result.material, scene), np.float32)
+    for picture, scene, some in zip(inputs.pictures, result.scenes, counted or result.counted, strict=True):
+        model = np.broadcast_to(brdf.render(result.material, scene), picture.pixels.shape)
         codes, fitted = (
-            encode(np.ascontiguousarray((values / picture.factor)[counted], np.float32), picture.encoding)
-            for values in (picture.pixels, np.broadcast_to(model, picture.pixels.shape))
+            encode(np.ascontiguousarray((values / picture.factor)[some], np.float32), picture.encoding)
+            for values in (picture.pixels, model)
         )
-        deviation = codes.astype(np.float64) - fitted
-        left += float(np.sum(deviation**2)) + deviation.size * (picture.code_step or 0.0) ** 2 / 12
+        left += (
+            float(np.sum((codes.astype(np.float64) - fitted) ** 2)) + codes.size * (picture.code_step or 0) ** 2 / 12
+        )
         total += float(np.sum(codes.astype(np.float64) ** 2))
-    return left, total
+    return left / total
 
 
-def _on_same_pixels(one: FitResult, other: FitResult) -> tuple[FitResult, FitResult]:
-    """Both, to be compared where both count: each leaves out what its own reading calls cut off."""
-    both = [mine & its for mine, its in zip(one.counted, other.counted, strict=True)]
-    if not all(np.any(counted) for counted in both):
-        return one, other
-    return dataclasses.replace(one, counted=both), dataclasses.replace(other, counted=both)
-
-
-def judge(jobs: tuple[Job, Job], results: tuple[FitResult, FitResult]) -> tuple[bool, str]:
-    """Which of two readings to keep, and what to say about it.
+def judge(target: Path, picture: brdf.Picture, shares: tuple[float, float]) -> tuple[bool, str]:
+    """Which of two encodings to keep, and what to say about it.
 
     Args:
-        jobs: as assumed, and the other way.
-        results: of both.
+        target: the first file.
+        picture: one that does not say how it is encoded, as assumed.
+        shares: what is left as assumed, and the other way.
 
     Returns:
         Whether it is the other one; and a warning, empty where the pictures speak clearly for what was assumed.
     """
-    shares = [left / total for left, total in (unexplained(*pair) for pair in zip(jobs, results, strict=True))]
-    picture = next(one for one in jobs[0].pictures if one.source == "assumed")
-    assumed, other = (_NAMES.get(str(one), str(one)) for one in (picture.encoding, _other(picture)))
-    left, other_left = (f"{100 * share**0.5:.{2 if share < 0.99 else 3}g} %" for share in shares)
-    silent = f"{jobs[0].target.name} does not say how its values are encoded"
-    leaves = "the fit is off by {} of the values in the file (rms), under {} by {}"
-    if shares[1] < CLEARLY * shares[0]:
-        told = leaves.format(other_left, assumed, left)
-        return True, f"{silent}: read as {other}, under which {told}. Where you know better, say so with --encoding"
-    if shares[1] < LESS * shares[0]:
-        told = leaves.format(other_left, assumed, left)
-        return True, f"{silent}: {other} is a guess. Under it {told}. Where you know, say so with --encoding"
-    if shares[0] < CLEARLY * shares[1]:
+    assumed, other = shares
+    if assumed < CLEARLY * other:
         return False, ""
-    told = leaves.format(left, other, other_left)
-    return False, f"{silent}: {assumed} is a guess. Under it {told}. Where you know, say so with --encoding"
+    is_other, is_clear = other < LESS * assumed, other < CLEARLY * assumed
+    names = ["sRGB" if one == "srgb" else str(one) for one in (picture.encoding, _other(picture))]
+    left = [f"{100 * share**0.5:.{2 if share < 0.99 else 3}g} %" for share in shares]
+    (taken, refused), (least, most) = (names[::-1], left[::-1]) if is_other else (names, left)
+    reads = f"read as {taken}, under which" if is_clear else f"{taken} is a guess. Under it"
+    off = f"the fit is off by {least} of the values in the file (rms), under {refused} by {most}"
+    know = "Where you know better" if is_clear else "Where you know"
+    silent = f"{target.name} does not say how its values are encoded"
+    return is_other, f"{silent}: {reads} {off}. {know}, say so with --encoding"

@@ -4,16 +4,15 @@ import dataclasses
 import json
 import shlex
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+import brdf
+from brdf.errors import InputError
 from brdf.files import check_folder, write_text
-from fitting.cli.common import MODEL_NAMES, named_as, show, use_compilation_cache, waiting
-from fitting.cli.interrupts import held
-from fitting.cli.picture_options import PictureOptions, takes_picture_options
+from fitting.cli.common import MODEL_NAMES, PictureOptions, named_as, show, use_compilation_cache, waiting
 
 EXAMPLE = "\n\n".join(
     [
@@ -26,7 +25,6 @@ EXAMPLE = "\n\n".join(
 LOSS_NAMES = "squared, relative, log, huber or cauchy; for a measured BRDF cosine (its default), squared or log"
 
 
-@takes_picture_options
 def fit(
     target: Annotated[
         list[Path],
@@ -53,41 +51,39 @@ def fit(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")] = False,
 ) -> None:
     """Fit a model to a picture: value ± error of every parameter, with no guess to give."""
-    import brdf
+    from brdf.measured.loading import is_measured
 
     if plot and out is None:
-        raise brdf.InputError("--plot", "needs a folder to draw into", "Add --out DIR")
+        raise InputError("--plot", "needs a folder to draw into", "Add --out DIR")
     if report is not None and report.suffix.lower() not in (".html", ".htm"):
-        raise brdf.InputError(report, "is no name of a page", "Name it .html")
+        raise InputError(report, "is no name of a page", "Name it .html")
     if out is not None:
         # Told now instead of after the fit.
         check_folder(out)
     notes: tuple[str, ...] = ()
-    with waiting("fitting") as tell:
-        with held():
-            import brdf.images.reading
-        if len(target) == 1 and brdf.is_measured(target[0]):
+    with waiting("fitting"):
+        if len(target) == 1 and is_measured(target[0]):
             given = any(option is not None for option in (dark, noise, accuracy, seconds, report))
             if given or plausible or plot or precision != "float32" or pictures != PictureOptions():
                 came = "is a measured BRDF; of the options only --model, --loss, --out and --json concern it"
-                raise brdf.InputError(target[0], came, "Leave the others out")
+                raise InputError(target[0], came, "Leave the others out")
             result = _fit_table(target[0], model, loss or "cosine")
         else:
-            how = {
-                "model": model,
-                "precision": precision,
-                "saturation": pictures.saturation,
-                "dark": dark,
-                "noise": noise,
-                "plausible": plausible,
-                "loss": loss or "squared",
-                "accuracy": accuracy,
-                "seconds": seconds,
-            }
-            with named_as({name: f"--{name}" for name in how} | pictures.names()):
-                result, notes = _fit_pictures(target, pictures, tell, **how)
+            result, notes = _fit_pictures(
+                target,
+                pictures,
+                model=model,
+                precision=precision,
+                saturation=pictures.saturation,
+                dark=dark,
+                noise=noise,
+                plausible=plausible,
+                loss=loss or "squared",
+                accuracy=accuracy,
+                seconds=seconds,
+            )
         if out is not None:
-            _save(result, out, **({"plot": True} if plot else {}))
+            result.save(out, **({"plot": True} if plot else {}))
         if report is not None:
             from fitting.report.html import report_page
 
@@ -96,55 +92,34 @@ def fit(
     if as_json:
         show(json.dumps(result.to_dict() | ({"notes": notes} if notes else {}), indent=2))
         return
-    show("\n".join([*notes, str(result)]))
-    if out is not None:
-        show(f"saved in {out}")
-    if report is not None:
-        show(f"wrote {report}")
+    saved = [] if out is None else [f"saved in {out}"]
+    written = [] if report is None else [f"wrote {report}"]
+    show("\n".join([*notes, str(result), *saved, *written]))
 
 
 def _fit_table(path: Path, model: str, loss: str) -> Any:
-    import brdf
-
     table = brdf.load_measured(path)
-    with named_as({"model": "--model", "loss": "--loss", table.name: path}):
-        with held():
-            use_compilation_cache()
-            import fitting
+    use_compilation_cache()
+    import fitting
 
-            fit_brdf = fitting.fit_brdf
-        return fit_brdf(table, model, loss=loss)  # pyright: ignore[reportArgumentType]  # refused there
+    with named_as({table.name: path}):
+        return fitting.fit_brdf(table, model, loss=loss)  # pyright: ignore[reportArgumentType]  # refused there
 
 
 def _fit_pictures(
-    target: list[Path], pictures: PictureOptions, tell: Callable[[str], None], *, noise: str | None, **how: Any
+    target: list[Path], pictures: PictureOptions, *, noise: str | None, **how: Any
 ) -> tuple[Any, tuple[str, ...]]:
     """The fit, and what was found out on the way."""
-    from fitting.cli.first_look import read_first
+    from fitting.cli.inputs import read_inputs
+    from fitting.photographs.light_files import parse_numbers
 
-    # Pictures are read before JAX is imported: a damaged one is told at once.
-    read = read_first(target, pictures, tell)
-    tell("fitting")
-    with held():
-        use_compilation_cache()
-        from fitting.budget.first_pixels import single_fit
-        from fitting.cli.encoding_trial import fit_either
-        from fitting.cli.inputs import collect
-        from fitting.photographs.light_files import parse_numbers
+    given = read_inputs(target, pictures)
+    use_compilation_cache()
+    from fitting.budget.first_pixels import single_fit
+    from fitting.cli.encoding_trial import fit_either
 
-    numbers = None if noise is None else parse_numbers(noise, "--noise", 2, "READ,SHOT")
-    how["noise"] = None if numbers is None else (numbers[0], numbers[1])
+    how["noise"] = None if noise is None else tuple(parse_numbers(noise, "--noise", 2, "READ,SHOT"))
     with single_fit():
-        result, notes = fit_either(read, lambda reading: collect(target, pictures, reading), how)
-    names = tuple(path.name for path in read)
+        result, notes = fit_either(given, how)
+    names = tuple(path.name for path in given.pictures)
     return (dataclasses.replace(result, names=names) if len(names) == len(result.targets) else result), notes
-
-
-def _save(result: Any, out: Path, **how: bool) -> None:
-    import brdf
-
-    try:
-        result.save(out, **how)
-    except brdf.InputError as error:
-        # What is gone by now was the place where the files wait until they are complete.
-        raise brdf.InputError(error.where if Path(error.where).exists() else out, error.what, error.remedy) from None

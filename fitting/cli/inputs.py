@@ -1,31 +1,387 @@
-"""What the command is given: a picture with its scene, photographs of a ball, a photometric-stereo archive."""
+"""What the command is given: a picture with its scene, photographs of a ball, a photometric-stereo archive.
+
+`read_inputs` refuses, before JAX is imported, which takes longer than reading a picture, what does not go together;
+`collect` makes pictures and scenes of the rest.
+"""
 
 from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
 
 import brdf
-from fitting.cli.first_look import is_archive, is_photograph, target_and_scene
-from fitting.cli.job import Job, exposed, opaque
-from fitting.cli.photograph_inputs import archive, photographs
-from fitting.cli.picture_options import PictureOptions
+from brdf.errors import InputError
+from brdf.files import input_file, read_toml
+from fitting.cli.common import PictureOptions, named_as
+from fitting.photographs.archives import read_archive, read_array
+from fitting.photographs.ball import ball_normals, ball_points, find_circle, parse_circle
+from fitting.photographs.light_files import parse_numbers, read_directions, read_intensities
+
+# A light from so far behind leaves a crescent of less than three fifths of the ball's radius. On a thin one ambient
+# light and a highlight can be taken for each other and for shading, and the jackknife does not see that.
+BEHIND = -0.4
+THIN_CRESCENT = " (it comes from behind: a highlight on the thin crescent can turn it by several times that)"
 
 
-def collect(targets: list[Path], options: PictureOptions, read: dict[Path, brdf.Picture]) -> Job:
-    """What the command was given, ready to fit.
+class Given(NamedTuple):
+    """What was typed, read as far as that needs no JAX.
+
+    Attributes:
+        targets: the files of the pictures, or the archive.
+        options: what they show.
+        pictures: by file; none for an archive.
+        scene: the scene file and its tables, where there is one.
+    """
+
+    targets: list[Path]
+    options: PictureOptions
+    pictures: dict[Path, brdf.Picture]
+    scene: tuple[Path, dict[str, Any]] | None = None
+
+
+class FitInputs(NamedTuple):
+    """Pictures and scenes to fit.
+
+    Attributes:
+        pictures: as many as scenes.
+        scenes: what they show.
+        masks: pixels that count in each, or None for all.
+        target: the first picture's file, for messages.
+        notes: what was found out on the way, for the person who waits.
+    """
+
+    pictures: list[brdf.Picture]
+    scenes: list["brdf.Scene"]
+    masks: list[np.ndarray | None]
+    target: Path
+    notes: tuple[str, ...] = ()
+
+
+def read_inputs(targets: list[Path], options: PictureOptions) -> Given:
+    """Read the pictures, and refuse those that cannot be what the options or the scene file say.
 
     Args:
-        targets: pictures, one folder, or one archive.
-        options: see there; checked.
-        read: the pictures, as `read_first` read them.
+        targets: what was given: pictures, a folder or an archive.
+        options: what they show.
 
     Raises:
         InputError: naming the file or option.
     """
-    if is_archive(targets):
-        return archive(targets[0], options)
-    if is_photograph(options):
-        return photographs(targets, options, read)
-    target, scene = target_and_scene(targets[0], options.scene)
+    _check_options(targets, options)
+    for beside in (options.mask, options.normals, options.lights, options.intensities):
+        if beside is not None:
+            input_file(beside)
+    if _is_archive(targets):
+        return Given(targets, options, {})
+    scene, circle, resolution = None, None, None
+    if options.sphere is not None:
+        circle = None if options.sphere == "mask" else parse_circle(options.sphere)
+    elif options.normals is None:
+        target, file = _target_and_scene(targets[0], options.scene)
+        targets, scene = [target], (file, read_toml(file))
+        camera = scene[1].get("camera")
+        resolution = camera.get("resolution") if isinstance(camera, dict) else None
+    pictures = {path: brdf.read_picture(path, encoding=options.encoding) for path in targets}
+    shapes = sorted({picture.pixels.shape for picture in pictures.values()})
+    height, width, _ = shapes[0]
+    sizes = ", ".join(f"{shape[1]} x {shape[0]} x {shape[2]}" for shape in shapes)
+    came = f"and the others differ in size ({sizes})"
+    _require(len(shapes) == 1, targets[0], came, "Give pictures of one camera")
+    if isinstance(resolution, list) and resolution != [width, height] and all(type(side) is int for side in resolution):
+        came = f"is {width} x {height}, the scene's camera {' x '.join(map(str, resolution))}"
+        raise InputError(targets[0], came, "Give a picture and a camera of the same resolution")
+    if circle is not None:
+        ball_normals((height, width), circle)
+    return Given(targets, options, pictures, scene)
+
+
+def _is_archive(targets: list[Path]) -> bool:
+    return len(targets) == 1 and targets[0].suffix.lower() == ".npz"
+
+
+def _require(fine: Any, where: object, came: str, remedy: str) -> None:
+    if not fine:
+        raise InputError(where, came, remedy)
+
+
+def _check_options(targets: list[Path], options: PictureOptions) -> None:
+    """Refuse options that do not belong together."""
+    lights = ("light", "lights", "intensities")
+    if _is_archive(targets):
+        came, remedy = f"is what {targets[0].name} says itself", "Leave it out"
+        for name in ("scene", "sphere", "normals", *lights, "encoding"):
+            _require(getattr(options, name) is None, f"--{name}", came, remedy)
+    elif options.sphere is not None or options.normals is not None:
+        remedy = "Give one of them"
+        _require(options.scene is None, "--scene", "says what --sphere or --normals says too", remedy)
+        _require(None in (options.sphere, options.normals), "--normals", "says what --sphere says too", remedy)
+        fine = (options.light is None) != (options.lights is None)
+        came, remedy = "or --lights has to say where the light is", "Give x,y,z, fit, or a file of directions"
+        _require(fine, "--light", came, remedy)
+    else:
+        came = "says where the light is, but nothing what the picture shows"
+        for name in lights:
+            _require(getattr(options, name) is None, f"--{name}", came, "Add --sphere x,y,radius")
+        remedy = "Leave it out, or add [ambient] to the scene"
+        _require(not options.ambient, "--ambient", "is what the scene file says", remedy)
+        remedy = "Several pictures are fitted with --sphere or --normals, and --lights"
+        _require(len(targets) == 1, "--sphere", f"{len(targets)} pictures come without their geometry", remedy)
+
+
+def _target_and_scene(target: Path, scene: Path | None) -> tuple[Path, Path]:
+    """The picture and the scene file that a file, or a folder with both, stands for."""
+    if not target.is_dir():
+        input_file(target)
+        remedy = "Add --scene SCENE.toml, or --sphere for a photo of a ball"
+        _require(scene, target, "comes without a scene", remedy)
+    else:
+        candidates = sorted(path for path in target.glob("target.*") if path.is_file())
+        _require(candidates, target, "has no file target.*", "Give the picture, or a folder that holds it")
+        came = f"has several targets, {', '.join(path.name for path in candidates)}"
+        _require(len(candidates) == 1, target, came, "Name the picture instead of the folder")
+        scene = scene or target / "scene.toml"
+        target = candidates[0]
+    assert scene is not None
+    return target, scene
+
+
+def collect(given: Given, read: dict[Path, brdf.Picture]) -> FitInputs:
+    """What the command was given, ready to fit.
+
+    Args:
+        given: as `read_inputs` read it.
+        read: its pictures, or other interpretations of their files.
+
+    Raises:
+        InputError: naming the file or option.
+    """
+    targets, options = given.targets, given.options
+    if _is_archive(targets):
+        return _archive(targets[0], options)
     mask = None if options.mask is None else brdf.read_mask(options.mask)
-    loaded = brdf.Scene.load(scene, within=options.within)
-    pictures = exposed([read[target]], options.exposure)
-    return Job(pictures, [loaded], opaque(mask, pictures), target)
+    pictures = _exposed([read[target] for target in targets], options.exposure)
+    masks = visible(mask, pictures)
+    if given.scene is None:
+        return _photographs(targets, options, pictures, mask, masks)
+    from brdf.scene_file import load_scene
+
+    file, tables = given.scene
+    return FitInputs(pictures, [load_scene(file, options.within, tables)], masks, targets[0])
+
+
+def _exposed(pictures: list[brdf.Picture], exposure: str | None) -> list[brdf.Picture]:
+    """Pictures in one unit, by one relative exposure or one for each, as typed."""
+    if exposure is None:
+        return pictures
+    count = len(exposure.replace(",", " ").split())
+    count = count if count == len(pictures) else 1
+    factors = parse_numbers(exposure, "--exposure", count, "one number, or one each")
+    came, remedy = f"must be above 0, got {exposure[:60]!r}", "Give a relative exposure time"
+    _require(min(factors) > 0, "--exposure", came, remedy)
+    factors = factors * (len(pictures) // count)
+    return [picture.scaled(1.0 / factor) for picture, factor in zip(pictures, factors, strict=True)]
+
+
+def visible(mask: np.ndarray | None, pictures: list[brdf.Picture]) -> list[np.ndarray | None]:
+    """Pixels that count in each picture: those of the mask without the fully transparent ones, which show nothing.
+
+    Args:
+        mask: (H, W), or None.
+        pictures: where alpha is 0 everywhere it was not meant.
+    """
+    masks = []
+    for picture in pictures:
+        opaque = None if picture.alpha is None or not picture.alpha.any() else picture.alpha > 0
+        if opaque is None or (mask is not None and mask.shape != opaque.shape):
+            masks.append(mask)
+        else:
+            masks.append(opaque if mask is None else opaque & mask)
+    return masks
+
+
+def ball_in(
+    shape: tuple[int, int], sphere: str, mask: np.ndarray | None
+) -> tuple["brdf.SurfacePoints", Any, tuple[str, ...]]:
+    """What the pixels see of the ball that --sphere names, its circle, and what to tell where a mask showed it.
+
+    Args:
+        shape: height and width of the picture.
+        sphere: "x,y,radius" or "mask".
+        mask: true on the ball.
+
+    Raises:
+        InputError: where there is no mask, no ball in it, or none in the picture.
+    """
+    if sphere != "mask":
+        circle = parse_circle(sphere)
+        return ball_points(shape, circle), circle, ()
+    if mask is None:
+        raise InputError("--sphere", "is to be found in the mask, but there is none", "Add --mask MASK.png")
+    circle = find_circle(mask)
+    found = f"ball found at {circle.x:.2f},{circle.y:.2f},{circle.radius:.2f}"
+    return ball_points(shape, circle), circle, (found,)
+
+
+def _photographs(
+    targets: list[Path],
+    options: PictureOptions,
+    pictures: list[brdf.Picture],
+    mask: np.ndarray | None,
+    masks: list[np.ndarray | None],
+) -> FitInputs:
+    """Photographs of one size under one distant light each."""
+    count, (height, width, channels), notes = len(targets), pictures[0].pixels.shape, ()
+    if options.sphere is not None:
+        points, _, notes = ball_in((height, width), options.sphere, mask)
+    else:
+        assert options.normals is not None
+        normal = _read_normals(options.normals)
+        came = f"is {normal.shape[1]} x {normal.shape[0]}, the pictures {width} x {height}"
+        _require(normal.shape[:2] == (height, width), options.normals, came, "Give a normal for each pixel")
+        points = brdf.SurfacePoints.from_normals(normal)
+    if options.lights is not None:
+        directions = read_directions(options.lights, count)
+    elif options.light == "fit":
+        found = [light_of(*one, points, options) for one in zip(targets, pictures, masks, strict=True)]
+        directions = np.array([light.direction for light in found])
+        mean = sum(light.strength for light in found) / count
+        for target, light in zip(targets, found, strict=True):
+            brighter = f", {100 * (light.strength / mean - 1):+.1f} % bright" if count > 1 else ""
+            direction = ",".join(f"{value:.4f}" for value in light.direction)
+            notes += (f"light of {target.name} from its shading: {direction} {stated_error(light)}{brighter}",)
+    else:
+        direction = parse_numbers(options.light or "", "--light", 3, "x,y,z: x right, y up, z to the camera; or fit")
+        _require(any(direction), "--light", "must not have zero length, got 0,0,0", "Give a direction")
+        directions = np.tile(direction, (count, 1))
+    intensities = np.ones((count, 1))
+    if options.intensities is not None:
+        intensities = read_intensities(options.intensities, count)
+        came = f"has {intensities.shape[1]} numbers a line, the pictures {channels} channels"
+        fine = intensities.shape[1] in (1, channels)
+        _require(fine, options.intensities, came, "Give one intensity per channel")
+    return FitInputs(*_of_intensity_1(pictures, points, directions, intensities, options), masks, targets[0], notes)
+
+
+def light_of(
+    target: Path,
+    picture: brdf.Picture,
+    mask: np.ndarray | None,
+    points: "brdf.SurfacePoints",
+    options: PictureOptions,
+) -> Any:
+    """The light of a photograph from its shading, a `fitting.photographs.distant_light.ShadingLight`.
+
+    Args:
+        target: the file.
+        picture: of it.
+        mask: pixels that count, as `visible` gives them, or None.
+        points: what its pixels see.
+        options: what it shows.
+
+    Raises:
+        InputError: naming the file.
+    """
+    from fitting.photographs.distant_light import light_from_shading
+
+    with named_as({"picture": target}):
+        how = {"saturation": options.saturation, "mask": mask, "ambient": options.ambient}
+        return light_from_shading(picture, points, **how)
+
+
+def stated_error(light: Any) -> str:
+    """What to say of the error of a light's direction.
+
+    Args:
+        light: as the shading tells it.
+    """
+    return f"± {light.error:.2g}°{THIN_CRESCENT if light.direction[2] < BEHIND else ''}"
+
+
+def _of_intensity_1(
+    pictures: list[brdf.Picture],
+    points: "brdf.SurfacePoints",
+    directions: np.ndarray,
+    intensities: np.ndarray,
+    options: PictureOptions,
+) -> tuple[list[brdf.Picture], list["brdf.Scene"]]:
+    """Pictures as under light of intensity 1, so that every photograph counts alike however bright its light was.
+
+    Ambient light is taken to be the same in all of them, and its intensity, which nobody knows, as 1.
+    """
+    from fitting.photographs.distant_light import photograph_scene
+
+    around = np.ones((len(pictures), 1))
+    if np.all(intensities > 0):
+        pictures = [picture.scaled(1.0 / intensity) for picture, intensity in zip(pictures, intensities, strict=True)]
+        intensities, around = around, 1.0 / intensities
+    scenes = [
+        photograph_scene(points, direction, intensity, ambient=ambient if options.ambient else None)
+        for direction, intensity, ambient in zip(directions, intensities, around, strict=True)
+    ]
+    return pictures, scenes
+
+
+def _read_normals(path: Path) -> np.ndarray:
+    """Normals (H, W, 3) from an .npy file, or from a picture: floats as they are, codes as 2 v - 1."""
+    if path.suffix.lower() == ".npy":
+        with input_file(path).open("rb") as file:
+            normal = read_array(file, path, path.stat().st_size)
+        if normal.ndim != 3 or normal.shape[2] != 3 or normal.dtype.kind not in "fiu":
+            raise InputError(path, f"is of shape {normal.shape} and type {normal.dtype}", "Give normals (H, W, 3)")
+        return normal.astype(np.float64)
+    picture = brdf.read_picture(path, encoding="linear")
+    if picture.pixels.shape[2] != 3:
+        raise InputError(path, f"has {picture.pixels.shape[2]} channels instead of 3", "Give an image of normals")
+    if picture.saturation is None:
+        return picture.pixels
+    normal = 2.0 * picture.pixels - 1.0
+    # A code of 0 in all channels, and those around the middle, are how tools write "no surface".
+    empty = np.all(picture.pixels == 0, axis=-1) | (np.sum(normal * normal, axis=-1) < 0.25)
+    return np.where(empty[..., None], 0.0, normal)
+
+
+def _archive(path: Path, options: PictureOptions) -> FitInputs:
+    """Photographs with normals and lights: images (K, H, W[, C]), normal (H, W, 3), light_dirs (K, 3).
+
+    And where there are: light_intensities (K, C), mask (H, W). Unsigned images span their type.
+    """
+    arrays = read_archive(path)
+    images, normal, directions = arrays["images"], arrays["normal"], arrays["light_dirs"]
+    remedy = "Save unsigned integers, which span their type, or floats"
+    came = f"holds {images.dtype}, of which it is not clear what is white"
+    _require(images.dtype.kind not in "bi", f"{path}: images", came, remedy)
+    images = images[..., None] if images.ndim == 3 else images
+    remedy = "Give (pictures, height, width, channels)"
+    _require(images.ndim == 4 and images.size > 0, f"{path}: images", f"is of shape {images.shape}", remedy)
+    count, *shape, channels = images.shape
+    _require(normal.shape == (*shape, 3), f"{path}: normal", f"is of shape {normal.shape}", f"Give {(*shape, 3)}")
+    fine = directions.shape == (count, 3) and directions.dtype.kind == "f" and np.all(np.isfinite(directions))
+    remedy = "Give a direction per picture"
+    _require(fine, f"{path}: light_dirs", f"is no finite array {(count, 3)}", remedy)
+    _require(np.all(np.any(directions != 0, axis=1)), f"{path}: light_dirs", "has a direction of zero length", remedy)
+    intensities = arrays.get("light_intensities", np.ones(count)).astype(np.float64)
+    intensities = intensities[:, None] if intensities.ndim == 1 else intensities
+    fine = intensities.shape in ((count, 1), (count, channels)) and np.all(np.isfinite(intensities))
+    came, remedy = f"is no finite array {(count, channels)}", "Give an intensity per picture and channel"
+    _require(fine, f"{path}: light_intensities", came, remedy)
+    remedy = "Give intensities of 0 or more"
+    _require(np.all(intensities >= 0), f"{path}: light_intensities", "has values below 0", remedy)
+    mask = arrays.get("mask") if options.mask is None else brdf.read_mask(options.mask)
+    if mask is not None and options.mask is None:
+        mask = mask != 0
+        _require(mask.shape == (*shape,), f"{path}: mask", f"is of shape {mask.shape}", f"Give {(*shape,)}")
+    points = brdf.SurfacePoints.from_normals(normal, mask=mask)
+    came = "has no normal" if mask is None else "has no normal inside the mask"
+    _require(np.any(points.mask), f"{path}: normal", came, "Give a direction (x, y, z) where the surface is")
+    pictures = _exposed([_as_picture(image) for image in images], options.exposure)
+    inputs = _of_intensity_1(pictures, points, directions, intensities, options)
+    return FitInputs(*inputs, [None] * count, path)
+
+
+def _as_picture(image: np.ndarray) -> brdf.Picture:
+    """An array as the picture it would be in a file: linear, integers with their largest code."""
+    bits = 8 * image.dtype.itemsize
+    if image.dtype.kind != "u":
+        return brdf.Picture(image.astype(np.float32), None, "linear", "format", bits, None)
+    pixels = (image / float((1 << bits) - 1)).astype(np.float32)
+    return brdf.Picture(pixels, None, "linear", "format", bits, 1.0)

@@ -2,10 +2,11 @@
 
 Python raises `KeyboardInterrupt` wherever it happens to be. Inside a callback of the garbage collector (JAX has one),
 of a weak reference or a finaliser it is printed and forgotten, and the command goes on; inside a library that is
-loading it can end the process with a fault.
+loading it can end the process with a fault. In both cases the signal is sent again a little later.
 """
 
 import contextlib
+import os
 import signal
 import sys
 import threading
@@ -13,71 +14,46 @@ from collections.abc import Iterator
 from types import FrameType
 from typing import Any
 
-# Callbacks of the collector take microseconds; in seconds.
-_AGAIN = 0.005
-_held = 0
-_pending = False
-_number: int = signal.SIGINT
+# In seconds; callbacks of the collector take microseconds, modules some milliseconds.
+LATER = 0.01
 
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
-    """Within the block Ctrl-C or SIGTERM ends the command, once. Where somebody else handles them, nothing changes."""
-    alone = threading.current_thread() is threading.main_thread()
-    if not alone or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+    """Within the block Ctrl-C or SIGTERM raises `KeyboardInterrupt`, its argument the number of the signal.
+
+    Where somebody else handles them, nothing changes.
+    """
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
-    alarm = signal.signal(signal.SIGALRM, _interrupt) if hasattr(signal, "SIGALRM") else None
-    signal.signal(signal.SIGINT, _interrupt)
-    # Else what waits to be complete would stay where it was written.
-    ended = signal.getsignal(signal.SIGTERM)
-    if ended is signal.SIG_DFL:
-        signal.signal(signal.SIGTERM, _interrupt)
-    forgotten = sys.unraisablehook
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    ours = [number for number, own in handlers.items() if own in (signal.default_int_handler, signal.SIG_DFL)]
+    hook, ended = sys.unraisablehook, threading.Event()
 
-    def again(unraisable: Any) -> None:
-        if isinstance(unraisable.exc_value, KeyboardInterrupt) and alarm is not None:
-            signal.setitimer(signal.ITIMER_REAL, _AGAIN)
+    def send_later(number: int) -> None:
+        threading.Timer(LATER, lambda: ended.is_set() or os.kill(os.getpid(), number)).start()
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        while frame is not None:
+            if frame.f_code.co_filename.startswith("<frozen importlib"):
+                return send_later(number)
+            frame = frame.f_back
+        raise KeyboardInterrupt(number)
+
+    def unraisable(lost: Any) -> None:
+        if isinstance(lost.exc_value, KeyboardInterrupt) and lost.exc_value.args:
+            send_later(*lost.exc_value.args)
         else:
-            forgotten(unraisable)
+            hook(lost)
 
-    sys.unraisablehook = again
+    sys.unraisablehook = unraisable
+    for number in ours:
+        signal.signal(number, interrupt)
     try:
         yield
     finally:
-        sys.unraisablehook = forgotten
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        if ended is signal.SIG_DFL:
-            signal.signal(signal.SIGTERM, ended)
-        if alarm is not None:
-            signal.setitimer(signal.ITIMER_REAL, 0)
-            signal.signal(signal.SIGALRM, alarm)
-
-
-@contextlib.contextmanager
-def held() -> Iterator[None]:
-    """Within the block Ctrl-C waits until its end: around imports of compiled libraries."""
-    global _held, _pending
-    _held += 1
-    try:
-        yield
-    finally:
-        _held -= 1
-    if _pending and not _held:
-        _pending = False
-        raise KeyboardInterrupt
-
-
-def exit_status() -> int:
-    """What shells expect of a command that a signal ended: 130 after Ctrl-C, 143 after SIGTERM."""
-    return 128 + _number
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    global _pending, _number
-    if number in (signal.SIGINT, signal.SIGTERM):
-        _number = number
-    if _held:
-        _pending = True
-    else:
-        raise KeyboardInterrupt
+        ended.set()
+        sys.unraisablehook = hook
+        for number in ours:
+            signal.signal(number, handlers[number])

@@ -5,11 +5,10 @@ from typing import Annotated
 
 import typer
 
+import brdf
 from brdf.errors import InputError
 from brdf.files import write_text
-from fitting.cli.common import named_as, show
-from fitting.cli.interrupts import held
-from fitting.cli.picture_options import ENCODINGS, PictureOptions, encoding_of
+from fitting.cli.common import Encoding, PictureOptions, named_as, show
 
 EXAMPLE = "Example: [bold]brdf lights chrome.*.png --sphere 253.5,148,119.5 --out lights.txt[/bold]"
 
@@ -26,7 +25,7 @@ def lights(
         typer.Option(help="An image: pixels that are 0 there are left out; for --sphere mask those beside the ball."),
     ] = None,
     out: Annotated[Path | None, typer.Option(help="A text file to write: a direction a line.")] = None,
-    encoding: Annotated[str | None, typer.Option(help=ENCODINGS)] = None,
+    encoding: Encoding = None,
     matt: Annotated[
         bool, typer.Option("--matt", help="The ball is matt: its shading tells the light, not a highlight.")
     ] = False,
@@ -41,30 +40,24 @@ def lights(
     for name, given in (("--ambient", ambient), ("--saturation", saturation is not None)):
         if given and not matt:
             raise InputError(name, "says nothing of a mirror ball's highlight", "Leave it out, or add --matt")
-    with held():
-        import brdf.images.reading
-        from fitting.cli.first_look import check_ball, find_ball
-        from fitting.cli.job import opaque
-        from fitting.cli.photograph_inputs import how_sure, light_of
-        from fitting.photographs.ball import ball_points, light_from_highlight
-    options = PictureOptions(sphere=sphere, mask=mask, ambient=ambient, encoding=encoding, saturation=saturation)
-    with named_as(options.names()):
-        pictures = [brdf.read_picture(path, encoding=encoding_of(encoding)) for path in target]
+    pictures = [brdf.read_picture(path, encoding=encoding) for path in target]
     inside = None if mask is None else brdf.read_mask(mask)
-    circle, notes = find_ball(sphere, inside, mask)
-    for picture in pictures:
-        check_ball(picture.pixels.shape[:2], circle)
+    from fitting.cli.inputs import ball_in, light_of, stated_error, visible
+    from fitting.photographs.distant_light import light_from_highlight
+
+    options = PictureOptions(ambient=ambient, saturation=saturation)
     lines = []
-    for path, picture, seen in zip(target, pictures, opaque(inside, pictures), strict=True):
-        said = ""
+    for path, picture, counts in zip(target, pictures, visible(inside, pictures), strict=True):
+        points, circle, notes = ball_in(picture.pixels.shape[:2], sphere, inside)
         if matt:
-            light = light_of(path, picture, ball_points(picture.pixels.shape[:2], circle), seen, options)
-            direction, said = light.direction, f"  # {how_sure(light)}"
+            light = light_of(path, picture, counts, points, options)
+            direction, error = light.direction, f"  # {stated_error(light)}"
         else:
-            with named_as({**options.names(), "picture": path}):
-                direction = light_from_highlight(picture, circle, mask=seen)
-        lines.append(" ".join(f"{value:.6f}" for value in direction) + said)
-    text = "\n".join([*(f"# {line}" for line in notes), *lines]) + "\n"
+            with named_as({"picture": path}):
+                direction, error = light_from_highlight(picture, circle, mask=counts), ""
+        lines = lines or [f"# {line}" for line in notes]
+        lines.append(" ".join(f"{value:.6f}" for value in direction) + error)
+    text = "\n".join(lines) + "\n"
     if out is not None:
         write_text(out, text)
     show(text.rstrip() if out is None else f"wrote {out}")

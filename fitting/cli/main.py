@@ -1,22 +1,18 @@
-"""The command ``brdf``: the front door for people who work with files.
-
-Help does not import JAX; each command imports what it needs.
-"""
+"""The command ``brdf``: the front door for people who work with files."""
 
 import importlib.metadata
 import io
+import signal
 import sys
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 
 from brdf.errors import InputError
 from fitting.cli import check, convert, fit, lights, render, tradeoff
-from fitting.cli.common import forget_output, show
-from fitting.cli.interrupts import exit_status, interruptible
+from fitting.cli.common import as_command, forget_output, show
+from fitting.cli.interrupts import interruptible
 
-# What typer turns Ctrl-C into.
-INTERRUPTED = 130
 # What a wrong option raises, wherever typer keeps its parser.
 USAGE_ERROR: type[BaseException] = typer.BadParameter.__mro__[2]
 
@@ -45,12 +41,12 @@ def about(
     """Which few numbers make this surface look like that picture."""
 
 
-app.command(epilog=fit.EXAMPLE)(fit.fit)
-app.command(epilog=lights.EXAMPLE)(lights.lights)
-app.command(epilog=render.EXAMPLE)(render.render)
-app.command(epilog=check.EXAMPLE)(check.check)
-app.command(epilog=convert.EXAMPLE)(convert.convert)
-app.command(epilog=tradeoff.EXAMPLE)(tradeoff.tradeoff)
+app.command(epilog=fit.EXAMPLE)(as_command(fit.fit))
+app.command(epilog=lights.EXAMPLE)(as_command(lights.lights))
+app.command(epilog=render.EXAMPLE)(as_command(render.render))
+app.command(epilog=check.EXAMPLE)(as_command(check.check))
+app.command(epilog=convert.EXAMPLE)(as_command(convert.convert))
+app.command(epilog=tradeoff.EXAMPLE)(as_command(tradeoff.tradeoff))
 
 
 def main(arguments: list[str] | None = None) -> Any:
@@ -62,17 +58,23 @@ def main(arguments: list[str] | None = None) -> Any:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # ± on a terminal that knows ASCII alone
+    command, words = typer.main.get_command(app), sys.argv[1:] if arguments is None else arguments
     try:
-        with interruptible():
-            status = app(args=arguments, prog_name="brdf", standalone_mode=False)
+        with interruptible(), command.make_context("brdf", [*words]) as context:
+            sys.exit(command.invoke(context))
+    except typer.Exit as done:
+        sys.exit(done.exit_code)
     except InputError as error:
         _fail(str(error))
     except USAGE_ERROR as error:
-        if not _words(error):  # no command at all: the help has been shown
+        message = " ".join(error.format_message().split()).rstrip(".")  # pyright: ignore[reportAttributeAccessIssue]
+        if not message:  # no command at all: the help has been shown
             sys.exit(2)
-        _fail(f"{_words(error).rstrip('.')}. See {_command(error)} --help.")
-    except KeyboardInterrupt:
-        _fail("interrupted.", status=exit_status())
+        context = getattr(error, "ctx", None)
+        _fail(f"{message}. See {'brdf' if context is None else context.command_path} --help.")
+    except KeyboardInterrupt as interrupt:
+        # As shells expect it of a command that a signal ended: 130 after Ctrl-C, 143 after SIGTERM.
+        _fail("interrupted.", 128 + (interrupt.args[0] if interrupt.args else signal.SIGINT))
     except BrokenPipeError:
         forget_output()
         sys.exit(1)
@@ -81,22 +83,8 @@ def main(arguments: list[str] | None = None) -> Any:
         if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
             raise
         _fail("memory: there is not enough for this. Use fewer pixels or light samples.")
-    else:
-        if status == INTERRUPTED:
-            _fail("interrupted.", status=exit_status())
-        sys.exit(status if isinstance(status, int) else 0)
 
 
-def _words(error: Any) -> str:
-    return " ".join(error.format_message().split())
-
-
-def _command(error: Any) -> str:
-    """The command, as far as it was understood: brdf fit."""
-    context = getattr(error, "ctx", None)
-    return "brdf" if context is None else context.command_path
-
-
-def _fail(message: str, status: int = 2) -> None:
+def _fail(message: str, status: int = 2) -> NoReturn:
     print(f"error: {message}", file=sys.stderr)  # noqa: T201  # this is the command's one line of failure
     sys.exit(status)

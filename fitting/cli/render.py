@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
-from fitting.cli.common import named_as, show, use_compilation_cache, waiting
-from fitting.cli.interrupts import held
+import brdf
+from fitting.cli.common import find_material, named_as, show, use_compilation_cache, waiting
 
 EXAMPLE = (
     "Example: [bold]brdf render material.json --scene scene.toml -o picture.exr[/bold]\n\n"
@@ -21,15 +21,9 @@ def render(
     precision: Annotated[str, typer.Option(help="float32 or float64.")] = "float32",
 ) -> None:
     """Render a material in a scene."""
-    with waiting("rendering"), named_as({"material": material, "precision": "--precision"}):
-        with held():
-            use_compilation_cache()
-            import numpy as np
-
-            import brdf.rendering
-            from fitting.cli.materials import find_material
-
+    with waiting("rendering"), named_as({"material": material}):
+        use_compilation_cache()
         loaded, _ = find_material(material)
         image = brdf.render(loaded, brdf.Scene.load(scene), precision=precision)  # pyright: ignore[reportArgumentType]
-        brdf.write_image(out, np.asarray(image))
+        brdf.write_image(out, image)
     show(f"wrote {out}")

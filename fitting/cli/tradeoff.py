@@ -3,15 +3,13 @@
 import json
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from brdf.errors import InputError
 from brdf.files import check_folder
-from fitting.cli.common import MODEL_NAMES, named_as, show, use_compilation_cache
-from fitting.cli.interrupts import held
-from fitting.cli.picture_options import PictureOptions, takes_picture_options
+from fitting.cli.common import MODEL_NAMES, PictureOptions, named_as, show, use_compilation_cache
 
 EXAMPLE = (
     "Example: [bold]brdf tradeoff photo.exr --scene scene.toml --out tradeoff/[/bold]\n\n"
@@ -19,7 +17,6 @@ EXAMPLE = (
 )
 
 
-@takes_picture_options
 def tradeoff(
     target: Annotated[
         Path, typer.Argument(help="A picture, a folder with target.* and scene.toml, or a photograph of a ball.")
@@ -36,74 +33,46 @@ def tradeoff(
 
     Ctrl-C ends the measuring and keeps what was measured.
     """
-    from fitting.cli.first_look import read_first
+    from fitting.cli.inputs import collect, read_inputs
 
     if out is not None:
         check_folder(out)
-    options = {"model": model, "accuracy": accuracy, "seconds": seconds}
-    with named_as({name: f"--{name}" for name in options} | pictures.names()):
-        read = read_first([target], pictures, lambda now: None)
-        with held():
-            use_compilation_cache()
-            import fitting
-            from fitting.cli.inputs import collect
+    given = read_inputs([target], pictures)
+    use_compilation_cache()
+    import fitting
 
-            measure = fitting.tradeoff
-        job = collect([target], pictures, read)
-        if len(job.pictures) > 1:
-            came = f"holds {len(job.pictures)} pictures, and one is measured"
-            raise InputError(target, came, "Give one picture with its scene or its light")
-        with named_as({"target": job.target}), _Progress() as progress:
-            found = measure(
-                job.pictures[0],
-                job.scenes[0],
-                mask=job.masks[0],
-                saturation=pictures.saturation,
-                render=render,
-                progress=progress.step,
-                **options,
-            )
-    silent = [path.name for path, picture in read.items() if picture.source == "assumed"]
+    inputs = collect(given, given.pictures)
+    if len(inputs.pictures) > 1:
+        came = f"holds {len(inputs.pictures)} pictures, and one is measured"
+        raise InputError(target, came, "Give one picture with its scene or its light")
+    from rich.console import Console
+    from rich.progress import Progress
+
+    bar = Progress(console=Console(stderr=True), disable=not sys.stderr.isatty())
+    task = bar.add_task("measuring", total=None)
+    with named_as({"target": inputs.target}), bar:
+        found = fitting.tradeoff(
+            inputs.pictures[0],
+            inputs.scenes[0],
+            mask=inputs.masks[0],
+            saturation=pictures.saturation,
+            render=render,
+            model=model,
+            accuracy=accuracy,
+            seconds=seconds,
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
+        )
+    silent = [path.name for path, picture in given.pictures.items() if picture.source == "assumed"]
     guess = [f"{name} does not say how its values are encoded; --encoding decides" for name in silent]
-    notes = [*job.notes, *guess]
+    notes = [*inputs.notes, *guess]
     if out is not None:
         found.save(out)
     if as_json:
         show(json.dumps(found.to_dict() | ({"notes": notes} if notes else {}), indent=2))
         return
-    for note in notes:
-        show(note)
-    _print_table(found)
-    show(found.advice)
-    if out is not None:
-        show(f"saved in {out}")
-
-
-def _print_table(found: Any) -> None:
-    """As wide as the terminal; in a pipe, as wide as it takes."""
-    from rich.console import Console
-
-    Console(width=None if sys.stdout.isatty() else 160).print(found.table())
-
-
-class _Progress:
-    """A bar with the time left, where standard error is a terminal."""
-
-    def __init__(self) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-        columns = (TextColumn("measuring"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-        self.bar = Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty())
-        self.task = self.bar.add_task("measuring", total=None)
-
-    def __enter__(self) -> "_Progress":
-        self.bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.bar.stop()
-
-    def step(self, done: int, total: int) -> None:
-        """So many runs of so many are done."""
-        self.bar.update(self.task, completed=done, total=total)
+    # As wide as the terminal; in a pipe, as wide as it takes.
+    console = Console(width=None if sys.stdout.isatty() else 160)
+    with console.capture() as table:
+        console.print(found.table())
+    saved = [] if out is None else [f"saved in {out}"]
+    show("\n".join([*notes, table.get().rstrip("\n"), found.advice, *saved]))

@@ -200,7 +200,7 @@ def fit_shading(
         found.append((left, mirror, shiny))
     _, mirror, shiny = min(found, key=lambda one: one[0])
     shiny, left, off, _ = _refine(shiny, free, mirror, scale, value, normal, lit)
-    if np.count_nonzero(lit) * np.log(cost / max(left, 1e-300)) > 2 * RISE:
+    if np.count_nonzero(lit) * np.log(max(cost, 1e-300) / max(left, 1e-300)) > 2 * RISE:
         # Lambert's law alone may have looked at pixels that the light does not reach.
         lit = _reached(normal, shiny[:3])
         scale = _bound(off[lit])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from command_runs import refused
 from project_paths import ROOT
-from sound_files import SCENE, scene, sound_files
+from sound_files import sound_files
 
 import brdf
 from fitting.photographs.archives import read_archive
@@ -58,16 +58,6 @@ def test_a_folder_that_cannot_be_written_is_told_before_the_fit(tmp_path, capsys
     (sound_files(tmp_path) / "file").write_text("")
     words = "fit", tmp_path / "missing.exr", "--scene", tmp_path / "scene.toml", "--out", tmp_path / "file"
     refused(capsys, tmp_path, "file: a part of the path is not a folder", *words)
-
-
-def test_a_picture_of_another_size_is_not_read(tmp_path, capsys, monkeypatch):
-    def read(*_, **__):
-        raise AssertionError("read")
-
-    (sound_files(tmp_path) / "scene.toml").write_text(scene("[8, 8]", "[9, 8]", SCENE))
-    monkeypatch.setattr("brdf.images.reading.read_picture", read)
-    words = "fit", tmp_path / "target.exr", "--scene", tmp_path / "scene.toml"
-    refused(capsys, tmp_path, "target.exr: is 8 x 8, the scene's camera 9 x 8", *words)
 
 
 def test_an_archive_whose_compressed_bytes_are_damaged(tmp_path):

@@ -16,7 +16,6 @@ from command_runs import run
 import brdf
 from brdf.images.encoding import encode
 from fitting.cli import encoding_trial
-from fitting.cli.job import Job
 from fitting.photographs.ball import Circle, ball_points
 from fitting.photographs.light_files import read_directions
 
@@ -231,12 +230,9 @@ def test_lights_from_a_mirror_ball_in_one_command(tmp_path, capsys, monkeypatch)
 
 
 @pytest.mark.parametrize("share", [0.2, 0.7, 0.95])
-def test_the_reading_that_leaves_less_is_taken_and_called_a_guess_unless_it_is_clear(share, monkeypatch):
+def test_the_encoding_that_leaves_less_is_taken_and_called_a_guess_unless_it_is_clear(share):
     picture = brdf.Picture(np.ones((2, 2, 1), np.float32), None, "srgb", "assumed", 8, 1.0)
-    jobs = (Job([picture], [], [None], Path("a.png")), Job([picture], [], [None], Path("a.png")))
-    left = iter([(1.0, 100.0), (share, 100.0)])
-    monkeypatch.setattr(encoding_trial, "unexplained", lambda job, result: next(left))
-    is_other, words = encoding_trial.judge(jobs, (Any, Any))
+    is_other, words = encoding_trial.judge(Path("a.png"), picture, (0.01, 0.01 * share))
     assert is_other == (share < 0.9)
     assert ("a guess" in words) == (share >= 0.5)
     assert words.endswith("say so with --encoding")
