@@ -81,31 +81,26 @@ def as_command(function: Callable[..., Any]) -> Callable[..., Any]:
     Args:
         function: what the command does.
     """
-    parameters = {name: one.replace(kind=one.KEYWORD_ONLY) for name, one in _parameters(function).items()}
-    takes_pictures = parameters.pop("pictures", None) is not None
-    if takes_pictures:
+    own = inspect.signature(function)
+    parameters = [one.replace(kind=one.KEYWORD_ONLY) for one in own.parameters.values() if one.name != "pictures"]
+    if "pictures" in own.parameters:
         hints = typing.get_type_hints(PictureOptions, include_extras=True)
-        for name, default in PictureOptions._field_defaults.items():
-            option = inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=hints[name])
-            parameters[name] = option
+        parameters += [
+            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=hints[name])
+            for name, default in PictureOptions._field_defaults.items()
+        ]
 
     @functools.wraps(function)
     def command(**given: Any) -> Any:
-        typed = {name: value if isinstance(value, Path) else f"--{name}" for name, value in given.items()}
-        typed |= {"circle": "--sphere"}
-        for argument in ("target", "material"):
-            typed.pop(argument, None)
-        if takes_pictures:
+        options = {name: value for name, value in given.items() if name not in ("target", "material")}
+        typed = {name: value if isinstance(value, Path) else f"--{name}" for name, value in options.items()}
+        if "pictures" in own.parameters:
             given["pictures"] = PictureOptions(**{name: given.pop(name) for name in PictureOptions._fields})
-        with named_as(typed):
+        with named_as(typed | {"circle": "--sphere"}):
             return function(**given)
 
-    command.__signature__ = inspect.Signature([*parameters.values()])  # pyright: ignore[reportAttributeAccessIssue]
+    command.__signature__ = own.replace(parameters=parameters)  # pyright: ignore[reportAttributeAccessIssue]
     return command
-
-
-def _parameters(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
-    return dict(inspect.signature(function).parameters)
 
 
 @contextlib.contextmanager

@@ -14,7 +14,7 @@ from brdf.errors import InputError
 from brdf.files import input_file, read_toml
 from fitting.cli.common import PictureOptions, named_as
 from fitting.photographs.archives import read_archive, read_array
-from fitting.photographs.ball import ball_normals, ball_points, find_circle, parse_circle
+from fitting.photographs.ball import Circle, ball_normals, ball_points, find_circle, parse_circle
 from fitting.photographs.light_files import parse_numbers, read_directions, read_intensities
 
 # A light from so far behind leaves a crescent of less than three fifths of the ball's radius. On a thin one ambient
@@ -199,27 +199,21 @@ def visible(mask: np.ndarray | None, pictures: list[brdf.Picture]) -> list[np.nd
     return masks
 
 
-def ball_in(
-    shape: tuple[int, int], sphere: str, mask: np.ndarray | None
-) -> tuple["brdf.SurfacePoints", Any, tuple[str, ...]]:
-    """What the pixels see of the ball that --sphere names, its circle, and what to tell where a mask showed it.
+def ball_in(sphere: str, mask: np.ndarray | None) -> tuple[Circle, tuple[str, ...]]:
+    """The ball that --sphere names, and what to tell where it was found in a mask.
 
     Args:
-        shape: height and width of the picture.
         sphere: "x,y,radius" or "mask".
         mask: true on the ball.
 
     Raises:
-        InputError: where there is no mask, no ball in it, or none in the picture.
+        InputError: where there is no mask, or no ball in it.
     """
     if sphere != "mask":
-        circle = parse_circle(sphere)
-        return ball_points(shape, circle), circle, ()
-    if mask is None:
-        raise InputError("--sphere", "is to be found in the mask, but there is none", "Add --mask MASK.png")
+        return parse_circle(sphere), ()
+    _require(mask is not None, "--sphere", "is to be found in the mask, but there is none", "Add --mask MASK.png")
     circle = find_circle(mask)
-    found = f"ball found at {circle.x:.2f},{circle.y:.2f},{circle.radius:.2f}"
-    return ball_points(shape, circle), circle, (found,)
+    return circle, (f"ball found at {circle.x:.2f},{circle.y:.2f},{circle.radius:.2f}",)
 
 
 def _photographs(
@@ -232,13 +226,14 @@ def _photographs(
     """Photographs of one size under one distant light each."""
     count, (height, width, channels), notes = len(targets), pictures[0].pixels.shape, ()
     if options.sphere is not None:
-        points, _, notes = ball_in((height, width), options.sphere, mask)
+        circle, notes = ball_in(options.sphere, mask)
+        points = ball_points((height, width), circle)
     else:
         assert options.normals is not None
-        normal = _read_normals(options.normals)
-        came = f"is {normal.shape[1]} x {normal.shape[0]}, the pictures {width} x {height}"
-        _require(normal.shape[:2] == (height, width), options.normals, came, "Give a normal for each pixel")
-        points = brdf.SurfacePoints.from_normals(normal)
+        with named_as({"normal": options.normals}):
+            points = brdf.SurfacePoints.from_normals(_read_normals(options.normals))
+        came = f"is {points.mask.shape[1]} x {points.mask.shape[0]}, the pictures {width} x {height}"
+        _require(points.mask.shape == (height, width), options.normals, came, "Give a normal for each pixel")
     if options.lights is not None:
         directions = read_directions(options.lights, count)
     elif options.light == "fit":
@@ -325,13 +320,8 @@ def _read_normals(path: Path) -> np.ndarray:
     """Normals (H, W, 3) from an .npy file, or from a picture: floats as they are, codes as 2 v - 1."""
     if path.suffix.lower() == ".npy":
         with input_file(path).open("rb") as file:
-            normal = read_array(file, path, path.stat().st_size)
-        if normal.ndim != 3 or normal.shape[2] != 3 or normal.dtype.kind not in "fiu":
-            raise InputError(path, f"is of shape {normal.shape} and type {normal.dtype}", "Give normals (H, W, 3)")
-        return normal.astype(np.float64)
+            return read_array(file, path, path.stat().st_size)
     picture = brdf.read_picture(path, encoding="linear")
-    if picture.pixels.shape[2] != 3:
-        raise InputError(path, f"has {picture.pixels.shape[2]} channels instead of 3", "Give an image of normals")
     if picture.saturation is None:
         return picture.pixels
     normal = 2.0 * picture.pixels - 1.0
@@ -353,35 +343,29 @@ def _archive(path: Path, options: PictureOptions) -> FitInputs:
     images = images[..., None] if images.ndim == 3 else images
     remedy = "Give (pictures, height, width, channels)"
     _require(images.ndim == 4 and images.size > 0, f"{path}: images", f"is of shape {images.shape}", remedy)
-    count, *shape, channels = images.shape
-    _require(normal.shape == (*shape, 3), f"{path}: normal", f"is of shape {normal.shape}", f"Give {(*shape, 3)}")
-    fine = directions.shape == (count, 3) and directions.dtype.kind == "f" and np.all(np.isfinite(directions))
-    remedy = "Give a direction per picture"
-    _require(fine, f"{path}: light_dirs", f"is no finite array {(count, 3)}", remedy)
-    _require(np.all(np.any(directions != 0, axis=1)), f"{path}: light_dirs", "has a direction of zero length", remedy)
-    intensities = arrays.get("light_intensities", np.ones(count)).astype(np.float64)
+    count, height, width, channels = images.shape
+    intensities = arrays.get("light_intensities", np.ones(count))
     intensities = intensities[:, None] if intensities.ndim == 1 else intensities
-    fine = intensities.shape in ((count, 1), (count, channels)) and np.all(np.isfinite(intensities))
-    came, remedy = f"is no finite array {(count, channels)}", "Give an intensity per picture and channel"
-    _require(fine, f"{path}: light_intensities", came, remedy)
-    remedy = "Give intensities of 0 or more"
-    _require(np.all(intensities >= 0), f"{path}: light_intensities", "has values below 0", remedy)
-    mask = arrays.get("mask") if options.mask is None else brdf.read_mask(options.mask)
-    if mask is not None and options.mask is None:
-        mask = mask != 0
-        _require(mask.shape == (*shape,), f"{path}: mask", f"is of shape {mask.shape}", f"Give {(*shape,)}")
-    points = brdf.SurfacePoints.from_normals(normal, mask=mask)
-    came = "has no normal" if mask is None else "has no normal inside the mask"
+    mask = arrays.get("mask", np.ones((height, width))) if options.mask is None else brdf.read_mask(options.mask)
+    wanted = {
+        "normal": (normal, (height, width, 3)),
+        "light_dirs": (directions, (count, 3)),
+        "light_intensities": (intensities, (count, 1 if intensities.shape[1:] == (1,) else channels)),
+        "mask": (mask, (height, width)),
+    }
+    for name, (array, shape) in wanted.items():
+        _require(array.shape == shape, f"{path}: {name}", f"is of shape {array.shape}", f"Give {shape}")
+    points = brdf.SurfacePoints.from_normals(normal, mask=mask != 0)
+    came = "has no normal" if np.all(mask) else "has no normal inside the mask"
     _require(np.any(points.mask), f"{path}: normal", came, "Give a direction (x, y, z) where the surface is")
     pictures = _exposed([_as_picture(image) for image in images], options.exposure)
-    inputs = _of_intensity_1(pictures, points, directions, intensities, options)
+    with named_as({"direction": f"{path}: light_dirs", "intensity": f"{path}: light_intensities"}):
+        inputs = _of_intensity_1(pictures, points, directions, intensities, options)
     return FitInputs(*inputs, [None] * count, path)
 
 
 def _as_picture(image: np.ndarray) -> brdf.Picture:
     """An array as the picture it would be in a file: linear, integers with their largest code."""
-    bits = 8 * image.dtype.itemsize
-    if image.dtype.kind != "u":
-        return brdf.Picture(image.astype(np.float32), None, "linear", "format", bits, None)
-    pixels = (image / float((1 << bits) - 1)).astype(np.float32)
-    return brdf.Picture(pixels, None, "linear", "format", bits, 1.0)
+    is_code = image.dtype.kind == "u"
+    pixels = (image / float(np.iinfo(image.dtype).max if is_code else 1)).astype(np.float32)
+    return brdf.Picture(pixels, None, "linear", "format", 8 * image.dtype.itemsize, 1.0 if is_code else None)

@@ -40,24 +40,25 @@ def lights(
     for name, given in (("--ambient", ambient), ("--saturation", saturation is not None)):
         if given and not matt:
             raise InputError(name, "says nothing of a mirror ball's highlight", "Leave it out, or add --matt")
+    from fitting.cli.inputs import ball_in, light_of, stated_error, visible
+
     pictures = [brdf.read_picture(path, encoding=encoding) for path in target]
     inside = None if mask is None else brdf.read_mask(mask)
-    from fitting.cli.inputs import ball_in, light_of, stated_error, visible
+    circle, notes = ball_in(sphere, inside)
+    lines = [f"# {note}" for note in notes]
+    from fitting.photographs.ball import ball_points
     from fitting.photographs.distant_light import light_from_highlight
 
     options = PictureOptions(ambient=ambient, saturation=saturation)
-    lines = []
     for path, picture, counts in zip(target, pictures, visible(inside, pictures), strict=True):
-        points, circle, notes = ball_in(picture.pixels.shape[:2], sphere, inside)
         if matt:
-            light = light_of(path, picture, counts, points, options)
+            light = light_of(path, picture, counts, ball_points(picture.pixels.shape[:2], circle), options)
             direction, error = light.direction, f"  # {stated_error(light)}"
         else:
             with named_as({"picture": path}):
                 direction, error = light_from_highlight(picture, circle, mask=counts), ""
-        lines = lines or [f"# {line}" for line in notes]
         lines.append(" ".join(f"{value:.6f}" for value in direction) + error)
-    text = "\n".join(lines) + "\n"
+    text = "\n".join(lines)
     if out is not None:
-        write_text(out, text)
-    show(text.rstrip() if out is None else f"wrote {out}")
+        write_text(out, text + "\n")
+    show(text if out is None else f"wrote {out}")
