@@ -1,211 +1,133 @@
-"""The command as a person runs it: a process of its own, its output, its exit status, the files it leaves."""
+"""The command as a person runs it: what it prints, its exit status, the files it leaves."""
 
 import importlib.metadata
 import json
-import os
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
+from command_runs import command, refused, run
 from project_paths import ROOT
+from sound_files import sound_files
 
 import brdf
-from fitting.cli.main import main
+from benchmarks.fuzz_corpus import LIGHT
+from fitting.photographs.archives import read_archive
 
-EXAMPLE = ROOT / "data" / "gold-ball"
-SCENE = (EXAMPLE / "scene.toml").read_text().replace("[256, 256]", "[48, 48]")
-
-
-@pytest.fixture(scope="session")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("cache")
+SCENE = (ROOT / "data" / "gold-ball" / "scene.toml").read_text().replace("[256, 256]", "[48, 48]")
 
 
 @pytest.fixture
-def run(cache: Path, tmp_path: Path):
-    def command(*words: object, status: int = 0) -> subprocess.CompletedProcess[str]:
-        done = subprocess.run(
-            [sys.executable, "-c", "from fitting.cli.main import main; main()", *map(str, words)],
-            capture_output=True,
-            text=True,
-            cwd=tmp_path,
-            env={**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(cache)},
-            check=False,
-        )
-        assert done.returncode == status, done.stderr
-        return done
-
-    return command
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path: Path, monkeypatch) -> Path:
     """A small picture of a known material with its scene."""
+    monkeypatch.chdir(tmp_path)
     place = tmp_path / "example"
     place.mkdir()
     (place / "scene.toml").write_text(SCENE)
     material = brdf.BlinnPhong(k_a=[0.1, 0.2, 0.3], k_d=[0.5, 0.4, 0.3], k_s=[0.4, 0.4, 0.4], n=30)
-    picture = np.asarray(brdf.render(material, brdf.Scene.load(place / "scene.toml"), precision="float64"))
-    brdf.write_image(place / "target.exr", picture)
+    brdf.write_image(place / "target.exr", brdf.render(material, brdf.Scene.load(place / "scene.toml")))
     return place
 
 
-def test_help_names_the_commands_and_imports_no_jax(run):
-    assert all(word in run("--help").stdout for word in ("fit", "render", "check"))
+def test_help_names_the_commands_and_imports_no_jax():
     code = "import sys; from fitting.cli.main import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
     code += "assert not {'jax', 'numpy', 'matplotlib'} & set(sys.modules), 'help imports too much'"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+    assert all(word in done.stdout for word in ("fit", "lights", "render", "check", "convert", "tradeoff"))
 
 
-@pytest.mark.parametrize("command", ["fit", "render", "check"])
-def test_each_help_text_shows_an_example(run, command: str):
-    assert "Example: brdf" in run(command, "--help").stdout
+@pytest.mark.parametrize("name", ["damaged.png", "small.exr"])
+def test_what_cannot_be_fitted_is_told_before_jax_is_imported(tmp_path, name):
+    """The import takes longer than all the rest, and this may be one of a thousand files."""
+    place = sound_files(tmp_path)
+    (place / "damaged.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(50))
+    brdf.write_image(place / "small.exr", np.ones((2, 2, 3), np.float32))
+    prefix = "import atexit, sys\natexit.register(lambda: print('jax' in sys.modules))\n"
+    words = ["--scene", "scene.toml"] if name == "small.exr" else ["--sphere", "90,9,5", "--light", "0,0,1"]
+    with command("fit", name, *words, cwd=place, prefix=prefix) as process:
+        out, err = process.communicate(timeout=60)
+    assert (process.returncode, out) == (2, "False\n"), err
+    assert err.startswith("error: ")
 
 
-def test_fit_a_folder_and_save(run, folder: Path):
-    printed = run("fit", folder, "--out", "result", "--plot", "--precision", "float64").stdout
-    assert "blinn-phong fitted to" in printed
-    saved = folder.parent / "result"
+@pytest.mark.parametrize("name", ["fit", "lights", "render", "check", "convert", "tradeoff"])
+def test_each_help_text_shows_an_example(capsys, name):
+    assert "Example: brdf" in run(capsys, name, "--help")[1]
+
+
+def test_a_scene_file_is_parsed_once(folder, capsys, monkeypatch):
+    parsed, loads = [], tomllib.loads
+    monkeypatch.setattr(tomllib, "loads", lambda text: parsed.append(text) or loads(text))
+    assert run(capsys, "fit", folder, "--model", "lambert")[0] == 0
+    assert parsed == [SCENE]
+
+
+def test_fit_render_fit_comes_round(folder, capsys):
+    words = ["fit", folder, "--out", "a", "--plot", "--model", "blinn-phong", "--precision", "float64"]
+    status, out, err = run(capsys, *words)
+    assert status == 0, err
+    assert "blinn-phong fitted to" in out
+    assert out.endswith("saved in a\n")
+    saved = folder.parent / "a"
     names = sorted(path.name for path in saved.iterdir())
-    assert names == ["comparison.png", "fit.json", "fitted.exr", "material.json", "material.mtl"]
+    assert set(names) >= {"comparison.png", "fit.json", "fitted.exr", "material.json", "material.mtl"}
     values = json.loads((saved / "material.json").read_text())
     assert values["model"] == "blinn-phong"
     # The target is stored in float32.
     np.testing.assert_allclose(values["n"], 30, rtol=1e-4)
     np.testing.assert_allclose(values["k_s"], 0.4, rtol=1e-4)
+    status, _, err = run(capsys, "render", "a/material.json", "--scene", folder / "scene.toml", "-o", "again.exr")
+    assert status == 0, err
+    np.testing.assert_allclose(brdf.read_image("again.exr"), brdf.read_image(folder / "target.exr"), atol=2e-6)
 
 
-def test_json_goes_to_standard_output(run, folder: Path):
-    values = json.loads(run("fit", folder, "--model", "lambert", "--json").stdout)
+def test_json_goes_to_standard_output(folder, capsys):
+    values = json.loads(run(capsys, "fit", folder, "--model", "lambert", "--json")[1])
     assert values["material"]["model"] == "lambert"
     assert values["pixels"] > 0
 
 
-def test_fit_render_fit_comes_round(run, folder: Path):
-    run("fit", folder, "--model", "blinn-phong", "--out", "a", "--precision", "float64")
-    run("render", "a/material.json", "--scene", folder / "scene.toml", "-o", "again.exr")
-    target = brdf.read_image(folder / "target.exr")
-    again = brdf.read_image(folder.parent / "again.exr")
-    np.testing.assert_allclose(again, target, atol=2e-6)
-
-
-def spoil(folder: Path, how: str) -> list[object]:
-    """Make one thing wrong and return the words of the command."""
-    target, scene = folder / "target.exr", folder / "scene.toml"
-    pixels = brdf.read_image(target)
-    if how == "wrong path":
-        return ["fit", folder / "none.exr", "--scene", scene]
-    if how == "no scene named":
-        return ["fit", target]
-    if how == "no target":
-        target.unlink()
-    if how == "two targets":
-        brdf.write_image(folder / "target.png", np.clip(pixels, 0, 1))
-    if how == "unknown key":
-        scene.write_text(SCENE + "colour = 1\n")
-    if how == "other size":
-        brdf.write_image(target, pixels[:40])
-    if how == "off the object":
-        scene.write_text(SCENE.replace("center = [0.0, 0.0, 0.0]", "center = [9.0, 0.0, 0.0]"))
-    if how == "black":
-        brdf.write_image(target, np.zeros_like(pixels))
-    if how == "nan":
-        brdf.write_image(target, np.full_like(pixels, np.nan))
-    if how == "unknown model":
-        return ["fit", folder, "--model", "ward"]
-    if how == "unknown precision":
-        return ["fit", folder, "--precision", "float16"]
-    if how == "unknown encoding":
-        return ["fit", folder, "--encoding", "film"]
-    if how == "unknown option":
-        return ["fit", folder, "--fast"]
-    if how == "no argument":
-        return ["fit"]
-    if how == "plot without folder":
-        return ["fit", folder, "--plot"]
-    if how == "saturated":
-        return ["fit", folder, "--saturation", "1e-6"]
-    if how == "text as picture":
-        target.write_text("no picture")
-    if how == "a file as folder":
-        (folder / "out").write_text("")
-        return ["fit", folder, "--out", folder / "out"]
-    if how == "mask of another size":
-        brdf.write_image(folder / "mask.png", np.ones((9, 9, 1)))
-        return ["fit", folder, "--mask", folder / "mask.png"]
-    return ["fit", folder]
-
-
-@pytest.mark.parametrize(
-    ("how", "words"),
-    [
-        ("wrong path", "none.exr: there is no such file"),
-        ("no scene named", "comes without a scene. Add --scene"),
-        ("no target", "has no file target.*"),
-        ("two targets", "has several targets, target.exr, target.png"),
-        ("unknown key", "lights[0].colour: is not a known key"),
-        ("other size", "target.exr: is 48 x 40, the scene's camera 48 x 48"),
-        ("off the object", "target.exr: has no pixel that sees a fitted shape"),
-        ("black", "target.exr: is black on the object"),
-        ("nan", "target.exr: has no finite value on the object"),
-        ("unknown model", "--model: is unknown, got 'ward'"),
-        ("unknown precision", "--precision: is unknown, got 'float16'"),
-        ("unknown encoding", "film"),
-        ("unknown option", "No such option: --fast"),
-        ("no argument", "Missing argument"),
-        ("plot without folder", "--plot: needs a folder"),
-        ("saturated", "target.exr: is clipped at 1e-06"),
-        ("text as picture", "target.exr"),
-        ("a file as folder", "a part of the path is not a folder"),
-        ("mask of another size", "mask"),
-    ],
-)
-def test_what_is_wrong_is_one_line_and_leaves_no_file(run, folder: Path, how: str, words: str):
-    command = spoil(folder, how)
-    if "--out" not in command and how != "plot without folder":
-        command += ["--out", folder.parent / "made"]
-    done = run(*command, status=2)
-    assert done.stdout == ""
-    assert done.stderr.startswith("error: ")
-    assert done.stderr.count("\n") == 1
-    assert words in done.stderr
-    assert "Traceback" not in done.stderr
-    assert not (folder.parent / "made").exists()
-
-
-def test_check_exit_statuses(run, tmp_path: Path):
-    brdf.save_material(brdf.Lambert(k_d=[0.5, 0.5, 0.5]), tmp_path / "good.json")
-    brdf.save_material(brdf.BlinnPhong(k_d=0.5, k_s=0.5, n=20), tmp_path / "classic.mtl")
-    run("check", "good.json", status=0)
-    printed = run("check", "classic.mtl", status=1).stdout
-    assert "not reciprocal" in printed
-    values = json.loads(run("check", "classic.mtl", "--json", status=1).stdout)
-    assert values
-    assert run("check", "none.json", status=2).stderr.startswith("error: none.json: there is no such file")
+def test_check_exit_statuses(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    brdf.save_material(brdf.Lambert(k_d=[0.5, 0.5, 0.5]), "good.json")
+    brdf.save_material(brdf.BlinnPhong(k_d=0.5, k_s=0.5, n=20), "classic.mtl")
+    assert run(capsys, "check", "good.json")[0] == 0
+    status, out, _ = run(capsys, "check", "classic.mtl")
+    assert status == 1
+    assert "not reciprocal" in out
+    status, out, _ = run(capsys, "check", "classic.mtl", "--json")
+    assert status == 1
+    assert json.loads(out)
 
 
 def test_no_command_shows_the_help_and_nothing_else(capsys):
-    with pytest.raises(SystemExit) as caught:
-        main([])
-    assert caught.value.code == 2
-    out, err = capsys.readouterr()
+    status, out, err = run(capsys)
+    assert status == 2
     assert "Usage" in out + err
     assert "error:" not in err
 
 
 def test_the_version_is_that_of_the_package(capsys):
-    with pytest.raises(SystemExit) as caught:
-        main(["--version"])
-    assert caught.value.code == 0
-    assert capsys.readouterr().out.strip() == f"brdf-fitting {importlib.metadata.version('brdf-fitting')}"
+    said = f"brdf-fitting {importlib.metadata.version('brdf-fitting')}\n"
+    assert run(capsys, "--version") == (0, said, "")
 
 
-@pytest.mark.parametrize("command", ["fit", "tradeoff"])
-def test_a_missing_picture_is_missing_whatever_else_is(command: str, tmp_path: Path, capsys):
-    with pytest.raises(SystemExit) as caught:
-        main([command, str(tmp_path / "none.png")])
-    assert caught.value.code == 2
-    assert "none.png: there is no such file" in capsys.readouterr().err
+def test_a_scene_may_be_allowed_to_reach_further(tmp_path, capsys):
+    (tmp_path / "deep").mkdir()
+    file = tmp_path / "deep" / "scene.toml"
+    brdf.write_image(tmp_path / "aovs.exr", np.ones((8, 8, 3), np.float32))
+    brdf.write_image(tmp_path / "target.exr", np.ones((8, 8, 3), np.float32))
+    file.write_text('[aov]\nfile = "../aovs.exr"\n' + LIGHT)
+    words = "fit", tmp_path / "target.exr", "--scene", file
+    refused(capsys, tmp_path, "or allow more with within", *words)
+    refused(capsys, tmp_path, "has no layer of normals", *words, "--within", tmp_path)  # it was opened
+
+
+def test_nothing_else_of_an_archive_is_read(tmp_path):
+    arrays = {"images": np.ones((1, 2, 2)), "normal": np.ones((2, 2, 3)), "light_dirs": np.ones((1, 3))}
+    np.savez(tmp_path / "a.npz", **arrays, evil=np.array([print], dtype=object))
+    assert set(read_archive(tmp_path / "a.npz")) == set(arrays)

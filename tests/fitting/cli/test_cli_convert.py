@@ -4,26 +4,19 @@ import json
 import re
 from pathlib import Path
 
+import command_runs
 import numpy as np
 import pytest
 from project_paths import ROOT
 
 import brdf
-from fitting.cli.main import main
 
 
 def run(capsys: pytest.CaptureFixture[str], *words: object, status: int = 0) -> str:
-    """The command in this process; its output, or its one line of failure."""
-    with pytest.raises(SystemExit) as stop:
-        main([str(word) for word in words])
-    assert (stop.value.code or 0) == status
-    said = capsys.readouterr()
-    if status == 2:
-        assert said.out == ""
-        assert said.err.count("\n") == 1
-        assert said.err.startswith("error: ")
-        return said.err
-    return said.out
+    """What the command prints."""
+    ended, out, err = command_runs.run(capsys, *words)
+    assert ended == status, err
+    return out
 
 
 @pytest.fixture
@@ -57,21 +50,6 @@ def test_convert_reads_what_it_wrote(capsys, tmp_path: Path):
     assert "not carried" not in run(capsys, "convert", tmp_path / "a.json", tmp_path / "a.glsl")
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["gold", "x.fbx"], r"x.fbx: does not say its format, got .fbx. Name it .json"),
-        (["gold", "x.json", "--to", "fbx"], "--to: is unknown, got 'fbx'. Use one of json, mtl, three"),
-        (["unobtainium", "x.json"], "unobtainium: is no material file"),
-        (["gold", "no/such/folder/x.json"], "x.json: there is no such file or folder"),
-    ],
-)
-def test_convert_names_what_is_wrong(capsys, tmp_path: Path, monkeypatch, words: list[str], message: str):
-    monkeypatch.chdir(tmp_path)
-    assert message in run(capsys, "convert", *words, status=2)
-    assert not list(tmp_path.iterdir())
-
-
 def test_photograph_with_ambient_light_gives_its_numbers_and_a_report(capsys, tmp_path: Path, photograph: Path):
     arguments = ["fit", photograph, "--sphere", "42,30,30", "--light", "0.3,0.5,0.8", "--ambient"]
     said = run(capsys, *arguments, "--out", tmp_path / "out", "--report", tmp_path / "report.html")
@@ -82,12 +60,6 @@ def test_photograph_with_ambient_light_gives_its_numbers_and_a_report(capsys, tm
     np.testing.assert_allclose(np.asarray(found.k_d), [0.5, 0.2, 0.1], atol=2e-3)
     np.testing.assert_allclose(float(found.n), 20, rtol=5e-3)
     assert "ball.png" in (tmp_path / "report.html").read_text()
-
-
-def test_ambient_is_for_photographs(capsys, tmp_path: Path, photograph: Path):
-    scene = ROOT / "data" / "gold-ball" / "scene.toml"
-    message = run(capsys, "fit", photograph, "--scene", scene, "--ambient", status=2)
-    assert "--ambient: is what the scene file says" in message
 
 
 def test_check_draws_its_picture(capsys, tmp_path: Path):
@@ -107,40 +79,3 @@ def test_every_command_knows_the_classic_table(capsys, tmp_path: Path, monkeypat
     brdf.save_material(brdf.preset("cyan plastic"), tmp_path / "b.json")
     run(capsys, "render", "b.json", "--scene", scene, "-o", "b.exr")
     np.testing.assert_array_equal(brdf.read_image(tmp_path / "a.exr"), brdf.read_image(tmp_path / "b.exr"))
-
-
-@pytest.mark.parametrize("words", [["check", "emrald"], ["convert", "emrald", "x.json"], ["render", "emrald"]])
-def test_a_misspelt_name_is_offered_the_right_one(capsys, tmp_path: Path, monkeypatch, words: list[str]):
-    monkeypatch.chdir(tmp_path)
-    more = ["--scene", "scene.toml", "-o", "x.exr"] if words[0] == "render" else []
-    message = run(capsys, *words, *more, status=2)
-    assert message == ("error: emrald: is no material file and no name of the classic table. The table has emerald.\n")
-
-
-def test_a_file_goes_before_a_name(capsys, tmp_path: Path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "gold").write_text("{}")
-    assert "gold: is no material file, got no suffix" in run(capsys, "check", "gold", status=2)
-
-
-@pytest.mark.parametrize(
-    ("words", "help_of"), [(["fit"], "brdf fit"), (["check", "a", "b"], "brdf check"), (["nope"], "brdf")]
-)
-def test_a_usage_error_ends_with_where_help_is(capsys, words: list[str], help_of: str):
-    assert run(capsys, *words, status=2).endswith(f". See {help_of} --help.\n")
-
-
-def test_a_measured_table_is_not_drawn(capsys, tmp_path: Path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "felt.alta").write_text("")
-    message = run(capsys, "check", "felt.alta", "--plot", "felt.png", status=2)
-    assert message.startswith("error: --plot: draws materials, and felt.alta is a measured table. Fit a material to it")
-
-
-def test_an_empty_name_of_a_material_is_told(capsys):
-    with pytest.raises(SystemExit) as exit_status:
-        main(["check", ""])
-    assert exit_status.value.code == 2
-    assert capsys.readouterr().err == (
-        "error: MATERIAL: is empty. Give a .json or .mtl file, or a name such as emerald.\n"
-    )
