@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from brdf.errors import InputError
-from brdf.measured.table import MeasuredBRDF, half_angle_grid, half_frame
+from brdf.measured.table import MeasuredBRDF, Values, Vectors, half_angle_grid, half_frame
 
 SHAPE = (90, 90, 180)
 SCALES = np.array([1.0 / 1500.0, 1.15 / 1500.0, 1.66 / 1500.0])
@@ -28,7 +28,7 @@ _MISSING = -1.0
 
 
 @functools.lru_cache(maxsize=1)
-def grid() -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3"], Float[np.ndarray, " P"]]:
+def grid() -> tuple[Vectors, Vectors, Float[np.ndarray, " P"]]:
     """Light and view of every entry, also below the horizon, and the solid angle that it stands for."""
     return half_angle_grid(SHAPE, np.pi)
 
@@ -84,9 +84,7 @@ def merl_table(f_r: Callable[[Any, Any], Any], *, name: str = "table") -> Measur
     return MeasuredBRDF.from_samples(light, view, f_r(light, view), name=name, solid_angle=share[above])
 
 
-def _look_up(
-    values: Float[np.ndarray, "P C"], to_light: Float[np.ndarray, "Q 3"], to_view: Float[np.ndarray, "Q 3"]
-) -> Float[np.ndarray, "Q C"]:
+def _look_up(values: Values, to_light: Vectors, to_view: Vectors) -> Values:
     """The entry that directions fall into, as the published reader does it."""
     half = to_light + to_view
     half = half / np.maximum(np.linalg.norm(half, axis=-1, keepdims=True), 1e-300)

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from brdf.errors import InputError
 from brdf.files import utf8_name
-from brdf.measured.table import Evaluation, MeasuredBRDF, half_angle_grid
+from brdf.measured.table import Evaluation, MeasuredBRDF, Values, Vectors, half_angle_grid
 
 MAGIC = b"tensor_file\0"
 
@@ -161,7 +161,7 @@ def _evaluation(path: Path, channels: tuple[str, ...]) -> Evaluation:
                 mitsuba.set_variant(before)
     together = 4 if wavelengths else 3  # channels that Mitsuba evaluates at once
 
-    def evaluate(to_light: Float[np.ndarray, "P 3"], to_view: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P C"]:
+    def evaluate(to_light: Vectors, to_view: Vectors) -> Values:
         to_light, to_view = np.broadcast_arrays(to_light, to_view)
         values = np.zeros((len(to_light), len(channels)))
         for first in range(0, len(channels), together):

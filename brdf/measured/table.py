@@ -13,7 +13,9 @@ from jaxtyping import Float
 
 from brdf.errors import InputError
 
-Evaluation = Callable[[Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3"]], Float[np.ndarray, "P C"]]
+Vectors = Float[np.ndarray, "P 3"]
+Values = Float[np.ndarray, "P C"]
+Evaluation = Callable[[Vectors, Vectors], Values]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -33,9 +35,9 @@ class MeasuredBRDF:
     """
 
     name: str
-    to_light: Float[np.ndarray, "P 3"]
-    to_view: Float[np.ndarray, "P 3"]
-    values: Float[np.ndarray, "P C"]
+    to_light: Vectors
+    to_view: Vectors
+    values: Values
     channels: tuple[str, ...]
     solid_angle: Float[np.ndarray, " P"]
     left_out: dict[str, int] = dataclasses.field(default_factory=dict)
@@ -113,7 +115,7 @@ def _numbers(name: str, value: Any) -> np.ndarray:
         raise InputError(name, f"must be numbers, got {type(value).__name__}", "Give an array") from None
 
 
-def _directions(name: str, value: Any) -> Float[np.ndarray, "P 3"]:
+def _directions(name: str, value: Any) -> Vectors:
     vectors = _numbers(name, value)
     if vectors.ndim != 2 or vectors.shape[1] != 3:
         raise InputError(name, f"must be of shape (P, 3), got {vectors.shape}", "Give a direction per sample")
@@ -124,16 +126,14 @@ def _directions(name: str, value: Any) -> Float[np.ndarray, "P 3"]:
     return vectors / np.sqrt(np.sum(vectors * vectors, axis=1, keepdims=True))
 
 
-def from_angles(polar: Any, azimuth: Any) -> Float[np.ndarray, "*P 3"]:
+def from_angles(polar: Any, azimuth: Any) -> Vectors:
     """Unit vectors from angles in radians: from the normal, and about it from +x towards +y."""
     polar, azimuth = np.broadcast_arrays(np.asarray(polar, np.float64), np.asarray(azimuth, np.float64))
     sine = np.sin(polar)
     return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), np.cos(polar)], axis=-1)
 
 
-def from_half_angles(
-    theta_h: Any, theta_d: Any, phi_d: Any, phi_h: Any = 0.0
-) -> tuple[Float[np.ndarray, "*P 3"], Float[np.ndarray, "*P 3"]]:
+def from_half_angles(theta_h: Any, theta_d: Any, phi_d: Any, phi_h: Any = 0.0) -> tuple[Vectors, Vectors]:
     """Light and view directions from Rusinkiewicz' angles.
 
     Args:
@@ -156,9 +156,7 @@ def half_frame(theta_h: Any, phi_h: Any) -> tuple[np.ndarray, np.ndarray, np.nda
     return from_angles(theta_h, phi_h), from_angles(theta_h + quarter, phi_h), from_angles(quarter, phi_h + quarter)
 
 
-def half_angle_grid(
-    shape: tuple[int, int, int], turn: float
-) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3"], Float[np.ndarray, " P"]]:
+def half_angle_grid(shape: tuple[int, int, int], turn: float) -> tuple[Vectors, Vectors, Float[np.ndarray, " P"]]:
     """Light and view in the middle of each cell of theta_h, theta_d and phi_d, and the solid angle that it stands for.
 
     Args:

@@ -9,20 +9,33 @@ that say nothing of the light are read as ALTA converts them: light along the no
 Source: L. Belcour, R. Pacanowski and P. Barla, "ALTA: a BRDF analysis library", MAM 2014.
 """
 
-from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from brdf.errors import InputError
 from brdf.files import parse_number, read_text
-from brdf.measured.table import MeasuredBRDF, from_angles, from_half_angles
+from brdf.measured.table import MeasuredBRDF, Vectors, from_angles, from_half_angles
 
 MOST_CHANNELS = 4096
 _OUTPUTS = ("INV_STERADIAN", "INV_STERADIAN_COSINE_FACTOR", "RGB_COLOR", "UNKNOWN_OUTPUT")
+# What the columns are: angles of half vector, difference, view and light, or cosines of them. What is not said is 0.
+_PARAMETRISATIONS = {
+    "COS_TH": "theta_h",
+    "COS_TH_TD": "theta_h theta_d",
+    "COS_TLV": "theta_v",
+    "COS_TLR": "theta_v",
+    "RUSIN_TH_TD": "theta_h theta_d",
+    "RUSIN_TH_TD_PD": "theta_h theta_d phi_d",
+    "RUSIN_TH_PH_TD_PD": "theta_h phi_h theta_d phi_d",
+    "ISOTROPIC_TV_TL_DPHI": "theta_v theta_l phi_l",
+    "ISOTROPIC_TV_PROJ_DPHI": "x_v y_v",
+    "ISOTROPIC_TL_TV_PROJ_DPHI": "theta_l x_v y_v",
+    "SPHERICAL_TL_PL_TV_PV": "theta_l phi_l theta_v phi_v",
+    "CARTESIAN": "x_v y_v z_v x_l y_l z_l",
+}
+_NOT_SAID = {"RUSIN_TH_TD": {"phi_d": 0.5 * np.pi}, "COS_TLR": {"phi_v": np.pi}}
 _NUMBERS = "Numbers have a decimal point and spaces between them; # starts a comment"
-_Pair = tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3"]]
 
 
 def load(path: Path) -> MeasuredBRDF:
@@ -58,7 +71,8 @@ def _cornell(path: Path, lines: list[tuple[str, str]]) -> MeasuredBRDF:
             remedy = "Give a row of theta_i phi_i theta_s phi_s and a value per wavelength on a line of its own"
             raise InputError(places[start], came, remedy)
     table = rows.reshape(-1, width)
-    theta_i, phi_i, theta_s, phi_s = _angles(places[1 + count :: width], table[:, :4].T)
+    _check_angles(places[1 + count :: width], table[:, :4].T)
+    theta_i, phi_i, theta_s, phi_s = table[:, :4].T
     names = tuple(f"{wavelength:g} nm" for wavelength in wavelengths)
     light, view = from_angles(theta_i, phi_i), from_angles(theta_s, phi_s)
     return MeasuredBRDF.from_samples(light, view, table[:, 4:], name=path.stem, channels=names)
@@ -77,8 +91,7 @@ def _alta(path: Path, lines: list[tuple[str, str]]) -> MeasuredBRDF:
     if not rows:
         raise InputError(path, "holds no samples", "Give a table with rows of numbers")
     table = _numbers([(place, word) for place, words in rows for word in words[:width]]).reshape(-1, width)
-    _, convert, directions = _PARAMETRISATIONS[header["PARAM_IN"]]
-    view, light = directions(*convert([place for place, _ in rows], table[:, :inputs].T))
+    view, light = _directions(header["PARAM_IN"], [place for place, _ in rows], table[:, :inputs].T)
     values, unit = table[:, inputs:], header.get("PARAM_OUT")
     if unit == "INV_STERADIAN_COSINE_FACTOR":
         values = values / np.where(view[:, 2:] > 0, view[:, 2:], 1.0)
@@ -107,13 +120,13 @@ def _dimensions(path: Path, header: dict[str, str]) -> tuple[int, int]:
     demand("PARAM_OUT", unit in _OUTPUTS, f"is no BRDF value, got {unit[:40]!r}", f"Known: {', '.join(_OUTPUTS)}")
     came, remedy = f"is not known, got {kind[:40]!r}", f"Known: {', '.join(_PARAMETRISATIONS)}"
     demand("PARAM_IN", kind in _PARAMETRISATIONS, came if kind else "is missing", remedy)
-    columns = _PARAMETRISATIONS[kind][0]
+    columns = len(_PARAMETRISATIONS[kind].split())
     demand("DIM", columns == inputs, f"says {inputs} input columns, {kind} has {columns}", "Correct the header")
     demand("VS", confidence in ("0", "1", "2"), f"must be 0, 1 or 2, got {confidence[:40]!r}", "Correct the header")
     return inputs, outputs
 
 
-def _numbers(words: Sequence[tuple[str, str]]) -> Float[np.ndarray, " P"]:
+def _numbers(words: list[tuple[str, str]]) -> np.ndarray:
     """The values of words, each with its place."""
     values = np.empty(len(words))
     for index, (place, word) in enumerate(words):
@@ -124,48 +137,35 @@ def _numbers(words: Sequence[tuple[str, str]]) -> Float[np.ndarray, " P"]:
     return values
 
 
-def _angles(places: list[str], columns: Float[np.ndarray, "A P"]) -> Float[np.ndarray, "A P"]:
+def _directions(kind: str, places: list[str], columns: np.ndarray) -> tuple[Vectors, Vectors]:
+    """View and light of each row."""
+    if kind == "CARTESIAN":
+        view, light = columns[:3].T, columns[3:].T
+        sound = np.isfinite(columns).all(axis=0) & np.any(view != 0, axis=1) & np.any(light != 0, axis=1)
+        if not sound.all():
+            came = "has a direction that is zero or not finite"
+            raise InputError(places[np.argmin(sound)], came, "Correct the file")
+        return view, light
+    if kind.startswith("COS_"):
+        _check(places, columns, 1.0, "a cosine", "It is within -1 and 1")
+        columns = 2 * np.arctan2(np.sqrt(1 - columns), np.sqrt(1 + columns))
+    else:
+        _check_angles(places, columns)
+    names = _PARAMETRISATIONS[kind].split()
+    angles = dict.fromkeys("theta_h theta_d phi_d phi_h theta_v phi_v theta_l phi_l".split(), 0.0 * columns[0])
+    angles |= _NOT_SAID.get(kind, {}) | dict(zip(names, columns, strict=True))
+    if "theta_h" in names:
+        return from_half_angles(*(angles[name] for name in ("theta_h", "theta_d", "phi_d", "phi_h")))
+    if "x_v" in names:  # the parts of the polar angle along two axes
+        x, y = angles["x_v"], angles["y_v"]
+        angles |= {"theta_v": np.hypot(x, y), "phi_v": np.arctan2(y, x)}
+    return from_angles(angles["theta_v"], angles["phi_v"]), from_angles(angles["theta_l"], angles["phi_l"])
+
+
+def _check_angles(places: list[str], columns: np.ndarray) -> None:
     _check(places, columns, 2 * np.pi + 1e-6, "an angle", "Angles are in radians, at most 2 pi")
-    return columns
-
-
-def _cosines(places: list[str], columns: Float[np.ndarray, "A P"]) -> Float[np.ndarray, "A P"]:
-    """Angles from their cosines."""
-    _check(places, columns, 1.0, "a cosine", "It is within -1 and 1")
-    return 2 * np.arctan2(np.sqrt(1 - columns), np.sqrt(1 + columns))
 
 
 def _check(places: list[str], columns: np.ndarray, largest: float, what: str, remedy: str) -> None:
     for row, column in np.argwhere(~(np.abs(columns.T) <= largest)):
         raise InputError(places[row], f"has {what} of {columns[column, row]:g}", remedy)
-
-
-def _vectors(places: list[str], columns: Float[np.ndarray, "6 P"]) -> Float[np.ndarray, "2 P 3"]:
-    pair = np.swapaxes(columns.reshape(2, 3, -1), 1, 2)
-    sound = np.all(np.isfinite(pair).all(axis=-1) & np.any(pair != 0, axis=-1), axis=0)
-    if not sound.all():
-        came = "has a direction that is zero or not finite"
-        raise InputError(places[np.argmin(sound)], came, "Correct the file")
-    return pair
-
-
-def _projected(x: np.ndarray, y: np.ndarray) -> Float[np.ndarray, "P 3"]:
-    """Directions from the parts of their polar angle along two axes."""
-    return from_angles(np.hypot(x, y), np.arctan2(y, x))
-
-
-# How many columns, what becomes of them, and view and light from that.
-_PARAMETRISATIONS: dict[str, tuple[int, Callable[..., np.ndarray], Callable[..., _Pair]]] = {
-    "COS_TH": (1, _cosines, lambda h: from_half_angles(h, 0.0 * h, 0.0)),
-    "COS_TH_TD": (2, _cosines, lambda h, d: from_half_angles(h, d, 0.0)),
-    "COS_TLV": (1, _cosines, lambda v: (from_angles(v, 0.0), from_angles(0.0 * v, 0.0))),
-    "COS_TLR": (1, _cosines, lambda v: (from_angles(-v, 0.0), from_angles(0.0 * v, 0.0))),
-    "RUSIN_TH_TD": (2, _angles, lambda h, d: from_half_angles(h, d, 0.5 * np.pi)),
-    "RUSIN_TH_TD_PD": (3, _angles, from_half_angles),
-    "RUSIN_TH_PH_TD_PD": (4, _angles, lambda h, ph, d, pd: from_half_angles(h, d, pd, ph)),
-    "ISOTROPIC_TV_TL_DPHI": (3, _angles, lambda v, light, phi: (from_angles(v, 0.0), from_angles(light, phi))),
-    "ISOTROPIC_TV_PROJ_DPHI": (2, _angles, lambda x, y: (_projected(x, y), from_angles(0.0 * x, 0.0))),
-    "ISOTROPIC_TL_TV_PROJ_DPHI": (3, _angles, lambda light, x, y: (_projected(x, y), from_angles(light, 0.0))),
-    "SPHERICAL_TL_PL_TV_PV": (4, _angles, lambda tl, pl, tv, pv: (from_angles(tv, pv), from_angles(tl, pl))),
-    "CARTESIAN": (6, _vectors, lambda view, light: (view, light)),
-}

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from brdf.measured.table import Evaluation, MeasuredBRDF, from_angles
+from brdf.measured.table import Evaluation, MeasuredBRDF, Values, Vectors, from_angles
 from brdf.plausibility.report import ENERGY_LIMIT, Angles, Finding, Report, verdict
 
 # Samples whose angles agree within this many radians are one direction: half a degree.
@@ -27,9 +27,9 @@ _BY_LAYOUT = 1e-5
 
 
 class _Samples(NamedTuple):
-    light: Float[np.ndarray, "P 3"]
-    view: Float[np.ndarray, "P 3"]
-    values: Float[np.ndarray, "P C"]
+    light: Vectors
+    view: Vectors
+    values: Values
 
 
 def check_table(table: MeasuredBRDF, subject: str | None = None) -> Report:
@@ -56,7 +56,7 @@ def check_table(table: MeasuredBRDF, subject: str | None = None) -> Report:
     return Report(subject or table.name, *findings)
 
 
-def _pairs(table: MeasuredBRDF, samples: _Samples, *, exchanged: bool) -> tuple[np.ndarray, Float[np.ndarray, "K C"]]:
+def _pairs(table: MeasuredBRDF, samples: _Samples, *, exchanged: bool) -> tuple[np.ndarray, Values]:
     """Samples that another one ought to repeat, by their index, and the difference of the two over their mean size.
 
     The other has light and view exchanged, or the view mirrored at the plane of incidence, as an isotropic surface
@@ -85,7 +85,7 @@ def _pairs(table: MeasuredBRDF, samples: _Samples, *, exchanged: bool) -> tuple[
     return first, np.abs(values - repeated) / np.where(size > 0, size, 1.0)
 
 
-def _median(difference: Float[np.ndarray, "K C"]) -> float:
+def _median(difference: Values) -> float:
     return float(np.median(difference)) if difference.size else math.nan
 
 
