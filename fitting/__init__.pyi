@@ -2,8 +2,8 @@ from .front_door import fit as fit
 from .implicit import Sensitivity as Sensitivity
 from .implicit import sensitivity as sensitivity
 from .joint import fit_jointly as fit_jointly
+from .measured_fit import BrdfFitResult as BrdfFitResult
 from .measured_fit import fit_brdf as fit_brdf
-from .measured_result import BrdfFitResult as BrdfFitResult
 from .relighting import (
     LightFit as LightFit,
 )

@@ -1,11 +1,23 @@
 """Fit a model to a measured BRDF: the table is the picture, each sample a pixel with its own directions.
 
-f_r = [k_d + k_s S / (N.L)] / pi is linear in k_d and k_s, so the engine that fits pictures fits tables. What differs is
-which deviations count: `fitting.measured_losses`.
+f_r = [k_d + k_s S / (N.L)] / pi is linear in k_d and k_s, so the solver that fits pictures fits tables. What differs is
+which deviations count, by one of three losses of the literature:
+
+| loss | sum over samples of weight times | when |
+| --- | --- | --- |
+| "cosine" (default) | [(f - m) cos θ_i]² | Ngan et al. 2005: what pictures under one light show; the peak rules |
+| "squared" | (f - m)² | as the table stands; grazing angles count in full |
+| "log" | [log(1 + f cos θ_i) - log(1 + m cos θ_i)]² | Löw et al. 2012: high dynamic range, the tails count too |
+
+The weight is the solid angle that a sample stands for, where the table's grid says it. Negative values count in the
+squared losses as they are; the logarithmic one leaves them out. Angles beyond 80 degrees are left out by default.
 """
 
+import dataclasses
 import time
-from typing import Any, NamedTuple, get_args
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -14,25 +26,247 @@ from jaxtyping import Float
 
 import brdf
 from brdf.errors import InputError
+from brdf.files import atomic_folder
+from brdf.materials.material_file import material_to_dict
 from brdf.models.base import SpecularMaterial
-from fitting.measured_losses import Loss, Samples, logarithmic, losses_of
-from fitting.measured_result import HALF, BrdfCandidate, BrdfFitResult, lowest_cosine
-from fitting.result import Parameter
+from fitting.report.saving import write_report
+from fitting.result import Parameter, undetermined
 from fitting.solver.normal_equations import OneLightLobe, Picture
-from fitting.solver.profile import Optimum, fit_linear, search
+from fitting.solver.profile import Optimum, search
 from fitting.uncertainty.covariance import residual_noise, uncertainty
+from fitting.uncertainty.interpretation import coefficient_factors
 
+Loss = Literal["cosine", "squared", "log"]
 N_RANGE = (0.1, 1e6)
 
 # A lobe has to leave less than this share of the squares that Lambert leaves before it is worth its unknowns: half of
 # them where Lambert itself explains half of the table, else nine tenths.
 WORTH, WORTH_WITHOUT_LAMBERT = 0.5, 0.9
+# A model that explains this share of the squares describes the peak, one that places this share of the light the body;
+# where the mean of both is below, it does not describe the table.
+HALF = 0.5
 # What Lambert leaves of a table that it describes exactly; a lobe has nothing to explain then.
-ROUNDING = 1e-12
+EXACT = 1e-12
+# Shares below this are told as rounding.
+ROUNDING = 1e-6
 # Largest value in 1/sr, and inverse of the least that a table may have as its largest: squares and sums stay in range.
 FAR = 1e50
-# A cosine's logarithm below this means that the lobe does not reach the sample (see `brdf.vectors`).
-_DARK = -1e8
+# Of a cosine's logarithm: below the one the lobe does not reach the sample (see `brdf.vectors`), the other is as good
+# as none and stays finite times n.
+_DARK, _LEAST = -1e8, -1e4
+# Reweighting ends when the loss changes by less than this share; it takes 2 to 10 rounds.
+_ENOUGH, _MOST_ROUNDS = 1e-9, 50
+
+
+class Losses(NamedTuple):
+    """How far a model is from a table.
+
+    Attributes:
+        cosine: root mean square of the deviation times N.L, over that of the table.
+        squared: the same without the cosine.
+        log: root mean square of the difference of log(1 + f_r N.L).
+        misplaced: the share of light that goes elsewhere: absolute deviations times N.L, summed, over f_r's.
+    """
+
+    cosine: float
+    squared: float
+    log: float
+    misplaced: float
+
+
+@dataclasses.dataclass(frozen=True)
+class BrdfCandidate:
+    """A model that was tried.
+
+    Attributes:
+        material: its best material.
+        parameters: value and error of each number, or why it has none; errors hold where the deviation is noise.
+        losses: its deviation under every loss.
+    """
+
+    material: brdf.Material
+    parameters: tuple[Parameter, ...]
+    losses: Losses
+
+    @property
+    def model(self) -> str:
+        """The model's name."""
+        return self.material.name
+
+
+@dataclasses.dataclass(frozen=True)
+class BrdfFitResult:
+    """The outcome of `fit_brdf`.
+
+    Attributes:
+        table: what was fitted.
+        loss: which loss was least.
+        candidates: all models tried.
+        chosen: which of them.
+        samples: how many samples counted.
+        negative: how many of their values are below 0.
+        left_out: how many entries did not count, by reason.
+        max_angle: light and view further than this from the normal did not count, in degrees.
+        seconds: how long it took.
+    """
+
+    table: brdf.MeasuredBRDF
+    loss: Loss
+    candidates: tuple[BrdfCandidate, ...]
+    chosen: int
+    samples: int
+    negative: int
+    left_out: dict[str, int]
+    max_angle: float
+    seconds: float
+
+    @property
+    def material(self) -> brdf.Material:
+        """The fitted material."""
+        return self.candidates[self.chosen].material
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Value and error of each of its numbers, or why it has none; errors hold where the deviation is noise."""
+        return self.candidates[self.chosen].parameters
+
+    @property
+    def losses(self) -> Losses:
+        """Its deviation under each loss."""
+        return self.candidates[self.chosen].losses
+
+    @property
+    def undetermined(self) -> dict[str, str]:
+        """What the table does not determine, and why."""
+        return undetermined(self.parameters)
+
+    @property
+    def fits(self) -> bool:
+        """Whether, on average of both, half of the squares are explained and half of the light is where it belongs."""
+        return 0.5 * (1 - self.losses.cosine**2 + 1 - self.losses.misplaced) >= HALF
+
+    @property
+    def verdict(self) -> str:
+        """The sentence that a person needs."""
+        name, several = self.material.name, len(self.candidates) > 1
+        if not self.fits:
+            best = min(self.candidates, key=self._loss)
+            subject = "none of these models fits: the best" if several else f"{name} does not fit: it"
+            closest = f"{subject}, {best.model}," if several else subject
+            left = f"{_percent(best.losses.cosine)} of the table (rms)"
+            return f"{closest} leaves {left}; the brightest sample is {self._brightest()}"
+        left = _percent(self.losses.cosine)
+        elsewhere = f"{_percent(self.losses.misplaced)} of the light goes elsewhere"
+        name = "Lambert" if name == "lambert" else name
+        beside = self._beside_lambert() if several else ""
+        if self.losses.cosine**2 > HALF:
+            placed = f"puts {_percent(1 - self.losses.misplaced)} of the light where it belongs"
+            return f"{name} {placed}, but not the peak, and leaves {left} (rms){beside}"
+        if self.losses.misplaced > HALF:
+            return f"{name} comes within {left} (rms), but {elsewhere}{beside}"
+        verb = "is enough" if several and name == "Lambert" else "describes it"
+        return f"{name} {verb} within {left} (rms; {elsewhere}){beside}"
+
+    def _loss(self, candidate: BrdfCandidate) -> float:
+        return getattr(candidate.losses, self.loss)
+
+    def _beside_lambert(self) -> str:
+        """What of the verdict compares lobes with Lambert, the first candidate."""
+        alone = self.candidates[0]
+        if self.chosen:
+            return f"; Lambert alone within {_percent(alone.losses.cosine)}"
+        if alone.losses.cosine <= ROUNDING:
+            return ""
+        lobe = min(self.candidates[1:], key=self._loss)
+        explained = 1 - (self._loss(lobe) / self._loss(alone)) ** 2
+        if explained <= ROUNDING:
+            return "; no lobe comes closer"
+        return f"; the best lobe, {lobe.model}, explains {_percent(explained)} of the squares that Lambert leaves"
+
+    def _brightest(self) -> str:
+        sums = np.where(_within(self.table, self.max_angle), self.table.values.sum(axis=1), -np.inf)
+        light, view = self.table.to_light[np.argmax(sums)], self.table.to_view[np.argmax(sums)]
+        retro, mirror = _apart(light, view), _apart(light * [-1, -1, 1], view)
+        back = f"{retro:.2g}° from the direction back to the light"
+        where = back if retro < mirror else f"{mirror:.2g}° from the mirror direction of the light"
+        return f"{where}, which stands at {_apart(light, _NORMAL):.3g}°"
+
+    def __str__(self) -> str:
+        """The report."""
+        channels = self.table.channels
+        plural = "channel" if len(channels) == 1 else "channels"
+        lines = [
+            f"{self.material.name} fitted to {self.table.name}: {self.samples} samples x {len(channels)} {plural}, "
+            f"{self.loss} loss, in {self.seconds:.2g} s"
+        ]
+        for parameter in self.parameters:
+            label = "" if parameter.channel is None or len(channels) == 1 else channels[parameter.channel]
+            lines.append(f"  {parameter.name:<4}{label:<8} {parameter}")
+        if self.negative:
+            lines.append(f"  {self.negative} values are below 0; squared losses count them, the logarithm does not")
+        lines += [f"  left out    {count} {reason}" for reason, count in self.left_out.items()]
+        lines.append(f"  {'deviation of':<24}{'cosine':>10}{'squared':>10}{'log':>10}{'misplaced':>11}")
+        for index, candidate in enumerate(self.candidates):
+            mark = "   <- chosen" if index == self.chosen and len(self.candidates) > 1 else ""
+            cosine, squared, log, misplaced = candidate.losses
+            numbers = f"{100 * cosine:>8.2f} %{100 * squared:>8.2f} %{log:>10.4f}{100 * misplaced:>9.2f} %"
+            lines.append(f"    {candidate.model:<22}{numbers}{mark}")
+        return "\n".join([*lines, f"  {self.verdict}."])
+
+    def to_dict(self) -> dict[str, Any]:
+        """The report as JSON holds it."""
+        candidates = [
+            {
+                "model": candidate.model,
+                "unknowns": sum(1 for parameter in candidate.parameters if parameter.value),
+                "losses": candidate.losses._asdict(),
+                "material": material_to_dict(candidate.material),
+                "chosen": index == self.chosen,
+            }
+            for index, candidate in enumerate(self.candidates)
+        ]
+        plain = {
+            key: getattr(self, key) for key in ("loss", "samples", "negative", "left_out", "fits", "verdict", "seconds")
+        }
+        return plain | {
+            "table": self.table.name,
+            "channels": list(self.table.channels),
+            "material": material_to_dict(self.material, undetermined=self.undetermined),
+            "parameters": [dataclasses.asdict(parameter) for parameter in self.parameters],
+            "losses": self.losses._asdict(),
+            "candidates": candidates,
+        }
+
+    def save(self, folder: str | Path) -> None:
+        """Write material.json, material.mtl (1 or 3 channels) and fit.json: all of them or none.
+
+        Args:
+            folder: made where missing.
+
+        Raises:
+            InputError: where the folder cannot be written.
+        """
+        with atomic_folder(folder) as stage:
+            write_report(stage, self)
+
+
+_NORMAL = np.array([0.0, 0.0, 1.0])
+
+
+def _percent(share: float) -> str:
+    if share < ROUNDING:
+        return f"{100 * ROUNDING:g} %" if share > 0 else "0 %"
+    return f"{100 * share:.{2 if share < 0.995 else 3}g} %"
+
+
+def _apart(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
+
+
+def _within(table: brdf.MeasuredBRDF, max_angle: float) -> np.ndarray:
+    """Which samples have light and view so near the normal; angles carry rounding: one at the limit counts."""
+    lowest = np.cos(np.radians(max_angle + 1e-4)) if max_angle < 90 else 0.0
+    return np.minimum(table.to_light[:, 2], table.to_view[:, 2]) > lowest
 
 
 def fit_brdf(
@@ -49,7 +283,7 @@ def fit_brdf(
         table: what `brdf.load_measured` reads.
         model: the name of a model, or "auto": Lambert, unless a lobe explains half of the squares that it leaves;
             (a tenth, where Lambert explains less than half of the table); then the form with the least loss.
-        loss: "cosine", "squared" or "log"; see `fitting.measured_losses`.
+        loss: "cosine", "squared" or "log"; see `fitting.measured_fit`.
         max_angle: light and view further than this from the normal are left out, in degrees, above 0 to 90.
         n_range: bounds of the exponent, 0 < lower < upper.
 
@@ -58,6 +292,9 @@ def fit_brdf(
 
     Raises:
         InputError: naming the argument.
+
+    Example:
+        ``print(fitting.fit_brdf(brdf.load_measured("gold.binary")).verdict)``
 
     Source: A. Ngan, F. Durand and W. Matusik, "Experimental analysis of BRDF models", EGSR 2005; J. Löw, J. Kronander,
     A. Ynnerman and J. Unger, "BRDF models for accurate and efficient rendering of glossy surfaces", TOG 31 (2012) 9.
@@ -69,45 +306,44 @@ def fit_brdf(
         raise InputError("model", f"is unknown, got {model!r}", f"Use auto or one of {', '.join(brdf.MODELS)}")
     if loss not in get_args(Loss):
         raise InputError("loss", f"is unknown, got {loss!r}", f"Use one of {', '.join(get_args(Loss))}")
-    low, high = n_range
-    if not 0 < low < high < np.inf:
+    if not 0 < n_range[0] < n_range[1] < np.inf:
         raise InputError("n_range", f"must be 0 < lower < upper, got {n_range}", "Correct the bounds")
-    samples, left_out = _samples(table, max_angle)
-    if loss == "log":
-        left_out["values below 0, out of reach of the logarithm"] = int(np.count_nonzero(~samples.positive))
-    names = tuple(brdf.MODELS) if model == "auto" else (model,)
-    names = tuple(name for name in names if samples.values.size > _unknowns(name, samples))
-    if not names:
-        came = f"has {len(samples.values)} samples that count, no more than there are numbers to find"
+    samples = _samples(table, max_angle)
+    count, channels = int(np.count_nonzero(samples.solid_angle)), len(samples.channels)
+    left_out, negative = samples.left_out, int(np.count_nonzero(samples.values[:count] < 0))
+    if loss == "log" and negative:
+        left_out = left_out | {"values below 0, out of reach of the logarithm": negative}
+    candidates = [
+        _fit_model(kind, samples, loss, n_range)
+        for kind in (brdf.MODELS.values() if model == "auto" else [brdf.MODELS[model]])
+        if count * channels > (2 * channels + 1 if issubclass(kind, SpecularMaterial) else channels)
+    ]
+    if not candidates:
+        came = f"has {count} samples that count, no more than there are numbers to find"
         raise InputError(table.name, came, "Give a table with more samples, or a model with fewer numbers")
-    fits = [_fit_model(name, samples, loss, n_range) for name in names]
-    candidates = [fit.candidate for fit in fits]
-    chosen = _choose(candidates)
-    best = fits[chosen]
     return BrdfFitResult(
         table=table,
-        material=best.material,
         loss=loss,
-        parameters=best.parameters,
-        losses=best.candidate.losses,
         candidates=tuple(candidates),
-        chosen=chosen,
-        samples=len(samples.values),
-        negative=int(np.count_nonzero(samples.values < 0)),
-        left_out={reason: count for reason, count in left_out.items() if count},
+        chosen=_choose(candidates, loss),
+        samples=count,
+        negative=negative,
+        left_out=left_out,
         max_angle=max_angle,
         seconds=time.perf_counter() - start,
     )
 
 
-def _samples(table: brdf.MeasuredBRDF, max_angle: float) -> tuple[Samples, dict[str, int]]:
+def _samples(table: brdf.MeasuredBRDF, max_angle: float) -> brdf.MeasuredBRDF:
+    """The samples that count, their solid angles of mean 1; more of solid angle 0 follow.
+
+    They make it one of a few sizes, so that few programs are compiled.
+    """
     if not (isinstance(max_angle, int | float) and 0 < max_angle <= 90):
         raise InputError("max_angle", f"must be above 0 and at most 90 degrees, got {max_angle!r}", "Correct it")
-    lowest = lowest_cosine(max_angle)
-    near = (table.to_light[:, 2] > lowest) & (table.to_view[:, 2] > lowest) & (table.solid_angle > 0)
-    left_out = dict(table.left_out)
-    left_out[f"further than {max_angle:g}° from the normal"] = int(np.count_nonzero(~near))
-    if not near.any():
+    near = np.flatnonzero(_within(table, max_angle) & (table.solid_angle > 0))
+    count = len(near)
+    if not count:
         raise InputError(table.name, f"has no sample within {max_angle:g}° of the normal", "Raise max_angle")
     values = table.values[near]
     if not values.any():
@@ -117,51 +353,45 @@ def _samples(table: brdf.MeasuredBRDF, max_angle: float) -> tuple[Samples, dict[
     largest = float(np.max(np.abs(values)))
     if not 1 / FAR <= largest <= FAR:
         raise InputError(table.name, f"holds values of up to {largest:.3g}/sr, as no BRDF does", "Check its unit")
-    share = table.solid_angle[near]
-    samples = Samples(table.to_light[near], table.to_view[near], values, share / np.mean(share), values >= 0)
-    return samples, left_out
+    power = 1 << max(10, (count - 1).bit_length())
+    more = (power * 3 // 4 if count <= power * 3 // 4 else power) - count
+    near, share = np.pad(near, (0, more), mode="edge"), table.solid_angle[near]
+    far = {f"further than {max_angle:g}° from the normal": len(table.values) - count}
+    return dataclasses.replace(
+        table,
+        to_light=table.to_light[near],
+        to_view=table.to_view[near],
+        values=table.values[near],
+        solid_angle=np.pad(share / np.mean(share), (0, more)),
+        left_out={reason: number for reason, number in (table.left_out | far).items() if number},
+    )
 
 
-def _unknowns(name: str, samples: Samples) -> int:
-    channels = samples.values.shape[1]
-    return 2 * channels + 1 if issubclass(brdf.MODELS[name], SpecularMaterial) else channels
-
-
-class _Fit(NamedTuple):
-    material: brdf.Material
-    parameters: tuple[Any, ...]
-    candidate: BrdfCandidate
-
-
-def _fit_model(name: str, samples: Samples, loss: Loss, n_range: tuple[float, float]) -> _Fit:
-    model = brdf.MODELS[name]
-    channels = samples.values.shape[1]
+def _fit_model(
+    model: type[brdf.Material], samples: brdf.MeasuredBRDF, loss: Loss, n_range: tuple[float, float]
+) -> BrdfCandidate:
+    values, cosine, share = samples.values, samples.to_light[:, 2:], samples.solid_angle[:, None]
+    channels = values.shape[1]
     specular = issubclass(model, SpecularMaterial)
-    log_cos, reach = _lobe(model, samples)
-    free = np.ones((3, channels), bool)
-    free[0], free[2] = False, specular
+    log_cos, reach = _lobe(model, samples) if specular else (0.0 * cosine, 0.0 * cosine)
+    free = np.repeat([[False], [True], [specular]], channels, axis=1)
 
-    def solve(weight: Float[np.ndarray, "P C"] | Float[np.ndarray, " P"]) -> Optimum:
-        pictures = [_picture(samples, weight, log_cos, reach)]
+    def solve(weight: Float[np.ndarray, "P C"] | Float[np.ndarray, "P 1"]) -> Optimum:
+        """The least weighted squares."""
         with jax.enable_x64(True):
-            if specular:
-                return search(pictures, n_min=n_range[0], n_max=n_range[1], free=free)
-            return fit_linear(pictures, free=free)
+            lobe = OneLightLobe(jnp.asarray(log_cos[:, 0]), jnp.asarray(reach))
+            target, weight = jnp.asarray(np.pi * values), jnp.asarray(weight)
+            picture = Picture(target, jnp.ones((len(values), 1)), lobe, weight, ambient=jnp.zeros(1))
+        return search([picture], n_min=n_range[0], n_max=n_range[1], free=free)
 
     def modelled(optimum: Optimum) -> Float[np.ndarray, "P C"]:
-        values = np.broadcast_to(optimum.x[1], samples.values.shape)
-        if specular:
-            values = values + optimum.x[2] * (reach * np.exp(np.maximum(optimum.n * log_cos, -745.0)))[:, None]
-        return values / np.pi
+        return (optimum.x[1] + optimum.x[2] * reach * np.exp(optimum.n * log_cos)) / np.pi
 
-    squared = samples.share * (samples.cosine[:, 0] ** 2 if loss != "squared" else 1.0)
-    optimum = solve(squared)
+    optimum = solve((share if loss == "squared" else share * cosine**2)[:, 0])
     if loss == "log":
-        optimum = logarithmic(samples, solve, modelled, optimum)
-    values = modelled(optimum)
-    losses = losses_of(samples, values)
-    brightest = np.pi * np.max(np.abs(samples.values), axis=0)
-    peak = float(np.max(reach * np.exp(np.maximum(optimum.n * log_cos, -745.0)))) if specular else 0.0
+        optimum = _logarithmic(samples, solve, modelled) or optimum
+    brightest = np.pi * np.max(np.abs(values), axis=0)
+    lobe = optimum.x[2] * reach * np.exp(optimum.n * log_cos)
     # A lobe that hardly reaches a sample needs a k_s whose square is out of range; it is found to be undetermined.
     with np.errstate(over="ignore", invalid="ignore"):
         sure = uncertainty(
@@ -171,75 +401,86 @@ def _fit_model(name: str, samples: Samples, loss: Loss, n_range: tuple[float, fl
             brightest,
             specular=specular,
             single=False,
-            visible=float(np.max(optimum.x[2]) * peak / np.max(brightest)),
+            visible=float(np.max(lobe) / np.max(brightest)),
         )
-    factors = np.ones((3, channels))
-    if specular:
-        with jax.enable_x64(True):
-            factors[2] = float(model.scale(np.float64(optimum.n)))
-    k = optimum.x / factors
+    factors = coefficient_factors(model, optimum.n, np.ones(channels))
+    k, errors, reasons = optimum.x / factors, sure.x_error / factors, sure.undetermined
     parameters = []
-    for term, key in ((1, "k_d"), (2, "k_s"))[: 2 if specular else 1]:
+    for term, name in ((1, "k_d"), (2, "k_s"))[: 1 + specular]:
         for channel in range(channels):
-            reason = sure.undetermined.get(key) or sure.undetermined.get(key if channels == 1 else f"{key}[{channel}]")
-            if reason:
-                parameters.append(Parameter(key, channel, None, None, reason=reason))
-                k[term, channel] = 0.0
-                continue
-            error = float(sure.x_error[term, channel] / factors[term, channel])
-            value = float(k[term, channel])
-            parameters.append(Parameter(key, channel, value, error, at_bound=value == 0))
+            reason = reasons.get(name) or reasons.get(f"{name}[{channel}]") or ""
+            k[term, channel] *= not reason
+            known = (None, None) if reason else (float(k[term, channel]), float(errors[term, channel]))
+            parameters.append(Parameter(name, channel, *known, at_bound=known[0] == 0, reason=reason))
     if not specular:
-        material = brdf.Lambert(k_d=k[1])
+        material = model(k_d=k[1])
     else:
-        reason = sure.undetermined.get("n", "")
-        parameters.append(
-            Parameter("n", None, None if reason else optimum.n, None if reason else sure.n_error, reason=reason)
-        )
+        reason = reasons.get("n", "")
+        known = (None, None) if reason else (optimum.n, sure.n_error)
+        parameters.append(Parameter("n", None, *known, reason=reason))
         material = model(k_d=k[1], k_s=k[2], n=optimum.n if k[2].any() else 0.0)
-    value = getattr(losses, loss)
-    unknowns = int(np.count_nonzero(k > 0)) + int(bool(k[2].any()))
-    return _Fit(material, tuple(parameters), BrdfCandidate(name, unknowns, value, losses, material))
+    return BrdfCandidate(material, tuple(parameters), _losses(samples, modelled(optimum)))
 
 
-def _lobe(model: type[brdf.Material], samples: Samples) -> tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]]:
-    """Logarithm of the lobe's cosine, and what multiplies the lobe: S / (N.L) without scale."""
-    count = len(samples.values)
-    if not issubclass(model, SpecularMaterial):
-        return np.zeros(count), np.zeros(count)
+def _lobe(model: type[SpecularMaterial], samples: brdf.MeasuredBRDF) -> tuple[np.ndarray, np.ndarray]:
+    """Logarithm of the lobe's cosine, and what multiplies the lobe: S / (N.L) without scale, (P, 1) each."""
     with jax.enable_x64(True):
-        normal = jnp.array([0.0, 0.0, 1.0])
-        log_cos = np.asarray(model.log_cosine(normal, jnp.asarray(samples.to_light), jnp.asarray(samples.to_view)))
-    reach = np.ones(count) if model.cosine_weighted else 1.0 / samples.cosine[:, 0]
-    return np.maximum(log_cos, -1e4), np.where(log_cos > _DARK, reach, 0.0)
+        directions = (jnp.asarray(vectors) for vectors in (_NORMAL, samples.to_light, samples.to_view))
+        log_cos = np.asarray(model.log_cosine(*directions))[:, None]
+    reach = 1.0 if model.cosine_weighted else 1.0 / samples.to_light[:, 2:]
+    return np.maximum(log_cos, _LEAST), np.where(log_cos > _DARK, reach, 0.0)
 
 
-def _picture(
-    samples: Samples, weight: np.ndarray, log_cos: Float[np.ndarray, " P"], reach: Float[np.ndarray, " P"]
-) -> Picture:
-    """The table as the engine's picture, padded to one of a few sizes so that few programs are compiled."""
-    count = len(samples.values)
-    power = 1 << max(10, (count - 1).bit_length())
-    size = power * 3 // 4 if count <= power * 3 // 4 else power
+def _logarithmic(
+    samples: brdf.MeasuredBRDF,
+    solve: Callable[[np.ndarray], Optimum],
+    modelled: Callable[[Optimum], np.ndarray],
+) -> Optimum | None:
+    """Least logarithmic loss by reweighting: the weighted squares have the gradient of the loss where they settle.
 
-    def padded(array: np.ndarray) -> Any:
-        return jnp.asarray(np.pad(array, [(0, size - count)] + [(0, 0)] * (array.ndim - 1)))
+    With a = log(1 + f cos), b = log(1 + m cos) the slope of the loss by m is -2 (a - b) cos / (1 + m cos), that of
+    weighted squares -2 w (f - m): equal for w = cos (a - b) / [(f - m) (1 + m cos)].
+    """
+    positive, cosine = samples.values >= 0, samples.to_light[:, 2:]
+    share = samples.solid_angle[:, None] * positive
+    value = np.where(positive, samples.values, 0.0) * cosine
+    # The first round's weights are those of a perfect model, which sees the tails that the peak would drown.
+    best, least, model = None, np.inf, value
+    for _ in range(_MOST_ROUNDS):
+        step, logarithms = value - model, np.log1p(value) - np.log1p(model)
+        small = np.abs(step) < 1e-9 * (1 + model)
+        slope = np.where(small, 1 / (1 + model), logarithms / np.where(small, 1.0, step))
+        found = solve(share * cosine**2 * slope / (1 + model))
+        model = modelled(found) * cosine
+        cost = float(np.sum(share * (np.log1p(value) - np.log1p(model)) ** 2))
+        if cost >= least * (1 - _ENOUGH):
+            break
+        best, least = found, cost
+    return best
 
-    with jax.enable_x64(True):
-        return Picture(
-            target=padded(np.pi * samples.values),
-            diffuse=jnp.ones((size, 1)),
-            lobe=OneLightLobe(padded(log_cos), padded(reach[:, None])),
-            weight=padded(weight),
-            ambient=jnp.zeros(1),
-        )
+
+def _losses(samples: brdf.MeasuredBRDF, model: Float[np.ndarray, "P C"]) -> Losses:
+    values, cosine, share = samples.values, samples.to_light[:, 2:], samples.solid_angle[:, None]
+    deviation, counted = values - model, share * (values >= 0)
+    logarithms = np.log1p(np.maximum(values, 0.0) * cosine) - np.log1p(model * cosine)
+
+    def relative(weight: np.ndarray) -> float:
+        return float((np.sum(weight * deviation**2) / np.sum(weight * values**2)) ** 0.5)
+
+    return Losses(
+        cosine=relative(share * cosine**2),
+        squared=relative(share),
+        log=float((np.sum(counted * logarithms**2) / np.sum(counted)) ** 0.5),
+        misplaced=float(np.sum(share * cosine * np.abs(deviation)) / np.sum(share * cosine * np.abs(values))),
+    )
 
 
-def _choose(candidates: list[BrdfCandidate]) -> int:
+def _choose(candidates: Sequence[BrdfCandidate], loss: Loss) -> int:
     """Lambert, which comes first, unless a lobe explains enough of the squares that it leaves."""
-    if candidates[0].losses.cosine <= ROUNDING:
+    lambert = candidates[0].losses
+    if lambert.cosine <= EXACT:
         return 0
-    best = int(np.argmin([candidate.loss for candidate in candidates]))
-    lambert = candidates[0]
-    worth = WORTH if 1 - lambert.losses.cosine**2 >= HALF else WORTH_WITHOUT_LAMBERT
-    return best if candidates[best].loss ** 2 <= worth * lambert.loss**2 else 0
+    losses = [getattr(candidate.losses, loss) for candidate in candidates]
+    best = int(np.argmin(losses))
+    worth = WORTH if 1 - lambert.cosine**2 >= HALF else WORTH_WITHOUT_LAMBERT
+    return best if losses[best] ** 2 <= worth * losses[0] ** 2 else 0
