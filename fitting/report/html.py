@@ -15,7 +15,8 @@ from typing import Any
 
 import brdf
 from brdf.channels import channel_names
-from fitting.result import FitResult, Parameter
+from brdf.display import material_html, report_html
+from fitting.result import FitResult
 
 _STYLE = """
 :root { color-scheme: light dark; }
@@ -37,9 +38,8 @@ def result_html(result: FitResult) -> str:
     Args:
         result: of a fit.
     """
-    residual = f"residual {100 * result.residual:.3g} % of the picture, {result.pixels} pixels"
-    parts = [brdf.material_html(result.material), f"<p>{residual}, {result.seconds:.2g} s, {result.precision}</p>"]
-    return "".join([*parts, _numbers(result), *_warnings(result)])
+    summary = f"residual {100 * result.residual:.3g} % of the picture, {result.pixels} pixels, {result.seconds:.2g} s"
+    return f"{material_html(result.material)}<p>{summary}, {result.precision}</p>{_numbers(result)}{_warnings(result)}"
 
 
 def report_page(result: FitResult, *, source: str = "", command: str = "") -> str:
@@ -53,107 +53,93 @@ def report_page(result: FitResult, *, source: str = "", command: str = "") -> st
     Returns:
         The page's text; it loads nothing and runs no program.
     """
-    from fitting.report.material_plots import overview
+    from fitting.report.material_plots import overview  # Matplotlib takes long to load
 
     check = brdf.check(result.material, name=result.material.name)
     title = html.escape(f"{result.surface} fitted to {source or 'a picture'}")
-    left_out = [f"{count} pixels {reason}" for reason, count in result.left_out.items() if count]
     summary = f"Residual {100 * result.residual:.3g} % of the picture (rms) over {result.pixels} pixels."
+    left_out = [f"{count} pixels {reason}" for reason, count in result.left_out.items() if count]
     summary += f" Left out: {', '.join(left_out)}." if left_out else ""
     count = len(result.targets)
-    several = f" Of {count} pictures the one that is explained worst is shown." if count > 1 else ""
-    alternative = "target, fit, residual, the highlight enlarged, a scanline through it, and the profile of n"
+    summary += f" Of {count} pictures the one that is explained worst is shown." if count > 1 else ""
     made = {
         "command": command,
         "made": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "time of the fit": f"{result.seconds:.3g} s, {result.precision}, {result.loss} loss",
         "with": _versions(),
     }
-    body = [
-        f"<h1>{title}</h1>",
-        brdf.material_html(result.material),
-        f"<p>{html.escape(summary + several)}</p>",
-        *_warnings(result),
-        "<h2>Numbers</h2>",
-        _numbers(result),
-        "<h2>Pictures</h2>",
-        _picture(result.plot(), alternative),
-        *_candidates(result),
-        "<h2>Is it plausible?</h2>",
-        brdf.report_html(check),
-        _picture(overview(result.material, check), "a lit sphere, the lobe, the albedo and the reciprocity error"),
-        "<h2>How it was made</h2>",
-        _table([[key, value] for key, value in made.items() if value], "left"),
-        f'<details><summary>The report as text</summary><pre class="wide">{html.escape(str(result))}</pre></details>',
-    ]
-    head = f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
-    head += '<meta name="viewport" content="width=device-width, initial-scale=1">'
-    head += f"<title>{title}</title><style>{_STYLE}</style>"
-    return f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>\n' + "\n".join(body) + "\n</body></html>\n"
+    alternative = "target, fit, residual, the highlight enlarged, a scanline through it, and the profile of n"
+    return f"""<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{_POLICY}">
+<meta name="viewport" content="width=device-width, initial-scale=1"><title>{title}</title><style>{_STYLE}</style></head>
+<body>
+<h1>{title}</h1>
+{material_html(result.material)}
+<p>{html.escape(summary)}</p>
+{_warnings(result)}
+<h2>Numbers</h2>
+{_numbers(result)}
+<h2>Pictures</h2>
+{_picture(result.plot(), alternative)}
+{_candidates(result)}
+<h2>Is it plausible?</h2>
+{report_html(check)}
+{_picture(overview(result.material, check), "a lit sphere, the lobe, the albedo and the reciprocity error")}
+<h2>How it was made</h2>
+{_table([[key, value] for key, value in made.items() if value], "left")}
+<details><summary>The report as text</summary><pre class="wide">{html.escape(str(result))}</pre></details>
+</body></html>
+"""
 
 
 def _numbers(result: FitResult) -> str:
-    rows = [_row(parameter, result) for parameter in result.parameters]
+    names = channel_names(result.material.k_d.shape[0])
+    rows = []
+    for one in result.parameters:
+        value = "not determined" if one.value is None else f"{one.value:.6g}"
+        ends = ("∞" if math.isinf(end) else f"{end:.6g}" for end in one.interval or ())
+        channel = "" if one.channel is None else names[one.channel]
+        error = f"{one.error:.2g}" if one.error else ""
+        rows.append(
+            [one.name, channel, value, error, " to ".join(ends), "at its bound" if one.at_bound else one.reason]
+        )
     return _table(rows, head=["", "channel", "value", "± error", "95 % interval", ""])
 
 
-def _row(parameter: Parameter, result: FitResult) -> list[str]:
-    names = channel_names(result.material.k_d.shape[0])
-    channel = "" if parameter.channel is None else names[parameter.channel]
-    interval = getattr(parameter, "interval", None)
-    ends = "" if interval is None else " to ".join("∞" if math.isinf(end) else f"{end:.6g}" for end in interval)
-    if parameter.value is None:
-        return [parameter.name, channel, "not determined", "", ends, parameter.reason]
-    error = "" if not parameter.error else f"{parameter.error:.2g}"
-    return [
-        parameter.name,
-        channel,
-        f"{parameter.value:.6g}",
-        error,
-        ends,
-        "at its bound" if parameter.at_bound else "",
-    ]
-
-
-def _candidates(result: FitResult) -> list[str]:
+def _candidates(result: FitResult) -> str:
     if len(result.candidates) < 2:
-        return []
+        return ""
     rows = []
     for one in result.candidates:
         mark = "chosen" if one.chosen else "adequate" if one.excess <= one.excess_error else ""
         excess = f"{one.excess:.4g} ± {one.excess_error:.2g}"
-        rows.append(
-            [one.name, mark, str(one.unknowns), f"{one.rms:.3e}", f"{one.held_out:.3e}", excess, f"{one.bic:.4g}"]
-        )
+        numbers = [f"{one.rms:.3e}", f"{one.held_out:.3e}", excess, f"{one.bic:.4g}"]
+        rows.append([one.name, mark, str(one.unknowns), *numbers])
     head = ["model", "", "unknowns", "rms", "held out", "excess ± its error", "BIC"]
-    told = (
-        "<p>The simplest adequate model is chosen: its squared error expected on held-out pixels exceeds that of the "
-        "best, in noise variances, by no more than its standard error.</p>"
+    return (
+        "<h2>What the scene requires</h2><p>The simplest adequate model is chosen: its squared error expected on "
+        "held-out pixels exceeds that of the best, in noise variances, by no more than its standard error.</p>"
+        + _table(rows, head=head)
     )
-    return ["<h2>What the scene requires</h2>", told, _table(rows, head=head)]
 
 
-def _warnings(result: FitResult) -> list[str]:
-    return [f'<p class="warning">⚠ {html.escape(warning)}</p>' for warning in result.warnings]
+def _warnings(result: FitResult) -> str:
+    return "".join(f'<p class="warning">⚠ {html.escape(warning)}</p>' for warning in result.warnings)
 
 
 def _table(rows: list[list[str]], align: str = "right", head: list[str] | None = None) -> str:
     """A table, without the columns that are empty in every row; the first names the rows."""
     filled = [any(column) for column in zip(*rows, strict=True)]
-    rows = [[cell for cell, keep in zip(row, filled, strict=True) if keep] for row in rows]
     left, lines = ' style="text-align:left"', []
-    if head is not None:
-        first, *others = [cell for cell, keep in zip(head, filled, strict=True) if keep]
-        lines.append(
-            f"<th{left}>{html.escape(first)}</th>" + "".join(f"<th>{html.escape(cell)}</th>" for cell in others)
-        )
-    for first, *others in rows:
-        cells = [f"<td{left}>{html.escape(first)}</td>"]
-        for cell in others:
-            # Numbers are not broken over lines; on a narrow screen the table is pushed sideways instead.
-            whole = ";white-space:nowrap" if head is not None and len(cell) < SENTENCE else ""
-            cells.append(f'<td style="text-align:{align}{whole}">{html.escape(cell)}</td>')
-        lines.append("".join(cells))
+    for cells in rows if head is None else [head, *rows]:
+        first, *others = (html.escape(cell) for cell, keep in zip(cells, filled, strict=True) if keep)
+        if cells is head:
+            lines.append(f"<th{left}>{first}</th>" + "".join(f"<th>{cell}</th>" for cell in others))
+            continue
+        # Numbers are not broken over lines; on a narrow screen the table is pushed sideways instead.
+        whole = [";white-space:nowrap" if head and len(cell) < SENTENCE else "" for cell in others]
+        line = [f'<td style="text-align:{align}{style}">{cell}</td>' for cell, style in zip(others, whole, strict=True)]
+        lines.append(f"<td{left}>{first}</td>" + "".join(line))
     return f'<div class="wide"><table>{"".join(f"<tr>{line}</tr>" for line in lines)}</table></div>'
 
 

@@ -1,7 +1,6 @@
 """Pictures of a material: albedo against angle, the lobe, the reciprocity error, and the stability map.
 
-Every function returns a matplotlib figure and shows nothing. Colours are those of Okabe and Ito (2008), which people
-with any common colour blindness tell apart; line styles say the same again.
+They return a matplotlib figure and show nothing.
 """
 
 import math
@@ -15,26 +14,19 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from brdf import displayed, lit_sphere
 from brdf.albedo import directional_albedo
-from brdf.channels import channel_names
-from brdf.models import Material, SpecularMaterial
+from brdf.channels import channel_names, in_channel
+from brdf.display import displayed, lit_sphere
+from brdf.models.base import Material, SpecularMaterial
 from brdf.plausibility.numeric import Sampler, albedo_of
 from brdf.plausibility.report import Report
 from brdf.plausibility.stability import StabilityMap
+from fitting.report.plots import CHANNELS, OTHERS, PRINT, SIGNED
 
-PRINT: dict[Any, Any] = {"font.size": 8, "axes.titlesize": 9, "legend.fontsize": 7}
-
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
-"""Blue, vermilion, green, purple, sky blue, orange."""
-
-RGB = (1, 2, 0)
-"""Which of them stand for red, green and blue."""
-
-_STYLES = ("-", "--", "-.", ":")
 Brdf = Material | Callable[[Any, Any], Any]
 
 
+@matplotlib.rc_context(PRINT)
 def overview(brdf: Brdf, report: Report | None = None) -> Figure:
     """A lit sphere, the lobe, the albedo and the reciprocity error on one page.
 
@@ -44,22 +36,20 @@ def overview(brdf: Brdf, report: Report | None = None) -> Figure:
 
     Returns:
         The figure.
+
+    Example:
+        ``fitting.overview(brdf.preset("gold")).savefig("gold.png")``
     """
-    with matplotlib.rc_context(PRINT):
-        figure = Figure(figsize=(7.2, 6.0), layout="constrained")
-        parts: Any = figure.subfigures(2, 2)
-        first, second, third, fourth = parts.ravel()
-        axes = first.add_subplot()
-        axes.set_axis_off()
-        if isinstance(brdf, Material):
-            axes.imshow(lit_sphere(brdf, 256))
-            axes.set_title(brdf.name if not isinstance(brdf, SpecularMaterial) else f"{brdf.name}, n = {brdf.n:.4g}")
-        else:
-            axes.imshow(_lit_function(_sampler(brdf)))
-            axes.set_title(getattr(brdf, "__name__", type(brdf).__name__))
-        plot_lobe(brdf, figure=second)
-        plot_albedo(brdf, report, figure=third)
-        plot_reciprocity(brdf, figure=fourth)
+    figure = Figure(figsize=(7.2, 6.0), layout="constrained")
+    ball, lobe, albedo, reciprocity = np.ravel(figure.subfigures(2, 2))
+    axes = ball.add_subplot()
+    axes.set_axis_off()
+    axes.imshow(lit_sphere(brdf, 256) if isinstance(brdf, Material) else _lit_function(_sampler(brdf)))
+    name = brdf.name if isinstance(brdf, Material) else getattr(brdf, "__name__", type(brdf).__name__)
+    axes.set_title(f"{name}, n = {brdf.n:.4g}" if isinstance(brdf, SpecularMaterial) else name)
+    plot_lobe(brdf, figure=lobe)
+    plot_albedo(brdf, report, figure=albedo)
+    plot_reciprocity(brdf, figure=reciprocity)
     return figure
 
 
@@ -73,32 +63,34 @@ def plot_albedo(brdf: Brdf, report: Report | None = None, figure: Any = None) ->
 
     Returns:
         The figure.
+
+    Example:
+        ``fitting.plot_albedo(brdf.preset("gold"))``
     """
-    degrees = np.append(np.arange(0.0, 89.6, 0.5), [89.7, 89.8, 89.9, 89.95, 89.99])
     if isinstance(brdf, Material):
+        degrees = np.append(np.arange(0.0, 89.6, 0.5), [89.7, 89.8, 89.9, 89.95, 89.99])
         albedo = np.asarray(directional_albedo(brdf, np.radians(degrees), precision="float64"))
     else:
         degrees = np.append(np.arange(0.0, 89.0, 2.0), [89.0, 89.5, 89.9])
         albedo = albedo_of(brdf, degrees)
+    count = albedo.shape[1]
     figure = figure or Figure(figsize=(6, 4), layout="constrained")
     axes = figure.add_subplot()
     axes.axhspan(1, 2, color="0.92", zorder=0)
     axes.axhline(1, color="black", linewidth=1)
     axes.annotate("more than arrives", (1, 1), (0, 4), textcoords="offset points", fontsize="small")
-    names = channel_names(albedo.shape[1])
-    for channel in range(albedo.shape[1]):
-        look = _look(channel)
-        if albedo.shape[1] == 3:
-            look["color"] = COLOURS[RGB[channel]]
-        axes.plot(degrees, albedo[:, channel], **look, label=names[channel])
-    if albedo.shape[1] > 1:
+    axes.set_prop_cycle(CHANNELS if count == 3 else OTHERS)
+    for values, name in zip(albedo.T, channel_names(count), strict=True):
+        axes.plot(degrees, values, linewidth=1.8, label=name)
+    if count > 1:
         axes.legend(loc="best")
-    if report is not None and report.energy.crossing:
-        axes.axvline(report.energy.crossing, color="0.4", linestyle=":", linewidth=1)
-        text = f"exceeds 1 beyond {report.energy.crossing:.4g}°"
-        axes.annotate(text, (report.energy.crossing, 1.2), (-5, 0), textcoords="offset points", ha="right")
-    if report is not None and report.energy.value < 1.5:
-        axes.plot(report.energy.to_light.polar, report.energy.value, "ko", markerfacecolor="none", clip_on=False)
+    energy = None if report is None else report.energy
+    if energy is not None and energy.crossing:
+        axes.axvline(energy.crossing, color="0.4", linestyle=":", linewidth=1)
+        text = f"exceeds 1 beyond {energy.crossing:.4g}°"
+        axes.annotate(text, (energy.crossing, 1.2), (-5, 0), textcoords="offset points", ha="right")
+    if energy is not None and energy.value < 1.5:
+        axes.plot(energy.to_light.polar, energy.value, "ko", markerfacecolor="none", clip_on=False)
     axes.set(xlabel="angle of the light in degrees", ylabel="albedo", xlim=(0, 90), ylim=(0, 1.5))
     axes.set_title("Light reflected, of that arriving")
     return figure
@@ -115,26 +107,28 @@ def plot_lobe(brdf: Brdf, angles: tuple[float, ...] = (0.0, 30.0, 60.0), channel
 
     Returns:
         The figure; radii grow with the root, so that the diffuse part shows beside a bright lobe.
+
+    Example:
+        ``fitting.plot_lobe(brdf.preset("gold"), angles=(0, 45))``
     """
     sample = _sampler(brdf)
     figure = figure or Figure(figsize=(6, 4), layout="constrained")
     axes: Any = figure.add_subplot(projection="polar")
-    for index, angle in enumerate(angles):
-        # denser near the mirror direction, where narrow lobes are
-        near = angle + np.concatenate([-np.geomspace(1e-3, 60, 400)[::-1], [0.0], np.geomspace(1e-3, 60, 400)])
-        views = np.unique(np.concatenate([np.linspace(-90, 90, 721), near]))
+    axes.set_prop_cycle(OTHERS)
+    apart = np.geomspace(1e-3, 60, 400)  # denser near the mirror direction, where narrow lobes are
+    for angle in angles:
+        views = np.unique(np.concatenate([np.linspace(-90, 90, 721), angle - apart, [angle], angle + apart]))
         views = np.radians(views[np.abs(views) <= 90])
-        light = np.array([-math.sin(math.radians(angle)), 0.0, math.cos(math.radians(angle))])
-        view = np.stack([np.sin(views), 0 * views, np.cos(views)], -1)
-        value = sample(light[None], view)[:, channel] * view[:, 2]
-        axes.plot(views, np.sign(value) * np.abs(value) ** 0.5, **_look(index), label=f"light at {angle:g}°")
+        view = _in_plane(views)
+        value = sample(_in_plane(np.radians([-angle])), view)[:, channel] * view[:, 2]
+        axes.plot(views, np.sign(value) * np.abs(value) ** 0.5, linewidth=1.8, label=f"light at {angle:g}°")
     axes.set_theta_zero_location("N")
     axes.set_theta_direction(-1)
     axes.set_thetalim(-np.pi / 2, np.pi / 2)
     axes.yaxis.set_major_locator(MaxNLocator(3))
     axes.yaxis.set_major_formatter(lambda r, _: f"{r * abs(r):.3g}")
     axes.legend(loc="lower center", ncols=len(angles), bbox_to_anchor=(0.5, 0.0))
-    axes.set_title(f"Lobe f_r (N·V) in 1/sr, root scale{_of(sample, channel)}")
+    axes.set_title(f"Lobe f_r (N·V) in 1/sr, root scale{in_channel(channel, sample.channels)}")
     return figure
 
 
@@ -148,22 +142,25 @@ def plot_reciprocity(brdf: Brdf, channel: int = 0, figure: Any = None) -> Any:
 
     Returns:
         The figure: angle of the light across, angle of the view upwards.
+
+    Example:
+        ``fitting.plot_reciprocity(brdf.preset("gold"))``
     """
     sample = _sampler(brdf)
     angles = np.linspace(0, 89.5, 180)
-    light, view = (x.ravel() for x in np.meshgrid(np.radians(angles), np.radians(angles), indexing="ij"))
-    to_light = np.stack([np.sin(light), 0 * light, np.cos(light)], -1)
-    to_view = np.stack([-np.sin(view), 0 * view, np.cos(view)], -1)
+    light, view = np.radians(np.meshgrid(angles, -angles, indexing="ij")).reshape(2, -1)
+    to_light, to_view = _in_plane(light), _in_plane(view)
     there, back = sample(to_light, to_view)[:, channel], sample(to_view, to_light)[:, channel]
     largest = np.maximum(np.maximum(np.abs(there), np.abs(back)), 1e-300)
     difference = ((there - back) / largest).reshape(len(angles), -1)
     figure = figure or Figure(figsize=(5.2, 4.2), layout="constrained")
     axes = figure.add_subplot()
-    bound = max(float(np.abs(difference).max()), 1e-6)
-    image = axes.pcolormesh(angles, angles, difference.T, cmap="cividis", vmin=-bound, vmax=bound, rasterized=True)
+    most = float(np.abs(difference).max())
+    bound = max(most, 1e-6)
+    image = axes.pcolormesh(angles, angles, difference.T, cmap=SIGNED, vmin=-bound, vmax=bound, rasterized=True)
     figure.colorbar(image, label="(f_r(light→view) − f_r(view→light)) / the larger")
     axes.set(xlabel="angle of the light in degrees", ylabel="angle of the view in degrees", aspect="equal")
-    axes.set_title(f"Reciprocity error, at most {np.abs(difference).max():.2g}{_of(sample, channel)}")
+    axes.set_title(f"Reciprocity error ≤ {most:.2g}{in_channel(channel, sample.channels)}")
     return figure
 
 
@@ -175,27 +172,31 @@ def plot_stability(maps: list[StabilityMap]) -> Figure:
 
     Returns:
         The figure.
+
+    Example:
+        ``fitting.plot_stability([brdf.stability_map(brdf.Phong)])``
     """
     figure = Figure(figsize=(3.0 * len(maps) + 1, 3.4), layout="constrained")
     panels = figure.subplots(1, len(maps), sharey=True, squeeze=False)[0]
     scale = matplotlib.colors.LogNorm(1e-8, 1e-4)
-    image = None
     for axes, found in zip(panels, maps, strict=True):
-        rows, columns = np.arange(len(found.exponents) + 1), np.arange(len(found.angles) + 1)
-        image = axes.pcolormesh(columns, rows, np.clip(found.error, 1e-8, None), norm=scale, cmap="cividis")
+        axes.pcolormesh(np.clip(found.error, 1e-8, None), norm=scale, cmap=SIGNED)
         bad = np.argwhere(~found.finite)
         axes.plot(bad[:, 1] + 0.5, bad[:, 0] + 0.5, "rx")
-        across, up = columns[:-1:6], rows[:-1:3]
-        axes.set_xticks(across + 0.5, [f"{found.angles[i]:g}" for i in across])
-        axes.set_yticks(up + 0.5, [f"{found.exponents[i]:.3g}" for i in up])
-        axes.set_title(
-            f"{found.model}\n{'all derivatives finite' if not len(bad) else f'{len(bad)} not finite'}", fontsize=10
-        )
+        axes.set_xticks(np.arange(len(found.angles))[::6] + 0.5, [f"{angle:g}" for angle in found.angles[::6]])
+        axes.set_yticks(np.arange(len(found.exponents))[::3] + 0.5, [f"{n:.3g}" for n in found.exponents[::3]])
+        said = f"{len(bad)} not finite" if len(bad) else "all derivatives finite"
+        axes.set_title(f"{found.model}\n{said}", fontsize=10)
         axes.set_xlabel("angle of the light in degrees")
     panels[0].set_ylabel("exponent n")
-    if image is not None:
-        figure.colorbar(image, ax=list(panels), label="error of float32, of the peak", extend="both")
+    colours = matplotlib.cm.ScalarMappable(scale, SIGNED)
+    figure.colorbar(colours, ax=list(panels), label="error of float32, of the peak", extend="both")
     return figure
+
+
+def _in_plane(angle: Float[np.ndarray, " P"]) -> Float[np.ndarray, "P 3"]:
+    """Directions in the plane of incidence, by their angle from the normal in radians."""
+    return np.stack([np.sin(angle), 0.0 * angle, np.cos(angle)], axis=-1)
 
 
 def _lit_function(sample: Sampler, size: int = 256) -> Float[np.ndarray, "H W 3"]:
@@ -206,29 +207,16 @@ def _lit_function(sample: Sampler, size: int = 256) -> Float[np.ndarray, "H W 3"
     place = 1.03 * ((np.arange(size) + 0.5) * 2 / size - 1)
     x, y = np.meshgrid(place, -place)
     inside = x * x + y * y < 1
-    normal = np.stack([x, y, np.sqrt(np.maximum(1 - x * x - y * y, 0))], -1)[inside]
-    tangent = np.stack([normal[:, 2], 0 * normal[:, 0], -normal[:, 0]], -1)
-    tangent = tangent / np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
+    normal = np.stack([x, y, np.sqrt(np.maximum(1 - x * x - y * y, 0))], axis=-1)[inside]
+    tangent = np.cross([0.0, 1.0, 0.0], normal)
+    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
     frame = np.stack([tangent, np.cross(normal, tangent), normal], axis=1)
-    light = np.array([-0.5, 0.6, 0.8]) / np.linalg.norm([-0.5, 0.6, 0.8])
-    to_light, to_view = frame @ light, frame[:, :, 2]
-    cosine = to_light[:, 2:]
-    radiance = 0.9 * np.pi * sample(to_light, to_view) * np.maximum(cosine, 0)
+    to_light = frame @ (np.array([-0.5, 0.6, 0.8]) / math.sqrt(1.25))
+    radiance = 0.9 * np.pi * sample(to_light, frame[:, :, 2]) * np.maximum(to_light[:, 2:], 0)
     image = np.zeros((size, size, radiance.shape[-1]))
-    image[inside] = np.where(cosine > 0, np.nan_to_num(radiance), 0.0)
+    image[inside] = np.nan_to_num(radiance)
     return np.where(inside[..., None], displayed(image), 1.0)
-
-
-def _of(sample: Sampler, channel: int) -> str:
-    """Which channel is shown, where there are several."""
-    if sample.channels == 1:
-        return ""
-    return f", {channel_names(sample.channels)[channel] if sample.channels == 3 else f'channel {channel}'}"
 
 
 def _sampler(brdf: Brdf) -> Sampler:
     return Sampler(brdf.reflectance if isinstance(brdf, Material) else brdf)
-
-
-def _look(index: int) -> dict[str, Any]:
-    return {"color": COLOURS[index % len(COLOURS)], "linestyle": _STYLES[index % len(_STYLES)], "linewidth": 1.8}

@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from brdf.channels import channel_names
 from fitting.result import FitResult
 from fitting.selection import Candidate
@@ -17,6 +19,7 @@ def report(result: FitResult) -> str:
         result: of a fit.
     """
     channels = result.material.k_d.shape[0]
+    labels = channel_names(channels)
     count = f"{len(result.targets)} pictures, " if len(result.targets) > 1 else ""
     plural = "channel" if channels == 1 else "channels"
     loss = "" if result.loss == "squared" else f", {result.loss} loss"
@@ -24,34 +27,32 @@ def report(result: FitResult) -> str:
         f"{result.surface} fitted to {count}{result.pixels} pixels x {channels} {plural} "
         f"in {result.seconds:.2g} s ({result.precision}{loss})"
     ]
-    labels = channel_names(channels)
     for parameter in result.parameters:
         label = "" if parameter.channel is None else labels[parameter.channel]
         lines.append(f"  {parameter.name:<4}{label:<6} {parameter}")
     lines.append(f"  residual    {100 * result.residual:.3g} % of the picture (rms)")
-    for reason, pixels in result.left_out.items():
-        if pixels:
-            lines.append(f"  left out    {pixels} pixels {reason}")
+    lines += [f"  left out    {pixels} pixels {reason}" for reason, pixels in result.left_out.items() if pixels]
     if result.highlight_pixels is not None:
         lines.append(f"  highlight   on {result.highlight_pixels:.3g} pixels")
     lines += [] if result.choice is None else result.choice.lines()
-    lines += _correlations(result)
-    if result.candidates:
-        lines += _candidates(result.candidates)
+    lines += _correlations(result, labels)
+    lines += _candidates(result.candidates) if result.candidates else []
     lines += [f"  warning: {warning}" for warning in result.warnings]
     return "\n".join(lines)
 
 
-def _correlations(result: FitResult) -> list[str]:
+def _correlations(result: FitResult, labels: Sequence[str]) -> list[str]:
     """The strongest correlations, as far as they are worth a line."""
-    free = result.free_parameters
-    pairs = [(abs(result.correlation[i, j]), i, j) for i in range(len(free)) for j in range(i)]
-    # A grey k_s is one number in all channels.
-    pairs = [(size, i, j) for size, i, j in pairs if free[i].name != free[j].name or size < 1 - 1e-9]
-    strong = sorted((pair for pair in pairs if pair[0] > STRONG), reverse=True)[:MOST_CORRELATIONS]
-    labels = channel_names(result.material.k_d.shape[0])
+    free, matrix = result.free_parameters, result.correlation
     names = ["n" if one.channel is None else f"{one.name} {labels[one.channel]}".rstrip() for one in free]
-    words = [f"{names[j]} and {names[i]} {result.correlation[i, j]:+.2f}" for _, i, j in strong]
+    # A grey k_s is one number in all channels.
+    strong = [
+        (abs(matrix[i, j]), i, j)
+        for i, j in np.argwhere(np.tril(np.abs(matrix) > STRONG, -1))
+        if free[i].name != free[j].name or abs(matrix[i, j]) < 1 - 1e-9
+    ]
+    strong = sorted(strong, reverse=True)[:MOST_CORRELATIONS]
+    words = [f"{names[j]} and {names[i]} {matrix[i, j]:+.2f}" for _, i, j in strong]
     return [f"  correlated  {', '.join(words)}"] if words else []
 
 
@@ -64,7 +65,6 @@ def _candidates(candidates: Sequence[Candidate]) -> list[str]:
         mark = "  <- chosen" if one.chosen else "  adequate" if one.excess <= one.excess_error else ""
         excess = f"{one.excess:.1f} ± {one.excess_error:.1f}" if one.excess < 1e6 else f"{one.excess:.2e}"
         bic = f"{one.bic:.1f}" if one.bic < 1e6 else f"{one.bic:.2e}"
-        lines.append(
-            f"    {one.name:<40}{one.unknowns:>9}{one.rms:>11.3e}{one.held_out:>11.3e}{excess:>26}{bic:>12}{mark}"
-        )
+        errors = f"{one.rms:>11.3e}{one.held_out:>11.3e}{excess:>26}{bic:>12}"
+        lines.append(f"    {one.name:<40}{one.unknowns:>9}{errors}{mark}")
     return lines

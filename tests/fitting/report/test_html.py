@@ -2,9 +2,11 @@
 
 import dataclasses
 import json
+import pickle
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,28 +19,14 @@ from fitting.report.html import report_page
 
 
 @pytest.fixture(scope="module")
-def result() -> fitting.FitResult:
-    camera = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=(48, 48))
-    scene = brdf.Scene(
-        camera=camera,
-        shapes=(brdf.Sphere(center=[0, 0, 0], radius=1),),
-        lights=(brdf.DirectionalLight(direction=[0.4, 0.5, 0.8], intensity=[0.9] * 3),),
-    )
-    material = brdf.BlinnPhong(k_d=[0.5, 0.4, 0.3], k_s=[0.4, 0.4, 0.4], n=30)
-    target = np.asarray(brdf.render(material, scene, precision="float64"))
-    target = target + np.random.default_rng(5).normal(0, 0.01, target.shape)
-    return fitting.fit(target, scene, model="blinn-phong")
+def page(glossy: fitting.FitResult) -> str:
+    return report_page(glossy, source="<b>&target.exr", command="brdf fit '<b>&target.exr'")
 
 
-@pytest.fixture(scope="module")
-def page(result: fitting.FitResult) -> str:
-    return report_page(result, source="<b>&target.exr", command="brdf fit '<b>&target.exr'")
-
-
-def test_page_says_everything(page: str, result: fitting.FitResult):
+def test_page_says_everything(page: str, glossy: fitting.FitResult):
     for word in ("95 % interval", "not reciprocal", "Residual", "brdf fit", "jax", "Is it plausible?", "scanline"):
         assert word in page
-    for parameter in result.parameters:
+    for parameter in glossy.parameters:
         if parameter.value is not None:
             assert f"{parameter.value:.6g}" in page
 
@@ -50,10 +38,18 @@ def test_page_loads_nothing_and_escapes_names(page: str):
     assert "Content-Security-Policy" in page
 
 
-def test_results_show_themselves_in_jupyter(result: fitting.FitResult):
-    assert "95 % interval" in result._repr_html_()
-    assert "data:image/png;base64," in (result.material._repr_html_() or "")
-    assert "not plausible" in brdf.check(result.material)._repr_html_()
+def test_a_result_that_another_process_made_shows_itself(glossy: fitting.FitResult, tmp_path: Path):
+    (tmp_path / "result.pickle").write_bytes(pickle.dumps(glossy))
+    program = "import pickle, sys; result = pickle.load(open(sys.argv[1], 'rb')); print(result); result.plot()"
+    command = [sys.executable, "-W", "ignore", "-c", program, str(tmp_path / "result.pickle")]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
+    assert done.stdout.strip() == str(glossy)
+
+
+def test_results_show_themselves_in_jupyter(glossy: fitting.FitResult):
+    assert "95 % interval" in glossy._repr_html_()
+    assert "data:image/png;base64," in (glossy.material._repr_html_() or "")
+    assert "not plausible" in brdf.check(glossy.material)._repr_html_()
 
 
 @pytest.mark.skipif(
@@ -77,17 +73,13 @@ def test_chromium_shows_the_page(page: str, width: int, tmp_path: Path):
     assert np.std(pixels) > 0.05
 
 
-def test_columns_without_content_are_not_shown(result: fitting.FitResult):
+def test_columns_without_content_are_not_shown(matt: fitting.FitResult, page: str):
     """One channel has no name, and without errors there is no interval."""
-    (scene,), (target,) = result.scenes, result.targets
-    lamp = brdf.DirectionalLight(direction=scene.lights[0].direction, intensity=[0.9])
-    grey_scene = brdf.Scene(camera=scene.camera, shapes=scene.shapes, lights=(lamp,))
-    grey = fitting.fit(target[..., :1], grey_scene, model="lambert")
-    parameters = tuple(dataclasses.replace(one, error=None, interval=None) for one in grey.parameters)
-    bare = report_page(dataclasses.replace(grey, parameters=parameters))
+    parameters = tuple(dataclasses.replace(one, error=None, interval=None) for one in matt.parameters)
+    bare = report_page(dataclasses.replace(matt, parameters=parameters))
     assert "<th>value</th>" in bare
     for head in ("channel", "± error", "95 % interval"):
-        assert f"<th>{head}</th>" in report_page(result)
+        assert f"<th>{head}</th>" in page
         assert f"<th>{head}</th>" not in bare
 
 
