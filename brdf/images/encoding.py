@@ -1,6 +1,6 @@
 """How pixel values stand for light: linear, sRGB or a power, and what a file says about it.
 
-The curves are OpenImageIO's. Only the curve is undone: channels keep the primaries that the file was made with, because
+Only the curve is undone: channels keep the primaries that the file was made with, because
 a fit treats channels independently. In order of authority, an encoding is
 
 | source     | what decides                                                                                    |
@@ -19,14 +19,13 @@ from typing import Any, Literal
 
 import numpy as np
 import OpenImageIO as oiio  # noqa: N813
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float, Float32, UInt8
 
 from brdf.errors import InputError
 
 Encoding = Literal["linear", "srgb"] | float
 EncodingSource = Literal["given", "file", "format", "assumed"]
 
-_LINEAR, _SRGB = "lin_rec709_scene", "srgb_rec709_scene"
 _DISPLAY_FORMATS = ("jpeg", "gif", "webp")
 _HOW_TO_SAY = 'Say how it is encoded: "linear", "srgb" or a gamma like 2.2'
 # g, a, b, c, d of y = (a x + b)^g for x >= d, c x below: sRGB as ICC profiles of type 4 hold it.
@@ -62,33 +61,29 @@ def parse_encoding(where: object, value: Any) -> Encoding | None:
     return "linear" if gamma == 1.0 else gamma
 
 
-def decode(values: Float32[np.ndarray, "..."], encoding: Encoding) -> Float32[np.ndarray, "..."]:
-    """Encoded values, 1 at the largest code, to linear ones. NaN and infinite values stay what they are."""
-    return _convert(values, encoding, inverse=False)
+def decode(values: Float[np.ndarray, "..."], encoding: Encoding) -> Float[np.ndarray, "..."]:
+    """Encoded values, 1 at the largest code, to linear ones; NaN and infinite values stay what they are.
 
-
-def encode(values: Float32[np.ndarray, "..."], encoding: Encoding) -> Float32[np.ndarray, "..."]:
-    """Linear values to encoded ones, the inverse of :func:`decode`."""
-    return _convert(values, encoding, inverse=True)
-
-
-def _convert(values: Float32[np.ndarray, "..."], encoding: Encoding, *, inverse: bool) -> Float32[np.ndarray, "..."]:
+    Source: IEC 61966-2-1 for sRGB, whose lower part goes on below 0; powers of negative values are NaN.
+    """
     if encoding == "linear":
         return values
-    # OpenImageIO converts colours, three channels; here any channels pass through its curve, three at a time.
-    width = 3 * 1024
-    flat = np.zeros(-(-values.size // width) * width, np.float32)
-    flat[: values.size] = values.reshape(-1)
-    pixels = oiio.ImageBuf(flat.reshape(-1, 1024, 3))
     if encoding == "srgb":
-        spaces = (_LINEAR, _SRGB) if inverse else (_SRGB, _LINEAR)
-        result = oiio.ImageBufAlgo.colorconvert(pixels, *spaces)
-    else:
-        result = oiio.ImageBufAlgo.pow(pixels, 1.0 / encoding if inverse else encoding)
-    converted = result.get_pixels(oiio.FLOAT)
-    if result.has_error or converted is None:
-        raise RuntimeError(f"OpenImageIO cannot convert colours: {result.geterror()}")
-    return converted.reshape(-1)[: values.size].reshape(values.shape)
+        upper = (np.maximum(values, 0.04045) + 0.055) / 1.055
+        return np.where(values <= 0.04045, values / 12.92, upper**2.4)
+    with np.errstate(invalid="ignore"):
+        return values**encoding
+
+
+def encode(values: Float[np.ndarray, "..."], encoding: Encoding) -> Float[np.ndarray, "..."]:
+    """Linear values to encoded ones, the inverse of `decode`."""
+    if encoding == "linear":
+        return values
+    if encoding == "srgb":
+        upper = 1.055 * np.maximum(values, 0.0031308) ** (1 / 2.4) - 0.055
+        return np.where(values <= 0.0031308, 12.92 * values, upper)
+    with np.errstate(invalid="ignore"):
+        return values ** (1 / encoding)
 
 
 @functools.lru_cache(maxsize=16)
