@@ -10,7 +10,7 @@ import numpy as np
 from brdf.files import write_text
 from brdf.geometry.surface_points import SurfacePoints
 from brdf.geometry.triangles import Mesh, Triangles
-from brdf.images.reading import write_image, write_layers
+from brdf.images.writing import write_image, write_layers
 from brdf.lights.environment import EnvironmentMap
 from brdf.scene import Scene
 from brdf.scene_file import SHAPES

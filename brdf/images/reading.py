@@ -1,51 +1,34 @@
-"""Pixels in and out, through OpenImageIO.
+"""Pictures read through OpenImageIO.
 
 Every reader returns float32 values proportional to light, rows from the top, channels last; see
-:mod:`brdf.images.encoding` for how an encoding is found. What comes out is the picture that a person would see: the
-display window of an OpenEXR file (NaN where it holds no data) and a photograph turned upright. Colour is as stored, not
+`brdf.images.encoding` for how an encoding is found. What comes out is the picture that a person would see: the display
+window of an OpenEXR file (NaN where it holds no data) and a photograph turned upright. Colour is as stored, not
 multiplied by alpha. NaN and infinite values are passed on; who fits leaves them out.
 
-Sizes are checked before memory is taken: one picture in memory may have at most ``MAX_VALUES`` values and needs to fit
-into the machine's memory (:class:`ImageReader` reads larger ones by bands), and a header that claims over
-``MAX_RATIO`` times the size of its file is refused, beyond a size that harms nobody.
+Sizes are checked before memory is taken (`brdf.images.damage`); `ImageReader` reads pictures larger than memory.
 """
 
 import dataclasses
 import os
+import re
+from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
+import OpenImageIO as oiio  # noqa: N813
 from jaxtyping import Bool, Float32
 
-from brdf.files import input_file
-from brdf.images.encoding import Encoding, EncodingSource, decode_table
-from brdf.images.file import (
-    BAND_VALUES,
-    MAX_RATIO,
-    MAX_VALUES,
-    band_rows,
-    check_header,
-    check_memory,
-    open_image,
-    parts,
-    read_rows,
-)
-from brdf.images.reader import ImageReader
-from brdf.images.writing import write_image, write_layers
+from brdf.errors import InputError
+from brdf.files import input_file, utf8_name
+from brdf.images.damage import check_content, check_header, check_memory
+from brdf.images.encoding import Encoding, EncodingSource, decode, decode_table, find_encoding, parse_encoding
 
-__all__ = [
-    "MAX_RATIO",
-    "MAX_VALUES",
-    "ImageReader",
-    "Picture",
-    "read_image",
-    "read_layers",
-    "read_mask",
-    "read_picture",
-    "write_image",
-    "write_layers",
-]
+LOSSY_TOP = 250 / 255
+"""Share of the largest code from which on a file compressed with losses is clipped: at quality 75 a clipped area has
+codes between 250 and 255, but for a few at its edge."""
 
-Array = np.ndarray
+# Remarks that libjpeg makes on sound pictures of some cameras.
+_HARMLESS = ("extraneous bytes", "Invalid SOS parameters")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -64,15 +47,15 @@ class Picture:
         factor: what the linear values of the file were multiplied by, a number or (C,).
     """
 
-    pixels: Float32[Array, "height width channels"]
-    alpha: Float32[Array, "height width"] | None
+    pixels: Float32[np.ndarray, "height width channels"]
+    alpha: Float32[np.ndarray, "height width"] | None
     encoding: Encoding
     source: EncodingSource
     bits: int
     saturation: float | None
-    factor: float | Array = 1.0
+    factor: float | np.ndarray = 1.0
 
-    def scaled(self, factor: float | Array) -> "Picture":
+    def scaled(self, factor: float | np.ndarray) -> "Picture":
         """The picture in another unit: of another exposure, or under light of another intensity.
 
         Args:
@@ -93,7 +76,7 @@ class Picture:
         """The distance of two codes before decoding, full scale 1; None for floats."""
         return None if self.saturation is None else 1.0 / ((1 << self.bits) - 1)
 
-    def quantisation(self) -> Float32[Array, "height width channels"] | None:
+    def quantisation(self) -> Float32[np.ndarray, "height width channels"] | None:
         """The distance of neighbouring codes at each pixel after decoding, in the unit of the pixels; None for floats.
 
         The rounding error of a pixel is uniform within ± half of it.
@@ -106,14 +89,251 @@ class Picture:
         return (np.interp(self.pixels / self.factor, table, np.gradient(table)) * self.factor).astype(np.float32)
 
 
+class ImageReader:
+    """A picture in a file, read by bands of rows, so that it may be larger than memory.
+
+    Example:
+        ``with brdf.ImageReader("large.exr") as reader: upper = reader.rows(0, reader.shape[0] // 2)``
+
+    Attributes:
+        path: the file.
+        shape: height, width and channels of the picture.
+        encoding: how values are encoded in the file; rows come out linear.
+        source: who says so.
+        bits: bits per value in the file.
+        is_integer: whether the file holds codes, which end somewhere, not floats.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], *, encoding: Encoding | None = None):
+        """Open a file and read its header.
+
+        Args:
+            path: the file, in any format that OpenImageIO reads.
+            encoding: "linear", "srgb" or a gamma; None for what the file says.
+
+        Raises:
+            InputError: if there is no readable picture, or the encoding is unknown.
+        """
+        given = parse_encoding("encoding", encoding)
+        self.path = input_file(path)
+        self._image = _open(self.path)
+        self._part, self._colour, self._alpha = _choose_channels(self._image)
+        self._spec = spec = self._image.spec(self._part)
+        check_header(self.path, spec)
+        kind, name = spec.channelformat(self._colour[0]), self._image.format_name()
+        self.is_integer = kind.basetype not in (oiio.FLOAT, oiio.HALF, oiio.DOUBLE)
+        stored = spec.get_int_attribute("oiio:BitsPerSample")
+        self.bits = stored if self.is_integer and 0 < stored <= 32 else 8 * kind.basesize()
+        self.encoding: Encoding = given or "linear"
+        self.source: EncodingSource = "given"
+        if given is None:
+            self.encoding, self.source = find_encoding(self.path, name, spec, self.bits)
+        compression = spec.get_string_attribute("compression")
+        self._is_lossy = name in ("jpeg", "webp", "heif") or compression.startswith("jpeg")
+        self._turn = spec.get_int_attribute("Orientation", 1)
+        self._upright: np.ndarray | None = None
+        height, width = spec.full_height, spec.full_width
+        self.shape = (*((width, height) if self._turn in (5, 6, 7, 8) else (height, width)), len(self._colour))
+        below, right = spec.y - spec.full_y, spec.x - spec.full_x
+        if not (-spec.height < below < height and -spec.width < right < width):
+            raise InputError(self.path, "has no data inside its display window", "Make the file again")
+
+    @property
+    def codes(self) -> tuple[float | None, float]:
+        """The linear value from which on codes are clipped, and the largest distance of two; None and 0 for floats.
+
+        That is the largest code; after compression with losses a few codes less, among which a clipped area wobbles.
+        """
+        if not self.is_integer:
+            return None, 0.0
+        table = decode_table(self.encoding, min(self.bits, 16))
+        top = decode(np.array(LOSSY_TOP), self.encoding) if self._is_lossy else table[-1]
+        return float(top), float(np.max(np.diff(table)))
+
+    def __enter__(self) -> Self:
+        """The reader itself."""
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        """Close the file."""
+        self.close()
+
+    def close(self) -> None:
+        """Close the file; the reader cannot be used any more."""
+        self._image.close()
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        """The whole picture, for what takes arrays."""
+        return np.asarray(self.read(), dtype)
+
+    def rows(self, start: int, stop: int) -> Float32[np.ndarray, "rows width channels"]:
+        """Rows ``start`` to ``stop`` (not included) of the picture, linear.
+
+        Bands in order from the top are read once; going back makes some formats start over.
+
+        Raises:
+            InputError: if the data are damaged or missing.
+            IndexError: if there are no such rows.
+        """
+        if not 0 <= start <= stop <= self.shape[0]:
+            raise IndexError(f"rows {start} to {stop} of a picture with {self.shape[0]} rows")
+        if self._turn not in range(2, 9):
+            return self._shown(start, stop, self._colour, self.encoding)
+        if self._upright is None:
+            # A turned photograph cannot be had by rows; kept, it is read once.
+            self._upright = _turned(self._shown(0, self._spec.full_height, self._colour, self.encoding), self._turn)
+        return self._upright[start:stop].copy()
+
+    def read(self) -> Float32[np.ndarray, "height width channels"]:
+        """The whole picture, linear.
+
+        Raises:
+            InputError: if it is too large for memory, or damaged.
+        """
+        check_memory(self.path, int(np.prod(self.shape)))
+        return self.rows(0, self.shape[0])
+
+    def read_alpha(self) -> Float32[np.ndarray, "height width"] | None:
+        """The whole alpha channel, None if there is none."""
+        if self._alpha is None:
+            return None
+        check_memory(self.path, self.shape[0] * self.shape[1])
+        return _turned(self._shown(0, self._spec.full_height, [self._alpha], "linear"), self._turn)[..., 0]
+
+    def _shown(self, start: int, stop: int, channels: list[int], encoding: Encoding) -> np.ndarray:
+        """Rows of the display window, not turned."""
+        spec = self._spec
+        top, left = spec.y - spec.full_y, spec.x - spec.full_x
+        if (top, left, spec.height, spec.width) == (0, 0, spec.full_height, spec.full_width):
+            return self._data(start, stop, channels, encoding)
+        first, last = max(start, top), min(stop, top + spec.height)
+        shown = np.full((stop - start, spec.full_width, len(channels)), np.nan, np.float32)
+        if first < last:
+            columns = slice(max(left, 0), min(left + spec.width, spec.full_width))
+            data = self._data(first - top, last - top, channels, encoding)
+            shown[first - start : last - start, columns] = data[:, columns.start - left : columns.stop - left]
+        return shown
+
+    def _data(self, first: int, last: int, channels: list[int], encoding: Encoding) -> np.ndarray:
+        """Rows of the data window."""
+        low, high = min(channels), max(channels) + 1
+        coded = self.is_integer and encoding != "linear"
+        kind = "uint16" if coded else "float"
+        pixels = _read_rows(self.path, self._image, self._part, (first, last), (low, high), kind)
+        if channels != list(range(low, high)):
+            pixels = pixels[..., [channel - low for channel in channels]]
+        if not coded:
+            return decode(pixels, encoding)
+        table, values = decode_table(encoding, 16), np.empty(pixels.shape, np.float32)
+        for row, codes in enumerate(pixels):
+            values[row] = table[codes]  # a row at a time: NumPy makes eight bytes of every code
+        return values
+
+
+def _turned(stored: np.ndarray, turn: int) -> np.ndarray:
+    """Turn a picture as the Exif orientation says (CIPA DC-008, 4.6.4.A)."""
+    if turn in (5, 6, 7, 8):
+        stored = stored.swapaxes(0, 1)
+    if turn in (2, 3, 6, 7):
+        stored = stored[:, ::-1]
+    return np.ascontiguousarray(stored[::-1] if turn in (3, 4, 7, 8) else stored)
+
+
+def _open(path: Path) -> oiio.ImageInput:
+    check_content(path)
+    request = oiio.ImageSpec()
+    # Colour as stored: what a half-transparent pixel shows is not darkened.
+    request.attribute("oiio:UnassociatedAlpha", 1)
+    image = oiio.ImageInput.open(utf8_name(path), request)
+    if image is None or image.format_name() in ("null", "term"):
+        what = f"cannot be read as an image ({said(oiio, path)})"
+        raise InputError(path, what, "Give an EXR, HDR, PNG, TIFF or JPEG file")
+    said(image)  # remarks on metadata; the pixels may be sound
+    check_header(path, image.spec())
+    return image
+
+
+def said(source: Any, path: str | os.PathLike[str] = "") -> str:
+    """What OpenImageIO says went wrong, the first line of it, and forgets then.
+
+    Args:
+        source: the image input or output, or the module itself for a file that did not open.
+        path: a name to leave out, the message having it already.
+    """
+    try:
+        message = source.geterror()
+    except UnicodeDecodeError as error:
+        # Bytes of a damaged header, quoted by the reader.
+        message = error.object.decode("utf-8", "replace")
+    if path:
+        name = re.escape(str(path))
+        message = re.sub(f'( for)? [("]+{name}[)"]+|"{name}":? ', "", message).replace(str(path), "it")
+    line = next((line.strip() for line in message.splitlines() if line.strip()), "no reason given")
+    return (line if len(line) <= 200 else line[:197] + "...").rstrip(". ")
+
+
+def _layers(image: oiio.ImageInput) -> dict[tuple[int, str], dict[str, int]]:
+    """The channels of each part and layer, by what comes after the last dot of their names."""
+    layers: dict[tuple[int, str], dict[str, int]] = {}
+    for part in range(max(1, image.spec().get_int_attribute("oiio:subimages"))):
+        for channel, name in enumerate(image.spec(part).channelnames):
+            layer, _, ending = name.rpartition(".")
+            layers.setdefault((part, layer), {})[ending.upper()] = channel
+    return layers
+
+
+def _choose_channels(image: oiio.ImageInput) -> tuple[int, list[int], int | None]:
+    """The part and channels that are the picture, and its alpha; depth and further layers are left apart.
+
+    Only OpenEXR files name their channels reliably: R, G, B or Y of the unnamed layer are the picture, in the first
+    part that has them, else those of the first layer that has them, else (a spectral file) all channels in the order
+    of the file. In other formats the picture is what comes before alpha.
+    """
+    spec = image.spec()
+    every = list(range(spec.nchannels))
+    if image.format_name() != "openexr":
+        # Some readers name an alpha channel beyond the last one.
+        alpha = spec.alpha_channel if 0 < spec.alpha_channel < spec.nchannels else None
+        return 0, every[:alpha], alpha
+    layers = _layers(image)
+    for (part, _), at in sorted(layers.items(), key=lambda item: item[0][1] != ""):
+        for wanted in ("RGB", "Y"):
+            if set(wanted) <= set(at):
+                return part, [at[letter] for letter in wanted], at.get("A")
+    apart = layers.get((0, ""), {})
+    rest = [channel for channel in every if channel not in (apart.get("A"), apart.get("Z"))]
+    return 0, rest or every, apart.get("A") if rest else None
+
+
+def _read_rows(
+    path: Path, image: oiio.ImageInput, part: int, rows: tuple[int, int], channels: tuple[int, int], kind: str
+) -> np.ndarray:
+    """Rows of the data window of a part, (rows, width, channels); OpenImageIO converts them to "float" or codes."""
+    spec = image.spec(part)
+    first, last, skip = spec.y + rows[0], spec.y + rows[1], 0
+    if spec.tile_width:
+        # OpenImageIO takes whole tiles only.
+        skip = rows[0] % spec.tile_height
+        last = min(spec.y - (-rows[1] // spec.tile_height) * spec.tile_height, spec.y + spec.height)
+        sides = (spec.x, spec.x + spec.width, first - skip, last, spec.z, spec.z + 1)
+        pixels = image.read_tiles(part, 0, *sides, *channels, kind)
+    else:
+        pixels = image.read_scanlines(part, 0, first, last, spec.z, *channels, kind)
+    complaint = said(image, path) if image.has_error else ""
+    if pixels is None or (complaint and not any(remark in complaint for remark in _HARMLESS)):
+        what = f"is damaged: rows {rows[0]} to {rows[1]} of {spec.height} cannot be read ({complaint or 'no data'})"
+        raise InputError(path, what, "Make the file again")
+    return pixels.reshape(-1, spec.width, channels[1] - channels[0])[skip : skip + rows[1] - rows[0]]
+
+
 def read_image(
     path: str | os.PathLike[str], *, encoding: Encoding | None = None
-) -> Float32[Array, "height width channels"]:
+) -> Float32[np.ndarray, "height width channels"]:
     """Read a picture as linear values.
 
     Args:
         path: an EXR, HDR, PNG, TIFF, JPEG, TGA file or whatever else OpenImageIO reads.
-        encoding: "linear", "srgb" or a gamma such as 2.2; None for what the file says (:mod:`brdf.images.encoding`).
+        encoding: "linear", "srgb" or a gamma such as 2.2; None for what the file says (`brdf.images.encoding`).
 
     Returns:
         Colour without alpha and further layers: RGB, grey, or all bands of a spectral file in the order of the file.
@@ -121,6 +341,9 @@ def read_image(
 
     Raises:
         InputError: if the file cannot be read.
+
+    Example:
+        ``target = brdf.read_image("data/gold-ball/target.exr")``
     """
     with ImageReader(path, encoding=encoding) as reader:
         return reader.read()
@@ -130,21 +353,21 @@ def read_picture(path: str | os.PathLike[str], *, encoding: Encoding | None = No
     """Read a picture with alpha, saturation level and quantisation step.
 
     Args:
-        path: the file, as for :func:`read_image`.
-        encoding: as for :func:`read_image`.
-
-    Returns:
-        The picture.
+        path: the file, as for `read_image`.
+        encoding: as for `read_image`.
 
     Raises:
         InputError: if the file cannot be read.
+
+    Example:
+        ``brdf.read_picture("photo.png", encoding="srgb").saturation``
     """
     with ImageReader(path, encoding=encoding) as reader:
         top, _ = reader.codes
         return Picture(reader.read(), reader.read_alpha(), reader.encoding, reader.source, reader.bits, top)
 
 
-def read_mask(path: str | os.PathLike[str]) -> Bool[Array, "height width"]:
+def read_mask(path: str | os.PathLike[str]) -> Bool[np.ndarray, "height width"]:
     """Read which pixels are inside a mask.
 
     Args:
@@ -156,32 +379,25 @@ def read_mask(path: str | os.PathLike[str]) -> Bool[Array, "height width"]:
 
     Raises:
         InputError: if the file cannot be read.
+
+    Example:
+        ``fitting.fit(target, scene, mask=brdf.read_mask("mask.png"))``
     """
     with ImageReader(path, encoding="linear") as reader:
         alpha = reader.read_alpha()
         inside = None if alpha is None else _over_half(alpha)
         if inside is None or inside.all() or not inside.any():
-            inside = _over_half(_mean_of_channels(reader))
+            with np.errstate(over="ignore", invalid="ignore"):  # NaN and infinite values are passed on
+                inside = _over_half(reader.read().mean(axis=-1))
     return inside
 
 
-def _mean_of_channels(reader: ImageReader) -> Float32[Array, "height width"]:
-    if reader.shape[2] == 1:
-        return reader.read()[..., 0]
-    mean = np.empty(reader.shape[:2], np.float32)
-    check_memory(reader.path, mean.size)
-    with np.errstate(over="ignore", invalid="ignore"):  # NaN and infinite values are passed on
-        for first, band in reader.bands():
-            band.mean(axis=-1, out=mean[first : first + len(band)])
-    return mean
-
-
-def _over_half(values: Float32[Array, "height width"]) -> Bool[Array, "height width"]:
+def _over_half(values: Float32[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
     values = np.nan_to_num(values, copy=False, nan=0.0)
     return values > 0.5 * values.max()
 
 
-def read_layers(path: str | os.PathLike[str]) -> dict[str, Float32[Array, "height width channels"]]:
+def read_layers(path: str | os.PathLike[str]) -> dict[str, Float32[np.ndarray, "height width channels"]]:
     """Read all channels of a file, grouped by layer.
 
     Args:
@@ -194,36 +410,24 @@ def read_layers(path: str | os.PathLike[str]) -> dict[str, Float32[Array, "heigh
 
     Raises:
         InputError: if the file cannot be read.
+
+    Example:
+        ``brdf.read_layers("aovs.exr")["normal"]``
     """
     file = input_file(path)
-    image = open_image(file)
-    count = parts(image)
-    specs = [image.spec(part) for part in range(count)]
-    for spec in specs:
-        check_header(file, spec, image.format_name())
-    check_memory(file, sum(spec.width * spec.height * spec.nchannels for spec in specs))
-    layers: dict[str, Array] = {}
-    for part, spec in enumerate(specs):
-        own = spec.get_string_attribute("oiio:subimagename", str(part)) if count > 1 else ""
-        groups: dict[str, list[int]] = {}
-        names = spec.channelnames
-        for index, name in enumerate(names):
-            groups.setdefault(name.rpartition(".")[0] or own, []).append(index)
-        own_layers = {layer: np.empty((spec.height, spec.width, len(groups[layer])), np.float32) for layer in groups}
-        order = {layer: _usual_order(names, indices) for layer, indices in groups.items()}
-        step = band_rows(spec, BAND_VALUES)
-        for start in range(0, spec.height, step):
-            rows = start, min(start + step, spec.height)
-            pixels = read_rows(file, image, part, rows, (0, spec.nchannels), "float")
-            for layer, values in own_layers.items():
-                values[rows[0] : rows[1]] = pixels[..., order[layer]]
-        layers |= own_layers
+    image = _open(file)
+    found = _layers(image)
+    specs = {part: image.spec(part) for part, _ in found}
+    for spec in specs.values():
+        check_header(file, spec)
+    check_memory(file, sum(spec.width * spec.height * spec.nchannels for spec in specs.values()))
+    layers: dict[str, np.ndarray] = {}
+    for part, spec in specs.items():
+        own = spec.get_string_attribute("oiio:subimagename", str(part)) if len(specs) > 1 else ""
+        pixels = _read_rows(file, image, part, (0, spec.height), (0, spec.nchannels), "float")
+        for (of_part, layer), at in found.items():
+            usual = sorted(at, key="RGBAXYZUV".find) if set(at) <= set("RGBAXYZUV") else list(at)
+            if of_part == part:
+                layers[layer or own] = pixels[..., [at[ending] for ending in usual]]
     image.close()
     return layers
-
-
-def _usual_order(names: tuple[str, ...], indices: list[int]) -> list[int]:
-    endings = {names[index].rpartition(".")[2].upper(): index for index in indices}
-    if len(endings) < len(indices) or not set(endings) <= set("RGBAXYZUV"):
-        return indices
-    return [endings[letter] for letter in "RGBAXYZUV" if letter in endings]

@@ -11,22 +11,28 @@ from jaxtyping import Float32
 
 from brdf.errors import InputError
 from brdf.files import atomic_path, utf8_name
-from brdf.images.bulk import MOST_CHANNELS
+from brdf.images.damage import MOST_CHANNELS
 from brdf.images.encoding import Encoding, encode, parse_encoding
-from brdf.images.file import quiet, said
+from brdf.images.reading import said
 
 DataType = Literal["uint8", "uint16", "half", "float"]
 
-# Per suffix: the data types it can hold, the usual one first.
-_WRITABLE: dict[str, tuple[DataType, ...]] = {
-    ".exr": ("float", "half"),
-    ".hdr": ("float",),
-    ".png": ("uint8", "uint16"),
-    ".tif": ("float", "half", "uint8", "uint16"),
-    ".tiff": ("float", "half", "uint8", "uint16"),
-    ".jpg": ("uint8",),
-    ".jpeg": ("uint8",),
+_FLOATS = {"float": ("linear",), "half": ("linear",)}
+_PNG = ("srgb", "linear", 1.8, 2.2, 2.4)
+_TIFF = {**_FLOATS, "uint8": ("srgb",), "uint16": ("srgb", "linear")}
+_JPEG = {"uint8": ("srgb",)}
+# Per suffix the data types that it can hold, and the encodings that a file of each can say, or reading it back would
+# guess wrong; the usual one first.
+_WRITABLE: dict[str, dict[str, tuple[Encoding, ...]]] = {
+    ".exr": _FLOATS,
+    ".hdr": {"float": ("linear",)},
+    ".png": {"uint8": _PNG, "uint16": _PNG},
+    ".tif": _TIFF,
+    ".tiff": _TIFF,
+    ".jpg": _JPEG,
+    ".jpeg": _JPEG,
 }
+_SPACES = {"linear": "lin_rec709_scene", "srgb": "srgb_rec709_scene"}
 # The last bytes of formats whose writers do not report a full disk.
 _ENDINGS = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
 _LARGEST_HALF = 65504.0
@@ -53,18 +59,22 @@ def write_image(
 
     Raises:
         InputError: if format, data type, encoding and shape do not go together, or the file cannot be written.
+
+    Example:
+        ``brdf.write_image("ball.png", brdf.render(material, scene))``
     """
     suffix, kind = _format(path, dtype)
-    pixels = _pixels(path, array)
+    pixels, sayable = _pixels(path, array), _WRITABLE[suffix][kind]
     channels = pixels.shape[2]
-    names = {1: ["Y"], 3: ["R", "G", "B"]}.get(channels, [f"C{index:04d}" for index in range(channels)])
+    names = _endings(channels, "RGB")
     if suffix not in (".exr", ".tif", ".tiff") and channels not in (1, 3):
         raise InputError(path, f"a {suffix} file holds 1 or 3 channels, got {channels}", "Write .exr or .tif instead")
     if suffix == ".hdr" and channels == 1:
-        pixels, names = pixels.repeat(3, axis=2), ["R", "G", "B"]
-    wanted = parse_encoding("encoding", encoding)
-    encoded = wanted or ("srgb" if kind.startswith("uint") else "linear")
-    _check_encoding(path, suffix, kind, encoded)
+        pixels, names = pixels.repeat(3, axis=2), _endings(3, "RGB")
+    encoded = parse_encoding("encoding", encoding) or sayable[0]
+    if encoded not in sayable:
+        words = f"Use {', '.join(map(str, sayable))}"
+        raise InputError(path, f"a {suffix} of {kind} cannot say that it is encoded as {encoded}", words)
     if kind.startswith("uint"):
         pixels = encode(np.clip(np.nan_to_num(pixels, nan=0.0), 0.0, 1.0), encoded)
     elif kind == "half" and np.any(np.abs(pixels[np.isfinite(pixels)]) > _LARGEST_HALF):
@@ -75,41 +85,42 @@ def write_image(
             what = f"alpha of shape {coverage.shape[:2]} cannot go with a {suffix} of shape {pixels.shape[:2]}"
             raise InputError(path, what, "Give alpha as (H, W), and a file that can hold it")
         pixels, names = np.concatenate([pixels, np.clip(coverage, 0, 1)], axis=2), [*names, "A"]
-    _write(path, pixels, names, kind, encoded if kind.startswith("uint") else None)
+    _write(path, pixels, names, kind, encoded)
 
 
-def write_layers(path: str | os.PathLike[str], layers: Mapping[str, Any], *, dtype: DataType = "float") -> None:
-    """Write layers of one size into an OpenEXR file, whole or not at all.
+def write_layers(path: str | os.PathLike[str], layers: Mapping[str, Any]) -> None:
+    """Write layers of one size into an OpenEXR file of floats, whole or not at all.
 
     Args:
         path: the file, .exr.
         layers: layer name to (H, W) or (H, W, C) values; the layer "" is the picture.
-        dtype: "float" or "half".
 
     Raises:
         InputError: if sizes differ, there is no layer, or the file cannot be written.
     """
-    suffix, kind = _format(path, dtype)
+    suffix, kind = _format(path, None)
     arrays = {layer: _pixels(path, array) for layer, array in layers.items()}
     if suffix != ".exr" or len({array.shape[:2] for array in arrays.values()}) != 1:
         raise InputError(path, "layers need an .exr file and one size", "Give arrays of one height and width")
     names: list[str] = []
     for layer, array in arrays.items():
-        count = array.shape[2]
-        usual = {1: "Y", 2: "XY", 3: "XYZ" if layer else "RGB", 4: "RGBA"}
-        endings = usual.get(count, [f"C{index:04d}" for index in range(count)])
+        endings = _endings(array.shape[2], "XYZ" if layer else "RGB")
         names += [f"{layer}.{ending}" if layer else ending for ending in endings]
-    _write(path, np.concatenate(list(arrays.values()), axis=2), names, kind, None)
+    _write(path, np.concatenate(list(arrays.values()), axis=2), names, kind, "linear")
 
 
-def _format(path: str | os.PathLike[str], dtype: DataType | None) -> tuple[str, DataType]:
+def _endings(count: int, three: str) -> list[str]:
+    return list({1: "Y", 3: three}.get(count, "")) or [f"C{index:04d}" for index in range(count)]
+
+
+def _format(path: str | os.PathLike[str], dtype: str | None) -> tuple[str, str]:
     suffix = Path(path).suffix.lower()
     if suffix not in _WRITABLE:
         raise InputError(path, f"{suffix or 'no suffix'} is no image format", f"Use one of {' '.join(_WRITABLE)}")
-    kind = dtype or _WRITABLE[suffix][0]
-    if kind not in _WRITABLE[suffix]:
-        raise InputError(path, f"{suffix} cannot hold {kind}", f"Use {' or '.join(_WRITABLE[suffix])}")
-    return suffix, kind
+    kinds = _WRITABLE[suffix]
+    if dtype is not None and dtype not in kinds:
+        raise InputError(path, f"{suffix} cannot hold {dtype}", f"Use {' or '.join(kinds)}")
+    return suffix, dtype or next(iter(kinds))
 
 
 def _pixels(path: str | os.PathLike[str], array: Any) -> Float32[np.ndarray, "height width channels"]:
@@ -124,23 +135,7 @@ def _pixels(path: str | os.PathLike[str], array: Any) -> Float32[np.ndarray, "he
     return np.ascontiguousarray(pixels[..., None] if pixels.ndim == 2 else pixels)
 
 
-def _check_encoding(path: str | os.PathLike[str], suffix: str, kind: str, encoding: Encoding) -> None:
-    """A file must be able to say how it is encoded, or reading it back would guess wrong."""
-    sayable: tuple[Encoding, ...] = ("srgb",)
-    if not kind.startswith("uint"):
-        sayable = ("linear",)
-    elif suffix == ".png":
-        sayable = ("srgb", "linear", 1.8, 2.2, 2.4)
-    elif kind == "uint16":
-        sayable = ("srgb", "linear")
-    if encoding not in sayable:
-        words = ", ".join(str(form) for form in sayable)
-        raise InputError(path, f"a {suffix} of {kind} cannot say that it is encoded as {encoding}", f"Use {words}")
-
-
-def _write(
-    path: str | os.PathLike[str], pixels: np.ndarray, names: list[str], kind: DataType, encoding: Encoding | None
-) -> None:
+def _write(path: str | os.PathLike[str], pixels: np.ndarray, names: list[str], kind: str, encoding: Encoding) -> None:
     if len(names) > MOST_CHANNELS:
         came = f"would have {len(names)} channels, which nothing reads back"
         raise InputError(path, came, f"Write at most {MOST_CHANNELS} into a file")
@@ -151,36 +146,25 @@ def _write(
     if Path(path).suffix.lower() in (".jpg", ".jpeg"):
         spec.attribute("CompressionQuality", 95)
         spec.attribute("jpeg:subsampling", "4:4:4")
-    if encoding is not None:
+    if kind.startswith("uint"):
         power = "" if isinstance(encoding, str) else f"g{round(10 * encoding)}_rec709_scene"
-        spec.attribute("oiio:ColorSpace", power or {"srgb": "srgb_rec709_scene"}.get(str(encoding), "lin_rec709_scene"))
+        spec.attribute("oiio:ColorSpace", power or _SPACES[str(encoding)])
     with atomic_path(path) as temporary:
-        _reserve(temporary, spec)
+        _ask_for_space(temporary, spec)
         file = oiio.ImageOutput.create(utf8_name(temporary))
-        if file is None:
-            raise InputError(path, f"cannot be written ({said(oiio, temporary)})", "Use another format")
-        with quiet("png" if temporary.suffix.lower() == ".png" else ""):
-            ok = file.open(str(temporary), spec) and file.write_image(pixels)
-            ok = file.close() and ok
+        ok = file.open(str(temporary), spec) and file.write_image(pixels)
+        ok = file.close() and ok
         # A remark without a failure does not count: TIFF complains of Exif data that nobody asked for.
         if not ok or not _is_complete(temporary):
             what = f"cannot be written ({said(file, temporary)})"
-            _ask_for_space(temporary, spec)
             raise InputError(path, what, "Check the space left and the size of the picture")
 
 
-def _reserve(temporary: Path, spec: oiio.ImageSpec) -> None:
-    """Find a full disk out before libjpeg does, which ends the program then."""
-    if temporary.suffix.lower() in _ENDINGS and hasattr(os, "posix_fallocate"):
-        with temporary.open("r+b") as file:
-            os.posix_fallocate(file.fileno(), 0, 3 * spec.image_bytes() // 2 + (1 << 16))
-
-
 def _ask_for_space(temporary: Path, spec: oiio.ImageSpec) -> None:
-    """Let the system say whether a full disk, a quota or a limit stopped the writer, which does not tell."""
+    """Find a full disk, a quota or a limit out first: libjpeg ends the program then, others do not tell the reason."""
     if hasattr(os, "posix_fallocate"):
         with temporary.open("r+b") as file:
-            os.posix_fallocate(file.fileno(), file.seek(0, os.SEEK_END), spec.image_bytes() + (1 << 16))
+            os.posix_fallocate(file.fileno(), 0, 3 * spec.image_bytes() // 2 + (1 << 16))
 
 
 def _is_complete(temporary: Path) -> bool:

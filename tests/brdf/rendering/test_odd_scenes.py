@@ -9,7 +9,7 @@ import pytest
 import brdf
 from benchmarks.fuzz_corpus import CAMERA, LIGHT, POINT, SPHERE
 from brdf.errors import InputError
-from brdf.images.reading import write_layers
+from brdf.images.writing import write_layers
 
 AOV = '[aov]\nfile = "n.exr"\n'
 SHADOW = LIGHT + 'visibility = "n.exr"\n'

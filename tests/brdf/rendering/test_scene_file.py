@@ -182,7 +182,7 @@ def test_surface_points_travel_through_an_aov_file(tmp_path: Path):
 
 
 def test_layers_of_an_aov_file_can_be_named(tmp_path: Path):
-    from brdf.images.reading import write_layers
+    from brdf.images.writing import write_layers
 
     normal = np.zeros((3, 4, 3), np.float32)
     normal[..., 2] = 2.0

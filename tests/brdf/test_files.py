@@ -11,7 +11,7 @@ import pytest
 from project_paths import ROOT
 
 from brdf.errors import InputError
-from brdf.files import atomic_folder, atomic_path, file_error, input_file, write_text
+from brdf.files import atomic_folder, atomic_path, input_file, write_text
 
 
 def everything(folder):
@@ -136,7 +136,8 @@ except InputError as error:
     result = run(code, tmp_path)
     assert result.stdout.count("larger than allowed") == 2, result.stderr
     assert everything(tmp_path) == []
-    assert "no space" in str(file_error("a", OSError(errno.ENOSPC, "x")))
+    with pytest.raises(InputError, match="no space"), atomic_path(tmp_path / "a"):
+        raise OSError(errno.ENOSPC, "x")
 
 
 @pytest.mark.parametrize("folder", ["out", "new/out"])

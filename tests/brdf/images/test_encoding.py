@@ -21,10 +21,7 @@ from image_files import (
 
 from brdf.errors import InputError
 from brdf.images.encoding import decode, encode
-from brdf.images.reading import (
-    read_image,
-    read_picture,
-)
+from brdf.images.reading import read_image, read_picture
 
 GRADIENT = np.arange(256, dtype=np.uint8).reshape(16, 16, 1).repeat(3, axis=2)
 SRGB = srgb_to_linear(GRADIENT / 255)

@@ -1,19 +1,14 @@
 """Pictures read from files: channels, layers, masks, windows and bands."""
 
+import warnings
+
 import numpy as np
 import OpenImageIO as oiio  # noqa: N813
 import pytest
 from image_files import REAL, codes, needs, png, random, raw_exr
 
-from brdf.images.reading import (
-    ImageReader,
-    read_image,
-    read_layers,
-    read_mask,
-    read_picture,
-    write_image,
-    write_layers,
-)
+from brdf.images.reading import ImageReader, read_image, read_layers, read_mask, read_picture
+from brdf.images.writing import write_image, write_layers
 
 # --- channels, layers, masks -------------------------------------------------------------------------------------
 
@@ -184,21 +179,38 @@ def test_bands_are_the_picture(tmp_path, suffix, kind):
     whole = read_picture(tmp_path / f"a{suffix}")
     with ImageReader(tmp_path / f"a{suffix}") as reader:
         assert reader.shape == (133, 57, 3)
-        bands = list(reader.bands(values=57 * 4 * 20))
-        np.testing.assert_array_equal(np.concatenate([pixels for _, pixels in bands]), whole.pixels)
-        starts = [start for start, _ in bands]
-        assert starts[0] == 0
-        assert len(starts) > 2
+        bands = [reader.rows(start, min(start + 20, 133)) for start in range(0, 133, 20)]
+        np.testing.assert_array_equal(np.concatenate(bands), whole.pixels)
         np.testing.assert_array_equal(reader.rows(10, 30), whole.pixels[10:30])
-        np.testing.assert_array_equal(reader.alpha_rows(7, 9), whole.alpha[7:9])
         assert reader.rows(5, 5).shape == (0, 57, 3)
         for wrong in ((-1, 3), (0, 134), (5, 4)):
             with pytest.raises(IndexError):
                 reader.rows(*wrong)
 
 
-def test_a_large_picture_is_read_in_bands(tmp_path, monkeypatch):
-    values = random(200, 30, 3)
-    raw_exr(tmp_path / "a.exr", values, "RGB", tile=16)
-    monkeypatch.setattr("brdf.images.reader.BAND_VALUES", 1000)
-    np.testing.assert_array_equal(read_image(tmp_path / "a.exr"), values)
+def test_tiles_are_read_by_rows(tmp_path):
+    values = random(100, 30, 3)
+    with ImageReader(raw_exr(tmp_path / "a.exr", values, "RGB", tile=16)) as reader:
+        for start, stop in ((0, 100), (3, 9), (15, 17), (90, 100)):
+            np.testing.assert_array_equal(reader.rows(start, stop), values[start:stop])
+
+
+def test_a_reader_is_an_array_for_what_takes_arrays(tmp_path):
+    (tmp_path / "a.png").write_bytes(png(codes(5, 7, 3)))
+    with ImageReader(tmp_path / "a.png") as reader:
+        np.testing.assert_array_equal(np.asarray(reader), read_image(tmp_path / "a.png"))
+        assert np.asarray(reader, np.float64).dtype == np.float64
+
+
+@pytest.mark.parametrize("odd", [np.nan, np.inf, np.float32(3e38)])
+def test_a_mask_of_odd_values_is_read_without_a_warning(tmp_path, odd):
+    values = np.zeros((6, 8, 3), np.float32)
+    values[2:4, 2:5] = 1.0 if np.isnan(odd) else odd
+    values[0, 0] = odd
+    values[1, 1] = np.inf, -np.inf, 0.0
+    raw_exr(tmp_path / "a.exr", values, "RGB")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        inside = read_mask(tmp_path / "a.exr")
+    assert inside[2:4, 2:5].all()
+    assert inside.sum() == 6 + (not np.isnan(odd))

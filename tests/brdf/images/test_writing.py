@@ -10,12 +10,8 @@ import pytest
 from image_files import ROOT, random
 
 from brdf.errors import InputError
-from brdf.images.reading import (
-    read_image,
-    read_picture,
-    write_image,
-    write_layers,
-)
+from brdf.images.reading import read_image, read_picture
+from brdf.images.writing import write_image, write_layers
 
 
 @pytest.mark.parametrize("shape", [(7, 5), (7, 5, 1), (7, 5, 3)])
@@ -121,18 +117,17 @@ def test_layers_that_cannot_be_written(tmp_path, name, layers):
         write_layers(tmp_path / name, layers)
 
 
-@pytest.mark.parametrize(
-    ("suffix", "reserved"), [(".exr", 1), (".tif", 1), (".hdr", 1), (".png", 1), (".png", 0), (".jpg", 1)]
-)
-def test_a_full_disk_leaves_nothing(tmp_path, suffix, reserved):
+@pytest.mark.parametrize(("suffix", "asked"), [(".exr", 1), (".tif", 0), (".hdr", 0), (".png", 0), (".jpg", 1)])
+def test_a_full_disk_leaves_nothing(tmp_path, suffix, asked):
+    """Where the system is asked for the space before, and where nobody can be asked and the writer fails."""
     code = """
 import resource, signal, sys
 import numpy as np
 from brdf.errors import InputError
 from brdf.images import writing as image_writer
-from brdf.images.reading import write_image
+from brdf.images.writing import write_image
 if sys.argv[2] == "0":
-    image_writer._reserve = lambda *_: None
+    image_writer._ask_for_space = lambda *_: None
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
 try:
@@ -142,7 +137,7 @@ except InputError as error:
 """
     path = tmp_path / f"a{suffix}"
     path.write_bytes(b"old")
-    command = [sys.executable, "-c", code, str(path), str(reserved)]
+    command = [sys.executable, "-c", code, str(path), str(asked)]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
     assert result.returncode == 0
     assert result.stdout.startswith((f"{path}: cannot be written", f"{path}: the file would be larger than allowed"))
