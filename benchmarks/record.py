@@ -32,6 +32,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 import brdf
@@ -331,7 +332,6 @@ _fit_case("no noise, float32", _made("directional", noise=0.0), "float32", model
 _fit_case("much noise", _made("directional", noise=0.3))
 _fit_case("local viewer", _made("directional", viewer="local"), model="phong")
 _fit_case("pixel area", _made("directional", samples=4), model="blinn-phong")
-_fit_case("pixel area before a wall", _made("rectangle", samples=4, wall=True), "float32", model="blinn-phong")
 _fit_case("plausible", _made("directional"), plausible=True)
 _fit_case(
     "plausible, bound at work",
@@ -729,7 +729,7 @@ FUNCTIONS = {
     "not reciprocal": _steep,
     "negative": lambda to_light, to_view: 0.1 - 0.2 * to_light[..., 2:] * to_view[..., 2:],
     "too bright": lambda to_light, to_view: np.full((*np.shape(to_light)[:-1], 1), 0.34),
-    "not finite": lambda to_light, to_view: np.where(to_light[..., 2:] > 0.9, np.nan, 0.1),
+    "not finite": lambda to_light, to_view: jnp.where(to_light[..., 2:] > 0.9, jnp.nan, 0.1),
     "scalar": lambda to_light, to_view: 0.2 * np.ones(np.shape(to_light)[:-1]),
 }
 for name, function in FUNCTIONS.items():
@@ -802,11 +802,8 @@ def _albedo() -> Any:
 
 @case("stability map", "float32")
 def _stability() -> Any:
-    told = {}
-    for name, model in brdf.MODELS.items():
-        found = brdf.stability_map(model, np.array([0.5, 50.0, 1e5]), np.array([0.0, 45.0, 89.0]))
-        told[name] = [bool(np.all(found.finite)), bool(np.all(found.error < 1e-5))]
-    return told
+    found = brdf.stability_map(brdf.NormalizedPhong, np.array([0.5, 50.0, 1e5]), np.array([0.0, 45.0, 89.0]))
+    return [found.model, bool(np.all(found.finite)), bool(np.all(found.error < 1e-5))]
 
 
 for light_name in LIGHTS:
