@@ -9,7 +9,7 @@ from brdf.materials.material_file import load_materials
 from brdf.measured import merl as measured_merl
 from brdf.measured import rgl as measured_rgl
 from brdf.measured.loading import load_measured
-from brdf.scene_file import load_scene
+from brdf.scene import Scene
 
 CAMERA = """[camera]
 type = "orthographic"
@@ -149,8 +149,8 @@ def corpus(folder: Path) -> list[tuple[str, bytes, Callable[[Path], Any]]]:
         folder: to work in.
     """
     text = [
-        (".toml", SCENE, load_scene),
-        (".toml", PERSPECTIVE, load_scene),
+        (".toml", SCENE, Scene.load),
+        (".toml", PERSPECTIVE, Scene.load),
         (".json", JSON, load_materials),
         (".json", LAMBERT, load_materials),
         (".mtl", MTL, load_materials),

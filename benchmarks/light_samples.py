@@ -8,7 +8,7 @@ Largest error over a ball of 64 × 64 pixels, relative to the brightest pixel; d
 import numpy as np
 
 import brdf
-from brdf.lights.punctual import Light
+from brdf.lights.base import Light
 
 CAMERA = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=[64, 64])
 BALL = [brdf.Sphere(center=[0, 0, 0], radius=1)]

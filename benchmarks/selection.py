@@ -16,7 +16,7 @@ import numpy as np
 
 import brdf
 import fitting
-from brdf.lights.punctual import Light
+from brdf.lights.base import Light
 
 FAMILIES = ("ambient", "lambert", "lambert", "phong", "blinn-phong")
 

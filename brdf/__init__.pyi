@@ -57,8 +57,6 @@ from .images.reading import read_layers as read_layers
 from .images.reading import read_mask as read_mask
 from .images.reading import read_picture as read_picture
 from .images.writing import write_image as write_image
-from .light_images import relight as relight
-from .light_images import render_lights as render_lights
 from .lights.area import PolygonLight as PolygonLight
 from .lights.area import RectangleLight as RectangleLight
 from .lights.area import SphereLight as SphereLight
@@ -115,7 +113,6 @@ from .models import (
 from .models import (
     Phong as Phong,
 )
-from .pixel_choice import some_pixels as some_pixels
 from .plausibility.report import Report as Report
 from .plausibility.stability import (
     stability_map as stability_map,
@@ -126,6 +123,13 @@ from .rendering import (
     basis_images as basis_images,
 )
 from .rendering import (
+    relight as relight,
+)
+from .rendering import (
     render as render,
 )
+from .rendering import (
+    render_lights as render_lights,
+)
 from .scene import Scene as Scene
+from .scene import some_pixels as some_pixels

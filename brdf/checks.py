@@ -1,25 +1,36 @@
-"""Values caught at the border: converters for the fields of scenes and materials.
+"""Input validation: what the fields of scenes and materials take; the name, bound first, is for the message.
 
-A converter turns what the user gave into a float64 array and refuses what cannot be one. Values that JAX already
+Each turns what the user gave into a float64 array and refuses what cannot be one. Values that JAX already
 holds (arrays and tracers of a transformation) keep their type; only their shape is checked.
 """
 
-import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jaxtyping import Array, Float
 
 from brdf.errors import InputError
 
 Parameter = jax.Array | np.ndarray
-
+Scalar = Float[Array, ""]
+Vector = Float[Array, "3"]
+Spectrum = Float[Array, " C"]
 
 LARGEST = 1e15
 """Of any number of a scene: squares and products of a few of them stay within float32's 3e38."""
+
+MAX_SAMPLES = 1 << 20
+
+
+def checked(check: Callable[[str, Any], Any], name: str, **field: Any) -> Any:
+    """A field whose value passes a check, which names it where it refuses."""
+    return eqx.field(converter=partial(check, name), **field)
 
 
 def _array(name: str, value: Any, shape_words: str, largest: float = LARGEST) -> Any:
@@ -41,109 +52,94 @@ def _shown(value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def vector(name: str, largest: float = LARGEST) -> Callable[[Any], Any]:
-    """A converter for a position or an edge: three finite numbers up to ``largest``."""
+def vector(name: str, value: Any, largest: float = LARGEST) -> Any:
+    """A position or an edge: three finite numbers up to ``largest``."""
+    array = _array(name, value, "three numbers", largest)
+    if array.shape != (3,):
+        raise InputError(name, f"must be three numbers, got {_shown(value)}", "Give [x, y, z]")
+    return array
 
-    def convert(value: Any) -> Any:
-        array = _array(name, value, "three numbers", largest)
-        if array.shape != (3,):
-            raise InputError(name, f"must be three numbers, got {_shown(value)}", "Give [x, y, z]")
+
+def direction_value(name: str, value: Any) -> Any:
+    """A direction of any length: three finite numbers, not all zero."""
+    array = vector(name, value, np.inf)
+    if not isinstance(array, np.ndarray):
         return array
-
-    return convert
-
-
-def direction_value(name: str) -> Callable[[Any], Any]:
-    """A converter for a direction of any length: three finite numbers, not all zero."""
-    to_vector = vector(name, np.inf)
-
-    def convert(value: Any) -> Any:
-        array = to_vector(value)
-        if not isinstance(array, np.ndarray):
-            return array
-        if not np.any(array):
-            raise InputError(name, "must not have zero length, got [0, 0, 0]", "Give a direction")
-        size = np.max(np.abs(array))
-        # Its squares must not leave float32; else it stays as it was given.
-        return array if 1e-6 <= size <= 1e6 else array / size
-
-    return convert
+    if not np.any(array):
+        raise InputError(name, "must not have zero length, got [0, 0, 0]", "Give a direction")
+    size = np.max(np.abs(array))
+    # Its squares must not leave float32; else it stays as it was given.
+    return array if 1e-6 <= size <= 1e6 else array / size
 
 
 def number(
-    name: str, low: float = -np.inf, high: float = np.inf, *, above: float = -np.inf, below: float = np.inf
-) -> Callable[[Any], Any]:
-    """A converter for one number with ``low`` <= x <= ``high`` and ``above`` < x < ``below``."""
-
-    def convert(value: Any) -> Any:
-        array = _array(name, value, "a number")
-        if array.shape != ():
-            raise InputError(name, f"must be one number, got {_shown(value)}", "Give a single number")
-        if isinstance(array, np.ndarray):
-            _within(name, float(array), low, high, above, below)
-        return array
-
-    return convert
-
-
-def _within(name: str, value: float, low: float, high: float, above: float, below: float) -> None:
-    limits = [
-        (value < low, f"at least {low:g}"),
-        (value > high, f"at most {high:g}"),
-        (value <= above, f"greater than {above:g}"),
-        (value >= below, f"less than {below:g}"),
-    ]
-    broken = [words for is_broken, words in limits if is_broken]
-    if broken:
-        raise InputError(name, f"must be {broken[0]}, got {value:g}", "Correct the value")
+    name: str, value: Any, low: float = -np.inf, high: float = np.inf, above: float = -np.inf, below: float = np.inf
+) -> Any:
+    """One number with ``low`` <= x <= ``high`` and ``above`` < x < ``below``."""
+    array = _array(name, value, "a number")
+    if array.shape != ():
+        raise InputError(name, f"must be one number, got {_shown(value)}", "Give a single number")
+    if isinstance(array, np.ndarray):
+        limits = [
+            (array < low, f"at least {low:g}"),
+            (array > high, f"at most {high:g}"),
+            (array <= above, f"greater than {above:g}"),
+            (array >= below, f"less than {below:g}"),
+        ]
+        for is_broken, words in limits:
+            if is_broken:
+                raise InputError(name, f"must be {words}, got {array:g}", "Correct the value")
+    return array
 
 
-def positive(name: str) -> Callable[[Any], Any]:
-    """A converter for one number greater than 0."""
-    return number(name, above=0.0)
+def positive(name: str, value: Any) -> Any:
+    """One number greater than 0."""
+    return number(name, value, above=0.0)
 
 
-def spectrum(name: str) -> Callable[[Any], Any]:
-    """A converter for one value per channel, at least 0; a single number becomes one channel."""
-
-    def convert(value: Any) -> Any:
-        array = _array(name, value, "a number per channel")
-        if array.ndim == 0:
-            array = array.reshape(1)
-        if array.ndim != 1 or array.shape[0] == 0:
-            raise InputError(name, f"must be a number per channel, got {_shown(value)}", "Give a list of numbers")
-        if isinstance(array, np.ndarray) and np.any(array < 0):
-            channel = int(np.argmax(array < 0))
-            came = f"must be at least 0, got {array[channel]:g} in channel {channel}"
-            raise InputError(name, came, "Give values of 0 or more")
-        return array
-
-    return convert
+def spectrum(name: str, value: Any) -> Any:
+    """One value per channel, at least 0; a single number becomes one channel."""
+    array = _array(name, value, "a number per channel")
+    if array.ndim == 0:
+        array = array.reshape(1)
+    if array.ndim != 1 or array.shape[0] == 0:
+        raise InputError(name, f"must be a number per channel, got {_shown(value)}", "Give a list of numbers")
+    if isinstance(array, np.ndarray) and np.any(array < 0):
+        channel = int(np.argmax(array < 0))
+        came = f"must be at least 0, got {array[channel]:g} in channel {channel}"
+        raise InputError(name, came, "Give values of 0 or more")
+    return array
 
 
-MAX_SAMPLES = 1 << 20
+def vertex_list(name: str, value: Any) -> Any:
+    """Corners of a polygon: three points or more."""
+    array = _array(name, value, "a list of points")
+    if array.ndim != 2 or array.shape[0] < 3 or array.shape[1] != 3:
+        raise InputError(name, f"must be three points or more, got {_shown(value)}", "Give [[x, y, z], ...]")
+    return array
 
 
 def sample_number(value: Any, most: int = MAX_SAMPLES) -> int:
-    """A converter for a number of samples: a whole number from 1 to ``most``."""
-    remedy = "Give a whole number"
+    """A number of samples: a whole number from 1 to ``most``."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise InputError("samples", f"must be a whole number, got {value!r}", remedy)
+        raise InputError("samples", f"must be a whole number, got {value!r}", "Give a whole number")
     if not 1 <= value <= most:
-        raise InputError("samples", f"must be between 1 and {most}, got {value}", remedy)
+        raise InputError("samples", f"must be between 1 and {most}, got {value}", "Give a whole number")
     return int(value)
 
 
-def vertex_list(name: str) -> Callable[[Any], Any]:
-    """A converter for corners of a polygon: three points or more."""
+def spans_area(edge_u: Any, edge_v: Any) -> None:
+    """Refuse two edges, (3,) each, that are parallel; values under a JAX transformation pass.
 
-    def convert(value: Any) -> Any:
-        array = _array(name, value, "a list of points")
-        if array.ndim != 2 or array.shape[0] < 3 or array.shape[1] != 3:
-            raise InputError(name, f"must be three points or more, got {_shown(value)}", "Give [[x, y, z], ...]")
-        return array
-
-    return convert
+    Raises:
+        InputError: where they are parallel.
+    """
+    if not (isinstance(edge_u, np.ndarray) and isinstance(edge_v, np.ndarray)):
+        return
+    area = float(np.linalg.norm(np.cross(edge_u, edge_v)))
+    if area <= 1e-12 * float(np.linalg.norm(edge_u) * np.linalg.norm(edge_v)):
+        came = f"got {edge_u.tolist()} and {edge_v.tolist()}"
+        raise InputError("edge_v", f"must not be parallel to edge_u, {came}", "Give two edges that span an area")
 
 
 def coefficients(**given: Any) -> list[Parameter]:
@@ -155,18 +151,18 @@ def coefficients(**given: Any) -> list[Parameter]:
     Raises:
         InputError: naming the one that is not finite, is negative, or does not go with the others.
     """
-    checked = [_not_negative(name, value) for name, value in given.items()]
-    for name, value in zip(given, checked, strict=True):
+    checked = {name: _not_negative(name, value) for name, value in given.items()}
+    for name, value in checked.items():
         if value.ndim > 1 or value.size == 0:
             raise InputError(name, f"must be one number or one number per channel, got shape {value.shape}")
-    channels = max(value.size for value in checked)
-    for name, value in zip(given, checked, strict=True):
+    channels = max(value.size for value in checked.values())
+    for name, value in checked.items():
         if value.size not in (1, channels):
-            sizes = ", ".join(f"{n} {v.size}" for n, v in zip(given, checked, strict=True))
-            raise InputError(
-                name, f"the coefficients differ in their number of channels ({sizes})", "Give each the same"
-            )
-    return [(np if isinstance(value, np.ndarray) else jnp).broadcast_to(value, (channels,)).copy() for value in checked]
+            sizes = ", ".join(f"{n} {v.size}" for n, v in checked.items())
+            came = f"the coefficients differ in their number of channels ({sizes})"
+            raise InputError(name, came, "Give each the same")
+    each = checked.values()
+    return [(np if isinstance(one, np.ndarray) else jnp).broadcast_to(one, (channels,)).copy() for one in each]
 
 
 def exponent(given: Any) -> Parameter:
@@ -198,7 +194,7 @@ def _not_negative(name: str, given: Any) -> Any:
         raise InputError(name, f"must be numbers, got {given!r:.60}") from None
     for channel, number in enumerate(value.ravel()):
         where = f" in channel {channel}" if value.size > 1 else ""
-        if not math.isfinite(number):
+        if not np.isfinite(number):
             raise InputError(name, f"must be finite, got {number}{where}")
         if number < 0:
             raise InputError(name, f"must be at least 0, got {number:g}{where}")

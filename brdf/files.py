@@ -250,9 +250,10 @@ def read_toml(path: str | os.PathLike[str], most: int = MAX_TEXT_BYTES) -> dict[
     Raises:
         InputError: if the file cannot be read, is too large or is not TOML.
     """
+    text = read_text(path, most)
     try:
-        return tomllib.loads(read_text(path, most))
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # ValueError: also of more digits than Python reads
         raise InputError(path, f"is not TOML ({error})", "Correct the file") from None
 
 

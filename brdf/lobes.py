@@ -1,195 +1,271 @@
-"""The specular basis image as a function of the exponent, in the forms that the fit evaluates again and again."""
+"""What light samples add up to at a point: the diffuse sum, and the cosine lobe averaged over samples and pixel area.
+
+Renderer and fit share it. Many samples never mean many images in memory: the pass over samples is a loop, and pixels
+are taken tile by tile, which also keeps a tile in the processor's cache while its samples pass.
+"""
 
 from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
+from brdf.checks import Scalar, Vector
+from brdf.geometry.base import Shape
 from brdf.geometry.surface_points import SurfacePoints
-from brdf.geometry.visibility import Lighting
-from brdf.light_sum import LightTerms, sum_over_samples
-from brdf.models import Material
+from brdf.geometry.visibility import share_seen
+from brdf.lights.base import Light, Lighting
+from brdf.models.base import Material, SpecularMaterial
+from brdf.vectors import BELOW_HORIZON, divide, dot, square_root
+
+STORED_SAMPLES = 4
+"""Up to so many light samples each is compiled on its own, and the fit keeps its terms as arrays of their own."""
+
+TILE = 8192
+"""Pixels that many samples pass over at a time."""
+
+STACKED_VALUES = 1 << 26
+"""Up to so many values the fit keeps the terms of many samples, too, for few pixels: 256 MiB in float32."""
 
 NO_LOBE = -1e9
 """The peak of a pixel without a lobe: exp(n * this) = 0 for every n that a fit visits."""
 
 
-def _power(weight: Array, log_cosine: Array, n: Array) -> tuple[Array, Array]:
-    value = weight * jnp.exp(jnp.asarray(n, log_cosine.dtype) * log_cosine)[:, None]
-    return value, value * log_cosine[:, None]
+class LightTerms(eqx.Module):
+    """What one light sample adds to the basis images at one point.
+
+    Attributes:
+        diffuse: I (N·L)+, (C,).
+        weight: I, times N·L where the model says so, 0 where the lobe is gated, (C,).
+        log_cosine: logarithm of the lobe's cosine; 0 where the lobe is gated.
+    """
+
+    diffuse: Float[Array, "*pixels C"]
+    weight: Float[Array, "*pixels C"]
+    log_cosine: Float[Array, "*pixels"]
+
+
+def light_terms(
+    model: type[Material],
+    occluders: tuple[Shape, ...],
+    kind: type[Light],
+    row: tuple[Array, ...],
+    light: Int[Array, ""],
+    point: SurfacePoints,
+) -> LightTerms:
+    """The terms at one point of one sample, a row of a stack, of the scene's light of that number."""
+    sample = kind.sample(point, *row)
+    if sample.moments is None:
+        cosine = dot(point.normal, sample.to_light)
+        above = jnp.ones_like(cosine)
+    else:
+        cosine, above = patch_cosine(point.normal, *sample.moments)
+    lit = point.mask & (cosine > 0)
+    intensity = sample.intensity
+    if occluders:
+        intensity = intensity * share_seen(occluders, point, sample.to_light, sample.distance, sample.radius)
+    if point.visibility is not None:
+        intensity = intensity * point.visibility[light]
+    matt = lit if sample.lobe_only is None else lit & (sample.lobe_only == 0)
+    diffuse = intensity * jnp.where(matt, cosine, 0)
+    if not issubclass(model, SpecularMaterial):
+        return LightTerms(diffuse, jnp.zeros_like(diffuse), jnp.zeros_like(cosine))
+    log_cosine = model.log_cosine(point.normal, sample.to_light, point.to_view)
+    glossy = lit if sample.lobe_only is None else lit & (sample.lobe_only > 0)
+    shines = glossy & (dot(point.normal, point.to_view) > 0) & (log_cosine > 0.5 * BELOW_HORIZON)
+    weight = intensity * jnp.where(shines, cosine if model.cosine_weighted else above, 0)
+    return LightTerms(diffuse, weight, jnp.where(shines, log_cosine, 0))
+
+
+def patch_cosine(normal: Vector, mean: Vector, covariance: Float[Array, "3 3"]) -> tuple[Scalar, Scalar]:
+    """Mean of (N·L)+ over a patch of the sky, and the share of its light above the horizon.
+
+    Exact where the patch does not cross the horizon. Where it does, N·L is taken to be spread by the parabola
+    3/4 (1 - x²) that has the patch's mean and variance.
+    """
+    middle = dot(normal, mean)
+    half_width = square_root(5.0 * dot(normal, covariance @ normal))
+    x = divide(middle, half_width)
+    crosses = (half_width > 0) & (jnp.abs(x) < 1)
+    x = jnp.where(crosses, x, 0.0)
+    partly = half_width * (3 / 16 + x * (1 / 2 + x * (3 / 8 - x * x / 16)))
+    share = 1 / 2 + x * (3 / 4 - x * x / 4)
+    return jnp.where(crosses, partly, middle), jnp.where(crosses, share, 1.0)
+
+
+def sum_over_samples(
+    model: type[Material],
+    points: SurfacePoints,
+    lighting: Lighting,
+    of_terms: Callable[[LightTerms], Any],
+    *,
+    combine: Any = jnp.add,
+    start: float = 0.0,
+) -> Any:
+    """Combine a function of one sample's terms at one point over all samples, for (P,) points.
+
+    ``combine`` makes one value of two and begins with ``start``. No more than one sample's images are held at a time.
+    """
+    few = lighting.samples <= STORED_SAMPLES
+
+    def at_point(point: SurfacePoints) -> Any:
+        def add(kind: type[Light], total: Any, sample: tuple[Any, Any]) -> tuple[Any, None]:
+            value = of_terms(light_terms(model, lighting.occluders, kind, *sample, point))
+            return (value if total is None else jax.tree.map(combine, total, value)), None
+
+        total = None
+        if few:
+            for kind, *sample in lighting.each():
+                total, _ = add(kind, total, sample)
+            return total
+        # a sum is as wide as the widest of its parts
+        first = jax.tree.map(lambda values: values[0], lighting.stacks)
+        shapes = [jax.eval_shape(partial(add, stack.kind, None), (stack.rows, stack.light))[0] for stack in first]
+        total = jax.tree.map(partial(_filled, start), *shapes)
+        for stack in lighting.stacks:
+            total, _ = jax.lax.scan(jax.checkpoint(partial(add, stack.kind)), total, (stack.rows, stack.light))
+        return total
+
+    return jax.vmap(at_point)(points) if few else _by_tiles(at_point, points)
+
+
+def _filled(value: float, *shapes: jax.ShapeDtypeStruct) -> Array:
+    return jnp.full(np.broadcast_shapes(*(shape.shape for shape in shapes)), value, shapes[0].dtype)
+
+
+def _by_tiles(at_point: Callable[[SurfacePoints], Any], points: SurfacePoints) -> Any:
+    """``at_point`` of all points, tile by tile; the last point fills up the last tile."""
+    count = points.mask.size
+    tiles = -(-count // TILE)
+    size = -(-count // tiles)
+    if tiles == 1:
+        return jax.vmap(at_point)(points)
+
+    def cut(leaf: Array) -> Array:
+        padded = jnp.pad(leaf, [(0, tiles * size - count)] + [(0, 0)] * (leaf.ndim - 1), mode="edge")
+        return padded.reshape(tiles, size, *leaf.shape[1:])
+
+    done = jax.lax.map(jax.vmap(at_point), jax.tree.map(cut, points))
+    return jax.tree.map(lambda leaf: leaf.reshape(tiles * size, *leaf.shape[2:])[:count], done)
+
+
+class Lobe(eqx.Module):
+    """The specular basis as a function of the exponent, which a fit evaluates again and again.
+
+    The terms of few light samples, or of few pixels, are kept as arrays; those of many are made anew at each
+    evaluation, in bounded memory. Where pixels are averaged over their area, theirs is the mean of a finer lobe.
+
+    Attributes:
+        model: the class of the material.
+        kept: weights, (P, S, C), and logarithms of the cosine, (P, S), of some samples each.
+        source: points (P,) and lights that the terms are made of anew; None where they are kept.
+        fine: of the points, (K M,), of those pixels that are averaged; None where no pixel is.
+        share: of each point in its pixel, (K, M).
+        slot: for every pixel its row in ``share``, or -1, (P,).
+    """
+
+    model: type[Material] = eqx.field(static=True)
+    kept: tuple[tuple[Float[Array, "P S C"], Float[Array, "P S"]], ...] = ()
+    source: tuple[SurfacePoints, Lighting] | None = None
+    fine: "Lobe | None" = None
+    share: Float[Array, "K M"] | None = None
+    slot: Int[Array, " P"] | None = None
+
+    def __call__(self, n: Scalar) -> tuple[Float[Array, "P C"], Float[Array, "P C"]]:
+        """The basis image without the model's scale, and its derivative in n."""
+        if self.source is None:
+            value = slope = 0.0
+            for weight, log_cosine in self.kept:
+                values, slopes = _power(n, weight, log_cosine)
+                value, slope = value + jnp.sum(values, axis=1), slope + jnp.sum(slopes, axis=1)
+        else:
+            of_terms = partial(_of_lobe, partial(_power, n))
+            value, slope = sum_over_samples(self.model, *self.source, of_terms)
+        if self.fine is None or self.share is None:
+            return value, slope
+        fine_value, fine_slope = self.fine(n)
+        value = self._averaged(value, average(self.share, fine_value))
+        return value, self._averaged(slope, average(self.share, fine_slope))
+
+    def peak(self) -> Float[Array, " P"]:
+        """The largest logarithm of the lobe's cosine over the samples, `NO_LOBE` where no sample has one."""
+        if self.source is None:
+            peak = jnp.max(jnp.concatenate([_peak(*sample) for sample in self.kept], axis=1), axis=1)
+        else:
+            of_terms = partial(_of_lobe, _peak)
+            peak = sum_over_samples(self.model, *self.source, of_terms, combine=jnp.maximum, start=NO_LOBE)
+        if self.fine is None or self.share is None:
+            return peak
+        return self._averaged(peak, jnp.max(self.fine.peak().reshape(self.share.shape), axis=1))
+
+    def pixels(self, choose: Callable[[Array], Array]) -> "Lobe":
+        """The same for some of the pixels: ``choose`` is applied to each array whose first axis is the pixels."""
+        source = None if self.source is None else (jax.tree.map(choose, self.source[0]), self.source[1])
+        kept, slot = jax.tree.map(choose, (self.kept, self.slot))
+        return Lobe(self.model, kept, source, self.fine, self.share, slot)
+
+    def _averaged(self, centre: Array, fine: Array) -> Array:
+        assert self.slot is not None
+        gathered = fine[jnp.maximum(self.slot, 0)]
+        return jnp.where((self.slot >= 0).reshape(-1, *(1,) * (centre.ndim - 1)), gathered, centre)
+
+
+def _of_lobe(function: Callable[..., Any], terms: LightTerms) -> Any:
+    return function(terms.weight, terms.log_cosine)
+
+
+def _power(n: Array, weight: Array, log_cosine: Array) -> tuple[Array, Array]:
+    log_cosine = log_cosine[..., None]
+    value = weight * jnp.exp(jnp.asarray(n, log_cosine.dtype) * log_cosine)
+    return value, value * log_cosine
 
 
 def _peak(weight: Array, log_cosine: Array) -> Array:
     return jnp.where(jnp.max(weight, axis=-1) > 0, log_cosine, NO_LOBE)
 
 
-class StoredLobe(eqx.Module):
-    """The specular basis of few light samples, kept as arrays: each evaluation costs an exponential per sample.
-
-    Attributes:
-        weights: of each sample, (P, C).
-        log_cosines: of each sample, (P,).
-    """
-
-    weights: tuple[Float[Array, "P C"], ...]
-    log_cosines: tuple[Float[Array, " P"], ...]
-
-    def __call__(self, n: Float[Array, ""]) -> tuple[Float[Array, "P C"], Float[Array, "P C"]]:
-        """The basis image without the model's scale, and its derivative in n.
-
-        Args:
-            n: the exponent.
-        """
-        value, slope = _power(self.weights[0], self.log_cosines[0], n)
-        for weight, log_cosine in zip(self.weights[1:], self.log_cosines[1:], strict=True):
-            more = _power(weight, log_cosine, n)
-            value, slope = value + more[0], slope + more[1]
-        return value, slope
-
-    def peak(self) -> Float[Array, " P"]:
-        """The largest logarithm of the lobe's cosine over the samples, `NO_LOBE` where no sample has one."""
-        peaks = [_peak(*sample) for sample in zip(self.weights, self.log_cosines, strict=True)]
-        return jnp.max(jnp.stack(peaks), axis=0)
-
-    def pixels(self, choose: Callable[[Array], Array]) -> "StoredLobe":
-        """The same for some of the pixels.
-
-        Args:
-            choose: applied to each array whose first axis is the pixels.
-        """
-        return jax.tree.map(choose, self)
-
-
-class StackedLobe(eqx.Module):
-    """The specular basis of many light samples and so few pixels that their terms fit into memory.
-
-    Attributes:
-        weights: of each sample, (P, S, C).
-        log_cosines: of each sample, (P, S).
-    """
-
-    weights: Float[Array, "P S C"]
-    log_cosines: Float[Array, "P S"]
-
-    def __call__(self, n: Float[Array, ""]) -> tuple[Float[Array, "P C"], Float[Array, "P C"]]:
-        """The basis image without the model's scale, and its derivative in n.
-
-        Args:
-            n: the exponent.
-        """
-        log_cosines = self.log_cosines[..., None]
-        values = self.weights * jnp.exp(jnp.asarray(n, log_cosines.dtype) * log_cosines)
-        return jnp.sum(values, axis=1), jnp.sum(values * log_cosines, axis=1)
-
-    def peak(self) -> Float[Array, " P"]:
-        """The largest logarithm of the lobe's cosine over the samples, `NO_LOBE` where no sample has one."""
-        return jnp.max(jnp.where(jnp.max(self.weights, axis=-1) > 0, self.log_cosines, NO_LOBE), axis=1)
-
-    def pixels(self, choose: Callable[[Array], Array]) -> "StackedLobe":
-        """The same for some of the pixels.
-
-        Args:
-            choose: applied to each array whose first axis is the pixels.
-        """
-        return jax.tree.map(choose, self)
-
-
-class StreamedLobe(eqx.Module):
-    """The specular basis of many light samples, made anew at each evaluation in bounded memory.
-
-    Attributes:
-        points: (P,) surface points.
-        lighting: lights and occluders.
-        model: the class of the material.
-    """
-
-    points: SurfacePoints
-    lighting: Lighting
-    model: type[Material] = eqx.field(static=True)
-
-    def __call__(self, n: Float[Array, ""]) -> tuple[Float[Array, "P C"], Float[Array, "P C"]]:
-        """The basis image without the model's scale, and its derivative in n.
-
-        Args:
-            n: the exponent.
-        """
-
-        def of_terms(terms: LightTerms) -> tuple[Array, Array]:
-            return _power(terms.weight, terms.log_cosine, n)
-
-        return sum_over_samples(self.model, self.points, self.lighting, of_terms)
-
-    def peak(self) -> Float[Array, " P"]:
-        """The largest logarithm of the lobe's cosine over the samples, `NO_LOBE` where no sample has one."""
-
-        def of_terms(terms: LightTerms) -> Array:
-            return _peak(terms.weight, terms.log_cosine)
-
-        return sum_over_samples(self.model, self.points, self.lighting, of_terms, combine=jnp.maximum, start=NO_LOBE)
-
-    def pixels(self, choose: Callable[[Array], Array]) -> "StreamedLobe":
-        """The same for some of the pixels.
-
-        Args:
-            choose: applied to each array whose first axis is the pixels.
-        """
-        return StreamedLobe(jax.tree.map(choose, self.points), self.lighting, self.model)
-
-
-class AveragedLobe(eqx.Module):
-    """The specular basis of pixels some of which are averaged over their area.
-
-    Attributes:
-        centre: of all pixels, by their centres.
-        fine: of the points, (K M,), of those that are averaged.
-        weight: of each point in its pixel, (K, M).
-        slot: for every pixel its row in ``weight``, or -1, (P,).
-    """
-
-    centre: StoredLobe | StackedLobe | StreamedLobe
-    fine: StoredLobe | StackedLobe | StreamedLobe
-    weight: Float[Array, "K M"]
-    slot: Int[Array, " P"]
-
-    def __call__(self, n: Float[Array, ""]) -> tuple[Float[Array, "P C"], Float[Array, "P C"]]:
-        """The basis image without the model's scale, and its derivative in n.
-
-        Args:
-            n: the exponent.
-        """
-        means = tuple(average(self.weight, part) for part in self.fine(n))
-        value, slope = (self._chosen(*pair) for pair in zip(self.centre(n), means, strict=True))
-        return value, slope
-
-    def peak(self) -> Float[Array, " P"]:
-        """The largest logarithm of the lobe's cosine over samples and points, `NO_LOBE` where none has one."""
-        finest = jnp.max(self.fine.peak().reshape(self.weight.shape), axis=1)
-        return self._chosen(self.centre.peak(), finest)
-
-    def pixels(self, choose: Callable[[Array], Array]) -> "AveragedLobe":
-        """The same for some of the pixels.
-
-        Args:
-            choose: applied to each array whose first axis is the pixels.
-        """
-        return AveragedLobe(self.centre.pixels(choose), self.fine, self.weight, choose(self.slot))
-
-    def _chosen(self, centre: Array, fine: Array) -> Array:
-        averaged = self.slot >= 0
-        gathered = fine[jnp.maximum(self.slot, 0)]
-        return jnp.where(averaged.reshape(-1, *(1,) * (centre.ndim - 1)), gathered, centre)
-
-
 def average(weight: Float[Array, "K M"], values: Float[Array, "K*M C"]) -> Float[Array, "K C"]:
-    """The mean of each pixel's points.
-
-    Args:
-        weight: of each point in its pixel.
-        values: of the points, pixel by pixel.
-    """
+    """The mean of each pixel's points."""
     return jnp.sum(weight[..., None] * values.reshape(*weight.shape, -1), axis=1)
 
 
-Lobe = StoredLobe | StackedLobe | StreamedLobe | AveragedLobe
+@eqx.filter_jit
+def diffuse_and_lobe(
+    model: type[Material], points: SurfacePoints, lighting: Lighting
+) -> tuple[Float[Array, "P C"], Lobe | None]:
+    """The diffuse basis of (P,) points, and the specular one where the model has one."""
+    specular = issubclass(model, SpecularMaterial)
+    if lighting.samples <= STORED_SAMPLES:
+        diffuse, kept = 0.0, ()
+        for kind, row, light in lighting.each():
+            terms = jax.vmap(partial(light_terms, model, lighting.occluders, kind, row, light))(points)
+            diffuse, kept = diffuse + terms.diffuse, (*kept, (terms.weight[:, None], terms.log_cosine[:, None]))
+    elif specular and _size(jax.eval_shape(partial(_stacked_terms, model, lighting), points)) <= STACKED_VALUES:
+        diffuse, kept = _stacked_terms(model, lighting, points)
+    else:
+        diffuse = sum_over_samples(model, points, lighting, lambda terms: terms.diffuse)
+        return diffuse, Lobe(model, source=(points, lighting)) if specular else None
+    return diffuse, Lobe(model, kept) if specular else None
+
+
+def _stacked_terms(model: type[Material], lighting: Lighting, points: SurfacePoints) -> tuple[Any, Any]:
+    """Sum of the diffuse terms, and weights and cosines of the lobe, of all samples at once."""
+
+    def at_point(point: SurfacePoints) -> tuple[Any, Any]:
+        diffuse, kept = 0.0, ()
+        for stack in lighting.stacks:
+            of_row = partial(light_terms, model, lighting.occluders, stack.kind, point=point)
+            terms = jax.lax.map(lambda sample, of_row=of_row: of_row(*sample), (stack.rows, stack.light))
+            diffuse, kept = diffuse + jnp.sum(terms.diffuse, axis=0), (*kept, (terms.weight, terms.log_cosine))
+        return diffuse, kept
+
+    return _by_tiles(at_point, points)
+
+
+def _size(tree: Any) -> int:
+    """The number of values in all arrays."""
+    return sum(leaf.size for leaf in jax.tree.leaves(tree))

@@ -14,6 +14,8 @@ Where camera, shapes or lights are being differentiated, which pixels need it ca
 points.
 """
 
+import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -25,12 +27,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from brdf.geometry.base import Shape
 from brdf.geometry.camera import Camera
-from brdf.geometry.rays import NO_SHAPE, shapes_met, trace
-from brdf.geometry.surface_points import PixelArea, SurfacePoints
-from brdf.geometry.visibility import Lighting, share_seen
-from brdf.light_sum import STORED_SAMPLES, nodes_of, sample_count
-from brdf.lights.punctual import Place
+from brdf.geometry.rays import shapes_met, trace
+from brdf.geometry.surface_points import NO_SHAPE, PixelArea, SurfacePoints
+from brdf.geometry.visibility import share_seen
+from brdf.lights.base import Light, Lighting, stacked
 from brdf.lights.sample_sets import square_rule
+from brdf.lobes import STORED_SAMPLES
 from brdf.precision import apart
 from brdf.vectors import dot, half_log_cosine
 
@@ -41,34 +43,34 @@ BENT = 0.9
 """Cosine between neighbouring normals of a mesh below which there is an edge between them."""
 
 
-def with_area(points: SurfacePoints, camera: Camera, shapes: tuple[Shape, ...], lighting: Lighting) -> SurfacePoints:
-    """Add the points of those pixels that their centres do not stand for.
-
-    Args:
-        points: (H, W) what the centres see.
-        camera: whose ``samples`` says how many points a pixel gets along each side.
-        shapes: of the scene.
-        lighting: lights and occluders.
-    """
+def with_area(
+    points: SurfacePoints,
+    camera: Camera,
+    shapes: tuple[Shape, ...],
+    lights: Sequence[Light],
+    occluders: tuple[Shape, ...],
+) -> SurfacePoints:
+    """Add the points of those pixels that their centres do not stand for."""
     count = points.mask.size
-    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((points, camera, shapes, lighting))):
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((points, camera, shapes, lights))):
         return _averaged(points, camera, shapes, np.arange(count, dtype=np.int32), np.zeros(0, np.int32))
+    sharp = [light for light in lights if light.rows()[0].shape[0] <= STORED_SAMPLES]
+    lighting = Lighting(stacked(sharp, points.position.dtype), occluders)
     edge, other = np.asarray(_matters(points, camera, shapes, lighting)).reshape(2, count)
-    return _averaged(points, camera, shapes, *(_padded(np.flatnonzero(mask), count) for mask in (edge, other & ~edge)))
+    return _averaged(points, camera, shapes, _padded(edge), _padded(other & ~edge))
 
 
-def _padded(pixel: Int[np.ndarray, " K"], count: int) -> Int[np.ndarray, " padded"]:
+def _padded(mask: Bool[np.ndarray, " P"]) -> Int[np.ndarray, " padded"]:
     """The pixels and some that are not there, so that few different sizes come up and few programs are compiled."""
+    pixel = np.flatnonzero(mask)
     step = 1 << max(4, int(max(len(pixel), 1) - 1).bit_length() - 2)
-    padded = np.full(step * -(-len(pixel) // step), count, np.int32)
-    padded[: len(pixel)] = pixel
-    return padded
+    return np.pad(pixel, (0, -len(pixel) % step), constant_values=mask.size).astype(np.int32)
 
 
-def _neighbours_differ(values: Array, differ: Any = jnp.not_equal) -> Bool[Array, "H W"]:
-    """Whether any of a pixel's four neighbours differs from it."""
-    down, right = differ(values[1:], values[:-1]), differ(values[:, 1:], values[:, :-1])
-    found = jnp.zeros(values.shape[:2], bool)
+def _over_neighbours(change: Any, values: Array) -> Array:
+    """The largest change, or whether there is any, between a pixel and its four neighbours."""
+    down, right = change(values[1:], values[:-1]), change(values[:, 1:], values[:, :-1])
+    found = jnp.zeros(values.shape[:2], down.dtype)
     found = found.at[1:].max(down).at[:-1].max(down)
     return found.at[:, 1:].max(right).at[:, :-1].max(right)
 
@@ -79,80 +81,64 @@ def _matters(
 ) -> Bool[Array, "2 H W"]:
     """Through which pixels an edge of a shape passes, and which others are to be averaged."""
     width, height = camera.resolution
-    x = jnp.arange(width + 1) * 2.0 / width - 1.0
-    y = height / width - jnp.arange(height + 1) * 2.0 / width
-    corners = apart(shapes_met, shapes, *camera.rays_through(x[None, :], y[:, None]))
-    one = corners[1:, 1:]
-    edge = jnp.zeros(one.shape, bool)
+    corners = apart(shapes_met, camera, shapes, np.arange(width + 1.0)[None, :], np.arange(height + 1.0)[:, None])
+    corner = corners[1:, 1:]
+    edge = points.met != corner
     for other in (corners[:-1, :-1], corners[1:, :-1], corners[:-1, 1:]):
-        edge |= other != one
-    centre = jnp.where(points.mask, 0, NO_SHAPE) if points.shape is None else points.shape
-    if points.shape is not None or all(shape.fitted for shape in shapes):
-        edge |= centre != one if points.shape is not None else (centre == NO_SHAPE) != (one == NO_SHAPE)
+        edge |= other != corner
     matters = jnp.zeros_like(edge)
     if not all(shape.convex for shape in shapes):
-        matters |= points.mask & _neighbours_differ(points.normal, lambda a, b: dot(a, b) < BENT)
-    for index, light in enumerate(lighting.lights):
-        if sample_count(light) <= STORED_SAMPLES:
-            matters |= points.mask & _light_matters(points, lighting, index)
-    return jnp.stack([edge, matters])
+        matters |= _over_neighbours(lambda a, b: dot(a, b) < BENT, points.normal)
+    for stack in lighting.stacks:
+
+        def or_light(found: Array, row: tuple[Array, ...], kind: type[Light] = stack.kind) -> tuple[Array, None]:
+            return found | _light_matters(points, lighting.occluders, kind, row), None
+
+        matters, _ = jax.lax.scan(or_light, matters, stack.rows)
+    return jnp.stack([edge, matters & points.mask])
 
 
-def _light_matters(points: SurfacePoints, lighting: Lighting, index: int) -> Bool[Array, "H W"]:
+def _light_matters(
+    points: SurfacePoints, occluders: tuple[Shape, ...], kind: type[Light], row: tuple[Array, ...]
+) -> Bool[Array, "H W"]:
     """Whether a highlight is narrow or a light's edge passes."""
-    light = lighting.lights[index]
-    node = jax.tree.map(lambda leaf: leaf[0], nodes_of(light, points))
 
     def at_point(point: SurfacePoints) -> tuple[Array, Array]:
-        sample = light.illuminate(node, Place(point.position, point.normal, point.to_view))
+        sample = kind.sample(point, *row)
         lit = (dot(point.normal, sample.to_light) > 0) & jnp.any(sample.intensity > 0)
-        if lighting.occluders:
-            lit &= share_seen(lighting.occluders, point, sample) > 0
+        if occluders:
+            lit &= share_seen(occluders, point, sample.to_light, sample.distance, sample.radius) > 0
         return lit, half_log_cosine(point.normal, sample.to_light, point.to_view)
 
-    lit, log_cosine = jax.vmap(jax.vmap(at_point))(eqx.tree_at(lambda p: p.visibility, points, None, is_leaf=_is_none))
-    steps = jnp.zeros_like(log_cosine)
-    for axis in (0, 1):
-        change = jnp.abs(jnp.diff(log_cosine, axis=axis))
-        first, second = [(slice(1, None),), (slice(None, -1),)]
-        whole = (slice(None),) * axis
-        steps = steps.at[whole + first].max(change).at[whole + second].max(change)
+    lit, log_cosine = jax.vmap(jax.vmap(at_point))(points)
+    steps = _over_neighbours(lambda a, b: jnp.abs(a - b), log_cosine)
     narrow = lit & (steps > 2 * NARROW * jnp.abs(log_cosine))
-    return narrow | _neighbours_differ(lit)
-
-
-def _is_none(value: Any) -> bool:
-    return value is None
+    return narrow | _over_neighbours(jnp.not_equal, lit)
 
 
 @eqx.filter_jit
 def _averaged(points: SurfacePoints, camera: Camera, shapes: tuple[Shape, ...], edge: Any, other: Any) -> SurfacePoints:
     """The points of the given pixels, those with an edge first, beside those of the centres."""
-    count = points.mask.size
     pixel = jnp.concatenate([edge, other])
-    rule = square_rule(camera.samples**2)
-    origins, directions = camera.rays_through(*camera.places_in_pixels(pixel, jnp.asarray(rule.s), jnp.asarray(rule.t)))
-    visibility = points.visibility
-    if visibility is not None:
-        visibility = tuple(None if mask is None else _spread(mask, pixel, rule.s.size) for mask in visibility)
-    fine = apart(trace, camera, shapes, visibility, origins, directions)
-    met = jnp.where(fine.mask, 0, NO_SHAPE) if fine.shape is None else fine.shape
-    side = 3 * camera.samples
-    steps = (jnp.arange(side) + 0.5) / side
-    right, down = (grid.ravel() for grid in jnp.meshgrid(steps, steps))
-    counted = apart(shapes_met, shapes, *camera.rays_through(*camera.places_in_pixels(jnp.asarray(edge), right, down)))
-    weight = jnp.broadcast_to(jnp.asarray(rule.weight, fine.position.dtype), met.shape)
-    weight = jnp.concatenate(
-        [_by_shares(weight[: edge.size], met[: edge.size], counted, len(shapes)), weight[edge.size :]]
-    )
-    used = pixel < count
-    weight = jnp.where(used[:, None], weight, 0.0)
+    width, count, edges = camera.resolution[0], points.mask.size, edge.size
+    rule, side = square_rule(camera.samples**2), 3 * camera.samples
+    column, row = (pixel % width)[:, None], (pixel // width)[:, None]
+    fine = apart(trace, camera, shapes, column + rule.s, row + rule.t)
+    if points.visibility is not None:
+        seen = jnp.take(points.visibility.reshape(count, -1), pixel, axis=0, mode="clip")[:, None]
+        seen = jnp.broadcast_to(seen, (*fine.mask.shape, seen.shape[-1]))
+        fine = dataclasses.replace(fine, visibility=seen)
+    right, down = (grid.ravel() for grid in np.meshgrid(*[(np.arange(side) + 0.5) / side] * 2))
+    counted = apart(shapes_met, camera, shapes, column[:edges] + right, row[:edges] + down)
+    weight = jnp.broadcast_to(jnp.asarray(rule.weight, fine.position.dtype), fine.mask.shape)
+    weight = weight.at[:edges].set(_by_shares(weight[:edges], fine.met[:edges], counted, len(shapes)))
+    weight = jnp.where((pixel < count)[:, None], weight, 0.0)
     slot = jnp.full(count, -1, jnp.int32).at[pixel].set(jnp.arange(pixel.size, dtype=jnp.int32), mode="drop")
     fitted = jnp.array([shape.fitted for shape in shapes] + [False])  # the last is NO_SHAPE
-    whole = jnp.all(fine.mask, axis=1).at[: edge.size].min(jnp.all(fitted[counted], axis=1))
+    whole = jnp.all(fine.mask, axis=1).at[:edges].min(jnp.all(fitted[counted], axis=1))
     mask = points.mask.ravel().at[pixel].set(whole, mode="drop").reshape(points.mask.shape)
     area = PixelArea(pixel, slot.reshape(points.mask.shape), fine, weight)
-    return eqx.tree_at(lambda p: (p.mask, p.area), points, (mask, area), is_leaf=_is_none)
+    return dataclasses.replace(points, mask=mask, area=area)
 
 
 def _by_shares(
@@ -166,8 +152,3 @@ def _by_shares(
         total = jnp.sum(jnp.where(mine, weight, 0.0), axis=1)
         result = jnp.where(mine, weight * (share / jnp.where(total > 0, total, 1.0))[:, None], result)
     return result
-
-
-def _spread(mask: Float[Array, "H W"], pixel: Int[Array, " K"], samples: int) -> Float[Array, "K M"]:
-    """A pixel's value for each of its points."""
-    return jnp.broadcast_to(jnp.take(jnp.asarray(mask).ravel(), pixel, mode="clip")[:, None], (pixel.size, samples))

@@ -1,11 +1,12 @@
 """Basis images and pictures: image = k_a B_a + k_d B_d + k_s B_s(n).
 
 A picture is linear in k_a, k_d, k_s and in the light, so rendering, fitting and relighting all read the same basis
-images. They come from the one pass over light samples of `brdf.light_sum`. What a scene lacks is not compiled:
-without ambient light, lights, a specular term or occluders there is no arithmetic for it.
+images. They come from the one pass over light samples of `brdf.lobes`. What a scene lacks is not compiled: without
+ambient light, lights, a specular term or occluders there is no arithmetic for it.
 """
 
 import contextlib
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -15,21 +16,12 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
+from brdf.checks import Scalar
 from brdf.errors import InputError
 from brdf.geometry.surface_points import SurfacePoints
-from brdf.geometry.visibility import Lighting
-from brdf.light_sum import (
-    STACKED_VALUES,
-    STORED_SAMPLES,
-    LightTerms,
-    each_sample,
-    light_channels,
-    sample_count,
-    stacked_terms,
-    sum_over_samples,
-)
-from brdf.lobes import AveragedLobe, Lobe, StackedLobe, StoredLobe, StreamedLobe, average
-from brdf.models import Material, SpecularMaterial
+from brdf.lights.base import Lighting, stacked
+from brdf.lobes import LightTerms, Lobe, average, diffuse_and_lobe, sum_over_samples
+from brdf.models.base import Material, SpecularMaterial
 from brdf.precision import Precision, cast, working_precision
 from brdf.scene import Scene
 
@@ -39,20 +31,13 @@ class Basis(eqx.Module):
 
     Attributes:
         points: (P,) surface points.
-        ambient: intensity of the ambient light, (C,), or None.
         diffuse: sum of I (N·L)+, (P, C); None without lights.
         lobe: the specular basis as a function of n; None without lights or for a model without a specular term.
     """
 
     points: SurfacePoints
-    ambient: Float[Array, " C"] | None
     diffuse: Float[Array, "P C"] | None
     lobe: Lobe | None
-
-
-def _flat(points: SurfacePoints) -> SurfacePoints:
-    centres = eqx.tree_at(lambda p: p.area, points, None, is_leaf=lambda leaf: leaf is None)
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf).reshape(-1, *leaf.shape[2:]), centres)
 
 
 def basis(model: type[Material], scene: Scene, *, points: SurfacePoints | None = None) -> Basis:
@@ -64,39 +49,20 @@ def basis(model: type[Material], scene: Scene, *, points: SurfacePoints | None =
         points: what the pixels see, where that is known already.
     """
     points = scene.surface_points() if points is None else points
-    return _basis(model, points, scene.ambient, scene.lighting)
+    centres, lighting, area = points.flat(), _lighting(scene, points), points.area
+    if not lighting.stacks:
+        return Basis(centres, None, None)
+    diffuse, lobe = diffuse_and_lobe(model, centres, lighting)
+    if area is not None:
+        fine_diffuse, fine_lobe = diffuse_and_lobe(model, area.points.flat(), lighting)
+        diffuse = diffuse.at[area.pixel].set(average(area.weight, fine_diffuse), mode="drop")
+        if lobe is not None:
+            lobe = dataclasses.replace(lobe, fine=fine_lobe, share=area.weight, slot=area.slot.ravel())
+    return Basis(centres, diffuse, lobe)
 
 
-@eqx.filter_jit
-def _basis(model: type[Material], points: SurfacePoints, ambient: Any, lighting: Lighting) -> Basis:
-    centres = _flat(points)
-    if not lighting.lights:
-        return Basis(centres, ambient, None, None)
-    diffuse, lobe = _diffuse_and_lobe(model, centres, lighting)
-    if points.area is not None:
-        fine_diffuse, fine_lobe = _diffuse_and_lobe(model, _flat(points.area.points), lighting)
-        diffuse = diffuse.at[points.area.pixel].set(average(points.area.weight, fine_diffuse), mode="drop")
-        if lobe is not None and fine_lobe is not None:
-            lobe = AveragedLobe(lobe, fine_lobe, points.area.weight, points.area.slot.ravel())
-    return Basis(centres, ambient, diffuse, lobe)
-
-
-def _diffuse_and_lobe(
-    model: type[Material], points: SurfacePoints, lighting: Lighting
-) -> tuple[Float[Array, "P C"], StoredLobe | StackedLobe | StreamedLobe | None]:
-    specular = issubclass(model, SpecularMaterial)
-    samples = sum(map(sample_count, lighting.lights))
-    if samples <= STORED_SAMPLES:
-        terms = list(each_sample(model, points, lighting))
-        diffuse = sum((term.diffuse for term in terms[1:]), start=terms[0].diffuse)
-        lobe = StoredLobe(tuple(t.weight for t in terms), tuple(t.log_cosine for t in terms))
-        return diffuse, lobe if specular else None
-    values = samples * points.mask.size * (1 + max(light_channels(light) for light in lighting.lights))
-    if specular and values <= STACKED_VALUES:
-        diffuse, weights, log_cosines = stacked_terms(model, points, lighting)
-        return diffuse, StackedLobe(weights, log_cosines)
-    diffuse = sum_over_samples(model, points, lighting, lambda terms: terms.diffuse)
-    return diffuse, StreamedLobe(points, lighting, model) if specular else None
+def _lighting(scene: Scene, points: SurfacePoints) -> Lighting:
+    return Lighting(stacked(scene.lights, jnp.asarray(points.position).dtype), scene.occluders)
 
 
 class BasisImages(eqx.Module):
@@ -125,69 +91,46 @@ def basis_images(
         points: what the pixels see, where that is known already.
     """
     points = scene.surface_points() if points is None else points
-    return _basis_images(model, points, scene.ambient, scene.lighting, jnp.asarray(n))
+    return _basis_images(model, points, scene.ambient, _lighting(scene, points), jnp.asarray(n))
 
 
 @eqx.filter_jit
 def _basis_images(
-    model: type[Material],
-    points: SurfacePoints,
-    ambient: Float[Array, " C"] | None,
-    lighting: Lighting,
-    n: Float[Array, ""],
+    model: type[Material], points: SurfacePoints, ambient: Any, lighting: Lighting, n: Scalar
 ) -> BasisImages:
-    shape, area = points.mask.shape, points.area
-
     def of_terms(terms: LightTerms) -> tuple[Array, Array | None]:
         if not issubclass(model, SpecularMaterial):
             return terms.diffuse, None
-        return terms.diffuse, terms.weight * (model.scale(n) * jnp.exp(n * terms.log_cosine))[:, None]
+        return terms.diffuse, terms.weight * (model.scale(n) * jnp.exp(n * terms.log_cosine))
 
-    def lit(points: SurfacePoints) -> tuple[Array | None, Array | None]:
-        return sum_over_samples(model, points, lighting, of_terms) if lighting.lights else (None, None)
-
-    def averaged(centre: Array | None, fine: Array | None) -> Float[Array, "H W C"] | None:
-        if centre is not None and fine is not None and area is not None:
-            centre = centre.at[area.pixel].set(average(area.weight, fine), mode="drop")
-        return None if centre is None else centre.reshape(*shape, -1)
-
-    def seen(points: SurfacePoints) -> Array | None:
-        return None if ambient is None else jnp.where(points.mask[:, None], ambient, 0)
-
-    centres = _flat(points)
-    images = (seen(centres), *lit(centres))
-    if area is None:
-        return BasisImages(*(averaged(image, None) for image in images))
-    fine = _flat(area.points)
-    return BasisImages(*map(averaged, images, (seen(fine), *lit(fine))))
-
-
-def combine(material: Material, images: BasisImages) -> Any:
-    """The picture k_a B_a + k_d B_d + k_s B_s; None where there is no light at all.
-
-    Args:
-        material: the coefficients.
-        images: the basis images for its model and exponent.
-    """
-    terms = [(material.k_a, images.ambient), (material.k_d, images.diffuse)]
-    if isinstance(material, SpecularMaterial):
-        terms.append((material.k_s, images.specular))
-    pictures = [k * image for k, image in terms if image is not None]
-    return sum(pictures[1:], start=pictures[0]) if pictures else None
+    area, parts = points.area, []
+    for part in (points,) if area is None else (points, area.points):
+        flat = part.flat()
+        seen = None if ambient is None else jnp.where(flat.mask[:, None], ambient, 0)
+        lit = sum_over_samples(model, flat, lighting, of_terms) if lighting.stacks else (None, None)
+        parts.append((seen, *lit))
+    images = parts[0]
+    if area is not None:
+        images = jax.tree.map(
+            lambda centre, fine: centre.at[area.pixel].set(average(area.weight, fine), mode="drop"), *parts
+        )
+    return BasisImages(*jax.tree.map(lambda image: image.reshape(*points.mask.shape, -1), images))
 
 
 @eqx.filter_jit
-def shade(material: Material, points: SurfacePoints, ambient: Any, lighting: Lighting) -> Any:
-    """The picture of a material at given points; None where there is no light at all.
-
-    Args:
-        material: what the points are made of.
-        points: what the pixels see.
-        ambient: intensity of the ambient light, (C,), or None.
-        lighting: lights and occluders.
-    """
-    n = material.n if isinstance(material, SpecularMaterial) else jnp.ones(())
-    return combine(material, _basis_images(type(material), points, ambient, lighting, jnp.asarray(n)))
+def _shade(material: Material, points: SurfacePoints, ambient: Any, lighting: Lighting) -> Any:
+    """The picture k_a B_a + k_d B_d + k_s B_s of surface points; None where there is no light at all."""
+    n = jnp.asarray(material.n) if isinstance(material, SpecularMaterial) else jnp.ones(())
+    images = _basis_images(type(material), points, ambient, lighting, n)
+    picture = None
+    for k, image in (
+        (material.k_a, images.ambient),
+        (material.k_d, images.diffuse),
+        (getattr(material, "k_s", None), images.specular),
+    ):
+        if image is not None:
+            picture = k * image if picture is None else picture + k * image
+    return picture
 
 
 def render(material: Material, scene: Scene, *, precision: Precision | None = None) -> Float[Array, "H W C"]:
@@ -208,13 +151,62 @@ def render(material: Material, scene: Scene, *, precision: Precision | None = No
         InputError: where material and light differ in their channels, or a coefficient is out of reach.
     """
     with working_precision(precision):
-        channels = channels_of(material, scene)
-        scene, points = seen(scene, precision)
+        shape = _shape(material, scene)
+        scene, points = _seen(scene, precision)
         _check_reach(material, np.dtype(points.normal.dtype))
         material = cast(material, precision)
-        image = shade(material, points, scene.ambient, scene.lighting)
-        width, height = scene.resolution
-        return jnp.zeros((height, width, channels)) if image is None else image
+        image = _shade(material, points, scene.ambient, _lighting(scene, points))
+        return jnp.zeros(shape) if image is None else image
+
+
+def render_lights(material: Material, scene: Scene, *, precision: Precision | None = None) -> Float[Array, "L H W C"]:
+    """One picture per light: their sum is the picture that `brdf.render` makes.
+
+    Args:
+        material: with as many channels as the light, or one of the two with 1.
+        scene: what is seen, and the light on it.
+        precision: as for `brdf.render`.
+
+    Returns:
+        Linear radiance, (L, H, W, C): a picture for each of the scene's lights in their order, and last one for the
+        ambient light where the scene has any.
+
+    Raises:
+        InputError: where material and light differ in their channels.
+
+    Source: P. Haeberli, Synthetic lighting for photography, Grafica Obscura, 1992.
+    """
+    with working_precision(precision):
+        shape = _shape(material, scene)
+        scene, points = _seen(scene, precision)
+        material = cast(material, precision)
+        images = []
+        for index, light in enumerate(scene.lights):
+            (stack,) = stacked((light,), points.position.dtype)
+            stack = dataclasses.replace(stack, light=stack.light + index)  # its own mask, where masks are given
+            images.append(_shade(material, points, None, Lighting((stack,), scene.occluders)))
+        if scene.ambient is not None:
+            images.append(_shade(material, points, scene.ambient, Lighting(())))
+        return jnp.stack([jnp.broadcast_to(image, shape) for image in images]) if images else jnp.zeros((0, *shape))
+
+
+def relight(images: Float[ArrayLike, "L H W C"], factors: ArrayLike) -> Float[Array, "H W C"]:
+    """The picture under other intensities and colours of the same lights, at the cost of a sum.
+
+    Args:
+        images: one per light, as `render_lights` returns them.
+        factors: what multiplies each light, (L,), or each of its channels, (L, C).
+
+    Raises:
+        InputError: where the factors do not fit the pictures.
+    """
+    images, factors = jnp.asarray(images), jnp.asarray(factors)
+    lights, _, _, channels = images.shape
+    fits = factors.ndim in (1, 2) and factors.shape[0] == lights
+    if not fits or (factors.ndim == 2 and channels != 1 and factors.shape[1] not in (1, channels)):
+        expected = f"({lights},) or ({lights}, {channels})"
+        raise InputError("factors", f"must be of shape {expected}, got {factors.shape}", "Give one per light")
+    return jnp.sum(images * factors.reshape(lights, 1, 1, -1), axis=0)
 
 
 def _check_reach(material: Material, dtype: np.dtype) -> None:
@@ -225,13 +217,11 @@ def _check_reach(material: Material, dtype: np.dtype) -> None:
             raise InputError(name, came, "Use another unit of light, or float64")
 
 
-def seen(scene: Scene, precision: Precision | None) -> tuple[Scene, SurfacePoints]:
+def _seen(scene: Scene, precision: Precision | None) -> tuple[Scene, SurfacePoints]:
     """A scene in a precision, and what each pixel sees.
 
-    Args:
-        scene: the scene; where pixels are averaged over their area, and nothing of it is being traced, the pixels that
-            need it are found at once, also inside a transformation of the material.
-        precision: "float32", "float64" or None.
+    Where pixels are averaged over their area, and nothing of the scene is being traced, the pixels that need it are
+    found at once, also inside a transformation of the material.
     """
     samples = 1 if scene.camera is None else scene.camera.samples
     traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(scene))
@@ -241,18 +231,11 @@ def seen(scene: Scene, precision: Precision | None) -> tuple[Scene, SurfacePoint
         return scene, scene.surface_points()
 
 
-def channels_of(material: Material, scene: Scene) -> int:
-    """The number of channels of a material's picture.
-
-    Args:
-        material: with as many channels as the light, or one of the two with 1.
-        scene: with the light.
-
-    Raises:
-        InputError: where they differ.
-    """
-    counts = {scene.channels, material.k_d.shape[0]} - {1}
-    if len(counts) > 1:
-        came = f"has {material.k_d.shape[0]} channels, the light has {scene.channels}"
+def _shape(material: Material, scene: Scene) -> tuple[int, int, int]:
+    """Height, width and channels of a material's picture."""
+    own, lit = material.k_d.shape[0], scene.channels
+    if own != lit and 1 not in (own, lit):
+        came = f"has {own} channels, the light has {lit}"
         raise InputError("material", came, "Give both the same number, or one of them a single channel")
-    return max(scene.channels, material.k_d.shape[0])
+    width, height = scene.resolution
+    return height, width, max(own, lit)

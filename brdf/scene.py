@@ -1,30 +1,44 @@
 """The scene: what each pixel sees, and the light that falls on it."""
 
+import dataclasses
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from brdf.checks import spectrum
+from brdf.checks import Spectrum, spectrum
 from brdf.errors import InputError
 from brdf.geometry.base import Shape
 from brdf.geometry.camera import Camera
-from brdf.geometry.rays import look
-from brdf.geometry.surface_points import SurfacePoints
-from brdf.geometry.visibility import Lighting, given_visibility, occluders
-from brdf.lights.punctual import Light
+from brdf.geometry.rays import compiled_apart, trace
+from brdf.geometry.surface_points import PixelArea, SurfacePoints
+from brdf.lights.base import Light
 from brdf.pixel_area import with_area
-
-
-def _is_none(value: Any) -> bool:
-    return value is None
+from brdf.precision import Precision, cast, working_precision
 
 
 def _ambient(value: Any) -> Any:
-    return None if value is None else spectrum("intensity")(value)
+    return None if value is None else spectrum("intensity", value)
+
+
+def _masks(value: Any) -> tuple[Any, ...]:
+    """Given shadow masks: (H, W) values from 0 to 1, or None, one for each light."""
+    masks = []
+    for mask in value:
+        if mask is not None and not isinstance(mask, jax.Array):
+            mask = np.asarray(mask, dtype=np.float64)
+            if mask.ndim != 2:
+                raise InputError("visibility", f"must be of shape (H, W), got {mask.shape}", "Give a value per pixel")
+            if not np.all((mask >= 0) & (mask <= 1)):
+                came = f"must lie between 0 and 1, got {np.min(mask):g} to {np.max(mask):g}"
+                raise InputError("visibility", came, "Give the share of the light that each pixel sees")
+        masks.append(mask)
+    return tuple(masks)
 
 
 class Scene(eqx.Module):
@@ -49,9 +63,9 @@ class Scene(eqx.Module):
     camera: Camera | None = None
     shapes: tuple[Shape, ...] = eqx.field(converter=tuple, default=())
     points: SurfacePoints | None = None
-    ambient: Float[Array, " C"] | None = eqx.field(converter=_ambient, default=None)
+    ambient: Spectrum | None = eqx.field(converter=_ambient, default=None)
     lights: tuple[Light, ...] = eqx.field(converter=tuple, default=())
-    visibility: tuple[Float[Array, "H W"] | None, ...] = eqx.field(converter=given_visibility, default=())
+    visibility: tuple[Float[Array, "H W"] | None, ...] = eqx.field(converter=_masks, default=())
 
     def __check_init__(self):
         """Refuse parts that do not belong together."""
@@ -76,7 +90,7 @@ class Scene(eqx.Module):
             came = f"lights have {' and '.join(map(str, counts))} channels"
             raise InputError("intensity", came, "Give all lights and the ambient light the same number of channels")
 
-    def emittances(self) -> list[Float[Array, " C"]]:
+    def emittances(self) -> list[Spectrum]:
         """The emittance of each light, then the ambient intensity where there is one."""
         ambient = [] if self.ambient is None else [self.ambient]
         return [light.emittance for light in self.lights] + ambient
@@ -95,41 +109,38 @@ class Scene(eqx.Module):
         height, width = self.points.mask.shape
         return width, height
 
+    @property
+    def occluders(self) -> tuple[Shape, ...]:
+        """All shapes; none where they cannot cast a shadow on what is seen."""
+        alone = self.camera is not None and len(self.shapes) == 1 and self.shapes[0].convex
+        return () if alone else self.shapes
+
     def surface_points(self, rows: tuple[int, int] | None = None) -> SurfacePoints:
         """What each pixel sees: traced by the camera, or as given.
 
         Args:
             rows: the first one, and the one after the last, where not all are wanted; then pixels are seen at their
-                centres, and numbers of the scene cannot be differentiated.
+                centres.
 
         Returns:
             (H, W) points, or as many rows.
         """
-        if rows is not None:
-            return self._some_rows(*rows)
-        visibility = self.visibility or None
+        width, height = self.resolution
+        first, stop = (0, height) if rows is None else rows
         if self.points is not None:
-            return eqx.tree_at(lambda points: points.visibility, self.points, visibility, is_leaf=_is_none)
-        assert self.camera is not None
-        points = look(self.camera, self.shapes, visibility)
-        return points if self.camera.samples == 1 else with_area(points, self.camera, self.shapes, self.lighting)
-
-    def _some_rows(self, first: int, stop: int) -> SurfacePoints:
-        visibility = tuple(None if mask is None else mask[first:stop] for mask in self.visibility) or None
-        if self.points is None:
-            assert self.camera is not None
-            # As an array, or every band would be compiled anew.
-            return look(self.camera, self.shapes, visibility, np.asarray(first, np.int32), stop - first)
-        if self.points.area is not None:
-            raise ValueError("points that are averaged over pixels cannot be cut into rows")
-        plain = eqx.tree_at(lambda points: points.visibility, self.points, None, is_leaf=_is_none)
-        some = jax.tree.map(lambda leaf: leaf[first:stop], plain)
-        return eqx.tree_at(lambda points: points.visibility, some, visibility, is_leaf=_is_none)
-
-    @property
-    def lighting(self) -> Lighting:
-        """The lights, and the shapes that stand in their way."""
-        return Lighting(self.lights, occluders(self.shapes, traced=self.camera is not None))
+            assert rows is None or self.points.area is None
+            points = self.points if rows is None else jax.tree.map(lambda leaf: leaf[first:stop], self.points)
+        else:
+            column, row = np.arange(width)[None, :] + 0.5, np.arange(first, stop)[:, None] + 0.5
+            points = compiled_apart(trace, self.camera, self.shapes, column, row)
+        visibility, given = None, [mask for mask in self.visibility if mask is not None]
+        if given:
+            masks = [jnp.ones_like(given[0]) if mask is None else mask for mask in self.visibility]
+            visibility = jnp.stack([mask[first:stop] for mask in masks], axis=-1)
+        points = dataclasses.replace(points, visibility=visibility)
+        if rows is not None or self.camera is None or self.camera.samples == 1:
+            return points
+        return with_area(points, self.camera, self.shapes, self.lights, self.occluders)
 
     @classmethod
     def load(cls, path: str | Path, *, within: str | Path | None = None) -> "Scene":
@@ -142,8 +153,6 @@ class Scene(eqx.Module):
         Raises:
             InputError: naming file, table and key.
         """
-        from brdf.scene_file import load_scene
-
         return load_scene(path, within)
 
     def save(self, path: str | Path) -> None:
@@ -156,6 +165,75 @@ class Scene(eqx.Module):
         Raises:
             InputError: where the file cannot be written.
         """
-        from brdf.scene_writer import save_scene
+        from brdf.scene_file import write_parts
 
-        save_scene(self, path)
+        write_parts(path, {field.name: getattr(self, field.name) for field in dataclasses.fields(self)})
+
+
+def load_scene(path: str | Path, within: str | Path | None = None, tables: dict[str, Any] | None = None) -> Scene:
+    """Read a scene file; see `Scene.load`. ``tables`` are what is in it, where it has been parsed already."""
+    from brdf.scene_file import read_parts  # late: it brings the picture library
+
+    parts = read_parts(Path(path), within, tables)
+    try:
+        return Scene(**parts)
+    except InputError as error:
+        raise error.inside(str(path)) from None
+
+
+def some_pixels(
+    scene: Scene,
+    pixel: Int[np.ndarray | Array, " K"] | Int[np.ndarray | Array, "H W"],
+    *,
+    precision: Precision = "float32",
+) -> Scene:
+    """The scene of a picture that shows some pixels of another: of one row, (1, K), or of the shape of ``pixel``.
+
+    Only those are traced, unless pixels are averaged over their area: which ones need that, their neighbours tell.
+
+    Args:
+        scene: any.
+        pixel: indices, row by row.
+        precision: in which the pixels are traced.
+
+    Returns:
+        A scene with surface points in place of the camera; what casts shadows there does so here.
+    """
+    pixel = pixel.reshape(1, -1) if pixel.ndim == 1 else pixel
+    with working_precision(precision):
+        if scene.camera is None:
+            points = _chosen(cast(scene.points, precision), pixel)
+        elif scene.camera.samples == 1:
+            width = scene.camera.resolution[0]
+            points = compiled_apart(trace, scene.camera, scene.shapes, pixel % width + 0.5, pixel // width + 0.5)
+        else:
+            points = _chosen(cast(scene, precision).surface_points(), pixel)
+        # The points know which shape they lie on by its place in the list, so all shapes stay.
+        hiding = tuple(dataclasses.replace(shape, fitted=False) for shape in scene.occluders)
+        choose = partial(_of_picture, pixel)
+        visibility = tuple(None if mask is None else choose(np.asarray(mask, np.float64)) for mask in scene.visibility)
+        return Scene(points=points, shapes=hiding, ambient=scene.ambient, lights=scene.lights, visibility=visibility)
+
+
+def _of_picture(pixel: Any, leaf: Any) -> np.ndarray:
+    """Some pixels of (H, W, ...) values; through NumPy: an XLA gather is ten times slower."""
+    return np.asarray(leaf).reshape(-1, *leaf.shape[2:])[np.asarray(pixel)]
+
+
+def _chosen(points: SurfacePoints, pixel: Any) -> SurfacePoints:
+    """Some of the points, in the shape of ``pixel``."""
+    area = points.area
+    plain = dataclasses.replace(points, visibility=None, area=None)
+    some = jax.tree.map(partial(_of_picture, pixel), plain)
+    if area is None:
+        return some
+    slot = _of_picture(pixel, area.slot)
+    averaged = np.flatnonzero(slot >= 0)
+    # An entry that is not used lies beyond the last pixel.
+    rows = slot.ravel()[averaged] if averaged.size else np.zeros(1, slot.dtype)
+    place = averaged if averaged.size else np.array([slot.size])
+    new = np.full(slot.size, -1, np.int32)
+    new[averaged] = np.arange(averaged.size, dtype=np.int32)
+    fine = dataclasses.replace(area.points, visibility=None)
+    fine, weight = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], (fine, area.weight))
+    return dataclasses.replace(some, area=PixelArea(place.astype(np.int32), new.reshape(slot.shape), fine, weight))

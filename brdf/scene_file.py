@@ -1,14 +1,16 @@
-"""scene.toml as an object. Strict: an unknown key, a wrong type or a missing value names file, table and key."""
+"""scene.toml in and out. Strict: an unknown key, a wrong type or a missing value names file, table and key."""
 
 import dataclasses
 import json
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
+
+import jax
+import numpy as np
 
 from brdf.checks import direction_value
 from brdf.errors import InputError
-from brdf.files import read_toml
+from brdf.files import read_toml, write_text
 from brdf.geometry.base import Shape
 from brdf.geometry.camera import CAMERAS
 from brdf.geometry.rectangle import Rectangle
@@ -16,222 +18,218 @@ from brdf.geometry.sphere import Sphere
 from brdf.geometry.surface_points import SurfacePoints
 from brdf.geometry.triangles import Triangles, load_mesh
 from brdf.images.reading import read_image, read_layers
+from brdf.images.writing import write_image, write_layers
 from brdf.lights.area import PolygonLight, RectangleLight, SphereLight
+from brdf.lights.base import Light
 from brdf.lights.environment import ConstantEnvironment, EnvironmentMap
-from brdf.lights.punctual import DirectionalLight, Light, PointLight, SpotLight
-from brdf.scene import Scene
+from brdf.lights.punctual import DirectionalLight, PointLight, SpotLight
 
 SHAPES: dict[str, type[Shape]] = {"sphere": Sphere, "rectangle": Rectangle, "triangles": Triangles}
-LIGHTS: dict[str, type[Light]] = {
-    light.type_name: light
-    for light in (
-        DirectionalLight,
-        PointLight,
-        SpotLight,
-        RectangleLight,
-        PolygonLight,
-        SphereLight,
-        ConstantEnvironment,
-    )
-}
+_LIGHTS = (DirectionalLight, PointLight, SpotLight, RectangleLight, PolygonLight, SphereLight, ConstantEnvironment)
+LIGHTS: dict[str, type[Light]] = {light.type_name: light for light in _LIGHTS}
 POSITION_LAYERS = ("position", "P")
-# Longer lists are no spectrum, no polygon that anybody draws.
-MOST_NUMBERS = 4096
-MOST_BYTES = 1 << 22
 NORMAL_LAYERS = ("normal", "sh_normal", "N")
 VIEW_LAYERS = ("to_view",)
 
+MOST_NUMBERS = 4096
+"""Longer lists are no spectrum, no polygon that anybody draws."""
 
-class Folder(NamedTuple):
-    """Where a scene file stands, and what its paths may reach.
+MOST_BYTES = 1 << 22
 
-    Attributes:
-        path: its folder.
-        within: the folder that no path may leave.
-    """
 
-    path: Path
-    within: Path
+# -- reading -----------------------------------------------------------------------------------------------------------
 
 
 class _Table:
-    """One table of the file: hands out its keys, and knows which nobody asked for."""
+    """One table of the file: hands out its keys, and knows which nobody asked for.
 
-    def __init__(self, place: str, values: Any):
+    Attributes:
+        place: file and table, for messages.
+        values: by key, those that have not been handed out.
+        within: the folder that no path may leave; None for the scene's own.
+    """
+
+    def __init__(self, path: Path, name: str, values: Any, within: Path | None):
+        self.path, self.place, self.within = path, f"{path}: {name}", within
         if not isinstance(values, dict):
-            raise InputError(place, f"must be a table, got {values!r}", "Write it as a [table]")
-        self.place = place
+            raise InputError(self.place, f"must be a table, got {values!r}", "Write it as a [table]")
         self.values = dict(values)
 
-    def pop(self, key: str, default: Any = None) -> Any:
-        return self.values.pop(key, default)
+    def plain(self, key: str) -> Any:
+        """A value, refused where Python would silently read a truth value or text as a number; None where missing."""
+        value, place = self.values.pop(key, None), f"{self.place}.{key}"
+        if isinstance(value, list) and len(value) > MOST_NUMBERS:
+            raise InputError(place, f"has {len(value)} entries", f"Give at most {MOST_NUMBERS}")
+        if key == "fitted":
+            if not isinstance(value, bool):
+                raise InputError(place, f"must be true or false, got {value!r}", "Correct the value")
+            return value
+        leaves = jax.tree.leaves(value)
+        if any(isinstance(leaf, bool) for leaf in leaves):
+            raise InputError(place, f"must be a number, got {json.dumps(value, default=str)}", "Give numbers")
+        if key != "viewer" and any(isinstance(leaf, str) for leaf in leaves):
+            words = "numbers" if isinstance(value, list) else "a number"
+            raise InputError(place, f"must be {words}, got {value!r}", "Give numbers without quotes")
+        return value
 
-    def choose(self, key: str, choices: dict[str, Any]) -> Any:
+    def choose(self, choices: dict[str, Any]) -> Any:
         """The class that the table's ``type`` names."""
         known = ", ".join(choices)
-        if key not in self.values:
-            raise InputError(self.place, f"has no {key}", f"Add {key} = one of {known}")
-        value = self.pop(key)
+        if "type" not in self.values:
+            raise InputError(self.place, "has no type", f"Add type = one of {known}")
+        value = self.values.pop("type")
         if not isinstance(value, str) or value not in choices:
-            raise InputError(f"{self.place}.{key}", f"is unknown, got {value!r}", f"Use one of {known}")
+            raise InputError(f"{self.place}.type", f"is unknown, got {value!r}", f"Use one of {known}")
         return choices[value]
 
-    def done(self, known: list[str]) -> None:
-        if self.values:
-            key = next(iter(self.values))
+    def done(self, *known: str) -> None:
+        """Refuse a key that nobody asked for."""
+        for key in self.values:
             raise InputError(f"{self.place}.{key}", "is not a known key", f"Known here: {', '.join(known)}")
 
     def build(self, cls: type) -> Any:
         """An object from the keys that bear its fields' names."""
         fields = {field.name: field for field in dataclasses.fields(cls) if field.init}
-        values = {name: _plain(f"{self.place}.{name}", self.pop(name)) for name in fields if name in self.values}
-        self.done(list(fields))
-        missing = [name for name, field in fields.items() if name not in values and not _has_default(field)]
-        if missing:
-            raise InputError(self.place, f"has no {missing[0]}", f"Add {missing[0]} = ...")
+        values = {name: self.plain(name) for name in fields if name in self.values}
+        self.done(*fields)
+        for name, field in fields.items():
+            if name not in values and field.default is dataclasses.MISSING:
+                raise InputError(self.place, f"has no {name}", f"Add {name} = ...")
+        return self.made(cls, **values)
+
+    def made(self, make: Any, *arguments: Any, **values: Any) -> Any:
+        """What a constructor makes; the table is named where it refuses."""
         try:
-            return cls(**values)
+            return make(*arguments, **values)
         except InputError as error:
             raise error.inside(self.place) from None
 
+    def file(self, key: str, example: str) -> Path:
+        """The file that a key names, which must lie within the folder."""
+        if key not in self.values:
+            raise InputError(self.place, f"has no {key}", f'Add {key} = "{example}"')
+        name, place = self.values.pop(key), f"{self.place}.{key}"
+        if not isinstance(name, str) or not name:
+            raise InputError(place, f"must be a path, got {name!r}", f'Give a path like "{example}"')
+        own = self.path.parent
+        within = own if self.within is None else self.within
+        try:
+            stays = (own / name).resolve().is_relative_to(within.resolve())
+        except (ValueError, OSError, RuntimeError):
+            raise InputError(place, f"is no path, got {name!r}", "Correct the path") from None
+        if not stays:
+            where = "the scene's folder" if own == within else str(within)
+            remedy = "Move the file there" + (", or allow more with within" if own == within else "")
+            raise InputError(place, f"must stay within {where}, got {name!r}", remedy)
+        return own / name
 
-def _has_default(field: Any) -> bool:
-    return field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
-
-
-def _flatten(value: Any) -> Iterator[Any]:
-    if isinstance(value, list):
-        for item in value:
-            yield from _flatten(item)
-    else:
-        yield value
-
-
-def _plain(place: str, value: Any) -> Any:
-    """A value of the file, refused where Python would silently read a truth value or text as a number."""
-    if isinstance(value, list) and len(value) > MOST_NUMBERS:
-        raise InputError(place, f"has {len(value)} entries", f"Give at most {MOST_NUMBERS}")
-    numbers = list(_flatten(value))
-    if any(isinstance(number, bool) for number in numbers) and not place.endswith(".fitted"):
-        raise InputError(place, f"must be a number, got {json.dumps(value)}", "Give numbers")
-    if place.endswith(".fitted") and not isinstance(value, bool):
-        raise InputError(place, f"must be true or false, got {value!r}", "Correct the value")
-    if isinstance(value, list) and any(isinstance(number, str) for number in numbers):
-        raise InputError(place, f"must be numbers, got {value!r}", "Give numbers without quotes")
-    if isinstance(value, str) and not place.endswith((".viewer", ".file")):
-        raise InputError(place, f"must be a number, got {value!r}", "Give numbers without quotes")
-    return value
-
-
-def _tables(place: str, values: Any) -> list[_Table]:
-    if not isinstance(values, list):
-        raise InputError(place, "must be a list of tables", f"Write [[{place.rpartition(': ')[2]}]]")
-    return [_Table(f"{place}[{index}]", value) for index, value in enumerate(values)]
+    def layer(self, key: str) -> str | None:
+        """The name of a layer."""
+        name = self.values.pop(key, None)
+        if not isinstance(name, str | None):
+            came = f"must be the name of a layer, got {name!r}"
+            raise InputError(f"{self.place}.{key}", came, "Give a name in quotes")
+        return name
 
 
-def load_scene(path: str | Path, within: str | Path | None = None, tables: dict[str, Any] | None = None) -> Scene:
-    """Read a scene file; see `Scene.load`. ``tables`` are what is in it, where it has been parsed already."""
-    path = Path(path)
-    folder = Folder(path.parent, path.parent if within is None else Path(within))
-    values = read_toml(path, MOST_BYTES) if tables is None else tables
-    root = _Table(str(path), values)
-    place = f"{path}: "
-    camera, shapes, points, ambient, lights, masks, has_position = None, [], None, None, [], [], True
-    if "camera" in root.values:
-        table = _Table(place + "camera", root.pop("camera"))
-        camera = table.build(table.choose("type", CAMERAS))
-    for table in _tables(place + "shapes", root.pop("shapes", [])):
-        shapes.append(_load_shape(table, folder))
-    if "aov" in root.values:
-        points, has_position = _load_points(_Table(place + "aov", root.pop("aov")), folder)
+def read_parts(path: Path, within: str | Path | None, tables: dict[str, Any] | None) -> dict[str, Any]:
+    """Read a scene file; see `brdf.Scene.load`.
+
+    Args:
+        path: the file.
+        within: a folder that the paths in it may not leave; None takes the file's own.
+        tables: what is in it, where it has been parsed already.
+
+    Returns:
+        The arguments of `brdf.Scene`.
+
+    Raises:
+        InputError: naming file, table and key.
+    """
+    within = None if within is None else Path(within)
+    values = read_toml(path, MOST_BYTES) if tables is None else dict(tables)
+    if any(isinstance(leaf, int) and abs(leaf) >> 1000 for leaf in jax.tree.leaves(values)):
+        raise InputError(path, "has a whole number of more than 300 digits", "Correct the file")
+    camera, points, ambient, has_position = None, None, None, True
+    if "camera" in values:
+        table = _Table(path, "camera", values.pop("camera"), within)
+        camera = table.build(table.choose(CAMERAS))
+    shapes = [_read_shape(table) for table in _tables(path, "shapes", values, within)]
+    if "aov" in values:
+        points, has_position = _read_points(_Table(path, "aov", values.pop("aov"), within))
         if shapes and not has_position:
-            came = f"stand somewhere, but {place}aov has no layer of positions"
-            raise InputError(place + "shapes", came, "Add the layer, or leave the shapes out")
-    if "ambient" in root.values:
-        table = _Table(place + "ambient", root.pop("ambient"))
-        given = "intensity" in table.values
-        value = table.pop("intensity") if given else None
+            came = f"stand somewhere, but {path}: aov has no layer of positions"
+            raise InputError(f"{path}: shapes", came, "Add the layer, or leave the shapes out")
+    if "ambient" in values:
+        table = _Table(path, "ambient", values.pop("ambient"), within)
+        given, ambient = "intensity" in table.values, table.plain("intensity")
         # A misspelt key is named before the one that it should have been.
-        table.done(["intensity"])
+        table.done("intensity")
         if not given:
             raise InputError(table.place, "has no intensity", "Add intensity = [r, g, b]")
-        ambient = _plain(f"{table.place}.intensity", value)
-    for table in _tables(place + "lights", root.pop("lights", [])):
-        masks.append(_load_mask(table, folder))
-        lights.append(_load_light(table, folder))
+    lights, masks = [], []
+    for table in _tables(path, "lights", values, within):
+        masks.append(_read_mask(table))
+        lights.append(_read_light(table))
         if not has_position and not isinstance(lights[-1], DirectionalLight | ConstantEnvironment | EnvironmentMap):
-            came = f"stands somewhere, but {place}aov has no layer of positions"
+            came = f"stands somewhere, but {path}: aov has no layer of positions"
             raise InputError(table.place, came, "Add the layer, or use directional lights")
-    if root.values:
+    for key in values:
         known = "camera, shapes, aov, ambient, lights"
-        raise InputError(f"{path}: {next(iter(root.values))}", "is not a known key", f"Known here: {known}")
-    try:
-        visibility = () if all(mask is None for mask in masks) else masks
-        return Scene(camera=camera, shapes=shapes, points=points, ambient=ambient, lights=lights, visibility=visibility)
-    except InputError as error:
-        raise error.inside(str(path)) from None
+        raise InputError(f"{path}: {key}", "is not a known key", f"Known here: {known}")
+    visibility = () if all(mask is None for mask in masks) else masks
+    parts = {"camera": camera, "shapes": shapes, "points": points, "ambient": ambient, "lights": lights}
+    return parts | {"visibility": visibility}
 
 
-def _file(table: _Table, key: str, folder: Folder, example: str) -> Path:
-    """The file that a key names."""
-    if key not in table.values:
-        raise InputError(table.place, f"has no {key}", f'Add {key} = "{example}"')
-    name = table.pop(key)
-    if not isinstance(name, str) or not name:
-        raise InputError(f"{table.place}.{key}", f"must be a path, got {name!r}", f'Give a path like "{example}"')
-    return inside(folder, name, f"{table.place}.{key}")
+def _tables(path: Path, name: str, values: dict[str, Any], within: Path | None) -> list[_Table]:
+    tables = values.pop(name, [])
+    if not isinstance(tables, list):
+        raise InputError(f"{path}: {name}", "must be a list of tables", f"Write [[{name}]]")
+    return [_Table(path, f"{name}[{index}]", table, within) for index, table in enumerate(tables)]
 
 
-def _load_shape(table: _Table, folder: Folder) -> Shape:
-    cls = table.choose("type", SHAPES)
+def _read_shape(table: _Table) -> Shape:
+    cls = table.choose(SHAPES)
     if cls is not Triangles:
         return table.build(cls)
-    mesh = load_mesh(_file(table, "file", folder, "mesh.obj"))
-    fitted = _plain(f"{table.place}.fitted", table.pop("fitted", True))
-    table.done(["type", "file", "fitted"])
+    mesh = load_mesh(table.file("file", "mesh.obj"))
+    fitted = table.plain("fitted") if "fitted" in table.values else True
+    table.done("type", "file", "fitted")
     return Triangles(mesh, fitted=fitted)
 
 
-def _load_light(table: _Table, folder: Folder) -> Light:
-    cls = table.choose("type", LIGHTS)
+def _read_light(table: _Table) -> Light:
+    cls = table.choose(LIGHTS)
     if cls is not ConstantEnvironment or "file" not in table.values:
         return table.build(cls)
-    path = _file(table, "file", folder, "sky.exr")
-    values = {
-        key: _plain(f"{table.place}.{key}", table.pop(key)) for key in ("radiance", "samples") if key in table.values
-    }
-    table.done(["type", "file", "radiance", "samples", "visibility", "visibility_layer"])
-    pixels = read_image(path)
-    try:
-        return EnvironmentMap(pixels, **values)
-    except InputError as error:
-        raise error.inside(table.place) from None
+    path = table.file("file", "sky.exr")
+    values = {key: table.plain(key) for key in ("radiance", "samples") if key in table.values}
+    table.done("type", "file", "radiance", "samples", "visibility", "visibility_layer")
+    return table.made(EnvironmentMap, read_image(path), **values)
 
 
-def _load_mask(table: _Table, folder: Folder) -> Any:
+def _read_mask(table: _Table) -> Any:
     """How much of the light each pixel sees, where a file tells; the first channel of the picture or layer."""
     if "visibility" not in table.values:
         return None
-    path = _file(table, "visibility", folder, "shadow.exr")
-    layer = _layer_name(table, "visibility_layer")
-    if layer is None:
-        return read_image(path, encoding="linear")[..., 0]
-    return _layer(read_layers(path), layer, (), path)[..., 0]
+    path, layer = table.file("visibility", "shadow.exr"), table.layer("visibility_layer")
+    pixels = read_image(path, encoding="linear") if layer is None else _layer(read_layers(path), layer, (), path)
+    return pixels[..., 0]
 
 
-def _load_points(table: _Table, folder: Folder) -> tuple[SurfacePoints, bool]:
+def _read_points(table: _Table) -> tuple[SurfacePoints, bool]:
     """Surface points from the layers of an image file, and whether their positions are among them."""
-    path = _file(table, "file", folder, "aovs.exr")
-    to_view = _plain(f"{table.place}.to_view", table.pop("to_view"))
+    path = table.file("file", "aovs.exr")
+    to_view = table.plain("to_view")
     if to_view is not None:
-        to_view = direction_value(f"{table.place}.to_view")(to_view)
-    names = {key: _layer_name(table, key) for key in ("position", "normal")}
-    table.done(["file", "position", "normal", "to_view"])
+        to_view = direction_value(f"{table.place}.to_view", to_view)
+    names = {key: table.layer(key) for key in ("position", "normal")}
+    table.done("file", "position", "normal", "to_view")
     layers = read_layers(path)
     normal = _layer(layers, names["normal"], NORMAL_LAYERS, path)
     if normal is None:
-        remedy = 'Name the layer: normal = "..."'
-        raise InputError(path, f"has no layer of normals, got {_named(layers)}", remedy)
+        raise InputError(path, f"has no layer of normals, got {_named(layers)}", 'Name the layer: normal = "..."')
     position = _layer(layers, names["position"], POSITION_LAYERS, path)
     if to_view is None:
         to_view = _layer(layers, None, VIEW_LAYERS, path)
@@ -242,44 +240,80 @@ def _load_points(table: _Table, folder: Folder) -> tuple[SurfacePoints, bool]:
         raise error.inside(str(path)) from None
 
 
-def _layer_name(table: _Table, key: str) -> str | None:
-    name = table.pop(key)
-    if not isinstance(name, str | None):
-        raise InputError(f"{table.place}.{key}", f"must be the name of a layer, got {name!r}", "Give a name in quotes")
-    return name
-
-
 def _named(layers: dict[str, Any]) -> str:
     return ", ".join(name or "the unnamed one" for name in layers)
 
 
-def _layer(layers: dict[str, Any], name: Any, known: tuple[str, ...], path: Path) -> Any:
-    if name is not None:
-        if name not in layers:
-            raise InputError(path, f"has no layer {name!r}, got {_named(layers)}", "Correct the layer's name")
-        return layers[name]
-    return next((layers[candidate] for candidate in known if candidate in layers), None)
+def _layer(layers: dict[str, Any], name: str | None, known: tuple[str, ...], path: Path) -> Any:
+    if name is not None and name not in layers:
+        raise InputError(path, f"has no layer {name!r}, got {_named(layers)}", "Correct the layer's name")
+    candidates = known if name is None else (name,)
+    return next((layers[candidate] for candidate in candidates if candidate in layers), None)
 
 
-def inside(folder: Folder, name: str, place: str) -> Path:
-    """A file that a scene file names, which must lie within a folder.
+# -- writing -----------------------------------------------------------------------------------------------------------
+
+
+def write_parts(path: str | Path, parts: dict[str, Any]) -> None:
+    """Write a scene file; see `brdf.Scene.save`.
 
     Args:
-        folder: of the scene file.
-        name: the path as the file gives it.
-        place: where it stands, for the message.
+        path: the file.
+        parts: the arguments of `brdf.Scene`.
 
     Raises:
-        InputError: where the path leaves the folder.
+        InputError: where the file cannot be written.
     """
-    path = folder.path / name
-    try:
-        stays = path.resolve().is_relative_to(folder.within.resolve())
-    except (ValueError, OSError, RuntimeError):
-        raise InputError(place, f"is no path, got {name!r}", "Correct the path") from None
-    if not stays:
-        own = folder.within == folder.path
-        where = "the scene's folder" if own else str(folder.within)
-        remedy = "Move the file there, or allow more with within" if own else "Move the file there"
-        raise InputError(place, f"must stay within {where}, got {name!r}", remedy)
-    return path
+    path = Path(path)
+    kinds = {cls: name for name, cls in (CAMERAS | SHAPES).items()}
+    sections = []
+
+    def section(header: str, values: dict[str, Any]) -> None:
+        sections.append("\n".join([header, *(f"{key} = {_toml(value)}" for key, value in values.items())]) + "\n")
+
+    def beside(ending: str) -> tuple[str, Path]:
+        return f"{path.stem}.{ending}", path.with_name(f"{path.stem}.{ending}")
+
+    camera, points = parts["camera"], parts["points"]
+    if camera is not None:
+        section("[camera]", {"type": kinds[type(camera)]} | _fields(camera))
+    if points is not None:
+        name, file = beside("aov.exr")
+        normal = np.where(np.asarray(points.mask)[..., None], np.asarray(points.normal), 0.0)
+        layers = {"position": np.asarray(points.position), "normal": normal, "to_view": np.asarray(points.to_view)}
+        write_layers(file, layers)
+        section("[aov]", {"file": name})
+    for index, shape in enumerate(parts["shapes"]):
+        values = {"type": kinds[type(shape)]} | _fields(shape)
+        if isinstance(shape, Triangles):
+            values["file"], file = beside(f"shape{index}.obj")
+            mesh = values.pop("mesh")
+            vertices = [f"v {x!r} {y!r} {z!r}" for x, y, z in mesh.vertices.tolist()]
+            faces = [f"f {a} {b} {c}" for a, b, c in (mesh.faces + 1).tolist()]
+            write_text(file, "\n".join([*vertices, *faces]) + "\n")
+        section("[[shapes]]", values)
+    if parts["ambient"] is not None:
+        section("[ambient]", {"intensity": parts["ambient"]})
+    for index, light in enumerate(parts["lights"]):
+        values = {"type": light.type_name}
+        if isinstance(light, EnvironmentMap):
+            values["file"], file = beside(f"light{index}.exr")
+            write_image(file, np.asarray(light.pixels, np.float32))
+            values |= {"radiance": light.radiance, "samples": light.samples}
+        else:
+            values |= _fields(light)
+        if parts["visibility"] and parts["visibility"][index] is not None:
+            values["visibility"], file = beside(f"visibility{index}.exr")
+            write_image(file, np.asarray(parts["visibility"][index], np.float32)[..., None])
+        section("[[lights]]", values)
+    write_text(path, "\n".join(sections))
+
+
+def _fields(item: Any) -> dict[str, Any]:
+    values = {field.name: getattr(item, field.name) for field in dataclasses.fields(item) if field.init}
+    return {name: value for name, value in values.items() if value is not None and (name, value) != ("fitted", True)}
+
+
+def _toml(value: Any) -> str:
+    """A TOML value: what JSON and TOML write alike."""
+    return json.dumps(np.asarray(value, dtype=np.float64).tolist() if hasattr(value, "shape") else value)

@@ -9,17 +9,21 @@ and the dot product of the two directions,
 
     log cos = -1/2 log(1 + |a x b|^2 / (a . b)^2),
 
-which needs no branch, no root and no unit length, and is as accurate as its two products. Those are formed
-without rounding where it matters, in ``products``.
+which needs no branch, no root and no unit length, and is as accurate as its two products.
+
+Those are formed without rounding where it matters. A vector is split into a leading part on a grid of 2^-11, whose
+products and short sums float32 holds exactly, and a small rest (after T. J. Dekker, "A floating-point technique for
+extending the available precision", Numer. Math. 18 (1971) 224-242; the fixed grid makes it safe against fused
+multiply-adds). The leading part has no derivative, the rest has all of it, and the products are bilinear: so automatic
+differentiation gives the derivative of the plain product. In float64 there is nothing to gain, and nothing is split.
 """
 
-from typing import Any
+import operator
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
-
-from brdf import products
 
 BELOW_HORIZON = -1e9
 """What the ``*log_cosine`` functions return where the cosine is not positive: exp(n * this) = 0 for any n > 1e-7."""
@@ -34,109 +38,50 @@ Scalars = Float[Array, "*batch"]
 
 
 def dot(a: Directions, b: Directions) -> Scalars:
-    """Scalar product over the last axis.
-
-    Args:
-        a: vectors, (..., 3).
-        b: vectors, (..., 3).
-
-    Returns:
-        (...), the batch shapes broadcast.
-    """
+    """Scalar product over the last axis."""
     product = jnp.asarray(a) * jnp.asarray(b)
     return product[..., 0] + product[..., 1] + product[..., 2]  # the order is fixed, unlike that of a reduction
 
 
-def norm(v: Directions) -> Scalars:
-    """Length of vectors, without underflow or overflow; the gradient at zero is zero, not NaN.
-
-    Args:
-        v: vectors, (..., 3), any length.
-
-    Returns:
-        (...), at least 0.
-    """
-    size, unscaled, length = _scaled(v)
-    del unscaled
-    return jnp.where(size[..., 0] > 0, size[..., 0] * length[..., 0], 0.0)
-
-
 def normalize(v: Directions) -> Vectors:
-    """Unit vectors of the same direction; zero stays zero, with a zero gradient.
-
-    Args:
-        v: vectors, (..., 3), any length.
-
-    Returns:
-        (..., 3), of length 1 or 0.
-    """
-    size, unscaled, length = _scaled(v)
-    return jnp.where(size > 0, unscaled / length, 0.0)
-
-
-def _scaled(v: ArrayLike) -> tuple[Array, Array, Array]:
-    """Size (0 where the vector is zero), the vector over its size, and the length of that; safe to divide by."""
-    v = _floating(v)
+    """Unit vectors of the same direction, without underflow or overflow; zero stays zero, with a zero gradient."""
+    v = jnp.asarray(v)
+    v = v.astype(jnp.result_type(v, 1.0))
     size = jax.lax.stop_gradient(jnp.max(jnp.abs(v), axis=-1, keepdims=True))  # a mere unit: it cancels
     nonzero = size > 4 * jnp.finfo(v.dtype).tiny  # so that 1 / size is finite too
     unscaled = jnp.where(nonzero, v, 1.0) / jnp.where(nonzero, size, 1.0)
-    return jnp.where(nonzero, size, 0.0), unscaled, jnp.sqrt(dot(unscaled, unscaled))[..., None]
+    squares = unscaled * unscaled
+    length = jnp.sqrt(squares[..., 0] + squares[..., 1] + squares[..., 2])
+    return jnp.where(nonzero, unscaled / length[..., None], 0.0)
 
 
-def mirror(to_light: Directions, normal: Directions) -> Vectors:
-    """Mirror direction 2 (N.L) N - L: where a mirror would send the light.
-
-    Args:
-        to_light: unit vectors, (..., 3).
-        normal: unit vectors, (..., 3).
-
-    Returns:
-        (..., 3), unit vectors.
-    """
-    normal = jnp.asarray(normal)
-    return 2.0 * dot(normal, to_light)[..., None] * normal - jnp.asarray(to_light)
-
-
-def half_vector(to_light: Directions, to_view: Directions) -> Vectors:
-    """Half vector (L + V) / |L + V|; zero, with a zero gradient, where L = -V.
-
-    Args:
-        to_light: unit vectors, (..., 3).
-        to_view: unit vectors, (..., 3).
-
-    Returns:
-        (..., 3), unit vectors or zero.
-    """
-    return normalize(jnp.asarray(to_light) + jnp.asarray(to_view))
+def norm(v: Directions) -> Scalars:
+    """Length of vectors, without underflow or overflow; the gradient at zero is zero, not NaN."""
+    return dot(v, normalize(v))
 
 
 def divide(numerator: ArrayLike, denominator: ArrayLike) -> Array:
-    """Numerator / denominator where the denominator is positive, else 0; the gradient is finite everywhere.
-
-    Args:
-        numerator: any shape.
-        denominator: broadcasts against it. What is below 1e-18 (float32) or 1e-153 (float64) counts as zero.
-
-    Returns:
-        The quotient, 0 where the denominator is not positive.
-    """
+    """Numerator / denominator where that is positive (above 1e-18 in float32, 1e-153 in float64), else 0."""
     denominator = _floating(denominator)
     positive = denominator > _smallest(denominator.dtype)
     return jnp.where(positive, jnp.asarray(numerator) / jnp.where(positive, denominator, 1.0), 0.0)
 
 
 def square_root(x: ArrayLike) -> Array:
-    """Square root where x is positive, else 0; the gradient is finite everywhere.
-
-    Args:
-        x: any shape. What is below 1e-18 (float32) or 1e-153 (float64) counts as zero.
-
-    Returns:
-        The root, at least 0.
-    """
+    """Square root where x is positive (above 1e-18 in float32, 1e-153 in float64), else 0."""
     x = _floating(x)
     positive = x > _smallest(x.dtype)
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
+
+
+def _floating(v: ArrayLike) -> Array:
+    v = jnp.asarray(v)
+    return v.astype(jnp.result_type(v, 1.0))
+
+
+def _smallest(dtype: Any) -> float:
+    """The smallest cosine told from zero: its inverse square is finite."""
+    return 1e-18 if dtype == jnp.float32 else 1e-153
 
 
 # -- the lobe ----------------------------------------------------------------------------------------------------------
@@ -147,61 +92,29 @@ def cosine_lobe(a: Directions, b: Directions, n: Numbers) -> Scalars:
 
     In float32 within 1e-5 of its exact value for those float32 directions up to n = 1e6. At n = 0 it is 1 above the
     horizon (a.b > 0) and 0 elsewhere.
-
-    Args:
-        a: directions, (..., 3); lengths that differ from 1 by rounding do not matter.
-        b: directions, (..., 3).
-        n: exponent, at least 0, (...).
-
-    Returns:
-        (...), from 0 to 1.
     """
     return lobe(log_cosine(a, b), n)
 
 
 def lobe(log_cosine: Numbers, n: Numbers) -> Scalars:
-    """The lobe cos^n of a logarithm of the cosine, 0 where that says "below the horizon" (also at n = 0).
-
-    Args:
-        log_cosine: what one of the ``*log_cosine`` functions returned, (...).
-        n: exponent, at least 0, (...).
-
-    Returns:
-        (...), from 0 to 1.
-    """
+    """The lobe cos^n of a logarithm of the cosine, 0 where that says "below the horizon" (also at n = 0)."""
     log_cosine = jnp.asarray(log_cosine)
     above = log_cosine > 0.5 * BELOW_HORIZON
     return jnp.where(above, jnp.exp(n * jnp.where(above, log_cosine, 0.0)), 0.0)
 
 
 def log_cosine(a: Directions, b: Directions) -> Scalars:
-    """Logarithm of the cosine of the angle between two directions, accurate near the peak and near the horizon.
-
-    Args:
-        a: directions, (..., 3).
-        b: directions, (..., 3).
-
-    Returns:
-        (...), at most 0; ``BELOW_HORIZON`` where a.b <= 0.
-    """
-    a_, b_ = _split(a, b)
-    return _from_tangent(products.cross_squared(a_, b_), products.dot(a_, b_))
+    """Logarithm of the cosine of the angle between two directions, accurate near the peak and near the horizon."""
+    first, second = _split(a, b)
+    return _from_tangent(_cross_squared(first, second), _dot(first, second))
 
 
 def half_log_cosine(normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
-    """Logarithm of N.H, of normal and half vector; never forms the half vector, which float32 would round too coarsely.
-
-    Args:
-        normal: unit vectors, (..., 3).
-        to_light: unit vectors, (..., 3).
-        to_view: unit vectors, (..., 3).
-
-    Returns:
-        (...), at most 0; ``BELOW_HORIZON`` where N.H <= 0 or L = -V.
-    """
-    normal_, light, view = _split(normal, to_light, to_view)
-    total, _ = products.sum_and_difference(light, view)
-    return _from_tangent(products.cross_squared(normal_, total), products.dot(normal_, total))
+    """Logarithm of N.H, of normal and half vector, which is never formed: float32 would round it too coarsely."""
+    axis, light, view = _split(normal, to_light, to_view)
+    total, difference = _combined(operator.add, light, view), _combined(operator.sub, light, view)
+    total = _shortened(total, difference, 0.25 * _dot(difference, total))
+    return _from_tangent(_cross_squared(axis, total), _dot(axis, total))
 
 
 def mirror_log_cosine(normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
@@ -209,71 +122,110 @@ def mirror_log_cosine(normal: Directions, to_light: Directions, to_view: Directi
 
     With s = L + V and d = L - V the distance to the peak is |R - V|^2 = |N x s|^2 + (N.d)^2, and
     log(R.V) = -log(1 + |R - V|^2 / (2 R.V)).
-
-    Args:
-        normal: unit vectors, (..., 3).
-        to_light: unit vectors, (..., 3).
-        to_view: unit vectors, (..., 3).
-
-    Returns:
-        (...), at most 0; ``BELOW_HORIZON`` where R.V <= 0.
     """
-    normal_, light, view = _split(normal, to_light, to_view)
-    total, difference = products.sum_and_difference(light, view)
-    along_total, along_difference = products.dot(normal_, total), products.dot(normal_, difference)
-    distance = products.cross_squared(normal_, total) + along_difference * along_difference
+    axis, light, view = _split(normal, to_light, to_view)
+    total, difference = _combined(operator.add, light, view), _combined(operator.sub, light, view)
+    excess = 0.25 * _dot(difference, total)
+    total, difference = _shortened(total, difference, excess), _shortened(difference, total, excess)
+    along_total, along_difference = _dot(axis, total), _dot(axis, difference)
+    distance = _cross_squared(axis, total) + along_difference * along_difference
     # R.V |N|^2 = 2 (N.L)(N.V) - (L.V) |N|^2, where 4 (N.L)(N.V) = (N.s)^2 - (N.d)^2
     twice_product = 0.5 * (along_total - along_difference) * (along_total + along_difference)
-    cosine = twice_product - products.dot(light, view) * products.dot(normal_, normal_)
-    above = jnp.maximum(cosine, _smallest(cosine.dtype))
-    return jnp.where(cosine > 0, -_log1p_ratio(0.5 * distance, above), BELOW_HORIZON)
+    cosine = twice_product - _dot(light, view) * _dot(axis, axis)
+    # (1 + distance / (2 cos))^2 = 1 + (distance cos + distance^2 / 4) / cos^2
+    return _from_tangent(distance * (cosine + 0.25 * distance), cosine)
 
 
 def log_cosine_of(cosine: Numbers, sine: Numbers) -> Scalars:
-    """Logarithm of the cosine of an angle whose cosine and sine are known, accurate also where the cosine is nearly 1.
-
-    Args:
-        cosine: (...).
-        sine: (...).
-
-    Returns:
-        (...), at most 0; ``BELOW_HORIZON`` where the cosine is not positive.
-    """
+    """Logarithm of the cosine of an angle whose cosine and sine are known, accurate also where that is nearly 1."""
     sine = _floating(sine)
     return _from_tangent(sine * sine, _floating(cosine))
 
 
-def _from_tangent(cross_squared: Scalars, along: Scalars) -> Scalars:
-    above = jnp.maximum(along, _smallest(along.dtype))
-    return jnp.where(along > 0, -0.5 * _log1p_ratio(cross_squared, above * above), BELOW_HORIZON)
-
-
 @jax.custom_jvp
-def _log1p_ratio(p: Array, q: Array) -> Array:
-    """log(1 + p / q) for p >= 0, q > 0."""
-    return jnp.log1p(p / q)
+def _from_tangent(p: Array, q: Array) -> Array:
+    """-1/2 log(1 + p / q^2) for p >= 0, ``BELOW_HORIZON`` where q <= 0."""
+    above = jnp.maximum(q, _smallest(q.dtype))
+    return jnp.where(q > 0, -0.5 * jnp.log1p(jnp.where(q > 0, p, 0.0) / (above * above)), BELOW_HORIZON)
 
 
-@_log1p_ratio.defjvp
-def _log1p_ratio_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
-    # by hand, because the chain rule through p / q squares q and underflows in float32 near the horizon
+@_from_tangent.defjvp
+def _from_tangent_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    # by hand, because the chain rule through p / q^2 squares that and underflows in float32 near the horizon
     (p, q), (dp, dq) = primals, tangents
-    # p + q = |L + V|^2 vanishes where L = -V; the floor keeps n times its inverse, and that over N.L, finite there
-    ratio, inverse = p / q, 1.0 / jnp.maximum(p + q, 1e-12 if q.dtype == jnp.float32 else 1e-100)
-    return jnp.log1p(ratio), (dp - ratio * dq) * inverse
+    above = jnp.where(q > 0, jnp.maximum(q, _smallest(q.dtype)), 1.0)
+    p = jnp.where(q > 0, p, 0.0)
+    # p + q^2 = |L + V|^2 vanishes where L = -V; the floor keeps n times its inverse, and that over N.L, finite there
+    sum_of_squares = jnp.maximum(p + above * above, 1e-12 if q.dtype == jnp.float32 else 1e-100)
+    slope = (p / above * dq - 0.5 * dp) / sum_of_squares
+    return _from_tangent(*primals), jnp.where(q > 0, slope, 0.0)
 
 
-def _split(*vectors: ArrayLike) -> list[products.Split]:
-    """The vectors in one common floating-point type, split for ``products``."""
-    dtype = jnp.result_type(*(_floating(v) for v in vectors))
-    return [products.split(_floating(v).astype(dtype)) for v in vectors]
+# -- products that float32 does not round ------------------------------------------------------------------------------
+
+# Components are kept apart here: a compiler that sees (..., 3) arrays stacked again computes each of them three times.
+_Components = tuple[Array, ...]
+
+_GRID = 2048.0  # products of two leading parts are multiples of 2^-22, so sums of a few stay below 2^24 steps
 
 
-def _floating(v: ArrayLike) -> Array:
-    v = jnp.asarray(v)
-    return v if jnp.issubdtype(v.dtype, jnp.floating) else v.astype(jnp.result_type(float))
+class _Split(NamedTuple):
+    """A vector as an exact sum of a leading part on a coarse grid and a rest; in float64 the leading part is all."""
+
+    value: _Components
+    high: _Components
+    low: _Components | None
 
 
-def _smallest(dtype: Any) -> float:
-    """The smallest cosine told from zero: its inverse square is finite."""
-    return 1e-18 if jnp.finfo(dtype).bits <= 32 else 1e-153
+def _split(*vectors: ArrayLike) -> list[_Split]:
+    """The parts of vectors whose components lie within +-1, in one common floating-point type."""
+    arrays, parts = list(map(jnp.asarray, vectors)), []
+    dtype = jnp.result_type(*arrays, 1.0)
+    for array in arrays:
+        value = jnp.unstack(array.astype(dtype), axis=-1)
+        if dtype != jnp.float32:
+            parts.append(_Split(value, value, None))
+            continue
+        high = tuple(map(jnp.round, map(operator.mul, value, (_GRID,) * 3)))  # no derivative: the rest carries it
+        high = tuple(map(operator.mul, high, (1.0 / _GRID,) * 3))
+        parts.append(_Split(value, high, tuple(map(operator.sub, value, high))))
+    return parts
+
+
+def _dot(a: _Split, b: _Split) -> Array:
+    """Scalar product of vectors whose components lie within +-2."""
+    (ax, ay, az), (bx, by, bz) = a.high, b.high
+    product = ax * bx + ay * by + az * bz
+    if a.low is None or b.low is None:
+        return product
+    (cx, cy, cz), (dx, dy, dz), (vx, vy, vz) = a.low, b.low, b.value
+    return product + ((ax * dx + ay * dy + az * dz) + (cx * vx + cy * vy + cz * vz))
+
+
+def _cross_squared(a: _Split, b: _Split) -> Array:
+    """Squared length of the cross product of vectors whose components lie within +-2."""
+    (ax, ay, az), (bx, by, bz) = a.high, b.high
+    x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    if a.low is not None and b.low is not None:
+        (cx, cy, cz), (dx, dy, dz), (vx, vy, vz) = a.low, b.low, b.value
+        x = x + ((ay * dz - az * dy) + (cy * vz - cz * vy))
+        y = y + ((az * dx - ax * dz) + (cz * vx - cx * vz))
+        z = z + ((ax * dy - ay * dx) + (cx * vy - cy * vx))
+    return x * x + y * y + z * z
+
+
+def _combined(operation: Any, a: _Split, b: _Split) -> _Split:
+    """Sum or difference."""
+    low = None if a.low is None or b.low is None else tuple(map(operation, a.low, b.low))
+    return _Split(tuple(map(operation, a.value, b.value)), tuple(map(operation, a.high, b.high)), low)
+
+
+def _shortened(a: _Split, b: _Split, excess: Array) -> _Split:
+    """The vector a - excess b.
+
+    With a and b sum and difference of two unit vectors, and the excess (|L|^2 - |V|^2) / 4 = (a . b) / 4, it is the sum
+    or difference after giving L and V one length: rounding makes those differ by 1e-7.
+    """
+    less = tuple(map(operator.mul, b.value, (excess,) * 3))
+    value = tuple(map(operator.sub, a.value, less))
+    return _Split(value, value, None) if a.low is None else _Split(value, a.high, tuple(map(operator.sub, a.low, less)))

@@ -1,14 +1,13 @@
-"""Shapes, and where a ray hits them: the camera and the shadows share it.
-
-Each shape answers for one ray; batching is ``jax.vmap`` outside.
-"""
+"""What a shape is: where a ray hits it, for camera and shadows alike. For one ray; batching is ``jax.vmap`` outside."""
 
 import abc
 from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
+
+from brdf.checks import Scalar, Vector
 
 
 class Hit(NamedTuple):
@@ -22,9 +21,9 @@ class Hit(NamedTuple):
     """
 
     hit: Bool[Array, ""]
-    distance: Float[Array, ""]
-    position: Float[Array, "3"]
-    normal: Float[Array, "3"]
+    distance: Scalar
+    position: Vector
+    normal: Vector
 
 
 class Shape(eqx.Module):
@@ -42,39 +41,24 @@ class Shape(eqx.Module):
         return True
 
     @abc.abstractmethod
-    def extent(self) -> Float[Array, ""]:
+    def extent(self) -> Scalar:
         """A length of the order of the shape: rounding moves its surface by some 1e-7 of this and its position."""
 
     @abc.abstractmethod
-    def intersect(self, origin: Float[Array, "3"], direction: Float[Array, "3"]) -> Hit:
-        """The nearest hit in front of ``origin``.
+    def intersect(self, origin: Vector, direction: Vector) -> Hit:
+        """The nearest hit in front of ``origin``."""
 
-        Args:
-            origin: where the ray starts, (3,).
-            direction: its unit direction, (3,).
-        """
-
-    def cover(
-        self, origin: Float[Array, "3"], direction: Float[Array, "3"], distance: Float[Array, ""], radius: Array | None
-    ) -> Float[Array, ""]:
-        """The share of a patch of light that the shape hides, 0 or 1 where it cannot tell more.
-
-        Args:
-            origin: the point that the light falls on, (3,).
-            direction: towards the middle of the patch, unit, (3,).
-            distance: of the patch.
-            radius: angular radius of the patch; None for a point.
-        """
+    def cover(self, origin: Vector, direction: Vector, distance: Scalar) -> Scalar:
+        """1 where the shape hides a point of light, else 0."""
         hit = self.intersect(origin, direction)
         return jnp.where(hit.hit & (hit.distance < distance), 1.0, 0.0)
 
+    def cover_patch(self, origin: Vector, direction: Vector, distance: Scalar, radius: Array) -> Scalar:
+        """The share of a patch of light that the shape hides; of its middle, where the shape cannot tell more."""
+        return self.cover(origin, direction, distance)
 
-def share_beyond(sine: Float[Array, ""], radius: Float[Array, ""]) -> Float[Array, ""]:
-    """The share of a patch of light beyond an edge, of a parabola 3/4 (1 - x²) with the variance of a disc.
 
-    Args:
-        sine: of the angle by which the patch's middle is beyond the edge.
-        radius: angular radius of the patch; below a millionth of a radian it counts as that.
-    """
+def share_beyond(sine: Scalar, radius: Scalar) -> Scalar:
+    """The share of a patch of light beyond an edge, of a parabola 3/4 (1 - x²) with the variance of a disc."""
     x = jnp.clip(sine / (1.118 * jnp.maximum(radius, 1e-6)), -1.0, 1.0)  # √5/2
     return 0.5 + x * (0.75 - 0.25 * x * x)

@@ -1,10 +1,9 @@
 """The sphere."""
 
-import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
-from brdf.checks import positive, vector
+from brdf.checks import Scalar, Vector, checked, positive, vector
 from brdf.geometry.base import Hit, Shape, share_beyond
 from brdf.vectors import divide, dot, norm, normalize, square_root
 
@@ -21,14 +20,14 @@ class Sphere(Shape):
         InputError: where a value is not finite or the radius is not positive.
     """
 
-    center: Float[Array, "3"] = eqx.field(converter=vector("center"))
-    radius: Float[Array, ""] = eqx.field(converter=positive("radius"))
+    center: Vector = checked(vector, "center")
+    radius: Scalar = checked(positive, "radius")
 
-    def extent(self) -> Float[Array, ""]:
+    def extent(self) -> Scalar:
         """The radius."""
         return jnp.asarray(self.radius)
 
-    def intersect(self, origin: Float[Array, "3"], direction: Float[Array, "3"]) -> Hit:
+    def intersect(self, origin: Vector, direction: Vector) -> Hit:
         """The nearest hit in front of ``origin``.
 
         The half chord comes from the distance of the ray to the centre, not from the quadratic's discriminant, which
@@ -38,20 +37,15 @@ class Sphere(Shape):
         along = dot(to_origin, direction)
         nearest = to_origin - along * direction
         squared_half_chord = self.radius * self.radius - dot(nearest, nearest)
-        crosses = squared_half_chord > 0
         half_chord = square_root(squared_half_chord)
         outside = -along - half_chord > 0
         signed = jnp.where(outside, -half_chord, half_chord)
-        hit = crosses & (signed - along > 0)
+        hit = (squared_half_chord > 0) & (signed - along > 0)
         normal = normalize(nearest + signed * direction)
         return Hit(hit, jnp.where(hit, signed - along, jnp.inf), self.center + self.radius * normal, normal)
 
-    def cover(
-        self, origin: Float[Array, "3"], direction: Float[Array, "3"], distance: Float[Array, ""], radius: Array | None
-    ) -> Float[Array, ""]:
-        """The share of the patch within the cone that the sphere fills; see `Shape.cover`."""
-        if radius is None:
-            return super().cover(origin, direction, distance, radius)
+    def cover_patch(self, origin: Vector, direction: Vector, distance: Scalar, radius: Array) -> Scalar:
+        """The share of the patch within the cone that the sphere fills; see `Shape.cover_patch`."""
         to_center = jnp.asarray(self.center - origin)
         along = dot(to_center, direction)
         miss = norm(to_center - along * direction)

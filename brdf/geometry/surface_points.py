@@ -1,13 +1,19 @@
 """What the pixels of a picture see."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from brdf.checks import direction_value
 from brdf.errors import InputError
+
+NO_SHAPE = -1
+"""The index of what is no shape: the background, or points that come from elsewhere."""
 
 
 class PixelArea(eqx.Module):
@@ -36,8 +42,7 @@ class SurfacePoints(eqx.Module):
         mask: (...), whether the pixel sees a fitted surface; elsewhere the other values are finite and mean nothing.
             Where a pixel is averaged over its area, whether all of it does.
         shape: (...), index of the shape that each pixel sees; None where the points come from elsewhere.
-        visibility: for each light, how much of it each point sees, (...), 0 to 1; None for a light of which nothing is
-            given, and in place of all where nothing is given.
+        visibility: for each of L lights, how much of it each point sees, (..., L), 0 to 1; None where nothing is given.
         area: the pixels that are averaged over their area; None where every pixel's centre stands for it.
     """
 
@@ -46,17 +51,22 @@ class SurfacePoints(eqx.Module):
     to_view: Float[Array, "*pixels 3"]
     mask: Bool[Array, "*pixels"]
     shape: Int[Array, "*pixels"] | None = None
-    visibility: tuple[Float[Array, "*pixels"] | None, ...] | None = None
+    visibility: Float[Array, "*pixels L"] | None = None
     area: PixelArea | None = None
+
+    @property
+    def met(self) -> Int[Array, "*pixels"]:
+        """Index of the shape that each pixel sees, `NO_SHAPE` for none; where one shape is all there is, that is 0."""
+        return jnp.where(self.mask, 0, NO_SHAPE) if self.shape is None else self.shape
+
+    def flat(self) -> "SurfacePoints":
+        """The points of a picture as one row, (H W,), without their areas."""
+        centres = dataclasses.replace(self, area=None)
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf).reshape(-1, *leaf.shape[self.mask.ndim :]), centres)
 
     @classmethod
     def from_normals(
-        cls,
-        normal: Any,
-        *,
-        position: Any = None,
-        mask: Any = None,
-        to_view: Any = (0.0, 0.0, 1.0),
+        cls, normal: Any, *, position: Any = None, mask: Any = None, to_view: Any = (0.0, 0.0, 1.0)
     ) -> "SurfacePoints":
         """Surface points from a normal map, as a scanner, a renderer or photometric stereo gives it.
 
@@ -74,12 +84,10 @@ class SurfacePoints(eqx.Module):
             raise InputError("normal", f"must be of shape (H, W, 3), got {normal.shape}", "Give a normal map")
         length = np.sqrt(np.sum(normal * normal, axis=-1))
         seen = np.isfinite(length) & (length > 0)
-        if position is None:
-            position = np.zeros(normal.shape)
-        position = np.asarray(position, dtype=np.float64)
+        position = np.asarray(np.zeros(normal.shape) if position is None else position, dtype=np.float64)
         to_view = np.asarray(to_view, dtype=np.float64)
         if to_view.shape == (3,):
-            to_view = np.broadcast_to(direction_value("to_view")(to_view), normal.shape)
+            to_view = np.broadcast_to(direction_value("to_view", to_view), normal.shape)
         for name, value in (("position", position), ("to_view", to_view)):
             if value.shape != normal.shape:
                 raise InputError(name, f"must be of shape {normal.shape}, got {value.shape}", "Give a value per pixel")

@@ -18,9 +18,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Int
 
-from brdf.checks import LARGEST
+from brdf.checks import LARGEST, Scalar, Vector
 from brdf.errors import InputError
 from brdf.files import read_text
 from brdf.geometry.base import Hit, Shape
@@ -71,24 +71,20 @@ class Mesh:
         """Whether the content is the same."""
         return isinstance(other, Mesh) and self._digest == other._digest
 
-    @property
-    def extent(self) -> float:
-        """The largest absolute coordinate."""
-        return float(np.max(np.abs(self.vertices)))
-
     @functools.cached_property
     def _tree(self) -> Any:
         return _trimesh().Trimesh(self.vertices, self.faces, process=False)
 
-    def first_hit(self, origins: np.ndarray, directions: np.ndarray) -> Int[np.ndarray, " R"]:
+    def first_hit(self, origins: Any, directions: Any) -> Int[np.ndarray, "..."]:
         """The first triangle that each ray meets, -1 for none.
 
         Args:
-            origins: (R, 3).
-            directions: (R, 3).
+            origins: (..., 3).
+            directions: (..., 3).
         """
-        found = self._tree.ray.intersects_first(origins, directions)
-        return np.asarray(found, np.int32)
+        rays = (np.asarray(vectors, np.float64).reshape(-1, 3) for vectors in (origins, directions))
+        found = np.asarray(self._tree.ray.intersects_first(*rays), np.int32)
+        return found.reshape(np.shape(origins)[:-1])
 
 
 def _trimesh() -> Any:
@@ -143,23 +139,18 @@ class Triangles(Shape):
         """A mesh may cast shadows on itself."""
         return False
 
-    def extent(self) -> Float[Array, ""]:
+    def extent(self) -> Scalar:
         """The largest absolute coordinate."""
-        return jnp.asarray(self.mesh.extent)
+        return jnp.asarray(float(np.max(np.abs(self.mesh.vertices))))
 
-    def intersect(self, origin: Float[Array, "3"], direction: Float[Array, "3"]) -> Hit:
+    def intersect(self, origin: Vector, direction: Vector) -> Hit:
         """The nearest hit in front of ``origin``, from either side; the normal is that of the front side."""
         rays = (jax.lax.stop_gradient(jnp.asarray(origin)), jax.lax.stop_gradient(jnp.asarray(direction)))
         shape = jax.ShapeDtypeStruct((), np.int32)
-        triangle = jax.pure_callback(self._first_hit, shape, *rays, vmap_method="broadcast_all")
+        triangle = jax.pure_callback(self.mesh.first_hit, shape, *rays, vmap_method="broadcast_all")
         corners = jnp.asarray(self.mesh.vertices, rays[0].dtype)[jnp.asarray(self.mesh.faces)[triangle]]
         normal = normalize(jnp.cross(corners[1] - corners[0], corners[2] - corners[0]))
         slope = dot(direction, normal)
         distance = divide(dot(corners[0] - origin, normal) * slope, slope * slope)
         hit = (triangle >= 0) & (distance > 0)
         return Hit(hit, jnp.where(hit, distance, jnp.inf), origin + distance * direction, normal)
-
-    def _first_hit(self, origins: Any, directions: Any) -> Int[np.ndarray, "..."]:
-        batch = np.shape(origins)[:-1]
-        rays = (np.asarray(rays, np.float64).reshape(-1, 3) for rays in (origins, directions))
-        return self.mesh.first_hit(*rays).reshape(batch)

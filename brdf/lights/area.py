@@ -22,15 +22,29 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from brdf.checks import direction_value, positive, sample_number, spectrum, vector, vertex_list
+from brdf.checks import (
+    Scalar,
+    Spectrum,
+    Vector,
+    checked,
+    direction_value,
+    positive,
+    sample_number,
+    spans_area,
+    spectrum,
+    vector,
+    vertex_list,
+)
 from brdf.errors import InputError
-from brdf.geometry.rectangle import check_spans_area
-from brdf.lights.punctual import Light, LightSample, Place
+from brdf.geometry.surface_points import SurfacePoints
+from brdf.lights.base import Light, LightSample, repeated
 from brdf.lights.sample_sets import disc_rule, square_rule
-from brdf.lights.triangulation import newell_normal, triangulate
 from brdf.vectors import divide, dot, norm, normalize, square_root
 
 SAMPLES = 64
+
+FLAT = 1e-6
+"""How far a vertex may lie off the plane, as a share of the polygon's size: what six digits in a file leave."""
 
 
 def _positive_range(at_0: Array, at_1: Array) -> tuple[Array, Array]:
@@ -42,40 +56,38 @@ def _positive_range(at_0: Array, at_1: Array) -> tuple[Array, Array]:
     return low, high
 
 
-class _Strip:
-    """A patch whose points are a(t) + s b(t), with a and b linear in t: a parallelogram or a triangle.
+def _above_horizon(
+    point: SurfacePoints, starts: tuple[Array, Array], edges: tuple[Array, Array], node: tuple[Array, Array]
+) -> tuple[Array, Array, Array]:
+    """The place of a node (s, t) of the unit square in that part of a patch which stands above the horizon.
 
-    A parallelogram has the ends of a at two corners and b constant, a triangle a at one corner and b turning.
+    The points of the patch are a(t) + s b(t), with a and b linear in t and given at t = 0 and t = 1: a parallelogram
+    has a constant b, a triangle a constant a. Returned are s, the point, and the share of the weight that is left.
     """
-
-    def __init__(self, start: tuple[Array, Array], edge: tuple[Array, Array]):
-        self.start, self.edge = start, edge
-
-    def above(self, node: Any, position: Array, normal: Array) -> tuple[Array, Array, Array]:
-        """The node's place in the part above the horizon: s, the point, and the share of the weight that is left."""
-        heights = [dot(a - position, normal) for a in self.start]
-        slopes = [dot(b, normal) for b in self.edge]
-        ends = [_positive_range(heights[0], heights[1])]
-        ends.append(_positive_range(heights[0] + slopes[0], heights[1] + slopes[1]))
-        empty = [high <= low for low, high in ends]
-        low = jnp.minimum(*(jnp.where(none, 1.0, low) for none, (low, _) in zip(empty, ends, strict=True)))
-        high = jnp.maximum(*(jnp.where(none, 0.0, high) for none, (_, high) in zip(empty, ends, strict=True)))
-        width = jnp.maximum(high - low, 0.0)
-        t = low + node.t * width
-        height, slope = (first + t * (second - first) for first, second in (heights, slopes))
-        bottom, top = _positive_range(height, height + slope)
-        s = bottom + node.s * (top - bottom)
-        start, edge = (first + t * (second - first) for first, second in (self.start, self.edge))
-        return s, start + s * edge, width * (top - bottom)
+    heights = [dot(a - point.position, point.normal) for a in starts]
+    slopes = [dot(b, point.normal) for b in edges]
+    (low, high), (other_low, other_high) = (
+        _positive_range(heights[0], heights[1]),
+        _positive_range(heights[0] + slopes[0], heights[1] + slopes[1]),
+    )
+    # a side that is wholly below the horizon has no say
+    lowest = jnp.minimum(jnp.where(high <= low, 1.0, low), jnp.where(other_high <= other_low, 1.0, other_low))
+    highest = jnp.maximum(jnp.where(high <= low, 0.0, high), jnp.where(other_high <= other_low, 0.0, other_high))
+    width = jnp.maximum(highest - lowest, 0.0)
+    t = lowest + node[1] * width
+    height, slope = (first + t * (second - first) for first, second in (heights, slopes))
+    bottom, top = _positive_range(height, height + slope)
+    s = bottom + node[0] * (top - bottom)
+    start, edge = (first + t * (second - first) for first, second in (starts, edges))
+    return s, start + s * edge, width * (top - bottom)
 
 
-def _from_patch(radiance: Array, point: Array, area: Array, light_normal: Array, position: Array) -> LightSample:
+def _from_patch(radiance: Array, patch: Array, area: Array, light_normal: Array, position: Array) -> LightSample:
     """The sample of a patch of a flat light that shines along ``light_normal``."""
-    offset = point - position
-    squared = dot(offset, offset)
+    offset = patch - position
     to_light = normalize(offset)
     facing = jnp.maximum(-dot(to_light, light_normal), 0.0)
-    squared_radius = divide(area * facing, np.pi * squared)
+    squared_radius = divide(area * facing, np.pi * dot(offset, offset))
     return LightSample(to_light, radiance * squared_radius, norm(offset), square_root(squared_radius))
 
 
@@ -93,31 +105,32 @@ class RectangleLight(Light):
         InputError: where a value is not finite, the edges are parallel or a radiance is negative.
     """
 
-    center: Float[Array, "3"] = eqx.field(converter=vector("center"))
-    edge_u: Float[Array, "3"] = eqx.field(converter=direction_value("edge_u"))
-    edge_v: Float[Array, "3"] = eqx.field(converter=direction_value("edge_v"))
-    radiance: Float[Array, " C"] = eqx.field(converter=spectrum("radiance"))
+    center: Vector = checked(vector, "center")
+    edge_u: Vector = checked(direction_value, "edge_u")
+    edge_v: Vector = checked(direction_value, "edge_v")
+    radiance: Spectrum = checked(spectrum, "radiance")
     samples: int = eqx.field(static=True, converter=sample_number, default=SAMPLES)
     type_name: ClassVar[str] = "rectangle"
-    emittance_name: ClassVar[str] = "radiance"
 
     def __check_init__(self):
         """Refuse edges that span no area."""
-        check_spans_area(self.edge_u, self.edge_v)
+        spans_area(self.edge_u, self.edge_v)
 
-    def nodes(self) -> Any:
-        """A product rule over the unit square."""
-        return square_rule(self.samples)
+    def rows(self) -> tuple[Any, ...]:
+        """The light, and a product rule over the unit square."""
+        rule = square_rule(self.samples)
+        return *repeated(rule.weight.size, self.center, self.edge_u, self.edge_v, self.radiance), *rule
 
-    def illuminate(self, node: Any, at: Place) -> LightSample:
+    @staticmethod
+    def sample(point: SurfacePoints, *row: Any) -> LightSample:
         """From a patch of the light above the horizon."""
-        edge_u, edge_v = jnp.asarray(self.edge_u), jnp.asarray(self.edge_v)
-        corner = self.center - edge_u - edge_v
-        strip = _Strip((corner, corner + 2 * edge_v), (2 * edge_u, 2 * edge_u))
-        _, point, share = strip.above(node, at.position, at.normal)
+        center, edge_u, edge_v, radiance, s, t, weight = row
+        corner = center - edge_u - edge_v
+        starts, edges = (corner, corner + 2 * edge_v), (2 * edge_u, 2 * edge_u)
+        _, patch, share = _above_horizon(point, starts, edges, (s, t))
         area_vector = jnp.cross(edge_u, edge_v)
-        area = 4 * norm(area_vector) * node.weight * share
-        return _from_patch(self.radiance, point, area, normalize(area_vector), at.position)
+        area = 4 * norm(area_vector) * weight * share
+        return _from_patch(radiance, patch, area, normalize(area_vector), point.position)
 
 
 class PolygonLight(Light):
@@ -133,37 +146,78 @@ class PolygonLight(Light):
             is negative.
     """
 
-    vertices: Float[Array, "V 3"] = eqx.field(converter=vertex_list("vertices"))
-    radiance: Float[Array, " C"] = eqx.field(converter=spectrum("radiance"))
+    vertices: Float[Array, "V 3"] = checked(vertex_list, "vertices")
+    radiance: Spectrum = checked(spectrum, "radiance")
     samples: int = eqx.field(static=True, converter=sample_number, default=SAMPLES)
     triangles: tuple[tuple[int, int, int], ...] = eqx.field(static=True, init=False)
     type_name: ClassVar[str] = "polygon"
-    emittance_name: ClassVar[str] = "radiance"
 
     def __post_init__(self):
         """Cut it into triangles, once."""
-        self.vertices = vertex_list("vertices")(self.vertices)  # a field's converter would run after this
+        self.vertices = vertex_list("vertices", self.vertices)  # a field's converter would run after this
         self.samples = sample_number(self.samples)
         self.triangles = triangulate(self.vertices)
         if self.samples < len(self.triangles):
             came = f"must be at least {len(self.triangles)} for {len(self.vertices)} vertices, got {self.samples}"
             raise InputError("samples", came, "Give one sample for each triangle at least")
 
-    def nodes(self) -> Any:
-        """Which triangle, and a product rule over the unit square of each."""
-        rule = square_rule(self.samples // len(self.triangles))
-        corners = np.repeat(np.array(self.triangles), len(rule.weight), axis=0)
-        tiled = [np.tile(values, len(self.triangles)) for values in rule]
-        return jnp.asarray(self.vertices)[corners], type(rule)(*tiled)
+    def rows(self) -> tuple[Any, ...]:
+        """The corners of each triangle, and a product rule over the unit square of each."""
+        rule, count = square_rule(self.samples // len(self.triangles)), len(self.triangles)
+        corners = self.vertices[np.repeat(np.array(self.triangles), rule.weight.size, axis=0)]
+        tiled = [np.tile(values, count) for values in rule]
+        return corners, *repeated(len(corners), _newell_normal(self.vertices), self.radiance), *tiled
 
-    def illuminate(self, node: Any, at: Place) -> LightSample:
+    @staticmethod
+    def sample(point: SurfacePoints, *row: Any) -> LightSample:
         """From a patch of one triangle above the horizon."""
-        (a, b, c), rule = node
-        strip = _Strip((a, a), (b - a, c - a))
-        s, point, share = strip.above(rule, at.position, at.normal)
-        double_area = norm(jnp.cross(b - a, c - a))
-        axis = normalize(newell_normal(jnp.asarray(self.vertices)))
-        return _from_patch(self.radiance, point, double_area * s * rule.weight * share, axis, at.position)
+        (a, b, c), area_vector, radiance, s, t, weight = row
+        place, patch, share = _above_horizon(point, (a, a), (b - a, c - a), (s, t))
+        area = norm(jnp.cross(b - a, c - a)) * place * weight * share
+        return _from_patch(radiance, patch, area, normalize(area_vector), point.position)
+
+
+def _newell_normal(vertices: Any) -> Any:
+    """Twice the polygon's area times its normal, about which the vertices, (V, 3), run counter-clockwise.
+
+    Source: I. E. Sutherland, R. F. Sproull and R. A. Schumacker, ACM Computing Surveys 6 (1974), after M. Newell.
+    """
+    xp = np if isinstance(vertices, np.ndarray) else jnp
+    relative = vertices - vertices[0]
+    return xp.sum(xp.cross(relative, xp.roll(relative, -1, axis=0)), axis=0)
+
+
+def triangulate(vertices: Any) -> tuple[tuple[int, int, int], ...]:
+    """Cut off ears until a triangle is left (G. H. Meisters, 1975); a fan where JAX is tracing the vertices."""
+    if not isinstance(vertices, np.ndarray):
+        return tuple((0, last - 1, last) for last in range(2, vertices.shape[0]))
+    size = float(np.max(np.abs(vertices - vertices.mean(axis=0))))
+    area_vector = _newell_normal(vertices)
+    double_area = float(np.linalg.norm(area_vector))
+    if double_area <= 1e-12 * size * size:
+        raise InputError("vertices", "span no area", "Give the corners of a polygon in order")
+    normal, relative = area_vector / double_area, vertices - vertices[0]
+    if np.max(np.abs(relative @ normal)) > FLAT * size:
+        raise InputError("vertices", "do not lie in one plane", "Cut the light into flat polygons")
+    left, triangles = list(range(len(vertices))), []
+
+    def turn(a: int, b: int, c: int) -> float:
+        """Twice the area of the triangle a b c, positive where it turns left."""
+        return float(normal @ np.cross(vertices[b] - vertices[a], vertices[c] - vertices[a]))
+
+    def is_ear(a: int, b: int, c: int) -> bool:
+        others = [d for d in left if d not in (a, b, c)]
+        return turn(a, b, c) >= 0 and not any(min(turn(a, b, d), turn(b, c, d), turn(c, a, d)) > 0 for d in others)
+
+    while len(left) > 3:
+        corners = [(left[i - 1], left[i], left[(i + 1) % len(left)]) for i in range(len(left))]
+        ear = next((corner for corner in corners if is_ear(*corner)), None)
+        if ear is None:
+            raise InputError("vertices", "cross each other's edges", "Give the corners of a simple polygon in order")
+        if turn(*ear) > 0:
+            triangles.append(ear)
+        left.remove(ear[1])
+    return (*triangles, (left[0], left[1], left[2]))
 
 
 class SphereLight(Light):
@@ -179,41 +233,39 @@ class SphereLight(Light):
         InputError: where a value is not finite, the radius is not positive or a radiance is negative.
     """
 
-    center: Float[Array, "3"] = eqx.field(converter=vector("center"))
-    radius: Float[Array, ""] = eqx.field(converter=positive("radius"))
-    radiance: Float[Array, " C"] = eqx.field(converter=spectrum("radiance"))
+    center: Vector = checked(vector, "center")
+    radius: Scalar = checked(positive, "radius")
+    radiance: Spectrum = checked(spectrum, "radiance")
     samples: int = eqx.field(static=True, converter=sample_number, default=SAMPLES)
     type_name: ClassVar[str] = "sphere"
-    emittance_name: ClassVar[str] = "radiance"
 
-    def nodes(self) -> Any:
-        """A rule over the cap of directions in which a point sees the sphere."""
-        return disc_rule(self.samples)
+    def rows(self) -> tuple[Any, ...]:
+        """The light, and a rule over the cap of directions in which a point sees it."""
+        rule = disc_rule(self.samples)
+        return *repeated(rule.weight.size, self.center, self.radius, self.radiance), *rule
 
-    def illuminate(self, node: Any, at: Place) -> LightSample:
+    @staticmethod
+    def sample(point: SurfacePoints, *row: Any) -> LightSample:
         """From a patch of the cap of directions, above the horizon."""
-        offset = self.center - at.position
+        center, radius, radiance, s, t, weight = row
+        offset = center - point.position
         distance = norm(offset)
         axis = normalize(offset)
-        squared_sine = jnp.minimum(divide(self.radius * self.radius, distance * distance), 1.0)
+        squared_sine = jnp.minimum(divide(radius * radius, distance * distance), 1.0)
         height = divide(squared_sine, 1.0 + square_root(1.0 - squared_sine))  # 1 - cos, without cancellation
         across, along = perpendicular(axis)
-        turn = 2 * np.pi * node.t
-        outward = jnp.cos(turn) * across + jnp.sin(turn) * along
-        low, high = _above_horizon(dot(axis, at.normal), dot(outward, at.normal), height)
-        share = low + node.s * (high - low)
-        below_axis = share * height  # 1 - cos of the angle to the axis
+        outward = jnp.cos(2 * np.pi * t) * across + jnp.sin(2 * np.pi * t) * along
+        low, high = _arc_above_horizon(dot(axis, point.normal), dot(outward, point.normal), height)
+        below_axis = (low + s * (high - low)) * height  # 1 - cos of the angle to the axis
         to_light = (1.0 - below_axis) * axis + square_root(below_axis * (2.0 - below_axis)) * outward
-        squared_radius = 2.0 * height * (high - low) * node.weight
+        squared_radius = 2.0 * height * (high - low) * weight
         along_ray = distance * (1.0 - below_axis)
-        half_chord = square_root(along_ray * along_ray - (distance * distance - self.radius * self.radius))
-        visible_side = along_ray - half_chord
-        return LightSample(
-            normalize(to_light), self.radiance * squared_radius, visible_side, square_root(squared_radius)
-        )
+        half_chord = square_root(along_ray * along_ray - (distance * distance - radius * radius))
+        intensity, patch_radius = radiance * squared_radius, square_root(squared_radius)
+        return LightSample(normalize(to_light), intensity, along_ray - half_chord, patch_radius)
 
 
-def _above_horizon(axial: Array, outward: Array, height: Array) -> tuple[Array, Array]:
+def _arc_above_horizon(axial: Array, outward: Array, height: Array) -> tuple[Array, Array]:
     """The part above the horizon of a great circle from a cap's axis to its rim, as shares of the cap's height.
 
     The circle is ``cos x axis + sin x outward``; at its angle x the sine of the elevation is ``cos x axial + sin x
@@ -230,9 +282,6 @@ def _above_horizon(axial: Array, outward: Array, height: Array) -> tuple[Array, 
 
 def perpendicular(axis: Array) -> tuple[Array, Array]:
     """Two unit vectors at right angles to a unit vector and to each other.
-
-    Args:
-        axis: (3,), unit.
 
     Source: Duff et al., Building an orthonormal basis, revisited, JCGT 6 (2017).
     """

@@ -24,10 +24,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from brdf.checks import sample_number, spectrum
+from brdf.checks import Spectrum, checked, sample_number, spectrum
 from brdf.errors import InputError
+from brdf.geometry.surface_points import SurfacePoints
 from brdf.lights.area import perpendicular
-from brdf.lights.punctual import Light, LightSample, Moments, Place
+from brdf.lights.base import Light, LightSample, repeated
 from brdf.lights.sample_sets import hemisphere_rule, ring_rule
 from brdf.vectors import dot, normalize, square_root
 
@@ -60,41 +61,42 @@ class ConstantEnvironment(Light):
         InputError: where a radiance is negative or not finite, or the samples are too few.
     """
 
-    radiance: Float[Array, " C"] = eqx.field(converter=spectrum("radiance"))
+    radiance: Spectrum = checked(spectrum, "radiance")
     samples: int = eqx.field(static=True, converter=sample_number, default=CONSTANT_SAMPLES)
     type_name: ClassVar[str] = "environment"
-    emittance_name: ClassVar[str] = "radiance"
 
     def __check_init__(self):
         """Refuse a single sample."""
         if self.samples < 2:
             raise InputError("samples", "must be at least 2 here, got 1", "Give more")
 
-    def nodes(self) -> Any:
-        """Two rules over the hemisphere, and which of the two a node belongs to."""
-        diffuse = hemisphere_rule(max(1, self.samples // 2))
-        lobe = ring_rule(self.samples - max(1, self.samples // 2))
-        both = [np.concatenate(pair) for pair in zip(diffuse, lobe, strict=True)]
-        return type(lobe)(*both), np.repeat([0.0, 1.0], [diffuse.weight.size, lobe.weight.size])
+    def rows(self) -> tuple[Any, ...]:
+        """The light, two rules over the hemisphere, and which of the two a row belongs to."""
+        half = max(1, self.samples // 2)
+        diffuse, lobe = hemisphere_rule(half), ring_rule(self.samples - half)
+        rule = [np.concatenate(pair) for pair in zip(diffuse, lobe, strict=True)]
+        lobe_only = np.repeat([0.0, 1.0], [diffuse.weight.size, lobe.weight.size])
+        return *repeated(lobe_only.size, self.radiance), *rule, lobe_only
 
-    def illuminate(self, node: Any, at: Place) -> LightSample:
+    @staticmethod
+    def sample(point: SurfacePoints, *row: Any) -> LightSample:
         """From a patch of the hemisphere above the point."""
-        rule, lobe_only = node
-        across, along = perpendicular(at.normal)
-        turn = 2 * np.pi * rule.t
-        outward = jnp.cos(turn) * across + jnp.sin(turn) * along
-        even = rule.s * at.normal + square_root(1.0 - rule.s * rule.s) * outward
-        view, view_outward = jnp.maximum(dot(at.normal, at.to_view), 1e-6), dot(outward, at.to_view)
-        end = 0.25 * np.pi + 0.5 * jnp.arctan2(view_outward, view)
-        angle = end * jnp.expm1(STEEPNESS * rule.s) / np.expm1(STEEPNESS)
-        half = jnp.cos(angle) * at.normal + jnp.sin(angle) * outward
-        view_half = dot(half, at.to_view)
-        mirrored = 2.0 * view_half * half - at.to_view
-        stretch = end * STEEPNESS * jnp.exp(STEEPNESS * rule.s) / np.expm1(STEEPNESS)
+        radiance, s, t, weight, lobe_only = row
+        normal, to_view = point.normal, point.to_view
+        across, along = perpendicular(normal)
+        outward = jnp.cos(2 * np.pi * t) * across + jnp.sin(2 * np.pi * t) * along
+        even = s * normal + square_root(1.0 - s * s) * outward
+        view = jnp.maximum(dot(normal, to_view), 1e-6)
+        end = 0.25 * np.pi + 0.5 * jnp.arctan2(dot(outward, to_view), view)
+        angle = end * jnp.expm1(STEEPNESS * s) / np.expm1(STEEPNESS)
+        half = jnp.cos(angle) * normal + jnp.sin(angle) * outward
+        view_half = dot(half, to_view)
+        mirrored = 2.0 * view_half * half - to_view
+        stretch = end * STEEPNESS * jnp.exp(STEEPNESS * s) / np.expm1(STEEPNESS)
         share = 8.0 * jnp.maximum(view_half, 0.0) * jnp.sin(angle) * stretch
-        squared_radius = jnp.where(lobe_only > 0, share, 2.0) * rule.weight
+        squared_radius = jnp.where(lobe_only > 0, share, 2.0) * weight
         to_light = normalize(jnp.where(lobe_only > 0, mirrored, even))
-        intensity, radius = self.radiance * squared_radius, square_root(squared_radius)
+        intensity, radius = radiance * squared_radius, square_root(squared_radius)
         return LightSample(to_light, intensity, jnp.asarray(jnp.inf), radius, lobe_only=lobe_only)
 
 
@@ -129,16 +131,15 @@ class EnvironmentMap(Light):
     """
 
     pixels: Float[Array, "H W C"]
-    radiance: Float[Array, " C"]
+    radiance: Spectrum
     patches: Patches
     samples: int = eqx.field(static=True)
     type_name: ClassVar[str] = "environment"
-    emittance_name: ClassVar[str] = "radiance"
 
     def __init__(self, pixels: Any, *, radiance: Any = 1.0, samples: int = MAP_SAMPLES):
         """Take a map's colour out where it has only one, and cut it up."""
         self.samples = sample_number(samples)
-        pixels, factor = _checked(pixels), spectrum("radiance")(radiance)
+        pixels, factor = _checked(pixels), spectrum("radiance", radiance)
         channels = pixels.shape[2]
         if factor.shape[0] not in (1, channels):
             came = f"has {factor.shape[0]} channels, the map {channels}"
@@ -152,15 +153,17 @@ class EnvironmentMap(Light):
         self.radiance = factor * colour
         self.patches = cut(np.asarray(self.pixels), self.samples)
 
-    def nodes(self) -> Any:
-        """The rectangles of the map."""
-        return self.patches
+    def rows(self) -> tuple[Any, ...]:
+        """The factor and the rectangles of the map."""
+        return *repeated(self.patches.mean.shape[0], self.radiance), *self.patches
 
-    def illuminate(self, node: Any, at: Place) -> LightSample:
+    @staticmethod
+    def sample(point: SurfacePoints, *row: Any) -> LightSample:
         """The same at every point: the light of one rectangle of the map."""
-        moments = Moments(node.mean, node.covariance)
-        radius = square_root(2.0 * jnp.trace(node.covariance))  # that of a disc of the same variance
-        return LightSample(normalize(node.mean), self.radiance * node.intensity, jnp.asarray(jnp.inf), radius, moments)
+        radiance, intensity, mean, covariance = row
+        radius = square_root(2.0 * jnp.trace(covariance))  # that of a disc of the same variance
+        moments = (mean, covariance)
+        return LightSample(normalize(mean), radiance * intensity, jnp.asarray(jnp.inf), radius, moments)
 
 
 def _checked(pixels: Any) -> np.ndarray:
@@ -188,12 +191,7 @@ def _solid_angles(height: int, width: int) -> Float[np.ndarray, "H 1"]:
 
 
 def map_directions(height: int, width: int) -> Float[np.ndarray, "H W 3"]:
-    """The direction in which each texel's centre is seen, unit vectors.
-
-    Args:
-        height: of the map, in texels.
-        width: of the map.
-    """
+    """The direction in which each texel's centre is seen, unit vectors."""
     turn = 2 * np.pi * (np.arange(width) + 0.5) / width
     down = np.pi * (np.arange(height)[:, None] + 0.5) / height
     x, z = np.sin(down) * np.sin(turn), -np.sin(down) * np.cos(turn)
@@ -201,56 +199,43 @@ def map_directions(height: int, width: int) -> Float[np.ndarray, "H W 3"]:
 
 
 def cut(pixels: Float[np.ndarray, "H W C"], samples: int) -> Patches:
-    """Cut a map into rectangles, see the module.
-
-    Args:
-        pixels: at least 0, not all 0.
-        samples: how many rectangles at most.
-    """
-    energy = pixels * _solid_angles(*pixels.shape[:2])[..., None]
-    moments = _texel_moments(energy)
+    """Cut a map into rectangles, see the module."""
+    moments = _texel_moments(pixels * _solid_angles(*pixels.shape[:2])[..., None])
     while moments.shape[0] * moments.shape[1] > LARGEST_MAP:
         for axis in (0, 1):
             moments = np.add.reduceat(moments, np.arange(0, moments.shape[axis], 2), axis=axis)
     table = np.pad(moments, ((1, 0), (1, 0), (0, 0))).cumsum(axis=0).cumsum(axis=1)
 
-    def total(box: Box) -> np.ndarray:
+    def entry(box: Box) -> tuple[float, Box]:
+        """Largest spread first: energy times variance of the directions, which is what is left of their length 1."""
         top, bottom, left, right = box
-        return table[bottom, right] - table[top, right] - table[bottom, left] + table[top, left]
+        sums = table[bottom, right] - table[top, right] - table[bottom, left] + table[top, left]
+        if sums[0] <= 0:
+            return 0.0, box
+        variance = 1.0 - float(np.sum((sums[1:4] / sums[0]) ** 2))
+        return -float(sums[0]) * variance if variance > 1e-12 else 0.0, box  # rounding aside
 
-    whole: Box = (0, moments.shape[0], 0, moments.shape[1])
-    heap: list[tuple[float, Box]] = [(-_spread(total(whole)), whole)]
+    heap = [entry((0, moments.shape[0], 0, moments.shape[1]))]
     done: list[Box] = []
     while heap and len(heap) + len(done) < samples:
-        spread, box = heapq.heappop(heap)
-        halves = _halves(moments, box)
-        if spread == 0 or halves is None:
+        negative_spread, box = heapq.heappop(heap)
+        halves = None if negative_spread == 0 else _halves(moments, box)
+        if halves is None:
             done.append(box)
             continue
         for half in halves:
-            heapq.heappush(heap, (-_spread(total(half)), half))
+            heapq.heappush(heap, entry(half))
     boxes = sorted(done + [box for _, box in heap])
     sums = np.stack([moments[top:bottom, left:right].sum(axis=(0, 1)) for top, bottom, left, right in boxes])
     return _patches(sums[sums[:, 0] > 0], pixels.shape[2])
 
 
-_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-
-
 def _texel_moments(energy: np.ndarray) -> np.ndarray:
-    """Per texel: energy, its products with the direction (3) and with pairs of its axes (6), energy of each channel."""
+    """Per texel: energy, its products with the direction (3) and with pairs of its axes (9), energy of each channel."""
     directions = map_directions(*energy.shape[:2])
-    pairs = np.stack([directions[..., i] * directions[..., j] for i, j in _PAIRS], axis=-1)
+    pairs = (directions[..., :, None] * directions[..., None, :]).reshape(*energy.shape[:2], 9)
     weight = energy.sum(axis=-1, keepdims=True)
     return np.concatenate([weight, weight * directions, weight * pairs, energy], axis=-1)
-
-
-def _spread(sums: np.ndarray) -> float:
-    """Energy times variance of the directions: what is left of their length 1; rounding aside."""
-    if sums[0] <= 0:
-        return 0.0
-    variance = 1.0 - float(np.sum((sums[1:4] / sums[0]) ** 2))
-    return float(sums[0]) * variance if variance > 1e-12 else 0.0
 
 
 def _halves(moments: np.ndarray, box: Box) -> list[Box] | None:
@@ -280,11 +265,9 @@ def _mean_and_variance(weight: np.ndarray) -> tuple[float, float]:
 
 def _patches(sums: np.ndarray, channels: int) -> Patches:
     mean = sums[:, 1:4] / sums[:, :1]
-    covariance = np.empty((len(sums), 3, 3))
-    for column, (i, j) in enumerate(_PAIRS):
-        covariance[:, i, j] = covariance[:, j, i] = sums[:, 4 + column] / sums[:, 0] - mean[:, i] * mean[:, j]
+    covariance = (sums[:, 4:13] / sums[:, :1]).reshape(-1, 3, 3) - mean[:, :, None] * mean[:, None, :]
     # a single texel is a direction, exactly: what rounding leaves of its spread would blur the horizon
     single = np.trace(covariance, axis1=1, axis2=2) <= 1e-12
     covariance[single] = 0.0
-    mean[single] /= np.sqrt(np.sum(mean[single] ** 2, axis=1, keepdims=True))
+    mean[single] /= np.linalg.norm(mean[single], axis=1, keepdims=True)
     return Patches(sums[:, -channels:] / np.pi, mean, covariance)

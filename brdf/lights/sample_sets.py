@@ -1,6 +1,7 @@
 """Deterministic sample sets: the nodes and weights of the rules by which lights with an extent are integrated.
 
-All are product rules. They have no noise, so a picture is a smooth function of every parameter of its lights.
+All are product rules over the unit square: Gauss-Legendre in s, and in t the same or equal steps of a turn. They have
+no noise, so a picture is a smooth function of every parameter of its lights. None has more nodes than are asked for.
 """
 
 from typing import NamedTuple
@@ -23,70 +24,43 @@ class SquareRule(NamedTuple):
     weight: Float[np.ndarray, " S"]
 
 
-def gauss_legendre(count: int) -> tuple[Float[np.ndarray, " count"], Float[np.ndarray, " count"]]:
-    """Nodes and weights over (0, 1), exact for polynomials up to degree 2 count - 1.
+def square_rule(samples: int) -> SquareRule:
+    """Gauss-Legendre in both directions, of the largest k × l nodes with k = ⌊√samples⌋."""
+    rows = int(np.sqrt(samples))
+    return _product(_gauss_legendre(samples // rows), _gauss_legendre(rows))
 
-    Args:
-        count: at least 1.
+
+def disc_rule(samples: int) -> SquareRule:
+    """A rule for a disc or cap: s is its share of the area, t its turn.
+
+    With four times as many turns as radii it is exact for polynomials over the disc of equal degree in both.
     """
+    return _turned(samples, round(np.sqrt(samples / 4)))
+
+
+def hemisphere_rule(samples: int) -> SquareRule:
+    """A rule for a hemisphere: s is the cosine to the pole, t the turn, with twice as many turns as cosines."""
+    return _turned(samples, round(np.sqrt(samples / 2)))
+
+
+def ring_rule(samples: int) -> SquareRule:
+    """A rule for rings around a centre: s is which ring, t the turn; four rings for every three turns."""
+    return _turned(samples, min(samples, round(np.sqrt(samples * 4 / 3))))
+
+
+def _turned(samples: int, count: int) -> SquareRule:
+    count = max(1, count)
+    turns = samples // count
+    return _product(_gauss_legendre(count), ((np.arange(turns) + 0.5) / turns, np.full(turns, 1.0 / turns)))
+
+
+def _gauss_legendre(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes and weights over (0, 1), exact for polynomials up to degree 2 count - 1."""
     nodes, weights = np.polynomial.legendre.leggauss(count)
     return 0.5 * (nodes + 1), 0.5 * weights
 
 
-def square_rule(samples: int) -> SquareRule:
-    """Gauss-Legendre in both directions, with as many nodes as go into the number of samples.
-
-    Args:
-        samples: at least 1; the rule has at most so many nodes, the largest k × l with k = ⌊√samples⌋.
-    """
-    rows = int(np.sqrt(samples))
-    s, s_weight = gauss_legendre(samples // rows)
-    t, t_weight = gauss_legendre(rows)
-    return _product(s, s_weight, t, t_weight)
-
-
-def disc_rule(samples: int) -> SquareRule:
-    """A rule for a disc or cap: Gauss-Legendre in s, its share of the area, and equal steps of t, its turn.
-
-    With four times as many turns as radii it is exact for polynomials over the disc of equal degree in both.
-
-    Args:
-        samples: at least 1; the rule has at most so many nodes.
-    """
-    radii = max(1, round(np.sqrt(samples / 4)))
-    s, s_weight = gauss_legendre(radii)
-    turns = samples // radii
-    t, t_weight = (np.arange(turns) + 0.5) / turns, np.full(turns, 1.0 / turns)
-    return _product(s, s_weight, t, t_weight)
-
-
-def hemisphere_rule(samples: int) -> SquareRule:
-    """A rule for a hemisphere: Gauss-Legendre in s, the cosine to the pole, and equal steps of t, the turn.
-
-    Args:
-        samples: at least 1; the rule has at most so many nodes, twice as many turns as cosines.
-    """
-    cosines = max(1, round(np.sqrt(samples / 2)))
-    s, s_weight = gauss_legendre(cosines)
-    turns = samples // cosines
-    t, t_weight = (np.arange(turns) + 0.5) / turns, np.full(turns, 1.0 / turns)
-    return _product(s, s_weight, t, t_weight)
-
-
-def ring_rule(samples: int) -> SquareRule:
-    """A rule for rings around a centre: Gauss-Legendre in s, which ring, and equal steps of t, the turn.
-
-    Args:
-        samples: at least 1; the rule has at most so many nodes, four rings for every three turns.
-    """
-    rings = max(1, round(np.sqrt(samples * 4 / 3)))
-    rings = min(rings, samples)
-    s, s_weight = gauss_legendre(rings)
-    turns = samples // rings
-    t, t_weight = (np.arange(turns) + 0.5) / turns, np.full(turns, 1.0 / turns)
-    return _product(s, s_weight, t, t_weight)
-
-
-def _product(s: np.ndarray, s_weight: np.ndarray, t: np.ndarray, t_weight: np.ndarray) -> SquareRule:
+def _product(first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray]) -> SquareRule:
+    (s, s_weight), (t, t_weight) = first, second
     s_all, t_all = (x.ravel() for x in np.meshgrid(s, t, indexing="ij"))
     return SquareRule(s_all, t_all, np.outer(s_weight, t_weight).ravel())

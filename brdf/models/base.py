@@ -1,4 +1,4 @@
-"""The five models: what one point of a surface reflects.
+"""What a material is, and what the models with a lobe share.
 
 The radiance of a point is ``k_a I_a + sum_i I_i [k_d (N.L_i)+ + k_s S(L_i, V)]``; the models differ in the specular
 term
@@ -25,7 +25,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
-from brdf import vectors
+from brdf import formatters, vectors
 from brdf.checks import Parameter, coefficients, exponent
 from brdf.vectors import Directions, Numbers, Scalars
 
@@ -38,9 +38,17 @@ class Material(eqx.Module):
         k_d: diffuse coefficient, (C,), at least 0: the diffuse albedo.
     """
 
-    k_a: eqx.AbstractVar[Float[Parameter, " C"]]
-    k_d: eqx.AbstractVar[Float[Parameter, " C"]]
+    k_a: Float[Parameter, " C"] = eqx.field(default=0.0, kw_only=True)
+    k_d: Float[Parameter, " C"] = eqx.field(kw_only=True)
     name: ClassVar[str]
+
+    def __post_init__(self):
+        """Check the numbers and give the coefficients one number of channels."""
+        given = {name: value for name, value in vars(self).items() if name != "n"}
+        for name, value in zip(given, coefficients(**given), strict=True):
+            setattr(self, name, value)
+        if isinstance(self, SpecularMaterial):
+            self.n = exponent(self.n)
 
     @abstractmethod
     def specular(self, normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
@@ -73,11 +81,8 @@ class Material(eqx.Module):
 
     def _repr_html_(self) -> str | None:
         """For Jupyter: a lit sphere and the numbers; nothing while JAX traces them."""
-        if any(isinstance(value, Tracer) for value in vars(self).values()):
-            return None
-        from brdf.display import material_html
-
-        return material_html(self)
+        traced = any(isinstance(value, Tracer) for value in vars(self).values())
+        return None if traced else formatters.html["material"](self)
 
 
 class SpecularMaterial(Material):
@@ -91,26 +96,9 @@ class SpecularMaterial(Material):
         cosine_weighted: whether the lobe is multiplied by N.L (class variable).
     """
 
-    k_a: Float[Parameter, " C"]
-    k_d: Float[Parameter, " C"]
-    k_s: Float[Parameter, " C"]
-    n: Float[Parameter, ""]
-    cosine_weighted: ClassVar[bool]
-
-    def __init__(self, *, k_d: ArrayLike, k_s: ArrayLike, n: ArrayLike, k_a: ArrayLike = 0.0):
-        """Check the numbers and give the coefficients one number of channels.
-
-        Args:
-            k_d: diffuse coefficient, a scalar or (C,), at least 0.
-            k_s: specular coefficient, a scalar or (C,), at least 0.
-            n: exponent, a scalar, at least 0.
-            k_a: ambient coefficient, a scalar or (C,), at least 0.
-
-        Raises:
-            InputError: a number is negative or not finite, or the shapes do not fit.
-        """
-        self.k_a, self.k_d, self.k_s = coefficients(k_a=k_a, k_d=k_d, k_s=k_s)
-        self.n = exponent(n)
+    k_s: Float[Parameter, " C"] = eqx.field(kw_only=True)
+    n: Float[Parameter, ""] = eqx.field(kw_only=True)
+    cosine_weighted: ClassVar[bool] = False
 
     @staticmethod
     @abstractmethod
@@ -127,16 +115,13 @@ class SpecularMaterial(Material):
         """
 
     @staticmethod
-    @abstractmethod
     def scale(n: Numbers) -> Scalars:
-        """The constant in front of the lobe: 1 in the classic forms.
+        """The constant in front of the lobe: 1 in the classic forms, at least 1 in the normalised ones.
 
         Args:
             n: exponent, at least 0, (...).
-
-        Returns:
-            (...), at least 1.
         """
+        return jnp.ones_like(n)
 
     def specular(self, normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
         """The specular term S; see ``Material.specular``."""
@@ -162,7 +147,7 @@ class SpecularMaterial(Material):
 
 
 def _text(value: Any) -> str:
-    if isinstance(value, np.ndarray) or (isinstance(value, jax.Array) and not isinstance(value, Tracer)):
+    if isinstance(value, np.ndarray | jax.Array) and not isinstance(value, Tracer):
         value = np.asarray(value)
         return f"{value:.6g}" if value.ndim == 0 else f"[{', '.join(f'{v:.6g}' for v in value)}]"
     return str(value)

@@ -1,4 +1,14 @@
-"""Blinn-Phong, classic and normalised."""
+"""Blinn's lobe of the half vector H = (L + V) / |L + V| about the normal: the classic form and the normalised one.
+
+| parameter | default | meaning | differentiable |
+| --- | --- | --- | --- |
+| k_a | 0 | ambient coefficient, a number or (C,), at least 0 | yes |
+| k_d | | diffuse coefficient, a number or (C,), at least 0 | yes |
+| k_s | | specular coefficient, a number or (C,), at least 0 | yes |
+| n | | exponent, one number for all channels, at least 0 | yes |
+
+`BlinnPhong`: S = (N.H)+^n. `NormalizedBlinnPhong`: S = (n+2)(n+4) / (8 (2^(-n/2) + n)) (N.H)+^n (N.L)+.
+"""
 
 import math
 from typing import ClassVar
@@ -7,7 +17,7 @@ import jax.numpy as jnp
 
 from brdf import vectors
 from brdf.models.base import SpecularMaterial
-from brdf.vectors import Directions, Numbers, Scalars
+from brdf.vectors import Numbers, Scalars
 
 
 class BlinnPhong(SpecularMaterial):
@@ -19,17 +29,7 @@ class BlinnPhong(SpecularMaterial):
     """
 
     name: ClassVar[str] = "blinn-phong"
-    cosine_weighted: ClassVar[bool] = False
-
-    @staticmethod
-    def log_cosine(normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
-        """Logarithm of N.H; see ``SpecularMaterial.log_cosine``."""
-        return vectors.half_log_cosine(normal, to_light, to_view)
-
-    @staticmethod
-    def scale(n: Numbers) -> Scalars:
-        """1: the classic form is not normalised."""
-        return jnp.ones_like(n)
+    log_cosine = staticmethod(vectors.half_log_cosine)
 
 
 class NormalizedBlinnPhong(SpecularMaterial):
@@ -42,11 +42,7 @@ class NormalizedBlinnPhong(SpecularMaterial):
 
     name: ClassVar[str] = "normalized-blinn-phong"
     cosine_weighted: ClassVar[bool] = True
-
-    @staticmethod
-    def log_cosine(normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
-        """Logarithm of N.H; see ``SpecularMaterial.log_cosine``."""
-        return vectors.half_log_cosine(normal, to_light, to_view)
+    log_cosine = staticmethod(vectors.half_log_cosine)
 
     @staticmethod
     def scale(n: Numbers) -> Scalars:

@@ -1,13 +1,20 @@
-"""The matt model."""
+"""A perfectly matt surface: S = 0, f_r = k_d / pi.
+
+| parameter | default | meaning | differentiable |
+| --- | --- | --- | --- |
+| k_a | 0 | ambient coefficient, a number or (C,), at least 0 | yes |
+| k_d | | diffuse coefficient, a number or (C,), at least 0: the albedo | yes |
+
+Reciprocal. Conserves energy when k_d <= 1. Source: J. H. Lambert, Photometria, 1760.
+"""
 
 import math
 from typing import ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from brdf import vectors
-from brdf.checks import Parameter, coefficients
 from brdf.models.base import Material
 from brdf.vectors import Directions, Scalars
 
@@ -17,26 +24,15 @@ class Lambert(Material):
 
     Reciprocal. Conserves energy when k_d <= 1. Source: J. H. Lambert, Photometria, 1760.
 
-    Attributes:
-        k_a: ambient coefficient, (C,), at least 0.
-        k_d: diffuse coefficient, (C,), at least 0.
+    Args:
+        k_a: ambient coefficient, a scalar or (C,), at least 0.
+        k_d: diffuse coefficient, a scalar or (C,), at least 0.
+
+    Raises:
+        InputError: a number is negative or not finite, or the shapes do not fit.
     """
 
-    k_a: Float[Parameter, " C"]
-    k_d: Float[Parameter, " C"]
     name: ClassVar[str] = "lambert"
-
-    def __init__(self, *, k_d: ArrayLike, k_a: ArrayLike = 0.0):
-        """Check the numbers and give the coefficients one number of channels.
-
-        Args:
-            k_d: diffuse coefficient, a scalar or (C,), at least 0.
-            k_a: ambient coefficient, a scalar or (C,), at least 0.
-
-        Raises:
-            InputError: a number is negative or not finite, or the shapes do not fit.
-        """
-        self.k_a, self.k_d = coefficients(k_a=k_a, k_d=k_d)
 
     def specular(self, normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
         """The specular term S, which is 0; see ``Material.specular``."""

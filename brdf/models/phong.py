@@ -1,4 +1,14 @@
-"""Phong, classic and normalised."""
+"""Phong's lobe about the mirror direction R = 2 (N.L) N - L of the light: the classic form and the normalised one.
+
+| parameter | default | meaning | differentiable |
+| --- | --- | --- | --- |
+| k_a | 0 | ambient coefficient, a number or (C,), at least 0 | yes |
+| k_d | | diffuse coefficient, a number or (C,), at least 0 | yes |
+| k_s | | specular coefficient, a number or (C,), at least 0 | yes |
+| n | | exponent, one number for all channels, at least 0 | yes |
+
+`Phong`: S = (R.V)+^n. `NormalizedPhong`: S = (n+2)/2 (R.V)+^n (N.L)+.
+"""
 
 from typing import ClassVar
 
@@ -6,7 +16,7 @@ import jax.numpy as jnp
 
 from brdf import vectors
 from brdf.models.base import SpecularMaterial
-from brdf.vectors import Directions, Numbers, Scalars
+from brdf.vectors import Numbers, Scalars
 
 
 class Phong(SpecularMaterial):
@@ -17,17 +27,7 @@ class Phong(SpecularMaterial):
     """
 
     name: ClassVar[str] = "phong"
-    cosine_weighted: ClassVar[bool] = False
-
-    @staticmethod
-    def log_cosine(normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
-        """Logarithm of R.V; see ``SpecularMaterial.log_cosine``."""
-        return vectors.mirror_log_cosine(normal, to_light, to_view)
-
-    @staticmethod
-    def scale(n: Numbers) -> Scalars:
-        """1: the classic form is not normalised."""
-        return jnp.ones_like(n)
+    log_cosine = staticmethod(vectors.mirror_log_cosine)
 
 
 class NormalizedPhong(SpecularMaterial):
@@ -41,11 +41,7 @@ class NormalizedPhong(SpecularMaterial):
 
     name: ClassVar[str] = "normalized-phong"
     cosine_weighted: ClassVar[bool] = True
-
-    @staticmethod
-    def log_cosine(normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
-        """Logarithm of R.V; see ``SpecularMaterial.log_cosine``."""
-        return vectors.mirror_log_cosine(normal, to_light, to_view)
+    log_cosine = staticmethod(vectors.mirror_log_cosine)
 
     @staticmethod
     def scale(n: Numbers) -> Scalars:

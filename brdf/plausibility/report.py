@@ -4,6 +4,8 @@ import dataclasses
 import math
 from typing import Any, Literal
 
+from brdf import formatters
+
 Verdict = Literal["pass", "fail", "cannot tell"]
 
 ENERGY_LIMIT = 1.0 + 1e-6
@@ -106,9 +108,7 @@ class Report:
 
     def _repr_html_(self) -> str:
         """For Jupyter."""
-        from brdf.display import report_html
-
-        return report_html(self)
+        return formatters.html["report"](self)
 
     def to_json(self) -> dict[str, Any]:
         """The report as plain numbers, strings and dictionaries, for ``json.dumps``."""

@@ -75,7 +75,7 @@ def casts_shadows(scene: brdf.Scene) -> bool:
     Args:
         scene: any.
     """
-    return bool(scene.lights) and bool(scene.lighting.occluders)
+    return bool(scene.lights) and bool(scene.occluders)
 
 
 def without_shadows(scene: brdf.Scene, precision: Precision) -> brdf.Scene:

@@ -7,7 +7,7 @@ from typing import Any
 import equinox as eqx
 
 import brdf
-from brdf.lights.punctual import Light
+from brdf.lights.base import Light
 
 
 def extended(scene: brdf.Scene) -> bool:

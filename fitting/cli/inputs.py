@@ -163,7 +163,7 @@ def collect(given: Given, read: dict[Path, brdf.Picture]) -> FitInputs:
     masks = visible(mask, pictures)
     if given.scene is None:
         return _photographs(targets, options, pictures, mask, masks)
-    from brdf.scene_file import load_scene
+    from brdf.scene import load_scene
 
     file, tables = given.scene
     return FitInputs(pictures, [load_scene(file, options.within, tables)], masks, targets[0])

@@ -210,6 +210,12 @@ def test_what_a_material_refuses(given, message):
         Phong(**(dict(k_d=0.1, k_s=[0.1, 0.2, 0.3], n=10.0) | given))
 
 
+@pytest.mark.parametrize("model", ALL)
+def test_a_missing_coefficient_is_said_of_its_model(model):
+    with pytest.raises(TypeError, match=rf"^{model.__name__}\.__init__\(\) missing 1 required .* 'k_d'"):
+        model(**({} if model is Lambert else dict(k_s=0.5, n=10.0)))
+
+
 def test_only_lobes_have_an_exponent():
     assert not issubclass(Lambert, SpecularMaterial)
     assert all(issubclass(model, SpecularMaterial) for model in LOBES)

@@ -8,7 +8,7 @@ from project_paths import ROOT
 
 import brdf
 import fitting
-from brdf.lights.punctual import Light
+from brdf.lights.base import Light
 
 CAMERA = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=(72, 72))
 BALL = brdf.Sphere(center=[0, 0, 0], radius=1)

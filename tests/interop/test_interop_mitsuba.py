@@ -10,8 +10,8 @@ import pytest
 from project_paths import ROOT
 
 import brdf
+from brdf.lights.base import Light
 from brdf.lights.environment import map_directions
-from brdf.lights.punctual import Light
 
 pytest.importorskip("mitsuba", reason="Mitsuba 3 renders the reference")
 sys.path.insert(0, str(ROOT / "data"))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import brdf
-from brdf.lights.punctual import Light
+from brdf.lights.base import Light
 
 NORMALS = np.array([[[0, 0, 1.0], [0, 0.5, 0.8], [0.9, 0, 0.3], [0.3, -0.2, 0.5]]])
 POINTS = brdf.SurfacePoints.from_normals(NORMALS, position=np.zeros(NORMALS.shape))

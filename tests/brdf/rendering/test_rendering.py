@@ -9,6 +9,7 @@ import pytest
 
 import brdf
 import fitting
+from brdf import lobes
 from brdf.rendering import basis
 
 SIZE = 128
@@ -97,11 +98,9 @@ def test_gradients_pass_through_pixel_areas():
 
 
 def test_many_samples_pass_tile_by_tile(monkeypatch: pytest.MonkeyPatch):
-    from brdf import light_sum as shading
-
     light = brdf.SphereLight(center=[1, 1, 3], radius=0.5, radiance=5, samples=16)
     whole = np.asarray(brdf.render(glossy(20), ball(1, size=40, lights=[light]), precision="float32"))
-    monkeypatch.setattr(shading, "TILE", 300)  # 1600 pixels: not a multiple
+    monkeypatch.setattr(lobes, "TILE", 300)  # 1600 pixels: not a multiple
     jax.clear_caches()
     tiled = np.asarray(brdf.render(glossy(20), ball(1, size=40, lights=[light]), precision="float32"))
     np.testing.assert_allclose(tiled, whole, atol=1e-6)
@@ -118,3 +117,56 @@ def test_an_averaged_basis_makes_the_averaged_picture():
     np.testing.assert_allclose(np.asarray(picture).reshape(expected.shape), expected, atol=1e-6)
     few = images.lobe.pixels(lambda a: a[100:200])
     np.testing.assert_allclose(few(jnp.asarray(200.0))[0], value[100:200], atol=1e-7)
+
+
+def directional(count: int, **more) -> list[brdf.DirectionalLight]:
+    turns = 2.4 * np.arange(count)
+    directions = np.stack([np.cos(turns), np.sin(turns), 1.0 + np.arange(count) / count], axis=-1)
+    return [brdf.DirectionalLight(direction=one, intensity=[1.0, 0.5, 0.2], **more) for one in directions / count]
+
+
+def test_a_thousand_lights_are_one_loop():
+    lights = directional(1000)
+    few, many = ball(1, size=16, lights=lights[:10]), ball(1, size=16, lights=lights)
+
+    def program(scene: brdf.Scene) -> str:
+        return str(jax.make_jaxpr(lambda n: basis_of(scene, n))(20.0))
+
+    def basis_of(scene: brdf.Scene, n: float) -> jax.Array:
+        return brdf.basis_images(brdf.BlinnPhong, scene, n).specular
+
+    assert program(many).count(" = ") == program(few).count(" = ")
+    image = np.asarray(brdf.render(glossy(20.0), many, precision="float64"))
+    parts = [ball(1, size=16, lights=lights[start::4]) for start in range(4)]
+    each = [np.asarray(brdf.render(glossy(20.0), part, precision="float64")) for part in parts]
+    np.testing.assert_allclose(image, sum(each), rtol=1e-12)
+
+
+def test_lights_of_any_kind_and_channels_add_up():
+    kinds = [
+        *directional(2),
+        brdf.DirectionalLight(direction=[0, 1, 1], intensity=0.3),
+        brdf.PointLight(position=[1, 2, 3], intensity=[5.0, 4.0, 3.0]),
+        brdf.SphereLight(center=[-1, 1, 3], radius=0.4, radiance=5, samples=9),
+    ]
+    masks = np.random.default_rng(0).uniform(size=(len(kinds), 16, 16))
+    scene = ball(1, size=16, lights=kinds, visibility=list(masks))
+    image = np.asarray(brdf.render(glossy(9.0), scene, precision="float64"))
+    each = np.asarray(brdf.render_lights(glossy(9.0), scene, precision="float64"))
+    np.testing.assert_allclose(each.sum(axis=0), image, rtol=1e-12)
+    images = basis(brdf.BlinnPhong, brdf.cast(scene, "float32"))
+    assert images.lobe is not None
+    picture = 0.5 * images.diffuse + 0.5 * images.lobe(jnp.asarray(9.0))[0]
+    np.testing.assert_allclose(np.asarray(picture).reshape(image.shape), image, atol=1e-5)
+
+
+@pytest.mark.parametrize("model", [brdf.Phong, brdf.BlinnPhong])
+def test_second_derivatives_are_finite_where_a_pixel_misses_the_shapes(model: type[brdf.Material]):
+    with jax.enable_x64(True):
+
+        def value(direction: jax.Array) -> jax.Array:
+            light = brdf.DirectionalLight(direction=direction, intensity=1.0)
+            return jnp.sum(brdf.render(model(k_d=0.5, k_s=0.5, n=20.0), ball(1, size=8, lights=[light])))
+
+        assert np.isfinite(jax.jit(jax.hessian(value))(jnp.asarray(TO_LIGHT))).all()
+        assert np.isfinite(jax.jit(jax.hessian(value))(jnp.array([0.3, 0.2, -1.0]))).all()

@@ -1,5 +1,6 @@
 """scene.toml: what is written reads back the same, and what is wrong is one line that names file, table and key."""
 
+import re
 from pathlib import Path
 
 import jax
@@ -7,6 +8,8 @@ import numpy as np
 import pytest
 
 import brdf
+from benchmarks.fuzz_corpus import CAMERA, LIGHT, POINT, SPHERE
+from brdf.images.writing import write_layers
 
 FULL = """
 [camera]
@@ -182,7 +185,6 @@ def test_surface_points_travel_through_an_aov_file(tmp_path: Path):
 
 
 def test_layers_of_an_aov_file_can_be_named(tmp_path: Path):
-    from brdf.images.writing import write_layers
 
     normal = np.zeros((3, 4, 3), np.float32)
     normal[..., 2] = 2.0
@@ -262,3 +264,60 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path: Path, case: str):
 def test_a_missing_scene_is_said(tmp_path: Path):
     with pytest.raises(brdf.InputError, match="there is no such file"):
         brdf.Scene.load(tmp_path / "none.toml")
+
+
+AOV = '[aov]\nfile = "n.exr"\n'
+SHADOW = LIGHT + 'visibility = "n.exr"\n'
+ENVIRONMENT = CAMERA + SPHERE + '[[lights]]\ntype = "environment"\n'
+REFUSED = {
+    "layer is a list": (AOV + 'normal = ["a"]\n' + LIGHT, r"aov\.normal: must be the name of a layer, got \['a'\]"),
+    "layer is a number": (AOV + "position = 3\n" + LIGHT, r"aov\.position: must be the name of a layer, got 3"),
+    "layer is missing": (AOV + 'position = "P"\n' + LIGHT, r"n\.exr: has no layer 'P', got the unnamed one, normal"),
+    "shadow's layer": (CAMERA + SPHERE + SHADOW + "visibility_layer = []\n", r"lights\[0\]\.visibility_layer: must be"),
+    "to_view is text": (AOV + 'to_view = "x"\n' + LIGHT, r"aov\.to_view: must be a number, got 'x'"),
+    "to_view is zero": (AOV + "to_view = [0, 0, 0]\n" + LIGHT, r"aov\.to_view: must not have zero length"),
+    "to_view is ragged": (AOV + "to_view = [[0], 0, 1]\n" + LIGHT, r"aov\.to_view: must be three numbers"),
+    "to_view is short": (AOV + "to_view = [0, 1]\n" + LIGHT, r"aov\.to_view: must be three numbers"),
+    "no positions": (
+        AOV + POINT,
+        r"lights\[0\]: stands somewhere, but .*aov has no layer of positions\. Add the layer",
+    ),
+    "occluders": (
+        AOV + '[[shapes]]\ntype = "sphere"\ncenter = [0, 0, 2]\nradius = 0.5\nfitted = false\n' + LIGHT,
+        r"shapes: stand somewhere, but .*aov has no layer of positions\. Add the layer",
+    ),
+    "empty name": (ENVIRONMENT + 'file = ""\n', r"lights\[0\]\.file: must be a path, got ''"),
+    "long list": (
+        CAMERA + SPHERE + LIGHT.replace("1.0, ", "1.0, " * 3000),
+        r"intensity: has 6001 entries\. Give at most",
+    ),
+    "long file": ("#" * (5 << 20), r"is larger than 4 MiB"),
+    "5,000 digits": (CAMERA + SPHERE + f"x = {'1' * 5000}", r"is not TOML \(Exceeds the limit"),
+    "5,000 hexadecimal digits": (CAMERA + SPHERE + f"x = 0x{'f' * 5000}", "has a whole number of more than 300 digits"),
+    "300 digits": (CAMERA + SPHERE + LIGHT + f"x = {10**299}", r"lights\[0\]\.x: is not a known key"),
+    "not UTF-8": ("# caf\xe9 \n", r"is not UTF-8 text \(line 1"),
+}
+
+
+@pytest.fixture
+def folder_with_normals(tmp_path: Path) -> Path:
+    normal = np.zeros((8, 8, 3), np.float32)
+    normal[..., 2] = 1
+    write_layers(tmp_path / "n.exr", {"": normal, "normal": normal})
+    return tmp_path
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_scene_that_is_refused(folder_with_normals, name):
+    content, said = REFUSED[name]
+    (folder_with_normals / "scene.toml").write_bytes(content.encode("latin-1"))
+    with pytest.raises(brdf.InputError) as told:
+        brdf.Scene.load(folder_with_normals / "scene.toml")
+    assert re.search(said, str(told.value)), told.value
+    assert str(told.value).startswith(str(folder_with_normals))
+
+
+@pytest.mark.parametrize("light", [LIGHT, '[[lights]]\ntype = "environment"\nradiance = 1\n'])
+def test_lights_from_far_away_need_no_positions(folder_with_normals, light):
+    (folder_with_normals / "scene.toml").write_text(AOV + light)
+    assert brdf.Scene.load(folder_with_normals / "scene.toml").points is not None
