@@ -24,9 +24,8 @@ from fitting.result import FitResult
 from fitting.selection import FAMILIES, Choice, choose
 from fitting.solver.losses import reweight
 from fitting.solver.normal_equations import Picture
-from fitting.solver.profile import Optimum, search
+from fitting.solver.profile import Optimum, fit_tied, search
 from fitting.solver.streams import Stream, each, joined
-from fitting.solver.tied import fit_tied
 from fitting.uncertainty.covariance import residual_noise
 from fitting.uncertainty.highlight import nearest_peak
 from fitting.uncertainty.interpretation import Interpretation, ModelFit, interpret
@@ -234,8 +233,7 @@ def _fit_simplest(seen: _Observed) -> tuple[ModelFit, Choice]:
         optimum = _search(pictures, choice.free, chosen.n_range)
     tied = grey[choice.model] if choice.grey else None
     if tied is not None:
-        single = problem.precision == "float32"
-        optimum = fit_tied(pictures, optimum, choice.free, tied, chosen.n_range, single=single)
+        optimum = fit_tied(pictures, optimum, choice.free, tied, chosen.n_range)
     return chosen._replace(pictures=pictures, optimum=optimum, free=choice.free, tied=tied), choice
 
 

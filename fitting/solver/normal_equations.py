@@ -17,7 +17,7 @@ ambient one, would else seem to differ from it by the rounding of the sums.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from functools import cache, partial
+from functools import partial
 from typing import NamedTuple, Protocol, Self, TypeAlias, runtime_checkable
 
 import equinox as eqx
@@ -105,6 +105,7 @@ class Picture(eqx.Module):
             ambient=self.ambient,
         )
 
+    @eqx.filter_jit
     def predicted(self, n: AnyArray, x: Float[AnyArray, "3 C"]) -> Float[Array, "P C"]:
         """What the model shows, in the dtype of the target."""
         dtype = self.target.dtype
@@ -113,6 +114,13 @@ class Picture(eqx.Module):
         if self.lobe is not None:
             model = model + x[2] * self.lobe(jnp.asarray(n))[0]
         return jnp.broadcast_to(model, self.target.shape)
+
+    @property
+    def weights(self) -> Float[AnyArray, "P Cw"]:
+        """Of each pixel, or of all of them where they weigh the same; Cw is 1 or C."""
+        if self.weight is None:
+            return np.ones((1, 1), self.target.dtype)
+        return self.weight if self.weight.ndim == 2 else self.weight[:, None]
 
 
 def relative_lobe(
@@ -178,6 +186,28 @@ class Sums(NamedTuple):
         square = self.square + np.sum(reference * (2 * self.product + moved), axis=-1)
         return Sums(self.gram, self.product + moved, square, self.pixels)
 
+    def within(self, t: Float[np.ndarray, " T"], width: float, reference: Float[np.ndarray, "C 3"]) -> "Sums":
+        """From the sums of a bracket those at some exponents in it, the lobe being Hermite's cubic of its ends.
+
+        Args:
+            t: where in the bracket, from 0 to 1.
+            width: of the bracket, in log n.
+            reference: the reference model, whose lobe was that of the lower end; here it is that of each t.
+        """
+        basis = np.zeros((t.size, 4, 6))
+        basis[:, [0, 1, 2], [0, 1, 2]] = 1.0
+        basis[:, 2, 3:] = np.stack([t * width, t * t * (3 - 2 * t), t * t * (t - 1) * width], axis=-1)
+        basis[:, 3, 3:] = np.stack([np.ones_like(t), 6 * t * (1 - t) / width, t * (3 * t - 2)], axis=-1)
+        change = reference[:, 2:] * (basis[:, None, 2] - np.eye(6)[2])
+        moved = (self.gram @ change[..., None])[..., 0]
+        square = self.square + np.sum(change * (moved - 2 * self.product), axis=-1)
+        return Sums(
+            gram=basis[:, None] @ self.gram @ basis[:, None].swapaxes(-1, -2),
+            product=(self.product - moved) @ basis.swapaxes(-1, -2),
+            square=square,
+            pixels=np.broadcast_to(self.pixels, square.shape),
+        )
+
 
 def _columns(
     lobe: Lobe | None, diffuse: Float[Array, "P Cb"], log_n: Float[Array, " N"], peak: Float[Array, ""]
@@ -208,54 +238,6 @@ def _reduce(products: Sequence[Float[Array, " B"]]) -> Float[Array, " S"]:
     return jnp.stack(totals).astype(jnp.float64)
 
 
-def _products(
-    columns: Sequence[Float[Array, " B"]],
-    residuals: Sequence[Float[Array, " B"]],
-    weight: Float[Array, " B"] | None,
-) -> list[Float[Array, " B"]]:
-    """Every product whose sum is wanted: upper triangle of the Gram, columns times residuals, squares, pixel count."""
-    weighted = columns if weight is None else [weight * column for column in columns]
-    products = [left * right for i, left in enumerate(weighted) for right in columns[i:]]
-    products += [left * residual for residual in residuals for left in weighted]
-    products += [residual * residual if weight is None else weight * residual * residual for residual in residuals]
-    one = jnp.ones_like(columns[0])
-    return [*products, one if weight is None else jnp.where(weight > 0, one, 0)]
-
-
-@cache
-def _places(columns: int) -> Int[np.ndarray, "R R"]:
-    """Where each entry of a Gram matrix lies in its packed upper triangle."""
-    place = np.zeros((columns, columns), int)
-    place[np.triu_indices(columns)] = np.arange(columns * (columns + 1) // 2)
-    return np.maximum(place, place.T)
-
-
-def _unpack(packed: Float[np.ndarray, "*K S"], picture: Picture, columns: int, leading: int) -> Sums:
-    """Undo the packing of :func:`_products`, and of what was taken off and added to it.
-
-    The ambient column is constant and was summed as 1; the others were summed less their means, which stand at the end.
-    """
-    channels = picture.target.shape[1]
-    if packed.ndim == leading + 1:
-        packed = packed[..., None, :]
-        residuals = channels
-    else:
-        residuals = 1
-    packed, mean = packed[..., : 1 - columns], packed[..., 1 - columns :]
-    triangle = columns * (columns + 1) // 2
-    last = triangle + residuals * columns
-    # A row of it makes a column of what was summed, in units of the ambient light.
-    whole = np.zeros((*mean.shape[:-1], columns, columns)) + np.eye(columns)
-    whole[..., 1:, 0] = mean
-    scale = np.ones((channels, columns))
-    scale[:, 0] = picture.ambient
-    gram = whole @ packed[..., _places(columns)] @ whole.swapaxes(-1, -2) * (scale[:, :, None] * scale[:, None, :])
-    product = packed[..., triangle:last].reshape(*packed.shape[:leading], channels, columns)
-    product = (whole @ product[..., None])[..., 0] * scale
-    square = packed[..., last:-1].reshape(*packed.shape[:leading], channels)
-    return Sums(gram, product, square, np.broadcast_to(packed[..., -1], square.shape))
-
-
 def _means(picture: Picture, log_n: Float[Array, " N"], peak: Float[Array, ""]) -> Float[Array, "R-1 Cb"]:
     """What to take off the columns: their means over some pixels that count, in the pixels' dtype; Cb is 1 or C."""
     stride = max(1, picture.target.shape[0] // _MEAN_PIXELS)
@@ -263,7 +245,7 @@ def _means(picture: Picture, log_n: Float[Array, " N"], peak: Float[Array, ""]) 
     columns = jnp.stack(jnp.broadcast_arrays(*_columns(few.lobe, few.diffuse, log_n, peak)))
     if few.weight is None:
         return jnp.mean(columns, axis=1)
-    counts = (few.weight if few.weight.ndim < 2 else jnp.max(few.weight, axis=1)) > 0
+    counts = jnp.max(few.weights, axis=1) > 0
     total = jnp.sum(jnp.where(counts[:, None], columns, 0), axis=1)
     return total / jnp.maximum(jnp.sum(counts), 1).astype(total.dtype)
 
@@ -275,8 +257,11 @@ def _block_sums(
     peak: Float[Array, ""],
     mean: Float[Array, "R-1 Cb"],
     inside: Bool[Array, " B"] | None,
-) -> Float[Array, "..."]:
-    """Packed sums of one block: (S,) where all channels share basis and weight, else (C, S)."""
+) -> Float[Array, "G S"]:
+    """Packed sums of one block; G is 1 where all channels share basis and weight, else C.
+
+    Upper triangle of the Gram, columns times residuals, squares, pixel count.
+    """
     target, dtype = picture.target, picture.target.dtype
     weight = picture.weight
     if inside is not None and weight is None:
@@ -302,15 +287,17 @@ def _block_sums(
                 model = model + reference[2, channel] * columns[1]
             residual = values - model
             residuals.append(residual if weight is None else jnp.where(weight > 0, residual, 0))
-        less = [column - mean[i] for i, column in enumerate(columns)]
-        return _reduce(_products([jnp.ones_like(columns[0]), *less], residuals, weight))
+        one = jnp.ones_like(columns[0])
+        columns = [one, *(column - mean[i] for i, column in enumerate(columns))]
+        weighted = columns if weight is None else [weight * column for column in columns]
+        products = [left * right for i, left in enumerate(weighted) for right in columns[i:]]
+        products += [left * residual for residual in residuals for left in weighted]
+        products += [residual * residual if weight is None else weight * residual * residual for residual in residuals]
+        return _reduce([*products, one if weight is None else jnp.where(weight > 0, one, 0)])
 
-    if (
-        len({column.shape[1] for column in lit} | {1}) == 1
-        and (weight is None or weight.ndim < 2)
-        and channels <= UNROLLED_CHANNELS
-    ):
-        return one_group([column[:, 0] for column in lit], mean[:, 0], target.T, weight, reference)
+    grey = all(column.shape[1] == 1 for column in lit) and (weight is None or weight.ndim < 2)
+    if grey and channels <= UNROLLED_CHANNELS:
+        return one_group([column[:, 0] for column in lit], mean[:, 0], target.T, weight, reference)[None]
     columns = [jnp.broadcast_to(column, target.shape).T for column in lit]
     weights = None if weight is None else jnp.broadcast_to(weight.T, target.T.shape)
     means = jnp.broadcast_to(mean, (len(columns), channels)).T
@@ -320,41 +307,63 @@ def _block_sums(
 
 def _all_blocks(
     picture: Picture, log_n: Float[Array, " N"], reference: Float[Array, "3 C"], peak: Float[Array, ""]
-) -> Float[Array, " S"] | Float[Array, "C S"]:
-    """Packed sums of one picture, block after block, and at the end what was taken off the columns."""
+) -> tuple[Float[Array, "G S"], Float[Array, "R-1 Cb"]]:
+    """Packed sums of one picture, block after block, and what was taken off the columns."""
     count = picture.target.shape[0]
     blocks = max(1, -(-count // BLOCK))
     size = -(-count // blocks)
     mean = _means(picture, log_n, peak)
+    if blocks == 1:
+        return _block_sums(picture, log_n, reference, peak, mean, None), mean
 
-    def block_sums(part: Picture, inside: Bool[Array, " B"] | None) -> Float[Array, "..."]:
-        return _block_sums(part, log_n, reference, peak, mean, inside)
-
-    def add(block: Int[Array, ""], packed: Float[Array, "..."]) -> Float[Array, "..."]:
+    def add(block: Int[Array, ""], packed: Float[Array, "G S"]) -> Float[Array, "G S"]:
         # The last block starts early enough to be whole; what it shares with the one before counts once.
         start = jnp.minimum(block * size, count - size)
         part = picture.pixels(lambda a: jax.lax.dynamic_slice_in_dim(a, start, size))
         inside = None if count % size == 0 else start + jnp.arange(size) >= block * size
-        return packed + block_sums(part, inside)
+        return packed + _block_sums(part, log_n, reference, peak, mean, inside)
 
-    if blocks == 1:
-        packed = block_sums(picture, None)
-    else:
-        shape = jax.eval_shape(lambda: block_sums(picture, None))
-        packed = jax.lax.fori_loop(0, blocks, add, jnp.zeros(shape.shape, shape.dtype))
-    taken = mean.T.astype(packed.dtype)
-    taken = taken[0] if packed.ndim == 1 else jnp.broadcast_to(taken, (packed.shape[0], taken.shape[1]))
-    return jnp.concatenate([packed, taken], axis=-1)
+    shape = jax.eval_shape(lambda: _block_sums(picture, log_n, reference, peak, mean, None))
+    return jax.lax.fori_loop(0, blocks, add, jnp.zeros(shape.shape, shape.dtype)), mean
 
 
-_one_exponent = jax.jit(_all_blocks, compiler_options=COMPILER_OPTIONS)
+_one = jax.jit(_all_blocks, compiler_options=COMPILER_OPTIONS)
 
 
 @partial(jax.jit, compiler_options=COMPILER_OPTIONS)
-def _many_exponents(
+def _each(
     picture: Picture, log_n: Float[Array, " N"], reference: Float[Array, "3 C"], peak: Float[Array, ""]
-) -> Float[Array, "N S"] | Float[Array, "N C S"]:
+) -> tuple[Float[Array, "N G S"], Float[Array, "N R-1 Cb"]]:
     return jax.lax.map(lambda one: _all_blocks(picture, one[None], reference, peak), log_n)
+
+
+def _unpack(packed: Float[np.ndarray, "*N G S"], mean: Float[np.ndarray, "*N R-1 Cb"], picture: Picture) -> Sums:
+    """Undo the packing, and what was done to the columns.
+
+    The ambient column is constant and was summed as 1; the others were summed less their means.
+    """
+    leading, channels, columns = packed.shape[:-2], picture.target.shape[1], mean.shape[-2] + 1
+    place = np.zeros((columns, columns), int)
+    triangle = columns * (columns + 1) // 2
+    place[np.triu_indices(columns)] = np.arange(triangle)
+    place = np.maximum(place, place.T)
+    products = triangle + channels // packed.shape[-2] * columns
+    # A row of it makes a column of what was summed, in units of the ambient light.
+    whole = np.zeros((*leading, mean.shape[-1], columns, columns)) + np.eye(columns)
+    whole[..., 1:, 0] = mean.swapaxes(-1, -2)
+    scale = np.ones((channels, columns))
+    scale[:, 0] = picture.ambient
+    gram = whole @ packed[..., place] @ whole.swapaxes(-1, -2) * (scale[:, :, None] * scale[:, None, :])
+    product = packed[..., triangle:products].reshape(*leading, channels, columns, 1)
+    product = (whole @ product)[..., 0] * scale
+    square = packed[..., products:-1].reshape(*leading, channels)
+    more = [(0, 0)] * product.ndim + [(0, max(0, 4 - columns))]
+    return Sums(
+        gram=np.pad(gram, [*more[:-2], more[-1], more[-1]]),
+        product=np.pad(product, more[1:]),
+        square=square,
+        pixels=np.broadcast_to(packed[..., -1], square.shape),
+    )
 
 
 def sums(
@@ -363,15 +372,15 @@ def sums(
     reference: Float[np.ndarray, "C 3"],
     *,
     grid: bool = False,
-    peak: float | Float[np.ndarray, ""] = 0.0,
+    peak: float = 0.0,
 ) -> Sums:
     """One pass over the pixels of one or many pictures, each let go before the next is asked for.
 
     Args:
         pictures: The pictures, or the tiles of one; at least one.
-        log_n: Natural logarithms of the exponent. None: the columns are ambient and diffuse. One: also the lobe and its
-            derivative by log n. Two make a bracket: beside value ``s_0`` and derivative ``s_0'`` at the first, the
-            columns are ``s_1 - s_0 - (log n_1 - log n_0) s_0'`` and ``s_1' - s_0'``.
+        log_n: Natural logarithms of the exponent. None: the columns are ambient and diffuse, and two of zeros. One:
+            also the lobe and its derivative by log n. Two make a bracket: beside value ``s_0`` and derivative ``s_0'``
+            at the first, the columns are ``s_1 - s_0 - (log n_1 - log n_0) s_0'`` and ``s_1' - s_0'``.
         reference: Coefficients x_a, x_d, x_s of the reference model; the lobe is that of the first exponent.
         grid: Treat each of ``log_n`` on its own; the sums have a leading axis N.
         peak: Take ``S exp(-n peak)`` for the lobe, its derivative and the reference; see :func:`relative_lobe`.
@@ -379,11 +388,24 @@ def sums(
     Returns:
         The sums over all pixels.
     """
-    run = _many_exponents if grid else _one_exponent
-    columns = 4 if grid else 2 + 2 * log_n.size
     result: Sums | None = None
     for picture in pictures:
-        part = _unpack(np.asarray(run(picture, log_n, reference.T, np.float64(peak))), picture, columns, int(grid))
+        packed, mean = (_each if grid else _one)(picture, log_n, reference.T, np.float64(peak))
+        part = _unpack(np.asarray(packed), np.asarray(mean, np.float64), picture)
         result = part if result is None else Sums(*map(np.add, result, part))
     assert result is not None
     return result
+
+
+def sums_at(pictures: Iterable[Picture], n: float, x: Float[np.ndarray, "3 C"]) -> Sums:
+    """Sums about the target at an optimum, the last column being the derivative by n.
+
+    Args:
+        pictures: as they were searched.
+        n: the exponent.
+        x: the coefficients, which the sums are exact near.
+    """
+    with jax.enable_x64(True):
+        parts = sums(pictures, np.log([n]), x.T).about(np.pad(x.T, [(0, 0), (0, 1)]))
+    by_n = np.array([1.0, 1.0, 1.0, 1.0 / n])
+    return parts._replace(gram=parts.gram * by_n[:, None] * by_n, product=parts.product * by_n)

@@ -12,21 +12,18 @@ on disk are the same loop.
    1 or more, so steps of 0.35 miss no minimum.
 2. The subsample also says how far its profile may be from that of all pixels. If one valley is left at six standard
    deviations, the search goes on there; else the grid is repeated on all pixels where the optimum may be.
-3. A bracket is polished on all pixels with one pass at its two ends (:mod:`fitting.solver.refinement`): values and
+3. A bracket is refined on all pixels with one pass at its two ends (:mod:`fitting.solver.refinement`): values and
    slopes of the lobe there, Hermite's cubic in between, so all products needed in the bracket follow from one Gram
-   matrix.
+   matrix, and Brent's method finds the least cost in it without a pixel.
 4. Passes at the optimum in residual form give the exact cost and a joint Gauss-Newton correction of x and n, repeated
    while it moves n.
 
-What optimistix does. Step 3 leaves a root of a scalar function on an interval, the slope of the profile, at the price
-of a 6 x 6 matrix. ``optimistix.root_find`` with ``Bisection`` keeps the bracket whatever active sets do to the slope's
-derivative, and needs no derivative to be traced; ``Newton`` takes three times as long to trace and may jump across the
-kinks where an unknown leaves zero; ``GoldenSearch`` on the cost itself stops at half the digits. With no pixel inside
-the solver, its 30 steps take 0.1 ms, and it is compiled once per number of channels for every picture and lobe.
+A cap on sums of coefficients (k_d + k_s <= 1, what a plausible material keeps) is one more bound of the tiny problem:
+the same search under it is as global.
 """
 
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -34,11 +31,27 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from fitting.solver.enumeration import Linear
 from fitting.solver.normal_equations import Picture, Sums, sums
-from fitting.solver.refinement import GRID_STEP, Point, Polisher, Problem, Start, solve_linear
+from fitting.solver.refinement import (
+    GRID_STEP,
+    TOLERANCE_DOUBLE,
+    TOLERANCE_SINGLE,
+    Cap,
+    Linear,
+    Point,
+    Problem,
+    Start,
+    enclose,
+    gauss_newton,
+    problem_of,
+    solve_linear,
+)
 from fitting.solver.streams import Stream, each
 from fitting.solver.subsample import Subsample, spread, subsample
+
+# How many pixels of all pictures together the grid is evaluated on, and how many of each picture at least.
+SAMPLE_SIZE = 4096
+SMALLEST_SAMPLE = 256
 
 # Six standard deviations: one wrong rejection in 1e9, and the variance itself is an estimate.
 DEVIATIONS = 6.0
@@ -85,7 +98,7 @@ class Profile(NamedTuple):
     @property
     def cost(self) -> Float[np.ndarray, " G"]:
         """Cost summed over channels."""
-        return np.array(self.linear.cost, np.float64).sum(axis=1)
+        return self.linear.cost.sum(axis=1)
 
     def margin(self) -> Float[np.ndarray, " G-1"]:
         """How far the cubic may be from the profile, cell by cell."""
@@ -94,12 +107,12 @@ class Profile(NamedTuple):
 
     def nearest(self, log_n: float) -> Float[np.ndarray, "C 3"]:
         """The best coefficients at the nearest sample."""
-        return np.asarray(self.linear.x)[np.argmin(np.abs(self.log_n - log_n))]
+        return self.linear.x[np.argmin(np.abs(self.log_n - log_n))]
 
     def fine(self) -> tuple[Float[np.ndarray, "G 33"], Float[np.ndarray, "G 33"]]:
         """Positions and values of the piecewise cubic through samples and slopes, 33 per cell, ends included."""
         t = np.linspace(0.0, 1.0, 33)
-        cost, slope = self.cost[:, None], np.asarray(self.linear.slope)[:, None]
+        cost, slope = self.cost[:, None], self.linear.slope[:, None]
         step = (self.log_n[1:] - self.log_n[:-1])[:, None]
         values = cost[:-1] + t * t * (3 - 2 * t) * (cost[1:] - cost[:-1])
         values = values + step * t * (1 - t) * ((1 - t) * slope[:-1] - t * slope[1:])
@@ -129,10 +142,10 @@ def rough_model(pictures: Iterable[Picture]) -> Float[np.ndarray, "C 3"]:
     return np.pad(x, [(0, 0), (0, 1)])
 
 
-def profile_on_grid(pictures: Collection[Picture], log_n: np.ndarray, rough: np.ndarray, problem: Problem) -> Profile:
+def profile_on_grid(pictures: Iterable[Picture], log_n: np.ndarray, rough: np.ndarray, problem: Problem) -> Profile:
     """The profile on a grid."""
     parts = sums(pictures, log_n, rough, grid=True, peak=problem.peak)
-    linear = jax.tree.map(np.asarray, solve_linear(parts, rough, problem))
+    linear = solve_linear(parts, log_n, rough, problem)
     # What each term of the cost is rounded by, relative to the reference.
     size = np.abs(linear.x - rough) * np.sqrt(np.diagonal(parts.gram, axis1=-2, axis2=-1)[..., :3])
     rounding = np.finfo(np.float32).eps * np.sum(np.sum(size, axis=-1) ** 2, axis=-1)
@@ -141,15 +154,11 @@ def profile_on_grid(pictures: Collection[Picture], log_n: np.ndarray, rough: np.
 
 def with_errors(profile: Profile, samples: Sequence[Subsample], problem: Problem) -> Profile:
     """How far the subsample's profile may be from that of all pixels."""
-    best = np.argmin(profile.cost)
-    log_n, x = profile.log_n, profile.linear.x
-    # It varies slowly; every other sample will do.
-    few = np.append(np.arange(0, log_n.size - 1, 2), log_n.size - 1)
-    variance = np.zeros((2, few.size))
+    variance = np.zeros((2, profile.log_n.size))
     for sample in samples:
         if sample.factor is not None:
-            variance = variance + np.stack(spread(sample, log_n[few], x[few], log_n[best], x[best], problem.peak))
-    error, slope_error = (np.interp(log_n, log_n[few], each) for each in variance**0.5)
+            variance += spread(sample, profile.log_n, profile.linear.x, np.argmin(profile.cost), problem.peak)
+    error, slope_error = np.sqrt(variance)
     return profile._replace(error=error, slope_error=slope_error)
 
 
@@ -175,7 +184,7 @@ def start_from_sample(profile: Profile, problem: Problem) -> Start | None:
     centre = float(position[cell, t])
     # Three standard deviations and what the cubic is off; a bracket that misses moves on.
     half = min(3 * float(np.max(profile.slope_error[cell : cell + 2])) / curvature + 0.01, GRID_STEP)
-    least, most = float(problem.lower), float(problem.upper)
+    least, most = problem.bounds
     return Start(max(least, centre - half), min(most, centre + half), least, most, profile.nearest(centre))
 
 
@@ -193,7 +202,7 @@ def starts(profile: Profile, problem: Problem) -> list[Start]:
     minima = np.flatnonzero((flat <= before) & (flat <= after) & (flat <= limit))
     # A dent no deeper than rounding is no minimum of its own: where a highlight is smaller than a pixel, the profile is
     # level over decades of n.
-    depth = 1e-9 * low + 2 * float(problem.tolerance) * (low + np.max(profile.cost))
+    depth = 1e-9 * low + 2 * problem.tolerance * (low + np.max(profile.cost))
     found: list[int] = []
     for i in minima[np.argsort(flat[minima], kind="stable")]:
         if all(np.max(flat[min(i, j) : max(i, j) + 1]) > flat[i] + depth for j in found):
@@ -208,15 +217,6 @@ def starts(profile: Profile, problem: Problem) -> list[Start]:
         lower, upper = float(profile.log_n[cell]), float(profile.log_n[cell + 1])
         starts.append(Start(lower, upper, least, most, profile.nearest(float(position[cell, t]))))
     return starts
-
-
-# How many pixels of all pictures together the grid is evaluated on, and how many of each picture at least.
-SAMPLE_SIZE = 4096
-SMALLEST_SAMPLE = 256
-
-# What rounding may leave of a column that depends on the others: a few units in the last place of the pixels.
-_TOLERANCE_SINGLE = 2e-7
-_TOLERANCE_DOUBLE = 1e-14
 
 
 class Optimum(eqx.Module):
@@ -236,7 +236,6 @@ class Optimum(eqx.Module):
         grid: Exponents of the profile's samples; empty without a lobe.
         profile: Least cost at each, summed over channels; of the subsample, scaled, where ``profile_sampled``.
         profile_sampled: The profile is that of a subsample of the pixels.
-        brackets: Lower and upper exponent of each bracket polished on all pixels, in order.
     """
 
     n: float
@@ -250,7 +249,6 @@ class Optimum(eqx.Module):
     grid: Float[np.ndarray, " G"]
     profile: Float[np.ndarray, " G"]
     profile_sampled: bool
-    brackets: Float[np.ndarray, "B 2"]
 
     @property
     def gauss_newton(self) -> Float[np.ndarray, "C 4 4"]:
@@ -266,6 +264,7 @@ def search(
     n_min: float = 0.1,
     n_max: float = 1e6,
     free: Bool[np.ndarray, "3 C"] | None = None,
+    cap: Cap | None = None,
 ) -> Optimum:
     """Find the global optimum over the exponent and the non-negative coefficients.
 
@@ -277,138 +276,120 @@ def search(
         n_max: Largest exponent.
         free: Which of x_a, x_d, x_s may be above 0, per channel; all by default. If no x_s may be, or no picture has a
             lobe, the problem is linear and n without meaning.
+        cap: From the exponent to what x_a, x_d, x_s of each channel count in a sum of at most 1, (3, C); None for no
+            such bound.
 
     Returns:
         The optimum.
     """
     with jax.enable_x64(True):
-        first = next(iter(pictures))
-        channels = first.target.shape[1]
-        free = np.ones((3, channels), bool) if free is None else np.asarray(free)
-        single = np.dtype(first.target.dtype) == np.float32
-        tolerance, accuracy = (_TOLERANCE_SINGLE, 1e-5) if single else (_TOLERANCE_DOUBLE, 5e-9)
-        lower, upper = np.asarray(math.log(n_min)), np.asarray(math.log(n_max))
-        bounds = n_min, n_max
-        problem = Problem(free.T, np.asarray(tolerance), accuracy, bounds, lower, upper, peak=np.zeros(()))
-        if not free[2].any():
-            return _search_without_lobe(pictures, problem)
-        size = max(SMALLEST_SAMPLE, SAMPLE_SIZE // len(pictures))
-        samples = [subsample(picture, size, n_max) for picture in pictures]
-        if all(sample.picture.lobe is None for sample in samples):
-            return _search_without_lobe(pictures, problem)
-        nearest = min(sample.nearest for sample in samples)
-        problem = problem._replace(peak=np.asarray(-nearest if nearest < math.inf else 0.0))
-        if n_min == n_max:
-            return _search_at_one(pictures, problem)
-        found = _search_with_lobe(pictures, samples, problem, single=single)
+        problem = problem_of(pictures, (n_min, n_max), free)._replace(cap=cap)
+        samples: Sequence[Subsample] = []
+        if problem.lobe:
+            size = max(SMALLEST_SAMPLE, SAMPLE_SIZE // len(pictures))
+            samples = [subsample(picture, size, n_max) for picture in pictures]
+            problem = problem._replace(lobe=any(sample.picture.lobe is not None for sample in samples))
+        if problem.lobe:
+            nearest = min(sample.nearest for sample in samples)
+            problem = problem._replace(peak=-nearest if nearest < math.inf else 0.0)
+        if not problem.lobe or n_min == n_max:
+            nothing = np.zeros(problem.free.shape)
+            return _optimum(*gauss_newton(problem, Point(problem.bounds[0], nothing, nothing[:, 0])), problem)
+        found = _search_with_lobe(problem, samples)
         if found is not None:
             return found
         # Sums in double precision over all pixels, one picture at a time: slow, and rarely needed.
-        exact = Stream(lambda i: _in_double(pictures[i]), len(pictures))
-        problem = problem._replace(tolerance=np.asarray(_TOLERANCE_DOUBLE))
-        samples = each(lambda picture: Subsample(picture, None, 0.0), exact)
-        found = _search_with_lobe(exact, samples, problem, single=False)
+        exact = Stream(lambda i: jax.tree.map(lambda leaf: leaf.astype(np.float64), pictures[i]), len(pictures))
+        problem = problem._replace(pictures=exact, tolerance=TOLERANCE_DOUBLE)
+        found = _search_with_lobe(problem, each(lambda picture: Subsample(picture, None, 0.0), exact))
         assert found is not None
         return found
 
 
-def _in_double(picture: Picture) -> Picture:
-    return jax.tree.map(lambda leaf: leaf.astype(np.float64), picture)
-
-
-def fit_linear(pictures: Sequence[Picture], *, free: Bool[np.ndarray, "3 C"] | None = None) -> Optimum:
+def fit_linear(
+    pictures: Sequence[Picture], *, free: Bool[np.ndarray, "3 C"] | None = None, cap: Cap | None = None
+) -> Optimum:
     """Ambient and diffuse only: one linear solve, a second in residual form for the exact cost.
 
     Args:
         pictures: As for :func:`search`; their lobes are not looked at.
         free: Which of x_a, x_d may be above 0.
+        cap: As for :func:`search`.
     """
     channels = next(iter(pictures)).target.shape[1]
     free = np.ones((3, channels), bool) if free is None else np.array(free)
     free[2] = False
-    return search(pictures, free=free)
+    return search(pictures, free=free, cap=cap)
 
 
-def _search_without_lobe(pictures: Sequence[Picture], problem: Problem) -> Optimum:
-    """A linear solve, and a second about its answer for the exact cost."""
+def fit_tied(
+    pictures: Sequence[Picture],
+    optimum: Optimum,
+    free: Bool[np.ndarray, "3 C"],
+    tied: Float[np.ndarray, " C"],
+    n_range: tuple[float, float],
+) -> Optimum:
+    """The optimum with one specular coefficient for all channels, from that with one for each.
 
-    def once(reference: Float[np.ndarray, "C 3"]) -> tuple[Point, Sums]:
-        parts = sums(pictures, np.zeros(0), reference)
-        # The columns of the lobe are empty.
-        gram, product = np.pad(parts.gram, [(0, 0), (0, 2), (0, 2)]), np.pad(parts.product, [(0, 0), (0, 2)])
-        parts = Sums(gram, product, parts.square, parts.pixels)
-        solved = jax.tree.map(np.asarray, solve_linear(parts, reference, problem))
-        return Point(problem.lower, solved.x, solved.cost), parts.about(np.pad(reference, [(0, 0), (0, 1)]))
-
-    first, _ = once(np.zeros(problem.free.shape))
-    return _optimum(*once(first.x), problem, None, False, [])
-
-
-def _search_at_one(pictures: Sequence[Picture], problem: Problem) -> Optimum:
-    """The same with the exponent given."""
-    x = np.zeros(problem.free.shape)
-    parts = sums(pictures, problem.lower[None], x, peak=problem.peak)
-    solved = jax.tree.map(np.asarray, solve_linear(parts, x, problem))
-    settled = Polisher(pictures, problem, []).settle(Point(problem.lower, solved.x, solved.cost))
-    return _optimum(*settled, problem, None, False, [])
+    Args:
+        pictures: as they were searched.
+        optimum: of the search with the same ``free``.
+        free: which coefficients may be above 0.
+        tied: x_s is a common factor times this, (C,).
+        n_range: bounds of n.
+    """
+    tied = np.where(free[2], tied, 0.0)
+    x = optimum.x.copy()
+    x[2] = tied * (x[2] @ tied) / max(tied @ tied, np.finfo(float).tiny)
+    with jax.enable_x64(True):
+        problem = problem_of(pictures, n_range, free)._replace(tied=tied)
+        found = _optimum(*gauss_newton(problem, Point(math.log(optimum.n), x.T, optimum.cost)), problem)
+    profile = (optimum.grid, optimum.profile, optimum.profile_sampled)
+    return eqx.tree_at(lambda o: (o.grid, o.profile, o.profile_sampled), found, profile)
 
 
-def _search_with_lobe(
-    pictures: Sequence[Picture], samples: Sequence[Subsample], problem: Problem, *, single: bool
-) -> Optimum | None:
-    """The search; nothing where it is done in single precision and that does not resolve the profile."""
+def _search_with_lobe(problem: Problem, samples: Sequence[Subsample]) -> Optimum | None:
+    """The search; nothing where single precision does not resolve the profile."""
     few = each(lambda sample: sample.picture, samples)
     rough = rough_model(few)
-    count = max(2, 1 + math.ceil((problem.upper - problem.lower) / GRID_STEP))
-    log_n = np.linspace(problem.lower, problem.upper, count)
-    run = Polisher(pictures, problem, [])
+    lower, upper = problem.bounds
+    count = max(2, 1 + math.ceil((upper - lower) / GRID_STEP))
+    log_n = np.linspace(lower, upper, count)
     sampled = any(sample.factor is not None for sample in samples)
-    if not sampled:
-        profile = part = profile_on_grid(pictures, log_n, rough, problem)
-        if single and not profile.resolved():
-            return None
-    else:
-        # Most subsamples are float32.
-        profile = profile_on_grid(few, log_n, rough, problem._replace(tolerance=np.asarray(_TOLERANCE_SINGLE)))
-        # The subsample is in single precision whatever the pictures are.
-        if not profile.resolved():
-            return None
+    # Most subsamples are float32.
+    profile = profile_on_grid(few, log_n, rough, problem._replace(tolerance=TOLERANCE_SINGLE) if sampled else problem)
+    part = profile
+    if (sampled or problem.tolerance == TOLERANCE_SINGLE) and not profile.resolved():
+        return None
+    if sampled:
         profile = with_errors(profile, samples, problem)
         start = start_from_sample(profile, problem)
         if start is not None:
-            point, inside = run.polish(start)
+            point, inside = enclose(problem, start)
             if inside:
-                return _optimum(*run.settle(point), problem, profile, True, run.tried)
+                return _optimum(*gauss_newton(problem, point), problem, profile, sampled=True)
         first, last = possible_cells(profile)
-        # A few lengths, hence a few compilations.
-        length = min(count, 8 * math.ceil((last - first + 4) / 8))
-        first = min(max(0, first - 1), count - length)
-        part = profile_on_grid(pictures, log_n[first : first + length], rough, problem)
-    candidates = [run.settle(run.polish(start)[0]) for start in starts(part, problem)]
+        part = profile_on_grid(problem.pictures, log_n[max(0, first - 1) : last + 3], rough, problem)
+    candidates = [gauss_newton(problem, enclose(problem, start)[0]) for start in starts(part, problem)]
     # Where the profile is level the best sample may be no worse than what the brackets led to.
     best = int(np.argmin(part.cost))
     if part.cost[best] < min(np.sum(point.cost) for point, _ in candidates):
-        x, cost = np.asarray(part.linear.x[best]), np.asarray(part.linear.cost[best])
-        candidates.append(run.settle(Point(part.log_n[best], x, cost)))
+        point = Point(float(part.log_n[best]), part.linear.x[best], part.linear.cost[best])
+        candidates.append(gauss_newton(problem, point))
     point, about = min(candidates, key=lambda candidate: float(np.sum(candidate[0].cost)))
-    return _optimum(point, about, problem, profile, sampled, run.tried)
+    return _optimum(point, about, problem, profile, sampled=sampled)
 
 
 def _optimum(
-    point: Point,
-    about: Sums,
-    problem: Problem,
-    profile: Profile | None,
-    sampled: bool,
-    tried: list[tuple[float, float]],
+    point: Point, about: Sums, problem: Problem, profile: Profile | None = None, *, sampled: bool = False
 ) -> Optimum:
     """Gather the answer, with the lobe and its derivative by n in place of those relative to the lobe's peak."""
     # An exponent at its bound is the bound, not the exponential of its logarithm.
-    known = dict(zip((float(problem.lower), float(problem.upper)), problem.bounds, strict=True))
-    n = known.get(float(point.log_n), math.exp(point.log_n))
-    decay = math.exp(n * float(problem.peak))
+    known = dict(zip(problem.bounds, problem.n_range, strict=True))
+    n = known.get(point.log_n, math.exp(point.log_n))
+    decay = math.exp(n * problem.peak)
     columns = np.diag([1.0, 1.0, decay, decay / n])
-    columns[3, 2] = decay * float(problem.peak)
+    columns[3, 2] = decay * problem.peak
     x = point.x.T.copy()
     x[2] /= decay
     return Optimum(
@@ -423,5 +404,4 @@ def _optimum(
         grid=np.zeros(0) if profile is None else np.exp(profile.log_n),
         profile=np.zeros(0) if profile is None else profile.cost,
         profile_sampled=sampled,
-        brackets=np.exp(np.array(tried).reshape(-1, 2)),
     )

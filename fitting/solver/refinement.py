@@ -2,60 +2,121 @@
 
 import itertools
 import math
-from collections.abc import Collection
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
-from fitting.solver import enumeration
-from fitting.solver.normal_equations import AnyArray, Picture, Sums, sums
+from fitting.solver.nnls import nonnegative_minima, nonnegative_minimum
+from fitting.solver.normal_equations import Picture, Sums, sums
+from fitting.solver.tied import design_of, join_channels
 
 # As a function of log n a lobe varies on a scale of 1 or more; steps of the coarse grid, and the widest bracket.
 GRID_STEP = 0.35
 
 # Over a bracket this wide Hermite's cubic is within 4e-6 of the lobe; the corrections of the last passes do the rest.
+# Under a cap there are none: a quarter of the width is 256 times closer.
 _WIDEST_BRACKET = 0.2
+_WIDEST_CAPPED = 0.05
 
 _MOST_BRACKETS = 10
 _MOST_CORRECTIONS = 8
+
+# What rounding may leave of a column that depends on the others: a few units in the last place of the pixels.
+TOLERANCE_SINGLE = 2e-7
+TOLERANCE_DOUBLE = 1e-14
+
+# Of an interval searched: the three samples that the last parabola goes through are so far apart.
+_CLOSE = 1e-3
+
+Cap = Callable[[float], Float[np.ndarray, "3 C"]]
+"""From the exponent to what x_a, x_d, x_s count in a sum that may not exceed 1, channel by channel."""
 
 
 class Problem(NamedTuple):
     """What stays the same during one search.
 
     Attributes:
+        pictures: The pictures or tiles; gone through once per pass.
         free: Which coefficients may be above 0.
         tolerance: What rounding may leave of a column that depends on the others, relative.
         accuracy: How far from the optimum log n may end.
-        bounds: Smallest and largest exponent.
-        lower: Natural logarithm of the smallest exponent.
-        upper: That of the largest.
+        n_range: Smallest and largest exponent.
+        lobe: Whether there is a highlight to search for.
         peak: Logarithm of the largest cosine of any pixel. Coefficients x_s are relative to ``exp(n peak)``.
+        cap: A bound on sums of coefficients, or none.
+        tied: x_s is a common factor times this; None where the channels are independent.
     """
 
+    pictures: Sequence[Picture]
     free: Bool[np.ndarray, "C 3"]
-    tolerance: Float[np.ndarray, ""]
+    tolerance: float
     accuracy: float
-    bounds: tuple[float, float]
-    lower: Float[np.ndarray, ""]
-    upper: Float[np.ndarray, ""]
-    peak: Float[np.ndarray, ""]
+    n_range: tuple[float, float]
+    lobe: bool = True
+    peak: float = 0.0
+    cap: Cap | None = None
+    tied: Float[np.ndarray, " C"] | None = None
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Of log n."""
+        return math.log(self.n_range[0]), math.log(self.n_range[1])
+
+    def sums(self, log_n: Any, reference: Float[np.ndarray, "C 3"]) -> Sums:
+        """One pass over all pixels."""
+        return sums(self.pictures, np.atleast_1d(log_n) if self.lobe else np.zeros(0), reference, peak=self.peak)
+
+    def caps(self, log_n: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N C 3"]:
+        """What the coefficients, relative to the peak, count towards the cap."""
+        assert self.cap is not None
+        caps = np.stack([self.cap(float(n)).T for n in np.exp(log_n)])
+        caps[:, :, 2] *= np.exp(-np.exp(log_n) * self.peak)[:, None]
+        return caps
+
+
+def problem_of(
+    pictures: Sequence[Picture], n_range: tuple[float, float], free: Bool[np.ndarray, "3 C"] | None
+) -> Problem:
+    """The problem of some pictures, all of one dtype.
+
+    Args:
+        pictures: of one material.
+        n_range: smallest and largest exponent.
+        free: which coefficients may be above 0; None for all.
+    """
+    first = next(iter(pictures))
+    free = np.ones((3, first.target.shape[1]), bool) if free is None else np.asarray(free)
+    single = np.dtype(first.target.dtype) == np.float32
+    tolerance, accuracy = (TOLERANCE_SINGLE, 1e-5) if single else (TOLERANCE_DOUBLE, 5e-9)
+    return Problem(pictures, free.T, tolerance, accuracy, n_range, lobe=bool(free[2].any()))
+
+
+class Linear(NamedTuple):
+    """The best coefficients at one exponent, or at each of some.
+
+    Attributes:
+        x: Coefficients x_a, x_d, x_s, at least 0.
+        cost: Sum of weighted squared residuals.
+        slope: Derivative of the cost by log n, summed over channels.
+    """
+
+    x: Float[np.ndarray, "*N C 3"]
+    cost: Float[np.ndarray, "*N C"]
+    slope: Float[np.ndarray, "*N"]
 
 
 class Point(NamedTuple):
-    """A candidate: coefficients as (C, 3)."""
+    """A candidate."""
 
-    log_n: Float[np.ndarray, ""]
+    log_n: float
     x: Float[np.ndarray, "C 3"]
     cost: Float[np.ndarray, " C"]
 
 
 class Start(NamedTuple):
-    """Where to polish a minimum: a first bracket in log n, the range it may move in, and a model near by."""
+    """Where to look for a minimum: a first bracket in log n, the range it may move in, and a model near by."""
 
     lower: float
     upper: float
@@ -64,82 +125,105 @@ class Start(NamedTuple):
     x: Float[np.ndarray, "C 3"]
 
 
-@jax.jit
-def solve_linear(parts: Sums, reference: Float[Array, "C 3"], problem: Problem) -> enumeration.Linear:
-    """The best coefficients at the exponent of the sums, or at each of a grid."""
-    return enumeration.solve(parts.gram, parts.product, parts.square, reference, problem.free, problem.tolerance)
-
-
-def solve_within(
-    parts: Sums,
-    t: Float[Array, ""],
-    width: Float[Array, ""],
-    reference: Float[Array, "C 3"],
-    free: Bool[AnyArray, "C 3"],
-    tolerance: Float[AnyArray, ""],
-) -> enumeration.Linear:
-    """The best coefficients at one exponent within a bracket, the lobe there being Hermite's cubic of its ends.
+def minimum_between(
+    costs: Callable[[Float[np.ndarray, " T"]], Float[np.ndarray, " T"]], low: float, high: float, points: int = 17
+) -> float:
+    """Where a function of one number is least: samples, again around the best of them, at last a parabola.
 
     Args:
-        parts: Sums of the bracket.
-        t: Where in the bracket, from 0 to 1.
-        width: Of the bracket, in log n.
-        reference: The reference model of the sums, whose lobe is that of the lower end.
-        free: Which coefficients may be above 0.
-        tolerance: See :func:`fitting.solver.enumeration.solve`.
-
-    Returns:
-        Coefficients, cost and slope.
+        costs: the function, of several numbers at once.
+        low: lower bound.
+        high: upper bound.
+        points: how many are tried at once.
     """
-    # Ambient, diffuse, lobe and derivative as combinations of the columns of a bracket.
-    value = jnp.stack([jnp.ones_like(t), t * width, t * t * (3 - 2 * t), t * t * (t - 1) * width])
-    slope = jnp.stack([jnp.zeros_like(t), jnp.ones_like(t), 6 * t * (1 - t) / width, t * (3 * t - 2)])
-    basis = jnp.eye(4, 6).at[2:, 2:].set(jnp.stack([value, slope]))
-    # The reference model gets the lobe of t, which changes its residual.
-    change = reference[:, 2:] * (basis[2] - jnp.eye(6)[2])
-    moved = jnp.sum(parts.gram * change[:, None, :], axis=2)
-    product = jnp.sum(basis * (parts.product - moved)[:, None, :], axis=2)
-    square = parts.square + jnp.sum(change * (moved - 2 * parts.product), axis=1)
-    half = jnp.sum(basis[None, :, None, :] * parts.gram[:, None, :, :], axis=3)
-    gram = jnp.sum(half[:, :, None, :] * basis[None, None, :, :], axis=3)
-    return enumeration.solve(gram, product, square, reference, free, tolerance)
+    width = high - low
+    while True:
+        at = np.linspace(low, high, points)
+        cost = costs(at)
+        middle = int(np.clip(np.argmin(cost), 1, points - 2))
+        low, here, high = at[middle - 1 : middle + 2]
+        if high - here <= _CLOSE * width:
+            break
+    before, after = np.diff(cost[middle - 1 : middle + 2])
+    bend = after - before
+    vertex = here - (high - here) * (before + after) / (2 * bend) if bend > 0 else at[np.argmin(cost)]
+    return float(np.clip(vertex, low, high))
 
 
-@jax.jit
+def solve_linear(parts: Sums, log_n: Any, reference: Float[np.ndarray, "C 3"], problem: Problem) -> Linear:
+    """The best coefficients at the exponent of the sums, or at each of several.
+
+    By the envelope theorem the coefficients may be held for the slope: -2 x_s <S', r>, r the best residual; and where
+    the cap is reached, its multiplier times the change of the cap.
+
+    Args:
+        parts: Sums, columns ambient, diffuse, lobe and derivative by log n; with a leading axis N or none.
+        log_n: One exponent, or (N,).
+        reference: The reference model of the sums.
+        problem: Bounds.
+    """
+    if problem.tied is not None and np.ndim(log_n):
+        each = [Sums(*(leaf[i] for leaf in parts)) for i in range(len(log_n))]
+        solved = [solve_linear(one, at, reference, problem) for one, at in zip(each, log_n, strict=True)]
+        return Linear(*map(np.stack, zip(*solved, strict=True)))
+    gram, product = parts.gram[..., :3, :3], parts.product[..., :3]
+    cap = None
+    if problem.cap is not None:
+        cap = problem.caps(np.atleast_1d(log_n)).reshape(*np.shape(log_n), *reference.shape)
+    if problem.tied is None:
+        x = nonnegative_minima(gram, product, reference, problem.free, problem.tolerance, cap)
+    else:
+        about = parts.about(np.pad(reference, [(0, 0), (0, 1)]))
+        whole, right, _ = join_channels(about.gram, about.product, about.square, reference[:, 2])
+        design = design_of(problem.free.T, problem.tied)[:, :-1]
+        x = (design @ nonnegative_minimum(design.T @ whole @ design, design.T @ right))[:-1].reshape(3, -1).T
+    step = x - reference
+    pull = parts.product - (parts.gram[..., :3] @ step[..., None])[..., 0]
+    change = -np.sum(step * (product + pull[..., :3]), axis=-1)
+    slope = -2 * np.sum(x[..., 2] * pull[..., 3], axis=-1)
+    if cap is not None:
+        later, before = (problem.caps(np.atleast_1d(log_n) + shift)[..., 2] for shift in (1e-4, -1e-4))
+        by_log_n = (later - before).reshape(cap.shape[:-1]) / 2e-4
+        counts = (x > 0) & (cap > 0)
+        first = np.argmax(counts, axis=-1)[..., None]
+        pulled, counted = (np.take_along_axis(a, first, axis=-1)[..., 0] for a in (pull[..., :3], cap))
+        multiplier = np.where(np.any(counts, axis=-1), 2 * pulled / np.where(counted > 0, counted, 1.0), 0.0)
+        slope = slope + np.sum(multiplier * x[..., 2] * by_log_n, axis=-1)
+    return Linear(x, np.maximum(parts.square + change, 0.0), slope)
+
+
 def _solve_bracket(
-    parts: Sums, ends: Float[Array, "2"], reference: Float[Array, "C 3"], problem: Problem
-) -> tuple[Point, Float[Array, ""]]:
+    parts: Sums, lower: float, upper: float, reference: Float[np.ndarray, "C 3"], problem: Problem
+) -> tuple[Point, float]:
     """The least cost within a bracket, and where it lies, as a share of the bracket."""
-    step = ends[1] - ends[0]
+    width = upper - lower
 
-    def at(t: Float[Array, ""]) -> enumeration.Linear:
-        return solve_within(parts, t, step, reference, problem.free, problem.tolerance)
+    def at(shares: Float[np.ndarray, " T"]) -> Linear:
+        return solve_linear(parts.within(shares, width, reference), lower + shares * width, reference, problem)
 
-    shares = jnp.linspace(0.0, 1.0, 9)
-    linear = jax.vmap(at)(shares)
-    best = jnp.argmin(jnp.sum(linear.cost, axis=1))
-    low, high = jnp.maximum(best - 1, 0), jnp.minimum(best + 1, shares.size - 1)
-    scale = jnp.max(jnp.abs(linear.slope)) + jnp.finfo(float).tiny
-    # What a share of 1e-9 is off, the last correction makes good.
+    share = minimum_between(lambda shares: np.sum(at(shares).cost, axis=1), 0.0, 1.0)
+    found = at(np.array([share]))
+    return Point(lower + share * width, found.x[0], found.cost[0]), share
 
-    def slope(t: Float[Array, ""], _: None) -> tuple[Float[Array, ""], tuple[Float[Array, ""], enumeration.Linear]]:
-        here = at(t)
-        return here.slope / scale, (t, here)
 
-    share, at_root = optx.root_find(
-        slope,
-        optx.Bisection(rtol=0.0, atol=1e-9, flip=False),
-        shares[best],
-        options={"lower": shares[low], "upper": shares[high]},
-        has_aux=True,
-        max_steps=30,
-        throw=False,
-    ).aux
-    crosses = (linear.slope[low] < 0) & (linear.slope[high] > 0)
-    share, linear = jax.tree.map(
-        lambda root, sample: jnp.where(crosses, root, sample[best]), (share, at_root), (shares, linear)
-    )
-    return Point(ends[0] + share * step, linear.x, linear.cost), share
+def enclose(problem: Problem, start: Start) -> tuple[Point, bool]:
+    """Follow one minimum until it lies inside a bracket narrow enough for the cubic, and say whether it does."""
+    lower, upper, x = start.lower, start.upper, start.x
+    widest = _WIDEST_BRACKET if problem.cap is None else _WIDEST_CAPPED
+    for attempt in itertools.count(1):
+        point, share = _solve_bracket(problem.sums([lower, upper], x), lower, upper, x, problem)
+        half, x = (upper - lower) / 2, point.x
+        if (share <= 0 and lower > start.least) or (share >= 1 and upper < start.most):
+            half = min(2 * half, GRID_STEP)
+        elif 2 * half > widest:
+            # What the cubic leaves of the error of a grid cell is far below this.
+            half = widest / 8
+        else:
+            return point, True
+        if attempt == _MOST_BRACKETS:
+            return point, False
+        lower, upper = max(start.least, point.log_n - half), min(start.most, point.log_n + half)
+    raise AssertionError
 
 
 def _correct(parts: Sums, point: Point, problem: Problem) -> tuple[Point, float]:
@@ -153,27 +237,26 @@ def _correct(parts: Sums, point: Point, problem: Problem) -> tuple[Point, float]
     Returns:
         The new point, and about how far from the optimum in log n it still is.
     """
-    active = point.x > 0
     x_s = point.x[:, 2]
-    score = np.where(active, parts.product[:, :3], 0.0)
-    cross = np.where(active, x_s[:, None] * parts.gram[:, :3, 3], 0.0)
-    gram = np.where(active[:, :, None] & active[:, None, :], parts.gram[:, :3, :3], np.eye(3))
+    gram, product, _ = join_channels(parts.gram, parts.product, parts.square, x_s)
+    # Of the unknowns those above 0 are columns.
+    design = design_of((point.x > 0).T, problem.tied)[:-1]
+    design = design[:, np.any(design != 0, axis=0)]
+    cross, score = design.T @ gram[:-1, -1], design.T @ product[:-1]
     here = Point(point.log_n, point.x, parts.square)
     try:
-        solved = np.linalg.solve(gram, np.stack([score, cross], axis=-1))
+        solved = np.linalg.solve(design.T @ gram[:-1, :-1] @ design, np.stack([score, cross], axis=-1))
     except np.linalg.LinAlgError:
         return here, 0.0
-    gain, along = solved[..., 0], solved[..., 1]
-    curvature = np.sum(x_s * x_s * parts.gram[:, 3, 3])
-    left = curvature - np.sum(along * cross)
-    move = 0.0
-    if left > problem.tolerance * curvature:
-        move = (np.sum(x_s * parts.product[:, 3]) - np.sum(along * score)) / left
-    log_n = np.clip(point.log_n + move, problem.lower, problem.upper)
+    gain, along = solved[:, 0], solved[:, 1]
+    curvature = gram[-1, -1]
+    left = curvature - along @ cross
+    move = (product[-1] - along @ score) / left if left > problem.tolerance * curvature else 0.0
+    log_n = float(np.clip(point.log_n + move, *problem.bounds))
     move = log_n - point.log_n
-    x = np.where(active, np.maximum(point.x + gain - move * along, 0.0), 0.0)
+    x = np.maximum(point.x + (design @ (gain - move * along)).reshape(3, -1).T, 0.0)
     step = np.concatenate([x - point.x, (move * x_s)[:, None]], axis=1)
-    change = np.einsum("ci,cij,cj->c", step, parts.gram, step) - 2 * np.sum(step * parts.product, axis=1)
+    change = np.sum(step * ((parts.gram @ step[..., None])[..., 0] - 2 * parts.product), axis=1)
     if not np.sum(change) <= 0:
         return here, 0.0
     # A Gauss-Newton step shrinks the error by about the error itself plus the relative uncertainty of n (half of it was
@@ -182,72 +265,35 @@ def _correct(parts: Sums, point: Point, problem: Problem) -> tuple[Point, float]
     return Point(log_n, x, np.maximum(parts.square + change, 0.0)), float(abs(move) * (abs(move) + 2 * uncertainty))
 
 
-class Polisher(NamedTuple):
-    """One search, the host's side of it.
+def gauss_newton(problem: Problem, point: Point) -> tuple[Point, Sums]:
+    """Residual passes with joint corrections until n stands still: exact cost, sums about the target.
 
-    Attributes:
-        pictures: The pictures or tiles; gone through once per pass.
-        problem: Bounds.
-        tried: The brackets polished so far.
+    At each exponent the best coefficients are found anew, so that a coefficient may leave 0 or come to it. Where noise
+    leaves n loosely determined a Gauss-Newton step may pass the minimum: a point that costs more than the last is
+    brought back, to the minimum of the parabola through both. Nothing is returned on the word of the quadratic model
+    unless its step was negligible. Under a cap the exponent is that of the bracket.
     """
-
-    pictures: Collection[Picture]
-    problem: Problem
-    tried: list[tuple[float, float]]
-
-    def polish(self, start: Start) -> tuple[Point, bool]:
-        """Follow one minimum until it lies inside a bracket narrow enough for the cubic, and say whether it does."""
-        lower, upper, x = start.lower, start.upper, start.x
-        for attempt in itertools.count(1):
-            ends = np.array([lower, upper])
-            self.tried.append((lower, upper))
-            parts = sums(self.pictures, ends, x, peak=self.problem.peak)
-            point, share = jax.tree.map(np.asarray, _solve_bracket(parts, ends, x, self.problem))
-            centre, half, x = float(point.log_n), (upper - lower) / 2, point.x
-            if (share <= 0 and lower > start.least) or (share >= 1 and upper < start.most):
-                half = min(2 * half, GRID_STEP)
-            elif 2 * half > _WIDEST_BRACKET:
-                # What the cubic leaves of the error of a grid cell is far below this.
-                half = _WIDEST_BRACKET / 8
-            else:
-                return point, True
-            if attempt == _MOST_BRACKETS:
-                return point, False
-            lower, upper = max(start.least, centre - half), min(start.most, centre + half)
-        raise AssertionError
-
-    def settle(self, point: Point) -> tuple[Point, Sums]:
-        """Residual passes with joint corrections until n stands still: exact cost, sums about the target.
-
-        At each exponent the best coefficients are found anew, so that a coefficient may leave 0 or come to it. Where
-        noise leaves n loosely determined a Gauss-Newton step may pass the minimum: a point that costs more than the
-        last is brought back, to the minimum of the parabola through both. Nothing is returned on the word of the
-        quadratic model unless its step was negligible.
-        """
-        held: tuple[Point, Sums] | None = None
-        slope = 0.0
-        for attempt in itertools.count(1):
-            reference = point.x
-            parts = sums(self.pictures, point.log_n[None], reference, peak=self.problem.peak)
-            solved = jax.tree.map(np.asarray, solve_linear(parts, reference, self.problem))
-            here, before = Point(point.log_n, solved.x, solved.cost), float(np.sum(parts.square))
-            last = math.inf if held is None else float(np.sum(held[0].cost))
-            rise = float(np.sum(here.cost)) - last
-            if held is not None and rise > float(self.problem.tolerance) * last:
-                share = np.clip(-slope / (2 * (rise - slope)), 0.1, 0.5)
-                slope *= share
-                point = jax.tree.map(lambda old, new, share=share: old + share * (new - old), held[0], here)
-                left = math.inf
-            else:
-                told = parts.about(np.pad(reference, [(0, 0), (0, 1)]))
-                held = here, told
-                # The sums with the residual against the best coefficients at this exponent.
-                parts = parts.about(np.pad(reference - here.x, [(0, 0), (0, 1)]))._replace(square=here.cost)
-                point, left = _correct(parts, here, self.problem)
-                slope = -2 * float((point.log_n - here.log_n) * np.sum(here.x[:, 2] * parts.product[:, 3]))
-                if before > 2 * float(np.sum(here.cost)) + float(self.problem.tolerance) * float(np.sum(told.square)):
-                    # A difference of far larger sums: known to fewer digits than about the coefficients themselves.
-                    left = math.inf
-            if left <= self.problem.accuracy or attempt == _MOST_CORRECTIONS:
-                return (point if left <= self.problem.accuracy else held[0]), held[1]
-        raise AssertionError
+    held, slope, last = (point, Sums(*np.zeros((4, 0)))), 0.0, math.inf
+    for attempt in itertools.count(1):
+        reference = point.x
+        parts = problem.sums(point.log_n, reference)
+        solved = solve_linear(parts, point.log_n, reference, problem)
+        here, cost, before = Point(point.log_n, solved.x, solved.cost), np.sum(solved.cost), np.sum(parts.square)
+        if cost - last > problem.tolerance * last:
+            share = np.clip(-slope / (2 * (cost - last - slope)), 0.1, 0.5)
+            slope *= share
+            point = Point(*(old + share * (new - old) for old, new in zip(held[0], here, strict=True)))
+            left = math.inf
+        else:
+            about = parts.about(np.pad(reference, [(0, 0), (0, 1)]))
+            held, last = (here, about), cost
+            # The sums with the residual against the best coefficients at this exponent.
+            parts = parts.about(np.pad(reference - here.x, [(0, 0), (0, 1)]))._replace(square=here.cost)
+            point, left = _correct(parts, here, problem) if problem.cap is None else (here, 0.0)
+            slope = -2 * float((point.log_n - here.log_n) * np.sum(here.x[:, 2] * parts.product[:, 3]))
+            if before > 2 * cost + problem.tolerance * np.sum(about.square):
+                # A difference of far larger sums: known to fewer digits than about the coefficients themselves.
+                left = last = math.inf
+        if left <= problem.accuracy or attempt == _MOST_CORRECTIONS:
+            return (point if left <= problem.accuracy else held[0]), held[1]
+    raise AssertionError

@@ -6,15 +6,14 @@ stratum; sparse ones are kept whole, the others sample to about equal numbers. W
 """
 
 import math
-from functools import partial
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, UInt8
+from jaxtyping import Array, Float, UInt8
 
-from fitting.solver.normal_equations import COMPILER_OPTIONS, UNROLLED_CHANNELS, AnyArray, Picture, relative_lobe
+from fitting.solver.normal_equations import Picture, relative_lobe
 
 # The strata are counted on every 16th pixel.
 _PREVIEW_STRIDE = 16
@@ -36,7 +35,7 @@ class Subsample(NamedTuple):
     """
 
     picture: Picture
-    factor: Float[AnyArray, " M"] | None
+    factor: Float[np.ndarray, " M"] | None
     nearest: float
 
 
@@ -47,18 +46,10 @@ def _octaves(picture: Picture) -> tuple[UInt8[Array, " P"], Float[Array, ""]]:
     distance = -picture.lobe.peak()
     octave = (jax.lax.bitcast_convert_type(distance.astype(jnp.float32), jnp.int32) >> 23) & 0xFF
     if picture.weight is not None:
-        weight = picture.weight if picture.weight.ndim == 1 else jnp.max(picture.weight, axis=1)
-        octave = jnp.where(weight > 0, octave, _EXCLUDED)
-        distance = jnp.where(weight > 0, distance, jnp.inf)
+        counts = jnp.max(picture.weights, axis=1) > 0
+        octave = jnp.where(counts, octave, _EXCLUDED)
+        distance = jnp.where(counts, distance, jnp.inf)
     return octave.astype(jnp.uint8), jnp.min(distance)
-
-
-@jax.jit
-def _chosen(octaves: UInt8[Array, " P"], share: Float[Array, "256"]) -> Bool[Array, " P"]:
-    """Which pixels are kept, given the share of each octave."""
-    # Multiples of the golden ratio modulo 1 spread evenly over any run of pixels, without a regular pattern.
-    step = jnp.arange(octaves.shape[0], dtype=jnp.uint32) * jnp.uint32(2654435769)
-    return step.astype(jnp.float32) * 2.0**-32 < share[octaves]
 
 
 def _shares(octaves: UInt8[np.ndarray, " P"], size: int) -> Float[np.ndarray, "256"]:
@@ -76,11 +67,11 @@ def _shares(octaves: UInt8[np.ndarray, " P"], size: int) -> Float[np.ndarray, "2
         rest -= here
     share = np.minimum(1.0, most / np.maximum(count, 1.0))
     share[_EXCLUDED] = 0.0
-    return share.astype(np.float32)
+    return share
 
 
 def subsample(picture: Picture, size: int, n_max: float) -> Subsample:
-    """Take about ``size`` pixels.
+    """Take about ``size`` pixels of a picture.
 
     Args:
         picture: The picture.
@@ -94,52 +85,48 @@ def subsample(picture: Picture, size: int, n_max: float) -> Subsample:
     capacity = size + size // 4
     if picture.lobe is None:
         return Subsample(picture, None, math.inf)
-    octaves, nearest = _octaves(picture)
-    nearest = float(nearest)
+    octaves, nearest = (np.asarray(a) for a in _octaves(picture))
     if count <= capacity:
-        return Subsample(picture, None, nearest)
-    share = _shares(np.asarray(octaves), size)
-    index = np.flatnonzero(np.asarray(_chosen(octaves, share)))
-    while index.size > capacity:
-        share = share * np.float32(0.9 * capacity / index.size)
-        index = np.flatnonzero(np.asarray(_chosen(octaves, share)))
+        return Subsample(picture, None, float(nearest))
+    share = _shares(octaves, size)
+    # Multiples of the golden ratio modulo 1 spread evenly over any run of pixels, without a regular pattern.
+    step = np.arange(count, dtype=np.uint32) * np.uint32(2654435769)
+    while True:
+        index = np.flatnonzero(step < (share * 0xFFFFFFFF).astype(np.uint32)[octaves])
+        if index.size <= capacity:
+            break
+        share = share * (0.9 * capacity / index.size)
     # Bracketing needs no more than float32, unless the lobe leaves its range.
     single = n_max * nearest < _LARGEST_DECAY
     # Padding repeats the first pixel with weight 0, for one shape means one compilation.
     padded = np.zeros(capacity, np.intp)
     padded[: index.size] = index
 
-    def choose(a: Array) -> Array:
+    def choose(a: Array) -> Any:
         # Through NumPy: an XLA gather is ten times slower.
         kept = np.take(np.asarray(a), padded, axis=0)
-        return cast(Array, kept.astype(np.float32) if single and kept.dtype == np.float64 else kept)
+        return kept.astype(np.float32) if single and kept.dtype == np.float64 else kept
 
     factor = np.zeros(capacity, np.float32)
-    factor[: index.size] = 1 / share[np.asarray(octaves)[index]]
+    factor[: index.size] = 1 / share[octaves[index]]
     kept = picture.pixels(choose)
-    weight = cast(Array, factor)
+    weight: Any = factor
     if kept.weight is not None:
         weight = kept.weight * (factor if kept.weight.ndim == 1 else factor[:, None])
-    return Subsample(Picture(kept.target, kept.diffuse, kept.lobe, weight, kept.ambient), factor, nearest)
+    return Subsample(Picture(kept.target, kept.diffuse, kept.lobe, weight, kept.ambient), factor, float(nearest))
 
 
-@partial(jax.jit, compiler_options=COMPILER_OPTIONS)
+@jax.jit
 def spread(
-    sample: Subsample,
-    log_n: Float[AnyArray, " N"],
-    x: Float[AnyArray, "N C 3"],
-    best_log_n: Float[AnyArray, ""],
-    best_x: Float[AnyArray, "C 3"],
-    peak: Float[AnyArray, ""],
+    sample: Subsample, log_n: Array, x: Float[Array, "N C 3"], best: Array, peak: Array
 ) -> tuple[Float[Array, " N"], Float[Array, " N"]]:
     """How far the subsample's profile may be from that of all pixels.
 
     Args:
         sample: The subsample of one picture.
-        log_n: Natural logarithms of the exponents.
+        log_n: Natural logarithms of the exponents, (N,).
         x: Best coefficients at each.
-        best_log_n: Natural logarithm of the exponent to compare with.
-        best_x: Best coefficients there.
+        best: Which to compare with.
         peak: See :func:`fitting.solver.normal_equations.relative_lobe`.
 
     Returns:
@@ -147,43 +134,25 @@ def spread(
         log n. They add up over pictures.
     """
     picture, factor = sample.picture, sample.factor
-    lobe, weight = picture.lobe, picture.weight
-    assert lobe is not None
-    assert weight is not None
+    assert picture.lobe is not None
     assert factor is not None
-    shape = picture.target.shape
     dtype = picture.target.dtype
-    # Channels first, and one at a time: the loops over pixels are then contiguous and evaluate the lobe once.
-    channels = (
-        picture.target.T,
-        jnp.broadcast_to(weight if weight.ndim == 2 else weight[:, None], shape).T,
-        jnp.broadcast_to(picture.diffuse, shape).T,
-        jnp.broadcast_to(picture.ambient, shape[1:]).astype(dtype),
-    )
-    unroll = min(shape[1], UNROLLED_CHANNELS)
-
-    def lit(at: Float[Array, ""]) -> tuple[Float[Array, "C M"], Float[Array, "C M"]]:
-        value, by_log_n = relative_lobe(lobe, at, jnp.asarray(peak), dtype)
-        return jnp.broadcast_to(value, shape).T, jnp.broadcast_to(by_log_n, shape).T
-
-    # A pixel that was sure to be kept adds nothing to the uncertainty.
+    x = x.astype(dtype)
+    # A pixel that was certain to be kept adds nothing to the uncertainty.
     chance = jnp.where(factor > 0, 1 - 1 / jnp.maximum(factor, 1), 0.0)
-    zero = np.zeros((), dtype)
-    model, _ = lit(jnp.asarray(best_log_n))
 
-    def one(at: tuple[Float[Array, ""], Float[Array, "C 3"]]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        def channel(carry: tuple, each: tuple) -> tuple[tuple, None]:
-            (target, weight, diffuse, ambient), value, by_log_n, best_value, x, best_x = each
-            mine = target - x[0] * ambient - x[1] * diffuse - x[2] * value
-            other = target - best_x[0] * ambient - best_x[1] * diffuse - best_x[2] * best_value
-            change = jnp.where(weight > 0, weight * (mine - other) * (mine + other), 0.0)
-            score = jnp.where(weight > 0, 2 * weight * mine * x[2] * by_log_n, 0.0)
-            return (carry[0] + change, carry[1] + score), None
+    def residual_and_slope(index: Array) -> tuple[Array, Array]:
+        value, slope = relative_lobe(picture.lobe, log_n[index], peak, dtype)
+        model = x[index, :, 0] * jnp.asarray(picture.ambient, dtype) + x[index, :, 1] * picture.diffuse
+        return picture.target - model - x[index, :, 2] * value, x[index, :, 2] * slope
 
-        nothing = jnp.zeros(shape[0], dtype)
-        each = (channels, *lit(at[0]), model, at[1], best_x.astype(dtype))
-        (change, score), _ = jax.lax.scan(channel, (nothing, nothing), each, unroll=unroll)
-        pair = (chance * change * change, chance * score * score)
-        return jax.lax.reduce(pair, (zero, zero), lambda a, b: (a[0] + b[0], a[1] + b[1]), (0,))
+    reference, _ = residual_and_slope(best)
 
-    return jax.lax.map(one, (log_n, x.astype(dtype)))
+    def one(index: Array) -> tuple[Array, Array]:
+        residual, slope = residual_and_slope(index)
+        change = (residual - reference) * (residual + reference)
+        changes = [jnp.where(picture.weights > 0, picture.weights * a, 0) for a in (change, 2 * residual * slope)]
+        total, score = (jnp.sum(chance * jnp.sum(each, axis=1) ** 2) for each in changes)
+        return total, score
+
+    return jax.lax.map(one, jnp.arange(log_n.shape[0]))

@@ -134,7 +134,6 @@ def interpret(
             sure.n_error,
             sure.rise,
             fit.n_range,
-            single=single,
             peak=seen.peak if seen else 0.0,
             tied=fit.tied,
         )

@@ -2,18 +2,15 @@
 
 import functools
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
-from fitting.solver.nnls import nonnegative_minimum
-from fitting.solver.normal_equations import Picture, Sums, sums
+from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
-from fitting.solver.refinement import solve_within
-from fitting.solver.tied import grey_design, join_channels
+from fitting.solver.refinement import problem_of, solve_linear
 
 NORMAL_95 = 1.959963984540054
 ONE_SIDED_95 = 1.6448536269514722
@@ -71,46 +68,14 @@ def above_zero(value: float, error: float) -> tuple[float, float]:
     return low * error, high * error
 
 
-@jax.jit
-def _profile(
-    parts: Sums, width: Float[Array, ""], reference: Float[Array, "C 3"], free: Bool[Array, "C 3"], tolerance: float
-) -> Float[Array, " K"]:
-    """Least cost, summed over channels, at shares of a bracket, from the bracket's sums."""
-
-    def at(t: Float[Array, ""]) -> Float[Array, ""]:
-        return jnp.sum(solve_within(parts, t, width, reference, free, jnp.asarray(tolerance)).cost)
-
-    return jax.vmap(at)(jnp.asarray(SHARES))
-
-
-def _tied_profile(
-    parts: Sums, width: float, reference: np.ndarray, free: np.ndarray, tied: np.ndarray
-) -> Float[np.ndarray, " K"]:
-    """The same with one specular coefficient for all channels."""
-    about = parts.about(np.pad(reference, [(0, 0), (0, 3)]))
-    costs = []
-    for t in SHARES:
-        basis = np.eye(4, 6)
-        basis[2, 2:] = [1.0, t * width, t * t * (3 - 2 * t), t * t * (t - 1) * width]
-        basis[3] = 0.0
-        gram = basis @ about.gram @ basis.T
-        normal = join_channels(gram, about.product @ basis.T, about.square, reference[:, 2], np.ones(tied.size))
-        design = grey_design(free, tied)[:, :-1]
-        gram, product = design.T @ normal.gram @ design, design.T @ normal.product
-        x = nonnegative_minimum(gram, product)
-        costs.append(normal.square - 2 * product @ x + x @ gram @ x)
-    return np.array(costs)
-
-
 def exponent_interval(
-    pictures: Collection[Picture],
+    pictures: Sequence[Picture],
     optimum: Optimum,
     free: Bool[np.ndarray, "3 C"],
     n_error: float,
     rise: float,
     n_range: tuple[float, float],
     *,
-    single: bool,
     peak: float = 0.0,
     tied: Float[np.ndarray, " C"] | None = None,
 ) -> tuple[float, float]:
@@ -126,7 +91,6 @@ def exponent_interval(
         n_error: standard error of n.
         rise: of the cost; see `fitting.uncertainty.covariance.Uncertainty`.
         n_range: bounds of the search.
-        single: whether the pixels are float32.
         peak: logarithm of the lobe's cosine in the pixel nearest to its centre.
         tied: x_s is a common factor times this, (C,); None where the channels are independent.
 
@@ -141,17 +105,15 @@ def exponent_interval(
         return optimum.n * math.exp(-NORMAL_95 * relative), optimum.n * math.exp(NORMAL_95 * relative)
     first = min(max(1.1 * NORMAL_95 * relative, 1e-3), WIDEST)
     limit = float(np.sum(optimum.cost)) + rise
-    tolerance = np.float64(2e-7 if single else 1e-14)
-
-    # Relative to the nearest pixel the lobe keeps its size where no pixel sees the centre: `normal_equations`.
+    problem = problem_of(pictures, n_range, free)._replace(peak=peak, tied=tied)
+    # Relative to the nearest pixel the lobe keeps its size where no pixel sees the centre.
     reference = optimum.x.T * [1.0, 1.0, math.exp(optimum.n * peak)]
 
     def costs(low: float, high: float) -> np.ndarray:
         with jax.enable_x64(True):
-            parts = sums(pictures, np.array([low, high]), reference, peak=peak)
-            if tied is not None:
-                return _tied_profile(parts, high - low, reference, free, tied)
-            return np.asarray(_profile(parts, np.float64(high - low), reference, free.T, tolerance))
+            parts = problem.sums([low, high], reference).within(SHARES, high - low, reference)
+        at = low + SHARES * (high - low)
+        return solve_linear(parts, at, reference, problem).cost.sum(axis=1)
 
     low, high = (_end(costs, centre, sign, bound, first, limit) for sign, bound in zip((-1, 1), bounds, strict=True))
     return math.exp(low), math.exp(high)

@@ -180,4 +180,3 @@ def test_what_comes_with_the_optimum():
     assert found.grid.shape == found.profile.shape
     np.testing.assert_allclose(found.profile[20], best_at([one], found.grid[20]), rtol=1e-9)
     np.testing.assert_allclose(found.gauss_newton[:, 3, 3], found.x[2] ** 2 * found.gram[:, 3, 3])
-    assert np.all(found.brackets[:, 0] < found.brackets[:, 1])
