@@ -25,9 +25,9 @@ from typing import Literal, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from fitting.solver.normal_equations import AnyArray, Picture
+from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
 from fitting.solver.streams import each
 
@@ -56,13 +56,69 @@ class Reweighted(NamedTuple):
         pictures: with the weights of the last round.
         noise_factor: what the weighted residual's standard deviation is multiplied by to give that which the formula
             for standard errors needs: the weights know the residuals.
-        settled: whether the rounds came to rest.
     """
 
     optimum: Optimum
     pictures: Sequence[Picture]
-    noise_factor: float
-    settled: bool
+    noise_factor: float = 1.0
+
+
+def iterate(
+    pictures: Sequence[Picture],
+    optimise: Callable[[Sequence[Picture]], Optimum],
+    working: Callable[[Optimum, int], Callable[[Picture], Picture]],
+    at_rest: Callable[[Optimum, Optimum], bool],
+) -> Reweighted:
+    """The one reweighted loop: squared fits, each of pictures made from the last one's optimum, until it rests.
+
+    A likelihood whose first and second derivative by the prediction m are the score s and -w asks for the target
+    m + s / w with the weight w (Green 1984, J. R. Stat. Soc. B 46, 149); a loss with weights, for the target itself.
+
+    Args:
+        pictures: as for the search.
+        optimise: the squared fit.
+        working: from the last optimum and the number of the round to what makes a picture's target and weight.
+        at_rest: from the last optimum and the next whether the rounds are over.
+    """
+    now, optimum = pictures, optimise(pictures)
+    for round_ in range(MOST_ROUNDS):
+        before, now = optimum, each(working(optimum, round_), pictures)
+        optimum = optimise(now)
+        if at_rest(before, optimum):
+            break
+    return Reweighted(optimum, now)
+
+
+def reweight(
+    pictures: Sequence[Picture],
+    optimise: Callable[[Sequence[Picture]], Optimum],
+    loss: Loss,
+    rounding: Float[np.ndarray, " C"],
+) -> Reweighted:
+    """Fit with a loss of any kind.
+
+    Args:
+        pictures: as for the search.
+        optimise: the squared fit.
+        loss: one of `LOSSES`.
+        rounding: standard deviation of a value's rounding, (C,); no scale is smaller.
+    """
+    if loss == "squared":
+        return Reweighted(optimise(pictures), pictures)
+    floor = DARKEST * _mean(pictures)
+    rule: str = loss
+
+    def working(optimum: Optimum, round_: int) -> Callable[[Picture], Picture]:
+        nonlocal rule
+        # Huber's loss is convex in the coefficients; the first rounds lead Cauchy's to the right one of its minima.
+        rule = "huber" if loss == "cauchy" and round_ < 3 else loss
+        scale = floor if loss in ("relative", "log") else _scale(pictures, optimum, rounding)
+        return partial(_with_weight, optimum=optimum, scale=scale, loss=rule)
+
+    found = iterate(pictures, optimise, working, lambda *both: rule == loss and _change(*both) < ENOUGH)
+    if loss in ("relative", "log"):
+        return found
+    return found._replace(noise_factor=_noise_factor(found.pictures, pictures, found.optimum, loss))
 
 
 def cut(channels: int) -> float:
@@ -80,40 +136,6 @@ def cut(channels: int) -> float:
     return limit(channels) / limit(1)
 
 
-def reweight(
-    pictures: Sequence[Picture],
-    optimise: Callable[[Sequence[Picture]], Optimum],
-    loss: Loss,
-    rounding: Float[np.ndarray, " C"],
-) -> Reweighted:
-    """Fit with a loss that is not the squared one.
-
-    Args:
-        pictures: as for the search.
-        optimise: the squared fit.
-        loss: one of `LOSSES`.
-        rounding: standard deviation of a value's rounding, (C,); no scale is smaller.
-    """
-    now = pictures
-    optimum = optimise(now)
-    if loss == "squared":
-        return Reweighted(optimum, now, 1.0, True)
-    floor = DARKEST * _mean(pictures)
-    before, settled = optimum, False
-    for round_ in range(MOST_ROUNDS):
-        # Huber's loss is convex in the coefficients; the first rounds lead Cauchy's to the right one of its minima.
-        rule = "huber" if loss == "cauchy" and round_ < 3 else loss
-        scale = floor if loss in ("relative", "log") else _scale(pictures, optimum, rounding)
-        now = each(partial(_with_weight, optimum=optimum, scale=scale, loss=rule), pictures)
-        optimum = optimise(now)
-        settled = rule == loss and _change(before, optimum) < ENOUGH
-        if settled:
-            break
-        before = optimum
-    factor = _noise_factor(now, pictures, optimum, loss) if loss in ("huber", "cauchy") else 1.0
-    return Reweighted(optimum, now, factor, settled)
-
-
 def _change(before: Optimum, after: Optimum) -> float:
     """The largest relative change of a coefficient, or of n."""
     scale = np.maximum(np.max(np.abs(before.x), axis=0), np.finfo(float).tiny)
@@ -121,26 +143,10 @@ def _change(before: Optimum, after: Optimum) -> float:
     return change if after.flat and before.flat else max(change, abs(np.log(after.n / before.n)))
 
 
-def _counted(picture: Picture) -> Array:
-    if picture.weight is None:
-        return jnp.ones((1, 1), picture.target.dtype)
-    return picture.weight if picture.weight.ndim == 2 else picture.weight[:, None]
-
-
-@eqx.filter_jit
-def _model(picture: Picture, n: Float[AnyArray, ""], x: Float[AnyArray, "3 C"]) -> Float[Array, "P C"]:
-    dtype = picture.target.dtype
-    x = jnp.asarray(x).astype(dtype)
-    model = x[0] * jnp.asarray(picture.ambient).astype(dtype) + x[1] * picture.diffuse
-    if picture.lobe is not None:
-        model = model + x[2] * picture.lobe(jnp.asarray(n))[0]
-    return jnp.broadcast_to(model, picture.target.shape)
-
-
 def _mean(pictures: Sequence[Picture]) -> np.ndarray:
     total, count = 0.0, 0.0
     for picture in pictures:
-        counted = np.broadcast_to(np.asarray(_counted(picture)) > 0, picture.target.shape)
+        counted = np.broadcast_to(np.asarray(picture.weights) > 0, picture.target.shape)
         total = total + np.sum(np.abs(np.asarray(picture.target, np.float64)), axis=0, where=counted)
         count = count + np.sum(counted, axis=0)
     return np.maximum(total / np.maximum(count, 1), np.finfo(np.float32).tiny)
@@ -151,16 +157,16 @@ def _scale(pictures: Sequence[Picture], optimum: Optimum, rounding: np.ndarray) 
     sizes = []
     for picture in pictures:
         stride = max(1, picture.target.shape[0] * len(pictures) // _MEDIAN_VALUES)
-        residual = np.abs(np.asarray(picture.target - _model(picture, np.asarray(optimum.n), optimum.x)))
-        weight = np.broadcast_to(np.asarray(_counted(picture)), residual.shape)
+        residual = np.abs(np.asarray(picture.target - picture.predicted(np.asarray(optimum.n), optimum.x)))
+        weight = np.broadcast_to(np.asarray(picture.weights), residual.shape)
         rows = np.flatnonzero(weight.min(axis=1) > 0)[::stride]
         sizes.append(residual[rows] * np.sqrt(weight[rows]))
     return np.maximum(np.median(np.concatenate(sizes), axis=0) / _MEDIAN, rounding)
 
 
 def _with_weight(picture: Picture, optimum: Optimum, scale: np.ndarray, loss: str) -> Picture:
-    model = np.asarray(_model(picture, np.asarray(optimum.n), optimum.x))
-    weight = weights(loss, np.asarray(picture.target), model, np.asarray(_counted(picture)), scale)
+    model = np.asarray(picture.predicted(np.asarray(optimum.n), optimum.x))
+    weight = weights(loss, np.asarray(picture.target), model, np.asarray(picture.weights), scale)
     weight = jnp.asarray(weight, picture.target.dtype)
     return eqx.tree_at(lambda p: p.weight, picture, weight, is_leaf=lambda leaf: leaf is None)
 
@@ -203,9 +209,9 @@ def _noise_factor(now: Sequence[Picture], base: Sequence[Picture], optimum: Opti
     """
     psi, slope, weights, squares, count = 0.0, 0.0, 0.0, 0.0, 0.0
     for picture, original in zip(now, base, strict=True):
-        residual = np.asarray(picture.target - _model(picture, np.asarray(optimum.n), optimum.x), np.float64)
-        start = np.broadcast_to(np.asarray(_counted(original), np.float64), residual.shape)
-        weight = np.broadcast_to(np.asarray(_counted(picture), np.float64), residual.shape)
+        residual = np.asarray(picture.target - picture.predicted(np.asarray(optimum.n), optimum.x), np.float64)
+        start = np.broadcast_to(np.asarray(original.weights, np.float64), residual.shape)
+        weight = np.broadcast_to(np.asarray(picture.weights, np.float64), residual.shape)
         good = start > 0
         w = np.where(good, weight / np.where(good, start, 1.0), 0.0)
         squared = np.where(good, start * np.where(good, residual, 0.0) ** 2, 0.0)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from fitting.solver.profile import Optimum
-from fitting.solver.tied import grey_design
+from fitting.solver.tied import design_of
 from fitting.uncertainty.intervals import NORMAL_95, above_zero
 
 # A squared column keeps less than this of itself when the others are taken out: the two tell the same story.
@@ -185,7 +185,7 @@ def _errors(
     unit = np.eye(size)
     basis = unit[:, np.append(active.ravel(), False)]
     if tied is not None and has_n:
-        basis = grey_design(active, tied)[:, :-1]
+        basis = design_of(active, tied)[:, :-1]
     inverse = _inverse(hessian, basis)
     along = inverse @ hessian[:, -1]
     if has_n:
