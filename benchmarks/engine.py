@@ -106,14 +106,15 @@ def parts(picture: Picture, repeats: int) -> None:
     for module, name in [
         (profile, "subsample"),
         (subsample, "_octaves"),
-        (subsample, "_chosen"),
         (profile, "rough_model"),
-        (normal_equations, "_many_exponents"),
-        (refinement, "_solve_bracket"),
-        (refinement, "_correct"),
-        (profile, "solve_linear"),
+        (profile, "profile_on_grid"),
+        (profile, "with_errors"),
         (profile, "spread"),
-        (normal_equations, "_one_exponent"),
+        (profile, "enclose"),
+        (profile, "gauss_newton"),
+        (refinement, "solve_linear"),
+        (normal_equations, "_one"),
+        (normal_equations, "_each"),
         (normal_equations, "_unpack"),
     ]:
         timed(module, name)

@@ -28,7 +28,7 @@ import brdf
 from brdf.precision import working_precision
 from fitting.result import FitResult
 
-POLISHING_STEPS = 3
+NEWTON_STEPS = 3
 
 
 @dataclass(frozen=True)
@@ -71,111 +71,89 @@ def sensitivity(result: FitResult, by: Callable[[list[brdf.Scene]], Sequence[Any
     leaves = tuple(by(scenes))
     if not leaves or not all(hasattr(leaf, "shape") for leaf in leaves):
         raise brdf.InputError("by", "names no leaf of the scenes", "Return the leaves to differentiate by")
-    unknowns = _Unknowns(result)
     with working_precision("float64"):
         scenes = brdf.cast(scenes, "float64")
-        seen = [_seen(target, counted) for target, counted in zip(result.targets, result.counted, strict=True)]
         known, unravel = jax.flatten_util.ravel_pytree(tuple(by(scenes)))
+        numbers, unravel_numbers, design, index = _unknowns(result)
+        vector = np.linalg.pinv(design) @ numbers
+        # By arguments, or the pictures would be constants of the program.
+        pictures = [(jnp.asarray(target, jnp.float64), jnp.asarray(counted)) for target, counted in _counted(result)]
 
-        def cost(vector: Array, known: Array, seen: Any) -> Array:
-            material = unknowns.material(vector)
-            moved = eqx.tree_at(lambda places: tuple(by(places)), scenes, unravel(known))
+        def cost(vector: Array, known: Array, pictures: Any) -> Array:
+            values = unravel_numbers(jnp.where(np.any(design, axis=1), design @ vector, numbers))
+            material = type(result.material)(**{key: jnp.exp(v) if key == "n" else v for key, v in values.items()})
+            moved = eqx.tree_at(lambda scenes: tuple(by(scenes)), scenes, unravel(known))
             total = jnp.zeros(())
-            for scene, (target, counted) in zip(moved, seen, strict=True):
+            for scene, (target, counted) in zip(moved, pictures, strict=True):
                 residual = jnp.where(counted[..., None], brdf.render(material, scene) - target, 0)
                 total = total + 0.5 * jnp.sum(residual * residual)
             return total
 
-        slope = jax.grad(cost)
+        def derivatives(vector: Array, known: Array, pictures: Any, argument: int) -> tuple[Array, Array]:
+            """The gradient by the unknowns, and its derivative by the unknowns or by what is known, row by row."""
+            arguments = [vector, known]
 
-        @eqx.filter_jit
-        def derivatives(vector: Array, seen: Any) -> tuple[Array, Array]:
-            def column(direction: Array) -> Array:
-                return jax.jvp(lambda v: slope(v, known, seen), (vector,), (direction,))[1]
+            def row(along: Array) -> Array:
+                moved = [jnp.zeros_like(a) if i != argument else along for i, a in enumerate(arguments)]
+                return jax.jvp(lambda *both: jax.grad(cost)(*both, pictures), arguments, moved)[1]
 
-            return slope(vector, known, seen), jax.lax.map(column, jnp.eye(vector.size))
+            return jax.grad(cost)(*arguments, pictures), jax.lax.map(row, jnp.eye(arguments[argument].size))
 
-        @eqx.filter_jit
-        def by_known(vector: Array, seen: Any) -> Array:
-            def column(direction: Array) -> Array:
-                return jax.jvp(lambda k: slope(vector, k, seen), (known,), (direction,))[1]
-
-            return jax.lax.map(column, jnp.eye(known.size))
-
-        vector = unknowns.vector
+        compiled = eqx.filter_jit(derivatives)
         hessian = np.eye(vector.size)
         # A fit in float32 stops a little beside the stationary point; Newton's steps go there.
-        for _ in range(POLISHING_STEPS):
-            gradient, columns = derivatives(jnp.asarray(vector), seen)
-            hessian = np.asarray(columns)
-            vector = vector - _solve(hessian, np.asarray(gradient))
-        moves = -_solve(hessian, np.asarray(by_known(jnp.asarray(vector), seen)).T)
-    return tuple(unknowns.derivatives(part, leaf.shape, vector) for part, leaf in _split(moves, leaves))
+        for _ in range(NEWTON_STEPS):
+            gradient, rows = (np.asarray(a) for a in compiled(jnp.asarray(vector), known, pictures, 0))
+            hessian = rows
+            vector = vector - _solve(hessian, gradient[:, None])[:, 0]
+        rows = np.asarray(compiled(jnp.asarray(vector), known, pictures, 1)[1])
+    moves = -design @ _solve(hessian, rows.T)
+    if "n" in index:
+        moves[index["n"]] *= np.exp(design @ vector)[index["n"], None]
+    channels = len(index["k_d"])
+    found, ends = [], np.cumsum([0, *(int(np.prod(leaf.shape)) for leaf in leaves)])
+    for leaf, start, end in zip(leaves, ends[:-1], ends[1:], strict=True):
+        parts = {key: np.zeros((channels, *leaf.shape)) for key in ("k_a", "k_d", "k_s")}
+        parts |= {key: moves[place, start:end].reshape(-1, *leaf.shape) for key, place in index.items()}
+        found.append(Sensitivity(**parts | {"n": parts["n"][0] if "n" in parts else np.zeros(leaf.shape)}))
+    return tuple(found)
 
 
-class _Unknowns:
-    """The fitted numbers that may move, as one vector; the exponent by its logarithm."""
-
-    def __init__(self, result: FitResult):
-        self.model = type(result.material)
-        self.channels = int(np.asarray(result.material.k_d).shape[0])
-        self.numbers = {
-            key: np.asarray(value, np.float64) for key, value in vars(result.material).items() if value is not None
-        }
-        self.places: list[tuple[str, int | None]] = []
-        # A grey highlight is one number, and the only way for all channels to agree to the last digit.
-        k_s = self.numbers.get("k_s", np.zeros(1))
-        self.grey = self.channels > 1 and bool(np.all(k_s == k_s[0]))
-        for parameter in result.free_parameters:
-            if parameter.name == "k_s" and self.grey and parameter.channel:
-                continue
-            self.places.append((parameter.name, parameter.channel))
-        values = [self.numbers[key] if channel is None else self.numbers[key][channel] for key, channel in self.places]
-        is_n = np.array([key == "n" for key, _ in self.places], bool)
-        self.vector = np.where(is_n, np.log(np.where(is_n, values, 1.0)), values)
-
-    def material(self, vector: Array) -> brdf.Material:
-        """The material with the vector's numbers in place."""
-        numbers = {key: jnp.asarray(value) for key, value in self.numbers.items()}
-        for index, (key, channel) in enumerate(self.places):
-            if key == "n":
-                numbers[key] = jnp.exp(vector[index])
-            elif key == "k_s" and self.grey:
-                numbers[key] = jnp.broadcast_to(vector[index], (self.channels,))
-            else:
-                numbers[key] = numbers[key].at[channel].set(vector[index])
-        return self.model(**numbers)
-
-    def derivatives(self, moves: Float[np.ndarray, "K S"], shape: tuple[int, ...], vector: np.ndarray) -> Sensitivity:
-        """The rows of the vector's derivative, by name."""
-        found = {key: np.zeros((self.channels, *shape)) for key in ("k_a", "k_d", "k_s")} | {"n": np.zeros(shape)}
-        for index, (key, channel) in enumerate(self.places):
-            row = moves[index].reshape(shape)
-            if key == "n":
-                found[key] = row * np.exp(vector[index])
-            else:
-                found[key][slice(None) if key == "k_s" and self.grey else channel] = row
-        return Sensitivity(**found)
+def _counted(result: FitResult) -> list[tuple[np.ndarray, np.ndarray]]:
+    both = zip(result.targets, result.counted, strict=True)
+    return [(np.where(counted[..., None], target, 0.0), counted) for target, counted in both]
 
 
-def _seen(target: np.ndarray, counted: np.ndarray) -> tuple[Array, Array]:
-    return jnp.where(counted[..., None], jnp.asarray(target, jnp.float64), 0.0), jnp.asarray(counted)
+def _unknowns(result: FitResult) -> tuple[np.ndarray, Callable[[Array], Any], np.ndarray, dict[str, np.ndarray]]:
+    """The material's numbers as one vector, n by its logarithm: how to undo that, what each unknown moves, and where.
+
+    A grey highlight is one number, and the only way for all channels to agree to the last digit.
+    """
+    material = {key: np.asarray(value, np.float64) for key, value in vars(result.material).items() if value is not None}
+    free = [(parameter.name, parameter.channel) for parameter in result.free_parameters]
+    if "n" in material:
+        # Of n = 0, which is never free, nothing is asked.
+        material["n"] = np.log(np.maximum(material["n"], np.finfo(float).tiny))
+    k_s = material.get("k_s", np.zeros(1))
+    if np.all(k_s == k_s[0]):
+        free = [(name, None if name == "k_s" else channel) for name, channel in free]
+    numbers, unravel = jax.flatten_util.ravel_pytree(material)
+    index = {
+        key: np.atleast_1d(np.asarray(place, int)) for key, place in unravel(jnp.arange(numbers.size * 1.0)).items()
+    }
+    design = np.zeros((numbers.size, len(set(free))))
+    for column, (name, channel) in enumerate(dict.fromkeys(free)):
+        design[index[name] if channel is None else index[name][channel], column] = 1.0
+    return np.asarray(numbers), unravel, design, index
 
 
-def _solve(hessian: Float[np.ndarray, "K K"], right: np.ndarray) -> np.ndarray:
+def _solve(hessian: Float[np.ndarray, "K K"], right: Float[np.ndarray, "K S"]) -> Float[np.ndarray, "K S"]:
     """Scaled by the diagonal, since coefficients and exponent differ by orders of magnitude in what they move."""
     diagonal = np.diag(hessian)
     if not np.all(np.isfinite(hessian)) or np.any(diagonal <= 0):
         raise brdf.InputError("result", "lies at no minimum that the picture determines", "Hold or mask less")
-    scale = 1.0 / np.sqrt(diagonal)
-    normed = hessian * scale[:, None] * scale
+    scale = 1.0 / np.sqrt(diagonal)[:, None]
+    normed = hessian * scale * scale.T
     if np.linalg.eigvalsh(normed)[0] <= 1e-13:
         raise brdf.InputError("result", "is determined only in combinations of its numbers", "Fit a simpler model")
-    columns = right if right.ndim == 2 else right[:, None]
-    solved = scale[:, None] * np.linalg.solve(normed, scale[:, None] * columns)
-    return solved.reshape(right.shape)
-
-
-def _split(moves: Float[np.ndarray, "K S"], leaves: Sequence[Any]) -> list[tuple[np.ndarray, Any]]:
-    ends = np.cumsum([int(np.prod(leaf.shape)) for leaf in leaves])
-    return list(zip(np.split(moves, ends[:-1], axis=1), leaves, strict=True))
+    return scale * np.linalg.solve(normed, scale * right)

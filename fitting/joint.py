@@ -26,115 +26,12 @@ import brdf
 from brdf.precision import Precision, working_precision
 from fitting.pixels import Tile, observe
 from fitting.problem import state_problem
+from fitting.solver.nnls import inverse_diagonal
 
 LARGEST_JACOBIAN = 1 << 27
 ROUNDS = 8
-
-
 # What freed leaves may not go below. A direction or a position has no bound, n is searched by its logarithm.
-_NOT_NEGATIVE = ("k_a", "k_d", "k_s", "intensity", "radiance", "ambient", "attenuation")
-
-
-class JointProblem(eqx.Module):
-    """From a vector of freed numbers to weighted residuals; a pytree, so that its programs are compiled once a shape.
-
-    Attributes:
-        start: material and list of scenes to start from.
-        seen: what is compared with.
-        places: of the freed leaves among those of ``start``.
-        names: of the fields that they are.
-    """
-
-    start: Any
-    seen: list[Tile]
-    places: tuple[int, ...] = eqx.field(static=True)
-    names: tuple[str, ...] = eqx.field(static=True)
-
-    @classmethod
-    def of(cls, start: Any, free: Callable[..., Sequence[Any]], seen: list[Tile]) -> "JointProblem":
-        """Find the freed leaves by putting markers there.
-
-        Raises:
-            InputError: where ``free`` does not name distinct leaves.
-        """
-        remedy = "Return a tuple of leaves, such as (material.n, scenes[0].lights[0].direction)"
-        try:
-            leaves = tuple(free(*start))
-        except TypeError as error:
-            raise brdf.InputError("free", f"gives no tuple of leaves ({error})", remedy) from None
-        if not leaves:
-            raise brdf.InputError("free", "names no leaf", "Return the leaves to fit")
-        own = {id(leaf) for leaf in jax.tree.leaves(start)}
-        if not all(id(leaf) in own and jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves):
-            raise brdf.InputError("free", "gives what is no number of material or scenes as a whole", remedy)
-        if len({id(leaf) for leaf in leaves}) < len(leaves):
-            raise brdf.InputError("free", "gives a leaf twice", remedy)
-        count = len(leaves)
-        marked = eqx.tree_at(lambda tree: tuple(free(*tree)), start, [_Marker(index) for index in range(count)])
-        paths = jax.tree_util.tree_leaves_with_path(marked, is_leaf=lambda leaf: isinstance(leaf, _Marker))
-        found = {
-            leaf.index: (place, path[-1].name) for place, (path, leaf) in enumerate(paths) if isinstance(leaf, _Marker)
-        }
-        places, names = zip(*(found[index] for index in range(count)), strict=True)
-        return cls(start, seen, places, names)
-
-    @property
-    def is_n(self) -> list[bool]:
-        """Which freed leaves are exponents, searched by their logarithm."""
-        return [name == "n" for name in self.names]
-
-    @property
-    def origin(self) -> Float[Array, " K"]:
-        """The vector to start from."""
-        return jax.flatten_util.ravel_pytree(self._coded())[0]
-
-    @property
-    def lower(self) -> Float[np.ndarray, " K"]:
-        """What each entry may not go below."""
-        bounds = [
-            np.full(np.size(leaf), 0.0 if name in _NOT_NEGATIVE else -np.inf)
-            for leaf, name in zip(self._coded(), self.names, strict=True)
-        ]
-        return np.concatenate(bounds)
-
-    def _coded(self) -> tuple[Array, ...]:
-        leaves = jax.tree.leaves(self.start)
-        freed = [jnp.asarray(leaves[place]) for place in self.places]
-        return tuple(jnp.log(leaf) if is_n else leaf for leaf, is_n in zip(freed, self.is_n, strict=True))
-
-    def unravel(self, vector: Float[Array, " K"]) -> tuple[Array, ...]:
-        """A vector's entries leaf by leaf."""
-        return jax.flatten_util.ravel_pytree(self._coded())[1](vector)
-
-    def decode(self, vector: Float[Array, " K"]) -> tuple[Array, ...]:
-        """The freed leaves."""
-        return tuple(
-            jnp.exp(leaf) if is_n else leaf for leaf, is_n in zip(self.unravel(vector), self.is_n, strict=True)
-        )
-
-    def put(self, vector: Float[Array, " K"]) -> Any:
-        """Material and scenes with the freed leaves in place."""
-        leaves, shape = jax.tree.flatten(self.start)
-        for place, leaf in zip(self.places, self.decode(vector), strict=True):
-            leaves[place] = leaf
-        return jax.tree.unflatten(shape, leaves)
-
-    def residuals(self, vector: Float[Array, " K"]) -> list[Array]:
-        """Weighted residuals of each picture."""
-        material, scenes = self.put(vector)
-        found = []
-        for observation, scene in zip(self.seen, scenes, strict=True):
-            residual = brdf.render(material, scene).reshape(observation.target.shape) - observation.target
-            if observation.weight is not None:
-                counts = observation.weight[:, None] > 0
-                residual = jnp.where(counts, residual * jnp.where(counts, observation.weight[:, None], 1) ** 0.5, 0)
-            found.append(residual)
-        return found
-
-
-@dataclass(frozen=True)
-class _Marker:
-    index: int
+NOT_NEGATIVE = ("k_a", "k_d", "k_s", "intensity", "radiance", "ambient", "attenuation")
 
 
 @dataclass(frozen=True)
@@ -206,44 +103,120 @@ def fit_jointly(
     with working_precision(precision):
         seen = [observation.tiles[0] for observation in observe(stated, at_once=True)]
         start = brdf.cast((material, stated.scenes), precision)
-        problem = JointProblem.of(start, free, seen)
+        problem = _freed(start, free, seen)
         values = sum(observation.target.size for observation in seen)
-        chosen = solver or ("lm" if values * problem.origin.size <= LARGEST_JACOBIAN else "bfgs")
+        chosen = solver or ("lm" if values * sum(leaf.size for leaf in problem.coded()) <= LARGEST_JACOBIAN else "bfgs")
         return _solve(problem, chosen, tolerance, max_steps)
+
+
+class _JointProblem(eqx.Module):
+    """From a vector of freed numbers to weighted residuals; a pytree, so that its programs are compiled once a shape.
+
+    Attributes:
+        leaves: of material and list of scenes to start from.
+        seen: what is compared with.
+        shape: of material and scenes.
+        places: of the freed leaves.
+        names: of the fields that they are.
+    """
+
+    leaves: list[Array]
+    seen: list[Tile]
+    shape: Any = eqx.field(static=True)
+    places: tuple[int, ...] = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    def coded(self) -> tuple[Array, ...]:
+        """The freed leaves as they are searched."""
+        freed = [self.leaves[place] for place in self.places]
+        return tuple(jnp.log(leaf) if name == "n" else leaf for leaf, name in zip(freed, self.names, strict=True))
+
+    def by_leaf(self, vector: Float[Array, " K"]) -> tuple[Array, ...]:
+        """A vector's entries leaf by leaf."""
+        return jax.flatten_util.ravel_pytree(self.coded())[1](vector)
+
+    def decode(self, vector: Float[Array, " K"]) -> list[Array]:
+        """The freed leaves."""
+        coded = self.by_leaf(vector)
+        return [jnp.exp(leaf) if name == "n" else leaf for leaf, name in zip(coded, self.names, strict=True)]
+
+    def put(self, vector: Float[Array, " K"]) -> Any:
+        """Material and scenes with the freed leaves in place."""
+        leaves = list(self.leaves)
+        for place, leaf in zip(self.places, self.decode(vector), strict=True):
+            leaves[place] = leaf
+        return jax.tree.unflatten(self.shape, leaves)
+
+    def residuals(self, vector: Float[Array, " K"]) -> Float[Array, " R"]:
+        """Weighted residuals of all pictures."""
+        material, scenes = self.put(vector)
+        found = []
+        for tile, scene in zip(self.seen, scenes, strict=True):
+            residual = brdf.render(material, scene).reshape(tile.target.shape) - tile.target
+            if tile.weight is not None:
+                counts = tile.weight[:, None] > 0
+                residual = jnp.where(counts, residual * jnp.where(counts, tile.weight[:, None], 1) ** 0.5, 0)
+            found.append(residual.ravel())
+        return jnp.concatenate(found)
+
+
+def _freed(start: Any, free: Callable[..., Sequence[Any]], seen: list[Tile]) -> _JointProblem:
+    """Find the freed leaves among those of the start, each an array of its own."""
+    start = jax.tree.map(jnp.array, start)
+    remedy = "Return a tuple of leaves, such as (material.n, scenes[0].lights[0].direction)"
+    try:
+        freed = [id(leaf) for leaf in free(*start)]
+    except TypeError as error:
+        raise brdf.InputError("free", f"gives no tuple of leaves ({error})", remedy) from None
+    if not freed:
+        raise brdf.InputError("free", "names no leaf", "Return the leaves to fit")
+    paths = jax.tree_util.tree_leaves_with_path(start)
+    own = {
+        id(leaf): (place, getattr(path[-1], "name", ""))
+        for place, (path, leaf) in enumerate(paths)
+        if jnp.issubdtype(leaf.dtype, jnp.floating)
+    }
+    if not own.keys() >= set(freed):
+        raise brdf.InputError("free", "gives what is no number of material or scenes as a whole", remedy)
+    if len(set(freed)) < len(freed):
+        raise brdf.InputError("free", "gives a leaf twice", remedy)
+    places, names = zip(*(own[leaf] for leaf in freed), strict=True)
+    leaves, shape = jax.tree.flatten(start)
+    return _JointProblem(leaves, seen, shape, places, names)
 
 
 @eqx.filter_jit
 def _run(
-    problem: JointProblem,
-    vector: Float[Array, " K"],
-    held: Bool[Array, " K"],
-    solver: str,
-    tolerance: float,
-    max_steps: int,
+    problem: _JointProblem, vector: Array, held: Bool[Array, " K"], solver: str, tolerance: float, max_steps: int
 ) -> optx.Solution:
     """The solver's answer with some of the freed numbers held."""
 
-    def residuals(free: Array, problem: JointProblem) -> list[Array]:
+    def residuals(free: Array, problem: _JointProblem) -> Array:
         return problem.residuals(jnp.where(held, vector, free))
+
+    def cost(free: Array, problem: _JointProblem) -> Array:
+        return 0.5 * jnp.sum(residuals(free, problem) ** 2)
 
     if solver == "lm":
         method = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
         return optx.least_squares(residuals, method, vector, problem, max_steps=max_steps, throw=False)
-
-    def cost(free: Array, problem: JointProblem) -> Array:
-        return _half_square(residuals(free, problem))
-
     method = optx.BFGS(rtol=tolerance, atol=tolerance)
     return optx.minimise(cost, method, vector, problem, max_steps=max_steps, throw=False)
 
 
 @eqx.filter_jit
-def _gradient(problem: JointProblem, vector: Float[Array, " K"]) -> Float[Array, " K"]:
-    return jax.grad(lambda free: _half_square(problem.residuals(free)))(vector)
+def _linearised(problem: _JointProblem, vector: Array) -> tuple[Float[Array, " R"], Float[Array, "K R"]]:
+    """The residuals and their derivatives, one column of the Jacobian at a time."""
+    columns = jax.lax.map(lambda along: jax.jvp(problem.residuals, (vector,), (along,))[1], jnp.eye(vector.size))
+    return problem.residuals(vector), columns
 
 
-def _solve(problem: JointProblem, solver: str, tolerance: float, max_steps: int) -> JointResult:
-    vector, lower = problem.origin, problem.lower
+def _solve(problem: _JointProblem, solver: str, tolerance: float, max_steps: int) -> JointResult:
+    vector = jax.flatten_util.ravel_pytree(problem.coded())[0]
+    bounded = [
+        np.full(leaf.size, name in NOT_NEGATIVE) for leaf, name in zip(problem.coded(), problem.names, strict=True)
+    ]
+    lower = np.where(np.concatenate(bounded), 0.0, -np.inf)
     held = np.zeros(lower.shape, bool)
     steps, converged = 0, False
     for _ in range(ROUNDS):
@@ -253,69 +226,33 @@ def _solve(problem: JointProblem, solver: str, tolerance: float, max_steps: int)
         vector = jnp.where(held, vector, solution.value)
         below = np.asarray(vector) < lower
         vector = jnp.maximum(vector, lower.astype(vector.dtype))
-        inwards = held & (np.asarray(_gradient(problem, vector)) < 0)
+        residual, columns = (np.asarray(a, np.float64) for a in _linearised(problem, vector))
+        inwards = held & (columns @ residual < 0)
         if not below.any() and not inwards.any():
             break
         held = (held | below) & ~inwards
-    material, scenes = problem.put(vector)
-    errors, residual = _errors(problem, vector, held)
+    targets = [np.asarray(tile.target, np.float64) for tile in problem.seen]
+    counted = [
+        target if tile.weight is None else target[np.asarray(tile.weight) > 0]
+        for target, tile in zip(targets, problem.seen, strict=True)
+    ]
+    pixels, square = sum(target.size for target in counted), sum(float(np.sum(target**2)) for target in counted)
+    cost = float(residual @ residual)
+    inverse = np.zeros(vector.size)
+    inverse[~held] = inverse_diagonal(columns[~held] @ columns[~held].T, 1e-12)
+    errors = problem.by_leaf(jnp.asarray(np.sqrt(cost / max(pixels - vector.size, 1) * inverse), vector.dtype))
+    values = problem.decode(vector)
+    material, scenes = jax.tree.map(np.asarray, problem.put(vector))
     return JointResult(
-        material=jax.tree.map(np.asarray, material),
-        scenes=[jax.tree.map(np.asarray, scene) for scene in scenes],
-        values=tuple(np.asarray(leaf) for leaf in problem.decode(vector)),
-        errors=errors,
-        residual=residual,
+        material=material,
+        scenes=scenes,
+        values=tuple(np.asarray(leaf) for leaf in values),
+        errors=tuple(
+            np.asarray(error * leaf if name == "n" else error)
+            for error, leaf, name in zip(errors, values, problem.names, strict=True)
+        ),
+        residual=(cost / square) ** 0.5,
         steps=steps,
         converged=converged,
         solver=solver,
     )
-
-
-def _half_square(residuals: list[Array]) -> Array:
-    return 0.5 * jnp.sum(jnp.stack([jnp.sum(residual * residual) for residual in residuals]))
-
-
-@eqx.filter_jit
-def _column(problem: JointProblem, vector: Float[Array, " K"], direction: Float[Array, " K"]) -> Float[Array, " R"]:
-    tangents = jax.jvp(problem.residuals, (vector,), (direction,))[1]
-    return jnp.concatenate([tangent.ravel() for tangent in tangents])
-
-
-@eqx.filter_jit
-def _values(problem: JointProblem, vector: Float[Array, " K"]) -> Float[Array, " R"]:
-    return jnp.concatenate([residual.ravel() for residual in problem.residuals(vector)])
-
-
-def _errors(problem: JointProblem, vector: Array, held: np.ndarray) -> tuple[tuple[np.ndarray, ...], float]:
-    """Standard errors from the Gauss-Newton Hessian, one column of the Jacobian at a time."""
-    size = vector.size
-    columns = [np.asarray(_column(problem, vector, direction), np.float64) for direction in jnp.eye(size)]
-    gram = np.array([[left @ right for right in columns] for left in columns])
-    residual = np.asarray(_values(problem, vector), np.float64)
-    square = sum(float(np.sum(np.square(np.asarray(_counted(o)), dtype=np.float64))) for o in problem.seen)
-    pixels = sum(int(_counted(o).size) for o in problem.seen)
-    variance = float(residual @ residual) / max(pixels - size, 1)
-    active = ~held & (np.diag(gram) > 0)
-    scale = np.sqrt(np.where(active, np.diag(gram), 1.0))
-    covariance = np.full(size, np.inf)
-    if active.any():
-        normed = (gram / np.outer(scale, scale))[np.ix_(active, active)]
-        eigenvalue, eigenvector = np.linalg.eigh(normed)
-        known = eigenvalue > 1e-12 * eigenvalue[-1]
-        spread = np.sum(eigenvector[:, known] ** 2 / eigenvalue[known], axis=1)
-        # A number that takes part in an undetermined combination is itself undetermined.
-        spread[np.any(np.abs(eigenvector[:, ~known]) > 1e-3, axis=1)] = np.inf
-        covariance[active] = variance * spread / scale[active] ** 2
-    covariance[held] = 0.0
-    errors = problem.unravel(jnp.asarray(np.sqrt(covariance), vector.dtype))
-    leaves = problem.decode(vector)
-    found = tuple(
-        np.asarray(error * leaf if is_n else error)
-        for error, leaf, is_n in zip(errors, leaves, problem.is_n, strict=True)
-    )
-    return found, float(np.sqrt(residual @ residual / square))
-
-
-def _counted(observation: Tile) -> np.ndarray:
-    target = np.asarray(observation.target)
-    return target if observation.weight is None else target[np.asarray(observation.weight) > 0]

@@ -7,6 +7,7 @@ same. That factor, one for each channel, no picture can determine; here the mean
 value it has in the scene, and the result says so.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,13 +19,13 @@ import brdf
 from brdf.errors import InputError
 from brdf.models.base import SpecularMaterial
 from brdf.precision import Precision
-from fitting.solver.nnls import DEPENDENT, nonnegative_minimum
+from fitting.solver.nnls import inverse_diagonal, nonnegative_minimum
+from fitting.solver.refinement import GRID_STEP, minimum_between
 
 UNKNOWN_FACTOR = (
     "one factor per channel between material and lights: the lights' mean intensity was kept at that of the scene"
 )
 N_RANGE = (0.5, 1e5)
-GRID_STEP = 0.35
 _ROUNDS = 200
 
 
@@ -56,14 +57,11 @@ class LightFit:
         names = [light.type_name for light in self.scene.lights]
         names += ["ambient"] * (len(self.emittances) - len(names))
         lines = [f"light of {len(names)} sources on {self.material.name}"]
-        for index, name in enumerate(names):
-            values = (f"{v:.6g} ± {v * e / f if f > 0 else e:.2g}" for v, f, e in self._numbers(index))
+        for name, *numbers in zip(names, self.emittances, self.factors, self.errors, strict=True):
+            values = (f"{v:.6g} ± {v * e / f if f > 0 else e:.2g}" for v, f, e in zip(*numbers, strict=True))
             lines.append(f"  {name:<12} {', '.join(values)}")
         lines.append(f"  residual     {100 * self.residual:.3g} % of the picture (rms)")
         return "\n".join(lines + [f"  not determined: {what}" for what in self.undetermined])
-
-    def _numbers(self, index: int) -> list[tuple[float, float, float]]:
-        return list(zip(self.emittances[index], self.factors[index], self.errors[index], strict=True))
 
 
 def fit_lights(
@@ -102,7 +100,7 @@ def fit_lights_and_material(
 ) -> LightFit:
     """Fit the lights and the material together, up to the one factor per channel that no picture determines.
 
-    For each exponent of a grid, and then by golden section around the best, the intensities and the coefficients are
+    For each exponent of a grid, and then around the best, the intensities and the coefficients are
     found in turn, each a non-negative linear problem, until the residual stands still. The ambient coefficient cannot
     be told from the ambient intensity: it is that of the scene, and k_a takes the rest.
 
@@ -138,15 +136,8 @@ def fit_lights_and_material(
         return np.broadcast_to(stacked, (*stacked.shape[:3], channels))
 
     ambient = np.zeros(channels) if scene.ambient is None else np.broadcast_to(scene.ambient, channels)
-    best = (
-        _search(lambda n: _in_turn(terms(n), ambient, pixels), n_range)
-        if specular
-        else (
-            1.0,
-            _in_turn(terms(1.0), ambient, pixels),
-        )
-    )
-    n, (_, factors, k) = best
+    n = _best_exponent(lambda n: _in_turn(terms(n), ambient, pixels)[0], n_range) if specular else 1.0
+    _, factors, k = _in_turn(terms(n), ambient, pixels)
     mean = factors.mean(axis=0)
     scale = np.where(mean > 0, mean, 1.0)
     factors, k = factors / scale, np.concatenate([k[:1], k[1:] * scale])
@@ -181,26 +172,19 @@ def _intensities(
 ) -> tuple[Float[np.ndarray, "L C"], Float[np.ndarray, "L C"]]:
     """Factors and their standard errors, channel by channel."""
     lights, count, channels = columns.shape
-    factors, errors = np.zeros((lights, channels)), np.full((lights, channels), np.inf)
+    factors, errors = np.zeros((2, lights, channels))
     for c in range(channels):
         gram = columns[..., c] @ columns[..., c].T
         factors[:, c] = nonnegative_minimum(gram, columns[..., c] @ pixels[:, c])
         residual = pixels[:, c] - factors[:, c] @ columns[..., c]
-        lit = np.diag(gram) > 0
-        scale = np.diag(gram)[lit] ** 0.5
-        value, vector = np.linalg.eigh(gram[np.ix_(lit, lit)] / np.outer(scale, scale))
-        told = value > DEPENDENT
-        inverse = np.sum(vector[:, told] ** 2 / value[told], axis=1)
-        inverse[np.any(np.abs(vector[:, ~told]) > 1e-3, axis=1)] = np.inf
         noise = max(float(np.sum(residual**2)), np.finfo(float).tiny) / max(count - lights, 1)
-        errors[lit, c] = (noise * inverse) ** 0.5 / scale
+        errors[:, c] = np.sqrt(noise * inverse_diagonal(gram))
     return factors, errors
 
 
-Turn = tuple[float, Float[np.ndarray, "L C"], Float[np.ndarray, "T C"]]
-
-
-def _in_turn(terms: Float[np.ndarray, "L T P C"], ambient: np.ndarray, pixels: Float[np.ndarray, "P C"]) -> Turn:
+def _in_turn(
+    terms: Float[np.ndarray, "L T P C"], ambient: np.ndarray, pixels: Float[np.ndarray, "P C"]
+) -> tuple[float, Float[np.ndarray, "L C"], Float[np.ndarray, "T C"]]:
     """Least cost at one exponent, the lights' factors, and coefficients with k_a first."""
     lights, parts, count, channels = terms.shape
     cost, factors, k = 0.0, np.ones((lights, channels)), np.zeros((parts + 1, channels))
@@ -232,25 +216,16 @@ def _fold(matrix: np.ndarray) -> np.ndarray:
     return wide
 
 
-def _search(at: Any, n_range: tuple[float, float]) -> tuple[float, Turn]:
-    """The exponent of least cost: a grid over log n, then golden section in the best cell's neighbourhood."""
-    low, high = (float(np.log(n)) for n in n_range)
+def _best_exponent(cost: Callable[[float], float], n_range: tuple[float, float]) -> float:
+    """The exponent of least cost: a grid over log n, then the best cell's neighbourhood."""
+
+    def costs(log_n: Float[np.ndarray, " T"]) -> Float[np.ndarray, " T"]:
+        return np.array([cost(float(n)) for n in np.exp(log_n)])
+
+    low, high = np.log(n_range)
     grid = np.linspace(low, high, 2 + int((high - low) / GRID_STEP))
-    best = int(np.argmin([at(float(np.exp(x)))[0] for x in grid]))
-    low, high = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
-    ratio = (5**0.5 - 1) / 2
-    left, right = high - ratio * (high - low), low + ratio * (high - low)
-    at_left, at_right = (at(float(np.exp(x))) for x in (left, right))
-    while high - low > 1e-5:
-        if at_left[0] < at_right[0]:
-            high, right, at_right = right, left, at_left
-            left = high - ratio * (high - low)
-            at_left = at(float(np.exp(left)))
-        else:
-            low, left, at_left = left, right, at_right
-            right = low + ratio * (high - low)
-            at_right = at(float(np.exp(right)))
-    return (float(np.exp(left)), at_left) if at_left[0] < at_right[0] else (float(np.exp(right)), at_right)
+    best = int(np.argmin(costs(grid)))
+    return float(np.exp(minimum_between(costs, grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)], points=9)))
 
 
 def _result(

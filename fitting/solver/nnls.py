@@ -99,13 +99,15 @@ def nonnegative_minimum(
 
     Source: C. L. Lawson and R. J. Hanson, Solving Least Squares Problems, 1974, chapter 23.
     """
+    if not product.size:
+        return product
     signed = np.zeros(product.size, bool) if signed is None else signed
     usable = np.diag(gram) > np.finfo(float).tiny
     scale = np.sqrt(np.where(usable, np.diag(gram), 1.0))
     gram, product = gram / np.outer(scale, scale), np.where(usable, product / scale, 0.0)
     passive = signed & usable
     x = np.zeros(product.size)
-    tolerance = 1e-13 * max(float(np.max(np.abs(product), initial=0.0)), np.finfo(float).tiny)
+    tolerance = 1e-13 * max(float(np.max(np.abs(product))), np.finfo(float).tiny)
     for _ in range(4 * product.size + 4):
         while True:
             trial = np.zeros_like(x)
@@ -126,3 +128,22 @@ def nonnegative_minimum(
             break
         passive[best] = True
     return x / scale
+
+
+def inverse_diagonal(gram: Float[np.ndarray, "U U"], share: float = DEPENDENT) -> Float[np.ndarray, " U"]:
+    """The diagonal of the inverse; infinite for an unknown that takes part in an undetermined combination.
+
+    Args:
+        gram: positive semidefinite.
+        share: of the largest eigenvalue, unknowns in units of their own columns; a smaller one determines nothing.
+    """
+    found = np.full(len(gram), np.inf)
+    lit = np.diag(gram) > 0
+    if lit.any():
+        scale = np.sqrt(np.diag(gram)[lit])
+        value, vector = np.linalg.eigh(gram[np.ix_(lit, lit)] / np.outer(scale, scale))
+        known = value > share * value[-1]
+        inverse = np.sum(vector[:, known] ** 2 / value[known], axis=1)
+        inverse[np.any(np.abs(vector[:, ~known]) > 1e-3, axis=1)] = np.inf
+        found[lit] = inverse / scale**2
+    return found

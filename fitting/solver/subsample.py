@@ -118,7 +118,7 @@ def subsample(picture: Picture, size: int, n_max: float) -> Subsample:
 
 @jax.jit
 def spread(
-    sample: Subsample, log_n: Array, x: Float[Array, "N C 3"], best: Array, peak: Array
+    sample: Subsample, log_n: Array, x: Float[Array, "N C 3"], few: Array, best: Array, peak: Array
 ) -> tuple[Float[Array, " N"], Float[Array, " N"]]:
     """How far the subsample's profile may be from that of all pixels.
 
@@ -126,11 +126,12 @@ def spread(
         sample: The subsample of one picture.
         log_n: Natural logarithms of the exponents, (N,).
         x: Best coefficients at each.
+        few: Which of them to look at.
         best: Which to compare with.
         peak: See :func:`fitting.solver.normal_equations.relative_lobe`.
 
     Returns:
-        Horvitz-Thompson variances of the cost at each exponent minus that at the best, and of the profile's slope by
+        Horvitz-Thompson variances of the cost at those exponents minus that at the best, and of the profile's slope by
         log n. They add up over pictures.
     """
     picture, factor = sample.picture, sample.factor
@@ -155,4 +156,4 @@ def spread(
         total, score = (jnp.sum(chance * jnp.sum(each, axis=1) ** 2) for each in changes)
         return total, score
 
-    return jax.lax.map(one, jnp.arange(log_n.shape[0]))
+    return jax.lax.map(one, few)
