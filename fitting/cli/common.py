@@ -167,7 +167,7 @@ def use_compilation_cache() -> None:
     """Keep compiled programs in the user's cache folder: the second run of the same kind skips the compiler."""
     # Of each program that it takes from there jaxlib 0.10.1 says, at length, that the compiler's own settings are no
     # features of the machine. What is an error comes as an exception.
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
     import jax
 
     base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
