@@ -91,10 +91,13 @@ def decode_table(encoding: Encoding, bits: int) -> Float[np.ndarray, " codes"]:
     return table
 
 
-def find_encoding(path: Path, format_name: str, spec: oiio.ImageSpec, bits: int) -> tuple[Encoding, EncodingSource]:
-    """What a file says of its encoding, or what its format or its kind makes likely.
+def find_encoding(
+    given: Encoding | None, path: Path, format_name: str, spec: oiio.ImageSpec, bits: int
+) -> tuple[Encoding, EncodingSource]:
+    """What the user says, what a file says of its encoding, or what its format or its kind makes likely.
 
     Args:
+        given: by the user, or None.
         path: the file.
         format_name: OpenImageIO's name of the format.
         spec: the header as OpenImageIO reads it.
@@ -106,6 +109,8 @@ def find_encoding(path: Path, format_name: str, spec: oiio.ImageSpec, bits: int)
     Raises:
         InputError: if the file states an encoding that is neither linear, sRGB nor a power.
     """
+    if given is not None:
+        return given, "given"
     stated = _stated(path, format_name, spec)
     if stated is not None:
         return stated, "file"
@@ -117,7 +122,7 @@ def find_encoding(path: Path, format_name: str, spec: oiio.ImageSpec, bits: int)
 
 
 def _stated(path: Path, format_name: str, spec: oiio.ImageSpec) -> Encoding | None:
-    attributes = {attribute.name: attribute.value for attribute in spec.extra_attribs}
+    attributes: dict[str, Any] = {attribute.name: attribute.value for attribute in spec.extra_attribs}
     if "ICCProfile" in attributes and "CICP" not in attributes:
         return _of_profile(path, np.asarray(attributes["ICCProfile"], np.uint8).tobytes())
     if attributes.get("Exif:ColorSpace") == 1:
@@ -145,7 +150,9 @@ def _of_profile(path: Path, profile: bytes) -> Encoding | None:
     try:
         (count,) = struct.unpack_from(">I", profile, 128)
         tags = [struct.unpack_from(">4sII", profile, 132 + 12 * tag) for tag in range(min(count, 100))]
-        curves = {_of_curve(profile[start : start + size]) for kind, start, size in tags if kind[1:] == b"TRC"}
+        curves: set[Encoding | None] = {
+            _of_curve(profile[start : start + size]) for kind, start, size in tags if kind[1:] == b"TRC"
+        }
     except (struct.error, ValueError):
         return None
     if len(curves) != 1 or None in curves:
@@ -167,6 +174,6 @@ def _of_curve(curve: bytes) -> Encoding | None:
         values = np.interp(at, np.linspace(0, 1, number), table / 65535) if number > 1 else at**gamma
     else:
         return None
-    known = (float(gamma), "srgb", 2.2, 1.8)
+    known: tuple[Encoding, ...] = (float(gamma), "srgb", 2.2, 1.8)
     found = [one for one in known if np.allclose(decode(at, one), values, rtol=0, atol=_CURVE_TOLERANCE)]
     return parse_encoding("ICC profile", found[0]) if found else None

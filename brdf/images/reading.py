@@ -124,12 +124,11 @@ class ImageReader:
         self.is_integer = kind.basetype not in (oiio.FLOAT, oiio.HALF, oiio.DOUBLE)
         stored = spec.get_int_attribute("oiio:BitsPerSample")
         self.bits = stored if self.is_integer and 0 < stored <= 32 else 8 * kind.basesize()
-        self.encoding: Encoding = given or "linear"
-        self.source: EncodingSource = "given"
-        if given is None:
-            self.encoding, self.source = find_encoding(self.path, name, spec, self.bits)
-        compression = spec.get_string_attribute("compression")
-        self._is_lossy = name in ("jpeg", "webp", "heif") or compression.startswith("jpeg")
+        self.encoding: Encoding
+        self.source: EncodingSource
+        self.encoding, self.source = find_encoding(given, self.path, name, spec, self.bits)
+        lossy = name in ("jpeg", "webp", "heif") or spec.get_string_attribute("compression").startswith("jpeg")
+        self._top = LOSSY_TOP if lossy else 1.0
         self._turn = spec.get_int_attribute("Orientation", 1)
         self._upright: np.ndarray | None = None
         height, width = spec.full_height, spec.full_width
@@ -146,9 +145,8 @@ class ImageReader:
         """
         if not self.is_integer:
             return None, 0.0
-        table = decode_table(self.encoding, min(self.bits, 16))
-        top = decode(np.array(LOSSY_TOP), self.encoding) if self._is_lossy else table[-1]
-        return float(top), float(np.max(np.diff(table)))
+        step = np.max(np.diff(decode_table(self.encoding, min(self.bits, 16))))
+        return float(decode(np.array(self._top), self.encoding)), float(step)
 
     def __enter__(self) -> Self:
         """The reader itself."""
@@ -292,8 +290,8 @@ def _choose_channels(image: oiio.ImageInput) -> tuple[int, list[int], int | None
     spec = image.spec()
     every = list(range(spec.nchannels))
     if image.format_name() != "openexr":
-        # Some readers name an alpha channel beyond the last one.
-        alpha = spec.alpha_channel if 0 < spec.alpha_channel < spec.nchannels else None
+        # By its name: some readers number an alpha channel beyond the last one.
+        alpha = spec.channelnames.index("A") if "A" in spec.channelnames[1:] else None
         return 0, every[:alpha], alpha
     layers = _layers(image)
     for (part, _), at in sorted(layers.items(), key=lambda item: item[0][1] != ""):

@@ -17,10 +17,10 @@ from brdf.images.reading import said
 
 DataType = Literal["uint8", "uint16", "half", "float"]
 
-_FLOATS = {"float": ("linear",), "half": ("linear",)}
-_PNG = ("srgb", "linear", 1.8, 2.2, 2.4)
-_TIFF = {**_FLOATS, "uint8": ("srgb",), "uint16": ("srgb", "linear")}
-_JPEG = {"uint8": ("srgb",)}
+_FLOATS: dict[str, tuple[Encoding, ...]] = {"float": ("linear",), "half": ("linear",)}
+_PNG: tuple[Encoding, ...] = ("srgb", "linear", 1.8, 2.2, 2.4)
+_TIFF: dict[str, tuple[Encoding, ...]] = {**_FLOATS, "uint8": ("srgb",), "uint16": ("srgb", "linear")}
+_JPEG: dict[str, tuple[Encoding, ...]] = {"uint8": ("srgb",)}
 # Per suffix the data types that it can hold, and the encodings that a file of each can say, or reading it back would
 # guess wrong; the usual one first.
 _WRITABLE: dict[str, dict[str, tuple[Encoding, ...]]] = {
@@ -152,6 +152,7 @@ def _write(path: str | os.PathLike[str], pixels: np.ndarray, names: list[str], k
     with atomic_path(path) as temporary:
         _ask_for_space(temporary, spec)
         file = oiio.ImageOutput.create(utf8_name(temporary))
+        assert file is not None  # of a format that OpenImageIO has
         ok = file.open(str(temporary), spec) and file.write_image(pixels)
         ok = file.close() and ok
         # A remark without a failure does not count: TIFF complains of Exif data that nobody asked for.

@@ -56,13 +56,12 @@ def test_odd_pictures_are_read_right(tmp_path):
     bits = np.random.default_rng(1).integers(0, 2, (5, 16), np.uint8)
     rows = b"".join(b"\0" + row.tobytes() for row in np.packbits(bits, axis=1))
     (tmp_path / "bits.png").write_bytes(png(16, 5, 1, 0, rows))
-    # OpenImageIO's curve gives white 2.4e-5 too much.
-    np.testing.assert_allclose(brdf.read_image(tmp_path / "bits.png")[..., 0], bits, atol=3e-5)
+    np.testing.assert_array_equal(brdf.read_image(tmp_path / "bits.png")[..., 0], bits)
     index = np.random.default_rng(1).integers(0, 3, (5, 7), np.uint8)
     colours = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255]], np.uint8)
     rows = b"".join(b"\0" + row.tobytes() for row in index)
     (tmp_path / "palette.png").write_bytes(png(7, 5, 8, 3, rows, (b"PLTE", colours.tobytes())))
-    np.testing.assert_allclose(brdf.read_image(tmp_path / "palette.png"), colours[index] / 255, atol=3e-5)
+    np.testing.assert_allclose(brdf.read_image(tmp_path / "palette.png"), colours[index] / 255, atol=1e-7)
     for name, shape in (("one.exr", (1, 1, 3)), ("wide.exr", (1, 16384, 3)), ("tall.exr", (16384, 1, 1))):
         values = np.random.default_rng(2).random(shape).astype(np.float32)
         write(tmp_path / name, values, "float", ("Y",) if shape[2] == 1 else ())
