@@ -6,22 +6,19 @@ Plain numbers are converted in float64, whatever JAX is set to; what JAX is trac
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import ArrayLike, Float
+from jaxtyping import Float
 
 from brdf import vectors
-from brdf.albedo import lobe_albedo, normalized_form
+from brdf.albedo import gauss_legendre, lobe_albedo, normalized_form
 from brdf.errors import InputError
 from brdf.models import BlinnPhong, Lambert, Material, NormalizedPhong, Phong, SpecularMaterial
 from brdf.precision import working_precision
 from brdf.vectors import Numbers, Scalars
 
-_NODES = (
-    400  # over the angle of the light; the integrands have at worst a boundary layer 1 / sqrt(n) wide at 90 degrees
-)
+_NODES = 400  # over the light's angle: the integrands have at worst a layer 1 / sqrt(n) wide at 90 degrees
 
 
 def slope_from_exponent(n: Numbers) -> Scalars:
@@ -33,8 +30,7 @@ def slope_from_exponent(n: Numbers) -> Scalars:
     Returns:
         (...), above 0 to 1. Source: Walter et al., "Microfacet models for refraction", EGSR 2007, section 5.2.
     """
-    _check("n", n, low=0.0)
-    return _converted(lambda n: vectors.square_root(2.0 / (n + 2.0)), n)
+    return _converted(_slope, n=n)
 
 
 def exponent_from_slope(alpha: Numbers) -> Scalars:
@@ -46,8 +42,7 @@ def exponent_from_slope(alpha: Numbers) -> Scalars:
     Returns:
         (...), at least 0.
     """
-    _check("alpha", alpha, above=0.0, high=1.0)
-    return _converted(lambda alpha: 2.0 * (1.0 - alpha) * (1.0 + alpha) / (alpha * alpha), alpha)
+    return _converted(_exponent, alpha=alpha)
 
 
 def roughness_from_exponent(n: Numbers) -> Scalars:
@@ -59,7 +54,7 @@ def roughness_from_exponent(n: Numbers) -> Scalars:
     Returns:
         (...), above 0 to 1. Source: glTF 2.0 specification, appendix B: alpha = roughness^2.
     """
-    return _converted(vectors.square_root, slope_from_exponent(n))
+    return _converted(lambda n: vectors.square_root(_slope(n)), n=n)
 
 
 def exponent_from_roughness(roughness: Numbers) -> Scalars:
@@ -71,8 +66,7 @@ def exponent_from_roughness(roughness: Numbers) -> Scalars:
     Returns:
         (...), at least 0.
     """
-    _check("roughness", roughness, above=0.0, high=1.0)
-    return exponent_from_slope(_converted(lambda roughness: roughness * roughness, roughness))
+    return _converted(lambda roughness: _exponent(roughness * roughness), roughness=roughness)
 
 
 def half_from_mirror(n: Numbers) -> Scalars:
@@ -87,8 +81,7 @@ def half_from_mirror(n: Numbers) -> Scalars:
     Returns:
         (...), at least 0.
     """
-    _check("n", n, low=0.0)
-    return _converted(lambda n: 4.0 * n, n)
+    return _converted(lambda n: 4.0 * n, n=n)
 
 
 def mirror_from_half(n: Numbers) -> Scalars:
@@ -100,8 +93,7 @@ def mirror_from_half(n: Numbers) -> Scalars:
     Returns:
         (...), at least 0.
     """
-    _check("n", n, low=0.0)
-    return _converted(lambda n: 0.25 * n, n)
+    return _converted(lambda n: 0.25 * n, n=n)
 
 
 def nearest_normalized(material: Material) -> Material:
@@ -139,55 +131,52 @@ def nearest_classic(material: Material) -> Material:
 def _nearest(material: SpecularMaterial, model: type[SpecularMaterial], *, bounded: bool) -> SpecularMaterial:
     # Light is uniform over the hemisphere, the view in proportion to N.V, as a sphere shows it to a far camera. Then
     # every entry of the normal equations is an integral over the light's angle of an albedo of exponent n or 2 n.
-    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
-    theta = 0.25 * np.pi * (nodes + 1)
-    weights = weights * np.sin(theta)
-    cosine = np.cos(theta)
-    old = type(material)
-    n = float(np.asarray(material.n))
-    plain = Phong if normalized_form(old) is NormalizedPhong else BlinnPhong
+    nodes, weights = gauss_legendre(_NODES)
+    theta = 0.5 * np.pi * nodes
+    weights, cosine, n = weights * np.sin(theta), np.cos(theta), float(np.asarray(material.n))
+    plain = Phong if normalized_form(model) is NormalizedPhong else BlinnPhong
     with working_precision("float64"):
-        lobe, lobe_squared = (
-            np.asarray(lobe_albedo(plain, jnp.asarray(m, jnp.float64), jnp.asarray(theta))) for m in (n, 2 * n)
-        )
-        to, of = (float(jax.jit(m.scale)(n)) * (cosine if m.cosine_weighted else 1.0) for m in (model, old))
-    gram = np.array(
-        [
-            [np.sum(weights * cosine**2), np.sum(weights * cosine * to * lobe)],
-            [np.sum(weights * cosine * to * lobe), np.sum(weights * to * to * lobe_squared)],
-        ]
-    )
-    cross = np.array([np.sum(weights * cosine * of * lobe), np.sum(weights * to * of * lobe_squared)])
+        single, double = (np.asarray(lobe_albedo(plain, jnp.asarray(m), jnp.asarray(theta))) for m in (n, 2 * n))
+        to, of = (float(m.scale(n)) * (cosine if m.cosine_weighted else 1.0) for m in (model, type(material)))
+    mixed, pure = np.sum(weights * cosine * to * single), np.sum(weights * to * to * double)
+    gram = np.array([[np.sum(weights * cosine**2), mixed], [mixed, pure]])
+    cross = np.array([np.sum(weights * cosine * of * single), np.sum(weights * to * of * double)])
     k_d, k_s = np.asarray(material.k_d, np.float64), np.asarray(material.k_s, np.float64)
     pairs = np.array([_constrained(gram, gram[:, 0] * d + cross * s, bounded) for d, s in zip(k_d, k_s, strict=True)])
     return model(k_a=material.k_a, k_d=pairs[:, 0], k_s=pairs[:, 1], n=n)
 
 
 def _constrained(gram: Float[np.ndarray, "2 2"], right: Float[np.ndarray, " 2"], bounded: bool) -> np.ndarray:
-    """The x >= 0 (with sum <= 1 if bounded) of least x' gram x / 2 - right' x: the best of all active sets."""
-    candidates = [np.linalg.solve(gram, right), np.zeros(2)]
-    candidates += [np.array([right[0] / gram[0, 0], 0.0]), np.array([0.0, right[1] / gram[1, 1]])]
-    if bounded:
-        along = np.array([1.0, -1.0])
-        start = np.array([0.0, 1.0])
-        step = along @ (right - gram @ start) / (along @ gram @ along)
-        candidates += [start, np.array([1.0, 0.0]), np.array([step, 1.0 - step])]
-    feasible = [x for x in candidates if np.all(x >= 0) and (not bounded or x.sum() <= 1 + 1e-15)]
-    return min(feasible, key=lambda x: 0.5 * x @ gram @ x - right @ x)
+    """The x >= 0 (with sum <= 1 if bounded) of least x' gram x / 2 - right' x: within, or the best on an edge."""
+    best = np.linalg.lstsq(gram, right, rcond=1e-12)[0]  # at n = 0 a lobe may be the diffuse term: they share it
+    if np.all(best > 1e-12 * best.max()) and (not bounded or best.sum() <= 1):
+        return best
+    edges = [((0.0, 0.0), (1.0, 0.0)), ((0.0, 0.0), (0.0, 1.0)), ((0.0, 1.0), (1.0, -1.0))]
+    candidates = []
+    for start, along in np.array(edges if bounded else edges[:2]):
+        step = along @ (right - gram @ start) / max(along @ gram @ along, 1e-300)
+        candidates.append(start + np.clip(step, 0.0, 1.0 if bounded else np.inf) * along)
+    return min(candidates, key=lambda x: 0.5 * x @ gram @ x - right @ x)
 
 
-def _converted(formula: Callable[[Any], Any], value: Any) -> Any:
+def _slope(n: Any) -> Any:
+    return vectors.square_root(2.0 / (n + 2.0))
+
+
+def _exponent(alpha: Any) -> Any:
+    return 2.0 * (1.0 - alpha) * (1.0 + alpha) / (alpha * alpha)
+
+
+def _converted(formula: Callable[[Any], Any], **named: Any) -> Any:
+    """The formula of one number, which is checked by its name: exponents are at least 0, the others in (0, 1]."""
+    ((name, value),) = named.items()
     if isinstance(value, Tracer):
         return formula(value)
-    with working_precision("float64"):
-        return np.asarray(formula(jnp.asarray(value, jnp.float64)))
-
-
-def _check(name: str, value: ArrayLike, low: float = -np.inf, above: float = -np.inf, high: float = np.inf) -> None:
-    if isinstance(value, Tracer):
-        return
     numbers = np.asarray(value, np.float64)
-    wrong = ~((numbers >= low) & (numbers > above) & (numbers <= high) & np.isfinite(numbers))
+    right = (numbers >= 0) if name == "n" else (numbers > 0) & (numbers <= 1)
+    wrong = ~(right & np.isfinite(numbers))
     if np.any(wrong):
-        wanted = "at least 0" if above == -np.inf else f"above {above:g} and at most {high:g}"
+        wanted = "at least 0" if name == "n" else "above 0 and at most 1"
         raise InputError(name, f"must be {wanted}, got {numbers[wrong].flat[0]:g}")
+    with working_precision("float64"):
+        return np.asarray(formula(jnp.asarray(numbers)))

@@ -16,7 +16,7 @@ from brdf.geometry.camera import OrthographicCamera
 from brdf.geometry.sphere import Sphere
 from brdf.images.encoding import encode
 from brdf.lights.punctual import DirectionalLight
-from brdf.models import Material, SpecularMaterial
+from brdf.models import Material
 from brdf.plausibility.report import Report
 from brdf.rendering import render
 from brdf.scene import Scene
@@ -81,20 +81,19 @@ def material_html(material: Material) -> str:
     Args:
         material: any of the models, of known numbers.
     """
-    labels = channel_names(np.asarray(material.k_d).size)
-    head = "".join(f'<th style="{_CELL}">{label}</th>' for label in ["", *labels])
-    rows = []
-    for key in ("k_a", "k_d", "k_s") if isinstance(material, SpecularMaterial) else ("k_a", "k_d"):
-        cells = "".join(f'<td style="{_CELL}">{value:.4g}</td>' for value in np.asarray(getattr(material, key)))
-        rows.append(f'<tr><th style="{_CELL}">{key}</th>{cells}</tr>')
-    if isinstance(material, SpecularMaterial):
-        rows.append(f'<tr><th style="{_CELL}">n</th><td style="{_CELL}">{float(material.n):.5g}</td></tr>')
+    cell = f'<td style="{_CELL}">{{}}</td>'.format
+    head = f'<th style="{_CELL}">{{}}</th>'.format
+    rows = [["", *map(head, channel_names(np.asarray(material.k_d).size))]]
+    for key in ("k_a", "k_d", "k_s", "n"):
+        if hasattr(material, key):
+            digits = 5 if key == "n" else 4
+            rows.append([key, *(cell(f"{value:.{digits}g}") for value in np.ravel(getattr(material, key)))])
+    table = "".join(f"<tr>{head(first)}{''.join(cells)}</tr>" for first, *cells in rows)
     picture = f'<img alt="a lit sphere" width="128" height="128" src="{png_address(lit_sphere(material))}">'
-    table = f"<table><tr>{head}</tr>{''.join(rows)}</table>"
-    name = html.escape(material.name)
     style = "display:flex;flex-wrap:wrap;gap:1em;align-items:center"
     # A spectrum is wider than a page: the table scrolls, not the page.
-    return f'<div style="{style}">{picture}<div style="min-width:0;overflow-x:auto"><b>{name}</b>{table}</div></div>'
+    words = f'<div style="min-width:0;overflow-x:auto"><b>{html.escape(material.name)}</b><table>{table}</table></div>'
+    return f'<div style="{style}">{picture}{words}</div>'
 
 
 def report_html(report: Report) -> str:
@@ -103,15 +102,12 @@ def report_html(report: Report) -> str:
     Args:
         report: of `brdf.check`.
     """
-    word = {True: "plausible", False: "not plausible", None: "cannot tell"}[report.plausible]
     rows = "".join(
         f'<tr><th style="{_CELL}">{name}</th><td style="{_CELL}">{_MARKS[finding.verdict]}</td>'
         f'<td style="padding:0.15em 0.8em;text-align:left">{html.escape(finding.sentence)}</td></tr>'
         for name, finding in report.findings.items()
     )
-    nearest = (
-        "" if report.nearest is None else f"<p>Its nearest plausible form is {html.escape(repr(report.nearest))}.</p>"
-    )
-    subject = html.escape(report.subject)
-    style = "overflow-x:auto;overflow-wrap:anywhere"
-    return f'<div style="{style}"><b>{subject}: {word}</b><table>{rows}</table>{nearest}</div>'
+    nearest = html.escape(f"{report.nearest!r}")
+    after = "" if report.nearest is None else f"<p>Its nearest plausible form is {nearest}.</p>"
+    title = html.escape(report.title)
+    return f'<div style="overflow-x:auto;overflow-wrap:anywhere"><b>{title}</b><table>{rows}</table>{after}</div>'

@@ -15,6 +15,10 @@ RECIPROCITY_LIMIT = 1e-6
 """The largest relative difference of f_r when light and view change places."""
 
 
+GRAZING = 89.99
+"""The largest angle from the normal, in degrees, that is looked at."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Angles:
     """A direction in the local frame.
@@ -26,6 +30,12 @@ class Angles:
 
     polar: float
     azimuth: float = 0.0
+
+    @classmethod
+    def of(cls, direction: Any) -> "Angles":
+        """The angles of a direction, (3,)."""
+        x, y, z = map(float, direction)
+        return cls(math.degrees(math.atan2(math.hypot(x, y), z)), math.degrees(math.atan2(y, x)) % 360.0)
 
     def __str__(self) -> str:
         """The angles with a degree sign, the azimuth only where it is not zero."""
@@ -61,10 +71,6 @@ class Finding:
     sentence: str
     crossing: float | None = None
 
-    def to_json(self) -> dict[str, Any]:
-        """The finding as plain numbers, strings and dictionaries; what is not finite is None."""
-        return _plain(dataclasses.asdict(self))
-
 
 @dataclasses.dataclass(frozen=True)
 class Report:
@@ -95,10 +101,15 @@ class Report:
         verdicts = {finding.verdict for finding in self.findings.values()}
         return False if "fail" in verdicts else None if "cannot tell" in verdicts else True
 
+    @property
+    def title(self) -> str:
+        """What was checked, and whether it is plausible."""
+        word = {True: "plausible", False: "not plausible", None: "cannot tell"}[self.plausible]
+        return f"{self.subject}: {word}"
+
     def __str__(self) -> str:
         """A line for the whole, a sentence for each test."""
-        word = {True: "plausible", False: "not plausible", None: "cannot tell"}[self.plausible]
-        lines = [f"{self.subject}: {word}"]
+        lines = [self.title]
         for name, finding in self.findings.items():
             lines.append(f"  {name + ':':<13}{finding.verdict}; {finding.sentence}.")
             lines.append(f"{'':15}margin {finding.margin:.3g}, known to within {finding.error_bound:.1g}")
@@ -112,18 +123,9 @@ class Report:
 
     def to_json(self) -> dict[str, Any]:
         """The report as plain numbers, strings and dictionaries, for ``json.dumps``."""
-        nearest = None
-        if self.nearest is not None:
-            nearest = {"model": self.nearest.name} | {k: _plain(v) for k, v in vars(self.nearest).items()}
-        findings = {name: finding.to_json() for name, finding in self.findings.items()}
-        return {"subject": self.subject, "plausible": self.plausible, **findings, "nearest": nearest}
-
-
-def not_finite(finding: Finding, to_light: Angles, to_view: Angles) -> Finding:
-    """The finding, after f_r turned out not to be a number somewhere: nothing can be told."""
-    nan = math.nan
-    sentence = f"f_r is not a finite number for light {to_light}, view {to_view}"
-    return Finding("cannot tell", nan, finding.limit, nan, nan, to_light, to_view, 0, sentence)
+        nearest = None if self.nearest is None else {"model": self.nearest.name, **vars(self.nearest)}
+        findings = {name: dataclasses.asdict(finding) for name, finding in self.findings.items()}
+        return _plain({"subject": self.subject, "plausible": self.plausible, **findings, "nearest": nearest})
 
 
 def verdict(margin: float, error_bound: float) -> Verdict:
@@ -137,19 +139,15 @@ def verdict(margin: float, error_bound: float) -> Verdict:
 
 def times(ratio: float) -> str:
     """A ratio in words, with as many digits as tell it from 1."""
+    if ratio >= 1e6:
+        return "a million times and more"
     digits = 2 if ratio >= 1.1 else 2 + math.ceil(-math.log10(max(ratio - 1.0, 1e-12)))
-    return (
-        f"{ratio:.{digits}g} times"
-        if ratio < 100
-        else f"{ratio:.0f} times"
-        if ratio < 1e6
-        else "a million times and more"
-    )
+    return f"{ratio:.0f} times" if ratio >= 100 else f"{ratio:.{digits}g} times"
 
 
 def _plain(value: Any) -> Any:
+    """As JSON knows it; what is not finite is None."""
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value.tolist() if hasattr(value, "tolist") else value
+    value = value.tolist() if hasattr(value, "tolist") else value
+    return None if isinstance(value, float) and not math.isfinite(value) else value

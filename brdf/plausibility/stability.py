@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from brdf.models import MODELS, Lambert, Material, SpecularMaterial
+from brdf.models import Material, SpecularMaterial
 
 EXPONENTS = np.array([0.0, 1e-3, 0.1, 0.5, 1.0, 2.0, 5.0, *np.geomspace(10.0, 1e8, 15)])
 ANGLES = np.array([*np.arange(0.0, 85.0, 5.0), 85.0, 87.0, 88.0, 89.0, 89.5, 89.9, 89.99, 89.999, 90.0])
@@ -47,51 +47,42 @@ def stability_map(
 
     Returns:
         The map.
+
+    Example:
+        ``brdf.stability_map(brdf.BlinnPhong).error.max()``
     """
-    n, angle, offset, across = (x.ravel() for x in np.meshgrid(exponents, angles, OFFSETS, [0.0, 1.0], indexing="ij"))
-    vectors = _vectors(n, np.radians(angle), offset, across)
-    results, finite = [], np.ones(len(n), bool)
+
+    def value(n: Array, vectors: Float[Array, "3 3"]) -> Array:
+        """The specular term, then f_r."""
+        material = model(k_d=0.5, k_s=0.5, n=n) if issubclass(model, SpecularMaterial) else model(k_d=0.5)
+        return jnp.append(material.specular(*vectors), material.reflectance(vectors[1], vectors[2]))
+
+    grid = np.meshgrid(exponents, np.radians(angles), OFFSETS, [False, True], indexing="ij")
+    n, angle, offset, across = (x.ravel() for x in grid)
+    vectors = _vectors(angle, offset / np.sqrt(n + 1.0), across)
+    terms, finite, peak = [], np.ones(len(n), bool), np.ones(len(n))
     for x64 in (False, True):
         with jax.enable_x64(x64):
-            kind = jnp.result_type(float)
-            arguments = jnp.asarray(n, kind), jnp.asarray(vectors, kind)
-            for function in (_value(model), jax.jacfwd(_value(model), (0, 1)), jax.jacrev(_value(model), (0, 1))):
-                leaves = jax.tree.leaves(jax.jit(jax.vmap(function))(*arguments))
-                finite &= np.all([np.isfinite(np.asarray(x)).reshape(len(n), -1).all(axis=1) for x in leaves], axis=0)
-            results.append(np.asarray(jax.jit(jax.vmap(_value(model)))(*arguments), np.float64)[:, 0])
+            arguments = [jnp.asarray(x, jnp.result_type(float)) for x in (n, vectors)]
+            functions = value, jax.jacfwd(value, (0, 1)), jax.jacrev(value, (0, 1))
+            outcomes = [jax.jit(jax.vmap(function))(*arguments) for function in functions]
+            for leaf in jax.tree.leaves(outcomes):
+                finite &= np.isfinite(np.asarray(leaf)).reshape(len(n), -1).all(axis=1)
+            terms.append(np.asarray(outcomes[0], np.float64)[:, 0])
+            if issubclass(model, SpecularMaterial):
+                peak = np.maximum(model.scale(arguments[0]), 1.0)
     shape = len(exponents), len(angles), -1
-    difference = np.abs(results[0] - results[1]) / np.maximum(_peak(model, n), 1.0)
-    error = np.nan_to_num(difference, nan=np.inf).reshape(shape).max(axis=2)
+    error = np.nan_to_num(np.abs(terms[0] - terms[1]) / peak, nan=np.inf).reshape(shape).max(axis=2)
     return StabilityMap(model.name, exponents, angles, error, finite.reshape(shape).all(axis=2))
 
 
-def stability_maps() -> list[StabilityMap]:
-    """The maps of the five models."""
-    return [stability_map(model) for model in MODELS.values()]
+def _vectors(theta: np.ndarray, tilt: np.ndarray, across: np.ndarray) -> Float[np.ndarray, "m 3 3"]:
+    """Normal, light and view, rounded to float32; the view tilts from the mirror direction, in or across the plane."""
 
+    def in_plane(angle: np.ndarray) -> np.ndarray:
+        return np.stack([np.sin(angle), 0 * angle, np.cos(angle)], -1)
 
-def _value(model: type[Material]):
-    def value(n: Array, vectors: Float[Array, "3 3"]) -> Array:
-        """The specular term, then f_r."""
-        material = model(k_d=0.5, k_s=0.5, n=n) if issubclass(model, SpecularMaterial) else Lambert(k_d=0.5)
-        return jnp.append(material.specular(*vectors), material.reflectance(vectors[1], vectors[2]))
-
-    return value
-
-
-def _vectors(n: np.ndarray, theta: np.ndarray, offset: np.ndarray, across: np.ndarray) -> Float[np.ndarray, "m 3 3"]:
-    """Normal, light and view, rounded to float32."""
-    zero, one = np.zeros_like(theta), np.ones_like(theta)
-    light = np.stack([np.sin(theta), zero, np.cos(theta)], -1)
-    tilt = offset / np.sqrt(n + 1.0)
-    in_plane = np.stack([-np.sin(theta + tilt), zero, np.cos(theta + tilt)], -1)
-    beside = np.cos(tilt)[:, None] * light * [-1.0, 1.0, 1.0] + np.sin(tilt)[:, None] * np.array([0.0, 1.0, 0.0])
-    view = np.where(across[:, None] > 0, beside, in_plane)
-    return np.stack([np.stack([zero, zero, one], -1), light, view], axis=1).astype(np.float32)
-
-
-def _peak(model: type[Material], n: np.ndarray) -> np.ndarray:
-    if not issubclass(model, SpecularMaterial):
-        return np.ones_like(n)
-    with jax.enable_x64(True):
-        return np.asarray(model.scale(n))
+    light = in_plane(theta)
+    beside = np.cos(tilt)[:, None] * light * [-1.0, 1.0, 1.0] + np.sin(tilt)[:, None] * [0.0, 1.0, 0.0]
+    view = np.where(across[:, None], beside, in_plane(-theta - tilt))
+    return np.stack([in_plane(0 * theta), light, view], axis=1).astype(np.float32)

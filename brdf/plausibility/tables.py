@@ -110,7 +110,7 @@ def _positivity(table: MeasuredBRDF, noise: float) -> Finding:
     row, channel = np.unravel_index(np.argmin(table.values), table.values.shape)
     value = float(table.values[row, channel])
     bound = 0.0 if math.isnan(noise) else noise * float(np.median(np.abs(table.values[:, channel])))
-    light, view = _named(table.to_light[row]), _named(table.to_view[row])
+    light, view = Angles.of(table.to_light[row]), Angles.of(table.to_view[row])
     sentence = f"no value is below 0, the least is {value:.3g}/sr"
     if value < 0:
         where = f"for light {light}, view {view}, channel {table.channels[channel]}"
@@ -126,7 +126,7 @@ def _reciprocity(table: MeasuredBRDF, samples: _Samples, noise: float) -> Findin
         return _cannot_tell(PASSES, "the table holds no pair of directions both ways round")
     typical = _median(difference)
     row, channel = np.unravel_index(np.argmax(difference), difference.shape)
-    light, view = _named(samples.light[first[row]]), _named(samples.view[first[row]])
+    light, view = Angles.of(samples.light[first[row]]), Angles.of(samples.view[first[row]])
     where = light, view, channel
     if typical < _BY_LAYOUT:
         sentence = "f_r is the same when light and view change places, as the layout of the table has it"
@@ -174,8 +174,3 @@ def _albedo(evaluate: Evaluation, polar: float, fineness: int) -> Float[np.ndarr
     cell = np.repeat(np.sin(theta) * np.pi * root / rings, sectors) * 2 * np.pi / sectors
     values = evaluate(np.broadcast_to(light, view[seen].shape), view[seen])
     return np.sum(values * (view[seen, 2] * 4 * along[seen] * cell[seen])[:, None], axis=0)
-
-
-def _named(direction: Float[np.ndarray, "3"]) -> Angles:
-    x, y, z = map(float, direction)
-    return Angles(math.degrees(math.atan2(math.hypot(x, y), z)), math.degrees(math.atan2(y, x)) % 360)

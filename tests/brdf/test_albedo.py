@@ -10,17 +10,18 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from brdf.albedo import absorbed_fraction, directional_albedo, lobe_albedo
+from brdf.albedo import directional_albedo, lobe_albedo
 from brdf.models import BlinnPhong, Lambert, NormalizedBlinnPhong, NormalizedPhong, Phong
 
 EXPONENTS = [0.0, 0.01, 0.5, 1.0, 10.0, 33.3, 1e3, 1e5, 1e6]
 DEGREES = [0.0, 1e-3, 0.1, 5.0, 30.0, 60.0, 85.0, 89.0, 89.9, 89.99, 89.999, 90.0]
-THETA = np.radians(DEGREES)
+# Angles that float32 holds too, so that one reference serves both precisions.
+THETA = np.minimum(np.float32(np.radians(DEGREES)).astype(float), math.pi / 2)
 
 
 def phong_reference(n, theta):
     """The closed form, with mpmath's quadrature for the incomplete beta function."""
-    with mpmath.workdps(40):
+    with mpmath.workdps(25):
         n, theta = mpmath.mpf(n), mpmath.mpf(theta)
         sine, cosine = mpmath.sin(theta), mpmath.cos(theta)
         width = 1 / mpmath.sqrt(n + 1)
@@ -65,9 +66,9 @@ def test_albedo_of_the_normalised_lobes(model, n, tolerance):
     material = model(k_d=0.0, k_s=1.0, n=n)
     double = directional_albedo(material, THETA, precision="float64")
     assert double.dtype == np.float64
-    np.testing.assert_allclose(double[:, 0], [REFERENCES[model](n, t) for t in THETA], rtol=0, atol=tolerance)
+    exact = [REFERENCES[model](n, t) for t in THETA]
+    np.testing.assert_allclose(double[:, 0], exact, rtol=0, atol=tolerance)
     single = directional_albedo(material, np.float32(THETA), precision="float32")
-    exact = [REFERENCES[model](n, float(min(t, math.pi / 2))) for t in np.float32(THETA)]
     np.testing.assert_allclose(single[:, 0], exact, rtol=0, atol=1e-5)
 
 
@@ -110,7 +111,6 @@ def test_albedo_is_the_integral_of_f_r(model):
             expected = np.einsum("z,zac->c", weights * z, f_r) * (2 * np.pi / 1200)
             # 1e-6: the view's horizon and R.V = 0 are kinks for the product rule
             np.testing.assert_allclose(directional_albedo(material, theta), expected, rtol=1e-6)
-            np.testing.assert_allclose(absorbed_fraction(material, theta), 1 - expected, rtol=1e-5)
 
 
 def test_classic_albedo_diverges_at_grazing_light():
@@ -121,13 +121,12 @@ def test_classic_albedo_diverges_at_grazing_light():
     np.testing.assert_allclose(directional_albedo(Lambert(k_d=[0.3, 0.4]), [0.1, 1.0]), [[0.3, 0.4]] * 2, rtol=1e-6)
 
 
-@pytest.mark.parametrize("n", [0.2, 1.0, 30.0, 1e4, 1e6])
 @pytest.mark.parametrize("model", [Phong, NormalizedPhong, NormalizedBlinnPhong])
-def test_derivatives_of_the_albedo(model, n):
+def test_derivatives_of_the_albedo(model):
     with jax.enable_x64(True):
         modes = jax.grad, jax.jacfwd
         derivatives = [jax.jit(mode(lambda n, t: lobe_albedo(model, n, t), argnums=(0, 1))) for mode in modes]
-        for theta in (0.3, 1.1, 1.55):
+        for n, theta in itertools.product((0.2, 1.0, 30.0, 1e4, 1e6), (0.3, 1.1, 1.55)):
             gradient, forward = (derivative(n, theta) for derivative in derivatives)
             np.testing.assert_allclose(gradient, forward, rtol=1e-9, atol=1e-14 / (n + 1))
             h, k = 1e-3 * n, 1e-3 / math.sqrt(n + 1)

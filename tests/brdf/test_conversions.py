@@ -60,7 +60,7 @@ def test_what_conversions_refuse(function, value):
 @pytest.mark.parametrize(("old", "new"), [(Phong, NormalizedPhong), (BlinnPhong, NormalizedBlinnPhong)])
 @pytest.mark.parametrize(("k_d", "k_s", "n"), [(0.3, 0.5, 8.0), (0.9, 2.0, 3.0), (1.3, 0.1, 20.0), (0.0, 4.0, 2.0)])
 def test_nearest_plausible_form_is_the_constrained_least_squares_one(old, new, k_d, k_s, n):
-    """Radiance sampled over random lights and sphere pixels, minimised by SciPy."""
+    """Radiance sampled over lights and sphere pixels, minimised by SciPy."""
     nearest = conversions.nearest_normalized(old(k_a=0.1, k_d=k_d, k_s=k_s, n=n))
     assert type(nearest) is new
     assert nearest.n == n
@@ -95,6 +95,9 @@ def test_nearest_forms_of_what_needs_none():
     for a, b in zip(jax.tree.leaves(material), jax.tree.leaves(same), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9)
     assert type(conversions.nearest_classic(material)) is BlinnPhong
+    matt = NormalizedBlinnPhong(k_d=[0.3, 0.1], k_s=[0.2, 0.7], n=0.0)  # its lobe is the diffuse term
+    np.testing.assert_allclose(conversions.nearest_normalized(matt).k_d, [0.25, 0.4])
+    np.testing.assert_allclose(conversions.nearest_normalized(matt).k_s, [0.25, 0.4])
     classic = Phong(k_d=0.5, k_s=3.0, n=12.0)
     np.testing.assert_allclose(conversions.nearest_classic(classic).k_s, 3.0)
     np.testing.assert_allclose(conversions.nearest_normalized(Lambert(k_d=[0.5, 1.5])).k_d, [0.5, 1.0])

@@ -167,31 +167,21 @@ def _materials():
 
 
 def _functions():
-    for n in (0.0, 30.0, 1e5):
-        yield f"function, normalised Phong {n:g}", NormalizedPhong(k_d=0.5, k_s=0.5, n=n).reflectance, True, True, True
-        yield (
-            f"function, gaining Blinn-Phong {n:g}",
-            NormalizedBlinnPhong(k_d=0.5, k_s=0.5002, n=n).reflectance,
-            True,
-            True,
-            False,
-        )
-    yield "function, classic Phong", Phong(k_d=0.5, k_s=0.2, n=20.0).reflectance, True, False, False
+    yield "function, lossless Phong", NormalizedPhong(k_d=0.5, k_s=0.5, n=1e5).reflectance, True, True, True
+    for n in (0.0, 1e5):
+        gaining = NormalizedBlinnPhong(k_d=0.5, k_s=0.5002, n=n).reflectance
+        yield f"function, gaining Blinn-Phong {n:g}", gaining, True, True, False
     yield "function, classic Blinn-Phong", BlinnPhong(k_d=0.5, k_s=0.2, n=500.0).reflectance, True, False, False
     yield "function, float32", single_precision(NormalizedPhong(k_d=0.4, k_s=0.4, n=40.0)), True, True, True
-    yield "black", constant(0.0), True, True, True
     yield "white", constant(1.0), True, True, True
     yield "too white", constant(1.00001), True, True, False
     yield "negative", constant(-1e-3), False, True, True
     yield "(n+8)/(8 pi), 10", half_lobe(10, 18 / (8 * PI)), True, True, False
-    yield "(n+8)/(8 pi), 1", half_lobe(1, 9 / (8 * PI)), True, True, False
-    yield "(n+2)/(2 pi), 10", half_lobe(10, 12 / (2 * PI)), True, True, False
     yield "(n+2)/(2 pi), 3000", half_lobe(3000, 3002 / (2 * PI)), True, True, False
     yield "(n+2)/(8 pi), 60", half_lobe(60, 62 / (8 * PI)), True, True, True
-    yield "retro 100", retro_lobe(100, 1.0), True, True, True
     yield "retro 1e5", retro_lobe(1e5, 1.0), True, True, True
     yield "retro 1e4 gaining", retro_lobe(1e4, 1.001), True, True, False
-    for where in ((0, 0), (23.4, 77), (57, 200), (84, 310)):
+    for where in ((23.4, 77), (84, 310)):
         yield f"hole in the view {where}", dented(where, "view"), False, False, True
         yield f"hole in the half vector {where}", dented(where, "half"), False, True, True
     yield "hole in the light", dented((41, 130), "light"), False, False, True
@@ -201,15 +191,11 @@ def _functions():
     yield "non-reciprocal by 1e-4, azimuth", unequal(base, 1e-4, lambda light, view: view[0]), True, False, True
     narrow = unequal(base, 1e-4, lambda light, view: jnp.exp(-((view[2] - 0.5) ** 2) / 1e-4))
     yield "non-reciprocal by 1e-4, in a band", narrow, True, False, True
-    yield "Ashikhmin-Shirley", ashikhmin_shirley(10.0, 100.0, 0.5, 0.3), True, True, True
     yield "Ashikhmin-Shirley, narrow", ashikhmin_shirley(1e4, 1e3, 0.2, 0.8), True, True, True
     yield "Ward-Dür", ward(0.2, 0.5, "dür"), True, True, False
-    yield "Ward bounded", ward(0.2, 0.99, "bounded"), True, True, True
     yield "Ward bounded, narrow", ward(0.01, 1.0, "bounded"), True, True, True
-    yield "GGX", microfacets(0.3, True), True, True, True
     yield "GGX, narrow", microfacets(0.02, True), True, True, True
     yield "GGX without shadowing", microfacets(0.3, False), True, True, False
-    yield "Minnaert", minnaert(1.5, 1.0), True, True, True
     yield "Minnaert gaining", minnaert(1.5, 1.001), True, True, False
     yield "Minnaert diverging", minnaert(0.7, 0.8), True, True, False
     yield "Lommel-Seeliger", lommel_seeliger(1.0), True, True, True
