@@ -380,8 +380,8 @@ def _fit_model(
         """The least weighted squares."""
         with jax.enable_x64(True):
             lobe = OneLightLobe(jnp.asarray(log_cos[:, 0]), jnp.asarray(reach))
-            target, weight = jnp.asarray(np.pi * values), jnp.asarray(weight)
-            picture = Picture(target, jnp.ones((len(values), 1)), lobe, weight, ambient=jnp.zeros(1))
+            ones, target = jnp.ones((len(values), 1)), jnp.asarray(np.pi * values)
+            picture = Picture(target, ones, lobe, jnp.asarray(weight), ambient=jnp.zeros(1))
         return search([picture], n_min=n_range[0], n_max=n_range[1], free=free)
 
     def modelled(optimum: Optimum) -> Float[np.ndarray, "P C"]:
@@ -413,7 +413,7 @@ def _fit_model(
             known = (None, None) if reason else (float(k[term, channel]), float(errors[term, channel]))
             parameters.append(Parameter(name, channel, *known, at_bound=known[0] == 0, reason=reason))
     if not specular:
-        material = model(k_d=k[1])
+        material = brdf.Lambert(k_d=k[1])
     else:
         reason = reasons.get("n", "")
         known = (None, None) if reason else (optimum.n, sure.n_error)

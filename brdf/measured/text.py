@@ -10,6 +10,7 @@ Source: L. Belcour, R. Pacanowski and P. Barla, "ALTA: a BRDF analysis library",
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -34,7 +35,7 @@ _PARAMETRISATIONS = {
     "SPHERICAL_TL_PL_TV_PV": "theta_l phi_l theta_v phi_v",
     "CARTESIAN": "x_v y_v z_v x_l y_l z_l",
 }
-_NOT_SAID = {"RUSIN_TH_TD": {"phi_d": 0.5 * np.pi}, "COS_TLR": {"phi_v": np.pi}}
+_NOT_SAID: dict[str, dict[str, Any]] = {"RUSIN_TH_TD": {"phi_d": 0.5 * np.pi}, "COS_TLR": {"phi_v": np.pi}}
 _NUMBERS = "Numbers have a decimal point and spaces between them; # starts a comment"
 
 
@@ -152,14 +153,16 @@ def _directions(kind: str, places: list[str], columns: np.ndarray) -> tuple[Vect
     else:
         _check_angles(places, columns)
     names = _PARAMETRISATIONS[kind].split()
-    angles = dict.fromkeys("theta_h theta_d phi_d phi_h theta_v phi_v theta_l phi_l".split(), 0.0 * columns[0])
-    angles |= _NOT_SAID.get(kind, {}) | dict(zip(names, columns, strict=True))
-    if "theta_h" in names:
-        return from_half_angles(*(angles[name] for name in ("theta_h", "theta_d", "phi_d", "phi_h")))
+    said = _NOT_SAID.get(kind, {}) | dict(zip(names, columns, strict=True))
     if "x_v" in names:  # the parts of the polar angle along two axes
-        x, y = angles["x_v"], angles["y_v"]
-        angles |= {"theta_v": np.hypot(x, y), "phi_v": np.arctan2(y, x)}
-    return from_angles(angles["theta_v"], angles["phi_v"]), from_angles(angles["theta_l"], angles["phi_l"])
+        said |= {"theta_v": np.hypot(said["x_v"], said["y_v"]), "phi_v": np.arctan2(said["y_v"], said["x_v"])}
+
+    def angles(*wanted: str) -> list[np.ndarray]:
+        return [said.get(name, 0.0) + 0.0 * columns[0] for name in wanted]
+
+    if "theta_h" in names:
+        return from_half_angles(*angles("theta_h", "theta_d", "phi_d", "phi_h"))
+    return from_angles(*angles("theta_v", "phi_v")), from_angles(*angles("theta_l", "phi_l"))
 
 
 def _check_angles(places: list[str], columns: np.ndarray) -> None:

@@ -6,13 +6,13 @@ or is symmetric by its layout, its noise is not known and the check says so.
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from brdf.measured.table import Evaluation, MeasuredBRDF, Values, Vectors, from_angles
-from brdf.plausibility.report import ENERGY_LIMIT, Angles, Finding, Report, verdict
+from brdf.plausibility.report import ENERGY_LIMIT, Angles, Finding, Report, Verdict, verdict
 
 # Samples whose angles agree within this many radians are one direction: half a degree.
 CELL = math.radians(0.5)
@@ -71,14 +71,14 @@ def _pairs(table: MeasuredBRDF, samples: _Samples, *, exchanged: bool) -> tuple[
             other = light, view - 2 * np.sum(view * across, axis=1, keepdims=True) * across
         first, repeated = np.arange(len(light)), table.evaluate(*other)
     else:
-        polar = [np.arctan2(np.hypot(v[:, 0], v[:, 1]), v[:, 2]) for v in (light, view)]
+        a, b = (np.arctan2(np.hypot(v[:, 0], v[:, 1]), v[:, 2]) for v in (light, view))
         turn = np.arctan2(view[:, 1], view[:, 0]) - np.arctan2(light[:, 1], light[:, 0])
-        turn = np.where(np.minimum(*polar) < CELL, 0.0, (turn + np.pi) % (2 * np.pi) - np.pi)
-        codes, mirrored = _codes(*polar, turn), _codes(*(polar[::-1] if exchanged else polar), -turn)
+        turn = np.where(np.minimum(a, b) < CELL, 0.0, (turn + np.pi) % (2 * np.pi) - np.pi)
+        codes, mirrored = _codes(a, b, turn), _codes(b, a, -turn) if exchanged else _codes(a, b, -turn)
         known, index = np.unique(codes, return_index=True)
         place = np.minimum(np.searchsorted(known, mirrored), len(known) - 1)
         # What stands on the line between the two repeats itself.
-        apart = np.abs(polar[0] - polar[1] if exchanged else turn) > CELL
+        apart = np.abs(a - b if exchanged else turn) > CELL
         first = np.flatnonzero((known[place] == mirrored) & apart & (index[place] != np.arange(len(codes))))
         values, repeated = values[first], values[index[place[first]]]
     size = 0.5 * (np.abs(values) + np.abs(repeated))
@@ -97,13 +97,14 @@ def _codes(first: np.ndarray, second: np.ndarray, turn: np.ndarray) -> np.ndarra
 
 
 def _finding(
-    word: str, value: float, limit: float, bound: float, light: Angles, view: Angles | None, channel: int, sentence: str
+    word: Verdict, value: float, limit: float, bound: float, where: tuple[Angles, Angles | None, Any], sentence: str
 ) -> Finding:
+    light, view, channel = where
     return Finding(word, value, limit, limit - value, bound, light, view, int(channel), sentence)
 
 
 def _cannot_tell(limit: float, sentence: str) -> Finding:
-    return _finding("cannot tell", math.nan, limit, math.nan, Angles(0.0), None, 0, sentence)
+    return _finding("cannot tell", math.nan, limit, math.nan, (Angles(0.0), None, 0), sentence)
 
 
 def _positivity(table: MeasuredBRDF, noise: float) -> Finding:
@@ -130,7 +131,7 @@ def _reciprocity(table: MeasuredBRDF, samples: _Samples, noise: float) -> Findin
     where = light, view, channel
     if typical < _BY_LAYOUT:
         sentence = "f_r is the same when light and view change places, as the layout of the table has it"
-        return _finding("pass", 0.0, PASSES, 0.0, *where, sentence)
+        return _finding("pass", 0.0, PASSES, 0.0, where, sentence)
     worst = f"the largest, {100 * difference[row, channel]:.3g} %, for light {light}, view {view}"
     said, pairs = "the typical reciprocity error is", f"over {len(difference)} pairs; {worst}"
     if math.isnan(noise):
@@ -138,13 +139,13 @@ def _reciprocity(table: MeasuredBRDF, samples: _Samples, noise: float) -> Findin
         sentence = (
             f"the typical reciprocity error is {100 * typical:.2g} % {pairs}; the noise is not known from the table"
         )
-        return _finding(word, typical, LARGEST_NOISE, 0.0, *where, sentence)
+        return _finding(word, typical, LARGEST_NOISE, 0.0, where, sentence)
     ratio = typical / noise
     word = "pass" if ratio <= PASSES else "fail" if ratio >= FAILS else "cannot tell"
     compared = f"{ratio:.2g} times the noise ({100 * typical:.2g} % against {100 * noise:.2g} %)"
     # The median of K absolute deviations is known to within 1.2 / sqrt(K) of itself.
     bound = ratio * 1.2 / len(difference) ** 0.5
-    return _finding(word, ratio, PASSES, bound, *where, f"{said} {compared} {pairs}")
+    return _finding(word, ratio, PASSES, bound, where, f"{said} {compared} {pairs}")
 
 
 def _energy(table: MeasuredBRDF) -> Finding:
@@ -157,7 +158,7 @@ def _energy(table: MeasuredBRDF) -> Finding:
     word = verdict(ENERGY_LIMIT - value, bound)
     said = f"the largest albedo is {value:.4g} for light {light}, channel {table.channels[channel]}"
     sentence = f"does not conserve energy: {said}" if word == "fail" else said
-    return _finding(word, value, ENERGY_LIMIT, bound, light, None, channel, sentence)
+    return _finding(word, value, ENERGY_LIMIT, bound, (light, None, channel), sentence)
 
 
 def _albedo(evaluate: Evaluation, polar: float, fineness: int) -> Float[np.ndarray, " C"]:

@@ -8,9 +8,10 @@ from collections.abc import Callable
 from typing import Any
 
 import matplotlib
-import matplotlib.colors
 import numpy as np
 from jaxtyping import Float
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -40,8 +41,8 @@ def overview(brdf: Brdf, report: Report | None = None) -> Figure:
     Example:
         ``fitting.overview(brdf.preset("gold")).savefig("gold.png")``
     """
-    figure = Figure(figsize=(7.2, 6.0), layout="constrained")
-    ball, lobe, albedo, reciprocity = np.ravel(figure.subfigures(2, 2))
+    figure: Any = Figure(figsize=(7.2, 6.0), layout="constrained")
+    (ball, lobe), (albedo, reciprocity) = figure.subfigures(2, 2)
     axes = ball.add_subplot()
     axes.set_axis_off()
     axes.imshow(lit_sphere(brdf, 256) if isinstance(brdf, Material) else _lit_function(_sampler(brdf)))
@@ -67,11 +68,11 @@ def plot_albedo(brdf: Brdf, report: Report | None = None, figure: Any = None) ->
     Example:
         ``fitting.plot_albedo(brdf.preset("gold"))``
     """
-    if isinstance(brdf, Material):
-        degrees = np.append(np.arange(0.0, 89.6, 0.5), [89.7, 89.8, 89.9, 89.95, 89.99])
+    known = isinstance(brdf, Material)
+    degrees = np.append(np.arange(0.0, 89.0, 0.5 if known else 2.0), [89.0, 89.5, 89.7, 89.8, 89.9, 89.95, 89.99])
+    if known:
         albedo = np.asarray(directional_albedo(brdf, np.radians(degrees), precision="float64"))
     else:
-        degrees = np.append(np.arange(0.0, 89.0, 2.0), [89.0, 89.5, 89.9])
         albedo = albedo_of(brdf, degrees)
     count = albedo.shape[1]
     figure = figure or Figure(figsize=(6, 4), layout="constrained")
@@ -178,7 +179,7 @@ def plot_stability(maps: list[StabilityMap]) -> Figure:
     """
     figure = Figure(figsize=(3.0 * len(maps) + 1, 3.4), layout="constrained")
     panels = figure.subplots(1, len(maps), sharey=True, squeeze=False)[0]
-    scale = matplotlib.colors.LogNorm(1e-8, 1e-4)
+    scale = LogNorm(1e-8, 1e-4)
     for axes, found in zip(panels, maps, strict=True):
         axes.pcolormesh(np.clip(found.error, 1e-8, None), norm=scale, cmap=SIGNED)
         bad = np.argwhere(~found.finite)
@@ -189,7 +190,7 @@ def plot_stability(maps: list[StabilityMap]) -> Figure:
         axes.set_title(f"{found.model}\n{said}", fontsize=10)
         axes.set_xlabel("angle of the light in degrees")
     panels[0].set_ylabel("exponent n")
-    colours = matplotlib.cm.ScalarMappable(scale, SIGNED)
+    colours = ScalarMappable(scale, SIGNED)
     figure.colorbar(colours, ax=list(panels), label="error of float32, of the peak", extend="both")
     return figure
 

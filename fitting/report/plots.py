@@ -117,17 +117,18 @@ def _highlight(
     result: "FitResult", picture: int, counted: Bool[np.ndarray, "H W"], specular: bool
 ) -> tuple[int, slice, slice]:
     """The row of the highlight's peak, and the rows and columns worth enlarging."""
-    material, image = result.material, np.nan_to_num(np.asarray(result.targets[picture]))
+    material: Any = result.material
+    image = np.nan_to_num(np.asarray(result.targets[picture]))
     if specular:
         dark = type(material)(k_d=0.0 * np.asarray(material.k_d), k_s=material.k_s, n=material.n)
         image = np.asarray(brdf.render(dark, result.scenes[picture], precision=result.precision))
     image = np.where(counted, image.max(axis=-1), 0.0)
-    peak = np.unravel_index(np.argmax(image), image.shape)
+    peak = [int(at) for at in np.unravel_index(np.argmax(image), image.shape)]
     bright = np.argwhere(image > 0.2 * image.max())
     reach = int(np.max(np.abs(bright - peak), initial=0)) + 2
     reach = min(max(reach, 8), max(image.shape) // 2)
-    near = (slice(max(at - reach, 0), min(at + reach + 1, size)) for at, size in zip(peak, image.shape, strict=True))
-    return int(peak[0]), *near
+    rows, columns = (slice(max(at - reach, 0), at + reach + 1) for at in peak)
+    return peak[0], rows, slice(columns.start, min(columns.stop, image.shape[1]))
 
 
 def _residual(figure: Figure, axes: Any, target: np.ndarray, fitted: np.ndarray, counted: np.ndarray) -> None:
