@@ -88,7 +88,6 @@ from .materials.material_file import (
 )
 from .materials.presets import PRESETS as PRESETS
 from .materials.presets import preset as preset
-from .measured.loading import is_measured as is_measured
 from .measured.loading import load_measured as load_measured
 from .measured.merl import merl_table as merl_table
 from .measured.table import MeasuredBRDF as MeasuredBRDF

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from brdf.errors import InputError
 from brdf.files import utf8_name
@@ -24,6 +23,8 @@ _MOST_FIELDS = 64
 _MOST_BYTES = 1 << 31
 _TYPES = {5: np.dtype("<u4"), 10: np.dtype("<f4")}  # others count in bytes
 _BYTE, _FLOAT = 1, 10
+# Dimensions of a field, and the least size of each.
+_LAYOUT = {"phi_i": (1, 1), "theta_i": (1, 2), "sigma": (2, 2), "ndf": (2, 2), "vndf": (4, 1), "luminance": (4, 1)}
 _REPAIR = "The file is damaged; get it again"
 # Half angle, difference angle and azimuth: the samples that a fit sees. The files hold 32 x 32 views for 8 lights.
 _GRID = (90, 30, 36)
@@ -70,44 +71,39 @@ def _check(content: bytes, place: object) -> tuple[str, ...]:
     """Names of the channels, after finding that Mitsuba can read the file."""
     fields = read_fields(content, place)
 
-    def numbers(name: str, dimensions: int, smallest: int = 1) -> Float[np.ndarray, "..."]:
-        if name not in fields:
-            raise InputError(place, f"has no field {name}", "Give an isotropic or anisotropic file of the RGL database")
-        kind, values = fields[name]
-        if kind != _FLOAT or values.ndim != dimensions or min(values.shape) < smallest:
-            came = f"must be {dimensions}-dimensional and of type float32, got {list(values.shape)} of type {kind}"
-            raise InputError(f"{place}: {name}", came, _REPAIR)
-        demand(name, np.isfinite(values).all(), "holds values that are not finite")
-        return values
-
     def demand(name: str, good: Any, what: str) -> None:
         if not good:
             raise InputError(f"{place}: {name}", what, _REPAIR)
 
-    angles = {"phi_i": numbers("phi_i", 1), "theta_i": numbers("theta_i", 1, 2)}
-    for name, values in angles.items():
-        demand(name, np.all(np.diff(values) > 0), "does not grow from entry to entry")
-    numbers("sigma", 2, 2)
-    numbers("ndf", 2, 2)
-    spectral = "spectra" in fields and "rgb" not in fields
-    colour, lights = "spectra" if spectral else "rgb", tuple(values.size for values in angles.values())
-    shapes = {name: numbers(name, 4).shape for name in ("vndf", "luminance")} | {colour: numbers(colour, 5).shape}
-    for name, shape in shapes.items():
+    colour = "spectra" if "spectra" in fields and "rgb" not in fields else "rgb"
+    layout = _LAYOUT | {colour: (5, 1)} | ({"wavelengths": (1, 2)} if colour == "spectra" else {})
+    for name, (dimensions, least) in layout.items():
+        if name not in fields:
+            raise InputError(place, f"has no field {name}", "Give an isotropic or anisotropic file of the RGL database")
+        kind, values = fields[name]
+        came = f"must be {dimensions}-dimensional and of type float32, got {list(values.shape)} of type {kind}"
+        demand(name, kind == _FLOAT and values.ndim == dimensions and min(values.shape) >= least, came)
+        demand(name, np.isfinite(values).all(), "holds values that are not finite")
+    for name, what in (("jacobian", "one byte"), ("description", "text")):
+        kind, values = fields.get(name, (0, np.empty(0)))
+        sound = kind == _BYTE and values.ndim == 1 and (name == "description" or values.size == 1)
+        demand(name, sound, f"must be {what}")
+    for name in ("phi_i", "theta_i"):
+        demand(name, np.all(np.diff(fields[name][1]) > 0), "does not grow from entry to entry")
+    lights = fields["phi_i"][1].size, fields["theta_i"][1].size
+    for name in ("vndf", "luminance", colour):
+        shape = fields[name][1].shape
         came = f"has {shape[0]} x {shape[1]} slices for {lights[0]} x {lights[1]} directions of light"
         demand(name, shape[:2] == lights, came)
         demand(name, min(shape[-2:]) >= 2, f"is of shape {list(shape)}")
-    shape = shapes[colour]
-    demand(colour, shape[3:] == shapes["luminance"][2:], f"is of shape {list(shape)}")
-    kind, values = fields.get("jacobian", (0, np.empty(0)))
-    demand("jacobian", kind == _BYTE and values.shape == (1,), "must be one byte")
-    kind, values = fields.get("description", (0, np.empty(0)))
-    demand("description", kind == _BYTE and values.ndim == 1, "must be text")
-    if not spectral:
+    shape = fields[colour][1].shape
+    demand(colour, shape[3:] == fields["luminance"][1].shape[2:], f"is of shape {list(shape)}")
+    if colour == "rgb":
         demand(colour, shape[2] == 3, f"has {shape[2]} channels instead of 3")
         return ("red", "green", "blue")
-    wavelengths = numbers("wavelengths", 1, 2)
-    fit = wavelengths.size == shape[2] and np.all(np.diff(wavelengths) > 0)
-    demand("wavelengths", fit, "does not fit to the spectra")
+    wavelengths = fields["wavelengths"][1]
+    grows = wavelengths.size == shape[2] and np.all(np.diff(wavelengths) > 0)
+    demand("wavelengths", grows, "does not fit to the spectra")
     return tuple(f"{wavelength:g} nm" for wavelength in wavelengths)
 
 

@@ -119,18 +119,16 @@ def _directions(name: str, value: Any) -> Vectors:
     vectors = _numbers(name, value)
     if vectors.ndim != 2 or vectors.shape[1] != 3:
         raise InputError(name, f"must be of shape (P, 3), got {vectors.shape}", "Give a direction per sample")
-    size = np.max(np.abs(vectors), axis=1, initial=0.0, keepdims=True)
-    if not np.all(np.isfinite(size)) or np.any(size == 0):
+    size = np.linalg.norm(vectors, axis=1, keepdims=True)
+    if not np.all(np.isfinite(size) & (size > 0)):
         raise InputError(name, "must be finite directions that are not zero", "Correct the values")
-    vectors = vectors / size
-    return vectors / np.sqrt(np.sum(vectors * vectors, axis=1, keepdims=True))
+    return vectors / size
 
 
 def from_angles(polar: Any, azimuth: Any) -> Vectors:
     """Unit vectors from angles in radians: from the normal, and about it from +x towards +y."""
-    polar, azimuth = np.broadcast_arrays(np.asarray(polar, np.float64), np.asarray(azimuth, np.float64))
-    sine = np.sin(polar)
-    return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), np.cos(polar)], axis=-1)
+    sine, cosine, _ = np.broadcast_arrays(np.sin(polar), np.cos(polar), azimuth)
+    return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine], axis=-1)
 
 
 def from_half_angles(theta_h: Any, theta_d: Any, phi_d: Any, phi_h: Any = 0.0) -> tuple[Vectors, Vectors]:

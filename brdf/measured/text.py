@@ -9,6 +9,7 @@ that say nothing of the light are read as ALTA converts them: light along the no
 Source: L. Belcour, R. Pacanowski and P. Barla, "ALTA: a BRDF analysis library", MAM 2014.
 """
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,6 @@ from brdf.files import parse_number, read_text
 from brdf.measured.table import MeasuredBRDF, Vectors, from_angles, from_half_angles
 
 MOST_CHANNELS = 4096
-_OUTPUTS = ("INV_STERADIAN", "INV_STERADIAN_COSINE_FACTOR", "RGB_COLOR", "UNKNOWN_OUTPUT")
 # What the columns are: angles of half vector, difference, view and light, or cosines of them. What is not said is 0.
 _PARAMETRISATIONS = {
     "COS_TH": "theta_h",
@@ -36,6 +36,20 @@ _PARAMETRISATIONS = {
     "CARTESIAN": "x_v y_v z_v x_l y_l z_l",
 }
 _NOT_SAID: dict[str, dict[str, Any]] = {"RUSIN_TH_TD": {"phi_d": 0.5 * np.pi}, "COS_TLR": {"phi_v": np.pi}}
+_OUTPUTS = ("INV_STERADIAN", "INV_STERADIAN_COSINE_FACTOR", "RGB_COLOR", "UNKNOWN_OUTPUT")
+# Of a key: what it is where it is missing, what it may be, what is wrong with others, what to do.
+_HEADER = {
+    "FORMAT": ("text", "(?i)text", "is {!r}, which is not read", "Save it as text with ALTA"),
+    "DIM": (
+        "",
+        r"[0-9]{1,5}\s+[0-9]{1,5}",
+        "must be two whole numbers, got {!r}",
+        "Write #DIM and the numbers of input and output columns",
+    ),
+    "PARAM_OUT": ("UNKNOWN_OUTPUT", "|".join(_OUTPUTS), "is no BRDF value, got {!r}", f"Known: {', '.join(_OUTPUTS)}"),
+    "PARAM_IN": ("", "|".join(_PARAMETRISATIONS), "is not known, got {!r}", f"Known: {', '.join(_PARAMETRISATIONS)}"),
+    "VS": ("0", "[012]", "must be 0, 1 or 2, got {!r}", "Correct the header"),
+}
 _NUMBERS = "Numbers have a decimal point and spaces between them; # starts a comment"
 
 
@@ -84,7 +98,7 @@ def _alta(path: Path, lines: list[tuple[str, str]]) -> MeasuredBRDF:
     header = {key: value.strip() for key, _, value in reversed(heads) if key.isupper()}  # the first of a key counts
     inputs, outputs = _dimensions(path, header)
     rows = [(place, line.split()) for place, line in lines if line.strip() and not line.startswith("#")]
-    width, confidence = inputs + outputs, int(header.get("VS", "0"))
+    width, confidence = inputs + outputs, int(header["VS"])
     for place, words in rows:
         if not width <= len(words) <= width + confidence * outputs:
             came = f"has {len(words)} numbers instead of {width}"
@@ -93,7 +107,7 @@ def _alta(path: Path, lines: list[tuple[str, str]]) -> MeasuredBRDF:
         raise InputError(path, "holds no samples", "Give a table with rows of numbers")
     table = _numbers([(place, word) for place, words in rows for word in words[:width]]).reshape(-1, width)
     view, light = _directions(header["PARAM_IN"], [place for place, _ in rows], table[:, :inputs].T)
-    values, unit = table[:, inputs:], header.get("PARAM_OUT")
+    values, unit = table[:, inputs:], header["PARAM_OUT"]
     if unit == "INV_STERADIAN_COSINE_FACTOR":
         values = values / np.where(view[:, 2:] > 0, view[:, 2:], 1.0)
     names = ("red", "green", "blue") if unit == "RGB_COLOR" and outputs == 3 else None
@@ -102,28 +116,19 @@ def _alta(path: Path, lines: list[tuple[str, str]]) -> MeasuredBRDF:
 
 def _dimensions(path: Path, header: dict[str, str]) -> tuple[int, int]:
     """How many columns are input and output, after finding that the header can be read."""
-
-    def demand(key: str, good: bool, what: str, remedy: str) -> None:
-        if not good:
+    for key, (default, pattern, what, remedy) in _HEADER.items():
+        value = header.setdefault(key, default)
+        if not re.fullmatch(pattern, value):
+            what = what.format(value[:40]) if value or key != "PARAM_IN" else "is missing"
             raise InputError(f"{path}: {key}", what, remedy)
-
-    form, sizes, confidence = header.get("FORMAT", "text"), header.get("DIM", ""), header.get("VS", "0")
-    unit, kind = header.get("PARAM_OUT", "UNKNOWN_OUTPUT"), header.get("PARAM_IN", "")
-    demand("FORMAT", form.lower() == "text", f"is {form!r}, which is not read", "Save it as text with ALTA")
-    words = sizes.split()
-    whole = len(words) == 2 and all(word.isascii() and word.isdigit() and len(word) < 6 for word in words)
-    remedy = "Write #DIM and the numbers of input and output columns"
-    demand("DIM", whole, f"must be two whole numbers, got {sizes[:40]!r}", remedy)
-    inputs, outputs = map(int, words)
-    remedy = f"There are 1 to 6 inputs and 1 to {MOST_CHANNELS} outputs"
-    sound = 1 <= inputs <= 6 and 1 <= outputs <= MOST_CHANNELS
-    demand("DIM", sound, f"says {inputs} and {outputs} columns", remedy)
-    demand("PARAM_OUT", unit in _OUTPUTS, f"is no BRDF value, got {unit[:40]!r}", f"Known: {', '.join(_OUTPUTS)}")
-    came, remedy = f"is not known, got {kind[:40]!r}", f"Known: {', '.join(_PARAMETRISATIONS)}"
-    demand("PARAM_IN", kind in _PARAMETRISATIONS, came if kind else "is missing", remedy)
-    columns = len(_PARAMETRISATIONS[kind].split())
-    demand("DIM", columns == inputs, f"says {inputs} input columns, {kind} has {columns}", "Correct the header")
-    demand("VS", confidence in ("0", "1", "2"), f"must be 0, 1 or 2, got {confidence[:40]!r}", "Correct the header")
+    inputs, outputs = map(int, header["DIM"].split())
+    columns = len(_PARAMETRISATIONS[header["PARAM_IN"]].split())
+    if not (1 <= inputs <= 6 and 1 <= outputs <= MOST_CHANNELS):
+        remedy = f"There are 1 to 6 inputs and 1 to {MOST_CHANNELS} outputs"
+        raise InputError(f"{path}: DIM", f"says {inputs} and {outputs} columns", remedy)
+    if columns != inputs:
+        came = f"says {inputs} input columns, {header['PARAM_IN']} has {columns}"
+        raise InputError(f"{path}: DIM", came, "Correct the header")
     return inputs, outputs
 
 

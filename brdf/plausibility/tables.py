@@ -5,13 +5,14 @@ incidence, so that samples of equal angles and of mirrored azimuth repeat each o
 or is symmetric by its layout, its noise is not known and the check says so.
 """
 
+import dataclasses
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from brdf.measured.table import Evaluation, MeasuredBRDF, Values, Vectors, from_angles
+from brdf.measured.table import Evaluation, MeasuredBRDF, Values, from_angles
 from brdf.plausibility.report import ENERGY_LIMIT, Angles, Finding, Report, Verdict, verdict
 
 # Samples whose angles agree within this many radians are one direction: half a degree.
@@ -26,12 +27,6 @@ LIGHTS = (5.0, 20.0, 35.0, 50.0, 65.0, 75.0)
 _BY_LAYOUT = 1e-5
 
 
-class _Samples(NamedTuple):
-    light: Vectors
-    view: Vectors
-    values: Values
-
-
 def check_table(table: MeasuredBRDF, subject: str | None = None) -> Report:
     """Test a measured BRDF for positivity, reciprocity and energy conservation.
 
@@ -42,44 +37,46 @@ def check_table(table: MeasuredBRDF, subject: str | None = None) -> Report:
     Returns:
         The report. For reciprocity the value is the typical relative error over the typical noise where that is known.
     """
-    light, view, values = table.to_light, table.to_view, table.values
+    samples = table
     if table.evaluate is not None:
         random = np.random.default_rng(20)
         polar = np.arccos(random.uniform(math.cos(math.radians(75)), 1, (2, 4000)))
         light, view = from_angles(polar, random.uniform(0, 2 * np.pi, (2, 4000)))
         values = table.evaluate(light, view)
-    samples = _Samples(light, view, values)
-    noise = _median(_pairs(table, samples, exchanged=False)[1])
+        samples = dataclasses.replace(table, to_light=light, to_view=view, values=values)
+    noise = _median(_pairs(samples, exchanged=False)[1])
     # What repeats by the table's layout says nothing of its noise.
     noise = math.nan if noise < _BY_LAYOUT else noise
-    findings = _positivity(table, noise), _reciprocity(table, samples, noise), _energy(table)
-    return Report(subject or table.name, *findings)
+    return Report(subject or table.name, _positivity(table, noise), _reciprocity(samples, noise), _energy(table))
 
 
-def _pairs(table: MeasuredBRDF, samples: _Samples, *, exchanged: bool) -> tuple[np.ndarray, Values]:
+def _pairs(samples: MeasuredBRDF, *, exchanged: bool) -> tuple[np.ndarray, Values]:
     """Samples that another one ought to repeat, by their index, and the difference of the two over their mean size.
 
     The other has light and view exchanged, or the view mirrored at the plane of incidence, as an isotropic surface
     cannot tell.
     """
-    light, view, values = samples
-    if table.evaluate is not None:
+    light, view, values = samples.to_light, samples.to_view, samples.values
+    if samples.evaluate is not None:
         other = view, light
         if not exchanged:
             across = np.cross(light, [0.0, 0.0, 1.0])
             across /= np.linalg.norm(across, axis=1, keepdims=True)
             other = light, view - 2 * np.sum(view * across, axis=1, keepdims=True) * across
-        first, repeated = np.arange(len(light)), table.evaluate(*other)
+        first, repeated = np.arange(len(light)), samples.evaluate(*other)
     else:
         a, b = (np.arctan2(np.hypot(v[:, 0], v[:, 1]), v[:, 2]) for v in (light, view))
         turn = np.arctan2(view[:, 1], view[:, 0]) - np.arctan2(light[:, 1], light[:, 0])
         turn = np.where(np.minimum(a, b) < CELL, 0.0, (turn + np.pi) % (2 * np.pi) - np.pi)
-        codes, mirrored = _codes(a, b, turn), _codes(b, a, -turn) if exchanged else _codes(a, b, -turn)
+        angles = np.array([(a, b, turn), (b, a, -turn) if exchanged else (a, b, -turn)])
+        cells = np.round(angles / CELL)
+        cells[:, 2] %= round(2 * np.pi / CELL)
+        codes, wanted = np.unique(np.concatenate(cells, axis=1), axis=1, return_inverse=True)[1].reshape(2, -1)
         known, index = np.unique(codes, return_index=True)
-        place = np.minimum(np.searchsorted(known, mirrored), len(known) - 1)
+        place = np.minimum(np.searchsorted(known, wanted), len(known) - 1)
         # What stands on the line between the two repeats itself.
         apart = np.abs(a - b if exchanged else turn) > CELL
-        first = np.flatnonzero((known[place] == mirrored) & apart & (index[place] != np.arange(len(codes))))
+        first = np.flatnonzero((known[place] == wanted) & apart & (index[place] != np.arange(len(codes))))
         values, repeated = values[first], values[index[place[first]]]
     size = 0.5 * (np.abs(values) + np.abs(repeated))
     return first, np.abs(values - repeated) / np.where(size > 0, size, 1.0)
@@ -87,13 +84,6 @@ def _pairs(table: MeasuredBRDF, samples: _Samples, *, exchanged: bool) -> tuple[
 
 def _median(difference: Values) -> float:
     return float(np.median(difference)) if difference.size else math.nan
-
-
-def _codes(first: np.ndarray, second: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """One whole number for each cell of the three angles."""
-    turns = round(2 * np.pi / CELL)
-    first, second, turn = (np.round(angle / CELL).astype(np.int64) for angle in (first, second, turn))
-    return (first * 4 * turns + second) * 4 * turns + turn % turns
 
 
 def _finding(
@@ -121,13 +111,13 @@ def _positivity(table: MeasuredBRDF, noise: float) -> Finding:
     return Finding(word, value, 0.0, value, bound, light, view, int(channel), sentence)
 
 
-def _reciprocity(table: MeasuredBRDF, samples: _Samples, noise: float) -> Finding:
-    first, difference = _pairs(table, samples, exchanged=True)
+def _reciprocity(samples: MeasuredBRDF, noise: float) -> Finding:
+    first, difference = _pairs(samples, exchanged=True)
     if not difference.size:
         return _cannot_tell(PASSES, "the table holds no pair of directions both ways round")
     typical = _median(difference)
     row, channel = np.unravel_index(np.argmax(difference), difference.shape)
-    light, view = Angles.of(samples.light[first[row]]), Angles.of(samples.view[first[row]])
+    light, view = Angles.of(samples.to_light[first[row]]), Angles.of(samples.to_view[first[row]])
     where = light, view, channel
     if typical < _BY_LAYOUT:
         sentence = "f_r is the same when light and view change places, as the layout of the table has it"

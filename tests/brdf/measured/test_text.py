@@ -100,7 +100,7 @@ REFUSED = [
     ("#DIM 3\n1 2 3", "DIM: must be two whole numbers"),
     ("#DIM -3 1\n1 2 3", "DIM: must be two whole numbers"),
     ("#DIM 3 99999999999\n1 2 3", "DIM: must be two whole numbers"),
-    ("#DIM 9 1\n1 2 3", "DIM: says 9"),
+    ("#DIM 9 1\n#PARAM_IN COS_TH\n1 2 3", "DIM: says 9"),
     ("#DIM 3 1\n1 2 3 4", r"PARAM_IN: is missing\. Known: "),
     ("#DIM 3 1\n#PARAM_IN POLAR\n1 2 3 4", "PARAM_IN: is not known, got 'POLAR'"),
     ("#DIM 3 1\n#PARAM_IN COS_TH\n1 2 3 4", "COS_TH has 1"),
