@@ -26,18 +26,6 @@ from .conversions import (
 from .display import (
     displayed as displayed,
 )
-from .display import (
-    lit_sphere as lit_sphere,
-)
-from .display import (
-    material_html as material_html,
-)
-from .display import (
-    png_address as png_address,
-)
-from .display import (
-    report_html as report_html,
-)
 from .errors import InputError as InputError
 from .geometry.camera import (
     OrthographicCamera as OrthographicCamera,

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 
 import brdf
 import fitting
+from brdf.display import lit_sphere
 
 HERE = Path(__file__).resolve().parent
 DPI = 110
@@ -31,7 +32,7 @@ def presets() -> Figure:
     with matplotlib.rc_context({"font.size": 7}):
         figure = Figure(figsize=(7.2, 3.5), layout="constrained")
         for axes, name in zip(np.ravel(figure.subplots(3, 8)), brdf.PRESETS, strict=True):
-            axes.imshow(brdf.lit_sphere(brdf.preset(name), 96))
+            axes.imshow(lit_sphere(brdf.preset(name), 96))
             axes.set_title(name.replace("_", " "), pad=2)
             axes.set_axis_off()
     return figure

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import brdf
+from brdf.display import lit_sphere
 from fitting.report import plots
 from fitting.report.material_plots import overview
 
@@ -103,7 +104,7 @@ def test_a_spectrum_is_drawn_from_its_first_channel_to_its_last(matt, tmp_path):
 def test_a_function_is_drawn_as_the_ball_of_the_material_that_it_is():
     material = brdf.BlinnPhong(k_d=[0.5, 0.3, 0.2], k_s=[0.3] * 3, n=30)
     ball = next(part.axes[0].images[0] for part in overview(material.reflectance).subfigs)
-    expected = brdf.lit_sphere(material, 256)
+    expected = lit_sphere(material, 256)
     np.testing.assert_allclose(np.asarray(ball.get_array()), expected, atol=1e-3)  # its screen values have 16 bits
 
 
