@@ -2,22 +2,19 @@
 
 import dataclasses
 import time
-from collections import Counter
 from collections.abc import Sequence
 from functools import partial
-from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
 
 import brdf
-from brdf.models.base import SpecularMaterial
 from brdf.precision import working_precision
 from brdf.rendering import basis
 from fitting.censored_noise import without_censored_noise
-from fitting.light_colour import coefficient_factors, take_colour_out
-from fitting.pixels import Observation, Tile, observe
+from fitting.light_colour import coefficient_factors
+from fitting.model_fit import ModelFit
+from fitting.pixels import Observed, Tile, observe
 from fitting.plausible import fit_plausible, is_plausible
 from fitting.problem import FitProblem
 from fitting.result import FitResult
@@ -25,10 +22,10 @@ from fitting.selection import FAMILIES, Choice, choose
 from fitting.solver.losses import reweight
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum, fit_tied, search
-from fitting.solver.streams import Stream, each, joined
+from fitting.solver.streams import Stream, each
 from fitting.uncertainty.covariance import residual_noise
 from fitting.uncertainty.highlight import nearest_peak
-from fitting.uncertainty.interpretation import Interpretation, ModelFit, interpret
+from fitting.uncertainty.interpretation import Interpretation, interpret
 from fitting.uncertainty.noise_model import weighted_sums
 from fitting.uncertainty.residual_correlation import residual_correlation
 
@@ -38,31 +35,6 @@ UNEXPLAINED = 0.5
 UNSEEN = 60.0
 # An exponent up to this multiple of the lower bound is at the bound.
 WIDEST = 1.01
-
-
-class _Observed(NamedTuple):
-    """A problem whose pixels are known: what stays the same for every model.
-
-    Attributes:
-        problem: what is fitted.
-        observations: its pictures.
-        colour: what all lights share, taken out of the tiles' scenes, (C,).
-        tiles: of all pictures; a stream where one of them is.
-        lit: which channels have ambient light, and which have lights, (2, C).
-        rounding: standard deviation of a value's rounding, (C,).
-    """
-
-    problem: FitProblem
-    observations: list[Observation]
-    colour: Float[np.ndarray, " C"]
-    tiles: Sequence[Tile]
-    lit: Bool[np.ndarray, "2 C"]
-    rounding: Float[np.ndarray, " C"]
-
-    def reached(self, model: type[brdf.Material]) -> Bool[np.ndarray, "3 C"]:
-        """Which coefficients of a model the light reaches."""
-        ambient, direct = self.lit
-        return np.stack([ambient, direct, direct & issubclass(model, SpecularMaterial)])
 
 
 def fit_pictures(problem: FitProblem) -> FitResult:
@@ -89,7 +61,7 @@ def fit_pictures(problem: FitProblem) -> FitResult:
 
 
 def _fit(problem: FitProblem) -> FitResult:
-    seen = _observed(problem)
+    seen = observe(problem)
     if problem.model == "auto":
         fit, choice = _fit_simplest(seen)
     else:
@@ -102,54 +74,21 @@ def _fit(problem: FitProblem) -> FitResult:
         free = fit.free & [[True], [True], [False]]
         pictures = fit.pictures if problem.loss == "squared" else None
         fit = _held_plausible(_fit_model(fit.model, seen, free, pictures), seen)
-        told = _interpreted(fit, seen, choice)
-        lost = [p.name in ("k_s", "n") and p.value is None for p in told.parameters]
-        parameters = [
-            dataclasses.replace(p, reason=hidden) if gone else p for p, gone in zip(told.parameters, lost, strict=True)
-        ]
-        told = told._replace(parameters=tuple(parameters))
-    left_out: Counter[str] = Counter()
-    for observation in seen.observations:
-        left_out.update(observation.left_out)
+        told = _interpreted(fit, seen, choice, hidden)
     return FitResult(
-        material=told.material,
-        parameters=told.parameters,
-        noise=told.noise,
-        structure=told.structure,
-        highlight_pixels=told.highlight_pixels,
-        residual=_residual(fit.optimum),
+        **told._asdict(),
+        residual=fit.residual,
         pixels=int(fit.optimum.pixels[0]),
-        left_out=dict(left_out),
-        warnings=told.warnings,
+        left_out=seen.left_out,
         candidates=() if choice is None else choice.candidates,
-        correlation=told.correlation,
         optimum=optimum,
         loss=problem.loss,
         precision=problem.precision,
         seconds=0.0,
-        targets=[observation.shown for observation in seen.observations],
-        scenes=[observation.scene for observation in seen.observations],
-        counted=[observation.counted for observation in seen.observations],
+        targets=seen.shown,
+        scenes=seen.scenes,
+        counted=seen.counted,
     )
-
-
-def _observed(problem: FitProblem) -> _Observed:
-    channels = problem.targets[0].pixels.shape[-1]
-    light = take_colour_out(problem.scenes, channels)
-    observations = observe(problem, light.scenes)
-    ambient, direct = np.zeros(channels, bool), np.zeros(channels, bool)
-    for scene in light.scenes:
-        if scene.ambient is not None:
-            ambient |= np.asarray(scene.ambient) > 0
-        for lamp in scene.lights:
-            direct |= np.asarray(lamp.emittance) * light.colour > 0
-    rounding = np.max([observation.rounding for observation in observations], axis=0)
-    tiles = joined([observation.tiles for observation in observations])
-    return _Observed(problem, observations, light.colour, tiles, np.stack([ambient, direct]), rounding)
-
-
-def _residual(optimum: Optimum) -> float:
-    return float(np.sqrt(np.sum(optimum.cost) / np.sum(optimum.square)))
 
 
 def _picture(model: type[brdf.Material], tile: Tile) -> Picture:
@@ -161,14 +100,14 @@ def _picture(model: type[brdf.Material], tile: Tile) -> Picture:
     return Picture(tile.target, diffuse, images.lobe, tile.weight, ambient)
 
 
-def _search(pictures: Sequence[Picture], free: Bool[np.ndarray, "3 C"], n_range: tuple[float, float]) -> Optimum:
+def _search(pictures: Sequence[Picture], free: np.ndarray, n_range: tuple[float, float]) -> Optimum:
     return search(pictures, n_min=n_range[0], n_max=n_range[1], free=free)
 
 
 def _fit_model(
     model: type[brdf.Material],
-    seen: _Observed,
-    free: Bool[np.ndarray, "3 C"] | None = None,
+    seen: Observed,
+    free: np.ndarray | None = None,
     pictures: Sequence[Picture] | None = None,
 ) -> ModelFit:
     """One model with the loss that is asked for; all that the light reaches is free where nothing else is said."""
@@ -188,11 +127,11 @@ def _fit_model(
     return ModelFit(model, found.pictures, found.optimum, free, n_range, None, found.noise_factor)
 
 
-def _fit_simplest(seen: _Observed) -> tuple[ModelFit, Choice]:
+def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
     """Every family first, then the simplest adequate candidate on its own."""
     problem, colour = seen.problem, seen.colour
     fits: dict[str, ModelFit] = {}
-    for name in problem.families if seen.lit[1].any() else ("lambert",):
+    for name in problem.families if seen.reached(brdf.Lambert)[1].any() else ("lambert",):
         if isinstance(seen.tiles, Stream) and problem.loss == "squared":
             # The pictures of one model at a time are in memory; those of the others are made anew where asked for.
             fits = {
@@ -223,7 +162,7 @@ def _fit_simplest(seen: _Observed) -> tuple[ModelFit, Choice]:
     choice = choose(optima, free, grey, noise, known.inflation, whitened)
     matt = choice.model in FAMILIES
     chosen = list(fits.values())[-1] if matt else fits[choice.model]
-    fits, best = {}, None
+    del fits, best
     pictures = chosen.pictures if problem.streamed else list(chosen.pictures)
     if matt:
         pictures = each(lambda picture: dataclasses.replace(picture, lobe=None), pictures)
@@ -241,7 +180,7 @@ def _with_weight_of(picture: Picture, other: Picture) -> Picture:
     return dataclasses.replace(picture, weight=other.weight)
 
 
-def _held_plausible(fit: ModelFit, seen: _Observed) -> ModelFit:
+def _held_plausible(fit: ModelFit, seen: Observed) -> ModelFit:
     if not seen.problem.plausible or is_plausible(fit.optimum, fit.model, seen.colour):
         return fit
     optimum = fit_plausible(fit.pictures, fit.optimum, fit.free, fit.model, seen.colour, fit.n_range)
@@ -250,11 +189,9 @@ def _held_plausible(fit: ModelFit, seen: _Observed) -> ModelFit:
     return fit._replace(optimum=optimum, tied=None, capped=True, noise_factor=noise)
 
 
-def _interpreted(fit: ModelFit, seen: _Observed, choice: Choice | None) -> Interpretation:
-    brightest = np.max([observation.brightest for observation in seen.observations], axis=0)
-    # What the light reaches but the simplest model does without is 0, with the error that it would have.
-    told = interpret(fit, seen.colour, seen.rounding, brightest, seen.tiles, seen.reached(fit.model))
-    warnings, share = list(told.warnings), _residual(fit.optimum)
+def _interpreted(fit: ModelFit, seen: Observed, choice: Choice | None, hidden: str = "") -> Interpretation:
+    told = interpret(fit, seen, hidden)
+    warnings, share = list(told.warnings), fit.residual
     if share > UNEXPLAINED:
         words = f"the model leaves {100 * share:.0f} % of the picture: are light, camera and encoding what they were?"
         warnings.insert(0, words)

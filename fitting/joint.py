@@ -101,7 +101,7 @@ def fit_jointly(
         raise brdf.InputError("tolerance", came, "Give for example 1e-10 and 256")
     stated = state_problem(target, scene, mask, precision=precision, saturation=saturation)
     with working_precision(precision):
-        seen = [observation.tiles[0] for observation in observe(stated, at_once=True)]
+        seen = list(observe(stated, at_once=True).tiles)
         start = brdf.cast((material, stated.scenes), precision)
         problem = _freed(start, free, seen)
         values = sum(observation.target.size for observation in seen)

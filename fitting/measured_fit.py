@@ -29,12 +29,12 @@ from brdf.errors import InputError
 from brdf.files import atomic_folder
 from brdf.materials.material_file import material_to_dict
 from brdf.models.base import SpecularMaterial
+from fitting.light_colour import coefficient_factors
 from fitting.report.saving import write_report
 from fitting.result import Parameter, undetermined
 from fitting.solver.normal_equations import OneLightLobe, Picture
 from fitting.solver.profile import Optimum, search
 from fitting.uncertainty.covariance import residual_noise, uncertainty
-from fitting.uncertainty.interpretation import coefficient_factors
 
 Loss = Literal["cosine", "squared", "log"]
 N_RANGE = (0.1, 1e6)
@@ -399,25 +399,23 @@ def _fit_model(
             free,
             residual_noise(optimum, brightest * np.finfo(float).eps),
             brightest,
-            specular=specular,
+            float(np.max(lobe) / np.max(brightest)),
             single=False,
-            visible=float(np.max(lobe) / np.max(brightest)),
         )
     factors = coefficient_factors(model, optimum.n, np.ones(channels))
-    k, errors, reasons = optimum.x / factors, sure.x_error / factors, sure.undetermined
+    k, errors = optimum.x / factors, sure.x_error / factors
     parameters = []
     for term, name in ((1, "k_d"), (2, "k_s"))[: 1 + specular]:
         for channel in range(channels):
-            reason = reasons.get(name) or reasons.get(f"{name}[{channel}]") or ""
+            reason = sure.reasons[term, channel]
             k[term, channel] *= not reason
             known = (None, None) if reason else (float(k[term, channel]), float(errors[term, channel]))
             parameters.append(Parameter(name, channel, *known, at_bound=known[0] == 0, reason=reason))
     if not specular:
         material = brdf.Lambert(k_d=k[1])
     else:
-        reason = reasons.get("n", "")
-        known = (None, None) if reason else (optimum.n, sure.n_error)
-        parameters.append(Parameter("n", None, *known, reason=reason))
+        known = (None, None) if sure.n_reason else (optimum.n, sure.n_error)
+        parameters.append(Parameter("n", None, *known, reason=sure.n_reason))
         material = model(k_d=k[1], k_s=k[2], n=optimum.n if k[2].any() else 0.0)
     return BrdfCandidate(material, tuple(parameters), _losses(samples, modelled(optimum)))
 

@@ -5,6 +5,7 @@ what the solver needs of that a third of it. A picture in a file is not even kep
 """
 
 import functools
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -15,8 +16,11 @@ from jaxtyping import Array, Bool, Float
 
 import brdf
 from brdf.errors import InputError
+from brdf.models.base import SpecularMaterial
+from brdf.precision import Precision
+from fitting.light_colour import take_colour_out
 from fitting.problem import TOP, FitProblem, Target, has_pixel_areas
-from fitting.solver.streams import Stream, each
+from fitting.solver.streams import Stream, each, joined
 
 # How many pixels are taken together; of a file at least as many rows as its blocks hold, or these are read twice.
 TILE_PIXELS = 1 << 18
@@ -49,26 +53,45 @@ class Tile(NamedTuple):
     scene: brdf.Scene
 
 
-class Observation(NamedTuple):
-    """One picture.
+class Observed(NamedTuple):
+    """A problem whose pixels are known: what stays the same for every model.
 
     Attributes:
-        tiles: all of it, made when asked for.
+        problem: what is fitted.
+        colour: what all lights share, taken out of the tiles' scenes, (C,).
+        tiles: of all pictures, made when asked for; a stream where one of them is.
+        rounding: standard deviation of the error that rounding puts into a value, (C,).
+        brightest: largest size of a value that counts, (C,).
         left_out: how many pixels were left out, by reason.
-        rounding: standard deviation of the error that rounding puts into a value; (C,).
-        brightest: largest size of a value that counts; (C,).
-        shown: (H, W, C), the picture for people: of a large file every so many pixels.
-        scene: what ``shown`` shows.
-        counted: (H, W), which pixels of ``shown`` counted.
+        shown: the pictures for people, (H, W, C) each: of a large file every so many pixels.
+        scenes: what these show.
+        counted: which of their pixels counted, (H, W) each.
     """
 
+    problem: FitProblem
+    colour: Float[np.ndarray, " C"]
     tiles: Sequence[Tile]
-    left_out: dict[str, int]
     rounding: Float[np.ndarray, " C"]
     brightest: Float[np.ndarray, " C"]
-    shown: Float[np.ndarray, "H W C"]
-    scene: brdf.Scene
-    counted: Bool[np.ndarray, "H W"]
+    left_out: dict[str, int]
+    shown: list[np.ndarray]
+    scenes: list[brdf.Scene]
+    counted: list[np.ndarray]
+
+    def reached(self, model: type[brdf.Material]) -> Bool[np.ndarray, "3 C"]:
+        """Which coefficients of a model the light reaches.
+
+        Args:
+            model: its class.
+        """
+        reached = np.zeros((3, self.colour.size), bool)
+        for scene in self.problem.scenes:
+            if scene.ambient is not None:
+                reached[0] |= np.asarray(scene.ambient) > 0
+            for light in scene.lights:
+                reached[1] |= np.asarray(light.emittance) > 0
+        reached[2] = reached[1] & issubclass(model, SpecularMaterial)
+        return reached
 
 
 class _Band(NamedTuple):
@@ -97,34 +120,42 @@ class Statistics(NamedTuple):
     scale: Any
 
 
-def observe(
-    problem: FitProblem, scenes: Sequence[brdf.Scene] | None = None, *, at_once: bool = False
-) -> list[Observation]:
+def observe(problem: FitProblem, *, at_once: bool = False) -> Observed:
     """Decide which pixels of each picture count.
 
     Args:
         problem: the pictures.
-        scenes: to give the tiles, instead of the problem's.
         at_once: make one tile of each picture, however large it is.
 
     Raises:
         InputError: where nothing is left to fit.
     """
-    parts = problem.targets, problem.scenes, scenes or problem.scenes, problem.masks, problem.weights
-    return [_observe(problem, *part, at_once) for part in zip(*parts, strict=True)]
+    light = take_colour_out(problem.scenes, problem.targets[0].pixels.shape[-1])
+    given = zip(problem.targets, problem.scenes, light.scenes, problem.masks, problem.weights, strict=True)
+    parts = [_observe(problem, *part, at_once) for part in given]
+    tiles, rounding, brightest, counts, shown, scenes, counted = (list(part) for part in zip(*parts, strict=True))
+    left_out: Counter[str] = Counter()
+    for some in counts:
+        left_out.update(some)
+    return Observed(
+        problem,
+        light.colour,
+        joined(tiles),
+        np.max(rounding, axis=0),
+        np.max(brightest, axis=0),
+        dict(left_out),
+        shown,
+        scenes,
+        counted,
+    )
 
 
 def _observe(
-    problem: FitProblem,
-    target: Target,
-    scene: brdf.Scene,
-    lit_scene: brdf.Scene,
-    mask: np.ndarray | None,
-    given: np.ndarray | None,
-    at_once: bool,
-) -> Observation:
+    problem: FitProblem, target: Target, scene: brdf.Scene, grey: brdf.Scene, mask: Any, given: Any, at_once: bool
+) -> tuple[Any, ...]:
+    """Tiles, rounding, brightest value, pixels left out, and what is shown: see `Observed`."""
     dtype, noise, dark = np.dtype(problem.precision), problem.noise, problem.dark
-    height, width, channels = target.pixels.shape
+    height, width = target.pixels.shape[:2]
     bands = _bands(target, brdf.cast(scene, problem.precision), dtype, mask, at_once or noise is not None)
     level = target.saturation if problem.saturation is None else problem.saturation
     found, total = _statistics(bands, level, dark, keep=not target.streamed)
@@ -138,7 +169,7 @@ def _observe(
         if level is not None:
             found, total = _statistics(bands, level, dark, keep=not target.streamed)
     left_out = _left_out(total, height * width, level, dark, masked=mask is not None)
-    lit_scene = brdf.cast(lit_scene, problem.precision)
+    grey = brdf.cast(grey, problem.precision)
 
     def tile(band: _Band, counted: tuple[np.ndarray, Statistics]) -> Tile:
         good, weight = counted[0], None
@@ -150,19 +181,19 @@ def _observe(
         if given is not None:
             stated = jnp.asarray(given[band.rows].ravel(), dtype)
             weight = stated if weight is None else stated * weight
-        return Tile(band.values, weight, band.points, lit_scene)
+        return Tile(band.values, weight, band.points, grey)
 
     tiles = each(tile, bands, found)
     brightest = total.scale.astype(np.float64)
     resolution = float(np.finfo(dtype).eps)
     if target.streamed:
-        shown = _shown(tiles, scene, channels)
+        shown = _shown(bands, found, scene, problem.precision)
     else:
         resolution = max(resolution, float(np.finfo(target.pixels.dtype).eps))
         counted = np.concatenate([good for good, _ in found]).reshape(height, width)
         shown = target.pixels.astype(dtype, copy=False), scene, counted
     rounding = np.maximum(brightest * resolution, target.step / np.sqrt(12.0))
-    return Observation(tiles, left_out, rounding, brightest, *shown)
+    return tiles, rounding, brightest, left_out, *shown
 
 
 def _bands(
@@ -211,9 +242,7 @@ def _statistics(
 
 
 @jax.jit
-def _count(
-    values: Float[Array, "P C"], seen: Bool[Array, " P"], allowed: Bool[Array, " P"], level: float, dark: float
-) -> tuple[Bool[Array, " P"], Statistics]:
+def _count(values: Array, seen: Array, allowed: Array, level: float, dark: float) -> tuple[Array, Statistics]:
     brightest = _over_channels(jnp.maximum, values)
     finite = allowed & jnp.isfinite(_over_channels(jnp.add, values))
     largest = jnp.max(jnp.where(finite, brightest, -jnp.inf))
@@ -269,28 +298,31 @@ def _left_out(
     return left_out
 
 
-def _shown(tiles: Sequence[Tile], scene: brdf.Scene, channels: int) -> tuple[np.ndarray, brdf.Scene, np.ndarray]:
+def _shown(
+    bands: Sequence[_Band], found: Sequence[tuple[np.ndarray, Statistics]], scene: brdf.Scene, precision: Precision
+) -> tuple[np.ndarray, brdf.Scene, np.ndarray]:
     """Every so many pixels of a picture that is not in memory, what they show, and which of them counted."""
     width, height = scene.resolution
     stride = -(-max(width, height) // SHOWN_PIXELS)
-    pictures, counted, first = [], [], 0
-    for tile in tiles:
-        rows = tile.points.mask.shape[0]
-        some = slice(-first % stride, None, stride)
-        # Copies: a view would keep the whole tile.
-        pictures.append(np.asarray(tile.target).reshape(rows, width, channels)[some, ::stride].copy())
-        weight = np.ones(rows * width) if tile.weight is None else np.asarray(tile.weight)
-        counted.append((weight > 0).reshape(rows, width)[some, ::stride].copy())
-        first += rows
+
+    def some(values: Any, first: int) -> np.ndarray:
+        rows = np.asarray(values).reshape(-1, width, *values.shape[1:])
+        # A copy: a view would keep the whole band.
+        return rows[-first % stride :: stride, ::stride].copy()
+
+    parts = [
+        (some(band.values, band.rows.start), some(good, band.rows.start))
+        for band, (good, _) in zip(bands, found, strict=True)
+    ]
+    shown, counted = (np.concatenate(part) for part in zip(*parts, strict=True))
     pixel = np.arange(0, height, stride)[:, None] * width + np.arange(0, width, stride)
-    precision = pictures[0].dtype.name
-    return np.concatenate(pictures), brdf.some_pixels(scene, pixel, precision=precision), np.concatenate(counted)
+    return shown, brdf.some_pixels(scene, pixel, precision=precision), counted
 
 
 @functools.partial(jax.jit, static_argnums=2)
 def _inverse_variance(
-    values: Float[Array, "P C"], good: Bool[Array, " P"], shape: tuple[int, int], read: float, shot: float, step: float
-) -> Float[Array, " P"]:
+    values: Array, good: Array, shape: tuple[int, int], read: float, shot: float, step: float
+) -> Array:
     """Inverse variances over their mean; a pixel's channels share the variance of their mean value.
 
     The value is the mean of 5 x 5 pixels: taken from the pixel itself, weights would favour what noise made darker.
@@ -319,5 +351,5 @@ def _inverse_variance(
     return (weight * (jnp.sum(count) / jnp.sum(weight))).astype(values.dtype)
 
 
-def _over_channels(combine: Any, values: Float[Array, "P C"]) -> Float[Array, " P"]:
+def _over_channels(combine: Any, values: Array) -> Array:
     return functools.reduce(combine, [values[:, channel] for channel in range(values.shape[1])])

@@ -164,13 +164,9 @@ class FitResult:
         return {
             "material": material_to_dict(self.material, undetermined=self.undetermined),
             "parameters": [
-                {
-                    "name": parameter.name,
-                    "channel": parameter.channel,
-                    "value": parameter.value,
-                    "error": parameter.error,
+                vars(parameter)
+                | {
                     "interval": None if parameter.interval is None else [_finite(end) for end in parameter.interval],
-                    "at_bound": parameter.at_bound,
                     "reason": parameter.reason or None,
                 }
                 for parameter in self.parameters

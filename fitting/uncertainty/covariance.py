@@ -19,6 +19,7 @@ NO_TRACE = 1e-6
 SIGNIFICANT = 10.0
 
 TERMS = ("k_a", "k_d", "k_s")
+LIGHT = ("no ambient light", "no light", "no light")
 
 
 class Uncertainty(NamedTuple):
@@ -32,7 +33,8 @@ class Uncertainty(NamedTuple):
         correlation: of x_a, x_d, x_s (channel after channel each) and n, (3C + 1, 3C + 1); 0 for what is at its bound
             or not determined.
         rise: by how much the cost, summed over channels, rises at the ends of a 95 % interval of n.
-        undetermined: why, by parameter: "n", "k_s", or "k_d[2]" for one channel.
+        reasons: why a coefficient is not determined, (3, C) of texts; empty where it is.
+        n_reason: why n is not; empty where it is.
     """
 
     x_error: Float[np.ndarray, "3 C"]
@@ -40,7 +42,8 @@ class Uncertainty(NamedTuple):
     n_error: float
     correlation: Float[np.ndarray, "P P"]
     rise: float
-    undetermined: dict[str, str]
+    reasons: np.ndarray
+    n_reason: str
 
 
 def residual_noise(optimum: Optimum, rounding: Float[np.ndarray, " C"]) -> Float[np.ndarray, " C"]:
@@ -59,9 +62,8 @@ def uncertainty(
     free: Bool[np.ndarray, "3 C"],
     noise: Float[np.ndarray, " C"],
     brightest: Float[np.ndarray, " C"],
-    *,
-    specular: bool,
     visible: float,
+    *,
     single: bool,
     tied: Float[np.ndarray, " C"] | None = None,
     spread: Float[np.ndarray, "C 4 4"] | None = None,
@@ -77,37 +79,30 @@ def uncertainty(
         free: which coefficients the light reaches, (3, C).
         noise: standard deviation of the residual, (C,).
         brightest: largest value of the picture, (C,).
-        specular: whether the model has a lobe.
         visible: largest value of the specular term in the picture, over that of the picture.
         single: whether the pixels were float32.
         tied: x_s is a common factor times this, (C,); None where the channels are independent.
         spread: sums of the columns' products times the variance of each pixel, where it is not the same in all.
     """
-    channels = optimum.x.shape[1]
     dependent = DEPENDENT_SINGLE if single else DEPENDENT_DOUBLE
-    undetermined: dict[str, str] = {}
-    if specular:
-        reason = _without_trace(optimum, noise, visible)
-        if reason:
-            undetermined["n"] = undetermined["k_s"] = reason
-    known = free.copy()
-    known[2] &= specular and "k_s" not in undetermined
-    _name_unlit(free, specular, undetermined)
-    _name_dependent(optimum, known, undetermined, dependent)
+    reasons = np.full(free.shape, "", object)
+    n_reason = reasons[2, :] = _without_trace(optimum, noise, visible)
+    for term, channel in np.argwhere(~free & (reasons == "")):
+        where = "this channel" if free[term].any() else "the scene"
+        reasons[term, channel] = f"{LIGHT[term]} in {where}"
+    _name_dependent(optimum, reasons, dependent)
+    known = reasons == ""
     x_error, x_interval, n_error, correlation, rise = _errors(optimum, known, noise, tied, spread, dependent)
     for term, channel in np.argwhere(known):
         largest = max(optimum.square[channel], brightest[channel] ** 2)
         if x_error[term, channel] ** 2 * optimum.gram[channel, term, term] > largest:
-            name = f"{TERMS[term]}[{channel}]"
-            undetermined.setdefault(name, "its error is larger than the whole picture")
+            reasons[term, channel] = "its error is larger than the whole picture"
             x_error[term, channel] = np.inf
-    if specular and "n" not in undetermined and not np.isfinite(n_error):
-        undetermined["n"] = "the highlight fits as well with other exponents and another k_s"
-    if "n" in undetermined:
-        n_error = np.inf
-    if channels == 1:
-        undetermined = {name.removesuffix("[0]"): reason for name, reason in undetermined.items()}
-    return Uncertainty(x_error, x_interval, n_error, correlation, rise, undetermined)
+    if not n_reason and not np.isfinite(n_error):
+        n_reason = "the highlight fits as well with other exponents and another k_s"
+    if n_reason:
+        n_error = math.inf
+    return Uncertainty(x_error, x_interval, n_error, correlation, rise, reasons, n_reason)
 
 
 def _without_trace(optimum: Optimum, noise: np.ndarray, visible: float) -> str:
@@ -127,37 +122,19 @@ def _without_trace(optimum: Optimum, noise: np.ndarray, visible: float) -> str:
     return "" if gain > SIGNIFICANT * unknowns else "the highlight does not stand out of the noise"
 
 
-def _name_unlit(free: np.ndarray, specular: bool, undetermined: dict[str, str]) -> None:
-    words = ("no ambient light", "no light", "no light")
-    for term in range(3 if specular else 2):
-        if TERMS[term] in undetermined:
-            continue
-        if not free[term].any():
-            undetermined[TERMS[term]] = f"{words[term]} in the scene"
-            continue
-        for channel in np.flatnonzero(~free[term]):
-            undetermined[f"{TERMS[term]}[{channel}]"] = f"{words[term]} in this channel"
-
-
-def _name_dependent(optimum: Optimum, known: np.ndarray, undetermined: dict[str, str], dependent: float) -> None:
-    """Find terms that the others reproduce; takes them out of ``known``."""
-    for channel in range(known.shape[1]):
+def _name_dependent(optimum: Optimum, reasons: np.ndarray, dependent: float) -> None:
+    """Find terms that no pixel sees, or that the others reproduce."""
+    for channel, column in enumerate(reasons.T):
         gram = optimum.gram[channel, :3, :3]
         scale = np.sqrt(np.maximum(np.diag(gram), 0.0))
-        for term in np.flatnonzero(known[:, channel] & (scale == 0)):
-            undetermined[f"{TERMS[term]}[{channel}]"] = "its light reaches no pixel that counts"
-        known[:, channel] &= scale > 0
-        terms = np.flatnonzero(known[:, channel])
+        column[(column == "") & (scale == 0)] = "its light reaches no pixel that counts"
+        terms = np.flatnonzero(column == "")
         if terms.size < 2:
             continue
         value, vector = np.linalg.eigh(gram[np.ix_(terms, terms)] / np.outer(scale[terms], scale[terms]))
-        if value[0] > dependent:
-            continue
-        tied = terms[np.abs(vector[:, 0]) > 0.1]
-        names = " and ".join(TERMS[term] for term in tied)
-        for term in tied:
-            known[term, channel] = False
-            undetermined[f"{TERMS[term]}[{channel}]"] = f"only a sum of {names} is determined"
+        if value[0] <= dependent:
+            tied = terms[np.abs(vector[:, 0]) > 0.1]
+            column[tied] = f"only a sum of {' and '.join(TERMS[term] for term in tied)} is determined"
 
 
 def _errors(

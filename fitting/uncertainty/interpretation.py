@@ -4,16 +4,16 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 import brdf
 from brdf.channels import channel_names
 from brdf.models.base import SpecularMaterial
 from fitting.light_colour import coefficient_factors
-from fitting.pixels import Tile
+from fitting.model_fit import ModelFit
+from fitting.pixels import Observed
 from fitting.result import Parameter, free_parameters
 from fitting.solver.normal_equations import Picture
-from fitting.solver.profile import Optimum
 from fitting.uncertainty.covariance import TERMS, Uncertainty, residual_noise, uncertainty
 from fitting.uncertainty.highlight import OFF_CENTRE, Highlight, highlight
 from fitting.uncertainty.intervals import exponent_interval
@@ -28,30 +28,6 @@ CORRELATED, LARGE_ERROR = 0.98, 0.05
 # standard errors. That many pixels of that many pictures are looked at; a mean needs no more.
 SHARE, DEVIATIONS = 0.02, 5.0
 FEWEST_PIXELS, MOST_PIXELS, MOST_PICTURES = 30, 8192, 16
-
-
-class ModelFit(NamedTuple):
-    """One model fitted to the pictures.
-
-    Attributes:
-        model: its class.
-        pictures: in the units of the solver, with the weights of the fit.
-        optimum: in the units of the solver.
-        free: which coefficients could be above 0, (3, C).
-        n_range: between which exponents the optimum was searched.
-        tied: x_s is a common factor times this, (C,); None where the channels are independent.
-        noise_factor: see `fitting.solver.losses.Reweighted`.
-        capped: k_d + k_s is held at 1 in some channel.
-    """
-
-    model: type[brdf.Material]
-    pictures: Sequence[Picture]
-    optimum: Optimum
-    free: Bool[np.ndarray, "3 C"]
-    n_range: tuple[float, float]
-    tied: Float[np.ndarray, " C"] | None = None
-    noise_factor: float = 1.0
-    capped: bool = False
 
 
 class Interpretation(NamedTuple):
@@ -82,66 +58,39 @@ class Interpretation(NamedTuple):
         return reasons.pop() if len(reasons) == 1 else ""
 
 
-def interpret(
-    fit: ModelFit,
-    colour: Float[np.ndarray, " C"],
-    rounding: Float[np.ndarray, " C"],
-    brightest: Float[np.ndarray, " C"],
-    tiles: Sequence[Tile],
-    required: Bool[np.ndarray, "3 C"],
-) -> Interpretation:
+def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> Interpretation:
     """Tell what a fit says.
 
     Args:
         fit: of one model.
-        colour: what was taken out of the lights, (C,).
-        rounding: standard deviation of a value's rounding, (C,).
-        brightest: largest value of the pictures, (C,).
-        tiles: of which the pictures were made.
-        required: coefficients that the light reaches and that were not left out as needless, (3, C).
+        seen: what was fitted.
+        hidden: why there is no highlight, where a fit with one has told.
     """
-    specular = issubclass(fit.model, SpecularMaterial)
     optimum, pictures = fit.optimum, fit.pictures
-    single = np.dtype(pictures[0].target.dtype) == np.float32
-    rounding = rounding * _typical_weight(pictures)
+    rounding = seen.rounding * _typical_weight(pictures)
     noise = np.maximum(residual_noise(optimum, rounding) * fit.noise_factor, rounding)
-    seen = highlight(pictures, optimum.n) if specular and not optimum.flat else None
+    lobe = None if optimum.flat else highlight(pictures, optimum.n)
     visible = 0.0
-    if seen is not None:
-        visible = float(np.max(optimum.x[2]) * seen.largest / max(np.max(brightest), np.finfo(float).tiny))
-    known = residual_correlation(pictures, tiles, optimum, rounding)
+    if lobe is not None:
+        visible = float(np.max(optimum.x[2]) * lobe.largest / max(np.max(seen.brightest), np.finfo(float).tiny))
+    known = residual_correlation(pictures, seen.tiles, optimum, rounding)
     spread = None
     if known.noise is not None:
         spread = fit.noise_factor**2 * weighted_sums(pictures, optimum, known.noise, inverse=False).gram
+    # What the light reaches but the simplest model does without is 0, with the error that it would have.
+    reached = seen.reached(fit.model)
     sure = uncertainty(
-        optimum,
-        required,
-        noise,
-        brightest,
-        specular=specular,
-        visible=visible,
-        single=single,
-        tied=fit.tied,
-        spread=spread,
+        optimum, reached, noise, seen.brightest, visible, single=fit.single, tied=fit.tied, spread=spread
     )
     interval = None
     # At k_d + k_s = 1 the cost still falls across the bound: a profile that does not know it has its least elsewhere.
-    if specular and "n" not in sure.undetermined and not fit.capped:
-        interval = exponent_interval(
-            pictures,
-            optimum,
-            fit.free,
-            sure.n_error,
-            sure.rise,
-            fit.n_range,
-            peak=seen.peak if seen else 0.0,
-            tied=fit.tied,
-        )
-        reason = _open_exponent(interval)
-        if reason:
-            sure.undetermined["n"] = reason
-    factors = coefficient_factors(fit.model, optimum.n, colour)
-    parameters = _parameters(optimum, sure, factors, interval, specular=specular)
+    if lobe is not None and not sure.n_reason and not fit.capped:
+        interval = exponent_interval(fit, sure.n_error, sure.rise, lobe.peak)
+        sure = sure._replace(n_reason=_open_exponent(interval))
+    if hidden:
+        sure.reasons[2], sure = hidden, sure._replace(n_reason=hidden)
+    specular = issubclass(fit.model, SpecularMaterial)
+    parameters = _parameters(fit, sure, coefficient_factors(fit.model, optimum.n, seen.colour), interval)
     k = np.array([[p.value or 0.0 for p in parameters if p.name == term] for term in TERMS[: 2 + specular]])
     if specular:
         material = fit.model(k_a=k[0], k_d=k[1], k_s=k[2], n=optimum.n if k[2].any() else 0.0)  # pyright: ignore[reportCallIssue]
@@ -152,9 +101,9 @@ def interpret(
     correlation = sure.correlation[np.ix_(index, index)]
     warnings = [_capped(k)] if fit.capped else []
     warnings += _missing_ambient(pictures)
-    warnings += _warnings(known, None if "k_s" in sure.undetermined else seen)
+    warnings += _warnings(known, None if all(sure.reasons[2]) else lobe)
     warnings += _hard_to_tell(free, correlation)
-    pixels = None if seen is None else seen.pixels
+    pixels = None if lobe is None else lobe.pixels
     return Interpretation(material, parameters, noise, known.correlation, pixels, correlation, tuple(warnings))
 
 
@@ -162,9 +111,8 @@ def _typical_weight(pictures: Sequence[Picture]) -> float:
     """Root of the mean weight of what counts: the unit of the weighted residual."""
     total, count = 0.0, 0
     for picture in pictures:
-        weight = np.ones(1) if picture.weight is None else np.asarray(picture.weight)
-        share = picture.target.shape[0] if picture.weight is None else 1
-        total, count = total + share * float(np.sum(weight, dtype=float)), count + share * np.count_nonzero(weight)
+        weight = np.ones(picture.target.shape[0]) if picture.weight is None else np.asarray(picture.weight)
+        total, count = total + float(np.sum(weight, dtype=float)), count + np.count_nonzero(weight)
     return float(np.sqrt(total / max(count, 1)))
 
 
@@ -182,24 +130,22 @@ def _open_exponent(interval: tuple[float, float]) -> str:
 
 
 def _parameters(
-    optimum: Optimum, sure: Uncertainty, factors: np.ndarray, interval: tuple[float, float] | None, *, specular: bool
+    fit: ModelFit, sure: Uncertainty, factors: np.ndarray, interval: tuple[float, float] | None
 ) -> tuple[Parameter, ...]:
     found = []
+    specular = issubclass(fit.model, SpecularMaterial)
     for term, name in enumerate(TERMS[: 2 + specular]):
         for channel, factor in enumerate(factors[term]):
-            reason = sure.undetermined.get(name) or sure.undetermined.get(f"{name}[{channel}]")
-            if reason:
-                found.append(Parameter(name, channel, None, None, reason=reason))
+            if sure.reasons[term, channel]:
+                found.append(Parameter(name, channel, None, None, reason=sure.reasons[term, channel]))
                 continue
-            value = float(optimum.x[term, channel] / factor)
+            value = float(fit.optimum.x[term, channel] / factor)
             low, high = sure.x_interval[term, channel] / factor
             error = float(sure.x_error[term, channel] / factor)
             found.append(Parameter(name, channel, value, error, (float(low), float(high)), at_bound=value == 0))
-    reason = sure.undetermined.get("n", "")
-    if specular and reason:
-        found.append(Parameter("n", None, None, None, interval, reason=reason))
-    elif specular:
-        found.append(Parameter("n", None, float(optimum.n), sure.n_error, interval))
+    if specular:
+        n, error = (None, None) if sure.n_reason else (float(fit.optimum.n), sure.n_error)
+        found.append(Parameter("n", None, n, error, interval, reason=sure.n_reason))
     return tuple(found)
 
 

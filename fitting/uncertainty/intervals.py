@@ -2,14 +2,12 @@
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
 
-from fitting.solver.normal_equations import Picture
-from fitting.solver.profile import Optimum
+from fitting.model_fit import ModelFit
 from fitting.solver.refinement import problem_of, solve_linear
 
 NORMAL_95 = 1.959963984540054
@@ -24,23 +22,22 @@ SHARES = np.linspace(0.0, 1.0, 17)
 
 
 @functools.cache
-def _acceptance() -> tuple[Float[np.ndarray, " M"], Float[np.ndarray, " M"], Float[np.ndarray, " M"]]:
+def _acceptance() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Truths in units of the error, and between which estimates each is accepted, after Feldman and Cousins."""
 
-    def below(x: float) -> float:
-        return 0.5 * math.erfc(-x / math.sqrt(2.0))
+    def below(x: np.ndarray) -> np.ndarray:
+        return 0.5 * np.array([math.erfc(-size / math.sqrt(2.0)) for size in x])
 
     truths = np.linspace(0.0, NORMAL_95, 41)
-    lower, upper = np.full(truths.size, -np.inf), np.full(truths.size, ONE_SIDED_95)
-    for i, truth in enumerate(truths[1:], start=1):
-        low, high = truth + ONE_SIDED_95, truth + NORMAL_95
-        for _ in range(40):
-            middle = 0.5 * (low + high)
-            other = (truth**2 - (middle - truth) ** 2) / (2 * truth)
-            enough = below(middle - truth) - below(other - truth) > 0.95
-            low, high = (low, middle) if enough else (middle, high)
-        upper[i], lower[i] = high, (truth**2 - (high - truth) ** 2) / (2 * truth)
-    return truths, lower, upper
+    above = truths[1:]
+    low, high = above + ONE_SIDED_95, above + NORMAL_95
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        other = (above**2 - (middle - above) ** 2) / (2 * above)
+        enough = below(middle - above) - below(other - above) > 0.95
+        low, high = np.where(enough, low, middle), np.where(enough, middle, high)
+    lower = (above**2 - (high - above) ** 2) / (2 * above)
+    return truths, np.append(-np.inf, lower), np.append(ONE_SIDED_95, high)
 
 
 def above_zero(value: float, error: float) -> tuple[float, float]:
@@ -68,44 +65,31 @@ def above_zero(value: float, error: float) -> tuple[float, float]:
     return low * error, high * error
 
 
-def exponent_interval(
-    pictures: Sequence[Picture],
-    optimum: Optimum,
-    free: Bool[np.ndarray, "3 C"],
-    n_error: float,
-    rise: float,
-    n_range: tuple[float, float],
-    *,
-    peak: float = 0.0,
-    tied: Float[np.ndarray, " C"] | None = None,
-) -> tuple[float, float]:
+def exponent_interval(fit: ModelFit, n_error: float, rise: float, peak: float) -> tuple[float, float]:
     """The 95 % profile-likelihood interval of n: where the least cost rises by ``rise``.
 
     A relative error below a hundredth needs no pixel: there the profile is a parabola in log n. Else the cost is
     followed outwards from the optimum, two brackets of pixels' sums in the ordinary case.
 
     Args:
-        pictures: as they were searched.
-        optimum: of the search.
-        free: which coefficients may be above 0, (3, C).
+        fit: of a model with a lobe.
         n_error: standard error of n.
         rise: of the cost; see `fitting.uncertainty.covariance.Uncertainty`.
-        n_range: bounds of the search.
         peak: logarithm of the lobe's cosine in the pixel nearest to its centre.
-        tied: x_s is a common factor times this, (C,); None where the channels are independent.
 
     Returns:
         Lower and upper end; 0 and infinity where the cost does not rise before the bound of the search.
     """
+    optimum = fit.optimum
     relative = n_error / optimum.n
-    bounds = math.log(n_range[0]), math.log(n_range[1])
+    bounds = math.log(fit.n_range[0]), math.log(fit.n_range[1])
     centre = math.log(optimum.n)
     inside = bounds[0] < centre - 3 * relative and centre + 3 * relative < bounds[1]
     if relative < PARABOLIC and inside:
         return optimum.n * math.exp(-NORMAL_95 * relative), optimum.n * math.exp(NORMAL_95 * relative)
     first = min(max(1.1 * NORMAL_95 * relative, 1e-3), WIDEST)
     limit = float(np.sum(optimum.cost)) + rise
-    problem = problem_of(pictures, n_range, free)._replace(peak=peak, tied=tied)
+    problem = problem_of(fit.pictures, fit.n_range, fit.free)._replace(peak=peak, tied=fit.tied)
     # Relative to the nearest pixel the lobe keeps its size where no pixel sees the centre.
     reference = optimum.x.T * [1.0, 1.0, math.exp(optimum.n * peak)]
 

@@ -87,9 +87,7 @@ def _one_channel(squared: np.ndarray, value: np.ndarray, least: float) -> tuple[
 
 
 @eqx.filter_jit
-def _reweighted(
-    picture: Picture, n: AnyArray, x: Float[AnyArray, "3 C"], coefficients: Float[AnyArray, "C 3"], inverse: bool
-) -> Float[Array, "P C"]:
+def _reweighted(picture: Picture, n: AnyArray, x: AnyArray, coefficients: AnyArray, inverse: bool) -> Array:
     dtype = picture.target.dtype
     value = jnp.maximum(picture.predicted(n, x), 0.0)
     variance = _variance(jnp.asarray(coefficients).astype(dtype), value)

@@ -101,9 +101,7 @@ def _neighbours(counted: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]
 
 
 @eqx.filter_jit
-def _residuals(
-    picture: Picture, pairs: AnyArray, n: AnyArray, x: Float[AnyArray, "3 C"]
-) -> tuple[Float[Array, "M2 C"], Float[Array, "M2 Cw"], Float[Array, "M2 C"]]:
+def _residuals(picture: Picture, pairs: AnyArray, n: AnyArray, x: AnyArray) -> tuple[Array, Array, Array]:
     some = picture.pixels(lambda a: jnp.take(a, pairs.ravel(), axis=0))
     model = some.predicted(n, x)
     weight = jnp.ones((1, 1), model.dtype) if some.weight is None else some.weight.reshape(pairs.size, -1)

@@ -12,7 +12,7 @@ from fitting import core, pixels
 from fitting.solver.streams import Stream, each, joined
 
 MATERIAL = brdf.BlinnPhong(k_a=[0.05, 0.04, 0.03], k_d=[0.5, 0.3, 0.1], k_s=[0.3, 0.25, 0.2], n=60.0)
-SIZE = (96, 90)
+SIZE = (64, 60)
 
 
 def scene(**changes) -> brdf.Scene:
@@ -37,9 +37,9 @@ def picture(noise: float = 0.01) -> np.ndarray:
 
 @pytest.fixture(autouse=True)
 def small_bands(monkeypatch):
-    """Seven bands, the last one shorter."""
-    monkeypatch.setattr(pixels, "TILE_PIXELS", 14 * SIZE[0] + 5)
-    monkeypatch.setattr(pixels, "ALIGNED_ROWS", 14)
+    """Five bands of one size."""
+    monkeypatch.setattr(pixels, "TILE_PIXELS", 12 * SIZE[0] + 5)
+    monkeypatch.setattr(pixels, "ALIGNED_ROWS", 12)
 
 
 def same(streamed: fitting.FitResult, whole: fitting.FitResult, tolerance: float = 2e-5):
@@ -56,8 +56,11 @@ def same(streamed: fitting.FitResult, whole: fitting.FitResult, tolerance: float
     np.testing.assert_allclose(streamed.residual, whole.residual, rtol=1e-5, atol=1e-7)
 
 
-@pytest.mark.parametrize("model", ["auto", "blinn-phong", "normalized-phong", "lambert"])
-def test_file_and_memory_agree(tmp_path: Path, model: str):
+@pytest.mark.parametrize(("model", "rows"), [("auto", 12), ("lambert", 13)])
+def test_file_and_memory_agree(tmp_path: Path, monkeypatch, model: str, rows: int):
+    # Of 13 rows the last band is shorter.
+    monkeypatch.setattr(pixels, "TILE_PIXELS", rows * SIZE[0])
+    monkeypatch.setattr(pixels, "ALIGNED_ROWS", rows)
     path = tmp_path / "target.exr"
     brdf.write_image(path, picture())
     whole = fitting.fit(brdf.read_image(path), scene(), model=model)
@@ -65,7 +68,7 @@ def test_file_and_memory_agree(tmp_path: Path, model: str):
         same(fitting.fit(reader, scene(), model=model), whole)
 
 
-@pytest.mark.parametrize("options", [{"loss": "huber"}, {"loss": "relative"}, {"plausible": True}, {"dark": 0.05}])
+@pytest.mark.parametrize("options", [{"loss": "huber"}, {"plausible": True}, {"dark": 0.05}])
 def test_options_agree(tmp_path: Path, options: dict):
     path = tmp_path / "target.exr"
     brdf.write_image(path, picture())
@@ -138,18 +141,18 @@ def test_surface_points_in_place_of_a_camera(tmp_path: Path):
 
 
 def test_large_file_is_shown_by_some_of_its_pixels(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(pixels, "SHOWN_PIXELS", 30)
+    monkeypatch.setattr(pixels, "SHOWN_PIXELS", 20)
     path = tmp_path / "target.exr"
     brdf.write_image(path, picture(0.0))
     with brdf.ImageReader(path) as reader:
         result = fitting.fit(reader, scene())
-    assert result.targets[0].shape == (23, 24, 3)
+    assert result.targets[0].shape == (15, 16, 3)
     np.testing.assert_allclose(result.targets[0], picture(0.0)[::4, ::4])
-    assert result.counted[0].shape == (23, 24)
+    assert result.counted[0].shape == (15, 16)
     fitted = result.fitted(0)
     np.testing.assert_allclose(fitted[result.counted[0]], result.targets[0][result.counted[0]], atol=1e-4)
     result.save(tmp_path / "out")
-    assert brdf.read_image(tmp_path / "out" / "fitted.exr").shape == (23, 24, 3)
+    assert brdf.read_image(tmp_path / "out" / "fitted.exr").shape == (15, 16, 3)
 
 
 @pytest.mark.parametrize(

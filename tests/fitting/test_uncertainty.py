@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 from scipy import optimize, stats
+from small_ball import ball_scene, pictured
 
 import brdf
 import fitting
 from fitting.uncertainty.intervals import above_zero
 
 CAMERA = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=(36, 36))
-BALL = brdf.Sphere(center=[0, 0, 0], radius=1)
 LIGHT = brdf.DirectionalLight(direction=[0.5, 0.6, 0.7], intensity=[1.0])
-SCENE = brdf.Scene(camera=CAMERA, shapes=[BALL], ambient=[0.2], lights=[LIGHT])
+SCENE = ball_scene(LIGHT, ambient=[0.2], camera=CAMERA)
 # Told that nothing is clipped: the largest value of a noisy picture is no plateau.
 OPTIONS = {"precision": "float64", "saturation": np.inf}
 
@@ -31,8 +31,7 @@ def columns(n: float, scene: brdf.Scene = SCENE) -> tuple[np.ndarray, np.ndarray
 
 
 def noisy(material: brdf.Material, noise, seed: int, scene: brdf.Scene = SCENE) -> np.ndarray:
-    clean = np.asarray(brdf.render(material, scene, precision="float64"))
-    return clean + noise * np.random.default_rng(seed).standard_normal(clean.shape)
+    return pictured(material, scene, noise, seed)
 
 
 GLOSS = brdf.BlinnPhong(k_a=0.5, k_d=0.5, k_s=0.6, n=30.0)
@@ -111,7 +110,7 @@ def test_a_wrong_model_is_given_away_by_the_structure_of_its_residual():
 
 
 def test_without_ambient_light_k_a_is_open():
-    scene = brdf.Scene(camera=CAMERA, shapes=[BALL], lights=[LIGHT])
+    scene = ball_scene(LIGHT, ambient=None, camera=CAMERA)
     result = fitting.fit(noisy(GLOSS, 0.01, 0, scene), scene, model="blinn-phong", **OPTIONS)
     assert list(result.undetermined.values()) == ["no ambient light in the scene"]
     assert result.to_dict()["material"]["k_a"] == [None]
@@ -160,15 +159,13 @@ def test_a_coefficient_at_its_bound_is_zero_with_a_one_sided_interval():
 def test_a_flat_sheet_under_a_distant_light_tells_only_a_sum_of_ambient_and_diffuse(precision, model):
     """Its diffuse basis image is a multiple of the ambient one, which the rounding of sums must not hide."""
     camera = brdf.PerspectiveCamera(
-        position=[0.0, 0.0, 4.0], target=[0.0, 0.0, 0.0], up=[0.0, 1.0, 0.0], fov=25.0, resolution=(128, 128)
+        position=[0.0, 0.0, 4.0], target=[0.0, 0.0, 0.0], up=[0.0, 1.0, 0.0], fov=25.0, resolution=(64, 64)
     )
     sheet = brdf.Rectangle(center=[0.0, 0.0, 0.0], edge_u=[1.0, 0.0, 0.3], edge_v=[0.0, 1.0, 0.06])
     light = brdf.DirectionalLight(direction=[0.3, 0.4, 0.8], intensity=[1.0, 0.9, 0.8])
     scene = brdf.Scene(camera=camera, shapes=[sheet], lights=[light], ambient=[0.3, 0.3, 0.3])
     truth = brdf.BlinnPhong(k_a=[0.5] * 3, k_d=[0.5] * 3, k_s=[0.3] * 3, n=20.0)
-    picture = np.asarray(brdf.render(truth, scene, precision="float64"))
-    picture = picture + 0.01 * np.random.default_rng(0).standard_normal(picture.shape)
-    result = fitting.fit(picture, scene, model=model, precision=precision)
+    result = fitting.fit(pictured(truth, scene, 0.01), scene, model=model, precision=precision)
     told = {(one.name, one.channel): one for one in result.parameters}
     for channel in range(3):
         for name in ("k_a", "k_d"):
@@ -177,3 +174,31 @@ def test_a_flat_sheet_under_a_distant_light_tells_only_a_sum_of_ambient_and_diff
     if model == "blinn-phong":
         highlight = told["k_s", 0]
         assert abs(highlight.value - 0.3) < 4 * highlight.error
+
+
+SIDE, FRONT = [0.8, 0.5, 0.4], [0.0, 0.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("direction", "there", "known", "told"),
+    [
+        (SIDE, 0.2, None, True),
+        (SIDE, None, None, False),
+        (SIDE, 0.2, 0.2, False),
+        (SIDE, 0.004, None, False),  # 0.7 % of the lit side: less than is worth a word
+        (FRONT, 0.2, None, False),  # nothing is dark that could tell
+    ],
+    ids=["missing", "not there", "known", "a trace", "no dark side"],
+)
+def test_missing_ambient_light_is_hinted_at_where_the_dark_side_is_bright(direction, there, known, told: bool):
+    material = brdf.BlinnPhong(k_a=[0.4] * 3, k_d=[0.5, 0.4, 0.3], k_s=[0.3] * 3, n=30.0)
+    light = brdf.DirectionalLight(direction=direction, intensity=[0.9] * 3)
+    truth, stated = (ball_scene(light, ambient=None if value is None else [value] * 3) for value in (there, known))
+    target = pictured(material, truth, 0.01)
+    hints = [w for w in fitting.fit(target, stated, model="blinn-phong").warnings if "[ambient]" in w]
+    assert len(hints) == told
+    if told:
+        points = stated.surface_points()
+        on_ball, cosine = np.asarray(points.mask), np.asarray(points.normal) @ np.array(direction)
+        share = target[on_ball & (cosine <= 0)].mean() / target[on_ball & (cosine > 0)].mean()
+        assert f"still shows {100 * share:.2g} % of its lit side" in hints[0]

@@ -1,0 +1,45 @@
+"""One model fitted to the pictures, in the units of the solver."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+import brdf
+from fitting.solver.normal_equations import Picture
+from fitting.solver.profile import Optimum
+
+
+class ModelFit(NamedTuple):
+    """One model fitted to the pictures.
+
+    Attributes:
+        model: its class.
+        pictures: with the weights of the fit.
+        optimum: of the search.
+        free: which coefficients could be above 0, (3, C).
+        n_range: between which exponents the optimum was searched.
+        tied: x_s is a common factor times this, (C,); None where the channels are independent.
+        noise_factor: see `fitting.solver.losses.Reweighted`.
+        capped: k_d + k_s is held at 1 in some channel.
+    """
+
+    model: type[brdf.Material]
+    pictures: Sequence[Picture]
+    optimum: Optimum
+    free: Bool[np.ndarray, "3 C"]
+    n_range: tuple[float, float]
+    tied: Float[np.ndarray, " C"] | None = None
+    noise_factor: float = 1.0
+    capped: bool = False
+
+    @property
+    def single(self) -> bool:
+        """Whether the pixels are float32."""
+        return np.dtype(self.pictures[0].target.dtype) == np.float32
+
+    @property
+    def residual(self) -> float:
+        """Root mean square of the residual over that of the picture."""
+        return float(np.sqrt(np.sum(self.optimum.cost) / np.sum(self.optimum.square)))
