@@ -4,7 +4,6 @@ import json
 import tomllib
 
 import numpy as np
-import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -13,7 +12,7 @@ from benchmarks import fuzz, fuzz_corpus
 from brdf.errors import InputError
 
 SETTINGS = settings(
-    max_examples=300, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=150, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 numbers = st.one_of(st.integers(-(2**70), 2**70), st.floats(), st.sampled_from([0, 1, -1, 0.5, 1e308, 1e-320]))
 leaves = st.one_of(st.none(), st.booleans(), numbers, st.text(max_size=8))
@@ -122,9 +121,8 @@ def test_any_bytes(tmp_path, content, name):
         one_line(error, path)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_damaged_files_give_a_value_or_one_error(tmp_path, seed):
-    outcomes, found = fuzz.run(3000, seed, 60.0, tmp_path)
+def test_damaged_files_give_a_value_or_one_error(tmp_path):
+    outcomes, found = fuzz.run(3000, 1, 60.0, tmp_path)
     assert found == []
     assert sum(outcomes.values()) > 0
     assert any(outcome.endswith("value") for outcome in outcomes)

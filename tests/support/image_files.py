@@ -31,13 +31,18 @@ def chunk(kind, data):
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
+def raw_png(width, height, bits, colour_type, rows, *chunks):
+    """The bytes of a PNG file, after its specification; each row begins with its filter."""
+    header = struct.pack(">IIBBBBB", width, height, bits, colour_type, 0, 0, 0)
+    body = [(b"IHDR", header), *chunks, (b"IDAT", zlib.compress(rows)), (b"IEND", b"")]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*item) for item in body)
+
+
 def png(codes, *chunks, colour_type=2):
-    """The bytes of a PNG file, after its specification."""
-    bits = 8 * codes.dtype.itemsize
-    header = struct.pack(">IIBBBBB", codes.shape[1], codes.shape[0], bits, colour_type, 0, 0, 0)
+    """A PNG file of whole bytes."""
+    height, width, _ = codes.shape
     rows = b"".join(b"\0" + row.astype(row.dtype.newbyteorder(">")).tobytes() for row in codes)
-    body = [chunk(b"IHDR", header), *(chunk(*item) for item in chunks), chunk(b"IDAT", zlib.compress(rows))]
-    return b"\x89PNG\r\n\x1a\n" + b"".join(body) + chunk(b"IEND", b"")
+    return raw_png(width, height, 8 * codes.dtype.itemsize, colour_type, rows, *chunks)
 
 
 def profile(curve):
@@ -71,10 +76,11 @@ def codes(*shape, dtype=np.uint8, seed=0):
     return np.random.default_rng(seed).integers(0, np.iinfo(dtype).max, shape, dtype, endpoint=True)
 
 
-def raw_exr(path, array, names, *, kind="float", tile=0, data_at=(0, 0), display=None, **attributes):
-    """An EXR file by plain OpenImageIO calls."""
+def raw(path, array, names=(), *, kind="float", tile=0, data_at=(0, 0), display=None, **attributes):
+    """A file of any format by plain OpenImageIO calls."""
     spec = oiio.ImageSpec(array.shape[1], array.shape[0], array.shape[2], kind)
-    spec.channelnames = tuple(names)
+    if names:
+        spec.channelnames = tuple(names)
     spec.tile_width = spec.tile_height = tile
     spec.x, spec.y = data_at
     if display is not None:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio  # noqa: N813
 import pytest
-from image_files import BAD_IMAGES, REAL, ROOT, chunk, codes, needs, png, random, raw_exr
+from image_files import BAD_IMAGES, REAL, ROOT, chunk, codes, needs, png, random, raw, raw_png
 
 import brdf
 from brdf.errors import InputError
@@ -92,13 +92,32 @@ BAD = {
     "fax.tif": (white_fax(30_000), "claims 30000 × 30000 pixels"),
 }
 
+CLAIMS = {
+    "huge.png": raw_png(2**31 - 1, 2**31 - 1, 8, 2, b""),
+    "wide.png": raw_png(2**30, 1, 16, 6, b""),
+    "depth.png": raw_png(60, 40, 3, 2, bytes(181 * 40)),
+    "no_palette.png": raw_png(60, 40, 8, 3, bytes(61 * 40)),
+    "few_rows.png": raw_png(60, 40, 8, 2, bytes(181 * 10)),
+    "huge.hdr": b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2000000000 +X 2000000000\n",
+    "huge.ppm": b"P6 99999999 99999999 255\n",
+    "negative.ppm": b"P6 -5 7 255\n12345678",
+    "letters.ppm": b"P3\n2 2\n255\n1 2 3 a b c",
+    "huge.pfm": b"PF\n999999999 999999999\n-1.0\n",
+    "page.jpg": b"<!DOCTYPE html><html>404</html>",
+    "drawing.png": b"<svg xmlns='http://www.w3.org/2000/svg'/>",
+}
+
+BAD |= {name: (content, r"is damaged|claims|cannot be read as an image") for name, content in CLAIMS.items()}
+
 
 @pytest.mark.parametrize("name", BAD)
 def test_what_is_no_picture(tmp_path, name, capfd):
     content, said = BAD[name]
     (tmp_path / name).write_bytes(content)
-    refused(tmp_path / name, said)
-    assert capfd.readouterr() == ("", "")
+    # Some headers are sound.
+    refused(tmp_path / name, said, READERS[:-1] if name in CLAIMS else READERS)
+    # What is damaged with sound checksums libpng tells itself.
+    assert name in CLAIMS or capfd.readouterr() == ("", "")
 
 
 def test_what_is_no_file(tmp_path):
@@ -107,21 +126,29 @@ def test_what_is_no_file(tmp_path):
     refused(tmp_path / "missing.exr", "no such file")
 
 
-@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif", ".hdr", ".exr"])
-@pytest.mark.parametrize("part", [0.05, 0.5, 0.95])
-def test_a_truncated_file(tmp_path, suffix, part, capfd):
-    write_image(tmp_path / f"a{suffix}", random(60, 70, 3))
-    content = (tmp_path / f"a{suffix}").read_bytes()
-    (tmp_path / f"b{suffix}").write_bytes(content[: int(part * len(content))])
-    refused(tmp_path / f"b{suffix}", r"damaged|cannot be read", [read_image])
-    assert capfd.readouterr().err == ""
+KINDS = {"exr": "float", "tif": "float", "hdr": "float", "pfm": "float", "fits": "float", "rla": "uint16"}
+KINDS |= dict.fromkeys("png dpx webp gif tga bmp jp2 ppm sgi iff jpg".split(), "uint8")
+
+
+@pytest.mark.parametrize("share", [0.3, 0.7])
+@pytest.mark.parametrize("suffix", KINDS)
+def test_a_file_cut_short_is_told(tmp_path, capfd, suffix, share):
+    path = tmp_path / f"cut.{suffix}"
+    if oiio.ImageOutput.create(str(path)) is None:
+        oiio.geterror()
+        pytest.skip(f"OpenImageIO was built without a writer for {suffix}")
+    raw(path, random(40, 60, 3), kind=KINDS[suffix])
+    assert read_image(path).shape == (40, 60, 3)
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    refused(path, r"is damaged|cannot be read as an image", [read_image])
+    assert capfd.readouterr() == ("", "")
 
 
 def test_display_windows_that_are_absurd(tmp_path):
-    raw_exr(tmp_path / "a.exr", random(4, 4, 3), "RGB", display=(0, 0, 900_000, 900_000))
+    raw(tmp_path / "a.exr", random(4, 4, 3), "RGB", display=(0, 0, 900_000, 900_000))
     refused(tmp_path / "a.exr", "claims 900000 × 900000 pixels")
     for at in ((100, 0), (0, 100), (-4, 0), (0, -4)):
-        raw_exr(tmp_path / "b.exr", random(4, 4, 3), "RGB", display=(*at, 4, 4))
+        raw(tmp_path / "b.exr", random(4, 4, 3), "RGB", display=(*at, 4, 4))
         refused(tmp_path / "b.exr", "no data inside its display window", [read_image])
 
 
@@ -142,7 +169,7 @@ def test_deep_data_and_volumes(tmp_path):
 
 
 def test_a_picture_larger_than_memory(tmp_path, monkeypatch):
-    raw_exr(tmp_path / "a.exr", random(40, 40, 3), "RGB")
+    raw(tmp_path / "a.exr", random(40, 40, 3), "RGB")
     monkeypatch.setattr(damage, "MAX_VALUES", 40 * 40 * 3 - 1)
     refused(tmp_path / "a.exr", "by bands of rows", [read_image, read_layers])
     with ImageReader(tmp_path / "a.exr") as reader:
@@ -220,14 +247,14 @@ def test_a_png_without_what_nobody_needs(tmp_path):
 
 
 def test_a_tile_larger_than_the_picture(tmp_path):
-    raw_exr(tmp_path / "a.exr", random(20, 30, 3), "RGB", tile=64)
+    raw(tmp_path / "a.exr", random(20, 30, 3), "RGB", tile=64)
     np.testing.assert_array_equal(read_image(tmp_path / "a.exr"), random(20, 30, 3))
 
 
 def test_large_even_pictures_in_a_few_bytes(tmp_path):
     """Masks and renderings of a small thing, 36 and 53 MB of pixels."""
     (tmp_path / "a.tif").write_bytes(white_fax(6000))
-    raw_exr(tmp_path / "a.exr", np.zeros((2160, 4096, 3), np.float32), "RGB", kind="half", compression="dwab")
+    raw(tmp_path / "a.exr", np.zeros((2160, 4096, 3), np.float32), "RGB", kind="half", compression="dwab")
     for name, shape, value in (("a.tif", (6000, 6000, 1), 1), ("a.exr", (2160, 4096, 3), 0)):
         assert np.prod(shape) > 4096 * (tmp_path / name).stat().st_size
         with ImageReader(tmp_path / name, encoding="linear") as reader:

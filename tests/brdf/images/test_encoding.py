@@ -14,7 +14,7 @@ from image_files import (
     png,
     profile,
     random,
-    raw_exr,
+    raw,
     srgb_to_linear,
     table,
 )
@@ -131,8 +131,8 @@ def test_encode_undoes_decode(encoding, shape):
 
 def test_a_float_file_is_linear_unless_someone_says_otherwise(tmp_path):
     values = random(9, 8, 3)
-    raw_exr(tmp_path / "a.exr", values, "RGB")
-    raw_exr(tmp_path / "b.exr", values, "RGB", colorInteropID="srgb_rec709_scene")
+    raw(tmp_path / "a.exr", values, "RGB")
+    raw(tmp_path / "b.exr", values, "RGB", colorInteropID="srgb_rec709_scene")
     assert read_picture(tmp_path / "a.exr").source == "format"
     np.testing.assert_array_equal(read_image(tmp_path / "a.exr"), values)
     for said in (read_image(tmp_path / "a.exr", encoding="srgb"), read_image(tmp_path / "b.exr")):

@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import OpenImageIO as oiio  # noqa: N813
 import pytest
-from image_files import REAL, codes, needs, png, random, raw_exr
+from image_files import REAL, codes, needs, png, random, raw, raw_png
 
 from brdf.images.reading import ImageReader, read_image, read_layers, read_mask, read_picture
 from brdf.images.writing import write_image, write_layers
@@ -47,7 +47,7 @@ def test_grey(tmp_path):
 )
 def test_the_picture_in_an_exr(tmp_path, names, chosen, alpha):
     values = random(5, 4, len(names))
-    picture = read_picture(raw_exr(tmp_path / "a.exr", values, names))
+    picture = read_picture(raw(tmp_path / "a.exr", values, names))
     np.testing.assert_array_equal(picture.pixels, values[..., [names.index(name) for name in chosen]])
     if alpha is None:
         assert picture.alpha is None
@@ -115,7 +115,7 @@ def test_masks(tmp_path):
     (tmp_path / "one.png").write_bytes(png(inside.astype(np.uint8)[..., None], colour_type=0))
     (tmp_path / "alpha.png").write_bytes(png(np.dstack([codes(8, 9, 3), white]), colour_type=6))
     (tmp_path / "opaque.png").write_bytes(png(np.dstack([white] * 3 + [np.full_like(white, 255)]), colour_type=6))
-    raw_exr(tmp_path / "float.exr", np.where(inside, 1, np.nan)[..., None].astype(np.float32), ["Y"])
+    raw(tmp_path / "float.exr", np.where(inside, 1, np.nan)[..., None].astype(np.float32), ["Y"])
     for name, alpha in (("faint.png", 254), ("nothing.png", 0), ("veiled.png", np.where(inside, 255, 200))):
         # Alpha that keeps all pixels, or none, was not meant.
         pixels = np.dstack([white] * 3 + [np.broadcast_to(alpha, white.shape).astype(np.uint8)])
@@ -127,6 +127,23 @@ def test_masks(tmp_path):
     assert not read_mask(tmp_path / "black.png").any()
 
 
+def test_odd_pictures(tmp_path):
+    bits = codes(5, 16) % 2
+    rows = b"".join(b"\0" + row.tobytes() for row in np.packbits(bits, axis=1))
+    (tmp_path / "bits.png").write_bytes(raw_png(16, 5, 1, 0, rows))
+    np.testing.assert_array_equal(read_image(tmp_path / "bits.png")[..., 0], bits)
+    index, colours = codes(5, 7) % 3, np.diag([255, 255, 255]).astype(np.uint8)
+    rows = b"".join(b"\0" + row.tobytes() for row in index)
+    (tmp_path / "palette.png").write_bytes(raw_png(7, 5, 8, 3, rows, (b"PLTE", colours.tobytes())))
+    np.testing.assert_array_equal(read_image(tmp_path / "palette.png"), colours[index] / 255)
+    for shape in ((1, 1, 3), (1, 16384, 3), (16384, 1, 1)):
+        values = random(*shape)
+        raw(tmp_path / "a.exr", values, ["Y"] if shape[2] == 1 else ())
+        np.testing.assert_array_equal(read_image(tmp_path / "a.exr"), values)
+    raw(tmp_path / "signed.tif", random(4, 5, 3), kind="int16")
+    np.testing.assert_allclose(read_image(tmp_path / "signed.tif"), random(4, 5, 3), atol=2 / 32767)
+
+
 # --- windows, orientation, bands ---------------------------------------------------------------------------------
 
 
@@ -134,7 +151,7 @@ def test_masks(tmp_path):
 @pytest.mark.parametrize("shift", [(3, 5), (-4, -7), (0, 0)])
 def test_the_display_window_is_the_picture(tmp_path, tile, shift):
     values = random(40, 50, 3)
-    path = raw_exr(tmp_path / "a.exr", values, "RGB", tile=tile, data_at=shift, display=(0, 0, 50, 40))
+    path = raw(tmp_path / "a.exr", values, "RGB", tile=tile, data_at=shift, display=(0, 0, 50, 40))
     expected = np.full((40, 50, 3), np.nan, np.float32)
     for y in range(40):
         for x in range(50):
@@ -190,7 +207,7 @@ def test_bands_are_the_picture(tmp_path, suffix, kind):
 
 def test_tiles_are_read_by_rows(tmp_path):
     values = random(100, 30, 3)
-    with ImageReader(raw_exr(tmp_path / "a.exr", values, "RGB", tile=16)) as reader:
+    with ImageReader(raw(tmp_path / "a.exr", values, "RGB", tile=16)) as reader:
         for start, stop in ((0, 100), (3, 9), (15, 17), (90, 100)):
             np.testing.assert_array_equal(reader.rows(start, stop), values[start:stop])
 
@@ -208,7 +225,7 @@ def test_a_mask_of_odd_values_is_read_without_a_warning(tmp_path, odd):
     values[2:4, 2:5] = 1.0 if np.isnan(odd) else odd
     values[0, 0] = odd
     values[1, 1] = np.inf, -np.inf, 0.0
-    raw_exr(tmp_path / "a.exr", values, "RGB")
+    raw(tmp_path / "a.exr", values, "RGB")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         inside = read_mask(tmp_path / "a.exr")
