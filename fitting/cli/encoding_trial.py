@@ -64,8 +64,6 @@ def fit_either(given: Given, how: dict[str, Any]) -> tuple[FitResult, tuple[str,
 
 def _fit(inputs: FitInputs, how: dict[str, Any]) -> FitResult:
     with named_as({"target": inputs.target}):
-        if len(inputs.pictures) == 1:
-            return fitting.fit(inputs.pictures[0], inputs.scenes[0], mask=inputs.masks[0], **how)
         return fitting.fit(inputs.pictures, inputs.scenes, mask=inputs.masks, **how)
 
 

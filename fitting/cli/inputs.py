@@ -17,6 +17,8 @@ from fitting.photographs.archives import read_archive, read_array
 from fitting.photographs.ball import Circle, ball_normals, ball_points, find_circle, parse_circle
 from fitting.photographs.light_files import parse_numbers, read_directions, read_intensities
 
+Array = np.ndarray
+
 # A light from so far behind leaves a crescent of less than three fifths of the ball's radius. On a thin one ambient
 # light and a highlight can be taken for each other and for shading, and the jackknife does not see that.
 BEHIND = -0.4
@@ -52,7 +54,7 @@ class FitInputs(NamedTuple):
 
     pictures: list[brdf.Picture]
     scenes: list["brdf.Scene"]
-    masks: list[np.ndarray | None]
+    masks: list[Array | None]
     target: Path
     notes: tuple[str, ...] = ()
 
@@ -182,24 +184,30 @@ def _exposed(pictures: list[brdf.Picture], exposure: str | None) -> list[brdf.Pi
     return [picture.scaled(1.0 / factor) for picture, factor in zip(pictures, factors, strict=True)]
 
 
-def visible(mask: np.ndarray | None, pictures: list[brdf.Picture]) -> list[np.ndarray | None]:
+def visible(mask: Array | None, pictures: list[brdf.Picture]) -> list[Array | None]:
     """Pixels that count in each picture: those of the mask without the fully transparent ones, which show nothing.
 
     Args:
         mask: (H, W), or None.
         pictures: where alpha is 0 everywhere it was not meant.
+
+    Raises:
+        InputError: where the mask is not of their size.
     """
     masks = []
     for picture in pictures:
-        opaque = None if picture.alpha is None or not picture.alpha.any() else picture.alpha > 0
-        if opaque is None or (mask is not None and mask.shape != opaque.shape):
-            masks.append(mask)
-        else:
-            masks.append(opaque if mask is None else opaque & mask)
+        shape, alpha = picture.pixels.shape[:2], picture.alpha
+        counts = None if alpha is None or not alpha.any() else alpha > 0
+        if mask is not None:
+            _require(
+                mask.shape == shape, "mask", f"is of shape {mask.shape}, the target {shape}", "Give a value per pixel"
+            )
+            counts = mask if counts is None else counts & mask
+        masks.append(counts)
     return masks
 
 
-def ball_in(sphere: str, mask: np.ndarray | None) -> tuple[Circle, tuple[str, ...]]:
+def ball_in(sphere: str, mask: Array | None) -> tuple[Circle, tuple[str, ...]]:
     """The ball that --sphere names, and what to tell where it was found in a mask.
 
     Args:
@@ -220,8 +228,8 @@ def _photographs(
     targets: list[Path],
     options: PictureOptions,
     pictures: list[brdf.Picture],
-    mask: np.ndarray | None,
-    masks: list[np.ndarray | None],
+    mask: Array | None,
+    masks: list[Array | None],
 ) -> FitInputs:
     """Photographs of one size under one distant light each."""
     count, (height, width, channels), notes = len(targets), pictures[0].pixels.shape, ()
@@ -260,7 +268,7 @@ def _photographs(
 def light_of(
     target: Path,
     picture: brdf.Picture,
-    mask: np.ndarray | None,
+    mask: Array | None,
     points: "brdf.SurfacePoints",
     options: PictureOptions,
 ) -> Any:
@@ -279,7 +287,8 @@ def light_of(
     from fitting.photographs.distant_light import light_from_shading
 
     with named_as({"picture": target}):
-        how = {"saturation": options.saturation, "mask": mask, "ambient": options.ambient}
+        counts = True if mask is None else mask
+        how = {"saturation": options.saturation, "mask": counts, "ambient": options.ambient}
         return light_from_shading(picture, points, **how)
 
 
@@ -295,8 +304,8 @@ def stated_error(light: Any) -> str:
 def _of_intensity_1(
     pictures: list[brdf.Picture],
     points: "brdf.SurfacePoints",
-    directions: np.ndarray,
-    intensities: np.ndarray,
+    directions: Array,
+    intensities: Array,
     options: PictureOptions,
 ) -> tuple[list[brdf.Picture], list["brdf.Scene"]]:
     """Pictures as under light of intensity 1, so that every photograph counts alike however bright its light was.
@@ -316,7 +325,7 @@ def _of_intensity_1(
     return pictures, scenes
 
 
-def _read_normals(path: Path) -> np.ndarray:
+def _read_normals(path: Path) -> Array:
     """Normals (H, W, 3) from an .npy file, or from a picture: floats as they are, codes as 2 v - 1."""
     if path.suffix.lower() == ".npy":
         with input_file(path).open("rb") as file:
@@ -364,7 +373,7 @@ def _archive(path: Path, options: PictureOptions) -> FitInputs:
     return FitInputs(*inputs, [None] * count, path)
 
 
-def _as_picture(image: np.ndarray) -> brdf.Picture:
+def _as_picture(image: Array) -> brdf.Picture:
     """An array as the picture it would be in a file: linear, integers with their largest code."""
     is_code = image.dtype.kind == "u"
     pixels = (image / float(np.iinfo(image.dtype).max if is_code else 1)).astype(np.float32)

@@ -56,7 +56,7 @@ def lights(
             direction, error = light.direction, f"  # {stated_error(light)}"
         else:
             with named_as({"picture": path}):
-                direction, error = light_from_highlight(picture, circle, mask=counts), ""
+                direction, error = light_from_highlight(picture, circle, mask=True if counts is None else counts), ""
         lines.append(" ".join(f"{value:.6f}" for value in direction) + error)
     text = "\n".join(lines)
     if out is not None:

@@ -41,12 +41,9 @@ def about(
     """Which few numbers make this surface look like that picture."""
 
 
-app.command(epilog=fit.EXAMPLE)(as_command(fit.fit))
-app.command(epilog=lights.EXAMPLE)(as_command(lights.lights))
-app.command(epilog=render.EXAMPLE)(as_command(render.render))
-app.command(epilog=check.EXAMPLE)(as_command(check.check))
-app.command(epilog=convert.EXAMPLE)(as_command(convert.convert))
-app.command(epilog=tradeoff.EXAMPLE)(as_command(tradeoff.tradeoff))
+COMMANDS = (fit.fit, lights.lights, render.render, check.check, convert.convert, tradeoff.tradeoff)
+for function in COMMANDS:
+    app.command(epilog=sys.modules[function.__module__].EXAMPLE)(as_command(function))
 
 
 def main(arguments: list[str] | None = None) -> Any:

@@ -13,7 +13,9 @@ from jaxtyping import Bool, Float, Int
 
 import brdf
 from brdf.errors import InputError
-from fitting.photographs.ball import Circle, ball_points
+from fitting.photographs.ball import Circle, ball_normals
+
+Array = np.ndarray
 
 # What belongs to a highlight: its core is looked for above one share of the brightest pixel; it reaches down to half of
 # the brightest, within a share of the radius around it.
@@ -60,26 +62,17 @@ def photograph_scene(
     return brdf.Scene(points=points, lights=(light,), ambient=ambient)
 
 
-def _values(picture: Any) -> Float[np.ndarray, "H W C"]:
+def _values(picture: Any) -> Float[Array, "H W C"]:
     return np.atleast_3d(np.asarray(getattr(picture, "pixels", picture), np.float64))
 
 
-def _visible(points: brdf.SurfacePoints, mask: Any) -> Bool[np.ndarray, "H W"]:
-    if mask is None:
-        return np.asarray(points.mask)
-    if np.shape(mask) != np.shape(points.mask):
-        came = f"is of shape {np.shape(mask)}, the points {np.shape(points.mask)}"
-        raise InputError("mask", came, "Give one of its size")
-    return np.asarray(points.mask) & np.asarray(mask, bool)
-
-
-def light_from_highlight(picture: Any, circle: Circle, *, mask: Any = None) -> Float[np.ndarray, "3"]:
+def light_from_highlight(picture: Any, circle: Circle, *, mask: Any = True) -> Float[Array, "3"]:
     """Direction towards a distant light from its reflection in a mirror ball.
 
     Args:
         picture: linear values, (H, W, C) or (H, W), or a `brdf.Picture`, of the mirror ball.
         circle: its outline.
-        mask: (H, W), pixels that count.
+        mask: (H, W), pixels that count; or True.
 
     Returns:
         The unit direction, 2 (N.V) N - V at the middle of the highlight.
@@ -88,7 +81,7 @@ def light_from_highlight(picture: Any, circle: Circle, *, mask: Any = None) -> F
         InputError: where the ball is not in the picture or shows no highlight.
     """
     grey = _values(picture).mean(axis=-1)
-    inside = _visible(ball_points((grey.shape[0], grey.shape[1]), circle), mask) & np.isfinite(grey)
+    inside = np.any(ball_normals((grey.shape[0], grey.shape[1]), circle) != 0, axis=-1) & np.isfinite(grey) & mask
     largest = float(np.max(grey, where=inside, initial=-np.inf))
     if not largest > 0:
         raise InputError("picture", "is black on the mirror ball", "Give a picture with a highlight")
@@ -119,7 +112,7 @@ class ShadingLight(NamedTuple):
             the direction everywhere alike.
     """
 
-    direction: Float[np.ndarray, "3"]
+    direction: Float[Array, "3"]
     strength: float
     error: float
 
@@ -129,7 +122,7 @@ def light_from_shading(
     points: brdf.SurfacePoints,
     *,
     saturation: float | None = None,
-    mask: Any = None,
+    mask: Any = True,
     ambient: bool = False,
 ) -> ShadingLight:
     """Direction of a distant light from the shading: Lambert's law and a highlight where the light comes in.
@@ -138,7 +131,7 @@ def light_from_shading(
         picture: linear values, (H, W, C) or (H, W), or a `brdf.Picture`.
         points: what each pixel sees.
         saturation: linear value from which on pixels are clipped; None takes the largest code of an integer file.
-        mask: (H, W), pixels that count.
+        mask: (H, W), pixels that count; or True.
         ambient: whether the surface is lit from all around as well.
 
     Returns:
@@ -152,7 +145,7 @@ def light_from_shading(
     if saturation is None:
         saturation = getattr(picture, "saturation", None)
     values = _values(picture)
-    counts = _visible(points, mask) & np.isfinite(values.mean(axis=-1))
+    counts = np.asarray(points.mask) & np.isfinite(values.mean(axis=-1)) & mask
     if saturation is not None:
         counts &= np.max(values, axis=-1) < saturation
     normal = np.asarray(points.normal, np.float64)[counts]
@@ -160,9 +153,9 @@ def light_from_shading(
 
 
 def fit_shading(
-    value: Float[np.ndarray, " M"],
-    normal: Float[np.ndarray, "M 3"],
-    pixel: Int[np.ndarray, "M 2"],
+    value: Float[Array, " M"],
+    normal: Float[Array, "M 3"],
+    pixel: Int[Array, "M 2"],
     *,
     ambient: bool = False,
 ) -> ShadingLight:
@@ -191,7 +184,7 @@ def fit_shading(
         if np.allclose(before, matt, rtol=0, atol=10 * CLOSE):
             break
         lit = _reached(normal, matt[:3])
-    light, free = matt[:3], np.array([True, True, True, ambient, True, True])
+    light, free = matt[:3], free | [False, False, False, False, True, True]
     few = np.flatnonzero(lit)[:: max(1, -(-np.count_nonzero(lit) // SEARCH_PIXELS))]
     found = []
     for mirror, n in itertools.product((False, True), STARTS):
@@ -217,7 +210,7 @@ def _too_little() -> InputError:
     return InputError("picture", "shows too little of the lit surface to tell the light", "Give its direction")
 
 
-def _blocks(pixel: np.ndarray) -> np.ndarray:
+def _blocks(pixel: Array) -> Array:
     """Which of the blocks each pixel lies in."""
     if not len(pixel):
         return np.zeros(0, int)
@@ -226,12 +219,12 @@ def _blocks(pixel: np.ndarray) -> np.ndarray:
     return row * BLOCKS + column
 
 
-def _bound(residual: np.ndarray) -> float:
+def _bound(residual: Array) -> float:
     """Beyond which a residual's pull is constant."""
     return max(HUBER * float(np.median(np.abs(residual))), ROUNDING)
 
 
-def _reached(normal: np.ndarray, light: np.ndarray) -> np.ndarray:
+def _reached(normal: Array, light: Array) -> Array:
     """Pixels that the light reaches at an angle."""
     lit = normal @ light > LIT * np.linalg.norm(light)
     if np.count_nonzero(lit) < FEWEST:
@@ -239,7 +232,7 @@ def _reached(normal: np.ndarray, light: np.ndarray) -> np.ndarray:
     return lit
 
 
-def _shown(numbers: np.ndarray, mirror: bool, normal: np.ndarray) -> np.ndarray:
+def _shown(numbers: Array, mirror: bool, normal: Array) -> Array:
     """What pixels with these normals show, the light reaching them: ambient light, Lambert's law and a highlight.
 
     Args:
@@ -260,26 +253,26 @@ def _shown(numbers: np.ndarray, mirror: bool, normal: np.ndarray) -> np.ndarray:
 
 
 def _refine(
-    numbers: np.ndarray,
-    free: np.ndarray,
+    numbers: Array,
+    free: Array,
     mirror: bool,
     scale: float,
-    value: np.ndarray,
-    normal: np.ndarray,
-    lit: np.ndarray,
-) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
+    value: Array,
+    normal: Array,
+    lit: Array,
+) -> tuple[Array, float, Array, Array]:
     """The nearest minimum of Huber's cost, by Newton steps that are damped as Levenberg and Marquardt's.
 
     Returns:
         The numbers and the cost, and of every pixel the residual and the derivatives.
     """
 
-    def at(numbers: np.ndarray) -> tuple[float, np.ndarray]:
+    def at(numbers: Array) -> tuple[float, Array]:
         residual = value - _shown(numbers, mirror, normal)
         off = np.abs(residual[lit]) / scale
         return float(np.sum(np.where(off <= 1, off**2, 2 * off - 1))), residual
 
-    def slopes(numbers: np.ndarray) -> np.ndarray:
+    def slopes(numbers: Array) -> Array:
         steps = 1e-5 * np.maximum(np.abs(numbers), 1e-3) * np.eye(6)
         ends = [_shown(numbers + step, mirror, normal) - _shown(numbers - step, mirror, normal) for step in steps]
         return np.stack(ends, axis=1) * free / (2 * np.diag(steps))
@@ -304,7 +297,7 @@ def _refine(
     return numbers, cost, residual, columns
 
 
-def _error(light: np.ndarray, residual: np.ndarray, slopes: np.ndarray, scale: float, block: np.ndarray) -> float:
+def _error(light: Array, residual: Array, slopes: Array, scale: float, block: Array) -> float:
     """Root mean square angle to the true direction in degrees, where residuals of one block go together as they like.
 
     The jackknife over blocks: how far leaving one out moves the light, by one Newton step. A pixel pulls with its
