@@ -9,7 +9,7 @@ import itertools
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 import brdf
 from brdf.errors import InputError
