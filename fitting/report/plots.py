@@ -52,7 +52,8 @@ def comparison(result: "FitResult", picture: int | None = None) -> Figure:
         InputError: where there is no such picture.
     """
     count, why = len(result.targets), " (explained worst)" if picture is None else ""
-    picture = _explained_worst(result) if picture is None else picture
+    if picture is None:
+        picture = 0 if count == 1 else max(range(count), key=lambda index: _unexplained(result, index))
     if not 0 <= picture < count:
         raise InputError("picture", f"must be from 0 to {count - 1}, got {picture}", "Count the pictures from 0")
     name = result.names[picture] if result.names else ""
@@ -88,16 +89,11 @@ def comparison(result: "FitResult", picture: int | None = None) -> Figure:
     return figure
 
 
-def _explained_worst(result: "FitResult") -> int:
-    """Which picture has the largest residual, as a share of itself."""
-    shares = [0.0]
-    if len(result.targets) > 1:
-        shares = []
-        for index, (target, counted) in enumerate(zip(result.targets, result.counted, strict=True)):
-            values = np.asarray(target, np.float64)[np.asarray(counted)]
-            left = np.sum((result.fitted(index)[np.asarray(counted)] - values) ** 2)
-            shares.append(left / max(np.sum(values**2), np.finfo(float).tiny))
-    return int(np.argmax(shares))
+def _unexplained(result: "FitResult", picture: int) -> float:
+    """Squares of the residual of a picture, over its own."""
+    counted = np.asarray(result.counted[picture])
+    values = np.asarray(result.targets[picture], np.float64)[counted]
+    return float(np.sum((result.fitted(picture)[counted] - values) ** 2) / max(np.sum(values**2), 1e-300))
 
 
 def _around(counted: Bool[np.ndarray, "H W"]) -> dict[str, Any]:
