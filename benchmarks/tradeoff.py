@@ -14,9 +14,9 @@ import numpy as np
 import brdf
 import fitting
 from fitting.budget.configurations import Configuration, run
-from fitting.budget.deviation import deviation
-from fitting.budget.lamps import Lamps, extended
-from fitting.budget.reference import reference
+from fitting.budget.subsample import with_samples
+from fitting.problem import state_problem
+from fitting.speed_accuracy import parameter_deviation, reference
 
 ACCURACIES = (1e-1, 1e-2, 1e-3, 1e-4)
 OPTIONS = {"n_range": (0.1, 1e6), "mask": None, "saturation": None}
@@ -92,12 +92,17 @@ def scenes():
     yield "sky", scene(brdf.EnvironmentMap(sky(3)), look=small), material(20.0), "blinn-phong", 0.01
 
 
+def samples_of(place):
+    """Whether a light's number of samples can be chosen."""
+    return any(hasattr(light, "samples") for light in place.lights)
+
+
 def configurations(place, model):
     """The grid of plain configurations that the price is compared with."""
     pixels = (1024, 4096, 16384, None) if place.resolution[0] > SMALL else (None,)
-    samples = (16, 64, 256, 1024) if extended(place) else (None,)
+    samples = (16, 64, 256, 1024) if samples_of(place) else (None,)
     found = [Configuration(model, "float32", p, s) for p in pixels for s in samples]
-    return found if extended(place) else [*found, Configuration(model, "float64")]
+    return found if samples_of(place) else [*found, Configuration(model, "float64")]
 
 
 def measure(jobs):
@@ -115,24 +120,35 @@ def measure(jobs):
 
 def photograph(name, place, true, noise):
     """What a scene shows under 4096 light samples, with noise, a share of the mean."""
-    picture = np.asarray(brdf.render(true, Lamps().with_samples(place, 4096), precision="float64"))
+    picture = np.asarray(brdf.render(true, with_samples(place, 4096), precision="float64"))
     random = np.random.default_rng(zlib.crc32(name.encode()))
     picture = picture + noise * picture.mean() * random.standard_normal(picture.shape)
     return picture.astype(np.float32)
 
 
+def deviation(result, best):
+    """The larger one of the errors of the parameters and of the picture (RMS), relative to those of a reference."""
+    square, total = 0.0, np.finfo(float).tiny
+    for place in best.scenes:
+        true = np.asarray(brdf.render(best.material, place, precision="float64"))
+        change = np.asarray(brdf.render(result.material, place, precision="float64")) - true
+        square, total = square + np.sum(change**2), total + np.sum(true**2)
+    return max(parameter_deviation(result.material, best), float(np.sqrt(square / total)))
+
+
 def study(name, place, picture, model, options=OPTIONS, *, timed=True):
     """All accuracies on one scene."""
-    lamps, given = Lamps(), {key: value for key, value in options.items() if value is not None}
-    best = reference([picture], [place], model, options, lamps, start_samples=64 if extended(place) else None)
+    lights, given = {}, {key: value for key, value in options.items() if value is not None}
+    problem = state_problem(picture, place, model=model, **given)
+    best = reference(problem, lights)
     jobs, errors, rows = {}, {}, []
     for how in configurations(place, model) if timed else ():
-        jobs[how] = lambda how=how: run([picture], [place], how, options, lamps)
-        errors[how] = max(deviation(jobs[how]().result, best)[:2])
+        jobs[how] = lambda how=how: run(problem, how, lights)
+        errors[how] = deviation(jobs[how]().result, best)
     for accuracy in ACCURACIES:
         jobs[accuracy] = lambda e=accuracy: fitting.fit(picture, place, model=model, accuracy=e, **given)
         result = jobs[accuracy]()
-        rows.append([accuracy, max(deviation(result, best)[:2]), result.choice])
+        rows.append([accuracy, deviation(result, best), result.choice])
     times = measure(jobs) if timed else {}
     found = []
     for accuracy, actual, choice in rows:

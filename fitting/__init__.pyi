@@ -30,5 +30,5 @@ from .report.material_plots import (
     plot_stability as plot_stability,
 )
 from .result import Parameter as Parameter
+from .speed_accuracy import Tradeoff as Tradeoff
 from .speed_accuracy import tradeoff as tradeoff
-from .speed_table import Tradeoff as Tradeoff

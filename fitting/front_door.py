@@ -6,7 +6,7 @@ from typing import Any
 import brdf
 from brdf.errors import InputError
 from brdf.precision import Precision
-from fitting.budget.budget import fit_within
+from fitting.budget.escalation import fit_within
 from fitting.core import fit_pictures
 from fitting.problem import state_problem
 from fitting.report import FitResult
@@ -52,8 +52,8 @@ def fit(
         plausible: hold k_d + k_s <= 1 inside the fit, with a normalised form or Lambert, so that `brdf.check` passes;
             see `fitting.plausible`.
         accuracy: relative error that is good enough: the cheapest number of pixels and light samples and the cheapest
-            precision that keep it are chosen, see `fitting.budget.budget`; the result's ``choice`` says which and why.
-            None looks at all pixels under the lights as they are.
+            precision that keep it are chosen, see `fitting.budget.escalation`; the result's ``choice`` says which and
+            why. None looks at all pixels under the lights as they are.
         seconds: the same for the time to spend; what it buys is the most accurate fit.
 
     Returns:
@@ -83,14 +83,4 @@ def fit(
     if problem.streamed:
         words = "is read by bands of rows; accuracy and seconds choose among pixels in memory"
         raise InputError("target", words, "Read it with brdf.read_image, or leave accuracy and seconds out")
-    how = {
-        "mask": problem.masks,
-        "saturation": saturation,
-        "n_range": n_range,
-        "dark": dark,
-        "weight": problem.weights,
-    }
-    beside = {"loss": loss != "squared", "noise": noise is not None, "plausible": plausible}
-    return fit_within(
-        problem.targets, problem.scenes, model, precision, how, beside, accuracy=accuracy, seconds=seconds
-    )
+    return fit_within(problem, accuracy, seconds)

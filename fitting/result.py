@@ -12,7 +12,7 @@ from jaxtyping import Float
 import brdf
 from brdf.materials.material_file import material_to_dict
 from brdf.precision import Precision
-from fitting.budget.budget_choice import BudgetChoice
+from fitting.budget.choice import BudgetChoice
 from fitting.selection import Candidate
 from fitting.solver.profile import Optimum
 

@@ -1,27 +1,254 @@
 """Speed against accuracy, measured on the user's own scene.
 
-What is tried is in `fitting.budget.trials`. Each configuration runs once with cold caches, once warm, and then in
-rounds, every round in another order (fixed seed), so that a machine that grows slower or quicker favours none. The
-compiler's time is taken out of every run. What takes long, or compiles anew each time, runs once.
+Only what the scene has is varied: pixels where there are enough of them, light samples where a light has an extent. A
+check has nothing to choose: its albedo is closed, and of a BRDF without a closed one the adaptive rule tells its own
+error.
+
+Fewer pixels are a stratified subsample, not a level of the picture's pyramid: averaged pixels blur a highlight, which
+the fit takes for a smaller exponent. Of 36 fits (four exponents, three noises, three sizes) the subsample was closer
+in 97 %, by a factor of 37 in the median.
+
+Each configuration runs once with cold caches, once warm, and then in rounds, every round in another order (fixed seed),
+so that a machine that grows slower or quicker favours none. The compiler's time is taken out of every run. What takes
+long, or compiles anew each time, runs once.
 """
 
+import contextlib
+import csv
+import ctypes
+import dataclasses
+import functools
+import io
+import json
 import time
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
+import jax.monitoring
 import numpy as np
 
 import brdf
-from brdf.errors import InputError
-from fitting.budget.stopwatch import Taken, take
-from fitting.budget.trials import Bench, Trial
-from fitting.speed_table import Tradeoff
+from brdf.files import atomic_folder, write_text
+from brdf.models.base import SpecularMaterial
+from brdf.precision import Precision
+from fitting.budget.configurations import MOST_SAMPLES, Configuration, run, some_of
+from fitting.budget.error_estimate import SMALLEST
+from fitting.budget.escalation import WHOLE, check_above_zero, near
+from fitting.budget.subsample import MadeLights, sample_pixels, with_samples
+from fitting.problem import FitProblem, state_problem
+from fitting.result import FitResult
+from fitting.uncertainty.covariance import TERMS
 
+PIXELS, SAMPLES = (1024, 4096, 16384, 65536, 262144), (4, 16, 64, 256, 1024)
+# Of the reference under lights with an extent, of pictures that are compared there, of solvers that keep a Jacobian.
+FEW_PIXELS = 1024
+# Light samples of the fit of all pixels that the reference starts from.
+START_SAMPLES = 64
+# Where the general solvers start, which they are, and the relative changes at which they stop.
+START = 30.0
+SOLVERS = ("lm", 1e-8), ("lm", 1e-4), ("bfgs", 1e-8)
 MOST_ROUNDS = 9
 # What takes longer than this is run once: beside it cold caches count for nothing.
 LONG = 1.0
 # Axes that are told for comparison: their fits leave something out of the picture.
-BESIDE = ("model", "shadows", "render")
+BESIDE = ("model", "render")
+# Among fits whose times are within this factor the least work is recommended, which is the same on every machine.
+CLEARLY = 2.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One configuration, measured.
+
+    Attributes:
+        axis: what it was tried for: "default", "pixels", "samples", ...
+        configuration: in which the fit ran; None for a row of the renderer.
+        name: the configuration in words.
+        compile_seconds: of tracing and compiling in the first run.
+        seconds: median of the runs after the first, or the only one, without the compiler.
+        spread: half the distance of their quartiles.
+        runs: how many they were.
+        peak: bytes of resident memory that a run took beyond what was resident before it; None where unknown.
+        rms: error of the picture, root mean square over that of the reference's picture.
+        worst: its largest error, in the same unit.
+        parameters: error of the parameters, see `parameter_deviation`.
+        work: pixels times light samples, twice for float64: what the time grows with.
+    """
+
+    axis: str
+    configuration: Configuration | None
+    name: str
+    compile_seconds: float
+    seconds: float
+    spread: float
+    runs: int
+    peak: int | None
+    rms: float
+    worst: float
+    parameters: float
+    work: float
+
+    @property
+    def error(self) -> float:
+        """The larger of the errors of picture (RMS) and parameters."""
+        return max(self.rms, self.parameters)
+
+
+@dataclasses.dataclass(frozen=True)
+class Tradeoff:
+    """What was measured on a scene.
+
+    Attributes:
+        rows: in the order of the axes.
+        reference: what the errors are measured against, in words.
+        accuracy: the error that the recommendation keeps.
+        planned: how many rows there would be, had time and patience been enough for all.
+        seconds: that the measuring took.
+    """
+
+    rows: tuple[Row, ...]
+    reference: str
+    accuracy: float
+    planned: int
+    seconds: float
+
+    @property
+    def complete(self) -> bool:
+        """Whether everything was measured; False where it was interrupted, or took too long."""
+        return len(self.rows) == self.planned
+
+    @property
+    def default(self) -> Row | None:
+        """What a plain `fitting.fit` does."""
+        return next((row for row in self.rows if row.axis == "default"), None)
+
+    @property
+    def front(self) -> tuple[Row, ...]:
+        """The fits than which none is both quicker and closer, quickest first."""
+        found: list[Row] = []
+        for row in sorted(self._fits(), key=lambda row: (row.seconds, row.error)):
+            if not found or row.error < found[-1].error:
+                found.append(row)
+        return tuple(found)
+
+    @property
+    def recommended(self) -> Row | None:
+        """Of the fits on the front that keep the accuracy, the quickest, or one as quick that is less work.
+
+        None where nothing that was measured keeps it.
+        """
+        good = [row for row in self.front if row.error <= self.accuracy]
+        return min((row for row in good if row.seconds <= CLEARLY * good[0].seconds), key=_by_work, default=None)
+
+    @property
+    def closest(self) -> Row | None:
+        """The least error; None where nothing was measured."""
+        return self.front[-1] if self.front else None
+
+    @property
+    def advice(self) -> str:
+        """What to use, in words; where nothing keeps the accuracy that is said, and what comes closest."""
+        best, closest = self.recommended, self.closest
+        if best is not None:
+            words = f"recommended: {best.name} ({1e3 * best.seconds:.3g} ms, error {best.error:.1g})"
+        elif closest is not None:
+            words = (
+                f"nothing is recommended: no configuration that was measured keeps the accuracy of {self.accuracy:g}; "
+                f"the most accurate is {closest.name} ({1e3 * closest.seconds:.3g} ms, error {closest.error:.1g})"
+            )
+        else:
+            words = "nothing is recommended: no fit was measured"
+        if self.complete:
+            return words
+        measured = f"{len(self.rows)} of {self.planned} configurations were measured"
+        return f"{words}\n{measured}; more time measures the others"
+
+    def _fits(self) -> list[Row]:
+        return [row for row in self.rows if row.configuration is not None and np.isfinite(row.error)]
+
+    def marks(self, row: Row) -> str:
+        """What is to be said of a row.
+
+        Args:
+            row: of the table.
+        """
+        best = self.recommended
+        marked = {"default": self.default, "recommended": best, "most accurate": None if best else self.closest}
+        words = [word for word, one in marked.items() if one is row]
+        return ", ".join([*words, *(["front"] if row in self.front else [])])
+
+    def table(self) -> Any:
+        """A table for `rich.print`."""
+        from rich.table import Table
+
+        table = Table(caption=f"errors against {self.reference}", title="speed against accuracy")
+        table.add_column("axis")
+        table.add_column("configuration", overflow="fold")
+        for name in ("compile s", "run ms", "± ms", "memory MB", "rms", "worst", "parameters"):
+            table.add_column(name, justify="right")
+        table.add_column("")
+        for row in self.rows:
+            times = f"{row.compile_seconds:.2f}", f"{1e3 * row.seconds:.1f}"
+            spread = f"{1e3 * row.spread:.1f}" if row.runs > 1 else ""
+            memory = "" if row.peak is None else f"{row.peak / 1e6:.0f}"
+            errors = (f"{error:.1e}" for error in (row.rms, row.worst, row.parameters))
+            style = "bold green" if row is self.recommended else "bold" if row is self.default else None
+            table.add_row(row.axis, row.name, *times, spread, memory, *errors, self.marks(row), style=style)
+        return table
+
+    def __str__(self) -> str:
+        """The table as text."""
+        from rich.console import Console
+
+        stream = io.StringIO()
+        Console(file=stream, width=150, color_system=None, force_jupyter=False).print(self.table())
+        return stream.getvalue().rstrip()
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON holds it; what is infinite is None."""
+        rows = []
+        for row in self.rows:
+            values = vars(row) | {"error": row.error, "marks": self.marks(row)}
+            values["configuration"] = row.configuration and vars(row.configuration)
+            rows.append({name: None if value == np.inf else value for name, value in values.items()})
+        names = ("reference", "accuracy", "complete", "planned", "seconds", "advice")
+        return {name: getattr(self, name) for name in names} | {"rows": rows}
+
+    def to_csv(self) -> str:
+        """One line for each row, a header above."""
+        names = [field.name for field in dataclasses.fields(Row) if field.name != "configuration"]
+        stream = io.StringIO()
+        writer = csv.DictWriter(stream, [*names, "marks"], extrasaction="ignore", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(vars(row) | {"marks": self.marks(row)} for row in self.rows)
+        return stream.getvalue()
+
+    def plot(self) -> Any:
+        """Error against time, a matplotlib figure."""
+        from fitting.report.tradeoff_plot import error_against_time
+
+        return error_against_time(self)
+
+    def save(self, folder: str | Path) -> None:
+        """Write tradeoff.csv, tradeoff.json, tradeoff.png and tradeoff.pdf: all of them or none.
+
+        Args:
+            folder: made where missing.
+
+        Raises:
+            InputError: where the folder cannot be written.
+        """
+        with atomic_folder(folder) as stage:
+            write_text(stage / "tradeoff.csv", self.to_csv())
+            write_text(stage / "tradeoff.json", json.dumps(self.to_dict(), indent=2) + "\n")
+            figure = self.plot()
+            figure.savefig(stage / "tradeoff.png", dpi=200)
+            figure.savefig(stage / "tradeoff.pdf")
+
+
+def _by_work(row: Row) -> tuple[float, float]:
+    return row.work, row.error
 
 
 def tradeoff(
@@ -42,7 +269,7 @@ def tradeoff(
         target: linear values, (H, W, C) or (H, W), or a `brdf.Picture`.
         scene: what the picture shows.
         model: the name of a model, or "auto".
-        mask: (H, W), pixels to look at.
+        mask: (H, W), pixels that count.
         saturation: see `fitting.fit`.
         accuracy: relative error that the recommendation is to keep.
         seconds: that the measuring may take: no new run begins after them. A running one is waited for.
@@ -56,55 +283,256 @@ def tradeoff(
         InputError: where target, scene or a number cannot be used.
     """
     begun = time.perf_counter()
-    for name, value in (("accuracy", accuracy), ("seconds", seconds)):
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < np.inf:
-            raise InputError(name, f"must be a number above 0, got {value!r}", "Give for example 0.001")
-    if model != "auto" and model not in brdf.MODELS:
-        raise InputError("model", f"is unknown, got {model!r}", f"Use auto or one of {', '.join(brdf.MODELS)}")
-    # The front door says what is wrong with the picture, before anything is measured.
-    options = {"mask": mask, "saturation": saturation, "n_range": (0.1, 1e6)}
-    bench = Bench(target, scene, model, options)
-    trials = bench.trials()
-    if render:
-        trials += bench.render_trials()
-    taken: dict[int, list[Taken]] = {}
-    found: dict[int, Any] = {}
+    check_above_zero(accuracy=accuracy, seconds=seconds)
+    bench = Bench(state_problem(target, scene, mask, model=model, saturation=saturation))
+    trials = bench.trials(render=render)
+    works = [bench.work(*trial) for trial in trials]
+    taken: list[list[Taken]] = [[] for _ in trials]
+    outcomes: dict[int, Any] = {}
     # Everything once, so that the errors, which decide what is recommended, are known however slow the compiler is:
     # first what can be recommended, from little to much work, so that what would take too long is known before, and
-    # last what compiles anew each time. Then again, warm, and then in rounds, every one shuffled.
-    by_work = sorted(range(len(trials)), key=lambda index: _turn(trials[index]))
-    first = [*by_work, *by_work]
-    again = [index for index, trial in enumerate(trials) if not trial.once]
+    # last what compiles anew each time. Then, warm, in rounds, every one shuffled.
+    axes = [axis for axis, _ in trials]
+    by_work = sorted(range(len(trials)), key=lambda i: (axes[i] == "solver", axes[i] in ("model", "render"), works[i]))
     random = np.random.default_rng(0)
-    order = [*first, *(index for _ in range(MOST_ROUNDS) for index in random.permutation(again))]
+    order = np.concatenate([by_work, *(random.permutation(by_work) for _ in range(MOST_ROUNDS + 1))])
     try:
         for done, index in enumerate(map(int, order)):
-            trial, before = trials[index], taken.get(index, [])
+            before, once = taken[index], axes[index] == "solver"
             left = seconds - (time.perf_counter() - begun)
-            if before and (trial.once or before[-1].seconds > min(LONG, left)):
+            if before and (once or before[-1].seconds > min(LONG, left)):
                 continue
-            if left < 0 or _expected(trial, trials, taken) > left:
+            most = max(outcomes, key=works.__getitem__, default=None)
+            # What a fit may take is told by the one of the most work so far.
+            known = most is not None and not once and axes[index] != "render"
+            if left < (taken[most][-1].seconds * works[index] / works[most] if known else 0.0):
                 continue
-            # The first run holds the compiler's memory too; the later ones are only timed.
-            outcome, one = take(trial.run, trimmed=len(before) < 2)
-            taken.setdefault(index, []).append(one)
-            found.setdefault(index, outcome)
+            outcome, one = take(functools.partial(bench.run, *trials[index]))
+            before.append(one)
+            outcomes.setdefault(index, outcome)
             if progress is not None:
                 progress(done + 1, len(order))
     except KeyboardInterrupt:
         pass
-    rows = [bench.row(trial, taken[i], found[i]) for i, trial in enumerate(trials) if i in taken]
-    return Tradeoff(tuple(rows), bench.told, accuracy, len(trials), time.perf_counter() - begun)
+    rows = [bench.row(*trials[index], taken[index], outcomes[index]) for index in sorted(outcomes)]
+    return Tradeoff(tuple(rows), bench.reference, accuracy, len(trials), time.perf_counter() - begun)
 
 
-def _turn(trial: Trial) -> tuple[bool, bool, float]:
-    """What comes first: what can be recommended, then what is only to be compared with it."""
-    return trial.once, trial.axis in BESIDE, trial.work
+class Taken(NamedTuple):
+    """Seconds that a run took without the compiler, those of the compiler, and bytes of memory beyond those before."""
+
+    seconds: float
+    compiling: float
+    peak: int | None
 
 
-def _expected(trial: Trial, trials: Sequence[Trial], taken: Mapping[int, Sequence[Taken]]) -> float:
-    """Seconds that a fit may take, by the one of the most work so far; 0 where nothing is known."""
-    if trial.configuration is None or trial.once or not taken:
-        return 0.0
-    most = max(taken, key=lambda index: trials[index].work)
-    return taken[most][-1].seconds * trial.work / trials[most].work
+def reference(problem: FitProblem, lights: MadeLights, pixels: int | None = None) -> FitResult:
+    """Fit as well as can be: in float64, all pixels, as many light samples as can be paid for.
+
+    Under lights with an extent all pixels are fitted with a few samples, and what `MOST_SAMPLES` change is taken from
+    some of the pixels. Both fits of these see the same noise, which is not in their difference.
+
+    Args:
+        problem: one picture.
+        lights: made so far.
+        pixels: how many under many light samples; None for all.
+    """
+    if not any(hasattr(light, "samples") for light in problem.scenes[0].lights):
+        return run(problem, Configuration(problem.model, "float64"), lights).result
+    few = Configuration(problem.model, "float32", None, START_SAMPLES)
+    whole = run(problem, few, lights).result
+    about, kind = near(whole, 0.0, problem.n_range), type(whole.material)
+    few = dataclasses.replace(few, model=kind.name, pixels=pixels)
+    fine = run(problem, dataclasses.replace(few, samples=MOST_SAMPLES), lights, about).result
+    if pixels is None:
+        return fine
+    coarse = run(problem, few, lights, about).result
+    values: dict[str, Any] = {}
+    for name in ("k_a", "k_d", "k_s", "n"):
+        if hasattr(whole.material, name):
+            value, before, after = (np.asarray(getattr(one.material, name)) for one in (whole, coarse, fine))
+            changed = value * after / np.where(before > 0, before, 1.0) if name == "n" else value + after - before
+            # What is not determined is 0 in the material.
+            values[name] = np.where((value > 0) & (before > 0), np.maximum(changed, 0.0), value)
+    return dataclasses.replace(whole, material=kind(**values))
+
+
+def parameter_deviation(material: brdf.Material, best: FitResult) -> float:
+    """How far the parameters of a fit are from a reference: what an estimated error is an estimate of.
+
+    Of a coefficient: its difference over the largest channel of its kind in the reference (or over `SMALLEST` of its
+    largest coefficient, if that is more); of n: the difference of its logarithms; infinite where the models differ in
+    their highlight. What the reference does not determine is left out.
+    """
+    names = [name for name in TERMS if hasattr(best.material, name)]
+    largest = {name: float(np.max(getattr(best.material, name))) for name in names}
+    least = max(SMALLEST * max(largest.values()), np.finfo(float).tiny)
+    worst = 0.0
+    for parameter in best.parameters:
+        name = parameter.name
+        if parameter.value is None or (name == "n" and not largest["k_s"]):
+            continue
+        value, true = np.asarray(getattr(material, name, 0.0)), np.asarray(getattr(best.material, name))
+        if name == "n":
+            comparable = type(material) is type(best.material) and value > 0
+            worst = max(worst, abs(float(np.log(value / true))) if comparable else np.inf)
+        else:
+            off = np.abs(value - true)[parameter.channel]
+            worst = max(worst, float(off) / max(largest[name], least))
+    return worst
+
+
+class Bench:
+    """The configurations that a scene offers, and the measure of their errors."""
+
+    def __init__(self, problem: FitProblem):
+        """Fit the reference."""
+        self.problem, self.scene = problem, problem.scenes[0]
+        self.lights: MadeLights = {}
+        scene, self.pixels = self.scene, int(np.prod(self.scene.resolution))
+        self.samples = [light.samples for light in scene.lights if hasattr(light, "samples")]
+        self.reference, pixels = "float64, all pixels", None
+        # Where pictures are compared: the whole one, or some pixels under many light samples; and their weights.
+        self.compared, self.weight = with_samples(scene, MOST_SAMPLES, self.lights), np.ones((1, 1, 1))
+        if self.samples:
+            self.reference = f"{MOST_SAMPLES} light samples, all pixels"
+            if self.pixels > 2 * FEW_PIXELS:
+                pixels = FEW_PIXELS
+                self.reference += f" (what so many samples change, told by about {2 * pixels} of the pixels)"
+            sample = sample_pixels(self.compared, brdf.BlinnPhong, FEW_PIXELS)
+            if sample is not None:
+                self.compared = brdf.some_pixels(self.compared, sample.pixel, precision="float64")
+                self.weight = sample.stands_for[None, :, None]
+        self.best = reference(problem, self.lights, pixels)
+        self.model = self.best.material.name if problem.model == "auto" else problem.model
+
+    def trials(self, *, render: bool = False) -> list[tuple[str, Configuration]]:
+        """What there is to try, and what for, the most telling first."""
+        default, samples = Configuration(self.model), max(self.samples, default=1)
+        change = functools.partial(dataclasses.replace, default)
+        sizes = [size for size in PIXELS if size <= WHOLE * self.pixels]
+        few = (sizes or [None])[:2][-1]
+        found = [("default", default), *(("pixels", change(pixels=size)) for size in sizes)]
+        # Many samples are tried on few pixels: what they change does not hang on how many.
+        steps = [count for count in SAMPLES if self.samples and count <= 4 * samples and count != samples]
+        found += [("samples", change(pixels=few, samples=count)) for count in steps]
+        found += [("samples", change(samples=16))] if samples > 16 else []
+        found += [("precision", change(precision="float64", pixels=count)) for count in (few, None)]
+        others = [name for name in ("lambert", "phong", "blinn-phong") if name != self.model]
+        found += [("model", change(model=name, pixels=few)) for name in others]
+        if isinstance(self.best.material, SpecularMaterial):
+            solvers = [change(precision="float64", pixels=FEW_PIXELS, solver=s, tolerance=t) for s, t in SOLVERS]
+            found += [("solver", how) for how in solvers]
+        if render:
+            precisions: tuple[Precision, ...] = ("float32", "float64")
+            counts = [None, *(count for count in steps if count < min(samples, 1024))]
+            found += [("render", change(precision=p, samples=count)) for p in precisions for count in counts]
+        return list(dict.fromkeys(found))
+
+    def work(self, axis: str, how: Configuration) -> float:
+        """What the time grows with, and what every fit takes whatever its size."""
+        return (4096 + how.work(self.pixels, [self.scene])) * (100 if axis == "solver" else 1)
+
+    def run(self, axis: str, how: Configuration) -> Any:
+        """What a trial gives: a material, or a picture."""
+        if axis == "solver":
+            return self.solve(how)
+        if axis == "render":
+            scene = with_samples(self.scene, how.samples, self.lights)
+            return np.asarray(brdf.render(self.best.material, scene, precision=how.precision))
+        return run(self.problem, how, self.lights).result.material
+
+    def solve(self, how: Configuration) -> brdf.Material:
+        """Levenberg-Marquardt or BFGS on a few pixels, from a guess."""
+        from fitting.joint import fit_jointly
+
+        # Evenly spread: these solvers know no weights.
+        sample = sample_pixels(self.scene, brdf.Lambert, FEW_PIXELS)
+        # They leave out what the reference left out, such as pixels whose noise is cut off.
+        target, scene, mask = self.problem.targets[0].pixels, self.scene, self.best.counted[0]
+        if sample is not None:
+            target, mask = some_of(target, sample), some_of(mask, sample)
+            scene = brdf.some_pixels(scene, sample.pixel, precision="float64")
+        half = np.full(self.best.material.k_d.shape, 0.5)
+        start = brdf.MODELS[self.model](k_a=half, k_d=half, k_s=half, n=START)  # pyright: ignore[reportCallIssue]
+        names = ("k_d", "k_s", "n") if scene.ambient is None else ("k_a", "k_d", "k_s", "n")
+        return fit_jointly(
+            target,
+            scene,
+            start,
+            lambda material, scenes: [getattr(material, name) for name in names],
+            solver=how.solver,  # pyright: ignore[reportArgumentType]
+            tolerance=how.tolerance or 1e-8,
+            mask=mask,
+            saturation=self.problem.saturation,
+        ).material
+
+    def row(self, axis: str, how: Configuration, taken: Sequence[Taken], outcome: Any) -> Row:
+        """What was measured: of several runs the first is left out, for caches were cold."""
+        parameters, name, scene, weight = 0.0, str(how), self.compared, self.weight
+        if axis == "render":
+            name = ", ".join(["render", how.precision, *([f"{how.samples} light samples"] if how.samples else [])])
+            # Rendered whole, under at most the scene's own samples.
+            scene, weight = self.scene, np.ones((1, 1, 1))
+        picture = functools.partial(brdf.render, scene=scene, precision="float64")
+        if axis != "render":
+            parameters, outcome = parameter_deviation(outcome, self.best), np.asarray(picture(outcome))
+        true = np.asarray(picture(self.best.material))
+        change, scale = outcome - true, float(np.sqrt(np.mean(weight * true**2)))
+        later = [one.seconds for one in taken[1:] or taken]
+        low, median, high = np.quantile(later, [0.25, 0.5, 0.75])
+        return Row(
+            axis=axis,
+            configuration=None if axis == "render" else how,
+            name=name,
+            compile_seconds=taken[0].compiling,
+            seconds=float(median),
+            spread=float(high - low) / 2,
+            runs=len(later),
+            peak=taken[min(1, len(taken) - 1)].peak,
+            rms=float(np.sqrt(np.mean(weight * change**2))) / scale,
+            worst=float(np.max(np.abs(change))) / scale,
+            parameters=parameters,
+            work=self.work(axis, how),
+        )
+
+
+def take(run: Callable[[], Any]) -> tuple[Any, Taken]:
+    """Run something: what it returned, and what it took."""
+    spans: list[tuple[float, float]] = []
+
+    def listen(event: str, duration_secs: float, **_: Any) -> None:
+        if event.startswith("/jax/core/compile/"):
+            now = time.perf_counter()
+            spans.append((now - duration_secs, now))
+
+    # Memory that was freed before is given back, so that what the run uses again counts.
+    with contextlib.suppress(AttributeError, OSError):
+        ctypes.CDLL(None).malloc_trim(0)
+    before = _resident("VmRSS", reset=True)
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        start = time.perf_counter()
+        outcome = run()
+        seconds = time.perf_counter() - start
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    compiling, end = 0.0, start
+    # Spans of tracing, lowering and compiling lie within each other.
+    for first, last in sorted(spans):
+        compiling += max(0.0, last - max(first, end))
+        end = max(end, last)
+    after = _resident("VmHWM")
+    peak = None if before is None or after is None else max(after - before, 0)
+    return outcome, Taken(max(seconds - compiling, 0.0), compiling, peak)
+
+
+def _resident(name: str, *, reset: bool = False) -> int | None:
+    """Bytes now resident, or at most since the kernel's mark was set back; None where there is no such mark."""
+    try:
+        if reset:
+            Path("/proc/self/clear_refs").write_text("5")
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return next(1024 * int(line.split()[1]) for line in lines if line.startswith(f"{name}:"))
+    except (OSError, StopIteration):
+        return None

@@ -115,11 +115,11 @@ def _fit_pictures(
 
     given = read_inputs(target, pictures)
     use_compilation_cache()
-    from fitting.budget.first_pixels import single_fit
+    from fitting.budget.escalation import OnlyFit
     from fitting.cli.encoding_trial import fit_either
 
     how["noise"] = None if noise is None else tuple(parse_numbers(noise, "--noise", 2, "READ,SHOT"))
-    with single_fit():
-        result, notes = fit_either(given, how)
+    how["accuracy"] = None if how["accuracy"] is None else OnlyFit(how["accuracy"])
+    result, notes = fit_either(given, how)
     names = tuple(path.name for path in given.pictures)
     return (dataclasses.replace(result, names=names) if len(names) == len(result.targets) else result), notes

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 if TYPE_CHECKING:
-    from fitting.speed_table import Row, Tradeoff
+    from fitting.speed_accuracy import Row, Tradeoff
 
 # Colours that colour-blind readers tell apart (Okabe and Ito 2008), and marks that print in black and white.
 MARKS = {
@@ -14,7 +14,6 @@ MARKS = {
     "pixels": ("#0072B2", "s"),
     "samples": ("#D55E00", "^"),
     "precision": ("#009E73", "D"),
-    "shadows": ("#CC79A7", "v"),
     "model": ("#E69F00", "P"),
     "solver": ("#56B4E9", "X"),
 }
@@ -96,6 +95,5 @@ def _name(row: "Row", tradeoff: "Tradeoff") -> str:
         how.precision: how.precision != "float32" and how.solver == "separable",
         how.model: usual is not None and how.model != usual.model,
         how.solver.upper(): how.solver != "separable",
-        "no shadows": not how.shadows,
     }
     return ", ".join(part for part, unusual in parts.items() if unusual)

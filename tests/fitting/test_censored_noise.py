@@ -7,12 +7,12 @@ import pytest
 import brdf
 import fitting
 from brdf.images.encoding import encode
-from fitting.budget.deviation import parameter_deviation
-from fitting.budget.trials import Bench
 from fitting.censored_noise import BLACK, WHITE, without_censored_noise
 from fitting.cli.main import main
 from fitting.photographs.ball import Circle, ball_points
 from fitting.photographs.distant_light import photograph_scene
+from fitting.problem import state_problem
+from fitting.speed_accuracy import Bench, parameter_deviation
 
 SIZE = 96
 POINTS = ball_points((SIZE, SIZE), Circle(47.5, 47.5, 44.0))
@@ -158,13 +158,12 @@ def test_a_clipped_highlight_in_a_jpeg_file_does_not_bend_the_fit(tmp_path, qual
 
 
 def test_solvers_that_are_compared_leave_out_the_same_pixels():
-    options = {"mask": None, "saturation": None, "n_range": (0.1, 1e6)}
-    bench = Bench(seen(DULL, 0.03, 0, low=0.0, bits=8), SCENE, "blinn-phong", options)
-    solver = next(trial for trial in bench.trials() if trial.axis == "solver")
-    assert parameter_deviation(solver.run(), bench.best) < 0.05
+    bench = Bench(state_problem(seen(DULL, 0.03, 0, low=0.0, bits=8), SCENE, model="blinn-phong"))
+    solver = next(trial for trial in bench.trials() if trial[0] == "solver")
+    assert parameter_deviation(bench.run(*solver), bench.best) < 0.05
     # All of the fitted pixels: what is cut off bends this fit as well.
     bench.best.counted[0][:] = True
-    assert parameter_deviation(solver.run(), bench.best) > 0.08
+    assert parameter_deviation(bench.run(*solver), bench.best) > 0.08
 
 
 @pytest.mark.parametrize(("low", "share"), [(0.0, True), (-1.0, False)])

@@ -35,10 +35,10 @@ class BudgetChoice:
         accuracy: the relative error that was asked for, or None.
         seconds: the time that was allowed, or None.
         attempts: what was tried, the last being what was chosen.
-        pixels: how many pixels were looked at, of all pictures.
+        pixels: how many pixels were fitted, of all pictures.
         of_pixels: of how many.
         met: whether the accuracy holds by the estimate; None where none was asked for.
-        reason: why all pixels were looked at; empty where not all were.
+        reason: why all pixels were fitted; empty where not all were.
     """
 
     accuracy: float | None
@@ -57,35 +57,25 @@ class BudgetChoice:
     @property
     def basis(self) -> str:
         """What the estimate rests on."""
-        one = self.chosen
-        parts = [f"rounding {one.rounding:.1g}" if one.rounding else "float64"]
+        chosen, parts = self.chosen, []
         if self.pixels < self.of_pixels:
-            parts.insert(0, f"pixels left out {one.pixels:.1g} (information matrix)")
-        if one.light:
-            parts.insert(-1, f"light samples left out {one.light:.1g} (by four times as many)")
-        return ", ".join(parts)
+            parts.append(f"pixels left out {chosen.pixels:.1g} (information matrix)")
+        if chosen.light:
+            parts.append(f"light samples left out {chosen.light:.1g} (by four times as many)")
+        return ", ".join([*parts, f"rounding {chosen.rounding:.1g}"])
 
     def lines(self) -> list[str]:
         """For the report."""
-        one = self.chosen
-        looked = f" ({self.pixels} of {self.of_pixels} pixels)" if self.pixels < self.of_pixels else ""
-        lines = [
-            f"  chosen      {one.configuration}{looked}{': ' if self.reason else ''}{self.reason}",
-            f"  its error   {one.error:.2g} relative to the full fit, below {one.bound:.2g} with 95 %: {self.basis}",
-        ]
+        chosen = self.chosen
+        share = f" ({self.pixels} of {self.of_pixels} pixels)" if self.pixels < self.of_pixels else ""
+        reason = f": {self.reason}" if self.reason else ""
+        error = f"{chosen.error:.2g} relative to the full fit, below {chosen.bound:.2g} with 95 %: {self.basis}"
+        lines = [f"  chosen      {chosen.configuration}{share}{reason}", f"  its error   {error}"]
         if self.met is False:
             lines.append(f"  warning: the accuracy of {self.accuracy:g} is not reached")
         return lines
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON holds it."""
-        return {
-            "accuracy": self.accuracy,
-            "seconds": self.seconds,
-            "met": self.met,
-            "pixels": self.pixels,
-            "of_pixels": self.of_pixels,
-            "reason": self.reason,
-            "basis": self.basis,
-            "attempts": [vars(attempt) for attempt in self.attempts],
-        }
+        attempts = [vars(attempt) for attempt in self.attempts]
+        return vars(self) | {"basis": self.basis, "attempts": attempts}
