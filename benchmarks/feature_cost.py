@@ -10,12 +10,12 @@ import sys
 
 import jax
 import numpy as np
-from fitting.budget.stopwatch import take
 
 import brdf
 import fitting
 from benchmarks.tradeoff import BALL, FLOOR, camera, sky
 from brdf.rendering import basis
+from fitting.speed_accuracy import take
 
 ROUNDS, PATIENCE, SAMPLES = 7, 3.0, 64
 SUN = brdf.DirectionalLight(direction=(0.5, 0.6, 0.7), intensity=1.0)

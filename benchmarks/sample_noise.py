@@ -1,4 +1,4 @@
-"""How far noise puts a fit of a sample of the pixels off: the constants of `fitting.budget.first_pixels`.
+"""How far noise puts a fit of a sample of the pixels off: `SPREAD` of `fitting.budget.escalation`.
 
 ``python -m benchmarks.sample_noise [SCENES]`` draws balls under one to three lights with random materials, shiny and
 matt ones, fits a sample of each, and prints the median and the quartiles of its error (95 %, of the worst parameter),
@@ -10,12 +10,11 @@ import sys
 import numpy as np
 
 import brdf
-from benchmarks.tradeoff import OPTIONS, scene
+from benchmarks.tradeoff import scene
 from fitting.budget.configurations import Configuration, run
-from fitting.budget.first_pixels import FIRST_PIXELS, noise_and_size
-from fitting.budget.lamps import Lamps
-from fitting.budget.linear_system import System
-from fitting.budget.sampling_error import estimate
+from fitting.budget.error_estimate import estimate
+from fitting.budget.escalation import FIRST_PIXELS, noise_and_size
+from fitting.problem import state_problem
 
 
 def drawn(random: np.random.Generator, *, shiny: bool) -> tuple[brdf.Scene, brdf.Material]:
@@ -38,9 +37,8 @@ def ratio(random: np.random.Generator, *, shiny: bool) -> float:
     clean = np.asarray(brdf.render(material, place))
     noise = 10 ** random.uniform(-2.3, -1.3) * clean.mean()
     picture = (clean + noise * random.standard_normal(clean.shape)).astype(np.float32)
-    lamps = Lamps()
-    done = run([picture], [place], Configuration(material.name, "float32", FIRST_PIXELS), OPTIONS, lamps)
-    told = estimate(System(done, [picture], dict(OPTIONS), lamps), rule=0.0)
+    done = run(state_problem(picture, place), Configuration(material.name, "float32", FIRST_PIXELS), {})
+    told = estimate(done, {})
     deviation, size = noise_and_size(picture)
     sample = done.samples[0]
     assert sample is not None

@@ -5,8 +5,7 @@ check has nothing to choose: its albedo is closed, and of a BRDF without a close
 error.
 
 Fewer pixels are a stratified subsample, not a level of the picture's pyramid: averaged pixels blur a highlight, which
-the fit takes for a smaller exponent. Of 36 fits (four exponents, three noises, three sizes) the subsample was closer
-in 97 %, by a factor of 37 in the median.
+the fit takes for a smaller exponent.
 
 Each configuration runs once with cold caches, once warm, and then in rounds, every round in another order (fixed seed),
 so that a machine that grows slower or quicker favours none. The compiler's time is taken out of every run. What takes

@@ -44,8 +44,8 @@ SMALL_ERROR = 0.5
 NEAR, NEAR_AUTO = 4.0, 16.0
 
 # Relative error (95 %) of the worst parameter, times the root of the number of pixels, over noise over the picture's
-# root mean square: upper quartile of 40 random balls (8 in the median without a highlight, 36 with one), since a few
-# pixels more cost less than a second fit.
+# root mean square: upper quartile of `python -m benchmarks.sample_noise`, since a few pixels more cost less than a
+# second fit.
 SPREAD = 60.0
 # A sample that is crowded where highlights are holds so many times as many pixels as it is asked for.
 CROWDED = 1.5
@@ -104,7 +104,7 @@ def fit_within(problem: FitProblem, accuracy: float | None, seconds: float | Non
     most = max(sizes) * (WHOLE_IF_SINGLE if accuracy is not None and not has_samples else WHOLE)
     pixels, reason = FIRST_PIXELS, ""
     if not has_samples:
-        pixels, reason = _first_pixels(problem, accuracy, sizes, most, timed=seconds is not None)
+        pixels, reason = _first_pixels(problem, accuracy, sizes, most)
     now = Configuration(problem.model, precision, pixels, FIRST_SAMPLES if has_samples else None)
     lights: MadeLights = {}
     attempts, n_range = [], None
@@ -181,7 +181,7 @@ def near(result: FitResult, error: float, n_range: tuple[float, float]) -> tuple
 
 
 def _first_pixels(
-    problem: FitProblem, accuracy: float | None, sizes: Sequence[int], most: float, *, timed: bool
+    problem: FitProblem, accuracy: float | None, sizes: Sequence[int], most: float
 ) -> tuple[int | None, str]:
     """How many pixels of each picture to fit first under single lights; None for all, and why all.
 
@@ -197,8 +197,6 @@ def _first_pixels(
     work = kinds * sum(n * max(len(scene.lights), 1) for n, scene in zip(counts, problem.scenes, strict=True))
     if isinstance(accuracy, OnlyFit) and EACH_PIXEL * work < CHOOSING:
         return None, ONLY
-    if timed:
-        return FIRST_PIXELS, ""
     pictures = [target.pixels for target in problem.targets]
     asked = pixels_for_noise(pictures, problem.masks, problem.model, accuracy) / len(sizes)
     pixels = FIRST_PIXELS
