@@ -18,7 +18,7 @@ import numpy as np
 import brdf
 import fitting
 from fitting.budget.configurations import Configuration, run
-from fitting.budget.subsample import with_samples
+from fitting.budget.sampling import with_samples
 from fitting.problem import state_problem
 from fitting.speed_accuracy import parameter_deviation, reference
 

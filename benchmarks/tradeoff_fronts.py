@@ -21,7 +21,7 @@ import numpy as np
 import brdf
 import fitting
 from benchmarks.tradeoff import material, sky
-from fitting.budget.subsample import with_samples
+from fitting.budget.sampling import with_samples
 
 SIZE, NOISE, SECONDS = 512, 0.01, 60.0
 SCENES = ("directional", "area", "environment")

@@ -34,7 +34,7 @@ from brdf.precision import Precision
 from fitting.budget.configurations import MOST_SAMPLES, Configuration, run, some_of
 from fitting.budget.error_estimate import SMALLEST
 from fitting.budget.escalation import WHOLE, check_above_zero, near
-from fitting.budget.subsample import MadeLights, sample_pixels, with_samples
+from fitting.budget.sampling import MadeLights, sample_pixels, with_samples
 from fitting.problem import FitProblem, state_problem
 from fitting.result import FitResult
 from fitting.uncertainty.covariance import TERMS

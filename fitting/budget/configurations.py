@@ -12,7 +12,7 @@ import numpy as np
 import brdf
 from brdf.errors import InputError
 from brdf.precision import Precision
-from fitting.budget.subsample import MadeLights, PixelSample, sample_pixels, with_samples
+from fitting.budget.sampling import MadeLights, PixelSample, sample_pixels, with_samples
 from fitting.core import fit_pictures
 from fitting.pixels import SYMMETRIC_PIXELS
 from fitting.problem import TOP, FitProblem

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 import brdf
 from brdf.rendering import basis
 from fitting.budget.configurations import MOST_SAMPLES, Run, some_of
-from fitting.budget.subsample import MadeLights, PixelSample, compiled_at_pixels, sample_pixels, with_samples
+from fitting.budget.sampling import MadeLights, PixelSample, compiled_at_pixels, sample_pixels, with_samples
 from fitting.light_colour import coefficient_factors, take_colour_out
 from fitting.solver.profile import Optimum
 

@@ -22,7 +22,7 @@ from brdf.models.base import SpecularMaterial
 from fitting.budget.choice import Attempt, BudgetChoice
 from fitting.budget.configurations import MOST_SAMPLES, Configuration, run
 from fitting.budget.error_estimate import STEP, Estimate, estimate
-from fitting.budget.subsample import MadeLights
+from fitting.budget.sampling import MadeLights
 from fitting.problem import FitProblem
 from fitting.result import FitResult
 

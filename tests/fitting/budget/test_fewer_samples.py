@@ -7,7 +7,7 @@ import pytest
 from ball_scenes import MATERIAL, ball
 
 import brdf
-from fitting.budget.subsample import sample_pixels, with_samples
+from fitting.budget.sampling import sample_pixels, with_samples
 
 
 @pytest.mark.parametrize("kind", ["one ball", "two shapes", "points", "area"])
