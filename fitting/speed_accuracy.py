@@ -31,7 +31,7 @@ import brdf
 from brdf.files import atomic_folder, write_text
 from brdf.models.base import SpecularMaterial
 from brdf.precision import Precision
-from fitting.budget.configurations import MOST_SAMPLES, Configuration, run, some_of
+from fitting.budget.configurations import MOST_SAMPLES, Configuration, run, sample_counts, some_of
 from fitting.budget.error_estimate import SMALLEST
 from fitting.budget.escalation import WHOLE, check_above_zero, near
 from fitting.budget.sampling import MadeLights, sample_pixels, with_samples
@@ -301,9 +301,9 @@ def tradeoff(
             left = seconds - (time.perf_counter() - begun)
             if before and (once or before[-1].seconds > min(LONG, left)):
                 continue
-            most = max(outcomes, key=works.__getitem__, default=None)
             # What a fit may take is told by the one of the most work so far.
-            known = most is not None and not once and axes[index] != "render"
+            most = max(outcomes, key=works.__getitem__, default=index)
+            known = outcomes and not once and axes[index] != "render"
             if left < (taken[most][-1].seconds * works[index] / works[most] if known else 0.0):
                 continue
             outcome, one = take(functools.partial(bench.run, *trials[index]))
@@ -336,7 +336,7 @@ def reference(problem: FitProblem, lights: MadeLights, pixels: int | None = None
         lights: made so far.
         pixels: how many under many light samples; None for all.
     """
-    if not any(hasattr(light, "samples") for light in problem.scenes[0].lights):
+    if not any(sample_counts(problem.scenes)):
         return run(problem, Configuration(problem.model, "float64"), lights).result
     few = Configuration(problem.model, "float32", None, START_SAMPLES)
     whole = run(problem, few, lights).result
@@ -389,7 +389,7 @@ class Bench:
         self.problem, self.scene = problem, problem.scenes[0]
         self.lights: MadeLights = {}
         scene, self.pixels = self.scene, int(np.prod(self.scene.resolution))
-        self.samples = [light.samples for light in scene.lights if hasattr(light, "samples")]
+        self.samples = max(filter(None, sample_counts([scene])), default=0)
         self.reference, pixels = "float64, all pixels", None
         # Where pictures are compared: the whole one, or some pixels under many light samples; and their weights.
         self.compared, self.weight = with_samples(scene, MOST_SAMPLES, self.lights), np.ones((1, 1, 1))
@@ -407,13 +407,13 @@ class Bench:
 
     def trials(self, *, render: bool = False) -> list[tuple[str, Configuration]]:
         """What there is to try, and what for, the most telling first."""
-        default, samples = Configuration(self.model), max(self.samples, default=1)
+        default, samples = Configuration(self.model), self.samples
         change = functools.partial(dataclasses.replace, default)
         sizes = [size for size in PIXELS if size <= WHOLE * self.pixels]
         few = (sizes or [None])[:2][-1]
         found = [("default", default), *(("pixels", change(pixels=size)) for size in sizes)]
         # Many samples are tried on few pixels: what they change does not hang on how many.
-        steps = [count for count in SAMPLES if self.samples and count <= 4 * samples and count != samples]
+        steps = [count for count in SAMPLES if count <= 4 * samples and count != samples]
         found += [("samples", change(pixels=few, samples=count)) for count in steps]
         found += [("samples", change(samples=16))] if samples > 16 else []
         found += [("precision", change(precision="float64", pixels=count)) for count in (few, None)]

@@ -50,10 +50,14 @@ class Configuration:
 
     def work(self, pixels: int, scenes: Sequence[brdf.Scene]) -> float:
         """Pixels times light samples, twice for float64, of several pictures of so many pixels."""
-        lights = [light for scene in scenes for light in scene.lights]
-        counts = [self.samples or light.samples if hasattr(light, "samples") else 1 for light in lights]
+        counts = [(self.samples or count) if count else 1 for count in sample_counts(scenes)]
         pixels = min(self.pixels or pixels, pixels)
         return float(pixels * max(sum(counts), 1) * (2 if self.precision == "float64" else 1))
+
+
+def sample_counts(scenes: Sequence[brdf.Scene]) -> list[int | None]:
+    """Of each light the number of samples; None of one without an extent."""
+    return [getattr(light, "samples", None) for scene in scenes for light in scene.lights]
 
 
 class Run(NamedTuple):

@@ -142,7 +142,7 @@ class LinearSystem:
             jacobian = np.einsum("mci,cip->mcp", columns, place)
             weighed = share[..., None] * jacobian
             scores = np.einsum("mcp,mc->mp", weighed, residual)
-            self.hessian += np.tensordot(weighed, jacobian, [(0, 1), (0, 1)])
+            self.hessian += np.einsum("mcp,mcq->pq", weighed, jacobian, optimize=True)
             self.gradient += scores.sum(axis=0)
             # Of the picture of the fit, which errors of the picture are relative to.
             self.square += np.sum(share * fitted**2)
@@ -154,7 +154,7 @@ class LinearSystem:
             if finer is not None:
                 fine, _ = jax.device_get(_columns(with_samples(scene, finer, lights), *how))
                 # A coarser model gives more of what it lacks, hence the sign.
-                self.light -= np.tensordot(weighed, _fitted(fine[: share.size], optimum) - fitted, 2 * [(0, 1)])
+                self.light -= np.einsum("mcp,mc->p", weighed, _fitted(fine[: share.size], optimum) - fitted)
         self.at_bound, self.known = np.append((optimum.x <= 0).ravel(), False), np.zeros(size, bool)
         self.known[: len(result.parameters)] = [one.value is not None for one in result.parameters]
         factors = coefficient_factors(model, optimum.n, grey.colour)

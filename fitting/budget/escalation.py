@@ -10,7 +10,6 @@ with `MOST_SAMPLES` samples of each light, the larger one of that of the paramet
 import dataclasses
 import time
 from collections.abc import Sequence
-from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ import brdf
 from brdf.errors import InputError
 from brdf.models.base import SpecularMaterial
 from fitting.budget.choice import Attempt, BudgetChoice
-from fitting.budget.configurations import MOST_SAMPLES, Configuration, run
+from fitting.budget.configurations import MOST_SAMPLES, Configuration, run, sample_counts
 from fitting.budget.error_estimate import STEP, Estimate, estimate
 from fitting.budget.sampling import MadeLights
 from fitting.problem import FitProblem
@@ -95,7 +94,7 @@ def fit_within(problem: FitProblem, accuracy: float | None, seconds: float | Non
             came = "cannot be combined with an accuracy or a time to spend, whose estimate is for plain squares"
             raise InputError(name, came, "Leave one of them out")
     scenes, precision = problem.scenes, problem.precision
-    has_samples = any(hasattr(light, "samples") for scene in scenes for light in scene.lights)
+    has_samples = any(sample_counts(scenes))
     hard_shadows = not has_samples and any(scene.lights and scene.lighting.occluders for scene in scenes)
     if hard_shadows or (accuracy or COARSE) < COARSE:
         # In float32 some pixels fall on the other side of a shadow's edge, each of which weighs much in a sample.
@@ -133,7 +132,8 @@ def fit_within(problem: FitProblem, accuracy: float | None, seconds: float | Non
 def check_above_zero(**values: Any) -> None:
     """Refuse what is given and no number above 0, naming it."""
     for name, value in values.items():
-        if value is not None and (isinstance(value, bool) or not isinstance(value, Real) or not 0 < value < np.inf):
+        number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+        if value is not None and not (number and 0 < value < np.inf):
             raise InputError(name, f"must be a number above 0, got {value!r}", "Give for example 0.001")
 
 

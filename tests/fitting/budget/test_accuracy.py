@@ -122,7 +122,7 @@ def test_the_next_search_is_narrow_only_where_the_estimate_can_be_believed(error
         ((1e-3, 0.2, 1e-7), 1e-2, {"samples": 256}),
         ((0.0, 0.0, 1e-2), 1e-2, {"precision": "float64"}),
         # Each little enough, and together too much: the largest.
-        ((5e-3, 2e-3, 2e-3), 1e-2, {"pixels": 4096}),
+        ((5e-3, 1e-3, 1e-3), 1e-2, {"pixels": 4096}),
         # Without an accuracy as well.
         ((5e-3, 1e-4, 1e-4), None, {"pixels": 8192}),
         ((0.0, 0.0, 0.0), 1e-2, None),

@@ -144,7 +144,7 @@ def test_fits_of_the_front_are_numbered_and_named():
     rows = (
         row("1024 pixels", 0.014, 8e-3, 1, configuration=few),
         row("all", 0.07, 1e-7, 9, axis="default", configuration=all_pixels),
-        row("16384 pixels", 0.12, 8e-4, 3, configuration=most),
+        row("16384 pixels", 0.05, 8e-4, 3, configuration=most),
     )
     axes = table(*rows).plot().axes[0]
     assert [text.get_text() for text in axes.texts] == ["1", "2", "3"]
