@@ -95,7 +95,7 @@ def fit_within(problem: FitProblem, accuracy: float | None, seconds: float | Non
             raise InputError(name, came, "Leave one of them out")
     scenes, precision = problem.scenes, problem.precision
     has_samples = any(sample_counts(scenes))
-    hard_shadows = not has_samples and any(scene.lights and scene.lighting.occluders for scene in scenes)
+    hard_shadows = not has_samples and any(scene.lights and scene.occluders for scene in scenes)
     if hard_shadows or (accuracy or COARSE) < COARSE:
         # In float32 some pixels fall on the other side of a shadow's edge, each of which weighs much in a sample.
         precision = "float64"
