@@ -87,7 +87,7 @@ def test_a_table_cut_short_recommends_only_what_keeps_the_accuracy():
 
 def test_only_the_axes_that_a_scene_has_are_tried(tmp_path):
     scene = ball(64)
-    found = fitting.tradeoff(noisy(scene, 0.01), scene, seconds=60.0)
+    found = fitting.tradeoff(noisy(scene, 0.01), scene, seconds=600.0)
     axes = {one.axis for one in found.rows}
     assert {"default", "precision", "model", "solver"} <= axes
     assert not axes & {"samples", "shadows", "render"}
@@ -119,12 +119,12 @@ def test_ctrl_c_keeps_what_was_measured():
 def test_the_command_measures_a_photograph_of_a_ball(tmp_path, capsys):
     scene = ball(64)
     brdf.write_image(tmp_path / "ball.png", noisy(scene, 0.01).astype(np.float32), encoding="srgb")
-    options = ["--sphere", "31.5,31.5,29.09", "--light", "0.5,0.6,0.7", "--ambient", "--seconds", "4", "--json"]
+    options = ["--sphere", "31.5,31.5,29.09", "--light", "0.5,0.6,0.7", "--ambient", "--seconds", "4", "--accuracy", "1e-2", "--json"]
     with pytest.raises(SystemExit) as ended:
         main(["tradeoff", str(tmp_path / "ball.png"), *options])
     assert ended.value.code == 0
     told = json.loads(capsys.readouterr().out)
-    assert told["rows"][0]["error"] < 1e-3
+    assert told["rows"][0]["error"] < 1e-2
     assert told["advice"].startswith("recommended")
 
 
