@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array
 
 from brdf.geometry.base import Shape
 from brdf.geometry.camera import Camera
@@ -60,7 +60,7 @@ def with_area(
     return _averaged(points, camera, shapes, _padded(edge), _padded(other & ~edge))
 
 
-def _padded(mask: Bool[np.ndarray, " P"]) -> Int[np.ndarray, " padded"]:
+def _padded(mask: np.ndarray) -> np.ndarray:
     """The pixels and some that are not there, so that few different sizes come up and few programs are compiled."""
     pixel = np.flatnonzero(mask)
     step = 1 << max(4, int(max(len(pixel), 1) - 1).bit_length() - 2)
@@ -76,9 +76,7 @@ def _over_neighbours(change: Any, values: Array) -> Array:
 
 
 @eqx.filter_jit
-def _matters(
-    points: SurfacePoints, camera: Camera, shapes: tuple[Shape, ...], lighting: Lighting
-) -> Bool[Array, "2 H W"]:
+def _matters(points: SurfacePoints, camera: Camera, shapes: tuple[Shape, ...], lighting: Lighting) -> Array:
     """Through which pixels an edge of a shape passes, and which others are to be averaged."""
     width, height = camera.resolution
     corners = apart(shapes_met, camera, shapes, np.arange(width + 1.0)[None, :], np.arange(height + 1.0)[:, None])
@@ -100,7 +98,7 @@ def _matters(
 
 def _light_matters(
     points: SurfacePoints, occluders: tuple[Shape, ...], kind: type[Light], row: tuple[Array, ...]
-) -> Bool[Array, "H W"]:
+) -> Array:
     """Whether a highlight is narrow or a light's edge passes."""
 
     def at_point(point: SurfacePoints) -> tuple[Array, Array]:
@@ -141,9 +139,7 @@ def _averaged(points: SurfacePoints, camera: Camera, shapes: tuple[Shape, ...], 
     return dataclasses.replace(points, mask=mask, area=area)
 
 
-def _by_shares(
-    weight: Float[Array, "K M"], met: Int[Array, "K M"], counted: Int[Array, "K N"], shapes: int
-) -> Float[Array, "K M"]:
+def _by_shares(weight: Array, met: Array, counted: Array, shapes: int) -> Array:
     """Weights that give each shape the share of the pixel that was counted."""
     result = jnp.zeros_like(weight)
     for index in range(NO_SHAPE, shapes):

@@ -185,7 +185,7 @@ def _checked(pixels: Any) -> np.ndarray:
     return array
 
 
-def _solid_angles(height: int, width: int) -> Float[np.ndarray, "H 1"]:
+def _solid_angles(height: int, width: int) -> np.ndarray:
     edges = np.cos(np.linspace(0.0, np.pi, height + 1))
     return (-np.diff(edges) * 2 * np.pi / width)[:, None]
 
