@@ -23,10 +23,14 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 BELOW_HORIZON = -1e9
 """What the ``*log_cosine`` functions return where the cosine is not positive: exp(n * this) = 0 for any n > 1e-7."""
+
+_SMALLEST = {np.dtype(np.float32): 1e-18, np.dtype(np.float64): 1e-153}
+"""The smallest cosine told from zero: its inverse square is finite."""
 
 Directions = Float[ArrayLike, "*#batch 3"]
 Numbers = Float[ArrayLike, "*#batch"]
@@ -63,25 +67,20 @@ def norm(v: Directions) -> Scalars:
 def divide(numerator: ArrayLike, denominator: ArrayLike) -> Array:
     """Numerator / denominator where that is positive (above 1e-18 in float32, 1e-153 in float64), else 0."""
     denominator = _floating(denominator)
-    positive = denominator > _smallest(denominator.dtype)
+    positive = denominator > _SMALLEST[denominator.dtype]
     return jnp.where(positive, jnp.asarray(numerator) / jnp.where(positive, denominator, 1.0), 0.0)
 
 
 def square_root(x: ArrayLike) -> Array:
     """Square root where x is positive (above 1e-18 in float32, 1e-153 in float64), else 0."""
     x = _floating(x)
-    positive = x > _smallest(x.dtype)
+    positive = x > _SMALLEST[x.dtype]
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 
 
 def _floating(v: ArrayLike) -> Array:
     v = jnp.asarray(v)
     return v.astype(jnp.result_type(v, 1.0))
-
-
-def _smallest(dtype: Any) -> float:
-    """The smallest cosine told from zero: its inverse square is finite."""
-    return 1e-18 if dtype == jnp.float32 else 1e-153
 
 
 # -- the lobe ----------------------------------------------------------------------------------------------------------
@@ -145,7 +144,7 @@ def log_cosine_of(cosine: Numbers, sine: Numbers) -> Scalars:
 @jax.custom_jvp
 def _from_tangent(p: Array, q: Array) -> Array:
     """-1/2 log(1 + p / q^2) for p >= 0, ``BELOW_HORIZON`` where q <= 0."""
-    above = jnp.maximum(q, _smallest(q.dtype))
+    above = jnp.maximum(q, _SMALLEST[q.dtype])
     return jnp.where(q > 0, -0.5 * jnp.log1p(jnp.where(q > 0, p, 0.0) / (above * above)), BELOW_HORIZON)
 
 
@@ -153,7 +152,7 @@ def _from_tangent(p: Array, q: Array) -> Array:
 def _from_tangent_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
     # by hand, because the chain rule through p / q^2 squares that and underflows in float32 near the horizon
     (p, q), (dp, dq) = primals, tangents
-    above = jnp.where(q > 0, jnp.maximum(q, _smallest(q.dtype)), 1.0)
+    above = jnp.where(q > 0, jnp.maximum(q, _SMALLEST[q.dtype]), 1.0)
     p = jnp.where(q > 0, p, 0.0)
     # p + q^2 = |L + V|^2 vanishes where L = -V; the floor keeps n times its inverse, and that over N.L, finite there
     sum_of_squares = jnp.maximum(p + above * above, 1e-12 if q.dtype == jnp.float32 else 1e-100)
