@@ -162,7 +162,7 @@ def scene_text(scene: Any) -> dict[str, Any]:
 
 def masked(text: str) -> str:
     """A text without seconds, paths and versions."""
-    for path, name in ((tempfile.gettempdir(), "TMP"), (str(REAL), "REAL"), (str(ROOT), "ROOT")):
+    for path, name in ((str(REAL), "REAL"), (str(ROOT), "ROOT"), (tempfile.gettempdir(), "TMP")):
         text = text.replace(str(path), name)
     text = re.sub(r"TMP/record-\w+", "FOLDER", text)
     text = re.sub(r"\.\w+\.part\w*", ".PART", text)
