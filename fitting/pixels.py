@@ -208,7 +208,7 @@ def _bands(
         if mask is not None:
             allowed = allowed & mask[first:last].ravel()
         if target.streamed:
-            values = jnp.asarray(pixels.rows(first, last).reshape(-1, channels), dtype)
+            values = jnp.asarray(target.pixels.rows(first, last).reshape(-1, channels), dtype)
         else:
             # A view: on the device all bands together would be the picture once more.
             values = pixels[first:last].reshape(-1, channels)

@@ -75,7 +75,8 @@ def _one_channel(squared: np.ndarray, value: np.ndarray, least: float) -> tuple[
     largest = max(float(np.max(value)), np.finfo(float).tiny)
     columns = (value / largest) ** np.arange(3)[:, None]
     constant = max(float(np.mean(squared)), least, np.finfo(float).tiny)
-    variance = np.full(value.size, constant)
+    coefficients = np.array([constant, 0.0, 0.0])
+    variance = coefficients @ columns
     for _ in range(ROUNDS):
         # The variance of a squared residual is twice its mean squared; scaled, so that no digit is lost.
         scaled = columns / variance
