@@ -127,28 +127,27 @@ def _blinn_phong_albedo(n: Numbers, theta: Numbers) -> Array:
     nodes, weights = (jnp.asarray(x, theta.dtype) for x in gauss_legendre(_NODES))
     reach = _REACH / vectors.square_root(n + 1)[..., None]
     first = 0.5 * (0.5 * math.pi - theta)  # up to here all phi see the view above the horizon
+    cos_theta, sin_theta = jnp.maximum(jnp.cos(theta), 0.0), jnp.sin(theta)
 
-    def ring(alpha: Array, phi: Array, sin_phi: Array, cos_phi: Array) -> Array:
+    def ring(alpha: Array, phi: Array) -> Array:
         """cos^n times the integral over phi of 4 (L.H) (N.V), times sin alpha."""
         cos_alpha, sin_alpha = jnp.cos(alpha), jnp.sin(alpha)
-        across, along = jnp.sin(theta) * sin_alpha, jnp.maximum(jnp.cos(theta), 0.0)
-        value = cos_alpha * across * across * (phi + sin_phi * cos_phi)
-        value += along * across * sin_phi * (4 * cos_alpha * cos_alpha - 1)
-        value += along * along * cos_alpha * jnp.cos(2 * alpha) * phi
+        across = sin_theta * sin_alpha
+        value = cos_alpha * across * across * (phi + 0.5 * jnp.sin(2 * phi))
+        value += cos_theta * across * jnp.sin(phi) * (4 * cos_alpha * cos_alpha - 1)
+        value += cos_theta * cos_theta * cos_alpha * jnp.cos(2 * alpha) * phi
         return 8 * value * sin_alpha * jnp.exp(n[..., None] * vectors.log_cosine_of(cos_alpha, sin_alpha))
 
     width = jnp.minimum(first, reach)
-    zero = jnp.zeros_like(nodes)
-    full = width * ring(width * nodes, zero + math.pi, zero, zero - 1.0)
+    full = width * ring(width * nodes, jnp.full_like(nodes, math.pi))
 
     width = jnp.maximum(jnp.minimum(theta, reach - first), 0.0)
     beyond = width * jnp.sin(0.5 * math.pi * nodes) ** 2  # alpha - first
-    cos_phi = -jnp.maximum(jnp.cos(theta), 0.0) * jnp.cos(2 * (first + beyond))  # times sin theta sin 2 alpha
+    cos_phi = -cos_theta * jnp.cos(2 * (first + beyond))  # times sin theta sin 2 alpha
     sin_phi = vectors.square_root(jnp.sin(2 * beyond) * jnp.sin(2 * (theta - beyond)))
-    length = jnp.where(sin_phi > 0, vectors.norm(jnp.stack([sin_phi, cos_phi, jnp.zeros_like(sin_phi)], -1)), 1.0)
-    phi = jnp.where(sin_phi > 0, jnp.arctan2(sin_phi, jnp.where(sin_phi > 0, cos_phi, 1.0)), 0.0)
-    jacobian = width * 0.5 * math.pi * jnp.sin(math.pi * nodes)
-    partial = jacobian * ring(first + beyond, phi, sin_phi / length, cos_phi / length)
+    seen = sin_phi > 0
+    phi = jnp.where(seen, jnp.arctan2(sin_phi, jnp.where(seen, cos_phi, 1.0)), 0.0)
+    partial = width * 0.5 * math.pi * jnp.sin(math.pi * nodes) * ring(first + beyond, phi)
     return NormalizedBlinnPhong.scale(n) / math.pi * jnp.sum(weights * (full + partial), axis=-1)
 
 
