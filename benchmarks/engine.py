@@ -19,8 +19,10 @@ from typing import Any
 import jax
 import numpy as np
 
+import brdf
+from brdf.lobes import Lobe
 from fitting.solver import normal_equations, profile, refinement, subsample
-from fitting.solver.normal_equations import OneLightLobe, Picture
+from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import search
 
 N = 80.0
@@ -60,7 +62,8 @@ def one_pass(n_dot_l: np.ndarray, log_cos: np.ndarray, target: np.ndarray) -> tu
 def on_device(n_dot_l: np.ndarray, log_cos: np.ndarray, target: np.ndarray, dtype: type) -> Picture:
     """The arrays of the engine."""
     with jax.enable_x64(True):
-        lobe = OneLightLobe(*(jax.device_put(a.astype(dtype)) for a in (log_cos, np.ones((log_cos.size, 1)))))
+        kept = [jax.device_put(a.astype(dtype)) for a in (np.ones((log_cos.size, 1, 1)), log_cos[:, None])]
+        lobe = Lobe(brdf.BlinnPhong, (tuple(kept),))
         return Picture(*(jax.device_put(a.astype(dtype)) for a in (target, n_dot_l[:, None])), lobe)
 
 

@@ -27,12 +27,13 @@ from jaxtyping import Float
 import brdf
 from brdf.errors import InputError
 from brdf.files import atomic_folder
+from brdf.lobes import Lobe
 from brdf.materials.material_file import material_to_dict
 from brdf.models.base import SpecularMaterial
 from fitting.light_colour import coefficient_factors
 from fitting.report.saving import write_report
 from fitting.result import Parameter, undetermined
-from fitting.solver.normal_equations import OneLightLobe, Picture
+from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum, search
 from fitting.uncertainty.covariance import residual_noise, uncertainty
 
@@ -379,7 +380,7 @@ def _fit_model(
     def solve(weight: Float[np.ndarray, "P C"] | Float[np.ndarray, "P 1"]) -> Optimum:
         """The least weighted squares."""
         with jax.enable_x64(True):
-            lobe = OneLightLobe(jnp.asarray(log_cos[:, 0]), jnp.asarray(reach))
+            lobe = Lobe(model, ((jnp.asarray(reach)[:, None], jnp.asarray(log_cos)),))
             ones, target = jnp.ones((len(values), 1)), jnp.asarray(np.pi * values)
             picture = Picture(target, ones, lobe, jnp.asarray(weight), ambient=jnp.zeros(1))
         return search([picture], n_min=n_range[0], n_max=n_range[1], free=free)

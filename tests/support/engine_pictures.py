@@ -6,9 +6,26 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import nnls
 
-from fitting.solver.normal_equations import OneLightLobe, Picture
+from fitting.solver.normal_equations import Picture
 
 X = np.array([[0.05, 0.03, 0.02], [0.5, 0.3, 0.1], [0.3, 0.4, 0.5]])
+
+
+class OneLightLobe(eqx.Module):
+    """The lobe of one light sample per pixel: ``weight * exp(n * log_cos)``."""
+
+    log_cos: jax.Array
+    weight: jax.Array
+
+    def __call__(self, n):
+        value = self.weight * jnp.exp(n.astype(self.log_cos.dtype) * self.log_cos)[:, None]
+        return value, value * self.log_cos[:, None]
+
+    def peak(self):
+        return jnp.where(jnp.any(self.weight > 0, axis=1), self.log_cos, -1e9)
+
+    def pixels(self, choose):
+        return OneLightLobe(choose(self.log_cos), choose(self.weight))
 
 
 class SumOfLobes(eqx.Module):

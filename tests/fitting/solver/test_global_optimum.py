@@ -3,12 +3,12 @@
 import jax
 import numpy as np
 import pytest
-from engine_pictures import SumOfLobes, ball, best_at, cost_of
+from engine_pictures import OneLightLobe, SumOfLobes, ball, best_at, cost_of
 from scipy.optimize import least_squares, nnls
 
 import brdf
 import fitting
-from fitting.solver.normal_equations import OneLightLobe, Picture
+from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import search
 
 

@@ -3,9 +3,9 @@
 import jax
 import numpy as np
 import pytest
-from engine_pictures import X, ball, best_at, cost_of, picture
+from engine_pictures import OneLightLobe, X, ball, best_at, cost_of, picture
 
-from fitting.solver.normal_equations import OneLightLobe, Picture
+from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import fit_linear, search
 from fitting.solver.streams import Stream
 
