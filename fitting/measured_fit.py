@@ -30,12 +30,13 @@ from brdf.files import atomic_folder
 from brdf.lobes import Lobe
 from brdf.materials.material_file import material_to_dict
 from brdf.models.base import SpecularMaterial
-from fitting.light_colour import coefficient_factors
+from fitting.model_fit import ModelFit
 from fitting.report.saving import write_report
 from fitting.result import Parameter, undetermined
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum, search
 from fitting.uncertainty.covariance import residual_noise, uncertainty
+from fitting.uncertainty.interpretation import material_and_parameters
 
 Loss = Literal["cosine", "squared", "log"]
 N_RANGE = (0.1, 1e6)
@@ -403,22 +404,10 @@ def _fit_model(
             float(np.max(lobe) / np.max(brightest)),
             single=False,
         )
-    factors = coefficient_factors(model, optimum.n, np.ones(channels))
-    k, errors = optimum.x / factors, sure.x_error / factors
-    parameters = []
-    for term, name in ((1, "k_d"), (2, "k_s"))[: 1 + specular]:
-        for channel in range(channels):
-            reason = sure.reasons[term, channel]
-            k[term, channel] *= not reason
-            known = (None, None) if reason else (float(k[term, channel]), float(errors[term, channel]))
-            parameters.append(Parameter(name, channel, *known, at_bound=known[0] == 0, reason=reason))
-    if not specular:
-        material = brdf.Lambert(k_d=k[1])
-    else:
-        known = (None, None) if sure.n_reason else (optimum.n, sure.n_error)
-        parameters.append(Parameter("n", None, *known, reason=sure.n_reason))
-        material = model(k_d=k[1], k_s=k[2], n=optimum.n if k[2].any() else 0.0)
-    return BrdfCandidate(material, tuple(parameters), _losses(samples, modelled(optimum)))
+    fit = ModelFit(model, [], optimum, free, n_range)
+    material, parameters = material_and_parameters(fit, sure, np.ones(channels), None)
+    parameters = tuple(dataclasses.replace(one, interval=None) for one in parameters if one.name != "k_a")
+    return BrdfCandidate(material, parameters, _losses(samples, modelled(optimum)))
 
 
 def _lobe(model: type[SpecularMaterial], samples: brdf.MeasuredBRDF) -> tuple[np.ndarray, np.ndarray]:

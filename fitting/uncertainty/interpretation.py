@@ -1,7 +1,7 @@
 """From the solver's numbers to a material, its errors, and what a user should know of them."""
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -89,17 +89,11 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> Interpretation
         sure = sure._replace(n_reason=_open_exponent(interval))
     if hidden:
         sure.reasons[2], sure = hidden, sure._replace(n_reason=hidden)
-    specular = issubclass(fit.model, SpecularMaterial)
-    parameters = _parameters(fit, sure, coefficient_factors(fit.model, optimum.n, seen.colour), interval)
-    k = np.array([[p.value or 0.0 for p in parameters if p.name == term] for term in TERMS[: 2 + specular]])
-    if specular:
-        material = fit.model(k_a=k[0], k_d=k[1], k_s=k[2], n=optimum.n if k[2].any() else 0.0)  # pyright: ignore[reportCallIssue]
-    else:
-        material = fit.model(k_a=k[0], k_d=k[1])  # pyright: ignore[reportCallIssue]
-    free, channels = free_parameters(parameters), k.shape[1]
+    material, parameters = material_and_parameters(fit, sure, seen.colour, interval)
+    free, channels = free_parameters(parameters), material.k_d.shape[0]
     index = [3 * channels if p.channel is None else TERMS.index(p.name) * channels + p.channel for p in free]
     correlation = sure.correlation[np.ix_(index, index)]
-    warnings = [_capped(k)] if fit.capped else []
+    warnings = [_capped(material)] if fit.capped else []
     warnings += _missing_ambient(pictures)
     warnings += _warnings(known, None if all(sure.reasons[2]) else lobe)
     warnings += _hard_to_tell(free, correlation)
@@ -129,29 +123,41 @@ def _open_exponent(interval: tuple[float, float]) -> str:
     return ""
 
 
-def _parameters(
-    fit: ModelFit, sure: Uncertainty, factors: np.ndarray, interval: tuple[float, float] | None
-) -> tuple[Parameter, ...]:
-    found = []
-    specular = issubclass(fit.model, SpecularMaterial)
+def material_and_parameters(
+    fit: ModelFit, sure: Uncertainty, colour: Float[np.ndarray, " C"], interval: tuple[float, float] | None
+) -> tuple[brdf.Material, tuple[Parameter, ...]]:
+    """The material that was found, what is not determined being 0 in it, and its numbers with their errors.
+
+    Args:
+        fit: of one model.
+        sure: its errors, in the units of the solver.
+        colour: what was taken out of the lights, (C,).
+        interval: of the exponent.
+    """
+    found: list[Parameter] = []
+    k: dict[str, Any] = {}
+    optimum, specular = fit.optimum, issubclass(fit.model, SpecularMaterial)
+    factors = coefficient_factors(fit.model, optimum.n, colour)
     for term, name in enumerate(TERMS[: 2 + specular]):
         for channel, factor in enumerate(factors[term]):
             if sure.reasons[term, channel]:
                 found.append(Parameter(name, channel, None, None, reason=sure.reasons[term, channel]))
                 continue
-            value = float(fit.optimum.x[term, channel] / factor)
+            value = float(optimum.x[term, channel] / factor)
             low, high = sure.x_interval[term, channel] / factor
             error = float(sure.x_error[term, channel] / factor)
             found.append(Parameter(name, channel, value, error, (float(low), float(high)), at_bound=value == 0))
+        k[name] = np.array([parameter.value or 0.0 for parameter in found[-factors.shape[1] :]])
     if specular:
-        n, error = (None, None) if sure.n_reason else (float(fit.optimum.n), sure.n_error)
+        k["n"] = optimum.n if k["k_s"].any() else 0.0
+        n, error = (None, None) if sure.n_reason else (float(optimum.n), sure.n_error)
         found.append(Parameter("n", None, n, error, interval, reason=sure.n_reason))
-    return tuple(found)
+    return fit.model(**k), tuple(found)
 
 
-def _capped(k: np.ndarray) -> str:
-    labels = channel_names(k.shape[1])
-    held = ", ".join(labels[channel] for channel in np.flatnonzero(k[1:].sum(axis=0) >= 1 - 1e-6))
+def _capped(material: Any) -> str:
+    labels = channel_names(material.k_d.shape[0])
+    held = ", ".join(labels[channel] for channel in np.flatnonzero(material.k_d + material.k_s >= 1 - 1e-6))
     where = f" in channel {held}" if held else ""
     return (
         f"k_d + k_s is held at 1{where}: a brighter material fits better, but is not plausible; "
