@@ -22,17 +22,17 @@ brdf.errors brdf.formatters brdf.checks brdf.files brdf.channels brdf.precision 
 brdf.models brdf.albedo brdf.conversions
 brdf.geometry brdf.lights brdf.lobes brdf.pixel_area brdf.images brdf.scene_file brdf.scene brdf.rendering
 brdf.materials brdf.measured brdf.plausibility brdf.display
-fitting.solver fitting.problem fitting.pixels fitting.selection fitting.budget.budget_choice fitting.result
-fitting.light_colour fitting.uncertainty fitting.plausible fitting.censored_noise fitting.core
+fitting.solver fitting.model_fit fitting.light_colour fitting.problem fitting.pixels fitting.selection
+fitting.budget.choice fitting.result fitting.uncertainty fitting.plausible fitting.censored_noise fitting.core
 fitting.report fitting.implicit fitting.joint fitting.relighting fitting.measured_fit fitting.photographs
-fitting.budget fitting.speed_table fitting.budget.trials fitting.speed_accuracy fitting.front_door
+fitting.budget fitting.speed_accuracy fitting.front_door
 fitting.cli
 """.split()
 
 # What fitting needs of brdf and no user calls.
 OPEN_TO_FITTING = set(
     """
-brdf.albedo brdf.channels brdf.display brdf.errors brdf.files brdf.images.encoding brdf.lights.base
+brdf.albedo brdf.channels brdf.display brdf.errors brdf.files brdf.images.encoding brdf.lobes
     brdf.materials.material_file brdf.measured.loading brdf.models.base brdf.plausibility.numeric
     brdf.plausibility.report brdf.plausibility.stability brdf.precision brdf.rendering brdf.scene
 """.split()
