@@ -289,7 +289,7 @@ def _refine(
         trial_cost, left = at(trial)
         if trial_cost < cost:
             numbers, cost, residual, damping = trial, trial_cost, left, damping / 10
-            columns = slopes(numbers)
+            columns = slopes(numbers) if free[4] else columns  # without a highlight all is linear
         else:
             damping *= 10
         if np.max(np.abs(step)) < CLOSE:
