@@ -123,7 +123,7 @@ def test_clipping_is_found_across_bands(tmp_path: Path, suffix: str, monkeypatch
     # Of a picture in memory alone.
     monkeypatch.setattr(core, "without_censored_noise", lambda result, *_: result)
     path = tmp_path / f"target{suffix}"
-    brdf.write_image(path, np.minimum(picture() * 1.5, 1.0))
+    brdf.write_image(path, np.minimum(picture() * 2.0, 1.0))
     whole = fitting.fit(brdf.read_picture(path), scene())
     assert whole.left_out["clipped"] > 20
     with brdf.ImageReader(path) as reader:
