@@ -155,9 +155,10 @@ def material_and_parameters(
     return fit.model(**k), tuple(found)
 
 
-def _capped(material: Any) -> str:
-    labels = channel_names(material.k_d.shape[0])
-    held = ", ".join(labels[channel] for channel in np.flatnonzero(material.k_d + material.k_s >= 1 - 1e-6))
+def _capped(material: brdf.Material) -> str:
+    diffuse, specular = material.k_d, getattr(material, "k_s", 0.0)
+    labels = channel_names(diffuse.shape[0])
+    held = ", ".join(labels[channel] for channel in np.flatnonzero(diffuse + specular >= 1 - 1e-6))
     where = f" in channel {held}" if held else ""
     return (
         f"k_d + k_s is held at 1{where}: a brighter material fits better, but is not plausible; "
