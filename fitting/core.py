@@ -123,7 +123,8 @@ def _fit_model(
             n_range = n_range[0], upper
         else:
             free[2] = False
-    found = reweight(pictures, lambda weighed: _search(weighed, free, n_range), seen.problem.loss, seen.rounding)
+    optimise = partial(search, n_min=n_range[0], n_max=n_range[1], free=free)
+    found = reweight(pictures, optimise, seen.problem.loss, seen.rounding)
     return ModelFit(model, found.pictures, found.optimum, free, n_range, None, found.noise_factor)
 
 
