@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import OpenImageIO as oiio  # noqa: N813
 from jaxtyping import Float
 
 from brdf.errors import InputError
@@ -26,6 +25,7 @@ from brdf.errors import InputError
 Encoding = Literal["linear", "srgb"] | float
 EncodingSource = Literal["given", "file", "format", "assumed"]
 
+FLOATS = ("float", "half", "double")
 _DISPLAY_FORMATS = ("jpeg", "gif", "webp")
 _HOW_TO_SAY = 'Say how it is encoded: "linear", "srgb" or a gamma like 2.2'
 # Profiles hold 16-bit or s15Fixed16 numbers, tables of 256 entries are common; the curves lie 2e-2 apart.
@@ -58,7 +58,7 @@ def parse_encoding(where: object, value: Any) -> Encoding | None:
     return "linear" if gamma == 1.0 else gamma
 
 
-def decode(values: Float[np.ndarray, "..."], encoding: Encoding) -> Float[np.ndarray, "..."]:
+def decode(values: np.ndarray, encoding: Encoding) -> np.ndarray:
     """Encoded values, 1 at the largest code, to linear ones; NaN and infinite values stay what they are.
 
     Source: IEC 61966-2-1 for sRGB, whose lower part goes on below 0; powers of negative values are NaN.
@@ -72,7 +72,7 @@ def decode(values: Float[np.ndarray, "..."], encoding: Encoding) -> Float[np.nda
         return values**encoding
 
 
-def encode(values: Float[np.ndarray, "..."], encoding: Encoding) -> Float[np.ndarray, "..."]:
+def encode(values: np.ndarray, encoding: Encoding) -> np.ndarray:
     """Linear values to encoded ones, the inverse of `decode`."""
     if encoding == "linear":
         return values
@@ -87,12 +87,12 @@ def encode(values: Float[np.ndarray, "..."], encoding: Encoding) -> Float[np.nda
 def decode_table(encoding: Encoding, bits: int) -> Float[np.ndarray, " codes"]:
     """The linear value of every code of an integer file with ``bits`` bits, at most 16."""
     table = decode(np.linspace(0, 1, 1 << bits), encoding)
-    table.setflags(write=False)
+    table.flags.writeable = False
     return table
 
 
 def find_encoding(
-    given: Encoding | None, path: Path, format_name: str, spec: oiio.ImageSpec, bits: int
+    given: Encoding | None, path: Path, format_name: str, spec: Any, bits: int
 ) -> tuple[Encoding, EncodingSource]:
     """What the user says, what a file says of its encoding, or what its format or its kind makes likely.
 
@@ -100,7 +100,7 @@ def find_encoding(
         given: by the user, or None.
         path: the file.
         format_name: OpenImageIO's name of the format.
-        spec: the header as OpenImageIO reads it.
+        spec: the header, an `OpenImageIO.ImageSpec`, which who only computes with encodings need not import.
         bits: bits per value as stored.
 
     Returns:
@@ -114,15 +114,15 @@ def find_encoding(
     stated = _stated(path, format_name, spec)
     if stated is not None:
         return stated, "file"
-    if spec.format.basetype in (oiio.FLOAT, oiio.HALF, oiio.DOUBLE):
+    if str(spec.format) in FLOATS:
         return "linear", "format"
     if format_name in _DISPLAY_FORMATS:
         return "srgb", "format"
     return ("srgb" if bits <= 8 else "linear"), "assumed"
 
 
-def _stated(path: Path, format_name: str, spec: oiio.ImageSpec) -> Encoding | None:
-    attributes: dict[str, Any] = {attribute.name: attribute.value for attribute in spec.extra_attribs}
+def _stated(path: Path, format_name: str, spec: Any) -> Encoding | None:
+    attributes = {attribute.name: attribute.value for attribute in spec.extra_attribs}
     if "ICCProfile" in attributes and "CICP" not in attributes:
         return _of_profile(path, np.asarray(attributes["ICCProfile"], np.uint8).tobytes())
     if attributes.get("Exif:ColorSpace") == 1:
@@ -150,9 +150,7 @@ def _of_profile(path: Path, profile: bytes) -> Encoding | None:
     try:
         (count,) = struct.unpack_from(">I", profile, 128)
         tags = [struct.unpack_from(">4sII", profile, 132 + 12 * tag) for tag in range(min(count, 100))]
-        curves: set[Encoding | None] = {
-            _of_curve(profile[start : start + size]) for kind, start, size in tags if kind[1:] == b"TRC"
-        }
+        curves = {_of_curve(profile[start : start + size]) for kind, start, size in tags if kind[1:] == b"TRC"}
     except (struct.error, ValueError):
         return None
     if len(curves) != 1 or None in curves:
@@ -174,6 +172,7 @@ def _of_curve(curve: bytes) -> Encoding | None:
         values = np.interp(at, np.linspace(0, 1, number), table / 65535) if number > 1 else at**gamma
     else:
         return None
-    known: tuple[Encoding, ...] = (float(gamma), "srgb", 2.2, 1.8)
-    found = [one for one in known if np.allclose(decode(at, one), values, rtol=0, atol=_CURVE_TOLERANCE)]
-    return parse_encoding("ICC profile", found[0]) if found else None
+    for known in (float(gamma), "srgb", 2.2, 1.8):
+        if np.allclose(decode(at, known), values, rtol=0, atol=_CURVE_TOLERANCE):
+            return parse_encoding("ICC profile", known)
+    return None

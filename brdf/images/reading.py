@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float32
 from brdf.errors import InputError
 from brdf.files import input_file, utf8_name
 from brdf.images.damage import check_content, check_header, check_memory
-from brdf.images.encoding import Encoding, EncodingSource, decode, decode_table, find_encoding, parse_encoding
+from brdf.images.encoding import FLOATS, Encoding, EncodingSource, decode, decode_table, find_encoding, parse_encoding
 
 LOSSY_TOP = 250 / 255
 """Share of the largest code from which on a file compressed with losses is clipped: at quality 75 a clipped area has
@@ -65,7 +65,7 @@ class Picture:
         factors = np.asarray(factor, np.float32)
         pixels, saturation = self.pixels * factors, self.saturation
         if saturation is not None and factors.size == 1:
-            saturation = saturation * float(factors.reshape(()))
+            saturation *= factors.item()
         elif saturation is not None:
             clipped = np.any(self.pixels >= saturation * (1 - 1e-6), axis=-1, keepdims=True)
             pixels, saturation = np.where(clipped, np.float32(np.nan), pixels), np.inf
@@ -121,18 +121,17 @@ class ImageReader:
         self._spec = spec = self._image.spec(self._part)
         check_header(self.path, spec)
         kind, name = spec.channelformat(self._colour[0]), self._image.format_name()
-        self.is_integer = kind.basetype not in (oiio.FLOAT, oiio.HALF, oiio.DOUBLE)
+        self.is_integer = str(kind) not in FLOATS
         stored = spec.get_int_attribute("oiio:BitsPerSample")
         self.bits = stored if self.is_integer and 0 < stored <= 32 else 8 * kind.basesize()
-        self.encoding: Encoding
-        self.source: EncodingSource
         self.encoding, self.source = find_encoding(given, self.path, name, spec, self.bits)
         lossy = name in ("jpeg", "webp", "heif") or spec.get_string_attribute("compression").startswith("jpeg")
         self._top = LOSSY_TOP if lossy else 1.0
-        self._turn = spec.get_int_attribute("Orientation", 1)
-        self._upright: np.ndarray | None = None
+        turn = spec.get_int_attribute("Orientation", 1)
+        self._turn = turn if turn in range(2, 9) else 1
+        self._upright = None
         height, width = spec.full_height, spec.full_width
-        self.shape = (*((width, height) if self._turn in (5, 6, 7, 8) else (height, width)), len(self._colour))
+        self.shape = (*((width, height) if self._turn > 4 else (height, width)), len(self._colour))
         below, right = spec.y - spec.full_y, spec.x - spec.full_x
         if not (-spec.height < below < height and -spec.width < right < width):
             raise InputError(self.path, "has no data inside its display window", "Make the file again")
@@ -175,7 +174,7 @@ class ImageReader:
         """
         if not 0 <= start <= stop <= self.shape[0]:
             raise IndexError(f"rows {start} to {stop} of a picture with {self.shape[0]} rows")
-        if self._turn not in range(2, 9):
+        if self._turn == 1:
             return self._shown(start, stop, self._colour, self.encoding)
         if self._upright is None:
             # A turned photograph cannot be had by rows; kept, it is read once.
@@ -199,27 +198,21 @@ class ImageReader:
         return _turned(self._shown(0, self._spec.full_height, [self._alpha], "linear"), self._turn)[..., 0]
 
     def _shown(self, start: int, stop: int, channels: list[int], encoding: Encoding) -> np.ndarray:
-        """Rows of the display window, not turned."""
+        """Rows of the display window, not turned; NaN where there are no data."""
         spec = self._spec
         top, left = spec.y - spec.full_y, spec.x - spec.full_x
-        if (top, left, spec.height, spec.width) == (0, 0, spec.full_height, spec.full_width):
-            return self._data(start, stop, channels, encoding)
         first, last = max(start, top), min(stop, top + spec.height)
-        shown = np.full((stop - start, spec.full_width, len(channels)), np.nan, np.float32)
-        if first < last:
-            columns = slice(max(left, 0), min(left + spec.width, spec.full_width))
-            data = self._data(first - top, last - top, channels, encoding)
-            shown[first - start : last - start, columns] = data[:, columns.start - left : columns.stop - left]
-        return shown
+        if first >= last:
+            return np.full((stop - start, spec.full_width, len(channels)), np.nan, np.float32)
+        begin, end = max(left, 0), min(left + spec.width, spec.full_width)
+        data = self._data(first - top, last - top, channels, encoding)[:, begin - left : end - left]
+        margins = ((first - start, stop - last), (begin, spec.full_width - end), (0, 0))
+        return np.pad(data, margins, constant_values=np.nan) if np.any(margins) else data
 
     def _data(self, first: int, last: int, channels: list[int], encoding: Encoding) -> np.ndarray:
         """Rows of the data window."""
-        low, high = min(channels), max(channels) + 1
         coded = self.is_integer and encoding != "linear"
-        kind = "uint16" if coded else "float"
-        pixels = _read_rows(self.path, self._image, self._part, (first, last), (low, high), kind)
-        if channels != list(range(low, high)):
-            pixels = pixels[..., [channel - low for channel in channels]]
+        pixels = _read_rows(self.path, self._image, self._part, first, last, channels, "uint16" if coded else "float")
         if not coded:
             return decode(pixels, encoding)
         table, values = decode_table(encoding, 16), np.empty(pixels.shape, np.float32)
@@ -230,7 +223,7 @@ class ImageReader:
 
 def _turned(stored: np.ndarray, turn: int) -> np.ndarray:
     """Turn a picture as the Exif orientation says (CIPA DC-008, 4.6.4.A)."""
-    if turn in (5, 6, 7, 8):
+    if turn > 4:
         stored = stored.swapaxes(0, 1)
     if turn in (2, 3, 6, 7):
         stored = stored[:, ::-1]
@@ -266,13 +259,13 @@ def said(source: Any, path: str | os.PathLike[str] = "") -> str:
     if path:
         name = re.escape(str(path))
         message = re.sub(f'( for)? [("]+{name}[)"]+|"{name}":? ', "", message).replace(str(path), "it")
-    line = next((line.strip() for line in message.splitlines() if line.strip()), "no reason given")
+    line, *_ = [line.strip() for line in message.splitlines() if line.strip()] or ["no reason given"]
     return (line if len(line) <= 200 else line[:197] + "...").rstrip(". ")
 
 
 def _layers(image: oiio.ImageInput) -> dict[tuple[int, str], dict[str, int]]:
     """The channels of each part and layer, by what comes after the last dot of their names."""
-    layers: dict[tuple[int, str], dict[str, int]] = {}
+    layers = {}
     for part in range(max(1, image.spec().get_int_attribute("oiio:subimages"))):
         for channel, name in enumerate(image.spec(part).channelnames):
             layer, _, ending = name.rpartition(".")
@@ -303,25 +296,27 @@ def _choose_channels(image: oiio.ImageInput) -> tuple[int, list[int], int | None
     return 0, rest or every, apart.get("A") if rest else None
 
 
-def _read_rows(
-    path: Path, image: oiio.ImageInput, part: int, rows: tuple[int, int], channels: tuple[int, int], kind: str
-) -> np.ndarray:
+def _read_rows(path, image, part: int, start: int, stop: int, channels: list[int], kind: str) -> np.ndarray:
     """Rows of the data window of a part, (rows, width, channels); OpenImageIO converts them to "float" or codes."""
     spec = image.spec(part)
-    first, last, skip = spec.y + rows[0], spec.y + rows[1], 0
+    low, high = min(channels), max(channels) + 1
+    first, last, skip = spec.y + start, spec.y + stop, 0
     if spec.tile_width:
         # OpenImageIO takes whole tiles only.
-        skip = rows[0] % spec.tile_height
-        last = min(spec.y - (-rows[1] // spec.tile_height) * spec.tile_height, spec.y + spec.height)
+        skip = start % spec.tile_height
+        last = min(spec.y - (-stop // spec.tile_height) * spec.tile_height, spec.y + spec.height)
         sides = (spec.x, spec.x + spec.width, first - skip, last, spec.z, spec.z + 1)
-        pixels = image.read_tiles(part, 0, *sides, *channels, kind)
+        pixels = image.read_tiles(part, 0, *sides, low, high, kind)
     else:
-        pixels = image.read_scanlines(part, 0, first, last, spec.z, *channels, kind)
+        pixels = image.read_scanlines(part, 0, first, last, spec.z, low, high, kind)
     complaint = said(image, path) if image.has_error else ""
     if pixels is None or (complaint and not any(remark in complaint for remark in _HARMLESS)):
-        what = f"is damaged: rows {rows[0]} to {rows[1]} of {spec.height} cannot be read ({complaint or 'no data'})"
+        what = f"is damaged: rows {start} to {stop} of {spec.height} cannot be read ({complaint or 'no data'})"
         raise InputError(path, what, "Make the file again")
-    return pixels.reshape(-1, spec.width, channels[1] - channels[0])[skip : skip + rows[1] - rows[0]]
+    pixels = pixels.reshape(-1, spec.width, high - low)[skip : skip + stop - start]
+    if channels == list(range(low, high)):
+        return pixels
+    return pixels[..., [channel - low for channel in channels]]
 
 
 def read_image(
@@ -383,14 +378,14 @@ def read_mask(path: str | os.PathLike[str]) -> Bool[np.ndarray, "height width"]:
     """
     with ImageReader(path, encoding="linear") as reader:
         alpha = reader.read_alpha()
-        inside = None if alpha is None else _over_half(alpha)
-        if inside is None or inside.all() or not inside.any():
+        inside = _over_half(np.zeros(1) if alpha is None else alpha)
+        if inside.all() or not inside.any():
             with np.errstate(over="ignore", invalid="ignore"):  # NaN and infinite values are passed on
                 inside = _over_half(reader.read().mean(axis=-1))
     return inside
 
 
-def _over_half(values: Float32[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
+def _over_half(values: np.ndarray) -> np.ndarray:
     values = np.nan_to_num(values, copy=False, nan=0.0)
     return values > 0.5 * values.max()
 
@@ -419,10 +414,10 @@ def read_layers(path: str | os.PathLike[str]) -> dict[str, Float32[np.ndarray, "
     for spec in specs.values():
         check_header(file, spec)
     check_memory(file, sum(spec.width * spec.height * spec.nchannels for spec in specs.values()))
-    layers: dict[str, np.ndarray] = {}
+    layers = {}
     for part, spec in specs.items():
         own = spec.get_string_attribute("oiio:subimagename", str(part)) if len(specs) > 1 else ""
-        pixels = _read_rows(file, image, part, (0, spec.height), (0, spec.nchannels), "float")
+        pixels = _read_rows(file, image, part, 0, spec.height, list(range(spec.nchannels)), "float")
         for (of_part, layer), at in found.items():
             usual = sorted(at, key="RGBAXYZUV".find) if set(at) <= set("RGBAXYZUV") else list(at)
             if of_part == part:

@@ -7,7 +7,6 @@ from typing import Any, Literal
 
 import numpy as np
 import OpenImageIO as oiio  # noqa: N813
-from jaxtyping import Float32
 
 from brdf.errors import InputError
 from brdf.files import atomic_path, utf8_name
@@ -123,7 +122,7 @@ def _format(path: str | os.PathLike[str], dtype: str | None) -> tuple[str, str]:
     return suffix, dtype or next(iter(kinds))
 
 
-def _pixels(path: str | os.PathLike[str], array: Any) -> Float32[np.ndarray, "height width channels"]:
+def _pixels(path: object, array: Any) -> np.ndarray:
     try:
         pixels = np.asarray(array)
         pixels = np.asarray(pixels, np.float32) if pixels.dtype.kind in "fiub" else None
