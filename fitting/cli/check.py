@@ -9,7 +9,7 @@ import typer
 import brdf
 from brdf.errors import InputError
 from brdf.files import atomic_path
-from fitting.cli.common import find_materials, show, use_compilation_cache, waiting
+from fitting.cli.common import AsJson, find_materials, show, use_compilation_cache, waiting
 
 EXAMPLE = (
     "Example: [bold]brdf check material.json[/bold]\n\n"
@@ -25,7 +25,7 @@ def check(
             help="A .json, .mtl (every material is checked) or measured BRDF file, or a name of the classic table."
         ),
     ],
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")] = False,
+    as_json: AsJson = False,
     plot: Annotated[Path | None, typer.Option(help="A picture of albedo, lobe and reciprocity to write.")] = None,
 ) -> int:
     """Is a material plausible: positive, reciprocal, energy conserving? Exit 0 if so, 1 if not, 2 if it cannot tell."""

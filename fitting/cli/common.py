@@ -9,7 +9,6 @@ import functools
 import inspect
 import os
 import sys
-import typing
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -39,6 +38,12 @@ Encoding = Annotated[
         metavar="TEXT",
     ),
 ]
+
+
+Model = Annotated[str, typer.Option(help=f"One of {', '.join(MODEL_NAMES)}.")]
+Precision = Annotated[str, typer.Option(help="float32 or float64.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
+AMaterial = Annotated[str, typer.Argument(help="A .json or .mtl file, or a name of the classic table: emerald.")]
 
 
 def _option(said: str, *names: str) -> Any:
@@ -81,25 +86,20 @@ def as_command(function: Callable[..., Any]) -> Callable[..., Any]:
     Args:
         function: what the command does.
     """
-    own = inspect.signature(function)
-    parameters = [one.replace(kind=one.KEYWORD_ONLY) for one in own.parameters.values() if one.name != "pictures"]
-    if "pictures" in own.parameters:
-        hints = typing.get_type_hints(PictureOptions, include_extras=True)
-        parameters += [
-            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=hints[name])
-            for name, default in PictureOptions._field_defaults.items()
-        ]
+    own = inspect.signature(function).parameters
+    shown = inspect.signature(PictureOptions).parameters if "pictures" in own else {}
 
     @functools.wraps(function)
     def command(**given: Any) -> Any:
         options = {name: value for name, value in given.items() if name not in ("target", "material")}
         typed = {name: value if isinstance(value, Path) else f"--{name}" for name, value in options.items()}
-        if "pictures" in own.parameters:
-            given["pictures"] = PictureOptions(**{name: given.pop(name) for name in PictureOptions._fields})
+        if shown:
+            given["pictures"] = PictureOptions(**{name: given.pop(name) for name in shown})
         with named_as(typed | {"circle": "--sphere"}):
             return function(**given)
 
-    command.__signature__ = own.replace(parameters=parameters)  # pyright: ignore[reportAttributeAccessIssue]
+    every = [one.replace(kind=one.KEYWORD_ONLY) for one in (*own.values(), *shown.values()) if one.name != "pictures"]
+    command.__signature__ = inspect.Signature(every)  # pyright: ignore[reportAttributeAccessIssue]
     return command
 
 

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 import brdf
-from fitting.cli.common import find_material, show
+from fitting.cli.common import AMaterial, find_material, show
 
 EXAMPLE = (
     "Example: [bold]brdf convert material.json material.gltf[/bold]\n\n"
@@ -15,7 +15,7 @@ EXAMPLE = (
 
 
 def convert(
-    material: Annotated[str, typer.Argument(help="A .json or .mtl file, or a name of the classic table: emerald.")],
+    material: AMaterial,
     out: Annotated[
         Path, typer.Argument(help="The file to write: .json .mtl .gltf .xml (Mitsuba) .glsl .py (PyTorch3D).")
     ],

@@ -25,7 +25,7 @@ LESS = 0.9
 CLEARLY = 0.5
 
 
-def fit_either(given: Given, how: dict[str, Any]) -> tuple[FitResult, tuple[str, ...]]:
+def fit_either(given: Given, **how: Any) -> tuple[FitResult, tuple[str, ...]]:
     """Fit, where a file does not say how it is encoded under both interpretations.
 
     Args:
@@ -39,46 +39,38 @@ def fit_either(given: Given, how: dict[str, Any]) -> tuple[FitResult, tuple[str,
         InputError: naming the file or option.
     """
     silent = {path: picture for path, picture in given.pictures.items() if picture.source == "assumed"}
-    if silent and how.get("seconds") is not None:
-        how = how | {"seconds": how["seconds"] / 2}
-    inputs = collect(given, given.pictures)
-    result = _fit(inputs, how)
+    if silent and how["seconds"] is not None:
+        how["seconds"] /= 2
+    inputs, result = _fit(given, {}, how)
     if not silent:
         return result, inputs.notes
     try:
         others = {path: brdf.read_picture(path, encoding=_other(picture)) for path, picture in silent.items()}
-        other_inputs = collect(given, given.pictures | others)
-        other = _fit(other_inputs, how)
+        other_inputs, other = _fit(given, others, how)
     except InputError:
         return result, inputs.notes  # under the other encoding it cannot be fitted at all
     # To be compared where both count: each leaves out what under its own encoding is cut off.
     both = [mine & its for mine, its in zip(result.counted, other.counted, strict=True)]
     common = both if all(counted.any() for counted in both) else None
-    shares = unexplained(inputs, result, common), unexplained(other_inputs, other, common)
-    is_other, warning = judge(inputs.target, next(iter(silent.values())), shares)
+    shares = _unexplained(inputs, result, common), _unexplained(other_inputs, other, common)
+    is_other, warning = judge(given.targets[0], next(iter(silent.values())), shares)
     if is_other:
         result, inputs = other, other_inputs
-    warnings = (*result.warnings, warning) if warning else result.warnings
-    return dataclasses.replace(result, warnings=warnings), inputs.notes
+    return dataclasses.replace(result, warnings=(*result.warnings, *warning)), inputs.notes
 
 
-def _fit(inputs: FitInputs, how: dict[str, Any]) -> FitResult:
-    with named_as({"target": inputs.target}):
-        return fitting.fit(inputs.pictures, inputs.scenes, mask=inputs.masks, **how)
+def _fit(given: Given, others: dict[Path, brdf.Picture], how: dict[str, Any]) -> tuple[FitInputs, FitResult]:
+    inputs = collect(given, given.pictures | others)
+    with named_as({"target": given.targets[0]}):
+        return inputs, fitting.fit(inputs.pictures, inputs.scenes, mask=inputs.masks, **how)
 
 
 def _other(picture: brdf.Picture) -> Any:
     return "srgb" if picture.encoding == "linear" else "linear"
 
 
-def unexplained(inputs: FitInputs, result: FitResult, counted: list[np.ndarray] | None) -> float:
-    """What a fit leaves of the codes in the files: the share of their squares.
-
-    Args:
-        inputs: what was fitted.
-        result: the fit of it.
-        counted: pixels to compare in each picture; None for those that the fit counts.
-    """
+def _unexplained(inputs: FitInputs, result: FitResult, counted: list[np.ndarray] | None) -> float:
+    """What a fit leaves of the codes in the files: the share of their squares; None for the pixels that it counts."""
     left = total = 0.0
     for picture, scene, some in zip(inputs.pictures, result.scenes, counted or result.counted, strict=True):
         model = np.broadcast_to(brdf.render(result.material, scene), picture.pixels.shape)
@@ -86,14 +78,13 @@ def unexplained(inputs: FitInputs, result: FitResult, counted: list[np.ndarray] 
             encode(np.ascontiguousarray((values / picture.factor)[some], np.float32), picture.encoding)
             for values in (picture.pixels, model)
         )
-        left += (
-            float(np.sum((codes.astype(np.float64) - fitted) ** 2)) + codes.size * (picture.code_step or 0) ** 2 / 12
-        )
-        total += float(np.sum(codes.astype(np.float64) ** 2))
+        codes = codes.astype(np.float64)
+        left += np.sum((codes - fitted) ** 2) + codes.size * (picture.code_step or 0) ** 2 / 12
+        total += np.sum(codes**2)
     return left / total
 
 
-def judge(target: Path, picture: brdf.Picture, shares: tuple[float, float]) -> tuple[bool, str]:
+def judge(target: Path, picture: brdf.Picture, shares: tuple[float, float]) -> tuple[bool, list[str]]:
     """Which of two encodings to keep, and what to say about it.
 
     Args:
@@ -102,11 +93,11 @@ def judge(target: Path, picture: brdf.Picture, shares: tuple[float, float]) -> t
         shares: what is left as assumed, and the other way.
 
     Returns:
-        Whether it is the other one; and a warning, empty where the pictures speak clearly for what was assumed.
+        Whether it is the other one; and the warning, none where the pictures speak clearly for what was assumed.
     """
     assumed, other = shares
     if assumed < CLEARLY * other:
-        return False, ""
+        return False, []
     is_other, is_clear = other < LESS * assumed, other < CLEARLY * assumed
     names = ["sRGB" if one == "srgb" else str(one) for one in (picture.encoding, _other(picture))]
     left = [f"{100 * share**0.5:.{2 if share < 0.99 else 3}g} %" for share in shares]
@@ -115,4 +106,4 @@ def judge(target: Path, picture: brdf.Picture, shares: tuple[float, float]) -> t
     off = f"the fit is off by {least} of the values in the file (rms), under {refused} by {most}"
     know = "Where you know better" if is_clear else "Where you know"
     silent = f"{target.name} does not say how its values are encoded"
-    return is_other, f"{silent}: {reads} {off}. {know}, say so with --encoding"
+    return is_other, [f"{silent}: {reads} {off}. {know}, say so with --encoding"]

@@ -12,7 +12,16 @@ import typer
 import brdf
 from brdf.errors import InputError
 from brdf.files import check_folder, write_text
-from fitting.cli.common import MODEL_NAMES, PictureOptions, named_as, show, use_compilation_cache, waiting
+from fitting.cli.common import (
+    AsJson,
+    Model,
+    PictureOptions,
+    Precision,
+    named_as,
+    show,
+    use_compilation_cache,
+    waiting,
+)
 
 EXAMPLE = "\n\n".join(
     [
@@ -31,9 +40,9 @@ def fit(
         typer.Argument(help="A picture; a folder with target.* and scene.toml; photographs; an .npz; a measured BRDF."),
     ],
     pictures: PictureOptions,
-    model: Annotated[str, typer.Option(help=f"One of {', '.join(MODEL_NAMES)}.")] = "auto",
+    model: Model = "auto",
     out: Annotated[Path | None, typer.Option(help="A folder for material.json, material.mtl, fitted.exr, ...")] = None,
-    precision: Annotated[str, typer.Option(help="float32 or float64.")] = "float32",
+    precision: Precision = "float32",
     dark: Annotated[float | None, typer.Option(help="Linear values up to here are too dark to count.")] = None,
     noise: Annotated[
         str | None, typer.Option(help="READ,SHOT of the camera: the variance is READ² + SHOT·value.")
@@ -48,7 +57,7 @@ def fit(
     seconds: Annotated[float | None, typer.Option(help="Time to spend: the most accurate fit that it buys.")] = None,
     plot: Annotated[bool, typer.Option("--plot", help="Also draw comparison.png into --out.")] = False,
     report: Annotated[Path | None, typer.Option(help="One .html page with everything, to keep or to send.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Fit a model to a picture: value ± error of every parameter, with no guess to give."""
     from brdf.measured.loading import is_measured
@@ -63,23 +72,27 @@ def fit(
     notes: tuple[str, ...] = ()
     with waiting("fitting"):
         if len(target) == 1 and is_measured(target[0]):
-            given = any(option is not None for option in (dark, noise, accuracy, seconds, report))
-            if given or plausible or plot or precision != "float32" or pictures != PictureOptions():
+            if any([*pictures, dark, noise, plausible, accuracy, seconds, plot, report, precision != "float32"]):
                 came = "is a measured BRDF; of the options only --model, --loss, --out and --json concern it"
                 raise InputError(target[0], came, "Leave the others out")
-            result = _fit_table(target[0], model, loss or "cosine")
+            table = brdf.load_measured(target[0])
+            use_compilation_cache()
+            import fitting
+
+            with named_as({table.name: target[0]}):
+                result = fitting.fit_brdf(table, model, loss=loss or "cosine")  # pyright: ignore[reportArgumentType]
         else:
             result, notes = _fit_pictures(
                 target,
                 pictures,
+                noise,
+                accuracy,
                 model=model,
                 precision=precision,
                 saturation=pictures.saturation,
                 dark=dark,
-                noise=noise,
                 plausible=plausible,
                 loss=loss or "squared",
-                accuracy=accuracy,
                 seconds=seconds,
             )
         if out is not None:
@@ -97,18 +110,7 @@ def fit(
     show("\n".join([*notes, str(result), *saved, *written]))
 
 
-def _fit_table(path: Path, model: str, loss: str) -> Any:
-    table = brdf.load_measured(path)
-    use_compilation_cache()
-    import fitting
-
-    with named_as({table.name: path}):
-        return fitting.fit_brdf(table, model, loss=loss)  # pyright: ignore[reportArgumentType]  # refused there
-
-
-def _fit_pictures(
-    target: list[Path], pictures: PictureOptions, *, noise: str | None, **how: Any
-) -> tuple[Any, tuple[str, ...]]:
+def _fit_pictures(target: Any, pictures: Any, noise: Any, accuracy: Any, **how: Any) -> tuple[Any, tuple[str, ...]]:
     """The fit, and what was found out on the way."""
     from fitting.cli.inputs import read_inputs
     from fitting.photographs.light_files import parse_numbers
@@ -119,7 +121,7 @@ def _fit_pictures(
     from fitting.cli.encoding_trial import fit_either
 
     how["noise"] = None if noise is None else tuple(parse_numbers(noise, "--noise", 2, "READ,SHOT"))
-    how["accuracy"] = None if how["accuracy"] is None else OnlyFit(how["accuracy"])
-    result, notes = fit_either(given, how)
+    how["accuracy"] = None if accuracy is None else OnlyFit(accuracy)
+    result, notes = fit_either(given, **how)
     names = tuple(path.name for path in given.pictures)
     return (dataclasses.replace(result, names=names) if len(names) == len(result.targets) else result), notes

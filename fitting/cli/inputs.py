@@ -4,6 +4,7 @@
 `collect` makes pictures and scenes of the rest.
 """
 
+import itertools
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -48,14 +49,12 @@ class FitInputs(NamedTuple):
         pictures: as many as scenes.
         scenes: what they show.
         masks: pixels that count in each, or None for all.
-        target: the first picture's file, for messages.
         notes: what was found out on the way, for the person who waits.
     """
 
     pictures: list[brdf.Picture]
     scenes: list["brdf.Scene"]
     masks: list[Array | None]
-    target: Path
     notes: tuple[str, ...] = ()
 
 
@@ -75,10 +74,9 @@ def read_inputs(targets: list[Path], options: PictureOptions) -> Given:
             input_file(beside)
     if _is_archive(targets):
         return Given(targets, options, {})
-    scene, circle, resolution = None, None, None
-    if options.sphere is not None:
-        circle = None if options.sphere == "mask" else parse_circle(options.sphere)
-    elif options.normals is None:
+    circle = None if options.sphere in (None, "mask") else parse_circle(options.sphere)
+    scene, resolution = None, None
+    if options.sphere is None and options.normals is None:
         target, file = _target_and_scene(targets[0], options.scene)
         targets, scene = [target], (file, read_toml(file))
         camera = scene[1].get("camera")
@@ -89,7 +87,7 @@ def read_inputs(targets: list[Path], options: PictureOptions) -> Given:
     sizes = ", ".join(f"{shape[1]} x {shape[0]} x {shape[2]}" for shape in shapes)
     came = f"and the others differ in size ({sizes})"
     _require(len(shapes) == 1, targets[0], came, "Give pictures of one camera")
-    if isinstance(resolution, list) and resolution != [width, height] and all(type(side) is int for side in resolution):
+    if isinstance(resolution, list) and resolution != [width, height]:
         came = f"is {width} x {height}, the scene's camera {' x '.join(map(str, resolution))}"
         raise InputError(targets[0], came, "Give a picture and a camera of the same resolution")
     if circle is not None:
@@ -108,22 +106,21 @@ def _require(fine: Any, where: object, came: str, remedy: str) -> None:
 
 def _check_options(targets: list[Path], options: PictureOptions) -> None:
     """Refuse options that do not belong together."""
-    lights = ("light", "lights", "intensities")
+    refused = ("light", "lights", "intensities")
+    came, remedy = "says where the light is, but nothing what the picture shows", "Add --sphere x,y,radius"
     if _is_archive(targets):
+        refused += ("scene", "sphere", "normals", "encoding")
         came, remedy = f"is what {targets[0].name} says itself", "Leave it out"
-        for name in ("scene", "sphere", "normals", *lights, "encoding"):
-            _require(getattr(options, name) is None, f"--{name}", came, remedy)
     elif options.sphere is not None or options.normals is not None:
         remedy = "Give one of them"
         _require(options.scene is None, "--scene", "says what --sphere or --normals says too", remedy)
         _require(None in (options.sphere, options.normals), "--normals", "says what --sphere says too", remedy)
-        fine = (options.light is None) != (options.lights is None)
         came, remedy = "or --lights has to say where the light is", "Give x,y,z, fit, or a file of directions"
-        _require(fine, "--light", came, remedy)
-    else:
-        came = "says where the light is, but nothing what the picture shows"
-        for name in lights:
-            _require(getattr(options, name) is None, f"--{name}", came, "Add --sphere x,y,radius")
+        _require((options.light is None) != (options.lights is None), "--light", came, remedy)
+        return
+    for name in refused:
+        _require(getattr(options, name) is None, f"--{name}", came, remedy)
+    if not _is_archive(targets):
         remedy = "Leave it out, or add [ambient] to the scene"
         _require(not options.ambient, "--ambient", "is what the scene file says", remedy)
         remedy = "Several pictures are fitted with --sphere or --normals, and --lights"
@@ -132,23 +129,24 @@ def _check_options(targets: list[Path], options: PictureOptions) -> None:
 
 def _target_and_scene(target: Path, scene: Path | None) -> tuple[Path, Path]:
     """The picture and the scene file that a file, or a folder with both, stands for."""
-    if not target.is_dir():
-        input_file(target)
+    if target.is_dir():
+        found = sorted(path for path in target.glob("target.*") if path.is_file())
+        _require(found, target, "has no file target.*", "Give the picture, or a folder that holds it")
+        came = f"has several targets, {', '.join(path.name for path in found)}"
+        _require(len(found) == 1, target, came, "Name the picture instead of the folder")
+        return found[0], scene or target / "scene.toml"
+    input_file(target)
+    if scene is None:
         remedy = "Add --scene SCENE.toml, or --sphere for a photo of a ball"
-        _require(scene, target, "comes without a scene", remedy)
-    else:
-        candidates = sorted(path for path in target.glob("target.*") if path.is_file())
-        _require(candidates, target, "has no file target.*", "Give the picture, or a folder that holds it")
-        came = f"has several targets, {', '.join(path.name for path in candidates)}"
-        _require(len(candidates) == 1, target, came, "Name the picture instead of the folder")
-        scene = scene or target / "scene.toml"
-        target = candidates[0]
-    assert scene is not None
+        raise InputError(target, "comes without a scene", remedy)
     return target, scene
 
 
 def collect(given: Given, read: dict[Path, brdf.Picture]) -> FitInputs:
     """What the command was given, ready to fit.
+
+    Photographs come as under light of intensity 1, so that each counts alike however bright its light was. Ambient
+    light is taken to be the same in all of them, and its intensity, which nobody knows, as 1.
 
     Args:
         given: as `read_inputs` read it.
@@ -157,31 +155,44 @@ def collect(given: Given, read: dict[Path, brdf.Picture]) -> FitInputs:
     Raises:
         InputError: naming the file or option.
     """
-    targets, options = given.targets, given.options
-    if _is_archive(targets):
-        return _archive(targets[0], options)
+    targets, options, _, scene = given
     mask = None if options.mask is None else brdf.read_mask(options.mask)
-    pictures = _exposed([read[target] for target in targets], options.exposure)
-    masks = visible(mask, pictures)
-    if given.scene is None:
-        return _photographs(targets, options, pictures, mask, masks)
-    from brdf.scene import load_scene
+    named: dict[str, Any] = {}
+    if _is_archive(targets):
+        pictures, points, directions, intensities = _read_photographs(targets[0], mask)
+        pictures, masks, notes = _exposed(pictures, options.exposure), [None] * len(pictures), ()
+        named = {"direction": f"{targets[0]}: light_dirs", "intensity": f"{targets[0]}: light_intensities"}
+    else:
+        pictures = _exposed([read[target] for target in targets], options.exposure)
+        masks = visible(mask, pictures)
+        if scene is not None:
+            from brdf.scene import load_scene
 
-    file, tables = given.scene
-    return FitInputs(pictures, [load_scene(file, options.within, tables)], masks, targets[0])
+            return FitInputs(pictures, [load_scene(scene[0], options.within, scene[1])], masks)
+        points, directions, intensities, notes = _photographs(targets, options, pictures, mask, masks)
+    from fitting.photographs.distant_light import photograph_scene
+
+    around = np.ones((len(pictures), 1))
+    if np.all(intensities > 0):
+        pictures = [picture.scaled(1.0 / intensity) for picture, intensity in zip(pictures, intensities, strict=True)]
+        intensities, around = around, 1.0 / intensities
+    with named_as(named):
+        scenes = [
+            photograph_scene(points, direction, intensity, ambient=ambient if options.ambient else None)
+            for direction, intensity, ambient in zip(directions, intensities, around, strict=True)
+        ]
+    return FitInputs(pictures, scenes, masks, notes)
 
 
 def _exposed(pictures: list[brdf.Picture], exposure: str | None) -> list[brdf.Picture]:
     """Pictures in one unit, by one relative exposure or one for each, as typed."""
     if exposure is None:
         return pictures
-    count = len(exposure.replace(",", " ").split())
-    count = count if count == len(pictures) else 1
+    count = len(pictures) if len(exposure.replace(",", " ").split()) == len(pictures) else 1
     factors = parse_numbers(exposure, "--exposure", count, "one number, or one each")
-    came, remedy = f"must be above 0, got {exposure[:60]!r}", "Give a relative exposure time"
-    _require(min(factors) > 0, "--exposure", came, remedy)
-    factors = factors * (len(pictures) // count)
-    return [picture.scaled(1.0 / factor) for picture, factor in zip(pictures, factors, strict=True)]
+    came = f"must be above 0, got {exposure[:60]!r}"
+    _require(min(factors) > 0, "--exposure", came, "Give a relative exposure time")
+    return [picture.scaled(1.0 / factor) for picture, factor in zip(pictures, itertools.cycle(factors), strict=False)]
 
 
 def visible(mask: Array | None, pictures: list[brdf.Picture]) -> list[Array | None]:
@@ -197,11 +208,10 @@ def visible(mask: Array | None, pictures: list[brdf.Picture]) -> list[Array | No
     masks = []
     for picture in pictures:
         shape, alpha = picture.pixels.shape[:2], picture.alpha
-        counts = None if alpha is None or not alpha.any() else alpha > 0
+        counts = alpha > 0 if alpha is not None and alpha.any() else None
         if mask is not None:
-            _require(
-                mask.shape == shape, "mask", f"is of shape {mask.shape}, the target {shape}", "Give a value per pixel"
-            )
+            came = f"is of shape {mask.shape}, the target {shape}"
+            _require(mask.shape == shape, "mask", came, "Give a value per pixel")
             counts = mask if counts is None else counts & mask
         masks.append(counts)
     return masks
@@ -224,20 +234,13 @@ def ball_in(sphere: str, mask: Array | None) -> tuple[Circle, tuple[str, ...]]:
     return circle, (f"ball found at {circle.x:.2f},{circle.y:.2f},{circle.radius:.2f}",)
 
 
-def _photographs(
-    targets: list[Path],
-    options: PictureOptions,
-    pictures: list[brdf.Picture],
-    mask: Array | None,
-    masks: list[Array | None],
-) -> FitInputs:
-    """Photographs of one size under one distant light each."""
+def _photographs(targets: list[Path], options: PictureOptions, pictures: Any, mask: Any, masks: Any) -> Any:
+    """What the pixels of photographs under one distant light each see, the lights, and what to tell of it."""
     count, (height, width, channels), notes = len(targets), pictures[0].pixels.shape, ()
-    if options.sphere is not None:
-        circle, notes = ball_in(options.sphere, mask)
+    if options.normals is None:
+        circle, notes = ball_in(options.sphere or "", mask)
         points = ball_points((height, width), circle)
     else:
-        assert options.normals is not None
         with named_as({"normal": options.normals}):
             points = brdf.SurfacePoints.from_normals(_read_normals(options.normals))
         came = f"is {points.mask.shape[1]} x {points.mask.shape[0]}, the pictures {width} x {height}"
@@ -246,8 +249,7 @@ def _photographs(
         directions = read_directions(options.lights, count)
     elif options.light == "fit":
         found = [light_of(*one, points, options) for one in zip(targets, pictures, masks, strict=True)]
-        directions = np.array([light.direction for light in found])
-        mean = sum(light.strength for light in found) / count
+        directions, mean = [light.direction for light in found], sum(light.strength for light in found) / count
         for target, light in zip(targets, found, strict=True):
             brighter = f", {100 * (light.strength / mean - 1):+.1f} % bright" if count > 1 else ""
             direction = ",".join(f"{value:.4f}" for value in light.direction)
@@ -255,14 +257,13 @@ def _photographs(
     else:
         direction = parse_numbers(options.light or "", "--light", 3, "x,y,z: x right, y up, z to the camera; or fit")
         _require(any(direction), "--light", "must not have zero length, got 0,0,0", "Give a direction")
-        directions = np.tile(direction, (count, 1))
+        directions = [direction] * count
     intensities = np.ones((count, 1))
     if options.intensities is not None:
         intensities = read_intensities(options.intensities, count)
         came = f"has {intensities.shape[1]} numbers a line, the pictures {channels} channels"
-        fine = intensities.shape[1] in (1, channels)
-        _require(fine, options.intensities, came, "Give one intensity per channel")
-    return FitInputs(*_of_intensity_1(pictures, points, directions, intensities, options), masks, targets[0], notes)
+        _require(intensities.shape[1] in (1, channels), options.intensities, came, "Give one intensity per channel")
+    return points, directions, intensities, notes
 
 
 def light_of(
@@ -286,10 +287,9 @@ def light_of(
     """
     from fitting.photographs.distant_light import light_from_shading
 
+    counts = True if mask is None else mask
     with named_as({"picture": target}):
-        counts = True if mask is None else mask
-        how = {"saturation": options.saturation, "mask": counts, "ambient": options.ambient}
-        return light_from_shading(picture, points, **how)
+        return light_from_shading(picture, points, saturation=options.saturation, mask=counts, ambient=options.ambient)
 
 
 def stated_error(light: Any) -> str:
@@ -299,30 +299,6 @@ def stated_error(light: Any) -> str:
         light: as the shading tells it.
     """
     return f"± {light.error:.2g}°{THIN_CRESCENT if light.direction[2] < BEHIND else ''}"
-
-
-def _of_intensity_1(
-    pictures: list[brdf.Picture],
-    points: "brdf.SurfacePoints",
-    directions: Array,
-    intensities: Array,
-    options: PictureOptions,
-) -> tuple[list[brdf.Picture], list["brdf.Scene"]]:
-    """Pictures as under light of intensity 1, so that every photograph counts alike however bright its light was.
-
-    Ambient light is taken to be the same in all of them, and its intensity, which nobody knows, as 1.
-    """
-    from fitting.photographs.distant_light import photograph_scene
-
-    around = np.ones((len(pictures), 1))
-    if np.all(intensities > 0):
-        pictures = [picture.scaled(1.0 / intensity) for picture, intensity in zip(pictures, intensities, strict=True)]
-        intensities, around = around, 1.0 / intensities
-    scenes = [
-        photograph_scene(points, direction, intensity, ambient=ambient if options.ambient else None)
-        for direction, intensity, ambient in zip(directions, intensities, around, strict=True)
-    ]
-    return pictures, scenes
 
 
 def _read_normals(path: Path) -> Array:
@@ -339,15 +315,16 @@ def _read_normals(path: Path) -> Array:
     return np.where(empty[..., None], 0.0, normal)
 
 
-def _archive(path: Path, options: PictureOptions) -> FitInputs:
-    """Photographs with normals and lights: images (K, H, W[, C]), normal (H, W, 3), light_dirs (K, 3).
+def _read_photographs(path: Path, mask: Any) -> Any:
+    """Pictures, points, directions and intensities of an archive.
 
-    And where there are: light_intensities (K, C), mask (H, W). Unsigned images span their type.
+    It holds images (K, H, W[, C]), normal (H, W, 3) and light_dirs (K, 3), and may hold light_intensities (K, C) and
+    mask (H, W). Unsigned images span their type.
     """
     arrays = read_archive(path)
     images, normal, directions = arrays["images"], arrays["normal"], arrays["light_dirs"]
-    remedy = "Save unsigned integers, which span their type, or floats"
     came = f"holds {images.dtype}, of which it is not clear what is white"
+    remedy = "Save unsigned integers, which span their type, or floats"
     _require(images.dtype.kind not in "bi", f"{path}: images", came, remedy)
     images = images[..., None] if images.ndim == 3 else images
     remedy = "Give (pictures, height, width, channels)"
@@ -355,26 +332,20 @@ def _archive(path: Path, options: PictureOptions) -> FitInputs:
     count, height, width, channels = images.shape
     intensities = arrays.get("light_intensities", np.ones(count))
     intensities = intensities[:, None] if intensities.ndim == 1 else intensities
-    mask = arrays.get("mask", np.ones((height, width))) if options.mask is None else brdf.read_mask(options.mask)
-    wanted = {
-        "normal": (normal, (height, width, 3)),
-        "light_dirs": (directions, (count, 3)),
-        "light_intensities": (intensities, (count, 1 if intensities.shape[1:] == (1,) else channels)),
-        "mask": (mask, (height, width)),
-    }
-    for name, (array, shape) in wanted.items():
+    mask = arrays.get("mask", np.ones((height, width))) if mask is None else mask
+    for name, array, shape in (
+        ("normal", normal, (height, width, 3)),
+        ("light_dirs", directions, (count, 3)),
+        ("light_intensities", intensities, (count, 1 if intensities.shape[1:] == (1,) else channels)),
+        ("mask", mask, (height, width)),
+    ):
         _require(array.shape == shape, f"{path}: {name}", f"is of shape {array.shape}", f"Give {shape}")
     points = brdf.SurfacePoints.from_normals(normal, mask=mask != 0)
     came = "has no normal" if np.all(mask) else "has no normal inside the mask"
     _require(np.any(points.mask), f"{path}: normal", came, "Give a direction (x, y, z) where the surface is")
-    pictures = _exposed([_as_picture(image) for image in images], options.exposure)
-    with named_as({"direction": f"{path}: light_dirs", "intensity": f"{path}: light_intensities"}):
-        inputs = _of_intensity_1(pictures, points, directions, intensities, options)
-    return FitInputs(*inputs, [None] * count, path)
-
-
-def _as_picture(image: Array) -> brdf.Picture:
-    """An array as the picture it would be in a file: linear, integers with their largest code."""
-    is_code = image.dtype.kind == "u"
-    pixels = (image / float(np.iinfo(image.dtype).max if is_code else 1)).astype(np.float32)
-    return brdf.Picture(pixels, None, "linear", "format", 8 * image.dtype.itemsize, 1.0 if is_code else None)
+    # As in a file: linear, integers with their largest code.
+    is_code = images.dtype.kind == "u"
+    bits, pixels = 8 * images.dtype.itemsize, images / float(np.iinfo(images.dtype).max if is_code else 1)
+    top = 1.0 if is_code else None
+    pictures = [brdf.Picture(one, None, "linear", "format", bits, top) for one in pixels.astype(np.float32)]
+    return pictures, points, directions, intensities

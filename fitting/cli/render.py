@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 import brdf
-from fitting.cli.common import find_material, named_as, show, use_compilation_cache, waiting
+from fitting.cli.common import AMaterial, Precision, find_material, named_as, show, use_compilation_cache, waiting
 
 EXAMPLE = (
     "Example: [bold]brdf render material.json --scene scene.toml -o picture.exr[/bold]\n\n"
@@ -15,10 +15,10 @@ EXAMPLE = (
 
 
 def render(
-    material: Annotated[str, typer.Argument(help="A .json or .mtl file, or a name of the classic table: emerald.")],
+    material: AMaterial,
     scene: Annotated[Path, typer.Option(help="The scene file.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="The picture to write: .exr, .hdr, .png, .tiff or .jpg.")],
-    precision: Annotated[str, typer.Option(help="float32 or float64.")] = "float32",
+    precision: Precision = "float32",
 ) -> None:
     """Render a material in a scene."""
     with waiting("rendering"), named_as({"material": material}):

@@ -9,7 +9,7 @@ import typer
 
 from brdf.errors import InputError
 from brdf.files import check_folder
-from fitting.cli.common import MODEL_NAMES, PictureOptions, named_as, show, use_compilation_cache
+from fitting.cli.common import AsJson, Model, PictureOptions, named_as, show, use_compilation_cache
 
 EXAMPLE = (
     "Example: [bold]brdf tradeoff photo.exr --scene scene.toml --out tradeoff/[/bold]\n\n"
@@ -23,11 +23,11 @@ def tradeoff(
     ],
     pictures: PictureOptions,
     out: Annotated[Path | None, typer.Option(help="A folder for tradeoff.csv, .json, .png and .pdf.")] = None,
-    model: Annotated[str, typer.Option(help=f"One of {', '.join(MODEL_NAMES)}.")] = "blinn-phong",
+    model: Model = "blinn-phong",
     accuracy: Annotated[float, typer.Option(help="Relative error that the recommendation is to keep.")] = 1e-3,
     seconds: Annotated[float, typer.Option(help="Time that the measuring may take.")] = 45.0,
     render: Annotated[bool, typer.Option("--render", help="Also measure the renderer alone.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Measure speed against accuracy on a scene: pixels, light samples, precision, model, solver.
 
@@ -50,7 +50,7 @@ def tradeoff(
 
     bar = Progress(console=Console(stderr=True), disable=not sys.stderr.isatty())
     task = bar.add_task("measuring", total=None)
-    with named_as({"target": inputs.target}), bar:
+    with named_as({"target": given.targets[0]}), bar:
         found = fitting.tradeoff(
             inputs.pictures[0],
             inputs.scenes[0],

@@ -9,7 +9,7 @@ right, y up and z to the camera, which is taken to be far away (orthographic, vi
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 import brdf
 from brdf.errors import InputError
@@ -71,22 +71,21 @@ def find_circle(mask: Any) -> Circle:
     inside = np.asarray(mask, bool)
     if not inside.any():
         raise InputError("mask", "is empty", "Give a mask that is white on the ball")
-    # The outermost pixels of every row, then of every column; the outline is at their outer edge.
-    rows, left, right = _outermost(inside)
-    columns, top, bottom = _outermost(inside.T)
-    outline = np.concatenate([[left, rows], [right, rows], [columns, top], [columns, bottom]], axis=1)
+    outline = np.concatenate([_sides(inside), _sides(inside.T)[::-1]], axis=1)
     # Area and centroid are the start, which holes and specks hardly move.
-    y, x = (float(np.mean(index)) for index in np.nonzero(inside))
+    y, x = np.argwhere(inside).mean(axis=0).tolist()
     circle = Circle(x, y, float(np.sqrt(np.count_nonzero(inside) / np.pi)))
-    near = np.ones(outline.shape[1], bool)
     for _ in range(10):
-        distance = _distance(outline, circle)
-        near = distance <= max(1.0, 3 * float(np.median(distance)))
-        circle = _circle_through(*outline[:, near])
-    distance = _distance(outline, circle)
+        distance = np.abs(np.hypot(outline[0] - circle.x, outline[1] - circle.y) - circle.radius)
+        near = distance <= max(1.0, 3 * np.median(distance))
+        x, y = outline[:, near]
+        # The circle of least algebraic distance (Kåsa 1976).
+        columns = np.stack([x, y, np.ones_like(x)], axis=1)
+        a, b, c = np.linalg.lstsq(columns, x * x + y * y, rcond=None)[0].tolist()
+        circle = Circle(0.5 * a, 0.5 * b, max(c + 0.25 * (a * a + b * b), 0.0) ** 0.5)
     if np.mean(near) >= OUTLINE:
         distance = distance[near]
-    off = float(np.sqrt(np.mean(distance**2))) / max(circle.radius, 1e-9)
+    off = np.sqrt(np.mean(distance**2)) / max(circle.radius, 1e-9)
     if off > ROUND:
         came = f"is no ball: its outline is {100 * off:.0f} % of the radius off a circle"
         raise InputError("mask", came, "Give the mask of a whole ball, or its circle")
@@ -94,22 +93,12 @@ def find_circle(mask: Any) -> Circle:
     return circle
 
 
-def _outermost(inside: Bool[np.ndarray, "H W"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The rows that hold something, and the outer edges of their first and last pixel of it."""
+def _sides(inside: np.ndarray) -> np.ndarray:
+    """The outer edges of the first and the last pixel in each row that has one: x and y, (2, K)."""
     rows = np.flatnonzero(inside.any(axis=1))
-    last = inside.shape[1] - np.argmax(inside[rows, ::-1], axis=1)
-    return rows, np.argmax(inside[rows], axis=1) - 0.5, last - 0.5
-
-
-def _distance(points: Float[np.ndarray, "2 K"], circle: Circle) -> Float[np.ndarray, " K"]:
-    return np.abs(np.hypot(points[0] - circle.x, points[1] - circle.y) - circle.radius)
-
-
-def _circle_through(x: Float[np.ndarray, " K"], y: Float[np.ndarray, " K"]) -> Circle:
-    """The circle of least algebraic distance (Kåsa 1976)."""
-    columns = np.stack([x, y, np.ones_like(x)], axis=1)
-    a, b, c = (float(value) for value in np.linalg.lstsq(columns, x * x + y * y, rcond=None)[0])
-    return Circle(0.5 * a, 0.5 * b, max(c + 0.25 * (a * a + b * b), 0.0) ** 0.5)
+    first = np.argmax(inside[rows], axis=1) - 0.5
+    last = inside.shape[1] - np.argmax(inside[rows, ::-1], axis=1) - 0.5
+    return np.array([[*first, *last], [*rows, *rows]])
 
 
 def ball_normals(shape: tuple[int, int], circle: Circle) -> Float[np.ndarray, "H W 3"]:
