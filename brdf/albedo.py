@@ -42,7 +42,8 @@ def directional_albedo(
         (..., C), at least 0, accurate to ``ACCURACY`` times k_s (classic forms: times k_s / (scale(n) cos theta)).
 
     Example:
-        ``brdf.directional_albedo(brdf.preset("gold"), np.radians([0, 30, 60]))``
+        >>> brdf.directional_albedo(brdf.NormalizedPhong(k_d=0.0, k_s=1.0, n=1), np.radians([0, 60])).round(3)
+        Array([[1.   ], [0.609]], dtype=float32)
     """
     with working_precision(precision):
         result = _albedo(cast(material, precision), jnp.asarray(theta, jnp.result_type(float)))

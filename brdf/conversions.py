@@ -29,6 +29,10 @@ def slope_from_exponent(n: Numbers) -> Scalars:
 
     Returns:
         (...), above 0 to 1. Source: Walter et al., "Microfacet models for refraction", EGSR 2007, section 5.2.
+
+    Example:
+        >>> float(brdf.slope_from_exponent(6.0))
+        0.5
     """
     return _converted(_slope, n=n)
 
@@ -41,6 +45,10 @@ def exponent_from_slope(alpha: Numbers) -> Scalars:
 
     Returns:
         (...), at least 0.
+
+    Example:
+        >>> float(brdf.exponent_from_slope(0.5))
+        6.0
     """
     return _converted(_exponent, alpha=alpha)
 
@@ -53,6 +61,10 @@ def roughness_from_exponent(n: Numbers) -> Scalars:
 
     Returns:
         (...), above 0 to 1. Source: glTF 2.0 specification, appendix B: alpha = roughness^2.
+
+    Example:
+        >>> float(brdf.roughness_from_exponent(30.0))
+        0.5
     """
     return _converted(lambda n: vectors.square_root(_slope(n)), n=n)
 
@@ -65,6 +77,10 @@ def exponent_from_roughness(roughness: Numbers) -> Scalars:
 
     Returns:
         (...), at least 0.
+
+    Example:
+        >>> float(brdf.exponent_from_roughness(0.5))
+        30.0
     """
     return _converted(lambda roughness: _exponent(roughness * roughness), roughness=roughness)
 
@@ -80,6 +96,10 @@ def half_from_mirror(n: Numbers) -> Scalars:
 
     Returns:
         (...), at least 0.
+
+    Example:
+        >>> float(brdf.half_from_mirror(10.0))
+        40.0
     """
     return _converted(lambda n: 4.0 * n, n=n)
 
@@ -92,6 +112,10 @@ def mirror_from_half(n: Numbers) -> Scalars:
 
     Returns:
         (...), at least 0.
+
+    Example:
+        >>> float(brdf.mirror_from_half(40.0))
+        10.0
     """
     return _converted(lambda n: 0.25 * n, n=n)
 
@@ -107,6 +131,10 @@ def nearest_normalized(material: Material) -> Material:
 
     Returns:
         ``NormalizedPhong``, ``NormalizedBlinnPhong`` or ``Lambert``.
+
+    Example:
+        >>> brdf.nearest_normalized(brdf.Phong(k_d=0.3, k_s=0.5, n=50))
+        NormalizedPhong(k_a=[0], k_d=[0.3...], k_s=[0...], n=50)
     """
     if not isinstance(material, SpecularMaterial):
         return Lambert(k_a=material.k_a, k_d=np.clip(np.asarray(material.k_d), 0.0, 1.0))
@@ -121,6 +149,10 @@ def nearest_classic(material: Material) -> Material:
 
     Returns:
         ``Phong``, ``BlinnPhong`` or ``Lambert``.
+
+    Example:
+        >>> brdf.nearest_classic(brdf.NormalizedPhong(k_d=0.3, k_s=0.6, n=50))
+        Phong(k_a=[0], k_d=[0.354...], k_s=[10.28...], n=50)
     """
     if not isinstance(material, SpecularMaterial):
         return material

@@ -33,6 +33,10 @@ def displayed(linear: Float[np.ndarray, "H W C"], white: float = 1.0) -> Float[n
         linear: radiance; one or three channels are shown as they are, others as their mean, NaN as black;
             rounded to 16 bits.
         white: the radiance that is shown as white.
+
+    Example:
+        >>> brdf.displayed(np.full((1, 1, 3), 0.5)).round(3)
+        array([[[0.735, 0.735, 0.735]]], dtype=float32)
     """
     linear = np.asarray(linear, np.float32)
     if linear.shape[-1] != 3:

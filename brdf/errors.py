@@ -6,6 +6,12 @@ class InputError(ValueError):
 
     The message is one line, ``<file or argument>: <what is wrong, what came>. <what to do>``; the command prints it
     after ``error:`` and exits with status 2.
+
+    Example:
+        >>> brdf.preset("unobtainium")
+        Traceback (most recent call last):
+            ...
+        brdf.errors.InputError: preset: is unknown, got 'unobtainium'. Use one of emerald, ...
     """
 
     def __init__(self, where: object, what: str, remedy: str = ""):

@@ -57,6 +57,10 @@ def cast(tree: Any, precision: Precision | None) -> Any:
     Args:
         tree: any pytree; tracers keep their type where ``precision`` is None.
         precision: "float32", "float64", or None for JAX's own default.
+
+    Example:
+        >>> brdf.cast(brdf.preset("gold"), "float32").n.dtype
+        dtype('float32')
     """
     default = jnp.result_type(float) if precision is None else jnp.dtype(precision)
 

@@ -89,6 +89,11 @@ def basis_images(
         scene: what is seen, and the light on it.
         n: the exponent; a model without a specular term does not look at it.
         points: what the pixels see, where that is known already.
+
+    Example:
+        >>> basis = brdf.basis_images(brdf.BlinnPhong, brdf.Scene.load("scene.toml"), n=50)
+        >>> basis.diffuse.shape, basis.specular.shape
+        ((32, 32, 3), (32, 32, 3))
     """
     points = scene.surface_points() if points is None else points
     return _basis_images(model, points, scene.ambient, _lighting(scene, points), jnp.asarray(n))
@@ -149,6 +154,10 @@ def render(material: Material, scene: Scene, *, precision: Precision | None = No
 
     Raises:
         InputError: where material and light differ in their channels, or a coefficient is out of reach.
+
+    Example:
+        >>> brdf.render(brdf.preset("gold"), brdf.Scene.load("scene.toml")).shape
+        (32, 32, 3)
     """
     with working_precision(precision):
         shape = _shape(material, scene)
@@ -173,6 +182,11 @@ def render_lights(material: Material, scene: Scene, *, precision: Precision | No
 
     Raises:
         InputError: where material and light differ in their channels.
+
+    Example:
+        >>> images = brdf.render_lights(brdf.preset("gold"), brdf.Scene.load("scene.toml"))
+        >>> images.shape  # the light and the ambient light
+        (2, 32, 32, 3)
 
     Source: P. Haeberli, Synthetic lighting for photography, Grafica Obscura, 1992.
     """
@@ -199,6 +213,11 @@ def relight(images: Float[ArrayLike, "L H W C"], factors: ArrayLike) -> Float[Ar
 
     Raises:
         InputError: where the factors do not fit the pictures.
+
+    Example:
+        >>> images = brdf.render_lights(brdf.preset("gold"), brdf.Scene.load("scene.toml"))
+        >>> brdf.relight(images, [0.5, 1.0]).shape  # the light halved
+        (32, 32, 3)
     """
     images, factors = jnp.asarray(images), jnp.asarray(factors)
     lights, _, _, channels = images.shape

@@ -58,6 +58,11 @@ class Scene(eqx.Module):
 
     Raises:
         InputError: where the parts do not belong together.
+
+    Example:
+        >>> scene = brdf.Scene.load("scene.toml")
+        >>> scene.resolution, scene.channels, len(scene.lights)
+        ((32, 32), 3, 1)
     """
 
     camera: Camera | None = None
@@ -198,6 +203,12 @@ def some_pixels(
 
     Returns:
         A scene with surface points in place of the camera; what casts shadows there does so here.
+
+    Example:
+        >>> scene = brdf.Scene.load("scene.toml")
+        >>> two = brdf.some_pixels(scene, np.array([528, 529]))
+        >>> brdf.render(brdf.preset("gold"), two).shape
+        (1, 2, 3)
     """
     pixel = pixel.reshape(1, -1) if pixel.ndim == 1 else pixel
     with working_precision(precision):

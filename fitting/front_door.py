@@ -62,6 +62,12 @@ def fit(
     Raises:
         InputError: naming the argument, where it cannot be used.
 
+    Example:
+        >>> target, scene = brdf.read_image("target.exr"), brdf.Scene.load("scene.toml")
+        >>> result = fitting.fit(target, scene, model="blinn-phong")
+        >>> round(float(result.material.n), 2)
+        51.2
+
     Source: Golub and Pereyra 1973, variable projection; see `fitting.solver.profile`.
     """
     problem = state_problem(

@@ -40,6 +40,12 @@ class Sensitivity:
         k_d: of the diffuse coefficient, (C, S...).
         k_s: of the specular coefficient, (C, S...).
         n: of the exponent, (S...).
+
+    Example:
+        >>> result = fitting.fit(brdf.read_image("target.exr"), brdf.Scene.load("scene.toml"), model="blinn-phong")
+        >>> (by_direction,) = fitting.sensitivity(result, lambda scenes: (scenes[0].lights[0].direction,))
+        >>> by_direction.k_d.shape  # of each channel, by each component
+        (3, 3)
     """
 
     k_a: Float[np.ndarray, " channels *leaf"]
@@ -63,7 +69,10 @@ def sensitivity(result: FitResult, by: Callable[[list[brdf.Scene]], Sequence[Any
         InputError: where the loss is another, ``by`` names no leaf, or the picture does not determine the numbers.
 
     Example:
-        ``fitting.sensitivity(result, lambda scenes: (scenes[0].lights[0].direction,))[0].n``
+        >>> result = fitting.fit(brdf.read_image("target.exr"), brdf.Scene.load("scene.toml"), model="blinn-phong")
+        >>> (by_direction,) = fitting.sensitivity(result, lambda scenes: (scenes[0].lights[0].direction,))
+        >>> by_direction.n.shape
+        (3,)
     """
     if result.loss != "squared":
         raise brdf.InputError("result", f"must be of the squared loss, got {result.loss}", "Fit without a loss")

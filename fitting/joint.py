@@ -93,6 +93,13 @@ def fit_jointly(
 
     Raises:
         InputError: where an argument cannot be used, or ``free`` does not name distinct leaves.
+
+    Example:
+        >>> target, scene = brdf.read_image("target.exr"), brdf.Scene.load("scene.toml")
+        >>> start = brdf.BlinnPhong(k_a=brdf.preset("gold").k_a, k_d=[0.7, 0.6, 0.2], k_s=brdf.preset("gold").k_s, n=40)
+        >>> result = fitting.fit_jointly(target, scene, start, lambda material, scenes: (material.k_d, material.n))
+        >>> round(float(result.material.n), 2)
+        51.2
     """
     if solver not in (None, "lm", "bfgs"):
         raise brdf.InputError("solver", f"is unknown, got {solver!r}", "Use lm, bfgs or None")

@@ -110,6 +110,11 @@ class BrdfFitResult:
         left_out: how many entries did not count, by reason.
         max_angle: light and view further than this from the normal did not count, in degrees.
         seconds: how long it took.
+
+    Example:
+        >>> result = fitting.fit_brdf(brdf.load_measured("paint.txt"), model="lambert")
+        >>> result.samples, result.fits
+        (25, True)
     """
 
     table: brdf.MeasuredBRDF
@@ -296,7 +301,9 @@ def fit_brdf(
         InputError: naming the argument.
 
     Example:
-        ``print(fitting.fit_brdf(brdf.load_measured("gold.binary")).verdict)``
+        >>> table = brdf.load_measured("paint.txt")
+        >>> fitting.fit_brdf(table, model="lambert").material.k_d.round(3)
+        array([0.5])
 
     Source: A. Ngan, F. Durand and W. Matusik, "Experimental analysis of BRDF models", EGSR 2005; J. Löw, J. Kronander,
     A. Ynnerman and J. Unger, "BRDF models for accurate and efficient rendering of glossy surfaces", TOG 31 (2012) 9.

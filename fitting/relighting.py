@@ -42,6 +42,12 @@ class LightFit:
             fit of both hold for the material found.
         residual: root mean square of the residual over that of the picture.
         undetermined: what the picture cannot tell, in words; empty where it tells all.
+
+    Example:
+        >>> target, scene = brdf.read_image("target.exr"), brdf.Scene.load("scene.toml")
+        >>> fitting.fit_lights(2 * target, scene, brdf.preset("gold")).factors.round(3)  # twice as bright
+        array([[2., 2., 2.],
+               [2., 2., 2.]])
     """
 
     scene: brdf.Scene
@@ -81,6 +87,12 @@ def fit_lights(
 
     Raises:
         InputError: where the picture does not fit the scene.
+
+    Example:
+        >>> target, scene = brdf.read_image("target.exr"), brdf.Scene.load("scene.toml")
+        >>> found = fitting.fit_lights(target, scene, brdf.preset("gold"))
+        >>> found.emittances.shape  # of the light and the ambient light
+        (2, 3)
     """
     pixels, seen = _pixels(target, scene, mask)
     images = np.asarray(brdf.render_lights(material, scene, precision=precision), np.float64)[:, seen]
@@ -117,6 +129,12 @@ def fit_lights_and_material(
 
     Raises:
         InputError: where the picture does not fit the scene, the model is unknown, or there is no light.
+
+    Example:
+        >>> target, scene = brdf.read_image("target.exr"), brdf.Scene.load("scene.toml")
+        >>> found = fitting.fit_lights_and_material(target, scene)
+        >>> round(float(found.material.n), 1), len(found.undetermined)
+        (51.2, 1)
     """
     if model not in brdf.MODELS:
         raise InputError("model", f"is unknown, got {model!r}", f"Use one of {', '.join(brdf.MODELS)}")

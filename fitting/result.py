@@ -37,6 +37,12 @@ class Parameter:
             from the profile likelihood, also where n is not determined but bounded on one side.
         at_bound: the value is 0 because it may not be negative, or because the picture does not require it.
         reason: why it is not determined.
+
+    Example:
+        >>> result = fitting.fit(brdf.read_image("target.exr"), brdf.Scene.load("scene.toml"), model="blinn-phong")
+        >>> n = result.parameters[-1]
+        >>> n.name, round(n.value, 2), n.interval[0] < n.value < n.interval[1]
+        ('n', 51.2, True)
     """
 
     name: str
@@ -104,6 +110,12 @@ class FitResult:
         counted: which pixels counted, (H, W) each.
         names: of the pictures' files; empty where they came without.
         choice: what an accuracy or a time to spend made of the fit; None without one.
+
+    Example:
+        >>> result = fitting.fit(brdf.read_image("target.exr"), brdf.Scene.load("scene.toml"), model="blinn-phong")
+        >>> result.surface, result.pixels, result.warnings
+        ('blinn-phong', 656, ())
+        >>> result.save("out")
     """
 
     material: brdf.Material

@@ -104,6 +104,12 @@ class Tradeoff:
         accuracy: the error that the recommendation keeps.
         planned: how many rows there would be, had time and patience been enough for all.
         seconds: that the measuring took.
+
+    Example:
+        >>> target, scene = brdf.read_image("target.exr"), brdf.Scene.load("scene.toml")
+        >>> table = fitting.tradeoff(target, scene, seconds=0.1)
+        >>> table.accuracy, table.complete
+        (0.001, False)
     """
 
     rows: tuple[Row, ...]
@@ -280,6 +286,12 @@ def tradeoff(
 
     Raises:
         InputError: where target, scene or a number cannot be used.
+
+    Example:
+        >>> target, scene = brdf.read_image("target.exr"), brdf.Scene.load("scene.toml")
+        >>> table = fitting.tradeoff(target, scene, accuracy=1e-2, seconds=0.1)  # a first glance; 45 s tell more
+        >>> table.reference
+        'float64, all pixels'
     """
     begun = time.perf_counter()
     check_above_zero(accuracy=accuracy, seconds=seconds)

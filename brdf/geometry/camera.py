@@ -111,6 +111,13 @@ class OrthographicCamera(Camera):
 
     Raises:
         InputError: where a value is not finite or spans no picture.
+
+    Example:
+        >>> camera = brdf.OrthographicCamera(
+        ...     position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=[16, 12]
+        ... )
+        >>> brdf.Scene(camera, [brdf.Sphere([0, 0, 0], 1)]).resolution
+        (16, 12)
     """
 
     width: Scalar = checked(positive, "width", kw_only=True)
@@ -133,6 +140,13 @@ class PerspectiveCamera(Camera):
 
     Raises:
         InputError: where a value is not finite or spans no picture.
+
+    Example:
+        >>> camera = brdf.PerspectiveCamera(
+        ...     position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], fov=30, resolution=[16, 12]
+        ... )
+        >>> brdf.Scene(camera, [brdf.Sphere([0, 0, 0], 1)]).surface_points().mask.shape
+        (12, 16)
     """
 
     fov: Scalar = eqx.field(converter=partial(number, "fov", above=0.0, below=180.0), kw_only=True)

@@ -19,6 +19,9 @@ class Rectangle(Shape):
 
     Raises:
         InputError: where a value is not finite or the edges are parallel.
+
+    Example:
+        >>> floor = brdf.Rectangle(center=[0, -1, 0], edge_u=[0, 0, 2], edge_v=[2, 0, 0])  # looks up, along y
     """
 
     center: Vector = checked(vector, "center")

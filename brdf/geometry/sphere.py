@@ -18,6 +18,10 @@ class Sphere(Shape):
 
     Raises:
         InputError: where a value is not finite or the radius is not positive.
+
+    Example:
+        >>> ball = brdf.Sphere(center=[0, 0, 0], radius=1)
+        >>> pillar = brdf.Sphere(center=[1, 1, 1], radius=0.2, fitted=False)  # only casts a shadow
     """
 
     center: Vector = checked(vector, "center")

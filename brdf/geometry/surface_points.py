@@ -44,6 +44,11 @@ class SurfacePoints(eqx.Module):
         shape: (...), index of the shape that each pixel sees; None where the points come from elsewhere.
         visibility: for each of L lights, how much of it each point sees, (..., L), 0 to 1; None where nothing is given.
         area: the pixels that are averaged over their area; None where every pixel's centre stands for it.
+
+    Example:
+        >>> points = brdf.Scene.load("scene.toml").surface_points()
+        >>> points.normal.shape, int(points.mask.sum())
+        ((32, 32, 3), 656)
     """
 
     position: Float[Array, "*pixels 3"]

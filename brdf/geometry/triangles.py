@@ -104,6 +104,11 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
 
     Raises:
         InputError: where it cannot be read or holds no triangles.
+
+    Example:
+        >>> mesh = brdf.load_mesh("pyramid.obj")
+        >>> mesh.vertices.shape, mesh.faces.shape
+        ((4, 3), (4, 3))
     """
     trimesh = _trimesh()
     text = read_text(path)
@@ -130,6 +135,11 @@ class Triangles(Shape):
     Args:
         mesh: vertices and triangles; see `load_mesh`.
         fitted: see `Shape`.
+
+    Example:
+        >>> pyramid = brdf.Triangles(brdf.load_mesh("pyramid.obj"), fitted=False)  # only casts a shadow
+        >>> pyramid.fitted
+        False
     """
 
     mesh: Mesh = eqx.field(static=True)

@@ -45,6 +45,11 @@ class Picture:
             compressed with losses (`ImageReader.codes`); None for floats. Infinite where the clipped pixels were taken
             out, see `scaled`.
         factor: what the linear values of the file were multiplied by, a number or (C,).
+
+    Example:
+        >>> picture = brdf.read_picture("target.exr")
+        >>> picture.pixels.shape, picture.alpha, picture.encoding
+        ((32, 32, 3), None, 'linear')
     """
 
     pixels: Float32[np.ndarray, "height width channels"]
@@ -92,9 +97,6 @@ class Picture:
 class ImageReader:
     """A picture in a file, read by bands of rows, so that it may be larger than memory.
 
-    Example:
-        ``with brdf.ImageReader("large.exr") as reader: upper = reader.rows(0, reader.shape[0] // 2)``
-
     Attributes:
         path: the file.
         shape: height, width and channels of the picture.
@@ -102,6 +104,12 @@ class ImageReader:
         source: who says so.
         bits: bits per value in the file.
         is_integer: whether the file holds codes, which end somewhere, not floats.
+
+    Example:
+        >>> with brdf.ImageReader("target.exr") as reader:
+        ...     upper = reader.rows(0, reader.shape[0] // 2)
+        >>> upper.shape
+        (16, 32, 3)
     """
 
     def __init__(self, path: str | os.PathLike[str], *, encoding: Encoding | None = None):
@@ -336,7 +344,9 @@ def read_image(
         InputError: if the file cannot be read.
 
     Example:
-        ``target = brdf.read_image("data/gold-ball/target.exr")``
+        >>> target = brdf.read_image("target.exr")
+        >>> target.shape, target.dtype
+        ((32, 32, 3), dtype('float32'))
     """
     with ImageReader(path, encoding=encoding) as reader:
         return reader.read()
@@ -353,7 +363,9 @@ def read_picture(path: str | os.PathLike[str], *, encoding: Encoding | None = No
         InputError: if the file cannot be read.
 
     Example:
-        ``brdf.read_picture("photo.png", encoding="srgb").saturation``
+        >>> picture = brdf.read_picture("target.png")
+        >>> picture.encoding, picture.bits, picture.saturation
+        ('srgb', 8, 1.0)
     """
     with ImageReader(path, encoding=encoding) as reader:
         top, _ = reader.codes
@@ -374,7 +386,9 @@ def read_mask(path: str | os.PathLike[str]) -> Bool[np.ndarray, "height width"]:
         InputError: if the file cannot be read.
 
     Example:
-        ``fitting.fit(target, scene, mask=brdf.read_mask("mask.png"))``
+        >>> mask = brdf.read_mask("mask.png")
+        >>> mask.shape, mask.dtype
+        ((32, 32), dtype('bool'))
     """
     with ImageReader(path, encoding="linear") as reader:
         alpha = reader.read_alpha()
@@ -405,7 +419,8 @@ def read_layers(path: str | os.PathLike[str]) -> dict[str, Float32[np.ndarray, "
         InputError: if the file cannot be read.
 
     Example:
-        ``brdf.read_layers("aovs.exr")["normal"]``
+        >>> {name: values.shape for name, values in brdf.read_layers("target.exr").items()}
+        {'': (32, 32, 3)}
     """
     file = input_file(path)
     image = _open(file)

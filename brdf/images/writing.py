@@ -60,7 +60,8 @@ def write_image(
         InputError: if format, data type, encoding and shape do not go together, or the file cannot be written.
 
     Example:
-        ``brdf.write_image("ball.png", brdf.render(material, scene))``
+        >>> ball = brdf.render(brdf.preset("gold"), brdf.Scene.load("scene.toml"))
+        >>> brdf.write_image("ball.png", ball)
     """
     suffix, kind = _format(path, dtype)
     pixels, sayable = _pixels(path, array), _WRITABLE[suffix][kind]

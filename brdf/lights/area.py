@@ -103,6 +103,11 @@ class RectangleLight(Light):
 
     Raises:
         InputError: where a value is not finite, the edges are parallel or a radiance is negative.
+
+    Example:
+        >>> window = brdf.RectangleLight([0, 0, 2], edge_u=[0.5, 0, 0], edge_v=[0, -0.5, 0], radiance=3.0)
+        >>> window.samples
+        64
     """
 
     center: Vector = checked(vector, "center")
@@ -144,6 +149,11 @@ class PolygonLight(Light):
     Raises:
         InputError: where a value is not finite, the polygon has no area, is not flat or crosses itself, or a radiance
             is negative.
+
+    Example:
+        >>> lamp = brdf.PolygonLight([[0, 0, 2], [0, 1, 2], [1, 0, 2]], radiance=3.0)  # shines down
+        >>> lamp.samples
+        64
     """
 
     vertices: Float[Array, "V 3"] = checked(vertex_list, "vertices")
@@ -231,6 +241,11 @@ class SphereLight(Light):
 
     Raises:
         InputError: where a value is not finite, the radius is not positive or a radiance is negative.
+
+    Example:
+        >>> bulb = brdf.SphereLight(center=[0, 0, 2], radius=0.1, radiance=[9.0, 8.0, 7.0], samples=16)
+        >>> bulb.samples
+        16
     """
 
     center: Vector = checked(vector, "center")

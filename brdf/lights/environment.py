@@ -59,6 +59,12 @@ class ConstantEnvironment(Light):
 
     Raises:
         InputError: where a radiance is negative or not finite, or the samples are too few.
+
+    Example:
+        >>> ball = brdf.Scene.load("scene.toml")
+        >>> outdoors = brdf.Scene(ball.camera, ball.shapes, lights=[brdf.ConstantEnvironment(1.0, samples=64)])
+        >>> float(brdf.render(brdf.Lambert(k_d=0.5), outdoors).max().round(3))
+        0.5
     """
 
     radiance: Spectrum = checked(spectrum, "radiance")
@@ -128,6 +134,12 @@ class EnvironmentMap(Light):
 
     Raises:
         InputError: where the map is no picture or all black, or a factor is negative.
+
+    Example:
+        >>> sky = brdf.EnvironmentMap(np.ones((4, 8, 3)) * [0.3, 0.5, 1.0], samples=64)
+        >>> ball = brdf.Scene.load("scene.toml")
+        >>> brdf.Scene(ball.camera, ball.shapes, lights=[sky]).channels
+        3
     """
 
     pixels: Float[Array, "H W C"]

@@ -23,6 +23,12 @@ class DirectionalLight(Light):
 
     Raises:
         InputError: where a value is not finite, the direction has no length or an intensity is negative.
+
+    Example:
+        >>> sun = brdf.DirectionalLight(direction=[0, 3, 4], intensity=[1.0, 0.9, 0.8])
+        >>> ball = brdf.Scene.load("scene.toml")
+        >>> brdf.Scene(ball.camera, ball.shapes, lights=[sun]).channels
+        3
     """
 
     direction: Vector = checked(direction_value, "direction")
@@ -59,6 +65,11 @@ class PointLight(Light):
 
     Raises:
         InputError: where a value is not finite, an intensity or an attenuation is negative, or all of the latter are 0.
+
+    Example:
+        >>> lamp = brdf.PointLight(position=[0, 0, 2], intensity=4.0)
+        >>> lamp.attenuation
+        array([0., 0., 1.])
 
     Source: OpenGL 1.5 specification, section 2.14.1.
     """
@@ -98,6 +109,11 @@ class SpotLight(Light):
 
     Raises:
         InputError: where a value is not finite or out of its range.
+
+    Example:
+        >>> spot = brdf.SpotLight(position=[0, 0, 2], direction=[0, 0, -1], intensity=4.0, cutoff_angle=30, exponent=2)
+        >>> float(spot.cutoff_angle)
+        30.0
 
     Source: OpenGL 1.5 specification, section 2.14.1; there the exponent ends at 128, here it does not.
     """

@@ -73,7 +73,9 @@ def export_material(material: Material, to: str, *, name: str = "fitted") -> Exp
         InputError: an unknown format, or channels that the format does not know.
 
     Example:
-        ``brdf.export_material(brdf.preset("gold"), "three").text``
+        >>> export = brdf.export_material(brdf.preset("gold"), "three")
+        >>> export.losses[0]
+        'k_a is left out: the format has no ambient coefficient'
     """
     if to not in EXPORTS:
         raise InputError("to", f"is unknown, got {to!r}", f"Use one of {', '.join(EXPORTS)}")
@@ -100,7 +102,8 @@ def save_export(material: Material, path: str | Path, *, to: str | None = None, 
         InputError: as for `export_material`, or where the file cannot be written.
 
     Example:
-        ``brdf.save_export(brdf.preset("gold"), "gold.gltf").losses``
+        >>> brdf.save_export(brdf.preset("gold"), "gold.gltf").losses[0]
+        'k_a is left out: the format has no ambient coefficient'
     """
     suffix = Path(path).suffix.lower()
     if to is None and suffix not in _SUFFIXES:

@@ -32,7 +32,9 @@ def load_material(path: str | Path, name: str | None = None) -> Material:
         InputError: naming file and key, or where the file holds several materials and no name is given.
 
     Example:
-        ``brdf.load_material("out/material.json")``
+        >>> brdf.save_material(brdf.Lambert(k_d=0.5), "grey.json")
+        >>> brdf.load_material("grey.json")
+        Lambert(k_a=[0], k_d=[0.5])
     """
     entries = _entries(path)
     names = ", ".join(known[:SHOWN] for known in list(entries)[:10]) + (" or another" if len(entries) > 10 else "")
@@ -54,7 +56,9 @@ def load_materials(path: str | Path) -> dict[str, Material]:
         InputError: naming file and key.
 
     Example:
-        ``brdf.load_materials("scene.mtl")["gold"]``
+        >>> brdf.save_material(brdf.preset("gold"), "gold.mtl")
+        >>> list(brdf.load_materials("gold.mtl"))
+        ['fitted']
     """
     return {name: _material(path, name, entry) for name, entry in _entries(path).items()}
 
@@ -71,7 +75,7 @@ def save_material(material: Material, path: str | Path, *, undetermined: Collect
         InputError: where the file cannot be written or cannot hold the material.
 
     Example:
-        ``brdf.save_material(brdf.preset("gold"), "gold.mtl")``
+        >>> brdf.save_material(brdf.preset("gold"), "gold.mtl")
     """
     channels = material.k_d.shape[0]
     if _suffix(path, "Name it .json or .mtl") == ".json":

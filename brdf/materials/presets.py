@@ -38,7 +38,12 @@ yellow_rubber  0.05     0.05     0         0.5      0.5      0.4       0.7      
 """
 
 PRESETS: dict[str, tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], float]] = {}
-"""Ambient, diffuse and specular coefficient (linear RGB) and shininess, 0 to 1, by name."""
+"""Ambient, diffuse and specular coefficient (linear RGB) and shininess, 0 to 1, by name.
+
+Example:
+    >>> len(brdf.PRESETS), brdf.PRESETS["chrome"][0]
+    (24, (0.25, 0.25, 0.25))
+"""
 
 for _row in _TABLE.strip().splitlines():
     _name, *_words = _row.split()
@@ -59,7 +64,8 @@ def preset(name: str) -> BlinnPhong:
         InputError: where the table has no such name.
 
     Example:
-        ``brdf.preset("emerald")``
+        >>> brdf.preset("cyan plastic").k_s
+        array([0.50196078, 0.50196078, 0.50196078])
     """
     key = str(name).strip().lower().replace(" ", "_").replace("-", "_")
     if key not in PRESETS:

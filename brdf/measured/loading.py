@@ -28,6 +28,10 @@ def load_measured(path: str | os.PathLike[str]) -> MeasuredBRDF:
 
     Raises:
         InputError: naming the file, where it is none of these, damaged, or (RGL) Mitsuba is not installed.
+
+    Example:
+        >>> brdf.load_measured("paint.txt")
+        MeasuredBRDF('paint', 25 samples x 1 channels, 0 negative values)
     """
     file = input_file(path)
     with file.open("rb") as stream:

@@ -77,6 +77,10 @@ def merl_table(f_r: Callable[[Any, Any], Any], *, name: str = "table") -> Measur
 
     Raises:
         InputError: where the values do not fit.
+
+    Example:
+        >>> brdf.merl_table(lambda to_light, to_view: np.full(len(to_light), 0.2), name="chalk")
+        MeasuredBRDF('chalk', 1096216 samples x 1 channels, 0 negative values)
     """
     light, view, share = grid()
     above = (light[:, 2] > 0) & (view[:, 2] > 0)

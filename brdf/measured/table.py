@@ -32,6 +32,11 @@ class MeasuredBRDF:
             the samples are scattered.
         left_out: how many entries of the file are no samples, by reason.
         evaluate: f_r at any pairs of directions, where the file determines it; None for scattered samples.
+
+    Example:
+        >>> up, slanted = [0, 0, 1], [0, 0.6, 0.8]
+        >>> brdf.MeasuredBRDF.from_samples(to_light=[up, up], to_view=[up, slanted], values=[0.20, 0.19], name="chalk")
+        MeasuredBRDF('chalk', 2 samples x 1 channels, 0 negative values)
     """
 
     name: str

@@ -19,4 +19,9 @@ __all__ = [
 MODELS: dict[str, type[Material]] = {
     model.name: model for model in (Lambert, Phong, BlinnPhong, NormalizedPhong, NormalizedBlinnPhong)
 }
-"""The models by the names that files and the command line use."""
+"""The models by the names that files and the command line use.
+
+Example:
+    >>> brdf.MODELS["phong"](k_d=0.3, k_s=0.5, n=50)
+    Phong(k_a=[0], k_d=[0.3], k_s=[0.5], n=50)
+"""

@@ -36,6 +36,11 @@ class Material(eqx.Module):
     Attributes:
         k_a: ambient coefficient, (C,), at least 0.
         k_d: diffuse coefficient, (C,), at least 0: the diffuse albedo.
+
+    Example:
+        >>> material = brdf.preset("gold")
+        >>> isinstance(material, brdf.Material), float(material.n)
+        (True, 51.2)
     """
 
     k_a: Float[Parameter, " C"] = eqx.field(default=0.0, kw_only=True)

@@ -26,6 +26,10 @@ class BlinnPhong(SpecularMaterial):
     k_a, k_d, k_s at least 0, n at least 0. Not reciprocal and not energy conserving for k_s > 0: the albedo diverges
     at grazing light. Source: J. F. Blinn, "Models of light reflection for computer synthesized pictures", SIGGRAPH
     1977, 192-198.
+
+    Example:
+        >>> brdf.BlinnPhong(k_d=[0.4, 0.3, 0.1], k_s=0.5, n=50)
+        BlinnPhong(k_a=[0, 0, 0], k_d=[0.4, 0.3, 0.1], k_s=[0.5, 0.5, 0.5], n=50)
     """
 
     name: ClassVar[str] = "blinn-phong"
@@ -38,6 +42,10 @@ class NormalizedBlinnPhong(SpecularMaterial):
     k_a, k_d, k_s at least 0, n at least 0. Reciprocal. Conserves energy when k_d + k_s <= 1: the lobe alone reflects
     all light at normal incidence and less at grazing angles. Source: F. Giesen, "Phong normalization factor
     derivation", 2009; the lobe is Blinn's of 1977.
+
+    Example:
+        >>> brdf.check(brdf.NormalizedBlinnPhong(k_d=0.3, k_s=0.6, n=50)).plausible
+        True
     """
 
     name: ClassVar[str] = "normalized-blinn-phong"

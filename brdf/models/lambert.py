@@ -30,6 +30,10 @@ class Lambert(Material):
 
     Raises:
         InputError: a number is negative or not finite, or the shapes do not fit.
+
+    Example:
+        >>> float(brdf.Lambert(k_d=0.5).reflectance([0, 0, 1], [0, 0.6, 0.8])[0])  # k_d / pi
+        0.159...
     """
 
     name: ClassVar[str] = "lambert"

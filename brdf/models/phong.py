@@ -24,6 +24,10 @@ class Phong(SpecularMaterial):
 
     k_a, k_d, k_s at least 0, n at least 0. Not reciprocal and not energy conserving for k_s > 0: the albedo diverges
     at grazing light. Source: B. T. Phong, "Illumination for computer generated pictures", CACM 18 (1975) 311-317.
+
+    Example:
+        >>> brdf.Phong(k_d=0.3, k_s=0.5, n=50)
+        Phong(k_a=[0], k_d=[0.3], k_s=[0.5], n=50)
     """
 
     name: ClassVar[str] = "phong"
@@ -37,6 +41,10 @@ class NormalizedPhong(SpecularMaterial):
     all light at normal incidence and less at grazing angles, where the surface cuts it. Source: R. R. Lewis, "Making
     shaders more physically plausible", Computer Graphics Forum 13 (1994) 109-120; E. P. Lafortune and Y. D. Willems,
     "Using the modified Phong reflectance model for physically based rendering", Report CW 197, K.U. Leuven, 1994.
+
+    Example:
+        >>> brdf.check(brdf.NormalizedPhong(k_d=0.3, k_s=0.6, n=50)).plausible
+        True
     """
 
     name: ClassVar[str] = "normalized-phong"

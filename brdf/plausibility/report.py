@@ -82,6 +82,11 @@ class Report:
         reciprocity: whether f_r stays the same when light and view change places.
         energy: whether from no direction more light is reflected than arrives.
         nearest: the nearest plausible material, where one is known and the material is not plausible itself.
+
+    Example:
+        >>> print(brdf.check(brdf.Lambert(k_d=0.5), name="grey"))
+        grey: plausible
+        ...
     """
 
     subject: str

@@ -49,7 +49,9 @@ def stability_map(
         The map.
 
     Example:
-        ``brdf.stability_map(brdf.BlinnPhong).error.max()``
+        >>> errors = brdf.stability_map(brdf.Lambert, np.array([0.0]), np.array([0.0, 60.0])).error
+        >>> bool(errors.max() < 1e-5)
+        True
     """
 
     def value(n: Array, vectors: Float[Array, "3 3"]) -> Array:

@@ -29,7 +29,9 @@ def check(brdf: Material | MeasuredBRDF | Callable[[Any, Any], Any], *, name: st
         InputError: it is neither, or it cannot be called as described.
 
     Example:
-        ``print(brdf.check(brdf.BlinnPhong(k_d=0.3, k_s=0.5, n=50)))``
+        >>> report = brdf.check(brdf.BlinnPhong(k_d=0.3, k_s=0.5, n=50))
+        >>> report.plausible, report.energy.verdict
+        (False, 'fail')
     """
     if type(brdf) in MODELS.values():
         return check_material(brdf, name or repr(brdf))

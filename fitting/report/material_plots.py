@@ -39,7 +39,7 @@ def overview(brdf: Brdf, report: Report | None = None) -> Figure:
         The figure.
 
     Example:
-        ``fitting.overview(brdf.preset("gold")).savefig("gold.png")``
+        >>> fitting.overview(brdf.preset("gold")).savefig("gold.png")
     """
     figure: Any = Figure(figsize=(7.2, 6.0), layout="constrained")
     (ball, lobe), (albedo, reciprocity) = figure.subfigures(2, 2)
@@ -66,7 +66,7 @@ def plot_albedo(brdf: Brdf, report: Report | None = None, figure: Any = None) ->
         The figure.
 
     Example:
-        ``fitting.plot_albedo(brdf.preset("gold"))``
+        >>> fitting.plot_albedo(brdf.preset("gold")).savefig("albedo.png")
     """
     known = isinstance(brdf, Material)
     degrees = np.append(np.arange(0.0, 89.0, 0.5 if known else 2.0), [89.0, 89.5, 89.7, 89.8, 89.9, 89.95, 89.99])
@@ -110,7 +110,7 @@ def plot_lobe(brdf: Brdf, angles: tuple[float, ...] = (0.0, 30.0, 60.0), channel
         The figure; radii grow with the root, so that the diffuse part shows beside a bright lobe.
 
     Example:
-        ``fitting.plot_lobe(brdf.preset("gold"), angles=(0, 45))``
+        >>> fitting.plot_lobe(brdf.preset("gold"), angles=(0, 45)).savefig("lobe.png")
     """
     sample = _sampler(brdf)
     figure = figure or Figure(figsize=(6, 4), layout="constrained")
@@ -145,7 +145,7 @@ def plot_reciprocity(brdf: Brdf, channel: int = 0, figure: Any = None) -> Any:
         The figure: angle of the light across, angle of the view upwards.
 
     Example:
-        ``fitting.plot_reciprocity(brdf.preset("gold"))``
+        >>> fitting.plot_reciprocity(brdf.preset("gold")).savefig("reciprocity.png")
     """
     sample = _sampler(brdf)
     angles = np.linspace(0, 89.5, 180)
@@ -175,7 +175,8 @@ def plot_stability(maps: list[StabilityMap]) -> Figure:
         The figure.
 
     Example:
-        ``fitting.plot_stability([brdf.stability_map(brdf.Phong)])``
+        >>> errors = brdf.stability_map(brdf.Lambert, np.array([0.0]), np.array([0.0, 60.0]))
+        >>> fitting.plot_stability([errors]).savefig("stability.png")
     """
     figure = Figure(figsize=(3.0 * len(maps) + 1, 3.4), layout="constrained")
     panels = figure.subplots(1, len(maps), sharey=True, squeeze=False)[0]

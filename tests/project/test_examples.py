@@ -1,0 +1,66 @@
+"""Every public name has an example in its docstring, and each of them runs as it stands there.
+
+They run in a folder as a user has it: `scene.toml` and a picture of it, a mask, a mesh, a measured table. `brdf`,
+`fitting` and `np` are imported, as documentation does it.
+"""
+
+import ast
+import doctest
+import inspect
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+from project_paths import ROOT
+
+import brdf
+import fitting
+
+# Constants: what explains them is the string under their assignment.
+CONSTANTS = {"MODELS": "brdf/models/__init__.py", "PRESETS": "brdf/materials/presets.py"}
+OPTIONS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+NAMES = [("brdf", name) for name in brdf.__all__] + [("fitting", name) for name in fitting.__all__]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("examples")
+    text = (ROOT / "data" / "gold-ball" / "scene.toml").read_text(encoding="utf-8")
+    (folder / "scene.toml").write_text(text.replace("[256, 256]", "[32, 32]"), encoding="utf-8")
+    scene = brdf.Scene.load(folder / "scene.toml")
+    ball = brdf.render(brdf.preset("gold"), scene)
+    brdf.write_image(folder / "target.exr", ball)
+    brdf.write_image(folder / "target.png", ball)
+    brdf.write_image(folder / "mask.png", np.asarray(scene.surface_points().mask, float))
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
+    (folder / "pyramid.obj").write_text(f"{corners}f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+    angles = np.linspace(0, 1.2, 5)  # a table as Cornell's: one wavelength, then directions and f_r = 0.5 / pi
+    rows = "".join(f"{light} 0 {view} 0 {0.5 / np.pi}\n" for light in angles for view in angles)
+    (folder / "paint.txt").write_text(f"1\n550\n{rows}")
+    return folder
+
+
+def documentation(package: str, name: str) -> str:
+    if name not in CONSTANTS:
+        return inspect.getdoc(getattr({"brdf": brdf, "fitting": fitting}[package], name)) or ""
+    body = ast.parse((ROOT / CONSTANTS[name]).read_text(encoding="utf-8")).body
+    for assignment, below in itertools.pairwise(body):
+        if isinstance(assignment, ast.AnnAssign) and ast.unparse(assignment.target) == name:
+            return inspect.cleandoc(ast.literal_eval(below.value)) if isinstance(below, ast.Expr) else ""
+    return ""
+
+
+@pytest.mark.parametrize(("package", "name"), NAMES, ids=lambda value: value)
+def test_a_public_name_has_an_example_that_runs(package, name, folder, monkeypatch):
+    import matplotlib
+
+    matplotlib.use("agg")
+    monkeypatch.chdir(folder)
+    text = documentation(package, name)
+    globs = {"brdf": brdf, "fitting": fitting, "np": np}
+    examples = doctest.DocTestParser().get_doctest(text, globs, f"{package}.{name}", None, 0)
+    assert examples.examples, "its docstring has no example"
+    said: list[str] = []
+    doctest.DocTestRunner(optionflags=OPTIONS).run(examples, out=said.append)
+    assert not said, "".join(said)
