@@ -123,11 +123,20 @@ def sum_over_samples(
                 total, _ = add(kind, total, sample)
             return total
         # a sum is as wide as the widest of its parts
-        first = jax.tree.map(lambda values: values[0], lighting.stacks)
-        shapes = [jax.eval_shape(partial(add, stack.kind, None), (stack.rows, stack.light))[0] for stack in first]
+        firsts = [(stack.kind, jax.tree.map(lambda values: values[0], stack.rows())) for stack in lighting.stacks]
+        shapes = [jax.eval_shape(partial(add, kind, None), first)[0] for kind, first in firsts]
         total = jax.tree.map(partial(_filled, start), *shapes)
         for stack in lighting.stacks:
-            total, _ = jax.lax.scan(jax.checkpoint(partial(add, stack.kind)), total, (stack.rows, stack.light))
+
+            def add_light(total: Any, one: Any, kind: type[Light] = stack.kind) -> tuple[Any, None]:
+                numbers, nodes, light = one
+                if not nodes:
+                    return jax.checkpoint(partial(add, kind))(total, (numbers, light))
+                # what the samples of a light have in common is computed once, outside their loop
+                step = jax.checkpoint(lambda total, node: add(kind, total, ((*numbers, *node), light)))
+                return jax.lax.scan(step, total, nodes)
+
+            total, _ = jax.lax.scan(add_light, total, (stack.numbers, stack.nodes, stack.light))
         return total
 
     return jax.vmap(at_point)(points) if few else _by_tiles(at_point, points)
@@ -258,9 +267,16 @@ def _stacked_terms(model: type[Material], lighting: Lighting, points: SurfacePoi
     def at_point(point: SurfacePoints) -> tuple[Any, Any]:
         diffuse, kept = 0.0, ()
         for stack in lighting.stacks:
-            of_row = partial(light_terms, model, lighting.occluders, stack.kind, point=point)
-            terms = jax.lax.map(lambda sample, of_row=of_row: of_row(*sample), (stack.rows, stack.light))
-            diffuse, kept = diffuse + jnp.sum(terms.diffuse, axis=0), (*kept, (terms.weight, terms.log_cosine))
+
+            def of_light(one: Any, kind: type[Light] = stack.kind) -> LightTerms:
+                numbers, nodes, light = one
+                at = partial(light_terms, model, lighting.occluders, kind, light=light, point=point)
+                return jax.lax.map(lambda node: at((*numbers, *node)), nodes) if nodes else at(numbers)
+
+            terms = jax.lax.map(of_light, (stack.numbers, stack.nodes, stack.light))
+            terms = jax.tree.map(partial(jnp.reshape, shape=(stack.samples, -1)), terms)
+            diffuse = diffuse + jnp.sum(terms.diffuse, axis=0)
+            kept = (*kept, (terms.weight, terms.log_cosine[:, 0]))
         return diffuse, kept
 
     return _by_tiles(at_point, points)

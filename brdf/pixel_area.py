@@ -54,8 +54,9 @@ def with_area(
     count = points.mask.size
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((points, camera, shapes, lights))):
         return _averaged(points, camera, shapes, np.arange(count, dtype=np.int32), np.zeros(0, np.int32))
-    sharp = [light for light in lights if light.rows()[0].shape[0] <= STORED_SAMPLES]
-    lighting = Lighting(stacked(sharp, points.position.dtype), occluders)
+    stacks = stacked(lights, points.position.dtype)
+    sharp = tuple(stack for stack in stacks if stack.samples <= STORED_SAMPLES * stack.light.shape[0])
+    lighting = Lighting(sharp, occluders)
     edge, other = np.asarray(_matters(points, camera, shapes, lighting)).reshape(2, count)
     return _averaged(points, camera, shapes, _padded(edge), _padded(other & ~edge))
 
@@ -92,7 +93,7 @@ def _matters(points: SurfacePoints, camera: Camera, shapes: tuple[Shape, ...], l
         def or_light(found: Array, row: tuple[Array, ...], kind: type[Light] = stack.kind) -> tuple[Array, None]:
             return found | _light_matters(points, lighting.occluders, kind, row), None
 
-        matters, _ = jax.lax.scan(or_light, matters, stack.rows)
+        matters, _ = jax.lax.scan(or_light, matters, stack.rows()[0])
     return jnp.stack([edge, matters & points.mask])
 
 

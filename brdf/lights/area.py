@@ -37,7 +37,7 @@ from brdf.checks import (
 )
 from brdf.errors import InputError
 from brdf.geometry.surface_points import SurfacePoints
-from brdf.lights.base import Light, LightSample, repeated
+from brdf.lights.base import Light, LightSample
 from brdf.lights.sample_sets import disc_rule, square_rule
 from brdf.vectors import divide, dot, norm, normalize, square_root
 
@@ -121,10 +121,9 @@ class RectangleLight(Light):
         """Refuse edges that span no area."""
         spans_area(self.edge_u, self.edge_v)
 
-    def rows(self) -> tuple[Any, ...]:
+    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """The light, and a product rule over the unit square."""
-        rule = square_rule(self.samples)
-        return *repeated(rule.weight.size, self.center, self.edge_u, self.edge_v, self.radiance), *rule
+        return (self.center, self.edge_u, self.edge_v, self.radiance), square_rule(self.samples)
 
     @staticmethod
     def sample(point: SurfacePoints, *row: Any) -> LightSample:
@@ -171,17 +170,17 @@ class PolygonLight(Light):
             came = f"must be at least {len(self.triangles)} for {len(self.vertices)} vertices, got {self.samples}"
             raise InputError("samples", came, "Give one sample for each triangle at least")
 
-    def rows(self) -> tuple[Any, ...]:
+    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """The corners of each triangle, and a product rule over the unit square of each."""
         rule, count = square_rule(self.samples // len(self.triangles)), len(self.triangles)
         corners = self.vertices[np.repeat(np.array(self.triangles), rule.weight.size, axis=0)]
         tiled = [np.tile(values, count) for values in rule]
-        return corners, *repeated(len(corners), _newell_normal(self.vertices), self.radiance), *tiled
+        return (_newell_normal(self.vertices), self.radiance), (corners, *tiled)
 
     @staticmethod
     def sample(point: SurfacePoints, *row: Any) -> LightSample:
         """From a patch of one triangle above the horizon."""
-        (a, b, c), area_vector, radiance, s, t, weight = row
+        area_vector, radiance, (a, b, c), s, t, weight = row
         place, patch, share = _above_horizon(point, (a, a), (b - a, c - a), (s, t))
         area = norm(jnp.cross(b - a, c - a)) * place * weight * share
         return _from_patch(radiance, patch, area, normalize(area_vector), point.position)
@@ -254,10 +253,9 @@ class SphereLight(Light):
     samples: int = eqx.field(static=True, converter=sample_number, default=SAMPLES)
     type_name: ClassVar[str] = "sphere"
 
-    def rows(self) -> tuple[Any, ...]:
+    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """The light, and a rule over the cap of directions in which a point sees it."""
-        rule = disc_rule(self.samples)
-        return *repeated(rule.weight.size, self.center, self.radius, self.radiance), *rule
+        return (self.center, self.radius, self.radiance), disc_rule(self.samples)
 
     @staticmethod
     def sample(point: SurfacePoints, *row: Any) -> LightSample:

@@ -5,8 +5,8 @@ light would show. Irradiance is π times that, and a sample of radiance L over t
 L dω / π. A light's emittance has C channels and the picture is linear in it. Each kind of light answers for one point
 and one of its samples; batching over points and the sum over samples are outside.
 
-Lights of one kind become one stack of arrays with a row for each sample, which one loop shades: a program is no larger
-for a thousand lights than for two.
+Lights of one kind and as many samples are one stack of arrays, which one loop over lights and samples shades: a program
+is no larger for a thousand lights than for two.
 """
 
 import abc
@@ -56,13 +56,18 @@ class Light(eqx.Module):
     type_name: ClassVar[str]
 
     @abc.abstractmethod
-    def rows(self) -> tuple[Any, ...]:
-        """What `sample` takes: arrays with one leading axis, as long as the light has samples."""
+    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        """Its numbers, and those of its samples: arrays with one leading axis, none for a light of a single sample."""
 
     @staticmethod
     @abc.abstractmethod
     def sample(point: SurfacePoints, *row: Any) -> LightSample:
-        """What one sample sends to one point."""
+        """What one sample sends to one point; lights with an extent put their samples above its horizon.
+
+        Args:
+            point: where.
+            row: the light's numbers and those of one of its samples.
+        """
 
     @property
     def emittance(self) -> Spectrum:
@@ -71,27 +76,34 @@ class Light(eqx.Module):
         return fields["intensity" if "intensity" in fields else "radiance"]
 
 
-def repeated(count: int, *values: Any) -> tuple[Any, ...]:
-    """Each value ``count`` times, as rows."""
-    rows = []
-    for value in values:
-        xp = jnp if isinstance(value, Tracer) else np
-        rows.append(xp.broadcast_to(value, (count, *value.shape)))
-    return tuple(rows)
-
-
 class LightStack(eqx.Module):
-    """The lights of one kind.
+    """The L lights of one kind, with S samples each.
 
     Attributes:
         kind: their class.
-        rows: of all their samples, arrays (S, ...).
-        light: which of the scene's lights each row belongs to, (S,).
+        numbers: of each light, arrays (L, ...).
+        nodes: of each light's samples, arrays (L, S, ...); none where S is 1.
+        light: which of the scene's lights each is, (L,).
     """
 
     kind: type[Light] = eqx.field(static=True)
-    rows: tuple[Array, ...]
-    light: Int[Array, " S"]
+    numbers: tuple[Array, ...]
+    nodes: tuple[Array, ...]
+    light: Int[Array, " L"]
+
+    @property
+    def samples(self) -> int:
+        """Of all the lights."""
+        return self.light.shape[0] * (self.nodes[0].shape[1] if self.nodes else 1)
+
+    def rows(self) -> tuple[tuple[Array, ...], Array]:
+        """What `Light.sample` takes, one row for each sample, and the light that each belongs to."""
+        if not self.nodes:
+            return self.numbers, self.light
+        each = self.nodes[0].shape[1]
+        numbers = tuple(jnp.repeat(values, each, axis=0) for values in self.numbers)
+        nodes = tuple(values.reshape(-1, *values.shape[2:]) for values in self.nodes)
+        return (*numbers, *nodes), jnp.repeat(self.light, each)
 
 
 class Lighting(eqx.Module):
@@ -108,29 +120,31 @@ class Lighting(eqx.Module):
     @property
     def samples(self) -> int:
         """Of all lights together."""
-        return sum(stack.light.shape[0] for stack in self.stacks)
+        return sum(stack.samples for stack in self.stacks)
 
     def each(self) -> Iterator[tuple[type[Light], tuple[Array, ...], Array]]:
-        """Every sample on its own: the kind of its light, its numbers, which light it belongs to."""
+        """Every sample on its own: the kind of its light, its row, which light it belongs to."""
         for stack in self.stacks:
-            for index in range(stack.light.shape[0]):
-                yield stack.kind, tuple(values[index] for values in stack.rows), stack.light[index]
+            rows, light = stack.rows()
+            for index in range(stack.samples):
+                yield stack.kind, tuple(values[index] for values in rows), light[index]
 
 
 def stacked(lights: Sequence[Light], dtype: Any) -> tuple[LightStack, ...]:
     """Lights as arrays, kind by kind; those of one kind that have no common shape, as of other channels, apart."""
     kinds: dict[Any, list[tuple[Any, ...]]] = {}
     for index, light in enumerate(lights):
-        rows = light.rows()
-        shapes = tuple(values.shape[1:] for values in rows)
-        kinds.setdefault((type(light), shapes), []).append((*rows, np.full(rows[0].shape[0], index, np.int32)))
+        numbers, nodes = light.rows()
+        shapes = tuple(values.shape for values in (*numbers, *nodes))
+        kinds.setdefault((type(light), len(numbers), shapes), []).append((np.int32(index), *numbers, *nodes))
     stacks = []
-    for (kind, _), members in kinds.items():
-        *rows, light = (_joined(values) for values in zip(*members, strict=True))
-        stacks.append(LightStack(kind, tuple(jnp.asarray(values, dtype) for values in rows), light))
+    for (kind, count, _), members in kinds.items():
+        light, *values = map(_stack, zip(*members, strict=True))
+        values = tuple(jnp.asarray(value, dtype) for value in values)
+        stacks.append(LightStack(kind, values[:count], values[count:], light))
     return tuple(stacks)
 
 
-def _joined(values: Sequence[Any]) -> Any:
+def _stack(values: Sequence[Any]) -> Any:
     traced = any(isinstance(value, Tracer) for value in values)
-    return jnp.concatenate(values) if traced else np.concatenate(values)
+    return jnp.stack(values) if traced else np.stack(values)

@@ -28,7 +28,7 @@ from brdf.checks import Spectrum, checked, sample_number, spectrum
 from brdf.errors import InputError
 from brdf.geometry.surface_points import SurfacePoints
 from brdf.lights.area import perpendicular
-from brdf.lights.base import Light, LightSample, repeated
+from brdf.lights.base import Light, LightSample
 from brdf.lights.sample_sets import hemisphere_rule, ring_rule
 from brdf.vectors import dot, normalize, square_root
 
@@ -76,13 +76,13 @@ class ConstantEnvironment(Light):
         if self.samples < 2:
             raise InputError("samples", "must be at least 2 here, got 1", "Give more")
 
-    def rows(self) -> tuple[Any, ...]:
+    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """The light, two rules over the hemisphere, and which of the two a row belongs to."""
         half = max(1, self.samples // 2)
         diffuse, lobe = hemisphere_rule(half), ring_rule(self.samples - half)
         rule = [np.concatenate(pair) for pair in zip(diffuse, lobe, strict=True)]
         lobe_only = np.repeat([0.0, 1.0], [diffuse.weight.size, lobe.weight.size])
-        return *repeated(lobe_only.size, self.radiance), *rule, lobe_only
+        return (self.radiance,), (*rule, lobe_only)
 
     @staticmethod
     def sample(point: SurfacePoints, *row: Any) -> LightSample:
@@ -165,9 +165,9 @@ class EnvironmentMap(Light):
         self.radiance = factor * colour
         self.patches = cut(np.asarray(self.pixels), self.samples)
 
-    def rows(self) -> tuple[Any, ...]:
+    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """The factor and the rectangles of the map."""
-        return *repeated(self.patches.mean.shape[0], self.radiance), *self.patches
+        return (self.radiance,), self.patches
 
     @staticmethod
     def sample(point: SurfacePoints, *row: Any) -> LightSample:

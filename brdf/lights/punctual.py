@@ -10,7 +10,7 @@ import numpy as np
 from brdf.checks import Scalar, Spectrum, Vector, checked, direction_value, number, spectrum, vector
 from brdf.errors import InputError
 from brdf.geometry.surface_points import SurfacePoints
-from brdf.lights.base import Light, LightSample, repeated
+from brdf.lights.base import Light, LightSample
 from brdf.vectors import cosine_lobe, divide, dot, norm, normalize
 
 
@@ -35,9 +35,9 @@ class DirectionalLight(Light):
     intensity: Spectrum = checked(spectrum, "intensity")
     type_name: ClassVar[str] = "directional"
 
-    def rows(self) -> tuple[Any, ...]:
-        """One."""
-        return repeated(1, self.direction, self.intensity)
+    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        """It is a single sample."""
+        return (self.direction, self.intensity), ()
 
     @staticmethod
     def sample(point: SurfacePoints, *row: Any) -> LightSample:
@@ -79,9 +79,9 @@ class PointLight(Light):
     attenuation: Vector = eqx.field(converter=_attenuation, default=(0.0, 0.0, 1.0))
     type_name: ClassVar[str] = "point"
 
-    def rows(self) -> tuple[Any, ...]:
-        """One."""
-        return repeated(1, self.position, self.intensity, self.attenuation)
+    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        """It is a single sample."""
+        return (self.position, self.intensity, self.attenuation), ()
 
     @staticmethod
     def sample(point: SurfacePoints, *row: Any) -> LightSample:
@@ -132,10 +132,10 @@ class SpotLight(Light):
             came = f"must be 0 to 90 degrees, or 180, got {float(self.cutoff_angle):g}"
             raise InputError("cutoff_angle", came, "A spot of more than 90 degrees is a point light")
 
-    def rows(self) -> tuple[Any, ...]:
-        """One."""
+    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        """It is a single sample."""
         cone = (self.direction, self.cutoff_angle, self.exponent)
-        return repeated(1, self.position, self.intensity, self.attenuation, *cone)
+        return (self.position, self.intensity, self.attenuation, *cone), ()
 
     @staticmethod
     def sample(point: SurfacePoints, *row: Any) -> LightSample:
