@@ -15,14 +15,12 @@ squared losses as they are; the logarithmic one leaves them out. Angles beyond 8
 
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 import brdf
 from brdf.errors import InputError
@@ -34,7 +32,7 @@ from fitting.model_fit import ModelFit
 from fitting.report.saving import write_report
 from fitting.result import Parameter, undetermined
 from fitting.solver.normal_equations import Picture
-from fitting.solver.profile import Optimum, search
+from fitting.solver.profile import search
 from fitting.uncertainty.covariance import residual_noise, uncertainty
 from fitting.uncertainty.interpretation import material_and_parameters
 
@@ -155,42 +153,40 @@ class BrdfFitResult:
     @property
     def verdict(self) -> str:
         """The sentence that a person needs."""
-        name, several = self.material.name, len(self.candidates) > 1
+        name, several, losses = self.material.name, len(self.candidates) > 1, self.losses
         if not self.fits:
             best = min(self.candidates, key=self._loss)
-            subject = "none of these models fits: the best" if several else f"{name} does not fit: it"
-            closest = f"{subject}, {best.model}," if several else subject
+            closest = f"none of these models fits: the best, {best.model}," if several else f"{name} does not fit: it"
             left = f"{_percent(best.losses.cosine)} of the table (rms)"
             return f"{closest} leaves {left}; the brightest sample is {self._brightest()}"
-        left = _percent(self.losses.cosine)
-        elsewhere = f"{_percent(self.losses.misplaced)} of the light goes elsewhere"
+        left, beside = _percent(losses.cosine), self._beside_lambert()
+        elsewhere = f"{_percent(losses.misplaced)} of the light goes elsewhere"
         name = "Lambert" if name == "lambert" else name
-        beside = self._beside_lambert() if several else ""
-        if self.losses.cosine**2 > HALF:
-            placed = f"puts {_percent(1 - self.losses.misplaced)} of the light where it belongs"
+        if losses.cosine**2 > HALF:
+            placed = f"puts {_percent(1 - losses.misplaced)} of the light where it belongs"
             return f"{name} {placed}, but not the peak, and leaves {left} (rms){beside}"
-        if self.losses.misplaced > HALF:
+        if losses.misplaced > HALF:
             return f"{name} comes within {left} (rms), but {elsewhere}{beside}"
         verb = "is enough" if several and name == "Lambert" else "describes it"
         return f"{name} {verb} within {left} (rms; {elsewhere}){beside}"
 
-    def _loss(self, candidate: BrdfCandidate) -> float:
+    def _loss(self, candidate):
         return getattr(candidate.losses, self.loss)
 
-    def _beside_lambert(self) -> str:
+    def _beside_lambert(self):
         """What of the verdict compares lobes with Lambert, the first candidate."""
-        alone = self.candidates[0]
+        alone, *lobes = self.candidates
+        if not lobes or (not self.chosen and alone.losses.cosine <= ROUNDING):
+            return ""
         if self.chosen:
             return f"; Lambert alone within {_percent(alone.losses.cosine)}"
-        if alone.losses.cosine <= ROUNDING:
-            return ""
-        lobe = min(self.candidates[1:], key=self._loss)
+        lobe = min(lobes, key=self._loss)
         explained = 1 - (self._loss(lobe) / self._loss(alone)) ** 2
         if explained <= ROUNDING:
             return "; no lobe comes closer"
         return f"; the best lobe, {lobe.model}, explains {_percent(explained)} of the squares that Lambert leaves"
 
-    def _brightest(self) -> str:
+    def _brightest(self):
         sums = np.where(_within(self.table, self.max_angle), self.table.values.sum(axis=1), -np.inf)
         light, view = self.table.to_light[np.argmax(sums)], self.table.to_view[np.argmax(sums)]
         retro, mirror = _apart(light, view), _apart(light * [-1, -1, 1], view)
@@ -232,14 +228,12 @@ class BrdfFitResult:
             }
             for index, candidate in enumerate(self.candidates)
         ]
-        plain = {
-            key: getattr(self, key) for key in ("loss", "samples", "negative", "left_out", "fits", "verdict", "seconds")
-        }
-        return plain | {
+        names = ("loss", "samples", "negative", "left_out", "fits", "verdict", "seconds")
+        return {name: getattr(self, name) for name in names} | {
             "table": self.table.name,
             "channels": list(self.table.channels),
             "material": material_to_dict(self.material, undetermined=self.undetermined),
-            "parameters": [dataclasses.asdict(parameter) for parameter in self.parameters],
+            "parameters": [vars(parameter) for parameter in self.parameters],
             "losses": self.losses._asdict(),
             "candidates": candidates,
         }
@@ -260,17 +254,17 @@ class BrdfFitResult:
 _NORMAL = np.array([0.0, 0.0, 1.0])
 
 
-def _percent(share: float) -> str:
+def _percent(share):
     if share < ROUNDING:
         return f"{100 * ROUNDING:g} %" if share > 0 else "0 %"
     return f"{100 * share:.{2 if share < 0.995 else 3}g} %"
 
 
-def _apart(a: np.ndarray, b: np.ndarray) -> float:
-    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
+def _apart(a, b):
+    return np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
 
 
-def _within(table: brdf.MeasuredBRDF, max_angle: float) -> np.ndarray:
+def _within(table, max_angle):
     """Which samples have light and view so near the normal; angles carry rounding: one at the limit counts."""
     lowest = np.cos(np.radians(max_angle + 1e-4)) if max_angle < 90 else 0.0
     return np.minimum(table.to_light[:, 2], table.to_view[:, 2]) > lowest
@@ -330,20 +324,11 @@ def fit_brdf(
     if not candidates:
         came = f"has {count} samples that count, no more than there are numbers to find"
         raise InputError(table.name, came, "Give a table with more samples, or a model with fewer numbers")
-    return BrdfFitResult(
-        table=table,
-        loss=loss,
-        candidates=tuple(candidates),
-        chosen=_choose(candidates, loss),
-        samples=count,
-        negative=negative,
-        left_out=left_out,
-        max_angle=max_angle,
-        seconds=time.perf_counter() - start,
-    )
+    chosen, seconds = _choose(candidates, loss), time.perf_counter() - start
+    return BrdfFitResult(table, loss, tuple(candidates), chosen, count, negative, left_out, max_angle, seconds)
 
 
-def _samples(table: brdf.MeasuredBRDF, max_angle: float) -> brdf.MeasuredBRDF:
+def _samples(table, max_angle):
     """The samples that count, their solid angles of mean 1; more of solid angle 0 follow.
 
     They make it one of a few sizes, so that few programs are compiled.
@@ -355,69 +340,64 @@ def _samples(table: brdf.MeasuredBRDF, max_angle: float) -> brdf.MeasuredBRDF:
     if not count:
         raise InputError(table.name, f"has no sample within {max_angle:g}° of the normal", "Raise max_angle")
     values = table.values[near]
-    if not values.any():
+    largest = np.max(np.abs(values))
+    if not largest:
         raise InputError(table.name, "is black", "Give a table with values")
     if not np.any(values > 0):
         raise InputError(table.name, f"has no value above 0 within {max_angle:g}° of the normal", "Check its sign")
-    largest = float(np.max(np.abs(values)))
     if not 1 / FAR <= largest <= FAR:
         raise InputError(table.name, f"holds values of up to {largest:.3g}/sr, as no BRDF does", "Check its unit")
     power = 1 << max(10, (count - 1).bit_length())
     more = (power * 3 // 4 if count <= power * 3 // 4 else power) - count
-    near, share = np.pad(near, (0, more), mode="edge"), table.solid_angle[near]
-    far = {f"further than {max_angle:g}° from the normal": len(table.values) - count}
+    share, near = table.solid_angle[near], np.pad(near, (0, more), mode="edge")
+    left_out = table.left_out | {f"further than {max_angle:g}° from the normal": len(table.values) - count}
     return dataclasses.replace(
         table,
         to_light=table.to_light[near],
         to_view=table.to_view[near],
         values=table.values[near],
         solid_angle=np.pad(share / np.mean(share), (0, more)),
-        left_out={reason: number for reason, number in (table.left_out | far).items() if number},
+        left_out={reason: number for reason, number in left_out.items() if number},
     )
 
 
-def _fit_model(
-    model: type[brdf.Material], samples: brdf.MeasuredBRDF, loss: Loss, n_range: tuple[float, float]
-) -> BrdfCandidate:
+def _fit_model(model, samples, loss, n_range):
     values, cosine, share = samples.values, samples.to_light[:, 2:], samples.solid_angle[:, None]
-    channels = values.shape[1]
-    specular = issubclass(model, SpecularMaterial)
+    channels, specular = values.shape[1], issubclass(model, SpecularMaterial)
     log_cos, reach = _lobe(model, samples) if specular else (0.0 * cosine, 0.0 * cosine)
     free = np.repeat([[False], [True], [specular]], channels, axis=1)
+    brightest = np.pi * np.max(np.abs(values), axis=0)
 
-    def solve(weight: Float[np.ndarray, "P C"] | Float[np.ndarray, "P 1"]) -> Optimum:
-        """The least weighted squares."""
+    def solve(weight):
+        """The least weighted squares; a diffuse coefficient that is rounding is 0."""
         with jax.enable_x64(True):
             lobe = Lobe(model, ((jnp.asarray(reach)[:, None], jnp.asarray(log_cos)),))
             ones, target = jnp.ones((len(values), 1)), jnp.asarray(np.pi * values)
             picture = Picture(target, ones, lobe, jnp.asarray(weight), ambient=jnp.zeros(1))
-        return search([picture], n_min=n_range[0], n_max=n_range[1], free=free)
+        optimum = search([picture], n_min=n_range[0], n_max=n_range[1], free=free)
+        return dataclasses.replace(optimum, x=np.where(optimum.x > [[0], [EXACT], [0]] * brightest, optimum.x, 0.0))
 
-    def modelled(optimum: Optimum) -> Float[np.ndarray, "P C"]:
-        return (optimum.x[1] + optimum.x[2] * reach * np.exp(optimum.n * log_cos)) / np.pi
+    def highlight(optimum):
+        return optimum.x[2] * reach * np.exp(optimum.n * log_cos)
+
+    def modelled(optimum):
+        return (optimum.x[1] + highlight(optimum)) / np.pi
 
     optimum = solve((share if loss == "squared" else share * cosine**2)[:, 0])
     if loss == "log":
         optimum = _logarithmic(samples, solve, modelled) or optimum
-    brightest = np.pi * np.max(np.abs(values), axis=0)
-    lobe = optimum.x[2] * reach * np.exp(optimum.n * log_cos)
+    noise = residual_noise(optimum, brightest * np.finfo(float).eps)
+    visible = float(np.max(highlight(optimum)) / np.max(brightest))
     # A lobe that hardly reaches a sample needs a k_s whose square is out of range; it is found to be undetermined.
     with np.errstate(over="ignore", invalid="ignore"):
-        sure = uncertainty(
-            optimum,
-            free,
-            residual_noise(optimum, brightest * np.finfo(float).eps),
-            brightest,
-            float(np.max(lobe) / np.max(brightest)),
-            single=False,
-        )
+        sure = uncertainty(optimum, free, noise, brightest, visible, single=False)
     fit = ModelFit(model, [], optimum, free, n_range)
     material, parameters = material_and_parameters(fit, sure, np.ones(channels), None)
     parameters = tuple(dataclasses.replace(one, interval=None) for one in parameters if one.name != "k_a")
     return BrdfCandidate(material, parameters, _losses(samples, modelled(optimum)))
 
 
-def _lobe(model: type[SpecularMaterial], samples: brdf.MeasuredBRDF) -> tuple[np.ndarray, np.ndarray]:
+def _lobe(model, samples):
     """Logarithm of the lobe's cosine, and what multiplies the lobe: S / (N.L) without scale, (P, 1) each."""
     with jax.enable_x64(True):
         directions = (jnp.asarray(vectors) for vectors in (_NORMAL, samples.to_light, samples.to_view))
@@ -426,11 +406,7 @@ def _lobe(model: type[SpecularMaterial], samples: brdf.MeasuredBRDF) -> tuple[np
     return np.maximum(log_cos, _LEAST), np.where(log_cos > _DARK, reach, 0.0)
 
 
-def _logarithmic(
-    samples: brdf.MeasuredBRDF,
-    solve: Callable[[np.ndarray], Optimum],
-    modelled: Callable[[Optimum], np.ndarray],
-) -> Optimum | None:
+def _logarithmic(samples, solve, modelled):
     """Least logarithmic loss by reweighting: the weighted squares have the gradient of the loss where they settle.
 
     With a = log(1 + f cos), b = log(1 + m cos) the slope of the loss by m is -2 (a - b) cos / (1 + m cos), that of
@@ -454,12 +430,12 @@ def _logarithmic(
     return best
 
 
-def _losses(samples: brdf.MeasuredBRDF, model: Float[np.ndarray, "P C"]) -> Losses:
+def _losses(samples, model):
     values, cosine, share = samples.values, samples.to_light[:, 2:], samples.solid_angle[:, None]
     deviation, counted = values - model, share * (values >= 0)
     logarithms = np.log1p(np.maximum(values, 0.0) * cosine) - np.log1p(model * cosine)
 
-    def relative(weight: np.ndarray) -> float:
+    def relative(weight):
         return float((np.sum(weight * deviation**2) / np.sum(weight * values**2)) ** 0.5)
 
     return Losses(
@@ -470,7 +446,7 @@ def _losses(samples: brdf.MeasuredBRDF, model: Float[np.ndarray, "P C"]) -> Loss
     )
 
 
-def _choose(candidates: Sequence[BrdfCandidate], loss: Loss) -> int:
+def _choose(candidates, loss):
     """Lambert, which comes first, unless a lobe explains enough of the squares that it leaves."""
     lambert = candidates[0].losses
     if lambert.cosine <= EXACT:

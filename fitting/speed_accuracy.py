@@ -20,9 +20,9 @@ import functools
 import io
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import jax.monitoring
 import numpy as np
@@ -54,6 +54,8 @@ LONG = 1.0
 BESIDE = ("model", "render")
 # Among fits whose times are within this factor the least work is recommended, which is the same on every machine.
 CLEARLY = 2.0
+# Columns of the table.
+NUMBERS = ("compile s", "run ms", "± ms", "memory MB", "rms", "worst", "parameters")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,8 +133,9 @@ class Tradeoff:
     @property
     def front(self) -> tuple[Row, ...]:
         """The fits than which none is both quicker and closer, quickest first."""
+        fits = [row for row in self.rows if row.configuration is not None and np.isfinite(row.error)]
         found: list[Row] = []
-        for row in sorted(self._fits(), key=lambda row: (row.seconds, row.error)):
+        for row in sorted(fits, key=lambda row: (row.seconds, row.error)):
             if not found or row.error < found[-1].error:
                 found.append(row)
         return tuple(found)
@@ -144,7 +147,8 @@ class Tradeoff:
         None where nothing that was measured keeps it.
         """
         good = [row for row in self.front if row.error <= self.accuracy]
-        return min((row for row in good if row.seconds <= CLEARLY * good[0].seconds), key=_by_work, default=None)
+        quick = (row for row in good if row.seconds <= CLEARLY * good[0].seconds)
+        return min(quick, key=lambda row: (row.work, row.error), default=None)
 
     @property
     def closest(self) -> Row | None:
@@ -169,9 +173,6 @@ class Tradeoff:
         measured = f"{len(self.rows)} of {self.planned} configurations were measured"
         return f"{words}\n{measured}; more time measures the others"
 
-    def _fits(self) -> list[Row]:
-        return [row for row in self.rows if row.configuration is not None and np.isfinite(row.error)]
-
     def marks(self, row: Row) -> str:
         """What is to be said of a row.
 
@@ -185,21 +186,21 @@ class Tradeoff:
 
     def table(self) -> Any:
         """A table for `rich.print`."""
-        from rich.table import Table
+        from rich.table import Column, Table
 
-        table = Table(caption=f"errors against {self.reference}", title="speed against accuracy")
-        table.add_column("axis")
-        table.add_column("configuration", overflow="fold")
-        for name in ("compile s", "run ms", "± ms", "memory MB", "rms", "worst", "parameters"):
-            table.add_column(name, justify="right")
-        table.add_column("")
+        numbers = (Column(name, justify="right") for name in NUMBERS)
+        head = ("axis", Column("configuration", overflow="fold"), *numbers, "")
+        table = Table(*head, caption=f"errors against {self.reference}", title="speed against accuracy")
         for row in self.rows:
-            times = f"{row.compile_seconds:.2f}", f"{1e3 * row.seconds:.1f}"
-            spread = f"{1e3 * row.spread:.1f}" if row.runs > 1 else ""
-            memory = "" if row.peak is None else f"{row.peak / 1e6:.0f}"
-            errors = (f"{error:.1e}" for error in (row.rms, row.worst, row.parameters))
+            numbers = [
+                f"{row.compile_seconds:.2f}",
+                f"{1e3 * row.seconds:.1f}",
+                f"{1e3 * row.spread:.1f}" if row.runs > 1 else "",
+                "" if row.peak is None else f"{row.peak / 1e6:.0f}",
+                *(f"{error:.1e}" for error in (row.rms, row.worst, row.parameters)),
+            ]
             style = "bold green" if row is self.recommended else "bold" if row is self.default else None
-            table.add_row(row.axis, row.name, *times, spread, memory, *errors, self.marks(row), style=style)
+            table.add_row(row.axis, row.name, *numbers, self.marks(row), style=style)
         return table
 
     def __str__(self) -> str:
@@ -212,21 +213,20 @@ class Tradeoff:
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON holds it; what is infinite is None."""
-        rows = []
-        for row in self.rows:
-            values = vars(row) | {"error": row.error, "marks": self.marks(row)}
-            values["configuration"] = row.configuration and vars(row.configuration)
-            rows.append({name: None if value == np.inf else value for name, value in values.items()})
+        rows = [dataclasses.asdict(row) | {"error": row.error, "marks": self.marks(row)} for row in self.rows]
+        for row in rows:
+            row |= {name: None for name, value in row.items() if value == np.inf}
         names = ("reference", "accuracy", "complete", "planned", "seconds", "advice")
         return {name: getattr(self, name) for name in names} | {"rows": rows}
 
     def to_csv(self) -> str:
         """One line for each row, a header above."""
-        names = [field.name for field in dataclasses.fields(Row) if field.name != "configuration"]
+        rows = [vars(row) | {"marks": self.marks(row)} for row in self.rows]
+        names = [name for name in (*Row.__dataclass_fields__, "marks") if name != "configuration"]
         stream = io.StringIO()
-        writer = csv.DictWriter(stream, [*names, "marks"], extrasaction="ignore", lineterminator="\n")
+        writer = csv.DictWriter(stream, names, extrasaction="ignore", lineterminator="\n")
         writer.writeheader()
-        writer.writerows(vars(row) | {"marks": self.marks(row)} for row in self.rows)
+        writer.writerows(rows)
         return stream.getvalue()
 
     def plot(self) -> Any:
@@ -250,10 +250,6 @@ class Tradeoff:
             figure = self.plot()
             figure.savefig(stage / "tradeoff.png", dpi=200)
             figure.savefig(stage / "tradeoff.pdf")
-
-
-def _by_work(row: Row) -> tuple[float, float]:
-    return row.work, row.error
 
 
 def tradeoff(
@@ -297,35 +293,34 @@ def tradeoff(
     check_above_zero(accuracy=accuracy, seconds=seconds)
     bench = Bench(state_problem(target, scene, mask, model=model, saturation=saturation))
     trials = bench.trials(render=render)
-    works = [bench.work(*trial) for trial in trials]
-    taken: list[list[Taken]] = [[] for _ in trials]
-    outcomes: dict[int, Any] = {}
     # Everything once, so that the errors, which decide what is recommended, are known however slow the compiler is:
     # first what can be recommended, from little to much work, so that what would take too long is known before, and
     # last what compiles anew each time. Then, warm, in rounds, every one shuffled.
-    axes = [axis for axis, _ in trials]
-    by_work = sorted(range(len(trials)), key=lambda i: (axes[i] == "solver", axes[i] in ("model", "render"), works[i]))
+    by_work = sorted(trials, key=lambda trial: (trial.axis == "solver", trial.axis in BESIDE, trial.work))
     random = np.random.default_rng(0)
-    order = np.concatenate([by_work, *(random.permutation(by_work) for _ in range(MOST_ROUNDS + 1))])
+    order = [*by_work, *(by_work[i] for _ in range(MOST_ROUNDS + 1) for i in random.permutation(len(by_work)))]
+    known: list[Trial] = []
     try:
-        for done, index in enumerate(map(int, order)):
-            before, once = taken[index], axes[index] == "solver"
+        for done, trial in enumerate(order, start=1):
+            once = trial.axis == "solver"
             left = seconds - (time.perf_counter() - begun)
-            if before and (once or before[-1].seconds > min(LONG, left)):
+            if trial.taken and (once or trial.taken[-1].seconds > min(LONG, left)):
                 continue
             # What a fit may take is told by the one of the most work so far.
-            most = max(outcomes, key=works.__getitem__, default=index)
-            known = outcomes and not once and axes[index] != "render"
-            if left < (taken[most][-1].seconds * works[index] / works[most] if known else 0.0):
+            most = max(known, key=lambda trial: trial.work, default=None)
+            told = most is not None and not once and trial.axis != "render"
+            if left < (most.taken[-1].seconds * trial.work / most.work if told else 0.0):
                 continue
-            outcome, one = take(functools.partial(bench.run, *trials[index]))
-            before.append(one)
-            outcomes.setdefault(index, outcome)
+            outcome, one = take(functools.partial(bench.run, trial))
+            if not trial.taken:
+                trial.outcome = outcome
+                known.append(trial)
+            trial.taken.append(one)
             if progress is not None:
-                progress(done + 1, len(order))
+                progress(done, len(order))
     except KeyboardInterrupt:
         pass
-    rows = [bench.row(*trials[index], taken[index], outcomes[index]) for index in sorted(outcomes)]
+    rows = [bench.row(trial) for trial in trials if trial.taken]
     return Tradeoff(tuple(rows), bench.reference, accuracy, len(trials), time.perf_counter() - begun)
 
 
@@ -335,6 +330,25 @@ class Taken(NamedTuple):
     seconds: float
     compiling: float
     peak: int | None
+
+
+@dataclasses.dataclass(eq=False)
+class Trial:
+    """A configuration to be measured.
+
+    Attributes:
+        axis: what it is tried for.
+        how: the configuration.
+        work: what the time grows with, and what every fit takes whatever its size.
+        taken: by the runs so far.
+        outcome: of the first: a material, or a picture.
+    """
+
+    axis: str
+    how: Configuration
+    work: float
+    taken: list[Taken] = dataclasses.field(default_factory=list)
+    outcome: Any = None
 
 
 def reference(problem: FitProblem, lights: MadeLights, pixels: int | None = None) -> FitResult:
@@ -358,13 +372,12 @@ def reference(problem: FitProblem, lights: MadeLights, pixels: int | None = None
     if pixels is None:
         return fine
     coarse = run(problem, few, lights, about).result
-    values: dict[str, Any] = {}
-    for name in ("k_a", "k_d", "k_s", "n"):
-        if hasattr(whole.material, name):
-            value, before, after = (np.asarray(getattr(one.material, name)) for one in (whole, coarse, fine))
-            changed = value * after / np.where(before > 0, before, 1.0) if name == "n" else value + after - before
-            # What is not determined is 0 in the material.
-            values[name] = np.where((value > 0) & (before > 0), np.maximum(changed, 0.0), value)
+    values = {}
+    for name in {parameter.name for parameter in whole.parameters}:
+        value, before, after = (np.asarray(getattr(one.material, name)) for one in (whole, coarse, fine))
+        changed = value * after / np.where(before > 0, before, 1.0) if name == "n" else value + after - before
+        # What is not determined is 0 in the material.
+        values[name] = np.where((value > 0) & (before > 0), np.maximum(changed, 0.0), value)
     return dataclasses.replace(whole, material=kind(**values))
 
 
@@ -404,20 +417,19 @@ class Bench:
         self.samples = max(filter(None, sample_counts([scene])), default=0)
         self.reference, pixels = "float64, all pixels", None
         # Where pictures are compared: the whole one, or some pixels under many light samples; and their weights.
-        self.compared, self.weight = with_samples(scene, MOST_SAMPLES, self.lights), np.ones((1, 1, 1))
+        self.compared, self.weight = with_samples(scene, MOST_SAMPLES, self.lights), 1.0
         if self.samples:
             self.reference = f"{MOST_SAMPLES} light samples, all pixels"
             if self.pixels > 2 * FEW_PIXELS:
                 pixels = FEW_PIXELS
                 self.reference += f" (what so many samples change, told by about {2 * pixels} of the pixels)"
-            sample = sample_pixels(self.compared, brdf.BlinnPhong, FEW_PIXELS)
-            if sample is not None:
+            if sample := sample_pixels(self.compared, brdf.BlinnPhong, FEW_PIXELS):
                 self.compared = brdf.some_pixels(self.compared, sample.pixel, precision="float64")
                 self.weight = sample.stands_for[None, :, None]
         self.best = reference(problem, self.lights, pixels)
         self.model = self.best.material.name if problem.model == "auto" else problem.model
 
-    def trials(self, *, render: bool = False) -> list[tuple[str, Configuration]]:
+    def trials(self, *, render: bool = False) -> list[Trial]:
         """What there is to try, and what for, the most telling first."""
         default, samples = Configuration(self.model), self.samples
         change = functools.partial(dataclasses.replace, default)
@@ -432,23 +444,22 @@ class Bench:
         others = [name for name in ("lambert", "phong", "blinn-phong") if name != self.model]
         found += [("model", change(model=name, pixels=few)) for name in others]
         if isinstance(self.best.material, SpecularMaterial):
-            solvers = [change(precision="float64", pixels=FEW_PIXELS, solver=s, tolerance=t) for s, t in SOLVERS]
-            found += [("solver", how) for how in solvers]
+            solver = functools.partial(change, precision="float64", pixels=FEW_PIXELS)
+            found += [("solver", solver(solver=name, tolerance=tolerance)) for name, tolerance in SOLVERS]
         if render:
-            precisions: tuple[Precision, ...] = ("float32", "float64")
             counts = [None, *(count for count in steps if count < min(samples, 1024))]
-            found += [("render", change(precision=p, samples=count)) for p in precisions for count in counts]
-        return list(dict.fromkeys(found))
+            found += [("render", change(precision=p, samples=n)) for p in get_args(Precision) for n in counts]
+        return [Trial(axis, how, self._work(axis, how)) for axis, how in dict.fromkeys(found)]
 
-    def work(self, axis: str, how: Configuration) -> float:
-        """What the time grows with, and what every fit takes whatever its size."""
+    def _work(self, axis: str, how: Configuration) -> float:
         return (4096 + how.work(self.pixels, [self.scene])) * (100 if axis == "solver" else 1)
 
-    def run(self, axis: str, how: Configuration) -> Any:
+    def run(self, trial: Trial) -> Any:
         """What a trial gives: a material, or a picture."""
-        if axis == "solver":
+        how = trial.how
+        if trial.axis == "solver":
             return self.solve(how)
-        if axis == "render":
+        if trial.axis == "render":
             scene = with_samples(self.scene, how.samples, self.lights)
             return np.asarray(brdf.render(self.best.material, scene, precision=how.precision))
         return run(self.problem, how, self.lights).result.material
@@ -461,7 +472,7 @@ class Bench:
         sample = sample_pixels(self.scene, brdf.Lambert, FEW_PIXELS)
         # They leave out what the reference left out, such as pixels whose noise is cut off.
         target, scene, mask = self.problem.targets[0].pixels, self.scene, self.best.counted[0]
-        if sample is not None:
+        if sample:
             target, mask = some_of(target, sample), some_of(mask, sample)
             scene = brdf.some_pixels(scene, sample.pixel, precision="float64")
         half = np.full(self.best.material.k_d.shape, 0.5)
@@ -478,33 +489,34 @@ class Bench:
             saturation=self.problem.saturation,
         ).material
 
-    def row(self, axis: str, how: Configuration, taken: Sequence[Taken], outcome: Any) -> Row:
+    def row(self, trial: Trial) -> Row:
         """What was measured: of several runs the first is left out, for caches were cold."""
-        parameters, name, scene, weight = 0.0, str(how), self.compared, self.weight
-        if axis == "render":
-            name = ", ".join(["render", how.precision, *([f"{how.samples} light samples"] if how.samples else [])])
-            # Rendered whole, under at most the scene's own samples.
-            scene, weight = self.scene, np.ones((1, 1, 1))
+        how, taken, outcome, render = trial.how, trial.taken, trial.outcome, trial.axis == "render"
+        # Rendered whole, under at most the scene's own samples.
+        scene, weight = (self.scene, 1.0) if render else (self.compared, self.weight)
         picture = functools.partial(brdf.render, scene=scene, precision="float64")
-        if axis != "render":
+        name, parameters = str(how), 0.0
+        if render:
+            name = ", ".join(["render", how.precision, *([f"{how.samples} light samples"] if how.samples else [])])
+        else:
             parameters, outcome = parameter_deviation(outcome, self.best), np.asarray(picture(outcome))
         true = np.asarray(picture(self.best.material))
         change, scale = outcome - true, float(np.sqrt(np.mean(weight * true**2)))
         later = [one.seconds for one in taken[1:] or taken]
         low, median, high = np.quantile(later, [0.25, 0.5, 0.75])
         return Row(
-            axis=axis,
-            configuration=None if axis == "render" else how,
+            axis=trial.axis,
+            configuration=None if render else how,
             name=name,
             compile_seconds=taken[0].compiling,
             seconds=float(median),
             spread=float(high - low) / 2,
             runs=len(later),
-            peak=taken[min(1, len(taken) - 1)].peak,
+            peak=taken[:2][-1].peak,
             rms=float(np.sqrt(np.mean(weight * change**2))) / scale,
             worst=float(np.max(np.abs(change))) / scale,
             parameters=parameters,
-            work=self.work(axis, how),
+            work=trial.work,
         )
 
 
@@ -538,7 +550,7 @@ def take(run: Callable[[], Any]) -> tuple[Any, Taken]:
     return outcome, Taken(max(seconds - compiling, 0.0), compiling, peak)
 
 
-def _resident(name: str, *, reset: bool = False) -> int | None:
+def _resident(name, reset=False):
     """Bytes now resident, or at most since the kernel's mark was set back; None where there is no such mark."""
     try:
         if reset:

@@ -13,10 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from brdf.errors import InputError
-from brdf.measured.table import MeasuredBRDF, Values, Vectors, half_angle_grid, half_frame
+from brdf.measured.table import Grid, MeasuredBRDF, Values, Vectors, half_angle_grid, half_frame, sampled
 
 SHAPE = (90, 90, 180)
 SCALES = np.array([1.0 / 1500.0, 1.15 / 1500.0, 1.66 / 1500.0])
@@ -28,7 +27,7 @@ _MISSING = -1.0
 
 
 @functools.lru_cache(maxsize=1)
-def grid() -> tuple[Vectors, Vectors, Float[np.ndarray, " P"]]:
+def grid() -> Grid:
     """Light and view of every entry, also below the horizon, and the solid angle that it stands for."""
     return half_angle_grid(SHAPE, np.pi)
 
@@ -82,10 +81,7 @@ def merl_table(f_r: Callable[[Any, Any], Any], *, name: str = "table") -> Measur
         >>> brdf.merl_table(lambda to_light, to_view: np.full(len(to_light), 0.2), name="chalk")
         MeasuredBRDF('chalk', 1096216 samples x 1 channels, 0 negative values)
     """
-    light, view, share = grid()
-    above = (light[:, 2] > 0) & (view[:, 2] > 0)
-    light, view = light[above], view[above]
-    return MeasuredBRDF.from_samples(light, view, f_r(light, view), name=name, solid_angle=share[above])
+    return sampled(grid(), f_r, name=name)
 
 
 def _look_up(values: Values, to_light: Vectors, to_view: Vectors) -> Values:

@@ -15,7 +15,7 @@ import numpy as np
 
 from brdf.errors import InputError
 from brdf.files import utf8_name
-from brdf.measured.table import Evaluation, MeasuredBRDF, Values, Vectors, half_angle_grid
+from brdf.measured.table import Evaluation, MeasuredBRDF, Values, Vectors, half_angle_grid, sampled
 
 MAGIC = b"tensor_file\0"
 
@@ -90,13 +90,12 @@ def _check(content: bytes, place: object) -> tuple[str, ...]:
         demand(name, sound, f"must be {what}")
     for name in ("phi_i", "theta_i"):
         demand(name, np.all(np.diff(fields[name][1]) > 0), "does not grow from entry to entry")
-    lights = fields["phi_i"][1].size, fields["theta_i"][1].size
+    phi, theta = fields["phi_i"][1].size, fields["theta_i"][1].size
     for name in ("vndf", "luminance", colour):
         shape = fields[name][1].shape
-        came = f"has {shape[0]} x {shape[1]} slices for {lights[0]} x {lights[1]} directions of light"
-        demand(name, shape[:2] == lights, came)
+        came = f"has {shape[0]} x {shape[1]} slices for {phi} x {theta} directions of light"
+        demand(name, shape[:2] == (phi, theta), came)
         demand(name, min(shape[-2:]) >= 2, f"is of shape {list(shape)}")
-    shape = fields[colour][1].shape
     demand(colour, shape[3:] == fields["luminance"][1].shape[2:], f"is of shape {list(shape)}")
     if colour == "rgb":
         demand(colour, shape[2] == 3, f"has {shape[2]} channels instead of 3")
@@ -120,18 +119,7 @@ def load(path: Path) -> MeasuredBRDF:
         raise InputError(path, f"is larger than {_MOST_BYTES >> 30} GiB", "Give a .bsdf file of the RGL database")
     channels = _check(path.read_bytes(), path)
     evaluate = _evaluation(path, channels)
-    light, view, share = half_angle_grid(_GRID, 2 * np.pi)
-    above = (light[:, 2] > 0) & (view[:, 2] > 0)
-    light, view = light[above], view[above]
-    return MeasuredBRDF.from_samples(
-        light,
-        view,
-        evaluate(light, view),
-        name=path.stem,
-        channels=channels,
-        solid_angle=share[above],
-        evaluate=evaluate,
-    )
+    return sampled(half_angle_grid(_GRID, 2 * np.pi), evaluate, name=path.stem, channels=channels, evaluate=evaluate)
 
 
 def _evaluation(path: Path, channels: tuple[str, ...]) -> Evaluation:

@@ -16,6 +16,8 @@ from brdf.errors import InputError
 Vectors = Float[np.ndarray, "P 3"]
 Values = Float[np.ndarray, "P C"]
 Evaluation = Callable[[Vectors, Vectors], Values]
+# Light and view of many pairs of directions, and the solid angle that each stands for.
+Grid = tuple[Vectors, Vectors, Float[np.ndarray, " P"]]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -96,7 +98,7 @@ class MeasuredBRDF:
         for what, array in (("to_light", light), ("to_view", view), ("solid_angle", weight)):
             if len(array) != samples:
                 raise InputError(what, f"has {len(array)} rows for {samples} samples", "Give one per sample")
-        if weight.ndim != 1 or not np.all(np.isfinite(weight)) or np.any(weight < 0):
+        if weight.ndim != 1 or not np.all((weight >= 0) & (weight < np.inf)):
             raise InputError("solid_angle", "must be a finite number of 0 or more per sample", "Correct the values")
         channels = channels or tuple(map(str, range(count)))
         if len(channels) != count:
@@ -153,13 +155,13 @@ def from_half_angles(theta_h: Any, theta_d: Any, phi_d: Any, phi_h: Any = 0.0) -
     return z * half + beside, z * half - beside
 
 
-def half_frame(theta_h: Any, phi_h: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def half_frame(theta_h: Any, phi_h: Any) -> tuple[np.ndarray, ...]:
     """The half vector, and the directions in which theta_h and phi_h grow, from these."""
     quarter = 0.5 * np.pi
     return from_angles(theta_h, phi_h), from_angles(theta_h + quarter, phi_h), from_angles(quarter, phi_h + quarter)
 
 
-def half_angle_grid(shape: tuple[int, int, int], turn: float) -> tuple[Vectors, Vectors, Float[np.ndarray, " P"]]:
+def half_angle_grid(shape: tuple[int, int, int], turn: float) -> Grid:
     """Light and view in the middle of each cell of theta_h, theta_d and phi_d, and the solid angle that it stands for.
 
     Args:
@@ -175,3 +177,16 @@ def half_angle_grid(shape: tuple[int, int, int], turn: float) -> tuple[Vectors, 
     # dω_light dω_view = 4 cos θ_d dω_half dω_difference, and dθ_h is in proportion to the root.
     share = np.outer(np.sin(theta_h) * root, np.sin(theta_d) * np.cos(theta_d)).ravel().repeat(shape[2])
     return light.reshape(-1, 3), view.reshape(-1, 3), share / np.mean(share)
+
+
+def sampled(grid: Grid, f_r: Evaluation, **told: Any) -> MeasuredBRDF:
+    """The table of a BRDF at those pairs of directions of a grid that are above the horizon.
+
+    Args:
+        grid: light, view and solid angle.
+        f_r: from light and view directions to values in 1/sr.
+        told: further arguments of `MeasuredBRDF.from_samples`.
+    """
+    above = (grid[0][:, 2] > 0) & (grid[1][:, 2] > 0)
+    light, view, share = (each[above] for each in grid)
+    return MeasuredBRDF.from_samples(light, view, f_r(light, view), solid_angle=share, **told)

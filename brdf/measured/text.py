@@ -10,14 +10,14 @@ Source: L. Belcour, R. Pacanowski and P. Barla, "ALTA: a BRDF analysis library",
 """
 
 import re
+from collections import defaultdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from brdf.errors import InputError
 from brdf.files import parse_number, read_text
-from brdf.measured.table import MeasuredBRDF, Vectors, from_angles, from_half_angles
+from brdf.measured.table import MeasuredBRDF, from_angles, from_half_angles
 
 MOST_CHANNELS = 4096
 # What the columns are: angles of half vector, difference, view and light, or cosines of them. What is not said is 0.
@@ -35,7 +35,7 @@ _PARAMETRISATIONS = {
     "SPHERICAL_TL_PL_TV_PV": "theta_l phi_l theta_v phi_v",
     "CARTESIAN": "x_v y_v z_v x_l y_l z_l",
 }
-_NOT_SAID: dict[str, dict[str, Any]] = {"RUSIN_TH_TD": {"phi_d": 0.5 * np.pi}, "COS_TLR": {"phi_v": np.pi}}
+_NOT_SAID = {"RUSIN_TH_TD": {"phi_d": 0.5 * np.pi}, "COS_TLR": {"phi_v": np.pi}}
 _OUTPUTS = ("INV_STERADIAN", "INV_STERADIAN_COSINE_FACTOR", "RGB_COLOR", "UNKNOWN_OUTPUT")
 # Of a key: what it is where it is missing, what it may be, what is wrong with others, what to do.
 _HEADER = {
@@ -50,7 +50,8 @@ _HEADER = {
     "PARAM_IN": ("", "|".join(_PARAMETRISATIONS), "is not known, got {!r}", f"Known: {', '.join(_PARAMETRISATIONS)}"),
     "VS": ("0", "[012]", "must be 0, 1 or 2, got {!r}", "Correct the header"),
 }
-_NUMBERS = "Numbers have a decimal point and spaces between them; # starts a comment"
+# Lines that hold something, each with its place.
+_Rows = list[tuple[str, list[str]]]
 
 
 def load(path: Path) -> MeasuredBRDF:
@@ -62,42 +63,43 @@ def load(path: Path) -> MeasuredBRDF:
     Raises:
         InputError: naming file and line.
     """
-    text = read_text(path).splitlines()
-    lines = [(f"{path}: line {number}", line) for number, line in enumerate(text, start=1)]
-    return _alta(path, lines) if any(line.startswith("#DIM") for line in text) else _cornell(path, lines)
+    lines = read_text(path).splitlines()
+    rows = [(f"{path}: line {number}", line.partition("#")[0].split()) for number, line in enumerate(lines, start=1)]
+    rows = [row for row in rows if row[1]]
+    heads = [line[1:].partition(" ") for line in lines if line.startswith("#")]
+    header = {key: value.strip() for key, _, value in reversed(heads) if key.isupper()}  # the first of a key counts
+    is_alta = any(line.startswith("#DIM") for line in lines)
+    light, view, values, names = _alta(path, header, rows) if is_alta else _cornell(path, rows)
+    return MeasuredBRDF.from_samples(light, view, values, name=path.stem, channels=names)
 
 
-def _cornell(path: Path, lines: list[tuple[str, str]]) -> MeasuredBRDF:
-    words = [(place, word) for place, line in lines for word in line.partition("#")[0].split()]
-    if not words:
+def _cornell(path: Path, rows: _Rows) -> tuple:
+    if not rows:
         raise InputError(path, "holds no numbers", "Give a table of a measured BRDF")
-    values, places = _numbers(words), [place for place, _ in words]
+    values, places = _numbers(rows), [place for place, words in rows for _ in words]
     if not (1 <= values[0] <= MOST_CHANNELS and values[0] == int(values[0])):
         remedy = "The first number says how many wavelengths follow; ALTA files have a #DIM line"
-        raise InputError(places[0], f"is no measured BRDF, got {words[0][1][:40]!r}", remedy)
+        raise InputError(places[0], f"is no measured BRDF, got {rows[0][1][0][:40]!r}", remedy)
     count = int(values[0])
-    width, wavelengths, rows = 4 + count, values[1 : 1 + count], values[1 + count :]
-    if not rows.size or rows.size % width:
-        came = f"has {rows.size} numbers after {count} wavelengths, not a multiple of {width}"
+    width, first = 4 + count, 1 + count
+    table = values[first:]
+    if not table.size or table.size % width:
+        came = f"has {table.size} numbers after {count} wavelengths, not a multiple of {width}"
         raise InputError(path, came, "Give rows of theta_i phi_i theta_s phi_s and a value per wavelength")
-    for start in range(1 + count, len(places), width):
-        if places[start] == places[start - 1]:
+    starts = places[first::width]
+    for start, before in zip(starts, places[count::width], strict=False):
+        if start == before:
             came = f"holds the end of a row and the start of the next, as if rows had {width} numbers"
             remedy = "Give a row of theta_i phi_i theta_s phi_s and a value per wavelength on a line of its own"
-            raise InputError(places[start], came, remedy)
-    table = rows.reshape(-1, width)
-    _check_angles(places[1 + count :: width], table[:, :4].T)
-    theta_i, phi_i, theta_s, phi_s = table[:, :4].T
-    names = tuple(f"{wavelength:g} nm" for wavelength in wavelengths)
-    light, view = from_angles(theta_i, phi_i), from_angles(theta_s, phi_s)
-    return MeasuredBRDF.from_samples(light, view, table[:, 4:], name=path.stem, channels=names)
+            raise InputError(start, came, remedy)
+    table = table.reshape(-1, width)
+    theta_i, phi_i, theta_s, phi_s = _within(starts, table[:, :4].T)
+    names = tuple(f"{wavelength:g} nm" for wavelength in values[1:first])
+    return from_angles(theta_i, phi_i), from_angles(theta_s, phi_s), table[:, 4:], names
 
 
-def _alta(path: Path, lines: list[tuple[str, str]]) -> MeasuredBRDF:
-    heads = [line[1:].partition(" ") for _, line in lines if line.startswith("#")]
-    header = {key: value.strip() for key, _, value in reversed(heads) if key.isupper()}  # the first of a key counts
+def _alta(path: Path, header: dict[str, str], rows: _Rows) -> tuple:
     inputs, outputs = _dimensions(path, header)
-    rows = [(place, line.split()) for place, line in lines if line.strip() and not line.startswith("#")]
     width, confidence = inputs + outputs, int(header["VS"])
     for place, words in rows:
         if not width <= len(words) <= width + confidence * outputs:
@@ -105,13 +107,12 @@ def _alta(path: Path, lines: list[tuple[str, str]]) -> MeasuredBRDF:
             raise InputError(place, came, "Give as many as the #DIM line says")
     if not rows:
         raise InputError(path, "holds no samples", "Give a table with rows of numbers")
-    table = _numbers([(place, word) for place, words in rows for word in words[:width]]).reshape(-1, width)
+    table = _numbers([(place, words[:width]) for place, words in rows]).reshape(-1, width)
     view, light = _directions(header["PARAM_IN"], [place for place, _ in rows], table[:, :inputs].T)
     values, unit = table[:, inputs:], header["PARAM_OUT"]
     if unit == "INV_STERADIAN_COSINE_FACTOR":
         values = values / np.where(view[:, 2:] > 0, view[:, 2:], 1.0)
-    names = ("red", "green", "blue") if unit == "RGB_COLOR" and outputs == 3 else None
-    return MeasuredBRDF.from_samples(light, view, values, name=path.stem, channels=names)
+    return light, view, values, ("red", "green", "blue") if unit == "RGB_COLOR" and outputs == 3 else None
 
 
 def _dimensions(path: Path, header: dict[str, str]) -> tuple[int, int]:
@@ -132,48 +133,52 @@ def _dimensions(path: Path, header: dict[str, str]) -> tuple[int, int]:
     return inputs, outputs
 
 
-def _numbers(words: list[tuple[str, str]]) -> np.ndarray:
-    """The values of words, each with its place."""
-    values = np.empty(len(words))
-    for index, (place, word) in enumerate(words):
-        try:
-            values[index] = parse_number(word)
-        except ValueError:
-            raise InputError(place, f"must be a number, got {word[:40]!r}", _NUMBERS) from None
-    return values
+def _numbers(rows: _Rows) -> np.ndarray:
+    """All values, row after row."""
+    values = []
+    for place, words in rows:
+        for word in words:
+            try:
+                values.append(parse_number(word))
+            except ValueError:
+                remedy = "Numbers have a decimal point and spaces between them; # starts a comment"
+                raise InputError(place, f"must be a number, got {word[:40]!r}", remedy) from None
+    return np.array(values)
 
 
-def _directions(kind: str, places: list[str], columns: np.ndarray) -> tuple[Vectors, Vectors]:
+def _directions(kind: str, places: list[str], columns: np.ndarray) -> list[np.ndarray]:
     """View and light of each row."""
     if kind == "CARTESIAN":
-        view, light = columns[:3].T, columns[3:].T
-        sound = np.isfinite(columns).all(axis=0) & np.any(view != 0, axis=1) & np.any(light != 0, axis=1)
+        length = np.linalg.norm(columns.reshape(2, 3, -1), axis=1)
+        sound = np.all(np.isfinite(length) & (length > 0), axis=0)
         if not sound.all():
             came = "has a direction that is zero or not finite"
             raise InputError(places[np.argmin(sound)], came, "Correct the file")
-        return view, light
+        return [columns[:3].T, columns[3:].T]
     if kind.startswith("COS_"):
-        _check(places, columns, 1.0, "a cosine", "It is within -1 and 1")
+        _within(places, columns, 1.0, "a cosine", "It is within -1 and 1")
         columns = 2 * np.arctan2(np.sqrt(1 - columns), np.sqrt(1 + columns))
-    else:
-        _check_angles(places, columns)
     names = _PARAMETRISATIONS[kind].split()
-    said = _NOT_SAID.get(kind, {}) | dict(zip(names, columns, strict=True))
+    columns = dict(zip(names, _within(places, columns), strict=True))
+    angles = defaultdict(float, _NOT_SAID.get(kind, {}) | columns)
     if "x_v" in names:  # the parts of the polar angle along two axes
-        said |= {"theta_v": np.hypot(said["x_v"], said["y_v"]), "phi_v": np.arctan2(said["y_v"], said["x_v"])}
-
-    def angles(*wanted: str) -> list[np.ndarray]:
-        return [said.get(name, 0.0) + 0.0 * columns[0] for name in wanted]
-
+        x, y = angles["x_v"], angles["y_v"]
+        angles |= {"theta_v": np.hypot(x, y), "phi_v": np.arctan2(y, x)}
     if "theta_h" in names:
-        return from_half_angles(*angles("theta_h", "theta_d", "phi_d", "phi_h"))
-    return from_angles(*angles("theta_v", "phi_v")), from_angles(*angles("theta_l", "phi_l"))
+        pair = from_half_angles(angles["theta_h"], angles["theta_d"], angles["phi_d"], angles["phi_h"])
+    else:
+        pair = from_angles(angles["theta_v"], angles["phi_v"]), from_angles(angles["theta_l"], angles["phi_l"])
+    return np.broadcast_arrays(*pair)
 
 
-def _check_angles(places: list[str], columns: np.ndarray) -> None:
-    _check(places, columns, 2 * np.pi + 1e-6, "an angle", "Angles are in radians, at most 2 pi")
-
-
-def _check(places: list[str], columns: np.ndarray, largest: float, what: str, remedy: str) -> None:
+def _within(
+    places: list[str],
+    columns: np.ndarray,
+    largest: float = 2 * np.pi + 1e-6,
+    what: str = "an angle",
+    remedy: str = "Angles are in radians, at most 2 pi",
+) -> np.ndarray:
+    """Columns that hold nothing larger."""
     for row, column in np.argwhere(~(np.abs(columns.T) <= largest)):
         raise InputError(places[row], f"has {what} of {columns[column, row]:g}", remedy)
+    return columns

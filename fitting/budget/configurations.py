@@ -100,13 +100,14 @@ def run(
         shares = [1.0 if mask is None else max(float(np.mean(mask)), 1e-9) for mask in problem.masks]
         some = zip(scenes, shares, strict=True)
         samples = [sample_pixels(scene, kind, round(pixels / share)) for scene, share in some]
+    whole = dataclasses.replace(configuration, pixels=None)
     try:
         result = fit_pictures(_subsampled(made, samples) if any(samples) else made)
     except InputError:
         if not any(samples):
             raise
         # Nothing to fit among so few pixels: all of them tell, or tell what is wrong.
-        return run(problem, dataclasses.replace(configuration, pixels=None), lights, n_range)
+        return run(problem, whole, lights, n_range)
     counted = list(result.counted)
     for index, sample in enumerate(samples):
         if sample is not None:
@@ -114,12 +115,10 @@ def run(
             counted[index].ravel()[sample.pixel] = result.counted[index].ravel()
     targets = [target.pixels for target in problem.targets]
     result = dataclasses.replace(result, targets=targets, scenes=problem.scenes, counted=counted)
-    if not any(samples):
-        configuration = dataclasses.replace(configuration, pixels=None)
-    return Run(configuration, made, samples, result)
+    return Run(configuration if any(samples) else whole, made, samples, result)
 
 
-def _subsampled(problem: FitProblem, samples: Sequence[PixelSample | None]) -> FitProblem:
+def _subsampled(problem, samples):
     """The problem of some pixels of its pictures, each of which weighs as many as it stands for."""
     targets, scenes, saturation = list(problem.targets), list(problem.scenes), problem.saturation
     masks, weights = list(problem.masks), list(problem.weights)

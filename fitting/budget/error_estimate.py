@@ -13,19 +13,16 @@ of weight w, the normal matrix is H = Σ w JᵀJ, and what makes the fit cheap i
 The first is random, and is told as the median and the 95 % quantile of what it does; the others are added to it.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
-import brdf
 from brdf.rendering import basis
 from fitting.budget.configurations import MOST_SAMPLES, Run, some_of
 from fitting.budget.sampling import MadeLights, PixelSample, compiled_at_pixels, sample_pixels, with_samples
 from fitting.light_colour import coefficient_factors, take_colour_out
-from fitting.solver.profile import Optimum
 
 # Pixels at which the model is evaluated, of all pictures together and of each at least; filled up to a multiple of
 # `FILLED`, so that few programs are compiled.
@@ -64,35 +61,55 @@ def estimate(run: Run, lights: MadeLights) -> Estimate:
     optimum, how = run.result.optimum, run.configuration
     # More for a lobe so narrow that the rounding of directions counts against its width.
     rounding = float(np.finfo(how.precision).eps * (3 + 0.01 * np.sqrt(max(optimum.n, 0.0))))
-    if how.precision == "float32" and _nearly_dependent(optimum):
+    if how.precision == "float32" and _nearly_dependent(optimum.gauss_newton):
         return Estimate(1.0, 1.0, 0.0, 0.0, 1.0)
     finer = None if how.samples is None or how.samples >= MOST_SAMPLES else min(STEP * how.samples, MOST_SAMPLES)
     if how.pixels is None and finer is None:
         return Estimate(rounding, 3 * rounding, 0.0, 0.0, rounding)
-    system = LinearSystem(run, finer, lights)
-    value, vector = np.linalg.eigh(system.inverse @ system.spread @ system.inverse)
+    grey = take_colour_out(run.problem.scenes, optimum.x.shape[1])
+    system = _sums(run, grey.scenes, finer, lights)
+    at_bound, known = np.append((optimum.x <= 0).ravel(), False), np.zeros(system.gradient.size, bool)
+    known[: len(run.result.parameters)] = [one.value is not None for one in run.result.parameters]
+    factors = coefficient_factors(type(run.result.material), optimum.n, grey.colour)
+    k = np.where(known[:-1].reshape(3, -1), optimum.x / factors, 0.0)
+    least = max(SMALLEST * float(np.max(k)), np.finfo(float).tiny)
+    scale = np.append((np.maximum(np.max(k, axis=1), least)[:, None] * factors).ravel(), 1.0)
+    diagonal = np.diag(system.hessian)
+    length = np.where((diagonal > 0) & (known | ~at_bound), np.sqrt(diagonal), np.inf)
+    inverse = np.linalg.pinv(system.hessian / np.outer(length, length), rcond=1e-13, hermitian=True)
+    inverse /= np.outer(length, length)
+
+    def above_bound(shift):
+        """Coefficients at their bound leave it upwards only."""
+        return np.where(at_bound, np.maximum(shift, 0.0), shift)
+
+    def relative(shift):
+        """The larger of the relative error of the picture and the largest one of a parameter."""
+        parameters = np.max(np.where(known, np.abs(shift) / scale, 0.0), axis=-1)
+        square = np.sum((shift @ system.hessian) * shift, axis=-1)
+        return np.maximum(parameters, np.sqrt(np.maximum(square, 0.0) / system.square))
+
+    value, vector = np.linalg.eigh(inverse @ system.spread @ inverse)
     draws = np.random.default_rng(0).standard_normal((DRAWS, value.size)) * np.sqrt(np.maximum(value, 0.0))
     # What the bound held back is part of it: without it such a coefficient would be off by chance alone.
-    held = system.inverse @ np.where(system.at_bound, system.gradient, 0.0)
-    drawn = system.above_bound(draws @ vector.T + held) - system.above_bound(held)
-    missed = system.inverse @ system.light
-    light, pixels = float(system.relative(missed)), np.quantile(system.relative(drawn), 0.95)
-    error, bound = np.quantile(np.hypot(system.relative(drawn + missed), rounding), [0.5, 0.95])
-    return Estimate(float(error), float(bound) + (MARGIN - 1) * light, float(pixels), light, rounding)
+    held = inverse @ np.where(at_bound, system.gradient, 0.0)
+    drawn = above_bound(draws @ vector.T + held) - above_bound(held)
+    missed = inverse @ system.light
+    light, pixels = float(relative(missed)), float(np.quantile(relative(drawn), 0.95))
+    error, bound = np.quantile(np.hypot(relative(drawn + missed), rounding), [0.5, 0.95])
+    return Estimate(float(error), float(bound) + (MARGIN - 1) * light, pixels, light, rounding)
 
 
-def _nearly_dependent(optimum: Optimum) -> bool:
+def _nearly_dependent(gram):
     """Whether the columns of a fit so nearly add up to one another that float32 cannot tell what they add up to."""
-    square = np.einsum("cii->ci", optimum.gauss_newton)
-    size = np.sqrt(np.where(square > 0, square, 1.0))
-    normed = optimum.gauss_newton / (size[:, :, None] * size[:, None, :])
-    # A column of nothing depends on none.
-    normed += np.where(square > 0, 0.0, 1.0)[:, :, None] * np.eye(4)
-    return bool(np.any(np.linalg.eigvalsh(normed) < DEPENDENT**2))
+    size = np.sqrt(np.einsum("cii->ci", gram))
+    size = np.where(size > 0, size, np.inf)  # a column of nothing depends on none
+    normed = gram / (size[:, :, None] * size[:, None, :]) + np.isinf(size)[:, :, None] * np.eye(4)
+    return np.any(np.linalg.eigvalsh(normed) < DEPENDENT**2)
 
 
 @compiled_at_pixels
-def _columns(scene: brdf.Scene, model: Any, n: Any, channels: int) -> tuple[Float[Array, "M C 4"], Array]:
+def _columns(scene, model, n, channels):
     """Ambient, diffuse, lobe and its derivative by log n, for each channel; and which pixels see the object."""
     images, nothing = basis(model, scene), jnp.zeros(1)
     ambient = nothing if scene.ambient is None else jnp.asarray(scene.ambient)
@@ -103,88 +120,69 @@ def _columns(scene: brdf.Scene, model: Any, n: Any, channels: int) -> tuple[Floa
     return jnp.stack(columns, axis=-1), images.points.mask.ravel()
 
 
-class LinearSystem:
-    """The linear system of a fit's parameters: x_a, x_d, x_s, channel after channel each, and log n, (P,).
+class _Sums(NamedTuple):
+    """Of x_a, x_d, x_s, channel after channel each, and log n, (P,).
 
     Attributes:
-        inverse: of the normal matrix, (P, P).
+        hessian: Σ w JᵀJ, (P, P).
         gradient: Σ w Jᵀr, (P,).
         spread: variance of that sum by the choice of the pixels, (P, P).
         light: Σ w Jᵀ (fine − coarse), (P,).
-        at_bound: which coefficients are 0.
+        square: Σ w times the picture of the fit squared, which errors of the picture are relative to.
     """
 
-    def __init__(self, run: Run, finer: int | None, lights: MadeLights) -> None:
-        """Sum over some pixels of all pictures; ``finer`` is a number of light samples to compare with, or None."""
-        problem, result, optimum = run.problem, run.result, run.result.optimum
-        model = type(result.material)
-        channels = optimum.x.shape[1]
-        size = 3 * channels + 1
-        grey = take_colour_out(problem.scenes, channels)
-        # From the columns of a channel to the parameters.
-        place = np.zeros((channels, 4, size))
-        for channel in range(channels):
-            place[channel, range(3), channel + channels * np.arange(3)] = 1.0
-            place[channel, 3, -1] = optimum.x[2, channel]
-        self.hessian, self.spread = np.zeros((size, size)), np.zeros((size, size))
-        self.gradient, self.light, self.square = np.zeros(size), np.zeros(size), np.finfo(float).tiny
-        most = max(FEWEST_PROBES, PROBES // len(problem.targets))
-        pictures = zip(problem.targets, grey.scenes, result.counted, run.samples, problem.weights, strict=True)
-        for target, scene, counted, sample, weight in pictures:
-            part, share, stride = _probes(scene, model, counted.ravel(), sample, weight, most)
-            padded = np.pad(part.pixel, (0, FILLED - part.pixel.size % FILLED))
-            how = padded, "float64", model, np.float64(max(optimum.n, 1e-3)), channels
-            columns, seen = (each[: share.size] for each in jax.device_get(_columns(scene, *how)))
-            share = np.where(seen, share, 0.0)[:, None]
-            fitted = _fitted(columns, optimum)
-            # What does not count may be no number.
-            residual = np.where(share > 0, some_of(target.pixels, part)[0] - fitted, 0.0)
-            jacobian = np.einsum("mci,cip->mcp", columns, place)
-            weighed = share[..., None] * jacobian
-            scores = np.einsum("mcp,mc->mp", weighed, residual)
-            self.hessian += np.einsum("mcp,mcq->pq", weighed, jacobian, optimize=True)
-            self.gradient += scores.sum(axis=0)
-            # Of the picture of the fit, which errors of the picture are relative to.
-            self.square += np.sum(share * fitted**2)
-            if sample is not None:
-                # A pixel here stands for `stride` pixels of the sample, whose own chance is what counts.
-                chance = 1 - stride / np.maximum(part.stands_for, stride)
-                change = np.diff(scores / stride, axis=0)
-                self.spread += 0.5 * stride * (change * np.minimum(chance[1:], chance[:-1])[:, None]).T @ change
-            if finer is not None:
-                fine, _ = jax.device_get(_columns(with_samples(scene, finer, lights), *how))
-                # A coarser model gives more of what it lacks, hence the sign.
-                self.light -= np.einsum("mcp,mc->p", weighed, _fitted(fine[: share.size], optimum) - fitted)
-        self.at_bound, self.known = np.append((optimum.x <= 0).ravel(), False), np.zeros(size, bool)
-        self.known[: len(result.parameters)] = [one.value is not None for one in result.parameters]
-        factors = coefficient_factors(model, optimum.n, grey.colour)
-        k = np.where(self.known[:-1].reshape(3, -1), optimum.x / factors, 0.0)
-        least = max(SMALLEST * float(np.max(k)), np.finfo(float).tiny)
-        self.scale = np.append((np.maximum(np.max(k, axis=1), least)[:, None] * factors).ravel(), 1.0)
-        diagonal = np.diag(self.hessian)
-        free = (diagonal > 0) & (self.known | ~self.at_bound)
-        length = np.where(free, np.sqrt(np.where(free, diagonal, 1.0)), np.inf)
-        normed = np.outer(length, length)
-        self.inverse = np.linalg.pinv(self.hessian / normed, rcond=1e-13, hermitian=True) / normed
-
-    def above_bound(self, shift: Float[np.ndarray, "*D P"]) -> Float[np.ndarray, "*D P"]:
-        """Coefficients at their bound leave it upwards only."""
-        return np.where(self.at_bound, np.maximum(shift, 0.0), shift)
-
-    def relative(self, shift: Float[np.ndarray, "*D P"]) -> Float[np.ndarray, "*D"]:
-        """The larger of the relative error of the picture and the largest one of a parameter."""
-        parameters = np.max(np.where(self.known, np.abs(shift) / self.scale, 0.0), axis=-1)
-        square = np.sum((shift @ self.hessian) * shift, axis=-1)
-        return np.maximum(parameters, np.sqrt(np.maximum(square, 0.0) / self.square))
+    hessian: np.ndarray
+    gradient: np.ndarray
+    spread: np.ndarray
+    light: np.ndarray
+    square: float
 
 
-def _fitted(columns: np.ndarray, optimum: Optimum) -> np.ndarray:
-    return np.einsum("mck,kc->mc", columns[..., :3], optimum.x)
+def _sums(run, scenes, finer, lights):
+    """Sums over some pixels of all pictures; ``finer`` is a number of light samples to compare with, or None."""
+    problem, optimum, model = run.problem, run.result.optimum, type(run.result.material)
+    channels = optimum.x.shape[1]
+    size = 3 * channels + 1
+    # From the columns of a channel to the parameters.
+    place = np.zeros((channels, 4, size))
+    for channel in range(channels):
+        place[channel, range(3), channel + channels * np.arange(3)] = 1.0
+        place[channel, 3, -1] = optimum.x[2, channel]
+    hessian, spread = np.zeros((size, size)), np.zeros((size, size))
+    gradient, light, square = np.zeros(size), np.zeros(size), np.finfo(float).tiny
+    most = max(FEWEST_PROBES, PROBES // len(problem.targets))
+    pictures = zip(problem.targets, scenes, run.result.counted, run.samples, problem.weights, strict=True)
+    for target, scene, counted, sample, weight in pictures:
+        part, share, stride = _probes(scene, model, counted.ravel(), sample, weight, most)
+        padded = np.pad(part.pixel, (0, FILLED - part.pixel.size % FILLED))
+        how = padded, "float64", model, np.float64(max(optimum.n, 1e-3)), channels
+
+        def fitted(columns):
+            return np.einsum("mck,kc->mc", columns[..., :3], optimum.x)
+
+        columns, seen = (each[: share.size] for each in jax.device_get(_columns(scene, *how)))
+        share, coarse = np.where(seen, share, 0.0)[:, None], fitted(columns)
+        # What does not count may be no number.
+        residual = np.where(share > 0, some_of(target.pixels, part)[0] - coarse, 0.0)
+        jacobian = np.einsum("mci,cip->mcp", columns, place)
+        weighed = share[..., None] * jacobian
+        scores = np.einsum("mcp,mc->mp", weighed, residual)
+        hessian += np.einsum("mcp,mcq->pq", weighed, jacobian, optimize=True)
+        gradient += scores.sum(axis=0)
+        square += np.sum(share * coarse**2)
+        if sample is not None:
+            # A pixel here stands for `stride` pixels of the sample, whose own chance is what counts.
+            chance = 1 - stride / np.maximum(part.stands_for, stride)
+            change = np.diff(scores / stride, axis=0)
+            spread += 0.5 * stride * (change * np.minimum(chance[1:], chance[:-1])[:, None]).T @ change
+        if finer is not None:
+            fine, _ = jax.device_get(_columns(with_samples(scene, finer, lights), *how))
+            # A coarser model gives more of what it lacks, hence the sign.
+            light -= np.einsum("mcp,mc->p", weighed, fitted(fine[: share.size]) - coarse)
+    return _Sums(hessian, gradient, spread, light, square)
 
 
-def _probes(
-    scene: brdf.Scene, model: Any, counted: np.ndarray, sample: PixelSample | None, weight: Any, most: int
-) -> tuple[PixelSample, np.ndarray, float]:
+def _probes(scene, model, counted, sample, weight, most):
     """At most so many of the fitted pixels that count, or that border on one that does in the sample's order.
 
     Returns:

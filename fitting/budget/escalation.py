@@ -101,9 +101,7 @@ def fit_within(problem: FitProblem, accuracy: float | None, seconds: float | Non
         precision = "float64"
     sizes = [target.pixels[..., 0].size for target in problem.targets]
     most = max(sizes) * (WHOLE_IF_SINGLE if accuracy is not None and not has_samples else WHOLE)
-    pixels, reason = FIRST_PIXELS, ""
-    if not has_samples:
-        pixels, reason = _first_pixels(problem, accuracy, sizes, most)
+    pixels, reason = (FIRST_PIXELS, "") if has_samples else _first_pixels(problem, accuracy, sizes, most)
     now = Configuration(problem.model, precision, pixels, FIRST_SAMPLES if has_samples else None)
     lights: MadeLights = {}
     attempts, n_range = [], None
@@ -137,27 +135,29 @@ def check_above_zero(**values: Any) -> None:
             raise InputError(name, f"must be a number above 0, got {value!r}", "Give for example 0.001")
 
 
-def _better(now: Configuration, told: Estimate, accuracy: float | None, most: float) -> Configuration | None:
+def _better(now, told, accuracy, most):
     """The next configuration to try; None where nothing is left to improve."""
-    pixels = told.pixels if now.pixels is not None else 0.0
-    light = told.light if now.samples is not None and now.samples < MOST_SAMPLES else 0.0
+    pixels = told.pixels if now.pixels else 0.0
+    light = told.light if now.samples and now.samples < MOST_SAMPLES else 0.0
     rounding = told.rounding if now.precision == "float32" else 0.0
     worst = max(pixels, light, rounding)
     if worst == 0:
         return None
     # Without an accuracy the largest part of the error is taken down, four times per attempt.
     aim = worst / 2.5 if accuracy is None else min(AIM * accuracy, 0.7 * worst)
-    after = now
-    if now.pixels is not None and pixels > aim:
+    change: dict[str, Any] = {}
+    if now.pixels and pixels > aim:
         more = now.pixels * _power_of_two((pixels / aim) ** 2)
-        after = dataclasses.replace(after, pixels=None if more > most else more)
-    if now.samples is not None and light > aim / 2:
+        change["pixels"] = None if more > most else more
+    if now.samples and light > aim / 2:
         factor = STEP if told.bound > SMALL_ERROR else min(_power_of_two(2 * light / aim), STEP**2)
-        after = dataclasses.replace(after, samples=min(now.samples * factor, MOST_SAMPLES))
-    return dataclasses.replace(after, precision="float64") if rounding > aim / 2 else after
+        change["samples"] = min(now.samples * factor, MOST_SAMPLES)
+    if rounding > aim / 2:
+        change["precision"] = "float64"
+    return dataclasses.replace(now, **change)
 
 
-def _power_of_two(factor: float) -> int:
+def _power_of_two(factor):
     """The next one up, at least 2, so that programs are compiled for few sizes."""
     return 2 ** max(1, int(np.ceil(np.log2(min(factor, 1e9)))))
 
@@ -170,19 +170,17 @@ def near(result: FitResult, error: float, n_range: tuple[float, float]) -> tuple
         error: its estimated error: the interval is of the noise alone, light samples left out can lead far away.
         n_range: bounds that were given.
     """
-    n = next((parameter for parameter in result.parameters if parameter.name == "n"), None)
-    if n is None or n.value is None or n.interval is None or error > SMALL_ERROR:
-        return None
     factor = NEAR_AUTO if result.candidates else NEAR
     inner = np.sqrt(factor)
-    if n.interval[0] < n.value / inner or n.interval[1] > n.value * inner:
-        return None
-    return max(n_range[0], n.value / factor), min(n_range[1], n.value * factor)
+    for n in result.parameters:
+        if n.name != "n" or n.value is None or n.interval is None or error > SMALL_ERROR:
+            continue
+        if n.value / inner <= n.interval[0] and n.interval[1] <= n.value * inner:
+            return max(n_range[0], n.value / factor), min(n_range[1], n.value * factor)
+    return None
 
 
-def _first_pixels(
-    problem: FitProblem, accuracy: float | None, sizes: Sequence[int], most: float
-) -> tuple[int | None, str]:
+def _first_pixels(problem, accuracy, sizes, most):
     """How many pixels of each picture to fit first under single lights; None for all, and why all.
 
     What the noise asks for, as long as that costs little, since relief may pass for noise. Where it asks for more, a

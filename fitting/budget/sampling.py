@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 
 import brdf
 from brdf.models.base import SpecularMaterial
-from brdf.precision import Precision, working_precision
+from brdf.precision import working_precision
 from brdf.rendering import basis
 
 # Of the squares of each size this share is cut further.
@@ -41,10 +41,9 @@ def with_samples(scene: brdf.Scene, samples: int | None, made: MadeLights | None
         samples: at most so many; None leaves it as it is.
         made: lights made so far, and those made now.
     """
-    if samples is None or not scene.lights:
+    if samples is None:
         return scene
-    made = {} if made is None else made
-    lights = []
+    made, lights = {} if made is None else made, []
     for light in scene.lights:
         key = (id(light), samples)
         if getattr(light, "samples", samples) != samples and key not in made:
@@ -53,7 +52,7 @@ def with_samples(scene: brdf.Scene, samples: int | None, made: MadeLights | None
     return dataclasses.replace(scene, lights=tuple(lights))
 
 
-def _sampled(light: Any, samples: int) -> Any:
+def _sampled(light, samples):
     if not isinstance(light, brdf.EnvironmentMap):
         return dataclasses.replace(light, samples=samples)
     plain = brdf.EnvironmentMap(light.pixels, samples=samples)
@@ -79,31 +78,21 @@ def compiled_at_pixels(program: Callable[..., Any]) -> Callable[..., Any]:
         program: of a scene, and of further arguments.
 
     Returns:
-        The same with pixel indices and a precision after the scene. The pixels are traced within the program, unless
-        they are averaged over their area or their visibility is given: then they are cut out beforehand.
+        The same with pixel indices and a precision after the scene.
     """
+    compiled = eqx.filter_jit(program)
 
-    def of_pixels(scene: brdf.Scene, pixel: Any, precision: Precision, *arguments: Any) -> Any:
-        return program(brdf.cast(brdf.some_pixels(scene, pixel, precision=precision), precision), *arguments)
-
-    whole, of_points = eqx.filter_jit(of_pixels), eqx.filter_jit(program)
-
-    def run(scene: brdf.Scene, pixel: np.ndarray, precision: Precision, *arguments: Any) -> Any:
+    def run(scene, pixel, precision, *arguments):
         with working_precision(precision):
-            if scene.camera is not None and scene.camera.samples == 1 and not scene.visibility:
-                return whole(scene, pixel.astype(np.int32), precision, *arguments)
-            points = brdf.cast(brdf.some_pixels(scene, pixel, precision=precision), precision)
-            return of_points(points, *arguments)
+            return compiled(brdf.cast(brdf.some_pixels(scene, pixel, precision=precision), precision), *arguments)
 
     return run
 
 
 @compiled_at_pixels
-def _peaks(scene: brdf.Scene, model: type[brdf.Material]) -> Any:
+def _peaks(scene, model):
     """The largest log cosine of the lobe at each pixel."""
-    lobe = basis(model, scene).lobe
-    assert lobe is not None
-    return lobe.peak()
+    return basis(model, scene).lobe.peak()
 
 
 def sample_pixels(scene: brdf.Scene, model: type[brdf.Material], size: int) -> PixelSample | None:
@@ -151,7 +140,7 @@ def sample_pixels(scene: brdf.Scene, model: type[brdf.Material], size: int) -> P
         corner = corner[:, np.all(corner < end, axis=0)]
 
 
-def _along_curve(rows: int, columns: int) -> Int[np.ndarray, "2 S"]:
+def _along_curve(rows, columns):
     """Rows and columns of a table's entries along Morton's curve: what is near in the order is near in the table."""
     row, column = np.indices((rows, columns)).reshape(2, -1)
     key = np.zeros(row.shape, np.int64)

@@ -5,18 +5,19 @@ its head forbids it to load anything, so that it shows the same in twenty years 
 """
 
 import base64
+import contextlib
 import datetime
 import html
 import importlib.metadata
 import io
 import math
 import platform
-from typing import Any
 
 import brdf
 from brdf.channels import channel_names
 from brdf.display import material_html, report_html
-from fitting.result import FitResult
+from fitting.report.text import standing
+from fitting.result import NOT_DETERMINED, FitResult
 
 _STYLE = """
 :root { color-scheme: light dark; }
@@ -86,75 +87,72 @@ def report_page(result: FitResult, *, source: str = "", command: str = "") -> st
 {report_html(check)}
 {_picture(overview(result.material, check), "a lit sphere, the lobe, the albedo and the reciprocity error")}
 <h2>How it was made</h2>
-{_table([[key, value] for key, value in made.items() if value], "left")}
+{_table([[key, value] for key, value in made.items() if value])}
 <details><summary>The report as text</summary><pre class="wide">{html.escape(str(result))}</pre></details>
 </body></html>
 """
 
 
-def _numbers(result: FitResult) -> str:
+def _numbers(result):
     names = channel_names(result.material.k_d.shape[0])
-    rows = []
+    rows = [["", "channel", "value", "± error", "95 % interval", ""]]
     for one in result.parameters:
-        value = "not determined" if one.value is None else f"{one.value:.6g}"
         ends = ("∞" if math.isinf(end) else f"{end:.6g}" for end in one.interval or ())
         channel = "" if one.channel is None else names[one.channel]
+        value = NOT_DETERMINED if one.value is None else f"{one.value:.6g}"
         error = f"{one.error:.2g}" if one.error else ""
-        rows.append(
-            [one.name, channel, value, error, " to ".join(ends), "at its bound" if one.at_bound else one.reason]
-        )
-    return _table(rows, head=["", "channel", "value", "± error", "95 % interval", ""])
+        remark = "at its bound" if one.at_bound else one.reason
+        rows.append([one.name, channel, value, error, " to ".join(ends), remark])
+    return _table(rows, head=True)
 
 
-def _candidates(result: FitResult) -> str:
+def _candidates(result):
     if len(result.candidates) < 2:
         return ""
-    rows = []
+    rows = [["model", "", "unknowns", "rms", "held out", "excess ± its error", "BIC"]]
     for one in result.candidates:
-        mark = "chosen" if one.chosen else "adequate" if one.excess <= one.excess_error else ""
         excess = f"{one.excess:.4g} ± {one.excess_error:.2g}"
         numbers = [f"{one.rms:.3e}", f"{one.held_out:.3e}", excess, f"{one.bic:.4g}"]
-        rows.append([one.name, mark, str(one.unknowns), *numbers])
-    head = ["model", "", "unknowns", "rms", "held out", "excess ± its error", "BIC"]
+        rows.append([one.name, standing(one), str(one.unknowns), *numbers])
     return (
         "<h2>What the scene requires</h2><p>The simplest adequate model is chosen: its squared error expected on "
         "held-out pixels exceeds that of the best, in noise variances, by no more than its standard error.</p>"
-        + _table(rows, head=head)
+        + _table(rows, head=True)
     )
 
 
-def _warnings(result: FitResult) -> str:
+def _warnings(result):
     return "".join(f'<p class="warning">⚠ {html.escape(warning)}</p>' for warning in result.warnings)
 
 
-def _table(rows: list[list[str]], align: str = "right", head: list[str] | None = None) -> str:
-    """A table, without the columns that are empty in every row; the first names the rows."""
-    filled = [any(column) for column in zip(*rows, strict=True)]
-    left, lines = ' style="text-align:left"', []
-    for cells in rows if head is None else [head, *rows]:
-        first, *others = (html.escape(cell) for cell, keep in zip(cells, filled, strict=True) if keep)
-        if cells is head:
-            lines.append(f"<th{left}>{first}</th>" + "".join(f"<th>{cell}</th>" for cell in others))
+def _table(rows, head=False):
+    """A table, its first row a head or not, without the columns that are empty below it; the first names the rows."""
+    filled = [any(column[head:]) for column in zip(*rows, strict=True)]
+    left, lines = "text-align:left", ""
+    for index, row in enumerate(rows):
+        first, *others = (html.escape(cell) for cell, keep in zip(row, filled, strict=True) if keep)
+        if head and not index:
+            lines += f'<tr><th style="{left}">{first}</th><th>{"</th><th>".join(others)}</th></tr>'
             continue
-        # Numbers are not broken over lines; on a narrow screen the table is pushed sideways instead.
-        whole = [";white-space:nowrap" if head and len(cell) < SENTENCE else "" for cell in others]
-        line = [f'<td style="text-align:{align}{style}">{cell}</td>' for cell, style in zip(others, whole, strict=True)]
-        lines.append(f"<td{left}>{first}</td>" + "".join(line))
-    return f'<div class="wide"><table>{"".join(f"<tr>{line}</tr>" for line in lines)}</table></div>'
+        lines += f'<tr><td style="{left}">{first}</td>'
+        for cell in others:
+            # Numbers are not broken over lines; on a narrow screen the table is pushed sideways instead.
+            whole = "text-align:right;white-space:nowrap" if len(cell) < SENTENCE else "text-align:right"
+            lines += f'<td style="{whole if head else left}">{cell}</td>'
+        lines += "</tr>"
+    return f'<div class="wide"><table>{lines}</table></div>'
 
 
-def _picture(figure: Any, alternative: str) -> str:
+def _picture(figure, alternative):
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=150)
     data = base64.b64encode(file.getvalue()).decode()
     return f'<p><img alt="{html.escape(alternative)}" src="data:image/png;base64,{data}"></p>'
 
 
-def _versions() -> str:
+def _versions():
     found = [f"Python {platform.python_version()}"]
     for name in ("brdf-fitting", "jax", "optimistix", "numpy"):
-        try:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):  # run from a source tree
             found.append(f"{name} {importlib.metadata.version(name)}")
-        except importlib.metadata.PackageNotFoundError:  # run from a source tree
-            continue
     return ", ".join(found)

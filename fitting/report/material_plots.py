@@ -9,7 +9,6 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from jaxtyping import Float
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
@@ -25,6 +24,7 @@ from brdf.plausibility.stability import StabilityMap
 from fitting.report.plots import CHANNELS, OTHERS, PRINT, SIGNED
 
 Brdf = Material | Callable[[Any, Any], Any]
+LIGHT = "angle of the light in degrees"
 
 
 @matplotlib.rc_context(PRINT)
@@ -70,30 +70,26 @@ def plot_albedo(brdf: Brdf, report: Report | None = None, figure: Any = None) ->
     """
     known = isinstance(brdf, Material)
     degrees = np.append(np.arange(0.0, 89.0, 0.5 if known else 2.0), [89.0, 89.5, 89.7, 89.8, 89.9, 89.95, 89.99])
-    if known:
-        albedo = np.asarray(directional_albedo(brdf, np.radians(degrees), precision="float64"))
-    else:
-        albedo = albedo_of(brdf, degrees)
+    albedo: Any = (
+        directional_albedo(brdf, np.radians(degrees), precision="float64") if known else albedo_of(brdf, degrees)
+    )
     count = albedo.shape[1]
-    figure = figure or Figure(figsize=(6, 4), layout="constrained")
-    axes = figure.add_subplot()
+    figure, axes = _axes(figure, (6, 4))
     axes.axhspan(1, 2, color="0.92", zorder=0)
     axes.axhline(1, color="black", linewidth=1)
     axes.annotate("more than arrives", (1, 1), (0, 4), textcoords="offset points", fontsize="small")
     axes.set_prop_cycle(CHANNELS if count == 3 else OTHERS)
-    for values, name in zip(albedo.T, channel_names(count), strict=True):
-        axes.plot(degrees, values, linewidth=1.8, label=name)
+    axes.plot(degrees, albedo, linewidth=1.8, label=channel_names(count))
     if count > 1:
         axes.legend(loc="best")
-    energy = None if report is None else report.energy
-    if energy is not None and energy.crossing:
-        axes.axvline(energy.crossing, color="0.4", linestyle=":", linewidth=1)
-        text = f"exceeds 1 beyond {energy.crossing:.4g}°"
-        axes.annotate(text, (energy.crossing, 1.2), (-5, 0), textcoords="offset points", ha="right")
-    if energy is not None and energy.value < 1.5:
-        axes.plot(energy.to_light.polar, energy.value, "ko", markerfacecolor="none", clip_on=False)
-    axes.set(xlabel="angle of the light in degrees", ylabel="albedo", xlim=(0, 90), ylim=(0, 1.5))
-    axes.set_title("Light reflected, of that arriving")
+    if report is not None and report.energy.crossing:
+        crossing = report.energy.crossing
+        axes.axvline(crossing, color="0.4", linestyle=":", linewidth=1)
+        text = f"exceeds 1 beyond {crossing:.4g}°"
+        axes.annotate(text, (crossing, 1.2), (-5, 0), textcoords="offset points", ha="right")
+    if report is not None and report.energy.value < 1.5:
+        axes.plot(report.energy.to_light.polar, report.energy.value, "ko", markerfacecolor="none", clip_on=False)
+    axes.set(xlabel=LIGHT, ylabel="albedo", xlim=(0, 90), ylim=(0, 1.5), title="Light reflected, of that arriving")
     return figure
 
 
@@ -113,12 +109,11 @@ def plot_lobe(brdf: Brdf, angles: tuple[float, ...] = (0.0, 30.0, 60.0), channel
         >>> fitting.plot_lobe(brdf.preset("gold"), angles=(0, 45)).savefig("lobe.png")
     """
     sample = _sampler(brdf)
-    figure = figure or Figure(figsize=(6, 4), layout="constrained")
-    axes: Any = figure.add_subplot(projection="polar")
+    figure, axes = _axes(figure, (6, 4), projection="polar")
     axes.set_prop_cycle(OTHERS)
     apart = np.geomspace(1e-3, 60, 400)  # denser near the mirror direction, where narrow lobes are
     for angle in angles:
-        views = np.unique(np.concatenate([np.linspace(-90, 90, 721), angle - apart, [angle], angle + apart]))
+        views = np.unique([*np.linspace(-90, 90, 721), *(angle - apart), angle, *(angle + apart)])
         views = np.radians(views[np.abs(views) <= 90])
         view = _in_plane(views)
         value = sample(_in_plane(np.radians([-angle])), view)[:, channel] * view[:, 2]
@@ -149,18 +144,16 @@ def plot_reciprocity(brdf: Brdf, channel: int = 0, figure: Any = None) -> Any:
     """
     sample = _sampler(brdf)
     angles = np.linspace(0, 89.5, 180)
-    light, view = np.radians(np.meshgrid(angles, -angles, indexing="ij")).reshape(2, -1)
-    to_light, to_view = _in_plane(light), _in_plane(view)
+    to_light, to_view = map(_in_plane, np.radians(np.meshgrid(angles, -angles, indexing="ij")).reshape(2, -1))
     there, back = sample(to_light, to_view)[:, channel], sample(to_view, to_light)[:, channel]
-    largest = np.maximum(np.maximum(np.abs(there), np.abs(back)), 1e-300)
+    largest = np.max(np.abs([there, back]), axis=0, initial=1e-300)
     difference = ((there - back) / largest).reshape(len(angles), -1)
-    figure = figure or Figure(figsize=(5.2, 4.2), layout="constrained")
-    axes = figure.add_subplot()
-    most = float(np.abs(difference).max())
+    figure, axes = _axes(figure, (5.2, 4.2))
+    most = np.abs(difference).max()
     bound = max(most, 1e-6)
     image = axes.pcolormesh(angles, angles, difference.T, cmap=SIGNED, vmin=-bound, vmax=bound, rasterized=True)
     figure.colorbar(image, label="(f_r(light→view) − f_r(view→light)) / the larger")
-    axes.set(xlabel="angle of the light in degrees", ylabel="angle of the view in degrees", aspect="equal")
+    axes.set(xlabel=LIGHT, ylabel="angle of the view in degrees", aspect="equal")
     axes.set_title(f"Reciprocity error ≤ {most:.2g}{in_channel(channel, sample.channels)}")
     return figure
 
@@ -183,25 +176,31 @@ def plot_stability(maps: list[StabilityMap]) -> Figure:
     scale = LogNorm(1e-8, 1e-4)
     for axes, found in zip(panels, maps, strict=True):
         axes.pcolormesh(np.clip(found.error, 1e-8, None), norm=scale, cmap=SIGNED)
-        bad = np.argwhere(~found.finite)
-        axes.plot(bad[:, 1] + 0.5, bad[:, 0] + 0.5, "rx")
+        row, column = np.nonzero(~found.finite)
+        axes.plot(column + 0.5, row + 0.5, "rx")
         axes.set_xticks(np.arange(len(found.angles))[::6] + 0.5, [f"{angle:g}" for angle in found.angles[::6]])
         axes.set_yticks(np.arange(len(found.exponents))[::3] + 0.5, [f"{n:.3g}" for n in found.exponents[::3]])
-        said = f"{len(bad)} not finite" if len(bad) else "all derivatives finite"
+        said = f"{len(row)} not finite" if len(row) else "all derivatives finite"
         axes.set_title(f"{found.model}\n{said}", fontsize=10)
-        axes.set_xlabel("angle of the light in degrees")
+        axes.set_xlabel(LIGHT)
     panels[0].set_ylabel("exponent n")
     colours = ScalarMappable(scale, SIGNED)
     figure.colorbar(colours, ax=list(panels), label="error of float32, of the peak", extend="both")
     return figure
 
 
-def _in_plane(angle: Float[np.ndarray, " P"]) -> Float[np.ndarray, "P 3"]:
+def _axes(figure, size, **how):
+    """A figure, of some size where there is none yet, and axes that fill it."""
+    figure = figure or Figure(figsize=size, layout="constrained")
+    return figure, figure.add_subplot(**how)
+
+
+def _in_plane(angle):
     """Directions in the plane of incidence, by their angle from the normal in radians."""
     return np.stack([np.sin(angle), 0.0 * angle, np.cos(angle)], axis=-1)
 
 
-def _lit_function(sample: Sampler, size: int = 256) -> Float[np.ndarray, "H W 3"]:
+def _lit_function(sample, size=256):
     """A sphere of any BRDF in one light from above left, as a screen shows it, on white; as `lit_sphere` lights it.
 
     The tangent lies along the sphere's circles of latitude.
@@ -209,16 +208,17 @@ def _lit_function(sample: Sampler, size: int = 256) -> Float[np.ndarray, "H W 3"
     place = 1.03 * ((np.arange(size) + 0.5) * 2 / size - 1)
     x, y = np.meshgrid(place, -place)
     inside = x * x + y * y < 1
-    normal = np.stack([x, y, np.sqrt(np.maximum(1 - x * x - y * y, 0))], axis=-1)[inside]
+    x, y = x[inside], y[inside]
+    normal = np.stack([x, y, np.sqrt(1 - x * x - y * y)], axis=-1)
     tangent = np.cross([0.0, 1.0, 0.0], normal)
     tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
     frame = np.stack([tangent, np.cross(normal, tangent), normal], axis=1)
-    to_light = frame @ (np.array([-0.5, 0.6, 0.8]) / math.sqrt(1.25))
+    to_light = frame @ np.array([-0.5, 0.6, 0.8]) / math.sqrt(1.25)
     radiance = 0.9 * np.pi * sample(to_light, frame[:, :, 2]) * np.maximum(to_light[:, 2:], 0)
-    image = np.zeros((size, size, radiance.shape[-1]))
-    image[inside] = np.nan_to_num(radiance)
-    return np.where(inside[..., None], displayed(image), 1.0)
+    image = np.ones((size, size, 3))
+    image[inside] = displayed(np.nan_to_num(radiance)[None])[0]
+    return image
 
 
-def _sampler(brdf: Brdf) -> Sampler:
+def _sampler(brdf):
     return Sampler(brdf.reflectance if isinstance(brdf, Material) else brdf)

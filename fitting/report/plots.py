@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import matplotlib
 import numpy as np
 from cycler import cycler
-from jaxtyping import Bool
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
@@ -53,7 +52,7 @@ def comparison(result: "FitResult", picture: int | None = None) -> Figure:
     """
     count, why = len(result.targets), " (explained worst)" if picture is None else ""
     if picture is None:
-        picture = 0 if count == 1 else max(range(count), key=lambda index: _unexplained(result, index))
+        picture = max(range(count), key=lambda index: _unexplained(result, index))
     if not 0 <= picture < count:
         raise InputError("picture", f"must be from 0 to {count - 1}, got {picture}", "Count the pictures from 0")
     name = result.names[picture] if result.names else ""
@@ -65,38 +64,38 @@ def comparison(result: "FitResult", picture: int | None = None) -> Figure:
     row, rows, columns = _highlight(result, picture, counted, specular)
     figure = Figure(figsize=(7.2, 4.9), layout="constrained")
     figure.suptitle(title, fontsize=PRINT["axes.titlesize"])
-    grid = figure.add_gridspec(2, 3)
-    above = [figure.add_subplot(grid[0, column]) for column in range(3)]
-    for axes, image, title in zip(above, (target, fitted), ("target", f"fit, {result.surface}"), strict=False):
-        axes.imshow(brdf.displayed(image, white))
-        axes.set_title(title)
-        axes.axhline(row, color="white", linewidth=0.6, linestyle=(0, (4, 4)))
-    _residual(figure, above[2], target, fitted, counted)
-    for axes in above:
-        axes.set(xticks=[], yticks=[], **_around(counted))
-    if not specular:
-        _scanline(figure.add_subplot(grid[1, :]), target, fitted, counted, row, slice(0, target.shape[1]))
-        return figure
-    axes, width = figure.add_subplot(grid[1, 0]), columns.stop - columns.start
-    crop = np.concatenate([image[rows, columns] for image in (target, fitted)], axis=1)
-    axes.imshow(brdf.displayed(crop, max(white, float(np.nanmax(crop)))), interpolation="nearest")
-    axes.axvline(width - 0.5, color="white", linewidth=1)
-    axes.set(xticks=[0.5 * width, 1.5 * width], xticklabels=["target", "fit"], yticks=[])
-    axes.tick_params(length=0)
-    axes.set_title(f"highlight, {width} pixels wide")
-    _scanline(figure.add_subplot(grid[1, 1]), target, fitted, counted, row, columns)
-    _profile(figure.add_subplot(grid[1, 2]), result)
+    below = ["highlight", "scanline", "profile"] if specular else ["scanline"] * 3
+    panels: Any = figure.subplot_mosaic([["target", "fit", "residual"], below])
+    for key, image, title in ("target", target, "target"), ("fit", fitted, f"fit, {result.surface}"):
+        panels[key].imshow(brdf.displayed(image, white))
+        panels[key].axhline(row, color="white", linewidth=0.6, linestyle=(0, (4, 4)))
+        panels[key].set_title(title)
+    _residual(panels["residual"], target, fitted, counted)
+    for key in ("target", "fit", "residual"):
+        panels[key].set(xticks=[], yticks=[], **_around(counted))
+    if specular:
+        _profile(panels["profile"], result)
+        axes, width = panels["highlight"], columns.stop - columns.start
+        crop = np.concatenate([image[rows, columns] for image in (target, fitted)], axis=1)
+        axes.imshow(brdf.displayed(crop, max(white, float(np.nanmax(crop)))), interpolation="nearest")
+        axes.axvline(width - 0.5, color="white", linewidth=1)
+        axes.set(xticks=[0.5 * width, 1.5 * width], xticklabels=["target", "fit"], yticks=[])
+        axes.tick_params(length=0)
+        axes.set_title(f"highlight, {width} pixels wide")
+    else:
+        columns = slice(0, target.shape[1])
+    _scanline(panels["scanline"], target, fitted, counted, row, columns)
     return figure
 
 
-def _unexplained(result: "FitResult", picture: int) -> float:
+def _unexplained(result, picture):
     """Squares of the residual of a picture, over its own."""
     counted = np.asarray(result.counted[picture])
     values = np.asarray(result.targets[picture], np.float64)[counted]
-    return float(np.sum((result.fitted(picture)[counted] - values) ** 2) / max(np.sum(values**2), 1e-300))
+    return np.sum((result.fitted(picture)[counted] - values) ** 2) / max(np.sum(values**2), 1e-300)
 
 
-def _around(counted: Bool[np.ndarray, "H W"]) -> dict[str, Any]:
+def _around(counted):
     """Limits of axes that show what counts, and a margin around it: a thing may be small in its picture."""
     if not counted.any():
         return {}
@@ -109,25 +108,23 @@ def _around(counted: Bool[np.ndarray, "H W"]) -> dict[str, Any]:
     }
 
 
-def _highlight(
-    result: "FitResult", picture: int, counted: Bool[np.ndarray, "H W"], specular: bool
-) -> tuple[int, slice, slice]:
+def _highlight(result, picture, counted, specular):
     """The row of the highlight's peak, and the rows and columns worth enlarging."""
-    material: Any = result.material
+    material = result.material
     image = np.nan_to_num(np.asarray(result.targets[picture]))
     if specular:
         dark = type(material)(k_d=0.0 * np.asarray(material.k_d), k_s=material.k_s, n=material.n)
         image = np.asarray(brdf.render(dark, result.scenes[picture], precision=result.precision))
     image = np.where(counted, image.max(axis=-1), 0.0)
-    peak = [int(at) for at in np.unravel_index(np.argmax(image), image.shape)]
+    peak = np.array(np.unravel_index(np.argmax(image), image.shape))
     bright = np.argwhere(image > 0.2 * image.max())
-    reach = int(np.max(np.abs(bright - peak), initial=0)) + 2
+    reach = np.max(np.abs(bright - peak), initial=0) + 2
     reach = min(max(reach, 8), max(image.shape) // 2)
-    rows, columns = (slice(max(at - reach, 0), at + reach + 1) for at in peak)
-    return peak[0], rows, slice(columns.start, min(columns.stop, image.shape[1]))
+    (top, left), (bottom, right) = np.maximum(peak - reach, 0), np.minimum(peak + reach + 1, image.shape)
+    return peak[0], slice(top, bottom), slice(left, right)
 
 
-def _residual(figure: Figure, axes: Any, target: np.ndarray, fitted: np.ndarray, counted: np.ndarray) -> None:
+def _residual(axes, target, fitted, counted):
     """At each pixel the channel that is farthest off, with its sign: a mean could hide a wrong colour."""
     difference = fitted - np.nan_to_num(target)
     farthest = np.argmax(np.abs(difference), axis=-1, keepdims=True)
@@ -136,33 +133,33 @@ def _residual(figure: Figure, axes: Any, target: np.ndarray, fitted: np.ndarray,
     axes.set_facecolor("0.85")
     image = axes.imshow(signed, cmap=SIGNED, vmin=-limit, vmax=limit)
     axes.set_title("fit − target" + (", largest channel" if target.shape[-1] > 1 else ""))
-    bar: Any = figure.colorbar(image, ax=axes, label="radiance", extend="both")
+    bar = axes.figure.colorbar(image, ax=axes, label="radiance", extend="both")
     bar.formatter.set_powerlimits((-2, 3))
 
 
-def _scanline(axes: Any, target: np.ndarray, fitted: np.ndarray, counted: np.ndarray, row: int, columns: slice) -> None:
+def _scanline(axes, target, fitted, counted, row, columns):
     axes.set_prop_cycle(CHANNELS)
-    target, fitted, counted = target[row, columns], fitted[row, columns], counted[row, columns]
+    target, fitted, counted = target[row, columns], fitted[row, columns], counted[row, columns, None]
     across, count = np.arange(columns.start, columns.stop), target.shape[-1]
-    names, step = channel_names(count), max(1, len(across) // 30)
-    seen = counted | np.any(fitted != 0, axis=-1)
+    names, some = channel_names(count), slice(None, None, max(1, len(across) // 30))
+    lines = np.where(counted | np.any(fitted != 0, axis=-1, keepdims=True), fitted, np.nan)
+    known = np.where(counted, target, np.nan)
+    circles: dict[str, Any] = {"marker": "o", "linestyle": "", "markersize": 2.5, "markerfacecolor": "none"}
     # Of a spectrum, as many channels as there are colours, from the first to the last.
     for channel in np.unique(np.linspace(0, count - 1, min(count, len(CHANNELS))).round().astype(int)):
         label = "fit" if count == 1 else names[channel] if count == 3 else f"channel {names[channel]}"
-        line = np.where(seen, fitted[:, channel], np.nan)
-        colour = axes.plot(across, line, linewidth=1.2, label=label)[0].get_color()
-        known = np.where(counted, target[:, channel], np.nan)[::step]
-        axes.plot(across[::step], known, "o", color=colour, markersize=2.5, markerfacecolor="none")
-    axes.plot([], [], "o", color="0.3", markersize=2.5, markerfacecolor="none", label="target")
+        (line,) = axes.plot(across, lines[:, channel], linewidth=1.2, label=label)
+        axes.plot(across[some], known[some, channel], color=line.get_color(), **circles)
+    axes.plot([], [], color="0.3", label="target", **circles)
     axes.set(xlabel=f"column, in row {row}", ylabel="radiance (linear)", title="scanline")
     axes.legend(frameon=False, handlelength=2.2, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.2))
 
 
-def _profile(axes: Any, result: "FitResult") -> None:
+def _profile(axes, result):
     """The least residual at each exponent: how deep the minimum is, and whether there are others."""
     optimum = result.optimum
     grid, profile = np.asarray(optimum.grid), np.asarray(optimum.profile)
-    exact = float(np.sum(optimum.cost))
+    exact = np.sum(optimum.cost)
     if grid.size and not optimum.flat and exact < profile.min():  # the grid steps over a sharp minimum
         place = np.searchsorted(grid, optimum.n)
         grid, profile = np.insert(grid, place, optimum.n), np.insert(profile, place, exact)

@@ -1,7 +1,5 @@
 """A fit as text: what the command prints, and what a person pastes into a paper."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from brdf.channels import channel_names
@@ -41,7 +39,16 @@ def report(result: FitResult) -> str:
     return "\n".join(lines)
 
 
-def _correlations(result: FitResult, labels: Sequence[str]) -> list[str]:
+def standing(candidate: Candidate) -> str:
+    """What the comparison of models says of one: "chosen", "adequate" or nothing.
+
+    Args:
+        candidate: one of them.
+    """
+    return "chosen" if candidate.chosen else "adequate" if candidate.excess <= candidate.excess_error else ""
+
+
+def _correlations(result, labels):
     """The strongest correlations, as far as they are worth a line."""
     free, matrix = result.free_parameters, result.correlation
     names = ["n" if one.channel is None else f"{one.name} {labels[one.channel]}".rstrip() for one in free]
@@ -56,15 +63,15 @@ def _correlations(result: FitResult, labels: Sequence[str]) -> list[str]:
     return [f"  correlated  {', '.join(words)}"] if words else []
 
 
-def _candidates(candidates: Sequence[Candidate]) -> list[str]:
+def _candidates(candidates):
     lines = [
         "  what the scene requires (squared error expected on held-out pixels, over the best, in noise variances):",
         f"    {'model':<40}{'unknowns':>9}{'rms':>11}{'held out':>11}{'excess ± its error':>26}{'BIC':>12}",
     ]
     for one in candidates:
-        mark = "  <- chosen" if one.chosen else "  adequate" if one.excess <= one.excess_error else ""
+        mark = f"  {'<- ' * one.chosen}{standing(one)}"
         excess = f"{one.excess:.1f} ± {one.excess_error:.1f}" if one.excess < 1e6 else f"{one.excess:.2e}"
         bic = f"{one.bic:.1f}" if one.bic < 1e6 else f"{one.bic:.2e}"
         errors = f"{one.rms:>11.3e}{one.held_out:>11.3e}{excess:>26}{bic:>12}"
-        lines.append(f"    {one.name:<40}{one.unknowns:>9}{errors}{mark}")
+        lines.append(f"    {one.name:<40}{one.unknowns:>9}{errors}{mark}".rstrip())
     return lines

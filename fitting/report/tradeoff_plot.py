@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 if TYPE_CHECKING:
-    from fitting.speed_accuracy import Row, Tradeoff
+    from fitting.speed_accuracy import Tradeoff
 
 # Colours that colour-blind readers tell apart (Okabe and Ito 2008), and marks that print in black and white.
 MARKS = {
@@ -38,10 +38,9 @@ def error_against_time(tradeoff: "Tradeoff") -> Figure:
     errors = {row: row.error if np.isfinite(row.error) else row.rms for row in rows}
     least = min([error for error in errors.values() if error > 0] + [accuracy]) / BELOW
     points = {row: (1e3 * row.seconds, max(error, least)) for row, error in errors.items()}
-    for axis, (colour, marker) in MARKS.items():
+    for axis in dict.fromkeys(row.axis for row in rows):
+        colour, marker = MARKS[axis]
         chosen = [row for row in rows if row.axis == axis]
-        if not chosen:
-            continue
         times, heights = np.transpose([points[row] for row in chosen])
         # Of another model only the picture can be compared.
         hollow = all(np.isinf(row.error) for row in chosen)
@@ -57,43 +56,28 @@ def error_against_time(tradeoff: "Tradeoff") -> Figure:
             zorder=3,
         )
     beside: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8, "color": "0.3", "zorder": 5}
-    for row in rows:
-        if errors[row] == 0:
-            axes.annotate("error 0: the reference", points[row], xytext=(9, -3), **beside)
     axes.axhline(accuracy, color="0.2", linewidth=0.9, linestyle=(0, (4, 3)), zorder=1, label=f"accuracy {accuracy:g}")
     if tradeoff.front:
         front = np.transpose([points[row] for row in tradeoff.front])
         axes.step(*front, where="post", color="0.6", linewidth=1.2, zorder=1, label="Pareto front")
-    best = tradeoff.recommended
-    words = {tradeoff.closest if best is None else best: "most accurate" if best is None else "recommended"}
-    words[tradeoff.default] = ", ".join(word for word in (words.get(tradeoff.default), "default") if word)
-    ringed = [row for row in words if row in points and np.isfinite(row.error)]
+    words = {row: tradeoff.marks(row).removesuffix("front").rstrip(", ") for row in rows if np.isfinite(row.error)}
+    ringed = [row for row in words if words[row]]
     for number, row in enumerate(dict.fromkeys([*tradeoff.front, *ringed]), start=1):
         axes.annotate(str(number), points[row], xytext=(-7, -5), ha="right", va="top", **beside)
-        name = _name(row, tradeoff)
+        # Of a configuration, what is not usual.
+        usual = "" if tradeoff.default is None else str(tradeoff.default.configuration)
+        parts = str(row.configuration).split(", ")
+        name = ", ".join(part for part in parts if part not in usual.split(", ") or part.endswith("pixels"))
         if row in ringed:
             axes.plot(*points[row], "o", zorder=4, markersize=11, markerfacecolor="none", markeredgecolor="0.1")
             name += f"\n({words[row]})"
         axes.plot([], [], color="0.3", marker=f"${number}$", linestyle="", label=name)
+    for row in rows:
+        if errors[row] == 0:
+            axes.annotate("error 0: the reference", points[row], xytext=(9, -3), **beside)
     axes.margins(0.12)
     axes.grid(visible=True, which="major", color="0.9", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0)
     return figure
-
-
-def _name(row: "Row", tradeoff: "Tradeoff") -> str:
-    """What of a configuration is not usual, in a few words."""
-    how, default = row.configuration, tradeoff.default
-    usual = default.configuration if default is not None else None
-    if how is None:
-        return row.name
-    parts = {
-        "all pixels" if how.pixels is None else f"{how.pixels} pixels": True,
-        f"{how.samples} samples": how.samples is not None,
-        how.precision: how.precision != "float32" and how.solver == "separable",
-        how.model: usual is not None and how.model != usual.model,
-        how.solver.upper(): how.solver != "separable",
-    }
-    return ", ".join(part for part, unusual in parts.items() if unusual)

@@ -159,11 +159,11 @@ def test_a_clipped_highlight_in_a_jpeg_file_does_not_bend_the_fit(tmp_path, qual
 
 def test_solvers_that_are_compared_leave_out_the_same_pixels():
     bench = Bench(state_problem(seen(DULL, 0.03, 0, low=0.0, bits=8), SCENE, model="blinn-phong"))
-    solver = next(trial for trial in bench.trials() if trial[0] == "solver")
-    assert parameter_deviation(bench.run(*solver), bench.best) < 0.05
+    solver = next(trial for trial in bench.trials() if trial.axis == "solver")
+    assert parameter_deviation(bench.run(solver), bench.best) < 0.05
     # All of the fitted pixels: what is cut off bends this fit as well.
     bench.best.counted[0][:] = True
-    assert parameter_deviation(bench.run(*solver), bench.best) > 0.08
+    assert parameter_deviation(bench.run(solver), bench.best) > 0.08
 
 
 @pytest.mark.parametrize(("low", "share"), [(0.0, True), (-1.0, False)])

@@ -267,7 +267,7 @@ def test_the_command_fits_and_checks_tables(tmp_path, capsys):
     words = ["fit", str(tmp_path / "paint.brdf"), "--json", "--out", str(tmp_path / "out"), "--loss", "log"]
     with pytest.raises(SystemExit) as done:
         main(words)
-    assert done.value.code == 0
+    assert not done.value.code
     said = json.loads(capsys.readouterr().out)
     assert said["material"]["model"] == "phong"
     assert said["material"]["n"] == pytest.approx(20.0, rel=1e-4)

@@ -95,7 +95,8 @@ def test_a_spectrum_is_drawn_from_its_first_channel_to_its_last(matt, tmp_path):
     material = brdf.Lambert(k_d=np.linspace(0.1, 0.9, 9))
     target = np.asarray(brdf.render(material, matt.scenes[0]))
     figure = dataclasses.replace(matt, material=material, targets=[target]).plot()
-    labels = [text.get_text() for text in figure.axes[-1].get_legend().get_texts()]
+    scanline = next(axes for axes in figure.axes if axes.get_title() == "scanline")
+    labels = [text.get_text() for text in scanline.get_legend().get_texts()]
     assert (labels[0], labels[-2]) == ("channel 0", "channel 8")
     figure.savefig(tmp_path / "picture.png")
     assert (tmp_path / "picture.png").stat().st_size > 10_000
