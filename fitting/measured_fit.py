@@ -29,6 +29,7 @@ from brdf.lobes import Lobe
 from brdf.materials.material_file import material_to_dict
 from brdf.models.base import SpecularMaterial
 from fitting.model_fit import ModelFit
+from fitting.problem import check_choice
 from fitting.report.saving import write_report
 from fitting.result import Parameter, undetermined
 from fitting.solver.normal_equations import Picture
@@ -305,12 +306,7 @@ def fit_brdf(
     start = time.perf_counter()
     if not isinstance(table, brdf.MeasuredBRDF):
         raise InputError("table", f"must be a brdf.MeasuredBRDF, got {type(table).__name__}", "Use brdf.load_measured")
-    if model != "auto" and model not in brdf.MODELS:
-        raise InputError("model", f"is unknown, got {model!r}", f"Use auto or one of {', '.join(brdf.MODELS)}")
-    if loss not in get_args(Loss):
-        raise InputError("loss", f"is unknown, got {loss!r}", f"Use one of {', '.join(get_args(Loss))}")
-    if not 0 < n_range[0] < n_range[1] < np.inf:
-        raise InputError("n_range", f"must be 0 < lower < upper, got {n_range}", "Correct the bounds")
+    check_choice(model, loss, get_args(Loss), n_range)
     samples = _samples(table, max_angle)
     count, channels = int(np.count_nonzero(samples.solid_angle)), len(samples.channels)
     left_out, negative = samples.left_out, int(np.count_nonzero(samples.values[:count] < 0))

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Iterable
 from numbers import Real
 from typing import Any, NamedTuple
 
@@ -211,21 +212,36 @@ def has_pixel_areas(scene: brdf.Scene) -> bool:
     return scene.points is not None and scene.points.area is not None
 
 
-def _check_options(problem: FitProblem) -> None:
-    model, loss, n_range = problem.model, problem.loss, problem.n_range
+def check_choice(model: str, loss: str, losses: Iterable[str], n_range: tuple[float, float]) -> None:
+    """Refuse what is no model, no loss and no range of exponents.
+
+    Args:
+        model: "auto" or the name of a model.
+        loss: its name.
+        losses: the names that there are.
+        n_range: bounds of the exponent.
+
+    Raises:
+        InputError: naming the argument.
+    """
     if model != "auto" and model not in brdf.MODELS:
         raise InputError("model", f"is unknown, got {model!r}", f"Use auto or one of {', '.join(brdf.MODELS)}")
-    if problem.plausible and model in CLASSIC:
-        remedy = f"Use auto, normalized-{model}, or a normalised form of your choice"
-        raise InputError("model", f"{model} is neither reciprocal nor energy conserving, so never plausible", remedy)
-    if loss not in LOSSES:
-        raise InputError("loss", f"is unknown, got {loss!r}", f"Use one of {', '.join(LOSSES)}")
+    if loss not in losses:
+        raise InputError("loss", f"is unknown, got {loss!r}", f"Use one of {', '.join(losses)}")
     try:
         low, high = (float(bound) for bound in n_range)
     except (TypeError, ValueError):
         low = high = math.nan
     if not 0 < low < high < math.inf:
         raise InputError("n_range", f"must be 0 < lower < upper, got {n_range}", "Correct the bounds")
+
+
+def _check_options(problem: FitProblem) -> None:
+    model = problem.model
+    check_choice(model, problem.loss, LOSSES, problem.n_range)
+    if problem.plausible and model in CLASSIC:
+        remedy = f"Use auto, normalized-{model}, or a normalised form of your choice"
+        raise InputError("model", f"{model} is neither reciprocal nor energy conserving, so never plausible", remedy)
     for name in ("saturation", "dark"):
         value = getattr(problem, name)
         if value is not None and (isinstance(value, bool) or not isinstance(value, Real) or math.isnan(value)):

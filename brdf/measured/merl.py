@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from brdf.errors import InputError
-from brdf.measured.table import Grid, MeasuredBRDF, Values, Vectors, half_angle_grid, half_frame, sampled
+from brdf.measured.table import Grid, MeasuredBRDF, half_angle_grid, half_frame, sampled
 
 SHAPE = (90, 90, 180)
 SCALES = np.array([1.0 / 1500.0, 1.15 / 1500.0, 1.66 / 1500.0])
@@ -84,14 +84,11 @@ def merl_table(f_r: Callable[[Any, Any], Any], *, name: str = "table") -> Measur
     return sampled(grid(), f_r, name=name)
 
 
-def _look_up(values: Values, to_light: Vectors, to_view: Vectors) -> Values:
+def _look_up(values, to_light, to_view):
     """The entry that directions fall into, as the published reader does it."""
-    half = to_light + to_view
-    half = half / np.maximum(np.linalg.norm(half, axis=-1, keepdims=True), 1e-300)
-    flat = np.linalg.norm(half[..., :2], axis=-1)
-    theta_h, phi_h = np.arctan2(flat, half[..., 2]), np.where(flat > 0, np.arctan2(half[..., 1], half[..., 0]), 0.0)
-    theta_d = np.arctan2(np.linalg.norm(np.cross(half, to_light), axis=-1), np.sum(half * to_light, axis=-1))
-    _, down, across = half_frame(theta_h, phi_h)
-    phi_d = np.arctan2(np.sum(across * to_light, axis=-1), np.sum(down * to_light, axis=-1)) % np.pi
-    position = (SHAPE[0] * (theta_h / (0.5 * np.pi)) ** 0.5, np.degrees(theta_d), np.degrees(phi_d))
+    x, y, z = np.moveaxis(to_light + to_view, -1, 0)
+    theta_h, phi_h = np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)
+    z, x, y = (np.sum(axis * to_light, axis=-1) for axis in half_frame(theta_h, phi_h))
+    theta_d, phi_d = np.degrees(np.arctan2(np.hypot(x, y), z)), np.degrees(np.arctan2(y, x) % np.pi)
+    position = SHAPE[0] * (theta_h / (0.5 * np.pi)) ** 0.5, theta_d, phi_d
     return values[np.ravel_multi_index(np.floor(position).astype(int), SHAPE, mode="clip")]

@@ -15,7 +15,7 @@ import numpy as np
 
 from brdf.errors import InputError
 from brdf.files import utf8_name
-from brdf.measured.table import Evaluation, MeasuredBRDF, Values, Vectors, half_angle_grid, sampled
+from brdf.measured.table import MeasuredBRDF, half_angle_grid, sampled
 
 MAGIC = b"tensor_file\0"
 
@@ -67,11 +67,11 @@ def read_fields(content: bytes, place: object) -> dict[str, tuple[int, np.ndarra
     return fields
 
 
-def _check(content: bytes, place: object) -> tuple[str, ...]:
+def _check(content, place):
     """Names of the channels, after finding that Mitsuba can read the file."""
     fields = read_fields(content, place)
 
-    def demand(name: str, good: Any, what: str) -> None:
+    def demand(name, good, what):
         if not good:
             raise InputError(f"{place}: {name}", what, _REPAIR)
 
@@ -122,7 +122,7 @@ def load(path: Path) -> MeasuredBRDF:
     return sampled(half_angle_grid(_GRID, 2 * np.pi), evaluate, name=path.stem, channels=channels, evaluate=evaluate)
 
 
-def _evaluation(path: Path, channels: tuple[str, ...]) -> Evaluation:
+def _evaluation(path, channels):
     try:
         import mitsuba
     except ImportError:
@@ -145,7 +145,7 @@ def _evaluation(path: Path, channels: tuple[str, ...]) -> Evaluation:
                 mitsuba.set_variant(before)
     together = 4 if wavelengths else 3  # channels that Mitsuba evaluates at once
 
-    def evaluate(to_light: Vectors, to_view: Vectors) -> Values:
+    def evaluate(to_light, to_view):
         to_light, to_view = np.broadcast_arrays(to_light, to_view)
         values = np.zeros((len(to_light), len(channels)))
         for first in range(0, len(channels), together):

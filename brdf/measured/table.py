@@ -115,14 +115,14 @@ class MeasuredBRDF:
         return cls(name, *kept, left_out=counts, evaluate=evaluate)
 
 
-def _numbers(name: str, value: Any) -> np.ndarray:
+def _numbers(name, value):
     try:
         return np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         raise InputError(name, f"must be numbers, got {type(value).__name__}", "Give an array") from None
 
 
-def _directions(name: str, value: Any) -> Vectors:
+def _directions(name, value):
     vectors = _numbers(name, value)
     if vectors.ndim != 2 or vectors.shape[1] != 3:
         raise InputError(name, f"must be of shape (P, 3), got {vectors.shape}", "Give a direction per sample")

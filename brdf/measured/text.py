@@ -50,8 +50,6 @@ _HEADER = {
     "PARAM_IN": ("", "|".join(_PARAMETRISATIONS), "is not known, got {!r}", f"Known: {', '.join(_PARAMETRISATIONS)}"),
     "VS": ("0", "[012]", "must be 0, 1 or 2, got {!r}", "Correct the header"),
 }
-# Lines that hold something, each with its place.
-_Rows = list[tuple[str, list[str]]]
 
 
 def load(path: Path) -> MeasuredBRDF:
@@ -64,6 +62,7 @@ def load(path: Path) -> MeasuredBRDF:
         InputError: naming file and line.
     """
     lines = read_text(path).splitlines()
+    # Lines that hold something, each with its place.
     rows = [(f"{path}: line {number}", line.partition("#")[0].split()) for number, line in enumerate(lines, start=1)]
     rows = [row for row in rows if row[1]]
     heads = [line[1:].partition(" ") for line in lines if line.startswith("#")]
@@ -73,7 +72,7 @@ def load(path: Path) -> MeasuredBRDF:
     return MeasuredBRDF.from_samples(light, view, values, name=path.stem, channels=names)
 
 
-def _cornell(path: Path, rows: _Rows) -> tuple:
+def _cornell(path, rows):
     if not rows:
         raise InputError(path, "holds no numbers", "Give a table of a measured BRDF")
     values, places = _numbers(rows), [place for place, words in rows for _ in words]
@@ -98,7 +97,7 @@ def _cornell(path: Path, rows: _Rows) -> tuple:
     return from_angles(theta_i, phi_i), from_angles(theta_s, phi_s), table[:, 4:], names
 
 
-def _alta(path: Path, header: dict[str, str], rows: _Rows) -> tuple:
+def _alta(path, header, rows):
     inputs, outputs = _dimensions(path, header)
     width, confidence = inputs + outputs, int(header["VS"])
     for place, words in rows:
@@ -115,7 +114,7 @@ def _alta(path: Path, header: dict[str, str], rows: _Rows) -> tuple:
     return light, view, values, ("red", "green", "blue") if unit == "RGB_COLOR" and outputs == 3 else None
 
 
-def _dimensions(path: Path, header: dict[str, str]) -> tuple[int, int]:
+def _dimensions(path, header):
     """How many columns are input and output, after finding that the header can be read."""
     for key, (default, pattern, what, remedy) in _HEADER.items():
         value = header.setdefault(key, default)
@@ -133,7 +132,7 @@ def _dimensions(path: Path, header: dict[str, str]) -> tuple[int, int]:
     return inputs, outputs
 
 
-def _numbers(rows: _Rows) -> np.ndarray:
+def _numbers(rows):
     """All values, row after row."""
     values = []
     for place, words in rows:
@@ -146,7 +145,7 @@ def _numbers(rows: _Rows) -> np.ndarray:
     return np.array(values)
 
 
-def _directions(kind: str, places: list[str], columns: np.ndarray) -> list[np.ndarray]:
+def _directions(kind, places, columns):
     """View and light of each row."""
     if kind == "CARTESIAN":
         length = np.linalg.norm(columns.reshape(2, 3, -1), axis=1)
@@ -171,13 +170,7 @@ def _directions(kind: str, places: list[str], columns: np.ndarray) -> list[np.nd
     return np.broadcast_arrays(*pair)
 
 
-def _within(
-    places: list[str],
-    columns: np.ndarray,
-    largest: float = 2 * np.pi + 1e-6,
-    what: str = "an angle",
-    remedy: str = "Angles are in radians, at most 2 pi",
-) -> np.ndarray:
+def _within(places, columns, largest=2 * np.pi + 1e-6, what="an angle", remedy="Angles are in radians, at most 2 pi"):
     """Columns that hold nothing larger."""
     for row, column in np.argwhere(~(np.abs(columns.T) <= largest)):
         raise InputError(places[row], f"has {what} of {columns[column, row]:g}", remedy)

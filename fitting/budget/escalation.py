@@ -20,7 +20,7 @@ from brdf.errors import InputError
 from brdf.models.base import SpecularMaterial
 from fitting.budget.choice import Attempt, BudgetChoice
 from fitting.budget.configurations import MOST_SAMPLES, Configuration, run, sample_counts
-from fitting.budget.error_estimate import STEP, Estimate, estimate
+from fitting.budget.error_estimate import STEP, estimate
 from fitting.budget.sampling import MadeLights
 from fitting.problem import FitProblem
 from fitting.result import FitResult

@@ -92,7 +92,8 @@ def compiled_at_pixels(program: Callable[..., Any]) -> Callable[..., Any]:
 @compiled_at_pixels
 def _peaks(scene, model):
     """The largest log cosine of the lobe at each pixel."""
-    return basis(model, scene).lobe.peak()
+    lobe: Any = basis(model, scene).lobe
+    return lobe.peak()
 
 
 def sample_pixels(scene: brdf.Scene, model: type[brdf.Material], size: int) -> PixelSample | None:
@@ -126,8 +127,7 @@ def sample_pixels(scene: brdf.Scene, model: type[brdf.Material], size: int) -> P
         cut = np.zeros(pixel.size, bool)
         if has_peaks and side > 1 and pixel.size > most:
             # One shape for few sizes, so that few programs are compiled.
-            padded = np.zeros(1 << int(pixel.size - 1).bit_length(), int)
-            padded[: pixel.size] = pixel
+            padded = np.resize(pixel, 1 << int(pixel.size - 1).bit_length())
             peak = np.asarray(_peaks(with_samples(lit, FEW_SAMPLES), padded, "float32", model))[: pixel.size]
             cut[np.argpartition(-peak, most)[:most]] = True
         pixels.append(pixel[~cut])

@@ -192,6 +192,15 @@ def test_a_model_needs_more_samples_than_it_has_numbers():
         fitted(3, "phong")
 
 
+@pytest.mark.parametrize("loss", ["cosine", "squared", "log"])
+def test_a_coefficient_at_its_bound_is_exactly_0(loss):
+    light, view = directions(300)
+    values = f_r("blinn-phong", [0.0, 0.2], [0.4, 0.3], 20.0, light, view)
+    result = fitting.fit_brdf(brdf.MeasuredBRDF.from_samples(light, view, values), "blinn-phong", loss=loss)
+    assert result.material.k_d[0] == 0
+    assert str(result.parameters[0]) == "0 (at its bound)"
+
+
 def test_rounding_is_no_highlight():
     light, view = directions(40)
     result = fitting.fit_brdf(brdf.MeasuredBRDF.from_samples(light, view, np.full((40, 1), 0.3)))
