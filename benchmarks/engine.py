@@ -111,12 +111,11 @@ def parts(picture: Picture, repeats: int) -> None:
         (subsample, "_octaves"),
         (profile, "rough_model"),
         (profile, "profile_on_grid"),
-        (profile, "with_errors"),
+        (profile, "sampling_errors"),
         (profile, "spread"),
         (profile, "enclose"),
         (profile, "gauss_newton"),
         (refinement, "solve_linear"),
-        (normal_equations, "_one"),
         (normal_equations, "_each"),
         (normal_equations, "_unpack"),
     ]:

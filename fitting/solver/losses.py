@@ -18,11 +18,12 @@ The reweighting. Minimising the sum of rho(r) is solved by weights rho'(r) / r, 
 is the residual of all channels of a pixel together, in units of a scale taken from the median.
 """
 
+import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Literal, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -63,39 +64,13 @@ class Reweighted(NamedTuple):
     noise_factor: float = 1.0
 
 
-def iterate(
-    pictures: Sequence[Picture],
-    optimise: Callable[[Sequence[Picture]], Optimum],
-    working: Callable[[Optimum, int], Callable[[Picture], Picture]],
-    at_rest: Callable[[Optimum, Optimum], bool],
-) -> Reweighted:
-    """The one reweighted loop: squared fits, each of pictures made from the last one's optimum, until it rests.
-
-    A likelihood whose first and second derivative by the prediction m are the score s and -w asks for the target
-    m + s / w with the weight w (Green 1984, J. R. Stat. Soc. B 46, 149); a loss with weights, for the target itself.
-
-    Args:
-        pictures: as for the search.
-        optimise: the squared fit.
-        working: from the last optimum and the number of the round to what makes a picture's target and weight.
-        at_rest: from the last optimum and the next whether the rounds are over.
-    """
-    now, optimum = pictures, optimise(pictures)
-    for round_ in range(MOST_ROUNDS):
-        before, now = optimum, each(working(optimum, round_), pictures)
-        optimum = optimise(now)
-        if at_rest(before, optimum):
-            break
-    return Reweighted(optimum, now)
-
-
 def reweight(
     pictures: Sequence[Picture],
     optimise: Callable[[Sequence[Picture]], Optimum],
     loss: Loss,
     rounding: Float[np.ndarray, " C"],
 ) -> Reweighted:
-    """Fit with a loss of any kind.
+    """Fit with a loss of any kind: squared fits, each with the weights of the last one's optimum, until it rests.
 
     Args:
         pictures: as for the search.
@@ -103,37 +78,20 @@ def reweight(
         loss: one of `LOSSES`.
         rounding: standard deviation of a value's rounding, (C,); no scale is smaller.
     """
+    now, optimum, robust = pictures, optimise(pictures), loss in ("huber", "cauchy")
     if loss == "squared":
-        return Reweighted(optimise(pictures), pictures)
-    floor = DARKEST * _mean(pictures)
-    rule: str = loss
-
-    def working(optimum: Optimum, round_: int) -> Callable[[Picture], Picture]:
-        nonlocal rule
+        return Reweighted(optimum, pictures)
+    scale = rounding if robust else DARKEST * _mean(pictures)
+    for round_ in range(MOST_ROUNDS):
         # Huber's loss is convex in the coefficients; the first rounds lead Cauchy's to the right one of its minima.
         rule = "huber" if loss == "cauchy" and round_ < 3 else loss
-        scale = floor if loss in ("relative", "log") else _scale(pictures, optimum, rounding)
-        return partial(_with_weight, optimum=optimum, scale=scale, loss=rule)
-
-    found = iterate(pictures, optimise, working, lambda *both: rule == loss and _change(*both) < ENOUGH)
-    if loss in ("relative", "log"):
-        return found
-    return found._replace(noise_factor=_noise_factor(found.pictures, pictures, found.optimum, loss))
-
-
-def cut(channels: int) -> float:
-    """By what factor the cut of one channel changes for the root mean square over several.
-
-    Wilson and Hilferty's cube-root approximation of chi squared (1931) keeps the share of normal pixels beyond it.
-
-    Args:
-        channels: how many.
-    """
-
-    def limit(degrees: int) -> float:
-        return float((1 - 2 / (9 * degrees) + _QUANTILE * np.sqrt(2 / (9 * degrees))) ** 1.5)
-
-    return limit(channels) / limit(1)
+        if robust:
+            scale = _scale(pictures, optimum, rounding)
+        before, now = optimum, each(partial(_with_weight, optimum=optimum, scale=scale, loss=rule), pictures)
+        optimum = optimise(now)
+        if rule == loss and _change(before, optimum) < ENOUGH:
+            break
+    return Reweighted(optimum, now, _noise_factor(now, pictures, optimum, loss) if robust else 1.0)
 
 
 def _change(before: Optimum, after: Optimum) -> float:
@@ -143,10 +101,18 @@ def _change(before: Optimum, after: Optimum) -> float:
     return change if after.flat and before.flat else max(change, abs(np.log(after.n / before.n)))
 
 
+def _weights(picture: Picture) -> np.ndarray:
+    return np.broadcast_to(np.asarray(picture.weights), picture.target.shape)
+
+
+def _predicted(picture: Picture, optimum: Optimum) -> np.ndarray:
+    return np.asarray(picture.predicted(np.asarray(optimum.n), optimum.x))
+
+
 def _mean(pictures: Sequence[Picture]) -> np.ndarray:
     total, count = 0.0, 0.0
     for picture in pictures:
-        counted = np.broadcast_to(np.asarray(picture.weights) > 0, picture.target.shape)
+        counted = _weights(picture) > 0
         total = total + np.sum(np.abs(np.asarray(picture.target, np.float64)), axis=0, where=counted)
         count = count + np.sum(counted, axis=0)
     return np.maximum(total / np.maximum(count, 1), np.finfo(np.float32).tiny)
@@ -157,18 +123,17 @@ def _scale(pictures: Sequence[Picture], optimum: Optimum, rounding: np.ndarray) 
     sizes = []
     for picture in pictures:
         stride = max(1, picture.target.shape[0] * len(pictures) // _MEDIAN_VALUES)
-        residual = np.abs(np.asarray(picture.target - picture.predicted(np.asarray(optimum.n), optimum.x)))
-        weight = np.broadcast_to(np.asarray(picture.weights), residual.shape)
+        weight = _weights(picture)
         rows = np.flatnonzero(weight.min(axis=1) > 0)[::stride]
-        sizes.append(residual[rows] * np.sqrt(weight[rows]))
+        residual = np.asarray(picture.target) - _predicted(picture, optimum)
+        sizes.append(np.abs(residual[rows]) * np.sqrt(weight[rows]))
     return np.maximum(np.median(np.concatenate(sizes), axis=0) / _MEDIAN, rounding)
 
 
 def _with_weight(picture: Picture, optimum: Optimum, scale: np.ndarray, loss: str) -> Picture:
-    model = np.asarray(picture.predicted(np.asarray(optimum.n), optimum.x))
-    weight = weights(loss, np.asarray(picture.target), model, np.asarray(picture.weights), scale)
-    weight = jnp.asarray(weight, picture.target.dtype)
-    return eqx.tree_at(lambda p: p.weight, picture, weight, is_leaf=lambda leaf: leaf is None)
+    base = np.asarray(picture.weights)
+    weight = weights(loss, np.asarray(picture.target), _predicted(picture, optimum), base, scale)
+    return replace(picture, weight=jnp.asarray(weight, picture.target.dtype))
 
 
 def weights(
@@ -188,18 +153,27 @@ def weights(
         scale: standard deviation of good residuals; or the darkest value of a relative or log loss, (C,).
     """
     target = np.where(base > 0, target, model)
+    bright = np.maximum(model, scale)
     if loss == "relative":
-        return base / np.maximum(model, scale) ** 2
+        return base / bright**2
     if loss == "log":
-        bright, value = np.maximum(model, scale), np.maximum(target, scale)
-        excess = value / bright - 1
+        excess = np.maximum(target, scale) / bright - 1
         near = np.abs(excess) < 1e-3
         away = np.where(near, 1.0, excess)
         return base * np.where(near, 1 - excess / 2, np.log1p(away) / away) / bright**2
-    distance = np.mean(base * ((target - model) / scale) ** 2, axis=1, keepdims=True) / cut(target.shape[1]) ** 2
+    distance = np.mean(base * ((target - model) / scale) ** 2, axis=1, keepdims=True)
+    distance = distance * (_limit(1) / _limit(target.shape[1])) ** 2
     if loss == "huber":
         return base * np.minimum(1.0, HUBER / np.sqrt(np.maximum(distance, HUBER**2)))
     return base / (1 + distance / CAUCHY**2)
+
+
+def _limit(channels: int) -> float:
+    """How large a root mean square over channels the same share of normal pixels has, by Wilson and Hilferty (1931).
+
+    Their cube-root approximation of chi squared.
+    """
+    return (1 - 2 / (9 * channels) + _QUANTILE * math.sqrt(2 / (9 * channels))) ** 1.5
 
 
 def _noise_factor(now: Sequence[Picture], base: Sequence[Picture], optimum: Optimum, loss: str) -> float:
@@ -207,22 +181,15 @@ def _noise_factor(now: Sequence[Picture], base: Sequence[Picture], optimum: Opti
 
     ψ = w r; its derivative is 1 where the loss is quadratic. The weighted Gram matrix is mean(w) times the plain one.
     """
-    psi, slope, weights, squares, count = 0.0, 0.0, 0.0, 0.0, 0.0
+    totals = np.zeros(5)
     for picture, original in zip(now, base, strict=True):
-        residual = np.asarray(picture.target - picture.predicted(np.asarray(optimum.n), optimum.x), np.float64)
-        start = np.broadcast_to(np.asarray(original.weights, np.float64), residual.shape)
-        weight = np.broadcast_to(np.asarray(picture.weights, np.float64), residual.shape)
-        good = start > 0
-        w = np.where(good, weight / np.where(good, start, 1.0), 0.0)
-        squared = np.where(good, start * np.where(good, residual, 0.0) ** 2, 0.0)
+        channels, good = picture.target.shape[1], _weights(original) > 0
+        residual = np.asarray(picture.target - _predicted(picture, optimum), np.float64)[good]
+        start, weight = (_weights(one)[good].astype(np.float64) for one in (original, picture))
+        w, squared = weight / start, start * residual**2
         # Of a pixel's C channels one direction carries the cut: there psi' is that of the loss, in the others w.
-        radial = np.where(w < 1, 0.0, 1.0) if loss == "huber" else w * (2 * w - 1)
-        channels = residual.shape[1]
-        slope += np.sum(np.where(good, (radial + (channels - 1) * w) / channels, 0.0))
-        psi += np.sum(w * w * squared)
-        squares += np.sum(w * squared)
-        weights += np.sum(w)
-        count += np.count_nonzero(good)
-    if not (count and squares and slope > 0):
-        return 1.0
-    return float(np.sqrt((psi / count) * (weights / count) / (slope / count) ** 2 / (squares / count)))
+        radial = w >= 1 if loss == "huber" else w * (2 * w - 1)
+        slope = (radial + (channels - 1) * w) / channels
+        totals += [np.sum(w * w * squared), np.sum(w), w.size, np.sum(slope), np.sum(w * squared)]
+    psi, weight, count, slope, square = totals
+    return math.sqrt(psi * weight * count / square) / slope if square > 0 and slope > 0 else 1.0

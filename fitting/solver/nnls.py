@@ -11,28 +11,8 @@ import itertools
 import numpy as np
 from jaxtyping import Bool, Float
 
-# A combination of columns that keeps less than this of their squares is none.
-DEPENDENT = 1e-10
 # By so much rounding may lift a sum that has a cap over it.
 ROUNDING = 1e-12
-
-
-def _eliminate(
-    gram: Float[np.ndarray, "*K U U"], right: Float[np.ndarray, "*K U"], tolerance: float, definite: int
-) -> tuple[Float[np.ndarray, "*K U"], Bool[np.ndarray, "*K"]]:
-    """The solution, and whether what elimination leaves of the diagonal of the first ``definite`` rows is no rounding.
-
-    Gauss-Jordan; a symmetric definite system needs no pivoting.
-    """
-    whole = np.concatenate([gram, right[..., None]], axis=-1)
-    regular = np.ones(right.shape[:-1], bool)
-    for i in range(right.shape[-1]):
-        pivot = whole[..., i, i]
-        regular &= pivot > tolerance * gram[..., i, i] if i < definite else pivot < 0
-        row = whole[..., i, :] / np.where(pivot == 0, 1.0, pivot)[..., None]
-        whole -= whole[..., :, i, None] * row[..., None, :]
-        whole[..., i, :] = row
-    return whole[..., -1], regular
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
@@ -48,6 +28,7 @@ def nonnegative_minima(
 
     A few unknowns have a few active sets: all are solved and the best feasible one is taken. That has no iterations and
     no tolerance on the answer. The step from the start is what is solved for, so no digits are lost near the optimum.
+    The multiplier of a cap is one more unknown, which starts at 0.
 
     Args:
         gram: G, of any number of problems.
@@ -61,26 +42,32 @@ def nonnegative_minima(
     Source: for the sets on the cap, Nocedal and Wright, Numerical Optimization, 2006, section 16.5.
     """
     unknowns = product.shape[-1]
-    sets = np.array(list(itertools.product([False, True], repeat=unknowns)))
-    active = sets.reshape(-1, *(1,) * (product.ndim - 1), unknowns)
-    leave = np.where(active, 0.0, start)
-    both = active[..., :, None] & active[..., None, :]
-    system = np.where(both, gram, np.eye(unknowns))
-    right = np.where(active, product + (gram @ leave[..., None])[..., 0], 0.0)
-    gain, regular = _eliminate(system, right, tolerance, unknowns)
-    x = np.where(active, start + gain, 0.0)
-    feasible = regular & np.all(~active | (free & (x >= 0)), axis=-1)
+    start = np.broadcast_to(start, product.shape)
+    system, right, begin = gram, product, start
     if cap is not None:
-        weight = np.where(active, cap, 0.0)
-        feasible &= np.sum(weight * x, axis=-1) <= 1 + ROUNDING
-        bordered = np.zeros((*system.shape[:-2], unknowns + 1, unknowns + 1))
-        bordered[..., :-1, :-1] = system
-        bordered[..., -1, :-1] = bordered[..., :-1, -1] = weight
-        room = 1 - np.sum(weight * start, axis=-1, keepdims=True)
-        gain, regular = _eliminate(bordered, np.concatenate([right, room], axis=-1), tolerance, unknowns)
-        capped = np.where(active, start + gain[..., :-1], 0.0)
-        regular &= np.all(~active | (free & (capped >= 0)), axis=-1)
-        x, feasible = np.concatenate([x, capped]), np.concatenate([feasible, regular])
+        more = [(0, 0)] * (product.ndim - 1)
+        system = np.pad(gram, [*more, (0, 1), (0, 1)])
+        system[..., -1, :-1] = system[..., :-1, -1] = cap
+        right = np.concatenate([product, 1 - np.sum(cap * start, axis=-1, keepdims=True)], axis=-1)
+        begin = np.pad(start, [*more, (0, 1)])
+    sets = np.array(list(itertools.product([False, True], repeat=right.shape[-1])))
+    active = sets.reshape(-1, *(1,) * (product.ndim - 1), right.shape[-1])
+    leave = np.where(active, 0.0, begin)
+    right = np.where(active, right + (system @ leave[..., None])[..., 0], 0.0)
+    both = active[..., :, None] & active[..., None, :]
+    whole = np.concatenate([np.where(both, system, np.eye(right.shape[-1])), right[..., None]], axis=-1)
+    # Gauss and Jordan; a symmetric definite system needs no pivoting. On a cap the last pivot is below 0.
+    feasible = np.ones(right.shape[:-1], bool)
+    for i, diagonal in enumerate(np.moveaxis(np.diagonal(whole, axis1=-2, axis2=-1).copy(), -1, 0)):
+        pivot = whole[..., i, i]
+        feasible &= np.where(diagonal > 0, pivot, -pivot) > tolerance * diagonal
+        row = whole[..., i, :] / np.where(pivot == 0, 1.0, pivot)[..., None]
+        whole -= whole[..., :, i, None] * row[..., None, :]
+        whole[..., i, :] = row
+    x = np.where(active, begin + whole[..., -1], 0.0)[..., :unknowns]
+    feasible &= np.all(~active[..., :unknowns] | (free & (x >= 0)), axis=-1)
+    if cap is not None:
+        feasible &= active[..., -1] | (np.sum(cap * x, axis=-1) <= 1 + ROUNDING)
     step = x - start
     change = np.sum(step * ((gram @ step[..., None])[..., 0] - 2 * product), axis=-1)
     best = np.argmin(np.where(feasible, change, np.inf), axis=0)
@@ -99,15 +86,12 @@ def nonnegative_minimum(
 
     Source: C. L. Lawson and R. J. Hanson, Solving Least Squares Problems, 1974, chapter 23.
     """
-    if not product.size:
-        return product
-    signed = np.zeros(product.size, bool) if signed is None else signed
     usable = np.diag(gram) > np.finfo(float).tiny
     scale = np.sqrt(np.where(usable, np.diag(gram), 1.0))
     gram, product = gram / np.outer(scale, scale), np.where(usable, product / scale, 0.0)
-    passive = signed & usable
-    x = np.zeros(product.size)
-    tolerance = 1e-13 * max(float(np.max(np.abs(product))), np.finfo(float).tiny)
+    signed = np.zeros(product.size, bool) if signed is None else signed
+    passive, x = signed & usable, np.zeros(product.size)
+    tolerance = 1e-13 * np.max(np.abs(product), initial=np.finfo(float).tiny)
     for _ in range(4 * product.size + 4):
         while True:
             trial = np.zeros_like(x)
@@ -115,22 +99,20 @@ def nonnegative_minimum(
             negative = passive & ~signed & (trial <= 0)
             if not negative.any():
                 break
-            shares = np.full(x.shape, np.inf)
-            shares[negative] = x[negative] / np.maximum(x - trial, np.finfo(float).tiny)[negative]
-            share = np.min(shares)
-            x = x + share * (trial - x)
-            passive &= ~(negative & ((x <= 1e-15 * np.max(np.abs(x))) | (shares <= share)))
+            # Towards the trial as far as all stay positive; what comes to 0 first leaves.
+            shares = np.where(negative, x / np.maximum(x - trial, np.finfo(float).tiny), np.inf)
+            x = x + np.min(shares) * (trial - x)
+            passive &= shares > np.min(shares)
             x = np.where(passive, x, 0.0)
         x = trial
-        gain = np.where(passive | ~usable, -np.inf, product - gram @ x)
-        best = int(np.argmax(gain))
-        if not gain[best] > tolerance:
+        gain = np.where(passive | ~usable, 0.0, product - gram @ x)
+        if not np.max(gain, initial=0.0) > tolerance:
             break
-        passive[best] = True
+        passive[np.argmax(gain)] = True
     return x / scale
 
 
-def inverse_diagonal(gram: Float[np.ndarray, "U U"], share: float = DEPENDENT) -> Float[np.ndarray, " U"]:
+def inverse_diagonal(gram: Float[np.ndarray, "U U"], share: float = 1e-10) -> Float[np.ndarray, " U"]:
     """The diagonal of the inverse; infinite for an unknown that takes part in an undetermined combination.
 
     Args:

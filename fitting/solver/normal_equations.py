@@ -18,7 +18,7 @@ ambient one, would else seem to differ from it by the rounding of the sums.
 
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -108,7 +108,7 @@ _MEAN_PIXELS = 64
 # Beyond this many channels of one grey basis a matrix product is as fast and compiles in a fraction of the time.
 UNROLLED_CHANNELS = 4
 
-COMPILER_OPTIONS: dict[str, bool | int | float | str] = {
+COMPILER_OPTIONS: Any = {
     "xla_cpu_enable_fast_math": True,
     "xla_cpu_fast_math_honor_nans": True,
     "xla_cpu_fast_math_honor_infs": True,
@@ -134,15 +134,22 @@ class Sums(NamedTuple):
     square: Float[np.ndarray, "*K C"]
     pixels: Float[np.ndarray, "*K C"]
 
-    def about(self, reference: Float[np.ndarray, "C R"]) -> "Sums":
+    def about(self, reference: np.ndarray) -> "Sums":
         """The same sums with the residual against the reference model replaced by the target, or by another residual.
 
         Args:
-            reference: What to add to the residual, as coefficients of the columns.
+            reference: What to add to the residual, as coefficients of the first columns, (..., C, 3) or more.
         """
-        moved = np.einsum("...ij,...j->...i", self.gram, reference)
+        missing = self.product.shape[-1] - reference.shape[-1]
+        reference = np.pad(reference, [*[(0, 0)] * (reference.ndim - 1), (0, missing)])
+        moved = (self.gram @ reference[..., None])[..., 0]
         square = self.square + np.sum(reference * (2 * self.product + moved), axis=-1)
-        return Sums(self.gram, self.product + moved, square, self.pixels)
+        return self._replace(product=self.product + moved, square=square)
+
+    def columns(self, basis: np.ndarray) -> "Sums":
+        """Sums of other columns, each row of a basis saying what one is made of."""
+        product = (basis @ self.product[..., None])[..., 0]
+        return self._replace(gram=basis @ self.gram @ basis.swapaxes(-1, -2), product=product)
 
     def within(self, t: Float[np.ndarray, " T"], width: float, reference: Float[np.ndarray, "C 3"]) -> "Sums":
         """From the sums of a bracket those at some exponents in it, the lobe being Hermite's cubic of its ends.
@@ -152,40 +159,57 @@ class Sums(NamedTuple):
             width: of the bracket, in log n.
             reference: the reference model, whose lobe was that of the lower end; here it is that of each t.
         """
-        basis = np.zeros((t.size, 4, 6))
-        basis[:, [0, 1, 2], [0, 1, 2]] = 1.0
-        basis[:, 2, 3:] = np.stack([t * width, t * t * (3 - 2 * t), t * t * (t - 1) * width], axis=-1)
-        basis[:, 3, 3:] = np.stack([np.ones_like(t), 6 * t * (1 - t) / width, t * (3 * t - 2)], axis=-1)
-        change = reference[:, 2:] * (basis[:, None, 2] - np.eye(6)[2])
-        moved = (self.gram @ change[..., None])[..., 0]
-        square = self.square + np.sum(change * (moved - 2 * self.product), axis=-1)
-        return Sums(
-            gram=basis[:, None] @ self.gram @ basis[:, None].swapaxes(-1, -2),
-            product=(self.product - moved) @ basis.swapaxes(-1, -2),
-            square=square,
-            pixels=np.broadcast_to(self.pixels, square.shape),
-        )
+        basis = np.zeros((t.size, 1, 4, 6))
+        basis[..., [0, 1, 2], [0, 1, 2]] = 1.0
+        basis[:, 0, 2, 3:] = np.stack([t * width, t * t * (3 - 2 * t), t * t * (t - 1) * width], axis=-1)
+        basis[:, 0, 3, 3:] = np.stack([np.ones_like(t), 6 * t * (1 - t) / width, t * (3 * t - 2)], axis=-1)
+        return self.about(reference[:, 2:] * (np.eye(6)[2] - basis[..., 2, :])).columns(basis)
 
 
-def _columns(picture: Picture, log_n: Array, peak: Array) -> tuple[Float[Array, "P Cb"], ...]:
+def _columns(picture: Picture, log_n: Array, peak: Array) -> list[Array]:
     """Diffuse, lobe, derivative by log n, and for a bracket what Hermite's cubic adds to the straight line."""
-    lobe, diffuse = picture.lobe, picture.diffuse
-    if log_n.shape[0] == 0:
-        return (diffuse,)
-    if lobe is None:
-        return (diffuse,) + (jnp.zeros_like(diffuse),) * (2 * log_n.shape[0])
-    value, slope = relative_lobe(lobe, log_n[0], peak, diffuse.dtype)
-    if log_n.shape[0] == 1:
-        return diffuse, value, slope
-    end_value, end_slope = relative_lobe(lobe, log_n[1], peak, diffuse.dtype)
-    step = (log_n[1] - log_n[0]).astype(diffuse.dtype)
-    # Differences are taken per pixel: taken between sums they would lose the digits that a narrow bracket lives on.
-    return diffuse, value, slope, end_value - value - step * slope, end_slope - slope
+    diffuse = picture.diffuse
+    if picture.lobe is None:
+        return [diffuse, *[jnp.zeros_like(diffuse)] * (2 * log_n.size)]
+    ends = [relative_lobe(picture.lobe, at, peak, diffuse.dtype) for at in log_n]
+    columns = [diffuse, *(column for end in ends[:1] for column in end)]
+    if len(ends) == 2:
+        (value, slope), (end_value, end_slope) = ends
+        step = (log_n[1] - log_n[0]).astype(diffuse.dtype)
+        # Differences are taken per pixel: taken between sums they would lose the digits a narrow bracket lives on.
+        columns += [end_value - value - step * slope, end_slope - slope]
+    return columns
 
 
-def _reduce(products: Sequence[Array]) -> Array:
-    """All sums in one loop over the pixels."""
-    zero = np.zeros((), products[0].dtype)
+def _means(picture: Picture, log_n: Array, peak: Array) -> Array:
+    """What to take off the columns: their means over some pixels that count, in the pixels' dtype, (R - 1, Cb)."""
+    stride = max(1, picture.target.shape[0] // _MEAN_PIXELS)
+    few = picture.pixels(lambda a: a[::stride])
+    columns = jnp.stack(jnp.broadcast_arrays(*_columns(few, log_n, peak)))
+    counts = jnp.broadcast_to(jnp.max(few.weights, axis=1) > 0, columns.shape[1])
+    total = jnp.sum(jnp.where(counts[:, None], columns, 0), axis=1)
+    return total / jnp.maximum(jnp.sum(counts), 1).astype(total.dtype)
+
+
+def _summed(columns: int, residuals: int) -> list[tuple[int, int]]:
+    """Which products of the columns and of the residuals after them are summed: of two residuals none."""
+    size = columns + residuals
+    return [(i, j) for i in range(size) for j in range(i, size) if i < columns or i == j]
+
+
+def _group_sums(columns: Sequence[Array], mean: Array, targets: Array, weight: Array, reference: Array) -> Array:
+    """Sums of the channels that share basis and weight, in one loop over the pixels; the last is the pixel count."""
+    one = jnp.ones_like(columns[0])
+    parts = [one, *(column - mean[i] for i, column in enumerate(columns))]
+    for target, (ambient, *coefficients) in zip(targets, reference.T, strict=True):
+        model = ambient
+        for coefficient, column in zip(coefficients, columns, strict=False):
+            model = model + coefficient * column
+        parts.append(jnp.where(weight > 0, target - model, 0))
+    weighted = [weight * part for part in parts]
+    products = [weighted[i] * parts[j] for i, j in _summed(1 + len(columns), len(targets))]
+    products.append(jnp.where(weight > 0, one, 0))
+    zero = np.zeros((), one.dtype)
     totals = jax.lax.reduce(
         tuple(products),
         (zero,) * len(products),
@@ -195,114 +219,63 @@ def _reduce(products: Sequence[Array]) -> Array:
     return jnp.stack(totals).astype(jnp.float64)
 
 
-def _means(picture: Picture, log_n: Array, peak: Array) -> Float[Array, "R-1 Cb"]:
-    """What to take off the columns: their means over some pixels that count, in the pixels' dtype; Cb is 1 or C."""
-    stride = max(1, picture.target.shape[0] // _MEAN_PIXELS)
-    few = picture.pixels(lambda a: a[::stride])
-    columns = jnp.stack(jnp.broadcast_arrays(*_columns(few, log_n, peak)))
-    counts = jnp.broadcast_to(jnp.max(few.weights, axis=1) > 0, columns.shape[1])
-    total = jnp.sum(jnp.where(counts[:, None], columns, 0), axis=1)
-    return total / jnp.maximum(jnp.sum(counts), 1).astype(total.dtype)
-
-
-def _block_sums(
-    picture: Picture, log_n: Array, reference: Array, peak: Array, mean: Array, inside: Array | bool
-) -> Float[Array, "G S"]:
-    """Packed sums of one block; G is 1 where all channels share basis and weight, else C.
-
-    Upper triangle of the Gram, columns times residuals, squares, pixel count.
-    """
+def _block_sums(picture: Picture, log_n: Array, reference: Array, peak: Array, mean: Array, inside: Any) -> Array:
+    """Sums of one block, (G, S); G is 1 where all channels share basis and weight, else C."""
     target = picture.target.T
+    columns = [column.T for column in _columns(picture, log_n, peak)]
     # Weights of 1 are constants that the compiler leaves out.
-    weight = jnp.where(inside, picture.weights.T, 0)
-    lit = [column.T for column in _columns(picture, log_n, peak)]
-    ambient = jnp.broadcast_to(picture.ambient, len(target)) * reference[0]
-    reference = jnp.stack([ambient, reference[1], reference[2]]).astype(target.dtype)
-
-    def one_group(columns: Sequence[Array], mean: Array, targets: Array, weight: Array, reference: Array) -> Array:
-        residuals = []
-        for values, (ambient, diffuse, specular) in zip(targets, reference.T, strict=True):
-            model = ambient + diffuse * columns[0]
-            if len(columns) > 1:
-                model = model + specular * columns[1]
-            residuals.append(jnp.where(weight > 0, values - model, 0))
-        one = jnp.ones_like(columns[0])
-        columns = [one, *(column - mean[i] for i, column in enumerate(columns))]
-        weighted = [weight * column for column in columns]
-        products = [left * right for i, left in enumerate(weighted) for right in columns[i:]]
-        products += [left * residual for residual in residuals for left in weighted]
-        products += [weight * residual * residual for residual in residuals]
-        return _reduce([*products, jnp.where(weight > 0, one, 0)])
-
-    groups = max(len(a) for a in (*lit, weight))
-    if groups == 1 and len(target) <= UNROLLED_CHANNELS:
-        weight = jnp.broadcast_to(weight[0], target.shape[1])
-        return one_group([column[0] for column in lit], mean[:, 0], target, weight, reference)[None]
-    columns = [jnp.broadcast_to(column, target.shape) for column in lit]
-    means = jnp.broadcast_to(mean, (len(columns), len(target))).T
-    weight = jnp.broadcast_to(weight, target.shape)
-    return jax.vmap(one_group)(columns, means, target[:, None], weight, reference.T[:, :, None])
-
-
-def _all_blocks(
-    picture: Picture, log_n: Array, reference: Array, peak: Array
-) -> tuple[Float[Array, "G S"], Float[Array, "R-1 Cb"]]:
-    """Packed sums of one picture, block after block, and what was taken off the columns."""
-    count = picture.target.shape[0]
-    blocks = max(1, -(-count // BLOCK))
-    size = -(-count // blocks)
-    mean = _means(picture, log_n, peak)
-    if blocks == 1:
-        return _block_sums(picture, log_n, reference, peak, mean, True), mean
-
-    def add(block: Array, packed: Array) -> Array:
-        # The last block starts early enough to be whole; what it shares with the one before counts once.
-        start = jnp.minimum(block * size, count - size)
-        part = picture.pixels(lambda a: jax.lax.dynamic_slice_in_dim(a, start, size))
-        inside = True if count % size == 0 else start + jnp.arange(size) >= block * size
-        return packed + _block_sums(part, log_n, reference, peak, mean, inside)
-
-    shape = jax.eval_shape(lambda: _block_sums(picture, log_n, reference, peak, mean, True))
-    return jax.lax.fori_loop(0, blocks, add, jnp.zeros(shape.shape, shape.dtype)), mean
-
-
-_one = jax.jit(_all_blocks, compiler_options=COMPILER_OPTIONS)
+    columns.append(jnp.where(inside, picture.weights.T, 0))
+    shared = max(map(len, columns)) == 1 and len(target) <= UNROLLED_CHANNELS
+    groups = 1 if shared else len(target)
+    *columns, weight = (jnp.broadcast_to(column, (groups, target.shape[1])) for column in columns)
+    reference = reference.at[0].multiply(picture.ambient).astype(target.dtype).reshape(3, groups, -1)
+    mean = jnp.broadcast_to(mean, (len(columns), groups))
+    return jax.vmap(_group_sums, (0, 1, 0, 0, 1))(
+        columns, mean, target.reshape(groups, -1, target.shape[1]), weight, reference
+    )
 
 
 @partial(jax.jit, compiler_options=COMPILER_OPTIONS)
-def _each(
-    picture: Picture, log_n: Array, reference: Array, peak: Array
-) -> tuple[Float[Array, "N G S"], Float[Array, "N R-1 Cb"]]:
-    return jax.lax.map(lambda one: _all_blocks(picture, one[None], reference, peak), log_n)
+def _each(picture: Picture, log_n: Array, reference: Array, peak: Array) -> tuple[Array, Array]:
+    """For each row of exponents the sums of one picture, block after block, and what was taken off the columns."""
+    count = picture.target.shape[0]
+    blocks = max(1, -(-count // BLOCK))
+    size = -(-count // blocks)
+
+    def one(log_n: Array) -> tuple[Array, Array]:
+        mean = _means(picture, log_n, peak)
+
+        def block_sums(block: Array) -> Array:
+            # The last block starts early enough to be whole; what it shares with the one before counts once.
+            start = jnp.minimum(block * size, count - size)
+            part = picture.pixels(lambda a: jax.lax.dynamic_slice_in_dim(a, start, size))
+            inside = True if count % size == 0 else start + jnp.arange(size) >= block * size
+            return _block_sums(part, log_n, reference, peak, mean, inside)
+
+        return jnp.sum(jax.lax.map(block_sums, jnp.arange(blocks)), axis=0), mean
+
+    return jax.lax.map(one, log_n)
 
 
-def _unpack(packed: Float[np.ndarray, "*N G S"], mean: Float[np.ndarray, "*N R-1 Cb"], picture: Picture) -> Sums:
-    """Undo the packing, and what was done to the columns.
-
-    The ambient column is constant and was summed as 1; the others were summed less their means.
-    """
-    leading, channels, columns = packed.shape[:-2], picture.target.shape[1], mean.shape[-2] + 1
-    place = np.zeros((columns, columns), int)
-    triangle = columns * (columns + 1) // 2
-    place[np.triu_indices(columns)] = np.arange(triangle)
-    place = np.maximum(place, place.T)
-    products = triangle + channels // packed.shape[-2] * columns
-    # A row of it makes a column of what was summed, in units of the ambient light.
-    whole = np.zeros((*leading, mean.shape[-1], columns, columns)) + np.eye(columns)
-    whole[..., 1:, 0] = mean.swapaxes(-1, -2)
-    scale = np.ones((channels, columns))
-    scale[:, 0] = picture.ambient
-    gram = whole @ packed[..., place] @ whole.swapaxes(-1, -2) * (scale[:, :, None] * scale[:, None, :])
-    product = packed[..., triangle:products].reshape(*leading, channels, columns, 1)
-    product = (whole @ product)[..., 0] * scale
-    square = packed[..., products:-1].reshape(*leading, channels)
-    more = [(0, 0)] * product.ndim + [(0, max(0, 4 - columns))]
-    return Sums(
-        gram=np.pad(gram, [*more[:-2], more[-1], more[-1]]),
-        product=np.pad(product, more[1:]),
+def _unpack(packed: np.ndarray, mean: np.ndarray, picture: Picture) -> Sums:
+    """Undo the packing, and what was done to the columns."""
+    channels, columns = picture.target.shape[1], mean.shape[1] + 1
+    residuals = channels // packed.shape[1]
+    i, j = np.array(_summed(columns, residuals)).T
+    products = np.zeros((*packed.shape[:2], *(columns + residuals,) * 2))
+    products[..., i, j] = products[..., j, i] = packed[..., :-1]
+    square = np.diagonal(products[..., columns:, columns:], axis1=-2, axis2=-1).reshape(-1, channels)
+    found = Sums(
+        gram=products[..., :columns, :columns],
+        product=products[..., columns:, :columns].reshape(-1, channels, columns),
         square=square,
         pixels=np.broadcast_to(packed[..., -1], square.shape),
     )
+    # The ambient column is constant and was summed as 1; the others were summed less their means.
+    basis = np.zeros((len(mean), channels, max(4, columns), columns)) + np.eye(max(4, columns), columns)
+    basis[..., 1:columns, 0] = mean.swapaxes(1, 2)
+    basis[..., 0, 0] = picture.ambient
+    return found.columns(basis)
 
 
 def sums(
@@ -329,22 +302,8 @@ def sums(
     """
     result: Sums | None = None
     for picture in pictures:
-        packed, mean = (_each if grid else _one)(picture, log_n, reference.T, np.float64(peak))
+        packed, mean = _each(picture, log_n[:, None] if grid else log_n[None], reference.T, np.float64(peak))
         part = _unpack(np.asarray(packed), np.asarray(mean, np.float64), picture)
         result = part if result is None else Sums(*map(np.add, result, part))
     assert result is not None
-    return result
-
-
-def sums_at(pictures: Iterable[Picture], n: float, x: Float[np.ndarray, "3 C"]) -> Sums:
-    """Sums about the target at an optimum, the last column being the derivative by n.
-
-    Args:
-        pictures: as they were searched.
-        n: the exponent.
-        x: the coefficients, which the sums are exact near.
-    """
-    with jax.enable_x64(True):
-        parts = sums(pictures, np.log([n]), x.T).about(np.pad(x.T, [(0, 0), (0, 1)]))
-    by_n = np.array([1.0, 1.0, 1.0, 1.0 / n])
-    return parts._replace(gram=parts.gram * by_n[:, None] * by_n, product=parts.product * by_n)
+    return result if grid else Sums(*(leaf[0] for leaf in result))

@@ -3,18 +3,16 @@
 Variable projection (Golub and Pereyra 1973, SIAM J. Numer. Anal. 10, 413): for a given n the best x is a tiny exact
 problem, so the search is one-dimensional, in log n. The host drives it and pixels are touched only by
 :mod:`fitting.solver.normal_equations`, whose results add up: one picture in memory, a hundred photographs and the tiles
-of a file
-on disk are the same loop.
+of a file on disk are the same loop.
 
 1. A stratified subsample of each picture (:mod:`fitting.solver.subsample`), or all of a small one, gives the profile
-   and
-   its slope on a grid over log n (:mod:`fitting.solver.profile`). As a function of log n any lobe varies on a scale of
-   1 or more, so steps of 0.35 miss no minimum.
+   and its slope on a grid over log n. As a function of log n any lobe varies on a scale of 1 or more, so steps of 0.35
+   miss no minimum.
 2. The subsample also says how far its profile may be from that of all pixels. If one valley is left at six standard
    deviations, the search goes on there; else the grid is repeated on all pixels where the optimum may be.
 3. A bracket is refined on all pixels with one pass at its two ends (:mod:`fitting.solver.refinement`): values and
    slopes of the lobe there, Hermite's cubic in between, so all products needed in the bracket follow from one Gram
-   matrix, and Brent's method finds the least cost in it without a pixel.
+   matrix, and the least cost in it is found without a pixel.
 4. Passes at the optimum in residual form give the exact cost and a joint Gauss-Newton correction of x and n, repeated
    while it moves n.
 
@@ -24,7 +22,7 @@ the same search under it is as global.
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -37,10 +35,8 @@ from fitting.solver.refinement import (
     TOLERANCE_DOUBLE,
     TOLERANCE_SINGLE,
     Cap,
-    Linear,
     Point,
     Problem,
-    Start,
     enclose,
     gauss_newton,
     problem_of,
@@ -61,156 +57,6 @@ UNRESOLVED = 0.1
 
 # Hermite's cubic over a grid cell is within this share of the change that the steeper end's slope would make over it.
 GRID_ERROR = 0.02
-
-
-class Profile(NamedTuple):
-    """The profile's samples: of a subsample of the pixels or of all of them.
-
-    Attributes:
-        log_n: Grid.
-        linear: Best coefficients, cost and slope at each.
-        error: Standard deviation of the cost relative to the best sample; 0 where all pixels were used.
-        slope_error: That of the slope.
-        resolved: Whether rounding leaves the valley, or what noise leaves of it.
-    """
-
-    log_n: Float[np.ndarray, " G"]
-    linear: Linear
-    error: Float[np.ndarray, " G"]
-    slope_error: Float[np.ndarray, " G"]
-    resolved: bool
-
-    @property
-    def cost(self) -> Float[np.ndarray, " G"]:
-        """Cost summed over channels."""
-        return self.linear.cost.sum(axis=1)
-
-    def margin(self) -> Float[np.ndarray, " G-1"]:
-        """How far the cubic may be from the profile, cell by cell."""
-        slope = np.abs(self.linear.slope)
-        return GRID_ERROR * np.diff(self.log_n) * np.maximum(slope[:-1], slope[1:])
-
-    def nearest(self, log_n: float) -> Float[np.ndarray, "C 3"]:
-        """The best coefficients at the nearest sample."""
-        return self.linear.x[np.argmin(np.abs(self.log_n - log_n))]
-
-    def fine(self) -> tuple[Float[np.ndarray, "G 33"], Float[np.ndarray, "G 33"]]:
-        """Positions and values of the piecewise cubic through samples and slopes, 33 per cell, ends included."""
-        t = np.linspace(0.0, 1.0, 33)
-        cost, slope = self.cost[:, None], self.linear.slope[:, None]
-        step = (self.log_n[1:] - self.log_n[:-1])[:, None]
-        values = cost[:-1] + t * t * (3 - 2 * t) * (cost[1:] - cost[:-1])
-        values = values + step * t * (1 - t) * ((1 - t) * slope[:-1] - t * slope[1:])
-        return self.log_n[:-1, None] + t * step, values
-
-
-def rough_model(pictures: Iterable[Picture]) -> Float[np.ndarray, "C 3"]:
-    """Ambient and diffuse from a few hundred pixels of each picture.
-
-    Products are taken of the residual against this model, so that float32 sums lose nothing to the bulk of the picture;
-    any model near the target will do.
-    """
-    gram, product = 0.0, 0.0
-    for picture in pictures:
-        stride = max(1, picture.target.shape[0] // 256)
-        # Through NumPy: a slice of an array on the device would be compiled.
-        target, diffuse = (np.asarray(a)[::stride].astype(float) for a in (picture.target, picture.diffuse))
-        weight = np.ones((1, 1)) if picture.weight is None else np.asarray(picture.weight)[::stride]
-        weight = np.broadcast_to(weight if weight.ndim == 2 else weight[:, None], target.shape)
-        target = np.where(weight > 0, target, 0.0)
-        # (C, P, 2), so that the products are matrix products, channel by channel.
-        columns = np.stack([np.broadcast_to(a, target.shape).T for a in (picture.ambient, diffuse)], axis=-1)
-        weighted = (columns * weight.T[:, :, None]).swapaxes(1, 2)
-        gram = gram + weighted @ columns
-        product = product + (weighted @ target.T[:, :, None])[:, :, 0]
-    x = np.einsum("cij,cj->ci", np.linalg.pinv(gram, hermitian=True), product)
-    return np.pad(x, [(0, 0), (0, 1)])
-
-
-def profile_on_grid(pictures: Iterable[Picture], log_n: np.ndarray, rough: np.ndarray, problem: Problem) -> Profile:
-    """The profile on a grid."""
-    parts = sums(pictures, log_n, rough, grid=True, peak=problem.peak)
-    linear = solve_linear(parts, log_n, rough, problem)
-    cost, nothing = linear.cost.sum(axis=1), np.zeros(log_n.size)
-    best = int(np.argmin(cost))
-    # Where basis images nearly add up to one another, large coefficients cancel, and with them the digits of the
-    # products: then several samples may seem to fit exactly. In scenes where they do not, rounding is 1e-5 to 2e-4 of
-    # the rise to the next sample (`python -m benchmarks.tradeoff`, its twenty scenes).
-    size = np.abs(linear.x[best] - rough) * np.sqrt(np.diagonal(parts.gram[best], axis1=-2, axis2=-1)[:, :3])
-    rounding = np.finfo(np.float32).eps * np.sum(np.sum(size, axis=-1) ** 2)
-    rise = np.min(np.delete(cost[max(best - 1, 0) : best + 2], min(best, 1))) - cost[best]
-    noise = cost[best] / max(np.max(parts.pixels), 1.0)
-    return Profile(log_n, linear, nothing, nothing, bool(rounding <= UNRESOLVED * max(rise, noise)))
-
-
-def with_errors(profile: Profile, samples: Sequence[Subsample], problem: Problem) -> Profile:
-    """How far the subsample's profile may be from that of all pixels."""
-    log_n, best = profile.log_n, np.argmin(profile.cost)
-    # It varies slowly; every other sample will do.
-    few = np.append(np.arange(0, log_n.size - 1, 2), log_n.size - 1)
-    variance = np.zeros((2, few.size))
-    for sample in samples:
-        if sample.factor is not None:
-            variance += spread(sample, log_n, profile.linear.x, few, best, problem.peak)
-    error, slope_error = (np.interp(log_n, log_n[few], each) for each in np.sqrt(variance))
-    return profile._replace(error=error, slope_error=slope_error)
-
-
-def possible_cells(profile: Profile) -> tuple[int, int]:
-    """First and last grid cell of a subsample's profile that may hold the optimum of all pixels."""
-    lowest = np.min(profile.fine()[1], axis=1)
-    best = np.argmin(lowest)
-    error = np.maximum(profile.error[:-1], profile.error[1:])
-    margin = profile.margin()
-    possible = np.flatnonzero(lowest - lowest[best] <= DEVIATIONS * error + margin + margin[best])
-    return int(possible[0]), int(possible[-1])
-
-
-def start_from_sample(profile: Profile, problem: Problem) -> Start | None:
-    """The valley of a subsample's profile, where that is clear."""
-    position, value = profile.fine()
-    cell, t = np.unravel_index(np.argmin(value), value.shape)
-    first, last = possible_cells(profile)
-    slope = profile.linear.slope
-    curvature = (slope[cell + 1] - slope[cell]) / (profile.log_n[cell + 1] - profile.log_n[cell])
-    if last - first > 3 or curvature <= 0:
-        return None
-    centre = float(position[cell, t])
-    # Three standard deviations and what the cubic is off; a bracket that misses moves on.
-    half = min(3 * float(np.max(profile.slope_error[cell : cell + 2])) / curvature + 0.01, GRID_STEP)
-    least, most = problem.bounds
-    return Start(max(least, centre - half), min(most, centre + half), least, most, profile.nearest(centre))
-
-
-def starts(profile: Profile, problem: Problem) -> list[Start]:
-    """Every cell of the profile of all pixels that may hold the optimum, the most promising first."""
-    position, value = profile.fine()
-    cells, inside = value.shape
-    flat = value.ravel()
-    low = np.min(flat)
-    best = int(np.argmin(np.min(value, axis=1)))
-    margin = profile.margin()
-    limit = np.repeat(low + margin + margin[best], inside)
-    before = np.concatenate([[np.inf], flat[:-1]])
-    after = np.concatenate([flat[1:], [np.inf]])
-    minima = np.flatnonzero((flat <= before) & (flat <= after) & (flat <= limit))
-    # A dent no deeper than rounding is no minimum of its own: where a highlight is smaller than a pixel, the profile is
-    # level over decades of n.
-    depth = 1e-9 * low + 2 * problem.tolerance * (low + np.max(profile.cost))
-    found: list[int] = []
-    for i in minima[np.argsort(flat[minima], kind="stable")]:
-        if all(np.max(flat[min(i, j) : max(i, j) + 1]) > flat[i] + depth for j in found):
-            found.append(int(i))
-    starts = []
-    for i in found:
-        cell, t = divmod(i, inside)
-        # The cubic cannot tell on which side of a sample a minimum beside it lies.
-        first = cell - 1 if t == 0 and cell > 0 else cell
-        last = cell + 1 if t == inside - 1 and cell < cells - 1 else cell
-        least, most = float(profile.log_n[first]), float(profile.log_n[last + 1])
-        lower, upper = float(profile.log_n[cell]), float(profile.log_n[cell + 1])
-        starts.append(Start(lower, upper, least, most, profile.nearest(float(position[cell, t]))))
-    return starts
 
 
 class Optimum(eqx.Module):
@@ -282,38 +128,20 @@ def search(
         if problem.lobe:
             size = max(SMALLEST_SAMPLE, SAMPLE_SIZE // len(pictures))
             samples = [subsample(picture, size, n_max) for picture in pictures]
-            problem = problem._replace(lobe=any(sample.picture.lobe is not None for sample in samples))
-        if problem.lobe:
             nearest = min(sample.nearest for sample in samples)
-            problem = problem._replace(peak=-nearest if nearest < math.inf else 0.0)
+            lobe = any(sample.picture.lobe is not None for sample in samples)
+            problem = problem._replace(lobe=lobe, peak=-nearest if nearest < math.inf else 0.0)
         if not problem.lobe or n_min == n_max:
             nothing = np.zeros(problem.free.shape)
             return _optimum(*gauss_newton(problem, Point(problem.bounds[0], nothing, nothing[:, 0])), problem)
         found = _search_with_lobe(problem, samples)
-        if found is not None:
-            return found
-        # Sums in double precision over all pixels, one picture at a time: slow, and rarely needed.
-        exact = Stream(lambda i: jax.tree.map(lambda leaf: leaf.astype(np.float64), pictures[i]), len(pictures))
-        problem = problem._replace(pictures=exact, tolerance=TOLERANCE_DOUBLE)
-        found = _search_with_lobe(problem, each(lambda picture: Subsample(picture, None, 0.0), exact))
+        if found is None:
+            # Sums in double precision over all pixels, one picture at a time: slow, and rarely needed.
+            exact = Stream(lambda i: jax.tree.map(lambda leaf: leaf.astype(np.float64), pictures[i]), len(pictures))
+            problem = problem._replace(pictures=exact, tolerance=TOLERANCE_DOUBLE)
+            found = _search_with_lobe(problem, each(lambda picture: Subsample(picture, None, 0.0), exact))
         assert found is not None
         return found
-
-
-def fit_linear(
-    pictures: Sequence[Picture], *, free: Bool[np.ndarray, "3 C"] | None = None, cap: Cap | None = None
-) -> Optimum:
-    """Ambient and diffuse only: one linear solve, a second in residual form for the exact cost.
-
-    Args:
-        pictures: As for :func:`search`; their lobes are not looked at.
-        free: Which of x_a, x_d may be above 0.
-        cap: As for :func:`search`.
-    """
-    channels = next(iter(pictures)).target.shape[1]
-    free = np.ones((3, channels), bool) if free is None else np.array(free)
-    free[2] = False
-    return search(pictures, free=free, cap=cap)
 
 
 def fit_tied(
@@ -337,9 +165,8 @@ def fit_tied(
     x[2] = tied * (x[2] @ tied) / max(tied @ tied, np.finfo(float).tiny)
     with jax.enable_x64(True):
         problem = problem_of(pictures, n_range, free)._replace(tied=tied)
-        found = _optimum(*gauss_newton(problem, Point(math.log(optimum.n), x.T, optimum.cost)), problem)
-    profile = (optimum.grid, optimum.profile, optimum.profile_sampled)
-    return eqx.tree_at(lambda o: (o.grid, o.profile, o.profile_sampled), found, profile)
+        found = gauss_newton(problem, Point(math.log(optimum.n), x.T, optimum.cost))
+    return _optimum(*found, problem, optimum.grid, optimum.profile, sampled=optimum.profile_sampled)
 
 
 def _search_with_lobe(problem: Problem, samples: Sequence[Subsample]) -> Optimum | None:
@@ -347,55 +174,147 @@ def _search_with_lobe(problem: Problem, samples: Sequence[Subsample]) -> Optimum
     few = each(lambda sample: sample.picture, samples)
     rough = rough_model(few)
     lower, upper = problem.bounds
-    count = max(2, 1 + math.ceil((upper - lower) / GRID_STEP))
-    log_n = np.linspace(lower, upper, count)
+    log_n = np.linspace(lower, upper, max(2, 1 + math.ceil((upper - lower) / GRID_STEP)))
     sampled = any(sample.factor is not None for sample in samples)
     # Most subsamples are float32.
-    profile = profile_on_grid(few, log_n, rough, problem._replace(tolerance=TOLERANCE_SINGLE) if sampled else problem)
-    part = profile
-    if (sampled or problem.tolerance == TOLERANCE_SINGLE) and not profile.resolved:
+    tolerance = TOLERANCE_SINGLE if sampled else problem.tolerance
+    profile, resolved = profile_on_grid(few, log_n, rough, problem._replace(tolerance=tolerance))
+    if tolerance == TOLERANCE_SINGLE and not resolved:
         return None
+    grid, cost, part = np.exp(log_n), profile.cost.sum(axis=1), profile
     if sampled:
-        profile = with_errors(profile, samples, problem)
-        start = start_from_sample(profile, problem)
-        if start is not None:
-            point, inside = enclose(problem, start)
+        error, slope_error = sampling_errors(profile, samples, problem.peak)
+        position, lowest, possible = _cells(profile, error)
+        cell = int(np.argmin(lowest))
+        first, last = np.flatnonzero(possible)[[0, -1]]
+        curvature = (np.diff(profile.slope) / np.diff(log_n))[cell]
+        if last - first <= 3 and curvature > 0:
+            # Three standard deviations and what the cubic is off; a bracket that misses moves on.
+            half = min(3 * np.max(slope_error[cell : cell + 2]) / curvature + 0.01, GRID_STEP)
+            bracket = max(lower, position[cell] - half), min(upper, position[cell] + half)
+            point, inside = enclose(problem, *bracket, profile.x[cell])
             if inside:
-                return _optimum(*gauss_newton(problem, point), problem, profile, sampled=True)
-        first, last = possible_cells(profile)
-        part = profile_on_grid(problem.pictures, log_n[max(0, first - 1) : last + 3], rough, problem)
-    candidates = [gauss_newton(problem, enclose(problem, start)[0]) for start in starts(part, problem)]
+                return _optimum(*gauss_newton(problem, point), problem, grid, cost, sampled=True)
+        part, _ = profile_on_grid(problem.pictures, log_n[max(0, first - 1) : last + 3], rough, problem)
+    candidates = [
+        gauss_newton(problem, enclose(problem, part.log_n[cell], part.log_n[cell + 1], part.x[cell])[0])
+        for cell in _valleys(part, problem.tolerance)
+    ]
     # Where the profile is level the best sample may be no worse than what the brackets led to.
-    best = int(np.argmin(part.cost))
-    if part.cost[best] < min(np.sum(point.cost) for point, _ in candidates):
-        point = Point(float(part.log_n[best]), part.linear.x[best], part.linear.cost[best])
-        candidates.append(gauss_newton(problem, point))
-    point, about = min(candidates, key=lambda candidate: float(np.sum(candidate[0].cost)))
-    return _optimum(point, about, problem, profile, sampled=sampled)
+    costs = part.cost.sum(axis=1)
+    if np.min(costs) < min(np.sum(point.cost) for point, _ in candidates):
+        candidates.append(gauss_newton(problem, Point(*(leaf[np.argmin(costs)] for leaf in part))))
+    best = min(candidates, key=lambda candidate: float(np.sum(candidate[0].cost)))
+    return _optimum(*best, problem, grid, cost, sampled=sampled)
+
+
+def rough_model(pictures: Iterable[Picture]) -> np.ndarray:
+    """Ambient and diffuse from a few hundred pixels of each picture, (C, 3).
+
+    Products are taken of the residual against this model, so that float32 sums lose nothing to the bulk of the picture;
+    any model near the target will do.
+    """
+    gram = 0.0
+    for picture in pictures:
+        stride = max(1, picture.target.shape[0] // 256)
+        # Through NumPy: a slice of an array on the device would be compiled.
+        few = picture.pixels(lambda a, stride=stride: np.asarray(a)[::stride])
+        target = np.where(few.weights > 0, few.target, 0).astype(float)
+        columns = np.stack(np.broadcast_arrays(few.ambient, few.diffuse, target))
+        gram = gram + np.einsum("ipc,jpc->cij", few.weights * columns, columns)
+    x = np.linalg.pinv(gram[:, :2, :2], hermitian=True) @ gram[:, :2, 2:]
+    return np.pad(x[..., 0], [(0, 0), (0, 1)])
+
+
+def profile_on_grid(
+    pictures: Iterable[Picture], log_n: np.ndarray, rough: np.ndarray, problem: Problem
+) -> tuple[Point, bool]:
+    """The profile on a grid, and whether rounding leaves the valley, or what noise leaves of it."""
+    parts = sums(pictures, log_n, rough, grid=True, peak=problem.peak)
+    profile = solve_linear(parts, log_n, rough, problem)
+    cost = profile.cost.sum(axis=1)
+    best = int(np.argmin(cost))
+    # Where basis images nearly add up to one another, large coefficients cancel, and with them the digits of the
+    # products: then several samples may seem to fit exactly. In scenes where they do not, rounding is 1e-5 to 2e-4 of
+    # the rise to the next sample (`python -m benchmarks.tradeoff`, its twenty scenes).
+    size = np.abs(profile.x[best] - rough) * np.sqrt(np.diagonal(parts.gram[best], axis1=-2, axis2=-1)[:, :3])
+    rounding = np.finfo(np.float32).eps * np.sum(np.sum(size, axis=-1) ** 2)
+    rise = np.min(np.delete(cost[max(best - 1, 0) : best + 2], min(best, 1))) - cost[best]
+    noise = cost[best] / max(np.max(parts.pixels), 1.0)
+    return profile, bool(rounding <= UNRESOLVED * max(rise, noise))
+
+
+def sampling_errors(profile: Point, samples: Sequence[Subsample], peak: float) -> tuple[np.ndarray, np.ndarray]:
+    """Standard deviations of a subsample's cost relative to its best sample, and of its slope, over the grid."""
+    log_n, best = profile.log_n, np.argmin(profile.cost.sum(axis=1))
+    # It varies slowly; every other sample will do.
+    few = np.append(np.arange(0, log_n.size - 1, 2), log_n.size - 1)
+    variance = np.zeros((2, few.size))
+    for sample in samples:
+        if sample.factor is not None:
+            variance += spread(sample, log_n, profile.x, few, best, peak)
+    error, slope_error = (np.interp(log_n, log_n[few], deviation) for deviation in np.sqrt(variance))
+    return error, slope_error
+
+
+def _cells(profile: Point, error: Any = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where in each cell of the grid the cubic through the samples is least, how low, and whether it may be the best.
+
+    Args:
+        profile: On the grid.
+        error: Standard deviation of the cost at each sample relative to the best.
+    """
+    t = np.linspace(0.0, 1.0, 33)
+    cost, slope = profile.cost.sum(axis=1)[:, None], profile.slope[:, None]
+    step = np.diff(profile.log_n)
+    values = cost[:-1] + t * t * (3 - 2 * t) * (cost[1:] - cost[:-1])
+    values = values + step[:, None] * t * (1 - t) * ((1 - t) * slope[:-1] - t * slope[1:])
+    lowest = np.min(values, axis=1)
+    steeper, error = (np.maximum(a[:-1], a[1:]) for a in (np.abs(profile.slope), error + np.zeros(len(cost))))
+    margin = GRID_ERROR * step * steeper
+    best = np.argmin(lowest)
+    possible = lowest <= lowest[best] + DEVIATIONS * error + margin + margin[best]
+    return profile.log_n[:-1] + t[np.argmin(values, axis=1)] * step, lowest, possible
+
+
+def _valleys(profile: Point, tolerance: float) -> np.ndarray:
+    """Every cell with a minimum of the profile of all pixels that may be the least."""
+    _, lowest, possible = _cells(profile)
+    # A dent no deeper than rounding is no minimum of its own: where a highlight is smaller than a pixel, the profile is
+    # level over decades of n.
+    low = np.min(lowest)
+    depth = 1e-9 * low + 2 * tolerance * (low + np.max(profile.cost.sum(axis=1))) + np.finfo(float).tiny
+    level = np.pad(np.where(possible, np.round((lowest - low) / depth), np.inf), 1, constant_values=np.inf)
+    return np.flatnonzero((level[1:-1] < level[:-2]) & (level[1:-1] <= level[2:]))
 
 
 def _optimum(
-    point: Point, about: Sums, problem: Problem, profile: Profile | None = None, *, sampled: bool = False
+    point: Point,
+    about: Sums,
+    problem: Problem,
+    grid: Any = (),
+    profile: Any = (),
+    *,
+    sampled: bool = False,
 ) -> Optimum:
     """Gather the answer, with the lobe and its derivative by n in place of those relative to the lobe's peak."""
     # An exponent at its bound is the bound, not the exponential of its logarithm.
     known = dict(zip(problem.bounds, problem.n_range, strict=True))
     n = known.get(point.log_n, math.exp(point.log_n))
     decay = math.exp(n * problem.peak)
-    columns = np.diag([1.0, 1.0, decay, decay / n])
-    columns[3, 2] = decay * problem.peak
-    x = point.x.T.copy()
-    x[2] /= decay
+    basis = np.diag([1.0, 1.0, decay, decay / n])
+    basis[3, 2] = decay * problem.peak
+    about = about.columns(basis)
     return Optimum(
         n=n,
-        x=x,
+        x=point.x.T / np.array([[1.0], [1.0], [decay]]),
         cost=point.cost,
         pixels=about.pixels,
-        gram=columns @ about.gram @ columns.T,
-        product=about.product @ columns.T,
+        gram=about.gram,
+        product=about.product,
         square=about.square,
         flat=not np.any(point.x[:, 2] > 0),
-        grid=np.zeros(0) if profile is None else np.exp(profile.log_n),
-        profile=np.zeros(0) if profile is None else profile.cost,
+        grid=np.asarray(grid),
+        profile=np.asarray(profile),
         profile_sampled=sampled,
     )

@@ -1,6 +1,5 @@
 """From a bracket around one minimum of the profile to the minimum itself, on all pixels."""
 
-import itertools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -39,41 +38,50 @@ class Problem(NamedTuple):
 
     Attributes:
         pictures: The pictures or tiles; gone through once per pass.
-        free: Which coefficients may be above 0.
+        free: Which coefficients may be above 0, (C, 3).
         tolerance: What rounding may leave of a column that depends on the others, relative.
         accuracy: How far from the optimum log n may end.
         n_range: Smallest and largest exponent.
         lobe: Whether there is a highlight to search for.
         peak: Logarithm of the largest cosine of any pixel. Coefficients x_s are relative to ``exp(n peak)``.
         cap: A bound on sums of coefficients, or none.
-        tied: x_s is a common factor times this; None where the channels are independent.
+        tied: x_s is a common factor times this, (C,); None where the channels are independent.
     """
 
     pictures: Sequence[Picture]
-    free: Bool[np.ndarray, "C 3"]
+    free: np.ndarray
     tolerance: float
     accuracy: float
     n_range: tuple[float, float]
-    lobe: bool = True
+    lobe: bool
     peak: float = 0.0
     cap: Cap | None = None
-    tied: Float[np.ndarray, " C"] | None = None
+    tied: np.ndarray | None = None
 
     @property
     def bounds(self) -> tuple[float, float]:
         """Of log n."""
         return math.log(self.n_range[0]), math.log(self.n_range[1])
 
-    def sums(self, log_n: Any, reference: Float[np.ndarray, "C 3"]) -> Sums:
+    def sums(self, log_n: Any, reference: np.ndarray) -> Sums:
         """One pass over all pixels."""
-        return sums(self.pictures, np.atleast_1d(log_n) if self.lobe else np.zeros(0), reference, peak=self.peak)
+        return sums(self.pictures, np.array(log_n if self.lobe else []), reference, peak=self.peak)
 
-    def caps(self, log_n: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N C 3"]:
-        """What the coefficients, relative to the peak, count towards the cap."""
-        assert self.cap is not None
-        caps = np.stack([self.cap(float(n)).T for n in np.exp(log_n)])
-        caps[:, :, 2] *= np.exp(-np.exp(log_n) * self.peak)[:, None]
-        return caps
+
+class Point(NamedTuple):
+    """An exponent and the best coefficients there; or several, with a leading axis.
+
+    Attributes:
+        log_n: Logarithm of the exponent.
+        x: Coefficients x_a, x_d, x_s, at least 0, (C, 3).
+        cost: Sum of weighted squared residuals, (C,).
+        slope: Derivative of the cost by log n, summed over channels.
+    """
+
+    log_n: Any
+    x: np.ndarray
+    cost: np.ndarray
+    slope: Any = 0.0
 
 
 def problem_of(
@@ -86,48 +94,13 @@ def problem_of(
         n_range: smallest and largest exponent.
         free: which coefficients may be above 0; None for all.
     """
-    first = next(iter(pictures))
-    free = np.ones((3, first.target.shape[1]), bool) if free is None else np.asarray(free)
-    single = np.dtype(first.target.dtype) == np.float32
-    tolerance, accuracy = (TOLERANCE_SINGLE, 1e-5) if single else (TOLERANCE_DOUBLE, 5e-9)
-    return Problem(pictures, free.T, tolerance, accuracy, n_range, lobe=bool(free[2].any()))
+    target = pictures[0].target
+    free = np.ones((3, target.shape[1]), bool) if free is None else np.asarray(free)
+    tolerance, accuracy = (TOLERANCE_SINGLE, 1e-5) if target.dtype == np.float32 else (TOLERANCE_DOUBLE, 5e-9)
+    return Problem(pictures, free.T, tolerance, accuracy, n_range, bool(free[2].any()))
 
 
-class Linear(NamedTuple):
-    """The best coefficients at one exponent, or at each of some.
-
-    Attributes:
-        x: Coefficients x_a, x_d, x_s, at least 0.
-        cost: Sum of weighted squared residuals.
-        slope: Derivative of the cost by log n, summed over channels.
-    """
-
-    x: Float[np.ndarray, "*N C 3"]
-    cost: Float[np.ndarray, "*N C"]
-    slope: Float[np.ndarray, "*N"]
-
-
-class Point(NamedTuple):
-    """A candidate."""
-
-    log_n: float
-    x: Float[np.ndarray, "C 3"]
-    cost: Float[np.ndarray, " C"]
-
-
-class Start(NamedTuple):
-    """Where to look for a minimum: a first bracket in log n, the range it may move in, and a model near by."""
-
-    lower: float
-    upper: float
-    least: float
-    most: float
-    x: Float[np.ndarray, "C 3"]
-
-
-def minimum_between(
-    costs: Callable[[Float[np.ndarray, " T"]], Float[np.ndarray, " T"]], low: float, high: float, points: int = 17
-) -> float:
+def minimum_between(costs: Callable[[np.ndarray], np.ndarray], low: float, high: float, points: int = 17) -> float:
     """Where a function of one number is least: samples, again around the best of them, at last a parabola.
 
     Args:
@@ -150,84 +123,84 @@ def minimum_between(
     return float(np.clip(vertex, low, high))
 
 
-def solve_linear(parts: Sums, log_n: Any, reference: Float[np.ndarray, "C 3"], problem: Problem) -> Linear:
-    """The best coefficients at the exponent of the sums, or at each of several.
+def solve_linear(parts: Sums, log_n: Float[np.ndarray, " N"], reference: np.ndarray, problem: Problem) -> Point:
+    """The best coefficients at each of some exponents.
 
     By the envelope theorem the coefficients may be held for the slope: -2 x_s <S', r>, r the best residual; and where
     the cap is reached, its multiplier times the change of the cap.
 
     Args:
-        parts: Sums, columns ambient, diffuse, lobe and derivative by log n; with a leading axis N or none.
-        log_n: One exponent, or (N,).
-        reference: The reference model of the sums.
+        parts: Sums, columns ambient, diffuse, lobe and derivative by log n; with a leading axis N.
+        log_n: The exponents.
+        reference: The reference model of the sums, (C, 3).
         problem: Bounds.
     """
-    if problem.tied is not None and np.ndim(log_n):
-        each = [Sums(*(leaf[i] for leaf in parts)) for i in range(len(log_n))]
-        solved = [solve_linear(one, at, reference, problem) for one, at in zip(each, log_n, strict=True)]
-        return Linear(*map(np.stack, zip(*solved, strict=True)))
+
+    def caps(shift: float) -> np.ndarray:
+        """What the coefficients, relative to the peak, count towards the cap."""
+        return np.stack([problem.cap(n).T * [1, 1, np.exp(-n * problem.peak)] for n in np.exp(log_n + shift)])
+
     gram, product = parts.gram[..., :3, :3], parts.product[..., :3]
-    cap = None
-    if problem.cap is not None:
-        cap = problem.caps(np.atleast_1d(log_n)).reshape(*np.shape(log_n), *reference.shape)
     if problem.tied is None:
+        cap = None if problem.cap is None else caps(0.0)
         x = nonnegative_minima(gram, product, reference, problem.free, problem.tolerance, cap)
     else:
-        about = parts.about(np.pad(reference, [(0, 0), (0, 1)]))
-        whole, right, _ = join_channels(about.gram, about.product, about.square, reference[:, 2])
         design = design_of(problem.free.T, problem.tied)[:, :-1]
-        x = (design @ nonnegative_minimum(design.T @ whole @ design, design.T @ right))[:-1].reshape(3, -1).T
+        found = []
+        for one in zip(*parts.about(reference)[:3], strict=True):
+            whole, right, _ = join_channels(*one, reference[:, 2])
+            found.append(design @ nonnegative_minimum(design.T @ whole @ design, design.T @ right))
+        x = np.stack(found)[:, :-1].reshape(len(found), 3, -1).swapaxes(1, 2)
     step = x - reference
     pull = parts.product - (parts.gram[..., :3] @ step[..., None])[..., 0]
     change = -np.sum(step * (product + pull[..., :3]), axis=-1)
     slope = -2 * np.sum(x[..., 2] * pull[..., 3], axis=-1)
-    if cap is not None:
-        later, before = (problem.caps(np.atleast_1d(log_n) + shift)[..., 2] for shift in (1e-4, -1e-4))
-        by_log_n = (later - before).reshape(cap.shape[:-1]) / 2e-4
-        counts = (x > 0) & (cap > 0)
-        first = np.argmax(counts, axis=-1)[..., None]
-        pulled, counted = (np.take_along_axis(a, first, axis=-1)[..., 0] for a in (pull[..., :3], cap))
-        multiplier = np.where(np.any(counts, axis=-1), 2 * pulled / np.where(counted > 0, counted, 1.0), 0.0)
+    if problem.cap is not None:
+        # The coefficients above 0 are pulled by multiples of the cap, which add up to 1 where it is reached.
+        multiplier = 2 * np.sum(pull[..., :3] * x, axis=-1)
+        by_log_n = (caps(1e-4) - caps(-1e-4))[..., 2] / 2e-4
         slope = slope + np.sum(multiplier * x[..., 2] * by_log_n, axis=-1)
-    return Linear(x, np.maximum(parts.square + change, 0.0), slope)
+    return Point(log_n, x, np.maximum(parts.square + change, 0.0), slope)
 
 
-def _solve_bracket(
-    parts: Sums, lower: float, upper: float, reference: Float[np.ndarray, "C 3"], problem: Problem
-) -> tuple[Point, float]:
+def _solve_bracket(problem: Problem, lower: float, upper: float, x: np.ndarray) -> tuple[Point, float]:
     """The least cost within a bracket, and where it lies, as a share of the bracket."""
-    width = upper - lower
+    parts, width = problem.sums([lower, upper], x), upper - lower
 
-    def at(shares: Float[np.ndarray, " T"]) -> Linear:
-        return solve_linear(parts.within(shares, width, reference), lower + shares * width, reference, problem)
+    def at(shares: np.ndarray) -> Point:
+        return solve_linear(parts.within(shares, width, x), lower + shares * width, x, problem)
 
     share = minimum_between(lambda shares: np.sum(at(shares).cost, axis=1), 0.0, 1.0)
-    found = at(np.array([share]))
-    return Point(lower + share * width, found.x[0], found.cost[0]), share
+    return Point(*(leaf[0] for leaf in at(np.array([share])))), share
 
 
-def enclose(problem: Problem, start: Start) -> tuple[Point, bool]:
-    """Follow one minimum until it lies inside a bracket narrow enough for the cubic, and say whether it does."""
-    lower, upper, x = start.lower, start.upper, start.x
+def enclose(problem: Problem, lower: float, upper: float, x: np.ndarray) -> tuple[Point, bool]:
+    """Follow one minimum until it lies inside a bracket narrow enough for the cubic, and say whether it does.
+
+    Args:
+        problem: What is searched.
+        lower: Of the first bracket in log n.
+        upper: Likewise.
+        x: Coefficients of a model near by, (C, 3).
+    """
+    least, most = problem.bounds
     widest = _WIDEST_BRACKET if problem.cap is None else _WIDEST_CAPPED
-    for attempt in itertools.count(1):
-        point, share = _solve_bracket(problem.sums([lower, upper], x), lower, upper, x, problem)
+    for _ in range(_MOST_BRACKETS):
+        point, share = _solve_bracket(problem, lower, upper, x)
         half, x = (upper - lower) / 2, point.x
-        if (share <= 0 and lower > start.least) or (share >= 1 and upper < start.most):
+        if (share <= 0 and lower > least) or (share >= 1 and upper < most):
             half = min(2 * half, GRID_STEP)
         elif 2 * half > widest:
             # What the cubic leaves of the error of a grid cell is far below this.
             half = widest / 8
         else:
             return point, True
-        if attempt == _MOST_BRACKETS:
-            return point, False
-        lower, upper = max(start.least, point.log_n - half), min(start.most, point.log_n + half)
-    raise AssertionError
+        lower, upper = max(least, point.log_n - half), min(most, point.log_n + half)
+    return point, False
 
 
 def _correct(parts: Sums, point: Point, problem: Problem) -> tuple[Point, float]:
-    """One joint Gauss-Newton step from the residual at a point; its active set is kept.
+    """One joint Gauss-Newton step from a point; its active set is kept.
 
     Args:
         parts: Sums at the point, the reference being its own coefficients.
@@ -238,31 +211,29 @@ def _correct(parts: Sums, point: Point, problem: Problem) -> tuple[Point, float]
         The new point, and about how far from the optimum in log n it still is.
     """
     x_s = point.x[:, 2]
-    gram, product, _ = join_channels(parts.gram, parts.product, parts.square, x_s)
+    gram, product, _ = join_channels(*parts[:3], x_s)
     # Of the unknowns those above 0 are columns.
     design = design_of((point.x > 0).T, problem.tied)[:-1]
     design = design[:, np.any(design != 0, axis=0)]
     cross, score = design.T @ gram[:-1, -1], design.T @ product[:-1]
-    here = Point(point.log_n, point.x, parts.square)
     try:
-        solved = np.linalg.solve(design.T @ gram[:-1, :-1] @ design, np.stack([score, cross], axis=-1))
+        gain, along = np.linalg.solve(design.T @ gram[:-1, :-1] @ design, np.stack([score, cross], axis=-1)).T
     except np.linalg.LinAlgError:
-        return here, 0.0
-    gain, along = solved[:, 0], solved[:, 1]
+        return point, 0.0
     curvature = gram[-1, -1]
     left = curvature - along @ cross
     move = (product[-1] - along @ score) / left if left > problem.tolerance * curvature else 0.0
     log_n = float(np.clip(point.log_n + move, *problem.bounds))
     move = log_n - point.log_n
     x = np.maximum(point.x + (design @ (gain - move * along)).reshape(3, -1).T, 0.0)
-    step = np.concatenate([x - point.x, (move * x_s)[:, None]], axis=1)
+    step = np.column_stack([x - point.x, move * x_s])
     change = np.sum(step * ((parts.gram @ step[..., None])[..., 0] - 2 * parts.product), axis=1)
     if not np.sum(change) <= 0:
-        return here, 0.0
+        return point, 0.0
     # A Gauss-Newton step shrinks the error by about the error itself plus the relative uncertainty of n (half of it was
     # seen at 1 and 3 % noise).
     uncertainty = (np.sum(parts.square) / (left * np.sum(parts.pixels))) ** 0.5 if move else 0.0
-    return Point(log_n, x, np.maximum(parts.square + change, 0.0)), float(abs(move) * (abs(move) + 2 * uncertainty))
+    return Point(log_n, x, np.maximum(parts.square + change, 0.0)), abs(move) * (abs(move) + 2 * uncertainty)
 
 
 def gauss_newton(problem: Problem, point: Point) -> tuple[Point, Sums]:
@@ -273,27 +244,28 @@ def gauss_newton(problem: Problem, point: Point) -> tuple[Point, Sums]:
     brought back, to the minimum of the parabola through both. Nothing is returned on the word of the quadratic model
     unless its step was negligible. Under a cap the exponent is that of the bracket.
     """
-    held, slope, last = (point, Sums(*np.zeros((4, 0)))), 0.0, math.inf
-    for attempt in itertools.count(1):
+    held, about, slope, last = point, None, 0.0, math.inf
+    for _ in range(_MOST_CORRECTIONS):
         reference = point.x
-        parts = problem.sums(point.log_n, reference)
-        solved = solve_linear(parts, point.log_n, reference, problem)
-        here, cost, before = Point(point.log_n, solved.x, solved.cost), np.sum(solved.cost), np.sum(parts.square)
+        parts = problem.sums([point.log_n], reference)
+        solved = solve_linear(Sums(*(leaf[None] for leaf in parts)), np.array([point.log_n]), reference, problem)
+        here = Point(*(leaf[0] for leaf in solved))
+        cost = np.sum(here.cost)
         if cost - last > problem.tolerance * last:
             share = np.clip(-slope / (2 * (cost - last - slope)), 0.1, 0.5)
             slope *= share
-            point = Point(*(old + share * (new - old) for old, new in zip(held[0], here, strict=True)))
-            left = math.inf
-        else:
-            about = parts.about(np.pad(reference, [(0, 0), (0, 1)]))
-            held, last = (here, about), cost
-            # The sums with the residual against the best coefficients at this exponent.
-            parts = parts.about(np.pad(reference - here.x, [(0, 0), (0, 1)]))._replace(square=here.cost)
-            point, left = _correct(parts, here, problem) if problem.cap is None else (here, 0.0)
-            slope = -2 * float((point.log_n - here.log_n) * np.sum(here.x[:, 2] * parts.product[:, 3]))
-            if before > 2 * cost + problem.tolerance * np.sum(about.square):
-                # A difference of far larger sums: known to fewer digits than about the coefficients themselves.
-                left = last = math.inf
-        if left <= problem.accuracy or attempt == _MOST_CORRECTIONS:
-            return (point if left <= problem.accuracy else held[0]), held[1]
-    raise AssertionError
+            point = Point(*(old + share * (new - old) for old, new in zip(held, here, strict=True)))
+            continue
+        held, about, last = here, parts.about(reference), cost
+        # A difference of far larger sums is known to fewer digits than about the coefficients themselves.
+        lost = np.sum(parts.square) > 2 * cost + problem.tolerance * np.sum(about.square)
+        # The sums with the residual against the best coefficients at this exponent.
+        parts = parts.about(reference - here.x)._replace(square=here.cost)
+        point, left = _correct(parts, here, problem) if problem.cap is None else (here, 0.0)
+        slope = -2 * (point.log_n - here.log_n) * np.sum(here.x[:, 2] * parts.product[:, 3])
+        if lost:
+            last = math.inf
+        elif left <= problem.accuracy:
+            return point, about
+    assert about is not None
+    return held, about

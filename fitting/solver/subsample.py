@@ -6,12 +6,13 @@ stratum; sparse ones are kept whole, the others sample to about equal numbers. W
 """
 
 import math
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, UInt8
+from jaxtyping import Array, Float
 
 from fitting.solver.normal_equations import Picture, relative_lobe
 
@@ -40,7 +41,7 @@ class Subsample(NamedTuple):
 
 
 @jax.jit
-def _octaves(picture: Picture) -> tuple[UInt8[Array, " P"], Float[Array, ""]]:
+def _octaves(picture: Picture) -> tuple[Array, Array]:
     """The octave of ``-log_cos``, which is its binary exponent, 0 at the peak itself; and the smallest ``-log_cos``."""
     assert picture.lobe is not None
     distance = -picture.lobe.peak()
@@ -52,20 +53,15 @@ def _octaves(picture: Picture) -> tuple[UInt8[Array, " P"], Float[Array, ""]]:
     return octave.astype(jnp.uint8), jnp.min(distance)
 
 
-def _shares(octaves: UInt8[np.ndarray, " P"], size: int) -> Float[np.ndarray, "256"]:
+def _shares(octaves: np.ndarray, size: int) -> np.ndarray:
     """Which share of each octave to keep, so that about ``size`` pixels remain."""
     preview = octaves[::_PREVIEW_STRIDE]
     count = np.bincount(preview, minlength=256) * (octaves.size / preview.size)
     count[_EXCLUDED] = 0
     # The largest number per octave that fits: the sparse ones leave their part to the others.
-    rest, most = float(size), 0.0
     ordered = np.sort(count[count > 0])
-    for i, here in enumerate(ordered):
-        most = rest / (ordered.size - i)
-        if here > most:
-            break
-        rest -= here
-    share = np.minimum(1.0, most / np.maximum(count, 1.0))
+    most = (size - np.cumsum(ordered) + ordered) / np.arange(ordered.size, 0, -1)
+    share = np.minimum(1.0, np.max(most, initial=0.0) / np.maximum(count, 1.0))
     share[_EXCLUDED] = 0.0
     return share
 
@@ -110,16 +106,13 @@ def subsample(picture: Picture, size: int, n_max: float) -> Subsample:
     factor = np.zeros(capacity, np.float32)
     factor[: index.size] = 1 / share[octaves[index]]
     kept = picture.pixels(choose)
-    weight: Any = factor
-    if kept.weight is not None:
-        weight = kept.weight * (factor if kept.weight.ndim == 1 else factor[:, None])
-    return Subsample(Picture(kept.target, kept.diffuse, kept.lobe, weight, kept.ambient), factor, float(nearest))
+    return Subsample(replace(kept, weight=kept.weights * factor[:, None]), factor, float(nearest))
 
 
 @jax.jit
 def spread(
     sample: Subsample, log_n: Array, x: Float[Array, "N C 3"], few: Array, best: Array, peak: Array
-) -> tuple[Float[Array, " N"], Float[Array, " N"]]:
+) -> tuple[Array, Array]:
     """How far the subsample's profile may be from that of all pixels.
 
     Args:
@@ -144,16 +137,17 @@ def spread(
 
     def residual_and_slope(index: Array) -> tuple[Array, Array]:
         value, slope = relative_lobe(picture.lobe, log_n[index], peak, dtype)
-        model = x[index, :, 0] * jnp.asarray(picture.ambient, dtype) + x[index, :, 1] * picture.diffuse
-        return picture.target - model - x[index, :, 2] * value, x[index, :, 2] * slope
+        x_a, x_d, x_s = x[index].T
+        model = x_a * jnp.asarray(picture.ambient, dtype) + x_d * picture.diffuse + x_s * value
+        return picture.target - model, x_s * slope
+
+    def variance(a: Array) -> Array:
+        return jnp.sum(chance * jnp.sum(jnp.where(picture.weights > 0, picture.weights * a, 0), axis=1) ** 2)
 
     reference, _ = residual_and_slope(best)
 
     def one(index: Array) -> tuple[Array, Array]:
         residual, slope = residual_and_slope(index)
-        change = (residual - reference) * (residual + reference)
-        changes = [jnp.where(picture.weights > 0, picture.weights * a, 0) for a in (change, 2 * residual * slope)]
-        total, score = (jnp.sum(chance * jnp.sum(each, axis=1) ** 2) for each in changes)
-        return total, score
+        return variance((residual - reference) * (residual + reference)), variance(2 * residual * slope)
 
     return jax.lax.map(one, few)

@@ -116,11 +116,5 @@ def weighted_sums(
         return dataclasses.replace(picture, weight=_reweighted(picture, n, x, coefficients, inverse))
 
     with jax.enable_x64(True):
-        has_lobe = any(picture.lobe is not None for picture in pictures)
-        parts = sums(each(again, pictures), np.log([optimum.n]) if has_lobe else np.zeros(0), x.T)
-    missing = 4 - parts.gram.shape[-1]
-    parts = parts.about(np.pad(x.T, [(0, 0), (0, 1)])[:, : 4 - missing])
-    by_n = np.array([1.0, 1.0, 1.0, 1.0 / optimum.n])
-    gram = np.pad(parts.gram, [(0, 0), (0, missing), (0, missing)])
-    product = np.pad(parts.product, [(0, 0), (0, missing)])
-    return Sums(gram * by_n[:, None] * by_n, product * by_n, parts.square, parts.pixels)
+        parts = sums(each(again, pictures), np.log([n]), x.T)
+    return parts.about(x.T).columns(np.diag([1.0, 1.0, 1.0, 1.0 / n]))

@@ -6,7 +6,7 @@ import pytest
 from engine_pictures import OneLightLobe, X, ball, best_at, cost_of, picture
 
 from fitting.solver.normal_equations import Picture
-from fitting.solver.profile import fit_linear, search
+from fitting.solver.profile import search
 from fitting.solver.streams import Stream
 
 
@@ -148,14 +148,14 @@ def test_free_holds_unknowns_at_zero():
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_without_a_lobe_is_linear_least_squares(dtype):
     one = picture(96, noise=0.05, dtype=dtype)
-    found = fit_linear([one])
+    found = search([one], free=np.array([[True] * 3, [True] * 3, [False] * 3]))
     columns = np.stack([np.ones(one.diffuse.shape[0]), one.diffuse[:, 0].astype(float)], axis=1)
     expected, square, *_ = np.linalg.lstsq(columns, one.target.astype(float), rcond=None)
     accuracy = 1e-5 if dtype == np.float32 else 1e-11
     np.testing.assert_allclose(found.x[:2], expected, rtol=accuracy)
     np.testing.assert_allclose(found.cost, square, rtol=accuracy)
     assert not np.any(found.x[2])
-    alone = fit_linear([one], free=np.array([[True] * 3, [False] * 3, [True] * 3]))
+    alone = search([one], free=np.array([[True] * 3, [False] * 3, [False] * 3]))
     np.testing.assert_allclose(alone.x[0], np.mean(one.target.astype(float), axis=0), rtol=accuracy)
 
 
