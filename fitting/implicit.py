@@ -86,7 +86,10 @@ def sensitivity(result: FitResult, by: Callable[[list[brdf.Scene]], Sequence[Any
         numbers, unravel_numbers, design, index = _unknowns(result)
         vector = np.linalg.pinv(design) @ numbers
         # By arguments, or the pictures would be constants of the program.
-        pictures = [(jnp.asarray(target, jnp.float64), jnp.asarray(counted)) for target, counted in _counted(result)]
+        pictures = [
+            (jnp.asarray(np.where(counted[..., None], target, 0.0), jnp.float64), jnp.asarray(counted))
+            for target, counted in zip(result.targets, result.counted, strict=True)
+        ]
 
         def cost(vector: Array, known: Array, pictures: Any) -> Array:
             values = unravel_numbers(jnp.where(np.any(design, axis=1), design @ vector, numbers))
@@ -98,24 +101,22 @@ def sensitivity(result: FitResult, by: Callable[[list[brdf.Scene]], Sequence[Any
                 total = total + 0.5 * jnp.sum(residual * residual)
             return total
 
-        def derivatives(vector: Array, known: Array, pictures: Any, argument: int) -> tuple[Array, Array]:
+        def derivatives(vector: Array, known: Array, pictures: Any, *, by_known: bool) -> tuple[Array, Array]:
             """The gradient by the unknowns, and its derivative by the unknowns or by what is known, row by row."""
-            arguments = [vector, known]
-
-            def row(along: Array) -> Array:
-                moved = [jnp.zeros_like(a) if i != argument else along for i, a in enumerate(arguments)]
-                return jax.jvp(lambda *both: jax.grad(cost)(*both, pictures), arguments, moved)[1]
-
-            return jax.grad(cost)(*arguments, pictures), jax.lax.map(row, jnp.eye(arguments[argument].size))
+            gradient = jax.grad(cost)
+            if by_known:
+                found, along = jax.linearize(lambda known: gradient(vector, known, pictures), known)
+            else:
+                found, along = jax.linearize(lambda vector: gradient(vector, known, pictures), vector)
+            return found, jax.lax.map(along, jnp.eye(known.size if by_known else vector.size))
 
         compiled = eqx.filter_jit(derivatives)
         hessian = np.eye(vector.size)
         # A fit in float32 stops a little beside the stationary point; Newton's steps go there.
         for _ in range(NEWTON_STEPS):
-            gradient, rows = (np.asarray(a) for a in compiled(jnp.asarray(vector), known, pictures, 0))
-            hessian = rows
+            gradient, hessian = (np.asarray(a) for a in compiled(jnp.asarray(vector), known, pictures, by_known=False))
             vector = vector - _solve(hessian, gradient[:, None])[:, 0]
-        rows = np.asarray(compiled(jnp.asarray(vector), known, pictures, 1)[1])
+        rows = np.asarray(compiled(jnp.asarray(vector), known, pictures, by_known=True)[1])
     moves = -design @ _solve(hessian, rows.T)
     if "n" in index:
         moves[index["n"]] *= np.exp(design @ vector)[index["n"], None]
@@ -126,11 +127,6 @@ def sensitivity(result: FitResult, by: Callable[[list[brdf.Scene]], Sequence[Any
         parts |= {key: moves[place, start:end].reshape(-1, *leaf.shape) for key, place in index.items()}
         found.append(Sensitivity(**parts | {"n": parts["n"][0] if "n" in parts else np.zeros(leaf.shape)}))
     return tuple(found)
-
-
-def _counted(result: FitResult) -> list[tuple[np.ndarray, np.ndarray]]:
-    both = zip(result.targets, result.counted, strict=True)
-    return [(np.where(counted[..., None], target, 0.0), counted) for target, counted in both]
 
 
 def _unknowns(result: FitResult) -> tuple[np.ndarray, Callable[[Array], Any], np.ndarray, dict[str, np.ndarray]]:
@@ -156,7 +152,7 @@ def _unknowns(result: FitResult) -> tuple[np.ndarray, Callable[[Array], Any], np
     return np.asarray(numbers), unravel, design, index
 
 
-def _solve(hessian: Float[np.ndarray, "K K"], right: Float[np.ndarray, "K S"]) -> Float[np.ndarray, "K S"]:
+def _solve(hessian: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Scaled by the diagonal, since coefficients and exponent differ by orders of magnitude in what they move."""
     diagonal = np.diag(hessian)
     if not np.all(np.isfinite(hessian)) or np.any(diagonal <= 0):

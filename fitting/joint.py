@@ -16,11 +16,10 @@ from typing import Any, Literal
 
 import equinox as eqx
 import jax
-import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array
 
 import brdf
 from brdf.precision import Precision, working_precision
@@ -108,57 +107,55 @@ def fit_jointly(
         raise brdf.InputError("tolerance", came, "Give for example 1e-10 and 256")
     stated = state_problem(target, scene, mask, precision=precision, saturation=saturation)
     with working_precision(precision):
-        seen = list(observe(stated, at_once=True).tiles)
-        start = brdf.cast((material, stated.scenes), precision)
-        problem = _freed(start, free, seen)
-        values = sum(observation.target.size for observation in seen)
-        chosen = solver or ("lm" if values * sum(leaf.size for leaf in problem.coded()) <= LARGEST_JACOBIAN else "bfgs")
-        return _solve(problem, chosen, tolerance, max_steps)
+        tiles = list(observe(stated, at_once=True).tiles)
+        problem = _freed(brdf.cast((material, stated.scenes), precision), free, tiles)
+        jacobian = sum(tile.target.size for tile in tiles) * problem.start().size
+        return _solve(problem, solver or ("lm" if jacobian <= LARGEST_JACOBIAN else "bfgs"), tolerance, max_steps)
 
 
 class _JointProblem(eqx.Module):
     """From a vector of freed numbers to weighted residuals; a pytree, so that its programs are compiled once a shape.
 
     Attributes:
-        leaves: of material and list of scenes to start from.
-        seen: what is compared with.
+        leaves: of material and list of scenes.
+        tiles: what is compared with.
         shape: of material and scenes.
         places: of the freed leaves.
         names: of the fields that they are.
     """
 
     leaves: list[Array]
-    seen: list[Tile]
+    tiles: list[Tile]
     shape: Any = eqx.field(static=True)
     places: tuple[int, ...] = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
 
-    def coded(self) -> tuple[Array, ...]:
-        """The freed leaves as they are searched."""
-        freed = [self.leaves[place] for place in self.places]
-        return tuple(jnp.log(leaf) if name == "n" else leaf for leaf, name in zip(freed, self.names, strict=True))
-
-    def by_leaf(self, vector: Float[Array, " K"]) -> tuple[Array, ...]:
-        """A vector's entries leaf by leaf."""
-        return jax.flatten_util.ravel_pytree(self.coded())[1](vector)
-
-    def decode(self, vector: Float[Array, " K"]) -> list[Array]:
+    def freed(self) -> list[Array]:
         """The freed leaves."""
-        coded = self.by_leaf(vector)
-        return [jnp.exp(leaf) if name == "n" else leaf for leaf, name in zip(coded, self.names, strict=True)]
+        return [self.leaves[place] for place in self.places]
 
-    def put(self, vector: Float[Array, " K"]) -> Any:
-        """Material and scenes with the freed leaves in place."""
-        leaves = list(self.leaves)
-        for place, leaf in zip(self.places, self.decode(vector), strict=True):
-            leaves[place] = leaf
-        return jax.tree.unflatten(self.shape, leaves)
+    def start(self) -> Array:
+        """The freed numbers as they are searched: n by its logarithm."""
+        both = zip(self.freed(), self.names, strict=True)
+        return jnp.concatenate([jnp.ravel(jnp.log(leaf) if name == "n" else leaf) for leaf, name in both])
 
-    def residuals(self, vector: Float[Array, " K"]) -> Float[Array, " R"]:
-        """Weighted residuals of all pictures."""
-        material, scenes = self.put(vector)
+    def at(self, vector: Array) -> "_JointProblem":
+        """The problem with other freed numbers."""
+        leaves, begin = list(self.leaves), 0
+        for place, name in zip(self.places, self.names, strict=True):
+            part = vector[begin : begin + leaves[place].size].reshape(leaves[place].shape)
+            leaves[place], begin = jnp.exp(part) if name == "n" else part, begin + part.size
+        return eqx.tree_at(lambda problem: problem.leaves, self, leaves)
+
+    def content(self) -> tuple[brdf.Material, list[brdf.Scene]]:
+        """Material and scenes."""
+        return jax.tree.unflatten(self.shape, self.leaves)
+
+    def residuals(self, vector: Array) -> Array:
+        """Weighted residuals of all pictures, one after the other."""
+        material, scenes = self.at(vector).content()
         found = []
-        for tile, scene in zip(self.seen, scenes, strict=True):
+        for tile, scene in zip(self.tiles, scenes, strict=True):
             residual = brdf.render(material, scene).reshape(tile.target.shape) - tile.target
             if tile.weight is not None:
                 counts = tile.weight[:, None] > 0
@@ -167,7 +164,7 @@ class _JointProblem(eqx.Module):
         return jnp.concatenate(found)
 
 
-def _freed(start: Any, free: Callable[..., Sequence[Any]], seen: list[Tile]) -> _JointProblem:
+def _freed(start: Any, free: Callable[..., Sequence[Any]], tiles: list[Tile]) -> _JointProblem:
     """Find the freed leaves among those of the start, each an array of its own."""
     start = jax.tree.map(jnp.array, start)
     remedy = "Return a tuple of leaves, such as (material.n, scenes[0].lights[0].direction)"
@@ -189,12 +186,12 @@ def _freed(start: Any, free: Callable[..., Sequence[Any]], seen: list[Tile]) -> 
         raise brdf.InputError("free", "gives a leaf twice", remedy)
     places, names = zip(*(own[leaf] for leaf in freed), strict=True)
     leaves, shape = jax.tree.flatten(start)
-    return _JointProblem(leaves, seen, shape, places, names)
+    return _JointProblem(leaves, tiles, shape, places, names)
 
 
 @eqx.filter_jit
 def _run(
-    problem: _JointProblem, vector: Array, held: Bool[Array, " K"], solver: str, tolerance: float, max_steps: int
+    problem: _JointProblem, vector: Array, held: Array, solver: str, tolerance: float, max_steps: int
 ) -> optx.Solution:
     """The solver's answer with some of the freed numbers held."""
 
@@ -212,54 +209,41 @@ def _run(
 
 
 @eqx.filter_jit
-def _linearised(problem: _JointProblem, vector: Array) -> tuple[Float[Array, " R"], Float[Array, "K R"]]:
+def _linearised(problem: _JointProblem, vector: Array) -> tuple[Array, Array]:
     """The residuals and their derivatives, one column of the Jacobian at a time."""
-    columns = jax.lax.map(lambda along: jax.jvp(problem.residuals, (vector,), (along,))[1], jnp.eye(vector.size))
-    return problem.residuals(vector), columns
+    residuals, along = jax.linearize(problem.residuals, vector)
+    return residuals, jax.lax.map(along, jnp.eye(vector.size))
 
 
 def _solve(problem: _JointProblem, solver: str, tolerance: float, max_steps: int) -> JointResult:
-    vector = jax.flatten_util.ravel_pytree(problem.coded())[0]
-    bounded = [
-        np.full(leaf.size, name in NOT_NEGATIVE) for leaf, name in zip(problem.coded(), problem.names, strict=True)
-    ]
-    lower = np.where(np.concatenate(bounded), 0.0, -np.inf)
-    held = np.zeros(lower.shape, bool)
+    vector, freed = problem.start(), problem.freed()
+    bounded = np.repeat([name in NOT_NEGATIVE for name in problem.names], [leaf.size for leaf in freed])
+    held = np.zeros(vector.shape, bool)
     steps, converged = 0, False
     for _ in range(ROUNDS):
         solution = _run(problem, vector, jnp.asarray(held), solver, tolerance, max_steps)
         steps += int(solution.stats["num_steps"])
         converged = bool(solution.result == optx.RESULTS.successful)
         vector = jnp.where(held, vector, solution.value)
-        below = np.asarray(vector) < lower
-        vector = jnp.maximum(vector, lower.astype(vector.dtype))
+        below = bounded & np.asarray(vector < 0)
+        vector = jnp.where(below, 0, vector)
         residual, columns = (np.asarray(a, np.float64) for a in _linearised(problem, vector))
         inwards = held & (columns @ residual < 0)
         if not below.any() and not inwards.any():
             break
         held = (held | below) & ~inwards
-    targets = [np.asarray(tile.target, np.float64) for tile in problem.seen]
-    counted = [
-        target if tile.weight is None else target[np.asarray(tile.weight) > 0]
-        for target, tile in zip(targets, problem.seen, strict=True)
-    ]
-    pixels, square = sum(target.size for target in counted), sum(float(np.sum(target**2)) for target in counted)
-    cost = float(residual @ residual)
+    cost, square, count = float(residual @ residual), 0.0, 0
+    for tile in problem.tiles:
+        counted = np.asarray(tile.target, np.float64)[... if tile.weight is None else np.asarray(tile.weight) > 0]
+        square, count = square + float(np.sum(counted**2)), count + counted.size
     inverse = np.zeros(vector.size)
     inverse[~held] = inverse_diagonal(columns[~held] @ columns[~held].T, 1e-12)
-    errors = problem.by_leaf(jnp.asarray(np.sqrt(cost / max(pixels - vector.size, 1) * inverse), vector.dtype))
-    values = problem.decode(vector)
-    material, scenes = jax.tree.map(np.asarray, problem.put(vector))
-    return JointResult(
-        material=material,
-        scenes=scenes,
-        values=tuple(np.asarray(leaf) for leaf in values),
-        errors=tuple(
-            np.asarray(error * leaf if name == "n" else error)
-            for error, leaf, name in zip(errors, values, problem.names, strict=True)
-        ),
-        residual=(cost / square) ** 0.5,
-        steps=steps,
-        converged=converged,
-        solver=solver,
-    )
+    found = problem.at(vector)
+    errors, values = [], [np.asarray(leaf) for leaf in found.freed()]
+    deviations = np.sqrt(cost / max(count - vector.size, 1) * inverse).astype(vector.dtype)
+    parts = np.split(deviations, np.cumsum([leaf.size for leaf in freed])[:-1])
+    for part, leaf, name in zip(parts, values, problem.names, strict=True):
+        errors.append(part.reshape(leaf.shape) * (leaf if name == "n" else 1))
+    material, scenes = jax.tree.map(np.asarray, found.content())
+    residual_share = (cost / square) ** 0.5
+    return JointResult(material, scenes, tuple(values), tuple(errors), residual_share, steps, converged, solver)

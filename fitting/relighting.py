@@ -13,7 +13,7 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 import brdf
 from brdf.errors import InputError
@@ -141,34 +141,37 @@ def fit_lights_and_material(
     if not scene.lights:
         raise InputError("scene", "has no lights", "Add a [[lights]] table")
     pixels, seen = _pixels(target, scene, mask)
-    channels = pixels.shape[1]
     cls: Any = brdf.MODELS[model]
-    specular = issubclass(cls, SpecularMaterial)
+    names = ["k_d", "k_s"] if issubclass(cls, SpecularMaterial) else ["k_d"]
+    lights = len(scene.lights)
 
-    def terms(n: float) -> Float[np.ndarray, "L T P C"]:
-        """One picture per light for k_d = 1, and for k_s = 1."""
-        unit = [cls(k_d=1.0, k_s=0.0, n=n), cls(k_d=0.0, k_s=1.0, n=n)] if specular else [cls(k_d=1.0)]
-        lit = eqx.tree_at(lambda s: s.ambient, scene, None, is_leaf=lambda leaf: leaf is None)
-        images = [np.asarray(brdf.render_lights(one, lit, precision=precision), np.float64)[:, seen] for one in unit]
-        stacked = np.stack(images, axis=1)
-        return np.broadcast_to(stacked, (*stacked.shape[:3], channels))
+    def surface(k: Any, n: float) -> brdf.Material:
+        return cls(**dict(zip([*names, "k_a"], k, strict=True)), **{"n": n} if len(names) > 1 else {})
 
-    ambient = np.zeros(channels) if scene.ambient is None else np.broadcast_to(scene.ambient, channels)
-    n = _best_exponent(lambda n: _in_turn(terms(n), ambient, pixels)[0], n_range) if specular else 1.0
-    _, factors, k = _in_turn(terms(n), ambient, pixels)
-    mean = factors.mean(axis=0)
+    def terms(n: float) -> np.ndarray:
+        """One picture per light, and of the ambient light, for k_d = 1, for k_s = 1 and for k_a = 1; (L, T, P, C)."""
+        units = [surface(k, n) for k in np.eye(len(names), len(names) + 1)]
+        images = [np.asarray(brdf.render_lights(one, scene, precision=precision))[:, seen] for one in units]
+        found = np.zeros((len(images[0]), len(names) + 1, *pixels.shape))
+        found[:, :-1] = np.stack(images, axis=1)
+        if scene.ambient is not None:
+            found[-1, -1] = scene.ambient
+        return found
+
+    n = _best_exponent(lambda n: _in_turn(terms(n), pixels, lights)[0], n_range) if len(names) > 1 else 1.0
+    images = terms(n)
+    _, factors, k = _in_turn(images, pixels, lights)
+    mean = factors[:lights].mean(axis=0)
     scale = np.where(mean > 0, mean, 1.0)
-    factors, k = factors / scale, np.concatenate([k[:1], k[1:] * scale])
-    material = cls(k_a=k[0], k_d=k[1], k_s=k[2], n=n) if specular else cls(k_a=k[0], k_d=k[1])
-    columns = np.einsum("ltpc,tc->lpc", terms(n), k[1:])
-    if scene.ambient is not None:
-        columns = np.concatenate([columns, np.broadcast_to(k[0] * ambient, (1, *pixels.shape))])
-        factors = np.concatenate([factors, np.ones((1, channels))])
+    factors[:lights] /= scale
+    k[:-1] *= scale
+    columns = np.einsum("ltpc,tc->lpc", images, k)
     _, errors = _intensities(columns, pixels)
-    return _result(scene, material, columns, pixels, factors, errors, (UNKNOWN_FACTOR,))
+    return _result(scene, surface(k, n), columns, pixels, factors, errors, (UNKNOWN_FACTOR,))
 
 
-def _pixels(target: Any, scene: brdf.Scene, mask: Any) -> tuple[Float[np.ndarray, "P C"], Bool[np.ndarray, "H W"]]:
+def _pixels(target: Any, scene: brdf.Scene, mask: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Values of the pixels that count, (P, C), and which these are, (H, W)."""
     values = np.asarray(target.pixels if isinstance(target, brdf.Picture) else target, np.float64)
     values = values[..., None] if values.ndim == 2 else values
     if values.ndim != 3 or values.shape[1::-1] != scene.resolution:
@@ -185,10 +188,8 @@ def _pixels(target: Any, scene: brdf.Scene, mask: Any) -> tuple[Float[np.ndarray
     return values[seen], seen
 
 
-def _intensities(
-    columns: Float[np.ndarray, "L P C"], pixels: Float[np.ndarray, "P C"]
-) -> tuple[Float[np.ndarray, "L C"], Float[np.ndarray, "L C"]]:
-    """Factors and their standard errors, channel by channel."""
+def _intensities(columns: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Factors and their standard errors, channel by channel, (L, C) each; the columns are (L, P, C)."""
     lights, count, channels = columns.shape
     factors, errors = np.zeros((2, lights, channels))
     for c in range(channels):
@@ -200,44 +201,33 @@ def _intensities(
     return factors, errors
 
 
-def _in_turn(
-    terms: Float[np.ndarray, "L T P C"], ambient: np.ndarray, pixels: Float[np.ndarray, "P C"]
-) -> tuple[float, Float[np.ndarray, "L C"], Float[np.ndarray, "T C"]]:
-    """Least cost at one exponent, the lights' factors, and coefficients with k_a first."""
-    lights, parts, count, channels = terms.shape
-    cost, factors, k = 0.0, np.ones((lights, channels)), np.zeros((parts + 1, channels))
+def _in_turn(terms: np.ndarray, pixels: np.ndarray, lights: int) -> tuple[float, np.ndarray, np.ndarray]:
+    """Least cost at one exponent, the lights' factors, (L, C), and the coefficients with k_a last, (T, C)."""
+    shape, channels = terms.shape[:2], pixels.shape[1]
+    cost, factors, coefficients = 0.0, np.ones((shape[0], channels)), np.zeros((shape[1], channels))
     for c in range(channels):
-        columns = np.concatenate([terms[..., c].reshape(-1, count), np.full((1, count), ambient[c])])
-        gram, product = columns @ columns.T, columns @ pixels[:, c]
-        square, last = float(pixels[:, c] @ pixels[:, c]), np.inf
-        light, now, coefficients = np.ones(lights), square, np.zeros(parts + 1)
+        columns = terms[..., c].reshape(-1, len(pixels))
+        gram, product = (columns @ columns.T).reshape(*shape, *shape), (columns @ pixels[:, c]).reshape(shape)
+        square, last, light = float(pixels[:, c] @ pixels[:, c]), np.inf, np.ones(shape[0])
         for _ in range(_ROUNDS):
-            by_k = _fold(np.kron(light[:, None], np.eye(parts)))
-            coefficients = nonnegative_minimum(by_k.T @ gram @ by_k, by_k.T @ product)
-            by_light = _fold(np.kron(np.eye(lights), coefficients[:-1, None]))
-            found = nonnegative_minimum(by_light.T @ gram @ by_light, by_light.T @ product)
-            light, whole = found[:-1], by_light @ found
-            coefficients[-1] = found[-1]
-            now = max(float(square - 2 * whole @ product + whole @ gram @ whole), 0.0)
+            k = nonnegative_minimum(np.einsum("l,ltms,m->ts", light, gram, light), light @ product)
+            by_light = np.einsum("t,ltms,s->lm", k, gram, k)
+            light = nonnegative_minimum(by_light, product @ k)
+            now = max(float(square - 2 * light @ product @ k + light @ by_light @ light), 0.0)
+            # The ambient light keeps its intensity.
+            k[-1] *= light[lights:].sum()
+            light[lights:] = 1.0
             if last - now <= 1e-12 * square:
                 break
             last = now
-        cost, factors[:, c] = cost + now, light
-        k[1:, c], k[0, c] = coefficients[:-1], coefficients[-1]
-    return cost, factors, k
-
-
-def _fold(matrix: np.ndarray) -> np.ndarray:
-    """Beside the terms of the lights, the ambient term as it is."""
-    wide = np.zeros((matrix.shape[0] + 1, matrix.shape[1] + 1))
-    wide[:-1, :-1], wide[-1, -1] = matrix, 1.0
-    return wide
+        cost, factors[:, c], coefficients[:, c] = cost + now, light, k
+    return cost, factors, coefficients
 
 
 def _best_exponent(cost: Callable[[float], float], n_range: tuple[float, float]) -> float:
     """The exponent of least cost: a grid over log n, then the best cell's neighbourhood."""
 
-    def costs(log_n: Float[np.ndarray, " T"]) -> Float[np.ndarray, " T"]:
+    def costs(log_n: np.ndarray) -> np.ndarray:
         return np.array([cost(float(n)) for n in np.exp(log_n)])
 
     low, high = np.log(n_range)
@@ -249,10 +239,10 @@ def _best_exponent(cost: Callable[[float], float], n_range: tuple[float, float])
 def _result(
     scene: brdf.Scene,
     material: brdf.Material,
-    columns: Float[np.ndarray, "L P C"],
-    pixels: Float[np.ndarray, "P C"],
-    factors: Float[np.ndarray, "L C"],
-    errors: Float[np.ndarray, "L C"],
+    columns: np.ndarray,
+    pixels: np.ndarray,
+    factors: np.ndarray,
+    errors: np.ndarray,
     undetermined: tuple[str, ...],
 ) -> LightFit:
     channels = pixels.shape[1]

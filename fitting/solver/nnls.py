@@ -100,7 +100,8 @@ def nonnegative_minimum(
             if not negative.any():
                 break
             # Towards the trial as far as all stay positive; what comes to 0 first leaves.
-            shares = np.where(negative, x / np.maximum(x - trial, np.finfo(float).tiny), np.inf)
+            shares = np.full(x.shape, np.inf)
+            shares[negative] = x[negative] / np.maximum(x - trial, np.finfo(float).tiny)[negative]
             x = x + np.min(shares) * (trial - x)
             passive &= shares > np.min(shares)
             x = np.where(passive, x, 0.0)

@@ -124,13 +124,13 @@ def search(
     """
     with jax.enable_x64(True):
         problem = problem_of(pictures, (n_min, n_max), free)._replace(cap=cap)
-        samples: Sequence[Subsample] = []
-        if problem.lobe:
-            size = max(SMALLEST_SAMPLE, SAMPLE_SIZE // len(pictures))
-            samples = [subsample(picture, size, n_max) for picture in pictures]
-            nearest = min(sample.nearest for sample in samples)
-            lobe = any(sample.picture.lobe is not None for sample in samples)
-            problem = problem._replace(lobe=lobe, peak=-nearest if nearest < math.inf else 0.0)
+        size = max(SMALLEST_SAMPLE, SAMPLE_SIZE // len(pictures))
+        samples = [subsample(picture, size, n_max) for picture in pictures] if problem.lobe else []
+        nearest = min((sample.nearest for sample in samples), default=math.inf)
+        if nearest < math.inf:
+            problem = problem._replace(peak=-nearest)
+        else:
+            problem = problem._replace(lobe=False)
         if not problem.lobe or n_min == n_max:
             nothing = np.zeros(problem.free.shape)
             return _optimum(*gauss_newton(problem, Point(problem.bounds[0], nothing, nothing[:, 0])), problem)

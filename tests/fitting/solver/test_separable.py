@@ -74,8 +74,7 @@ def test_all_zero_target_and_one_zero_channel():
     assert not np.any(found.x[:, 1])
 
 
-@pytest.mark.parametrize("per_channel", [False, True])
-@pytest.mark.parametrize("size", [48, 128])
+@pytest.mark.parametrize(("size", "per_channel"), [(48, True), (128, False)])
 def test_pixels_of_weight_zero_may_hold_anything(size, per_channel):
     rng = np.random.default_rng(1)
     one = picture(size, noise=0.02)
@@ -94,8 +93,7 @@ def test_pixels_of_weight_zero_may_hold_anything(size, per_channel):
     assert np.all(found.pixels == np.count_nonzero(~out))
 
 
-@pytest.mark.parametrize("channels", [1, 3, 5, 31])
-@pytest.mark.parametrize("coloured", [False, True])
+@pytest.mark.parametrize(("channels", "coloured"), [(1, False), (3, True), (5, False), (31, True)])
 def test_channels_and_coloured_lights(channels, coloured):
     rng = np.random.default_rng(channels)
     (cosine,), (log_cos,), (gate,) = ball(96, [(0.5, 0.6, 0.7)])
