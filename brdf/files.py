@@ -34,19 +34,20 @@ _REMEDIES = {
     errno.ELOOP: ("the links lead in a circle", "Check the path"),
 }
 MAX_TEXT_BYTES = 1 << 24
+AnyPath = str | os.PathLike[str]
 
 
 @contextmanager
-def _told(path: str | os.PathLike[str]) -> Iterator[None]:
+def _told(path: AnyPath) -> Iterator[None]:
     """What the operating system refuses, as the one line that names what the user gave."""
     try:
         yield
     except OSError as error:
         what, remedy = _REMEDIES.get(error.errno or 0, (error.strerror or type(error).__name__, "Check the path"))
-        raise InputError(os.fspath(path), what, remedy) from None
+        raise InputError(path, what, remedy) from None
 
 
-def input_file(path: str | os.PathLike[str]) -> Path:
+def input_file(path: AnyPath) -> Path:
     """The path of an ordinary, readable file that is not empty.
 
     Args:
@@ -67,7 +68,7 @@ def input_file(path: str | os.PathLike[str]) -> Path:
     return Path(path)
 
 
-def _plain(path: str | os.PathLike[str]) -> str:
+def _plain(path: AnyPath) -> str:
     if not isinstance(path, str | os.PathLike) or not isinstance(os.fspath(path), str):
         raise InputError(repr(path), f"a path must be text, got {type(path).__name__}", "Give the path of a file")
     text = os.fspath(path)
@@ -77,7 +78,7 @@ def _plain(path: str | os.PathLike[str]) -> str:
     raise InputError(repr(text), "is not a path", "Give the path of a file")
 
 
-def utf8_name(path: str | os.PathLike[str]) -> str:
+def utf8_name(path: AnyPath) -> str:
     """A path as text, for libraries that know names in UTF-8 alone.
 
     Args:
@@ -86,16 +87,15 @@ def utf8_name(path: str | os.PathLike[str]) -> str:
     Raises:
         InputError: where the name is other bytes.
     """
-    name = os.fspath(path)
     try:
-        name.encode()
+        os.fspath(path).encode()
     except UnicodeEncodeError:
-        raise InputError(name, "has a name or folder that is not UTF-8", "Rename it") from None
-    return name
+        raise InputError(path, "has a name or folder that is not UTF-8", "Rename it") from None
+    return os.fspath(path)
 
 
 @contextmanager
-def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
+def atomic_path(path: AnyPath) -> Iterator[Path]:
     """A temporary name beside ``path``, with the same suffix, that becomes ``path`` when the block ends well.
 
     On any exception, Ctrl-C among them, the temporary file is deleted and ``path`` stays as it was. An existing file
@@ -112,9 +112,9 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     target = Path(os.path.realpath(_plain(path)))
     if os.path.isdir(target):
-        raise InputError(os.fspath(path), "is a folder, not a file", "Give the path of a file")
+        raise InputError(path, "is a folder, not a file", "Give the path of a file")
     if os.path.exists(target) and not os.path.isfile(target):
-        raise InputError(os.fspath(path), "is not an ordinary file", "Give the path of a file")
+        raise InputError(path, "is not an ordinary file", "Give the path of a file")
     temporary = target.with_name(f".{secrets.token_hex(6)}{target.suffix}")
     try:
         with _told(path):
@@ -129,7 +129,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
             temporary.unlink()
 
 
-def write_text(path: str | os.PathLike[str], text: str) -> None:
+def write_text(path: AnyPath, text: str) -> None:
     """Write a text file, whole or not at all, as UTF-8 with newlines as they are.
 
     Args:
@@ -144,7 +144,7 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 
 
 @contextmanager
-def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+def atomic_folder(path: AnyPath) -> Iterator[Path]:
     """A folder to write a set of files into, which appear together in ``path`` when the block ends well.
 
     On any exception nothing has changed: no file of the set appears, files that were there keep their content, and
@@ -183,7 +183,7 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
                 parent.rmdir()  # refused where there is something in it
 
 
-def check_folder(path: str | os.PathLike[str]) -> None:
+def check_folder(path: AnyPath) -> None:
     """Refuse a folder of results that cannot be made or written, before there are any; nothing of the trial stays.
 
     Args:
@@ -215,7 +215,7 @@ def _move_together(new: Path, old: Path, folder: Path) -> None:
         raise
 
 
-def read_text(path: str | os.PathLike[str], most: int = MAX_TEXT_BYTES) -> str:
+def read_text(path: AnyPath, most: int = MAX_TEXT_BYTES) -> str:
     """Read a text file.
 
     Args:
@@ -227,20 +227,20 @@ def read_text(path: str | os.PathLike[str], most: int = MAX_TEXT_BYTES) -> str:
     """
     with input_file(path).open("rb") as file:
         content = file.read(most + 1)
-    name, remedy = os.fspath(path), "Give a text file, saved as UTF-8"
+    remedy = "Give a text file, saved as UTF-8"
     if len(content) > most:
-        raise InputError(name, f"is larger than {most >> 20} MiB", "Check what it is, or make it smaller")
+        raise InputError(path, f"is larger than {most >> 20} MiB", "Check what it is, or make it smaller")
     try:
         text = content.decode("utf-8-sig")  # some editors write a byte-order mark
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
-        raise InputError(name, f"is not UTF-8 text (line {line}: {error.reason})", remedy) from None
+        raise InputError(path, f"is not UTF-8 text (line {line}: {error.reason})", remedy) from None
     if "\0" in text:
-        raise InputError(name, "is not UTF-8 text (it holds null bytes)", remedy)
+        raise InputError(path, "is not UTF-8 text (it holds null bytes)", remedy)
     return text
 
 
-def read_toml(path: str | os.PathLike[str], most: int = MAX_TEXT_BYTES) -> dict[str, Any]:
+def read_toml(path: AnyPath, most: int = MAX_TEXT_BYTES) -> dict[str, Any]:
     """Read a TOML file.
 
     Args:

@@ -150,6 +150,7 @@ def _of_profile(path: Path, profile: bytes) -> Encoding | None:
     try:
         (count,) = struct.unpack_from(">I", profile, 128)
         tags = [struct.unpack_from(">4sII", profile, 132 + 12 * tag) for tag in range(min(count, 100))]
+        curves: set[Encoding | None]
         curves = {_of_curve(profile[start : start + size]) for kind, start, size in tags if kind[1:] == b"TRC"}
     except (struct.error, ValueError):
         return None

@@ -9,7 +9,6 @@ Sizes are checked before memory is taken (`brdf.images.damage`); `ImageReader` r
 """
 
 import dataclasses
-import os
 import re
 from pathlib import Path
 from typing import Any, Self
@@ -19,7 +18,7 @@ import OpenImageIO as oiio  # noqa: N813
 from jaxtyping import Bool, Float32
 
 from brdf.errors import InputError
-from brdf.files import input_file, utf8_name
+from brdf.files import AnyPath, input_file, utf8_name
 from brdf.images.damage import check_content, check_header, check_memory
 from brdf.images.encoding import FLOATS, Encoding, EncodingSource, decode, decode_table, find_encoding, parse_encoding
 
@@ -112,7 +111,7 @@ class ImageReader:
         (16, 32, 3)
     """
 
-    def __init__(self, path: str | os.PathLike[str], *, encoding: Encoding | None = None):
+    def __init__(self, path: AnyPath, *, encoding: Encoding | None = None):
         """Open a file and read its header.
 
         Args:
@@ -132,6 +131,8 @@ class ImageReader:
         self.is_integer = str(kind) not in FLOATS
         stored = spec.get_int_attribute("oiio:BitsPerSample")
         self.bits = stored if self.is_integer and 0 < stored <= 32 else 8 * kind.basesize()
+        self.encoding: Encoding
+        self.source: EncodingSource
         self.encoding, self.source = find_encoding(given, self.path, name, spec, self.bits)
         lossy = name in ("jpeg", "webp", "heif") or spec.get_string_attribute("compression").startswith("jpeg")
         self._top = LOSSY_TOP if lossy else 1.0
@@ -252,7 +253,7 @@ def _open(path: Path) -> oiio.ImageInput:
     return image
 
 
-def said(source: Any, path: str | os.PathLike[str] = "") -> str:
+def said(source: Any, path: AnyPath = "") -> str:
     """What OpenImageIO says went wrong, the first line of it, and forgets then.
 
     Args:
@@ -327,9 +328,7 @@ def _read_rows(path, image, part: int, start: int, stop: int, channels: list[int
     return pixels[..., [channel - low for channel in channels]]
 
 
-def read_image(
-    path: str | os.PathLike[str], *, encoding: Encoding | None = None
-) -> Float32[np.ndarray, "height width channels"]:
+def read_image(path: AnyPath, *, encoding: Encoding | None = None) -> Float32[np.ndarray, "height width channels"]:
     """Read a picture as linear values.
 
     Args:
@@ -352,7 +351,7 @@ def read_image(
         return reader.read()
 
 
-def read_picture(path: str | os.PathLike[str], *, encoding: Encoding | None = None) -> Picture:
+def read_picture(path: AnyPath, *, encoding: Encoding | None = None) -> Picture:
     """Read a picture with alpha, saturation level and quantisation step.
 
     Args:
@@ -372,7 +371,7 @@ def read_picture(path: str | os.PathLike[str], *, encoding: Encoding | None = No
         return Picture(reader.read(), reader.read_alpha(), reader.encoding, reader.source, reader.bits, top)
 
 
-def read_mask(path: str | os.PathLike[str]) -> Bool[np.ndarray, "height width"]:
+def read_mask(path: AnyPath) -> Bool[np.ndarray, "height width"]:
     """Read which pixels are inside a mask.
 
     Args:
@@ -404,7 +403,7 @@ def _over_half(values: np.ndarray) -> np.ndarray:
     return values > 0.5 * values.max()
 
 
-def read_layers(path: str | os.PathLike[str]) -> dict[str, Float32[np.ndarray, "height width channels"]]:
+def read_layers(path: AnyPath) -> dict[str, Float32[np.ndarray, "height width channels"]]:
     """Read all channels of a file, grouped by layer.
 
     Args:

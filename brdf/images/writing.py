@@ -9,20 +9,20 @@ import numpy as np
 import OpenImageIO as oiio  # noqa: N813
 
 from brdf.errors import InputError
-from brdf.files import atomic_path, utf8_name
+from brdf.files import AnyPath, atomic_path, utf8_name
 from brdf.images.damage import MOST_CHANNELS
 from brdf.images.encoding import Encoding, encode, parse_encoding
 from brdf.images.reading import said
 
 DataType = Literal["uint8", "uint16", "half", "float"]
 
-_FLOATS: dict[str, tuple[Encoding, ...]] = {"float": ("linear",), "half": ("linear",)}
-_PNG: tuple[Encoding, ...] = ("srgb", "linear", 1.8, 2.2, 2.4)
-_TIFF: dict[str, tuple[Encoding, ...]] = {**_FLOATS, "uint8": ("srgb",), "uint16": ("srgb", "linear")}
-_JPEG: dict[str, tuple[Encoding, ...]] = {"uint8": ("srgb",)}
+_FLOATS = {"float": ("linear",), "half": ("linear",)}
+_PNG = ("srgb", "linear", 1.8, 2.2, 2.4)
+_TIFF = {**_FLOATS, "uint8": ("srgb",), "uint16": ("srgb", "linear")}
+_JPEG = {"uint8": ("srgb",)}
 # Per suffix the data types that it can hold, and the encodings that a file of each can say, or reading it back would
 # guess wrong; the usual one first.
-_WRITABLE: dict[str, dict[str, tuple[Encoding, ...]]] = {
+_WRITABLE: dict[str, Mapping[str, tuple[Any, ...]]] = {
     ".exr": _FLOATS,
     ".hdr": {"float": ("linear",)},
     ".png": {"uint8": _PNG, "uint16": _PNG},
@@ -38,7 +38,7 @@ _LARGEST_HALF = 65504.0
 
 
 def write_image(
-    path: str | os.PathLike[str],
+    path: AnyPath,
     array: Any,
     *,
     dtype: DataType | None = None,
@@ -88,7 +88,7 @@ def write_image(
     _write(path, pixels, names, kind, encoded)
 
 
-def write_layers(path: str | os.PathLike[str], layers: Mapping[str, Any]) -> None:
+def write_layers(path: AnyPath, layers: Mapping[str, Any]) -> None:
     """Write layers of one size into an OpenEXR file of floats, whole or not at all.
 
     Args:
@@ -113,7 +113,7 @@ def _endings(count: int, three: str) -> list[str]:
     return list({1: "Y", 3: three}.get(count, "")) or [f"C{index:04d}" for index in range(count)]
 
 
-def _format(path: str | os.PathLike[str], dtype: str | None) -> tuple[str, str]:
+def _format(path: AnyPath, dtype: str | None) -> tuple[str, str]:
     suffix = Path(path).suffix.lower()
     if suffix not in _WRITABLE:
         raise InputError(path, f"{suffix or 'no suffix'} is no image format", f"Use one of {' '.join(_WRITABLE)}")
@@ -135,7 +135,7 @@ def _pixels(path: object, array: Any) -> np.ndarray:
     return np.ascontiguousarray(pixels[..., None] if pixels.ndim == 2 else pixels)
 
 
-def _write(path: str | os.PathLike[str], pixels: np.ndarray, names: list[str], kind: str, encoding: Encoding) -> None:
+def _write(path: AnyPath, pixels: np.ndarray, names: list[str], kind: str, encoding: Encoding) -> None:
     if len(names) > MOST_CHANNELS:
         came = f"would have {len(names)} channels, which nothing reads back"
         raise InputError(path, came, f"Write at most {MOST_CHANNELS} into a file")

@@ -22,19 +22,12 @@ from brdf.errors import InputError
 MODEL_NAMES = ("auto", "lambert", "phong", "blinn-phong", "normalized-phong", "normalized-blinn-phong")
 
 
-def _encoding(text: str) -> Any:
-    """A gamma as a number."""
-    with contextlib.suppress(ValueError):
-        return float(text)
-    return text
-
-
 Encoding = Annotated[
     Any,
     typer.Option(
         help="linear, srgb or a gamma; default: what the file says.",
         rich_help_panel="What the pictures show",
-        parser=_encoding,
+        parser=str,
         metavar="TEXT",
     ),
 ]

@@ -60,7 +60,7 @@ def fit_either(given: Given, **how: Any) -> tuple[FitResult, tuple[str, ...]]:
 
 
 def _fit(given: Given, others: dict[Path, brdf.Picture], how: dict[str, Any]) -> tuple[FitInputs, FitResult]:
-    inputs = collect(given, given.pictures | others)
+    inputs = collect(given._replace(pictures=given.pictures | others))
     with named_as({"target": given.targets[0]}):
         return inputs, fitting.fit(inputs.pictures, inputs.scenes, mask=inputs.masks, **how)
 

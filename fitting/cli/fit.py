@@ -101,7 +101,8 @@ def fit(
             from fitting.report.html import report_page
 
             command = shlex.join(["brdf", *sys.argv[1:]])
-            write_text(report, report_page(result, source=target[0].name, command=command))
+            page = report_page(result, source=target[0].name, command=command)  # pyright: ignore[reportArgumentType]
+            write_text(report, page)
     if as_json:
         show(json.dumps(result.to_dict() | ({"notes": notes} if notes else {}), indent=2))
         return

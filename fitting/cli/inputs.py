@@ -142,21 +142,21 @@ def _target_and_scene(target: Path, scene: Path | None) -> tuple[Path, Path]:
     return target, scene
 
 
-def collect(given: Given, read: dict[Path, brdf.Picture]) -> FitInputs:
+def collect(given: Given) -> FitInputs:
     """What the command was given, ready to fit.
 
     Photographs come as under light of intensity 1, so that each counts alike however bright its light was. Ambient
     light is taken to be the same in all of them, and its intensity, which nobody knows, as 1.
 
     Args:
-        given: as `read_inputs` read it.
-        read: its pictures, or other interpretations of their files.
+        given: as `read_inputs` read it, or with other interpretations of its files.
 
     Raises:
         InputError: naming the file or option.
     """
-    targets, options, _, scene = given
+    targets, options, read, scene = given
     mask = None if options.mask is None else brdf.read_mask(options.mask)
+    masks: Any
     named: dict[str, Any] = {}
     if _is_archive(targets):
         pictures, points, directions, intensities = _read_photographs(targets[0], mask)

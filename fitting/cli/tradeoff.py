@@ -41,7 +41,7 @@ def tradeoff(
     use_compilation_cache()
     import fitting
 
-    inputs = collect(given, given.pictures)
+    inputs = collect(given)
     if len(inputs.pictures) > 1:
         came = f"holds {len(inputs.pictures)} pictures, and one is measured"
         raise InputError(target, came, "Give one picture with its scene or its light")

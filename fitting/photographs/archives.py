@@ -30,12 +30,10 @@ def read_array(file: Any, where: object, size: int) -> np.ndarray:
     damaged = "The file is damaged; make it again"
     try:
         headers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-        version = np.lib.format.read_magic(file)
-        if version not in headers:
-            raise InputError(where, f"is of NumPy's format {version}", "Save it with numpy.save")
+        read_header = headers[np.lib.format.read_magic(file)]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of what a damaged header looks like as Python
-            shape, fortran, kind = headers[version](file)
+            shape, fortran, kind = read_header(file)
         if kind.kind not in "biuf":
             raise InputError(where, f"holds {kind}, not numbers", "Save plain arrays")
         count = math.prod(shape)

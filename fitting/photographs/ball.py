@@ -75,6 +75,7 @@ def find_circle(mask: Any) -> Circle:
     # Area and centroid are the start, which holes and specks hardly move.
     y, x = np.argwhere(inside).mean(axis=0).tolist()
     circle = Circle(x, y, float(np.sqrt(np.count_nonzero(inside) / np.pi)))
+    distance, near = np.zeros(0), np.zeros(0, bool)
     for _ in range(10):
         distance = np.abs(np.hypot(outline[0] - circle.x, outline[1] - circle.y) - circle.radius)
         near = distance <= max(1.0, 3 * np.median(distance))

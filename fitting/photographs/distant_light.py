@@ -152,7 +152,7 @@ def light_from_shading(
     if np.count_nonzero(lit) < FEWEST:
         raise InputError("picture", "has fewer than ten lit pixels on the surface", "Give a brighter picture")
     value = residual = value / unit
-    numbers, free = np.zeros(6), np.array([True, True, True, ambient, False, False])
+    numbers, cost, scale, free = np.zeros(6), 0.0, 0.0, np.array([True, True, True, ambient, False, False])
     for _ in range(100):
         before, scale = numbers, _bound(residual[lit])
         numbers, cost = _refine(numbers, free, False, scale, value[lit], normal[lit])
@@ -175,7 +175,7 @@ def light_from_shading(
         residual = value - _shown(numbers, mirror, normal)
     pixel -= pixel.min(axis=0)
     block = pixel // -(-(pixel.max() + 1) // BLOCKS) @ [BLOCKS, 1]
-    slopes = _slopes(numbers, mirror, normal[lit]) * free
+    slopes = _slopes(numbers, free, mirror, normal[lit])
     error = _error(numbers[:3], residual[lit], slopes, scale, block[lit])
     if not error < GUESS:
         raise _too_little()
@@ -223,11 +223,14 @@ def _shown(numbers, mirror, normal) -> np.ndarray:
     return shown + abs(specular) * np.clip(cosine, 1e-9, 1.0) ** n
 
 
-def _slopes(numbers, mirror, normal) -> np.ndarray:
-    """The derivatives of `_shown` by the numbers."""
-    steps = 1e-5 * np.maximum(np.abs(numbers), 1e-3)
-    ends = [[_shown(numbers + end, mirror, normal) for end in (step, -step)] for step in np.diag(steps)]
-    return np.array([above - below for above, below in ends]).T / (2 * steps)
+def _slopes(numbers, free, mirror, normal) -> np.ndarray:
+    """The derivatives of `_shown` by the numbers that are free, 0 by the others."""
+    columns = np.zeros((len(normal), 6))
+    for index in np.flatnonzero(free):
+        step = 1e-5 * max(abs(numbers[index]), 1e-3) * np.eye(6)[index]
+        above, below = _shown(numbers + step, mirror, normal), _shown(numbers - step, mirror, normal)
+        columns[:, index] = (above - below) / (2 * step[index])
+    return columns
 
 
 def _refine(numbers, free, mirror, scale, value, normal) -> tuple[np.ndarray, float]:
@@ -238,7 +241,7 @@ def _refine(numbers, free, mirror, scale, value, normal) -> tuple[np.ndarray, fl
         off = np.abs(residual) / scale
         return np.sum(np.where(off <= 1, off**2, 2 * off - 1)), residual
 
-    (cost, residual), columns, damping = at(numbers), _slopes(numbers, mirror, normal) * free, 1e-3
+    (cost, residual), columns, damping = at(numbers), _slopes(numbers, free, mirror, normal), 1e-3
     for _ in range(50):
         weight = np.minimum(1.0, scale / np.maximum(np.abs(residual), 1e-300))
         pull = columns.T @ (weight * residual)
@@ -247,7 +250,7 @@ def _refine(numbers, free, mirror, scale, value, normal) -> tuple[np.ndarray, fl
         trial_cost, trial_residual = at(numbers + step)
         if trial_cost < cost:
             numbers, cost, residual, damping = numbers + step, trial_cost, trial_residual, damping / 10
-            columns = _slopes(numbers, mirror, normal) * free
+            columns = _slopes(numbers, free, mirror, normal)
         else:
             damping *= 10
         if np.max(np.abs(step)) < CLOSE:

@@ -89,11 +89,16 @@ def test_highlights_and_cast_shadows_do_not_pull():
 
 
 @pytest.mark.parametrize("ambient", [0.0, 0.1])
-@pytest.mark.parametrize("highlight", [(0.0, 1.0), (0.3, 100.0), (0.3, 8.0)], ids=["matt", "narrow", "broad"])
-@pytest.mark.parametrize("model", ["phong", "blinn-phong"])
-def test_ambient_light_and_highlights_do_not_pull_the_light(ambient, highlight, model):
+@pytest.mark.parametrize(
+    ("model", "k_s", "n"),
+    [
+        pytest.param("phong", 0.0, 1.0, id="matt"),
+        *[(model, 0.3, n) for model in ("phong", "blinn-phong") for n in (8.0, 100.0)],
+    ],
+)
+def test_ambient_light_and_highlights_do_not_pull_the_light(ambient, model, k_s, n):
     points = ball_points((128, 128), Circle(63.3, 64.1, 55.0))
-    material = brdf.MODELS[model](k_a=[ambient], k_d=[0.5], k_s=[highlight[0]], n=highlight[1])  # pyright: ignore
+    material = brdf.MODELS[model](k_a=[ambient], k_d=[0.5], k_s=[k_s], n=n)  # pyright: ignore
     shares = []
     for seed, direction in enumerate([(0.3, 0.4, 0.9), (0.5, 0.4, 0.7), (-0.8, 0.2, 0.4), (0.6, -0.6, 0.25)]):
         clean = np.asarray(brdf.render(material, photograph_scene(points, direction, ambient=[1.0])))
@@ -230,7 +235,7 @@ def test_the_gray_sphere_is_matt_and_equally_bright_under_twelve_lights():
 @real_data
 def test_the_gray_sphere_tells_its_own_lights_and_how_bright_they_are():
     strengths, brightest = [], []
-    for picture in photographs("gray"):
+    for picture in photographs("gray")[::2]:
         points = ball_points(picture.pixels.shape[:2], GRAY)
         strengths.append(light_from_shading(picture, points).strength)
         # Whatever its direction, a light shows its strength where the ball faces it; no model is needed to see that.
@@ -246,8 +251,8 @@ def test_the_gray_sphere_tells_its_own_lights_and_how_bright_they_are():
 
 @real_data
 def test_lambert_is_chosen_for_the_gray_sphere():
-    directions = read_directions(REAL / "uw-spheres" / "lights.txt", 12)
-    pictures = photographs("gray")
+    directions = read_directions(REAL / "uw-spheres" / "lights.txt", 12)[::3]
+    pictures = photographs("gray")[::3]
     points = ball_points(pictures[0].pixels.shape[:2], GRAY)
     result = fitting.fit(pictures, [photograph_scene(points, direction) for direction in directions])
     assert result.material.name == "lambert"
