@@ -89,9 +89,13 @@ def _check_png(path: Path, content: mmap.mmap) -> None:
     at = 8
     while at + 8 <= len(content):
         length, kind = struct.unpack_from(">I4s", content, at)
+        if not kind.isalpha():
+            raise InputError(path, "is damaged: it holds a chunk of no type", _AGAIN)
         body, at = slice(at + 4, at + 8 + length), at + 12 + length
         if kind[:1].isupper() and content[body.stop : at] != struct.pack(">I", zlib.crc32(content[body])):
             raise InputError(path, f"is damaged: the checksum of its {kind.decode('latin-1')} is wrong", _AGAIN)
+        if kind == b"IEND":
+            return
 
 
 def _check_count(path: Path, what: str, count: int, most: int) -> None:
