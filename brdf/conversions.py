@@ -3,6 +3,8 @@
 Plain numbers are converted in float64, whatever JAX is set to; what JAX is tracing keeps its type.
 """
 
+import functools
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -21,6 +23,27 @@ from brdf.vectors import Numbers, Scalars
 _NODES = 400  # over the light's angle: the integrands have at worst a layer 1 / sqrt(n) wide at 90 degrees
 
 
+def _converter(formula: Callable[..., Any]) -> Callable[[Numbers], Scalars]:
+    """The formula of one number, which is checked by its name: exponents are at least 0, the others in (0, 1]."""
+    (name,) = inspect.signature(formula).parameters
+    wanted = "at least 0" if name == "n" else "above 0 and at most 1"
+
+    @functools.wraps(formula)
+    def convert(value: Any) -> Any:
+        if isinstance(value, Tracer):
+            return formula(value)
+        numbers = np.asarray(value, np.float64)
+        right = (numbers >= 0) if name == "n" else (numbers > 0) & (numbers <= 1)
+        wrong = ~(right & np.isfinite(numbers))
+        if np.any(wrong):
+            raise InputError(name, f"must be {wanted}, got {numbers[wrong].flat[0]:g}")
+        with working_precision("float64"):
+            return np.asarray(formula(jnp.asarray(numbers)))
+
+    return convert
+
+
+@_converter
 def slope_from_exponent(n: Numbers) -> Scalars:
     """Microfacet slope alpha = sqrt(2 / (n+2)) of a half-vector exponent.
 
@@ -34,9 +57,10 @@ def slope_from_exponent(n: Numbers) -> Scalars:
         >>> float(brdf.slope_from_exponent(6.0))
         0.5
     """
-    return _converted(_slope, n=n)
+    return vectors.square_root(2.0 / (n + 2.0))
 
 
+@_converter
 def exponent_from_slope(alpha: Numbers) -> Scalars:
     """Half-vector exponent n = 2 / alpha^2 - 2 of a microfacet slope.
 
@@ -50,9 +74,10 @@ def exponent_from_slope(alpha: Numbers) -> Scalars:
         >>> float(brdf.exponent_from_slope(0.5))
         6.0
     """
-    return _converted(_exponent, alpha=alpha)
+    return 2.0 * (1.0 - alpha) * (1.0 + alpha) / (alpha * alpha)
 
 
+@_converter
 def roughness_from_exponent(n: Numbers) -> Scalars:
     """Perceptual roughness of glTF, sqrt(alpha) = (2 / (n+2))^(1/4), of a half-vector exponent.
 
@@ -66,9 +91,10 @@ def roughness_from_exponent(n: Numbers) -> Scalars:
         >>> float(brdf.roughness_from_exponent(30.0))
         0.5
     """
-    return _converted(lambda n: vectors.square_root(_slope(n)), n=n)
+    return vectors.square_root(slope_from_exponent(n))
 
 
+@_converter
 def exponent_from_roughness(roughness: Numbers) -> Scalars:
     """Half-vector exponent n = 2 / roughness^4 - 2 of the perceptual roughness of glTF.
 
@@ -82,9 +108,10 @@ def exponent_from_roughness(roughness: Numbers) -> Scalars:
         >>> float(brdf.exponent_from_roughness(0.5))
         30.0
     """
-    return _converted(lambda roughness: _exponent(roughness * roughness), roughness=roughness)
+    return exponent_from_slope(roughness * roughness)
 
 
+@_converter
 def half_from_mirror(n: Numbers) -> Scalars:
     """Half-vector exponent of nearly the same highlight as a mirror exponent: 4 n.
 
@@ -101,9 +128,10 @@ def half_from_mirror(n: Numbers) -> Scalars:
         >>> float(brdf.half_from_mirror(10.0))
         40.0
     """
-    return _converted(lambda n: 4.0 * n, n=n)
+    return 4.0 * n
 
 
+@_converter
 def mirror_from_half(n: Numbers) -> Scalars:
     """Mirror exponent of nearly the same highlight as a half-vector exponent: n / 4; see ``half_from_mirror``.
 
@@ -117,7 +145,7 @@ def mirror_from_half(n: Numbers) -> Scalars:
         >>> float(brdf.mirror_from_half(40.0))
         10.0
     """
-    return _converted(lambda n: 0.25 * n, n=n)
+    return 0.25 * n
 
 
 def nearest_normalized(material: Material) -> Material:
@@ -189,26 +217,3 @@ def _constrained(gram: Float[np.ndarray, "2 2"], right: Float[np.ndarray, " 2"],
         step = along @ (right - gram @ start) / max(along @ gram @ along, 1e-300)
         candidates.append(start + np.clip(step, 0.0, 1.0 if bounded else np.inf) * along)
     return min(candidates, key=lambda x: 0.5 * x @ gram @ x - right @ x)
-
-
-def _slope(n: Any) -> Any:
-    return vectors.square_root(2.0 / (n + 2.0))
-
-
-def _exponent(alpha: Any) -> Any:
-    return 2.0 * (1.0 - alpha) * (1.0 + alpha) / (alpha * alpha)
-
-
-def _converted(formula: Callable[[Any], Any], **named: Any) -> Any:
-    """The formula of one number, which is checked by its name: exponents are at least 0, the others in (0, 1]."""
-    ((name, value),) = named.items()
-    if isinstance(value, Tracer):
-        return formula(value)
-    numbers = np.asarray(value, np.float64)
-    right = (numbers >= 0) if name == "n" else (numbers > 0) & (numbers <= 1)
-    wrong = ~(right & np.isfinite(numbers))
-    if np.any(wrong):
-        wanted = "at least 0" if name == "n" else "above 0 and at most 1"
-        raise InputError(name, f"must be {wanted}, got {numbers[wrong].flat[0]:g}")
-    with working_precision("float64"):
-        return np.asarray(formula(jnp.asarray(numbers)))

@@ -121,8 +121,8 @@ def _rgb(values: Any) -> Colour:
     return np.broadcast_to(np.asarray(values, np.float64), 3)
 
 
-def _height(material: SpecularMaterial) -> float:
-    return height(type(material), float(material.n))
+def _json_text(values: Any) -> str:
+    return json.dumps(values, indent=2) + "\n"
 
 
 def _brightness(material: Material, drawn: Callable[[float], Colour]) -> list[str]:
@@ -136,10 +136,9 @@ def _brightness(material: Material, drawn: Callable[[float], Colour]) -> list[st
     if not isinstance(material, SpecularMaterial) or not np.any(material.k_s):
         return []
     ratios = []
-    for cosine in (1.0, float(np.cos(np.radians(_GRAZING)))):
-        weight = _height(material) * (cosine if material.cosine_weighted else 1.0)
-        ours = _rgb(material.k_d) * cosine + _rgb(material.k_s) * weight
-        ratios.append(float(np.sum(drawn(cosine)) / np.sum(ours)))
+    for cosine in np.cos(np.radians([0.0, _GRAZING])):
+        weight = height(material) * (cosine if material.cosine_weighted else 1.0)
+        ratios.append(np.sum(drawn(cosine)) / np.sum(_rgb(material.k_d) * cosine + _rgb(material.k_s) * weight))
     if np.allclose(ratios, 1.0, rtol=0, atol=1e-3):
         return []
     facing, grazing = (f"{ratio:.2f}" if ratio < 10 else f"{ratio:.0f}" for ratio in ratios)
@@ -185,7 +184,7 @@ def _mtl(material: Material, name: str) -> Written:
         losses.append("MTL's highlight is (N·H)^Ns: Ns is 4 n, of nearly the same highlight as (R·V)^n")
     if isinstance(material, SpecularMaterial) and material.cosine_weighted:
         losses.append("the factor N·L of the highlight is left out: it is brighter towards grazing light")
-        bare = _rgb(material.k_s) * _height(material)
+        bare = _rgb(material.k_s) * height(material)
         losses += _brightness(material, lambda cosine: _rgb(material.k_d) * cosine + bare)
     return to_mtl(material, name=name), losses
 
@@ -255,7 +254,7 @@ def _glsl(material: Material, name: str) -> Written:
 
     numbers, lobe, reflected = {}, "", "    return intensity * BRDF_K_D * cosine;"
     if isinstance(material, SpecularMaterial):
-        numbers = {"N": float(material.n), "SCALE": _height(material)}
+        numbers = {"N": float(material.n), "SCALE": height(material)}
         first, second = "normal", "to_light + to_view"
         if isinstance(material, Phong | NormalizedPhong):
             first, second = "2.0 * dot(normal, to_light) * normal - to_light", "to_view"
@@ -282,7 +281,7 @@ def _three(material: Material, name: str) -> Written:
     if isinstance(plausible, SpecularMaterial):
         n = half_exponent(plausible)
         # three.js draws specular (n+2)/8 (N·H)^n N·L times Schlick's Fresnel term, which is 1 at normal incidence.
-        k_s = _rgb(plausible.k_s) * _height(plausible) * 8.0 / (n + 2.0)
+        k_s = _rgb(plausible.k_s) * height(plausible) * 8.0 / (n + 2.0)
         losses.append("three.js adds a Fresnel term: the highlight turns white where light and view are far apart")
     losses.append("colours are 8-bit sRGB, as MaterialLoader reads them; userData.linear holds them in full")
     linear = {"color": _rgb(plausible.k_d), "specular": k_s}
@@ -304,7 +303,7 @@ def _three(material: Material, name: str) -> Written:
         "shininess": n,
         "userData": {"linear": {key: colour.tolist() for key, colour in linear.items()}, "losses": losses},
     }
-    return json.dumps(values, indent=2) + "\n", losses
+    return _json_text(values), losses
 
 
 # -- glTF --------------------------------------------------------------------------------------------------------------
@@ -347,7 +346,7 @@ def _gltf(material: Material, name: str) -> Written:
             }
         ],
     }
-    return json.dumps(values, indent=2) + "\n", losses
+    return _json_text(values), losses
 
 
 # -- Mitsuba -----------------------------------------------------------------------------------------------------------
@@ -355,7 +354,7 @@ def _gltf(material: Material, name: str) -> Written:
 
 def _mitsuba_json(material: Material, name: str) -> Written:
     plugin, losses = _mitsuba(material)
-    return json.dumps(plugin, indent=2) + "\n", losses
+    return _json_text(plugin), losses
 
 
 def _mitsuba_xml(material: Material, name: str) -> Written:

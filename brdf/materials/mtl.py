@@ -27,9 +27,9 @@ def half_exponent(material: SpecularMaterial) -> float:
     return float(half_from_mirror(n)) if isinstance(material, Phong | NormalizedPhong) else n
 
 
-def height(model: type[SpecularMaterial], n: Any) -> float:
+def height(material: SpecularMaterial) -> float:
     """The constant before the lobe, 1 in the classic forms."""
-    return float(model.scale(np.float64(n)))
+    return float(material.scale(np.float64(material.n)))
 
 
 def to_mtl(material: Material, *, name: str = "fitted", undetermined: Collection[str] = ()) -> str:
@@ -49,7 +49,7 @@ def to_mtl(material: Material, *, name: str = "fitted", undetermined: Collection
     colours, illum = [material.k_a, material.k_d, 0.0], 1
     if isinstance(material, SpecularMaterial):
         lines.append(f"Ns {half_exponent(material)!r}")
-        colours[2], illum = np.asarray(material.k_s, np.float64) * height(type(material), material.n), 2
+        colours[2], illum = np.asarray(material.k_s, np.float64) * height(material), 2
     for key, colour in zip("ads", colours, strict=True):
         numbers = np.broadcast_to(np.asarray(colour, np.float64), 3).tolist()
         lines.append(f"K{key} {' '.join(map(repr, numbers))}")

@@ -10,18 +10,17 @@
 import math
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from brdf.albedo import ACCURACY, directional_albedo, lobe_albedo, normalized_form
 from brdf.channels import in_channel
 from brdf.conversions import nearest_normalized
 from brdf.models import Material, SpecularMaterial
-from brdf.plausibility.report import ENERGY_LIMIT, GRAZING, RECIPROCITY_LIMIT, Angles, Finding, Report, times, verdict
+from brdf.plausibility.report import ENERGY_LIMIT, GRAZING, RECIPROCITY_LIMIT, Angles, Finding, Report, judged, times
 from brdf.precision import cast, working_precision
 
-_ANGLES = np.array([*np.arange(90.0), 89.5, 89.9, GRAZING])
+_LIGHTS = np.array([*np.arange(90.0), 89.5, 89.9, GRAZING])
+_VIEWS = np.concatenate([_LIGHTS, -_LIGHTS])  # below 0 on the other side of the normal
 _ROUNDING = 1e-13  # relative; float64 at n = 1e6 reaches 1e-14
 
 
@@ -34,102 +33,76 @@ def check_material(material: Material, subject: str) -> Report:
     """
     with working_precision("float64"):
         double = cast(material, "float64")
-        findings = _positivity(double), _reciprocity(double), _energy(double)
+        classic = isinstance(double, SpecularMaterial) and not double.cosine_weighted and bool(np.any(double.k_s != 0))
+        if classic:
+            findings = _positivity(double), _classic_reciprocity(double), _classic_energy(double)
+        else:
+            findings = _positivity(double), _reciprocity(), _energy(double)
     fails = any(finding.verdict == "fail" for finding in findings)
     return Report(subject, *findings, nearest=nearest_normalized(material) if fails else None)
 
 
 def _positivity(material: Material) -> Finding:
-    values = _in_plane(material, _ANGLES, _ANGLES)
-    side, row, column, channel = map(int, np.unravel_index(np.argmin(values), values.shape))
-    value = float(values[side, row, column, channel])
-    light, view = Angles(_ANGLES[row]), Angles(_ANGLES[column], 180.0 * side)
-    bound = _ROUNDING * abs(value)
-    word = verdict(value, bound)
-    sentence = f"the least f_r is {value:.4g}/sr, because no coefficient is negative"
-    if word != "pass":
-        sentence = f"negative: f_r is {value:.4g}/sr for light {light}, view {view}"
-    return Finding(word, value, 0.0, value, bound, light, view, channel, sentence + _named(material, channel))
+    values = _in_plane(material, _LIGHTS, _VIEWS)
+    row, column, channel = map(int, np.unravel_index(np.argmin(values), values.shape))
+    value = float(values[row, column, channel])
+    light, view = Angles(_LIGHTS[row]), Angles(abs(_VIEWS[column]), 180.0 * (_VIEWS[column] < 0))
+    named = in_channel(channel, values.shape[2])
+    passed = f"the least f_r is {value:.4g}/sr, because no coefficient is negative{named}"
+    failed = f"negative: f_r is {value:.4g}/sr for light {light}, view {view}{named}"
+    return judged(value, 0.0, _ROUNDING * abs(value), (light, view, channel), passed, failed, least=True)
 
 
-def _reciprocity(material: Material) -> Finding:
-    if not _diverges(material):
-        normal, limit = Angles(0.0), RECIPROCITY_LIMIT
-        sentence = "f_r is the same when light and view change places"
-        return Finding("pass", 0.0, limit, limit, 0.0, normal, normal, 0, sentence)
-    # For given angles the lobe, and with it the difference, is largest with light and view on opposite sides.
-    lights = views = _ANGLES
-    light = view = larger = smaller = 0.0
-    channel = 0
-    for _ in range(4):
-        there = _in_plane(material, lights, views)[1]
-        back = np.swapaxes(_in_plane(material, views, lights)[1], 0, 1)
-        difference = (there - back) / np.maximum(np.maximum(there, back), 1e-300)
-        row, column, channel = map(int, np.unravel_index(np.argmax(difference), difference.shape))
-        light, view = lights[row], views[column]
-        larger, smaller = float(there[row, column, channel]), float(back[row, column, channel])
-        lights, views = _closer(lights, row), _closer(views, column)
-    value, to_light = 1.0 - smaller / larger, Angles(light)
-    a, b = f"{light:.4g}°", f"{view:.4g}°"
-    compared = f"f_r({a}→{b}) is {times(larger / max(smaller, 1e-300))} f_r({b}→{a})"
+def _reciprocity() -> Finding:
+    normal = Angles(0.0)
+    return judged(0.0, RECIPROCITY_LIMIT, 0.0, (normal, normal, 0), "f_r is the same when light and view change places")
+
+
+def _classic_reciprocity(material: SpecularMaterial) -> Finding:
+    # For a given angle between light and view the difference is largest where they stand on opposite sides of the
+    # normal, and the light as low as can be.
+    lights, views = np.array([GRAZING]), np.geomspace(GRAZING - 90.0, -90.0, 100_001) + 90.0
+    there, back = _in_plane(material, lights, -views)[0], _in_plane(material, views, -lights)[:, 0]
+    difference = 1.0 - back / there
+    row, channel = map(int, np.unravel_index(np.argmax(difference), difference.shape))
+    value, light, view = float(difference[row, channel]), Angles(GRAZING), Angles(views[row], 180.0)
+    a, b = f"{light.polar:.4g}°", f"{view.polar:.4g}°"
+    ratio = float(there[row, channel] / max(back[row, channel], 1e-300))
+    compared = f"f_r({a}→{b}) is {times(ratio)} f_r({b}→{a})"
     if value < 2 * RECIPROCITY_LIMIT:  # a trace of k_s shows only closer to 90 degrees than the angles go
-        value, to_light, compared = 1.0, Angles(90.0), "towards grazing light the ratio grows without bound"
-    sentence = f"not reciprocal: the specular term is not multiplied by N·L; {compared}{_named(material, channel)}"
-    limit = RECIPROCITY_LIMIT
-    return Finding("fail", value, limit, limit - value, _ROUNDING, to_light, Angles(view, 180.0), channel, sentence)
+        value, light, compared = 1.0, Angles(90.0), "towards grazing light the ratio grows without bound"
+    sentence = f"not reciprocal: the specular term is not multiplied by N·L; {compared}"
+    sentence += in_channel(channel, there.shape[1])
+    return judged(value, RECIPROCITY_LIMIT, _ROUNDING, (light, view, channel), sentence)
 
 
-def _in_plane(
-    material: Material, light: Float[np.ndarray, " a"], view: Float[np.ndarray, " b"]
-) -> Float[np.ndarray, "2 a b C"]:
-    """f_r for view and light in one plane through the normal: on the same side of it, and on opposite sides.
-
-    The five models have their extremes there.
-    """
-    return np.asarray(_in_plane_of(material, jnp.asarray(np.radians(light)), jnp.asarray(np.radians(view))))
+def _in_plane(material: Material, light: np.ndarray, view: np.ndarray) -> np.ndarray:
+    """f_r, (a, b, C), for angles of light and view in degrees, in one plane: there the five models have extremes."""
+    to_light, to_view = (np.stack([np.sin(x), 0 * x, np.cos(x)], axis=-1) for x in map(np.radians, (light, view)))
+    return np.asarray(_reflectance(material, to_light[:, None], to_view))
 
 
-@jax.jit
-def _in_plane_of(material: Material, light: Array, view: Array) -> Array:
-    to_light, to_view = (jnp.stack([jnp.sin(x), jnp.zeros_like(x), jnp.cos(x)], -1) for x in (light, view))
-    sides = [to_view * jnp.array([side, 1.0, 1.0]) for side in (1.0, -1.0)]
-    return jnp.stack([material.reflectance(to_light[:, None], side) for side in sides])
-
-
-def _closer(angles: Float[np.ndarray, " a"], index: int) -> Float[np.ndarray, " a"]:
-    """As many angles, between the neighbours of one of them, and that one."""
-    fine = np.linspace(angles[max(index - 1, 0)], angles[min(index + 1, len(angles) - 1)], len(angles))
-    fine[np.argmin(np.abs(fine - angles[index]))] = angles[index]
-    return fine
-
-
-def _diverges(material: Material) -> bool:
-    """Whether it is of classic form, and has a highlight."""
-    return isinstance(material, SpecularMaterial) and not material.cosine_weighted and bool(np.any(material.k_s != 0))
+_reflectance = jax.jit(lambda material, to_light, to_view: material.reflectance(to_light, to_view))
 
 
 def _energy(material: Material) -> Finding:
-    if isinstance(material, SpecularMaterial) and _diverges(material):
-        return _classic_energy(material)
-    albedo = np.asarray(directional_albedo(material, np.radians(_ANGLES)))
-    row, channel = map(int, np.unravel_index(np.argmax(albedo), albedo.shape))
-    value, light = float(albedo[row, channel]), Angles(_ANGLES[row])
+    albedo = np.asarray(directional_albedo(material, 0.0))
+    channel = int(np.argmax(albedo))
+    value, light = float(albedo[channel]), Angles(0.0)
     lobe = float(np.abs(material.k_s[channel])) if isinstance(material, SpecularMaterial) else 0.0
     bound = ACCURACY["float64"] * lobe + _ROUNDING * abs(value)
-    margin = ENERGY_LIMIT - value
-    word = verdict(margin, bound)
-    sentence, crossing = f"the largest albedo is {value:.7g}, for light at {light}{_named(material, channel)}", None
-    if word == "fail":
-        sentence, crossing = f"does not conserve energy: {sentence}", 0.0
-    return Finding(word, value, ENERGY_LIMIT, margin, bound, light, None, channel, sentence, crossing)
+    words = f"the largest albedo is {value:.7g}, for light at {light}{in_channel(channel, albedo.size)}"
+    crossing = 0.0 if value > ENERGY_LIMIT + bound else None
+    failed = f"does not conserve energy: {words}"
+    return judged(value, ENERGY_LIMIT, bound, (light, None, channel), words, failed, crossing=crossing)
 
 
 def _classic_energy(material: SpecularMaterial) -> Finding:
     k_d, k_s = np.asarray(material.k_d), np.asarray(material.k_s)
 
-    def albedo(cosine: float) -> Float[np.ndarray, " C"]:
+    def albedo(cosine: float) -> np.ndarray:
         # by the cosine of the light's angle, which resolves grazing light where the angle does not
-        lobe = lobe_albedo(type(material), jnp.asarray(material.n), jnp.asarray(0.5 * np.pi - np.arcsin(cosine)))
+        lobe = lobe_albedo(type(material), material.n, 0.5 * np.pi - np.arcsin(cosine))
         return k_d + k_s * (float(lobe) / cosine)
 
     within, beyond = 1e-14, 1.0  # the albedo falls as the cosine grows: up to which does it exceed 1?
@@ -147,11 +120,6 @@ def _classic_energy(material: SpecularMaterial) -> Finding:
     bound = ACCURACY["float64"] * float(k_s[channel] / (scale * worst)) + _ROUNDING * value
     sentence = (
         f"does not conserve energy: the albedo exceeds 1 for light beyond {crossing:.4g}° and grows without bound, "
-        f"to {value:.3g} at {light}{_named(material, channel)}"
+        f"to {value:.3g} at {light}{in_channel(channel, k_d.size)}"
     )
-    limit = ENERGY_LIMIT
-    return Finding("fail", value, limit, limit - value, bound, light, None, channel, sentence, crossing)
-
-
-def _named(material: Material, channel: int) -> str:
-    return in_channel(channel, material.k_d.shape[-1])
+    return judged(value, ENERGY_LIMIT, bound, (light, None, channel), sentence, crossing=crossing)

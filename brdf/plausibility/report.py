@@ -133,6 +133,35 @@ class Report:
         return _plain({"subject": self.subject, "plausible": self.plausible, **findings, "nearest": nearest})
 
 
+def judged(
+    value: float,
+    limit: float,
+    bound: float,
+    where: tuple[Angles, Angles | None, int],
+    passed: str,
+    failed: str | None = None,
+    *,
+    least: bool = False,
+    crossing: float | None = None,
+) -> Finding:
+    """A finding, its verdict read off its numbers.
+
+    Args:
+        value: the worst value found.
+        limit: the largest that passes, or the least.
+        bound: on the error of the value.
+        where: light, view and channel.
+        passed: the finding in words.
+        failed: that of one that fails, where it is another.
+        least: whether the limit is one from below.
+        crossing: see `Finding`.
+    """
+    margin = value - limit if least else limit - value
+    word = verdict(margin, bound)
+    sentence = failed if failed and word == "fail" else passed
+    return Finding(word, value, limit, margin, bound, *where, sentence, crossing)
+
+
 def verdict(margin: float, error_bound: float) -> Verdict:
     """What a margin known to within an error bound allows to say."""
     if math.isnan(margin) or math.isnan(error_bound):
