@@ -268,7 +268,7 @@ def _energy(scan: _Scan) -> Finding:
     lights = np.concatenate([lights, *(light[:1] for light, _ in scan.bright)])
     found = _albedos(scan, lights)
     top = lights[np.argmax(found[0].max(axis=1))]
-    better = scan.improved(lambda tried: _albedos(scan, tried)[0].max(axis=1), top[None, None], rounds=6, tries=8)[0]
+    better = scan.improved(lambda tried: _albedos(scan, tried)[0].max(axis=1), top[None, None], rounds=10, tries=6)[0]
     lights = np.append(lights, better, axis=0)
     albedo, bound = found = np.append(found, _albedos(scan, better), axis=1)
     tolerance = np.full(len(lights), _COARSE)
