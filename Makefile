@@ -10,7 +10,7 @@ fit: $(VENV)/installed
 	$(BIN)/brdf fit $(EXAMPLE) --out out/gold-ball --plot
 
 test: $(VENV)/installed-tests
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 check: $(VENV)/installed-tests
 	$(BIN)/ruff check .
@@ -18,7 +18,7 @@ check: $(VENV)/installed-tests
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
 notebooks: $(VENV)/installed-notebooks
-	$(BIN)/python notebooks/run.py
+	printf '%s\n' 5 1 2 3 4 6 7 | xargs -P 2 -n 1 $(BIN)/python notebooks/run.py
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)

@@ -1,8 +1,6 @@
-"""The notebooks: stored without outputs, through the front door only, and run to a picture without a warning."""
+"""The notebooks: stored without outputs, through the front door only; `make notebooks` runs them to their pictures."""
 
 import ast
-import importlib.util
-import sys
 from pathlib import Path
 
 import pytest
@@ -37,20 +35,3 @@ def test_notebook_is_plain_text_with_prose(path: Path):
     assert "format_name: percent" in text
     assert text.count("# %% [markdown]") >= 4
     assert not list(HERE.glob("*.ipynb")), "notebooks are stored as text, without outputs"
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")  # Jupyter's own machinery; the notebooks' warnings are looked for in their output
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_notebook_runs_to_a_picture(path: Path, tmp_path: Path):
-    for name in ("jupytext", "nbconvert", "ipykernel"):
-        pytest.importorskip(name, reason="needs the extra `notebooks`")
-    spec = importlib.util.spec_from_file_location("run_notebooks", HERE / "run.py")
-    assert spec is not None
-    assert spec.loader is not None
-    run = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = run
-    spec.loader.exec_module(run)
-    notebook = run.execute(path, tmp_path)
-    assert run.faults(notebook) == []
-    assert len(list(tmp_path.glob("*.png"))) == len(run.pictures(notebook)) > 0
