@@ -28,7 +28,7 @@ _REACH = 9.0  # cos^n x < exp(-n x^2 / 2): beyond 9 / sqrt(n) it is below 3e-18
 
 def directional_albedo(
     material: Material, theta: Numbers, *, precision: Precision | None = None
-) -> Float[Array, "*batch C"]:
+) -> Float[Array | np.ndarray, "*batch C"]:
     """The fraction of the light arriving at angle theta that the surface reflects; one minus this is absorbed.
 
     Ambient light is no part of it. The classic forms with k_s > 0 diverge at grazing light: infinite at pi/2.

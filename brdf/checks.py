@@ -17,10 +17,11 @@ from jaxtyping import Array, Float
 
 from brdf.errors import InputError
 
-Parameter = jax.Array | np.ndarray
-Scalar = Float[Array, ""]
-Vector = Float[Array, "3"]
-Spectrum = Float[Array, " C"]
+# Any: a constructor takes numbers, lists and arrays, of which the checks make arrays.
+Parameter = Any
+Scalar = Float[Any, ""]
+Vector = Float[Any, "3"]
+Spectrum = Float[Any, " C"]
 
 LARGEST = 1e15
 """Of any number of a scene: squares and products of a few of them stay within float32's 3e38."""
@@ -142,7 +143,7 @@ def spans_area(edge_u: Any, edge_v: Any) -> None:
         raise InputError("edge_v", f"must not be parallel to edge_u, {came}", "Give two edges that span an area")
 
 
-def coefficients(**given: Any) -> list[Parameter]:
+def coefficients(**given: Any) -> list[Array | np.ndarray]:
     """The coefficients of a material at one common number of channels, (C,) each.
 
     Args:
@@ -165,7 +166,7 @@ def coefficients(**given: Any) -> list[Parameter]:
     return [(np if isinstance(one, np.ndarray) else jnp).broadcast_to(one, (channels,)).copy() for one in each]
 
 
-def exponent(given: Any) -> Parameter:
+def exponent(given: Any) -> Array | np.ndarray:
     """The exponent of a material.
 
     Args:

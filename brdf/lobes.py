@@ -119,8 +119,8 @@ def sum_over_samples(
 
         total = None
         if few:
-            for kind, *sample in lighting.each():
-                total, _ = add(kind, total, sample)
+            for kind, row, light in lighting.each():
+                total, _ = add(kind, total, (row, light))
             return total
         # a sum is as wide as the widest of its parts
         firsts = [(stack.kind, jax.tree.map(lambda values: values[0], stack.rows())) for stack in lighting.stacks]
@@ -187,7 +187,8 @@ class Lobe(eqx.Module):
     def __call__(self, n: Scalar) -> tuple[Float[Array, "P C"], Float[Array, "P C"]]:
         """The basis image without the model's scale, and its derivative in n."""
         if self.source is None:
-            value = slope = 0.0
+            value: Any = 0.0
+            slope: Any = 0.0
             for weight, log_cosine in self.kept:
                 values, slopes = _power(n, weight, log_cosine)
                 value, slope = value + jnp.sum(values, axis=1), slope + jnp.sum(slopes, axis=1)
@@ -249,7 +250,8 @@ def diffuse_and_lobe(
     """The diffuse basis of (P,) points, and the specular one where the model has one."""
     specular = issubclass(model, SpecularMaterial)
     if lighting.samples <= STORED_SAMPLES:
-        diffuse, kept = 0.0, ()
+        diffuse: Any = 0.0
+        kept: tuple[Any, ...] = ()
         for kind, row, light in lighting.each():
             terms = jax.vmap(partial(light_terms, model, lighting.occluders, kind, row, light))(points)
             diffuse, kept = diffuse + terms.diffuse, (*kept, (terms.weight[:, None], terms.log_cosine[:, None]))
@@ -265,7 +267,8 @@ def _stacked_terms(model: type[Material], lighting: Lighting, points: SurfacePoi
     """Sum of the diffuse terms, and weights and cosines of the lobe, of all samples at once."""
 
     def at_point(point: SurfacePoints) -> tuple[Any, Any]:
-        diffuse, kept = 0.0, ()
+        diffuse: Any = 0.0
+        kept: tuple[Any, ...] = ()
         for stack in lighting.stacks:
 
             def of_light(one: Any, kind: type[Light] = stack.kind) -> LightTerms:

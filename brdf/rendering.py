@@ -131,7 +131,7 @@ def _shade(material: Material, points: SurfacePoints, ambient: Any, lighting: Li
     for k, image in (
         (material.k_a, images.ambient),
         (material.k_d, images.diffuse),
-        (getattr(material, "k_s", None), images.specular),
+        (getattr(material, "k_s", 0.0), images.specular),
     ):
         if image is not None:
             picture = k * image if picture is None else picture + k * image

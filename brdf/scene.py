@@ -242,8 +242,8 @@ def _chosen(points: SurfacePoints, pixel: Any) -> SurfacePoints:
     averaged = np.flatnonzero(slot >= 0)
     # An entry that is not used lies beyond the last pixel.
     rows = slot.ravel()[averaged] if averaged.size else np.zeros(1, slot.dtype)
-    place = averaged if averaged.size else np.array([slot.size])
-    new = np.full(slot.size, -1, np.int32)
+    place: Any = averaged if averaged.size else np.array([slot.size])
+    new: Any = np.full(slot.size, -1, np.int32)
     new[averaged] = np.arange(averaged.size, dtype=np.int32)
     fine = dataclasses.replace(area.points, visibility=None)
     fine, weight = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], (fine, area.weight))

@@ -287,7 +287,8 @@ def write_parts(path: str | Path, parts: dict[str, Any]) -> None:
         values = {"type": kinds[type(shape)]} | _fields(shape)
         if isinstance(shape, Triangles):
             values["file"], file = beside(f"shape{index}.obj")
-            mesh = values.pop("mesh")
+            mesh = shape.mesh
+            del values["mesh"]
             vertices = [f"v {x!r} {y!r} {z!r}" for x, y, z in mesh.vertices.tolist()]
             faces = [f"f {a} {b} {c}" for a, b, c in (mesh.faces + 1).tolist()]
             write_text(file, "\n".join([*vertices, *faces]) + "\n")

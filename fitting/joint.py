@@ -219,7 +219,7 @@ def _solve(problem: _JointProblem, solver: str, tolerance: float, max_steps: int
     vector, freed = problem.start(), problem.freed()
     bounded = np.repeat([name in NOT_NEGATIVE for name in problem.names], [leaf.size for leaf in freed])
     held = np.zeros(vector.shape, bool)
-    steps, converged = 0, False
+    steps, converged, residual, columns = 0, False, np.zeros(0), np.zeros((0, 0))
     for _ in range(ROUNDS):
         solution = _run(problem, vector, jnp.asarray(held), solver, tolerance, max_steps)
         steps += int(solution.stats["num_steps"])

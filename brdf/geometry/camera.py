@@ -87,7 +87,7 @@ class Camera(eqx.Module):
             row: from 0 at its upper edge, in pixels.
         """
 
-    def off_axis(self, column: Array, row: Array, half_width: Array) -> tuple[Array, Array]:
+    def off_axis(self, column: Any, row: Any, half_width: Array) -> tuple[Array, Array]:
         """How far places lie from the middle of the picture, whose half width is in any unit; and the way forward."""
         width, height = self.resolution
         forward = normalize(self.target - self.position)

@@ -75,7 +75,7 @@ def stability_map(
                 peak = np.maximum(model.scale(arguments[0]), 1.0)
     shape = len(exponents), len(angles), -1
     error = np.nan_to_num(np.abs(terms[0] - terms[1]) / peak, nan=np.inf).reshape(shape).max(axis=2)
-    return StabilityMap(model.name, exponents, angles, error, finite.reshape(shape).all(axis=2))
+    return StabilityMap(model.name, exponents, angles, error, np.all(finite.reshape(shape), axis=2))
 
 
 def _vectors(theta: np.ndarray, tilt: np.ndarray, across: np.ndarray) -> Float[np.ndarray, "m 3 3"]:

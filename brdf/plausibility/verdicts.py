@@ -33,9 +33,9 @@ def check(brdf: Material | MeasuredBRDF | Callable[[Any, Any], Any], *, name: st
         >>> report.plausible, report.energy.verdict
         (False, 'fail')
     """
-    if type(brdf) in MODELS.values():
-        return check_material(brdf, name or repr(brdf))
     if isinstance(brdf, Material):
+        if type(brdf) in MODELS.values():
+            return check_material(brdf, name or repr(brdf))
         return check_black_box(brdf.reflectance, name or repr(brdf))
     if isinstance(brdf, MeasuredBRDF):
         return check_table(brdf, name)

@@ -127,8 +127,8 @@ def spread(
         Horvitz-Thompson variances of the cost at those exponents minus that at the best, and of the profile's slope by
         log n. They add up over pictures.
     """
-    picture, factor = sample.picture, sample.factor
-    assert picture.lobe is not None
+    picture, lobe, factor = sample.picture, sample.picture.lobe, sample.factor
+    assert lobe is not None
     assert factor is not None
     dtype = picture.target.dtype
     x = x.astype(dtype)
@@ -136,7 +136,7 @@ def spread(
     chance = jnp.where(factor > 0, 1 - 1 / jnp.maximum(factor, 1), 0.0)
 
     def residual_and_slope(index: Array) -> tuple[Array, Array]:
-        value, slope = relative_lobe(picture.lobe, log_n[index], peak, dtype)
+        value, slope = relative_lobe(lobe, log_n[index], peak, dtype)
         x_a, x_d, x_s = x[index].T
         model = x_a * jnp.asarray(picture.ambient, dtype) + x_d * picture.diffuse + x_s * value
         return picture.target - model, x_s * slope
