@@ -306,10 +306,12 @@ def tradeoff(
             left = seconds - (time.perf_counter() - begun)
             if trial.taken and (once or trial.taken[-1].seconds > min(LONG, left)):
                 continue
-            # What a fit may take is told by the one of the most work so far.
-            most = max(known, key=lambda trial: trial.work, default=None)
-            told = most is not None and not once and trial.axis != "render"
-            if left < (most.taken[-1].seconds * trial.work / most.work if told else 0.0):
+            expected = 0.0
+            if known and not once and trial.axis != "render":
+                # What a fit may take is told by the one of the most work so far.
+                most = max(known, key=lambda trial: trial.work)
+                expected = most.taken[-1].seconds * trial.work / most.work
+            if left < expected:
                 continue
             outcome, one = take(functools.partial(bench.run, trial))
             if not trial.taken:
