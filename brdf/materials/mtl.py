@@ -137,5 +137,5 @@ def material_from_mtl(entry: dict[str, Any]) -> Material:
     if exponent < 0:
         raise InputError("Ns", f"must be at least 0, got {exponent:g}", "Correct the value")
     n = float(mirror_from_half(exponent)) if issubclass(model, Phong | NormalizedPhong) else exponent
-    colours["k_s"] = colours["k_s"] / height(model, n)
+    colours["k_s"] = colours["k_s"] / float(model.scale(np.float64(n)))
     return model(**colours, n=n)
