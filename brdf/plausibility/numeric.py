@@ -264,7 +264,7 @@ def _reciprocity(scan: _Scan) -> Finding:
 
 def _energy(scan: _Scan) -> Finding:
     # the lowest along an axis of the quadrature's square, which is halved less often there
-    lights = from_angles(_POLAR, _TURN * np.arange(len(_POLAR)) * (_POLAR < _FIXED[-1]))
+    lights = from_angles(_POLAR, 0.75 * np.pi * np.arange(len(_POLAR)) * (_POLAR < _FIXED[-1]))
     lights = np.concatenate([lights, *(light[:1] for light, _ in scan.bright)])
     found = _albedos(scan, lights)
     top = lights[np.argmax(found[0].max(axis=1))]
