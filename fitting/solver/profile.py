@@ -22,6 +22,7 @@ the same search under it is as global.
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -218,7 +219,7 @@ def rough_model(pictures: Iterable[Picture]) -> np.ndarray:
     for picture in pictures:
         stride = max(1, picture.target.shape[0] // 256)
         # Through NumPy: a slice of an array on the device would be compiled.
-        few = picture.pixels(lambda a, stride=stride: np.asarray(a)[::stride])
+        few = replace(picture, lobe=None).pixels(lambda a, stride=stride: np.asarray(a)[::stride])
         target = np.where(few.weights > 0, few.target, 0).astype(float)
         columns = np.stack(np.broadcast_arrays(few.ambient, few.diffuse, target))
         gram = gram + np.einsum("ipc,jpc->cij", few.weights * columns, columns)
