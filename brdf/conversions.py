@@ -74,7 +74,7 @@ def exponent_from_slope(alpha: Numbers) -> Scalars:
         >>> float(brdf.exponent_from_slope(0.5))
         6.0
     """
-    return 2.0 * (1.0 - alpha) * (1.0 + alpha) / (alpha * alpha)
+    return jnp.asarray(2.0 * (1.0 - alpha) * (1.0 + alpha) / (alpha * alpha))
 
 
 @_converter
@@ -128,7 +128,7 @@ def half_from_mirror(n: Numbers) -> Scalars:
         >>> float(brdf.half_from_mirror(10.0))
         40.0
     """
-    return 4.0 * n
+    return jnp.multiply(4.0, n)
 
 
 @_converter
@@ -145,7 +145,7 @@ def mirror_from_half(n: Numbers) -> Scalars:
         >>> float(brdf.mirror_from_half(40.0))
         10.0
     """
-    return 0.25 * n
+    return jnp.multiply(0.25, n)
 
 
 def nearest_normalized(material: Material) -> Material:

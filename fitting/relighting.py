@@ -209,6 +209,7 @@ def _in_turn(terms: np.ndarray, pixels: np.ndarray, lights: int) -> tuple[float,
         columns = terms[..., c].reshape(-1, len(pixels))
         gram, product = (columns @ columns.T).reshape(*shape, *shape), (columns @ pixels[:, c]).reshape(shape)
         square, last, light = float(pixels[:, c] @ pixels[:, c]), np.inf, np.ones(shape[0])
+        now, k = square, np.zeros(shape[1])
         for _ in range(_ROUNDS):
             k = nonnegative_minimum(np.einsum("l,ltms,m->ts", light, gram, light), light @ product)
             by_light = np.einsum("t,ltms,s->lm", k, gram, k)

@@ -215,8 +215,8 @@ class ImageReader:
             return np.full((stop - start, spec.full_width, len(channels)), np.nan, np.float32)
         begin, end = max(left, 0), min(left + spec.width, spec.full_width)
         data = self._data(first - top, last - top, channels, encoding)[:, begin - left : end - left]
-        margins = ((first - start, stop - last), (begin, spec.full_width - end), (0, 0))
-        return np.pad(data, margins, constant_values=np.nan) if np.any(margins) else data
+        margins = np.array([(first - start, stop - last), (begin, spec.full_width - end), (0, 0)])
+        return np.pad(data, margins, constant_values=np.nan) if margins.any() else data
 
     def _data(self, first: int, last: int, channels: list[int], encoding: Encoding) -> np.ndarray:
         """Rows of the data window."""

@@ -216,7 +216,7 @@ def cut(pixels: Float[np.ndarray, "H W C"], samples: int) -> Patches:
     while moments.shape[0] * moments.shape[1] > LARGEST_MAP:
         for axis in (0, 1):
             moments = np.add.reduceat(moments, np.arange(0, moments.shape[axis], 2), axis=axis)
-    table = np.pad(moments, ((1, 0), (1, 0), (0, 0))).cumsum(axis=0).cumsum(axis=1)
+    table = np.pad(moments, np.array([(1, 0), (1, 0), (0, 0)])).cumsum(axis=0).cumsum(axis=1)
 
     def entry(box: Box) -> tuple[float, Box]:
         """Largest spread first: energy times variance of the directions, which is what is left of their length 1."""

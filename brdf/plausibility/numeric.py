@@ -141,7 +141,7 @@ class Sampler:
         """Values, (m, C); where they are not finite that is remembered, and 0 stands for them."""
         pairs = np.stack(np.broadcast_arrays(to_light, to_view))
         count = pairs.shape[1]
-        batches = np.pad(pairs, ((0, 0), (0, -count % _BATCH), (0, 0)), mode="edge").reshape(2, -1, _BATCH, 3)
+        batches = np.pad(pairs, np.array([(0, 0), (0, -count % _BATCH), (0, 0)]), mode="edge").reshape(2, -1, _BATCH, 3)
         with jax.enable_x64(True):
             parts = [np.asarray(self._batch(light, view), np.float64) for light, view in zip(*batches, strict=True)]
         values = np.concatenate(parts)[:count]

@@ -216,7 +216,7 @@ def pixels_for_noise(pictures: Sequence[Any], masks: Sequence[Any], model: str, 
         model: "auto" or the name of a model.
         accuracy: relative error, in 95 % of cases.
     """
-    noise, size = np.sqrt(np.mean(np.square(list(map(noise_and_size, pictures, masks))), axis=0))
+    noise, size = np.sqrt(np.mean(np.array(list(map(noise_and_size, pictures, masks))) ** 2, axis=0))
     crowded = model == "auto" or issubclass(brdf.MODELS[model], SpecularMaterial)
     return (SPREAD * noise / max(size, np.finfo(float).tiny) / accuracy) ** 2 / (CROWDED if crowded else 1.0)
 

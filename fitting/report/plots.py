@@ -65,7 +65,8 @@ def comparison(result: "FitResult", picture: int | None = None) -> Figure:
     figure = Figure(figsize=(7.2, 4.9), layout="constrained")
     figure.suptitle(title, fontsize=PRINT["axes.titlesize"])
     below = ["highlight", "scanline", "profile"] if specular else ["scanline"] * 3
-    panels: Any = figure.subplot_mosaic([["target", "fit", "residual"], below])
+    mosaic: Any = [["target", "fit", "residual"], below]
+    panels: Any = figure.subplot_mosaic(mosaic)
     for key, image, title in ("target", target, "target"), ("fit", fitted, f"fit, {result.surface}"):
         panels[key].imshow(brdf.displayed(image, white))
         panels[key].axhline(row, color="white", linewidth=0.6, linestyle=(0, (4, 4)))

@@ -41,7 +41,7 @@ def error_against_time(tradeoff: "Tradeoff") -> Figure:
     for axis in dict.fromkeys(row.axis for row in rows):
         colour, marker = MARKS[axis]
         chosen = [row for row in rows if row.axis == axis]
-        times, heights = np.transpose([points[row] for row in chosen])
+        times, heights = np.array([points[row] for row in chosen]).T
         # Of another model only the picture can be compared.
         hollow = all(np.isinf(row.error) for row in chosen)
         axes.errorbar(
@@ -58,7 +58,7 @@ def error_against_time(tradeoff: "Tradeoff") -> Figure:
     beside: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8, "color": "0.3", "zorder": 5}
     axes.axhline(accuracy, color="0.2", linewidth=0.9, linestyle=(0, (4, 3)), zorder=1, label=f"accuracy {accuracy:g}")
     if tradeoff.front:
-        front = np.transpose([points[row] for row in tradeoff.front])
+        front = np.array([points[row] for row in tradeoff.front]).T
         axes.step(*front, where="post", color="0.6", linewidth=1.2, zorder=1, label="Pareto front")
     words = {row: tradeoff.marks(row).removesuffix("front").rstrip(", ") for row in rows if np.isfinite(row.error)}
     ringed = [row for row in words if words[row]]

@@ -46,10 +46,10 @@ def nonnegative_minima(
     system, right, begin = gram, product, start
     if cap is not None:
         more = [(0, 0)] * (product.ndim - 1)
-        system = np.pad(gram, [*more, (0, 1), (0, 1)])
+        system = np.pad(gram, np.array([*more, (0, 1), (0, 1)]))
         system[..., -1, :-1] = system[..., :-1, -1] = cap
         right = np.concatenate([product, 1 - np.sum(cap * start, axis=-1, keepdims=True)], axis=-1)
-        begin = np.pad(start, [*more, (0, 1)])
+        begin = np.pad(start, np.array([*more, (0, 1)]))
     sets = np.array(list(itertools.product([False, True], repeat=right.shape[-1])))
     active = sets.reshape(-1, *(1,) * (product.ndim - 1), right.shape[-1])
     leave = np.where(active, 0.0, begin)

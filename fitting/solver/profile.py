@@ -23,7 +23,7 @@ the same search under it is as global.
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -215,16 +215,16 @@ def rough_model(pictures: Iterable[Picture]) -> np.ndarray:
     Products are taken of the residual against this model, so that float32 sums lose nothing to the bulk of the picture;
     any model near the target will do.
     """
-    gram = 0.0
+    gram: Any = 0.0
     for picture in pictures:
         stride = max(1, picture.target.shape[0] // 256)
         # Through NumPy: a slice of an array on the device would be compiled.
-        few = replace(picture, lobe=None).pixels(lambda a, stride=stride: np.asarray(a)[::stride])
+        few = replace(picture, lobe=None).pixels(lambda a, stride=stride: cast(Any, np.asarray(a)[::stride]))
         target = np.where(few.weights > 0, few.target, 0).astype(float)
         columns = np.stack(np.broadcast_arrays(few.ambient, few.diffuse, target))
         gram = gram + np.einsum("ipc,jpc->cij", few.weights * columns, columns)
     x = np.linalg.pinv(gram[:, :2, :2], hermitian=True) @ gram[:, :2, 2:]
-    return np.pad(x[..., 0], [(0, 0), (0, 1)])
+    return np.pad(x[..., 0], np.array([(0, 0), (0, 1)]))
 
 
 def profile_on_grid(

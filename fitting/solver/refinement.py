@@ -138,6 +138,7 @@ def solve_linear(parts: Sums, log_n: Float[np.ndarray, " N"], reference: np.ndar
 
     def caps(shift: float) -> np.ndarray:
         """What the coefficients, relative to the peak, count towards the cap."""
+        assert problem.cap is not None
         return np.stack([problem.cap(n).T * [1, 1, np.exp(-n * problem.peak)] for n in np.exp(log_n + shift)])
 
     gram, product = parts.gram[..., :3, :3], parts.product[..., :3]
@@ -185,7 +186,9 @@ def enclose(problem: Problem, lower: float, upper: float, x: np.ndarray) -> tupl
     """
     least, most = problem.bounds
     widest = _WIDEST_BRACKET if problem.cap is None else _WIDEST_CAPPED
-    for _ in range(_MOST_BRACKETS):
+    attempt = 0
+    while True:
+        attempt += 1
         point, share = _solve_bracket(problem, lower, upper, x)
         half, x = (upper - lower) / 2, point.x
         if (share <= 0 and lower > least) or (share >= 1 and upper < most):
@@ -195,8 +198,9 @@ def enclose(problem: Problem, lower: float, upper: float, x: np.ndarray) -> tupl
             half = widest / 8
         else:
             return point, True
+        if attempt == _MOST_BRACKETS:
+            return point, False
         lower, upper = max(least, point.log_n - half), min(most, point.log_n + half)
-    return point, False
 
 
 def _correct(parts: Sums, point: Point, problem: Problem) -> tuple[Point, float]:

@@ -70,7 +70,8 @@ def residual_correlation(
         weight = np.broadcast_to(weight.reshape(len(weight), -1).min(axis=1), picture.target.shape[0])
         first, second = _neighbours((weight > 0).reshape(shape), most)
         count += first.size
-        pairs = np.pad([first, second], [(0, 0), (0, most - first.size)]).astype(np.int32)
+        pairs = np.zeros((2, most), np.int32)
+        pairs[:, : first.size] = first, second
         residual, root, value = _residuals(picture, pairs, np.asarray(optimum.n), optimum.x)
         scaled = np.asarray(residual, np.float64) * np.sqrt(np.asarray(root, np.float64))
         one, other = scaled.reshape(2, most, -1)[:, : first.size]
