@@ -5,8 +5,8 @@ from typing import Any
 
 from brdf.errors import InputError
 from brdf.measured.table import MeasuredBRDF
-from brdf.models import MODELS, Material
-from brdf.plausibility.analytic import check_material
+from brdf.models import Material
+from brdf.plausibility.analytic import KNOWN, check_material
 from brdf.plausibility.numeric import check_black_box
 from brdf.plausibility.report import Report
 from brdf.plausibility.tables import check_table
@@ -34,7 +34,7 @@ def check(brdf: Material | MeasuredBRDF | Callable[[Any, Any], Any], *, name: st
         (False, 'fail')
     """
     if isinstance(brdf, Material):
-        if type(brdf) in MODELS.values():
+        if type(brdf) in KNOWN:
             return check_material(brdf, name or repr(brdf))
         return check_black_box(brdf.reflectance, name or repr(brdf))
     if isinstance(brdf, MeasuredBRDF):

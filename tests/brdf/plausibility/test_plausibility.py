@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from labelled_brdfs import FUNCTIONS, MATERIALS, constant, dented, direction
 
+import brdf
 from brdf.albedo import directional_albedo
 from brdf.errors import InputError
 from brdf.models import BlinnPhong, Lambert, NormalizedBlinnPhong, NormalizedPhong, Phong
@@ -156,3 +157,16 @@ def test_quadrature_bounds_its_error(n):
 
 def test_limit_leaves_room_for_a_lossless_material():
     assert check(NormalizedPhong(k_d=0.3, k_s=0.7, n=1e6)).energy.value <= ENERGY_LIMIT
+
+
+def test_a_registered_model_that_nobody_knows_on_paper_is_measured(monkeypatch):
+    """What is known of the five models was taken for known of every model in the table."""
+
+    class Bright(brdf.Lambert):
+        name = "bright"
+
+        def reflectance(self, to_light, to_view):
+            return 2.0 * super().reflectance(to_light, to_view)
+
+    monkeypatch.setitem(brdf.MODELS, "bright", Bright)
+    assert brdf.check(Bright(k_d=0.9)).energy.verdict == "fail"
