@@ -66,6 +66,8 @@ def fit(
         raise InputError("--plot", "needs a folder to draw into", "Add --out DIR")
     if report is not None and report.suffix.lower() not in (".html", ".htm"):
         raise InputError(report, "is no name of a page", "Name it .html")
+    if report is not None and not report.absolute().parent.is_dir():
+        raise InputError(report, f"cannot be written, {report.parent} is no folder", "Make it first")
     if out is not None:
         # Told now instead of after the fit.
         check_folder(out)

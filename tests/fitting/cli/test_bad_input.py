@@ -208,6 +208,7 @@ CASES: list[tuple[dict[str, Any], str, str]] = [
     ({}, f"{FIT} --noise -1,0", "^error: --noise: must be two numbers of 0"),
     ({}, f"{FIT} --plot", "^error: --plot: needs a folder"),
     ({}, f"{FIT} --report o.pdf", "o.pdf: is no name of a page"),
+    ({}, f"{FIT} --out fitted --report nodir/o.html", "nodir/o.html: cannot be written, .*nodir is no folder"),
     ({}, f"{FIT} --ambient", "--ambient: is what the scene file says"),
     ({}, f"{FIT} --light 0,0,1", "--light: says where the light is, but nothing what the picture shows"),
     # photographs
