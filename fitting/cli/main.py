@@ -58,7 +58,7 @@ def main(arguments: list[str] | None = None) -> Any:
     command, words = typer.main.get_command(app), sys.argv[1:] if arguments is None else arguments
     try:
         with interruptible(), command.make_context("brdf", [*words]) as context:
-            sys.exit(command.invoke(context))
+            sys.exit(command.invoke(context) or 0)
     except typer.Exit as done:
         sys.exit(done.exit_code)
     except InputError as error:
