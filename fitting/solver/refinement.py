@@ -27,7 +27,7 @@ TOLERANCE_SINGLE = 2e-7
 TOLERANCE_DOUBLE = 1e-14
 
 # Of an interval searched: the three samples that the last parabola goes through are so far apart.
-_CLOSE = 1e-3
+_CLOSE, _NEAR = 1e-3, 5e-2
 
 Cap = Callable[[float], Float[np.ndarray, "3 C"]]
 """From the exponent to what x_a, x_d, x_s count in a sum that may not exceed 1, channel by channel."""
@@ -100,7 +100,9 @@ def problem_of(
     return Problem(pictures, free.T, tolerance, accuracy, n_range, bool(free[2].any()))
 
 
-def minimum_between(costs: Callable[[np.ndarray], np.ndarray], low: float, high: float, points: int = 17) -> float:
+def minimum_between(
+    costs: Callable[[np.ndarray], np.ndarray], low: float, high: float, points: int = 17, close: float = _CLOSE
+) -> float:
     """Where a function of one number is least: samples, again around the best of them, at last a parabola.
 
     Args:
@@ -108,6 +110,7 @@ def minimum_between(costs: Callable[[np.ndarray], np.ndarray], low: float, high:
         low: lower bound.
         high: upper bound.
         points: how many are tried at once.
+        close: samples go on until they are this share of the range apart.
     """
     width = high - low
     while True:
@@ -115,7 +118,7 @@ def minimum_between(costs: Callable[[np.ndarray], np.ndarray], low: float, high:
         cost = costs(at)
         middle = int(np.clip(np.argmin(cost), 1, points - 2))
         low, here, high = at[middle - 1 : middle + 2]
-        if high - here <= _CLOSE * width:
+        if high - here <= close * width:
             break
     before, after = np.diff(cost[middle - 1 : middle + 2])
     bend = after - before
@@ -171,7 +174,9 @@ def _solve_bracket(problem: Problem, lower: float, upper: float, x: np.ndarray) 
     def at(shares: np.ndarray) -> Point:
         return solve_linear(parts.within(shares, width, x), lower + shares * width, x, problem)
 
-    share = minimum_between(lambda shares: np.sum(at(shares).cost, axis=1), 0.0, 1.0)
+    # Without a cap the cost is smooth, and Gauss-Newton steps follow.
+    close = _NEAR if problem.cap is None else _CLOSE
+    share = minimum_between(lambda shares: np.sum(at(shares).cost, axis=1), 0.0, 1.0, close=close)
     return Point(*(leaf[0] for leaf in at(np.array([share])))), share
 
 
