@@ -48,6 +48,8 @@ WORTH, WORTH_WITHOUT_LAMBERT = 0.5, 0.9
 HALF = 0.5
 # What Lambert leaves of a table that it describes exactly; a lobe has nothing to explain then.
 EXACT = 1e-12
+# The search for the exponent stops at this share of a value: a diffuse coefficient below it, of the brightest, is 0.
+SEARCH = 1e-9
 # Shares below this are told as rounding.
 ROUNDING = 1e-6
 # Largest value in 1/sr, and inverse of the least that a table may have as its largest: squares and sums stay in range.
@@ -365,13 +367,13 @@ def _fit_model(model, samples, loss, n_range):
     brightest = np.pi * np.max(np.abs(values), axis=0)
 
     def solve(weight):
-        """The least weighted squares; a diffuse coefficient that is rounding is 0."""
+        """The least weighted squares; a diffuse coefficient that the search cannot tell from 0 is 0."""
         with jax.enable_x64(True):
             lobe = Lobe(model, ((jnp.asarray(reach)[:, None], jnp.asarray(log_cos)),))
             ones, target = jnp.ones((len(values), 1)), jnp.asarray(np.pi * values)
             picture = Picture(target, ones, lobe, jnp.asarray(weight), ambient=jnp.zeros(1))
         optimum = search([picture], n_min=n_range[0], n_max=n_range[1], free=free)
-        return dataclasses.replace(optimum, x=np.where(optimum.x > [[0], [EXACT], [0]] * brightest, optimum.x, 0.0))
+        return dataclasses.replace(optimum, x=np.where(optimum.x > [[0], [SEARCH], [0]] * brightest, optimum.x, 0.0))
 
     def highlight(optimum):
         return optimum.x[2] * reach * np.exp(optimum.n * log_cos)

@@ -201,6 +201,13 @@ def test_a_coefficient_at_its_bound_is_exactly_0(loss):
     assert str(result.parameters[0]) == "0 (at its bound)"
 
 
+def test_a_small_coefficient_is_not_taken_for_its_bound():
+    light, view = directions(300)
+    values = f_r("blinn-phong", [1e-6, 0.2], [0.4, 0.3], 20.0, light, view)
+    result = fitting.fit_brdf(brdf.MeasuredBRDF.from_samples(light, view, values), "blinn-phong")
+    assert result.material.k_d[0] == pytest.approx(1e-6, rel=1e-3)
+
+
 def test_rounding_is_no_highlight():
     light, view = directions(40)
     result = fitting.fit_brdf(brdf.MeasuredBRDF.from_samples(light, view, np.full((40, 1), 0.3)))
