@@ -160,19 +160,20 @@ class Scene(eqx.Module):
         """
         return load_scene(path, within)
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: str | Path, *, aov: str | None = None) -> None:
         """Write a scene file that `load` reads back to the same scene.
 
         Args:
             path: a ``.toml`` file; surface points, meshes, environment maps and shadow masks are written beside it, as
                 ``<name>.aov.exr`` and so on.
+            aov: the name of a file beside it that holds the surface points already, where several scenes share them.
 
         Raises:
             InputError: where the file cannot be written.
         """
         from brdf.scene_file import write_parts
 
-        write_parts(path, {field.name: getattr(self, field.name) for field in dataclasses.fields(self)})
+        write_parts(path, {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}, aov)
 
 
 def load_scene(path: str | Path, within: str | Path | None = None, tables: dict[str, Any] | None = None) -> Scene:

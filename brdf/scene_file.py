@@ -254,12 +254,13 @@ def _layer(layers: dict[str, Any], name: str | None, known: tuple[str, ...], pat
 # -- writing -----------------------------------------------------------------------------------------------------------
 
 
-def write_parts(path: str | Path, parts: dict[str, Any]) -> None:
+def write_parts(path: str | Path, parts: dict[str, Any], aov: str | None = None) -> None:
     """Write a scene file; see `brdf.Scene.save`.
 
     Args:
         path: the file.
         parts: the arguments of `brdf.Scene`.
+        aov: the file beside it that holds the points already; None writes one.
 
     Raises:
         InputError: where the file cannot be written.
@@ -277,12 +278,13 @@ def write_parts(path: str | Path, parts: dict[str, Any]) -> None:
     camera, points = parts["camera"], parts["points"]
     if camera is not None:
         section("[camera]", {"type": kinds[type(camera)]} | _fields(camera))
-    if points is not None:
-        name, file = beside("aov.exr")
+    if points is not None and aov is None:
+        aov, file = beside("aov.exr")
         normal = np.where(np.asarray(points.mask)[..., None], np.asarray(points.normal), 0.0)
         layers = {"position": np.asarray(points.position), "normal": normal, "to_view": np.asarray(points.to_view)}
         write_layers(file, layers)
-        section("[aov]", {"file": name})
+    if points is not None:
+        section("[aov]", {"file": aov})
     for index, shape in enumerate(parts["shapes"]):
         values = {"type": kinds[type(shape)]} | _fields(shape)
         if isinstance(shape, Triangles):

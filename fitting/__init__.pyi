@@ -13,6 +13,7 @@ from .report.material_plots import plot_albedo as plot_albedo
 from .report.material_plots import plot_lobe as plot_lobe
 from .report.material_plots import plot_reciprocity as plot_reciprocity
 from .report.material_plots import plot_stability as plot_stability
+from .report.saving import load_result as load_result
 from .result import Parameter as Parameter
 from .speed_accuracy import Tradeoff as Tradeoff
 from .speed_accuracy import tradeoff as tradeoff

@@ -88,6 +88,7 @@ def _fit(problem: FitProblem) -> FitResult:
         targets=seen.shown,
         scenes=seen.scenes,
         counted=seen.counted,
+        files=[target.file for target in problem.targets],
     )
 
 

@@ -31,7 +31,7 @@ from brdf.models.base import SpecularMaterial
 from fitting.model_fit import ModelFit
 from fitting.problem import check_choice
 from fitting.report.saving import write_report
-from fitting.result import Parameter, undetermined
+from fitting.result import Parameter, Parameters
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import search
 from fitting.uncertainty.covariance import residual_noise, uncertainty
@@ -98,7 +98,7 @@ class BrdfCandidate:
 
 
 @dataclasses.dataclass(frozen=True)
-class BrdfFitResult:
+class BrdfFitResult(Parameters):
     """The outcome of `fit_brdf`.
 
     Attributes:
@@ -142,11 +142,6 @@ class BrdfFitResult:
     def losses(self) -> Losses:
         """Its deviation under each loss."""
         return self.candidates[self.chosen].losses
-
-    @property
-    def undetermined(self) -> dict[str, str]:
-        """What the table does not determine, and why."""
-        return undetermined(self.parameters)
 
     @property
     def fits(self) -> bool:

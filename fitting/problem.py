@@ -26,11 +26,13 @@ class Target(NamedTuple):
         pixels: linear values (H, W, C); or a `brdf.ImageReader`, of which a band of rows is in memory at a time.
         saturation: the value of the largest code, where it is known.
         step: the distance of two codes; 0 where there are none.
+        file: path, encoding and factor of the `brdf.Picture` that it was; None where no file holds it.
     """
 
     pixels: Any
     saturation: float | None = None
     step: float = 0.0
+    file: dict[str, Any] | None = None
 
     @property
     def streamed(self) -> bool:
@@ -143,8 +145,10 @@ def as_target(given: Any) -> Target:
     if isinstance(given, brdf.ImageReader):
         largest, step = given.codes
         return Target(given, None if largest is None else largest * TOP, step)
-    saturation, step = None, 0.0
+    saturation, step, file = None, 0.0, None
     if isinstance(given, brdf.Picture):
+        if given.path is not None:
+            file = {"path": str(given.path), "encoding": given.encoding, "factor": np.asarray(given.factor).tolist()}
         steps = given.quantisation()
         step = 0.0 if steps is None else float(np.nanmax(steps))
         saturation = None if given.saturation is None else given.saturation * TOP
@@ -161,7 +165,7 @@ def as_target(given: Any) -> Target:
         pixels = pixels[..., None]
     if pixels.ndim != 3 or 0 in pixels.shape:
         raise InputError("target", f"must be of shape (H, W, C), got {pixels.shape}", "Give one picture")
-    return Target(pixels, saturation, step)
+    return Target(pixels, saturation, step, file)
 
 
 def looked_at(mask: Any, weight: Any) -> Any:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 import brdf
+from brdf.errors import InputError
 from brdf.materials.material_file import material_to_dict
 from brdf.precision import Precision
 from fitting.budget.choice import BudgetChoice
@@ -58,6 +59,10 @@ class Parameter:
         """Its name, with the channel where it has one: "n", "k_s[2]"."""
         return self.name if self.channel is None else f"{self.name}[{self.channel}]"
 
+    def __float__(self) -> float:
+        """The value; NaN where it is not determined."""
+        return math.nan if self.value is None else float(self.value)
+
     def __str__(self) -> str:
         """Value ± error (relative), or why there is none."""
         if self.value is None:
@@ -84,8 +89,41 @@ def _rounded(value: float, error: float) -> str:
     return f"{value:.{min(max(digits, 2), 12)}g}"
 
 
+class Parameters:
+    """The numbers of a result by their names, as every result has them.
+
+    Attributes:
+        parameters: value and error of each number.
+    """
+
+    parameters: tuple[Parameter, ...]
+
+    def __getitem__(self, name: str) -> Any:
+        """The `Parameter` "n" or "k_d[0]"; of "k_d" the tuple of them, one for each channel.
+
+        Raises:
+            InputError: where there is none of that name.
+        """
+        exact = [one for one in self.parameters if one.key == name]
+        found = exact or tuple(one for one in self.parameters if one.name == name)
+        if not found:
+            known = ", ".join(dict.fromkeys(one.name for one in self.parameters))
+            raise InputError("result", f"has no number {name!r}", f"It has {known}")
+        return exact[0] if exact else found
+
+    @property
+    def undetermined(self) -> dict[str, str]:
+        """What is not determined, and why: "n", or "k_s[2]" for one channel."""
+        return {one.key: one.reason for one in self.parameters if one.value is None}
+
+    @property
+    def free_parameters(self) -> tuple[Parameter, ...]:
+        """Those that are determined and that no bound holds."""
+        return free_parameters(self.parameters)
+
+
 @dataclass(frozen=True)
-class FitResult:
+class FitResult(Parameters):
     """The outcome of a fit.
 
     Attributes:
@@ -108,13 +146,15 @@ class FitResult:
         targets: the pictures, (H, W, C) each.
         scenes: their scenes.
         counted: which pixels counted, (H, W) each.
-        names: of the pictures' files; empty where they came without.
+        files: path, encoding and factor of each picture; None where it came without a file.
         choice: what an accuracy or a time to spend made of the fit; None without one.
 
     Example:
         >>> result = fitting.fit(brdf.read_image("target.exr"), brdf.Scene.load("scene.toml"), model="blinn-phong")
         >>> result.surface, result.pixels, result.warnings
         ('blinn-phong', 656, ())
+        >>> round(float(result["n"]), 2), result["k_d"][0].at_bound
+        (51.2, False)
         >>> result.save("out")
     """
 
@@ -129,25 +169,15 @@ class FitResult:
     warnings: tuple[str, ...]
     candidates: tuple[Candidate, ...]
     correlation: Float[np.ndarray, "F F"]
-    optimum: Optimum
+    optimum: Optimum | None
     loss: str
     precision: Precision
     seconds: float
     targets: Sequence[np.ndarray] = field(repr=False)
     scenes: Sequence[brdf.Scene] = field(repr=False)
     counted: Sequence[np.ndarray] = field(repr=False)
-    names: Sequence[str] = ()
+    files: Sequence[dict[str, Any] | None] = ()
     choice: BudgetChoice | None = None
-
-    @property
-    def undetermined(self) -> dict[str, str]:
-        """What the picture does not determine, and why: "n", or "k_s[2]" for one channel."""
-        return undetermined(self.parameters)
-
-    @property
-    def free_parameters(self) -> tuple[Parameter, ...]:
-        """Those that the picture determines and no bound holds."""
-        return free_parameters(self.parameters)
 
     @property
     def surface(self) -> str:
@@ -202,7 +232,10 @@ class FitResult:
         }
 
     def save(self, folder: str | Path, *, plot: bool = False) -> None:
-        """Write material.json, material.mtl, fitted.exr and fit.json: all of them or none.
+        """Write what `fitting.load_result` reads back, all of it or nothing.
+
+        material.json, material.mtl, fitted.exr, fit.json and fit.npz; the scene as scene.toml; where the picture is in
+        a file its path and digest, else target.exr. Those of further pictures are scene1.toml and so on.
 
         Args:
             folder: made where missing. The MTL file is left out where the picture has neither 1 nor 3 channels.
@@ -232,15 +265,6 @@ def free_parameters(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
         parameters: all of them.
     """
     return tuple(one for one in parameters if one.value is not None and not one.at_bound)
-
-
-def undetermined(parameters: Sequence[Parameter]) -> dict[str, str]:
-    """Those that have no value, and why.
-
-    Args:
-        parameters: all of a material's.
-    """
-    return {one.key: one.reason for one in parameters if one.value is None}
 
 
 def _finite(value: float) -> float | None:

@@ -44,6 +44,7 @@ class Picture:
             compressed with losses (`ImageReader.codes`); None for floats. Infinite where the clipped pixels were taken
             out, see `scaled`.
         factor: what the linear values of the file were multiplied by, a number or (C,).
+        path: the file; None where it came from none.
 
     Example:
         >>> picture = brdf.read_picture("target.exr")
@@ -58,6 +59,7 @@ class Picture:
     bits: int
     saturation: float | None
     factor: float | np.ndarray = 1.0
+    path: Path | None = None
 
     def scaled(self, factor: float | np.ndarray) -> "Picture":
         """The picture in another unit: of another exposure, or under light of another intensity.
@@ -368,7 +370,8 @@ def read_picture(path: AnyPath, *, encoding: Encoding | None = None) -> Picture:
     """
     with ImageReader(path, encoding=encoding) as reader:
         top, _ = reader.codes
-        return Picture(reader.read(), reader.read_alpha(), reader.encoding, reader.source, reader.bits, top)
+        about = reader.encoding, reader.source, reader.bits, top
+        return Picture(reader.read(), reader.read_alpha(), *about, path=reader.path)
 
 
 def read_mask(path: AnyPath) -> Bool[np.ndarray, "height width"]:

@@ -25,7 +25,7 @@ def load_material(path: str | Path, name: str | None = None) -> Material:
     """Read one material.
 
     Args:
-        path: a ``.json`` or ``.mtl`` file.
+        path: a ``.json`` or ``.mtl`` file; a folder that a fit was saved in, or its fit.json.
         name: which one, where an MTL file holds several.
 
     Raises:
@@ -50,7 +50,7 @@ def load_materials(path: str | Path) -> dict[str, Material]:
     """Read all materials of a file, by name; the one in a JSON file bears the file's name.
 
     Args:
-        path: a ``.json`` or ``.mtl`` file.
+        path: as for `load_material`.
 
     Raises:
         InputError: naming file and key.
@@ -170,15 +170,19 @@ def _suffix(path: str | Path, remedy: str) -> str:
 
 def _entries(path: str | Path) -> dict[str, Any]:
     """What a file says of each of its materials, by name."""
+    if Path(path).is_dir():
+        path = Path(path) / "material.json"
     suffix, text = _suffix(path, "Give a .json or .mtl file"), read_text(path, _MOST_BYTES)
     if suffix == ".mtl":
         return read_mtl(path, text)
     try:
-        return {Path(path).stem: json.loads(text, object_pairs_hook=_without_repetition)}
+        values = json.loads(text, object_pairs_hook=_without_repetition)
     except InputError as error:
         raise error.inside(path) from None
     except (ValueError, RecursionError) as error:
         raise InputError(path, f"is not JSON ({error})", "Correct the file") from None
+    is_report = isinstance(values, dict) and "model" not in values and "material" in values
+    return {Path(path).stem: values["material"] if is_report else values}
 
 
 def _material(path: str | Path, name: str, entry: Any) -> Material:

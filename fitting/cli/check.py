@@ -22,7 +22,7 @@ def check(
     material: Annotated[
         str,
         typer.Argument(
-            help="A .json, .mtl (every material is checked) or measured BRDF file, or a name of the classic table."
+            help="A .json, .mtl (all its materials) or measured BRDF file, a folder of brdf fit --out, or a name."
         ),
     ],
     as_json: AsJson = False,

@@ -36,7 +36,9 @@ Encoding = Annotated[
 Model = Annotated[str, typer.Option(help=f"One of {', '.join(MODEL_NAMES)}.")]
 Precision = Annotated[str, typer.Option(help="float32 or float64.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
-AMaterial = Annotated[str, typer.Argument(help="A .json or .mtl file, or a name of the classic table: emerald.")]
+AMaterial = Annotated[
+    str, typer.Argument(help="A .json or .mtl file, a folder of brdf fit --out, or a name of the classic table.")
+]
 
 
 def _option(said: str, *names: str) -> Any:

@@ -1,6 +1,5 @@
 """``brdf fit``: pictures, photographs of a ball, archives and measured BRDFs."""
 
-import dataclasses
 import json
 import shlex
 import sys
@@ -125,6 +124,4 @@ def _fit_pictures(target: Any, pictures: Any, noise: Any, accuracy: Any, **how: 
 
     how["noise"] = None if noise is None else tuple(parse_numbers(noise, "--noise", 2, "READ,SHOT"))
     how["accuracy"] = None if accuracy is None else OnlyFit(accuracy)
-    result, notes = fit_either(given, **how)
-    names = tuple(path.name for path in given.pictures)
-    return (dataclasses.replace(result, names=names) if len(names) == len(result.targets) else result), notes
+    return fit_either(given, **how)

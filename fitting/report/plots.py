@@ -3,6 +3,7 @@
 They return a matplotlib figure and show nothing.
 """
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import matplotlib
@@ -55,7 +56,8 @@ def comparison(result: "FitResult", picture: int | None = None) -> Figure:
         picture = max(range(count), key=lambda index: _unexplained(result, index))
     if not 0 <= picture < count:
         raise InputError("picture", f"must be from 0 to {count - 1}, got {picture}", "Count the pictures from 0")
-    name = result.names[picture] if result.names else ""
+    file = result.files[picture] if result.files else None
+    name = "" if file is None else Path(file["path"]).name
     title = name if count == 1 else f"picture {picture + 1} of {count}{', ' if name else ''}{name}{why}"
     target, fitted = np.asarray(result.targets[picture]), result.fitted(picture)
     counted = np.asarray(result.counted[picture])

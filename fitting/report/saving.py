@@ -1,25 +1,36 @@
-"""A fit as files."""
+"""A fit as files, and back."""
 
+import hashlib
 import json
+import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
+
+import numpy as np
 
 import brdf
-from brdf.files import atomic_folder, write_text
-from fitting.result import FitResult
+from brdf.errors import InputError
+from brdf.files import atomic_folder, read_text, write_text
+from brdf.materials.material_file import material_from_dict
+from fitting.budget.choice import Attempt, BudgetChoice
+from fitting.result import FitResult, Parameter
+from fitting.selection import Candidate
+from fitting.solver.profile import Optimum
 
 
-def write_report(stage: Path, result: Any) -> None:
+def write_report(stage: Path, result: Any, **further: Any) -> None:
     """Write material.json, material.mtl (of 1 or 3 channels) and fit.json.
 
     Args:
         stage: a folder that is there.
         result: with ``material``, ``undetermined`` and ``to_dict()``.
+        further: what else fit.json is to hold.
     """
     names = ["material.json", *(["material.mtl"] if result.material.k_d.shape[0] in (1, 3) else [])]
     for name in names:
         brdf.save_material(result.material, stage / name, undetermined=result.undetermined)
-    write_text(stage / "fit.json", json.dumps(result.to_dict(), indent=2) + "\n")
+    write_text(stage / "fit.json", json.dumps(result.to_dict() | further, indent=2) + "\n")
 
 
 def save(result: FitResult, folder: str | Path, plot: bool) -> None:
@@ -34,7 +45,123 @@ def save(result: FitResult, folder: str | Path, plot: bool) -> None:
         InputError: where the folder cannot be written.
     """
     with atomic_folder(folder) as stage:
-        write_report(stage, result)
+        pictures = [_write_picture(stage, result, index) for index in range(len(result.scenes))]
+        write_report(stage, result, pictures=pictures)
+        counted = {f"counted{index}": counted for index, counted in enumerate(result.counted)}
+        np.savez_compressed(stage / "fit.npz", **counted, **({} if result.optimum is None else vars(result.optimum)))
         brdf.write_image(stage / "fitted.exr", result.fitted())
         if plot:
             result.plot().savefig(stage / "comparison.png", dpi=150)
+
+
+def _write_picture(stage: Path, result: FitResult, index: int) -> dict[str, Any]:
+    """Write one scene, and its picture where no file holds it; what fit.json says of them."""
+    scene, file, number = result.scenes[index], (result.files or [None] * (index + 1))[index], index or ""
+    is_shared = scene.points is not None and scene.points is result.scenes[0].points and index > 0
+    scene.save(stage / f"scene{number}.toml", aov="scene.aov.exr" if is_shared else None)
+    path = stage / f"target{number}.exr"
+    if file is None:
+        brdf.write_image(path, np.asarray(result.targets[index], np.float32))
+        file = {"path": path.name, "encoding": "linear", "factor": 1.0}
+    else:
+        path = Path(file["path"]).absolute()
+        file = file | {"path": str(path)}
+    return file | {"sha256": _digest(path), "scene": f"scene{number}.toml"}
+
+
+def _digest(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        remedy = "Put it there again, or beside fit.json"
+        raise InputError(path, f"which was fitted, cannot be read ({error.strerror})", remedy) from None
+
+
+class _Pictures(Sequence[np.ndarray]):
+    """The pictures of a saved fit, read when they are asked for, if they still are what was fitted."""
+
+    def __init__(self, folder: Path, files: list[dict[str, Any]], precision: str):
+        self.folder, self.files, self.precision = folder, files, precision
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    @overload
+    def __getitem__(self, index: int) -> np.ndarray: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[np.ndarray]: ...
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return [self[one] for one in range(*index.indices(len(self)))]
+        file = self.files[index]
+        path, beside = self.folder / file["path"], self.folder / Path(file["path"]).name
+        path = beside if beside.is_file() and not path.is_file() else path
+        if _digest(path) != file["sha256"]:
+            raise InputError(path, "is not what was fitted, it has changed since", "Put that back, or fit again")
+        picture = brdf.read_picture(path, encoding=file["encoding"]).scaled(np.asarray(file["factor"]))
+        return picture.pixels.astype(self.precision)
+
+
+def load_result(folder: str | Path) -> FitResult:
+    """Read a fit that `FitResult.save` or ``brdf fit --out`` wrote: to report, plot or render it.
+
+    Args:
+        folder: as it was written, or the fit.json in it.
+
+    Returns:
+        The result. A picture that was in a file is read again when it is asked for; where that file has moved it is
+        looked for beside fit.json.
+
+    Raises:
+        InputError: where there is no such fit; when a picture is asked for, where it is gone or not what was fitted.
+
+    Example:
+        >>> target, scene = brdf.read_picture("target.exr"), brdf.Scene.load("scene.toml")
+        >>> fitting.fit(target, scene, model="blinn-phong").save("saved")
+        >>> result = fitting.load_result("saved")
+        >>> round(float(result["n"]), 2), result.targets[0].shape
+        (51.2, (32, 32, 3))
+    """
+    path = Path(folder) if Path(folder).suffix.lower() == ".json" else Path(folder) / "fit.json"
+    folder = path.parent
+    try:
+        values = json.loads(read_text(path))
+        if "table" in values:
+            remedy = "Its material is what brdf.load_material reads"
+            raise InputError(path, "is the fit of a measured BRDF, which holds no picture", remedy)
+        pictures, choice = values.pop("pictures"), values["choice"]
+        with np.load(folder / "fit.npz") as arrays:
+            counted = [arrays[f"counted{index}"] for index in range(len(pictures))]
+            optimum = {name: arrays[name] for name in Optimum.__dataclass_fields__ if name in arrays}
+        if choice is not None:
+            del choice["basis"]
+            choice = BudgetChoice(**choice | {"attempts": tuple(Attempt(**one) for one in choice["attempts"])})
+        known = {name: value for name, value in values.items() if name in FitResult.__dataclass_fields__}
+        return FitResult(
+            **known
+            | {
+                "material": material_from_dict(values["material"]),
+                "parameters": tuple(map(_parameter, values["parameters"])),
+                "noise": np.array(values["noise"]),
+                "warnings": tuple(values["warnings"]),
+                "candidates": tuple(Candidate(**one) for one in values["candidates"]),
+                "correlation": np.array(values["correlation"]["matrix"]),
+                "optimum": Optimum(**{name: value[()] for name, value in optimum.items()}) if optimum else None,
+                "choice": choice,
+                "targets": _Pictures(folder, pictures, values["precision"]),
+                "scenes": [brdf.Scene.load(folder / picture["scene"]) for picture in pictures],
+                "counted": counted,
+                "files": pictures,
+            }
+        )
+    except InputError:
+        raise
+    except (KeyError, TypeError, ValueError, OSError) as error:
+        raise InputError(path, f"is no fit that this version saved ({error})", "Fit and save again") from None
+
+
+def _parameter(values: dict[str, Any]) -> Parameter:
+    low, high = values["interval"] or (None, None)
+    ends = (-math.inf if low is None else low, math.inf if high is None else high)
+    return Parameter(**values | {"interval": values["interval"] and ends, "reason": values["reason"] or ""})

@@ -82,9 +82,10 @@ def test_overview_has_four_quarters(material: brdf.Material, tmp_path):
 def test_of_several_pictures_the_one_explained_worst_is_drawn_and_named(matt):
     noise = np.random.default_rng(1).normal(0, 0.02, matt.targets[0].shape)
     targets = [matt.targets[0], matt.targets[0] + noise, matt.targets[0]]
-    several = dataclasses.replace(matt, targets=targets, scenes=list(matt.scenes) * 3, counted=list(matt.counted) * 3)
+    three = {"scenes": list(matt.scenes) * 3, "counted": list(matt.counted) * 3}
+    several = dataclasses.replace(matt, targets=targets, **three, files=())
     assert several.plot().get_suptitle() == "picture 2 of 3 (explained worst)"
-    named = dataclasses.replace(several, names=("a.png", "b.png", "c.png"))
+    named = dataclasses.replace(several, files=[{"path": f"/x/{name}.png"} for name in "abc"])
     assert named.plot(2).get_suptitle() == "picture 3 of 3, c.png"
     assert matt.plot().get_suptitle() == ""
     with pytest.raises(brdf.InputError, match="picture: must be from 0 to 2, got 3"):
