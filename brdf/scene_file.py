@@ -60,7 +60,7 @@ class _Table:
         value, place = self.values.pop(key, None), f"{self.place}.{key}"
         if isinstance(value, list) and len(value) > MOST_NUMBERS:
             raise InputError(place, f"has {len(value)} entries", f"Give at most {MOST_NUMBERS}")
-        if key == "fitted":
+        if key in ("fitted", "smooth"):
             if not isinstance(value, bool):
                 raise InputError(place, f"must be true or false, got {value!r}", "Correct the value")
             return value
@@ -193,10 +193,10 @@ def _read_shape(table: _Table) -> Shape:
     cls = table.choose(SHAPES)
     if cls is not Triangles:
         return table.build(cls)
-    mesh = load_mesh(table.file("file", "mesh.obj"))
-    fitted = table.plain("fitted") if "fitted" in table.values else True
-    table.done("type", "file", "fitted")
-    return Triangles(mesh, fitted=fitted)
+    path = table.file("file", "mesh.obj")
+    fitted, smooth = (table.plain(key) if key in table.values else True for key in ("fitted", "smooth"))
+    table.done("type", "file", "fitted", "smooth")
+    return Triangles(load_mesh(path, smooth=smooth), fitted=fitted)
 
 
 def _read_light(table: _Table) -> Light:
@@ -289,11 +289,16 @@ def write_parts(path: str | Path, parts: dict[str, Any], aov: str | None = None)
         values = {"type": kinds[type(shape)]} | _fields(shape)
         if isinstance(shape, Triangles):
             values["file"], file = beside(f"shape{index}.obj")
-            mesh = shape.mesh
-            del values["mesh"]
-            vertices = [f"v {x!r} {y!r} {z!r}" for x, y, z in mesh.vertices.tolist()]
-            faces = [f"f {a} {b} {c}" for a, b, c in (mesh.faces + 1).tolist()]
-            write_text(file, "\n".join([*vertices, *faces]) + "\n")
+            mesh = values.pop("mesh")
+            lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in mesh.vertices.tolist()]
+            if mesh.normals is None:
+                values["smooth"] = False
+                lines += [f"f {a} {b} {c}" for a, b, c in (mesh.faces + 1).tolist()]
+            else:
+                lines += [f"vn {x!r} {y!r} {z!r}" for x, y, z in mesh.normals.reshape(-1, 3).tolist()]
+                corners = [f"{vertex}//{at}" for at, vertex in enumerate((mesh.faces + 1).ravel().tolist(), start=1)]
+                lines += [f"f {a} {b} {c}" for a, b, c in zip(*[iter(corners)] * 3, strict=True)]
+            write_text(file, "\n".join(lines) + "\n")
         section("[[shapes]]", values)
     if parts["ambient"] is not None:
         section("[ambient]", {"intensity": parts["ambient"]})

@@ -18,12 +18,14 @@ class Hit(NamedTuple):
         distance: along the ray, in units of its direction's length; infinite where it misses.
         position: the point, (3,), finite also where the ray misses.
         normal: the unit normal there, (3,), finite also where the ray misses.
+        shading: the normal of the surface that a flat piece stands for, (3,); None where that is ``normal``.
     """
 
     hit: Bool[Array, ""]
     distance: Scalar
     position: Vector
     normal: Vector
+    shading: Vector | None = None
 
 
 class Shape(eqx.Module):

@@ -19,7 +19,7 @@ def trace(camera: Camera, shapes: tuple[Shape, ...], column: Any, row: Any) -> S
     distance = jnp.full(origins.shape[:-1], jnp.inf)
     mask = jnp.zeros(origins.shape[:-1], bool)
     index = jnp.full(origins.shape[:-1], NO_SHAPE, jnp.int32)
-    position, normal = origins, -directions
+    position, normal, facet, has_facets = origins, -directions, -directions, False
     for number, shape in enumerate(shapes):
         hit = jax.vmap(jax.vmap(shape.intersect))(origins, directions)
         nearer = hit.hit & (hit.distance < distance)
@@ -27,9 +27,12 @@ def trace(camera: Camera, shapes: tuple[Shape, ...], column: Any, row: Any) -> S
         mask = jnp.where(nearer, shape.fitted, mask)
         index = jnp.where(nearer, number, index)
         position = jnp.where(nearer[..., None], hit.position, position)
-        normal = jnp.where(nearer[..., None], hit.normal, normal)
+        has_facets |= hit.shading is not None
+        facet = jnp.where(nearer[..., None], hit.normal, facet)
+        normal = jnp.where(nearer[..., None], hit.normal if hit.shading is None else hit.shading, normal)
     to_view = jnp.where(mask[..., None], camera.to_view(position), normal)
-    return SurfacePoints(position, normal, to_view, mask, index if len(shapes) > 1 else None)
+    shape = index if len(shapes) > 1 else None
+    return SurfacePoints(position, normal, to_view, mask, shape, facet=facet if has_facets else None)
 
 
 def shapes_met(camera: Camera, shapes: tuple[Shape, ...], column: Any, row: Any) -> Int[Array, "..."]:

@@ -44,6 +44,8 @@ class SurfacePoints(eqx.Module):
         shape: (...), index of the shape that each pixel sees; None where the points come from elsewhere.
         visibility: for each of L lights, how much of it each point sees, (..., L), 0 to 1; None where nothing is given.
         area: the pixels that are averaged over their area; None where every pixel's centre stands for it.
+        facet: (..., 3), the unit normal of the flat piece that a smooth mesh is made of there; None where that is
+            ``normal``. No light comes from behind it, and shadow rays start above it.
 
     Example:
         >>> points = brdf.Scene.load("scene.toml").surface_points()
@@ -58,6 +60,7 @@ class SurfacePoints(eqx.Module):
     shape: Int[Array, "*pixels"] | None = None
     visibility: Float[Array, "*pixels L"] | None = None
     area: PixelArea | None = None
+    facet: Float[Array, "*pixels 3"] | None = None
 
     @property
     def met(self) -> Int[Array, "*pixels"]:

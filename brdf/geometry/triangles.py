@@ -1,16 +1,19 @@
-"""Triangle meshes from Wavefront ``.obj`` files. Reading them and finding what a ray hits is trimesh's business.
+"""Triangle meshes from Wavefront ``.obj`` files, shaded smoothly; what a ray hits is trimesh's business.
 
 With embreex beside it (``pip install brdf-fitting[meshes]`` brings both) trimesh asks Intel's Embree, in float32;
 without it, its own and far slower search. The rays of a program travel to the host and back: a mesh works on any
 device, and costs no more to compile than a sphere. Which triangle a ray meets has no derivative; where on that
 triangle it meets it has, by the ray. The vertices are part of the program, not numbers that can be fitted.
+
+A triangle is flat, the surface that it stands for is not: the light on it is that of the normal interpolated between
+its corners (Phong 1975). Shadows, and which side is seen, are those of the triangle. The normals are the file's; where
+it has none, each corner's is the mean of the faces around it up to the next crease, weighted by their angles there.
 """
 
 import functools
 import hashlib
-import io
+import itertools
 import os
-import re
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +21,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from brdf.checks import LARGEST, Scalar, Vector
 from brdf.errors import InputError
-from brdf.files import read_text
+from brdf.files import parse_number, read_text
 from brdf.geometry.base import Hit, Shape
 from brdf.vectors import divide, dot, normalize
 
-# A corner 0 of a face, which a parser may take for the last vertex.
-_FACE_OF_NOTHING = re.compile(r"^f[ \t](?:.*[ \t])?0+(?=[/\s]|$)", re.MULTILINE)
+CREASE = np.radians(30.0)
+"""Faces that meet at this angle or more meet in an edge, not in a rounding."""
 
 
 class Mesh:
@@ -36,19 +39,22 @@ class Mesh:
     Attributes:
         vertices: (V, 3), world units.
         faces: (F, 3) indices of corners, counter-clockwise seen from the front.
+        normals: (F, 3, 3) unit normals at the corners of each face; None for flat faces.
         name: of the file it came from, or empty.
     """
 
-    def __init__(self, vertices: Any, faces: Any, name: str = ""):
+    def __init__(self, vertices: Any, faces: Any, name: str = "", *, normals: Any = None):
         """Check the numbers.
 
         Args:
             vertices: (V, 3).
             faces: (F, 3).
             name: of the file it came from.
+            normals: (F, 3, 3), of any length, at the corners of each face; None for flat faces.
 
         Raises:
-            InputError: where there is no triangle, a vertex is not finite or an index leads nowhere.
+            InputError: where there is no triangle, a vertex is not finite or an index leads nowhere, or where the
+                normals point to the other side than the faces do.
         """
         self.vertices = np.array(vertices, np.float64)
         self.faces = np.array(faces, np.int32)
@@ -61,7 +67,39 @@ class Mesh:
             raise InputError("vertices", f"must be within ± {LARGEST:g}", "Give the mesh in another unit")
         if self.faces.min() < 0 or self.faces.max() >= len(self.vertices):
             raise InputError("faces", "name a vertex that is not there", "Correct the indices")
-        self._digest = hashlib.sha256(self.vertices.tobytes() + self.faces.tobytes()).digest()
+        self.normals = None if normals is None else self._checked(np.asarray(normals, np.float64))
+        shading = b"" if self.normals is None else self.normals.tobytes()
+        self._digest = hashlib.sha256(self.vertices.tobytes() + self.faces.tobytes() + shading).digest()
+
+    def _checked(self, normals: np.ndarray) -> np.ndarray:
+        if normals.shape != (*self.faces.shape, 3):
+            came = f"must be of shape {(*self.faces.shape, 3)}, got {normals.shape}"
+            raise InputError("normals", came, "Give one for each corner of each face")
+        length = np.linalg.norm(normals, axis=-1, keepdims=True)
+        front = self.front[:, None, :]
+        normals = np.where(length > 0, normals / np.where(length > 0, length, 1.0), front)
+        towards = np.sum(normals * front, axis=-1)
+        if not np.all(np.isfinite(towards)):
+            raise InputError("normals", "must be finite", "Export the mesh again, or load it with smooth = false")
+        if np.mean(towards) < 0:
+            remedy = "Turn the faces or the normals over, or load the mesh with smooth = false"
+            raise InputError("normals", "point to the back of the faces, whose corners run clockwise", remedy)
+        return normals
+
+    @functools.cached_property
+    def front(self) -> Float[np.ndarray, "F 3"]:
+        """The unit normal of each face; 0 for one without area."""
+        a, b, c = np.moveaxis(self.vertices[self.faces], 1, 0)
+        area = np.cross(b - a, c - a)
+        length = np.linalg.norm(area, axis=-1, keepdims=True)
+        return np.divide(area, length, out=np.zeros_like(area), where=length > 0)
+
+    def __repr__(self) -> str:
+        """Its name, size and place."""
+        ends = self.vertices.min(axis=0), self.vertices.max(axis=0)
+        low, high = (", ".join(f"{value:.4g}" for value in end) for end in ends)
+        size = f"{len(self.vertices)} vertices, {len(self.faces)} {'flat' if self.normals is None else 'smooth'} faces"
+        return f"Mesh({self.name!r}: {size}, [{low}] to [{high}])"
 
     def __hash__(self) -> int:
         """Of the content."""
@@ -96,41 +134,108 @@ def _trimesh() -> Any:
     return trimesh
 
 
-def load_mesh(path: str | os.PathLike[str]) -> Mesh:
-    """Read the triangles of a Wavefront ``.obj`` file; its materials and normals are not looked at.
+def load_mesh(path: str | os.PathLike[str], *, smooth: bool = True) -> Mesh:
+    """Read the triangles of a Wavefront ``.obj`` file and their normals; its materials are not looked at.
 
     Args:
         path: the file.
+        smooth: shade with the file's vertex normals, or, where a face has none, with those of the faces around; False
+            shows flat faces.
 
     Raises:
         InputError: where it cannot be read or holds no triangles.
 
     Example:
         >>> mesh = brdf.load_mesh("pyramid.obj")
-        >>> mesh.vertices.shape, mesh.faces.shape
-        ((4, 3), (4, 3))
+        >>> mesh.vertices.shape, mesh.faces.shape, mesh.normals.shape
+        ((4, 3), (4, 3), (4, 3, 3))
+
+    Source: G. Thürmer and C. A. Wüthrich, "Computing vertex normals from polygonal facets", JGT 3 (1998) 43: each face
+    weighs by its angle at the vertex.
     """
-    trimesh = _trimesh()
-    text = read_text(path)
-    if _FACE_OF_NOTHING.search(text):
-        raise InputError(os.fspath(path), "has a face with the vertex 0; vertices count from 1", "Export it again")
-    try:
-        loaded = trimesh.load_mesh(
-            io.StringIO(text), file_type="obj", process=False, skip_materials=True, maintain_order=True
-        )
-    except Exception as error:  # trimesh raises whatever its parser stumbles over
-        raise InputError(os.fspath(path), f"is no .obj file that trimesh reads ({error})", "Export it again") from None
-    faces = getattr(loaded, "faces", None)
-    if faces is None or not len(faces):
+    _trimesh()  # told now, not when the first ray is sent
+    values: dict[str, list[list[float]]] = {"v": [], "vn": []}
+    faces, normal_of = [], []
+    for line, text in enumerate(read_text(path).replace("\\\n", "  ").splitlines(), start=1):
+        kind, *words = text.split() or [""]
+        try:
+            if kind in values:
+                x, y, z, *_ = map(parse_number, words)
+                values[kind].append([x, y, z])
+            elif kind == "f":
+                corners = [_corner(word, len(values["v"]), len(values["vn"])) for word in words]
+                if len(corners) < 3:
+                    raise ValueError("a face has three corners or more")
+                for second, third in itertools.pairwise(corners[1:]):
+                    vertex, normal = zip(corners[0], second, third, strict=True)
+                    faces.append(vertex)
+                    normal_of.append(normal)
+        except ValueError as error:
+            place = f"{os.fspath(path)}: line {line}"
+            raise InputError(place, f"cannot be read ({error})", "Export the mesh again") from None
+    if not faces:
         raise InputError(os.fspath(path), "holds no triangles", "Export a mesh with faces")
     try:
-        return Mesh(loaded.vertices, faces, Path(path).name)
+        flat, name = Mesh(values["v"], faces, Path(path).name), Path(path).name
+        if not smooth:
+            return flat
+        index, given = np.array(normal_of), np.array([*values["vn"], [0.0] * 3])
+        if index.max() >= len(given) - 1:
+            raise InputError("faces", "name a normal that is not there", "Export the mesh again")
+        normals = given[index] if np.all(index >= 0) else np.where(index[..., None] < 0, rounded(flat), given[index])
+        return Mesh(values["v"], faces, name, normals=normals)
     except InputError as error:
         raise error.inside(os.fspath(path)) from None
 
 
+def _corner(word: str, vertices: int, normals: int) -> tuple[int, int]:
+    """Indices from 0 of the vertex and the normal that a corner such as 3, 3/1, 3//2 or -1 names; -1 for none."""
+    vertex, _, rest = word.partition("/")
+    found = [int(vertex), int(rest.partition("/")[2] or 0)]
+    if not found[0]:
+        raise ValueError("there is no vertex 0, they count from 1")
+    return tuple(one - 1 if one >= 0 else count + one for one, count in zip(found, (vertices, normals), strict=True))
+
+
+def rounded(mesh: Mesh) -> Float[np.ndarray, "F 3 3"]:
+    """Normals at the corners of the faces, as if the mesh were round but for its creases.
+
+    Around a vertex two faces belong together where the edge between them is no crease, and where others join them. The
+    normal is the mean of those that belong together, weighted by their angles at the vertex.
+
+    Args:
+        mesh: its own normals are not looked at.
+    """
+    # One vertex in each place, also where a file repeats it.
+    _, place = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    faces, front = place.reshape(-1)[mesh.faces], mesh.front
+    corner = np.arange(faces.size).reshape(faces.shape)
+    ends = np.stack([corner, np.roll(corner, -1, axis=1)], axis=-1).reshape(-1, 2)
+    vertices = faces.ravel()[ends]
+    turned = vertices[:, 0] > vertices[:, 1]
+    ends[turned], vertices[turned] = ends[turned, ::-1], vertices[turned, ::-1]
+    order = np.lexsort(vertices.T)
+    ends, vertices = ends[order], vertices[order]
+    one, other = ends[:-1], ends[1:]
+    bend = np.sum(front[one[:, 0] // 3] * front[other[:, 0] // 3], axis=-1)
+    joined = np.all(vertices[:-1] == vertices[1:], axis=-1) & (bend > np.cos(CREASE))
+    one, other = one[joined].ravel(), other[joined].ravel()
+    group, before = corner.ravel(), None
+    while before is None or np.any(group != before):
+        before, group = group, group.copy()
+        np.minimum.at(group, other, before[one])
+        np.minimum.at(group, one, before[other])
+    corners = mesh.vertices[mesh.faces]
+    to_next, to_last = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
+    across = np.linalg.norm(np.cross(to_next, to_last), axis=-1)
+    angle = np.arctan2(across, np.sum(to_next * to_last, axis=-1))
+    total = np.zeros((faces.size, 3))
+    np.add.at(total, group, (angle[..., None] * front[:, None, :]).reshape(-1, 3))
+    return total[group].reshape(*faces.shape, 3)
+
+
 class Triangles(Shape):
-    """A triangle mesh, flat between its edges; the front of a triangle sees its corners counter-clockwise.
+    """A triangle mesh; the front of a triangle sees its corners counter-clockwise.
 
     Args:
         mesh: vertices and triangles; see `load_mesh`.
@@ -154,13 +259,23 @@ class Triangles(Shape):
         return jnp.asarray(float(np.max(np.abs(self.mesh.vertices))))
 
     def intersect(self, origin: Vector, direction: Vector) -> Hit:
-        """The nearest hit in front of ``origin``, from either side; the normal is that of the front side."""
+        """The nearest hit in front of ``origin``, from either side; the normals are those of the front side."""
         rays = (jax.lax.stop_gradient(jnp.asarray(origin)), jax.lax.stop_gradient(jnp.asarray(direction)))
         shape = jax.ShapeDtypeStruct((), np.int32)
         triangle = jax.pure_callback(self.mesh.first_hit, shape, *rays, vmap_method="broadcast_all")
         corners = jnp.asarray(self.mesh.vertices, rays[0].dtype)[jnp.asarray(self.mesh.faces)[triangle]]
-        normal = normalize(jnp.cross(corners[1] - corners[0], corners[2] - corners[0]))
+        edge, other_edge = corners[1] - corners[0], corners[2] - corners[0]
+        area = jnp.cross(edge, other_edge)
+        normal = normalize(area)
         slope = dot(direction, normal)
         distance = divide(dot(corners[0] - origin, normal) * slope, slope * slope)
-        hit = (triangle >= 0) & (distance > 0)
-        return Hit(hit, jnp.where(hit, distance, jnp.inf), origin + distance * direction, normal)
+        hit, position = (triangle >= 0) & (distance > 0), origin + distance * direction
+        shading = None
+        if self.mesh.normals is not None:
+            offset, size = position - corners[0], dot(area, area)
+            second = divide(dot(jnp.cross(offset, other_edge), area), size)
+            third = divide(dot(jnp.cross(edge, offset), area), size)
+            weights = jnp.stack([1.0 - second - third, second, third])
+            shading = normalize(weights @ jnp.asarray(self.mesh.normals, position.dtype)[triangle])
+            shading = jnp.where(slope < 0, shading, normal)  # the back is not lit, however its normals lean
+        return Hit(hit, jnp.where(hit, distance, jnp.inf), position, normal, shading)

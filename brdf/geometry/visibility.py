@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from brdf.checks import Scalar, Vector
 from brdf.geometry.base import Shape
 from brdf.geometry.surface_points import SurfacePoints
+from brdf.vectors import dot
 
 OFFSET = 300
 """Shadow rays start this many rounding errors above the surface: 4e-5 of the coordinates in float32."""
@@ -31,11 +32,11 @@ def share_seen(
 
     All shapes of the scene are given, in its order: the point knows by that which of them it lies on.
     """
-    position, normal = point.position, point.normal
+    position, normal = point.position, point.normal if point.facet is None else point.facet
     size = jnp.max(jnp.abs(position))
     rounding = OFFSET * jnp.finfo(jnp.result_type(position)).eps
     before = distance * (1 - 4 * rounding)
-    seen = jnp.ones_like(size)
+    seen = jnp.ones_like(size) if point.facet is None else jnp.where(dot(normal, to_light) > 0, 1.0, 0.0)
     for index, shape in enumerate(occluders):
         start = position + jax.lax.stop_gradient(rounding * jnp.maximum(size, shape.extent())) * normal
         if radius is None:

@@ -215,7 +215,7 @@ def _shape(shape: Mapping[str, Any]) -> dict[str, Any]:
     if shape["type"] == "sphere":
         return {"type": "sphere", "center": shape["center"], "radius": float(shape["radius"])}
     if shape["type"] == "triangles":
-        return {"type": "obj", "filename": str(shape["file"]), "face_normals": True}
+        return {"type": "obj", "filename": str(shape["file"]), "face_normals": not shape.get("smooth", True)}
     edge_u, edge_v = np.array(shape["edge_u"], float), np.array(shape["edge_v"], float)
     normal = np.cross(edge_u, edge_v)
     to_world = np.eye(4)

@@ -10,6 +10,7 @@ import pytest
 from project_paths import ROOT
 
 import brdf
+import fitting
 from brdf.lights.base import Light
 from brdf.lights.environment import map_directions
 
@@ -115,3 +116,34 @@ def test_a_picture_is_mitsubas(kind: str, model: str, tmp_path: Path):
     # Mitsuba's own noise of these sample numbers is 0.1 %, with a constant environment 0.2 %
     assert np.median(difference) < (0.003 if kind == "environment" else 0.002)
     assert np.percentile(difference, 99) < 0.02
+
+
+def test_a_smooth_mesh_is_mitsubas(tmp_path: Path):
+    """The exponent of a picture that Mitsuba made of the same mesh comes back; flat shading of it costs a tenth."""
+    trimesh = pytest.importorskip("trimesh", reason="trimesh intersects meshes")
+    from drawing import mitsuba_scene
+
+    path, ball = tmp_path / "ball.obj", trimesh.creation.icosphere(subdivisions=2, radius=1.5)
+    lines = [f"v {x} {y} {z}\nvn {x} {y} {z}" for x, y, z in ball.vertices.tolist()]
+    corners = [f"f {a}//{a} {b}//{b} {c}//{c}" for a, b, c in (ball.faces + 1).tolist()]
+    path.write_text("\n".join(lines + corners))
+    light = LIGHTS["directional"]
+    tables = {
+        "camera": CAMERA,
+        "shapes": [{"type": "triangles", "file": path}],
+        "lights": [light | {"type": "directional"}],
+    }
+    numbers = NUMBERS | {"model": "blinn-phong", "k_a": [0.0] * 3}
+    expected = mitsuba_scene.render(tables, numbers, spp=1)
+    camera = brdf.OrthographicCamera(**{key: value for key, value in CAMERA.items() if key != "type"})
+    exponents = {}
+    for shading in (True, False):
+        shape = brdf.Triangles(brdf.load_mesh(path, smooth=shading))
+        scene = brdf.Scene(camera, [shape], lights=[brdf.DirectionalLight(**light)])
+        exponents[shading] = fitting.fit(expected, scene, model="blinn-phong", precision="float64").material.n
+        if shading:
+            got = brdf.render(brdf.BlinnPhong(k_d=NUMBERS["k_d"], k_s=NUMBERS["k_s"], n=30.0), scene)
+            inside = away_from_edges(np.asarray(scene.surface_points().mask).astype(int))
+            np.testing.assert_allclose(np.asarray(got)[inside], expected[inside], atol=1e-5)
+    np.testing.assert_allclose(exponents[True], NUMBERS["n"], rtol=0.01)
+    assert abs(exponents[False] / NUMBERS["n"] - 1) > 0.05

@@ -149,22 +149,3 @@ def test_a_mesh_casts_shadows_on_itself(tmp_path: Path):
     np.testing.assert_allclose(row[(x > -1.4) & (x < -0.6)], 0)
     np.testing.assert_allclose(row[(x > -0.4) & (x < 0.4)], lit, rtol=1e-5)
     np.testing.assert_allclose(row[x > 0.6], lit, rtol=1e-5)
-
-
-@pytest.mark.parametrize("text", ["", "v 0 0 0\n", "hello\n", "f 1 2 3\n"])
-def test_a_file_without_triangles_is_refused(tmp_path: Path, text: str):
-    pytest.importorskip("trimesh", reason="trimesh reads and intersects meshes")
-    (tmp_path / "bad.obj").write_text(text)
-    with pytest.raises(brdf.InputError, match=r"bad\.obj"):
-        brdf.load_mesh(tmp_path / "bad.obj")
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n", "vertex 0"), ("v 0 0 1e300\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "within")],
-)
-def test_meshes_that_cannot_be_used_are_refused(tmp_path: Path, text: str, words: str):
-    pytest.importorskip("trimesh", reason="trimesh reads meshes")
-    (tmp_path / "mesh.obj").write_text(text)
-    with pytest.raises(brdf.InputError, match=words):
-        brdf.load_mesh(tmp_path / "mesh.obj")
