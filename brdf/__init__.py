@@ -9,7 +9,15 @@ import lazy_loader
 
 from brdf.formatters import html as _html
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> Any:
+    if name != "__version__":
+        return _load(name)
+    import importlib.metadata
+
+    return importlib.metadata.version("brdf-fitting")
 
 
 def _material_html(material: Any) -> str:

@@ -58,3 +58,5 @@ from .rendering import render as render
 from .rendering import render_lights as render_lights
 from .scene import Scene as Scene
 from .scene import some_pixels as some_pixels
+
+__version__: str

@@ -4,6 +4,8 @@ Each turns what the user gave into a float64 array and refuses what cannot be on
 holds (arrays and tracers of a transformation) keep their type; only their shape is checked.
 """
 
+import inspect
+import textwrap
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -27,6 +29,83 @@ LARGEST = 1e15
 """Of any number of a scene: squares and products of a few of them stay within float32's 3e38."""
 
 MAX_SAMPLES = 1 << 20
+
+SHOWN, LARGE = 8, 31
+"""What is shown of things: how many of a list, arrays of up to so many numbers."""
+
+
+class _Named(type(eqx.Module)):  # pyright: ignore[reportGeneralTypeIssues]
+    """Of classes that say in one line what they take, where what they are given does not go."""
+
+    def __call__(cls, *given: Any, **named: Any) -> Any:
+        """Construct it."""
+        try:
+            return super().__call__(*given, **named)
+        except TypeError:
+            signature = inspect.signature(cls)
+            try:
+                signature.bind(*given, **named)
+            except TypeError as error:
+                needed = (name for name, one in signature.parameters.items() if one.default is one.empty)
+                remedy = f"Write {cls.__name__}({', '.join(f'{name}=...' for name in needed)})"
+                raise InputError(cls.__name__, str(error), remedy) from None
+            raise
+
+
+class Checked(eqx.Module, metaclass=_Named):
+    """What a person makes of numbers: it refuses what cannot be one of its parts, and shows them."""
+
+    def __repr__(self) -> str:
+        """Its parts, as one would write them; those that are as usual are left out."""
+        values = {
+            name: getattr(self, name)
+            for name, one in inspect.signature(type(self)).parameters.items()
+            if not (isinstance(value := getattr(self, name), tuple | int | None) and value == one.default)
+        }
+        parts = [f"{name}={shown(value)}" for name, value in values.items()]
+        inner = [one for value in values.values() for one in (value if isinstance(value, tuple) else (value,))]
+        if not any(isinstance(one, Checked) for one in inner):
+            return f"{type(self).__name__}({', '.join(parts)})"
+        lines = "".join(f"{part},\n" for part in parts)
+        return f"{type(self).__name__}(\n{textwrap.indent(lines, '    ')})"
+
+
+def shown(value: Any) -> str:
+    """A value as a person writes it: numbers to six digits, of large arrays the shape, of long lists the beginning."""
+    if isinstance(value, tuple):
+        more = f", ... {len(value) - SHOWN} more" if len(value) > SHOWN else ""
+        return f"[{', '.join(map(shown, value[:SHOWN]))}{more}]"
+    if isinstance(value, np.ndarray | jax.Array) and not isinstance(value, Tracer):
+        array = np.asarray(value)
+        if array.size > LARGE:
+            return f"<{' x '.join(map(str, array.shape))} {array.dtype}>"
+        return f"{array:.6g}" if array.ndim == 0 else shown(tuple(array))
+    return f"{value:.6g}" if isinstance(value, float | np.floating) else repr(value)
+
+
+def instance(name: str, value: Any, kind: type | tuple[type, ...], remedy: str) -> None:
+    """Refuse what is of another kind.
+
+    Args:
+        name: of the argument.
+        value: what came.
+        kind: what it must be an instance of.
+        remedy: what to write.
+
+    Raises:
+        InputError: naming the argument.
+    """
+    if not isinstance(value, kind):
+        wanted = " or ".join(one.__name__ for one in (kind if isinstance(kind, tuple) else (kind,)))
+        came = f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
+        raise InputError(name, f"must be a {wanted}, got {came}", remedy)
+
+
+def several(name: str, value: Any) -> tuple[Any, ...]:
+    """A list of things."""
+    if not isinstance(value, list | tuple):
+        raise InputError(name, f"must be a list, got {type(value).__name__}", f"Write {name}=[...]")
+    return tuple(value)
 
 
 def checked(check: Callable[[str, Any], Any], name: str, **field: Any) -> Any:

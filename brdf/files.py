@@ -68,9 +68,21 @@ def input_file(path: AnyPath) -> Path:
     return Path(path)
 
 
+def as_path(path: Any) -> Path:
+    """What a person gives as a path.
+
+    Args:
+        path: text or a `Path`.
+
+    Raises:
+        InputError: where it is something else.
+    """
+    return Path(_plain(path))
+
+
 def _plain(path: AnyPath) -> str:
     if not isinstance(path, str | os.PathLike) or not isinstance(os.fspath(path), str):
-        raise InputError(repr(path), f"a path must be text, got {type(path).__name__}", "Give the path of a file")
+        raise InputError("path", f"must be text, got {type(path).__name__}", "Give the path of a file")
     text = os.fspath(path)
     with suppress(UnicodeEncodeError):
         if text and b"\0" not in os.fsencode(text):

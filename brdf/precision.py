@@ -58,21 +58,24 @@ def cast(tree: Any, precision: Precision | None) -> Any:
         tree: any pytree; tracers keep their type where ``precision`` is None.
         precision: "float32", "float64", or None for JAX's own default.
 
+    Raises:
+        InputError: where the precision is unknown.
+
     Example:
         >>> brdf.cast(brdf.preset("gold"), "float32").n.dtype
         dtype('float32')
     """
-    default = jnp.result_type(float) if precision is None else jnp.dtype(precision)
 
     def leaf(value: Any) -> Any:
         if isinstance(value, jax.Array) and precision is None:
             return value
         array = jnp.asarray(value)
         if jnp.issubdtype(array.dtype, np.floating):
-            return array.astype(default)
+            return array.astype(jnp.result_type(float) if precision is None else precision)
         return array
 
-    return jax.tree.map(leaf, tree)
+    with working_precision(precision):  # float64 stays what it is outside of it
+        return jax.tree.map(leaf, tree)
 
 
 def apart(function: Callable[..., Any], *arguments: Any) -> Any:

@@ -16,12 +16,12 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
-from brdf.checks import Scalar
+from brdf.checks import Scalar, instance
 from brdf.errors import InputError
 from brdf.geometry.surface_points import SurfacePoints
 from brdf.lights.base import Lighting, stacked
 from brdf.lobes import LightTerms, Lobe, average, diffuse_and_lobe, sum_over_samples
-from brdf.models.base import Material, SpecularMaterial
+from brdf.models.base import Material, SpecularMaterial, check_model
 from brdf.precision import Precision, cast, working_precision
 from brdf.scene import Scene
 
@@ -95,6 +95,8 @@ def basis_images(
         >>> basis.diffuse.shape, basis.specular.shape
         ((32, 32, 3), (32, 32, 3))
     """
+    check_model(model)
+    instance("scene", scene, Scene, "Write brdf.basis_images(brdf.BlinnPhong, scene)")
     points = scene.surface_points() if points is None else points
     return _basis_images(model, points, scene.ambient, _lighting(scene, points), jnp.asarray(n))
 
@@ -220,6 +222,9 @@ def relight(images: Float[ArrayLike, "L H W C"], factors: ArrayLike) -> Float[Ar
         (32, 32, 3)
     """
     images, factors = jnp.asarray(images), jnp.asarray(factors)
+    if images.ndim != 4:
+        came = f"must be of shape (L, H, W, C), got {images.shape}"
+        raise InputError("images", came, "Give what brdf.render_lights returns")
     lights, _, _, channels = images.shape
     fits = factors.ndim in (1, 2) and factors.shape[0] == lights
     if not fits or (factors.ndim == 2 and channels != 1 and factors.shape[1] not in (1, channels)):
@@ -252,6 +257,12 @@ def _seen(scene: Scene, precision: Precision | None) -> tuple[Scene, SurfacePoin
 
 def _shape(material: Material, scene: Scene) -> tuple[int, int, int]:
     """Height, width and channels of a material's picture."""
+    words = "Write brdf.render(material, scene)"
+    instance("material", material, Material, words)
+    instance("scene", scene, Scene, words)
+    if jnp.ndim(material.k_d) != 1:
+        words = "Write jax.vmap(lambda material: brdf.render(material, scene))(materials)"
+        raise InputError("material", f"is a stack of {material.k_d.shape[0]} materials", words)
     own, lit = material.k_d.shape[0], scene.channels
     if own != lit and 1 not in (own, lit):
         came = f"has {own} channels, the light has {lit}"

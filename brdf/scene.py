@@ -1,6 +1,7 @@
 """The scene: what each pixel sees, and the light that falls on it."""
 
 import dataclasses
+import math
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -9,10 +10,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
-from brdf.checks import Spectrum, spectrum
+from brdf.checks import Checked, Spectrum, instance, several, spectrum
 from brdf.errors import InputError
+from brdf.files import as_path
 from brdf.geometry.base import Shape
 from brdf.geometry.camera import Camera
 from brdf.geometry.rays import compiled_apart, trace
@@ -29,7 +32,7 @@ def _ambient(value: Any) -> Any:
 def _masks(value: Any) -> tuple[Any, ...]:
     """Given shadow masks: (H, W) values from 0 to 1, or None, one for each light."""
     masks = []
-    for mask in value:
+    for mask in several("visibility", value):
         if mask is not None and not isinstance(mask, jax.Array):
             mask = np.asarray(mask, dtype=np.float64)
             if mask.ndim != 2:
@@ -41,7 +44,7 @@ def _masks(value: Any) -> tuple[Any, ...]:
     return tuple(masks)
 
 
-class Scene(eqx.Module):
+class Scene(Checked):
     """Camera and shapes, or surface points in their place; lights; ambient light.
 
     A scene is a pytree: every number in it can be differentiated or fitted. What a scene does not have is None or
@@ -66,14 +69,20 @@ class Scene(eqx.Module):
     """
 
     camera: Camera | None = None
-    shapes: tuple[Shape, ...] = eqx.field(converter=tuple, default=())
+    shapes: tuple[Shape, ...] = eqx.field(converter=partial(several, "shapes"), default=())
     points: SurfacePoints | None = None
     ambient: Spectrum | None = eqx.field(converter=_ambient, default=None)
-    lights: tuple[Light, ...] = eqx.field(converter=tuple, default=())
+    lights: tuple[Light, ...] = eqx.field(converter=partial(several, "lights"), default=())
     visibility: tuple[Float[Array, "H W"] | None, ...] = eqx.field(converter=_masks, default=())
 
     def __check_init__(self):
         """Refuse parts that do not belong together."""
+        words = "Write Scene(camera, shapes=[...], lights=[...])"
+        instance("camera", self.camera, (Camera, type(None)), words)
+        instance("points", self.points, (SurfacePoints, type(None)), "Use brdf.SurfacePoints.from_normals")
+        for name, parts, kind in (("shapes", self.shapes, Shape), ("lights", self.lights, Light)):
+            for index, part in enumerate(parts):
+                instance(f"{name}[{index}]", part, kind, words)
         if (self.camera is None) == (self.points is None):
             remedy = "Give either a camera and shapes, or an aov file"
             raise InputError("scene", "must have a camera or surface points, and not both", remedy)
@@ -180,7 +189,7 @@ def load_scene(path: str | Path, within: str | Path | None = None, tables: dict[
     """Read a scene file; see `Scene.load`. ``tables`` are what is in it, where it has been parsed already."""
     from brdf.scene_file import read_parts  # late: it brings the picture library
 
-    parts = read_parts(Path(path), within, tables)
+    parts = read_parts(as_path(path), within, tables)
     try:
         return Scene(**parts)
     except InputError as error:
@@ -211,6 +220,12 @@ def some_pixels(
         >>> brdf.render(brdf.preset("gold"), two).shape
         (1, 2, 3)
     """
+    count = math.prod(scene.resolution)
+    if not isinstance(pixel, Tracer):
+        pixel = np.asarray(pixel)
+        if pixel.dtype.kind not in "iu" or np.any((pixel < 0) | (pixel >= count)):
+            came = f"must be whole numbers from 0 to {count - 1}"
+            raise InputError("pixel", came, "Of a mask, give np.flatnonzero(mask)")
     pixel = pixel.reshape(1, -1) if pixel.ndim == 1 else pixel
     with working_precision(precision):
         if scene.camera is None:

@@ -3,6 +3,16 @@
 Names load when first used, so that the command's help does not import JAX; `__init__.pyi` says from where.
 """
 
+from typing import Any
+
 import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> Any:
+    if name != "__version__":
+        return _load(name)
+    import importlib.metadata
+
+    return importlib.metadata.version("brdf-fitting")

@@ -17,3 +17,5 @@ from .report.saving import load_result as load_result
 from .result import Parameter as Parameter
 from .speed_accuracy import Tradeoff as Tradeoff
 from .speed_accuracy import tradeoff as tradeoff
+
+__version__: str

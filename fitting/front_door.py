@@ -17,7 +17,7 @@ def fit(
     target: Any,
     scene: brdf.Scene | Sequence[brdf.Scene],
     *,
-    model: str = "auto",
+    model: str | type[brdf.Material] = "auto",
     precision: Precision = "float32",
     mask: Any = None,
     saturation: float | None = None,
@@ -36,7 +36,8 @@ def fit(
         target: linear values, (H, W, C) or (H, W), or a `brdf.Picture`; a `brdf.ImageReader` for a file that is larger
             than memory, which is read by bands of rows, several times (of censored noise it only warns); or a list.
         scene: what the picture shows; a list of as many where there are several pictures.
-        model: "auto" for the simplest adequate of Lambert, Phong and Blinn-Phong, or the name of a model.
+        model: "auto" for the simplest adequate of Lambert, Phong and Blinn-Phong, or a model: its class or its
+            name.
         precision: "float32" or "float64".
         mask: (H, W), pixels to look at; a list where there are several pictures.
         saturation: linear value from which on pixels are clipped and do not count. None takes the largest code of an

@@ -29,7 +29,7 @@ from brdf.lobes import Lobe
 from brdf.materials.material_file import material_to_dict
 from brdf.models.base import SpecularMaterial
 from fitting.model_fit import ModelFit
-from fitting.problem import check_choice
+from fitting.problem import check_choice, model_name
 from fitting.report.saving import write_report
 from fitting.result import Parameter, Parameters
 from fitting.solver.normal_equations import Picture
@@ -270,7 +270,7 @@ def _within(table, max_angle):
 
 def fit_brdf(
     table: brdf.MeasuredBRDF,
-    model: str = "auto",
+    model: str | type[brdf.Material] = "auto",
     *,
     loss: Loss = "cosine",
     max_angle: float = 80.0,
@@ -303,7 +303,8 @@ def fit_brdf(
     start = time.perf_counter()
     if not isinstance(table, brdf.MeasuredBRDF):
         raise InputError("table", f"must be a brdf.MeasuredBRDF, got {type(table).__name__}", "Use brdf.load_measured")
-    check_choice(model, loss, get_args(Loss), n_range)
+    model = model_name(model)
+    check_choice(loss, get_args(Loss), n_range)
     samples = _samples(table, max_angle)
     count, channels = int(np.count_nonzero(samples.solid_angle)), len(samples.channels)
     left_out, negative = samples.left_out, int(np.count_nonzero(samples.values[:count] < 0))

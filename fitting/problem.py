@@ -6,7 +6,9 @@ from collections.abc import Iterable
 from numbers import Real
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
+from jax.core import Tracer
 
 import brdf
 from brdf.errors import InputError
@@ -83,6 +85,43 @@ class FitProblem:
         return PLAUSIBLE if self.plausible else CLASSIC
 
 
+def model_name(model: Any) -> str:
+    """The name of a model that a person gives: "blinn-phong" or "BlinnPhong", or the class itself; or "auto".
+
+    Args:
+        model: name or class.
+
+    Raises:
+        InputError: where it is neither.
+    """
+    if isinstance(model, type) and issubclass(model, brdf.Material):
+        model = model.name
+    names = {_letters(name): name for name in ("auto", *brdf.MODELS)}
+    name = names.get(_letters(model)) if isinstance(model, str) else None
+    if name is None:
+        came = f"{type(model).__name__}, no name" if isinstance(model, brdf.Material) else repr(model)
+        raise InputError("model", f"is unknown, got {came}", f"Use auto or one of {', '.join(brdf.MODELS)}")
+    return name
+
+
+def _letters(name: str) -> str:
+    return "".join(filter(str.isalpha, name.lower()))
+
+
+def refuse_traced(*given: Any) -> None:
+    """Refuse what a transformation of JAX traces: a search over all pixels is a program of its own.
+
+    Args:
+        given: arguments of a fit.
+
+    Raises:
+        InputError: pointing to what can be transformed.
+    """
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(given)):
+        words = "Use fitting.sensitivity for derivatives, fitting.fit_many for batches, fitting.functional inside jax"
+        raise InputError("fit", "cannot run inside jax.grad, jax.vmap or jax.jit", words)
+
+
 def state_problem(target: Any, scene: Any, mask: Any = None, weight: Any = None, **options: Any) -> FitProblem:
     """Check what was given for one picture or for several.
 
@@ -96,6 +135,8 @@ def state_problem(target: Any, scene: Any, mask: Any = None, weight: Any = None,
     Raises:
         InputError: naming what cannot be used.
     """
+    refuse_traced(target, scene, mask, weight)
+    options |= {"model": model_name(options["model"])} if "model" in options else {}
     several = isinstance(target, list | tuple)
     targets = list(target) if several else [target]
     if not targets:
@@ -196,7 +237,8 @@ def _check_picture(target: Target, scene: brdf.Scene, problem: FitProblem) -> No
         raise InputError("target", came, "Give a picture and a camera of the same resolution")
     if scene.channels not in (1, channels):
         came = f"has {channels} channels, the scene's light {scene.channels}"
-        raise InputError("target", came, "Give both the same number of channels")
+        remedy = "Give both the same number of channels; light of one serves every picture"
+        raise InputError("target", came, remedy)
     if target.streamed and problem.noise is not None:
         remedy = "Give the picture in memory, or weight in place of noise"
         raise InputError("noise", "needs the whole picture at once, the target is read by bands", remedy)
@@ -216,11 +258,10 @@ def has_pixel_areas(scene: brdf.Scene) -> bool:
     return scene.points is not None and scene.points.area is not None
 
 
-def check_choice(model: str, loss: str, losses: Iterable[str], n_range: tuple[float, float]) -> None:
-    """Refuse what is no model, no loss and no range of exponents.
+def check_choice(loss: str, losses: Iterable[str], n_range: tuple[float, float]) -> None:
+    """Refuse what is no loss and no range of exponents.
 
     Args:
-        model: "auto" or the name of a model.
         loss: its name.
         losses: the names that there are.
         n_range: bounds of the exponent.
@@ -228,8 +269,6 @@ def check_choice(model: str, loss: str, losses: Iterable[str], n_range: tuple[fl
     Raises:
         InputError: naming the argument.
     """
-    if model != "auto" and model not in brdf.MODELS:
-        raise InputError("model", f"is unknown, got {model!r}", f"Use auto or one of {', '.join(brdf.MODELS)}")
     if loss not in losses:
         raise InputError("loss", f"is unknown, got {loss!r}", f"Use one of {', '.join(losses)}")
     try:
@@ -242,7 +281,7 @@ def check_choice(model: str, loss: str, losses: Iterable[str], n_range: tuple[fl
 
 def _check_options(problem: FitProblem) -> None:
     model = problem.model
-    check_choice(model, problem.loss, LOSSES, problem.n_range)
+    check_choice(problem.loss, LOSSES, problem.n_range)
     if problem.plausible and model in CLASSIC:
         remedy = f"Use auto, normalized-{model}, or a normalised form of your choice"
         raise InputError("model", f"{model} is neither reciprocal nor energy conserving, so never plausible", remedy)

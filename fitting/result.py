@@ -96,7 +96,7 @@ class Parameters:
         parameters: value and error of each number.
     """
 
-    parameters: tuple[Parameter, ...]
+    parameters: Any
 
     def __getitem__(self, name: str) -> Any:
         """The `Parameter` "n" or "k_d[0]"; of "k_d" the tuple of them, one for each channel.

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from brdf.checks import Scalar, Vector
+from brdf.checks import Checked, Scalar, Vector
 
 
 class Hit(NamedTuple):
@@ -28,7 +28,7 @@ class Hit(NamedTuple):
     shading: Vector | None = None
 
 
-class Shape(eqx.Module):
+class Shape(Checked):
     """A surface that a ray can hit.
 
     Attributes:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from brdf.checks import Scalar, Vector, checked, direction_value, number, positive, sample_number, vector
+from brdf.checks import Checked, Scalar, Vector, checked, direction_value, number, positive, sample_number, vector
 from brdf.errors import InputError
 from brdf.vectors import Numbers, Vectors, normalize
 
@@ -40,7 +40,7 @@ def _viewer(value: Any) -> str | None:
     return value
 
 
-class Camera(eqx.Module):
+class Camera(Checked):
     """Where the picture is taken from. Pixel centres lie at half-integers, row 0 is the top.
 
     Attributes:

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from brdf.checks import LARGEST, Scalar, Vector
+from brdf.checks import LARGEST, Scalar, Vector, instance
 from brdf.errors import InputError
 from brdf.files import parse_number, read_text
 from brdf.geometry.base import Hit, Shape
@@ -191,10 +191,10 @@ def load_mesh(path: str | os.PathLike[str], *, smooth: bool = True) -> Mesh:
 def _corner(word: str, vertices: int, normals: int) -> tuple[int, int]:
     """Indices from 0 of the vertex and the normal that a corner such as 3, 3/1, 3//2 or -1 names; -1 for none."""
     vertex, _, rest = word.partition("/")
-    found = [int(vertex), int(rest.partition("/")[2] or 0)]
-    if not found[0]:
+    place, normal = int(vertex), int(rest.partition("/")[2] or 0)
+    if not place:
         raise ValueError("there is no vertex 0, they count from 1")
-    return tuple(one - 1 if one >= 0 else count + one for one, count in zip(found, (vertices, normals), strict=True))
+    return place - 1 if place > 0 else vertices + place, normal - 1 if normal >= 0 else normals + normal
 
 
 def rounded(mesh: Mesh) -> Float[np.ndarray, "F 3 3"]:
@@ -248,6 +248,10 @@ class Triangles(Shape):
     """
 
     mesh: Mesh = eqx.field(static=True)
+
+    def __check_init__(self):
+        """Refuse what is no mesh."""
+        instance("mesh", self.mesh, Mesh, 'Write Triangles(brdf.load_mesh("mesh.obj"))')
 
     @property
     def convex(self) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 import OpenImageIO as oiio  # noqa: N813
 
 from brdf.errors import InputError
-from brdf.files import AnyPath, atomic_path, utf8_name
+from brdf.files import AnyPath, as_path, atomic_path, utf8_name
 from brdf.images.damage import MOST_CHANNELS
 from brdf.images.encoding import Encoding, encode, parse_encoding
 from brdf.images.reading import said
@@ -114,7 +114,7 @@ def _endings(count: int, three: str) -> list[str]:
 
 
 def _format(path: AnyPath, dtype: str | None) -> tuple[str, str]:
-    suffix = Path(path).suffix.lower()
+    suffix = as_path(path).suffix.lower()
     if suffix not in _WRITABLE:
         raise InputError(path, f"{suffix or 'no suffix'} is no image format", f"Use one of {' '.join(_WRITABLE)}")
     kinds = _WRITABLE[suffix]

@@ -19,7 +19,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
-from brdf.checks import Scalar, Spectrum, Vector
+from brdf.checks import Checked, Scalar, Spectrum, Vector
 from brdf.geometry.base import Shape
 from brdf.geometry.surface_points import SurfacePoints
 
@@ -46,7 +46,7 @@ class LightSample(NamedTuple):
     lobe_only: Scalar | None = None
 
 
-class Light(eqx.Module):
+class Light(Checked):
     """A source of light.
 
     Attributes:

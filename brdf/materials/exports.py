@@ -28,6 +28,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from jaxtyping import Float
 
+from brdf.checks import instance
 from brdf.conversions import (
     mirror_from_half,
     nearest_classic,
@@ -36,7 +37,7 @@ from brdf.conversions import (
     slope_from_exponent,
 )
 from brdf.errors import InputError
-from brdf.files import write_text
+from brdf.files import as_path, write_text
 from brdf.images.encoding import decode, encode
 from brdf.materials.material_file import to_json
 from brdf.materials.mtl import half_exponent, height, to_mtl
@@ -77,6 +78,7 @@ def export_material(material: Material, to: str, *, name: str = "fitted") -> Exp
         >>> export.losses[0]
         'k_a is left out: the format has no ambient coefficient'
     """
+    instance("material", material, Material, "Write brdf.export_material(material, to)")
     if to not in EXPORTS:
         raise InputError("to", f"is unknown, got {to!r}", f"Use one of {', '.join(EXPORTS)}")
     channels = np.asarray(material.k_d).size
@@ -105,7 +107,7 @@ def save_export(material: Material, path: str | Path, *, to: str | None = None, 
         >>> brdf.save_export(brdf.preset("gold"), "gold.gltf").losses[0]
         'k_a is left out: the format has no ambient coefficient'
     """
-    suffix = Path(path).suffix.lower()
+    suffix = as_path(path).suffix.lower()
     if to is None and suffix not in _SUFFIXES:
         remedy = f"Name it {' '.join(_SUFFIXES)} or say which of {', '.join(EXPORTS)} you want"
         raise InputError(path, f"does not say its format, got {suffix or 'no suffix'}", remedy)

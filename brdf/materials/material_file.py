@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from brdf.checks import instance
 from brdf.errors import InputError
-from brdf.files import read_text, write_text
+from brdf.files import as_path, read_text, write_text
 from brdf.materials.mtl import SHOWN, material_from_mtl, read_mtl, to_mtl
 from brdf.models import MODELS, Material
 
@@ -77,6 +78,7 @@ def save_material(material: Material, path: str | Path, *, undetermined: Collect
     Example:
         >>> brdf.save_material(brdf.preset("gold"), "gold.mtl")
     """
+    instance("material", material, Material, "Write brdf.save_material(material, path)")
     channels = material.k_d.shape[0]
     if _suffix(path, "Name it .json or .mtl") == ".json":
         text = to_json(material, undetermined=undetermined)
@@ -162,7 +164,7 @@ def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _suffix(path: str | Path, remedy: str) -> str:
-    suffix = Path(path).suffix.lower()
+    suffix = as_path(path).suffix.lower()
     if suffix not in (".json", ".mtl"):
         raise InputError(path, f"is no material file, got {suffix or 'no suffix'}", remedy)
     return suffix
@@ -170,7 +172,7 @@ def _suffix(path: str | Path, remedy: str) -> str:
 
 def _entries(path: str | Path) -> dict[str, Any]:
     """What a file says of each of its materials, by name."""
-    if Path(path).is_dir():
+    if as_path(path).is_dir():
         path = Path(path) / "material.json"
     suffix, text = _suffix(path, "Give a .json or .mtl file"), read_text(path, _MOST_BYTES)
     if suffix == ".mtl":

@@ -19,18 +19,17 @@ from abc import abstractmethod
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from brdf import formatters, vectors
-from brdf.checks import Parameter, coefficients, exponent
+from brdf.checks import Checked, Parameter, coefficients, exponent
+from brdf.errors import InputError
 from brdf.vectors import Directions, Numbers, Scalars
 
 
-class Material(eqx.Module):
+class Material(Checked):
     """What the five models share: ambient and diffuse coefficients, and how to ask for the reflection.
 
     Attributes:
@@ -79,10 +78,6 @@ class Material(eqx.Module):
         Returns:
             (..., C), at least 0; 0 where either direction is not above the horizon.
         """
-
-    def __repr__(self) -> str:
-        """Model and numbers, as one would write them."""
-        return f"{type(self).__name__}({', '.join(f'{k}={_text(v)}' for k, v in vars(self).items())})"
 
     def _repr_html_(self) -> str | None:
         """For Jupyter: a lit sphere and the numbers; nothing while JAX traces them."""
@@ -151,8 +146,12 @@ class SpecularMaterial(Material):
         return jnp.where(above, self.scale(self.n) * lobe, 0.0)
 
 
-def _text(value: Any) -> str:
-    if isinstance(value, np.ndarray | jax.Array) and not isinstance(value, Tracer):
-        value = np.asarray(value)
-        return f"{value:.6g}" if value.ndim == 0 else f"[{', '.join(f'{v:.6g}' for v in value)}]"
-    return str(value)
+def check_model(model: Any) -> None:
+    """Refuse what is not the class of a material.
+
+    Raises:
+        InputError: where it is a material, a name or anything else.
+    """
+    if not (isinstance(model, type) and issubclass(model, Material)):
+        came = model if isinstance(model, str) else type(model).__name__
+        raise InputError("model", f"must be the class of a material, got {came}", "Write for example brdf.BlinnPhong")

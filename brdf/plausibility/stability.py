@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from brdf.models import Material, SpecularMaterial
+from brdf.models.base import check_model
 
 EXPONENTS = np.array([0.0, 1e-3, 0.1, 0.5, 1.0, 2.0, 5.0, *np.geomspace(10.0, 1e8, 15)])
 ANGLES = np.array([*np.arange(0.0, 85.0, 5.0), 85.0, 87.0, 88.0, 89.0, 89.5, 89.9, 89.99, 89.999, 90.0])
@@ -53,6 +54,7 @@ def stability_map(
         >>> bool(errors.max() < 1e-5)
         True
     """
+    check_model(model)
 
     def value(n: Array, vectors: Float[Array, "3 3"]) -> Array:
         """The specular term, then f_r."""

@@ -39,6 +39,7 @@ def check(brdf: Material | MeasuredBRDF | Callable[[Any, Any], Any], *, name: st
         return check_black_box(brdf.reflectance, name or repr(brdf))
     if isinstance(brdf, MeasuredBRDF):
         return check_table(brdf, name)
-    if not callable(brdf):
-        raise InputError("brdf", f"must be a material or a function, got {type(brdf).__name__}")
+    if isinstance(brdf, type) or not callable(brdf):
+        came = f"the class {brdf.__name__}" if isinstance(brdf, type) else type(brdf).__name__
+        raise InputError("brdf", f"must be a material or a function, got {came}", "Give one with numbers")
     return check_black_box(brdf, name or getattr(brdf, "__name__", type(brdf).__name__))

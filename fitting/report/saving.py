@@ -11,7 +11,7 @@ import numpy as np
 
 import brdf
 from brdf.errors import InputError
-from brdf.files import atomic_folder, read_text, write_text
+from brdf.files import as_path, atomic_folder, read_text, write_text
 from brdf.materials.material_file import material_from_dict
 from fitting.budget.choice import Attempt, BudgetChoice
 from fitting.result import FitResult, Parameter
@@ -123,7 +123,8 @@ def load_result(folder: str | Path) -> FitResult:
         >>> round(float(result["n"]), 2), result.targets[0].shape
         (51.2, (32, 32, 3))
     """
-    path = Path(folder) if Path(folder).suffix.lower() == ".json" else Path(folder) / "fit.json"
+    path = as_path(folder)
+    path = path if path.suffix.lower() == ".json" else path / "fit.json"
     folder = path.parent
     try:
         values = json.loads(read_text(path))
