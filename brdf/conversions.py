@@ -189,21 +189,35 @@ def nearest_classic(material: Material) -> Material:
 
 
 def _nearest(material: SpecularMaterial, model: type[SpecularMaterial], *, bounded: bool) -> SpecularMaterial:
+    n = float(np.asarray(material.n))
+    gram, cross = nearest_equations(type(material), model, n)
+    k_d, k_s = np.asarray(material.k_d, np.float64), np.asarray(material.k_s, np.float64)
+    pairs = np.array([_constrained(gram, gram[:, 0] * d + cross * s, bounded) for d, s in zip(k_d, k_s, strict=True)])
+    return model(k_a=material.k_a, k_d=pairs[:, 0], k_s=pairs[:, 1], n=n)
+
+
+def nearest_equations(
+    given: type[SpecularMaterial], model: type[SpecularMaterial], n: float
+) -> tuple[Float[np.ndarray, "2 2"], Float[np.ndarray, " 2"]]:
+    """The normal equations of the nearest k_d and k_s: gram x = gram[:, 0] k_d + cross k_s.
+
+    Args:
+        given: the form that k_d and k_s are of.
+        model: the form that is wanted.
+        n: the exponent, which both have.
+    """
     # Light is uniform over the hemisphere, the view in proportion to N.V, as a sphere shows it to a far camera. Then
     # every entry of the normal equations is an integral over the light's angle of an albedo of exponent n or 2 n.
     nodes, weights = gauss_legendre(_NODES)
     theta = 0.5 * np.pi * nodes
-    weights, cosine, n = weights * np.sin(theta), np.cos(theta), float(np.asarray(material.n))
+    weights, cosine = weights * np.sin(theta), np.cos(theta)
     plain = Phong if normalized_form(model) is NormalizedPhong else BlinnPhong
     with working_precision("float64"):
         single, double = (np.asarray(lobe_albedo(plain, jnp.asarray(m), jnp.asarray(theta))) for m in (n, 2 * n))
-        to, of = (float(m.scale(n)) * (cosine if m.cosine_weighted else 1.0) for m in (model, type(material)))
+        to, of = (float(m.scale(n)) * (cosine if m.cosine_weighted else 1.0) for m in (model, given))
     mixed, pure = np.sum(weights * cosine * to * single), np.sum(weights * to * to * double)
     gram = np.array([[np.sum(weights * cosine**2), mixed], [mixed, pure]])
-    cross = np.array([np.sum(weights * cosine * of * single), np.sum(weights * to * of * double)])
-    k_d, k_s = np.asarray(material.k_d, np.float64), np.asarray(material.k_s, np.float64)
-    pairs = np.array([_constrained(gram, gram[:, 0] * d + cross * s, bounded) for d, s in zip(k_d, k_s, strict=True)])
-    return model(k_a=material.k_a, k_d=pairs[:, 0], k_s=pairs[:, 1], n=n)
+    return gram, np.array([np.sum(weights * cosine * of * single), np.sum(weights * to * of * double)])
 
 
 def _constrained(gram: Float[np.ndarray, "2 2"], right: Float[np.ndarray, " 2"], bounded: bool) -> np.ndarray:

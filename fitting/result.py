@@ -257,6 +257,17 @@ class FitResult(Parameters):
         """
         return REPORTS["plot"](self, picture)
 
+    def view(self, picture: int | None = None) -> Any:
+        """A page that turns: the surface in WebGL2, with its numbers, light and view to move.
+
+        Args:
+            picture: which of the pictures, from 0; None takes the one that is explained worst.
+
+        Returns:
+            A page, which Jupyter shows without a kernel and ``.save("page.html")`` writes: one file, no network.
+        """
+        return REPORTS["view"](self, picture)
+
 
 def free_parameters(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
     """Those of a material's parameters that are determined and at no bound.

@@ -249,29 +249,40 @@ float brdf_lobe(vec3 normal, vec3 to_light, vec3 to_view) {
 """)
 
 
+def shader(model: type[Material], declarations: str) -> str:
+    """The formula of a model in GLSL: brdf_ambient and brdf_light.
+
+    Args:
+        model: one of the five models.
+        declarations: of ``BRDF_K_A``, ``BRDF_K_D`` and, where there is a lobe, ``BRDF_K_S``, ``BRDF_N`` and
+            ``BRDF_SCALE``: constants, uniforms, or globals that the shader sets for each pixel.
+    """
+    lobe, reflected = "", "    return intensity * BRDF_K_D * cosine;"
+    if issubclass(model, SpecularMaterial):
+        first, second = "normal", "to_light + to_view"
+        if issubclass(model, Phong | NormalizedPhong):
+            first, second = "2.0 * dot(normal, to_light) * normal - to_light", "to_view"
+        lobe = _SHADER_LOBE.substitute(first=first, second=second)
+        weight = " * cosine" if model.cosine_weighted else ""
+        reflected = f"    float lobe = brdf_lobe(normal, to_light, to_view){weight};\n"
+        reflected += "    return intensity * (BRDF_K_D * cosine + BRDF_K_S * lobe);"
+    return _SHADER.substitute(model=model.name, constants=declarations, lobe=lobe, reflected=reflected)
+
+
 def _glsl(material: Material, name: str) -> Written:
     def number(value: float) -> str:
         text = f"{value:.9g}"
         return text if "." in text or "e" in text else text + ".0"
 
-    numbers, lobe, reflected = {}, "", "    return intensity * BRDF_K_D * cosine;"
-    if isinstance(material, SpecularMaterial):
-        numbers = {"N": float(material.n), "SCALE": height(material)}
-        first, second = "normal", "to_light + to_view"
-        if isinstance(material, Phong | NormalizedPhong):
-            first, second = "2.0 * dot(normal, to_light) * normal - to_light", "to_view"
-        lobe = _SHADER_LOBE.substitute(first=first, second=second)
-        weight = " * cosine" if material.cosine_weighted else ""
-        reflected = f"    float lobe = brdf_lobe(normal, to_light, to_view){weight};\n"
-        reflected += "    return intensity * (BRDF_K_D * cosine + BRDF_K_S * lobe);"
     constants = [
         f"const vec3 BRDF_{key.upper()} = vec3({', '.join(map(number, _rgb(getattr(material, key))))});"
         for key in ("k_a", "k_d", "k_s")
         if hasattr(material, key)
     ]
-    constants += [f"const float BRDF_{key} = {number(value)};" for key, value in numbers.items()]
-    shader = {"model": material.name, "constants": "\n".join(constants), "lobe": lobe, "reflected": reflected}
-    return _SHADER.substitute(shader), []
+    if isinstance(material, SpecularMaterial):
+        numbers = {"N": float(material.n), "SCALE": height(material)}
+        constants += [f"const float BRDF_{key} = {number(value)};" for key, value in numbers.items()]
+    return shader(type(material), "\n".join(constants)), []
 
 
 # -- three.js ----------------------------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ makes a result takes the class from here, and a pickled one names the package, w
 
 from typing import Any
 
-from fitting.report import html, saving, text
+from fitting.report import html, saving, text, viewer
 from fitting.result import REPORTS, FitResult
 
 __all__ = ["FitResult"]
@@ -18,5 +18,5 @@ def _plot(result: FitResult, picture: int | None) -> Any:
     return comparison(result, picture)
 
 
-REPORTS |= {"text": text.report, "html": html.result_html, "save": saving.save, "plot": _plot}
+REPORTS |= {"text": text.report, "html": html.result_html, "save": saving.save, "plot": _plot, "view": viewer.view}
 FitResult.__module__ = "fitting"

@@ -1,7 +1,7 @@
 """A fit as HTML: a table for Jupyter, and a page of its own that needs no network.
 
-The page holds numbers with their intervals, warnings, pictures, plausibility, and how it was made. A content policy in
-its head forbids it to load anything, so that it shows the same in twenty years and may be opened from a mail.
+The page holds the surface to turn, numbers with their intervals, warnings, pictures, plausibility, and how it was made.
+A content policy in its head forbids it to load anything, so that it shows the same in twenty years.
 """
 
 import base64
@@ -17,20 +17,10 @@ import brdf
 from brdf.channels import channel_names
 from brdf.display import material_html, report_html
 from fitting.report.text import standing
+from fitting.report.viewer import secure_page, viewer
 from fitting.result import NOT_DETERMINED, FitResult
 
-_STYLE = """
-:root { color-scheme: light dark; }
-body { font: 16px/1.45 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; }
-h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2rem; border-bottom: 1px solid #8888; }
-.wide { overflow-x: auto; } table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-th, td { padding: 0.15em 0.6em; text-align: right; border-bottom: 1px solid #8884; }
-img { max-width: 100%; height: auto; background: white; }
-.warning { border-left: 4px solid #d55e00; padding: 0.3em 0.8em; margin: 0.6em 0; }
-pre { overflow-x: auto; background: #8882; padding: 0.6em; }
-"""
 SENTENCE = 45  # letters, from which on the text in a cell is broken over lines
-_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 
 
 def result_html(result: FitResult) -> str:
@@ -52,12 +42,12 @@ def report_page(result: FitResult, *, source: str = "", command: str = "") -> st
         command: how it was made.
 
     Returns:
-        The page's text; it loads nothing and runs no program.
+        The page's text; it loads nothing and runs no program but the viewer's.
     """
     from fitting.report.material_plots import overview  # Matplotlib takes long to load
 
     check = brdf.check(result.material, name=result.material.name)
-    title = html.escape(f"{result.surface} fitted to {source or 'a picture'}")
+    title = f"{result.surface} fitted to {source or 'a picture'}"
     summary = f"Residual {100 * result.residual:.3g} % of the picture (rms) over {result.pixels} pixels."
     left_out = [f"{count} pixels {reason}" for reason, count in result.left_out.items() if count]
     summary += f" Left out: {', '.join(left_out)}." if left_out else ""
@@ -70,14 +60,12 @@ def report_page(result: FitResult, *, source: str = "", command: str = "") -> st
         "with": _versions(),
     }
     alternative = "target, fit, residual, the highlight enlarged, a scanline through it, and the profile of n"
-    return f"""<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{_POLICY}">
-<meta name="viewport" content="width=device-width, initial-scale=1"><title>{title}</title><style>{_STYLE}</style></head>
-<body>
-<h1>{title}</h1>
+    body = f"""<h1>{html.escape(title)}</h1>
 {material_html(result.material)}
 <p>{html.escape(summary)}</p>
 {_warnings(result)}
+<h2>The surface, to turn</h2>
+{viewer(result)}
 <h2>Numbers</h2>
 {_numbers(result)}
 <h2>Pictures</h2>
@@ -88,9 +76,8 @@ def report_page(result: FitResult, *, source: str = "", command: str = "") -> st
 {_picture(overview(result.material, check), "a lit sphere, the lobe, the albedo and the reciprocity error")}
 <h2>How it was made</h2>
 {_table([[key, value] for key, value in made.items() if value])}
-<details><summary>The report as text</summary><pre class="wide">{html.escape(str(result))}</pre></details>
-</body></html>
-"""
+<details><summary>The report as text</summary><pre class="wide">{html.escape(str(result))}</pre></details>"""
+    return secure_page(title, body)
 
 
 def _numbers(result):

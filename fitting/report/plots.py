@@ -52,10 +52,7 @@ def comparison(result: "FitResult", picture: int | None = None) -> Figure:
         InputError: where there is no such picture.
     """
     count, why = len(result.targets), " (explained worst)" if picture is None else ""
-    if picture is None:
-        picture = max(range(count), key=lambda index: _unexplained(result, index))
-    if not 0 <= picture < count:
-        raise InputError("picture", f"must be from 0 to {count - 1}, got {picture}", "Count the pictures from 0")
+    picture = shown_picture(result, picture)
     file = result.files[picture] if result.files else None
     name = "" if file is None else Path(file["path"]).name
     title = name if count == 1 else f"picture {picture + 1} of {count}{', ' if name else ''}{name}{why}"
@@ -89,6 +86,24 @@ def comparison(result: "FitResult", picture: int | None = None) -> Figure:
         columns = slice(0, target.shape[1])
     _scanline(panels["scanline"], target, fitted, counted, row, columns)
     return figure
+
+
+def shown_picture(result: "FitResult", picture: int | None) -> int:
+    """Which of a fit's pictures is shown.
+
+    Args:
+        result: of a fit.
+        picture: from 0; None takes the one that is explained worst.
+
+    Raises:
+        InputError: where there is no such picture.
+    """
+    count = len(result.targets)
+    if picture is None:
+        return max(range(count), key=lambda index: _unexplained(result, index)) if count > 1 else 0
+    if not 0 <= picture < count:
+        raise InputError("picture", f"must be from 0 to {count - 1}, got {picture}", "Count the pictures from 0")
+    return picture
 
 
 def _unexplained(result, picture):

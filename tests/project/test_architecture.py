@@ -32,8 +32,8 @@ fitting.cli
 # What fitting needs of brdf and no user calls.
 OPEN_TO_FITTING = set(
     """
-brdf.albedo brdf.channels brdf.display brdf.errors brdf.files brdf.images.encoding brdf.lobes
-    brdf.materials.material_file brdf.measured.loading brdf.models.base brdf.plausibility.numeric
+brdf.albedo brdf.channels brdf.conversions brdf.display brdf.errors brdf.files brdf.images.encoding brdf.lobes
+    brdf.materials.exports brdf.materials.material_file brdf.measured.loading brdf.models.base brdf.plausibility.numeric
     brdf.plausibility.report brdf.plausibility.stability brdf.precision brdf.rendering brdf.scene
 """.split()
 )

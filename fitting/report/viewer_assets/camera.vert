@@ -1,0 +1,24 @@
+// Triangles of a mesh, or one triangle over the whole canvas where every pixel finds its own hit.
+uniform vec2 size, middle;
+uniform float pitch, depth_of_pivot;
+uniform bool perspective;
+uniform vec3 axis_point, right, up, forward;
+#ifdef MESH
+in vec3 corner, corner_normal, corner_front;
+out vec3 position, shading;
+flat out vec3 front;
+
+void main() {
+    position = corner;
+    shading = corner_normal;
+    front = corner_front;
+    vec3 offset = corner - axis_point;
+    float w = perspective ? dot(offset, forward) + depth_of_pivot : 1.0;
+    vec2 reach = 0.5 * pitch * size;
+    gl_Position = vec4((vec2(dot(offset, right), dot(offset, up)) - middle * w) / reach, 0.0, w);
+}
+#else
+void main() {
+    gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0);
+}
+#endif
