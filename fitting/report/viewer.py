@@ -236,10 +236,10 @@ def _scene(scene: brdf.Scene, chosen: list[int]) -> tuple[dict[str, Any], list[s
             shapes["rectangles"].append([home(shape.center), *edges, shape.fitted])
         elif isinstance(shape, brdf.Triangles):
             corners = (shape.mesh.vertices[shape.mesh.faces] - pivot) / unit
-            fronts = np.repeat(shape.mesh.front[:, None], 3, axis=1)
-            normals = fronts if shape.mesh.normals is None else shape.mesh.normals
-            values = {"corners": corners, "normals": normals, "fronts": fronts}
-            shapes["meshes"].append({key: _packed(one) for key, one in values.items()} | {"fitted": shape.fitted})
+            flat = shape.mesh.normals is None
+            normals = np.repeat(shape.mesh.front[:, None], 3, axis=1) if flat else shape.mesh.normals
+            mesh = {"corners": _packed(corners), "normals": _packed(normals), "fitted": shape.fitted}
+            shapes["meshes"].append(mesh)
     lights = [_light(light, home, chosen) for light in scene.lights if light.type_name in _KINDS]
     missing = sorted({light.type_name for light in scene.lights if light.type_name not in _KINDS})
     notes = [f"A light of the type {kind} is not drawn: it has an extent." for kind in missing]

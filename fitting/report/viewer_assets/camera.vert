@@ -4,14 +4,12 @@ uniform float pitch, depth_of_pivot;
 uniform bool perspective;
 uniform vec3 axis_point, right, up, forward;
 #ifdef MESH
-in vec3 corner, corner_normal, corner_front;
-out vec3 position, shading;
-flat out vec3 front;
+in vec3 corner, corner_a, corner_b, corner_c, normal_a, normal_b, normal_c;
+flat out vec3 a, b, c, of_a, of_b, of_c;  // the triangle whole: what lies between is found per pixel, exactly
 
 void main() {
-    position = corner;
-    shading = corner_normal;
-    front = corner_front;
+    a = corner_a, b = corner_b, c = corner_c;
+    of_a = normal_a, of_b = normal_b, of_c = normal_c;
     vec3 offset = corner - axis_point;
     float w = perspective ? dot(offset, forward) + depth_of_pivot : 1.0;
     vec2 reach = 0.5 * pitch * size;

@@ -101,8 +101,7 @@ void nearer(inout Hit best, float along, float start, vec3 position, vec3 normal
 }
 
 #ifdef MESH
-in vec3 position, shading;
-flat in vec3 front;
+flat in vec3 a, b, c, of_a, of_b, of_c;
 #endif
 
 void main() {
@@ -116,8 +115,13 @@ void main() {
     const float FAR = 1e4;
     Hit best = Hit(FAR, vec3(0.0), vec3(0.0, 0.0, 1.0), false);
 #ifdef MESH
-    vec3 normal = dot(ray, front) < 0.0 ? normalize(shading) : front;
-    best = Hit(dot(position - start, ray), position, normal, mesh_fitted);
+    vec3 area = cross(b - a, c - a);
+    float slope = dot(ray, area), along = dot(a - start, area) / slope;
+    vec3 position = start + along * ray;
+    float second = dot(cross(position - a, c - a), area) / dot(area, area);
+    float third = dot(cross(b - a, position - a), area) / dot(area, area);
+    vec3 shading = (1.0 - second - third) * of_a + second * of_b + third * of_c;
+    best = Hit(along, position, normalize(slope < 0.0 ? shading : area), mesh_fitted);
 #else
     for (int i = 0; i < spheres; i++) {
         vec3 to_start = start - sphere[i].xyz;

@@ -91,7 +91,7 @@
       gl.attachShader(made, part);
       if (!gl.getShaderParameter(part, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(part));
     }
-    ["corner", "corner_normal", "corner_front"].forEach((key, i) => gl.bindAttribLocation(made, i, key));
+    ["corner", "corner_a", "corner_b", "corner_c", "normal_a", "normal_b", "normal_c"].forEach((key, i) => gl.bindAttribLocation(made, i, key));
     gl.linkProgram(made);
     if (!gl.getProgramParameter(made, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(made));
     const places = {};
@@ -121,17 +121,22 @@
       gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, width, height, 0, gl.RGBA, gl.FLOAT, values);
     }
     meshes = await Promise.all(data.meshes.map(async (mesh) => {
+      const [corners, normals] = [await floats(mesh.corners), await floats(mesh.normals)];
       const vertices = gl.createVertexArray();
       gl.bindVertexArray(vertices);
-      let count = 0;
-      for (const [index, text] of [mesh.corners, mesh.normals, mesh.fronts].entries()) {
-        const values = await floats(text);
-        gl.bindVertexArray(vertices);
-        gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
-        gl.bufferData(gl.ARRAY_BUFFER, values, gl.STATIC_DRAW);
-        gl.enableVertexAttribArray(index);
-        gl.vertexAttribPointer(index, 3, gl.FLOAT, false, 0, 0);
-        count = values.length / 3;
+      const count = corners.length / 3;
+      const values = new Float32Array(21 * count); // a corner, and with it its triangle's three and their normals
+      for (let i = 0; i < count; i++) {
+        const face = 9 * Math.floor(i / 3);
+        values.set(corners.subarray(3 * i, 3 * i + 3), 21 * i);
+        values.set(corners.subarray(face, face + 9), 21 * i + 3);
+        values.set(normals.subarray(face, face + 9), 21 * i + 12);
+      }
+      gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+      gl.bufferData(gl.ARRAY_BUFFER, values, gl.STATIC_DRAW);
+      for (let i = 0; i < 7; i++) {
+        gl.enableVertexAttribArray(i);
+        gl.vertexAttribPointer(i, 3, gl.FLOAT, false, 84, 12 * i);
       }
       gl.bindVertexArray(null);
       return { vertices, count, fitted: mesh.fitted };
