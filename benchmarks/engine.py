@@ -19,7 +19,6 @@ from typing import Any
 import jax
 import numpy as np
 
-import brdf
 from brdf.lobes import Lobe
 from fitting.solver import normal_equations, profile, refinement, subsample
 from fitting.solver.normal_equations import Picture
@@ -63,7 +62,7 @@ def on_device(n_dot_l: np.ndarray, log_cos: np.ndarray, target: np.ndarray, dtyp
     """The arrays of the engine."""
     with jax.enable_x64(True):
         kept = [jax.device_put(a.astype(dtype)) for a in (np.ones((log_cos.size, 1, 1)), log_cos[:, None])]
-        lobe = Lobe(brdf.BlinnPhong, (tuple(kept),))
+        lobe = Lobe.of_terms((tuple(kept),))
         return Picture(*(jax.device_put(a.astype(dtype)) for a in (target, n_dot_l[:, None])), lobe)
 
 
@@ -108,15 +107,12 @@ def parts(picture: Picture, repeats: int) -> None:
 
     for module, name in [
         (profile, "subsample"),
-        (subsample, "_octaves"),
-        (profile, "rough_model"),
-        (profile, "profile_on_grid"),
-        (profile, "sampling_errors"),
-        (profile, "spread"),
-        (profile, "enclose"),
+        (subsample, "_lobes"),
+        (profile, "_sampling_errors"),
         (profile, "gauss_newton"),
+        (profile, "solve_linear"),
         (refinement, "solve_linear"),
-        (normal_equations, "_each"),
+        (normal_equations, "_pass"),
         (normal_equations, "_unpack"),
     ]:
         timed(module, name)

@@ -4,6 +4,7 @@ Renderer and fit share it. Many samples never mean many images in memory: the pa
 are taken tile by tile, which also keeps a tile in the processor's cache while its samples pass.
 """
 
+import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -103,19 +104,20 @@ def sum_over_samples(
     lighting: Lighting,
     of_terms: Callable[[LightTerms], Any],
     *,
-    combine: Any = jnp.add,
-    start: float = 0.0,
+    combine: Callable[[Any, Any], Any] | None = None,
+    start: Any = None,
 ) -> Any:
     """Combine a function of one sample's terms at one point over all samples, for (P,) points.
 
-    ``combine`` makes one value of two and begins with ``start``. No more than one sample's images are held at a time.
+    ``combine`` makes one value of two and begins with ``start``, of the same structure; without them they are added. No
+    more than one sample's images are held at a time.
     """
-    few = lighting.samples <= STORED_SAMPLES
+    few, combine = lighting.samples <= STORED_SAMPLES, combine or partial(jax.tree.map, jnp.add)
 
     def at_point(point: SurfacePoints) -> Any:
         def add(kind: type[Light], total: Any, sample: tuple[Any, Any]) -> tuple[Any, None]:
             value = of_terms(light_terms(model, lighting.occluders, kind, *sample, point))
-            return (value if total is None else jax.tree.map(combine, total, value)), None
+            return (value if total is None else combine(total, value)), None
 
         total = None
         if few:
@@ -125,7 +127,8 @@ def sum_over_samples(
         # a sum is as wide as the widest of its parts
         firsts = [(stack.kind, jax.tree.map(lambda values: values[0], stack.rows())) for stack in lighting.stacks]
         shapes = [jax.eval_shape(partial(add, kind, None), first)[0] for kind, first in firsts]
-        total = jax.tree.map(partial(_filled, start), *shapes)
+        begin = jax.tree.map(lambda _: 0.0, shapes[0]) if start is None else start
+        total = jax.tree.map(_filled, begin, *shapes)
         for stack in lighting.stacks:
 
             def add_light(total: Any, one: Any, kind: type[Light] = stack.kind) -> tuple[Any, None]:
@@ -167,9 +170,11 @@ class Lobe(eqx.Module):
 
     The terms of few light samples, or of few pixels, are kept as arrays; those of many are made anew at each
     evaluation, in bounded memory. Where pixels are averaged over their area, theirs is the mean of a finer lobe.
+    Arrays of NumPy are evaluated by NumPy.
 
     Attributes:
-        model: the class of the material.
+        peak: the largest logarithm of the lobe's cosine over the samples, `NO_LOBE` where no sample has one.
+        model: the class of the material, where the terms are made anew.
         kept: weights, (P, S, C), and logarithms of the cosine, (P, S), of some samples each.
         source: points (P,) and lights that the terms are made of anew; None where they are kept.
         fine: of the points, (K M,), of those pixels that are averaged; None where no pixel is.
@@ -177,70 +182,124 @@ class Lobe(eqx.Module):
         slot: for every pixel its row in ``share``, or -1, (P,).
     """
 
-    model: type[Material] = eqx.field(static=True)
+    peak: Float[Array, " P"]
+    model: type[Material] | None = eqx.field(static=True, default=None)
     kept: tuple[tuple[Float[Array, "P S C"], Float[Array, "P S"]], ...] = ()
     source: tuple[SurfacePoints, Lighting] | None = None
     fine: "Lobe | None" = None
     share: Float[Array, "K M"] | None = None
     slot: Int[Array, " P"] | None = None
 
-    def __call__(self, n: Scalar) -> tuple[Float[Array, "P C"], Float[Array, "P C"]]:
-        """The basis image without the model's scale, and its derivative in n."""
+    @classmethod
+    def of_terms(cls, kept: tuple[tuple[Float[Array, "P S C"], Float[Array, "P S"]], ...]) -> "Lobe":
+        """The lobe of terms that are kept."""
+        return cls(jnp.max(jnp.concatenate([_peak(*terms) for terms in kept], axis=1), axis=1), kept=kept)
+
+    def __call__(self, n: Scalar, peak: Scalar | float = 0.0) -> tuple[Float[Array, "*N P C"], Float[Array, "*N P C"]]:
+        """The basis image without the model's scale, and its derivative in n.
+
+        Args:
+            n: the exponent; of terms kept in NumPy also several, (N, 1, 1).
+            peak: the logarithm of a cosine; the lobe is ``S exp(-n peak)``. Where no pixel sees the highlight's centre
+                a lobe itself falls by many powers of ten within a step of log n, but its shape does not change faster
+                than elsewhere. What lies nearer to the centre than that counts as if it were there.
+        """
+        value: Any = 0.0
+        slope: Any = 0.0
         if self.source is None:
-            value: Any = 0.0
-            slope: Any = 0.0
             for weight, log_cosine in self.kept:
-                values, slopes = _power(n, weight, log_cosine)
-                value, slope = value + jnp.sum(values, axis=1), slope + jnp.sum(slopes, axis=1)
+                xp: Any = np if isinstance(log_cosine, np.ndarray) else jnp
+                exponent = xp.minimum(log_cosine - xp.asarray(peak, log_cosine.dtype), 0)
+                power = xp.exp(n * exponent if xp is np else jnp.asarray(n, exponent.dtype) * exponent)
+                value = value + _over_samples(power, weight)
+                slope = slope + _over_samples(power * exponent, weight)
         else:
-            of_terms = partial(_of_lobe, partial(_power, n))
-            value, slope = sum_over_samples(self.model, *self.source, of_terms)
+            assert self.model is not None
+            value, slope = sum_over_samples(self.model, *self.source, partial(_relative, n, peak))
         if self.fine is None or self.share is None:
             return value, slope
-        fine_value, fine_slope = self.fine(n)
-        value = self._averaged(value, average(self.share, fine_value))
-        return value, self._averaged(slope, average(self.share, fine_slope))
-
-    def peak(self) -> Float[Array, " P"]:
-        """The largest logarithm of the lobe's cosine over the samples, `NO_LOBE` where no sample has one."""
-        if self.source is None:
-            peak = jnp.max(jnp.concatenate([_peak(*sample) for sample in self.kept], axis=1), axis=1)
-        else:
-            of_terms = partial(_of_lobe, _peak)
-            peak = sum_over_samples(self.model, *self.source, of_terms, combine=jnp.maximum, start=NO_LOBE)
-        if self.fine is None or self.share is None:
-            return peak
-        return self._averaged(peak, jnp.max(self.fine.peak().reshape(self.share.shape), axis=1))
+        fine_value, fine_slope = (average(self.share, fine) for fine in self.fine(n, peak))
+        return self._averaged(value, fine_value), self._averaged(slope, fine_slope)
 
     def pixels(self, choose: Callable[[Array], Array]) -> "Lobe":
         """The same for some of the pixels: ``choose`` is applied to each array whose first axis is the pixels."""
         source = None if self.source is None else (jax.tree.map(choose, self.source[0]), self.source[1])
-        kept, slot = jax.tree.map(choose, (self.kept, self.slot))
-        return Lobe(self.model, kept, source, self.fine, self.share, slot)
+        peak, kept, slot = jax.tree.map(choose, (self.peak, self.kept, self.slot))
+        return Lobe(peak, self.model, kept, source, self.fine, self.share, slot)
+
+    @property
+    def samples(self) -> int:
+        """How many light samples add up at a point."""
+        return sum(terms[1].shape[1] for terms in self.kept) if self.source is None else self.source[1].samples
+
+    def on_host(self, pixel: Int[np.ndarray, " K"]) -> "Lobe":
+        """The same for some of the pixels, all terms kept in NumPy."""
+
+        def of_pixels(leaf: Any) -> Any:
+            return np.asarray(leaf)[pixel]
+
+        lobe = self.pixels(of_pixels)
+        if self.source is not None and self.model is not None:
+            # Of one size for few numbers of pixels, or each would be compiled.
+            padded = np.resize(pixel, 1 << max(pixel.size - 1, 0).bit_length())
+            points = jax.tree.map(lambda leaf: np.asarray(leaf)[padded], self.source[0])
+            terms = _kept_terms(self.model, self.source[1], points)
+            lobe = dataclasses.replace(
+                lobe, source=None, kept=jax.tree.map(lambda a: np.asarray(a)[: pixel.size], terms)
+            )
+        if self.fine is None or self.share is None:
+            return lobe
+        slot, each = np.asarray(lobe.slot), np.arange(self.share.shape[1])
+        rows = np.unique(slot[slot >= 0])
+        if not rows.size:
+            return dataclasses.replace(lobe, fine=None, share=None, slot=None)
+        fine = self.fine.on_host((rows[:, None] * each.size + each).ravel())
+        slot = np.where(slot >= 0, np.searchsorted(rows, slot), -1)
+        return dataclasses.replace(lobe, fine=fine, share=np.asarray(self.share)[rows], slot=slot)
+
+    def over_areas(self, fine: "Lobe", share: Float[Array, "K M"], slot: Int[Array, " P"]) -> "Lobe":
+        """The lobe where some pixels are averaged: that of their points, their shares, and the row of each pixel."""
+        lobe = dataclasses.replace(self, fine=fine, share=share, slot=slot)
+        peak = lobe._averaged(self.peak, jnp.max(fine.peak.reshape(share.shape), axis=1))
+        return dataclasses.replace(lobe, peak=peak)
 
     def _averaged(self, centre: Array, fine: Array) -> Array:
-        assert self.slot is not None
-        gathered = fine[jnp.maximum(self.slot, 0)]
-        return jnp.where((self.slot >= 0).reshape(-1, *(1,) * (centre.ndim - 1)), gathered, centre)
+        """The pixel axis is the last but one of images, the only one of peaks."""
+        slot = self.slot
+        assert slot is not None
+        xp: Any = np if isinstance(fine, np.ndarray) else jnp
+        if centre.ndim == 1:
+            return xp.where(slot >= 0, fine[xp.maximum(slot, 0)], centre)
+        return xp.where((slot >= 0)[:, None], xp.take(fine, xp.maximum(slot, 0), axis=-2), centre)
 
 
-def _of_lobe(function: Callable[..., Any], terms: LightTerms) -> Any:
-    return function(terms.weight, terms.log_cosine)
+def _over_samples(power: Any, weight: Any) -> Any:
+    if isinstance(power, np.ndarray):
+        # NumPy is slow where the last axes are short.
+        alone = weight.shape[1:] == (1, 1)
+        return (power[..., 0] * weight[:, 0, 0])[..., None] if alone else np.einsum("...ps,psc->...pc", power, weight)
+    return jnp.sum(power[..., None] * weight, axis=-2)
 
 
-def _power(n: Array, weight: Array, log_cosine: Array) -> tuple[Array, Array]:
-    log_cosine = log_cosine[..., None]
-    value = weight * jnp.exp(jnp.asarray(n, log_cosine.dtype) * log_cosine)
-    return value, value * log_cosine
+def _relative(n: Scalar, peak: Scalar | float, terms: LightTerms) -> tuple[Array, Array]:
+    """What one sample adds to the lobe relative to a peak, and to its derivative."""
+    exponent = jnp.minimum(terms.log_cosine - jnp.asarray(peak, terms.log_cosine.dtype), 0)
+    value = terms.weight * jnp.exp(jnp.asarray(n, exponent.dtype) * exponent)
+    return value, value * exponent
 
 
 def _peak(weight: Array, log_cosine: Array) -> Array:
     return jnp.where(jnp.max(weight, axis=-1) > 0, log_cosine, NO_LOBE)
 
 
-def average(weight: Float[Array, "K M"], values: Float[Array, "K*M C"]) -> Float[Array, "K C"]:
+def _added_or_larger(total: tuple[Array, Array], value: tuple[Array, Array]) -> tuple[Array, Array]:
+    return total[0] + value[0], jnp.maximum(total[1], value[1])
+
+
+def average(weight: Float[Array, "K M"], values: Float[Array, "*N K*M C"]) -> Float[Array, "*N K C"]:
     """The mean of each pixel's points."""
-    return jnp.sum(weight[..., None] * values.reshape(*weight.shape, -1), axis=1)
+    xp: Any = np if isinstance(values, np.ndarray) else jnp
+    return xp.sum(weight[..., None] * values.reshape(*values.shape[:-2], *weight.shape, values.shape[-1]), axis=-2)
 
 
 @eqx.filter_jit
@@ -258,9 +317,24 @@ def diffuse_and_lobe(
     elif specular and _size(jax.eval_shape(partial(_stacked_terms, model, lighting), points)) <= STACKED_VALUES:
         diffuse, kept = _stacked_terms(model, lighting, points)
     else:
-        diffuse = sum_over_samples(model, points, lighting, lambda terms: terms.diffuse)
-        return diffuse, Lobe(model, source=(points, lighting)) if specular else None
-    return diffuse, Lobe(model, kept) if specular else None
+        diffuse, peak = sum_over_samples(
+            model,
+            points,
+            lighting,
+            lambda terms: (terms.diffuse, _peak(terms.weight, terms.log_cosine)),
+            combine=_added_or_larger,
+            start=(0.0, NO_LOBE),
+        )
+        return diffuse, Lobe(peak, model, source=(points, lighting)) if specular else None
+    if not specular:
+        return diffuse, None
+    return diffuse, Lobe.of_terms(kept)
+
+
+@eqx.filter_jit
+def _kept_terms(model: type[Material], lighting: Lighting, points: SurfacePoints) -> Any:
+    """Weights and cosines of the lobe of all samples at once."""
+    return _stacked_terms(model, lighting, points)[1]
 
 
 def _stacked_terms(model: type[Material], lighting: Lighting, points: SurfacePoints) -> tuple[Any, Any]:

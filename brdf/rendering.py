@@ -57,7 +57,7 @@ def basis(model: type[Material], scene: Scene, *, points: SurfacePoints | None =
         fine_diffuse, fine_lobe = diffuse_and_lobe(model, area.points.flat(), lighting)
         diffuse = diffuse.at[area.pixel].set(average(area.weight, fine_diffuse), mode="drop")
         if lobe is not None:
-            lobe = dataclasses.replace(lobe, fine=fine_lobe, share=area.weight, slot=area.slot.ravel())
+            lobe = lobe.over_areas(fine_lobe, area.weight, area.slot.ravel())
     return Basis(centres, diffuse, lobe)
 
 

@@ -365,7 +365,7 @@ def _fit_model(model, samples, loss, n_range):
     def solve(weight):
         """The least weighted squares; a diffuse coefficient that the search cannot tell from 0 is 0."""
         with jax.enable_x64(True):
-            lobe = Lobe(model, ((jnp.asarray(reach)[:, None], jnp.asarray(log_cos)),))
+            lobe = Lobe.of_terms(((jnp.asarray(reach)[:, None], jnp.asarray(log_cos)),))
             ones, target = jnp.ones((len(values), 1)), jnp.asarray(np.pi * values)
             picture = Picture(target, ones, lobe, jnp.asarray(weight), ambient=jnp.zeros(1))
         optimum = search([picture], n_min=n_range[0], n_max=n_range[1], free=free)

@@ -93,7 +93,7 @@ def compiled_at_pixels(program: Callable[..., Any]) -> Callable[..., Any]:
 def _peaks(scene, model):
     """The largest log cosine of the lobe at each pixel."""
     lobe: Any = basis(model, scene).lobe
-    return lobe.peak()
+    return lobe.peak
 
 
 def sample_pixels(scene: brdf.Scene, model: type[brdf.Material], size: int) -> PixelSample | None:

@@ -42,7 +42,12 @@ def nonnegative_minima(
     Source: for the sets on the cap, Nocedal and Wright, Numerical Optimization, 2006, section 16.5.
     """
     unknowns = product.shape[-1]
-    start = np.broadcast_to(start, product.shape)
+    start, scale = np.broadcast_to(start, product.shape), np.ones(unknowns)
+    if cap is not None:
+        # In units in which each counts 1, or rounding would lift a small one that counts much over the cap.
+        scale = np.where(cap > 0, 1 / np.where(cap > 0, cap, 1.0), 1.0)
+        gram, product, start = gram * scale[..., :, None] * scale[..., None, :], product * scale, start / scale
+        cap = (cap > 0).astype(float)
     system, right, begin = gram, product, start
     if cap is not None:
         more = [(0, 0)] * (product.ndim - 1)
@@ -50,28 +55,33 @@ def nonnegative_minima(
         system[..., -1, :-1] = system[..., :-1, -1] = cap
         right = np.concatenate([product, 1 - np.sum(cap * start, axis=-1, keepdims=True)], axis=-1)
         begin = np.pad(start, np.array([*more, (0, 1)]))
-    sets = np.array(list(itertools.product([False, True], repeat=right.shape[-1])))
-    active = sets.reshape(-1, *(1,) * (product.ndim - 1), right.shape[-1])
-    leave = np.where(active, 0.0, begin)
-    right = np.where(active, right + (system @ leave[..., None])[..., 0], 0.0)
-    both = active[..., :, None] & active[..., None, :]
-    whole = np.concatenate([np.where(both, system, np.eye(right.shape[-1])), right[..., None]], axis=-1)
-    # Gauss and Jordan; a symmetric definite system needs no pivoting. On a cap the last pivot is below 0.
-    feasible = np.ones(right.shape[:-1], bool)
-    for i, diagonal in enumerate(np.moveaxis(np.diagonal(whole, axis1=-2, axis2=-1).copy(), -1, 0)):
-        pivot = whole[..., i, i]
-        feasible &= np.where(diagonal > 0, pivot, -pivot) > tolerance * diagonal
-        row = whole[..., i, :] / np.where(pivot == 0, 1.0, pivot)[..., None]
-        whole -= whole[..., :, i, None] * row[..., None, :]
-        whole[..., i, :] = row
-    x = np.where(active, begin + whole[..., -1], 0.0)[..., :unknowns]
-    feasible &= np.all(~active[..., :unknowns] | (free & (x >= 0)), axis=-1)
+    every = np.array(list(itertools.product([False, True], repeat=right.shape[-1])))
+    # Mostly all that may be above 0 are; where one is not, every set is tried.
+    for sets in (every[-1:], every) if cap is None else (every,):
+        active = sets.reshape(-1, *(1,) * (product.ndim - 1), right.shape[-1])
+        if cap is None:
+            active = active & free
+        whole = np.where(active, right + (system @ np.where(active, 0.0, begin)[..., None])[..., 0], 0.0)[..., None]
+        both = active[..., :, None] & active[..., None, :]
+        whole = np.concatenate([np.where(both, system, np.eye(right.shape[-1])), whole], axis=-1)
+        # Gauss and Jordan; a symmetric definite system needs no pivoting. On a cap the last pivot is below 0.
+        feasible = np.ones(whole.shape[:-2], bool)
+        for i, diagonal in enumerate(np.moveaxis(np.diagonal(whole, axis1=-2, axis2=-1).copy(), -1, 0)):
+            pivot = whole[..., i, i]
+            feasible &= np.where(diagonal > 0, pivot, -pivot) > tolerance * diagonal
+            row = whole[..., i, :] / np.where(pivot == 0, 1.0, pivot)[..., None]
+            whole -= whole[..., :, i, None] * row[..., None, :]
+            whole[..., i, :] = row
+        x = np.where(active, begin + whole[..., -1], 0.0)[..., :unknowns]
+        feasible &= np.all(~active[..., :unknowns] | (free & (x >= 0)), axis=-1)
+        if len(sets) == 1 and feasible.all():
+            return x[0]
     if cap is not None:
-        feasible &= active[..., -1] | (np.sum(cap * x, axis=-1) <= 1 + ROUNDING)
+        feasible &= np.sum(cap * x, axis=-1) <= 1 + ROUNDING
     step = x - start
     change = np.sum(step * ((gram @ step[..., None])[..., 0] - 2 * product), axis=-1)
     best = np.argmin(np.where(feasible, change, np.inf), axis=0)
-    return np.take_along_axis(x, best[None, ..., None], axis=0)[0]
+    return np.take_along_axis(x, best[None, ..., None], axis=0)[0] * scale
 
 
 def nonnegative_minimum(

@@ -16,7 +16,8 @@ pixels, which is put back in float64: a surface that is lit alike all over, whos
 ambient one, would else seem to differ from it by the rounding of the sums.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+import operator
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
@@ -27,11 +28,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from brdf.lobes import Lobe
-
-# Natural logarithms of what is still well inside float32 and float64, times an exponent of 1e7 too: a compiler that may
-# reorder products multiplies the two first, and infinity times the 0 of a dark pixel is no number.
-_LARGEST_DECAY_SINGLE = 60.0
-_LARGEST_DECAY_DOUBLE = 600.0
 
 # On the host or on the device.
 AnyArray: TypeAlias = jax.Array | np.ndarray
@@ -83,27 +79,14 @@ class Picture(eqx.Module):
         return self.weight if self.weight.ndim == 2 else self.weight[:, None]
 
 
-def relative_lobe(lobe: Lobe, log_n: Array, peak: Array, dtype: np.dtype) -> tuple[Array, Array]:
-    """The lobe relative to its largest value, ``S exp(-n peak)``, and the derivative of that by log n.
-
-    Where no pixel sees the highlight's centre a lobe itself falls by many powers of ten within a step of log n, but its
-    shape does not change faster than elsewhere. Past the range of the dtype it counts as dark.
-    """
-    n = jnp.exp(log_n)
-    value, slope = lobe(n)
-    decay = n * peak
-    limit = _LARGEST_DECAY_SINGLE if dtype == np.float32 else _LARGEST_DECAY_DOUBLE
-    scale = jnp.where(-decay < limit, jnp.exp(-decay), 0.0).astype(dtype)
-    value = value.astype(dtype)
-    slope = slope.astype(dtype) * n.astype(dtype) - value * decay.astype(dtype)
-    return value * scale, slope * scale
-
-
 # 32768 pixels of the six or seven arrays a pass reads stay in the second-level cache.
 BLOCK = 32768
 
-# Means of the columns are taken of about this many pixels.
+# Means of the columns are taken of about this many pixels of each block.
 _MEAN_PIXELS = 64
+
+# One program serves up to so many exponents.
+_MOST_EXPONENTS = 64
 
 # Beyond this many channels of one grey basis a matrix product is as fast and compiles in a fraction of the time.
 UNROLLED_CHANNELS = 4
@@ -151,45 +134,6 @@ class Sums(NamedTuple):
         product = (basis @ self.product[..., None])[..., 0]
         return self._replace(gram=basis @ self.gram @ basis.swapaxes(-1, -2), product=product)
 
-    def within(self, t: Float[np.ndarray, " T"], width: float, reference: Float[np.ndarray, "C 3"]) -> "Sums":
-        """From the sums of a bracket those at some exponents in it, the lobe being Hermite's cubic of its ends.
-
-        Args:
-            t: where in the bracket, from 0 to 1.
-            width: of the bracket, in log n.
-            reference: the reference model, whose lobe was that of the lower end; here it is that of each t.
-        """
-        basis = np.zeros((t.size, 1, 4, 6))
-        basis[..., [0, 1, 2], [0, 1, 2]] = 1.0
-        basis[:, 0, 2, 3:] = np.stack([t * width, t * t * (3 - 2 * t), t * t * (t - 1) * width], axis=-1)
-        basis[:, 0, 3, 3:] = np.stack([np.ones_like(t), 6 * t * (1 - t) / width, t * (3 * t - 2)], axis=-1)
-        return self.about(reference[:, 2:] * (np.eye(6)[2] - basis[..., 2, :])).columns(basis)
-
-
-def _columns(picture: Picture, log_n: Array, peak: Array) -> list[Array]:
-    """Diffuse, lobe, derivative by log n, and for a bracket what Hermite's cubic adds to the straight line."""
-    diffuse = picture.diffuse
-    if picture.lobe is None:
-        return [diffuse, *[jnp.zeros_like(diffuse)] * (2 * log_n.size)]
-    ends = [relative_lobe(picture.lobe, at, peak, diffuse.dtype) for at in log_n]
-    columns = [diffuse, *(column for end in ends[:1] for column in end)]
-    if len(ends) == 2:
-        (value, slope), (end_value, end_slope) = ends
-        step = (log_n[1] - log_n[0]).astype(diffuse.dtype)
-        # Differences are taken per pixel: taken between sums they would lose the digits a narrow bracket lives on.
-        columns += [end_value - value - step * slope, end_slope - slope]
-    return columns
-
-
-def _means(picture: Picture, log_n: Array, peak: Array) -> Array:
-    """What to take off the columns: their means over some pixels that count, in the pixels' dtype, (R - 1, Cb)."""
-    stride = max(1, picture.target.shape[0] // _MEAN_PIXELS)
-    few = picture.pixels(lambda a: a[::stride])
-    columns = jnp.stack(jnp.broadcast_arrays(*_columns(few, log_n, peak)))
-    counts = jnp.broadcast_to(jnp.max(few.weights, axis=1) > 0, columns.shape[1])
-    total = jnp.sum(jnp.where(counts[:, None], columns, 0), axis=1)
-    return total / jnp.maximum(jnp.sum(counts), 1).astype(total.dtype)
-
 
 def _summed(columns: int, residuals: int) -> list[tuple[int, int]]:
     """Which products of the columns and of the residuals after them are summed: of two residuals none."""
@@ -197,113 +141,109 @@ def _summed(columns: int, residuals: int) -> list[tuple[int, int]]:
     return [(i, j) for i in range(size) for j in range(i, size) if i < columns or i == j]
 
 
-def _group_sums(columns: Sequence[Array], mean: Array, targets: Array, weight: Array, reference: Array) -> Array:
-    """Sums of the channels that share basis and weight, in one loop over the pixels; the last is the pixel count."""
-    one = jnp.ones_like(columns[0])
-    parts = [one, *(column - mean[i] for i, column in enumerate(columns))]
-    for target, (ambient, *coefficients) in zip(targets, reference.T, strict=True):
-        model = ambient
-        for coefficient, column in zip(coefficients, columns, strict=False):
-            model = model + coefficient * column
-        parts.append(jnp.where(weight > 0, target - model, 0))
-    weighted = [weight * part for part in parts]
-    products = [weighted[i] * parts[j] for i, j in _summed(1 + len(columns), len(targets))]
-    products.append(jnp.where(weight > 0, one, 0))
-    zero = np.zeros((), one.dtype)
-    totals = jax.lax.reduce(
-        tuple(products),
-        (zero,) * len(products),
-        lambda left, right: tuple(a + b for a, b in zip(left, right, strict=True)),
-        (0,),
-    )
-    return jnp.stack(totals).astype(jnp.float64)
-
-
-def _block_sums(picture: Picture, log_n: Array, reference: Array, peak: Array, mean: Array, inside: Any) -> Array:
-    """Sums of one block, (G, S); G is 1 where all channels share basis and weight, else C."""
-    target = picture.target.T
-    columns = [column.T for column in _columns(picture, log_n, peak)]
-    # Weights of 1 are constants that the compiler leaves out.
-    columns.append(jnp.where(inside, picture.weights.T, 0))
-    shared = max(map(len, columns)) == 1 and len(target) <= UNROLLED_CHANNELS
-    groups = 1 if shared else len(target)
-    *columns, weight = (jnp.broadcast_to(column, (groups, target.shape[1])) for column in columns)
-    reference = reference.at[0].multiply(picture.ambient).astype(target.dtype).reshape(3, groups, -1)
-    mean = jnp.broadcast_to(mean, (len(columns), groups))
-    return jax.vmap(_group_sums, (0, 1, 0, 0, 1))(
-        columns, mean, target.reshape(groups, -1, target.shape[1]), weight, reference
-    )
-
-
 @partial(jax.jit, compiler_options=COMPILER_OPTIONS)
-def _each(picture: Picture, log_n: Array, reference: Array, peak: Array) -> tuple[Array, Array]:
-    """For each row of exponents the sums of one picture, block after block, and what was taken off the columns."""
-    count = picture.target.shape[0]
-    blocks = max(1, -(-count // BLOCK))
-    size = -(-count // blocks)
+def _pass(picture: Picture, log_n: Array, count: Array, reference: Array, peak: Array) -> tuple[Array, Array]:
+    """For the first exponents the sums of each block of pixels, and what was taken off its columns.
 
-    def one(log_n: Array) -> tuple[Array, Array]:
-        mean = _means(picture, log_n, peak)
+    Returns:
+        (exponents, blocks, groups, products), the last product counting the pixels; a group is all the channels where
+        they share basis and weight, else one of them. And (exponents, blocks, 3, groups).
+    """
+    pixels, channels = picture.target.shape
+    dtype, blocks = picture.target.dtype, max(1, -(-pixels // BLOCK))
+    size = -(-pixels // blocks)
+    shared = picture.diffuse.shape[1] == picture.weights.shape[1] == 1 and channels <= UNROLLED_CHANNELS
+    groups = 1 if shared else channels
+    ambient, *scales = reference.at[0].multiply(picture.ambient).astype(dtype).reshape(3, groups, -1, 1)
+    stride = max(1, size // _MEAN_PIXELS)
 
-        def block_sums(block: Array) -> Array:
-            # The last block starts early enough to be whole; what it shares with the one before counts once.
-            start = jnp.minimum(block * size, count - size)
-            part = picture.pixels(lambda a: jax.lax.dynamic_slice_in_dim(a, start, size))
-            inside = True if count % size == 0 else start + jnp.arange(size) >= block * size
-            return _block_sums(part, log_n, reference, peak, mean, inside)
+    def add_block(step: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        index, block = step // blocks, step % blocks
+        # The last block starts early enough to be whole; what it shares with the one before counts once.
+        start = jnp.minimum(block * size, pixels - size)
+        part = picture.pixels(lambda a: jax.lax.dynamic_slice_in_dim(a, start, size))
+        # Weights of 1 are constants that the compiler leaves out.
+        inside = True if pixels % size == 0 else start + jnp.arange(size) >= block * size
+        weight = jnp.broadcast_to(jnp.where(inside, part.weights.T, 0), (groups, size))
+        few = part.pixels(lambda a: a[::stride])
+        counts = jnp.broadcast_to(weight[:, ::stride] > 0, (groups, few.target.shape[0]))
+        columns, means, n = [jnp.ones((groups, size), dtype)], [], jnp.exp(log_n[index])
+        pairs = [(part.diffuse, few.diffuse)]
+        if part.lobe is None or few.lobe is None:
+            pairs += 2 * [(jnp.zeros_like(part.diffuse), jnp.zeros_like(few.diffuse))]
+        else:
+            (value, slope), (some, change) = part.lobe(n, peak), few.lobe(n, peak)
+            pairs += [(value, some), (slope * n.astype(dtype), change * n.astype(dtype))]
+        for column, sampled in pairs:
+            mean = jnp.sum(jnp.where(counts, sampled.T, 0), axis=1) / jnp.maximum(jnp.sum(counts, axis=1), 1)
+            means.append(mean.astype(dtype))
+            columns.append(jnp.broadcast_to(column.T.astype(dtype), (groups, size)))
+        target = part.target.T.reshape(groups, -1, size)
+        parts = [columns[0], *(column - mean[:, None] for column, mean in zip(columns[1:], means, strict=True))]
+        for i in range(target.shape[1]):
+            model = ambient[:, i] + scales[0][:, i] * columns[1] + scales[1][:, i] * columns[2]
+            parts.append(jnp.where(weight > 0, target[:, i] - model, 0))
+        weighted = [weight * one for one in parts]
+        products = [weighted[i] * parts[j] for i, j in _summed(4, target.shape[1])]
+        products.append(jnp.where(weight > 0, columns[0], 0))
+        zeros = (np.zeros((), dtype),) * len(products)
+        totals = jax.lax.reduce(tuple(products), zeros, lambda left, right: tuple(map(operator.add, left, right)), (1,))
+        found = jnp.stack(totals, axis=1).astype(jnp.float64), jnp.stack(means)
+        return jax.tree.map(lambda all_, one: all_.at[index, block].set(one), state, found)
 
-        return jnp.sum(jax.lax.map(block_sums, jnp.arange(blocks)), axis=0), mean
-
-    return jax.lax.map(one, log_n)
+    kinds = len(_summed(4, channels // groups)) + 1
+    start = jnp.zeros((_MOST_EXPONENTS, blocks, groups, kinds)), jnp.zeros((_MOST_EXPONENTS, blocks, 3, groups), dtype)
+    return jax.lax.fori_loop(0, count * blocks, add_block, start)
 
 
 def _unpack(packed: np.ndarray, mean: np.ndarray, picture: Picture) -> Sums:
-    """Undo the packing, and what was done to the columns."""
-    channels, columns = picture.target.shape[1], mean.shape[1] + 1
-    residuals = channels // packed.shape[1]
-    i, j = np.array(_summed(columns, residuals)).T
-    products = np.zeros((*packed.shape[:2], *(columns + residuals,) * 2))
+    """Undo the packing, and what was done to the columns; the blocks together."""
+    channels, groups = picture.target.shape[1], packed.shape[2]
+    residuals = channels // groups
+    i, j = np.array(_summed(4, residuals)).T
+    products = np.zeros((*packed.shape[:3], *(4 + residuals,) * 2))
     products[..., i, j] = products[..., j, i] = packed[..., :-1]
-    square = np.diagonal(products[..., columns:, columns:], axis1=-2, axis2=-1).reshape(-1, channels)
-    found = Sums(
-        gram=products[..., :columns, :columns],
-        product=products[..., columns:, :columns].reshape(-1, channels, columns),
-        square=square,
-        pixels=np.broadcast_to(packed[..., -1], square.shape),
-    )
-    # The ambient column is constant and was summed as 1; the others were summed less their means.
-    basis = np.zeros((len(mean), channels, max(4, columns), columns)) + np.eye(max(4, columns), columns)
-    basis[..., 1:columns, 0] = mean.swapaxes(1, 2)
-    basis[..., 0, 0] = picture.ambient
-    return found.columns(basis)
+    # The ambient column was summed as 1; the others were summed less their means.
+    basis = np.zeros((*packed.shape[:3], 1, 4, 4)) + np.eye(4)
+    basis[..., 0, 1:, 0] = mean.swapaxes(2, 3)
+    columns = Sums(
+        gram=products[..., None, :4, :4],
+        product=products[..., 4:, :4],
+        square=np.diagonal(products[..., 4:, 4:], axis1=-2, axis2=-1),
+        pixels=np.broadcast_to(packed[..., -1:], (*packed.shape[:3], residuals)),
+    ).columns(basis)
+    whole = np.broadcast_to(columns.gram, (*columns.product.shape, 4))
+    totals = [np.sum(leaf, axis=1) for leaf in columns._replace(gram=whole)]
+    found = Sums(*(leaf.reshape(len(packed), channels, *leaf.shape[3:]) for leaf in totals))
+    lit = np.zeros((channels, 4, 4)) + np.eye(4)
+    lit[:, 0, 0] = picture.ambient
+    return found.columns(lit)
 
 
 def sums(
-    pictures: Iterable[Picture],
-    log_n: Float[np.ndarray, " N"],
-    reference: Float[np.ndarray, "C 3"],
-    *,
-    grid: bool = False,
-    peak: float = 0.0,
+    pictures: Iterable[Picture], log_n: Float[np.ndarray, " N"], reference: Float[np.ndarray, "C 3"], peak: float = 0.0
 ) -> Sums:
     """One pass over the pixels of one or many pictures, each let go before the next is asked for.
 
+    The columns are ambient, diffuse, lobe, and the derivative of that by log n; the last two are 0 without a lobe.
+
     Args:
         pictures: The pictures, or the tiles of one; at least one.
-        log_n: Natural logarithms of the exponent. None: the columns are ambient and diffuse, and two of zeros. One:
-            also the lobe and its derivative by log n. Two make a bracket: beside value ``s_0`` and derivative ``s_0'``
-            at the first, the columns are ``s_1 - s_0 - (log n_1 - log n_0) s_0'`` and ``s_1' - s_0'``.
-        reference: Coefficients x_a, x_d, x_s of the reference model; the lobe is that of the first exponent.
-        grid: Treat each of ``log_n`` on its own; the sums have a leading axis N.
-        peak: Take ``S exp(-n peak)`` for the lobe, its derivative and the reference; see :func:`relative_lobe`.
+        log_n: Natural logarithms of some exponents.
+        reference: Coefficients x_a, x_d, x_s of the reference model, whose lobe is that of the exponent.
+        peak: Take ``S exp(-n peak)`` for the lobe, its derivative and the reference; see :class:`brdf.lobes.Lobe`.
 
     Returns:
-        The sums over all pixels.
+        The sums over all pixels, at each exponent, with a leading axis N.
     """
-    result: Sums | None = None
-    for picture in pictures:
-        packed, mean = _each(picture, log_n[:, None] if grid else log_n[None], reference.T, np.float64(peak))
-        part = _unpack(np.asarray(packed), np.asarray(mean, np.float64), picture)
-        result = part if result is None else Sums(*map(np.add, result, part))
-    assert result is not None
-    return result if grid else Sums(*(leaf[0] for leaf in result))
+    totals: list[Sums] = []
+    for first in range(0, len(log_n), _MOST_EXPONENTS):
+        some = log_n[first : first + _MOST_EXPONENTS]
+        padded = np.pad(some, (0, _MOST_EXPONENTS - some.size))
+        parts = []
+        for picture in pictures:
+            found = _pass(picture, padded, np.int32(some.size), reference.T, np.float64(peak))
+            packed, mean = (np.asarray(leaf)[: some.size].astype(np.float64) for leaf in found)
+            parts.append(_unpack(packed, mean, picture))
+        totals.append(Sums(*map(sum, zip(*parts, strict=True))))
+    return Sums(*map(np.concatenate, zip(*totals, strict=True)))

@@ -5,25 +5,21 @@ problem, so the search is one-dimensional, in log n. The host drives it and pixe
 :mod:`fitting.solver.normal_equations`, whose results add up: one picture in memory, a hundred photographs and the tiles
 of a file on disk are the same loop.
 
-1. A stratified subsample of each picture (:mod:`fitting.solver.subsample`), or all of a small one, gives the profile
+1. A stratified subsample of the pixels (:mod:`fitting.solver.subsample`), or all of a small picture, gives the profile
    and its slope on a grid over log n. As a function of log n any lobe varies on a scale of 1 or more, so steps of 0.35
    miss no minimum.
 2. The subsample also says how far its profile may be from that of all pixels. If one valley is left at six standard
    deviations, the search goes on there; else the grid is repeated on all pixels where the optimum may be.
-3. A bracket is refined on all pixels with one pass at its two ends (:mod:`fitting.solver.refinement`): values and
-   slopes of the lobe there, Hermite's cubic in between, so all products needed in the bracket follow from one Gram
-   matrix, and the least cost in it is found without a pixel.
-4. Passes at the optimum in residual form give the exact cost and a joint Gauss-Newton correction of x and n, repeated
-   while it moves n.
+3. Passes over all pixels in residual form (:mod:`fitting.solver.refinement`) give the exact cost at an exponent and a
+   joint Gauss-Newton correction of x and n, repeated while it moves n.
 
 A cap on sums of coefficients (k_d + k_s <= 1, what a plausible material keeps) is one more bound of the tiny problem:
 the same search under it is as global.
 """
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
-from typing import Any, cast
+from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -38,17 +34,13 @@ from fitting.solver.refinement import (
     Cap,
     Point,
     Problem,
-    enclose,
+    capped_minimum,
     gauss_newton,
     problem_of,
     solve_linear,
 )
-from fitting.solver.streams import Stream, each
-from fitting.solver.subsample import Subsample, spread, subsample
-
-# How many pixels of all pictures together the grid is evaluated on, and how many of each picture at least.
-SAMPLE_SIZE = 4096
-SMALLEST_SAMPLE = 256
+from fitting.solver.streams import Stream
+from fitting.solver.subsample import Subsample, subsample
 
 # Six standard deviations: one wrong rejection in 1e9, and the variance itself is an estimate.
 DEVIATIONS = 6.0
@@ -125,24 +117,53 @@ def search(
     """
     with jax.enable_x64(True):
         problem = problem_of(pictures, (n_min, n_max), free)._replace(cap=cap)
-        size = max(SMALLEST_SAMPLE, SAMPLE_SIZE // len(pictures))
-        samples = [subsample(picture, size, n_max) for picture in pictures] if problem.lobe else []
-        nearest = min((sample.nearest for sample in samples), default=math.inf)
-        if nearest < math.inf:
-            problem = problem._replace(peak=-nearest)
-        else:
-            problem = problem._replace(lobe=False)
-        if not problem.lobe or n_min == n_max:
-            nothing = np.zeros(problem.free.shape)
-            return _optimum(*gauss_newton(problem, Point(problem.bounds[0], nothing, nothing[:, 0])), problem)
-        found = _search_with_lobe(problem, samples)
-        if found is None:
+        lower, upper = problem.bounds
+        sample = subsample(pictures) if problem.free[:, 2].any() else None
+        if sample is None or sample.nearest == math.inf:
+            problem = problem._replace(free=problem.free & [True, True, False])
+            start = Point(lower, np.zeros(problem.free.shape), np.zeros(len(problem.free)))
+            return _optimum(*gauss_newton(problem, start), problem)
+        problem = problem._replace(peak=-sample.nearest)
+        log_n = np.linspace(lower, upper, max(2, 1 + math.ceil((upper - lower) / GRID_STEP)))
+        few = sample.sums(log_n, problem.peak)
+        profile = solve_linear(few, log_n, np.zeros(problem.free.shape), problem)
+        about = np.exp(log_n), profile.cost.sum(axis=1), not sample.whole
+        rough = _without_lobe(few)
+        if problem.tolerance == TOLERANCE_SINGLE and not _resolved(profile, few, rough):
             # Sums in double precision over all pixels, one picture at a time: slow, and rarely needed.
             exact = Stream(lambda i: jax.tree.map(lambda leaf: leaf.astype(np.float64), pictures[i]), len(pictures))
             problem = problem._replace(pictures=exact, tolerance=TOLERANCE_DOUBLE)
-            found = _search_with_lobe(problem, each(lambda picture: Subsample(picture, None, 0.0), exact))
-        assert found is not None
-        return found
+        if n_min == n_max:
+            return _optimum(*gauss_newton(problem, Point(*(leaf[0] for leaf in profile))), problem, *about)
+        if not sample.whole:
+            error = _sampling_errors(profile, sample, problem.peak)
+            position, lowest, possible = _cells(profile, error)
+            cell = int(np.argmin(lowest))
+            first, last = np.flatnonzero(possible)[[0, -1]]
+            if last - first <= 3 and profile.slope[cell] < profile.slope[cell + 1]:
+                found = _refined(problem, profile, cell, position[cell], beyond=1)
+                # A minimum at the end of its reach is none, but for the bounds of the search.
+                if abs(found[0].log_n - position[cell]) < GRID_STEP or found[0].log_n in problem.bounds:
+                    return _optimum(*found, problem, *about)
+            log_n = log_n[max(0, first - 1) : last + 3]
+            profile = solve_linear(sums(pictures, log_n, rough, problem.peak), log_n, rough, problem)
+        position, *_ = _cells(profile)
+        candidates = [_refined(problem, profile, cell, position[cell]) for cell in _valleys(profile, problem.tolerance)]
+        # Where the profile is level the best sample may be no worse than what the valleys led to.
+        costs = profile.cost.sum(axis=1)
+        if problem.cap is None and np.min(costs) < min(np.sum(point.cost) for point, _ in candidates):
+            candidates.append(gauss_newton(problem, Point(*(leaf[np.argmin(costs)] for leaf in profile)), GRID_STEP))
+        best = min(candidates, key=lambda candidate: float(np.sum(candidate[0].cost)))
+        return _optimum(*best, problem, *about)
+
+
+def _refined(problem: Problem, profile: Point, cell: int, position: float, beyond: int = 0) -> tuple[Point, Sums]:
+    """The minimum in a cell of the grid, or so many beside it."""
+    nearer = cell + int(2 * position > profile.log_n[cell] + profile.log_n[cell + 1])
+    if problem.cap is None:
+        return gauss_newton(problem, Point(position, profile.x[nearer], profile.cost[nearer]), GRID_STEP)
+    ends = profile.log_n[[max(0, cell - beyond), min(cell + 1 + beyond, len(profile.log_n) - 1)]]
+    return capped_minimum(problem, *ends, profile.x[nearer])
 
 
 def fit_tied(
@@ -167,95 +188,41 @@ def fit_tied(
     with jax.enable_x64(True):
         problem = problem_of(pictures, n_range, free)._replace(tied=tied)
         found = gauss_newton(problem, Point(math.log(optimum.n), x.T, optimum.cost))
-    return _optimum(*found, problem, optimum.grid, optimum.profile, sampled=optimum.profile_sampled)
+    return _optimum(*found, problem, optimum.grid, optimum.profile, optimum.profile_sampled)
 
 
-def _search_with_lobe(problem: Problem, samples: Sequence[Subsample]) -> Optimum | None:
-    """The search; nothing where single precision does not resolve the profile."""
-    few = each(lambda sample: sample.picture, samples)
-    rough = rough_model(few)
-    lower, upper = problem.bounds
-    log_n = np.linspace(lower, upper, max(2, 1 + math.ceil((upper - lower) / GRID_STEP)))
-    sampled = any(sample.factor is not None for sample in samples)
-    # Most subsamples are float32.
-    tolerance = TOLERANCE_SINGLE if sampled else problem.tolerance
-    profile, resolved = profile_on_grid(few, log_n, rough, problem._replace(tolerance=tolerance))
-    if tolerance == TOLERANCE_SINGLE and not resolved:
-        return None
-    grid, cost, part = np.exp(log_n), profile.cost.sum(axis=1), profile
-    if sampled:
-        error, slope_error = sampling_errors(profile, samples, problem.peak)
-        position, lowest, possible = _cells(profile, error)
-        cell = int(np.argmin(lowest))
-        first, last = np.flatnonzero(possible)[[0, -1]]
-        curvature = (np.diff(profile.slope) / np.diff(log_n))[cell]
-        if last - first <= 3 and curvature > 0:
-            # Three standard deviations and what the cubic is off; a bracket that misses moves on.
-            half = min(3 * np.max(slope_error[cell : cell + 2]) / curvature + 0.01, GRID_STEP)
-            bracket = max(lower, position[cell] - half), min(upper, position[cell] + half)
-            point, inside = enclose(problem, *bracket, profile.x[cell])
-            if inside:
-                return _optimum(*gauss_newton(problem, point), problem, grid, cost, sampled=True)
-        part, _ = profile_on_grid(problem.pictures, log_n[max(0, first - 1) : last + 3], rough, problem)
-    candidates = [
-        gauss_newton(problem, enclose(problem, part.log_n[cell], part.log_n[cell + 1], part.x[cell])[0])
-        for cell in _valleys(part, problem.tolerance)
-    ]
-    # Where the profile is level the best sample may be no worse than what the brackets led to.
-    costs = part.cost.sum(axis=1)
-    if np.min(costs) < min(np.sum(point.cost) for point, _ in candidates):
-        candidates.append(gauss_newton(problem, Point(*(leaf[np.argmin(costs)] for leaf in part))))
-    best = min(candidates, key=lambda candidate: float(np.sum(candidate[0].cost)))
-    return _optimum(*best, problem, grid, cost, sampled=sampled)
-
-
-def rough_model(pictures: Iterable[Picture]) -> np.ndarray:
-    """Ambient and diffuse from a few hundred pixels of each picture, (C, 3).
+def _without_lobe(few: Sums) -> np.ndarray:
+    """Ambient and diffuse alone, (C, 3).
 
     Products are taken of the residual against this model, so that float32 sums lose nothing to the bulk of the picture;
     any model near the target will do.
     """
-    gram: Any = 0.0
-    for picture in pictures:
-        stride = max(1, picture.target.shape[0] // 256)
-        # Through NumPy: a slice of an array on the device would be compiled.
-        few = replace(picture, lobe=None).pixels(lambda a, stride=stride: cast(Any, np.asarray(a)[::stride]))
-        target = np.where(few.weights > 0, few.target, 0).astype(float)
-        columns = np.stack(np.broadcast_arrays(few.ambient, few.diffuse, target))
-        gram = gram + np.einsum("ipc,jpc->cij", few.weights * columns, columns)
-    x = np.linalg.pinv(gram[:, :2, :2], hermitian=True) @ gram[:, :2, 2:]
+    x = np.linalg.pinv(few.gram[0, :, :2, :2], hermitian=True) @ few.product[0, :, :2, None]
     return np.pad(x[..., 0], np.array([(0, 0), (0, 1)]))
 
 
-def profile_on_grid(
-    pictures: Iterable[Picture], log_n: np.ndarray, rough: np.ndarray, problem: Problem
-) -> tuple[Point, bool]:
-    """The profile on a grid, and whether rounding leaves the valley, or what noise leaves of it."""
-    parts = sums(pictures, log_n, rough, grid=True, peak=problem.peak)
-    profile = solve_linear(parts, log_n, rough, problem)
+def _resolved(profile: Point, few: Sums, rough: np.ndarray) -> bool:
+    """Whether single precision leaves the valley, or what noise leaves of it."""
     cost = profile.cost.sum(axis=1)
     best = int(np.argmin(cost))
     # Where basis images nearly add up to one another, large coefficients cancel, and with them the digits of the
     # products: then several samples may seem to fit exactly. In scenes where they do not, rounding is 1e-5 to 2e-4 of
     # the rise to the next sample (`python -m benchmarks.tradeoff`, its twenty scenes).
-    size = np.abs(profile.x[best] - rough) * np.sqrt(np.diagonal(parts.gram[best], axis1=-2, axis2=-1)[:, :3])
+    size = np.abs(profile.x[best] - rough) * np.sqrt(np.diagonal(few.gram[best], axis1=-2, axis2=-1)[:, :3])
     rounding = np.finfo(np.float32).eps * np.sum(np.sum(size, axis=-1) ** 2)
     rise = np.min(np.delete(cost[max(best - 1, 0) : best + 2], min(best, 1))) - cost[best]
-    noise = cost[best] / max(np.max(parts.pixels), 1.0)
-    return profile, bool(rounding <= UNRESOLVED * max(rise, noise))
+    noise = cost[best] / max(np.max(few.pixels), 1.0)
+    return bool(rounding <= UNRESOLVED * max(rise, noise))
 
 
-def sampling_errors(profile: Point, samples: Sequence[Subsample], peak: float) -> tuple[np.ndarray, np.ndarray]:
-    """Standard deviations of a subsample's cost relative to its best sample, and of its slope, over the grid."""
-    log_n, best = profile.log_n, np.argmin(profile.cost.sum(axis=1))
-    # It varies slowly; every other sample will do.
-    few = np.append(np.arange(0, log_n.size - 1, 2), log_n.size - 1)
-    variance = np.zeros((2, few.size))
-    for sample in samples:
-        if sample.factor is not None:
-            variance += spread(sample, log_n, profile.x, few, best, peak)
-    error, slope_error = (np.interp(log_n, log_n[few], deviation) for deviation in np.sqrt(variance))
-    return error, slope_error
+def _sampling_errors(profile: Point, sample: Subsample, peak: float) -> np.ndarray:
+    """Standard deviation of a subsample's cost relative to its best sample, over the grid."""
+    size, best = profile.log_n.size, int(np.argmin(profile.cost.sum(axis=1)))
+    # It varies slowly; every fourth sample will do, and those about the best.
+    near = np.clip(np.arange(best - 2, best + 3), 0, size - 1)
+    few = np.unique(np.concatenate([np.arange(0, size, 4), near, [size - 1]]))
+    variance = sample.spread(profile.log_n[few], profile.x[few], int(np.searchsorted(few, best)), peak)
+    return np.interp(profile.log_n, profile.log_n[few], np.sqrt(variance))
 
 
 def _cells(profile: Point, error: Any = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -295,7 +262,6 @@ def _optimum(
     problem: Problem,
     grid: Any = (),
     profile: Any = (),
-    *,
     sampled: bool = False,
 ) -> Optimum:
     """Gather the answer, with the lobe and its derivative by n in place of those relative to the lobe's peak."""
@@ -305,6 +271,8 @@ def _optimum(
     decay = math.exp(n * problem.peak)
     basis = np.diag([1.0, 1.0, decay, decay / n])
     basis[3, 2] = decay * problem.peak
+    if not problem.free[:, 2].any():
+        basis[2:] = 0.0
     about = about.columns(basis)
     return Optimum(
         n=n,

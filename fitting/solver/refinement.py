@@ -1,4 +1,4 @@
-"""From a bracket around one minimum of the profile to the minimum itself, on all pixels."""
+"""From near one minimum of the profile to the minimum itself, on all pixels: a pass at each exponent."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -11,23 +11,18 @@ from fitting.solver.nnls import nonnegative_minima, nonnegative_minimum
 from fitting.solver.normal_equations import Picture, Sums, sums
 from fitting.solver.tied import design_of, join_channels
 
-# As a function of log n a lobe varies on a scale of 1 or more; steps of the coarse grid, and the widest bracket.
+# As a function of log n a lobe varies on a scale of 1 or more: the steps of the coarse grid.
 GRID_STEP = 0.35
 
-# Over a bracket this wide Hermite's cubic is within 4e-6 of the lobe; the corrections of the last passes do the rest.
-# Under a cap there are none: a quarter of the width is 256 times closer.
-_WIDEST_BRACKET = 0.2
-_WIDEST_CAPPED = 0.05
-
-_MOST_BRACKETS = 10
 _MOST_CORRECTIONS = 8
+_MOST_SECANTS = 40
 
 # What rounding may leave of a column that depends on the others: a few units in the last place of the pixels.
 TOLERANCE_SINGLE = 2e-7
 TOLERANCE_DOUBLE = 1e-14
 
 # Of an interval searched: the three samples that the last parabola goes through are so far apart.
-_CLOSE, _NEAR = 1e-3, 5e-2
+_CLOSE = 1e-3
 
 Cap = Callable[[float], Float[np.ndarray, "3 C"]]
 """From the exponent to what x_a, x_d, x_s count in a sum that may not exceed 1, channel by channel."""
@@ -42,7 +37,6 @@ class Problem(NamedTuple):
         tolerance: What rounding may leave of a column that depends on the others, relative.
         accuracy: How far from the optimum log n may end.
         n_range: Smallest and largest exponent.
-        lobe: Whether there is a highlight to search for.
         peak: Logarithm of the largest cosine of any pixel. Coefficients x_s are relative to ``exp(n peak)``.
         cap: A bound on sums of coefficients, or none.
         tied: x_s is a common factor times this, (C,); None where the channels are independent.
@@ -53,7 +47,6 @@ class Problem(NamedTuple):
     tolerance: float
     accuracy: float
     n_range: tuple[float, float]
-    lobe: bool
     peak: float = 0.0
     cap: Cap | None = None
     tied: np.ndarray | None = None
@@ -62,10 +55,6 @@ class Problem(NamedTuple):
     def bounds(self) -> tuple[float, float]:
         """Of log n."""
         return math.log(self.n_range[0]), math.log(self.n_range[1])
-
-    def sums(self, log_n: Any, reference: np.ndarray) -> Sums:
-        """One pass over all pixels."""
-        return sums(self.pictures, np.array(log_n if self.lobe else []), reference, peak=self.peak)
 
 
 class Point(NamedTuple):
@@ -97,12 +86,10 @@ def problem_of(
     target = pictures[0].target
     free = np.ones((3, target.shape[1]), bool) if free is None else np.asarray(free)
     tolerance, accuracy = (TOLERANCE_SINGLE, 1e-5) if target.dtype == np.float32 else (TOLERANCE_DOUBLE, 5e-9)
-    return Problem(pictures, free.T, tolerance, accuracy, n_range, bool(free[2].any()))
+    return Problem(pictures, free.T, tolerance, accuracy, n_range)
 
 
-def minimum_between(
-    costs: Callable[[np.ndarray], np.ndarray], low: float, high: float, points: int = 17, close: float = _CLOSE
-) -> float:
+def minimum_between(costs: Callable[[np.ndarray], np.ndarray], low: float, high: float, points: int = 17) -> float:
     """Where a function of one number is least: samples, again around the best of them, at last a parabola.
 
     Args:
@@ -110,7 +97,6 @@ def minimum_between(
         low: lower bound.
         high: upper bound.
         points: how many are tried at once.
-        close: samples go on until they are this share of the range apart.
     """
     width = high - low
     while True:
@@ -118,7 +104,7 @@ def minimum_between(
         cost = costs(at)
         middle = int(np.clip(np.argmin(cost), 1, points - 2))
         low, here, high = at[middle - 1 : middle + 2]
-        if high - here <= close * width:
+        if high - here <= _CLOSE * width:
             break
     before, after = np.diff(cost[middle - 1 : middle + 2])
     bend = after - before
@@ -140,9 +126,10 @@ def solve_linear(parts: Sums, log_n: Float[np.ndarray, " N"], reference: np.ndar
     """
 
     def caps(shift: float) -> np.ndarray:
-        """What the coefficients, relative to the peak, count towards the cap."""
+        """What the coefficients, relative to the peak, count towards the cap; no more than has a finite square."""
         assert problem.cap is not None
-        return np.stack([problem.cap(n).T * [1, 1, np.exp(-n * problem.peak)] for n in np.exp(log_n + shift)])
+        exponents = np.exp(log_n + shift)
+        return np.stack([problem.cap(n).T * [1, 1, np.exp(min(-n * problem.peak, 300))] for n in exponents])
 
     gram, product = parts.gram[..., :3, :3], parts.product[..., :3]
     if problem.tied is None:
@@ -167,54 +154,49 @@ def solve_linear(parts: Sums, log_n: Float[np.ndarray, " N"], reference: np.ndar
     return Point(log_n, x, np.maximum(parts.square + change, 0.0), slope)
 
 
-def _solve_bracket(problem: Problem, lower: float, upper: float, x: np.ndarray) -> tuple[Point, float]:
-    """The least cost within a bracket, and where it lies, as a share of the bracket."""
-    parts, width = problem.sums([lower, upper], x), upper - lower
-
-    def at(shares: np.ndarray) -> Point:
-        return solve_linear(parts.within(shares, width, x), lower + shares * width, x, problem)
-
-    # Without a cap the cost is smooth, and Gauss-Newton steps follow.
-    close = _NEAR if problem.cap is None else _CLOSE
-    share = minimum_between(lambda shares: np.sum(at(shares).cost, axis=1), 0.0, 1.0, close=close)
-    return Point(*(leaf[0] for leaf in at(np.array([share])))), share
-
-
-def enclose(problem: Problem, lower: float, upper: float, x: np.ndarray) -> tuple[Point, bool]:
-    """Follow one minimum until it lies inside a bracket narrow enough for the cubic, and say whether it does.
+def capped_minimum(problem: Problem, lower: float, upper: float, x: np.ndarray) -> tuple[Point, Sums]:
+    """The minimum under a cap between two exponents: where the slope is 0, or at one of them.
 
     Args:
         problem: What is searched.
-        lower: Of the first bracket in log n.
+        lower: Logarithm of an exponent.
         upper: Likewise.
         x: Coefficients of a model near by, (C, 3).
+
+    Source: M. Dowell and P. Jarratt, "A modified regula falsi method", BIT 11 (1971) 168-174, the Illinois algorithm.
     """
-    least, most = problem.bounds
-    widest = _WIDEST_BRACKET if problem.cap is None else _WIDEST_CAPPED
-    attempt = 0
-    while True:
-        attempt += 1
-        point, share = _solve_bracket(problem, lower, upper, x)
-        half, x = (upper - lower) / 2, point.x
-        if (share <= 0 and lower > least) or (share >= 1 and upper < most):
-            half = min(2 * half, GRID_STEP)
-        elif 2 * half > widest:
-            # What the cubic leaves of the error of a grid cell is far below this.
-            half = widest / 8
+
+    def at(log_n: float, x: np.ndarray) -> tuple[Point, Sums]:
+        parts = sums(problem.pictures, np.array([log_n]), x, problem.peak)
+        solved = solve_linear(parts, np.array([log_n]), x, problem)
+        return Point(*(leaf[0] for leaf in solved)), Sums(*(leaf[0] for leaf in parts)).about(x)
+
+    low, high = (at(log_n, x) for log_n in (lower, upper))
+    left, right = float(low[0].slope), float(high[0].slope)
+    if not left < 0 < right:
+        return min(low, high, key=lambda found: float(np.sum(found[0].cost)))
+    a, b, best = lower, upper, low
+    for _ in range(_MOST_SECANTS):
+        log_n = (a * right - b * left) / (right - left)
+        last, best = best, at(log_n, best[0].x)
+        slope = float(best[0].slope)
+        if slope == 0 or abs(best[0].log_n - last[0].log_n) <= problem.accuracy:
+            break
+        if slope < 0:
+            a, left, right = log_n, slope, right / 2 if last[0].slope < 0 else right
         else:
-            return point, True
-        if attempt == _MOST_BRACKETS:
-            return point, False
-        lower, upper = max(least, point.log_n - half), min(most, point.log_n + half)
+            b, right, left = log_n, slope, left / 2 if last[0].slope > 0 else left
+    return best
 
 
-def _correct(parts: Sums, point: Point, problem: Problem) -> tuple[Point, float]:
+def _correct(parts: Sums, point: Point, problem: Problem, bounds: tuple[float, float]) -> tuple[Point, float]:
     """One joint Gauss-Newton step from a point; its active set is kept.
 
     Args:
         parts: Sums at the point, the reference being its own coefficients.
         point: The point.
-        problem: Bounds.
+        problem: What is searched.
+        bounds: Of log n.
 
     Returns:
         The new point, and about how far from the optimum in log n it still is.
@@ -232,7 +214,8 @@ def _correct(parts: Sums, point: Point, problem: Problem) -> tuple[Point, float]
     curvature = gram[-1, -1]
     left = curvature - along @ cross
     move = (product[-1] - along @ score) / left if left > problem.tolerance * curvature else 0.0
-    log_n = float(np.clip(point.log_n + move, *problem.bounds))
+    # Farther than a step of the grid the derivative says nothing of the lobe.
+    log_n = float(np.clip(point.log_n + np.clip(move, -GRID_STEP, GRID_STEP), *bounds))
     move = log_n - point.log_n
     x = np.maximum(point.x + (design @ (gain - move * along)).reshape(3, -1).T, 0.0)
     step = np.column_stack([x - point.x, move * x_s])
@@ -245,20 +228,30 @@ def _correct(parts: Sums, point: Point, problem: Problem) -> tuple[Point, float]
     return Point(log_n, x, np.maximum(parts.square + change, 0.0)), abs(move) * (abs(move) + 2 * uncertainty)
 
 
-def gauss_newton(problem: Problem, point: Point) -> tuple[Point, Sums]:
+def gauss_newton(problem: Problem, point: Point, reach: float = math.inf) -> tuple[Point, Sums]:
     """Residual passes with joint corrections until n stands still: exact cost, sums about the target.
 
     At each exponent the best coefficients are found anew, so that a coefficient may leave 0 or come to it. Where noise
     leaves n loosely determined a Gauss-Newton step may pass the minimum: a point that costs more than the last is
     brought back, to the minimum of the parabola through both. Nothing is returned on the word of the quadratic model
-    unless its step was negligible. Under a cap the exponent is that of the bracket.
+    unless its step was negligible.
+
+    Args:
+        problem: What is searched.
+        point: Where to start; its cost is not looked at.
+        reach: How far from there log n may go.
+
+    Returns:
+        The minimum, and the sums at it or next to it, about the target.
     """
     held, about, slope, last = point, None, 0.0, math.inf
+    least, most = problem.bounds
+    bounds = max(least, point.log_n - reach), min(most, point.log_n + reach)
     for _ in range(_MOST_CORRECTIONS):
         reference = point.x
-        parts = problem.sums([point.log_n], reference)
-        solved = solve_linear(Sums(*(leaf[None] for leaf in parts)), np.array([point.log_n]), reference, problem)
-        here = Point(*(leaf[0] for leaf in solved))
+        several = sums(problem.pictures, np.array([point.log_n]), reference, problem.peak)
+        solved = solve_linear(several, np.array([point.log_n]), reference, problem)
+        parts, here = Sums(*(leaf[0] for leaf in several)), Point(*(leaf[0] for leaf in solved))
         cost = np.sum(here.cost)
         if cost - last > problem.tolerance * last:
             share = np.clip(-slope / (2 * (cost - last - slope)), 0.1, 0.5)
@@ -270,7 +263,7 @@ def gauss_newton(problem: Problem, point: Point) -> tuple[Point, Sums]:
         lost = np.sum(parts.square) > 2 * cost + problem.tolerance * np.sum(about.square)
         # The sums with the residual against the best coefficients at this exponent.
         parts = parts.about(reference - here.x)._replace(square=here.cost)
-        point, left = _correct(parts, here, problem) if problem.cap is None else (here, 0.0)
+        point, left = _correct(parts, here, problem, bounds) if problem.cap is None else (here, 0.0)
         slope = -2 * (point.log_n - here.log_n) * np.sum(here.x[:, 2] * parts.product[:, 3])
         if lost:
             last = math.inf

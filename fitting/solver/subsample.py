@@ -1,153 +1,188 @@
-"""A stratified subsample of a picture: a few thousand pixels that see every exponent.
+"""A stratified subsample of the pixels: a few thousand that see every exponent, and the profile that they show.
 
 A lobe of exponent n lights the pixels with ``-log_cos`` below about 1 / n: at n = 1e5 a handful around the peak, while
 an n below 1 is told from another by the few that are nearly at 90 degrees from it. So each octave of ``-log_cos`` is a
 stratum; sparse ones are kept whole, the others sample to about equal numbers. Weights are the inverse probabilities.
+
+So few pixels are dealt with on the host, in float64: nothing is compiled for them.
 """
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from fitting.solver.normal_equations import Picture, relative_lobe
+from fitting.solver.normal_equations import Picture, Sums
+
+# How many pixels of all pictures together are taken, and how many of each picture at least.
+SAMPLE_SIZE = 4096
+SMALLEST_SAMPLE = 256
 
 # The strata are counted on every 16th pixel.
 _PREVIEW_STRIDE = 16
 
-# Down to exp(-60) of its value at the centre a lobe is well inside float32.
-_LARGEST_DECAY = 60.0
-
-# A pixel of weight 0 is in no stratum.
+# A pixel that does not count is in no stratum.
 _EXCLUDED = 255
+
+# No more terms than this, pixels times light samples, of one picture.
+_TERMS = 1 << 20
+
+# Lobes are evaluated at so many values at a time, which stay in the second-level cache.
+_VALUES = 1 << 16
 
 
 class Subsample(NamedTuple):
-    """Some pixels of a picture.
+    """Some pixels of all pictures, and what they see.
 
     Attributes:
-        picture: The pixels kept, their weights times ``factor``.
-        factor: How many pixels each stands for, at least 1; 0 for padding. None where all pixels were kept.
-        nearest: The smallest ``-log_cos`` of all pixels that count; infinite without a lobe.
+        parts: of each picture some pixels, in NumPy; weights times ``factor``.
+        factor: of each picture, how many pixels each stands for, at least 1; None where every pixel was kept.
+        nearest: the smallest ``-log_cos`` of all pixels that count; infinite without a lobe.
     """
 
-    picture: Picture
-    factor: Float[np.ndarray, " M"] | None
+    parts: list[Picture]
+    factor: list[Float[np.ndarray, " M"] | None]
     nearest: float
 
+    @property
+    def whole(self) -> bool:
+        """Every pixel that counts was kept."""
+        return all(factor is None for factor in self.factor)
 
-@jax.jit
-def _octaves(picture: Picture) -> tuple[Array, Array]:
-    """The octave of ``-log_cos``, which is its binary exponent, 0 at the peak itself; and the smallest ``-log_cos``."""
-    assert picture.lobe is not None
-    distance = -picture.lobe.peak()
-    octave = (jax.lax.bitcast_convert_type(distance.astype(jnp.float32), jnp.int32) >> 23) & 0xFF
-    if picture.weight is not None:
-        counts = jnp.max(picture.weights, axis=1) > 0
-        octave = jnp.where(counts, octave, _EXCLUDED)
-        distance = jnp.where(counts, distance, jnp.inf)
-    return octave.astype(jnp.uint8), jnp.min(distance)
+    def sums(self, log_n: Float[np.ndarray, " N"], peak: float) -> Sums:
+        """What `fitting.solver.normal_equations.sums` gives for all pixels, the reference being 0.
+
+        Of the derivative only the products that a profile needs: that with itself is left out.
+        """
+        totals: list[Sums] = []
+        for part in self.parts:
+            weight = part.weights.astype(np.float64)
+            target = np.where(weight > 0, part.target, 0.0).astype(np.float64)
+            fixed = np.stack(np.broadcast_arrays(part.ambient, part.diffuse.astype(np.float64)))
+            groups = 1 if fixed.shape[2] == weight.shape[1] == 1 else target.shape[1]
+            gram = np.zeros((log_n.size, groups, 4, 4))
+            product = np.zeros((log_n.size, target.shape[1], 4))
+            for index, *moving in _lobes(part, log_n, peak):
+                for group in range(groups):
+                    own = slice(None) if groups == 1 else slice(group, group + 1)
+                    w = weight[:, min(group, weight.shape[1] - 1)]
+                    still = fixed[..., min(group, fixed.shape[2] - 1)]
+                    value, slope = (one[..., min(group, one.shape[2] - 1)] for one in moving)
+                    heavy, seen = still * w, (w[:, None] * target[:, own])
+                    gram[index, group, :2, :2] = heavy @ still.T
+                    product[index, own, :2] = seen.T @ still.T
+                    for column, one in enumerate((value, slope), start=2):
+                        cross = one @ heavy.T
+                        gram[index, group, :2, column] = gram[index, group, column, :2] = cross
+                        cross = np.einsum("gm,gm,m->g", one, value, w)
+                        gram[index, group, 2, column] = gram[index, group, column, 2] = cross
+                        product[index, own, column] = one @ seen
+            pixels = np.broadcast_to(np.count_nonzero(weight, axis=0), target.shape[1])
+            square = np.sum(weight * target**2, axis=0)
+            whole = np.broadcast_to(gram, (*product.shape, 4))
+            totals.append(Sums(whole, product, *np.broadcast_arrays(square, pixels, product[..., 0])[:2]))
+        return Sums(*map(sum, zip(*totals, strict=True)))
+
+    def spread(
+        self, log_n: Float[np.ndarray, " N"], x: Float[np.ndarray, "N C 3"], best: int, peak: float
+    ) -> np.ndarray:
+        """How far the subsample's profile may be from that of all pixels.
+
+        Args:
+            log_n: Natural logarithms of some exponents.
+            x: Best coefficients at each.
+            best: Which to compare with.
+            peak: See :class:`brdf.lobes.Lobe`.
+
+        Returns:
+            Horvitz-Thompson variances of the cost at each exponent minus that at the best.
+        """
+        total = np.zeros(log_n.size)
+        for part, factor in zip(self.parts, self.factor, strict=True):
+            if factor is None:
+                continue
+            # A pixel that was certain to be kept adds nothing to the uncertainty.
+            unsure = np.flatnonzero(factor > 1)
+            part = part.pixels(lambda a, unsure=unsure: a[unsure])
+            chance = (1 - 1 / factor[unsure]).astype(np.float32)
+            # Fourth powers stay in the range of single precision; NumPy is slow where the last axis is short.
+            target = np.where(part.weights > 0, part.target, 0.0)
+            scale = float(np.max(np.abs(target), initial=0.0)) or 1.0
+            target, weight, diffuse = (a.T.astype(np.float32) for a in (target / scale, part.weights, part.diffuse))
+            value = np.concatenate([value for _, value, _ in _lobes(part, log_n, peak)])
+            x_a, x_d, x_s = (x / scale).astype(np.float32).transpose(2, 0, 1)[..., None]
+            still = x_a * np.asarray(part.ambient, np.float32)[:, None] + x_d * diffuse
+            residual = target - still - x_s * value.astype(np.float32).swapaxes(1, 2)
+            rise = (residual - residual[best]) * (residual + residual[best]) * weight
+            total += scale**4 * np.sum(rise, axis=1, dtype=np.float64) ** 2 @ chance
+        return total
 
 
-def _shares(octaves: np.ndarray, size: int) -> np.ndarray:
-    """Which share of each octave to keep, so that about ``size`` pixels remain."""
-    preview = octaves[::_PREVIEW_STRIDE]
-    count = np.bincount(preview, minlength=256) * (octaves.size / preview.size)
+def _lobes(part: Picture, log_n: np.ndarray, peak: float) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
+    """Values and derivatives by log n of the lobe, (N, M, Cb), some exponents at a time."""
+    lobe = part.lobe
+    if lobe is None:
+        nothing = np.zeros((log_n.size, *part.diffuse.shape))
+        yield slice(None), nothing, nothing
+        return
+    values = sum(leaf.size for leaf in jax.tree.leaves((lobe.kept, lobe.fine)))
+    step = max(1, _VALUES // max(values, 1))
+    for first in range(0, log_n.size, step):
+        index = slice(first, first + step)
+        n = np.exp(log_n[index])[:, None, None]
+        value, slope = lobe(n, peak)
+        yield index, value, slope * n
+
+
+def subsample(pictures: Sequence[Picture]) -> Subsample:
+    """Take some pixels of each picture.
+
+    Args:
+        pictures: all that are searched.
+
+    Returns:
+        The pixels kept: all of a small picture, and where there is no lobe.
+    """
+    size = max(SMALLEST_SAMPLE, SAMPLE_SIZE // len(pictures))
+    parts, factors, nearest = [], [], math.inf
+    for picture in pictures:
+        weight = None if picture.weight is None else np.asarray(picture.weights)
+        counts = None if weight is None else np.max(weight, axis=1) > 0
+        index, factor = np.arange(picture.target.shape[0]) if counts is None else np.flatnonzero(counts), None
+        if picture.lobe is not None and index.size:
+            distance = -np.asarray(picture.lobe.peak)
+            nearest = min(nearest, float(np.min(distance if counts is None else distance[index])))
+            wanted = max(SMALLEST_SAMPLE, min(size, _TERMS // picture.lobe.samples))
+            if index.size > wanted + wanted // 4:
+                index, factor = _stratified(distance, counts, wanted)
+        # Through NumPy: an XLA gather is ten times slower.
+        lobe = None if picture.lobe is None else picture.lobe.on_host(index)
+        part = replace(picture, lobe=None).pixels(lambda a, index=index: np.asarray(a)[index])  # pyright: ignore[reportArgumentType]
+        weight = part.weights if factor is None else part.weights * factor[:, None]
+        parts.append(replace(part, lobe=lobe, weight=weight))
+        factors.append(factor)
+    return Subsample(parts, factors, nearest)
+
+
+def _stratified(distance: np.ndarray, counts: np.ndarray | None, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Some pixels, and how many each stands for."""
+    # The octave of a number is its binary exponent, 0 at the peak itself.
+    octave = ((distance.astype(np.float32).view(np.int32) >> 23) & 0xFF).astype(np.uint8)
+    if counts is not None:
+        octave[~counts] = _EXCLUDED
+    preview = octave[::_PREVIEW_STRIDE]
+    count = np.bincount(preview, minlength=256) * (octave.size / preview.size)
     count[_EXCLUDED] = 0
     # The largest number per octave that fits: the sparse ones leave their part to the others.
     ordered = np.sort(count[count > 0])
     most = (size - np.cumsum(ordered) + ordered) / np.arange(ordered.size, 0, -1)
     share = np.minimum(1.0, np.max(most, initial=0.0) / np.maximum(count, 1.0))
     share[_EXCLUDED] = 0.0
-    return share
-
-
-def subsample(picture: Picture, size: int, n_max: float) -> Subsample:
-    """Take about ``size`` pixels of a picture.
-
-    Args:
-        picture: The picture.
-        size: How many pixels are wanted.
-        n_max: Largest exponent that they are to be used with.
-
-    Returns:
-        The pixels kept: all of them where there is no lobe, or no more than a quarter over ``size``.
-    """
-    count = picture.target.shape[0]
-    capacity = size + size // 4
-    if picture.lobe is None:
-        return Subsample(picture, None, math.inf)
-    octaves, nearest = (np.asarray(a) for a in _octaves(picture))
-    if count <= capacity:
-        return Subsample(picture, None, float(nearest))
-    share = _shares(octaves, size)
     # Multiples of the golden ratio modulo 1 spread evenly over any run of pixels, without a regular pattern.
-    step = np.arange(count, dtype=np.uint32) * np.uint32(2654435769)
-    while True:
-        index = np.flatnonzero(step < (share * 0xFFFFFFFF).astype(np.uint32)[octaves])
-        if index.size <= capacity:
-            break
-        share = share * (0.9 * capacity / index.size)
-    # Bracketing needs no more than float32, unless the lobe leaves its range.
-    single = n_max * nearest < _LARGEST_DECAY
-    # Padding repeats the first pixel with weight 0, for one shape means one compilation.
-    padded = np.zeros(capacity, np.intp)
-    padded[: index.size] = index
-
-    def choose(a: Array) -> Any:
-        # Through NumPy: an XLA gather is ten times slower.
-        kept = np.take(np.asarray(a), padded, axis=0)
-        return kept.astype(np.float32) if single and kept.dtype == np.float64 else kept
-
-    factor = np.zeros(capacity, np.float32)
-    factor[: index.size] = 1 / share[octaves[index]]
-    kept = picture.pixels(choose)
-    return Subsample(replace(kept, weight=kept.weights * factor[:, None]), factor, float(nearest))
-
-
-@jax.jit
-def spread(
-    sample: Subsample, log_n: Array, x: Float[Array, "N C 3"], few: Array, best: Array, peak: Array
-) -> tuple[Array, Array]:
-    """How far the subsample's profile may be from that of all pixels.
-
-    Args:
-        sample: The subsample of one picture.
-        log_n: Natural logarithms of the exponents, (N,).
-        x: Best coefficients at each.
-        few: Which of them to look at.
-        best: Which to compare with.
-        peak: See :func:`fitting.solver.normal_equations.relative_lobe`.
-
-    Returns:
-        Horvitz-Thompson variances of the cost at those exponents minus that at the best, and of the profile's slope by
-        log n. They add up over pictures.
-    """
-    picture, lobe, factor = sample.picture, sample.picture.lobe, sample.factor
-    assert lobe is not None
-    assert factor is not None
-    dtype = picture.target.dtype
-    x = x.astype(dtype)
-    # A pixel that was certain to be kept adds nothing to the uncertainty.
-    chance = jnp.where(factor > 0, 1 - 1 / jnp.maximum(factor, 1), 0.0)
-
-    def residual_and_slope(index: Array) -> tuple[Array, Array]:
-        value, slope = relative_lobe(lobe, log_n[index], peak, dtype)
-        x_a, x_d, x_s = x[index].T
-        model = x_a * jnp.asarray(picture.ambient, dtype) + x_d * picture.diffuse + x_s * value
-        return picture.target - model, x_s * slope
-
-    def variance(a: Array) -> Array:
-        return jnp.sum(chance * jnp.sum(jnp.where(picture.weights > 0, picture.weights * a, 0), axis=1) ** 2)
-
-    reference, _ = residual_and_slope(best)
-
-    def one(index: Array) -> tuple[Array, Array]:
-        residual, slope = residual_and_slope(index)
-        return variance((residual - reference) * (residual + reference)), variance(2 * residual * slope)
-
-    return jax.lax.map(one, few)
+    step = np.arange(octave.size, dtype=np.uint32) * np.uint32(2654435769)
+    index = np.flatnonzero(step < (share * 0xFFFFFFFF).astype(np.uint32)[octave])
+    return index, 1 / share[octave[index]]

@@ -74,7 +74,7 @@ def _where_counted(picture: Picture, values: Array, otherwise: float) -> Array:
 @eqx.filter_jit
 def _nearest_peak(picture: Picture) -> Array:
     assert picture.lobe is not None
-    return jnp.max(_where_counted(picture, picture.lobe.peak(), -jnp.inf))
+    return jnp.max(_where_counted(picture, picture.lobe.peak, -jnp.inf))
 
 
 @eqx.filter_jit

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from fitting.model_fit import ModelFit
+from fitting.solver.normal_equations import sums
 from fitting.solver.refinement import problem_of, solve_linear
 
 NORMAL_95 = 1.959963984540054
@@ -16,9 +17,8 @@ ONE_SIDED_95 = 1.6448536269514722
 LOWEST = -2.0
 # Below this relative error of n the profile is a parabola in log n to within a hundredth of the interval.
 PARABOLIC = 0.01
-# Hermite's cubic of the lobe over log n holds this far.
-WIDEST = 0.35
-SHARES = np.linspace(0.0, 1.0, 17)
+# The widest step outwards in log n, and the share of a step to which an end is found.
+WIDEST, CLOSE = 0.35, 1e-3
 
 
 @functools.cache
@@ -69,7 +69,7 @@ def exponent_interval(fit: ModelFit, n_error: float, rise: float, peak: float) -
     """The 95 % profile-likelihood interval of n: where the least cost rises by ``rise``.
 
     A relative error below a hundredth needs no pixel: there the profile is a parabola in log n. Else the cost is
-    followed outwards from the optimum, two brackets of pixels' sums in the ordinary case.
+    followed outwards from the optimum, a pass over the pixels at each exponent tried.
 
     Args:
         fit: of a model with a lobe.
@@ -88,39 +88,38 @@ def exponent_interval(fit: ModelFit, n_error: float, rise: float, peak: float) -
     if relative < PARABOLIC and inside:
         return optimum.n * math.exp(-NORMAL_95 * relative), optimum.n * math.exp(NORMAL_95 * relative)
     first = min(max(1.1 * NORMAL_95 * relative, 1e-3), WIDEST)
-    limit = float(np.sum(optimum.cost)) + rise
+    least = float(np.sum(optimum.cost))
     problem = problem_of(fit.pictures, fit.n_range, fit.free)._replace(peak=peak, tied=fit.tied)
     # Relative to the nearest pixel the lobe keeps its size where no pixel sees the centre.
     reference = optimum.x.T * [1.0, 1.0, math.exp(optimum.n * peak)]
 
-    def costs(low: float, high: float) -> np.ndarray:
+    def rise_at(log_n: float) -> float:
         with jax.enable_x64(True):
-            parts = problem.sums([low, high], reference).within(SHARES, high - low, reference)
-        at = low + SHARES * (high - low)
-        return solve_linear(parts, at, reference, problem).cost.sum(axis=1)
+            parts = sums(problem.pictures, np.array([log_n]), reference, peak)
+            return float(np.sum(solve_linear(parts, np.array([log_n]), reference, problem).cost)) - least
 
-    low, high = (_end(costs, centre, sign, bound, first, limit) for sign, bound in zip((-1, 1), bounds, strict=True))
+    low, high = (_end(rise_at, centre, sign, bound, first, rise) for sign, bound in zip((-1, 1), bounds, strict=True))
     return math.exp(low), math.exp(high)
 
 
-def _end(
-    costs: Callable[[float, float], np.ndarray], start: float, sign: int, bound: float, width: float, limit: float
-) -> float:
-    """Where the profile crosses the limit on one side of the optimum, in log n; infinite where it does not."""
-    while (bound - start) * sign > 1e-9:
-        end = bound if (bound - start) * sign < width else start + sign * width
-        cost = costs(min(start, end), max(start, end))[::sign]
-        position = start + SHARES * (end - start)
-        above = np.flatnonzero(cost > limit)
-        if above.size == 0:
-            start, width = end, WIDEST
+def _end(rise_at: Callable[[float], float], start: float, sign: int, bound: float, step: float, limit: float) -> float:
+    """Where the profile first rises by a limit on one side of the optimum, in log n; infinite where it does not."""
+    inside, below = start, 0.0
+    while (bound - inside) * sign > 1e-9:
+        outside = min(inside + sign * step, bound, key=lambda end: abs(end - start))
+        above = rise_at(outside)
+        if above <= limit:
+            inside, below, step = outside, max(above, 0.0), WIDEST
             continue
-        first = int(above[0])
-        if first == 0:
-            return float(position[0])
-        # Interpolated in the square root of the rise, which is nearly straight.
-        least = min(float(cost[0]), limit)
-        root = np.sqrt(np.maximum(cost[first - 1 : first + 1] - least, 0.0))
-        share = (math.sqrt(limit - least) - root[0]) / max(root[1] - root[0], np.finfo(float).tiny)
-        return float(position[first - 1] + min(max(share, 0.0), 1.0) * (position[first] - position[first - 1]))
+        # The root of the rise is nearly straight.
+        while True:
+            share = (math.sqrt(limit) - math.sqrt(below)) / (math.sqrt(above) - math.sqrt(below))
+            middle = inside + share * (outside - inside)
+            if abs(outside - inside) < CLOSE or min(share, 1 - share) * abs(outside - inside) < CLOSE * step:
+                return middle
+            rise = rise_at(middle)
+            if rise > limit:
+                outside, above = middle, rise
+            else:
+                inside, below = middle, max(rise, 0.0)
     return sign * math.inf

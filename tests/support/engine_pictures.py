@@ -1,48 +1,25 @@
 """Pictures of a ball as the engine takes them, and what they cost by plain NumPy and SciPy."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import nnls
 
+from brdf.lobes import Lobe
 from fitting.solver.normal_equations import Picture
 
 X = np.array([[0.05, 0.03, 0.02], [0.5, 0.3, 0.1], [0.3, 0.4, 0.5]])
 
 
-class OneLightLobe(eqx.Module):
-    """The lobe of one light sample per pixel: ``weight * exp(n * log_cos)``."""
-
-    log_cos: jax.Array
-    weight: jax.Array
-
-    def __call__(self, n):
-        value = self.weight * jnp.exp(n.astype(self.log_cos.dtype) * self.log_cos)[:, None]
-        return value, value * self.log_cos[:, None]
-
-    def peak(self):
-        return jnp.where(jnp.any(self.weight > 0, axis=1), self.log_cos, -1e9)
-
-    def pixels(self, choose):
-        return OneLightLobe(choose(self.log_cos), choose(self.weight))
+def one_light_lobe(log_cos, weight):
+    """The lobe of one light sample per pixel: ``weight * exp(n * log_cos)``, of (P,) and (P, C)."""
+    return sum_of_lobes(log_cos[:, None], weight[:, None])
 
 
-class SumOfLobes(eqx.Module):
-    """Several lights, each weight and cosine (P, L)."""
-
-    log_cos: jax.Array
-    weight: jax.Array
-
-    def __call__(self, n):
-        each = self.weight * jnp.exp(n.astype(self.log_cos.dtype) * self.log_cos)
-        return jnp.sum(each, axis=1, keepdims=True), jnp.sum(each * self.log_cos, axis=1, keepdims=True)
-
-    def peak(self):
-        return jnp.max(self.log_cos, axis=1)
-
-    def pixels(self, choose):
-        return SumOfLobes(choose(self.log_cos), choose(self.weight))
+def sum_of_lobes(log_cos, weight):
+    """Several samples, weights (P, S, C) and cosines (P, S)."""
+    with jax.enable_x64(True):
+        return Lobe.of_terms(((jnp.asarray(weight), jnp.asarray(log_cos)),))
 
 
 def ball(size, lights):
@@ -69,7 +46,7 @@ def picture(size=64, n=80.0, x=X, noise=0.0, dtype=np.float64, light=(0.5, 0.6, 
     basis = np.stack([np.ones_like(cosine), cosine, gate * np.exp(n * log_cos)])
     target = basis.T @ x
     target = target + noise * np.max(target) * np.random.default_rng(seed).standard_normal(target.shape)
-    lobe = OneLightLobe(log_cos.astype(dtype), gate[:, None].astype(dtype))
+    lobe = one_light_lobe(log_cos.astype(dtype), gate[:, None].astype(dtype))
     return Picture(target.astype(dtype), cosine[:, None].astype(dtype), lobe, **more)
 
 

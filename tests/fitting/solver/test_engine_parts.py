@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from engine_pictures import best_at, cost_of, picture
+from engine_pictures import best_at, cost_of, picture, sum_of_lobes
 from scipy.optimize import nnls
 
 from fitting.solver.nnls import nonnegative_minima
@@ -12,38 +12,46 @@ from fitting.solver.refinement import Point, gauss_newton, problem_of
 from fitting.solver.subsample import subsample
 
 
-@pytest.mark.parametrize("columns", [0, 1, 2])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_sums_are_those_of_numpy(columns, dtype):
+def test_sums_are_those_of_numpy(dtype):
     """Ragged blocks too; float32 products are summed in blocks, so they are good to a few 1e-7."""
     one = picture(400, noise=0.1, dtype=dtype).pixels(lambda a: a[:100_003])
     rng = np.random.default_rng(0)
     one = Picture(one.target, one.diffuse, one.lobe, rng.uniform(0, 1, one.target.shape[0]).astype(dtype))
-    log_n, reference = np.log([40.0, 45.0])[:columns], rng.uniform(0, 0.3, (3, 3))
+    log_n, reference = np.log([40.0, 45.0]), rng.uniform(0, 0.3, (3, 3))
     with jax.enable_x64(True):
         found = sums([one], log_n, reference)
-    log_cos, gate = np.asarray(one.lobe.log_cos, float), np.asarray(one.lobe.weight, float)[:, 0]
-    lobes = [gate * np.exp(np.exp(at) * log_cos) for at in log_n]
-    slopes = [lobe * log_cos * np.exp(at) for lobe, at in zip(lobes, log_n, strict=True)]
-    basis = [np.ones_like(gate), np.asarray(one.diffuse, float)[:, 0], *lobes[:1], *slopes[:1]]
-    if columns == 2:
-        basis += [lobes[1] - lobes[0] - (log_n[1] - log_n[0]) * slopes[0], slopes[1] - slopes[0]]
-    basis = np.stack(basis)
-    known = np.stack([*basis[:2], *basis[2:3]])
-    residual = np.asarray(one.target, float).T - reference[:, : len(known)] @ known
-    weight = np.asarray(one.weight, float)
-    scale = np.sqrt(np.sum(weight * basis**2, axis=1))
+    gate, log_cos = (np.asarray(a, float).ravel() for a in one.lobe.kept[0])
     accuracy = 1e-6 if dtype == np.float32 else 1e-12
-    gram = (weight * basis) @ basis.T / scale[:, None] / scale
-    # The two last columns of a bracket are small differences, and keep as many digits as their pixels have.
-    loose = 300 if columns == 2 else 1
-    np.testing.assert_allclose(
-        found.gram[0, : len(basis), : len(basis)] / scale[:, None] / scale, gram, atol=loose * accuracy
-    )
-    size = np.sqrt(np.sum(weight * residual**2, axis=1))
-    product = (weight * residual) @ basis.T / scale / size[:, None]
-    np.testing.assert_allclose(found.product[:, : len(basis)] / scale / size[:, None], product, atol=loose * accuracy)
-    np.testing.assert_allclose(found.square, size**2, rtol=10 * accuracy)
+    for at, gram_found, product_found, square_found in zip(log_n, *found[:3], strict=True):
+        lobe = gate * np.exp(np.exp(at) * log_cos)
+        basis = np.stack([np.ones_like(gate), np.asarray(one.diffuse, float)[:, 0], lobe, lobe * log_cos * np.exp(at)])
+        residual = np.asarray(one.target, float).T - reference @ basis[:3]
+        weight = np.asarray(one.weight, float)
+        scale = np.sqrt(np.sum(weight * basis**2, axis=1))
+        gram = (weight * basis) @ basis.T / scale[:, None] / scale
+        np.testing.assert_allclose(gram_found[0] / scale[:, None] / scale, gram, atol=accuracy)
+        size = np.sqrt(np.sum(weight * residual**2, axis=1))
+        product = (weight * residual) @ basis.T / scale / size[:, None]
+        np.testing.assert_allclose(product_found / scale / size[:, None], product, atol=accuracy)
+        np.testing.assert_allclose(square_found, size**2, rtol=10 * accuracy)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_sums_on_the_host_are_those_of_a_pass(channels):
+    """Two light samples; weight and basis of all channels or of each."""
+    rng = np.random.default_rng(0)
+    log_cos, kept = -rng.uniform(0, 0.2, (500, 2)), rng.uniform(0, 1, (500, 2, channels))
+    diffuse, weight, target = (rng.uniform(0, 1, (500, size)) for size in (channels, channels, 3))
+    one = Picture(target, diffuse, sum_of_lobes(log_cos, kept), weight, ambient=np.array([0.5]))
+    log_n, nothing = np.log([3.0, 40.0]), np.zeros((3, 3))
+    sample = subsample([one])
+    with jax.enable_x64(True):
+        expected = sums([one], log_n, nothing, -sample.nearest)
+    found = sample.sums(log_n, -sample.nearest)
+    np.testing.assert_allclose(found.gram[..., :3], expected.gram[..., :3], rtol=1e-10)
+    np.testing.assert_allclose(found.product, expected.product, rtol=1e-10)
+    np.testing.assert_allclose(found.square, np.broadcast_to(expected.square, found.square.shape), rtol=1e-10)
 
 
 def test_nonnegative_solver_against_scipy():
@@ -65,14 +73,13 @@ def test_nonnegative_solver_against_scipy():
 def test_subsample_keeps_the_innermost_pixels_and_the_totals():
     one = picture(512, light=(0.2, 0.1, 1.0))
     with jax.enable_x64(True):
-        sample = subsample(one, 4096, 1e6)
-    distance = -np.asarray(one.lobe.log_cos)
-    factor = np.asarray(sample.factor)
-    assert np.count_nonzero(factor) < 5200
+        sample = subsample([one])
+    distance, (factor,) = -np.asarray(one.lobe.peak), sample.factor
+    assert factor.size < 5200
     for octave in range(-16, 0):
         here = (distance >= 2.0**octave) & (distance < 2.0 ** (octave + 1))
-        kept = -np.asarray(sample.picture.lobe.log_cos)
-        kept = (kept >= 2.0**octave) & (kept < 2.0 ** (octave + 1)) & (factor > 0)
+        kept = -sample.parts[0].lobe.peak
+        kept = (kept >= 2.0**octave) & (kept < 2.0 ** (octave + 1))
         if np.count_nonzero(here) < 100:
             assert np.count_nonzero(kept) == np.count_nonzero(here)
         else:

@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from engine_pictures import OneLightLobe, SumOfLobes, ball, best_at, cost_of
+from engine_pictures import ball, best_at, cost_of, one_light_lobe, sum_of_lobes
 from scipy.optimize import least_squares, nnls
 
 import brdf
@@ -15,8 +15,9 @@ from fitting.solver.profile import search
 def scipy_starts(one, starts, seed):
     """The least cost that SciPy's trust-region solver finds from random starts, with an analytic Jacobian."""
     target, diffuse = one.target, one.diffuse[:, 0]
-    log_cos, weight = np.asarray(one.lobe.log_cos), np.asarray(one.lobe.weight)
-    count, channels = target.shape
+    (weight, log_cos), count = map(np.asarray, one.lobe.kept[0]), len(one.target)
+    weight = weight[..., 0]
+    channels = target.shape[1]
 
     def lobe(log_n):
         each = weight * np.exp(np.exp(log_n) * log_cos)
@@ -55,7 +56,7 @@ def random_problem(rng, size):
     target = np.stack([np.ones_like(diffuse), diffuse, np.sum(weight * np.exp(n * log_cos), axis=0)]).T @ x
     noise = rng.uniform(0, 0.05) * (rng.random() < 0.85)
     target = target + noise * np.max(target) * rng.standard_normal(target.shape)
-    return Picture(target, diffuse[:, None], SumOfLobes(log_cos.T, weight.T))
+    return Picture(target, diffuse[:, None], sum_of_lobes(log_cos.T, weight.T[..., None]))
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -85,7 +86,7 @@ def test_highlight_that_no_pixel_sees():
     cosine, distance = rng.uniform(0.2, 1, 300), rng.uniform(4e-3, 2e-2, 300)
     target = 0.1 + 0.4 * cosine[:, None] + 0.3 * np.exp(-3e4 * (distance - np.min(distance)))[:, None]
     target = target + 0.003 * rng.standard_normal(target.shape)
-    found = search([Picture(target, cosine[:, None], OneLightLobe(-distance, np.ones((300, 1))))])
+    found = search([Picture(target, cosine[:, None], one_light_lobe(-distance, np.ones((300, 1))))])
     for n in np.geomspace(0.1, 1e5, 61):
         lobe = np.exp(-n * (distance - np.min(distance)))
         assert np.sum(found.cost) <= nnls(np.stack([np.ones(300), cosine, lobe], 1), target[:, 0])[1] ** 2 * (1 + 1e-9)
@@ -115,7 +116,7 @@ def test_where_noise_leaves_n_loose_the_cost_is_that_of_the_answer_and_the_least
         return sum(nnls(columns, target[:, channel])[1] ** 2 for channel in range(3))
 
     with jax.enable_x64(True):
-        found = search([Picture(target, diffuse[:, None], OneLightLobe(log_cos, np.ones((diffuse.size, 1))))])
+        found = search([Picture(target, diffuse[:, None], one_light_lobe(log_cos, np.ones((diffuse.size, 1))))])
     np.testing.assert_allclose(np.sum(found.cost), least(found.n), rtol=1e-9)
     assert np.sum(found.cost) <= min(map(least, np.geomspace(0.1, 1e6, 300))) * (1 + 1e-6)
 

@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from engine_pictures import OneLightLobe, X, ball, best_at, cost_of, picture
+from engine_pictures import X, ball, best_at, cost_of, one_light_lobe, picture
 
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import search
@@ -101,7 +101,7 @@ def test_channels_and_coloured_lights(channels, coloured):
     diffuse, weight = cosine[:, None] * colour, gate[:, None] * colour**2
     x = rng.uniform(0.05, 0.5, (3, channels))
     target = x[0] + x[1] * diffuse + x[2] * weight * np.exp(60.0 * log_cos)[:, None]
-    found = search([Picture(target, diffuse, OneLightLobe(log_cos, weight))])
+    found = search([Picture(target, diffuse, one_light_lobe(log_cos, weight))])
     np.testing.assert_allclose(found.n, 60.0, rtol=1e-9)
     np.testing.assert_allclose(found.x, x, rtol=1e-9)
 
