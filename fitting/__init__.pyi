@@ -1,3 +1,4 @@
+from . import functional as functional
 from .front_door import fit as fit
 from .implicit import Sensitivity as Sensitivity
 from .implicit import sensitivity as sensitivity

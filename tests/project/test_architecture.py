@@ -22,9 +22,9 @@ brdf.errors brdf.formatters brdf.checks brdf.files brdf.channels brdf.precision 
 brdf.models brdf.albedo brdf.conversions
 brdf.geometry brdf.lights brdf.lobes brdf.pixel_area brdf.images brdf.scene_file brdf.scene brdf.rendering
 brdf.materials brdf.measured brdf.plausibility brdf.display
-fitting.solver fitting.model_fit fitting.light_colour fitting.problem fitting.pixels fitting.selection
-fitting.budget.choice fitting.result fitting.uncertainty fitting.plausible fitting.censored_noise fitting.core
-fitting.report fitting.implicit fitting.joint fitting.relighting fitting.measured_fit fitting.photographs
+fitting.functional fitting.solver fitting.model_fit fitting.light_colour fitting.problem fitting.pixels
+fitting.selection fitting.budget.choice fitting.result fitting.uncertainty fitting.plausible fitting.censored_noise
+fitting.core fitting.report fitting.implicit fitting.joint fitting.relighting fitting.measured_fit fitting.photographs
 fitting.budget fitting.speed_accuracy fitting.front_door
 fitting.cli
 """.split()
@@ -53,6 +53,7 @@ class Tree:
     def __init__(self, root: Path):
         paths = [path for package in PACKAGES for path in sorted((root / package).rglob("*.py"))]
         self.paths = {_name(path.relative_to(root)): path for path in paths}
+        self.modules = {package: _public_modules(root / package / "__init__.pyi") for package in PACKAGES}
         self.public = {package: _public_names(root / package / "__init__.pyi") for package in PACKAGES}
 
     @functools.cached_property
@@ -109,6 +110,14 @@ def _public_names(stub: Path) -> set[str]:
         return set()
     nodes = ast.parse(stub.read_text(encoding="utf-8")).body
     return {alias.asname or alias.name for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names}
+
+
+def _public_modules(stub: Path) -> set[str]:
+    """Modules that are public as a whole."""
+    nodes = ast.parse(stub.read_text(encoding="utf-8")).body if stub.exists() else []
+    return {
+        alias.name for node in nodes if isinstance(node, ast.ImportFrom) and not node.module for alias in node.names
+    }
 
 
 def _layer(module: str, layers: list[str]) -> int:
@@ -168,7 +177,7 @@ def hiding(tree: Tree) -> list[str]:
         for package in PACKAGES
         for name in tree.paths
         if name.startswith(f"{package}.") and not name.startswith(COMMAND)
-        if name.rpartition(".")[2] in tree.public[package]
+        if name.rpartition(".")[2] in tree.public[package] - tree.modules[package]
     ]
 
 

@@ -8,6 +8,7 @@ import ast
 import doctest
 import inspect
 import itertools
+import operator
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ import fitting
 CONSTANTS = {"MODELS": "brdf/models/__init__.py", "PRESETS": "brdf/materials/presets.py"}
 OPTIONS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 NAMES = [("brdf", name) for name in brdf.__all__] + [("fitting", name) for name in fitting.__all__]
+NAMES += [("fitting", f"functional.{name}") for name in ("fit", "solve")]
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +45,7 @@ def folder(tmp_path_factory) -> Path:
 
 def documentation(package: str, name: str) -> str:
     if name not in CONSTANTS:
-        return inspect.getdoc(getattr({"brdf": brdf, "fitting": fitting}[package], name)) or ""
+        return inspect.getdoc(operator.attrgetter(name)({"brdf": brdf, "fitting": fitting}[package])) or ""
     body = ast.parse((ROOT / CONSTANTS[name]).read_text(encoding="utf-8")).body
     for assignment, below in itertools.pairwise(body):
         if isinstance(assignment, ast.AnnAssign) and ast.unparse(assignment.target) == name:
