@@ -4,11 +4,12 @@ Each turns what the user gave into a float64 array and refuses what cannot be on
 holds (arrays and tracers of a transformation) keep their type; only their shape is checked.
 """
 
+import abc
 import inspect
 import textwrap
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -34,21 +35,24 @@ SHOWN, LARGE = 8, 31
 """What is shown of things: how many of a list, arrays of up to so many numbers."""
 
 
-class _Named(type(eqx.Module)):  # pyright: ignore[reportGeneralTypeIssues]
+_Meta: Any = abc.ABCMeta if TYPE_CHECKING else type(eqx.Module)
+
+
+class _Named(_Meta):
     """Of classes that say in one line what they take, where what they are given does not go."""
 
-    def __call__(cls, *given: Any, **named: Any) -> Any:
+    def __call__(self, *given: Any, **named: Any) -> Any:
         """Construct it."""
         try:
             return super().__call__(*given, **named)
         except TypeError:
-            signature = inspect.signature(cls)
+            signature = inspect.signature(self)
             try:
                 signature.bind(*given, **named)
             except TypeError as error:
                 needed = (name for name, one in signature.parameters.items() if one.default is one.empty)
-                remedy = f"Write {cls.__name__}({', '.join(f'{name}=...' for name in needed)})"
-                raise InputError(cls.__name__, str(error), remedy) from None
+                remedy = f"Write {self.__name__}({', '.join(f'{name}=...' for name in needed)})"
+                raise InputError(self.__name__, str(error), remedy) from None
             raise
 
 
@@ -83,7 +87,7 @@ def shown(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float | np.floating) else repr(value)
 
 
-def instance(name: str, value: Any, kind: type | tuple[type, ...], remedy: str) -> None:
+def instance(name: str, value: Any, kind: type, remedy: str) -> None:
     """Refuse what is of another kind.
 
     Args:
@@ -96,9 +100,8 @@ def instance(name: str, value: Any, kind: type | tuple[type, ...], remedy: str) 
         InputError: naming the argument.
     """
     if not isinstance(value, kind):
-        wanted = " or ".join(one.__name__ for one in (kind if isinstance(kind, tuple) else (kind,)))
         came = f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
-        raise InputError(name, f"must be a {wanted}, got {came}", remedy)
+        raise InputError(name, f"must be a {kind.__name__}, got {came}", remedy)
 
 
 def several(name: str, value: Any) -> tuple[Any, ...]:

@@ -78,8 +78,10 @@ class Scene(Checked):
     def __check_init__(self):
         """Refuse parts that do not belong together."""
         words = "Write Scene(camera, shapes=[...], lights=[...])"
-        instance("camera", self.camera, (Camera, type(None)), words)
-        instance("points", self.points, (SurfacePoints, type(None)), "Use brdf.SurfacePoints.from_normals")
+        if self.camera is not None:
+            instance("camera", self.camera, Camera, words)
+        if self.points is not None:
+            instance("points", self.points, SurfacePoints, "Use brdf.SurfacePoints.from_normals")
         for name, parts, kind in (("shapes", self.shapes, Shape), ("lights", self.lights, Light)):
             for index, part in enumerate(parts):
                 instance(f"{name}[{index}]", part, kind, words)

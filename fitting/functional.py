@@ -174,7 +174,7 @@ def fit_basis(
     diffuse = jnp.zeros((weight.size, 1), target.dtype) if images.diffuse is None else images.diffuse
     lobe, peak = None, None
     if images.lobe is not None:
-        peak = jnp.max(jnp.where(weight > 0, images.lobe.peak, -jnp.inf))
+        peak = jnp.max(jnp.where(weight > 0, images.lobe.peak(), -jnp.inf))
         lobe = eqx.Partial(_value, images.lobe)
     ambient = jnp.zeros(1, target.dtype) if ambient is None else ambient
     target = target.reshape(weight.size, -1)

@@ -10,6 +10,9 @@ Bounds: coefficients and emittances may not be negative. A number that leaves it
 rest fitted again; it is let go where the cost falls inwards. So a solution at a bound is exactly there.
 """
 
+import contextlib
+import dataclasses
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -22,37 +25,42 @@ import optimistix as optx
 from jaxtyping import Array
 
 import brdf
+from brdf.errors import InputError
 from brdf.precision import Precision, working_precision
-from fitting.pixels import Tile, observe
-from fitting.problem import state_problem
+from fitting.core import fit_pictures
+from fitting.pixels import Observed, Tile, observe
+from fitting.problem import CLASSIC, FitProblem, model_name, state_problem
+from fitting.report import FitResult
+from fitting.result import Parameter, free_parameters
 from fitting.solver.nnls import inverse_diagonal
+from fitting.uncertainty.intervals import NORMAL_95, above_zero
+from fitting.uncertainty.residual_correlation import correlation_in_rows, structure_warning
 
 LARGEST_JACOBIAN = 1 << 27
 ROUNDS = 8
 # What freed leaves may not go below. A direction or a position has no bound, n is searched by its logarithm.
+DIRECTIONS = ("direction",)
+OPEN = "only a combination with other freed numbers is determined"
+# Of the largest eigenvalue of the normal equations: a smaller one determines nothing.
+DEPENDENT = 1e-12
 NOT_NEGATIVE = ("k_a", "k_d", "k_s", "intensity", "radiance", "ambient", "attenuation")
 
 
-@dataclass(frozen=True)
-class JointResult:
-    """The outcome of a joint fit.
+@dataclass(frozen=True, kw_only=True)
+class JointResult(FitResult):
+    """The outcome of a joint fit: a `FitResult` whose parameters are the freed numbers, and what the solver says.
 
     Attributes:
-        material: the material, fitted where it was freed.
-        scenes: the scenes, likewise.
         values: of the freed leaves.
-        errors: their standard errors; infinite where only a combination of the freed numbers is determined.
-        residual: root mean square of the residual over that of the pictures.
+        errors: their standard errors; of a direction the angle, in degrees; infinite where only a combination of the
+            freed numbers is determined.
         steps: of the solver.
         converged: whether the solver said so.
         solver: "lm" or "bfgs".
     """
 
-    material: brdf.Material
-    scenes: list[brdf.Scene]
     values: tuple[np.ndarray, ...]
     errors: tuple[np.ndarray, ...]
-    residual: float
     steps: int
     converged: bool
     solver: str
@@ -61,8 +69,8 @@ class JointResult:
 def fit_jointly(
     target: Any,
     scene: brdf.Scene | Sequence[brdf.Scene],
-    material: brdf.Material,
-    free: Callable[[brdf.Material, list[brdf.Scene]], Sequence[Any]],
+    material: brdf.Material | type[brdf.Material] | str = "auto",
+    free: Callable[[brdf.Material, list[brdf.Scene]], Sequence[Any]] | None = None,
     *,
     solver: Literal["lm", "bfgs"] | None = None,
     precision: Precision = "float64",
@@ -76,9 +84,10 @@ def fit_jointly(
     Args:
         target: linear values, (H, W, C), or a list of pictures.
         scene: what the picture shows, or a list of as many.
-        material: to start from, usually ``fitting.fit(target, scene).material``.
+        material: to start from; or a model, from whose separable optimum it starts; or "auto" for the simplest
+            adequate model under the scenes that were found.
         free: from material and list of scenes to the leaves to fit, for example
-            ``lambda m, s: (m.k_d, m.n, s[0].lights[0].direction)``.
+            ``lambda m, s: (m.k_d, m.n, s[0].lights[0].direction)``; all others are held.
         solver: "lm", "bfgs", or None to choose by size.
         precision: "float32" or "float64".
         mask: (H, W), pixels to look at, or a list, such as ``fitting.fit(target, scene).counted[0]``.
@@ -97,20 +106,45 @@ def fit_jointly(
         >>> target, scene = brdf.read_image("target.exr"), brdf.Scene.load("scene.toml")
         >>> start = brdf.BlinnPhong(k_a=brdf.preset("gold").k_a, k_d=[0.7, 0.6, 0.2], k_s=brdf.preset("gold").k_s, n=40)
         >>> result = fitting.fit_jointly(target, scene, start, lambda material, scenes: (material.k_d, material.n))
-        >>> round(float(result.material.n), 2)
+        >>> round(float(result["n"]), 2)
         51.2
     """
+    begun = time.perf_counter()
     if solver not in (None, "lm", "bfgs"):
-        raise brdf.InputError("solver", f"is unknown, got {solver!r}", "Use lm, bfgs or None")
+        raise InputError("solver", f"is unknown, got {solver!r}", "Use lm, bfgs or None")
     if not (0 < tolerance < 1 and max_steps >= 1):
         came = f"and max_steps must be above 0, got {tolerance!r} and {max_steps!r}"
-        raise brdf.InputError("tolerance", came, "Give for example 1e-10 and 256")
+        raise InputError("tolerance", came, "Give for example 1e-10 and 256")
     stated = state_problem(target, scene, mask, precision=precision, saturation=saturation)
     with working_precision(precision):
-        tiles = list(observe(stated, at_once=True).tiles)
-        problem = _freed(brdf.cast((material, stated.scenes), precision), free, tiles)
-        jacobian = sum(tile.target.size for tile in tiles) * problem.start().size
-        return _solve(problem, solver or ("lm" if jacobian <= LARGEST_JACOBIAN else "bfgs"), tolerance, max_steps)
+        seen = observe(stated, at_once=True)
+
+        def solve(start: brdf.Material, scenes: Sequence[brdf.Scene]) -> JointResult:
+            problem = _freed(brdf.cast((start, list(scenes)), precision), free, list(seen.tiles))
+            jacobian = sum(tile.target.size for tile in seen.tiles) * problem.start().size
+            chosen = solver or ("lm" if jacobian <= LARGEST_JACOBIAN else "bfgs")
+            return _solve(problem, seen, chosen, tolerance, max_steps)
+
+        if isinstance(material, brdf.Material):
+            result = solve(material, stated.scenes)
+        else:
+            result = _of_model(stated, model_name(material), solve)
+    return dataclasses.replace(result, seconds=time.perf_counter() - begun)
+
+
+def _of_model(stated: FitProblem, model: str, solve: Callable[..., JointResult]) -> JointResult:
+    """From the separable optimum of a model; of "auto" the simplest adequate one under the scenes of the best lobe."""
+
+    def separable(model: str, scenes: Sequence[brdf.Scene] = stated.scenes) -> FitResult:
+        return fit_pictures(dataclasses.replace(stated, model=model, scenes=list(scenes)))
+
+    if model != "auto":
+        return solve(separable(model).material, stated.scenes)
+    best = min((solve(separable(name).material, stated.scenes) for name in CLASSIC), key=lambda one: one.residual)
+    simplest = separable("auto", best.scenes)
+    with contextlib.suppress(InputError):  # of a number that the simplest model has not
+        return dataclasses.replace(solve(simplest.material, best.scenes), candidates=simplest.candidates)
+    return best
 
 
 class _JointProblem(eqx.Module):
@@ -122,6 +156,7 @@ class _JointProblem(eqx.Module):
         shape: of material and scenes.
         places: of the freed leaves.
         names: of the fields that they are.
+        words: what a person calls them.
     """
 
     leaves: list[Array]
@@ -129,6 +164,7 @@ class _JointProblem(eqx.Module):
     shape: Any = eqx.field(static=True)
     places: tuple[int, ...] = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
+    words: tuple[str, ...] = eqx.field(static=True)
 
     def freed(self) -> list[Array]:
         """The freed leaves."""
@@ -164,29 +200,37 @@ class _JointProblem(eqx.Module):
         return jnp.concatenate(found)
 
 
-def _freed(start: Any, free: Callable[..., Sequence[Any]], tiles: list[Tile]) -> _JointProblem:
+def _freed(start: Any, free: Callable[..., Sequence[Any]] | None, tiles: list[Tile]) -> _JointProblem:
     """Find the freed leaves among those of the start, each an array of its own."""
     start = jax.tree.map(jnp.array, start)
     remedy = "Return a tuple of leaves, such as (material.n, scenes[0].lights[0].direction)"
     try:
-        freed = [id(leaf) for leaf in free(*start)]
-    except TypeError as error:
-        raise brdf.InputError("free", f"gives no tuple of leaves ({error})", remedy) from None
+        freed = [id(leaf) for leaf in free(*start)]  # pyright: ignore[reportOptionalCall]  # None is refused below
+    except (TypeError, AttributeError, IndexError) as error:
+        raise InputError("free", f"gives no tuple of leaves ({error})", remedy) from None
     if not freed:
-        raise brdf.InputError("free", "names no leaf", "Return the leaves to fit")
+        raise InputError("free", "names no leaf", "Return the leaves to fit")
     paths = jax.tree_util.tree_leaves_with_path(start)
     own = {
-        id(leaf): (place, getattr(path[-1], "name", ""))
+        id(leaf): (place, getattr(path[-1], "name", ""), _words(path, len(start[1])))
         for place, (path, leaf) in enumerate(paths)
         if jnp.issubdtype(leaf.dtype, jnp.floating)
     }
     if not own.keys() >= set(freed):
-        raise brdf.InputError("free", "gives what is no number of material or scenes as a whole", remedy)
+        raise InputError("free", "gives what is no number of material or scenes as a whole", remedy)
     if len(set(freed)) < len(freed):
-        raise brdf.InputError("free", "gives a leaf twice", remedy)
-    places, names = zip(*(own[leaf] for leaf in freed), strict=True)
+        raise InputError("free", "gives a leaf twice", remedy)
+    places, names, words = zip(*(own[leaf] for leaf in freed), strict=True)
     leaves, shape = jax.tree.flatten(start)
-    return _JointProblem(leaves, tiles, shape, places, names)
+    return _JointProblem(leaves, tiles, shape, places, names, words)
+
+
+def _words(path: Sequence[Any], scenes: int) -> str:
+    """What a person calls a leaf: n, lights[0].direction, or scenes[1].ambient where there are several."""
+    words = jax.tree_util.keystr(tuple(path[1:]))  # without the number that says material or scenes
+    if path[0].idx == 1:
+        words = f"scenes{words}" if scenes > 1 else words.partition("]")[2]
+    return words.removeprefix(".")
 
 
 @eqx.filter_jit
@@ -215,7 +259,7 @@ def _linearised(problem: _JointProblem, vector: Array) -> tuple[Array, Array]:
     return residuals, jax.lax.map(along, jnp.eye(vector.size))
 
 
-def _solve(problem: _JointProblem, solver: str, tolerance: float, max_steps: int) -> JointResult:
+def _solve(problem: _JointProblem, seen: Observed, solver: str, tolerance: float, max_steps: int) -> JointResult:
     vector, freed = problem.start(), problem.freed()
     bounded = np.repeat([name in NOT_NEGATIVE for name in problem.names], [leaf.size for leaf in freed])
     held = np.zeros(vector.shape, bool)
@@ -232,18 +276,113 @@ def _solve(problem: _JointProblem, solver: str, tolerance: float, max_steps: int
         if not below.any() and not inwards.any():
             break
         held = (held | below) & ~inwards
-    cost, square, count = float(residual @ residual), 0.0, 0
+    found, vector = problem.at(vector), np.asarray(vector, np.float64)
+    channels = seen.colour.size
+    squares = np.sum(residual.reshape(-1, channels) ** 2, axis=0)
+    square, pixels = 0.0, 0
     for tile in problem.tiles:
         counted = np.asarray(tile.target, np.float64)[... if tile.weight is None else np.asarray(tile.weight) > 0]
-        square, count = square + float(np.sum(counted**2)), count + counted.size
-    inverse = np.zeros(vector.size)
-    inverse[~held] = inverse_diagonal(columns[~held] @ columns[~held].T, 1e-12)
-    found = problem.at(vector)
-    errors, values = [], [np.asarray(leaf) for leaf in found.freed()]
-    deviations = np.sqrt(cost / max(count - vector.size, 1) * inverse).astype(vector.dtype)
-    parts = np.split(deviations, np.cumsum([leaf.size for leaf in freed])[:-1])
-    for part, leaf, name in zip(parts, values, problem.names, strict=True):
-        errors.append(part.reshape(leaf.shape) * (leaf if name == "n" else 1))
+        square, pixels = square + float(np.sum(counted**2)), pixels + len(counted)
+    noise = squares / max(pixels - vector.size / channels, 1)
     material, scenes = jax.tree.map(np.asarray, found.content())
-    residual_share = (cost / square) ** 0.5
-    return JointResult(material, scenes, tuple(values), tuple(errors), residual_share, steps, converged, solver)
+    given = jax.tree.leaves((material, seen.problem.scenes))
+    given = [given[place] for place in problem.places]
+    parameters, errors, correlation = _with_errors(problem, given, vector, held, columns, float(np.mean(noise)))
+    warnings = [] if converged else [f"the solver stopped after {steps} steps without an end: raise max_steps"]
+    parts = np.split(residual, np.cumsum([tile.target.size for tile in problem.tiles])[:-1])
+    both = zip(parts, problem.tiles, strict=True)
+    share = (float(np.sum(squares)) / square) ** 0.5
+    known = correlation_in_rows([part.reshape(*tile.points.mask.shape, channels) for part, tile in both], share)
+    return JointResult(
+        material=material,
+        parameters=parameters,
+        noise=np.sqrt(noise),
+        structure=known.correlation,
+        highlight_pixels=None,
+        residual=share,
+        pixels=pixels,
+        left_out=seen.left_out,
+        warnings=(*warnings, *structure_warning(known)),
+        candidates=(),
+        correlation=correlation,
+        optimum=None,
+        loss=seen.problem.loss,
+        precision=seen.problem.precision,
+        seconds=0.0,
+        targets=seen.shown,
+        scenes=scenes,
+        counted=seen.counted,
+        files=[target.file for target in seen.problem.targets],
+        values=tuple(np.asarray(leaf) for leaf in found.freed()),
+        errors=errors,
+        steps=steps,
+        converged=converged,
+        solver=solver,
+    )
+
+
+def _with_errors(
+    problem: _JointProblem,
+    given: Sequence[Any],
+    vector: np.ndarray,
+    held: np.ndarray,
+    columns: np.ndarray,
+    noise: float,
+) -> tuple[tuple[Parameter, ...], tuple[np.ndarray, ...], np.ndarray]:
+    """The freed numbers as parameters, their errors leaf by leaf, and the correlation of those that are determined.
+
+    Of a direction the length is no unknown: its errors are those of two small turns across it.
+    """
+    columns = np.where(held[:, None], 0.0, columns)
+    blocks = np.split(np.arange(vector.size), np.cumsum([leaf.size for leaf in problem.freed()])[:-1])
+    leaves = list(zip(problem.words, problem.names, blocks, given, strict=True))
+    parts = []
+    for _, name, block, _ in leaves:
+        across = np.linalg.svd(vector[block][None])[2][1:] * np.linalg.norm(vector[block])
+        parts.append(across @ columns[block] if name in DIRECTIONS else columns[block])
+    design = np.concatenate(parts)
+    gram = design @ design.T
+    variance = noise * inverse_diagonal(gram, DEPENDENT)
+    scale = np.sqrt(np.where(np.diag(gram) > 0, np.diag(gram), 1.0))
+    inverse = np.linalg.pinv(gram / np.outer(scale, scale), rcond=DEPENDENT, hermitian=True)
+    parameters, errors, at = [], [], []
+    for (word, name, block, leaf), own in zip(leaves, np.split(np.arange(len(gram)), _ends(parts)), strict=True):
+        if name in DIRECTIONS:
+            error = float(np.degrees(np.sqrt(np.sum(variance[own]))))
+            before, after = (one / np.linalg.norm(one) for one in (np.asarray(leaf, np.float64), vector[block]))
+            turned = float(np.degrees(np.arctan2(np.linalg.norm(np.cross(before, after)), before @ after)))
+            parameters.append(_parameter(word, None, turned, error, direction=tuple(after.tolist())))
+            errors.append(error)
+            at.append(-1)
+            continue
+        values = np.exp(vector[block]) if name == "n" else vector[block]
+        deviations = np.where(held[block], 0.0, np.sqrt(variance[own]) * (values if name == "n" else 1.0))
+        errors.append(deviations.reshape(np.shape(leaf)))
+        at += own.tolist()
+        for index, (value, deviation) in enumerate(zip(values, deviations, strict=True)):
+            value, error, interval = float(value), float(deviation), None
+            if np.isfinite(error) and not held[block][index]:
+                interval = value - NORMAL_95 * error, value + NORMAL_95 * error
+                if name == "n":
+                    interval = value * np.exp(-NORMAL_95 * error / value), value * np.exp(NORMAL_95 * error / value)
+                elif name in NOT_NEGATIVE:
+                    interval = above_zero(value, error)
+            channel = index if np.ndim(leaf) else None
+            parameters.append(_parameter(word, channel, value, error, interval, bool(held[block][index])))
+    is_free = [one in free_parameters(parameters) for one in parameters]
+    at = np.array(at)[is_free]
+    error = np.sqrt(np.diag(inverse)[at])
+    correlation = np.where((at >= 0)[:, None] & (at >= 0), inverse[np.ix_(at, at)] / np.outer(error, error), 0.0)
+    np.fill_diagonal(correlation, 1.0)
+    return tuple(parameters), tuple(map(np.asarray, errors)), correlation
+
+
+def _ends(parts: Sequence[np.ndarray]) -> np.ndarray:
+    return np.cumsum([len(part) for part in parts])[:-1]
+
+
+def _parameter(name: str, channel: int | None, value: float, error: float, *further: Any, **named: Any) -> Parameter:
+    """A freed number; without a value where only a combination is determined."""
+    known = bool(np.isfinite(error))
+    reason = "" if known else OPEN
+    return Parameter(name, channel, value if known else None, error, *further, reason=reason, **named)

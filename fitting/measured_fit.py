@@ -36,6 +36,7 @@ from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import search
 from fitting.uncertainty.covariance import residual_noise, uncertainty
 from fitting.uncertainty.interpretation import material_and_parameters
+from fitting.uncertainty.intervals import NORMAL_95
 
 Loss = Literal["cosine", "squared", "log"]
 N_RANGE = (0.1, 1e6)
@@ -149,24 +150,30 @@ class BrdfFitResult(Parameters):
         return 0.5 * (1 - self.losses.cosine**2 + 1 - self.losses.misplaced) >= HALF
 
     @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a user should know before using the numbers."""
+        return () if self.fits else (self.verdict,)
+
+    @property
     def verdict(self) -> str:
         """The sentence that a person needs."""
         name, several, losses = self.material.name, len(self.candidates) > 1, self.losses
         if not self.fits:
             best = min(self.candidates, key=self._loss)
             closest = f"none of these models fits: the best, {best.model}," if several else f"{name} does not fit: it"
-            left = f"{_percent(best.losses.cosine)} of the table (rms)"
+            left = f"{_percent(best.losses.cosine)} of the table (rms of f_r cos θ)"
             return f"{closest} leaves {left}; the brightest sample is {self._brightest()}"
         left, beside = _percent(losses.cosine), self._beside_lambert()
         elsewhere = f"{_percent(losses.misplaced)} of the light goes elsewhere"
         name = "Lambert" if name == "lambert" else name
         if losses.cosine**2 > HALF:
             placed = f"puts {_percent(1 - losses.misplaced)} of the light where it belongs"
-            return f"{name} {placed}, but not the peak, and leaves {left} (rms){beside}"
+            return f"{name} {placed}, but not the peak, and leaves {left} of the table (rms of f_r cos θ){beside}"
+        off = f"its f_r cos θ is off by {left} (rms)"
         if losses.misplaced > HALF:
-            return f"{name} comes within {left} (rms), but {elsewhere}{beside}"
+            return f"{name} fits the peak, {off}, but {elsewhere}{beside}"
         verb = "is enough" if several and name == "Lambert" else "describes it"
-        return f"{name} {verb} within {left} (rms; {elsewhere}){beside}"
+        return f"{name} {verb}: {off}, and {elsewhere}{beside}"
 
     def _loss(self, candidate):
         return getattr(candidate.losses, self.loss)
@@ -177,7 +184,7 @@ class BrdfFitResult(Parameters):
         if not lobes or (not self.chosen and alone.losses.cosine <= ROUNDING):
             return ""
         if self.chosen:
-            return f"; Lambert alone within {_percent(alone.losses.cosine)}"
+            return f"; Lambert alone is off by {_percent(alone.losses.cosine)}"
         lobe = min(lobes, key=self._loss)
         explained = 1 - (self._loss(lobe) / self._loss(alone)) ** 2
         if explained <= ROUNDING:
@@ -204,7 +211,9 @@ class BrdfFitResult(Parameters):
             label = "" if parameter.channel is None or len(channels) == 1 else channels[parameter.channel]
             lines.append(f"  {parameter.name:<4}{label:<8} {parameter}")
         if self.negative:
-            lines.append(f"  {self.negative} values are below 0; squared losses count them, the logarithm does not")
+            why = f", {self.table.below_zero}" if self.table.below_zero else ""
+            counted = "squared losses count them, the logarithm does not"
+            lines.append(f"  {self.negative} values are below 0{why}; {counted}")
         lines += [f"  left out    {count} {reason}" for reason, count in self.left_out.items()]
         lines.append(f"  {'deviation of':<24}{'cosine':>10}{'squared':>10}{'log':>10}{'misplaced':>11}")
         for index, candidate in enumerate(self.candidates):
@@ -212,6 +221,7 @@ class BrdfFitResult(Parameters):
             cosine, squared, log, misplaced = candidate.losses
             numbers = f"{100 * cosine:>8.2f} %{100 * squared:>8.2f} %{log:>10.4f}{100 * misplaced:>9.2f} %"
             lines.append(f"    {candidate.model:<22}{numbers}{mark}")
+        lines.append("    (cosine: of f_r cos θ; misplaced: the share of the light that goes elsewhere)")
         return "\n".join([*lines, f"  {self.verdict}."])
 
     def to_dict(self) -> dict[str, Any]:
@@ -226,27 +236,40 @@ class BrdfFitResult(Parameters):
             }
             for index, candidate in enumerate(self.candidates)
         ]
-        names = ("loss", "samples", "negative", "left_out", "fits", "verdict", "seconds")
+        names = ("loss", "samples", "negative", "left_out", "fits", "verdict", "warnings", "seconds")
         return {name: getattr(self, name) for name in names} | {
             "table": self.table.name,
             "channels": list(self.table.channels),
             "material": material_to_dict(self.material, undetermined=self.undetermined),
-            "parameters": [vars(parameter) for parameter in self.parameters],
+            "parameters": [parameter.to_dict() for parameter in self.parameters],
             "losses": self.losses._asdict(),
             "candidates": candidates,
         }
 
-    def save(self, folder: str | Path) -> None:
+    def plot(self) -> Any:
+        """The table and the fit over the angle of the half vector, as papers show measured BRDFs.
+
+        Returns:
+            A matplotlib figure.
+        """
+        from fitting.report.material_plots import plot_table  # Matplotlib takes long to load
+
+        return plot_table(self.table, self.material, _within(self.table, self.max_angle))
+
+    def save(self, folder: str | Path, *, plot: bool = False) -> None:
         """Write material.json, material.mtl (1 or 3 channels) and fit.json: all of them or none.
 
         Args:
             folder: made where missing.
+            plot: also comparison.png.
 
         Raises:
             InputError: where the folder cannot be written.
         """
         with atomic_folder(folder) as stage:
             write_report(stage, self)
+            if plot:
+                self.plot().savefig(stage / "comparison.png", dpi=150)
 
 
 _NORMAL = np.array([0.0, 0.0, 1.0])
@@ -387,7 +410,11 @@ def _fit_model(model, samples, loss, n_range):
         sure = uncertainty(optimum, free, noise, brightest, visible, single=False)
     fit = ModelFit(model, [], optimum, free, n_range)
     material, parameters = material_and_parameters(fit, sure, np.ones(channels), None)
-    parameters = tuple(dataclasses.replace(one, interval=None) for one in parameters if one.name != "k_a")
+    parameters = tuple(one for one in parameters if one.name != "k_a")
+    if parameters[-1].error and parameters[-1].name == "n":
+        ratio = np.exp(NORMAL_95 * parameters[-1].error / optimum.n)
+        ends = float(optimum.n / ratio), float(optimum.n * ratio)
+        parameters = (*parameters[:-1], dataclasses.replace(parameters[-1], interval=ends))
     return BrdfCandidate(material, parameters, _losses(samples, modelled(optimum)))
 
 

@@ -149,8 +149,9 @@ def state_problem(target: Any, scene: Any, mask: Any = None, weight: Any = None,
             came = f"has {len(lists[-1])} entries for {len(targets)} pictures"
             raise InputError(name, came, "Give one for each")
     scenes, masks, weights = lists
-    if not all(isinstance(each, brdf.Scene) for each in scenes):
-        raise InputError("scene", f"must be a brdf.Scene, got {type(scene).__name__}", "Use brdf.Scene.load")
+    for each in scenes:
+        if not isinstance(each, brdf.Scene):
+            raise InputError("scene", f"must be a brdf.Scene, got {type(each).__name__}", "Use brdf.Scene.load")
     problem = FitProblem([as_target(picture) for picture in targets], scenes, masks, weights, **options)
     _check_options(problem)
     for index, (picture, place) in enumerate(zip(problem.targets, scenes, strict=True)):

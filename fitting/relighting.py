@@ -16,58 +16,59 @@ import numpy as np
 from jaxtyping import Float
 
 import brdf
+from brdf.checks import instance
 from brdf.errors import InputError
 from brdf.models.base import SpecularMaterial
-from brdf.precision import Precision
+from brdf.precision import Precision, working_precision
+from fitting.pixels import Observed, observe
+from fitting.problem import model_name, state_problem
+from fitting.report import FitResult
+from fitting.result import Parameter, free_parameters
 from fitting.solver.nnls import inverse_diagonal, nonnegative_minimum
 from fitting.solver.refinement import GRID_STEP, minimum_between
+from fitting.uncertainty.intervals import above_zero
+from fitting.uncertainty.residual_correlation import correlation_in_rows, structure_warning
 
-UNKNOWN_FACTOR = (
-    "one factor per channel between material and lights: the lights' mean intensity was kept at that of the scene"
-)
+FACTOR = "one factor per channel between material and lights"
+KEPT = "no picture determines it; the lights' mean intensity was kept at that of the scene"
 N_RANGE = (0.5, 1e5)
 _ROUNDS = 200
 
 
-@dataclass(frozen=True)
-class LightFit:
-    """Lights found in a picture.
+@dataclass(frozen=True, kw_only=True)
+class LightFit(FitResult):
+    """Lights found in a picture: a `FitResult` whose parameters are their emittances.
 
     Attributes:
-        scene: the scene with the emittances found.
-        material: the one that was given, or found.
         emittances: of each light, then of the ambient light where the scene has any, (L, C).
         factors: the same over those of the scene, (L, C).
         errors: standard errors of the factors, (L, C); infinite where the picture does not determine one. Those of a
             fit of both hold for the material found.
-        residual: root mean square of the residual over that of the picture.
-        undetermined: what the picture cannot tell, in words; empty where it tells all.
 
     Example:
         >>> target, scene = brdf.read_image("target.exr"), brdf.Scene.load("scene.toml")
-        >>> fitting.fit_lights(2 * target, scene, brdf.preset("gold")).factors.round(3)  # twice as bright
+        >>> found = fitting.fit_lights(2 * target, scene, brdf.preset("gold"))  # twice as bright
+        >>> found.factors.round(3)
         array([[2., 2., 2.],
                [2., 2., 2.]])
+        >>> round(float(found["lights[0].intensity"][0]), 3)
+        1.3
     """
 
-    scene: brdf.Scene
-    material: brdf.Material
     emittances: Float[np.ndarray, "L C"]
     factors: Float[np.ndarray, "L C"]
     errors: Float[np.ndarray, "L C"]
-    residual: float
-    undetermined: tuple[str, ...]
 
-    def __str__(self) -> str:
-        """The report."""
-        names = [light.type_name for light in self.scene.lights]
-        names += ["ambient"] * (len(self.emittances) - len(names))
-        lines = [f"light of {len(names)} sources on {self.material.name}"]
-        for name, *numbers in zip(names, self.emittances, self.factors, self.errors, strict=True):
-            values = (f"{v:.6g} ± {v * e / f if f > 0 else e:.2g}" for v, f, e in zip(*numbers, strict=True))
-            lines.append(f"  {name:<12} {', '.join(values)}")
-        lines.append(f"  residual     {100 * self.residual:.3g} % of the picture (rms)")
-        return "\n".join(lines + [f"  not determined: {what}" for what in self.undetermined])
+    @property
+    def scene(self) -> brdf.Scene:
+        """The scene with the emittances found."""
+        return self.scenes[0]
+
+    @property
+    def undetermined(self) -> dict[str, str]:
+        """What the picture cannot tell, and why; also the factor that light and material share."""
+        factor = {FACTOR: KEPT} if FACTOR in " ".join(self.warnings) else {}
+        return factor | super().undetermined
 
 
 def fit_lights(
@@ -94,11 +95,13 @@ def fit_lights(
         >>> found.emittances.shape  # of the light and the ambient light
         (2, 3)
     """
-    pixels, seen = _pixels(target, scene, mask)
-    images = np.asarray(brdf.render_lights(material, scene, precision=precision), np.float64)[:, seen]
+    seen = _observed(target, scene, mask, precision)
+    instance("material", material, brdf.Material, "Write fitting.fit_lights(target, scene, material)")
+    pixels, place = seen.shown[0][seen.counted[0]].astype(np.float64), seen.counted[0]
+    images = np.asarray(brdf.render_lights(material, scene, precision=precision), np.float64)[:, place]
     columns = np.broadcast_to(images, (*images.shape[:2], pixels.shape[1]))
     factors, errors = _intensities(columns, pixels)
-    return _result(scene, material, columns, pixels, factors, errors, ())
+    return _result(seen, material, columns, pixels, factors, errors, has_material=False)
 
 
 def fit_lights_and_material(
@@ -125,7 +128,7 @@ def fit_lights_and_material(
         n_range: bounds of the exponent.
 
     Returns:
-        Lights and material; ``undetermined`` names the factor.
+        Lights and material; ``undetermined`` names the factor. The material's numbers come without errors.
 
     Raises:
         InputError: where the picture does not fit the scene, the model is unknown, or there is no light.
@@ -136,12 +139,14 @@ def fit_lights_and_material(
         >>> round(float(found.material.n), 1), len(found.undetermined)
         (51.2, 1)
     """
-    if model not in brdf.MODELS:
-        raise InputError("model", f"is unknown, got {model!r}", f"Use one of {', '.join(brdf.MODELS)}")
+    name = model_name(model)
+    if name == "auto":
+        raise InputError("model", "is unknown, got 'auto'", f"Use one of {', '.join(brdf.MODELS)}")
+    seen = _observed(target, scene, mask, precision)
     if not scene.lights:
         raise InputError("scene", "has no lights", "Add a [[lights]] table")
-    pixels, seen = _pixels(target, scene, mask)
-    cls: Any = brdf.MODELS[model]
+    pixels, place = seen.shown[0][seen.counted[0]].astype(np.float64), seen.counted[0]
+    cls: Any = brdf.MODELS[name]
     names = ["k_d", "k_s"] if issubclass(cls, SpecularMaterial) else ["k_d"]
     lights = len(scene.lights)
 
@@ -151,7 +156,7 @@ def fit_lights_and_material(
     def terms(n: float) -> np.ndarray:
         """One picture per light, and of the ambient light, for k_d = 1, for k_s = 1 and for k_a = 1; (L, T, P, C)."""
         units = [surface(k, n) for k in np.eye(len(names), len(names) + 1)]
-        images = [np.asarray(brdf.render_lights(one, scene, precision=precision))[:, seen] for one in units]
+        images = [np.asarray(brdf.render_lights(one, scene, precision=precision))[:, place] for one in units]
         found = np.zeros((len(images[0]), len(names) + 1, *pixels.shape))
         found[:, :-1] = np.stack(images, axis=1)
         if scene.ambient is not None:
@@ -167,25 +172,14 @@ def fit_lights_and_material(
     k[:-1] *= scale
     columns = np.einsum("ltpc,tc->lpc", images, k)
     _, errors = _intensities(columns, pixels)
-    return _result(scene, surface(k, n), columns, pixels, factors, errors, (UNKNOWN_FACTOR,))
+    return _result(seen, surface(k, n), columns, pixels, factors, errors, has_material=True)
 
 
-def _pixels(target: Any, scene: brdf.Scene, mask: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Values of the pixels that count, (P, C), and which these are, (H, W)."""
-    values = np.asarray(target.pixels if isinstance(target, brdf.Picture) else target, np.float64)
-    values = values[..., None] if values.ndim == 2 else values
-    if values.ndim != 3 or values.shape[1::-1] != scene.resolution:
-        came = f"is of shape {values.shape}, the scene {scene.resolution[0]} x {scene.resolution[1]} pixels"
-        raise InputError("target", came, "Give a picture and a camera of the same resolution")
-    if scene.channels not in (1, values.shape[2]):
-        came = f"has {values.shape[2]} channels, the scene's light {scene.channels}"
-        raise InputError("target", came, "Give both the same number of channels")
-    seen = np.asarray(scene.surface_points().mask) & np.all(np.isfinite(values), axis=-1)
-    if mask is not None:
-        seen &= np.asarray(mask, bool)
-    if not seen.any():
-        raise InputError("target", "has no finite pixel that sees a fitted shape", "Check camera, shapes and mask")
-    return values[seen], seen
+def _observed(target: Any, scene: Any, mask: Any, precision: Precision) -> Observed:
+    """Which pixels count."""
+    problem = state_problem([target], [scene], [mask], precision=precision)
+    with working_precision(precision):
+        return observe(problem, at_once=True)
 
 
 def _intensities(columns: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -238,15 +232,17 @@ def _best_exponent(cost: Callable[[float], float], n_range: tuple[float, float])
 
 
 def _result(
-    scene: brdf.Scene,
+    seen: Observed,
     material: brdf.Material,
     columns: np.ndarray,
     pixels: np.ndarray,
     factors: np.ndarray,
     errors: np.ndarray,
-    undetermined: tuple[str, ...],
+    *,
+    has_material: bool,
 ) -> LightFit:
-    channels = pixels.shape[1]
+    """The result; ``has_material`` where the material was found too."""
+    scene, channels = seen.problem.scenes[0], pixels.shape[1]
     before = np.stack([np.broadcast_to(np.asarray(one, float), channels) for one in scene.emittances()])
     emittances = before * factors
     lights = tuple(
@@ -257,9 +253,53 @@ def _result(
     if scene.ambient is not None:
         found = eqx.tree_at(lambda s: s.ambient, found, emittances[-1])
     residual = pixels - np.einsum("lc,lpc->pc", factors, columns)
-    share = float((np.sum(residual**2) / max(np.sum(pixels**2), np.finfo(float).tiny)) ** 0.5)
-    dark = [
-        f"intensity of light {index} in channel {channel}: another light or none would look the same"
-        for index, channel in np.argwhere(~np.isfinite(errors))
+    square = max(float(np.sum(pixels**2)), np.finfo(float).tiny)
+    fields = ("radiance" if "radiance" in vars(light) else "intensity" for light in lights)
+    names = [f"lights[{index}].{field}" for index, field in enumerate(fields)]
+    names += ["ambient"] * (len(emittances) - len(names))
+    parameters = [
+        _emittance(name, channel, *numbers)
+        for name, *rows in zip(names, emittances, before * errors, strict=True)
+        for channel, numbers in enumerate(zip(*rows, strict=True))
     ]
-    return LightFit(found, material, emittances, factors, errors, share, (*undetermined, *dark))
+    if has_material:
+        numbers = {name: np.atleast_1d(value) for name, value in vars(material).items()}
+        parameters += [
+            Parameter(name, None if name == "n" else channel, float(value), None)
+            for name, values in numbers.items()
+            for channel, value in enumerate(values)
+        ]
+    picture = np.zeros((*seen.counted[0].shape, channels))
+    picture[seen.counted[0]] = residual
+    share = (float(np.sum(residual**2)) / square) ** 0.5
+    known = correlation_in_rows([picture], share)
+    return LightFit(
+        material=material,
+        parameters=tuple(parameters),
+        noise=np.sqrt(np.sum(residual**2, axis=0) / max(len(pixels) - len(factors), 1)),
+        structure=known.correlation,
+        highlight_pixels=None,
+        residual=share,
+        pixels=len(pixels),
+        left_out=seen.left_out,
+        warnings=(*(f"{FACTOR}: {KEPT}",) * has_material, *structure_warning(known)),
+        candidates=(),
+        correlation=np.eye(len(free_parameters(parameters))),
+        optimum=None,
+        loss="squared",
+        precision=seen.problem.precision,
+        seconds=0.0,
+        targets=seen.shown,
+        scenes=[found],
+        counted=seen.counted,
+        files=[target.file for target in seen.problem.targets],
+        emittances=emittances,
+        factors=factors,
+        errors=errors,
+    )
+
+
+def _emittance(name: str, channel: int, value: float, error: float) -> Parameter:
+    if not np.isfinite(error):
+        return Parameter(name, channel, None, float(error), reason="another light or none would look the same")
+    return Parameter(name, channel, float(value), float(error), above_zero(float(value), float(error)), not value)

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 import brdf
+from brdf.channels import channel_names
 from brdf.errors import InputError
 from brdf.materials.material_file import material_to_dict
 from brdf.precision import Precision
@@ -38,6 +39,8 @@ class Parameter:
             from the profile likelihood, also where n is not determined but bounded on one side.
         at_bound: the value is 0 because it may not be negative, or because the picture does not require it.
         reason: why it is not determined.
+        direction: where the number is a direction, the unit vector; the value then is by how many degrees it has turned
+            from where it started, and the error that angle's.
 
     Example:
         >>> result = fitting.fit(brdf.read_image("target.exr"), brdf.Scene.load("scene.toml"), model="blinn-phong")
@@ -53,11 +56,28 @@ class Parameter:
     interval: tuple[float, float] | None = None
     at_bound: bool = False
     reason: str = ""
+    direction: tuple[float, ...] | None = None
 
     @property
     def key(self) -> str:
         """Its name, with the channel where it has one: "n", "k_s[2]"."""
         return self.name if self.channel is None else f"{self.name}[{self.channel}]"
+
+    def label(self, channels: int) -> str:
+        """The channel in words: its colour, or of a position its axis.
+
+        Args:
+            channels: of the picture.
+        """
+        if self.channel is None:
+            return ""
+        is_spectrum = self.name.endswith(("k_a", "k_d", "k_s", "intensity", "radiance", "ambient"))
+        return channel_names(channels)[self.channel] if is_spectrum else "xyz"[self.channel]
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON holds it: infinite ends of the interval are None."""
+        ends = None if self.interval is None else [end if math.isfinite(end) else None for end in self.interval]
+        return vars(self) | {"interval": ends, "reason": self.reason or None}
 
     def __float__(self) -> float:
         """The value; NaN where it is not determined."""
@@ -67,6 +87,9 @@ class Parameter:
         """Value ± error (relative), or why there is none."""
         if self.value is None:
             return f"{NOT_DETERMINED}: {self.reason}"
+        if self.direction is not None:
+            towards = ", ".join(f"{value:.5f}" for value in self.direction)
+            return f"{towards} ± {self.error:.2g}° (turned by {self.value:.3g}°)"
         if self.at_bound:
             return "0 (at its bound" + (f"; below {self.interval[1]:.2g} with 95 %)" if self.interval else ")")
         if not self.error:
@@ -205,14 +228,7 @@ class FitResult(Parameters):
         """The report as JSON holds it: what is not determined is None."""
         return {
             "material": material_to_dict(self.material, undetermined=self.undetermined),
-            "parameters": [
-                vars(parameter)
-                | {
-                    "interval": None if parameter.interval is None else [_finite(end) for end in parameter.interval],
-                    "reason": parameter.reason or None,
-                }
-                for parameter in self.parameters
-            ],
+            "parameters": [parameter.to_dict() for parameter in self.parameters],
             "residual": self.residual,
             "noise": self.noise.tolist(),
             "structure": self.structure,
@@ -276,7 +292,3 @@ def free_parameters(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
         parameters: all of them.
     """
     return tuple(one for one in parameters if one.value is not None and not one.at_bound)
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None

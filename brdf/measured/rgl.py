@@ -5,6 +5,7 @@ one lies within the file. Source: J. Dupuy and W. Jakob, "An adaptive parameteri
 acquisition and rendering", SIGGRAPH Asia 2018; the layout is Mitsuba's ``tensor_file`` 1.0.
 """
 
+import dataclasses
 import math
 import struct
 import threading
@@ -119,7 +120,8 @@ def load(path: Path) -> MeasuredBRDF:
         raise InputError(path, f"is larger than {_MOST_BYTES >> 30} GiB", "Give a .bsdf file of the RGL database")
     channels = _check(path.read_bytes(), path)
     evaluate = _evaluation(path, channels)
-    return sampled(half_angle_grid(_GRID, 2 * np.pi), evaluate, name=path.stem, channels=channels, evaluate=evaluate)
+    table = sampled(half_angle_grid(_GRID, 2 * np.pi), evaluate, name=path.stem, channels=channels, evaluate=evaluate)
+    return dataclasses.replace(table, below_zero="which Mitsuba's interpolation of the file makes, no measurement")
 
 
 def _evaluation(path, channels):

@@ -34,6 +34,7 @@ class MeasuredBRDF:
             the samples are scattered.
         left_out: how many entries of the file are no samples, by reason.
         evaluate: f_r at any pairs of directions, where the file determines it; None for scattered samples.
+        below_zero: why values are below 0, where that is known; else it is noise of the measurement.
 
     Example:
         >>> up, slanted = [0, 0, 1], [0, 0.6, 0.8]
@@ -49,6 +50,7 @@ class MeasuredBRDF:
     solid_angle: Float[np.ndarray, " P"]
     left_out: dict[str, int] = dataclasses.field(default_factory=dict)
     evaluate: Evaluation | None = dataclasses.field(default=None, repr=False)
+    below_zero: str = ""
 
     @property
     def negative(self) -> int:

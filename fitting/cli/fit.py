@@ -73,8 +73,8 @@ def fit(
     notes: tuple[str, ...] = ()
     with waiting("fitting"):
         if len(target) == 1 and is_measured(target[0]):
-            if any([*pictures, dark, noise, plausible, accuracy, seconds, plot, report, precision != "float32"]):
-                came = "is a measured BRDF; of the options only --model, --loss, --out and --json concern it"
+            if any([*pictures, dark, noise, plausible, accuracy, seconds, report, precision != "float32"]):
+                came = "is a measured BRDF; of the options only --model, --loss, --out, --plot and --json concern it"
                 raise InputError(target[0], came, "Leave the others out")
             table = brdf.load_measured(target[0])
             use_compilation_cache()

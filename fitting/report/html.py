@@ -14,7 +14,6 @@ import math
 import platform
 
 import brdf
-from brdf.channels import channel_names
 from brdf.display import material_html, report_html
 from fitting.report.text import standing
 from fitting.report.viewer import secure_page, viewer
@@ -81,11 +80,11 @@ def report_page(result: FitResult, *, source: str = "", command: str = "") -> st
 
 
 def _numbers(result):
-    names = channel_names(result.material.k_d.shape[0])
+    channels = result.material.k_d.shape[0]
     rows = [["", "channel", "value", "± error", "95 % interval", ""]]
     for one in result.parameters:
         ends = ("∞" if math.isinf(end) else f"{end:.6g}" for end in one.interval or ())
-        channel = "" if one.channel is None else names[one.channel]
+        channel = one.label(channels)
         value = NOT_DETERMINED if one.value is None else f"{one.value:.6g}"
         error = f"{one.error:.2g}" if one.error else ""
         remark = "at its bound" if one.at_bound else one.reason

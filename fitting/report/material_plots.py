@@ -17,13 +17,15 @@ from matplotlib.ticker import MaxNLocator
 from brdf.albedo import directional_albedo
 from brdf.channels import channel_names, in_channel
 from brdf.display import displayed, lit_sphere
+from brdf.measured.table import MeasuredBRDF
 from brdf.models.base import Material, SpecularMaterial
 from brdf.plausibility.numeric import Sampler, albedo_of
 from brdf.plausibility.report import Report
 from brdf.plausibility.stability import StabilityMap
-from fitting.report.plots import CHANNELS, OTHERS, PRINT, SIGNED
+from fitting.report.plots import CHANNEL_COLOURS, CHANNELS, OTHERS, PRINT, SIGNED
 
 Brdf = Material | Callable[[Any, Any], Any]
+PARTS = 60  # of the samples of a table, each a point of a line
 LIGHT = "angle of the light in degrees"
 
 
@@ -222,3 +224,34 @@ def _lit_function(sample, size=256):
 
 def _sampler(brdf):
     return Sampler(brdf.reflectance if isinstance(brdf, Material) else brdf)
+
+
+@matplotlib.rc_context(PRINT)
+def plot_table(table: MeasuredBRDF, material: Material, counted: np.ndarray) -> Figure:
+    """A measured BRDF and the material fitted to it: f_r cos θ of the light over the angle of the half vector.
+
+    Lines are medians; shaded is what the middle four fifths of the table's samples at that angle show.
+
+    Args:
+        table: what was fitted.
+        material: to it.
+        counted: which samples, (P,).
+    """
+    light, view = table.to_light[counted], table.to_view[counted]
+    half = light + view
+    angle = np.degrees(np.arctan2(np.linalg.norm(half[:, :2], axis=1), half[:, 2]))
+    fitted = np.broadcast_to(material.reflectance(light, view), table.values[counted].shape)
+    parts = np.array_split(np.argsort(angle), min(PARTS, len(angle)))
+    across = [np.mean(angle[part]) for part in parts]
+    figure = Figure(figsize=(4.6, 3.2), layout="constrained")
+    axes = figure.add_subplot(yscale="log", xlabel="half vector from the normal (°)", ylabel="f_r cos θ (1/sr)")
+    shown = np.unique(np.linspace(0, len(table.channels) - 1, 3).round().astype(int))
+    for colour, channel in zip(CHANNEL_COLOURS, shown, strict=False):
+        measured, modelled = (values[:, channel] * light[:, 2] for values in (table.values[counted], fitted))
+        low, middle, high = np.transpose([np.quantile(measured[part], (0.1, 0.5, 0.9)) for part in parts])
+        axes.fill_between(across, low, high, color=colour, alpha=0.2, linewidth=0)
+        axes.plot(across, middle, color=colour, label=f"{table.channels[channel]}, table")
+        axes.plot(across, [np.median(modelled[part]) for part in parts], "--", color=colour, label="fit")
+    axes.set_title(f"{table.name}: {material.name}")
+    axes.legend(frameon=False, bbox_to_anchor=(1.0, 1.0), loc="upper left")
+    return figure

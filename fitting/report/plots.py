@@ -63,7 +63,8 @@ def comparison(result: "FitResult", picture: int | None = None) -> Figure:
     row, rows, columns = _highlight(result, picture, counted, specular)
     figure = Figure(figsize=(7.2, 4.9), layout="constrained")
     figure.suptitle(title, fontsize=PRINT["axes.titlesize"])
-    below = ["highlight", "scanline", "profile"] if specular else ["scanline"] * 3
+    last = "scanline" if result.optimum is None else "profile"
+    below = ["highlight", "scanline", last] if specular else ["scanline"] * 3
     mosaic: Any = [["target", "fit", "residual"], below]
     panels: Any = figure.subplot_mosaic(mosaic)
     for key, image, title in ("target", target, "target"), ("fit", fitted, f"fit, {result.surface}"):
@@ -74,7 +75,8 @@ def comparison(result: "FitResult", picture: int | None = None) -> Figure:
     for key in ("target", "fit", "residual"):
         panels[key].set(xticks=[], yticks=[], **_around(counted))
     if specular:
-        _profile(panels["profile"], result)
+        if result.optimum is not None:
+            _profile(panels["profile"], result)
         axes, width = panels["highlight"], columns.stop - columns.start
         crop = np.concatenate([image[rows, columns] for image in (target, fitted)], axis=1)
         axes.imshow(brdf.displayed(crop, max(white, float(np.nanmax(crop)))), interpolation="nearest")

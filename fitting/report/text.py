@@ -25,9 +25,9 @@ def report(result: FitResult) -> str:
         f"{result.surface} fitted to {count}{result.pixels} pixels x {channels} {plural} "
         f"in {result.seconds:.2g} s ({result.precision}{loss})"
     ]
+    width = max((len(parameter.name) for parameter in result.parameters), default=3)
     for parameter in result.parameters:
-        label = "" if parameter.channel is None else labels[parameter.channel]
-        lines.append(f"  {parameter.name:<4}{label:<6} {parameter}")
+        lines.append(f"  {parameter.name:<{width}} {parameter.label(channels):<6} {parameter}")
     lines.append(f"  residual    {100 * result.residual:.3g} % of the picture (rms)")
     lines += [f"  left out    {pixels} pixels {reason}" for reason, pixels in result.left_out.items() if pixels]
     if result.highlight_pixels is not None:
@@ -51,7 +51,7 @@ def standing(candidate: Candidate) -> str:
 def _correlations(result, labels):
     """The strongest correlations, as far as they are worth a line."""
     free, matrix = result.free_parameters, result.correlation
-    names = ["n" if one.channel is None else f"{one.name} {labels[one.channel]}".rstrip() for one in free]
+    names = [f"{one.name} {one.label(len(labels))}".rstrip() for one in free]
     # A grey k_s is one number in all channels.
     strong = [
         (abs(matrix[i, j]), i, j)

@@ -19,6 +19,7 @@ FEWEST_PAIRS = 256
 MOST_PICTURES = 16
 # A correlation above this, and above so many of its own standard errors, is structure.
 CORRELATED, DEVIATIONS = 0.1, 5.0
+NEGLIGIBLE = 1e-6
 
 
 class ResidualCorrelation(NamedTuple):
@@ -107,3 +108,32 @@ def _residuals(picture: Picture, pairs: AnyArray, n: AnyArray, x: AnyArray) -> t
     model = some.predicted(n, x)
     weight = jnp.ones((1, 1), model.dtype) if some.weight is None else some.weight.reshape(pairs.size, -1)
     return jnp.where(weight > 0, some.target - model, 0), weight, model
+
+
+def correlation_in_rows(residuals: Sequence[Float[np.ndarray, "H W C"]], share_left: float) -> ResidualCorrelation:
+    """Correlate the residuals of all neighbours in the rows of pictures.
+
+    Args:
+        residuals: 0 where a pixel does not count.
+        share_left: of the picture, root mean square; up to `NEGLIGIBLE` it shows where a solver stopped.
+    """
+    together, alone, pairs = 0.0, 0.0, 0
+    for residual in residuals:
+        left, right = residual[:, :-1], residual[:, 1:]
+        both = (left != 0) & (right != 0)
+        together, alone = together + np.sum(left * right), alone + np.sum((left**2 + right**2)[both]) / 2
+        pairs += np.count_nonzero(both)
+    share = float(together / alone) if alone else 0.0
+    enough = max(CORRELATED, DEVIATIONS / max(pairs, 1) ** 0.5)
+    return ResidualCorrelation(share, bool(share > enough and share_left > NEGLIGIBLE))
+
+
+def structure_warning(known: ResidualCorrelation) -> tuple[str, ...]:
+    """What to say where neighbours err alike; nothing where they do not.
+
+    Args:
+        known: of the residual.
+    """
+    words = f"the residual has structure: neighbouring pixels err alike (correlation {known.correlation:.2f})"
+    words = f"{words}, so model or scene are not the whole truth and the errors are too small"
+    return (words,) if known.significant else ()

@@ -81,6 +81,7 @@ def test_the_factor_between_light_and_material_is_not_determined():
     target = np.asarray(brdf.render(brdf.Lambert(k_d=[0.5]), alone, precision="float64"))
     target = target + np.random.default_rng(3).normal(0, 1e-3, target.shape)
     result = fitting.fit_jointly(target, alone, brdf.Lambert(k_d=[0.4]), lambda m, s: (m.k_d, s[0].lights[0].intensity))
+    assert result.undetermined.keys() == {"k_d[0]", "lights[0].intensity[0]"}
     assert np.isinf(result.errors[0]).all()
     assert np.isinf(result.errors[1]).all()
     np.testing.assert_allclose(result.values[0] * result.values[1], 0.5, rtol=1e-3)
@@ -100,6 +101,8 @@ def test_nothing_to_free_is_an_error(target: np.ndarray):
         (lambda m, s: (np.ones(3),), "no number"),
         (lambda m, s: (m.k_d[0],), "no number"),
         (None, "no tuple"),
+        (lambda m, s: (m.gloss,), "no attribute 'gloss'"),
+        (lambda m, s: (s[0].lights[7].direction,), "out of range"),
     ],
 )
 def test_what_names_no_leaf_is_an_error(target: np.ndarray, free, said):
@@ -112,3 +115,28 @@ def test_options_of_the_solver_are_checked(target: np.ndarray, options):
     known = scene(TRUE_DIRECTION, [1.0, 0.9, 0.8])
     with pytest.raises(brdf.InputError, match=next(iter(options))):
         fitting.fit_jointly(target, known, MATERIAL, lambda m, s: (m.n,), **options)
+
+
+@pytest.mark.slow
+def test_a_joint_fit_chooses_the_model_and_tells_errors_as_a_fit_does(target: np.ndarray, tmp_path):
+    sigma = 0.005
+    noisy = target + np.random.default_rng(0).normal(0, sigma, target.shape)
+    away = scene(TRUE_DIRECTION + 0.18 * np.array([0.6, -0.5, 0.0]), [1.0, 0.9, 0.8])
+    result = fitting.fit_jointly(noisy, away, free=lambda m, s: (m.k_a, m.k_d, m.k_s, m.n, s[0].lights[0].direction))
+    assert result.surface == "blinn-phong"
+    assert result.candidates
+    np.testing.assert_allclose(result.noise, sigma, rtol=0.1)
+    found = result["lights[0].direction"]
+    assert angle(np.array(found.direction), TRUE_DIRECTION) < 4 * found.error
+    # One radian of a light's direction moves a pixel by its diffuse and specular slopes: some 0.005 / sqrt(pixels).
+    assert 0.01 < found.error < 0.2
+    np.testing.assert_allclose(found.value, angle(away.lights[0].direction, TRUE_DIRECTION), atol=4 * found.error)
+    low, high = result["n"].interval
+    assert low < 25 < high
+    assert abs(float(result["k_d"][1]) - 0.4) < 4 * result["k_d"][1].error
+    assert "° (turned by" in str(result)
+    assert not result.warnings
+    result.save(tmp_path, plot=True)
+    again = fitting.load_result(tmp_path)
+    assert str(again) == str(result)
+    assert again.scenes[0].lights[0].direction == pytest.approx(result.scenes[0].lights[0].direction)

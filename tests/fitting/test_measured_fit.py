@@ -94,11 +94,11 @@ def test_auto_names_the_form_and_lambert_where_it_is_enough():
     matt = brdf.MeasuredBRDF.from_samples(light, view, f_r("phong", [0.5], [0.0], 1.0, light, view))
     result = fitting.fit_brdf(matt)
     assert result.material.name == "lambert"
-    assert result.verdict.startswith("Lambert is enough within")
+    assert result.verdict.startswith("Lambert is enough: ")
     glossy = f_r("normalized-phong", [0.2], [0.3], 30.0, light, view)
     result = fitting.fit_brdf(brdf.MeasuredBRDF.from_samples(light, view, glossy))
     assert result.material.name == "normalized-phong"
-    assert "Lambert alone within" in result.verdict
+    assert "Lambert alone is off by" in result.verdict
     assert len(result.candidates) == 5
 
 
@@ -256,7 +256,7 @@ def test_published_fits_come_back_from_tables_on_the_merl_grid():
     ("name", "sentence"),
     [
         ("alta/retro-gray-tape.dat", "none of these models fits"),
-        ("rgl/colodur_napoli_4f_rgb.bsdf", "Lambert is enough within"),
+        ("rgl/colodur_napoli_4f_rgb.bsdf", "Lambert is enough: "),
         ("rgl/satin_rosaline_rgb.bsdf", "phong puts "),
     ],
 )
@@ -310,9 +310,33 @@ def lobe() -> fitting.BrdfFitResult:
     return fitting.fit_brdf(brdf.MeasuredBRDF.from_samples(light, view, values), "normalized-blinn-phong")
 
 
+def test_a_table_is_told_saved_and_drawn_as_a_picture_is(lobe, tmp_path):
+    assert float(lobe["n"]) == lobe.material.n
+    low, high = lobe["n"].interval
+    assert low <= float(lobe["n"]) <= high
+    assert not lobe.warnings
+    lobe.save(tmp_path, plot=True)
+    assert (tmp_path / "comparison.png").stat().st_size > 10000
+    with pytest.raises(brdf.InputError, match="is the fit of a measured BRDF, which holds no picture"):
+        fitting.load_result(tmp_path)
+    assert brdf.load_material(tmp_path).n == lobe.material.n
+    mended = dataclasses.replace(lobe.table, below_zero="which somebody made")
+    said = str(dataclasses.replace(lobe, table=mended, negative=3))
+    assert "3 values are below 0, which somebody made; squared losses" in said
+    assert "misplaced: the share of the light that goes elsewhere" in said
+
+
 SENTENCES = {
-    "all of it": (0.1, 0.05, "normalized-blinn-phong describes it within 10 % (rms; 5 % of the light goes elsewhere)"),
-    "rounding": (1e-12, 0.0, "normalized-blinn-phong describes it within 0.0001 % (rms; 0 % of the light"),
+    "all of it": (
+        0.1,
+        0.05,
+        "normalized-blinn-phong describes it: its f_r cos θ is off by 10 % (rms), and 5 % of",
+    ),
+    "rounding": (
+        1e-12,
+        0.0,
+        "normalized-blinn-phong describes it: its f_r cos θ is off by 0.0001 % (rms), and 0",
+    ),
     "a plastic's body": (
         0.73,
         0.17,
@@ -321,7 +345,7 @@ SENTENCES = {
     "the peak of two lobes": (
         0.075,
         0.53,
-        "normalized-blinn-phong comes within 7.5 % (rms), but 53 % of the light goes",
+        "normalized-blinn-phong fits the peak, its f_r cos θ is off by 7.5 % (rms), but 53 % of the light",
     ),
     "the body of a retro-reflector": (0.96, 0.466, "normalized-blinn-phong does not fit: it leaves 96 % of the table"),
     "a peak, and all the light elsewhere": (0.3, 1.2, "normalized-blinn-phong does not fit"),
@@ -357,7 +381,8 @@ def test_how_much_closer_the_best_lobe_comes_is_told_as_it_is(lobe, share, rest,
         dataclasses.replace(lobe.candidates[0], losses=closer),
     )
     result = dataclasses.replace(lobe, loss=loss, candidates=candidates, chosen=0)
-    assert result.verdict == f"Lambert is enough within 24 % (rms; 10 % of the light goes elsewhere){rest}"
+    start = "Lambert is enough: its f_r cos θ is off by 24 % (rms), and 10 % of the light goes elsewhere"
+    assert result.verdict == f"{start}{rest}"
 
 
 def test_where_no_lobe_helps_it_says_so():
@@ -384,7 +409,7 @@ def test_one_pair_of_directions_gives_no_warning():
     table = brdf.MeasuredBRDF.from_samples(light, view, np.full(50, 0.5))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert fitting.fit_brdf(table).verdict.startswith("Lambert is enough within 0")
+        assert fitting.fit_brdf(table).verdict.startswith("Lambert is enough: its f_r cos θ is off by 0")
 
 
 @pytest.mark.parametrize("values", [-0.5, np.linspace(-1, 0, 600)])

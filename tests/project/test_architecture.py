@@ -25,16 +25,18 @@ brdf.materials brdf.measured brdf.plausibility brdf.display
 fitting.functional fitting.solver fitting.model_fit fitting.light_colour fitting.problem fitting.pixels
 fitting.selection fitting.budget.choice fitting.result fitting.uncertainty fitting.plausible fitting.censored_noise
 fitting.core fitting.report fitting.implicit fitting.joint fitting.relighting fitting.measured_fit fitting.photographs
-fitting.budget fitting.speed_accuracy fitting.front_door fitting.many
+fitting.budget fitting.speed_accuracy fitting.front_door
 fitting.cli
 """.split()
 
 # What fitting needs of brdf and no user calls.
 OPEN_TO_FITTING = set(
     """
-brdf.albedo brdf.channels brdf.conversions brdf.display brdf.errors brdf.files brdf.images.encoding brdf.lobes
-    brdf.materials.exports brdf.materials.material_file brdf.measured.loading brdf.models.base brdf.plausibility.numeric
-    brdf.plausibility.report brdf.plausibility.stability brdf.precision brdf.rendering brdf.scene
+brdf.albedo brdf.channels brdf.checks brdf.conversions brdf.display brdf.errors brdf.files brdf.images.encoding
+    brdf.lobes
+    brdf.materials.exports brdf.materials.material_file brdf.measured.loading brdf.measured.table brdf.models.base
+    brdf.plausibility.numeric brdf.plausibility.report brdf.plausibility.stability brdf.precision brdf.rendering
+    brdf.scene
 """.split()
 )
 

@@ -43,6 +43,22 @@ def test_lights_are_found_given_the_material():
     np.testing.assert_allclose(found.emittances, expected, rtol=1e-4)
     assert not found.undetermined
     assert found.residual < 1e-5
+    assert [one.key for one in found.parameters[:3]] == [f"lights[0].intensity[{channel}]" for channel in range(3)]
+    np.testing.assert_allclose(np.asarray(found["lights[1].radiance"], float), found.emittances[1])
+
+
+def test_lights_are_told_saved_and_drawn_as_a_fit_is(tmp_path):
+    clean = np.asarray(brdf.render(MATERIAL, scene(INTENSITIES), precision="float64"))
+    noisy = clean + np.random.default_rng(0).normal(0, 0.01, clean.shape)
+    found = fitting.fit_lights(noisy, scene(np.ones((3, 3))), MATERIAL)
+    truth = (INTENSITIES * np.array([[1.0], [20.0], [1.0]])).ravel()
+    for one, true in zip(found.parameters, truth, strict=True):
+        assert abs(float(one) - true) < 4.5 * one.error
+    np.testing.assert_allclose(found.noise, 0.01, rtol=0.1)
+    assert not found.warnings
+    assert f"  {found.parameters[0].name} red    {found.parameters[0]}" in str(found)
+    found.save(tmp_path, plot=True)
+    np.testing.assert_allclose(fitting.load_result(tmp_path).fitted(), found.fitted(), rtol=1e-5)
 
 
 def test_lights_that_look_alike_are_not_told_apart():
