@@ -2,22 +2,31 @@
 
 A result is written under a temporary name beside its place and renamed when it is complete, so that an error, a full
 disk or Ctrl-C leaves whatever was there before, and nothing else. Renaming guards against a dying program, not against
-a power cut: nothing is forced to the disk.
+a power cut: nothing is forced to the disk. What a program leaves that is killed on the spot, the next that writes into
+the same folder removes: a writer holds a lock on what it stages, and the system lets go of it when the writer ends.
 """
 
 import errno
+import functools
 import os
+import re
 import secrets
 import shutil
 import stat
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from brdf.errors import InputError
 
+try:
+    import fcntl
+except ImportError:  # on Windows, where nothing is removed
+    fcntl = None
+
+_STAGED = re.compile(r"\.brdf-[0-9a-f]{12}(\..*)?")
 _FREE, _ELSEWHERE = "Free some space or write elsewhere", "Change the permissions or choose another place"
 _REMEDIES = {
     errno.ENOSPC: ("there is no space left to write it", _FREE),
@@ -127,10 +136,11 @@ def atomic_path(path: AnyPath) -> Iterator[Path]:
         raise InputError(path, "is a folder, not a file", "Give the path of a file")
     if os.path.exists(target) and not os.path.isfile(target):
         raise InputError(path, "is not an ordinary file", "Give the path of a file")
-    temporary = target.with_name(f".{secrets.token_hex(6)}{target.suffix}")
+    temporary, lock = target.with_name(f".brdf-{secrets.token_hex(6)}{target.suffix}"), None
     try:
         with _told(path):
-            os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+            _remove_abandoned(target.parent)
+            lock = _hold(temporary, lambda new: os.close(os.open(new, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)))
             yield temporary
             if target.exists():
                 shutil.copymode(target, temporary)
@@ -139,6 +149,47 @@ def atomic_path(path: AnyPath) -> Iterator[Path]:
         # After success the name is gone already.
         with suppress(OSError):
             temporary.unlink()
+        if lock is not None:
+            os.close(lock)
+
+
+def _hold(staged: Path, make: Callable[[Path], Any]) -> int | None:
+    """Make a file or folder and lock it, and only then give it the name by which it could be found abandoned."""
+    new = staged.with_name(staged.name.replace("-", "-new-", 1))
+    make(new)
+    try:
+        lock = _lock(new)
+        new.rename(staged)
+    except BaseException:
+        shutil.rmtree(new) if new.is_dir() else new.unlink()
+        raise
+    return lock
+
+
+def _lock(place: Path) -> int | None:
+    """What holds a file or folder until it is closed or this process ends; None where that cannot be had."""
+    if fcntl is None:
+        return None
+    with suppress(OSError):
+        descriptor = os.open(place, os.O_RDONLY)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return descriptor
+        except OSError:
+            os.close(descriptor)
+    return None
+
+
+@functools.cache
+def _remove_abandoned(folder: Path) -> None:
+    """Remove what writers that are gone have staged there, once for each folder."""
+    staged = [place for place in folder.glob(".brdf-*") if _STAGED.fullmatch(place.name)]
+    for place in staged:
+        with suppress(OSError):
+            lock = _lock(place)
+            if lock is not None:
+                shutil.rmtree(place) if place.is_dir() else place.unlink()
+                os.close(lock)
 
 
 def write_text(path: AnyPath, text: str) -> None:
@@ -173,12 +224,14 @@ def atomic_folder(path: AnyPath) -> Iterator[Path]:
     """
     folder = Path(os.path.realpath(_plain(path)))
     missing = [parent for parent in (folder, *folder.parents) if not os.path.exists(parent)]
-    stage = folder / f".{secrets.token_hex(6)}"
+    stage, lock = folder / f".brdf-{secrets.token_hex(6)}", None
     new, old = stage / "new", stage / "old"
     try:
         with _told(path):
             folder.mkdir(parents=True, exist_ok=True)
-            for place in (stage, new, old):
+            _remove_abandoned(folder)
+            lock = _hold(stage, Path.mkdir)
+            for place in (new, old):
                 place.mkdir()
             yield new
             _move_together(new, old, folder)
@@ -190,6 +243,8 @@ def atomic_folder(path: AnyPath) -> Iterator[Path]:
         raise InputError(Path(path) / staged.relative_to(new), error.what, error.remedy) from None
     finally:
         shutil.rmtree(stage, ignore_errors=True)
+        if lock is not None:
+            os.close(lock)
         for parent in missing:
             with suppress(OSError):
                 parent.rmdir()  # refused where there is something in it

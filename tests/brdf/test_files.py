@@ -226,6 +226,46 @@ with atomic_folder(sys.argv[1] + "/out") as folder:
     assert everything(tmp_path) == []
 
 
+WRITES_FOR_EVER = """
+import sys, time
+from pathlib import Path
+from brdf.files import atomic_folder, atomic_path
+folder = Path(sys.argv[1])
+with atomic_folder(folder) as stage, atomic_path(folder / "a.txt"):
+    (stage / "b.txt").write_text("half")
+    print("ready", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_what_a_killed_writer_left_the_next_one_removes_and_never_a_live_one(tmp_path):
+    def writer():
+        command = [sys.executable, "-c", WRITES_FOR_EVER, str(tmp_path)]
+        process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+        assert process.stdout.readline() == "ready\n"
+        return process
+
+    killed = writer()
+    killed.kill()
+    killed.communicate()
+    left = {path.name for path in tmp_path.iterdir()}
+    assert len(left) == 2
+    (tmp_path / ".brdf-notes").write_text("mine")
+    live = writer()
+    try:
+        staged = {path.name for path in tmp_path.iterdir()} - {".brdf-notes"}
+        assert len(staged) == 2
+        assert not staged & left
+        write_text(tmp_path / "c.txt", "x")
+        assert {path.name for path in tmp_path.iterdir()} == staged | {".brdf-notes", "c.txt"}
+    finally:
+        live.kill()
+        live.communicate()
+    # Once for each folder and process: here the first run has been.
+    run("import sys; from brdf.files import write_text; write_text(sys.argv[1], 'y')", tmp_path / "d.txt")
+    assert everything(tmp_path) == [".brdf-notes", "c.txt", "d.txt"]
+
+
 def test_input_files(tmp_path):
     (tmp_path / "a").write_text("x")
     assert input_file(tmp_path / "a") == tmp_path / "a"

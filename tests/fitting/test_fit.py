@@ -42,6 +42,12 @@ def test_two_pictures_tell_what_one_does_not():
     assert "2 pictures" in str(both)
 
 
+def test_a_constant_picture_is_not_taken_for_a_clipped_one():
+    result = fitting.fit(np.full_like(MATT, 0.5), SCENE, model="lambert")
+    assert not result.left_out.get("clipped")
+    assert result.pixels == np.count_nonzero(SCENE.surface_points().mask)
+
+
 def test_clipped_and_missing_pixels_are_left_out_and_counted():
     truth = brdf.BlinnPhong(k_a=0.3, k_d=[0.5, 0.4, 0.3], k_s=0.8, n=20.0)
     picture = np.minimum(pictured(truth, SCENE), 0.9)
