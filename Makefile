@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 EXAMPLE := data/gold-ball
 
-.PHONY: fit test check notebooks clean
+.PHONY: fit test check docs lab clean
 
 fit: $(VENV)/installed
 	$(BIN)/brdf fit $(EXAMPLE) --out out/gold-ball --plot
@@ -17,8 +17,11 @@ check: $(VENV)/installed-tests
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-notebooks: $(VENV)/installed-notebooks
-	printf '%s\n' 5 1 2 3 4 6 7 | xargs -P 2 -n 1 $(BIN)/python notebooks/run.py
+docs: $(VENV)/installed-docs
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going -q -j 2 -b html -d out/docs-cache docs out/docs
+
+lab: $(VENV)/installed-lab
+	JUPYTER_CONFIG_PATH=$(CURDIR)/$(VENV)/lab $(BIN)/jupyter lab notebooks
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -29,8 +32,13 @@ $(VENV)/installed-tests: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[tests,check,interop,measured,meshes]'
 	touch $@
 
-$(VENV)/installed-notebooks: $(VENV)/installed
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[notebooks]'
+$(VENV)/installed-docs: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	touch $@
+
+$(VENV)/installed-lab: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[lab]'
+	$(BIN)/jupytext-config --settings-file $(VENV)/lab/labconfig/default_setting_overrides.json set-default-viewer python
 	touch $@
 
 clean:

@@ -119,8 +119,8 @@ def half_log_cosine(normal: Directions, to_light: Directions, to_view: Direction
 def mirror_log_cosine(normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
     """Logarithm of R.V, of mirror direction and view; never forms the mirror direction.
 
-    With s = L + V and d = L - V the distance to the peak is |R - V|^2 = |N x s|^2 + (N.d)^2, and
-    log(R.V) = -log(1 + |R - V|^2 / (2 R.V)).
+    With s = L + V and d = L - V the distance to the peak is ‖R - V‖² = ‖N × s‖² + (N.d)², and
+    log(R.V) = -log(1 + ‖R - V‖² / (2 R.V)).
     """
     axis, light, view = _split(normal, to_light, to_view)
     total, difference = _combined(operator.add, light, view), _combined(operator.sub, light, view)

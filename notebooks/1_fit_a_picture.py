@@ -13,6 +13,8 @@
 # %% [markdown]
 # # 1. Fit a picture
 #
+# *`make lab` opens this notebook in Jupyter; it is kept as text, a double click on it opens it as a notebook.*
+#
 # You have a picture of a thing under known light, and want the few numbers that reproduce its look: ambient `k_a`,
 # diffuse `k_d`, specular `k_s` and the exponent `n`. Two files are needed: the picture, and `scene.toml`, which says
 # what it shows. Here both come with the project: a golden ball, drawn by OpenGL with the classic "gold".

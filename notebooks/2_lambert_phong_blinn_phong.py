@@ -13,6 +13,8 @@
 # %% [markdown]
 # # 2. Lambert, Phong, Blinn-Phong
 #
+# *`make lab` opens this notebook in Jupyter; it is kept as text, a double click on it opens it as a notebook.*
+#
 # A point reflects $k_a I_a + \sum_i I_i\,[\,k_d\,(N{\cdot}L_i)_+ + k_s\,S(L_i, V)\,]$. The models differ in $S$ alone:
 #
 # | model | S | who draws it |

@@ -13,6 +13,8 @@
 # %% [markdown]
 # # 3. Lights
 #
+# *`make lab` opens this notebook in Jupyter; it is kept as text, a double click on it opens it as a notebook.*
+#
 # Every light ends in light samples, a direction and an intensity at a surface point. *Intensity* is the radiance that a
 # white Lambertian surface facing the light shows; an irradiance is π times that. A rendering sums over the samples that a
 # point can see.

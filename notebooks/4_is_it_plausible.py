@@ -13,6 +13,8 @@
 # %% [markdown]
 # # 4. Is it plausible?
 #
+# *`make lab` opens this notebook in Jupyter; it is kept as text, a double click on it opens it as a notebook.*
+#
 # A surface that a physically based renderer may use has to be **positive** (no negative light), **reciprocal** (light and
 # viewer may change places) and **energy conserving** (not more light comes back than arrives). `brdf.check` tests all
 # three, with a bound on its own numerical error.

@@ -13,6 +13,8 @@
 # %% [markdown]
 # # 5. Speed against accuracy
 #
+# *`make lab` opens this notebook in Jupyter; it is kept as text, a double click on it opens it as a notebook.*
+#
 # How many pixels, how many light samples, which precision? The answer depends on the scene, so the toolkit measures it
 # there. A word on the times below: they were taken while this page was made, on whatever else the machine had to do;
 # compare them with each other, not with yours.

@@ -13,6 +13,8 @@
 # %% [markdown]
 # # 6. Photographs
 #
+# *`make lab` opens this notebook in Jupyter; it is kept as text, a double click on it opens it as a notebook.*
+#
 # Real pictures are not renders: lights are known roughly, surfaces do not follow a formula, light comes back from the
 # table. What does a fit say then, and how sure is it?
 #

@@ -13,6 +13,8 @@
 # %% [markdown]
 # # 7. Differentiable
 #
+# *`make lab` opens this notebook in Jupyter; it is kept as text, a double click on it opens it as a notebook.*
+#
 # `brdf.render` is a JAX function: it can be differentiated by every number in material and scene. And a fit can be
 # differentiated too, without differentiating its search.
 

@@ -164,7 +164,7 @@ def viewer(result: FitResult, picture: int | None = None) -> str:
     }
     data["albedo"] = {"degrees": _DEGREES.tolist()}
     if isinstance(material, SpecularMaterial):
-        data |= _tables(type(material))
+        data |= _tables(material.name)
     # In a script element nothing but </script and <!-- has a meaning to HTML.
     text = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     still = np.concatenate([brdf.displayed(image, max(white, 1e-12)) for image in (target, fitted)], axis=1)
@@ -336,12 +336,13 @@ def _shaders(model):
 
 
 @functools.cache
-def _tables(model: type[SpecularMaterial]) -> dict[str, Any]:
+def _tables(name: str) -> dict[str, Any]:
     """What the page interpolates in log n: the lobe's albedo, and what the nearest normalised form takes."""
 
     def rounded(values: Any) -> Any:
         return [[float(f"{value:.5g}") for value in row] for row in values]
 
+    model: Any = brdf.MODELS[name]
     with working_precision("float64"):
         lobe = np.asarray(lobe_albedo(model, 10.0 ** _LOG_N[:, None], np.radians(_DEGREES)[None, :]))
     tables = {"albedo": {"log_n": _LOG_N.tolist(), "degrees": _DEGREES.tolist(), "lobe": rounded(lobe)}}

@@ -1,4 +1,4 @@
-"""The notebooks: stored without outputs, through the front door only; `make notebooks` runs them to their pictures."""
+"""The notebooks: stored without outputs, through the front door only; `make docs` runs them."""
 
 import ast
 from pathlib import Path
@@ -34,4 +34,5 @@ def test_notebook_is_plain_text_with_prose(path: Path):
     text = path.read_text()
     assert "format_name: percent" in text
     assert text.count("# %% [markdown]") >= 4
+    assert "`make lab` opens this notebook" in text.split("# %%")[1]
     assert not list(HERE.glob("*.ipynb")), "notebooks are stored as text, without outputs"
