@@ -3,6 +3,8 @@ from .front_door import fit as fit
 from .implicit import Sensitivity as Sensitivity
 from .implicit import sensitivity as sensitivity
 from .joint import fit_jointly as fit_jointly
+from .many import ManyFits as ManyFits
+from .many import fit_many as fit_many
 from .measured_fit import BrdfFitResult as BrdfFitResult
 from .measured_fit import fit_brdf as fit_brdf
 from .relighting import LightFit as LightFit

@@ -17,6 +17,7 @@ import numpy as np
 
 from brdf.channels import channel_names
 from fitting.result import FitResult
+from fitting.solver.normal_equations import AnyArray
 
 # Predictions within so many standard deviations of an end are bent by more than a thousandth of one.
 REACH = 3.0
@@ -99,16 +100,20 @@ def _count(masks: Sequence[np.ndarray]) -> int:
 
 def _piles_up(target: np.ndarray, counted: np.ndarray) -> bool:
     """Whether noise may be cut at black in some channel; a look that needs no prediction."""
-    return any(_single_values_at_end(value, counted) for value in np.moveaxis(target, -1, 0))
+    return any(single_values_at_end(value, counted) for value in np.moveaxis(target, -1, 0))
 
 
-def _single_values_at_end(value: np.ndarray, counted: np.ndarray) -> bool:
-    """Whether single pixels stand at the lower end among larger ones: what is dark without noise is so in one piece."""
-    inside = value[counted]
-    if not inside.size or np.count_nonzero(inside == np.min(inside)) < FEWEST:
-        return False
-    above = counted & (value > np.min(inside))
-    return int(np.count_nonzero(above[:, :-2] & (counted & ~above)[:, 1:-1] & above[:, 2:])) >= FEWEST
+def single_values_at_end(value: AnyArray, counted: AnyArray) -> Any:
+    """Whether single pixels stand at the lower end among larger ones: what is dark without noise is so in one piece.
+
+    Args:
+        value: of one channel, (H, W), on the host or traced.
+        counted: which pixels count.
+    """
+    least = value.min(where=counted, initial=np.inf)
+    at_end, above = counted & (value == least), counted & (value > least)
+    single = above[:, :-2] & at_end[:, 1:-1] & above[:, 2:]
+    return (at_end.sum() >= FEWEST) & (single.sum() >= FEWEST)
 
 
 def _censored(
@@ -158,7 +163,7 @@ def _censored(
 def _near_black(value: np.ndarray, model: np.ndarray, counted: np.ndarray) -> np.ndarray:
     """Pixels predicted so near to black that noise is cut there; none where no single values stand at the end."""
     nowhere = np.zeros(counted.shape, bool)
-    if not _single_values_at_end(value, counted):
+    if not single_values_at_end(value, counted):
         return nowhere
     floor = float(np.min(value[counted]))
     at_end = counted & (value == floor) & (model > 0)

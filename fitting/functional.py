@@ -50,7 +50,7 @@ from brdf.models.base import SpecularMaterial
 from brdf.rendering import Basis, basis
 
 # As a function of log n a lobe varies on a scale of 1 or more; Hermite's cubic over such a cell finds every valley.
-GRID_STEP = 0.5
+GRID_STEP = 0.7
 # Newton's steps double the digits, from a cell's cubic to the end of the precision; a step below CLOSE is one of these.
 STEPS = {"float32": 4, "float64": 6}
 CLOSE = 1e-3
@@ -174,7 +174,7 @@ def fit_basis(
     diffuse = jnp.zeros((weight.size, 1), target.dtype) if images.diffuse is None else images.diffuse
     lobe, peak = None, None
     if images.lobe is not None:
-        peak = jnp.max(jnp.where(weight > 0, images.lobe.peak(), -jnp.inf))
+        peak = jnp.max(jnp.where(weight > 0, images.lobe.peak, -jnp.inf))
         lobe = eqx.Partial(_value, images.lobe)
     ambient = jnp.zeros(1, target.dtype) if ambient is None else ambient
     target = target.reshape(weight.size, -1)

@@ -1,0 +1,294 @@
+"""Many fits in one call: pictures of one size, each of a material of its own, through one compiled program.
+
+A fit of a small picture is mostly the host's work between short programs. Here the core of the fit
+(`fitting.functional`) runs over all pictures together: in one scene they share the basis images, the lobe on the grid
+over n and its Gram matrices, so that of each picture little more is read than its products with those.
+
+What one fit finds out about its picture, clipping, cut-off noise, values that are rounded, holds here too: pictures
+that show signs of it are fitted by `fitting.fit`, one by one.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Iterator, Sequence
+from typing import Any, overload
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+import brdf
+from brdf.errors import InputError
+from brdf.models.base import SpecularMaterial
+from brdf.precision import Precision, working_precision
+from brdf.rendering import Basis, basis
+from fitting import functional
+from fitting.censored_noise import single_values_at_end
+from fitting.core import fit_pictures
+from fitting.light_colour import take_colour_out
+from fitting.pixels import SYMMETRIC_PIXELS
+from fitting.problem import TOP, FitProblem, state_problem
+from fitting.report import FitResult
+
+# So many pictures at a time: their columns stay in the processor's cache.
+BATCH = 16
+NAMES = ("k_a", "k_d", "k_s", "n")
+
+
+class ManyFits(Sequence[FitResult]):
+    """The fits of many pictures: numbers of all as arrays, and of each the whole result.
+
+    Attributes:
+        problem: the pictures and how they were fitted.
+
+    Example:
+        >>> scene = brdf.Scene.load("scene.toml")
+        >>> pictures = np.stack([brdf.render(brdf.preset(name), scene) for name in ("gold", "emerald")])
+        >>> fits = fitting.fit_many(pictures, scene, model="blinn-phong")
+        >>> len(fits), fits.n.round(1), fits[0].material.k_d.shape
+        (2, array([51.2, 76.8]), (3,))
+    """
+
+    def __init__(self, problem: FitProblem, numbers: dict[str, np.ndarray] | None, done: dict[int, FitResult]):
+        """Gather what was found; `fit_many` does.
+
+        Args:
+            problem: all pictures.
+            numbers: of all fits; None takes them from the results.
+            done: results that are known already.
+        """
+        self.problem, self._numbers, self._done = problem, numbers, done
+
+    def __len__(self) -> int:
+        """How many pictures."""
+        return len(self.problem.targets)
+
+    @overload
+    def __getitem__(self, index: int) -> FitResult: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[FitResult]: ...
+    def __getitem__(self, index: int | slice) -> FitResult | list[FitResult]:
+        """The result of one picture with intervals, warnings and report: made by `fitting.fit` when first asked for."""
+        if isinstance(index, slice):
+            return [self[i] for i in range(len(self))[index]]
+        index = range(len(self))[index]
+        if index not in self._done:
+            self._done[index] = fit_pictures(_one(self.problem, index))
+        return self._done[index]
+
+    def __repr__(self) -> str:
+        """How many, of what."""
+        height, width, channels = self.problem.targets[0].pixels.shape
+        return f"ManyFits({len(self)} pictures, {width} x {height} x {channels}, {self.problem.model})"
+
+    @functools.cached_property
+    def numbers(self) -> dict[str, np.ndarray]:
+        """k_a, k_d, k_s (N, C), n and the residual (N,), and errors as ``n_error``; 0 where a fit has none."""
+        if self._numbers is not None:
+            return self._numbers
+        rows = [_numbers_of(result) for result in self]
+        return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+
+    @property
+    def k_a(self) -> Float[np.ndarray, "N C"]:
+        """Ambient coefficients."""
+        return self.numbers["k_a"]
+
+    @property
+    def k_d(self) -> Float[np.ndarray, "N C"]:
+        """Diffuse coefficients."""
+        return self.numbers["k_d"]
+
+    @property
+    def k_s(self) -> Float[np.ndarray, "N C"]:
+        """Specular coefficients of the optima; where noise hides a highlight, ``fits[i]`` is without."""
+        return self.numbers["k_s"]
+
+    @property
+    def n(self) -> Float[np.ndarray, " N"]:
+        """Exponents of the optima, see ``k_s``."""
+        return self.numbers["n"]
+
+    @property
+    def errors(self) -> dict[str, np.ndarray]:
+        """Standard errors of k_a, k_d, k_s and n, under independent noise; 0 at a bound."""
+        return {name: self.numbers[f"{name}_error"] for name in NAMES}
+
+    @property
+    def residual(self) -> Float[np.ndarray, " N"]:
+        """Root mean square of each residual over that of its picture."""
+        return self.numbers["residual"]
+
+
+def fit_many(
+    pictures: Any,
+    scenes: brdf.Scene | Sequence[brdf.Scene],
+    *,
+    model: Any = "auto",
+    precision: Precision = "float32",
+    mask: Any = None,
+    n_range: tuple[float, float] = (0.1, 1e6),
+) -> ManyFits:
+    """Fit a material to each of many pictures of one size, as `fitting.fit` does to one.
+
+    Args:
+        pictures: (N, H, W, C) linear values, or a list of what `fitting.fit` takes.
+        scenes: one scene that all show, or a list of one for each.
+        model: the name of a model: then all are fitted together. "auto" compares models for each picture, one by one,
+            when its result is asked for.
+        precision: "float32" or "float64".
+        mask: (H, W), pixels to look at in every picture, or a list of one for each.
+        n_range: bounds of the exponent.
+
+    Returns:
+        The fits: ``fits.n``, ``fits.k_d`` are arrays, ``fits[i]`` is the result of one.
+
+    Raises:
+        InputError: naming the argument, where it cannot be used.
+
+    Example:
+        >>> scene = brdf.Scene.load("scene.toml")
+        >>> pictures = np.stack([brdf.render(brdf.preset(name), scene) for name in ("gold", "ruby")])
+        >>> fitting.fit_many(pictures, scene, model="blinn-phong").k_d.shape
+        (2, 3)
+    """
+    pictures = list(pictures)
+    scenes = [scenes] * len(pictures) if isinstance(scenes, brdf.Scene) else scenes
+    mask = mask if isinstance(mask, list | tuple) else [mask] * len(pictures)
+    problem = state_problem(pictures, scenes, mask, model=model, precision=precision, n_range=n_range)
+    shapes = {target.pixels.shape for target in problem.targets}
+    if len(shapes) > 1 or problem.streamed:
+        came = "are read by bands" if problem.streamed else f"have the shapes {sorted(shapes)}"
+        raise InputError("pictures", f"{came}, and are fitted together", "Give arrays of one size, or call fitting.fit")
+    if problem.model == "auto":
+        return ManyFits(problem, None, {})
+    with working_precision(problem.precision):
+        numbers, plain = _fit_together(problem)
+    done = {int(i): fit_pictures(_one(problem, i)) for i in np.flatnonzero(~plain)}
+    for index, result in done.items():
+        for name, value in _numbers_of(result).items():
+            numbers[name][index] = value
+    return ManyFits(problem, numbers, done)
+
+
+def _one(problem: FitProblem, index: int) -> FitProblem:
+    lists = {name: [getattr(problem, name)[index]] for name in ("targets", "scenes", "masks", "weights")}
+    return dataclasses.replace(problem, **lists)
+
+
+def _numbers_of(result: FitResult) -> dict[str, np.ndarray]:
+    material, channels = result.material, result.material.k_d.shape[0]
+    found = {name: np.asarray(getattr(material, name, np.zeros(channels))) for name in NAMES[:3]}
+    found |= {"n": np.asarray(getattr(material, "n", 0.0)), "residual": np.asarray(result.residual)}
+    for name in NAMES:
+        errors = [0.0 if one.at_bound else one.error for one in result.parameters if one.name == name]
+        errors = [np.inf if error is None else error for error in errors] or [0.0]
+        found[f"{name}_error"] = np.asarray(errors[0] if name == "n" else np.broadcast_to(errors, channels))
+    return found
+
+
+def _fit_together(problem: FitProblem) -> tuple[dict[str, np.ndarray], Bool[np.ndarray, " N"]]:
+    """The numbers of all fits, and which pictures need no closer look."""
+    model, dtype, count = brdf.MODELS[problem.model], np.dtype(problem.precision), len(problem.targets)
+    targets = np.stack([target.pixels for target in problem.targets]).astype(dtype, copy=False)
+    channels = targets.shape[-1]
+    light = take_colour_out(problem.scenes[:1] if _alike(problem) else problem.scenes, channels)
+    scenes = [brdf.cast(scene, problem.precision) for scene in light.scenes]
+    places = [scene.surface_points() for scene in scenes]
+    allowed = [True if mask is None else mask for mask in problem.masks[: len(scenes)]]
+    seen = np.stack([np.asarray(points.mask) & mask for points, mask in zip(places, allowed, strict=True)])
+    exact = np.array([target.saturation is None and not target.step for target in problem.targets])
+    plain = exact & np.asarray(_plain(targets, seen))
+    if len(scenes) == 1:
+        pixel = np.flatnonzero(seen)
+        images = basis(model, scenes[0], points=places[0])
+        choose = functools.partial(_chosen, pixel)
+        images = Basis(images.points, choose(images.diffuse), images.lobe and images.lobe.pixels(choose))
+        few = jnp.asarray(np.take(targets.reshape(count, -1, channels), pixel, axis=1))
+        solution = _in_one_scene(few, images, scenes[0].ambient, problem.n_range)
+    else:
+        solution = None
+        for some in _of_one_structure(scenes):
+            stack = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(scenes[i] for i in some))
+            lit = _bases(model, stack)
+            part = _in_scenes_of_their_own(
+                jnp.asarray(targets[some]), jnp.asarray(seen[some]), lit, stack.ambient, problem.n_range
+            )
+            if solution is None:
+                solution = jax.tree.map(lambda leaf: np.zeros((count, *leaf.shape[1:]), leaf.dtype), part)
+            jax.tree.map(lambda whole, leaf, some=some: whole.__setitem__(some, leaf), solution, part)
+    assert solution is not None
+    solution, square = jax.tree.map(np.array, solution)
+    factor = np.where(light.colour > 0, light.colour, 1.0)
+    scale = model.scale(solution.n)[:, None] if issubclass(model, SpecularMaterial) else 1.0
+    numbers = {"n": np.where(solution.k_s.any(axis=1), solution.n, 0), "n_error": solution.errors[3]}
+    for name, by, error in zip(NAMES, (1.0, factor, factor * scale), solution.errors, strict=False):
+        numbers |= {name: np.array(getattr(solution, name) / by), f"{name}_error": np.array(error / by)}
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return numbers | {"residual": np.sqrt(solution.cost.sum(axis=1) / square)}, plain
+
+
+def _alike(problem: FitProblem) -> bool:
+    """Whether all pictures show one scene, and the same pixels of it."""
+    first = problem.scenes[0], problem.masks[0]
+    pairs = zip(problem.scenes, problem.masks, strict=True)
+    return all(scene is first[0] and (mask is first[1] or np.array_equal(mask, first[1])) for scene, mask in pairs)
+
+
+def _of_one_structure(scenes: Sequence[brdf.Scene]) -> Iterator[list[int]]:
+    """Indices of scenes that differ in nothing but numbers, together."""
+    groups: dict[Any, list[int]] = {}
+    for index, scene in enumerate(scenes):
+        leaves, structure = jax.tree.flatten(scene)
+        groups.setdefault((structure, tuple(leaf.shape for leaf in leaves)), []).append(index)
+    yield from groups.values()
+
+
+def _chosen(pixel: np.ndarray, leaf: Any) -> Any:
+    return None if leaf is None else jnp.asarray(np.asarray(leaf)[pixel])
+
+
+@functools.partial(jax.jit, static_argnums=3)
+def _in_one_scene(
+    targets: Array, images: Basis, ambient: Array | None, n_range: Any
+) -> tuple[functional.Solution, Array]:
+    weight = jnp.ones(targets.shape[1], targets.dtype)
+
+    def fit(target: Array) -> functional.Solution:
+        return functional.fit_basis(target, images, weight, ambient, n_range)
+
+    return jax.lax.map(fit, targets, batch_size=BATCH), jnp.sum(targets * targets, axis=(1, 2))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _bases(model: type[brdf.Material], scenes: brdf.Scene) -> Basis:
+    """A program of its own: inside that of the fits XLA would make geometry and lights anew at every step."""
+    return jax.lax.map(functools.partial(basis, model), scenes)
+
+
+@functools.partial(jax.jit, static_argnums=4)
+def _in_scenes_of_their_own(
+    targets: Array, seen: Array, images: Basis, ambient: Array | None, n_range: Any
+) -> tuple[functional.Solution, Array]:
+    def fit(picture: Any) -> functional.Solution:
+        target, seen, images, ambient = picture
+        return functional.fit_basis(target, images, seen.ravel().astype(target.dtype), ambient, n_range)
+
+    found = jax.lax.map(fit, (targets, seen, images, ambient), batch_size=BATCH)
+    return found, jnp.sum(jnp.where(seen[..., None], targets * targets, 0), axis=(1, 2, 3))
+
+
+@jax.jit
+def _plain(targets: Float[Array, "N H W C"], seen: Bool[Array, "#N H W"]) -> Bool[Array, " N"]:
+    """Whether all pixels of a picture count, and alike: finite, nothing clipped, no noise cut off."""
+
+    def plain(target: Array, seen: Array) -> Array:
+        brightest = jnp.max(target, axis=-1)
+        largest = jnp.max(jnp.where(seen, brightest, -jnp.inf))
+        top = jnp.count_nonzero(seen & (brightest >= largest * TOP))
+        cut = jax.vmap(single_values_at_end, (-1, None))(target, seen)
+        finite = jnp.all(jnp.isfinite(target) | ~seen[..., None])
+        return finite & (largest > 0) & (top <= SYMMETRIC_PIXELS) & ~jnp.any(cut)
+
+    return jax.vmap(plain, (0, 0 if len(seen) > 1 else None))(targets, seen if len(seen) > 1 else seen[0])

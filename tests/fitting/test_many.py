@@ -1,0 +1,98 @@
+"""Many fits in one call are those that one at a time gives."""
+
+import jax
+import numpy as np
+import pytest
+from small_ball import ball_scene, pictured
+
+import brdf
+import fitting
+
+COUNT = 5
+
+
+def materials(kind=brdf.BlinnPhong) -> list[brdf.Material]:
+    rng = np.random.default_rng(4)
+    k = rng.uniform(0.05, 0.5, (COUNT, 3, 3))
+    return [kind(k_a=a, k_d=d, k_s=s, n=n) for (a, d, s), n in zip(k, np.geomspace(2, 800, COUNT), strict=True)]
+
+
+def assert_alike(fits: fitting.ManyFits, pictures, scenes, **options):
+    for index, (picture, scene) in enumerate(zip(pictures, scenes, strict=True)):
+        one = fitting.fit(picture, scene, **options)
+        for name in ("k_a", "k_d", "k_s", "n"):
+            expected = np.asarray(getattr(one.material, name))
+            np.testing.assert_allclose(getattr(fits, name)[index], expected, rtol=1e-9, atol=1e-11)
+            errors = [parameter.error for parameter in one.parameters if parameter.name == name]
+            np.testing.assert_allclose(np.ravel(fits.errors[name][index]), errors, rtol=1e-5)
+        np.testing.assert_allclose(fits.residual[index], one.residual, rtol=1e-9)
+        assert str(fits[index]).split("\n")[1:] == str(one).split("\n")[1:]
+
+
+def test_one_scene_for_all():
+    pictures = np.stack([pictured(m, ball_scene(), 0.003, seed) for seed, m in enumerate(materials())])
+    fits = fitting.fit_many(pictures, ball_scene(), model="blinn-phong", precision="float64")
+    assert_alike(fits, pictures, [ball_scene()] * COUNT, model="blinn-phong", precision="float64")
+    assert len(fits[1:3]) == 2
+    assert "5 pictures, 48 x 48 x 3" in repr(fits)
+
+
+def test_scenes_of_their_own_masks_and_a_normalised_model():
+    lights = [
+        brdf.DirectionalLight(direction=[x, 0.4, 0.8], intensity=[1.0, 0.8, 0.6]) for x in np.linspace(-1, 1, COUNT)
+    ]
+    lights[2] = brdf.PointLight(position=[1, 2, 3], intensity=[10.0, 8.0, 6.0])
+    scenes = [ball_scene(light) for light in lights]
+    kinds = materials(brdf.NormalizedPhong)
+    pictures = [pictured(m, scene, 0.003, seed) for seed, (m, scene) in enumerate(zip(kinds, scenes, strict=True))]
+    masks = [np.arange(48)[:, None] + np.zeros(48) < 40 + i for i in range(COUNT)]
+    fits = fitting.fit_many(pictures, scenes, model="normalized-phong", precision="float64", mask=masks)
+    for index in (0, 2):
+        one = fitting.fit(
+            pictures[index], scenes[index], model="normalized-phong", precision="float64", mask=masks[index]
+        )
+        np.testing.assert_allclose(fits.n[index], one.material.n, rtol=1e-9)
+        np.testing.assert_allclose(fits.k_s[index], one.material.k_s, rtol=1e-9)
+
+
+def test_pictures_that_need_a_closer_look_get_it():
+    pictures = np.stack([pictured(m, ball_scene(), 0.003, seed) for seed, m in enumerate(materials())])
+    pictures[1] = np.minimum(pictures[1], 0.5 * pictures[1].max())  # clipped
+    pictures[2] = np.maximum(pictured(materials()[2], ball_scene(), 0.05, 7), 0)  # noise cut off at black
+    pictures[3][20, 20] = np.nan
+    fits = fitting.fit_many(pictures, ball_scene(), model="blinn-phong", precision="float64")
+    for index in (1, 2, 3):
+        one = fitting.fit(pictures[index], ball_scene(), model="blinn-phong", precision="float64")
+        assert fits[index].left_out == one.left_out
+        np.testing.assert_allclose(fits.n[index], one.material.n, rtol=1e-9)
+
+
+def test_a_model_is_chosen_for_each_in_float32():
+    matt = brdf.Lambert(k_a=[0.1, 0.1, 0.1], k_d=[0.5, 0.4, 0.3])
+    pictures = np.stack([pictured(m, ball_scene(), 0.003, 1) for m in (matt, materials()[2])]).astype(np.float32)
+    fits = fitting.fit_many(pictures, ball_scene())
+    assert [fit.surface for fit in fits] == ["lambert", "blinn-phong"]
+    np.testing.assert_array_equal(fits.k_d[1], fits[1].material.k_d)
+    assert fits.n[0] == 0
+    named = fitting.fit_many(pictures, ball_scene(), model="lambert")
+    np.testing.assert_allclose(named.k_d[0], fits[0].material.k_d, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("pictures", "scenes", "message"),
+    [
+        (np.ones((2, 48, 48, 3)), [ball_scene()], "1 entries for 2 pictures"),
+        (np.ones((2, 30, 48, 3)), ball_scene(), "48 x 30"),
+        ([], ball_scene(), "empty"),
+        (np.zeros((2, 48, 48, 3)), ball_scene(), "black"),
+    ],
+)
+def test_what_cannot_be_fitted_is_told_in_one_line(pictures, scenes, message):
+    with pytest.raises(brdf.InputError, match=message):
+        fitting.fit_many(pictures, scenes, model="blinn-phong")
+
+
+def test_the_switch_of_jax_stays_as_it_was():
+    before = jax.config.read("jax_enable_x64")
+    fitting.fit_many(np.ones((1, 48, 48, 3)) * np.linspace(0.1, 1, 48)[:, None], ball_scene(), model="lambert")
+    assert jax.config.read("jax_enable_x64") == before
