@@ -5,6 +5,9 @@ from .implicit import sensitivity as sensitivity
 from .joint import fit_jointly as fit_jointly
 from .many import ManyFits as ManyFits
 from .many import fit_many as fit_many
+from .maps.map_fit import fit_maps as fit_maps
+from .maps.map_result import Maps as Maps
+from .maps.map_result import load_maps as load_maps
 from .measured_fit import BrdfFitResult as BrdfFitResult
 from .measured_fit import fit_brdf as fit_brdf
 from .relighting import LightFit as LightFit

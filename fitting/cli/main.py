@@ -9,7 +9,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from brdf.errors import InputError
-from fitting.cli import check, convert, fit, lights, render, tradeoff
+from fitting.cli import check, convert, fit, lights, maps, render, tradeoff
 from fitting.cli.common import as_command, forget_output, show
 from fitting.cli.interrupts import interruptible
 
@@ -41,7 +41,7 @@ def about(
     """Which few numbers make this surface look like that picture."""
 
 
-COMMANDS = (fit.fit, lights.lights, render.render, check.check, convert.convert, tradeoff.tradeoff)
+COMMANDS = (fit.fit, maps.maps, lights.lights, render.render, check.check, convert.convert, tradeoff.tradeoff)
 for function in COMMANDS:
     app.command(epilog=sys.modules[function.__module__].EXAMPLE)(as_command(function))
 

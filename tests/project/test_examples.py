@@ -40,7 +40,19 @@ def folder(tmp_path_factory) -> Path:
     angles = np.linspace(0, 1.2, 5)  # a table as Cornell's: one wavelength, then directions and f_r = 0.5 / pi
     rows = "".join(f"{light} 0 {view} 0 {0.5 / np.pi}\n" for light in angles for view in angles)
     (folder / "paint.txt").write_text(f"1\n550\n{rows}")
+    tilts = np.array([[0, 0], [1, 0], [0, 1], [-1, 0], [0, -1], [0.4, 0.4]])
+    to_light, flat = np.c_[0.5 * tilts, np.ones(6)], np.broadcast_to([0.0, 0.0, 1.0], (4, 4, 3))
+    scenes = [scene_of(flat, light) for light in to_light]
+    fitting.fit_maps([brdf.render(GLOSSY, one) for one in scenes], to_light, flat).save(folder / "maps")
     return folder
+
+
+GLOSSY = brdf.BlinnPhong(k_d=[0.3, 0.2, 0.1], k_s=0.5, n=60)
+
+
+def scene_of(normals: np.ndarray, to_light: np.ndarray) -> brdf.Scene:
+    points = brdf.SurfacePoints.from_normals(normals)
+    return brdf.Scene(points=points, lights=[brdf.DirectionalLight(to_light, 1.0)])
 
 
 def documentation(package: str, name: str) -> str:

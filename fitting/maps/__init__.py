@@ -1,0 +1,1 @@
+"""One material per texel, from photographs of one view under many lights."""

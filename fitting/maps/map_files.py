@@ -1,0 +1,149 @@
+"""Maps as files for this program and for others, and as a figure."""
+
+import base64
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import brdf
+from brdf.files import atomic_folder, write_text
+from brdf.images.writing import write_layers
+from fitting.maps.map_result import Maps
+from fitting.maps.texels import OCTAVES
+
+
+def write_maps(maps: Maps, folder: str | Path, *, plot: bool = False) -> None:
+    """Write what `Maps.save` promises.
+
+    Args:
+        maps: any.
+        folder: made where missing.
+        plot: also maps.png.
+
+    Raises:
+        InputError: where it cannot be written.
+    """
+    layers = maps.layers()
+    k_d, k_s = np.nan_to_num(maps.k_d), maps.fitted_k_s
+    # some outliers must not darken the rest
+    scale = {name: float(np.percentile(k, 99.9)) or 1.0 for name, k in (("k_d", k_d), ("k_s", k_s))}
+    gloss = np.log2(np.maximum(maps.fitted_n, 1)) / OCTAVES
+    roughness = (2 / (maps.fitted_n + 2)) ** 0.25
+    inside = np.any(maps.normal != 0, axis=-1)
+    normals = np.where(inside[..., None], 0.5 * maps.normal + 0.5, 0.5)
+    grey = lambda values: np.repeat(values[..., None], 3, axis=-1)  # noqa: E731
+    images = {
+        "k_d": (k_d / scale["k_d"], "linear"),
+        "k_s": (k_s / scale["k_s"], "linear"),
+        "normals": (normals, "linear"),
+        "gloss": (gloss, "linear"),
+        "base_color": (k_d / max(1.0, scale["k_d"]), "srgb"),
+        "metallic_roughness": (np.stack([np.zeros_like(gloss), roughness, np.zeros_like(gloss)], axis=-1), "linear"),
+        "residual": (np.nan_to_num(maps.residual), "linear"),
+    }
+    height, width = maps.n.shape
+    told = {
+        "models": maps.models,
+        "to_view": maps.to_view.tolist(),
+        "notes": maps.notes,
+        "layers": {name: str(values.dtype) for name, values in layers.items()},
+        "scale": scale,
+        "gloss": f"log2(n) / {OCTAVES}",
+    }
+    with atomic_folder(folder) as stage:
+        write_layers(stage / "maps.exr", {name: np.asarray(values, np.float32) for name, values in layers.items()})
+        for name, (values, encoding) in images.items():
+            values = values if values.ndim == 2 or values.shape[2] in (1, 3) else grey(values.mean(axis=-1))
+            brdf.write_image(stage / f"{name}.png", values, dtype="uint16", encoding=encoding)
+        if plot:
+            draw_maps(maps).savefig(stage / "maps.png", dpi=110)
+        write_text(stage / "maps.json", json.dumps(told, indent=2) + "\n")
+        write_text(stage / "material.gltf", json.dumps(_gltf(width / height), indent=2) + "\n")
+        write_text(stage / "info.json", json.dumps(_openlime(width, height, scale), indent=2) + "\n")
+
+
+def _gltf(aspect: float) -> dict[str, Any]:
+    """A glTF 2.0 material with textures, on a rectangle of the picture's shape."""
+    names = ("base_color", "metallic_roughness", "normals")
+    corners = np.array([[-aspect, -1, 0], [aspect, -1, 0], [aspect, 1, 0], [-aspect, 1, 0]], "<f4")
+    texture = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], "<f4")
+    faces = np.array([0, 1, 2, 0, 2, 3], "<u2")
+    parts = [array.tobytes() for array in (corners, texture, faces)]
+    views, offset = [], 0
+    for part in parts:
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(part)})
+        offset += len(part)
+    data = base64.b64encode(b"".join(parts)).decode()
+    ends = {"min": corners.min(axis=0).tolist(), "max": corners.max(axis=0).tolist()}
+    return {
+        "asset": {"version": "2.0", "generator": "brdf-fitting"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0}]}],
+        "materials": [
+            {
+                "name": "maps",
+                "pbrMetallicRoughness": {
+                    "baseColorTexture": {"index": 0},
+                    "metallicRoughnessTexture": {"index": 1},
+                    "metallicFactor": 0.0,
+                },
+                "normalTexture": {"index": 2},
+            }
+        ],
+        "textures": [{"source": i} for i in range(3)],
+        "images": [{"uri": f"{name}.png"} for name in names],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3", **ends},
+            {"bufferView": 1, "componentType": 5126, "count": 4, "type": "VEC2"},
+            {"bufferView": 2, "componentType": 5123, "count": 6, "type": "SCALAR"},
+        ],
+        "bufferViews": views,
+        "buffers": [{"byteLength": offset, "uri": f"data:application/octet-stream;base64,{data}"}],
+    }
+
+
+def _openlime(width: int, height: int, scale: dict[str, float]) -> dict[str, Any]:
+    """What OpenLIME's LayerBRDF is given: where its four channels are, and their ranges."""
+    return {
+        "type": "brdf",
+        "width": width,
+        "height": height,
+        "channels": {"kd": "k_d.png", "ks": "k_s.png", "normals": "normals.png", "gloss": "gloss.png"},
+        "colorspaces": {"kd": "linear", "ks": "linear"},
+        "scale": {"kd": scale["k_d"], "ks": scale["k_s"]},
+    }
+
+
+def draw_maps(maps: Maps) -> Any:
+    """The figure of `Maps.plot`.
+
+    Args:
+        maps: any.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 7), layout="constrained")
+    axes = figure.subplots(2, 3).ravel()
+    k_d, k_s = np.nan_to_num(maps.k_d), np.nan_to_num(maps.k_s)
+    pictures = [
+        ("k_d", brdf.displayed(_three(k_d / (np.percentile(k_d, 99.5) or 1))), {}),
+        ("k_s", brdf.displayed(_three(k_s / (np.percentile(k_s, 99.5) or 1))), {}),
+        ("normal", np.clip(0.5 * maps.normal + 0.5, 0, 1), {}),
+        ("log2 n", np.log2(maps.n), {"vmin": 0, "vmax": OCTAVES, "cmap": "viridis"}),
+        ("error of ln n", maps.n_error / maps.n, {"vmin": 0, "vmax": 0.25, "cmap": "magma"}),
+        ("residual", maps.residual, {"vmin": 0, "cmap": "magma"}),
+    ]
+    for place, (name, values, how) in zip(axes, pictures, strict=True):
+        shown = place.imshow(values, interpolation="nearest", **how)
+        place.set(title=name, xticks=[], yticks=[])
+        if how:
+            figure.colorbar(shown, ax=place, shrink=0.8)
+    return figure
+
+
+def _three(values: np.ndarray) -> np.ndarray:
+    return values if values.shape[2] == 3 else np.repeat(values.mean(axis=-1, keepdims=True), 3, axis=-1)

@@ -1,0 +1,394 @@
+"""Maps from photographs: every texel's material, band of rows by band of rows."""
+
+import dataclasses
+import os
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+import brdf
+from brdf.errors import InputError
+from brdf.lights.base import LightStack, stacked
+from brdf.lobes import light_terms
+from brdf.models.base import SpecularMaterial
+from brdf.precision import Precision, working_precision
+from fitting.maps import map_inputs
+from fitting.maps.map_inputs import Photographs
+from fitting.maps.map_result import REASONS, Maps
+from fitting.maps.texels import CAP, Columns, Distant, TexelFit, fit_texels, fit_with_normals
+
+TILE = 1024
+"""Texels that go through the program in step: what they need stays in the processor's cache."""
+
+BAND = 64 * TILE
+"""Texels that are read and laid out at a time."""
+
+RING = 0.15
+"""Lights whose heights z spread by less than this are a ring: n shows less well, and the grid is finer."""
+
+MOST_ERROR = 0.25
+"""Of ln n, where it counts as determined."""
+
+LEAST_HIGHLIGHT = 2.0
+"""k_s is seen where it exceeds so many of its standard errors."""
+
+
+def fit_maps(
+    pictures: Any,
+    lights: Any = None,
+    normals: Any = None,
+    *,
+    intensities: Any = None,
+    exposures: Any = None,
+    ambient: Any = None,
+    to_view: Any = (0.0, 0.0, 1.0),
+    model: str = "blinn-phong",
+    specular: str = "coloured",
+    mask: Any = None,
+    encoding: Any = None,
+    flip_y: bool = False,
+    precision: Precision = "float32",
+) -> Maps:
+    """Fit a material to every texel of one view under many lights: the global optimum of each, with errors.
+
+    Args:
+        pictures: photographs of one size, (P, H, W, C) linear values or a list of arrays, `brdf.Picture`,
+            `brdf.ImageReader` or files; or a folder with an ``.lp`` file, or with DiLiGenT's text files.
+        lights: towards the lights, (P, 3), x right, y up, z to the camera; or directional lights; or scenes with one
+            light of any kind each, whose camera and shapes tell what texels see, cast shadows left out; or an ``.lp``
+            or text file. None for the folder's.
+        normals: (H, W, 3); a file (.npy, .exr, or an image with n·0.5 + 0.5, y up); "fit" to find them too, under
+            distant lights. None for the scene's or the folder's ``normals.*``, else they are found.
+        intensities: of the lights, (P,) or (P, C): photographs are divided by them.
+        exposures: of the photographs, (P,), likewise.
+        ambient: intensity of the ambient light, a number or (C,), where there is some: k_a is found too.
+        to_view: towards the camera, which is far away.
+        model: "lambert", "phong", "blinn-phong" or a normalised form; "auto" for the simplest of Lambert, Phong and
+            Blinn-Phong that serves each texel, by the Bayesian information criterion.
+        specular: "coloured", or "grey": the channels share k_s.
+        mask: (H, W), or a file: texels to look at. None for the folder's ``mask.*``, else all.
+        encoding: of the files: "linear", "srgb" or a gamma; None for what they say. Where files of 8 bits say nothing,
+            the one is taken that the model explains better, and a note says so.
+        flip_y: whether y goes down in a file of normals.
+        precision: "float32" or "float64".
+
+    Returns:
+        The maps.
+
+    Raises:
+        InputError: naming the photograph or argument.
+
+    Example:
+        >>> to_light = np.array([[0, 0, 1], [0.5, 0, 1], [0, 0.5, 1], [-0.5, 0, 1], [0, -0.5, 1], [0.2, 0.2, 1]])
+        >>> normals = np.broadcast_to([0.0, 0.0, 1.0], (4, 4, 3))
+        >>> truth = brdf.BlinnPhong(k_d=[0.3, 0.2, 0.1], k_s=0.5, n=60)
+        >>> points = brdf.SurfacePoints.from_normals(normals)
+        >>> scenes = [brdf.Scene(points=points, lights=[brdf.DirectionalLight(v, 1.0)]) for v in to_light]
+        >>> maps = fitting.fit_maps([brdf.render(truth, scene) for scene in scenes], to_light, normals)
+        >>> round(float(maps.n[0, 0]), 2), np.round(maps.k_d[0, 0], 3)
+        (60.0, array([0.3, 0.2, 0.1], dtype=float32))
+
+    Source: variable projection, Golub and Pereyra 1973; see `fitting.maps.texels`.
+    """
+    if isinstance(pictures, str | Path) and Path(pictures).is_dir():
+        found = map_inputs.read_folder(Path(pictures))
+        pictures, lights = found["pictures"], found["lights"] if lights is None else lights
+        intensities = found.get("intensities") if intensities is None else intensities
+        normals = found.get("normals") if normals is None else normals
+        mask = found.get("mask") if mask is None else mask
+    elif isinstance(pictures, str | Path):
+        raise InputError(pictures, "is no folder", "Give a folder of photographs with their lights, or a list of files")
+    if specular not in ("coloured", "grey"):
+        raise InputError("specular", f"must be coloured or grey, got {specular!r}", "Choose one of them")
+    models = _models(model)
+    given = map_inputs.photographs(pictures, lights, intensities, exposures, encoding)
+    points, free = _points(given, normals, mask, to_view, flip_y)
+    how = _How(models, specular == "grey", free, _ambient(ambient, given), np.asarray(to_view, float), precision)
+    notes: tuple[str, ...] = ()
+    if given.silent:
+        other = map_inputs.photographs(pictures, lights, intensities, exposures, "linear")
+        given, notes = _likelier(given, other, points, how)
+    _, height, width, _ = given.shape
+    layers: dict[str, np.ndarray] = {}
+    for start, stop, band in _fitted(given, points, how):
+        for name, values in band.items():
+            if name not in layers:
+                layers[name] = np.zeros((height, width, *values.shape[1:]), values.dtype)
+            layers[name][start:stop] = values.reshape(stop - start, width, *values.shape[1:])
+    if not np.any(layers["reason"] != REASONS.index("outside")):
+        raise InputError("pictures", "show no texel that counts", "Check mask, normals and clipping")
+    return Maps(models=tuple(one.name for one in models), to_view=how.to_view, notes=notes, **layers)
+
+
+@dataclasses.dataclass(frozen=True)
+class _How:
+    """What is fitted: models, grey k_s, free normals, the ambient light's columns (P, C), the view, the precision."""
+
+    models: tuple[Any, ...]
+    grey: bool
+    free: bool
+    ambient: np.ndarray | None
+    to_view: np.ndarray
+    precision: Precision
+
+
+def _models(model: str) -> tuple[Any, ...]:
+    if model == "auto":
+        return brdf.Lambert, brdf.Phong, brdf.BlinnPhong
+    if model not in brdf.MODELS:
+        raise InputError("model", f"is unknown, got {model!r}", f"Use auto, {', '.join(brdf.MODELS)}")
+    return (brdf.MODELS[model],)
+
+
+def _ambient(ambient: Any, given: Photographs) -> np.ndarray | None:
+    if ambient is None:
+        return None
+    values = np.asarray(ambient, float).reshape(-1)
+    if values.size not in (1, given.shape[3]) or not np.all((values > 0) & np.isfinite(values)):
+        came = f"must be 1 or {given.shape[3]} numbers above 0, got {ambient!r:.60}"
+        raise InputError("ambient", came, "Give the intensity of the ambient light")
+    columns = values / given.unit
+    return columns[:, :1] if np.all(columns == columns[:, :1]) else columns
+
+
+def _points(given: Photographs, normals: Any, mask: Any, to_view: Any, flip_y: bool) -> tuple[brdf.SurfacePoints, bool]:
+    """What the texels see, and whether their normals are still to be found."""
+    _, height, width, _ = given.shape
+    if mask is not None:
+        mask = brdf.read_mask(mask) if isinstance(mask, str | Path) else np.asarray(mask, bool)
+        if mask.shape != (height, width):
+            came = f"is of shape {mask.shape}, the photographs of {(height, width)}"
+            raise InputError("mask", came, "Give a value for each pixel")
+    if given.scenes is not None:
+        if normals is not None:
+            raise InputError("normals", "are told by the scenes", "Leave them out")
+        points = given.scenes[0].surface_points()
+        if points.mask.shape != (height, width):
+            came = f"show {points.mask.shape[1]} x {points.mask.shape[0]} pixels, the photographs {width} x {height}"
+            raise InputError("lights", came, "Give scenes of the photographs' size")
+        inside = np.asarray(points.mask) if mask is None else np.asarray(points.mask) & mask
+        return dataclasses.replace(points, mask=inside, area=None), False
+    free = normals is None or (isinstance(normals, str) and normals == "fit")
+    if free:
+        normals = np.broadcast_to(np.array([0.0, 0.0, 1.0]), (height, width, 3))
+    elif isinstance(normals, str | Path):
+        name, normals = normals, map_inputs.read_normal_map(normals, flip_y=flip_y)
+        if normals.shape[:2] != (height, width):
+            came = f"is {normals.shape[1]} x {normals.shape[0]}, the photographs {width} x {height}"
+            raise InputError(name, came, "Give a normal for each pixel")
+    if np.shape(normals) != (height, width, 3):
+        came = f"are of shape {np.shape(normals)}, the photographs of {(height, width)}"
+        raise InputError("normals", came, "Give a normal for each pixel")
+    return brdf.SurfacePoints.from_normals(normals, mask=mask, to_view=to_view), free
+
+
+def _fitted(given: Photographs, points: brdf.SurfacePoints, how: _How) -> Iterator[tuple[int, int, dict[str, Any]]]:
+    """Bands of the maps from the top, fitted on all cores while the next ones are read."""
+    _, height, width, _ = given.shape
+    rows = max(1, min(height, BAND // width))
+    texels = -(-rows * width // TILE) * TILE
+    waiting: deque[tuple[int, int, Future]] = deque()
+    workers = os.cpu_count() or 1
+    with ThreadPoolExecutor(workers) as pool:
+        for start in range(0, height, rows):
+            stop = min(start + rows, height)
+            values = given.band(start, stop).reshape(given.shape[0], -1, given.shape[3])
+            band = _some(points, slice(start, stop))
+            waiting.append((start, stop, pool.submit(_fit_band, given, how, values, band, texels)))
+            if len(waiting) > workers:
+                first, last, future = waiting.popleft()
+                yield first, last, future.result()
+        for first, last, future in waiting:
+            yield first, last, future.result()
+
+
+def _some(points: brdf.SurfacePoints, rows: Any) -> brdf.SurfacePoints:
+    """The points of some rows, one after the other."""
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[rows].reshape(-1, *leaf.shape[2:]), points)
+
+
+def _fit_band(given: Photographs, how: _How, values: np.ndarray, points: Any, texels: int) -> dict[str, np.ndarray]:
+    """The layers of a band of texels, (B, ...), padded to the size that the program is compiled for."""
+    count = values.shape[1]
+    with working_precision(how.precision):
+        dtype = np.dtype(how.precision)
+        values = np.pad(values.astype(dtype, copy=False), [(0, 0), (0, texels - count), (0, 0)])
+        points = jax.tree.map(lambda leaf: np.pad(leaf, [(0, texels - count)] + [(0, 0)] * (leaf.ndim - 1)), points)
+        points = jax.tree.map(lambda leaf: leaf.astype(dtype) if leaf.dtype.kind == "f" else leaf, points)
+        stacks, occluders = (), ()
+        if given.scenes is not None:
+            stacks = stacked([scene.lights[0] for scene in given.scenes], dtype)
+            occluders = given.scenes[0].occluders
+        to_light = np.zeros((given.shape[0], 3)) if given.to_light is None else given.to_light
+        ambient = None if how.ambient is None else how.ambient[..., None].astype(dtype)
+        distant = Distant(to_light.astype(dtype), (how.to_view / np.linalg.norm(how.to_view)).astype(dtype), ambient)
+        finer = 2 if given.to_light is not None and np.ptp(to_light[:, 2]) < RING else 1
+        layers = _program(how.models, how.grey, how.free, finer, values, points, distant, stacks, occluders)
+        return {name: np.asarray(layer)[:count] for name, layer in layers.items()}
+
+
+@partial(eqx.filter_jit)
+def _program(
+    models: tuple[Any, ...],
+    grey: bool,
+    free: bool,
+    finer: int,
+    values: Float[Array, "P B C"],
+    points: Any,
+    distant: Distant,
+    stacks: tuple[LightStack, ...],
+    occluders: tuple[Any, ...],
+) -> dict[str, Array]:
+    """The layers of a band, tile by tile."""
+    tiles = values.shape[1] // TILE
+
+    def cut(leaf: Array) -> Array:
+        return leaf.reshape(tiles, TILE, *leaf.shape[1:])
+
+    def of_tile(tile: Any) -> dict[str, Array]:
+        values, points = tile
+        target = jnp.stack([values[..., c] for c in range(values.shape[2])], axis=1)
+        seen = jnp.all(jnp.isfinite(target), axis=1) & points.mask
+        target, seen = jnp.where(seen[:, None], target, 0), seen.astype(target.dtype)
+        found = []
+        for model in models:
+            columns = None
+            if stacks:
+                columns = _near_columns(model, points, stacks, occluders, distant.ambient)
+                lit = seen * (columns.diffuse[:, 0] > 0) if distant.ambient is None else seen
+            else:
+                lit = seen
+            shown = target * lit[:, None]
+            tied = grey and issubclass(model, SpecularMaterial)
+            normal, normal_error = points.normal.T, jnp.zeros_like(lit[0])
+            if free:
+                fit, normal, normal_error, lit = fit_with_normals(model, shown, lit, distant, tied, finer)
+            else:
+                columns = distant.columns(model, normal, lit) if columns is None else _masked(columns, lit)
+                fit = fit_texels(model, shown, columns, tied, finer)
+            found.append(_layers(model, fit, shown, lit, points.mask, tied, normal, normal_error, free))
+        return _simplest(found)
+
+    by_tile = jax.lax.map(of_tile, (jnp.swapaxes(jax.vmap(cut)(values), 0, 1), jax.tree.map(cut, points)))
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 1).reshape(tiles * TILE, *leaf.shape[1:-1]), by_tile)
+
+
+def _masked(columns: Columns, seen: Array) -> Columns:
+    return Columns(
+        None if columns.ambient is None else columns.ambient * seen[:, None],
+        columns.diffuse * seen[:, None],
+        columns.weight * seen[:, None, None],
+        columns.log_cosine,
+    )
+
+
+def _near_columns(model: Any, points: Any, stacks: Any, occluders: Any, ambient: Any) -> Columns:
+    """Columns of lights of any kind at the points of a tile, (T,)."""
+    terms, order = [], []
+    for stack in stacks:
+        rows, lights = stack.rows()
+
+        def of_sample(one: Any, kind: Any = stack.kind) -> Any:
+            row, light = one
+            return jax.vmap(partial(light_terms, model, occluders, kind, row, light))(points)
+
+        found = jax.lax.map(of_sample, (rows, lights))
+        terms.append(jax.tree.map(partial(_by_light, stack.light.shape[0]), found))
+        order.append(stack.light)
+    every = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[jnp.argsort(jnp.concatenate(order))], *terms)
+    diffuse = jnp.sum(every.diffuse, axis=1)
+    ambient = None if ambient is None else ambient * jnp.ones_like(diffuse[:, None, :, 0])
+    return Columns(ambient, jnp.swapaxes(diffuse, 1, 2), jnp.swapaxes(every.weight, 2, 3), every.log_cosine)
+
+
+def _by_light(lights: int, samples: Array) -> Array:
+    return samples.reshape(lights, -1, *samples.shape[1:])
+
+
+def _layers(
+    model: Any,
+    fit: TexelFit,
+    target: Array,
+    seen: Array,
+    mask: Array,
+    grey: bool,
+    normal: Array,
+    tilt: Array,
+    free: bool,
+) -> dict[str, Array]:
+    """The layers of a model's maps, texels last."""
+    channels, lanes = target.shape[1:]
+    glossy = issubclass(model, SpecularMaterial)
+    k_s, k_s_error = (fit.k[-1], fit.k_error[-1]) if glossy else (jnp.zeros((channels, lanes)),) * 2
+    linear = fit.k[:-1] if glossy else fit.k
+    unknowns = len(linear) * channels + glossy * (2 if grey else channels + 1) + 2 * free
+    values = channels * jnp.sum(seen, axis=0)
+    freedom = values - unknowns
+    noise = jnp.sqrt(fit.cost / jnp.maximum(freedom, 1))
+    n = jnp.exp(fit.log_n)
+    error = noise * fit.log_n_error
+    shows = jnp.any(k_s > LEAST_HIGHLIGHT * noise * k_s_error, axis=0)
+    capped = jnp.any(k_s >= CAP * jnp.max(target, axis=(0, 1)), axis=0)
+    tests = (~mask | (values == 0), freedom < 1, ~shows | (not glossy), capped, ~(error <= MOST_ERROR))
+    reason = jnp.select([*tests], jnp.arange(1, len(REASONS)), 0).astype(jnp.uint8)
+    known = reason == 0
+    inside = reason != REASONS.index("outside")
+    names = ("k_a", "k_d")[-len(linear) :]
+    layers = {name: jnp.where(inside, k, jnp.nan) for name, k in zip(names, linear, strict=True)}
+    layers |= {f"{name}_error": noise * e for name, e in zip(names, fit.k_error, strict=False)}
+    square = jnp.sum(target * target, axis=(0, 1))
+    return layers | {
+        "n": jnp.where(known, n, jnp.nan),
+        "k_s": jnp.where(known, k_s, jnp.nan),
+        "n_error": jnp.where(known, n * error, jnp.nan),
+        "k_s_error": jnp.where(known, noise * k_s_error, jnp.nan),
+        "fitted_n": n,
+        "fitted_k_s": jnp.where(inside, k_s, 0),
+        "normal": jnp.where(inside, normal, 0),
+        "normal_error": jnp.degrees(noise * tilt),
+        "determined": known,
+        "reason": reason,
+        "residual": jnp.where(inside, jnp.sqrt(fit.cost / jnp.where(square > 0, square, 1)), jnp.nan),
+        "criterion": values * jnp.log(jnp.maximum(fit.cost, jnp.finfo(n.dtype).tiny)) + unknowns * jnp.log(values + 1),
+    }
+
+
+def _simplest(found: list[dict[str, Array]]) -> dict[str, Array]:
+    """Of each texel the layers of the model with the least criterion."""
+    best, chosen = found[0], jnp.zeros_like(found[0]["reason"])
+    for index, other in enumerate(found[1:], start=1):
+        better = other["criterion"] < best["criterion"]
+        chosen = jnp.where(better, jnp.uint8(index), chosen)
+        best = {name: jnp.where(better, other[name], best[name]) for name in best}
+    best.pop("criterion")
+    return best | {"chosen": chosen}
+
+
+def _likelier(given: Photographs, other: Photographs, points: Any, how: _How) -> tuple[Photographs, tuple[str, ...]]:
+    """Silent photographs as sRGB or as linear light: as the model explains more of some rows."""
+    _, height, width, _ = given.shape
+    rows = np.linspace(0, height - 1, min(height, max(1, 4 * TILE // width))).astype(int)
+    left = []
+    for one in (given, other):
+        values = np.concatenate([one.band(row, row + 1) for row in rows], axis=1).reshape(
+            one.shape[0], -1, one.shape[3]
+        )
+        some = _some(points, rows)
+        layers = _fit_band(one, how, values, some, -(-values.shape[1] // TILE) * TILE)
+        left.append(float(np.nanmedian(layers["residual"])))
+    kept = int(left[1] < left[0])
+    note = (
+        f"{given.silent[0]} does not say how its values are encoded: read as {('sRGB', 'linear')[kept]}, which leaves "
+        f"{100 * left[kept]:.2g} % of a texel unexplained, {('linear', 'sRGB')[kept]} {100 * left[1 - kept]:.2g} %. "
+        "Where you know, say so with the encoding"
+    )
+    return (given, other)[kept], (note,)

@@ -1,0 +1,248 @@
+"""What maps are made of, in one form: photographs that are read by bands of rows, their lights, and what texels see."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+import brdf
+from brdf.errors import InputError
+from brdf.files import parse_number, read_text
+from fitting.photographs.archives import read_array
+from fitting.photographs.light_files import MOST_BYTES, read_directions, read_intensities
+
+PICTURES = (".exr", ".hdr", ".png", ".tif", ".tiff", ".jpg", ".jpeg")
+# An image's code 0 in all channels, and those about the middle, are how tools write "no surface".
+NO_SURFACE = 0.25
+
+
+@dataclasses.dataclass(frozen=True)
+class Photographs:
+    """Photographs of one view, each under its own light.
+
+    Attributes:
+        bands: of each photograph, rows from one to another, linear, in units of its light; NaN where clipped.
+        shape: count, height, width, channels.
+        to_light: unit, (P, 3); None where ``scenes`` tell.
+        scenes: of each photograph with its one light, of intensity 1; None where all lights are distant.
+        unit: what each photograph was divided by, (P, C).
+        silent: names of files of 8 bits that do not say how they are encoded.
+        names: of the photographs.
+    """
+
+    bands: tuple[Callable[[int, int], Float[np.ndarray, "rows W C"]], ...]
+    shape: tuple[int, int, int, int]
+    to_light: Float[np.ndarray, "P 3"] | None
+    scenes: tuple[brdf.Scene, ...] | None
+    unit: Float[np.ndarray, "P C"]
+    silent: tuple[str, ...]
+    names: tuple[str, ...]
+
+    def band(self, start: int, stop: int) -> Float[np.ndarray, "P rows W C"]:
+        """Rows of all photographs."""
+        _, _, width, channels = self.shape
+        found = np.empty((len(self.bands), stop - start, width, channels), np.float32)
+        for values, rows, unit in zip(found, self.bands, self.unit, strict=True):
+            np.divide(rows(start, stop), unit, out=values, casting="unsafe")
+        return found
+
+
+def read_lights(path: str | Path) -> tuple[list[Path], Float[np.ndarray, "P 3"]]:
+    """Photographs and their lights from a file as RTI programs write it.
+
+    Args:
+        path: an ``.lp`` file: a count, then a line ``name x y z`` a photograph. The last three words are the numbers:
+            a name may hold blanks, and folders, which are looked for beside the file and then left out.
+
+    Raises:
+        InputError: naming file and line.
+    """
+    lines = [line.strip() for line in read_text(path, MOST_BYTES).replace("\\", "/").splitlines()]
+    numbered = [(number, line) for number, line in enumerate(lines, start=1) if line]
+    names, directions = [], []
+    for number, line in numbered[1:]:
+        words = line.replace(",", " ").replace("\t", " ").split()
+        try:
+            vector = [parse_number(word) for word in words[-3:]]
+        except ValueError:
+            vector = []
+        if len(words) < 4 or not np.all(np.isfinite(vector)) or not any(vector):
+            came = f"must be a name and three numbers that are not all 0, got {line[:60]!r}"
+            raise InputError(f"{path}: line {number}", came, "Give name x y z, towards the light")
+        for word in reversed(words[-3:]):
+            line = line[: line.rindex(word)]
+        name = Path(line.rstrip(" ,\t").strip("\"'"))
+        folder = Path(path).parent
+        names.append(folder / name if (folder / name).is_file() else folder / name.name)
+        directions.append(vector)
+    if not names or numbered[0][1].split()[0] != str(len(names)):
+        came = f"has {len(names)} lights after the count {numbered[0][1] if numbered else ''!r}"
+        raise InputError(path, came, "Give the count, then a line a photograph")
+    return names, np.array(directions)
+
+
+def read_folder(folder: Path) -> dict[str, Any]:
+    """What a folder of photographs says: ``pictures`` and ``lights``, and ``intensities``, ``mask``, ``normals``.
+
+    Args:
+        folder: with one ``.lp`` file, or with ``filenames.txt`` and ``light_directions.txt`` as DiLiGenT has them.
+
+    Raises:
+        InputError: naming what is missing.
+    """
+    tables, names = sorted(folder.glob("*.lp")), folder / "filenames.txt"
+    found: dict[str, Any] = {}
+    if len(tables) == 1:
+        found["pictures"], found["lights"] = read_lights(tables[0])
+    elif (folder / "light_directions.txt").is_file() and not tables:
+        lines = read_text(names, MOST_BYTES).split("\n") if names.is_file() else []
+        listed = [folder / line.strip() for line in lines if line.strip()]
+        beside = ("mask", "normal")
+        every = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in PICTURES]
+        found["pictures"] = listed or [path for path in every if not path.stem.lower().startswith(beside)]
+        found["lights"] = read_directions(folder / "light_directions.txt", len(found["pictures"]))
+        if (folder / "light_intensities.txt").is_file():
+            found["intensities"] = read_intensities(folder / "light_intensities.txt", len(found["pictures"]))
+    else:
+        came = f"has {len(tables)} .lp files and no light_directions.txt" if tables else "has no file of lights"
+        raise InputError(folder, came, "Put one lights.lp, or light_directions.txt, beside the photographs")
+    for key, stem in (("mask", "mask"), ("normals", "normals")):
+        beside = [path for path in sorted(folder.glob(f"{stem}.*")) if path.suffix.lower() in (*PICTURES, ".npy")]
+        found |= {key: beside[0]} if beside else {}
+    return found
+
+
+def read_normal_map(path: str | Path, *, flip_y: bool = False) -> Float[np.ndarray, "H W 3"]:
+    """Normals from a file: floats as they are, codes as n·0.5 + 0.5; 0 where there is no surface.
+
+    Args:
+        path: .npy, .exr, or an image of 8 or 16 bits.
+        flip_y: whether y goes down in the file.
+
+    Raises:
+        InputError: naming the file.
+    """
+    if Path(path).suffix.lower() == ".npy":
+        with Path(path).open("rb") as file:
+            normal = np.array(read_array(file, path, Path(path).stat().st_size), np.float32)
+    else:
+        with brdf.ImageReader(path, encoding="linear") as reader:
+            normal = reader.read()
+            if reader.is_integer:
+                normal = 2 * normal - 1
+                normal[np.sum(normal * normal, axis=-1) < NO_SURFACE] = 0
+    if normal.ndim != 3 or normal.shape[2] != 3:
+        raise InputError(path, f"is of shape {normal.shape}, a normal has 3 channels", "Give a map of normals")
+    return normal * np.array([1, -1 if flip_y else 1, 1], np.float32)
+
+
+def photographs(
+    pictures: Any, lights: Any, intensities: Any = None, exposures: Any = None, encoding: Any = None
+) -> Photographs:
+    """Photographs and lights in one form.
+
+    Args:
+        pictures: (P, H, W, C) or (P, H, W) linear values; unsigned integers span their type. Or a list of such
+            pictures, `brdf.Picture`, `brdf.ImageReader`, or files.
+        lights: (P, 3) towards the lights, P lights, P scenes with one light each, or an ``.lp`` or text file.
+        intensities: (P,) or (P, C), which the photographs are divided by.
+        exposures: (P,), likewise.
+        encoding: of files.
+
+    Raises:
+        InputError: naming the photograph or argument.
+    """
+    opened = [_open(f"pictures[{i}]", picture, encoding) for i, picture in enumerate(pictures)]
+    if not opened:
+        raise InputError("pictures", "is empty", "Give a photograph for each light")
+    bands, shapes, names, silent = zip(*opened, strict=True)
+    for name, shape in zip(names, shapes, strict=True):
+        if shape != shapes[0]:
+            raise InputError(name, f"is of shape {shape}, {names[0]} of {shapes[0]}", "Give photographs of one size")
+    count, channels = len(bands), shapes[0][2]
+    if isinstance(lights, str | Path):
+        lights = read_lights(lights)[1] if Path(lights).suffix.lower() == ".lp" else read_directions(lights)
+    if lights is None:
+        raise InputError("lights", "are missing", "Give a direction towards the light for each photograph")
+    if len(lights) != count:
+        raise InputError("lights", f"are {len(lights)} for {count} photographs", "Give a light for each photograph")
+    unit = np.ones((count, channels))
+    for name, given in (("intensities", intensities), ("exposures", exposures)):
+        if given is not None:
+            unit = unit * _factors(name, given, count, channels)
+    to_light, scenes = None, None
+    if isinstance(lights[0], brdf.Scene):
+        scenes, colours = zip(*(_white(f"lights[{i}]", scene) for i, scene in enumerate(lights)), strict=True)
+        unit = unit * [_factors(f"lights[{i}]", one[None], 1, channels)[0] for i, one in enumerate(colours)]
+    elif isinstance(lights[0], brdf.DirectionalLight):
+        to_light = _directions([light.direction for light in lights])
+        unit = unit * [_factors("lights", np.asarray(light.intensity)[None], 1, channels)[0] for light in lights]
+    else:
+        to_light = _directions(lights)
+    return Photographs(bands, (count, *shapes[0]), to_light, scenes, unit, tuple(filter(None, silent)), names)
+
+
+def _open(name: str, picture: Any, encoding: Any) -> tuple[Any, tuple[int, int, int], str, str]:
+    """How to read rows of a photograph, its height, width and channels, its name, and that again where it is silent."""
+    if isinstance(picture, str | Path):
+        name, picture = str(picture), brdf.ImageReader(picture, encoding=encoding)
+    silent, top = "", np.inf
+    if isinstance(picture, brdf.ImageReader):
+        read, shape, top = picture.rows, picture.shape, picture.codes[0] or np.inf
+        silent = name if picture.is_integer and picture.bits <= 8 and picture.source in ("assumed", "format") else ""
+    else:
+        if isinstance(picture, brdf.Picture):
+            picture, top = picture.pixels, picture.saturation or np.inf
+        values = np.asarray(picture)
+        values = values[..., None] if values.ndim == 2 else values
+        if values.ndim != 3 or 0 in values.shape or values.dtype.kind not in "fu":
+            came = f"is of shape {values.shape} and type {values.dtype}"
+            raise InputError(name, came, "Give (H, W, C) floats, or unsigned integers that span their type")
+        if values.dtype.kind == "u":
+            largest = np.iinfo(values.dtype).max
+            read, top = (lambda start, stop: values[start:stop].astype(np.float32) / np.float32(largest)), 1.0
+        else:
+            read = lambda start, stop: values[start:stop]  # noqa: E731
+        shape = values.shape
+
+    def rows(start: int, stop: int) -> np.ndarray:
+        values = read(start, stop)
+        return values if top == np.inf else np.where(values < top * (1 - 1e-6), values, np.float32(np.nan))
+
+    return rows, shape, name, silent
+
+
+def _factors(name: str, given: Any, count: int, channels: int) -> Float[np.ndarray, "P C"]:
+    values = np.asarray(given, np.float64)
+    values = values[:, None] if values.ndim == 1 else values
+    if values.ndim != 2 or values.shape[0] != count or values.shape[1] not in (1, channels):
+        came = f"is of shape {np.shape(given)} for {count} photographs of {channels} channels"
+        raise InputError(name, came, "Give a number for each photograph, or one for each of its channels")
+    if not np.all((values > 0) & np.isfinite(values)):
+        raise InputError(name, f"must be above 0, got {np.min(values):g}", "Leave that photograph out")
+    return np.broadcast_to(values, (count, channels))
+
+
+def _directions(given: Any) -> Float[np.ndarray, "P 3"]:
+    vectors = np.asarray(given, np.float64)
+    if vectors.ndim != 2 or vectors.shape[1] != 3:
+        raise InputError("lights", f"are of shape {vectors.shape}", "Give (P, 3) directions towards the lights")
+    length = np.sqrt(np.sum(vectors * vectors, axis=1))
+    if not np.all((length > 0) & np.isfinite(length)):
+        worst = int(np.argmin(np.where(np.isfinite(length), length, -1)))
+        raise InputError(f"lights[{worst}]", f"has no direction, got {vectors[worst].tolist()}", "Give x, y, z")
+    return vectors / length[:, None]
+
+
+def _white(name: str, scene: brdf.Scene) -> tuple[brdf.Scene, np.ndarray]:
+    """A scene whose one light is of intensity 1, and what that was."""
+    if len(scene.lights) != 1 or isinstance(scene.lights[0], brdf.EnvironmentMap):
+        came = f"has {len(scene.lights)} lights" if len(scene.lights) != 1 else "is lit by an environment map"
+        raise InputError(name, came, "Give scenes with one light each, of one colour")
+    (light,) = scene.lights
+    field = "intensity" if "intensity" in vars(light) else "radiance"
+    white = dataclasses.replace(light, **{field: 1.0})
+    return dataclasses.replace(scene, lights=(white,), ambient=None), np.asarray(light.emittance)

@@ -1,0 +1,198 @@
+"""Maps: one material per texel, how sure it is, and why where it is not; as files and as pictures."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+import brdf
+from brdf.errors import InputError
+from brdf.files import read_text
+from brdf.models.base import SpecularMaterial
+
+REASONS = (
+    "determined",
+    "outside",
+    "too few photographs",
+    "no highlight seen",
+    "no light near the mirror direction",
+    "n is loose",
+)
+"""Why n and k_s of a texel are not determined, by the number in `Maps.reason`."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Maps:
+    """One material per texel. Values that the photographs do not determine are NaN.
+
+    Attributes:
+        n: exponent.
+        k_d: diffuse coefficient.
+        k_s: specular coefficient.
+        normal: unit; 0 outside.
+        n_error: standard error.
+        k_d_error: standard error.
+        k_s_error: standard error.
+        normal_error: standard error, in degrees; 0 where normals were given.
+        determined: whether n and k_s are: the standard error of ln n is at most 0.25, and k_s above twice its own.
+        reason: why not, as a number; `REASONS` has the words.
+        residual: root mean square of what is left, over that of the photographs.
+        fitted_n: the exponent that fits best, also where it is not determined: what renders.
+        fitted_k_s: the specular coefficient to it.
+        chosen: which of ``models`` each texel has.
+        models: names.
+        to_view: towards the camera.
+        notes: what was found out about the photographs.
+        k_a: ambient coefficient, where there was ambient light.
+        k_a_error: standard error.
+
+    Example:
+        >>> maps = fitting.load_maps("maps")
+        >>> maps.n.shape, maps.k_d.shape, bool(maps.determined.all())
+        ((4, 4), (4, 4, 3), True)
+    """
+
+    n: Float[np.ndarray, "H W"]
+    k_d: Float[np.ndarray, "H W C"]
+    k_s: Float[np.ndarray, "H W C"]
+    normal: Float[np.ndarray, "H W 3"]
+    n_error: Float[np.ndarray, "H W"]
+    k_d_error: Float[np.ndarray, "H W C"]
+    k_s_error: Float[np.ndarray, "H W C"]
+    normal_error: Float[np.ndarray, "H W"]
+    determined: Bool[np.ndarray, "H W"]
+    reason: UInt8[np.ndarray, "H W"]
+    residual: Float[np.ndarray, "H W"]
+    fitted_n: Float[np.ndarray, "H W"]
+    fitted_k_s: Float[np.ndarray, "H W C"]
+    chosen: UInt8[np.ndarray, "H W"]
+    models: tuple[str, ...]
+    to_view: Float[np.ndarray, "3"]
+    notes: tuple[str, ...] = ()
+    k_a: Float[np.ndarray, "H W C"] | None = None
+    k_a_error: Float[np.ndarray, "H W C"] | None = None
+
+    def layers(self) -> dict[str, np.ndarray]:
+        """Every map by name."""
+        return {name: value for name, value in vars(self).items() if isinstance(value, np.ndarray) and value.ndim > 1}
+
+    def __str__(self) -> str:
+        """How many texels are determined, why the others are not, and the middle of what was found."""
+        height, width = self.n.shape
+        inside = self.reason != REASONS.index("outside")
+        total = max(np.count_nonzero(inside), 1)
+        lines = [
+            f"maps of {width} x {height} texels, {np.count_nonzero(inside)} of them fitted ({', '.join(self.models)})"
+        ]
+        for number, words in enumerate(REASONS):
+            share = np.count_nonzero((self.reason == number) & inside) / total
+            lines += [f"  {words:<36}{100 * share:6.1f} %"] if share else []
+        for name, values in (("n", self.n), ("k_d", self.k_d), ("k_s", self.k_s), ("residual", self.residual)):
+            known = values[np.isfinite(values)]
+            quartiles = np.percentile(known, [25, 50, 75]) if known.size else [np.nan] * 3
+            lines.append(
+                f"  {name:<9} median {quartiles[1]:.4g}, half of it from {quartiles[0]:.4g} to {quartiles[2]:.4g}"
+            )
+        return "\n".join([*lines, *(f"  note: {note}" for note in self.notes)])
+
+    def render(self, light: Any) -> Float[np.ndarray, "H W C"]:
+        """The picture under another distant light.
+
+        Args:
+            light: direction towards it, (3,), or a `brdf.DirectionalLight`.
+
+        Returns:
+            Linear values; 0 outside.
+
+        Raises:
+            InputError: where it is no direction.
+
+        Example:
+            >>> fitting.load_maps("maps").render([0.3, 0.0, 1.0]).shape
+            (4, 4, 3)
+        """
+        light = light if isinstance(light, brdf.DirectionalLight) else brdf.DirectionalLight(light, 1.0)
+        to_light = np.asarray(light.direction) / np.linalg.norm(light.direction)
+        to_view = self.to_view / np.linalg.norm(self.to_view)
+        normal = jnp.asarray(self.normal)
+        cosine = np.maximum(self.normal @ to_light, 0)[..., None]
+        picture = np.nan_to_num(self.k_d) * cosine
+        for index, name in enumerate(self.models):
+            model = brdf.MODELS[name]
+            if issubclass(model, SpecularMaterial):
+                shape = model(k_d=0.0, k_s=1.0, n=1.0)
+                n = jnp.asarray(self.fitted_n)
+                object.__setattr__(shape, "n", n)
+                lobe = np.asarray(shape.specular(normal, jnp.asarray(to_light), jnp.asarray(to_view)))
+                picture += np.where((self.chosen == index)[..., None], self.fitted_k_s * lobe[..., None], 0)
+        return (picture * np.asarray(light.intensity)).astype(np.float32)
+
+    def save(self, folder: str | Path, *, plot: bool = False) -> None:
+        """Write maps.exr with a layer a map, maps.json, and 16-bit images for other programs: all of it or nothing.
+
+        The images are k_d.png and k_s.png (linear, divided by the ``scale`` that maps.json tells), normals.png
+        (n·0.5 + 0.5, y up), gloss.png (log2 n / 16), base_color.png (sRGB), metallic_roughness.png with
+        material.gltf, residual.png; info.json is for OpenLIME.
+
+        Args:
+            folder: made where missing.
+            plot: also maps.png, the figure of `plot`.
+
+        Raises:
+            InputError: where it cannot be written.
+
+        Example:
+            >>> maps = fitting.load_maps("maps")
+            >>> maps.save("copy")
+        """
+        from fitting.maps.map_files import write_maps  # late: pictures are written by what renders none
+
+        write_maps(self, folder, plot=plot)
+
+    def plot(self) -> Any:
+        """A Matplotlib figure of the maps.
+
+        Example:
+            >>> figure = fitting.load_maps("maps").plot()
+        """
+        from fitting.maps.map_files import draw_maps
+
+        return draw_maps(self)
+
+
+def load_maps(folder: str | Path) -> Maps:
+    """Read what `Maps.save` wrote.
+
+    Args:
+        folder: with maps.exr and maps.json.
+
+    Raises:
+        InputError: naming the file.
+
+    Example:
+        >>> fitting.load_maps("maps").models
+        ('blinn-phong',)
+    """
+    path = Path(folder) / "maps.json"
+    try:
+        told = json.loads(read_text(path))
+        kinds = {name: np.dtype(kind) for name, kind in told["layers"].items()}
+        texts = tuple(told["models"]), np.array(told["to_view"], float), tuple(told["notes"])
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise InputError(path, "does not describe maps", "Give a folder that Maps.save wrote") from None
+    found = brdf.read_layers(Path(folder) / "maps.exr")
+    layers = {}
+    for name, kind in kinds.items():
+        if name not in found:
+            raise InputError(Path(folder) / "maps.exr", f"has no layer {name}", "Write the maps again")
+        values = (
+            found[name]
+            if name.startswith(("k_", "fitted_k", "normal")) and name != "normal_error"
+            else found[name][..., 0]
+        )
+        layers[name] = values.astype(kind)
+    return Maps(models=texts[0], to_view=texts[1], notes=texts[2], **layers)

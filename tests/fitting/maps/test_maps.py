@@ -1,0 +1,317 @@
+"""Maps: each texel against the fit of one material, a dense search and the truth; lights of any kind; files."""
+
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import brdf
+import fitting
+from brdf.images.writing import write_image
+from fitting.maps.map_inputs import read_lights
+from fitting.maps.texels import nonnegative
+from fitting.solver.nnls import nonnegative_minimum
+
+VIEW = np.array([0.0, 0.0, 1.0])
+
+
+def dome(count: int) -> np.ndarray:
+    """Lights spread evenly over the upper sky."""
+    turn = np.arange(count) + 0.5
+    z, angle = 0.25 + 0.75 * turn / count, np.pi * (1 + 5**0.5) * turn
+    across = np.sqrt(1 - z * z)
+    return np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)
+
+
+def texels(count: int, noise: float, lights: np.ndarray, seed: int = 0) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Photographs (P, 1, count, 3) of Blinn-Phong texels by the equation, and what they are."""
+    random = np.random.default_rng(seed)
+    tilt, turn = np.abs(random.normal(0, 0.2, count)), random.uniform(0, 2 * np.pi, count)
+    normal = np.stack([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)], axis=1)
+    truth = {
+        "normal": normal,
+        "k_d": random.uniform(0.1, 0.8, (count, 3)),
+        "k_s": random.uniform(0.2, 0.8, (count, 1)),
+        "n": np.exp(random.uniform(np.log(5), np.log(80), count)),
+    }
+    half = (lights + VIEW) / np.linalg.norm(lights + VIEW, axis=1)[:, None]
+    cosine = np.maximum(lights @ normal.T, 0)[..., None]
+    lobe = np.where(cosine > 0, ((half @ normal.T) ** truth["n"])[..., None], 0)
+    pictures = truth["k_d"] * cosine + truth["k_s"] * lobe
+    return (pictures + noise * random.normal(size=pictures.shape))[:, None], truth
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    pictures, truth = texels(256, 0.01, dome(32))
+    return pictures, truth, fitting.fit_maps(pictures, dome(32), truth["normal"][None])
+
+
+def test_errors_cover_the_truth(noisy):
+    _, truth, maps = noisy
+    known = maps.determined[0]
+    assert known.mean() > 0.9
+    off = np.abs(np.log(maps.n[0]) - np.log(truth["n"])) / (maps.n_error[0] / maps.n[0])
+    assert 0.88 < np.mean(off[known] < 1.96) <= 1
+    for name in ("k_d", "k_s"):
+        off = np.abs(getattr(maps, name)[0] - truth[name]) / getattr(maps, f"{name}_error")[0]
+        assert 0.88 < np.mean(off[known] < 1.96) <= 1
+
+
+def test_the_optimum_is_global(noisy):
+    pictures, truth, maps = noisy
+    lights, known = dome(32), maps.determined[0]
+    half = (lights + VIEW) / np.linalg.norm(lights + VIEW, axis=1)[:, None]
+    reached, least = [], []
+    for t in np.flatnonzero(known)[:40]:
+        cosine, axis = np.maximum(lights @ truth["normal"][t], 0), half @ truth["normal"][t]
+
+        def cost(n, y=pictures[:, 0, t], cosine=cosine, axis=axis):
+            columns = np.stack([cosine, np.where(cosine > 0, axis**n, 0)])
+            gram, total = columns @ columns.T, 0.0
+            for values in y.T:
+                k = nonnegative_minimum(gram, columns @ values)
+                total += np.sum((values - k @ columns) ** 2)
+            return total
+
+        reached.append(cost(maps.n[0, t]))
+        least.append(min(cost(n) for n in np.exp(np.linspace(0, 11, 120))))
+    assert np.mean(np.array(reached) < np.array(least) * (1 + 1e-4)) > 0.95
+
+
+def test_a_texel_is_the_fit_of_one_material():
+    lights = dome(24)
+    pictures, truth = texels(1, 0.005, lights, seed=3)
+    normal = truth["normal"][None]
+    maps = fitting.fit_maps(pictures, lights, normal, precision="float64")
+    points = brdf.SurfacePoints.from_normals(normal)
+    scenes = [brdf.Scene(points=points, lights=[brdf.DirectionalLight(light, 1.0)]) for light in lights]
+    fit = fitting.fit(list(pictures), scenes, model="blinn-phong", precision="float64")
+    np.testing.assert_allclose(maps.n[0, 0], fit.material.n, rtol=1e-6)
+    np.testing.assert_allclose(maps.k_d[0, 0], fit.material.k_d, rtol=1e-6)
+    np.testing.assert_allclose(maps.k_s[0, 0], fit.material.k_s, rtol=1e-6)
+
+
+@pytest.mark.parametrize("model", ["phong", "normalized-phong", "normalized-blinn-phong", "lambert"])
+@pytest.mark.parametrize("specular", ["coloured", "grey"])
+def test_every_model_is_found_and_rendered(model, specular):
+    lights, normal = dome(20), np.broadcast_to(VIEW, (1, 2, 3))
+    kind = brdf.MODELS[model]
+    numbers = {"k_a": [0.3, 0.2, 0.1], "k_d": [0.4, 0.3, 0.2]} | ({} if model == "lambert" else {"k_s": 0.2, "n": 20.0})
+    points = brdf.SurfacePoints.from_normals(normal)
+    scenes = [brdf.Scene(points=points, ambient=0.5, lights=[brdf.DirectionalLight(v, 1.0)]) for v in lights]
+    pictures = [np.asarray(brdf.render(kind(**numbers), scene)) for scene in scenes]
+    maps = fitting.fit_maps(pictures, lights, normal, ambient=0.5, model=model, specular=specular, precision="float64")
+    np.testing.assert_allclose(maps.k_a[0, 0], numbers["k_a"], rtol=1e-4)
+    np.testing.assert_allclose(maps.k_d[0, 0], numbers["k_d"], rtol=1e-4)
+    if model == "lambert":
+        assert np.isnan(maps.n).all()
+    else:
+        np.testing.assert_allclose(maps.n, 20, rtol=1e-4)
+        np.testing.assert_allclose(maps.k_s[0, 0], 0.2, rtol=1e-4)
+    direct = pictures[3] - 0.5 * np.array(numbers["k_a"])
+    np.testing.assert_allclose(maps.render(lights[3]), direct, atol=1e-4)
+
+
+def test_bounded_least_squares_is_exact():
+    random = np.random.default_rng(1)
+    columns, target = random.normal(size=(3, 8, 200)) + 0.5, random.normal(size=(8, 2, 200))
+    gram = [[np.sum(a * b, axis=0)[None] for b in columns] for a in columns]
+    moment = [np.einsum("pt,pct->ct", a, target) for a in columns]
+    zero, high = [jnp.zeros((2, 200))] * 3, jnp.inf * jnp.ones(200)
+    k = nonnegative(gram, moment, zero, high, False, start=zero[0], steps=0)
+    for t in range(200):
+        matrix = np.array([[entry[0, t] for entry in row] for row in gram])
+        for c in range(2):
+            expected = nonnegative_minimum(matrix, np.array([b[c, t] for b in moment]))
+            np.testing.assert_allclose([x[c, t] for x in k], expected, atol=2e-4)
+
+
+def test_normals_are_found_beside_the_material():
+    pictures, truth = texels(64, 0.005, dome(32))
+    maps = fitting.fit_maps(pictures, dome(32), "fit")
+    angle = np.degrees(np.arccos(np.clip(np.sum(maps.normal[0] * truth["normal"], axis=-1), -1, 1)))
+    assert np.median(angle) < 0.25
+    assert 0.5 < np.median(angle) / np.median(maps.normal_error) < 2
+
+
+def test_without_a_light_near_the_mirror_direction_n_is_not_determined():
+    lights = dome(24)
+    lights = lights[lights[:, 2] < 0.8]
+    random = np.random.default_rng(0)
+    normal = np.broadcast_to(VIEW, (1, 50, 3))
+    pictures = 0.5 * np.maximum(lights[:, 2], 0)[:, None, None, None] + 0.005 * random.normal(
+        size=(len(lights), 1, 50, 3)
+    )
+    maps = fitting.fit_maps(pictures, lights, normal)
+    assert np.mean(maps.determined) < 0.1
+    assert np.isnan(maps.n[~maps.determined]).all()
+    assert np.isnan(maps.k_s[~maps.determined]).all()
+    assert np.isfinite(maps.render([0, 0, 1])).all()
+    assert maps.fitted_k_s.max() < 100
+
+
+def test_near_lights_and_cast_shadows_of_a_scene():
+    camera = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=(16, 16))
+    shapes = [
+        brdf.Rectangle(center=[0, 0, 0], edge_u=[1.2, 0, 0], edge_v=[0, 1.2, 0]),
+        brdf.Sphere(center=[0.3, 0.3, 0.35], radius=0.3, fitted=False),
+    ]
+    spots = 2.5 * dome(30) + [0.1, 0, 0]
+    scenes = [
+        brdf.Scene(camera=camera, shapes=shapes, lights=[brdf.PointLight(position=spot, intensity=[4.0, 5.0, 6.0])])
+        for spot in spots
+    ]
+    truth = brdf.BlinnPhong(k_d=[0.4, 0.3, 0.2], k_s=0.3, n=15.0)
+    pictures = [np.asarray(brdf.render(truth, scene)) for scene in scenes]
+    maps = fitting.fit_maps(pictures, scenes)
+    assert maps.determined.mean() > 0.5
+    np.testing.assert_allclose(maps.n[maps.determined], 15, rtol=1e-2)
+    np.testing.assert_allclose(
+        maps.k_d[maps.determined], np.broadcast_to([0.4, 0.3, 0.2], (maps.determined.sum(), 3)), rtol=1e-3
+    )
+
+
+def test_auto_takes_the_simplest():
+    lights, normal = dome(24), np.broadcast_to(VIEW, (1, 40, 3))
+    random = np.random.default_rng(0)
+    pictures = np.broadcast_to(0.5 * lights[:, 2][:, None, None, None], (24, 1, 40, 1)) + 0.01 * random.normal(
+        size=(24, 1, 40, 1)
+    )
+    half = (lights + VIEW) / np.linalg.norm(lights + VIEW, axis=1)[:, None]
+    pictures[:, :, 20:] += 0.5 * (half[:, 2] ** 30)[:, None, None, None]
+    maps = fitting.fit_maps(pictures, lights, normal, model="auto")
+    assert np.mean(maps.chosen[0, :20] == 0) > 0.9
+    assert np.mean(maps.chosen[0, 20:] != 0) > 0.9
+
+
+# -- folders and files -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def folder(tmp_path):
+    lights = dome(12)
+    pictures, truth = texels(48, 0.0, lights)
+    lines = []
+    for i, (light, picture) in enumerate(zip(lights, pictures, strict=True)):
+        name = f"photo {i}.png"
+        write_image(tmp_path / name, np.clip(picture.reshape(6, 8, 3) / 2, 0, 1), dtype="uint16", encoding="linear")
+        lines.append(f"C:\\sets\\{name}\t{2 * light[0]:.6f}, {2 * light[1]:.6f} {2 * light[2]:.6f}  ")
+    (tmp_path / "lights.lp").write_text("12 \n" + "\n".join(lines) + "\n\n")
+    write_image(
+        tmp_path / "normals.png", 0.5 * truth["normal"].reshape(6, 8, 3) + 0.5, dtype="uint16", encoding="linear"
+    )
+    return tmp_path, truth
+
+
+def test_a_folder_is_fitted_saved_and_loaded(folder, tmp_path):
+    path, truth = folder
+    maps = fitting.fit_maps(path)
+    known = maps.determined
+    assert known.mean() > 0.5
+    np.testing.assert_allclose(maps.n[known], truth["n"].reshape(6, 8)[known], rtol=0.05)
+    maps.save(tmp_path / "out", plot=True)
+    again = fitting.load_maps(tmp_path / "out")
+    for name, values in maps.layers().items():
+        np.testing.assert_array_equal(values, again.layers()[name])
+    assert str(again) == str(maps)
+    written = json.loads((tmp_path / "out" / "material.gltf").read_text())
+    for image in written["images"]:
+        assert (tmp_path / "out" / image["uri"]).is_file()
+    assert brdf.read_picture(tmp_path / "out" / "normals.png").bits == 16
+
+
+def test_clipped_values_are_no_data():
+    lights = dome(32)
+    pictures, truth = texels(64, 0.0, lights)
+    codes = np.round(np.clip(pictures, 0, 1) * 65535).astype(np.uint16)
+    maps = fitting.fit_maps(codes, lights, truth["normal"][None])
+    known = maps.determined[0]
+    assert np.any(pictures > 1)
+    assert np.median(np.abs(np.log(maps.n[0] / truth["n"]))[known]) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("line", "name"),
+    [
+        ("a.png 1 2 3", "a.png"),
+        ("b c/d.png,1,2,3", "d.png"),
+        ('"e f.png"\t1\t2\t3\t', "e f.png"),
+        ("1.png 1 1 1", "1.png"),
+    ],
+)
+def test_lines_of_a_light_file(tmp_path, line, name):
+    (tmp_path / "x.lp").write_text(f"1\r\n{line}\r\n")
+    names, directions = read_lights(tmp_path / "x.lp")
+    assert names[0].name == name
+    assert directions.shape == (1, 3)
+
+
+def _break(path, what):
+    if what == "missing":
+        (path / "photo 3.png").unlink()
+    elif what == "size":
+        write_image(path / "photo 3.png", np.ones((5, 8, 3)) / 2, dtype="uint16")
+    elif what == "damaged":
+        (path / "photo 3.png").write_bytes((path / "photo 3.png").read_bytes()[:60])
+    elif what == "normals":
+        write_image(path / "normals.png", np.ones((5, 8, 3)) / 2, dtype="uint16")
+    elif what == "no lights":
+        (path / "lights.lp").unlink()
+    else:
+        text = (path / "lights.lp").read_text()
+        lines = text.splitlines()
+        broken = {
+            "count": ["11", *lines[1:]],
+            "zero": [*lines[:-2], "photo 11.png 0 0 0"],
+            "word": ["12", *lines[1:-2], "x"],
+        }
+        (path / "lights.lp").write_text("\n".join(broken[what]))
+
+
+@pytest.mark.parametrize(
+    ("what", "words"),
+    [
+        ("missing", "photo 3.png"),
+        ("size", "photo 3.png"),
+        ("damaged", "photo 3.png"),
+        ("normals", "normals.png"),
+        ("no lights", "file of lights"),
+        ("count", "lights.lp"),
+        ("zero", "line 13"),
+        ("word", "line 13"),
+    ],
+)
+def test_a_broken_folder_is_told_in_one_line(folder, what, words):
+    path, _ = folder
+    _break(path, what)
+    with pytest.raises(brdf.InputError) as error:
+        fitting.fit_maps(path)
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"lights": dome(5)}, "lights"),
+        ({"lights": np.zeros((6, 3))}, "lights[0]"),
+        ({"pictures": np.full((6, 2, 2, 3), np.nan)}, "pictures"),
+        ({"pictures": np.full((6, 2, 2, 3), 255, np.uint8)}, "pictures"),
+        ({"pictures": np.ones((6, 2, 2, 3), int)}, "pictures[0]"),
+        ({"normals": np.ones((3, 2, 3))}, "normals"),
+        ({"mask": np.ones((3, 2))}, "mask"),
+        ({"intensities": np.ones(5)}, "intensities"),
+        ({"intensities": np.zeros(6)}, "intensities"),
+        ({"model": "ward"}, "model"),
+        ({"specular": "gray"}, "specular"),
+        ({"ambient": -1.0}, "ambient"),
+    ],
+)
+def test_bad_arguments_are_told_in_one_line(change, words):
+    good = {"pictures": np.ones((6, 2, 2, 3)), "lights": dome(6), "normals": np.ones((2, 2, 3))}
+    with pytest.raises(brdf.InputError) as error:
+        fitting.fit_maps(**(good | change))
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)
