@@ -3,18 +3,20 @@
 import base64
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 import brdf
 from brdf.files import atomic_folder, write_text
 from brdf.images.writing import write_layers
-from fitting.maps.map_result import Maps
 from fitting.maps.texels import OCTAVES
 
+if TYPE_CHECKING:
+    from fitting.maps.map_result import Maps
 
-def write_maps(maps: Maps, folder: str | Path, *, plot: bool = False) -> None:
+
+def write_maps(maps: "Maps", folder: str | Path, *, plot: bool = False) -> None:
     """Write what `Maps.save` promises.
 
     Args:
@@ -118,7 +120,7 @@ def _openlime(width: int, height: int, scale: dict[str, float]) -> dict[str, Any
     }
 
 
-def draw_maps(maps: Maps) -> Any:
+def draw_maps(maps: "Maps") -> Any:
     """The figure of `Maps.plot`.
 
     Args:
