@@ -63,6 +63,7 @@ def _block(writer: Any, node: nodes.math_block) -> None:
 def setup(app: Any) -> None:
     """Formulas as MathML, which browsers draw without a program; pages written from the code itself."""
     app.add_html_math_renderer("mathml", inline_renderers=(_inline, None), block_renderers=(_block, None))
+    app.connect("autodoc-process-docstring", reference.tables)
     app.connect("builder-inited", lambda app: reference.write(Path(app.srcdir)))
 
 

@@ -60,6 +60,16 @@ print(gold)
 print(f"n is off by {abs(float(result.material.n) / float(gold.n) - 1):.1e} of itself")
 
 # %% [markdown]
+# ## The fit, to turn
+#
+# Drag on the ball: the highlight follows. Drag beside it: the view turns. The two white lines wipe target, fit and residual
+# over each other, the sliders carry the 95 % intervals. It needs no kernel, and `result.view().save("page.html")` writes
+# it as a file.
+
+# %%
+result.view()
+
+# %% [markdown]
 # ## Is it plausible?
 #
 # Classic Blinn-Phong never is. The check says why, from which angle on, and what the nearest plausible material is.
