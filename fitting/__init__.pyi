@@ -3,6 +3,8 @@ from .front_door import fit as fit
 from .implicit import Sensitivity as Sensitivity
 from .implicit import sensitivity as sensitivity
 from .joint import fit_jointly as fit_jointly
+from .light_choice import LightChoice as LightChoice
+from .light_choice import next_light as next_light
 from .many import ManyFits as ManyFits
 from .many import fit_many as fit_many
 from .maps.map_fit import fit_maps as fit_maps

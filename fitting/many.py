@@ -46,8 +46,8 @@ class ManyFits(Sequence[FitResult]):
         >>> scene = brdf.Scene.load("scene.toml")
         >>> pictures = np.stack([brdf.render(brdf.preset(name), scene) for name in ("gold", "emerald")])
         >>> fits = fitting.fit_many(pictures, scene, model="blinn-phong")
-        >>> len(fits), fits.n.round(1), fits[0].material.k_d.shape
-        (2, array([51.2, 76.8]), (3,))
+        >>> len(fits), fits.n.shape, fits[0].surface, round(float(fits[1].material.n), 1)
+        (2, (2,), 'blinn-phong', 76.8)
     """
 
     def __init__(self, problem: FitProblem, numbers: dict[str, np.ndarray] | None, done: dict[int, FitResult]):

@@ -13,8 +13,8 @@ HERE = ROOT / "notebooks"
 NOTEBOOKS = sorted(HERE.glob("[0-9]_*.py"))
 
 
-def test_all_seven_are_there():
-    assert [path.name[0] for path in NOTEBOOKS] == list("1234567")
+def test_all_eight_are_there():
+    assert [path.name[0] for path in NOTEBOOKS] == list("12345678")
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)

@@ -1,0 +1,289 @@
+"""Which light to add next: the one under which one more picture would tell most.
+
+The information of a picture (Fisher's; for noise of one size the Gram matrix of the derivatives by the numbers, over
+the noise's variance) adds up over pixels and pictures, and its inverse is the covariance. So what a picture under
+another light would make of the errors is known before it is taken: its derivatives are those of the fitted material.
+
+Source: Fedorov, "Theory of Optimal Experiments", 1972; Pukelsheim, "Optimal Design of Experiments", 2006, chapter 6,
+for adding one observation after the other.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+import brdf
+from brdf.errors import InputError
+from brdf.lights.base import Light
+from brdf.models.base import SpecularMaterial
+from brdf.precision import working_precision
+from brdf.rendering import basis
+from fitting.result import FitResult
+
+# Directions of the hemisphere that are tried: 6° apart; the best is then followed, in steps down to a tenth of that.
+DIRECTIONS = 400
+FIRST_STEP, ROUNDS, AROUND = 0.05, 5, 6
+# Of a picture at most so many pixels are looked at, evenly spread; what they tell is scaled up.
+MOST_PIXELS = 1 << 14
+# The square of a number's share that no pixel sees.
+UNSEEN = 1e-9
+
+
+@dataclass(frozen=True)
+class LightChoice:
+    """The lights to add, and what they are foretold to do.
+
+    Attributes:
+        lights: the chosen ones, the best first; each after those before it.
+        of: the number whose error they shrink.
+        before: its standard error now; the root mean square where it has a value per channel.
+        after: with the first of the lights, with the first two, and so on.
+        candidates: the lights that were tried for the first.
+        foretold: the error with each of them alone, (K,).
+        known: the lights that the result has seen.
+
+    Example:
+        >>> result = fitting.fit(brdf.read_image("target.exr"), brdf.Scene.load("scene.toml"), model="blinn-phong")
+        >>> choice = fitting.next_light(result, [[0, 0, 1], [0.9, 0, 0.3]])
+        >>> len(choice.lights), choice.after[0] < choice.before
+        (1, True)
+        >>> figure = choice.plot()
+    """
+
+    lights: tuple[Light, ...]
+    of: str
+    before: float
+    after: tuple[float, ...]
+    candidates: tuple[Light, ...] = field(repr=False)
+    foretold: Float[np.ndarray, " K"] = field(repr=False)
+    known: tuple[Light, ...] = field(repr=False)
+
+    @property
+    def direction(self) -> Float[np.ndarray, "3"]:
+        """Of the first light where it is directional: the unit vector towards it."""
+        return _direction(self.lights[0])
+
+    def __str__(self) -> str:
+        """In words."""
+        shown = ", ".join(f"{value:.3f}" for value in self.direction)
+        return f"a light from ({shown}) brings the error of {self.of} from {self.before:.3g} to {self.after[0]:.3g}"
+
+    def plot(self) -> Any:
+        """The hemisphere of lights seen from the camera, coloured by the error that each would leave.
+
+        Returns:
+            A matplotlib figure.
+
+        Raises:
+            InputError: where the candidates have no direction.
+        """
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(4.6, 3.8), layout="constrained")
+        axes = figure.subplots()
+        tried = np.array([_direction(light) for light in self.candidates])
+        finite = np.isfinite(self.foretold)
+        colours = axes.scatter(*tried[finite, :2].T, c=self.foretold[finite], cmap="cividis_r", s=45, linewidths=0)
+        axes.scatter(*tried[~finite, :2].T, facecolors="none", edgecolors="0.6", s=20, linewidths=0.5)
+        for lights, marker, label in ((self.known, "x", "there already"), (self.lights, "*", "chosen")):
+            places = np.array([_direction(light) for light in lights if hasattr(light, "direction")]).reshape(-1, 3)
+            axes.scatter(*places[:, :2].T, marker=marker, s=90, color="#D55E00", label=label)
+        axes.set(
+            title=f"error of {self.of} with one more light", xlabel="x towards the light", ylabel="y", aspect="equal"
+        )
+        axes.legend(loc="lower right", fontsize=7)
+        figure.colorbar(colours, label=f"standard error of {self.of}")
+        return figure
+
+
+def next_light(
+    result: FitResult, candidates: Sequence[Any] | None = None, count: int = 1, *, of: str = "n"
+) -> LightChoice:
+    """Find the light under which one more picture would shrink the error of a number most.
+
+    Camera, shapes, ambient light and noise are taken to stay as they are in the first picture.
+
+    Args:
+        result: of `fitting.fit`, of one picture or several.
+        candidates: lights, or directions towards them, (K, 3), which shine like the brightest of the result's lights;
+            None for any direction of the hemisphere on the camera's side.
+        count: how many, one chosen after the other.
+        of: "n", "k_s", "k_d", "k_a", or one channel, as "k_s[0]".
+
+    Returns:
+        The lights, the error before and after, and a picture of the hemisphere: `LightChoice`.
+
+    Raises:
+        InputError: naming the argument, where it cannot be used.
+
+    Example:
+        >>> result = fitting.fit(brdf.read_image("target.exr"), brdf.Scene.load("scene.toml"), model="blinn-phong")
+        >>> choice = fitting.next_light(result, candidates=[[0, 0, 1], [0.5, 0.6, 0.7]])
+        >>> choice.direction.round(1)
+        array([0., 0., 1.])
+    """
+    if not isinstance(result, FitResult):
+        raise InputError("result", f"must be of fitting.fit, got {type(result).__name__}", "Fit the pictures first")
+    if count < 1:
+        raise InputError("count", f"must be 1 or more, got {count}", "Say how many lights to add")
+    wanted, active = _numbers(result, of)
+    known = tuple(light for scene in result.scenes for light in scene.lights)
+    scenes = [_scene(result, index) for index in range(len(result.scenes))]
+    shining = max((np.asarray(light.emittance) for light in known), key=np.sum, default=np.ones(1))
+    given = None if candidates is None else [_light(one, shining) for one in candidates]
+    if given is not None and not given:
+        raise InputError("candidates", "is empty", "Give lights or directions, or None for any direction")
+    with working_precision("float64"):
+        material = brdf.cast(result.material, "float64")
+        variance = np.asarray(result.noise, np.float64) ** 2
+
+        def told(scene: brdf.Scene, share: float) -> np.ndarray:
+            return np.asarray(_information(material, brdf.cast(scene, "float64"), variance)) / share
+
+        def error(information: np.ndarray) -> float:
+            return _error(information[np.ix_(active, active)], wanted[active])
+
+        def foretold(light: Light) -> tuple[float, np.ndarray]:
+            more = information + told(dataclasses.replace(scenes[0][0], lights=(light,), visibility=()), scenes[0][1])
+            return error(more), more
+
+        information = np.sum([told(*scene) for scene in scenes], axis=0)
+        before, chosen, after, first = error(information), [], [], None
+        for _ in range(count):
+            tried = [_towards(one, shining) for one in _hemisphere(scenes[0][0])] if given is None else given
+            errors = [foretold(light)[0] for light in tried]
+            first = (tuple(tried), np.array(errors)) if first is None else first
+            best = tried[int(np.argmin(errors))]
+            if given is None:
+                best = _followed(best, min(errors), lambda light: foretold(light)[0], shining)
+            left, information = foretold(best)
+            chosen.append(best)
+            after.append(left)
+    assert first is not None
+    return LightChoice(tuple(chosen), of, before, tuple(after), *first, known)
+
+
+def _towards(direction: np.ndarray, intensity: np.ndarray) -> Light:
+    return brdf.DirectionalLight(direction=direction, intensity=intensity)
+
+
+def _numbers(result: FitResult, of: str) -> tuple[np.ndarray, np.ndarray]:
+    """Which of k_a, k_d, k_s, channel after channel each, and n are asked for, and which are free."""
+    asked = result[of] if isinstance(of, str) else ()
+    asked = asked if isinstance(asked, tuple) else (asked,)
+    free = result.free_parameters
+    missing = [one for one in asked if one not in free]
+    if missing:
+        why = missing[0].reason or "is at its bound"
+        raise InputError("of", f"{missing[0].key} has no error to shrink: {why}", "Ask for another number")
+    channels, order = result.material.k_d.shape[0], ("k_a", "k_d", "k_s")
+    places = {
+        one.key: 3 * channels if one.channel is None else order.index(one.name) * channels + one.channel for one in free
+    }
+    wanted, active = np.zeros((2, 3 * channels + 1), bool)
+    wanted[[places[one.key] for one in asked]] = True
+    active[list(places.values())] = True
+    return wanted, active
+
+
+def _light(given: Any, shining: np.ndarray) -> Light:
+    if isinstance(given, Light):
+        return given
+    direction = np.asarray(given, np.float64)
+    if direction.shape != (3,):
+        came = f"must hold lights or directions of 3 numbers, got shape {direction.shape}"
+        raise InputError("candidates", came, "Give brdf lights, or (K, 3) directions towards the light")
+    return _towards(direction, shining)
+
+
+def _direction(light: Light) -> np.ndarray:
+    if not isinstance(light, brdf.DirectionalLight):
+        raise InputError("candidates", f"hold a {type(light).__name__}, which has no one direction", "Look at foretold")
+    direction = np.asarray(light.direction, np.float64)
+    return direction / np.linalg.norm(direction)
+
+
+def _scene(result: FitResult, index: int) -> tuple[brdf.Scene, float]:
+    """The pixels of a picture that counted, or some of them, and which share these are."""
+    pixel = np.flatnonzero(result.counted[index])
+    some = pixel[:: -(-pixel.size // MOST_PIXELS)]
+    return brdf.some_pixels(result.scenes[index], some, precision="float64"), some.size / pixel.size
+
+
+def _hemisphere(scene: brdf.Scene) -> np.ndarray:
+    """Evenly spread directions around the mean of those to the eye, (K, 3): Vogel's spiral, of equal areas."""
+    assert scene.points is not None
+    middle = np.asarray(scene.points.to_view, np.float64).reshape(-1, 3).mean(axis=0)
+    height = 1 - (np.arange(DIRECTIONS) + 0.5) / DIRECTIONS
+    angle = np.arange(DIRECTIONS) * np.pi * (3 - np.sqrt(5))
+    radius = np.sqrt(1 - height**2)
+    across = _across(middle / np.linalg.norm(middle))
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1) @ across
+
+
+def _across(direction: np.ndarray) -> np.ndarray:
+    """Two unit vectors across a direction, and itself, as rows."""
+    start = np.eye(3)[np.argmin(np.abs(direction))]
+    first = np.cross(start, direction)
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(direction, first), direction])
+
+
+def _followed(light: Light, error: float, foretold: Any, shining: np.ndarray) -> Light:
+    """The best direction near by: a ring of directions around it, which shrinks where none of them is better."""
+    step = FIRST_STEP
+    for _ in range(ROUNDS):
+        angle = 2 * np.pi * np.arange(AROUND) / AROUND
+        first, second, middle = _across(_direction(light))
+        ring = middle + step * (np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second)
+        tried = [_towards(one, shining) for one in ring]
+        errors = [foretold(one) for one in tried]
+        if min(errors) < error:
+            light, error = tried[int(np.argmin(errors))], min(errors)
+        else:
+            step /= 2
+    return light
+
+
+@eqx.filter_jit
+def _information(material: brdf.Material, scene: brdf.Scene, variance: Array) -> Array:
+    """Of a picture of a material, by k_a, k_d, k_s, channel after channel each, and n."""
+    model, channels = type(material), material.k_d.shape[0]
+    images = basis(model, scene)
+    shape = images.points.mask.size, channels
+    nothing = jnp.zeros(shape)
+    ambient = nothing if scene.ambient is None else nothing + scene.ambient
+    diffuse = nothing if images.diffuse is None else nothing + images.diffuse
+    lobe = slope = nothing
+    if isinstance(material, SpecularMaterial) and images.lobe is not None:
+        terms = images.lobe
+        lobe, slope = jax.jvp(lambda n: model.scale(n) * terms(n)[0], (material.n,), (jnp.ones_like(material.n),))
+        lobe, slope = nothing + lobe, material.k_s * slope
+    columns = jnp.where(images.points.mask[:, None], jnp.stack([ambient, diffuse, lobe, slope]), 0)
+    gram = jnp.einsum("ipc,jpc->cij", columns, columns) / variance[:, None, None]
+    place = np.zeros((channels, 4, 3 * channels + 1))
+    for channel, term in np.ndindex(channels, 3):
+        place[channel, term, term * channels + channel] = 1
+    place[:, 3, -1] = 1
+    return jnp.einsum("cij,ciu,cjv->uv", gram, place, place)
+
+
+def _error(information: np.ndarray, wanted: np.ndarray) -> float:
+    """Root mean square of the standard errors of what is wanted; infinite where one is not determined."""
+    size = np.sqrt(np.diag(information))
+    if not np.all(size[wanted] > 0):
+        return np.inf
+    size = np.where(size > 0, size, 1)
+    value, vector = np.linalg.eigh(information / np.outer(size, size))
+    open_ = value <= 1e-12
+    if np.any(np.sum(vector[wanted][:, open_] ** 2, axis=1) > UNSEEN):
+        return np.inf
+    variance = np.sum(vector[wanted][:, ~open_] ** 2 / value[~open_], axis=1) / size[wanted] ** 2
+    return float(np.sqrt(np.mean(variance)))

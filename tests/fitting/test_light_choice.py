@@ -1,0 +1,67 @@
+"""The light to add next: foretold errors against fits, and the best direction against many others."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from small_ball import SUN, ball_scene, pictured
+
+import brdf
+import fitting
+
+MATERIAL = brdf.BlinnPhong(k_a=[0.2, 0.1, 0.15], k_d=[0.5, 0.4, 0.3], k_s=[0.3, 0.3, 0.4], n=35.0)
+NOISE = 0.01
+
+
+@pytest.fixture(scope="module")
+def result() -> fitting.FitResult:
+    low = dataclasses.replace(SUN, direction=np.array([1.0, 0.2, -0.3]))
+    return fitting.fit(pictured(MATERIAL, ball_scene(low), NOISE), ball_scene(low), model="blinn-phong")
+
+
+@pytest.mark.parametrize("of", ["n", "k_s[1]", "k_d"])
+def test_foretold_errors_are_those_of_fits(result, of):
+    light = dataclasses.replace(SUN, direction=np.array([-0.3, 0.2, 0.8]))
+    choice = fitting.next_light(result, [light], of=of)
+    pictures = [result.targets[0], pictured(MATERIAL, ball_scene(light), NOISE, 1).astype(np.float32)]
+    after = fitting.fit(pictures, [result.scenes[0], ball_scene(light)], model="blinn-phong")
+
+    def error(one: fitting.FitResult) -> float:
+        asked = one[of] if isinstance(one[of], tuple) else (one[of],)
+        return float(np.sqrt(np.mean([number.error**2 for number in asked])))
+
+    np.testing.assert_allclose(choice.before, error(result), rtol=0.01)
+    np.testing.assert_allclose(choice.after[0], error(after), rtol=0.05)  # noise moves n by some of its errors
+
+
+def test_no_direction_is_better_than_the_one_it_finds(result):
+    choice = fitting.next_light(result)
+    rng = np.random.default_rng(3)
+    others = rng.standard_normal((100, 3)) * [1, 1, 0.5] + [0, 0, 0.5]
+    others = np.concatenate([others, choice.direction + 0.03 * rng.standard_normal((20, 3))])
+    assert choice.after[0] <= 1.002 * fitting.next_light(result, others).foretold.min()
+    assert choice.after[0] < choice.foretold.max() < np.inf
+    assert "brings the error of n" in str(choice)
+    assert choice.plot().axes[0].get_title() == "error of n with one more light"
+
+
+def test_several_are_chosen_one_after_the_other(result):
+    candidates = [[0, 0, 1], [0.5, 0.5, 0.7], [-0.7, 0.1, 0.6]]
+    both = fitting.next_light(result, candidates, count=2)
+    one = fitting.next_light(result, candidates)
+    assert len(both.lights) == 2
+    assert both.after[0] == one.after[0] == one.foretold.min()
+    assert both.after[1] < both.after[0]
+
+
+def test_what_cannot_be_answered_is_told(result):
+    matt = fitting.fit(pictured(brdf.Lambert(k_d=[0.5] * 3), ball_scene(), NOISE), ball_scene(), model="lambert")
+    for wrong, message in (
+        (lambda: fitting.next_light(matt), "has no number 'n'"),
+        (lambda: fitting.next_light(result, []), "candidates: is empty"),
+        (lambda: fitting.next_light(result, [[1, 2]]), "directions of 3 numbers"),
+        (lambda: fitting.next_light(result, count=0), "count: must be 1 or more"),
+        (lambda: fitting.next_light("result"), "must be of fitting.fit"),
+    ):
+        with pytest.raises(brdf.InputError, match=message):
+            wrong()
