@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 EXAMPLE := data/gold-ball
 
-.PHONY: fit test check docs lab clean
+.PHONY: fit test check docs lab wheel clean
 
 fit: $(VENV)/installed
 	$(BIN)/brdf fit $(EXAMPLE) --out out/gold-ball --plot
@@ -19,6 +19,15 @@ check: $(VENV)/installed-tests
 
 docs: $(VENV)/installed-docs
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going -q -j 2 -b html -d out/docs-cache docs out/docs
+
+# The wheel, built and used where nothing else of the project is: in an empty environment, outside of this folder.
+wheel: $(VENV)/installed
+	rm -rf out/wheel && mkdir -p out/wheel
+	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps -w out/wheel .
+	$(PYTHON) -m venv out/wheel/venv
+	out/wheel/venv/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt out/wheel/*.whl
+	cd out/wheel && venv/bin/brdf fit ../../$(EXAMPLE) --model blinn-phong --out fit && venv/bin/brdf render fit -o again.exr
+	cd out/wheel && venv/bin/python -c "import brdf, fitting; print(brdf.__version__, fitting.load_result('fit')['n'])"
 
 lab: $(VENV)/installed-lab
 	JUPYTER_CONFIG_PATH=$(CURDIR)/$(VENV)/lab $(BIN)/jupyter lab notebooks

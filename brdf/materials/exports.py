@@ -41,8 +41,10 @@ from brdf.files import as_path, write_text
 from brdf.images.encoding import decode, encode
 from brdf.materials.material_file import to_json
 from brdf.materials.mtl import half_exponent, height, to_mtl
-from brdf.models import BlinnPhong, Material, NormalizedPhong, Phong, SpecularMaterial
+from brdf.models import BlinnPhong, Material, NormalizedBlinnPhong, NormalizedPhong, Phong, SpecularMaterial
 
+# The lobes that are written as they are; those of other models as Blinn-Phong's.
+WRITTEN = (Phong, BlinnPhong, NormalizedPhong, NormalizedBlinnPhong)
 Colour = Float[np.ndarray, "3"]
 Written = tuple[str, list[str]]
 
@@ -85,6 +87,8 @@ def export_material(material: Material, to: str, *, name: str = "fitted") -> Exp
     if to != "json" and channels not in (1, 3):
         raise InputError("material", f"has {channels} channels, {to} knows RGB alone", "Use the format json")
     text, losses = EXPORTS[to](material, name)
+    if to != "json" and isinstance(material, SpecularMaterial) and not isinstance(material, WRITTEN):
+        losses = [f"the format has no word for the lobe of {material.name}: it is written as Blinn-Phong's", *losses]
     return Export(text, tuple(losses))
 
 

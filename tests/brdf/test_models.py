@@ -6,12 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from extra_model import Retroreflector
 
 from brdf.errors import InputError
 from brdf.models import MODELS, BlinnPhong, Lambert, NormalizedBlinnPhong, NormalizedPhong, Phong, SpecularMaterial
 
 UP = np.array([0.0, 0.0, 1.0])
-LOBES = [Phong, BlinnPhong, NormalizedPhong, NormalizedBlinnPhong]
+# With one that only the tests have: what is said of a model holds for any that is added.
+LOBES = [Phong, BlinnPhong, NormalizedPhong, NormalizedBlinnPhong, Retroreflector]
 ALL = [Lambert, *LOBES]
 
 
@@ -34,10 +36,13 @@ def textbook(model, normal, light, view, n):
         return 0.0
     if model in (Phong, NormalizedPhong):
         cosine = max((2 * n_l * normal - light) @ view, 0.0)
+    elif model is Retroreflector:
+        cosine = max(light @ view, 0.0)
     else:
         cosine = max(normal @ (light + view) / np.linalg.norm(light + view), 0.0)
     factor = {
         Phong: 1.0,
+        Retroreflector: 1.0,
         BlinnPhong: 1.0,
         NormalizedPhong: (n + 2) / 2 * n_l,
         NormalizedBlinnPhong: (n + 2) * (n + 4) / (8 * (2 ** (-n / 2) + n)) * n_l,
