@@ -56,7 +56,7 @@ def _inline(writer: Any, node: nodes.math) -> None:
 
 
 def _block(writer: Any, node: nodes.math_block) -> None:
-    writer.body.append(f'<div class="math">{tex2mathml(node.astext(), as_block=True)}</div>')
+    writer.body.append(f'<div class="math" style="overflow-x: auto">{tex2mathml(node.astext(), as_block=True)}</div>')
     raise nodes.SkipNode
 
 
@@ -64,6 +64,7 @@ def setup(app: Any) -> None:
     """Formulas as MathML, which browsers draw without a program; pages written from the code itself."""
     app.add_html_math_renderer("mathml", inline_renderers=(_inline, None), block_renderers=(_block, None))
     app.connect("autodoc-process-docstring", reference.tables)
+    app.connect("autodoc-skip-member", reference.skip)
     app.connect("builder-inited", lambda app: reference.write(Path(app.srcdir)))
 
 

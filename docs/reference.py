@@ -82,6 +82,15 @@ def tables(*said: Any) -> None:
     lines[:] = done
 
 
+def skip(*said: Any) -> bool | None:
+    """Leave out the fields of named tuples, which Python documents by their place; the class says what they are.
+
+    Args:
+        said: what autodoc hands over; the fourth is the member.
+    """
+    return True if (getattr(said[3], "__doc__", None) or "").startswith("Alias for field number") else None
+
+
 def _commands() -> str:
     import typer
 

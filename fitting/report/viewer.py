@@ -148,11 +148,7 @@ def viewer(result: FitResult, picture: int | None = None) -> str:
         "channels": names,
         "shown": chosen,
         "material": _numbers(material),
-        "numbers": [
-            _parameter(one)
-            for one in result.parameters
-            if hasattr(material, one.name) and one.channel in (None, *chosen)
-        ],
+        "numbers": _sliders(result, chosen),
         "window": [left, top, target.shape[1], target.shape[0], stride],
         "target": _packed(_with_alpha(target, counted)),
         "still": "" if drawable else _packed(_with_alpha(fitted, counted)),
@@ -215,9 +211,19 @@ def _numbers(material):
     return {key: np.asarray(getattr(material, key), np.float64).tolist() for key in keys}
 
 
-def _parameter(one):
-    interval = None if one.interval is None else [end if math.isfinite(end) else None for end in one.interval]
-    return {key: getattr(one, key) for key in ("name", "channel", "value", "reason")} | {"interval": interval}
+def _sliders(result, chosen):
+    """What stands at each number's slider; of one that was held in the fit its value alone."""
+    fitted = {(one.name, one.channel): one for one in result.parameters}
+    rows = []
+    for name, values in _numbers(result.material).items():
+        for channel in (None,) if name == "n" else sorted(set(chosen) & set(range(len(values)))):
+            row = {"name": name, "channel": channel, "value": values if channel is None else values[channel]}
+            one = fitted.get((name, channel))
+            if one is not None:
+                ends = None if one.interval is None else [end if math.isfinite(end) else None for end in one.interval]
+                row |= {"value": one.value, "interval": ends, "reason": one.reason}
+            rows.append(row)
+    return rows
 
 
 def _scene(scene: brdf.Scene, chosen: list[int]) -> tuple[dict[str, Any], list[str]]:

@@ -168,8 +168,10 @@ def test_a_bare_power_would_be_seen(glossy: fitting.FitResult, tmp_path: Path):
     exact = r"exp\(-0\.5 \* BRDF_N \* brdf_log1p\([^;]*\)\);"
     broken, count = re.subn(exact, "pow(dot(normalize(a), normalize(b)), BRDF_N);", page)
     assert count
+    broken = broken.replace("</body>", "<script>alert(1)</script></body>")
     (answer,) = drawn([(broken, [f"{PLAIN}&yaw=25&pitch=-15&n={n}" for n in (1000, 10_000)])], tmp_path)
     scene = turned(SCENES["directional"], 25, -15, 13, DIRECTIONS[0])
+    assert "Content Security Policy" in " ".join(answer["messages"])  # a program that is not the page's own
     for codes, n in zip(answer["codes"], (1000.0, 10_000.0), strict=True):
         assert off(codes, dataclasses.replace(MODELS[1], n=n), scene) > LIMIT
 
