@@ -72,7 +72,7 @@
 
   // -- what is drawn ------------------------------------------------------------------------------------------------
 
-  const shapes = [["scene", "the scene’s own"], ["ball", "ball"], ["plane", "plane"]];
+  const shapes = [["scene", "the scene’s own"], ["ball", "ball"], ["plane", "plane, near eye"]];
   const counts = { SPHERES: Math.max(1, data.spheres.length), RECTANGLES: Math.max(1, data.rectangles.length), LIGHTS: Math.max(1, data.lights.length) };
   const programs = {};
 
@@ -148,7 +148,8 @@
     const turned = (v) => rotated(rotated(v, own.right, state.pitch), own.up, state.yaw);
     const [right, up, forward, position] = [own.right, own.up, own.forward, own.position].map(turned);
     const depth = Math.max(-dot(position, forward), 1e-3);
-    return { ...own, right, up, forward, position, depth, axis_point: add(position, forward, depth) };
+    const local = own.local || state.shape === "plane"; // for a far eye a plane in far light shows one colour
+    return { ...own, local, right, up, forward, position, depth, axis_point: add(position, forward, depth) };
   }
 
   function geometry() {
