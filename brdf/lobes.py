@@ -26,8 +26,8 @@ from brdf.vectors import BELOW_HORIZON, divide, dot, square_root
 STORED_SAMPLES = 4
 """Up to so many light samples each is compiled on its own, and the fit keeps its terms as arrays of their own."""
 
-TILE = 8192
-"""Pixels that many samples pass over at a time."""
+TILE = 1 << 15
+"""Pixels that many samples pass over at a time: loops over less than a megabyte XLA does not vectorise."""
 
 STACKED_VALUES = 1 << 26
 """Up to so many values the fit keeps the terms of many samples, too, for few pixels: 256 MiB in float32."""
@@ -338,25 +338,28 @@ def _kept_terms(model: type[Material], lighting: Lighting, points: SurfacePoints
 
 
 def _stacked_terms(model: type[Material], lighting: Lighting, points: SurfacePoints) -> tuple[Any, Any]:
-    """Sum of the diffuse terms, and weights and cosines of the lobe, of all samples at once."""
+    """Sum of the diffuse terms, and weights and cosines of the lobe, of all samples at once.
 
-    def at_point(point: SurfacePoints) -> tuple[Any, Any]:
-        diffuse: Any = 0.0
-        kept: tuple[Any, ...] = ()
-        for stack in lighting.stacks:
+    The loop over samples is the outer one: an array of all of them would be made in many steps of its own size.
+    """
+    diffuse: Any = 0.0
+    kept: tuple[Any, ...] = ()
+    for stack in lighting.stacks:
 
-            def of_light(one: Any, kind: type[Light] = stack.kind) -> LightTerms:
-                numbers, nodes, light = one
-                at = partial(light_terms, model, lighting.occluders, kind, light=light, point=point)
-                return jax.lax.map(lambda node: at((*numbers, *node)), nodes) if nodes else at(numbers)
+        def of_light(one: Any, kind: type[Light] = stack.kind) -> LightTerms:
+            numbers, nodes, light = one
 
-            terms = jax.lax.map(of_light, (stack.numbers, stack.nodes, stack.light))
-            terms = jax.tree.map(partial(jnp.reshape, shape=(stack.samples, -1)), terms)
-            diffuse = diffuse + jnp.sum(terms.diffuse, axis=0)
-            kept = (*kept, (terms.weight, terms.log_cosine[:, 0]))
-        return diffuse, kept
+            def of_sample(node: tuple[Array, ...]) -> LightTerms:
+                of_point = partial(light_terms, model, lighting.occluders, kind, (*numbers, *node), light)
+                return jax.vmap(of_point)(points)
 
-    return _by_tiles(at_point, points)
+            return jax.lax.map(of_sample, nodes) if nodes else of_sample(())
+
+        terms = jax.lax.map(of_light, (stack.numbers, stack.nodes, stack.light))
+        terms = jax.tree.map(lambda leaf, count=stack.samples: leaf.reshape(count, points.mask.size, -1), terms)
+        diffuse = diffuse + jnp.sum(terms.diffuse, axis=0)
+        kept = (*kept, (terms.weight.swapaxes(0, 1), terms.log_cosine[..., 0].T))
+    return diffuse, kept
 
 
 def _size(tree: Any) -> int:
