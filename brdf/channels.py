@@ -1,5 +1,8 @@
 """What the channels of a picture or a material are called where a person reads of them."""
 
+MOST_CHANNELS = 4096
+"""Of a picture, a material or a measured table: more are no spectrum."""
+
 
 def channel_names(count: int) -> tuple[str, ...]:
     """Names of channels: nothing for one, red, green and blue for three, numbers from 0 for others.

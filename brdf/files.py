@@ -136,6 +136,10 @@ def atomic_path(path: AnyPath) -> Iterator[Path]:
         raise InputError(path, "is a folder, not a file", "Give the path of a file")
     if os.path.exists(target) and not os.path.isfile(target):
         raise InputError(path, "is not an ordinary file", "Give the path of a file")
+    if not os.path.lexists(target.parent):
+        raise InputError(
+            path, f"cannot be written, there is no folder {os.path.dirname(_plain(path))}", "Make it first"
+        )
     temporary, lock = target.with_name(f".brdf-{secrets.token_hex(6)}{target.suffix}"), None
     try:
         with _told(path):

@@ -28,7 +28,7 @@ class Target(NamedTuple):
         pixels: linear values (H, W, C); or a `brdf.ImageReader`, of which a band of rows is in memory at a time.
         saturation: the value of the largest code, where it is known.
         step: the distance of two codes; 0 where there are none.
-        file: path, encoding and factor of the `brdf.Picture` that it was; None where no file holds it.
+        file: path, encoding, its source, and factor of the `brdf.Picture` that it was; None where no file holds it.
     """
 
     pixels: Any
@@ -190,7 +190,8 @@ def as_target(given: Any) -> Target:
     saturation, step, file = None, 0.0, None
     if isinstance(given, brdf.Picture):
         if given.path is not None:
-            file = {"path": str(given.path), "encoding": given.encoding, "factor": np.asarray(given.factor).tolist()}
+            file = {"path": str(given.path), "encoding": given.encoding, "source": given.source}
+            file |= {"factor": np.asarray(given.factor).tolist()}
         steps = given.quantisation()
         step = 0.0 if steps is None else float(np.nanmax(steps))
         saturation = None if given.saturation is None else given.saturation * TOP

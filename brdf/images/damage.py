@@ -13,14 +13,13 @@ from pathlib import Path
 
 import OpenImageIO as oiio  # noqa: N813
 
+from brdf.channels import MOST_CHANNELS
 from brdf.errors import InputError
 
 MAX_VALUES = 1 << 31
 """Most values (height × width × channels) of a picture in memory: 8 GiB."""
 MAX_RATIO = 1 << 12
 """Most bytes of pixels per byte of file, beyond 64 MiB; deflate reaches 1032, a small ball on black in DWAB 2077."""
-MOST_CHANNELS = 1 << 12
-"""As for materials and measured tables: more are no spectrum."""
 # OpenEXR takes seconds for some ten thousand in one part.
 MOST_ATTRIBUTES = 1 << 12
 # Each scan of a progressive JPEG file goes over the whole picture. libjpeg-turbo's own tests stop there.

@@ -8,9 +8,9 @@ from typing import Any, Literal
 import numpy as np
 import OpenImageIO as oiio  # noqa: N813
 
+from brdf.channels import MOST_CHANNELS
 from brdf.errors import InputError
 from brdf.files import AnyPath, as_path, atomic_path, utf8_name
-from brdf.images.damage import MOST_CHANNELS
 from brdf.images.encoding import Encoding, encode, parse_encoding
 from brdf.images.reading import said
 

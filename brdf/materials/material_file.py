@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from brdf.channels import MOST_CHANNELS
 from brdf.checks import instance
 from brdf.errors import InputError
 from brdf.files import as_path, read_text, write_text
 from brdf.materials.mtl import SHOWN, material_from_mtl, read_mtl, to_mtl
 from brdf.models import MODELS, Material
 
-MOST_CHANNELS = 4096  # as for measured tables: more are no spectrum
 _MOST_BYTES = 1 << 22
 
 
@@ -173,7 +173,9 @@ def _suffix(path: str | Path, remedy: str) -> str:
 def _entries(path: str | Path) -> dict[str, Any]:
     """What a file says of each of its materials, by name."""
     if as_path(path).is_dir():
-        path = Path(path) / "material.json"
+        folder, path = path, Path(path) / "material.json"
+        if not path.exists():
+            raise InputError(folder, "is a folder without material.json", "Give a file, or what brdf fit --out wrote")
     suffix, text = _suffix(path, "Give a .json or .mtl file"), read_text(path, _MOST_BYTES)
     if suffix == ".mtl":
         return read_mtl(path, text)

@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
+from brdf.channels import MOST_CHANNELS
 from brdf.errors import InputError
 from brdf.files import parse_number, read_text
 from brdf.measured.table import MeasuredBRDF, from_angles, from_half_angles
 
-MOST_CHANNELS = 4096
 # What the columns are: angles of half vector, difference, view and light, or cosines of them. What is not said is 0.
 _PARAMETRISATIONS = {
     "COS_TH": "theta_h",

@@ -11,7 +11,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, get_args
 
 import typer
 
@@ -22,13 +22,16 @@ from brdf.errors import InputError
 MODEL_NAMES = ("auto", "lambert", "phong", "blinn-phong", "normalized-phong", "normalized-blinn-phong")
 
 
+# What help shows that an option takes.
+TAKES = ((bool, ""), (Path, "PATH"), (float, "NUMBER"), (int, "NUMBER"), (str, "TEXT"), (Any, "TEXT"))
+
+
 Encoding = Annotated[
     Any,
     typer.Option(
         help="linear, srgb or a gamma; default: what the file says.",
         rich_help_panel="What the pictures show",
         parser=str,
-        metavar="TEXT",
     ),
 ]
 
@@ -94,6 +97,11 @@ def as_command(function: Callable[..., Any]) -> Callable[..., Any]:
             return function(**given)
 
     every = [one.replace(kind=one.KEYWORD_ONLY) for one in (*own.values(), *shown.values()) if one.name != "pictures"]
+    for one in every:
+        kind, about, *_ = (*get_args(one.annotation), None, None)
+        if isinstance(about, typer.models.OptionInfo) and about.metavar is None:
+            # A switch takes nothing, so nothing is shown behind it.
+            about.metavar = next((word for type_, word in TAKES if type_ in (kind, *get_args(kind))), None)
     command.__signature__ = inspect.Signature(every)  # pyright: ignore[reportAttributeAccessIssue]
     return command
 

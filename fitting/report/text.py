@@ -1,5 +1,7 @@
 """A fit as text: what the command prints, and what a person pastes into a paper."""
 
+from pathlib import Path
+
 import numpy as np
 
 from brdf.channels import channel_names
@@ -30,6 +32,7 @@ def report(result: FitResult) -> str:
         lines.append(f"  {parameter.name:<{width}} {parameter.label(channels):<6} {parameter}")
     lines.append(f"  residual    {100 * result.residual:.3g} % of the picture (rms)")
     lines += [f"  left out    {pixels} pixels {reason}" for reason, pixels in result.left_out.items() if pixels]
+    lines += _silent(result.files)
     if result.highlight_pixels is not None:
         lines.append(f"  highlight   on {result.highlight_pixels:.3g} pixels")
     lines += [] if result.choice is None else result.choice.lines()
@@ -46,6 +49,16 @@ def standing(candidate: Candidate) -> str:
         candidate: one of them.
     """
     return "chosen" if candidate.chosen else "adequate" if candidate.excess <= candidate.excess_error else ""
+
+
+def _silent(files):
+    """How files were read that do not say how they hold light."""
+    silent = [file for file in files if file is not None and file.get("source") == "assumed"]
+    if not silent:
+        return []
+    encoding = {"srgb": "sRGB"}.get(silent[0]["encoding"], silent[0]["encoding"])
+    others = f" and {len(silent) - 1} more do" if len(silent) > 1 else " does"
+    return [f"  read as     {encoding}: {Path(silent[0]['path']).name}{others} not say how values are encoded"]
 
 
 def _correlations(result, labels):

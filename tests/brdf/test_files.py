@@ -75,7 +75,7 @@ def test_a_new_file_follows_the_umask(tmp_path):
 @pytest.mark.parametrize(
     ("place", "said"),
     [
-        ("missing/a.txt", "no such file or folder"),
+        ("missing/a.txt", "cannot be written, there is no folder .*missing. Make it first"),
         ("file/a.txt", "not a folder"),
         ("folder", "is a folder"),
         ("pipe", "not an ordinary file"),

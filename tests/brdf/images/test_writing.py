@@ -99,7 +99,7 @@ def test_any_number_of_channels(tmp_path, channels, suffix):
         ("a.exr", np.ones((2, 2), complex), {}, "no numbers"),
         ("a.exr", np.ones((2, 2)), {"alpha": np.ones((2, 3))}, "alpha of shape"),
         ("a.jpg", np.ones((2, 2)), {"alpha": np.ones((2, 2))}, "alpha of shape"),
-        ("missing/a.exr", np.ones((2, 2)), {}, "no such file or folder"),
+        ("missing/a.exr", np.ones((2, 2)), {}, "there is no folder"),
     ],
 )
 def test_what_cannot_be_written(tmp_path, name, array, options, said):

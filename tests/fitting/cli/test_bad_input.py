@@ -135,10 +135,14 @@ CASES: list[tuple[dict[str, Any], str, str]] = [
     ({}, "tradeoff none.png", "none.png: there is no such file"),
     ({}, "render material.json --scene . -o o.exr", "is a folder, not a file"),
     ({}, "fit none.exr --scene scene.toml --out target.exr", "target.exr: a part of the path is not a folder"),
-    ({}, "render material.json --scene scene.toml -o no/o.exr", "no/o.exr: there is no such file or folder"),
+    (
+        {},
+        "render material.json --scene scene.toml -o no/o.exr",
+        "no/o.exr: cannot be written, there is no folder no. Make it first",
+    ),
     ({"o.exr": Path.mkdir}, "render material.json --scene scene.toml -o o.exr", "o.exr: is a folder"),
     ({}, "render material.json --scene scene.toml -o o.xyz", "o.xyz"),
-    ({".json": Path.mkdir}, "render .json --scene scene.toml -o o.exr", "is no material|is a folder"),
+    ({".json": Path.mkdir}, "render .json --scene scene.toml -o o.exr", ".json: is a folder without material.json"),
     ({"odd": os.mkfifo}, "fit odd --scene scene.toml", "odd: is not an ordinary file"),
     ({"odd": device}, "fit odd --scene scene.toml", "odd: is not an ordinary file"),
     ({"odd": loop}, "fit odd --scene scene.toml", "odd: the links lead in a circle"),
@@ -165,7 +169,7 @@ CASES: list[tuple[dict[str, Any], str, str]] = [
     ({}, "convert emerald o.json --name a", "--name: chooses from a file"),
     ({}, "convert gold x.fbx", r"x.fbx: does not say its format, got .fbx. Name it .json"),
     ({}, "convert gold x.json --to fbx", "^error: --to: is unknown, got 'fbx'. Use one of json, mtl, three"),
-    ({}, "convert gold no/such/folder/x.json", "x.json: there is no such file or folder"),
+    ({}, "convert gold no/such/folder/x.json", "x.json: cannot be written, there is no folder no"),
     # measured tables
     (
         {"felt.alta": ""},
