@@ -306,8 +306,8 @@ def average(weight: Float[Array, "K M"], values: Float[Array, "*N K*M C"]) -> Fl
 def diffuse_and_lobe(
     model: type[Material], points: SurfacePoints, lighting: Lighting
 ) -> tuple[Float[Array, "P C"], Lobe | None]:
-    """The diffuse basis of (P,) points, and the specular one where the model has one."""
-    specular = issubclass(model, SpecularMaterial)
+    """The diffuse basis of P points, of any shape, and the specular one where the model has one."""
+    points, specular = points.flat(), issubclass(model, SpecularMaterial)
     if lighting.samples <= STORED_SAMPLES:
         diffuse: Any = 0.0
         kept: tuple[Any, ...] = ()

@@ -67,12 +67,13 @@ def cast(tree: Any, precision: Precision | None) -> Any:
     """
 
     def leaf(value: Any) -> Any:
-        if isinstance(value, jax.Array) and precision is None:
-            return value
-        array = jnp.asarray(value)
-        if jnp.issubdtype(array.dtype, np.floating):
-            return array.astype(jnp.result_type(float) if precision is None else precision)
-        return array
+        if isinstance(value, jax.Array):
+            floating = jnp.issubdtype(value.dtype, np.floating)
+            return value if precision is None or not floating else value.astype(precision)
+        # Through NumPy, or each kind of number would be compiled.
+        array = np.asarray(value)
+        floating = jnp.result_type(float) if precision is None else precision
+        return jax.device_put(array.astype(floating) if array.dtype.kind == "f" else array)
 
     with working_precision(precision):  # float64 stays what it is outside of it
         return jax.tree.map(leaf, tree)

@@ -30,7 +30,7 @@ class Basis(eqx.Module):
     """What the pixels show before any material: flat over the picture's pixels, row by row.
 
     Attributes:
-        points: (P,) surface points.
+        points: what the pixels see, (H, W) or (P,).
         diffuse: sum of I (N·L)+, (P, C); None without lights.
         lobe: the specular basis as a function of n; None without lights or for a model without a specular term.
     """
@@ -49,16 +49,16 @@ def basis(model: type[Material], scene: Scene, *, points: SurfacePoints | None =
         points: what the pixels see, where that is known already.
     """
     points = scene.surface_points() if points is None else points
-    centres, lighting, area = points.flat(), _lighting(scene, points), points.area
+    lighting, area = _lighting(scene, points), points.area
     if not lighting.stacks:
-        return Basis(centres, None, None)
-    diffuse, lobe = diffuse_and_lobe(model, centres, lighting)
+        return Basis(points, None, None)
+    diffuse, lobe = diffuse_and_lobe(model, dataclasses.replace(points, area=None), lighting)
     if area is not None:
-        fine_diffuse, fine_lobe = diffuse_and_lobe(model, area.points.flat(), lighting)
+        fine_diffuse, fine_lobe = diffuse_and_lobe(model, area.points, lighting)
         diffuse = diffuse.at[area.pixel].set(average(area.weight, fine_diffuse), mode="drop")
         if lobe is not None:
             lobe = lobe.over_areas(fine_lobe, area.weight, area.slot.ravel())
-    return Basis(centres, diffuse, lobe)
+    return Basis(points, diffuse, lobe)
 
 
 def _lighting(scene: Scene, points: SurfacePoints) -> Lighting:

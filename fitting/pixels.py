@@ -178,10 +178,10 @@ def _observe(
             read, shot = map(float, noise)
             weight = _inverse_variance(band.values, jnp.asarray(good), (height, width), read, shot, target.step)
         elif total.counts[-1] < height * width:
-            weight = jnp.asarray(good, dtype)
+            weight = jax.device_put(good.astype(dtype))
         if given is not None:
-            stated = jnp.asarray(given[band.rows].ravel(), dtype)
-            weight = stated if weight is None else stated * weight
+            stated = given[band.rows].ravel().astype(dtype)
+            weight = jax.device_put(stated if weight is None else stated * np.asarray(weight))
         return Tile(band.values, weight, band.points, grey)
 
     tiles = each(tile, bands, found)
@@ -205,7 +205,8 @@ def _bands(
 
     def band(first: int, last: int) -> _Band:
         points = scene.surface_points(None if last - first == height else (first, last))
-        allowed = jnp.ravel(points.mask)
+        # Here and below through NumPy, or each conversion would be compiled.
+        allowed = np.asarray(points.mask).ravel()
         if mask is not None:
             allowed = allowed & mask[first:last].ravel()
         if target.streamed:
@@ -218,7 +219,7 @@ def _bands(
     rows = max(TILE_PIXELS // width, ALIGNED_ROWS if target.streamed else 1)
     if at_once or has_pixel_areas(scene) or rows >= height:
         whole = band(0, height)
-        return [whole._replace(values=jnp.asarray(whole.values))]
+        return [whole._replace(values=jax.device_put(whole.values))]
     rows -= rows % ALIGNED_ROWS if rows > ALIGNED_ROWS else 0
     return Stream(lambda i: band(i * rows, min((i + 1) * rows, height)), -(-height // rows))
 
@@ -230,7 +231,7 @@ def _statistics(
     limits = np.inf if level is None else level, -np.inf if dark is None else dark
 
     def of_band(band: _Band) -> tuple[np.ndarray, Statistics]:
-        return jax.device_get(_count(band.values, jnp.ravel(band.points.mask), band.allowed, *limits))
+        return jax.device_get(_count(band.values, np.asarray(band.points.mask).ravel(), band.allowed, *limits))
 
     def together(one: Statistics, other: Statistics) -> Statistics:
         largest = max(one.largest, other.largest)

@@ -5,6 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, Int
 
 from brdf.geometry.base import Shape
@@ -40,5 +41,10 @@ def shapes_met(camera: Camera, shapes: tuple[Shape, ...], column: Any, row: Any)
     return trace(camera, shapes, column, row).met
 
 
-compiled_apart = eqx.filter_jit(apart)
-"""`brdf.precision.apart` as a program: of `trace`, camera, shapes and places it makes what those places see."""
+_compiled = eqx.filter_jit(trace)
+
+
+def traced(camera: Camera, shapes: tuple[Shape, ...], column: Any, row: Any) -> SurfacePoints:
+    """`trace` as a program of its own, inside a program that is being made too."""
+    inside = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((camera, shapes, column, row)))
+    return apart(_compiled, camera, shapes, column, row) if inside else _compiled(camera, shapes, column, row)

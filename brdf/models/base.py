@@ -19,7 +19,9 @@ from abc import abstractmethod
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
@@ -121,7 +123,7 @@ class SpecularMaterial(Material):
         Args:
             n: exponent, at least 0, (...).
         """
-        return jnp.ones_like(n)
+        return jnp.ones_like(n) if isinstance(n, jax.Array) else np.ones_like(n, float)
 
     def specular(self, normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
         """The specular term S; see ``Material.specular``."""

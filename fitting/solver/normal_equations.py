@@ -18,14 +18,15 @@ ambient one, would else seem to differ from it by the rounding of the sums.
 
 import operator
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias, cast
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from brdf.lobes import Lobe
 
@@ -60,6 +61,11 @@ class Picture(eqx.Module):
             weight=None if self.weight is None else choose(self.weight),
             ambient=self.ambient,
         )
+
+    def on_host(self, pixel: Int[np.ndarray, " K"]) -> "Picture":
+        """The same picture, some of its pixels, in NumPy: an XLA gather is ten times slower."""
+        lobe = None if self.lobe is None else self.lobe.on_host(pixel)
+        return replace(replace(self, lobe=None).pixels(lambda a: cast(Any, np.asarray(a)[pixel])), lobe=lobe)
 
     @eqx.filter_jit
     def predicted(self, n: AnyArray, x: Float[AnyArray, "3 C"]) -> Float[Array, "P C"]:
@@ -161,11 +167,11 @@ def _pass(picture: Picture, log_n: Array, count: Array, reference: Array, peak: 
         index, block = step // blocks, step % blocks
         # The last block starts early enough to be whole; what it shares with the one before counts once.
         start = jnp.minimum(block * size, pixels - size)
-        part = picture.pixels(lambda a: jax.lax.dynamic_slice_in_dim(a, start, size))
+        part = picture.pixels(partial(jax.lax.dynamic_slice_in_dim, start_index=start, slice_size=size))
         # Weights of 1 are constants that the compiler leaves out.
         inside = True if pixels % size == 0 else start + jnp.arange(size) >= block * size
         weight = jnp.broadcast_to(jnp.where(inside, part.weights.T, 0), (groups, size))
-        few = part.pixels(lambda a: a[::stride])
+        few = part.pixels(operator.itemgetter(slice(None, None, stride)))
         counts = jnp.broadcast_to(weight[:, ::stride] > 0, (groups, few.target.shape[0]))
         columns, means, n = [jnp.ones((groups, size), dtype)], [], jnp.exp(log_n[index])
         pairs = [(part.diffuse, few.diffuse)]

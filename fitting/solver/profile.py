@@ -141,29 +141,36 @@ def search(
             cell = int(np.argmin(lowest))
             first, last = np.flatnonzero(possible)[[0, -1]]
             if last - first <= 3 and profile.slope[cell] < profile.slope[cell + 1]:
-                found = _refined(problem, profile, cell, position[cell], beyond=1)
+                start = _start(profile, cell, position[cell])
+                if cap is None:
+                    found = gauss_newton(problem, start, GRID_STEP)
+                else:
+                    found = capped_minimum(problem, *log_n[[max(0, cell - 1), min(cell + 2, log_n.size - 1)]], start.x)
                 # A minimum at the end of its reach is none, but for the bounds of the search.
                 if abs(found[0].log_n - position[cell]) < GRID_STEP or found[0].log_n in problem.bounds:
                     return _optimum(*found, problem, *about)
             log_n = log_n[max(0, first - 1) : last + 3]
             profile = solve_linear(sums(pictures, log_n, rough, problem.peak), log_n, rough, problem)
         position, *_ = _cells(profile)
-        candidates = [_refined(problem, profile, cell, position[cell]) for cell in _valleys(profile, problem.tolerance)]
+        candidates = []
+        for cell in _valleys(profile, problem.tolerance):
+            start = _start(profile, cell, position[cell])
+            if cap is None:
+                candidates.append(gauss_newton(problem, start, GRID_STEP))
+            else:
+                candidates.append(capped_minimum(problem, *log_n[cell : cell + 2], start.x))
         # Where the profile is level the best sample may be no worse than what the valleys led to.
         costs = profile.cost.sum(axis=1)
-        if problem.cap is None and np.min(costs) < min(np.sum(point.cost) for point, _ in candidates):
+        if cap is None and np.min(costs) < min(np.sum(point.cost) for point, _ in candidates):
             candidates.append(gauss_newton(problem, Point(*(leaf[np.argmin(costs)] for leaf in profile)), GRID_STEP))
         best = min(candidates, key=lambda candidate: float(np.sum(candidate[0].cost)))
         return _optimum(*best, problem, *about)
 
 
-def _refined(problem: Problem, profile: Point, cell: int, position: float, beyond: int = 0) -> tuple[Point, Sums]:
-    """The minimum in a cell of the grid, or so many beside it."""
+def _start(profile: Point, cell: int, position: float) -> Point:
+    """A point in a cell of the grid, with the coefficients of the nearer end."""
     nearer = cell + int(2 * position > profile.log_n[cell] + profile.log_n[cell + 1])
-    if problem.cap is None:
-        return gauss_newton(problem, Point(position, profile.x[nearer], profile.cost[nearer]), GRID_STEP)
-    ends = profile.log_n[[max(0, cell - beyond), min(cell + 1 + beyond, len(profile.log_n) - 1)]]
-    return capped_minimum(problem, *ends, profile.x[nearer])
+    return Point(position, profile.x[nearer], profile.cost[nearer])
 
 
 def fit_tied(

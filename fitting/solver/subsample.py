@@ -150,8 +150,8 @@ def subsample(pictures: Sequence[Picture]) -> Subsample:
     size = max(SMALLEST_SAMPLE, SAMPLE_SIZE // len(pictures))
     parts, factors, nearest = [], [], math.inf
     for picture in pictures:
-        weight = None if picture.weight is None else np.asarray(picture.weights)
-        counts = None if weight is None else np.max(weight, axis=1) > 0
+        weight = None if picture.weight is None else np.asarray(picture.weight)
+        counts = None if weight is None else np.max(weight.reshape(len(weight), -1), axis=1) > 0
         index, factor = np.arange(picture.target.shape[0]) if counts is None else np.flatnonzero(counts), None
         if picture.lobe is not None and index.size:
             distance = -np.asarray(picture.lobe.peak)
@@ -159,11 +159,9 @@ def subsample(pictures: Sequence[Picture]) -> Subsample:
             wanted = max(SMALLEST_SAMPLE, min(size, _TERMS // picture.lobe.samples))
             if index.size > wanted + wanted // 4:
                 index, factor = _stratified(distance, counts, wanted)
-        # Through NumPy: an XLA gather is ten times slower.
-        lobe = None if picture.lobe is None else picture.lobe.on_host(index)
-        part = replace(picture, lobe=None).pixels(lambda a, index=index: np.asarray(a)[index])  # pyright: ignore[reportArgumentType]
+        part = picture.on_host(index)
         weight = part.weights if factor is None else part.weights * factor[:, None]
-        parts.append(replace(part, lobe=lobe, weight=weight))
+        parts.append(replace(part, weight=weight))
         factors.append(factor)
     return Subsample(parts, factors, nearest)
 

@@ -45,14 +45,14 @@ def highlight(pictures: Sequence[Picture], n: float) -> Highlight:
         pictures: with a lobe.
         n: exponent.
     """
-    largest, pixels, peak = 0.0, 0.0, -math.inf
+    largest, pixels = 0.0, 0.0
     for picture in pictures:
         if picture.lobe is not None:
-            value, squares, nearest = (float(v) for v in _measured(picture, np.asarray(n)))
-            largest, peak = max(largest, value), max(peak, nearest)
+            value, squares = (float(v) for v in _measured(picture, np.asarray(n)))
+            largest = max(largest, value)
             # Squares of a highlight that no pixel sees fall below the smallest number.
             pixels += squares / value**2 if squares > 0 and value**2 > 0 else 0.0
-    peak = min(peak, 0.0)
+    peak = min(nearest_peak(pictures), 0.0)
     return Highlight(largest, pixels, peak, math.exp(n * peak))
 
 
@@ -62,7 +62,14 @@ def nearest_peak(pictures: Sequence[Picture]) -> float:
     Args:
         pictures: with or without a lobe.
     """
-    return max((float(_nearest_peak(picture)) for picture in pictures if picture.lobe is not None), default=0.0)
+    peaks = []
+    for picture in pictures:
+        if picture.lobe is not None:
+            peak = np.asarray(picture.lobe.peak)
+            if picture.weight is not None:
+                peak = peak[np.any(np.asarray(picture.weight).reshape(len(peak), -1) > 0, axis=1)]
+            peaks.append(float(np.max(peak, initial=-np.inf)))
+    return max(peaks, default=0.0)
 
 
 def _where_counted(picture: Picture, values: Array, otherwise: float) -> Array:
@@ -72,13 +79,7 @@ def _where_counted(picture: Picture, values: Array, otherwise: float) -> Array:
 
 
 @eqx.filter_jit
-def _nearest_peak(picture: Picture) -> Array:
-    assert picture.lobe is not None
-    return jnp.max(_where_counted(picture, picture.lobe.peak, -jnp.inf))
-
-
-@eqx.filter_jit
-def _measured(picture: Picture, n: AnyArray) -> tuple[Array, Array, Array]:
+def _measured(picture: Picture, n: AnyArray) -> tuple[Array, Array]:
     assert picture.lobe is not None
     value = _where_counted(picture, jnp.max(picture.lobe(jnp.asarray(n))[0], axis=1), 0)
-    return jnp.max(value), jnp.sum(value * value), _nearest_peak(picture)
+    return jnp.max(value), jnp.sum(value * value)

@@ -3,10 +3,8 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from fitting.pixels import Tile
 from fitting.solver.normal_equations import AnyArray, Picture
@@ -73,7 +71,7 @@ def residual_correlation(
         count += first.size
         pairs = np.zeros((2, most), np.int32)
         pairs[:, : first.size] = first, second
-        residual, root, value = _residuals(picture, pairs, np.asarray(optimum.n), optimum.x)
+        residual, root, value = _residuals(picture, pairs, optimum.n, optimum.x)
         scaled = np.asarray(residual, np.float64) * np.sqrt(np.asarray(root, np.float64))
         one, other = scaled.reshape(2, most, -1)[:, : first.size]
         products += np.stack([np.sum(one * other, axis=0), np.sum(one * one, axis=0), np.sum(other * other, axis=0)])
@@ -102,12 +100,12 @@ def _neighbours(counted: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]
     return first, second
 
 
-@eqx.filter_jit
-def _residuals(picture: Picture, pairs: AnyArray, n: AnyArray, x: AnyArray) -> tuple[Array, Array, Array]:
-    some = picture.pixels(lambda a: jnp.take(a, pairs.ravel(), axis=0))
-    model = some.predicted(n, x)
-    weight = jnp.ones((1, 1), model.dtype) if some.weight is None else some.weight.reshape(pairs.size, -1)
-    return jnp.where(weight > 0, some.target - model, 0), weight, model
+def _residuals(picture: Picture, pairs: AnyArray, n: float, x: AnyArray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Residual, weight and model of so few pixels: on the host, where nothing is compiled."""
+    some = picture.on_host(pairs.ravel())
+    value = 0.0 if some.lobe is None else some.lobe(np.float64(n))[0]
+    model = x[0] * some.ambient + x[1] * some.diffuse + x[2] * value
+    return np.where(some.weights > 0, some.target - model, 0), some.weights, model
 
 
 def correlation_in_rows(residuals: Sequence[Float[np.ndarray, "H W C"]], share_left: float) -> ResidualCorrelation:
