@@ -19,6 +19,7 @@ from fitting.plausible import fit_plausible, is_plausible
 from fitting.problem import FitProblem
 from fitting.result import FitResult
 from fitting.selection import FAMILIES, Choice, choose
+from fitting.solver.devices import placed
 from fitting.solver.losses import reweight
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum, fit_tied, search
@@ -115,7 +116,9 @@ def _fit_model(
     free = seen.reached(model) if free is None else free
     if pictures is None:
         make = partial(_picture, model)
-        pictures = each(make, seen.tiles) if seen.problem.streamed else list(map(make, seen.tiles))
+        pictures = each(make, seen.tiles)
+        if not seen.problem.streamed:
+            pictures = [placed(index, picture) for index, picture in enumerate(pictures)]
     n_range = seen.problem.n_range
     if free[2].any():
         # Exponents of which some pixel sees at least a trace: with larger ones k_s could be anything.

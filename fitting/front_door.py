@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from typing import Any
 
+from jax.sharding import Mesh
+
 import brdf
 from brdf.errors import InputError
 from brdf.precision import Precision
@@ -10,6 +12,7 @@ from fitting.budget.escalation import fit_within
 from fitting.core import fit_pictures
 from fitting.problem import state_problem
 from fitting.report import FitResult
+from fitting.solver.devices import spread_over
 from fitting.solver.losses import Loss
 
 
@@ -29,6 +32,7 @@ def fit(
     plausible: bool = False,
     accuracy: float | None = None,
     seconds: float | None = None,
+    mesh: Mesh | None = None,
 ) -> FitResult:
     """Fit a material to a picture, or to several pictures of one material: the global optimum, with no start to give.
 
@@ -56,6 +60,9 @@ def fit(
             precision that keep it are chosen, see `fitting.budget.escalation`; the result's ``choice`` says which and
             why. None looks at all pixels under the lights as they are.
         seconds: the same for the time to spend; what it buys is the most accurate fit.
+        mesh: of the devices to spread the pixels over, on one machine or, under `jax.distributed`, on many: each
+            process calls this with the same arguments and has the same result. A file is read by bands of rows, of
+            which every pass takes those of its own devices. None takes the one device that JAX does.
 
     Returns:
         The result.
@@ -86,7 +93,12 @@ def fit(
         plausible=plausible,
     )
     if accuracy is None and seconds is None:
-        return fit_pictures(problem)
+        with spread_over(mesh):
+            return fit_pictures(problem)
+    if mesh is not None:
+        raise InputError(
+            "mesh", "spreads all pixels over devices; accuracy and seconds choose some", "Give one of them"
+        )
     if problem.streamed:
         words = "is read by bands of rows; accuracy and seconds choose among pixels in memory"
         raise InputError("target", words, "Read it with brdf.read_image, or leave accuracy and seconds out")

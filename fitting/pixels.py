@@ -20,6 +20,7 @@ from brdf.models.base import SpecularMaterial
 from brdf.precision import Precision
 from fitting.light_colour import take_colour_out
 from fitting.problem import TOP, FitProblem, Target, has_pixel_areas
+from fitting.solver.devices import device_count
 from fitting.solver.streams import Stream, each, joined
 
 # How many pixels are taken together; of a file at least as many rows as its blocks hold, or these are read twice.
@@ -217,6 +218,7 @@ def _bands(
         return _Band(slice(first, last), values, points, allowed)
 
     rows = max(TILE_PIXELS // width, ALIGNED_ROWS if target.streamed else 1)
+    rows = min(rows, -(-height // device_count()))
     if at_once or has_pixel_areas(scene) or rows >= height:
         whole = band(0, height)
         return [whole._replace(values=jax.device_put(whole.values))]

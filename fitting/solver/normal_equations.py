@@ -17,7 +17,7 @@ ambient one, would else seem to differ from it by the rounding of the sums.
 """
 
 import operator
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple, TypeAlias, cast
@@ -29,6 +29,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from brdf.lobes import Lobe
+from fitting.solver.devices import device_count, gathered, own, placed
 
 # On the host or on the device.
 AnyArray: TypeAlias = jax.Array | np.ndarray
@@ -202,9 +203,9 @@ def _pass(picture: Picture, log_n: Array, count: Array, reference: Array, peak: 
     return jax.lax.fori_loop(0, count * blocks, add_block, start)
 
 
-def _unpack(packed: np.ndarray, mean: np.ndarray, picture: Picture) -> Sums:
+def _unpack(packed: np.ndarray, mean: np.ndarray, ambient: AnyArray, channels: int) -> Sums:
     """Undo the packing, and what was done to the columns; the blocks together."""
-    channels, groups = picture.target.shape[1], packed.shape[2]
+    groups = packed.shape[2]
     residuals = channels // groups
     i, j = np.array(_summed(4, residuals)).T
     products = np.zeros((*packed.shape[:3], *(4 + residuals,) * 2))
@@ -222,14 +223,16 @@ def _unpack(packed: np.ndarray, mean: np.ndarray, picture: Picture) -> Sums:
     totals = [np.sum(leaf, axis=1) for leaf in columns._replace(gram=whole)]
     found = Sums(*(leaf.reshape(len(packed), channels, *leaf.shape[3:]) for leaf in totals))
     lit = np.zeros((channels, 4, 4)) + np.eye(4)
-    lit[:, 0, 0] = picture.ambient
+    lit[:, 0, 0] = ambient
     return found.columns(lit)
 
 
 def sums(
-    pictures: Iterable[Picture], log_n: Float[np.ndarray, " N"], reference: Float[np.ndarray, "C 3"], peak: float = 0.0
+    pictures: Sequence[Picture], log_n: Float[np.ndarray, " N"], reference: Float[np.ndarray, "C 3"], peak: float = 0.0
 ) -> Sums:
     """One pass over the pixels of one or many pictures, each let go before the next is asked for.
+
+    Under a mesh each process makes those of its own devices (`fitting.solver.devices`).
 
     The columns are ambient, diffuse, lobe, and the derivative of that by log n; the last two are 0 without a lobe.
 
@@ -246,10 +249,20 @@ def sums(
     for first in range(0, len(log_n), _MOST_EXPONENTS):
         some = log_n[first : first + _MOST_EXPONENTS]
         padded = np.pad(some, (0, _MOST_EXPONENTS - some.size))
-        parts = []
-        for picture in pictures:
+        passed = {}
+        for index in own(len(pictures)):
+            picture = placed(index, pictures[index])
             found = _pass(picture, padded, np.int32(some.size), reference.T, np.float64(peak))
+            # Under a mesh the next device begins before this one is done.
+            passed[index] = jax.block_until_ready(found) if device_count() == 1 else found, picture.ambient
+        parts = {}
+        for index, (found, ambient) in passed.items():
             packed, mean = (np.asarray(leaf)[: some.size].astype(np.float64) for leaf in found)
-            parts.append(_unpack(packed, mean, picture))
-        totals.append(Sums(*map(sum, zip(*parts, strict=True))))
+            part = _unpack(packed, mean, ambient, len(reference))
+            parts[index] = np.concatenate([leaf.reshape(some.size, -1) for leaf in part], axis=1)
+        channels = len(reference)
+        table = np.sum(gathered(parts, len(pictures), (some.size, 22 * channels)), axis=0)
+        gram, product, square, pixels = np.split(table, np.cumsum([16, 4, 1]) * channels, axis=1)
+        gram, product = gram.reshape(-1, channels, 4, 4), product.reshape(-1, channels, 4)
+        totals.append(Sums(gram, product, square, pixels))
     return Sums(*map(np.concatenate, zip(*totals, strict=True)))

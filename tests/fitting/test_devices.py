@@ -1,0 +1,99 @@
+"""A fit over several devices, and over two processes, gives the numbers of one; a process that dies is told."""
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from project_paths import ROOT
+from small_ball import ball_scene, pictured
+
+import brdf
+import fitting
+
+MATERIAL = brdf.BlinnPhong(k_a=[0.2, 0.1, 0.15], k_d=[0.5, 0.4, 0.3], k_s=[0.3, 0.3, 0.4], n=35.0)
+PATH = os.pathsep.join([str(ROOT), str(ROOT / "tests/support")])
+
+
+def numbers(result: fitting.FitResult) -> np.ndarray:
+    return np.array([[float(one), one.error] for one in result.parameters])
+
+
+def expected() -> np.ndarray:
+    picture = pictured(MATERIAL, ball_scene(), 0.01)
+    return numbers(fitting.fit(picture, ball_scene(), model="blinn-phong", precision="float64"))
+
+
+def run_two(folder: Path, how: str) -> list[tuple[int, str]]:
+    """Exit status and what was said on standard error, of each process."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    program = ROOT / "tests/support/two_processes.py"
+    environment = {**os.environ, "PYTHONPATH": PATH, "JAX_PLATFORMS": "cpu"}
+    pair = [
+        subprocess.Popen(
+            [sys.executable, str(program), str(rank), str(port), str(folder), how],
+            env=environment,
+            cwd=ROOT,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for rank in (0, 1)
+    ]
+    try:
+        said = [one.communicate(timeout=300)[1] for one in pair]
+    finally:
+        for one in pair:
+            one.kill()
+    return [(one.returncode, text) for one, text in zip(pair, said, strict=True)]
+
+
+def test_two_devices_of_one_process(tmp_path):
+    program = (
+        "import jax, numpy as np, test_devices as t, fitting\n"
+        "from small_ball import ball_scene, pictured\n"
+        "mesh = jax.make_mesh((2,), ('pixels',))\n"
+        "one = pictured(t.MATERIAL, ball_scene(), 0.01)\n"
+        "fit = fitting.fit(one, ball_scene(), model='blinn-phong', precision='float64', mesh=mesh)\n"
+        "np.savez('numbers', numbers=t.numbers(fit))\n"
+    )
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
+    path = os.pathsep.join([PATH, str(ROOT / "tests/fitting")])
+    environment = {**os.environ, "PYTHONPATH": path, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags}
+    subprocess.run([sys.executable, "-c", program], env=environment, cwd=tmp_path, check=True, timeout=300)
+    with np.load(tmp_path / "numbers.npz") as found:
+        np.testing.assert_allclose(found["numbers"], expected(), rtol=1e-12)
+
+
+def test_two_processes(tmp_path):
+    ended = run_two(tmp_path, "lives")
+    assert [status for status, _ in ended] == [0, 0], ended
+    for rank in (0, 1):
+        with np.load(tmp_path / f"{rank}.npz") as found:
+            np.testing.assert_allclose(found["numbers"], expected(), rtol=1e-12)
+
+
+def test_a_process_that_dies_is_told_and_leaves_nothing_that_looks_whole(tmp_path):
+    start = time.monotonic()
+    (status, said), _ = run_two(tmp_path, "dies")
+    assert time.monotonic() - start < 120
+    assert status == 2, said
+    assert "error: mesh: has lost a process" in said
+    assert not list(tmp_path.glob("*.npz"))
+
+
+def test_a_mesh_of_one_device_and_what_is_none():
+    picture = pictured(MATERIAL, ball_scene(), 0.01)
+    mesh = jax.make_mesh((1,), ("pixels",))
+    found = fitting.fit(picture, ball_scene(), model="blinn-phong", precision="float64", mesh=mesh)
+    np.testing.assert_allclose(numbers(found), expected(), rtol=1e-12)
+    with pytest.raises(brdf.InputError, match=r"mesh: must be a jax.sharding.Mesh, got int"):
+        fitting.fit(picture, ball_scene(), mesh=2)
+    with pytest.raises(brdf.InputError, match="accuracy and seconds choose some"):
+        fitting.fit(picture, ball_scene(), mesh=mesh, accuracy=0.1)

@@ -1,0 +1,48 @@
+"""A process of two that fit together over a mesh: rank, port, folder of the results, and when to be killed.
+
+Run as a program by the tests; what it finds is written whole as ``RANK.npz``.
+"""
+
+import os
+import signal
+import sys
+from pathlib import Path
+
+import jax
+
+rank, port, folder, dies = int(sys.argv[1]), sys.argv[2], Path(sys.argv[3]), sys.argv[4] == "dies"
+jax.config.update("jax_cpu_collectives_implementation", "gloo")
+jax.distributed.initialize(f"127.0.0.1:{port}", num_processes=2, process_id=rank, heartbeat_timeout_seconds=20)
+
+import numpy as np  # noqa: E402
+from small_ball import SIZE, ball_scene, pictured  # noqa: E402
+
+import brdf  # noqa: E402
+import fitting  # noqa: E402
+from fitting.solver import normal_equations  # noqa: E402
+
+if dies and rank == 1:
+    gather, calls = normal_equations.gathered, []
+
+    def killed(*arguments):
+        """The second pass over the pixels is the last."""
+        calls.append(0)
+        if len(calls) == 2:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return gather(*arguments)
+
+    normal_equations.gathered = killed
+
+material = brdf.BlinnPhong(k_a=[0.2, 0.1, 0.15], k_d=[0.5, 0.4, 0.3], k_s=[0.3, 0.3, 0.4], n=35.0)
+picture = pictured(material, ball_scene(), 0.01)
+mesh = jax.make_mesh((jax.device_count(),), ("pixels",))
+try:
+    result = fitting.fit(picture, ball_scene(), model="blinn-phong", precision="float64", mesh=mesh)
+except brdf.InputError as error:
+    print(f"error: {error}", file=sys.stderr, flush=True)  # noqa: T201
+    os._exit(2)
+assert result.pixels < SIZE * SIZE
+numbers = [[float(one), one.error] for one in result.parameters]
+with (folder / f"{rank}.part").open("wb") as file:
+    np.savez(file, numbers=np.array(numbers))
+(folder / f"{rank}.part").rename(folder / f"{rank}.npz")
