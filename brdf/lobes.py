@@ -211,8 +211,12 @@ class Lobe(eqx.Module):
                 xp: Any = np if isinstance(log_cosine, np.ndarray) else jnp
                 exponent = xp.minimum(log_cosine - xp.asarray(peak, log_cosine.dtype), 0)
                 power = xp.exp(n * exponent if xp is np else jnp.asarray(n, exponent.dtype) * exponent)
-                value = value + _over_samples(power, weight)
-                slope = slope + _over_samples(power * exponent, weight)
+                if xp is np:
+                    value = value + _over_samples(power, weight)
+                    slope = slope + _over_samples(power * exponent, weight)
+                    continue
+                value = value + jnp.sum(power[..., None] * weight, axis=-2)
+                slope = slope + jnp.sum((power * exponent)[..., None] * weight, axis=-2)
         else:
             assert self.model is not None
             value, slope = sum_over_samples(self.model, *self.source, partial(_relative, n, peak))
@@ -273,12 +277,10 @@ class Lobe(eqx.Module):
         return xp.where((slot >= 0)[:, None], xp.take(fine, xp.maximum(slot, 0), axis=-2), centre)
 
 
-def _over_samples(power: Any, weight: Any) -> Any:
-    if isinstance(power, np.ndarray):
-        # NumPy is slow where the last axes are short.
-        alone = weight.shape[1:] == (1, 1)
-        return (power[..., 0] * weight[:, 0, 0])[..., None] if alone else np.einsum("...ps,psc->...pc", power, weight)
-    return jnp.sum(power[..., None] * weight, axis=-2)
+def _over_samples(power: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    # NumPy is slow where the last axes are short.
+    alone = weight.shape[1:] == (1, 1)
+    return (power[..., 0] * weight[:, 0, 0])[..., None] if alone else np.einsum("...ps,psc->...pc", power, weight)
 
 
 def _relative(n: Scalar, peak: Scalar | float, terms: LightTerms) -> tuple[Array, Array]:

@@ -18,7 +18,7 @@ from brdf.errors import InputError
 from brdf.files import as_path
 from brdf.geometry.base import Shape
 from brdf.geometry.camera import Camera
-from brdf.geometry.rays import traced
+from brdf.geometry.rays import tracing
 from brdf.geometry.surface_points import PixelArea, SurfacePoints
 from brdf.lights.base import Light
 from brdf.pixel_area import with_area
@@ -148,7 +148,7 @@ class Scene(Checked):
             points = self.points if rows is None else jax.tree.map(lambda leaf: leaf[first:stop], self.points)
         else:
             column, row = np.arange(width)[None, :] + 0.5, np.arange(first, stop)[:, None] + 0.5
-            points = traced(self.camera, self.shapes, column, row)
+            points = tracing(self.camera, self.shapes)(self.camera, self.shapes, column, row)
         visibility, given = None, [mask for mask in self.visibility if mask is not None]
         if given:
             masks = [jnp.ones_like(given[0]) if mask is None else mask for mask in self.visibility]
@@ -234,7 +234,8 @@ def some_pixels(
             points = _chosen(cast(scene.points, precision), pixel)
         elif scene.camera.samples == 1:
             width = scene.camera.resolution[0]
-            points = traced(scene.camera, scene.shapes, pixel % width + 0.5, pixel // width + 0.5)
+            column, row = pixel % width + 0.5, pixel // width + 0.5
+            points = tracing(scene.camera, scene.shapes, pixel)(scene.camera, scene.shapes, column, row)
         else:
             points = _chosen(cast(scene, precision).surface_points(), pixel)
         # The points know which shape they lie on by its place in the list, so all shapes stay.

@@ -128,7 +128,7 @@ def _fit_model(
         else:
             free[2] = False
     optimise = partial(search, n_min=n_range[0], n_max=n_range[1], free=free)
-    found = reweight(pictures, optimise, seen.problem.loss, seen.rounding)
+    found = reweight(pictures, optimise(pictures), optimise, seen.problem.loss, seen.rounding)
     return ModelFit(model, found.pictures, found.optimum, free, n_range, None, found.noise_factor)
 
 

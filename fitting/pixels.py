@@ -5,6 +5,7 @@ what the solver needs of that a third of it. A picture in a file is not even kep
 """
 
 import functools
+import itertools
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -133,7 +134,7 @@ def observe(problem: FitProblem, *, at_once: bool = False) -> Observed:
     """
     light = take_colour_out(problem.scenes, problem.targets[0].pixels.shape[-1])
     given = zip(problem.targets, problem.scenes, light.scenes, problem.masks, problem.weights, strict=True)
-    parts = [_observe(problem, *part, at_once) for part in given]
+    parts = itertools.starmap(functools.partial(_observe, problem, at_once), given)
     tiles, rounding, brightest, counts, shown, scenes, counted = (list(part) for part in zip(*parts, strict=True))
     left_out: Counter[str] = Counter()
     for some in counts:
@@ -152,7 +153,7 @@ def observe(problem: FitProblem, *, at_once: bool = False) -> Observed:
 
 
 def _observe(
-    problem: FitProblem, target: Target, scene: brdf.Scene, grey: brdf.Scene, mask: Any, given: Any, at_once: bool
+    problem: FitProblem, at_once: bool, target: Target, scene: brdf.Scene, grey: brdf.Scene, mask: Any, given: Any
 ) -> tuple[Any, ...]:
     """Tiles, rounding, brightest value, pixels left out, and what is shown: see `Observed`."""
     dtype, noise, dark = np.dtype(problem.precision), problem.noise, problem.dark

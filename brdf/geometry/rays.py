@@ -1,5 +1,7 @@
 """What a camera's rays meet first."""
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -44,7 +46,7 @@ def shapes_met(camera: Camera, shapes: tuple[Shape, ...], column: Any, row: Any)
 _compiled = eqx.filter_jit(trace)
 
 
-def traced(camera: Camera, shapes: tuple[Shape, ...], column: Any, row: Any) -> SurfacePoints:
-    """`trace` as a program of its own, inside a program that is being made too."""
-    inside = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((camera, shapes, column, row)))
-    return apart(_compiled, camera, shapes, column, row) if inside else _compiled(camera, shapes, column, row)
+def tracing(*arguments: Any) -> Callable[..., SurfacePoints]:
+    """`trace` as a program of its own, inside a program of its arguments that is being made too."""
+    inside = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments))
+    return partial(apart, _compiled) if inside else _compiled

@@ -66,6 +66,7 @@ class Reweighted(NamedTuple):
 
 def reweight(
     pictures: Sequence[Picture],
+    optimum: Optimum,
     optimise: Callable[[Sequence[Picture]], Optimum],
     loss: Loss,
     rounding: Float[np.ndarray, " C"],
@@ -74,11 +75,12 @@ def reweight(
 
     Args:
         pictures: as for the search.
-        optimise: the squared fit.
+        optimum: of the squared fit.
+        optimise: that fit.
         loss: one of `LOSSES`.
         rounding: standard deviation of a value's rounding, (C,); no scale is smaller.
     """
-    now, optimum, robust = pictures, optimise(pictures), loss in ("huber", "cauchy")
+    now, robust = pictures, loss in ("huber", "cauchy")
     if loss == "squared":
         return Reweighted(optimum, pictures)
     scale = rounding if robust else DARKEST * _mean(pictures)
