@@ -6,6 +6,7 @@ leaves is compared in the codes of the file, the same numbers under both, with t
 """
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +26,14 @@ LESS = 0.9
 CLEARLY = 0.5
 
 
-def fit_either(given: Given, **how: Any) -> tuple[FitResult, tuple[str, ...]]:
+def fit_either(
+    given: Given, say: Callable[[str], None] = lambda what: None, **how: Any
+) -> tuple[FitResult, tuple[str, ...]]:
     """Fit, where a file does not say how it is encoded under both interpretations.
 
     Args:
         given: to the command.
+        say: what is being done.
         how: further arguments of `fitting.fit`; seconds are shared by the two fits.
 
     Returns:
@@ -41,9 +45,13 @@ def fit_either(given: Given, **how: Any) -> tuple[FitResult, tuple[str, ...]]:
     silent = {path: picture for path, picture in given.pictures.items() if picture.source == "assumed"}
     if silent and how["seconds"] is not None:
         how["seconds"] /= 2
+    count = len(given.pictures)
+    what = f"fitting {count} pictures" if count > 1 else "fitting"
+    say(f"{what} as {_name(next(iter(silent.values())).encoding)}" if silent else what)
     inputs, result = _fit(given, {}, how)
     if not silent:
         return result, inputs.notes
+    say(f"{what} as {_name(_other(next(iter(silent.values()))))}")
     try:
         others = {path: brdf.read_picture(path, encoding=_other(picture)) for path, picture in silent.items()}
         other_inputs, other = _fit(given, others, how)
@@ -67,6 +75,10 @@ def _fit(given: Given, others: dict[Path, brdf.Picture], how: dict[str, Any]) ->
 
 def _other(picture: brdf.Picture) -> Any:
     return "srgb" if picture.encoding == "linear" else "linear"
+
+
+def _name(encoding: Any) -> str:
+    return "sRGB" if encoding == "srgb" else str(encoding)
 
 
 def _unexplained(inputs: FitInputs, result: FitResult, counted: list[np.ndarray] | None) -> float:
@@ -99,7 +111,7 @@ def judge(target: Path, picture: brdf.Picture, shares: tuple[float, float]) -> t
     if assumed < CLEARLY * other:
         return False, []
     is_other, is_clear = other < LESS * assumed, other < CLEARLY * assumed
-    names = ["sRGB" if one == "srgb" else str(one) for one in (picture.encoding, _other(picture))]
+    names = [_name(one) for one in (picture.encoding, _other(picture))]
     left = [f"{100 * share**0.5:.{2 if share < 0.99 else 3}g} %" for share in shares]
     (taken, refused), (least, most) = (names[::-1], left[::-1]) if is_other else (names, left)
     reads = f"read as {taken}, under which" if is_clear else f"{taken} is a guess. Under it"

@@ -3,6 +3,7 @@
 import json
 import shlex
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -71,7 +72,7 @@ def fit(
         # Told now instead of after the fit.
         check_folder(out)
     notes: tuple[str, ...] = ()
-    with waiting("fitting"):
+    with waiting("reading") as say:
         if len(target) == 1 and is_measured(target[0]):
             if any([*pictures, dark, noise, plausible, accuracy, seconds, report, precision != "float32"]):
                 came = "is a measured BRDF; of the options only --model, --loss, --out, --plot and --json concern it"
@@ -80,6 +81,7 @@ def fit(
             use_compilation_cache()
             import fitting
 
+            say("fitting")
             with named_as({table.name: target[0]}):
                 result = fitting.fit_brdf(table, model, loss=loss or "cosine")  # pyright: ignore[reportArgumentType]
         else:
@@ -88,6 +90,7 @@ def fit(
                 pictures,
                 noise,
                 accuracy,
+                say,
                 model=model,
                 precision=precision,
                 saturation=pictures.saturation,
@@ -97,8 +100,10 @@ def fit(
                 seconds=seconds,
             )
         if out is not None:
+            say("saving and drawing" if plot else "saving")
             result.save(out, **({"plot": True} if plot else {}))
         if report is not None:
+            say("drawing the page")
             from fitting.report.html import report_page
 
             command = shlex.join(["brdf", *sys.argv[1:]])
@@ -112,7 +117,9 @@ def fit(
     show("\n".join([*notes, str(result), *saved, *written]))
 
 
-def _fit_pictures(target: Any, pictures: Any, noise: Any, accuracy: Any, **how: Any) -> tuple[Any, tuple[str, ...]]:
+def _fit_pictures(
+    target: Any, pictures: Any, noise: Any, accuracy: Any, say: Callable[[str], None], **how: Any
+) -> tuple[Any, tuple[str, ...]]:
     """The fit, and what was found out on the way."""
     from fitting.cli.inputs import read_inputs
     from fitting.photographs.light_files import parse_numbers
@@ -124,4 +131,4 @@ def _fit_pictures(target: Any, pictures: Any, noise: Any, accuracy: Any, **how: 
 
     how["noise"] = None if noise is None else tuple(parse_numbers(noise, "--noise", 2, "READ,SHOT"))
     how["accuracy"] = None if accuracy is None else OnlyFit(accuracy)
-    return fit_either(given, **how)
+    return fit_either(given, say, **how)

@@ -1,14 +1,14 @@
 """``brdf lights``: directions of distant lights from photographs of a ball."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 import brdf
 from brdf.errors import InputError
 from brdf.files import write_text
-from fitting.cli.common import Encoding, PictureOptions, named_as, show
+from fitting.cli.common import Encoding, PictureOptions, named_as, show, waiting
 
 EXAMPLE = "Example: [bold]brdf lights chrome.*.png --sphere 253.5,148,119.5 --out lights.txt[/bold]"
 
@@ -40,6 +40,16 @@ def lights(
     for name, given in (("--ambient", ambient), ("--saturation", saturation is not None)):
         if given and not matt:
             raise InputError(name, "says nothing of a mirror ball's highlight", "Leave it out, or add --matt")
+    with waiting("finding the lights"):
+        lines = _lines(target, sphere, mask, encoding, matt, PictureOptions(ambient=ambient, saturation=saturation))
+    text = "\n".join(lines)
+    if out is not None:
+        write_text(out, text + "\n")
+    show(text if out is None else f"wrote {out}")
+
+
+def _lines(target: Any, sphere: str, mask: Any, encoding: Any, matt: bool, options: PictureOptions) -> list[str]:
+    """What the text file holds: remarks, and a direction for each photograph."""
     from fitting.cli.inputs import ball_in, light_of, stated_error, visible
 
     pictures = [brdf.read_picture(path, encoding=encoding) for path in target]
@@ -49,7 +59,6 @@ def lights(
     from fitting.photographs.ball import ball_points
     from fitting.photographs.distant_light import light_from_highlight
 
-    options = PictureOptions(ambient=ambient, saturation=saturation)
     for path, picture, counts in zip(target, pictures, visible(inside, pictures), strict=True):
         if matt:
             light = light_of(path, picture, counts, ball_points(picture.pixels.shape[:2], circle), options)
@@ -58,7 +67,4 @@ def lights(
             with named_as({"picture": path}):
                 direction, error = light_from_highlight(picture, circle, mask=True if counts is None else counts), ""
         lines.append(" ".join(f"{value:.6f}" for value in direction) + error)
-    text = "\n".join(lines)
-    if out is not None:
-        write_text(out, text + "\n")
-    show(text if out is None else f"wrote {out}")
+    return lines
