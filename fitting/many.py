@@ -16,6 +16,7 @@ from typing import Any, overload
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float
 
 import brdf
@@ -30,6 +31,7 @@ from fitting.light_colour import take_colour_out
 from fitting.pixels import SYMMETRIC_PIXELS
 from fitting.problem import TOP, FitProblem, state_problem
 from fitting.report import FitResult
+from fitting.solver.devices import device_count, gathered, own, placed, spread_over
 
 # So many pictures at a time: their columns stay in the processor's cache.
 BATCH = 16
@@ -129,6 +131,7 @@ def fit_many(
     precision: Precision = "float32",
     mask: Any = None,
     n_range: tuple[float, float] = (0.1, 1e6),
+    mesh: Mesh | None = None,
 ) -> ManyFits:
     """Fit a material to each of many pictures of one size, as `fitting.fit` does to one.
 
@@ -140,6 +143,7 @@ def fit_many(
         precision: "float32" or "float64".
         mask: (H, W), pixels to look at in every picture, or a list of one for each.
         n_range: bounds of the exponent.
+        mesh: of the devices to deal the pictures out to, see `fitting.fit`; where a model is named.
 
     Returns:
         The fits: ``fits.n``, ``fits.k_d`` are arrays, ``fits[i]`` is the result of one.
@@ -163,7 +167,7 @@ def fit_many(
         raise InputError("pictures", f"{came}, and are fitted together", "Give arrays of one size, or call fitting.fit")
     if problem.model == "auto":
         return ManyFits(problem, None, {})
-    with working_precision(problem.precision):
+    with working_precision(problem.precision), spread_over(mesh):
         numbers, plain = _fit_together(problem)
     done = {int(i): fit_pictures(_one(problem, i)) for i in np.flatnonzero(~plain)}
     for index, result in done.items():
@@ -206,15 +210,14 @@ def _fit_together(problem: FitProblem) -> tuple[dict[str, np.ndarray], Bool[np.n
         choose = functools.partial(_chosen, pixel)
         images = Basis(images.points, choose(images.diffuse), images.lobe and images.lobe.pixels(choose))
         few = jnp.asarray(np.take(targets.reshape(count, -1, channels), pixel, axis=1))
-        solution = _in_one_scene(few, images, scenes[0].ambient, problem.n_range)
+        solution = _dealt_out(_in_one_scene, (few,), (images, scenes[0].ambient), problem.n_range)
     else:
         solution = None
         for some in _of_one_structure(scenes):
             stack = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(scenes[i] for i in some))
             lit = _bases(model, stack)
-            part = _in_scenes_of_their_own(
-                jnp.asarray(targets[some]), jnp.asarray(seen[some]), lit, stack.ambient, problem.n_range
-            )
+            parts = jnp.asarray(targets[some]), jnp.asarray(seen[some]), lit, stack.ambient
+            part = _dealt_out(_in_scenes_of_their_own, parts, (), problem.n_range)
             if solution is None:
                 solution = jax.tree.map(lambda leaf: np.zeros((count, *leaf.shape[1:]), leaf.dtype), part)
             jax.tree.map(lambda whole, leaf, some=some: whole.__setitem__(some, leaf), solution, part)
@@ -243,6 +246,32 @@ def _of_one_structure(scenes: Sequence[brdf.Scene]) -> Iterator[list[int]]:
         leaves, structure = jax.tree.flatten(scene)
         groups.setdefault((structure, tuple(leaf.shape for leaf in leaves)), []).append(index)
     yield from groups.values()
+
+
+def _dealt_out(solve: Any, pictures: tuple[Any, ...], shared: tuple[Any, ...], n_range: Any) -> Any:
+    """What a program finds of pictures, those of each device of the mesh on that device."""
+    if device_count() == 1:
+        return solve(*pictures, *shared, n_range)
+    count = len(pictures[0])
+    if count < device_count():
+        came = f"has {device_count()} devices for {count} pictures"
+        raise InputError("mesh", came, "Give no more devices than pictures, or leave it out")
+    places = np.array_split(np.arange(count), device_count())
+    found = {}
+    for device in own(device_count()):
+        mine = jax.tree.map(lambda leaf, some=places[device]: leaf[some], pictures)
+        found[device] = solve(*placed(device, mine), *placed(device, shared), n_range)
+    rows, some = {}, None
+    for device, some in found.items():
+        table = np.concatenate([np.reshape(leaf, (len(leaf), -1)) for leaf in jax.tree.leaves(some)], axis=1)
+        rows |= dict(zip(places[device].tolist(), table.astype(np.float64), strict=True))
+    leaves, structure = jax.tree.flatten(some)
+    table = gathered(rows, count, (sum(leaf[0].size for leaf in leaves),))
+    ends = np.cumsum([leaf[0].size for leaf in leaves])[:-1]
+    columns = [
+        part.reshape(count, *leaf.shape[1:]) for part, leaf in zip(np.split(table, ends, 1), leaves, strict=True)
+    ]
+    return jax.tree.unflatten(structure, columns)
 
 
 def _chosen(pixel: np.ndarray, leaf: Any) -> Any:

@@ -22,6 +22,7 @@ from fitting.cli.common import (
     use_compilation_cache,
     waiting,
 )
+from fitting.cli.devices import all_devices, is_first_process
 
 EXAMPLE = "\n\n".join(
     [
@@ -55,6 +56,9 @@ def fit(
         float | None, typer.Option(help="Relative error that is good enough: as few pixels and samples as keep it.")
     ] = None,
     seconds: Annotated[float | None, typer.Option(help="Time to spend: the most accurate fit that it buys.")] = None,
+    devices: Annotated[
+        str | None, typer.Option(help="all: spread the pixels over all cores or accelerators, and processes.")
+    ] = None,
     plot: Annotated[bool, typer.Option("--plot", help="Also draw comparison.png into --out.")] = False,
     report: Annotated[Path | None, typer.Option(help="One .html page with everything, to keep or to send.")] = None,
     as_json: AsJson = False,
@@ -72,9 +76,10 @@ def fit(
         # Told now instead of after the fit.
         check_folder(out)
     notes: tuple[str, ...] = ()
+    mesh = all_devices(devices)
     with waiting("reading") as say:
         if len(target) == 1 and is_measured(target[0]):
-            if any([*pictures, dark, noise, plausible, accuracy, seconds, report, precision != "float32"]):
+            if any([*pictures, dark, noise, plausible, accuracy, seconds, report, mesh, precision != "float32"]):
                 came = "is a measured BRDF; of the options only --model, --loss, --out, --plot and --json concern it"
                 raise InputError(target[0], came, "Leave the others out")
             table = brdf.load_measured(target[0])
@@ -98,7 +103,10 @@ def fit(
                 plausible=plausible,
                 loss=loss or "squared",
                 seconds=seconds,
+                mesh=mesh,
             )
+        if not is_first_process(mesh):
+            return
         if out is not None:
             say("saving and drawing" if plot else "saving")
             result.save(out, **({"plot": True} if plot else {}))

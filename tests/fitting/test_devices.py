@@ -77,6 +77,11 @@ def test_two_processes(tmp_path):
     for rank in (0, 1):
         with np.load(tmp_path / f"{rank}.npz") as found:
             np.testing.assert_allclose(found["numbers"], expected(), rtol=1e-12)
+            picture = pictured(MATERIAL, ball_scene(), 0.01)
+            pictures = np.stack([picture, 0.5 * picture, 2 * picture])
+            many = fitting.fit_many(pictures, ball_scene(), model="blinn-phong", precision="float64")
+            np.testing.assert_allclose(found["n"], many.n, rtol=1e-12)
+            np.testing.assert_allclose(found["k_d"], many.k_d, rtol=1e-12)
 
 
 def test_a_process_that_dies_is_told_and_leaves_nothing_that_looks_whole(tmp_path):

@@ -43,6 +43,8 @@ except brdf.InputError as error:
     os._exit(2)
 assert result.pixels < SIZE * SIZE
 numbers = [[float(one), one.error] for one in result.parameters]
+pictures = np.stack([picture, 0.5 * picture, 2 * picture])
+many = fitting.fit_many(pictures, ball_scene(), model="blinn-phong", precision="float64", mesh=mesh)
 with (folder / f"{rank}.part").open("wb") as file:
-    np.savez(file, numbers=np.array(numbers))
+    np.savez(file, numbers=np.array(numbers), n=many.n, k_d=many.k_d)
 (folder / f"{rank}.part").rename(folder / f"{rank}.npz")
