@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 
 import brdf
 from brdf.errors import InputError
+from brdf.images.encoding import encode
 from brdf.lights.base import LightStack, stacked
 from brdf.lobes import light_terms
 from brdf.models.base import SpecularMaterial
@@ -34,6 +35,9 @@ BAND = 64 * TILE
 
 RING = 0.15
 """Lights whose heights z spread by less than this are a ring: n shows less well, and the grid is finer."""
+
+LESS = 0.9
+"""Photographs of 8 bits that do not say so are linear where that leaves less than this share of sRGB's squares."""
 
 MOST_ERROR = 0.25
 """Of ln n, where it counts as determined."""
@@ -114,7 +118,7 @@ def fit_maps(
     points, free = _points(given, normals, mask, to_view, flip_y)
     how = _How(models, specular == "grey", free, _ambient(ambient, given), np.asarray(to_view, float), precision)
     notes: tuple[str, ...] = ()
-    if given.silent:
+    if given.silent and given.to_light is not None:
         other = map_inputs.photographs(pictures, lights, intensities, exposures, "linear")
         given, notes = _likelier(given, other, points, how)
     _, height, width, _ = given.shape
@@ -126,7 +130,11 @@ def fit_maps(
             layers[name][start:stop] = values.reshape(stop - start, width, *values.shape[1:])
     if not np.any(layers["reason"] != REASONS.index("outside")):
         raise InputError("pictures", "show no texel that counts", "Check mask, normals and clipping")
-    return Maps(models=tuple(one.name for one in models), to_view=how.to_view, notes=notes, **layers)
+    return _maps(layers, how, notes)
+
+
+def _maps(layers: dict[str, np.ndarray], how: "_How", notes: tuple[str, ...] = ()) -> Maps:
+    return Maps(models=tuple(one.name for one in how.models), to_view=how.to_view, notes=notes, **layers)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -374,21 +382,36 @@ def _simplest(found: list[dict[str, Array]]) -> dict[str, Array]:
 
 
 def _likelier(given: Photographs, other: Photographs, points: Any, how: _How) -> tuple[Photographs, tuple[str, ...]]:
-    """Silent photographs as sRGB or as linear light: as the model explains more of some rows."""
+    """Silent photographs as sRGB or as linear light: as the model leaves less of the codes of some rows.
+
+    Args:
+        given: read as sRGB.
+        other: read as linear light, whose values are the codes.
+        points: what the texels see.
+        how: they are fitted.
+    """
     _, height, width, _ = given.shape
     rows = np.linspace(0, height - 1, min(height, max(1, 4 * TILE // width))).astype(int)
-    left = []
-    for one in (given, other):
-        values = np.concatenate([one.band(row, row + 1) for row in rows], axis=1).reshape(
-            one.shape[0], -1, one.shape[3]
-        )
-        some = _some(points, rows)
-        layers = _fit_band(one, how, values, some, -(-values.shape[1] // TILE) * TILE)
-        left.append(float(np.nanmedian(layers["residual"])))
-    kept = int(left[1] < left[0])
+    left, codes = [], np.concatenate([other.band(row, row + 1) for row in rows], axis=1) * other.unit[:, None, None]
+    for one, encoding in ((given, "srgb"), (other, "linear")):
+        values = np.concatenate([one.band(row, row + 1) for row in rows], axis=1)
+        layers = _fit_band(one, how, values.reshape(one.shape[0], -1, one.shape[3]), _some(points, rows), 4 * TILE)
+        maps = _maps({name: layer.reshape(rows.size, width, *layer.shape[1:]) for name, layer in layers.items()}, how)
+        square = np.zeros((rows.size, width))
+        for code, unit, to_light, ambient in zip(codes, one.unit, one.to_light, _each(how.ambient, codes), strict=True):
+            model = maps.render(to_light) + (0 if maps.k_a is None else maps.k_a * ambient)
+            off = encode(model * unit, encoding) - code
+            square += np.sum(np.nan_to_num(off) ** 2, axis=-1)
+        left.append(float(np.nanmedian(np.sqrt(square / np.nansum(codes**2, axis=(0, 3))))))
+    kept = int(left[1] ** 2 < LESS * left[0] ** 2)
+    names = ("sRGB", "linear")
     note = (
-        f"{given.silent[0]} does not say how its values are encoded: read as {('sRGB', 'linear')[kept]}, which leaves "
-        f"{100 * left[kept]:.2g} % of a texel unexplained, {('linear', 'sRGB')[kept]} {100 * left[1 - kept]:.2g} %. "
+        f"{given.silent[0]} does not say how its values are encoded: read as {names[kept]}, under which the maps are "
+        f"off by {100 * left[kept]:.2g} % of a texel's codes, under {names[1 - kept]} by {100 * left[1 - kept]:.2g} %. "
         "Where you know, say so with the encoding"
     )
     return (given, other)[kept], (note,)
+
+
+def _each(ambient: np.ndarray | None, photographs: Any) -> Any:
+    return ambient if ambient is not None else [0.0] * len(photographs)

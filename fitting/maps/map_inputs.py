@@ -29,7 +29,7 @@ class Photographs:
         to_light: unit, (P, 3); None where ``scenes`` tell.
         scenes: of each photograph with its one light, of intensity 1; None where all lights are distant.
         unit: what each photograph was divided by, (P, C).
-        silent: names of files of 8 bits that do not say how they are encoded.
+        silent: names of files of 8 bits that do not say how they are encoded, which were read as sRGB.
         names: of the photographs.
     """
 

@@ -33,7 +33,7 @@ CAP = 32.0
 """k_s is at most so many times the brightest value of its texel: where no light comes near the mirror direction, k_s
 and n would go up together without end."""
 
-JOINT_STEPS = 6
+JOINT_STEPS = 3
 """Gauss-Newton steps of material and normal together."""
 
 GEMAN_MCCLURE = 2.0
@@ -90,18 +90,23 @@ def distant_columns(model: Any, normal: Array, to_light: Array, to_view: Array, 
         to_view: (3,), unit.
         seen: how much each texel counts in each photograph, (P, T).
     """
-    # stacked here, XLA takes it apart again: a transposed array it would copy
-    axis, glossy = jnp.stack(tuple(normal), axis=-1), issubclass(model, SpecularMaterial)
-    faces = dot(axis, to_view) > 0
+    axis = _axis(normal)
+    columns = jax.lax.map(lambda light: _light_columns(model, axis, light[0], to_view, light[1]), (to_light, seen))
+    return Columns(None, columns[0][:, None], columns[1][:, None, None], columns[2][:, None])
 
-    def of_light(direction: Array, seen: Array) -> tuple[Array, ...]:
-        cosine = dot(axis, direction)
-        diffuse, shines = seen * jnp.maximum(cosine, 0), jnp.where((cosine > 0) & faces, seen, 0)
-        weight = shines * cosine if glossy and model.cosine_weighted else shines
-        return diffuse, weight, model.log_cosine(axis, direction, to_view) if glossy else cosine
 
-    diffuse, weight, log_cosine = jax.lax.map(lambda light: of_light(*light), (to_light, seen))
-    return Columns(None, diffuse[:, None], weight[:, None, None], log_cosine[:, None])
+def _axis(components: Sequence[Array]) -> Array:
+    """Vectors (T, 3) of their components, which XLA takes apart again: a transposed array it would copy."""
+    return jnp.stack(tuple(components), axis=-1)
+
+
+def _light_columns(model: Any, axis: Array, to_light: Array, to_view: Array, seen: Array) -> tuple[Array, Array, Array]:
+    """I (N·L)+, the lobe's weight and the logarithm of its cosine under one light, (T,) each."""
+    glossy, cosine = issubclass(model, SpecularMaterial), dot(axis, to_light)
+    diffuse = seen * jnp.maximum(cosine, 0)
+    shines = jnp.where((cosine > 0) & (dot(axis, to_view) > 0), seen, 0)
+    weight = shines * cosine if glossy and model.cosine_weighted else shines
+    return diffuse, weight, model.log_cosine(axis, to_light, to_view) if glossy else cosine
 
 
 def fit_texels(model: Any, target: Float[Array, "P C T"], columns: Columns, grey: bool, finer: int) -> TexelFit:
@@ -236,7 +241,7 @@ def lambert_normals(grey: Float[Array, "P T"], seen: Float[Array, "P T"], to_lig
         ratio = divide(residual**2, GEMAN_MCCLURE**2 * scale)
         return _least_squares(lit / (1 + ratio) ** 2, grey, to_light)
 
-    vector = jax.lax.fori_loop(0, 15, step, _least_squares(seen, grey, to_light))
+    vector = jax.lax.fori_loop(0, 8, step, _least_squares(seen, grey, to_light))
     return normalize(vector.T).T
 
 
@@ -267,14 +272,15 @@ def _jointly(
         frame = _frame(normal)
 
         def of_light(photograph: tuple[Array, Array]) -> list[Array]:
-            light, shown = photograph
-
             def columns(log_n: Array, *tilt: Array) -> tuple[Array, Array]:
-                turned = normalize((normal + sum(map(operator.mul, tilt, frame))).T).T
-                here = distant_columns(model, turned, light[None], lights.to_view, shown[None])
-                n = jnp.exp(log_n)[None]
-                lobe = _lobe(here.weight[0], here.log_cosine[0], n, model.scale(n)) if glossy else here.diffuse[0]
-                return here.diffuse[0], lobe
+                axis = normalize(
+                    _axis([x + sum(map(operator.mul, tilt, e)) for x, *e in zip(normal, *frame, strict=True)])
+                )
+                light, shown = photograph
+                diffuse, weight, log_cosine = _light_columns(model, axis, light, lights.to_view, shown)
+                n = jnp.exp(log_n)
+                lobe = model.scale(n) * weight * jnp.exp(n * log_cosine) if glossy else diffuse
+                return diffuse[None], lobe[None]
 
             point, zero, one = (log_n, *[jnp.zeros_like(log_n)] * 2), jnp.zeros_like(log_n), jnp.ones_like(log_n)
             units = [tuple(one if i == j else zero for j in range(3)) for i in range(3)]
