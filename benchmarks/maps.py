@@ -1,4 +1,4 @@
-"""Maps: time a texel beside SciPy's and Adam's, the optimum and its errors, a photographed ball, RTI beside PTM and HSH.
+"""Maps: time a texel beside SciPy's and Adam's, the optimum, its errors, a photographed ball, RTI beside PTM, HSH.
 
     python -m benchmarks.maps [speed] [errors] [ball] [rti]
 
@@ -192,11 +192,10 @@ def errors(count: int = 20_000) -> None:
             np.mean(np.abs(maps.k_s[0, :, 0] - truth["k_s"])[known] < 1.96 * maps.k_s_error[0, :, 0][known]),
             np.mean(np.abs(maps.k_d[0] - truth["k_d"])[known] < 1.96 * maps.k_d_error[0][known]),
         ]
-        print(
-            f"{name}: determined {np.mean(known):.3f}; "
-            f"within 1e-6 of the least cost {np.mean(reached < best * (1 + 1e-6)):.4f}, in its basin {basin:.4f}; determined right {np.mean((known == should)[clear]):.4f}; "
-            f"coverage ln n {covered[0]:.3f}, k_s {covered[1]:.3f}, k_d {covered[2]:.3f}"
-        )
+        print(f"{name}: determined {np.mean(known):.3f}, rightly so {np.mean((known == should)[clear]):.4f}")
+        near = np.mean(reached < best * (1 + 1e-6))
+        print(f"    within 1e-6 of the least cost {near:.4f}, in its basin {basin:.4f}")
+        print(f"    coverage of ln n {covered[0]:.3f}, k_s {covered[1]:.3f}, k_d {covered[2]:.3f}")
 
 
 def least_cost(pictures, lights, truth, some, log_n) -> np.ndarray:

@@ -209,7 +209,7 @@ def _fitted(given: Photographs, points: brdf.SurfacePoints, how: _How) -> Iterat
     with ThreadPoolExecutor(workers) as pool:
         for start in range(0, height, rows):
             stop = min(start + rows, height)
-            values = given.band(start, stop).reshape(given.shape[0], -1, given.shape[3])
+            values = given.band(start, stop, how.precision)
             band = _some(points, slice(start, stop))
             waiting.append((start, stop, pool.submit(_fit_band, given, how, values, band, texels)))
             if len(waiting) > workers:
@@ -226,10 +226,11 @@ def _some(points: brdf.SurfacePoints, rows: Any) -> brdf.SurfacePoints:
 
 def _fit_band(given: Photographs, how: _How, values: np.ndarray, points: Any, texels: int) -> dict[str, np.ndarray]:
     """The layers of a band of texels, (B, ...), padded to the size that the program is compiled for."""
-    count = values.shape[1]
+    count = values.shape[2]
     with working_precision(how.precision):
         dtype = np.dtype(how.precision)
-        values = np.pad(values.astype(dtype, copy=False), [(0, 0), (0, texels - count), (0, 0)])
+        if count < texels:
+            values = np.pad(values, [(0, 0), (0, 0), (0, texels - count)])
         points = jax.tree.map(lambda leaf: np.pad(leaf, [(0, texels - count)] + [(0, 0)] * (leaf.ndim - 1)), points)
         points = jax.tree.map(lambda leaf: leaf.astype(dtype) if leaf.dtype.kind == "f" else leaf, points)
         stacks, occluders = (), ()
@@ -241,30 +242,35 @@ def _fit_band(given: Photographs, how: _How, values: np.ndarray, points: Any, te
         distant = Distant(to_light.astype(dtype), (how.to_view / np.linalg.norm(how.to_view)).astype(dtype), ambient)
         finer = 2 if given.to_light is not None and np.ptp(to_light[:, 2]) < RING else 1
         layers = _program(how.models, how.grey, how.free, finer, values, points, distant, stacks, occluders)
-        return {name: np.asarray(layer)[:count] for name, layer in layers.items()}
+        return {name: _by_texel(np.asarray(layer))[:count] for name, layer in layers.items()}
 
 
-@partial(eqx.filter_jit)
+def _by_texel(tiles: np.ndarray) -> np.ndarray:
+    """(tiles, ..., T) as (tiles T, ...)."""
+    return np.moveaxis(tiles, -1, 1).reshape(-1, *tiles.shape[1:-1])
+
+
+@eqx.filter_jit
 def _program(
     models: tuple[Any, ...],
     grey: bool,
     free: bool,
     finer: int,
-    values: Float[Array, "P B C"],
+    values: Float[Array, "P C B"],
     points: Any,
     distant: Distant,
     stacks: tuple[LightStack, ...],
     occluders: tuple[Any, ...],
 ) -> dict[str, Array]:
     """The layers of a band, tile by tile."""
-    tiles = values.shape[1] // TILE
+    tiles = values.shape[2] // TILE
 
     def cut(leaf: Array) -> Array:
         return leaf.reshape(tiles, TILE, *leaf.shape[1:])
 
     def of_tile(tile: Any) -> dict[str, Array]:
-        values, points = tile
-        target = jnp.stack([values[..., c] for c in range(values.shape[2])], axis=1)
+        start, points = tile
+        target = jax.lax.dynamic_slice_in_dim(values, start, TILE, axis=2)
         seen = jnp.all(jnp.isfinite(target), axis=1) & points.mask
         target, seen = jnp.where(seen[:, None], target, 0), seen.astype(target.dtype)
         found = []
@@ -286,8 +292,7 @@ def _program(
             found.append(_layers(model, fit, shown, lit, points.mask, tied, normal, normal_error, free))
         return _simplest(found)
 
-    by_tile = jax.lax.map(of_tile, (jnp.swapaxes(jax.vmap(cut)(values), 0, 1), jax.tree.map(cut, points)))
-    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 1).reshape(tiles * TILE, *leaf.shape[1:-1]), by_tile)
+    return jax.lax.map(of_tile, (TILE * jnp.arange(tiles), jax.tree.map(cut, points)))
 
 
 def _masked(columns: Columns, seen: Array) -> Columns:
@@ -392,17 +397,16 @@ def _likelier(given: Photographs, other: Photographs, points: Any, how: _How) ->
     """
     _, height, width, _ = given.shape
     rows = np.linspace(0, height - 1, min(height, max(1, 4 * TILE // width))).astype(int)
-    left, codes = [], np.concatenate([other.band(row, row + 1) for row in rows], axis=1) * other.unit[:, None, None]
+    left, codes = [], _rows(other, rows, how.precision) * other.unit[..., None]
     for one, encoding in ((given, "srgb"), (other, "linear")):
-        values = np.concatenate([one.band(row, row + 1) for row in rows], axis=1)
-        layers = _fit_band(one, how, values.reshape(one.shape[0], -1, one.shape[3]), _some(points, rows), 4 * TILE)
+        layers = _fit_band(one, how, _rows(one, rows, how.precision), _some(points, rows), 4 * TILE)
         maps = _maps({name: layer.reshape(rows.size, width, *layer.shape[1:]) for name, layer in layers.items()}, how)
         square = np.zeros((rows.size, width))
         for code, unit, to_light, ambient in zip(codes, one.unit, one.to_light, _each(how.ambient, codes), strict=True):
             model = maps.render(to_light) + (0 if maps.k_a is None else maps.k_a * ambient)
-            off = encode(model * unit, encoding) - code
+            off = encode(model * unit, encoding) - code.T.reshape(model.shape)
             square += np.sum(np.nan_to_num(off) ** 2, axis=-1)
-        left.append(float(np.nanmedian(np.sqrt(square / np.nansum(codes**2, axis=(0, 3))))))
+        left.append(float(np.nanmedian(np.sqrt(square.ravel() / np.nansum(codes**2, axis=(0, 1))))))
     kept = int(left[1] ** 2 < LESS * left[0] ** 2)
     names = ("sRGB", "linear")
     note = (
@@ -411,6 +415,10 @@ def _likelier(given: Photographs, other: Photographs, points: Any, how: _How) ->
         "Where you know, say so with the encoding"
     )
     return (given, other)[kept], (note,)
+
+
+def _rows(given: Photographs, rows: np.ndarray, precision: Precision) -> np.ndarray:
+    return np.concatenate([given.band(row, row + 1, precision) for row in rows], axis=2)
 
 
 def _each(ambient: np.ndarray | None, photographs: Any) -> Any:

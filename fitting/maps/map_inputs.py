@@ -41,13 +41,20 @@ class Photographs:
     silent: tuple[str, ...]
     names: tuple[str, ...]
 
-    def band(self, start: int, stop: int) -> Float[np.ndarray, "P rows W C"]:
-        """Rows of all photographs."""
-        _, _, width, channels = self.shape
-        found = np.empty((len(self.bands), stop - start, width, channels), np.float32)
-        for values, rows, unit in zip(found, self.bands, self.unit, strict=True):
-            np.divide(rows(start, stop), unit, out=values, casting="unsafe")
-        return found
+    def band(self, start: int, stop: int, precision: str) -> Float[np.ndarray, "P C texels"]:
+        """Rows of all photographs, channel by channel."""
+        count, _, width, channels = self.shape
+        found = np.empty((count, channels, stop - start, width), precision)
+        for planes, read, unit in zip(found, self.bands, self.unit, strict=True):
+            values = read(start, stop)
+            for c in range(channels):
+                np.multiply(
+                    values[..., c],
+                    np.float32(1 / unit[c]) if values.dtype == np.float32 else 1 / unit[c],
+                    out=planes[c],
+                    casting="unsafe",
+                )
+        return found.reshape(count, channels, -1)
 
 
 def read_lights(path: str | Path) -> tuple[list[Path], Float[np.ndarray, "P 3"]]:

@@ -93,8 +93,10 @@ def test_a_texel_is_the_fit_of_one_material():
     np.testing.assert_allclose(maps.k_s[0, 0], fit.material.k_s, rtol=1e-6)
 
 
-@pytest.mark.parametrize("model", ["phong", "normalized-phong", "normalized-blinn-phong", "lambert"])
-@pytest.mark.parametrize("specular", ["coloured", "grey"])
+@pytest.mark.parametrize(
+    ("model", "specular"),
+    [("phong", "grey"), ("normalized-phong", "coloured"), ("normalized-blinn-phong", "grey"), ("lambert", "grey")],
+)
 def test_every_model_is_found_and_rendered(model, specular):
     lights, normal = dome(20), np.broadcast_to(VIEW, (1, 2, 3))
     kind = brdf.MODELS[model]
