@@ -26,7 +26,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from brdf.lobes import Lobe
 from fitting.solver.devices import device_count, gathered, own, placed
@@ -77,6 +77,22 @@ class Picture(eqx.Module):
         if self.lobe is not None:
             model = model + x[2] * self.lobe(jnp.asarray(n))[0]
         return jnp.broadcast_to(model, self.target.shape)
+
+    @property
+    def counts(self) -> Bool[np.ndarray, " P"]:
+        """Which pixels have a weight above 0, on the host."""
+        if self.weight is None:
+            return np.ones(self.target.shape[0], bool)
+        above = np.asarray(self.weight) > 0
+        return above if above.ndim == 1 else np.any(above, axis=1)
+
+    @property
+    def nearest_peak(self) -> float:
+        """The largest logarithm of the lobe's cosine of any pixel that counts; minus infinity without a lobe."""
+        if self.lobe is None:
+            return -np.inf
+        where = True if self.weight is None else self.counts
+        return float(np.max(np.asarray(self.lobe.peak), initial=-np.inf, where=where))
 
     @property
     def weights(self) -> Float[AnyArray, "P Cw"]:

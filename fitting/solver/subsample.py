@@ -150,15 +150,13 @@ def subsample(pictures: Sequence[Picture]) -> Subsample:
     size = max(SMALLEST_SAMPLE, SAMPLE_SIZE // len(pictures))
     parts, factors, nearest = [], [], math.inf
     for picture in pictures:
-        weight = None if picture.weight is None else np.asarray(picture.weight)
-        counts = None if weight is None else np.max(weight.reshape(len(weight), -1), axis=1) > 0
-        index, factor = np.arange(picture.target.shape[0]) if counts is None else np.flatnonzero(counts), None
-        if picture.lobe is not None and index.size:
-            distance = -np.asarray(picture.lobe.peak)
-            nearest = min(nearest, float(np.min(distance if counts is None else distance[index])))
-            wanted = max(SMALLEST_SAMPLE, min(size, _TERMS // picture.lobe.samples))
-            if index.size > wanted + wanted // 4:
-                index, factor = _stratified(distance, counts, wanted)
+        counts, factor = picture.counts, None
+        nearest = min(nearest, -picture.nearest_peak)
+        wanted = size if picture.lobe is None else max(SMALLEST_SAMPLE, min(size, _TERMS // picture.lobe.samples))
+        if picture.lobe is not None and np.count_nonzero(counts) > wanted + wanted // 4:
+            index, factor = _stratified(-np.asarray(picture.lobe.peak), counts, wanted)
+        else:
+            index = np.flatnonzero(counts)
         part = picture.on_host(index)
         weight = part.weights if factor is None else part.weights * factor[:, None]
         parts.append(replace(part, weight=weight))
@@ -166,12 +164,11 @@ def subsample(pictures: Sequence[Picture]) -> Subsample:
     return Subsample(parts, factors, nearest)
 
 
-def _stratified(distance: np.ndarray, counts: np.ndarray | None, size: int) -> tuple[np.ndarray, np.ndarray]:
+def _stratified(distance: np.ndarray, counts: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Some pixels, and how many each stands for."""
     # The octave of a number is its binary exponent, 0 at the peak itself.
     octave = ((distance.astype(np.float32).view(np.int32) >> 23) & 0xFF).astype(np.uint8)
-    if counts is not None:
-        octave[~counts] = _EXCLUDED
+    octave[~counts] = _EXCLUDED
     preview = octave[::_PREVIEW_STRIDE]
     count = np.bincount(preview, minlength=256) * (octave.size / preview.size)
     count[_EXCLUDED] = 0

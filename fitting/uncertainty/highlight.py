@@ -62,14 +62,7 @@ def nearest_peak(pictures: Sequence[Picture]) -> float:
     Args:
         pictures: with or without a lobe.
     """
-    peaks = []
-    for picture in pictures:
-        if picture.lobe is not None:
-            peak = np.asarray(picture.lobe.peak)
-            if picture.weight is not None:
-                peak = peak[np.any(np.asarray(picture.weight).reshape(len(peak), -1) > 0, axis=1)]
-            peaks.append(float(np.max(peak, initial=-np.inf)))
-    return max(peaks, default=0.0)
+    return max((picture.nearest_peak for picture in pictures if picture.lobe is not None), default=0.0)
 
 
 def _where_counted(picture: Picture, values: Array, otherwise: float) -> Array:
