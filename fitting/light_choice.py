@@ -266,7 +266,7 @@ def _information(material: brdf.Material, scene: brdf.Scene, variance: Array) ->
         terms = images.lobe
         lobe, slope = jax.jvp(lambda n: model.scale(n) * terms(n)[0], (material.n,), (jnp.ones_like(material.n),))
         lobe, slope = nothing + lobe, material.k_s * slope
-    columns = jnp.where(images.points.mask[:, None], jnp.stack([ambient, diffuse, lobe, slope]), 0)
+    columns = jnp.where(images.points.mask.ravel()[:, None], jnp.stack([ambient, diffuse, lobe, slope]), 0)
     gram = jnp.einsum("ipc,jpc->cij", columns, columns) / variance[:, None, None]
     place = np.zeros((channels, 4, 3 * channels + 1))
     for channel, term in np.ndindex(channels, 3):
