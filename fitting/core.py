@@ -5,13 +5,13 @@ import time
 from collections.abc import Sequence
 from functools import partial
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 import brdf
 from brdf.precision import working_precision
 from brdf.rendering import basis
-from fitting.censored_noise import without_censored_noise
 from fitting.light_colour import coefficient_factors
 from fitting.model_fit import ModelFit
 from fitting.pixels import Observed, Tile, observe
@@ -21,19 +21,24 @@ from fitting.result import FitResult
 from fitting.selection import FAMILIES, Choice, choose
 from fitting.solver.devices import placed
 from fitting.solver.losses import reweight
-from fitting.solver.normal_equations import Picture
-from fitting.solver.profile import Optimum, fit_tied, search
+from fitting.solver.maximum_likelihood import evidence, unexplained
+from fitting.solver.normal_equations import Picture, Sums
+from fitting.solver.profile import Optimum, refit, search
 from fitting.solver.streams import Stream, each
+from fitting.solver.tied import join_channels
 from fitting.uncertainty.covariance import residual_noise
 from fitting.uncertainty.highlight import nearest_peak
-from fitting.uncertainty.interpretation import Interpretation, interpret
+from fitting.uncertainty.interpretation import Interpretation, interpret, shared_errors
 from fitting.uncertainty.noise_model import weighted_sums
 from fitting.uncertainty.residual_correlation import residual_correlation
+from fitting.uncertainty.structure import CHANCE, Errors, shared
 
 # A residual above this share of the picture: what the scene says is probably not what the picture shows.
 UNEXPLAINED = 0.5
 # The nearest pixel shows exp(-UNSEEN) of a highlight's peak, or more, or the exponent is not looked at.
 UNSEEN = 60.0
+# A highlight that explains less than this share of what errs together without it is none.
+EXPLAINED = 0.35
 # An exponent up to this multiple of the lower bound is at the bound.
 WIDEST = 1.01
 
@@ -53,11 +58,8 @@ def fit_pictures(problem: FitProblem) -> FitResult:
     weights = [None if weight is None else weight / largest for weight in problem.weights]
     problem = dataclasses.replace(problem, weights=weights)
 
-    def again(masks: list[np.ndarray]) -> FitResult:
-        return _fit(dataclasses.replace(problem, masks=masks))
-
     with working_precision(problem.precision):
-        result = without_censored_noise(_fit(problem), problem.masks, None if problem.streamed else again)
+        result = _fit(problem)
     return dataclasses.replace(result, seconds=time.perf_counter() - start)
 
 
@@ -99,7 +101,7 @@ def _picture(model: type[brdf.Material], tile: Tile) -> Picture:
     diffuse = images.diffuse
     if diffuse is None:
         diffuse = jnp.zeros((tile.target.shape[0], 1), tile.target.dtype)
-    return Picture(tile.target, diffuse, images.lobe, tile.weight, ambient)
+    return Picture(tile.target, diffuse, images.lobe, tile.weight, ambient, tile.bounds)
 
 
 def _search(pictures: Sequence[Picture], free: np.ndarray, n_range: tuple[float, float]) -> Optimum:
@@ -129,7 +131,20 @@ def _fit_model(
             free[2] = False
     optimise = partial(search, n_min=n_range[0], n_max=n_range[1], free=free)
     found = reweight(pictures, optimise(pictures), optimise, seen.problem.loss, seen.rounding)
-    return ModelFit(model, found.pictures, found.optimum, free, n_range, None, found.noise_factor)
+    fit = ModelFit(model, found.pictures, found.optimum, free, n_range, None, found.noise_factor)
+    return _most_likely(fit, seen)
+
+
+def _most_likely(fit: ModelFit, seen: Observed) -> ModelFit:
+    """The fit, by what rounded values say where there are any."""
+    if fit.capped or any(picture.bounds is None for picture in fit.pictures):
+        return fit
+    said = evidence(fit.pictures, fit.optimum, fit.free, fit.n_range, fit.tied)
+    if said is None:
+        return fit
+    found = said.optimum
+    optimum = dataclasses.replace(fit.optimum, x=found.x, n=found.n, flat=found.flat)
+    return fit._replace(optimum=optimum, evidence=said)
 
 
 def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
@@ -162,9 +177,18 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
         # Each pixel by its own variance, or noise in bright pixels would pass for a highlight.
         for name, fit in fits.items():
             whitened[name] = weighted_sums(fit.pictures, fit.optimum, known.noise, inverse=True)
+    inflation = known.inflation
+    if all(fit.evidence is not None for fit in fits.values()):
+        noise, whitened = np.ones_like(noise), {name: _likely_sums(fit) for name, fit in fits.items()}
+        inflation = _inflation(best, seen)
     free = np.logical_or.reduce([fit.free for fit in fits.values()])
     optima = {name: fit.optimum for name, fit in fits.items()}
-    choice = choose(optima, free, grey, noise, known.inflation, whitened)
+    choice = choose(optima, free, grey, noise, inflation, whitened)
+    if choice.model not in FAMILIES and not _explains_structure(fits[choice.model], seen):
+        best = _fit_model(brdf.Lambert, seen)
+        whitened = {"lambert": _likely_sums(best)} if best.evidence is not None and whitened else {}
+        choice = choose({"lambert": best.optimum}, best.free, grey, noise, inflation, whitened)
+        fits = {"lambert": best}
     matt = choice.model in FAMILIES
     chosen = list(fits.values())[-1] if matt else fits[choice.model]
     del fits, best
@@ -177,8 +201,54 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
         optimum = _search(pictures, choice.free, chosen.n_range)
     tied = grey[choice.model] if choice.grey else None
     if tied is not None:
-        optimum = fit_tied(pictures, optimum, choice.free, tied, chosen.n_range)
-    return chosen._replace(pictures=pictures, optimum=optimum, free=choice.free, tied=tied), choice
+        optimum = refit(pictures, optimum, choice.free, chosen.n_range, tied)
+    chosen = chosen._replace(pictures=pictures, optimum=optimum, free=choice.free, tied=tied)
+    return _most_likely(chosen, seen), choice
+
+
+def _likely_sums(fit: ModelFit) -> Sums:
+    """Sums whose cost is minus twice the logarithm of the likelihood."""
+    said = fit.evidence
+    assert said is not None
+    optimum = said.optimum
+    square = optimum.square - optimum.cost - 2 * said.value / optimum.square.size
+    return Sums(optimum.gram, optimum.product, square, optimum.pixels)
+
+
+def _inflation(fit: ModelFit, seen: Observed) -> float:
+    """By what factor errors are too small where neighbours err together: the largest of any number."""
+    said = fit.evidence
+    assert said is not None
+    scatter = shared_errors(said, seen.tiles)
+    if scatter is None:
+        return 1.0
+    optimum = said.optimum
+    normal = join_channels(optimum.gram, optimum.product, optimum.square, optimum.x[2], np.ones(optimum.square.size))
+    known = np.append(optimum.x.ravel() > 0, optimum.x[2].any())
+    inverse = np.linalg.pinv(normal.gram[np.ix_(known, known)], hermitian=True)
+    together = np.diag(inverse @ scatter[np.ix_(known, known)] @ inverse)
+    return float(np.sqrt(max(np.max(together / np.maximum(np.diag(inverse), np.finfo(float).tiny)), 1.0)))
+
+
+def _explains_structure(fit: ModelFit, seen: Observed) -> bool:
+    """Whether a highlight explains a good part of what errs together without it, where something is left of that.
+
+    Where the scene is not what it is said to be, or a codec has smoothed, a highlight however significant mends some
+    of that: in trials up to a third of it, where true highlights of 1 % explained more.
+    """
+    matt = _search(fit.pictures, fit.free & [[True], [True], [False]], fit.n_range)
+    left, chance = shared(_unexplained(fit.pictures, fit.optimum, seen))
+    before, _ = shared(_unexplained(fit.pictures, matt, seen))
+    return left < CHANCE * chance or before - left > EXPLAINED * before
+
+
+def _unexplained(pictures: Sequence[Picture], optimum: Optimum, seen: Observed) -> list[Errors]:
+    found = []
+    with jax.enable_x64(True):
+        for picture, tile in zip(pictures, seen.tiles, strict=True):
+            values = unexplained(picture, optimum.x, optimum.n)
+            found.append(Errors(values, np.arange(len(values)), tile.points.mask.shape[1]))
+    return found
 
 
 def _with_weight_of(picture: Picture, other: Picture) -> Picture:

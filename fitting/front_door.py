@@ -7,8 +7,10 @@ from jax.sharding import Mesh
 
 import brdf
 from brdf.errors import InputError
+from brdf.images.encoding import Encoding
 from brdf.precision import Precision
 from fitting.budget.escalation import fit_within
+from fitting.codes import Rounding
 from fitting.core import fit_pictures
 from fitting.problem import state_problem
 from fitting.report import FitResult
@@ -29,6 +31,8 @@ def fit(
     dark: float | None = None,
     noise: tuple[float, float] | None = None,
     weight: Any = None,
+    rounding: Rounding = None,
+    encoding: Encoding | None = None,
     plausible: bool = False,
     accuracy: float | None = None,
     seconds: float | None = None,
@@ -37,15 +41,16 @@ def fit(
     """Fit a material to a picture, or to several pictures of one material: the global optimum, with no start to give.
 
     Args:
-        target: linear values, (H, W, C) or (H, W), or a `brdf.Picture`; a `brdf.ImageReader` for a file that is larger
-            than memory, which is read by bands of rows, several times (of censored noise it only warns); or a list.
+        target: the path of a picture, a `brdf.Picture`, or an array (H, W, C) or (H, W): linear values, or codes of
+            8 or 16 bits; a `brdf.ImageReader` for a file that is larger than memory, which is read by bands of rows,
+            several times, and fitted by least squares; or a list.
         scene: what the picture shows; a list of as many where there are several pictures.
         model: "auto" for the simplest adequate of Lambert, Phong and Blinn-Phong, or a model: its class or its
             name.
         precision: "float32" or "float64".
         mask: (H, W), pixels to look at; a list where there are several pictures.
-        saturation: linear value from which on pixels are clipped and do not count. None takes the largest code of an
-            integer file, or the largest value where many pixels share it exactly.
+        saturation: linear value from which on pixels are clipped: all that they say is that they were no darker. None
+            takes the largest code of an integer file, or the largest value where many pixels share it exactly.
         n_range: bounds of the exponent, 0 < lower < upper.
         loss: "squared"; "relative" or "log" for high dynamic range; "huber" or "cauchy" where some pixels show what the
             scene does not know. See `fitting.solver.losses` for what to use when.
@@ -54,6 +59,10 @@ def fit(
         noise: of the camera, (read, shot): the variance of a value is read² + shot · value, and pixels weigh by its
             inverse. None weighs all alike.
         weight: (H, W), how much each pixel counts beside that, at least 0; a list where there are several pictures.
+        rounding: the full step between neighbouring values of the picture, in its linear unit, a number or per value;
+            0 for plain least squares; "floor" where the writer truncated. None finds out, see `fitting.codes`.
+        encoding: "linear", "srgb" or a gamma: how a file or an array holds its values. None for what the file says; an
+            array is linear.
         plausible: hold k_d + k_s <= 1 inside the fit, with a normalised form or Lambert, so that `brdf.check` passes;
             see `fitting.plausible`.
         accuracy: relative error that is good enough: the cheapest number of pixels and light samples and the cheapest
@@ -83,6 +92,8 @@ def fit(
         scene,
         mask,
         weight,
+        rounding,
+        encoding,
         model=model,
         precision=precision,
         n_range=n_range,

@@ -25,7 +25,7 @@ from brdf.models.base import SpecularMaterial
 from brdf.precision import Precision, working_precision
 from brdf.rendering import Basis, basis
 from fitting import functional
-from fitting.censored_noise import single_values_at_end
+from fitting.codes import single_values_at_end
 from fitting.core import fit_pictures
 from fitting.light_colour import take_colour_out
 from fitting.pixels import SYMMETRIC_PIXELS
@@ -202,7 +202,7 @@ def _fit_together(problem: FitProblem) -> tuple[dict[str, np.ndarray], Bool[np.n
     places = [scene.surface_points() for scene in scenes]
     allowed = [True if mask is None else mask for mask in problem.masks[: len(scenes)]]
     seen = np.stack([np.asarray(points.mask) & mask for points, mask in zip(places, allowed, strict=True)])
-    exact = np.array([target.saturation is None and not target.step for target in problem.targets])
+    exact = np.array([target.codes is None and target.saturation is None for target in problem.targets])
     plain = exact & np.asarray(_plain(targets, seen))
     if len(scenes) == 1:
         pixel = np.flatnonzero(seen)
@@ -316,7 +316,8 @@ def _plain(targets: Float[Array, "N H W C"], seen: Bool[Array, "#N H W"]) -> Boo
         brightest = jnp.max(target, axis=-1)
         largest = jnp.max(jnp.where(seen, brightest, -jnp.inf))
         top = jnp.count_nonzero(seen & (brightest >= largest * TOP))
-        cut = jax.vmap(single_values_at_end, (-1, None))(target, seen)
+        least = jnp.min(target, where=jnp.isfinite(target), initial=jnp.inf)
+        cut = jax.vmap(single_values_at_end, (-1, None, None))(target, seen, least)
         finite = jnp.all(jnp.isfinite(target) | ~seen[..., None])
         return finite & (largest > 0) & (top <= SYMMETRIC_PIXELS) & ~jnp.any(cut)
 

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 import brdf
+from fitting.solver.maximum_likelihood import Evidence
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
 
@@ -23,6 +24,7 @@ class ModelFit(NamedTuple):
         tied: x_s is a common factor times this, (C,); None where the channels are independent.
         noise_factor: see `fitting.solver.losses.Reweighted`.
         capped: k_d + k_s is held at 1 in some channel.
+        evidence: what rounded values say; None where least squares is the whole answer.
     """
 
     model: type[brdf.Material]
@@ -33,6 +35,7 @@ class ModelFit(NamedTuple):
     tied: Float[np.ndarray, " C"] | None = None
     noise_factor: float = 1.0
     capped: bool = False
+    evidence: Evidence | None = None
 
     @property
     def single(self) -> bool:

@@ -19,7 +19,9 @@ import brdf
 from brdf.errors import InputError
 from brdf.models.base import SpecularMaterial
 from brdf.precision import Precision
+from fitting.codes import open_ends
 from fitting.light_colour import take_colour_out
+from fitting.likelihood import Bounds
 from fitting.problem import TOP, FitProblem, Target, has_pixel_areas
 from fitting.solver.devices import device_count
 from fitting.solver.streams import Stream, each, joined
@@ -47,12 +49,14 @@ class Tile(NamedTuple):
         weight: (P,), 0 where the pixel does not count; None where all do, and alike.
         points: what the pixels see, (rows, W).
         scene: of the picture, in the precision of the fit.
+        bounds: between which codes each value lay before rounding; None for values that no rounding touched.
     """
 
     target: Float[Array, "P C"]
     weight: Float[Array, " P"] | None
     points: brdf.SurfacePoints
     scene: brdf.Scene
+    bounds: Bounds | None = None
 
 
 class Observed(NamedTuple):
@@ -174,6 +178,11 @@ def _observe(
     left_out = _left_out(total, height * width, level, dark, masked=mask is not None)
     grey = brdf.cast(grey, problem.precision)
 
+    # Other losses, dark levels and steps of 0 are ways of one's own to say what pixels say.
+    plain = dark is None and problem.loss == "squared" and not target.least_squares
+    plain = plain and not target.streamed and device_count() == 1
+    floor = float(np.nanmin(target.pixels)) if plain and target.codes is None else -np.inf
+
     def tile(band: _Band, counted: tuple[np.ndarray, Statistics]) -> Tile:
         good, weight = counted[0], None
         if noise is not None:
@@ -184,7 +193,19 @@ def _observe(
         if given is not None:
             stated = given[band.rows].ravel().astype(dtype)
             weight = jax.device_put(stated if weight is None else stated * np.asarray(weight))
-        return Tile(band.values, weight, band.points, grey)
+        bounds = None
+        if plain:
+            valid = np.asarray(band.allowed) & np.all(np.isfinite(np.asarray(band.values)), axis=-1)
+            spread = 1.0
+            if weight is not None and (given is not None or noise is not None):
+                heavy = np.asarray(weight)
+                valid &= heavy > 0
+                spread = 1.0 / np.sqrt(np.where(heavy > 0, heavy, 1.0))[:, None]
+            if target.codes is not None:
+                bounds = target.codes.bounds(band.rows, valid, level, spread)
+            else:
+                bounds = open_ends(np.asarray(band.values), valid, floor, level, spread, width)
+        return Tile(band.values, weight, band.points, grey, bounds)
 
     tiles = each(tile, bands, found)
     brightest = total.scale.astype(np.float64)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import os
 from collections.abc import Iterable
 from numbers import Real
 from typing import Any, NamedTuple
@@ -12,7 +13,9 @@ from jax.core import Tracer
 
 import brdf
 from brdf.errors import InputError
+from brdf.images.encoding import Encoding, decode, decode_table, parse_encoding
 from brdf.precision import Precision
+from fitting.codes import Codes, Rounding, find_codes
 from fitting.solver.losses import LOSSES, Loss
 
 CLASSIC = ("phong", "blinn-phong")
@@ -28,12 +31,18 @@ class Target(NamedTuple):
         pixels: linear values (H, W, C); or a `brdf.ImageReader`, of which a band of rows is in memory at a time.
         saturation: the value of the largest code, where it is known.
         step: the distance of two codes; 0 where there are none.
+        codes: behind the values; None where no rounding touched these.
+        lossy: the file was compressed with losses.
+        least_squares: is asked for, whatever the values are.
         file: path, encoding, its source, and factor of the `brdf.Picture` that it was; None where no file holds it.
     """
 
     pixels: Any
     saturation: float | None = None
     step: float = 0.0
+    codes: Codes | None = None
+    lossy: bool = False
+    least_squares: bool = False
     file: dict[str, Any] | None = None
 
     @property
@@ -122,7 +131,15 @@ def refuse_traced(*given: Any) -> None:
         raise InputError("fit", "cannot run inside jax.grad, jax.vmap or jax.jit", words)
 
 
-def state_problem(target: Any, scene: Any, mask: Any = None, weight: Any = None, **options: Any) -> FitProblem:
+def state_problem(
+    target: Any,
+    scene: Any,
+    mask: Any = None,
+    weight: Any = None,
+    rounding: Rounding = None,
+    encoding: Encoding | None = None,
+    **options: Any,
+) -> FitProblem:
     """Check what was given for one picture or for several.
 
     Args:
@@ -130,6 +147,8 @@ def state_problem(target: Any, scene: Any, mask: Any = None, weight: Any = None,
         scene: a scene for all, or a list.
         mask: likewise, or None.
         weight: likewise.
+        rounding: of the values, see `fitting.codes.find_codes`.
+        encoding: of the values of a file or an array.
         options: further fields of `FitProblem`.
 
     Raises:
@@ -152,7 +171,10 @@ def state_problem(target: Any, scene: Any, mask: Any = None, weight: Any = None,
     for each in scenes:
         if not isinstance(each, brdf.Scene):
             raise InputError("scene", f"must be a brdf.Scene, got {type(each).__name__}", "Use brdf.Scene.load")
-    problem = FitProblem([as_target(picture) for picture in targets], scenes, masks, weights, **options)
+    targets = [as_target(picture, rounding, encoding) for picture in targets]
+    if any(target.codes is not None and target.codes.fine for target in targets):
+        options["precision"] = "float64"
+    problem = FitProblem(targets, scenes, masks, weights, **options)
     _check_options(problem)
     for index, (picture, place) in enumerate(zip(problem.targets, scenes, strict=True)):
         _check_picture(picture, place, problem)
@@ -173,42 +195,68 @@ def state_problem(target: Any, scene: Any, mask: Any = None, weight: Any = None,
     return problem
 
 
-def as_target(given: Any) -> Target:
+def as_target(given: Any, rounding: Rounding = None, encoding: Encoding | None = None) -> Target:
     """A picture as the fit takes it.
 
     Args:
-        given: an array, a `brdf.Picture`, a `brdf.ImageReader`, or what this returned.
+        given: the path of a picture, an array, a `brdf.Picture`, a `brdf.ImageReader`, or what this returned.
+        rounding: of the values, see `fitting.codes.find_codes`.
+        encoding: of a file or an array; None for what the file says, and for linear values in an array.
 
     Raises:
-        InputError: where it holds no linear floating-point values.
+        InputError: where it holds no values.
     """
+    if isinstance(given, str | os.PathLike):
+        given, encoding = brdf.read_picture(given, encoding=encoding), None
+    curve = parse_encoding("encoding", encoding)
+    if isinstance(given, Target | brdf.ImageReader | brdf.Picture) and curve is not None:
+        raise InputError("encoding", "is that of a file or an array, this picture is decoded", "Leave it out")
     if isinstance(given, Target):
         return given
     if isinstance(given, brdf.ImageReader):
         largest, step = given.codes
         return Target(given, None if largest is None else largest * TOP, step)
-    saturation, step, file = None, 0.0, None
     if isinstance(given, brdf.Picture):
-        if given.path is not None:
-            file = {"path": str(given.path), "encoding": given.encoding, "source": given.source}
-            file |= {"factor": np.asarray(given.factor).tolist()}
-        steps = given.quantisation()
-        step = 0.0 if steps is None else float(np.nanmax(steps))
-        saturation = None if given.saturation is None else given.saturation * TOP
-        given = given.pixels
-    if isinstance(given, str | bytes) or not hasattr(given, "__array__"):
-        raise InputError("target", f"must be an array, got {type(given).__name__}", "Read it with brdf.read_image")
-    pixels = np.asarray(given)
-    if pixels.dtype.kind != "f":
-        came = f"must hold linear floating-point values, got {pixels.dtype}"
-        raise InputError("target", came, "Read it with brdf.read_image, or divide by the largest code")
-    if pixels.dtype == np.float16:
-        step, pixels = float(np.finfo(np.float16).eps), pixels.astype(np.float32)
-    if pixels.ndim == 2:
-        pixels = pixels[..., None]
-    if pixels.ndim != 3 or 0 in pixels.shape:
-        raise InputError("target", f"must be of shape (H, W, C), got {pixels.shape}", "Give one picture")
-    return Target(pixels, saturation, step, file)
+        return _of_picture(given, rounding)
+    if isinstance(given, bytes) or not hasattr(given, "__array__"):
+        came = f"must be an array or the path of a picture, got {type(given).__name__}"
+        raise InputError("target", came, "Read it with brdf.read_picture")
+    return _of_array(np.asarray(given), rounding, curve or "linear")
+
+
+def _of_picture(picture: brdf.Picture, rounding: Rounding) -> Target:
+    steps = picture.quantisation()
+    codes, step, top = None, 0.0 if steps is None else float(np.nanmax(steps)), picture.saturation
+    if rounding is not None or not picture.lossy or steps is not None:
+        of_file = (picture.encoding, picture.bits) if steps is not None else (None, None)
+        codes = find_codes(picture.pixels, *of_file, rounding, picture.factor)
+    codes = None if codes is None else codes._replace(lossy=picture.lossy)
+    least, file = rounding is not None and codes is None, None
+    if picture.path is not None:
+        file = {"path": str(picture.path), "encoding": picture.encoding, "source": picture.source}
+        file |= {"factor": np.asarray(picture.factor).tolist()}
+    return Target(picture.pixels, None if top is None else top * TOP, step, codes, picture.lossy, least, file)
+
+
+def _of_array(values: np.ndarray, rounding: Rounding, encoding: Encoding) -> Target:
+    kind, step, bits = values.dtype, 0.0, None
+    if kind in (np.uint8, np.uint16):
+        bits = 8 * kind.itemsize
+        values = decode_table(encoding, bits)[values].astype(np.float32)
+        step = float(np.max(np.diff(decode_table(encoding, bits))))
+    elif kind.kind != "f":
+        came = f"must hold floating-point values, or codes of 8 or 16 bits, got {kind}"
+        raise InputError("target", came, "Read it with brdf.read_picture, or divide by the largest code")
+    elif encoding != "linear":
+        values = decode(values, encoding)
+    if kind == np.float16:
+        step, values = float(np.finfo(np.float16).eps), values.astype(np.float32)
+    if values.ndim == 2:
+        values = values[..., None]
+    if values.ndim != 3 or 0 in values.shape:
+        raise InputError("target", f"must be of shape (H, W, C), got {values.shape}", "Give one picture")
+    codes = find_codes(values, encoding if bits else None, bits, rounding)
+    return Target(values, TOP if bits else None, step, codes, least_squares=rounding is not None and codes is None)
 
 
 def looked_at(mask: Any, weight: Any) -> Any:

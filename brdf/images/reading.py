@@ -45,6 +45,7 @@ class Picture:
             out, see `scaled`.
         factor: what the linear values of the file were multiplied by, a number or (C,).
         path: the file; None where it came from none.
+        lossy: the file was compressed with losses, so that neighbours share errors.
 
     Example:
         >>> picture = brdf.read_picture("target.exr")
@@ -60,6 +61,7 @@ class Picture:
     saturation: float | None
     factor: float | np.ndarray = 1.0
     path: Path | None = None
+    lossy: bool = False
 
     def scaled(self, factor: float | np.ndarray) -> "Picture":
         """The picture in another unit: of another exposure, or under light of another intensity.
@@ -136,8 +138,9 @@ class ImageReader:
         self.encoding: Encoding
         self.source: EncodingSource
         self.encoding, self.source = find_encoding(given, self.path, name, spec, self.bits)
-        lossy = name in ("jpeg", "webp", "heif") or spec.get_string_attribute("compression").startswith("jpeg")
-        self._top = LOSSY_TOP if lossy else 1.0
+        packed = spec.get_string_attribute("compression")
+        self.lossy = name in ("jpeg", "webp", "heif") or packed.startswith(("jpeg", "dwa", "b44"))
+        self._top = LOSSY_TOP if self.lossy else 1.0
         turn = spec.get_int_attribute("Orientation", 1)
         self._turn = turn if turn in range(2, 9) else 1
         self._upright = None
@@ -371,7 +374,8 @@ def read_picture(path: AnyPath, *, encoding: Encoding | None = None) -> Picture:
     with ImageReader(path, encoding=encoding) as reader:
         top, _ = reader.codes
         about = reader.encoding, reader.source, reader.bits, top
-        return Picture(reader.read(), reader.read_alpha(), *about, path=reader.path)
+        pixels, alpha = reader.read(), reader.read_alpha()
+        return Picture(pixels, alpha, *about, path=reader.path, lossy=reader.lossy)
 
 
 def read_mask(path: AnyPath) -> Bool[np.ndarray, "height width"]:

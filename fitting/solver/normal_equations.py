@@ -20,7 +20,7 @@ import operator
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple, TypeAlias, cast
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -29,10 +29,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from brdf.lobes import Lobe
+from fitting.likelihood import AnyArray, Bounds
 from fitting.solver.devices import device_count, gathered, own, placed
-
-# On the host or on the device.
-AnyArray: TypeAlias = jax.Array | np.ndarray
 
 
 class Picture(eqx.Module):
@@ -45,6 +43,7 @@ class Picture(eqx.Module):
         weight: Weight of each squared residual, at least 0; a target of weight 0 may be anything, NaN too. ``None``
             weighs every pixel 1 and costs nothing.
         ambient: What multiplies ``x_a``, the same for all pixels; 0 in a picture without ambient light.
+        bounds: Between which codes each value lay before rounding; ``None`` for values that no rounding touched.
     """
 
     target: Float[Array, "P C"]
@@ -52,6 +51,7 @@ class Picture(eqx.Module):
     lobe: Lobe | None = None
     weight: Float[Array, " P"] | Float[Array, "P C"] | None = None
     ambient: Float[AnyArray, " Ca"] = eqx.field(default_factory=lambda: np.ones(1))
+    bounds: Bounds | None = None
 
     def pixels(self, choose: Callable[[Array], Array]) -> "Picture":
         """The same picture, some of its pixels."""
@@ -61,6 +61,7 @@ class Picture(eqx.Module):
             lobe=None if self.lobe is None else self.lobe.pixels(choose),
             weight=None if self.weight is None else choose(self.weight),
             ambient=self.ambient,
+            bounds=None if self.bounds is None else self.bounds.pixels(choose),
         )
 
     def on_host(self, pixel: Int[np.ndarray, " K"]) -> "Picture":

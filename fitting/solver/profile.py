@@ -173,27 +173,30 @@ def _start(profile: Point, cell: int, position: float) -> Point:
     return Point(position, profile.x[nearer], profile.cost[nearer])
 
 
-def fit_tied(
+def refit(
     pictures: Sequence[Picture],
     optimum: Optimum,
     free: Bool[np.ndarray, "3 C"],
-    tied: Float[np.ndarray, " C"],
     n_range: tuple[float, float],
+    tied: Float[np.ndarray, " C"] | None = None,
 ) -> Optimum:
-    """The optimum with one specular coefficient for all channels, from that with one for each.
+    """The optimum near another one: of other weights, or with one specular coefficient for all channels.
 
     Args:
         pictures: as they were searched.
         optimum: of the search with the same ``free``.
         free: which coefficients may be above 0.
-        tied: x_s is a common factor times this, (C,).
         n_range: bounds of n.
+        tied: x_s is a common factor times this, (C,); None where the channels are independent.
     """
-    tied = np.where(free[2], tied, 0.0)
     x = optimum.x.copy()
-    x[2] = tied * (x[2] @ tied) / max(tied @ tied, np.finfo(float).tiny)
+    if tied is not None:
+        tied = np.where(free[2], tied, 0.0)
+        x[2] = tied * (x[2] @ tied) / max(tied @ tied, np.finfo(float).tiny)
     with jax.enable_x64(True):
         problem = problem_of(pictures, n_range, free)._replace(tied=tied)
+        if not x[2].any():
+            problem = problem._replace(free=problem.free & [True, True, False])
         found = gauss_newton(problem, Point(math.log(optimum.n), x.T, optimum.cost))
     return _optimum(*found, problem, optimum.grid, optimum.profile, optimum.profile_sampled)
 

@@ -154,7 +154,7 @@ def subsample(pictures: Sequence[Picture]) -> Subsample:
         nearest = min(nearest, -picture.nearest_peak)
         wanted = size if picture.lobe is None else max(SMALLEST_SAMPLE, min(size, _TERMS // picture.lobe.samples))
         if picture.lobe is not None and np.count_nonzero(counts) > wanted + wanted // 4:
-            index, factor = _stratified(-np.asarray(picture.lobe.peak), counts, wanted)
+            index, factor = stratified(-np.asarray(picture.lobe.peak), counts, wanted)
         else:
             index = np.flatnonzero(counts)
         part = picture.on_host(index)
@@ -164,8 +164,14 @@ def subsample(pictures: Sequence[Picture]) -> Subsample:
     return Subsample(parts, factors, nearest)
 
 
-def _stratified(distance: np.ndarray, counts: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Some pixels, and how many each stands for."""
+def stratified(distance: np.ndarray, counts: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Some pixels, and how many each stands for.
+
+    Args:
+        distance: ``-log_cos`` of each pixel.
+        counts: which may be taken.
+        size: about how many.
+    """
     # The octave of a number is its binary exponent, 0 at the peak itself.
     octave = ((distance.astype(np.float32).view(np.int32) >> 23) & 0xFF).astype(np.uint8)
     octave[~counts] = _EXCLUDED

@@ -67,6 +67,8 @@ def uncertainty(
     single: bool,
     tied: Float[np.ndarray, " C"] | None = None,
     spread: Float[np.ndarray, "C 4 4"] | None = None,
+    scatter: Float[np.ndarray, "U U"] | None = None,
+    widening: Float[np.ndarray, " U"] | float = 1.0,
 ) -> Uncertainty:
     """Errors of an optimum.
 
@@ -83,6 +85,8 @@ def uncertainty(
         single: whether the pixels were float32.
         tied: x_s is a common factor times this, (C,); None where the channels are independent.
         spread: sums of the columns' products times the variance of each pixel, where it is not the same in all.
+        scatter: what takes the place of the Hessian times the noise, over all unknowns, where pixels err together.
+        widening: what to multiply errors by.
     """
     dependent = DEPENDENT_SINGLE if single else DEPENDENT_DOUBLE
     reasons = np.full(free.shape, "", object)
@@ -92,7 +96,9 @@ def uncertainty(
         reasons[term, channel] = f"{LIGHT[term]} in {where}"
     _name_dependent(optimum, reasons, dependent)
     known = reasons == ""
-    x_error, x_interval, n_error, correlation, rise = _errors(optimum, known, noise, tied, spread, dependent)
+    x_error, x_interval, n_error, correlation, rise = _errors(
+        optimum, known, noise, tied, spread, scatter, widening, dependent
+    )
     for term, channel in np.argwhere(known):
         largest = max(optimum.square[channel], brightest[channel] ** 2)
         if x_error[term, channel] ** 2 * optimum.gram[channel, term, term] > largest:
@@ -143,6 +149,8 @@ def _errors(
     noise: np.ndarray,
     tied: np.ndarray | None,
     spread: np.ndarray | None,
+    scatter: np.ndarray | None,
+    widening: np.ndarray | float,
     dependent: float,
 ) -> tuple[np.ndarray, np.ndarray, float, np.ndarray, float]:
     """Errors and intervals of x, the error of n, the correlation of all unknowns, and the rise of the cost.
@@ -157,6 +165,7 @@ def _errors(
         hessian[place] += block
         scale = np.array([1.0, 1.0, 1.0, x[2, channel]])
         middle[place] += noise[channel] ** 2 * block if spread is None else spread[channel] * np.outer(scale, scale)
+    middle = middle if scatter is None else scatter
     active = known & (x > 0)
     has_n, with_n = bool(active[2].any()), False
     unit = np.eye(size)
@@ -171,6 +180,11 @@ def _errors(
         if with_n:
             inverse = _inverse(hessian, np.column_stack([basis, unit[:, -1]]))
     covariance = inverse @ middle @ inverse
+    if scatter is not None:
+        # Of a few blocks the scatter alone says too little.
+        least = np.diag(inverse) * np.maximum(np.trace(inverse @ scatter) / max(np.linalg.matrix_rank(inverse), 1), 1.0)
+        widening = widening * np.sqrt(np.maximum(least / np.maximum(np.diag(covariance), np.finfo(float).tiny), 1.0))
+    covariance = covariance * np.outer(widening * np.ones(size), widening * np.ones(size))
     variance = np.maximum(np.diag(covariance), 0.0)
     error, interval = np.full((3, channels), np.inf), np.zeros((3, channels, 2))
     interval[..., 1] = np.inf

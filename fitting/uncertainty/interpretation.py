@@ -11,15 +11,19 @@ from brdf.channels import channel_names
 from brdf.models.base import SpecularMaterial
 from fitting.light_colour import coefficient_factors
 from fitting.model_fit import ModelFit
-from fitting.pixels import Observed
+from fitting.pixels import Observed, Tile
 from fitting.result import Parameter, free_parameters
+from fitting.solver.maximum_likelihood import Evidence
 from fitting.solver.normal_equations import Picture
 from fitting.uncertainty.covariance import TERMS, Uncertainty, residual_noise, uncertainty
 from fitting.uncertainty.highlight import OFF_CENTRE, Highlight, highlight
 from fitting.uncertainty.intervals import exponent_interval
 from fitting.uncertainty.noise_model import weighted_sums
 from fitting.uncertainty.residual_correlation import ResidualCorrelation, residual_correlation
+from fitting.uncertainty.structure import errors_of, scatter, structure
 
+# With less noise than this, in codes, few pixels of a block say something, and these by turns.
+ROUNDED = 0.25
 # An interval of n wider than this factor says nothing but its order of magnitude.
 WIDEST_INTERVAL = 100.0
 # Two parameters whose errors go together more than this are hard to tell apart, if an error is also large.
@@ -74,13 +78,28 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> Interpretation
     if lobe is not None:
         visible = float(np.max(optimum.x[2]) * lobe.largest / max(np.max(seen.brightest), np.finfo(float).tiny))
     known = residual_correlation(pictures, seen.tiles, optimum, rounding)
-    spread = None
-    if known.noise is not None:
+    spread, shared, widening, deviation = None, None, 1.0, noise
+    if fit.evidence is not None:
+        # Each working target has the noise 1.
+        said = fit.evidence
+        fit, optimum, deviation = fit._replace(pictures=said.pictures, optimum=said.optimum), said.optimum, noise**0
+        shared = shared_errors(said, seen.tiles)
+        widening = said.widening
+    elif known.noise is not None:
         spread = fit.noise_factor**2 * weighted_sums(pictures, optimum, known.noise, inverse=False).gram
     # What the light reaches but the simplest model does without is 0, with the error that it would have.
     reached = seen.reached(fit.model)
     sure = uncertainty(
-        optimum, reached, noise, seen.brightest, visible, single=fit.single, tied=fit.tied, spread=spread
+        optimum,
+        reached,
+        deviation,
+        seen.brightest,
+        visible,
+        single=fit.single,
+        tied=fit.tied,
+        spread=spread,
+        scatter=shared,
+        widening=widening,
     )
     interval = None
     # At k_d + k_s = 1 the cost still falls across the bound: a profile that does not know it has its least elsewhere.
@@ -99,6 +118,30 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> Interpretation
     warnings += _hard_to_tell(free, correlation)
     pixels = None if lobe is None else lobe.pixels
     return Interpretation(material, parameters, noise, known.correlation, pixels, correlation, tuple(warnings))
+
+
+def shared_errors(said: Evidence, tiles: Sequence[Tile]) -> Float[np.ndarray, "U U"] | None:
+    """What takes the place of the Hessian where neighbours share errors; None where they do not.
+
+    They do in a file that was compressed with losses, or where the residual shows it.
+
+    Args:
+        said: of a fit.
+        tiles: of which its pictures were made.
+    """
+    lossy = any(tile.bounds is not None and tile.bounds.lossy for tile in tiles)
+    errors = (
+        errors_of(picture, said.optimum, place) for picture, place in zip(said.pictures, said.places, strict=True)
+    )
+    if not lossy and (said.noise < ROUNDED or not structure(list(errors)).significant):
+        return None
+    return np.sum(
+        [
+            scatter(picture, np.asarray(tile.target)[place[0]], said.optimum, place, said.noise if lossy else None)
+            for picture, tile, place in zip(said.pictures, tiles, said.places, strict=True)
+        ],
+        axis=0,
+    )
 
 
 def _typical_weight(pictures: Sequence[Picture]) -> float:

@@ -93,7 +93,7 @@ def _reweighted(picture: Picture, n: AnyArray, x: AnyArray, coefficients: AnyArr
     value = jnp.maximum(picture.predicted(n, x), 0.0)
     variance = _variance(jnp.asarray(coefficients).astype(dtype), value)
     weight = jnp.ones((1, 1), dtype) if picture.weight is None else picture.weight.reshape(value.shape[0], -1)
-    return weight / variance if inverse else weight * variance
+    return (weight / variance if inverse else weight * variance).astype(dtype)
 
 
 def weighted_sums(

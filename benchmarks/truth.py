@@ -1,0 +1,337 @@
+"""Are the numbers and their errors true on the files that people have? Balls of an independent renderer, many draws.
+
+    python -m benchmarks.truth [coverage|selection|structure] [--rows PATTERN] [--draws N] [--size PIXELS] [--json FILE]
+
+Every ball is drawn here in plain NumPy (nothing of the toolkit), its brightest pixel at 0.97 of white; noise is a
+standard deviation, of white for float pictures and in codes for files; draw i has the seed i. Files are written by
+OpenImageIO and read back as a user would read them. Beside each row stands plain least squares (``rounding=0``).
+
+* Coverage: share of all draws with the truth inside the 95 % interval; "not determined" counts as a miss. ``stated`` is
+  the mean stated error over the root mean square of the real one.
+* Found: ``result.surface`` has a specular term. On Lambert balls that is an invention.
+* Mesh normals: drawn with normals interpolated over a latitude-longitude mesh of R rings, fitted as a sphere.
+"""
+
+import argparse
+import fnmatch
+import json
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio  # noqa: N813
+
+import brdf
+import fitting
+
+WIDTH = 2.2  # of the picture, the ball's radius being 1
+
+
+@dataclass(frozen=True)
+class Ball:
+    """A ball under one distant light: what is drawn and what the fit is told.
+
+    Attributes:
+        model: "lambert", "phong" or "blinn-phong".
+        k: k_a, k_d, k_s, (3, C).
+        n: exponent.
+        to_light: unit vector that is drawn.
+        size: pixels on a side.
+    """
+
+    model: str
+    k: np.ndarray
+    n: float
+    to_light: np.ndarray
+    size: int
+
+    def scene(self, to_light: np.ndarray | None = None) -> brdf.Scene:
+        """What the fit is told, with this light."""
+        camera = brdf.OrthographicCamera(
+            position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=WIDTH, resolution=(self.size, self.size)
+        )
+        light = brdf.DirectionalLight(direction=self.to_light if to_light is None else to_light, intensity=[1.0])
+        shapes = (brdf.Sphere(center=[0, 0, 0], radius=1),)
+        return brdf.Scene(camera=camera, shapes=shapes, ambient=[1.0], lights=(light,))
+
+    def drawn(self, normals: Callable[[np.ndarray], np.ndarray] | None = None) -> np.ndarray:
+        """Linear radiance, (H, W, C); black beside the ball."""
+        place = (np.arange(self.size) - (self.size - 1) / 2) * (WIDTH / self.size)
+        x, y = place[None, :], -place[:, None]
+        inside = x**2 + y**2 < 1
+        normal = np.stack(np.broadcast_arrays(x, y, np.sqrt(np.maximum(1 - x**2 - y**2, 0))), axis=-1)
+        if normals is not None:
+            normal = normals(normal)
+        view = np.array([0.0, 0.0, 1.0])
+        lit = normal @ self.to_light
+        if self.model == "phong":
+            cosine = 2 * lit * normal[..., 2] - self.to_light[2]
+        else:
+            half = self.to_light + view
+            cosine = normal @ (half / np.linalg.norm(half))
+        seen = (lit > 0) & (cosine > 0) & (normal[..., 2] > 0)
+        lobe = np.where(seen, np.maximum(cosine, 1e-300) ** self.n, 0.0)
+        shown = self.k[0] + np.maximum(lit, 0)[..., None] * self.k[1] + lobe[..., None] * self.k[2]
+        return np.where(inside[..., None], shown, 0.0)
+
+
+def ball(
+    seed: int, *, model: str = "", channels: int = 1, size: int = 128, k_s: float | None = None, ambient: bool = True
+) -> Ball:
+    """The ball of a seed, brightest pixel 0.97; ``k_s`` as a share of white where it is given."""
+    random = np.random.default_rng(seed)
+    model = model or ("phong", "blinn-phong")[seed % 2]
+    tilt, turn = random.uniform(0.15, 0.85), random.uniform(0, 2 * np.pi)
+    to_light = np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)])
+    n = float(np.exp(random.uniform(np.log(5), np.log(300))))
+    k = np.stack(
+        [random.uniform(0.02, 0.1, channels), random.uniform(0.3, 0.7, channels), random.uniform(0.1, 0.5, channels)]
+    )
+    if model == "lambert":
+        k[2] = 0
+    if not ambient:
+        k[0] = 0
+    if k_s is not None:
+        k[2] = 0
+    drawn = Ball(model, k, n, to_light, size)
+    k = k * ((0.97 - (k_s or 0.0)) / drawn.drawn().max())
+    if k_s is not None:
+        k[2] = k_s
+    return Ball(model, k, n, to_light, size)
+
+
+def meshed(rings: int) -> Callable[[np.ndarray], np.ndarray]:
+    """Normals of a latitude-longitude mesh of the ball, interpolated in its quadrilaterals; poles up and down."""
+
+    def interpolated(normal: np.ndarray) -> np.ndarray:
+        polar = np.arccos(np.clip(normal[..., 1], -1, 1)) * rings / np.pi
+        around = np.arctan2(normal[..., 0], normal[..., 2]) * rings / np.pi
+        row, column = np.floor(polar), np.floor(around)
+        mixed = np.zeros_like(normal)
+        for up in (0, 1):
+            for along in (0, 1):
+                theta, phi = (row + up) * np.pi / rings, (column + along) * np.pi / rings
+                corner = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), np.sin(theta) * np.cos(phi)], axis=-1)
+                share = (polar - row if up else 1 - polar + row) * (around - column if along else 1 - around + column)
+                mixed += share[..., None] * corner
+        return mixed / np.linalg.norm(mixed, axis=-1, keepdims=True)
+
+    return interpolated
+
+
+def encoded(linear: np.ndarray, curve: str) -> np.ndarray:
+    """IEC 61966-2-1, or as it is."""
+    if curve == "linear":
+        return linear
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
+
+
+@dataclass(frozen=True)
+class File:
+    """How a picture is kept.
+
+    Attributes:
+        noise: standard deviation: of white without codes, else in codes of the file.
+        curve: "linear" or "srgb".
+        top: largest code; 0 for floats.
+        suffix: of the file, "" where an array is handed over.
+        kind: OpenImageIO's data type.
+        step: so many codes of the file are one step of the picture: 16 for 12 bits in 16.
+        quality: of a JPEG.
+        channels: of the ball.
+        as_rgb: grey saved as RGB.
+    """
+
+    noise: float = 0.0
+    curve: str = "linear"
+    top: int = 255
+    suffix: str = ".png"
+    kind: str = "uint8"
+    step: int = 1
+    quality: int = 0
+    channels: int = 1
+    as_rgb: bool = False
+
+    def picture(self, linear: np.ndarray, seed: int, folder: Path) -> Any:
+        """What the fit is given: a `brdf.Picture` read back from a file, or an array."""
+        random = np.random.default_rng([seed, 1])
+        if not self.top:
+            shown = linear + self.noise * random.standard_normal(linear.shape)
+            if not self.suffix:
+                return shown.astype(np.float32)
+            codes = shown.astype(np.float32)
+        else:
+            codes = encoded(linear, self.curve) * self.top + self.noise * random.standard_normal(linear.shape)
+            codes = (np.clip(np.rint(codes), 0, self.top) * self.step).astype(self.kind)
+        if self.as_rgb:
+            codes = np.repeat(codes, 3, axis=2)
+        path = folder / f"ball{self.suffix}"
+        spec = oiio.ImageSpec(codes.shape[1], codes.shape[0], codes.shape[2], self.kind)
+        spec["CompressionQuality"] = self.quality or 100
+        if self.quality:
+            spec["compression"] = f"jpeg:{self.quality}"
+        file = oiio.ImageOutput.create(str(path))
+        file.open(str(path), spec)
+        file.write_image(np.ascontiguousarray(codes))
+        file.close()
+        return brdf.read_picture(path, encoding=self.curve if self.top else None)
+
+
+FLOAT = File(0.01, top=0, suffix="", kind="float")
+COVERAGE = {
+    "float, noise 0.01": FLOAT,
+    "linear 8 bit": File(),
+    "sRGB 8 bit": File(curve="srgb"),
+    "sRGB 8 bit, colour": File(curve="srgb", channels=3),
+    "grey as RGB": File(curve="srgb", as_rgb=True),
+    "linear 8 bit, noise 0.2": File(0.2),
+    "linear 8 bit, noise 1": File(1.0),
+    "linear 8 bit, noise 3": File(3.0),
+    "sRGB 8 bit, noise 0.2": File(0.2, curve="srgb"),
+    "sRGB 8 bit, noise 1": File(1.0, curve="srgb"),
+    "sRGB 8 bit, noise 3": File(3.0, curve="srgb"),
+    "sRGB 8 bit, colour, noise 1": File(1.0, curve="srgb", channels=3),
+    "12 in 16 bit": File(top=4095, kind="uint16", step=16),
+    "12 in 16 bit, noise 1": File(1.0, top=4095, kind="uint16", step=16),
+    "linear 16 bit": File(top=65535, kind="uint16"),
+    "sRGB 16 bit": File(top=65535, kind="uint16", curve="srgb"),
+    "half": File(top=0, suffix=".exr", kind="half"),
+    "RGBE": File(top=0, suffix=".hdr", kind="float", channels=3),
+    "JPEG q95, noise 1": File(1.0, curve="srgb", suffix=".jpg", quality=95),
+    "JPEG q90, noise 1": File(1.0, curve="srgb", suffix=".jpg", quality=90),
+    "JPEG q75, noise 1": File(1.0, curve="srgb", suffix=".jpg", quality=75),
+    "JPEG q95": File(curve="srgb", suffix=".jpg", quality=95),
+    "JPEG q90": File(curve="srgb", suffix=".jpg", quality=90),
+    "JPEG q75": File(curve="srgb", suffix=".jpg", quality=75),
+}
+LAMBERT = {
+    "linear": File(),
+    "sRGB": File(curve="srgb"),
+    "sRGB, no ambient": File(curve="srgb"),
+    "linear, no ambient": File(),
+    "colour": File(curve="srgb", channels=3),
+    "dithered": File(0.5, curve="srgb"),
+    "colour JPEG q90": File(curve="srgb", suffix=".jpg", quality=90, channels=3),
+    "colour JPEG q90, noise 1": File(1.0, curve="srgb", suffix=".jpg", quality=90, channels=3),
+    "mesh of 24 rings": File(curve="srgb"),
+    "mesh of 48 rings": File(curve="srgb"),
+    "mesh of 96 rings": File(curve="srgb"),
+}
+
+
+def rows(table: dict[str, File], pattern: str) -> Iterator[tuple[str, File]]:
+    """Those whose name fits."""
+    return ((name, file) for name, file in table.items() if fnmatch.fnmatch(name, f"*{pattern}*"))
+
+
+def coverage(pattern: str, draws: int, size: int, first: int) -> list[dict[str, Any]]:
+    """Errors of each number, and how often its interval holds the truth."""
+    said = []
+    head = f"{'':30}{'covered (%)':>24}{'rms error of k_a, k_d, k_s, ln n':>40}{'stated / real':>24}"
+    print(head, flush=True)
+    for name, file in rows(COVERAGE, pattern):
+        for method, options in (("", {}), ("  least squares", {"rounding": 0})):
+            inside, wrong, stated = [], [], []
+            for seed in range(first, first + draws):
+                one = ball(seed, channels=file.channels, size=size)
+                with tempfile.TemporaryDirectory() as folder:
+                    picture = file.picture(one.drawn(), seed, Path(folder))
+                result = fitting.fit(picture, one.scene(), model=one.model, **options)
+                kept = {"k_a": [], "k_d": [], "k_s": [], "n": []}
+                for parameter in result.parameters:
+                    index = {"k_a": 0, "k_d": 1, "k_s": 2, "n": 3}[parameter.name]
+                    channel = min(parameter.channel or 0, one.k.shape[1] - 1)
+                    true = one.n if index == 3 else one.k[index, channel]
+                    low, high = parameter.interval or (np.nan, np.nan)
+                    if parameter.value is None or not parameter.error:
+                        kept[parameter.name].append((False, np.nan, np.nan))
+                    else:
+                        unit = true if index == 3 else 1.0
+                        kept[parameter.name].append(
+                            (low <= true <= high, (parameter.value - true) / unit, parameter.error / unit)
+                        )
+                table = np.array([np.mean(kept[key], axis=0) for key in kept])
+                inside.append([np.mean([row[0] for row in kept[key]]) for key in kept])
+                wrong.append(np.array([np.sqrt(np.mean(np.square([row[1] for row in kept[key]]))) for key in kept]))
+                stated.append(table[:, 2])
+            share, rms = 100 * np.mean(inside, axis=0), np.sqrt(np.nanmean(np.square(wrong), axis=0))
+            ratio = np.nanmean(stated, axis=0) / rms
+            print(
+                f"{name + method:30.30}{''.join(f'{v:6.1f}' for v in share)}{''.join(f'{v:10.1e}' for v in rms)}"
+                f"{''.join(f'{v:6.2f}' for v in ratio)}",
+                flush=True,
+            )
+            said.append(
+                {"row": name + method, "covered": share.tolist(), "rms": rms.tolist(), "stated": ratio.tolist()}
+            )
+    return said
+
+
+def selection(pattern: str, draws: int, size: int, first: int) -> list[dict[str, Any]]:
+    """Highlights invented on Lambert balls, and found where k_s is 0.01."""
+    said = []
+    print(f"{'':30}{'invented (%)':>14}{'k_s = 0.01 found (%)':>22}", flush=True)
+    for name, file in rows(LAMBERT, pattern):
+        ambient = "no ambient" not in name
+        normals = meshed(int(name.split()[2])) if name.startswith("mesh") else None
+        counts = {0.0: 0, 0.01: 0}
+        for k_s in counts:
+            for seed in range(first, first + draws):
+                model = "lambert" if k_s == 0 else ""
+                one = ball(seed, model=model, channels=file.channels, size=size, k_s=k_s or None, ambient=ambient)
+                with tempfile.TemporaryDirectory() as folder:
+                    picture = file.picture(one.drawn(normals), seed, Path(folder))
+                counts[k_s] += "phong" in fitting.fit(picture, one.scene()).surface
+        shares = [100 * count / draws for count in counts.values()]
+        print(f"{name:30}{shares[0]:14.1f}{shares[1]:22.1f}", flush=True)
+        said.append({"row": name, "invented": shares[0], "found": shares[1]})
+    return said
+
+
+def structure(pattern: str, draws: int, size: int, first: int) -> list[dict[str, Any]]:
+    """How often a light that is off is warned of, and nothing wrong."""
+    said = []
+    print(f"{'':30}{'warned (%)':>12}", flush=True)
+    for degrees, noise in ((1.0, 0.01), (1.0, 0.02), (0.3, 0.01), (0.0, 0.01), (0.0, 0.02)):
+        name = f"light {degrees:g} degrees off, noise {noise:g}"
+        if not fnmatch.fnmatch(name, f"*{pattern}*"):
+            continue
+        warned = 0
+        for seed in range(first, first + draws):
+            one = ball(seed, size=size)
+            random = np.random.default_rng([seed, 2])
+            aside = np.cross(one.to_light, random.standard_normal(3))
+            aside /= np.linalg.norm(aside)
+            told = np.cos(np.radians(degrees)) * one.to_light + np.sin(np.radians(degrees)) * aside
+            picture = File(noise, top=0, suffix="", kind="float").picture(one.drawn(), seed, Path())
+            result = fitting.fit(picture, one.scene(told), model=one.model)
+            warned += any("structure" in words for words in result.warnings)
+        print(f"{name:42}{100 * warned / draws:6.1f}", flush=True)
+        said.append({"row": name, "warned": 100 * warned / draws})
+    return said
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    tables = {"coverage": (coverage, 400), "selection": (selection, 100), "structure": (structure, 100)}
+    parser.add_argument("table", nargs="?", choices=tables)
+    parser.add_argument("--rows", default="")
+    parser.add_argument("--draws", type=int)
+    parser.add_argument("--size", type=int, default=128)
+    parser.add_argument("--first", type=int, default=0, help="the first seed")
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    said = {}
+    for name, (run, draws) in tables.items():
+        if options.table in (None, name):
+            said[name] = run(options.rows, options.draws or draws, options.size, options.first)
+    if options.json:
+        options.json.write_text(json.dumps(said, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,275 @@
+"""What a picture vouches for: the codes behind its values, and how far each can be wrong.
+
+| the picture | its codes | a value lay |
+| --- | --- | --- |
+| integer files, arrays | as stored, in steps as the codes used show (12 bits may stand in 16) | half a step around |
+| half floats | the values | half a unit in the last place around |
+| RGBE (.hdr) | the values; channels share an exponent | up to a step above: the format truncates |
+| float32 | none | where it is |
+
+The largest code of an integer picture has no upper bound and 0 no lower one: that is clipping and cut-off noise.
+A float array whose values all lie on the levels of one of these is taken as such.
+"""
+
+from typing import Any, Literal, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from brdf.errors import InputError
+from brdf.images.encoding import Encoding, encode
+from fitting.likelihood import AnyArray, Bounds
+
+Rounding = float | np.ndarray | Literal["floor"] | None
+# Whether a picture lies on levels is told by so many values first.
+_FIRST = 64
+# So far from a code a value may lie that stands for it: rounding errors of float32, and of the curves.
+_TOLERANCE = {255: 2e-3, 65535: 2e-2}
+# So many values of a float picture share its least one where noise was cut off; symmetry makes up to eight equal.
+_FEWEST_ENDS = 10
+# Fewer different codes than this may be chance.
+_FEWEST = 6
+# Beyond so many codes the basis images of single precision err by a good part of what the edges of codes tell.
+FINE = 8192
+# Pixels on a side of what a codec for photographs transforms together; twice that where colours have half the
+# resolution.
+BLOCK = 8
+
+
+class Codes(NamedTuple):
+    """The codes of a picture, in units of their step.
+
+    Attributes:
+        values: (H, W, C).
+        below: how far below its code a value may have lain, a number or (H, W, C).
+        above: how far above.
+        ends: codes whose lower and upper bound are open.
+        scale: codes where the encoding is 1.
+        encoding: "linear", "srgb" or a gamma.
+        unit: radiance where the encoding is 1, a number or (C,).
+        name: for people.
+        lossy: the file was compressed with losses.
+        found: it was not said that there are codes: the values lie on their levels.
+    """
+
+    values: Float[np.ndarray, "H W C"]
+    below: float | np.ndarray
+    above: float | np.ndarray
+    ends: tuple[float, float]
+    scale: float
+    encoding: Encoding
+    name: str
+    unit: float | np.ndarray = 1.0
+    lossy: bool = False
+    found: bool = False
+
+    @property
+    def fine(self) -> bool:
+        """Single precision does not resolve a small share of a step."""
+        return self.ends[1] < np.inf and self.ends[1] > FINE
+
+    def bounds(
+        self, rows: slice, valid: Bool[np.ndarray, " P"], level: float | None, spread: np.ndarray | float
+    ) -> Bounds:
+        """Between which codes the values of some rows lay.
+
+        Args:
+            rows: of the picture.
+            valid: pixels that say something; others may have lain anywhere.
+            level: radiance from which on values are clipped; None for the largest code.
+            spread: noise of each pixel over that of the picture, a number or (P, 1).
+        """
+        channels = self.values.shape[2]
+
+        def flat(values: Any) -> np.ndarray:
+            values = np.broadcast_to(values, self.values.shape)[rows]
+            return values.reshape(-1, channels).astype(np.float64)
+
+        if self.lossy:
+            inside = valid & ~_mixed(~valid.reshape(-1, self.values.shape[1]), BLOCK if channels == 1 else 2 * BLOCK)
+            # Or the picture is too small to do without.
+            valid = inside if 2 * np.count_nonzero(inside) >= np.count_nonzero(valid) else valid
+        code, good, top = flat(self.values), valid[:, None], np.full(channels, self.ends[1])
+        if level is not None and np.isfinite(level):
+            top = np.minimum(
+                top, np.rint(self.scale * encode(level / np.asarray(self.unit, np.float64), self.encoding))
+            )
+        lower = np.where(good & (code > self.ends[0]), np.minimum(code, top) - flat(self.below), -np.inf)
+        upper = np.where(good & (code < top), code + flat(self.above), np.inf)
+        parts = (jnp.asarray(part) for part in (lower, upper, self.scale, self.unit))
+        width = np.int64(self.values.shape[1])
+        return Bounds(*parts, np.arange(len(code)), width, jnp.asarray(spread), self.encoding, self.lossy)
+
+
+def _mixed(beside: Bool[np.ndarray, "H W"], size: int) -> Bool[np.ndarray, " P"]:
+    """Pixels of blocks into which compression mixes what lies beside the object."""
+    height, width = beside.shape
+    padded = np.pad(beside, np.array([(0, -height % size), (0, -width % size)]))
+    blocks = padded.reshape(-1, size, padded.shape[1] // size, size)
+    mixed = np.broadcast_to(blocks.any(axis=(1, 3), keepdims=True), blocks.shape)
+    return mixed.reshape(padded.shape)[:height, :width].ravel()
+
+
+def find_codes(
+    pixels: Float[np.ndarray, "H W C"],
+    encoding: Encoding | None,
+    bits: int | None,
+    rounding: Rounding,
+    unit: float | np.ndarray = 1.0,
+) -> Codes | None:
+    """The codes behind linear values; None where no rounding touched them.
+
+    Args:
+        pixels: linear values.
+        encoding: of the codes, where a file says so.
+        bits: of an integer file; None where it is not known to be one.
+        rounding: the full step between neighbouring values in the unit of the pixels; 0 for none, "floor" where the
+            writer truncated, None finds out.
+        unit: radiance of the largest code of a file, a number or (C,).
+    """
+    if rounding is not None and not isinstance(rounding, str):
+        return _stated(pixels, rounding)
+    if bits is not None and encoding is not None:
+        found = _integers(pixels / unit, encoding, 255 if bits <= 8 else 65535)
+        found = None if found is None else found._replace(unit=unit)
+    else:
+        found = _levels(pixels)
+    if found is not None and rounding == "floor":
+        found = found._replace(below=0.0, above=1.0)
+    return found
+
+
+def open_ends(
+    values: Float[np.ndarray, "P C"],
+    valid: Bool[np.ndarray, " P"],
+    floor: float,
+    level: float | None,
+    spread: np.ndarray | float,
+    width: int,
+) -> Bounds | None:
+    """Which values of a float picture say no more than that they were below or above; None where none does.
+
+    Args:
+        values: linear.
+        valid: pixels that say something.
+        floor: the least value of the picture: noise was cut off there where several values share it.
+        level: radiance from which on values are clipped; None where none are.
+        spread: noise of each pixel over that of the picture, a number or (P, 1).
+        width: of the picture.
+    """
+    good = valid[:, None]
+    low, high = good & (values <= floor), good & (values >= (np.inf if level is None else level))
+    images = np.moveaxis(values.reshape(-1, width, values.shape[1]), -1, 0)
+    low &= np.array([single_values_at_end(image, valid.reshape(-1, width), floor) for image in images])
+    if not (low.any() or high.any()):
+        return None
+    lower = np.where(good & ~low, np.where(high, min(level or np.inf, np.inf), values), -np.inf)
+    upper = np.where(good & ~high, values, np.inf)
+    one = np.float64(1.0)
+    parts = (jnp.asarray(part) for part in (lower, upper, one, one))
+    index = np.arange(len(values))
+    return Bounds(*parts, index, np.int64(width), jnp.asarray(spread), "linear", lossy=False, exact=True)
+
+
+def single_values_at_end(
+    value: Float[AnyArray, "H W"], counted: Bool[AnyArray, "H W"], least: float | AnyArray
+) -> Bool[AnyArray, ""]:
+    """Whether single pixels stand at the lower end among larger ones: what is dark without noise is so in one piece.
+
+    Args:
+        value: of one channel, on the host or traced.
+        counted: which pixels count.
+        least: value of the picture.
+    """
+    at_end, above = counted & (value <= least), counted & (value > least)
+    single = above[:, :-2] & at_end[:, 1:-1] & above[:, 2:]
+    return (at_end.sum() >= _FEWEST_ENDS) & (single.sum() >= _FEWEST_ENDS)
+
+
+def _stated(pixels: np.ndarray, rounding: Any) -> Codes | None:
+    """Steps of a size that the user states."""
+    try:
+        step = np.asarray(rounding, np.float64)
+        np.broadcast_shapes(step.shape, pixels.shape)
+    except ValueError:
+        step = np.array(np.nan)
+    if not np.all(np.isfinite(step) & (step >= 0)):
+        words = 'Give the full step between neighbouring values, 0 for none, or "floor"'
+        raise InputError("rounding", f"must be 0 or more and fit the picture, got {rounding!r}", words)
+    if not np.any(step > 0):
+        return None
+    size = float(np.median(step[step > 0]))
+    half = 0.5 * np.maximum(step, 1e-6 * size) / size
+    half = float(half) if half.ndim == 0 else np.broadcast_to(half, pixels.shape)
+    return Codes(pixels / size, half, half, (-np.inf, np.inf), 1 / size, "linear", "steps as stated")
+
+
+def _integers(pixels: np.ndarray, encoding: Encoding, top: int) -> Codes | None:
+    """Of an integer file; the step is the greatest common divisor of what is used."""
+    with np.errstate(invalid="ignore"):
+        codes = np.rint(encode(np.asarray(pixels, np.float32), encoding) * np.float32(top))
+    used = np.unique(codes[np.isfinite(codes)]).astype(np.int64)
+    if used.size < 2:
+        return None
+    inside = used[(used > 0) & (used < top)]
+    step = int(np.gcd.reduce(inside)) if inside.size else 1
+    if step > 1 and used[-1] == top and top % step:
+        # Clipped to the largest number of the file, not to a code of the sensor.
+        codes = np.where(codes == top, np.ceil(top / step) * step, codes)
+    largest = float(top // step)
+    name = f"{'sRGB ' if encoding == 'srgb' else ''}{int(np.ceil(np.log2(largest + 1)))} bit"
+    return Codes((codes / step).astype(np.float32), 0.5, 0.5, (0.0, largest), top / step, encoding, name)
+
+
+def _levels(pixels: np.ndarray) -> Codes | None:
+    """Of a float array: those of a file whose levels hold all values."""
+    good = np.isfinite(pixels)
+    stride = max(1, pixels.size // _FIRST)
+    for some in (pixels[good][::stride][:_FIRST] if good.any() else pixels.ravel()[:0], pixels[good]):
+        if some.size == 0 or np.any(some < 0):
+            return None
+        fitting = [(top, curve) for top in _TOLERANCE for curve in ("linear", "srgb") if _on_levels(some, curve, top)]
+        with np.errstate(over="ignore", under="ignore"):
+            half = bool(np.all(some == some.astype(np.float16)))
+        rgbe = _is_rgbe(pixels) if some.size > _FIRST else True
+        if not (fitting or half or rgbe):
+            return None
+    if np.unique(pixels[good]).size < _FEWEST:
+        return None
+    for top, curve in fitting:
+        found = _integers(pixels, curve, top)
+        if found is not None:
+            return found._replace(found=True)
+    if rgbe:
+        step = np.broadcast_to(_shared_step(pixels)[..., None], pixels.shape)
+        unit = float(np.median(step[step > 0]))
+        ends = (-np.inf, np.inf)
+        return Codes(
+            (pixels / unit).astype(np.float32), 0.0, np.maximum(step, 1e-30) / unit, ends, 1 / unit, "linear", "RGBE"
+        )
+    if half:
+        ulp = np.spacing(np.maximum(pixels, 6e-5).astype(np.float16)).astype(np.float64)
+        unit = float(np.median(ulp[pixels > 0])) if np.any(pixels > 0) else 1.0
+        around = 0.5 * ulp / unit
+        return Codes((pixels / unit).astype(np.float32), around, around, (-np.inf, np.inf), 1 / unit, "linear", "half")
+    return None
+
+
+def _on_levels(values: np.ndarray, curve: Encoding, top: int) -> bool:
+    codes = encode(values.astype(np.float32), curve) * np.float32(top)
+    return bool(np.all(codes <= top + 0.5) and np.all(np.abs(codes - np.rint(codes)) < _TOLERANCE[top]))
+
+
+def _shared_step(pixels: np.ndarray) -> np.ndarray:
+    """The step of RGBE: the brightest channel takes 128 to 255 of them."""
+    largest = np.max(np.nan_to_num(pixels), axis=-1)
+    return np.where(largest > 0, np.exp2(np.floor(np.log2(np.where(largest > 0, largest, 1.0))) - 7), 0.0)
+
+
+def _is_rgbe(pixels: np.ndarray) -> bool:
+    if pixels.shape[-1] != 3 or not np.all(np.isfinite(pixels)):
+        return False
+    step = _shared_step(pixels)[..., None]
+    codes = pixels / np.where(step > 0, step, 1.0)
+    return bool(np.any(step > 0) and np.all(codes == np.rint(codes)))

@@ -1,0 +1,194 @@
+"""What errs together: sums of residuals over blocks of pixels, against what independent errors give.
+
+Independent errors of any size, also where they grow with brightness, have sums over a block whose square is in the mean
+the sum of the squares. A light that stands elsewhere, a ball whose circle is off, the blocks of a JPEG make it larger.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from fitting.solver.normal_equations import Picture
+from fitting.solver.profile import Optimum
+
+SIZES = (8, 16, 32)
+# Of those whose sums of scores tell how much errs together: the blocks of JPEG, and larger ones.
+SCATTER_SIZES = (8, 16)
+# So many standard deviations above what chance gives, at any of the sizes.
+CHANCE = 4.0
+
+
+class Errors(NamedTuple):
+    """Errors of pixels of one picture, each in units of its noise.
+
+    Attributes:
+        values: residuals, 0 where a pixel does not count.
+        index: of the pixels in the picture, row by row.
+        width: of the picture.
+    """
+
+    values: Float[np.ndarray, "P C"]
+    index: Int[np.ndarray, " P"]
+    width: int
+
+    def blocks(self, size: int) -> Int[np.ndarray, " P"]:
+        """In which block of size x size pixels each lies."""
+        row, column = np.divmod(self.index, self.width)
+        return (row // size) * -(-self.width // size) + column // size
+
+
+class Structure(NamedTuple):
+    """How much errs together.
+
+    Attributes:
+        excess: of the blocks' sums over independent errors, in standard deviations; the largest over the sizes.
+        inflation: by what factor the errors of smooth numbers are too small; at least 1.
+    """
+
+    excess: float
+    inflation: float
+
+    @property
+    def significant(self) -> bool:
+        """Too large for chance."""
+        return self.excess > CHANCE
+
+
+def structure(pictures: Sequence[Errors]) -> Structure:
+    """Compare sums over blocks with independent errors.
+
+    Args:
+        pictures: their errors.
+    """
+    excess, inflation = -math.inf, 1.0
+    for size in SIZES:
+        ratio, count, total, squares = 0.0, 0, 0.0, 0.0
+        for errors in pictures:
+            together, apart = block_sums(errors, size)
+            seen = apart > 0
+            ratio += float(np.sum(together[seen] / apart[seen]))
+            count += int(np.count_nonzero(seen))
+            total, squares = total + float(np.sum(together)), squares + float(np.sum(apart))
+        if count:
+            excess = max(excess, (ratio - count) / math.sqrt(2 * count))
+            inflation = max(inflation, math.sqrt(total / max(squares, np.finfo(float).tiny)))
+    return Structure(excess, inflation)
+
+
+def block_sums(errors: Errors, size: int) -> tuple[Float[np.ndarray, "B C"], Float[np.ndarray, "B C"]]:
+    """Squares of the sums over blocks, and sums of the squares.
+
+    Args:
+        errors: of one picture.
+        size: of a block, pixels on a side.
+    """
+    blocks = errors.blocks(size)
+    sums = [np.bincount(blocks, weights=values) ** 2 for values in errors.values.T]
+    squares = [np.bincount(blocks, weights=values**2) for values in errors.values.T]
+    return np.stack(sums, axis=1), np.stack(squares, axis=1)
+
+
+def shared(pictures: Sequence[Errors], size: int = 8) -> tuple[float, float]:
+    """What errs together within blocks: squares of sums less sums of squares; and what chance makes of it.
+
+    Args:
+        pictures: their errors.
+        size: of a block, pixels on a side.
+    """
+    excess, variance = 0.0, 0.0
+    for errors in pictures:
+        together, apart = block_sums(errors, size)
+        excess += float(np.sum(together - apart))
+        variance += float(np.sum(2 * apart**2))
+    return excess, math.sqrt(variance)
+
+
+def errors_of(picture: Picture, optimum: Optimum, place: tuple[np.ndarray, int]) -> Errors:
+    """What a fit leaves, in units of the noise.
+
+    Args:
+        picture: whose weights are inverse variances.
+        optimum: of the fit.
+        place: index of the pixels and width of the picture.
+    """
+    with jax.enable_x64(True):
+        left = np.asarray(picture.target) - np.asarray(picture.predicted(np.asarray(optimum.n), optimum.x))
+    weight = np.asarray(picture.weights)
+    return Errors(np.where(weight > 0, left, 0.0) * np.sqrt(weight), *place)
+
+
+def scatter(
+    picture: Picture,
+    shown: Float[np.ndarray, "P C"],
+    optimum: Optimum,
+    place: tuple[np.ndarray, int],
+    noise: float | None,
+) -> Float[np.ndarray, "U U"]:
+    """Products of the scores by x_a, x_d, x_s, channel after channel, and n, summed over blocks of pixels first.
+
+    That is what the Hessian would be if pixels of a block err together. In a file compressed with losses the pixels of
+    a flat region share the error of the rounding to its code: uniform within half a code.
+
+    Args:
+        picture: whose weights are inverse variances.
+        shown: what the pixels show.
+        optimum: of the fit.
+        place: index of the pixels and width of the picture.
+        noise: of a file compressed with losses, in codes; None for others.
+    """
+    errors, weight = errors_of(picture, optimum, place), np.asarray(picture.weights)
+    with jax.enable_x64(True):
+        columns = np.asarray(_columns(picture, np.asarray(optimum.n)))
+    root, scatters = np.sqrt(weight), []
+    for size in SCATTER_SIZES:
+        blocks = [errors.blocks(size)] * columns.shape[-1]
+        together = _joined(columns * root * errors.values, blocks, optimum)
+        scatters.append(together @ together.T)
+    scale = np.maximum(np.diag(scatters[0]), np.finfo(float).tiny)
+    largest = max(scatters, key=lambda sums: float(np.sum(np.diag(sums) / scale)))
+    if noise is not None:
+        flat = _flat_regions(shown, errors)
+        shared = _joined(columns * np.where(flat > 0, root / noise, 0.0), list(flat.T), optimum)
+        largest = largest + shared @ shared.T / 12.0
+    return largest
+
+
+@eqx.filter_jit
+def _columns(picture: Picture, n: Array) -> Float[Array, "4 P C"]:
+    """Ambient, diffuse, lobe, and its derivative by n."""
+    columns = [jnp.asarray(picture.ambient).reshape(1, -1), picture.diffuse, jnp.zeros((1, 1)), jnp.zeros((1, 1))]
+    if picture.lobe is not None:
+        columns[2:] = picture.lobe(n)
+    return jnp.stack([jnp.broadcast_to(column, picture.target.shape) for column in columns])
+
+
+def _joined(terms: np.ndarray, groups: Sequence[np.ndarray], optimum: Optimum) -> np.ndarray:
+    """Sums over groups of pixels, one grouping a channel, of what each unknown moves; (U, groups)."""
+    channels, most = range(len(groups)), max(int(np.max(group, initial=0)) for group in groups) + 1
+    sums = [[np.bincount(groups[c], weights=term[:, c], minlength=most) for c in channels] for term in terms]
+    by_n = [by * x for by, x in zip(sums[3], optimum.x[2], strict=True)]
+    if all(np.array_equal(groups[0], group) for group in groups):
+        return np.array([*sums[0], *sums[1], *sums[2], sum(by_n)])
+    # Regions of one channel are not those of another.
+    parts = [np.zeros((3 * len(channels) + 1, most)) for _ in channels]
+    for c, part in enumerate(parts):
+        part[[c, len(channels) + c, 2 * len(channels) + c, -1]] = sums[0][c], sums[1][c], sums[2][c], by_n[c]
+    return np.concatenate(parts, axis=1)
+
+
+def _flat_regions(values: np.ndarray, errors: Errors) -> np.ndarray:
+    """A number above 0 for pixels whose neighbours all show the same, the same for the same value; (P, C)."""
+    row, column = np.divmod(errors.index, errors.width)
+    image = np.full((int(row.max()) + 3, errors.width + 2, values.shape[1]), np.nan)
+    image[row + 1, column + 1] = values
+    middle = image[1:-1, 1:-1]
+    beside = (image[:-2, 1:-1], image[2:, 1:-1], image[1:-1, :-2], image[1:-1, 2:])
+    flat = np.logical_and.reduce([middle == other for other in beside])[row, column]
+    numbers = np.stack([np.unique(one, return_inverse=True)[1] + 1 for one in values.T], axis=1)
+    return np.where(flat, numbers, 0)

@@ -1,0 +1,117 @@
+"""Noise that is cut off at black or white: such a value says that it was no larger, or no smaller, and no more."""
+
+import numpy as np
+import OpenImageIO as oiio  # noqa: N813
+import pytest
+
+import brdf
+import fitting
+from brdf.images.encoding import encode
+from fitting.photographs.ball import Circle, ball_points
+from fitting.photographs.distant_light import photograph_scene
+
+SIZE = 96
+POINTS = ball_points((SIZE, SIZE), Circle(47.5, 47.5, 44.0))
+SCENE = photograph_scene(POINTS, (0.5, 0.4, 0.7), ambient=[1.0])
+DULL = brdf.BlinnPhong(k_a=[0.02], k_d=[0.5], k_s=[0.3], n=30.0)
+BRIGHT = brdf.BlinnPhong(k_a=[0.1], k_d=[1.0], k_s=[0.2], n=30.0)
+DRAWS = 6
+
+
+def seen(material: brdf.Material, noise: float, seed: int, *, low: float, bits: int | None) -> brdf.Picture:
+    """A picture whose noise is cut off below ``low`` and above 1."""
+    clean = np.asarray(brdf.render(material, SCENE))
+    values = np.clip(clean + np.random.default_rng(seed).normal(0, noise, clean.shape), low, 1.0)
+    if bits:
+        values = np.rint(values * (2**bits - 1)) / (2**bits - 1)
+    return brdf.Picture(values.astype(np.float32), None, "linear", "given", bits or 32, 1.0)
+
+
+def deviations(result: fitting.FitResult, material: brdf.BlinnPhong) -> np.ndarray:
+    """Of k_a and k_d from the truth, in their standard errors."""
+    errors = {one.name: (one.value, one.error) for one in result.parameters}
+    return np.array(
+        [(errors[name][0] - float(getattr(material, name)[0])) / errors[name][1] for name in ("k_a", "k_d")]
+    )
+
+
+@pytest.mark.parametrize("bits", [8, None])
+@pytest.mark.parametrize(("material", "low"), [(DULL, 0.0), (BRIGHT, -1.0)])
+def test_noise_that_is_cut_off_does_not_bend_the_fit(material, low, bits):
+    found = {}
+    for options in ({"rounding": 0}, {}):
+        pictures = [seen(material, 0.03, seed, low=low, bits=bits) for seed in range(DRAWS)]
+        results = [fitting.fit(picture, SCENE, model="blinn-phong", **options) for picture in pictures]
+        found[len(options)] = np.mean([deviations(result, material) for result in results], axis=0)
+    # The mean of six is known to 0.4 of a standard error; least squares is bent.
+    assert np.max(np.abs(found[1])) > 1.8
+    assert np.all(np.abs(found[0]) < 1.2)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.03])
+def test_where_no_value_is_at_an_end_least_squares_is_the_answer(noise):
+    material = brdf.BlinnPhong(k_a=[0.1], k_d=[0.5], k_s=[0.3], n=30.0)
+    picture = seen(material, noise, 0, low=-1.0, bits=None).pixels
+    result, plain = (fitting.fit(picture, SCENE, model="blinn-phong", rounding=step) for step in (None, 0))
+    assert [one.value for one in result.parameters] == [one.value for one in plain.parameters]
+
+
+def test_a_floor_of_a_float_picture_that_nothing_lies_below_is_no_matter():
+    """The dark side of a clean render is 0 because no light reaches it."""
+    scene = brdf.Scene(lights=SCENE.lights, points=SCENE.points)
+    picture = np.asarray(brdf.render(DULL, scene))
+    result = fitting.fit(picture, scene, model="blinn-phong")
+    assert float(result.material.k_d[0]) == pytest.approx(0.5, rel=1e-5)
+    assert float(result.material.n) == pytest.approx(30.0, rel=1e-4)
+
+
+@pytest.mark.parametrize("by", ["mask", "weight"])
+def test_what_is_masked_says_nothing(by):
+    picture = seen(DULL, 0.03, 0, low=0.0, bits=None).pixels
+    wanted = np.asarray(brdf.render(DULL, SCENE))[..., 0] < 0.5
+    result = fitting.fit(picture, SCENE, model="blinn-phong", **{by: wanted.astype(float)})
+    assert np.all(np.abs(deviations(result, DULL)) < 4)
+
+
+def test_weights_are_inverse_variances_beside_open_ends_too():
+    clean = np.asarray(brdf.render(DULL, SCENE))
+    random, draws = np.random.default_rng(0), []
+    noise = np.where(np.arange(SIZE) % 2, 0.1, 0.01)[None, :, None]
+    for _ in range(DRAWS):
+        picture = np.maximum(clean + noise * random.standard_normal(clean.shape), 0).astype(np.float32)
+        weight = np.broadcast_to(noise[..., 0] ** -2, clean.shape[:2])
+        draws.append(deviations(fitting.fit(picture, SCENE, model="blinn-phong", weight=weight), DULL))
+    assert np.all(np.abs(np.mean(draws, axis=0)) < 1.2)
+
+
+def test_a_channel_that_is_all_noise_does_not_take_the_others_along():
+    clean = np.asarray(brdf.render(DULL, SCENE)) * np.array([1.0, 0.02])
+    values = np.maximum(clean + np.random.default_rng(0).normal(0, 0.03, clean.shape), 0).astype(np.float32)
+    result = fitting.fit(values, SCENE, model="blinn-phong")
+    found = {(one.name, one.channel): one for one in result.parameters}
+    for channel, true in enumerate((0.5, 0.01)):
+        kept = found[("k_d", channel)]
+        assert abs(kept.value - true) < 4 * kept.error
+
+
+@pytest.mark.parametrize("quality", [75, 85, 95])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_a_clipped_highlight_in_a_jpeg_file_does_not_bend_the_fit(tmp_path, quality, channels):
+    shiny = brdf.BlinnPhong(k_a=[0.05] * channels, k_d=[0.7] * channels, k_s=[0.6] * channels, n=30.0)
+    values = np.clip(np.asarray(brdf.render(shiny, SCENE)), 0, 1).astype(np.float32)
+    codes = np.rint(encode(values, "srgb") * 255).astype(np.uint8)
+    spec = oiio.ImageSpec(SIZE, SIZE, channels, "uint8")
+    spec.attribute("Compression", f"jpeg:{quality}")
+    file = oiio.ImageOutput.create("ball.jpg")
+    assert file.open(str(tmp_path / "ball.jpg"), spec)
+    assert file.write_image(codes)
+    file.close()
+    picture = brdf.read_picture(tmp_path / "ball.jpg")
+    brightest = picture.pixels[values.max(axis=-1) == 1].max(axis=-1)
+    assert brightest.min() < 1  # the plateau is none any more
+    assert np.mean(brightest >= picture.saturation) > 0.97
+    material = fitting.fit(picture, SCENE, model="blinn-phong").material
+    assert isinstance(material, brdf.BlinnPhong)
+    assert material.k_d == pytest.approx([0.7] * channels, rel=0.02)
+    assert material.k_s == pytest.approx([0.6] * channels, rel=0.05)
+    assert float(material.n) == pytest.approx(30, rel=0.05)
