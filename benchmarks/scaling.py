@@ -3,10 +3,10 @@
 Usage: python -m benchmarks.scaling [--size 1024] [--repeats 5]
 
 Each process has one device and calls `fitting.fit(mesh=...)`; sums cross through gloo. Strong: the same picture; weak:
-as many pixels for each process. On a machine whose cores are busy, or fewer than the processes, it says little: the load
-is printed. The model: t = P / (D r) + passes (α log2 D + bytes / β) + h, with the rate r, the host's part h and the
-gather's α measured here; β is that of a network of 10 Gbit/s. It holds for the passes: what each process looks at for
-the whole picture, which pixels count and how neighbours err, is not shortened by more of them.
+as many pixels for each process. On a machine whose cores are busy, or fewer than the processes, it says little, so the
+load is printed. The model: t = P / (D r) + passes (α log2 D + bytes / β) + h, with the rate r, the host's part h and
+the gather's α measured here; β is that of a network of 10 Gbit/s. It holds for the passes: what each process looks at
+for the whole picture, which pixels count and how neighbours err, is not shortened by more of them.
 """
 
 import argparse

@@ -147,7 +147,7 @@ def fit(
         ((2, 3), True)
     """
     target = jnp.asarray(target)
-    scene = brdf.cast(scene, target.dtype.name)
+    scene = brdf.cast(scene, "float64" if target.dtype == jnp.float64 else "float32")
     points = scene.surface_points()
     seen = jnp.ravel(points.mask)
     weight = seen if weight is None else seen * jnp.ravel(jnp.asarray(weight))

@@ -26,6 +26,7 @@ from brdf.models.base import SpecularMaterial
 from brdf.precision import working_precision
 from brdf.rendering import basis
 from fitting.result import FitResult
+from fitting.solver.normal_equations import AnyArray
 
 # Directions of the hemisphere that are tried: 6° apart; the best is then followed, in steps down to a tenth of that.
 DIRECTIONS = 400
@@ -253,7 +254,7 @@ def _followed(light: Light, error: float, foretold: Any, shining: np.ndarray) ->
 
 
 @eqx.filter_jit
-def _information(material: brdf.Material, scene: brdf.Scene, variance: Array) -> Array:
+def _information(material: brdf.Material, scene: brdf.Scene, variance: AnyArray) -> Array:
     """Of a picture of a material, by k_a, k_d, k_s, channel after channel each, and n."""
     model, channels = type(material), material.k_d.shape[0]
     images = basis(model, scene)

@@ -169,7 +169,7 @@ def fit_many(
         return ManyFits(problem, None, {})
     with working_precision(problem.precision), spread_over(mesh):
         numbers, plain = _fit_together(problem)
-    done = {int(i): fit_pictures(_one(problem, i)) for i in np.flatnonzero(~plain)}
+    done = {int(i): fit_pictures(_one(problem, int(i))) for i in np.flatnonzero(~plain)}
     for index, result in done.items():
         for name, value in _numbers_of(result).items():
             numbers[name][index] = value
@@ -234,9 +234,10 @@ def _fit_together(problem: FitProblem) -> tuple[dict[str, np.ndarray], Bool[np.n
 
 def _alike(problem: FitProblem) -> bool:
     """Whether all pictures show one scene, and the same pixels of it."""
-    first = problem.scenes[0], problem.masks[0]
-    pairs = zip(problem.scenes, problem.masks, strict=True)
-    return all(scene is first[0] and (mask is first[1] or np.array_equal(mask, first[1])) for scene, mask in pairs)
+    (scene, *scenes), (mask, *masks) = problem.scenes, problem.masks
+    if mask is None or any(one is None for one in masks):
+        return all(one is scene for one in scenes) and all(one is mask for one in masks)
+    return all(one is scene for one in scenes) and bool(np.all([one == mask for one in masks]))
 
 
 def _of_one_structure(scenes: Sequence[brdf.Scene]) -> Iterator[list[int]]:
