@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 import brdf
 from brdf.errors import InputError
-from brdf.images.encoding import encode
+from brdf.images.encoding import Encoding, encode
 from brdf.lights.base import LightStack, stacked
 from brdf.lobes import light_terms
 from brdf.models.base import SpecularMaterial
@@ -193,8 +193,9 @@ def _points(given: Photographs, normals: Any, mask: Any, to_view: Any, flip_y: b
         if normals.shape[:2] != (height, width):
             came = f"is {normals.shape[1]} x {normals.shape[0]}, the photographs {width} x {height}"
             raise InputError(name, came, "Give a normal for each pixel")
-    if np.shape(normals) != (height, width, 3):
-        came = f"are of shape {np.shape(normals)}, the photographs of {(height, width)}"
+    normals = np.asarray(normals)
+    if normals.shape != (height, width, 3):
+        came = f"are of shape {normals.shape}, the photographs of {(height, width)}"
         raise InputError("normals", came, "Give a normal for each pixel")
     return brdf.SurfacePoints.from_normals(normals, mask=mask, to_view=to_view), free
 
@@ -256,7 +257,7 @@ def _program(
     grey: bool,
     free: bool,
     finer: int,
-    values: Float[Array, "P C B"],
+    values: Float[Any, "P C B"],
     points: Any,
     distant: Distant,
     stacks: tuple[LightStack, ...],
@@ -352,7 +353,7 @@ def _layers(
     shows = jnp.any(k_s > LEAST_HIGHLIGHT * noise * k_s_error, axis=0)
     capped = jnp.any(k_s >= CAP * jnp.max(target, axis=(0, 1)), axis=0)
     tests = (~mask | (values == 0), freedom < 1, ~shows | (not glossy), capped, ~(error <= MOST_ERROR))
-    reason = jnp.select([*tests], jnp.arange(1, len(REASONS)), 0).astype(jnp.uint8)
+    reason = jnp.select([*tests], [*range(1, len(REASONS))], 0).astype(jnp.uint8)
     known = reason == 0
     inside = reason != REASONS.index("outside")
     names = ("k_a", "k_d")[-len(linear) :]
@@ -397,12 +398,14 @@ def _likelier(given: Photographs, other: Photographs, points: Any, how: _How) ->
     """
     _, height, width, _ = given.shape
     rows = np.linspace(0, height - 1, min(height, max(1, 4 * TILE // width))).astype(int)
-    left, codes = [], _rows(other, rows, how.precision) * other.unit[..., None]
-    for one, encoding in ((given, "srgb"), (other, "linear")):
+    assert given.to_light is not None
+    to_lights, left, codes = given.to_light, [], _rows(other, rows, how.precision) * other.unit[..., None]
+    readings: tuple[tuple[Photographs, Encoding], ...] = ((given, "srgb"), (other, "linear"))
+    for one, encoding in readings:
         layers = _fit_band(one, how, _rows(one, rows, how.precision), _some(points, rows), 4 * TILE)
         maps = _maps({name: layer.reshape(rows.size, width, *layer.shape[1:]) for name, layer in layers.items()}, how)
         square = np.zeros((rows.size, width))
-        for code, unit, to_light, ambient in zip(codes, one.unit, one.to_light, _each(how.ambient, codes), strict=True):
+        for code, unit, to_light, ambient in zip(codes, one.unit, to_lights, _each(how.ambient, codes), strict=True):
             model = maps.render(to_light) + (0 if maps.k_a is None else maps.k_a * ambient)
             off = encode(model * unit, encoding) - code.T.reshape(model.shape)
             square += np.sum(np.nan_to_num(off) ** 2, axis=-1)

@@ -13,7 +13,7 @@ that single precision loses no digits of the answer. The C channels share the co
 import functools
 import math
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -26,7 +26,7 @@ from brdf.vectors import divide, dot, normalize, square_root
 OCTAVES = 16
 """The exponent is sought from 1 to 2^16: beyond, a lobe is narrower than the step between any two lights."""
 
-STEPS = 4
+STEPS = 5
 """Gauss-Newton steps in a bracket of two steps of the grid: they converge to single precision."""
 
 CAP = 32.0
@@ -95,7 +95,7 @@ def distant_columns(model: Any, normal: Array, to_light: Array, to_view: Array, 
     return Columns(None, columns[0][:, None], columns[1][:, None, None], columns[2][:, None])
 
 
-def _axis(components: Sequence[Array]) -> Array:
+def _axis(components: Iterable[Array]) -> Array:
     """Vectors (T, 3) of their components, which XLA takes apart again: a transposed array it would copy."""
     return jnp.stack(tuple(components), axis=-1)
 
@@ -123,8 +123,8 @@ def fit_texels(model: Any, target: Float[Array, "P C T"], columns: Columns, grey
     if not glossy:
         nothing = jnp.zeros(target.shape[2:], target.dtype)
         linear = [jnp.zeros_like(target[0])] * (1 + (columns.ambient is not None))
-        at = _evaluate(_linear_columns(columns), [], target, linear, jnp.inf, False, [], False)
-        return TexelFit(at.k, at.k_error, nothing, nothing + jnp.inf, at.cost)
+        lambert = _evaluate(_linear_columns(columns), [], target, linear, jnp.inf, False, [], False)
+        return TexelFit(lambert.k, lambert.k_error, nothing, nothing + jnp.inf, lambert.cost)
     cap = cap_of(target)
     grid = math.log(2.0) * jnp.linspace(0, OCTAVES, OCTAVES * finer + 1, dtype=target.dtype)
     k, best = _search_grid(model, target, columns, cap, grid, grey)
@@ -159,9 +159,9 @@ class Distant(NamedTuple):
         ambient: column of the ambient light, (P, D, 1), or None.
     """
 
-    to_light: Float[Array, "P 3"]
-    to_view: Float[Array, "3"]
-    ambient: Float[Array, "P D 1"] | None
+    to_light: Float[Any, "P 3"]
+    to_view: Float[Any, "3"]
+    ambient: Float[Any, "P D 1"] | None
 
     def columns(self, model: Any, normal: Array, seen: Array) -> Columns:
         """Of texels with these normals, (3, T), that count where seen, (P, T)."""
@@ -371,7 +371,7 @@ def _total(of_photograph: Callable[..., Any], *stored: Any) -> Any:
     return jax.lax.scan(add, zeros, stored)[0]
 
 
-def _over_channels(values: Array) -> Array:
+def _over_channels(values: Any) -> Array:
     """The sum over the axis before the last, which stays; a reduction would keep XLA from fusing it with the rest."""
     return functools.reduce(operator.add, (values[..., c : c + 1, :] for c in range(values.shape[-2])))
 
@@ -556,7 +556,7 @@ def _bounded(gram: list[list[Array]], moment: list[Array], low: list[Array], hig
     return [jnp.where(tight, a, b) for a, b in zip([low[0], *bound], [x, *free], strict=True)]
 
 
-def _solve(matrix: Any, right: list[Array], active: list[Array], shared: int) -> tuple[list[Array], ...]:
+def _solve(matrix: Any, right: Any, active: list[Array], shared: int) -> tuple[list[Array], ...]:
     """Solve M x = b by elimination, unknown by unknown; those from ``shared`` on the channels have in common.
 
     Args:

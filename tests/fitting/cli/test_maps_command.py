@@ -1,0 +1,42 @@
+"""``brdf maps``: what goes wrong is one line, and nothing is written; what goes well is a folder."""
+
+import numpy as np
+import pytest
+
+import fitting
+from brdf.images.writing import write_image
+from fitting.cli.main import main
+
+
+def run(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as end:
+        main([str(argument) for argument in arguments])
+    return int(end.value.code or 0)
+
+
+def test_a_folder_without_lights_is_told_and_nothing_is_written(tmp_path, capsys):
+    assert run("maps", tmp_path, "--out", tmp_path / "out") == 2
+    told = capsys.readouterr()
+    assert told.err.startswith(f"error: {tmp_path}: has no file of lights")
+    assert told.err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_diligent_text_files_are_read_and_maps_written(tmp_path, capsys):
+    turn = np.linspace(0, 2 * np.pi, 7)[:6]
+    lights = np.stack([0.4 * np.cos(turn), 0.4 * np.sin(turn), np.ones(6)], axis=1)
+    lights /= np.linalg.norm(lights, axis=1)[:, None]
+    intensities = np.linspace([1.0, 1.5, 2.0], [2.0, 1.0, 1.5], 6)
+    for i, (light, intensity) in enumerate(zip(lights, intensities, strict=True)):
+        picture = np.ones((3, 4, 3)) * [0.3, 0.2, 0.1] * light[2] * intensity
+        write_image(tmp_path / f"{i}.png", picture, dtype="uint16", encoding="linear")
+    (tmp_path / "filenames.txt").write_text("".join(f"{i}.png\n" for i in range(6)))
+    np.savetxt(tmp_path / "light_directions.txt", lights)
+    np.savetxt(tmp_path / "light_intensities.txt", intensities)
+    write_image(tmp_path / "mask.png", np.eye(3, 4), dtype="uint8")
+    np.save(tmp_path / "normals.npy", np.broadcast_to([0.0, 0.0, 1.0], (3, 4, 3)))
+    assert run("maps", tmp_path, "--model", "lambert", "--out", tmp_path / "out") == 0
+    assert "3 of them fitted (lambert)" in capsys.readouterr().out
+    maps = fitting.load_maps(tmp_path / "out")
+    np.testing.assert_allclose(maps.k_d[np.eye(3, 4) > 0], np.broadcast_to([0.3, 0.2, 0.1], (3, 3)), rtol=1e-3)
+    assert np.isnan(maps.k_d[np.eye(3, 4) == 0]).all()
