@@ -35,9 +35,9 @@ def test_one_scene_for_all():
     assert_alike(fits, pictures, [ball_scene()] * COUNT, model="blinn-phong", precision="float64")
     assert len(fits[1:3]) == 2
     half = np.arange(48)[:, None] + np.zeros(48) < 30
-    fits = fitting.fit_many(pictures[:2], ball_scene(), model="blinn-phong", precision="float64", mask=half)
+    masked = fitting.fit_many(pictures[:2], ball_scene(), model="blinn-phong", precision="float64", mask=half)
     one = fitting.fit(pictures[1], ball_scene(), model="blinn-phong", precision="float64", mask=half)
-    np.testing.assert_allclose(fits.n[1], one.material.n, rtol=1e-9)
+    np.testing.assert_allclose(masked.n[1], one.material.n, rtol=1e-9)
     assert "5 pictures, 48 x 48 x 3" in repr(fits)
 
 
