@@ -16,7 +16,8 @@
   const scaled = (a, s) => a.map((x) => x * s);
   const unit = (a) => scaled(a, 1 / Math.hypot(...a));
 
-  function rotated(v, axis, degrees) { // Rodrigues
+  function rotated(v, axis, degrees) {
+    // Rodrigues
     const [c, s] = [Math.cos((degrees * Math.PI) / 180), Math.sin((degrees * Math.PI) / 180)];
     return add(add(scaled(v, c), cross(axis, v), s), axis, dot(axis, v) * (1 - c));
   }
@@ -27,8 +28,16 @@
   const fitted = copy(data.material);
   const specular = "n" in fitted;
   const first = {
-    yaw: 0, pitch: 0, shape: "scene", selected: 0, places: data.lights.map((light) => light.place),
-    exposure: data.exposure, srgb: true, marked: true, wipe: [1 / 3, 2 / 3], ...fitted,
+    yaw: 0,
+    pitch: 0,
+    shape: "scene",
+    selected: 0,
+    places: data.lights.map((light) => light.place),
+    exposure: data.exposure,
+    srgb: true,
+    marked: true,
+    wipe: [1 / 3, 2 / 3],
+    ...fitted,
   };
   const state = copy(first);
   const same = (a, b) => JSON.stringify(a) === JSON.stringify(b);
@@ -36,22 +45,37 @@
   const ownView = () => !state.yaw && !state.pitch && state.shape === "scene" && same(state.places, first.places);
   const compared = () => ownView() && (data.drawable || !moved());
 
-  function scale(n) { // the constant before the lobe, see brdf.models
+  function scale(n) {
+    // the constant before the lobe, see brdf.models
     if (!data.weighted) return 1;
     return data.family === "mirror" ? (n + 2) / 2 : ((n + 2) * (n + 4)) / (8 * (2 ** (-n / 2) + n));
   }
 
   // The state in the address: what differs from the fit. A light's place there is in the scene's own units.
   const worldly = (light, place) => (data.lights[light].kind ? add(data.pivot, place, data.unit) : place);
-  const homely = (light, place) => (data.lights[light].kind ? scaled(add(place, data.pivot, -1), 1 / data.unit) : unit(place));
+  const homely = (light, place) =>
+    data.lights[light].kind ? scaled(add(place, data.pivot, -1), 1 / data.unit) : unit(place);
 
   function write() {
     const said = new URLSearchParams();
     for (const key of ["yaw", "pitch", "shape", "exposure", "srgb", "marked", "wipe", ...Object.keys(fitted)]) {
-      if (!same(state[key], first[key])) said.set(key, [state[key]].flat().map((x) => (typeof x === "number" ? +x.toPrecision(9) : x)).join(","));
+      if (!same(state[key], first[key]))
+        said.set(
+          key,
+          [state[key]]
+            .flat()
+            .map((x) => (typeof x === "number" ? +x.toPrecision(9) : x))
+            .join(","),
+        );
     }
     state.places.forEach((place, i) => {
-      if (!same(place, first.places[i])) said.set(`light${i}`, worldly(i, place).map((x) => +x.toPrecision(9)).join(","));
+      if (!same(place, first.places[i]))
+        said.set(
+          `light${i}`,
+          worldly(i, place)
+            .map((x) => +x.toPrecision(9))
+            .join(","),
+        );
     });
     if (location.protocol !== "about:") history.replaceState(null, "", `#${said.toString().replaceAll("%2C", ",")}`);
   }
@@ -61,19 +85,30 @@
       const numbers = text.split(",").map(Number);
       const known = numbers.every(Number.isFinite);
       const light = /^light(\d+)$/.exec(key)?.[1];
-      if (light !== undefined && data.lights[light] && known && numbers.length === 3 && Math.hypot(...numbers)) state.places[light] = homely(light, numbers);
+      if (light !== undefined && data.lights[light] && known && numbers.length === 3 && Math.hypot(...numbers))
+        state.places[light] = homely(light, numbers);
       else if (["srgb", "marked"].includes(key)) state[key] = text === "true";
       else if (key === "shape" && shapes.some(([name]) => name === text)) state.shape = text;
-      else if (known && Array.isArray(first[key]) && key !== "places" && numbers.length === first[key].length) state[key] = numbers;
+      else if (known && Array.isArray(first[key]) && key !== "places" && numbers.length === first[key].length)
+        state[key] = numbers;
       else if (known && typeof first[key] === "number" && numbers.length === 1) state[key] = numbers[0];
     }
-    if (!data.traced && (state.yaw || state.pitch || !same(state.places, first.places)) && state.shape === "scene") state.shape = "ball";
+    if (!data.traced && (state.yaw || state.pitch || !same(state.places, first.places)) && state.shape === "scene")
+      state.shape = "ball";
   }
 
   // -- what is drawn ------------------------------------------------------------------------------------------------
 
-  const shapes = [["scene", "the scene’s own"], ["ball", "ball"], ["plane", "plane, near eye"]];
-  const counts = { SPHERES: Math.max(1, data.spheres.length), RECTANGLES: Math.max(1, data.rectangles.length), LIGHTS: Math.max(1, data.lights.length) };
+  const shapes = [
+    ["scene", "the scene’s own"],
+    ["ball", "ball"],
+    ["plane", "plane, near eye"],
+  ];
+  const counts = {
+    SPHERES: Math.max(1, data.spheres.length),
+    RECTANGLES: Math.max(1, data.rectangles.length),
+    LIGHTS: Math.max(1, data.lights.length),
+  };
   const programs = {};
 
   function program(mesh, probe) {
@@ -84,14 +119,19 @@
     if (probe) head.push("#define PROBE");
     head.push("precision highp float;", "precision highp int;", "precision highp sampler2D;", "");
     const made = gl.createProgram();
-    for (const [kind, text] of [[gl.VERTEX_SHADER, data.shader.vertex], [gl.FRAGMENT_SHADER, data.shader.material + data.shader.fragment]]) {
+    for (const [kind, text] of [
+      [gl.VERTEX_SHADER, data.shader.vertex],
+      [gl.FRAGMENT_SHADER, data.shader.material + data.shader.fragment],
+    ]) {
       const part = gl.createShader(kind);
       gl.shaderSource(part, head.join("\n") + text);
       gl.compileShader(part);
       gl.attachShader(made, part);
       if (!gl.getShaderParameter(part, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(part));
     }
-    ["corner", "corner_a", "corner_b", "corner_c", "normal_a", "normal_b", "normal_c"].forEach((key, i) => gl.bindAttribLocation(made, i, key));
+    ["corner", "corner_a", "corner_b", "corner_c", "normal_a", "normal_b", "normal_c"].forEach((key, i) =>
+      gl.bindAttribLocation(made, i, key),
+    );
     gl.linkProgram(made);
     if (!gl.getProgramParameter(made, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(made));
     const places = {};
@@ -120,27 +160,29 @@
       gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
       gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, width, height, 0, gl.RGBA, gl.FLOAT, values);
     }
-    meshes = await Promise.all(data.meshes.map(async (mesh) => {
-      const [corners, normals] = [await floats(mesh.corners), await floats(mesh.normals)];
-      const vertices = gl.createVertexArray();
-      gl.bindVertexArray(vertices);
-      const count = corners.length / 3;
-      const values = new Float32Array(21 * count); // a corner, and with it its triangle's three and their normals
-      for (let i = 0; i < count; i++) {
-        const face = 9 * Math.floor(i / 3);
-        values.set(corners.subarray(3 * i, 3 * i + 3), 21 * i);
-        values.set(corners.subarray(face, face + 9), 21 * i + 3);
-        values.set(normals.subarray(face, face + 9), 21 * i + 12);
-      }
-      gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
-      gl.bufferData(gl.ARRAY_BUFFER, values, gl.STATIC_DRAW);
-      for (let i = 0; i < 7; i++) {
-        gl.enableVertexAttribArray(i);
-        gl.vertexAttribPointer(i, 3, gl.FLOAT, false, 84, 12 * i);
-      }
-      gl.bindVertexArray(null);
-      return { vertices, count, fitted: mesh.fitted };
-    }));
+    meshes = await Promise.all(
+      data.meshes.map(async (mesh) => {
+        const [corners, normals] = [await floats(mesh.corners), await floats(mesh.normals)];
+        const vertices = gl.createVertexArray();
+        gl.bindVertexArray(vertices);
+        const count = corners.length / 3;
+        const values = new Float32Array(21 * count); // a corner, and with it its triangle's three and their normals
+        for (let i = 0; i < count; i++) {
+          const face = 9 * Math.floor(i / 3);
+          values.set(corners.subarray(3 * i, 3 * i + 3), 21 * i);
+          values.set(corners.subarray(face, face + 9), 21 * i + 3);
+          values.set(normals.subarray(face, face + 9), 21 * i + 12);
+        }
+        gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+        gl.bufferData(gl.ARRAY_BUFFER, values, gl.STATIC_DRAW);
+        for (let i = 0; i < 7; i++) {
+          gl.enableVertexAttribArray(i);
+          gl.vertexAttribPointer(i, 3, gl.FLOAT, false, 84, 12 * i);
+        }
+        gl.bindVertexArray(null);
+        return { vertices, count, fitted: mesh.fitted };
+      }),
+    );
   }
 
   function camera() {
@@ -170,7 +212,10 @@
     const [x, y] = data.window;
     const [wide, high] = view.resolution;
     const pixel = (2 * view.half_width) / wide;
-    const middle = [(x + 0.5 + stride * (width / 2 - 0.5) - wide / 2) * pixel, (high / 2 - y - 0.5 - stride * (height / 2 - 0.5)) * pixel];
+    const middle = [
+      (x + 0.5 + stride * (width / 2 - 0.5) - wide / 2) * pixel,
+      (high / 2 - y - 0.5 - stride * (height / 2 - 0.5)) * pixel,
+    ];
     const shown = geometry();
     gl.viewport(...(probe ? [-probe[0], -probe[1]] : [0, 0]), canvas.width, canvas.height);
     gl.enable(gl.DEPTH_TEST);
@@ -180,14 +225,63 @@
     for (const mesh of [null, ...shown.meshes]) {
       const { made, place } = program(Boolean(mesh), Boolean(probe));
       gl.useProgram(made);
-      const numbers = { pitch: (pixel * stride) / factor, depth_of_pivot: view.depth, unit: data.unit, exposure: 2 ** state.exposure, residual_limit: data.residual, BRDF_N: state.n, BRDF_SCALE: specular ? scale(state.n) : 1 };
-      const truths = { perspective: view.perspective, local_viewer: view.local, compared: comparing, from_still: Boolean(data.still), srgb: state.srgb, marked: state.marked, target: 0, still: 1, spheres: shown.spheres.length, rectangles: shown.rectangles.length, lights: data.lights.length, mesh_fitted: mesh?.fitted };
-      const triples = { axis_point: view.axis_point, right: view.right, up: view.up, forward: view.forward, eye: view.position, ambient: data.ambient, BRDF_K_A: rgb(state.k_a), BRDF_K_D: rgb(state.k_d), BRDF_K_S: rgb(state.k_s ?? [0]), light_place: state.places.flat(), light_intensity: data.lights.flatMap((light) => light.intensity), light_attenuation: data.lights.flatMap((light) => light.attenuation), light_axis: data.lights.flatMap((light, i) => axis(light, i)), light_kind: data.lights.flatMap((light) => [light.kind, ...light.cone]), rectangle: shown.rectangles.flatMap((one) => one.slice(0, 3).flat()) };
+      const numbers = {
+        pitch: (pixel * stride) / factor,
+        depth_of_pivot: view.depth,
+        unit: data.unit,
+        exposure: 2 ** state.exposure,
+        residual_limit: data.residual,
+        BRDF_N: state.n,
+        BRDF_SCALE: specular ? scale(state.n) : 1,
+      };
+      const truths = {
+        perspective: view.perspective,
+        local_viewer: view.local,
+        compared: comparing,
+        from_still: Boolean(data.still),
+        srgb: state.srgb,
+        marked: state.marked,
+        target: 0,
+        still: 1,
+        spheres: shown.spheres.length,
+        rectangles: shown.rectangles.length,
+        lights: data.lights.length,
+        mesh_fitted: mesh?.fitted,
+      };
+      const triples = {
+        axis_point: view.axis_point,
+        right: view.right,
+        up: view.up,
+        forward: view.forward,
+        eye: view.position,
+        ambient: data.ambient,
+        BRDF_K_A: rgb(state.k_a),
+        BRDF_K_D: rgb(state.k_d),
+        BRDF_K_S: rgb(state.k_s ?? [0]),
+        light_place: state.places.flat(),
+        light_intensity: data.lights.flatMap((light) => light.intensity),
+        light_attenuation: data.lights.flatMap((light) => light.attenuation),
+        light_axis: data.lights.flatMap((light, i) => axis(light, i)),
+        light_kind: data.lights.flatMap((light) => [light.kind, ...light.cone]),
+        rectangle: shown.rectangles.flatMap((one) => one.slice(0, 3).flat()),
+      };
       for (const [key, value] of Object.entries(numbers)) gl.uniform1f(place(key), value ?? 0);
       for (const [key, value] of Object.entries(truths)) gl.uniform1i(place(key), Number(value ?? 0));
       for (const [key, value] of Object.entries(triples)) if (value.length) gl.uniform3fv(place(key), value);
-      for (const [key, list] of [["sphere_fitted", shown.spheres], ["rectangle_fitted", shown.rectangles]]) if (list.length) gl.uniform1iv(place(key), list.map((one) => Number(one.at(-1))));
-      if (shown.spheres.length) gl.uniform4fv(place("sphere"), shown.spheres.flatMap((one) => one.slice(0, 4)));
+      for (const [key, list] of [
+        ["sphere_fitted", shown.spheres],
+        ["rectangle_fitted", shown.rectangles],
+      ])
+        if (list.length)
+          gl.uniform1iv(
+            place(key),
+            list.map((one) => Number(one.at(-1))),
+          );
+      if (shown.spheres.length)
+        gl.uniform4fv(
+          place("sphere"),
+          shown.spheres.flatMap((one) => one.slice(0, 4)),
+        );
       gl.uniform2f(place("size"), canvas.width, canvas.height);
       gl.uniform2f(place("middle"), ...middle);
       gl.uniform2f(place("corner_of_probe"), ...(probe ?? [0, 0]));
@@ -199,7 +293,8 @@
 
   const rgb = (values) => data.shown.map((channel) => values[Math.min(channel, values.length - 1)]);
 
-  function axis(light, i) { // a spot that is moved goes on aiming at what it aimed at
+  function axis(light, i) {
+    // a spot that is moved goes on aiming at what it aimed at
     if (light.kind !== 2 || same(state.places[i], light.place)) return light.axis;
     return unit(add(add(light.place, light.axis, Math.hypot(...light.place)), state.places[i], -1));
   }
@@ -232,7 +327,12 @@
       return [...new Float32Array(bits.buffer)];
     });
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    return { value: value.slice(0, 3), normal: normal.slice(0, 3), hit: normal[3] > 0.5, position: position.slice(0, 3) };
+    return {
+      value: value.slice(0, 3),
+      normal: normal.slice(0, 3),
+      hit: normal[3] > 0.5,
+      position: position.slice(0, 3),
+    };
   }
 
   // -- pointer and keys ---------------------------------------------------------------------------------------------
@@ -260,7 +360,8 @@
     state.places[i] = data.lights[i].kind ? add(seen.position, mirror, apart) : mirror;
   }
 
-  function leave_scene() { // surface points from a file cannot be turned
+  function leave_scene() {
+    // surface points from a file cannot be turned
     if (!data.traced && state.shape === "scene") state.shape = "ball";
   }
 
@@ -294,7 +395,11 @@
     update();
     if (pixel) point(pixel);
   });
-  for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, () => { drag = null; canvas.style.cursor = ""; });
+  for (const end of ["pointerup", "pointercancel"])
+    canvas.addEventListener(end, () => {
+      drag = null;
+      canvas.style.cursor = "";
+    });
   canvas.addEventListener("keydown", (event) => {
     const step = { ArrowLeft: [-3, 0], ArrowRight: [3, 0], ArrowUp: [0, -3], ArrowDown: [0, 3] }[event.key];
     if (!step) return;
@@ -307,10 +412,15 @@
     update();
   });
 
-  const digits = (values) => values.slice(0, data.channels.length).map((x) => (x === 0 ? "0" : Math.abs(x) < 1e-3 || Math.abs(x) >= 1e4 ? x.toExponential(2) : x.toPrecision(4))).join("  ");
+  const digits = (values) =>
+    values
+      .slice(0, data.channels.length)
+      .map((x) => (x === 0 ? "0" : Math.abs(x) < 1e-3 || Math.abs(x) >= 1e4 ? x.toExponential(2) : x.toPrecision(4)))
+      .join("  ");
 
   function point([column, row]) {
-    const place = `column ${Math.round(data.window[0] + (stride * column) / (canvas.width / width))}, row ${Math.round(data.window[1] + (stride * row) / (canvas.height / height))}`;
+    const [x, y] = [column, row].map((at, i) => Math.round(data.window[i] + (stride * at * width) / canvas.width));
+    const place = `column ${x}, row ${y}`;
     const comparing = compared();
     let value = data.traced || state.shape !== "scene" ? probe(column, row).value : [0, 0, 0];
     if (!comparing) return void (find("pointer").textContent = `${place}\n${digits(value)}`);
@@ -318,10 +428,12 @@
     const [target, still] = pictures.map((picture) => [...picture.slice(at, at + 4)]);
     if (still) value = still.slice(0, 3);
     const left_out = target[3] > 0.5 ? "" : "  (does not count)";
-    find("pointer").textContent = `${place}${left_out}\ntarget ${digits(target)}   fit ${digits(value)}\nresidual ${digits(add(value, target.slice(0, 3), -1))}`;
+    find("pointer").textContent =
+      `${place}${left_out}\ntarget ${digits(target)}   fit ${digits(value)}\n` +
+      `residual ${digits(add(value, target.slice(0, 3), -1))}`;
   }
 
-  // -- the edges between target, fit and residual ---------------------------------------------------------------------
+  // -- the edges between target, fit and residual -------------------------------------------------------------------
 
   const least = 0.02;
   function wipe_to(i, share) {
@@ -357,7 +469,7 @@
     find("pane-2").textContent = `residual ± ${data.residual.toPrecision(2)}`;
   }
 
-  // -- numbers --------------------------------------------------------------------------------------------------------
+  // -- numbers ------------------------------------------------------------------------------------------------------
 
   const rows = [];
   function number_row(number) {
@@ -368,8 +480,12 @@
     const get = () => (logarithmic ? state.n : state[number.name][number.channel]);
     const row = document.createElement("div");
     row.className = "number";
-    const label = logarithmic ? "n (log)" : `${number.name} ${data.channels.length > 1 ? data.channels[number.channel] : ""}`;
-    row.innerHTML = '<label></label><div class="track"><div class="band"></div><input type="range" step="any"></div><input type="number" step="any" min="0">';
+    const label = logarithmic
+      ? "n (log)"
+      : `${number.name} ${data.channels.length > 1 ? data.channels[number.channel] : ""}`;
+    row.innerHTML =
+      '<label></label><div class="track"><div class="band"></div><input type="range" step="any"></div>' +
+      '<input type="number" step="any" min="0">';
     const [name, track, box] = row.children;
     const [band, range] = track.children;
     name.textContent = label;
@@ -407,21 +523,33 @@
     return row;
   }
 
-  // -- lobe, albedo, verdict --------------------------------------------------------------------------------------------
+  // -- lobe, albedo, verdict ----------------------------------------------------------------------------------------
 
-  const at_n = (table) => { // between the rows for two exponents as powers of n, which is what lobes come to be
+  const at_n = (table) => {
+    // between the rows for two exponents as powers of n, which is what lobes come to be
     const grid = data.albedo.log_n;
-    const place = Math.max(0, Math.min(grid.length - 1.000001, (Math.log10(state.n) - grid[0]) / (grid[1] - grid[0])));
+    const place = Math.max(
+      0,
+      Math.min(grid.length - 1.000001, (Math.log10(state.n) - grid[0]) / (grid[1] - grid[0])),
+    );
     const [i, share] = [Math.floor(place), place % 1];
     return table[i].map((x, j) => x ** (1 - share) * table[i + 1][j] ** share);
   };
 
-  function albedo() { // per angle, per channel
+  function albedo() {
+    // per angle, per channel
     const lobe = specular && state.k_s.some((k) => k > 0) ? at_n(data.albedo.lobe) : null;
-    return data.albedo.degrees.map((degrees, i) => state.k_d.map((k, c) => k + (lobe ? (state.k_s[c] * lobe[i]) / (data.weighted ? 1 : Math.cos((degrees * Math.PI) / 180)) : 0)));
+    return data.albedo.degrees.map((degrees, i) =>
+      state.k_d.map(
+        (k, c) =>
+          k + (lobe ? (state.k_s[c] * lobe[i]) / (data.weighted ? 1 : Math.cos((degrees * Math.PI) / 180)) : 0),
+      ),
+    );
   }
 
-  const path = (points, colour, kind = "") => `<path class="${kind}" ${colour ? `stroke="${colour}"` : ""} d="M${points.map(([x, y]) => `${x.toFixed(1)} ${y.toFixed(1)}`).join("L")}"/>`;
+  const path = (points, colour, kind = "") =>
+    `<path class="${kind}" ${colour ? `stroke="${colour}"` : ""} d="M` +
+    `${points.map((point) => point.map((x) => x.toFixed(1)).join(" ")).join("L")}"/>`;
   const label = (x, y, text, anchor = "middle") => `<text x="${x}" y="${y}" text-anchor="${anchor}">${text}</text>`;
 
   function draw_lobe() {
@@ -429,25 +557,85 @@
     const [k_d, k_s, n] = [mean(state.k_d), specular ? mean(state.k_s) : 0, state.n];
     const near = Array.from({ length: 120 }, (_, i) => 1e-3 * 6e4 ** (i / 119));
     const curves = [0, 30, 60].map((angle) => {
-      const views = [...Array.from({ length: 181 }, (_, i) => i - 90), ...near.flatMap((x) => [angle - x, angle + x]), angle];
-      return views.filter((view) => Math.abs(view) <= 90).sort((a, b) => a - b).map((view) => {
-        const [light, to] = [angle, view].map((x) => (x * Math.PI) / 180);
-        const cosine = Math.cos((to - light) / (data.family === "mirror" ? 1 : 2));
-        const lobe = k_s && cosine > 0 ? (k_s * scale(n) * Math.exp(n * Math.log(cosine))) / (data.weighted ? 1 : Math.cos(light)) : 0;
-        return [to, Math.sqrt(((k_d + lobe) / Math.PI) * Math.max(Math.cos(to), 0))];
-      });
+      const views = [
+        ...Array.from({ length: 181 }, (_, i) => i - 90),
+        ...near.flatMap((x) => [angle - x, angle + x]),
+        angle,
+      ];
+      return views
+        .filter((view) => Math.abs(view) <= 90)
+        .sort((a, b) => a - b)
+        .map((view) => {
+          const [light, to] = [angle, view].map((x) => (x * Math.PI) / 180);
+          const cosine = Math.cos((to - light) / (data.family === "mirror" ? 1 : 2));
+          const lobe =
+            k_s && cosine > 0
+              ? (k_s * scale(n) * Math.exp(n * Math.log(cosine))) / (data.weighted ? 1 : Math.cos(light))
+              : 0;
+          return [to, Math.sqrt(((k_d + lobe) / Math.PI) * Math.max(Math.cos(to), 0))];
+        });
     });
     const longest = Math.max(1e-9, ...curves.flat().map(([, r]) => r));
-    const drawn = curves.map((curve, i) => path(curve.map(([to, r]) => [100 + (96 * r * Math.sin(to)) / longest, 104 - (96 * r * Math.cos(to)) / longest]), ["#0072b2", "#d55e00", "#009e73"][i]));
-    find("lobe").innerHTML = path([[4, 104], [196, 104]], "", "axis") + path([[100, 104], [100, 8]], "", "axis") + drawn.join("") + label(100, 113, `largest ${(longest ** 2).toPrecision(3)} / sr`);
+    const drawn = curves.map((curve, i) =>
+      path(
+        curve.map(([to, r]) => [100 + (96 * r * Math.sin(to)) / longest, 104 - (96 * r * Math.cos(to)) / longest]),
+        ["#0072b2", "#d55e00", "#009e73"][i],
+      ),
+    );
+    find("lobe").innerHTML =
+      path(
+        [
+          [4, 104],
+          [196, 104],
+        ],
+        "",
+        "axis",
+      ) +
+      path(
+        [
+          [100, 104],
+          [100, 8],
+        ],
+        "",
+        "axis",
+      ) +
+      drawn.join("") +
+      label(100, 113, `largest ${(longest ** 2).toPrecision(3)} / sr`);
   }
 
   function draw_albedo(values) {
     const [x, y] = [(degrees) => 18 + (176 * degrees) / 90, (a) => 100 - 61 * Math.max(0, Math.min(a, 1.5))];
     const colours = data.channels.length > 1 ? ["#d55e00", "#009e73", "#0072b2"] : ["currentColor"];
-    const curves = colours.map((colour, c) => path(data.albedo.degrees.map((degrees, i) => [x(degrees), y(rgb(values[i])[c])]), colour));
-    const ticks = [0, 30, 60, 90].map((degrees) => label(x(degrees), 109, `${degrees}°`)).join("") + [0, 0.5, 1].map((a) => label(15, y(a) + 2.5, a, "end")).join("");
-    find("albedo").innerHTML = path([[18, 8], [18, 100], [194, 100]], "", "axis") + path([[18, y(1)], [194, y(1)]], "", "one") + curves.join("") + ticks + label(20, y(1) - 3, "more than arrives", "start");
+    const curves = colours.map((colour, c) =>
+      path(
+        data.albedo.degrees.map((degrees, i) => [x(degrees), y(rgb(values[i])[c])]),
+        colour,
+      ),
+    );
+    const ticks =
+      [0, 30, 60, 90].map((degrees) => label(x(degrees), 109, `${degrees}°`)).join("") +
+      [0, 0.5, 1].map((a) => label(15, y(a) + 2.5, a, "end")).join("");
+    find("albedo").innerHTML =
+      path(
+        [
+          [18, 8],
+          [18, 100],
+          [194, 100],
+        ],
+        "",
+        "axis",
+      ) +
+      path(
+        [
+          [18, y(1)],
+          [194, y(1)],
+        ],
+        "",
+        "one",
+      ) +
+      curves.join("") +
+      ticks +
+      label(20, y(1) - 3, "more than arrives", "start");
   }
 
   function draw_verdict(values) {
@@ -456,13 +644,20 @@
     const largest = values.map((one) => Math.max(...one));
     const over = largest.findIndex((a) => a > 1 + 1e-6);
     const most = Math.max(...largest);
-    const energy = over < 0 && !classic ? `the albedo is at most ${most.toPrecision(3)}` : over === 0 ? "it reflects more than arrives, at normal incidence already" : `the albedo exceeds 1 beyond ${over < 0 ? "89.9" : data.albedo.degrees[over - 1]}° or soon after`;
+    const energy =
+      over < 0 && !classic
+        ? `the albedo is at most ${most.toPrecision(3)}`
+        : over === 0
+          ? "it reflects more than arrives, at normal incidence already"
+          : `the albedo exceeds 1 beyond ${over < 0 ? "89.9" : data.albedo.degrees[over - 1]}° or soon after`;
     const good = !classic && over < 0;
     find("verdict").className = `verdict ${good ? "good" : "bad"}`;
-    find("verdict").textContent = `${good ? "Plausible" : "Not plausible"}: ${classic ? "not reciprocal, the classic form is not divided by N·L" : "reciprocal"}; ${energy}.`;
+    find("verdict").textContent =
+      `${good ? "Plausible" : "Not plausible"}: ` +
+      `${classic ? "not reciprocal, the highlight is not multiplied by N·L" : "reciprocal"}; ${energy}.`;
   }
 
-  // -- copies -----------------------------------------------------------------------------------------------------------
+  // -- copies -------------------------------------------------------------------------------------------------------
 
   const rgb_text = (values) => rgb(values).join(" ");
   const half_exponent = () => (data.family === "mirror" ? 4 * state.n : state.n);
@@ -476,8 +671,22 @@
       const free = [c * right[0] - b * right[1], a * right[1] - b * right[0]].map((x) => x / (a * c - b * b));
       if (Math.min(...free) >= 0 && free[0] + free[1] <= 1) return free;
       const cost = ([x, y]) => 0.5 * (a * x * x + 2 * b * x * y + c * y * y) - right[0] * x - right[1] * y;
-      const edges = [[[0, 0], [1, 0]], [[0, 0], [0, 1]], [[0, 1], [1, -1]]].map(([[x, y], [p, q]]) => {
-        const step = (p * (right[0] - a * x - b * y) + q * (right[1] - b * x - c * y)) / (a * p * p + 2 * b * p * q + c * q * q);
+      const edges = [
+        [
+          [0, 0],
+          [1, 0],
+        ],
+        [
+          [0, 0],
+          [0, 1],
+        ],
+        [
+          [0, 1],
+          [1, -1],
+        ],
+      ].map(([[x, y], [p, q]]) => {
+        const step =
+          (p * (right[0] - a * x - b * y) + q * (right[1] - b * x - c * y)) / (a * p * p + 2 * b * p * q + c * q * q);
         const t = Math.max(0, Math.min(1, step));
         return [x + t * p, y + t * q];
       });
@@ -487,22 +696,52 @@
   }
 
   const writers = {
-    json: () => `${JSON.stringify({ model: data.model, ...Object.fromEntries(Object.keys(fitted).map((key) => [key, state[key]])) }, null, 2)}\n`,
-    mtl: () => ["# Wavefront material, linear values", ...(data.model === "blinn-phong" ? [] : [`# brdf model: ${data.model}`]), "newmtl fitted", ...(specular ? [`Ns ${half_exponent()}`] : []), `Ka ${rgb_text(state.k_a)}`, `Kd ${rgb_text(state.k_d)}`, `Ks ${rgb_text((state.k_s ?? [0]).map((k) => k * scale(state.n ?? 0)))}`, `illum ${specular ? 2 : 1}`, ""].join("\n"),
+    json: () => {
+      const values = Object.keys(fitted).map((key) => [key, state[key]]);
+      return `${JSON.stringify({ model: data.model, ...Object.fromEntries(values) }, null, 2)}\n`;
+    },
+    mtl: () =>
+      [
+        "# Wavefront material, linear values",
+        ...(data.model === "blinn-phong" ? [] : [`# brdf model: ${data.model}`]),
+        "newmtl fitted",
+        ...(specular ? [`Ns ${half_exponent()}`] : []),
+        `Ka ${rgb_text(state.k_a)}`,
+        `Kd ${rgb_text(state.k_d)}`,
+        `Ks ${rgb_text((state.k_s ?? [0]).map((k) => k * scale(state.n ?? 0)))}`,
+        `illum ${specular ? 2 : 1}`,
+        "",
+      ].join("\n"),
     glsl: () => {
-      const number = (x) => { const text = String(+x.toPrecision(9)); return /[.e]/.test(text) ? text : `${text}.0`; };
+      const number = (x) => {
+        const text = String(+x.toPrecision(9));
+        return /[.e]/.test(text) ? text : `${text}.0`;
+      };
       const values = { N: number(state.n ?? 0), SCALE: number(scale(state.n ?? 0)) };
-      for (const key of ["k_a", "k_d", "k_s"]) values[key.toUpperCase()] = `vec3(${rgb(state[key] ?? [0]).map(number).join(", ")})`;
-      return data.formats.glsl.text.replace(/(const \w+ BRDF_(\w+) = )[^;]*;/g, (_, before, key) => `${before}${values[key]};`);
+      for (const key of ["k_a", "k_d", "k_s"])
+        values[key.toUpperCase()] = `vec3(${rgb(state[key] ?? [0])
+          .map(number)
+          .join(", ")})`;
+      return data.formats.glsl.text.replace(
+        /(const \w+ BRDF_(\w+) = )[^;]*;/g,
+        (_, before, key) => `${before}${values[key]};`,
+      );
     },
     three: () => {
       const material = JSON.parse(data.formats.three.text);
       const { k_d, k_s } = nearest();
       const n = specular ? half_exponent() : 30;
-      const plausible_scale = data.family === "mirror" ? (state.n + 2) / 2 : ((state.n + 2) * (state.n + 4)) / (8 * (2 ** (-state.n / 2) + state.n));
-      const linear = { color: rgb(k_d), specular: rgb(k_s).map((k) => (specular ? (k * plausible_scale * 8) / (n + 2) : 0)) };
+      const plausible_scale =
+        data.family === "mirror"
+          ? (state.n + 2) / 2
+          : ((state.n + 2) * (state.n + 4)) / (8 * (2 ** (-state.n / 2) + state.n));
+      const linear = {
+        color: rgb(k_d),
+        specular: rgb(k_s).map((k) => (specular ? (k * plausible_scale * 8) / (n + 2) : 0)),
+      };
       const code = (x) => Math.round(255 * (x <= 0.0031308 ? 12.92 * x : 1.055 * x ** (1 / 2.4) - 0.055));
-      for (const [key, colour] of Object.entries(linear)) material[key] = colour.reduce((all, x) => 256 * all + code(Math.max(0, Math.min(1, x))), 0);
+      for (const [key, colour] of Object.entries(linear))
+        material[key] = colour.reduce((all, x) => 256 * all + code(Math.max(0, Math.min(1, x))), 0);
       Object.assign(material, { shininess: n, userData: { linear, losses: material.userData.losses } });
       return `${JSON.stringify(material, null, 2)}\n`;
     },
@@ -514,7 +753,13 @@
     find("copied").hidden = false;
     find("text").hidden = !text;
     find("text").value = text;
-    find("losses").replaceChildren(...losses.map((loss) => { const item = document.createElement("li"); item.textContent = loss; return item; }));
+    find("losses").replaceChildren(
+      ...losses.map((loss) => {
+        const item = document.createElement("li");
+        item.textContent = loss;
+        return item;
+      }),
+    );
     if (!text) return void (find("said").textContent = "");
     let done = true;
     try {
@@ -523,11 +768,13 @@
       find("text").select();
       done = document.execCommand("copy");
     }
-    const lost = losses.length ? `It cannot carry everything${moved() ? "; what is lost at the fitted numbers" : ""}:` : "It carries everything.";
+    const lost = losses.length
+      ? `It cannot carry everything${moved() ? "; what is lost at the fitted numbers" : ""}:`
+      : "It carries everything.";
     find("said").textContent = `${done ? "Copied." : "Select and copy the text below."} ${lost}`;
   }
 
-  // -- putting it together ------------------------------------------------------------------------------------------------
+  // -- putting it together ------------------------------------------------------------------------------------------
 
   let waiting = 0;
   function paint() {
@@ -547,7 +794,9 @@
     find("reset").disabled = !moved();
     write();
   }
-  const update = () => { waiting ||= requestAnimationFrame(paint); };
+  const update = () => {
+    waiting ||= requestAnimationFrame(paint);
+  };
 
   function options(select, names) {
     select.replaceChildren(...names.map(([value, text]) => new Option(text, value)));
@@ -557,19 +806,52 @@
     await load();
     read();
     options(find("shape"), shapes);
-    options(find("light"), data.lights.map((light, i) => [i, `${i + 1}: ${["directional", "point", "spot"][light.kind]}`]));
+    options(
+      find("light"),
+      data.lights.map((light, i) => [i, `${i + 1}: ${["directional", "point", "spot"][light.kind]}`]),
+    );
     find("light-label").hidden = data.lights.length < 2;
     find("model").textContent = data.model;
     find("sliders").append(...data.numbers.map(number_row));
-    find("notes").append(...data.notes.map((note) => { const item = document.createElement("li"); item.textContent = note; return item; }));
-    find("shape").addEventListener("change", (event) => { state.shape = event.target.value; if (!data.traced && state.shape === "scene") to_own(); update(); });
-    find("light").addEventListener("change", (event) => { state.selected = Number(event.target.value); });
-    find("exposure").addEventListener("input", (event) => { state.exposure = Number(event.target.value); update(); });
-    for (const key of ["srgb", "marked"]) find(key).addEventListener("change", (event) => { state[key] = event.target.checked; update(); });
-    find("reset").addEventListener("click", () => { Object.assign(state, copy(fitted)); update(); });
-    find("own").addEventListener("click", () => { to_own(); update(); });
-    for (const button of document.querySelectorAll("[data-format]")) button.addEventListener("click", () => copy_as(button.dataset.format));
-    addEventListener("hashchange", () => { Object.assign(state, copy(first)); read(); update(); });
+    find("notes").append(
+      ...data.notes.map((note) => {
+        const item = document.createElement("li");
+        item.textContent = note;
+        return item;
+      }),
+    );
+    find("shape").addEventListener("change", (event) => {
+      state.shape = event.target.value;
+      if (!data.traced && state.shape === "scene") to_own();
+      update();
+    });
+    find("light").addEventListener("change", (event) => {
+      state.selected = Number(event.target.value);
+    });
+    find("exposure").addEventListener("input", (event) => {
+      state.exposure = Number(event.target.value);
+      update();
+    });
+    for (const key of ["srgb", "marked"])
+      find(key).addEventListener("change", (event) => {
+        state[key] = event.target.checked;
+        update();
+      });
+    find("reset").addEventListener("click", () => {
+      Object.assign(state, copy(fitted));
+      update();
+    });
+    find("own").addEventListener("click", () => {
+      to_own();
+      update();
+    });
+    for (const button of document.querySelectorAll("[data-format]"))
+      button.addEventListener("click", () => copy_as(button.dataset.format));
+    addEventListener("hashchange", () => {
+      Object.assign(state, copy(first));
+      read();
+      update();
+    });
     find("viewer").classList.add("drawn");
     find("why").textContent = "Target and fit in the fit’s own view and light, as they were computed.";
     find("fixed").hidden = data.drawable;
@@ -580,7 +862,8 @@
     Object.assign(state, { yaw: 0, pitch: 0, shape: "scene", places: copy(first.places) });
   }
 
-  start().catch((error) => { // whatever fails here, the still picture stays
+  start().catch((error) => {
+    // whatever fails here, the still picture stays
     find("viewer").classList.remove("drawn");
     find("fixed").hidden = false;
     console.error(error);
