@@ -117,6 +117,8 @@ void main() {
 #ifdef MESH
     vec3 area = cross(b - a, c - a);
     float slope = dot(ray, area), along = dot(a - start, area) / slope;
+    vec3 depths = vec3(dot(a - start, ray), dot(b - start, ray), dot(c - start, ray));  // seen edge-on, a plane says little
+    along = clamp(along, min(depths.x, min(depths.y, depths.z)), max(depths.x, max(depths.y, depths.z)));
     vec3 position = start + along * ray;
     float second = dot(cross(position - a, c - a), area) / dot(area, area);
     float third = dot(cross(b - a, position - a), area) / dot(area, area);
