@@ -11,9 +11,11 @@
 """
 
 import math
-from typing import ClassVar
+from typing import Any, ClassVar
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 
 from brdf import vectors
 from brdf.models.base import SpecularMaterial
@@ -55,5 +57,7 @@ class NormalizedBlinnPhong(SpecularMaterial):
     @staticmethod
     def scale(n: Numbers) -> Scalars:
         """(n+2)(n+4) / (8 (2^(-n/2) + n)): the albedo of the lobe at normal incidence is 1."""
-        n = jnp.asarray(n)
-        return 0.125 * (n + 2.0) * ((n + 4.0) / (jnp.exp(-0.5 * math.log(2.0) * n) + n))
+        # A plain number by NumPy: by JAX each operation would be compiled.
+        xp: Any = jnp if isinstance(n, jax.Array) else np
+        n = xp.asarray(n, None if xp is jnp else float)
+        return 0.125 * (n + 2.0) * ((n + 4.0) / (xp.exp(-0.5 * math.log(2.0) * n) + n))
