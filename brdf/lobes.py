@@ -277,7 +277,7 @@ class Lobe(eqx.Module):
         return xp.where((slot >= 0)[:, None], xp.take(fine, xp.maximum(slot, 0), axis=-2), centre)
 
 
-def _over_samples(power: np.ndarray, weight: np.ndarray) -> np.ndarray:
+def _over_samples(power: np.ndarray, weight: Any) -> np.ndarray:
     # NumPy is slow where the last axes are short.
     alone = weight.shape[1:] == (1, 1)
     return (power[..., 0] * weight[:, 0, 0])[..., None] if alone else np.einsum("...ps,psc->...pc", power, weight)

@@ -56,6 +56,7 @@ def nonnegative_minima(
         right = np.concatenate([product, 1 - np.sum(cap * start, axis=-1, keepdims=True)], axis=-1)
         begin = np.pad(start, np.array([*more, (0, 1)]))
     every = np.array(list(itertools.product([False, True], repeat=right.shape[-1])))
+    x, feasible = start, np.zeros(0, bool)
     # Mostly all that may be above 0 are; where one is not, every set is tried.
     for sets in (every[-1:], every) if cap is None else (every,):
         active = sets.reshape(-1, *(1,) * (product.ndim - 1), right.shape[-1])

@@ -145,7 +145,9 @@ def search(
                 if cap is None:
                     found = gauss_newton(problem, start, GRID_STEP)
                 else:
-                    found = capped_minimum(problem, *log_n[[max(0, cell - 1), min(cell + 2, log_n.size - 1)]], start.x)
+                    found = capped_minimum(
+                        problem, log_n[max(0, cell - 1)], log_n[min(cell + 2, log_n.size - 1)], start.x
+                    )
                 # A minimum at the end of its reach is none, but for the bounds of the search.
                 if abs(found[0].log_n - position[cell]) < GRID_STEP or found[0].log_n in problem.bounds:
                     return _optimum(*found, problem, *about)
@@ -158,7 +160,7 @@ def search(
             if cap is None:
                 candidates.append(gauss_newton(problem, start, GRID_STEP))
             else:
-                candidates.append(capped_minimum(problem, *log_n[cell : cell + 2], start.x))
+                candidates.append(capped_minimum(problem, log_n[cell], log_n[cell + 1], start.x))
         # Where the profile is level the best sample may be no worse than what the valleys led to.
         costs = profile.cost.sum(axis=1)
         if cap is None and np.min(costs) < min(np.sum(point.cost) for point, _ in candidates):

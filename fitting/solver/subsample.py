@@ -10,7 +10,7 @@ So few pixels are dealt with on the host, in float64: nothing is compiled for th
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import numpy as np
@@ -85,7 +85,7 @@ class Subsample(NamedTuple):
             square = np.sum(weight * target**2, axis=0)
             whole = np.broadcast_to(gram, (*product.shape, 4))
             totals.append(Sums(whole, product, *np.broadcast_arrays(square, pixels, product[..., 0])[:2]))
-        return Sums(*map(sum, zip(*totals, strict=True)))
+        return Sums(*(np.sum(leaf, axis=0) for leaf in zip(*totals, strict=True)))
 
     def spread(
         self, log_n: Float[np.ndarray, " N"], x: Float[np.ndarray, "N C 3"], best: int, peak: float
@@ -134,7 +134,7 @@ def _lobes(part: Picture, log_n: np.ndarray, peak: float) -> Iterator[tuple[slic
     for first in range(0, log_n.size, step):
         index = slice(first, first + step)
         n = np.exp(log_n[index])[:, None, None]
-        value, slope = lobe(n, peak)
+        value, slope = map(np.asarray, lobe(cast(Any, n), peak))
         yield index, value, slope * n
 
 

@@ -1,13 +1,13 @@
 """What a residual gives away: neighbours that err alike, and noise that grows with brightness."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from jaxtyping import Float
 
 from fitting.pixels import Tile
-from fitting.solver.normal_equations import AnyArray, Picture
+from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
 from fitting.uncertainty.noise_model import noise_model
 
@@ -100,10 +100,10 @@ def _neighbours(counted: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]
     return first, second
 
 
-def _residuals(picture: Picture, pairs: AnyArray, n: float, x: AnyArray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _residuals(picture: Picture, pairs: np.ndarray, n: float, x: np.ndarray) -> tuple[Any, Any, Any]:
     """Residual, weight and model of so few pixels: on the host, where nothing is compiled."""
     some = picture.on_host(pairs.ravel())
-    value = 0.0 if some.lobe is None else some.lobe(np.float64(n))[0]
+    value = 0.0 if some.lobe is None else some.lobe(cast(Any, np.float64(n)))[0]
     model = x[0] * some.ambient + x[1] * some.diffuse + x[2] * value
     return np.where(some.weights > 0, some.target - model, 0), some.weights, model
 
