@@ -164,7 +164,8 @@ class File:
                 return shown.astype(np.float32)
             codes = shown.astype(np.float32)
         else:
-            codes = encoded(linear, self.curve) * self.top + self.noise * random.standard_normal(linear.shape)
+            white = np.iinfo(self.kind).max / self.step
+            codes = encoded(linear, self.curve) * white + self.noise * random.standard_normal(linear.shape)
             codes = (np.clip(np.rint(codes), 0, self.top) * self.step).astype(self.kind)
         if self.as_rgb:
             codes = np.repeat(codes, 3, axis=2)

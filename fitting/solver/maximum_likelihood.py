@@ -152,7 +152,8 @@ def evidence(
         closed = sum(part.closed for part in stated)
         at = at._replace(noise=math.sqrt(sum(part.closed_squares for part in stated) / max(closed, 1)))
         rounding = 0.0 if exact else 1 / 12
-        if exact or at.noise**2 > ENOUGH_NOISE**2 + rounding:
+        widest = 1.0 if exact else max(_widest(picture) for picture in pictures)
+        if exact or at.noise**2 > (ENOUGH_NOISE**2 + rounding) * widest**2:
             linear = all(picture.bounds is not None and picture.bounds.encoding == "linear" for picture in pictures)
             if linear and not any(_open_ends_tell(picture, at) for picture in pictures):
                 return None
@@ -508,6 +509,13 @@ def _inside(picture: Picture, at: Estimate) -> np.ndarray:
     code = np.asarray(_codes(picture, at.x, np.float64(at.log_n)))
     inside = np.minimum(code - np.asarray(picture.bounds.lower), np.asarray(picture.bounds.upper) - code)
     return inside / (at.noise * np.asarray(picture.bounds.spread))
+
+
+def _widest(picture: Picture) -> float:
+    """The largest distance of two ends: of floats that grows with brightness."""
+    assert picture.bounds is not None
+    width = np.asarray(picture.bounds.upper) - np.asarray(picture.bounds.lower)
+    return float(np.max(width, where=np.isfinite(width), initial=0.0))
 
 
 def _open_ends_tell(picture: Picture, at: Estimate) -> bool:

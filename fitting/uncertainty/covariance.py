@@ -165,7 +165,7 @@ def _errors(
         hessian[place] += block
         scale = np.array([1.0, 1.0, 1.0, x[2, channel]])
         middle[place] += noise[channel] ** 2 * block if spread is None else spread[channel] * np.outer(scale, scale)
-    middle = middle if scatter is None else scatter
+    alone, middle = middle, middle if scatter is None else scatter
     active = known & (x > 0)
     has_n, with_n = bool(active[2].any()), False
     unit = np.eye(size)
@@ -182,8 +182,10 @@ def _errors(
     covariance = inverse @ middle @ inverse
     if scatter is not None:
         # Of a few blocks the scatter alone says too little.
-        least = np.diag(inverse) * np.maximum(np.trace(inverse @ scatter) / max(np.linalg.matrix_rank(inverse), 1), 1.0)
-        widening = widening * np.sqrt(np.maximum(least / np.maximum(np.diag(covariance), np.finfo(float).tiny), 1.0))
+        alike = inverse @ alone @ inverse
+        more = max(np.trace(inverse @ scatter) / max(np.trace(inverse @ alone), np.finfo(float).tiny), 1.0)
+        least = np.diag(alike) * more / np.maximum(np.diag(covariance), np.finfo(float).tiny)
+        widening = widening * np.sqrt(np.maximum(least, 1.0))
     covariance = covariance * np.outer(widening * np.ones(size), widening * np.ones(size))
     variance = np.maximum(np.diag(covariance), 0.0)
     error, interval = np.full((3, channels), np.inf), np.zeros((3, channels, 2))

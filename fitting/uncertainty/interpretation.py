@@ -13,14 +13,16 @@ from fitting.light_colour import coefficient_factors
 from fitting.model_fit import ModelFit
 from fitting.pixels import Observed, Tile
 from fitting.result import Parameter, free_parameters
+from fitting.solver.devices import device_count
 from fitting.solver.maximum_likelihood import Evidence
 from fitting.solver.normal_equations import Picture
+from fitting.solver.profile import Optimum
 from fitting.uncertainty.covariance import TERMS, Uncertainty, residual_noise, uncertainty
 from fitting.uncertainty.highlight import OFF_CENTRE, Highlight, highlight
 from fitting.uncertainty.intervals import exponent_interval
 from fitting.uncertainty.noise_model import weighted_sums
 from fitting.uncertainty.residual_correlation import ResidualCorrelation, residual_correlation
-from fitting.uncertainty.structure import errors_of, scatter, structure
+from fitting.uncertainty.structure import Structure, errors_of, of_blocks, scatter, structure
 
 # With less noise than this, in codes, few pixels of a block say something, and these by turns.
 ROUNDED = 0.25
@@ -78,14 +80,19 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> Interpretation
     if lobe is not None:
         visible = float(np.max(optimum.x[2]) * lobe.largest / max(np.max(seen.brightest), np.finfo(float).tiny))
     known = residual_correlation(pictures, seen.tiles, optimum, rounding)
-    spread, shared, widening, deviation = None, None, 1.0, noise
+    spread, shared, widening, deviation, together = None, None, 1.0, noise, None
     if fit.evidence is not None:
-        # Each working target has the noise 1.
-        said = fit.evidence
+        # Each working target has the noise 1; what least squares leaves is rounding, which goes together.
+        said, known = fit.evidence, known._replace(significant=False, noise=None)
         fit, optimum, deviation = fit._replace(pictures=said.pictures, optimum=said.optimum), said.optimum, noise**0
         shared = shared_errors(said, seen.tiles)
+        together = None if said.noise < ROUNDED else _structure_of(said, seen.tiles)
         widening = said.widening
-    elif known.noise is not None:
+    else:
+        together = _structure(pictures, seen, optimum, noise)
+        if together is not None and together.significant:
+            shared = _scattered(pictures, seen, optimum)
+    if fit.evidence is None and shared is None and known.noise is not None:
         spread = fit.noise_factor**2 * weighted_sums(pictures, optimum, known.noise, inverse=False).gram
     # What the light reaches but the simplest model does without is 0, with the error that it would have.
     reached = seen.reached(fit.model)
@@ -114,7 +121,7 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> Interpretation
     correlation = sure.correlation[np.ix_(index, index)]
     warnings = [_capped(material)] if fit.capped else []
     warnings += _missing_ambient(pictures)
-    warnings += _warnings(known, None if all(sure.reasons[2]) else lobe)
+    warnings += _warnings(known, together, None if all(sure.reasons[2]) else lobe)
     warnings += _hard_to_tell(free, correlation)
     pixels = None if lobe is None else lobe.pixels
     return Interpretation(material, parameters, noise, known.correlation, pixels, correlation, tuple(warnings))
@@ -129,11 +136,8 @@ def shared_errors(said: Evidence, tiles: Sequence[Tile]) -> Float[np.ndarray, "U
         said: of a fit.
         tiles: of which its pictures were made.
     """
-    lossy = any(tile.bounds is not None and tile.bounds.lossy for tile in tiles)
-    errors = (
-        errors_of(picture, said.optimum, place) for picture, place in zip(said.pictures, said.places, strict=True)
-    )
-    if not lossy and (said.noise < ROUNDED or not structure(list(errors)).significant):
+    lossy = _lossy(tiles)
+    if not lossy and (said.noise < ROUNDED or not _structure_of(said, tiles).significant):
         return None
     return np.sum(
         [
@@ -142,6 +146,37 @@ def shared_errors(said: Evidence, tiles: Sequence[Tile]) -> Float[np.ndarray, "U
         ],
         axis=0,
     )
+
+
+def _lossy(tiles: Sequence[Tile]) -> bool:
+    return any(tile.bounds is not None and tile.bounds.lossy for tile in tiles)
+
+
+def _structure_of(said: Evidence, tiles: Sequence[Tile]) -> Structure:
+    """In a file that was compressed with losses the pixels of a block err together in any case."""
+    parts = zip(said.pictures, said.places, strict=True)
+    errors = [errors_of(picture, said.optimum, place) for picture, place in parts]
+    return structure(list(map(of_blocks, errors)), (2, 4)) if _lossy(tiles) else structure(errors)
+
+
+def _structure(
+    pictures: Sequence[Picture], seen: Observed, optimum: Optimum, noise: Float[np.ndarray, " C"]
+) -> Structure | None:
+    """That of a fit by least squares; None where all pixels are not at hand, or weights are part of what is fitted."""
+    if seen.problem.streamed or device_count() > 1 or seen.problem.loss != "squared" or not noise.all():
+        return None
+    errors = [errors_of(picture, optimum, _whole(tile)) for picture, tile in zip(pictures, seen.tiles, strict=True)]
+    return structure([error._replace(values=error.values / noise.astype(error.values.dtype)) for error in errors])
+
+
+def _scattered(pictures: Sequence[Picture], seen: Observed, optimum: Optimum) -> Float[np.ndarray, "U U"]:
+    parts = zip(pictures, seen.tiles, strict=True)
+    found = [scatter(picture, np.asarray(tile.target), optimum, _whole(tile), None) for picture, tile in parts]
+    return np.sum(found, axis=0)
+
+
+def _whole(tile: Tile) -> tuple[np.ndarray, int]:
+    return np.arange(tile.target.shape[0]), tile.points.mask.shape[1]
 
 
 def _typical_weight(pictures: Sequence[Picture]) -> float:
@@ -237,13 +272,19 @@ def _missing_ambient(pictures: Sequence[Picture]) -> Iterator[str]:
         )
 
 
-def _warnings(known: ResidualCorrelation, seen: Highlight | None) -> Iterator[str]:
-    if known.significant:
-        yield (
-            f"the residual has structure: neighbouring pixels err alike (correlation {known.correlation:.2f}), so the "
-            "model is not the whole truth, or the picture was smoothed. The errors come from a formula for independent "
-            f"noise and are too small, by a factor of {known.inflation:.2g} or more"
-        )
+def _warnings(known: ResidualCorrelation, together: Structure | None, seen: Highlight | None) -> Iterator[str]:
+    if known.significant or (together is not None and together.significant):
+        words = "the residual has structure: neighbouring pixels err alike"
+        if known.correlation > 0.05:
+            words += f" (correlation {known.correlation:.2f})"
+        words += ", so the model or the scene is not the whole truth, or the picture was smoothed. "
+        if together is None or not together.significant:
+            words += f"The errors are too small, by a factor of {known.inflation:.2g} or more"
+        else:
+            words += (
+                "The errors allow for that among neighbours, not for what it does to the numbers: they may be too small"
+            )
+        yield words
     if known.noise is not None:
         yield (
             "the noise grows with brightness; the errors allow for it, but pixels are weighed alike: told of the "

@@ -18,10 +18,14 @@ from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
 
 SIZES = (8, 16, 32)
+# Pixels on a side of the blocks of JPEG, whose errors go together by themselves.
+CODED_BLOCK = 8
 # Of those whose sums of scores tell how much errs together: the blocks of JPEG, and larger ones.
 SCATTER_SIZES = (8, 16)
-# So many standard deviations above what chance gives, at any of the sizes.
-CHANCE = 4.0
+# So many standard deviations above what chance gives: in blocks of 8 x 8, and at any of the sizes.
+CHANCE, SIGNIFICANT = 4.0, 3.2
+# A block counts where this share of its pixels does.
+FULL = 0.5
 
 
 class Errors(NamedTuple):
@@ -47,38 +51,75 @@ class Structure(NamedTuple):
     """How much errs together.
 
     Attributes:
-        excess: of the blocks' sums over independent errors, in standard deviations; the largest over the sizes.
-        inflation: by what factor the errors of smooth numbers are too small; at least 1.
+        excess: of the squares of the blocks' sums over what independent errors give, in standard deviations; the
+            largest over the sizes.
+        share: of the squares that errs together in the largest blocks.
     """
 
     excess: float
-    inflation: float
+    share: float
 
     @property
     def significant(self) -> bool:
         """Too large for chance."""
-        return self.excess > CHANCE
+        return self.excess > SIGNIFICANT
 
 
-def structure(pictures: Sequence[Errors]) -> Structure:
+def structure(pictures: Sequence[Errors], sizes: Sequence[int] = SIZES) -> Structure:
     """Compare sums over blocks with independent errors.
 
     Args:
         pictures: their errors.
+        sizes: of the blocks, pixels on a side; multiples of the first.
     """
-    excess, inflation = -math.inf, 1.0
-    for size in SIZES:
-        ratio, count, total, squares = 0.0, 0, 0.0, 0.0
-        for errors in pictures:
-            together, apart = block_sums(errors, size)
-            seen = apart > 0
-            ratio += float(np.sum(together[seen] / apart[seen]))
-            count += int(np.count_nonzero(seen))
-            total, squares = total + float(np.sum(together)), squares + float(np.sum(apart))
-        if count:
-            excess = max(excess, (ratio - count) / math.sqrt(2 * count))
-            inflation = max(inflation, math.sqrt(total / max(squares, np.finfo(float).tiny)))
-    return Structure(excess, inflation)
+    grids = [_grid(errors, sizes[0]) for errors in pictures]
+    excess, share = -math.inf, 0.0
+    for size in sizes:
+        total, blocks, variance, together, apart = 0.0, 0, 0.0, 0.0, 0.0
+        for sums, squares, count in grids:
+            factor = size // sizes[0]
+            joined, alone, pixels = (_coarser(part, factor) for part in (sums, squares, count))
+            # In a block with few pixels the ratio says little.
+            seen = (pixels >= FULL * size**2) & (alone > 0)
+            ratio = joined[seen] ** 2 / alone[seen]
+            total, blocks = total + float(np.sum(ratio)), blocks + int(np.count_nonzero(seen))
+            together, apart = together + float(np.sum(joined[seen] ** 2)), apart + float(np.sum(alone[seen]))
+            variance += float(np.sum(2 * (pixels[seen] - 1) / (pixels[seen] + 2)))
+        if blocks:
+            # Wilson and Hilferty (1931): the cube root of chi squared is nearly normal.
+            spread = variance / (9 * blocks**2)
+            excess = max(excess, ((total / blocks) ** (1 / 3) - (1 - spread)) / math.sqrt(spread))
+            share = max(share, (together - apart) / max(apart, np.finfo(float).tiny) / (size**2 * FULL))
+    return Structure(excess, share)
+
+
+def of_blocks(errors: Errors) -> Errors:
+    """Sums over the blocks of a codec, which are what its errors are independent in.
+
+    Args:
+        errors: of one picture.
+    """
+    sums, _, _ = _grid(errors, CODED_BLOCK)
+    return Errors(sums.reshape(-1, sums.shape[2]), np.arange(sums.shape[0] * sums.shape[1]), sums.shape[1])
+
+
+def _grid(errors: Errors, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Sums of errors, of their squares, and how many pixels, over blocks; (rows, columns, C) each."""
+    row, column = np.divmod(errors.index[-1], errors.width)
+    values = errors.values
+    if errors.index.size == (row + 1) * errors.width and column == errors.width - 1:
+        image = values.reshape(row + 1, errors.width, -1)
+    else:
+        image = np.zeros((int(np.max(errors.index)) // errors.width + 1, errors.width, values.shape[1]), values.dtype)
+        image[np.divmod(errors.index, errors.width)] = values
+    image = np.pad(image, np.array([(0, -image.shape[0] % size), (0, -image.shape[1] % size), (0, 0)]))
+    blocks = image.reshape(-1, size, image.shape[1] // size, size, image.shape[2])
+    return tuple(part.sum(axis=(1, 3), dtype=np.float64) for part in (blocks, blocks**2, blocks != 0))
+
+
+def _coarser(grid: np.ndarray, factor: int) -> np.ndarray:
+    padded = np.pad(grid, np.array([(0, -grid.shape[0] % factor), (0, -grid.shape[1] % factor), (0, 0)]))
+    return padded.reshape(-1, factor, padded.shape[1] // factor, factor, padded.shape[2]).sum(axis=(1, 3))
 
 
 def block_sums(errors: Errors, size: int) -> tuple[Float[np.ndarray, "B C"], Float[np.ndarray, "B C"]]:
