@@ -184,8 +184,9 @@ def _errors(
         # Of a few blocks the scatter alone says too little.
         alike = inverse @ alone @ inverse
         more = max(np.trace(inverse @ scatter) / max(np.trace(inverse @ alone), np.finfo(float).tiny), 1.0)
-        least = np.diag(alike) * more / np.maximum(np.diag(covariance), np.finfo(float).tiny)
-        widening = widening * np.sqrt(np.maximum(least, 1.0))
+        variance, least = np.diag(covariance), np.diag(alike) * more
+        ratio = np.divide(least, variance, out=np.ones(size), where=variance > 1e-9 * least)
+        widening = widening * np.sqrt(np.maximum(ratio, 1.0))
     covariance = covariance * np.outer(widening * np.ones(size), widening * np.ones(size))
     variance = np.maximum(np.diag(covariance), 0.0)
     error, interval = np.full((3, channels), np.inf), np.zeros((3, channels, 2))

@@ -89,7 +89,7 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> Interpretation
         together = None if said.noise < ROUNDED else _structure_of(said, seen.tiles)
         widening = said.widening
     else:
-        together = _structure(pictures, seen, optimum, noise)
+        together = _structure(pictures, seen, optimum, noise, rounding, even=known.noise is None)
         if together is not None and together.significant:
             shared = _scattered(pictures, seen, optimum)
     if fit.evidence is None and shared is None and known.noise is not None:
@@ -160,13 +160,22 @@ def _structure_of(said: Evidence, tiles: Sequence[Tile]) -> Structure:
 
 
 def _structure(
-    pictures: Sequence[Picture], seen: Observed, optimum: Optimum, noise: Float[np.ndarray, " C"]
+    pictures: Sequence[Picture],
+    seen: Observed,
+    optimum: Optimum,
+    noise: Float[np.ndarray, " C"],
+    rounding: Float[np.ndarray, " C"],
+    *,
+    even: bool,
 ) -> Structure | None:
-    """That of a fit by least squares; None where all pixels are not at hand, or weights are part of what is fitted."""
-    if seen.problem.streamed or device_count() > 1 or seen.problem.loss != "squared" or not noise.all():
+    """That of a fit by least squares; None where it cannot be told, or weights are part of what is fitted."""
+    tell, found = noise > 2 * rounding, []
+    if device_count() > 1 or seen.problem.loss != "squared" or not tell.any():
         return None
-    errors = [errors_of(picture, optimum, _whole(tile)) for picture, tile in zip(pictures, seen.tiles, strict=True)]
-    return structure([error._replace(values=error.values / noise.astype(error.values.dtype)) for error in errors])
+    for picture, tile in zip(pictures, seen.tiles, strict=True):
+        errors = errors_of(picture, optimum, _whole(tile))
+        found.append(errors._replace(values=(errors.values / noise)[:, tell].astype(np.float32)))
+    return structure(found, even=even)
 
 
 def _scattered(pictures: Sequence[Picture], seen: Observed, optimum: Optimum) -> Float[np.ndarray, "U U"]:

@@ -65,17 +65,19 @@ class Structure(NamedTuple):
         return self.excess > SIGNIFICANT
 
 
-def structure(pictures: Sequence[Errors], sizes: Sequence[int] = SIZES) -> Structure:
+def structure(pictures: Sequence[Errors], sizes: Sequence[int] = SIZES, *, even: bool = True) -> Structure:
     """Compare sums over blocks with independent errors.
 
     Args:
         pictures: their errors.
+        even: the noise is the same everywhere. Where it is not, blocks count by their noise: what least squares leaves
+            where there is little of it is the noise of other places.
         sizes: of the blocks, pixels on a side; multiples of the first.
     """
     grids = [_grid(errors, sizes[0]) for errors in pictures]
     excess, share = -math.inf, 0.0
     for size in sizes:
-        total, blocks, variance, together, apart = 0.0, 0, 0.0, 0.0, 0.0
+        total, blocks, variance, together, apart, chance = 0.0, 0, 0.0, 0.0, 0.0, 0.0
         for sums, squares, count in grids:
             factor = size // sizes[0]
             joined, alone, pixels = (_coarser(part, factor) for part in (sums, squares, count))
@@ -85,7 +87,10 @@ def structure(pictures: Sequence[Errors], sizes: Sequence[int] = SIZES) -> Struc
             total, blocks = total + float(np.sum(ratio)), blocks + int(np.count_nonzero(seen))
             together, apart = together + float(np.sum(joined[seen] ** 2)), apart + float(np.sum(alone[seen]))
             variance += float(np.sum(2 * (pixels[seen] - 1) / (pixels[seen] + 2)))
-        if blocks:
+            chance += float(np.sum(2 * alone[seen] ** 2))
+        if blocks and not even:
+            excess = max(excess, SIGNIFICANT / CHANCE * (together - apart) / math.sqrt(chance))
+        elif blocks:
             # Wilson and Hilferty (1931): the cube root of chi squared is nearly normal.
             spread = variance / (9 * blocks**2)
             excess = max(excess, ((total / blocks) ** (1 / 3) - (1 - spread)) / math.sqrt(spread))
