@@ -150,7 +150,8 @@ class FitResult(Parameters):
     """The outcome of a fit.
 
     Attributes:
-        material: the fitted material; what is not determined is 0 in it, which changes no picture.
+        material: the fitted material; what is not determined is 0 in it, which changes no picture, or stands for a
+            sum that is, which its reason states.
         parameters: value and error of each number, or why it has none.
         noise: standard deviation of the residual, (C,); with weights, that of the weighted residual.
         structure: correlation of neighbouring residuals.
@@ -206,7 +207,9 @@ class FitResult(Parameters):
     def surface(self) -> str:
         """The model in words: its name, or what is left of it where the picture requires neither shape nor light."""
         chosen = next((one.model for one in self.candidates if one.chosen), self.material.name)
-        return {"none": "none (black)", "ambient": "ambient (no shading)"}.get(chosen, chosen)
+        # Where no more than a sum is determined, ambient light alone shows as well what the material shows with k_d.
+        words = {"none": "none (black)", "ambient": "ambient (no shading)"}
+        return self.material.name if np.any(self.material.k_d) else words.get(chosen, chosen)
 
     def fitted(self, picture: int = 0) -> Float[np.ndarray, "H W C"]:
         """The picture that the fitted material makes.

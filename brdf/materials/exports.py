@@ -64,13 +64,14 @@ class Export:
     losses: tuple[str, ...]
 
 
-def export_material(material: Material, to: str, *, name: str = "fitted") -> Export:
+def export_material(material: Material, to: str, *, name: str = "fitted", note: str = "") -> Export:
     """A material as another program reads it.
 
     Args:
         material: any of the five models, of known numbers, with 1 or 3 channels (``json``: any number).
         to: one of json, mtl, three, gltf, mitsuba, mitsuba-dict, pytorch3d, glsl.
         name: what to call it, where the format names its materials.
+        note: what to say of it in the file, a line: what a picture left open, say.
 
     Raises:
         InputError: an unknown format, or channels that the format does not know.
@@ -89,10 +90,12 @@ def export_material(material: Material, to: str, *, name: str = "fitted") -> Exp
     text, losses = EXPORTS[to](material, name)
     if to != "json" and isinstance(material, SpecularMaterial) and not isinstance(material, WRITTEN):
         losses = [f"the format has no word for the lobe of {material.name}: it is written as Blinn-Phong's", *losses]
-    return Export(text, tuple(losses))
+    return Export(_with_note(text, to, note) if note else text, tuple(losses))
 
 
-def save_export(material: Material, path: str | Path, *, to: str | None = None, name: str = "fitted") -> Export:
+def save_export(
+    material: Material, path: str | Path, *, to: str | None = None, name: str = "fitted", note: str = ""
+) -> Export:
     """Write a material as another program reads it.
 
     Args:
@@ -100,6 +103,7 @@ def save_export(material: Material, path: str | Path, *, to: str | None = None, 
         path: the file to write.
         to: as for `export_material`; None goes by the suffix: .json .mtl .gltf .xml .glsl .py.
         name: what to call it.
+        note: as for `export_material`.
 
     Returns:
         What was written, and what it cannot carry.
@@ -115,9 +119,24 @@ def save_export(material: Material, path: str | Path, *, to: str | None = None, 
     if to is None and suffix not in _SUFFIXES:
         remedy = f"Name it {' '.join(_SUFFIXES)} or say which of {', '.join(EXPORTS)} you want"
         raise InputError(path, f"does not say its format, got {suffix or 'no suffix'}", remedy)
-    export = export_material(material, to or _SUFFIXES[suffix], name=name)
+    export = export_material(material, to or _SUFFIXES[suffix], name=name, note=note)
     write_text(path, export.text)
     return export
+
+
+def _with_note(text: str, to: str, note: str) -> str:
+    """The text with a note where its format has a place for one."""
+    if not text.startswith("{"):
+        start, end = {"glsl": ("//", ""), "mitsuba": ("<!--", " -->")}.get(to, ("#", ""))
+        return f"{start} note: {note.replace('--', '- -')}{end}\n{text}"
+    values = json.loads(text)
+    if to == "gltf":
+        values["materials"][0].setdefault("extras", {})["note"] = note
+    elif to == "three":
+        values.setdefault("userData", {})["note"] = note
+    elif to == "json":
+        values["note"] = note
+    return _json_text(values)
 
 
 # -- what several formats need -----------------------------------------------------------------------------------------

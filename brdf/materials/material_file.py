@@ -1,12 +1,13 @@
 """Material files in and out: JSON, which carries everything, and Wavefront MTL (``mtl``), which other programs load.
 
-In JSON a value that a picture could not determine is ``null``; it reads back as 0, which changes no picture.
+In JSON a value that a picture could not determine is ``null``; it reads back as 0, which changes no picture. One that
+stands for a sum, of which the picture says no more, is a number, and ``note`` says so.
 """
 
 import dataclasses
 import json
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -64,13 +65,30 @@ def load_materials(path: str | Path) -> dict[str, Material]:
     return {name: _material(path, name, entry) for name, entry in _entries(path).items()}
 
 
+def load_note(path: str | Path, name: str | None = None) -> str:
+    """What a file says that its material leaves open; empty where it says nothing.
+
+    Args:
+        path: as for `load_material`.
+        name: which one, where an MTL file holds several.
+
+    Raises:
+        InputError: where the file cannot be read.
+    """
+    entries = _entries(path)
+    entry = entries.get(name) if name else next(iter(entries.values()))
+    note = entry.get("note") if isinstance(entry, dict) else None
+    return note if isinstance(note, str) else ""
+
+
 def save_material(material: Material, path: str | Path, *, undetermined: Collection[str] = ()) -> None:
     """Write a material that `load_material` reads back.
 
     Args:
         material: any of the models; MTL holds three channels, so one channel is written three times.
         path: a ``.json`` or ``.mtl`` file.
-        undetermined: what a picture could not determine, written as ``null``: "n", "k_s" or "k_s[2]" for one channel.
+        undetermined: what a picture could not determine, written as ``null`` where it is 0: "n", "k_s" or "k_s[2]" for
+            one channel; a dictionary says why.
 
     Raises:
         InputError: where the file cannot be written or cannot hold the material.
@@ -83,7 +101,7 @@ def save_material(material: Material, path: str | Path, *, undetermined: Collect
     if _suffix(path, "Name it .json or .mtl") == ".json":
         text = to_json(material, undetermined=undetermined)
     elif channels in (1, 3):
-        text = to_mtl(material, undetermined=undetermined)
+        text = to_mtl(material, undetermined=undetermined, note=undetermined_note(material, undetermined))
     else:
         came = f"cannot hold {channels} channels, MTL knows RGB alone"
         raise InputError(path, came, "Save the material as .json")
@@ -106,11 +124,29 @@ def material_to_dict(material: Material, *, undetermined: Collection[str] = ()) 
     for key in _parameters(type(material)):
         numbers = np.asarray(getattr(material, key), np.float64)
         listed = [
-            None if key in undetermined or f"{key}[{channel}]" in undetermined else float(number)
+            None if number == 0 and not {key, f"{key}[{channel}]"}.isdisjoint(undetermined) else float(number)
             for channel, number in enumerate(numbers.ravel())
         ]
         values[key] = listed if numbers.ndim else listed[0]
-    return values
+    note = undetermined_note(material, undetermined)
+    return values | ({"note": note} if note else {})
+
+
+def undetermined_note(material: Material, undetermined: Collection[str]) -> str:
+    """What to say of numbers that are not 0 although no picture determined them; empty where there are none.
+
+    Args:
+        material: any of the models.
+        undetermined: see `save_material`.
+    """
+    reasons = undetermined if isinstance(undetermined, Mapping) else {}
+    open_keys: dict[str, list[str]] = {}
+    for key in undetermined:
+        numbers = np.ravel(getattr(material, key.partition("[")[0]))
+        if numbers[int(key.partition("[")[2].rstrip("]") or 0)]:
+            open_keys.setdefault(reasons.get(key, "the picture leaves them open"), []).append(key)
+    told = "; ".join(f"{', '.join(keys)}: {reason}" for reason, keys in open_keys.items())
+    return f"not determined: {told}" if told else ""
 
 
 def material_from_dict(values: Any) -> Material:
@@ -129,7 +165,7 @@ def material_from_dict(values: Any) -> Material:
         raise InputError("model", f"is unknown, got {repr(name)[:SHOWN]}", f"Use one of {', '.join(MODELS)}")
     known = _parameters(MODELS[name])
     for key in values:
-        if key not in ("model", *known):
+        if key not in ("model", "note", *known):
             raise InputError(key[:SHOWN], "is not a known key", f"Known here: model, {', '.join(known)}")
     for key in known:
         if key not in values and key != "k_a":

@@ -17,6 +17,7 @@ from brdf.models import MODELS, BlinnPhong, Lambert, Material, NormalizedPhong, 
 
 SHOWN = 40  # the first letters of a word that messages show
 _MODEL_COMMENT = "# brdf model:"
+_NOTE_COMMENT = "# note:"
 _TEXTURE = "map_kd"
 _COEFFICIENTS = {"ka": "k_a", "kd": "k_d", "ks": "k_s"}
 
@@ -32,19 +33,22 @@ def height(material: SpecularMaterial) -> float:
     return float(material.scale(np.float64(material.n)))
 
 
-def to_mtl(material: Material, *, name: str = "fitted", undetermined: Collection[str] = ()) -> str:
+def to_mtl(material: Material, *, name: str = "fitted", undetermined: Collection[str] = (), note: str = "") -> str:
     """The material as MTL holds it.
 
     Args:
         material: any of the models, with 1 or 3 channels.
         name: what ``newmtl`` calls it.
         undetermined: what a picture could not determine, told in a comment.
+        note: what else a comment is to tell, a line.
     """
     lines = ["# Wavefront material, linear values"]
     if type(material) is not BlinnPhong:
         lines.append(f"{_MODEL_COMMENT} {material.name}")
     if undetermined:
         lines.append(f"# not determined by the picture: {', '.join(undetermined)}")
+    if note:
+        lines.append(f"{_NOTE_COMMENT} {note}")
     lines.append(f"newmtl {name}")
     colours, illum = [material.k_a, material.k_d, 0.0], 1
     if isinstance(material, SpecularMaterial):
@@ -67,11 +71,13 @@ def read_mtl(path: Any, text: str) -> dict[str, dict[str, Any]]:
         InputError: naming the line.
     """
     entries: dict[str, dict[str, Any]] = {}
-    name = model = None
+    name = model = note = None
     for number, line in _logical_lines(text):
         place = f"{path}: line {number}"
         if line.startswith(_MODEL_COMMENT):
             model = line.removeprefix(_MODEL_COMMENT).strip()
+        elif line.startswith(_NOTE_COMMENT):
+            note = line.removeprefix(_NOTE_COMMENT).strip()
         words = line.partition("#")[0].split()
         key = words[0].lower() if words else ""
         if key == "newmtl":
@@ -79,7 +85,7 @@ def read_mtl(path: Any, text: str) -> dict[str, dict[str, Any]]:
             if name in entries:
                 came = f"names the material {name[:SHOWN]} a second time"
                 raise InputError(place, came, "Give each a name of its own")
-            entries[name] = {"model": model}
+            entries[name], note = {"model": model, "note": note}, None
         elif key in (*_COEFFICIENTS, "ns", "illum", _TEXTURE):
             if name is None:
                 raise InputError(place, f"has {words[0]} before any newmtl", "Start the material with newmtl NAME")

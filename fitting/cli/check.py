@@ -9,7 +9,7 @@ import typer
 import brdf
 from brdf.errors import InputError
 from brdf.files import atomic_path
-from fitting.cli.common import AsJson, find_materials, show, use_compilation_cache, waiting
+from fitting.cli.common import AsJson, find_materials, find_note, show, use_compilation_cache, waiting
 
 EXAMPLE = (
     "Example: [bold]brdf check material.json[/bold]\n\n"
@@ -49,9 +49,17 @@ def check(
             with atomic_path(plot) as path:
                 for name, one in materials.items():
                     overview(one, reports[name]).savefig(path)
+    notes = {name: "" if is_table else find_note(material, name) for name in reports}
     if as_json:
-        show(json.dumps({name: report.to_json() for name, report in reports.items()}, indent=2))
+        told = {
+            name: report.to_json() | ({"note": notes[name]} if notes[name] else {}) for name, report in reports.items()
+        }
+        show(json.dumps(told, indent=2))
     else:
-        show("\n\n".join(map(str, reports.values())))
+        show(
+            "\n\n".join(
+                f"{report}\n  note: {notes[name]}" if notes[name] else str(report) for name, report in reports.items()
+            )
+        )
     verdicts = [report.plausible for report in reports.values()]
     return 1 if False in verdicts else 2 if None in verdicts else 0

@@ -152,6 +152,21 @@ def find_materials(text: str) -> dict[str, "brdf.Material"]:
     return brdf.load_materials(text) if key is None else {key: brdf.preset(key)}
 
 
+def find_note(text: str, name: str | None) -> str:
+    """What a material's file says that it leaves open.
+
+    Args:
+        text: see `find_material`.
+        name: likewise.
+
+    Raises:
+        InputError: naming the file.
+    """
+    from brdf.materials.material_file import load_note
+
+    return "" if _table_name(text) else load_note(text, name)
+
+
 def _table_name(text: str) -> str | None:
     """The name in the classic table; None where a file is meant."""
     if not text.strip():

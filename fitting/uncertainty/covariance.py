@@ -1,10 +1,11 @@
 """How sure a fit is: covariance from the Gauss-Newton Hessian, intervals, and what the picture leaves open."""
 
+import dataclasses
 import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from fitting.solver.profile import Optimum
 from fitting.solver.tied import design_of
@@ -20,6 +21,32 @@ SIGNIFICANT = 10.0
 
 TERMS = ("k_a", "k_d", "k_s")
 LIGHT = ("no ambient light", "no light", "no light")
+# What ambient light is taken to add where no more than its sum with the diffuse term is determined.
+AMBIENT_SHARE = 0.01
+
+
+class Sum(NamedTuple):
+    """Terms of which the picture determines no more than their sum: each looks like the others.
+
+    Attributes:
+        terms: their indices.
+        columns: root mean square over pixels of what each shows at 1, (T,).
+        value: of all together.
+        error: standard error of that.
+    """
+
+    terms: Int[np.ndarray, " T"]
+    columns: Float[np.ndarray, " T"]
+    value: float
+    error: float
+
+    @property
+    def stand_in(self) -> Float[np.ndarray, " 3"]:
+        """Coefficients that show it: of k_a little, of k_d the rest, of k_s nothing."""
+        shares, of_two = np.zeros(3), self.terms[self.terms < 2]
+        shares[of_two] = 1.0 if of_two.size == 1 else (AMBIENT_SHARE, 1 - AMBIENT_SHARE)
+        shares[self.terms] *= self.value / self.columns
+        return shares
 
 
 class Uncertainty(NamedTuple):
@@ -35,6 +62,7 @@ class Uncertainty(NamedTuple):
         rise: by how much the cost, summed over channels, rises at the ends of a 95 % interval of n.
         reasons: why a coefficient is not determined, (3, C) of texts; empty where it is.
         n_reason: why n is not; empty where it is.
+        sums: by channel, what is determined of several terms together.
     """
 
     x_error: Float[np.ndarray, "3 C"]
@@ -44,6 +72,7 @@ class Uncertainty(NamedTuple):
     rise: float
     reasons: np.ndarray
     n_reason: str
+    sums: dict[int, Sum]
 
 
 def residual_noise(optimum: Optimum, rounding: Float[np.ndarray, " C"]) -> Float[np.ndarray, " C"]:
@@ -69,6 +98,7 @@ def uncertainty(
     spread: Float[np.ndarray, "C 4 4"] | None = None,
     scatter: Float[np.ndarray, "U U"] | None = None,
     widening: Float[np.ndarray, " U"] | float = 1.0,
+    columns: Float[np.ndarray, "3 C"] | None = None,
 ) -> Uncertainty:
     """Errors of an optimum.
 
@@ -87,18 +117,29 @@ def uncertainty(
         spread: sums of the columns' products times the variance of each pixel, where it is not the same in all.
         scatter: what takes the place of the Hessian times the noise, over all unknowns, where pixels err together.
         widening: what to multiply errors by.
+        columns: root mean square over pixels of what each term shows at 1; None where no pixel weighs more.
     """
+    if columns is None:
+        columns = rms_columns(optimum)
     dependent = DEPENDENT_SINGLE if single else DEPENDENT_DOUBLE
     reasons = np.full(free.shape, "", object)
     n_reason = reasons[2, :] = _without_trace(optimum, noise, visible)
     for term, channel in np.argwhere(~free & (reasons == "")):
         where = "this channel" if free[term].any() else "the scene"
         reasons[term, channel] = f"{LIGHT[term]} in {where}"
-    _name_dependent(optimum, reasons, dependent)
-    known = reasons == ""
+    sums = _dependent(optimum, reasons, dependent, columns)
+    known, stand_in = reasons == "", optimum.x.copy()
+    determined = known.copy()
+    for channel, some in sums.items():
+        # One takes the place of all, and its error is that of the sum.
+        first = some.terms[0]
+        stand_in[some.terms, channel] = 0.0
+        stand_in[first, channel], determined[first, channel] = some.value / some.columns[0], True
+    optimum = dataclasses.replace(optimum, x=stand_in)
     x_error, x_interval, n_error, correlation, rise = _errors(
-        optimum, known, noise, tied, spread, scatter, widening, dependent
+        optimum, determined, noise, tied, spread, scatter, widening, dependent
     )
+    sums = {c: some._replace(error=some.columns[0] * x_error[some.terms[0], c]) for c, some in sums.items()}
     for term, channel in np.argwhere(known):
         largest = max(optimum.square[channel], brightest[channel] ** 2)
         if x_error[term, channel] ** 2 * optimum.gram[channel, term, term] > largest:
@@ -108,7 +149,7 @@ def uncertainty(
         n_reason = "the highlight fits as well with other exponents and another k_s"
     if n_reason:
         n_error = math.inf
-    return Uncertainty(x_error, x_interval, n_error, correlation, rise, reasons, n_reason)
+    return Uncertainty(x_error, x_interval, n_error, correlation, rise, reasons, n_reason, sums)
 
 
 def _without_trace(optimum: Optimum, noise: np.ndarray, visible: float) -> str:
@@ -128,8 +169,20 @@ def _without_trace(optimum: Optimum, noise: np.ndarray, visible: float) -> str:
     return "" if gain > SIGNIFICANT * unknowns else "the highlight does not stand out of the noise"
 
 
-def _name_dependent(optimum: Optimum, reasons: np.ndarray, dependent: float) -> None:
-    """Find terms that no pixel sees, or that the others reproduce."""
+def rms_columns(optimum: Optimum, weight: float = 1.0) -> Float[np.ndarray, "3 C"]:
+    """Root mean square over pixels of what each term shows at 1.
+
+    Args:
+        optimum: of the engine.
+        weight: root of the mean weight of its pixels.
+    """
+    squares = np.diagonal(optimum.gram[:, :3, :3], axis1=1, axis2=2).T
+    return np.sqrt(np.maximum(squares, 0.0) / np.maximum(optimum.pixels, 1)) / weight
+
+
+def _dependent(optimum: Optimum, reasons: np.ndarray, dependent: float, columns: np.ndarray) -> dict[int, Sum]:
+    """Name terms that no pixel sees, or that the others reproduce; of each channel the sum, where that is all."""
+    sums = {}
     for channel, column in enumerate(reasons.T):
         gram = optimum.gram[channel, :3, :3]
         scale = np.sqrt(np.maximum(np.diag(gram), 0.0))
@@ -139,8 +192,13 @@ def _name_dependent(optimum: Optimum, reasons: np.ndarray, dependent: float) -> 
             continue
         value, vector = np.linalg.eigh(gram[np.ix_(terms, terms)] / np.outer(scale[terms], scale[terms]))
         if value[0] <= dependent:
-            tied = terms[np.abs(vector[:, 0]) > 0.1]
+            ways = np.abs(vector[:, value <= dependent])
+            tied = terms[ways.max(axis=1) > 0.1]
             column[tied] = f"only a sum of {' and '.join(TERMS[term] for term in tied)} is determined"
+            if ways.shape[1] == tied.size - 1:
+                shown = columns[tied, channel]
+                sums[channel] = Sum(tied, shown, float(shown @ optimum.x[tied, channel]), math.inf)
+    return sums
 
 
 def _errors(

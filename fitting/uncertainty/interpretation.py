@@ -17,7 +17,15 @@ from fitting.solver.devices import device_count
 from fitting.solver.maximum_likelihood import Evidence
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
-from fitting.uncertainty.covariance import TERMS, Uncertainty, residual_noise, uncertainty
+from fitting.uncertainty.covariance import (
+    AMBIENT_SHARE,
+    TERMS,
+    Sum,
+    Uncertainty,
+    residual_noise,
+    rms_columns,
+    uncertainty,
+)
 from fitting.uncertainty.highlight import OFF_CENTRE, Highlight, highlight
 from fitting.uncertainty.intervals import exponent_interval
 from fitting.uncertainty.noise_model import weighted_sums
@@ -73,7 +81,8 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> Interpretation
         hidden: why there is no highlight, where a fit with one has told.
     """
     optimum, pictures = fit.optimum, fit.pictures
-    rounding = seen.rounding * _typical_weight(pictures)
+    weight = _typical_weight(pictures)
+    rounding, columns = seen.rounding * weight, rms_columns(optimum, weight)
     noise = np.maximum(residual_noise(optimum, rounding) * fit.noise_factor, rounding)
     lobe = None if optimum.flat else highlight(pictures, optimum.n)
     visible = 0.0
@@ -107,6 +116,7 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> Interpretation
         spread=spread,
         scatter=shared,
         widening=widening,
+        columns=columns,
     )
     interval = None
     # At k_d + k_s = 1 the cost still falls across the bound: a profile that does not know it has its least elsewhere.
@@ -123,6 +133,10 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> Interpretation
     warnings += _missing_ambient(pictures)
     warnings += _warnings(known, together, None if all(sure.reasons[2]) else lobe)
     warnings += _hard_to_tell(free, correlation)
+    if sure.sums:
+        words = "no more than a sum of several numbers is determined, see there: the material shows it with "
+        words += f"{100 * AMBIENT_SHARE:g} % of it as ambient light, if there is any, and the rest as k_d. "
+        warnings.append(words + "Another light, or a curved surface, would tell them apart")
     pixels = None if lobe is None else lobe.pixels
     return Interpretation(material, parameters, noise, known.correlation, pixels, correlation, tuple(warnings))
 
@@ -213,7 +227,9 @@ def _open_exponent(interval: tuple[float, float]) -> str:
 def material_and_parameters(
     fit: ModelFit, sure: Uncertainty, colour: Float[np.ndarray, " C"], interval: tuple[float, float] | None
 ) -> tuple[brdf.Material, tuple[Parameter, ...]]:
-    """The material that was found, what is not determined being 0 in it, and its numbers with their errors.
+    """The material that was found, and its numbers with their errors.
+
+    What is not determined is 0 in the material, unless it is part of a sum that is: that the material shows.
 
     Args:
         fit: of one model.
@@ -228,6 +244,8 @@ def material_and_parameters(
     for term, name in enumerate(TERMS[: 2 + specular]):
         for channel, factor in enumerate(factors[term]):
             if sure.reasons[term, channel]:
+                if channel in sure.sums and term in sure.sums[channel].terms:
+                    sure.reasons[term, channel] = _in_words(sure.sums[channel], factors[:, channel])
                 found.append(Parameter(name, channel, None, None, reason=sure.reasons[term, channel]))
                 continue
             value = float(optimum.x[term, channel] / factor)
@@ -235,11 +253,20 @@ def material_and_parameters(
             error = float(sure.x_error[term, channel] / factor)
             found.append(Parameter(name, channel, value, error, (float(low), float(high)), at_bound=value == 0))
         k[name] = np.array([parameter.value or 0.0 for parameter in found[-factors.shape[1] :]])
+        for channel, known in sure.sums.items():
+            k[name][channel] += known.stand_in[term] / factors[term, channel]
     if specular:
         k["n"] = optimum.n if k["k_s"].any() else 0.0
         n, error = (None, None) if sure.n_reason else (float(optimum.n), sure.n_error)
         found.append(Parameter("n", None, n, error, interval, reason=sure.n_reason))
     return fit.model(**k), tuple(found)
+
+
+def _in_words(known: Sum, factors: Float[np.ndarray, " 3"]) -> str:
+    parts = zip(known.terms, known.columns, strict=True)
+    terms = " + ".join(f"{column * factors[term]:.4g} {TERMS[term]}" for term, column in parts)
+    value = Parameter("", None, known.value, known.error)
+    return f"only {terms} = {str(value).partition(' (')[0]} is determined"
 
 
 def _capped(material: brdf.Material) -> str:

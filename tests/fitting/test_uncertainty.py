@@ -1,5 +1,7 @@
 """Errors and intervals against dense least squares and SciPy, coverage over draws, and words for what is left open."""
 
+import re
+
 import numpy as np
 import pytest
 from scipy import optimize, stats
@@ -7,6 +9,7 @@ from small_ball import ball_scene, pictured
 
 import brdf
 import fitting
+from brdf.materials.material_file import load_note, material_from_dict, material_to_dict
 from fitting.uncertainty.intervals import above_zero
 
 CAMERA = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=(36, 36))
@@ -120,8 +123,38 @@ def test_a_wall_that_faces_the_light_tells_only_the_sum_of_ambient_and_diffuse()
     wall = brdf.Rectangle(center=[0, 0, 0], edge_u=[2, 0, 0], edge_v=[0, 2, 0])
     light = brdf.DirectionalLight(direction=[0, 0, 1], intensity=[1.0])
     scene = brdf.Scene(camera=CAMERA, shapes=[wall], ambient=[0.2], lights=[light])
-    result = fitting.fit(noisy(brdf.Lambert(k_a=0.5, k_d=0.4), 0.01, 0, scene), scene, model="lambert", **OPTIONS)
-    assert all("only a sum of k_a and k_d" in parameter.reason for parameter in result.parameters)
+    picture = noisy(brdf.Lambert(k_a=0.5, k_d=0.4), 0.01, 0, scene)
+    for model in ("lambert", "auto"):
+        result = fitting.fit(picture, scene, model=model, **OPTIONS)
+        told = re.fullmatch(r"only 0\.2 k_a \+ 1 k_d = (.*) ± (.*) is determined", result["k_a"][0].reason)
+        value, error = map(float, told.groups())
+        assert abs(value - 0.5) < 4 * error
+        assert error == pytest.approx(0.01 / np.sqrt(result.pixels), rel=0.2)
+        assert result["k_d"][0].reason == result["k_a"][0].reason
+        assert result.surface == "lambert"
+        assert any("sum" in warning for warning in result.warnings)
+        # The material shows the picture, with 1 % of it as ambient light.
+        np.testing.assert_allclose(
+            [0.2 * result.material.k_a[0], result.material.k_d[0]], [0.01 * value, 0.99 * value], 1e-3
+        )
+    again = material_from_dict(result.to_dict()["material"])
+    assert float(again.k_d[0]) == float(result.material.k_d[0])
+
+
+def test_files_and_exports_say_that_a_number_stands_for_a_sum(tmp_path):
+    material, reasons = (
+        brdf.Lambert(k_a=[0.1, 0.0], k_d=[0.5, 0.5]),
+        {"k_a[0]": "only a sum", "k_a[1]": "no ambient light"},
+    )
+    grey = brdf.Lambert(k_a=0.1, k_d=0.5)
+    assert material_to_dict(material, undetermined=reasons)["k_a"] == [0.1, None]
+    for name in ("material.json", "material.mtl"):
+        brdf.save_material(grey, tmp_path / name, undetermined={"k_a[0]": "only a sum"})
+        assert load_note(tmp_path / name) == "not determined: k_a[0]: only a sum"
+        brdf.save_material(grey, tmp_path / name)
+        assert load_note(tmp_path / name) == ""
+    for to in ("json", "mtl", "glsl", "pytorch3d", "three", "gltf", "mitsuba"):
+        assert "only a sum" in brdf.export_material(grey, to, note="only a sum").text
 
 
 @pytest.mark.parametrize("k_s", [0.0, 1e-3])
@@ -170,7 +203,7 @@ def test_a_flat_sheet_under_a_distant_light_tells_only_a_sum_of_ambient_and_diff
     for channel in range(3):
         for name in ("k_a", "k_d"):
             assert told[name, channel].value is None
-            assert "only a sum of k_a and k_d" in told[name, channel].reason
+            assert re.match(r"only .* k_a \+ .* k_d = .* is determined", told[name, channel].reason)
     if model == "blinn-phong":
         highlight = told["k_s", 0]
         assert abs(highlight.value - 0.3) < 4 * highlight.error
