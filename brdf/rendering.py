@@ -56,7 +56,7 @@ def basis(model: type[Material], scene: Scene, *, points: SurfacePoints | None =
     if area is not None:
         fine_diffuse, fine_lobe = diffuse_and_lobe(model, area.points, lighting)
         diffuse = diffuse.at[area.pixel].set(average(area.weight, fine_diffuse), mode="drop")
-        if lobe is not None:
+        if lobe is not None and fine_lobe is not None:
             lobe = lobe.over_areas(fine_lobe, area.weight, area.slot.ravel())
     return Basis(points, diffuse, lobe)
 

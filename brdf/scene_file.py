@@ -289,7 +289,8 @@ def write_parts(path: str | Path, parts: dict[str, Any], aov: str | None = None)
         values = {"type": kinds[type(shape)]} | _fields(shape)
         if isinstance(shape, Triangles):
             values["file"], file = beside(f"shape{index}.obj")
-            mesh = values.pop("mesh")
+            mesh = shape.mesh
+            del values["mesh"]
             lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in mesh.vertices.tolist()]
             if mesh.normals is None:
                 values["smooth"] = False

@@ -26,6 +26,7 @@ Rounding = float | np.ndarray | Literal["floor"] | None
 _FIRST = 64
 # So far from a code a value may lie that stands for it: rounding errors of float32, and of the curves.
 _TOLERANCE = {255: 2e-3, 65535: 2e-2}
+_CURVES: tuple[Encoding, ...] = ("linear", "srgb")
 # So many values of a float picture share its least one where noise was cut off; symmetry makes up to eight equal.
 _FEWEST_ENDS = 10
 # Fewer different codes than this may be chance.
@@ -97,9 +98,9 @@ class Codes(NamedTuple):
             )
         lower = np.where(good & (code > self.ends[0]), np.minimum(code, top) - flat(self.below), -np.inf)
         upper = np.where(good & (code < top), code + flat(self.above), np.inf)
-        parts = (jnp.asarray(part) for part in (lower, upper, self.scale, self.unit))
-        width = np.int64(self.values.shape[1])
-        return Bounds(*parts, np.arange(len(code)), width, jnp.asarray(spread), self.encoding, self.lossy)
+        lower, upper, scale, unit = (jnp.asarray(part) for part in (lower, upper, self.scale, self.unit))
+        index, width = np.arange(len(code)), np.asarray(self.values.shape[1])
+        return Bounds(lower, upper, scale, unit, index, width, jnp.asarray(spread), self.encoding, self.lossy)
 
 
 def _mixed(beside: Bool[np.ndarray, "H W"], size: int) -> Bool[np.ndarray, " P"]:
@@ -166,10 +167,9 @@ def open_ends(
         return None
     lower = np.where(good & ~low, np.where(high, min(level or np.inf, np.inf), values), -np.inf)
     upper = np.where(good & ~high, values, np.inf)
-    one = np.float64(1.0)
-    parts = (jnp.asarray(part) for part in (lower, upper, one, one))
-    index = np.arange(len(values))
-    return Bounds(*parts, index, np.int64(width), jnp.asarray(spread), "linear", lossy=False, exact=True)
+    lower, upper, one = (jnp.asarray(part) for part in (lower, upper, np.float64(1.0)))
+    place = np.arange(len(values)), np.asarray(width)
+    return Bounds(lower, upper, one, one, *place, jnp.asarray(spread), "linear", lossy=False, exact=True)
 
 
 def single_values_at_end(
@@ -229,7 +229,8 @@ def _levels(pixels: np.ndarray) -> Codes | None:
     for some in (pixels[good][::stride][:_FIRST] if good.any() else pixels.ravel()[:0], pixels[good]):
         if some.size == 0 or np.any(some < 0):
             return None
-        fitting = [(top, curve) for top in _TOLERANCE for curve in ("linear", "srgb") if _on_levels(some, curve, top)]
+        fitting: list[tuple[int, Encoding]]
+        fitting = [(top, curve) for top in _TOLERANCE for curve in _CURVES if _on_levels(some, curve, top)]
         with np.errstate(over="ignore", under="ignore"):
             half = bool(np.all(some == some.astype(np.float16)))
         rgbe = _is_rgbe(pixels) if some.size > _FIRST else True

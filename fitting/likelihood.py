@@ -26,7 +26,7 @@ Stegun 26.2.14, the continued fraction.
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -71,8 +71,8 @@ class Bounds(eqx.Module):
     upper: Float[Array, "P C"]
     scale: Float[Array, ""] | Float[np.ndarray, ""]
     unit: Float[Array, "*C"] | Float[np.ndarray, "*C"]
-    index: Int[Array, " P"]
-    width: Int[Array, ""] | Int[np.ndarray, ""]
+    index: Int[AnyArray, " P"]
+    width: Int[AnyArray, ""]
     spread: Float[Array, "*P"] | Float[np.ndarray, ""]
     encoding: Encoding = eqx.field(static=True)
     lossy: bool = eqx.field(static=True)
@@ -82,22 +82,22 @@ class Bounds(eqx.Module):
         """Predictions in codes before rounding, and their derivative by radiance."""
         light, scale = radiance / self.unit, self.scale / self.unit
         if self.encoding == "linear":
-            return self.scale * light, jnp.broadcast_to(scale, radiance.shape)
+            return light * self.scale, jnp.broadcast_to(scale, radiance.shape)
         if self.encoding == "srgb":
             bright = light > 0.0031308
             base, power = jnp.where(bright, light, 1.0), 1.0 / 2.4
             curved = 1.055 * base**power
             code = jnp.where(bright, curved - 0.055, 12.92 * light)
-            return self.scale * code, scale * jnp.where(bright, power * curved / base, 12.92)
+            return code * self.scale, jnp.where(bright, power * curved / base, 12.92) * scale
         # A power is infinitely steep at 0; below a quarter of a code it goes on straight, to no code's edge.
         power = 1.0 / self.encoding
         least = (0.25 / self.scale) ** self.encoding
         base = jnp.maximum(light, least)
         curved = base**power
         slope = power * curved / base
-        return self.scale * (curved + slope * jnp.minimum(light - least, 0.0)), scale * slope
+        return (curved + slope * jnp.minimum(light - least, 0.0)) * self.scale, slope * scale
 
-    def pixels(self, choose: Callable[[Array], Array]) -> "Bounds":
+    def pixels(self, choose: Callable[[Any], Array]) -> "Bounds":
         """Those of some pixels."""
         lower, upper, index = choose(self.lower), choose(self.upper), choose(self.index)
         spread = choose(self.spread) if self.spread.ndim else self.spread

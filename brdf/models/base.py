@@ -117,7 +117,7 @@ class SpecularMaterial(Material):
         """
 
     @staticmethod
-    def scale(n: Numbers) -> Scalars:
+    def scale(n: Numbers) -> Scalars | Float[np.ndarray, "*batch"]:
         """The constant in front of the lobe: 1 in the classic forms, at least 1 in the normalised ones.
 
         Args:

@@ -59,6 +59,7 @@ class Estimate(NamedTuple):
 def estimate(run: Run, lights: MadeLights) -> Estimate:
     """The error of a fit; ``lights`` are those made so far."""
     optimum, how = run.result.optimum, run.configuration
+    assert optimum is not None
     # More for a lobe so narrow that the rounding of directions counts against its width.
     rounding = float(np.finfo(how.precision).eps * (3 + 0.01 * np.sqrt(max(optimum.n, 0.0))))
     if how.precision == "float32" and _nearly_dependent(optimum.gauss_newton):

@@ -231,7 +231,7 @@ def _fit_band(given: Photographs, how: _How, values: np.ndarray, points: Any, te
     with working_precision(how.precision):
         dtype = np.dtype(how.precision)
         if count < texels:
-            values = np.pad(values, [(0, 0), (0, 0), (0, texels - count)])
+            values = np.pad(values, np.array([(0, 0), (0, 0), (0, texels - count)]))
         points = jax.tree.map(lambda leaf: np.pad(leaf, [(0, texels - count)] + [(0, 0)] * (leaf.ndim - 1)), points)
         points = jax.tree.map(lambda leaf: leaf.astype(dtype) if leaf.dtype.kind == "f" else leaf, points)
         stacks, occluders = (), ()

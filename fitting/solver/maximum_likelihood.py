@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from fitting.likelihood import AnyArray
 from fitting.solver.nnls import nonnegative_minimum
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum, refit, search
@@ -88,7 +89,8 @@ class Evidence(NamedTuple):
     widening: Float[np.ndarray, " U"]
 
 
-class Precision(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Precision:
     """What is known of the unknowns (x_a, x_d, x_s, channel after channel each, log n) at some noise.
 
     Attributes:
@@ -105,10 +107,10 @@ class Precision(NamedTuple):
 
 
 class _Sums(NamedTuple):
-    value: np.ndarray
-    by_log_noise: np.ndarray
-    score: np.ndarray
-    weight: np.ndarray
+    value: Any
+    by_log_noise: Any
+    score: Any
+    weight: Any
 
 
 class _Space(NamedTuple):
@@ -221,7 +223,8 @@ def _change(before: Optimum, after: Optimum) -> float:
     return float(max(np.max(x), by_n))
 
 
-class _Stated(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class _Stated:
     """A picture as least squares takes it.
 
     Attributes:
@@ -269,7 +272,7 @@ def _stated(picture: Picture, optimum: Optimum, noise: float, rounding: float) -
 
 
 @eqx.filter_jit
-def _linearised(picture: Picture, n: Array, x: Array) -> tuple[Array, Array, Array, Array]:
+def _linearised(picture: Picture, n: AnyArray, x: AnyArray) -> tuple[Array, Array, Array, Array]:
     """Working targets and weights of values with both ends, squares of their residuals in codes, their count."""
     bounds = picture.bounds
     assert bounds is not None
@@ -497,7 +500,7 @@ def _compute(picture: Picture, x: Array, log_n: Array, noise: Array) -> _Told:
 
 
 @eqx.filter_jit
-def _codes(picture: Picture, x: Array, log_n: Array) -> Array:
+def _codes(picture: Picture, x: AnyArray, log_n: AnyArray) -> Array:
     """What is predicted, in codes."""
     assert picture.bounds is not None
     return picture.bounds.codes(picture.predicted(jnp.exp(log_n), x).astype(jnp.float64))[0]
@@ -506,7 +509,7 @@ def _codes(picture: Picture, x: Array, log_n: Array) -> Array:
 def _inside(picture: Picture, at: Estimate) -> np.ndarray:
     """How far inside its bounds each prediction is, in standard deviations of the noise, (P, C)."""
     assert picture.bounds is not None
-    code = np.asarray(_codes(picture, at.x, np.float64(at.log_n)))
+    code = np.asarray(_codes(picture, at.x, np.asarray(at.log_n)))
     inside = np.minimum(code - np.asarray(picture.bounds.lower), np.asarray(picture.bounds.upper) - code)
     return inside / (at.noise * np.asarray(picture.bounds.spread))
 
@@ -536,7 +539,7 @@ def unexplained(picture: Picture, x: np.ndarray, n: float) -> np.ndarray:
     if picture.bounds is None:
         left = np.asarray(picture.target) - np.asarray(picture.predicted(np.asarray(n), x))
         return np.where(np.asarray(picture.weights) > 0, left, 0.0) * np.sqrt(np.asarray(picture.weights))
-    code = np.asarray(_codes(picture, x, np.log(n)))
+    code = np.asarray(_codes(picture, x, np.asarray(np.log(n))))
     lower, upper = np.asarray(picture.bounds.lower), np.asarray(picture.bounds.upper)
     return np.maximum(lower - code, 0.0) - np.maximum(code - upper, 0.0)
 

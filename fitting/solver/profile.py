@@ -141,26 +141,25 @@ def search(
             cell = int(np.argmin(lowest))
             first, last = np.flatnonzero(possible)[[0, -1]]
             if last - first <= 3 and profile.slope[cell] < profile.slope[cell + 1]:
-                start = _start(profile, cell, position[cell])
+                start = _start(profile, cell, float(position[cell]))
                 if cap is None:
                     found = gauss_newton(problem, start, GRID_STEP)
                 else:
-                    found = capped_minimum(
-                        problem, log_n[max(0, cell - 1)], log_n[min(cell + 2, log_n.size - 1)], start.x
-                    )
+                    ends = float(log_n[max(0, cell - 1)]), float(log_n[min(cell + 2, log_n.size - 1)])
+                    found = capped_minimum(problem, *ends, start.x)
                 # A minimum at the end of its reach is none, but for the bounds of the search.
                 if abs(found[0].log_n - position[cell]) < GRID_STEP or found[0].log_n in problem.bounds:
                     return _optimum(*found, problem, *about)
             log_n = log_n[max(0, first - 1) : last + 3]
             profile = solve_linear(sums(pictures, log_n, rough, problem.peak), log_n, rough, problem)
         position, *_ = _cells(profile)
-        candidates = []
+        candidates: list[tuple[Point, Sums]] = []
         for cell in _valleys(profile, problem.tolerance):
-            start = _start(profile, cell, position[cell])
+            start = _start(profile, cell, float(position[cell]))
             if cap is None:
                 candidates.append(gauss_newton(problem, start, GRID_STEP))
             else:
-                candidates.append(capped_minimum(problem, log_n[cell], log_n[cell + 1], start.x))
+                candidates.append(capped_minimum(problem, float(log_n[cell]), float(log_n[cell + 1]), start.x))
         # Where the profile is level the best sample may be no worse than what the valleys led to.
         costs = profile.cost.sum(axis=1)
         if cap is None and np.min(costs) < min(np.sum(point.cost) for point, _ in candidates):

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from fitting.likelihood import AnyArray
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
 
@@ -33,17 +34,17 @@ class Errors(NamedTuple):
 
     Attributes:
         values: residuals, 0 where a pixel does not count.
-        index: of the pixels in the picture, row by row.
+        pixel: index of each in the picture, row by row.
         width: of the picture.
     """
 
     values: Float[np.ndarray, "P C"]
-    index: Int[np.ndarray, " P"]
+    pixel: Int[np.ndarray, " P"]
     width: int
 
     def blocks(self, size: int) -> Int[np.ndarray, " P"]:
         """In which block of size x size pixels each lies."""
-        row, column = np.divmod(self.index, self.width)
+        row, column = np.divmod(self.pixel, self.width)
         return (row // size) * -(-self.width // size) + column // size
 
 
@@ -110,13 +111,13 @@ def of_blocks(errors: Errors) -> Errors:
 
 def _grid(errors: Errors, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Sums of errors, of their squares, and how many pixels, over blocks; (rows, columns, C) each."""
-    row, column = np.divmod(errors.index[-1], errors.width)
+    row, column = np.divmod(errors.pixel[-1], errors.width)
     values = errors.values
-    if errors.index.size == (row + 1) * errors.width and column == errors.width - 1:
+    if errors.pixel.size == (row + 1) * errors.width and column == errors.width - 1:
         image = values.reshape(row + 1, errors.width, -1)
     else:
-        image = np.zeros((int(np.max(errors.index)) // errors.width + 1, errors.width, values.shape[1]), values.dtype)
-        image[np.divmod(errors.index, errors.width)] = values
+        image = np.zeros((int(np.max(errors.pixel)) // errors.width + 1, errors.width, values.shape[1]), values.dtype)
+        image[np.divmod(errors.pixel, errors.width)] = values
     image = np.pad(image, np.array([(0, -image.shape[0] % size), (0, -image.shape[1] % size), (0, 0)]))
     blocks = image.reshape(-1, size, image.shape[1] // size, size, image.shape[2])
     return tuple(part.sum(axis=(1, 3), dtype=np.float64) for part in (blocks, blocks**2, blocks != 0))
@@ -206,7 +207,7 @@ def scatter(
 
 
 @eqx.filter_jit
-def _columns(picture: Picture, n: Array) -> Float[Array, "4 P C"]:
+def _columns(picture: Picture, n: AnyArray) -> Float[Array, "4 P C"]:
     """Ambient, diffuse, lobe, and its derivative by n."""
     columns = [jnp.asarray(picture.ambient).reshape(1, -1), picture.diffuse, jnp.zeros((1, 1)), jnp.zeros((1, 1))]
     if picture.lobe is not None:
@@ -230,7 +231,7 @@ def _joined(terms: np.ndarray, groups: Sequence[np.ndarray], optimum: Optimum) -
 
 def _flat_regions(values: np.ndarray, errors: Errors) -> np.ndarray:
     """A number above 0 for pixels whose neighbours all show the same, the same for the same value; (P, C)."""
-    row, column = np.divmod(errors.index, errors.width)
+    row, column = np.divmod(errors.pixel, errors.width)
     image = np.full((int(row.max()) + 3, errors.width + 2, values.shape[1]), np.nan)
     image[row + 1, column + 1] = values
     middle = image[1:-1, 1:-1]
