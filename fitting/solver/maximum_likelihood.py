@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from fitting.likelihood import AnyArray
+from fitting.likelihood import AnyArray, Bounds, LogLikelihood, tabulated
 from fitting.solver.nnls import nonnegative_minimum
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum, refit, search
@@ -39,6 +39,8 @@ REACH = 7.0
 MOST_STEPS, LEAST_GAIN = 12, 1e-3
 # The largest change of log n in one step.
 LARGEST_SHIFT = 0.5
+# The noise is known well enough where it changes by less than this factor.
+ENOUGH_KNOWN = 1.1
 # So many values have to tell of a number before the Hessian is taken for its error.
 ENOUGH_VALUES = 6.0
 SUBSAMPLE = 16384
@@ -342,6 +344,8 @@ def maximise(pictures: Sequence[Picture], start: Estimate, space: _Space) -> tup
         low, high = float(below[1].by_log_noise), float(above[1].by_log_noise)
         share = min(max(low / (low - high), 0.1), 0.9)
         noise = below[0].noise * (above[0].noise / below[0].noise) ** share
+        if max(noise, at.noise) < ENOUGH_KNOWN * min(noise, at.noise):
+            break
         at, now = _climb(pictures, below[0]._replace(noise=noise), space)
         below, above = ((at, now), above) if now.by_log_noise > 0 else (below, (at, now))
     return at, [*(entry for entry in known if entry.noise > at.noise), _precision(pictures, at, now, space)]
@@ -387,6 +391,9 @@ def _climb(pictures: Sequence[Picture], at: Estimate, space: _Space) -> tuple[Es
         gram[np.diag_indices_from(gram)] *= 1 + 1e-9
         product = design.T @ (normal.product + normal.gram @ unknowns)
         step = design @ nonnegative_minimum(gram, product, signed) - unknowns
+        # What the step is going to gain.
+        if step @ (normal.product - 0.5 * normal.gram @ step) < LEAST_GAIN:
+            break
         gain = 0.0
         for halvings in range(12):
             share = 0.5**halvings
@@ -482,11 +489,24 @@ class _Told(NamedTuple):
 
 
 def _told(picture: Picture, at: Estimate) -> _Told:
-    return jax.device_get(_compute(picture, at.x, np.float64(at.log_n), np.float64(at.noise)))
+    bounds = picture.bounds
+    assert bounds is not None
+    code, *rest = jax.device_get(_predictions(picture, at.x, np.float64(at.log_n)))
+    said = None
+    if not bounds.spread.ndim:
+        noise = at.noise * float(bounds.spread)
+        said = tabulated(np.asarray(bounds.lower), np.asarray(bounds.upper), code, noise)
+    return _Told(*(said or jax.device_get(_said(bounds, code, np.float64(at.noise)))), *rest)
 
 
 @eqx.filter_jit
-def _compute(picture: Picture, x: Array, log_n: Array, noise: Array) -> _Told:
+def _said(bounds: Bounds, code: Array, noise: Array) -> LogLikelihood:
+    return bounds.said(code, noise)
+
+
+@eqx.filter_jit
+def _predictions(picture: Picture, x: Array, log_n: Array) -> tuple[Array, Array, Array, Array]:
+    """Codes, radiance, slope of the code by it, and columns."""
     assert picture.bounds is not None
     shape = picture.target.shape
     columns = [jnp.asarray(picture.ambient).reshape(1, -1), picture.diffuse, jnp.zeros((1, 1)), jnp.zeros((1, 1))]
@@ -496,7 +516,7 @@ def _compute(picture: Picture, x: Array, log_n: Array, noise: Array) -> _Told:
     columns = jnp.stack([jnp.broadcast_to(column, shape).astype(jnp.float64) for column in columns])
     radiance = x[0] * columns[0] + x[1] * columns[1] + x[2] * columns[2]
     code, slope = picture.bounds.codes(radiance)
-    return _Told(*picture.bounds.said(code, noise), radiance, slope, columns)
+    return code, radiance, slope, columns
 
 
 @eqx.filter_jit
