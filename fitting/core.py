@@ -181,6 +181,8 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
     if all(fit.evidence is not None for fit in fits.values()):
         noise, whitened = np.ones_like(noise), {name: _likely_sums(fit) for name, fit in fits.items()}
         inflation = _inflation(best, seen)
+    if seen.copies:
+        inflation *= np.sqrt(seen.colour.size)
     free = np.logical_or.reduce([fit.free for fit in fits.values()])
     optima = {name: fit.optimum for name, fit in fits.items()}
     choice = choose(optima, free, grey, noise, inflation, whitened)

@@ -84,6 +84,11 @@ class Observed(NamedTuple):
     scenes: list[brdf.Scene]
     counted: list[np.ndarray]
 
+    @property
+    def copies(self) -> bool:
+        """Whether the channels are copies of each other: grey that was saved as colour."""
+        return all(_grey(picture) for picture in self.shown)
+
     def reached(self, model: type[brdf.Material]) -> Bool[np.ndarray, "3 C"]:
         """Which coefficients of a model the light reaches.
 
@@ -153,6 +158,17 @@ def observe(problem: FitProblem, *, at_once: bool = False) -> Observed:
         shown,
         scenes,
         counted,
+    )
+
+
+def _grey(picture: np.ndarray) -> bool:
+    if picture.shape[-1] == 1:
+        return False
+    some = picture[:: max(1, picture.shape[0] // 8)]
+    return all(
+        np.array_equal(image[..., 0], image[..., channel], equal_nan=True)
+        for image in (some, picture)
+        for channel in range(1, picture.shape[-1])
     )
 
 

@@ -98,6 +98,7 @@ def uncertainty(
     spread: Float[np.ndarray, "C 4 4"] | None = None,
     scatter: Float[np.ndarray, "U U"] | None = None,
     widening: Float[np.ndarray, " U"] | float = 1.0,
+    copies: bool = False,
     columns: Float[np.ndarray, "3 C"] | None = None,
 ) -> Uncertainty:
     """Errors of an optimum.
@@ -117,6 +118,7 @@ def uncertainty(
         spread: sums of the columns' products times the variance of each pixel, where it is not the same in all.
         scatter: what takes the place of the Hessian times the noise, over all unknowns, where pixels err together.
         widening: what to multiply errors by.
+        copies: the channels are copies of each other, and err together.
         columns: root mean square over pixels of what each term shows at 1; None where no pixel weighs more.
     """
     if columns is None:
@@ -137,7 +139,7 @@ def uncertainty(
         stand_in[first, channel], determined[first, channel] = some.value / some.columns[0], True
     optimum = dataclasses.replace(optimum, x=stand_in)
     x_error, x_interval, n_error, correlation, rise = _errors(
-        optimum, determined, noise, tied, spread, scatter, widening, dependent
+        optimum, determined, noise, tied, spread, scatter, widening, copies, dependent
     )
     sums = {c: some._replace(error=some.columns[0] * x_error[some.terms[0], c]) for c, some in sums.items()}
     for term, channel in np.argwhere(known):
@@ -209,6 +211,7 @@ def _errors(
     spread: np.ndarray | None,
     scatter: np.ndarray | None,
     widening: np.ndarray | float,
+    copies: bool,
     dependent: float,
 ) -> tuple[np.ndarray, np.ndarray, float, np.ndarray, float]:
     """Errors and intervals of x, the error of n, the correlation of all unknowns, and the rise of the cost.
@@ -218,11 +221,13 @@ def _errors(
     x, channels = optimum.x, noise.size
     size = 3 * channels + 1
     hessian, middle = np.zeros((size, size)), np.zeros((size, size))
+    places = [[channel, channels + channel, 2 * channels + channel, size - 1] for channel in range(channels)]
     for channel, block in enumerate(optimum.gauss_newton):
-        place = np.ix_(*2 * [[channel, channels + channel, 2 * channels + channel, size - 1]])
-        hessian[place] += block
+        hessian[np.ix_(places[channel], places[channel])] += block
         scale = np.array([1.0, 1.0, 1.0, x[2, channel]])
-        middle[place] += noise[channel] ** 2 * block if spread is None else spread[channel] * np.outer(scale, scale)
+        scores = noise[channel] ** 2 * block if spread is None else spread[channel] * np.outer(scale, scale)
+        for place in places if copies else places[channel : channel + 1]:
+            middle[np.ix_(places[channel], place)] += scores
     alone, middle = middle, middle if scatter is None else scatter
     active = known & (x > 0)
     has_n, with_n = bool(active[2].any()), False

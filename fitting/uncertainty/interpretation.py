@@ -117,6 +117,7 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> Interpretation
         scatter=shared,
         widening=widening,
         columns=columns,
+        copies=seen.copies,
     )
     interval = None
     # At k_d + k_s = 1 the cost still falls across the bound: a profile that does not know it has its least elsewhere.
