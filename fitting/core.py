@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 
 import jax
@@ -179,7 +179,7 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
             whitened[name] = weighted_sums(fit.pictures, fit.optimum, known.noise, inverse=True)
     inflation = known.inflation
     if all(fit.evidence is not None for fit in fits.values()):
-        noise, whitened = np.ones_like(noise), {name: _likely_sums(fit) for name, fit in fits.items()}
+        noise, whitened = np.ones_like(noise), _likely_sums(fits)
         inflation = _inflation(best, seen)
     if seen.copies:
         inflation *= np.sqrt(seen.colour.size)
@@ -188,7 +188,7 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
     choice = choose(optima, free, grey, noise, inflation, whitened)
     if choice.model not in FAMILIES and not _explains_structure(fits[choice.model], seen):
         best = _fit_model(brdf.Lambert, seen)
-        whitened = {"lambert": _likely_sums(best)} if best.evidence is not None and whitened else {}
+        whitened = _likely_sums({"lambert": best}) if best.evidence is not None and whitened else {}
         choice = choose({"lambert": best.optimum}, best.free, grey, noise, inflation, whitened)
         fits = {"lambert": best}
     matt = choice.model in FAMILIES
@@ -208,13 +208,16 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
     return _most_likely(chosen, seen), choice
 
 
-def _likely_sums(fit: ModelFit) -> Sums:
-    """Sums whose cost is minus twice the logarithm of the likelihood."""
-    said = fit.evidence
-    assert said is not None
-    optimum = said.optimum
-    square = optimum.square - optimum.cost - 2 * said.value / optimum.square.size
-    return Sums(optimum.gram, optimum.product, square, optimum.pixels)
+def _likely_sums(fits: Mapping[str, ModelFit]) -> dict[str, Sums]:
+    """Sums whose cost is minus twice the logarithm of the likelihood, beside that of the likeliest, and so above 0."""
+    said = {name: fit.evidence for name, fit in fits.items() if fit.evidence is not None}
+    best = max(one.value for one in said.values())
+    found = {}
+    for name, one in said.items():
+        optimum = one.optimum
+        least = 2 * (best - one.value) / optimum.square.size + optimum.pixels
+        found[name] = Sums(optimum.gram, optimum.product, optimum.square - optimum.cost + least, optimum.pixels)
+    return found
 
 
 def _inflation(fit: ModelFit, seen: Observed) -> float:

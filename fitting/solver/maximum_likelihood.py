@@ -357,10 +357,11 @@ def _precision(pictures: Sequence[Picture], at: Estimate, now: _Sums, space: _Sp
     whole = join_channels(now.weight, now.score, np.zeros(channels), at.x[2], np.ones(channels)).gram
     active = np.append(at.x.ravel() > 0, at.x[2].any())
     moved = space.design[:, active @ np.abs(space.design) > 0]
+    moved = moved[:, np.einsum("uv,uw,wv->v", moved, whole, moved) > np.finfo(float).tiny]
     gram = moved.T @ whole @ moved
-    scale = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
+    scale = np.sqrt(np.diag(gram))
     value, vector = np.linalg.eigh(gram / np.outer(scale, scale))
-    # What nothing tells of has a large variance, not none.
+    # What nothing tells of has a large variance, not none; a column of zeros is no unknown.
     value = np.maximum(value, np.finfo(float).eps)
     root = moved @ (vector / np.sqrt(value) / scale[:, None])
     influence, information = root @ root.T, float(np.sum(np.log(value)) + 2 * np.sum(np.log(scale)))

@@ -287,7 +287,8 @@ def _optimum(
     about = about.columns(basis)
     return Optimum(
         n=n,
-        x=point.x.T / np.array([[1.0], [1.0], [decay]]),
+        # Where no pixel sees the lobe it is not free, and its x_s is 0.
+        x=point.x.T / np.array([[1.0], [1.0], [decay or 1.0]]),
         cost=point.cost,
         pixels=about.pixels,
         gram=about.gram,

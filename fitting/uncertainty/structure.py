@@ -105,7 +105,8 @@ def of_blocks(errors: Errors) -> Errors:
     Args:
         errors: of one picture.
     """
-    sums, _, _ = _grid(errors, CODED_BLOCK)
+    # Colours have half the resolution.
+    sums, _, _ = _grid(errors, CODED_BLOCK if errors.values.shape[1] == 1 else 2 * CODED_BLOCK)
     return Errors(sums.reshape(-1, sums.shape[2]), np.arange(sums.shape[0] * sums.shape[1]), sums.shape[1])
 
 
