@@ -1,6 +1,6 @@
 """Are the numbers and their errors true on the files that people have? Balls of an independent renderer, many draws.
 
-    python -m benchmarks.truth [coverage|selection|structure] [--rows PATTERN] [--draws N] [--size PIXELS] [--json FILE]
+    python -m benchmarks.truth [coverage|selection|structure|diagnosis] [--rows PATTERN] [--draws N] [--size PIXELS] [--json FILE]
 
 Every ball is drawn here in plain NumPy (nothing of the toolkit), its brightest pixel at 0.97 of white; noise is a
 standard deviation, of white for float pictures and in codes for files; draw i has the seed i. Files are written by
@@ -10,9 +10,12 @@ OpenImageIO and read back as a user would read them. Beside each row stands plai
   the mean stated error over the root mean square of the real one.
 * Found: ``result.surface`` has a specular term. On Lambert balls that is an invention.
 * Mesh normals: drawn with normals interpolated over a latitude-longitude mesh of R rings, fitted as a sphere.
+* Diagnosis: one thing is wrong, by 15 times the error that the sound picture gives it; draws in which that is no small
+  change do not determine it. ``first``: the first named cause is the right one, or one of those named together.
 """
 
 import argparse
+import dataclasses
 import fnmatch
 import json
 import tempfile
@@ -26,6 +29,7 @@ import OpenImageIO as oiio  # noqa: N813
 
 import brdf
 import fitting
+from fitting.diagnosis import possible_causes
 
 WIDTH = 2.2  # of the picture, the ball's radius being 1
 
@@ -315,10 +319,113 @@ def structure(pattern: str, draws: int, size: int, first: int) -> list[dict[str,
     return said
 
 
+LINEAR = {"light": 10.0, "intensity": 30.0, "ball": 1.5, "radius": 1.5, "gamma": 30.0, "black": 10.0}
+TIMES = 15.0
+
+
+def scenes_of(kind: str, seed: int, size: int) -> tuple[Ball, np.ndarray, brdf.Scene]:
+    """A ball on which such a cause can be seen, what it shows, and what is true of it."""
+    one = ball(seed, size=size, ambient=kind != "black")
+    shown, scene = one.drawn(), one.scene()
+    if kind == "black":
+        scene = dataclasses.replace(scene, ambient=None)
+    if kind == "intensity":
+        beside = dataclasses.replace(one, to_light=one.to_light * [-1, -1, 1], k=one.k * [[0], [0.5], [0.5]])
+        light = brdf.DirectionalLight(direction=beside.to_light, intensity=[0.5])
+        shown, scene = shown + beside.drawn(), dataclasses.replace(scene, lights=(*scene.lights, light))
+        factor = 0.97 / shown.max()
+        one, shown = dataclasses.replace(one, k=one.k * factor), shown * factor
+    return one, shown, scene
+
+
+def made_wrong(
+    kind: str, shown: np.ndarray, scene: brdf.Scene, size: float, seed: int
+) -> tuple[np.ndarray, brdf.Scene]:
+    """Picture and scene with one thing wrong, by so many degrees, pixels or per cent."""
+    random = np.random.default_rng([seed, 2])
+    pixel = WIDTH / scene.resolution[0]
+    lights, sphere = list(scene.lights), scene.shapes[0]
+    if kind == "light":
+        to_light = np.asarray(lights[0].direction)
+        aside = np.cross(to_light, random.standard_normal(3))
+        aside /= np.linalg.norm(aside)
+        told = np.cos(np.radians(size)) * to_light + np.sin(np.radians(size)) * aside
+        lights[0] = dataclasses.replace(lights[0], direction=told)
+    if kind == "intensity":
+        lights[1] = dataclasses.replace(lights[1], intensity=np.asarray(lights[1].intensity) * (1 + size / 100))
+    if kind == "ball":
+        angle = random.uniform(0, 2 * np.pi)
+        sphere = dataclasses.replace(sphere, center=size * pixel * np.array([np.cos(angle), np.sin(angle), 0]))
+    if kind == "radius":
+        sphere = dataclasses.replace(sphere, radius=1 + random.choice([-1, 1]) * size * pixel)
+    if kind == "gamma":
+        shown = shown ** (1 + size / 100)
+    if kind == "black":
+        shown = shown + size / 100
+    if kind.startswith("mirrored"):
+        shown = np.flip(shown, 1 if "left" in kind else 0)
+    return shown, dataclasses.replace(scene, lights=tuple(lights), shapes=(sphere,))
+
+
+def diagnosis(pattern: str, draws: int, size: int, first: int) -> list[dict[str, Any]]:
+    """How often what is wrong is named."""
+    said = []
+    files = {"float": FLOAT, "sRGB 8 bit": File(1.0, curve="srgb"), "sRGB 8 bit, no noise": File(curve="srgb")}
+    kinds = ("sound", *LINEAR, "mirrored left-right", "mirrored upside down")
+    print(f"{'':42}{'draws':>7}{'named':>7}{'first':>7}{'size / true':>13}{'within 2 sigma':>16}", flush=True)
+    for name, file, kind in ((f"{name}: {kind}", file, kind) for name, file in files.items() for kind in kinds):
+        if not fnmatch.fnmatch(name, f"*{pattern}*"):
+            continue
+        found = []
+        for seed in range(first, first + draws):
+            one, shown, scene = scenes_of(kind, seed, size)
+            wrong = 0.0
+            if kind in LINEAR:
+                sound = _fitted(file, shown, scene, one.model, seed)
+                errors = [cause.error for cause in possible_causes(sound) if cause.name.split()[0] == kind]
+                wrong = TIMES * max(errors, default=np.inf)
+                if wrong > LINEAR[kind]:
+                    continue
+            shown, told = made_wrong(kind, shown, scene, wrong, seed)
+            causes = _fitted(file, shown, told, one.model, seed).diagnosis
+            names = (
+                [word.removesuffix(" 0").removesuffix(" 1") for word in causes[0].name.split(" or ")] if causes else []
+            )
+            right = next((cause for cause in causes if cause.name.split()[0] == kind), None)
+            ratio, inside = (np.nan, np.nan)
+            if right is not None:
+                off = abs(abs(causes[0].size) - wrong)
+                ratio, inside = abs(causes[0].size) / wrong, off < 2 * causes[0].error
+            found.append((bool(causes), kind in names, ratio, inside))
+            if kind != "sound" and kind not in names:
+                print(
+                    "   ",
+                    seed,
+                    wrong,
+                    [(c.name, round(c.size, 3), round(c.error, 3), round(c.share, 2)) for c in causes],
+                )
+        table = np.array(found, float).reshape(-1, 4)
+        row = [
+            100 * table[:, 0].mean(),
+            100 * table[:, 1].mean(),
+            np.nanmean(table[:, 2]),
+            100 * np.nanmean(table[:, 3]),
+        ]
+        print(f"{name:42}{len(table):7d}{row[0]:7.1f}{row[1]:7.1f}{row[2]:13.3f}{row[3]:16.1f}", flush=True)
+        said.append({"row": name, "draws": len(table), "named": row[0], "first": row[1]})
+    return said
+
+
+def _fitted(file: File, shown: np.ndarray, scene: brdf.Scene, model: str, seed: int) -> Any:
+    with tempfile.TemporaryDirectory() as folder:
+        return fitting.fit(file.picture(shown, seed, Path(folder)), scene, model=model)
+
+
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     tables = {"coverage": (coverage, 400), "selection": (selection, 100), "structure": (structure, 100)}
+    tables["diagnosis"] = (diagnosis, 30)
     parser.add_argument("table", nargs="?", choices=tables)
     parser.add_argument("--rows", default="")
     parser.add_argument("--draws", type=int)

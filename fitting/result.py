@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,42 @@ NOT_DETERMINED = "not determined"
 LOPSIDED = 0.01
 
 REPORTS: dict[str, Callable[..., Any]] = {}
-"""What makes text, HTML, pictures and files of a result; `fitting.report`, which stands above, enters it here."""
+"""What makes text, pictures, files and a diagnosis of a result; `fitting.report`, which stands above, enters it here."""
+
+
+@dataclass(frozen=True)
+class Cause:
+    """What may be wrong with a scene or a picture, and would explain what the fit leaves.
+
+    Attributes:
+        name: "light", "intensity", "ball" (its centre), "radius", "gamma", "black", "mirrored left-right" or "mirrored
+            upside down"; a light of several with its index, of one picture with that. "light or ball" where the
+            picture does not tell them apart.
+        size: how far off, in the first order; a length where there are several directions.
+        error: standard error of the size.
+        unit: of both; "" for a mirrored picture.
+        share: of the structure in the residual that it would explain, from 0 to 1.
+        remedy: what to do.
+
+    Example:
+        >>> scene = brdf.Scene.load("scene.toml")
+        >>> target = brdf.render(brdf.preset("gold"), scene) ** 1.1
+        >>> cause = fitting.fit(target, scene, model="blinn-phong").diagnosis[0]
+        >>> cause.name, round(cause.size), cause.unit
+        ('gamma', 10, '%')
+    """
+
+    name: str
+    size: float
+    error: float
+    unit: str
+    share: float
+    remedy: str
+
+    def __str__(self) -> str:
+        """In a line."""
+        off = f" off by {self.size:.3g} ± {self.error:.2g} {self.unit}" if self.unit else ""
+        return f"{self.name}{off} would explain {100 * self.share:.0f} % of it: {self.remedy}"
 
 
 @dataclass(frozen=True)
@@ -211,6 +247,11 @@ class FitResult(Parameters):
         words = {"none": "none (black)", "ambient": "ambient (no shading)"}
         return self.material.name if np.any(self.material.k_d) else words.get(chosen, chosen)
 
+    @cached_property
+    def diagnosis(self) -> tuple[Cause, ...]:
+        """What may be wrong with the scene, likeliest first, from score tests; empty where nothing explains much."""
+        return REPORTS["diagnose"](self)
+
     def fitted(self, picture: int = 0) -> Float[np.ndarray, "H W C"]:
         """The picture that the fitted material makes.
 
@@ -218,6 +259,11 @@ class FitResult(Parameters):
             picture: which of the scenes.
         """
         return np.asarray(brdf.render(self.material, self.scenes[picture], precision=self.precision))
+
+    @property
+    def causes_of_structure(self) -> tuple[Cause, ...]:
+        """The diagnosis where the residual has structure, which a warning says; else nothing is looked for."""
+        return self.diagnosis if any("structure" in words for words in self.warnings) else ()
 
     def __str__(self) -> str:
         """The report."""
@@ -239,6 +285,7 @@ class FitResult(Parameters):
             "pixels": self.pixels,
             "left_out": self.left_out,
             "warnings": list(self.warnings),
+            "diagnosis": [vars(cause) for cause in self.causes_of_structure],
             "candidates": [vars(candidate) for candidate in self.candidates],
             "correlation": {
                 "parameters": [parameter.key for parameter in self.free_parameters],

@@ -6,6 +6,7 @@ makes a result takes the class from here, and a pickled one names the package, w
 
 from typing import Any
 
+from fitting.diagnosis import diagnose
 from fitting.report import html, saving, text, viewer
 from fitting.result import REPORTS, FitResult
 
@@ -19,4 +20,5 @@ def _plot(result: FitResult, picture: int | None) -> Any:
 
 
 REPORTS |= {"text": text.report, "html": html.result_html, "save": saving.save, "plot": _plot, "view": viewer.view}
+REPORTS["diagnose"] = diagnose
 FitResult.__module__ = "fitting"

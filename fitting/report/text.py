@@ -39,6 +39,7 @@ def report(result: FitResult) -> str:
     lines += _correlations(result, labels)
     lines += _candidates(result.candidates) if result.candidates else []
     lines += [f"  warning: {warning}" for warning in result.warnings]
+    lines += [f"  cause?      {cause}" for cause in result.causes_of_structure[:1]]
     return "\n".join(lines)
 
 
