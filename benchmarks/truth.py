@@ -1,6 +1,8 @@
 """Are the numbers and their errors true on the files that people have? Balls of an independent renderer, many draws.
 
-    python -m benchmarks.truth [coverage|selection|structure|diagnosis] [--rows PATTERN] [--draws N] [--size PIXELS] [--json FILE]
+    python -m benchmarks.truth [TABLE] [--rows PATTERN] [--draws N] [--size PIXELS] [--json FILE]
+
+TABLE is coverage, selection, structure or diagnosis.
 
 Every ball is drawn here in plain NumPy (nothing of the toolkit), its brightest pixel at 0.97 of white; noise is a
 standard deviation, of white for float pictures and in codes for files; draw i has the seed i. Files are written by
@@ -385,6 +387,13 @@ def diagnosis(pattern: str, draws: int, size: int, first: int) -> list[dict[str,
                 errors = [cause.error for cause in possible_causes(sound) if cause.name.split()[0] == kind]
                 wrong = TIMES * max(errors, default=np.inf)
                 if wrong > LINEAR[kind]:
+                    continue
+            elif kind != "sound":
+                # It moves the light, by that much; less than so many errors of the light are not seen.
+                axis = 0 if "left" in kind else 1
+                moved = 2 * np.degrees(np.arcsin(abs(one.to_light[axis])))
+                sound = _fitted(file, shown, scene, one.model, seed)
+                if moved < TIMES * next(cause.error for cause in possible_causes(sound) if cause.name == "light"):
                     continue
             shown, told = made_wrong(kind, shown, scene, wrong, seed)
             causes = _fitted(file, shown, told, one.model, seed).diagnosis

@@ -22,6 +22,7 @@ from .report.material_plots import plot_lobe as plot_lobe
 from .report.material_plots import plot_reciprocity as plot_reciprocity
 from .report.material_plots import plot_stability as plot_stability
 from .report.saving import load_result as load_result
+from .result import Cause as Cause
 from .result import Parameter as Parameter
 from .speed_accuracy import Tradeoff as Tradeoff
 from .speed_accuracy import tradeoff as tradeoff

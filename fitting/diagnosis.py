@@ -41,11 +41,12 @@ MOST_PIXELS, FEWEST_PIXELS = 256, 48
 RIM = 1.5
 # What is darker than so many standard deviations is left out where noise was cut off at 0.
 DARK = 3.0
-# A mirrored picture leaves less than this share of what the fit leaves; it is fitted with these exponents, and around
-# the best of them, the distance halved so often.
-MIRRORED, EXPONENTS, HALVINGS = 0.5, np.geomspace(2, 1000, 16), 8
+# A mirrored picture explains more than this share of the structure. It is fitted with these exponents, and around the
+# best of them, the distance halved so often; coefficients so often, with weights from the slope of a file's curve.
+MIRRORED, EXPONENTS, HALVINGS, PASSES, CURVED = 0.5, np.geomspace(2, 1000, 16), 8, 2, 1e-4
 
 Images = list[Float[np.ndarray, "H W C"]]
+Masks = Sequence[Bool[np.ndarray, "H W"]]
 Scenes = Sequence[brdf.Scene]
 
 
@@ -154,23 +155,19 @@ class _Residual:
 
     def mirrored(self) -> Iterator[_Test]:
         """Whether the pictures show the scenes mirrored."""
-        total = float(np.sum(self.left**2))
-        if total * MIRRORED < self.left.size:
+        if self.excess < LEAST_SIZE**2:
             return
         for words, axis in (("left-right", 1), ("upside down", 0)):
             good = [counted & np.flip(counted, axis) for counted in self.counted]
             if 2 * sum(map(np.count_nonzero, good)) < sum(map(np.count_nonzero, self.counted)):
                 continue
-            straight = [one - other for one, other in zip(self.targets, self.fitted, strict=True)]
-            before = sum(float(np.sum(image[some] ** 2)) for image, some in zip(straight, good, strict=True))
-            target = np.concatenate(
-                [np.flip(image, axis)[some] for image, some in zip(self.targets, good, strict=True)]
-            )
-            leaves = self._best_fit(good, target)
-            share = 1 - leaves / before
-            if share > 1 - MIRRORED:
-                cause = Cause(f"mirrored {words}", 1.0, 0.0, "", share, "flip the picture, or the lights and the shape")
-                yield _Test(cause, np.zeros((self.left.size, 0)), share * total, 1.0)
+            before, size = self._squares(self.targets, self.fitted, good)
+            gain = before - self._least([np.flip(target, axis) for target in self.targets], good)
+            share = min(gain / max(before - size, gain, 1.0), 1.0)
+            if share > MIRRORED and gain > LEAST_SIZE**2:
+                remedy = "flip the picture, or the lights and the shape"
+                cause = Cause(f"mirrored {words}", 1.0, 0.0, "", share, remedy)
+                yield _Test(cause, np.zeros((self.left.size, 0)), gain, 1.0)
 
     def alike(self, first: _Test, other: _Test) -> bool:
         """Whether the other cause would do as well: the first explains nothing beside it."""
@@ -271,7 +268,7 @@ class _Residual:
             ]
             for part in moved[1:]
         ]
-        columns.append(self._slope(*by_n, tiny))
+        columns.append(self._slope(by_n[0], by_n[1], tiny))
         tangents = []
         for channel in range(self.noise.size):
             matrix = np.stack([column[:, channel] for column in columns], axis=1)
@@ -288,16 +285,24 @@ class _Residual:
         ambient, diffuse, specular = (np.zeros(shape) if one is None else np.broadcast_to(one, shape) for one in parts)
         return ambient, diffuse, specular
 
-    def _best_fit(self, good: Sequence[Bool[np.ndarray, "H W"]], target: Float[np.ndarray, "P C"]) -> float:
-        """Squares that the model leaves of other values of some pixels: by all exponents, then around the best."""
+    def _squares(self, targets: Images, images: Images, good: Masks) -> tuple[float, int]:
+        """Squares of what images leave of some pixels, in units of the noise, and how many values these are."""
+        both = zip(self._codes(targets), self._codes(images), good, strict=True)
+        left = np.concatenate([(one - other)[some] for one, other, some in both]) / self.noise
+        return float(np.sum(left**2)), left.size
+
+    def _least(self, targets: Images, good: Masks) -> float:
+        """Squares that the model leaves of other pictures: by all exponents, then around the best."""
 
         def leaves(n: float) -> float:
             parts = [self._basis(index, n) for index in range(len(self.scenes))]
-            columns = [
-                np.concatenate([image[some] for image, some in zip(images, good, strict=True)])
-                for images in zip(*parts, strict=True)
-            ]
-            return _linear_fit(columns, target)
+            images, weights = targets, [np.ones_like(target) for target in targets]
+            for _ in range(PASSES):
+                k = [_coefficients(parts, targets, weights, good, channel) for channel in range(self.noise.size)]
+                images = [np.einsum("tijc,ct->ijc", np.stack(part), np.stack(k)) for part in parts]
+                ahead, behind = (self._codes([image + step for image in images]) for step in (CURVED, -CURVED))
+                weights = [(one - other) / (2 * CURVED) for one, other in zip(ahead, behind, strict=True)]
+            return self._squares(targets, images, good)[0]
 
         if not isinstance(self.material, SpecularMaterial):
             return leaves(1.0)
@@ -338,7 +343,7 @@ def _seen(scene: brdf.Scene, pixel: Int[np.ndarray, "H W"]) -> brdf.Scene:
     return scene if pixel.size == math.prod(scene.resolution) else brdf.some_pixels(scene, pixel, precision="float64")
 
 
-def _white_noise(residuals: Images, counted: Sequence[Bool[np.ndarray, "H W"]]) -> Float[np.ndarray, " C"]:
+def _white_noise(residuals: Images, counted: Masks) -> Float[np.ndarray, " C"]:
     """Standard deviation of what single pixels err: from differences of neighbours, which know no wide structure."""
     total, count = 0.0, 0
     for residual, good in zip(residuals, counted, strict=True):
@@ -350,14 +355,16 @@ def _white_noise(residuals: Images, counted: Sequence[Bool[np.ndarray, "H W"]]) 
     return np.sqrt(total / max(count, 1)) + np.float64(1e-7 * scale + np.finfo(float).tiny)
 
 
-def _linear_fit(columns: Sequence[Float[np.ndarray, "P C"]], target: Float[np.ndarray, "P C"]) -> float:
-    """Squares that the best coefficients of each channel leave."""
-    left = 0.0
-    for channel in range(target.shape[1]):
-        matrix = np.stack([column[:, channel] for column in columns], axis=1)
-        size = np.linalg.lstsq(matrix, target[:, channel])[0]
-        left += float(np.sum((target[:, channel] - matrix @ size) ** 2))
-    return left
+def _coefficients(
+    parts: Sequence[Sequence[np.ndarray]], targets: Images, weights: Images, good: Masks, channel: int
+) -> Float[np.ndarray, "3"]:
+    """Of the three terms, in one channel of all pictures, by weighted least squares."""
+    rows, values = [], []
+    for part, target, weight, some in zip(parts, targets, weights, good, strict=True):
+        root = weight[some][:, channel]
+        rows.append(np.stack([image[some][:, channel] * root for image in part], axis=1))
+        values.append(target[some][:, channel] * root)
+    return np.linalg.lstsq(np.concatenate(rows), np.concatenate(values))[0]
 
 
 def _power(values: Any, percent: float) -> Any:

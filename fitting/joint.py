@@ -12,6 +12,7 @@ rest fitted again; it is let go where the cost falls inwards. So a solution at a
 
 import contextlib
 import dataclasses
+import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -43,6 +44,8 @@ DIRECTIONS = ("direction",)
 OPEN = "only a combination with other freed numbers is determined"
 # Of the largest eigenvalue of the normal equations: a smaller one determines nothing.
 DEPENDENT = 1e-12
+# What a diagnosis names that is a number of a scene.
+NAMED = re.compile(r"(light|intensity|ball|radius)(?: (\d+))?(?: of picture (\d+))?")
 NOT_NEGATIVE = ("k_a", "k_d", "k_s", "intensity", "radiance", "ambient", "attenuation")
 
 
@@ -70,7 +73,7 @@ def fit_jointly(
     target: Any,
     scene: brdf.Scene | Sequence[brdf.Scene],
     material: brdf.Material | type[brdf.Material] | str = "auto",
-    free: Callable[[brdf.Material, list[brdf.Scene]], Sequence[Any]] | None = None,
+    free: Callable[[brdf.Material, list[brdf.Scene]], Sequence[Any]] | str | Sequence[str] | None = None,
     *,
     solver: Literal["lm", "bfgs"] | None = None,
     precision: Precision = "float64",
@@ -87,7 +90,8 @@ def fit_jointly(
         material: to start from; or a model, from whose separable optimum it starts; or "auto" for the simplest
             adequate model under the scenes that were found.
         free: from material and list of scenes to the leaves to fit, for example
-            ``lambda m, s: (m.k_d, m.n, s[0].lights[0].direction)``; all others are held.
+            ``lambda m, s: (m.k_d, m.n, s[0].lights[0].direction)``; all others are held. Or what `FitResult.diagnosis`
+            names beside the whole material: "light", "intensity", "ball" or "radius", also "light 1 of picture 0".
         solver: "lm", "bfgs", or None to choose by size.
         precision: "float32" or "float64".
         mask: (H, W), pixels to look at, or a list, such as ``fitting.fit(target, scene).counted[0]``.
@@ -115,12 +119,13 @@ def fit_jointly(
     if not (0 < tolerance < 1 and max_steps >= 1):
         came = f"and max_steps must be above 0, got {tolerance!r} and {max_steps!r}"
         raise InputError("tolerance", came, "Give for example 1e-10 and 256")
+    freed = free if callable(free) or free is None else _named([free] if isinstance(free, str) else free)
     stated = state_problem(target, scene, mask, precision=precision, saturation=saturation)
     with working_precision(precision):
         seen = observe(stated, at_once=True)
 
         def solve(start: brdf.Material, scenes: Sequence[brdf.Scene]) -> JointResult:
-            problem = _freed(brdf.cast((start, list(scenes)), precision), free, list(seen.tiles))
+            problem = _freed(brdf.cast((start, list(scenes)), precision), freed, list(seen.tiles))
             jacobian = sum(tile.target.size for tile in seen.tiles) * problem.start().size
             chosen = solver or ("lm" if jacobian <= LARGEST_JACOBIAN else "bfgs")
             return _solve(problem, seen, chosen, tolerance, max_steps)
@@ -223,6 +228,41 @@ def _freed(start: Any, free: Callable[..., Sequence[Any]] | None, tiles: list[Ti
     places, names, words = zip(*(own[leaf] for leaf in freed), strict=True)
     leaves, shape = jax.tree.flatten(start)
     return _JointProblem(leaves, tiles, shape, places, names, words)
+
+
+def _named(names: Sequence[str]) -> Callable[[Any, list[brdf.Scene]], list[Any]]:
+    """The leaves of causes that a diagnosis names, after those of the material."""
+    asked = [NAMED.fullmatch(str(name)) for name in names]
+    for name, match in zip(names, asked, strict=True):
+        if match is None:
+            words = "Name light, intensity, ball or radius, or one of them as the diagnosis does"
+            raise InputError("free", f"names {name!r}, which is no number of a scene", words)
+
+    def leaves(material: Any, scenes: list[brdf.Scene]) -> list[Any]:
+        found = [material.k_d] if any(scene.lights for scene in scenes) else []
+        found += [material.k_a] if any(scene.ambient is not None for scene in scenes) else []
+        found += [material.k_s, material.n] if np.any(getattr(material, "k_s", 0.0)) else []
+        for match in asked:
+            assert match is not None
+            index, picture = (None if part is None else int(part) for part in match.groups()[1:])
+            for place, scene in enumerate(scenes):
+                if picture in (None, place):
+                    found += _leaves_of(match[1], scene, index, first=place == 0)
+        return found
+
+    return leaves
+
+
+def _leaves_of(kind: str, scene: brdf.Scene, index: int | None, *, first: bool) -> list[Any]:
+    """Of a scene. The first light's intensity is the unit of the material."""
+    spheres: list[Any] = [shape for shape in scene.shapes if isinstance(shape, brdf.Sphere) and shape.fitted]
+    lights: list[Any] = [light for place, light in enumerate(scene.lights) if index in (None, place)]
+    if kind == "light":
+        return [light.direction for light in lights if isinstance(light, brdf.DirectionalLight)]
+    if kind == "intensity":
+        shining = lights[1:] if first and index is None else lights
+        return [light.intensity if hasattr(light, "intensity") else light.radiance for light in shining]
+    return [sphere.center if kind == "ball" else sphere.radius for sphere in spheres]
 
 
 def _words(path: Sequence[Any], scenes: int) -> str:

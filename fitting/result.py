@@ -1,5 +1,6 @@
 """What came out of a fit, and how sure it is: plain data. `fitting.report` tells, draws and writes it."""
 
+import contextlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -24,7 +25,7 @@ NOT_DETERMINED = "not determined"
 LOPSIDED = 0.01
 
 REPORTS: dict[str, Callable[..., Any]] = {}
-"""What makes text, pictures, files and a diagnosis of a result; `fitting.report`, which stands above, enters it here."""
+"""What makes text, pictures and a diagnosis of a result; `fitting.report`, which stands above, enters it here."""
 
 
 @dataclass(frozen=True)
@@ -43,10 +44,10 @@ class Cause:
 
     Example:
         >>> scene = brdf.Scene.load("scene.toml")
-        >>> target = brdf.render(brdf.preset("gold"), scene) ** 1.1
+        >>> target = brdf.render(brdf.preset("gold"), scene) ** 1.02
         >>> cause = fitting.fit(target, scene, model="blinn-phong").diagnosis[0]
         >>> cause.name, round(cause.size), cause.unit
-        ('gamma', 10, '%')
+        ('gamma', 2, '%')
     """
 
     name: str
@@ -59,7 +60,7 @@ class Cause:
     def __str__(self) -> str:
         """In a line."""
         off = f" off by {self.size:.3g} ± {self.error:.2g} {self.unit}" if self.unit else ""
-        return f"{self.name}{off} would explain {100 * self.share:.0f} % of it: {self.remedy}"
+        return f"{self.name}{off} would explain {100 * self.share:.0f} % of the structure: {self.remedy}"
 
 
 @dataclass(frozen=True)
@@ -262,8 +263,10 @@ class FitResult(Parameters):
 
     @property
     def causes_of_structure(self) -> tuple[Cause, ...]:
-        """The diagnosis where the residual has structure, which a warning says; else nothing is looked for."""
-        return self.diagnosis if any("structure" in words for words in self.warnings) else ()
+        """The diagnosis where the residual has structure, which a warning says, and the picture is still there."""
+        with contextlib.suppress(InputError):  # of a saved result whose picture has gone
+            return self.diagnosis if any("structure" in words for words in self.warnings) else ()
+        return ()
 
     def __str__(self) -> str:
         """The report."""

@@ -1,5 +1,6 @@
 """``brdf fit``: pictures, photographs of a ball, archives and measured BRDFs."""
 
+import dataclasses
 import json
 import shlex
 import sys
@@ -56,6 +57,12 @@ def fit(
         float | None, typer.Option(help="Relative error that is good enough: as few pixels and samples as keep it.")
     ] = None,
     seconds: Annotated[float | None, typer.Option(help="Time to spend: the most accurate fit that it buys.")] = None,
+    free: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME", help="light, intensity, ball or radius: fitted as well, from where the scene says."
+        ),
+    ] = None,
     devices: Annotated[
         str | None, typer.Option(help="all: spread the pixels over all cores or accelerators, and processes.")
     ] = None,
@@ -79,7 +86,7 @@ def fit(
     mesh = all_devices(devices)
     with waiting("reading") as say:
         if len(target) == 1 and is_measured(target[0]):
-            if any([*pictures, dark, noise, plausible, accuracy, seconds, report, mesh, precision != "float32"]):
+            if any([*pictures, dark, noise, plausible, accuracy, seconds, free, report, mesh, precision != "float32"]):
                 came = "is a measured BRDF; of the options only --model, --loss, --out, --plot and --json concern it"
                 raise InputError(target[0], came, "Leave the others out")
             table = brdf.load_measured(target[0])
@@ -105,6 +112,9 @@ def fit(
                 seconds=seconds,
                 mesh=mesh,
             )
+            if free:
+                say("fitting jointly")
+                result = _freed(result, free)
         if not is_first_process(mesh):
             return
         if out is not None:
@@ -123,6 +133,15 @@ def fit(
     saved = [] if out is None else [f"saved in {out}"]
     written = [] if report is None else [f"wrote {report}"]
     show("\n".join([*notes, str(result), *saved, *written]))
+
+
+def _freed(result: Any, names: list[str]) -> Any:
+    """The fit again, with what the names say of the scenes freed; where a command was told so, beside the material."""
+    import fitting
+
+    with named_as({"free": "--free"}):
+        found = fitting.fit_jointly(result.targets, result.scenes, result.material, names, mask=result.counted)
+    return dataclasses.replace(found, files=result.files, candidates=result.candidates)
 
 
 def _fit_pictures(

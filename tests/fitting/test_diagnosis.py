@@ -1,0 +1,130 @@
+"""What is wrong with a scene is named, with its size; nothing is named where nothing is; no scene is too odd to ask."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import brdf
+import fitting
+
+SIZE = 64
+PIXEL = 2.2 / SIZE
+CAMERA = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=(SIZE, SIZE))
+LIGHT = brdf.DirectionalLight(direction=[0.4, 0.5, 0.8], intensity=[1.0])
+BALL = brdf.Sphere(center=[0, 0, 0], radius=1)
+SCENE = brdf.Scene(camera=CAMERA, shapes=[BALL], ambient=[1.0], lights=[LIGHT])
+MATERIAL = brdf.BlinnPhong(k_a=[0.05], k_d=[0.45], k_s=[0.3], n=30)
+ACROSS = np.array([0.8, 0.0, -0.4]) / np.sqrt(0.8)
+
+
+def drawn(scene: brdf.Scene = SCENE, noise: float = 0.004) -> np.ndarray:
+    clean = np.asarray(brdf.render(MATERIAL, scene, precision="float64"))
+    return clean + np.random.default_rng(1).normal(0, noise, clean.shape)
+
+
+def with_light(degrees: float) -> brdf.Scene:
+    straight, angle = np.array([0.4, 0.5, 0.8]) / np.sqrt(1.05), np.radians(degrees)
+    light = dataclasses.replace(LIGHT, direction=np.cos(angle) * straight + np.sin(angle) * ACROSS)
+    return dataclasses.replace(SCENE, lights=(light,))
+
+
+def with_ball(**changed: Any) -> brdf.Scene:
+    return dataclasses.replace(SCENE, shapes=(dataclasses.replace(BALL, **changed),))
+
+
+def fitted(target: Any, scene: Any = SCENE) -> fitting.FitResult:
+    return fitting.fit(target, scene, model="blinn-phong")
+
+
+CLEAN = drawn(noise=0.0)
+NOISE = drawn() - CLEAN
+WRONG = {
+    "light": (drawn(), with_light(2.0), 2.0),
+    "ball": (drawn(), with_ball(center=[0.0, 0.5 * PIXEL, 0.0]), 0.5),
+    "radius": (drawn(), with_ball(radius=1 + 0.6 * PIXEL), -0.6),
+    "gamma": (CLEAN**1.08 + NOISE, SCENE, 8.0),
+    "mirrored left-right": (drawn()[:, ::-1], SCENE, 1.0),
+    "mirrored upside down": (drawn()[::-1], SCENE, 1.0),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_is_wrong_is_named(name: str):
+    target, told, size = WRONG[name]
+    result = fitted(target, told)
+    cause = result.diagnosis[0]
+    assert cause.name == name
+    assert abs(cause.size - size) <= max(4 * cause.error, 0.1 * abs(size))
+    assert cause.share > 0.8
+    assert f"{name}" in str(result).splitlines()[-1]
+    assert result.to_dict()["diagnosis"][0]["name"] == name
+
+
+def test_a_black_level_and_one_of_two_lights_are_named():
+    beside = brdf.DirectionalLight(direction=[-0.5, -0.3, 0.8], intensity=[0.6])
+    scene = dataclasses.replace(SCENE, ambient=None, lights=(LIGHT, beside))
+    target = drawn(scene)
+    assert fitted(target + 0.03, scene).diagnosis[0].name == "black"
+    brighter = dataclasses.replace(beside, intensity=np.array([0.66]))
+    told = dataclasses.replace(scene, lights=(LIGHT, brighter))
+    # Either light may be the one: only their ratio shows.
+    assert fitted(target, told).diagnosis[0].name in ("intensity 0 or intensity 1", "intensity 1 or intensity 0")
+
+
+def test_nothing_is_named_where_nothing_is_wrong():
+    result = fitted(drawn())
+    assert result.diagnosis == ()
+    assert "would explain" not in str(result)
+
+
+def test_codes_of_srgb(tmp_path: Path):
+    brdf.write_image(tmp_path / "ball.png", drawn().astype(np.float32))
+    target = brdf.read_picture(tmp_path / "ball.png", encoding="srgb")
+    assert fitted(target).diagnosis == ()
+    cause = fitted(target, with_light(2.0)).diagnosis[0]
+    assert cause.name == "light"
+    assert abs(cause.size - 2.0) < 0.1
+
+
+AREA = brdf.RectangleLight(center=[0, 2, 2], edge_u=[0.5, 0, 0], edge_v=[0, 0, 0.5], radiance=[3.0], samples=4)
+ODD = {
+    "no light": dataclasses.replace(SCENE, lights=()),
+    "environment": dataclasses.replace(SCENE, lights=(brdf.ConstantEnvironment(radiance=[1.0]),), ambient=None),
+    "area light": dataclasses.replace(SCENE, lights=(AREA,)),
+    "surface points": brdf.some_pixels(SCENE, np.arange(SIZE * SIZE).reshape(SIZE, SIZE)[16:48, 16:48]),
+}
+
+
+@pytest.mark.parametrize("name", [*ODD, "mesh"])
+def test_scenes_that_lack_a_cause(name: str, tmp_path: Path):
+    if name == "mesh":
+        (tmp_path / "mesh.obj").write_text("v -1 -1 0\nv 1 -1 0\nv 0 1 0.5\nf 1 2 3\n")
+        scene = dataclasses.replace(SCENE, shapes=(brdf.Triangles(brdf.load_mesh(tmp_path / "mesh.obj")),))
+    else:
+        scene = ODD[name]
+    result = fitting.fit(drawn(scene), scene, model="lambert")
+    assert all(cause.share > 0.3 for cause in result.diagnosis)
+
+
+def test_of_several_pictures_the_one_is_named():
+    scenes = [SCENE, with_light(40.0), with_light(-30.0)]
+    targets = [drawn(scene) for scene in scenes]
+    told = [SCENE, with_light(42.0), with_light(-30.0)]
+    assert fitted(targets, told).diagnosis[0].name == "light of picture 1"
+
+
+def test_what_was_named_is_freed():
+    target, told, _ = WRONG["light"]
+    result = fitting.fit_jointly(target, told, fitted(target, told).material, "light")
+    np.testing.assert_allclose(float(result.parameters[-1]), 2.0, atol=0.15)
+    assert result.diagnosis == ()
+    ball = fitting.fit_jointly(target, with_ball(radius=1.01), MATERIAL, ["radius"])
+    np.testing.assert_allclose(ball.values[-1], 1.0, atol=2e-3)
+
+
+def test_what_cannot_be_freed_is_told():
+    with pytest.raises(brdf.InputError, match="'gamma', which is no number of a scene"):
+        fitting.fit_jointly(drawn(), SCENE, MATERIAL, "gamma")
