@@ -41,6 +41,8 @@ MOST_PIXELS, FEWEST_PIXELS = 256, 48
 RIM = 1.5
 # What is darker than so many standard deviations is left out where noise was cut off at 0.
 DARK = 3.0
+# Of a step between codes: noise below that is mostly rounding.
+ROUNDED = 0.5
 # A mirrored picture explains more than this share of the structure. It is fitted with these exponents, and around the
 # best of them, the distance halved so often; coefficients so often, with weights from the slope of a file's curve.
 MIRRORED, EXPONENTS, HALVINGS, PASSES, CURVED = 0.5, np.geomspace(2, 1000, 16), 8, 2, 1e-4
@@ -87,6 +89,8 @@ def diagnose(result: FitResult) -> tuple[Cause, ...]:
     """
     with working_precision("float64"):
         residual = _Residual(result)
+        if residual.rounded and not any("structure" in words for words in result.warnings):
+            return ()
         tests = [test for test in residual.tests() if _stands_out(test.cause)]
         tests = sorted([*tests, *residual.mirrored()], key=lambda test: -test.gain)
         if not tests:
@@ -134,6 +138,15 @@ class _Residual:
         self.tangent = self._material_tangent()
         self.left = self._unfollowed(self._flat(raw)).ravel()
         self.excess = float(np.sum(self.left**2)) - self.left.size
+
+    @property
+    def rounded(self) -> bool:
+        """Whether rounding to codes is most of the noise: it has a shape of its own, as a wrong scene does."""
+        for codes, counted in zip(self._codes(self.targets), self.counted, strict=True):
+            used = np.unique(codes[counted].astype(np.float32))
+            if used.size > 1 and ROUNDED * float(np.median(np.diff(used))) > float(np.max(self.noise)):
+                return True
+        return False
 
     def tests(self) -> Iterator[_Test]:
         """Each cause that the scenes determine, as large as it explains most."""
