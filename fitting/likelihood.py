@@ -120,9 +120,9 @@ class LogLikelihood(NamedTuple):
         weight: minus its second derivative, 0 to 1 / s².
     """
 
-    value: Float[Array, "*shape"]
-    score: Float[Array, "*shape"]
-    weight: Float[Array, "*shape"]
+    value: Float[AnyArray, "*shape"]
+    score: Float[AnyArray, "*shape"]
+    weight: Float[AnyArray, "*shape"]
 
 
 def interval(

@@ -492,21 +492,21 @@ class _Told(NamedTuple):
 def _told(picture: Picture, at: Estimate) -> _Told:
     bounds = picture.bounds
     assert bounds is not None
-    code, *rest = jax.device_get(_predictions(picture, at.x, np.float64(at.log_n)))
+    code, *rest = jax.device_get(_predictions(picture, at.x, np.asarray(at.log_n)))
     said = None
     if not bounds.spread.ndim:
         noise = at.noise * float(bounds.spread)
         said = tabulated(np.asarray(bounds.lower), np.asarray(bounds.upper), code, noise)
-    return _Told(*(said or jax.device_get(_said(bounds, code, np.float64(at.noise)))), *rest)
+    return _Told(*(said or jax.device_get(_said(bounds, code, np.asarray(at.noise)))), *rest)
 
 
 @eqx.filter_jit
-def _said(bounds: Bounds, code: Array, noise: Array) -> LogLikelihood:
-    return bounds.said(code, noise)
+def _said(bounds: Bounds, code: AnyArray, noise: AnyArray) -> LogLikelihood:
+    return bounds.said(jnp.asarray(code), jnp.asarray(noise))
 
 
 @eqx.filter_jit
-def _predictions(picture: Picture, x: Array, log_n: Array) -> tuple[Array, Array, Array, Array]:
+def _predictions(picture: Picture, x: AnyArray, log_n: AnyArray) -> tuple[Array, Array, Array, Array]:
     """Codes, radiance, slope of the code by it, and columns."""
     assert picture.bounds is not None
     shape = picture.target.shape
@@ -515,7 +515,7 @@ def _predictions(picture: Picture, x: Array, log_n: Array) -> tuple[Array, Array
         value, by_n = picture.lobe(jnp.exp(log_n))
         columns[2:] = value, by_n * jnp.exp(log_n)
     columns = jnp.stack([jnp.broadcast_to(column, shape).astype(jnp.float64) for column in columns])
-    radiance = x[0] * columns[0] + x[1] * columns[1] + x[2] * columns[2]
+    radiance = columns[0] * x[0] + columns[1] * x[1] + columns[2] * x[2]
     code, slope = picture.bounds.codes(radiance)
     return code, radiance, slope, columns
 
