@@ -12,6 +12,7 @@ import numpy as np
 import brdf
 from brdf.precision import working_precision
 from brdf.rendering import basis
+from fitting.doubts import doubts
 from fitting.light_colour import coefficient_factors
 from fitting.model_fit import ModelFit
 from fitting.pixels import Observed, Tile, observe
@@ -279,4 +280,6 @@ def _interpreted(fit: ModelFit, seen: Observed, choice: Choice | None, hidden: s
         names = " and ".join(choice.rivals)
         words = f"{names} fits as well as {fit.model.name}: the picture does not tell the two highlights apart"
         warnings.append(words)
+    structure = any("structure" in text for text in told.warnings)
+    warnings += doubts(fit, told.material, seen, _fit_model, structure=structure)
     return told._replace(warnings=tuple(warnings))

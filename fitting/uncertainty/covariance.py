@@ -121,8 +121,7 @@ def uncertainty(
         copies: the channels are copies of each other, and err together.
         columns: root mean square over pixels of what each term shows at 1; None where no pixel weighs more.
     """
-    if columns is None:
-        columns = rms_columns(optimum)
+    columns = rms_columns(optimum) if columns is None else columns
     dependent = DEPENDENT_SINGLE if single else DEPENDENT_DOUBLE
     reasons = np.full(free.shape, "", object)
     n_reason = reasons[2, :] = _without_trace(optimum, noise, visible)

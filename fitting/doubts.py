@@ -1,0 +1,132 @@
+"""Inputs that are probably something else than they are given as: codes, sRGB, radians, a constant, noise."""
+
+from collections.abc import Callable, Iterator, Sequence
+
+import jax.numpy as jnp
+import numpy as np
+
+import brdf
+from brdf.images.encoding import Encoding, decode, encode
+from fitting.model_fit import ModelFit
+from fitting.pixels import FLAT, Observed
+from fitting.solver.devices import device_count
+from fitting.solver.normal_equations import Picture
+from fitting.uncertainty.structure import CHANCE, Errors, shared
+
+# Diffuse reflection of this size is none: light of intensity 1 that is pi, or one at twice its distance, stays below.
+FAR_ABOVE = 10.0
+# Decoded values are what was meant where the model leaves less than this share of the squares; or this share, and of
+# that nothing that errs together.
+CLEARLY, LESS = 0.25, 0.9
+# Degrees that are as likely radians, where a fit leaves more than this share of the picture.
+RADIANS, BADLY = 2.1, 0.05
+# A picture of noise: the fit leaves this share of what varies, and that is much.
+NOISE, MUCH = 0.95, 0.2
+
+
+def doubts(
+    fit: ModelFit, material: brdf.Material, seen: Observed, refit: Callable[..., ModelFit], *, structure: bool
+) -> Iterator[str]:
+    """Warnings, each with the remedy.
+
+    Args:
+        fit: of one model.
+        material: that it found.
+        seen: what was fitted.
+        refit: fits a model to what was seen.
+        structure: whether the residual has some.
+    """
+    shown = [image[counted] for image, counted in zip(seen.shown, seen.counted, strict=True)]
+    floats = [one for one in seen.problem.targets if one.file is None and not one.streamed]
+    brightest = float(np.max(seen.brightest))
+    if floats and 2 < brightest <= 65535 and all(np.all(values == np.rint(values)) for values in shown):
+        yield (
+            f"the picture holds whole numbers up to {brightest:g}: if they are codes of a file, give them as uint8 or "
+            'uint16, with encoding="srgb" where they are for a screen'
+        )
+    elif np.max(material.k_d) > FAR_ABOVE:
+        yield (
+            f"k_d is {np.max(material.k_d):.3g}, and a surface reflects no more than 1: are the picture and the "
+            "light's intensity in one unit? Values of 0 to 255 want dividing by 255, dim lights their true intensity"
+        )
+    yield from _field_of_view(seen.scenes, fit.residual)
+    if all(len(values) > 1 and not np.any(np.ptp(values, axis=0)) for values in shown) and _shaded(fit.pictures):
+        yield (
+            "the picture is the same in every pixel, under light that is not: is it the one that was meant? "
+            "Numbers from it say nothing of the surface"
+        )
+    if fit.residual > MUCH:
+        varies = sum(float(np.sum((values - values.mean(axis=0)) ** 2, dtype=np.float64)) for values in shown)
+        total = sum(float(np.sum(values**2, dtype=np.float64)) for values in shown)
+        if fit.residual**2 * total > NOISE * varies and not any(map(_follows_light, fit.pictures)):
+            yield (
+                "light and shape explain nothing of what varies in the picture, which may be noise: is it a picture of "
+                "this scene, and neither mirrored nor shifted?"
+            )
+    plain = len(floats) == len(seen.problem.targets) and device_count() == 1 and brightest <= 1
+    if structure and plain and _is_encoded(fit, seen, refit):
+        yield (
+            "the picture looks sRGB-encoded: decoded, the model explains it far better. "
+            'Give encoding="srgb", or the file itself'
+        )
+
+
+def _field_of_view(scenes: Sequence[brdf.Scene], residual: float) -> Iterator[str]:
+    for scene in scenes:
+        camera = scene.camera
+        if isinstance(camera, brdf.PerspectiveCamera) and camera.fov <= RADIANS and residual > BADLY:
+            fov = float(camera.fov)
+            yield (
+                f"the camera's field of view is {fov:.3g} degrees, and the fit is poor: if these are radians, give "
+                f"fov={np.degrees(fov):.4g}"
+            )
+            return
+
+
+def _shaded(pictures: Sequence[Picture]) -> bool:
+    """Whether light falls unevenly on what counts."""
+    for picture in pictures:
+        counts = _counted(picture)
+        light = np.asarray(picture.diffuse)[counts]
+        if light.size and np.max(np.ptp(light, axis=0)) > FLAT * np.max(light):
+            return True
+    return False
+
+
+def _counted(picture: Picture) -> np.ndarray:
+    return np.broadcast_to(np.all(np.asarray(picture.weights) > 0, axis=1), len(picture.target))
+
+
+def _follows_light(picture: Picture) -> bool:
+    """Whether what counts varies with the light that falls on it, or that does not vary."""
+    counts = _counted(picture)
+    light, value = (np.asarray(part)[counts].mean(axis=1, dtype=float) for part in (picture.diffuse, picture.target))
+    light, value = light - light.mean(), value - value.mean()
+    return bool((light @ value) ** 2 >= (1 - NOISE) * (light @ light) * (value @ value))
+
+
+def _is_encoded(fit: ModelFit, seen: Observed, refit: Callable[..., ModelFit]) -> bool:
+    """Whether the decoded picture is explained, or far better; compared in the values that were given.
+
+    A highlight is allowed under both, as the wrong encoding may have hidden one.
+    """
+    model = brdf.BlinnPhong if seen.problem.model == "auto" and fit.model is brdf.Lambert else fit.model
+    decoded = []
+    for tile in seen.tiles:
+        values = decode(np.clip(np.asarray(tile.target, np.float32), 0.0, None), "srgb")
+        decoded.append(tile._replace(target=jnp.asarray(values, tile.target.dtype), bounds=None))
+    as_given = _left(fit if model is fit.model else refit(model, seen), seen, "linear")
+    as_srgb = _left(refit(model, seen._replace(tiles=decoded)), seen, "srgb")
+    share = sum(np.sum(one.values**2) for one in as_srgb) / sum(np.sum(one.values**2) for one in as_given)
+    together, chance = shared(as_srgb)
+    return bool(share < CLEARLY or (share < LESS and together < CHANCE * chance))
+
+
+def _left(fit: ModelFit, seen: Observed, encoding: Encoding) -> list[Errors]:
+    """By how much a fit misses the values that were given."""
+    found = []
+    for picture, tile in zip(fit.pictures, seen.tiles, strict=True):
+        shown = np.asarray(picture.predicted(np.asarray(fit.optimum.n), fit.optimum.x), np.float64)
+        left = np.where(np.asarray(picture.weights) > 0, np.asarray(tile.target) - encode(shown, encoding), 0.0)
+        found.append(Errors(left, np.arange(len(left)), tile.points.mask.shape[1]))
+    return found
