@@ -61,7 +61,7 @@ def random_problem(rng, size):
 
 @pytest.mark.parametrize("seed", range(6))
 def test_no_scipy_start_finds_less(seed):
-    one = random_problem(np.random.default_rng(seed), 24)
+    one = random_problem(np.random.default_rng(seed), 16)
     best = scipy_starts(one, 6, seed)
     found = search([one])
     assert np.all(np.isfinite(found.x))
