@@ -40,6 +40,8 @@ UNEXPLAINED = 0.5
 UNSEEN = 60.0
 # A highlight that explains less than this share of what errs together without it is none.
 EXPLAINED = 0.35
+# As many independent values a picture has at least.
+FEWEST_MEASUREMENTS = 30.0
 # An exponent up to this multiple of the lower bound is at the bound.
 WIDEST = 1.01
 
@@ -184,6 +186,8 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
         inflation = _inflation(best, seen)
     if seen.copies:
         inflation *= np.sqrt(seen.colour.size)
+    # However much errs together, the picture is not less than a few measurements.
+    inflation = min(inflation, max(float(np.sqrt(np.sum(best.optimum.pixels) / FEWEST_MEASUREMENTS)), 1.0))
     free = np.logical_or.reduce([fit.free for fit in fits.values()])
     optima = {name: fit.optimum for name, fit in fits.items()}
     choice = choose(optima, free, grey, noise, inflation, whitened)
