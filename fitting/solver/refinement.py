@@ -85,7 +85,7 @@ def problem_of(
     """
     target = pictures[0].target
     free = np.ones((3, target.shape[1]), bool) if free is None else np.asarray(free)
-    tolerance, accuracy = (TOLERANCE_SINGLE, 1e-5) if target.dtype == np.float32 else (TOLERANCE_DOUBLE, 1e-10)
+    tolerance, accuracy = (TOLERANCE_SINGLE, 2e-6) if target.dtype == np.float32 else (TOLERANCE_DOUBLE, 1e-10)
     return Problem(pictures, free.T, tolerance, accuracy, n_range)
 
 
