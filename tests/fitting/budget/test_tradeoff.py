@@ -124,7 +124,7 @@ def test_the_command_measures_a_photograph_of_a_ball(tmp_path, capsys):
     scene = ball(64)
     brdf.write_image(tmp_path / "ball.png", noisy(scene, 0.01).astype(np.float32), encoding="srgb")
     options = ["--sphere", "31.5,31.5,29.09", "--light", "0.5,0.6,0.7", "--ambient"]
-    options += ["--seconds", "4", "--accuracy", "1e-2", "--json"]
+    options += ["--seconds", "20", "--accuracy", "1e-2", "--json"]
     with pytest.raises(SystemExit) as ended:
         main(["tradeoff", str(tmp_path / "ball.png"), *options])
     assert not ended.value.code
