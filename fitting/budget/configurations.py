@@ -129,7 +129,8 @@ def _subsampled(problem, samples):
         if sample is None:
             continue
         pixels = some_of(target.pixels, sample)
-        targets[index] = target._replace(pixels=pixels)
+        # Of pixels that stand for many the codes are a small part of what is not known.
+        targets[index] = target._replace(pixels=pixels, codes=None, least_squares=True)
         scenes[index] = brdf.some_pixels(scenes[index], sample.pixel, precision=problem.precision)
         weights[index] = some_of(weights[index], sample) * sample.stands_for
         masks[index] = None if mask is None else some_of(mask, sample)

@@ -141,9 +141,13 @@ def uncertainty(
         optimum, determined, noise, tied, spread, scatter, widening, copies, dependent
     )
     sums = {c: some._replace(error=some.columns[0] * x_error[some.terms[0], c]) for c, some in sums.items()}
+    alone = x_error
+    if scatter is not None:
+        # What errs together makes errors larger, but not the numbers less determined.
+        alone, *_ = _errors(optimum, determined, noise, tied, spread, None, widening, copies, dependent)
     for term, channel in np.argwhere(known):
         largest = max(optimum.square[channel], brightest[channel] ** 2)
-        if x_error[term, channel] ** 2 * optimum.gram[channel, term, term] > largest:
+        if alone[term, channel] ** 2 * optimum.gram[channel, term, term] > largest:
             reasons[term, channel] = "its error is larger than the whole picture"
             x_error[term, channel] = np.inf
     if not n_reason and not np.isfinite(n_error):

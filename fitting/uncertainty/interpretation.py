@@ -99,7 +99,8 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> Interpretation
         widening = said.widening
     else:
         together = _structure(pictures, seen, optimum, noise, rounding, even=known.noise is None)
-        if together is not None and together.significant:
+        # What a bound of the material leaves is no error of the pixels.
+        if together is not None and together.significant and not fit.capped:
             shared = _scattered(pictures, seen, optimum)
     if fit.evidence is None and shared is None and known.noise is not None:
         spread = fit.noise_factor**2 * weighted_sums(pictures, optimum, known.noise, inverse=False).gram
