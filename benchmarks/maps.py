@@ -8,6 +8,7 @@ Real data lie where the environment variable ``BRDF_REAL_DATA`` says (default: .
 import os
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -82,8 +83,7 @@ def speed() -> None:
         pictures, normal = pictures.reshape(32, -1, 1000, 3), truth["normal"].reshape(-1, 1000, 3)
         for specular in ("grey", "coloured"):
             fitting.fit_maps(pictures[:, :66], lights, normal[:66], specular=specular)
-            run = lambda s=specular, p=pictures, m=normal: fitting.fit_maps(p, lights, m, specular=s)  # noqa: E731
-            wall, cpu, _ = best_of(2, run)
+            wall, cpu, _ = best_of(2, partial(fitting.fit_maps, pictures, lights, normal, specular=specular))
             ours[specular] = wall / count
             print(
                 f"{count} texels x 32 RGB, {specular} k_s: "
@@ -221,7 +221,10 @@ def cramer_rao(lights: np.ndarray, truth: dict[str, np.ndarray], noise: float) -
     d, s = (np.array(one) for one in zip(*basis, strict=True))
     slope = truth["k_s"] * s * np.log(np.maximum(s, 1e-300))
     dd = np.sum(d * d, 0)
-    left = lambda a, b: 3 * (np.sum(a * b, 0) - np.sum(a * d, 0) * np.sum(b * d, 0) / dd)  # noqa: E731
+
+    def left(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return 3 * (np.sum(a * b, 0) - np.sum(a * d, 0) * np.sum(b * d, 0) / dd)
+
     ss, sn, nn = left(s, s), left(s, slope), left(slope, slope)
     both = np.maximum(ss * nn - sn * sn, 1e-300)
     return noise * np.sqrt(nn / both), noise * np.sqrt(ss / both)

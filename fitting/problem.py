@@ -32,7 +32,6 @@ class Target(NamedTuple):
         saturation: the value of the largest code, where it is known.
         step: the distance of two codes; 0 where there are none.
         codes: behind the values; None where no rounding touched these.
-        lossy: the file was compressed with losses.
         least_squares: is asked for, whatever the values are.
         file: path, encoding, its source, and factor of the `brdf.Picture` that it was; None where no file holds it.
     """
@@ -41,7 +40,6 @@ class Target(NamedTuple):
     saturation: float | None = None
     step: float = 0.0
     codes: Codes | None = None
-    lossy: bool = False
     least_squares: bool = False
     file: dict[str, Any] | None = None
 
@@ -235,7 +233,7 @@ def _of_picture(picture: brdf.Picture, rounding: Rounding) -> Target:
     if picture.path is not None:
         file = {"path": str(picture.path), "encoding": picture.encoding, "source": picture.source}
         file |= {"factor": np.asarray(picture.factor).tolist()}
-    return Target(picture.pixels, None if top is None else top * TOP, step, codes, picture.lossy, least, file)
+    return Target(picture.pixels, None if top is None else top * TOP, step, codes, least, file)
 
 
 def _of_array(values: np.ndarray, rounding: Rounding, encoding: Encoding) -> Target:

@@ -35,7 +35,6 @@ def write_maps(maps: "Maps", folder: str | Path, *, plot: bool = False) -> None:
     roughness = (2 / (maps.fitted_n + 2)) ** 0.25
     inside = np.any(maps.normal != 0, axis=-1)
     normals = np.where(inside[..., None], 0.5 * maps.normal + 0.5, 0.5)
-    grey = lambda values: np.repeat(values[..., None], 3, axis=-1)  # noqa: E731
     images = {
         "k_d": (k_d / scale["k_d"], "linear"),
         "k_s": (k_s / scale["k_s"], "linear"),
@@ -57,7 +56,11 @@ def write_maps(maps: "Maps", folder: str | Path, *, plot: bool = False) -> None:
     with atomic_folder(folder) as stage:
         write_layers(stage / "maps.exr", {name: np.asarray(values, np.float32) for name, values in layers.items()})
         for name, (values, encoding) in images.items():
-            values = values if values.ndim == 2 or values.shape[2] in (1, 3) else grey(values.mean(axis=-1))
+            values = (
+                values
+                if values.ndim == 2 or values.shape[2] in (1, 3)
+                else np.repeat(values.mean(axis=-1)[..., None], 3, axis=-1)
+            )
             brdf.write_image(stage / f"{name}.png", values, dtype="uint16", encoding=encoding)
         if plot:
             draw_maps(maps).savefig(stage / "maps.png", dpi=110)

@@ -208,12 +208,12 @@ def _open(name: str, picture: Any, encoding: Any) -> tuple[Any, tuple[int, int, 
         if values.ndim != 3 or 0 in values.shape or values.dtype.kind not in "fu":
             came = f"is of shape {values.shape} and type {values.dtype}"
             raise InputError(name, came, "Give (H, W, C) floats, or unsigned integers that span their type")
-        if values.dtype.kind == "u":
-            largest = np.iinfo(values.dtype).max
-            read, top = (lambda start, stop: values[start:stop].astype(np.float32) / np.float32(largest)), 1.0
-        else:
-            read = lambda start, stop: values[start:stop]  # noqa: E731
-        shape = values.shape
+        codes = values.dtype.kind == "u"
+        top, shape = (1.0 if codes else top), values.shape
+
+        def read(start: int, stop: int) -> np.ndarray:
+            part = values[start:stop]
+            return part.astype(np.float32) / np.float32(np.iinfo(part.dtype).max) if codes else part
 
     def rows(start: int, stop: int) -> np.ndarray:
         values = read(start, stop)
