@@ -298,7 +298,15 @@ def stated_error(light: Any) -> str:
     Args:
         light: as the shading tells it.
     """
-    return f"± {light.error:.2g}°{THIN_CRESCENT if light.direction[2] < BEHIND else ''}"
+    from fitting.photographs.distant_light import DOUBTFUL
+
+    doubt = ""
+    if light.direction[2] < BEHIND:
+        doubt = THIN_CRESCENT
+    elif light.unexplained > DOUBTFUL:
+        share = 100 * light.unexplained
+        doubt = f" (the shading leaves {share:.0f} % of the light unexplained: it can be off by several times that)"
+    return f"± {light.error:.2g}°{doubt}"
 
 
 def _read_normals(path: Path) -> Array:

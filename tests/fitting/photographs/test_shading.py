@@ -3,10 +3,19 @@
 import numpy as np
 import pytest
 from ball_pictures import angle
+from project_paths import REAL, real_data
 
+import brdf
 from brdf.errors import InputError
 from fitting.photographs.ball import Circle, ball_points
-from fitting.photographs.distant_light import GUESS, LIT, ShadingLight, light_from_shading
+from fitting.photographs.distant_light import (
+    DOUBTFUL,
+    GUESS,
+    LIT,
+    ShadingLight,
+    light_from_highlight,
+    light_from_shading,
+)
 
 SIDE = 90
 POINTS = ball_points((SIDE, SIDE), Circle(44.3, 44.8, 42.0))
@@ -113,3 +122,49 @@ def test_a_single_block_is_refused():
     noisy = shown(FRONT) + 0.01 * np.random.default_rng(3).standard_normal(len(NORMAL))
     with pytest.raises(InputError, match="too little of the lit surface"):
         light_of(noisy, mask=mask)
+
+
+# -- what is no ball ---------------------------------------------------------------------------------------------------
+
+
+def relief(light, *, depth=0.5, k_s=0.0):
+    """A plane with waves, lit from one side: bright all over where a ball has a crescent in the dark."""
+    slope = depth * np.stack([np.cos(0.31 * COLUMN + 0.2 * ROW), np.sin(0.27 * ROW)], axis=1)
+    normal = np.concatenate([slope, np.ones((len(slope), 1))], axis=1)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    to_light = np.array(light) / np.linalg.norm(light)
+    half = to_light + np.array([0, 0, 1])
+    return 0.6 * np.maximum(normal @ to_light, 0) + k_s * np.maximum(normal @ half / np.linalg.norm(half), 0) ** 200
+
+
+@pytest.mark.parametrize("ambient", [False, True])
+@pytest.mark.parametrize("light", [(0.4, 0.3, 0.87), (0.9, 0.1, 0.3)])
+def test_a_relief_is_not_taken_for_a_matt_ball(light, ambient):
+    with pytest.raises(InputError, match=r"not shaded like this surface|too little of the lit surface"):
+        light_of(relief(light), ambient=ambient)
+
+
+def test_highlights_all_over_are_not_taken_for_a_mirror_ball():
+    picture = np.zeros((SIDE, SIDE))
+    picture[ON_BALL] = relief((0.4, 0.3, 0.87), k_s=3.0)
+    with pytest.raises(InputError, match="bright in many places"):
+        light_from_highlight(picture, Circle(44.3, 44.8, 42.0))
+
+
+def test_noise_is_no_reason_to_doubt_a_ball():
+    rng = np.random.default_rng(5)
+    found = light_of(shown(FRONT) + 0.15 * rng.standard_normal(len(NORMAL)))
+    assert found.unexplained < DOUBTFUL
+
+
+@real_data
+@pytest.mark.parametrize("name", ["real-item2/image00.jpg", "real-item9/image17.jpg"])
+def test_a_fresco_and_a_coin_are_no_balls(name):
+    """Taken for balls, their light was up to 98° off and said to be known to 5°."""
+    picture = brdf.read_picture(REAL / "rti" / name)
+    height, width, _ = picture.pixels.shape
+    circle = Circle((width - 1) / 2, (height - 1) / 2, min(width, height) / 2 - 1)
+    with pytest.raises(InputError, match=r"not shaded like this surface"):
+        light_from_shading(picture, ball_points((height, width), circle))
+    with pytest.raises(InputError, match="bright in many places"):
+        light_from_highlight(picture, circle)
