@@ -19,13 +19,13 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 import brdf
 from brdf.precision import working_precision
+from fitting.joint import JointProblem, joint_problem
 from fitting.result import FitResult
 
 NEWTON_STEPS = 3
@@ -76,80 +76,63 @@ def sensitivity(result: FitResult, by: Callable[[list[brdf.Scene]], Sequence[Any
     """
     if result.loss != "squared":
         raise brdf.InputError("result", f"must be of the squared loss, got {result.loss}", "Fit without a loss")
-    scenes = list(result.scenes)
-    leaves = tuple(by(scenes))
+    leaves = tuple(by(list(result.scenes)))
     if not leaves or not all(hasattr(leaf, "shape") for leaf in leaves):
         raise brdf.InputError("by", "names no leaf of the scenes", "Return the leaves to differentiate by")
+    names = list(dict.fromkeys(one.name for one in result.free_parameters))
     with working_precision("float64"):
-        scenes = brdf.cast(scenes, "float64")
-        known, unravel = jax.flatten_util.ravel_pytree(tuple(by(scenes)))
-        numbers, unravel_numbers, design, index = _unknowns(result)
-        vector = np.linalg.pinv(design) @ numbers
-        # By arguments, or the pictures would be constants of the program.
-        pictures = [
-            (jnp.asarray(np.where(counted[..., None], target, 0.0), jnp.float64), jnp.asarray(counted))
-            for target, counted in zip(result.targets, result.counted, strict=True)
-        ]
-
-        def cost(vector: Array, known: Array, pictures: Any) -> Array:
-            values = unravel_numbers(jnp.where(np.any(design, axis=1), design @ vector, numbers))
-            material = type(result.material)(**{key: jnp.exp(v) if key == "n" else v for key, v in values.items()})
-            moved = eqx.tree_at(lambda scenes: tuple(by(scenes)), scenes, unravel(known))
-            total = jnp.zeros(())
-            for scene, (target, counted) in zip(moved, pictures, strict=True):
-                residual = jnp.where(counted[..., None], brdf.render(material, scene) - target, 0)
-                total = total + 0.5 * jnp.sum(residual * residual)
-            return total
-
-        def derivatives(vector: Array, known: Array, pictures: Any, *, by_known: bool) -> tuple[Array, Array]:
-            """The gradient by the unknowns, and its derivative by the unknowns or by what is known, row by row."""
-            gradient = jax.grad(cost)
-            if by_known:
-                found, along = jax.linearize(lambda known: gradient(vector, known, pictures), known)
-            else:
-                found, along = jax.linearize(lambda vector: gradient(vector, known, pictures), vector)
-            return found, jax.lax.map(along, jnp.eye(known.size if by_known else vector.size))
-
-        compiled = eqx.filter_jit(derivatives)
-        hessian = np.eye(vector.size)
+        start = brdf.cast((result.material, list(result.scenes)), "float64")
+        problem = joint_problem(
+            start,
+            lambda material, scenes: (*(getattr(material, name) for name in names), *by(scenes)),
+            [jnp.asarray(target, jnp.float64).reshape(-1, target.shape[-1]) for target in result.targets],
+            [jnp.asarray(counted, jnp.float64).ravel() for counted in result.counted],
+        )
+        vector = np.array(problem.start())
+        blocks = np.split(np.arange(vector.size), np.cumsum([leaf.size for leaf in problem.freed()])[:-1])
+        index, known = dict(zip(names, blocks, strict=False)), blocks[len(names) :]
+        unknowns = _unknowns(result, index, vector.size)
         # A fit in float32 stops a little beside the stationary point; Newton's steps go there.
+        hessian = np.eye(len(unknowns))
         for _ in range(NEWTON_STEPS):
-            gradient, hessian = (np.asarray(a) for a in compiled(jnp.asarray(vector), known, pictures, by_known=False))
-            vector = vector - _solve(hessian, gradient[:, None])[:, 0]
-        rows = np.asarray(compiled(jnp.asarray(vector), known, pictures, by_known=True)[1])
-    moves = -design @ _solve(hessian, rows.T)
+            gradient, rows = _curvature(problem, jnp.asarray(vector), jnp.asarray(unknowns))
+            hessian = np.asarray(rows) @ unknowns.T
+            vector -= unknowns.T @ _solve(hessian, unknowns @ np.asarray(gradient)[:, None])[:, 0]
+        directions = np.eye(vector.size)[np.concatenate(known)]
+        _, rows = _curvature(problem, jnp.asarray(vector), jnp.asarray(directions))
+    moves = -unknowns.T @ _solve(hessian, unknowns @ np.asarray(rows).T)
     if "n" in index:
-        moves[index["n"]] *= np.exp(design @ vector)[index["n"], None]
-    channels = len(index["k_d"])
-    found, ends = [], np.cumsum([0, *(int(np.prod(leaf.shape)) for leaf in leaves)])
-    for leaf, start, end in zip(leaves, ends[:-1], ends[1:], strict=True):
-        parts = {key: np.zeros((channels, *leaf.shape)) for key in ("k_a", "k_d", "k_s")}
-        parts |= {key: moves[place, start:end].reshape(-1, *leaf.shape) for key, place in index.items()}
-        found.append(Sensitivity(**parts | {"n": parts["n"][0] if "n" in parts else np.zeros(leaf.shape)}))
+        moves[index["n"]] *= np.exp(vector[index["n"], None])
+    sizes, found = dict.fromkeys(("k_a", "k_d", "k_s"), result.material.k_d.shape) | {"n": ()}, []
+    for leaf, block in zip(leaves, known, strict=True):
+        parts = {key: np.zeros((*size, *leaf.shape)) for key, size in sizes.items()}
+        for key, place in index.items():
+            parts[key] = moves[np.ix_(place, block - known[0][0])].reshape(parts[key].shape)
+        found.append(Sensitivity(**parts))
     return tuple(found)
 
 
-def _unknowns(result: FitResult) -> tuple[np.ndarray, Callable[[Array], Any], np.ndarray, dict[str, np.ndarray]]:
-    """The material's numbers as one vector, n by its logarithm: how to undo that, what each unknown moves, and where.
+@eqx.filter_jit
+def _curvature(problem: JointProblem, vector: Array, directions: Array) -> tuple[Array, Array]:
+    """The gradient of half the sum of squares by all numbers, and how it changes along each direction."""
+    gradient = jax.grad(lambda vector: 0.5 * jnp.sum(problem.residuals(vector) ** 2))
+    found, along = jax.linearize(gradient, vector)
+    return found, jax.lax.map(along, directions)
+
+
+def _unknowns(result: FitResult, index: dict[str, np.ndarray], size: int) -> Float[np.ndarray, "U S"]:
+    """What each unknown moves of all numbers.
 
     A grey highlight is one number, and the only way for all channels to agree to the last digit.
     """
-    material = {key: np.asarray(value, np.float64) for key, value in vars(result.material).items() if value is not None}
-    free = [(parameter.name, parameter.channel) for parameter in result.free_parameters]
-    if "n" in material:
-        # Of n = 0, which is never free, nothing is asked.
-        material["n"] = np.log(np.maximum(material["n"], np.finfo(float).tiny))
-    k_s = material.get("k_s", np.zeros(1))
-    if np.all(k_s == k_s[0]):
-        free = [(name, None if name == "k_s" else channel) for name, channel in free]
-    numbers, unravel = jax.flatten_util.ravel_pytree(material)
-    index = {
-        key: np.atleast_1d(np.asarray(place, int)) for key, place in unravel(jnp.arange(numbers.size * 1.0)).items()
-    }
-    design = np.zeros((numbers.size, len(set(free))))
-    for column, (name, channel) in enumerate(dict.fromkeys(free)):
-        design[index[name] if channel is None else index[name][channel], column] = 1.0
-    return np.asarray(numbers), unravel, design, index
+    k_s = np.asarray(getattr(result.material, "k_s", np.zeros(1)))
+    grey = bool(np.all(k_s == k_s[0]))
+    rows = {}
+    for one in result.free_parameters:
+        is_shared = one.channel is None or (grey and one.name == "k_s")
+        place = index[one.name] if is_shared else index[one.name][one.channel]
+        rows[one.name if is_shared else one.key] = np.isin(np.arange(size), place).astype(float)
+    return np.array(list(rows.values()))
 
 
 def _solve(hessian: np.ndarray, right: np.ndarray) -> np.ndarray:

@@ -29,7 +29,7 @@ import brdf
 from brdf.errors import InputError
 from brdf.precision import Precision, working_precision
 from fitting.core import fit_pictures
-from fitting.pixels import Observed, Tile, observe
+from fitting.pixels import Observed, observe
 from fitting.problem import CLASSIC, FitProblem, model_name, state_problem
 from fitting.report import FitResult
 from fitting.result import Parameter, free_parameters
@@ -125,7 +125,9 @@ def fit_jointly(
         seen = observe(stated, at_once=True)
 
         def solve(start: brdf.Material, scenes: Sequence[brdf.Scene]) -> JointResult:
-            problem = _freed(brdf.cast((start, list(scenes)), precision), freed, list(seen.tiles))
+            weights = [tile.weight for tile in seen.tiles]
+            targets = [tile.target for tile in seen.tiles]
+            problem = joint_problem(brdf.cast((start, list(scenes)), precision), freed, targets, weights)
             jacobian = sum(tile.target.size for tile in seen.tiles) * problem.start().size
             chosen = solver or ("lm" if jacobian <= LARGEST_JACOBIAN else "bfgs")
             return _solve(problem, seen, chosen, tolerance, max_steps)
@@ -152,12 +154,13 @@ def _of_model(stated: FitProblem, model: str, solve: Callable[..., JointResult])
     return best
 
 
-class _JointProblem(eqx.Module):
+class JointProblem(eqx.Module):
     """From a vector of freed numbers to weighted residuals; a pytree, so that its programs are compiled once a shape.
 
     Attributes:
         leaves: of material and list of scenes.
-        tiles: what is compared with.
+        targets: what is compared with, (P, C) each.
+        weights: of their pixels, (P,) each; None where all count, and alike.
         shape: of material and scenes.
         places: of the freed leaves.
         names: of the fields that they are.
@@ -165,7 +168,8 @@ class _JointProblem(eqx.Module):
     """
 
     leaves: list[Array]
-    tiles: list[Tile]
+    targets: list[Array]
+    weights: list[Array | None]
     shape: Any = eqx.field(static=True)
     places: tuple[int, ...] = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
@@ -180,7 +184,7 @@ class _JointProblem(eqx.Module):
         both = zip(self.freed(), self.names, strict=True)
         return jnp.concatenate([jnp.ravel(jnp.log(leaf) if name == "n" else leaf) for leaf, name in both])
 
-    def at(self, vector: Array) -> "_JointProblem":
+    def at(self, vector: Array) -> "JointProblem":
         """The problem with other freed numbers."""
         leaves, begin = list(self.leaves), 0
         for place, name in zip(self.places, self.names, strict=True):
@@ -196,17 +200,29 @@ class _JointProblem(eqx.Module):
         """Weighted residuals of all pictures, one after the other."""
         material, scenes = self.at(vector).content()
         found = []
-        for tile, scene in zip(self.tiles, scenes, strict=True):
-            residual = brdf.render(material, scene).reshape(tile.target.shape) - tile.target
-            if tile.weight is not None:
-                counts = tile.weight[:, None] > 0
-                residual = jnp.where(counts, residual * jnp.where(counts, tile.weight[:, None], 1) ** 0.5, 0)
+        for target, weight, scene in zip(self.targets, self.weights, scenes, strict=True):
+            residual = brdf.render(material, scene).reshape(target.shape) - target
+            if weight is not None:
+                counts = weight[:, None] > 0
+                residual = jnp.where(counts, residual * jnp.where(counts, weight[:, None], 1) ** 0.5, 0)
             found.append(residual.ravel())
         return jnp.concatenate(found)
 
 
-def _freed(start: Any, free: Callable[..., Sequence[Any]] | None, tiles: list[Tile]) -> _JointProblem:
-    """Find the freed leaves among those of the start, each an array of its own."""
+def joint_problem(
+    start: Any, free: Callable[..., Sequence[Any]] | None, targets: list[Array], weights: list[Array | None]
+) -> JointProblem:
+    """Find the freed leaves among those of the start, each an array of its own.
+
+    Args:
+        start: material and list of scenes.
+        free: from both to the leaves.
+        targets: see `JointProblem`.
+        weights: likewise.
+
+    Raises:
+        InputError: where ``free`` does not name distinct leaves.
+    """
     start = jax.tree.map(jnp.array, start)
     remedy = "Return a tuple of leaves, such as (material.n, scenes[0].lights[0].direction)"
     try:
@@ -227,7 +243,7 @@ def _freed(start: Any, free: Callable[..., Sequence[Any]] | None, tiles: list[Ti
         raise InputError("free", "gives a leaf twice", remedy)
     places, names, words = zip(*(own[leaf] for leaf in freed), strict=True)
     leaves, shape = jax.tree.flatten(start)
-    return _JointProblem(leaves, tiles, shape, places, names, words)
+    return JointProblem(leaves, targets, weights, shape, places, names, words)
 
 
 def _named(names: Sequence[str]) -> Callable[[Any, list[brdf.Scene]], list[Any]]:
@@ -275,14 +291,14 @@ def _words(path: Sequence[Any], scenes: int) -> str:
 
 @eqx.filter_jit
 def _run(
-    problem: _JointProblem, vector: Array, held: Array, solver: str, tolerance: float, max_steps: int
+    problem: JointProblem, vector: Array, held: Array, solver: str, tolerance: float, max_steps: int
 ) -> optx.Solution:
     """The solver's answer with some of the freed numbers held."""
 
-    def residuals(free: Array, problem: _JointProblem) -> Array:
+    def residuals(free: Array, problem: JointProblem) -> Array:
         return problem.residuals(jnp.where(held, vector, free))
 
-    def cost(free: Array, problem: _JointProblem) -> Array:
+    def cost(free: Array, problem: JointProblem) -> Array:
         return 0.5 * jnp.sum(residuals(free, problem) ** 2)
 
     if solver == "lm":
@@ -293,13 +309,13 @@ def _run(
 
 
 @eqx.filter_jit
-def _linearised(problem: _JointProblem, vector: Array) -> tuple[Array, Array]:
+def _linearised(problem: JointProblem, vector: Array) -> tuple[Array, Array]:
     """The residuals and their derivatives, one column of the Jacobian at a time."""
     residuals, along = jax.linearize(problem.residuals, vector)
     return residuals, jax.lax.map(along, jnp.eye(vector.size))
 
 
-def _solve(problem: _JointProblem, seen: Observed, solver: str, tolerance: float, max_steps: int) -> JointResult:
+def _solve(problem: JointProblem, seen: Observed, solver: str, tolerance: float, max_steps: int) -> JointResult:
     vector, freed = problem.start(), problem.freed()
     bounded = np.repeat([name in NOT_NEGATIVE for name in problem.names], [leaf.size for leaf in freed])
     held = np.zeros(vector.shape, bool)
@@ -320,8 +336,8 @@ def _solve(problem: _JointProblem, seen: Observed, solver: str, tolerance: float
     channels = seen.colour.size
     squares = np.sum(residual.reshape(-1, channels) ** 2, axis=0)
     square, pixels = 0.0, 0
-    for tile in problem.tiles:
-        counted = np.asarray(tile.target, np.float64)[... if tile.weight is None else np.asarray(tile.weight) > 0]
+    for target, weight in zip(problem.targets, problem.weights, strict=True):
+        counted = np.asarray(target, np.float64)[... if weight is None else np.asarray(weight) > 0]
         square, pixels = square + float(np.sum(counted**2)), pixels + len(counted)
     noise = squares / max(pixels - vector.size / channels, 1)
     material, scenes = jax.tree.map(np.asarray, found.content())
@@ -329,10 +345,10 @@ def _solve(problem: _JointProblem, seen: Observed, solver: str, tolerance: float
     given = [given[place] for place in problem.places]
     parameters, errors, correlation = _with_errors(problem, given, vector, held, columns, float(np.mean(noise)))
     warnings = [] if converged else [f"the solver stopped after {steps} steps without an end: raise max_steps"]
-    parts = np.split(residual, np.cumsum([tile.target.size for tile in problem.tiles])[:-1])
-    both = zip(parts, problem.tiles, strict=True)
+    parts = np.split(residual, np.cumsum([target.size for target in problem.targets])[:-1])
+    both = zip(parts, seen.shown, strict=True)
     share = (float(np.sum(squares)) / square) ** 0.5
-    known = correlation_in_rows([part.reshape(*tile.points.mask.shape, channels) for part, tile in both], share)
+    known = correlation_in_rows([part.reshape(picture.shape) for part, picture in both], share)
     return JointResult(
         material=material,
         parameters=parameters,
@@ -362,7 +378,7 @@ def _solve(problem: _JointProblem, seen: Observed, solver: str, tolerance: float
 
 
 def _with_errors(
-    problem: _JointProblem,
+    problem: JointProblem,
     given: Sequence[Any],
     vector: np.ndarray,
     held: np.ndarray,

@@ -24,8 +24,8 @@ brdf.geometry brdf.lights brdf.lobes brdf.pixel_area brdf.images brdf.scene_file
 brdf.materials brdf.measured brdf.plausibility brdf.display
 fitting.likelihood fitting.codes fitting.functional fitting.solver fitting.model_fit fitting.light_colour
 fitting.problem fitting.pixels fitting.selection fitting.budget.choice fitting.result fitting.uncertainty
-fitting.plausible fitting.doubts fitting.core fitting.diagnosis fitting.report fitting.implicit fitting.light_choice
-fitting.joint fitting.relighting fitting.measured_fit fitting.photographs fitting.budget fitting.speed_accuracy
+fitting.plausible fitting.doubts fitting.core fitting.diagnosis fitting.report fitting.light_choice fitting.joint
+fitting.implicit fitting.relighting fitting.measured_fit fitting.photographs fitting.budget fitting.speed_accuracy
 fitting.front_door fitting.many fitting.maps
 fitting.cli
 """.split()
