@@ -11,11 +11,12 @@ that show signs of it are fitted by `fitting.fit`, one by one.
 import dataclasses
 import functools
 from collections.abc import Iterator, Sequence
-from typing import Any, overload
+from typing import Any, NamedTuple, overload
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float
 
@@ -210,19 +211,20 @@ def _fit_together(problem: FitProblem) -> tuple[dict[str, np.ndarray], Bool[np.n
         choose = functools.partial(_chosen, pixel)
         images = Basis(images.points, choose(images.diffuse), images.lobe and images.lobe.pixels(choose))
         few = jnp.asarray(np.take(targets.reshape(count, -1, channels), pixel, axis=1))
-        solution = _dealt_out(_in_one_scene, (few,), (images, scenes[0].ambient), problem.n_range)
+        shared = _Given(images=images, weight=jnp.ones(pixel.size, dtype), ambient=scenes[0].ambient)
+        found = _dealt_out(_Given(few), shared, problem.n_range)
     else:
-        solution = None
+        found = None
         for some in _of_one_structure(scenes):
             stack = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(scenes[i] for i in some))
-            lit = _bases(model, stack)
-            parts = jnp.asarray(targets[some]), jnp.asarray(seen[some]), lit, stack.ambient
-            part = _dealt_out(_in_scenes_of_their_own, parts, (), problem.n_range)
-            if solution is None:
-                solution = jax.tree.map(lambda leaf: np.zeros((count, *leaf.shape[1:]), leaf.dtype), part)
-            jax.tree.map(lambda whole, leaf, some=some: whole.__setitem__(some, leaf), solution, part)
-    assert solution is not None
-    solution, square = jax.tree.map(np.array, solution)
+            weight = jnp.asarray(seen[some].reshape(len(some), -1), dtype)
+            own = _Given(jnp.asarray(targets[some]), _bases(model, stack), weight, stack.ambient)
+            part = _dealt_out(own, _Given(), problem.n_range)
+            if found is None:
+                found = jax.tree.map(lambda leaf: np.zeros((count, *leaf.shape[1:]), leaf.dtype), part)
+            jax.tree.map(lambda whole, leaf, some=some: whole.__setitem__(some, leaf), found, part)
+    assert found is not None
+    solution, square = jax.tree.map(np.array, found)
     factor = np.where(light.colour > 0, light.colour, 1.0)
     scale = model.scale(solution.n)[:, None] if issubclass(model, SpecularMaterial) else 1.0
     numbers = {"n": np.where(solution.k_s.any(axis=1), solution.n, 0), "n_error": solution.errors[3]}
@@ -235,9 +237,7 @@ def _fit_together(problem: FitProblem) -> tuple[dict[str, np.ndarray], Bool[np.n
 def _alike(problem: FitProblem) -> bool:
     """Whether all pictures show one scene, and the same pixels of it."""
     (scene, *scenes), (mask, *masks) = problem.scenes, problem.masks
-    if mask is None or any(one is None for one in masks):
-        return all(one is scene for one in scenes) and all(one is mask for one in masks)
-    return all(one is scene for one in scenes) and bool(np.all([one == mask for one in masks]))
+    return all(one is scene for one in scenes) and all(one is mask or np.array_equal(one, mask) for one in masks)
 
 
 def _of_one_structure(scenes: Sequence[brdf.Scene]) -> Iterator[list[int]]:
@@ -249,46 +249,37 @@ def _of_one_structure(scenes: Sequence[brdf.Scene]) -> Iterator[list[int]]:
     yield from groups.values()
 
 
-def _dealt_out(solve: Any, pictures: tuple[Any, ...], shared: tuple[Any, ...], n_range: Any) -> Any:
-    """What a program finds of pictures, those of each device of the mesh on that device."""
+class _Given(NamedTuple):
+    """What `fitting.functional.fit_basis` takes: of each of several pictures, or of all; the other then is None."""
+
+    target: Array | None = None
+    images: Basis | None = None
+    weight: Array | None = None
+    ambient: Array | None = None
+
+
+def _dealt_out(own_parts: _Given, shared: _Given, n_range: Any) -> tuple[functional.Solution, Array]:
+    """What is found of pictures, those of each device of the mesh on that device."""
     if device_count() == 1:
-        return solve(*pictures, *shared, n_range)
-    count = len(pictures[0])
+        return _solved(own_parts, shared, n_range)
+    assert own_parts.target is not None
+    count = len(own_parts.target)
     if count < device_count():
         came = f"has {device_count()} devices for {count} pictures"
         raise InputError("mesh", came, "Give no more devices than pictures, or leave it out")
     places = np.array_split(np.arange(count), device_count())
-    found = {}
-    for device in own(device_count()):
-        mine = jax.tree.map(lambda leaf, some=places[device]: leaf[some], pictures)
-        found[device] = solve(*placed(device, mine), *placed(device, shared), n_range)
     rows, some = {}, None
-    for device, some in found.items():
-        table = np.concatenate([np.reshape(leaf, (len(leaf), -1)) for leaf in jax.tree.leaves(some)], axis=1)
-        rows |= dict(zip(places[device].tolist(), table.astype(np.float64), strict=True))
-    leaves, structure = jax.tree.flatten(some)
-    table = gathered(rows, count, (sum(leaf[0].size for leaf in leaves),))
-    ends = np.cumsum([leaf[0].size for leaf in leaves])[:-1]
-    columns = [
-        part.reshape(count, *leaf.shape[1:]) for part, leaf in zip(np.split(table, ends, 1), leaves, strict=True)
-    ]
-    return jax.tree.unflatten(structure, columns)
+    for device in own(device_count()):
+        mine = jax.tree.map(lambda leaf, some=places[device]: leaf[some], own_parts)
+        some = _solved(placed(device, mine), placed(device, shared), n_range)
+        table = np.asarray(jax.vmap(lambda one: ravel_pytree(one)[0])(some), np.float64)
+        rows |= dict(zip(places[device].tolist(), table, strict=True))
+    flat, unravel = ravel_pytree(jax.tree.map(lambda leaf: leaf[0], some))
+    return jax.vmap(unravel)(jnp.asarray(gathered(rows, count, flat.shape), flat.dtype))
 
 
 def _chosen(pixel: np.ndarray, leaf: Any) -> Any:
     return None if leaf is None else jnp.asarray(np.asarray(leaf)[pixel])
-
-
-@functools.partial(jax.jit, static_argnums=3)
-def _in_one_scene(
-    targets: Array, images: Basis, ambient: Array | None, n_range: Any
-) -> tuple[functional.Solution, Array]:
-    weight = jnp.ones(targets.shape[1], targets.dtype)
-
-    def fit(target: Array) -> functional.Solution:
-        return functional.fit_basis(target, images, weight, ambient, n_range)
-
-    return jax.lax.map(fit, targets, batch_size=BATCH), jnp.sum(targets * targets, axis=(1, 2))
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -297,16 +288,17 @@ def _bases(model: type[brdf.Material], scenes: brdf.Scene) -> Basis:
     return jax.lax.map(functools.partial(basis, model), scenes)
 
 
-@functools.partial(jax.jit, static_argnums=4)
-def _in_scenes_of_their_own(
-    targets: Array, seen: Array, images: Basis, ambient: Array | None, n_range: Any
-) -> tuple[functional.Solution, Array]:
-    def fit(picture: Any) -> functional.Solution:
-        target, seen, images, ambient = picture
-        return functional.fit_basis(target, images, seen.ravel().astype(target.dtype), ambient, n_range)
+@functools.partial(jax.jit, static_argnums=2)
+def _solved(own_parts: _Given, shared: _Given, n_range: Any) -> tuple[functional.Solution, Array]:
+    """The solution of each picture, and the sum of its squares."""
 
-    found = jax.lax.map(fit, (targets, seen, images, ambient), batch_size=BATCH)
-    return found, jnp.sum(jnp.where(seen[..., None], targets * targets, 0), axis=(1, 2, 3))
+    def fit(one: _Given) -> tuple[functional.Solution, Array]:
+        target, images, weight, ambient = (mine if its is None else its for mine, its in zip(one, shared, strict=True))
+        solution = functional.fit_basis(target, images, weight, ambient, n_range)
+        values = target.reshape(weight.size, -1)
+        return solution, jnp.sum(jnp.where(weight[:, None] > 0, values * values, 0))
+
+    return jax.lax.map(fit, own_parts, batch_size=BATCH)
 
 
 @jax.jit

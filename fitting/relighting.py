@@ -25,13 +25,14 @@ from fitting.problem import model_name, state_problem
 from fitting.report import FitResult
 from fitting.result import Parameter, free_parameters
 from fitting.solver.nnls import inverse_diagonal, nonnegative_minimum
-from fitting.solver.refinement import GRID_STEP, minimum_between
+from fitting.solver.refinement import GRID_STEP
 from fitting.uncertainty.intervals import above_zero
 from fitting.uncertainty.residual_correlation import correlation_in_rows, structure_warning
 
 FACTOR = "one factor per channel between material and lights"
 KEPT = "no picture determines it; the lights' mean intensity was kept at that of the scene"
 N_RANGE = (0.5, 1e5)
+CLOSE = 1e-5
 _ROUNDS = 200
 
 
@@ -220,15 +221,15 @@ def _in_turn(terms: np.ndarray, pixels: np.ndarray, lights: int) -> tuple[float,
 
 
 def _best_exponent(cost: Callable[[float], float], n_range: tuple[float, float]) -> float:
-    """The exponent of least cost: a grid over log n, then the best cell's neighbourhood."""
-
-    def costs(log_n: np.ndarray) -> np.ndarray:
-        return np.array([cost(float(n)) for n in np.exp(log_n)])
-
+    """The exponent of least cost: a grid over log n, and finer ones around the best, down to `CLOSE`."""
     low, high = np.log(n_range)
     grid = np.linspace(low, high, 2 + int((high - low) / GRID_STEP))
-    best = int(np.argmin(costs(grid)))
-    return float(np.exp(minimum_between(costs, grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)], points=9)))
+    while True:
+        best = int(np.argmin([cost(float(n)) for n in np.exp(grid)]))
+        low, high = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
+        if high - low <= CLOSE:
+            return float(np.exp(grid[best]))
+        grid = np.linspace(low, high, 9)
 
 
 def _result(

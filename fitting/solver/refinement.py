@@ -21,9 +21,6 @@ _MOST_SECANTS = 40
 TOLERANCE_SINGLE = 2e-7
 TOLERANCE_DOUBLE = 1e-14
 
-# Of an interval searched: the three samples that the last parabola goes through are so far apart.
-_CLOSE = 1e-3
-
 Cap = Callable[[float], Float[np.ndarray, "3 C"]]
 """From the exponent to what x_a, x_d, x_s count in a sum that may not exceed 1, channel by channel."""
 
@@ -87,29 +84,6 @@ def problem_of(
     free = np.ones((3, target.shape[1]), bool) if free is None else np.asarray(free)
     tolerance, accuracy = (TOLERANCE_SINGLE, 2e-6) if target.dtype == np.float32 else (TOLERANCE_DOUBLE, 1e-10)
     return Problem(pictures, free.T, tolerance, accuracy, n_range)
-
-
-def minimum_between(costs: Callable[[np.ndarray], np.ndarray], low: float, high: float, points: int = 17) -> float:
-    """Where a function of one number is least: samples, again around the best of them, at last a parabola.
-
-    Args:
-        costs: the function, of several numbers at once.
-        low: lower bound.
-        high: upper bound.
-        points: how many are tried at once.
-    """
-    width = high - low
-    while True:
-        at = np.linspace(low, high, points)
-        cost = costs(at)
-        middle = int(np.clip(np.argmin(cost), 1, points - 2))
-        low, here, high = at[middle - 1 : middle + 2]
-        if high - here <= _CLOSE * width:
-            break
-    before, after = np.diff(cost[middle - 1 : middle + 2])
-    bend = after - before
-    vertex = here - (high - here) * (before + after) / (2 * bend) if bend > 0 else at[np.argmin(cost)]
-    return float(np.clip(vertex, low, high))
 
 
 def solve_linear(parts: Sums, log_n: Float[np.ndarray, " N"], reference: np.ndarray, problem: Problem) -> Point:
