@@ -13,7 +13,7 @@ A float array whose values all lie on the levels of one of these is taken as suc
 
 from typing import Any, Literal, NamedTuple
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -98,9 +98,9 @@ class Codes(NamedTuple):
             )
         lower = np.where(good & (code > self.ends[0]), np.minimum(code, top) - flat(self.below), -np.inf)
         upper = np.where(good & (code < top), code + flat(self.above), np.inf)
-        lower, upper, scale, unit = (jnp.asarray(part) for part in (lower, upper, self.scale, self.unit))
-        index, width = np.arange(len(code)), np.asarray(self.values.shape[1])
-        return Bounds(lower, upper, scale, unit, index, width, jnp.asarray(spread), self.encoding, self.lossy)
+        place = np.arange(len(code)), np.asarray(self.values.shape[1])
+        scale, unit, spread = (np.asarray(part, np.float64) for part in (self.scale, self.unit, spread))
+        return Bounds(*_stored(lower, upper), scale, unit, *place, spread, self.encoding, self.lossy)
 
 
 def _mixed(beside: Bool[np.ndarray, "H W"], size: int) -> Bool[np.ndarray, " P"]:
@@ -167,9 +167,14 @@ def open_ends(
         return None
     lower = np.where(good & ~low, np.where(high, min(level or np.inf, np.inf), values), -np.inf)
     upper = np.where(good & ~high, values, np.inf)
-    lower, upper, one = (jnp.asarray(part) for part in (lower, upper, np.float64(1.0)))
-    place = np.arange(len(values)), np.asarray(width)
-    return Bounds(lower, upper, one, one, *place, jnp.asarray(spread), "linear", lossy=False, exact=True)
+    place, one = (np.arange(len(values)), np.asarray(width)), np.ones(())
+    spread = np.asarray(spread, np.float64)
+    return Bounds(*_stored(lower, upper), one, one, *place, spread, "linear", lossy=False, exact=True)
+
+
+def _stored(*bounds: np.ndarray) -> list[np.ndarray]:
+    """In the precision of the fit."""
+    return [bound.astype(np.float64 if jax.config.jax_enable_x64 else np.float32) for bound in bounds]
 
 
 def single_values_at_end(

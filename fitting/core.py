@@ -14,6 +14,7 @@ from brdf.precision import working_precision
 from brdf.rendering import basis
 from fitting.doubts import doubts
 from fitting.light_colour import coefficient_factors
+from fitting.maximum_likelihood import most_likely, unexplained
 from fitting.model_fit import ModelFit
 from fitting.pixels import Observed, Tile, observe
 from fitting.plausible import fit_plausible, is_plausible
@@ -22,7 +23,6 @@ from fitting.result import FitResult
 from fitting.selection import FAMILIES, Choice, choose
 from fitting.solver.devices import placed
 from fitting.solver.losses import reweight
-from fitting.solver.maximum_likelihood import evidence, unexplained
 from fitting.solver.normal_equations import Picture, Sums
 from fitting.solver.profile import Optimum, refit, search
 from fitting.solver.streams import Stream, each
@@ -42,6 +42,8 @@ UNSEEN = 60.0
 EXPLAINED = 0.35
 # As many independent values a picture has at least.
 FEWEST_MEASUREMENTS = 30.0
+# A highlight that leaves so many times the squares of another one is not made likelier than it by rounding.
+HOPELESS = 3.0
 # An exponent up to this multiple of the lower bound is at the bound.
 WIDEST = 1.01
 
@@ -62,25 +64,21 @@ def fit_pictures(problem: FitProblem) -> FitResult:
     problem = dataclasses.replace(problem, weights=weights)
 
     with working_precision(problem.precision):
-        result = _fit(problem)
-    return dataclasses.replace(result, seconds=time.perf_counter() - start)
-
-
-def _fit(problem: FitProblem) -> FitResult:
-    seen = observe(problem)
-    if problem.model == "auto":
-        fit, choice = _fit_simplest(seen)
-    else:
-        fit, choice = _fit_model(brdf.MODELS[problem.model], seen), None
-    fit = _held_plausible(fit, seen)
-    told, optimum = _interpreted(fit, seen, choice), fit.optimum
-    hidden = told.hidden_highlight
-    if hidden and not fit.capped and optimum.x[2].any():
-        # Or ambient and diffuse would be the ones that go with the highlight. Weights of a robust loss are made anew.
-        free = fit.free & [[True], [True], [False]]
-        pictures = fit.pictures if problem.loss == "squared" else None
-        fit = _held_plausible(_fit_model(fit.model, seen, free, pictures), seen)
-        told = _interpreted(fit, seen, choice, hidden)
+        seen = observe(problem)
+        if problem.model == "auto":
+            fit, choice = _fit_simplest(seen)
+        else:
+            fit, choice = most_likely(_fit_model(brdf.MODELS[problem.model], seen)), None
+        fit = _held_plausible(fit, seen)
+        told, optimum = _interpreted(fit, seen, choice), fit.optimum
+        hidden = told.hidden_highlight
+        if hidden and not fit.capped and optimum.x[2].any():
+            # Or ambient and diffuse would be the ones that go with the highlight. Weights of a robust loss are made
+            # anew.
+            free = fit.free & [[True], [True], [False]]
+            pictures = fit.pictures if problem.loss == "squared" else None
+            fit = _held_plausible(most_likely(_fit_model(fit.model, seen, free, pictures)), seen)
+            told = _interpreted(fit, seen, choice, hidden)
     return FitResult(
         **told._asdict(),
         residual=fit.residual,
@@ -90,7 +88,7 @@ def _fit(problem: FitProblem) -> FitResult:
         optimum=optimum,
         loss=problem.loss,
         precision=problem.precision,
-        seconds=0.0,
+        seconds=time.perf_counter() - start,
         targets=seen.shown,
         scenes=seen.scenes,
         counted=seen.counted,
@@ -117,7 +115,10 @@ def _fit_model(
     free: np.ndarray | None = None,
     pictures: Sequence[Picture] | None = None,
 ) -> ModelFit:
-    """One model with the loss that is asked for; all that the light reaches is free where nothing else is said."""
+    """One model by least squares, with the loss that is asked for.
+
+    All that the light reaches is free where nothing else is said.
+    """
     free = seen.reached(model) if free is None else free
     if pictures is None:
         make = partial(_picture, model)
@@ -134,20 +135,7 @@ def _fit_model(
             free[2] = False
     optimise = partial(search, n_min=n_range[0], n_max=n_range[1], free=free)
     found = reweight(pictures, optimise(pictures), optimise, seen.problem.loss, seen.rounding)
-    fit = ModelFit(model, found.pictures, found.optimum, free, n_range, None, found.noise_factor)
-    return _most_likely(fit, seen)
-
-
-def _most_likely(fit: ModelFit, seen: Observed) -> ModelFit:
-    """The fit, by what rounded values say where there are any."""
-    if fit.capped or any(picture.bounds is None for picture in fit.pictures):
-        return fit
-    said = evidence(fit.pictures, fit.optimum, fit.free, fit.n_range, fit.tied)
-    if said is None:
-        return fit
-    found = said.optimum
-    optimum = dataclasses.replace(fit.optimum, x=found.x, n=found.n, flat=found.flat)
-    return fit._replace(optimum=optimum, evidence=said)
+    return ModelFit(model, found.pictures, found.optimum, free, n_range, None, found.noise_factor)
 
 
 def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
@@ -162,9 +150,13 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
                 for done, fit in fits.items()
             }
         fits[name] = _fit_model(brdf.MODELS[name], seen)
+    least = min(float(np.sum(fit.optimum.cost)) for fit in fits.values())
+    for name, fit in fits.items():
+        if np.sum(fit.optimum.cost) <= HOPELESS * least:
+            fits[name] = most_likely(fit)
     # A lobe that would be wider than the search allows is no highlight: it mends what Lambert's law leaves at the rim.
     fits = {name: fit for name, fit in fits.items() if fit.optimum.flat or fit.optimum.n > WIDEST * problem.n_range[0]}
-    fits = fits or {"lambert": _fit_model(brdf.Lambert, seen)}
+    fits = fits or {"lambert": most_likely(_fit_model(brdf.Lambert, seen))}
     if problem.loss != "squared":
         # Weights are part of what is minimised: those of the better family serve all, or costs could not be compared.
         best = min(fits.values(), key=lambda fit: float(np.sum(residual_noise(fit.optimum, seen.rounding))))
@@ -172,18 +164,19 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
             pictures = each(_with_weight_of, fit.pictures, best.pictures)
             fits[name] = fit._replace(pictures=pictures, optimum=_search(pictures, fit.free, fit.n_range))
     grey = {name: coefficient_factors(fit.model, fit.optimum.n, colour)[2] for name, fit in fits.items()}
-    best = min(fits.values(), key=lambda fit: float(np.sum(fit.optimum.cost)))
-    noise = residual_noise(best.optimum, seen.rounding)
-    known = residual_correlation(best.pictures, seen.tiles, best.optimum, seen.rounding)
-    whitened = {}
-    if known.noise is not None:
-        # Each pixel by its own variance, or noise in bright pixels would pass for a highlight.
-        for name, fit in fits.items():
-            whitened[name] = weighted_sums(fit.pictures, fit.optimum, known.noise, inverse=True)
-    inflation = known.inflation
-    if all(fit.evidence is not None for fit in fits.values()):
-        noise, whitened = np.ones_like(noise), _likely_sums(fits)
-        inflation = _inflation(best, seen)
+    # The best comes first: what is judged without a highlight is judged by its sums.
+    fits = dict(sorted(fits.items(), key=lambda one: float(np.sum(one[1].optimum.cost))))
+    best = next(iter(fits.values()))
+    noise, whitened = residual_noise(best.optimum, seen.rounding), _likely_sums(fits)
+    if whitened:
+        noise, inflation = np.ones_like(noise), _inflation(best, seen)
+    else:
+        known = residual_correlation(best.pictures, seen.tiles, best.optimum, seen.rounding)
+        inflation = known.inflation
+        if known.noise is not None:
+            # Each pixel by its own variance, or noise in bright pixels would pass for a highlight.
+            for name, fit in fits.items():
+                whitened[name] = weighted_sums(fit.pictures, fit.optimum, known.noise, inverse=True)
     if seen.copies:
         inflation *= np.sqrt(seen.colour.size)
     # However much errs together, the picture is not less than a few measurements.
@@ -192,10 +185,9 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
     optima = {name: fit.optimum for name, fit in fits.items()}
     choice = choose(optima, free, grey, noise, inflation, whitened)
     if choice.model not in FAMILIES and not _explains_structure(fits[choice.model], seen):
-        best = _fit_model(brdf.Lambert, seen)
-        whitened = _likely_sums({"lambert": best}) if best.evidence is not None and whitened else {}
-        choice = choose({"lambert": best.optimum}, best.free, grey, noise, inflation, whitened)
-        fits = {"lambert": best}
+        fits = {"lambert": most_likely(_fit_model(brdf.Lambert, seen))}
+        best = fits["lambert"]
+        choice = choose({"lambert": best.optimum}, best.free, grey, noise, inflation, _likely_sums(fits))
     matt = choice.model in FAMILIES
     chosen = list(fits.values())[-1] if matt else fits[choice.model]
     del fits, best
@@ -204,24 +196,40 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
         pictures = each(lambda picture: dataclasses.replace(picture, lobe=None), pictures)
         chosen = chosen._replace(model=brdf.Lambert)
     optimum = chosen.optimum
+    if not matt and not choice.grey and np.array_equal(choice.free, chosen.free):
+        return chosen, choice
     if matt or not np.array_equal(choice.free, chosen.free):
         optimum = _search(pictures, choice.free, chosen.n_range)
     tied = grey[choice.model] if choice.grey else None
     if tied is not None:
         optimum = refit(pictures, optimum, choice.free, chosen.n_range, tied)
     chosen = chosen._replace(pictures=pictures, optimum=optimum, free=choice.free, tied=tied)
-    return _most_likely(chosen, seen), choice
+    return most_likely(chosen), choice
 
 
 def _likely_sums(fits: Mapping[str, ModelFit]) -> dict[str, Sums]:
-    """Sums whose cost is minus twice the logarithm of the likelihood, beside that of the likeliest, and so above 0."""
-    said = {name: fit.evidence for name, fit in fits.items() if fit.evidence is not None}
-    best = max(one.value for one in said.values())
-    found = {}
-    for name, one in said.items():
-        optimum = one.optimum
-        least = 2 * (best - one.value) / optimum.square.size + optimum.pixels
-        found[name] = Sums(optimum.gram, optimum.product, optimum.square - optimum.cost + least, optimum.pixels)
+    """Sums whose cost is minus twice the logarithm of the likelihood, beside that of the likeliest, and so above 0.
+
+    Of a fit whose likelihood was not asked for, those of least squares over the noise of the best; nothing where least
+    squares is the whole answer for that.
+
+    Args:
+        fits: the best by least squares first.
+    """
+    best, found = next(iter(fits.values())), {}
+    if best.evidence is None:
+        return found
+    value = max(fit.evidence.value for fit in fits.values() if fit.evidence is not None)
+    noise = np.maximum(best.optimum.cost / best.optimum.pixels, np.finfo(float).tiny)
+    for name, fit in fits.items():
+        one = fit.optimum if fit.evidence is None else fit.evidence.optimum
+        if fit.evidence is None:
+            found[name] = Sums(
+                one.gram / noise[:, None, None], one.product / noise[:, None], one.square / noise, one.pixels
+            )
+            continue
+        least = 2 * (value - fit.evidence.value) / one.square.size + one.pixels
+        found[name] = Sums(one.gram, one.product, one.square - one.cost + least, one.pixels)
     return found
 
 

@@ -47,6 +47,8 @@ _TERMS = 24
 _SERIES = 4.0
 # Tables reach so far inside an end and beyond it, in units of s.
 _INSIDE, _OUTSIDE, _KNOTS = 9.0, 14.0, 2048
+# Widths are powers of two of each other to this share.
+_ALIKE = 1e-6
 _LOG_ROOT_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 
 
@@ -70,45 +72,43 @@ class Bounds(eqx.Module):
         exact: no rounding: where both ends are there they are the same.
     """
 
-    lower: Float[Array, "P C"]
-    upper: Float[Array, "P C"]
-    scale: Float[Array, ""] | Float[np.ndarray, ""]
-    unit: Float[Array, "*C"] | Float[np.ndarray, "*C"]
-    index: Int[AnyArray, " P"]
-    width: Int[AnyArray, ""]
-    spread: Float[Array, "*P"] | Float[np.ndarray, ""]
+    lower: Float[np.ndarray, "P C"]
+    upper: Float[np.ndarray, "P C"]
+    scale: Float[np.ndarray, ""]
+    unit: Float[np.ndarray, "*C"]
+    index: Int[np.ndarray, " P"]
+    width: Int[np.ndarray, ""]
+    spread: Float[np.ndarray, "*P"]
     encoding: Encoding = eqx.field(static=True)
     lossy: bool = eqx.field(static=True)
     exact: bool = eqx.field(static=True, default=False)
 
-    def codes(self, radiance: Float[Array, "*shape"]) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"]]:
-        """Predictions in codes before rounding, and their derivative by radiance."""
-        light, scale = radiance / self.unit, self.scale / self.unit
+    def codes(self, radiance: Float[AnyArray, "*shape"]) -> tuple[Float[AnyArray, "*shape"], Float[AnyArray, "*shape"]]:
+        """Predictions in codes before rounding, and their derivative by radiance; on the host where these are."""
+        xp: Any = np if isinstance(radiance, np.ndarray) else jnp
+        unit, steps = (xp.asarray(part, radiance.dtype) for part in (self.unit, self.scale))
+        light, scale = radiance / unit, steps / unit
         if self.encoding == "linear":
-            return light * self.scale, jnp.broadcast_to(scale, radiance.shape)
+            return light * steps, xp.broadcast_to(scale, radiance.shape)
         if self.encoding == "srgb":
             bright = light > 0.0031308
-            base, power = jnp.where(bright, light, 1.0), 1.0 / 2.4
+            base, power = xp.where(bright, light, 1.0), 1.0 / 2.4
             curved = 1.055 * base**power
-            code = jnp.where(bright, curved - 0.055, 12.92 * light)
-            return code * self.scale, jnp.where(bright, power * curved / base, 12.92) * scale
+            code = xp.where(bright, curved - 0.055, 12.92 * light)
+            return code * steps, xp.where(bright, power * curved / base, 12.92) * scale
         # A power is infinitely steep at 0; below a quarter of a code it goes on straight, to no code's edge.
         power = 1.0 / self.encoding
-        least = (0.25 / self.scale) ** self.encoding
-        base = jnp.maximum(light, least)
+        least = (0.25 / steps) ** self.encoding
+        base = xp.maximum(light, least)
         curved = base**power
         slope = power * curved / base
-        return (curved + slope * jnp.minimum(light - least, 0.0)) * self.scale, slope * scale
+        return (curved + slope * xp.minimum(light - least, 0.0)) * steps, slope * scale
 
     def pixels(self, choose: Callable[[Any], Array]) -> "Bounds":
         """Those of some pixels."""
         lower, upper, index = choose(self.lower), choose(self.upper), choose(self.index)
         spread = choose(self.spread) if self.spread.ndim else self.spread
         return dataclasses.replace(self, lower=lower, upper=upper, index=index, spread=spread)
-
-    def said(self, code: Float[Array, "P C"], s: Float[Array, ""]) -> "LogLikelihood":
-        """What the values say of predicted codes, with noise of standard deviation ``s``."""
-        return interval(self.lower, self.upper, code, s * self.spread)
 
 
 class LogLikelihood(NamedTuple):
@@ -146,60 +146,102 @@ def interval(
     narrow, inside = (decay <= _STEEP) & (width <= _WIDE), near <= 0
     ends = _Ends(near), _Ends(far)
     by_quadrature = _narrow(jnp.where(narrow, middle, 1.0), jnp.where(narrow, width, 1.0))
+    # Where the far end counts less; other numbers stand in where that fails.
+    fails = narrow | inside
+    ratios = _mills(_Ends(jnp.where(fails, 1.0, near))), _mills(_Ends(jnp.where(fails, 9.0, far)))
+    apart, left = jnp.where(fails, 9.0, jnp.minimum(width, _FAR)), jnp.exp(-jnp.where(fails, 40.0, decay))
     value, mean, weight = (
         jnp.where(narrow, one, jnp.where(inside, two, three))
         for one, two, three in zip(
             by_quadrature,
             _around(*ends, decay, ~narrow & inside),
-            _beyond(*ends, width, decay, narrow | inside),
+            _beyond(jnp.where(fails, 1.0, near), apart, left, *ratios),
             strict=True,
         )
     )
     return LogLikelihood(value, jnp.where(above, mean, -mean) / s, weight / (s * s))
 
 
-class Table:
-    """The log-likelihood of intervals of one width, tabulated over the prediction: for millions of values on the host.
+class _Table(NamedTuple):
+    """Value, score by the distance and weight, (3, knots), over the distance of a prediction beyond the upper end."""
 
-    Cubic between knots where the derivative is at hand, which is right to 1e-8; beyond the last knot the first terms of
-    the tail's series, right to 1e-6 of it.
+    first: float
+    step: float
+    values: Float[np.ndarray, "3 K"]
 
-    Attributes:
-        half: half the width, in units of s; 0 for an interval with one end.
+
+@functools.lru_cache(maxsize=256)
+def _table(ratio: float) -> _Table:
+    """Of intervals whose width is so many s; infinite for an interval with one end."""
+    first = -min(0.5 * ratio, _INSIDE)
+    beyond, step = np.linspace(first, _OUTSIDE, _KNOTS, retstep=True)
+    with jax.enable_x64(True):
+        found = jax.device_get(_interval(np.full(_KNOTS, -ratio), np.zeros(_KNOTS), beyond, np.ones(())))
+    return _Table(first, float(step), np.stack(found))
+
+
+class Intervals:
+    """What values say that lay between bounds, of millions of them on the host.
+
+    Where the widths are powers of two of each other, as those of integers and of floating point, by tables over the
+    prediction: cubic between knots where the derivative is at hand, which is right to 1e-8; beyond the last knot the
+    first terms of the tail's series, right to 1e-6 of it.
     """
 
-    def __init__(self, ratio: float):
-        """Tabulate.
+    def __init__(
+        self, lower: Float[np.ndarray, "P C"], upper: Float[np.ndarray, "P C"], spread: Float[np.ndarray, "*P"]
+    ):
+        """Sort the values by the width of their intervals.
 
         Args:
-            ratio: width over s; infinite for an interval with one end.
+            lower: their lower ends, minus infinity for open ones.
+            upper: their upper ends, infinity for open ones.
+            spread: noise of each pixel over that of the picture, a number or (P, 1).
         """
-        finite = math.isfinite(ratio)
-        self.half = 0.5 * ratio if finite else 0.0
-        self._first = -min(self.half, _INSIDE) if finite else -_INSIDE
-        self._step = (_OUTSIDE - self._first) / (_KNOTS - 1)
-        with jax.enable_x64(True):
-            # Distance beyond the upper end.
-            beyond = jnp.linspace(self._first, _OUTSIDE, _KNOTS)
-            lower = jnp.full(_KNOTS, -ratio if finite else -jnp.inf)
-            parts = _interval(lower, jnp.zeros(_KNOTS), beyond, jnp.ones(()))
-        self._value, self._score, self._weight = (np.asarray(part) for part in parts)
+        self._ends, self._spread = (lower, upper), spread
+        below, above = np.isfinite(lower), np.isfinite(upper)
+        closed = below & above & (upper > lower)
+        self._tells = closed | (below ^ above)
+        self._high, self._low = np.where(above, upper, 0.0), np.where(below, lower, 0.0)
+        # Twice the prediction below which the upper end is the farther one.
+        self._turn = np.where(below, np.where(above, self._high + self._low, np.inf), -np.inf)
+        width = (self._high - self._low)[closed]
+        least = float(np.min(width, initial=1.0 if not width.size else np.inf))
+        power = np.rint(np.log2(width / least)).astype(np.intp)
+        self._tabulated = not spread.ndim and bool(np.all(np.abs(width / least / 2.0**power - 1) < _ALIKE))
+        # The first kind has one end.
+        self._kinds = np.append(np.inf, least * 2.0 ** np.arange(np.max(power, initial=0) + 1))
+        self._kind = np.zeros(lower.shape, np.intp)
+        self._kind[closed] = 1 + power
 
-    def __call__(self, beyond: Float[np.ndarray, " K"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Value, score by the distance and weight.
+    def said(self, predicted: Float[np.ndarray, "P C"], noise: float) -> LogLikelihood:
+        """What they say of predictions.
 
         Args:
-            beyond: distance of the predictions beyond the nearer end, below 0 inside, in units of s.
+            predicted: z, in units of the ends.
+            noise: standard deviation of the noise before rounding.
         """
-        position = np.clip((beyond - self._first) / self._step, 0.0, _KNOTS - 1.000001)
+        s = noise * self._spread
+        if not self._tabulated:
+            filled = np.array([(0, (1 << max(len(predicted) - 1, 0).bit_length()) - len(predicted)), (0, 0)])
+            parts = (*self._ends, predicted, np.broadcast_to(s, predicted.shape))
+            with jax.enable_x64(True):
+                found = jax.device_get(_interval(*(np.pad(part, filled, mode="edge") for part in parts)))
+            return LogLikelihood(*(part[: len(predicted)] for part in found))
+        up = 2 * predicted >= self._turn
+        beyond = np.where(up, predicted - self._high, self._low - predicted) / s
+        tables = list(map(_table, (self._kinds / s).tolist()))
+        first, step = (np.array([getattr(one, name) for one in tables])[self._kind] for name in ("first", "step"))
+        position = np.clip((beyond - first) / step, 0.0, _KNOTS - 1.000001)
         index = position.astype(np.intp)
-        share, step = position - index, self._step
-        value = _hermite(self._value, self._score * step, index, share)
-        score = _hermite(self._score, -self._weight * step, index, share)
-        weight = self._weight[index] + share * (self._weight[index + 1] - self._weight[index])
-        inside = beyond < self._first
-        if inside.any():
-            value[inside], score[inside], weight[inside] = 0.0, 0.0, 0.0
+        share = position - index
+        index += _KNOTS * self._kind
+        values, scores, weights = np.concatenate([one.values for one in tables], axis=1)
+        weight = weights[index]
+        after = weights[index + 1]
+        score = _hermite(scores[index], scores[index + 1], -weight * step, -after * step, share)
+        value = _hermite(values[index], values[index + 1], scores[index] * step, scores[index + 1] * step, share)
+        weight = weight + share * (after - weight)
         tail = beyond > _OUTSIDE
         if tail.any():
             x = beyond[tail]
@@ -207,45 +249,15 @@ class Table:
             value[tail] = -0.5 * square - np.log(x) - _LOG_ROOT_TWO_PI + np.log1p((3 / square - 1) / square)
             score[tail] = -(x + (1 - 2 / square) / x)
             weight[tail] = 1 - (1 - 6 / square) / square
-        return value, score, weight
+        nothing = ~self._tells | (beyond < first)
+        for part in (value, score, weight):
+            part[nothing] = 0.0
+        return LogLikelihood(value, np.where(up, score, -score) / s, weight / s**2)
 
 
-def _hermite(values: np.ndarray, slopes: np.ndarray, index: np.ndarray, share: np.ndarray) -> np.ndarray:
-    low, high, start, end = values[index], values[index + 1], slopes[index], slopes[index + 1]
+def _hermite(low: Any, high: Any, start: Any, end: Any, share: Any) -> np.ndarray:
     rise = high - low
     return low + share * (start + share * (3 * rise - 2 * start - end + share * (start + end - 2 * rise)))
-
-
-table = functools.lru_cache(maxsize=64)(Table)
-
-
-def tabulated(
-    lower: Float[np.ndarray, "P C"], upper: Float[np.ndarray, "P C"], predicted: Float[np.ndarray, "P C"], s: float
-) -> LogLikelihood | None:
-    """`interval` of values on the host, from tables; None where widths are not those of codes or floating point.
-
-    Args:
-        lower: its lower end, minus infinity for an open one.
-        upper: its upper end, infinity for an open one.
-        predicted: z.
-        s: standard deviation of the noise.
-    """
-    below, above = np.isfinite(lower), np.isfinite(upper)
-    closed = below & above
-    width = np.subtract(upper, lower, out=np.where(below ^ above, np.inf, 0.0), where=closed)
-    mantissa, exponent = np.frexp(width)
-    if closed.any() and np.ptp(mantissa[closed]) > 1e-6:
-        return None
-    value, score, weight = np.zeros(width.shape), np.zeros(width.shape), np.zeros(width.shape)
-    high, low = np.where(above, upper, 0.0), np.where(below, lower, 0.0)
-    up = above & ~(below & (high + low > 2 * predicted))
-    beyond = np.where(up, predicted - high, low - predicted) / s
-    kinds = [np.inf, *(mantissa[closed].mean() * 2.0**power for power in np.unique(exponent[closed]))]
-    for kind in kinds:
-        some = np.isinf(width) if np.isinf(kind) else closed & (np.abs(width - kind) < 1e-3 * kind)
-        if some.any():
-            value[some], score[some], weight[some] = table(float(kind / s))(beyond[some])
-    return LogLikelihood(value, np.where(up, score, -score) / s, weight / s**2)
 
 
 class _Ends:
@@ -256,15 +268,18 @@ class _Ends:
         self.tail = 0.5 * jax.scipy.special.erfc(jnp.abs(x) * math.sqrt(0.5))
         self.density = jnp.exp(-0.5 * x * x - _LOG_ROOT_TWO_PI)
 
-    def mills(self) -> tuple[Array, Array]:
-        """Mills' ratio R = Q(x) / phi(x), and 1 - x R, for x > 0."""
-        large = self.x > _SERIES
-        at = jnp.where(large, self.x, _SERIES)
-        # 1 / R = x + 1 / (x + 2 / (x + 3 / ...)); what follows the first x is (1 - x R) / R.
-        tail = jax.lax.fori_loop(0, _TERMS - 1, lambda i, tail: at + (_TERMS - i) / tail, at)
-        far = 1.0 / (at + 1.0 / tail)
-        near = self.tail / jnp.where(large, 1.0, self.density)
-        return jnp.where(large, far, near), jnp.where(large, far / tail, 1.0 - self.x * near)
+
+def _mills(end: _Ends) -> tuple[Array, Array]:
+    """Mills' ratio R = Q(x) / phi(x), and 1 - x R, for x > 0."""
+    large = end.x > _SERIES
+    at = jnp.where(large, end.x, _SERIES)
+    # 1 / R = x + 1 / (x + 2 / (x + 3 / ...)); what follows the first x is (1 - x R) / R.
+    tail = at
+    for term in range(_TERMS, 1, -1):
+        tail = at + term / tail
+    far = 1.0 / (at + 1.0 / tail)
+    near = end.tail / jnp.where(large, 1.0, end.density)
+    return jnp.where(large, far, near), jnp.where(large, far / tail, 1.0 - end.x * near)
 
 
 _interval = jax.jit(interval)
@@ -281,28 +296,24 @@ def _around(near: _Ends, far: _Ends, decay: Array, holds: Array) -> tuple[Array,
 def _narrow(middle: Array, width: Array) -> tuple[Array, Array, Array]:
     """The same by quadrature about the middle."""
 
-    def add(index: Array, sums: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        node, part = jnp.asarray(_NODES, middle.dtype)[index], jnp.asarray(_WEIGHTS, middle.dtype)[index]
+    total = first = second = jnp.zeros_like(middle)
+    for node, part in zip(_NODES.tolist(), _WEIGHTS.tolist(), strict=True):
         # From the near end, where the density is largest.
-        offset = 0.5 * width * (1.0 + node)
+        offset, shift = 0.5 * width * (1.0 + node), 0.5 * width * node
         density = 0.5 * part * jnp.exp(-offset * (middle - 0.5 * width + 0.5 * offset))
-        shift = 0.5 * width * node
-        return sums[0] + density, sums[1] + density * shift, sums[2] + density * shift * shift
-
-    zero = jnp.zeros_like(middle)
-    total, first, second = jax.lax.fori_loop(0, len(_NODES), add, (zero, zero, zero))
+        total, first, second = total + density, first + density * shift, second + density * shift * shift
     shift = first / total
     near = middle - 0.5 * width
     value = jnp.log(width * total) - 0.5 * near * near - _LOG_ROOT_TWO_PI
     return value, middle + shift, 1.0 - (second / total - shift * shift)
 
 
-def _beyond(near: _Ends, far: _Ends, width: Array, decay: Array, fails: Array) -> tuple[Array, Array, Array]:
-    """The same where the far end counts less; another interval stands in where that fails."""
-    near, far = _Ends(jnp.where(fails, 1.0, near.x)), _Ends(jnp.where(fails, 9.0, far.x))
-    (mills1, rest1), (mills2, rest2) = near.mills(), far.mills()
-    left = jnp.exp(-jnp.where(fails, 40.0, decay))
+def _beyond(
+    near: Array, width: Array, left: Array, first: tuple[Array, Array], second: tuple[Array, Array]
+) -> tuple[Array, Array, Array]:
+    """The same where the far end counts less: ``left`` of the density at the near one; Mills' ratios at both."""
+    (mills1, rest1), (mills2, rest2) = first, second
     mass = mills1 - mills2 * left
-    value = jnp.log(mass) - 0.5 * near.x**2 - _LOG_ROOT_TWO_PI
-    beyond = jnp.where(left > 0, jnp.minimum(width, _FAR) * (mills1 - mills2) - rest1 - rest2, 0.0)
+    value = jnp.log(mass) - 0.5 * near**2 - _LOG_ROOT_TWO_PI
+    beyond = jnp.where(left > 0, width * (mills1 - mills2) - rest1 - rest2, 0.0)
     return value, (1.0 - left) / mass, (rest1 + left * beyond + left * left * rest2) / mass**2

@@ -4,12 +4,31 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 import brdf
-from fitting.solver.maximum_likelihood import Evidence
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
+
+
+class Evidence(NamedTuple):
+    """What rounded values say, as least squares with weights would: the noise of each is 1.
+
+    Attributes:
+        pictures: the pixels that say something, with working targets and weights, in double precision.
+        optimum: most likely, with the sums of these.
+        noise: before rounding, standard deviation in codes.
+        value: logarithm of the likelihood.
+        places: of each picture the index of its pixels in the whole one, row by row, and the width of that.
+        widening: what to multiply the errors of x_a, x_d, x_s, channel after channel, and n by.
+    """
+
+    pictures: Sequence[Picture]
+    optimum: Optimum
+    noise: float
+    value: float
+    places: Sequence[tuple[Int[np.ndarray, " P"], int]]
+    widening: Float[np.ndarray, " U"]
 
 
 class ModelFit(NamedTuple):

@@ -69,15 +69,47 @@ class Picture(eqx.Module):
         lobe = None if self.lobe is None else self.lobe.on_host(pixel)
         return replace(replace(self, lobe=None).pixels(lambda a: cast(Any, np.asarray(a)[pixel])), lobe=lobe)
 
-    @eqx.filter_jit
-    def predicted(self, n: AnyArray, x: Float[AnyArray, "3 C"]) -> Float[Array, "P C"]:
-        """What the model shows, in the dtype of the target."""
-        dtype = self.target.dtype
-        x = jnp.asarray(x).astype(dtype)
-        model = x[0] * jnp.asarray(self.ambient).astype(dtype) + x[1] * self.diffuse
+    def in_double(self, pixel: Int[np.ndarray, " K"]) -> "Picture":
+        """The same picture, some of its pixels, in NumPy and double precision.
+
+        Where the lobe is made anew at each evaluation some of them are repeated, with bounds that say nothing: programs
+        are compiled for a few numbers of pixels only.
+        """
+        lobe = self.lobe
+        if lobe is None or lobe.source is None:
+            some, filled = self.on_host(pixel), 0
+        else:
+            filled = -pixel.size % (_FEW if pixel.size <= _FEW else 8 * _FEW)
+            pixel = np.append(pixel, np.zeros(filled, pixel.dtype))
+            some = self.pixels(lambda a: cast(Any, np.asarray(a)[pixel]))
+        some = jax.tree.map(lambda a: np.asarray(a, np.float64) if eqx.is_inexact_array_like(a) else a, some)
+        if filled and some.bounds is not None:
+            some.bounds.lower[-filled:], some.bounds.upper[-filled:] = -np.inf, np.inf
+        return some
+
+    def columns(self, n: float) -> Float[np.ndarray, "4 P C"]:
+        """What x_a, x_d, x_s multiply, and the derivative of the last by n, on the host.
+
+        Args:
+            n: the exponent.
+        """
+        found = np.zeros((4, *self.target.shape), np.float64)
+        found[0], found[1] = self.ambient, self.diffuse
         if self.lobe is not None:
-            model = model + x[2] * self.lobe(jnp.asarray(n))[0]
-        return jnp.broadcast_to(model, self.target.shape)
+            found[2], found[3] = self.lobe(cast(Any, n)) if self._all_on_host else _lobe(self.lobe, np.asarray(n))
+        return found
+
+    @property
+    def _all_on_host(self) -> bool:
+        return isinstance(self.target, np.ndarray) and (self.lobe is None or self.lobe.source is None)
+
+    def predicted(self, n: AnyArray, x: Float[AnyArray, "3 C"]) -> Float[AnyArray, "P C"]:
+        """What the model shows, in the dtype of the target; in NumPy where the picture is."""
+        if not self._all_on_host:
+            return _predicted(self, n, x)
+        shown = x[0] * self.ambient + x[1] * self.diffuse
+        shown = shown if self.lobe is None else shown + x[2] * self.lobe(cast(Any, n))[0]
+        return cast(Any, np.broadcast_to(shown, self.target.shape))
 
     @property
     def counts(self) -> Bool[np.ndarray, " P"]:
@@ -102,6 +134,24 @@ class Picture(eqx.Module):
             return np.ones((1, 1), self.target.dtype)
         return self.weight if self.weight.ndim == 2 else self.weight[:, None]
 
+
+@eqx.filter_jit
+def _predicted(picture: Picture, n: AnyArray, x: Float[AnyArray, "3 C"]) -> Float[Array, "P C"]:
+    dtype = picture.target.dtype
+    x = jnp.asarray(x).astype(dtype)
+    model = x[0] * jnp.asarray(picture.ambient).astype(dtype) + x[1] * picture.diffuse
+    if picture.lobe is not None:
+        model = model + x[2] * picture.lobe(jnp.asarray(n))[0]
+    return jnp.broadcast_to(model, picture.target.shape)
+
+
+@eqx.filter_jit
+def _lobe(lobe: Lobe, n: AnyArray) -> tuple[Array, Array]:
+    return lobe(jnp.asarray(n))
+
+
+# Of a lobe that is made anew at each evaluation this many pixels, or multiples of eight times as many.
+_FEW = 2048
 
 # 32768 pixels of the six or seven arrays a pass reads stay in the second-level cache.
 BLOCK = 32768

@@ -10,11 +10,10 @@ import brdf
 from brdf.channels import channel_names
 from brdf.models.base import SpecularMaterial
 from fitting.light_colour import coefficient_factors
-from fitting.model_fit import ModelFit
+from fitting.model_fit import Evidence, ModelFit
 from fitting.pixels import Observed, Tile
 from fitting.result import Parameter, free_parameters
 from fitting.solver.devices import device_count
-from fitting.solver.maximum_likelihood import Evidence
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
 from fitting.uncertainty.covariance import (

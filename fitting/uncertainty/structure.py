@@ -8,13 +8,9 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
-from fitting.likelihood import AnyArray
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
 
@@ -165,8 +161,7 @@ def errors_of(picture: Picture, optimum: Optimum, place: tuple[np.ndarray, int])
         optimum: of the fit.
         place: index of the pixels and width of the picture.
     """
-    with jax.enable_x64(True):
-        left = np.asarray(picture.target) - np.asarray(picture.predicted(np.asarray(optimum.n), optimum.x))
+    left = np.asarray(picture.target) - np.asarray(picture.predicted(np.asarray(optimum.n), optimum.x))
     weight = np.asarray(picture.weights)
     return Errors(np.where(weight > 0, left, 0.0) * np.sqrt(weight), *place)
 
@@ -191,8 +186,7 @@ def scatter(
         noise: of a file compressed with losses, in codes; None for others.
     """
     errors, weight = errors_of(picture, optimum, place), np.asarray(picture.weights)
-    with jax.enable_x64(True):
-        columns = np.asarray(_columns(picture, np.asarray(optimum.n)))
+    columns = picture.columns(optimum.n)
     root, scatters = np.sqrt(weight), []
     for size in SCATTER_SIZES:
         blocks = [errors.blocks(size)] * columns.shape[-1]
@@ -205,15 +199,6 @@ def scatter(
         shared = _joined(columns * np.where(flat > 0, root / noise, 0.0), list(flat.T), optimum)
         largest = largest + shared @ shared.T / 12.0
     return largest
-
-
-@eqx.filter_jit
-def _columns(picture: Picture, n: AnyArray) -> Float[Array, "4 P C"]:
-    """Ambient, diffuse, lobe, and its derivative by n."""
-    columns = [jnp.asarray(picture.ambient).reshape(1, -1), picture.diffuse, jnp.zeros((1, 1)), jnp.zeros((1, 1))]
-    if picture.lobe is not None:
-        columns[2:] = picture.lobe(n)
-    return jnp.stack([jnp.broadcast_to(column, picture.target.shape) for column in columns])
 
 
 def _joined(terms: np.ndarray, groups: Sequence[np.ndarray], optimum: Optimum) -> np.ndarray:

@@ -16,18 +16,20 @@ gathered for the last steps.
 import dataclasses
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
-from fitting.likelihood import AnyArray, Bounds, LogLikelihood, tabulated
+from fitting.likelihood import AnyArray, Bounds, Intervals
+from fitting.model_fit import Evidence, ModelFit
 from fitting.solver.nnls import nonnegative_minimum
 from fitting.solver.normal_equations import Picture
-from fitting.solver.profile import Optimum, refit, search
+from fitting.solver.profile import Optimum, refit
 from fitting.solver.subsample import stratified
 from fitting.solver.tied import design_of, join_channels
 
@@ -44,8 +46,8 @@ ENOUGH_KNOWN = 1.1
 # So many values have to tell of a number before the Hessian is taken for its error.
 ENOUGH_VALUES = 6.0
 SUBSAMPLE = 16384
-# Numbers of pixels that are looked at together.
-FEW = (2048, 16384)
+# By this factor the noise is made smaller at a time.
+HALF = 0.5
 # In codes: with more noise than this, and no code at an end, a linear picture says what least squares says.
 ENOUGH_NOISE = 0.5
 FIRST_NOISE = 0.3
@@ -69,26 +71,6 @@ class Estimate(NamedTuple):
     log_n: float
     noise: float
     value: float = -math.inf
-
-
-class Evidence(NamedTuple):
-    """What rounded values say, as least squares with weights would: the noise of each is 1.
-
-    Attributes:
-        pictures: the pixels that say something, with working targets and weights, in double precision.
-        optimum: most likely, with the sums of these.
-        noise: before rounding, standard deviation in codes.
-        value: logarithm of the likelihood.
-        places: of each picture the index of its pixels in the whole one, row by row, and the width of that.
-        widening: what to multiply the errors of x_a, x_d, x_s, channel after channel, and n by.
-    """
-
-    pictures: Sequence[Picture]
-    optimum: Optimum
-    noise: float
-    value: float
-    places: Sequence[tuple[Int[np.ndarray, " P"], int]]
-    widening: Float[np.ndarray, " U"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,94 +109,132 @@ class _Space(NamedTuple):
     bounds: tuple[float, float]
 
 
-def evidence(
-    pictures: Sequence[Picture],
-    optimum: Optimum,
-    free: Bool[np.ndarray, "3 C"],
-    n_range: tuple[float, float],
-    tied: Float[np.ndarray, " C"] | None,
-) -> Evidence | None:
-    """The most likely numbers, from least squares on; None where least squares is the whole answer.
+class _Pixels(NamedTuple):
+    """Some pixels of a picture, on the host in double precision.
+
+    Attributes:
+        picture: its weight is how many pixels each stands for; None for one.
+        intervals: between which codes the values lay.
+    """
+
+    picture: Picture
+    intervals: Intervals
+
+
+class _Told(NamedTuple):
+    """What each value says of a prediction: log-likelihood, score and weight by the predicted code, (P, C).
+
+    Also the radiance that is predicted, the slope of the code by it, and the columns ambient, diffuse, lobe and
+    derivative of the lobe by log n, (4, P, C).
+    """
+
+    value: Any
+    score: Any
+    weight: Any
+    radiance: Any
+    slope: Any
+    columns: Any
+
+
+def most_likely(fit: ModelFit) -> ModelFit:
+    """A fit by what rounded values and open ends say, from least squares on; as it is where they say no more.
 
     Args:
-        pictures: with bounds.
-        optimum: of least squares.
-        free: which coefficients may be above 0.
-        n_range: bounds of the exponent.
-        tied: x_s is a common factor times this, (C,); None where the channels are independent.
+        fit: by least squares.
     """
-    space = _Space(design_of(free, tied), (math.log(n_range[0]), math.log(n_range[1])))
-    at = Estimate(optimum.x, math.log(optimum.n), 1.0)
-    exact = all(picture.bounds is not None and picture.bounds.exact for picture in pictures)
+    if fit.capped or any(picture.bounds is None for picture in fit.pictures):
+        return fit
+    optimum, exact = fit.optimum, all(bounds.exact for bounds in map(_bounds, fit.pictures))
     deviation = math.sqrt(float(np.sum(optimum.cost)) / max(float(np.sum(optimum.pixels)), 1.0))
     if exact and deviation <= NO_NOISE * float(np.max(optimum.square / np.maximum(optimum.pixels, 1))) ** 0.5:
-        return None
-    with jax.enable_x64(True):
-        # Weights of least squares leave out what is clipped, which says something here.
-        pictures = [dataclasses.replace(picture, weight=None) for picture in pictures]
-        stated = [_stated(picture, optimum, 1.0, 0.0) for picture in pictures]
-        closed = sum(part.closed for part in stated)
-        at = at._replace(noise=math.sqrt(sum(part.closed_squares for part in stated) / max(closed, 1)))
-        rounding = 0.0 if exact else 1 / 12
-        widest = 1.0 if exact else max(_widest(picture) for picture in pictures)
-        if exact or at.noise**2 > (ENOUGH_NOISE**2 + rounding) * widest**2:
-            linear = all(picture.bounds is not None and picture.bounds.encoding == "linear" for picture in pictures)
-            if linear and not any(_open_ends_tell(picture, at) for picture in pictures):
-                return None
-            return _reweighted(pictures, optimum, free, n_range, tied, at.noise, rounding)
-        at = at._replace(noise=max(at.noise, FIRST_NOISE))
-        if sum(picture.target.shape[0] for picture in pictures) > 2 * SUBSAMPLE:
-            some = [_stratum(picture, SUBSAMPLE // len(pictures)) for picture in pictures]
-            at, known = maximise(some, at, space)
-            # The whole picture has the pixels near an edge that a part of it lacks.
-            at = at._replace(noise=_telling(known).noise)
-        at, known = maximise([_gathered(picture, at) for picture in pictures], at, space)
-        telling = at._replace(noise=_telling(known).noise)
-        near = [_gathered(picture, telling) for picture in pictures]
-        widening = _widening(known, _precision(near, telling, _sums(near, telling), space))
-        told = [_told(picture, telling) for picture in near]
-        working = [_working(picture, said) for picture, said in zip(near, told, strict=True)]
-        held = (math.exp(at.log_n),) * 2
-        found = search(working, n_min=held[0], n_max=held[1], free=free & (at.x.any() | ~free))
-        cost = found.square - 2 * np.einsum("ci,ic->c", found.product[:, :3], at.x)
-        cost += np.einsum("ic,cij,jc->c", at.x, found.gram[:, :3, :3], at.x)
-    found = dataclasses.replace(found, x=at.x, n=held[0], cost=cost, flat=not np.any(at.x[2] > 0))
-    return Evidence(working, found, at.noise, at.value, [_place(picture) for picture in near], widening)
+        return fit
+    # Weights of least squares leave out what is clipped, which says something here.
+    pictures = [dataclasses.replace(picture, weight=None) for picture in fit.pictures]
+    at = Estimate(optimum.x, math.log(optimum.n), 1.0)
+    squares, count = np.sum([_squares(picture, at) for picture in pictures], axis=0)
+    at = at._replace(noise=math.sqrt(squares / max(count, 1)))
+    rounding = 0.0 if exact else 1 / 12
+    widest = 1.0 if exact else max(_widest(picture) for picture in pictures)
+    if exact or at.noise**2 > (ENOUGH_NOISE**2 + rounding) * widest**2:
+        linear = all(bounds.encoding == "linear" for bounds in map(_bounds, pictures))
+        if linear and not any(_open_ends_tell(picture, at) for picture in pictures):
+            return fit
+        said = _reweighted(fit._replace(pictures=pictures), at.noise, rounding)
+    else:
+        said = _near_edges(fit._replace(pictures=pictures), at._replace(noise=max(at.noise, FIRST_NOISE)))
+    found = said.optimum
+    optimum = dataclasses.replace(optimum, x=found.x, n=found.n, flat=found.flat)
+    return fit._replace(optimum=optimum, evidence=said)
 
 
-def _reweighted(
-    pictures: Sequence[Picture],
-    optimum: Optimum,
-    free: Bool[np.ndarray, "3 C"],
-    n_range: tuple[float, float],
-    tied: Float[np.ndarray, " C"] | None,
-    noise: float,
-    rounding: float,
-) -> Evidence:
+def _near_edges(fit: ModelFit, at: Estimate) -> Evidence:
+    """Where rounding is most of the noise: what pixels near the edge of a code say."""
+    pictures, space = fit.pictures, _Space(design_of(fit.free, fit.tied), tuple(map(math.log, fit.n_range)))
+    if sum(picture.target.shape[0] for picture in pictures) > 2 * SUBSAMPLE:
+        at, known = maximise([_stratum(picture, SUBSAMPLE // len(pictures)) for picture in pictures], at, space)
+        # The whole picture has the pixels near an edge that a part of it lacks.
+        at = at._replace(noise=_telling(known).noise)
+    at, known = maximise([_gathered(picture, at) for picture in pictures], at, space)
+    telling = at._replace(noise=_telling(known).noise)
+    near = [_gathered(picture, telling) for picture in pictures]
+    told = [_told(pixels, telling) for pixels in near]
+    sums = _sums(near, telling, told)
+    widening = _widening(known, _precision(near, telling, sums, space, told))
+    working = [_working(pixels.picture, said) for pixels, said in zip(near, told, strict=True)]
+    optimum = _optimum(working, sums, fit, at)
+    return Evidence(working, optimum, at.noise, at.value, [_place(part.picture) for part in near], widening)
+
+
+def _optimum(working: Sequence[Picture], sums: _Sums, fit: ModelFit, at: Estimate) -> Optimum:
+    """The optimum of the least squares that takes Newton's step, at which it rests."""
+    scale, steps = np.ones(4), np.zeros(at.x.shape[1])
+    # By n, not by its logarithm.
+    scale[3] = math.exp(-at.log_n)
+    if not fit.free[2].any():
+        scale[2:] = 0.0
+    gram, score = sums.weight * scale[:, None] * scale, sums.score * scale
+    product = score + np.einsum("cij,jc->ci", gram[..., :3], at.x)
+    square, count = np.zeros_like(steps), np.zeros_like(steps)
+    for picture in working:
+        weight = np.asarray(picture.weights)
+        left = np.asarray(picture.target) - picture.predicted(np.exp(at.log_n), at.x)
+        steps += np.sum(weight * left**2, axis=0)
+        square += np.sum(weight * np.asarray(picture.target) ** 2, axis=0)
+        count += np.count_nonzero(weight, axis=0)
+    flat = not np.any(at.x[2] > 0)
+    return dataclasses.replace(
+        fit.optimum,
+        **{"n": math.exp(at.log_n), "x": at.x, "cost": steps, "pixels": count, "gram": gram, "product": product},
+        square=square,
+        flat=flat,
+    )
+
+
+def _reweighted(fit: ModelFit, noise: float, rounding: float) -> Evidence:
     """Where rounding is little beside the noise: least squares in codes, and what an open end says in a value's place.
 
     Args:
-        pictures: with bounds.
-        optimum: of least squares in radiance.
-        free: which coefficients may be above 0.
-        n_range: bounds of the exponent.
-        tied: x_s is a common factor times this.
+        fit: by least squares in radiance.
         noise: standard deviation of the residual in codes.
         rounding: what its variance owes to rounding.
     """
-    stated = [_stated(picture, optimum, noise, rounding) for picture in pictures]
-    for _ in range(MOST_ROUNDS):
-        before, optimum = optimum, refit([part.picture for part in stated], optimum, free, n_range, tied)
-        last, stated = noise, [_stated(picture, optimum, noise, rounding) for picture in pictures]
-        noise = math.sqrt(sum(part.squares for part in stated) / max(sum(part.count for part in stated), 1))
-        if _change(before, optimum) < ENOUGH_CHANGE and abs(noise / last - 1) < ENOUGH_CHANGE:
-            break
+    pictures, optimum = fit.pictures, fit.optimum
+    with jax.enable_x64(True):
+        stated = [_stated(picture, optimum, noise, rounding) for picture in pictures]
+        for _ in range(MOST_ROUNDS):
+            working = [part.picture for part in stated]
+            before, optimum = optimum, refit(working, optimum, fit.free, fit.n_range, fit.tied)
+            last, stated = noise, [_stated(picture, optimum, noise, rounding) for picture in pictures]
+            noise = math.sqrt(sum(part.squares for part in stated) / max(sum(part.count for part in stated), 1))
+            if _change(before, optimum) < ENOUGH_CHANGE and abs(noise / last - 1) < ENOUGH_CHANGE:
+                break
     scale = 1 / noise**2
     working = [dataclasses.replace(part.picture, weight=part.picture.weights * scale) for part in stated]
     sums = {name: getattr(optimum, name) * scale for name in ("cost", "gram", "product", "square")}
     value = sum(part.value - part.closed * math.log(noise) - part.closed_squares * scale / 2 for part in stated)
-    places = [_place(picture) for picture in pictures]
-    return Evidence(working, dataclasses.replace(optimum, **sums), noise, value, places, np.ones(3 * free.shape[1] + 1))
+    widening = np.ones(3 * fit.free.shape[1] + 1)
+    optimum = dataclasses.replace(optimum, **sums)
+    return Evidence(working, optimum, noise, value, [_place(picture) for picture in pictures], widening)
 
 
 def _change(before: Optimum, after: Optimum) -> float:
@@ -247,20 +267,18 @@ class _Stated:
 
 
 def _stated(picture: Picture, optimum: Optimum, noise: float, rounding: float) -> _Stated:
-    bounds = picture.bounds
-    assert bounds is not None
+    bounds = _bounds(picture)
     made = jax.device_get(_linearised(picture, np.asarray(optimum.n), optimum.x))
     target, weight = np.array(made[0]), np.array(made[1])
     squares, closed = float(made[2]), int(made[3])
     plain, value, count = squares, 0.0, closed
-    half = np.isfinite(np.asarray(bounds.lower)) ^ np.isfinite(np.asarray(bounds.upper))
+    half = np.isfinite(bounds.lower) ^ np.isfinite(bounds.upper)
     index = np.flatnonzero(half.any(axis=1))
     if index.size:
         s = math.sqrt(max(noise**2 - rounding, LEAST_NOISE**2))
-        some = _some(dataclasses.replace(picture, bounds=dataclasses.replace(bounds, exact=False)), index)
-        told = _told(some, Estimate(optimum.x, math.log(optimum.n), s))
+        told = _told(_some(picture, index), Estimate(optimum.x, math.log(optimum.n), s))
         told = _Told(*(part[..., : index.size, :] for part in told))
-        at_end, own = half[index], s * np.asarray(bounds.spread)[index if bounds.spread.ndim else ...]
+        at_end, own = half[index], s * bounds.spread[index if bounds.spread.ndim else ...]
         curvature = told.weight * told.slope**2
         step = np.divide(told.score * told.slope, curvature, out=np.zeros_like(curvature), where=curvature > 0)
         target[index] = np.where(at_end, told.radiance + step, target[index])
@@ -276,9 +294,7 @@ def _stated(picture: Picture, optimum: Optimum, noise: float, rounding: float) -
 @eqx.filter_jit
 def _linearised(picture: Picture, n: AnyArray, x: AnyArray) -> tuple[Array, Array, Array, Array]:
     """Working targets and weights of values with both ends, squares of their residuals in codes, their count."""
-    bounds = picture.bounds
-    assert bounds is not None
-    dtype = picture.target.dtype
+    bounds, dtype = _bounds(picture), picture.target.dtype
     radiance = picture.predicted(n, x)
     code, slope = bounds.codes(radiance)
     closed = jnp.isfinite(bounds.lower) & jnp.isfinite(bounds.upper)
@@ -291,8 +307,8 @@ def _linearised(picture: Picture, n: AnyArray, x: AnyArray) -> tuple[Array, Arra
 
 def _place(picture: Picture) -> tuple[np.ndarray, int]:
     """Index of the pixels in their picture, and its width."""
-    assert picture.bounds is not None
-    return np.asarray(picture.bounds.index), int(picture.bounds.width)
+    bounds = _bounds(picture)
+    return np.asarray(bounds.index), int(bounds.width)
 
 
 def _telling(known: Sequence[Precision]) -> Precision:
@@ -314,27 +330,27 @@ def _widening(known: Sequence[Precision], most: Precision) -> Float[np.ndarray, 
     return np.sqrt(ratio)
 
 
-def maximise(pictures: Sequence[Picture], start: Estimate, space: _Space) -> tuple[Estimate, list[Precision]]:
+def maximise(pixels: Sequence[_Pixels], start: Estimate, space: _Space) -> tuple[Estimate, list[Precision]]:
     """The most likely coefficients, exponent and noise; and what was known of them on the way.
 
     Args:
-        pictures: with bounds.
+        pixels: of each picture.
         start: whose noise is where the halving starts.
         space: where to look.
     """
-    at, now = _climb(pictures, start, space)
-    above, below, known = None, None, [_precision(pictures, at, now, space)]
+    at, now = _climb(pixels, start, space)
+    above, below, known = None, None, [_precision(pixels, at, now, space)]
     # Less noise makes it likelier: halve.
     while now.by_log_noise < 0 and at.noise > LEAST_NOISE:
         above = at, now
-        pictures = [_gathered(picture, at) for picture in pictures]
-        at, now = _climb(pictures, at._replace(noise=max(at.noise / 2, LEAST_NOISE)), space)
-        known.append(_precision(pictures, at, now, space))
+        pixels = [_nearer(part, at) for part in pixels]
+        at, now = _climb(pixels, at._replace(noise=max(at.noise * HALF, LEAST_NOISE)), space)
+        known.append(_precision(pixels, at, now, space))
     if now.by_log_noise <= 0:
         return at, known
     below = at, now
     while above is None:
-        trial, sums = _climb(pictures, at._replace(noise=at.noise * 2), space)
+        trial, sums = _climb(pixels, at._replace(noise=at.noise * 2), space)
         if sums.by_log_noise < 0:
             above = trial, sums
         else:
@@ -346,12 +362,14 @@ def maximise(pictures: Sequence[Picture], start: Estimate, space: _Space) -> tup
         noise = below[0].noise * (above[0].noise / below[0].noise) ** share
         if max(noise, at.noise) < ENOUGH_KNOWN * min(noise, at.noise):
             break
-        at, now = _climb(pictures, below[0]._replace(noise=noise), space)
+        at, now = _climb(pixels, below[0]._replace(noise=noise), space)
         below, above = ((at, now), above) if now.by_log_noise > 0 else (below, (at, now))
-    return at, [*(entry for entry in known if entry.noise > at.noise), _precision(pictures, at, now, space)]
+    return at, [*(entry for entry in known if entry.noise > at.noise), _precision(pixels, at, now, space)]
 
 
-def _precision(pictures: Sequence[Picture], at: Estimate, now: _Sums, space: _Space) -> Precision:
+def _precision(
+    pixels: Sequence[_Pixels], at: Estimate, now: _Sums, space: _Space, told: Sequence[_Told] | None = None
+) -> Precision:
     """Variance of each unknown at some noise, and how many values tell of it."""
     channels = at.x.shape[1]
     whole = join_channels(now.weight, now.score, np.zeros(channels), at.x[2], np.ones(channels)).gram
@@ -366,25 +384,24 @@ def _precision(pictures: Sequence[Picture], at: Estimate, now: _Sums, space: _Sp
     root = moved @ (vector / np.sqrt(value) / scale[:, None])
     influence, information = root @ root.T, float(np.sum(np.log(value)) + 2 * np.sum(np.log(scale)))
     total, squares = np.zeros(len(whole)), np.zeros(len(whole))
-    for picture in pictures:
-        told = _told(picture, at)
-        weight = told.weight * told.slope**2
+    for said in told or map(partial(_told, at=at), pixels):
+        weight = said.weight * said.slope**2
         for channel in range(channels):
             rows = influence[[channel, channels + channel, 2 * channels + channel, -1]]
             rows = rows * np.array([1.0, 1.0, 1.0, at.x[2, channel]])[:, None]
-            share = weight[:, channel] * np.square(rows.T @ told.columns[..., channel])  # (U, P)
+            share = weight[:, channel] * np.square(rows.T @ said.columns[..., channel])  # (U, P)
             total, squares = total + share.sum(axis=1), squares + np.square(share).sum(axis=1)
     count = np.divide(total**2, squares, out=np.zeros_like(total), where=squares > 0)
     return Precision(at.noise, information, np.diag(influence), count)
 
 
-def _climb(pictures: Sequence[Picture], at: Estimate, space: _Space) -> tuple[Estimate, _Sums]:
+def _climb(pixels: Sequence[_Pixels], at: Estimate, space: _Space) -> tuple[Estimate, _Sums]:
     """Newton's method at a given noise."""
     design, channels = space.design, at.x.shape[1]
     signed = np.zeros(design.shape[1], bool)
     lobe = bool(design[-1].any())
     signed[-1:] = lobe
-    now = _sums(pictures, at)
+    now = _sums(pixels, at)
     for _ in range(MOST_STEPS):
         normal = join_channels(now.weight, now.score, np.zeros(channels), at.x[2], np.ones(channels))
         unknowns = np.append(at.x.ravel(), 0.0)
@@ -401,7 +418,7 @@ def _climb(pictures: Sequence[Picture], at: Estimate, space: _Space) -> tuple[Es
             x = np.maximum(unknowns[:-1] + share * step[:-1], 0.0).reshape(3, channels)
             shift = float(np.clip(share * step[-1], -LARGEST_SHIFT, LARGEST_SHIFT))
             trial = at._replace(x=x, log_n=float(np.clip(at.log_n + shift, *space.bounds)) if lobe else at.log_n)
-            sums = _sums(pictures, trial)
+            sums = _sums(pixels, trial)
             gain = float(sums.value - now.value)
             if gain > 0:
                 at, now = trial, sums
@@ -411,19 +428,18 @@ def _climb(pictures: Sequence[Picture], at: Estimate, space: _Space) -> tuple[Es
     return at._replace(value=float(now.value)), now
 
 
-def _sums(pictures: Sequence[Picture], at: Estimate) -> _Sums:
+def _sums(pixels: Sequence[_Pixels], at: Estimate, told: Sequence[_Told] | None = None) -> _Sums:
     """What Newton's step needs, added up over the pictures."""
     parts = []
-    for picture in pictures:
-        said, bounds = _told(picture, at), picture.bounds
-        assert bounds is not None
-        weight = np.ones((1, 1)) if picture.weight is None else np.asarray(picture.weights)
+    for part, said in zip(pixels, told or map(partial(_told, at=at), pixels), strict=True):
+        own = at.noise * np.asarray(_bounds(part.picture).spread)
+        weight = part.picture.weights
         score, curvature = weight * said.score * said.slope, weight * said.weight * said.slope**2
         columns = np.moveaxis(said.columns, -1, 0)  # (C, 4, P)
         parts.append(
             (
                 float(np.sum(weight * said.value)),
-                float(np.sum(weight * (said.score**2 - said.weight) * (at.noise * np.asarray(bounds.spread)) ** 2)),
+                float(np.sum(weight * (said.score**2 - said.weight) * own**2)),
                 (columns @ score.T[..., None])[..., 0],
                 (columns * curvature.T[:, None]) @ np.swapaxes(columns, 1, 2),
             )
@@ -431,121 +447,80 @@ def _sums(pictures: Sequence[Picture], at: Estimate) -> _Sums:
     return _Sums(*(sum(part) for part in zip(*parts, strict=True)))
 
 
-def _in_double(picture: Picture) -> Picture:
-    numbers, rest = eqx.partition(picture, eqx.is_inexact_array_like)
-    return eqx.combine(jax.tree.map(lambda leaf: jnp.asarray(leaf, np.float64), numbers), rest)
-
-
-def _gathered(picture: Picture, at: Estimate) -> Picture:
+def _gathered(picture: Picture, at: Estimate) -> _Pixels:
     """The pixels that say something: those not surely inside their bounds."""
-    assert picture.bounds is not None
-    index = np.flatnonzero(np.any(_inside(picture, at) < REACH, axis=1))
-    if _length(index.size) >= picture.target.shape[0] and picture.target.dtype == np.float64:
-        return picture
-    return _some(picture, index)
+    return _some(picture, np.flatnonzero(np.any(_inside(picture, at) < REACH, axis=1)))
 
 
-def _stratum(picture: Picture, size: int) -> Picture:
+def _nearer(pixels: _Pixels, at: Estimate) -> _Pixels:
+    """Those of some that say something at less noise."""
+    near = np.any(_inside(pixels.picture, at) < REACH, axis=1)
+    return pixels if near.all() else _some(pixels.picture, np.flatnonzero(near))
+
+
+def _stratum(picture: Picture, size: int) -> _Pixels:
     """Some of the pixels, weighted by how many each stands for."""
     count = picture.target.shape[0]
     if count <= size:
-        return _in_double(picture)
+        return _some(picture, np.arange(count))
     nearness = np.zeros(count) if picture.lobe is None else -np.asarray(picture.lobe.peak)
     index, factor = stratified(nearness, np.ones(count, bool), size)
     some = _some(picture, index)
-    weight = np.zeros(some.target.shape[0])
+    weight = np.zeros(some.picture.target.shape[0])
     weight[: index.size] = factor
-    return dataclasses.replace(some, weight=jnp.asarray(weight))
+    return some._replace(picture=dataclasses.replace(some.picture, weight=weight))
 
 
-def _length(count: int) -> int:
-    """A few lengths, hence a few compilations."""
-    return next((few for few in FEW if count <= few), -(-count // FEW[-1]) * FEW[-1])
+def _some(picture: Picture, index: np.ndarray) -> _Pixels:
+    """Some of the pixels."""
+    some = picture.in_double(index)
+    bounds = _bounds(some)
+    return _Pixels(some, Intervals(bounds.lower, bounds.upper, bounds.spread))
 
 
-def _some(picture: Picture, index: np.ndarray) -> Picture:
-    """Some of the pixels, in double precision; what fills up may have lain anywhere."""
-    filled = np.arange(_length(index.size))[:, None] >= index.size
-    padded = np.concatenate([index, np.zeros(filled.size - index.size, index.dtype)])
-    some = _in_double(picture.pixels(lambda values: jnp.asarray(np.take(np.asarray(values), padded, axis=0))))
-    assert some.bounds is not None
-    lower, upper = np.where(filled, -np.inf, some.bounds.lower), np.where(filled, np.inf, some.bounds.upper)
-    bounds = dataclasses.replace(some.bounds, lower=jnp.asarray(lower), upper=jnp.asarray(upper))
-    return dataclasses.replace(some, bounds=bounds)
+def _told(pixels: _Pixels, at: Estimate) -> _Told:
+    columns = pixels.picture.columns(math.exp(at.log_n))
+    columns[3] *= math.exp(at.log_n)
+    radiance = columns[0] * at.x[0] + columns[1] * at.x[1] + columns[2] * at.x[2]
+    code, slope = _bounds(pixels.picture).codes(radiance)
+    return _Told(*pixels.intervals.said(code, at.noise), radiance, slope, columns)
 
 
-class _Told(NamedTuple):
-    """What each value says of a prediction: log-likelihood, score and weight by the predicted code, (P, C).
-
-    Also the radiance that is predicted, the slope of the code by it, and the columns ambient, diffuse, lobe and
-    derivative of the lobe by log n, (4, P, C).
-    """
-
-    value: Any
-    score: Any
-    weight: Any
-    radiance: Any
-    slope: Any
-    columns: Any
-
-
-def _told(picture: Picture, at: Estimate) -> _Told:
-    bounds = picture.bounds
-    assert bounds is not None
-    code, *rest = jax.device_get(_predictions(picture, at.x, np.asarray(at.log_n)))
-    said = None
-    if not bounds.spread.ndim:
-        noise = at.noise * float(bounds.spread)
-        said = tabulated(np.asarray(bounds.lower), np.asarray(bounds.upper), code, noise)
-    return _Told(*(said or jax.device_get(_said(bounds, code, np.asarray(at.noise)))), *rest)
-
-
-@eqx.filter_jit
-def _said(bounds: Bounds, code: AnyArray, noise: AnyArray) -> LogLikelihood:
-    return bounds.said(jnp.asarray(code), jnp.asarray(noise))
-
-
-@eqx.filter_jit
-def _predictions(picture: Picture, x: AnyArray, log_n: AnyArray) -> tuple[Array, Array, Array, Array]:
-    """Codes, radiance, slope of the code by it, and columns."""
+def _bounds(picture: Picture) -> Bounds:
     assert picture.bounds is not None
-    shape = picture.target.shape
-    columns = [jnp.asarray(picture.ambient).reshape(1, -1), picture.diffuse, jnp.zeros((1, 1)), jnp.zeros((1, 1))]
-    if picture.lobe is not None:
-        value, by_n = picture.lobe(jnp.exp(log_n))
-        columns[2:] = value, by_n * jnp.exp(log_n)
-    columns = jnp.stack([jnp.broadcast_to(column, shape).astype(jnp.float64) for column in columns])
-    radiance = columns[0] * x[0] + columns[1] * x[1] + columns[2] * x[2]
-    code, slope = picture.bounds.codes(radiance)
-    return code, radiance, slope, columns
+    return picture.bounds
 
 
-@eqx.filter_jit
-def _codes(picture: Picture, x: AnyArray, log_n: AnyArray) -> Array:
-    """What is predicted, in codes."""
-    assert picture.bounds is not None
-    return picture.bounds.codes(picture.predicted(jnp.exp(log_n), x).astype(jnp.float64))[0]
+def _codes(picture: Picture, at: Estimate) -> np.ndarray:
+    """What is predicted, in codes, (P, C)."""
+    radiance = np.asarray(picture.predicted(np.exp(at.log_n), at.x), np.float64)
+    return _bounds(picture).codes(radiance)[0]
+
+
+def _squares(picture: Picture, at: Estimate) -> tuple[float, int]:
+    """Of the residual in codes, summed over values with both ends, and their number."""
+    bounds = _bounds(picture)
+    closed = np.isfinite(bounds.lower) & np.isfinite(bounds.upper)
+    middle = 0.5 * np.add(bounds.lower, bounds.upper, out=np.zeros(closed.shape), where=closed)
+    left = np.where(closed, middle - _codes(picture, at), 0.0) / bounds.spread
+    return float(np.sum(left**2)), int(np.count_nonzero(closed))
 
 
 def _inside(picture: Picture, at: Estimate) -> np.ndarray:
     """How far inside its bounds each prediction is, in standard deviations of the noise, (P, C)."""
-    assert picture.bounds is not None
-    code = np.asarray(_codes(picture, at.x, np.asarray(at.log_n)))
-    inside = np.minimum(code - np.asarray(picture.bounds.lower), np.asarray(picture.bounds.upper) - code)
-    return inside / (at.noise * np.asarray(picture.bounds.spread))
+    bounds, code = _bounds(picture), _codes(picture, at)
+    return np.minimum(code - bounds.lower, bounds.upper - code) / (at.noise * bounds.spread)
 
 
 def _widest(picture: Picture) -> float:
     """The largest distance of two ends: of floats that grows with brightness."""
-    assert picture.bounds is not None
-    width = np.asarray(picture.bounds.upper) - np.asarray(picture.bounds.lower)
+    width = _bounds(picture).upper - _bounds(picture).lower
     return float(np.max(width, where=np.isfinite(width), initial=0.0))
 
 
 def _open_ends_tell(picture: Picture, at: Estimate) -> bool:
     """Whether some value is known by one end only and is predicted near it."""
-    assert picture.bounds is not None
-    half = np.isfinite(np.asarray(picture.bounds.lower)) ^ np.isfinite(np.asarray(picture.bounds.upper))
+    half = np.isfinite(_bounds(picture).lower) ^ np.isfinite(_bounds(picture).upper)
     return bool(half.any()) and bool(np.any(_inside(picture, at)[half] < END_REACH))
 
 
@@ -560,14 +535,12 @@ def unexplained(picture: Picture, x: np.ndarray, n: float) -> np.ndarray:
     if picture.bounds is None:
         left = np.asarray(picture.target) - np.asarray(picture.predicted(np.asarray(n), x))
         return np.where(np.asarray(picture.weights) > 0, left, 0.0) * np.sqrt(np.asarray(picture.weights))
-    code = np.asarray(_codes(picture, x, np.asarray(np.log(n))))
-    lower, upper = np.asarray(picture.bounds.lower), np.asarray(picture.bounds.upper)
-    return np.maximum(lower - code, 0.0) - np.maximum(code - upper, 0.0)
+    code = _codes(picture, Estimate(x, math.log(n), 1.0))
+    return np.maximum(picture.bounds.lower - code, 0.0) - np.maximum(code - picture.bounds.upper, 0.0)
 
 
 def _working(picture: Picture, said: _Told) -> Picture:
     """Targets and weights with which least squares takes Newton's step."""
     weight = said.weight * said.slope**2
     step = np.divide(said.score * said.slope, weight, out=np.zeros_like(weight), where=weight > 0)
-    target = jnp.asarray(said.radiance + step)
-    return dataclasses.replace(picture, target=target, weight=jnp.asarray(weight), bounds=None)
+    return dataclasses.replace(picture, target=said.radiance + step, weight=weight, bounds=None)
