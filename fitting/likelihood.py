@@ -295,7 +295,6 @@ def _around(near: _Ends, far: _Ends, decay: Array, holds: Array) -> tuple[Array,
 
 def _narrow(middle: Array, width: Array) -> tuple[Array, Array, Array]:
     """The same by quadrature about the middle."""
-
     total = first = second = jnp.zeros_like(middle)
     for node, part in zip(_NODES.tolist(), _WEIGHTS.tolist(), strict=True):
         # From the near end, where the density is largest.

@@ -16,7 +16,6 @@ gathered for the last steps.
 import dataclasses
 import math
 from collections.abc import Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -37,6 +36,8 @@ from fitting.solver.tied import design_of, join_channels
 LEAST_NOISE = 1e-4
 # A pixel says nothing where its code is as good as certain: this many s from the nearer edge.
 REACH = 7.0
+# One that has come nearer than this on the way is taken in.
+NEARER = 5.0
 # Newton's steps at one s; a step that gains less ends them.
 MOST_STEPS, LEAST_GAIN = 12, 1e-3
 # The largest change of log n in one step.
@@ -46,13 +47,12 @@ ENOUGH_KNOWN = 1.1
 # So many values have to tell of a number before the Hessian is taken for its error.
 ENOUGH_VALUES = 6.0
 SUBSAMPLE = 16384
-# By this factor the noise is made smaller at a time.
-HALF = 0.5
 # In codes: with more noise than this, and no code at an end, a linear picture says what least squares says.
 ENOUGH_NOISE = 0.5
 FIRST_NOISE = 0.3
-# Rounds of least squares in codes; a change below this many standard errors ends them.
-MOST_ROUNDS, ENOUGH_CHANGE = 10, 0.02
+# Rounds of least squares in codes; each leaves some hundredth of its change. What ends them: such a change, in standard
+# errors, and this one of the noise.
+MOST_ROUNDS, ENOUGH_CHANGE, ENOUGH_NOISE_CHANGE = 10, 2.0, 0.02
 # An open end tells where a value is predicted within so many s of it; noise below this share of the picture is none.
 END_REACH, NO_NOISE = 4.0, 1e-5
 
@@ -95,6 +95,7 @@ class _Sums(NamedTuple):
     by_log_noise: Any
     score: Any
     weight: Any
+    told: Sequence["_Told"]
 
 
 class _Space(NamedTuple):
@@ -119,6 +120,10 @@ class _Pixels(NamedTuple):
 
     picture: Picture
     intervals: Intervals
+
+    def some(self, index: np.ndarray) -> "_Pixels":
+        """Some of them, or themselves where these are all."""
+        return self if index.size == self.picture.target.shape[0] else _some(self.picture, index)
 
 
 class _Told(NamedTuple):
@@ -174,13 +179,13 @@ def _near_edges(fit: ModelFit, at: Estimate) -> Evidence:
         at, known = maximise([_stratum(picture, SUBSAMPLE // len(pictures)) for picture in pictures], at, space)
         # The whole picture has the pixels near an edge that a part of it lacks.
         at = at._replace(noise=_telling(known).noise)
-    at, known = maximise([_gathered(picture, at) for picture in pictures], at, space)
+    gathered = [_some(picture, _near(picture, at)) for picture in pictures]
+    at, known = maximise(gathered, at, space)
     telling = at._replace(noise=_telling(known).noise)
-    near = [_gathered(picture, telling) for picture in pictures]
-    told = [_told(pixels, telling) for pixels in near]
-    sums = _sums(near, telling, told)
-    widening = _widening(known, _precision(near, telling, sums, space, told))
-    working = [_working(pixels.picture, said) for pixels, said in zip(near, told, strict=True)]
+    near = [part.some(_near(part.picture, telling)) for part in gathered]
+    sums = _sums(near, telling)
+    widening = _widening(known, _precision(telling, sums, space))
+    working = [_working(pixels.picture, said) for pixels, said in zip(near, sums.told, strict=True)]
     optimum = _optimum(working, sums, fit, at)
     return Evidence(working, optimum, at.noise, at.value, [_place(part.picture) for part in near], widening)
 
@@ -226,7 +231,7 @@ def _reweighted(fit: ModelFit, noise: float, rounding: float) -> Evidence:
             before, optimum = optimum, refit(working, optimum, fit.free, fit.n_range, fit.tied)
             last, stated = noise, [_stated(picture, optimum, noise, rounding) for picture in pictures]
             noise = math.sqrt(sum(part.squares for part in stated) / max(sum(part.count for part in stated), 1))
-            if _change(before, optimum) < ENOUGH_CHANGE and abs(noise / last - 1) < ENOUGH_CHANGE:
+            if _change(before, optimum) < ENOUGH_CHANGE and abs(noise / last - 1) < ENOUGH_NOISE_CHANGE:
                 break
     scale = 1 / noise**2
     working = [dataclasses.replace(part.picture, weight=part.picture.weights * scale) for part in stated]
@@ -339,13 +344,12 @@ def maximise(pixels: Sequence[_Pixels], start: Estimate, space: _Space) -> tuple
         space: where to look.
     """
     at, now = _climb(pixels, start, space)
-    above, below, known = None, None, [_precision(pixels, at, now, space)]
+    above, known = None, [_precision(at, now, space)]
     # Less noise makes it likelier: halve.
     while now.by_log_noise < 0 and at.noise > LEAST_NOISE:
         above = at, now
-        pixels = [_nearer(part, at) for part in pixels]
-        at, now = _climb(pixels, at._replace(noise=max(at.noise * HALF, LEAST_NOISE)), space)
-        known.append(_precision(pixels, at, now, space))
+        at, now = _climb(pixels, at._replace(noise=max(at.noise / 2, LEAST_NOISE)), space)
+        known.append(_precision(at, now, space))
     if now.by_log_noise <= 0:
         return at, known
     below = at, now
@@ -364,12 +368,10 @@ def maximise(pixels: Sequence[_Pixels], start: Estimate, space: _Space) -> tuple
             break
         at, now = _climb(pixels, below[0]._replace(noise=noise), space)
         below, above = ((at, now), above) if now.by_log_noise > 0 else (below, (at, now))
-    return at, [*(entry for entry in known if entry.noise > at.noise), _precision(pixels, at, now, space)]
+    return at, [*(entry for entry in known if entry.noise > at.noise), _precision(at, now, space)]
 
 
-def _precision(
-    pixels: Sequence[_Pixels], at: Estimate, now: _Sums, space: _Space, told: Sequence[_Told] | None = None
-) -> Precision:
+def _precision(at: Estimate, now: _Sums, space: _Space) -> Precision:
     """Variance of each unknown at some noise, and how many values tell of it."""
     channels = at.x.shape[1]
     whole = join_channels(now.weight, now.score, np.zeros(channels), at.x[2], np.ones(channels)).gram
@@ -384,7 +386,7 @@ def _precision(
     root = moved @ (vector / np.sqrt(value) / scale[:, None])
     influence, information = root @ root.T, float(np.sum(np.log(value)) + 2 * np.sum(np.log(scale)))
     total, squares = np.zeros(len(whole)), np.zeros(len(whole))
-    for said in told or map(partial(_told, at=at), pixels):
+    for said in now.told:
         weight = said.weight * said.slope**2
         for channel in range(channels):
             rows = influence[[channel, channels + channel, 2 * channels + channel, -1]]
@@ -395,45 +397,54 @@ def _precision(
     return Precision(at.noise, information, np.diag(influence), count)
 
 
-def _climb(pixels: Sequence[_Pixels], at: Estimate, space: _Space) -> tuple[Estimate, _Sums]:
-    """Newton's method at a given noise."""
+def _climb(whole: Sequence[_Pixels], at: Estimate, space: _Space) -> tuple[Estimate, _Sums]:
+    """Newton's method at a given noise, with the pixels that say something there."""
     design, channels = space.design, at.x.shape[1]
     signed = np.zeros(design.shape[1], bool)
     lobe = bool(design[-1].any())
     signed[-1:] = lobe
-    now = _sums(pixels, at)
-    for _ in range(MOST_STEPS):
-        normal = join_channels(now.weight, now.score, np.zeros(channels), at.x[2], np.ones(channels))
-        unknowns = np.append(at.x.ravel(), 0.0)
-        gram = design.T @ normal.gram @ design
-        gram[np.diag_indices_from(gram)] *= 1 + 1e-9
-        product = design.T @ (normal.product + normal.gram @ unknowns)
-        step = design @ nonnegative_minimum(gram, product, signed) - unknowns
-        # What the step is going to gain.
-        if step @ (normal.product - 0.5 * normal.gram @ step) < LEAST_GAIN:
-            break
-        gain = 0.0
-        for halvings in range(12):
-            share = 0.5**halvings
-            x = np.maximum(unknowns[:-1] + share * step[:-1], 0.0).reshape(3, channels)
-            shift = float(np.clip(share * step[-1], -LARGEST_SHIFT, LARGEST_SHIFT))
-            trial = at._replace(x=x, log_n=float(np.clip(at.log_n + shift, *space.bounds)) if lobe else at.log_n)
-            sums = _sums(pixels, trial)
-            gain = float(sums.value - now.value)
-            if gain > 0:
-                at, now = trial, sums
+    kept, now = [_near(part.picture, at) for part in whole], None
+    while True:
+        if now is not None:
+            # Others may say something at the new numbers.
+            near = [np.union1d(some, _near(part.picture, at, NEARER)) for some, part in zip(kept, whole, strict=True)]
+            if all(one.size == other.size for one, other in zip(near, kept, strict=True)):
+                return at._replace(value=float(now.value)), now
+            kept = near
+        pixels = [part.some(some) for part, some in zip(whole, kept, strict=True)]
+        now = _sums(pixels, at)
+        for _ in range(MOST_STEPS):
+            normal = join_channels(now.weight, now.score, np.zeros(channels), at.x[2], np.ones(channels))
+            unknowns = np.append(at.x.ravel(), 0.0)
+            gram = design.T @ normal.gram @ design
+            gram[np.diag_indices_from(gram)] *= 1 + 1e-9
+            product = design.T @ (normal.product + normal.gram @ unknowns)
+            step = design @ nonnegative_minimum(gram, product, signed) - unknowns
+            # What the step is going to gain.
+            if step @ (normal.product - 0.5 * normal.gram @ step) < LEAST_GAIN:
                 break
-        if gain < LEAST_GAIN:
-            break
-    return at._replace(value=float(now.value)), now
+            gain = 0.0
+            for halvings in range(12):
+                share = 0.5**halvings
+                x = np.maximum(unknowns[:-1] + share * step[:-1], 0.0).reshape(3, channels)
+                shift = float(np.clip(share * step[-1], -LARGEST_SHIFT, LARGEST_SHIFT))
+                trial = at._replace(x=x, log_n=float(np.clip(at.log_n + shift, *space.bounds)) if lobe else at.log_n)
+                sums = _sums(pixels, trial)
+                gain = float(sums.value - now.value)
+                if gain > 0:
+                    at, now = trial, sums
+                    break
+            if gain < LEAST_GAIN:
+                break
 
 
-def _sums(pixels: Sequence[_Pixels], at: Estimate, told: Sequence[_Told] | None = None) -> _Sums:
+def _sums(pixels: Sequence[_Pixels], at: Estimate) -> _Sums:
     """What Newton's step needs, added up over the pictures."""
-    parts = []
-    for part, said in zip(pixels, told or map(partial(_told, at=at), pixels), strict=True):
-        own = at.noise * np.asarray(_bounds(part.picture).spread)
-        weight = part.picture.weights
+    parts, told = [], []
+    for part in pixels:
+        said, weight = _told(part, at), part.picture.weights
+        told.append(said)
+        own = at.noise * _bounds(part.picture).spread
         score, curvature = weight * said.score * said.slope, weight * said.weight * said.slope**2
         columns = np.moveaxis(said.columns, -1, 0)  # (C, 4, P)
         parts.append(
@@ -444,18 +455,12 @@ def _sums(pixels: Sequence[_Pixels], at: Estimate, told: Sequence[_Told] | None 
                 (columns * curvature.T[:, None]) @ np.swapaxes(columns, 1, 2),
             )
         )
-    return _Sums(*(sum(part) for part in zip(*parts, strict=True)))
+    return _Sums(*(sum(part) for part in zip(*parts, strict=True)), told)
 
 
-def _gathered(picture: Picture, at: Estimate) -> _Pixels:
-    """The pixels that say something: those not surely inside their bounds."""
-    return _some(picture, np.flatnonzero(np.any(_inside(picture, at) < REACH, axis=1)))
-
-
-def _nearer(pixels: _Pixels, at: Estimate) -> _Pixels:
-    """Those of some that say something at less noise."""
-    near = np.any(_inside(pixels.picture, at) < REACH, axis=1)
-    return pixels if near.all() else _some(pixels.picture, np.flatnonzero(near))
+def _near(picture: Picture, at: Estimate, reach: float = REACH) -> np.ndarray:
+    """Which pixels say something: those not surely inside their bounds."""
+    return np.flatnonzero(np.any(_inside(picture, at) < reach, axis=1))
 
 
 def _stratum(picture: Picture, size: int) -> _Pixels:
