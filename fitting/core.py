@@ -237,7 +237,7 @@ def _inflation(fit: ModelFit, seen: Observed) -> float:
     """By what factor errors are too small where neighbours err together: the largest of any number."""
     said = fit.evidence
     assert said is not None
-    scatter = shared_errors(said, seen.tiles)
+    scatter, _ = shared_errors(said, seen.tiles)
     if scatter is None:
         return 1.0
     optimum = said.optimum

@@ -31,7 +31,7 @@ from fitting.uncertainty.noise_model import weighted_sums
 from fitting.uncertainty.residual_correlation import ResidualCorrelation, residual_correlation
 from fitting.uncertainty.structure import Structure, errors_of, of_blocks, scatter, structure
 
-# With less noise than this, in codes, few pixels of a block say something, and these by turns.
+# With less noise than this, in codes, rounding hides more than errs together.
 ROUNDED = 0.25
 # An interval of n wider than this factor says nothing but its order of magnitude.
 WIDEST_INTERVAL = 100.0
@@ -93,8 +93,9 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> Interpretation
         # Each working target has the noise 1; what least squares leaves is rounding, which goes together.
         said, known = fit.evidence, known._replace(significant=False, noise=None)
         fit, optimum, deviation = fit._replace(pictures=said.pictures, optimum=said.optimum), said.optimum, noise**0
-        shared = shared_errors(said, seen.tiles)
-        together = None if said.noise < ROUNDED else _structure_of(said, seen.tiles)
+        shared, together = shared_errors(said, seen.tiles)
+        # What errs together by less than codes tell apart is in the errors, and no more need be said.
+        together = None if said.noise < ROUNDED else together
         widening = said.widening
     else:
         together = _structure(pictures, seen, optimum, noise, rounding, even=known.noise is None)
@@ -142,8 +143,8 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> Interpretation
     return Interpretation(material, parameters, noise, known.correlation, pixels, correlation, tuple(warnings))
 
 
-def shared_errors(said: Evidence, tiles: Sequence[Tile]) -> Float[np.ndarray, "U U"] | None:
-    """What takes the place of the Hessian where neighbours share errors; None where they do not.
+def shared_errors(said: Evidence, tiles: Sequence[Tile]) -> tuple[Float[np.ndarray, "U U"] | None, Structure]:
+    """What takes the place of the Hessian where neighbours share errors, None where they do not; and how much they do.
 
     They do in a file that was compressed with losses, or where the residual shows it.
 
@@ -151,27 +152,23 @@ def shared_errors(said: Evidence, tiles: Sequence[Tile]) -> Float[np.ndarray, "U
         said: of a fit.
         tiles: of which its pictures were made.
     """
-    lossy = _lossy(tiles)
-    if not lossy and (said.noise < ROUNDED or not _structure_of(said, tiles).significant):
-        return None
-    return np.sum(
-        [
-            scatter(picture, np.asarray(tile.target)[place[0]], said.optimum, place, said.noise if lossy else None)
-            for picture, tile, place in zip(said.pictures, tiles, said.places, strict=True)
-        ],
-        axis=0,
-    )
-
-
-def _lossy(tiles: Sequence[Tile]) -> bool:
-    return any(tile.bounds is not None and tile.bounds.lossy for tile in tiles)
-
-
-def _structure_of(said: Evidence, tiles: Sequence[Tile]) -> Structure:
-    """In a file that was compressed with losses the pixels of a block err together in any case."""
-    parts = zip(said.pictures, said.places, strict=True)
-    errors = [errors_of(picture, said.optimum, place) for picture, place in parts]
-    return structure(list(map(of_blocks, errors)), (2, 4)) if _lossy(tiles) else structure(errors)
+    lossy = any(tile.bounds is not None and tile.bounds.lossy for tile in tiles)
+    errors = [
+        errors_of(picture, said.optimum, place) for picture, place in zip(said.pictures, said.places, strict=True)
+    ]
+    if lossy:
+        # The pixels of a block err together in any case.
+        together = structure(list(map(of_blocks, errors)), (2, 4))
+    else:
+        # With little noise few pixels of a block say much.
+        together = structure(errors, even=said.noise >= ROUNDED)
+    if not (lossy or together.significant):
+        return None, together
+    parts = [
+        scatter(picture, np.asarray(tile.target)[one.pixel], said.optimum, one, said.noise if lossy else None)
+        for picture, tile, one in zip(said.pictures, tiles, errors, strict=True)
+    ]
+    return np.sum(parts, axis=0), together
 
 
 def _structure(
@@ -194,8 +191,10 @@ def _structure(
 
 
 def _scattered(pictures: Sequence[Picture], seen: Observed, optimum: Optimum) -> Float[np.ndarray, "U U"]:
-    parts = zip(pictures, seen.tiles, strict=True)
-    found = [scatter(picture, np.asarray(tile.target), optimum, _whole(tile), None) for picture, tile in parts]
+    found = [
+        scatter(picture, np.asarray(tile.target), optimum, errors_of(picture, optimum, _whole(tile)), None)
+        for picture, tile in zip(pictures, seen.tiles, strict=True)
+    ]
     return np.sum(found, axis=0)
 
 

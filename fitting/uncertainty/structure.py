@@ -17,8 +17,8 @@ from fitting.solver.profile import Optimum
 SIZES = (8, 16, 32)
 # Pixels on a side of the blocks of JPEG, whose errors go together by themselves.
 CODED_BLOCK = 8
-# Of those whose sums of scores tell how much errs together: the blocks of JPEG, and larger ones.
-SCATTER_SIZES = (8, 16)
+# Of those whose sums of scores tell how much errs together: the blocks of JPEG, and larger ones where there are many.
+SCATTER_SIZES, FEWEST_BLOCKS = (8, 16, 32), 30
 # So many standard deviations above what chance gives: in blocks of 8 x 8, and at any of the sizes.
 CHANCE, SIGNIFICANT = 4.0, 3.2
 # A block counts where this share of its pixels does.
@@ -170,7 +170,7 @@ def scatter(
     picture: Picture,
     shown: Float[np.ndarray, "P C"],
     optimum: Optimum,
-    place: tuple[np.ndarray, int],
+    errors: Errors,
     noise: float | None,
 ) -> Float[np.ndarray, "U U"]:
     """Products of the scores by x_a, x_d, x_s, channel after channel, and n, summed over blocks of pixels first.
@@ -182,15 +182,15 @@ def scatter(
         picture: whose weights are inverse variances.
         shown: what the pixels show.
         optimum: of the fit.
-        place: index of the pixels and width of the picture.
+        errors: of its pixels.
         noise: of a file compressed with losses, in codes; None for others.
     """
-    errors, weight = errors_of(picture, optimum, place), np.asarray(picture.weights)
-    columns = picture.columns(optimum.n)
-    root, scatters = np.sqrt(weight), []
+    columns, root, scatters = picture.columns(optimum.n), np.sqrt(np.asarray(picture.weights)), []
     for size in SCATTER_SIZES:
-        blocks = [errors.blocks(size)] * columns.shape[-1]
-        together = _joined(columns * root * errors.values, blocks, optimum)
+        blocks = errors.blocks(size)
+        if scatters and np.unique(blocks).size < FEWEST_BLOCKS:
+            break
+        together = _joined(columns * root * errors.values, [blocks] * columns.shape[-1], optimum)
         scatters.append(together @ together.T)
     scale = np.maximum(np.diag(scatters[0]), np.finfo(float).tiny)
     largest = max(scatters, key=lambda sums: float(np.sum(np.diag(sums) / scale)))
