@@ -13,6 +13,7 @@ from fitting.budget.escalation import fit_within
 from fitting.codes import Rounding
 from fitting.core import fit_pictures
 from fitting.problem import state_problem
+from fitting.progress import waiting
 from fitting.report import FitResult
 from fitting.solver.devices import spread_over
 from fitting.solver.losses import Loss
@@ -104,7 +105,7 @@ def fit(
         plausible=plausible,
     )
     if accuracy is None and seconds is None:
-        with spread_over(mesh):
+        with spread_over(mesh), waiting("fitting"):
             return fit_pictures(problem)
     if mesh is not None:
         raise InputError(
@@ -113,4 +114,5 @@ def fit(
     if problem.streamed:
         words = "is read by bands of rows; accuracy and seconds choose among pixels in memory"
         raise InputError("target", words, "Read it with brdf.read_image, or leave accuracy and seconds out")
-    return fit_within(problem, accuracy, seconds)
+    with waiting("fitting"):
+        return fit_within(problem, accuracy, seconds)

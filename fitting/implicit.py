@@ -26,6 +26,7 @@ from jaxtyping import Array, Float
 import brdf
 from brdf.precision import working_precision
 from fitting.joint import JointProblem, joint_problem
+from fitting.progress import waiting
 from fitting.result import FitResult
 
 NEWTON_STEPS = 3
@@ -80,7 +81,7 @@ def sensitivity(result: FitResult, by: Callable[[list[brdf.Scene]], Sequence[Any
     if not leaves or not all(hasattr(leaf, "shape") for leaf in leaves):
         raise brdf.InputError("by", "names no leaf of the scenes", "Return the leaves to differentiate by")
     names = list(dict.fromkeys(one.name for one in result.free_parameters))
-    with working_precision("float64"):
+    with working_precision("float64"), waiting("differentiating the fit"):
         start = brdf.cast((result.material, list(result.scenes)), "float64")
         problem = joint_problem(
             start,

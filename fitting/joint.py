@@ -31,6 +31,7 @@ from brdf.precision import Precision, working_precision
 from fitting.core import fit_pictures
 from fitting.pixels import Observed, observe
 from fitting.problem import CLASSIC, FitProblem, model_name, state_problem
+from fitting.progress import waiting
 from fitting.report import FitResult
 from fitting.result import Parameter, free_parameters
 from fitting.solver.nnls import inverse_diagonal
@@ -121,7 +122,7 @@ def fit_jointly(
         raise InputError("tolerance", came, "Give for example 1e-10 and 256")
     freed = free if callable(free) or free is None else _named([free] if isinstance(free, str) else free)
     stated = state_problem(target, scene, mask, precision=precision, saturation=saturation)
-    with working_precision(precision):
+    with working_precision(precision), waiting("fitting jointly"):
         seen = observe(stated, at_once=True)
 
         def solve(start: brdf.Material, scenes: Sequence[brdf.Scene]) -> JointResult:

@@ -25,6 +25,7 @@ from brdf.lights.base import Light
 from brdf.models.base import SpecularMaterial
 from brdf.precision import working_precision
 from brdf.rendering import basis
+from fitting.progress import waiting
 from fitting.result import FitResult
 from fitting.solver.normal_equations import AnyArray
 
@@ -141,7 +142,7 @@ def next_light(
     given = None if candidates is None else [_light(one, shining) for one in candidates]
     if given is not None and not given:
         raise InputError("candidates", "is empty", "Give lights or directions, or None for any direction")
-    with working_precision("float64"):
+    with working_precision("float64"), waiting("trying lights"):
         material = brdf.cast(result.material, "float64")
         variance = np.asarray(result.noise, np.float64) ** 2
 

@@ -11,7 +11,7 @@ that show signs of it are fitted by `fitting.fit`, one by one.
 import dataclasses
 import functools
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple, overload
+from typing import Any, overload
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +31,7 @@ from fitting.core import fit_pictures
 from fitting.light_colour import take_colour_out
 from fitting.pixels import SYMMETRIC_PIXELS
 from fitting.problem import TOP, FitProblem, state_problem
+from fitting.progress import waiting
 from fitting.report import FitResult
 from fitting.solver.devices import device_count, gathered, own, placed, spread_over
 
@@ -168,9 +169,10 @@ def fit_many(
         raise InputError("pictures", f"{came}, and are fitted together", "Give arrays of one size, or call fitting.fit")
     if problem.model == "auto":
         return ManyFits(problem, None, {})
-    with working_precision(problem.precision), spread_over(mesh):
-        numbers, plain = _fit_together(problem)
-    done = {int(i): fit_pictures(_one(problem, int(i))) for i in np.flatnonzero(~plain)}
+    with waiting(f"fitting {len(pictures)} pictures"):
+        with working_precision(problem.precision), spread_over(mesh):
+            numbers, plain = _fit_together(problem)
+        done = {int(i): fit_pictures(_one(problem, int(i))) for i in np.flatnonzero(~plain)}
     for index, result in done.items():
         for name, value in _numbers_of(result).items():
             numbers[name][index] = value
@@ -211,15 +213,15 @@ def _fit_together(problem: FitProblem) -> tuple[dict[str, np.ndarray], Bool[np.n
         choose = functools.partial(_chosen, pixel)
         images = Basis(images.points, choose(images.diffuse), images.lobe and images.lobe.pixels(choose))
         few = jnp.asarray(np.take(targets.reshape(count, -1, channels), pixel, axis=1))
-        shared = _Given(images=images, weight=jnp.ones(pixel.size, dtype), ambient=scenes[0].ambient)
-        found = _dealt_out(_Given(few), shared, problem.n_range)
+        shared = {"images": images, "weight": jnp.ones(pixel.size, dtype), "ambient": scenes[0].ambient}
+        found = _dealt_out({"target": few}, shared, problem.n_range)
     else:
         found = None
         for some in _of_one_structure(scenes):
             stack = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(scenes[i] for i in some))
             weight = jnp.asarray(seen[some].reshape(len(some), -1), dtype)
-            own = _Given(jnp.asarray(targets[some]), _bases(model, stack), weight, stack.ambient)
-            part = _dealt_out(own, _Given(), problem.n_range)
+            given = {"target": jnp.asarray(targets[some]), "images": _bases(model, stack)}
+            part = _dealt_out(given | {"weight": weight, "ambient": stack.ambient}, {}, problem.n_range)
             if found is None:
                 found = jax.tree.map(lambda leaf: np.zeros((count, *leaf.shape[1:]), leaf.dtype), part)
             jax.tree.map(lambda whole, leaf, some=some: whole.__setitem__(some, leaf), found, part)
@@ -236,8 +238,8 @@ def _fit_together(problem: FitProblem) -> tuple[dict[str, np.ndarray], Bool[np.n
 
 def _alike(problem: FitProblem) -> bool:
     """Whether all pictures show one scene, and the same pixels of it."""
-    (scene, *scenes), (mask, *masks) = problem.scenes, problem.masks
-    return all(one is scene for one in scenes) and all(one is mask or np.array_equal(one, mask) for one in masks)
+    (scene, *scenes), (mask, *masks) = problem.scenes, [np.asarray(one) for one in problem.masks]
+    return all(one is scene for one in scenes) and all(np.array_equal(one, mask) for one in masks)
 
 
 def _of_one_structure(scenes: Sequence[brdf.Scene]) -> Iterator[list[int]]:
@@ -249,28 +251,18 @@ def _of_one_structure(scenes: Sequence[brdf.Scene]) -> Iterator[list[int]]:
     yield from groups.values()
 
 
-class _Given(NamedTuple):
-    """What `fitting.functional.fit_basis` takes: of each of several pictures, or of all; the other then is None."""
-
-    target: Array | None = None
-    images: Basis | None = None
-    weight: Array | None = None
-    ambient: Array | None = None
-
-
-def _dealt_out(own_parts: _Given, shared: _Given, n_range: Any) -> tuple[functional.Solution, Array]:
-    """What is found of pictures, those of each device of the mesh on that device."""
+def _dealt_out(pictures: dict[str, Any], shared: dict[str, Any], n_range: Any) -> tuple[functional.Solution, Array]:
+    """What is found of pictures, those of each device of the mesh on that device; see `_solved`."""
     if device_count() == 1:
-        return _solved(own_parts, shared, n_range)
-    assert own_parts.target is not None
-    count = len(own_parts.target)
+        return _solved(pictures, shared, n_range)
+    count = len(pictures["target"])
     if count < device_count():
         came = f"has {device_count()} devices for {count} pictures"
         raise InputError("mesh", came, "Give no more devices than pictures, or leave it out")
     places = np.array_split(np.arange(count), device_count())
     rows, some = {}, None
     for device in own(device_count()):
-        mine = jax.tree.map(lambda leaf, some=places[device]: leaf[some], own_parts)
+        mine = jax.tree.map(lambda leaf, some=places[device]: leaf[some], pictures)
         some = _solved(placed(device, mine), placed(device, shared), n_range)
         table = np.asarray(jax.vmap(lambda one: ravel_pytree(one)[0])(some), np.float64)
         rows |= dict(zip(places[device].tolist(), table, strict=True))
@@ -289,16 +281,24 @@ def _bases(model: type[brdf.Material], scenes: brdf.Scene) -> Basis:
 
 
 @functools.partial(jax.jit, static_argnums=2)
-def _solved(own_parts: _Given, shared: _Given, n_range: Any) -> tuple[functional.Solution, Array]:
-    """The solution of each picture, and the sum of its squares."""
+def _solved(
+    pictures: dict[str, Any], shared: dict[str, Any], n_range: tuple[float, float]
+) -> tuple[functional.Solution, Array]:
+    """The solution of each picture, and the sum of its squares.
 
-    def fit(one: _Given) -> tuple[functional.Solution, Array]:
-        target, images, weight, ambient = (mine if its is None else its for mine, its in zip(one, shared, strict=True))
-        solution = functional.fit_basis(target, images, weight, ambient, n_range)
-        values = target.reshape(weight.size, -1)
-        return solution, jnp.sum(jnp.where(weight[:, None] > 0, values * values, 0))
+    Args:
+        pictures: what `fitting.functional.fit_basis` takes, of each picture.
+        shared: what of that is the same for all.
+        n_range: bounds of the exponent.
+    """
 
-    return jax.lax.map(fit, own_parts, batch_size=BATCH)
+    def fit(picture: dict[str, Any]) -> tuple[functional.Solution, Array]:
+        given = picture | shared
+        counts = given["weight"][:, None] > 0
+        values = jnp.where(counts, given["target"].reshape(len(counts), -1), 0)
+        return functional.fit_basis(**given, n_range=n_range), jnp.sum(values * values)
+
+    return jax.lax.map(fit, pictures, batch_size=BATCH)
 
 
 @jax.jit

@@ -30,6 +30,7 @@ from brdf.materials.material_file import material_to_dict
 from brdf.models.base import SpecularMaterial
 from fitting.model_fit import ModelFit
 from fitting.problem import check_choice, model_name
+from fitting.progress import waiting
 from fitting.report.saving import write_report
 from fitting.result import Parameter, Parameters
 from fitting.solver.normal_equations import Picture
@@ -333,11 +334,12 @@ def fit_brdf(
     left_out, negative = samples.left_out, int(np.count_nonzero(samples.values[:count] < 0))
     if loss == "log" and negative:
         left_out = left_out | {"values below 0, out of reach of the logarithm": negative}
-    candidates = [
-        _fit_model(kind, samples, loss, n_range)
-        for kind in (brdf.MODELS.values() if model == "auto" else [brdf.MODELS[model]])
-        if count * channels > (2 * channels + 1 if issubclass(kind, SpecularMaterial) else channels)
-    ]
+    with waiting(f"fitting {table.name}"):
+        candidates = [
+            _fit_model(kind, samples, loss, n_range)
+            for kind in (brdf.MODELS.values() if model == "auto" else [brdf.MODELS[model]])
+            if count * channels > (2 * channels + 1 if issubclass(kind, SpecularMaterial) else channels)
+        ]
     if not candidates:
         came = f"has {count} samples that count, no more than there are numbers to find"
         raise InputError(table.name, came, "Give a table with more samples, or a model with fewer numbers")

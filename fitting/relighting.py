@@ -22,6 +22,7 @@ from brdf.models.base import SpecularMaterial
 from brdf.precision import Precision, working_precision
 from fitting.pixels import Observed, observe
 from fitting.problem import model_name, state_problem
+from fitting.progress import waiting
 from fitting.report import FitResult
 from fitting.result import Parameter, free_parameters
 from fitting.solver.nnls import inverse_diagonal, nonnegative_minimum
@@ -164,9 +165,10 @@ def fit_lights_and_material(
             found[-1, -1] = scene.ambient
         return found
 
-    n = _best_exponent(lambda n: _in_turn(terms(n), pixels, lights)[0], n_range) if len(names) > 1 else 1.0
-    images = terms(n)
-    _, factors, k = _in_turn(images, pixels, lights)
+    with waiting("fitting lights and material"):
+        n = _best_exponent(lambda n: _in_turn(terms(n), pixels, lights)[0], n_range) if len(names) > 1 else 1.0
+        images = terms(n)
+        _, factors, k = _in_turn(images, pixels, lights)
     mean = factors[:lights].mean(axis=0)
     scale = np.where(mean > 0, mean, 1.0)
     factors[:lights] /= scale

@@ -36,6 +36,7 @@ from fitting.budget.error_estimate import SMALLEST
 from fitting.budget.escalation import WHOLE, check_above_zero, near
 from fitting.budget.sampling import MadeLights, sample_pixels, with_samples
 from fitting.problem import FitProblem, state_problem
+from fitting.progress import waiting
 from fitting.result import FitResult
 from fitting.uncertainty.covariance import TERMS
 
@@ -300,7 +301,7 @@ def tradeoff(
     random = np.random.default_rng(0)
     order = [*by_work, *(by_work[i] for _ in range(MOST_ROUNDS + 1) for i in random.permutation(len(by_work)))]
     known: list[Trial] = []
-    try:
+    with contextlib.suppress(KeyboardInterrupt), waiting("measuring") as say:
         for done, trial in enumerate(order, start=1):
             once = trial.axis == "solver"
             left = seconds - (time.perf_counter() - begun)
@@ -318,10 +319,9 @@ def tradeoff(
                 trial.outcome = outcome
                 known.append(trial)
             trial.taken.append(one)
+            say(f"measuring, {done} of {len(order)} runs")
             if progress is not None:
                 progress(done, len(order))
-    except KeyboardInterrupt:
-        pass
     rows = [bench.row(trial) for trial in trials if trial.taken]
     return Tradeoff(tuple(rows), bench.reference, accuracy, len(trials), time.perf_counter() - begun)
 

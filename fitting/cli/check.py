@@ -9,7 +9,8 @@ import typer
 import brdf
 from brdf.errors import InputError
 from brdf.files import atomic_path
-from fitting.cli.common import AsJson, find_materials, find_note, show, use_compilation_cache, waiting
+from fitting.cli.common import AsJson, find_materials, find_note, show, use_compilation_cache
+from fitting.progress import waiting
 
 EXAMPLE = (
     "Example: [bold]brdf check material.json[/bold]\n\n"

@@ -195,28 +195,6 @@ def use_compilation_cache() -> None:
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
-@contextlib.contextmanager
-def waiting(what: str) -> Iterator[Callable[[str], None]]:
-    """What is being done and since when, where a person waits; nothing where standard error is no terminal.
-
-    Args:
-        what: is being done.
-
-    Yields:
-        To say what is done next.
-    """
-    if not sys.stderr.isatty():
-        yield lambda what: None
-        return
-    from rich.console import Console
-    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-
-    columns = SpinnerColumn(), TextColumn("{task.description} ..."), TimeElapsedColumn()
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(what, total=None)
-        yield lambda what: bar.update(task, description=what)
-
-
 def show(text: str) -> None:
     """Print the command's output.
 

@@ -21,9 +21,9 @@ from fitting.cli.common import (
     named_as,
     show,
     use_compilation_cache,
-    waiting,
 )
 from fitting.cli.devices import all_devices, is_first_process
+from fitting.progress import waiting
 
 EXAMPLE = "\n\n".join(
     [

@@ -8,7 +8,8 @@ import typer
 import brdf
 from brdf.errors import InputError
 from brdf.files import write_text
-from fitting.cli.common import Encoding, PictureOptions, named_as, show, waiting
+from fitting.cli.common import Encoding, PictureOptions, named_as, show
+from fitting.progress import waiting
 
 EXAMPLE = "Example: [bold]brdf lights chrome.*.png --sphere 253.5,148,119.5 --out lights.txt[/bold]"
 

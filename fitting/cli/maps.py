@@ -6,7 +6,8 @@ from typing import Annotated
 import typer
 
 from brdf.files import check_folder
-from fitting.cli.common import Encoding, Precision, named_as, show, use_compilation_cache, waiting
+from fitting.cli.common import Encoding, Precision, named_as, show, use_compilation_cache
+from fitting.progress import waiting
 
 EXAMPLE = "Example: [bold]brdf maps photographs/ --normals fit --out maps/[/bold]"
 

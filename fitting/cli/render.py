@@ -7,7 +7,8 @@ import typer
 
 import brdf
 from brdf.errors import InputError
-from fitting.cli.common import AMaterial, Precision, find_material, named_as, show, use_compilation_cache, waiting
+from fitting.cli.common import AMaterial, Precision, find_material, named_as, show, use_compilation_cache
+from fitting.progress import waiting
 
 EXAMPLE = (
     "Example: [bold]brdf render material.json --scene scene.toml -o picture.exr[/bold]\n\n"

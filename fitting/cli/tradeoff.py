@@ -45,12 +45,7 @@ def tradeoff(
     if len(inputs.pictures) > 1:
         came = f"holds {len(inputs.pictures)} pictures, and one is measured"
         raise InputError(target, came, "Give one picture with its scene or its light")
-    from rich.console import Console
-    from rich.progress import Progress
-
-    bar = Progress(console=Console(stderr=True), disable=not sys.stderr.isatty())
-    task = bar.add_task("measuring", total=None)
-    with named_as({"target": given.targets[0]}), bar:
+    with named_as({"target": given.targets[0]}):
         found = fitting.tradeoff(
             inputs.pictures[0],
             inputs.scenes[0],
@@ -60,7 +55,6 @@ def tradeoff(
             model=model,
             accuracy=accuracy,
             seconds=seconds,
-            progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
     silent = [path.name for path, picture in given.pictures.items() if picture.source == "assumed"]
     guess = [f"{name} does not say how its values are encoded; --encoding decides" for name in silent]
@@ -70,6 +64,8 @@ def tradeoff(
     if as_json:
         show(json.dumps(found.to_dict() | ({"notes": notes} if notes else {}), indent=2))
         return
+    from rich.console import Console
+
     # As wide as the terminal; in a pipe, as wide as it takes.
     console = Console(width=None if sys.stdout.isatty() else 160)
     with console.capture() as table:

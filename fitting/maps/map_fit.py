@@ -26,6 +26,7 @@ from fitting.maps import map_inputs
 from fitting.maps.map_inputs import Photographs
 from fitting.maps.map_result import REASONS, Maps
 from fitting.maps.texels import CAP, Columns, Distant, TexelFit, fit_texels, fit_with_normals
+from fitting.progress import waiting
 
 TILE = 1024
 """Texels that go through the program in step: what they need stays in the processor's cache."""
@@ -123,11 +124,13 @@ def fit_maps(
         given, notes = _likelier(given, other, points, how)
     _, height, width, _ = given.shape
     layers: dict[str, np.ndarray] = {}
-    for start, stop, band in _fitted(given, points, how):
-        for name, values in band.items():
-            if name not in layers:
-                layers[name] = np.zeros((height, width, *values.shape[1:]), values.dtype)
-            layers[name][start:stop] = values.reshape(stop - start, width, *values.shape[1:])
+    with waiting("fitting maps") as say:
+        for start, stop, band in _fitted(given, points, how):
+            for name, values in band.items():
+                if name not in layers:
+                    layers[name] = np.zeros((height, width, *values.shape[1:]), values.dtype)
+                layers[name][start:stop] = values.reshape(stop - start, width, *values.shape[1:])
+            say(f"fitting maps, {100 * stop // height} % done")
     if not np.any(layers["reason"] != REASONS.index("outside")):
         raise InputError("pictures", "show no texel that counts", "Check mask, normals and clipping")
     return _maps(layers, how, notes)

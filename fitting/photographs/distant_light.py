@@ -92,6 +92,7 @@ def light_from_highlight(picture: Any, circle: Circle, *, mask: Any = True) -> F
         # The median fell between two lights.
         x, y = float(columns[0]), float(rows[0])
     rows, columns = np.nonzero(inside & (grey >= HIGHLIGHT * largest))
+    near = np.ones(rows.shape, bool)
     for _ in range(20):
         near = np.hypot(columns - x, rows - y) <= HIGHLIGHT_RADIUS * circle.radius
         x, y = float(columns[near].mean()), float(rows[near].mean())
