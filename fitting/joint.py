@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 import brdf
 from brdf.errors import InputError
@@ -40,6 +40,7 @@ from fitting.uncertainty.residual_correlation import correlation_in_rows, struct
 
 LARGEST_JACOBIAN = 1 << 27
 ROUNDS = 8
+TINY = np.finfo(float).tiny
 # What freed leaves may not go below. A direction or a position has no bound, n is searched by its logarithm.
 DIRECTIONS = ("direction",)
 OPEN = "only a combination with other freed numbers is determined"
@@ -334,48 +335,61 @@ def _solve(problem: JointProblem, seen: Observed, solver: str, tolerance: float,
             break
         held = (held | below) & ~inwards
     found, vector = problem.at(vector), np.asarray(vector, np.float64)
-    channels = seen.colour.size
-    squares = np.sum(residual.reshape(-1, channels) ** 2, axis=0)
-    square, pixels = 0.0, 0
-    for target, weight in zip(problem.targets, problem.weights, strict=True):
-        counted = np.asarray(target, np.float64)[... if weight is None else np.asarray(weight) > 0]
-        square, pixels = square + float(np.sum(counted**2)), pixels + len(counted)
-    noise = squares / max(pixels - vector.size / channels, 1)
+    parts = np.split(residual, np.cumsum([target.size for target in problem.targets])[:-1])
+    left = left_over(
+        seen, [part.reshape(shown.shape) for part, shown in zip(parts, seen.shown, strict=True)], vector.size
+    )
     material, scenes = jax.tree.map(np.asarray, found.content())
     given = jax.tree.leaves((material, seen.problem.scenes))
     given = [given[place] for place in problem.places]
-    parameters, errors, correlation = _with_errors(problem, given, vector, held, columns, float(np.mean(noise)))
-    warnings = [] if converged else [f"the solver stopped after {steps} steps without an end: raise max_steps"]
-    parts = np.split(residual, np.cumsum([target.size for target in problem.targets])[:-1])
-    both = zip(parts, seen.shown, strict=True)
-    share = (float(np.sum(squares)) / square) ** 0.5
-    known = correlation_in_rows([part.reshape(picture.shape) for part, picture in both], share)
+    parameters, errors, correlation = _with_errors(
+        problem, given, vector, held, columns, float(np.mean(left["noise"] ** 2))
+    )
+    warnings = () if converged else (f"the solver stopped after {steps} steps without an end: raise max_steps",)
     return JointResult(
+        **left | {"warnings": warnings + left["warnings"]},
         material=material,
         parameters=parameters,
-        noise=np.sqrt(noise),
-        structure=known.correlation,
-        highlight_pixels=None,
-        residual=share,
-        pixels=pixels,
-        left_out=seen.left_out,
-        warnings=(*warnings, *structure_warning(known)),
-        candidates=(),
         correlation=correlation,
-        optimum=None,
-        loss=seen.problem.loss,
-        precision=seen.problem.precision,
-        seconds=0.0,
-        targets=seen.shown,
         scenes=scenes,
-        counted=seen.counted,
-        files=[target.file for target in seen.problem.targets],
         values=tuple(np.asarray(leaf) for leaf in found.freed()),
         errors=errors,
         steps=steps,
         converged=converged,
         solver=solver,
     )
+
+
+def left_over(seen: Observed, residuals: Sequence[Float[np.ndarray, "H W C"]], unknowns: int) -> dict[str, Any]:
+    """What a `FitResult` says of the pictures and of what a fit leaves of them.
+
+    Args:
+        seen: what was fitted.
+        residuals: of each picture, 0 where a pixel does not count.
+        unknowns: how many numbers were found.
+    """
+    squares = np.sum([np.sum(np.square(residual), axis=(0, 1)) for residual in residuals], axis=0)
+    told = [np.asarray(shown, np.float64)[counted] for shown, counted in zip(seen.shown, seen.counted, strict=True)]
+    pixels = sum(map(len, told))
+    share = (float(np.sum(squares)) / max(sum(float(np.sum(values**2)) for values in told), TINY)) ** 0.5
+    known = correlation_in_rows(residuals, share)
+    return {
+        "noise": np.sqrt(squares / max(pixels - unknowns / squares.size, 1)),
+        "structure": known.correlation,
+        "highlight_pixels": None,
+        "residual": share,
+        "pixels": pixels,
+        "left_out": seen.left_out,
+        "warnings": structure_warning(known),
+        "candidates": (),
+        "optimum": None,
+        "loss": seen.problem.loss,
+        "precision": seen.problem.precision,
+        "seconds": 0.0,
+        "targets": seen.shown,
+        "counted": seen.counted,
+        "files": [target.file for target in seen.problem.targets],
+    }
 
 
 def _with_errors(

@@ -27,15 +27,15 @@ from brdf.precision import working_precision
 from brdf.rendering import basis
 from fitting.progress import waiting
 from fitting.result import FitResult
+from fitting.solver.nnls import inverse_diagonal
 from fitting.solver.normal_equations import AnyArray
 
-# Directions of the hemisphere that are tried: 6° apart; the best is then followed, in steps down to a tenth of that.
-DIRECTIONS = 400
-FIRST_STEP, ROUNDS, AROUND = 0.05, 5, 6
+# Directions of the hemisphere that are tried, 6° apart, and then around the best: up to which angle, how many.
+HEMISPHERE, AROUND = (np.pi / 2, 400), ((0.1, 16), (0.025, 16))
 # Of a picture at most so many pixels are looked at, evenly spread; what they tell is scaled up.
 MOST_PIXELS = 1 << 14
-# The square of a number's share that no pixel sees.
-UNSEEN = 1e-9
+# Of the largest eigenvalue of the information: a smaller one tells nothing.
+DEPENDENT = 1e-12
 
 
 @dataclass(frozen=True)
@@ -150,26 +150,30 @@ def next_light(
             return np.asarray(_information(material, brdf.cast(scene, "float64"), variance)) / share
 
         def error(information: np.ndarray) -> float:
-            return _error(information[np.ix_(active, active)], wanted[active])
+            """Root mean square of the standard errors of what is wanted; infinite where one is not determined."""
+            variance = inverse_diagonal(information[np.ix_(active, active)], DEPENDENT)
+            return float(np.sqrt(np.mean(variance[wanted[active]])))
 
-        def foretold(light: Light) -> tuple[float, np.ndarray]:
-            more = information + told(dataclasses.replace(scenes[0][0], lights=(light,), visibility=()), scenes[0][1])
-            return error(more), more
+        def informed(light: Light) -> np.ndarray:
+            return information + told(dataclasses.replace(first, lights=(light,), visibility=()), share)
 
-        information = np.sum([told(*scene) for scene in scenes], axis=0)
-        before, chosen, after, first = error(information), [], [], None
+        def best_of(lights: Sequence[Light]) -> tuple[Light, list[float]]:
+            errors = [error(informed(light)) for light in lights]
+            return lights[int(np.argmin(errors))], errors
+
+        (first, share), information = scenes[0], np.sum([told(*scene) for scene in scenes], axis=0)
+        before, chosen, after, foretold = error(information), [], [], np.zeros(0)
+        to_view = np.asarray(first.surface_points().to_view, np.float64).reshape(-1, 3).mean(axis=0)
+        tried = [_towards(one, shining) for one in _cap(to_view, *HEMISPHERE)] if given is None else given
         for _ in range(count):
-            tried = [_towards(one, shining) for one in _hemisphere(scenes[0][0])] if given is None else given
-            errors = [foretold(light)[0] for light in tried]
-            first = (tuple(tried), np.array(errors)) if first is None else first
-            best = tried[int(np.argmin(errors))]
-            if given is None:
-                best = _followed(best, min(errors), lambda light: foretold(light)[0], shining)
-            left, information = foretold(best)
+            best, errors = best_of(tried)
+            foretold = foretold if chosen else np.array(errors)
+            for near in AROUND if given is None else ():
+                best, _ = best_of([best, *(_towards(one, shining) for one in _cap(_direction(best), *near))])
+            information = informed(best)
             chosen.append(best)
-            after.append(left)
-    assert first is not None
-    return LightChoice(tuple(chosen), of, before, tuple(after), *first, known)
+            after.append(error(information))
+    return LightChoice(tuple(chosen), of, before, tuple(after), tuple(tried), foretold, known)
 
 
 def _towards(direction: np.ndarray, intensity: np.ndarray) -> Light:
@@ -219,15 +223,13 @@ def _scene(result: FitResult, index: int) -> tuple[brdf.Scene, float]:
     return brdf.some_pixels(result.scenes[index], some, precision="float64"), some.size / pixel.size
 
 
-def _hemisphere(scene: brdf.Scene) -> np.ndarray:
-    """Evenly spread directions around the mean of those to the eye, (K, 3): Vogel's spiral, of equal areas."""
-    assert scene.points is not None
-    middle = np.asarray(scene.points.to_view, np.float64).reshape(-1, 3).mean(axis=0)
-    height = 1 - (np.arange(DIRECTIONS) + 0.5) / DIRECTIONS
-    angle = np.arange(DIRECTIONS) * np.pi * (3 - np.sqrt(5))
+def _cap(middle: np.ndarray, size: float, count: int) -> list[np.ndarray]:
+    """Evenly spread directions around another one, up to an angle from it: Vogel's spiral, of equal areas."""
+    height = 1 - (1 - np.cos(size)) * (np.arange(count) + 0.5) / count
+    angle = np.arange(count) * np.pi * (3 - np.sqrt(5))
     radius = np.sqrt(1 - height**2)
     across = _across(middle / np.linalg.norm(middle))
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1) @ across
+    return list(np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1) @ across)
 
 
 def _across(direction: np.ndarray) -> np.ndarray:
@@ -236,22 +238,6 @@ def _across(direction: np.ndarray) -> np.ndarray:
     first = np.cross(start, direction)
     first /= np.linalg.norm(first)
     return np.stack([first, np.cross(direction, first), direction])
-
-
-def _followed(light: Light, error: float, foretold: Any, shining: np.ndarray) -> Light:
-    """The best direction near by: a ring of directions around it, which shrinks where none of them is better."""
-    step = FIRST_STEP
-    for _ in range(ROUNDS):
-        angle = 2 * np.pi * np.arange(AROUND) / AROUND
-        first, second, middle = _across(_direction(light))
-        ring = middle + step * (np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second)
-        tried = [_towards(one, shining) for one in ring]
-        errors = [foretold(one) for one in tried]
-        if min(errors) < error:
-            light, error = tried[int(np.argmin(errors))], min(errors)
-        else:
-            step /= 2
-    return light
 
 
 @eqx.filter_jit
@@ -275,17 +261,3 @@ def _information(material: brdf.Material, scene: brdf.Scene, variance: AnyArray)
         place[channel, term, term * channels + channel] = 1
     place[:, 3, -1] = 1
     return jnp.einsum("cij,ciu,cjv->uv", gram, place, place)
-
-
-def _error(information: np.ndarray, wanted: np.ndarray) -> float:
-    """Root mean square of the standard errors of what is wanted; infinite where one is not determined."""
-    size = np.sqrt(np.diag(information))
-    if not np.all(size[wanted] > 0):
-        return np.inf
-    size = np.where(size > 0, size, 1)
-    value, vector = np.linalg.eigh(information / np.outer(size, size))
-    open_ = value <= 1e-12
-    if np.any(np.sum(vector[wanted][:, open_] ** 2, axis=1) > UNSEEN):
-        return np.inf
-    variance = np.sum(vector[wanted][:, ~open_] ** 2 / value[~open_], axis=1) / size[wanted] ** 2
-    return float(np.sqrt(np.mean(variance)))

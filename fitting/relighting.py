@@ -20,6 +20,7 @@ from brdf.checks import instance
 from brdf.errors import InputError
 from brdf.models.base import SpecularMaterial
 from brdf.precision import Precision, working_precision
+from fitting.joint import left_over
 from fitting.pixels import Observed, observe
 from fitting.problem import model_name, state_problem
 from fitting.progress import waiting
@@ -28,7 +29,6 @@ from fitting.result import Parameter, free_parameters
 from fitting.solver.nnls import inverse_diagonal, nonnegative_minimum
 from fitting.solver.refinement import GRID_STEP
 from fitting.uncertainty.intervals import above_zero
-from fitting.uncertainty.residual_correlation import correlation_in_rows, structure_warning
 
 FACTOR = "one factor per channel between material and lights"
 KEPT = "no picture determines it; the lights' mean intensity was kept at that of the scene"
@@ -255,8 +255,6 @@ def _result(
     found = eqx.tree_at(lambda s: s.lights, scene, lights)
     if scene.ambient is not None:
         found = eqx.tree_at(lambda s: s.ambient, found, emittances[-1])
-    residual = pixels - np.einsum("lc,lpc->pc", factors, columns)
-    square = max(float(np.sum(pixels**2)), np.finfo(float).tiny)
     fields = ("radiance" if "radiance" in vars(light) else "intensity" for light in lights)
     names = [f"lights[{index}].{field}" for index, field in enumerate(fields)]
     names += ["ambient"] * (len(emittances) - len(names))
@@ -272,30 +270,15 @@ def _result(
             for name, values in numbers.items()
             for channel, value in enumerate(values)
         ]
-    picture = np.zeros((*seen.counted[0].shape, channels))
-    picture[seen.counted[0]] = residual
-    share = (float(np.sum(residual**2)) / square) ** 0.5
-    known = correlation_in_rows([picture], share)
+    residual = np.zeros((*seen.counted[0].shape, channels))
+    residual[seen.counted[0]] = pixels - np.einsum("lc,lpc->pc", factors, columns)
+    left = left_over(seen, [residual], factors.size)
     return LightFit(
+        **left | {"warnings": (*(f"{FACTOR}: {KEPT}",) * has_material, *left["warnings"])},
         material=material,
         parameters=tuple(parameters),
-        noise=np.sqrt(np.sum(residual**2, axis=0) / max(len(pixels) - len(factors), 1)),
-        structure=known.correlation,
-        highlight_pixels=None,
-        residual=share,
-        pixels=len(pixels),
-        left_out=seen.left_out,
-        warnings=(*(f"{FACTOR}: {KEPT}",) * has_material, *structure_warning(known)),
-        candidates=(),
         correlation=np.eye(len(free_parameters(parameters))),
-        optimum=None,
-        loss="squared",
-        precision=seen.problem.precision,
-        seconds=0.0,
-        targets=seen.shown,
         scenes=[found],
-        counted=seen.counted,
-        files=[target.file for target in seen.problem.targets],
         emittances=emittances,
         factors=factors,
         errors=errors,
