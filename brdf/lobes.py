@@ -5,9 +5,10 @@ are taken tile by tile, which also keeps a tile in the processor's cache while i
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -21,13 +22,14 @@ from brdf.geometry.surface_points import SurfacePoints
 from brdf.geometry.visibility import share_seen
 from brdf.lights.base import Light, Lighting
 from brdf.models.base import Material, SpecularMaterial
-from brdf.vectors import BELOW_HORIZON, divide, dot, square_root
+from brdf.vectors import BELOW_HORIZON, Components, divide, dot, quadratic_form, square_root
 
 STORED_SAMPLES = 4
 """Up to so many light samples each is compiled on its own, and the fit keeps its terms as arrays of their own."""
 
-TILE = 1 << 15
-"""Pixels that many samples pass over at a time: loops over less than a megabyte XLA does not vectorise."""
+TILE, CHUNK, ROWS = 1 << 12, 32, 3
+"""Pixels, and samples, that are dealt with at a time: half a megabyte for each of the few values in between.
+And rows from which on XLA's product of two matrices is a quick one."""
 
 STACKED_VALUES = 1 << 26
 """Up to so many values the fit keeps the terms of many samples, too, for few pixels: 256 MiB in float32."""
@@ -36,7 +38,7 @@ NO_LOBE = -1e9
 """The peak of a pixel without a lobe: exp(n * this) = 0 for every n that a fit visits."""
 
 
-class LightTerms(eqx.Module):
+class LightTerms(NamedTuple):
     """What one light sample adds to the basis images at one point.
 
     Attributes:
@@ -61,8 +63,7 @@ def light_terms(
     """The terms at one point of one sample, a row of a stack, of the scene's light of that number."""
     sample = kind.sample(point, *row)
     if sample.moments is None:
-        cosine = dot(point.normal, sample.to_light)
-        above = jnp.ones_like(cosine)
+        cosine, above = dot(point.normal, sample.to_light), 1.0
     else:
         cosine, above = patch_cosine(point.normal, *sample.moments)
     lit = point.mask & (cosine > 0)
@@ -74,7 +75,7 @@ def light_terms(
     matt = lit if sample.lobe_only is None else lit & (sample.lobe_only == 0)
     diffuse = intensity * jnp.where(matt, cosine, 0)
     if not issubclass(model, SpecularMaterial):
-        return LightTerms(diffuse, jnp.zeros_like(diffuse), jnp.zeros_like(cosine))
+        return LightTerms(diffuse, 0.0 * diffuse, jnp.zeros_like(cosine))
     log_cosine = model.log_cosine(point.normal, sample.to_light, point.to_view)
     glossy = lit if sample.lobe_only is None else lit & (sample.lobe_only > 0)
     shines = glossy & (dot(point.normal, point.to_view) > 0) & (log_cosine > 0.5 * BELOW_HORIZON)
@@ -89,7 +90,7 @@ def patch_cosine(normal: Vector, mean: Vector, covariance: Float[Array, "3 3"]) 
     3/4 (1 - x²) that has the patch's mean and variance.
     """
     middle = dot(normal, mean)
-    half_width = square_root(5.0 * dot(normal, covariance @ normal))
+    half_width = square_root(5.0 * quadratic_form(normal, covariance))
     x = divide(middle, half_width)
     crosses = (half_width > 0) & (jnp.abs(x) < 1)
     x = jnp.where(crosses, x, 0.0)
@@ -99,69 +100,124 @@ def patch_cosine(normal: Vector, mean: Vector, covariance: Float[Array, "3 3"]) 
 
 
 def sum_over_samples(
-    model: type[Material],
-    points: SurfacePoints,
-    lighting: Lighting,
-    of_terms: Callable[[LightTerms], Any],
-    *,
-    combine: Callable[[Any, Any], Any] | None = None,
-    start: Any = None,
+    model: type[Material], points: SurfacePoints, lighting: Lighting, of_terms: Callable[[LightTerms], Any]
 ) -> Any:
-    """Combine a function of one sample's terms at one point over all samples, for (P,) points.
+    """Add up a function of one sample's terms at one point, linear in diffuse and weight, over all samples.
 
-    ``combine`` makes one value of two and begins with ``start``, of the same structure; without them they are added. No
-    more than one sample's images are held at a time.
+    Args:
+        model: the class of the material.
+        points: (P,).
+        lighting: with at least one light.
+        of_terms: gives values without an axis of channels where it gets such; of any structure.
+
+    Returns:
+        The sums in that structure, (P, C) each.
     """
-    few, combine = lighting.samples <= STORED_SAMPLES, combine or partial(jax.tree.map, jnp.add)
+    if lighting.samples > STORED_SAMPLES:
+        return over_samples(model, points, lighting, of_terms)[0]
 
     def at_point(point: SurfacePoints) -> Any:
-        def add(kind: type[Light], total: Any, sample: tuple[Any, Any]) -> tuple[Any, None]:
-            value = of_terms(light_terms(model, lighting.occluders, kind, *sample, point))
-            return (value if total is None else combine(total, value)), None
+        terms = (light_terms(model, lighting.occluders, *sample, point) for sample in lighting.each())
+        return functools.reduce(partial(jax.tree.map, jnp.add), map(of_terms, terms))
 
-        total = None
-        if few:
-            for kind, row, light in lighting.each():
-                total, _ = add(kind, total, (row, light))
-            return total
-        # a sum is as wide as the widest of its parts
-        firsts = [(stack.kind, jax.tree.map(lambda values: values[0], stack.rows())) for stack in lighting.stacks]
-        shapes = [jax.eval_shape(partial(add, kind, None), first)[0] for kind, first in firsts]
-        begin = jax.tree.map(lambda _: 0.0, shapes[0]) if start is None else start
-        total = jax.tree.map(_filled, begin, *shapes)
+    return jax.vmap(at_point)(points)
+
+
+def over_samples(
+    model: type[Material], points: SurfacePoints, lighting: Lighting, of_terms: Callable[[LightTerms], Any]
+) -> tuple[Any, Float[Array, " P"]]:
+    """Sums as of `sum_over_samples` for many samples, and the peak of the lobe.
+
+    All is done for a tile of pixels and a chunk of samples at a time, which the processor's cache holds, with light of
+    strength 1; what a chunk's samples emit, in C channels, is multiplied with that as a matrix.
+    """
+    occluders = tuple(_apart(shape) if shape.in_components else shape for shape in lighting.occluders)
+    channels = max(one.shape[-1] for stack in lighting.stacks for one in stack.spectra)
+
+    def of_tile(tile: SurfacePoints) -> Any:
+        dtype = tile.normal.parts[0].dtype
+
+        def add(kind: type[Light], numbers: Any, light: Any, total: Any, chunk: tuple[Any, ...]) -> tuple[Any, None]:
+            nodes, emitted = chunk[:2]
+            row = (*map(_apart, numbers), *map(_chunk_apart, nodes))
+            grey = tuple(1.0 if place in kind.emits else part for place, part in enumerate(row))
+            terms = light_terms(model, occluders, kind, grey, light if len(chunk) == 2 else chunk[2], tile)
+            terms = LightTerms(*(jnp.broadcast_to(part, (len(emitted), *tile.mask.shape)) for part in terms))
+            terms = jax.lax.optimization_barrier(terms)  # or each of the sums would make them anew
+            peak = jnp.max(jnp.where(emitted.max(axis=1, keepdims=True) > 0, _peak(terms), NO_LOBE), axis=0)
+            added = jax.tree.map(partial(_emitted, emitted), of_terms(terms))
+            return (jax.tree.map(jnp.add, total[0], added), jnp.maximum(total[1], peak)), None
+
+        nothing = jnp.zeros((channels, *tile.mask.shape), dtype)
+        shapes = jax.eval_shape(of_terms, LightTerms(*3 * [nothing[:1]]))
+        total = jax.tree.map(lambda _: nothing, shapes), jnp.full(tile.mask.shape, NO_LOBE, dtype)
         for stack in lighting.stacks:
+            kind = stack.kind
+            if not stack.nodes:
+                chunks = _chunks((stack.numbers, stack.emitted(channels)[:, 0], stack.light))
+                total, _ = jax.lax.scan(jax.checkpoint(partial(add, kind, (), None)), total, chunks)
+                continue
 
-            def add_light(total: Any, one: Any, kind: type[Light] = stack.kind) -> tuple[Any, None]:
-                numbers, nodes, light = one
-                if not nodes:
-                    return jax.checkpoint(partial(add, kind))(total, (numbers, light))
-                # what the samples of a light have in common is computed once, outside their loop
-                step = jax.checkpoint(lambda total, node: add(kind, total, ((*numbers, *node), light)))
-                return jax.lax.scan(step, total, nodes)
+            def add_light(total: Any, one: Any, kind: type[Light] = kind) -> tuple[Any, None]:
+                numbers, light, *samples = one
+                step = jax.checkpoint(partial(add, kind, numbers, light))
+                return jax.lax.scan(step, total, _chunks(tuple(samples)))
 
-            total, _ = jax.lax.scan(add_light, total, (stack.numbers, stack.nodes, stack.light))
-        return total
+            each = stack.numbers, stack.light, stack.nodes, stack.emitted(channels)
+            total, _ = jax.lax.scan(add_light, total, each)
+        return jax.tree.map(lambda leaf: leaf.T, total)
 
-    return jax.vmap(at_point)(points) if few else _by_tiles(at_point, points)
+    return _by_tiles(of_tile, points)
 
 
-def _filled(value: float, *shapes: jax.ShapeDtypeStruct) -> Array:
-    return jnp.full(np.broadcast_shapes(*(shape.shape for shape in shapes)), value, shapes[0].dtype)
+def _emitted(emitted: Float[Array, "B C"], value: Float[Array, "B P"]) -> Float[Array, "C P"]:
+    """The sum over samples; a product with a matrix of one row would be slow."""
+    rows = jnp.pad(emitted.T, ((0, max(0, ROWS - emitted.shape[1])), (0, 0)))
+    return jnp.matmul(rows, value, precision="highest")[: emitted.shape[1]]
 
 
-def _by_tiles(at_point: Callable[[SurfacePoints], Any], points: SurfacePoints) -> Any:
-    """``at_point`` of all points, tile by tile; the last point fills up the last tile."""
+def _apart(tree: Any) -> Any:
+    """Vectors in components."""
+    return jax.tree.map(lambda leaf: Components.of(leaf) if jnp.ndim(leaf) == 1 else leaf, tree)
+
+
+def _chunk_apart(values: Array) -> Any:
+    """Numbers of B samples as (B, 1), vectors as components of that form, a matrix as rows of such."""
+    if values.ndim == 3:
+        return tuple(map(_chunk_apart, jnp.unstack(values, axis=1)))
+    return values[:, None] if values.ndim == 1 else Components.of(values[:, None])
+
+
+def _chunks(samples: Any) -> Any:
+    """Arrays (S, ...) as (S / B, B, ...); samples of no light fill up the last chunk."""
+    count = jax.tree.leaves(samples)[0].shape[0]
+    chunks = -(-count // CHUNK)
+    size = -(-count // chunks)
+    index = np.minimum(np.arange(chunks * size), count - 1).reshape(chunks, size)
+    numbers, emitted, *light = jax.tree.map(lambda leaf: leaf[index], samples)
+    beyond = np.arange(chunks * size).reshape(chunks, size, 1) >= count
+    return numbers, jnp.where(beyond, 0, emitted), *light
+
+
+def _points_apart(points: SurfacePoints) -> Any:
+    """The vectors of (P,) points in components, and the lights that they see along the first axis."""
+    seen = None if points.visibility is None else points.visibility.T
+    plain = dataclasses.replace(points, visibility=None)
+    apart = jax.tree.map(lambda leaf: Components.of(leaf) if leaf.ndim == 2 else leaf, plain)
+    return dataclasses.replace(apart, visibility=seen)
+
+
+def _by_tiles(of_tile: Callable[[SurfacePoints], Any], points: SurfacePoints) -> Any:
+    """``of_tile`` of all points, tile by tile; the last point fills up the last tile."""
     count = points.mask.size
     tiles = -(-count // TILE)
     size = -(-count // tiles)
-    if tiles == 1:
-        return jax.vmap(at_point)(points)
 
     def cut(leaf: Array) -> Array:
         padded = jnp.pad(leaf, [(0, tiles * size - count)] + [(0, 0)] * (leaf.ndim - 1), mode="edge")
         return padded.reshape(tiles, size, *leaf.shape[1:])
 
-    done = jax.lax.map(jax.vmap(at_point), jax.tree.map(cut, points))
+    done = jax.lax.map(lambda tile: of_tile(_points_apart(tile)), jax.tree.map(cut, points))
     return jax.tree.map(lambda leaf: leaf.reshape(tiles * size, *leaf.shape[2:])[:count], done)
 
 
@@ -193,7 +249,8 @@ class Lobe(eqx.Module):
     @classmethod
     def of_terms(cls, kept: tuple[tuple[Float[Array, "P S C"], Float[Array, "P S"]], ...]) -> "Lobe":
         """The lobe of terms that are kept."""
-        return cls(jnp.max(jnp.concatenate([_peak(*terms) for terms in kept], axis=1), axis=1), kept=kept)
+        peaks = [jnp.where(jnp.max(weight, axis=-1) > 0, log_cosine, NO_LOBE) for weight, log_cosine in kept]
+        return cls(jnp.max(jnp.concatenate(peaks, axis=1), axis=1), kept=kept)
 
     def __call__(self, n: Scalar, peak: Scalar | float = 0.0) -> tuple[Float[Array, "*N P C"], Float[Array, "*N P C"]]:
         """The basis image without the model's scale, and its derivative in n.
@@ -290,12 +347,8 @@ def _relative(n: Scalar, peak: Scalar | float, terms: LightTerms) -> tuple[Array
     return value, value * exponent
 
 
-def _peak(weight: Array, log_cosine: Array) -> Array:
-    return jnp.where(jnp.max(weight, axis=-1) > 0, log_cosine, NO_LOBE)
-
-
-def _added_or_larger(total: tuple[Array, Array], value: tuple[Array, Array]) -> tuple[Array, Array]:
-    return total[0] + value[0], jnp.maximum(total[1], value[1])
+def _peak(terms: LightTerms) -> Array:
+    return jnp.where(terms.weight > 0, terms.log_cosine, NO_LOBE)
 
 
 def average(weight: Float[Array, "K M"], values: Float[Array, "*N K*M C"]) -> Float[Array, "*N K C"]:
@@ -319,14 +372,7 @@ def diffuse_and_lobe(
     elif specular and _size(jax.eval_shape(partial(_stacked_terms, model, lighting), points)) <= STACKED_VALUES:
         diffuse, kept = _stacked_terms(model, lighting, points)
     else:
-        diffuse, peak = sum_over_samples(
-            model,
-            points,
-            lighting,
-            lambda terms: (terms.diffuse, _peak(terms.weight, terms.log_cosine)),
-            combine=_added_or_larger,
-            start=(0.0, NO_LOBE),
-        )
+        diffuse, peak = over_samples(model, points, lighting, lambda terms: terms.diffuse)
         return diffuse, Lobe(peak, model, source=(points, lighting)) if specular else None
     if not specular:
         return diffuse, None

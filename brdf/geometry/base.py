@@ -1,7 +1,7 @@
 """What a shape is: where a ray hits it, for camera and shadows alike. For one ray; batching is ``jax.vmap`` outside."""
 
 import abc
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -33,9 +33,11 @@ class Shape(Checked):
 
     Attributes:
         fitted: False for an occluder, which casts shadows and hides what lies behind it, but is not fitted.
+        in_components: whether the covers take vectors in `brdf.vectors.Components`.
     """
 
     fitted: bool = eqx.field(static=True, default=True, kw_only=True)
+    in_components: ClassVar[bool] = False
 
     @property
     def convex(self) -> bool:

@@ -1,5 +1,7 @@
 """The sphere."""
 
+from typing import ClassVar
+
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -24,6 +26,7 @@ class Sphere(Shape):
         >>> pillar = brdf.Sphere(center=[1, 1, 1], radius=0.2, fitted=False)  # only casts a shadow
     """
 
+    in_components: ClassVar[bool] = True
     center: Vector = checked(vector, "center")
     radius: Scalar = checked(positive, "radius")
 
@@ -37,7 +40,7 @@ class Sphere(Shape):
         The half chord comes from the distance of the ray to the centre, not from the quadratic's discriminant, which
         cancels for a small far sphere (Haines, Günther and Akenine-Möller, Ray Tracing Gems 2019, chapter 7).
         """
-        to_origin = jnp.asarray(origin - self.center)
+        to_origin = origin - self.center
         along = dot(to_origin, direction)
         nearest = to_origin - along * direction
         squared_half_chord = self.radius * self.radius - dot(nearest, nearest)
@@ -50,7 +53,7 @@ class Sphere(Shape):
 
     def cover_patch(self, origin: Vector, direction: Vector, distance: Scalar, radius: Array) -> Scalar:
         """The share of the patch within the cone that the sphere fills; see `Shape.cover_patch`."""
-        to_center = jnp.asarray(self.center - origin)
+        to_center = self.center - origin
         along = dot(to_center, direction)
         miss = norm(to_center - along * direction)
         # of the angle between the direction and the sphere's rim

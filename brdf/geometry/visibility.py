@@ -9,13 +9,15 @@ A hard shadow edge has no derivative: gradients by positions of lights and shape
 They are exact for pixels that no edge passes, for soft shadows of spheres and rectangles, and by intensities.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
 from brdf.checks import Scalar, Vector
 from brdf.geometry.base import Shape
 from brdf.geometry.surface_points import SurfacePoints
-from brdf.vectors import dot
+from brdf.vectors import Components, dot, largest
 
 OFFSET = 300
 """Shadow rays start this many rounding errors above the surface: 4e-5 of the coordinates in float32."""
@@ -33,13 +35,15 @@ def share_seen(
     All shapes of the scene are given, in its order: the point knows by that which of them it lies on.
     """
     position, normal = point.position, point.normal if point.facet is None else point.facet
-    size = jnp.max(jnp.abs(position))
-    rounding = OFFSET * jnp.finfo(jnp.result_type(position)).eps
+    size = jnp.maximum(largest(position), largest(-position))
+    rounding = OFFSET * jnp.finfo(size.dtype).eps
     before = distance * (1 - 4 * rounding)
     seen = jnp.ones_like(size) if point.facet is None else jnp.where(dot(normal, to_light) > 0, 1.0, 0.0)
     for index, shape in enumerate(occluders):
         start = position + jax.lax.stop_gradient(rounding * jnp.maximum(size, shape.extent())) * normal
-        if radius is None:
+        if isinstance(start, Components) and not shape.in_components:
+            covered = _at_each(shape, start, to_light, before, radius)
+        elif radius is None:
             covered = shape.cover(start, to_light, before)
         else:
             covered = shape.cover_patch(start, to_light, before, radius)
@@ -47,3 +51,13 @@ def share_seen(
             covered = jnp.where(point.shape == index, 0.0, covered)  # the horizon has dealt with that
         seen *= 1.0 - covered
     return seen
+
+
+def _at_each(shape: Shape, start: Components, to_light: Any, before: Scalar, radius: Scalar | None) -> Scalar:
+    """The same for points whose vectors are in components, by a shape that takes one point."""
+    vectors = start.stacked(), to_light.stacked()
+    *numbers, size = jnp.broadcast_arrays(before, 0.0 if radius is None else radius, vectors[0][..., 0])
+    vectors = tuple(jnp.broadcast_to(vector, (*size.shape, 3)) for vector in vectors)
+    if radius is None:
+        return jax.vmap(shape.cover)(*vectors, numbers[0])
+    return jax.vmap(shape.cover_patch)(*vectors, *numbers)

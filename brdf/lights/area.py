@@ -39,7 +39,7 @@ from brdf.errors import InputError
 from brdf.geometry.surface_points import SurfacePoints
 from brdf.lights.base import Light, LightSample
 from brdf.lights.sample_sets import disc_rule, square_rule
-from brdf.vectors import divide, dot, norm, normalize, square_root
+from brdf.vectors import Components, cross, divide, dot, norm, normalize, square_root
 
 SAMPLES = 64
 
@@ -116,6 +116,7 @@ class RectangleLight(Light):
     radiance: Spectrum = checked(spectrum, "radiance")
     samples: int = eqx.field(static=True, converter=sample_number, default=SAMPLES)
     type_name: ClassVar[str] = "rectangle"
+    emits: ClassVar[tuple[int, ...]] = (3,)
 
     def __check_init__(self):
         """Refuse edges that span no area."""
@@ -132,7 +133,7 @@ class RectangleLight(Light):
         corner = center - edge_u - edge_v
         starts, edges = (corner, corner + 2 * edge_v), (2 * edge_u, 2 * edge_u)
         _, patch, share = _above_horizon(point, starts, edges, (s, t))
-        area_vector = jnp.cross(edge_u, edge_v)
+        area_vector = cross(edge_u, edge_v)
         area = 4 * norm(area_vector) * weight * share
         return _from_patch(radiance, patch, area, normalize(area_vector), point.position)
 
@@ -160,6 +161,7 @@ class PolygonLight(Light):
     samples: int = eqx.field(static=True, converter=sample_number, default=SAMPLES)
     triangles: tuple[tuple[int, int, int], ...] = eqx.field(static=True, init=False)
     type_name: ClassVar[str] = "polygon"
+    emits: ClassVar[tuple[int, ...]] = (1,)
 
     def __post_init__(self):
         """Cut it into triangles, once."""
@@ -182,7 +184,7 @@ class PolygonLight(Light):
         """From a patch of one triangle above the horizon."""
         area_vector, radiance, (a, b, c), s, t, weight = row
         place, patch, share = _above_horizon(point, (a, a), (b - a, c - a), (s, t))
-        area = norm(jnp.cross(b - a, c - a)) * place * weight * share
+        area = norm(cross(b - a, c - a)) * place * weight * share
         return _from_patch(radiance, patch, area, normalize(area_vector), point.position)
 
 
@@ -252,6 +254,7 @@ class SphereLight(Light):
     radiance: Spectrum = checked(spectrum, "radiance")
     samples: int = eqx.field(static=True, converter=sample_number, default=SAMPLES)
     type_name: ClassVar[str] = "sphere"
+    emits: ClassVar[tuple[int, ...]] = (2,)
 
     def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """The light, and a rule over the cap of directions in which a point sees it."""
@@ -302,4 +305,5 @@ def perpendicular(axis: Array) -> tuple[Array, Array]:
     sign = jnp.where(z < 0, -1.0, 1.0)
     a = -1.0 / (sign + z)
     b = x * y * a
-    return jnp.stack([1.0 + sign * x * x * a, sign * b, -sign * x]), jnp.stack([b, sign + y * y * a, -y])
+    across, along = (1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
+    return tuple(Components(one) if isinstance(axis, Components) else jnp.stack(one) for one in (across, along))

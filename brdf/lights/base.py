@@ -10,6 +10,8 @@ is no larger for a thousand lights than for two.
 """
 
 import abc
+import functools
+import operator
 from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar, NamedTuple
 
@@ -51,9 +53,11 @@ class Light(Checked):
 
     Attributes:
         type_name: what ``type`` in a scene file says.
+        emits: the places in a row whose product is a spectrum that the sample's intensity is proportional to.
     """
 
     type_name: ClassVar[str]
+    emits: ClassVar[tuple[int, ...]]
 
     @abc.abstractmethod
     def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
@@ -95,6 +99,18 @@ class LightStack(eqx.Module):
     def samples(self) -> int:
         """Of all the lights."""
         return self.light.shape[0] * (self.nodes[0].shape[1] if self.nodes else 1)
+
+    @property
+    def spectra(self) -> list[Array]:
+        """What multiplies each other to what a sample emits, (L, 1 or S, C) each."""
+        found, count = [*self.numbers, *self.nodes], len(self.numbers)
+        return [found[place] if place >= count else found[place][:, None] for place in self.kind.emits]
+
+    def emitted(self, channels: int) -> Float[Array, "L S C"]:
+        """What each sample emits, in so many channels, for an intensity of 1."""
+        each = self.nodes[0].shape[1] if self.nodes else 1
+        product = functools.reduce(operator.mul, self.spectra)
+        return jnp.broadcast_to(product, (self.light.shape[0], each, channels))
 
     def rows(self) -> tuple[tuple[Array, ...], Array]:
         """What `Light.sample` takes, one row for each sample, and the light that each belongs to."""

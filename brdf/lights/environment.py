@@ -30,7 +30,7 @@ from brdf.geometry.surface_points import SurfacePoints
 from brdf.lights.area import perpendicular
 from brdf.lights.base import Light, LightSample
 from brdf.lights.sample_sets import hemisphere_rule, ring_rule
-from brdf.vectors import dot, normalize, square_root
+from brdf.vectors import dot, normalize, square_root, trace
 
 CONSTANT_SAMPLES = 512
 MAP_SAMPLES = 1024
@@ -70,6 +70,7 @@ class ConstantEnvironment(Light):
     radiance: Spectrum = checked(spectrum, "radiance")
     samples: int = eqx.field(static=True, converter=sample_number, default=CONSTANT_SAMPLES)
     type_name: ClassVar[str] = "environment"
+    emits: ClassVar[tuple[int, ...]] = (0,)
 
     def __check_init__(self):
         """Refuse a single sample."""
@@ -101,7 +102,7 @@ class ConstantEnvironment(Light):
         stretch = end * STEEPNESS * jnp.exp(STEEPNESS * s) / np.expm1(STEEPNESS)
         share = 8.0 * jnp.maximum(view_half, 0.0) * jnp.sin(angle) * stretch
         squared_radius = jnp.where(lobe_only > 0, share, 2.0) * weight
-        to_light = normalize(jnp.where(lobe_only > 0, mirrored, even))
+        to_light = normalize(even + lobe_only * (mirrored - even))
         intensity, radius = radiance * squared_radius, square_root(squared_radius)
         return LightSample(to_light, intensity, jnp.asarray(jnp.inf), radius, lobe_only=lobe_only)
 
@@ -147,6 +148,7 @@ class EnvironmentMap(Light):
     patches: Patches
     samples: int = eqx.field(static=True)
     type_name: ClassVar[str] = "environment"
+    emits: ClassVar[tuple[int, ...]] = (0, 1)
 
     def __init__(self, pixels: Any, *, radiance: Any = 1.0, samples: int = MAP_SAMPLES):
         """Take a map's colour out where it has only one, and cut it up."""
@@ -173,7 +175,7 @@ class EnvironmentMap(Light):
     def sample(point: SurfacePoints, *row: Any) -> LightSample:
         """The same at every point: the light of one rectangle of the map."""
         radiance, intensity, mean, covariance = row
-        radius = square_root(2.0 * jnp.trace(covariance))  # that of a disc of the same variance
+        radius = square_root(2.0 * trace(covariance))  # that of a disc of the same variance
         moments = (mean, covariance)
         return LightSample(normalize(mean), radiance * intensity, jnp.asarray(jnp.inf), radius, moments)
 

@@ -34,6 +34,7 @@ class DirectionalLight(Light):
     direction: Vector = checked(direction_value, "direction")
     intensity: Spectrum = checked(spectrum, "intensity")
     type_name: ClassVar[str] = "directional"
+    emits: ClassVar[tuple[int, ...]] = (1,)
 
     def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """It is a single sample."""
@@ -78,6 +79,7 @@ class PointLight(Light):
     intensity: Spectrum = checked(spectrum, "intensity")
     attenuation: Vector = eqx.field(converter=_attenuation, default=(0.0, 0.0, 1.0))
     type_name: ClassVar[str] = "point"
+    emits: ClassVar[tuple[int, ...]] = (1,)
 
     def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """It is a single sample."""
@@ -125,6 +127,7 @@ class SpotLight(Light):
     exponent: Scalar = eqx.field(converter=partial(number, "exponent", low=0.0), default=0.0)
     attenuation: Vector = eqx.field(converter=_attenuation, default=(0.0, 0.0, 1.0))
     type_name: ClassVar[str] = "spot"
+    emits: ClassVar[tuple[int, ...]] = (1,)
 
     def __check_init__(self):
         """Refuse what OpenGL does not define."""
