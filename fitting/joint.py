@@ -335,19 +335,18 @@ def _solve(problem: JointProblem, seen: Observed, solver: str, tolerance: float,
             break
         held = (held | below) & ~inwards
     found, vector = problem.at(vector), np.asarray(vector, np.float64)
+    warnings = () if converged else (f"the solver stopped after {steps} steps without an end: raise max_steps",)
     parts = np.split(residual, np.cumsum([target.size for target in problem.targets])[:-1])
-    left = left_over(
-        seen, [part.reshape(shown.shape) for part, shown in zip(parts, seen.shown, strict=True)], vector.size
-    )
+    residuals = [part.reshape(shown.shape) for part, shown in zip(parts, seen.shown, strict=True)]
+    left = left_over(seen, residuals, vector.size, warnings)
     material, scenes = jax.tree.map(np.asarray, found.content())
     given = jax.tree.leaves((material, seen.problem.scenes))
     given = [given[place] for place in problem.places]
     parameters, errors, correlation = _with_errors(
         problem, given, vector, held, columns, float(np.mean(left["noise"] ** 2))
     )
-    warnings = () if converged else (f"the solver stopped after {steps} steps without an end: raise max_steps",)
     return JointResult(
-        **left | {"warnings": warnings + left["warnings"]},
+        **left,
         material=material,
         parameters=parameters,
         correlation=correlation,
@@ -360,13 +359,16 @@ def _solve(problem: JointProblem, seen: Observed, solver: str, tolerance: float,
     )
 
 
-def left_over(seen: Observed, residuals: Sequence[Float[np.ndarray, "H W C"]], unknowns: int) -> dict[str, Any]:
+def left_over(
+    seen: Observed, residuals: Sequence[Float[np.ndarray, "H W C"]], unknowns: int, warnings: tuple[str, ...]
+) -> dict[str, Any]:
     """What a `FitResult` says of the pictures and of what a fit leaves of them.
 
     Args:
         seen: what was fitted.
         residuals: of each picture, 0 where a pixel does not count.
         unknowns: how many numbers were found.
+        warnings: that come before those of the residual.
     """
     squares = np.sum([np.sum(np.square(residual), axis=(0, 1)) for residual in residuals], axis=0)
     told = [np.asarray(shown, np.float64)[counted] for shown, counted in zip(seen.shown, seen.counted, strict=True)]
@@ -380,7 +382,7 @@ def left_over(seen: Observed, residuals: Sequence[Float[np.ndarray, "H W C"]], u
         "residual": share,
         "pixels": pixels,
         "left_out": seen.left_out,
-        "warnings": structure_warning(known),
+        "warnings": (*warnings, *structure_warning(known)),
         "candidates": (),
         "optimum": None,
         "loss": seen.problem.loss,

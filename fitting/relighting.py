@@ -272,9 +272,8 @@ def _result(
         ]
     residual = np.zeros((*seen.counted[0].shape, channels))
     residual[seen.counted[0]] = pixels - np.einsum("lc,lpc->pc", factors, columns)
-    left = left_over(seen, [residual], factors.size)
     return LightFit(
-        **left | {"warnings": (*(f"{FACTOR}: {KEPT}",) * has_material, *left["warnings"])},
+        **left_over(seen, [residual], factors.size, (f"{FACTOR}: {KEPT}",) * has_material),
         material=material,
         parameters=tuple(parameters),
         correlation=np.eye(len(free_parameters(parameters))),

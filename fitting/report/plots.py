@@ -72,8 +72,10 @@ def comparison(result: "FitResult", picture: int | None = None) -> Figure:
         panels[key].axhline(row, color="white", linewidth=0.6, linestyle=(0, (4, 4)))
         panels[key].set_title(title)
     _residual(panels["residual"], target, fitted, counted)
+    down, across = window(counted)
+    limits = {"xlim": (across.start - 0.5, across.stop - 0.5), "ylim": (down.stop - 0.5, down.start - 0.5)}
     for key in ("target", "fit", "residual"):
-        panels[key].set(xticks=[], yticks=[], **_around(counted))
+        panels[key].set(xticks=[], yticks=[], **limits)
     if specular:
         if result.optimum is not None:
             _profile(panels["profile"], result)
@@ -115,17 +117,19 @@ def _unexplained(result, picture):
     return np.sum((result.fitted(picture)[counted] - values) ** 2) / max(np.sum(values**2), 1e-300)
 
 
-def _around(counted):
-    """Limits of axes that show what counts, and a margin around it: a thing may be small in its picture."""
+def window(counted: np.ndarray) -> tuple[slice, slice]:
+    """Rows and columns that show what counts, and a margin around it: a thing may be small in its picture.
+
+    Args:
+        counted: (H, W).
+    """
+    height, width = counted.shape
     if not counted.any():
-        return {}
+        return slice(0, height), slice(0, width)
     (top, bottom), (left, right) = (np.flatnonzero(counted.any(axis=axis))[[0, -1]] for axis in (1, 0))
     margin = 2 + max(bottom - top, right - left) // 16
-    height, width = counted.shape
-    return {
-        "xlim": (max(left - margin, 0) - 0.5, min(right + margin, width - 1) + 0.5),
-        "ylim": (min(bottom + margin, height - 1) + 0.5, max(top - margin, 0) - 0.5),
-    }
+    rows = slice(max(top - margin, 0), min(bottom + margin + 1, height))
+    return rows, slice(max(left - margin, 0), min(right + margin + 1, width))
 
 
 def _highlight(result, picture, counted, specular):

@@ -120,7 +120,7 @@ def viewer(result: FitResult, picture: int | None = None) -> str:
         result: of a fit.
         picture: which of its pictures, from 0; None takes the one that is explained worst.
     """
-    from fitting.report.plots import shown_picture  # Matplotlib takes long to load
+    from fitting.report.plots import shown_picture, window  # Matplotlib takes long to load
 
     picture = shown_picture(result, picture)
     scene, material = result.scenes[picture], result.material
@@ -129,7 +129,10 @@ def viewer(result: FitResult, picture: int | None = None) -> str:
     chosen = [0, count // 2, count - 1] if count > 3 else [min(channel, count - 1) for channel in range(3)]
     target, fitted = np.asarray(result.targets[picture], np.float32), result.fitted(picture)
     counted = np.asarray(result.counted[picture])
-    left, top, stride, (rows, columns) = _window(counted)
+    rows, columns = window(counted)
+    left, top = int(columns.start), int(rows.start)
+    stride = math.ceil(max(rows.stop - top, columns.stop - left) / LARGEST)
+    rows, columns = slice(top, rows.stop, stride), slice(left, columns.stop, stride)
     target, fitted = (_of_channels(image, chosen)[rows, columns] for image in (target, fitted))
     counted = counted[rows, columns]
     drawn, notes = _scene(scene, chosen)
@@ -185,19 +188,6 @@ def _with_alpha(image, counted):
 def _of_channels(image, chosen):
     """Three colours of an image, or of one colour."""
     return np.take(image, [min(channel, image.shape[-1] - 1) for channel in chosen], axis=-1)
-
-
-def _window(counted):
-    """The part of a picture that is held: what counts and a margin around it, and how many pixels a step goes."""
-    height, width = counted.shape
-    top, bottom, left, right = 0, height, 0, width
-    if counted.any():
-        (top, bottom), (left, right) = (np.flatnonzero(counted.any(axis=axis))[[0, -1]] for axis in (1, 0))
-        margin = 2 + max(bottom - top, right - left) // 16
-        top, left = max(top - margin, 0), max(left - margin, 0)
-        bottom, right = min(bottom + margin + 1, height), min(right + margin + 1, width)
-    stride = math.ceil(max(bottom - top, right - left) / LARGEST)
-    return int(left), int(top), stride, (slice(top, bottom, stride), slice(left, right, stride))
 
 
 def _family(material):
