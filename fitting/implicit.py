@@ -104,7 +104,8 @@ def sensitivity(result: FitResult, by: Callable[[list[brdf.Scene]], Sequence[Any
     moves = -unknowns.T @ _solve(hessian, unknowns @ np.asarray(rows).T)
     if "n" in index:
         moves[index["n"]] *= np.exp(vector[index["n"], None])
-    sizes, found = dict.fromkeys(("k_a", "k_d", "k_s"), result.material.k_d.shape) | {"n": ()}, []
+    channels: tuple[int, ...] = result.material.k_d.shape
+    sizes, found = dict.fromkeys(("k_a", "k_d", "k_s"), channels) | {"n": ()}, []
     for leaf, block in zip(leaves, known, strict=True):
         parts = {key: np.zeros((*size, *leaf.shape)) for key, size in sizes.items()}
         for key, place in index.items():

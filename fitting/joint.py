@@ -33,7 +33,7 @@ from fitting.pixels import Observed, observe
 from fitting.problem import CLASSIC, FitProblem, model_name, state_problem
 from fitting.progress import waiting
 from fitting.report import FitResult
-from fitting.result import Parameter, free_parameters
+from fitting.result import Parameter
 from fitting.solver.nnls import inverse_diagonal
 from fitting.uncertainty.intervals import NORMAL_95, above_zero
 from fitting.uncertainty.residual_correlation import correlation_in_rows, structure_warning
@@ -408,50 +408,51 @@ def _with_errors(
     """
     columns = np.where(held[:, None], 0.0, columns)
     blocks = np.split(np.arange(vector.size), np.cumsum([leaf.size for leaf in problem.freed()])[:-1])
-    leaves = list(zip(problem.words, problem.names, blocks, given, strict=True))
-    parts = []
-    for _, name, block, _ in leaves:
-        across = np.linalg.svd(vector[block][None])[2][1:] * np.linalg.norm(vector[block])
-        parts.append(across @ columns[block] if name in DIRECTIONS else columns[block])
+    both = list(zip(problem.names, blocks, strict=True))
+    parts = [_across(vector[block]) @ columns[block] if name in DIRECTIONS else columns[block] for name, block in both]
     design = np.concatenate(parts)
-    gram = design @ design.T
-    variance = noise * inverse_diagonal(gram, DEPENDENT)
+    gram, ends = design @ design.T, np.cumsum([len(part) for part in parts])[:-1]
     scale = np.sqrt(np.where(np.diag(gram) > 0, np.diag(gram), 1.0))
     inverse = np.linalg.pinv(gram / np.outer(scale, scale), rcond=DEPENDENT, hermitian=True)
+    deviation = np.split(np.sqrt(noise * inverse_diagonal(gram, DEPENDENT)), ends)
     parameters, errors, at = [], [], []
-    for (word, name, block, leaf), own in zip(leaves, np.split(np.arange(len(gram)), _ends(parts)), strict=True):
+    for word, (name, block), leaf, own, place in zip(
+        problem.words, both, given, deviation, np.split(np.arange(len(gram)), ends), strict=True
+    ):
         if name in DIRECTIONS:
-            error = float(np.degrees(np.sqrt(np.sum(variance[own]))))
+            error = float(np.degrees(np.linalg.norm(own)))
             before, after = (one / np.linalg.norm(one) for one in (np.asarray(leaf, np.float64), vector[block]))
             turned = float(np.degrees(np.arctan2(np.linalg.norm(np.cross(before, after)), before @ after)))
             parameters.append(_parameter(word, None, turned, error, direction=tuple(after.tolist())))
-            errors.append(error)
+            errors.append(np.asarray(error))
             at.append(-1)
             continue
         values = np.exp(vector[block]) if name == "n" else vector[block]
-        deviations = np.where(held[block], 0.0, np.sqrt(variance[own]) * (values if name == "n" else 1.0))
-        errors.append(deviations.reshape(np.shape(leaf)))
-        at += own.tolist()
-        for index, (value, deviation) in enumerate(zip(values, deviations, strict=True)):
-            value, error, interval = float(value), float(deviation), None
-            if np.isfinite(error) and not held[block][index]:
-                interval = value - NORMAL_95 * error, value + NORMAL_95 * error
-                if name == "n":
-                    interval = value * np.exp(-NORMAL_95 * error / value), value * np.exp(NORMAL_95 * error / value)
-                elif name in NOT_NEGATIVE:
-                    interval = above_zero(value, error)
-            channel = index if np.ndim(leaf) else None
-            parameters.append(_parameter(word, channel, value, error, interval, bool(held[block][index])))
-    is_free = [one in free_parameters(parameters) for one in parameters]
-    at = np.array(at)[is_free]
+        own = np.where(held[block], 0.0, own * (values if name == "n" else 1.0))
+        errors.append(own.reshape(np.shape(leaf)))
+        at += place.tolist()
+        for index, (value, error) in enumerate(zip(values.tolist(), own.tolist(), strict=True)):
+            at_bound = bool(held[block][index])
+            interval = _interval(name, value, error) if np.isfinite(error) and not at_bound else None
+            parameters.append(_parameter(word, index if np.ndim(leaf) else None, value, error, interval, at_bound))
+    at = np.array(at)[[one.value is not None and not one.at_bound for one in parameters]]
     error = np.sqrt(np.diag(inverse)[at])
     correlation = np.where((at >= 0)[:, None] & (at >= 0), inverse[np.ix_(at, at)] / np.outer(error, error), 0.0)
     np.fill_diagonal(correlation, 1.0)
-    return tuple(parameters), tuple(map(np.asarray, errors)), correlation
+    return tuple(parameters), tuple(errors), correlation
 
 
-def _ends(parts: Sequence[np.ndarray]) -> np.ndarray:
-    return np.cumsum([len(part) for part in parts])[:-1]
+def _across(direction: np.ndarray) -> np.ndarray:
+    """Small turns of a direction, of an angle of 1: two vectors across it, of its length."""
+    return np.linalg.svd(direction[None])[2][1:] * np.linalg.norm(direction)
+
+
+def _interval(name: str, value: float, error: float) -> tuple[float, float]:
+    if name == "n":
+        return value * np.exp(-NORMAL_95 * error / value), value * np.exp(NORMAL_95 * error / value)
+    if name in NOT_NEGATIVE:
+        return above_zero(value, error)
+    return value - NORMAL_95 * error, value + NORMAL_95 * error
 
 
 def _parameter(name: str, channel: int | None, value: float, error: float, *further: Any, **named: Any) -> Parameter:
