@@ -14,7 +14,7 @@ import brdf
 from brdf.errors import InputError
 from brdf.files import input_file, read_toml
 from fitting.cli.common import PictureOptions, named_as
-from fitting.photographs.archives import read_archive, read_array
+from fitting.photographs.archives import read_archive
 from fitting.photographs.ball import Circle, ball_normals, ball_points, find_circle, parse_circle
 from fitting.photographs.light_files import parse_numbers, read_directions, read_intensities
 
@@ -241,8 +241,9 @@ def _photographs(targets: list[Path], options: PictureOptions, pictures: Any, ma
         circle, notes = ball_in(options.sphere or "", mask)
         points = ball_points((height, width), circle)
     else:
-        with named_as({"normal": options.normals}):
-            points = brdf.SurfacePoints.from_normals(_read_normals(options.normals))
+        from fitting.maps.map_inputs import read_normal_map
+
+        points = brdf.SurfacePoints.from_normals(read_normal_map(options.normals))
         came = f"is {points.mask.shape[1]} x {points.mask.shape[0]}, the pictures {width} x {height}"
         _require(points.mask.shape == (height, width), options.normals, came, "Give a normal for each pixel")
     if options.lights is not None:
@@ -307,20 +308,6 @@ def stated_error(light: Any) -> str:
         share = 100 * light.unexplained
         doubt = f" (the shading leaves {share:.0f} % of the light unexplained: it can be off by several times that)"
     return f"± {light.error:.2g}°{doubt}"
-
-
-def _read_normals(path: Path) -> Array:
-    """Normals (H, W, 3) from an .npy file, or from a picture: floats as they are, codes as 2 v - 1."""
-    if path.suffix.lower() == ".npy":
-        with input_file(path).open("rb") as file:
-            return read_array(file, path, path.stat().st_size)
-    picture = brdf.read_picture(path, encoding="linear")
-    if picture.saturation is None:
-        return picture.pixels
-    normal = 2.0 * picture.pixels - 1.0
-    # A code of 0 in all channels, and those around the middle, are how tools write "no surface".
-    empty = np.all(picture.pixels == 0, axis=-1) | (np.sum(normal * normal, axis=-1) < 0.25)
-    return np.where(empty[..., None], 0.0, normal)
 
 
 def _read_photographs(path: Path, mask: Any) -> Any:

@@ -139,10 +139,10 @@ def read_normal_map(path: str | Path, *, flip_y: bool = False) -> Float[np.ndarr
         with brdf.ImageReader(path, encoding="linear") as reader:
             normal = reader.read()
             if reader.is_integer:
-                normal = 2 * normal - 1
-                normal[np.sum(normal * normal, axis=-1) < NO_SURFACE] = 0
+                empty, normal = np.all(normal == 0, axis=-1), 2 * normal - 1
+                normal[empty | (np.sum(normal * normal, axis=-1) < NO_SURFACE)] = 0
     if normal.ndim != 3 or normal.shape[2] != 3:
-        raise InputError(path, f"is of shape {normal.shape}, a normal has 3 channels", "Give a map of normals")
+        raise InputError(path, f"must be of shape (H, W, 3), got {normal.shape}", "Give a normal map")
     return normal * np.array([1, -1 if flip_y else 1, 1], np.float32)
 
 
