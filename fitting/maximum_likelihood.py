@@ -44,6 +44,8 @@ MOST_STEPS, LEAST_GAIN = 12, 1e-3
 LARGEST_SHIFT = 0.5
 # The noise is known well enough where it changes by less than this factor.
 ENOUGH_KNOWN = 1.1
+# Where the Hessian is no larger all values are surely inside their codes.
+NOTHING = 1e-100
 # So many values have to tell of a number before the Hessian is taken for its error.
 ENOUGH_VALUES = 6.0
 SUBSAMPLE = 16384
@@ -53,6 +55,8 @@ FIRST_NOISE = 0.3
 # Rounds of least squares in codes; each leaves some hundredth of its change. What ends them: such a change, in standard
 # errors, and this one of the noise.
 MOST_ROUNDS, ENOUGH_CHANGE, ENOUGH_NOISE_CHANGE = 10, 2.0, 0.02
+# Predictions are the same to such a share of a code, where these are so many values, and so many times as usual.
+ALIKE, FEWEST_ALIKE, MORE_ALIKE = 1024, 64, 10
 # An open end tells where a value is predicted within so many s of it; noise below this share of the picture is none.
 END_REACH, NO_NOISE = 4.0, 1e-5
 
@@ -153,16 +157,18 @@ def most_likely(fit: ModelFit) -> ModelFit:
     deviation = math.sqrt(float(np.sum(optimum.cost)) / max(float(np.sum(optimum.pixels)), 1.0))
     if exact and deviation <= NO_NOISE * float(np.max(optimum.square / np.maximum(optimum.pixels, 1))) ** 0.5:
         return fit
-    # Weights of least squares leave out what is clipped, which says something here.
-    pictures = [dataclasses.replace(picture, weight=None) for picture in fit.pictures]
     at = Estimate(optimum.x, math.log(optimum.n), 1.0)
-    squares, count = np.sum([_squares(picture, at) for picture in pictures], axis=0)
+    squares, count = np.sum([_squares(picture, at) for picture in fit.pictures], axis=0)
     at = at._replace(noise=math.sqrt(squares / max(count, 1)))
+    lossy = any(bounds.lossy for bounds in map(_bounds, fit.pictures))
+    # Weights of least squares leave out what is clipped, which says something here.
+    weights = [_alike(picture, at) if lossy else None for picture in fit.pictures]
+    pictures = list(map(_with_weight, fit.pictures, weights))
     rounding = 0.0 if exact else 1 / 12
     widest = 1.0 if exact else max(_widest(picture) for picture in pictures)
-    if exact or at.noise**2 > (ENOUGH_NOISE**2 + rounding) * widest**2:
+    if exact or lossy or at.noise**2 > (ENOUGH_NOISE**2 + rounding) * widest**2:
         linear = all(bounds.encoding == "linear" for bounds in map(_bounds, pictures))
-        if linear and not any(_open_ends_tell(picture, at) for picture in pictures):
+        if linear and not lossy and not any(_open_ends_tell(picture, at) for picture in pictures):
             return fit
         said = _reweighted(fit._replace(pictures=pictures), at.noise, rounding)
     else:
@@ -170,6 +176,25 @@ def most_likely(fit: ModelFit) -> ModelFit:
     found = said.optimum
     optimum = dataclasses.replace(optimum, x=found.x, n=found.n, flat=found.flat)
     return fit._replace(optimum=optimum, evidence=said)
+
+
+def _with_weight(picture: Picture, weight: np.ndarray | None) -> Picture:
+    return dataclasses.replace(picture, weight=weight)
+
+
+def _alike(picture: Picture, at: Estimate) -> Float[np.ndarray, "P C"]:
+    """Weights for values whose prediction is the same, as on an unlit side: these share one rounding error.
+
+    It came before the losses of the file, which hide it. N values of noise s whose mean has a further error of variance
+    1 / 12 weigh 1 / (1 + N / 12 s²) each.
+    """
+    bounds, code = _bounds(picture), np.rint(_codes(picture, at) * ALIKE).astype(np.int64)
+    tells, weight = np.isfinite(bounds.lower) | np.isfinite(bounds.upper), np.ones(code.shape)
+    for one, some, own in zip(code.T, tells.T, weight.T, strict=True):
+        _, kind, count = np.unique(one[some], return_inverse=True, return_counts=True)
+        many = count > max(FEWEST_ALIKE, MORE_ALIKE * np.median(count)) if count.size else count > 0
+        own[some] = np.where(many, 1 / (1 + count / (12 * at.noise**2)), 1.0)[kind]
+    return weight
 
 
 def _near_edges(fit: ModelFit, at: Estimate) -> Evidence:
@@ -256,8 +281,8 @@ class _Stated:
 
     Attributes:
         picture: with working targets, and weights in codes².
-        squares: of the residual in codes; of a value at an open end what is to be expected.
-        count: of how many values.
+        squares: of the residual in codes times the weight; of a value at an open end what is to be expected.
+        count: of how many values, by their weight.
         closed: how many of these have both ends.
         closed_squares: of their residual.
         value: logarithm of the likelihood of the others.
@@ -265,8 +290,8 @@ class _Stated:
 
     picture: Picture
     squares: float
-    count: int
-    closed: int
+    count: float
+    closed: float
     closed_squares: float
     value: float
 
@@ -275,23 +300,25 @@ def _stated(picture: Picture, optimum: Optimum, noise: float, rounding: float) -
     bounds = _bounds(picture)
     made = jax.device_get(_linearised(picture, np.asarray(optimum.n), optimum.x))
     target, weight = np.array(made[0]), np.array(made[1])
-    squares, closed = float(made[2]), int(made[3])
+    squares, closed = float(made[2]), float(made[3])
     plain, value, count = squares, 0.0, closed
     half = np.isfinite(bounds.lower) ^ np.isfinite(bounds.upper)
     index = np.flatnonzero(half.any(axis=1))
     if index.size:
         s = math.sqrt(max(noise**2 - rounding, LEAST_NOISE**2))
-        told = _told(_some(picture, index), Estimate(optimum.x, math.log(optimum.n), s))
+        pixels = _some(picture, index)
+        told = _told(pixels, Estimate(optimum.x, math.log(optimum.n), s))
         told = _Told(*(part[..., : index.size, :] for part in told))
         at_end, own = half[index], s * bounds.spread[index if bounds.spread.ndim else ...]
+        weighs = np.broadcast_to(pixels.picture.weights, told.value.shape)[: index.size]
         curvature = told.weight * told.slope**2
         step = np.divide(told.score * told.slope, curvature, out=np.zeros_like(curvature), where=curvature > 0)
         target[index] = np.where(at_end, told.radiance + step, target[index])
-        weight[index] = np.where(at_end, curvature * noise**2, weight[index])
+        weight[index] = np.where(at_end, weighs * curvature * noise**2, weight[index])
         # Mean square of what the value may have been, about the prediction.
         expected = ((told.score * own) ** 2 + 1 - told.weight * own**2) * noise**2
-        squares += float(np.sum(expected, where=at_end))
-        value, count = float(np.sum(told.value, where=at_end)), closed + int(np.count_nonzero(at_end))
+        squares += float(np.sum(weighs * expected, where=at_end))
+        value, count = float(np.sum(weighs * told.value, where=at_end)), closed + float(np.sum(weighs, where=at_end))
     taken = dataclasses.replace(picture, target=jnp.asarray(target), weight=jnp.asarray(weight), bounds=None)
     return _Stated(taken, squares, count, closed, plain, value)
 
@@ -305,9 +332,10 @@ def _linearised(picture: Picture, n: AnyArray, x: AnyArray) -> tuple[Array, Arra
     closed = jnp.isfinite(bounds.lower) & jnp.isfinite(bounds.upper)
     middle = 0.5 * (jnp.where(closed, bounds.lower, 0.0) + jnp.where(closed, bounds.upper, 0.0))
     residual = jnp.where(closed, middle - code, 0.0)
-    weight = jnp.where(closed, (slope / bounds.spread) ** 2, 0.0)
-    squares = jnp.sum((residual / bounds.spread).astype(jnp.float64) ** 2)
-    return (radiance + residual / slope).astype(dtype), weight.astype(dtype), squares, jnp.count_nonzero(closed)
+    counts = jnp.where(closed, picture.weights, 0.0)
+    squares = jnp.sum((counts * (residual / bounds.spread) ** 2).astype(jnp.float64))
+    weight = (counts * (slope / bounds.spread) ** 2).astype(dtype)
+    return (radiance + residual / slope).astype(dtype), weight, squares, jnp.sum(counts.astype(jnp.float64))
 
 
 def _place(picture: Picture) -> tuple[np.ndarray, int]:
@@ -377,7 +405,7 @@ def _precision(at: Estimate, now: _Sums, space: _Space) -> Precision:
     whole = join_channels(now.weight, now.score, np.zeros(channels), at.x[2], np.ones(channels)).gram
     active = np.append(at.x.ravel() > 0, at.x[2].any())
     moved = space.design[:, active @ np.abs(space.design) > 0]
-    moved = moved[:, np.einsum("uv,uw,wv->v", moved, whole, moved) > np.finfo(float).tiny]
+    moved = moved[:, np.einsum("uv,uw,wv->v", moved, whole, moved) > NOTHING]
     gram = moved.T @ whole @ moved
     scale = np.sqrt(np.diag(gram))
     value, vector = np.linalg.eigh(gram / np.outer(scale, scale))

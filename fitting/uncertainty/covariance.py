@@ -100,6 +100,7 @@ def uncertainty(
     widening: Float[np.ndarray, " U"] | float = 1.0,
     copies: bool = False,
     columns: Float[np.ndarray, "3 C"] | None = None,
+    gain: float = 0.0,
 ) -> Uncertainty:
     """Errors of an optimum.
 
@@ -120,11 +121,13 @@ def uncertainty(
         widening: what to multiply errors by.
         copies: the channels are copies of each other, and err together.
         columns: root mean square over pixels of what each term shows at 1; None where no pixel weighs more.
+        gain: see `specular_gain`, where more pixels tell of it than those of the optimum's sums.
     """
+    gain = max(gain, specular_gain(optimum, noise))
     columns = rms_columns(optimum) if columns is None else columns
     dependent = DEPENDENT_SINGLE if single else DEPENDENT_DOUBLE
     reasons = np.full(free.shape, "", object)
-    n_reason = reasons[2, :] = _without_trace(optimum, noise, visible)
+    n_reason = reasons[2, :] = _without_trace(optimum, gain, visible)
     for term, channel in np.argwhere(~free & (reasons == "")):
         where = "this channel" if free[term].any() else "the scene"
         reasons[term, channel] = f"{LIGHT[term]} in {where}"
@@ -157,12 +160,23 @@ def uncertainty(
     return Uncertainty(x_error, x_interval, n_error, correlation, rise, reasons, n_reason, sums)
 
 
-def _without_trace(optimum: Optimum, noise: np.ndarray, visible: float) -> str:
+def _without_trace(optimum: Optimum, gain: float, visible: float) -> str:
     """Why there is no specular term to speak of; empty where there is one."""
     if optimum.flat:
         return "the picture has no highlight"
     if visible < NO_TRACE:
         return f"the highlight is below {NO_TRACE:g} of the picture"
+    unknowns = 1 + np.count_nonzero(optimum.x[2] > 0)
+    return "" if gain > SIGNIFICANT * unknowns else "the highlight does not stand out of the noise"
+
+
+def specular_gain(optimum: Optimum, noise: Float[np.ndarray, " C"]) -> float:
+    """By how many noise variances the cost rises without the specular term.
+
+    Args:
+        optimum: of the engine.
+        noise: standard deviation of the residual, (C,).
+    """
     gain = 0.0
     for gram, x, deviation in zip(optimum.gram, optimum.x.T, noise, strict=True):
         others = np.flatnonzero(x[:2] > 0)
@@ -170,8 +184,7 @@ def _without_trace(optimum: Optimum, noise: np.ndarray, visible: float) -> str:
         block = gram[np.ix_(others, others)]
         left = gram[2, 2] - cross @ np.linalg.lstsq(block, cross, rcond=DEPENDENT_DOUBLE)[0]
         gain += x[2] ** 2 * max(left, 0.0) / deviation**2
-    unknowns = 1 + np.count_nonzero(optimum.x[2] > 0)
-    return "" if gain > SIGNIFICANT * unknowns else "the highlight does not stand out of the noise"
+    return gain
 
 
 def rms_columns(optimum: Optimum, weight: float = 1.0) -> Float[np.ndarray, "3 C"]:

@@ -23,6 +23,7 @@ from fitting.uncertainty.covariance import (
     Uncertainty,
     residual_noise,
     rms_columns,
+    specular_gain,
     uncertainty,
 )
 from fitting.uncertainty.highlight import OFF_CENTRE, Highlight, highlight
@@ -88,10 +89,12 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> Interpretation
     if lobe is not None:
         visible = float(np.max(optimum.x[2]) * lobe.largest / max(np.max(seen.brightest), np.finfo(float).tiny))
     known = residual_correlation(pictures, seen.tiles, optimum, rounding)
-    spread, shared, widening, deviation, together = None, None, 1.0, noise, None
+    spread, shared, widening, deviation, together, gain = None, None, 1.0, noise, None, 0.0
     if fit.evidence is not None:
         # Each working target has the noise 1; what least squares leaves is rounding, which goes together.
         said, known = fit.evidence, known._replace(significant=False, noise=None)
+        # Of a small highlight the pixels near an edge may tell next to nothing.
+        gain = specular_gain(optimum, noise)
         fit, optimum, deviation = fit._replace(pictures=said.pictures, optimum=said.optimum), said.optimum, noise**0
         shared, together = shared_errors(said, seen.tiles)
         # What errs together by less than codes tell apart is in the errors, and no more need be said.
@@ -119,6 +122,7 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> Interpretation
         widening=widening,
         columns=columns,
         copies=seen.copies,
+        gain=gain,
     )
     interval = None
     # At k_d + k_s = 1 the cost still falls across the bound: a profile that does not know it has its least elsewhere.
@@ -164,11 +168,8 @@ def shared_errors(said: Evidence, tiles: Sequence[Tile]) -> tuple[Float[np.ndarr
         together = structure(errors, even=said.noise >= ROUNDED)
     if not (lossy or together.significant):
         return None, together
-    parts = [
-        scatter(picture, np.asarray(tile.target)[one.pixel], said.optimum, one, said.noise if lossy else None)
-        for picture, tile, one in zip(said.pictures, tiles, errors, strict=True)
-    ]
-    return np.sum(parts, axis=0), together
+    parts = zip(said.pictures, errors, strict=True)
+    return np.sum([scatter(picture, said.optimum, one) for picture, one in parts], axis=0), together
 
 
 def _structure(
@@ -191,10 +192,8 @@ def _structure(
 
 
 def _scattered(pictures: Sequence[Picture], seen: Observed, optimum: Optimum) -> Float[np.ndarray, "U U"]:
-    found = [
-        scatter(picture, np.asarray(tile.target), optimum, errors_of(picture, optimum, _whole(tile)), None)
-        for picture, tile in zip(pictures, seen.tiles, strict=True)
-    ]
+    parts = zip(pictures, seen.tiles, strict=True)
+    found = [scatter(picture, optimum, errors_of(picture, optimum, _whole(tile))) for picture, tile in parts]
     return np.sum(found, axis=0)
 
 

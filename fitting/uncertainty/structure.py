@@ -166,62 +166,24 @@ def errors_of(picture: Picture, optimum: Optimum, place: tuple[np.ndarray, int])
     return Errors(np.where(weight > 0, left, 0.0) * np.sqrt(weight), *place)
 
 
-def scatter(
-    picture: Picture,
-    shown: Float[np.ndarray, "P C"],
-    optimum: Optimum,
-    errors: Errors,
-    noise: float | None,
-) -> Float[np.ndarray, "U U"]:
+def scatter(picture: Picture, optimum: Optimum, errors: Errors) -> Float[np.ndarray, "U U"]:
     """Products of the scores by x_a, x_d, x_s, channel after channel, and n, summed over blocks of pixels first.
 
-    That is what the Hessian would be if pixels of a block err together. In a file compressed with losses the pixels of
-    a flat region share the error of the rounding to its code: uniform within half a code.
+    That is what the Hessian would be if pixels of a block err together.
 
     Args:
         picture: whose weights are inverse variances.
-        shown: what the pixels show.
         optimum: of the fit.
         errors: of its pixels.
-        noise: of a file compressed with losses, in codes; None for others.
     """
-    columns, root, scatters = picture.columns(optimum.n), np.sqrt(np.asarray(picture.weights)), []
+    terms, scatters = picture.columns(optimum.n) * np.sqrt(np.asarray(picture.weights)) * errors.values, []
+    terms[3] *= optimum.x[2]
     for size in SCATTER_SIZES:
         blocks = errors.blocks(size)
         if scatters and np.unique(blocks).size < FEWEST_BLOCKS:
             break
-        together = _joined(columns * root * errors.values, [blocks] * columns.shape[-1], optimum)
+        *by_x, by_n = np.array([[np.bincount(blocks, weights=one) for one in term.T] for term in terms])
+        together = np.array([*np.concatenate(by_x), by_n.sum(axis=0)])
         scatters.append(together @ together.T)
     scale = np.maximum(np.diag(scatters[0]), np.finfo(float).tiny)
-    largest = max(scatters, key=lambda sums: float(np.sum(np.diag(sums) / scale)))
-    if noise is not None:
-        flat = _flat_regions(shown, errors)
-        shared = _joined(columns * np.where(flat > 0, root / noise, 0.0), list(flat.T), optimum)
-        largest = largest + shared @ shared.T / 12.0
-    return largest
-
-
-def _joined(terms: np.ndarray, groups: Sequence[np.ndarray], optimum: Optimum) -> np.ndarray:
-    """Sums over groups of pixels, one grouping a channel, of what each unknown moves; (U, groups)."""
-    channels, most = range(len(groups)), max(int(np.max(group, initial=0)) for group in groups) + 1
-    sums = [[np.bincount(groups[c], weights=term[:, c], minlength=most) for c in channels] for term in terms]
-    by_n = [by * x for by, x in zip(sums[3], optimum.x[2], strict=True)]
-    if all(np.array_equal(groups[0], group) for group in groups):
-        return np.array([*sums[0], *sums[1], *sums[2], sum(by_n)])
-    # Regions of one channel are not those of another.
-    parts = [np.zeros((3 * len(channels) + 1, most)) for _ in channels]
-    for c, part in enumerate(parts):
-        part[[c, len(channels) + c, 2 * len(channels) + c, -1]] = sums[0][c], sums[1][c], sums[2][c], by_n[c]
-    return np.concatenate(parts, axis=1)
-
-
-def _flat_regions(values: np.ndarray, errors: Errors) -> np.ndarray:
-    """A number above 0 for pixels whose neighbours all show the same, the same for the same value; (P, C)."""
-    row, column = np.divmod(errors.pixel, errors.width)
-    image = np.full((int(row.max()) + 3, errors.width + 2, values.shape[1]), np.nan)
-    image[row + 1, column + 1] = values
-    middle = image[1:-1, 1:-1]
-    beside = (image[:-2, 1:-1], image[2:, 1:-1], image[1:-1, :-2], image[1:-1, 2:])
-    flat = np.logical_and.reduce([middle == other for other in beside])[row, column]
-    numbers = np.stack([np.unique(one, return_inverse=True)[1] + 1 for one in values.T], axis=1)
-    return np.where(flat, numbers, 0)
+    return max(scatters, key=lambda sums: float(np.sum(np.diag(sums) / scale)))
