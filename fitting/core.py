@@ -68,7 +68,7 @@ def fit_pictures(problem: FitProblem) -> FitResult:
         if problem.model == "auto":
             fit, choice = _fit_simplest(seen)
         else:
-            fit, choice = most_likely(_fit_model(brdf.MODELS[problem.model], seen)), None
+            fit, choice = most_likely(_fit_model(brdf.MODELS[problem.model], seen), copies=seen.copies), None
         fit = _held_plausible(fit, seen)
         told, optimum = _interpreted(fit, seen, choice), fit.optimum
         hidden = told.hidden_highlight
@@ -77,7 +77,7 @@ def fit_pictures(problem: FitProblem) -> FitResult:
             # anew.
             free = fit.free & [[True], [True], [False]]
             pictures = fit.pictures if problem.loss == "squared" else None
-            fit = _held_plausible(most_likely(_fit_model(fit.model, seen, free, pictures)), seen)
+            fit = _held_plausible(most_likely(_fit_model(fit.model, seen, free, pictures), copies=seen.copies), seen)
             told = _interpreted(fit, seen, choice, hidden)
     return FitResult(
         **told._asdict(),
@@ -153,10 +153,10 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
     least = min(float(np.sum(fit.optimum.cost)) for fit in fits.values())
     for name, fit in fits.items():
         if np.sum(fit.optimum.cost) <= HOPELESS * least:
-            fits[name] = most_likely(fit)
+            fits[name] = most_likely(fit, copies=seen.copies)
     # A lobe that would be wider than the search allows is no highlight: it mends what Lambert's law leaves at the rim.
     fits = {name: fit for name, fit in fits.items() if fit.optimum.flat or fit.optimum.n > WIDEST * problem.n_range[0]}
-    fits = fits or {"lambert": most_likely(_fit_model(brdf.Lambert, seen))}
+    fits = fits or {"lambert": most_likely(_fit_model(brdf.Lambert, seen), copies=seen.copies)}
     if problem.loss != "squared":
         # Weights are part of what is minimised: those of the better family serve all, or costs could not be compared.
         best = min(fits.values(), key=lambda fit: float(np.sum(residual_noise(fit.optimum, seen.rounding))))
@@ -185,7 +185,7 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
     optima = {name: fit.optimum for name, fit in fits.items()}
     choice = choose(optima, free, grey, noise, inflation, whitened)
     if choice.model not in FAMILIES and not _explains_structure(fits[choice.model], seen):
-        fits = {"lambert": most_likely(_fit_model(brdf.Lambert, seen))}
+        fits = {"lambert": most_likely(_fit_model(brdf.Lambert, seen), copies=seen.copies)}
         best = fits["lambert"]
         choice = choose({"lambert": best.optimum}, best.free, grey, noise, inflation, _likely_sums(fits))
     matt = choice.model in FAMILIES
@@ -204,7 +204,7 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
     if tied is not None:
         optimum = refit(pictures, optimum, choice.free, chosen.n_range, tied)
     chosen = chosen._replace(pictures=pictures, optimum=optimum, free=choice.free, tied=tied)
-    return most_likely(chosen), choice
+    return most_likely(chosen, copies=seen.copies), choice
 
 
 def _likely_sums(fits: Mapping[str, ModelFit]) -> dict[str, Sums]:

@@ -43,11 +43,11 @@ MOST_STEPS, LEAST_GAIN = 12, 1e-3
 # The largest change of log n in one step.
 LARGEST_SHIFT = 0.5
 # The noise is known well enough where it changes by less than this factor.
-ENOUGH_KNOWN = 1.1
+ENOUGH_KNOWN = 1.02
 # Where the Hessian is no larger all values are surely inside their codes.
 NOTHING = 1e-100
 # So many values have to tell of a number before the Hessian is taken for its error.
-ENOUGH_VALUES = 6.0
+FEWEST_VALUES = 6.0
 SUBSAMPLE = 16384
 # In codes: with more noise than this, and no code at an end, a linear picture says what least squares says.
 ENOUGH_NOISE = 0.5
@@ -145,11 +145,12 @@ class _Told(NamedTuple):
     columns: Any
 
 
-def most_likely(fit: ModelFit) -> ModelFit:
+def most_likely(fit: ModelFit, *, copies: bool = False) -> ModelFit:
     """A fit by what rounded values and open ends say, from least squares on; as it is where they say no more.
 
     Args:
         fit: by least squares.
+        copies: the channels are copies of each other.
     """
     if fit.capped or any(picture.bounds is None for picture in fit.pictures):
         return fit
@@ -172,7 +173,11 @@ def most_likely(fit: ModelFit) -> ModelFit:
             return fit
         said = _reweighted(fit._replace(pictures=pictures), at.noise, rounding)
     else:
-        said = _near_edges(fit._replace(pictures=pictures), at._replace(noise=max(at.noise, FIRST_NOISE)))
+        at = at._replace(noise=max(at.noise, FIRST_NOISE))
+        # Copies of a value tell no more of what all channels share.
+        fewest = np.full(optimum.x.size + 1, FEWEST_VALUES)
+        fewest[-1] *= optimum.square.size if copies else 1
+        said = _near_edges(fit._replace(pictures=pictures), at, fewest)
     found = said.optimum
     optimum = dataclasses.replace(optimum, x=found.x, n=found.n, flat=found.flat)
     return fit._replace(optimum=optimum, evidence=said)
@@ -197,7 +202,7 @@ def _alike(picture: Picture, at: Estimate) -> Float[np.ndarray, "P C"]:
     return weight
 
 
-def _near_edges(fit: ModelFit, at: Estimate) -> Evidence:
+def _near_edges(fit: ModelFit, at: Estimate, fewest: Float[np.ndarray, " U"]) -> Evidence:
     """Where rounding is most of the noise: what pixels near the edge of a code say."""
     pictures, space = fit.pictures, _Space(design_of(fit.free, fit.tied), tuple(map(math.log, fit.n_range)))
     if sum(picture.target.shape[0] for picture in pictures) > 2 * SUBSAMPLE:
@@ -209,7 +214,7 @@ def _near_edges(fit: ModelFit, at: Estimate) -> Evidence:
     telling = at._replace(noise=_telling(known).noise)
     near = [part.some(_near(part.picture, telling)) for part in gathered]
     sums = _sums(near, telling)
-    widening = _widening(known, _precision(telling, sums, space))
+    widening = _widening(known, _precision(telling, sums, space), fewest)
     working = [_working(pixels.picture, said) for pixels, said in zip(near, sums.told, strict=True)]
     optimum = _optimum(working, sums, fit, at)
     return Evidence(working, optimum, at.noise, at.value, [_place(part.picture) for part in near], widening)
@@ -352,10 +357,10 @@ def _telling(known: Sequence[Precision]) -> Precision:
     return max(known, key=lambda entry: entry.information)
 
 
-def _widening(known: Sequence[Precision], most: Precision) -> Float[np.ndarray, " U"]:
+def _widening(known: Sequence[Precision], most: Precision, fewest: Float[np.ndarray, " U"]) -> Float[np.ndarray, " U"]:
     """What to multiply errors by: each unknown is known as well as where enough values still tell of it."""
     variance = np.array([entry.variance for entry in known])
-    enough = np.array([entry.count for entry in known]) >= ENOUGH_VALUES
+    enough = np.array([entry.count for entry in known]) >= fewest
     # With the most noise all values tell.
     enough[0] = True
     least = np.min(np.where(enough & (variance > 0), variance, np.inf), axis=0)
