@@ -395,11 +395,11 @@ def maximise(pixels: Sequence[_Pixels], start: Estimate, space: _Space) -> tuple
     # In between, where the derivative by the noise is 0.
     for _ in range(3):
         low, high = float(below[1].by_log_noise), float(above[1].by_log_noise)
-        share = min(max(low / (low - high), 0.1), 0.9)
+        share = min(max(low / (low - high), 0.01), 0.99)
         noise = below[0].noise * (above[0].noise / below[0].noise) ** share
         if max(noise, at.noise) < ENOUGH_KNOWN * min(noise, at.noise):
             break
-        at, now = _climb(pixels, below[0]._replace(noise=noise), space)
+        at, now = _climb(pixels, at._replace(noise=noise), space)
         below, above = ((at, now), above) if now.by_log_noise > 0 else (below, (at, now))
     return at, [*(entry for entry in known if entry.noise > at.noise), _precision(at, now, space)]
 
