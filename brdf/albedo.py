@@ -15,6 +15,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from brdf import vectors
+from brdf.checks import instance
 from brdf.models import Material, NormalizedBlinnPhong, NormalizedPhong, Phong, SpecularMaterial
 from brdf.precision import Precision, cast, working_precision
 from brdf.vectors import Numbers, Scalars
@@ -45,6 +46,7 @@ def directional_albedo(
         >>> brdf.directional_albedo(brdf.NormalizedPhong(k_d=0.0, k_s=1.0, n=1), np.radians([0, 60])).round(3)
         Array([[1.   ], [0.609]], dtype=float32)
     """
+    instance("material", material, Material, "Write brdf.directional_albedo(material, theta)")
     with working_precision(precision):
         result = _albedo(cast(material, precision), jnp.asarray(theta, jnp.result_type(float)))
     # a float64 array of JAX would be cut to float32, with a warning, by the first thing done to it outside the context

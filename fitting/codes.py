@@ -129,7 +129,7 @@ def find_codes(
             writer truncated, None finds out.
         unit: radiance of the largest code of a file, a number or (C,).
     """
-    if rounding is not None and not isinstance(rounding, str):
+    if rounding is not None and not (isinstance(rounding, str) and rounding == "floor"):
         return _stated(pixels, rounding)
     if bits is not None and encoding is not None:
         found = _integers(pixels / unit, encoding, 255 if bits <= 8 else 65535)

@@ -45,8 +45,10 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 import brdf
+from brdf.checks import instance
+from brdf.errors import InputError
 from brdf.lobes import Lobe
-from brdf.models.base import SpecularMaterial
+from brdf.models.base import SpecularMaterial, check_model
 from brdf.rendering import Basis, basis
 
 # As a function of log n a lobe varies on a scale of 1 or more; Hermite's cubic over such a cell finds every valley.
@@ -138,6 +140,9 @@ def fit(
     Returns:
         The material, and cost and errors.
 
+    Raises:
+        InputError: where the model is no class of a material, or the picture is not what the scene shows.
+
     Example:
         >>> import jax, jax.numpy as jnp
         >>> target, scene = brdf.read_image("target.exr"), brdf.Scene.load("scene.toml")
@@ -146,7 +151,12 @@ def fit(
         >>> found.material.k_d.shape, bool(jnp.allclose(found.material.k_d[0], 2 * found.material.k_d[1], rtol=1e-3))
         ((2, 3), True)
     """
-    target = jnp.asarray(target)
+    check_model(model)
+    instance("scene", scene, brdf.Scene, "Write fitting.functional.fit(target, scene)")
+    target, (width, height) = jnp.asarray(target), scene.resolution
+    if target.shape[:2] != (height, width) or target.ndim != 3:
+        came = f"must be of shape ({height}, {width}, C), got {target.shape}"
+        raise InputError("target", came, "Give the picture that the scene shows")
     scene = brdf.cast(scene, "float64" if target.dtype == jnp.float64 else "float32")
     points = scene.surface_points()
     seen = jnp.ravel(points.mask)

@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import brdf
+from brdf.checks import instance
 from brdf.precision import working_precision
 from fitting.joint import JointProblem, joint_problem
 from fitting.progress import waiting
@@ -75,20 +76,28 @@ def sensitivity(result: FitResult, by: Callable[[list[brdf.Scene]], Sequence[Any
         >>> by_direction.n.shape
         (3,)
     """
+    instance("result", result, FitResult, "Give what fitting.fit returns")
+    if not callable(by):
+        came = f"must be a function, got {by!r}"
+        raise brdf.InputError("by", came, "Write lambda scenes: (scenes[0].lights[0].direction,)")
     if result.loss != "squared":
         raise brdf.InputError("result", f"must be of the squared loss, got {result.loss}", "Fit without a loss")
-    leaves = tuple(by(list(result.scenes)))
-    if not leaves or not all(hasattr(leaf, "shape") for leaf in leaves):
+    leaves = by(list(result.scenes))
+    if not isinstance(leaves, Sequence) or not leaves or not all(hasattr(leaf, "shape") for leaf in leaves):
         raise brdf.InputError("by", "names no leaf of the scenes", "Return the leaves to differentiate by")
     names = list(dict.fromkeys(one.name for one in result.free_parameters))
     with working_precision("float64"), waiting("differentiating the fit"):
         start = brdf.cast((result.material, list(result.scenes)), "float64")
-        problem = joint_problem(
-            start,
-            lambda material, scenes: (*(getattr(material, name) for name in names), *by(scenes)),
-            [jnp.asarray(target, jnp.float64).reshape(-1, target.shape[-1]) for target in result.targets],
-            [jnp.asarray(counted, jnp.float64).ravel() for counted in result.counted],
-        )
+        targets = [jnp.asarray(target, jnp.float64).reshape(-1, target.shape[-1]) for target in result.targets]
+        weights: list[Array | None] = [jnp.asarray(counted, jnp.float64).ravel() for counted in result.counted]
+
+        def freed(material: brdf.Material, scenes: list[brdf.Scene]) -> tuple[Any, ...]:
+            return (*(getattr(material, name) for name in names), *by(scenes))
+
+        try:
+            problem = joint_problem(start, freed, targets, weights)
+        except brdf.InputError as error:
+            raise brdf.InputError("by", error.what, "Return leaves of the scenes, each once") from None
         vector = np.array(problem.start())
         blocks = np.split(np.arange(vector.size), np.cumsum([leaf.size for leaf in problem.freed()])[:-1])
         index, known = dict(zip(names, blocks, strict=False)), blocks[len(names) :]

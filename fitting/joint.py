@@ -121,7 +121,11 @@ def fit_jointly(
     if not (0 < tolerance < 1 and max_steps >= 1):
         came = f"and max_steps must be above 0, got {tolerance!r} and {max_steps!r}"
         raise InputError("tolerance", came, "Give for example 1e-10 and 256")
-    freed = free if callable(free) or free is None else _named([free] if isinstance(free, str) else free)
+    names = [free] if isinstance(free, str) else free
+    if not (callable(names) or names is None or isinstance(names, Sequence)):
+        came = f"must be a function or names, got {type(free).__name__}"
+        raise InputError("free", came, "Write lambda material, scenes: (material.n,), or light")
+    freed = _named(names) if isinstance(names, Sequence) else names
     stated = state_problem(target, scene, mask, precision=precision, saturation=saturation)
     with working_precision(precision), waiting("fitting jointly"):
         seen = observe(stated, at_once=True)

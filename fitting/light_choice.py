@@ -133,12 +133,15 @@ def next_light(
     """
     if not isinstance(result, FitResult):
         raise InputError("result", f"must be of fitting.fit, got {type(result).__name__}", "Fit the pictures first")
-    if count < 1:
+    if not isinstance(count, int) or count < 1:
         raise InputError("count", f"must be 1 or more, got {count}", "Say how many lights to add")
     wanted, active = _numbers(result, of)
     known = tuple(light for scene in result.scenes for light in scene.lights)
     scenes = [_scene(result, index) for index in range(len(result.scenes))]
     shining = max((np.asarray(light.emittance) for light in known), key=np.sum, default=np.ones(1))
+    if candidates is not None and not isinstance(candidates, Sequence | np.ndarray):
+        came = f"must be a list, got {type(candidates).__name__}"
+        raise InputError("candidates", came, "Give lights or directions, or None for any direction")
     given = None if candidates is None else [_light(one, shining) for one in candidates]
     if given is not None and not given:
         raise InputError("candidates", "is empty", "Give lights or directions, or None for any direction")
@@ -182,7 +185,7 @@ def _towards(direction: np.ndarray, intensity: np.ndarray) -> Light:
 
 def _numbers(result: FitResult, of: str) -> tuple[np.ndarray, np.ndarray]:
     """Which of k_a, k_d, k_s, channel after channel each, and n are asked for, and which are free."""
-    asked = result[of] if isinstance(of, str) else ()
+    asked = result[of]
     asked = asked if isinstance(asked, tuple) else (asked,)
     free = result.free_parameters
     missing = [one for one in asked if one not in free]

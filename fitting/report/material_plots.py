@@ -16,6 +16,7 @@ from matplotlib.ticker import MaxNLocator
 
 from brdf.albedo import directional_albedo
 from brdf.channels import channel_names, in_channel
+from brdf.checks import several
 from brdf.display import displayed, lit_sphere
 from brdf.measured.table import MeasuredBRDF
 from brdf.models.base import Material, SpecularMaterial
@@ -173,6 +174,7 @@ def plot_stability(maps: list[StabilityMap]) -> Figure:
         >>> errors = brdf.stability_map(brdf.Lambert, np.array([0.0]), np.array([0.0, 60.0]))
         >>> fitting.plot_stability([errors]).savefig("stability.png")
     """
+    several("maps", maps)
     figure = Figure(figsize=(3.0 * len(maps) + 1, 3.4), layout="constrained")
     panels = figure.subplots(1, len(maps), sharey=True, squeeze=False)[0]
     scale = LogNorm(1e-8, 1e-4)

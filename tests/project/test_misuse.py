@@ -28,6 +28,9 @@ MISUSES = {
     "brdf.basis_images(material, scene)": r"model: must be the class of a material, got BlinnPhong\.",
     "brdf.stability_map(material)": r"model: must be the class of a material, got BlinnPhong\.",
     "brdf.cast(material, 'double')": r"precision: is unknown, got 'double'\.",
+    "brdf.directional_albedo('gold', 0.5)": r"material: must be a Material, got str\.",
+    "brdf.nearest_normalized('gold')": r"material: must be a Material, got str\.",
+    "brdf.nearest_classic(brdf.Phong)": r"material: must be a Material, got the class Phong\.",
     # scenes
     "brdf.Scene(camera, brdf.Sphere([0, 0, 0], 1))": r"shapes: must be a list, got Sphere\. Write shapes=\[\.\.\.\]",
     "brdf.Scene(camera, [ball], lights=sun)": r"lights: must be a list, got DirectionalLight\. Write lights=\[",
@@ -94,6 +97,15 @@ MISUSES = {
     "fitting.fit_jointly(target, scene, material, lambda m, s: (m.gloss,))": r"free: gives no tuple of leaves .*gloss",
     "fitting.fit_jointly(target, scene, material)": r"free: gives no tuple of leaves .* Return a tuple",
     "fitting.fit_jointly(target, scene, 'ward', lambda m, s: (m.k_d,))": r"model: is unknown, got 'ward'\.",
+    "fitting.fit_jointly(target, scene, lambda m, s: (m.n,), material)": r"(material|model|free): .*got ",
+    "fitting.fit_jointly(target, scene, material, 3)": r"free: must be a function or names, got int\. Write lambda",
+    "fitting.fit(target, scene, rounding='up')": r"rounding: must be 0 or more .*got 'up'",
+    "fitting.functional.fit(target, scene, 'phong')": r"model: must be the class of a material, got phong\.",
+    "fitting.functional.fit(target[:10], scene)": r"target: must be of shape \(48, 48, C\), got \(10, 48, 3\)\.",
+    "fitting.sensitivity(fitted(), 'light')": r"by: must be a function, got 'light'\. Write lambda scenes",
+    "fitting.sensitivity(fitted(), lambda s: (2 * s[0].lights[0].direction,))": r"by: gives what is no number of",
+    "fitting.sensitivity(material, lambda s: (s[0].ambient,))": r"result: must be a FitResult, got BlinnPhong\.",
+    "fitting.next_light(material)": r"result: must be of fitting\.fit, got BlinnPhong\.",
     "fitting.fit_lights(target, material, scene)": r"scene: must be a brdf\.Scene, got BlinnPhong\.",
     "fitting.fit_lights(target, scene, brdf.Phong)": r"material: must be a Material, got the class Phong\.",
     "fitting.fit_lights('target.exr', scene, material)": r"target\.exr: there is no such file or folder\.",
@@ -111,6 +123,7 @@ def test_a_misuse_is_one_line_that_names_the_remedy(written, tmp_path, monkeypat
         **{"brdf": brdf, "fitting": fitting, "jax": jax, "np": np, "scene": SCENE, "material": MATERIAL},
         **{"camera": CAMERA, "ball": BALL, "sun": SUN, "target": target, "traced": jnp.asarray(target)},
         "mask": np.ones((SIZE, SIZE), bool),
+        "fitted": lambda: fitting.fit(target, SCENE, model="lambert"),
         "stack": jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), MATERIAL),
     }
     with pytest.raises(brdf.InputError, match=f"^{MISUSES[written]}") as told:
