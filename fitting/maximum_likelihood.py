@@ -419,10 +419,13 @@ def _precision(at: Estimate, now: _Sums, space: _Space) -> Precision:
     root = moved @ (vector / np.sqrt(value) / scale[:, None])
     influence, information = root @ root.T, float(np.sum(np.log(value)) + 2 * np.sum(np.log(scale)))
     total, squares = np.zeros(len(whole)), np.zeros(len(whole))
+    # In units of its own error, or squares overflow where next to nothing tells.
+    own = np.sqrt(np.diag(influence))
+    relative = influence / np.where(own > 0, own, 1.0)[:, None]
     for said in now.told:
         weight = said.weight * said.slope**2
         for channel in range(channels):
-            rows = influence[[channel, channels + channel, 2 * channels + channel, -1]]
+            rows = relative.T[[channel, channels + channel, 2 * channels + channel, -1]]
             rows = rows * np.array([1.0, 1.0, 1.0, at.x[2, channel]])[:, None]
             share = weight[:, channel] * np.square(rows.T @ said.columns[..., channel])  # (U, P)
             total, squares = total + share.sum(axis=1), squares + np.square(share).sum(axis=1)
@@ -560,6 +563,20 @@ def _open_ends_tell(picture: Picture, at: Estimate) -> bool:
     """Whether some value is known by one end only and is predicted near it."""
     half = np.isfinite(_bounds(picture).lower) ^ np.isfinite(_bounds(picture).upper)
     return bool(half.any()) and bool(np.any(_inside(picture, at)[half] < END_REACH))
+
+
+def highlight_in_codes(picture: Picture, x: np.ndarray, n: float) -> float:
+    """By how many codes of its file a highlight changes a value at most; infinite without codes.
+
+    Args:
+        picture: of a fit.
+        x: coefficients, (3, C).
+        n: exponent.
+    """
+    if picture.bounds is None or picture.bounds.exact:
+        return math.inf
+    shown = [_codes(picture, Estimate(some, math.log(n), 1.0)) for some in (x, x * [[1], [1], [0]])]
+    return float(np.max(shown[0] - shown[1]))
 
 
 def unexplained(picture: Picture, x: np.ndarray, n: float) -> np.ndarray:
