@@ -1,19 +1,20 @@
 """Maps from photographs: every texel's material, band of rows by band of rows."""
 
 import dataclasses
+import functools
 import os
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 import brdf
 from brdf.errors import InputError
@@ -22,16 +23,18 @@ from brdf.lights.base import LightStack, stacked
 from brdf.lobes import light_terms
 from brdf.models.base import SpecularMaterial
 from brdf.precision import Precision, working_precision
+from brdf.vectors import normalize
 from fitting.maps import map_inputs
 from fitting.maps.map_inputs import Photographs
 from fitting.maps.map_result import REASONS, Maps
 from fitting.maps.texels import CAP, Columns, Distant, TexelFit, fit_texels, fit_with_normals
 from fitting.progress import waiting
 
-TILE = 1024
-"""Texels that go through the program in step: what they need stays in the processor's cache."""
+TILE = 528
+"""Texels that go through the program in step: what they need stays in the processor's cache. No power of two: rows so
+far apart would all fall on the same few places of the cache, and sums over them take up to five times longer."""
 
-BAND = 64 * TILE
+BAND = 124 * TILE
 """Texels that are read and laid out at a time."""
 
 RING = 0.15
@@ -116,20 +119,21 @@ def fit_maps(
         raise InputError("specular", f"must be coloured or grey, got {specular!r}", "Choose one of them")
     models = _models(model)
     given = map_inputs.photographs(pictures, lights, intensities, exposures, encoding)
-    points, free = _points(given, normals, mask, to_view, flip_y)
-    how = _How(models, specular == "grey", free, _ambient(ambient, given), np.asarray(to_view, float), precision)
+    surface = _surface(given, normals, mask, to_view, flip_y)
+    how = _How(models, specular == "grey", _ambient(ambient, given), np.asarray(to_view, float), precision)
     notes: tuple[str, ...] = ()
     if given.silent and given.to_light is not None:
         other = map_inputs.photographs(pictures, lights, intensities, exposures, "linear")
-        given, notes = _likelier(given, other, points, how)
+        given, notes = _likelier(given, other, surface, how)
     _, height, width, _ = given.shape
     layers: dict[str, np.ndarray] = {}
     with waiting("fitting maps") as say:
-        for start, stop, band in _fitted(given, points, how):
+        for start, stop, band in _fitted(given, surface, how):
             for name, values in band.items():
                 if name not in layers:
-                    layers[name] = np.zeros((height, width, *values.shape[1:]), values.dtype)
-                layers[name][start:stop] = values.reshape(stop - start, width, *values.shape[1:])
+                    layers[name] = np.empty((height, width, *values.shape[1:]), values.dtype)
+                rows = values[: (stop - start) * width]
+                layers[name][start:stop] = rows.reshape(stop - start, width, *values.shape[1:])
             say(f"fitting maps, {100 * stop // height} % done")
     if not np.any(layers["reason"] != REASONS.index("outside")):
         raise InputError("pictures", "show no texel that counts", "Check mask, normals and clipping")
@@ -142,11 +146,10 @@ def _maps(layers: dict[str, np.ndarray], how: "_How", notes: tuple[str, ...] = (
 
 @dataclasses.dataclass(frozen=True)
 class _How:
-    """What is fitted: models, grey k_s, free normals, the ambient light's columns (P, C), the view, the precision."""
+    """What is fitted: models, grey k_s, the ambient light's columns (P, C), the view, the precision."""
 
     models: tuple[Any, ...]
     grey: bool
-    free: bool
     ambient: np.ndarray | None
     to_view: np.ndarray
     precision: Precision
@@ -171,14 +174,15 @@ def _ambient(ambient: Any, given: Photographs) -> np.ndarray | None:
     return columns[:, :1] if np.all(columns == columns[:, :1]) else columns
 
 
-def _points(given: Photographs, normals: Any, mask: Any, to_view: Any, flip_y: bool) -> tuple[brdf.SurfacePoints, bool]:
-    """What the texels see, and whether their normals are still to be found."""
+def _surface(given: Photographs, normals: Any, mask: Any, to_view: Any, flip_y: bool) -> "_Surface":
+    """What the texels see."""
     _, height, width, _ = given.shape
-    if mask is not None:
-        mask = brdf.read_mask(mask) if isinstance(mask, str | Path) else np.asarray(mask, bool)
-        if mask.shape != (height, width):
-            came = f"is of shape {mask.shape}, the photographs of {(height, width)}"
-            raise InputError("mask", came, "Give a value for each pixel")
+    if mask is None:
+        mask = np.ones((height, width), bool)
+    mask = brdf.read_mask(mask) if isinstance(mask, str | Path) else np.asarray(mask, bool)
+    if mask.shape != (height, width):
+        came = f"is of shape {mask.shape}, the photographs of {(height, width)}"
+        raise InputError("mask", came, "Give a value for each pixel")
     if given.scenes is not None:
         if normals is not None:
             raise InputError("normals", "are told by the scenes", "Leave them out")
@@ -186,24 +190,47 @@ def _points(given: Photographs, normals: Any, mask: Any, to_view: Any, flip_y: b
         if points.mask.shape != (height, width):
             came = f"show {points.mask.shape[1]} x {points.mask.shape[0]} pixels, the photographs {width} x {height}"
             raise InputError("lights", came, "Give scenes of the photographs' size")
-        inside = np.asarray(points.mask) if mask is None else np.asarray(points.mask) & mask
-        return dataclasses.replace(points, mask=inside, area=None), False
-    free = normals is None or (isinstance(normals, str) and normals == "fit")
-    if free:
-        normals = np.broadcast_to(np.array([0.0, 0.0, 1.0]), (height, width, 3))
-    elif isinstance(normals, str | Path):
-        name, normals = normals, map_inputs.read_normal_map(normals, flip_y=flip_y)
-        if normals.shape[:2] != (height, width):
-            came = f"is {normals.shape[1]} x {normals.shape[0]}, the photographs {width} x {height}"
-            raise InputError(name, came, "Give a normal for each pixel")
+        points = dataclasses.replace(points, mask=points.mask & mask, area=None)
+        return _Surface(points.normal, points.mask, points)
+    if normals is None or (isinstance(normals, str) and normals == "fit"):
+        return _Surface(None, mask, None)
+    name = "normals"
+    if isinstance(normals, str | Path):
+        name, normals = str(normals), map_inputs.read_normal_map(normals, flip_y=flip_y)
     normals = np.asarray(normals)
     if normals.shape != (height, width, 3):
         came = f"are of shape {normals.shape}, the photographs of {(height, width)}"
-        raise InputError("normals", came, "Give a normal for each pixel")
-    return brdf.SurfacePoints.from_normals(normals, mask=mask, to_view=to_view), free
+        raise InputError(name, came, "Give a normal for each pixel")
+    return _Surface(normals, mask, None)
 
 
-def _fitted(given: Photographs, points: brdf.SurfacePoints, how: _How) -> Iterator[tuple[int, int, dict[str, Any]]]:
+class _Surface(NamedTuple):
+    """What texels see, (H, W, ...) or some of them one after the other.
+
+    Attributes:
+        normal: of any length, 0 or not finite where there is no surface; None where it is sought.
+        mask: texels to look at.
+        points: where lights are near.
+    """
+
+    normal: Any
+    mask: Any
+    points: brdf.SurfacePoints | None
+
+    def some(self, rows: Any, texels: int, dtype: Any) -> "_Surface":
+        """Rows of it, padded to so many texels."""
+
+        def cut(leaf: Any) -> np.ndarray:
+            part = np.asarray(leaf[rows])
+            part = part.reshape(-1, *part.shape[2:])
+            found = np.zeros((texels, *part.shape[1:]), dtype if part.dtype.kind == "f" else part.dtype)
+            found[: len(part)] = part
+            return found
+
+        return jax.tree.map(cut, self)
+
+
+def _fitted(given: Photographs, surface: _Surface, how: _How) -> Iterator[tuple[int, int, dict[str, Any]]]:
     """Bands of the maps from the top, fitted on all cores while the next ones are read."""
     _, height, width, _ = given.shape
     rows = max(1, min(height, BAND // width))
@@ -213,9 +240,9 @@ def _fitted(given: Photographs, points: brdf.SurfacePoints, how: _How) -> Iterat
     with ThreadPoolExecutor(workers) as pool:
         for start in range(0, height, rows):
             stop = min(start + rows, height)
-            values = given.band(start, stop, how.precision)
-            band = _some(points, slice(start, stop))
-            waiting.append((start, stop, pool.submit(_fit_band, given, how, values, band, texels)))
+            part = np.arange(start, stop)
+            codes, some = given.band(part, texels, how.precision), surface.some(part, texels, how.precision)
+            waiting.append((start, stop, pool.submit(_fit_band, given, how, codes, some)))
             if len(waiting) > workers:
                 first, last, future = waiting.popleft()
                 yield first, last, future.result()
@@ -223,20 +250,10 @@ def _fitted(given: Photographs, points: brdf.SurfacePoints, how: _How) -> Iterat
             yield first, last, future.result()
 
 
-def _some(points: brdf.SurfacePoints, rows: Any) -> brdf.SurfacePoints:
-    """The points of some rows, one after the other."""
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[rows].reshape(-1, *leaf.shape[2:]), points)
-
-
-def _fit_band(given: Photographs, how: _How, values: np.ndarray, points: Any, texels: int) -> dict[str, np.ndarray]:
-    """The layers of a band of texels, (B, ...), padded to the size that the program is compiled for."""
-    count = values.shape[2]
+def _fit_band(given: Photographs, how: _How, codes: np.ndarray, surface: _Surface) -> dict[str, np.ndarray]:
+    """The layers of some texels, one after the other."""
     with working_precision(how.precision):
         dtype = np.dtype(how.precision)
-        if count < texels:
-            values = np.pad(values, np.array([(0, 0), (0, 0), (0, texels - count)]))
-        points = jax.tree.map(lambda leaf: np.pad(leaf, [(0, texels - count)] + [(0, 0)] * (leaf.ndim - 1)), points)
-        points = jax.tree.map(lambda leaf: leaf.astype(dtype) if leaf.dtype.kind == "f" else leaf, points)
         stacks, occluders = (), ()
         if given.scenes is not None:
             stacks = stacked([scene.lights[0] for scene in given.scenes], dtype)
@@ -245,67 +262,62 @@ def _fit_band(given: Photographs, how: _How, values: np.ndarray, points: Any, te
         ambient = None if how.ambient is None else how.ambient[..., None].astype(dtype)
         distant = Distant(to_light.astype(dtype), (how.to_view / np.linalg.norm(how.to_view)).astype(dtype), ambient)
         finer = 2 if given.to_light is not None and np.ptp(to_light[:, 2]) < RING else 1
-        layers = _program(how.models, how.grey, how.free, finer, values, points, distant, stacks, occluders)
-        return {name: _by_texel(np.asarray(layer))[:count] for name, layer in layers.items()}
-
-
-def _by_texel(tiles: np.ndarray) -> np.ndarray:
-    """(tiles, ..., T) as (tiles T, ...)."""
-    return np.moveaxis(tiles, -1, 1).reshape(-1, *tiles.shape[1:-1])
+        photographs = codes, given.top.astype(dtype), given.scale.astype(dtype)
+        layers = _program(how.models, how.grey, finer, photographs, surface, distant, stacks, occluders)
+        return {name: np.asarray(layer) for name, layer in layers.items()}
 
 
 @eqx.filter_jit
 def _program(
     models: tuple[Any, ...],
     grey: bool,
-    free: bool,
     finer: int,
-    values: Float[Any, "P C B"],
-    points: Any,
+    photographs: tuple[Array, Array, Array],
+    surface: _Surface,
     distant: Distant,
     stacks: tuple[LightStack, ...],
     occluders: tuple[Any, ...],
 ) -> dict[str, Array]:
     """The layers of a band, tile by tile."""
-    tiles = values.shape[2] // TILE
-
-    def cut(leaf: Array) -> Array:
-        return leaf.reshape(tiles, TILE, *leaf.shape[1:])
+    codes, top, scale = photographs
 
     def of_tile(tile: Any) -> dict[str, Array]:
-        start, points = tile
-        target = jax.lax.dynamic_slice_in_dim(values, start, TILE, axis=2)
-        seen = jnp.all(jnp.isfinite(target), axis=1) & points.mask
-        target, seen = jnp.where(seen[:, None], target, 0), seen.astype(target.dtype)
-        found = []
-        for model in models:
-            columns = None
-            if stacks:
-                columns = _near_columns(model, points, stacks, occluders, distant.ambient)
-                lit = seen * (columns.diffuse[:, 0] > 0) if distant.ambient is None else seen
-            else:
-                lit = seen
-            shown = target * lit[:, None]
-            tied = grey and issubclass(model, SpecularMaterial)
-            normal, normal_error = points.normal.T, jnp.zeros_like(lit[0])
-            if free:
-                fit, normal, normal_error, lit = fit_with_normals(model, shown, lit, distant, tied, finer)
-            else:
-                columns = distant.columns(model, normal, lit) if columns is None else _masked(columns, lit)
-                fit = fit_texels(model, shown, columns, tied, finer)
-            found.append(_layers(model, fit, shown, lit, points.mask, tied, normal, normal_error, free))
-        return _simplest(found)
+        start, (normal, mask, points) = tile
+        if normal is not None:
+            mask &= jnp.all(jnp.isfinite(normal) & jnp.any(normal != 0, axis=1, keepdims=True), axis=1)
+            normal = normalize(jnp.where(mask[:, None], normal, jnp.array([0.0, 0.0, 1.0]))).T
 
-    return jax.lax.map(of_tile, (TILE * jnp.arange(tiles), jax.tree.map(cut, points)))
+        def decoded(photograph: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+            shown, top, scale = photograph
+            shown = shown.T.astype(scale.dtype)
+            counts = mask & functools.reduce(jnp.logical_and, (jnp.isfinite(x) & (x < top) for x in shown))
+            return jnp.where(counts, shown * scale[:, None], 0), counts.astype(scale.dtype)
 
+        tile = jax.lax.dynamic_slice_in_dim(codes, start, TILE, axis=1)
+        target, seen = jax.lax.map(decoded, (tile, top, scale))
+        found = [_of_model(model, target, seen, mask, normal, points) for model in models]
+        return {name: layer.T for name, layer in _simplest(found).items()}
 
-def _masked(columns: Columns, seen: Array) -> Columns:
-    return Columns(
-        None if columns.ambient is None else columns.ambient * seen[:, None],
-        columns.diffuse * seen[:, None],
-        columns.weight * seen[:, None, None],
-        columns.log_cosine,
-    )
+    def _of_model(model: Any, target: Array, seen: Array, mask: Array, normal: Any, points: Any) -> dict[str, Array]:
+        tied = grey and issubclass(model, SpecularMaterial)
+        if normal is None:
+            fit, normal, normal_error, seen = fit_with_normals(model, target, seen, distant, tied, finer)
+            return _layers(model, fit, target * seen[:, None], seen, mask, tied, normal, normal_error)
+        if points is None:
+            columns = distant.columns(model, normal, seen)
+        else:
+            columns = _near_columns(model, points, stacks, occluders, distant.ambient)
+            if distant.ambient is None:
+                seen *= columns.linear[0][:, 0] > 0
+            linear = [column * seen[:, None] for column in columns.linear]
+            columns = columns._replace(linear=linear, weight=columns.weight * seen[:, None])
+            target *= seen[:, None]
+        fit = fit_texels(model, target, columns, tied, finer)
+        return _layers(model, fit, target, seen, mask, tied, normal, None)
+
+    starts = jnp.arange(0, codes.shape[1], TILE)
+    tiles = jax.lax.map(of_tile, (starts, jax.tree.map(lambda leaf: leaf.reshape(-1, TILE, *leaf.shape[1:]), surface)))
+    return {name: layer.reshape(-1, *layer.shape[2:]) for name, layer in tiles.items()}
 
 
 def _near_columns(model: Any, points: Any, stacks: Any, occluders: Any, ambient: Any) -> Columns:
@@ -322,9 +334,9 @@ def _near_columns(model: Any, points: Any, stacks: Any, occluders: Any, ambient:
         terms.append(jax.tree.map(partial(_by_light, stack.light.shape[0]), found))
         order.append(stack.light)
     every = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[jnp.argsort(jnp.concatenate(order))], *terms)
-    diffuse = jnp.sum(every.diffuse, axis=1)
-    ambient = None if ambient is None else ambient * jnp.ones_like(diffuse[:, None, :, 0])
-    return Columns(ambient, jnp.swapaxes(diffuse, 1, 2), jnp.swapaxes(every.weight, 2, 3), every.log_cosine)
+    diffuse = jnp.swapaxes(jnp.sum(every.diffuse, axis=1), 1, 2)
+    linear = [] if ambient is None else [ambient * jnp.ones_like(diffuse)]
+    return Columns([*linear, diffuse], every.weight[..., 0], every.log_cosine)
 
 
 def _by_light(lights: int, samples: Array) -> Array:
@@ -339,15 +351,14 @@ def _layers(
     mask: Array,
     grey: bool,
     normal: Array,
-    tilt: Array,
-    free: bool,
+    tilt: Array | None,
 ) -> dict[str, Array]:
     """The layers of a model's maps, texels last."""
     channels, lanes = target.shape[1:]
     glossy = issubclass(model, SpecularMaterial)
     k_s, k_s_error = (fit.k[-1], fit.k_error[-1]) if glossy else (jnp.zeros((channels, lanes)),) * 2
     linear = fit.k[:-1] if glossy else fit.k
-    unknowns = len(linear) * channels + glossy * (2 if grey else channels + 1) + 2 * free
+    unknowns = len(linear) * channels + glossy * (2 if grey else channels + 1) + 2 * (tilt is not None)
     values = channels * jnp.sum(seen, axis=0)
     freedom = values - unknowns
     noise = jnp.sqrt(fit.cost / jnp.maximum(freedom, 1))
@@ -371,7 +382,7 @@ def _layers(
         "fitted_n": n,
         "fitted_k_s": jnp.where(inside, k_s, 0),
         "normal": jnp.where(inside, normal, 0),
-        "normal_error": jnp.degrees(noise * tilt),
+        "normal_error": jnp.zeros_like(n) if tilt is None else jnp.degrees(noise * tilt),
         "determined": known,
         "reason": reason,
         "residual": jnp.where(inside, jnp.sqrt(fit.cost / jnp.where(square > 0, square, 1)), jnp.nan),
@@ -390,29 +401,31 @@ def _simplest(found: list[dict[str, Array]]) -> dict[str, Array]:
     return best | {"chosen": chosen}
 
 
-def _likelier(given: Photographs, other: Photographs, points: Any, how: _How) -> tuple[Photographs, tuple[str, ...]]:
+def _likelier(given: Photographs, other: Photographs, surface: Any, how: _How) -> tuple[Photographs, tuple[str, ...]]:
     """Silent photographs as sRGB or as linear light: as the model leaves less of the codes of some rows.
 
     Args:
         given: read as sRGB.
         other: read as linear light, whose values are the codes.
-        points: what the texels see.
+        surface: what the texels see.
         how: they are fitted.
     """
     _, height, width, _ = given.shape
     rows = np.linspace(0, height - 1, min(height, max(1, 4 * TILE // width))).astype(int)
     assert given.to_light is not None
-    to_lights, left, codes = given.to_light, [], _rows(other, rows, how.precision) * other.unit[..., None]
+    count, left, codes = rows.size * width, [], other.band(rows, rows.size * width, how.precision)
+    codes = np.where(codes < other.top[:, None, None], codes, np.nan)
     readings: tuple[tuple[Photographs, Encoding], ...] = ((given, "srgb"), (other, "linear"))
     for one, encoding in readings:
-        layers = _fit_band(one, how, _rows(one, rows, how.precision), _some(points, rows), 4 * TILE)
-        maps = _maps({name: layer.reshape(rows.size, width, *layer.shape[1:]) for name, layer in layers.items()}, how)
-        square = np.zeros((rows.size, width))
-        for code, unit, to_light, ambient in zip(codes, one.unit, to_lights, _each(how.ambient, codes), strict=True):
-            model = maps.render(to_light) + (0 if maps.k_a is None else maps.k_a * ambient)
-            off = encode(model * unit, encoding) - code.T.reshape(model.shape)
-            square += np.sum(np.nan_to_num(off) ** 2, axis=-1)
-        left.append(float(np.nanmedian(np.sqrt(square.ravel() / np.nansum(codes**2, axis=(0, 1))))))
+        texels = -(-count // TILE) * TILE
+        layers = _fit_band(one, how, one.band(rows, texels, how.precision), surface.some(rows, texels, how.precision))
+        shaped = {name: layer[:count].reshape(rows.size, width, *layer.shape[1:]) for name, layer in layers.items()}
+        maps, square = _maps(shaped, how), np.zeros(count)
+        for p, code in enumerate(codes):
+            ambient = 0 if maps.k_a is None or how.ambient is None else maps.k_a * how.ambient[p]
+            shown = encode((maps.render(given.to_light[p]) + ambient) * one.unit[p], encoding)
+            square += np.sum(np.nan_to_num(shown.reshape(code.shape) - code) ** 2, axis=-1)
+        left.append(float(np.nanmedian(np.sqrt(square / np.nansum(codes**2, axis=(0, 2))))))
     kept = int(left[1] ** 2 < LESS * left[0] ** 2)
     names = ("sRGB", "linear")
     note = (
@@ -421,11 +434,3 @@ def _likelier(given: Photographs, other: Photographs, points: Any, how: _How) ->
         "Where you know, say so with the encoding"
     )
     return (given, other)[kept], (note,)
-
-
-def _rows(given: Photographs, rows: np.ndarray, precision: Precision) -> np.ndarray:
-    return np.concatenate([given.band(row, row + 1, precision) for row in rows], axis=2)
-
-
-def _each(ambient: np.ndarray | None, photographs: Any) -> Any:
-    return ambient if ambient is not None else [0.0] * len(photographs)

@@ -2,11 +2,12 @@
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Num
 
 import brdf
 from brdf.errors import InputError
@@ -17,6 +18,8 @@ from fitting.photographs.light_files import MOST_BYTES, read_directions, read_in
 PICTURES = (".exr", ".hdr", ".png", ".tif", ".tiff", ".jpg", ".jpeg")
 # An image's code 0 in all channels, and those about the middle, are how tools write "no surface".
 NO_SURFACE = 0.25
+# Values are clipped from the largest on, but for rounding.
+BELOW_TOP = 1 - 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,37 +27,47 @@ class Photographs:
     """Photographs of one view, each under its own light.
 
     Attributes:
-        bands: of each photograph, rows from one to another, linear, in units of its light; NaN where clipped.
+        rows: of each photograph, those from one to another, codes or linear values.
         shape: count, height, width, channels.
         to_light: unit, (P, 3); None where ``scenes`` tell.
         scenes: of each photograph with its one light, of intensity 1; None where all lights are distant.
-        unit: what each photograph was divided by, (P, C).
+        unit: what each photograph is divided by, (P, C).
+        codes: the type of ``rows`` where these are codes; None for linear values.
+        top: values from which on they are clipped, (P,).
+        scale: what values are multiplied with, (P, C): the inverse of ``unit``, and of the largest code.
         silent: names of files of 8 bits that do not say how they are encoded, which were read as sRGB.
         names: of the photographs.
     """
 
-    bands: tuple[Callable[[int, int], Float[np.ndarray, "rows W C"]], ...]
+    rows: tuple[Callable[[int, int], Num[np.ndarray, "rows W C"]], ...]
     shape: tuple[int, int, int, int]
     to_light: Float[np.ndarray, "P 3"] | None
     scenes: tuple[brdf.Scene, ...] | None
     unit: Float[np.ndarray, "P C"]
+    codes: np.dtype | None
+    top: Float[np.ndarray, " P"]
+    scale: Float[np.ndarray, "P C"]
     silent: tuple[str, ...]
     names: tuple[str, ...]
 
-    def band(self, start: int, stop: int, precision: str) -> Float[np.ndarray, "P C texels"]:
-        """Rows of all photographs, channel by channel."""
+    def band(self, rows: np.ndarray, texels: int, precision: str) -> Num[np.ndarray, "P texels C"]:
+        """Some rows of all photographs, one after the other, padded to so many texels.
+
+        Args:
+            rows: indices that rise.
+            texels: at least as many as the rows have.
+            precision: of the result, where values are no codes.
+        """
+        runs = [(run[0], run[-1] + 1) for run in np.split(rows, np.flatnonzero(np.diff(rows) != 1) + 1)]
         count, _, width, channels = self.shape
-        found = np.empty((count, channels, stop - start, width), precision)
-        for planes, read, unit in zip(found, self.bands, self.unit, strict=True):
-            values = read(start, stop)
-            for c in range(channels):
-                np.multiply(
-                    values[..., c],
-                    np.float32(1 / unit[c]) if values.dtype == np.float32 else 1 / unit[c],
-                    out=planes[c],
-                    casting="unsafe",
-                )
-        return found.reshape(count, channels, -1)
+        found = np.empty((count, texels, channels), self.codes or precision)
+        for photograph, read in zip(found, self.rows, strict=True):
+            end = 0
+            for start, stop in runs:
+                begin, end = end, end + (stop - start) * width
+                photograph[begin:end] = read(start, stop).reshape(-1, channels)
+            photograph[end:] = 0
+        return found
 
 
 def read_lights(path: str | Path) -> tuple[list[Path], Float[np.ndarray, "P 3"]]:
@@ -165,11 +178,11 @@ def photographs(
     opened = [_open(f"pictures[{i}]", picture, encoding) for i, picture in enumerate(pictures)]
     if not opened:
         raise InputError("pictures", "is empty", "Give a photograph for each light")
-    bands, shapes, names, silent = zip(*opened, strict=True)
+    rows, shapes, names, silent, types, tops = zip(*opened, strict=True)
     for name, shape in zip(names, shapes, strict=True):
         if shape != shapes[0]:
             raise InputError(name, f"is of shape {shape}, {names[0]} of {shapes[0]}", "Give photographs of one size")
-    count, channels = len(bands), shapes[0][2]
+    count, channels = len(rows), shapes[0][2]
     if isinstance(lights, str | Path):
         lights = read_lights(lights)[1] if Path(lights).suffix.lower() == ".lp" else read_directions(lights)
     if lights is None:
@@ -189,37 +202,45 @@ def photographs(
         unit = unit * [_factors("lights", np.asarray(light.intensity)[None], 1, channels)[0] for light in lights]
     else:
         to_light = _directions(lights)
-    return Photographs(bands, (count, *shapes[0]), to_light, scenes, unit, tuple(filter(None, silent)), names)
+    codes = types[0] if len(set(types)) == 1 and types[0].kind == "u" else None
+    if codes is None:
+        rows = [partial(_linear, read, kind) for read, kind in zip(rows, types, strict=True)]
+        tops = [1.0 if kind.kind == "u" else top for top, kind in zip(tops, types, strict=True)]
+    scale = 1 / (unit if codes is None else unit * np.iinfo(codes).max)
+    told = tuple(filter(None, silent))
+    return Photographs(
+        tuple(rows), (count, *shapes[0]), to_light, scenes, unit, codes, np.array(tops), scale, told, names
+    )
 
 
-def _open(name: str, picture: Any, encoding: Any) -> tuple[Any, tuple[int, int, int], str, str]:
-    """How to read rows of a photograph, its height, width and channels, its name, and that again where it is silent."""
+def _linear(read: Any, kind: np.dtype, start: int, stop: int) -> np.ndarray:
+    values = read(start, stop)
+    return values / np.float32(np.iinfo(kind).max) if kind.kind == "u" else values
+
+
+def _open(name: str, picture: Any, encoding: Any) -> tuple[Any, tuple[int, int, int], str, str, np.dtype, float]:
+    """A photograph.
+
+    Returns:
+        How to read rows of it; height, width and channels; its name, and that again where it is silent on its encoding;
+        the type of the rows, and from where on they are clipped.
+    """
     if isinstance(picture, str | Path):
         name, picture = str(picture), brdf.ImageReader(picture, encoding=encoding)
-    silent, top = "", np.inf
     if isinstance(picture, brdf.ImageReader):
-        read, shape, top = picture.rows, picture.shape, picture.codes[0] or np.inf
-        silent = name if picture.is_integer and picture.bits <= 8 and picture.source in ("assumed", "format") else ""
-    else:
-        if isinstance(picture, brdf.Picture):
-            picture, top = picture.pixels, picture.saturation or np.inf
-        values = np.asarray(picture)
-        values = values[..., None] if values.ndim == 2 else values
-        if values.ndim != 3 or 0 in values.shape or values.dtype.kind not in "fu":
-            came = f"is of shape {values.shape} and type {values.dtype}"
-            raise InputError(name, came, "Give (H, W, C) floats, or unsigned integers that span their type")
-        codes = values.dtype.kind == "u"
-        top, shape = (1.0 if codes else top), values.shape
-
-        def read(start: int, stop: int) -> np.ndarray:
-            part = values[start:stop]
-            return part.astype(np.float32) / np.float32(np.iinfo(part.dtype).max) if codes else part
-
-    def rows(start: int, stop: int) -> np.ndarray:
-        values = read(start, stop)
-        return values if top == np.inf else np.where(values < top * (1 - 1e-6), values, np.float32(np.nan))
-
-    return rows, shape, name, silent
+        silent = picture.is_integer and picture.bits <= 8 and picture.source in ("assumed", "format")
+        top = (picture.codes[0] or np.inf) * BELOW_TOP
+        return picture.rows, picture.shape, name, name if silent else "", np.dtype(np.float32), top
+    top = np.inf
+    if isinstance(picture, brdf.Picture):
+        picture, top = picture.pixels, (picture.saturation or np.inf) * BELOW_TOP
+    values = np.asarray(picture)
+    values = values[..., None] if values.ndim == 2 else values
+    if values.ndim != 3 or 0 in values.shape or values.dtype.kind not in "fu":
+        came = f"is of shape {values.shape} and type {values.dtype}"
+        raise InputError(name, came, "Give (H, W, C) floats, or unsigned integers that span their type")
+    top = np.iinfo(values.dtype).max if values.dtype.kind == "u" else top
+    return lambda start, stop: values[start:stop], values.shape, name, "", values.dtype, top
 
 
 def _factors(name: str, given: Any, count: int, channels: int) -> Float[np.ndarray, "P C"]:

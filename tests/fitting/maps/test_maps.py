@@ -121,8 +121,7 @@ def test_bounded_least_squares_is_exact():
     columns, target = random.normal(size=(3, 8, 200)) + 0.5, random.normal(size=(8, 2, 200))
     gram = [[np.sum(a * b, axis=0)[None] for b in columns] for a in columns]
     moment = [np.einsum("pt,pct->ct", a, target) for a in columns]
-    zero, high = [jnp.zeros((2, 200))] * 3, jnp.inf * jnp.ones(200)
-    k = nonnegative(gram, moment, zero, high, False, start=zero[0], steps=0)
+    k = nonnegative(gram, moment, jnp.inf * jnp.ones(200), False, steps=0)
     for t in range(200):
         matrix = np.array([[entry[0, t] for entry in row] for row in gram])
         for c in range(2):
