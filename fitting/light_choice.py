@@ -231,16 +231,9 @@ def _cap(middle: np.ndarray, size: float, count: int) -> list[np.ndarray]:
     height = 1 - (1 - np.cos(size)) * (np.arange(count) + 0.5) / count
     angle = np.arange(count) * np.pi * (3 - np.sqrt(5))
     radius = np.sqrt(1 - height**2)
-    across = _across(middle / np.linalg.norm(middle))
-    return list(np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1) @ across)
-
-
-def _across(direction: np.ndarray) -> np.ndarray:
-    """Two unit vectors across a direction, and itself, as rows."""
-    start = np.eye(3)[np.argmin(np.abs(direction))]
-    first = np.cross(start, direction)
-    first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(direction, first), direction])
+    across = np.linalg.svd(middle[None])[2][1:]
+    around = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1) @ across
+    return list(height[:, None] * middle / np.linalg.norm(middle) + around)
 
 
 @eqx.filter_jit

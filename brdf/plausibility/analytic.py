@@ -15,6 +15,7 @@ import numpy as np
 from brdf.albedo import ACCURACY, directional_albedo, lobe_albedo, normalized_form
 from brdf.channels import in_channel
 from brdf.conversions import nearest_normalized
+from brdf.measured.table import from_angles
 from brdf.models import BlinnPhong, Lambert, Material, NormalizedBlinnPhong, NormalizedPhong, Phong, SpecularMaterial
 from brdf.plausibility.report import ENERGY_LIMIT, GRAZING, RECIPROCITY_LIMIT, Angles, Finding, Report, judged, times
 from brdf.precision import cast, working_precision
@@ -81,7 +82,7 @@ def _classic_reciprocity(material: SpecularMaterial) -> Finding:
 
 def _in_plane(material: Material, light: np.ndarray, view: np.ndarray) -> np.ndarray:
     """f_r, (a, b, C), for angles of light and view in degrees, in one plane: there the five models have extremes."""
-    to_light, to_view = (np.stack([np.sin(x), 0 * x, np.cos(x)], axis=-1) for x in map(np.radians, (light, view)))
+    to_light, to_view = (from_angles(np.radians(angle), 0.0) for angle in (light, view))
     return np.asarray(_reflectance(material, to_light[:, None], to_view))
 
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from brdf.measured.table import from_angles
 from brdf.models import Material, SpecularMaterial
 from brdf.models.base import check_model
 
@@ -82,11 +83,7 @@ def stability_map(
 
 def _vectors(theta: np.ndarray, tilt: np.ndarray, across: np.ndarray) -> Float[np.ndarray, "m 3 3"]:
     """Normal, light and view, rounded to float32; the view tilts from the mirror direction, in or across the plane."""
-
-    def in_plane(angle: np.ndarray) -> np.ndarray:
-        return np.stack([np.sin(angle), 0 * angle, np.cos(angle)], -1)
-
-    light = in_plane(theta)
+    light = from_angles(theta, 0.0)
     beside = np.cos(tilt)[:, None] * light * [-1.0, 1.0, 1.0] + np.sin(tilt)[:, None] * [0.0, 1.0, 0.0]
-    view = np.where(across[:, None], beside, in_plane(-theta - tilt))
-    return np.stack([in_plane(0 * theta), light, view], axis=1).astype(np.float32)
+    view = np.where(across[:, None], beside, from_angles(-theta - tilt, 0.0))
+    return np.stack([np.broadcast_to([0.0, 0.0, 1.0], light.shape), light, view], axis=1).astype(np.float32)

@@ -18,7 +18,7 @@ from brdf.albedo import directional_albedo
 from brdf.channels import channel_names, in_channel
 from brdf.checks import several
 from brdf.display import displayed, lit_sphere
-from brdf.measured.table import MeasuredBRDF
+from brdf.measured.table import MeasuredBRDF, from_angles
 from brdf.models.base import Material, SpecularMaterial
 from brdf.plausibility.numeric import Sampler, albedo_of
 from brdf.plausibility.report import Report
@@ -118,8 +118,8 @@ def plot_lobe(brdf: Brdf, angles: tuple[float, ...] = (0.0, 30.0, 60.0), channel
     for angle in angles:
         views = np.unique([*np.linspace(-90, 90, 721), *(angle - apart), angle, *(angle + apart)])
         views = np.radians(views[np.abs(views) <= 90])
-        view = _in_plane(views)
-        value = sample(_in_plane(np.radians([-angle])), view)[:, channel] * view[:, 2]
+        view = from_angles(views, 0.0)
+        value = sample(from_angles(np.radians([-angle]), 0.0), view)[:, channel] * view[:, 2]
         axes.plot(views, np.sign(value) * np.abs(value) ** 0.5, linewidth=1.8, label=f"light at {angle:g}°")
     axes.set_theta_zero_location("N")
     axes.set_theta_direction(-1)
@@ -147,7 +147,7 @@ def plot_reciprocity(brdf: Brdf, channel: int = 0, figure: Any = None) -> Any:
     """
     sample = _sampler(brdf)
     angles = np.linspace(0, 89.5, 180)
-    to_light, to_view = map(_in_plane, np.radians(np.meshgrid(angles, -angles, indexing="ij")).reshape(2, -1))
+    to_light, to_view = from_angles(np.radians(np.meshgrid(angles, -angles, indexing="ij")).reshape(2, -1), 0.0)
     there, back = sample(to_light, to_view)[:, channel], sample(to_view, to_light)[:, channel]
     largest = np.max(np.abs([there, back]), axis=0, initial=1e-300)
     difference = ((there - back) / largest).reshape(len(angles), -1)
@@ -197,11 +197,6 @@ def _axes(figure, size, **how):
     """A figure, of some size where there is none yet, and axes that fill it."""
     figure = figure or Figure(figsize=size, layout="constrained")
     return figure, figure.add_subplot(**how)
-
-
-def _in_plane(angle):
-    """Directions in the plane of incidence, by their angle from the normal in radians."""
-    return np.stack([np.sin(angle), 0.0 * angle, np.cos(angle)], axis=-1)
 
 
 def _lit_function(sample, size=256):
