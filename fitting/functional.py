@@ -307,17 +307,16 @@ def _search(
     residual = _residual(pixels, matt)
     profile = jax.vmap(lambda t: _point(pixels, jnp.stack(_derivatives(relative, t)[:2], 1), residual, matt))(grid)
     cost = jnp.sum(profile.cost, axis=(1, 2))
-    cells = _cells(grid, cost, profile.slope)
+    position, lowest = _cells(grid, cost, profile.slope)
     # Of the two lowest valleys the better one, after a step in each.
-    lowest = jnp.where(
-        (cells.lowest <= _left(cells.lowest)) & (cells.lowest < _right(cells.lowest)), cells.lowest, jnp.inf
-    )
-    _, best = jax.lax.top_k(-lowest, min(2, count - 1))
-    points = jax.vmap(lambda cell: at(cells.log_n[cell], profile.x[cell]))(best)
+    beside = jnp.pad(lowest, 1, constant_values=jnp.inf)
+    valleys = jnp.where((lowest <= beside[:-2]) & (lowest < beside[2:]), lowest, jnp.inf)
+    _, best = jax.lax.top_k(-valleys, min(2, count - 1))
+    points = jax.vmap(lambda cell: at(position[cell], profile.x[cell]))(best)
     gain = points.slope**2 / jnp.where(points.curvature > 0, 2 * points.curvature, jnp.inf)
     first = jnp.argmin(jnp.sum(points.cost, axis=(1, 2)) - gain)
     width = grid[1] - grid[0]
-    start = cells.log_n[best[first]]
+    start = position[best[first]]
     point = jax.tree.map(lambda leaf: leaf[first], points)
     bracket = jnp.maximum(low, start - width), jnp.minimum(high, start + width)
 
@@ -348,27 +347,14 @@ def _derivatives(function: Callable[[Array], Array], at: Array) -> tuple[Array, 
     return value, first, second
 
 
-class _Cells(NamedTuple):
-    log_n: Array
-    lowest: Array
-
-
-def _cells(grid: Array, cost: Array, slope: Array) -> _Cells:
+def _cells(grid: Array, cost: Array, slope: Array) -> tuple[Array, Array]:
     """Where in each cell of the grid the cubic through the samples is least, and how low."""
     t = jnp.linspace(0.0, 1.0, 33, dtype=grid.dtype)
     step = jnp.diff(grid)[:, None]
     rise = jnp.diff(cost)[:, None]
     bent = step * t * (1 - t) * ((1 - t) * slope[:-1, None] - t * slope[1:, None])
     values = cost[:-1, None] + t * t * (3 - 2 * t) * rise + bent
-    return _Cells(grid[:-1] + t[jnp.argmin(values, axis=1)] * step[:, 0], jnp.min(values, axis=1))
-
-
-def _left(values: Array) -> Array:
-    return jnp.concatenate([jnp.full(1, jnp.inf, values.dtype), values[:-1]])
-
-
-def _right(values: Array) -> Array:
-    return jnp.concatenate([values[1:], jnp.full(1, jnp.inf, values.dtype)])
+    return grid[:-1] + t[jnp.argmin(values, axis=1)] * step[:, 0], jnp.min(values, axis=1)
 
 
 def _residual(pixels: _Pixels, x: Array, lobe: Array | None = None) -> Array:

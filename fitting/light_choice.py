@@ -28,7 +28,7 @@ from brdf.rendering import basis
 from fitting.progress import waiting
 from fitting.result import FitResult
 from fitting.solver.nnls import inverse_diagonal
-from fitting.solver.normal_equations import AnyArray
+from fitting.solver.tied import join_channels
 
 # Directions of the hemisphere that are tried, 6° apart, and then around the best: up to which angle, how many.
 HEMISPHERE, AROUND = (np.pi / 2, 400), ((0.1, 16), (0.025, 16))
@@ -150,7 +150,10 @@ def next_light(
         variance = np.asarray(result.noise, np.float64) ** 2
 
         def told(scene: brdf.Scene, share: float) -> np.ndarray:
-            return np.asarray(_information(material, brdf.cast(scene, "float64"), variance)) / share
+            """Fisher's information by k_a, k_d, k_s, channel after channel each, and n."""
+            gram = np.asarray(_gram(material, brdf.cast(scene, "float64"))) / share
+            none, k_s = np.zeros(gram.shape[:2]), np.asarray(getattr(material, "k_s", np.zeros(len(gram))))
+            return join_channels(gram, none, none[:, 0], k_s, variance).gram
 
         def error(information: np.ndarray) -> float:
             """Root mean square of the standard errors of what is wanted; infinite where one is not determined."""
@@ -237,23 +240,17 @@ def _cap(middle: np.ndarray, size: float, count: int) -> list[np.ndarray]:
 
 
 @eqx.filter_jit
-def _information(material: brdf.Material, scene: brdf.Scene, variance: AnyArray) -> Array:
-    """Of a picture of a material, by k_a, k_d, k_s, channel after channel each, and n."""
+def _gram(material: brdf.Material, scene: brdf.Scene) -> Float[Array, "C 4 4"]:
+    """Products of the columns of a picture: ambient, diffuse, lobe, and the lobe's derivative by n."""
     model, channels = type(material), material.k_d.shape[0]
     images = basis(model, scene)
-    shape = images.points.mask.size, channels
-    nothing = jnp.zeros(shape)
+    nothing = jnp.zeros((images.points.mask.size, channels))
     ambient = nothing if scene.ambient is None else nothing + scene.ambient
     diffuse = nothing if images.diffuse is None else nothing + images.diffuse
     lobe = slope = nothing
     if isinstance(material, SpecularMaterial) and images.lobe is not None:
         terms = images.lobe
         lobe, slope = jax.jvp(lambda n: model.scale(n) * terms(n)[0], (material.n,), (jnp.ones_like(material.n),))
-        lobe, slope = nothing + lobe, material.k_s * slope
+        lobe, slope = nothing + lobe, nothing + slope
     columns = jnp.where(images.points.mask.ravel()[:, None], jnp.stack([ambient, diffuse, lobe, slope]), 0)
-    gram = jnp.einsum("ipc,jpc->cij", columns, columns) / variance[:, None, None]
-    place = np.zeros((channels, 4, 3 * channels + 1))
-    for channel, term in np.ndindex(channels, 3):
-        place[channel, term, term * channels + channel] = 1
-    place[:, 3, -1] = 1
-    return jnp.einsum("cij,ciu,cjv->uv", gram, place, place)
+    return jnp.einsum("ipc,jpc->cij", columns, columns)
