@@ -1,5 +1,6 @@
 """``brdf maps``: a material for every pixel of one view under many lights."""
 
+import shutil
 from pathlib import Path
 from typing import Annotated
 
@@ -7,9 +8,13 @@ import typer
 
 from brdf.files import check_folder
 from fitting.cli.common import Encoding, Precision, named_as, show, use_compilation_cache
+from fitting.cli.devices import all_devices, is_first_process
 from fitting.progress import waiting
 
 EXAMPLE = "Example: [bold]brdf maps photographs/ --normals fit --out maps/[/bold]"
+
+# Below --out, while the maps are being fitted: what is done, from which the same command goes on after an interruption.
+BANDS = "bands"
 
 
 def maps(
@@ -33,6 +38,9 @@ def maps(
     encoding: Encoding = None,
     plot: Annotated[bool, typer.Option("--plot", help="Also draw maps.png into --out.")] = False,
     precision: Precision = "float32",
+    devices: Annotated[
+        str | None, typer.Option(help="all: every core, accelerator and process that Slurm or mpirun has started.")
+    ] = None,
 ) -> None:
     """Fit k_d, k_s, n and normals to every pixel of photographs under many lights."""
     from brdf.errors import InputError
@@ -41,6 +49,7 @@ def maps(
         raise InputError("--plot", "needs a folder to draw into", "Add --out DIR")
     if out is not None:
         check_folder(out)
+    mesh = all_devices(devices)
     use_compilation_cache()
     import fitting
 
@@ -55,7 +64,12 @@ def maps(
             flip_y=flip_y,
             encoding=encoding,
             precision=precision,  # pyright: ignore[reportArgumentType]
+            mesh=mesh,
+            keep=None if out is None else out / BANDS,
         )
+        if not is_first_process(mesh):
+            return
         if out is not None:
             found.save(out, plot=plot)
+            shutil.rmtree(out / BANDS, ignore_errors=True)
     show("\n".join([str(found), *([] if out is None else [f"saved in {out}"])]))

@@ -25,10 +25,12 @@ from brdf.models.base import SpecularMaterial
 from brdf.precision import Precision, working_precision
 from brdf.vectors import normalize
 from fitting.maps import map_inputs
+from fitting.maps.kept_bands import KeptBands
 from fitting.maps.map_inputs import Photographs
 from fitting.maps.map_result import REASONS, Maps
 from fitting.maps.texels import CAP, Columns, Distant, TexelFit, fit_texels, fit_with_normals
 from fitting.progress import waiting
+from fitting.solver.devices import device_count, gathered, own, placed, spread_over
 
 TILE = 528
 """Texels that go through the program in step: what they need stays in the processor's cache. No power of two: rows so
@@ -65,6 +67,8 @@ def fit_maps(
     encoding: Any = None,
     flip_y: bool = False,
     precision: Precision = "float32",
+    mesh: Any = None,
+    keep: str | Path | None = None,
 ) -> Maps:
     """Fit a material to every texel of one view under many lights: the global optimum of each, with errors.
 
@@ -88,6 +92,10 @@ def fit_maps(
             the one is taken that the model explains better, and a note says so.
         flip_y: whether y goes down in a file of normals.
         precision: "float32" or "float64".
+        mesh: a `jax.sharding.Mesh` of the devices to deal bands of rows out to, on one machine or, under
+            `jax.distributed`, on many: each process reads and fits those of its own devices. None for all cores.
+        keep: a folder for the bands that are done. A call with the same inputs goes on from there, where one was
+            interrupted; processes take the bands of the others from it, so all must see it.
 
     Returns:
         The maps.
@@ -125,16 +133,9 @@ def fit_maps(
     if given.silent and given.to_light is not None:
         other = map_inputs.photographs(pictures, lights, intensities, exposures, "linear")
         given, notes = _likelier(given, other, surface, how)
-    _, height, width, _ = given.shape
-    layers: dict[str, np.ndarray] = {}
-    with waiting("fitting maps") as say:
-        for start, stop, band in _fitted(given, surface, how):
-            for name, values in band.items():
-                if name not in layers:
-                    layers[name] = np.empty((height, width, *values.shape[1:]), values.dtype)
-                rows = values[: (stop - start) * width]
-                layers[name][start:stop] = rows.reshape(stop - start, width, *values.shape[1:])
-            say(f"fitting maps, {100 * stop // height} % done")
+    with spread_over(mesh):
+        bands = _Bands(given, surface, how, keep)
+        layers = bands.fit()
     if not np.any(layers["reason"] != REASONS.index("outside")):
         raise InputError("pictures", "show no texel that counts", "Check mask, normals and clipping")
     return _maps(layers, how, notes)
@@ -230,24 +231,71 @@ class _Surface(NamedTuple):
         return jax.tree.map(cut, self)
 
 
-def _fitted(given: Photographs, surface: _Surface, how: _How) -> Iterator[tuple[int, int, dict[str, Any]]]:
-    """Bands of the maps from the top, fitted on all cores while the next ones are read."""
-    _, height, width, _ = given.shape
-    rows = max(1, min(height, BAND // width))
-    texels = -(-rows * width // TILE) * TILE
-    waiting: deque[tuple[int, int, Future]] = deque()
-    workers = os.cpu_count() or 1
-    with ThreadPoolExecutor(workers) as pool:
-        for start in range(0, height, rows):
-            stop = min(start + rows, height)
-            part = np.arange(start, stop)
-            codes, some = given.band(part, texels, how.precision), surface.some(part, texels, how.precision)
-            waiting.append((start, stop, pool.submit(_fit_band, given, how, codes, some)))
-            if len(waiting) > workers:
-                first, last, future = waiting.popleft()
-                yield first, last, future.result()
-        for first, last, future in waiting:
-            yield first, last, future.result()
+class _Bands:
+    """Bands of rows, from the top: each is read, fitted on a core or device while others are, and kept where asked."""
+
+    def __init__(self, given: Photographs, surface: _Surface, how: _How, keep: str | Path | None):
+        self.given, self.surface, self.how = given, surface, how
+        _, height, width, _ = given.shape
+        count = min(height, max(-(-height * width // BAND), device_count()))
+        self.rows = -(-height // count)
+        self.starts = range(0, height, self.rows)
+        self.texels = -(-self.rows * width // TILE) * TILE
+        self.kept = None if keep is None else KeptBands(keep, given, (how, surface.normal, surface.mask, self.rows))
+
+    def fit(self) -> dict[str, np.ndarray]:
+        """The layers, (H, W, ...)."""
+        mine, count = own(len(self.starts)), len(self.starts)
+        if len(mine) < count and self.kept is None:
+            raise InputError("keep", "is missing", "Give a folder that all processes see, for the bands of each")
+        _, height, width, _ = self.given.shape
+        layers: dict[str, np.ndarray] = {}
+
+        def place(index: int, band: dict[str, np.ndarray]) -> None:
+            start = self.starts[index]
+            stop = min(start + self.rows, height)
+            for name, values in band.items():
+                if name not in layers:
+                    layers[name] = np.empty((height, width, *values.shape[1:]), values.dtype)
+                texels = values[: (stop - start) * width]
+                layers[name][start:stop] = texels.reshape(stop - start, width, *values.shape[1:])
+
+        with waiting("fitting maps") as say:
+            for done, (index, band) in enumerate(self._each(mine), start=1):
+                place(index, band)
+                say(f"fitting maps, {100 * done // len(mine)} % done")
+        if len(mine) < count and self.kept is not None:
+            gathered({}, 1, (1,))  # until all processes have kept theirs
+            for index in sorted(set(range(count)) - set(mine)):
+                place(index, self.kept.read(self.starts[index]) or {})
+            gathered({}, 1, (1,))  # and have read those of the others
+        return layers
+
+    def _each(self, mine: list[int]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+        queue: deque[tuple[int, Future]] = deque()
+        workers = os.cpu_count() or 1
+        with ThreadPoolExecutor(workers) as pool:
+            for index in mine:
+                start, precision = self.starts[index], self.how.precision
+                band = None if self.kept is None else self.kept.read(start)
+                if band is not None:
+                    yield index, band
+                    continue
+                rows = np.arange(start, min(start + self.rows, self.given.shape[1]))
+                codes = self.given.band(rows, self.texels, precision, pool)
+                with working_precision(precision):
+                    placed_there = placed(index, (codes, self.surface.some(rows, self.texels, precision)))
+                queue.append((index, pool.submit(_fit_band, self.given, self.how, *placed_there)))
+                if len(queue) > workers:
+                    yield self._done(*queue.popleft())
+            for one in queue:
+                yield self._done(*one)
+
+    def _done(self, index: int, future: Future) -> tuple[int, dict[str, np.ndarray]]:
+        band = future.result()
+        if self.kept is not None:
+            self.kept.write(self.starts[index], band)
+        return index, band
 
 
 def _fit_band(given: Photographs, how: _How, codes: np.ndarray, surface: _Surface) -> dict[str, np.ndarray]:

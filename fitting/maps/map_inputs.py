@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from concurrent.futures import Executor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -50,23 +51,29 @@ class Photographs:
     silent: tuple[str, ...]
     names: tuple[str, ...]
 
-    def band(self, rows: np.ndarray, texels: int, precision: str) -> Num[np.ndarray, "P texels C"]:
+    def band(
+        self, rows: np.ndarray, texels: int, precision: str, pool: Executor | None = None
+    ) -> Num[np.ndarray, "P texels C"]:
         """Some rows of all photographs, one after the other, padded to so many texels.
 
         Args:
             rows: indices that rise.
             texels: at least as many as the rows have.
             precision: of the result, where values are no codes.
+            pool: reads several photographs at a time.
         """
         runs = [(run[0], run[-1] + 1) for run in np.split(rows, np.flatnonzero(np.diff(rows) != 1) + 1)]
         count, _, width, channels = self.shape
         found = np.empty((count, texels, channels), self.codes or precision)
-        for photograph, read in zip(found, self.rows, strict=True):
+
+        def fill(photograph: np.ndarray, read: Any) -> None:
             end = 0
             for start, stop in runs:
                 begin, end = end, end + (stop - start) * width
                 photograph[begin:end] = read(start, stop).reshape(-1, channels)
             photograph[end:] = 0
+
+        list((map if pool is None else pool.map)(fill, found, self.rows))
         return found
 
 

@@ -84,6 +84,19 @@ def test_two_processes(tmp_path):
             np.testing.assert_allclose(found["k_d"], many.k_d, rtol=1e-12)
 
 
+def test_two_processes_fit_the_bands_of_maps(tmp_path):
+    ended = run_two(tmp_path, "maps")
+    assert [status for status, _ in ended] == [0, 0], ended
+    assert len(list((tmp_path / "keep").iterdir())) == 2
+    to_light = np.array([[0, 0, 1], [0.5, 0, 1], [0, 0.5, 1], [-0.5, 0, 1], [0, -0.5, 1], [0.2, 0.2, 1]])
+    photographs = np.random.default_rng(0).uniform(0.1, 0.9, (6, 4, 5, 3))
+    expected = fitting.fit_maps(photographs, to_light, np.ones((4, 5, 3)))
+    for rank in (0, 1):
+        with np.load(tmp_path / f"{rank}.npz") as found:
+            for name, values in expected.layers().items():
+                np.testing.assert_allclose(found[name], values, rtol=1e-5, equal_nan=True)
+
+
 def test_a_process_that_dies_is_told_and_leaves_nothing_that_looks_whole(tmp_path):
     start = time.monotonic()
     (status, said), _ = run_two(tmp_path, "dies")

@@ -36,6 +36,12 @@ if dies and rank == 1:
 material = brdf.BlinnPhong(k_a=[0.2, 0.1, 0.15], k_d=[0.5, 0.4, 0.3], k_s=[0.3, 0.3, 0.4], n=35.0)
 picture = pictured(material, ball_scene(), 0.01)
 mesh = jax.make_mesh((jax.device_count(),), ("pixels",))
+if sys.argv[4] == "maps":
+    to_light = np.array([[0, 0, 1], [0.5, 0, 1], [0, 0.5, 1], [-0.5, 0, 1], [0, -0.5, 1], [0.2, 0.2, 1]])
+    photographs = np.random.default_rng(0).uniform(0.1, 0.9, (6, 4, 5, 3))
+    maps = fitting.fit_maps(photographs, to_light, np.ones((4, 5, 3)), mesh=mesh, keep=folder / "keep")
+    np.savez(folder / f"{rank}.npz", **maps.layers())
+    sys.exit()
 try:
     result = fitting.fit(picture, ball_scene(), model="blinn-phong", precision="float64", mesh=mesh)
 except brdf.InputError as error:

@@ -1,14 +1,20 @@
 """Maps: each texel against the fit of one material, a dense search and the truth; lights of any kind; files."""
 
 import json
+import os
+import subprocess
+import sys
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from project_paths import ROOT
 
 import brdf
 import fitting
 from brdf.images.writing import write_image
+from fitting.maps import map_fit
+from fitting.maps.kept_bands import KeptBands
 from fitting.maps.map_inputs import read_lights
 from fitting.maps.texels import nonnegative
 from fitting.solver.nnls import nonnegative_minimum
@@ -316,3 +322,54 @@ def test_bad_arguments_are_told_in_one_line(change, words):
         fitting.fit_maps(**(good | change))
     assert words in str(error.value)
     assert "\n" not in str(error.value)
+
+
+# -- bands, devices, processes -----------------------------------------------------------------------------------------
+
+
+def test_an_interrupted_run_goes_on_where_it_was(folder, tmp_path, monkeypatch):
+    path, _ = folder
+    monkeypatch.setattr(map_fit, "BAND", 16)
+    whole, keep = fitting.fit_maps(path), tmp_path / "keep"
+    write, fit_band, calls = KeptBands.write, map_fit._fit_band, []
+
+    def stops(self, start, layers):
+        write(self, start, layers)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(KeptBands, "write", stops)
+        with pytest.raises(KeyboardInterrupt):
+            fitting.fit_maps(path, keep=keep)
+    assert len(list(keep.iterdir())) == 1
+    monkeypatch.setattr(map_fit, "_fit_band", lambda *all: calls.append(0) or fit_band(*all))
+    again = fitting.fit_maps(path, keep=keep)
+    assert len(calls) == 2
+    for name, values in whole.layers().items():
+        np.testing.assert_array_equal(values, again.layers()[name])
+    fitting.fit_maps(path, keep=keep, specular="grey")
+    assert len(calls) == 5
+
+
+def test_two_devices_give_the_maps_of_one(tmp_path):
+    program = (
+        "import jax, numpy as np, test_maps as t, fitting\n"
+        "pictures, truth = t.texels(64, 0.01, t.dome(16))\n"
+        "pictures, normals = pictures.reshape(16, 8, 8, 3), truth['normal'].reshape(8, 8, 3)\n"
+        "mesh = jax.make_mesh((2,), ('rows',))\n"
+        "maps = fitting.fit_maps(pictures, t.dome(16), normals, precision='float64', mesh=mesh)\n"
+        "np.savez('maps', **maps.layers())\n"
+    )
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests/support"), str(ROOT / "tests/fitting/maps")]),
+        "JAX_PLATFORMS": "cpu",
+        "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2",
+    }
+    subprocess.run([sys.executable, "-c", program], env=environment, cwd=tmp_path, check=True, timeout=300)
+    pictures, truth = texels(64, 0.01, dome(16))
+    pictures, normals = pictures.reshape(16, 8, 8, 3), truth["normal"].reshape(8, 8, 3)
+    maps = fitting.fit_maps(pictures, dome(16), normals, precision="float64")
+    with np.load(tmp_path / "maps.npz") as found:
+        for name, values in maps.layers().items():
+            np.testing.assert_allclose(found[name], values, rtol=1e-9, equal_nan=True)
