@@ -65,7 +65,7 @@ def write(folder):
         (place / "scene.toml").write_text(SCENE.format(size=SIZE) + LIGHTS[name])
         if (place / "target.exr").exists():
             continue
-        fine = with_samples(brdf.Scene.load(place / "scene.toml"), 1024)
+        fine = with_samples(brdf.Scene.load(place / "scene.toml"), 4096)
         picture = np.asarray(brdf.render(material(), fine))
         noise = np.random.default_rng(0).standard_normal(picture.shape)
         brdf.write_image(place / "target.exr", (picture + NOISE * picture.mean() * noise).astype(np.float32))

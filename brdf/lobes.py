@@ -6,6 +6,7 @@ are taken tile by tile, which also keeps a tile in the processor's cache while i
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -33,6 +34,12 @@ And rows from which on XLA's product of two matrices is a quick one."""
 
 STACKED_VALUES = 1 << 26
 """Up to so many values the fit keeps the terms of many samples, too, for few pixels: 256 MiB in float32."""
+
+NODES, STEP, WIDEST, ROUGH = 5, 0.35, 1.0, 1e4
+"""A polynomial through so many exponents stands for a lobe: between nodes of Chebyshev over a range of log n of 0.7 to
+1e-5, of 0.04 to 1e-11; wider than `WIDEST` at equal steps, to 1e-3, which serves to find where to look.
+
+Up to the last of these as exponent products may be rounded."""
 
 NO_LOBE = -1e9
 """The peak of a pixel without a lobe: exp(n * this) = 0 for every n that a fit visits."""
@@ -113,7 +120,7 @@ def sum_over_samples(
     Returns:
         The sums in that structure, (P, C) each.
     """
-    if lighting.samples > STORED_SAMPLES:
+    if is_sampled(lighting):
         return over_samples(model, points, lighting, of_terms)[0]
 
     def at_point(point: SurfacePoints) -> Any:
@@ -123,8 +130,18 @@ def sum_over_samples(
     return jax.vmap(at_point)(points)
 
 
+def is_sampled(lighting: Lighting) -> bool:
+    """Whether the samples are so many that they are looped over."""
+    return lighting.samples > STORED_SAMPLES
+
+
 def over_samples(
-    model: type[Material], points: SurfacePoints, lighting: Lighting, of_terms: Callable[[LightTerms], Any]
+    model: type[Material],
+    points: SurfacePoints,
+    lighting: Lighting,
+    of_terms: Callable[[LightTerms], Any],
+    *,
+    rough: bool = False,
 ) -> tuple[Any, Float[Array, " P"]]:
     """Sums as of `sum_over_samples` for many samples, and the peak of the lobe.
 
@@ -167,7 +184,7 @@ def over_samples(
             total, _ = jax.lax.scan(add_light, total, each)
         return jax.tree.map(lambda leaf: leaf.T, total)
 
-    return _by_tiles(of_tile, points)
+    return _by_tiles(of_tile, points, rough)
 
 
 def _emitted(emitted: Float[Array, "B C"], value: Float[Array, "B P"]) -> Float[Array, "C P"]:
@@ -199,15 +216,16 @@ def _chunks(samples: Any) -> Any:
     return numbers, jnp.where(beyond, 0, emitted), *light
 
 
-def _points_apart(points: SurfacePoints) -> Any:
+def _points_apart(points: SurfacePoints, rough: bool) -> Any:
     """The vectors of (P,) points in components, and the lights that they see along the first axis."""
     seen = None if points.visibility is None else points.visibility.T
     plain = dataclasses.replace(points, visibility=None)
     apart = jax.tree.map(lambda leaf: Components.of(leaf) if leaf.ndim == 2 else leaf, plain)
-    return dataclasses.replace(apart, visibility=seen)
+    normal = dataclasses.replace(apart.normal, rough=rough)
+    return dataclasses.replace(apart, normal=normal, visibility=seen)
 
 
-def _by_tiles(of_tile: Callable[[SurfacePoints], Any], points: SurfacePoints) -> Any:
+def _by_tiles(of_tile: Callable[[SurfacePoints], Any], points: SurfacePoints, rough: bool) -> Any:
     """``of_tile`` of all points, tile by tile; the last point fills up the last tile."""
     count = points.mask.size
     tiles = -(-count // TILE)
@@ -217,8 +235,51 @@ def _by_tiles(of_tile: Callable[[SurfacePoints], Any], points: SurfacePoints) ->
         padded = jnp.pad(leaf, [(0, tiles * size - count)] + [(0, 0)] * (leaf.ndim - 1), mode="edge")
         return padded.reshape(tiles, size, *leaf.shape[1:])
 
-    done = jax.lax.map(lambda tile: of_tile(_points_apart(tile)), jax.tree.map(cut, points))
+    done = jax.lax.map(lambda tile: of_tile(_points_apart(tile, rough)), jax.tree.map(cut, points))
     return jax.tree.map(lambda leaf: leaf.reshape(tiles * size, *leaf.shape[2:])[:count], done)
+
+
+class Near(NamedTuple):
+    """Exponents at which a lobe of many samples is tabulated, once for all that is asked of it later.
+
+    Attributes:
+        log_n: their logarithms, increasing, (N,), at least `NODES`.
+        peak: about the largest logarithm of the lobe's cosine in any pixel, which the values are relative to.
+    """
+
+    log_n: Float[Any, " N"]
+    peak: Float[Any, ""]
+
+    @property
+    def narrow(self) -> bool:
+        """Whether one polynomial goes through all of them."""
+        return self.log_n.size == NODES
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Logarithms of the exponents between which it serves; the nodes of Chebyshev end short of that."""
+        low, high = float(self.log_n[0]), float(self.log_n[-1])
+        beyond = 0.5 * (high - low) * (1 / math.cos(0.5 * math.pi / NODES) - 1) if self.narrow else 0.0
+        return low - beyond, high + beyond
+
+    @classmethod
+    def between(cls, low: float, high: float, peak: float) -> "Near":
+        """The nodes of Chebyshev between two logarithms of n, or many at equal steps where these are far apart."""
+        if high - low > WIDEST:
+            return cls(np.linspace(low, high, math.ceil((high - low) / STEP) + NODES), np.float64(peak))
+        turn = np.cos(np.pi * (np.arange(NODES) + 0.5) / NODES)[::-1]
+        return cls(0.5 * (low + high) + 0.5 * (high - low) * turn, np.float64(peak))
+
+
+def _lagrange(xp: Any, nodes: Any, at: Any) -> Any:
+    """What multiplies the values at some nodes to give that of their polynomial, and its derivative, (2, N)."""
+    away, weights, slopes = at - nodes, [], []
+    for k in range(NODES):
+        others = [j for j in range(NODES) if j != k]
+        scale = math.prod(nodes[k] - nodes[j] for j in others)
+        weights.append(math.prod(away[j] for j in others) / scale)
+        slopes.append(sum(math.prod(away[i] for i in others if i != j) for j in others) / scale)
+    return xp.stack([xp.stack(weights), xp.stack(slopes)])
 
 
 class Lobe(eqx.Module):
@@ -235,6 +296,8 @@ class Lobe(eqx.Module):
         source: points (P,) and lights that the terms are made of anew; None where they are kept.
         fine: of the points, (K M,), of those pixels that are averaged; None where no pixel is.
         share: of each point in its pixel, (K, M).
+        table: values at some exponents, relative to a peak, (P, N, C); None where nothing is tabulated.
+        near: what they are tabulated at.
         slot: for every pixel its row in ``share``, or -1, (P,).
     """
 
@@ -245,6 +308,8 @@ class Lobe(eqx.Module):
     fine: "Lobe | None" = None
     share: Float[Array, "K M"] | None = None
     slot: Int[Array, " P"] | None = None
+    table: Float[Array, "P N C"] | None = None
+    near: Near | None = None
 
     @classmethod
     def of_terms(cls, kept: tuple[tuple[Float[Array, "P S C"], Float[Array, "P S"]], ...]) -> "Lobe":
@@ -261,6 +326,8 @@ class Lobe(eqx.Module):
                 a lobe itself falls by many powers of ten within a step of log n, but its shape does not change faster
                 than elsewhere. What lies nearer to the centre than that counts as if it were there.
         """
+        if self.table is not None:
+            return self._interpolated(n, peak)
         value: Any = 0.0
         slope: Any = 0.0
         if self.source is None:
@@ -282,15 +349,43 @@ class Lobe(eqx.Module):
         fine_value, fine_slope = (average(self.share, fine) for fine in self.fine(n, peak))
         return self._averaged(value, fine_value), self._averaged(slope, fine_slope)
 
+    def _interpolated(self, n: Scalar, peak: Scalar | float) -> tuple[Array, Array]:
+        """From the table, by Lagrange's polynomial through the nearest nodes."""
+        near, table = self.near, self.table
+        assert near is not None
+        assert table is not None
+        xp: Any = np if isinstance(table, np.ndarray) else jnp
+        n = xp.asarray(n, float if xp is np else None)
+        nodes = xp.asarray(near.log_n)
+        beyond = 0.03 * (nodes[-1] - nodes[0])  # the nodes of Chebyshev end short of their range
+        log_n = xp.clip(xp.log(n), nodes[0] - beyond, nodes[-1] + beyond)
+        first = xp.clip(xp.searchsorted(nodes, log_n) - NODES // 2, 0, nodes.size - NODES)
+        if xp is np:
+            weights = np.stack(
+                [_lagrange(np, nodes[i : i + NODES], at) for i, at in zip(first.flat, log_n.flat, strict=True)]
+            )
+            some = np.stack([table[:, i : i + NODES] for i in first.flat])
+            value, slope = np.einsum("nwk,npkc->wnpc", weights, some).reshape(2, *n.shape[:-2], *table[:, 0].shape)
+        else:
+            weights = _lagrange(jnp, jax.lax.dynamic_slice_in_dim(nodes, first, NODES), log_n).astype(table.dtype)
+            some = jax.lax.dynamic_slice_in_dim(table, first, NODES, axis=1)
+            value, slope = (sum(weight[k] * some[:, k] for k in range(NODES)) for weight in weights)
+        more = near.peak - peak
+        factor = xp.asarray(xp.exp(n * more), table.dtype)
+        slope = slope / xp.asarray(n, table.dtype)
+        return factor * value, factor * (slope + xp.asarray(more, table.dtype) * value)
+
     def pixels(self, choose: Callable[[Array], Array]) -> "Lobe":
         """The same for some of the pixels: ``choose`` is applied to each array whose first axis is the pixels."""
         source = None if self.source is None else (jax.tree.map(choose, self.source[0]), self.source[1])
-        peak, kept, slot = jax.tree.map(choose, (self.peak, self.kept, self.slot))
-        return Lobe(peak, self.model, kept, source, self.fine, self.share, slot)
+        peak, kept, slot, table = jax.tree.map(choose, (self.peak, self.kept, self.slot, self.table))
+        return Lobe(peak, self.model, kept, source, self.fine, self.share, slot, table, self.near)
 
     @property
     def samples(self) -> int:
         """How many light samples add up at a point."""
+        if self.table is not None:
+            return NODES
         return sum(terms[1].shape[1] for terms in self.kept) if self.source is None else self.source[1].samples
 
     def on_host(self, pixel: Int[np.ndarray, " K"]) -> "Lobe":
@@ -363,7 +458,7 @@ def diffuse_and_lobe(
 ) -> tuple[Float[Array, "P C"], Lobe | None]:
     """The diffuse basis of P points, of any shape, and the specular one where the model has one."""
     points, specular = points.flat(), issubclass(model, SpecularMaterial)
-    if lighting.samples <= STORED_SAMPLES:
+    if not is_sampled(lighting):
         diffuse: Any = 0.0
         kept: tuple[Any, ...] = ()
         for kind, row, light in lighting.each():
@@ -377,6 +472,22 @@ def diffuse_and_lobe(
     if not specular:
         return diffuse, None
     return diffuse, Lobe.of_terms(kept)
+
+
+@eqx.filter_jit
+def tabulated(
+    model: type[Material], points: SurfacePoints, lighting: Lighting, near: Near, *, rough: bool
+) -> tuple[Float[Array, "P C"], Float[Array, " P"], Float[Array, "P N C"] | None]:
+    """Of (P,) points under many samples the diffuse basis, the peak and the lobe at some exponents, in one pass."""
+
+    def of_terms(terms: LightTerms) -> Any:
+        dtype = terms.log_cosine.dtype
+        exponent = jnp.minimum(terms.log_cosine - jnp.asarray(near.peak, dtype), 0)
+        n = jnp.exp(jnp.asarray(near.log_n)).astype(dtype) if issubclass(model, SpecularMaterial) else []
+        return terms.diffuse, [terms.weight * jnp.exp(one * exponent) for one in n]
+
+    (diffuse, values), peak = over_samples(model, points, lighting, of_terms, rough=rough)
+    return diffuse, peak, jnp.stack(values, axis=1) if values else None
 
 
 @eqx.filter_jit

@@ -7,6 +7,7 @@ ambient light, lights, a specular term or occluders there is no arithmetic for i
 
 import contextlib
 import dataclasses
+import math
 from typing import Any
 
 import equinox as eqx
@@ -14,13 +15,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from brdf.checks import Scalar, instance
 from brdf.errors import InputError
 from brdf.geometry.surface_points import SurfacePoints
 from brdf.lights.base import Lighting, stacked
-from brdf.lobes import LightTerms, Lobe, average, diffuse_and_lobe, sum_over_samples
+from brdf.lobes import (
+    NO_LOBE,
+    ROUGH,
+    TILE,
+    LightTerms,
+    Lobe,
+    Near,
+    average,
+    diffuse_and_lobe,
+    is_sampled,
+    sum_over_samples,
+    tabulated,
+)
 from brdf.models.base import Material, SpecularMaterial, check_model
 from brdf.precision import Precision, cast, working_precision
 from brdf.scene import Scene
@@ -40,18 +53,29 @@ class Basis(eqx.Module):
     lobe: Lobe | None
 
 
-def basis(model: type[Material], scene: Scene, *, points: SurfacePoints | None = None) -> Basis:
+def basis(
+    model: type[Material],
+    scene: Scene,
+    *,
+    points: SurfacePoints | None = None,
+    near: Near | None = None,
+    counts: Bool[np.ndarray, " P"] | None = None,
+) -> Basis:
     """The basis images of a scene under a model, to be evaluated at any n.
 
     Args:
         model: the class of the material.
         scene: what is seen, and the light on it.
         points: what the pixels see, where that is known already.
+        near: which exponents will be asked for, so that many light samples are gone through once; None for any.
+        counts: which pixels will be looked at, where ``near`` is given; the others may be 0. None for all.
     """
     points = scene.surface_points() if points is None else points
     lighting, area = _lighting(scene, points), points.area
     if not lighting.stacks:
         return Basis(points, None, None)
+    if near is not None and area is None and is_sampled(lighting):
+        return _tabulated(model, points, lighting, near, counts)
     diffuse, lobe = diffuse_and_lobe(model, dataclasses.replace(points, area=None), lighting)
     if area is not None:
         fine_diffuse, fine_lobe = diffuse_and_lobe(model, area.points, lighting)
@@ -59,6 +83,27 @@ def basis(model: type[Material], scene: Scene, *, points: SurfacePoints | None =
         if lobe is not None and fine_lobe is not None:
             lobe = lobe.over_areas(fine_lobe, area.weight, area.slot.ravel())
     return Basis(points, diffuse, lobe)
+
+
+def _tabulated(
+    model: type[Material], points: SurfacePoints, lighting: Lighting, near: Near, counts: np.ndarray | None
+) -> Basis:
+    flat = jax.tree.map(np.asarray, points.flat())
+    index = np.flatnonzero(flat.mask if counts is None else flat.mask & counts)
+    # Of one size for few numbers of pixels, or each would be compiled.
+    padded = np.resize(index, -(-max(index.size, 1) // TILE) * TILE) if index.size else np.zeros(TILE, int)
+    rough = near.ends[1] <= math.log(ROUGH) or not near.narrow
+    found = tabulated(model, jax.tree.map(lambda leaf: leaf[padded], flat), lighting, near, rough=rough)
+
+    def spread(values: Any, outside: float = 0.0) -> Array:
+        some = np.asarray(values)[: index.size]
+        image = np.full((flat.mask.size, *some.shape[1:]), outside, some.dtype)
+        image[index] = some
+        return jax.device_put(image)
+
+    diffuse, peak, table = found
+    lobe = None if table is None else Lobe(spread(peak, NO_LOBE), table=spread(table), near=near)
+    return Basis(points, spread(diffuse), lobe)
 
 
 def _lighting(scene: Scene, points: SurfacePoints) -> Lighting:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import brdf
+from brdf.lobes import Near
 from brdf.precision import working_precision
 from brdf.rendering import basis
 from fitting.doubts import doubts
@@ -20,6 +21,7 @@ from fitting.pixels import Observed, Tile, observe
 from fitting.plausible import fit_plausible, is_plausible
 from fitting.problem import FitProblem
 from fitting.result import FitResult
+from fitting.sample_error import SampleError, between, nearer
 from fitting.selection import FAMILIES, Choice, choose
 from fitting.solver.devices import placed
 from fitting.solver.losses import reweight
@@ -46,6 +48,8 @@ HIDDEN = 0.3
 FEWEST_MEASUREMENTS = 30.0
 # A highlight that leaves so many times the squares of another one is not made likelier than it by rounding.
 HOPELESS = 3.0
+# So often lobes of many light samples are tabulated, nearer to where n was found each time.
+TRIALS = 4
 # An exponent up to this multiple of the lower bound is at the bound.
 WIDEST = 1.01
 
@@ -92,15 +96,17 @@ def fit_pictures(problem: FitProblem) -> FitResult:
         precision=problem.precision,
         seconds=time.perf_counter() - start,
         targets=seen.shown,
-        scenes=seen.scenes,
+        scenes=problem.shown or seen.scenes,
         counted=seen.counted,
         files=[target.file for target in problem.targets],
     )
 
 
-def _picture(model: type[brdf.Material], tile: Tile) -> Picture:
+def _picture(model: type[brdf.Material], tile: Tile, near: Near | None = None) -> Picture:
     ambient = np.zeros(1) if tile.scene.ambient is None else np.asarray(tile.scene.ambient, np.float64)
-    images = basis(model, tile.scene, points=tile.points)
+    # What a file's largest code stands for has no weight, but a say.
+    counts = None if tile.weight is None or tile.bounds is not None else np.asarray(tile.weight) > 0
+    images = basis(model, tile.scene, points=tile.points, near=near, counts=counts)
     diffuse = images.diffuse
     if diffuse is None:
         diffuse = jnp.zeros((tile.target.shape[0], 1), tile.target.dtype)
@@ -121,13 +127,32 @@ def _fit_model(
 
     All that the light reaches is free where nothing else is said.
     """
-    free = seen.reached(model) if free is None else free
-    if pictures is None:
-        make = partial(_picture, model)
-        pictures = each(make, seen.tiles)
-        if not seen.problem.streamed:
+    free, problem = seen.reached(model) if free is None else free, seen.problem
+    if pictures is not None:
+        return _fit_about(
+            model, seen, free, pictures, next((p.lobe.near for p in pictures if p.lobe is not None), None)
+        )
+    near, told = None, problem.sample_errors or {}
+    if told:
+        near = told.get(model.name, next(iter(told.values()))).near
+    for trial in range(TRIALS):
+        pictures = each(partial(_picture, model, near=near), seen.tiles)
+        if not problem.streamed:
             pictures = [placed(index, picture) for index, picture in enumerate(pictures)]
-    n_range = seen.problem.n_range
+        fit = _fit_about(model, seen, free.copy(), pictures, near)
+        if near is None or fit.optimum.flat:
+            break
+        near = nearer(near, fit.optimum.n, problem.n_range, nearest_peak(pictures), last=trial + 2 >= TRIALS)
+        if near is None:
+            break
+    return _with_profile(fit, told.get(model.name))
+
+
+def _fit_about(
+    model: type[brdf.Material], seen: Observed, free: np.ndarray, pictures: Sequence[Picture], near: Near | None
+) -> ModelFit:
+    """One model, whose lobe may be tabulated near some exponents."""
+    n_range = between(near, seen.problem.n_range)
     if free[2].any():
         # Exponents of which some pixel sees at least a trace: with larger ones k_s could be anything.
         upper = min(n_range[1], UNSEEN / max(-nearest_peak(pictures), UNSEEN / n_range[1]))
@@ -138,6 +163,14 @@ def _fit_model(
     optimise = partial(search, n_min=n_range[0], n_max=n_range[1], free=free)
     found = reweight(pictures, optimise(pictures), optimise, seen.problem.loss, seen.rounding)
     return ModelFit(model, found.pictures, found.optimum, free, n_range, None, found.noise_factor)
+
+
+def _with_profile(fit: ModelFit, error: SampleError | None) -> ModelFit:
+    """With the profile over all exponents, where all pixels were looked at near one."""
+    if error is None or not error.profile.size:
+        return fit
+    grid, profile = error.profile
+    return fit._replace(optimum=dataclasses.replace(fit.optimum, grid=grid, profile=profile, profile_sampled=True))
 
 
 def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:

@@ -1,5 +1,6 @@
 """Inputs that are probably something else than they are given as: codes, sRGB, radians, a constant, noise."""
 
+import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 
 import jax.numpy as jnp
@@ -116,7 +117,12 @@ def _is_encoded(fit: ModelFit, seen: Observed, refit: Callable[..., ModelFit]) -
         values = decode(np.clip(np.asarray(tile.target, np.float32), 0.0, None), "srgb")
         decoded.append(tile._replace(target=jnp.asarray(values, tile.target.dtype), bounds=None))
     as_given = _left(fit if model is fit.model else refit(model, seen), seen, "linear")
-    as_srgb = _left(refit(model, seen._replace(tiles=decoded)), seen, "srgb")
+    pictures = None
+    if seen.problem.sample_errors and model is fit.model:
+        # Lobes of many light samples are not made anew for a doubt.
+        pairs = zip(fit.pictures, decoded, strict=True)
+        pictures = [dataclasses.replace(picture, target=tile.target, bounds=None) for picture, tile in pairs]
+    as_srgb = _left(refit(model, seen._replace(tiles=decoded), pictures=pictures), seen, "srgb")
     share = sum(np.sum(one.values**2) for one in as_srgb) / sum(np.sum(one.values**2) for one in as_given)
     together, chance = shared(as_srgb)
     return bool(share < CLEARLY or (share < LESS and together < CHANCE * chance))

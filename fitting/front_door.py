@@ -1,5 +1,7 @@
 """The front door: from pictures and scenes to a material, its errors, and what they cannot tell."""
 
+import dataclasses
+import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,6 +12,7 @@ from brdf.errors import InputError
 from brdf.images.encoding import Encoding
 from brdf.precision import Precision
 from fitting.budget.escalation import fit_within
+from fitting.budget.light_samples import with_enough_samples
 from fitting.codes import Rounding
 from fitting.core import fit_pictures
 from fitting.problem import state_problem
@@ -105,8 +108,12 @@ def fit(
         plausible=plausible,
     )
     if accuracy is None and seconds is None:
-        with spread_over(mesh), waiting("fitting"):
-            return fit_pictures(problem)
+        with waiting("fitting"):
+            start = time.perf_counter()
+            problem = with_enough_samples(problem)
+            with spread_over(mesh):
+                result = fit_pictures(problem)
+            return dataclasses.replace(result, seconds=time.perf_counter() - start)
     if mesh is not None:
         raise InputError(
             "mesh", "spreads all pixels over devices; accuracy and seconds choose some", "Give one of them"

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from numbers import Real
 from typing import Any, NamedTuple
 
@@ -16,6 +16,7 @@ from brdf.errors import InputError
 from brdf.images.encoding import Encoding, decode, decode_table, parse_encoding
 from brdf.precision import Precision
 from fitting.codes import Codes, Rounding, find_codes
+from fitting.sample_error import SampleError
 from fitting.solver.losses import LOSSES, Loss
 
 CLASSIC = ("phong", "blinn-phong")
@@ -66,6 +67,8 @@ class FitProblem:
         dark: linear value up to which pixels are too dark to count; None for none.
         noise: of the camera, (read, shot); None for the same everywhere.
         plausible: hold k_d + k_s <= 1.
+        shown: what results are shown under, where the scenes have other light samples; None for the scenes.
+        sample_errors: by model what those leave out; None where nothing is known of it.
     """
 
     targets: list[Target]
@@ -80,6 +83,8 @@ class FitProblem:
     dark: float | None = None
     noise: tuple[float, float] | None = None
     plausible: bool = False
+    shown: list[brdf.Scene] | None = None
+    sample_errors: Mapping[str, SampleError] | None = None
 
     @property
     def streamed(self) -> bool:

@@ -12,7 +12,8 @@ setting, a bend is left, and the largest error over a ball falls like S^-1.5 to 
 brightest point with S = 64 for rectangle, polygon and sphere. A lobe asks for nodes closer than its width and then
 converges exponentially too: at n = 30, S = 16 leaves 2e-5 for a rectangle, 2e-3 for a polygon, 1e-6 for a sphere; at
 n = 1000, S = 64 leaves 1e-3, 2e-2 and 3e-3, S = 256 less than 1e-5 for each, and S = 16 shows the single samples
-(``python -m benchmarks.light_samples``).
+(``python -m benchmarks.light_samples``). ``samples`` is what a picture is rendered with; ``fitting.fit`` finds how many
+it takes.
 """
 
 from typing import Any, ClassVar

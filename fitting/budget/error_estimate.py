@@ -101,6 +101,16 @@ def estimate(run: Run, lights: MadeLights) -> Estimate:
     return Estimate(float(error), float(bound) + (MARGIN - 1) * light, pixels, light, rounding)
 
 
+def jacobian_places(optimum):
+    """From the columns of each channel to x_a, x_d, x_s, channel after channel each, and log n, (C, 4, U)."""
+    channels = optimum.x.shape[1]
+    place = np.zeros((channels, 4, 3 * channels + 1))
+    for channel in range(channels):
+        place[channel, range(3), channel + channels * np.arange(3)] = 1.0
+        place[channel, 3, -1] = optimum.x[2, channel]
+    return place
+
+
 def _nearly_dependent(gram):
     """Whether the columns of a fit so nearly add up to one another that float32 cannot tell what they add up to."""
     size = np.sqrt(np.einsum("cii->ci", gram))
@@ -110,15 +120,16 @@ def _nearly_dependent(gram):
 
 
 @compiled_at_pixels
-def _columns(scene, model, n, channels):
-    """Ambient, diffuse, lobe and its derivative by log n, for each channel; and which pixels see the object."""
+def at_probes(scene, model, n, channels):
+    """Ambient, diffuse, lobe and its derivative by log n, for each channel; which pixels see the object; the peak."""
     images, nothing = basis(model, scene), jnp.zeros(1)
     ambient = nothing if scene.ambient is None else jnp.asarray(scene.ambient)
     diffuse = nothing if images.diffuse is None else images.diffuse
     value, slope = (nothing, nothing) if images.lobe is None else images.lobe(n)
     shape = (images.points.mask.size, channels)
     columns = [jnp.broadcast_to(column, shape) for column in (ambient, diffuse, value, slope * n)]
-    return jnp.stack(columns, axis=-1), images.points.mask.ravel()
+    seen = images.points.mask.ravel()
+    return jnp.stack(columns, axis=-1), seen, jnp.zeros(seen.shape) if images.lobe is None else images.lobe.peak
 
 
 class _Sums(NamedTuple):
@@ -143,25 +154,20 @@ def _sums(run, scenes, finer, lights):
     """Sums over some pixels of all pictures; ``finer`` is a number of light samples to compare with, or None."""
     problem, optimum, model = run.problem, run.result.optimum, type(run.result.material)
     channels = optimum.x.shape[1]
-    size = 3 * channels + 1
-    # From the columns of a channel to the parameters.
-    place = np.zeros((channels, 4, size))
-    for channel in range(channels):
-        place[channel, range(3), channel + channels * np.arange(3)] = 1.0
-        place[channel, 3, -1] = optimum.x[2, channel]
+    size, place = 3 * channels + 1, jacobian_places(optimum)
     hessian, spread = np.zeros((size, size)), np.zeros((size, size))
     gradient, light, square = np.zeros(size), np.zeros(size), np.finfo(float).tiny
     most = max(FEWEST_PROBES, PROBES // len(problem.targets))
     pictures = zip(problem.targets, scenes, run.result.counted, run.samples, problem.weights, strict=True)
     for target, scene, counted, sample, weight in pictures:
-        part, share, stride = _probes(scene, model, counted.ravel(), sample, weight, most)
+        part, share, stride = probes(scene, model, counted.ravel(), sample, weight, most)
         padded = np.pad(part.pixel, (0, FILLED - part.pixel.size % FILLED))
         how = padded, "float64", model, np.float64(max(optimum.n, 1e-3)), channels
 
         def fitted(columns):
             return np.einsum("mck,kc->mc", columns[..., :3], optimum.x)
 
-        columns, seen = (each[: share.size] for each in jax.device_get(_columns(scene, *how)))
+        columns, seen, _ = (each[: share.size] for each in jax.device_get(at_probes(scene, *how)))
         share, coarse = np.where(seen, share, 0.0)[:, None], fitted(columns)
         # What does not count may be no number.
         residual = np.where(share > 0, some_of(target.pixels, part)[0] - coarse, 0.0)
@@ -177,13 +183,13 @@ def _sums(run, scenes, finer, lights):
             change = np.diff(scores / stride, axis=0)
             spread += 0.5 * stride * (change * np.minimum(chance[1:], chance[:-1])[:, None]).T @ change
         if finer is not None:
-            fine, _ = jax.device_get(_columns(with_samples(scene, finer, lights), *how))
+            fine, *_ = jax.device_get(at_probes(with_samples(scene, finer, lights), *how))
             # A coarser model gives more of what it lacks, hence the sign.
             light -= np.einsum("mcp,mc->p", weighed, fitted(fine[: share.size]) - coarse)
     return _Sums(hessian, gradient, spread, light, square)
 
 
-def _probes(scene, model, counted, sample, weight, most):
+def probes(scene, model, counted, sample, weight, most):
     """At most so many of the fitted pixels that count, or that border on one that does in the sample's order.
 
     Returns:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from fitting.sample_error import SampleError
 from fitting.solver.profile import Optimum
 from fitting.solver.tied import design_of
 from fitting.uncertainty.intervals import NORMAL_95, above_zero
@@ -101,6 +102,7 @@ def uncertainty(
     copies: bool = False,
     columns: Float[np.ndarray, "3 C"] | None = None,
     gain: float = 0.0,
+    missed: SampleError | None = None,
 ) -> Uncertainty:
     """Errors of an optimum.
 
@@ -122,6 +124,7 @@ def uncertainty(
         copies: the channels are copies of each other, and err together.
         columns: root mean square over pixels of what each term shows at 1; None where no pixel weighs more.
         gain: see `specular_gain`, where more pixels tell of it than those of the optimum's sums.
+        missed: what light samples leave out; None where there are none.
     """
     gain = max(gain, specular_gain(optimum, noise))
     columns = rms_columns(optimum) if columns is None else columns
@@ -141,7 +144,7 @@ def uncertainty(
         stand_in[first, channel], determined[first, channel] = some.value / some.columns[0], True
     optimum = dataclasses.replace(optimum, x=stand_in)
     x_error, x_interval, n_error, correlation, rise = _errors(
-        optimum, determined, noise, tied, spread, scatter, widening, copies, dependent
+        optimum, determined, noise, tied, spread, scatter, widening, copies, dependent, missed
     )
     sums = {c: some._replace(error=some.columns[0] * x_error[some.terms[0], c]) for c, some in sums.items()}
     alone = x_error
@@ -229,6 +232,7 @@ def _errors(
     widening: np.ndarray | float,
     copies: bool,
     dependent: float,
+    missed: SampleError | None = None,
 ) -> tuple[np.ndarray, np.ndarray, float, np.ndarray, float]:
     """Errors and intervals of x, the error of n, the correlation of all unknowns, and the rise of the cost.
 
@@ -267,6 +271,9 @@ def _errors(
         ratio = np.divide(least, variance, out=np.ones(size), where=variance > 1e-9 * least)
         widening = widening * np.sqrt(np.maximum(ratio, 1.0))
     covariance = covariance * np.outer(widening * np.ones(size), widening * np.ones(size))
+    if missed is not None:
+        off = missed.shift(np.append(active.ravel(), with_n)) * np.append(np.ones(size - 1), optimum.n)
+        covariance = covariance + np.outer(off, off)
     variance = np.maximum(np.diag(covariance), 0.0)
     error, interval = np.full((3, channels), np.inf), np.zeros((3, channels, 2))
     interval[..., 1] = np.inf

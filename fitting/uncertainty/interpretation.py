@@ -109,6 +109,8 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> Interpretation
         spread = fit.noise_factor**2 * weighted_sums(pictures, optimum, known.noise, inverse=False).gram
     # What the light reaches but the simplest model does without is 0, with the error that it would have.
     reached = seen.reached(fit.model)
+    told = seen.problem.sample_errors or {}
+    missed = told.get(fit.model.name, next(iter(told.values()), None))
     sure = uncertainty(
         optimum,
         reached,
@@ -123,6 +125,7 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> Interpretation
         columns=columns,
         copies=seen.copies,
         gain=gain,
+        missed=missed,
     )
     interval = None
     # At k_d + k_s = 1 the cost still falls across the bound: a profile that does not know it has its least elsewhere.

@@ -1,0 +1,92 @@
+"""What light samples leave out, told by two counts; and about which exponents they are gone through once for all.
+
+`fitting.budget.light_samples` finds both before all pixels are fitted.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from brdf.lobes import Near
+
+# Of log n, to either side: so far a polynomial stands for a lobe.
+MOST = 0.35
+# Of a lobe's peak the nearest pixel shows the exponential of this, or the lobe is tabulated relative to that.
+FAINT = -20.0
+# Nearer to an end of what is tabulated than this share of it an exponent may lie beyond.
+CLOSE = 0.05
+
+
+class SampleError(NamedTuple):
+    """What light samples leave out, for one model.
+
+    Attributes:
+        near: where to tabulate its lobe.
+        hessian: of x_a, x_d, x_s, channel after channel each, and log n, (U, U).
+        score: what more samples would change, (U,).
+        profile: exponents, and the least cost at each by the first fit, (2, G).
+    """
+
+    near: Near
+    hessian: Float[np.ndarray, "U U"]
+    score: Float[np.ndarray, " U"]
+    profile: Float[np.ndarray, "2 G"]
+
+    def shift(self, active: Bool[np.ndarray, " U"]) -> Float[np.ndarray, " U"]:
+        """How far off each number is, where some of them are free."""
+        found, some = np.zeros(active.size), np.flatnonzero(active)
+        found[some] = inverse(self.hessian[np.ix_(some, some)]) @ self.score[some]
+        return found
+
+
+def inverse(hessian: Float[np.ndarray, "U U"]) -> Float[np.ndarray, "U U"]:
+    """Of a Hessian whose unknowns are of any size."""
+    length = np.sqrt(np.maximum(np.diag(hessian), np.finfo(float).tiny))
+    return np.linalg.pinv(hessian / np.outer(length, length), rcond=1e-12, hermitian=True) / np.outer(length, length)
+
+
+def near_exponent(n: float, reach: float, peak: float) -> Near:
+    """Where to tabulate lobes about an exponent.
+
+    Args:
+        n: exponent.
+        reach: of its logarithm, to either side.
+        peak: logarithm of the lobe's cosine in the pixel nearest to its centre.
+    """
+    return Near.between(math.log(n) - reach, math.log(n) + reach, peak if n * peak < FAINT else 0.0)
+
+
+def between(near: Near | None, n_range: tuple[float, float]) -> tuple[float, float]:
+    """Which of some exponents are tabulated; all of them where nothing is.
+
+    Args:
+        near: where lobes are tabulated.
+        n_range: bounds of the exponent.
+    """
+    if near is None:
+        return n_range
+    low, high = (math.exp(end) for end in near.ends)
+    return min(max(low, n_range[0]), n_range[1]), max(min(high, n_range[1]), n_range[0])
+
+
+def nearer(near: Near, n: float, n_range: tuple[float, float], peak: float, *, last: bool) -> Near | None:
+    """Where to tabulate anew, after an exponent was found; None where it is well inside.
+
+    Args:
+        near: where it was looked for.
+        n: what was found.
+        n_range: bounds of the exponent.
+        peak: logarithm of the lobe's cosine in the pixel nearest to its centre.
+        last: whether nothing else is tried after that.
+    """
+    low, high = near.ends
+    edge = CLOSE * (high - low)
+    below = math.log(n) < low + edge and math.log(n_range[0]) < low
+    above = math.log(n) > high - edge and math.log(n_range[1]) > high
+    if near.narrow and not (below or above):
+        return None
+    if last and near.narrow:
+        return Near.between(math.log(n_range[0]), math.log(n_range[1]), peak)
+    return None if last else near_exponent(n, MOST, peak)

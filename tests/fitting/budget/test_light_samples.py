@@ -1,0 +1,80 @@
+"""How many light samples a fit takes, and what they leave out is in its errors."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+import brdf
+import fitting
+from brdf.lobes import Near
+from brdf.rendering import basis
+from fitting.budget.light_samples import with_enough_samples
+from fitting.budget.sampling import with_samples
+from fitting.problem import state_problem
+
+MATERIAL = brdf.BlinnPhong(k_a=[0.2, 0.3], k_d=[0.5, 0.3], k_s=[0.4, 0.3], n=60.0)
+WINDOW = brdf.RectangleLight([1, 1, 2.5], edge_u=[0, 0.5, 0], edge_v=[0.5, 0, 0], radiance=3.0)
+GLOW = np.linspace(0.2, 3.0, 8)[:, None, None] * (1.0 + np.sin(np.arange(16) / 2)[None, :, None])
+SKY = brdf.EnvironmentMap(np.repeat(np.repeat(GLOW, 4, axis=0), 4, axis=1), samples=128)
+
+
+def ball(light: brdf.RectangleLight | brdf.EnvironmentMap) -> brdf.Scene:
+    """A ball of 56 pixels."""
+    camera = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=[56, 56])
+    return brdf.Scene(camera=camera, shapes=[brdf.Sphere([0, 0, 0], radius=1)], lights=[light], ambient=[0.2])
+
+
+@pytest.mark.parametrize("light", [WINDOW, SKY], ids=["window", "sky"])
+def test_the_truth_under_all_light_is_within_the_errors(light: brdf.RectangleLight | brdf.EnvironmentMap):
+    scene = ball(light)
+    clean = np.asarray(brdf.render(MATERIAL, with_samples(scene, 4096)))
+    noise = 1e-3 * np.random.default_rng(1).standard_normal(clean.shape)
+    result = fitting.fit((clean + noise).astype(np.float32), scene, model="blinn-phong")
+    assert result.scenes == [scene]
+    for one in result.parameters:
+        truth = np.asarray(getattr(MATERIAL, one.name))
+        truth = float(truth if one.channel is None else truth[one.channel])
+        assert one.value is not None
+        assert one.error is not None
+        assert abs(one.value - truth) < 3.5 * one.error, one
+
+
+def test_without_noise_the_samples_that_a_picture_was_drawn_with_are_taken_and_told_of():
+    scene = ball(WINDOW)
+    picture = np.asarray(brdf.render(MATERIAL, scene, precision="float64"))
+    problem = with_enough_samples(state_problem(picture, scene, model="blinn-phong", precision="float64"))
+    assert [light.samples for light in problem.scenes[0].lights] == [64]
+    result = fitting.fit(picture, scene, model="blinn-phong", precision="float64")
+    assert float(result["n"]) == pytest.approx(60.0, rel=1e-6)
+    assert 0 < result["n"].error < 0.06
+
+
+def test_noise_that_hides_them_spares_samples():
+    scene = ball(dataclasses.replace(WINDOW, samples=1024))
+    clean = np.asarray(brdf.render(MATERIAL, scene))
+    picture = (clean + 0.03 * np.random.default_rng(0).standard_normal(clean.shape)).astype(np.float32)
+    problem = with_enough_samples(state_problem(picture, scene, model="blinn-phong"))
+    assert [light.samples for light in problem.scenes[0].lights] < [1024]
+
+
+@pytest.mark.parametrize("reach", [0.02, 0.3])
+def test_a_tabulated_lobe_is_the_lobe_between_its_nodes(reach: float):
+    scene, middle = ball(SKY), np.log(60.0)
+    near = Near.between(middle - reach, middle + reach, 0.0)
+    assert np.allclose(near.ends, [middle - reach, middle + reach])
+    with jax.enable_x64(True):
+        double = brdf.cast(scene, "float64")
+        exact, table = basis(brdf.Phong, double), basis(brdf.Phong, double, near=near)
+        seen = np.asarray(exact.points.mask).ravel()
+        np.testing.assert_allclose(np.asarray(table.diffuse)[seen], np.asarray(exact.diffuse)[seen], rtol=1e-12)
+        assert exact.lobe is not None
+        assert table.lobe is not None
+        host = table.lobe.on_host(np.flatnonzero(seen))
+        for n in np.exp(middle + reach * np.array([-1.0, -0.4, 0.0, 0.9])):
+            for true, one, few in zip(exact.lobe(n), table.lobe(n), host(n), strict=True):
+                size = np.max(np.abs(true))
+                tolerance = 1e-3 * (reach / 0.3) ** 4 * size
+                np.testing.assert_allclose(np.asarray(one)[seen], np.asarray(true)[seen], atol=tolerance)
+                np.testing.assert_allclose(np.reshape(few, (-1, 1)), np.asarray(one)[seen], atol=1e-9 * size)
