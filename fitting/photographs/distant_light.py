@@ -197,7 +197,7 @@ def light_from_shading(
     if unexplained > NO_BALL:
         came = f"is not shaded like this surface: {100 * unexplained:.0f} % of the light is left unexplained"
         raise InputError(
-            "picture", came, "Give a matt ball and its circle; --ambient where light comes from all around"
+            "picture", came, "Give a matt ball and its circle; check encoding, saturation and ambient light"
         )
     return ShadingLight(numbers[:3] / length, length * unit, error, unexplained)
 
