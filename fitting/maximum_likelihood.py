@@ -208,10 +208,10 @@ def _near_edges(fit: ModelFit, at: Estimate, fewest: Float[np.ndarray, " U"]) ->
     if sum(picture.target.shape[0] for picture in pictures) > 2 * SUBSAMPLE:
         at, known = maximise([_stratum(picture, SUBSAMPLE // len(pictures)) for picture in pictures], at, space)
         # The whole picture has the pixels near an edge that a part of it lacks.
-        at = at._replace(noise=_telling(known).noise)
+        at = at._replace(noise=_telling(known, fewest).noise)
     gathered = [_some(picture, _near(picture, at)) for picture in pictures]
     at, known = maximise(gathered, at, space)
-    telling = at._replace(noise=_telling(known).noise)
+    telling = at._replace(noise=_telling(known, fewest).noise)
     near = [part.some(_near(part.picture, telling)) for part in gathered]
     sums = _sums(near, telling)
     widening = _widening(known, _precision(telling, sums, space), fewest)
@@ -349,12 +349,13 @@ def _place(picture: Picture) -> tuple[np.ndarray, int]:
     return np.asarray(bounds.index), int(bounds.width)
 
 
-def _telling(known: Sequence[Precision]) -> Precision:
-    """Where the values say most of all unknowns together.
+def _telling(known: Sequence[Precision], fewest: Float[np.ndarray, " U"]) -> Precision:
+    """Where the values say most of all unknowns together, and enough of them of each.
 
     With less noise all pixels of a small highlight may lie well inside their codes, and the Hessian there says nothing.
     """
-    return max(known, key=lambda entry: entry.information)
+    enough = [entry for entry in known[1:] if np.all((entry.count >= fewest) | (known[0].variance == 0))]
+    return max([known[0], *enough], key=lambda entry: entry.information)
 
 
 def _widening(known: Sequence[Precision], most: Precision, fewest: Float[np.ndarray, " U"]) -> Float[np.ndarray, " U"]:

@@ -1,0 +1,63 @@
+"""Numbers behind rounded values: balls of another renderer, saved as files are, against what they were drawn with."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fitting
+from benchmarks.truth import COVERAGE, LAMBERT, ball, meshed
+
+# In standard errors: five of some two hundred numbers would be chance once in ten thousand runs.
+FAR = 5.0
+
+
+def deviations(row: str, seed: int, folder: Path) -> dict[str, tuple[float, float]]:
+    """Of each number from the truth, and in standard errors; infinite where it is not determined."""
+    file = COVERAGE[row]
+    one = ball(seed, channels=file.channels)
+    result = fitting.fit(file.picture(one.drawn(), seed, folder), one.scene(), model=one.model)
+    found = {}
+    for parameter in result.parameters:
+        term = {"k_a": 0, "k_d": 1, "k_s": 2, "n": 3}[parameter.name]
+        true = one.n if term == 3 else float(one.k[term, min(parameter.channel or 0, one.k.shape[1] - 1)])
+        off = np.inf if parameter.value is None else parameter.value - true
+        found[parameter.key] = off, off / (parameter.error or 1.0)
+    return found
+
+
+@pytest.mark.parametrize(
+    "row", ["linear 8 bit", "sRGB 8 bit", "grey as RGB", "12 in 16 bit", "half", "RGBE", "JPEG q90"]
+)
+def test_files_without_noise_are_read_within_their_errors(row: str, tmp_path: Path):
+    for seed in (1, 2, 4):
+        found = deviations(row, seed, tmp_path)
+        assert max(abs(far) for _, far in found.values()) < FAR, (seed, found)
+        if not row.startswith("JPEG"):
+            assert abs(found["k_d[0]"][0]) < 3e-5, (seed, found)
+
+
+def test_a_small_highlight_none_of_whose_values_lies_near_an_edge_is_there_all_the_same(tmp_path: Path):
+    """At the noise where the picture is likeliest the pixels that tell are all elsewhere."""
+    found = deviations("linear 8 bit", 188, tmp_path)
+    assert max(abs(far) for _, far in found.values()) < FAR, found
+
+
+@pytest.mark.parametrize("seed", [1, 8, 11])
+def test_normals_of_a_mesh_are_no_highlight(seed: int, tmp_path: Path):
+    file = LAMBERT["mesh of 96 rings"]
+    for k_s in (0.0, 0.01):
+        one = ball(seed, model="" if k_s else "lambert", k_s=k_s or None)
+        result = fitting.fit(file.picture(one.drawn(meshed(96)), seed, tmp_path), one.scene())
+        assert bool(k_s) == (result.surface != "lambert"), (k_s, result.surface)
+
+
+def test_what_rounding_leaves_does_not_make_up_for_the_wrong_highlight(tmp_path: Path):
+    """It is judged by least squares, and stands in the table with the others."""
+    one = ball(1)
+    file = COVERAGE["linear 8 bit"]
+    result = fitting.fit(file.picture(one.drawn(), 1, tmp_path), one.scene())
+    rivals = [candidate for candidate in result.candidates if candidate.model == "phong" and candidate.ambient]
+    assert result.surface == one.model == "blinn-phong"
+    assert rivals
+    assert all(rival.excess > 1000 for rival in rivals)
