@@ -15,6 +15,8 @@ from fitting.uncertainty.intervals import NORMAL_95, above_zero
 # A squared column keeps less than this of itself when the others are taken out: the two tell the same story.
 # Float32 sums leave some 1e-7 of a column that depends on the others.
 DEPENDENT_SINGLE, DEPENDENT_DOUBLE = 1e-6, 1e-10
+# What the arithmetic of single precision leaves of a number, relative: a few of its rounding errors.
+RESOLUTION = 5e-7
 # A term that moves no pixel by more than this share of the brightest one leaves no trace.
 NO_TRACE = 1e-6
 # A specular term counts when leaving it out raises the cost by so many noise variances for each of its unknowns.
@@ -102,6 +104,7 @@ def uncertainty(
     copies: bool = False,
     columns: Float[np.ndarray, "3 C"] | None = None,
     gain: float = 0.0,
+    resolution: float = 0.0,
     missed: SampleError | None = None,
 ) -> Uncertainty:
     """Errors of an optimum.
@@ -123,6 +126,7 @@ def uncertainty(
         widening: what to multiply errors by.
         copies: the channels are copies of each other, and err together.
         columns: root mean square over pixels of what each term shows at 1; None where no pixel weighs more.
+        resolution: relative error of a number that is left by the arithmetic of the basis images.
         gain: see `specular_gain`, where more pixels tell of it than those of the optimum's sums.
         missed: what light samples leave out; None where there are none.
     """
@@ -144,13 +148,13 @@ def uncertainty(
         stand_in[first, channel], determined[first, channel] = some.value / some.columns[0], True
     optimum = dataclasses.replace(optimum, x=stand_in)
     x_error, x_interval, n_error, correlation, rise = _errors(
-        optimum, determined, noise, tied, spread, scatter, widening, copies, dependent, missed
+        optimum, determined, noise, tied, spread, scatter, widening, copies, dependent, resolution, missed
     )
     sums = {c: some._replace(error=some.columns[0] * x_error[some.terms[0], c]) for c, some in sums.items()}
     alone = x_error
     if scatter is not None:
         # What errs together makes errors larger, but not the numbers less determined.
-        alone, *_ = _errors(optimum, determined, noise, tied, spread, None, widening, copies, dependent)
+        alone, *_ = _errors(optimum, determined, noise, tied, spread, None, widening, copies, dependent, 0.0)
     for term, channel in np.argwhere(known):
         largest = max(optimum.square[channel], brightest[channel] ** 2)
         if alone[term, channel] ** 2 * optimum.gram[channel, term, term] > largest:
@@ -232,6 +236,7 @@ def _errors(
     widening: np.ndarray | float,
     copies: bool,
     dependent: float,
+    resolution: float,
     missed: SampleError | None = None,
 ) -> tuple[np.ndarray, np.ndarray, float, np.ndarray, float]:
     """Errors and intervals of x, the error of n, the correlation of all unknowns, and the rise of the cost.
@@ -291,12 +296,13 @@ def _errors(
             if left > dependent * hessian[index, index]:
                 score = optimum.product[channel, term] - optimum.gram[channel, term, :3] @ x[:, channel]
                 value, deviation = float(score / left), float(np.sqrt(direction @ middle @ direction) / left)
+        deviation = math.hypot(deviation, resolution * value)
         error[term, channel] = deviation
         interval[term, channel] = above_zero(value, deviation)
     scale = np.divide(1.0, np.sqrt(variance), out=np.zeros(size), where=variance > 0)
     n_error, rise = math.inf, 0.0
     if with_n:
-        n_error = math.sqrt(variance[-1])
+        n_error = math.hypot(math.sqrt(variance[-1]), resolution * optimum.n)
         # The noise variance, averaged over channels as n feels it, times the 95 % quantile of chi squared.
         rise = float(NORMAL_95**2 * covariance[-1, -1] / inverse[-1, -1])
     return error, interval, n_error, covariance * np.outer(scale, scale), rise

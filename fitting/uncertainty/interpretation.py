@@ -18,6 +18,7 @@ from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
 from fitting.uncertainty.covariance import (
     AMBIENT_SHARE,
+    RESOLUTION,
     TERMS,
     Sum,
     Uncertainty,
@@ -89,6 +90,7 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> Interpretation
     if lobe is not None:
         visible = float(np.max(optimum.x[2]) * lobe.largest / max(np.max(seen.brightest), np.finfo(float).tiny))
     known = residual_correlation(pictures, seen.tiles, optimum, rounding)
+    resolution = RESOLUTION if fit.single else 0.0
     spread, shared, widening, deviation, together, gain = None, None, 1.0, noise, None, 0.0
     if fit.evidence is not None:
         # Each working target has the noise 1; what least squares leaves is rounding, which goes together.
@@ -126,6 +128,7 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> Interpretation
         copies=seen.copies,
         gain=gain,
         missed=missed,
+        resolution=resolution,
     )
     interval = None
     # At k_d + k_s = 1 the cost still falls across the bound: a profile that does not know it has its least elsewhere.
