@@ -54,12 +54,15 @@ def waiting(what: str) -> Iterator[Callable[[str], None]]:
 
 
 def _terminal() -> Callable[[str], None] | None:
-    stream = sys.stderr
-    if stream is None or not stream.isatty():
+    stream: Any = sys.stderr
+    try:
+        if not stream.isatty():
+            return None
+    except (AttributeError, ValueError):  # there is none, or it is closed
         return None
 
     def write(text: str) -> None:
-        with contextlib.suppress(OSError):  # the terminal has gone
+        with contextlib.suppress(OSError, ValueError):  # the terminal has gone
             stream.write(f"\r\x1b[2K{text}")
             stream.flush()
 

@@ -73,6 +73,11 @@ def test_who_waits_a_moment_or_reads_a_file_is_told_nothing(monkeypatch: pytest.
     with waiting("fitting"):
         time.sleep(0.05)
     assert not file.getvalue()
+    file.close()
+    for gone in (file, None, object()):
+        monkeypatch.setattr(sys, "stderr", gone)
+        with waiting("fitting"):
+            pass
 
 
 def test_a_notebook_shows_one_line_below_its_cell(monkeypatch: pytest.MonkeyPatch):
