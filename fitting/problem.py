@@ -262,18 +262,6 @@ def _of_array(values: np.ndarray, rounding: Rounding, encoding: Encoding) -> Tar
     return Target(values, TOP if bits else None, step, codes, least_squares=rounding is not None and codes is None)
 
 
-def looked_at(mask: Any, weight: Any) -> Any:
-    """Pixels that a mask allows and that weigh something, (H, W); None where all do.
-
-    Args:
-        mask: as given to `fitting.fit`, checked.
-        weight: likewise.
-    """
-    given = [np.asarray(mask).astype(bool)] if mask is not None else []
-    given += [np.asarray(weight) > 0] if weight is not None else []
-    return np.logical_and.reduce(given) if given else None
-
-
 def _per_pixel(name: str, values: Any, shape: tuple[int, int]) -> np.ndarray:
     values = np.asarray(values)
     if values.shape != shape:
