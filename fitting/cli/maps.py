@@ -30,6 +30,9 @@ def maps(
         str, typer.Option(help="blinn-phong, phong, a normalised form, lambert, or auto.")
     ] = "blinn-phong",
     grey: Annotated[bool, typer.Option("--grey", help="All channels share k_s.")] = False,
+    labels: Annotated[
+        str | None, typer.Option(help="An image: pixels of one value there share n; or all: every pixel does.")
+    ] = None,
     mask: Annotated[Path | None, typer.Option(help="An image: pixels that are 0 there are left out.")] = None,
     ambient: Annotated[
         bool, typer.Option("--ambient", help="The view is lit from all around too: find k_a for that light as 1.")
@@ -59,6 +62,7 @@ def maps(
             normals=normals,
             model=model,
             specular="grey" if grey else "coloured",
+            labels=0 if labels == "all" else labels,
             mask=mask,
             ambient=1.0 if ambient else None,
             flip_y=flip_y,

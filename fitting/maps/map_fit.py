@@ -28,7 +28,19 @@ from fitting.maps import map_inputs
 from fitting.maps.kept_bands import KeptBands
 from fitting.maps.map_inputs import Photographs
 from fitting.maps.map_result import REASONS, Maps
-from fitting.maps.texels import CAP, Columns, Distant, TexelFit, fit_texels, fit_with_normals
+from fitting.maps.texels import (
+    CAP,
+    STEPS,
+    Bracket,
+    Columns,
+    Distant,
+    TexelFit,
+    fit_at,
+    fit_texels,
+    fit_with_normals,
+    octave_gains,
+    slope_and_curvature,
+)
 from fitting.progress import waiting
 from fitting.solver.devices import device_count, gathered, own, placed, spread_over
 
@@ -67,6 +79,7 @@ def fit_maps(
     encoding: Any = None,
     flip_y: bool = False,
     precision: Precision = "float32",
+    labels: Any = None,
     mesh: Any = None,
     keep: str | Path | None = None,
 ) -> Maps:
@@ -92,6 +105,8 @@ def fit_maps(
             the one is taken that the model explains better, and a note says so.
         flip_y: whether y goes down in a file of normals.
         precision: "float32" or "float64".
+        labels: (H, W) whole numbers, or a file of them as codes: texels with the same one share n, which then is known
+            far better than each could tell; 0 for all texels. None for an n of each.
         mesh: a `jax.sharding.Mesh` of the devices to deal bands of rows out to, on one machine or, under
             `jax.distributed`, on many: each process reads and fits those of its own devices. None for all cores.
         keep: a folder for the bands that are done. A call with the same inputs goes on from there, where one was
@@ -134,8 +149,9 @@ def fit_maps(
         other = map_inputs.photographs(pictures, lights, intensities, exposures, "linear")
         given, notes = _likelier(given, other, surface, how)
     with spread_over(mesh):
-        bands = _Bands(given, surface, how, keep)
-        layers = bands.fit()
+        if labels is not None:
+            surface = _with_shared_n(given, surface, how, labels)
+        layers = _Bands(given, surface, how, keep).fit()
     if not np.any(layers["reason"] != REASONS.index("outside")):
         raise InputError("pictures", "show no texel that counts", "Check mask, normals and clipping")
     return _maps(layers, how, notes)
@@ -147,13 +163,18 @@ def _maps(layers: dict[str, np.ndarray], how: "_How", notes: tuple[str, ...] = (
 
 @dataclasses.dataclass(frozen=True)
 class _How:
-    """What is fitted: models, grey k_s, the ambient light's columns (P, C), the view, the precision."""
+    """What is fitted: models, grey k_s, the ambient light's columns (P, C), the view, the precision.
+
+    Attributes:
+        seek: "layers", or for an n that texels share the "gains" at octaves of n, or the "slope" by log n.
+    """
 
     models: tuple[Any, ...]
     grey: bool
     ambient: np.ndarray | None
     to_view: np.ndarray
     precision: Precision
+    seek: str = "layers"
 
 
 def _models(model: str) -> tuple[Any, ...]:
@@ -212,11 +233,13 @@ class _Surface(NamedTuple):
         normal: of any length, 0 or not finite where there is no surface; None where it is sought.
         mask: texels to look at.
         points: where lights are near.
+        shared: log n and its standard error, which texels share.
     """
 
     normal: Any
     mask: Any
     points: brdf.SurfacePoints | None
+    shared: Any = None
 
     def some(self, rows: Any, texels: int, dtype: Any) -> "_Surface":
         """Rows of it, padded to so many texels."""
@@ -241,7 +264,7 @@ class _Bands:
         self.rows = -(-height // count)
         self.starts = range(0, height, self.rows)
         self.texels = -(-self.rows * width // TILE) * TILE
-        self.kept = None if keep is None else KeptBands(keep, given, (how, surface.normal, surface.mask, self.rows))
+        self.kept = None if keep is None else KeptBands(keep, given, (how, surface[:2], surface.shared, self.rows))
 
     def fit(self) -> dict[str, np.ndarray]:
         """The layers, (H, W, ...)."""
@@ -298,6 +321,49 @@ class _Bands:
         return index, band
 
 
+def _with_shared_n(given: Photographs, surface: _Surface, how: _How, labels: Any) -> _Surface:
+    """The n that texels of one label share, and its error: the sums of its texels in place of those of one."""
+    (model, *more), (_, height, width, _) = how.models, given.shape
+    if more or not issubclass(model, SpecularMaterial):
+        raise InputError("labels", "need one model with an exponent", "Name the model, as blinn-phong")
+    if surface.normal is None:
+        surface = surface._replace(normal=_Bands(given, surface, how, None).fit()["normal"])
+    if isinstance(labels, str | Path):
+        with brdf.ImageReader(labels, encoding="linear") as reader:
+            labels = np.round(reader.read()[..., 0] * (2**reader.bits - 1)).astype(int)
+    labels = np.asarray(labels)
+    if labels.dtype.kind not in "iub" or labels.shape not in ((), (height, width)):
+        came = f"are of shape {labels.shape} and type {labels.dtype}, the photographs of {(height, width)}"
+        raise InputError("labels", came, "Give a whole number for each texel, or 0")
+    names, index = np.unique(np.broadcast_to(labels, (height, width)), return_inverse=True)
+    index = index.reshape(height, width)
+
+    def summed(layer: np.ndarray) -> np.ndarray:
+        weights = layer.reshape(-1, layer.shape[2]).T.astype(float)
+        return np.stack([np.bincount(index.ravel(), values, names.size) for values in weights])
+
+    def sought(seek: str, shared: Any) -> np.ndarray:
+        there = surface._replace(shared=shared)
+        (layer,) = _Bands(given, there, dataclasses.replace(how, seek=seek), None).fit().values()
+        return summed(layer)
+
+    with working_precision("float64"):
+        bracket = Bracket.about_best(jnp.asarray(sought("gains", None)), _finer(given))
+        for step in range(STEPS + 1):
+            log_n = np.asarray(bracket.log_n)
+            shared = np.stack([log_n[index], np.zeros((height, width))], axis=-1)
+            slope, curvature, cost, values = sought("slope", shared)
+            if step < STEPS:
+                bracket = bracket.narrowed(jnp.asarray(slope), jnp.asarray(curvature))
+    noise = cost / np.maximum(values, 1)
+    error = np.sqrt(np.divide(noise, curvature, out=np.full_like(noise, np.inf), where=curvature > 0))
+    return surface._replace(shared=np.stack([log_n[index], error[index]], axis=-1))
+
+
+def _finer(given: Photographs) -> int:
+    return 2 if given.to_light is not None and np.ptp(given.to_light[:, 2]) < RING else 1
+
+
 def _fit_band(given: Photographs, how: _How, codes: np.ndarray, surface: _Surface) -> dict[str, np.ndarray]:
     """The layers of some texels, one after the other."""
     with working_precision(how.precision):
@@ -309,9 +375,10 @@ def _fit_band(given: Photographs, how: _How, codes: np.ndarray, surface: _Surfac
         to_light = np.zeros((given.shape[0], 3)) if given.to_light is None else given.to_light
         ambient = None if how.ambient is None else how.ambient[..., None].astype(dtype)
         distant = Distant(to_light.astype(dtype), (how.to_view / np.linalg.norm(how.to_view)).astype(dtype), ambient)
-        finer = 2 if given.to_light is not None and np.ptp(to_light[:, 2]) < RING else 1
         photographs = codes, given.top.astype(dtype), given.scale.astype(dtype)
-        layers = _program(how.models, how.grey, finer, photographs, surface, distant, stacks, occluders)
+        layers = _program(
+            how.models, how.grey, _finer(given), how.seek, photographs, surface, distant, stacks, occluders
+        )
         return {name: np.asarray(layer) for name, layer in layers.items()}
 
 
@@ -320,6 +387,7 @@ def _program(
     models: tuple[Any, ...],
     grey: bool,
     finer: int,
+    seek: str,
     photographs: tuple[Array, Array, Array],
     surface: _Surface,
     distant: Distant,
@@ -330,7 +398,7 @@ def _program(
     codes, top, scale = photographs
 
     def of_tile(tile: Any) -> dict[str, Array]:
-        start, (normal, mask, points) = tile
+        start, (normal, mask, points, shared) = tile
         if normal is not None:
             mask &= jnp.all(jnp.isfinite(normal) & jnp.any(normal != 0, axis=1, keepdims=True), axis=1)
             normal = normalize(jnp.where(mask[:, None], normal, jnp.array([0.0, 0.0, 1.0]))).T
@@ -343,10 +411,13 @@ def _program(
 
         tile = jax.lax.dynamic_slice_in_dim(codes, start, TILE, axis=1)
         target, seen = jax.lax.map(decoded, (tile, top, scale))
-        found = [_of_model(model, target, seen, mask, normal, points) for model in models]
-        return {name: layer.T for name, layer in _simplest(found).items()}
+        found = [_of_model(model, target, seen, mask, normal, points, shared) for model in models]
+        layers = _simplest(found) if seek == "layers" else found[0]
+        return {name: layer.T for name, layer in layers.items()}
 
-    def _of_model(model: Any, target: Array, seen: Array, mask: Array, normal: Any, points: Any) -> dict[str, Array]:
+    def _of_model(
+        model: Any, target: Array, seen: Array, mask: Array, normal: Any, points: Any, shared: Any
+    ) -> dict[str, Array]:
         tied = grey and issubclass(model, SpecularMaterial)
         if normal is None:
             fit, normal, normal_error, seen = fit_with_normals(model, target, seen, distant, tied, finer)
@@ -360,8 +431,19 @@ def _program(
             linear = [column * seen[:, None] for column in columns.linear]
             columns = columns._replace(linear=linear, weight=columns.weight * seen[:, None])
             target *= seen[:, None]
-        fit = fit_texels(model, target, columns, tied, finer)
-        return _layers(model, fit, target, seen, mask, tied, normal, None)
+        if seek == "gains":
+            return {"gains": jnp.where(mask, octave_gains(model, target, columns, tied, finer), 0)}
+        if shared is None:
+            fit = fit_texels(model, target, columns, tied, finer)
+            return _layers(model, fit, target, seen, mask, tied, normal, None)
+        log_n, error = shared.T
+        if seek == "slope":
+            slope, curvature = slope_and_curvature(model, target, columns, tied, log_n)
+            cost = fit_at(model, target, columns, tied, log_n).cost
+            sums = jnp.stack([slope, curvature, cost, target.shape[1] * jnp.sum(seen, axis=0)])
+            return {"sums": jnp.where(mask, sums, 0)}
+        fit = fit_at(model, target, columns, tied, log_n, sure=True)
+        return _layers(model, fit, target, seen, mask, tied, normal, None, error)
 
     starts = jnp.arange(0, codes.shape[1], TILE)
     tiles = jax.lax.map(of_tile, (starts, jax.tree.map(lambda leaf: leaf.reshape(-1, TILE, *leaf.shape[1:]), surface)))
@@ -400,6 +482,7 @@ def _layers(
     grey: bool,
     normal: Array,
     tilt: Array | None,
+    shared: Array | None = None,
 ) -> dict[str, Array]:
     """The layers of a model's maps, texels last."""
     channels, lanes = target.shape[1:]
@@ -411,7 +494,7 @@ def _layers(
     freedom = values - unknowns
     noise = jnp.sqrt(fit.cost / jnp.maximum(freedom, 1))
     n = jnp.exp(fit.log_n)
-    error = noise * fit.log_n_error
+    error = noise * fit.log_n_error if shared is None else shared
     shows = jnp.any(k_s > LEAST_HIGHLIGHT * noise * k_s_error, axis=0)
     capped = jnp.any(k_s >= CAP * jnp.max(target, axis=(0, 1)), axis=0)
     tests = (~mask | (values == 0), freedom < 1, ~shows | (not glossy), capped, ~(error <= MOST_ERROR))

@@ -224,14 +224,17 @@ def slope_and_curvature(model: Any, target: Array, columns: Columns, grey: bool,
     return point.slope[0], divide(1.0, point.error[0] ** 2)
 
 
-def fit_at(model: Any, target: Array, columns: Columns, grey: bool, log_n: Float[Array, " T"]) -> TexelFit:
-    """The best coefficients for a given n."""
+def fit_at(
+    model: Any, target: Array, columns: Columns, grey: bool, log_n: Float[Array, " T"], *, sure: bool = False
+) -> TexelFit:
+    """The best coefficients for a given n; their errors allow for that of n, unless n is sure."""
     if not issubclass(model, SpecularMaterial):
         point = _evaluate(columns.linear, [], target, jnp.inf, False)
         return TexelFit(point.k, point.k_error, log_n, jnp.full_like(log_n, jnp.inf), point.cost)
     lobe, slope = columns.lobe(model, log_n)
-    point = _evaluate([*columns.linear, lobe], [{len(columns.linear): slope}], target, cap_of(target), grey)
-    return TexelFit(point.k, point.k_error, log_n, point.error[0], point.cost)
+    unknowns = [] if sure else [{len(columns.linear): slope}]
+    point = _evaluate([*columns.linear, lobe], unknowns, target, cap_of(target), grey)
+    return TexelFit(point.k, point.k_error, log_n, jnp.zeros_like(log_n) if sure else point.error[0], point.cost)
 
 
 # -- normals sought ----------------------------------------------------------------------------------------------------

@@ -373,3 +373,33 @@ def test_two_devices_give_the_maps_of_one(tmp_path):
     with np.load(tmp_path / "maps.npz") as found:
         for name, values in maps.layers().items():
             np.testing.assert_allclose(found[name], values, rtol=1e-9, equal_nan=True)
+
+
+def test_an_n_that_texels_share_is_the_optimum_of_all():
+    lights = dome(24)
+    pictures, truth = texels(60, 0.02, lights, seed=4)
+    half = (lights + VIEW) / np.linalg.norm(lights + VIEW, axis=1)[:, None]
+    labels, n = np.arange(60)[None] % 2, np.array([12.0, 40.0])[np.arange(60) % 2]
+    cosine = np.maximum(lights @ truth["normal"].T, 0)
+    lobe = np.where(cosine > 0, (half @ truth["normal"].T) ** n, 0)
+    noise = pictures - texels(60, 0.0, lights, seed=4)[0]
+    pictures = (cosine[..., None] * truth["k_d"] + lobe[..., None] * truth["k_s"])[:, None] + noise
+    maps = fitting.fit_maps(pictures, lights, truth["normal"][None], labels=labels, precision="float64")
+    assert np.ptp(maps.n[labels == 0]) == np.ptp(maps.n[labels == 1]) == 0
+    for label, true in ((0, 12.0), (1, 40.0)):
+        found, error = maps.n[labels == label][0], maps.n_error[labels == label][0]
+        assert abs(found - true) < 3 * error
+        assert error < 0.03 * true
+    few = np.flatnonzero(labels[0] == 1)
+
+    def cost(n):
+        total = 0.0
+        for t in few:
+            lobe = np.where(cosine[:, t] > 0, (half @ truth["normal"][t]) ** n, 0)
+            columns = np.stack([cosine[:, t], lobe])
+            for values in pictures[:, 0, t].T:
+                total += np.sum((values - nonnegative_minimum(columns @ columns.T, columns @ values) @ columns) ** 2)
+        return total
+
+    best = maps.n[labels == 1][0]
+    assert cost(best) < min(cost(best * 0.999), cost(best * 1.001))
