@@ -32,7 +32,7 @@ class KeptBands:
                 status = Path(name).stat()
                 _add(digest, (name, status.st_size, status.st_mtime_ns))
             else:
-                _add(digest, zlib.crc32(np.ascontiguousarray(read(0, given.shape[1]))))
+                _add(digest, zlib.crc32(np.ascontiguousarray(read(0, given.shape[1])).tobytes()))
         self._key = digest.hexdigest()[:16]
 
     def _path(self, start: int) -> Path:

@@ -349,13 +349,17 @@ def _with_shared_n(given: Photographs, surface: _Surface, how: _How, labels: Any
 
     with working_precision("float64"):
         bracket = Bracket.about_best(jnp.asarray(sought("gains", None)), _finer(given))
-        for step in range(STEPS + 1):
-            log_n = np.asarray(bracket.log_n)
-            shared = np.stack([log_n[index], np.zeros((height, width))], axis=-1)
-            slope, curvature, cost, values = sought("slope", shared)
-            if step < STEPS:
-                bracket = bracket.narrowed(jnp.asarray(slope), jnp.asarray(curvature))
-    noise = cost / np.maximum(values, 1)
+
+        def sums(log_n: Any) -> np.ndarray:
+            shared = np.stack([np.asarray(log_n)[index], np.zeros((height, width))], axis=-1)
+            return sought("slope", shared)
+
+        for _ in range(STEPS):
+            slope, curvature, _, _ = sums(bracket.log_n)
+            bracket = bracket.narrowed(jnp.asarray(slope), jnp.asarray(curvature))
+        log_n = np.asarray(bracket.log_n)
+        _, curvature, cost, freedom = sums(log_n)
+    noise = cost / np.maximum(freedom, 1)
     error = np.sqrt(np.divide(noise, curvature, out=np.full_like(noise, np.inf), where=curvature > 0))
     return surface._replace(shared=np.stack([log_n[index], error[index]], axis=-1))
 
@@ -388,7 +392,7 @@ def _program(
     grey: bool,
     finer: int,
     seek: str,
-    photographs: tuple[Array, Array, Array],
+    photographs: tuple[Any, Any, Any],
     surface: _Surface,
     distant: Distant,
     stacks: tuple[LightStack, ...],
@@ -440,7 +444,9 @@ def _program(
         if seek == "slope":
             slope, curvature = slope_and_curvature(model, target, columns, tied, log_n)
             cost = fit_at(model, target, columns, tied, log_n).cost
-            sums = jnp.stack([slope, curvature, cost, target.shape[1] * jnp.sum(seen, axis=0)])
+            own = target.shape[1] * len(columns.linear) + (1 if tied else target.shape[1])
+            freedom = target.shape[1] * jnp.sum(seen, axis=0) - own
+            sums = jnp.stack([slope, curvature, cost, jnp.maximum(freedom, 0)])
             return {"sums": jnp.where(mask, sums, 0)}
         fit = fit_at(model, target, columns, tied, log_n, sure=True)
         return _layers(model, fit, target, seen, mask, tied, normal, None, error)

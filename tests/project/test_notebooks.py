@@ -13,8 +13,8 @@ HERE = ROOT / "notebooks"
 NOTEBOOKS = sorted(HERE.glob("[0-9]_*.py"))
 
 
-def test_all_eight_are_there():
-    assert [path.name[0] for path in NOTEBOOKS] == list("12345678")
+def test_all_nine_are_there():
+    assert [path.name[0] for path in NOTEBOOKS] == list("123456789")
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
