@@ -1,6 +1,6 @@
 """Are the numbers and their errors true on the files that people have? Balls of an independent renderer, many draws.
 
-    python -m benchmarks.truth [TABLE] [--rows PATTERN] [--draws N] [--size PIXELS] [--json FILE]
+    python -m benchmarks.truth [TABLE] [--rows PATTERN] [--draws N] [--size PIXELS] [--json FILE] [--picture FILE]
 
 TABLE is coverage, selection, structure or diagnosis.
 
@@ -425,6 +425,45 @@ def diagnosis(pattern: str, draws: int, size: int, first: int) -> list[dict[str,
     return said
 
 
+def against_noise(pattern: str, draws: int, size: int, first: int) -> list[dict[str, Any]]:
+    """Errors of sRGB files of 8 bits over the noise before rounding."""
+    said = []
+    print(f"{'noise in codes':16}{'rms of k_d':>24}{'of ln n':>24}   (likelihood, least squares)", flush=True)
+    for noise in (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.6, 1.0, 2.0):
+        wrong = []
+        for seed in range(first, first + draws):
+            one = ball(seed, size=size)
+            with tempfile.TemporaryDirectory() as folder:
+                picture = File(noise, curve="srgb").picture(one.drawn(), seed, Path(folder))
+            pair = [fitting.fit(picture, one.scene(), model=one.model, **way) for way in ({}, {"rounding": 0})]
+            wrong.append([[one.k[1, 0] - fit.material.k_d[0], np.log(fit.material.n / one.n)] for fit in pair])
+        rms = np.sqrt(np.mean(np.square(wrong), axis=0))
+        print(f"{noise:<16g}{''.join(f'{value:12.1e}' for value in rms.T.ravel())}", flush=True)
+        said.append({"noise": noise, "k_d": rms[:, 0].tolist(), "n": rms[:, 1].tolist()})
+    return said
+
+
+def drawn(said: list[dict[str, Any]], path: Path) -> None:
+    """The picture of errors over noise."""
+    from matplotlib.figure import Figure  # late: the tables need none
+
+    figure = Figure(figsize=(7.2, 2.9), layout="constrained")
+    for axes, name, label in zip(
+        figure.subplots(1, 2), ("k_d", "n"), ("error of $k_d$", "error of $\\ln n$"), strict=True
+    ):
+        # No noise has a place of its own.
+        noise = [max(row["noise"], 0.008) for row in said]
+        for way, marker, colour, words in ((1, "s", "#777777", "least squares"), (0, "o", "#D55E00", "likelihood")):
+            axes.loglog(noise, [row[name][way] for row in said], marker=marker, color=colour, label=words, markersize=4)
+        ticks = {0.008: "none", 0.02: "0.02", 0.1: "0.1", 0.5: "0.5", 2.0: "2"}
+        axes.set_xticks(list(ticks), list(ticks.values()))
+        axes.minorticks_off()
+        axes.set(xlabel="noise before rounding, in codes", ylabel=label)
+        axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False)
+    figure.savefig(path, dpi=150)
+
+
 def _fitted(file: File, shown: np.ndarray, scene: brdf.Scene, model: str, seed: int) -> Any:
     with tempfile.TemporaryDirectory() as folder:
         return fitting.fit(file.picture(shown, seed, Path(folder)), scene, model=model)
@@ -434,18 +473,21 @@ def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     tables = {"coverage": (coverage, 400), "selection": (selection, 100), "structure": (structure, 100)}
-    tables["diagnosis"] = (diagnosis, 30)
+    tables |= {"diagnosis": (diagnosis, 30), "noise": (against_noise, 40)}
     parser.add_argument("table", nargs="?", choices=tables)
     parser.add_argument("--rows", default="")
     parser.add_argument("--draws", type=int)
     parser.add_argument("--size", type=int, default=128)
     parser.add_argument("--first", type=int, default=0, help="the first seed")
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--picture", type=Path, help="of the errors over noise")
     options = parser.parse_args()
     said = {}
     for name, (run, draws) in tables.items():
         if options.table in (None, name):
             said[name] = run(options.rows, options.draws or draws, options.size, options.first)
+    if options.picture and "noise" in said:
+        drawn(said["noise"], options.picture)
     if options.json:
         options.json.write_text(json.dumps(said, indent=1) + "\n")
 
