@@ -125,9 +125,15 @@ class _Pixels(NamedTuple):
     picture: Picture
     intervals: Intervals
 
+    @classmethod
+    def of(cls, picture: Picture) -> "_Pixels":
+        """All of a picture on the host."""
+        bounds = _bounds(picture)
+        return cls(picture, Intervals(bounds.lower, bounds.upper, bounds.spread))
+
     def some(self, index: np.ndarray) -> "_Pixels":
         """Some of them, or themselves where these are all."""
-        return self if index.size == self.picture.target.shape[0] else _some(self.picture, index)
+        return self if index.size == self.picture.target.shape[0] else _Pixels.of(self.picture.in_double(index))
 
 
 class _Told(NamedTuple):
@@ -209,7 +215,7 @@ def _near_edges(fit: ModelFit, at: Estimate, fewest: Float[np.ndarray, " U"]) ->
         at, known = maximise([_stratum(picture, SUBSAMPLE // len(pictures)) for picture in pictures], at, space)
         # The whole picture has the pixels near an edge that a part of it lacks.
         at = at._replace(noise=_telling(known, fewest).noise)
-    gathered = [_some(picture, _near(picture, at)) for picture in pictures]
+    gathered = [_Pixels.of(picture.in_double(_near(picture, at))) for picture in pictures]
     at, known = maximise(gathered, at, space)
     telling = at._replace(noise=_telling(known, fewest).noise)
     near = [part.some(_near(part.picture, telling)) for part in gathered]
@@ -311,8 +317,8 @@ def _stated(picture: Picture, optimum: Optimum, noise: float, rounding: float) -
     index = np.flatnonzero(half.any(axis=1))
     if index.size:
         s = math.sqrt(max(noise**2 - rounding, LEAST_NOISE**2))
-        pixels = _some(picture, index)
-        told = _told(pixels, Estimate(optimum.x, math.log(optimum.n), s))
+        pixels = _Pixels.of(picture.in_double(index))
+        (told,) = _sums([pixels], Estimate(optimum.x, math.log(optimum.n), s)).told
         told = _Told(*(part[..., : index.size, :] for part in told))
         at_end, own = half[index], s * bounds.spread[index if bounds.spread.ndim else ...]
         weighs = np.broadcast_to(pixels.picture.weights, told.value.shape)[: index.size]
@@ -448,7 +454,7 @@ def _climb(whole: Sequence[_Pixels], at: Estimate, space: _Space) -> tuple[Estim
             if all(one.size == other.size for one, other in zip(near, kept, strict=True)):
                 return at._replace(value=float(now.value)), now
             kept = near
-        pixels = [part.some(some) for part, some in zip(whole, kept, strict=True)]
+        pixels = list(map(_Pixels.some, whole, kept))
         now = _sums(pixels, at)
         for _ in range(MOST_STEPS):
             normal = join_channels(now.weight, now.score, np.zeros(channels), at.x[2], np.ones(channels))
@@ -479,9 +485,14 @@ def _sums(pixels: Sequence[_Pixels], at: Estimate) -> _Sums:
     """What Newton's step needs, added up over the pictures."""
     parts, told = [], []
     for part in pixels:
-        said, weight = _told(part, at), part.picture.weights
+        weight, bounds = part.picture.weights, _bounds(part.picture)
+        columns = part.picture.columns(math.exp(at.log_n))
+        columns[3] *= math.exp(at.log_n)
+        radiance = columns[0] * at.x[0] + columns[1] * at.x[1] + columns[2] * at.x[2]
+        code, slope = bounds.codes(radiance)
+        said = _Told(*part.intervals.said(code, at.noise), radiance, slope, columns)
         told.append(said)
-        own = at.noise * _bounds(part.picture).spread
+        own = at.noise * bounds.spread
         score, curvature = weight * said.score * said.slope, weight * said.weight * said.slope**2
         columns = np.moveaxis(said.columns, -1, 0)  # (C, 4, P)
         parts.append(
@@ -504,28 +515,13 @@ def _stratum(picture: Picture, size: int) -> _Pixels:
     """Some of the pixels, weighted by how many each stands for."""
     count = picture.target.shape[0]
     if count <= size:
-        return _some(picture, np.arange(count))
+        return _Pixels.of(picture.in_double(np.arange(count)))
     nearness = np.zeros(count) if picture.lobe is None else -np.asarray(picture.lobe.peak)
     index, factor = stratified(nearness, np.ones(count, bool), size)
-    some = _some(picture, index)
+    some = _Pixels.of(picture.in_double(index))
     weight = np.zeros(some.picture.target.shape[0])
     weight[: index.size] = factor
     return some._replace(picture=dataclasses.replace(some.picture, weight=weight))
-
-
-def _some(picture: Picture, index: np.ndarray) -> _Pixels:
-    """Some of the pixels."""
-    some = picture.in_double(index)
-    bounds = _bounds(some)
-    return _Pixels(some, Intervals(bounds.lower, bounds.upper, bounds.spread))
-
-
-def _told(pixels: _Pixels, at: Estimate) -> _Told:
-    columns = pixels.picture.columns(math.exp(at.log_n))
-    columns[3] *= math.exp(at.log_n)
-    radiance = columns[0] * at.x[0] + columns[1] * at.x[1] + columns[2] * at.x[2]
-    code, slope = _bounds(pixels.picture).codes(radiance)
-    return _Told(*pixels.intervals.said(code, at.noise), radiance, slope, columns)
 
 
 def _bounds(picture: Picture) -> Bounds:
