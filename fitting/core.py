@@ -21,7 +21,7 @@ from fitting.pixels import Observed, Tile, observe
 from fitting.plausible import fit_plausible, is_plausible
 from fitting.problem import FitProblem
 from fitting.result import FitResult
-from fitting.sample_error import SampleError, between, nearer
+from fitting.sample_error import MOST, SampleError, between, near_exponent, nearer
 from fitting.selection import FAMILIES, Choice, choose
 from fitting.solver.devices import placed
 from fitting.solver.losses import reweight
@@ -140,12 +140,22 @@ def _fit_model(
         if not problem.streamed:
             pictures = [placed(index, picture) for index, picture in enumerate(pictures)]
         fit = _fit_about(model, seen, free.copy(), pictures, near)
-        if near is None or fit.optimum.flat:
+        if fit.optimum.flat:
             break
+        if near is None:
+            if not any(map(_is_made_anew, pictures)):
+                break
+            near = near_exponent(fit.optimum.n, MOST, nearest_peak(pictures))
+            continue
         near = nearer(near, fit.optimum.n, problem.n_range, nearest_peak(pictures), last=trial + 2 >= TRIALS)
         if near is None:
             break
     return _with_profile(fit, told.get(model.name))
+
+
+def _is_made_anew(picture: Picture) -> bool:
+    """Whether its lobe is, for each exponent, and rounded values ask for many."""
+    return picture.bounds is not None and picture.lobe is not None and picture.lobe.source is not None
 
 
 def _fit_about(
