@@ -5,7 +5,6 @@ are taken tile by tile, which also keeps a tile in the processor's cache while i
 """
 
 import dataclasses
-import functools
 import math
 from collections.abc import Callable
 from functools import partial
@@ -124,8 +123,11 @@ def sum_over_samples(
         return over_samples(model, points, lighting, of_terms)[0]
 
     def at_point(point: SurfacePoints) -> Any:
-        terms = (light_terms(model, lighting.occluders, *sample, point) for sample in lighting.each())
-        return functools.reduce(partial(jax.tree.map, jnp.add), map(of_terms, terms))
+        total = None
+        for sample in lighting.each():
+            value = of_terms(light_terms(model, lighting.occluders, *sample, point))
+            total = value if total is None else jax.tree.map(jnp.add, total, value)
+        return total
 
     return jax.vmap(at_point)(points)
 

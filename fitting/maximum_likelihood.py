@@ -16,13 +16,14 @@ gathered for the last steps.
 import dataclasses
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from fitting.likelihood import AnyArray, Bounds, Intervals
 from fitting.model_fit import Evidence, ModelFit
@@ -131,9 +132,9 @@ class _Pixels(NamedTuple):
         bounds = _bounds(picture)
         return cls(picture, Intervals(bounds.lower, bounds.upper, bounds.spread))
 
-    def some(self, index: np.ndarray) -> "_Pixels":
+    def some(self, which: Bool[np.ndarray, " P"]) -> "_Pixels":
         """Some of them, or themselves where these are all."""
-        return self if index.size == self.picture.target.shape[0] else _Pixels.of(self.picture.in_double(index))
+        return self if which.all() else _Pixels.of(self.picture.in_double(np.flatnonzero(which)))
 
 
 class _Told(NamedTuple):
@@ -215,10 +216,11 @@ def _near_edges(fit: ModelFit, at: Estimate, fewest: Float[np.ndarray, " U"]) ->
         at, known = maximise([_stratum(picture, SUBSAMPLE // len(pictures)) for picture in pictures], at, space)
         # The whole picture has the pixels near an edge that a part of it lacks.
         at = at._replace(noise=_telling(known, fewest).noise)
-    gathered = [_Pixels.of(picture.in_double(_near(picture, at))) for picture in pictures]
+    near = [np.flatnonzero(_near(picture, at, REACH)) for picture in pictures]
+    gathered = [_Pixels.of(picture.in_double(some)) for picture, some in zip(pictures, near, strict=True)]
     at, known = maximise(gathered, at, space)
     telling = at._replace(noise=_telling(known, fewest).noise)
-    near = [part.some(_near(part.picture, telling)) for part in gathered]
+    near = [part.some(_near(part.picture, telling, REACH)) for part in gathered]
     sums = _sums(near, telling)
     widening = _widening(known, _precision(telling, sums, space), fewest)
     working = [_working(pixels.picture, said) for pixels, said in zip(near, sums.told, strict=True)]
@@ -446,12 +448,13 @@ def _climb(whole: Sequence[_Pixels], at: Estimate, space: _Space) -> tuple[Estim
     signed = np.zeros(design.shape[1], bool)
     lobe = bool(design[-1].any())
     signed[-1:] = lobe
-    kept, now = [_near(part.picture, at) for part in whole], None
+    pictures, now = [part.picture for part in whole], None
+    kept = list(map(partial(_near, at=at, reach=REACH), pictures))
     while True:
         if now is not None:
             # Others may say something at the new numbers.
-            near = [np.union1d(some, _near(part.picture, at, NEARER)) for some, part in zip(kept, whole, strict=True)]
-            if all(one.size == other.size for one, other in zip(near, kept, strict=True)):
+            near = list(map(np.logical_or, kept, map(partial(_near, at=at, reach=NEARER), pictures)))
+            if all(map(np.array_equal, near, kept)):
                 return at._replace(value=float(now.value)), now
             kept = near
         pixels = list(map(_Pixels.some, whole, kept))
@@ -506,9 +509,11 @@ def _sums(pixels: Sequence[_Pixels], at: Estimate) -> _Sums:
     return _Sums(*(sum(part) for part in zip(*parts, strict=True)), told)
 
 
-def _near(picture: Picture, at: Estimate, reach: float = REACH) -> np.ndarray:
-    """Which pixels say something: those not surely inside their bounds."""
-    return np.flatnonzero(np.any(_inside(picture, at) < reach, axis=1))
+def _near(picture: Picture, at: Estimate, reach: float) -> Bool[np.ndarray, " P"]:
+    """Which pixels say something: those with a value not surely inside its bounds, by so many s."""
+    bounds, code = _bounds(picture), _codes(picture, at)
+    inside = np.minimum(code - bounds.lower, bounds.upper - code)
+    return np.any(inside < reach * at.noise * bounds.spread, axis=1)
 
 
 def _stratum(picture: Picture, size: int) -> _Pixels:
@@ -544,12 +549,6 @@ def _squares(picture: Picture, at: Estimate) -> tuple[float, int]:
     return float(np.sum(left**2)), int(np.count_nonzero(closed))
 
 
-def _inside(picture: Picture, at: Estimate) -> np.ndarray:
-    """How far inside its bounds each prediction is, in standard deviations of the noise, (P, C)."""
-    bounds, code = _bounds(picture), _codes(picture, at)
-    return np.minimum(code - bounds.lower, bounds.upper - code) / (at.noise * bounds.spread)
-
-
 def _widest(picture: Picture) -> float:
     """The largest distance of two ends: of floats that grows with brightness."""
     width = _bounds(picture).upper - _bounds(picture).lower
@@ -558,8 +557,8 @@ def _widest(picture: Picture) -> float:
 
 def _open_ends_tell(picture: Picture, at: Estimate) -> bool:
     """Whether some value is known by one end only and is predicted near it."""
-    half = np.isfinite(_bounds(picture).lower) ^ np.isfinite(_bounds(picture).upper)
-    return bool(half.any()) and bool(np.any(_inside(picture, at)[half] < END_REACH))
+    half = np.any(np.isfinite(_bounds(picture).lower) ^ np.isfinite(_bounds(picture).upper), axis=1)
+    return bool(half.any()) and bool(np.any(_near(picture, at, END_REACH)[half]))
 
 
 def highlight_in_codes(picture: Picture, x: np.ndarray, n: float) -> float:

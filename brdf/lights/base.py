@@ -136,7 +136,7 @@ class Lighting(eqx.Module):
     @property
     def samples(self) -> int:
         """Of all lights together."""
-        return sum(stack.samples for stack in self.stacks)
+        return sum(map(operator.attrgetter("samples"), self.stacks))
 
     def each(self) -> Iterator[tuple[type[Light], tuple[Array, ...], Array]]:
         """Every sample on its own: the kind of its light, its row, which light it belongs to."""
