@@ -9,7 +9,7 @@ for adding one observation after the other.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -105,15 +105,13 @@ class LightChoice:
         return figure
 
 
-def next_light(
-    result: FitResult, candidates: Sequence[Any] | None = None, count: int = 1, *, of: str = "n"
-) -> LightChoice:
+def next_light(result: Any, candidates: Sequence[Any] | None = None, count: int = 1, *, of: str = "n") -> LightChoice:
     """Find the light under which one more picture would shrink the error of a number most.
 
     Camera, shapes, ambient light and noise are taken to stay as they are in the first picture.
 
     Args:
-        result: of `fitting.fit`, of one picture or several.
+        result: of `fitting.fit`, of one picture or several; or maps, see `Maps.next_light`.
         candidates: lights, or directions towards them, (K, 3), which shine like the brightest of the result's lights;
             None for any direction of the hemisphere on the camera's side.
         count: how many, one chosen after the other.
@@ -131,20 +129,14 @@ def next_light(
         >>> choice.direction.round(1)
         array([0., 0., 1.])
     """
+    if hasattr(result, "next_light"):  # maps, which stand above this module, know their own texels
+        return result.next_light(candidates, count, of=of)
     if not isinstance(result, FitResult):
-        raise InputError("result", f"must be of fitting.fit, got {type(result).__name__}", "Fit the pictures first")
-    if not isinstance(count, int) or count < 1:
-        raise InputError("count", f"must be 1 or more, got {count}", "Say how many lights to add")
+        came = f"must be of fitting.fit or fit_maps, got {type(result).__name__}"
+        raise InputError("result", came, "Fit the pictures first")
     wanted, active = _numbers(result, of)
     known = tuple(light for scene in result.scenes for light in scene.lights)
     scenes = [_scene(result, index) for index in range(len(result.scenes))]
-    shining = max((np.asarray(light.emittance) for light in known), key=np.sum, default=np.ones(1))
-    if candidates is not None and not isinstance(candidates, Sequence | np.ndarray):
-        came = f"must be a list, got {type(candidates).__name__}"
-        raise InputError("candidates", came, "Give lights or directions, or None for any direction")
-    given = None if candidates is None else [_light(one, shining) for one in candidates]
-    if given is not None and not given:
-        raise InputError("candidates", "is empty", "Give lights or directions, or None for any direction")
     with working_precision("float64"), waiting("trying lights"):
         material = brdf.cast(result.material, "float64")
         variance = np.asarray(result.noise, np.float64) ** 2
@@ -160,25 +152,64 @@ def next_light(
             variance = inverse_diagonal(information[np.ix_(active, active)], DEPENDENT)
             return float(np.sqrt(np.mean(variance[wanted[active]])))
 
-        def informed(light: Light) -> np.ndarray:
-            return information + told(dataclasses.replace(first, lights=(light,), visibility=()), share)
+        def told_by(light: Light) -> np.ndarray:
+            return told(dataclasses.replace(first, lights=(light,), visibility=()), share)
 
-        def best_of(lights: Sequence[Light]) -> tuple[Light, list[float]]:
-            errors = [error(informed(light)) for light in lights]
-            return lights[int(np.argmin(errors))], errors
-
-        (first, share), information = scenes[0], np.sum([told(*scene) for scene in scenes], axis=0)
-        before, chosen, after, foretold = error(information), [], [], np.zeros(0)
+        first, share = scenes[0]
         to_view = np.asarray(first.surface_points().to_view, np.float64).reshape(-1, 3).mean(axis=0)
-        tried = [_towards(one, shining) for one in _cap(to_view, *HEMISPHERE)] if given is None else given
-        for _ in range(count):
-            best, errors = best_of(tried)
-            foretold = foretold if chosen else np.array(errors)
-            for near in AROUND if given is None else ():
-                best, _ = best_of([best, *(_towards(one, shining) for one in _cap(_direction(best), *near))])
-            information = informed(best)
-            chosen.append(best)
-            after.append(error(information))
+        information = np.sum([told(*scene) for scene in scenes], axis=0)
+        return choose_lights(candidates, count, of, known, to_view, information, told_by, error)
+
+
+def choose_lights(
+    candidates: Any,
+    count: int,
+    of: str,
+    known: tuple[Light, ...],
+    to_view: np.ndarray,
+    information: np.ndarray,
+    told_by: Callable[[Light], np.ndarray],
+    error: Callable[[np.ndarray], float],
+) -> LightChoice:
+    """Choose lights one after the other, each where it leaves the least error.
+
+    Args:
+        candidates: see `next_light`.
+        count: how many.
+        of: the number that errs.
+        known: the lights that there are.
+        to_view: where a hemisphere of candidates lies around.
+        information: what is told by the known lights, which adds up.
+        told_by: what one more would tell.
+        error: that some information leaves.
+
+    Raises:
+        InputError: naming the argument.
+    """
+    if not isinstance(count, int) or count < 1:
+        raise InputError("count", f"must be 1 or more, got {count}", "Say how many lights to add")
+    if candidates is not None and not isinstance(candidates, Sequence | np.ndarray):
+        came = f"must be a list, got {type(candidates).__name__}"
+        raise InputError("candidates", came, "Give lights or directions, or None for any direction")
+    shining = max((np.asarray(light.emittance) for light in known), key=np.sum, default=np.ones(1))
+    given = None if candidates is None else [_light(one, shining) for one in candidates]
+    if given is not None and not given:
+        raise InputError("candidates", "is empty", "Give lights or directions, or None for any direction")
+
+    def best_of(lights: Sequence[Light]) -> tuple[Light, list[float]]:
+        errors = [error(information + told_by(light)) for light in lights]
+        return lights[int(np.argmin(errors))], errors
+
+    before, chosen, after, foretold = error(information), [], [], np.zeros(0)
+    tried = [_towards(one, shining) for one in _cap(to_view, *HEMISPHERE)] if given is None else given
+    for _ in range(count):
+        best, errors = best_of(tried)
+        foretold = foretold if chosen else np.array(errors)
+        for near in AROUND if given is None else ():
+            best, _ = best_of([best, *(_towards(one, shining) for one in _cap(_direction(best), *near))])
+        information = information + told_by(best)
+        chosen.append(best)
+        after.append(error(information))
     return LightChoice(tuple(chosen), of, before, tuple(after), tuple(tried), foretold, known)
 
 

@@ -48,6 +48,7 @@ def write_maps(maps: "Maps", folder: str | Path, *, plot: bool = False) -> None:
     told = {
         "models": maps.models,
         "to_view": maps.to_view.tolist(),
+        "to_light": None if maps.to_light is None else maps.to_light.tolist(),
         "notes": maps.notes,
         "layers": {name: str(values.dtype) for name, values in layers.items()},
         "scale": scale,

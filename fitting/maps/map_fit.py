@@ -27,7 +27,7 @@ from brdf.vectors import normalize
 from fitting.maps import map_inputs
 from fitting.maps.kept_bands import KeptBands
 from fitting.maps.map_inputs import Photographs
-from fitting.maps.map_result import REASONS, Maps
+from fitting.maps.map_result import MOST_ERROR, REASONS, Maps
 from fitting.maps.texels import (
     CAP,
     STEPS,
@@ -56,9 +56,6 @@ RING = 0.15
 
 LESS = 0.9
 """Photographs of 8 bits that do not say so are linear where that leaves less than this share of sRGB's squares."""
-
-MOST_ERROR = 0.25
-"""Of ln n, where it counts as determined."""
 
 LEAST_HIGHLIGHT = 2.0
 """k_s is seen where it exceeds so many of its standard errors."""
@@ -154,7 +151,7 @@ def fit_maps(
         layers = _Bands(given, surface, how, keep).fit()
     if not np.any(layers["reason"] != REASONS.index("outside")):
         raise InputError("pictures", "show no texel that counts", "Check mask, normals and clipping")
-    return _maps(layers, how, notes)
+    return dataclasses.replace(_maps(layers, how, notes), to_light=given.to_light)
 
 
 def _maps(layers: dict[str, np.ndarray], how: "_How", notes: tuple[str, ...] = ()) -> Maps:
@@ -520,6 +517,7 @@ def _layers(
         "fitted_k_s": jnp.where(inside, k_s, 0),
         "normal": jnp.where(inside, normal, 0),
         "normal_error": jnp.zeros_like(n) if tilt is None else jnp.degrees(noise * tilt),
+        "noise": jnp.where(inside, noise, jnp.nan),
         "determined": known,
         "reason": reason,
         "residual": jnp.where(inside, jnp.sqrt(fit.cost / jnp.where(square > 0, square, 1)), jnp.nan),

@@ -24,6 +24,9 @@ REASONS = (
 )
 """Why n and k_s of a texel are not determined, by the number in `Maps.reason`."""
 
+MOST_ERROR = 0.25
+"""Standard error of ln n up to which it counts as determined."""
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Maps:
@@ -49,6 +52,8 @@ class Maps:
         notes: what was found out about the photographs.
         k_a: ambient coefficient, where there was ambient light.
         k_a_error: standard error.
+        to_light: unit vectors towards the lights, where all are distant.
+        noise: of a value, its standard deviation.
 
     Example:
         >>> maps = fitting.load_maps("maps")
@@ -75,10 +80,15 @@ class Maps:
     notes: tuple[str, ...] = ()
     k_a: Float[np.ndarray, "H W C"] | None = None
     k_a_error: Float[np.ndarray, "H W C"] | None = None
+    to_light: Float[np.ndarray, "P 3"] | None = None
+    noise: Float[np.ndarray, "H W"] | None = None
 
     def layers(self) -> dict[str, np.ndarray]:
         """Every map by name."""
-        return {name: value for name, value in vars(self).items() if isinstance(value, np.ndarray) and value.ndim > 1}
+        size = self.n.shape
+        return {
+            k: value for k, value in vars(self).items() if isinstance(value, np.ndarray) and value.shape[:2] == size
+        }
 
     def __str__(self) -> str:
         """How many texels are determined, why the others are not, and the middle of what was found."""
@@ -131,6 +141,30 @@ class Maps:
                 picture += np.where((self.chosen == index)[..., None], self.fitted_k_s * lobe[..., None], 0)
         return (picture * np.asarray(light.intensity)).astype(np.float32)
 
+    def next_light(self, candidates: Any = None, count: int = 1, *, of: str = "n") -> Any:
+        """The light under which one more photograph would tell most of the exponents.
+
+        Args:
+            candidates: directions towards lights, (K, 3); None for any of the hemisphere.
+            count: how many lights, one chosen after the other.
+            of: "n" for the median standard error of ln n over texels with a highlight, or "undetermined" for how many
+                of these have one above 0.25.
+
+        Returns:
+            A `LightChoice`.
+
+        Raises:
+            InputError: naming the argument, or where the maps do not know their lights.
+
+        Example:
+            >>> choice = fitting.load_maps("maps").next_light([[0, 0, 1], [0.3, 0.1, 1], [0.9, 0, 0.3]])
+            >>> choice.after[0] <= choice.before
+            True
+        """
+        from fitting.maps.map_light_choice import next_light
+
+        return next_light(self, candidates, count, of)
+
     def save(self, folder: str | Path, *, plot: bool = False) -> None:
         """Write maps.exr with a layer a map, maps.json, and 16-bit images for other programs: all of it or nothing.
 
@@ -182,6 +216,7 @@ def load_maps(folder: str | Path) -> Maps:
         told = json.loads(read_text(path))
         kinds = {name: np.dtype(kind) for name, kind in told["layers"].items()}
         texts = tuple(told["models"]), np.array(told["to_view"], float), tuple(told["notes"])
+        to_light = np.array(told["to_light"], float) if told.get("to_light") else None
     except (ValueError, KeyError, TypeError, AttributeError):
         raise InputError(path, "does not describe maps", "Give a folder that Maps.save wrote") from None
     found = brdf.read_layers(Path(folder) / "maps.exr")
@@ -195,4 +230,4 @@ def load_maps(folder: str | Path) -> Maps:
             else found[name][..., 0]
         )
         layers[name] = values.astype(kind)
-    return Maps(models=texts[0], to_view=texts[1], notes=texts[2], **layers)
+    return Maps(models=texts[0], to_view=texts[1], notes=texts[2], to_light=to_light, **layers)

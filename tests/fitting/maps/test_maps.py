@@ -403,3 +403,24 @@ def test_an_n_that_texels_share_is_the_optimum_of_all():
 
     best = maps.n[labels == 1][0]
     assert cost(best) < min(cost(best * 0.999), cost(best * 1.001))
+
+
+def test_the_light_that_is_added_is_where_it_tells_most():
+    low = dome(24)
+    low = low[low[:, 2] < 0.75]
+    pictures, truth = texels(200, 0.01, dome(64), seed=5)
+    seen = np.array([np.argmin(np.sum((dome(64) - light) ** 2, axis=1)) for light in low])
+    maps = fitting.fit_maps(pictures[seen], dome(64)[seen], truth["normal"][None])
+    choice = fitting.next_light(maps, of="undetermined")
+    assert choice.direction[2] > 0.7
+    assert choice.after[0] < choice.before
+    best = int(np.argmin(np.sum((dome(64) - choice.direction) ** 2, axis=1)))
+    worst = int(np.argmin(dome(64)[:, 2]))
+    more = [
+        fitting.fit_maps(pictures[[*seen, one]], dome(64)[[*seen, one]], truth["normal"][None]).determined.sum()
+        for one in (best, worst)
+    ]
+    assert more[0] > more[1]
+    assert fitting.next_light(maps).after[0] < fitting.next_light(maps).before
+    with pytest.raises(brdf.InputError, match="of: must be n or undetermined"):
+        fitting.next_light(maps, of="k_d")
