@@ -42,7 +42,7 @@ def each(function: Callable[..., T], *sequences: Sequence[Any]) -> Sequence[T]:
     """
     if any(isinstance(sequence, Stream) for sequence in sequences):
         return Stream(lambda i: function(*(sequence[i] for sequence in sequences)), len(sequences[0]))
-    return [function(*elements) for elements in zip(*sequences, strict=True)]
+    return list(map(function, *sequences))
 
 
 def joined(sequences: Sequence[Sequence[T]]) -> Sequence[T]:
