@@ -27,7 +27,8 @@ from brdf.vectors import normalize
 from fitting.maps import map_inputs
 from fitting.maps.kept_bands import KeptBands
 from fitting.maps.map_inputs import Photographs
-from fitting.maps.map_result import MOST_ERROR, REASONS, Maps
+from fitting.maps.map_light_choice import MOST_ERROR
+from fitting.maps.map_result import REASONS, Maps
 from fitting.maps.texels import (
     CAP,
     STEPS,

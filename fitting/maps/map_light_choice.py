@@ -1,6 +1,6 @@
 """Which light to add to those of maps: the texels' information on their exponents, light by light."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -11,13 +11,18 @@ from brdf.errors import InputError
 from brdf.models.base import SpecularMaterial
 from brdf.vectors import dot
 from fitting.light_choice import LightChoice, choose_lights
-from fitting.maps.map_result import MOST_ERROR, Maps
+
+if TYPE_CHECKING:
+    from fitting.maps.map_result import Maps
+
+MOST_ERROR = 0.25
+"""Standard error of ln n up to which it counts as determined."""
 
 MOST_TEXELS = 4096
 """Of the maps at most so many texels are looked at, evenly spread."""
 
 
-def next_light(maps: Maps, candidates: Any, count: int, of: str) -> LightChoice:
+def next_light(maps: "Maps", candidates: Any, count: int, of: str) -> LightChoice:
     """See `Maps.next_light`."""
     if of not in ("n", "undetermined"):
         raise InputError("of", f"must be n or undetermined, got {of!r}", "Ask for one of these")

@@ -24,9 +24,6 @@ REASONS = (
 )
 """Why n and k_s of a texel are not determined, by the number in `Maps.reason`."""
 
-MOST_ERROR = 0.25
-"""Standard error of ln n up to which it counts as determined."""
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Maps:
