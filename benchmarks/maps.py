@@ -1,12 +1,14 @@
 """Maps: time a texel beside SciPy's and Adam's, the optimum, its errors, a photographed ball, RTI beside PTM, HSH.
 
-    python -m benchmarks.maps [speed] [errors] [ball] [rti]
+    python -m benchmarks.maps [speed] [files] [errors] [ball] [rti]
 
 Real data lie where the environment variable ``BRDF_REAL_DATA`` says (default: ../shared/data).
 """
 
 import os
+import subprocess
 import sys
+import tempfile
 import time
 from functools import partial
 from pathlib import Path
@@ -16,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
 
+import brdf
 import fitting
 
 DATA = Path(os.environ.get("BRDF_REAL_DATA", "../shared/data"))
@@ -97,6 +100,37 @@ def speed() -> None:
     adam_seconds, there = adam_peer(lights)
     words = f"{100 * there:.0f} % of the texels within 1 % of the least cost"
     print(f"Adam over all texels: {1e6 * adam_seconds:.0f} us a texel, {adam_seconds / ours['grey']:.0f} x; {words}")
+
+
+def files(side: int = 1000) -> None:
+    """Time a texel and peak memory from 16-bit files, in a process of its own that holds no photograph."""
+    lights = dome(32)
+    with tempfile.TemporaryDirectory() as folder:
+        pictures, truth = texels(side * side, lights, 0.01, 0)
+        lines = [str(len(lights))]
+        for i, (picture, light) in enumerate(zip(pictures, lights, strict=True)):
+            image = picture.reshape(side, side, 3) / 2
+            brdf.write_image(Path(folder, f"{i}.tif"), image, dtype="uint16", encoding="linear")
+            lines.append(f"{i}.tif {light[0]:.9f} {light[1]:.9f} {light[2]:.9f}")
+        Path(folder, "lights.lp").write_text("\n".join(lines))
+        np.save(Path(folder, "normals.npy"), truth["normal"].reshape(side, side, 3).astype(np.float32))
+        program = (
+            "import os, resource, sys, time, fitting\n"
+            "for _ in range(2):\n"
+            "    begin, busy = time.perf_counter(), time.process_time()\n"
+            "    fitting.fit_maps(sys.argv[1], specular='grey')\n"
+            "    print(time.perf_counter() - begin, time.process_time() - busy)\n"
+            "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
+        )
+        said = subprocess.run(
+            [sys.executable, "-c", program, folder], capture_output=True, text=True, check=True
+        ).stdout
+        *_, last, peak = said.splitlines()
+        wall, cpu = (1e6 * float(word) / side**2 for word in last.split())
+        print(
+            f"{side * side} texels from 16-bit TIFF, grey k_s: {wall:.2f} us a texel ({cpu:.2f} us of all cores), "
+            f"peak {int(peak) / 2**20:.2f} GiB, load of the machine {os.getloadavg()[0]:.1f}"
+        )
 
 
 def scipy_peer(lights: np.ndarray, count: int = 100) -> float:
@@ -275,7 +309,6 @@ def rti() -> None:
 
 def read_codes(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     """Photographs as codes, and their lights."""
-    import brdf
     from fitting.maps.map_inputs import read_lights
 
     names, lights = read_lights(folder / "dirs.lp")
@@ -333,5 +366,6 @@ def rbf(centres):
 
 
 if __name__ == "__main__":
-    for part in sys.argv[1:] or ["speed", "errors", "ball", "rti"]:
-        {"speed": speed, "errors": errors, "ball": ball, "rti": rti}[part]()
+    parts = {"speed": speed, "files": files, "errors": errors, "ball": ball, "rti": rti}
+    for part in sys.argv[1:] or parts:
+        parts[part]()
