@@ -34,7 +34,7 @@ And rows from which on XLA's product of two matrices is a quick one."""
 STACKED_VALUES = 1 << 26
 """Up to so many values the fit keeps the terms of many samples, too, for few pixels: 256 MiB in float32."""
 
-NODES, STEP, WIDEST, ROUGH = 5, 0.35, 1.0, 1e4
+NODES, STEP, NARROWEST, WIDEST, ROUGH = 5, 0.35, 0.04, 1.0, 1e4
 """A polynomial through so many exponents stands for a lobe: between nodes of Chebyshev over a range of log n of 0.7 to
 1e-5, of 0.04 to 1e-11; wider than `WIDEST` at equal steps, to 1e-3, which serves to find where to look.
 
@@ -270,7 +270,8 @@ class Near(NamedTuple):
         if high - low > WIDEST:
             return cls(np.linspace(low, high, math.ceil((high - low) / STEP) + NODES), np.float64(peak))
         turn = np.cos(np.pi * (np.arange(NODES) + 0.5) / NODES)[::-1]
-        return cls(0.5 * (low + high) + 0.5 * (high - low) * turn, np.float64(peak))
+        # Nodes too close to each other would make slopes of rounding.
+        return cls(0.5 * (low + high) + 0.5 * max(high - low, NARROWEST) * turn, np.float64(peak))
 
 
 def _lagrange(xp: Any, nodes: Any, at: Any) -> Any:

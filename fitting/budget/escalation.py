@@ -28,11 +28,12 @@ from fitting.result import FitResult
 FIRST_PIXELS, FIRST_SAMPLES = 1024, 16
 # Fits to an accuracy below this are in float64.
 COARSE = 1e-4
-# An attempt aims at this share of the accuracy in the pixels that it leaves out, at half of it in the other parts.
-AIM = 0.6
+# An attempt aims at this share of the accuracy in the pixels that it leaves out, at half of it in the other parts, and
+# where pixels are all that it leaves out.
+AIM, AIM_ALONE = 0.6, 0.8
 # A sample of more than this share of the pixels is not worth the choosing and weighing, and all are taken: under lights
 # of many samples or where only time counts, and under single lights.
-WHOLE, WHOLE_IF_SINGLE = 0.4, 0.1
+WHOLE, WHOLE_IF_SINGLE = 0.4, 0.15
 MOST_ATTEMPTS = 8
 # What a fit takes whatever its size, in pixels times samples.
 FIXED = 1e5
@@ -144,7 +145,8 @@ def _better(now, told, accuracy, most):
     if worst == 0:
         return None
     # Without an accuracy the largest part of the error is taken down, four times per attempt.
-    aim = worst / 2.5 if accuracy is None else min(AIM * accuracy, 0.7 * worst)
+    share = AIM if now.samples else AIM_ALONE
+    aim = worst / 2.5 if accuracy is None else min(share * accuracy, 0.7 * worst)
     change: dict[str, Any] = {}
     if now.pixels and pixels > aim:
         more = now.pixels * _power_of_two((pixels / aim) ** 2)

@@ -78,3 +78,11 @@ def test_a_tabulated_lobe_is_the_lobe_between_its_nodes(reach: float):
                 tolerance = 1e-3 * (reach / 0.3) ** 4 * size
                 np.testing.assert_allclose(np.asarray(one)[seen], np.asarray(true)[seen], atol=tolerance)
                 np.testing.assert_allclose(np.reshape(few, (-1, 1)), np.asarray(one)[seen], atol=1e-9 * size)
+
+
+def test_an_exponent_that_is_given_is_kept():
+    scene = ball(WINDOW)
+    picture = np.asarray(brdf.render(MATERIAL, scene))
+    material = fitting.fit(picture, scene, model="blinn-phong", n_range=(60.0, 60.0001)).material
+    assert isinstance(material, brdf.BlinnPhong)
+    np.testing.assert_allclose(material.k_s, MATERIAL.k_s, rtol=1e-3)
