@@ -1,8 +1,8 @@
 """Speed against accuracy, measured on the user's own scene.
 
-Only what the scene has is varied: pixels where there are enough of them, light samples where a light has an extent. A
-check has nothing to choose: its albedo is closed, and of a BRDF without a closed one the adaptive rule tells its own
-error.
+Only what the scene has is varied: pixels where there are enough of them, light samples where a light has an extent,
+least squares in place of the likelihood where the picture holds codes. A check has nothing to choose: its albedo is
+closed, and of a BRDF without a closed one the adaptive rule tells its own error.
 
 Fewer pixels are a stratified subsample, not a level of the picture's pyramid: averaged pixels blur a highlight, which
 the fit takes for a smaller exponent.
@@ -443,6 +443,8 @@ class Bench:
         found += [("samples", change(pixels=few, samples=count)) for count in steps]
         found += [("samples", change(samples=16))] if samples > 16 else []
         found += [("precision", change(precision="float64", pixels=count)) for count in (few, None)]
+        if self.problem.targets[0].codes is not None:
+            found += [("rounding", change(least_squares=True))]
         others = [name for name in ("lambert", "phong", "blinn-phong") if name != self.model]
         found += [("model", change(model=name, pixels=few)) for name in others]
         if isinstance(self.best.material, SpecularMaterial):

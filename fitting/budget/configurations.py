@@ -32,6 +32,7 @@ class Configuration:
         samples: of each light with an extent; None for those of the scene.
         solver: "separable", "lm" or "bfgs".
         tolerance: of the latter two, relative.
+        least_squares: also where the picture holds codes, whose likelihood is the default.
     """
 
     model: str = "auto"
@@ -40,11 +41,13 @@ class Configuration:
     samples: int | None = None
     solver: str = "separable"
     tolerance: float | None = None
+    least_squares: bool = False
 
     def __str__(self) -> str:
         """In words, what is usual left out."""
         words = [self.model, self.precision, "all pixels" if self.pixels is None else f"{self.pixels} pixels"]
         words += [f"{self.samples} light samples"] if self.samples is not None else []
+        words += ["least squares"] if self.least_squares else []
         words += [] if self.solver == "separable" else [f"{self.solver} to {self.tolerance:g}"]
         return ", ".join(words)
 
@@ -94,6 +97,9 @@ def run(
     scenes = [with_samples(scene, configuration.samples, lights) for scene in problem.scenes]
     n_range = n_range or problem.n_range
     made = dataclasses.replace(problem, scenes=scenes, model=model, precision=precision, n_range=n_range)
+    if configuration.least_squares:
+        plain = [target._replace(codes=None, least_squares=True) for target in problem.targets]
+        made = dataclasses.replace(made, targets=plain)
     samples: list[PixelSample | None] = [None] * len(scenes)
     if pixels is not None:
         kind = brdf.BlinnPhong if model == "auto" else brdf.MODELS[model]
