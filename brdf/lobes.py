@@ -6,6 +6,7 @@ are taken tile by tile, which also keeps a tile in the processor's cache while i
 
 import dataclasses
 import math
+import operator
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -393,11 +394,7 @@ class Lobe(eqx.Module):
 
     def on_host(self, pixel: Int[np.ndarray, " K"]) -> "Lobe":
         """The same for some of the pixels, all terms kept in NumPy."""
-
-        def of_pixels(leaf: Any) -> Any:
-            return np.asarray(leaf)[pixel]
-
-        lobe = self.pixels(of_pixels)
+        lobe = jax.tree.map(np.asarray, self).pixels(operator.itemgetter(pixel))
         if self.source is not None and self.model is not None:
             # Of one size for few numbers of pixels, or each would be compiled.
             padded = np.resize(pixel, 1 << max(pixel.size - 1, 0).bit_length())

@@ -67,7 +67,8 @@ class Picture(eqx.Module):
     def on_host(self, pixel: Int[np.ndarray, " K"]) -> "Picture":
         """The same picture, some of its pixels, in NumPy: an XLA gather is ten times slower."""
         lobe = None if self.lobe is None else self.lobe.on_host(pixel)
-        return replace(replace(self, lobe=None).pixels(lambda a: cast(Any, np.asarray(a)[pixel])), lobe=lobe)
+        here = jax.tree.map(np.asarray, replace(self, lobe=None))
+        return replace(here.pixels(operator.itemgetter(pixel)), lobe=lobe)
 
     def in_double(self, pixel: Int[np.ndarray, " K"]) -> "Picture":
         """The same picture, some of its pixels, in NumPy and double precision.
@@ -81,7 +82,7 @@ class Picture(eqx.Module):
         else:
             filled = -pixel.size % (_FEW if pixel.size <= _FEW else 8 * _FEW)
             pixel = np.append(pixel, np.zeros(filled, pixel.dtype))
-            some = self.pixels(lambda a: cast(Any, np.asarray(a)[pixel]))
+            some = jax.tree.map(np.asarray, self).pixels(operator.itemgetter(pixel))
         some = jax.tree.map(lambda a: np.asarray(a, np.float64) if eqx.is_inexact_array_like(a) else a, some)
         if filled and some.bounds is not None:
             some.bounds.lower[-filled:], some.bounds.upper[-filled:] = -np.inf, np.inf
