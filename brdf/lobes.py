@@ -154,13 +154,13 @@ def over_samples(
     occluders = tuple(_apart(shape) if shape.in_components else shape for shape in lighting.occluders)
     channels = max(one.shape[-1] for stack in lighting.stacks for one in stack.spectra)
 
-    def of_tile(tile: SurfacePoints) -> Any:
+    def of_tile(tile: Any) -> Any:
         dtype = tile.normal.parts[0].dtype
 
         def add(kind: type[Light], numbers: Any, light: Any, total: Any, chunk: tuple[Any, ...]) -> tuple[Any, None]:
             nodes, emitted = chunk[:2]
             row = (*map(_apart, numbers), *map(_chunk_apart, nodes))
-            grey = tuple(1.0 if place in kind.emits else part for place, part in enumerate(row))
+            grey: Any = tuple(1.0 if place in kind.emits else part for place, part in enumerate(row))
             terms = light_terms(model, occluders, kind, grey, light if len(chunk) == 2 else chunk[2], tile)
             terms = LightTerms(*(jnp.broadcast_to(part, (len(emitted), *tile.mask.shape)) for part in terms))
             terms = jax.lax.optimization_barrier(terms)  # or each of the sums would make them anew

@@ -143,7 +143,7 @@ def dot(a: Directions, b: Directions) -> Scalars:
     return product[..., 0] + product[..., 1] + product[..., 2]  # the order is fixed, unlike that of a reduction
 
 
-def normalize(v: Directions) -> Vectors:
+def normalize(v: Any) -> Any:
     """Unit vectors of the same direction, without underflow or overflow; zero stays zero, with a zero gradient."""
     if isinstance(v, Components):
         size = jax.lax.stop_gradient(largest(Components(tuple(map(jnp.abs, v.parts)))))

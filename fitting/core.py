@@ -135,7 +135,9 @@ def _fit_model(
     near, told = None, problem.sample_errors or {}
     if told:
         near = told.get(model.name, next(iter(told.values()))).near
-    for trial in range(TRIALS):
+    trial = -1
+    while True:
+        trial += 1
         pictures = each(partial(_picture, model, near=near), seen.tiles)
         if not problem.streamed:
             pictures = [placed(index, picture) for index, picture in enumerate(pictures)]

@@ -57,7 +57,7 @@ def _at_each(shape: Shape, start: Components, to_light: Any, before: Scalar, rad
     """The same for points whose vectors are in components, by a shape that takes one point."""
     vectors = start.stacked(), to_light.stacked()
     *numbers, size = jnp.broadcast_arrays(before, 0.0 if radius is None else radius, vectors[0][..., 0])
-    vectors = tuple(jnp.broadcast_to(vector, (*size.shape, 3)) for vector in vectors)
+    vectors = jnp.broadcast_to(vectors[0], (*size.shape, 3)), jnp.broadcast_to(vectors[1], (*size.shape, 3))
     if radius is None:
         return jax.vmap(shape.cover)(*vectors, numbers[0])
-    return jax.vmap(shape.cover_patch)(*vectors, *numbers)
+    return jax.vmap(shape.cover_patch)(*vectors, numbers[0], numbers[1])

@@ -297,7 +297,7 @@ def _arc_above_horizon(axial: Array, outward: Array, height: Array) -> tuple[Arr
     return low, high
 
 
-def perpendicular(axis: Array) -> tuple[Array, Array]:
+def perpendicular(axis: Any) -> tuple[Any, ...]:
     """Two unit vectors at right angles to a unit vector and to each other.
 
     Source: Duff et al., Building an orthonormal basis, revisited, JCGT 6 (2017).

@@ -102,7 +102,8 @@ class _Ladder:
             peaks.append(np.max(peak, initial=-np.inf, where=share > 0))
             self.parts.append((pixel, share, np.einsum("mci,cip->mcp", columns, places)))
         self.peak = min(max(peaks), 0.0)
-        self.hessian = sum(np.einsum("m,mcp,mcq->pq", share, by, by, optimize=True) for _, share, by in self.parts)
+        hessians = [np.einsum("m,mcp,mcq->pq", share, by, by, optimize=True) for _, share, by in self.parts]
+        self.hessian: np.ndarray = np.sum(hessians, axis=0)
         self.active = np.append((self.x > 0).ravel(), bool((self.x[2] > 0).any()))
         self.samples = next(filter(self._enough, self.counts), self.counts[-1])
 
