@@ -255,6 +255,7 @@ def _photographs(targets: list[Path], options: PictureOptions, pictures: Any, ma
             brighter = f", {100 * (light.strength / mean - 1):+.1f} % bright" if count > 1 else ""
             direction = ",".join(f"{value:.4f}" for value in light.direction)
             notes += (f"light of {target.name} from its shading: {direction} {stated_error(light)}{brighter}",)
+        notes += ("the errors of the numbers are those under this light: its own is not in them",)
     else:
         direction = parse_numbers(options.light or "", "--light", 3, "x,y,z: x right, y up, z to the camera; or fit")
         _require(any(direction), "--light", "must not have zero length, got 0,0,0", "Give a direction")

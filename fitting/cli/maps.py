@@ -76,4 +76,4 @@ def maps(
         if out is not None:
             found.save(out, plot=plot)
             shutil.rmtree(out / BANDS, ignore_errors=True)
-    show("\n".join([str(found), *([] if out is None else [f"saved in {out}"])]))
+    show(f"{found}\n{'nothing saved: give --out DIR' if out is None else f'saved in {out}'}")
