@@ -13,7 +13,7 @@ A float array whose values all lie on the levels of one of these is taken as suc
 
 from typing import Any, Literal, NamedTuple
 
-import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -98,9 +98,10 @@ class Codes(NamedTuple):
             )
         lower = np.where(good & (code > self.ends[0]), np.minimum(code, top) - flat(self.below), -np.inf)
         upper = np.where(good & (code < top), code + flat(self.above), np.inf)
-        place = np.arange(len(code)), np.asarray(self.values.shape[1])
         scale, unit, spread = (np.asarray(part, np.float64) for part in (self.scale, self.unit, spread))
-        return Bounds(*_stored(lower, upper), scale, unit, *place, spread, self.encoding, self.lossy)
+        index, width = np.arange(len(code)), np.asarray(self.values.shape[1])
+        lower, upper = _stored(lower), _stored(upper)
+        return Bounds(lower, upper, scale, unit, index, width, spread, self.encoding, self.lossy)
 
 
 def _mixed(beside: Bool[np.ndarray, "H W"], size: int) -> Bool[np.ndarray, " P"]:
@@ -167,14 +168,14 @@ def open_ends(
         return None
     lower = np.where(good & ~low, np.where(high, min(level or np.inf, np.inf), values), -np.inf)
     upper = np.where(good & ~high, values, np.inf)
-    place, one = (np.arange(len(values)), np.asarray(width)), np.ones(())
-    spread = np.asarray(spread, np.float64)
-    return Bounds(*_stored(lower, upper), one, one, *place, spread, "linear", lossy=False, exact=True)
+    index, one, spread = np.arange(len(values)), np.ones(()), np.asarray(spread, np.float64)
+    lower, upper, pitch = _stored(lower), _stored(upper), np.asarray(width)
+    return Bounds(lower, upper, one, one, index, pitch, spread, "linear", lossy=False, exact=True)
 
 
-def _stored(*bounds: np.ndarray) -> list[np.ndarray]:
+def _stored(bound: np.ndarray) -> np.ndarray:
     """In the precision of the fit."""
-    return [bound.astype(np.float64 if jax.config.jax_enable_x64 else np.float32) for bound in bounds]
+    return bound.astype(jnp.result_type(float))
 
 
 def single_values_at_end(

@@ -83,7 +83,7 @@ class Bounds(eqx.Module):
     lossy: bool = eqx.field(static=True)
     exact: bool = eqx.field(static=True, default=False)
 
-    def codes(self, radiance: Float[AnyArray, "*shape"]) -> tuple[Float[AnyArray, "*shape"], Float[AnyArray, "*shape"]]:
+    def codes(self, radiance: Float[AnyArray, "*shape"]) -> tuple[Any, Any]:
         """Predictions in codes before rounding, and their derivative by radiance; on the host where these are."""
         xp: Any = np if isinstance(radiance, np.ndarray) else jnp
         unit, steps = (xp.asarray(part, radiance.dtype) for part in (self.unit, self.scale))

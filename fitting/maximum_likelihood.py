@@ -166,8 +166,8 @@ def most_likely(fit: ModelFit, *, copies: bool = False) -> ModelFit:
     if exact and deviation <= NO_NOISE * float(np.max(optimum.square / np.maximum(optimum.pixels, 1))) ** 0.5:
         return fit
     at = Estimate(optimum.x, math.log(optimum.n), 1.0)
-    squares, count = np.sum([_squares(picture, at) for picture in fit.pictures], axis=0)
-    at = at._replace(noise=math.sqrt(squares / max(count, 1)))
+    squares, counts = zip(*(_squares(picture, at) for picture in fit.pictures), strict=True)
+    at = at._replace(noise=math.sqrt(sum(squares) / max(sum(counts), 1)))
     lossy = any(bounds.lossy for bounds in map(_bounds, fit.pictures))
     # Weights of least squares leave out what is clipped, which says something here.
     weights = [_alike(picture, at) if lossy else None for picture in fit.pictures]
@@ -211,7 +211,8 @@ def _alike(picture: Picture, at: Estimate) -> Float[np.ndarray, "P C"]:
 
 def _near_edges(fit: ModelFit, at: Estimate, fewest: Float[np.ndarray, " U"]) -> Evidence:
     """Where rounding is most of the noise: what pixels near the edge of a code say."""
-    pictures, space = fit.pictures, _Space(design_of(fit.free, fit.tied), tuple(map(math.log, fit.n_range)))
+    least, most = map(math.log, fit.n_range)
+    pictures, space = fit.pictures, _Space(design_of(fit.free, fit.tied), (least, most))
     if sum(picture.target.shape[0] for picture in pictures) > 2 * SUBSAMPLE:
         at, known = maximise([_stratum(picture, SUBSAMPLE // len(pictures)) for picture in pictures], at, space)
         # The whole picture has the pixels near an edge that a part of it lacks.
@@ -506,7 +507,8 @@ def _sums(pixels: Sequence[_Pixels], at: Estimate) -> _Sums:
                 (columns * curvature.T[:, None]) @ np.swapaxes(columns, 1, 2),
             )
         )
-    return _Sums(*(sum(part) for part in zip(*parts, strict=True)), told)
+    value, by_log_noise, score, weight = (sum(part) for part in zip(*parts, strict=True))
+    return _Sums(value, by_log_noise, score, weight, told)
 
 
 def _near(picture: Picture, at: Estimate, reach: float) -> Bool[np.ndarray, " P"]:
