@@ -8,6 +8,7 @@ from typing import Any
 
 from docutils import nodes
 from docutils.utils.math.latex2mathml import tex2mathml
+from jupyter_cache import get_cache
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
@@ -32,6 +33,9 @@ smartquotes = False  # -- begins an option
 # warning fails the build. Widgets would pull scripts from elsewhere: their pictures stand in for them.
 nb_custom_formats = {".py": ["jupytext.reads", {"fmt": "py:percent"}]}
 nb_execution_mode = "cache"
+nb_execution_cache_path = str(ROOT / "out" / ".jupyter_cache")
+# Made before the build parts, or two parts of it make its tables at once, and one fails.
+_ = get_cache(nb_execution_cache_path).db
 nb_execution_timeout = 300
 nb_execution_raise_on_error = True
 nb_output_stderr = "remove-warn"
