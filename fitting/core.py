@@ -42,8 +42,8 @@ UNEXPLAINED = 0.5
 UNSEEN = 60.0
 # A highlight that explains less than this share of what errs together without it is none.
 EXPLAINED = 0.35
-# A highlight that changes no value by this share of a code is none.
-HIDDEN = 0.3
+# A highlight that changes no value by this share of a code is none: rounding hides it.
+HIDDEN = 0.5
 # As many independent values a picture has at least.
 FEWEST_MEASUREMENTS = 30.0
 # A highlight that leaves so many times the squares of another one is not made likelier than it by rounding.
