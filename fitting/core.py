@@ -216,7 +216,7 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
     best = next(iter(fits.values()))
     noise, whitened = residual_noise(best.optimum, seen.rounding), _likely_sums(fits)
     if whitened:
-        noise, inflation = np.ones_like(noise), _inflation(best, seen)
+        inflation = _inflation(best, seen)
     else:
         known = residual_correlation(best.pictures, seen.tiles, best.optimum, seen.rounding)
         inflation = known.inflation

@@ -1,5 +1,6 @@
 """Which light to add to those of maps: the texels' information on their exponents, light by light."""
 
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -20,6 +21,11 @@ MOST_ERROR = 0.25
 
 MOST_TEXELS = 4096
 """Of the maps at most so many texels are looked at, evenly spread."""
+
+
+def _lobe(model: type[SpecularMaterial], weight: Any, log_cosine: Any, log_n: Any) -> Any:
+    n = jnp.exp(log_n)
+    return model.scale(n) * weight * jnp.exp(n * log_cosine)
 
 
 def next_light(maps: "Maps", candidates: Any, count: int, of: str) -> LightChoice:
@@ -49,8 +55,8 @@ def next_light(maps: "Maps", candidates: Any, count: int, of: str) -> LightChoic
             if not issubclass(model, SpecularMaterial):
                 continue
             log_cosine, weight = model.log_cosine(normal, to_light, to_view), cosine if model.cosine_weighted else 1.0
-            of_log_n = lambda x, m=model, w=weight, c=log_cosine: m.scale(jnp.exp(x)) * w * jnp.exp(jnp.exp(x) * c)  # noqa: E731
-            found = jax.jvp(of_log_n, (jnp.asarray(log_n),), (jnp.ones_like(jnp.asarray(log_n)),))
+            at = jnp.asarray(log_n)
+            found = jax.jvp(partial(_lobe, model, weight, log_cosine), (at,), (jnp.ones_like(at),))
             here = (chosen == index) & (cosine > 0)
             lobe, slope = (jnp.where(here, new, old) for new, old in zip(found, (lobe, slope), strict=True))
         columns = cosine, lobe, slope

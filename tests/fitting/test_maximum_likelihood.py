@@ -61,3 +61,5 @@ def test_what_rounding_leaves_does_not_make_up_for_the_wrong_highlight(tmp_path:
     assert result.surface == one.model == "blinn-phong"
     assert rivals
     assert all(rival.excess > 1000 for rival in rivals)
+    (chosen,) = (candidate for candidate in result.candidates if candidate.chosen)
+    assert chosen.rms < chosen.held_out < 1.1 * chosen.rms
