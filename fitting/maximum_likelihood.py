@@ -1,23 +1,18 @@
-"""The most likely numbers behind rounded values: from least squares on, Newton's method, the noise halved and halved.
+"""The most likely material behind rounded values, from least squares on.
 
 Where the noise before rounding is small, least squares is wrong twice: a rounding error is no noise, and a side of the
 object that shows one code counts as thousands of independent values. What is maximised here is the likelihood of
 `fitting.likelihood`: each value lay somewhere between the bounds that its code states.
 
-For a given noise s (in codes) and exponent the logarithm of the likelihood is concave in the coefficients if the
-encoding is linear, and nearly so else. Newton's step needs the score and the weight of each pixel where least squares
-needs the residual and 1; the sums are the same (ambient, diffuse, lobe, derivative of the lobe by log n), and the step
-is the same non-negative least squares. With less noise fewer pixels say something: those whose prediction is near the
-edge of a code. So s starts at what least squares leaves and is halved as long as that makes the picture likelier, each
-time from the last answer; that is done on a stratified subsample. Of the whole picture only the pixels near an edge are
-gathered for the last steps.
+The numbers of a picture are its coefficients, in which it is linear, and the exponent; the sums that Newton's method
+(`fitting.continuation`) needs are those of least squares. It starts on a stratified subsample; of the whole picture
+only the pixels near an edge are gathered for the last steps.
 """
 
 import dataclasses
 import math
 from collections.abc import Sequence
-from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -25,31 +20,31 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from fitting.likelihood import AnyArray, Bounds, Intervals
+from fitting.continuation import (
+    LEAST_NOISE,
+    MOST_TELLING,
+    REACH,
+    Estimate,
+    Score,
+    maximise,
+    precision,
+    telling,
+    widening,
+)
+from fitting.likelihood import AnyArray, Bounds, Intervals, LogLikelihood
 from fitting.model_fit import Evidence, ModelFit
-from fitting.solver.nnls import nonnegative_minimum
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum, refit
 from fitting.solver.subsample import stratified
 from fitting.solver.tied import design_of, join_channels
 
-# In codes: below this the edges of codes are as sharp as the arithmetic of the basis images.
-LEAST_NOISE = 1e-4
-# A pixel says nothing where its code is as good as certain: this many s from the nearer edge.
-REACH = 7.0
-# One that has come nearer than this on the way is taken in.
-NEARER = 5.0
-# Newton's steps at one s; a step that gains less ends them.
-MOST_STEPS, LEAST_GAIN = 12, 1e-3
 # The largest change of log n in one step.
 LARGEST_SHIFT = 0.5
-# The noise is known well enough where it changes by less than this factor.
-ENOUGH_KNOWN = 1.02
-# Where the Hessian is no larger all values are surely inside their codes.
-NOTHING = 1e-100
 # So many values have to tell of a number before the Hessian is taken for its error.
 FEWEST_VALUES = 6.0
 SUBSAMPLE = 16384
+# The noise of a part of the pixels is known well enough to this factor.
+ROUGHLY_KNOWN = 1.2
 # In codes: with more noise than this, and no code at an end, a linear picture says what least squares says.
 ENOUGH_NOISE = 0.5
 FIRST_NOISE = 0.3
@@ -62,57 +57,28 @@ ALIKE, FEWEST_ALIKE, MORE_ALIKE = 1024, 64, 10
 END_REACH, NO_NOISE = 4.0, 1e-5
 
 
-class Estimate(NamedTuple):
-    """The most likely numbers.
+class Numbers(NamedTuple):
+    """What a picture is predicted from.
 
     Attributes:
         x: coefficients x_a, x_d, x_s, at least 0, (3, C).
         log_n: logarithm of the exponent.
-        noise: s, in codes.
-        value: logarithm of the likelihood.
     """
 
     x: Float[np.ndarray, "3 C"]
     log_n: float
-    noise: float
-    value: float = -math.inf
 
+    @classmethod
+    def of(cls, at: Optimum | Estimate) -> "Numbers":
+        """Those of an optimum, or of an estimate: coefficients, channel after channel each, and log n."""
+        if isinstance(at, Optimum):
+            return cls(at.x, math.log(at.n))
+        return cls(at.unknowns[:-1].reshape(3, -1), float(at.unknowns[-1]))
 
-@dataclasses.dataclass(frozen=True)
-class Precision:
-    """What is known of the unknowns (x_a, x_d, x_s, channel after channel each, log n) at some noise.
-
-    Attributes:
-        noise: s.
-        information: logarithm of the determinant of the Hessian.
-        variance: of each, (U,).
-        count: how many values tell of it, by their share in the Hessian, (U,).
-    """
-
-    noise: float
-    information: float
-    variance: Float[np.ndarray, " U"]
-    count: Float[np.ndarray, " U"]
-
-
-class _Sums(NamedTuple):
-    value: Any
-    by_log_noise: Any
-    score: Any
-    weight: Any
-    told: Sequence["_Told"]
-
-
-class _Space(NamedTuple):
-    """Where Newton's method may go.
-
-    Attributes:
-        design: what each unknown moves of x_a, x_d, x_s, channel after channel, and log n.
-        bounds: of log n.
-    """
-
-    design: Float[np.ndarray, "U V"]
-    bounds: tuple[float, float]
+    @property
+    def unknowns(self) -> Float[np.ndarray, " U"]:
+        """All of them."""
+        return np.append(self.x.ravel(), self.log_n)
 
 
 class _Pixels(NamedTuple):
@@ -137,21 +103,6 @@ class _Pixels(NamedTuple):
         return self if which.all() else _Pixels.of(self.picture.in_double(np.flatnonzero(which)))
 
 
-class _Told(NamedTuple):
-    """What each value says of a prediction: log-likelihood, score and weight by the predicted code, (P, C).
-
-    Also the radiance that is predicted, the slope of the code by it, and the columns ambient, diffuse, lobe and
-    derivative of the lobe by log n, (4, P, C).
-    """
-
-    value: Any
-    score: Any
-    weight: Any
-    radiance: Any
-    slope: Any
-    columns: Any
-
-
 def most_likely(fit: ModelFit, *, copies: bool = False) -> ModelFit:
     """A fit by what rounded values and open ends say, from least squares on; as it is where they say no more.
 
@@ -165,26 +116,25 @@ def most_likely(fit: ModelFit, *, copies: bool = False) -> ModelFit:
     deviation = math.sqrt(float(np.sum(optimum.cost)) / max(float(np.sum(optimum.pixels)), 1.0))
     if exact and deviation <= NO_NOISE * float(np.max(optimum.square / np.maximum(optimum.pixels, 1))) ** 0.5:
         return fit
-    at = Estimate(optimum.x, math.log(optimum.n), 1.0)
+    at = Numbers.of(optimum)
     squares, counts = zip(*(_squares(picture, at) for picture in fit.pictures), strict=True)
-    at = at._replace(noise=math.sqrt(sum(squares) / max(sum(counts), 1)))
+    noise = math.sqrt(sum(squares) / max(sum(counts), 1))
     lossy = any(bounds.lossy for bounds in map(_bounds, fit.pictures))
     # Weights of least squares leave out what is clipped, which says something here.
-    weights = [_alike(picture, at) if lossy else None for picture in fit.pictures]
+    weights = [_alike(picture, at, noise) if lossy else None for picture in fit.pictures]
     pictures = list(map(_with_weight, fit.pictures, weights))
     rounding = 0.0 if exact else 1 / 12
     widest = 1.0 if exact else max(_widest(picture) for picture in pictures)
-    if exact or lossy or at.noise**2 > (ENOUGH_NOISE**2 + rounding) * widest**2:
+    if exact or lossy or noise**2 > (ENOUGH_NOISE**2 + rounding) * widest**2:
         linear = all(bounds.encoding == "linear" for bounds in map(_bounds, pictures))
-        if linear and not lossy and not any(_open_ends_tell(picture, at) for picture in pictures):
+        if linear and not lossy and not any(_open_ends_tell(picture, at, noise) for picture in pictures):
             return fit
-        said = _reweighted(fit._replace(pictures=pictures), at.noise, rounding)
+        said = _reweighted(fit._replace(pictures=pictures), noise, rounding)
     else:
-        at = at._replace(noise=max(at.noise, FIRST_NOISE))
         # Copies of a value tell no more of what all channels share.
         fewest = np.full(optimum.x.size + 1, FEWEST_VALUES)
         fewest[-1] *= optimum.square.size if copies else 1
-        said = _near_edges(fit._replace(pictures=pictures), at, fewest)
+        said = _near_edges(fit._replace(pictures=pictures), Estimate(at.unknowns, max(noise, FIRST_NOISE)), fewest)
     found = said.optimum
     optimum = dataclasses.replace(optimum, x=found.x, n=found.n, flat=found.flat)
     return fit._replace(optimum=optimum, evidence=said)
@@ -194,7 +144,7 @@ def _with_weight(picture: Picture, weight: np.ndarray | None) -> Picture:
     return dataclasses.replace(picture, weight=weight)
 
 
-def _alike(picture: Picture, at: Estimate) -> Float[np.ndarray, "P C"]:
+def _alike(picture: Picture, at: Numbers, noise: float) -> Float[np.ndarray, "P C"]:
     """Weights for values whose prediction is the same, as on an unlit side: these share one rounding error.
 
     It came before the losses of the file, which hide it. N values of noise s whose mean has a further error of variance
@@ -205,38 +155,42 @@ def _alike(picture: Picture, at: Estimate) -> Float[np.ndarray, "P C"]:
     for one, some, own in zip(code.T, tells.T, weight.T, strict=True):
         _, kind, count = np.unique(one[some], return_inverse=True, return_counts=True)
         many = count > max(FEWEST_ALIKE, MORE_ALIKE * np.median(count)) if count.size else count > 0
-        own[some] = np.where(many, 1 / (1 + count / (12 * at.noise**2)), 1.0)[kind]
+        own[some] = np.where(many, 1 / (1 + count / (12 * noise**2)), 1.0)[kind]
     return weight
 
 
 def _near_edges(fit: ModelFit, at: Estimate, fewest: Float[np.ndarray, " U"]) -> Evidence:
     """Where rounding is most of the noise: what pixels near the edge of a code say."""
-    least, most = map(math.log, fit.n_range)
-    pictures, space = fit.pictures, _Space(design_of(fit.free, fit.tied), (least, most))
+    design, bounds = design_of(fit.free, fit.tied), (math.log(fit.n_range[0]), math.log(fit.n_range[1]))
+    pictures, first = fit.pictures, 2.0
     if sum(picture.target.shape[0] for picture in pictures) > 2 * SUBSAMPLE:
-        at, known = maximise([_stratum(picture, SUBSAMPLE // len(pictures)) for picture in pictures], at, space)
+        some = [_stratum(picture, SUBSAMPLE // len(pictures)) for picture in pictures]
+        at, known = maximise(_Separable(some, design, bounds), at, ROUGHLY_KNOWN)
         # The whole picture has the pixels near an edge that a part of it lacks.
-        at = at._replace(noise=_telling(known, fewest).noise)
+        at, first = at._replace(noise=telling(known, fewest).noise), ROUGHLY_KNOWN
     near = [np.flatnonzero(_near(picture, at, REACH)) for picture in pictures]
     gathered = [_Pixels.of(picture.in_double(some)) for picture, some in zip(pictures, near, strict=True)]
-    at, known = maximise(gathered, at, space)
-    telling = at._replace(noise=_telling(known, fewest).noise)
-    near = [part.some(_near(part.picture, telling, REACH)) for part in gathered]
-    sums = _sums(near, telling)
-    widening = _widening(known, _precision(telling, sums, space), fewest)
-    working = [_working(pixels.picture, said) for pixels, said in zip(near, sums.told, strict=True)]
-    optimum = _optimum(working, sums, fit, at)
-    return Evidence(working, optimum, at.noise, at.value, [_place(part.picture) for part in near], widening)
+    problem = _Separable(gathered, design, bounds)
+    at, known = maximise(problem, at, first=first)
+    most = telling(known, fewest)
+    at_most = at._replace(noise=most.noise)
+    said = problem.score(at_most, problem.near(at_most, REACH))
+    wider = widening(known, precision(problem, at_most, said), fewest)
+    working = [one.working() for one in said.said]
+    optimum = _optimum(working, said, fit, Numbers.of(at))
+    places = [_place(one.pixels.picture) for one in said.said]
+    return Evidence(working, optimum, at.noise, at.value, places, wider)
 
 
-def _optimum(working: Sequence[Picture], sums: _Sums, fit: ModelFit, at: Estimate) -> Optimum:
+def _optimum(working: Sequence[Picture], said: Score, fit: ModelFit, at: Numbers) -> Optimum:
     """The optimum of the least squares that takes Newton's step, at which it rests."""
     scale, steps = np.ones(4), np.zeros(at.x.shape[1])
     # By n, not by its logarithm.
     scale[3] = math.exp(-at.log_n)
     if not fit.free[2].any():
         scale[2:] = 0.0
-    gram, score = sums.weight * scale[:, None] * scale, sums.score * scale
+    weight, score = (sum(parts) for parts in zip(*(one.sums() for one in said.said), strict=True))
+    gram, score = weight * scale[:, None] * scale, score * scale
     product = score + np.einsum("cij,jc->ci", gram[..., :3], at.x)
     square, count = np.zeros_like(steps), np.zeros_like(steps)
     for picture in working:
@@ -321,13 +275,13 @@ def _stated(picture: Picture, optimum: Optimum, noise: float, rounding: float) -
     if index.size:
         s = math.sqrt(max(noise**2 - rounding, LEAST_NOISE**2))
         pixels = _Pixels.of(picture.in_double(index))
-        (told,) = _sums([pixels], Estimate(optimum.x, math.log(optimum.n), s)).told
-        told = _Told(*(part[..., : index.size, :] for part in told))
+        said = _Said.of(pixels, Estimate(Numbers.of(optimum).unknowns, s))
+        told, radiance, slope = jax.tree.map(lambda part: part[: index.size], (said.told, said.radiance, said.slope))
         at_end, own = half[index], s * bounds.spread[index if bounds.spread.ndim else ...]
         weighs = np.broadcast_to(pixels.picture.weights, told.value.shape)[: index.size]
-        curvature = told.weight * told.slope**2
-        step = np.divide(told.score * told.slope, curvature, out=np.zeros_like(curvature), where=curvature > 0)
-        target[index] = np.where(at_end, told.radiance + step, target[index])
+        curvature = told.weight * slope**2
+        step = np.divide(told.score * slope, curvature, out=np.zeros_like(curvature), where=curvature > 0)
+        target[index] = np.where(at_end, radiance + step, target[index])
         weight[index] = np.where(at_end, weighs * curvature * noise**2, weight[index])
         # Mean square of what the value may have been, about the prediction.
         expected = ((told.score * own) ** 2 + 1 - told.weight * own**2) * noise**2
@@ -358,162 +312,129 @@ def _place(picture: Picture) -> tuple[np.ndarray, int]:
     return np.asarray(bounds.index), int(bounds.width)
 
 
-def _telling(known: Sequence[Precision], fewest: Float[np.ndarray, " U"]) -> Precision:
-    """Where the values say most of all unknowns together, and enough of them of each.
+class _Some(NamedTuple):
+    """Some pixels, and which of a picture's they are."""
 
-    With less noise all pixels of a small highlight may lie well inside their codes, and the Hessian there says nothing.
-    """
-    enough = [entry for entry in known[1:] if np.all((entry.count >= fewest) | (known[0].variance == 0))]
-    return max([known[0], *enough], key=lambda entry: entry.information)
+    which: Bool[np.ndarray, " P"]
+    pixels: _Pixels
 
 
-def _widening(known: Sequence[Precision], most: Precision, fewest: Float[np.ndarray, " U"]) -> Float[np.ndarray, " U"]:
-    """What to multiply errors by: each unknown is known as well as where enough values still tell of it."""
-    variance = np.array([entry.variance for entry in known])
-    enough = np.array([entry.count for entry in known]) >= fewest
-    # With the most noise all values tell.
-    enough[0] = True
-    least = np.min(np.where(enough & (variance > 0), variance, np.inf), axis=0)
-    ratio = np.divide(least, most.variance, out=np.ones_like(least), where=(most.variance > 0) & np.isfinite(least))
-    return np.sqrt(ratio)
+class _Separable(NamedTuple):
+    """Rounded values, and the model of which they show the coefficients and the exponent.
 
-
-def maximise(pixels: Sequence[_Pixels], start: Estimate, space: _Space) -> tuple[Estimate, list[Precision]]:
-    """The most likely coefficients, exponent and noise; and what was known of them on the way.
-
-    Args:
+    Attributes:
         pixels: of each picture.
-        start: whose noise is where the halving starts.
-        space: where to look.
+        design: what each free number moves of x_a, x_d, x_s, channel after channel, and log n.
+        bounds: of log n.
     """
-    at, now = _climb(pixels, start, space)
-    above, known = None, [_precision(at, now, space)]
-    # Less noise makes it likelier: halve.
-    while now.by_log_noise < 0 and at.noise > LEAST_NOISE:
-        above = at, now
-        at, now = _climb(pixels, at._replace(noise=max(at.noise / 2, LEAST_NOISE)), space)
-        known.append(_precision(at, now, space))
-    if now.by_log_noise <= 0:
-        return at, known
-    below = at, now
-    while above is None:
-        trial, sums = _climb(pixels, at._replace(noise=at.noise * 2), space)
-        if sums.by_log_noise < 0:
-            above = trial, sums
-        else:
-            below = at, now = trial, sums
-    # In between, where the derivative by the noise is 0.
-    for _ in range(3):
-        low, high = float(below[1].by_log_noise), float(above[1].by_log_noise)
-        share = min(max(low / (low - high), 0.01), 0.99)
-        noise = below[0].noise * (above[0].noise / below[0].noise) ** share
-        if max(noise, at.noise) < ENOUGH_KNOWN * min(noise, at.noise):
-            break
-        at, now = _climb(pixels, at._replace(noise=noise), space)
-        below, above = ((at, now), above) if now.by_log_noise > 0 else (below, (at, now))
-    return at, [*(entry for entry in known if entry.noise > at.noise), _precision(at, now, space)]
+
+    pixels: Sequence[_Pixels]
+    design: Float[np.ndarray, "U V"]
+    bounds: tuple[float, float]
+
+    @property
+    def signed(self) -> Bool[np.ndarray, " U"]:
+        """Log n may be below 0."""
+        return np.arange(len(self.design)) == len(self.design) - 1
+
+    def near(self, at: Estimate, reach: float, beside: list[_Some] | None = None) -> list[_Some]:
+        """The pixels that say something, and those beside."""
+        which = [_near(part.picture, at, reach) for part in self.pixels]
+        if beside is not None:
+            if not any(np.any(some & ~one.which) for some, one in zip(which, beside, strict=True)):
+                return beside
+            which = [some | one.which for some, one in zip(which, beside, strict=True)]
+        return [_Some(some, part.some(some)) for part, some in zip(self.pixels, which, strict=True)]
+
+    def active(self, at: Estimate) -> Bool[np.ndarray, " U"]:
+        """Coefficients above 0, and the exponent where there is a highlight."""
+        x = Numbers.of(at).x
+        return np.append(x.ravel() > 0, x[2].any())
+
+    def moved(self, at: Estimate, step: Float[np.ndarray, " U"]) -> Estimate:
+        """Another estimate, within the bounds."""
+        unknowns = np.maximum(at.unknowns + step, 0.0)
+        unknowns[-1] = at.unknowns[-1]
+        if self.design[-1].any():
+            shift = np.clip(step[-1], -LARGEST_SHIFT, LARGEST_SHIFT)
+            unknowns[-1] = np.clip(unknowns[-1] + shift, *self.bounds)
+        return at._replace(unknowns=unknowns)
+
+    def score(self, at: Estimate, values: Sequence[_Some]) -> Score:
+        """What some pixels say."""
+        said = [_Said.of(some.pixels, at) for some in values]
+        numbers = Numbers.of(at)
+        weight, score = (sum(parts) for parts in zip(*(one.sums() for one in said), strict=True))
+        normal = join_channels(weight, score, np.zeros(len(score)), numbers.x[2])
+        value, *by_noise = (sum(parts) for parts in zip(*(one.by_noise(at.noise) for one in said), strict=True))
+        return Score(value, *by_noise, normal.product, normal.gram, said)
+
+    def squared_shares(self, at: Estimate, said: Score, influence: Float[np.ndarray, "U U"]) -> Float[np.ndarray, " U"]:
+        """Sums of squares of each value's share."""
+        squares, x_s = np.zeros(len(influence)), Numbers.of(at).x[2]
+        for one in said.said:
+            weight = one.told.weight * one.slope**2
+            for channel, factor in enumerate(x_s):
+                rows = influence[:, [channel, x_s.size + channel, 2 * x_s.size + channel, -1]]
+                share = (rows * np.array([1.0, 1.0, 1.0, factor])) @ one.columns[..., channel]  # (U, P)
+                share *= share
+                share *= weight[:, channel]
+                squares += np.einsum("up,up->u", share, share)
+        return squares
 
 
-def _precision(at: Estimate, now: _Sums, space: _Space) -> Precision:
-    """Variance of each unknown at some noise, and how many values tell of it."""
-    channels = at.x.shape[1]
-    whole = join_channels(now.weight, now.score, np.zeros(channels), at.x[2], np.ones(channels)).gram
-    active = np.append(at.x.ravel() > 0, at.x[2].any())
-    moved = space.design[:, active @ np.abs(space.design) > 0]
-    moved = moved[:, np.einsum("uv,uw,wv->v", moved, whole, moved) > NOTHING]
-    gram = moved.T @ whole @ moved
-    scale = np.sqrt(np.diag(gram))
-    value, vector = np.linalg.eigh(gram / np.outer(scale, scale))
-    # What nothing tells of has a large variance, not none; a column of zeros is no unknown.
-    value = np.maximum(value, np.finfo(float).eps)
-    root = moved @ (vector / np.sqrt(value) / scale[:, None])
-    influence, information = root @ root.T, float(np.sum(np.log(value)) + 2 * np.sum(np.log(scale)))
-    total, squares = np.zeros(len(whole)), np.zeros(len(whole))
-    # In units of its own error, or squares overflow where next to nothing tells.
-    own = np.sqrt(np.diag(influence))
-    relative = influence / np.where(own > 0, own, 1.0)[:, None]
-    for said in now.told:
-        weight = said.weight * said.slope**2
-        for channel in range(channels):
-            rows = relative.T[[channel, channels + channel, 2 * channels + channel, -1]]
-            rows = rows * np.array([1.0, 1.0, 1.0, at.x[2, channel]])[:, None]
-            share = weight[:, channel] * np.square(rows.T @ said.columns[..., channel])  # (U, P)
-            total, squares = total + share.sum(axis=1), squares + np.square(share).sum(axis=1)
-    count = np.divide(total**2, squares, out=np.zeros_like(total), where=squares > 0)
-    return Precision(at.noise, information, np.diag(influence), count)
+class _Said(NamedTuple):
+    """What each value of some pixels says of a prediction.
 
+    Attributes:
+        pixels: which.
+        told: log-likelihood, score and weight by the predicted code, (P, C).
+        radiance: that is predicted, (P, C).
+        slope: of the code by it, (P, C).
+        columns: ambient, diffuse, lobe and derivative of the lobe by log n, (4, P, C).
+    """
 
-def _climb(whole: Sequence[_Pixels], at: Estimate, space: _Space) -> tuple[Estimate, _Sums]:
-    """Newton's method at a given noise, with the pixels that say something there."""
-    design, channels = space.design, at.x.shape[1]
-    signed = np.zeros(design.shape[1], bool)
-    lobe = bool(design[-1].any())
-    signed[-1:] = lobe
-    pictures, now = [part.picture for part in whole], None
-    kept = list(map(partial(_near, at=at, reach=REACH), pictures))
-    while True:
-        if now is not None:
-            # Others may say something at the new numbers.
-            near = list(map(np.logical_or, kept, map(partial(_near, at=at, reach=NEARER), pictures)))
-            if all(map(np.array_equal, near, kept)):
-                return at._replace(value=float(now.value)), now
-            kept = near
-        pixels = list(map(_Pixels.some, whole, kept))
-        now = _sums(pixels, at)
-        for _ in range(MOST_STEPS):
-            normal = join_channels(now.weight, now.score, np.zeros(channels), at.x[2], np.ones(channels))
-            unknowns = np.append(at.x.ravel(), 0.0)
-            gram = design.T @ normal.gram @ design
-            gram[np.diag_indices_from(gram)] *= 1 + 1e-9
-            product = design.T @ (normal.product + normal.gram @ unknowns)
-            step = design @ nonnegative_minimum(gram, product, signed) - unknowns
-            # What the step is going to gain.
-            if step @ (normal.product - 0.5 * normal.gram @ step) < LEAST_GAIN:
-                break
-            gain = 0.0
-            for halvings in range(12):
-                share = 0.5**halvings
-                x = np.maximum(unknowns[:-1] + share * step[:-1], 0.0).reshape(3, channels)
-                shift = float(np.clip(share * step[-1], -LARGEST_SHIFT, LARGEST_SHIFT))
-                trial = at._replace(x=x, log_n=float(np.clip(at.log_n + shift, *space.bounds)) if lobe else at.log_n)
-                sums = _sums(pixels, trial)
-                gain = float(sums.value - now.value)
-                if gain > 0:
-                    at, now = trial, sums
-                    break
-            if gain < LEAST_GAIN:
-                break
+    pixels: _Pixels
+    told: LogLikelihood
+    radiance: Float[np.ndarray, "P C"]
+    slope: Float[np.ndarray, "P C"]
+    columns: Float[np.ndarray, "4 P C"]
 
+    @classmethod
+    def of(cls, pixels: _Pixels, at: Estimate) -> "_Said":
+        """At an estimate."""
+        x, n = Numbers.of(at).x, math.exp(at.unknowns[-1])
+        columns = pixels.picture.columns(n)
+        columns[3] *= n
+        radiance = columns[0] * x[0] + columns[1] * x[1] + columns[2] * x[2]
+        code, slope = _bounds(pixels.picture).codes(radiance)
+        return cls(pixels, pixels.intervals.said(code, at.noise), radiance, slope, columns)
 
-def _sums(pixels: Sequence[_Pixels], at: Estimate) -> _Sums:
-    """What Newton's step needs, added up over the pictures."""
-    parts, told = [], []
-    for part in pixels:
-        weight, bounds = part.picture.weights, _bounds(part.picture)
-        columns = part.picture.columns(math.exp(at.log_n))
-        columns[3] *= math.exp(at.log_n)
-        radiance = columns[0] * at.x[0] + columns[1] * at.x[1] + columns[2] * at.x[2]
-        code, slope = bounds.codes(radiance)
-        said = _Told(*part.intervals.said(code, at.noise), radiance, slope, columns)
-        told.append(said)
-        own = at.noise * bounds.spread
-        score, curvature = weight * said.score * said.slope, weight * said.weight * said.slope**2
-        columns = np.moveaxis(said.columns, -1, 0)  # (C, 4, P)
-        parts.append(
-            (
-                float(np.sum(weight * said.value)),
-                float(np.sum(weight * (said.score**2 - said.weight) * own**2)),
-                (columns @ score.T[..., None])[..., 0],
-                (columns * curvature.T[:, None]) @ np.swapaxes(columns, 1, 2),
-            )
-        )
-    value, by_log_noise, score, weight = (sum(part) for part in zip(*parts, strict=True))
-    return _Sums(value, by_log_noise, score, weight, told)
+    def by_noise(self, noise: float) -> tuple[float, float, float]:
+        """Logarithm of the likelihood, its derivative by log s, and the information of that."""
+        weight, told = self.pixels.picture.weights, self.told
+        each = (told.score**2 - told.weight) * (noise * _bounds(self.pixels.picture).spread) ** 2
+        information = np.minimum(each**2, MOST_TELLING)
+        return tuple(float(np.sum(weight * part)) for part in (told.value, each, information))
+
+    def sums(self) -> tuple[Float[np.ndarray, "C 4 4"], Float[np.ndarray, "C 4"]]:
+        """Products of the columns weighted by the values' weights, and with their scores."""
+        weight, told = self.pixels.picture.weights, self.told
+        score, curvature = weight * told.score * self.slope, weight * told.weight * self.slope**2
+        columns = np.moveaxis(self.columns, -1, 0)  # (C, 4, P)
+        products = (columns * curvature.T[:, None]) @ np.swapaxes(columns, 1, 2)
+        return products, (columns @ score.T[..., None])[..., 0]
+
+    def working(self) -> Picture:
+        """Targets and weights with which least squares takes Newton's step."""
+        weight = self.told.weight * self.slope**2
+        step = np.divide(self.told.score * self.slope, weight, out=np.zeros_like(weight), where=weight > 0)
+        return dataclasses.replace(self.pixels.picture, target=self.radiance + step, weight=weight, bounds=None)
 
 
 def _near(picture: Picture, at: Estimate, reach: float) -> Bool[np.ndarray, " P"]:
     """Which pixels say something: those with a value not surely inside its bounds, by so many s."""
-    bounds, code = _bounds(picture), _codes(picture, at)
+    bounds, code = _bounds(picture), _codes(picture, Numbers.of(at))
     inside = np.minimum(code - bounds.lower, bounds.upper - code)
     return np.any(inside < reach * at.noise * bounds.spread, axis=1)
 
@@ -536,13 +457,13 @@ def _bounds(picture: Picture) -> Bounds:
     return picture.bounds
 
 
-def _codes(picture: Picture, at: Estimate) -> np.ndarray:
+def _codes(picture: Picture, at: Numbers) -> np.ndarray:
     """What is predicted, in codes, (P, C)."""
     radiance = np.asarray(picture.predicted(np.exp(at.log_n), at.x), np.float64)
     return _bounds(picture).codes(radiance)[0]
 
 
-def _squares(picture: Picture, at: Estimate) -> tuple[float, int]:
+def _squares(picture: Picture, at: Numbers) -> tuple[float, int]:
     """Of the residual in codes, summed over values with both ends, and their number."""
     bounds = _bounds(picture)
     closed = np.isfinite(bounds.lower) & np.isfinite(bounds.upper)
@@ -557,10 +478,10 @@ def _widest(picture: Picture) -> float:
     return float(np.max(width, where=np.isfinite(width), initial=0.0))
 
 
-def _open_ends_tell(picture: Picture, at: Estimate) -> bool:
+def _open_ends_tell(picture: Picture, at: Numbers, noise: float) -> bool:
     """Whether some value is known by one end only and is predicted near it."""
     half = np.any(np.isfinite(_bounds(picture).lower) ^ np.isfinite(_bounds(picture).upper), axis=1)
-    return bool(half.any()) and bool(np.any(_near(picture, at, END_REACH)[half]))
+    return bool(half.any()) and bool(np.any(_near(picture, Estimate(at.unknowns, noise), END_REACH)[half]))
 
 
 def highlight_in_codes(picture: Picture, x: np.ndarray, n: float) -> float:
@@ -573,7 +494,7 @@ def highlight_in_codes(picture: Picture, x: np.ndarray, n: float) -> float:
     """
     if picture.bounds is None or picture.bounds.exact:
         return math.inf
-    shown = [_codes(picture, Estimate(some, math.log(n), 1.0)) for some in (x, x * [[1], [1], [0]])]
+    shown = [_codes(picture, Numbers(some, math.log(n))) for some in (x, x * [[1], [1], [0]])]
     return float(np.max(shown[0] - shown[1]))
 
 
@@ -588,12 +509,5 @@ def unexplained(picture: Picture, x: np.ndarray, n: float) -> np.ndarray:
     if picture.bounds is None:
         left = np.asarray(picture.target) - np.asarray(picture.predicted(np.asarray(n), x))
         return np.where(np.asarray(picture.weights) > 0, left, 0.0) * np.sqrt(np.asarray(picture.weights))
-    code = _codes(picture, Estimate(x, math.log(n), 1.0))
+    code = _codes(picture, Numbers(x, math.log(n)))
     return np.maximum(picture.bounds.lower - code, 0.0) - np.maximum(code - picture.bounds.upper, 0.0)
-
-
-def _working(picture: Picture, said: _Told) -> Picture:
-    """Targets and weights with which least squares takes Newton's step."""
-    weight = said.weight * said.slope**2
-    step = np.divide(said.score * said.slope, weight, out=np.zeros_like(weight), where=weight > 0)
-    return dataclasses.replace(picture, target=said.radiance + step, weight=weight, bounds=None)

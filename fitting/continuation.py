@@ -1,0 +1,229 @@
+"""The most likely numbers and noise: Newton's method, from much noise to as little as the values allow.
+
+For a given noise s the logarithm of the likelihood of rounded values (`fitting.likelihood`) is concave in the numbers,
+or nearly so, and Newton's step needs of each value its score and weight. With less noise fewer values say something,
+those that are predicted near the edge of a code, and the reach of Newton's method shrinks. So s starts at what least
+squares leaves, and follows its own score from there, by a factor of two at most, each time from the last answer.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from fitting.solver.nnls import nonnegative_minimum
+
+# In codes: below this the edges of codes are as sharp as the arithmetic of the pictures.
+LEAST_NOISE = 1e-4
+# A value says nothing where its code is as good as certain: this many s from the nearer edge. One that has come nearer
+# than the second on the way is taken in.
+REACH, NEARER = 7.0, 5.0
+# Newton's steps at one s; a step that gains less ends them, at the last s and on the way there.
+MOST_STEPS, LEAST_GAIN, ROUGH_GAIN = 12, 1e-3, 0.1
+# The noise is known well enough where its step is no larger than this factor; so many steps at most.
+ENOUGH_KNOWN, MOST_NOISES = 1.02, 60
+MOST_TELLING = 10.0
+# Where the Hessian is no larger all values are surely inside their codes.
+NOTHING = 1e-100
+
+
+class Estimate(NamedTuple):
+    """The most likely numbers.
+
+    Attributes:
+        unknowns: the numbers, (U,).
+        noise: s, in codes.
+        value: logarithm of the likelihood.
+    """
+
+    unknowns: Float[np.ndarray, " U"]
+    noise: float
+    value: float = -math.inf
+
+
+class Score(NamedTuple):
+    """What some values say of an estimate.
+
+    Attributes:
+        value: logarithm of the likelihood.
+        by_log_noise: its derivative by log s.
+        noise_information: of log s, by the squares of each value's derivative (Berndt, Hall, Hall, Hausman 1974), none
+            above `MOST_TELLING`: those that the model misses would hide what the others say.
+        gradient: of the likelihood by the unknowns, (U,).
+        hessian: minus the second derivative, (U, U).
+        said: of each picture, for the problem's own use.
+    """
+
+    value: float
+    by_log_noise: float
+    noise_information: float
+    gradient: Float[np.ndarray, " U"]
+    hessian: Float[np.ndarray, "U U"]
+    said: Sequence[Any]
+
+
+class Problem(Protocol):
+    """Values, and a model that predicts them.
+
+    Attributes:
+        design: what each free number moves of the unknowns, (U, V).
+        signed: which unknowns may be below 0, and move relative to where they are, (U,).
+    """
+
+    design: Float[np.ndarray, "U V"]
+    signed: Bool[np.ndarray, " U"]
+
+    def near(self, at: Estimate, reach: float, beside: Any = None) -> Any:
+        """The values that say something: those not surely in their codes, by so many s, and those given beside.
+
+        The latter themselves where there are no others.
+        """
+        ...
+
+    def score(self, at: Estimate, values: Any) -> Score:
+        """What these values say of an estimate."""
+        ...
+
+    def moved(self, at: Estimate, step: Float[np.ndarray, " U"]) -> Estimate:
+        """An estimate with other unknowns, within their bounds."""
+        ...
+
+    def active(self, at: Estimate) -> Bool[np.ndarray, " U"]:
+        """Which unknowns have an error: those that are not at a bound."""
+        ...
+
+    def squared_shares(self, at: Estimate, said: Score, influence: Float[np.ndarray, "U U"]) -> Float[np.ndarray, " U"]:
+        """Sums of squares of each value's share in what is known of each unknown.
+
+        The share is its weight times the square of the product of the influence and its derivatives by the unknowns.
+        """
+        ...
+
+
+class Precision(NamedTuple):
+    """What is known of the unknowns at some noise.
+
+    Attributes:
+        noise: s.
+        information: logarithm of the determinant of the Hessian.
+        variance: of each, (U,).
+        count: how many values tell of it, by their share in the Hessian, (U,).
+    """
+
+    noise: float
+    information: float
+    variance: Float[np.ndarray, " U"]
+    count: Float[np.ndarray, " U"]
+
+
+def maximise(
+    problem: Problem, start: Estimate, enough: float = ENOUGH_KNOWN, first: float = 2.0
+) -> tuple[Estimate, list[Precision]]:
+    """The most likely unknowns and noise, and what was known of the unknowns with more noise.
+
+    Args:
+        problem: values and their model.
+        start: from which to go; its noise is not much too small.
+        enough: the noise is known well enough where its step is no larger than this factor.
+        first: the first step is no larger than this factor; later ones no larger than 2.
+    """
+    at, known, before, low, high, largest = start, [], None, -math.inf, math.inf, math.log(first)
+    for _ in range(MOST_NOISES):
+        at, said = _climb(problem, at, ROUGH_GAIN)
+        known.append(precision(problem, at, said))
+        now, score = math.log(at.noise), said.by_log_noise
+        low, high = (max(low, now), high) if score > 0 else (low, min(high, now))
+        # By the last two scores, of which one takes the place of the other; at first by what is known of the noise.
+        slope = -said.noise_information if before is None else (score - before[1]) / (now - before[0])
+        step, before = -score / slope if slope < 0 else math.copysign(math.inf, score), (now, score)
+        step, largest = min(max(step, -largest, math.log(LEAST_NOISE) - now), largest), math.log(2)
+        if not low <= now + step <= high:
+            step = 0.5 * (low + high) - now
+        if abs(step) < math.log(enough):
+            break
+        at = at._replace(noise=math.exp(now + step))
+    at, said = _climb(problem, at, LEAST_GAIN)
+    return at, [*(entry for entry in known if entry.noise > at.noise), precision(problem, at, said)]
+
+
+def _climb(problem: Problem, at: Estimate, enough: float) -> tuple[Estimate, Score]:
+    """Newton's method at a given noise, with the pixels that say something there, to what gains next to nothing."""
+    design = problem.design
+    values = problem.near(at, REACH)
+    while True:
+        now = problem.score(at, values)
+        for _ in range(MOST_STEPS):
+            base = np.where(problem.signed, 0.0, at.unknowns)
+            hessian = design.T @ now.hessian @ design
+            hessian[np.diag_indices_from(hessian)] *= 1 + 1e-9
+            product = design.T @ (now.gradient + now.hessian @ base)
+            step = design @ nonnegative_minimum(hessian, product, problem.signed @ (design != 0)) - base
+            # What the step is going to gain.
+            if step @ (now.gradient - 0.5 * now.hessian @ step) < enough:
+                break
+            gain = 0.0
+            for halvings in range(12):
+                trial = problem.moved(at, 0.5**halvings * step)
+                said = problem.score(trial, values)
+                gain = said.value - now.value
+                if gain > 0:
+                    at, now = trial, said
+                    break
+            if gain < enough:
+                break
+        # Others may say something at the new numbers.
+        before, values = values, problem.near(at, NEARER, values)
+        if values is before:
+            return at._replace(value=now.value), now
+
+
+def precision(problem: Problem, at: Estimate, said: Score) -> Precision:
+    """Variance of each unknown, and how many values tell of it."""
+    moved = problem.design[:, problem.active(at) @ np.abs(problem.design) > 0]
+    moved = moved[:, np.einsum("uv,uw,wv->v", moved, said.hessian, moved) > NOTHING]
+    hessian = moved.T @ said.hessian @ moved
+    scale = np.sqrt(np.diag(hessian))
+    value, vector = np.linalg.eigh(hessian / np.outer(scale, scale))
+    # What nothing tells of has a large variance, not none; a column of zeros is no unknown.
+    value = np.maximum(value, np.finfo(float).eps)
+    root = moved @ (vector / np.sqrt(value) / scale[:, None])
+    influence, information = root @ root.T, float(np.sum(np.log(value)) + 2 * np.sum(np.log(scale)))
+    # In units of its own error, or squares overflow where next to nothing tells.
+    own = np.sqrt(np.diag(influence))
+    relative = influence / np.where(own > 0, own, 1.0)[:, None]
+    total = np.einsum("uv,vw,uw->u", relative, said.hessian, relative)
+    squares = problem.squared_shares(at, said, relative)
+    count = np.divide(total**2, squares, out=np.zeros_like(total), where=squares > 0)
+    return Precision(at.noise, information, np.diag(influence), count)
+
+
+def telling(known: Sequence[Precision], fewest: Float[np.ndarray, " U"]) -> Precision:
+    """Where the values say most of all unknowns together, and enough of them of each.
+
+    With less noise all pixels of a small highlight may lie well inside their codes, and the Hessian there says nothing.
+
+    Args:
+        known: from much noise to little.
+        fewest: so many values have to tell of each unknown.
+    """
+    enough = [entry for entry in known[1:] if np.all((entry.count >= fewest) | (known[0].variance == 0))]
+    return max([known[0], *enough], key=lambda entry: entry.information)
+
+
+def widening(known: Sequence[Precision], most: Precision, fewest: Float[np.ndarray, " U"]) -> Float[np.ndarray, " U"]:
+    """What to multiply errors by: each unknown is known as well as where enough values still tell of it.
+
+    Args:
+        known: from much noise to little.
+        most: of which the errors are.
+        fewest: so many values have to tell of each unknown.
+    """
+    variance = np.array([entry.variance for entry in known])
+    enough = np.array([entry.count for entry in known]) >= fewest
+    # With the most noise all values tell.
+    enough[0] = True
+    least = np.min(np.where(enough & (variance > 0), variance, np.inf), axis=0)
+    ratio = np.divide(least, most.variance, out=np.ones_like(least), where=(most.variance > 0) & np.isfinite(least))
+    return np.sqrt(ratio)
