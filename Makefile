@@ -10,7 +10,7 @@ fit: $(VENV)/installed
 	$(BIN)/brdf fit $(EXAMPLE) --out out/gold-ball --plot
 
 test: $(VENV)/installed-tests
-	$(BIN)/python -m pytest -n auto --dist loadfile
+	$(BIN)/python -m pytest -n auto --dist worksteal
 
 check: $(VENV)/installed-tests
 	$(BIN)/ruff check .

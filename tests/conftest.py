@@ -1,0 +1,10 @@
+"""Compiled programs are kept in out/compiled for all processes and the next run; docs/conf.py names the same folder."""
+
+import os
+
+from project_paths import ROOT
+
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / "out" / "compiled"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+# jaxlib warns of programs that it takes from there, see `fitting.cli.common.use_compilation_cache`.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
