@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from jaxtyping import Bool, Float
 
+from fitting.likelihood import LogLikelihood
 from fitting.solver.nnls import nonnegative_minimum
 
 # In codes: below this the edges of codes are as sharp as the arithmetic of the pictures.
@@ -64,16 +65,46 @@ class Score(NamedTuple):
     said: Sequence[Any]
 
 
-class Problem(Protocol):
-    """Values, and a model that predicts them.
+def noise_score(told: LogLikelihood, noise: Any, weight: Any = 1.0) -> tuple[float, float, float]:
+    """The logarithm of the likelihood of values, its derivative by log s, and what they tell of that.
 
-    Attributes:
-        design: what each free number moves of the unknowns, (U, V).
-        signed: which unknowns may be below 0, and move relative to where they are, (U,).
+    Args:
+        told: of each.
+        noise: of each, in units of its interval.
+        weight: how many values each stands for.
     """
+    each = (told.score**2 - told.weight) * noise**2
+    parts = told.value, each, np.minimum(each**2, MOST_TELLING)
+    value, by_log_noise, information = (float(np.sum(weight * part)) for part in parts)
+    return value, by_log_noise, information
 
-    design: Float[np.ndarray, "U V"]
-    signed: Bool[np.ndarray, " U"]
+
+def together(
+    which: Sequence[Bool[np.ndarray, " P"]], beside: Sequence[Bool[np.ndarray, " P"]]
+) -> list[Bool[np.ndarray, " P"]] | None:
+    """Pixels of each picture and those beside; None where the latter are all.
+
+    Args:
+        which: pixels of each picture.
+        beside: others.
+    """
+    if not any(np.any(some & ~other) for some, other in zip(which, beside, strict=True)):
+        return None
+    return [some | other for some, other in zip(which, beside, strict=True)]
+
+
+class Problem(Protocol):
+    """Values, and a model that predicts them."""
+
+    @property
+    def design(self) -> Float[np.ndarray, "U V"]:
+        """What each free number moves of the unknowns."""
+        ...
+
+    @property
+    def signed(self) -> Bool[np.ndarray, " U"]:
+        """Which unknowns may be below 0, and move relative to where they are."""
+        ...
 
     def near(self, at: Estimate, reach: float, beside: Any = None) -> Any:
         """The values that say something: those not surely in their codes, by so many s, and those given beside.
@@ -109,13 +140,13 @@ class Precision(NamedTuple):
         noise: s.
         information: logarithm of the determinant of the Hessian.
         variance: of each, (U,).
-        count: how many values tell of it, by their share in the Hessian, (U,).
+        values: how many tell of it, by their share in the Hessian, (U,).
     """
 
     noise: float
     information: float
     variance: Float[np.ndarray, " U"]
-    count: Float[np.ndarray, " U"]
+    values: Float[np.ndarray, " U"]
 
 
 def maximise(
@@ -208,7 +239,7 @@ def telling(known: Sequence[Precision], fewest: Float[np.ndarray, " U"]) -> Prec
         known: from much noise to little.
         fewest: so many values have to tell of each unknown.
     """
-    enough = [entry for entry in known[1:] if np.all((entry.count >= fewest) | (known[0].variance == 0))]
+    enough = [entry for entry in known[1:] if np.all((entry.values >= fewest) | (known[0].variance == 0))]
     return max([known[0], *enough], key=lambda entry: entry.information)
 
 
@@ -221,7 +252,7 @@ def widening(known: Sequence[Precision], most: Precision, fewest: Float[np.ndarr
         fewest: so many values have to tell of each unknown.
     """
     variance = np.array([entry.variance for entry in known])
-    enough = np.array([entry.count for entry in known]) >= fewest
+    enough = np.array([entry.values for entry in known]) >= fewest
     # With the most noise all values tell.
     enough[0] = True
     least = np.min(np.where(enough & (variance > 0), variance, np.inf), axis=0)

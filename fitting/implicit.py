@@ -26,7 +26,7 @@ from jaxtyping import Array, Float
 import brdf
 from brdf.checks import instance
 from brdf.precision import working_precision
-from fitting.joint import JointProblem, joint_problem
+from fitting.joint_problem import JointProblem, joint_problem
 from fitting.progress import waiting
 from fitting.result import FitResult
 

@@ -8,11 +8,12 @@ into `LARGEST_JACOBIAN`, since it needs some ten steps; BFGS beyond, which keeps
 
 Bounds: coefficients and emittances may not be negative. A number that leaves its range is held at the bound and the
 rest fitted again; it is let go where the cost falls inwards. So a solution at a bound is exactly there.
+
+Of rounded values that is the start: `fitting.joint_likelihood` goes on to what the codes say.
 """
 
 import contextlib
 import dataclasses
-import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -27,8 +28,12 @@ from jaxtyping import Array, Float
 
 import brdf
 from brdf.errors import InputError
+from brdf.images.encoding import Encoding
 from brdf.precision import Precision, working_precision
+from fitting.codes import Rounding
 from fitting.core import fit_pictures
+from fitting.joint_likelihood import Likely, most_likely_numbers
+from fitting.joint_problem import DIRECTIONS, NOT_NEGATIVE, JointProblem, joint_problem, linearised, named_leaves
 from fitting.pixels import Observed, observe
 from fitting.problem import CLASSIC, FitProblem, model_name, state_problem
 from fitting.progress import waiting
@@ -41,14 +46,9 @@ from fitting.uncertainty.residual_correlation import correlation_in_rows, struct
 LARGEST_JACOBIAN = 1 << 27
 ROUNDS = 8
 TINY = np.finfo(float).tiny
-# What freed leaves may not go below. A direction or a position has no bound, n is searched by its logarithm.
-DIRECTIONS = ("direction",)
 OPEN = "only a combination with other freed numbers is determined"
 # Of the largest eigenvalue of the normal equations: a smaller one determines nothing.
 DEPENDENT = 1e-12
-# What a diagnosis names that is a number of a scene.
-NAMED = re.compile(r"(light|intensity|ball|radius)(?: (\d+))?(?: of picture (\d+))?")
-NOT_NEGATIVE = ("k_a", "k_d", "k_s", "intensity", "radiance", "ambient", "attenuation")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,6 +81,8 @@ def fit_jointly(
     precision: Precision = "float64",
     mask: Any = None,
     saturation: float | None = None,
+    rounding: Rounding = None,
+    encoding: Encoding | None = None,
     tolerance: float = 1e-10,
     max_steps: int = 256,
 ) -> JointResult:
@@ -98,6 +100,8 @@ def fit_jointly(
         precision: "float32" or "float64".
         mask: (H, W), pixels to look at, or a list, such as ``fitting.fit(target, scene).counted[0]``.
         saturation: see `fitting.fit`.
+        rounding: likewise.
+        encoding: likewise.
         tolerance: relative and absolute, on the freed numbers and the cost.
         max_steps: of the solver.
 
@@ -125,8 +129,10 @@ def fit_jointly(
     if not (callable(names) or names is None or isinstance(names, Sequence)):
         came = f"must be a function or names, got {type(free).__name__}"
         raise InputError("free", came, "Write lambda material, scenes: (material.n,), or light")
-    freed = _named(names) if isinstance(names, Sequence) else names
-    stated = state_problem(target, scene, mask, precision=precision, saturation=saturation)
+    freed = named_leaves(names) if isinstance(names, Sequence) else names
+    stated = state_problem(
+        target, scene, mask, rounding=rounding, encoding=encoding, precision=precision, saturation=saturation
+    )
     with working_precision(precision), waiting("fitting jointly"):
         seen = observe(stated, at_once=True)
 
@@ -160,141 +166,6 @@ def _of_model(stated: FitProblem, model: str, solve: Callable[..., JointResult])
     return best
 
 
-class JointProblem(eqx.Module):
-    """From a vector of freed numbers to weighted residuals; a pytree, so that its programs are compiled once a shape.
-
-    Attributes:
-        leaves: of material and list of scenes.
-        targets: what is compared with, (P, C) each.
-        weights: of their pixels, (P,) each; None where all count, and alike.
-        shape: of material and scenes.
-        places: of the freed leaves.
-        names: of the fields that they are.
-        words: what a person calls them.
-    """
-
-    leaves: list[Array]
-    targets: list[Array]
-    weights: list[Array | None]
-    shape: Any = eqx.field(static=True)
-    places: tuple[int, ...] = eqx.field(static=True)
-    names: tuple[str, ...] = eqx.field(static=True)
-    words: tuple[str, ...] = eqx.field(static=True)
-
-    def freed(self) -> list[Array]:
-        """The freed leaves."""
-        return [self.leaves[place] for place in self.places]
-
-    def start(self) -> Array:
-        """The freed numbers as they are searched: n by its logarithm."""
-        both = zip(self.freed(), self.names, strict=True)
-        return jnp.concatenate([jnp.ravel(jnp.log(leaf) if name == "n" else leaf) for leaf, name in both])
-
-    def at(self, vector: Array) -> "JointProblem":
-        """The problem with other freed numbers."""
-        leaves, begin = list(self.leaves), 0
-        for place, name in zip(self.places, self.names, strict=True):
-            part = vector[begin : begin + leaves[place].size].reshape(leaves[place].shape)
-            leaves[place], begin = jnp.exp(part) if name == "n" else part, begin + part.size
-        return eqx.tree_at(lambda problem: problem.leaves, self, leaves)
-
-    def content(self) -> tuple[brdf.Material, list[brdf.Scene]]:
-        """Material and scenes."""
-        return jax.tree.unflatten(self.shape, self.leaves)
-
-    def residuals(self, vector: Array) -> Array:
-        """Weighted residuals of all pictures, one after the other."""
-        material, scenes = self.at(vector).content()
-        found = []
-        for target, weight, scene in zip(self.targets, self.weights, scenes, strict=True):
-            residual = brdf.render(material, scene).reshape(target.shape) - target
-            if weight is not None:
-                counts = weight[:, None] > 0
-                residual = jnp.where(counts, residual * jnp.where(counts, weight[:, None], 1) ** 0.5, 0)
-            found.append(residual.ravel())
-        return jnp.concatenate(found)
-
-
-def joint_problem(
-    start: Any, free: Callable[..., Sequence[Any]] | None, targets: list[Array], weights: list[Array | None]
-) -> JointProblem:
-    """Find the freed leaves among those of the start, each an array of its own.
-
-    Args:
-        start: material and list of scenes.
-        free: from both to the leaves.
-        targets: see `JointProblem`.
-        weights: likewise.
-
-    Raises:
-        InputError: where ``free`` does not name distinct leaves.
-    """
-    start = jax.tree.map(jnp.array, start)
-    remedy = "Return a tuple of leaves, such as (material.n, scenes[0].lights[0].direction)"
-    try:
-        freed = [id(leaf) for leaf in free(*start)]  # pyright: ignore[reportOptionalCall]  # None is refused below
-    except (TypeError, AttributeError, IndexError) as error:
-        raise InputError("free", f"gives no tuple of leaves ({error})", remedy) from None
-    if not freed:
-        raise InputError("free", "names no leaf", "Return the leaves to fit")
-    paths = jax.tree_util.tree_leaves_with_path(start)
-    own = {
-        id(leaf): (place, getattr(path[-1], "name", ""), _words(path, len(start[1])))
-        for place, (path, leaf) in enumerate(paths)
-        if jnp.issubdtype(leaf.dtype, jnp.floating)
-    }
-    if not own.keys() >= set(freed):
-        raise InputError("free", "gives what is no number of material or scenes as a whole", remedy)
-    if len(set(freed)) < len(freed):
-        raise InputError("free", "gives a leaf twice", remedy)
-    places, names, words = zip(*(own[leaf] for leaf in freed), strict=True)
-    leaves, shape = jax.tree.flatten(start)
-    return JointProblem(leaves, targets, weights, shape, places, names, words)
-
-
-def _named(names: Sequence[str]) -> Callable[[Any, list[brdf.Scene]], list[Any]]:
-    """The leaves of causes that a diagnosis names, after those of the material."""
-    asked = [NAMED.fullmatch(str(name)) for name in names]
-    for name, match in zip(names, asked, strict=True):
-        if match is None:
-            words = "Name light, intensity, ball or radius, or one of them as the diagnosis does"
-            raise InputError("free", f"names {name!r}, which is no number of a scene", words)
-
-    def leaves(material: Any, scenes: list[brdf.Scene]) -> list[Any]:
-        found = [material.k_d] if any(scene.lights for scene in scenes) else []
-        found += [material.k_a] if any(scene.ambient is not None for scene in scenes) else []
-        found += [material.k_s, material.n] if np.any(getattr(material, "k_s", 0.0)) else []
-        for match in asked:
-            assert match is not None
-            index, picture = (None if part is None else int(part) for part in match.groups()[1:])
-            for place, scene in enumerate(scenes):
-                if picture in (None, place):
-                    found += _leaves_of(match[1], scene, index, first=place == 0)
-        return found
-
-    return leaves
-
-
-def _leaves_of(kind: str, scene: brdf.Scene, index: int | None, *, first: bool) -> list[Any]:
-    """Of a scene. The first light's intensity is the unit of the material."""
-    spheres: list[Any] = [shape for shape in scene.shapes if isinstance(shape, brdf.Sphere) and shape.fitted]
-    lights: list[Any] = [light for place, light in enumerate(scene.lights) if index in (None, place)]
-    if kind == "light":
-        return [light.direction for light in lights if isinstance(light, brdf.DirectionalLight)]
-    if kind == "intensity":
-        shining = lights[1:] if first and index is None else lights
-        return [light.intensity if hasattr(light, "intensity") else light.radiance for light in shining]
-    return [sphere.center if kind == "ball" else sphere.radius for sphere in spheres]
-
-
-def _words(path: Sequence[Any], scenes: int) -> str:
-    """What a person calls a leaf: n, lights[0].direction, or scenes[1].ambient where there are several."""
-    words = jax.tree_util.keystr(tuple(path[1:]))  # without the number that says material or scenes
-    if path[0].idx == 1:
-        words = f"scenes{words}" if scenes > 1 else words.partition("]")[2]
-    return words.removeprefix(".")
-
-
 @eqx.filter_jit
 def _run(
     problem: JointProblem, vector: Array, held: Array, solver: str, tolerance: float, max_steps: int
@@ -314,17 +185,9 @@ def _run(
     return optx.minimise(cost, method, vector, problem, max_steps=max_steps, throw=False)
 
 
-@eqx.filter_jit
-def _linearised(problem: JointProblem, vector: Array) -> tuple[Array, Array]:
-    """The residuals and their derivatives, one column of the Jacobian at a time."""
-    residuals, along = jax.linearize(problem.residuals, vector)
-    return residuals, jax.lax.map(along, jnp.eye(vector.size))
-
-
 def _solve(problem: JointProblem, seen: Observed, solver: str, tolerance: float, max_steps: int) -> JointResult:
-    vector, freed = problem.start(), problem.freed()
-    bounded = np.repeat([name in NOT_NEGATIVE for name in problem.names], [leaf.size for leaf in freed])
-    held = np.zeros(vector.shape, bool)
+    vector = problem.start()
+    bounded, held = problem.bounded, np.zeros(vector.shape, bool)
     steps, converged, residual, columns = 0, False, np.zeros(0), np.zeros((0, 0))
     for _ in range(ROUNDS):
         solution = _run(problem, vector, jnp.asarray(held), solver, tolerance, max_steps)
@@ -333,12 +196,18 @@ def _solve(problem: JointProblem, seen: Observed, solver: str, tolerance: float,
         vector = jnp.where(held, vector, solution.value)
         below = bounded & np.asarray(vector < 0)
         vector = jnp.where(below, 0, vector)
-        residual, columns = (np.asarray(a, np.float64) for a in _linearised(problem, vector))
+        residual, columns = (np.asarray(a, np.float64) for a in linearised(problem, vector))
         inwards = held & (columns @ residual < 0)
         if not below.any() and not inwards.any():
             break
         held = (held | below) & ~inwards
-    found, vector = problem.at(vector), np.asarray(vector, np.float64)
+    vector = np.asarray(vector, np.float64)
+    likely = most_likely_numbers(problem, seen, vector)
+    if likely is not None:
+        vector = likely.vector
+        held = bounded & (vector == 0)
+        residual = np.asarray(problem.residuals(jnp.asarray(vector)), np.float64)
+    found = problem.at(jnp.asarray(vector))
     warnings = () if converged else (f"the solver stopped after {steps} steps without an end: raise max_steps",)
     parts = np.split(residual, np.cumsum([target.size for target in problem.targets])[:-1])
     residuals = [part.reshape(shown.shape) for part, shown in zip(parts, seen.shown, strict=True)]
@@ -346,9 +215,8 @@ def _solve(problem: JointProblem, seen: Observed, solver: str, tolerance: float,
     material, scenes = jax.tree.map(np.asarray, found.content())
     given = jax.tree.leaves((material, seen.problem.scenes))
     given = [given[place] for place in problem.places]
-    parameters, errors, correlation = _with_errors(
-        problem, given, vector, held, columns, float(np.mean(left["noise"] ** 2))
-    )
+    known = likely or Likely(vector, columns @ columns.T / np.mean(left["noise"] ** 2))
+    parameters, errors, correlation = _with_errors(problem, given, known, held)
     return JointResult(
         **left,
         material=material,
@@ -399,29 +267,29 @@ def left_over(
 
 
 def _with_errors(
-    problem: JointProblem,
-    given: Sequence[Any],
-    vector: np.ndarray,
-    held: np.ndarray,
-    columns: np.ndarray,
-    noise: float,
+    problem: JointProblem, given: Sequence[Any], known: Likely, held: np.ndarray
 ) -> tuple[tuple[Parameter, ...], tuple[np.ndarray, ...], np.ndarray]:
     """The freed numbers as parameters, their errors leaf by leaf, and the correlation of those that are determined.
 
     Of a direction the length is no unknown: its errors are those of two small turns across it.
     """
-    columns = np.where(held[:, None], 0.0, columns)
+    vector, design = known.vector, np.where(held[:, None], 0.0, problem.design(known.vector))
     blocks = np.split(np.arange(vector.size), np.cumsum([leaf.size for leaf in problem.freed()])[:-1])
     both = list(zip(problem.names, blocks, strict=True))
-    parts = [_across(vector[block]) @ columns[block] if name in DIRECTIONS else columns[block] for name, block in both]
-    design = np.concatenate(parts)
-    gram, ends = design @ design.T, np.cumsum([len(part) for part in parts])[:-1]
-    scale = np.sqrt(np.where(np.diag(gram) > 0, np.diag(gram), 1.0))
-    inverse = np.linalg.pinv(gram / np.outer(scale, scale), rcond=DEPENDENT, hermitian=True)
-    deviation = np.split(np.sqrt(noise * inverse_diagonal(gram, DEPENDENT)), ends)
+    sizes = [2 if name in DIRECTIONS else len(block) for name, block in both]
+    hessian, ends = design.T @ known.hessian @ design, np.cumsum(sizes)[:-1]
+    scale = np.sqrt(np.where(np.diag(hessian) > 0, np.diag(hessian), 1.0))
+    inverse = np.linalg.pinv(hessian / np.outer(scale, scale), rcond=DEPENDENT, hermitian=True)
+    variance = inverse_diagonal(hessian, DEPENDENT)
+    if known.scatter is not None:
+        inverse = inverse @ (design.T @ known.scatter @ design / np.outer(scale, scale)) @ inverse
+        variance = np.where(np.isfinite(variance), np.diag(inverse) / scale**2, variance)
+    # A turn is as much wider as the part of the direction of which least is known.
+    wider = np.max(np.where(design != 0, known.widening[:, None], 0.0), axis=0)
+    deviation = np.split(np.sqrt(variance) * np.where(wider > 0, wider, 1.0), ends)
     parameters, errors, at = [], [], []
     for word, (name, block), leaf, own, place in zip(
-        problem.words, both, given, deviation, np.split(np.arange(len(gram)), ends), strict=True
+        problem.words, both, given, deviation, np.split(np.arange(len(hessian)), ends), strict=True
     ):
         if name in DIRECTIONS:
             error = float(np.degrees(np.linalg.norm(own)))
@@ -444,11 +312,6 @@ def _with_errors(
     correlation = np.where((at >= 0)[:, None] & (at >= 0), inverse[np.ix_(at, at)] / np.outer(error, error), 0.0)
     np.fill_diagonal(correlation, 1.0)
     return tuple(parameters), tuple(errors), correlation
-
-
-def _across(direction: np.ndarray) -> np.ndarray:
-    """Small turns of a direction, of an angle of 1: two vectors across it, of its length."""
-    return np.linalg.svd(direction[None])[2][1:] * np.linalg.norm(direction)
 
 
 def _interval(name: str, value: float, error: float) -> tuple[float, float]:

@@ -26,14 +26,14 @@ Stegun 26.2.14, the continued fraction.
 import dataclasses
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from brdf.images.encoding import Encoding
 
@@ -104,11 +104,37 @@ class Bounds(eqx.Module):
         slope = power * curved / base
         return (curved + slope * xp.minimum(light - least, 0.0)) * steps, slope * scale
 
+    def near(self, code: Float[np.ndarray, "P C"], distance: float) -> Bool[np.ndarray, " P"]:
+        """Which pixels have a value that is predicted beyond an end or near it.
+
+        Args:
+            code: predictions before rounding.
+            distance: from an end, where the noise is that of the picture.
+        """
+        inside = np.minimum(code - self.lower, self.upper - code)
+        return np.any(inside < distance * self.spread, axis=1)
+
     def pixels(self, choose: Callable[[Any], Array]) -> "Bounds":
         """Those of some pixels."""
         lower, upper, index = choose(self.lower), choose(self.upper), choose(self.index)
         spread = choose(self.spread) if self.spread.ndim else self.spread
         return dataclasses.replace(self, lower=lower, upper=upper, index=index, spread=spread)
+
+
+def residual_deviation(bounds: Iterable[Bounds], codes: Iterable[Float[np.ndarray, "P C"]]) -> float:
+    """Standard deviation of what predictions leave of values with both ends, in codes.
+
+    Args:
+        bounds: of each picture.
+        codes: that are predicted.
+    """
+    squares, count = 0.0, 0
+    for own, code in zip(bounds, codes, strict=True):
+        closed = np.isfinite(own.lower) & np.isfinite(own.upper)
+        middle = 0.5 * np.add(own.lower, own.upper, out=np.zeros(closed.shape), where=closed)
+        left = np.where(closed, middle - code, 0.0) / own.spread
+        squares, count = squares + float(np.sum(left**2)), count + int(np.count_nonzero(closed))
+    return math.sqrt(squares / max(count, 1))
 
 
 class LogLikelihood(NamedTuple):

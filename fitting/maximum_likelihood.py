@@ -22,16 +22,17 @@ from jaxtyping import Array, Bool, Float
 
 from fitting.continuation import (
     LEAST_NOISE,
-    MOST_TELLING,
     REACH,
     Estimate,
     Score,
     maximise,
+    noise_score,
     precision,
     telling,
+    together,
     widening,
 )
-from fitting.likelihood import AnyArray, Bounds, Intervals, LogLikelihood
+from fitting.likelihood import AnyArray, Bounds, Intervals, LogLikelihood, residual_deviation
 from fitting.model_fit import Evidence, ModelFit
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum, refit
@@ -117,11 +118,10 @@ def most_likely(fit: ModelFit, *, copies: bool = False) -> ModelFit:
     if exact and deviation <= NO_NOISE * float(np.max(optimum.square / np.maximum(optimum.pixels, 1))) ** 0.5:
         return fit
     at = Numbers.of(optimum)
-    squares, counts = zip(*(_squares(picture, at) for picture in fit.pictures), strict=True)
-    noise = math.sqrt(sum(squares) / max(sum(counts), 1))
+    noise = residual_deviation(map(_bounds, fit.pictures), (_codes(picture, at) for picture in fit.pictures))
     lossy = any(bounds.lossy for bounds in map(_bounds, fit.pictures))
     # Weights of least squares leave out what is clipped, which says something here.
-    weights = [_alike(picture, at, noise) if lossy else None for picture in fit.pictures]
+    weights = [alike(_bounds(picture), _codes(picture, at), noise) if lossy else None for picture in fit.pictures]
     pictures = list(map(_with_weight, fit.pictures, weights))
     rounding = 0.0 if exact else 1 / 12
     widest = 1.0 if exact else max(_widest(picture) for picture in pictures)
@@ -144,13 +144,18 @@ def _with_weight(picture: Picture, weight: np.ndarray | None) -> Picture:
     return dataclasses.replace(picture, weight=weight)
 
 
-def _alike(picture: Picture, at: Numbers, noise: float) -> Float[np.ndarray, "P C"]:
-    """Weights for values whose prediction is the same, as on an unlit side: these share one rounding error.
+def alike(bounds: Bounds, codes: Float[np.ndarray, "P C"], noise: float) -> Float[np.ndarray, "P C"]:
+    """Weights for values of a lossy file that are predicted alike, as on an unlit side: they share a rounding error.
 
     It came before the losses of the file, which hide it. N values of noise s whose mean has a further error of variance
     1 / 12 weigh 1 / (1 + N / 12 s²) each.
+
+    Args:
+        bounds: of the values.
+        codes: that are predicted.
+        noise: s.
     """
-    bounds, code = _bounds(picture), np.rint(_codes(picture, at) * ALIKE).astype(np.int64)
+    code = np.rint(codes * ALIKE).astype(np.int64)
     tells, weight = np.isfinite(bounds.lower) | np.isfinite(bounds.upper), np.ones(code.shape)
     for one, some, own in zip(code.T, tells.T, weight.T, strict=True):
         _, kind, count = np.unique(one[some], return_inverse=True, return_counts=True)
@@ -341,9 +346,9 @@ class _Separable(NamedTuple):
         """The pixels that say something, and those beside."""
         which = [_near(part.picture, at, reach) for part in self.pixels]
         if beside is not None:
-            if not any(np.any(some & ~one.which) for some, one in zip(which, beside, strict=True)):
-                return beside
-            which = [some | one.which for some, one in zip(which, beside, strict=True)]
+            which = together(which, [one.which for one in beside])
+        if which is None:
+            return beside or []
         return [_Some(some, part.some(some)) for part, some in zip(self.pixels, which, strict=True)]
 
     def active(self, at: Estimate) -> Bool[np.ndarray, " U"]:
@@ -363,11 +368,15 @@ class _Separable(NamedTuple):
     def score(self, at: Estimate, values: Sequence[_Some]) -> Score:
         """What some pixels say."""
         said = [_Said.of(some.pixels, at) for some in values]
-        numbers = Numbers.of(at)
-        weight, score = (sum(parts) for parts in zip(*(one.sums() for one in said), strict=True))
-        normal = join_channels(weight, score, np.zeros(len(score)), numbers.x[2])
-        value, *by_noise = (sum(parts) for parts in zip(*(one.by_noise(at.noise) for one in said), strict=True))
-        return Score(value, *by_noise, normal.product, normal.gram, said)
+        sums = [one.sums() for one in said]
+        weight, score = np.sum([one[0] for one in sums], axis=0), np.sum([one[1] for one in sums], axis=0)
+        normal = join_channels(weight, score, np.zeros(len(score)), Numbers.of(at).x[2])
+        by_noise = [
+            noise_score(one.told, at.noise * _bounds(one.pixels.picture).spread, one.pixels.picture.weights)
+            for one in said
+        ]
+        value, by_log_noise, information = np.sum(by_noise, axis=0).tolist()
+        return Score(value, by_log_noise, information, normal.product, normal.gram, said)
 
     def squared_shares(self, at: Estimate, said: Score, influence: Float[np.ndarray, "U U"]) -> Float[np.ndarray, " U"]:
         """Sums of squares of each value's share."""
@@ -410,13 +419,6 @@ class _Said(NamedTuple):
         code, slope = _bounds(pixels.picture).codes(radiance)
         return cls(pixels, pixels.intervals.said(code, at.noise), radiance, slope, columns)
 
-    def by_noise(self, noise: float) -> tuple[float, float, float]:
-        """Logarithm of the likelihood, its derivative by log s, and the information of that."""
-        weight, told = self.pixels.picture.weights, self.told
-        each = (told.score**2 - told.weight) * (noise * _bounds(self.pixels.picture).spread) ** 2
-        information = np.minimum(each**2, MOST_TELLING)
-        return tuple(float(np.sum(weight * part)) for part in (told.value, each, information))
-
     def sums(self) -> tuple[Float[np.ndarray, "C 4 4"], Float[np.ndarray, "C 4"]]:
         """Products of the columns weighted by the values' weights, and with their scores."""
         weight, told = self.pixels.picture.weights, self.told
@@ -434,9 +436,7 @@ class _Said(NamedTuple):
 
 def _near(picture: Picture, at: Estimate, reach: float) -> Bool[np.ndarray, " P"]:
     """Which pixels say something: those with a value not surely inside its bounds, by so many s."""
-    bounds, code = _bounds(picture), _codes(picture, Numbers.of(at))
-    inside = np.minimum(code - bounds.lower, bounds.upper - code)
-    return np.any(inside < reach * at.noise * bounds.spread, axis=1)
+    return _bounds(picture).near(_codes(picture, Numbers.of(at)), reach * at.noise)
 
 
 def _stratum(picture: Picture, size: int) -> _Pixels:
@@ -461,15 +461,6 @@ def _codes(picture: Picture, at: Numbers) -> np.ndarray:
     """What is predicted, in codes, (P, C)."""
     radiance = np.asarray(picture.predicted(np.exp(at.log_n), at.x), np.float64)
     return _bounds(picture).codes(radiance)[0]
-
-
-def _squares(picture: Picture, at: Numbers) -> tuple[float, int]:
-    """Of the residual in codes, summed over values with both ends, and their number."""
-    bounds = _bounds(picture)
-    closed = np.isfinite(bounds.lower) & np.isfinite(bounds.upper)
-    middle = 0.5 * np.add(bounds.lower, bounds.upper, out=np.zeros(closed.shape), where=closed)
-    left = np.where(closed, middle - _codes(picture, at), 0.0) / bounds.spread
-    return float(np.sum(left**2)), int(np.count_nonzero(closed))
 
 
 def _widest(picture: Picture) -> float:

@@ -176,14 +176,25 @@ def scatter(picture: Picture, optimum: Optimum, errors: Errors) -> Float[np.ndar
         optimum: of the fit.
         errors: of its pixels.
     """
-    terms, scatters = picture.columns(optimum.n) * np.sqrt(np.asarray(picture.weights)) * errors.values, []
+    terms = picture.columns(optimum.n) * np.sqrt(np.asarray(picture.weights)) * errors.values
     terms[3] *= optimum.x[2]
+    by_x = np.moveaxis(terms[:3], -1, 1).reshape(-1, terms.shape[1])
+    return block_scatter(np.concatenate([by_x, terms[3].sum(axis=1)[None]]), errors)
+
+
+def block_scatter(scores: Float[np.ndarray, "U P"], errors: Errors) -> Float[np.ndarray, "U U"]:
+    """Products of sums of scores over blocks of pixels, of the size that gives most.
+
+    Args:
+        scores: of each pixel by each unknown.
+        errors: which pixels these are.
+    """
+    scatters = []
     for size in SCATTER_SIZES:
         blocks = errors.blocks(size)
         if scatters and np.unique(blocks).size < FEWEST_BLOCKS:
             break
-        *by_x, by_n = np.array([[np.bincount(blocks, weights=one) for one in term.T] for term in terms])
-        together = np.array([*np.concatenate(by_x), by_n.sum(axis=0)])
+        together = np.array([np.bincount(blocks, weights=row) for row in scores])
         scatters.append(together @ together.T)
     scale = np.maximum(np.diag(scatters[0]), np.finfo(float).tiny)
     return max(scatters, key=lambda sums: float(np.sum(np.diag(sums) / scale)))

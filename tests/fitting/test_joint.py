@@ -1,10 +1,13 @@
 """The general road: freed lights are found again, bounds are met exactly, and what no picture determines is said."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 import brdf
 import fitting
+from benchmarks.truth import COVERAGE, ball
 
 CAMERA = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=(40, 40))
 BALL = brdf.Sphere(center=[0, 0, 0], radius=1)
@@ -140,3 +143,24 @@ def test_a_joint_fit_chooses_the_model_and_tells_errors_as_a_fit_does(target: np
     again = fitting.load_result(tmp_path)
     assert str(again) == str(result)
     assert again.scenes[0].lights[0].direction == pytest.approx(result.scenes[0].lights[0].direction)
+
+
+@pytest.mark.parametrize(("row", "closest"), [("sRGB 8 bit", 5.0), ("JPEG q90, noise 1", 0.0)])
+def test_a_freed_light_is_found_behind_rounded_values_as_the_material_is(row: str, closest: float, tmp_path: Path):
+    """Within its errors, and far closer than a code where rounding is all the noise there is."""
+    file, one = COVERAGE[row], ball(1, model="blinn-phong")
+    picture, told = file.picture(one.drawn(), 1, tmp_path), one.scene()
+    true = np.asarray(told.lights[0].direction)
+    away = brdf.DirectionalLight(direction=true + 0.02 * np.array([0.6, -0.5, 0.0]), intensity=[1.0])
+    wrong = brdf.Scene(told.camera, told.shapes, ambient=told.ambient, lights=[away])
+    result = fitting.fit_jointly(picture, wrong, "blinn-phong", "light")
+    light = next(parameter for parameter in result.parameters if parameter.direction is not None)
+    assert light.error is not None
+    assert angle(np.array(light.direction), true) < 4 * light.error
+    numbers = {"k_a": one.k[0, 0], "k_d": one.k[1, 0], "k_s": one.k[2, 0], "n": one.n}
+    for parameter in result.parameters:
+        if parameter.name in numbers:
+            off = abs(float(parameter) - numbers[parameter.name])
+            assert off < 4 * np.array(parameter.error), parameter
+    plain = fitting.fit_jointly(picture, wrong, "blinn-phong", "light", rounding=0)
+    assert np.array(plain[light.name].error) > closest * light.error
