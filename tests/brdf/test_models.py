@@ -131,10 +131,10 @@ def test_derivatives_are_finite_at_the_corners(model, x64):
         cases = [(n, k, name) for n in (0.0, 1e-3, 0.5, 1.0, 1e6) for k in (0.0, 0.5) for name in CORNERS]
         n, k = (jnp.array([case[i] for case in cases]) for i in range(2))
         vectors = jnp.array([CORNERS[name] for _, _, name in cases])
-        for function in (both, jax.jacfwd(both, argnums=(0, 1, 2)), jax.jacrev(both, argnums=(0, 1, 2))):
-            for leaf in jax.tree.leaves(jax.jit(jax.vmap(function))(n, k, vectors)):
-                finite = np.all(np.isfinite(np.asarray(leaf).reshape(len(cases), -1)), axis=1)
-                assert np.all(finite), [case for case, good in zip(cases, finite, strict=True) if not good]
+        functions = both, jax.jacfwd(both, argnums=(0, 1, 2)), jax.jacrev(both, argnums=(0, 1, 2))
+        for leaf in jax.tree.leaves(jax.jit(jax.vmap(lambda *at: [one(*at) for one in functions]))(n, k, vectors)):
+            finite = np.all(np.isfinite(np.asarray(leaf).reshape(len(cases), -1)), axis=1)
+            assert np.all(finite), [case for case, good in zip(cases, finite, strict=True) if not good]
 
 
 @pytest.mark.parametrize("n", [0.5, 5.0, 60.0, 3e3])

@@ -168,26 +168,21 @@ def _materials():
 
 def _functions():
     yield "function, lossless Phong", NormalizedPhong(k_d=0.5, k_s=0.5, n=1e5).reflectance, True, True, True
-    for n in (0.0, 1e5):
-        gaining = NormalizedBlinnPhong(k_d=0.5, k_s=0.5002, n=n).reflectance
-        yield f"function, gaining Blinn-Phong {n:g}", gaining, True, True, False
-    yield "function, classic Blinn-Phong", BlinnPhong(k_d=0.5, k_s=0.2, n=500.0).reflectance, True, False, False
+    gaining = NormalizedBlinnPhong(k_d=0.5, k_s=0.5002, n=1e5)
+    yield "function, gaining Blinn-Phong", gaining.reflectance, True, True, False
     yield "function, float32", single_precision(NormalizedPhong(k_d=0.4, k_s=0.4, n=40.0)), True, True, True
     yield "white", constant(1.0), True, True, True
     yield "too white", constant(1.00001), True, True, False
     yield "negative", constant(-1e-3), False, True, True
     yield "(n+8)/(8 pi), 10", half_lobe(10, 18 / (8 * PI)), True, True, False
     yield "(n+2)/(2 pi), 3000", half_lobe(3000, 3002 / (2 * PI)), True, True, False
-    yield "(n+2)/(8 pi), 60", half_lobe(60, 62 / (8 * PI)), True, True, True
     yield "retro 1e5", retro_lobe(1e5, 1.0), True, True, True
     yield "retro 1e4 gaining", retro_lobe(1e4, 1.001), True, True, False
-    for where in ((23.4, 77), (84, 310)):
-        yield f"hole in the view {where}", dented(where, "view"), False, False, True
-        yield f"hole in the half vector {where}", dented(where, "half"), False, True, True
+    yield "hole in the view", dented((84, 310), "view"), False, False, True
+    yield "hole in the half vector", dented((23.4, 77), "half"), False, True, True
     yield "hole in the light", dented((41, 130), "light"), False, False, True
     yield "smooth hole", smooth_dent((33, 250)), False, True, True
     base = NormalizedBlinnPhong(k_d=0.3, k_s=0.3, n=20.0)
-    yield "non-reciprocal by 1e-4, cosine", unequal(base, 1e-4, lambda light, view: light[2]), True, False, True
     yield "non-reciprocal by 1e-4, azimuth", unequal(base, 1e-4, lambda light, view: view[0]), True, False, True
     narrow = unequal(base, 1e-4, lambda light, view: jnp.exp(-((view[2] - 0.5) ** 2) / 1e-4))
     yield "non-reciprocal by 1e-4, in a band", narrow, True, False, True

@@ -29,7 +29,7 @@ def glossy(n: float) -> brdf.BlinnPhong:
 
 
 @functools.cache
-def pixel_averages(n: float, samples: int = 64) -> np.ndarray:
+def pixel_averages(n: float, samples: int = 32) -> np.ndarray:
     """The ball in plain NumPy, samples × samples midpoints per pixel."""
     half = TO_LIGHT + np.array([0, 0, 1])
     half /= np.linalg.norm(half)

@@ -21,8 +21,8 @@ SKY = brdf.EnvironmentMap(np.repeat(np.repeat(GLOW, 4, axis=0), 4, axis=1), samp
 
 
 def ball(light: brdf.RectangleLight | brdf.EnvironmentMap) -> brdf.Scene:
-    """A ball of 56 pixels."""
-    camera = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=[56, 56])
+    """A ball of 40 pixels."""
+    camera = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=[40, 40])
     return brdf.Scene(camera=camera, shapes=[brdf.Sphere([0, 0, 0], radius=1)], lights=[light], ambient=[0.2])
 
 

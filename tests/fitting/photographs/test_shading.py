@@ -59,8 +59,6 @@ def test_the_error_is_that_of_theory_for_gaussian_noise(light):
     "surface",
     [
         pytest.param({}, id="matt"),
-        pytest.param({"ambient": 0.1}, id="matt, ambient"),
-        pytest.param({"k_s": 0.4, "n": 40.0}, id="shiny"),
         pytest.param({"ambient": 0.1, "k_s": 0.4, "n": 40.0}, id="shiny, ambient"),
         pytest.param({"k_s": 0.4, "n": 8000.0}, id="a highlight in one block"),
     ],

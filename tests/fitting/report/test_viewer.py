@@ -116,7 +116,7 @@ State = tuple[str, brdf.Material, brdf.Scene]  # of the page, and what it should
 
 def turns(model: brdf.Material) -> list[State]:
     """The ball turned, under lights from two sides, dull and sharp."""
-    cases = [(n, turn) for n in (20.0, 10_000.0) for turn in TURNS] if hasattr(model, "n") else [(None, TURNS[1])]
+    cases = [(20.0, TURNS[2]), *((10_000.0, turn) for turn in TURNS)] if hasattr(model, "n") else [(None, TURNS[1])]
     states = []
     for n, (yaw, pitch, factor, light) in cases:
         place = DIRECTIONS[light]
