@@ -132,7 +132,7 @@ def _left(fit: ModelFit, seen: Observed, encoding: Encoding) -> list[Errors]:
     """By how much a fit misses the values that were given."""
     found = []
     for picture, tile in zip(fit.pictures, seen.tiles, strict=True):
-        shown = np.asarray(picture.predicted(np.asarray(fit.optimum.n), fit.optimum.x), np.float64)
+        shown = picture.shown(fit.optimum.n, fit.optimum.x).astype(np.float64)
         left = np.where(np.asarray(picture.weights) > 0, np.asarray(tile.target) - encode(shown, encoding), 0.0)
         found.append(Errors(left, np.arange(len(left)), tile.points.mask.shape[1]))
     return found

@@ -151,10 +151,84 @@ class LogLikelihood(NamedTuple):
     weight: Float[AnyArray, "*shape"]
 
 
+def _module_of(values: AnyArray) -> Any:
+    return np if isinstance(values, np.ndarray) else jnp
+
+
+def _erfc(x: AnyArray) -> Any:
+    # NumPy has none; that of the standard library is for single numbers.
+    return _each_erfc(x).astype(x.dtype) if isinstance(x, np.ndarray) else jax.scipy.special.erfc(x)
+
+
+_each_erfc = np.frompyfunc(math.erfc, 1, 1)
+
+
+class _Ends:
+    """An end of the interval: x, the normal tail beyond |x|, the density there."""
+
+    def __init__(self, x: AnyArray):
+        self.x = x
+        self.xp = _module_of(x)
+        self.tail = 0.5 * _erfc(self.xp.abs(x) * math.sqrt(0.5))
+        self.density = self.xp.exp(-0.5 * x * x - _LOG_ROOT_TWO_PI)
+
+
+def _mills(end: _Ends) -> tuple[AnyArray, AnyArray]:
+    """Mills' ratio R = Q(x) / phi(x), and 1 - x R, for x > 0."""
+    xp, large = end.xp, end.x > _SERIES
+    at = xp.where(large, end.x, _SERIES)
+    # 1 / R = x + 1 / (x + 2 / (x + 3 / ...)); what follows the first x is (1 - x R) / R.
+    tail = at
+    for term in range(_TERMS, 1, -1):
+        tail = at + term / tail
+    far = 1.0 / (at + 1.0 / tail)
+    near = end.tail / xp.where(large, 1.0, end.density)
+    return xp.where(large, far, near), xp.where(large, far / tail, 1.0 - end.x * near)
+
+
+def _around(near: _Ends, far: _Ends, decay: AnyArray, holds: AnyArray) -> tuple[AnyArray, AnyArray, AnyArray]:
+    """Logarithm of P, mean, 1 - variance, for x1 <= 0 <= x2."""
+    xp = near.xp
+    outside = xp.where(holds, near.tail + far.tail, 0.25)
+    mass = 1.0 - outside
+    mean = -near.density / mass * xp.expm1(-xp.where(holds, decay, 0.0))
+    return xp.log1p(-outside), mean, mean * mean + (far.x * far.density - near.x * near.density) / mass
+
+
+def _narrow(middle: AnyArray, width: AnyArray) -> tuple[AnyArray, AnyArray, AnyArray]:
+    """The same by quadrature about the middle."""
+    xp = _module_of(middle)
+    total = first = second = xp.zeros_like(middle)
+    for node, part in zip(_NODES.tolist(), _WEIGHTS.tolist(), strict=True):
+        # From the near end, where the density is largest.
+        offset, shift = 0.5 * width * (1.0 + node), 0.5 * width * node
+        density = 0.5 * part * xp.exp(-offset * (middle - 0.5 * width + 0.5 * offset))
+        total, first, second = total + density, first + density * shift, second + density * shift * shift
+    shift = first / total
+    near = middle - 0.5 * width
+    value = xp.log(width * total) - 0.5 * near * near - _LOG_ROOT_TWO_PI
+    return value, middle + shift, 1.0 - (second / total - shift * shift)
+
+
+def _beyond(
+    near: AnyArray, width: AnyArray, left: AnyArray, first: tuple[AnyArray, AnyArray], second: tuple[AnyArray, AnyArray]
+) -> tuple[AnyArray, AnyArray, AnyArray]:
+    """The same where the far end counts less: ``left`` of the density at the near one; Mills' ratios at both."""
+    xp = _module_of(near)
+    (mills1, rest1), (mills2, rest2) = first, second
+    mass = mills1 - mills2 * left
+    value = xp.log(mass) - 0.5 * near**2 - _LOG_ROOT_TWO_PI
+    beyond = xp.where(left > 0, width * (mills1 - mills2) - rest1 - rest2, 0.0)
+    return value, (1.0 - left) / mass, (rest1 + left * beyond + left * left * rest2) / mass**2
+
+
 def interval(
-    lower: Float[Array, "*shape"], upper: Float[Array, "*shape"], predicted: Float[Array, "*shape"], s: Float[Array, ""]
+    lower: Float[AnyArray, "*shape"],
+    upper: Float[AnyArray, "*shape"],
+    predicted: Float[AnyArray, "*shape"],
+    s: Float[AnyArray, ""],
 ) -> LogLikelihood:
-    """The log-likelihood of values known to lie in an interval.
+    """The log-likelihood of values known to lie in an interval; in NumPy where the prediction is.
 
     Args:
         lower: its lower end, minus infinity for an open one.
@@ -162,30 +236,34 @@ def interval(
         predicted: z, in the same units.
         s: standard deviation of the noise before rounding, above 0.
     """
-    a = jnp.clip((lower - predicted) / s, -_FAR, _FAR)
-    b = jnp.clip((upper - predicted) / s, -_FAR, _FAR)
+    xp = _module_of(predicted)
+    a = xp.clip((lower - predicted) / s, -_FAR, _FAR)
+    b = xp.clip((upper - predicted) / s, -_FAR, _FAR)
     above = a + b >= 0
-    near, far = jnp.where(above, a, -b), jnp.where(above, b, -a)
-    width = jnp.clip((upper - lower) / s, 0.0, 2 * _FAR)
+    near, far = xp.where(above, a, -b), xp.where(above, b, -a)
+    width = xp.clip((upper - lower) / s, 0.0, 2 * _FAR)
     middle = 0.5 * (near + far)
-    decay = width * jnp.minimum(middle, _FAR)
+    decay = width * xp.minimum(middle, _FAR)
     narrow, inside = (decay <= _STEEP) & (width <= _WIDE), near <= 0
     ends = _Ends(near), _Ends(far)
-    by_quadrature = _narrow(jnp.where(narrow, middle, 1.0), jnp.where(narrow, width, 1.0))
+    by_quadrature = _narrow(xp.where(narrow, middle, 1.0), xp.where(narrow, width, 1.0))
     # Where the far end counts less; other numbers stand in where that fails.
     fails = narrow | inside
-    ratios = _mills(_Ends(jnp.where(fails, 1.0, near))), _mills(_Ends(jnp.where(fails, 9.0, far)))
-    apart, left = jnp.where(fails, 9.0, jnp.minimum(width, _FAR)), jnp.exp(-jnp.where(fails, 40.0, decay))
+    ratios = _mills(_Ends(xp.where(fails, 1.0, near))), _mills(_Ends(xp.where(fails, 9.0, far)))
+    apart, left = xp.where(fails, 9.0, xp.minimum(width, _FAR)), xp.exp(-xp.where(fails, 40.0, decay))
     value, mean, weight = (
-        jnp.where(narrow, one, jnp.where(inside, two, three))
+        xp.where(narrow, one, xp.where(inside, two, three))
         for one, two, three in zip(
             by_quadrature,
             _around(*ends, decay, ~narrow & inside),
-            _beyond(jnp.where(fails, 1.0, near), apart, left, *ratios),
+            _beyond(xp.where(fails, 1.0, near), apart, left, *ratios),
             strict=True,
         )
     )
-    return LogLikelihood(value, jnp.where(above, mean, -mean) / s, weight / (s * s))
+    return LogLikelihood(value, xp.where(above, mean, -mean) / s, weight / (s * s))
+
+
+_interval = jax.jit(interval)
 
 
 class _Table(NamedTuple):
@@ -201,8 +279,8 @@ def _table(ratio: float) -> _Table:
     """Of intervals whose width is so many s; infinite for an interval with one end."""
     first = -min(0.5 * ratio, _INSIDE)
     beyond, step = np.linspace(first, _OUTSIDE, _KNOTS, retstep=True)
-    with jax.enable_x64(True):
-        found = jax.device_get(_interval(np.full(_KNOTS, -ratio), np.zeros(_KNOTS), beyond, np.ones(())))
+    with np.errstate(all="ignore"):
+        found = interval(np.full(_KNOTS, -ratio), np.zeros(_KNOTS), beyond, np.ones(()))
     return _Table(first, float(step), np.stack(found))
 
 
@@ -284,61 +362,3 @@ class Intervals:
 def _hermite(low: Any, high: Any, start: Any, end: Any, share: Any) -> np.ndarray:
     rise = high - low
     return low + share * (start + share * (3 * rise - 2 * start - end + share * (start + end - 2 * rise)))
-
-
-class _Ends:
-    """An end of the interval: x, the normal tail beyond |x|, the density there."""
-
-    def __init__(self, x: Array):
-        self.x = x
-        self.tail = 0.5 * jax.scipy.special.erfc(jnp.abs(x) * math.sqrt(0.5))
-        self.density = jnp.exp(-0.5 * x * x - _LOG_ROOT_TWO_PI)
-
-
-def _mills(end: _Ends) -> tuple[Array, Array]:
-    """Mills' ratio R = Q(x) / phi(x), and 1 - x R, for x > 0."""
-    large = end.x > _SERIES
-    at = jnp.where(large, end.x, _SERIES)
-    # 1 / R = x + 1 / (x + 2 / (x + 3 / ...)); what follows the first x is (1 - x R) / R.
-    tail = at
-    for term in range(_TERMS, 1, -1):
-        tail = at + term / tail
-    far = 1.0 / (at + 1.0 / tail)
-    near = end.tail / jnp.where(large, 1.0, end.density)
-    return jnp.where(large, far, near), jnp.where(large, far / tail, 1.0 - end.x * near)
-
-
-_interval = jax.jit(interval)
-
-
-def _around(near: _Ends, far: _Ends, decay: Array, holds: Array) -> tuple[Array, Array, Array]:
-    """Logarithm of P, mean, 1 - variance, for x1 <= 0 <= x2."""
-    outside = jnp.where(holds, near.tail + far.tail, 0.25)
-    mass = 1.0 - outside
-    mean = -near.density / mass * jnp.expm1(-jnp.where(holds, decay, 0.0))
-    return jnp.log1p(-outside), mean, mean * mean + (far.x * far.density - near.x * near.density) / mass
-
-
-def _narrow(middle: Array, width: Array) -> tuple[Array, Array, Array]:
-    """The same by quadrature about the middle."""
-    total = first = second = jnp.zeros_like(middle)
-    for node, part in zip(_NODES.tolist(), _WEIGHTS.tolist(), strict=True):
-        # From the near end, where the density is largest.
-        offset, shift = 0.5 * width * (1.0 + node), 0.5 * width * node
-        density = 0.5 * part * jnp.exp(-offset * (middle - 0.5 * width + 0.5 * offset))
-        total, first, second = total + density, first + density * shift, second + density * shift * shift
-    shift = first / total
-    near = middle - 0.5 * width
-    value = jnp.log(width * total) - 0.5 * near * near - _LOG_ROOT_TWO_PI
-    return value, middle + shift, 1.0 - (second / total - shift * shift)
-
-
-def _beyond(
-    near: Array, width: Array, left: Array, first: tuple[Array, Array], second: tuple[Array, Array]
-) -> tuple[Array, Array, Array]:
-    """The same where the far end counts less: ``left`` of the density at the near one; Mills' ratios at both."""
-    (mills1, rest1), (mills2, rest2) = first, second
-    mass = mills1 - mills2 * left
-    value = jnp.log(mass) - 0.5 * near**2 - _LOG_ROOT_TWO_PI
-    beyond = jnp.where(left > 0, width * (mills1 - mills2) - rest1 - rest2, 0.0)
-    return value, (1.0 - left) / mass, (rest1 + left * beyond + left * left * rest2) / mass**2

@@ -200,7 +200,7 @@ def _optimum(working: Sequence[Picture], said: Score, fit: ModelFit, at: Numbers
     square, count = np.zeros_like(steps), np.zeros_like(steps)
     for picture in working:
         weight = np.asarray(picture.weights)
-        left = np.asarray(picture.target) - picture.predicted(np.exp(at.log_n), at.x)
+        left = np.asarray(picture.target) - picture.shown(math.exp(at.log_n), at.x)
         steps += np.sum(weight * left**2, axis=0)
         square += np.sum(weight * np.asarray(picture.target) ** 2, axis=0)
         count += np.count_nonzero(weight, axis=0)
@@ -459,7 +459,7 @@ def _bounds(picture: Picture) -> Bounds:
 
 def _codes(picture: Picture, at: Numbers) -> np.ndarray:
     """What is predicted, in codes, (P, C)."""
-    radiance = np.asarray(picture.predicted(np.exp(at.log_n), at.x), np.float64)
+    radiance = picture.shown(math.exp(at.log_n), at.x).astype(np.float64)
     return _bounds(picture).codes(radiance)[0]
 
 
@@ -498,7 +498,7 @@ def unexplained(picture: Picture, x: np.ndarray, n: float) -> np.ndarray:
         n: exponent.
     """
     if picture.bounds is None:
-        left = np.asarray(picture.target) - np.asarray(picture.predicted(np.asarray(n), x))
+        left = np.asarray(picture.target) - picture.shown(n, x)
         return np.where(np.asarray(picture.weights) > 0, left, 0.0) * np.sqrt(np.asarray(picture.weights))
     code = _codes(picture, Numbers(x, math.log(n)))
     return np.maximum(picture.bounds.lower - code, 0.0) - np.maximum(code - picture.bounds.upper, 0.0)

@@ -8,6 +8,7 @@ import functools
 import itertools
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -24,6 +25,7 @@ from fitting.light_colour import take_colour_out
 from fitting.likelihood import Bounds
 from fitting.problem import TOP, FitProblem, Target, has_pixel_areas
 from fitting.solver.devices import device_count
+from fitting.solver.normal_equations import FEW_VALUES
 from fitting.solver.streams import Stream, each, joined
 
 # How many pixels are taken together; of a file at least as many rows as its blocks hold, or these are read twice.
@@ -271,7 +273,11 @@ def _statistics(
     limits = np.inf if level is None else level, -np.inf if dark is None else dark
 
     def of_band(band: _Band) -> tuple[np.ndarray, Statistics]:
-        return jax.device_get(_count(band.values, np.asarray(band.points.mask).ravel(), band.allowed, *limits))
+        given = np.asarray(band.points.mask).ravel(), band.allowed, *limits
+        if band.values.size > FEW_VALUES:
+            return jax.device_get(_count_many(band.values, *given))
+        with np.errstate(invalid="ignore", over="ignore"):
+            return _count(np.asarray(band.values), *given, xp=np)
 
     def together(one: Statistics, other: Statistics) -> Statistics:
         largest = max(one.largest, other.largest)
@@ -283,16 +289,21 @@ def _statistics(
     return found, functools.reduce(together, (statistics for _, statistics in found))
 
 
-@jax.jit
-def _count(values: Array, seen: Array, allowed: Array, level: float, dark: float) -> tuple[Array, Statistics]:
-    brightest = _over_channels(jnp.maximum, values)
-    finite = allowed & jnp.isfinite(_over_channels(jnp.add, values))
-    largest = jnp.max(jnp.where(finite, brightest, -jnp.inf))
+def _count(
+    values: Any, seen: Any, allowed: Any, level: float, dark: float, *, xp: Any
+) -> tuple[Array | np.ndarray, Statistics]:
+    """Which pixels count, and what there is to know of them, in NumPy or JAX."""
+    brightest = _over_channels(xp.maximum, values)
+    finite = allowed & xp.isfinite(_over_channels(xp.add, values))
+    largest = xp.max(xp.where(finite, brightest, -xp.inf))
     below = finite & (brightest < level)
     good = below & (brightest > dark)
-    counts = jnp.stack([jnp.count_nonzero(some) for some in (seen, allowed, finite, below, good)])
-    top = jnp.count_nonzero(finite & (brightest >= largest * TOP))
-    return good, Statistics(counts, largest, top, jnp.max(jnp.where(good[:, None], jnp.abs(values), 0), axis=0))
+    counts = xp.stack([xp.count_nonzero(some) for some in (seen, allowed, finite, below, good)])
+    top = xp.count_nonzero(finite & (brightest >= largest * TOP))
+    return good, Statistics(counts, largest, top, xp.max(xp.where(good[:, None], xp.abs(values), 0), axis=0))
+
+
+_count_many = jax.jit(partial(_count, xp=jnp))
 
 
 def _plateau(

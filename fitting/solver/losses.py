@@ -108,7 +108,7 @@ def _weights(picture: Picture) -> np.ndarray:
 
 
 def _predicted(picture: Picture, optimum: Optimum) -> np.ndarray:
-    return np.asarray(picture.predicted(np.asarray(optimum.n), optimum.x))
+    return picture.shown(optimum.n, optimum.x)
 
 
 def _mean(pictures: Sequence[Picture]) -> np.ndarray:

@@ -112,6 +112,34 @@ class Picture(eqx.Module):
         shown = shown if self.lobe is None else shown + x[2] * self.lobe(cast(Any, n))[0]
         return cast(Any, np.broadcast_to(shown, self.target.shape))
 
+    def shown(self, n: float, x: Float[np.ndarray, "3 C"]) -> Float[np.ndarray, "P C"]:
+        """What the model shows, on the host; of a few pixels by NumPy.
+
+        Args:
+            n: the exponent.
+            x: coefficients.
+        """
+        return np.asarray(self._convenient.predicted(np.asarray(n), x))
+
+    def lobe_shown(self, n: float) -> Float[np.ndarray, "P C"]:
+        """The specular basis image, on the host; of a few pixels by NumPy.
+
+        Args:
+            n: the exponent.
+        """
+        picture = self._convenient
+        assert picture.lobe is not None
+        found = picture.lobe(cast(Any, n)) if picture._all_on_host else _lobe(picture.lobe, np.asarray(n))
+        return np.asarray(found[0])
+
+    @property
+    def _convenient(self) -> "Picture":
+        """The same picture; in NumPy where that takes less time than tracing and loading a program would."""
+        made = self.lobe is not None and self.lobe.source is not None
+        if self.target.size > FEW_VALUES or device_count() > 1 or made:
+            return self
+        return jax.tree.map(np.asarray, self)
+
     @property
     def counts(self) -> Bool[np.ndarray, " P"]:
         """Which pixels have a weight above 0, on the host."""
@@ -153,6 +181,9 @@ def _lobe(lobe: Lobe, n: AnyArray) -> tuple[Array, Array]:
 
 # Of a lobe that is made anew at each evaluation this many pixels, or multiples of eight times as many.
 _FEW = 2048
+
+# A NumPy evaluation of so many values takes less time than tracing and loading a program for them.
+FEW_VALUES = 1 << 19
 
 # 32768 pixels of the six or seven arrays a pass reads stay in the second-level cache.
 BLOCK = 32768

@@ -4,12 +4,9 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
-from fitting.solver.normal_equations import AnyArray, Picture
+from fitting.solver.normal_equations import Picture
 
 # A highlight on fewer pixels, counted by the squares of its values, is sampled too coarsely to trust its shape.
 FEW_PIXELS = 4.0
@@ -48,7 +45,8 @@ def highlight(pictures: Sequence[Picture], n: float) -> Highlight:
     largest, pixels = 0.0, 0.0
     for picture in pictures:
         if picture.lobe is not None:
-            value, squares = (float(v) for v in _measured(picture, np.asarray(n)))
+            values = np.where(picture.counts, np.max(picture.lobe_shown(n), axis=1), 0.0).astype(np.float64)
+            value, squares = float(np.max(values)), float(np.sum(values**2))
             largest = max(largest, value)
             # Squares of a highlight that no pixel sees fall below the smallest number.
             pixels += squares / value**2 if squares > 0 and value**2 > 0 else 0.0
@@ -63,16 +61,3 @@ def nearest_peak(pictures: Sequence[Picture]) -> float:
         pictures: with or without a lobe.
     """
     return max((picture.nearest_peak for picture in pictures if picture.lobe is not None), default=0.0)
-
-
-def _where_counted(picture: Picture, values: Array, otherwise: float) -> Array:
-    if picture.weight is None:
-        return values
-    return jnp.where(jnp.any(picture.weight.reshape(values.shape[0], -1) > 0, axis=1), values, otherwise)
-
-
-@eqx.filter_jit
-def _measured(picture: Picture, n: AnyArray) -> tuple[Array, Array]:
-    assert picture.lobe is not None
-    value = _where_counted(picture, jnp.max(picture.lobe(jnp.asarray(n))[0], axis=1), 0)
-    return jnp.max(value), jnp.sum(value * value)

@@ -161,7 +161,7 @@ def errors_of(picture: Picture, optimum: Optimum, place: tuple[np.ndarray, int])
         optimum: of the fit.
         place: index of the pixels and width of the picture.
     """
-    left = np.asarray(picture.target) - np.asarray(picture.predicted(np.asarray(optimum.n), optimum.x))
+    left = np.asarray(picture.target) - picture.shown(optimum.n, optimum.x)
     weight = np.asarray(picture.weights)
     return Errors(np.where(weight > 0, left, 0.0) * np.sqrt(weight), *place)
 
