@@ -157,7 +157,7 @@ def _module_of(values: AnyArray) -> Any:
 
 def _erfc(x: AnyArray) -> Any:
     # NumPy has none; that of the standard library is for single numbers.
-    return _each_erfc(x).astype(x.dtype) if isinstance(x, np.ndarray) else jax.scipy.special.erfc(x)
+    return np.asarray(_each_erfc(x), x.dtype) if isinstance(x, np.ndarray) else jax.scipy.special.erfc(x)
 
 
 _each_erfc = np.frompyfunc(math.erfc, 1, 1)

@@ -289,9 +289,7 @@ def _statistics(
     return found, functools.reduce(together, (statistics for _, statistics in found))
 
 
-def _count(
-    values: Any, seen: Any, allowed: Any, level: float, dark: float, *, xp: Any
-) -> tuple[Array | np.ndarray, Statistics]:
+def _count(values: Any, seen: Any, allowed: Any, level: float, dark: float, *, xp: Any) -> tuple[Any, Statistics]:
     """Which pixels count, and what there is to know of them, in NumPy or JAX."""
     brightest = _over_channels(xp.maximum, values)
     finite = allowed & xp.isfinite(_over_channels(xp.add, values))
