@@ -9,7 +9,7 @@ the fit takes for a smaller exponent.
 
 Each configuration runs once with cold caches, once warm, and then in rounds, every round in another order (fixed seed),
 so that a machine that grows slower or quicker favours none. The compiler's time is taken out of every run. What takes
-long, or compiles anew each time, runs once.
+long runs twice, what compiles anew each time once.
 """
 
 import contextlib
@@ -40,23 +40,31 @@ from fitting.progress import waiting
 from fitting.result import FitResult
 from fitting.uncertainty.covariance import TERMS
 
-PIXELS, SAMPLES = (1024, 4096, 16384, 65536, 262144), (4, 16, 64, 256, 1024)
+PIXELS, SAMPLES = (1024, 8192, 65536, 524288), (4, 16, 64, 256, 1024)
 # Of the reference under lights with an extent, of pictures that are compared there, of solvers that keep a Jacobian.
 FEW_PIXELS = 1024
 # Light samples of the fit of all pixels that the reference starts from.
 START_SAMPLES = 64
 # Where the general solvers start, which they are, and the relative changes at which they stop.
 START = 30.0
-SOLVERS = ("lm", 1e-8), ("lm", 1e-4), ("bfgs", 1e-8)
-MOST_ROUNDS = 9
-# What takes longer than this is run once: beside it cold caches count for nothing.
+SOLVERS = ("lm", 1e-8), ("bfgs", 1e-8)
+MOST_ROUNDS = 5
+# As wide as the printed table may be, and as the command prints it into a pipe.
+WIDTH = 100
+# What takes longer than this is run twice.
 LONG = 1.0
 # Axes that are told for comparison: their fits leave something out of the picture.
 BESIDE = ("model", "render")
 # Among fits whose times are within this factor the least work is recommended, which is the same on every machine.
 CLEARLY = 2.0
-# Columns of the table.
-NUMBERS = ("compile s", "run ms", "± ms", "memory MB", "rms", "worst", "parameters")
+# The numbers of the printed table, and what its reader is told of them and of the marks.
+COLUMNS = {
+    "compile s": "tracing and compiling, in the first run only",
+    "run ms": "a fit without that: median of its runs ± half the distance of their quartiles",
+    "picture": "error of the picture that the fit draws, root mean square, relative",
+    "parameters": "largest relative error of n and of the coefficients; inf: of another model",
+}
+MARKS = "front: no fit is both quicker and closer; recommended: a quick one of these that keeps {accuracy:g}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -182,26 +190,36 @@ class Tradeoff:
         """
         best = self.recommended
         marked = {"default": self.default, "recommended": best, "most accurate": None if best else self.closest}
-        words = [word for word, one in marked.items() if one is row]
-        return ", ".join([*words, *(["front"] if row in self.front else [])])
+        marked["front"] = row if row in self.front else None
+        return ", ".join(word for word, one in marked.items() if one is row)
+
+    def brief(self, row: Row) -> str:
+        """The pixels of a configuration, and in what else it differs from the default.
+
+        Args:
+            row: of the table.
+        """
+        usual = [] if self.default is None else self.default.name.split(", ")
+        return ", ".join(word for word in row.name.split(", ") if word not in usual or word.endswith("pixels"))
 
     def table(self) -> Any:
-        """A table for `rich.print`."""
+        """A table for `rich.print`; the rest that a row holds is in `to_csv`."""
+        from rich.box import SIMPLE_HEAD
         from rich.table import Column, Table
 
-        numbers = (Column(name, justify="right") for name in NUMBERS)
-        head = ("axis", Column("configuration", overflow="fold"), *numbers, "")
-        table = Table(*head, caption=f"errors against {self.reference}", title="speed against accuracy")
+        told = [*(f"{name}: {words}" for name, words in COLUMNS.items()), MARKS.format(accuracy=self.accuracy)]
+        caption = "\n".join([*told, f"errors are against {self.reference}"])
+        head = Column("configuration", overflow="fold"), *(Column(name, justify="right") for name in COLUMNS), ""
+        table = Table(
+            *head, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False, caption=caption, caption_justify="left"
+        )
         for row in self.rows:
-            numbers = [
-                f"{row.compile_seconds:.2f}",
-                f"{1e3 * row.seconds:.1f}",
-                f"{1e3 * row.spread:.1f}" if row.runs > 1 else "",
-                "" if row.peak is None else f"{row.peak / 1e6:.0f}",
-                *(f"{error:.1e}" for error in (row.rms, row.worst, row.parameters)),
-            ]
+            name = row.name if row is self.default else self.brief(row)
+            times = [row.seconds, row.spread] if row.runs > 1 else [row.seconds]
+            run = " ± ".join(f"{1e3 * time:.{0 if time >= 0.1 else 1}f}" for time in times)
+            numbers = f"{row.compile_seconds:.2f}", run, f"{row.rms:.1e}", f"{row.parameters:.1e}"
             style = "bold green" if row is self.recommended else "bold" if row is self.default else None
-            table.add_row(row.axis, row.name, *numbers, self.marks(row), style=style)
+            table.add_row(name, *numbers, self.marks(row).replace("recommended, front", "recommended"), style=style)
         return table
 
     def __str__(self) -> str:
@@ -209,7 +227,7 @@ class Tradeoff:
         from rich.console import Console
 
         stream = io.StringIO()
-        Console(file=stream, width=150, color_system=None, force_jupyter=False).print(self.table())
+        Console(file=stream, width=WIDTH, color_system=None, force_jupyter=False).print(self.table())
         return stream.getvalue().rstrip()
 
     def to_dict(self) -> dict[str, Any]:
@@ -261,7 +279,7 @@ def tradeoff(
     mask: Any = None,
     saturation: float | None = None,
     accuracy: float = 1e-3,
-    seconds: float = 45.0,
+    seconds: float = 15.0,
     render: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Tradeoff:
@@ -286,7 +304,7 @@ def tradeoff(
 
     Example:
         >>> target, scene = brdf.read_image("target.exr"), brdf.Scene.load("scene.toml")
-        >>> table = fitting.tradeoff(target, scene, accuracy=1e-2, seconds=0.1)  # a first glance; 45 s tell more
+        >>> table = fitting.tradeoff(target, scene, accuracy=1e-2, seconds=0.1)  # a first glance; 15 s tell more
         >>> table.reference
         'float64, all pixels'
     """
@@ -295,23 +313,30 @@ def tradeoff(
     bench = Bench(state_problem(target, scene, mask, model=model, saturation=saturation))
     trials = bench.trials(render=render)
     # Everything once, so that the errors, which decide what is recommended, are known however slow the compiler is:
-    # first what can be recommended, from little to much work, so that what would take too long is known before, and
-    # last what compiles anew each time. Then, warm, in rounds, every one shuffled.
-    by_work = sorted(trials, key=lambda trial: (trial.axis == "solver", trial.axis in BESIDE, trial.work))
+    # the default, twice, for its first run tells little; what can be recommended, from little to much work, so that
+    # what would take too long is known before; last what compiles anew each time. Then rounds, each shuffled.
+    ranks = {"default": 0, "solver": 3} | dict.fromkeys(BESIDE, 2)
+    by_work = sorted(trials, key=lambda trial: (ranks.get(trial.axis, 1), trial.work))
     random = np.random.default_rng(0)
-    order = [*by_work, *(by_work[i] for _ in range(MOST_ROUNDS + 1) for i in random.permutation(len(by_work)))]
+    order = [
+        by_work[0],
+        *by_work,
+        *(by_work[i] for _ in range(MOST_ROUNDS + 1) for i in random.permutation(len(by_work))),
+    ]
     known: list[Trial] = []
     with contextlib.suppress(KeyboardInterrupt), waiting("measuring") as say:
         for done, trial in enumerate(order, start=1):
             once = trial.axis == "solver"
             left = seconds - (time.perf_counter() - begun)
-            if trial.taken and (once or trial.taken[-1].seconds > min(LONG, left)):
+            long = LONG if len(trial.taken) > 1 else np.inf
+            if trial.taken and (once or trial.taken[-1].seconds > min(long, left)):
                 continue
             expected = 0.0
-            if known and not once and trial.axis != "render":
-                # What a fit may take is told by the one of the most work so far.
+            if known and trial.axis != "render":
+                # What a fit may take is told by the one of the most work so far, and of a first by the compiler too.
                 most = max(known, key=lambda trial: trial.work)
-                expected = most.taken[-1].seconds * trial.work / most.work
+                compiler = 0.0 if trial.taken else max(trial.taken[0].compiling for trial in known)
+                expected = most.taken[-1].seconds * trial.work / most.work + compiler
             if left < expected:
                 continue
             outcome, one = take(functools.partial(bench.run, trial))
@@ -442,11 +467,10 @@ class Bench:
         steps = [count for count in SAMPLES if count <= 4 * samples and count != samples]
         found += [("samples", change(pixels=few, samples=count)) for count in steps]
         found += [("samples", change(samples=16))] if samples > 16 else []
-        found += [("precision", change(precision="float64", pixels=count)) for count in (few, None)]
+        found += [("precision", change(precision="float64"))]
         if self.problem.targets[0].codes is not None:
             found += [("rounding", change(least_squares=True))]
-        others = [name for name in ("lambert", "phong", "blinn-phong") if name != self.model]
-        found += [("model", change(model=name, pixels=few)) for name in others]
+        found += [("model", change(model="lambert", pixels=few))] if self.model != "lambert" else []
         if isinstance(self.best.material, SpecularMaterial):
             solver = functools.partial(change, precision="float64", pixels=FEW_PIXELS)
             found += [("solver", solver(solver=name, tolerance=tolerance)) for name, tolerance in SOLVERS]

@@ -25,7 +25,7 @@ def tradeoff(
     out: Annotated[Path | None, typer.Option(help="A folder for tradeoff.csv, .json, .png and .pdf.")] = None,
     model: Model = "blinn-phong",
     accuracy: Annotated[float, typer.Option(help="Relative error that the recommendation is to keep.")] = 1e-3,
-    seconds: Annotated[float, typer.Option(help="Time that the measuring may take.")] = 45.0,
+    seconds: Annotated[float, typer.Option(help="Time that the measuring may take.")] = 15.0,
     render: Annotated[bool, typer.Option("--render", help="Also measure the renderer alone.")] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -66,9 +66,10 @@ def tradeoff(
         return
     from rich.console import Console
 
-    # As wide as the terminal; in a pipe, as wide as it takes.
-    console = Console(width=None if sys.stdout.isatty() else 160)
+    from fitting.speed_accuracy import WIDTH
+
+    console = Console(width=None if sys.stdout.isatty() else WIDTH)
     with console.capture() as table:
         console.print(found.table())
     saved = [] if out is None else [f"saved in {out}"]
-    show("\n".join([*notes, table.get().rstrip("\n"), found.advice, *saved]))
+    show("\n".join([*notes, table.get().strip("\n"), "", found.advice, *saved]))

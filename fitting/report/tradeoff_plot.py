@@ -65,10 +65,7 @@ def error_against_time(tradeoff: "Tradeoff") -> Figure:
     ringed = [row for row in words if words[row]]
     for number, row in enumerate(dict.fromkeys([*tradeoff.front, *ringed]), start=1):
         axes.annotate(str(number), points[row], xytext=(-7, -5), ha="right", va="top", **beside)
-        # Of a configuration, what is not usual.
-        usual = "" if tradeoff.default is None else str(tradeoff.default.configuration)
-        parts = str(row.configuration).split(", ")
-        name = ", ".join(part for part in parts if part not in usual.split(", ") or part.endswith("pixels"))
+        name = tradeoff.brief(row)
         if row in ringed:
             axes.plot(*points[row], "o", zorder=4, markersize=11, markerfacecolor="none", markeredgecolor="0.1")
             name += f"\n({words[row]})"
