@@ -415,29 +415,25 @@ def _gram(pixels: _Pixels, fixed: Array, lobes: Array) -> Array:
 def _errors(pixels: _Pixels, lobes: Array, x: Array, cost: Array, bounded: Array) -> tuple[Array, Array]:
     """Standard errors of x_a, x_d, x_s, (3, C), and of log n: channels share n but not their noise.
 
-    H⁻¹ (Σ σ² JᵀJ) H⁻¹ with Gauss and Newton's H; see `fitting.uncertainty.covariance`.
+    With the coefficients eliminated each channel tells log n with the weight of its Schur complement; what log n errs
+    moves the coefficients along.
     """
     fixed = jnp.stack([jnp.ones_like(pixels.diffuse), pixels.diffuse], axis=1)
-    gram = jnp.broadcast_to(_gram(pixels, fixed, lobes)[:, None], (*x.shape[:2], 4, 4)).reshape(-1, 4, 4)
-    x, channels = x.reshape(-1, 3), len(gram)
-    scale = jnp.concatenate([jnp.ones_like(x), x[:, 2:]], axis=1)
-    blocks = gram * scale[:, :, None] * scale[:, None, :]
-    place = np.zeros((channels, 4, 3 * channels + 1))
-    for channel, term in np.ndindex(channels, 3):
-        place[channel, term, term * channels + channel] = 1
-    place[:, 3, -1] = 1
-    active = jnp.append((x > 0).T.ravel(), jnp.any(x[:, 2] > 0) & ~bounded)
-    degrees = jnp.maximum(jnp.count_nonzero(pixels.weight) - jnp.count_nonzero(x > 0, axis=1), 1)
-    together = partial(jnp.einsum, "cij,ciu,cjv->uv", precision="highest")
-    hessian = together(blocks, place.astype(x.dtype), place.astype(x.dtype))
-    middle = together(blocks * (cost.ravel() / degrees)[:, None, None], place.astype(x.dtype), place.astype(x.dtype))
-    size = jnp.sqrt(jnp.where(active, jnp.diagonal(hessian), 1))
-    both = active[:, None] & active
-    inverse = jnp.linalg.inv(jnp.where(both, hessian, jnp.eye(size.size)) / (size[:, None] * size))
-    inverse = jnp.where(both, inverse / (size[:, None] * size), 0)
-    variance = jnp.diagonal(inverse @ middle @ inverse)
-    error = jnp.where(jnp.isfinite(variance) & (variance >= 0), jnp.sqrt(jnp.maximum(variance, 0)), jnp.inf)
-    return error[:-1].reshape(3, channels), error[-1]
+    gram = jnp.broadcast_to(_gram(pixels, fixed, lobes)[:, None], (*x.shape[:2], 4, 4))
+    active, x_s = x > 0, x[..., 2:]
+    noise = cost / jnp.maximum(jnp.count_nonzero(pixels.weight) - jnp.count_nonzero(active, axis=-1), 1)
+    cross = jnp.where(active, x_s * gram[..., :3, 3], 0)
+    along, kept = _solve_active(gram[..., :3, :3], cross, active)
+    told = x_s[..., 0] ** 2 * gram[..., 3, 3] - jnp.sum(cross * along, axis=-1)
+    total = jnp.sum(told)
+    by_n = jnp.where(total > 0, jnp.sum(noise * told) / jnp.where(total > 0, total, 1) ** 2, jnp.inf)
+    by_n = jnp.where(jnp.any(x_s > 0) & ~bounded, by_n, 0)
+    units = jnp.broadcast_to(jnp.eye(3, dtype=x.dtype)[:, None, None], (3, *x.shape))
+    inverse, _ = jax.vmap(_solve_active, (None, 0, None), -1)(gram[..., :3, :3], units, active)
+    own = noise[..., None] * jnp.diagonal(inverse, axis1=-2, axis2=-1)
+    variance = own + jnp.where(along == 0, 0, along**2 * by_n)
+    variance = jnp.where(active & ((kept[..., None] <= 0) | ~(variance >= 0)), jnp.inf, variance)
+    return jnp.sqrt(variance).reshape(-1, 3).T, jnp.sqrt(by_n)
 
 
 def _solve_active(
