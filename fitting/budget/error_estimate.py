@@ -119,17 +119,26 @@ def _nearly_dependent(gram):
     return np.any(np.linalg.eigvalsh(normed) < DEPENDENT**2)
 
 
+def at_probes(scene, pixel, model, n, channels):
+    """Ambient, diffuse, lobe and its derivative by log n at some pixels, (M, C, 4), and the peaks there, (M,)."""
+    found = jax.device_get(_at_probes(scene, filled(pixel), "float64", model, np.float64(max(n, 1e-3)), channels))
+    return [each[: pixel.size] for each in found]
+
+
+def filled(pixel):
+    """Pixels and more of them, so that few programs are compiled."""
+    return np.pad(pixel, (0, FILLED - pixel.size % FILLED))
+
+
 @compiled_at_pixels
-def at_probes(scene, model, n, channels):
-    """Ambient, diffuse, lobe and its derivative by log n, for each channel; which pixels see the object; the peak."""
+def _at_probes(scene, model, n, channels):
     images, nothing = basis(model, scene), jnp.zeros(1)
     ambient = nothing if scene.ambient is None else jnp.asarray(scene.ambient)
     diffuse = nothing if images.diffuse is None else images.diffuse
     value, slope = (nothing, nothing) if images.lobe is None else images.lobe(n)
-    shape = (images.points.mask.size, channels)
-    columns = [jnp.broadcast_to(column, shape) for column in (ambient, diffuse, value, slope * n)]
-    seen = images.points.mask.ravel()
-    return jnp.stack(columns, axis=-1), seen, jnp.zeros(seen.shape) if images.lobe is None else images.lobe.peak
+    count = images.points.mask.size
+    columns = [jnp.broadcast_to(column, (count, channels)) for column in (ambient, diffuse, value, slope * n)]
+    return jnp.stack(columns, axis=-1), jnp.zeros(count) if images.lobe is None else images.lobe.peak
 
 
 class _Sums(NamedTuple):
@@ -161,14 +170,13 @@ def _sums(run, scenes, finer, lights):
     pictures = zip(problem.targets, scenes, run.result.counted, run.samples, problem.weights, strict=True)
     for target, scene, counted, sample, weight in pictures:
         part, share, stride = probes(scene, model, counted.ravel(), sample, weight, most)
-        padded = np.pad(part.pixel, (0, FILLED - part.pixel.size % FILLED))
-        how = padded, "float64", model, np.float64(max(optimum.n, 1e-3)), channels
+        share = share[:, None]
 
-        def fitted(columns):
-            return np.einsum("mck,kc->mc", columns[..., :3], optimum.x)
+        def shown(scene, part=part):
+            columns, _ = at_probes(scene, part.pixel, model, optimum.n, channels)
+            return columns, np.einsum("mck,kc->mc", columns[..., :3], optimum.x)
 
-        columns, seen, _ = (each[: share.size] for each in jax.device_get(at_probes(scene, *how)))
-        share, coarse = np.where(seen, share, 0.0)[:, None], fitted(columns)
+        columns, coarse = shown(scene)
         # What does not count may be no number.
         residual = np.where(share > 0, some_of(target.pixels, part)[0] - coarse, 0.0)
         jacobian = np.einsum("mci,cip->mcp", columns, place)
@@ -183,9 +191,9 @@ def _sums(run, scenes, finer, lights):
             change = np.diff(scores / stride, axis=0)
             spread += 0.5 * stride * (change * np.minimum(chance[1:], chance[:-1])[:, None]).T @ change
         if finer is not None:
-            fine, *_ = jax.device_get(at_probes(with_samples(scene, finer, lights), *how))
+            _, fine = shown(with_samples(scene, finer, lights))
             # A coarser model gives more of what it lacks, hence the sign.
-            light -= np.einsum("mcp,mc->p", weighed, fitted(fine[: share.size]) - coarse)
+            light -= np.einsum("mcp,mc->p", weighed, fine - coarse)
     return _Sums(hessian, gradient, spread, light, square)
 
 

@@ -15,7 +15,6 @@ import functools
 import math
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -23,7 +22,7 @@ import brdf
 from brdf.errors import InputError
 from brdf.lobes import STORED_SAMPLES, Near
 from fitting.budget.configurations import MOST_SAMPLES, Configuration, run, sample_counts
-from fitting.budget.error_estimate import FILLED, at_probes, jacobian_places, probes
+from fitting.budget.error_estimate import at_probes, filled, jacobian_places, probes
 from fitting.budget.sampling import MadeLights, compiled_at_pixels, with_samples
 from fitting.light_colour import coefficient_factors, take_colour_out
 from fitting.problem import FitProblem, has_pixel_areas
@@ -94,13 +93,10 @@ class _Ladder:
         each = zip(self.scenes, done.result.counted, done.samples, problem.weights, strict=True)
         for scene, counted, sample, weight in each:
             part, share, _ = probes(scene, self.kind, counted.ravel(), sample, weight, most)
-            pixel = np.pad(part.pixel, (0, -part.pixel.size % FILLED))
             few = with_samples(scene, self.first, lights)
-            found = jax.device_get(at_probes(few, pixel, "float64", self.kind, np.float64(self.n), channels))
-            columns, seen, peak = (one[: share.size] for one in found)
-            share = np.where(seen, share, 0.0)
+            columns, peak = at_probes(few, part.pixel, self.kind, self.n, channels)
             peaks.append(np.max(peak, initial=-np.inf, where=share > 0))
-            self.parts.append((pixel, share, np.einsum("mci,cip->mcp", columns, places)))
+            self.parts.append((part.pixel, share, np.einsum("mci,cip->mcp", columns, places)))
         self.peak = min(max(peaks), 0.0)
         hessians = [np.einsum("m,mcp,mcq->pq", share, by, by, optimize=True) for _, share, by in self.parts]
         self.hessian: np.ndarray = np.sum(hessians, axis=0)
@@ -114,7 +110,7 @@ class _Ladder:
         found = []
         for scene, (pixel, share, _) in zip(self.scenes, self.parts, strict=True):
             lit = with_samples(scene, samples, self.lights)
-            picture = _picture(lit, pixel, "float64", self.kind, np.float64(self.n), self.x / factors)
+            picture = _picture(lit, filled(pixel), "float64", self.kind, np.float64(self.n), self.x / factors)
             found.append(np.asarray(picture)[: share.size])
         return found
 
