@@ -7,19 +7,17 @@ import base64
 import functools
 import html
 import io
+import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from brdf.channels import channel_names
-from brdf.geometry.camera import OrthographicCamera
-from brdf.geometry.sphere import Sphere
 from brdf.images.encoding import encode
-from brdf.lights.punctual import DirectionalLight
 from brdf.models import Material
 from brdf.plausibility.report import Report
-from brdf.rendering import render
-from brdf.scene import Scene
 
 _FINEST = 65535
 _CELL = "padding:0.15em 0.8em;text-align:right;white-space:nowrap"
@@ -52,18 +50,28 @@ def _encoding_table() -> Float[np.ndarray, " 65536"]:
     return np.clip(encode(np.linspace(0.0, 1.0, _FINEST + 1, dtype=np.float32), "srgb"), 0.0, 1.0)
 
 
-def lit_sphere(material: Material, size: int = 128) -> Float[np.ndarray, "H W 3"]:
+def lit_sphere(material: Material | Callable[[Any, Any], Any], size: int = 128) -> Float[np.ndarray, "H W 3"]:
     """A sphere of the material in one light from above left, as a screen shows it, on white.
 
     Args:
-        material: any of the models, of known numbers.
+        material: any of the models, of known numbers; or f_r of directions to light and view, (P, 3) -> (P, C), in
+            1/sr, whose tangent lies along the sphere's circles of latitude.
         size: pixels on a side.
     """
-    camera = OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.06, resolution=(size, size))
-    light = DirectionalLight(direction=[-0.5, 0.6, 0.8], intensity=[0.9])
-    scene = Scene(camera=camera, shapes=(Sphere(center=[0, 0, 0], radius=1),), ambient=[0.2], lights=(light,))
-    image = displayed(np.asarray(render(material, scene, precision="float32")))
-    return np.where(np.asarray(scene.surface_points().mask)[..., None], image, 1.0)
+    place = 1.03 * ((np.arange(size) + 0.5) * 2 / size - 1)
+    x, y = np.meshgrid(place, -place)
+    inside = x * x + y * y < 1
+    x, y = x[inside], y[inside]
+    normal = np.stack([x, y, np.sqrt(1 - x * x - y * y)], axis=-1)
+    tangent = np.cross([0.0, 1.0, 0.0], normal)
+    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
+    frame = np.stack([tangent, np.cross(normal, tangent), normal], axis=1)
+    to_light = frame @ np.array([-0.5, 0.6, 0.8]) / math.sqrt(1.25)
+    f_r, k_a = (material.reflectance, material.k_a) if isinstance(material, Material) else (material, 0.0)
+    lit = np.asarray(f_r(to_light, frame[:, :, 2])) * np.maximum(to_light[:, 2:], 0)
+    image = np.ones((size, size, 3))
+    image[inside] = displayed(np.nan_to_num(0.2 * np.asarray(k_a) + 0.9 * np.pi * lit)[None])[0]
+    return image
 
 
 def png_address(picture: Float[np.ndarray, "H W 3"]) -> str:

@@ -202,16 +202,14 @@ def _fit_together(problem: FitProblem) -> tuple[dict[str, np.ndarray], Bool[np.n
     channels = targets.shape[-1]
     light = take_colour_out(problem.scenes[:1] if _alike(problem) else problem.scenes, channels)
     scenes = [brdf.cast(scene, problem.precision) for scene in light.scenes]
-    places = [scene.surface_points() for scene in scenes]
     allowed = [True if mask is None else mask for mask in problem.masks[: len(scenes)]]
-    seen = np.stack([np.asarray(points.mask) & mask for points, mask in zip(places, allowed, strict=True)])
+    both = zip(scenes, allowed, strict=True)
+    seen = np.stack([np.asarray(scene.surface_points().mask) & mask for scene, mask in both])
     exact = np.array([target.codes is None and target.saturation is None for target in problem.targets])
     plain = exact & np.asarray(_plain(targets, seen))
     if len(scenes) == 1:
         pixel = np.flatnonzero(seen)
-        images = basis(model, scenes[0], points=places[0])
-        choose = functools.partial(_chosen, pixel)
-        images = Basis(images.points, choose(images.diffuse), images.lobe and images.lobe.pixels(choose))
+        images = basis(model, brdf.some_pixels(scenes[0], pixel, precision=problem.precision))
         few = jnp.asarray(np.take(targets.reshape(count, -1, channels), pixel, axis=1))
         shared = {"images": images, "weight": jnp.ones(pixel.size, dtype), "ambient": scenes[0].ambient}
         found = _dealt_out({"target": few}, shared, problem.n_range)
@@ -268,10 +266,6 @@ def _dealt_out(pictures: dict[str, Any], shared: dict[str, Any], n_range: Any) -
         rows |= dict(zip(places[device].tolist(), table, strict=True))
     flat, unravel = ravel_pytree(jax.tree.map(lambda leaf: leaf[0], some))
     return jax.vmap(unravel)(jnp.asarray(gathered(rows, count, flat.shape), flat.dtype))
-
-
-def _chosen(pixel: np.ndarray, leaf: Any) -> Any:
-    return None if leaf is None else jnp.asarray(np.asarray(leaf)[pixel])
 
 
 @functools.partial(jax.jit, static_argnums=0)

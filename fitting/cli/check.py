@@ -9,7 +9,7 @@ import typer
 import brdf
 from brdf.errors import InputError
 from brdf.files import atomic_path
-from fitting.cli.common import AsJson, find_materials, find_note, show, use_compilation_cache
+from fitting.cli.common import AsJson, find_materials, show, use_compilation_cache
 from fitting.progress import waiting
 
 EXAMPLE = (
@@ -38,29 +38,22 @@ def check(
             remedy = f"Fit a material to it with brdf fit {material} --out DIR, and check DIR/material.json"
             raise InputError("--plot", f"draws materials, and {material} is a measured table", remedy)
         use_compilation_cache()
-        materials: dict[str, Any] = (
-            {Path(material).stem: brdf.load_measured(material)} if is_table else find_materials(material)
+        found: dict[str, tuple[Any, str]] = (
+            {Path(material).stem: (brdf.load_measured(material), "")} if is_table else find_materials(material)
         )
-        reports = {name: brdf.check(one, name=name) for name, one in materials.items()}
+        reports = {name: (brdf.check(one, name=name), note) for name, (one, note) in found.items()}
         if plot is not None:
-            if len(materials) > 1:
-                raise InputError("--plot", f"draws one material, {material} holds {len(materials)}", "Give one")
+            if len(found) > 1:
+                raise InputError("--plot", f"draws one material, {material} holds {len(found)}", "Give one")
             from fitting.report.material_plots import overview
 
             with atomic_path(plot) as path:
-                for name, one in materials.items():
-                    overview(one, reports[name]).savefig(path)
-    notes = {name: "" if is_table else find_note(material, name) for name in reports}
+                for name, (one, _) in found.items():
+                    overview(one, reports[name][0]).savefig(path)
     if as_json:
-        told = {
-            name: report.to_json() | ({"note": notes[name]} if notes[name] else {}) for name, report in reports.items()
-        }
+        told = {name: report.to_json() | ({"note": note} if note else {}) for name, (report, note) in reports.items()}
         show(json.dumps(told, indent=2))
     else:
-        show(
-            "\n\n".join(
-                f"{report}\n  note: {notes[name]}" if notes[name] else str(report) for name, report in reports.items()
-            )
-        )
-    verdicts = [report.plausible for report in reports.values()]
+        show("\n\n".join(f"{report}\n  note: {note}" if note else str(report) for report, note in reports.values()))
+    verdicts = [report.plausible for report, _ in reports.values()]
     return 1 if False in verdicts else 2 if None in verdicts else 0

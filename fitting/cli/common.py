@@ -121,8 +121,8 @@ def named_as(typed: dict[str, Any]) -> Iterator[None]:
         raise InputError(typed[error.where], error.what, error.remedy) from None
 
 
-def find_material(text: str, name: str | None = None) -> tuple["brdf.Material", str]:
-    """One material, and what it is called.
+def find_material(text: str, name: str | None = None) -> tuple["brdf.Material", str, str]:
+    """One material, what it is called, and what its file says that it leaves open.
 
     Args:
         text: a file, or a name of the classic table such as emerald; a file goes before a name.
@@ -133,14 +133,14 @@ def find_material(text: str, name: str | None = None) -> tuple["brdf.Material", 
     """
     key = _table_name(text)
     if key is None:
-        return brdf.load_material(text, name), name or Path(text).stem
+        return brdf.load_material(text, name), name or Path(text).stem, _note(text, name)
     if name is not None:
         raise InputError("--name", f"chooses from a file, and {key} is one material", "Leave it out")
-    return brdf.preset(key), key
+    return brdf.preset(key), key, ""
 
 
-def find_materials(text: str) -> dict[str, "brdf.Material"]:
-    """Every material of a file, or the one of the classic table, by name.
+def find_materials(text: str) -> dict[str, tuple["brdf.Material", str]]:
+    """Every material of a file, or the one of the classic table, by name, with what its file says that it leaves open.
 
     Args:
         text: see `find_material`.
@@ -149,22 +149,15 @@ def find_materials(text: str) -> dict[str, "brdf.Material"]:
         InputError: naming the file.
     """
     key = _table_name(text)
-    return brdf.load_materials(text) if key is None else {key: brdf.preset(key)}
+    if key is not None:
+        return {key: (brdf.preset(key), "")}
+    return {name: (material, _note(text, name)) for name, material in brdf.load_materials(text).items()}
 
 
-def find_note(text: str, name: str | None) -> str:
-    """What a material's file says that it leaves open.
-
-    Args:
-        text: see `find_material`.
-        name: likewise.
-
-    Raises:
-        InputError: naming the file.
-    """
+def _note(text: str, name: str | None) -> str:
     from brdf.materials.material_file import load_note
 
-    return "" if _table_name(text) else load_note(text, name)
+    return load_note(text, name)
 
 
 def _table_name(text: str) -> str | None:

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 import brdf
-from fitting.cli.common import AMaterial, find_material, find_note, show, use_compilation_cache
+from fitting.cli.common import AMaterial, find_material, show, use_compilation_cache
 
 EXAMPLE = (
     "Example: [bold]brdf convert material.json material.gltf[/bold]\n\n"
@@ -27,15 +27,7 @@ def convert(
 ) -> None:
     """Write a material as three.js, glTF, Mitsuba, PyTorch3D, GLSL or Wavefront read it, and say what is lost."""
     use_compilation_cache()
-    loaded, called = find_material(material, name)
-    note = find_note(material, name)
+    loaded, called, note = find_material(material, name)
     export = brdf.save_export(loaded, out, to=to, name="_".join(called.split()), note=note)
-    show(
-        "\n".join(
-            [
-                f"wrote {out}",
-                *([f"  note: {note}"] if note else []),
-                *(f"  not carried: {loss}" for loss in export.losses),
-            ]
-        )
-    )
+    notes = [f"  note: {note}"] if note else []
+    show("\n".join([f"wrote {out}", *notes, *(f"  not carried: {loss}" for loss in export.losses)]))

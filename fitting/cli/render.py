@@ -28,7 +28,7 @@ def render(
     """Render a material in a scene."""
     with waiting("rendering"), named_as({"material": material}):
         use_compilation_cache()
-        loaded, _ = find_material(material)
+        loaded, *_ = find_material(material)
         if scene is None:
             scene = (Path(material) if Path(material).is_dir() else Path(material).parent) / "scene.toml"
             if Path(material).suffix == ".mtl" or not scene.is_file():

@@ -3,7 +3,6 @@
 They return a matplotlib figure and show nothing.
 """
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -17,7 +16,7 @@ from matplotlib.ticker import MaxNLocator
 from brdf.albedo import directional_albedo
 from brdf.channels import channel_names, in_channel
 from brdf.checks import several
-from brdf.display import displayed, lit_sphere
+from brdf.display import lit_sphere
 from brdf.measured.table import MeasuredBRDF, from_angles
 from brdf.models.base import Material, SpecularMaterial
 from brdf.plausibility.numeric import Sampler, albedo_of
@@ -48,7 +47,7 @@ def overview(brdf: Brdf, report: Report | None = None) -> Figure:
     (ball, lobe), (albedo, reciprocity) = figure.subfigures(2, 2)
     axes = ball.add_subplot()
     axes.set_axis_off()
-    axes.imshow(lit_sphere(brdf, 256) if isinstance(brdf, Material) else _lit_function(_sampler(brdf)))
+    axes.imshow(lit_sphere(brdf if isinstance(brdf, Material) else _sampler(brdf), 256))
     name = brdf.name if isinstance(brdf, Material) else getattr(brdf, "__name__", type(brdf).__name__)
     axes.set_title(f"{name}, n = {brdf.n:.4g}" if isinstance(brdf, SpecularMaterial) else name)
     plot_lobe(brdf, figure=lobe)
@@ -197,26 +196,6 @@ def _axes(figure, size, **how):
     """A figure, of some size where there is none yet, and axes that fill it."""
     figure = figure or Figure(figsize=size, layout="constrained")
     return figure, figure.add_subplot(**how)
-
-
-def _lit_function(sample, size=256):
-    """A sphere of any BRDF in one light from above left, as a screen shows it, on white; as `lit_sphere` lights it.
-
-    The tangent lies along the sphere's circles of latitude.
-    """
-    place = 1.03 * ((np.arange(size) + 0.5) * 2 / size - 1)
-    x, y = np.meshgrid(place, -place)
-    inside = x * x + y * y < 1
-    x, y = x[inside], y[inside]
-    normal = np.stack([x, y, np.sqrt(1 - x * x - y * y)], axis=-1)
-    tangent = np.cross([0.0, 1.0, 0.0], normal)
-    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
-    frame = np.stack([tangent, np.cross(normal, tangent), normal], axis=1)
-    to_light = frame @ np.array([-0.5, 0.6, 0.8]) / math.sqrt(1.25)
-    radiance = 0.9 * np.pi * sample(to_light, frame[:, :, 2]) * np.maximum(to_light[:, 2:], 0)
-    image = np.ones((size, size, 3))
-    image[inside] = displayed(np.nan_to_num(radiance)[None])[0]
-    return image
 
 
 def _sampler(brdf):
