@@ -23,23 +23,24 @@ from brdf.lights.base import LightStack, stacked
 from brdf.lobes import light_terms
 from brdf.models.base import SpecularMaterial
 from brdf.precision import Precision, working_precision
-from brdf.vectors import normalize
+from brdf.vectors import Components, normalize
 from fitting.maps import map_inputs
 from fitting.maps.kept_bands import KeptBands
 from fitting.maps.map_inputs import Photographs
 from fitting.maps.map_light_choice import MOST_ERROR
 from fitting.maps.map_result import REASONS, Maps
 from fitting.maps.texels import (
-    CAP,
     STEPS,
     Bracket,
     Columns,
     Distant,
+    Target,
     TexelFit,
     fit_at,
     fit_texels,
     fit_with_normals,
     octave_gains,
+    over_channels,
     slope_and_curvature,
 )
 from fitting.progress import waiting
@@ -402,28 +403,32 @@ def _program(
     def of_tile(tile: Any) -> dict[str, Array]:
         start, (normal, mask, points, shared) = tile
         if normal is not None:
-            mask &= jnp.all(jnp.isfinite(normal) & jnp.any(normal != 0, axis=1, keepdims=True), axis=1)
-            normal = normalize(jnp.where(mask[:, None], normal, jnp.array([0.0, 0.0, 1.0]))).T
+            mask &= functools.reduce(jnp.logical_and, map(jnp.isfinite, normal))
+            mask &= functools.reduce(jnp.logical_or, (x != 0 for x in normal))
+            axis = [jnp.where(mask, x, upright) for x, upright in zip(normal, (0.0, 0.0, 1.0), strict=True)]
+            normal = jnp.stack([*normalize(Components(tuple(axis)))])
 
-        def decoded(photograph: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-            shown, top, scale = photograph
-            shown = shown.T.astype(scale.dtype)
-            counts = mask & functools.reduce(jnp.logical_and, (jnp.isfinite(x) & (x < top) for x in shown))
-            return jnp.where(counts, shown * scale[:, None], 0), counts.astype(scale.dtype)
+        def decoded(tile: Array) -> tuple[Target, Array]:
+            shown = [tile[:, :, c].astype(scale.dtype) for c in range(tile.shape[2])]
+            counts = functools.reduce(jnp.logical_and, (jnp.isfinite(x) & (x < top[:, None]) for x in shown)) & mask
+            shown = [jnp.where(counts, x * scale[:, c, None], 0) for c, x in enumerate(shown)]
+            return Target.of(jnp.stack(shown, axis=1)), counts.astype(scale.dtype)
 
+        # under a condition XLA stores what comes out, and does not decode it anew for each sum
         tile = jax.lax.dynamic_slice_in_dim(codes, start, TILE, axis=1)
-        target, seen = jax.lax.map(decoded, (tile, top, scale))
+        empty = jax.tree.map(lambda one: jnp.zeros(one.shape, one.dtype), jax.eval_shape(decoded, tile))
+        target, seen = jax.lax.cond(jnp.any(mask), decoded, lambda _: empty, tile)
         found = [_of_model(model, target, seen, mask, normal, points, shared) for model in models]
         layers = _simplest(found) if seek == "layers" else found[0]
         return {name: layer.T for name, layer in layers.items()}
 
     def _of_model(
-        model: Any, target: Array, seen: Array, mask: Array, normal: Any, points: Any, shared: Any
+        model: Any, target: Target, seen: Array, mask: Array, normal: Any, points: Any, shared: Any
     ) -> dict[str, Array]:
         tied = grey and issubclass(model, SpecularMaterial)
         if normal is None:
             fit, normal, normal_error, seen = fit_with_normals(model, target, seen, distant, tied, finer)
-            return _layers(model, fit, target * seen[:, None], seen, mask, tied, normal, normal_error)
+            return _layers(model, fit, Target.of(target.shown * seen[:, None]), seen, mask, tied, normal, normal_error)
         if points is None:
             columns = distant.columns(model, normal, seen)
         else:
@@ -432,7 +437,7 @@ def _program(
                 seen *= columns.linear[0][:, 0] > 0
             linear = [column * seen[:, None] for column in columns.linear]
             columns = columns._replace(linear=linear, weight=columns.weight * seen[:, None])
-            target *= seen[:, None]
+            target = Target.of(target.shown * seen[:, None])
         if seek == "gains":
             return {"gains": jnp.where(mask, octave_gains(model, target, columns, tied, finer), 0)}
         if shared is None:
@@ -442,15 +447,19 @@ def _program(
         if seek == "slope":
             slope, curvature = slope_and_curvature(model, target, columns, tied, log_n)
             cost = fit_at(model, target, columns, tied, log_n).cost
-            own = target.shape[1] * len(columns.linear) + (1 if tied else target.shape[1])
-            freedom = target.shape[1] * jnp.sum(seen, axis=0) - own
+            channels = target.shown.shape[1]
+            own = channels * len(columns.linear) + (1 if tied else channels)
+            freedom = channels * jnp.sum(seen, axis=0) - own
             sums = jnp.stack([slope, curvature, cost, jnp.maximum(freedom, 0)])
             return {"sums": jnp.where(mask, sums, 0)}
         fit = fit_at(model, target, columns, tied, log_n, sure=True)
         return _layers(model, fit, target, seen, mask, tied, normal, None, error)
 
     starts = jnp.arange(0, codes.shape[1], TILE)
-    tiles = jax.lax.map(of_tile, (starts, jax.tree.map(lambda leaf: leaf.reshape(-1, TILE, *leaf.shape[1:]), surface)))
+    surface = jax.tree.map(lambda leaf: leaf.reshape(-1, TILE, *leaf.shape[1:]), surface)
+    if surface.normal is not None:
+        surface = surface._replace(normal=jnp.swapaxes(surface.normal, 1, 2))
+    tiles = jax.lax.map(of_tile, (starts, surface))
     return {name: layer.reshape(-1, *layer.shape[2:]) for name, layer in tiles.items()}
 
 
@@ -480,7 +489,7 @@ def _by_light(lights: int, samples: Array) -> Array:
 def _layers(
     model: Any,
     fit: TexelFit,
-    target: Array,
+    target: Target,
     seen: Array,
     mask: Array,
     grey: bool,
@@ -489,7 +498,7 @@ def _layers(
     shared: Array | None = None,
 ) -> dict[str, Array]:
     """The layers of a model's maps, texels last."""
-    channels, lanes = target.shape[1:]
+    channels, lanes = target.shown.shape[1:]
     glossy = issubclass(model, SpecularMaterial)
     k_s, k_s_error = (fit.k[-1], fit.k_error[-1]) if glossy else (jnp.zeros((channels, lanes)),) * 2
     linear = fit.k[:-1] if glossy else fit.k
@@ -500,15 +509,17 @@ def _layers(
     n = jnp.exp(fit.log_n)
     error = noise * fit.log_n_error if shared is None else shared
     shows = jnp.any(k_s > LEAST_HIGHLIGHT * noise * k_s_error, axis=0)
-    capped = jnp.any(k_s >= CAP * jnp.max(target, axis=(0, 1)), axis=0)
+    capped = jnp.any(k_s >= target.cap, axis=0)
     tests = (~mask | (values == 0), freedom < 1, ~shows | (not glossy), capped, ~(error <= MOST_ERROR))
-    reason = jnp.select([*tests], [*range(1, len(REASONS))], 0).astype(jnp.uint8)
+    reason = jnp.zeros(lanes, jnp.uint8)
+    for number, holds in reversed([*enumerate(tests, start=1)]):
+        reason = jnp.where(holds, jnp.uint8(number), reason)
     known = reason == 0
     inside = reason != REASONS.index("outside")
     names = ("k_a", "k_d")[-len(linear) :]
     layers = {name: jnp.where(inside, k, jnp.nan) for name, k in zip(names, linear, strict=True)}
     layers |= {f"{name}_error": noise * e for name, e in zip(names, fit.k_error, strict=False)}
-    square = jnp.sum(target * target, axis=(0, 1))
+    square = over_channels(jnp.sum(target.shown * target.shown, axis=0))[0]
     return layers | {
         "n": jnp.where(known, n, jnp.nan),
         "k_s": jnp.where(known, k_s, jnp.nan),

@@ -16,7 +16,7 @@ import functools
 import itertools
 import math
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -81,6 +81,27 @@ def _lowest(dtype: Any) -> float:
     return 0.24 * math.log(jnp.finfo(dtype).tiny)
 
 
+class Target(NamedTuple):
+    """What the photographs show of the texels; 0 where a value does not count.
+
+    Attributes:
+        shown: (P, C, T).
+        summed: over the channels, (P, T): all that tells of a k_s which these share.
+        cap: what k_s may be at most, (T,).
+    """
+
+    shown: Float[Array, "P C T"]
+    summed: Float[Array, "P T"]
+    cap: Float[Array, " T"]
+
+    @classmethod
+    def of(cls, shown: Float[Array, "P C T"]) -> "Target":
+        """With what follows from it."""
+        channels = [shown[:, c] for c in range(shown.shape[1])]
+        brightest = jnp.max(functools.reduce(jnp.maximum, channels), axis=0)
+        return cls(shown, functools.reduce(operator.add, channels), CAP * brightest)
+
+
 class TexelFit(NamedTuple):
     """The optimum of each texel. Errors are standard errors in units of the noise, infinite where nothing is known.
 
@@ -134,18 +155,18 @@ class Distant(NamedTuple):
 # -- normals given -----------------------------------------------------------------------------------------------------
 
 
-def fit_texels(model: Any, target: Float[Array, "P C T"], columns: Columns, grey: bool, finer: int) -> TexelFit:
+def fit_texels(model: Any, target: Target, columns: Columns, grey: bool, finer: int) -> TexelFit:
     """The best material of each texel whose normal is known.
 
     Args:
         model: class of the material.
-        target: what the photographs show; 0 where it does not count.
+        target: what the photographs show.
         columns: of the lights.
         grey: whether the channels share k_s.
         finer: steps of the grid in each doubling of n: 1 under lights all over the sky, 2 under a ring of them.
     """
     if not issubclass(model, SpecularMaterial):
-        return fit_at(model, target, columns, grey, jnp.zeros_like(target[0, 0]))
+        return fit_at(model, target, columns, grey, jnp.zeros_like(target.cap))
 
     def step(_: Any, bracket: Bracket) -> Bracket:
         return bracket.narrowed(*slope_and_curvature(model, target, columns, grey, bracket.log_n))
@@ -154,17 +175,18 @@ def fit_texels(model: Any, target: Float[Array, "P C T"], columns: Columns, grey
     return fit_at(model, target, columns, grey, jax.lax.fori_loop(0, STEPS, step, bracket).log_n)
 
 
-def octave_gains(model: Any, target: Array, columns: Columns, grey: bool, finer: int) -> Float[Array, "G T"]:
+def octave_gains(model: Any, target: Target, columns: Columns, grey: bool, finer: int) -> Float[Array, "G T"]:
     """By how much the best material lowers the cost, at each n of the grid: see `fit_texels`."""
-    first = 2.0 ** (jnp.arange(finer, dtype=target.dtype) / finer)
+    dtype = target.cap.dtype
+    first = 2.0 ** (jnp.arange(finer, dtype=dtype) / finer)
     gram, moment = _sums(columns.linear, target)
-    cap, floor = cap_of(target), jnp.exp(_lowest(target.dtype))
+    floor = jnp.exp(_lowest(dtype))
 
     def gain(lobe: Array, scale: Array) -> Array:
         across = [jnp.sum(column * lobe, axis=0) for column in columns.linear]
-        square, moments = jnp.sum(lobe * lobe, axis=0), [*moment, jnp.sum(lobe * target, axis=0)]
+        square, moments = jnp.sum(lobe * lobe, axis=0), [*moment, _moment(lobe, target, grey)]
         whole = [*([*row, x] for row, x in zip(gram, across, strict=True)), [*across, square]]
-        k = nonnegative(whole, moments, cap * scale, grey, steps=1)
+        k = nonnegative(whole, moments, target.cap * scale, grey, steps=1)
         left = [b - 0.5 * sum(map(operator.mul, row, k)) for b, row in zip(moments, whole, strict=True)]
         return over_channels(sum(map(operator.mul, k, left)))[0]
 
@@ -177,8 +199,8 @@ def octave_gains(model: Any, target: Array, columns: Columns, grey: bool, finer:
         return [lobe_of(power * power) for power, _ in chains], jnp.stack(gains)
 
     chains = [lobe_of(jnp.exp(n * columns.log_cosine)) for n in first]
-    exponents = first * 2.0 ** jnp.arange(OCTAVES + 1, dtype=target.dtype)[:, None]
-    return jax.lax.scan(octave, chains, exponents)[1].reshape(-1, target.shape[2])
+    exponents = first * 2.0 ** jnp.arange(OCTAVES + 1, dtype=dtype)[:, None]
+    return jax.lax.scan(octave, chains, exponents)[1].reshape(-1, *target.cap.shape)
 
 
 class Bracket(NamedTuple):
@@ -216,24 +238,24 @@ class Bracket(NamedTuple):
         return Bracket(jnp.clip(new, 0, OCTAVES * math.log(2.0)), low, high)
 
 
-def slope_and_curvature(model: Any, target: Array, columns: Columns, grey: bool, log_n: Array) -> tuple[Array, Array]:
+def slope_and_curvature(model: Any, target: Target, columns: Columns, grey: bool, log_n: Array) -> tuple[Array, Array]:
     """Half the negative derivative of the least cost by log n, and Gauss and Newton's curvature, (T,) each."""
     lobe, slope = columns.lobe(model, log_n)
     basis = [*columns.linear, lobe]
-    point = _evaluate(basis, [{len(columns.linear): slope}], target, cap_of(target), grey)
+    point = _evaluate(basis, [{len(columns.linear): slope}], target, grey)
     return point.slope[0], divide(1.0, point.error[0] ** 2)
 
 
 def fit_at(
-    model: Any, target: Array, columns: Columns, grey: bool, log_n: Float[Array, " T"], *, sure: bool = False
+    model: Any, target: Target, columns: Columns, grey: bool, log_n: Float[Array, " T"], *, sure: bool = False
 ) -> TexelFit:
     """The best coefficients for a given n; their errors allow for that of n, unless n is sure."""
     if not issubclass(model, SpecularMaterial):
-        point = _evaluate(columns.linear, [], target, jnp.inf, False)
+        point = _evaluate(columns.linear, [], target, False)
         return TexelFit(point.k, point.k_error, log_n, jnp.full_like(log_n, jnp.inf), point.cost)
     lobe, slope = columns.lobe(model, log_n)
     unknowns = [] if sure else [{len(columns.linear): slope}]
-    point = _evaluate([*columns.linear, lobe], unknowns, target, cap_of(target), grey)
+    point = _evaluate([*columns.linear, lobe], unknowns, target, grey)
     return TexelFit(point.k, point.k_error, log_n, jnp.zeros_like(log_n) if sure else point.error[0], point.cost)
 
 
@@ -242,7 +264,7 @@ def fit_at(
 
 def fit_with_normals(
     model: Any,
-    target: Float[Array, "P C T"],
+    target: Target,
     seen: Float[Array, "P T"],
     lights: Distant,
     grey: bool,
@@ -255,7 +277,7 @@ def fit_with_normals(
 
     Args:
         model: class of the material.
-        target: what the photographs show; 0 where it does not count.
+        target: what the photographs show.
         seen: 1 where it counts.
         lights: which are distant.
         grey: whether the channels share k_s.
@@ -270,13 +292,13 @@ def fit_with_normals(
         fit, normal, _, _ = state
         columns = lights.columns(model, normal, seen)
         lobe = [columns.lobe(model, fit.log_n)[0]] if issubclass(model, SpecularMaterial) else []
-        residual = target - sum(map(operator.mul, fit.k, [*columns.linear, *lobe]))
+        residual = target.shown - sum(map(operator.mul, fit.k, [*columns.linear, *lobe]))
         counts = _inliers(jnp.sum(residual, axis=1), seen)
-        some = target * counts[:, None]
+        some = Target.of(target.shown * counts[:, None])
         fit = fit_texels(model, some, lights.columns(model, normal, counts), grey, finer)
         return *_jointly(model, some, counts, lights, grey, fit, normal), counts
 
-    start = lambert_normals(jnp.sum(target, axis=1), seen, lights.to_light)
+    start = lambert_normals(target.summed, seen, lights.to_light)
     first = fit_texels(model, target, lights.columns(model, start, seen), grey, finer), start, seen[0], seen
     return jax.lax.fori_loop(0, 2, again, first)
 
@@ -302,7 +324,7 @@ def lambert_normals(grey: Float[Array, "P T"], seen: Float[Array, "P T"], to_lig
     def least_squares(weight: Array) -> Array:
         roots = jnp.sqrt(weight)
         axes = jax.lax.map(lambda one: [axis * one[1][None] for axis in one[0]], (to_light, roots))
-        gram, moment = _sums(axes, (roots * grey)[:, None])
+        gram, moment = _sums(axes, Target.of((roots * grey)[:, None]))
         return jnp.stack(_solve(_upper(gram), moment, [], 0)[1])
 
     def step(_: Any, vector: Array) -> Array:
@@ -317,7 +339,7 @@ def lambert_normals(grey: Float[Array, "P T"], seen: Float[Array, "P T"], to_lig
 
 
 def _jointly(
-    model: Any, target: Array, seen: Array, lights: Distant, grey: bool, fit: TexelFit, normal: Array
+    model: Any, target: Target, seen: Array, lights: Distant, grey: bool, fit: TexelFit, normal: Array
 ) -> tuple[TexelFit, Array, Array]:
     """Gauss-Newton of material and normal together; a step that does not lower the cost is cut to a quarter."""
     glossy = issubclass(model, SpecularMaterial)
@@ -351,7 +373,7 @@ def _jointly(
         first, last = int(lights.ambient is not None), len(basis) - 1
         by_n = [{last: slopes[0][1]}] if glossy else []
         tilts = [dict(enumerate(slope, start=first)) for slope in slopes[-2:]]
-        return _evaluate(basis, [*by_n, *tilts], target, cap_of(target) if glossy else jnp.inf, grey)
+        return _evaluate(basis, [*by_n, *tilts], target, grey)
 
     def step(_: Any, state: Any) -> Any:
         log_n, normal, cost, change = state
@@ -384,11 +406,6 @@ def _frame(normal: Array) -> tuple[Array, Array]:
 # -- least squares, one in each lane -----------------------------------------------------------------------------------
 
 
-def cap_of(target: Float[Array, "P C T"]) -> Float[Array, " T"]:
-    """What k_s may be at most."""
-    return CAP * jnp.max(target, axis=(0, 1))
-
-
 class _Point(NamedTuple):
     """The best coefficients at given nonlinear unknowns, and the Gauss-Newton step from there.
 
@@ -409,20 +426,21 @@ class _Point(NamedTuple):
     cost: Array
 
 
-def _evaluate(columns: list[Array], unknowns: list[dict[int, Array]], target: Array, cap: Any, grey: bool) -> _Point:
+def _evaluate(columns: list[Array], unknowns: list[dict[int, Array]], target: Target, grey: bool) -> _Point:
     """The best coefficients, and the Gauss-Newton step of these and the nonlinear unknowns together.
 
     Args:
         columns: U of (P, D, T); the last is k_s's where unknowns are given that move it.
         unknowns: of each nonlinear one the derivatives of the columns, by their index.
         target: what the photographs show.
-        cap: of the last coefficient.
-        grey: whether the channels share that.
+        grey: whether the channels share the last coefficient, which has a cap.
     """
     count = len(columns)
     slopes = [(i, slope) for unknown in unknowns for i, slope in unknown.items()]
-    gram, moment = _sums([*columns, *(slope for _, slope in slopes)], target)
-    k = nonnegative([row[:count] for row in gram[:count]], moment[:count], cap, grey, steps=2)
+    moved = [*range(count), *(i for i, _ in slopes)]
+    shared = {index for index, i in enumerate(moved) if grey and i == count - 1}
+    gram, moment = _sums([*columns, *(slope for _, slope in slopes)], target, shared)
+    k = nonnegative([row[:count] for row in gram[:count]], moment[:count], target.cap, grey, steps=2)
     left = [b - sum(map(operator.mul, row, k)) for b, row in zip(moment, gram, strict=True)]
     # the derivative by a nonlinear unknown is a combination of derivatives of columns
     index = itertools.count(count)
@@ -434,20 +452,38 @@ def _evaluate(columns: list[Array], unknowns: list[dict[int, Array]], target: Ar
     }
     right = [sum(a * left[i] for i, a in part) for part in parts]
     active = [x > 0 for x in k]
-    active[-1] &= k[-1] < cap
+    active[-1] &= k[-1] < target.cap
     slope, step, error = _solve(matrix, right, active, count - grey)
-    residual = jax.lax.map(lambda one: one[0] - sum(map(operator.mul, k, one[1])), (target, columns))
+    residual = jax.lax.map(lambda one: one[0] - sum(map(operator.mul, k, one[1])), (target.shown, columns))
     cost = over_channels(jnp.sum(residual * residual, axis=0))[0]
-    errors = [jnp.broadcast_to(value, target.shape[1:]) for value in error[:count]]
+    errors = [jnp.broadcast_to(value, target.shown.shape[1:]) for value in error[:count]]
     slope, step, error = (some[len(some) - len(unknowns) :] for some in (slope, step, error))
     return _Point(k, errors, slope, step, error, cost)
 
 
-def _sums(columns: Sequence[Array], target: Array) -> tuple[list[list[Array]], list[Array]]:
-    """The Gram matrix of columns, (D, T), and their moments with what the photographs show, (C, T)."""
+def _sums(
+    columns: Sequence[Array], target: Target, shared: Collection[int] = ()
+) -> tuple[list[list[Array]], list[Array]]:
+    """The Gram matrix of columns, (D, T), and their moments with what the photographs show, (C, T).
+
+    Args:
+        columns: U of (P, D, T).
+        target: what the photographs show.
+        shared: columns whose coefficient the channels share.
+    """
     size = range(len(columns))
     upper = {(i, j): jnp.sum(columns[i] * columns[j], axis=0) for j in size for i in size[: j + 1]}
-    return [[upper[min(i, j), max(i, j)] for j in size] for i in size], [jnp.sum(x * target, axis=0) for x in columns]
+    gram = [[upper[min(i, j), max(i, j)] for j in size] for i in size]
+    return gram, [_moment(column, target, i in shared) for i, column in enumerate(columns)]
+
+
+def _moment(column: Float[Array, "P D T"], target: Target, shared: bool) -> Float[Array, "C T"]:
+    """Of a column with what the photographs show; where channels share its coefficient the first has that of all."""
+    if not shared:
+        return jnp.sum(column * target.shown, axis=0)
+    channels = target.shown.shape[1]
+    first = jnp.arange(channels)[:, None] == 0
+    return jnp.where(first, jnp.sum(column[:, 0] * target.summed, axis=0), 0)
 
 
 def _upper(gram: list[list[Array]]) -> dict[tuple[int, int], Array]:
@@ -481,24 +517,33 @@ def nonnegative(
     """
     if not grey:
         return _bounded(gram, moment, high)
-    last, inner = len(gram) - 1, [row[:-1] for row in gram[:-1]]
-    upper = _upper(gram)
+    # channel by channel, in arrays of their own: a short axis between the lanes would cost four times as much
+    last, channels = len(gram) - 1, range(len(moment[-1]))
+    grams = [[[x[c % len(x)] for x in row] for row in gram] for c in channels]
+    moments = [[b[c] for b in moment] for c in channels]
 
-    def others(shared: Array) -> list[Array]:
-        right = [b - row[-1] * shared for b, row in zip(moment[:-1], gram[:-1], strict=True)]
-        return _bounded(inner, right, jnp.asarray(jnp.inf))
+    def others(shared: Array) -> list[list[Array]]:
+        rights = [
+            [b - row[-1] * shared for b, row in zip(own[:-1], rows, strict=False)]
+            for own, rows in zip(moments, grams, strict=True)
+        ]
+        inner = [[row[:-1] for row in rows[:-1]] for rows in grams]
+        return [_bounded(rows, right, jnp.asarray(jnp.inf)) for rows, right in zip(inner, rights, strict=True)]
 
-    def newton(_: Any, active: list[Array]) -> list[Array]:
-        return [x > 0 for x in others(solved(active))]
+    def solved(active: list[list[Array]]) -> Array:
+        systems = zip(map(_upper, grams), moments, active, strict=True)
+        left = [_eliminate(upper, enumerate(own), moves, range(last))[1] for upper, own, moves in systems]
+        square, right = (
+            functools.reduce(operator.add, terms)
+            for terms in zip(*((matrix[last, last], rest[last]) for matrix, rest in left), strict=True)
+        )
+        return jnp.clip(divide(right, square), 0, high)
 
-    def solved(active: list[Array]) -> Array:
-        _, (square, right) = _eliminate(upper, enumerate(moment), active, range(last))
-        whole = over_channels(jnp.broadcast_to(square[last, last], right[last].shape))
-        return jnp.clip(divide(over_channels(right[last]), whole), 0, high)
-
-    start = [jnp.ones(moment[-1].shape, bool)] * last
-    shared = solved(jax.lax.fori_loop(0, steps, newton, start))
-    return [*others(shared), jnp.broadcast_to(shared, moment[-1].shape)]
+    shared = solved([[jnp.ones(high.shape, bool)] * last for _ in channels])
+    for _ in range(steps):
+        shared = solved([[x > 0 for x in own] for own in others(shared)])
+    free = [jnp.stack(one) for one in zip(*others(shared), strict=True)]
+    return [*free, jnp.broadcast_to(shared, moment[-1].shape)]
 
 
 def _bounded(gram: list[list[Array]], moment: list[Array], high: Array) -> list[Array]:
