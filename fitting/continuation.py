@@ -23,9 +23,13 @@ LEAST_NOISE = 1e-4
 REACH, NEARER = 7.0, 5.0
 # Newton's steps at one s; a step that gains less ends them, at the last s and on the way there.
 MOST_STEPS, LEAST_GAIN, ROUGH_GAIN = 12, 1e-3, 0.1
+# Steps of so many of the errors that were known with more noise cost something.
+STEADY = 10.0
 # The noise is known well enough where its step is no larger than this factor; so many steps at most.
 ENOUGH_KNOWN, MOST_NOISES = 1.02, 60
 MOST_TELLING = 10.0
+# So many values have to tell of a number before the Hessian is taken for its error.
+FEWEST_VALUES = 6.0
 # Where the Hessian is no larger all values are surely inside their codes.
 NOTHING = 1e-100
 
@@ -162,7 +166,7 @@ def maximise(
     """
     at, known, before, low, high, largest = start, [], None, -math.inf, math.inf, math.log(first)
     for _ in range(MOST_NOISES):
-        at, said = _climb(problem, at, ROUGH_GAIN)
+        at, said = _climb(problem, at, ROUGH_GAIN, known)
         known.append(precision(problem, at, said))
         now, score = math.log(at.noise), said.by_log_noise
         low, high = (max(low, now), high) if score > 0 else (low, min(high, now))
@@ -175,21 +179,27 @@ def maximise(
         if abs(step) < math.log(enough):
             break
         at = at._replace(noise=math.exp(now + step))
-    at, said = _climb(problem, at, LEAST_GAIN)
+    at, said = _climb(problem, at, LEAST_GAIN, known)
     return at, [*(entry for entry in known if entry.noise > at.noise), precision(problem, at, said)]
 
 
-def _climb(problem: Problem, at: Estimate, enough: float) -> tuple[Estimate, Score]:
-    """Newton's method at a given noise, with the pixels that say something there, to what gains next to nothing."""
-    design = problem.design
+def _climb(problem: Problem, at: Estimate, enough: float, known: Sequence[Precision]) -> tuple[Estimate, Score]:
+    """Newton's method at a given noise, with the pixels that say something there, to what gains next to nothing.
+
+    What they say nothing of stays where more noise has put it, as a small highlight none of whose pixels lies near an
+    edge: steps cost something by the errors that were known.
+    """
+    design, start = problem.design, at
+    damping = 1 / (STEADY**2 * least_variance(known)) if known else np.zeros(len(design))
     values = problem.near(at, REACH)
+    now = problem.score(at, values)
     while True:
-        now = problem.score(at, values)
         for _ in range(MOST_STEPS):
             base = np.where(problem.signed, 0.0, at.unknowns)
-            hessian = design.T @ now.hessian @ design
+            damped = now.hessian + np.diag(damping)
+            hessian = design.T @ damped @ design
             hessian[np.diag_indices_from(hessian)] *= 1 + 1e-9
-            product = design.T @ (now.gradient + now.hessian @ base)
+            product = design.T @ (now.gradient + damped @ base)
             step = design @ nonnegative_minimum(hessian, product, problem.signed @ (design != 0)) - base
             # What the step is going to gain.
             if step @ (now.gradient - 0.5 * now.hessian @ step) < enough:
@@ -208,6 +218,10 @@ def _climb(problem: Problem, at: Estimate, enough: float) -> tuple[Estimate, Sco
         before, values = values, problem.near(at, NEARER, values)
         if values is before:
             return at._replace(value=now.value), now
+        now, first = problem.score(at, values), problem.score(start, values)
+        if first.value > now.value:
+            # What was left out would have held it back.
+            at, now = start, first
 
 
 def precision(problem: Problem, at: Estimate, said: Score) -> Precision:
@@ -230,31 +244,38 @@ def precision(problem: Problem, at: Estimate, said: Score) -> Precision:
     return Precision(at.noise, information, np.diag(influence), count)
 
 
-def telling(known: Sequence[Precision], fewest: Float[np.ndarray, " U"]) -> Precision:
+def telling(known: Sequence[Precision]) -> Precision:
     """Where the values say most of all unknowns together, and enough of them of each.
 
     With less noise all pixels of a small highlight may lie well inside their codes, and the Hessian there says nothing.
 
     Args:
         known: from much noise to little.
-        fewest: so many values have to tell of each unknown.
     """
-    enough = [entry for entry in known[1:] if np.all((entry.values >= fewest) | (known[0].variance == 0))]
+    enough = [entry for entry in known[1:] if np.all((entry.values >= FEWEST_VALUES) | (known[0].variance == 0))]
     return max([known[0], *enough], key=lambda entry: entry.information)
 
 
-def widening(known: Sequence[Precision], most: Precision, fewest: Float[np.ndarray, " U"]) -> Float[np.ndarray, " U"]:
+def least_variance(known: Sequence[Precision]) -> Float[np.ndarray, " U"]:
+    """Variance of each unknown where it is known best by enough values; infinite where it is not known at all.
+
+    Args:
+        known: from much noise to little.
+    """
+    variance = np.array([entry.variance for entry in known])
+    enough = np.array([entry.values for entry in known]) >= FEWEST_VALUES
+    # With the most noise all values tell.
+    enough[0] = True
+    return np.min(np.where(enough & (variance > 0), variance, np.inf), axis=0)
+
+
+def widening(known: Sequence[Precision], most: Precision) -> Float[np.ndarray, " U"]:
     """What to multiply errors by: each unknown is known as well as where enough values still tell of it.
 
     Args:
         known: from much noise to little.
         most: of which the errors are.
-        fewest: so many values have to tell of each unknown.
     """
-    variance = np.array([entry.variance for entry in known])
-    enough = np.array([entry.values for entry in known]) >= fewest
-    # With the most noise all values tell.
-    enough[0] = True
-    least = np.min(np.where(enough & (variance > 0), variance, np.inf), axis=0)
+    least = least_variance(known)
     ratio = np.divide(least, most.variance, out=np.ones_like(least), where=(most.variance > 0) & np.isfinite(least))
     return np.sqrt(ratio)

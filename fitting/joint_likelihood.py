@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 from fitting.continuation import REACH, Estimate, Score, maximise, noise_score, precision, telling, together, widening
 from fitting.joint_problem import NOT_NEGATIVE, JointProblem, linearised
 from fitting.likelihood import Bounds, Intervals, residual_deviation
-from fitting.maximum_likelihood import FEWEST_VALUES, FIRST_NOISE, alike
+from fitting.maximum_likelihood import FIRST_NOISE, alike
 from fitting.pixels import Observed
 from fitting.uncertainty.structure import Errors, block_scatter
 
@@ -48,23 +48,22 @@ def most_likely_numbers(problem: JointProblem, seen: Observed, vector: Float[np.
     bounds = [tile.bounds for tile in seen.tiles if tile.bounds is not None and not tile.bounds.exact]
     if len(bounds) < len(seen.tiles):
         return None
-    pictures = RenderedPictures(problem, bounds, vector)
+    pictures = RenderedPictures(problem, bounds, vector, copies=seen.copies)
     codes = pictures.codes(vector)
     noise = max(residual_deviation(bounds, codes), FIRST_NOISE)
     if any(own.lossy for own in bounds):
         pictures.weights = [alike(own, code, noise) for own, code in zip(bounds, codes, strict=True)]
     at, known = maximise(pictures, Estimate(vector, noise))
+    most = telling(known)
+    at_most = at._replace(noise=most.noise)
+    said = pictures.score(at_most, pictures.near(at_most, REACH))
     freed = list(zip(problem.names, problem.freed(), strict=True))
     shared = np.repeat(
         [name not in NOT_NEGATIVE or not leaf.ndim for name, leaf in freed], [leaf.size for _, leaf in freed]
     )
     # Copies of a value tell no more of what all channels share.
-    copies = np.where(shared, seen.colour.size if seen.copies else 1, 1)
-    fewest = FEWEST_VALUES * copies
-    most = telling(known, fewest)
-    at_most = at._replace(noise=most.noise)
-    said = pictures.score(at_most, pictures.near(at_most, REACH))
-    wider = widening(known, precision(pictures, at_most, said), fewest) * np.sqrt(copies)
+    copies = np.where(shared & seen.copies, seen.colour.size, 1)
+    wider = widening(known, precision(pictures, at_most, said)) * np.sqrt(copies)
     return Likely(at.unknowns, said.hessian, pictures.scatter(said), wider)
 
 
@@ -89,17 +88,20 @@ class _Said(NamedTuple):
 class RenderedPictures:
     """Rounded pictures and the freed numbers of the scenes that they show: a `fitting.continuation.Problem`."""
 
-    def __init__(self, problem: JointProblem, bounds: Sequence[Bounds], start: Float[np.ndarray, " U"]):
+    def __init__(
+        self, problem: JointProblem, bounds: Sequence[Bounds], start: Float[np.ndarray, " U"], *, copies: bool
+    ):
         """Take the pictures as they are.
 
         Args:
             problem: what is freed.
             bounds: of each picture, between which codes its values lay.
             start: the freed numbers, or nearly so.
+            copies: the channels are copies of each other, and tell of a number once.
         """
         self._problem = dataclasses.replace(problem, weights=[None] * len(bounds))
         self._bounds, self.design, self.signed = bounds, problem.design(start), ~problem.bounded
-        self._exponents = problem.exponents
+        self._exponents, self._copies = problem.exponents, copies
         self.weights = [np.ones(own.lower.shape) for own in bounds]
 
     def codes(self, vector: Float[np.ndarray, " U"]) -> list[Float[np.ndarray, "P C"]]:
@@ -160,6 +162,7 @@ class RenderedPictures:
         squares = np.zeros(len(influence))
         for one in said.said:
             share = np.einsum("uv,vpc->upc", influence, one.columns, optimize=True) ** 2 * one.weight
+            share = share.sum(axis=-1, keepdims=True) if self._copies else share
             squares += np.einsum("upc,upc->u", share, share)
         return squares
 

@@ -41,8 +41,6 @@ from fitting.solver.tied import design_of, join_channels
 
 # The largest change of log n in one step.
 LARGEST_SHIFT = 0.5
-# So many values have to tell of a number before the Hessian is taken for its error.
-FEWEST_VALUES = 6.0
 SUBSAMPLE = 16384
 # The noise of a part of the pixels is known well enough to this factor.
 ROUGHLY_KNOWN = 1.2
@@ -131,10 +129,8 @@ def most_likely(fit: ModelFit, *, copies: bool = False) -> ModelFit:
             return fit
         said = _reweighted(fit._replace(pictures=pictures), noise, rounding)
     else:
-        # Copies of a value tell no more of what all channels share.
-        fewest = np.full(optimum.x.size + 1, FEWEST_VALUES)
-        fewest[-1] *= optimum.square.size if copies else 1
-        said = _near_edges(fit._replace(pictures=pictures), Estimate(at.unknowns, max(noise, FIRST_NOISE)), fewest)
+        start = Estimate(at.unknowns, max(noise, FIRST_NOISE))
+        said = _near_edges(fit._replace(pictures=pictures), start, copies=copies)
     found = said.optimum
     optimum = dataclasses.replace(optimum, x=found.x, n=found.n, flat=found.flat)
     return fit._replace(optimum=optimum, evidence=said)
@@ -164,23 +160,23 @@ def alike(bounds: Bounds, codes: Float[np.ndarray, "P C"], noise: float) -> Floa
     return weight
 
 
-def _near_edges(fit: ModelFit, at: Estimate, fewest: Float[np.ndarray, " U"]) -> Evidence:
+def _near_edges(fit: ModelFit, at: Estimate, *, copies: bool) -> Evidence:
     """Where rounding is most of the noise: what pixels near the edge of a code say."""
     design, bounds = design_of(fit.free, fit.tied), (math.log(fit.n_range[0]), math.log(fit.n_range[1]))
     pictures, first = fit.pictures, 2.0
     if sum(picture.target.shape[0] for picture in pictures) > 2 * SUBSAMPLE:
         some = [_stratum(picture, SUBSAMPLE // len(pictures)) for picture in pictures]
-        at, known = maximise(_Separable(some, design, bounds), at, ROUGHLY_KNOWN)
+        at, known = maximise(_Separable(some, design, bounds, copies), at, ROUGHLY_KNOWN)
         # The whole picture has the pixels near an edge that a part of it lacks.
-        at, first = at._replace(noise=telling(known, fewest).noise), ROUGHLY_KNOWN
+        at, first = at._replace(noise=telling(known).noise), ROUGHLY_KNOWN
     near = [np.flatnonzero(_near(picture, at, REACH)) for picture in pictures]
     gathered = [_Pixels.of(picture.in_double(some)) for picture, some in zip(pictures, near, strict=True)]
-    problem = _Separable(gathered, design, bounds)
+    problem = _Separable(gathered, design, bounds, copies)
     at, known = maximise(problem, at, first=first)
-    most = telling(known, fewest)
+    most = telling(known)
     at_most = at._replace(noise=most.noise)
     said = problem.score(at_most, problem.near(at_most, REACH))
-    wider = widening(known, precision(problem, at_most, said), fewest)
+    wider = widening(known, precision(problem, at_most, said))
     working = [one.working() for one in said.said]
     optimum = _optimum(working, said, fit, Numbers.of(at))
     places = [_place(one.pixels.picture) for one in said.said]
@@ -331,11 +327,13 @@ class _Separable(NamedTuple):
         pixels: of each picture.
         design: what each free number moves of x_a, x_d, x_s, channel after channel, and log n.
         bounds: of log n.
+        copies: the channels are copies of each other, and tell of a number once.
     """
 
     pixels: Sequence[_Pixels]
     design: Float[np.ndarray, "U V"]
     bounds: tuple[float, float]
+    copies: bool
 
     @property
     def signed(self) -> Bool[np.ndarray, " U"]:
@@ -382,13 +380,15 @@ class _Separable(NamedTuple):
         """Sums of squares of each value's share."""
         squares, x_s = np.zeros(len(influence)), Numbers.of(at).x[2]
         for one in said.said:
-            weight = one.told.weight * one.slope**2
+            weight, together = one.told.weight * one.slope**2, np.zeros(1)
             for channel, factor in enumerate(x_s):
                 rows = influence[:, [channel, x_s.size + channel, 2 * x_s.size + channel, -1]]
                 share = (rows * np.array([1.0, 1.0, 1.0, factor])) @ one.columns[..., channel]  # (U, P)
                 share *= share
                 share *= weight[:, channel]
-                squares += np.einsum("up,up->u", share, share)
+                together = share + together if self.copies else share
+                if not self.copies or channel == x_s.size - 1:
+                    squares += np.einsum("up,up->u", together, together)
         return squares
 
 
