@@ -13,7 +13,7 @@ from project_paths import ROOT
 import brdf
 import fitting
 from brdf.images.writing import write_image
-from fitting.maps import map_fit
+from fitting.maps import map_bands
 from fitting.maps.kept_bands import KeptBands
 from fitting.maps.map_inputs import read_lights
 from fitting.maps.texels import nonnegative
@@ -329,9 +329,9 @@ def test_bad_arguments_are_told_in_one_line(change, words):
 
 def test_an_interrupted_run_goes_on_where_it_was(folder, tmp_path, monkeypatch):
     path, _ = folder
-    monkeypatch.setattr(map_fit, "BAND", 16)
+    monkeypatch.setattr(map_bands, "BAND", 16)
     whole, keep = fitting.fit_maps(path), tmp_path / "keep"
-    write, fit_band, calls = KeptBands.write, map_fit._fit_band, []
+    write, fit_band, calls = KeptBands.write, map_bands.fit_band, []
 
     def stops(self, start, layers):
         write(self, start, layers)
@@ -342,7 +342,7 @@ def test_an_interrupted_run_goes_on_where_it_was(folder, tmp_path, monkeypatch):
         with pytest.raises(KeyboardInterrupt):
             fitting.fit_maps(path, keep=keep)
     assert len(list(keep.iterdir())) == 1
-    monkeypatch.setattr(map_fit, "_fit_band", lambda *all: calls.append(0) or fit_band(*all))
+    monkeypatch.setattr(map_bands, "fit_band", lambda *all: calls.append(0) or fit_band(*all))
     again = fitting.fit_maps(path, keep=keep)
     assert len(calls) == 2
     for name, values in whole.layers().items():
