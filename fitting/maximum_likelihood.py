@@ -12,7 +12,7 @@ only the pixels near an edge are gathered for the last steps.
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -320,20 +320,28 @@ class _Some(NamedTuple):
     pixels: _Pixels
 
 
-class _Separable(NamedTuple):
-    """Rounded values, and the model of which they show the coefficients and the exponent.
+class _Separable:
+    """Rounded values, and the model of which they show the coefficients and the exponent."""
 
-    Attributes:
-        pixels: of each picture.
-        design: what each free number moves of x_a, x_d, x_s, channel after channel, and log n.
-        bounds: of log n.
-        copies: the channels are copies of each other, and tell of a number once.
-    """
+    def __init__(
+        self, pixels: Sequence[_Pixels], design: Float[np.ndarray, "U V"], bounds: tuple[float, float], copies: bool
+    ):
+        """State what is fitted.
 
-    pixels: Sequence[_Pixels]
-    design: Float[np.ndarray, "U V"]
-    bounds: tuple[float, float]
-    copies: bool
+        Args:
+            pixels: of each picture.
+            design: what each free number moves of x_a, x_d, x_s, channel after channel, and log n.
+            bounds: of log n.
+            copies: the channels are copies of each other, and tell of a number once.
+        """
+        self.pixels, self.design, self.bounds, self.copies = pixels, design, bounds, copies
+        self._last: tuple[Any, list[np.ndarray]] = (None, [])
+
+    def _codes(self, at: Estimate) -> list[Float[np.ndarray, "P C"]]:
+        """What is predicted, in codes; kept while only the noise changes."""
+        if self._last[0] is not at.unknowns:
+            self._last = at.unknowns, [_codes(part.picture, Numbers.of(at)) for part in self.pixels]
+        return self._last[1]
 
     @property
     def signed(self) -> Bool[np.ndarray, " U"]:
@@ -342,7 +350,8 @@ class _Separable(NamedTuple):
 
     def near(self, at: Estimate, reach: float, beside: list[_Some] | None = None) -> list[_Some]:
         """The pixels that say something, and those beside."""
-        which = [_near(part.picture, at, reach) for part in self.pixels]
+        both = zip(self.pixels, self._codes(at), strict=True)
+        which = [_bounds(part.picture).near(code, reach * at.noise) for part, code in both]
         if beside is not None:
             which = together(which, [one.which for one in beside])
         if which is None:
