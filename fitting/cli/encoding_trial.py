@@ -26,9 +26,7 @@ LESS = 0.9
 CLEARLY = 0.5
 
 
-def fit_either(
-    given: Given, say: Callable[[str], None] = lambda what: None, **how: Any
-) -> tuple[FitResult, tuple[str, ...]]:
+def fit_either(given: Given, say: Callable[[str], None] = lambda what: None, **how: Any) -> tuple[FitResult, FitInputs]:
     """Fit, where a file does not say how it is encoded under both interpretations.
 
     Args:
@@ -37,7 +35,7 @@ def fit_either(
         how: further arguments of `fitting.fit`; seconds are shared by the two fits.
 
     Returns:
-        The fit to keep, with a warning where the encoding is a guess or was changed; and what to tell of its inputs.
+        The fit to keep, with a warning where the encoding is a guess or was changed; and what was fitted.
 
     Raises:
         InputError: naming the file or option.
@@ -50,13 +48,13 @@ def fit_either(
     say(f"{what} as {_name(next(iter(silent.values())).encoding)}" if silent else what)
     inputs, result = _fit(given, {}, how)
     if not silent:
-        return result, inputs.notes
+        return result, inputs
     say(f"{what} as {_name(_other(next(iter(silent.values()))))}")
     try:
         others = {path: brdf.read_picture(path, encoding=_other(picture)) for path, picture in silent.items()}
         other_inputs, other = _fit(given, others, how)
     except InputError:
-        return result, inputs.notes  # under the other encoding it cannot be fitted at all
+        return result, inputs  # under the other encoding it cannot be fitted at all
     # To be compared where both count: each leaves out what under its own encoding is cut off.
     both = [mine & its for mine, its in zip(result.counted, other.counted, strict=True)]
     common = both if all(counted.any() for counted in both) else None
@@ -64,7 +62,7 @@ def fit_either(
     is_other, warning = judge(given.targets[0], next(iter(silent.values())), shares)
     if is_other:
         result, inputs = other, other_inputs
-    return dataclasses.replace(result, warnings=(*result.warnings, *warning)), inputs.notes
+    return dataclasses.replace(result, warnings=(*result.warnings, *warning)), inputs
 
 
 def _fit(given: Given, others: dict[Path, brdf.Picture], how: dict[str, Any]) -> tuple[FitInputs, FitResult]:

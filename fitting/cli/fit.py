@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 
 import brdf
@@ -139,8 +140,15 @@ def _freed(result: Any, names: list[str]) -> Any:
     """The fit again, with what the names say of the scenes freed; where a command was told so, beside the material."""
     import fitting
 
+    # As in their files: what was read has forgotten its codes.
+    targets = [
+        target
+        if file is None
+        else brdf.read_picture(file["path"], encoding=file["encoding"]).scaled(np.asarray(file["factor"]))
+        for target, file in zip(result.targets, result.files or [None] * len(result.targets), strict=True)
+    ]
     with named_as({"free": "--free"}):
-        found = fitting.fit_jointly(result.targets, result.scenes, result.material, names, mask=result.counted)
+        found = fitting.fit_jointly(targets, result.scenes, result.material, names, mask=result.counted)
     return dataclasses.replace(found, files=result.files, candidates=result.candidates)
 
 
@@ -158,4 +166,14 @@ def _fit_pictures(
 
     how["noise"] = None if noise is None else tuple(parse_numbers(noise, "--noise", 2, "READ,SHOT"))
     how["accuracy"] = None if accuracy is None else OnlyFit(accuracy)
-    return fit_either(given, say, **how)
+    result, inputs = fit_either(given, say, **how)
+    if not inputs.light_errors:
+        return result, inputs.notes
+    from fitting.photographs.light_error import with_light_errors
+
+    say("carrying the errors of the lights into those of the numbers")
+    try:
+        return with_light_errors(result, inputs.light_errors), inputs.notes
+    except brdf.InputError:
+        words = "the errors of the numbers are those under this light: its own is not in them"
+        return result, (*inputs.notes, words)

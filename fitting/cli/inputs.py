@@ -50,12 +50,14 @@ class FitInputs(NamedTuple):
         scenes: what they show.
         masks: pixels that count in each, or None for all.
         notes: what was found out on the way, for the person who waits.
+        light_errors: of the directions of lights that were found from the shading, in degrees.
     """
 
     pictures: list[brdf.Picture]
     scenes: list["brdf.Scene"]
     masks: list[Array | None]
     notes: tuple[str, ...] = ()
+    light_errors: tuple[float, ...] = ()
 
 
 def read_inputs(targets: list[Path], options: PictureOptions) -> Given:
@@ -161,6 +163,7 @@ def collect(given: Given) -> FitInputs:
     if _is_archive(targets):
         pictures, points, directions, intensities = _read_photographs(targets[0], mask)
         pictures, masks, notes = _exposed(pictures, options.exposure), [None] * len(pictures), ()
+        light_errors = ()
         named = {"direction": f"{targets[0]}: light_dirs", "intensity": f"{targets[0]}: light_intensities"}
     else:
         pictures = _exposed([read[target] for target in targets], options.exposure)
@@ -169,7 +172,7 @@ def collect(given: Given) -> FitInputs:
             from brdf.scene import load_scene
 
             return FitInputs(pictures, [load_scene(scene[0], options.within, scene[1])], masks)
-        points, directions, intensities, notes = _photographs(targets, options, pictures, mask, masks)
+        points, directions, intensities, light_errors, notes = _photographs(targets, options, pictures, mask, masks)
     from fitting.photographs.distant_light import photograph_scene
 
     around = np.ones((len(pictures), 1))
@@ -181,7 +184,7 @@ def collect(given: Given) -> FitInputs:
             photograph_scene(points, direction, intensity, ambient=ambient if options.ambient else None)
             for direction, intensity, ambient in zip(directions, intensities, around, strict=True)
         ]
-    return FitInputs(pictures, scenes, masks, notes)
+    return FitInputs(pictures, scenes, masks, notes, light_errors)
 
 
 def _exposed(pictures: list[brdf.Picture], exposure: str | None) -> list[brdf.Picture]:
@@ -237,6 +240,7 @@ def ball_in(sphere: str, mask: Array | None) -> tuple[Circle, tuple[str, ...]]:
 def _photographs(targets: list[Path], options: PictureOptions, pictures: Any, mask: Any, masks: Any) -> Any:
     """What the pixels of photographs under one distant light each see, the lights, and what to tell of it."""
     count, (height, width, channels), notes = len(targets), pictures[0].pixels.shape, ()
+    light_errors: tuple[float, ...] = ()
     if options.normals is None:
         circle, notes = ball_in(options.sphere or "", mask)
         points = ball_points((height, width), circle)
@@ -255,7 +259,7 @@ def _photographs(targets: list[Path], options: PictureOptions, pictures: Any, ma
             brighter = f", {100 * (light.strength / mean - 1):+.1f} % bright" if count > 1 else ""
             direction = ",".join(f"{value:.4f}" for value in light.direction)
             notes += (f"light of {target.name} from its shading: {direction} {stated_error(light)}{brighter}",)
-        notes += ("the errors of the numbers are those under this light: its own is not in them",)
+        light_errors = tuple(light.error for light in found)
     else:
         direction = parse_numbers(options.light or "", "--light", 3, "x,y,z: x right, y up, z to the camera; or fit")
         _require(any(direction), "--light", "must not have zero length, got 0,0,0", "Give a direction")
@@ -265,7 +269,7 @@ def _photographs(targets: list[Path], options: PictureOptions, pictures: Any, ma
         intensities = read_intensities(options.intensities, count)
         came = f"has {intensities.shape[1]} numbers a line, the pictures {channels} channels"
         _require(intensities.shape[1] in (1, channels), options.intensities, came, "Give one intensity per channel")
-    return points, directions, intensities, notes
+    return points, directions, intensities, light_errors, notes
 
 
 def light_of(
