@@ -169,11 +169,11 @@ class Tradeoff:
         """What to use, in words; where nothing keeps the accuracy that is said, and what comes closest."""
         best, closest = self.recommended, self.closest
         if best is not None:
-            words = f"recommended: {best.name} ({1e3 * best.seconds:.3g} ms, error {best.error:.1g})"
+            words = f"recommended: {best.name} ({_milliseconds(best.seconds)} ms, error {best.error:.1g})"
         elif closest is not None:
             words = (
                 f"nothing is recommended: no configuration that was measured keeps the accuracy of {self.accuracy:g}; "
-                f"the most accurate is {closest.name} ({1e3 * closest.seconds:.3g} ms, error {closest.error:.1g})"
+                f"the most accurate is {closest.name} ({_milliseconds(closest.seconds)} ms, error {closest.error:.1g})"
             )
         else:
             words = "nothing is recommended: no fit was measured"
@@ -216,7 +216,7 @@ class Tradeoff:
         for row in self.rows:
             name = row.name if row is self.default else self.brief(row)
             times = [row.seconds, row.spread] if row.runs > 1 else [row.seconds]
-            run = " ± ".join(f"{1e3 * time:.{0 if time >= 0.1 else 1}f}" for time in times)
+            run = " ± ".join(map(_milliseconds, times))
             numbers = f"{row.compile_seconds:.2f}", run, f"{row.rms:.1e}", f"{row.parameters:.1e}"
             style = "bold green" if row is self.recommended else "bold" if row is self.default else None
             table.add_row(name, *numbers, self.marks(row).replace("recommended, front", "recommended"), style=style)
@@ -269,6 +269,10 @@ class Tradeoff:
             figure = self.plot()
             figure.savefig(stage / "tradeoff.png", dpi=200)
             figure.savefig(stage / "tradeoff.pdf")
+
+
+def _milliseconds(seconds: float) -> str:
+    return f"{1e3 * seconds:.{0 if seconds >= 0.1 else 1}f}"
 
 
 def tradeoff(

@@ -74,7 +74,7 @@ def test_where_nothing_keeps_the_accuracy_nothing_is_recommended():
     assert found.closest is not None
     assert found.closest.name == "a"
     assert found.advice.startswith("nothing is recommended")
-    assert "the most accurate is a (1e+03 ms, error 0.01)" in found.advice
+    assert "the most accurate is a (1000 ms, error 0.01)" in found.advice
     assert [found.marks(one) for one in found.rows] == ["most accurate, front", "", ""]
 
 
