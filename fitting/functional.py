@@ -229,8 +229,9 @@ def solve(
         >>> print(f"{found.k_d[0]:.2f} {found.k_s[0]:.2f} {found.n:.1f}")
         0.30 0.60 20.0
     """
-    target, diffuse = jnp.asarray(target), jnp.asarray(diffuse)
+    target = jnp.asarray(target)
     dtype, channels = target.dtype, target.shape[1]
+    diffuse = jnp.asarray(diffuse, dtype)
     weight = jnp.ones(len(target), dtype) if weight is None else jnp.asarray(weight, dtype)
     ambient = jnp.broadcast_to(jnp.asarray(ambient, dtype), (channels,))
     groups = diffuse.shape[1]
@@ -288,7 +289,9 @@ def solve(
 def _solve_linearised(apply: Callable[[Any], Any], right: Any) -> Any:
     """Solve the linearised optimality, scaled by its diagonal: coefficients and exponent move pixels differently."""
     flat, unravel = jax.flatten_util.ravel_pytree(right)
-    columns = jax.lax.map(lambda unit: jax.flatten_util.ravel_pytree(apply(unravel(unit)))[0], jnp.eye(flat.size))
+    columns = jax.lax.map(
+        lambda unit: jax.flatten_util.ravel_pytree(apply(unravel(unit)))[0], jnp.eye(flat.size, dtype=flat.dtype)
+    )
     size = jnp.sqrt(jnp.abs(jnp.diagonal(columns)))
     size = jnp.where(size > 0, size, 1)
     return unravel(jnp.linalg.solve(columns.T / (size[:, None] * size), flat / size) / size)

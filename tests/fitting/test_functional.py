@@ -86,5 +86,8 @@ def test_of_two_valleys_the_lower_one_and_bounds_of_the_exponent():
     lobes = np.asarray(cosine)[:, 0] ** n
     costs = np.sum(np.asarray(target) ** 2) - (lobes @ np.asarray(target)[:, 0]) ** 2 / np.sum(lobes**2, axis=1)
     assert float(found.cost[0]) <= costs.min() + 1e-12
+    single = functional.solve(target.astype(np.float32), 0 * cosine, lambda n: cosine**n)
+    assert single.k_s.dtype == np.float32
+    np.testing.assert_allclose(single.n, found.n, rtol=1e-4)
     held = functional.solve(0.5 * cosine**30, cosine, lambda n: cosine**n, n_range=(50.0, 1e3))
     np.testing.assert_allclose(held.n, 50, rtol=1e-12)
