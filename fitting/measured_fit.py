@@ -33,6 +33,7 @@ from fitting.problem import check_choice, model_name
 from fitting.progress import waiting
 from fitting.report.saving import write_report
 from fitting.result import Parameter, Parameters
+from fitting.solver.losses import weights
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import search
 from fitting.uncertainty.covariance import residual_noise, uncertainty
@@ -430,21 +431,14 @@ def _lobe(model, samples):
 
 
 def _logarithmic(samples, solve, modelled):
-    """Least logarithmic loss by reweighting: the weighted squares have the gradient of the loss where they settle.
-
-    With a = log(1 + f cos), b = log(1 + m cos) the slope of the loss by m is -2 (a - b) cos / (1 + m cos), that of
-    weighted squares -2 w (f - m): equal for w = cos (a - b) / [(f - m) (1 + m cos)].
-    """
+    """Least logarithmic loss by reweighting: that of pictures, of values 1 + f cos."""
     positive, cosine = samples.values >= 0, samples.to_light[:, 2:]
     share = samples.solid_angle[:, None] * positive
     value = np.where(positive, samples.values, 0.0) * cosine
     # The first round's weights are those of a perfect model, which sees the tails that the peak would drown.
     best, least, model = None, np.inf, value
     for _ in range(_MOST_ROUNDS):
-        step, logarithms = value - model, np.log1p(value) - np.log1p(model)
-        small = np.abs(step) < 1e-9 * (1 + model)
-        slope = np.where(small, 1 / (1 + model), logarithms / np.where(small, 1.0, step))
-        found = solve(share * cosine**2 * slope / (1 + model))
+        found = solve(cosine**2 * weights("log", 1 + value, 1 + model, share, np.zeros(1)))
         model = modelled(found) * cosine
         cost = float(np.sum(share * (np.log1p(value) - np.log1p(model)) ** 2))
         if cost >= least * (1 - _ENOUGH):
