@@ -11,6 +11,7 @@ for adding one observation after the other.
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -24,7 +25,6 @@ from brdf.errors import InputError
 from brdf.lights.base import Light
 from brdf.models.base import SpecularMaterial
 from brdf.precision import working_precision
-from brdf.rendering import basis
 from fitting.progress import waiting
 from fitting.result import FitResult
 from fitting.solver.nnls import inverse_diagonal
@@ -273,15 +273,10 @@ def _cap(middle: np.ndarray, size: float, count: int) -> list[np.ndarray]:
 @eqx.filter_jit
 def _gram(material: brdf.Material, scene: brdf.Scene) -> Float[Array, "C 4 4"]:
     """Products of the columns of a picture: ambient, diffuse, lobe, and the lobe's derivative by n."""
-    model, channels = type(material), material.k_d.shape[0]
-    images = basis(model, scene)
-    nothing = jnp.zeros((images.points.mask.size, channels))
-    ambient = nothing if scene.ambient is None else nothing + scene.ambient
-    diffuse = nothing if images.diffuse is None else nothing + images.diffuse
-    lobe = slope = nothing
-    if isinstance(material, SpecularMaterial) and images.lobe is not None:
-        terms = images.lobe
-        lobe, slope = jax.jvp(lambda n: model.scale(n) * terms(n)[0], (material.n,), (jnp.ones_like(material.n),))
-        lobe, slope = nothing + lobe, nothing + slope
-    columns = jnp.where(images.points.mask.ravel()[:, None], jnp.stack([ambient, diffuse, lobe, slope]), 0)
-    return jnp.einsum("ipc,jpc->cij", columns, columns)
+    n = material.n if isinstance(material, SpecularMaterial) else jnp.ones(())
+    images, slopes = jax.jvp(partial(brdf.basis_images, type(material), scene), (n,), (jnp.ones_like(n),))
+    width, height = scene.resolution
+    nothing = jnp.zeros((height, width, material.k_d.shape[0]))
+    shown = (images.ambient, images.diffuse, images.specular, slopes.specular)
+    columns = jnp.stack([nothing if image is None else nothing + image for image in shown])
+    return jnp.einsum("ihwc,jhwc->cij", columns, columns)
