@@ -24,7 +24,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from brdf.models.base import SpecularMaterial
-from brdf.vectors import divide, dot, normalize, square_root
+from brdf.vectors import divide, dot, mirror_log_cosine, normalize, square_root
 
 OCTAVES = 16
 """The exponent is sought from 1 to 2^16: beyond, a lobe is narrower than the step between any two lights."""
@@ -38,6 +38,9 @@ and n would go up together without end."""
 
 JOINT_STEPS = 3
 """Gauss-Newton steps of material and normal together."""
+
+HIGHLIGHTS = (4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0)
+"""Exponents of a highlight that tells where the search for a normal starts."""
 
 GEMAN_MCCLURE = 2.0
 """Where the weight of a residual starts to fall, in deviations."""
@@ -255,7 +258,7 @@ def fit_at(
         return TexelFit(point.k, point.k_error, log_n, jnp.full_like(log_n, jnp.inf), point.cost)
     lobe, slope = columns.lobe(model, log_n)
     unknowns = [] if sure else [{len(columns.linear): slope}]
-    point = _evaluate([*columns.linear, lobe], unknowns, target, grey)
+    point = _evaluate([*columns.linear, lobe], unknowns, target, grey, free=True)
     return TexelFit(point.k, point.k_error, log_n, jnp.zeros_like(log_n) if sure else point.error[0], point.cost)
 
 
@@ -272,8 +275,9 @@ def fit_with_normals(
 ) -> tuple[TexelFit, Array, Array, Array]:
     """The best material and normal of each texel.
 
-    Lambert's law, fitted to what is neither highlight nor shadow, gives a normal, the search over n a material, and
-    Gauss-Newton both together; what no material explains is left out, n is sought once more, and both together again.
+    Lambert's law, fitted to what is neither highlight nor shadow, gives a normal, and a highlight alone, as of metals,
+    another. The search over n gives each a material, and Gauss-Newton takes the better of them with its normal
+    together; what no material explains is left out, n is sought once more, and both together again.
 
     Args:
         model: class of the material.
@@ -298,9 +302,15 @@ def fit_with_normals(
         fit = fit_texels(model, some, lights.columns(model, normal, counts), grey, finer)
         return *_jointly(model, some, counts, lights, grey, fit, normal), counts
 
-    start = lambert_normals(target.summed, seen, lights.to_light)
-    first = fit_texels(model, target, lights.columns(model, start, seen), grey, finer), start, seen[0], seen
-    return jax.lax.fori_loop(0, 2, again, first)
+    def first(normal: Array) -> tuple[TexelFit, Array]:
+        return fit_texels(model, target, lights.columns(model, normal, seen), grey, finer), normal
+
+    start = first(lambert_normals(target.summed, seen, lights.to_light))
+    if issubclass(model, SpecularMaterial):
+        shiny = first(highlight_normals(model, target.summed, seen, lights))
+        better = shiny[0].cost < start[0].cost
+        start = jax.tree.map(lambda a, b: jnp.where(better, a, b), shiny, start)
+    return jax.lax.fori_loop(0, 2, again, (*start, seen[0], seen))
 
 
 def _inliers(residual: Float[Array, "P T"], seen: Float[Array, "P T"]) -> Float[Array, "P T"]:
@@ -321,21 +331,47 @@ def lambert_normals(grey: Float[Array, "P T"], seen: Float[Array, "P T"], to_lig
     residuals: highlights are positive.
     """
 
-    def least_squares(weight: Array) -> Array:
-        roots = jnp.sqrt(weight)
-        axes = jax.lax.map(lambda one: [axis * one[1][None] for axis in one[0]], (to_light, roots))
-        gram, moment = _sums(axes, Target.of((roots * grey)[:, None]))
-        return jnp.stack(_solve(_upper(gram), moment, [], 0)[1])
-
     def step(_: Any, vector: Array) -> Array:
         predicted = to_light @ vector
         residual, lit = grey - predicted, jnp.where(predicted > 0, seen, 0)
         below = jnp.where(residual < 0, lit, 0)
         scale = divide(jnp.sum(below * residual**2, axis=0), jnp.sum(below, axis=0))
         ratio = divide(residual**2, GEMAN_MCCLURE**2 * scale)
-        return least_squares(lit / (1 + ratio) ** 2)
+        return _linear(to_light, lit / (1 + ratio) ** 2, grey)
 
-    return normalize(jax.lax.fori_loop(0, 8, step, least_squares(seen)).T).T
+    return normalize(jax.lax.fori_loop(0, 8, step, _linear(to_light, seen, grey)).T).T
+
+
+def highlight_normals(
+    model: Any, grey: Float[Array, "P T"], seen: Float[Array, "P T"], lights: Distant
+) -> Float[Array, "3 T"]:
+    """Normals by the highlight's law alone, for the best of some n.
+
+    It is (N·H)^n, or of Phong's models (L·R)^n where R is the view mirrored about N: the n-th root is linear in N or R.
+    Weights make the errors of the roots those of the values.
+    """
+    mirrors = model.log_cosine is mirror_log_cosine
+    axes = jnp.asarray(lights.to_light) if mirrors else normalize(lights.to_light + lights.to_view)
+    bright = jnp.maximum(divide(grey, jnp.max(grey, axis=0)), jnp.exp(_lowest(grey.dtype)))
+
+    def of_exponent(n: Array) -> tuple[Array, Array]:
+        root = jnp.exp(jnp.log(bright) / n)
+        vector = _linear(axes, seen * divide(bright, root) ** 2, root)
+        cosine = jnp.maximum(axes @ vector, 0)
+        return jnp.sum(seen * (bright - cosine**n) ** 2, axis=0), vector
+
+    cost, vector = jax.lax.map(of_exponent, jnp.asarray(HIGHLIGHTS, grey.dtype))
+    best = jnp.argmin(cost, axis=0)
+    found = normalize(jnp.take_along_axis(vector, best[None, None], axis=0)[0].T)
+    return normalize(found + lights.to_view if mirrors else found).T
+
+
+def _linear(axes: Array, weight: Float[Array, "P T"], value: Float[Array, "P T"]) -> Float[Array, "3 T"]:
+    """The vectors whose products with axes, (P, 3), are nearest to values."""
+    roots = jnp.sqrt(weight)
+    columns = jax.lax.map(lambda one: [axis * one[1][None] for axis in one[0]], (axes, roots))
+    gram, moment = _sums(columns, Target.of((roots * value)[:, None]))
+    return jnp.stack(_solve(_upper(gram), moment, [], 0)[1])
 
 
 def _jointly(
@@ -344,7 +380,7 @@ def _jointly(
     """Gauss-Newton of material and normal together; a step that does not lower the cost is cut to a quarter."""
     glossy = issubclass(model, SpecularMaterial)
 
-    def at(log_n: Array, normal: Array) -> _Point:
+    def at(log_n: Array, normal: Array, *, free: bool = False) -> _Point:
         frame = _frame(normal)
         n = jnp.exp(log_n)
         scale, change = jax.jvp(model.scale, (n,), (n,)) if glossy else (n, n)
@@ -373,7 +409,7 @@ def _jointly(
         first, last = int(lights.ambient is not None), len(basis) - 1
         by_n = [{last: slopes[0][1]}] if glossy else []
         tilts = [dict(enumerate(slope, start=first)) for slope in slopes[-2:]]
-        return _evaluate(basis, [*by_n, *tilts], target, grey)
+        return _evaluate(basis, [*by_n, *tilts], target, grey, free=free)
 
     def step(_: Any, state: Any) -> Any:
         log_n, normal, cost, change = state
@@ -388,7 +424,7 @@ def _jointly(
 
     state = fit.log_n, normal, jnp.full_like(fit.log_n, jnp.inf), [jnp.zeros_like(fit.log_n)] * 3
     log_n, normal, *_ = jax.lax.fori_loop(0, 1 + JOINT_STEPS, step, state)
-    point = at(log_n, normal)
+    point = at(log_n, normal, free=True)
     angle = square_root(point.error[-2] ** 2 + point.error[-1] ** 2)
     log_n_error = point.error[0] if glossy else fit.log_n_error
     return TexelFit(point.k, point.k_error, log_n, log_n_error, point.cost), normal, angle
@@ -426,7 +462,9 @@ class _Point(NamedTuple):
     cost: Array
 
 
-def _evaluate(columns: list[Array], unknowns: list[dict[int, Array]], target: Target, grey: bool) -> _Point:
+def _evaluate(
+    columns: list[Array], unknowns: list[dict[int, Array]], target: Target, grey: bool, *, free: bool = False
+) -> _Point:
     """The best coefficients, and the Gauss-Newton step of these and the nonlinear unknowns together.
 
     Args:
@@ -434,6 +472,8 @@ def _evaluate(columns: list[Array], unknowns: list[dict[int, Array]], target: Ta
         unknowns: of each nonlinear one the derivatives of the columns, by their index.
         target: what the photographs show.
         grey: whether the channels share the last coefficient, which has a cap.
+        free: whether a k_a or k_d of 0 is as unknown as others, as errors want it: what holds it there is noise, and n
+            would seem determined by light that the next draw gives to k_d. In a step it stays where it is.
     """
     count = len(columns)
     slopes = [(i, slope) for unknown in unknowns for i, slope in unknown.items()]
@@ -451,7 +491,7 @@ def _evaluate(columns: list[Array], unknowns: list[dict[int, Array]], target: Ta
         for u, v in itertools.combinations_with_replacement(range(len(parts)), 2)
     }
     right = [sum(a * left[i] for i, a in part) for part in parts]
-    active = [x > 0 for x in k]
+    active = [(x > 0) | (free and i < count - 1) for i, x in enumerate(k)]
     active[-1] &= k[-1] < target.cap
     slope, step, error = _solve(matrix, right, active, count - grey)
     residual = jax.lax.map(lambda one: one[0] - sum(map(operator.mul, k, one[1])), (target.shown, columns))

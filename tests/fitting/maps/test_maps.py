@@ -143,6 +143,35 @@ def test_normals_are_found_beside_the_material():
     assert 0.5 < np.median(angle) / np.median(maps.normal_error) < 2
 
 
+def seen_by_equation(lights, normal, k_d, k_s, n):
+    """Photographs (P, 1, T, 3) of texels of one material, grey but for three factors of k_d."""
+    half = (lights + VIEW) / np.linalg.norm(lights + VIEW, axis=1)[:, None]
+    cosine = np.maximum(lights @ normal.T, 0)
+    lobe = np.where(cosine > 0, np.maximum(half @ normal.T, 0) ** n, 0)
+    return (k_d * np.array([1.0, 0.6, 0.4]) * cosine[..., None] + k_s * lobe[..., None])[:, None]
+
+
+@pytest.mark.parametrize("n", [10.0, 40.0])
+def test_normals_of_what_shows_little_but_a_highlight(n):
+    random = np.random.default_rng(6)
+    place = random.uniform(-0.7, 0.7, (400, 2))
+    normal = np.column_stack([place, np.sqrt(1 - np.sum(place**2, axis=1))])
+    maps = fitting.fit_maps(seen_by_equation(dome(32), normal, 0.05, 0.6, n), dome(32), "fit")
+    angle = np.degrees(np.arccos(np.clip(np.sum(maps.normal[0] * normal, axis=-1), -1, 1)))
+    assert np.mean(angle < 1) > 0.98
+
+
+def test_a_k_d_at_its_bound_does_not_make_n_certain():
+    turn = 2 * np.pi * np.arange(32) / 32
+    ring = np.column_stack([0.6 * np.cos(turn), 0.6 * np.sin(turn), np.full(32, 0.8)])
+    normal = np.broadcast_to([np.sin(0.07), 0.0, np.cos(0.07)], (500, 3))  # n's least standard error here is 1
+    pictures = seen_by_equation(ring, normal, 0.1, 0.4, 9.0)
+    pictures = pictures + 0.01 * np.random.default_rng(7).normal(size=pictures.shape)
+    maps = fitting.fit_maps(pictures, ring, normal[None], specular="grey")
+    assert np.mean(np.any(maps.k_d == 0, axis=-1)) > 0.2
+    assert np.mean(maps.determined) < 0.1
+
+
 def test_without_a_light_near_the_mirror_direction_n_is_not_determined():
     lights = dome(24)
     lights = lights[lights[:, 2] < 0.8]
