@@ -382,7 +382,7 @@ class _Separable:
             noise_score(one.told, at.noise * _bounds(one.pixels.picture).spread, one.pixels.picture.weights)
             for one in said
         ]
-        value, by_log_noise, information = np.sum(by_noise, axis=0).tolist()
+        value, by_log_noise, information = np.array(by_noise).sum(axis=0).tolist()
         return Score(value, by_log_noise, information, normal.product, normal.gram, said)
 
     def squared_shares(self, at: Estimate, said: Score, influence: Float[np.ndarray, "U U"]) -> Float[np.ndarray, " U"]:
