@@ -45,6 +45,8 @@ class Bands:
         mine, count = own(len(self.starts)), len(self.starts)
         if len(mine) < count and self.kept is None:
             raise InputError("keep", "is missing", "Give a folder that all processes see, for the bands of each")
+        if len(mine) < count:
+            gathered({}, 1, (1,))  # connected before the work begins, processes notice at once where one is lost
         _, height, width, _ = self.given.shape
         layers: dict[str, np.ndarray] = {}
 

@@ -97,13 +97,17 @@ def test_two_processes_fit_the_bands_of_maps(tmp_path):
                 np.testing.assert_allclose(found[name], values, rtol=1e-5, equal_nan=True)
 
 
-def test_a_process_that_dies_is_told_and_leaves_nothing_that_looks_whole(tmp_path):
+@pytest.mark.parametrize(("how", "whole"), [("dies", 0), ("maps die", 1)])
+def test_a_process_that_dies_is_told_and_leaves_nothing_that_looks_whole(tmp_path, how, whole):
     start = time.monotonic()
-    (status, said), _ = run_two(tmp_path, "dies")
+    (status, said), _ = run_two(tmp_path, how)
     assert time.monotonic() - start < 120
     assert status == 2, said
     assert "error: mesh: has lost a process" in said
     assert not list(tmp_path.glob("*.npz"))
+    bands = list(tmp_path.glob("keep/[!.]*.npz"))  # of the process that lived
+    assert len(bands) == whole
+    assert all(dict(np.load(band)) for band in bands)
 
 
 def test_a_mesh_of_one_device_and_what_is_none():
