@@ -27,6 +27,11 @@ try {
     await page.waitForTimeout(200);
     return new URL(page.url()).hash.slice(1);
   };
+  // A busy machine takes its time to put the address back.
+  const restored = async () => {
+    await page.waitForFunction(() => location.hash.length < 2, undefined, { timeout: 10000 }).catch(() => {});
+    return state();
+  };
   const box = await page.locator("#canvas").boundingBox();
   const drag = async (from, to) => {
     await page.mouse.move(box.x + from[0] * box.width, box.y + from[1] * box.height);
@@ -41,7 +46,7 @@ try {
   seen.beside = await drag([0.02, 0.03], [0.06, 0.03]);
   seen.unlike = await page.locator(".pane:visible").count();
   await page.click("#own");
-  seen.own = await state();
+  seen.own = await restored();
   const numbers = page.locator(".number:not(.unknown) input[type=number]");
   for (let i = 0; i < await numbers.count(); i++) {
     await numbers.nth(i).fill(i === (await numbers.count()) - 1 ? "77" : String(0.1 + 0.05 * i));
@@ -55,7 +60,7 @@ try {
     seen.copied[format] = { text: await page.inputValue("#text"), losses: await text("#losses li") };
   }
   await page.click("#reset");
-  seen.reset = await state();
+  seen.reset = await restored();
   const poor = await browser.newPage();
   await poor.addInitScript(() => { HTMLCanvasElement.prototype.getContext = () => null; });
   await poor.goto(address);
