@@ -24,6 +24,7 @@ from brdf.lights.base import Lighting, stacked
 from brdf.lobes import (
     NO_LOBE,
     ROUGH,
+    STORED_SAMPLES,
     TILE,
     LightTerms,
     Lobe,
@@ -37,6 +38,9 @@ from brdf.lobes import (
 from brdf.models.base import Material, SpecularMaterial, check_model
 from brdf.precision import Precision, cast, working_precision
 from brdf.scene import Scene
+
+# Of so few pixels a program takes longer to make than to run: one serves lights of more or fewer samples.
+FEW_PIXELS = 4096
 
 
 class Basis(eqx.Module):
@@ -106,8 +110,8 @@ def _tabulated(
     return Basis(points, spread(diffuse), lobe)
 
 
-def _lighting(scene: Scene, points: SurfacePoints) -> Lighting:
-    return Lighting(stacked(scene.lights, jnp.asarray(points.position).dtype), scene.occluders)
+def _lighting(scene: Scene, points: SurfacePoints, fill_above: float = math.inf) -> Lighting:
+    return Lighting(stacked(scene.lights, jnp.asarray(points.position).dtype, fill_above), scene.occluders)
 
 
 class BasisImages(eqx.Module):
@@ -143,7 +147,8 @@ def basis_images(
     check_model(model)
     instance("scene", scene, Scene, "Write brdf.basis_images(brdf.BlinnPhong, scene)")
     points = scene.surface_points() if points is None else points
-    return _basis_images(model, points, scene.ambient, _lighting(scene, points), jnp.asarray(n))
+    fill_above = STORED_SAMPLES if points.mask.size <= FEW_PIXELS else math.inf
+    return _basis_images(model, points, scene.ambient, _lighting(scene, points, fill_above), jnp.asarray(n))
 
 
 @eqx.filter_jit

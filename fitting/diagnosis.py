@@ -44,8 +44,9 @@ DARK = 3.0
 # Of a step between codes: noise below that is mostly rounding.
 ROUNDED = 0.5
 # A mirrored picture explains more than this share of the structure. It is fitted with these exponents, and around the
-# best of them, the distance halved so often; coefficients so often, with weights from the slope of a file's curve.
-MIRRORED, EXPONENTS, HALVINGS, PASSES, CURVED = 0.5, np.geomspace(2, 1000, 16), 8, 2, 1e-4
+# best of them, the distance halved so often; coefficients so often, with weights from the slope of a file's curve. Some
+# of the exponents come first, by this stride.
+MIRRORED, EXPONENTS, FIRST, HALVINGS, PASSES, CURVED = 0.5, np.geomspace(2, 1000, 16), 5, 8, 2, 1e-4
 
 Images = list[Float[np.ndarray, "H W C"]]
 Masks = Sequence[Bool[np.ndarray, "H W"]]
@@ -175,7 +176,7 @@ class _Residual:
             if 2 * sum(map(np.count_nonzero, good)) < sum(map(np.count_nonzero, self.counted)):
                 continue
             before, size = self._squares(self.targets, self.fitted, good)
-            gain = before - self._least([np.flip(target, axis) for target in self.targets], good)
+            gain = before - self._least([np.flip(target, axis) for target in self.targets], good, before)
             share = min(gain / max(before - size, gain, 1.0), 1.0)
             if share > MIRRORED and gain > LEAST_SIZE**2:
                 remedy = "flip the picture, or the lights and the shape"
@@ -304,8 +305,11 @@ class _Residual:
         left = np.concatenate([(one - other)[some] for one, other, some in both]) / self.noise
         return float(np.sum(left**2)), left.size
 
-    def _least(self, targets: Images, good: Masks) -> float:
-        """Squares that the model leaves of other pictures: by all exponents, then around the best."""
+    def _least(self, targets: Images, good: Masks, enough: float) -> float:
+        """Squares that the model leaves of other pictures: by all exponents, then around the best.
+
+        Infinite where some exponents far apart all leave more than is enough.
+        """
 
         def leaves(n: float) -> float:
             parts = [self._basis(index, n) for index in range(len(self.scenes))]
@@ -319,7 +323,11 @@ class _Residual:
 
         if not isinstance(self.material, SpecularMaterial):
             return leaves(1.0)
-        least, n = min((leaves(float(n)), float(n)) for n in EXPONENTS)
+        some, others = EXPONENTS[FIRST::FIRST], np.delete(EXPONENTS, slice(FIRST, None, FIRST))
+        tried = [(leaves(n), n) for n in some.tolist()]
+        if min(tried)[0] > enough:
+            return math.inf
+        least, n = min([*tried, *((leaves(n), n) for n in others.tolist())])
         step = EXPONENTS[1] / EXPONENTS[0]
         for _ in range(HALVINGS):
             step = math.sqrt(step)

@@ -11,6 +11,7 @@ is no larger for a thousand lights than for two.
 
 import abc
 import functools
+import math
 import operator
 from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar, NamedTuple
@@ -54,10 +55,12 @@ class Light(Checked):
     Attributes:
         type_name: what ``type`` in a scene file says.
         emits: the places in a row whose product is a spectrum that the sample's intensity is proportional to.
+        weighs: the place among a sample's own numbers that its intensity is proportional to.
     """
 
     type_name: ClassVar[str]
     emits: ClassVar[tuple[int, ...]]
+    weighs: ClassVar[int] = -1
 
     @abc.abstractmethod
     def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
@@ -78,6 +81,10 @@ class Light(Checked):
         """The field that the picture is linear in, intensity or radiance, (C,)."""
         fields = vars(self)
         return fields["intensity" if "intensity" in fields else "radiance"]
+
+
+# Where samples are filled up, to so many at least, and to a power of four.
+FILLED = 256
 
 
 class LightStack(eqx.Module):
@@ -146,8 +153,14 @@ class Lighting(eqx.Module):
                 yield stack.kind, tuple(values[index] for values in rows), light[index]
 
 
-def stacked(lights: Sequence[Light], dtype: Any) -> tuple[LightStack, ...]:
-    """Lights as arrays, kind by kind; those of one kind that have no common shape, as of other channels, apart."""
+def stacked(lights: Sequence[Light], dtype: Any, fill_above: float = math.inf) -> tuple[LightStack, ...]:
+    """Lights as arrays, kind by kind; those of one kind that have no common shape, as of other channels, apart.
+
+    Args:
+        lights: of a scene.
+        dtype: of the arrays.
+        fill_above: lights of more samples get further ones that send nothing, so that one program serves many numbers.
+    """
     kinds: dict[Any, list[tuple[Any, ...]]] = {}
     for index, light in enumerate(lights):
         numbers, nodes = light.rows()
@@ -156,9 +169,21 @@ def stacked(lights: Sequence[Light], dtype: Any) -> tuple[LightStack, ...]:
     stacks = []
     for (kind, count, _), members in kinds.items():
         light, *values = map(_stack, zip(*members, strict=True))
+        values[count:] = _filled(values[count:], kind.weighs, fill_above)
         values = tuple(jnp.asarray(value, dtype) for value in values)
         stacks.append(LightStack(kind, values[:count], values[count:], light))
     return tuple(stacks)
+
+
+def _filled(nodes: Sequence[Any], weighs: int, above: float) -> list[Any]:
+    """Samples of lights, and further ones that send nothing, where there are more than so many."""
+    each = nodes[0].shape[1] if nodes else 0
+    if each <= above or not all(isinstance(values, np.ndarray) for values in nodes):
+        return list(nodes)
+    more = max(4 ** math.ceil(math.log(each, 4) - 1e-9), FILLED) - each
+    found = [np.concatenate([values, np.repeat(values[:, -1:], more, axis=1)], axis=1) for values in nodes]
+    found[weighs][:, each:] = 0
+    return found
 
 
 def _stack(values: Sequence[Any]) -> Any:

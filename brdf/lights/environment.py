@@ -71,6 +71,7 @@ class ConstantEnvironment(Light):
     samples: int = eqx.field(static=True, converter=sample_number, default=CONSTANT_SAMPLES)
     type_name: ClassVar[str] = "environment"
     emits: ClassVar[tuple[int, ...]] = (0,)
+    weighs: ClassVar[int] = 2
 
     def __check_init__(self):
         """Refuse a single sample."""
@@ -149,6 +150,7 @@ class EnvironmentMap(Light):
     samples: int = eqx.field(static=True)
     type_name: ClassVar[str] = "environment"
     emits: ClassVar[tuple[int, ...]] = (0, 1)
+    weighs: ClassVar[int] = 0
 
     def __init__(self, pixels: Any, *, radiance: Any = 1.0, samples: int = MAP_SAMPLES):
         """Take a map's colour out where it has only one, and cut it up."""

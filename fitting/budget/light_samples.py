@@ -13,17 +13,16 @@ The first fit also says where n is, so that all pixels see their light samples i
 import dataclasses
 import functools
 import math
-from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 import brdf
 from brdf.errors import InputError
 from brdf.lobes import STORED_SAMPLES, Near
+from brdf.precision import working_precision
 from fitting.budget.configurations import MOST_SAMPLES, Configuration, run, sample_counts
 from fitting.budget.error_estimate import at_probes, filled, jacobian_places, probes
-from fitting.budget.sampling import MadeLights, compiled_at_pixels, with_samples
+from fitting.budget.sampling import MadeLights, with_samples
 from fitting.light_colour import coefficient_factors, take_colour_out
 from fitting.problem import FitProblem, has_pixel_areas
 from fitting.sample_error import MOST, SampleError, inverse, near_exponent
@@ -88,7 +87,7 @@ class _Ladder:
         self.result, self.kind, self.n, self.x = done.result, brdf.MODELS[model], max(optimum.n, 1e-3), optimum.x
         channels = self.x.shape[1]
         self.scenes = take_colour_out(problem.scenes, channels).scenes
-        places, peaks, self.parts = jacobian_places(optimum), [-np.inf], []
+        places, peaks, self.parts, self.seen = jacobian_places(optimum), [-np.inf], [], []
         most = max(64, PROBES // len(self.scenes))
         each = zip(self.scenes, done.result.counted, done.samples, problem.weights, strict=True)
         for scene, counted, sample, weight in each:
@@ -96,6 +95,7 @@ class _Ladder:
             few = with_samples(scene, self.first, lights)
             columns, peak = at_probes(few, part.pixel, self.kind, self.n, channels)
             peaks.append(np.max(peak, initial=-np.inf, where=share > 0))
+            self.seen.append(brdf.some_pixels(scene, filled(part.pixel), precision="float64"))
             self.parts.append((part.pixel, share, np.einsum("mci,cip->mcp", columns, places)))
         self.peak = min(max(peaks), 0.0)
         hessians = [np.einsum("m,mcp,mcq->pq", share, by, by, optimize=True) for _, share, by in self.parts]
@@ -106,12 +106,15 @@ class _Ladder:
     @functools.cache  # noqa: B019 - lives as long as the ladder
     def _shown(self, samples: int) -> list[np.ndarray]:
         """What the fit shows at the pixels, under so many samples."""
-        factors = coefficient_factors(self.kind, self.n, np.ones(self.x.shape[1]))
+        k = self.x / coefficient_factors(self.kind, self.n, np.ones(self.x.shape[1]))
         found = []
-        for scene, (pixel, share, _) in zip(self.scenes, self.parts, strict=True):
-            lit = with_samples(scene, samples, self.lights)
-            picture = _picture(lit, filled(pixel), "float64", self.kind, np.float64(self.n), self.x / factors)
-            found.append(np.asarray(picture)[: share.size])
+        with working_precision("float64"):
+            for seen, (_, share, _) in zip(self.seen, self.parts, strict=True):
+                lit = brdf.cast(with_samples(seen, samples, self.lights), "float64")
+                images = brdf.basis_images(self.kind, lit, self.n)
+                parts = zip(k, (images.ambient, images.diffuse, images.specular), strict=True)
+                shown = [one * np.asarray(image) for one, image in parts if image is not None]
+                found.append(np.sum(shown, axis=0).reshape(-1, k.shape[1])[: share.size])
         return found
 
     def _change(self, coarse: int, fine: int) -> tuple[np.ndarray, float]:
@@ -170,12 +173,3 @@ class _Ladder:
         assert optimum is not None
         profile = np.stack([optimum.grid, optimum.profile])
         return SampleError(self.near(told), self.hessian, self._missed(told)[0], profile)
-
-
-@compiled_at_pixels
-def _picture(scene: brdf.Scene, model: type[brdf.Material], n: Any, k: Any) -> Any:
-    """What coefficients show under grey light."""
-    images = brdf.basis_images(model, scene, n)
-    parts = zip(k, (images.ambient, images.diffuse, images.specular), strict=True)
-    shown = [one * image for one, image in parts if image is not None]
-    return functools.reduce(jnp.add, shown).reshape(-1, k.shape[1])
