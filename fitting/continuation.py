@@ -23,6 +23,8 @@ LEAST_NOISE = 1e-4
 REACH, NEARER = 7.0, 5.0
 # Newton's steps at one s; a step that gains less ends them, at the last s and on the way there.
 MOST_STEPS, LEAST_GAIN, ROUGH_GAIN = 12, 1e-3, 0.1
+# The largest change of the logarithm of an exponent in one step.
+LARGEST_SHIFT = 0.5
 # Steps of so many of the errors that were known with more noise cost something.
 STEADY = 10.0
 # The noise is known well enough where its step is no larger than this factor; so many steps at most.
@@ -279,3 +281,18 @@ def widening(known: Sequence[Precision], most: Precision) -> Float[np.ndarray, "
     least = least_variance(known)
     ratio = np.divide(least, most.variance, out=np.ones_like(least), where=(most.variance > 0) & np.isfinite(least))
     return np.sqrt(ratio)
+
+
+def where_most_is_told(
+    problem: Problem, at: Estimate, known: Sequence[Precision]
+) -> tuple[Score, Float[np.ndarray, " U"]]:
+    """What the values say of an estimate at the noise of which errors are, and what to multiply these by.
+
+    Args:
+        problem: values and their model.
+        at: the most likely unknowns.
+        known: what was known of them on the way.
+    """
+    at = at._replace(noise=telling(known).noise)
+    said = problem.score(at, problem.near(at, REACH))
+    return said, widening(known, precision(problem, at, said))

@@ -10,15 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from fitting.continuation import REACH, Estimate, Score, maximise, noise_score, precision, telling, together, widening
+from fitting.continuation import LARGEST_SHIFT, Estimate, Score, maximise, noise_score, together, where_most_is_told
 from fitting.joint_problem import NOT_NEGATIVE, JointProblem, linearised
 from fitting.likelihood import Bounds, Intervals, residual_deviation
 from fitting.maximum_likelihood import FIRST_NOISE, alike
 from fitting.pixels import Observed
 from fitting.uncertainty.structure import Errors, block_scatter
-
-# The largest change of log n in one step.
-LARGEST_SHIFT = 0.5
 
 
 class Likely(NamedTuple):
@@ -54,17 +51,14 @@ def most_likely_numbers(problem: JointProblem, seen: Observed, vector: Float[np.
     if any(own.lossy for own in bounds):
         pictures.weights = [alike(own, code, noise) for own, code in zip(bounds, codes, strict=True)]
     at, known = maximise(pictures, Estimate(vector, noise))
-    most = telling(known)
-    at_most = at._replace(noise=most.noise)
-    said = pictures.score(at_most, pictures.near(at_most, REACH))
+    said, wider = where_most_is_told(pictures, at, known)
     freed = list(zip(problem.names, problem.freed(), strict=True))
     shared = np.repeat(
         [name not in NOT_NEGATIVE or not leaf.ndim for name, leaf in freed], [leaf.size for _, leaf in freed]
     )
     # Copies of a value tell no more of what all channels share.
     copies = np.where(shared & seen.copies, seen.colour.size, 1)
-    wider = widening(known, precision(pictures, at_most, said)) * np.sqrt(copies)
-    return Likely(at.unknowns, said.hessian, pictures.scatter(said), wider)
+    return Likely(at.unknowns, said.hessian, pictures.scatter(said), wider * np.sqrt(copies))
 
 
 class _Some(NamedTuple):

@@ -21,16 +21,16 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fitting.continuation import (
+    LARGEST_SHIFT,
     LEAST_NOISE,
     REACH,
     Estimate,
     Score,
     maximise,
     noise_score,
-    precision,
     telling,
     together,
-    widening,
+    where_most_is_told,
 )
 from fitting.likelihood import AnyArray, Bounds, Intervals, LogLikelihood, residual_deviation
 from fitting.model_fit import Evidence, ModelFit
@@ -39,8 +39,6 @@ from fitting.solver.profile import Optimum, refit
 from fitting.solver.subsample import stratified
 from fitting.solver.tied import design_of, join_channels
 
-# The largest change of log n in one step.
-LARGEST_SHIFT = 0.5
 SUBSAMPLE = 16384
 # The noise of a part of the pixels is known well enough to this factor.
 ROUGHLY_KNOWN = 1.2
@@ -173,10 +171,7 @@ def _near_edges(fit: ModelFit, at: Estimate, *, copies: bool) -> Evidence:
     gathered = [_Pixels.of(picture.in_double(some)) for picture, some in zip(pictures, near, strict=True)]
     problem = _Separable(gathered, design, bounds, copies)
     at, known = maximise(problem, at, first=first)
-    most = telling(known)
-    at_most = at._replace(noise=most.noise)
-    said = problem.score(at_most, problem.near(at_most, REACH))
-    wider = widening(known, precision(problem, at_most, said))
+    said, wider = where_most_is_told(problem, at, known)
     working = [one.working() for one in said.said]
     optimum = _optimum(working, said, fit, Numbers.of(at))
     places = [_place(one.pixels.picture) for one in said.said]

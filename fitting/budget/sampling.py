@@ -22,8 +22,8 @@ from brdf.rendering import basis
 
 # Of the squares of each size this share is cut further.
 CUT = 1 / 12
-# Lights with an extent stand here for the position of their highlight.
-FEW_SAMPLES = 4
+# Lights with an extent stand here for the position of their highlight: by more samples than are compiled each by itself.
+FEW_SAMPLES = 9
 # Which a picture of no more pixels than this is not worth.
 FEWEST = 256
 
