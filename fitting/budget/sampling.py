@@ -22,7 +22,7 @@ from brdf.rendering import basis
 
 # Of the squares of each size this share is cut further.
 CUT = 1 / 12
-# Lights with an extent stand here for the position of their highlight: by more samples than are compiled each by itself.
+# Lights with an extent stand here for the position of their highlight, by more samples than are compiled one by one.
 FEW_SAMPLES = 9
 # Which a picture of no more pixels than this is not worth.
 FEWEST = 256

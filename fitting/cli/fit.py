@@ -8,7 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
 
 import brdf
@@ -142,9 +141,7 @@ def _freed(result: Any, names: list[str]) -> Any:
 
     # As in their files: what was read has forgotten its codes.
     targets = [
-        target
-        if file is None
-        else brdf.read_picture(file["path"], encoding=file["encoding"]).scaled(np.asarray(file["factor"]))
+        target if file is None else brdf.read_picture(file["path"], encoding=file["encoding"]).scaled(file["factor"])
         for target, file in zip(result.targets, result.files or [None] * len(result.targets), strict=True)
     ]
     with named_as({"free": "--free"}):
