@@ -151,15 +151,6 @@ class LogLikelihood(NamedTuple):
     weight: Float[AnyArray, "*shape"]
 
 
-def _module_of(values: AnyArray) -> Any:
-    return np if isinstance(values, np.ndarray) else jnp
-
-
-def _erfc(x: AnyArray) -> Any:
-    # NumPy has none; that of the standard library is for single numbers.
-    return np.asarray(_each_erfc(x), x.dtype) if isinstance(x, np.ndarray) else jax.scipy.special.erfc(x)
-
-
 _each_erfc = np.frompyfunc(math.erfc, 1, 1)
 
 
@@ -167,9 +158,11 @@ class _Ends:
     """An end of the interval: x, the normal tail beyond |x|, the density there."""
 
     def __init__(self, x: AnyArray):
-        self.x = x
-        self.xp = _module_of(x)
-        self.tail = 0.5 * _erfc(self.xp.abs(x) * math.sqrt(0.5))
+        self.x, self.xp = x, np if isinstance(x, np.ndarray) else jnp
+        distance = self.xp.abs(x) * math.sqrt(0.5)
+        # NumPy has no erfc; that of the standard library is for single numbers.
+        found = _each_erfc(distance) if self.xp is np else jax.scipy.special.erfc(distance)
+        self.tail = 0.5 * self.xp.asarray(found, distance.dtype)
         self.density = self.xp.exp(-0.5 * x * x - _LOG_ROOT_TWO_PI)
 
 
@@ -197,7 +190,7 @@ def _around(near: _Ends, far: _Ends, decay: AnyArray, holds: AnyArray) -> tuple[
 
 def _narrow(middle: AnyArray, width: AnyArray) -> tuple[AnyArray, AnyArray, AnyArray]:
     """The same by quadrature about the middle."""
-    xp = _module_of(middle)
+    xp = np if isinstance(middle, np.ndarray) else jnp
     total = first = second = xp.zeros_like(middle)
     for node, part in zip(_NODES.tolist(), _WEIGHTS.tolist(), strict=True):
         # From the near end, where the density is largest.
@@ -214,7 +207,7 @@ def _beyond(
     near: AnyArray, width: AnyArray, left: AnyArray, first: tuple[AnyArray, AnyArray], second: tuple[AnyArray, AnyArray]
 ) -> tuple[AnyArray, AnyArray, AnyArray]:
     """The same where the far end counts less: ``left`` of the density at the near one; Mills' ratios at both."""
-    xp = _module_of(near)
+    xp = np if isinstance(near, np.ndarray) else jnp
     (mills1, rest1), (mills2, rest2) = first, second
     mass = mills1 - mills2 * left
     value = xp.log(mass) - 0.5 * near**2 - _LOG_ROOT_TWO_PI
@@ -236,7 +229,7 @@ def interval(
         predicted: z, in the same units.
         s: standard deviation of the noise before rounding, above 0.
     """
-    xp = _module_of(predicted)
+    xp = np if isinstance(predicted, np.ndarray) else jnp
     a = xp.clip((lower - predicted) / s, -_FAR, _FAR)
     b = xp.clip((upper - predicted) / s, -_FAR, _FAR)
     above = a + b >= 0

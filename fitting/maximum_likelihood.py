@@ -95,10 +95,6 @@ class _Pixels(NamedTuple):
         bounds = _bounds(picture)
         return cls(picture, Intervals(bounds.lower, bounds.upper, bounds.spread))
 
-    def some(self, which: Bool[np.ndarray, " P"]) -> "_Pixels":
-        """Some of them, or themselves where these are all."""
-        return self if which.all() else _Pixels.of(self.picture.in_double(np.flatnonzero(which)))
-
 
 def most_likely(fit: ModelFit, *, copies: bool = False) -> ModelFit:
     """A fit by what rounded values and open ends say, from least squares on; as it is where they say no more.
@@ -174,7 +170,7 @@ def _near_edges(fit: ModelFit, at: Estimate, *, copies: bool) -> Evidence:
     said, wider = where_most_is_told(problem, at, known)
     working = [one.working() for one in said.said]
     optimum = _optimum(working, said, fit, Numbers.of(at))
-    places = [_place(one.pixels.picture) for one in said.said]
+    places = [_place(one.shown.pixels.picture) for one in said.said]
     return Evidence(working, optimum, at.noise, at.value, places, wider)
 
 
@@ -271,8 +267,9 @@ def _stated(picture: Picture, optimum: Optimum, noise: float, rounding: float) -
     if index.size:
         s = math.sqrt(max(noise**2 - rounding, LEAST_NOISE**2))
         pixels = _Pixels.of(picture.in_double(index))
-        said = _Said.of(pixels, Estimate(Numbers.of(optimum).unknowns, s))
-        told, radiance, slope = jax.tree.map(lambda part: part[: index.size], (said.told, said.radiance, said.slope))
+        shown = _Shown.of(pixels, Numbers.of(optimum))
+        told = pixels.intervals.said(shown.code, s)
+        told, radiance, slope = jax.tree.map(lambda part: part[: index.size], (told, shown.radiance, shown.slope))
         at_end, own = half[index], s * bounds.spread[index if bounds.spread.ndim else ...]
         weighs = np.broadcast_to(pixels.picture.weights, told.value.shape)[: index.size]
         curvature = told.weight * slope**2
@@ -335,7 +332,11 @@ class _Separable:
     def _codes(self, at: Estimate) -> list[Float[np.ndarray, "P C"]]:
         """What is predicted, in codes; kept while only the noise changes."""
         if self._last[0] is not at.unknowns:
-            self._last = at.unknowns, [_codes(part.picture, Numbers.of(at)) for part in self.pixels]
+            self._last = at.unknowns, []
+            x, log_n = Numbers.of(at)
+            for part in self.pixels:
+                radiance = np.asarray(part.picture.predicted(np.asarray(math.exp(log_n)), x))
+                self._last[1].append(_bounds(part.picture).codes(radiance)[0])
         return self._last[1]
 
     @property
@@ -351,7 +352,11 @@ class _Separable:
             which = together(which, [one.which for one in beside])
         if which is None:
             return beside or []
-        return [_Some(some, part.some(some)) for part, some in zip(self.pixels, which, strict=True)]
+        found = []
+        for part, some in zip(self.pixels, which, strict=True):
+            chosen = part if some.all() else _Pixels.of(part.picture.in_double(np.flatnonzero(some)))
+            found.append(_Some(some, chosen))
+        return found
 
     def active(self, at: Estimate) -> Bool[np.ndarray, " U"]:
         """Coefficients above 0, and the exponent where there is a highlight."""
@@ -369,12 +374,15 @@ class _Separable:
 
     def score(self, at: Estimate, values: Sequence[_Some]) -> Score:
         """What some pixels say."""
-        said = [_Said.of(some.pixels, at) for some in values]
+        said = []
+        for some in values:
+            shown = _Shown.of(some.pixels, Numbers.of(at))
+            said.append(_Said(shown, some.pixels.intervals.said(shown.code, at.noise)))
         sums = [one.sums() for one in said]
         weight, score = np.sum([one[0] for one in sums], axis=0), np.sum([one[1] for one in sums], axis=0)
         normal = join_channels(weight, score, np.zeros(len(score)), Numbers.of(at).x[2])
         by_noise = [
-            noise_score(one.told, at.noise * _bounds(one.pixels.picture).spread, one.pixels.picture.weights)
+            noise_score(one.told, at.noise * _bounds(one.shown.pixels.picture).spread, one.shown.pixels.picture.weights)
             for one in said
         ]
         value, by_log_noise, information = np.array(by_noise).sum(axis=0).tolist()
@@ -384,10 +392,10 @@ class _Separable:
         """Sums of squares of each value's share."""
         squares, x_s = np.zeros(len(influence)), Numbers.of(at).x[2]
         for one in said.said:
-            weight, together = one.told.weight * one.slope**2, np.zeros(1)
+            weight, together = one.told.weight * one.shown.slope**2, np.zeros(1)
             for channel, factor in enumerate(x_s):
                 rows = influence[:, [channel, x_s.size + channel, 2 * x_s.size + channel, -1]]
-                share = (rows * np.array([1.0, 1.0, 1.0, factor])) @ one.columns[..., channel]  # (U, P)
+                share = (rows * np.array([1.0, 1.0, 1.0, factor])) @ one.shown.columns[..., channel]  # (U, P)
                 share *= share
                 share *= weight[:, channel]
                 together = share + together if self.copies else share
@@ -396,46 +404,55 @@ class _Separable:
         return squares
 
 
-class _Said(NamedTuple):
-    """What each value of some pixels says of a prediction.
+class _Shown(NamedTuple):
+    """What an estimate shows at some pixels.
 
     Attributes:
         pixels: which.
-        told: log-likelihood, score and weight by the predicted code, (P, C).
-        radiance: that is predicted, (P, C).
+        code: that is predicted, (P, C).
+        radiance: likewise.
         slope: of the code by it, (P, C).
         columns: ambient, diffuse, lobe and derivative of the lobe by log n, (4, P, C).
     """
 
     pixels: _Pixels
-    told: LogLikelihood
+    code: Float[np.ndarray, "P C"]
     radiance: Float[np.ndarray, "P C"]
     slope: Float[np.ndarray, "P C"]
     columns: Float[np.ndarray, "4 P C"]
 
     @classmethod
-    def of(cls, pixels: _Pixels, at: Estimate) -> "_Said":
-        """At an estimate."""
-        x, n = Numbers.of(at).x, math.exp(at.unknowns[-1])
+    def of(cls, pixels: _Pixels, at: Numbers) -> "_Shown":
+        """By coefficients and an exponent."""
+        x, n = at.x, math.exp(at.log_n)
         columns = pixels.picture.columns(n)
         columns[3] *= n
         radiance = columns[0] * x[0] + columns[1] * x[1] + columns[2] * x[2]
         code, slope = _bounds(pixels.picture).codes(radiance)
-        return cls(pixels, pixels.intervals.said(code, at.noise), radiance, slope, columns)
+        return cls(pixels, code, radiance, slope, columns)
+
+
+class _Said(NamedTuple):
+    """What each value of some pixels says of what is shown there: log-likelihood, score and weight by the code."""
+
+    shown: _Shown
+    told: LogLikelihood
 
     def sums(self) -> tuple[Float[np.ndarray, "C 4 4"], Float[np.ndarray, "C 4"]]:
         """Products of the columns weighted by the values' weights, and with their scores."""
-        weight, told = self.pixels.picture.weights, self.told
-        score, curvature = weight * told.score * self.slope, weight * told.weight * self.slope**2
-        columns = np.moveaxis(self.columns, -1, 0)  # (C, 4, P)
+        weight, told = self.shown.pixels.picture.weights, self.told
+        score, curvature = weight * told.score * self.shown.slope, weight * told.weight * self.shown.slope**2
+        columns = np.moveaxis(self.shown.columns, -1, 0)  # (C, 4, P)
         products = (columns * curvature.T[:, None]) @ np.swapaxes(columns, 1, 2)
         return products, (columns @ score.T[..., None])[..., 0]
 
     def working(self) -> Picture:
         """Targets and weights with which least squares takes Newton's step."""
-        weight = self.told.weight * self.slope**2
-        step = np.divide(self.told.score * self.slope, weight, out=np.zeros_like(weight), where=weight > 0)
-        return dataclasses.replace(self.pixels.picture, target=self.radiance + step, weight=weight, bounds=None)
+        weight = self.told.weight * self.shown.slope**2
+        step = np.divide(self.told.score * self.shown.slope, weight, out=np.zeros_like(weight), where=weight > 0)
+        return dataclasses.replace(
+            self.shown.pixels.picture, target=self.shown.radiance + step, weight=weight, bounds=None
+        )
 
 
 def _near(picture: Picture, at: Estimate, reach: float) -> Bool[np.ndarray, " P"]:
