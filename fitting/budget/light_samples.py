@@ -11,7 +11,6 @@ The first fit also says where n is, so that all pixels see their light samples i
 """
 
 import dataclasses
-import functools
 import math
 
 import numpy as np
@@ -80,7 +79,7 @@ class _Ladder:
         """Fit some pixels under a first number of samples, and find how many it takes."""
         self.problem, self.lights, self.own = problem, lights, own
         self.counts = sorted({*LADDER, own, first})
-        self.first = first
+        self.first, self.made = first, dict[int, list[np.ndarray]]()
         done = run(problem, Configuration(model, problem.precision, PIXELS, self.first), lights)
         optimum = done.result.optimum
         assert optimum is not None
@@ -103,9 +102,13 @@ class _Ladder:
         self.active = np.append((self.x > 0).ravel(), bool((self.x[2] > 0).any()))
         self.samples = next(filter(self._enough, self.counts), self.counts[-1])
 
-    @functools.cache  # noqa: B019 - lives as long as the ladder
     def _shown(self, samples: int) -> list[np.ndarray]:
-        """What the fit shows at the pixels, under so many samples."""
+        """What the fit shows at the pixels, under so many samples; made once."""
+        if samples not in self.made:
+            self.made[samples] = self._made(samples)
+        return self.made[samples]
+
+    def _made(self, samples: int) -> list[np.ndarray]:
         k = self.x / coefficient_factors(self.kind, self.n, np.ones(self.x.shape[1]))
         found = []
         with working_precision("float64"):
