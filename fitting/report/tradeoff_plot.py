@@ -17,6 +17,7 @@ MARKS = {
     "precision": ("#009E73", "D"),
     "model": ("#E69F00", "P"),
     "solver": ("#56B4E9", "X"),
+    "rounding": ("#CC79A7", "v"),
 }
 # An error of 0, that of the reference itself, is drawn so far below the least one.
 BELOW = 8.0

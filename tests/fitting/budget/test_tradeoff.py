@@ -162,3 +162,14 @@ def test_fits_of_the_front_are_numbered_and_named():
     assert [text.get_text() for text in axes.texts] == ["1", "2", "3"]
     names = [text.get_text() for text in axes.get_legend().get_texts()]
     assert {"1024 pixels", "all pixels\n(default)", "16384 pixels\n(recommended)"} <= set(names)
+
+
+def test_what_rounding_says_is_measured_and_drawn(tmp_path, monkeypatch):
+    monkeypatch.setattr(speed_accuracy, "SOLVERS", ())
+    monkeypatch.setattr(speed_accuracy, "MOST_ROUNDS", 1)
+    scene = ball(48)
+    codes = np.clip(np.rint(255 * np.asarray(noisy(scene, 0.0))), 0, 255).astype(np.uint8)
+    found = fitting.tradeoff(codes, scene, seconds=600.0)
+    assert "rounding" in {one.axis for one in found.rows}
+    found.save(tmp_path / "out")
+    assert (tmp_path / "out" / "tradeoff.png").stat().st_size > 10000
