@@ -31,7 +31,6 @@ Example:
     (3,)
 """
 
-import itertools
 import math
 from collections.abc import Callable
 from functools import partial
@@ -41,8 +40,7 @@ import equinox as eqx
 import jax
 import jax.flatten_util
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Float
 
 import brdf
 from brdf.checks import instance
@@ -50,6 +48,8 @@ from brdf.errors import InputError
 from brdf.lobes import Lobe
 from brdf.models.base import SpecularMaterial, check_model
 from brdf.rendering import Basis, basis
+from fitting.solver.nnls import nonnegative_minima, solve_active
+from fitting.solver.profile import lowest_in_cells
 
 # As a function of log n a lobe varies on a scale of 1 or more; Hermite's cubic over such a cell finds every valley.
 GRID_STEP = 0.7
@@ -58,8 +58,6 @@ STEPS = {"float32": 4, "float64": 6}
 CLOSE = 1e-3
 # The nearest pixel shows exp(-UNSEEN) of a highlight's peak, or more, or the exponent is not looked at.
 UNSEEN = 60.0
-
-_SETS = np.array(list(itertools.product([False, True], repeat=3)))
 
 
 class Solution(NamedTuple):
@@ -310,7 +308,7 @@ def _search(
     residual = _residual(pixels, matt)
     profile = jax.vmap(lambda t: _point(pixels, jnp.stack(_derivatives(relative, t)[:2], 1), residual, matt))(grid)
     cost = jnp.sum(profile.cost, axis=(1, 2))
-    position, lowest = _cells(grid, cost, profile.slope)
+    position, lowest = lowest_in_cells(grid, cost, profile.slope)
     # Of the two lowest valleys the better one, after a step in each.
     beside = jnp.pad(lowest, 1, constant_values=jnp.inf)
     valleys = jnp.where((lowest <= beside[:-2]) & (lowest < beside[2:]), lowest, jnp.inf)
@@ -350,16 +348,6 @@ def _derivatives(function: Callable[[Array], Array], at: Array) -> tuple[Array, 
     return value, first, second
 
 
-def _cells(grid: Array, cost: Array, slope: Array) -> tuple[Array, Array]:
-    """Where in each cell of the grid the cubic through the samples is least, and how low."""
-    t = jnp.linspace(0.0, 1.0, 33, dtype=grid.dtype)
-    step = jnp.diff(grid)[:, None]
-    rise = jnp.diff(cost)[:, None]
-    bent = step * t * (1 - t) * ((1 - t) * slope[:-1, None] - t * slope[1:, None])
-    values = cost[:-1, None] + t * t * (3 - 2 * t) * rise + bent
-    return grid[:-1] + t[jnp.argmin(values, axis=1)] * step[:, 0], jnp.min(values, axis=1)
-
-
 def _residual(pixels: _Pixels, x: Array, lobe: Array | None = None) -> Array:
     """Of a model, (B, G, P)."""
     shown = x[..., :1] + x[..., 1:2] * pixels.diffuse[:, None]
@@ -388,11 +376,10 @@ def _point(pixels: _Pixels, lobes: Array, residual: Array, x: Array) -> _Point:
     gram = _gram(pixels, fixed, lobes)[:, None]
     weighted = pixels.weight * residual
     product = jnp.concatenate([jnp.einsum("bkp,bgp->bgk", some, weighted) for some in (fixed, lobes)], axis=-1)
-    best = _nonnegative(gram[..., :3, :3], product[..., :3], x, pixels.free)
+    tolerance = 2e-6 if gram.dtype == jnp.float32 else 1e-14
+    best = nonnegative_minima(gram[..., :3, :3], product[..., :3], x, pixels.free, tolerance)
     step = best - x
-    pull = product - jnp.einsum(
-        "bgi,bgij->bgj", step, jnp.broadcast_to(gram, (*product.shape, gram.shape[-1]))[..., :3, :]
-    )
+    pull = product - (step[..., None, :] @ gram[..., :3, :])[..., 0, :]
     cost = jnp.sum(weighted * residual, axis=-1) - jnp.sum(step * (product + pull)[..., :3], axis=-1)
     x_s = best[..., 2]
     slope = -2 * jnp.sum(x_s * pull[..., 3])
@@ -401,7 +388,7 @@ def _point(pixels: _Pixels, lobes: Array, residual: Array, x: Array) -> _Point:
     # The Schur complement of the exact Hessian in what is above 0.
     cross = x_s[..., None] * gram[..., 3, :3] - jnp.array([0, 0, 1]) * pull[..., 3:4]
     active = best > 0
-    along, _ = _solve_active(gram[..., :3, :3], jnp.where(active, cross, 0), active)
+    along, _ = solve_active(gram[..., :3, :3], jnp.where(active, cross, 0), active)
     own = x_s**2 * gram[..., 3, 3] - x_s * pull[..., 4]
     return _Point(best, jnp.maximum(cost, 0), slope, 2 * jnp.sum(own - jnp.sum(cross * along, axis=-1)))
 
@@ -426,47 +413,14 @@ def _errors(pixels: _Pixels, lobes: Array, x: Array, cost: Array, bounded: Array
     active, x_s = x > 0, x[..., 2:]
     noise = cost / jnp.maximum(jnp.count_nonzero(pixels.weight) - jnp.count_nonzero(active, axis=-1), 1)
     cross = jnp.where(active, x_s * gram[..., :3, 3], 0)
-    along, kept = _solve_active(gram[..., :3, :3], cross, active)
+    along, kept = solve_active(gram[..., :3, :3], cross, active)
     told = x_s[..., 0] ** 2 * gram[..., 3, 3] - jnp.sum(cross * along, axis=-1)
     total = jnp.sum(told)
     by_n = jnp.where(total > 0, jnp.sum(noise * told) / jnp.where(total > 0, total, 1) ** 2, jnp.inf)
     by_n = jnp.where(jnp.any(x_s > 0) & ~bounded, by_n, 0)
     units = jnp.broadcast_to(jnp.eye(3, dtype=x.dtype)[:, None, None], (3, *x.shape))
-    inverse, _ = jax.vmap(_solve_active, (None, 0, None), -1)(gram[..., :3, :3], units, active)
+    inverse, _ = jax.vmap(solve_active, (None, 0, None), -1)(gram[..., :3, :3], units, active)
     own = noise[..., None] * jnp.diagonal(inverse, axis1=-2, axis2=-1)
     variance = own + jnp.where(along == 0, 0, along**2 * by_n)
     variance = jnp.where(active & ((kept[..., None] <= 0) | ~(variance >= 0)), jnp.inf, variance)
     return jnp.sqrt(variance).reshape(-1, 3).T, jnp.sqrt(by_n)
-
-
-def _solve_active(
-    gram: Float[Array, "*K 3 3"], right: Float[Array, "*K 3"], active: Bool[Array, "*K 3"]
-) -> tuple[Array, Array]:
-    """Solve a system among the active unknowns, 0 beside them; and the smallest share that a pivot keeps."""
-    both = active[..., :, None] & active[..., None, :]
-    system = jnp.where(both, gram, jnp.eye(3, dtype=gram.dtype))
-    whole = jnp.concatenate([system, jnp.where(active, right, 0)[..., None]], axis=-1)
-    kept = jnp.full(right.shape[:-1], jnp.inf, gram.dtype)
-    for i in range(3):
-        pivot, diagonal = whole[..., i, i], system[..., i, i]
-        kept = jnp.minimum(kept, jnp.where(diagonal > 0, pivot / jnp.where(diagonal > 0, diagonal, 1), 0))
-        row = whole[..., i, :] / jnp.where(pivot == 0, 1, pivot)[..., None]
-        others = whole - whole[..., :, i, None] * row[..., None, :]
-        whole = jnp.where(jnp.arange(3)[:, None] == i, row[..., None, :], others)
-    return jnp.where(active, whole[..., 3], 0), kept
-
-
-def _nonnegative(gram: Array, product: Array, start: Array, free: Array) -> Array:
-    """Minimise (x - s) G (x - s) - 2 b (x - s) over x >= 0: every active set; see `fitting.solver.nnls`."""
-    tolerance = 2e-6 if gram.dtype == jnp.float32 else 1e-14
-    active = jnp.broadcast_to(jnp.asarray(_SETS).reshape(-1, *(1,) * (product.ndim - 1), 3), (8, *product.shape))
-    leave = jnp.where(active, 0, start)
-    gram = jnp.broadcast_to(gram, (*product.shape, 3))
-    right = product + jnp.einsum("...ij,s...j->s...i", gram, leave)
-    move, kept = _solve_active(jnp.broadcast_to(gram, (8, *gram.shape)), right, active)
-    x = jnp.where(active, start + move, 0)
-    feasible = (kept > tolerance) & jnp.all(~active | (free & (x >= 0)), axis=-1)
-    step = x - start
-    change = jnp.sum(step * (jnp.einsum("...ij,s...j->s...i", gram, step) - 2 * product), axis=-1)
-    best = jnp.argmin(jnp.where(feasible, change, jnp.inf), axis=0)
-    return jnp.take_along_axis(x, best[None, ..., None], axis=0)[0]

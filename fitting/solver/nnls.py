@@ -7,23 +7,55 @@
 """
 
 import itertools
+from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
+
+from fitting.likelihood import AnyArray
 
 # By so much rounding may lift a sum that has a cap over it.
 ROUNDING = 1e-12
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def solve_active(gram: Any, right: Any, active: Any) -> tuple[Any, Any]:
+    """Solve a symmetric system among the active unknowns, 0 beside them, by NumPy or JAX.
+
+    Gauss and Jordan; a symmetric definite system needs no pivoting. On a cap the last pivot is below 0.
+
+    Args:
+        gram: (..., U, U).
+        right: (..., U).
+        active: (..., U).
+
+    Returns:
+        The solution, and the smallest share of its diagonal entry that a pivot keeps.
+    """
+    xp: Any = np if isinstance(gram, np.ndarray) else jnp
+    size = gram.shape[-1]
+    system = xp.where(active[..., :, None] & active[..., None, :], gram, xp.eye(size, dtype=gram.dtype))
+    right = xp.broadcast_to(xp.where(active, right, 0), system.shape[:-1])
+    whole, kept = xp.concatenate([system, right[..., None]], axis=-1), xp.inf
+    for i in range(size):
+        pivot, diagonal = whole[..., i, i], system[..., i, i]
+        share = xp.where(diagonal > 0, pivot / xp.where(diagonal > 0, diagonal, 1), xp.where(pivot < 0, xp.inf, 0))
+        row = (whole[..., i, :] / xp.where(pivot == 0, 1, pivot)[..., None])[..., None, :]
+        others = whole - whole[..., :, i, None] * row
+        kept, whole = xp.minimum(kept, share), xp.where(np.arange(size)[:, None] == i, row, others)
+    return xp.where(active, whole[..., -1], 0), kept
+
+
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def nonnegative_minima(
-    gram: Float[np.ndarray, "*K U U"],
-    product: Float[np.ndarray, "*K U"],
-    start: Float[np.ndarray, "*#K U"],
-    free: Bool[np.ndarray, "*#K U"],
+    gram: Float[AnyArray, "*#K U U"],
+    product: Float[AnyArray, "*K U"],
+    start: Float[AnyArray, "*#K U"],
+    free: Bool[AnyArray, "*#K U"],
     tolerance: float,
     cap: Float[np.ndarray, "*#K U"] | None = None,
-) -> Float[np.ndarray, "*K U"]:
+) -> Any:
     """Minimise (x - s) G (x - s) - 2 b (x - s) over x at least 0, and w x at most 1 where there is a cap, exactly.
 
     A few unknowns have a few active sets: all are solved and the best feasible one is taken. That has no iterations and
@@ -31,18 +63,22 @@ def nonnegative_minima(
     The multiplier of a cap is one more unknown, which starts at 0.
 
     Args:
-        gram: G, of any number of problems.
+        gram: G, of any number of problems; by NumPy, or by JAX where it is an array of that.
         product: b.
         start: s.
         free: which unknowns may be above 0.
         tolerance: share of a diagonal entry below which what elimination leaves of it counts as rounding: the column
             then depends on the others, and a smaller active set does as well.
-        cap: w, at least 0.
+        cap: w, at least 0; by NumPy alone.
+
+    Returns:
+        x, (..., U).
 
     Source: for the sets on the cap, Nocedal and Wright, Numerical Optimization, 2006, section 16.5.
     """
+    xp: Any = np if isinstance(gram, np.ndarray) else jnp
     unknowns = product.shape[-1]
-    start, scale = np.broadcast_to(start, product.shape), np.ones(unknowns)
+    start, scale = xp.broadcast_to(start, product.shape), 1.0
     if cap is not None:
         # In units in which each counts 1, or rounding would lift a small one that counts much over the cap.
         scale = np.where(cap > 0, 1 / np.where(cap > 0, cap, 1.0), 1.0)
@@ -58,31 +94,21 @@ def nonnegative_minima(
     every = np.array(list(itertools.product([False, True], repeat=right.shape[-1])))
     x, feasible = start, np.zeros(0, bool)
     # Mostly all that may be above 0 are; where one is not, every set is tried.
-    for sets in (every[-1:], every) if cap is None else (every,):
+    for sets in (every[-1:], every) if cap is None and xp is np else (every,):
         active = sets.reshape(-1, *(1,) * (product.ndim - 1), right.shape[-1])
         if cap is None:
             active = active & free
-        whole = np.where(active, right + (system @ np.where(active, 0.0, begin)[..., None])[..., 0], 0.0)[..., None]
-        both = active[..., :, None] & active[..., None, :]
-        whole = np.concatenate([np.where(both, system, np.eye(right.shape[-1])), whole], axis=-1)
-        # Gauss and Jordan; a symmetric definite system needs no pivoting. On a cap the last pivot is below 0.
-        feasible = np.ones(whole.shape[:-2], bool)
-        for i, diagonal in enumerate(np.moveaxis(np.diagonal(whole, axis1=-2, axis2=-1).copy(), -1, 0)):
-            pivot = whole[..., i, i]
-            feasible &= np.where(diagonal > 0, pivot, -pivot) > tolerance * diagonal
-            row = whole[..., i, :] / np.where(pivot == 0, 1.0, pivot)[..., None]
-            whole -= whole[..., :, i, None] * row[..., None, :]
-            whole[..., i, :] = row
-        x = np.where(active, begin + whole[..., -1], 0.0)[..., :unknowns]
-        feasible &= np.all(~active[..., :unknowns] | (free & (x >= 0)), axis=-1)
+        move, kept = solve_active(system, right + (system @ xp.where(active, 0, begin)[..., None])[..., 0], active)
+        x = xp.where(active, begin + move, 0)[..., :unknowns]
+        feasible = (kept > tolerance) & xp.all(~active[..., :unknowns] | (free & (x >= 0)), axis=-1)
         if len(sets) == 1 and feasible.all():
             return x[0]
     if cap is not None:
         feasible &= np.sum(cap * x, axis=-1) <= 1 + ROUNDING
     step = x - start
-    change = np.sum(step * ((gram @ step[..., None])[..., 0] - 2 * product), axis=-1)
-    best = np.argmin(np.where(feasible, change, np.inf), axis=0)
-    return np.take_along_axis(x, best[None, ..., None], axis=0)[0] * scale
+    change = xp.sum(step * ((gram @ step[..., None])[..., 0] - 2 * product), axis=-1)
+    best = xp.argmin(xp.where(feasible, change, xp.inf), axis=0)
+    return xp.take_along_axis(x, best[None, ..., None], axis=0)[0] * scale
 
 
 def nonnegative_minimum(

@@ -23,6 +23,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -141,25 +142,15 @@ def search(
             cell = int(np.argmin(lowest))
             first, last = np.flatnonzero(possible)[[0, -1]]
             if last - first <= 3 and profile.slope[cell] < profile.slope[cell + 1]:
-                start = _start(profile, cell, float(position[cell]))
-                if cap is None:
-                    found = gauss_newton(problem, start, GRID_STEP)
-                else:
-                    ends = float(log_n[max(0, cell - 1)]), float(log_n[min(cell + 2, log_n.size - 1)])
-                    found = capped_minimum(problem, *ends, start.x)
+                found = _minimum(problem, profile, cell, float(position[cell]), beside=1)
                 # A minimum at the end of its reach is none, but for the bounds of the search.
                 if abs(found[0].log_n - position[cell]) < GRID_STEP or found[0].log_n in problem.bounds:
                     return _optimum(*found, problem, *about)
             log_n = log_n[max(0, first - 1) : last + 3]
             profile = solve_linear(sums(pictures, log_n, rough, problem.peak), log_n, rough, problem)
         position, *_ = _cells(profile)
-        candidates: list[tuple[Point, Sums]] = []
-        for cell in _valleys(profile, problem.tolerance):
-            start = _start(profile, cell, float(position[cell]))
-            if cap is None:
-                candidates.append(gauss_newton(problem, start, GRID_STEP))
-            else:
-                candidates.append(capped_minimum(problem, float(log_n[cell]), float(log_n[cell + 1]), start.x))
+        valleys = _valleys(profile, problem.tolerance)
+        candidates = [_minimum(problem, profile, cell, float(position[cell])) for cell in valleys]
         # Where the profile is level the best sample may be no worse than what the valleys led to.
         costs = profile.cost.sum(axis=1)
         if cap is None and np.min(costs) < min(np.sum(point.cost) for point, _ in candidates):
@@ -168,10 +159,14 @@ def search(
         return _optimum(*best, problem, *about)
 
 
-def _start(profile: Point, cell: int, position: float) -> Point:
-    """A point in a cell of the grid, with the coefficients of the nearer end."""
-    nearer = cell + int(2 * position > profile.log_n[cell] + profile.log_n[cell + 1])
-    return Point(position, profile.x[nearer], profile.cost[nearer])
+def _minimum(problem: Problem, profile: Point, cell: int, position: float, beside: int = 0) -> tuple[Point, Sums]:
+    """The minimum in a cell of the grid, or so many beside it, from the coefficients of the nearer end."""
+    log_n = profile.log_n
+    nearer = cell + int(2 * position > log_n[cell] + log_n[cell + 1])
+    if problem.cap is None:
+        return gauss_newton(problem, Point(position, profile.x[nearer], profile.cost[nearer]), GRID_STEP)
+    ends = float(log_n[max(0, cell - beside)]), float(log_n[min(cell + 1 + beside, log_n.size - 1)])
+    return capped_minimum(problem, *ends, profile.x[nearer])
 
 
 def refit(
@@ -236,24 +231,33 @@ def _sampling_errors(profile: Point, sample: Subsample, peak: float) -> np.ndarr
     return np.interp(profile.log_n, profile.log_n[few], np.sqrt(variance))
 
 
+def lowest_in_cells(log_n: Any, cost: Any, slope: Any) -> tuple[Any, Any]:
+    """Where in each cell of a grid the cubic of Hermite through the samples is least, and how low.
+
+    Args:
+        log_n: of the samples, (G,), in NumPy or JAX.
+        cost: at each.
+        slope: its derivative by log n.
+    """
+    xp: Any = np if isinstance(cost, np.ndarray) else jnp
+    t, step = xp.linspace(0.0, 1.0, 33, dtype=log_n.dtype), xp.diff(log_n)
+    bent = step[:, None] * t * (1 - t) * ((1 - t) * slope[:-1, None] - t * slope[1:, None])
+    values = cost[:-1, None] + t * t * (3 - 2 * t) * xp.diff(cost)[:, None] + bent
+    return log_n[:-1] + t[xp.argmin(values, axis=1)] * step, xp.min(values, axis=1)
+
+
 def _cells(profile: Point, error: Any = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where in each cell of the grid the cubic through the samples is least, how low, and whether it may be the best.
+    """The lowest place in each cell of the grid, how low, and whether it may be the best.
 
     Args:
         profile: On the grid.
         error: Standard deviation of the cost at each sample relative to the best.
     """
-    t = np.linspace(0.0, 1.0, 33)
-    cost, slope = profile.cost.sum(axis=1)[:, None], profile.slope[:, None]
-    step = np.diff(profile.log_n)
-    values = cost[:-1] + t * t * (3 - 2 * t) * (cost[1:] - cost[:-1])
-    values = values + step[:, None] * t * (1 - t) * ((1 - t) * slope[:-1] - t * slope[1:])
-    lowest = np.min(values, axis=1)
-    steeper, error = (np.maximum(a[:-1], a[1:]) for a in (np.abs(profile.slope), error + np.zeros(len(cost))))
-    margin = GRID_ERROR * step * steeper
+    position, lowest = lowest_in_cells(profile.log_n, profile.cost.sum(axis=1), profile.slope)
+    steeper, error = (np.maximum(a[:-1], a[1:]) for a in (np.abs(profile.slope), error + np.zeros(len(profile.log_n))))
+    margin = GRID_ERROR * np.diff(profile.log_n) * steeper
     best = np.argmin(lowest)
-    possible = lowest <= lowest[best] + DEVIATIONS * error + margin + margin[best]
-    return profile.log_n[:-1] + t[np.argmin(values, axis=1)] * step, lowest, possible
+    return position, lowest, lowest <= lowest[best] + DEVIATIONS * error + margin + margin[best]
 
 
 def _valleys(profile: Point, tolerance: float) -> np.ndarray:

@@ -15,7 +15,6 @@ from fitting.solver.tied import design_of, join_channels
 GRID_STEP = 0.35
 
 _MOST_CORRECTIONS = 8
-_MOST_SECANTS = 40
 
 # What rounding may leave of a column that depends on the others: a few units in the last place of the pixels.
 TOLERANCE_SINGLE = 2e-7
@@ -136,31 +135,23 @@ def capped_minimum(problem: Problem, lower: float, upper: float, x: np.ndarray) 
         lower: Logarithm of an exponent.
         upper: Likewise.
         x: Coefficients of a model near by, (C, 3).
-
-    Source: M. Dowell and P. Jarratt, "A modified regula falsi method", BIT 11 (1971) 168-174, the Illinois algorithm.
     """
+    from scipy.optimize import brentq  # late: few fits have a cap
 
-    def at(log_n: float, x: np.ndarray) -> tuple[Point, Sums]:
-        parts = sums(problem.pictures, np.array([log_n]), x, problem.peak)
-        solved = solve_linear(parts, np.array([log_n]), x, problem)
-        return Point(*(leaf[0] for leaf in solved)), Sums(*(leaf[0] for leaf in parts)).about(x)
+    found: dict[float, tuple[Point, Sums]] = {}
 
-    low, high = (at(log_n, x) for log_n in (lower, upper))
-    left, right = float(low[0].slope), float(high[0].slope)
-    if not left < 0 < right:
-        return min(low, high, key=lambda found: float(np.sum(found[0].cost)))
-    a, b, best = lower, upper, low
-    for _ in range(_MOST_SECANTS):
-        log_n = (a * right - b * left) / (right - left)
-        last, best = best, at(log_n, best[0].x)
-        slope = float(best[0].slope)
-        if slope == 0 or abs(best[0].log_n - last[0].log_n) <= problem.accuracy:
-            break
-        if slope < 0:
-            a, left, right = log_n, slope, right / 2 if last[0].slope < 0 else right
-        else:
-            b, right, left = log_n, slope, left / 2 if last[0].slope > 0 else left
-    return best
+    def slope(log_n: float) -> float:
+        nonlocal x
+        if log_n not in found:
+            parts = sums(problem.pictures, np.array([log_n]), x, problem.peak)
+            solved = solve_linear(parts, np.array([log_n]), x, problem)
+            found[log_n] = Point(*(leaf[0] for leaf in solved)), Sums(*(leaf[0] for leaf in parts)).about(x)
+            x = found[log_n][0].x
+        return float(found[log_n][0].slope)
+
+    if slope(lower) < 0 < slope(upper):
+        return found[brentq(slope, lower, upper, xtol=problem.accuracy)]
+    return min(found.values(), key=lambda found: float(np.sum(found[0].cost)))
 
 
 def _correct(parts: Sums, point: Point, problem: Problem, bounds: tuple[float, float]) -> tuple[Point, float]:

@@ -54,10 +54,7 @@ class Subsample(NamedTuple):
         return all(factor is None for factor in self.factor)
 
     def sums(self, log_n: Float[np.ndarray, " N"], peak: float) -> Sums:
-        """What `fitting.solver.normal_equations.sums` gives for all pixels, the reference being 0.
-
-        Of the derivative only the products that a profile needs: that with itself is left out.
-        """
+        """What `fitting.solver.normal_equations.sums` gives for all pixels, the reference being 0."""
         totals: list[Sums] = []
         for part in self.parts:
             weight = part.weights.astype(np.float64)
@@ -69,18 +66,13 @@ class Subsample(NamedTuple):
             for index, *moving in _lobes(part, log_n, peak):
                 for group in range(groups):
                     own = slice(None) if groups == 1 else slice(group, group + 1)
-                    w = weight[:, min(group, weight.shape[1] - 1)]
-                    still = fixed[..., min(group, fixed.shape[2] - 1)]
-                    value, slope = (one[..., min(group, one.shape[2] - 1)] for one in moving)
-                    heavy, seen = still * w, (w[:, None] * target[:, own])
-                    gram[index, group, :2, :2] = heavy @ still.T
-                    product[index, own, :2] = seen.T @ still.T
-                    for column, one in enumerate((value, slope), start=2):
-                        cross = one @ heavy.T
-                        gram[index, group, :2, column] = gram[index, group, column, :2] = cross
-                        cross = np.einsum("gm,gm,m->g", one, value, w)
-                        gram[index, group, 2, column] = gram[index, group, column, 2] = cross
-                        product[index, own, column] = one @ seen
+                    still, moved = (
+                        [one[..., min(group, one.shape[-1] - 1)] for one in some] for some in (fixed, moving)
+                    )
+                    columns = np.stack(np.broadcast_arrays(*still, *moved), axis=1)
+                    heavy = columns * weight[:, min(group, weight.shape[1] - 1)]
+                    gram[index, group] = heavy @ columns.swapaxes(1, 2)
+                    product[index, own] = (heavy @ target[:, own]).swapaxes(1, 2)
             pixels = np.broadcast_to(np.count_nonzero(weight, axis=0), target.shape[1])
             square = np.sum(weight * target**2, axis=0)
             whole = np.broadcast_to(gram, (*product.shape, 4))
