@@ -166,6 +166,19 @@ def norm(v: Directions) -> Scalars:
     return dot(v, normalize(v))
 
 
+def perpendicular(axis: Any) -> tuple[Any, ...]:
+    """Two unit vectors at right angles to a unit vector and to each other; the components lie on the first axis.
+
+    Source: Duff et al., Building an orthonormal basis, revisited, JCGT 6 (2017).
+    """
+    x, y, z = axis
+    sign = jnp.where(z < 0, -1.0, 1.0)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    across, along = (1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
+    return tuple(Components(one) if isinstance(axis, Components) else jnp.stack(one) for one in (across, along))
+
+
 def divide(numerator: ArrayLike, denominator: ArrayLike) -> Array:
     """Numerator / denominator where that is positive (above 1e-18 in float32, 1e-153 in float64), else 0."""
     denominator = _floating(denominator)

@@ -22,7 +22,7 @@ from brdf.images.encoding import encode
 from brdf.models.base import SpecularMaterial
 from brdf.precision import working_precision
 from fitting.result import Cause, FitResult
-from fitting.uncertainty.structure import Errors, block_sums
+from fitting.uncertainty.structure import Errors, over_blocks
 
 # A cause is named where it explains this share of the structure, and is this many times its error.
 LEAST_SHARE, LEAST_SIZE = 0.3, 5.0
@@ -350,7 +350,7 @@ class _Residual:
         for counted, part in zip(self.counted, np.split(scores.reshape(-1, self.noise.size), ends), strict=True):
             if len(part):
                 errors = Errors(np.sum(part, axis=1, keepdims=True), np.flatnonzero(counted), counted.shape[1])
-                together += float(np.sum(block_sums(errors, BLOCK)[0]))
+                together += float(np.sum(over_blocks(errors, BLOCK)[0] ** 2))
         return max(together / max(float(np.sum(scores**2)), np.finfo(float).tiny), 1.0)
 
 

@@ -39,7 +39,7 @@ from fitting.problem import CLASSIC, FitProblem, model_name, state_problem
 from fitting.progress import waiting
 from fitting.report import FitResult
 from fitting.result import Parameter
-from fitting.solver.nnls import inverse_diagonal
+from fitting.solver.nnls import inverse_diagonal, scaled_inverse
 from fitting.uncertainty.intervals import NORMAL_95, above_zero
 from fitting.uncertainty.residual_correlation import correlation_in_rows, structure_warning
 
@@ -278,12 +278,10 @@ def _with_errors(
     both = list(zip(problem.names, blocks, strict=True))
     sizes = [2 if name in DIRECTIONS else len(block) for name, block in both]
     hessian, ends = design.T @ known.hessian @ design, np.cumsum(sizes)[:-1]
-    scale = np.sqrt(np.where(np.diag(hessian) > 0, np.diag(hessian), 1.0))
-    inverse = np.linalg.pinv(hessian / np.outer(scale, scale), rcond=DEPENDENT, hermitian=True)
-    variance = inverse_diagonal(hessian, DEPENDENT)
+    covariance, variance = scaled_inverse(hessian, DEPENDENT), inverse_diagonal(hessian, DEPENDENT)
     if known.scatter is not None:
-        inverse = inverse @ (design.T @ known.scatter @ design / np.outer(scale, scale)) @ inverse
-        variance = np.where(np.isfinite(variance), np.diag(inverse) / scale**2, variance)
+        covariance = covariance @ design.T @ known.scatter @ design @ covariance
+        variance = np.where(np.isfinite(variance), np.diag(covariance), variance)
     # A turn is as much wider as the part of the direction of which least is known.
     wider = np.max(np.where(design != 0, known.widening[:, None], 0.0), axis=0)
     deviation = np.split(np.sqrt(variance) * np.where(wider > 0, wider, 1.0), ends)
@@ -308,8 +306,8 @@ def _with_errors(
             interval = _interval(name, value, error) if np.isfinite(error) and not at_bound else None
             parameters.append(_parameter(word, index if np.ndim(leaf) else None, value, error, interval, at_bound))
     at = np.array(at)[[one.value is not None and not one.at_bound for one in parameters]]
-    error = np.sqrt(np.diag(inverse)[at])
-    correlation = np.where((at >= 0)[:, None] & (at >= 0), inverse[np.ix_(at, at)] / np.outer(error, error), 0.0)
+    error = np.sqrt(np.diag(covariance)[at])
+    correlation = np.where((at >= 0)[:, None] & (at >= 0), covariance[np.ix_(at, at)] / np.outer(error, error), 0.0)
     np.fill_diagonal(correlation, 1.0)
     return tuple(parameters), tuple(errors), correlation
 

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from brdf.lobes import Near
+from fitting.solver.nnls import scaled_inverse
 
 # Of log n, to either side: so far a polynomial stands for a lobe.
 MOST = 0.35
@@ -37,14 +38,8 @@ class SampleError(NamedTuple):
     def shift(self, active: Bool[np.ndarray, " U"]) -> Float[np.ndarray, " U"]:
         """How far off each number is, where some of them are free."""
         found, some = np.zeros(active.size), np.flatnonzero(active)
-        found[some] = inverse(self.hessian[np.ix_(some, some)]) @ self.score[some]
+        found[some] = scaled_inverse(self.hessian[np.ix_(some, some)]) @ self.score[some]
         return found
-
-
-def inverse(hessian: Float[np.ndarray, "U U"]) -> Float[np.ndarray, "U U"]:
-    """Of a Hessian whose unknowns are of any size."""
-    length = np.sqrt(np.maximum(np.diag(hessian), np.finfo(float).tiny))
-    return np.linalg.pinv(hessian / np.outer(length, length), rcond=1e-12, hermitian=True) / np.outer(length, length)
 
 
 def near_exponent(n: float, reach: float, peak: float) -> Near:

@@ -40,7 +40,7 @@ from brdf.errors import InputError
 from brdf.geometry.surface_points import SurfacePoints
 from brdf.lights.base import Light, LightSample
 from brdf.lights.sample_sets import disc_rule, square_rule
-from brdf.vectors import Components, cross, divide, dot, norm, normalize, square_root
+from brdf.vectors import cross, divide, dot, norm, normalize, perpendicular, square_root
 
 SAMPLES = 64
 
@@ -295,16 +295,3 @@ def _arc_above_horizon(axial: Array, outward: Array, height: Array) -> tuple[Arr
         (axial > 0) & (outward >= 0), 1.0, jnp.where(axial > 0, crossing, jnp.where(outward > 0, 1.0, 0.0))
     )
     return low, high
-
-
-def perpendicular(axis: Any) -> tuple[Any, ...]:
-    """Two unit vectors at right angles to a unit vector and to each other.
-
-    Source: Duff et al., Building an orthonormal basis, revisited, JCGT 6 (2017).
-    """
-    x, y, z = axis
-    sign = jnp.where(z < 0, -1.0, 1.0)
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    across, along = (1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
-    return tuple(Components(one) if isinstance(axis, Components) else jnp.stack(one) for one in (across, along))

@@ -27,10 +27,9 @@ from jaxtyping import Array, Float
 from brdf.checks import Spectrum, checked, sample_number, spectrum
 from brdf.errors import InputError
 from brdf.geometry.surface_points import SurfacePoints
-from brdf.lights.area import perpendicular
 from brdf.lights.base import Light, LightSample
 from brdf.lights.sample_sets import hemisphere_rule, ring_rule
-from brdf.vectors import dot, normalize, square_root, trace
+from brdf.vectors import dot, normalize, perpendicular, square_root, trace
 
 CONSTANT_SAMPLES = 512
 MAP_SAMPLES = 1024

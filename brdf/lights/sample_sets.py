@@ -9,6 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from brdf.albedo import gauss_legendre
+
 
 class SquareRule(NamedTuple):
     """A rule over the unit square, sum w f(s, t) for the integral of f.
@@ -27,7 +29,7 @@ class SquareRule(NamedTuple):
 def square_rule(samples: int) -> SquareRule:
     """Gauss-Legendre in both directions, of the largest k × l nodes with k = ⌊√samples⌋."""
     rows = int(np.sqrt(samples))
-    return _product(_gauss_legendre(samples // rows), _gauss_legendre(rows))
+    return _product(gauss_legendre(samples // rows), gauss_legendre(rows))
 
 
 def disc_rule(samples: int) -> SquareRule:
@@ -51,13 +53,7 @@ def ring_rule(samples: int) -> SquareRule:
 def _turned(samples: int, count: int) -> SquareRule:
     count = max(1, count)
     turns = samples // count
-    return _product(_gauss_legendre(count), ((np.arange(turns) + 0.5) / turns, np.full(turns, 1.0 / turns)))
-
-
-def _gauss_legendre(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes and weights over (0, 1), exact for polynomials up to degree 2 count - 1."""
-    nodes, weights = np.polynomial.legendre.leggauss(count)
-    return 0.5 * (nodes + 1), 0.5 * weights
+    return _product(gauss_legendre(count), ((np.arange(turns) + 0.5) / turns, np.full(turns, 1.0 / turns)))
 
 
 def _product(first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray]) -> SquareRule:

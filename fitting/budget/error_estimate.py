@@ -23,6 +23,7 @@ from brdf.rendering import basis
 from fitting.budget.configurations import MOST_SAMPLES, Run, some_of
 from fitting.budget.sampling import MadeLights, PixelSample, compiled_at_pixels, sample_pixels, with_samples
 from fitting.light_colour import coefficient_factors, take_colour_out
+from fitting.solver.nnls import scaled_inverse
 
 # Pixels at which the model is evaluated, of all pictures together and of each at least; filled up to a multiple of
 # `FILLED`, so that few programs are compiled.
@@ -75,10 +76,8 @@ def estimate(run: Run, lights: MadeLights) -> Estimate:
     k = np.where(known[:-1].reshape(3, -1), optimum.x / factors, 0.0)
     least = max(SMALLEST * float(np.max(k)), np.finfo(float).tiny)
     scale = np.append((np.maximum(np.max(k, axis=1), least)[:, None] * factors).ravel(), 1.0)
-    diagonal = np.diag(system.hessian)
-    length = np.where((diagonal > 0) & (known | ~at_bound), np.sqrt(diagonal), np.inf)
-    inverse = np.linalg.pinv(system.hessian / np.outer(length, length), rcond=1e-13, hermitian=True)
-    inverse /= np.outer(length, length)
+    told = (np.diag(system.hessian) > 0) & (known | ~at_bound)
+    inverse = scaled_inverse(np.where(np.outer(told, told), system.hessian, 0.0), 1e-13)
 
     def above_bound(shift):
         """Coefficients at their bound leave it upwards only."""

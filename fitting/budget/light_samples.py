@@ -24,7 +24,8 @@ from fitting.budget.error_estimate import at_probes, filled, jacobian_places, pr
 from fitting.budget.sampling import MadeLights, with_samples
 from fitting.light_colour import coefficient_factors, take_colour_out
 from fitting.problem import FitProblem, has_pixel_areas
-from fitting.sample_error import MOST, SampleError, inverse, near_exponent
+from fitting.sample_error import MOST, SampleError, near_exponent
+from fitting.solver.nnls import scaled_inverse
 
 # Pixels of the first fit, of which so many tell the error; its samples, and those that are tried.
 PIXELS, PROBES, FIRST_SAMPLES = 1024, 640, 64
@@ -142,12 +143,15 @@ class _Ladder:
 
     def _off(self, score: np.ndarray) -> np.ndarray:
         """How far off each number is."""
-        return inverse(self.hessian[np.ix_(self.active, self.active)]) @ score[self.active]
+        return scaled_inverse(self.hessian[np.ix_(self.active, self.active)]) @ score[self.active]
 
     def _enough(self, samples: int) -> bool:
         score, size = self._missed(samples)
         noise, active = float(np.sqrt(np.mean(self.result.noise**2))), self.active
-        rest, given = noise * np.sqrt(np.diag(inverse(self.hessian[np.ix_(active, active)]))), samples >= self.own
+        rest, given = (
+            noise * np.sqrt(np.diag(scaled_inverse(self.hessian[np.ix_(active, active)]))),
+            samples >= self.own,
+        )
         value = np.append(self.x.ravel(), 1.0)[active] * given
         off = np.abs(self._off(score))
         hidden = size <= HIDDEN * noise or (given and size > NO_NOISE * noise)

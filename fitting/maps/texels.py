@@ -24,7 +24,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from brdf.models.base import SpecularMaterial
-from brdf.vectors import divide, dot, mirror_log_cosine, normalize, square_root
+from brdf.vectors import divide, dot, mirror_log_cosine, normalize, perpendicular, square_root
 
 OCTAVES = 16
 """The exponent is sought from 1 to 2^16: beyond, a lobe is narrower than the step between any two lights."""
@@ -381,7 +381,7 @@ def _jointly(
     glossy = issubclass(model, SpecularMaterial)
 
     def at(log_n: Array, normal: Array, *, free: bool = False) -> _Point:
-        frame = _frame(normal)
+        frame = perpendicular(normal)
         n = jnp.exp(log_n)
         scale, change = jax.jvp(model.scale, (n,), (n,)) if glossy else (n, n)
 
@@ -413,7 +413,7 @@ def _jointly(
 
     def step(_: Any, state: Any) -> Any:
         log_n, normal, cost, change = state
-        turn = sum(map(operator.mul, change[1:], _frame(normal)))
+        turn = sum(map(operator.mul, change[1:], perpendicular(normal)))
         new = jnp.clip(log_n + change[0], 0, OCTAVES * math.log(2.0)), normalize((normal + turn).T).T
         point = at(*new)
         better = point.cost < cost
@@ -428,15 +428,6 @@ def _jointly(
     angle = square_root(point.error[-2] ** 2 + point.error[-1] ** 2)
     log_n_error = point.error[0] if glossy else fit.log_n_error
     return TexelFit(point.k, point.k_error, log_n, log_n_error, point.cost), normal, angle
-
-
-def _frame(normal: Array) -> tuple[Array, Array]:
-    """Two unit vectors across each normal, (3, T): Duff et al., Building an orthonormal basis, revisited, JCGT 2017."""
-    x, y, z = normal
-    sign = jnp.where(z < 0, -1.0, 1.0)
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    return jnp.stack([1 + sign * x * x * a, sign * b, -sign * x]), jnp.stack([b, sign + y * y * a, -y])
 
 
 # -- least squares, one in each lane -----------------------------------------------------------------------------------

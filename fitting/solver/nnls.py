@@ -150,6 +150,18 @@ def nonnegative_minimum(
     return x / scale
 
 
+def scaled_inverse(gram: Float[np.ndarray, "U U"], share: float = 1e-12) -> Float[np.ndarray, "U U"]:
+    """The inverse of a positive semidefinite matrix whose unknowns are of any size; 0 along what it does not determine.
+
+    Args:
+        gram: the matrix.
+        share: of the largest eigenvalue, unknowns in units of their own columns; a smaller one determines nothing.
+    """
+    scale = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
+    unit = np.outer(scale, scale)
+    return np.linalg.pinv(gram / unit, rcond=share, hermitian=True) / unit
+
+
 def inverse_diagonal(gram: Float[np.ndarray, "U U"], share: float = 1e-10) -> Float[np.ndarray, " U"]:
     """The diagonal of the inverse; infinite for an unknown that takes part in an undetermined combination.
 

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from fitting.sample_error import SampleError
+from fitting.solver.nnls import scaled_inverse
 from fitting.solver.profile import Optimum
 from fitting.solver.tied import design_of
 from fitting.uncertainty.intervals import NORMAL_95, above_zero
@@ -310,7 +311,4 @@ def _errors(
 
 def _inverse(hessian: np.ndarray, basis: np.ndarray) -> np.ndarray:
     """The inverse of the Hessian among the columns of a basis, 0 beside them."""
-    reduced = basis.T @ hessian @ basis
-    scale = np.sqrt(np.maximum(np.diag(reduced), np.finfo(float).tiny))
-    inverse = np.linalg.pinv(reduced / np.outer(scale, scale), rcond=1e-14, hermitian=True)
-    return basis @ (inverse / np.outer(scale, scale)) @ basis.T
+    return basis @ scaled_inverse(basis.T @ hessian @ basis, 1e-14) @ basis.T

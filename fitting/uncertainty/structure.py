@@ -71,7 +71,7 @@ def structure(pictures: Sequence[Errors], sizes: Sequence[int] = SIZES, *, even:
             where there is little of it is the noise of other places.
         sizes: of the blocks, pixels on a side; multiples of the first.
     """
-    grids = [_grid(errors, sizes[0]) for errors in pictures]
+    grids = [over_blocks(errors, sizes[0]) for errors in pictures]
     excess, share = -math.inf, 0.0
     for size in sizes:
         total, blocks, variance, together, apart, chance = 0.0, 0, 0.0, 0.0, 0.0, 0.0
@@ -102,12 +102,17 @@ def of_blocks(errors: Errors) -> Errors:
         errors: of one picture.
     """
     # Colours have half the resolution.
-    sums, _, _ = _grid(errors, CODED_BLOCK if errors.values.shape[1] == 1 else 2 * CODED_BLOCK)
+    sums, _, _ = over_blocks(errors, CODED_BLOCK if errors.values.shape[1] == 1 else 2 * CODED_BLOCK)
     return Errors(sums.reshape(-1, sums.shape[2]), np.arange(sums.shape[0] * sums.shape[1]), sums.shape[1])
 
 
-def _grid(errors: Errors, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sums of errors, of their squares, and how many pixels, over blocks; (rows, columns, C) each."""
+def over_blocks(errors: Errors, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Sums of errors, of their squares, and how many pixels, over blocks; (rows, columns, C) each.
+
+    Args:
+        errors: of one picture.
+        size: of a block, pixels on a side.
+    """
     row, column = np.divmod(errors.pixel[-1], errors.width)
     values = errors.values
     if errors.pixel.size == (row + 1) * errors.width and column == errors.width - 1:
@@ -115,27 +120,13 @@ def _grid(errors: Errors, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray
     else:
         image = np.zeros((int(np.max(errors.pixel)) // errors.width + 1, errors.width, values.shape[1]), values.dtype)
         image[np.divmod(errors.pixel, errors.width)] = values
-    image = np.pad(image, np.array([(0, -image.shape[0] % size), (0, -image.shape[1] % size), (0, 0)]))
-    blocks = image.reshape(-1, size, image.shape[1] // size, size, image.shape[2])
-    return tuple(part.sum(axis=(1, 3), dtype=np.float64) for part in (blocks, blocks**2, blocks != 0))
+    return tuple(_coarser(part, size) for part in (image, image**2, image != 0))
 
 
 def _coarser(grid: np.ndarray, factor: int) -> np.ndarray:
     padded = np.pad(grid, np.array([(0, -grid.shape[0] % factor), (0, -grid.shape[1] % factor), (0, 0)]))
-    return padded.reshape(-1, factor, padded.shape[1] // factor, factor, padded.shape[2]).sum(axis=(1, 3))
-
-
-def block_sums(errors: Errors, size: int) -> tuple[Float[np.ndarray, "B C"], Float[np.ndarray, "B C"]]:
-    """Squares of the sums over blocks, and sums of the squares.
-
-    Args:
-        errors: of one picture.
-        size: of a block, pixels on a side.
-    """
-    blocks = errors.blocks(size)
-    sums = [np.bincount(blocks, weights=values) ** 2 for values in errors.values.T]
-    squares = [np.bincount(blocks, weights=values**2) for values in errors.values.T]
-    return np.stack(sums, axis=1), np.stack(squares, axis=1)
+    blocks = padded.reshape(-1, factor, padded.shape[1] // factor, factor, padded.shape[2])
+    return blocks.sum(axis=(1, 3), dtype=np.float64)
 
 
 def shared(pictures: Sequence[Errors], size: int = 8) -> tuple[float, float]:
@@ -147,8 +138,8 @@ def shared(pictures: Sequence[Errors], size: int = 8) -> tuple[float, float]:
     """
     excess, variance = 0.0, 0.0
     for errors in pictures:
-        together, apart = block_sums(errors, size)
-        excess += float(np.sum(together - apart))
+        sums, apart, _ = over_blocks(errors, size)
+        excess += float(np.sum(sums**2 - apart))
         variance += float(np.sum(2 * apart**2))
     return excess, math.sqrt(variance)
 
