@@ -223,6 +223,11 @@ class _Residual:
             np.concatenate([image[counted] for image, counted in zip(images, self.counted, strict=True)]) / self.noise
         )
 
+    def _curves(self, images: Images) -> Images:
+        """The derivatives of the codes by the values."""
+        ahead, behind = (self._codes([image + step for image in images]) for step in (CURVED, -CURVED))
+        return [(one - other) / (2 * CURVED) for one, other in zip(ahead, behind, strict=True)]
+
     def _slope(self, ahead: Images, behind: Images, step: float) -> Float[np.ndarray, "P C"]:
         both = zip(self._codes(ahead), self._codes(behind), strict=True)
         return self._flat([(one - other) / (2 * step) for one, other in both])
@@ -258,31 +263,17 @@ class _Residual:
 
     def _material_tangent(self) -> list[Float[np.ndarray, "P K"]]:
         """What the coefficients of each channel, and the exponent, move; orthonormal."""
-        n = float(getattr(self.material, "n", 1.0))
-        tiny = 1e-4
-        moved = []
-        for factor in (1.0, 1 + tiny, 1 - tiny):
-            parts = [self._basis(index, n * factor) for index in range(len(self.scenes))]
-            moved.append([list(images) for images in zip(*parts, strict=True)])
-        k = [np.asarray(getattr(self.material, name, 0.0), np.float64) for name in ("k_a", "k_d", "k_s")]
-        steps = [(images, tiny) for images in moved[0]]
-        scale = [max(float(np.max(np.abs(image))) for image in images) for images in moved[0]]
-        columns = []
-        for (images, tiny), most in zip(steps, scale, strict=True):
-            size = tiny / max(most, 1e-300)
-            ahead, behind = (
-                [fitted + sign * size * image for fitted, image in zip(self.fitted, images, strict=True)]
-                for sign in (1, -1)
-            )
-            columns.append(self._slope(ahead, behind, size))
-        by_n = [
-            [
-                fitted + k[2] * (image - centre)
-                for fitted, image, centre in zip(self.fitted, part[2], moved[0][2], strict=True)
-            ]
-            for part in moved[1:]
+        n, step = float(getattr(self.material, "n", 1.0)), 1e-4
+        k_s = np.asarray(getattr(self.material, "k_s", 0.0), np.float64)
+        moves = []
+        for index in range(len(self.scenes)):
+            here, ahead, behind = (self._basis(index, n * factor) for factor in (1.0, 1 + step, 1 - step))
+            moves.append([*here, k_s * (ahead[2] - behind[2]) / step])
+        curves = self._curves(self.fitted)
+        columns = [
+            self._flat([curve * image for curve, image in zip(curves, images, strict=True)])
+            for images in zip(*moves, strict=True)
         ]
-        columns.append(self._slope(by_n[0], by_n[1], tiny))
         tangents = []
         for channel in range(self.noise.size):
             matrix = np.stack([column[:, channel] for column in columns], axis=1)
@@ -317,8 +308,7 @@ class _Residual:
             for _ in range(PASSES):
                 k = [_coefficients(parts, targets, weights, good, channel) for channel in range(self.noise.size)]
                 images = [np.einsum("tijc,ct->ijc", np.stack(part), np.stack(k)) for part in parts]
-                ahead, behind = (self._codes([image + step for image in images]) for step in (CURVED, -CURVED))
-                weights = [(one - other) / (2 * CURVED) for one, other in zip(ahead, behind, strict=True)]
+                weights = self._curves(images)
             return self._squares(targets, images, good)[0]
 
         if not isinstance(self.material, SpecularMaterial):

@@ -150,7 +150,8 @@ def capped_minimum(problem: Problem, lower: float, upper: float, x: np.ndarray) 
         return float(found[log_n][0].slope)
 
     if slope(lower) < 0 < slope(upper):
-        return found[brentq(slope, lower, upper, xtol=problem.accuracy)]
+        root: Any = brentq(slope, lower, upper, xtol=problem.accuracy)
+        return found[root]
     return min(found.values(), key=lambda found: float(np.sum(found[0].cost)))
 
 
