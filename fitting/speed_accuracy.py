@@ -14,7 +14,6 @@ long runs twice, what compiles anew each time once.
 
 import contextlib
 import csv
-import ctypes
 import dataclasses
 import functools
 import io
@@ -79,7 +78,6 @@ class Row:
         seconds: median of the runs after the first, or the only one, without the compiler.
         spread: half the distance of their quartiles.
         runs: how many they were.
-        peak: bytes of resident memory that a run took beyond what was resident before it; None where unknown.
         rms: error of the picture, root mean square over that of the reference's picture.
         worst: its largest error, in the same unit.
         parameters: error of the parameters, see `parameter_deviation`.
@@ -93,7 +91,6 @@ class Row:
     seconds: float
     spread: float
     runs: int
-    peak: int | None
     rms: float
     worst: float
     parameters: float
@@ -356,11 +353,10 @@ def tradeoff(
 
 
 class Taken(NamedTuple):
-    """Seconds that a run took without the compiler, those of the compiler, and bytes of memory beyond those before."""
+    """Seconds that a run took without the compiler, and those of the compiler."""
 
     seconds: float
     compiling: float
-    peak: int | None
 
 
 @dataclasses.dataclass(eq=False)
@@ -544,7 +540,6 @@ class Bench:
             seconds=float(median),
             spread=float(high - low) / 2,
             runs=len(later),
-            peak=taken[:2][-1].peak,
             rms=float(np.sqrt(np.mean(weight * change**2))) / scale,
             worst=float(np.max(np.abs(change))) / scale,
             parameters=parameters,
@@ -561,10 +556,6 @@ def take(run: Callable[[], Any]) -> tuple[Any, Taken]:
             now = time.perf_counter()
             spans.append((now - duration_secs, now))
 
-    # Memory that was freed before is given back, so that what the run uses again counts.
-    with contextlib.suppress(AttributeError, OSError):
-        ctypes.CDLL(None).malloc_trim(0)
-    before = _resident("VmRSS", reset=True)
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
         start = time.perf_counter()
@@ -577,17 +568,4 @@ def take(run: Callable[[], Any]) -> tuple[Any, Taken]:
     for first, last in sorted(spans):
         compiling += max(0.0, last - max(first, end))
         end = max(end, last)
-    after = _resident("VmHWM")
-    peak = None if before is None or after is None else max(after - before, 0)
-    return outcome, Taken(max(seconds - compiling, 0.0), compiling, peak)
-
-
-def _resident(name, reset=False):
-    """Bytes now resident, or at most since the kernel's mark was set back; None where there is no such mark."""
-    try:
-        if reset:
-            Path("/proc/self/clear_refs").write_text("5")
-        lines = Path("/proc/self/status").read_text().splitlines()
-        return next(1024 * int(line.split()[1]) for line in lines if line.startswith(f"{name}:"))
-    except (OSError, StopIteration):
-        return None
+    return outcome, Taken(max(seconds - compiling, 0.0), compiling)

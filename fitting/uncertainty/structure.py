@@ -120,7 +120,8 @@ def over_blocks(errors: Errors, size: int) -> tuple[np.ndarray, np.ndarray, np.n
     else:
         image = np.zeros((int(np.max(errors.pixel)) // errors.width + 1, errors.width, values.shape[1]), values.dtype)
         image[np.divmod(errors.pixel, errors.width)] = values
-    return tuple(_coarser(part, size) for part in (image, image**2, image != 0))
+    sums, squares, count = (_coarser(part, size) for part in (image, image**2, image != 0))
+    return sums, squares, count
 
 
 def _coarser(grid: np.ndarray, factor: int) -> np.ndarray:

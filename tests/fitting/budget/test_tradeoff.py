@@ -27,7 +27,6 @@ def row(name, seconds, error, work, **changes):
         "seconds": seconds,
         "spread": 0.0,
         "runs": 9,
-        "peak": None,
         "rms": error,
         "worst": error,
         "parameters": 0.0,
