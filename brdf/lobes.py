@@ -9,7 +9,7 @@ import math
 import operator
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeGuard
 
 import equinox as eqx
 import jax
@@ -22,6 +22,7 @@ from brdf.geometry.base import Shape
 from brdf.geometry.surface_points import SurfacePoints
 from brdf.geometry.visibility import share_seen
 from brdf.lights.base import Light, Lighting
+from brdf.models import MODELS
 from brdf.models.base import Material, SpecularMaterial
 from brdf.vectors import BELOW_HORIZON, Components, divide, dot, quadratic_form, square_root
 
@@ -45,6 +46,44 @@ NO_LOBE = -1e9
 """The peak of a pixel without a lobe: exp(n * this) = 0 for every n that a fit visits."""
 
 
+class OneOf(eqx.Module):
+    """A model with a lobe, known when a program runs and not before.
+
+    Many light samples make a program large: one serves all models.
+
+    Attributes:
+        models: those it may be.
+        index: which of them it is.
+    """
+
+    models: tuple[type[SpecularMaterial], ...] = eqx.field(static=True)
+    index: Int[Any, ""]
+
+    @classmethod
+    def of(cls, model: type[Material]) -> "type[Material] | OneOf":
+        """Of all models that have a name; the model itself where it is none of them or has no lobe."""
+        models = tuple(one for one in MODELS.values() if issubclass(one, SpecularMaterial))
+        return cls(models, np.int32(models.index(model))) if model in models else model
+
+    def log_cosine(self, *directions: Any) -> Array:
+        """See `SpecularMaterial.log_cosine`."""
+        kinds = list(dict.fromkeys(model.log_cosine for model in self.models))
+        kind = jnp.asarray([kinds.index(model.log_cosine) for model in self.models])[self.index]
+        return jax.lax.switch(kind, kinds, *directions)
+
+    def scale(self, n: Array) -> Array:
+        """See `SpecularMaterial.scale`."""
+        return jax.lax.switch(self.index, [model.scale for model in self.models], n)
+
+    @property
+    def cosine_weighted(self) -> Array:
+        """See `SpecularMaterial`."""
+        return jnp.asarray([model.cosine_weighted for model in self.models])[self.index]
+
+
+Model = type[Material] | OneOf
+
+
 class LightTerms(NamedTuple):
     """What one light sample adds to the basis images at one point.
 
@@ -60,7 +99,7 @@ class LightTerms(NamedTuple):
 
 
 def light_terms(
-    model: type[Material],
+    model: Model,
     occluders: tuple[Shape, ...],
     kind: type[Light],
     row: tuple[Array, ...],
@@ -81,13 +120,18 @@ def light_terms(
         intensity = intensity * point.visibility[light]
     matt = lit if sample.lobe_only is None else lit & (sample.lobe_only == 0)
     diffuse = intensity * jnp.where(matt, cosine, 0)
-    if not issubclass(model, SpecularMaterial):
+    if not has_lobe(model):
         return LightTerms(diffuse, 0.0 * diffuse, jnp.zeros_like(cosine))
     log_cosine = model.log_cosine(point.normal, sample.to_light, point.to_view)
     glossy = lit if sample.lobe_only is None else lit & (sample.lobe_only > 0)
     shines = glossy & (dot(point.normal, point.to_view) > 0) & (log_cosine > 0.5 * BELOW_HORIZON)
-    weight = intensity * jnp.where(shines, cosine if model.cosine_weighted else above, 0)
+    weight = intensity * jnp.where(shines, jnp.where(model.cosine_weighted, cosine, above), 0)
     return LightTerms(diffuse, weight, jnp.where(shines, log_cosine, 0))
+
+
+def has_lobe(model: Model) -> "TypeGuard[type[SpecularMaterial] | OneOf]":
+    """Whether it has a specular term."""
+    return isinstance(model, OneOf) or issubclass(model, SpecularMaterial)
 
 
 def patch_cosine(normal: Vector, mean: Vector, covariance: Float[Array, "3 3"]) -> tuple[Scalar, Scalar]:
@@ -107,7 +151,7 @@ def patch_cosine(normal: Vector, mean: Vector, covariance: Float[Array, "3 3"]) 
 
 
 def sum_over_samples(
-    model: type[Material], points: SurfacePoints, lighting: Lighting, of_terms: Callable[[LightTerms], Any]
+    model: Model, points: SurfacePoints, lighting: Lighting, of_terms: Callable[[LightTerms], Any]
 ) -> Any:
     """Add up a function of one sample's terms at one point, linear in diffuse and weight, over all samples.
 
@@ -139,7 +183,7 @@ def is_sampled(lighting: Lighting) -> bool:
 
 
 def over_samples(
-    model: type[Material],
+    model: Model,
     points: SurfacePoints,
     lighting: Lighting,
     of_terms: Callable[[LightTerms], Any],
@@ -159,6 +203,14 @@ def over_samples(
 
         def add(kind: type[Light], numbers: Any, light: Any, total: Any, chunk: tuple[Any, ...]) -> tuple[Any, None]:
             nodes, emitted = chunk[:2]
+            shines = emitted.any(axis=1)
+            if light is not None:
+                shines &= nodes[kind.weighs].reshape(shines.size, -1).any(axis=1)
+            added = partial(add_lit, kind, numbers, light)
+            return jax.lax.cond(jnp.any(shines), added, lambda before, _: before, total, chunk), None
+
+        def add_lit(kind: type[Light], numbers: Any, light: Any, total: Any, chunk: tuple[Any, ...]) -> Any:
+            nodes, emitted = chunk[:2]
             row = (*map(_apart, numbers), *map(_chunk_apart, nodes))
             grey: Any = tuple(1.0 if place in kind.emits else part for place, part in enumerate(row))
             terms = light_terms(model, occluders, kind, grey, light if len(chunk) == 2 else chunk[2], tile)
@@ -166,7 +218,7 @@ def over_samples(
             terms = jax.lax.optimization_barrier(terms)  # or each of the sums would make them anew
             peak = jnp.max(jnp.where(emitted.max(axis=1, keepdims=True) > 0, _peak(terms), NO_LOBE), axis=0)
             added = jax.tree.map(partial(_emitted, emitted), of_terms(terms))
-            return (jax.tree.map(jnp.add, total[0], added), jnp.maximum(total[1], peak)), None
+            return jax.tree.map(jnp.add, total[0], added), jnp.maximum(total[1], peak)
 
         nothing = jnp.zeros((channels, *tile.mask.shape), dtype)
         shapes = jax.eval_shape(of_terms, LightTerms(*3 * [nothing[:1]]))
@@ -399,7 +451,7 @@ class Lobe(eqx.Module):
             # Of one size for few numbers of pixels, or each would be compiled.
             padded = np.resize(pixel, 1 << max(pixel.size - 1, 0).bit_length())
             points = jax.tree.map(lambda leaf: np.asarray(leaf)[padded], self.source[0])
-            terms = _kept_terms(self.model, self.source[1], points)
+            terms = _kept_terms(OneOf.of(self.model), self.source[1], points)
             lobe = dataclasses.replace(
                 lobe, source=None, kept=jax.tree.map(lambda a: np.asarray(a)[: pixel.size], terms)
             )
@@ -452,38 +504,48 @@ def average(weight: Float[Array, "K M"], values: Float[Array, "*N K*M C"]) -> Fl
     return xp.sum(weight[..., None] * values.reshape(*values.shape[:-2], *weight.shape, values.shape[-1]), axis=-2)
 
 
-@eqx.filter_jit
 def diffuse_and_lobe(
     model: type[Material], points: SurfacePoints, lighting: Lighting
 ) -> tuple[Float[Array, "P C"], Lobe | None]:
     """The diffuse basis of P points, of any shape, and the specular one where the model has one."""
-    points, specular = points.flat(), issubclass(model, SpecularMaterial)
-    if not is_sampled(lighting):
-        diffuse: Any = 0.0
-        kept: tuple[Any, ...] = ()
-        for kind, row, light in lighting.each():
-            terms = jax.vmap(partial(light_terms, model, lighting.occluders, kind, row, light))(points)
-            diffuse, kept = diffuse + terms.diffuse, (*kept, (terms.weight[:, None], terms.log_cosine[:, None]))
-    elif specular and _size(jax.eval_shape(partial(_stacked_terms, model, lighting), points)) <= STACKED_VALUES:
-        diffuse, kept = _stacked_terms(model, lighting, points)
-    else:
+    points, specular = points.flat(), has_lobe(model)
+    if not specular or not is_sampled(lighting):
+        return _diffuse_and_lobe(model, points, lighting)
+    if _size(jax.eval_shape(partial(_stacked_terms, model, lighting), points)) > STACKED_VALUES:
+        return _diffuse_and_lobe(model, points, lighting)
+    return _diffuse_and_kept(OneOf.of(model), points, lighting)
+
+
+@eqx.filter_jit
+def _diffuse_and_lobe(model: type[Material], points: SurfacePoints, lighting: Lighting) -> tuple[Array, Lobe | None]:
+    specular = issubclass(model, SpecularMaterial)
+    if is_sampled(lighting):
         diffuse, peak = over_samples(model, points, lighting, lambda terms: terms.diffuse)
         return diffuse, Lobe(peak, model, source=(points, lighting)) if specular else None
-    if not specular:
-        return diffuse, None
+    diffuse: Any = 0.0
+    kept: tuple[Any, ...] = ()
+    for kind, row, light in lighting.each():
+        terms = jax.vmap(partial(light_terms, model, lighting.occluders, kind, row, light))(points)
+        diffuse, kept = diffuse + terms.diffuse, (*kept, (terms.weight[:, None], terms.log_cosine[:, None]))
+    return diffuse, Lobe.of_terms(kept) if specular else None
+
+
+@eqx.filter_jit
+def _diffuse_and_kept(model: Model, points: SurfacePoints, lighting: Lighting) -> tuple[Array, Lobe]:
+    diffuse, kept = _stacked_terms(model, lighting, points)
     return diffuse, Lobe.of_terms(kept)
 
 
 @eqx.filter_jit
 def tabulated(
-    model: type[Material], points: SurfacePoints, lighting: Lighting, near: Near, *, rough: bool
+    model: Model, points: SurfacePoints, lighting: Lighting, near: Near, *, rough: bool
 ) -> tuple[Float[Array, "P C"], Float[Array, " P"], Float[Array, "P N C"] | None]:
     """Of (P,) points under many samples the diffuse basis, the peak and the lobe at some exponents, in one pass."""
 
     def of_terms(terms: LightTerms) -> Any:
         dtype = terms.log_cosine.dtype
         exponent = jnp.minimum(terms.log_cosine - jnp.asarray(near.peak, dtype), 0)
-        n = jnp.exp(jnp.asarray(near.log_n)).astype(dtype) if issubclass(model, SpecularMaterial) else []
+        n = jnp.exp(jnp.asarray(near.log_n)).astype(dtype) if has_lobe(model) else []
         return terms.diffuse, [terms.weight * jnp.exp(one * exponent) for one in n]
 
     (diffuse, values), peak = over_samples(model, points, lighting, of_terms, rough=rough)
@@ -491,12 +553,12 @@ def tabulated(
 
 
 @eqx.filter_jit
-def _kept_terms(model: type[Material], lighting: Lighting, points: SurfacePoints) -> Any:
+def _kept_terms(model: Model, lighting: Lighting, points: SurfacePoints) -> Any:
     """Weights and cosines of the lobe of all samples at once."""
     return _stacked_terms(model, lighting, points)[1]
 
 
-def _stacked_terms(model: type[Material], lighting: Lighting, points: SurfacePoints) -> tuple[Any, Any]:
+def _stacked_terms(model: Model, lighting: Lighting, points: SurfacePoints) -> tuple[Any, Any]:
     """Sum of the diffuse terms, and weights and cosines of the lobe, of all samples at once.
 
     The loop over samples is the outer one: an array of all of them would be made in many steps of its own size.

@@ -28,9 +28,12 @@ from brdf.lobes import (
     TILE,
     LightTerms,
     Lobe,
+    Model,
     Near,
+    OneOf,
     average,
     diffuse_and_lobe,
+    has_lobe,
     is_sampled,
     sum_over_samples,
     tabulated,
@@ -97,7 +100,7 @@ def _tabulated(
     # Of one size for few numbers of pixels, or each would be compiled.
     padded = np.resize(index, -(-max(index.size, 1) // TILE) * TILE) if index.size else np.zeros(TILE, int)
     rough = near.ends[1] <= math.log(ROUGH) or not near.narrow
-    found = tabulated(model, jax.tree.map(lambda leaf: leaf[padded], flat), lighting, near, rough=rough)
+    found = tabulated(OneOf.of(model), jax.tree.map(lambda leaf: leaf[padded], flat), lighting, near, rough=rough)
 
     def spread(values: Any, outside: float = 0.0) -> Array:
         some = np.asarray(values)[: index.size]
@@ -147,16 +150,15 @@ def basis_images(
     check_model(model)
     instance("scene", scene, Scene, "Write brdf.basis_images(brdf.BlinnPhong, scene)")
     points = scene.surface_points() if points is None else points
-    fill_above = STORED_SAMPLES if points.mask.size <= FEW_PIXELS else math.inf
-    return _basis_images(model, points, scene.ambient, _lighting(scene, points, fill_above), jnp.asarray(n))
+    lighting = _lighting(scene, points, STORED_SAMPLES if points.mask.size <= FEW_PIXELS else math.inf)
+    lobe = OneOf.of(model) if is_sampled(lighting) else model
+    return _basis_images(lobe, points, scene.ambient, lighting, jnp.asarray(n))
 
 
 @eqx.filter_jit
-def _basis_images(
-    model: type[Material], points: SurfacePoints, ambient: Any, lighting: Lighting, n: Scalar
-) -> BasisImages:
+def _basis_images(model: Model, points: SurfacePoints, ambient: Any, lighting: Lighting, n: Scalar) -> BasisImages:
     def of_terms(terms: LightTerms) -> tuple[Array, Array | None]:
-        if not issubclass(model, SpecularMaterial):
+        if not has_lobe(model):
             return terms.diffuse, None
         return terms.diffuse, terms.weight * (model.scale(n) * jnp.exp(n * terms.log_cosine))
 

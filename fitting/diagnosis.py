@@ -199,13 +199,15 @@ class _Residual:
 
     def _rendered(self, scenes: Scenes) -> Images:
         """Pictures of the fitted material; of scenes that stayed what they are already."""
-        found = []
-        for index, (scene, pixel) in enumerate(zip(scenes, self.pixels, strict=True)):
+        found, n = [], float(getattr(self.material, "n", 1.0))
+        k = [np.asarray(getattr(self.material, name, 0.0), np.float64) for name in ("k_a", "k_d", "k_s")]
+        for index, scene in enumerate(scenes):
             if scene is self.scenes[index] and hasattr(self, "fitted"):
                 found.append(self.fitted[index])
             else:
-                image = np.asarray(brdf.render(self.material, _seen(scene, pixel), precision="float64"))
-                found.append(np.broadcast_to(image, self.targets[index].shape))
+                found.append(
+                    np.sum([one * image for one, image in zip(k, self._basis(index, n, scene), strict=True)], axis=0)
+                )
         return found
 
     def _codes(self, images: Images) -> Images:
@@ -282,9 +284,10 @@ class _Residual:
             tangents.append(vectors[:, values > 1e-6])
         return tangents
 
-    def _basis(self, index: int, n: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What ambient, diffuse and specular term show of a scene; 0 where there is none."""
-        images = brdf.basis_images(type(self.material), _seen(self.scenes[index], self.pixels[index]), n)
+    def _basis(self, index: int, n: float, scene: brdf.Scene | None = None) -> tuple[np.ndarray, ...]:
+        """What ambient, diffuse and specular term show of a scene, or of one in its place; 0 where there is none."""
+        seen = _seen(scene or self.scenes[index], self.pixels[index])
+        images = brdf.basis_images(type(self.material), seen, n)
         shape = self.targets[index].shape
         parts = (images.ambient, images.diffuse, images.specular)
         ambient, diffuse, specular = (np.zeros(shape) if one is None else np.broadcast_to(one, shape) for one in parts)

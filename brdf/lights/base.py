@@ -83,8 +83,8 @@ class Light(Checked):
         return fields["intensity" if "intensity" in fields else "radiance"]
 
 
-# Where samples are filled up, to so many at least, and to a power of four.
-FILLED = 256
+# Where samples are filled up, to a multiple of this.
+FILLED = 4096
 
 
 class LightStack(eqx.Module):
@@ -180,7 +180,7 @@ def _filled(nodes: Sequence[Any], weighs: int, above: float) -> list[Any]:
     each = nodes[0].shape[1] if nodes else 0
     if each <= above or not all(isinstance(values, np.ndarray) for values in nodes):
         return list(nodes)
-    more = max(4 ** math.ceil(math.log(each, 4) - 1e-9), FILLED) - each
+    more = -each % FILLED
     found = [np.concatenate([values, np.repeat(values[:, -1:], more, axis=1)], axis=1) for values in nodes]
     found[weighs][:, each:] = 0
     return found

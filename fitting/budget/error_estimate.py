@@ -15,13 +15,12 @@ The first is random, and is told as the median and the 95 % quantile of what it 
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from brdf.rendering import basis
+import brdf
+from brdf.precision import working_precision
 from fitting.budget.configurations import MOST_SAMPLES, Run, some_of
-from fitting.budget.sampling import MadeLights, PixelSample, compiled_at_pixels, sample_pixels, with_samples
+from fitting.budget.sampling import MadeLights, PixelSample, sample_pixels, with_samples
 from fitting.light_colour import coefficient_factors, take_colour_out
 from fitting.solver.nnls import scaled_inverse
 
@@ -35,6 +34,8 @@ DEPENDENT = 0.01
 SMALLEST = 0.01
 # What light samples leave out is told to first order only: the bound allows for this factor.
 MARGIN = 2.0
+# Of log n, for the difference that stands for the lobe's derivative: to 1e-6 of it.
+STEP_OF_LOG_N = 1e-4
 # What a sum of so many samples is compared with: the next step, as a factor.
 STEP = 4
 
@@ -118,26 +119,29 @@ def _nearly_dependent(gram):
     return np.any(np.linalg.eigvalsh(normed) < DEPENDENT**2)
 
 
-def at_probes(scene, pixel, model, n, channels):
-    """Ambient, diffuse, lobe and its derivative by log n at some pixels, (M, C, 4), and the peaks there, (M,)."""
-    found = jax.device_get(_at_probes(scene, filled(pixel), "float64", model, np.float64(max(n, 1e-3)), channels))
-    return [each[: pixel.size] for each in found]
-
-
 def filled(pixel):
     """Pixels and more of them, so that few programs are compiled."""
     return np.pad(pixel, (0, FILLED - pixel.size % FILLED))
 
 
-@compiled_at_pixels
-def _at_probes(scene, model, n, channels):
-    images, nothing = basis(model, scene), jnp.zeros(1)
-    ambient = nothing if scene.ambient is None else jnp.asarray(scene.ambient)
-    diffuse = nothing if images.diffuse is None else images.diffuse
-    value, slope = (nothing, nothing) if images.lobe is None else images.lobe(n)
-    count = images.points.mask.size
-    columns = [jnp.broadcast_to(column, (count, channels)) for column in (ambient, diffuse, value, slope * n)]
-    return jnp.stack(columns, axis=-1), jnp.zeros(count) if images.lobe is None else images.lobe.peak
+def at_probes(seen, model, n, channels):
+    """Ambient, diffuse and lobe at the pixels of a scene made of some, (M, C, 3)."""
+    with working_precision("float64"):
+        lit = brdf.cast(seen, "float64")
+        images = brdf.basis_images(model, lit, np.float64(n))
+    factors = coefficient_factors(model, n, np.ones(channels))
+    columns = np.zeros((seen.points.mask.size, channels, 3))
+    for column, image in enumerate((images.ambient, images.diffuse, images.specular)):
+        if image is not None:
+            columns[..., column] = np.asarray(image)[0] / factors[column]
+    return columns
+
+
+def derivatives(seen, model, n, channels):
+    """Of the picture by x_a, x_d, x_s and, for x_s = 1, log n, (M, C, 4)."""
+    before, after = (at_probes(seen, model, n * np.exp(step), channels) for step in (-STEP_OF_LOG_N, STEP_OF_LOG_N))
+    slope = (after[..., 2:] - before[..., 2:]) / (2 * STEP_OF_LOG_N)
+    return np.concatenate([at_probes(seen, model, n, channels), slope], axis=-1)
 
 
 class _Sums(NamedTuple):
@@ -171,11 +175,9 @@ def _sums(run, scenes, finer, lights):
         part, share, stride = probes(scene, model, counted.ravel(), sample, weight, most)
         share = share[:, None]
 
-        def shown(scene, part=part):
-            columns, _ = at_probes(scene, part.pixel, model, optimum.n, channels)
-            return columns, np.einsum("mck,kc->mc", columns[..., :3], optimum.x)
-
-        columns, coarse = shown(scene)
+        seen = brdf.some_pixels(scene, filled(part.pixel), precision="float64")
+        columns = derivatives(seen, model, optimum.n, channels)[: part.pixel.size]
+        coarse = np.einsum("mck,kc->mc", columns[..., :3], optimum.x)
         # What does not count may be no number.
         residual = np.where(share > 0, some_of(target.pixels, part)[0] - coarse, 0.0)
         jacobian = np.einsum("mci,cip->mcp", columns, place)
@@ -190,9 +192,9 @@ def _sums(run, scenes, finer, lights):
             change = np.diff(scores / stride, axis=0)
             spread += 0.5 * stride * (change * np.minimum(chance[1:], chance[:-1])[:, None]).T @ change
         if finer is not None:
-            _, fine = shown(with_samples(scene, finer, lights))
+            more = at_probes(with_samples(seen, finer, lights), model, optimum.n, channels)[: part.pixel.size]
             # A coarser model gives more of what it lacks, hence the sign.
-            light -= np.einsum("mcp,mc->p", weighed, fine - coarse)
+            light -= np.einsum("mcp,mc->p", weighed, np.einsum("mck,kc->mc", more, optimum.x) - coarse)
     return _Sums(hessian, gradient, spread, light, square)
 
 

@@ -18,11 +18,11 @@ import numpy as np
 import brdf
 from brdf.errors import InputError
 from brdf.lobes import STORED_SAMPLES, Near
-from brdf.precision import working_precision
 from fitting.budget.configurations import MOST_SAMPLES, Configuration, run, sample_counts
-from fitting.budget.error_estimate import at_probes, filled, jacobian_places, probes
+from fitting.budget.error_estimate import at_probes, derivatives, filled, jacobian_places, probes
 from fitting.budget.sampling import MadeLights, with_samples
-from fitting.light_colour import coefficient_factors, take_colour_out
+from fitting.core import UNSEEN
+from fitting.light_colour import take_colour_out
 from fitting.problem import FitProblem, has_pixel_areas
 from fitting.sample_error import MOST, SampleError, near_exponent
 from fitting.solver.nnls import scaled_inverse
@@ -87,17 +87,18 @@ class _Ladder:
         self.result, self.kind, self.n, self.x = done.result, brdf.MODELS[model], max(optimum.n, 1e-3), optimum.x
         channels = self.x.shape[1]
         self.scenes = take_colour_out(problem.scenes, channels).scenes
-        places, peaks, self.parts, self.seen = jacobian_places(optimum), [-np.inf], [], []
+        places, self.parts, self.seen = jacobian_places(optimum), [], []
         most = max(64, PROBES // len(self.scenes))
         each = zip(self.scenes, done.result.counted, done.samples, problem.weights, strict=True)
         for scene, counted, sample, weight in each:
             part, share, _ = probes(scene, self.kind, counted.ravel(), sample, weight, most)
-            few = with_samples(scene, self.first, lights)
-            columns, peak = at_probes(few, part.pixel, self.kind, self.n, channels)
-            peaks.append(np.max(peak, initial=-np.inf, where=share > 0))
-            self.seen.append(brdf.some_pixels(scene, filled(part.pixel), precision="float64"))
-            self.parts.append((part.pixel, share, np.einsum("mci,cip->mcp", columns, places)))
-        self.peak = min(max(peaks), 0.0)
+            seen = brdf.some_pixels(scene, filled(part.pixel), precision="float64")
+            columns = derivatives(with_samples(seen, self.first, lights), self.kind, self.n, channels)
+            self.seen.append(seen)
+            self.parts.append((part.pixel, share, np.einsum("mci,cip->mcp", columns[: share.size], places)))
+        # The search went up to the exponent that the nearest pixel sees a trace of.
+        highest = np.max(optimum.grid, initial=0.0)
+        self.peak = -UNSEEN / highest if 0 < highest < 0.999 * problem.n_range[1] else 0.0
         hessians = [np.einsum("m,mcp,mcq->pq", share, by, by, optimize=True) for _, share, by in self.parts]
         self.hessian: np.ndarray = np.sum(hessians, axis=0)
         self.active = np.append((self.x > 0).ravel(), bool((self.x[2] > 0).any()))
@@ -110,15 +111,10 @@ class _Ladder:
         return self.made[samples]
 
     def _made(self, samples: int) -> list[np.ndarray]:
-        k = self.x / coefficient_factors(self.kind, self.n, np.ones(self.x.shape[1]))
         found = []
-        with working_precision("float64"):
-            for seen, (_, share, _) in zip(self.seen, self.parts, strict=True):
-                lit = brdf.cast(with_samples(seen, samples, self.lights), "float64")
-                images = brdf.basis_images(self.kind, lit, self.n)
-                parts = zip(k, (images.ambient, images.diffuse, images.specular), strict=True)
-                shown = [one * np.asarray(image) for one, image in parts if image is not None]
-                found.append(np.sum(shown, axis=0).reshape(-1, k.shape[1])[: share.size])
+        for seen, (_, share, _) in zip(self.seen, self.parts, strict=True):
+            columns = at_probes(with_samples(seen, samples, self.lights), self.kind, self.n, self.x.shape[1])
+            found.append(np.einsum("mck,kc->mc", columns[: share.size], self.x))
         return found
 
     def _change(self, coarse: int, fine: int) -> tuple[np.ndarray, float]:

@@ -8,7 +8,6 @@ weight is the square's number of pixels, the inverse of its probability (Horvitz
 """
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -16,14 +15,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 import brdf
+from brdf.lights.base import Lighting, stacked
+from brdf.lobes import diffuse_and_lobe
 from brdf.models.base import SpecularMaterial
 from brdf.precision import working_precision
-from brdf.rendering import basis
 
 # Of the squares of each size this share is cut further.
 CUT = 1 / 12
-# Lights with an extent stand here for the position of their highlight, by more samples than are compiled one by one.
-FEW_SAMPLES = 9
 # Which a picture of no more pixels than this is not worth.
 FEWEST = 256
 
@@ -54,7 +52,7 @@ def with_samples(scene: brdf.Scene, samples: int | None, made: MadeLights | None
 
 def _sampled(light, samples):
     if not isinstance(light, brdf.EnvironmentMap):
-        return dataclasses.replace(light, samples=samples)
+        return dataclasses.replace(light, samples=max(samples, len(getattr(light, "triangles", ()))))
     plain = brdf.EnvironmentMap(light.pixels, samples=samples)
     return eqx.tree_at(lambda one: one.radiance, plain, plain.radiance * light.radiance)
 
@@ -71,28 +69,10 @@ class PixelSample(NamedTuple):
     stands_for: Float[np.ndarray, " M"]
 
 
-def compiled_at_pixels(program: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a program of a scene, to be run for some of its pixels.
-
-    Args:
-        program: of a scene, and of further arguments.
-
-    Returns:
-        The same with pixel indices and a precision after the scene.
-    """
-    compiled = eqx.filter_jit(program)
-
-    def run(scene, pixel, precision, *arguments):
-        with working_precision(precision):
-            return compiled(brdf.cast(brdf.some_pixels(scene, pixel, precision=precision), precision), *arguments)
-
-    return run
-
-
-@compiled_at_pixels
-def _peaks(scene, model):
-    """The largest log cosine of the lobe at each pixel."""
-    lobe: Any = basis(model, scene).lobe
+@eqx.filter_jit
+def _peaks(points, lights, model):
+    """The largest log cosine of the lobe at each pixel, of lights that nothing shadows."""
+    lobe: Any = diffuse_and_lobe(model, points, Lighting(stacked(lights, points.position.dtype)))[1]
     return lobe.peak
 
 
@@ -115,8 +95,8 @@ def sample_pixels(scene: brdf.Scene, model: type[brdf.Material], size: int) -> P
         return None
     random, end = np.random.default_rng(0), np.array([[height], [width]])
     corner = side * _along_curve(-(-height // side), -(-width // side))
-    lights = tuple(light for light in scene.lights if light.type_name != "environment")
-    lit = dataclasses.replace(scene, lights=lights, visibility=())
+    lights = with_samples(scene, 1).lights
+    lights = tuple(light for light in lights if light.type_name != "environment")
     has_peaks = bool(lights) and issubclass(model, SpecularMaterial)
     most = max(16, 4 * round(size * CUT / 4))
     pixels, areas = [], []
@@ -128,7 +108,9 @@ def sample_pixels(scene: brdf.Scene, model: type[brdf.Material], size: int) -> P
         if has_peaks and side > 1 and pixel.size > most:
             # One shape for few sizes, so that few programs are compiled.
             padded = np.resize(pixel, 1 << int(pixel.size - 1).bit_length())
-            peak = np.asarray(_peaks(with_samples(lit, FEW_SAMPLES), padded, "float32", model))[: pixel.size]
+            points = dataclasses.replace(brdf.some_pixels(scene, padded).surface_points(), area=None)
+            with working_precision("float32"):
+                peak = np.asarray(_peaks(points, lights, model))[: pixel.size]
             cut[np.argpartition(-peak, most)[:most]] = True
         pixels.append(pixel[~cut])
         areas.append(area[~cut])

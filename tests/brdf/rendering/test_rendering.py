@@ -1,5 +1,6 @@
 """The pass over light samples, and pixels averaged over their area."""
 
+import dataclasses
 import functools
 
 import jax
@@ -9,7 +10,7 @@ import pytest
 
 import brdf
 import fitting
-from brdf import lobes
+from brdf import lobes, rendering
 from brdf.rendering import basis
 
 SIZE = 128
@@ -170,3 +171,19 @@ def test_second_derivatives_are_finite_where_a_pixel_misses_the_shapes(model: ty
 
         assert np.isfinite(jax.jit(jax.hessian(value))(jnp.asarray(TO_LIGHT))).all()
         assert np.isfinite(jax.jit(jax.hessian(value))(jnp.array([0.3, 0.2, -1.0]))).all()
+
+
+@pytest.mark.parametrize("model", [brdf.Phong, brdf.NormalizedBlinnPhong])
+def test_one_program_under_many_samples_serves_every_lobe_and_number(model):
+    # Of few pixels samples are filled up with ones of no light, and the lobe is chosen as the program runs.
+    light = brdf.SphereLight(center=[1, 1, 3], radius=0.4, radiance=[2.0, 1.0, 3.0], samples=36)
+    scene = ball(1, 24, lights=[light, brdf.PointLight(position=[0, 0, 4], intensity=1.0)])
+    images = brdf.basis_images(model, scene, 20.0)
+    material = model(k_d=0.3, k_s=[0.2, 0.3, 0.4], n=20.0)
+    shown = 0.3 * images.diffuse + np.array([0.2, 0.3, 0.4]) * images.specular
+    np.testing.assert_allclose(shown, brdf.render(material, scene), rtol=2e-6, atol=1e-7)
+    before = rendering._basis_images._cached._cache_size()
+    for other, samples in ((brdf.BlinnPhong, 64), (model, 400)):
+        more = dataclasses.replace(scene, lights=(dataclasses.replace(light, samples=samples), scene.lights[1]))
+        brdf.basis_images(other, more, 30.0)
+    assert rendering._basis_images._cached._cache_size() == before

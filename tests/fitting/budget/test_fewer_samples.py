@@ -57,3 +57,11 @@ def test_a_light_map_keeps_its_light_with_other_samples():
     assert with_samples(scene, 16, made).lights[0] is light
     np.testing.assert_allclose(light.radiance, scene.lights[0].radiance, rtol=1e-12)
     assert with_samples(ball(8), 4).lights == ball(8).lights
+
+
+def test_a_light_of_many_corners_keeps_one_sample_for_each_triangle():
+    turn = np.linspace(0, 2 * np.pi, 14)[:-1]
+    corners = np.stack([np.cos(turn), np.sin(turn), np.full(13, 3.0)], axis=1)[::-1]
+    scene = ball(256, (brdf.PolygonLight(vertices=corners, radiance=2.0),))
+    assert with_samples(scene, 4).lights[0].samples == 11
+    assert sample_pixels(scene, brdf.BlinnPhong, 1024) is not None
