@@ -139,16 +139,21 @@ class Sampler:
 
     def __call__(self, to_light: Float[np.ndarray, "m 3"], to_view: Float[np.ndarray, "m 3"]) -> np.ndarray:
         """Values, (m, C); where they are not finite that is remembered, and 0 stands for them."""
-        pairs = np.stack(np.broadcast_arrays(to_light, to_view))
-        count = pairs.shape[1]
-        batches = np.pad(pairs, np.array([(0, 0), (0, -count % _BATCH), (0, 0)]), mode="edge").reshape(2, -1, _BATCH, 3)
+        both = np.broadcast_arrays(to_light, to_view)
+        count = len(both[0])
+        values = np.empty((self.channels, count)).T  # channel by channel: what is compared are channels of many pairs
         with jax.enable_x64(True):
-            parts = [np.asarray(self._batch(light, view), np.float64) for light, view in zip(*batches, strict=True)]
-        values = np.concatenate(parts)[:count]
-        finite = np.all(np.isfinite(values), axis=1)
-        if not np.all(finite):
-            self.not_finite = pairs[:, np.argmin(finite)]
-        return np.where(finite[:, None], values, 0.0)
+            for first in range(0, count, _BATCH):
+                some = [vectors[first : first + _BATCH] for vectors in both]
+                missing = np.array([(0, _BATCH - len(some[0])), (0, 0)])
+                found = self._batch(*(np.pad(part, missing, mode="edge") if missing.any() else part for part in some))
+                values[first : first + _BATCH] = np.asarray(found)[: len(some[0])]
+        finite = np.isfinite(values)
+        if not finite.all():
+            good = np.all(finite, axis=1)
+            self.not_finite = np.stack([vectors[np.argmin(good)] for vectors in both])
+            values[~good] = 0.0
+        return values
 
 
 class _Scan:
