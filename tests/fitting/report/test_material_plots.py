@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from brdf.models import BlinnPhong, NormalizedPhong
-from brdf.plausibility.stability import stability_map
+from brdf.plausibility.stability import StabilityMap
 from brdf.plausibility.verdicts import check
 from fitting.report.material_plots import plot_albedo, plot_lobe, plot_reciprocity, plot_stability
 
@@ -36,6 +36,10 @@ def test_reciprocity_map_is_antisymmetric():
 
 
 def test_stability_picture_has_a_panel_for_each_map():
-    found = stability_map(NormalizedPhong, np.array([1.0, 1e6]), np.array([0.0, 45.0, 90.0]))
-    figure = plot_stability([found, found])
-    assert [axes.get_title() for axes in figure.axes[:2]] == ["normalized-phong\nall derivatives finite"] * 2
+    exponents, angles = np.array([1.0, 1e6]), np.array([0.0, 45.0, 90.0])
+    finite = np.ones((2, 3), bool)
+    holds = StabilityMap("phong", exponents, angles, np.full((2, 3), 1e-7), finite)
+    fails = StabilityMap("blinn-phong", exponents, angles, np.full((2, 3), 1e-2), finite & (angles < 90))
+    figure = plot_stability([holds, fails])
+    titles = [axes.get_title() for axes in figure.axes[:2]]
+    assert titles == ["phong\nall derivatives finite", "blinn-phong\n2 not finite"]
