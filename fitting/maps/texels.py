@@ -184,26 +184,28 @@ def octave_gains(model: Any, target: Target, columns: Columns, grey: bool, finer
     first = 2.0 ** (jnp.arange(finer, dtype=dtype) / finer)
     gram, moment = _sums(columns.linear, target)
     floor = jnp.exp(_lowest(dtype))
+    # all that the loop sums is a column times the lobe's cosine to a power: one multiplication less at each n
+    weighted = [
+        column[:, None] * columns.weight[:, :, None]
+        for column in (*columns.linear, target.summed[:, None] if grey else target.shown)
+    ]
 
-    def gain(lobe: Array, scale: Array) -> Array:
-        across = [jnp.sum(column * lobe, axis=0) for column in columns.linear]
-        square, moments = jnp.sum(lobe * lobe, axis=0), [*moment, _moment(lobe, target, grey)]
+    def gain(power: Array, scale: Array) -> Array:
+        *across, shown = (jnp.sum(column * power[:, :, None], axis=(0, 1)) for column in weighted)
+        lobe = jnp.sum(columns.weight * power, axis=1, keepdims=True)
+        square, moments = jnp.sum(lobe * lobe, axis=0), [*moment, _of_all(shown, target) if grey else shown]
         whole = [*([*row, x] for row, x in zip(gram, across, strict=True)), [*across, square]]
         k = nonnegative(whole, moments, target.cap * scale, grey, steps=1)
         left = [b - 0.5 * sum(map(operator.mul, row, k)) for b, row in zip(moments, whole, strict=True)]
         return over_channels(sum(map(operator.mul, k, left)))[0]
 
-    def lobe_of(power: Array) -> tuple[Array, Array]:
-        power = jnp.maximum(power, floor)
-        return power, jnp.sum(columns.weight * power, axis=1, keepdims=True)
+    def octave(powers: list[Array], n: Array) -> tuple[list[Array], Array]:
+        gains = [gain(power, scale) for power, scale in zip(powers, model.scale(n), strict=True)]
+        return [jnp.maximum(power * power, floor) for power in powers], jnp.stack(gains)
 
-    def octave(chains: Any, n: Array) -> Any:
-        gains = [gain(lobe, scale) for (_, lobe), scale in zip(chains, model.scale(n), strict=True)]
-        return [lobe_of(power * power) for power, _ in chains], jnp.stack(gains)
-
-    chains = [lobe_of(jnp.exp(n * columns.log_cosine)) for n in first]
+    powers = [jnp.maximum(jnp.exp(n * columns.log_cosine), floor) for n in first]
     exponents = first * 2.0 ** jnp.arange(OCTAVES + 1, dtype=dtype)[:, None]
-    return jax.lax.scan(octave, chains, exponents)[1].reshape(-1, *target.cap.shape)
+    return jax.lax.scan(octave, powers, exponents)[1].reshape(-1, *target.cap.shape)
 
 
 class Bracket(NamedTuple):
@@ -512,9 +514,12 @@ def _moment(column: Float[Array, "P D T"], target: Target, shared: bool) -> Floa
     """Of a column with what the photographs show; where channels share its coefficient the first has that of all."""
     if not shared:
         return jnp.sum(column * target.shown, axis=0)
-    channels = target.shown.shape[1]
-    first = jnp.arange(channels)[:, None] == 0
-    return jnp.where(first, jnp.sum(column[:, 0] * target.summed, axis=0), 0)
+    return _of_all(jnp.sum(column[:, 0] * target.summed, axis=0), target)
+
+
+def _of_all(moment: Array, target: Target) -> Float[Array, "C T"]:
+    """The moment of all channels, (T,) or (1, T), as the first one's."""
+    return jnp.where(jnp.arange(target.shown.shape[1])[:, None] == 0, moment, 0)
 
 
 def _upper(gram: list[list[Array]]) -> dict[tuple[int, int], Array]:
