@@ -44,6 +44,24 @@ AMaterial = Annotated[
 ]
 
 
+Report = Annotated[Path | None, typer.Option(help="One .html page with everything, to keep or to send.")]
+
+
+def check_page(path: Path | None) -> None:
+    """Tell before the work that a page cannot be written.
+
+    Args:
+        path: of the page, or None.
+
+    Raises:
+        InputError: naming it.
+    """
+    if path is not None and path.suffix.lower() not in (".html", ".htm"):
+        raise InputError(path, "is no name of a page", "Name it .html")
+    if path is not None and not path.absolute().parent.is_dir():
+        raise InputError(path, f"cannot be written, {path.parent} is no folder", "Make it first")
+
+
 def _option(said: str, *names: str) -> Any:
     return typer.Option(*names, help=said, rich_help_panel="What the pictures show")
 

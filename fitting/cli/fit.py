@@ -18,6 +18,8 @@ from fitting.cli.common import (
     Model,
     PictureOptions,
     Precision,
+    Report,
+    check_page,
     named_as,
     show,
     use_compilation_cache,
@@ -67,7 +69,7 @@ def fit(
         str | None, typer.Option(help="all: spread the pixels over all cores or accelerators, and processes.")
     ] = None,
     plot: Annotated[bool, typer.Option("--plot", help="Also draw comparison.png into --out.")] = False,
-    report: Annotated[Path | None, typer.Option(help="One .html page with everything, to keep or to send.")] = None,
+    report: Report = None,
     as_json: AsJson = False,
 ) -> None:
     """Fit a model to a picture: value ± error of every parameter, with no guess to give."""
@@ -75,10 +77,7 @@ def fit(
 
     if plot and out is None:
         raise InputError("--plot", "needs a folder to draw into", "Add --out DIR")
-    if report is not None and report.suffix.lower() not in (".html", ".htm"):
-        raise InputError(report, "is no name of a page", "Name it .html")
-    if report is not None and not report.absolute().parent.is_dir():
-        raise InputError(report, f"cannot be written, {report.parent} is no folder", "Make it first")
+    check_page(report)
     if out is not None:
         # Told now instead of after the fit.
         check_folder(out)

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from brdf.files import check_folder
-from fitting.cli.common import Encoding, Precision, named_as, show, use_compilation_cache
+from fitting.cli.common import Encoding, Precision, Report, check_page, named_as, show, use_compilation_cache
 from fitting.cli.devices import all_devices, is_first_process
 from fitting.progress import waiting
 
@@ -40,6 +40,7 @@ def maps(
     flip_y: Annotated[bool, typer.Option("--flip-y", help="y goes down in the file of normals.")] = False,
     encoding: Encoding = None,
     plot: Annotated[bool, typer.Option("--plot", help="Also draw maps.png into --out.")] = False,
+    report: Report = None,
     precision: Precision = "float32",
     devices: Annotated[
         str | None, typer.Option(help="all: every core, accelerator and process that Slurm or mpirun has started.")
@@ -50,6 +51,7 @@ def maps(
 
     if plot and out is None:
         raise InputError("--plot", "needs a folder to draw into", "Add --out DIR")
+    check_page(report)
     if out is not None:
         check_folder(out)
     mesh = all_devices(devices)
@@ -76,4 +78,7 @@ def maps(
         if out is not None:
             found.save(out, plot=plot)
             shutil.rmtree(out / BANDS, ignore_errors=True)
-    show(f"{found}\n{'nothing saved: give --out DIR' if out is None else f'saved in {out}'}")
+        if report is not None:
+            found.view(f"Maps of {target.resolve().name}").save(report)
+    saved = "nothing saved: give --out DIR" if out is None else f"saved in {out}"
+    show("\n".join([str(found), saved, *([] if report is None else [f"wrote {report}"])]))

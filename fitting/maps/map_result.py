@@ -184,6 +184,31 @@ class Maps:
 
         write_maps(self, folder, plot=plot)
 
+    def view(self, title: str = "maps") -> Any:
+        """A page that relights the maps: under a light that moves, or one by one, drawn in WebGL2.
+
+        k_d, k_s and residual are held to 5e-4 of each, normals to 5e-5 radians, n to 1e-4 of it, of more than 1024
+        texels on a side every second, third, ...
+
+        Args:
+            title: of the page.
+
+        Returns:
+            A page, which Jupyter shows without a kernel and ``.save("page.html")`` writes: one file, no network.
+
+        Example:
+            >>> fitting.load_maps("maps").view().save("page.html")
+        """
+        from fitting.maps.map_page import maps_page
+
+        return maps_page(self, title, REASONS)
+
+    def _repr_html_(self) -> str:
+        """For Jupyter."""
+        from fitting.maps.map_page import maps_html
+
+        return maps_html(self)
+
     def plot(self) -> Any:
         """A Matplotlib figure of the maps.
 

@@ -15,8 +15,9 @@ import platform
 
 import brdf
 from brdf.display import material_html, report_html
+from fitting.report.page import secure_page
 from fitting.report.text import standing
-from fitting.report.viewer import secure_page, viewer
+from fitting.report.viewer import viewer
 from fitting.result import NOT_DETERMINED, FitResult
 
 SENTENCE = 45  # letters, from which on the text in a cell is broken over lines
@@ -76,7 +77,7 @@ def report_page(result: FitResult, *, source: str = "", command: str = "") -> st
 <h2>How it was made</h2>
 {_table([[key, value] for key, value in made.items() if value])}
 <details><summary>The report as text</summary><pre class="wide">{html.escape(str(result))}</pre></details>"""
-    return secure_page(title, body)
+    return secure_page(title, body, "viewer.js")
 
 
 def _numbers(result):

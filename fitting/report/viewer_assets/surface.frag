@@ -1,5 +1,6 @@
-// What a pixel sees and shows. Before this text stands the material (brdf_ambient, brdf_light) with its numbers as
-// uniforms. Lengths are in units of the scene's size and the pivot is the origin: single precision then is enough.
+// What a pixel sees and shows. Before this text stand the material (brdf_ambient, brdf_light) with its numbers as
+// uniforms, and display.frag. Lengths are in units of the scene's size and the pivot is the origin: single precision then
+// is enough.
 uniform vec2 size, middle, corner_of_probe;
 uniform float pitch, depth_of_pivot, unit;
 uniform bool perspective, local_viewer;
@@ -46,28 +47,9 @@ layout(location = 1) out uvec4 probed_normal;
 layout(location = 2) out uvec4 probed_position;
 #else
 uniform sampler2D target, still;
-uniform bool compared, from_still, srgb, marked;
+uniform bool compared, from_still;
 uniform vec2 wipe;  // columns: target before the first, residual beyond the second
-uniform float exposure, residual_limit;
-out vec4 colour;
-
-vec3 residual_colour(vec3 difference) {
-    vec3 size_of = abs(difference);
-    float largest = max(size_of.r, max(size_of.g, size_of.b));
-    float signed_one = largest == size_of.r ? difference.r : largest == size_of.g ? difference.g : difference.b;
-    float share = clamp(signed_one / residual_limit, -1.0, 1.0);
-    vec3 end = share < 0.0 ? vec3(0.0, 0.13, 0.31) : vec3(1.0, 0.92, 0.27);
-    return mix(vec3(0.48, 0.48, 0.47), end, abs(share));
-}
-
-vec3 display(vec3 value, vec2 place) {
-    value *= exposure;
-    bool clipped = marked && any(greaterThan(value, vec3(1.0)));
-    value = clamp(value, 0.0, 1.0);
-    if (srgb) value = mix(1.055 * pow(value, vec3(1.0 / 2.4)) - 0.055, 12.92 * value, lessThan(value, vec3(0.0031308)));
-    bool stripe = mod(floor((place.x + place.y) / 3.0), 2.0) < 1.0;
-    return clipped && stripe ? vec3(1.0, 0.0, 0.6) : value;
-}
+uniform float residual_limit;
 #endif
 
 void show(vec3 value, bool fitted, vec3 position, vec3 normal, vec2 place) {
@@ -80,13 +62,12 @@ void show(vec3 value, bool fitted, vec3 position, vec3 normal, vec2 place) {
         vec4 seen = texelFetch(target, ivec2(place), 0);
         if (from_still) value = texelFetch(still, ivec2(place), 0).rgb;
         if (place.x > wipe.y) {
-            colour = vec4(seen.a > 0.5 ? residual_colour(value - seen.rgb) : vec3(0.16), 1.0);
+            colour = vec4(seen.a > 0.5 ? ramp(largest(value - seen.rgb) / residual_limit) : vec3(0.16), 1.0);
             return;
         }
         if (place.x < wipe.x) value = seen.rgb;
     }
-    // Rounded here: not every driver rounds to the nearest of the 256 codes.
-    colour = vec4(floor(display(value, place) * 255.0 + 0.5) / 255.0, 1.0);
+    colour = rounded(display(value, place));
 #endif
 }
 

@@ -1,30 +1,10 @@
-"use strict";
-// The page that turns: draws the fitted surface with WebGL2, and lets its numbers, light and view be moved.
-// Everything it knows is in the element viewer-data; lengths there are in units of the scene, the pivot is the origin.
+// The page that turns: draws the fitted surface with WebGL2, and lets its numbers, light and view be moved. Lengths in
+// its data are in units of the scene, the pivot is the origin. Before this stands page.js.
 (() => {
-  const data = JSON.parse(document.getElementById("viewer-data").textContent);
-  const find = (id) => document.getElementById(id);
-  const canvas = find("canvas");
-  const gl = canvas.getContext("webgl2", { antialias: false, preserveDrawingBuffer: true, alpha: false });
-  if (!gl || typeof DecompressionStream === "undefined") return; // the still picture stays
-
-  // -- vectors ------------------------------------------------------------------------------------------------------
-
-  const add = (a, b, s = 1) => a.map((x, i) => x + s * b[i]);
-  const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-  const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-  const scaled = (a, s) => a.map((x) => x * s);
-  const unit = (a) => scaled(a, 1 / Math.hypot(...a));
-
-  function rotated(v, axis, degrees) {
-    // Rodrigues
-    const [c, s] = [Math.cos((degrees * Math.PI) / 180), Math.sin((degrees * Math.PI) / 180)];
-    return add(add(scaled(v, c), cross(axis, v), s), axis, dot(axis, v) * (1 - c));
-  }
+  if (!able) return;
 
   // -- state --------------------------------------------------------------------------------------------------------
 
-  const copy = (value) => JSON.parse(JSON.stringify(value));
   const fitted = copy(data.material);
   const specular = "n" in fitted;
   const first = {
@@ -40,7 +20,6 @@
     ...fitted,
   };
   const state = copy(first);
-  const same = (a, b) => JSON.stringify(a) === JSON.stringify(b);
   const moved = () => Object.keys(fitted).some((key) => !same(state[key], fitted[key]));
   const ownView = () => !state.yaw && !state.pitch && state.shape === "scene" && same(state.places, first.places);
   const compared = () => ownView() && (data.drawable || !moved());
@@ -56,42 +35,17 @@
   const homely = (light, place) =>
     data.lights[light].kind ? scaled(add(place, data.pivot, -1), 1 / data.unit) : unit(place);
 
-  function write() {
-    const said = new URLSearchParams();
-    for (const key of ["yaw", "pitch", "shape", "exposure", "srgb", "marked", "wipe", ...Object.keys(fitted)]) {
-      if (!same(state[key], first[key]))
-        said.set(
-          key,
-          [state[key]]
-            .flat()
-            .map((x) => (typeof x === "number" ? +x.toPrecision(9) : x))
-            .join(","),
-        );
-    }
-    state.places.forEach((place, i) => {
-      if (!same(place, first.places[i]))
-        said.set(
-          `light${i}`,
-          worldly(i, place)
-            .map((x) => +x.toPrecision(9))
-            .join(","),
-        );
-    });
-    if (location.protocol !== "about:") history.replaceState(null, "", `#${said.toString().replaceAll("%2C", ",")}`);
+  function told() {
+    const places = state.places.map((place, i) => [`light${i}`, worldly(i, place)]);
+    const { places: _, selected, ...others } = state;
+    return { ...others, ...Object.fromEntries(places) };
   }
 
-  function read() {
-    for (const [key, text] of new URLSearchParams(location.hash.slice(1))) {
-      const numbers = text.split(",").map(Number);
-      const known = numbers.every(Number.isFinite);
+  function take(read) {
+    for (const [key, value] of Object.entries(read)) {
       const light = /^light(\d+)$/.exec(key)?.[1];
-      if (light !== undefined && data.lights[light] && known && numbers.length === 3 && Math.hypot(...numbers))
-        state.places[light] = homely(light, numbers);
-      else if (["srgb", "marked"].includes(key)) state[key] = text === "true";
-      else if (key === "shape" && shapes.some(([name]) => name === text)) state.shape = text;
-      else if (known && Array.isArray(first[key]) && key !== "places" && numbers.length === first[key].length)
-        state[key] = numbers;
-      else if (known && typeof first[key] === "number" && numbers.length === 1) state[key] = numbers[0];
+      if (light === undefined) state[key] = value;
+      else state.places[light] = homely(light, value);
     }
     if (!data.traced && (state.yaw || state.pitch || !same(state.places, first.places)) && state.shape === "scene")
       state.shape = "ball";
@@ -110,55 +64,26 @@
     LIGHTS: Math.max(1, data.lights.length),
   };
   const programs = {};
+  const corners = ["corner", "corner_a", "corner_b", "corner_c", "normal_a", "normal_b", "normal_c"];
 
   function program(mesh, probe) {
-    const name = `${mesh}${probe}`;
-    if (programs[name]) return programs[name];
-    const head = ["#version 300 es", ...Object.entries(counts).map(([key, count]) => `#define ${key} ${count}`)];
-    if (mesh) head.push("#define MESH");
-    if (probe) head.push("#define PROBE");
-    head.push("precision highp float;", "precision highp int;", "precision highp sampler2D;", "");
-    const made = gl.createProgram();
-    for (const [kind, text] of [
-      [gl.VERTEX_SHADER, data.shader.vertex],
-      [gl.FRAGMENT_SHADER, data.shader.material + data.shader.fragment],
-    ]) {
-      const part = gl.createShader(kind);
-      gl.shaderSource(part, head.join("\n") + text);
-      gl.compileShader(part);
-      gl.attachShader(made, part);
-      if (!gl.getShaderParameter(part, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(part));
-    }
-    ["corner", "corner_a", "corner_b", "corner_c", "normal_a", "normal_b", "normal_c"].forEach((key, i) =>
-      gl.bindAttribLocation(made, i, key),
-    );
-    gl.linkProgram(made);
-    if (!gl.getProgramParameter(made, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(made));
-    const places = {};
-    return (programs[name] = { made, place: (key) => (places[key] ??= gl.getUniformLocation(made, key)) });
+    const defined = Object.entries(counts).map(([key, count]) => `${key} ${count}`);
+    if (mesh) defined.push("MESH");
+    if (probe) defined.push("PROBE");
+    return (programs[defined] ??= compiled(defined, data.shader.vertex, data.shader.fragment, corners));
   }
 
-  async function floats(text) {
-    const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
-    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
-    return new Float32Array(await new Response(stream).arrayBuffer());
-  }
-
+  const floats = async (text) => new Float32Array(await unpacked(text));
   const [, , width, height, stride] = data.window;
   const finer = Math.max(1, Math.ceil(512 / Math.max(width, height)));
   let pictures = [];
   let meshes = [];
 
   async function load() {
-    for (const [unitOf, text] of [data.target, data.still].entries()) {
+    for (const [at, text] of [data.target, data.still].entries()) {
       if (!text) continue;
-      const values = await floats(text);
-      pictures[unitOf] = values;
-      gl.activeTexture(gl.TEXTURE0 + unitOf);
-      gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
-      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
-      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
-      gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, width, height, 0, gl.RGBA, gl.FLOAT, values);
+      pictures[at] = await floats(text);
+      texture(at, width, height, [gl.RGBA32F, gl.RGBA, gl.FLOAT], pictures[at]);
     }
     meshes = await Promise.all(
       data.meshes.map(async (mesh) => {
@@ -265,9 +190,7 @@
         light_kind: data.lights.flatMap((light) => [light.kind, ...light.cone]),
         rectangle: shown.rectangles.flatMap((one) => one.slice(0, 3).flat()),
       };
-      for (const [key, value] of Object.entries(numbers)) gl.uniform1f(place(key), value ?? 0);
-      for (const [key, value] of Object.entries(truths)) gl.uniform1i(place(key), Number(value ?? 0));
-      for (const [key, value] of Object.entries(triples)) if (value.length) gl.uniform3fv(place(key), value);
+      uniforms(place, numbers, truths, triples);
       for (const [key, list] of [
         ["sphere_fitted", shown.spheres],
         ["rectangle_fitted", shown.rectangles],
@@ -337,13 +260,6 @@
 
   // -- pointer and keys ---------------------------------------------------------------------------------------------
 
-  function pixelOf(event) {
-    const box = canvas.getBoundingClientRect();
-    const [x, y] = [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
-    if (x < 0 || y < 0 || x >= 1 || y >= 1) return null;
-    return [Math.floor(x * canvas.width), Math.floor(y * canvas.height)];
-  }
-
   function toEye(position) {
     const view = camera();
     return view.local ? unit(add(view.position, position, -1)) : scaled(view.forward, -1);
@@ -401,7 +317,7 @@
       canvas.style.cursor = "";
     });
   canvas.addEventListener("keydown", (event) => {
-    const step = { ArrowLeft: [-3, 0], ArrowRight: [3, 0], ArrowUp: [0, -3], ArrowDown: [0, 3] }[event.key];
+    const step = arrow(event);
     if (!step) return;
     event.preventDefault();
     if (event.shiftKey && data.lights.length) {
@@ -411,12 +327,6 @@
     } else turn(...step);
     update();
   });
-
-  const digits = (values) =>
-    values
-      .slice(0, data.channels.length)
-      .map((x) => (x === 0 ? "0" : Math.abs(x) < 1e-3 || Math.abs(x) >= 1e4 ? x.toExponential(2) : x.toPrecision(4)))
-      .join("  ");
 
   function point([column, row]) {
     const [x, y] = [column, row].map((at, i) => Math.round(data.window[i] + (stride * at * width) / canvas.width));
@@ -753,13 +663,7 @@
     find("copied").hidden = false;
     find("text").hidden = !text;
     find("text").value = text;
-    find("losses").replaceChildren(
-      ...losses.map((loss) => {
-        const item = document.createElement("li");
-        item.textContent = loss;
-        return item;
-      }),
-    );
+    items(find("losses"), losses);
     if (!text) return void (find("said").textContent = "");
     let done = true;
     try {
@@ -776,9 +680,7 @@
 
   // -- putting it together ------------------------------------------------------------------------------------------
 
-  let waiting = 0;
   function paint() {
-    waiting = 0;
     draw();
     place_wipe();
     for (const row of rows) row();
@@ -786,25 +688,13 @@
     draw_lobe();
     draw_albedo(values);
     draw_verdict(values);
-    find("exposure").value = state.exposure;
-    find("stops").textContent = `${state.exposure > 0 ? "+" : ""}${(+state.exposure).toFixed(2)} stops`;
-    [find("srgb").checked, find("marked").checked] = [state.srgb, state.marked];
     [find("shape").value, find("light").value] = [state.shape, state.selected];
     find("own").disabled = ownView();
     find("reset").disabled = !moved();
-    write();
-  }
-  const update = () => {
-    waiting ||= requestAnimationFrame(paint);
-  };
-
-  function options(select, names) {
-    select.replaceChildren(...names.map(([value, text]) => new Option(text, value)));
   }
 
   async function start() {
     await load();
-    read();
     options(find("shape"), shapes);
     options(
       find("light"),
@@ -813,13 +703,6 @@
     find("light-label").hidden = data.lights.length < 2;
     find("model").textContent = data.model;
     find("sliders").append(...data.numbers.map(number_row));
-    find("notes").append(
-      ...data.notes.map((note) => {
-        const item = document.createElement("li");
-        item.textContent = note;
-        return item;
-      }),
-    );
     find("shape").addEventListener("change", (event) => {
       state.shape = event.target.value;
       if (!data.traced && state.shape === "scene") to_own();
@@ -828,15 +711,6 @@
     find("light").addEventListener("change", (event) => {
       state.selected = Number(event.target.value);
     });
-    find("exposure").addEventListener("input", (event) => {
-      state.exposure = Number(event.target.value);
-      update();
-    });
-    for (const key of ["srgb", "marked"])
-      find(key).addEventListener("change", (event) => {
-        state[key] = event.target.checked;
-        update();
-      });
     find("reset").addEventListener("click", () => {
       Object.assign(state, copy(fitted));
       update();
@@ -847,25 +721,13 @@
     });
     for (const button of document.querySelectorAll("[data-format]"))
       button.addEventListener("click", () => copy_as(button.dataset.format));
-    addEventListener("hashchange", () => {
-      Object.assign(state, copy(first));
-      read();
-      update();
-    });
-    find("viewer").classList.add("drawn");
     find("why").textContent = "Target and fit in the fit’s own view and light, as they were computed.";
-    find("fixed").hidden = data.drawable;
-    paint();
   }
 
   function to_own() {
     Object.assign(state, { yaw: 0, pitch: 0, shape: "scene", places: copy(first.places) });
   }
 
-  start().catch((error) => {
-    // whatever fails here, the still picture stays
-    find("viewer").classList.remove("drawn");
-    find("fixed").hidden = false;
-    console.error(error);
-  });
+  const words = { shape: shapes.map(([name]) => name) };
+  const update = begin(state, { load: start, paint, told, take, words });
 })();

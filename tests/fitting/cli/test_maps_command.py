@@ -20,6 +20,8 @@ def test_a_folder_without_lights_is_told_and_nothing_is_written(tmp_path, capsys
     assert told.err.startswith(f"error: {tmp_path}: has no file of lights")
     assert told.err.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+    assert run("maps", tmp_path, "--report", tmp_path / "page.txt") == 2
+    assert "page.txt: is no name of a page. Name it .html" in capsys.readouterr().err
 
 
 def test_diligent_text_files_are_read_and_maps_written(tmp_path, capsys):
@@ -35,8 +37,12 @@ def test_diligent_text_files_are_read_and_maps_written(tmp_path, capsys):
     np.savetxt(tmp_path / "light_intensities.txt", intensities)
     write_image(tmp_path / "mask.png", np.eye(3, 4), dtype="uint8")
     np.save(tmp_path / "normals.npy", np.broadcast_to([0.0, 0.0, 1.0], (3, 4, 3)))
-    assert run("maps", tmp_path, "--model", "lambert", "--out", tmp_path / "out") == 0
-    assert "3 of them fitted (lambert)" in capsys.readouterr().out
+    page = tmp_path / "page.html"
+    assert run("maps", tmp_path, "--model", "lambert", "--out", tmp_path / "out", "--report", page) == 0
+    told = capsys.readouterr().out
+    assert "3 of them fitted (lambert)" in told
+    assert f"wrote {page}" in told
+    assert "Content-Security-Policy" in page.read_text()
     maps = fitting.load_maps(tmp_path / "out")
     np.testing.assert_allclose(maps.k_d[np.eye(3, 4) > 0], np.broadcast_to([0.3, 0.2, 0.1], (3, 3)), rtol=1e-3)
     assert np.isnan(maps.k_d[np.eye(3, 4) == 0]).all()

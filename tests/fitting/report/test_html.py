@@ -1,17 +1,15 @@
 """The report page: complete, self-contained, and shown by a real browser."""
 
 import dataclasses
-import json
 import pickle
 import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from project_paths import BROWSER
+from browser_pages import asked, needs_browser
 
 import brdf
 import fitting
@@ -53,18 +51,12 @@ def test_results_show_themselves_in_jupyter(glossy: fitting.FitResult):
     assert "not plausible" in brdf.check(glossy.material)._repr_html_()
 
 
-@pytest.mark.skipif(
-    not (shutil.which("node") and shutil.which("chromium") and (BROWSER / "node_modules").exists()),
-    reason="needs node, Debian's chromium, and `npm ci` in tests/browser",
-)
+@needs_browser
 @pytest.mark.parametrize("width", [1000, 400])
 def test_chromium_shows_the_page(page: str, width: int, tmp_path: Path):
     (tmp_path / "report.html").write_text(page)
     shot = tmp_path / "shot.png"
-    command = ["node", str(BROWSER / "open_page.mjs"), str(tmp_path / "report.html"), str(shot), str(width)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
-    assert done.returncode == 0, done.stderr
-    seen = json.loads(done.stdout)
+    seen = asked("open_page.mjs", tmp_path / "report.html", shot, width)
     assert seen["requests"] == []
     assert seen["messages"] == []
     assert (seen["pictures"], seen["broken"]) == (4, 0)
@@ -84,13 +76,8 @@ def test_columns_without_content_are_not_shown(matt: fitting.FitResult, page: st
         assert f"<th>{head}</th>" not in bare
 
 
-@pytest.mark.skipif(
-    not (shutil.which("node") and shutil.which("chromium") and (BROWSER / "node_modules").exists()),
-    reason="needs node, Debian's chromium, and `npm ci` in tests/browser",
-)
+@needs_browser
 def test_a_spectrum_does_not_widen_the_page(tmp_path: Path):
     shown = brdf.Lambert(k_d=np.linspace(0, 1, 31))._repr_html_()
     (tmp_path / "page.html").write_text(f'<meta charset="utf-8">{shown}')
-    command = ["node", str(BROWSER / "open_page.mjs"), str(tmp_path / "page.html"), str(tmp_path / "shot.png"), "700"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
-    assert json.loads(done.stdout)["width"] <= 700
+    assert asked("open_page.mjs", tmp_path / "page.html", tmp_path / "shot.png", 700)["width"] <= 700

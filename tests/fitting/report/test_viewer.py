@@ -1,28 +1,22 @@
 """The page that turns shows in a browser what `brdf.render` shows, says what it cannot, and loads nothing."""
 
-import base64
 import dataclasses
 import importlib.util
 import json
 import re
-import shutil
-import subprocess
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from project_paths import BROWSER
+from browser_pages import asked, drawn, needs_browser
 from scipy.ndimage import binary_dilation, binary_erosion
 from scipy.spatial import ConvexHull
 
 import brdf
 import fitting
 
-pytestmark = pytest.mark.skipif(
-    not (shutil.which("node") and shutil.which("chromium") and (BROWSER / "node_modules").exists()),
-    reason="needs node, Debian's chromium, and `npm ci` in tests/browser",
-)
+pytestmark = needs_browser
 
 SIZE = 40  # of the fitted ball; turned, the page draws 13 times as many pixels on a side
 LIMIT = 0.51  # of 255 codes: rounding to a code takes 0.5
@@ -80,25 +74,6 @@ def turned(scene: brdf.Scene, yaw: float, pitch: float, factor: int, place: list
     camera = dataclasses.replace(camera, **places, up=turn @ up, resolution=(SIZE * factor, SIZE * factor))
     key = "direction" if isinstance(scene.lights[0], brdf.DirectionalLight) else "position"
     return dataclasses.replace(scene, camera=camera, lights=(dataclasses.replace(scene.lights[0], **{key: place}),))
-
-
-def drawn(pages: list[tuple[str, list[str]]], folder: Path) -> list[dict[str, Any]]:
-    """What the browser draws of each page in each state, (H, W, 3) codes."""
-    job = []
-    for index, (text, states) in enumerate(pages):
-        (folder / f"{index}.html").write_text(text)
-        job.append({"page": str(folder / f"{index}.html"), "states": states})
-    (folder / "job.json").write_text(json.dumps(job))
-    command = ["node", str(BROWSER / "turn_page.mjs"), str(folder / "job.json")]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
-    assert done.returncode == 0, done.stderr
-    answers = json.loads(done.stdout)
-    for answer in answers:
-        answer["codes"] = [
-            np.frombuffer(base64.b64decode(one["pixels"]), np.uint8).reshape(one["height"], one["width"], 4)[..., :3]
-            for one in answer["canvases"]
-        ]
-    return answers
 
 
 def off(codes: np.ndarray, material: brdf.Material, scene: brdf.Scene) -> float:
@@ -200,10 +175,7 @@ def test_a_bare_power_would_be_seen(glossy: fitting.FitResult, tmp_path: Path):
 
 def used(text: str, folder: Path) -> dict[str, Any]:
     (folder / "page.html").write_text(text)
-    command = ["node", str(BROWSER / "use_page.mjs"), str(folder / "page.html")]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    return asked("use_page.mjs", folder / "page.html")
 
 
 def test_a_reader_moves_light_view_and_numbers(glossy: fitting.FitResult, tmp_path: Path):

@@ -1,0 +1,194 @@
+"""A page of its own around what WebGL2 draws: one file that asks no network and no kernel for anything.
+
+What is drawn, and what may be moved, is the caller's: its script stands behind `viewer_assets/page.js`, its fragment
+shader behind `display.frag`. A fit's surface (`fitting.report.viewer`) and maps (`fitting.maps.map_page`) call here.
+"""
+
+import base64
+import dataclasses
+import functools
+import gzip
+import hashlib
+import html
+import json
+import math
+import re
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from string import Template
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from brdf.channels import channel_names
+from brdf.display import png_address
+from brdf.files import write_text
+
+_STYLE = """
+:root { color-scheme: light dark; }
+body { font: 16px/1.45 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; }
+h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2rem; border-bottom: 1px solid #8888; }
+.wide { overflow-x: auto; } table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
+th, td { padding: 0.15em 0.6em; text-align: right; border-bottom: 1px solid #8884; }
+img { max-width: 100%; height: auto; background: white; }
+.warning { border-left: 4px solid #d55e00; padding: 0.3em 0.8em; margin: 0.6em 0; }
+pre { overflow-x: auto; background: #8882; padding: 0.6em; }
+"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Page:
+    """A page of its own; Jupyter shows it in a frame, without a kernel, also in a notebook that is only read.
+
+    Attributes:
+        text: the HTML.
+    """
+
+    text: str = dataclasses.field(repr=False)
+
+    def _repr_html_(self) -> str:
+        """For Jupyter: the page in a frame."""
+        frame = "width:100%;height:46rem;border:0"
+        return f'<iframe style="{frame}" sandbox="allow-scripts" srcdoc="{html.escape(self.text)}"></iframe>'
+
+    def save(self, path: str | Path) -> None:
+        """Write the page.
+
+        Args:
+            path: an ``.html`` file.
+
+        Raises:
+            InputError: where it cannot be written.
+        """
+        write_text(path, self.text)
+
+
+def secure_page(title: str, body: str, script: str) -> str:
+    """A whole page. It loads nothing, and runs no program but its own.
+
+    Args:
+        title: as text.
+        body: as HTML, with a `stage`.
+        script: asset that draws on it.
+    """
+    style, script = _STYLE + asset("viewer.css"), asset("page.js") + asset(script)
+
+    def digest(text: str) -> str:
+        return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+
+    policy = f"default-src 'none'; img-src data:; style-src-elem {digest(style)}; style-src-attr 'unsafe-inline'"
+    policy += f"; script-src {digest(script)}"
+    return f"""<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{policy}">
+<meta name="viewport" content="width=device-width, initial-scale=1"><title>{html.escape(title)}</title>
+<style>{style}</style></head>
+<body>
+{body}
+<script>{script}</script></body></html>
+"""
+
+
+def stage(words: str, data: Mapping[str, Any], picture: Float[np.ndarray, "H W 3"]) -> str:
+    """What is drawn on and the controls below it, as HTML.
+
+    Args:
+        words: asset with what is this page's own, by headings.
+        data: for the script.
+        picture: shown where there is no WebGL2, values for a screen.
+    """
+    own = dict(re.findall(r"<!-- (\w+) -->\n(.*?)\n(?=<!-- |\Z)", asset(words), re.DOTALL))
+    # In a script element nothing but </script and <!-- has a meaning to HTML.
+    text = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    return Template(asset("stage.html")).substitute(own, picture=png_address(picture), data=text)
+
+
+@functools.cache
+def asset(name: str) -> str:
+    """The text of a file of `viewer_assets`.
+
+    Args:
+        name: of the file.
+    """
+    return (resources.files("fitting.report") / "viewer_assets" / name).read_text(encoding="utf-8")
+
+
+def packed(values: np.ndarray) -> str:
+    """Numbers as text: gzip, base64.
+
+    Args:
+        values: any.
+    """
+    return base64.b64encode(gzip.compress(np.ascontiguousarray(values).tobytes(), mtime=0)).decode()
+
+
+# -- which pixels and channels a page holds ----------------------------------------------------------------------------
+
+
+class Shown(NamedTuple):
+    """What a page holds of pictures.
+
+    Attributes:
+        rows: of them.
+        columns: of them.
+        channels: shown as red, green and blue.
+        data: what the script is told of it.
+        notes: of what is left out.
+    """
+
+    rows: slice
+    columns: slice
+    channels: list[int]
+    data: dict[str, Any]
+    notes: list[str]
+
+    @classmethod
+    def of(cls, counted: Bool[np.ndarray, "H W"], channels: int, largest: int) -> "Shown":
+        """What counts of them, of many pixels every second, third, ...
+
+        Args:
+            counted: which pixels do.
+            channels: how many there are.
+            largest: how many pixels on a side to hold.
+        """
+        from fitting.report.plots import window  # Matplotlib takes long to load
+
+        names, notes = channel_names(channels), []
+        chosen = [0, channels // 2, channels - 1] if channels > 3 else [min(i, channels - 1) for i in range(3)]
+        rows, columns = window(counted)
+        left, top = int(columns.start), int(rows.start)
+        stride = math.ceil(max(rows.stop - top, columns.stop - left) / largest)
+        rows, columns = slice(top, rows.stop, stride), slice(left, columns.stop, stride)
+        height, width = counted[rows, columns].shape
+        if channels > 3:
+            notes.append(f"Of {channels} channels three are shown as colours: {', '.join(names[c] for c in chosen)}.")
+        if stride > 1:
+            notes.append(f"Of the picture every {stride}th column and row is held here.")
+        data = {"channels": names, "shown": chosen, "window": [left, top, width, height, stride]}
+        return cls(rows, columns, chosen, data, notes)
+
+    def pixels(self, image: np.ndarray) -> np.ndarray:
+        """Those of an image, (H, W, ...), in three colours.
+
+        Args:
+            image: of the whole.
+        """
+        return self.colours(np.asarray(image)[self.rows, self.columns])
+
+    def colours(self, values: np.ndarray) -> np.ndarray:
+        """Three colours of values, (..., C), or of one.
+
+        Args:
+            values: of the channels.
+        """
+        return np.take(values, [min(channel, values.shape[-1] - 1) for channel in self.channels], axis=-1)
+
+
+def white(image: Float[np.ndarray, "..."]) -> float:
+    """What is shown as white: nothing that only a few pixels of a highlight reach, and none clipped for no reason.
+
+    Args:
+        image: values that count.
+    """
+    return max(float(min(4 * np.quantile(image, 0.999), np.max(image))), 1e-12) if image.size else 1.0

@@ -1,0 +1,45 @@
+// Uses a page of maps as a reader does: node relight_page.mjs PAGE.html
+//
+// On standard output, as JSON: the light and the readout after a drag to the upper right and after a key, each map's
+// legend, and whether the still picture shows where there is no WebGL2.
+
+import { resolve } from "node:path";
+import { pathToFileURL } from "node:url";
+import { launch } from "./browser.mjs";
+
+const address = pathToFileURL(resolve(process.argv[2])).href;
+const browser = await launch();
+try {
+  const page = await browser.newPage({ viewport: { width: 1000, height: 900 } });
+  const seen = { messages: [], requests: [], legends: {} };
+  page.on("console", (message) => seen.messages.push(message.text()));
+  page.on("pageerror", (error) => seen.messages.push(String(error)));
+  page.on("request", (request) => { if (!/^(file|data):/.test(request.url())) seen.requests.push(request.url()); });
+  await page.goto(address);
+  await page.waitForSelector(".viewer.drawn");
+  const light = async () => {
+    await page.waitForTimeout(200);
+    return new URLSearchParams(new URL(page.url()).hash.slice(1)).get("light0");
+  };
+  const box = await page.locator("#canvas").boundingBox();
+  await page.mouse.move(box.x + 0.5 * box.width, box.y + 0.5 * box.height);
+  await page.mouse.down();
+  await page.mouse.move(box.x + 0.75 * box.width, box.y + 0.25 * box.height, { steps: 3 });
+  await page.mouse.up();
+  seen.dragged = await light();
+  seen.pointer = await page.locator("#pointer").innerText();
+  await page.locator("#canvas").press("ArrowLeft");
+  seen.pressed = await light();
+  for (const name of await page.locator("#map option").allInnerTexts()) {
+    await page.selectOption("#map", name);
+    await page.waitForTimeout(200);
+    seen.legends[name] = await page.locator("#legend").innerText();
+  }
+  const poor = await browser.newPage();
+  await poor.addInitScript(() => { HTMLCanvasElement.prototype.getContext = () => null; });
+  await poor.goto(address);
+  seen.without = { still: await poor.locator("#still").isVisible(), viewer: await poor.locator("#viewer").isVisible() };
+  process.stdout.write(JSON.stringify(seen));
+} finally {
+  await browser.close();
+}
