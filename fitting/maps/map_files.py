@@ -136,8 +136,8 @@ def draw_maps(maps: "Maps") -> Any:
     axes = figure.subplots(2, 3).ravel()
     k_d, k_s = np.nan_to_num(maps.k_d), np.nan_to_num(maps.k_s)
     pictures = [
-        ("k_d", brdf.displayed(_three(k_d / (np.percentile(k_d, 99.5) or 1))), {}),
-        ("k_s", brdf.displayed(_three(k_s / (np.percentile(k_s, 99.5) or 1))), {}),
+        ("k_d", brdf.displayed(k_d / (np.percentile(k_d, 99.5) or 1)), {}),
+        ("k_s", brdf.displayed(k_s / (np.percentile(k_s, 99.5) or 1)), {}),
         ("normal", np.clip(0.5 * maps.normal + 0.5, 0, 1), {}),
         ("log2 n", np.log2(maps.n), {"vmin": 0, "vmax": OCTAVES, "cmap": "viridis"}),
         ("error of ln n", maps.n_error / maps.n, {"vmin": 0, "vmax": 0.25, "cmap": "magma"}),
@@ -149,7 +149,3 @@ def draw_maps(maps: "Maps") -> Any:
         if how:
             figure.colorbar(shown, ax=place, shrink=0.8)
     return figure
-
-
-def _three(values: np.ndarray) -> np.ndarray:
-    return values if values.shape[2] == 3 else np.repeat(values.mean(axis=-1, keepdims=True), 3, axis=-1)

@@ -179,6 +179,13 @@ def _scanline(axes, target, fitted, counted, row, columns):
     axes.legend(frameon=False, handlelength=2.2, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.2))
 
 
+def legible(axis: Any) -> None:
+    """Numbers of a logarithmic axis that are read off: 20 and 50, not 2 × 10¹."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(NullFormatter())
+
+
 def _profile(axes, result):
     """The least residual at each exponent: how deep the minimum is, and whether there are others."""
     optimum = result.optimum
@@ -194,9 +201,7 @@ def _profile(axes, result):
         axes.set(ylabel="least residual, % of the picture", xlim=(grid[0], grid[-1]))
         if percent.max() > 5 * max(percent.min(), 1e-9):
             axes.set_yscale("log")
-            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-            axes.yaxis.set_major_formatter("{x:g}")
-            axes.yaxis.set_minor_formatter(NullFormatter())
+            legible(axes.yaxis)
     found = next(parameter for parameter in result.parameters if parameter.name == "n")
     if found.value is None:
         axes.set_title("profile of n: not determined")

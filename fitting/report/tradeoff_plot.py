@@ -4,7 +4,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter
+
+from fitting.report.plots import legible
 
 if TYPE_CHECKING:
     from fitting.speed_accuracy import Tradeoff
@@ -75,10 +76,7 @@ def error_against_time(tradeoff: "Tradeoff") -> Figure:
         if errors[row] == 0:
             axes.annotate("error 0: the reference", points[row], xytext=(9, -3), **beside)
     axes.margins(0.12)
-    # Times are read off: 20 and 50, not 2 × 10¹.
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    legible(axes.xaxis)
     axes.grid(visible=True, which="major", color="0.9", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)

@@ -163,22 +163,23 @@ def _scene(scene: brdf.Scene, shown: Shown) -> tuple[dict[str, Any], list[str]]:
 
 def _extent(scene):
     """The middle of what is fitted, and half its size."""
-    ends = []
-    for shape in scene.shapes if scene.camera is not None else ():
-        if not shape.fitted:
-            continue
-        if isinstance(shape, brdf.Sphere):
-            center = np.asarray(shape.center, np.float64)
-            ends += [center - float(shape.radius), center + float(shape.radius)]
-        elif isinstance(shape, brdf.Rectangle):
-            center, u, v = (np.asarray(x, np.float64) for x in (shape.center, shape.edge_u, shape.edge_v))
-            ends += [center + a * u + b * v for a in (-1, 1) for b in (-1, 1)]
-        elif isinstance(shape, brdf.Triangles):
-            ends += [shape.mesh.vertices.min(axis=0), shape.mesh.vertices.max(axis=0)]
+    ends = [_outline(shape) for shape in scene.shapes if shape.fitted] if scene.camera is not None else []
     if not ends:
         return np.zeros(3), 1.0
+    ends = np.concatenate(ends)
     low, high = np.min(ends, axis=0), np.max(ends, axis=0)
     return 0.5 * (low + high), float(0.5 * np.max(high - low))
+
+
+def _outline(shape):
+    """Points that reach as far as the shape along each axis."""
+    if isinstance(shape, brdf.Triangles):
+        return shape.mesh.vertices
+    center = np.asarray(shape.center, np.float64)
+    if isinstance(shape, brdf.Sphere):
+        return center + float(shape.radius) * np.array([[-1.0], [1.0]])
+    u, v = (np.asarray(edge, np.float64) for edge in (shape.edge_u, shape.edge_v))
+    return np.array([center + a * u + b * v for a in (-1, 1) for b in (-1, 1)])
 
 
 def _camera(camera, home, unit):

@@ -1,6 +1,6 @@
 """From the solver's numbers to a material, its errors, and what a user should know of them."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,7 +31,7 @@ from fitting.uncertainty.highlight import OFF_CENTRE, Highlight, highlight
 from fitting.uncertainty.intervals import exponent_interval
 from fitting.uncertainty.noise_model import weighted_sums
 from fitting.uncertainty.residual_correlation import ResidualCorrelation, residual_correlation
-from fitting.uncertainty.structure import Structure, errors_of, of_blocks, scatter, structure
+from fitting.uncertainty.structure import Errors, Structure, errors_of, of_blocks, scatter, structure
 
 # With less noise than this, in codes, rounding hides more than errs together.
 ROUNDED = 0.25
@@ -106,7 +106,7 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> Interpretation
         together = _structure(pictures, seen, optimum, noise, rounding, even=known.noise is None)
         # What a bound of the material leaves is no error of the pixels.
         if together is not None and together.significant and not fit.capped:
-            shared = _scattered(pictures, seen, optimum)
+            shared = _scattered(pictures, optimum, _left(pictures, seen, optimum))
     if fit.evidence is None and shared is None and known.noise is not None:
         spread = fit.noise_factor**2 * weighted_sums(pictures, optimum, known.noise, inverse=False).gram
     # What the light reaches but the simplest model does without is 0, with the error that it would have.
@@ -174,8 +174,7 @@ def shared_errors(said: Evidence, tiles: Sequence[Tile]) -> tuple[Float[np.ndarr
         together = structure(errors, even=said.noise >= ROUNDED)
     if not (lossy or together.significant):
         return None, together
-    parts = zip(said.pictures, errors, strict=True)
-    return np.sum([scatter(picture, said.optimum, one) for picture, one in parts], axis=0), together
+    return _scattered(said.pictures, said.optimum, errors), together
 
 
 def _structure(
@@ -191,20 +190,19 @@ def _structure(
     tell, found = noise > 2 * rounding, []
     if device_count() > 1 or seen.problem.loss != "squared" or not tell.any():
         return None
-    for picture, tile in zip(pictures, seen.tiles, strict=True):
-        errors = errors_of(picture, optimum, _whole(tile))
+    for errors in _left(pictures, seen, optimum):
         found.append(errors._replace(values=(errors.values / noise)[:, tell].astype(np.float32)))
     return structure(found, even=even)
 
 
-def _scattered(pictures: Sequence[Picture], seen: Observed, optimum: Optimum) -> Float[np.ndarray, "U U"]:
-    parts = zip(pictures, seen.tiles, strict=True)
-    found = [scatter(picture, optimum, errors_of(picture, optimum, _whole(tile))) for picture, tile in parts]
-    return np.sum(found, axis=0)
+def _scattered(pictures: Sequence[Picture], optimum: Optimum, errors: Iterable[Errors]) -> Float[np.ndarray, "U U"]:
+    return np.sum([scatter(picture, optimum, one) for picture, one in zip(pictures, errors, strict=True)], axis=0)
 
 
-def _whole(tile: Tile) -> tuple[np.ndarray, int]:
-    return np.arange(tile.target.shape[0]), tile.points.mask.shape[1]
+def _left(pictures: Sequence[Picture], seen: Observed, optimum: Optimum) -> Iterator[Errors]:
+    """What a fit leaves of whole pictures."""
+    for picture, tile in zip(pictures, seen.tiles, strict=True):
+        yield errors_of(picture, optimum, (np.arange(tile.target.shape[0]), tile.points.mask.shape[1]))
 
 
 def _typical_weight(pictures: Sequence[Picture]) -> float:
