@@ -97,7 +97,7 @@ class Picture(eqx.Module):
         found = np.zeros((4, *self.target.shape), np.float64)
         found[0], found[1] = self.ambient, self.diffuse
         if self.lobe is not None:
-            found[2], found[3] = self._lobe_at(n)
+            found[2], found[3] = self.lobe(cast(Any, n)) if self._all_on_host else _lobe(self.lobe, np.asarray(n))
         return found
 
     @property
@@ -127,11 +127,10 @@ class Picture(eqx.Module):
         Args:
             n: the exponent.
         """
-        return np.asarray(self._convenient._lobe_at(n)[0])
-
-    def _lobe_at(self, n: float) -> tuple[Array, Array]:
-        assert self.lobe is not None
-        return self.lobe(cast(Any, n)) if self._all_on_host else _lobe(self.lobe, np.asarray(n))
+        picture = self._convenient
+        assert picture.lobe is not None
+        found = picture.lobe(cast(Any, n)) if picture._all_on_host else _lobe(picture.lobe, np.asarray(n))
+        return np.asarray(found[0])
 
     @property
     def _convenient(self) -> "Picture":

@@ -136,21 +136,23 @@ def search(
             problem = problem._replace(pictures=exact, tolerance=TOLERANCE_DOUBLE)
         if n_min == n_max:
             return _optimum(*gauss_newton(problem, Point(*(leaf[0] for leaf in profile))), problem, *about)
+        minimum = gauss_newton if cap is None else capped_minimum
         if not sample.whole:
             error = _sampling_errors(profile, sample, problem.peak)
             position, lowest, possible = _cells(profile, error)
             cell = int(np.argmin(lowest))
             first, last = np.flatnonzero(possible)[[0, -1]]
             if last - first <= 3 and profile.slope[cell] < profile.slope[cell + 1]:
-                found = _minimum(problem, profile, cell, float(position[cell]), beside=1)
+                found = minimum(problem, _start(profile, cell, float(position[cell])), GRID_STEP)
                 # A minimum at the end of its reach is none, but for the bounds of the search.
                 if abs(found[0].log_n - position[cell]) < GRID_STEP or found[0].log_n in problem.bounds:
                     return _optimum(*found, problem, *about)
             log_n = log_n[max(0, first - 1) : last + 3]
             profile = solve_linear(sums(pictures, log_n, rough, problem.peak), log_n, rough, problem)
         position, *_ = _cells(profile)
-        valleys = _valleys(profile, problem.tolerance)
-        candidates = [_minimum(problem, profile, cell, float(position[cell])) for cell in valleys]
+        candidates: list[tuple[Point, Sums]] = []
+        for cell in _valleys(profile, problem.tolerance):
+            candidates.append(minimum(problem, _start(profile, cell, float(position[cell])), GRID_STEP))
         # Where the profile is level the best sample may be no worse than what the valleys led to.
         costs = profile.cost.sum(axis=1)
         if cap is None and np.min(costs) < min(np.sum(point.cost) for point, _ in candidates):
@@ -159,14 +161,10 @@ def search(
         return _optimum(*best, problem, *about)
 
 
-def _minimum(problem: Problem, profile: Point, cell: int, position: float, beside: int = 0) -> tuple[Point, Sums]:
-    """The minimum in a cell of the grid, or so many beside it, from the coefficients of the nearer end."""
-    log_n = profile.log_n
-    nearer = cell + int(2 * position > log_n[cell] + log_n[cell + 1])
-    if problem.cap is None:
-        return gauss_newton(problem, Point(position, profile.x[nearer], profile.cost[nearer]), GRID_STEP)
-    ends = float(log_n[max(0, cell - beside)]), float(log_n[min(cell + 1 + beside, log_n.size - 1)])
-    return capped_minimum(problem, *ends, profile.x[nearer])
+def _start(profile: Point, cell: int, position: float) -> Point:
+    """A point in a cell of the grid, with the coefficients of the nearer end."""
+    nearer = cell + int(2 * position > profile.log_n[cell] + profile.log_n[cell + 1])
+    return Point(position, profile.x[nearer], profile.cost[nearer])
 
 
 def refit(

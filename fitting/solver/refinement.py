@@ -127,18 +127,19 @@ def solve_linear(parts: Sums, log_n: Float[np.ndarray, " N"], reference: np.ndar
     return Point(log_n, x, np.maximum(parts.square + change, 0.0), slope)
 
 
-def capped_minimum(problem: Problem, lower: float, upper: float, x: np.ndarray) -> tuple[Point, Sums]:
-    """The minimum under a cap between two exponents: where the slope is 0, or at one of them.
+def capped_minimum(problem: Problem, point: Point, reach: float) -> tuple[Point, Sums]:
+    """The minimum under a cap near an exponent: where the slope is 0, or at an end.
 
     Args:
         problem: What is searched.
-        lower: Logarithm of an exponent.
-        upper: Likewise.
-        x: Coefficients of a model near by, (C, 3).
+        point: Where to start.
+        reach: How far from there log n may go.
     """
     from scipy.optimize import brentq  # late: few fits have a cap
 
-    found: dict[float, tuple[Point, Sums]] = {}
+    x, found = point.x, dict[float, tuple[Point, Sums]]()
+    least, most = problem.bounds
+    lower, upper = max(least, point.log_n - reach), min(most, point.log_n + reach)
 
     def slope(log_n: float) -> float:
         nonlocal x
@@ -149,7 +150,8 @@ def capped_minimum(problem: Problem, lower: float, upper: float, x: np.ndarray) 
             x = found[log_n][0].x
         return float(found[log_n][0].slope)
 
-    if slope(lower) < 0 < slope(upper):
+    ends = slope(lower), slope(upper)
+    if ends[0] < 0 < ends[1]:
         root: Any = brentq(slope, lower, upper, xtol=problem.accuracy)
         return found[root]
     return min(found.values(), key=lambda found: float(np.sum(found[0].cost)))
