@@ -102,8 +102,9 @@ for label in range(1, 7):
 # %% [markdown]
 # ## Another light
 #
-# `maps.render` lights the thing anew; `maps.save` writes the maps for other programs (OpenEXR layers, 16-bit PNGs, a
-# glTF material, OpenLIME). On the command line all of this is `brdf maps photographs/ --out maps/`.
+# `maps.render` lights the thing anew, and `maps.view()` is a page where the light follows the mouse. `maps.save` writes
+# the maps for other programs (OpenEXR layers, 16-bit PNGs, a glTF material, OpenLIME). On the command line all of this is
+# `brdf maps photographs/ --out maps/ --report page.html`.
 
 # %%
 unseen = np.array([0.45, 0.2, 0.87])
