@@ -2,7 +2,7 @@
 
     python -m benchmarks.truth [TABLE] [--rows PATTERN] [--draws N] [--size PIXELS] [--json FILE] [--picture FILE]
 
-TABLE is coverage, selection, structure or diagnosis.
+TABLE is coverage, selection, dropped, structure, diagnosis or noise.
 
 Every ball is drawn here in plain NumPy (nothing of the toolkit), its brightest pixel at 0.97 of white; noise is a
 standard deviation, of white for float pictures and in codes for files; draw i has the seed i. Files are written by
@@ -213,6 +213,8 @@ COVERAGE = {
     "JPEG q95": File(curve="srgb", suffix=".jpg", quality=95),
     "JPEG q90": File(curve="srgb", suffix=".jpg", quality=90),
     "JPEG q75": File(curve="srgb", suffix=".jpg", quality=75),
+    "colour JPEG q90": File(curve="srgb", suffix=".jpg", quality=90, channels=3),
+    "colour JPEG q90, noise 1": File(1.0, curve="srgb", suffix=".jpg", quality=90, channels=3),
 }
 LAMBERT = {
     "linear": File(),
@@ -295,6 +297,49 @@ def selection(pattern: str, draws: int, size: int, first: int) -> list[dict[str,
         shares = [100 * count / draws for count in counts.values()]
         print(f"{name:30}{shares[0]:14.1f}{shares[1]:22.1f}", flush=True)
         said.append({"row": name, "invented": shares[0], "found": shares[1]})
+    return said
+
+
+JUST_FOUND = {"float, noise 0.01": (0.01, "linear"), "linear 8 bit, noise 1": (1 / 255, "linear")}
+JUST_FOUND |= {"sRGB 8 bit, noise 1": (1 / 255, "srgb"), "sRGB 8 bit, noise 3": (3 / 255, "srgb")}
+THRESHOLD = 4.3  # in standard errors of k_s: of so large highlights about half are found
+
+
+def just_found(seed: int, size: int, noise: float, curve: str) -> float:
+    """A k_s that is found in about half of the draws of its noise."""
+    matt, alone = ball(seed, size=size, k_s=1e-9), ball(seed, size=size, k_s=1e-9)
+    alone = dataclasses.replace(alone, k=np.array([[0.0], [0.0], [1.0]]))
+    lit = dataclasses.replace(alone, k=np.array([[0.0], [1.0], [0.0]]))
+    shown = matt.drawn().ravel()
+    columns = np.stack([np.ones(shown.size), lit.drawn().ravel(), alone.drawn().ravel()])[:, shown > 0]
+    slope = np.gradient(encoded(np.linspace(0, 1, 1001), curve), 1e-3)
+    weight = np.interp(shown[shown > 0], np.linspace(0, 1, 1001), slope) ** 2
+    return THRESHOLD * noise * float(np.sqrt(np.linalg.inv((columns * weight) @ columns.T)[2, 2]))
+
+
+def dropped(pattern: str, draws: int, size: int, first: int) -> list[dict[str, Any]]:
+    """Coverage of what stays where a highlight was dropped that is about as large as one just found."""
+    said = []
+    print(f"{'':30}{'dropped (%)':>14}{'covered: k_a, k_d (%)':>24}{'stated / real':>16}", flush=True)
+    for name, file in rows({name: COVERAGE[name] for name in JUST_FOUND}, pattern):
+        found = []
+        for seed in range(first, first + draws):
+            one = ball(seed, size=size, k_s=just_found(seed, size, *JUST_FOUND[name]))
+            with tempfile.TemporaryDirectory() as folder:
+                picture = file.picture(one.drawn(), seed, Path(folder))
+            result = fitting.fit(picture, one.scene())
+            if "phong" not in result.surface:
+                pair = result["k_a"][0], result["k_d"][0]
+                true = one.k[:2, 0]
+                inside = [p.interval[0] <= value <= p.interval[1] for p, value in zip(pair, true, strict=True)]
+                off = [p.value - value for p, value in zip(pair, true, strict=True)]
+                found.append([inside, off, [p.error for p in pair]])
+        inside, off, error = np.array(found).transpose(1, 0, 2)
+        covered, ratio = 100 * inside.mean(axis=0), error.mean(axis=0) / np.sqrt(np.mean(off**2, axis=0))
+        share = 100 * len(found) / draws
+        words = f"{covered[0]:16.1f}{covered[1]:8.1f}{ratio[0]:10.2f}{ratio[1]:6.2f}"
+        print(f"{name:30}{share:14.1f}{words}", flush=True)
+        said.append({"row": name, "dropped": share, "covered": covered.tolist(), "stated": ratio.tolist()})
     return said
 
 
@@ -473,7 +518,7 @@ def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     tables = {"coverage": (coverage, 400), "selection": (selection, 100), "structure": (structure, 100)}
-    tables |= {"diagnosis": (diagnosis, 30), "noise": (against_noise, 40)}
+    tables |= {"dropped": (dropped, 400), "diagnosis": (diagnosis, 30), "noise": (against_noise, 40)}
     parser.add_argument("table", nargs="?", choices=tables)
     parser.add_argument("--rows", default="")
     parser.add_argument("--draws", type=int)

@@ -25,10 +25,10 @@ from fitting.sample_error import MOST, SampleError, between, near_exponent, near
 from fitting.selection import FAMILIES, Choice, choose
 from fitting.solver.devices import placed
 from fitting.solver.losses import reweight
-from fitting.solver.normal_equations import Picture, Sums
+from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum, refit, search
 from fitting.solver.streams import Stream, each
-from fitting.solver.tied import join_channels
+from fitting.solver.tied import NormalEquations, design_of, join_channels
 from fitting.uncertainty.covariance import residual_noise
 from fitting.uncertainty.highlight import nearest_peak
 from fitting.uncertainty.interpretation import Interpretation, interpret, shared_errors
@@ -198,9 +198,12 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
             }
         fits[name] = _fit_model(brdf.MODELS[name], seen)
     least = min(float(np.sum(fit.optimum.cost)) for fit in fits.values())
+    by_squares, precision = dict(fits), None
     for name, fit in fits.items():
         if np.sum(fit.optimum.cost) <= HOPELESS * least:
-            fits[name] = most_likely(fit, copies=seen.copies)
+            grey = coefficient_factors(fit.model, fit.optimum.n, colour)[2]
+            fits[name] = fit = most_likely(fit, copies=seen.copies, grey=grey, precision=precision)
+            precision = None if fit.evidence is None else fit.evidence.precision
     # A lobe that would be wider than the search allows is no highlight: it mends what Lambert's law leaves at the rim.
     fits = {name: fit for name, fit in fits.items() if fit.optimum.flat or fit.optimum.n > WIDEST * problem.n_range[0]}
     fits = fits or {"lambert": most_likely(_fit_model(brdf.Lambert, seen), copies=seen.copies)}
@@ -214,23 +217,24 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
     # The best comes first: what is judged without a highlight is judged by its sums.
     fits = dict(sorted(fits.items(), key=lambda one: float(np.sum(one[1].optimum.cost))))
     best = next(iter(fits.values()))
-    noise, whitened = residual_noise(best.optimum, seen.rounding), _likely_sums(fits)
+    noise, whitened, colour_inflation = residual_noise(best.optimum, seen.rounding), _likely_sums(fits), 1.0
     if whitened:
-        inflation = _inflation(best, seen)
+        inflation, colour_inflation = _inflation(best, seen, grey[best.model.name])
     else:
         known = residual_correlation(best.pictures, seen.tiles, best.optimum, seen.rounding)
         inflation = known.inflation
         if known.noise is not None:
             # Each pixel by its own variance, or noise in bright pixels would pass for a highlight.
             for name, fit in fits.items():
-                whitened[name] = weighted_sums(fit.pictures, fit.optimum, known.noise, inverse=True)
+                parts = weighted_sums(fit.pictures, fit.optimum, known.noise, inverse=True)
+                whitened[name] = join_channels(parts.gram, parts.product, parts.square, fit.optimum.x[2])
     if seen.copies:
         inflation *= np.sqrt(seen.colour.size)
     # However much errs together, the picture is not less than a few measurements.
     inflation = min(inflation, max(float(np.sqrt(np.sum(best.optimum.pixels) / FEWEST_MEASUREMENTS)), 1.0))
     free = np.logical_or.reduce([fit.free for fit in fits.values()])
     optima = {name: fit.optimum for name, fit in fits.items()}
-    choice = choose(optima, free, grey, noise, inflation, whitened)
+    choice = choose(optima, free, grey, noise, inflation, whitened, colour_inflation)
     if choice.model not in FAMILIES and not _explains_structure(fits[choice.model], seen):
         fits = {"lambert": most_likely(_fit_model(brdf.Lambert, seen), copies=seen.copies)}
         best = fits["lambert"]
@@ -243,7 +247,10 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
         pictures = each(lambda picture: dataclasses.replace(picture, lobe=None), pictures)
         chosen = chosen._replace(model=brdf.Lambert)
     optimum = chosen.optimum
-    if not matt and not choice.grey and np.array_equal(choice.free, chosen.free):
+    if not (matt or choice.grey) and chosen.tied is not None:
+        # Where channels err together a highlight is looked for in brightness; its colour is each channel's own.
+        chosen, optimum = by_squares[choice.model], by_squares[choice.model].optimum
+    elif not (matt or choice.grey) and np.array_equal(choice.free, chosen.free):
         return chosen, choice
     if matt or not np.array_equal(choice.free, chosen.free):
         optimum = _search(pictures, choice.free, chosen.n_range)
@@ -254,7 +261,7 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
     return most_likely(chosen, copies=seen.copies), choice
 
 
-def _likely_sums(fits: Mapping[str, ModelFit]) -> dict[str, Sums]:
+def _likely_sums(fits: Mapping[str, ModelFit]) -> dict[str, NormalEquations]:
     """Sums whose cost is minus twice the logarithm of the likelihood, beside that of the likeliest, and so above 0.
 
     Of a fit whose likelihood was not asked for, those of least squares over the noise of the best; nothing where least
@@ -269,30 +276,40 @@ def _likely_sums(fits: Mapping[str, ModelFit]) -> dict[str, Sums]:
     value = max(fit.evidence.value for fit in fits.values() if fit.evidence is not None)
     noise = np.maximum(best.optimum.cost / best.optimum.pixels, np.finfo(float).tiny)
     for name, fit in fits.items():
-        one = fit.optimum if fit.evidence is None else fit.evidence.optimum
         if fit.evidence is None:
-            found[name] = Sums(
-                one.gram / noise[:, None, None], one.product / noise[:, None], one.square / noise, one.pixels
-            )
+            one = fit.optimum
+            found[name] = join_channels(one.gram, one.product, one.square, one.x[2], noise)
             continue
-        least = 2 * (value - fit.evidence.value) / one.square.size + one.pixels
-        found[name] = Sums(one.gram, one.product, one.square - one.cost + least, one.pixels)
+        one, normal = fit.evidence.optimum, fit.evidence.normal
+        at = np.append(one.x.ravel(), 0.0)
+        least = 2 * (value - fit.evidence.value) + float(np.sum(one.pixels))
+        found[name] = normal._replace(square=least + (2 * normal.product - normal.gram @ at) @ at)
     return found
 
 
-def _inflation(fit: ModelFit, seen: Observed) -> float:
-    """By what factor errors are too small where neighbours err together: the largest of any number."""
+def _inflation(fit: ModelFit, seen: Observed, grey: np.ndarray) -> tuple[float, float]:
+    """By what factor errors are too small where neighbours err together: the largest of any number.
+
+    Where channels err together that of a highlight, the same in all, and by what further factor those of their colours:
+    these err more, but tell little of it.
+    """
     said = fit.evidence
     assert said is not None
     scatter, _ = shared_errors(said, seen.tiles)
     if scatter is None:
-        return 1.0
-    optimum = said.optimum
-    normal = join_channels(optimum.gram, optimum.product, optimum.square, optimum.x[2], np.ones(optimum.square.size))
-    known = np.append(optimum.x.ravel() > 0, optimum.x[2].any())
-    inverse = np.linalg.pinv(normal.gram[np.ix_(known, known)], hermitian=True)
-    together = np.diag(inverse @ scatter[np.ix_(known, known)] @ inverse)
-    return float(np.sqrt(max(np.max(together / np.maximum(np.diag(inverse), np.finfo(float).tiny)), 1.0)))
+        return 1.0, 1.0
+
+    def largest(tied: np.ndarray | None, some: slice) -> float:
+        design = design_of(said.optimum.x > 0, tied)
+        inverse = np.linalg.pinv(design.T @ said.normal.gram @ design, hermitian=True)
+        together = np.diag(inverse @ design.T @ scatter @ design @ inverse)[some]
+        return float(np.sqrt(max(np.max(together / np.maximum(np.diag(inverse)[some], np.finfo(float).tiny)), 1.0)))
+
+    every = largest(None, slice(None))
+    if said.precision is None:
+        return every, 1.0
+    bright = largest(grey, slice(-2, None))
+    return bright, max(every / bright, 1.0)
 
 
 def _explains_structure(fit: ModelFit, seen: Observed) -> bool:
@@ -306,6 +323,8 @@ def _explains_structure(fit: ModelFit, seen: Observed) -> bool:
     if max(highlight_in_codes(picture, optimum.x, optimum.n) for picture in fit.pictures) < HIDDEN:
         return False
     matt = _search(fit.pictures, fit.free & [[True], [True], [False]], fit.n_range)
+    if fit.evidence is not None and fit.evidence.precision is not None:
+        return True
     left, chance = shared(_unexplained(fit.pictures, optimum, seen))
     before, _ = shared(_unexplained(fit.pictures, matt, seen))
     return left < CHANCE * chance or before - left > EXPLAINED * before

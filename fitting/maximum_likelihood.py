@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from fitting.channel_errors import can_be_coupled, coupled, each_alone, improved, precision_of, replaced, residuals
 from fitting.continuation import (
     LARGEST_SHIFT,
     LEAST_NOISE,
@@ -96,12 +97,16 @@ class _Pixels(NamedTuple):
         return cls(picture, Intervals(bounds.lower, bounds.upper, bounds.spread))
 
 
-def most_likely(fit: ModelFit, *, copies: bool = False) -> ModelFit:
+def most_likely(
+    fit: ModelFit, *, copies: bool = False, grey: np.ndarray | None = None, precision: np.ndarray | None = None
+) -> ModelFit:
     """A fit by what rounded values and open ends say, from least squares on; as it is where they say no more.
 
     Args:
         fit: by least squares.
         copies: the channels are copies of each other.
+        grey: x_s of a grey k_s, which a highlight has where channels err together; None for any colour.
+        precision: see `Evidence`; None finds it out where channels err together.
     """
     if fit.capped or any(picture.bounds is None for picture in fit.pictures):
         return fit
@@ -121,7 +126,10 @@ def most_likely(fit: ModelFit, *, copies: bool = False) -> ModelFit:
         linear = all(bounds.encoding == "linear" for bounds in map(_bounds, pictures))
         if linear and not lossy and not any(_open_ends_tell(picture, at, noise) for picture in pictures):
             return fit
-        said = _reweighted(fit._replace(pictures=pictures), noise, rounding)
+        together = lossy and not copies and (grey is not None or fit.tied is not None) and can_be_coupled(pictures)
+        if together and grey is not None:
+            fit = fit._replace(tied=np.where(fit.free[2], grey, 0.0))
+        said = _reweighted(fit._replace(pictures=pictures), noise, rounding, precision, together=together)
     else:
         start = Estimate(at.unknowns, max(noise, FIRST_NOISE))
         said = _near_edges(fit._replace(pictures=pictures), start, copies=copies)
@@ -200,31 +208,63 @@ def _optimum(working: Sequence[Picture], said: Score, fit: ModelFit, at: Numbers
     )
 
 
-def _reweighted(fit: ModelFit, noise: float, rounding: float) -> Evidence:
+def _reweighted(
+    fit: ModelFit, noise: float, rounding: float, precision: np.ndarray | None, *, together: bool
+) -> Evidence:
     """Where rounding is little beside the noise: least squares in codes, and what an open end says in a value's place.
 
     Args:
         fit: by least squares in radiance.
         noise: standard deviation of the residual in codes.
         rounding: what its variance owes to rounding.
+        precision: of the channels' errors together, where it is known.
+        together: they err together.
     """
-    pictures, optimum = fit.pictures, fit.optimum
+    pictures, optimum, places = fit.pictures, fit.optimum, [_place(picture) for picture in fit.pictures]
+    known = precision is not None
     with jax.enable_x64(True):
         stated = [_stated(picture, optimum, noise, rounding) for picture in pictures]
-        for _ in range(MOST_ROUNDS):
-            working = [part.picture for part in stated]
-            before, optimum = optimum, refit(working, optimum, fit.free, fit.n_range, fit.tied)
+        for trial in range(MOST_ROUNDS):
+            working, before = [part.picture for part in stated], optimum
+            if together:
+                if not known:
+                    count = sum(part.count for part in stated) / optimum.x.shape[1]
+                    left = [residuals(picture, optimum) for picture in working]
+                    precision = precision_of(left, places, count, rounding)
+                assert precision is not None
+                optimum = improved(working, precision, optimum, fit, anew=trial == 0)
+            else:
+                optimum = refit(working, optimum, fit.free, fit.n_range, fit.tied)
             last, stated = noise, [_stated(picture, optimum, noise, rounding) for picture in pictures]
             noise = math.sqrt(sum(part.squares for part in stated) / max(sum(part.count for part in stated), 1))
             if _change(before, optimum) < ENOUGH_CHANGE and abs(noise / last - 1) < ENOUGH_NOISE_CHANGE:
                 break
+        if together:
+            assert precision is not None
+            return _together([part.picture for part in stated], optimum, noise, places, precision)
     scale = 1 / noise**2
     working = [dataclasses.replace(part.picture, weight=part.picture.weights * scale) for part in stated]
     sums = {name: getattr(optimum, name) * scale for name in ("cost", "gram", "product", "square")}
     value = sum(part.value - part.closed * math.log(noise) - part.closed_squares * scale / 2 for part in stated)
     widening = np.ones(3 * fit.free.shape[1] + 1)
     optimum = dataclasses.replace(optimum, **sums)
-    return Evidence(working, optimum, noise, value, [_place(picture) for picture in pictures], widening)
+    return Evidence(working, optimum, noise, value, places, widening)
+
+
+def _together(
+    pictures: Sequence[Picture],
+    optimum: Optimum,
+    noise: float,
+    places: Sequence[tuple[np.ndarray, int]],
+    precision: np.ndarray,
+) -> Evidence:
+    """What channels say that err together."""
+    left = [residuals(picture, optimum) for picture in pictures]
+    value = -0.5 * sum(float(np.sum((values @ precision) * values)) for values in left)
+    parts = [each_alone(picture, some, precision, optimum) for picture, some in zip(pictures, left, strict=True)]
+    said = coupled(pictures, precision, optimum.x, np.array([math.log(optimum.n)]))[0]
+    normal, optimum = said.joined(optimum.x, optimum.n), replaced(optimum, said, optimum.x, optimum.n)
+    return Evidence(parts, optimum, noise, value, places, np.ones(len(normal.gram)), normal, precision)
 
 
 def _change(before: Optimum, after: Optimum) -> float:

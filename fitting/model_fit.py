@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 import brdf
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
+from fitting.solver.tied import NormalEquations, join_channels
 
 
 class Evidence(NamedTuple):
@@ -21,6 +22,9 @@ class Evidence(NamedTuple):
         value: logarithm of the likelihood.
         places: of each picture the index of its pixels in the whole one, row by row, and the width of that.
         widening: what to multiply the errors of x_a, x_d, x_s, channel after channel, and n by.
+        together: normal equations of all channels at the optimum, where these err together; see
+            `fitting.channel_errors`.
+        precision: W there, (C, C).
     """
 
     pictures: Sequence[Picture]
@@ -29,6 +33,16 @@ class Evidence(NamedTuple):
     value: float
     places: Sequence[tuple[Int[np.ndarray, " P"], int]]
     widening: Float[np.ndarray, " U"]
+    together: NormalEquations | None = None
+    precision: Float[np.ndarray, "C C"] | None = None
+
+    @property
+    def normal(self) -> NormalEquations:
+        """Of all channels, by x_a, x_d, x_s, channel after channel, and n."""
+        optimum = self.optimum
+        if self.together is not None:
+            return self.together
+        return join_channels(optimum.gram, optimum.product, optimum.square, optimum.x[2])
 
 
 class ModelFit(NamedTuple):

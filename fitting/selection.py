@@ -25,7 +25,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from fitting.solver.nnls import nonnegative_minimum
-from fitting.solver.normal_equations import Sums
 from fitting.solver.profile import Optimum
 from fitting.solver.tied import NormalEquations, design_of, join_channels
 
@@ -146,7 +145,8 @@ def choose(
     grey: Mapping[str, Float[np.ndarray, " C"]],
     noise: Float[np.ndarray, " C"],
     inflation: float,
-    whitened: Mapping[str, Sums],
+    whitened: Mapping[str, NormalEquations],
+    colour_inflation: float = 1.0,
 ) -> Choice:
     """Choose the simplest adequate model.
 
@@ -156,18 +156,21 @@ def choose(
         grey: for each model, the solver's x_s of a grey k_s, up to a factor; (C,).
         noise: standard deviation of the residual of the best fit, (C,).
         inflation: by what factor the structure of its residual makes errors larger; at least 1.
-        whitened: for each model the sums at its optimum with each pixel divided by its variance; empty where the
-            variance is the same in all.
+        whitened: for each model the normal equations at its optimum with each pixel divided by its variance; empty
+            where the variance is the same in all.
+        colour_inflation: by what further factor it makes errors of a highlight's colour larger than of its brightness.
     """
     channels = free.shape[1]
     no, ambient = np.zeros(channels, bool), bool(free[0].any())
     variance = (noise * inflation) ** 2
-    unit = np.full(channels, inflation**2) if whitened else variance
     normals, plain = {}, {}
     for name, fit in fits.items():
-        parts = whitened.get(name, fit)
-        normals[name] = join_channels(parts.gram, parts.product, parts.square, fit.x[2], unit)
-        plain[name] = join_channels(fit.gram, fit.product, fit.square, fit.x[2], np.ones(channels))
+        if name in whitened:
+            one, all_ = whitened[name], inflation**2
+            normals[name] = NormalEquations(one.gram / all_, one.product / all_, one.square / all_)
+        else:
+            normals[name] = join_channels(fit.gram, fit.product, fit.square, fit.x[2], variance)
+        plain[name] = join_channels(fit.gram, fit.product, fit.square, fit.x[2])
     first = next(iter(fits))
     terms = [("none", no, no), *([("ambient", free[0], no)] if ambient else []), ("lambert", no, free[1])]
     terms += [("lambert", free[0], free[1])] if ambient else []
@@ -177,8 +180,13 @@ def choose(
             continue
         for some in (no, free[0]) if ambient else (no,):
             wanted = np.stack([some, free[1], free[2]])
+            cost = np.inf
             for tied in (np.where(free[2], grey[name], 0.0), None) if channels > 1 else (None,):
                 trial = _try(name, wanted, tied, normals[name], plain[name], fit.n)
+                if tied is not None:
+                    cost = trial.cost
+                elif cost > trial.cost and np.isfinite(cost):
+                    trial = trial._replace(cost=cost - (cost - trial.cost) / colour_inflation**2)
                 # A highlight that comes out as nothing is Lambert's surface again.
                 if np.any(trial.solution[2 * channels : -1] > 0):
                     trials.append(trial)

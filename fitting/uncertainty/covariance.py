@@ -107,6 +107,7 @@ def uncertainty(
     gain: float = 0.0,
     resolution: float = 0.0,
     missed: SampleError | None = None,
+    joined: Float[np.ndarray, "U U"] | None = None,
 ) -> Uncertainty:
     """Errors of an optimum.
 
@@ -130,12 +131,13 @@ def uncertainty(
         resolution: relative error of a number that is left by the arithmetic of the basis images.
         gain: see `specular_gain`, where more pixels tell of it than those of the optimum's sums.
         missed: what light samples leave out; None where there are none.
+        joined: the Hessian of all channels, whose noise is 1, where these err together.
     """
     gain = max(gain, specular_gain(optimum, noise))
     columns = rms_columns(optimum) if columns is None else columns
     dependent = DEPENDENT_SINGLE if single else DEPENDENT_DOUBLE
     reasons = np.full(free.shape, "", object)
-    n_reason = reasons[2, :] = _without_trace(optimum, gain, visible)
+    n_reason = reasons[2, :] = _without_trace(optimum, gain, visible, grey=tied is not None)
     for term, channel in np.argwhere(~free & (reasons == "")):
         where = "this channel" if free[term].any() else "the scene"
         reasons[term, channel] = f"{LIGHT[term]} in {where}"
@@ -149,13 +151,15 @@ def uncertainty(
         stand_in[first, channel], determined[first, channel] = some.value / some.columns[0], True
     optimum = dataclasses.replace(optimum, x=stand_in)
     x_error, x_interval, n_error, correlation, rise = _errors(
-        optimum, determined, noise, tied, spread, scatter, widening, copies, dependent, resolution, missed
+        optimum, determined, noise, tied, spread, scatter, widening, copies, dependent, resolution, missed, joined
     )
     sums = {c: some._replace(error=some.columns[0] * x_error[some.terms[0], c]) for c, some in sums.items()}
     alone = x_error
     if scatter is not None:
         # What errs together makes errors larger, but not the numbers less determined.
-        alone, *_ = _errors(optimum, determined, noise, tied, spread, None, widening, copies, dependent, 0.0)
+        alone, *_ = _errors(
+            optimum, determined, noise, tied, spread, None, widening, copies, dependent, 0.0, None, joined
+        )
     for term, channel in np.argwhere(known):
         largest = max(optimum.square[channel], brightest[channel] ** 2)
         if alone[term, channel] ** 2 * optimum.gram[channel, term, term] > largest:
@@ -168,13 +172,13 @@ def uncertainty(
     return Uncertainty(x_error, x_interval, n_error, correlation, rise, reasons, n_reason, sums)
 
 
-def _without_trace(optimum: Optimum, gain: float, visible: float) -> str:
+def _without_trace(optimum: Optimum, gain: float, visible: float, *, grey: bool) -> str:
     """Why there is no specular term to speak of; empty where there is one."""
     if optimum.flat:
         return "the picture has no highlight"
     if visible < NO_TRACE:
         return f"the highlight is below {NO_TRACE:g} of the picture"
-    unknowns = 1 + np.count_nonzero(optimum.x[2] > 0)
+    unknowns = 2 if grey else 1 + np.count_nonzero(optimum.x[2] > 0)
     return "" if gain > SIGNIFICANT * unknowns else "the highlight does not stand out of the noise"
 
 
@@ -238,7 +242,8 @@ def _errors(
     copies: bool,
     dependent: float,
     resolution: float,
-    missed: SampleError | None = None,
+    missed: SampleError | None,
+    joined: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray, float, np.ndarray, float]:
     """Errors and intervals of x, the error of n, the correlation of all unknowns, and the rise of the cost.
 
@@ -254,6 +259,8 @@ def _errors(
         scores = noise[channel] ** 2 * block if spread is None else spread[channel] * np.outer(scale, scale)
         for place in places if copies else places[channel : channel + 1]:
             middle[np.ix_(places[channel], place)] += scores
+    if joined is not None:
+        hessian = middle = joined
     alone, middle = middle, middle if scatter is None else scatter
     active = known & (x > 0)
     has_n, with_n = bool(active[2].any()), False

@@ -9,6 +9,7 @@ from jaxtyping import Float
 import brdf
 from brdf.channels import channel_names
 from brdf.models.base import SpecularMaterial
+from fitting import channel_errors
 from fitting.light_colour import coefficient_factors
 from fitting.model_fit import Evidence, ModelFit
 from fitting.pixels import Observed, Tile
@@ -91,7 +92,7 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> Interpretation
         visible = float(np.max(optimum.x[2]) * lobe.largest / max(np.max(seen.brightest), np.finfo(float).tiny))
     known = residual_correlation(pictures, seen.tiles, optimum, rounding)
     resolution = RESOLUTION if fit.single else 0.0
-    spread, shared, widening, deviation, together, gain = None, None, 1.0, noise, None, 0.0
+    spread, shared, widening, deviation, together, gain, joined = None, None, 1.0, noise, None, 0.0, None
     if fit.evidence is not None:
         # Each working target has the noise 1; what least squares leaves is rounding, which goes together.
         said, known = fit.evidence, known._replace(significant=False, noise=None)
@@ -102,6 +103,9 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> Interpretation
         # What errs together by less than codes tell apart is in the errors, and no more need be said.
         together = None if said.noise < ROUNDED else together
         widening = said.widening
+        if said.together is not None:
+            joined = said.together.gram
+            gain = max(gain, channel_errors.specular_gain(joined, optimum.x))
     else:
         together = _structure(pictures, seen, optimum, noise, rounding, even=known.noise is None)
         # What a bound of the material leaves is no error of the pixels.
@@ -129,11 +133,12 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> Interpretation
         gain=gain,
         missed=missed,
         resolution=resolution,
+        joined=joined,
     )
     interval = None
     # At k_d + k_s = 1 the cost still falls across the bound: a profile that does not know it has its least elsewhere.
     if lobe is not None and not sure.n_reason and not fit.capped:
-        interval = exponent_interval(fit, sure.n_error, sure.rise, lobe.peak)
+        interval = exponent_interval(fit, sure.n_error, sure.rise, lobe.peak, parabolic=joined is not None)
         sure = sure._replace(n_reason=_open_exponent(interval))
     if hidden:
         sure.reasons[2], sure = hidden, sure._replace(n_reason=hidden)

@@ -65,7 +65,9 @@ def above_zero(value: float, error: float) -> tuple[float, float]:
     return low * error, high * error
 
 
-def exponent_interval(fit: ModelFit, n_error: float, rise: float, peak: float) -> tuple[float, float]:
+def exponent_interval(
+    fit: ModelFit, n_error: float, rise: float, peak: float, *, parabolic: bool = False
+) -> tuple[float, float]:
     """The 95 % profile-likelihood interval of n: where the least cost rises by ``rise``.
 
     A relative error below a hundredth needs no pixel: there the profile is a parabola in log n. Else the cost is
@@ -76,6 +78,7 @@ def exponent_interval(fit: ModelFit, n_error: float, rise: float, peak: float) -
         n_error: standard error of n.
         rise: of the cost; see `fitting.uncertainty.covariance.Uncertainty`.
         peak: logarithm of the lobe's cosine in the pixel nearest to its centre.
+        parabolic: the profile is taken for a parabola in any case.
 
     Returns:
         Lower and upper end; 0 and infinity where the cost does not rise before the bound of the search.
@@ -85,7 +88,7 @@ def exponent_interval(fit: ModelFit, n_error: float, rise: float, peak: float) -
     bounds = math.log(fit.n_range[0]), math.log(fit.n_range[1])
     centre = math.log(optimum.n)
     inside = bounds[0] < centre - 3 * relative and centre + 3 * relative < bounds[1]
-    if relative < PARABOLIC and inside:
+    if parabolic or (relative < PARABOLIC and inside):
         return optimum.n * math.exp(-NORMAL_95 * relative), optimum.n * math.exp(NORMAL_95 * relative)
     first = min(max(1.1 * NORMAL_95 * relative, 1e-3), WIDEST)
     least = float(np.sum(optimum.cost))

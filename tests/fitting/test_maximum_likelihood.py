@@ -52,6 +52,19 @@ def test_normals_of_a_mesh_are_no_highlight(seed: int, tmp_path: Path):
         assert bool(k_s) == (result.surface != "lambert"), (k_s, result.surface)
 
 
+@pytest.mark.parametrize("row", ["colour JPEG q90", "colour JPEG q90, noise 1"])
+def test_a_faint_highlight_of_a_colour_jpeg_is_found_in_its_brightness(row: str, tmp_path: Path):
+    """Its colours err by twice as much as the highlight adds, and by no highlight's shape."""
+    file = LAMBERT[row]
+    for seed in (2, 3, 8):
+        for k_s in (0.0, 0.01):
+            one = ball(seed, model="" if k_s else "lambert", channels=3, k_s=k_s or None)
+            result = fitting.fit(file.picture(one.drawn(), seed, tmp_path), one.scene())
+            assert bool(k_s) == (result.surface != "lambert"), (seed, k_s, result.surface)
+            if k_s:
+                assert np.allclose(result.material.k_s, 0.01, rtol=0.5), (seed, result.material)
+
+
 def test_what_rounding_leaves_does_not_make_up_for_the_wrong_highlight(tmp_path: Path):
     """It is judged by least squares, and stands in the table with the others."""
     one = ball(1)

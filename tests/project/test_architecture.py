@@ -23,7 +23,7 @@ brdf.models brdf.albedo brdf.conversions
 brdf.geometry brdf.lights brdf.lobes brdf.pixel_area brdf.images brdf.scene_file brdf.scene brdf.rendering
 brdf.materials brdf.measured brdf.plausibility brdf.display
 fitting.progress fitting.likelihood fitting.codes fitting.solver fitting.functional fitting.model_fit
-fitting.continuation fitting.maximum_likelihood fitting.light_colour fitting.sample_error
+fitting.channel_errors fitting.continuation fitting.maximum_likelihood fitting.light_colour fitting.sample_error
 fitting.problem fitting.pixels fitting.selection fitting.budget.choice fitting.result fitting.uncertainty
 fitting.plausible fitting.doubts fitting.core fitting.diagnosis fitting.report fitting.light_choice
 fitting.joint_problem fitting.joint_likelihood fitting.joint fitting.implicit fitting.relighting fitting.measured_fit

@@ -1,0 +1,228 @@
+"""Colours that err together: least squares that weighs the channels by what their errors have in common.
+
+A codec for photographs keeps brightness well and colour coarsely: the errors of red, green and blue are large and the
+same but for a part that is small. Least squares channel by channel looks for a faint highlight in the large errors of
+the colour. With the covariance V of a pixel's errors (generalised least squares; Aitken 1936) it is looked for in the
+brightness, and each colour is known as well as the codec kept it.
+
+The residual is a (C,) vector r a pixel; its score is J' W r and its Hessian J' W J with W the inverse of V. The
+products of the columns of two channels are those of one channel whose weight is the geometric mean of theirs: the same
+pass over the pixels makes them, for C x C channels.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from fitting.model_fit import ModelFit
+from fitting.solver.nnls import nonnegative_minimum
+from fitting.solver.normal_equations import Picture, sums
+from fitting.solver.profile import Optimum
+from fitting.solver.refinement import GRID_STEP
+from fitting.solver.tied import NormalEquations, design_of
+
+# Pixels on a side of what errors are summed over. The larger ones are the blocks of a codec that keeps colours at half
+# the resolution: over these errors of the colours go together. What is kept best errs as over the smaller ones, which
+# share a value of the colour: a highlight may be little larger, and what goes together farther is seen in the scores.
+SIZE, LARGE = 2, 16
+# A lobe is looked for where some pixel shows this share of its peak, and n is no less than this: wider ones look like
+# Lambert's law.
+SEEN, WIDE = 0.05, 1.0
+
+
+class Coupled(NamedTuple):
+    """What pixels say of numbers that all channels tell of together.
+
+    Attributes:
+        gram: products of the columns (ambient, diffuse, lobe and derivative of it by log n) of any two channels,
+            weighted by W.
+        score: of the columns with the residual, weighted likewise.
+    """
+
+    gram: Float[np.ndarray, "C C 4 4"]
+    score: Float[np.ndarray, "C 4"]
+
+    def joined(self, x: Float[np.ndarray, "3 C"], by: float = 1.0) -> NormalEquations:
+        """Normal equations in x_a, x_d, x_s, channel after channel, and log n; about 0.
+
+        Args:
+            x: coefficients, at which the residual was taken.
+            by: what the last unknown is times log n.
+        """
+        channels = x.shape[1]
+        scale = np.ones((channels, 4))
+        scale[:, 3] = x[2] / by
+        whole, score = np.zeros((3 * channels + 1,) * 2), np.zeros(3 * channels + 1)
+        index = [[c, channels + c, 2 * channels + c, 3 * channels] for c in range(channels)]
+        for c in range(channels):
+            score[index[c]] += self.score[c] * scale[c]
+            for other in range(channels):
+                whole[np.ix_(index[c], index[other])] += self.gram[c, other] * np.outer(scale[c], scale[other])
+        base = np.append(x.ravel(), 0.0)
+        return NormalEquations(whole, score + whole @ base, 0.0)
+
+
+def can_be_coupled(pictures: Sequence[Picture]) -> bool:
+    """Whether the channels share their basis images, up to a factor for ambient light."""
+    same = all(np.array_equal(picture.ambient, pictures[0].ambient) for picture in pictures)
+    return same and pictures[0].target.shape[1] > 1 and all(picture.diffuse.shape[1] == 1 for picture in pictures)
+
+
+def residuals(picture: Picture, optimum: Optimum) -> Float[np.ndarray, "P C"]:
+    """What a fit leaves, times the root of the weight.
+
+    Args:
+        picture: with working targets.
+        optimum: of the fit.
+    """
+    weight = np.asarray(picture.weights, np.float64)
+    left = np.asarray(picture.target, np.float64) - picture.shown(optimum.n, optimum.x)
+    return np.where(weight > 0, left, 0.0) * np.sqrt(weight)
+
+
+def precision_of(
+    left: Sequence[Float[np.ndarray, "P C"]], places: Sequence[tuple[np.ndarray, int]], count: float, rounding: float
+) -> Float[np.ndarray, "C C"]:
+    """W: the inverse of the covariance of the channels' errors, of a pixel whose neighbours err alike.
+
+    Args:
+        left: residuals of each picture, in codes.
+        places: index of the pixels in their picture, and its width.
+        count: of pixels.
+        rounding: variance that each value has at least.
+    """
+    small, large = (rounding * np.eye(left[0].shape[1]) for _ in range(2))
+    for values, (pixel, width) in zip(left, places, strict=True):
+        row, column = np.divmod(pixel, width)
+        for covariance, size in ((small, SIZE), (large, LARGE)):
+            block = (row // size) * -(-width // size) + column // size
+            together = np.array([np.bincount(block, weights=one) for one in values.T])
+            covariance += together @ together.T / count
+    root = np.linalg.inv(np.linalg.cholesky(small))
+    return np.linalg.inv(large) * np.linalg.eigvalsh(root @ large @ root.T)[0]
+
+
+def coupled(
+    pictures: Sequence[Picture], precision: Float[np.ndarray, "C C"], x: Float[np.ndarray, "3 C"], log_n: np.ndarray
+) -> list[Coupled]:
+    """One pass: what the pixels say at each of some exponents.
+
+    Args:
+        pictures: with working targets and weights, the noise of each value being that of its picture.
+        precision: W.
+        x: coefficients, about which residuals are taken.
+        log_n: logarithms of the exponents.
+    """
+    channels = len(precision)
+    one, other = np.divmod(np.arange(channels**2), channels)
+    scale = np.ones((channels, 4))
+    scale[:, 0] = pictures[0].ambient
+    found = sums([_paired(picture, one, other) for picture in pictures], log_n, x.T[other] * scale[other, :3])
+    gram = found.gram * (precision[one, other, None, None] * scale[one, :, None] * scale[other, None, :])
+    score = found.product * (precision[one, other, None] * scale[one])
+    return [
+        Coupled(products.reshape(channels, channels, 4, 4), scores.reshape(channels, channels, 4).sum(axis=1))
+        for products, scores in zip(gram, score, strict=True)
+    ]
+
+
+def _paired(picture: Picture, one: np.ndarray, other: np.ndarray) -> Picture:
+    """A channel for each pair: the columns of the one, the residual of the other."""
+    root = jnp.sqrt(jnp.broadcast_to(picture.weights, picture.target.shape))
+    return dataclasses.replace(
+        picture,
+        target=picture.target[:, other],
+        weight=root[:, one] * root[:, other],
+        ambient=np.ones(1),
+        bounds=None,
+    )
+
+
+def improved(
+    pictures: Sequence[Picture], precision: Float[np.ndarray, "C C"], optimum: Optimum, fit: ModelFit, *, anew: bool
+) -> Optimum:
+    """The optimum nearer to where the channels together put it.
+
+    Args:
+        pictures: with working targets.
+        precision: W.
+        optimum: so far.
+        fit: what is free, and between which exponents.
+        anew: look among all exponents; else a Gauss-Newton step from the last.
+    """
+    design, x, log_n = design_of(fit.free, fit.tied), optimum.x, np.array([math.log(optimum.n)])
+    anew = anew and bool(fit.free[2].any())
+    if anew:
+        peak = max(picture.nearest_peak for picture in pictures)
+        most = min(fit.n_range[1], math.log(SEEN) / min(peak, math.log(SEEN) / fit.n_range[1]))
+        least = max(fit.n_range[0], WIDE)
+        steps = max(2, 1 + math.ceil(math.log(max(most / least, 1.0)) / GRID_STEP))
+        log_n = np.append(log_n, np.linspace(math.log(least), math.log(max(most, least)), steps))
+        design = design[:, :-1]
+    signed, base = np.arange(len(design)) == len(design) - 1, np.append(x.ravel(), 0.0)
+    best = (-math.inf, base, float(log_n[0]), None)
+    for at, said in zip(log_n, coupled(pictures, precision, x, log_n), strict=True):
+        normal = said.joined(x)
+        reduced = design.T @ normal.gram @ design
+        found = design @ nonnegative_minimum(reduced, design.T @ normal.product, signed @ (design != 0))
+        gain = float(2 * normal.product @ found - found @ normal.gram @ found)
+        if gain > best[0]:
+            best = gain, found, float(at), said
+    _, found, at, said = best
+    assert said is not None
+    n = float(np.clip(math.exp(at + np.clip(found[-1], -GRID_STEP, GRID_STEP)), *fit.n_range))
+    x = np.maximum(found[:-1].reshape(x.shape), 0.0)
+    return replaced(optimum, said, x, n)
+
+
+def replaced(optimum: Optimum, said: Coupled, x: Float[np.ndarray, "3 C"], n: float) -> Optimum:
+    """An optimum with the sums of each channel for itself; each of its values has the noise 1.
+
+    Args:
+        optimum: whose profile and pixels stay.
+        said: the sums.
+        x: coefficients.
+        n: exponent.
+    """
+    scale = np.array([1.0, 1.0, 1.0, 1 / n])
+    gram = np.einsum("ccij->cij", said.gram) * np.outer(scale, scale)
+    product = said.score * scale + (gram[..., :3] @ x.T[..., None])[..., 0]
+    return dataclasses.replace(
+        optimum, n=n, x=x, cost=optimum.pixels, gram=gram, product=product, flat=not np.any(x[2] > 0)
+    )
+
+
+def each_alone(
+    picture: Picture, left: Float[np.ndarray, "P C"], precision: Float[np.ndarray, "C C"], optimum: Optimum
+) -> Picture:
+    """Targets and weights whose score, channel by channel, is that of all channels together.
+
+    Args:
+        picture: with targets of its own.
+        left: its residuals, times the root of the weight.
+        precision: W.
+        optimum: of the fit.
+    """
+    weight = np.broadcast_to(np.asarray(picture.weights, np.float64), left.shape)
+    own = weight * np.diag(precision)
+    step = np.divide(np.sqrt(weight) * (left @ precision), own, out=np.zeros_like(own), where=own > 0)
+    return dataclasses.replace(picture, target=picture.shown(optimum.n, optimum.x) + step, weight=own)
+
+
+def specular_gain(gram: Float[np.ndarray, "U U"], x: Float[np.ndarray, "3 C"]) -> float:
+    """By how many noise variances the cost rises without the specular term.
+
+    Args:
+        gram: of all channels, by x_a, x_d, x_s, channel after channel, and the exponent.
+        x: coefficients.
+    """
+    lobe = np.append(np.zeros(x[:2].size), x[2])
+    others = np.flatnonzero(x[:2].ravel() > 0)
+    pull = gram[:-1, :-1] @ lobe
+    along = np.linalg.lstsq(gram[np.ix_(others, others)], pull[others])[0]
+    return float(lobe @ pull - pull[others] @ along)
