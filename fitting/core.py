@@ -236,9 +236,13 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
     optima = {name: fit.optimum for name, fit in fits.items()}
     choice = choose(optima, free, grey, noise, inflation, whitened, colour_inflation)
     if choice.model not in FAMILIES and not _explains_structure(fits[choice.model], seen):
+        shown = fits[choice.model].optimum.x
         fits = {"lambert": most_likely(_fit_model(brdf.Lambert, seen), copies=seen.copies)}
         best = fits["lambert"]
         choice = choose({"lambert": best.optimum}, best.free, grey, noise, inflation, _likely_sums(fits))
+        # It may be one after all.
+        moved = np.where(best.optimum.x > 0, shown - best.optimum.x, 0.0)
+        choice = choice._replace(dropped=np.append(moved.ravel(), 0.0))
     matt = choice.model in FAMILIES
     chosen = list(fits.values())[-1] if matt else fits[choice.model]
     del fits, best
@@ -353,7 +357,7 @@ def _held_plausible(fit: ModelFit, seen: Observed) -> ModelFit:
 
 
 def _interpreted(fit: ModelFit, seen: Observed, choice: Choice | None, hidden: str = "") -> Interpretation:
-    told = interpret(fit, seen, hidden)
+    told = interpret(fit, seen, hidden, None if choice is None else choice.dropped)
     warnings, share = list(told.warnings), fit.residual
     if share > UNEXPLAINED:
         words = f"the model leaves {100 * share:.0f} % of the picture: are light, camera and encoding what they were?"

@@ -80,6 +80,7 @@ class Choice(NamedTuple):
         free: which coefficients it has, (3, C).
         grey: whether its k_s is the same in all channels.
         rivals: models with a highlight that the picture does not tell from the chosen one.
+        dropped: by how much what was left out may have moved x_a, x_d, x_s, channel after channel, and n.
     """
 
     candidates: tuple[Candidate, ...]
@@ -87,6 +88,7 @@ class Choice(NamedTuple):
     free: Bool[np.ndarray, "3 C"]
     grey: bool
     rivals: tuple[str, ...]
+    dropped: Float[np.ndarray, " U"]
 
 
 class _Trial(NamedTuple):
@@ -225,7 +227,27 @@ def _decide(trials: list[_Trial], normals: Mapping[str, NormalEquations], varian
         )
         for i, trial in ((i, trials[i]) for i in order)
     )
-    return Choice(candidates, chosen.model, chosen.free, chosen.grey, tuple(sorted(rivals)))
+    return Choice(candidates, chosen.model, chosen.free, chosen.grey, tuple(sorted(rivals)), _dropped(chosen, trials))
+
+
+def _dropped(chosen: _Trial, trials: list[_Trial]) -> Float[np.ndarray, " U"]:
+    """By how much the likeliest term that was left out may have moved what stays.
+
+    Its estimate moves it by that much, with an error of its own; it is there as probably as its expected error says
+    (Buckland, Burnham and Augustin, Biometrics 53 (1997) 603: the variance of an average over models).
+    """
+    fuller = [
+        trial
+        for trial in trials
+        if trial.effective > chosen.effective and np.all(trial.free >= chosen.free) and trial.grey >= chosen.grey
+    ]
+    if not fuller:
+        return np.zeros_like(chosen.solution)
+    other = min(fuller, key=lambda trial: trial.expected)
+    odds = np.exp(np.clip(0.5 * (chosen.expected - other.expected), -50.0, 50.0))
+    gain = max(chosen.cost - other.cost, 1.0)
+    step = np.where(chosen.solution > 0, other.solution - chosen.solution, 0.0)
+    return step * np.sqrt(odds / (1 + odds) * (1 + 1 / gain))
 
 
 def _distance(one: _Trial, other: _Trial, normals: Mapping[str, NormalEquations]) -> float:

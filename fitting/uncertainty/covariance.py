@@ -108,6 +108,7 @@ def uncertainty(
     resolution: float = 0.0,
     missed: SampleError | None = None,
     joined: Float[np.ndarray, "U U"] | None = None,
+    dropped: Float[np.ndarray, " U"] | None = None,
 ) -> Uncertainty:
     """Errors of an optimum.
 
@@ -132,6 +133,7 @@ def uncertainty(
         gain: see `specular_gain`, where more pixels tell of it than those of the optimum's sums.
         missed: what light samples leave out; None where there are none.
         joined: the Hessian of all channels, whose noise is 1, where these err together.
+        dropped: by how much terms that were left out may have moved the unknowns.
     """
     gain = max(gain, specular_gain(optimum, noise))
     columns = rms_columns(optimum) if columns is None else columns
@@ -151,7 +153,19 @@ def uncertainty(
         stand_in[first, channel], determined[first, channel] = some.value / some.columns[0], True
     optimum = dataclasses.replace(optimum, x=stand_in)
     x_error, x_interval, n_error, correlation, rise = _errors(
-        optimum, determined, noise, tied, spread, scatter, widening, copies, dependent, resolution, missed, joined
+        optimum,
+        determined,
+        noise,
+        tied,
+        spread,
+        scatter,
+        widening,
+        copies,
+        dependent,
+        resolution,
+        missed,
+        joined,
+        dropped,
     )
     sums = {c: some._replace(error=some.columns[0] * x_error[some.terms[0], c]) for c, some in sums.items()}
     alone = x_error
@@ -244,6 +258,7 @@ def _errors(
     resolution: float,
     missed: SampleError | None,
     joined: np.ndarray | None,
+    dropped: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, float, np.ndarray, float]:
     """Errors and intervals of x, the error of n, the correlation of all unknowns, and the rise of the cost.
 
@@ -287,6 +302,8 @@ def _errors(
     if missed is not None:
         off = missed.shift(np.append(active.ravel(), with_n)) * np.append(np.ones(size - 1), optimum.n)
         covariance = covariance + np.outer(off, off)
+    if dropped is not None:
+        covariance = covariance + np.outer(dropped, dropped)
     variance = np.maximum(np.diag(covariance), 0.0)
     error, interval = np.full((3, channels), np.inf), np.zeros((3, channels, 2))
     interval[..., 1] = np.inf

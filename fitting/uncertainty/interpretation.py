@@ -74,13 +74,16 @@ class Interpretation(NamedTuple):
         return reasons.pop() if len(reasons) == 1 else ""
 
 
-def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> Interpretation:
+def interpret(
+    fit: ModelFit, seen: Observed, hidden: str = "", dropped: Float[np.ndarray, " U"] | None = None
+) -> Interpretation:
     """Tell what a fit says.
 
     Args:
         fit: of one model.
         seen: what was fitted.
         hidden: why there is no highlight, where a fit with one has told.
+        dropped: by how much terms that were left out may have moved x_a, x_d, x_s, channel after channel, and n.
     """
     optimum, pictures = fit.optimum, fit.pictures
     weight = _typical_weight(pictures)
@@ -134,6 +137,7 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> Interpretation
         missed=missed,
         resolution=resolution,
         joined=joined,
+        dropped=dropped,
     )
     interval = None
     # At k_d + k_s = 1 the cost still falls across the bound: a profile that does not know it has its least elsewhere.

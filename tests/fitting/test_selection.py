@@ -1,5 +1,7 @@
 """The simplest adequate model: what it is called, what it costs, and what it is compared with."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy import optimize
@@ -7,6 +9,7 @@ from small_ball import ball_scene, pictured
 
 import brdf
 import fitting
+from benchmarks.truth import File, ball, just_found
 
 SCENE = ball_scene()
 K = {"k_a": [0.5, 0.4, 0.3], "k_d": [0.5, 0.2, 0.3]}
@@ -44,6 +47,19 @@ def test_a_grey_highlight_is_told_from_a_coloured_one():
     assert np.ptp(grey.material.k_s) < 1e-12
     assert grey.material.n == pytest.approx(30.0, rel=0.02)
     assert chosen(fit(brdf.BlinnPhong(**K, k_s=[0.4, 0.3, 0.2], n=30.0))).highlight == "coloured"
+
+
+@pytest.mark.parametrize("seed", [0, 1, 5])
+def test_what_stays_allows_for_a_highlight_that_was_left_out(seed: int):
+    """One about as large as is just found moves k_d by several of the errors that Lambert's law alone would state."""
+    one = ball(seed, k_s=just_found(seed, 128, 1 / 255, "linear"))
+    result = fitting.fit(File(1.0).picture(one.drawn(), seed, Path()), one.scene(), model="auto")
+    alone = fitting.fit(File(1.0).picture(one.drawn(), seed, Path()), one.scene(), model="lambert")
+    assert result.surface == "lambert"
+    k_d = result["k_d"][0]
+    assert k_d.value == pytest.approx(alone["k_d"][0].value, rel=1e-9)
+    assert k_d.error > 1.5 * alone["k_d"][0].error
+    assert abs(k_d.value - one.k[1, 0]) < 2.5 * k_d.error
 
 
 def test_without_an_ambient_term_it_is_left_out_and_bounded_and_the_grey_fit_is_that_of_scipy():
