@@ -233,8 +233,9 @@ def _decide(trials: list[_Trial], normals: Mapping[str, NormalEquations], varian
 def _dropped(chosen: _Trial, trials: list[_Trial]) -> Float[np.ndarray, " U"]:
     """By how much the likeliest term that was left out may have moved what stays.
 
-    Its estimate moves it by that much, with an error of its own; it is there as probably as its expected error says
-    (Buckland, Burnham and Augustin, Biometrics 53 (1997) 603: the variance of an average over models).
+    Its estimate moves it by that much, with an error of its own; it is there as probably as Akaike's criterion says, by
+    which nothing has to stand out (Buckland, Burnham and Augustin, Biometrics 53 (1997) 603: the variance of an average
+    over models).
     """
     fuller = [
         trial
@@ -244,8 +245,8 @@ def _dropped(chosen: _Trial, trials: list[_Trial]) -> Float[np.ndarray, " U"]:
     if not fuller:
         return np.zeros_like(chosen.solution)
     other = min(fuller, key=lambda trial: trial.expected)
-    odds = np.exp(np.clip(0.5 * (chosen.expected - other.expected), -50.0, 50.0))
     gain = max(chosen.cost - other.cost, 1.0)
+    odds = np.exp(np.clip(0.5 * gain - (other.unknowns - chosen.unknowns), -50.0, 50.0))
     step = np.where(chosen.solution > 0, other.solution - chosen.solution, 0.0)
     return step * np.sqrt(odds / (1 + odds) * (1 + 1 / gain))
 
