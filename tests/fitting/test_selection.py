@@ -50,11 +50,11 @@ def test_a_grey_highlight_is_told_from_a_coloured_one():
 
 
 @pytest.mark.parametrize("seed", [0, 1, 5])
-def test_what_stays_allows_for_a_highlight_that_was_left_out(seed: int):
+def test_what_stays_allows_for_a_highlight_that_was_left_out(seed: int, tmp_path: Path):
     """One about as large as is just found moves k_d by several of the errors that Lambert's law alone would state."""
     one = ball(seed, k_s=just_found(seed, 128, 1 / 255, "linear"))
-    result = fitting.fit(File(1.0).picture(one.drawn(), seed, Path()), one.scene(), model="auto")
-    alone = fitting.fit(File(1.0).picture(one.drawn(), seed, Path()), one.scene(), model="lambert")
+    result = fitting.fit(File(1.0).picture(one.drawn(), seed, tmp_path), one.scene(), model="auto")
+    alone = fitting.fit(File(1.0).picture(one.drawn(), seed, tmp_path), one.scene(), model="lambert")
     assert result.surface == "lambert"
     k_d = result["k_d"][0]
     assert k_d.value == pytest.approx(alone["k_d"][0].value, rel=1e-9)
