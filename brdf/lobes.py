@@ -504,16 +504,15 @@ def average(weight: Float[Array, "K M"], values: Float[Array, "*N K*M C"]) -> Fl
     return xp.sum(weight[..., None] * values.reshape(*values.shape[:-2], *weight.shape, values.shape[-1]), axis=-2)
 
 
-def diffuse_and_lobe(
+def basis_program(
     model: type[Material], points: SurfacePoints, lighting: Lighting
-) -> tuple[Float[Array, "P C"], Lobe | None]:
-    """The diffuse basis of P points, of any shape, and the specular one where the model has one."""
-    points, specular = points.flat(), has_lobe(model)
-    if not specular or not is_sampled(lighting):
-        return _diffuse_and_lobe(model, points, lighting)
-    if _size(jax.eval_shape(partial(_stacked_terms, model, lighting), points)) > STACKED_VALUES:
-        return _diffuse_and_lobe(model, points, lighting)
-    return _diffuse_and_kept(OneOf.of(model), points, lighting)
+) -> Callable[[], tuple[Float[Array, "P C"], Lobe | None]]:
+    """What makes the diffuse basis of P points, of any shape, and the specular one where the model has one."""
+    points = points.flat()
+    if issubclass(model, SpecularMaterial) and is_sampled(lighting):
+        if _size(jax.eval_shape(partial(_stacked_terms, model, lighting), points)) <= STACKED_VALUES:
+            return partial(_diffuse_and_kept, OneOf.of(model), points, lighting)
+    return partial(_diffuse_and_lobe, model, points, lighting)
 
 
 @eqx.filter_jit

@@ -32,7 +32,7 @@ from brdf.lobes import (
     Near,
     OneOf,
     average,
-    diffuse_and_lobe,
+    basis_program,
     has_lobe,
     is_sampled,
     sum_over_samples,
@@ -83,9 +83,9 @@ def basis(
         return Basis(points, None, None)
     if near is not None and area is None and is_sampled(lighting):
         return _tabulated(model, points, lighting, near, counts)
-    diffuse, lobe = diffuse_and_lobe(model, dataclasses.replace(points, area=None), lighting)
+    diffuse, lobe = basis_program(model, dataclasses.replace(points, area=None), lighting)()
     if area is not None:
-        fine_diffuse, fine_lobe = diffuse_and_lobe(model, area.points, lighting)
+        fine_diffuse, fine_lobe = basis_program(model, area.points, lighting)()
         diffuse = diffuse.at[area.pixel].set(average(area.weight, fine_diffuse), mode="drop")
         if lobe is not None and fine_lobe is not None:
             lobe = lobe.over_areas(fine_lobe, area.weight, area.slot.ravel())

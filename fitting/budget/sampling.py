@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 
 import brdf
 from brdf.lights.base import Lighting, stacked
-from brdf.lobes import diffuse_and_lobe
+from brdf.lobes import basis_program
 from brdf.models.base import SpecularMaterial
 from brdf.precision import working_precision
 
@@ -72,7 +72,7 @@ class PixelSample(NamedTuple):
 @eqx.filter_jit
 def _peaks(points, lights, model):
     """The largest log cosine of the lobe at each pixel, of lights that nothing shadows."""
-    lobe: Any = diffuse_and_lobe(model, points, Lighting(stacked(lights, points.position.dtype)))[1]
+    lobe: Any = basis_program(model, points, Lighting(stacked(lights, points.position.dtype)))()[1]
     return lobe.peak
 
 
