@@ -215,7 +215,9 @@ def _integers(pixels: np.ndarray, encoding: Encoding, top: int) -> Codes | None:
     """Of an integer file; the step is the greatest common divisor of what is used."""
     with np.errstate(invalid="ignore"):
         codes = np.rint(encode(np.asarray(pixels, np.float32), encoding) * np.float32(top))
-    used = np.unique(codes[np.isfinite(codes)]).astype(np.int64)
+    whole = codes[np.isfinite(codes)].astype(np.int64)
+    least = np.min(whole, initial=0)
+    used = np.flatnonzero(np.bincount(whole - least)) + least
     if used.size < 2:
         return None
     inside = used[(used > 0) & (used < top)]
@@ -242,7 +244,7 @@ def _levels(pixels: np.ndarray) -> Codes | None:
         rgbe = _is_rgbe(pixels) if some.size > _FIRST else True
         if not (fitting or half or rgbe):
             return None
-    if np.unique(pixels[good]).size < _FEWEST:
+    if all(np.unique(values).size < _FEWEST for values in (some[::stride], some)):
         return None
     for top, curve in fitting:
         found = _integers(pixels, curve, top)

@@ -326,9 +326,9 @@ def _explains_structure(fit: ModelFit, seen: Observed) -> bool:
     optimum = fit.optimum
     if max(highlight_in_codes(picture, optimum.x, optimum.n) for picture in fit.pictures) < HIDDEN:
         return False
-    matt = _search(fit.pictures, fit.free & [[True], [True], [False]], fit.n_range)
     if fit.evidence is not None and fit.evidence.precision is not None:
-        return True
+        return True  # what errs together has been weighed by the channels' covariance
+    matt = _search(fit.pictures, fit.free & [[True], [True], [False]], fit.n_range)
     left, chance = shared(_unexplained(fit.pictures, optimum, seen))
     before, _ = shared(_unexplained(fit.pictures, matt, seen))
     return left < CHANCE * chance or before - left > EXPLAINED * before
