@@ -15,8 +15,10 @@ from fitting.model_fit import Evidence, ModelFit
 from fitting.pixels import Observed, Tile
 from fitting.result import Parameter, free_parameters
 from fitting.solver.devices import device_count
+from fitting.solver.nnls import scaled_inverse
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
+from fitting.solver.tied import design_of, join_channels
 from fitting.uncertainty.covariance import (
     AMBIENT_SHARE,
     RESOLUTION,
@@ -102,7 +104,7 @@ def interpret(
         # Of a small highlight the pixels near an edge may tell next to nothing.
         gain = specular_gain(optimum, noise)
         fit, optimum, deviation = fit._replace(pictures=said.pictures, optimum=said.optimum), said.optimum, noise**0
-        shared, together = shared_errors(said, seen.tiles)
+        shared, together = shared_errors(said, seen.tiles, _alone(optimum, fit.tied) if said.together is None else None)
         # What errs together by less than codes tell apart is in the errors, and no more need be said.
         together = None if said.noise < ROUNDED else together
         widening = said.widening
@@ -113,7 +115,7 @@ def interpret(
         together = _structure(pictures, seen, optimum, noise, rounding, even=known.noise is None)
         # What a bound of the material leaves is no error of the pixels.
         if together is not None and together.significant and not fit.capped:
-            shared = _scattered(pictures, optimum, _left(pictures, seen, optimum))
+            shared = _scattered(pictures, optimum, _left(pictures, seen, optimum), _alone(optimum, fit.tied))
     if fit.evidence is None and shared is None and known.noise is not None:
         spread = fit.noise_factor**2 * weighted_sums(pictures, optimum, known.noise, inverse=False).gram
     # What the light reaches but the simplest model does without is 0, with the error that it would have.
@@ -162,7 +164,9 @@ def interpret(
     return Interpretation(material, parameters, noise, known.correlation, pixels, correlation, tuple(warnings))
 
 
-def shared_errors(said: Evidence, tiles: Sequence[Tile]) -> tuple[Float[np.ndarray, "U U"] | None, Structure]:
+def shared_errors(
+    said: Evidence, tiles: Sequence[Tile], covariance: Float[np.ndarray, "U U"] | None = None
+) -> tuple[Float[np.ndarray, "U U"] | None, Structure]:
     """What takes the place of the Hessian where neighbours share errors, None where they do not; and how much they do.
 
     They do in a file that was compressed with losses, or where the residual shows it.
@@ -170,6 +174,7 @@ def shared_errors(said: Evidence, tiles: Sequence[Tile]) -> tuple[Float[np.ndarr
     Args:
         said: of a fit.
         tiles: of which its pictures were made.
+        covariance: see `fitting.uncertainty.structure.scatter`.
     """
     lossy = any(tile.bounds is not None and tile.bounds.lossy for tile in tiles)
     errors = [
@@ -183,7 +188,7 @@ def shared_errors(said: Evidence, tiles: Sequence[Tile]) -> tuple[Float[np.ndarr
         together = structure(errors, even=said.noise >= ROUNDED)
     if not (lossy or together.significant):
         return None, together
-    return _scattered(said.pictures, said.optimum, errors), together
+    return _scattered(said.pictures, said.optimum, errors, covariance), together
 
 
 def _structure(
@@ -204,8 +209,18 @@ def _structure(
     return structure(found, even=even)
 
 
-def _scattered(pictures: Sequence[Picture], optimum: Optimum, errors: Iterable[Errors]) -> Float[np.ndarray, "U U"]:
-    return np.sum([scatter(picture, optimum, one) for picture, one in zip(pictures, errors, strict=True)], axis=0)
+def _scattered(
+    pictures: Sequence[Picture], optimum: Optimum, errors: Iterable[Errors], covariance: np.ndarray | None
+) -> Float[np.ndarray, "U U"]:
+    both = zip(pictures, errors, strict=True)
+    return np.sum([scatter(picture, optimum, one, covariance) for picture, one in both], axis=0)
+
+
+def _alone(optimum: Optimum, tied: np.ndarray | None) -> Float[np.ndarray, "U U"]:
+    """Covariance of independent pixels whose weights are inverse variances."""
+    design = design_of(optimum.x > 0, tied)
+    whole = join_channels(optimum.gram, optimum.product, optimum.square, optimum.x[2]).gram
+    return design @ scaled_inverse(design.T @ whole @ design) @ design.T
 
 
 def _left(pictures: Sequence[Picture], seen: Observed, optimum: Optimum) -> Iterator[Errors]:
