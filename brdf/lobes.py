@@ -9,7 +9,7 @@ import math
 import operator
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple, TypeGuard
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -22,8 +22,8 @@ from brdf.geometry.base import Shape
 from brdf.geometry.surface_points import SurfacePoints
 from brdf.geometry.visibility import share_seen
 from brdf.lights.base import Light, Lighting
-from brdf.models import MODELS
 from brdf.models.base import Material, SpecularMaterial
+from brdf.models.one_of import Model, OneOf, has_lobe
 from brdf.vectors import BELOW_HORIZON, Components, divide, dot, quadratic_form, square_root
 
 STORED_SAMPLES = 4
@@ -44,44 +44,6 @@ Up to the last of these as exponent products may be rounded."""
 
 NO_LOBE = -1e9
 """The peak of a pixel without a lobe: exp(n * this) = 0 for every n that a fit visits."""
-
-
-class OneOf(eqx.Module):
-    """A model with a lobe, known when a program runs and not before.
-
-    Many light samples make a program large: one serves all models.
-
-    Attributes:
-        models: those it may be.
-        index: which of them it is.
-    """
-
-    models: tuple[type[SpecularMaterial], ...] = eqx.field(static=True)
-    index: Int[Any, ""]
-
-    @classmethod
-    def of(cls, model: type[Material]) -> "type[Material] | OneOf":
-        """Of all models that have a name; the model itself where it is none of them or has no lobe."""
-        models = tuple(one for one in MODELS.values() if issubclass(one, SpecularMaterial))
-        return cls(models, np.int32(models.index(model))) if model in models else model
-
-    def log_cosine(self, *directions: Any) -> Array:
-        """See `SpecularMaterial.log_cosine`."""
-        kinds = list(dict.fromkeys(model.log_cosine for model in self.models))
-        kind = jnp.asarray([kinds.index(model.log_cosine) for model in self.models])[self.index]
-        return jax.lax.switch(kind, kinds, *directions)
-
-    def scale(self, n: Array) -> Array:
-        """See `SpecularMaterial.scale`."""
-        return jax.lax.switch(self.index, [model.scale for model in self.models], n)
-
-    @property
-    def cosine_weighted(self) -> Array:
-        """See `SpecularMaterial`."""
-        return jnp.asarray([model.cosine_weighted for model in self.models])[self.index]
-
-
-Model = type[Material] | OneOf
 
 
 class LightTerms(NamedTuple):
@@ -127,11 +89,6 @@ def light_terms(
     shines = glossy & (dot(point.normal, point.to_view) > 0) & (log_cosine > 0.5 * BELOW_HORIZON)
     weight = intensity * jnp.where(shines, jnp.where(model.cosine_weighted, cosine, above), 0)
     return LightTerms(diffuse, weight, jnp.where(shines, log_cosine, 0))
-
-
-def has_lobe(model: Model) -> "TypeGuard[type[SpecularMaterial] | OneOf]":
-    """Whether it has a specular term."""
-    return isinstance(model, OneOf) or issubclass(model, SpecularMaterial)
 
 
 def patch_cosine(normal: Vector, mean: Vector, covariance: Float[Array, "3 3"]) -> tuple[Scalar, Scalar]:
@@ -451,7 +408,7 @@ class Lobe(eqx.Module):
             # Of one size for few numbers of pixels, or each would be compiled.
             padded = np.resize(pixel, 1 << max(pixel.size - 1, 0).bit_length())
             points = jax.tree.map(lambda leaf: np.asarray(leaf)[padded], self.source[0])
-            terms = _kept_terms(OneOf.of(self.model), self.source[1], points)
+            terms = _diffuse_and_kept(OneOf.of(self.model), points, self.source[1])[1].kept
             lobe = dataclasses.replace(
                 lobe, source=None, kept=jax.tree.map(lambda a: np.asarray(a)[: pixel.size], terms)
             )
@@ -549,12 +506,6 @@ def tabulated(
 
     (diffuse, values), peak = over_samples(model, points, lighting, of_terms, rough=rough)
     return diffuse, peak, jnp.stack(values, axis=1) if values else None
-
-
-@eqx.filter_jit
-def _kept_terms(model: Model, lighting: Lighting, points: SurfacePoints) -> Any:
-    """Weights and cosines of the lobe of all samples at once."""
-    return _stacked_terms(model, lighting, points)[1]
 
 
 def _stacked_terms(model: Model, lighting: Lighting, points: SurfacePoints) -> tuple[Any, Any]:

@@ -28,17 +28,15 @@ from brdf.lobes import (
     TILE,
     LightTerms,
     Lobe,
-    Model,
     Near,
-    OneOf,
     average,
     basis_program,
-    has_lobe,
     is_sampled,
     sum_over_samples,
     tabulated,
 )
 from brdf.models.base import Material, SpecularMaterial, check_model
+from brdf.models.one_of import Model, OneOf, has_lobe
 from brdf.precision import Precision, cast, working_precision
 from brdf.scene import Scene
 

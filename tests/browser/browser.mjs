@@ -12,3 +12,11 @@ export function launch() {
   const args = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"];
   return chromium.launch({ executablePath: executable(), args });
 }
+
+// What of a page is seen where the browser has no WebGL2.
+export async function withoutWebGL(browser, address) {
+  const page = await browser.newPage();
+  await page.addInitScript(() => { HTMLCanvasElement.prototype.getContext = () => null; });
+  await page.goto(address);
+  return { still: await page.locator("#still").isVisible(), viewer: await page.locator("#viewer").isVisible() };
+}

@@ -5,7 +5,7 @@
 
 import { resolve } from "node:path";
 import { pathToFileURL } from "node:url";
-import { launch } from "./browser.mjs";
+import { launch, withoutWebGL } from "./browser.mjs";
 
 const address = pathToFileURL(resolve(process.argv[2])).href;
 const browser = await launch();
@@ -35,10 +35,7 @@ try {
     await page.waitForTimeout(200);
     seen.legends[name] = await page.locator("#legend").innerText();
   }
-  const poor = await browser.newPage();
-  await poor.addInitScript(() => { HTMLCanvasElement.prototype.getContext = () => null; });
-  await poor.goto(address);
-  seen.without = { still: await poor.locator("#still").isVisible(), viewer: await poor.locator("#viewer").isVisible() };
+  seen.without = await withoutWebGL(browser, address);
   process.stdout.write(JSON.stringify(seen));
 } finally {
   await browser.close();

@@ -11,6 +11,7 @@ import brdf
 import fitting
 from brdf.materials.material_file import load_note, material_from_dict, material_to_dict
 from fitting.uncertainty.intervals import above_zero
+from fitting.uncertainty.structure import LEAST_HELD, MOST_HELD, Errors, block_scatter
 
 CAMERA = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=(36, 36))
 LIGHT = brdf.DirectionalLight(direction=[0.5, 0.6, 0.7], intensity=[1.0])
@@ -235,3 +236,38 @@ def test_missing_ambient_light_is_hinted_at_where_the_dark_side_is_bright(direct
         on_ball, cosine = np.asarray(points.mask), np.asarray(points.normal) @ np.array(direction)
         share = target[on_ball & (cosine <= 0)].mean() / target[on_ball & (cosine > 0)].mean()
         assert f"still shows {100 * share:.2g} % of its lit side" in hints[0]
+
+
+def test_blocks_that_hold_much_count_as_a_fit_without_them_leaves_them():
+    # A lobe in one corner of 48 x 48 pixels, of two channels that share an exponent: a linear problem, fitted again
+    # without each block of 8 x 8.
+    random, size, channels = np.random.default_rng(0), 48, 2
+    row, column = np.divmod(np.arange(size * size), size)
+    lobe = np.exp(-((row - 5) ** 2 + (column - 6) ** 2) / 40)
+    one = np.stack([np.ones(size * size), random.random(size * size), lobe, lobe * (row - 5) / 5])
+    slopes = np.stack([one, 0.5 * one], axis=-1)
+    design = np.zeros((size * size, channels, 3 * channels + 1))
+    for channel in range(channels):
+        design[:, channel, [channel, channels + channel, 2 * channels + channel, -1]] = slopes[..., channel].T
+    values = random.standard_normal((size * size, channels))
+    blocks = (row // 8) * (size // 8) + column // 8
+
+    def left(some):
+        rows = design[some].reshape(-1, design.shape[-1])
+        return values - design @ np.linalg.lstsq(rows, values[some].ravel())[0]
+
+    residual, rows = left(blocks >= 0), design.reshape(-1, design.shape[-1])
+    covariance = np.linalg.inv(rows.T @ rows)
+    expected = np.zeros_like(covariance)
+    for block in range(blocks.max() + 1):
+        own = design[blocks == block].reshape(-1, design.shape[-1])
+        share = np.linalg.eigvals(own.T @ own @ covariance).real
+        assert share.max() < MOST_HELD
+        without = left(blocks != block) if share.sum() > LEAST_HELD else residual
+        score = own.T @ without[blocks == block].ravel()
+        expected += np.outer(score, score)
+    scores = np.einsum("pcu,pc->up", design, residual)
+    errors = Errors(residual, np.arange(size * size), size)
+    told, before = block_scatter(scores, errors, (slopes, covariance)), block_scatter(scores, errors)
+    np.testing.assert_allclose(told, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
+    assert np.all(np.diag(told)[4:] > 1.2 * np.diag(before)[4:])
