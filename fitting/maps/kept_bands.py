@@ -5,6 +5,7 @@ import zlib
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from brdf.errors import InputError
@@ -25,7 +26,8 @@ class KeptBands:
         """
         self.folder = Path(folder)
         digest = hashlib.sha256()
-        for part in (given.shape, given.to_light, given.scenes, given.scale, given.top, told):
+        scenes = jax.tree.flatten(given.scenes)
+        for part in (given.shape, given.to_light, *scenes, given.scale, given.top, given.encoding, told):
             _add(digest, part)
         for name, read in zip(given.names, given.rows, strict=True):
             if Path(name).is_file():
@@ -65,7 +67,7 @@ def _add(digest: Any, part: Any) -> None:
     if isinstance(part, tuple | list):
         for one in part:
             _add(digest, one)
-    elif isinstance(part, np.ndarray):
+    elif isinstance(part, np.ndarray | jax.Array):
         digest.update(np.ascontiguousarray(part).tobytes())
     else:
         digest.update(repr(part).encode())

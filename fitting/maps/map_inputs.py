@@ -38,6 +38,7 @@ class Photographs:
         scale: what values are multiplied with, (P, C): the inverse of ``unit``, and of the largest code.
         silent: names of files of 8 bits that do not say how they are encoded, which were read as sRGB.
         names: of the photographs.
+        encoding: as which files were read, None for what they say.
     """
 
     rows: tuple[Callable[[int, int], Num[np.ndarray, "rows W C"]], ...]
@@ -50,6 +51,7 @@ class Photographs:
     scale: Float[np.ndarray, "P C"]
     silent: tuple[str, ...]
     names: tuple[str, ...]
+    encoding: Any
 
     def band(
         self, rows: np.ndarray, texels: int, precision: str, pool: Executor | None = None
@@ -216,7 +218,7 @@ def photographs(
     scale = 1 / (unit if codes is None else unit * np.iinfo(codes).max)
     told = tuple(filter(None, silent))
     return Photographs(
-        tuple(rows), (count, *shapes[0]), to_light, scenes, unit, codes, np.array(tops), scale, told, names
+        tuple(rows), (count, *shapes[0]), to_light, scenes, unit, codes, np.array(tops), scale, told, names, encoding
     )
 
 

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from brdf.models.base import SpecularMaterial
@@ -28,6 +29,9 @@ from brdf.vectors import divide, dot, mirror_log_cosine, normalize, perpendicula
 
 OCTAVES = 16
 """The exponent is sought from 1 to 2^16: beyond, a lobe is narrower than the step between any two lights."""
+
+NARROW = (5.3, 6.5)
+"""And here: about n = 4 (N·H)^n is nearly N·L, which k_d takes, and the optimum's basin is narrower than an octave."""
 
 STEPS = 5
 """Gauss-Newton steps in a bracket of two steps of the grid: they converge to single precision."""
@@ -181,7 +185,6 @@ def fit_texels(model: Any, target: Target, columns: Columns, grey: bool, finer: 
 def octave_gains(model: Any, target: Target, columns: Columns, grey: bool, finer: int) -> Float[Array, "G T"]:
     """By how much the best material lowers the cost, at each n of the grid: see `fit_texels`."""
     dtype = target.cap.dtype
-    first = 2.0 ** (jnp.arange(finer, dtype=dtype) / finer)
     gram, moment = _sums(columns.linear, target)
     floor = jnp.exp(_lowest(dtype))
     # all that the loop sums is a column times the lobe's cosine to a power: one multiplication less at each n
@@ -203,9 +206,18 @@ def octave_gains(model: Any, target: Target, columns: Columns, grey: bool, finer
         gains = [gain(power, scale) for power, scale in zip(powers, model.scale(n), strict=True)]
         return [jnp.maximum(power * power, floor) for power in powers], jnp.stack(gains)
 
-    powers = [jnp.maximum(jnp.exp(n * columns.log_cosine), floor) for n in first]
-    exponents = first * 2.0 ** jnp.arange(OCTAVES + 1, dtype=dtype)[:, None]
-    return jax.lax.scan(octave, powers, exponents)[1].reshape(-1, *target.cap.shape)
+    def at(n: Array) -> Array:
+        return jnp.maximum(jnp.exp(n * columns.log_cosine), floor)
+
+    exponents = jnp.asarray(grid(finer), dtype)
+    octaves, between = exponents[: -len(NARROW)].reshape(-1, finer), exponents[-len(NARROW) :]
+    gains = jax.lax.scan(octave, [at(n) for n in octaves[0]], octaves)[1].reshape(-1, *target.cap.shape)
+    return jnp.concatenate([gains, jnp.stack([gain(at(n), model.scale(n)) for n in between])])
+
+
+def grid(finer: int) -> np.ndarray:
+    """The exponents that the search starts with: octaves, or so many steps of each, and then those between."""
+    return np.array([*2.0 ** (np.arange(finer * (OCTAVES + 1)) / finer), *NARROW])
 
 
 class Bracket(NamedTuple):
@@ -217,16 +229,17 @@ class Bracket(NamedTuple):
 
     @classmethod
     def about_best(cls, gains: Float[Array, "G T"], finer: int) -> "Bracket":
-        """About the best sample of a grid, from there: what is downhill of it is lower than all samples."""
+        """About the best sample of the grid, from there: what is downhill of it is lower than all samples."""
 
         def look(best: tuple[Array, Array], sample: tuple[Array, Array]) -> tuple[Any, None]:
             index, gain = sample
             return (jnp.where(gain > best[1], index, best[0]), jnp.maximum(gain, best[1])), None
 
-        index = jnp.arange(len(gains), dtype=gains.dtype)
-        (best, _), _ = jax.lax.scan(look, (jnp.zeros_like(gains[0]), gains[0]), (index, gains))
-        beside = (jnp.clip(best + side, 0, OCTAVES * finer) for side in (0, -1, 1))
-        return cls(*(math.log(2.0) / finer * sample for sample in beside))
+        order = np.argsort(grid(finer))
+        log_n = jnp.minimum(jnp.log(jnp.asarray(grid(finer)[order], gains.dtype)), OCTAVES * math.log(2.0))
+        start = jnp.zeros(gains.shape[1:], int), gains[0]
+        (best, _), _ = jax.lax.scan(look, start, (jnp.arange(len(gains)), gains[order]))
+        return cls(*(log_n[jnp.clip(best + side, 0, len(log_n) - 1)] for side in (0, -1, 1)))
 
     def narrowed(self, slope: Array, curvature: Array) -> "Bracket":
         """After a step; a step out of the bracket goes to its middle.
