@@ -149,6 +149,7 @@ class File:
         quality: of a JPEG.
         channels: of the ball.
         as_rgb: grey saved as RGB.
+        light_noise: standard deviation, of white, of noise that comes before the encoding.
     """
 
     noise: float = 0.0
@@ -160,6 +161,7 @@ class File:
     quality: int = 0
     channels: int = 1
     as_rgb: bool = False
+    light_noise: float = 0.0
 
     def picture(self, linear: np.ndarray, seed: int, folder: Path) -> Any:
         """What the fit is given: a `brdf.Picture` read back from a file, or an array."""
@@ -171,6 +173,8 @@ class File:
             codes = shown.astype(np.float32)
         else:
             white = np.iinfo(self.kind).max / self.step
+            if self.light_noise:
+                linear = linear + self.light_noise * random.standard_normal(linear.shape)
             codes = encoded(linear, self.curve) * white + self.noise * random.standard_normal(linear.shape)
             codes = (np.clip(np.rint(codes), 0, self.top) * self.step).astype(self.kind)
         if self.as_rgb:
@@ -201,6 +205,8 @@ COVERAGE = {
     "sRGB 8 bit, noise 1": File(1.0, curve="srgb"),
     "sRGB 8 bit, noise 3": File(3.0, curve="srgb"),
     "sRGB 8 bit, colour, noise 1": File(1.0, curve="srgb", channels=3),
+    "sRGB 8 bit, light noise 0.0005": File(curve="srgb", light_noise=0.0005),
+    "sRGB 8 bit, light noise 0.01": File(curve="srgb", light_noise=0.01),
     "12 in 16 bit": File(top=4095, kind="uint16", step=16),
     "12 in 16 bit, noise 1": File(1.0, top=4095, kind="uint16", step=16),
     "linear 16 bit": File(top=65535, kind="uint16"),

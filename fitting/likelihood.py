@@ -35,7 +35,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from brdf.images.encoding import Encoding
+from brdf.images.encoding import Encoding, decode
 
 # Distances in units of s beyond which nothing changes; squares of it stay within float32.
 _FAR = 1e18
@@ -103,6 +103,22 @@ class Bounds(eqx.Module):
         curved = base**power
         slope = power * curved / base
         return (curved + slope * xp.minimum(light - least, 0.0)) * steps, slope * scale
+
+    @property
+    def widths(self) -> Float[np.ndarray, " K"]:
+        """Distances of the ends, of values that have both."""
+        return (self.upper - self.lower)[np.isfinite(self.lower) & np.isfinite(self.upper)]
+
+    def in_light(self) -> "Bounds":
+        """The same ends in linear light, in units of their median distance."""
+        steps = float(self.scale)
+        lower, upper = (
+            np.where(np.isfinite(end), decode(np.where(np.isfinite(end), end, 0.0) / steps, self.encoding), end)
+            for end in (self.lower, self.upper)
+        )
+        light = dataclasses.replace(self, lower=lower, upper=upper, scale=np.ones(()), encoding="linear")
+        size = float(np.median(light.widths))
+        return dataclasses.replace(light, lower=lower / size, upper=upper / size, scale=np.asarray(1 / size))
 
     def near(self, code: Float[np.ndarray, "P C"], distance: float) -> Bool[np.ndarray, " P"]:
         """Which pixels have a value that is predicted beyond an end or near it.

@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float
 
 from fitting.channel_errors import can_be_coupled, coupled, each_alone, improved, precision_of, replaced, residuals
 from fitting.continuation import (
+    ENOUGH_KNOWN,
     LARGEST_SHIFT,
     LEAST_NOISE,
     REACH,
@@ -46,6 +47,8 @@ ROUGHLY_KNOWN = 1.2
 # In codes: with more noise than this, and no code at an end, a linear picture says what least squares says.
 ENOUGH_NOISE = 0.5
 FIRST_NOISE = 0.3
+# Noise of one size in light, not in codes, where the logarithm of the likelihood is so much larger.
+LIKELIER = 2.0
 # Rounds of least squares in codes; each leaves some hundredth of its change. What ends them: such a change, in standard
 # errors, and this one of the noise.
 MOST_ROUNDS, ENOUGH_CHANGE, ENOUGH_NOISE_CHANGE = 10, 2.0, 0.02
@@ -96,6 +99,10 @@ class _Pixels(NamedTuple):
         bounds = _bounds(picture)
         return cls(picture, Intervals(bounds.lower, bounds.upper, bounds.spread))
 
+    def in_light(self) -> "_Pixels":
+        """The same with ends in linear light."""
+        return _Pixels.of(dataclasses.replace(self.picture, bounds=_bounds(self.picture).in_light()))
+
 
 def most_likely(
     fit: ModelFit, *, copies: bool = False, grey: np.ndarray | None = None, precision: np.ndarray | None = None
@@ -115,8 +122,10 @@ def most_likely(
     if exact and deviation <= NO_NOISE * float(np.max(optimum.square / np.maximum(optimum.pixels, 1))) ** 0.5:
         return fit
     at = Numbers.of(optimum)
-    noise = residual_deviation(map(_bounds, fit.pictures), (_codes(picture, at) for picture in fit.pictures))
     lossy = any(bounds.lossy for bounds in map(_bounds, fit.pictures))
+    noise = _deviation(fit.pictures, at)
+    if not lossy:
+        fit, noise = _where_noise_is_even(fit, at, noise)
     # Weights of least squares leave out what is clipped, which says something here.
     weights = [alike(_bounds(picture), _codes(picture, at), noise) if lossy else None for picture in fit.pictures]
     pictures = list(map(_with_weight, fit.pictures, weights))
@@ -136,6 +145,43 @@ def most_likely(
     found = said.optimum
     optimum = dataclasses.replace(optimum, x=found.x, n=found.n, flat=found.flat)
     return fit._replace(optimum=optimum, evidence=said)
+
+
+def _deviation(pictures: Sequence[Picture], at: Numbers) -> float:
+    """Standard deviation of what is left, in codes."""
+    return residual_deviation(map(_bounds, pictures), (_codes(picture, at) for picture in pictures))
+
+
+def _in_light(fit: ModelFit) -> ModelFit:
+    """With the ends in linear light, for noise that came before the encoding: that of a camera or a path tracer."""
+    pictures = [dataclasses.replace(picture, bounds=_bounds(picture).in_light()) for picture in fit.pictures]
+    return fit._replace(pictures=pictures)
+
+
+def _where_noise_is_even(fit: ModelFit, at: Numbers, noise: float) -> tuple[ModelFit, float]:
+    """A fit and its noise in codes, or in light where noise of one size there is likelier and more than rounding."""
+    before = list(map(_bounds, fit.pictures))
+    if all(bounds.encoding == "linear" for bounds in before) or not all(bounds.widths.size for bounds in before):
+        return fit, noise
+    light = _in_light(fit)
+    after = _deviation(light.pictures, at)
+    if not min(noise, after) > 0:
+        return fit, noise
+    widths = zip(before, map(_bounds, light.pictures), strict=True)
+    narrower = np.concatenate([np.log(own.widths / other.widths) for own, other in widths])
+    gain = narrower.size * math.log(noise / after) - float(np.sum(narrower))
+    return (light, after) if gain > LIKELIER else (fit, noise)
+
+
+def _evener_in_light(problem: "_Separable", at: Estimate) -> Estimate | None:
+    """The most likely numbers with noise of one size in light, where they are likelier than any with it in codes."""
+    linear = all(_bounds(part.picture).encoding == "linear" for part in problem.pixels)
+    if linear or at.value > -LIKELIER:
+        return None
+    light = [part.in_light() for part in problem.pixels]
+    start = Estimate(at.unknowns, max(at.noise, FIRST_NOISE))
+    even, _ = maximise(_Separable(light, problem.design, problem.bounds, problem.copies), start, ROUGHLY_KNOWN)
+    return even if even.value > at.value + LIKELIER else None
 
 
 def _with_weight(picture: Picture, weight: np.ndarray | None) -> Picture:
@@ -165,16 +211,18 @@ def alike(bounds: Bounds, codes: Float[np.ndarray, "P C"], noise: float) -> Floa
 def _near_edges(fit: ModelFit, at: Estimate, *, copies: bool) -> Evidence:
     """Where rounding is most of the noise: what pixels near the edge of a code say."""
     design, bounds = design_of(fit.free, fit.tied), (math.log(fit.n_range[0]), math.log(fit.n_range[1]))
-    pictures, first = fit.pictures, 2.0
-    if sum(picture.target.shape[0] for picture in pictures) > 2 * SUBSAMPLE:
-        some = [_stratum(picture, SUBSAMPLE // len(pictures)) for picture in pictures]
-        at, known = maximise(_Separable(some, design, bounds, copies), at, ROUGHLY_KNOWN)
+    pictures = fit.pictures
+    large = sum(picture.target.shape[0] for picture in pictures) > 2 * SUBSAMPLE
+    some = [_stratum(picture, SUBSAMPLE // len(pictures)) for picture in pictures] if large else _gathered(pictures, at)
+    problem = _Separable(some, design, bounds, copies)
+    at, known = maximise(problem, at, ROUGHLY_KNOWN if large else ENOUGH_KNOWN)
+    if (even := _evener_in_light(problem, at)) is not None:
+        return _near_edges(_in_light(fit), even, copies=copies)
+    if large:
         # The whole picture has the pixels near an edge that a part of it lacks.
-        at, first = at._replace(noise=telling(known).noise), ROUGHLY_KNOWN
-    near = [np.flatnonzero(_near(picture, at, REACH)) for picture in pictures]
-    gathered = [_Pixels.of(picture.in_double(some)) for picture, some in zip(pictures, near, strict=True)]
-    problem = _Separable(gathered, design, bounds, copies)
-    at, known = maximise(problem, at, first=first)
+        at = at._replace(noise=telling(known).noise)
+        problem = _Separable(_gathered(pictures, at), design, bounds, copies)
+        at, known = maximise(problem, at, first=ROUGHLY_KNOWN)
     said, wider = where_most_is_told(problem, at, known)
     working = [one.working() for one in said.said]
     optimum = _optimum(working, said, fit, Numbers.of(at))
@@ -498,6 +546,11 @@ class _Said(NamedTuple):
 def _near(picture: Picture, at: Estimate, reach: float) -> Bool[np.ndarray, " P"]:
     """Which pixels say something: those with a value not surely inside its bounds, by so many s."""
     return _bounds(picture).near(_codes(picture, Numbers.of(at)), reach * at.noise)
+
+
+def _gathered(pictures: Sequence[Picture], at: Estimate) -> list[_Pixels]:
+    """Those of whole pictures."""
+    return [_Pixels.of(picture.in_double(np.flatnonzero(_near(picture, at, REACH)))) for picture in pictures]
 
 
 def _stratum(picture: Picture, size: int) -> _Pixels:

@@ -37,6 +37,16 @@ def test_files_without_noise_are_read_within_their_errors(row: str, tmp_path: Pa
             assert abs(found["k_d[0]"][0]) < 3e-5, (seed, found)
 
 
+@pytest.mark.parametrize("row", ["sRGB 8 bit, light noise 0.0005", "sRGB 8 bit, light noise 0.01"])
+def test_noise_that_comes_before_the_encoding_is_larger_in_dark_codes(row: str, tmp_path: Path):
+    for seed in (1, 2, 4, 6):
+        found = deviations(row, seed, tmp_path)
+        assert max(abs(far) for _, far in found.values()) < FAR, (seed, found)
+    one = ball(3, ambient=False)
+    result = fitting.fit(COVERAGE[row].picture(one.drawn(), 3, tmp_path), one.scene(), model=one.model)
+    assert not any("structure" in words for words in result.warnings)
+
+
 def test_a_small_highlight_none_of_whose_values_lies_near_an_edge_is_there_all_the_same(tmp_path: Path):
     """At the noise where the picture is likeliest the pixels that tell are all elsewhere."""
     found = deviations("linear 8 bit", 188, tmp_path)
