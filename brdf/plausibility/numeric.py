@@ -22,7 +22,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from brdf.albedo import gauss_legendre
 from brdf.channels import in_channel
@@ -31,24 +31,24 @@ from brdf.measured.table import from_angles
 from brdf.plausibility.report import ENERGY_LIMIT, GRAZING, RECIPROCITY_LIMIT, Angles, Finding, Report, judged, times
 
 BRDF = Callable[[Any, Any], Any]
-Evaluate = Callable[[Int[np.ndarray, " m"], Float[np.ndarray, "m 3"]], Float[np.ndarray, "m C"]]
+Evaluate = Callable[[Float[np.ndarray, "m 3"]], Float[np.ndarray, "m C"]]
 
 FINEST = 2.0**-13
 """Size of the squares around an announced lobe, about 1e-4 rad: a lobe of n = 1e7 is 3e-4 wide."""
 
 _LOWEST = math.cos(math.radians(GRAZING))
-_UP = np.array([0.0, 0.0, 1.0])
 _MIRRORED = np.array([-1.0, -1.0, 1.0])  # times a direction: its mirror direction about the normal
 _TURN = math.pi * (3.0 - math.sqrt(5.0))  # the golden angle: directions that turn by it fill a circle evenly
 _GRID = 2**18  # directions; any cap of 0.25 degree radius holds one
 _FIXED = np.radians([0.0, 7.0, 20.0, 35.0, 50.0, 65.0, 78.0, 86.0, 89.5])
+_KEPT = 12  # pairs of each look at the BRDF, for each test
 # Angles of light at which the albedo is taken; where it diverges, it may do so late.
 _POLAR = np.radians([*np.arange(0, 90, 2.5), 89.0, 89.9, *(90.0 - np.geomspace(1e-2, 1e-8, 4))])
-_BATCH = 2**13  # one size, so one compilation
-_COARSE = 1e-5  # tolerance of the quadrature for directions that turn out not to matter
+_BATCH = 2**12  # one size, so one compilation
+# Tolerance of the quadrature, and how many values it may take: for all directions, then where that does not decide.
+_COARSE, _FINE = (1e-5, 200_000), (1e-10, 3_000_000)
 _NODES = 5
 _QUARTERS = np.array([(0, 0), (0, 1), (1, 0), (1, 1)])
-_SMALLEST = 2.0**-32  # of any square
 
 
 def check_black_box(f_r: BRDF, subject: str) -> Report:
@@ -66,12 +66,13 @@ def check_black_box(f_r: BRDF, subject: str) -> Report:
         InputError: f_r cannot be traced or does not return one number per channel.
     """
     scan = _Scan(f_r)
-    findings = [_positivity(scan), _reciprocity(scan), _energy(scan)]
+    findings = _positivity(scan), _reciprocity(scan), _energy(scan)
     if scan.sample.not_finite is not None:
         light, view = map(Angles.of, scan.sample.not_finite)
         sentence = f"f_r is not a finite number for light {light}, view {view}"
-        findings = [judged(math.nan, f.limit, math.nan, (light, view, 0), sentence) for f in findings]
-    return Report(subject, *findings)
+        where = light, view, 0
+        findings = (judged(math.nan, finding.limit, math.nan, where, sentence) for finding in findings)
+    return Report(subject, *findings, nearest=None)
 
 
 def albedo_of(f_r: BRDF, polar: Float[np.ndarray, " K"]) -> Float[np.ndarray, "K C"]:
@@ -84,7 +85,7 @@ def albedo_of(f_r: BRDF, polar: Float[np.ndarray, " K"]) -> Float[np.ndarray, "K
     Returns:
         (K, C).
     """
-    return _albedos(_Scan(f_r), from_angles(np.radians(polar), 0.0), _COARSE)[0]
+    return _albedos(_Scan(f_r), from_angles(np.radians(polar), 0.0))[0]
 
 
 # -- values of f_r, and a first look at them everywhere ----------------------------------------------------------------
@@ -139,60 +140,54 @@ class Sampler:
 
     def __call__(self, to_light: Float[np.ndarray, "m 3"], to_view: Float[np.ndarray, "m 3"]) -> np.ndarray:
         """Values, (m, C); where they are not finite that is remembered, and 0 stands for them."""
-        both = np.broadcast_arrays(to_light, to_view)
-        count = len(both[0])
+        pairs = np.stack(np.broadcast_arrays(to_light, to_view))
+        count = pairs.shape[1]
         values = np.empty((self.channels, count)).T  # channel by channel: what is compared are channels of many pairs
         with jax.enable_x64(True):
             for first in range(0, count, _BATCH):
-                some = [vectors[first : first + _BATCH] for vectors in both]
-                missing = np.array([(0, _BATCH - len(some[0])), (0, 0)])
-                found = self._batch(*(np.pad(part, missing, mode="edge") if missing.any() else part for part in some))
-                values[first : first + _BATCH] = np.asarray(found)[: len(some[0])]
-        finite = np.isfinite(values)
+                rows = np.minimum(np.arange(first, first + _BATCH), count - 1)
+                values[first : first + _BATCH] = np.asarray(self._batch(*pairs[:, rows]))[: count - first]
+        finite = np.isfinite(values).all(axis=1)
         if not finite.all():
-            good = np.all(finite, axis=1)
-            self.not_finite = np.stack([vectors[np.argmin(good)] for vectors in both])
-            values[~good] = 0.0
+            self.not_finite = pairs[:, np.argmin(finite)]
+            values[~finite] = 0.0
         return values
 
 
 class _Scan:
-    """A BRDF, and what a first look at it found; pairs of light and view are of shape (2, m, 3).
+    """A BRDF, and what a first look at it found: pairs of light and view, (2, m, 3), ``_KEPT`` of each look.
 
     Attributes:
         sample: the BRDF.
         random: for directions that follow no pattern.
-        negative: the most negative pairs, look by look, worst first.
+        scale: a typical value of f_r (N.V), against which a value is small or large.
+        negative: the most negative pairs.
         unequal: the pairs that change most when light and view change places.
-        bright: the brightest pairs.
-        scale: a typical value of f_r, against which a value is small or large.
+        bright: the brightest pairs, moved to where it is brightest around them.
     """
 
     def __init__(self, f_r: BRDF):
         self.sample, self.random = Sampler(f_r), np.random.default_rng(20)
-        self.negative, self.unequal, self.bright = self._found = [], [], []
         light, view = (self.random.permutation(_fibonacci(2**16)) for _ in range(2))
         self.scale = float(np.mean(np.abs(self.seen(light, view))))
         fixed, grid = from_angles(_FIXED, _TURN * np.arange(len(_FIXED))), _fibonacci(_GRID)
-        self.scale = float(np.mean([self._look(one + 0 * grid, grid, keep=6) for one in fixed]))
-        self._look(light, view, keep=24)
         lights = np.concatenate([fixed, _fibonacci(64)])[:, None]
-        scales = np.append(0.0, np.geomspace(1e-5, 0.3, 180))[:, None]
-        for peaks in (lights * _MIRRORED, lights, _UP + 0 * lights):
-            views = _lifted(peaks + scales * self.random.standard_normal((len(peaks), len(scales), 3)))
-            self._look((lights + 0 * views).reshape(-1, 3), views.reshape(-1, 3), keep=24)
+        looks = [(light, view), *((one, grid) for one in fixed)]
+        for peaks in (lights * _MIRRORED, lights, np.array([0.0, 0.0, 1.0])):
+            offsets = self.random.standard_normal((len(lights), 181, 3))
+            looks.append((lights, _lifted(peaks + np.append(0.0, np.geomspace(1e-5, 0.3, 180))[:, None] * offsets)))
+        found = np.concatenate([self._look(*look) for look in looks], axis=2)
+        self.negative, self.unequal, bright = found
+        self.bright = self.improved(lambda *pair: self.seen(*pair).max(axis=1), bright)
 
-    def _look(self, light: np.ndarray, view: np.ndarray, keep: int) -> float:
-        """Take in pairs, both ways round; returns a typical value of f_r among them."""
+    def _look(self, light: np.ndarray, view: np.ndarray) -> np.ndarray:
+        """The most negative, most unequal and brightest among some pairs, taken both ways round."""
+        light, view = (vectors.reshape(-1, 3) for vectors in np.broadcast_arrays(light, view))
         pairs = np.stack([np.concatenate([light, view]), np.concatenate([view, light])])
         values = self.sample(*pairs)
-        seen = values * pairs[1, :, 2:]
         unequal = self.inequality(values, np.roll(values, len(light), axis=0))
-        for found, scores in zip(self._found, (-values, unequal, seen), strict=True):
-            score = scores.max(axis=1)
-            best = np.argpartition(-score, keep)[:keep]
-            found.append(pairs[:, best[np.argsort(-score[best])]])
-        return float(np.mean(np.abs(seen)))
+        scores = (score.max(axis=1) for score in (-values, unequal, values * pairs[1, :, 2:]))
+        return np.stack([pairs[:, np.argpartition(-score, _KEPT)[:_KEPT]] for score in scores])
 
     def seen(self, light: np.ndarray, view: np.ndarray) -> np.ndarray:
         """f_r (N.V)."""
@@ -208,14 +203,13 @@ class _Scan:
     def improved(self, score: Callable[..., Any], vectors: np.ndarray, rounds: int = 45, tries: int = 24) -> np.ndarray:
         """The one or two directions, (1 or 2, m, 3), of larger score after a random search from each of the m.
 
-        It moves both or one of them, and widens where it succeeds, narrows where it fails.
+        It moves some of them, and widens where it succeeds, narrows where it fails.
         """
         best, radius = score(*vectors), np.full(vectors.shape[1], 0.01)
-        turn, own = np.arange(tries) % (len(vectors) + 1), np.arange(len(vectors))[:, None] + 1
-        moves = ((turn == 0) | (turn == own))[:, None, :, None]
         for _ in range(rounds):
-            step = radius[:, None, None] * self.random.standard_normal((*vectors.shape[:2], tries, 3))
-            tried = _lifted(vectors[:, :, None] + moves * step)
+            shape = *vectors.shape[:2], tries
+            moves = radius[:, None] * (self.random.random(shape) < 0.6)
+            tried = _lifted(vectors[:, :, None] + moves[..., None] * self.random.standard_normal((*shape, 3)))
             scores = score(*tried.reshape(len(vectors), -1, 3)).reshape(-1, tries)
             largest, chosen = np.max(scores, axis=1), np.argmax(scores, axis=1)
             better = largest > best
@@ -228,20 +222,17 @@ class _Scan:
 # -- the three tests ---------------------------------------------------------------------------------------------------
 
 
-def _worst(
-    scan: _Scan, function: Callable[..., np.ndarray], pairs: list[np.ndarray]
-) -> tuple[float, float, np.ndarray, int]:
+def _worst(scan: _Scan, function: Callable[..., np.ndarray], pairs: np.ndarray) -> tuple[float, float, np.ndarray, int]:
     """The largest value found of a function of light and view, its error bound, and where: the pair and channel."""
-    found = scan.improved(lambda *pair: function(*pair).max(axis=1), np.concatenate(pairs, axis=1))
+    found = scan.improved(lambda *pair: function(*pair).max(axis=1), pairs)
     values = function(*found)
-    row, channel = np.unravel_index(np.argmax(values), values.shape)
-    pair = found[:, row]
+    row, channel = map(int, np.unravel_index(np.argmax(values), values.shape))
     # Its error is how much it scatters under changes of the directions by a few roundings, which are below real change.
     epsilon = scan.sample.epsilon
-    shaken = pair[:, None] + 4 * epsilon * scan.random.standard_normal((2, 64, 3))
+    shaken = found[:, row, None] + 4 * epsilon * scan.random.standard_normal((2, 64, 3))
     near = function(*_lifted(shaken))[:, channel]
     bound = 2 * float(np.ptp(near)) + 4 * epsilon * float(np.max(np.abs(near)))
-    return float(values[row, channel]), bound, pair, int(channel)
+    return float(values[row, channel]), bound, found[:, row], channel
 
 
 def _positivity(scan: _Scan) -> Finding:
@@ -270,22 +261,15 @@ def _reciprocity(scan: _Scan) -> Finding:
 def _energy(scan: _Scan) -> Finding:
     # the lowest along an axis of the quadrature's square, which is halved less often there
     lights = from_angles(_POLAR, 0.75 * np.pi * np.arange(len(_POLAR)) * (_POLAR < _FIXED[-1]))
-    lights = np.concatenate([lights, *(light[:1] for light, _ in scan.bright)])
-    found = _albedos(scan, lights)
-    top = lights[np.argmax(found[0].max(axis=1))]
-    better = scan.improved(lambda tried: _albedos(scan, tried)[0].max(axis=1), top[None, None], rounds=10, tries=6)[0]
-    lights = np.append(lights, better, axis=0)
-    albedo, bound = found = np.append(found, _albedos(scan, better), axis=1)
-    tolerance = np.full(len(lights), _COARSE)
-    for _ in range(60):  # sharpen those that decide, as long as they do not
-        row = np.argmax(np.max(albedo + bound, axis=1))
-        decided = np.all(albedo + bound <= ENERGY_LIMIT) or np.any(albedo - bound > ENERGY_LIMIT + 1e-3)
-        if decided or tolerance[row] < 1e-11:
-            break
-        tolerance[row] *= 0.02
-        found[:, [row]] = _albedos(scan, lights[[row]], tolerance[row])
+    lights = np.concatenate([lights, scan.bright[0, :: 4 * _KEPT]])
+    top = lights[np.argmax(_albedos(scan, lights)[0].max(axis=1))]
+    found = scan.improved(lambda tried: _albedos(scan, tried)[0].max(axis=1), top[None, None], rounds=10, tries=6)
+    lights = np.append(lights, found[0], axis=0)
+    albedo, bound = found = _albedos(scan, lights)
     score = albedo - bound
     if np.all(score <= ENERGY_LIMIT):
+        for row in np.flatnonzero(np.any(albedo + bound > ENERGY_LIMIT, axis=1)):
+            found[:, row] = _albedo(scan, lights[row], *_FINE)
         score = albedo + bound
     row, channel = map(int, np.unravel_index(np.argmax(score), score.shape))
     value, light = float(albedo[row, channel]), Angles.of(lights[row])
@@ -297,85 +281,66 @@ def _energy(scan: _Scan) -> Finding:
 # -- albedo ------------------------------------------------------------------------------------------------------------
 
 
-def _albedos(scan: _Scan, lights: np.ndarray, tolerance: float = _COARSE) -> np.ndarray:
-    """Albedos and bounds on their errors, (2, K, C), for lights (K, 3)."""
-    value, bound = integrate(
-        lambda which, views: scan.seen(lights[which], views),
-        _peaks(scan, lights),
-        tolerance=tolerance,
-        budget=3_000_000 + 60_000 * len(lights),
-    )
+def _albedos(scan: _Scan, lights: np.ndarray) -> np.ndarray:
+    """Albedos for lights (K, 3), and bounds on their errors, (2, K, C)."""
+    return np.stack([_albedo(scan, light, *_COARSE) for light in lights], axis=1)
+
+
+def _albedo(scan: _Scan, light: np.ndarray, tolerance: float, budget: int) -> np.ndarray:
+    """The albedo for one light, and a bound on its error, (2, C)."""
+    # A narrow lobe may sit where it is bright for other lights, too: about the same view or the same half vector.
+    halves = _lifted(scan.bright.sum(axis=0))
+    same_half = _lifted(2 * (halves @ light)[:, None] * halves - light)
+    views = np.concatenate([same_half, scan.bright[1], _fibonacci(2**12)])
+    brightest = views[np.argsort(scan.seen(light, views).max(axis=1))[-5:]]
+    centres = np.stack([*brightest, light * _MIRRORED, light])
+    value, bound = integrate(lambda views: scan.seen(light, views), centres, tolerance, budget)
     return np.stack([value, bound + 50 * scan.sample.epsilon * np.abs(value)])
 
 
-def _peaks(scan: _Scan, lights: np.ndarray) -> np.ndarray:
-    """For each light the views where a narrow lobe may sit, (K, p, 3): typical places, the brightest found near by."""
-    coarse = _fibonacci(2**12)
-    bright_light, bright_view = np.concatenate([pairs[:, :3] for pairs in scan.bright], axis=1)
-    halves = _lifted(bright_light + bright_view)
-    mirrored, starts = lights * _MIRRORED, []
-    for light, mirror in zip(lights, mirrored, strict=True):
-        same_half = _lifted(2 * (halves @ light)[:, None] * halves - light)
-        candidates = np.concatenate([coarse, bright_view, same_half])
-        value = scan.seen(light, candidates).max(axis=1)
-        starts.append([*candidates[np.argsort(-value)[:5]], mirror])
-
-    def brightness(views):
-        return scan.seen(np.repeat(lights, len(views) // len(lights), axis=0), views).max(axis=1)
-
-    views = np.array(starts)
-    found = scan.improved(brightness, views.reshape(1, -1, 3), rounds=25, tries=12)
-    return np.concatenate([found.reshape(views.shape), mirrored[:, None], lights[:, None]], axis=1)
-
-
 def integrate(
-    evaluate: Evaluate, centres: Float[np.ndarray, "K p 3"], *, tolerance: float, budget: int
-) -> tuple[Float[np.ndarray, "K C"], Float[np.ndarray, "K C"]]:
-    """Integrals of several functions over the hemisphere about +z.
+    evaluate: Evaluate, centres: Float[np.ndarray, "p 3"], tolerance: float, budget: int
+) -> tuple[Float[np.ndarray, " C"], Float[np.ndarray, " C"]]:
+    """Integral of a function over the hemisphere about +z.
 
     Args:
-        evaluate: called with which function, (m,), and directions, (m, 3); returns values, (m, C).
-        centres: for each of the K functions the directions (unit vectors) around which it may have narrow lobes.
+        evaluate: called with directions, (m, 3); returns values, (m, C).
+        centres: directions (unit vectors) around which the function may have narrow lobes.
         tolerance: the difference at which a square is refined no more.
         budget: the number of function values after which refinement stops.
 
     Returns:
-        The integrals, with bounds that also cover whatever the budget left unrefined.
+        The integral, with a bound that also covers whatever the budget left unrefined.
     """
     size = 0.25
     edges = np.arange(-1, 1, size)
-    grid = np.stack(np.meshgrid(edges, edges), axis=-1).reshape(-1, 2)
-    of, corner = np.repeat(np.arange(len(centres)), len(grid)), np.tile(grid, (len(centres), 1))
-    values = _rule(evaluate, of, corner, size)
-    total = np.zeros((len(centres), values.shape[1]))
-    bound = np.zeros_like(total)
-    while len(of):
+    corner = np.stack(np.meshgrid(edges, edges), axis=-1).reshape(-1, 2)
+    values = _rule(evaluate, corner, size)
+    total = bound = np.zeros(values.shape[1])
+    while len(corner):
         middle, _ = _from_square(*(corner.T + 0.5 * size))
         # the map stretches by 0.7 to 2: at least the square that holds the centre, and those around it
-        announced = np.min(np.linalg.norm(middle[:, None] - centres[of], axis=2), axis=1) < 2 * size
+        announced = np.min(np.linalg.norm(middle[:, None] - centres, axis=2), axis=1) < 2 * size
         size *= 0.5
         quarters = corner[:, None] + size * _QUARTERS
-        parts = _rule(evaluate, np.repeat(of, 4), quarters.reshape(-1, 2), size).reshape(len(of), 4, -1)
+        parts = _rule(evaluate, quarters.reshape(-1, 2), size).reshape(len(corner), 4, -1)
         sums = parts.sum(axis=1)
         differences = np.abs(sums - values)
-        budget -= 4 * len(of) * _NODES**2
+        budget -= 4 * len(corner) * _NODES**2
         refine = (np.max(differences, axis=1) > tolerance) | announced & (size >= FINEST)
-        refine &= (budget >= 0) & (size > _SMALLEST)
-        np.add.at(total, of[~refine], sums[~refine])
-        np.add.at(bound, of[~refine], differences[~refine])
-        of, corner = np.repeat(of[refine], 4), quarters[refine].reshape(-1, 2)
-        values = parts[refine].reshape(-1, total.shape[1])
+        refine &= budget >= 0
+        total, bound = total + sums[~refine].sum(axis=0), bound + differences[~refine].sum(axis=0)
+        corner, values = quarters[refine].reshape(-1, 2), parts[refine].reshape(-1, len(total))
     return total, bound + 1e-15 * _NODES * np.abs(total)
 
 
-def _rule(evaluate: Evaluate, of: np.ndarray, corner: np.ndarray, size: float) -> np.ndarray:
+def _rule(evaluate: Evaluate, corner: np.ndarray, size: float) -> np.ndarray:
     """Integrals over squares, (m, C)."""
     nodes, weights = gauss_legendre(_NODES)
     u, v = corner[:, 0, None, None] + size * nodes[:, None], corner[:, 1, None, None] + size * nodes
     directions, solid_angle = _from_square(u, v)
-    values = evaluate(np.repeat(of, _NODES**2), directions.reshape(-1, 3))
     weight = size**2 * solid_angle * np.outer(weights, weights)
-    return np.einsum("muv,muvc->mc", weight, values.reshape(*weight.shape, -1))
+    return np.einsum("muv,muvc->mc", weight, evaluate(directions.reshape(-1, 3)).reshape(*weight.shape, -1))
 
 
 def _from_square(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -5,6 +5,8 @@ import math
 from typing import Any, Literal
 
 from brdf import formatters
+from brdf.materials.material_file import material_to_dict
+from brdf.models import Material
 
 Verdict = Literal["pass", "fail", "cannot tell"]
 
@@ -93,7 +95,7 @@ class Report:
     positivity: Finding
     reciprocity: Finding
     energy: Finding
-    nearest: Any = None
+    nearest: Material | None = None
 
     @property
     def findings(self) -> dict[str, Finding]:
@@ -128,9 +130,12 @@ class Report:
 
     def to_json(self) -> dict[str, Any]:
         """The report as plain numbers, strings and dictionaries, for ``json.dumps``."""
-        nearest = None if self.nearest is None else {"model": self.nearest.name, **vars(self.nearest)}
-        findings = {name: dataclasses.asdict(finding) for name, finding in self.findings.items()}
-        return _plain({"subject": self.subject, "plausible": self.plausible, **findings, "nearest": nearest})
+        told: dict[str, Any] = {"subject": self.subject, "plausible": self.plausible}
+        for name, finding in self.findings.items():
+            told[name] = dataclasses.asdict(finding)
+            for key in ("value", "margin", "error_bound"):  # JSON knows no NaN
+                told[name][key] = None if math.isnan(told[name][key]) else told[name][key]
+        return told | {"nearest": None if self.nearest is None else material_to_dict(self.nearest)}
 
 
 def judged(
@@ -157,18 +162,9 @@ def judged(
         crossing: see `Finding`.
     """
     margin = value - limit if least else limit - value
-    word = verdict(margin, bound)
-    sentence = failed if failed and word == "fail" else passed
-    return Finding(word, value, limit, margin, bound, *where, sentence, crossing)
-
-
-def verdict(margin: float, error_bound: float) -> Verdict:
-    """What a margin known to within an error bound allows to say."""
-    if math.isnan(margin) or math.isnan(error_bound):
-        return "cannot tell"
-    if margin >= error_bound:
-        return "pass"
-    return "fail" if -margin > error_bound else "cannot tell"
+    verdict: Verdict = "pass" if margin >= bound else "fail" if -margin > bound else "cannot tell"
+    sentence = failed if failed and verdict == "fail" else passed
+    return Finding(verdict, value, limit, margin, bound, *where, sentence, crossing)
 
 
 def times(ratio: float) -> str:
@@ -177,11 +173,3 @@ def times(ratio: float) -> str:
         return "a million times and more"
     digits = 2 if ratio >= 1.1 else 2 + math.ceil(-math.log10(max(ratio - 1.0, 1e-12)))
     return f"{ratio:.0f} times" if ratio >= 100 else f"{ratio:.{digits}g} times"
-
-
-def _plain(value: Any) -> Any:
-    """As JSON knows it; what is not finite is None."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    value = value.tolist() if hasattr(value, "tolist") else value
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -58,15 +58,15 @@ def _pairs(samples: MeasuredBRDF, *, exchanged: bool) -> tuple[np.ndarray, np.nd
     a, b = (np.arctan2(np.hypot(v[:, 0], v[:, 1]), v[:, 2]) for v in (light, view))
     start, end = (np.arctan2(v[:, 1], v[:, 0]) for v in (light, view))
     if samples.evaluate is not None:
-        other = (view, light) if exchanged else (light, from_angles(b, 2 * start - end))
-        first, repeated = np.arange(len(light)), samples.evaluate(*other)
+        first = np.arange(len(light))
+        repeated = samples.evaluate(*((view, light) if exchanged else (light, from_angles(b, 2 * start - end))))
     else:
         turn = np.where(np.minimum(a, b) < CELL, 0.0, (end - start + np.pi) % (2 * np.pi) - np.pi)
         cells = np.round(np.array([(a, b, turn), (b, a, -turn) if exchanged else (a, b, -turn)]) / CELL)
         cells[:, 2] %= round(2 * np.pi / CELL)
-        own, wanted = np.swapaxes(cells, 1, 2).tolist()
-        rows = {tuple(cell): row for row, cell in enumerate(own)}
-        partner = np.array([rows.get(tuple(cell), -1) for cell in wanted])
+        own, wanted = (list(map(tuple, each.T)) for each in cells)
+        rows = {cell: row for row, cell in enumerate(own)}
+        partner = np.array([rows.get(cell, -1) for cell in wanted])
         # What stands on the line between the two repeats itself.
         apart = np.abs(a - b if exchanged else turn) > CELL
         first = np.flatnonzero(apart & (partner >= 0) & (partner != np.arange(len(partner))))
@@ -75,24 +75,18 @@ def _pairs(samples: MeasuredBRDF, *, exchanged: bool) -> tuple[np.ndarray, np.nd
     return first, np.abs(values - repeated) / np.where(size > 0, size, 1.0)
 
 
-def _cannot_tell(limit: float, sentence: str) -> Finding:
-    return judged(math.nan, limit, math.nan, (Angles(0.0), None, 0), sentence)
-
-
 def _positivity(table: MeasuredBRDF, noise: float) -> Finding:
     row, channel = map(int, np.unravel_index(np.argmin(table.values), table.values.shape))
-    value, light, view = (
-        float(table.values[row, channel]),
-        Angles.of(table.to_light[row]),
-        Angles.of(table.to_view[row]),
-    )
-    bound = 0.0 if math.isnan(noise) else noise * float(np.median(np.abs(table.values[:, channel])))
+    value, bound = float(table.values[row, channel]), 0.0
+    light, view = Angles.of(table.to_light[row]), Angles.of(table.to_view[row])
     sentence = f"no value is below 0, the least is {value:.3g}/sr"
     if value < 0:
         where = f"for light {light}, view {view}, channel {table.channels[channel]}"
         sentence = f"{table.negative} of {table.values.size} values are below 0, the least, {value:.3g}/sr, {where}"
-        sentence += "" if math.isnan(noise) else f"; the noise of a typical value is {bound:.2g}/sr"
-    return judged(value, 0.0, bound if value < 0 else 0.0, (light, view, channel), sentence, least=True)
+        if not math.isnan(noise):
+            bound = noise * float(np.median(np.abs(table.values[:, channel])))
+            sentence += f"; the noise of a typical value is {bound:.2g}/sr"
+    return judged(value, 0.0, bound, (light, view, channel), sentence, least=True)
 
 
 def _reciprocity(samples: MeasuredBRDF, noise: float) -> Finding:
@@ -108,17 +102,21 @@ def _reciprocity(samples: MeasuredBRDF, noise: float) -> Finding:
         return judged(0.0, PASSES, 0.0, where, sentence)
     largest = f"the largest, {100 * difference[row, channel]:.3g} %, for light {light}, view {view}"
     pairs = f"over {len(difference)} pairs; {largest}"
+    said = f"the typical reciprocity error is {{}} {pairs}".format
     if math.isnan(noise):
         word = "fail" if typical > LARGEST_NOISE else "cannot tell"
-        said = f"the typical reciprocity error is {100 * typical:.2g} % {pairs}; the noise is not known from the table"
-        return Finding(word, typical, LARGEST_NOISE, LARGEST_NOISE - typical, 0.0, *where, said)
+        sentence = said(f"{100 * typical:.2g} %") + "; the noise is not known from the table"
+        return Finding(word, typical, LARGEST_NOISE, LARGEST_NOISE - typical, 0.0, *where, sentence)
     ratio = typical / noise
     word = "pass" if ratio <= PASSES else "fail" if ratio >= FAILS else "cannot tell"
-    compared = f"{ratio:.2g} times the noise ({100 * typical:.2g} % against {100 * noise:.2g} %)"
     # The median of K absolute deviations is known to within 1.2 / sqrt(K) of itself.
     bound = ratio * 1.2 / len(difference) ** 0.5
-    said = f"the typical reciprocity error is {compared} {pairs}"
-    return Finding(word, ratio, PASSES, PASSES - ratio, bound, *where, said)
+    sentence = said(f"{ratio:.2g} times the noise ({100 * typical:.2g} % against {100 * noise:.2g} %)")
+    return Finding(word, ratio, PASSES, PASSES - ratio, bound, *where, sentence)
+
+
+def _cannot_tell(limit: float, sentence: str) -> Finding:
+    return judged(math.nan, limit, math.nan, (Angles(0.0), None, 0), sentence)
 
 
 def _energy(table: MeasuredBRDF) -> Finding:
