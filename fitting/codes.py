@@ -250,18 +250,20 @@ def _levels(pixels: np.ndarray) -> Codes | None:
         found = _integers(pixels, curve, top)
         if found is not None:
             return found._replace(found=True)
+    # A float's 0 is no end of its own, but noise may have been cut off there.
+    images = np.moveaxis(pixels, -1, 0)
+    cut = any(single_values_at_end(image, np.isfinite(image), 0.0) for image in images)
+    ends = (0.0 if cut else -np.inf, np.inf)
     if rgbe:
         step = np.broadcast_to(_shared_step(pixels)[..., None], pixels.shape)
         unit = float(np.median(step[step > 0]))
-        ends = (-np.inf, np.inf)
-        return Codes(
-            (pixels / unit).astype(np.float32), 0.0, np.maximum(step, 1e-30) / unit, ends, 1 / unit, "linear", "RGBE"
-        )
+        above = np.maximum(step, 1e-30) / unit
+        return Codes((pixels / unit).astype(np.float32), 0.0, above, ends, 1 / unit, "linear", "RGBE")
     if half:
         ulp = np.spacing(np.maximum(pixels, 6e-5).astype(np.float16)).astype(np.float64)
         unit = float(np.median(ulp[pixels > 0])) if np.any(pixels > 0) else 1.0
         around = 0.5 * ulp / unit
-        return Codes((pixels / unit).astype(np.float32), around, around, (-np.inf, np.inf), 1 / unit, "linear", "half")
+        return Codes((pixels / unit).astype(np.float32), around, around, ends, 1 / unit, "linear", "half")
     return None
 
 

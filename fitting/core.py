@@ -299,7 +299,7 @@ def _inflation(fit: ModelFit, seen: Observed, grey: np.ndarray) -> tuple[float, 
     """
     said = fit.evidence
     assert said is not None
-    scatter, _ = shared_errors(said, seen.tiles)
+    scatter, _ = shared_errors(said, seen)
     if scatter is None:
         return 1.0, 1.0
 

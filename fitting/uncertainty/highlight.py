@@ -34,6 +34,11 @@ class Highlight(NamedTuple):
         """Too few pixels see it to tell its shape."""
         return self.pixels < FEW_PIXELS or self.centre < OFF_CENTRE
 
+    @property
+    def broad(self) -> bool:
+        """More pixels see it than the four around a peak that falls between them."""
+        return self.pixels > 2 * FEW_PIXELS
+
 
 def highlight(pictures: Sequence[Picture], n: float) -> Highlight:
     """Measure the highlight.

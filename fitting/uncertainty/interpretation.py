@@ -12,7 +12,7 @@ from brdf.models.base import SpecularMaterial
 from fitting import channel_errors
 from fitting.light_colour import coefficient_factors
 from fitting.model_fit import Evidence, ModelFit
-from fitting.pixels import Observed, Tile
+from fitting.pixels import Observed
 from fitting.result import Parameter, free_parameters
 from fitting.solver.devices import device_count
 from fitting.solver.nnls import scaled_inverse
@@ -104,7 +104,7 @@ def interpret(
         # Of a small highlight the pixels near an edge may tell next to nothing.
         gain = specular_gain(optimum, noise)
         fit, optimum, deviation = fit._replace(pictures=said.pictures, optimum=said.optimum), said.optimum, noise**0
-        shared, together = shared_errors(said, seen.tiles, _alone(optimum, fit.tied) if said.together is None else None)
+        shared, together = shared_errors(said, seen, _alone(optimum, fit.tied) if said.together is None else None)
         # What errs together by less than codes tell apart is in the errors, and no more need be said.
         together = None if said.noise < ROUNDED else together
         widening = said.widening
@@ -165,7 +165,7 @@ def interpret(
 
 
 def shared_errors(
-    said: Evidence, tiles: Sequence[Tile], covariance: Float[np.ndarray, "U U"] | None = None
+    said: Evidence, seen: Observed, covariance: Float[np.ndarray, "U U"] | None = None
 ) -> tuple[Float[np.ndarray, "U U"] | None, Structure]:
     """What takes the place of the Hessian where neighbours share errors, None where they do not; and how much they do.
 
@@ -173,19 +173,19 @@ def shared_errors(
 
     Args:
         said: of a fit.
-        tiles: of which its pictures were made.
+        seen: of which its pictures were made.
         covariance: see `fitting.uncertainty.structure.scatter`.
     """
-    lossy = any(tile.bounds is not None and tile.bounds.lossy for tile in tiles)
+    lossy = any(tile.bounds is not None and tile.bounds.lossy for tile in seen.tiles)
     errors = [
         errors_of(picture, said.optimum, place) for picture, place in zip(said.pictures, said.places, strict=True)
     ]
     if lossy:
         # The pixels of a block err together in any case.
-        together = structure(list(map(of_blocks, errors)), (2, 4))
+        together = structure([of_blocks(_once(one, seen)) for one in errors], (2, 4))
     else:
         # With little noise few pixels of a block say much.
-        together = structure(errors, even=said.noise >= ROUNDED)
+        together = structure([_once(one, seen) for one in errors], even=said.noise >= ROUNDED)
     if not (lossy or together.significant):
         return None, together
     return _scattered(said.pictures, said.optimum, errors, covariance), together
@@ -205,8 +205,14 @@ def _structure(
     if device_count() > 1 or seen.problem.loss != "squared" or not tell.any():
         return None
     for errors in _left(pictures, seen, optimum):
-        found.append(errors._replace(values=(errors.values / noise)[:, tell].astype(np.float32)))
+        errors = errors._replace(values=(errors.values / noise)[:, tell].astype(np.float32))
+        found.append(_once(errors, seen))
     return structure(found, even=even)
+
+
+def _once(errors: Errors, seen: Observed) -> Errors:
+    """Of channels that are copies of each other the first."""
+    return errors._replace(values=errors.values[:, :1]) if seen.copies else errors
 
 
 def _scattered(
@@ -321,14 +327,15 @@ def _missing_ambient(pictures: Sequence[Picture]) -> Iterator[str]:
         if picture.weight is not None:
             counted &= np.asarray(picture.weight)[some].reshape(len(target), -1).min(axis=1) > 0
         reached = np.any(diffuse > 0, axis=1)
-        brightness = target.mean(axis=1)
-        dark.append(brightness[counted & ~reached])
-        lit.append(brightness[counted & reached])
+        dark.append(target[counted & ~reached])
+        lit.append(target[counted & reached])
     unlit, bright = np.concatenate(dark), np.concatenate(lit)
-    if min(unlit.size, bright.size) < FEWEST_PIXELS:
+    if min(len(unlit), len(bright)) < FEWEST_PIXELS:
         return
-    share = float(unlit.mean() / max(bright.mean(), np.finfo(float).tiny))
-    if share >= SHARE and unlit.mean() >= DEVIATIONS * unlit.std() / np.sqrt(unlit.size):
+    # The middle of each channel: the mean of noise that was cut off at black is above 0.
+    shown = float(np.mean(np.median(unlit, axis=0)))
+    share = shown / max(float(bright.mean()), np.finfo(float).tiny)
+    if share >= SHARE and shown >= DEVIATIONS * unlit.mean(axis=1).std() / np.sqrt(len(unlit)):
         yield (
             f"where no light of the scene arrives the picture still shows {100 * share:.2g} % of its lit side: give "
             "the scene an [ambient] light, or a photograph --ambient, and k_a takes that up"
@@ -358,6 +365,12 @@ def _warnings(known: ResidualCorrelation, together: Structure | None, seen: High
         amount = f"the nearest pixel shows {100 * seen.centre:.2g} % of its peak"
         if seen.centre >= OFF_CENTRE:
             amount = f"{seen.pixels:.1f} pixels carry it"
+        if seen.broad:
+            yield (
+                f"no pixel that counts shows the middle of the highlight ({amount}): k_s and n are told by its edge "
+                "alone. A picture that shows it, and does not clip it, would tell more"
+            )
+            return
         yield (
             f"the highlight is smaller than a pixel, or nearly so ({amount}): k_s and n hang on each pixel being "
             "sampled at its centre, and a camera averages over pixels. A larger picture or a larger light would tell"

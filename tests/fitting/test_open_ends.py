@@ -65,6 +65,21 @@ def test_a_floor_of_a_float_picture_that_nothing_lies_below_is_no_matter():
     assert float(result.material.n) == pytest.approx(30.0, rel=1e-4)
 
 
+@pytest.mark.parametrize(("name", "kind"), [("ball.exr", "half"), ("ball.exr", "float"), ("ball.hdr", "float")])
+def test_noise_may_be_cut_off_at_the_0_of_any_file_of_floats(name, kind, tmp_path):
+    dark, found = brdf.Scene(lights=SCENE.lights, points=SCENE.points), []
+    for seed in range(DRAWS):
+        for scene in (SCENE, dark):
+            clean = np.asarray(brdf.render(DULL, scene))
+            values = np.maximum(clean + np.random.default_rng(seed).normal(0, 0.03, clean.shape), 0)
+            brdf.write_image(tmp_path / name, values, dtype=kind)
+            result = fitting.fit(tmp_path / name, scene, model="blinn-phong")
+            assert not [words for words in result.warnings if "structure" in words or "[ambient]" in words]
+            if scene is SCENE:
+                found.append(deviations(result, DULL))
+    assert np.all(np.abs(np.mean(found, axis=0)) < 1.2)
+
+
 @pytest.mark.parametrize("by", ["mask", "weight"])
 def test_what_is_masked_says_nothing(by):
     picture = seen(DULL, 0.03, 0, low=0.0, bits=None).pixels

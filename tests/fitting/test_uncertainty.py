@@ -176,6 +176,14 @@ def test_a_highlight_smaller_than_a_pixel_is_warned_of():
     assert any("smaller than a pixel" in text for text in result.warnings)
 
 
+def test_a_broad_highlight_whose_middle_does_not_count_is_not_called_small():
+    dull = brdf.BlinnPhong(k_a=0.5, k_d=0.5, k_s=0.6, n=30.0)
+    edge = np.asarray(brdf.basis_images(brdf.BlinnPhong, SCENE, 30.0).specular)[..., 0] < 0.4
+    result = fitting.fit(noisy(dull, 0.001, 2), SCENE, model="blinn-phong", mask=edge, **OPTIONS)
+    assert [text for text in result.warnings if "shows the middle of the highlight" in text]
+    assert not [text for text in result.warnings if "smaller than a pixel" in text]
+
+
 def test_a_coefficient_at_its_bound_is_zero_with_a_one_sided_interval():
     for seed in range(20):
         truth = brdf.BlinnPhong(k_a=0.0, k_d=0.5, k_s=0.6, n=30.0)
