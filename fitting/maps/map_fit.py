@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 import brdf
+from brdf.checks import direction_value
 from brdf.errors import InputError
 from brdf.precision import Precision
 from fitting.maps import map_inputs
@@ -16,6 +17,7 @@ from fitting.maps.map_inputs import Photographs
 from fitting.maps.map_result import REASONS, Maps
 from fitting.maps.shared_exponent import with_shared_n
 from fitting.maps.tiles import How, Surface
+from fitting.problem import model_name
 from fitting.solver.devices import spread_over
 
 
@@ -28,7 +30,7 @@ def fit_maps(
     exposures: Any = None,
     ambient: Any = None,
     to_view: Any = (0.0, 0.0, 1.0),
-    model: str = "blinn-phong",
+    model: Any = "blinn-phong",
     specular: str = "coloured",
     mask: Any = None,
     encoding: Any = None,
@@ -98,7 +100,8 @@ def fit_maps(
     models = _models(model)
     given = map_inputs.photographs(pictures, lights, intensities, exposures, encoding)
     surface = _surface(given, normals, mask, to_view, flip_y)
-    how = How(models, specular == "grey", _ambient(ambient, given), np.asarray(to_view, float), precision)
+    to_view = np.asarray(direction_value("to_view", to_view))
+    how = How(models, specular == "grey", _ambient(ambient, given), to_view, precision)
     notes: tuple[str, ...] = ()
     if given.silent and given.to_light is not None:
         other = map_inputs.photographs(pictures, lights, intensities, exposures, "linear")
@@ -112,18 +115,15 @@ def fit_maps(
     return dataclasses.replace(how.maps(layers, notes), to_light=given.to_light)
 
 
-def _models(model: str) -> tuple[Any, ...]:
-    if model == "auto":
-        return brdf.Lambert, brdf.Phong, brdf.BlinnPhong
-    if model not in brdf.MODELS:
-        raise InputError("model", f"is unknown, got {model!r}", f"Use auto, {', '.join(brdf.MODELS)}")
-    return (brdf.MODELS[model],)
+def _models(model: Any) -> tuple[Any, ...]:
+    name = model_name(model)
+    return (brdf.Lambert, brdf.Phong, brdf.BlinnPhong) if name == "auto" else (brdf.MODELS[name],)
 
 
 def _ambient(ambient: Any, given: Photographs) -> np.ndarray | None:
     if ambient is None:
         return None
-    values = np.asarray(ambient, float).reshape(-1)
+    values = map_inputs.plain_numbers("ambient", ambient, "Give the intensity of the ambient light").reshape(-1)
     if values.size not in (1, given.shape[3]) or not np.all((values > 0) & np.isfinite(values)):
         came = f"must be 1 or {given.shape[3]} numbers above 0, got {ambient!r:.60}"
         raise InputError("ambient", came, "Give the intensity of the ambient light")

@@ -1,7 +1,7 @@
 """What maps are made of, in one form: photographs that are read by bands of rows, their lights, and what texels see."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
 from functools import partial
 from pathlib import Path
@@ -184,6 +184,10 @@ def photographs(
     Raises:
         InputError: naming the photograph or argument.
     """
+    for name, given in (("pictures", pictures), ("lights", lights)):
+        if not isinstance(given, Iterable):
+            came = "are missing" if given is None else f"must be a list, got {type(given).__name__}"
+            raise InputError(name, came, "Give a photograph for each light, and a direction towards each light")
     opened = [_open(f"pictures[{i}]", picture, encoding) for i, picture in enumerate(pictures)]
     if not opened:
         raise InputError("pictures", "is empty", "Give a photograph for each light")
@@ -194,8 +198,7 @@ def photographs(
     count, channels = len(rows), shapes[0][2]
     if isinstance(lights, str | Path):
         lights = read_lights(lights)[1] if Path(lights).suffix.lower() == ".lp" else read_directions(lights)
-    if lights is None:
-        raise InputError("lights", "are missing", "Give a direction towards the light for each photograph")
+    lights = list(lights)
     if len(lights) != count:
         raise InputError("lights", f"are {len(lights)} for {count} photographs", "Give a light for each photograph")
     unit = np.ones((count, channels))
@@ -203,10 +206,10 @@ def photographs(
         if given is not None:
             unit = unit * _factors(name, given, count, channels)
     to_light, scenes = None, None
-    if isinstance(lights[0], brdf.Scene):
+    if all(isinstance(light, brdf.Scene) for light in lights):
         scenes, colours = zip(*(_white(f"lights[{i}]", scene) for i, scene in enumerate(lights)), strict=True)
         unit = unit * [_factors(f"lights[{i}]", one[None], 1, channels)[0] for i, one in enumerate(colours)]
-    elif isinstance(lights[0], brdf.DirectionalLight):
+    elif all(isinstance(light, brdf.DirectionalLight) for light in lights):
         to_light = _directions([light.direction for light in lights])
         unit = unit * [_factors("lights", np.asarray(light.intensity)[None], 1, channels)[0] for light in lights]
     else:
@@ -252,8 +255,25 @@ def _open(name: str, picture: Any, encoding: Any) -> tuple[Any, tuple[int, int, 
     return lambda start, stop: values[start:stop], values.shape, name, "", values.dtype, top
 
 
+def plain_numbers(name: str, given: Any, remedy: str) -> np.ndarray:
+    """What a person gives for numbers, float64.
+
+    Args:
+        name: of the argument.
+        given: numbers, or lists of them.
+        remedy: what to give.
+
+    Raises:
+        InputError: naming the argument.
+    """
+    try:
+        return np.asarray(given, np.float64)
+    except (TypeError, ValueError):
+        raise InputError(name, f"must be numbers, got {given!r:.60}", remedy) from None
+
+
 def _factors(name: str, given: Any, count: int, channels: int) -> Float[np.ndarray, "P C"]:
-    values = np.asarray(given, np.float64)
+    values = plain_numbers(name, given, "Give a number for each photograph")
     values = values[:, None] if values.ndim == 1 else values
     if values.ndim != 2 or values.shape[0] != count or values.shape[1] not in (1, channels):
         came = f"is of shape {np.shape(given)} for {count} photographs of {channels} channels"
@@ -264,7 +284,7 @@ def _factors(name: str, given: Any, count: int, channels: int) -> Float[np.ndarr
 
 
 def _directions(given: Any) -> Float[np.ndarray, "P 3"]:
-    vectors = np.asarray(given, np.float64)
+    vectors = plain_numbers("lights", given, "Give directions, or for lights that are near a scene with each")
     if vectors.ndim != 2 or vectors.shape[1] != 3:
         raise InputError("lights", f"are of shape {vectors.shape}", "Give (P, 3) directions towards the lights")
     length = np.sqrt(np.sum(vectors * vectors, axis=1))

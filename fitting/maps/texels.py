@@ -106,7 +106,7 @@ class Target(NamedTuple):
         """With what follows from it."""
         channels = [shown[:, c] for c in range(shown.shape[1])]
         brightest = jnp.max(functools.reduce(jnp.maximum, channels), axis=0)
-        return cls(shown, functools.reduce(operator.add, channels), CAP * brightest)
+        return cls(shown, functools.reduce(operator.add, channels), CAP * jnp.maximum(brightest, 0))
 
 
 class TexelFit(NamedTuple):

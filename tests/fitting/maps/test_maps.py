@@ -267,6 +267,13 @@ def test_a_folder_is_fitted_saved_and_loaded(folder, tmp_path):
     assert brdf.read_picture(tmp_path / "out" / "normals.png").bits == 16
 
 
+def test_texels_that_show_less_than_nothing_are_black():
+    pictures = -np.abs(np.random.default_rng(0).normal(size=(5, 2, 8, 1)))  # a dark frame was taken off
+    maps = fitting.fit_maps(pictures, dome(5), np.broadcast_to(VIEW, (2, 8, 3)))
+    assert not maps.render(VIEW).any()
+    assert not maps.fitted_k_s.any()
+
+
 def test_clipped_values_are_no_data():
     lights = dome(32)
     pictures, truth = texels(64, 0.0, lights)
@@ -352,6 +359,13 @@ def test_a_broken_folder_is_told_in_one_line(folder, what, words):
         ({"model": "ward"}, "model"),
         ({"specular": "gray"}, "specular"),
         ({"ambient": -1.0}, "ambient"),
+        ({"ambient": "dim"}, "ambient"),
+        ({"exposures": "long"}, "exposures"),
+        ({"lights": 6}, "lights"),
+        ({"lights": [brdf.PointLight(light, 1.0) for light in dome(6)]}, "for lights that are near a scene"),
+        ({"pictures": None}, "pictures"),
+        ({"to_view": [0, 0, 0]}, "to_view"),
+        ({"to_view": [0, 1]}, "to_view"),
     ],
 )
 def test_bad_arguments_are_told_in_one_line(change, words):
