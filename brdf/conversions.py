@@ -224,13 +224,13 @@ def nearest_equations(
 
 
 def _constrained(gram: Float[np.ndarray, "2 2"], right: Float[np.ndarray, " 2"], bounded: bool) -> np.ndarray:
-    """The x >= 0 (with sum <= 1 if bounded) of least x' gram x / 2 - right' x: within, or the best on an edge."""
+    """The x >= 0 (with sum <= 1 if bounded) of least x' gram x / 2 - right' x: a bound that is broken is reached."""
     best = np.linalg.lstsq(gram, right, rcond=1e-12)[0]  # at n = 0 a lobe may be the diffuse term: they share it
-    if np.all(best > 1e-12 * best.max()) and (not bounded or best.sum() <= 1):
-        return best
-    edges = [((0.0, 0.0), (1.0, 0.0)), ((0.0, 0.0), (0.0, 1.0)), ((0.0, 1.0), (1.0, -1.0))]
-    candidates = []
-    for start, along in np.array(edges if bounded else edges[:2]):
-        step = along @ (right - gram @ start) / max(along @ gram @ along, 1e-300)
-        candidates.append(start + np.clip(step, 0.0, 1.0 if bounded else np.inf) * along)
-    return min(candidates, key=lambda x: 0.5 * x @ gram @ x - right @ x)
+    if best.min() <= 1e-12 * best.max():
+        kept = np.argmax(best)
+        best = np.where([kept == 0, kept == 1], right / np.diag(gram), 0.0)
+    if bounded and best.sum() > 1:
+        along = np.array([-1.0, 1.0])  # from (1, 0) to (0, 1)
+        share = np.clip(along @ (right - gram[:, 0]) / max(along @ gram @ along, 1e-12), 0.0, 1.0)
+        best = np.array([1 - share, share])
+    return best

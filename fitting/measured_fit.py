@@ -159,23 +159,23 @@ class BrdfFitResult(Parameters):
     @property
     def verdict(self) -> str:
         """The sentence that a person needs."""
-        name, several, losses = self.material.name, len(self.candidates) > 1, self.losses
+        losses, several = self.losses, len(self.candidates) > 1
+        name = "Lambert" if self.material.name == "lambert" else self.material.name
         if not self.fits:
             best = min(self.candidates, key=self._loss)
             closest = f"none of these models fits: the best, {best.model}," if several else f"{name} does not fit: it"
             left = f"{_percent(best.losses.cosine)} of the table (rms of f_r cos θ)"
             return f"{closest} leaves {left}; the brightest sample is {self._brightest()}"
-        left, beside = _percent(losses.cosine), self._beside_lambert()
-        elsewhere = f"{_percent(losses.misplaced)} of the light goes elsewhere"
-        name = "Lambert" if name == "lambert" else name
+        left, elsewhere = _percent(losses.cosine), f"{_percent(losses.misplaced)} of the light goes elsewhere"
         if losses.cosine**2 > HALF:
-            placed = f"puts {_percent(1 - losses.misplaced)} of the light where it belongs"
-            return f"{name} {placed}, but not the peak, and leaves {left} of the table (rms of f_r cos θ){beside}"
-        off = f"its f_r cos θ is off by {left} (rms)"
-        if losses.misplaced > HALF:
-            return f"{name} fits the peak, {off}, but {elsewhere}{beside}"
-        verb = "is enough" if several and name == "Lambert" else "describes it"
-        return f"{name} {verb}: {off}, and {elsewhere}{beside}"
+            placed = f"puts {_percent(1 - losses.misplaced)} of the light where it belongs, but not the peak"
+            told = f"{placed}, and leaves {left} of the table (rms of f_r cos θ)"
+        elif losses.misplaced > HALF:
+            told = f"fits the peak, its f_r cos θ is off by {left} (rms), but {elsewhere}"
+        else:
+            verb = "is enough" if several and name == "Lambert" else "describes it"
+            told = f"{verb}: its f_r cos θ is off by {left} (rms), and {elsewhere}"
+        return f"{name} {told}{self._beside_lambert()}"
 
     def _loss(self, candidate):
         return getattr(candidate.losses, self.loss)
@@ -196,10 +196,9 @@ class BrdfFitResult(Parameters):
     def _brightest(self):
         sums = np.where(_within(self.table, self.max_angle), self.table.values.sum(axis=1), -np.inf)
         light, view = self.table.to_light[np.argmax(sums)], self.table.to_view[np.argmax(sums)]
-        retro, mirror = _apart(light, view), _apart(light * [-1, -1, 1], view)
-        back = f"{retro:.2g}° from the direction back to the light"
-        where = back if retro < mirror else f"{mirror:.2g}° from the mirror direction of the light"
-        return f"{where}, which stands at {_apart(light, _NORMAL):.3g}°"
+        places = "direction back to the light", "mirror direction of the light"
+        apart, place = min(zip((_apart(light, view), _apart(light * [-1, -1, 1], view)), places, strict=True))
+        return f"{apart:.2g}° from the {place}, which stands at {_apart(light, _NORMAL):.3g}°"
 
     def __str__(self) -> str:
         """The report."""
@@ -228,16 +227,6 @@ class BrdfFitResult(Parameters):
 
     def to_dict(self) -> dict[str, Any]:
         """The report as JSON holds it."""
-        candidates = [
-            {
-                "model": candidate.model,
-                "unknowns": sum(1 for parameter in candidate.parameters if parameter.value),
-                "losses": candidate.losses._asdict(),
-                "material": material_to_dict(candidate.material),
-                "chosen": index == self.chosen,
-            }
-            for index, candidate in enumerate(self.candidates)
-        ]
         names = ("loss", "samples", "negative", "left_out", "fits", "verdict", "warnings", "seconds")
         return {name: getattr(self, name) for name in names} | {
             "table": self.table.name,
@@ -245,7 +234,16 @@ class BrdfFitResult(Parameters):
             "material": material_to_dict(self.material, undetermined=self.undetermined),
             "parameters": [parameter.to_dict() for parameter in self.parameters],
             "losses": self.losses._asdict(),
-            "candidates": candidates,
+            "candidates": [
+                {
+                    "model": candidate.model,
+                    "unknowns": sum(1 for parameter in candidate.parameters if parameter.value),
+                    "losses": candidate.losses._asdict(),
+                    "material": material_to_dict(candidate.material),
+                    "chosen": index == self.chosen,
+                }
+                for index, candidate in enumerate(self.candidates)
+            ],
         }
 
     def plot(self) -> Any:
@@ -330,8 +328,7 @@ def fit_brdf(
         raise InputError("table", f"must be a brdf.MeasuredBRDF, got {type(table).__name__}", "Use brdf.load_measured")
     model = model_name(model)
     check_choice(loss, get_args(Loss), n_range)
-    samples = _samples(table, max_angle)
-    count, channels = int(np.count_nonzero(samples.solid_angle)), len(samples.channels)
+    samples, count = _samples(table, max_angle)
     left_out, negative = samples.left_out, int(np.count_nonzero(samples.values[:count] < 0))
     if loss == "log" and negative:
         left_out = left_out | {"values below 0, out of reach of the logarithm": negative}
@@ -339,7 +336,7 @@ def fit_brdf(
         candidates = [
             _fit_model(kind, samples, loss, n_range)
             for kind in (brdf.MODELS.values() if model == "auto" else [brdf.MODELS[model]])
-            if count * channels > (2 * channels + 1 if issubclass(kind, SpecularMaterial) else channels)
+            if count > 1 + issubclass(kind, SpecularMaterial) * (1 + 1 / len(samples.channels))
         ]
     if not candidates:
         came = f"has {count} samples that count, no more than there are numbers to find"
@@ -349,9 +346,9 @@ def fit_brdf(
 
 
 def _samples(table, max_angle):
-    """The samples that count, their solid angles of mean 1; more of solid angle 0 follow.
+    """The samples that count, their solid angles of mean 1, and how many; more of solid angle 0 follow.
 
-    They make it one of a few sizes, so that few programs are compiled.
+    They make it a power of two, so that few programs are compiled.
     """
     if not (isinstance(max_angle, int | float) and 0 < max_angle <= 90):
         raise InputError("max_angle", f"must be above 0 and at most 90 degrees, got {max_angle!r}", "Correct it")
@@ -367,11 +364,10 @@ def _samples(table, max_angle):
         raise InputError(table.name, f"has no value above 0 within {max_angle:g}° of the normal", "Check its sign")
     if not 1 / FAR <= largest <= FAR:
         raise InputError(table.name, f"holds values of up to {largest:.3g}/sr, as no BRDF does", "Check its unit")
-    power = 1 << max(10, (count - 1).bit_length())
-    more = (power * 3 // 4 if count <= power * 3 // 4 else power) - count
+    more = (1 << max(10, (count - 1).bit_length())) - count
     share, near = table.solid_angle[near], np.pad(near, (0, more), mode="edge")
     left_out = table.left_out | {f"further than {max_angle:g}° from the normal": len(table.values) - count}
-    return dataclasses.replace(
+    samples = dataclasses.replace(
         table,
         to_light=table.to_light[near],
         to_view=table.to_view[near],
@@ -379,6 +375,7 @@ def _samples(table, max_angle):
         solid_angle=np.pad(share / np.mean(share), (0, more)),
         left_out={reason: number for reason, number in left_out.items() if number},
     )
+    return samples, count
 
 
 def _fit_model(model, samples, loss, n_range):
@@ -411,13 +408,13 @@ def _fit_model(model, samples, loss, n_range):
     # A lobe that hardly reaches a sample needs a k_s whose square is out of range; it is found to be undetermined.
     with np.errstate(over="ignore", invalid="ignore"):
         sure = uncertainty(optimum, free, noise, brightest, visible, single=False)
+    interval = None
+    if specular and sure.n_error:
+        ratio = np.exp(NORMAL_95 * sure.n_error / optimum.n)
+        interval = float(optimum.n / ratio), float(optimum.n * ratio)
     fit = ModelFit(model, [], optimum, free, n_range)
-    material, parameters = material_and_parameters(fit, sure, np.ones(channels), None)
+    material, parameters = material_and_parameters(fit, sure, np.ones(channels), interval)
     parameters = tuple(one for one in parameters if one.name != "k_a")
-    if parameters[-1].error and parameters[-1].name == "n":
-        ratio = np.exp(NORMAL_95 * parameters[-1].error / optimum.n)
-        ends = float(optimum.n / ratio), float(optimum.n * ratio)
-        parameters = (*parameters[:-1], dataclasses.replace(parameters[-1], interval=ends))
     return BrdfCandidate(material, parameters, _losses(samples, modelled(optimum)))
 
 
@@ -439,11 +436,11 @@ def _logarithmic(samples, solve, modelled):
     best, least, model = None, np.inf, value
     for _ in range(_MOST_ROUNDS):
         found = solve(cosine**2 * weights("log", 1 + value, 1 + model, share, np.zeros(1)))
-        model = modelled(found) * cosine
-        cost = float(np.sum(share * (np.log1p(value) - np.log1p(model)) ** 2))
-        if cost >= least * (1 - _ENOUGH):
+        f_r = modelled(found)
+        deviation, model = _losses(samples, f_r).log, f_r * cosine
+        if deviation >= least * (1 - _ENOUGH):
             break
-        best, least = found, cost
+        best, least = found, deviation
     return best
 
 
@@ -466,9 +463,7 @@ def _losses(samples, model):
 def _choose(candidates, loss):
     """Lambert, which comes first, unless a lobe explains enough of the squares that it leaves."""
     lambert = candidates[0].losses
-    if lambert.cosine <= EXACT:
-        return 0
     losses = [getattr(candidate.losses, loss) for candidate in candidates]
     best = int(np.argmin(losses))
     worth = WORTH if 1 - lambert.cosine**2 >= HALF else WORTH_WITHOUT_LAMBERT
-    return best if losses[best] ** 2 <= worth * losses[0] ** 2 else 0
+    return best if losses[best] ** 2 + EXACT**2 <= worth * losses[0] ** 2 else 0

@@ -15,7 +15,17 @@ from brdf.channels import in_channel
 from brdf.conversions import nearest_normalized
 from brdf.measured.table import from_angles
 from brdf.models import BlinnPhong, Lambert, Material, NormalizedBlinnPhong, NormalizedPhong, Phong, SpecularMaterial
-from brdf.plausibility.report import ENERGY_LIMIT, GRAZING, RECIPROCITY_LIMIT, Angles, Finding, Report, judged, times
+from brdf.plausibility.report import (
+    ENERGY_LIMIT,
+    GRAZING,
+    RECIPROCITY_LIMIT,
+    Angles,
+    Finding,
+    Report,
+    judged,
+    largest,
+    times,
+)
 from brdf.precision import cast, working_precision
 
 # What is known on paper holds for these alone; a subclass or a new model is looked at like any function.
@@ -56,7 +66,7 @@ _reflectance = jax.jit(lambda material, to_light, to_view: material.reflectance(
 
 def _positivity(material: Material) -> Finding:
     values = _in_plane(material, _LIGHTS, _VIEWS)
-    row, column, channel = map(int, np.unravel_index(np.argmin(values), values.shape))
+    row, column, channel = largest(-values)
     value, view = float(values[row, column, channel]), float(_VIEWS[column])
     where = Angles(float(_LIGHTS[row])), Angles(abs(view), 180.0 * (view < 0)), channel
     words = f"the least f_r is {value:.4g}/sr, because no coefficient is negative"
@@ -73,7 +83,7 @@ def _reciprocity(material: Material) -> Finding:
     lights, views = np.array([GRAZING]), np.geomspace(GRAZING - 90.0, -90.0, 100_001) + 90.0
     there, back = _in_plane(material, lights, -views)[0], _in_plane(material, views, -lights)[:, 0]
     difference = 1.0 - back / there
-    row, channel = map(int, np.unravel_index(np.argmax(difference), difference.shape))
+    row, channel = largest(difference)
     value, light, view = float(difference[row, channel]), Angles(GRAZING), Angles(float(views[row]), 180.0)
     a, b = f"{light.polar:.4g}°", f"{view.polar:.4g}°"
     ratio = float(there[row, channel] / max(back[row, channel], 1e-300))

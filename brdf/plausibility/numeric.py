@@ -28,7 +28,17 @@ from brdf.albedo import gauss_legendre
 from brdf.channels import in_channel
 from brdf.errors import InputError
 from brdf.measured.table import from_angles
-from brdf.plausibility.report import ENERGY_LIMIT, GRAZING, RECIPROCITY_LIMIT, Angles, Finding, Report, judged, times
+from brdf.plausibility.report import (
+    ENERGY_LIMIT,
+    GRAZING,
+    RECIPROCITY_LIMIT,
+    Angles,
+    Finding,
+    Report,
+    judged,
+    largest,
+    times,
+)
 
 BRDF = Callable[[Any, Any], Any]
 Evaluate = Callable[[Float[np.ndarray, "m 3"]], Float[np.ndarray, "m C"]]
@@ -211,10 +221,10 @@ class _Scan:
             moves = radius[:, None] * (self.random.random(shape) < 0.6)
             tried = _lifted(vectors[:, :, None] + moves[..., None] * self.random.standard_normal((*shape, 3)))
             scores = score(*tried.reshape(len(vectors), -1, 3)).reshape(-1, tries)
-            largest, chosen = np.max(scores, axis=1), np.argmax(scores, axis=1)
-            better = largest > best
+            highest, chosen = np.max(scores, axis=1), np.argmax(scores, axis=1)
+            better = highest > best
             vectors = np.where(better[:, None], tried[:, np.arange(len(best)), chosen], vectors)
-            best = np.maximum(best, largest)
+            best = np.maximum(best, highest)
             radius = np.clip(radius * np.where(better, 1.5, 0.5), 1e-8, 0.5)
         return vectors
 
@@ -226,7 +236,7 @@ def _worst(scan: _Scan, function: Callable[..., np.ndarray], pairs: np.ndarray) 
     """The largest value found of a function of light and view, its error bound, and where: the pair and channel."""
     found = scan.improved(lambda *pair: function(*pair).max(axis=1), pairs)
     values = function(*found)
-    row, channel = map(int, np.unravel_index(np.argmax(values), values.shape))
+    row, channel = largest(values)
     # Its error is how much it scatters under changes of the directions by a few roundings, which are below real change.
     epsilon = scan.sample.epsilon
     shaken = found[:, row, None] + 4 * epsilon * scan.random.standard_normal((2, 64, 3))
@@ -271,7 +281,7 @@ def _energy(scan: _Scan) -> Finding:
         for row in np.flatnonzero(np.any(albedo + bound > ENERGY_LIMIT, axis=1)):
             found[:, row] = _albedo(scan, lights[row], *_FINE)
         score = albedo + bound
-    row, channel = map(int, np.unravel_index(np.argmax(score), score.shape))
+    row, channel = largest(score)
     value, light = float(albedo[row, channel]), Angles.of(lights[row])
     words = f"the largest albedo is {value:.6g} for light {light}{in_channel(channel, scan.sample.channels)}"
     where, failed = (light, None, channel), f"does not conserve energy: {words}"

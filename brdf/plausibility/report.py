@@ -4,6 +4,8 @@ import dataclasses
 import math
 from typing import Any, Literal
 
+import numpy as np
+
 from brdf import formatters
 from brdf.materials.material_file import material_to_dict
 from brdf.models import Material
@@ -165,6 +167,11 @@ def judged(
     verdict: Verdict = "pass" if margin >= bound else "fail" if -margin > bound else "cannot tell"
     sentence = failed if failed and verdict == "fail" else passed
     return Finding(verdict, value, limit, margin, bound, *where, sentence, crossing)
+
+
+def largest(values: np.ndarray) -> tuple[int, ...]:
+    """Where the largest of some values stands."""
+    return tuple(map(int, np.unravel_index(np.argmax(values), values.shape)))
 
 
 def times(ratio: float) -> str:

@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from brdf.measured.table import Evaluation, MeasuredBRDF, from_angles
-from brdf.plausibility.report import ENERGY_LIMIT, Angles, Finding, Report, judged
+from brdf.plausibility.report import ENERGY_LIMIT, Angles, Finding, Report, judged, largest
 
 # Samples whose angles agree within this many radians are one direction: half a degree.
 CELL = math.radians(0.5)
@@ -76,7 +76,7 @@ def _pairs(samples: MeasuredBRDF, *, exchanged: bool) -> tuple[np.ndarray, np.nd
 
 
 def _positivity(table: MeasuredBRDF, noise: float) -> Finding:
-    row, channel = map(int, np.unravel_index(np.argmin(table.values), table.values.shape))
+    row, channel = largest(-table.values)
     value, bound = float(table.values[row, channel]), 0.0
     light, view = Angles.of(table.to_light[row]), Angles.of(table.to_view[row])
     sentence = f"no value is below 0, the least is {value:.3g}/sr"
@@ -94,14 +94,14 @@ def _reciprocity(samples: MeasuredBRDF, noise: float) -> Finding:
     if not difference.size:
         return _cannot_tell(PASSES, "the table holds no pair of directions both ways round")
     typical = float(np.median(difference))
-    row, channel = map(int, np.unravel_index(np.argmax(difference), difference.shape))
+    row, channel = largest(difference)
     light, view = Angles.of(samples.to_light[first[row]]), Angles.of(samples.to_view[first[row]])
     where = light, view, channel
     if typical < _BY_LAYOUT:
         sentence = "f_r is the same when light and view change places, as the layout of the table has it"
         return judged(0.0, PASSES, 0.0, where, sentence)
-    largest = f"the largest, {100 * difference[row, channel]:.3g} %, for light {light}, view {view}"
-    pairs = f"over {len(difference)} pairs; {largest}"
+    most = f"the largest, {100 * difference[row, channel]:.3g} %, for light {light}, view {view}"
+    pairs = f"over {len(difference)} pairs; {most}"
     said = f"the typical reciprocity error is {{}} {pairs}".format
     if math.isnan(noise):
         word = "fail" if typical > LARGEST_NOISE else "cannot tell"
@@ -123,7 +123,7 @@ def _energy(table: MeasuredBRDF) -> Finding:
     if table.evaluate is None:
         return _cannot_tell(ENERGY_LIMIT, "scattered samples do not say how much light they stand for")
     coarse, fine = (np.stack([_albedo(table.evaluate, polar, fineness) for polar in LIGHTS]) for fineness in (1, 2))
-    row, channel = map(int, np.unravel_index(np.argmax(fine), fine.shape))
+    row, channel = largest(fine)
     value, bound, light = float(fine[row, channel]), 2 * np.abs(fine - coarse)[row, channel], Angles(LIGHTS[row])
     said = f"the largest albedo is {value:.4g} for light {light}, channel {table.channels[channel]}"
     failed = f"does not conserve energy: {said}"
