@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float
 
 from brdf.errors import InputError
 from brdf.images.encoding import Encoding, encode
+from brdf.images.jpeg import Jpeg
 from fitting.likelihood import AnyArray, Bounds
 
 Rounding = float | np.ndarray | Literal["floor"] | None
@@ -51,6 +52,7 @@ class Codes(NamedTuple):
         unit: radiance where the encoding is 1, a number or (C,).
         name: for people.
         lossy: the file was compressed with losses.
+        jpeg: how a JPEG was.
         found: it was not said that there are codes: the values lie on their levels.
     """
 
@@ -63,6 +65,7 @@ class Codes(NamedTuple):
     name: str
     unit: float | np.ndarray = 1.0
     lossy: bool = False
+    jpeg: Jpeg | None = None
     found: bool = False
 
     @property

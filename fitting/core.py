@@ -13,6 +13,7 @@ import brdf
 from brdf.lobes import Near
 from brdf.precision import working_precision
 from brdf.rendering import basis
+from fitting.codec_errors import codec_of, without_codec_errors
 from fitting.doubts import doubts
 from fitting.light_colour import coefficient_factors
 from fitting.maximum_likelihood import highlight_in_codes, most_likely, unexplained
@@ -75,6 +76,7 @@ def fit_pictures(problem: FitProblem) -> FitResult:
             fit, choice = _fit_simplest(seen)
         else:
             fit, choice = most_likely(_fit_model(brdf.MODELS[problem.model], seen), copies=seen.copies), None
+        fit, seen = _less_codec_errors(fit, seen)
         fit = _held_plausible(fit, seen)
         told, optimum = _interpreted(fit, seen, choice), fit.optimum
         hidden = told.hidden_highlight
@@ -263,6 +265,22 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
         optimum = refit(pictures, optimum, choice.free, chosen.n_range, tied)
     chosen = chosen._replace(pictures=pictures, optimum=optimum, free=choice.free, tied=tied)
     return most_likely(chosen, copies=seen.copies), choice
+
+
+def _less_codec_errors(fit: ModelFit, seen: Observed) -> tuple[ModelFit, Observed]:
+    """The same model again, where compression erred in its colours, and the pixels without these errors.
+
+    What a codec takes away its look-alike does not show: which terms there are is decided before.
+    """
+    codecs = [codec_of(target) for target in seen.problem.targets]
+    if fit.evidence is None or not any(codecs):
+        return fit, seen
+    seen = without_codec_errors(seen, _fit_model(fit.model, seen, fit.free), codecs)
+    again = _fit_model(fit.model, seen, fit.free)
+    if fit.tied is not None:
+        optimum = refit(again.pictures, again.optimum, fit.free, again.n_range, fit.tied)
+        again = again._replace(optimum=optimum, tied=fit.tied)
+    return most_likely(again, copies=seen.copies), seen
 
 
 def _likely_sums(fits: Mapping[str, ModelFit]) -> dict[str, NormalEquations]:

@@ -21,6 +21,7 @@ from brdf.errors import InputError
 from brdf.files import AnyPath, input_file, utf8_name
 from brdf.images.damage import check_content, check_header, check_memory
 from brdf.images.encoding import FLOATS, Encoding, EncodingSource, decode, decode_table, find_encoding, parse_encoding
+from brdf.images.jpeg import Jpeg, steps
 
 LOSSY_TOP = 250 / 255
 """Share of the largest code from which on a file compressed with losses is clipped: at quality 75 a clipped area has
@@ -46,6 +47,7 @@ class Picture:
         factor: what the linear values of the file were multiplied by, a number or (C,).
         path: the file; None where it came from none.
         lossy: the file was compressed with losses, so that neighbours share errors.
+        jpeg: how a JPEG was; None for other files.
 
     Example:
         >>> picture = brdf.read_picture("target.exr")
@@ -62,6 +64,7 @@ class Picture:
     factor: float | np.ndarray = 1.0
     path: Path | None = None
     lossy: bool = False
+    jpeg: Jpeg | None = None
 
     def scaled(self, factor: float | np.ndarray) -> "Picture":
         """The picture in another unit: of another exposure, or under light of another intensity.
@@ -140,6 +143,9 @@ class ImageReader:
         self.encoding, self.source = find_encoding(given, self.path, name, spec, self.bits)
         packed = spec.get_string_attribute("compression")
         self.lossy = name in ("jpeg", "webp", "heif") or packed.startswith(("jpeg", "dwa", "b44"))
+        self.jpeg = None
+        if name == "jpeg":
+            self.jpeg = Jpeg(steps(self.path), spec.get_string_attribute("jpeg:subsampling", "4:4:4"))
         self._top = LOSSY_TOP if self.lossy else 1.0
         turn = spec.get_int_attribute("Orientation", 1)
         self._turn = turn if turn in range(2, 9) else 1
@@ -375,7 +381,7 @@ def read_picture(path: AnyPath, *, encoding: Encoding | None = None) -> Picture:
         top, _ = reader.codes
         about = reader.encoding, reader.source, reader.bits, top
         pixels, alpha = reader.read(), reader.read_alpha()
-        return Picture(pixels, alpha, *about, path=reader.path, lossy=reader.lossy)
+        return Picture(pixels, alpha, *about, path=reader.path, lossy=reader.lossy, jpeg=reader.jpeg)
 
 
 def read_mask(path: AnyPath) -> Bool[np.ndarray, "height width"]:

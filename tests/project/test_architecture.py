@@ -25,7 +25,7 @@ brdf.materials brdf.measured brdf.plausibility brdf.display
 fitting.progress fitting.likelihood fitting.codes fitting.solver fitting.functional fitting.model_fit
 fitting.channel_errors fitting.continuation fitting.maximum_likelihood fitting.light_colour fitting.sample_error
 fitting.problem fitting.pixels fitting.selection fitting.budget.choice fitting.result fitting.uncertainty
-fitting.plausible fitting.doubts fitting.core fitting.diagnosis fitting.report fitting.light_choice
+fitting.plausible fitting.doubts fitting.codec_errors fitting.core fitting.diagnosis fitting.report fitting.light_choice
 fitting.joint_problem fitting.joint_likelihood fitting.joint fitting.implicit fitting.relighting fitting.measured_fit
 fitting.photographs fitting.budget fitting.speed_accuracy
 fitting.front_door fitting.many fitting.maps
@@ -36,7 +36,7 @@ fitting.cli
 OPEN_TO_FITTING = set(
     """
 brdf.albedo brdf.channels brdf.checks brdf.conversions brdf.display brdf.errors brdf.files brdf.images.encoding
-    brdf.images.writing brdf.lights.base brdf.lobes
+    brdf.images.jpeg brdf.images.writing brdf.lights.base brdf.lobes
     brdf.materials.exports brdf.materials.material_file brdf.measured.loading brdf.measured.table brdf.models.base
     brdf.plausibility.numeric brdf.plausibility.report brdf.plausibility.stability brdf.precision brdf.rendering
     brdf.scene brdf.vectors

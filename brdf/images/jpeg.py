@@ -1,0 +1,80 @@
+"""With what losses a JPEG was written, and what these do to another picture."""
+
+import bisect
+import functools
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import OpenImageIO as oiio  # noqa: N813
+from jaxtyping import UInt8
+
+from brdf.files import utf8_name
+
+_TABLES, _SCAN = 0xDB, 0xDA
+
+
+class Jpeg(NamedTuple):
+    """How a JPEG was written.
+
+    Attributes:
+        steps: sum of its tables of steps.
+        subsampling: of the colours, "4:4:4" for none.
+    """
+
+    steps: int
+    subsampling: str
+
+    @property
+    def quality(self) -> int:
+        """1 to 100, as libjpeg counts: that with the nearest steps."""
+        return 1 + bisect.bisect_left(range(1, 100), -self.steps, key=lambda quality: -_steps_of(quality))
+
+    def through(self, codes: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
+        """Codes as they come back from such a file.
+
+        Args:
+            codes: that go into it.
+        """
+        with tempfile.TemporaryDirectory() as folder:
+            image = oiio.ImageInput.open(utf8_name(_written(codes, self.quality, self.subsampling, folder)))
+            assert image is not None
+            found = image.read_image("uint8")
+            assert found is not None
+            image.close()
+        return found
+
+
+def _written(codes: np.ndarray, quality: int, subsampling: str, folder: str) -> Path:
+    path = Path(folder, "picture.jpg")
+    spec = oiio.ImageSpec(codes.shape[1], codes.shape[0], codes.shape[2], "uint8")
+    spec.attribute("CompressionQuality", quality)
+    spec.attribute("jpeg:subsampling", subsampling)
+    file = oiio.ImageOutput.create(utf8_name(path))
+    assert file is not None
+    file.open(str(path), spec)
+    file.write_image(np.ascontiguousarray(codes))
+    file.close()
+    return path
+
+
+@functools.cache
+def _steps_of(quality: int) -> int:
+    with tempfile.TemporaryDirectory() as folder:
+        return steps(_written(np.zeros((16, 16, 3), np.uint8), quality, "4:4:4", folder))
+
+
+def steps(path: Path) -> int:
+    """The sum of a file's tables of steps (ITU T.81, B.2.4.1).
+
+    Args:
+        path: of a JPEG.
+    """
+    data, at, total = path.read_bytes(), 2, 0
+    while at + 4 <= len(data) and data[at + 1] != _SCAN:
+        end = at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+        if data[at + 1] == _TABLES:
+            total += sum(data[at + 4 : end])
+        at = end
+    return total

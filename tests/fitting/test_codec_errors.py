@@ -1,0 +1,90 @@
+"""What a JPEG does to colours, against the truth."""
+
+import numpy as np
+import OpenImageIO as oiio  # noqa: N813
+import pytest
+
+import brdf
+import fitting
+from benchmarks.truth import File, ball
+from brdf.images.jpeg import Jpeg, steps
+from fitting import codec_errors, core, pixels
+
+QUALITY = 90
+COLOUR = File(curve="srgb", suffix=".jpg", quality=QUALITY, channels=3)
+
+
+def written(path, codes, quality, subsampling):
+    spec = oiio.ImageSpec(codes.shape[1], codes.shape[0], 3, "uint8")
+    spec["CompressionQuality"], spec["jpeg:subsampling"] = quality, subsampling
+    file = oiio.ImageOutput.create(str(path))
+    assert file is not None
+    file.open(str(path), spec)
+    file.write_image(codes)
+    file.close()
+
+
+@pytest.mark.parametrize("quality", [30, 75, 90, 95, 100])
+@pytest.mark.parametrize("subsampling", ["4:4:4", "4:2:0"])
+def test_a_picture_goes_through_the_codec_of_a_file(tmp_path, quality, subsampling):
+    codes = np.random.default_rng(quality).integers(0, 256, (48, 40, 3), dtype=np.uint8)
+    written(tmp_path / "picture.jpg", codes, quality, subsampling)
+    read = brdf.read_picture(tmp_path / "picture.jpg", encoding="linear")
+    assert read.jpeg is not None
+    assert read.jpeg == Jpeg(steps(tmp_path / "picture.jpg"), subsampling)
+    assert read.jpeg.quality == quality
+    np.testing.assert_array_equal(read.jpeg.through(codes), np.rint(read.pixels * 255))
+
+
+def test_other_files_have_no_such_codec(tmp_path):
+    brdf.write_image(tmp_path / "picture.png", np.full((8, 8, 3), 0.5))
+    assert brdf.read_picture(tmp_path / "picture.png").jpeg is None
+
+
+def errors(folder, seed):
+    one = ball(seed, channels=3)
+    result = fitting.fit(COLOUR.picture(one.drawn(), seed, folder), one.scene(), model=one.model)
+    found = np.stack([result.material.k_a, result.material.k_d, result.material.k_s])
+    return np.abs(found - one.k).mean(axis=1)
+
+
+def test_what_the_codec_takes_from_colours_is_made_good(tmp_path, monkeypatch):
+    good = [errors(tmp_path, seed) for seed in range(6)]
+    monkeypatch.setattr(core, "codec_of", lambda target: None)
+    before = [errors(tmp_path, seed) for seed in range(6)]
+    k_d, k_s = np.exp(np.mean(np.log(good) - np.log(before), axis=0))[1:]
+    assert k_d < 0.9
+    assert k_s < 0.75
+
+
+def test_bands_of_rows_make_no_difference(tmp_path, monkeypatch):
+    one = ball(3, channels=3, size=128)
+    picture = COLOUR.picture(one.drawn(), 3, tmp_path)
+    whole = fitting.fit(picture, one.scene(), model=one.model)
+    monkeypatch.setattr(pixels, "TILE_PIXELS", 128 * pixels.ALIGNED_ROWS)
+    banded = fitting.fit(picture, one.scene(), model=one.model)
+    np.testing.assert_allclose(banded.material.k_d, whole.material.k_d, rtol=1e-5)
+    np.testing.assert_allclose(banded.material.n, whole.material.n, rtol=1e-4)
+
+
+def test_the_noise_of_a_look_alike_is_that_of_the_picture(tmp_path, monkeypatch):
+    seen = []
+    random = codec_errors.np.random.default_rng
+
+    class Counted:
+        def __init__(self, seed):
+            self.random = random(seed)
+
+        def standard_normal(self, *shape):
+            seen.append(1)
+            return self.random.standard_normal(*shape)
+
+    one, noisy = ball(4, channels=3, size=96), File(2.0, curve="srgb", suffix=".jpg", quality=QUALITY, channels=3)
+    pictures = [kept.picture(one.drawn(), 4, tmp_path) for kept in (COLOUR, noisy)]
+    monkeypatch.setattr(codec_errors.np.random, "default_rng", Counted)
+    tried = []
+    for picture in pictures:
+        seen.clear()
+        fitting.fit(picture, one.scene(), model=one.model)
+        tried.append(len(seen) - codec_errors.LOOK_ALIKES)
+    assert tried[0] < tried[1] <= len(codec_errors.NOISES)
