@@ -2,7 +2,7 @@
 
 ``python -m benchmarks.tradeoff [NAME ...]`` prints one line for each scene and accuracy: the error against a reference
 (float64, all pixels, 4096 light samples), the estimate, and the time over that of the cheapest of a grid of plain
-configurations that meets the accuracy, all compiled before and measured in turns.A summary follows.
+configurations that meets the accuracy, all compiled before and measured in turns. A summary follows.
 ``python -m benchmarks.tradeoff unlike`` does the same without the times for a dozen scenes of other kinds.
 """
 
@@ -20,11 +20,11 @@ import fitting
 from fitting.budget.configurations import Configuration, run
 from fitting.budget.sampling import with_samples
 from fitting.problem import state_problem
-from fitting.speed_accuracy import parameter_deviation, reference
+from fitting.speed_accuracy import parameter_deviation
 
 ACCURACIES = (1e-1, 1e-2, 1e-3, 1e-4)
 OPTIONS = {"n_range": (0.1, 1e6), "mask": None, "saturation": None}
-SIZE, SMALL = 512, 48
+SIZE, SMALL = 1200, 48
 # Rounds of timing: the most, the fewest, and the seconds after which no more than the fewest are begun.
 REPEATS, FEWEST_REPEATS, PATIENCE = 40, 3, 12.0
 # What the reference resolves: its steps end there.
@@ -146,12 +146,12 @@ def deviation(result, best):
 
 def study(name, place, picture, model, options=OPTIONS, *, timed=True):
     """All accuracies on one scene."""
-    lights, given = {}, {key: value for key, value in options.items() if value is not None}
+    given = {key: value for key, value in options.items() if value is not None}
     problem = state_problem(picture, place, model=model, **given)
-    best = reference(problem, lights)
+    best = run(problem, Configuration(model, "float64", samples=4096)).result
     jobs, errors, rows = {}, {}, []
     for how in configurations(place, model) if timed else ():
-        jobs[how] = lambda how=how: run(problem, how, lights)
+        jobs[how] = lambda how=how: run(problem, how)
         errors[how] = deviation(jobs[how]().result, best)
     for accuracy in ACCURACIES:
         jobs[accuracy] = lambda e=accuracy: fitting.fit(picture, place, model=model, accuracy=e, **given)

@@ -160,7 +160,7 @@ def number(
 ) -> Any:
     """One number with ``low`` <= x <= ``high`` and ``above`` < x < ``below``."""
     array = _array(name, value, "a number")
-    if array.shape != ():
+    if array.shape != () or isinstance(value, bool):
         raise InputError(name, f"must be one number, got {_shown(value)}", "Give a single number")
     if isinstance(array, np.ndarray):
         limits = [

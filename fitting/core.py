@@ -134,10 +134,8 @@ def _fit_model(
         return _fit_about(
             model, seen, free, pictures, next((p.lobe.near for p in pictures if p.lobe is not None), None)
         )
-    near, told = None, problem.sample_errors or {}
-    if told:
-        near = told.get(model.name, next(iter(told.values()))).near
-    trial = -1
+    error = problem.sample_error(model.name)
+    near, trial = None if error is None else error.near, -1
     while True:
         trial += 1
         pictures = each(partial(_picture, model, near=near), seen.tiles)
@@ -154,7 +152,7 @@ def _fit_model(
         near = nearer(near, fit.optimum.n, problem.n_range, nearest_peak(pictures), last=trial + 2 >= TRIALS)
         if near is None:
             break
-    return _with_profile(fit, told.get(model.name))
+    return _with_profile(fit, error if model.name in (problem.sample_errors or {}) else None)
 
 
 def _is_made_anew(picture: Picture) -> bool:

@@ -91,6 +91,15 @@ class FitProblem:
         """Whether a picture is read by bands of rows."""
         return any(target.streamed for target in self.targets)
 
+    def sample_error(self, model: str) -> SampleError | None:
+        """What the light samples leave out of a model, or of another one; None where nothing is known of it.
+
+        Args:
+            model: its name.
+        """
+        told = self.sample_errors or {}
+        return told.get(model, next(iter(told.values()), None))
+
     @property
     def families(self) -> tuple[str, ...]:
         """Models with a highlight that are compared where none is named."""

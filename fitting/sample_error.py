@@ -37,9 +37,7 @@ class SampleError(NamedTuple):
 
     def shift(self, active: Bool[np.ndarray, " U"]) -> Float[np.ndarray, " U"]:
         """How far off each number is, where some of them are free."""
-        found, some = np.zeros(active.size), np.flatnonzero(active)
-        found[some] = scaled_inverse(self.hessian[np.ix_(some, some)]) @ self.score[some]
-        return found
+        return scaled_inverse(self.hessian * np.outer(active, active)) @ self.score
 
 
 def near_exponent(n: float, reach: float, peak: float) -> Near:

@@ -8,8 +8,8 @@ Fewer pixels are a stratified subsample, not a level of the picture's pyramid: a
 the fit takes for a smaller exponent.
 
 Each configuration runs once with cold caches, once warm, and then in rounds, every round in another order (fixed seed),
-so that a machine that grows slower or quicker favours none. The compiler's time is taken out of every run. What takes
-long runs twice, what compiles anew each time once.
+so that a machine that grows slower or quicker favours none. The compiler's time is taken out of every run. What
+compiles anew each time runs once.
 """
 
 import contextlib
@@ -21,39 +21,33 @@ import json
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import jax.monitoring
 import numpy as np
 
 import brdf
+from brdf.checks import positive
 from brdf.files import atomic_folder, write_text
 from brdf.models.base import SpecularMaterial
-from brdf.precision import Precision
-from fitting.budget.configurations import MOST_SAMPLES, Configuration, run, sample_counts, some_of
+from fitting.budget.configurations import Configuration, run
 from fitting.budget.error_estimate import SMALLEST
-from fitting.budget.escalation import WHOLE, check_above_zero, near
-from fitting.budget.sampling import MadeLights, sample_pixels, with_samples
+from fitting.budget.escalation import WHOLE
+from fitting.budget.light_samples import with_enough_samples
+from fitting.budget.sampling import sample_counts, sample_pixels
+from fitting.core import fit_pictures
 from fitting.problem import FitProblem, state_problem
 from fitting.progress import waiting
 from fitting.result import FitResult
 from fitting.uncertainty.covariance import TERMS
 
 PIXELS, SAMPLES = (1024, 8192, 65536, 524288), (4, 16, 64, 256, 1024)
-# Of the reference under lights with an extent, of pictures that are compared there, of solvers that keep a Jacobian.
+# Of pictures that are compared, and of solvers that keep a Jacobian.
 FEW_PIXELS = 1024
-# Light samples of the fit of all pixels that the reference starts from.
-START_SAMPLES = 64
-# Where the general solvers start, which they are, and the relative changes at which they stop.
+# Where the general solvers start, which they are, the relative changes at which they stop, and how slow they may be.
 START = 30.0
-SOLVERS = ("lm", 1e-8), ("bfgs", 1e-8)
-MOST_ROUNDS = 5
-# As wide as the printed table may be, and as the command prints it into a pipe.
-WIDTH = 100
-# What takes longer than this is run twice.
-LONG = 1.0
-# Axes that are told for comparison: their fits leave something out of the picture.
-BESIDE = ("model", "render")
+SOLVERS, SLOWER = (("lm", 1e-8), ("bfgs", 1e-8)), 100
+ROUNDS = 6
 # Among fits whose times are within this factor the least work is recommended, which is the same on every machine.
 CLEARLY = 2.0
 # The numbers of the printed table, and what its reader is told of them and of the marks.
@@ -63,38 +57,74 @@ COLUMNS = {
     "picture": "error of the picture that the fit draws, root mean square, relative",
     "parameters": "largest relative error of n and of the coefficients; inf: of another model",
 }
-MARKS = "front: no fit is both quicker and closer; recommended: a quick one of these that keeps {accuracy:g}"
+# Of a row, in files.
+TOLD: tuple[str, ...] = (
+    "axis",
+    "name",
+    "compile_seconds",
+    "seconds",
+    "spread",
+    "runs",
+    "rms",
+    "parameters",
+    "error",
+    "work",
+)
+MARKS = "front: no fit is both quicker and closer; recommended: a quick one of these that keeps {:g}"
 
 
-@dataclasses.dataclass(frozen=True)
+class Taken(NamedTuple):
+    """Seconds that a run took without the compiler, and those of the compiler."""
+
+    seconds: float
+    compiling: float
+
+
+@dataclasses.dataclass(eq=False)
 class Row:
     """One configuration, measured.
 
     Attributes:
         axis: what it was tried for: "default", "pixels", "samples", ...
-        configuration: in which the fit ran; None for a row of the renderer.
-        name: the configuration in words.
-        compile_seconds: of tracing and compiling in the first run.
-        seconds: median of the runs after the first, or the only one, without the compiler.
-        spread: half the distance of their quartiles.
-        runs: how many they were.
+        configuration: in which the fit ran.
+        work: about what the time grows with.
+        taken: by the runs so far.
         rms: error of the picture, root mean square over that of the reference's picture.
-        worst: its largest error, in the same unit.
         parameters: error of the parameters, see `parameter_deviation`.
-        work: pixels times light samples, twice for float64: what the time grows with.
     """
 
     axis: str
-    configuration: Configuration | None
-    name: str
-    compile_seconds: float
-    seconds: float
-    spread: float
-    runs: int
-    rms: float
-    worst: float
-    parameters: float
+    configuration: Configuration
     work: float
+    taken: list[Taken] = dataclasses.field(default_factory=list)
+    rms: float = np.inf
+    parameters: float = np.inf
+
+    @property
+    def name(self) -> str:
+        """The configuration in words."""
+        return str(self.configuration)
+
+    @property
+    def compile_seconds(self) -> float:
+        """Of tracing and compiling in the first run."""
+        return self.taken[0].compiling
+
+    @property
+    def runs(self) -> int:
+        """How many runs tell the time: those after the first, whose caches were cold, or the only one."""
+        return max(len(self.taken) - 1, 1)
+
+    @property
+    def seconds(self) -> float:
+        """Their median, without the compiler."""
+        return float(np.median([one.seconds for one in self.taken[-self.runs :]]))
+
+    @property
+    def spread(self) -> float:
+        """Half the distance of their quartiles."""
+        low, high = np.quantile([one.seconds for one in self.taken[-self.runs :]], [0.25, 0.75])
+        return float(high - low) / 2
 
     @property
     def error(self) -> float:
@@ -139,9 +169,10 @@ class Tradeoff:
     @property
     def front(self) -> tuple[Row, ...]:
         """The fits than which none is both quicker and closer, quickest first."""
-        fits = [row for row in self.rows if row.configuration is not None and np.isfinite(row.error)]
         found: list[Row] = []
-        for row in sorted(fits, key=lambda row: (row.seconds, row.error)):
+        for row in sorted(
+            filter(lambda row: np.isfinite(row.error), self.rows), key=lambda row: (row.seconds, row.error)
+        ):
             if not found or row.error < found[-1].error:
                 found.append(row)
         return tuple(found)
@@ -165,15 +196,11 @@ class Tradeoff:
     def advice(self) -> str:
         """What to use, in words; where nothing keeps the accuracy that is said, and what comes closest."""
         best, closest = self.recommended, self.closest
+        words = f"nothing is recommended: no configuration that was measured keeps the accuracy of {self.accuracy:g}"
         if best is not None:
-            words = f"recommended: {best.name} ({_milliseconds(best.seconds)} ms, error {best.error:.1g})"
+            words = f"recommended: {_result(best)}"
         elif closest is not None:
-            words = (
-                f"nothing is recommended: no configuration that was measured keeps the accuracy of {self.accuracy:g}; "
-                f"the most accurate is {closest.name} ({_milliseconds(closest.seconds)} ms, error {closest.error:.1g})"
-            )
-        else:
-            words = "nothing is recommended: no fit was measured"
+            words += f"; the most accurate is {_result(closest)}"
         if self.complete:
             return words
         measured = f"{len(self.rows)} of {self.planned} configurations were measured"
@@ -187,8 +214,8 @@ class Tradeoff:
         """
         best = self.recommended
         marked = {"default": self.default, "recommended": best, "most accurate": None if best else self.closest}
-        marked["front"] = row if row in self.front else None
-        return ", ".join(word for word, one in marked.items() if one is row)
+        words = [word for word, one in marked.items() if one is row]
+        return ", ".join([*words, "front"] if row in self.front and row is not best else words)
 
     def brief(self, row: Row) -> str:
         """The pixels of a configuration, and in what else it differs from the default.
@@ -199,50 +226,39 @@ class Tradeoff:
         usual = [] if self.default is None else self.default.name.split(", ")
         return ", ".join(word for word in row.name.split(", ") if word not in usual or word.endswith("pixels"))
 
-    def table(self) -> Any:
-        """A table for `rich.print`; the rest that a row holds is in `to_csv`."""
-        from rich.box import SIMPLE_HEAD
-        from rich.table import Column, Table
-
-        told = [*(f"{name}: {words}" for name, words in COLUMNS.items()), MARKS.format(accuracy=self.accuracy)]
-        caption = "\n".join([*told, f"errors are against {self.reference}"])
-        head = Column("configuration", overflow="fold"), *(Column(name, justify="right") for name in COLUMNS), ""
-        table = Table(
-            *head, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False, caption=caption, caption_justify="left"
-        )
+    def __str__(self) -> str:
+        """The table as text, its numbers and marks explained beneath."""
+        lines = [("configuration", *COLUMNS, "")]
         for row in self.rows:
             name = row.name if row is self.default else self.brief(row)
             times = [row.seconds, row.spread] if row.runs > 1 else [row.seconds]
-            run = " ± ".join(map(_milliseconds, times))
-            numbers = f"{row.compile_seconds:.2f}", run, f"{row.rms:.1e}", f"{row.parameters:.1e}"
-            style = "bold green" if row is self.recommended else "bold" if row is self.default else None
-            table.add_row(name, *numbers, self.marks(row).replace("recommended, front", "recommended"), style=style)
-        return table
+            numbers = f"{row.compile_seconds:.2f}", " ± ".join(map(_milliseconds, times))
+            lines.append((name, *numbers, f"{row.rms:.1e}", f"{row.parameters:.1e}", self.marks(row)))
+        first, *widths, _ = (max(map(len, column)) for column in zip(*lines, strict=True))
+        text = []
+        for name, *numbers, marks in lines:
+            cells = [f"{number:>{width}}" for number, width in zip(numbers, widths, strict=True)]
+            text.append("  ".join([f"{name:<{first}}", *cells, marks]).rstrip())
+        text.insert(1, "─" * max(map(len, text)))
+        told = [f"{name}: {words}" for name, words in COLUMNS.items()]
+        return "\n".join([*text, *told, MARKS.format(self.accuracy), f"errors are against {self.reference}"])
 
-    def __str__(self) -> str:
-        """The table as text."""
-        from rich.console import Console
-
-        stream = io.StringIO()
-        Console(file=stream, width=WIDTH, color_system=None, force_jupyter=False).print(self.table())
-        return stream.getvalue().rstrip()
+    def _told(self, row: Row) -> dict[str, Any]:
+        return {name: getattr(row, name) for name in TOLD} | {"marks": self.marks(row)}
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON holds it; what is infinite is None."""
-        rows = [dataclasses.asdict(row) | {"error": row.error, "marks": self.marks(row)} for row in self.rows]
-        for row in rows:
-            row |= {name: None for name, value in row.items() if value == np.inf}
         names = ("reference", "accuracy", "complete", "planned", "seconds", "advice")
-        return {name: getattr(self, name) for name in names} | {"rows": rows}
+        rows = [self._told(row) | {"configuration": vars(row.configuration)} for row in self.rows]
+        finite = [{name: None if value == np.inf else value for name, value in row.items()} for row in rows]
+        return {name: getattr(self, name) for name in names} | {"rows": finite}
 
     def to_csv(self) -> str:
         """One line for each row, a header above."""
-        rows = [vars(row) | {"marks": self.marks(row)} for row in self.rows]
-        names = [name for name in (*Row.__dataclass_fields__, "marks") if name != "configuration"]
         stream = io.StringIO()
-        writer = csv.DictWriter(stream, names, extrasaction="ignore", lineterminator="\n")
+        writer = csv.DictWriter(stream, (*TOLD, "marks"), lineterminator="\n")
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows(map(self._told, self.rows))
         return stream.getvalue()
 
     def plot(self) -> Any:
@@ -272,6 +288,10 @@ def _milliseconds(seconds: float) -> str:
     return f"{1e3 * seconds:.{0 if seconds >= 0.1 else 1}f}"
 
 
+def _result(row: Row) -> str:
+    return f"{row.name} ({_milliseconds(row.seconds)} ms, error {row.error:.1g})"
+
+
 def tradeoff(
     target: Any,
     scene: brdf.Scene,
@@ -281,7 +301,6 @@ def tradeoff(
     saturation: float | None = None,
     accuracy: float = 1e-3,
     seconds: float = 15.0,
-    render: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Tradeoff:
     """Measure what the choices that a scene offers cost, and what error they make.
@@ -294,7 +313,6 @@ def tradeoff(
         saturation: see `fitting.fit`.
         accuracy: relative error that the recommendation is to keep.
         seconds: that the measuring may take: no new run begins after them. A running one is waited for.
-        render: also measure the renderer alone.
         progress: called with the number of runs done and that of all.
 
     Returns:
@@ -310,102 +328,34 @@ def tradeoff(
         'float64, all pixels'
     """
     begun = time.perf_counter()
-    check_above_zero(accuracy=accuracy, seconds=seconds)
-    bench = Bench(state_problem(target, scene, mask, model=model, saturation=saturation))
-    trials = bench.trials(render=render)
+    positive("accuracy", accuracy)
+    positive("seconds", seconds)
+    bench = Bench(state_problem(target, scene, mask, model=model, saturation=saturation), accuracy)
+    rows = bench.rows()
     # Everything once, so that the errors, which decide what is recommended, are known however slow the compiler is:
     # the default, twice, for its first run tells little; what can be recommended, from little to much work, so that
     # what would take too long is known before; last what compiles anew each time. Then rounds, each shuffled.
-    ranks = {"default": 0, "solver": 3} | dict.fromkeys(BESIDE, 2)
-    by_work = sorted(trials, key=lambda trial: (ranks.get(trial.axis, 1), trial.work))
-    random = np.random.default_rng(0)
-    order = [
-        by_work[0],
-        *by_work,
-        *(by_work[i] for _ in range(MOST_ROUNDS + 1) for i in random.permutation(len(by_work))),
-    ]
-    known: list[Trial] = []
+    ranks, random = {"default": 0, "model": 2, "solver": 3}, np.random.default_rng(0)
+    by_work = sorted(rows, key=lambda row: (ranks.get(row.axis, 1), row.work))
+    again = [row for row in by_work if row.axis != "solver"]
+    order = [by_work[0], *by_work, *(again[i] for _ in range(ROUNDS) for i in random.permutation(len(again)))]
     with contextlib.suppress(KeyboardInterrupt), waiting("measuring") as say:
-        for done, trial in enumerate(order, start=1):
-            once = trial.axis == "solver"
-            left = seconds - (time.perf_counter() - begun)
-            long = LONG if len(trial.taken) > 1 else np.inf
-            if trial.taken and (once or trial.taken[-1].seconds > min(long, left)):
+        for done, row in enumerate(order, start=1):
+            known, expected = [one for one in rows if one.taken], 0.0
+            if row.taken:
+                expected = row.taken[-1].seconds
+            elif known:
+                # By the fit of the most work so far, and by the compiler.
+                most = max(known, key=lambda one: one.work)
+                expected = most.taken[-1].seconds * row.work / most.work + max(one.compile_seconds for one in known)
+            if time.perf_counter() - begun + expected > seconds and known:
                 continue
-            expected = 0.0
-            if known and trial.axis != "render":
-                # What a fit may take is told by the one of the most work so far, and of a first by the compiler too.
-                most = max(known, key=lambda trial: trial.work)
-                compiler = 0.0 if trial.taken else max(trial.taken[0].compiling for trial in known)
-                expected = most.taken[-1].seconds * trial.work / most.work + compiler
-            if left < expected:
-                continue
-            outcome, one = take(functools.partial(bench.run, trial))
-            if not trial.taken:
-                trial.outcome = outcome
-                known.append(trial)
-            trial.taken.append(one)
+            bench.measure(row)
             say(f"measuring, {done} of {len(order)} runs")
             if progress is not None:
                 progress(done, len(order))
-    rows = [bench.row(trial) for trial in trials if trial.taken]
-    return Tradeoff(tuple(rows), bench.reference, accuracy, len(trials), time.perf_counter() - begun)
-
-
-class Taken(NamedTuple):
-    """Seconds that a run took without the compiler, and those of the compiler."""
-
-    seconds: float
-    compiling: float
-
-
-@dataclasses.dataclass(eq=False)
-class Trial:
-    """A configuration to be measured.
-
-    Attributes:
-        axis: what it is tried for.
-        how: the configuration.
-        work: what the time grows with, and what every fit takes whatever its size.
-        taken: by the runs so far.
-        outcome: of the first: a material, or a picture.
-    """
-
-    axis: str
-    how: Configuration
-    work: float
-    taken: list[Taken] = dataclasses.field(default_factory=list)
-    outcome: Any = None
-
-
-def reference(problem: FitProblem, lights: MadeLights, pixels: int | None = None) -> FitResult:
-    """Fit as well as can be: in float64, all pixels, as many light samples as can be paid for.
-
-    Under lights with an extent all pixels are fitted with a few samples, and what `MOST_SAMPLES` change is taken from
-    some of the pixels. Both fits of these see the same noise, which is not in their difference.
-
-    Args:
-        problem: one picture.
-        lights: made so far.
-        pixels: how many under many light samples; None for all.
-    """
-    if not any(sample_counts(problem.scenes)):
-        return run(problem, Configuration(problem.model, "float64"), lights).result
-    few = Configuration(problem.model, "float32", None, START_SAMPLES)
-    whole = run(problem, few, lights).result
-    about, kind = near(whole, 0.0, problem.n_range), type(whole.material)
-    few = dataclasses.replace(few, model=kind.name, pixels=pixels)
-    fine = run(problem, dataclasses.replace(few, samples=MOST_SAMPLES), lights, about).result
-    if pixels is None:
-        return fine
-    coarse = run(problem, few, lights, about).result
-    values = {}
-    for name in {parameter.name for parameter in whole.parameters}:
-        value, before, after = (np.asarray(getattr(one.material, name)) for one in (whole, coarse, fine))
-        changed = value * after / np.where(before > 0, before, 1.0) if name == "n" else value + after - before
-        # What is not determined is 0 in the material.
-        values[name] = np.where((value > 0) & (before > 0), np.maximum(changed, 0.0), value)
-    return dataclasses.replace(whole, material=kind(**values))
+    measured = tuple(row for row in rows if row.taken)
+    return Tradeoff(measured, bench.reference, accuracy, len(rows), time.perf_counter() - begun)
 
 
 def parameter_deviation(material: brdf.Material, best: FitResult) -> float:
@@ -415,58 +365,49 @@ def parameter_deviation(material: brdf.Material, best: FitResult) -> float:
     largest coefficient, if that is more); of n: the difference of its logarithms; infinite where the models differ in
     their highlight. What the reference does not determine is left out.
     """
-    names = [name for name in TERMS if hasattr(best.material, name)]
-    largest = {name: float(np.max(getattr(best.material, name))) for name in names}
+    largest = {name: float(np.max(getattr(best.material, name, 0.0))) for name in TERMS}
     least = max(SMALLEST * max(largest.values()), np.finfo(float).tiny)
     worst = 0.0
-    for parameter in best.parameters:
-        name = parameter.name
-        if parameter.value is None or (name == "n" and not largest["k_s"]):
+    for one in best.parameters:
+        if one.value is None:
             continue
-        value, true = np.asarray(getattr(material, name, 0.0)), np.asarray(getattr(best.material, name))
-        if name == "n":
-            comparable = type(material) is type(best.material) and value > 0
-            worst = max(worst, abs(float(np.log(value / true))) if comparable else np.inf)
+        value = np.asarray(getattr(material, one.name, np.zeros(best.material.k_d.shape)))
+        if one.name != "n":
+            off = abs(float(value[one.channel]) - one.value) / max(largest[one.name], least)
+        elif type(material) is type(best.material):
+            off = abs(float(np.log(value / one.value)))
         else:
-            off = np.abs(value - true)[parameter.channel]
-            worst = max(worst, float(off) / max(largest[name], least))
+            off = np.inf
+        worst = max(worst, off)
     return worst
 
 
 class Bench:
     """The configurations that a scene offers, and the measure of their errors."""
 
-    def __init__(self, problem: FitProblem):
-        """Fit the reference."""
-        self.problem, self.scene = problem, problem.scenes[0]
-        self.lights: MadeLights = {}
-        scene, self.pixels = self.scene, int(np.prod(self.scene.resolution))
-        self.samples = max(filter(None, sample_counts([scene])), default=0)
-        self.reference, pixels = "float64, all pixels", None
-        # Where pictures are compared: the whole one, or some pixels under many light samples; and their weights.
-        self.compared, self.weight = with_samples(scene, MOST_SAMPLES, self.lights), 1.0
-        if self.samples:
-            self.reference = f"{MOST_SAMPLES} light samples, all pixels"
-            if self.pixels > 2 * FEW_PIXELS:
-                pixels = FEW_PIXELS
-                self.reference += f" (what so many samples change, told by about {2 * pixels} of the pixels)"
-            if sample := sample_pixels(self.compared, brdf.BlinnPhong, FEW_PIXELS):
-                self.compared = brdf.some_pixels(self.compared, sample.pixel, precision="float64")
-                self.weight = sample.stands_for[None, :, None]
-        self.best = reference(problem, self.lights, pixels)
+    def __init__(self, problem: FitProblem, accuracy: float):
+        """Fit the reference: in float64, all pixels, so many light samples that they err far less than is allowed."""
+        dear = with_enough_samples(dataclasses.replace(problem, precision="float64"), accuracy / 2)
+        self.problem, self.scene, self.best = problem, problem.scenes[0], fit_pictures(dear)
         self.model = self.best.material.name if problem.model == "auto" else problem.model
+        self.reference, self.samples = "float64, all pixels", max(sample_counts(dear.scenes[0]), default=1)
+        if self.samples > 1:
+            self.reference += f", {self.samples} light samples"
+        # Pictures are compared at some pixels, by their weights.
+        compared, weight = dear.scenes[0], 1.0
+        if sample := sample_pixels(compared, brdf.BlinnPhong, FEW_PIXELS):
+            compared, weight = brdf.some_pixels(compared, sample.pixel, precision="float64"), sample.stands_for[:, None]
+        self.picture, self.weight = functools.partial(brdf.render, scene=compared, precision="float64"), weight
 
-    def trials(self, *, render: bool = False) -> list[Trial]:
+    def rows(self) -> list[Row]:
         """What there is to try, and what for, the most telling first."""
-        default, samples = Configuration(self.model), self.samples
+        default, found = Configuration(self.model), list[tuple[str, Configuration]]()
         change = functools.partial(dataclasses.replace, default)
-        sizes = [size for size in PIXELS if size <= WHOLE * self.pixels]
+        sizes = [size for size in PIXELS if size <= WHOLE * np.prod(self.scene.resolution)]
         few = (sizes or [None])[:2][-1]
-        found = [("default", default), *(("pixels", change(pixels=size)) for size in sizes)]
-        # Many samples are tried on few pixels: what they change does not hang on how many.
-        steps = [count for count in SAMPLES if count <= 4 * samples and count != samples]
-        found += [("samples", change(pixels=few, samples=count)) for count in steps]
-        found += [("samples", change(samples=16))] if samples > 16 else []
+        found += [("default", default), *(("pixels", change(pixels=size)) for size in sizes)]
+        # On few pixels: what samples change does not hang on how many these are.
+        found += [("samples", change(pixels=few, samples=count)) for count in SAMPLES if count < self.samples]
         found += [("precision", change(precision="float64"))]
         if self.problem.targets[0].codes is not None:
             found += [("rounding", change(least_squares=True))]
@@ -474,34 +415,35 @@ class Bench:
         if isinstance(self.best.material, SpecularMaterial):
             solver = functools.partial(change, precision="float64", pixels=FEW_PIXELS)
             found += [("solver", solver(solver=name, tolerance=tolerance)) for name, tolerance in SOLVERS]
-        if render:
-            counts = [None, *(count for count in steps if count < min(samples, 1024))]
-            found += [("render", change(precision=p, samples=n)) for p in get_args(Precision) for n in counts]
-        return [Trial(axis, how, self._work(axis, how)) for axis, how in dict.fromkeys(found)]
+        return [
+            Row(axis, how, (4096 + how.work(self.scene)) * (SLOWER if axis == "solver" else 1)) for axis, how in found
+        ]
 
-    def _work(self, axis: str, how: Configuration) -> float:
-        return (4096 + how.work(self.pixels, [self.scene])) * (100 if axis == "solver" else 1)
+    def measure(self, row: Row) -> None:
+        """Run a configuration once more; of the first run also the error is told."""
+        first = not row.taken
+        material, took = take(functools.partial(self.solve if row.axis == "solver" else self.fit, row.configuration))
+        row.taken.append(took)
+        if first:
+            true = np.asarray(self.picture(self.best.material))
+            change = np.asarray(self.picture(material)) - true
+            row.rms = float(np.sqrt(np.mean(self.weight * change**2) / np.mean(self.weight * true**2)))
+            row.parameters = parameter_deviation(material, self.best)
 
-    def run(self, trial: Trial) -> Any:
-        """What a trial gives: a material, or a picture."""
-        how = trial.how
-        if trial.axis == "solver":
-            return self.solve(how)
-        if trial.axis == "render":
-            scene = with_samples(self.scene, how.samples, self.lights)
-            return np.asarray(brdf.render(self.best.material, scene, precision=how.precision))
-        return run(self.problem, how, self.lights).result.material
+    def fit(self, how: Configuration) -> brdf.Material:
+        """By the separable solver, with as many light samples as a plain fit takes where no number is named."""
+        problem = dataclasses.replace(self.problem, model=how.model)
+        return run(with_enough_samples(problem) if how.samples is None else problem, how).result.material
 
     def solve(self, how: Configuration) -> brdf.Material:
-        """Levenberg-Marquardt or BFGS on a few pixels, from a guess."""
+        """By Levenberg-Marquardt or BFGS on a few pixels, from a guess."""
         from fitting.joint import fit_jointly
 
-        # Evenly spread: these solvers know no weights.
-        sample = sample_pixels(self.scene, brdf.Lambert, FEW_PIXELS)
         # They leave out what the reference left out, such as pixels whose noise is cut off.
         target, scene, mask = self.problem.targets[0].pixels, self.scene, self.best.counted[0]
-        if sample:
-            target, mask = some_of(target, sample), some_of(mask, sample)
+        # Evenly spread: these solvers know no weights.
+        if sample := sample_pixels(scene, brdf.Lambert, FEW_PIXELS):
+            target, mask = sample.of(target), sample.of(mask)
             scene = brdf.some_pixels(scene, sample.pixel, precision="float64")
         half = np.full(self.best.material.k_d.shape, 0.5)
         start = brdf.MODELS[self.model](k_a=half, k_d=half, k_s=half, n=START)  # pyright: ignore[reportCallIssue]
@@ -516,35 +458,6 @@ class Bench:
             mask=mask,
             saturation=self.problem.saturation,
         ).material
-
-    def row(self, trial: Trial) -> Row:
-        """What was measured: of several runs the first is left out, for caches were cold."""
-        how, taken, outcome, render = trial.how, trial.taken, trial.outcome, trial.axis == "render"
-        # Rendered whole, under at most the scene's own samples.
-        scene, weight = (self.scene, 1.0) if render else (self.compared, self.weight)
-        picture = functools.partial(brdf.render, scene=scene, precision="float64")
-        name, parameters = str(how), 0.0
-        if render:
-            name = ", ".join(["render", how.precision, *([f"{how.samples} light samples"] if how.samples else [])])
-        else:
-            parameters, outcome = parameter_deviation(outcome, self.best), np.asarray(picture(outcome))
-        true = np.asarray(picture(self.best.material))
-        change, scale = outcome - true, float(np.sqrt(np.mean(weight * true**2)))
-        later = [one.seconds for one in taken[1:] or taken]
-        low, median, high = np.quantile(later, [0.25, 0.5, 0.75])
-        return Row(
-            axis=trial.axis,
-            configuration=None if render else how,
-            name=name,
-            compile_seconds=taken[0].compiling,
-            seconds=float(median),
-            spread=float(high - low) / 2,
-            runs=len(later),
-            rms=float(np.sqrt(np.mean(weight * change**2))) / scale,
-            worst=float(np.max(np.abs(change))) / scale,
-            parameters=parameters,
-            work=trial.work,
-        )
 
 
 def take(run: Callable[[], Any]) -> tuple[Any, Taken]:

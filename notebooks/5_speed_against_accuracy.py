@@ -31,7 +31,7 @@ import fitting
 # %matplotlib inline
 
 # %%
-size = 512
+size = 1200
 camera = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=(size, size))
 material = brdf.BlinnPhong(k_d=[0.5, 0.4, 0.3], k_s=[0.4, 0.4, 0.4], n=40.0)
 
@@ -49,8 +49,8 @@ target = target + np.random.default_rng(0).normal(0, 0.01, target.shape)
 # ## Say how accurate, and no more is computed
 #
 # `accuracy` is the relative error of the fitted numbers that is good enough, over and above that of using all pixels. The
-# fit looks at a few pixels, estimates what the others would change, and takes more until the estimate holds. It says what
-# it chose.
+# fit looks at a few pixels, estimates what the others would change, and takes more until the estimate holds; up to a
+# megapixel it looks at all of them at once. It says what it chose.
 
 # %%
 full = fitting.fit(target, lamp, model="blinn-phong", precision="float64")

@@ -9,22 +9,22 @@ class Attempt:
     """One configuration that was tried.
 
     Attributes:
-        configuration: in words.
-        error: its estimated error, the median.
+        error: its estimated error, relative, the median; see `fitting.speed_accuracy.parameter_deviation`.
         bound: what the error does not exceed in 95 % of cases, by the estimate.
         pixels: the part of the pixels left out, of that bound.
         light: the part of the light samples left out.
         rounding: the part of rounding.
+        configuration: in words.
         seconds: that fit and estimate took.
     """
 
-    configuration: str
     error: float
     bound: float
     pixels: float
     light: float
     rounding: float
-    seconds: float
+    configuration: str = ""
+    seconds: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class BudgetChoice:
         if self.pixels < self.of_pixels:
             parts.append(f"pixels left out {chosen.pixels:.1g} (information matrix)")
         if chosen.light:
-            parts.append(f"light samples left out {chosen.light:.1g} (by four times as many)")
+            parts.append(f"light samples left out {chosen.light:.1g} (by more of them)")
         return ", ".join([*parts, f"rounding {chosen.rounding:.1g}"])
 
     def lines(self) -> list[str]:

@@ -4,21 +4,19 @@ A configuration only says what differs; running it is `fitting.core.fit_pictures
 """
 
 import dataclasses
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 import brdf
 from brdf.errors import InputError
 from brdf.precision import Precision
-from fitting.budget.sampling import MadeLights, PixelSample, sample_pixels, with_samples
+from fitting.budget.sampling import PixelSample, sample_counts, sample_pixels, with_samples
 from fitting.core import fit_pictures
 from fitting.pixels import SYMMETRIC_PIXELS
 from fitting.problem import TOP, FitProblem
 from fitting.result import FitResult
-
-MOST_SAMPLES = 4096
+from fitting.solver.profile import Optimum
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,7 +27,7 @@ class Configuration:
         model: "auto" or the name of a model.
         precision: "float32" or "float64".
         pixels: about how many of each picture are fitted; None for all.
-        samples: of each light with an extent; None for those of the scene.
+        samples: of each light with an extent; None for as many as the problem says.
         solver: "separable", "lm" or "bfgs".
         tolerance: of the latter two, relative.
         least_squares: also where the picture holds codes, whose likelihood is the default.
@@ -51,77 +49,68 @@ class Configuration:
         words += [] if self.solver == "separable" else [f"{self.solver} to {self.tolerance:g}"]
         return ", ".join(words)
 
-    def work(self, pixels: int, scenes: Sequence[brdf.Scene]) -> float:
-        """Pixels times light samples, twice for float64, of several pictures of so many pixels."""
-        counts = [(self.samples or count) if count else 1 for count in sample_counts(scenes)]
-        pixels = min(self.pixels or pixels, pixels)
-        return float(pixels * max(sum(counts), 1) * (2 if self.precision == "float64" else 1))
-
-
-def sample_counts(scenes: Sequence[brdf.Scene]) -> list[int | None]:
-    """Of each light the number of samples; None of one without an extent."""
-    return [getattr(light, "samples", None) for scene in scenes for light in scene.lights]
+    def work(self, scene: brdf.Scene) -> float:
+        """Of a picture pixels times light samples, twice for float64: what the time grows with."""
+        pixels = min(self.pixels or np.inf, np.prod(scene.resolution))
+        samples = [self.samples or count if count > 1 else 1 for count in sample_counts(scene)]
+        return float(pixels * max(sum(samples), 1) * (2 if self.precision == "float64" else 1))
 
 
 class Run(NamedTuple):
     """What a configuration gave.
 
     Attributes:
-        configuration: that ran: of all pixels where so few as were asked for would not do.
         problem: as the configuration made it, of whole pictures.
         samples: the pixels of each that were fitted; None for all.
         result: of the fit, for the user's own scenes.
     """
 
-    configuration: Configuration
     problem: FitProblem
     samples: list[PixelSample | None]
     result: FitResult
 
+    @property
+    def optimum(self) -> Optimum:
+        """Of the solver."""
+        assert self.result.optimum is not None
+        return self.result.optimum
 
-def run(
-    problem: FitProblem,
-    configuration: Configuration,
-    lights: MadeLights,
-    n_range: tuple[float, float] | None = None,
-) -> Run:
-    """Run a fit in a configuration of the separable solver.
+
+def run(problem: FitProblem, configuration: Configuration) -> Run:
+    """Run a fit in a configuration of the separable solver; of all pixels where so few as asked for would not do.
 
     Args:
         problem: pictures in memory.
         configuration: how.
-        lights: made so far.
-        n_range: bounds of the exponent, instead of those of the problem.
     """
-    model, precision, pixels = configuration.model, configuration.precision, configuration.pixels
-    scenes = [with_samples(scene, configuration.samples, lights) for scene in problem.scenes]
-    n_range = n_range or problem.n_range
-    made = dataclasses.replace(problem, scenes=scenes, model=model, precision=precision, n_range=n_range)
-    if configuration.least_squares:
-        plain = [target._replace(codes=None, least_squares=True) for target in problem.targets]
-        made = dataclasses.replace(made, targets=plain)
-    samples: list[PixelSample | None] = [None] * len(scenes)
-    if pixels is not None:
-        kind = brdf.BlinnPhong if model == "auto" else brdf.MODELS[model]
+    how, shown = configuration, problem.shown or problem.scenes
+    if how.samples is not None:
+        scenes = [with_samples(scene, how.samples) for scene in problem.scenes]
+        problem = dataclasses.replace(problem, scenes=scenes, shown=shown, sample_errors=None)
+    if how.least_squares:
+        targets = [target._replace(codes=None, least_squares=True) for target in problem.targets]
+        problem = dataclasses.replace(problem, targets=targets)
+    problem = dataclasses.replace(problem, model=how.model, precision=how.precision)
+    samples: list[PixelSample | None] = [None] * len(shown)
+    if how.pixels is not None:
+        kind = brdf.BlinnPhong if how.model == "auto" else brdf.MODELS[how.model]
         shares = [1.0 if mask is None else max(float(np.mean(mask)), 1e-9) for mask in problem.masks]
-        some = zip(scenes, shares, strict=True)
-        samples = [sample_pixels(scene, kind, round(pixels / share)) for scene, share in some]
-    whole = dataclasses.replace(configuration, pixels=None)
+        pictures = zip(problem.scenes, shares, strict=True)
+        samples = [sample_pixels(scene, kind, how.pixels / share) for scene, share in pictures]
     try:
-        result = fit_pictures(_subsampled(made, samples) if any(samples) else made)
+        result = fit_pictures(_subsampled(problem, samples) if any(samples) else problem)
     except InputError:
         if not any(samples):
             raise
         # Nothing to fit among so few pixels: all of them tell, or tell what is wrong.
-        return run(problem, whole, lights, n_range)
+        return run(problem, dataclasses.replace(how, pixels=None))
     counted = list(result.counted)
     for index, sample in enumerate(samples):
         if sample is not None:
-            counted[index] = np.zeros(scenes[index].resolution[::-1], bool)
+            counted[index] = np.zeros(shown[index].resolution[::-1], bool)
             counted[index].ravel()[sample.pixel] = result.counted[index].ravel()
     targets = [target.pixels for target in problem.targets]
-    result = dataclasses.replace(result, targets=targets, scenes=problem.scenes, counted=counted)
-    return Run(configuration if any(samples) else whole, made, samples, result)
+    return Run(problem, samples, dataclasses.replace(result, targets=targets, scenes=shown, counted=counted))
 
 
 def _subsampled(problem, samples):
@@ -134,12 +123,12 @@ def _subsampled(problem, samples):
         weights[index] = np.ones(target.pixels.shape[:2]) if weight is None else weight
         if sample is None:
             continue
-        pixels = some_of(target.pixels, sample)
+        pixels = sample.of(target.pixels)
         # Of pixels that stand for many the codes are a small part of what is not known.
         targets[index] = target._replace(pixels=pixels, codes=None, least_squares=True)
         scenes[index] = brdf.some_pixels(scenes[index], sample.pixel, precision=problem.precision)
-        weights[index] = some_of(weights[index], sample) * sample.stands_for
-        masks[index] = None if mask is None else some_of(mask, sample)
+        weights[index] = sample.of(weights[index]) * sample.stands_for
+        masks[index] = None if mask is None else sample.of(mask)
         if saturation is None and target.saturation is None:
             # Pixels may be clipped, so few of them in the sample that the fit would not notice.
             top = TOP * np.max(pixels, initial=-np.inf, where=np.isfinite(pixels))
@@ -147,9 +136,3 @@ def _subsampled(problem, samples):
                 saturation = float(top)
     how = {"targets": targets, "scenes": scenes, "masks": masks, "weights": weights, "saturation": saturation}
     return dataclasses.replace(problem, **how)
-
-
-def some_of(values: Any, sample: PixelSample) -> np.ndarray:
-    """What belongs to the pixels of a sample, as a picture of one row; values of (H, W) or (H, W, C)."""
-    values = np.asarray(values)
-    return values.reshape(-1, *values.shape[2:])[sample.pixel][None]

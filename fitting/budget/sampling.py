@@ -8,6 +8,7 @@ weight is the square's number of pixels, the inverse of its probability (Horvitz
 """
 
 import dataclasses
+import weakref
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -15,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 import brdf
-from brdf.lights.base import Lighting, stacked
+from brdf.lights.base import Light, Lighting, stacked
 from brdf.lobes import basis_program
 from brdf.models.base import SpecularMaterial
 from brdf.precision import working_precision
@@ -25,48 +26,56 @@ CUT = 1 / 12
 # Which a picture of no more pixels than this is not worth.
 FEWEST = 256
 
-
-# By identity of a light and number of samples: the light itself, or another might come to have its identity, and what
-# was made of it. A map is cut up anew for each number, which takes up to seconds.
-MadeLights = dict[tuple[int, int], tuple[Any, Any]]
+# By identity of a light, as long as there is one, and number of samples: to cut up a map takes up to seconds.
+_made: dict[tuple[int, int], Light] = {}
 
 
-def with_samples(scene: brdf.Scene, samples: int | None, made: MadeLights | None = None) -> brdf.Scene:
+def sample_counts(scene: brdf.Scene) -> list[int]:
+    """The number of samples of each light, 1 of one without an extent."""
+    return [getattr(light, "samples", 1) for light in scene.lights]
+
+
+def with_samples(scene: brdf.Scene, samples: int) -> brdf.Scene:
     """The scene with so many samples in each of its lights with an extent.
 
     Args:
         scene: any.
-        samples: at most so many; None leaves it as it is.
-        made: lights made so far, and those made now.
+        samples: at most so many.
     """
-    if samples is None:
-        return scene
-    made, lights = {} if made is None else made, []
-    for light in scene.lights:
-        key = (id(light), samples)
-        if getattr(light, "samples", samples) != samples and key not in made:
-            made[key] = (light, _sampled(light, samples))
-        lights.append(made[key][1] if key in made else light)
-    return dataclasses.replace(scene, lights=tuple(lights))
+    return dataclasses.replace(scene, lights=tuple(_with_samples(light, samples) for light in scene.lights))
 
 
-def _sampled(light, samples):
-    if not isinstance(light, brdf.EnvironmentMap):
-        return dataclasses.replace(light, samples=max(samples, len(getattr(light, "triangles", ()))))
-    plain = brdf.EnvironmentMap(light.pixels, samples=samples)
-    return eqx.tree_at(lambda one: one.radiance, plain, plain.radiance * light.radiance)
+def _with_samples(light: Light, samples: int) -> Light:
+    if getattr(light, "samples", samples) == samples:
+        return light
+    key = id(light), samples
+    if key not in _made:
+        if isinstance(light, brdf.EnvironmentMap):
+            plain = brdf.EnvironmentMap(light.pixels, samples=samples)
+            same = light.pixels, plain.radiance * light.radiance
+            made = eqx.tree_at(lambda one: (one.pixels, one.radiance), plain, same)
+        else:
+            made = dataclasses.replace(light, samples=max(samples, len(getattr(light, "triangles", ()))))
+        _made[key] = made
+        weakref.finalize(light, _made.pop, key)
+    return _made[key]
 
 
 class PixelSample(NamedTuple):
     """Some pixels of a picture.
 
     Attributes:
-        pixel: which, row by row of the picture, (M,); neighbours in the list are mostly neighbours in the picture.
+        pixel: which, row by row of the picture, (M,).
         stands_for: for how many pixels each stands, at least 1, (M,).
     """
 
     pixel: Int[np.ndarray, " M"]
     stands_for: Float[np.ndarray, " M"]
+
+    def of(self, values: Any) -> np.ndarray:
+        """What belongs to the pixels, as a picture of one row; of values (H, W) or (H, W, C)."""
+        values = np.asarray(values)
+        return values.reshape(-1, *values.shape[2:])[self.pixel][None]
 
 
 @eqx.filter_jit
@@ -76,7 +85,7 @@ def _peaks(points, lights, model):
     return lobe.peak
 
 
-def sample_pixels(scene: brdf.Scene, model: type[brdf.Material], size: int) -> PixelSample | None:
+def sample_pixels(scene: brdf.Scene, model: type[brdf.Material], size: float) -> PixelSample | None:
     """Choose about ``size`` pixels of a scene's picture.
 
     Args:
@@ -89,14 +98,13 @@ def sample_pixels(scene: brdf.Scene, model: type[brdf.Material], size: int) -> P
     """
     width, height = scene.resolution
     side = 1
-    while -(-height // (2 * side)) * -(-width // (2 * side)) >= max(size, FEWEST) * 3 // 4:
+    while -(-height // (2 * side)) * -(-width // (2 * side)) >= 0.75 * max(size, FEWEST):
         side *= 2
     if side == 1:
         return None
     random, end = np.random.default_rng(0), np.array([[height], [width]])
-    corner = side * _along_curve(-(-height // side), -(-width // side))
-    lights = with_samples(scene, 1).lights
-    lights = tuple(light for light in lights if light.type_name != "environment")
+    corner = side * np.indices((-(-height // side), -(-width // side))).reshape(2, -1)
+    lights = tuple(light for light in with_samples(scene, 1).lights if light.type_name != "environment")
     has_peaks = bool(lights) and issubclass(model, SpecularMaterial)
     most = max(16, 4 * round(size * CUT / 4))
     pixels, areas = [], []
@@ -120,13 +128,3 @@ def sample_pixels(scene: brdf.Scene, model: type[brdf.Material], size: int) -> P
         quarters = side * np.array([[0, 0, 1, 1], [0, 1, 0, 1]])
         corner = (corner[:, cut, None] + quarters[:, None]).reshape(2, -1)
         corner = corner[:, np.all(corner < end, axis=0)]
-
-
-def _along_curve(rows, columns):
-    """Rows and columns of a table's entries along Morton's curve: what is near in the order is near in the table."""
-    row, column = np.indices((rows, columns)).reshape(2, -1)
-    key = np.zeros(row.shape, np.int64)
-    for bit in range(17):
-        key |= ((row >> bit) & 1) << (2 * bit + 1) | ((column >> bit) & 1) << (2 * bit)
-    order = np.argsort(key, kind="stable")
-    return np.stack([row[order], column[order]])

@@ -100,7 +100,6 @@ def fit(
                 target,
                 pictures,
                 noise,
-                accuracy,
                 say,
                 model=model,
                 precision=precision,
@@ -108,6 +107,7 @@ def fit(
                 dark=dark,
                 plausible=plausible,
                 loss=loss or "squared",
+                accuracy=accuracy,
                 seconds=seconds,
                 mesh=mesh,
             )
@@ -149,7 +149,7 @@ def _freed(result: Any, names: list[str]) -> Any:
 
 
 def _fit_pictures(
-    target: Any, pictures: Any, noise: Any, accuracy: Any, say: Callable[[str], None], **how: Any
+    target: Any, pictures: Any, noise: Any, say: Callable[[str], None], **how: Any
 ) -> tuple[Any, tuple[str, ...]]:
     """The fit, and what was found out on the way."""
     from fitting.cli.inputs import read_inputs
@@ -157,11 +157,9 @@ def _fit_pictures(
 
     given = read_inputs(target, pictures)
     use_compilation_cache()
-    from fitting.budget.escalation import OnlyFit
     from fitting.cli.encoding_trial import fit_either
 
     how["noise"] = None if noise is None else tuple(parse_numbers(noise, "--noise", 2, "READ,SHOT"))
-    how["accuracy"] = None if accuracy is None else OnlyFit(accuracy)
     result, inputs = fit_either(given, say, **how)
     if not inputs.light_errors:
         return result, inputs.notes

@@ -1,7 +1,6 @@
 """``brdf tradeoff``: what the choices that a scene offers cost, and what error they make."""
 
 import json
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -26,7 +25,6 @@ def tradeoff(
     model: Model = "blinn-phong",
     accuracy: Annotated[float, typer.Option(help="Relative error that the recommendation is to keep.")] = 1e-3,
     seconds: Annotated[float, typer.Option(help="Time that the measuring may take.")] = 15.0,
-    render: Annotated[bool, typer.Option("--render", help="Also measure the renderer alone.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Measure speed against accuracy on a scene: pixels, light samples, precision, model, solver.
@@ -51,7 +49,6 @@ def tradeoff(
             inputs.scenes[0],
             mask=inputs.masks[0],
             saturation=pictures.saturation,
-            render=render,
             model=model,
             accuracy=accuracy,
             seconds=seconds,
@@ -64,12 +61,5 @@ def tradeoff(
     if as_json:
         show(json.dumps(found.to_dict() | ({"notes": notes} if notes else {}), indent=2))
         return
-    from rich.console import Console
-
-    from fitting.speed_accuracy import WIDTH
-
-    console = Console(width=None if sys.stdout.isatty() else WIDTH)
-    with console.capture() as table:
-        console.print(found.table())
     saved = [] if out is None else [f"saved in {out}"]
-    show("\n".join([*notes, table.get().strip("\n"), "", found.advice, *saved]))
+    show("\n".join([*notes, str(found), "", found.advice, *saved]))

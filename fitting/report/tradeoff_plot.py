@@ -16,7 +16,6 @@ MARKS = {
     "pixels": ("#0072B2", "s"),
     "samples": ("#D55E00", "^"),
     "precision": ("#009E73", "D"),
-    "model": ("#E69F00", "P"),
     "solver": ("#56B4E9", "X"),
     "rounding": ("#CC79A7", "v"),
 }
@@ -36,49 +35,35 @@ def error_against_time(tradeoff: "Tradeoff") -> Figure:
     figure = Figure(figsize=(6.4, 4.0), layout="constrained")
     axes = figure.add_subplot()
     axes.set(xscale="log", yscale="log", xlabel="time of a fit, compiled (ms)", ylabel="relative error of the fit")
-    accuracy = tradeoff.accuracy
-    rows = [row for row in tradeoff.rows if row.configuration is not None and np.isfinite(row.rms)]
-    errors = {row: row.error if np.isfinite(row.error) else row.rms for row in rows}
-    least = min([error for error in errors.values() if error > 0] + [accuracy]) / BELOW
-    points = {row: (1e3 * row.seconds, max(error, least)) for row, error in errors.items()}
-    for axis in dict.fromkeys(row.axis for row in rows):
-        colour, marker = MARKS[axis]
-        chosen = [row for row in rows if row.axis == axis]
-        times, heights = np.array([points[row] for row in chosen]).T
-        # Of another model only the picture can be compared.
-        hollow = all(np.isinf(row.error) for row in chosen)
-        axes.errorbar(
-            times,
-            heights,
-            xerr=np.minimum([1e3 * row.spread for row in chosen], 0.5 * times),
-            fmt=marker,
-            color=colour,
-            markerfacecolor="none" if hollow else colour,
-            elinewidth=0.8,
-            label=f"{axis} (picture only)" if hollow else axis,
-            zorder=3,
-        )
+    axes.axhline(tradeoff.accuracy, color="0.2", lw=0.9, ls=(0, (4, 3)), label=f"accuracy {tradeoff.accuracy:g}")
+    rows = [row for row in tradeoff.rows if np.isfinite(row.error)]
+    least = min([row.error for row in rows if row.error > 0] + [tradeoff.accuracy]) / BELOW
+    points = {row: (1e3 * row.seconds, max(row.error, least)) for row in rows}
     beside: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8, "color": "0.3", "zorder": 5}
-    axes.axhline(accuracy, color="0.2", linewidth=0.9, linestyle=(0, (4, 3)), zorder=1, label=f"accuracy {accuracy:g}")
+    for axis, (colour, marker) in MARKS.items():
+        for row in (row for row in rows if row.axis == axis):
+            time, height = points[row]
+            reach = min(1e3 * row.spread, 0.5 * time)
+            axes.errorbar(time, height, xerr=reach, fmt=marker, color=colour, elinewidth=0.8, zorder=3, label=axis)
+            if row.error == 0:
+                axes.annotate("error 0: the reference", points[row], xytext=(9, -3), **beside)
     if tradeoff.front:
         front = np.array([points[row] for row in tradeoff.front]).T
-        axes.step(*front, where="post", color="0.6", linewidth=1.2, zorder=1, label="Pareto front")
-    words = {row: tradeoff.marks(row).removesuffix("front").rstrip(", ") for row in rows if np.isfinite(row.error)}
-    ringed = [row for row in words if words[row]]
-    for number, row in enumerate(dict.fromkeys([*tradeoff.front, *ringed]), start=1):
+        axes.step(*front, where="post", color="0.6", lw=1.2, zorder=1, label="Pareto front")
+    words = {row: tradeoff.marks(row).removesuffix("front").rstrip(", ") for row in rows}
+    for number, row in enumerate(dict.fromkeys([*tradeoff.front, *filter(words.get, rows)]), start=1):
         axes.annotate(str(number), points[row], xytext=(-7, -5), ha="right", va="top", **beside)
         name = tradeoff.brief(row)
-        if row in ringed:
+        if words[row]:
             axes.plot(*points[row], "o", zorder=4, markersize=11, markerfacecolor="none", markeredgecolor="0.1")
             name += f"\n({words[row]})"
         axes.plot([], [], color="0.3", marker=f"${number}$", linestyle="", label=name)
-    for row in rows:
-        if errors[row] == 0:
-            axes.annotate("error 0: the reference", points[row], xytext=(9, -3), **beside)
     axes.margins(0.12)
     legible(axes.xaxis)
     axes.grid(visible=True, which="major", color="0.9", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0)
+    labels = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
+    place: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.0}
+    axes.legend(labels.values(), labels.keys(), frameon=False, fontsize=8, **place)
     return figure

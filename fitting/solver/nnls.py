@@ -154,10 +154,10 @@ def scaled_inverse(gram: Float[np.ndarray, "U U"], share: float = 1e-12) -> Floa
     """The inverse of a positive semidefinite matrix whose unknowns are of any size; 0 along what it does not determine.
 
     Args:
-        gram: the matrix.
+        gram: the matrix; rows and columns of 0 for what is left out.
         share: of the largest eigenvalue, unknowns in units of their own columns; a smaller one determines nothing.
     """
-    scale = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
+    scale = np.sqrt(np.where(np.diag(gram) > 0, np.diag(gram), 1.0))
     unit = np.outer(scale, scale)
     return np.linalg.pinv(gram / unit, rcond=share, hermitian=True) / unit
 

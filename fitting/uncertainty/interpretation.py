@@ -120,8 +120,6 @@ def interpret(
         spread = fit.noise_factor**2 * weighted_sums(pictures, optimum, known.noise, inverse=False).gram
     # What the light reaches but the simplest model does without is 0, with the error that it would have.
     reached = seen.reached(fit.model)
-    told = seen.problem.sample_errors or {}
-    missed = told.get(fit.model.name, next(iter(told.values()), None))
     sure = uncertainty(
         optimum,
         reached,
@@ -136,7 +134,7 @@ def interpret(
         columns=columns,
         copies=seen.copies,
         gain=gain,
-        missed=missed,
+        missed=seen.problem.sample_error(fit.model.name),
         resolution=resolution,
         joined=joined,
         dropped=dropped,

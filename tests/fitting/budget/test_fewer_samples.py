@@ -51,10 +51,9 @@ def test_a_sample_crowds_where_the_highlight_is():
 def test_a_light_map_keeps_its_light_with_other_samples():
     pixels = np.random.default_rng(1).random((16, 32, 3))
     scene = ball(8, (brdf.EnvironmentMap(pixels, radiance=[1.0, 2.0, 3.0], samples=64),))
-    made = {}
-    light = with_samples(scene, 16, made).lights[0]
+    light = with_samples(scene, 16).lights[0]
     assert light.samples == 16
-    assert with_samples(scene, 16, made).lights[0] is light
+    assert with_samples(scene, 16).lights[0] is light
     np.testing.assert_allclose(light.radiance, scene.lights[0].radiance, rtol=1e-12)
     assert with_samples(ball(8), 4).lights == ball(8).lights
 
