@@ -38,7 +38,7 @@ from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import search
 from fitting.uncertainty.covariance import residual_noise, uncertainty
 from fitting.uncertainty.interpretation import material_and_parameters
-from fitting.uncertainty.intervals import NORMAL_95
+from fitting.uncertainty.intervals import exponent_interval
 
 Loss = Literal["cosine", "squared", "log"]
 N_RANGE = (0.1, 1e6)
@@ -408,11 +408,10 @@ def _fit_model(model, samples, loss, n_range):
     # A lobe that hardly reaches a sample needs a k_s whose square is out of range; it is found to be undetermined.
     with np.errstate(over="ignore", invalid="ignore"):
         sure = uncertainty(optimum, free, noise, brightest, visible, single=False)
-    interval = None
-    if specular and sure.n_error:
-        ratio = np.exp(NORMAL_95 * sure.n_error / optimum.n)
-        interval = float(optimum.n / ratio), float(optimum.n * ratio)
     fit = ModelFit(model, [], optimum, free, n_range)
+    interval = None
+    if specular and not sure.n_reason:
+        interval = exponent_interval(fit, sure.n_error, sure.rise, 0.0, parabolic=True)
     material, parameters = material_and_parameters(fit, sure, np.ones(channels), interval)
     parameters = tuple(one for one in parameters if one.name != "k_a")
     return BrdfCandidate(material, parameters, _losses(samples, modelled(optimum)))

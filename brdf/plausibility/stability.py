@@ -64,18 +64,17 @@ def stability_map(
 
     grid = np.meshgrid(exponents, np.radians(angles), OFFSETS, [False, True], indexing="ij")
     n, angle, offset, across = (x.ravel() for x in grid)
-    vectors = _vectors(angle, offset / np.sqrt(n + 1.0), across)
-    terms, finite, peak = [], np.ones(len(n), bool), np.ones(len(n))
+    vectors = _vectors(angle, offset / np.sqrt(n + 1.0), across[:, None])
+    terms, finite = [], np.ones(len(n), bool)
     for x64 in (False, True):
         with jax.enable_x64(x64):
             arguments = [jnp.asarray(x, jnp.result_type(float)) for x in (n, vectors)]
             functions = value, jax.jacfwd(value, (0, 1)), jax.jacrev(value, (0, 1))
             outcomes = [jax.jit(jax.vmap(function))(*arguments) for function in functions]
-            for leaf in jax.tree.leaves(outcomes):
-                finite &= np.isfinite(np.asarray(leaf)).reshape(len(n), -1).all(axis=1)
-            terms.append(np.asarray(outcomes[0], np.float64)[:, 0])
-            if issubclass(model, SpecularMaterial):
-                peak = np.maximum(model.scale(arguments[0]), 1.0)
+        for leaf in jax.tree.leaves(outcomes):
+            finite &= np.isfinite(np.asarray(leaf)).reshape(len(n), -1).all(axis=1)
+        terms.append(np.asarray(outcomes[0], np.float64)[:, 0])
+    peak = np.maximum(model.scale(n), 1.0) if issubclass(model, SpecularMaterial) else 1.0
     shape = len(exponents), len(angles), -1
     error = np.nan_to_num(np.abs(terms[0] - terms[1]) / peak, nan=np.inf).reshape(shape).max(axis=2)
     return StabilityMap(model.name, exponents, angles, error, np.all(finite.reshape(shape), axis=2))
@@ -83,7 +82,7 @@ def stability_map(
 
 def _vectors(theta: np.ndarray, tilt: np.ndarray, across: np.ndarray) -> Float[np.ndarray, "m 3 3"]:
     """Normal, light and view, rounded to float32; the view tilts from the mirror direction, in or across the plane."""
-    light = from_angles(theta, 0.0)
-    beside = np.cos(tilt)[:, None] * light * [-1.0, 1.0, 1.0] + np.sin(tilt)[:, None] * [0.0, 1.0, 0.0]
-    view = np.where(across[:, None], beside, from_angles(-theta - tilt, 0.0))
+    light, tilt = from_angles(theta, 0.0), tilt[:, None]
+    sideways = np.where(across, [0.0, 1.0, 0.0], from_angles(-theta - 0.5 * np.pi, 0.0))
+    view = np.cos(tilt) * light * [-1.0, 1.0, 1.0] + np.sin(tilt) * sideways
     return np.stack([np.broadcast_to([0.0, 0.0, 1.0], light.shape), light, view], axis=1).astype(np.float32)

@@ -72,9 +72,10 @@ def plot_albedo(brdf: Brdf, report: Report | None = None, figure: Any = None) ->
     """
     known = isinstance(brdf, Material)
     degrees = np.append(np.arange(0.0, 89.0, 0.5 if known else 2.0), [89.0, 89.5, 89.7, 89.8, 89.9, 89.95, 89.99])
-    albedo: Any = (
-        directional_albedo(brdf, np.radians(degrees), precision="float64") if known else albedo_of(brdf, degrees)
-    )
+    if known:
+        albedo = np.asarray(directional_albedo(brdf, np.radians(degrees), precision="float64"))
+    else:
+        albedo = albedo_of(brdf, degrees)
     count = albedo.shape[1]
     figure, axes = _axes(figure, (6, 4))
     axes.axhspan(1, 2, color="0.92", zorder=0)
@@ -84,13 +85,13 @@ def plot_albedo(brdf: Brdf, report: Report | None = None, figure: Any = None) ->
     axes.plot(degrees, albedo, linewidth=1.8, label=channel_names(count))
     if count > 1:
         axes.legend(loc="best")
-    if report is not None and report.energy.crossing:
-        crossing = report.energy.crossing
-        axes.axvline(crossing, color="0.4", linestyle=":", linewidth=1)
-        text = f"exceeds 1 beyond {crossing:.4g}°"
-        axes.annotate(text, (crossing, 1.2), (-5, 0), textcoords="offset points", ha="right")
-    if report is not None and report.energy.value < 1.5:
-        axes.plot(report.energy.to_light.polar, report.energy.value, "ko", markerfacecolor="none", clip_on=False)
+    energy = report.energy if report else None
+    if energy and energy.crossing:
+        axes.axvline(energy.crossing, color="0.4", linestyle=":", linewidth=1)
+        text = f"exceeds 1 beyond {energy.crossing:.4g}°"
+        axes.annotate(text, (energy.crossing, 1.2), (-5, 0), textcoords="offset points", ha="right")
+    if energy and energy.value < 1.5:
+        axes.plot(energy.to_light.polar, energy.value, "ko", markerfacecolor="none", clip_on=False)
     axes.set(xlabel=LIGHT, ylabel="albedo", xlim=(0, 90), ylim=(0, 1.5), title="Light reflected, of that arriving")
     return figure
 
@@ -148,11 +149,11 @@ def plot_reciprocity(brdf: Brdf, channel: int = 0, figure: Any = None) -> Any:
     angles = np.linspace(0, 89.5, 180)
     to_light, to_view = from_angles(np.radians(np.meshgrid(angles, -angles, indexing="ij")).reshape(2, -1), 0.0)
     there, back = sample(to_light, to_view)[:, channel], sample(to_view, to_light)[:, channel]
-    largest = np.max(np.abs([there, back]), axis=0, initial=1e-300)
-    difference = ((there - back) / largest).reshape(len(angles), -1)
+    difference = (there - back) / np.max(np.abs([there, back]), axis=0, initial=1e-300)
     figure, axes = _axes(figure, (5.2, 4.2))
     most = np.abs(difference).max()
     bound = max(most, 1e-6)
+    difference = difference.reshape(len(angles), -1)
     image = axes.pcolormesh(angles, angles, difference.T, cmap=SIGNED, vmin=-bound, vmax=bound, rasterized=True)
     figure.colorbar(image, label="(f_r(light→view) − f_r(view→light)) / the larger")
     axes.set(xlabel=LIGHT, ylabel="angle of the view in degrees", aspect="equal")
