@@ -78,7 +78,7 @@ class ManyFits(Sequence[FitResult]):
             return [self[i] for i in range(len(self))[index]]
         index = range(len(self))[index]
         if index not in self._done:
-            self._done[index] = fit_pictures(_one(self.problem, index))
+            self._done[index] = _fit_alone(self.problem, index)
         return self._done[index]
 
     def __repr__(self) -> str:
@@ -172,16 +172,20 @@ def fit_many(
     with waiting(f"fitting {len(pictures)} pictures"):
         with working_precision(problem.precision), spread_over(mesh):
             numbers, plain = _fit_together(problem)
-        done = {int(i): fit_pictures(_one(problem, int(i))) for i in np.flatnonzero(~plain)}
-    for index, result in done.items():
-        for name, value in _numbers_of(result).items():
-            numbers[name][index] = value
+        done = {int(i): _fit_alone(problem, int(i)) for i in np.flatnonzero(~plain)}
+    if numbers is not None:
+        for index, result in done.items():
+            for name, value in _numbers_of(result).items():
+                numbers[name][index] = value
     return ManyFits(problem, numbers, done)
 
 
-def _one(problem: FitProblem, index: int) -> FitProblem:
+def _fit_alone(problem: FitProblem, index: int) -> FitResult:
     lists = {name: [getattr(problem, name)[index]] for name in ("targets", "scenes", "masks", "weights")}
-    return dataclasses.replace(problem, **lists)
+    try:
+        return fit_pictures(dataclasses.replace(problem, **lists))
+    except InputError as error:
+        raise error.inside(f"pictures[{index}]") from None
 
 
 def _numbers_of(result: FitResult) -> dict[str, np.ndarray]:
@@ -195,8 +199,8 @@ def _numbers_of(result: FitResult) -> dict[str, np.ndarray]:
     return found
 
 
-def _fit_together(problem: FitProblem) -> tuple[dict[str, np.ndarray], Bool[np.ndarray, " N"]]:
-    """The numbers of all fits, and which pictures need no closer look."""
+def _fit_together(problem: FitProblem) -> tuple[dict[str, np.ndarray] | None, Bool[np.ndarray, " N"]]:
+    """The numbers of all fits, and which pictures need no closer look; None for the numbers where all need one."""
     model, dtype, count = brdf.MODELS[problem.model], np.dtype(problem.precision), len(problem.targets)
     targets = np.stack([target.pixels for target in problem.targets]).astype(dtype, copy=False)
     channels = targets.shape[-1]
@@ -207,6 +211,8 @@ def _fit_together(problem: FitProblem) -> tuple[dict[str, np.ndarray], Bool[np.n
     seen = np.stack([np.asarray(scene.surface_points().mask) & mask for scene, mask in both])
     exact = np.array([target.codes is None and target.saturation is None for target in problem.targets])
     plain = exact & np.asarray(_plain(targets, seen))
+    if not plain.any():
+        return None, plain
     if len(scenes) == 1:
         pixel = np.flatnonzero(seen)
         images = basis(model, brdf.some_pixels(scenes[0], pixel, precision=problem.precision))

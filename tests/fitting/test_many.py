@@ -85,12 +85,18 @@ def test_a_model_is_chosen_for_each_in_float32():
         (np.ones((2, 48, 48, 3)), [ball_scene()], "1 entries for 2 pictures"),
         (np.ones((2, 30, 48, 3)), ball_scene(), "48 x 30"),
         ([], ball_scene(), "empty"),
-        (np.zeros((2, 48, 48, 3)), ball_scene(), "black"),
+        (np.zeros((2, 48, 48, 3)), ball_scene(), r"^pictures\[0\]: target: is black"),
     ],
 )
 def test_what_cannot_be_fitted_is_told_in_one_line(pictures, scenes, message):
     with pytest.raises(brdf.InputError, match=message):
         fitting.fit_many(pictures, scenes, model="lambert")
+
+
+def test_a_mask_that_leaves_nothing_names_its_picture():
+    mask = np.zeros((48, 48), bool)
+    with pytest.raises(brdf.InputError, match=r"^pictures\[0\]: mask: leaves no pixel"):
+        fitting.fit_many(np.ones((2, 48, 48, 3)), ball_scene(), model="lambert", mask=mask)
 
 
 def test_the_switch_of_jax_stays_as_it_was():
