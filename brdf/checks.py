@@ -155,6 +155,14 @@ def direction_value(name: str, value: Any) -> Any:
     return array if 1e-6 <= size <= 1e6 else array / size
 
 
+def edge_value(name: str, value: Any) -> Any:
+    """An edge: three numbers, in a unit in which areas, their squares, and those times a distance stay in float32."""
+    array = vector(name, value)
+    if isinstance(array, np.ndarray) and not 1e-8 <= np.max(np.abs(array)) <= 1e8:
+        raise InputError(name, f"must be between 1e-08 and 1e+08 long, got {_shown(value)}", "Use another unit")
+    return array
+
+
 def number(
     name: str, value: Any, low: float = -np.inf, high: float = np.inf, above: float = -np.inf, below: float = np.inf
 ) -> Any:

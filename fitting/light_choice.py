@@ -70,12 +70,14 @@ class LightChoice:
     @property
     def direction(self) -> Float[np.ndarray, "3"]:
         """Of the first light where it is directional: the unit vector towards it."""
-        return _direction(self.lights[0])
+        return direction_of(self.lights[0])
 
     def __str__(self) -> str:
         """In words."""
-        shown = ", ".join(f"{value:.3f}" for value in self.direction)
-        return f"a light from ({shown}) brings the error of {self.of} from {self.before:.3g} to {self.after[0]:.3g}"
+        shown = repr(self.lights[0])
+        if isinstance(self.lights[0], brdf.DirectionalLight):
+            shown = f"a light from ({', '.join(f'{value:.3f}' for value in self.direction)})"
+        return f"{shown} brings the error of {self.of} from {self.before:.3g} to {self.after[0]:.3g}"
 
     def plot(self) -> Any:
         """The hemisphere of lights seen from the camera, coloured by the error that each would leave.
@@ -90,12 +92,14 @@ class LightChoice:
 
         figure = Figure(figsize=(4.6, 3.8), layout="constrained")
         axes = figure.subplots()
-        tried = np.array([_direction(light) for light in self.candidates])
+        tried = np.array([direction_of(light) for light in self.candidates])
         finite = np.isfinite(self.foretold)
         colours = axes.scatter(*tried[finite, :2].T, c=self.foretold[finite], cmap="cividis_r", s=45, linewidths=0)
         axes.scatter(*tried[~finite, :2].T, facecolors="none", edgecolors="0.6", s=20, linewidths=0.5)
         for lights, marker, label in ((self.known, "x", "there already"), (self.lights, "*", "chosen")):
-            places = np.array([_direction(light) for light in lights if hasattr(light, "direction")]).reshape(-1, 3)
+            places = np.array(
+                [direction_of(light) for light in lights if isinstance(light, brdf.DirectionalLight)]
+            ).reshape(-1, 3)
             axes.scatter(*places[:, :2].T, marker=marker, s=90, color="#D55E00", label=label)
         axes.set(
             title=f"error of {self.of} with one more light", xlabel="x towards the light", ylabel="y", aspect="equal"
@@ -206,7 +210,7 @@ def choose_lights(
         best, errors = best_of(tried)
         foretold = foretold if chosen else np.array(errors)
         for near in AROUND if given is None else ():
-            best, _ = best_of([best, *(_towards(one, shining) for one in _cap(_direction(best), *near))])
+            best, _ = best_of([best, *(_towards(one, shining) for one in _cap(direction_of(best), *near))])
         information = information + told_by(best)
         chosen.append(best)
         after.append(error(information))
@@ -246,9 +250,18 @@ def _light(given: Any, shining: np.ndarray) -> Light:
     return _towards(direction, shining)
 
 
-def _direction(light: Light) -> np.ndarray:
+def direction_of(light: Light) -> np.ndarray:
+    """The unit vector towards a light.
+
+    Args:
+        light: a distant one.
+
+    Raises:
+        InputError: where it is none.
+    """
     if not isinstance(light, brdf.DirectionalLight):
-        raise InputError("candidates", f"hold a {type(light).__name__}, which has no one direction", "Look at foretold")
+        came = f"hold a {type(light).__name__}, which has no one direction"
+        raise InputError("candidates", came, "Give directional lights, or look at foretold")
     direction = np.asarray(light.direction, np.float64)
     return direction / np.linalg.norm(direction)
 

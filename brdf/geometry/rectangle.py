@@ -6,7 +6,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from brdf.checks import Scalar, Vector, checked, direction_value, spans_area, vector
+from brdf.checks import Scalar, Vector, checked, edge_value, spans_area, vector
 from brdf.geometry.base import Hit, Shape, share_beyond
 from brdf.vectors import cross, divide, dot, largest, normalize
 
@@ -29,8 +29,8 @@ class Rectangle(Shape):
 
     in_components: ClassVar[bool] = True
     center: Vector = checked(vector, "center")
-    edge_u: Vector = checked(direction_value, "edge_u")
-    edge_v: Vector = checked(direction_value, "edge_v")
+    edge_u: Vector = checked(edge_value, "edge_u")
+    edge_v: Vector = checked(edge_value, "edge_v")
 
     def __check_init__(self):
         """Refuse edges that span no area."""

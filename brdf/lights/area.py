@@ -28,7 +28,7 @@ from brdf.checks import (
     Spectrum,
     Vector,
     checked,
-    direction_value,
+    edge_value,
     positive,
     sample_number,
     spans_area,
@@ -112,8 +112,8 @@ class RectangleLight(Light):
     """
 
     center: Vector = checked(vector, "center")
-    edge_u: Vector = checked(direction_value, "edge_u")
-    edge_v: Vector = checked(direction_value, "edge_v")
+    edge_u: Vector = checked(edge_value, "edge_u")
+    edge_v: Vector = checked(edge_value, "edge_v")
     radiance: Spectrum = checked(spectrum, "radiance")
     samples: int = eqx.field(static=True, converter=sample_number, default=SAMPLES)
     type_name: ClassVar[str] = "rectangle"

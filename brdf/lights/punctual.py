@@ -49,9 +49,9 @@ class DirectionalLight(Light):
 
 def _attenuation(value: Any) -> Any:
     """(a, b, c), none of which may let the light turn negative."""
-    value = direction_value("attenuation", value)
-    if isinstance(value, np.ndarray) and np.any(value < 0):
-        came = f"must be at least 0, got {value.tolist()}"
+    value = vector("attenuation", value)
+    if isinstance(value, np.ndarray) and not (np.all(value >= 0) and np.any(value > 0)):
+        came = f"must be at least 0, and more somewhere, got {value.tolist()}"
         raise InputError("attenuation", came, "Give three values of 0 or more")
     return value
 

@@ -11,7 +11,7 @@ import brdf
 from brdf.errors import InputError
 from brdf.models.base import SpecularMaterial
 from brdf.vectors import dot
-from fitting.light_choice import LightChoice, choose_lights
+from fitting.light_choice import LightChoice, choose_lights, direction_of
 
 if TYPE_CHECKING:
     from fitting.maps.map_result import Maps
@@ -63,7 +63,7 @@ def next_light(maps: "Maps", candidates: Any, count: int, of: str) -> LightChoic
         return jnp.stack([a * b for i, a in enumerate(columns) for b in columns[i:]])
 
     def told_by(light: Any) -> np.ndarray:
-        return np.asarray(products(np.asarray(light.direction, float) / np.linalg.norm(light.direction)), np.float64)
+        return np.asarray(products(direction_of(light)), np.float64)
 
     def error(information: np.ndarray) -> float:
         dd, ds, dx, ss, sx, xx = information

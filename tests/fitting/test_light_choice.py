@@ -54,6 +54,12 @@ def test_several_are_chosen_one_after_the_other(result):
     assert both.after[1] < both.after[0]
 
 
+def test_a_lamp_that_is_near_can_be_chosen_and_told(result):
+    choice = fitting.next_light(result, [brdf.PointLight([0, 0, 3], 9.0)])
+    assert str(choice).startswith("PointLight(position=[0, 0, 3]")
+    assert choice.after[0] < choice.before
+
+
 def test_what_cannot_be_answered_is_told(result):
     matt = fitting.fit(pictured(brdf.Lambert(k_d=[0.5] * 3), ball_scene(), NOISE), ball_scene(), model="lambert")
     for wrong, message in (

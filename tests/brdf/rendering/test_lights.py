@@ -53,6 +53,19 @@ def test_flat_lights_follow_lamberts_formula(light: Light):
     np.testing.assert_allclose(radiance(light), lambert(QUAD), rtol=1e-6)
 
 
+@pytest.mark.parametrize("unit", [1e-7, 1e-4, 1e4, 1e7])
+def test_a_scene_looks_the_same_in_every_unit(unit: float):
+    def picture(unit: float) -> np.ndarray:
+        floor = brdf.Rectangle(center=[0, 0, 0], edge_u=[2 * unit, 0, 0], edge_v=[0, 2 * unit, 0])
+        place = {"position": [0, 0, 4 * unit], "target": [0, 0, 0], "up": [0, 1, 0]}
+        camera = brdf.OrthographicCamera(width=3 * unit, resolution=(6, 6), **place)
+        lamp = brdf.PointLight([unit, 0, unit], 1.0, attenuation=[0, 0.5 / unit, 1 / unit**2])
+        window = brdf.RectangleLight(unit * CENTER, edge_u=unit * EDGE_U, edge_v=unit * EDGE_V, radiance=1)
+        return np.asarray(brdf.render(GLOSSY, brdf.Scene(camera, [floor], lights=[lamp, window])))
+
+    np.testing.assert_allclose(picture(unit), picture(1.0), rtol=1e-4)
+
+
 def test_a_polygon_need_not_be_convex():
     corner = [[0, 0], [1, 0], [1, 0.3], [0.3, 0.3], [0.3, 1], [0, 1]]
     bent = np.array([[x, y, 2.0] for x, y in corner])[::-1]

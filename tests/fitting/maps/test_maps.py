@@ -488,3 +488,5 @@ def test_the_light_that_is_added_is_where_it_tells_most():
     assert fitting.next_light(maps).after[0] < fitting.next_light(maps).before
     with pytest.raises(brdf.InputError, match="of: must be n or undetermined"):
         fitting.next_light(maps, of="k_d")
+    with pytest.raises(brdf.InputError, match="candidates: hold a PointLight"):
+        fitting.next_light(maps, [brdf.PointLight([0, 0, 3], 9.0)])
