@@ -49,6 +49,8 @@ ENOUGH_NOISE = 0.5
 FIRST_NOISE = 0.3
 # Noise of one size in light, not in codes, where the logarithm of the likelihood is so much larger.
 LIKELIER = 2.0
+# Less noise than this, in codes, is the same in both.
+FAINT = 0.02
 # Rounds of least squares in codes; each leaves some hundredth of its change. What ends them: such a change, in standard
 # errors, and this one of the noise.
 MOST_ROUNDS, ENOUGH_CHANGE, ENOUGH_NOISE_CHANGE = 10, 2.0, 0.02
@@ -176,7 +178,7 @@ def _where_noise_is_even(fit: ModelFit, at: Numbers, noise: float) -> tuple[Mode
 def _evener_in_light(problem: "_Separable", at: Estimate) -> Estimate | None:
     """The most likely numbers with noise of one size in light, where they are likelier than any with it in codes."""
     linear = all(_bounds(part.picture).encoding == "linear" for part in problem.pixels)
-    if linear or at.value > -LIKELIER:
+    if linear or at.noise < FAINT:
         return None
     light = [part.in_light() for part in problem.pixels]
     start = Estimate(at.unknowns, max(at.noise, FIRST_NOISE))
