@@ -273,12 +273,17 @@ def _less_codec_errors(fit: ModelFit, seen: Observed) -> tuple[ModelFit, Observe
     codecs = [codec_of(target) for target in seen.problem.targets]
     if fit.evidence is None or not any(codecs):
         return fit, seen
-    seen = without_codec_errors(seen, _fit_model(fit.model, seen, fit.free), codecs)
-    again = _fit_model(fit.model, seen, fit.free)
-    if fit.tied is not None:
-        optimum = refit(again.pictures, again.optimum, fit.free, again.n_range, fit.tied)
-        again = again._replace(optimum=optimum, tied=fit.tied)
-    return most_likely(again, copies=seen.copies), seen
+    seen = without_codec_errors(seen, _by_squares(fit, seen), codecs)
+    return most_likely(_by_squares(fit, seen), copies=seen.copies), seen
+
+
+def _by_squares(fit: ModelFit, seen: Observed) -> ModelFit:
+    """A fit with the same terms by least squares, which takes all pixels."""
+    found = _fit_model(fit.model, seen, fit.free)
+    if fit.tied is None:
+        return found
+    near = dataclasses.replace(found.optimum, n=fit.optimum.n, x=fit.optimum.x)
+    return found._replace(optimum=refit(found.pictures, near, fit.free, found.n_range, fit.tied), tied=fit.tied)
 
 
 def _likely_sums(fits: Mapping[str, ModelFit]) -> dict[str, NormalEquations]:
