@@ -328,7 +328,7 @@ def fit_brdf(
         raise InputError("table", f"must be a brdf.MeasuredBRDF, got {type(table).__name__}", "Use brdf.load_measured")
     model = model_name(model)
     check_choice(loss, get_args(Loss), n_range)
-    samples, count = _samples(table, max_angle)
+    (samples, count), channels = _samples(table, max_angle), len(table.channels)
     left_out, negative = samples.left_out, int(np.count_nonzero(samples.values[:count] < 0))
     if loss == "log" and negative:
         left_out = left_out | {"values below 0, out of reach of the logarithm": negative}
@@ -336,7 +336,7 @@ def fit_brdf(
         candidates = [
             _fit_model(kind, samples, loss, n_range)
             for kind in (brdf.MODELS.values() if model == "auto" else [brdf.MODELS[model]])
-            if count > 1 + issubclass(kind, SpecularMaterial) * (1 + 1 / len(samples.channels))
+            if count * channels > (2 * channels + 1 if issubclass(kind, SpecularMaterial) else channels)
         ]
     if not candidates:
         came = f"has {count} samples that count, no more than there are numbers to find"

@@ -6,7 +6,6 @@ stands for a sum, of which the picture says no more, is a number, and ``note`` s
 
 import dataclasses
 import json
-from collections import Counter
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
@@ -101,7 +100,8 @@ def save_material(material: Material, path: str | Path, *, undetermined: Collect
     if _suffix(path, "Name it .json or .mtl") == ".json":
         text = to_json(material, undetermined=undetermined)
     elif channels in (1, 3):
-        text = to_mtl(material, undetermined=undetermined, note=undetermined_note(material, undetermined))
+        note = material_to_dict(material, undetermined=undetermined).get("note", "")
+        text = to_mtl(material, undetermined=undetermined, note=note)
     else:
         came = f"cannot hold {channels} channels, MTL knows RGB alone"
         raise InputError(path, came, "Save the material as .json")
@@ -114,39 +114,27 @@ def to_json(material: Material, *, undetermined: Collection[str] = ()) -> str:
 
 
 def material_to_dict(material: Material, *, undetermined: Collection[str] = ()) -> dict[str, Any]:
-    """The material as JSON holds it.
+    """The material as JSON holds it; numbers that are not 0 although no picture determined them are told in a note.
 
     Args:
         material: any of the models.
         undetermined: see `save_material`.
     """
     values: dict[str, Any] = {"model": material.name}
-    for key in _parameters(type(material)):
-        numbers = np.asarray(getattr(material, key), np.float64)
-        listed = [
-            None if number == 0 and not {key, f"{key}[{channel}]"}.isdisjoint(undetermined) else float(number)
-            for channel, number in enumerate(numbers.ravel())
-        ]
-        values[key] = listed if numbers.ndim else listed[0]
-    note = undetermined_note(material, undetermined)
-    return values | ({"note": note} if note else {})
-
-
-def undetermined_note(material: Material, undetermined: Collection[str]) -> str:
-    """What to say of numbers that are not 0 although no picture determined them; empty where there are none.
-
-    Args:
-        material: any of the models.
-        undetermined: see `save_material`.
-    """
     reasons = undetermined if isinstance(undetermined, Mapping) else {}
     open_keys: dict[str, list[str]] = {}
-    for key in undetermined:
-        numbers = np.ravel(getattr(material, key.partition("[")[0]))
-        if numbers[int(key.partition("[")[2].rstrip("]") or 0)]:
-            open_keys.setdefault(reasons.get(key, "the picture leaves them open"), []).append(key)
-    told = "; ".join(f"{', '.join(keys)}: {reason}" for reason, keys in open_keys.items())
-    return f"not determined: {told}" if told else ""
+    for key in _parameters(type(material)):
+        numbers = np.asarray(getattr(material, key), np.float64)
+        listed: list[Any] = numbers.ravel().tolist()
+        for channel, number in enumerate(listed):
+            for name in {key, f"{key}[{channel}]"}.intersection(undetermined):
+                if number:
+                    open_keys.setdefault(reasons.get(name, "the picture leaves them open"), []).append(name)
+                else:
+                    listed[channel] = None
+        values[key] = listed if numbers.ndim else listed[0]
+    told = "; ".join(f"{', '.join(dict.fromkeys(keys))}: {reason}" for reason, keys in open_keys.items())
+    return values | ({"note": f"not determined: {told}"} if told else {})
 
 
 def material_from_dict(values: Any) -> Material:
@@ -192,10 +180,11 @@ def _numbers(key: str, value: Any) -> Any:
 
 
 def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    entries = dict(pairs)
-    if len(entries) < len(pairs):
-        (twice, _), *_ = Counter(key for key, _ in pairs).most_common(1)
-        raise InputError(twice[:SHOWN], "is given twice", "Give it once")
+    entries: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in entries:
+            raise InputError(key[:SHOWN], "is given twice", "Give it once")
+        entries[key] = value
     return entries
 
 
