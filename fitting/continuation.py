@@ -271,20 +271,23 @@ def least_variance(known: Sequence[Precision]) -> Float[np.ndarray, " U"]:
     return np.min(np.where(enough & (variance > 0), variance, np.inf), axis=0)
 
 
-def widening(known: Sequence[Precision], most: Precision) -> Float[np.ndarray, " U"]:
+def widening(
+    known: Sequence[Precision], most: Precision, alone: Float[np.ndarray, " U"] | float
+) -> Float[np.ndarray, " U"]:
     """What to multiply errors by: each unknown is known as well as where enough values still tell of it.
 
     Args:
         known: from much noise to little.
         most: of which the errors are.
+        alone: variance of each that is left in any case.
     """
-    least = least_variance(known)
+    least = np.maximum(least_variance(known), alone)
     ratio = np.divide(least, most.variance, out=np.ones_like(least), where=(most.variance > 0) & np.isfinite(least))
     return np.sqrt(ratio)
 
 
 def where_most_is_told(
-    problem: Problem, at: Estimate, known: Sequence[Precision]
+    problem: Problem, at: Estimate, known: Sequence[Precision], alone: Float[np.ndarray, " U"] | float = 0.0
 ) -> tuple[Score, Float[np.ndarray, " U"]]:
     """What the values say of an estimate at the noise of which errors are, and what to multiply these by.
 
@@ -292,7 +295,8 @@ def where_most_is_told(
         problem: values and their model.
         at: the most likely unknowns.
         known: what was known of them on the way.
+        alone: variance of each that is left in any case.
     """
     at = at._replace(noise=telling(known).noise)
     said = problem.score(at, problem.near(at, REACH))
-    return said, widening(known, precision(problem, at, said))
+    return said, widening(known, precision(problem, at, said), alone)

@@ -34,6 +34,7 @@ from fitting.continuation import (
     together,
     where_most_is_told,
 )
+from fitting.continuation import precision as precision_at
 from fitting.likelihood import AnyArray, Bounds, Intervals, LogLikelihood, residual_deviation
 from fitting.model_fit import Evidence, ModelFit
 from fitting.solver.normal_equations import Picture
@@ -56,6 +57,8 @@ FAINT = 0.02
 MOST_ROUNDS, ENOUGH_CHANGE, ENOUGH_NOISE_CHANGE = 10, 2.0, 0.02
 # Predictions are the same to such a share of a code, where these are so many values, and so many times as usual.
 ALIKE, FEWEST_ALIKE, MORE_ALIKE = 1024, 64, 10
+# A picture of fewer different predictions is one of planes; so many pixels tell.
+MOST_LEVELS, MOST_PIXELS = 32, 4096
 # An open end tells where a value is predicted within so many s of it; noise below this share of the picture is none.
 END_REACH, NO_NOISE = 4.0, 1e-5
 
@@ -190,23 +193,31 @@ def _with_weight(picture: Picture, weight: np.ndarray | None) -> Picture:
     return dataclasses.replace(picture, weight=weight)
 
 
-def alike(bounds: Bounds, codes: Float[np.ndarray, "P C"], noise: float) -> Float[np.ndarray, "P C"]:
-    """Weights for values of a lossy file that are predicted alike, as on an unlit side: they share a rounding error.
+def alike(
+    bounds: Bounds, codes: Float[np.ndarray, "P C"], noise: float, *, level: bool = False
+) -> Float[np.ndarray, "P C"]:
+    """Weights for values that are predicted alike, as on an unlit side: they share a rounding error.
 
-    It came before the losses of the file, which hide it. N values of noise s whose mean has a further error of variance
-    1 / 12 weigh 1 / (1 + N / 12 s²) each.
+    In a lossy file it came before the losses, which hide it. N values of noise s whose mean has a further error of
+    variance 1 / 12 weigh 1 / (1 + N / 12 s²) each.
 
     Args:
         bounds: of the values.
         codes: that are predicted.
         noise: s.
+        level: of a picture of planes, and only those that also show one code; where some do not, noise tells where
+            between codes they lie.
     """
     code = np.rint(codes * ALIKE).astype(np.int64)
     tells, weight = np.isfinite(bounds.lower) | np.isfinite(bounds.upper), np.ones(code.shape)
-    for one, some, own in zip(code.T, tells.T, weight.T, strict=True):
+    for channel, (one, some) in enumerate(zip(code.T, tells.T, strict=True)):
         _, kind, count = np.unique(one[some], return_inverse=True, return_counts=True)
-        many = count > max(FEWEST_ALIKE, MORE_ALIKE * np.median(count)) if count.size else count > 0
-        own[some] = np.where(many, 1 / (1 + count / (12 * noise**2)), 1.0)[kind]
+        many = count > max(FEWEST_ALIKE, MORE_ALIKE * np.median(count) * (not level)) if count.size else count > 0
+        if level:
+            shown = bounds.lower[some, channel] + bounds.upper[some, channel]
+            first = shown[np.unique(kind, return_index=True)[1]]
+            many &= np.bincount(kind, weights=shown != first[kind]) == 0
+        weight[some, channel] = np.where(many, 1 / (1 + count / (12 * noise**2)), 1.0)[kind]
     return weight
 
 
@@ -225,11 +236,23 @@ def _near_edges(fit: ModelFit, at: Estimate, *, copies: bool) -> Evidence:
         at = at._replace(noise=telling(known).noise)
         problem = _Separable(_gathered(pictures, at), design, bounds, copies)
         at, known = maximise(problem, at, first=ROUGHLY_KNOWN)
-    said, wider = where_most_is_told(problem, at, known)
+    said, wider = where_most_is_told(problem, at, known, _of_planes(pictures, at, problem))
     working = [one.working() for one in said.said]
     optimum = _optimum(working, said, fit, Numbers.of(at))
     places = [_place(one.shown.pixels.picture) for one in said.said]
     return Evidence(working, optimum, at.noise, at.value, places, wider)
+
+
+def _of_planes(pictures: Sequence[Picture], at: Estimate, problem: "_Separable") -> Float[np.ndarray, " U"] | float:
+    """The least variance of each unknown where values on a plane show one code, and share a rounding error."""
+    codes = [_codes(picture, Numbers.of(at)) for picture in pictures]
+    if any(np.unique(np.rint(code[:: 1 + len(code) // MOST_PIXELS] * ALIKE)).size >= MOST_LEVELS for code in codes):
+        return 0.0
+    weights = [alike(_bounds(one), code, FIRST_NOISE, level=True) for one, code in zip(pictures, codes, strict=True)]
+    weighted = map(_with_weight, pictures, weights)
+    pixels = [_Pixels.of(picture.in_double(np.arange(len(picture.target)))) for picture in weighted]
+    at, alone = at._replace(noise=FIRST_NOISE), _Separable(pixels, problem.design, problem.bounds, problem.copies)
+    return precision_at(alone, at, alone.score(at, alone.near(at, REACH))).variance
 
 
 def _optimum(working: Sequence[Picture], said: Score, fit: ModelFit, at: Numbers) -> Optimum:

@@ -18,6 +18,8 @@ from fitting.uncertainty.intervals import NORMAL_95, above_zero
 DEPENDENT_SINGLE, DEPENDENT_DOUBLE = 1e-6, 1e-10
 # What the arithmetic of single precision leaves of a number, relative: a few of its rounding errors.
 RESOLUTION = 5e-7
+# As much of the scatter of independent pixels is there in any case.
+LEAST_SCATTER = 1e-6
 # A term that moves no pixel by more than this share of the brightest one leaves no trace.
 NO_TRACE = 1e-6
 # A specular term counts when leaving it out raises the cost by so many noise variances for each of its unknowns.
@@ -276,7 +278,8 @@ def _errors(
             middle[np.ix_(places[channel], place)] += scores
     if joined is not None:
         hessian = middle = joined
-    alone, middle = middle, middle if scatter is None else scatter
+    # What is left may be the dust of arithmetic, which errs together and says nothing.
+    alone, middle = middle, middle if scatter is None else scatter + LEAST_SCATTER * middle
     active = known & (x > 0)
     has_n, with_n = bool(active[2].any()), False
     unit = np.eye(size)
@@ -296,7 +299,7 @@ def _errors(
         alike = inverse @ alone @ inverse
         more = max(np.trace(inverse @ scatter) / max(np.trace(inverse @ alone), np.finfo(float).tiny), 1.0)
         variance, least = np.diag(covariance), np.diag(alike) * more
-        ratio = np.divide(least, variance, out=np.ones(size), where=variance > 1e-9 * least)
+        ratio = np.divide(least, variance, out=np.ones(size), where=variance > 0)
         widening = widening * np.sqrt(np.maximum(ratio, 1.0))
     covariance = covariance * np.outer(widening * np.ones(size), widening * np.ones(size))
     if missed is not None:

@@ -5,8 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import brdf
 import fitting
 from benchmarks.truth import COVERAGE, LAMBERT, ball, meshed
+from brdf.images.encoding import Encoding, encode
 
 # In standard errors: five of some two hundred numbers would be chance once in ten thousand runs.
 FAR = 5.0
@@ -45,6 +47,20 @@ def test_noise_that_comes_before_the_encoding_is_larger_in_dark_codes(row: str, 
     one = ball(3, ambient=False)
     result = fitting.fit(COVERAGE[row].picture(one.drawn(), 3, tmp_path), one.scene(), model=one.model)
     assert not any("structure" in words for words in result.warnings)
+
+
+@pytest.mark.parametrize("curve", ["linear", "srgb"])
+def test_a_plane_that_shows_one_code_is_known_to_a_rounding_error(curve: Encoding):
+    """Thousands of its values are one: they lie anywhere within that code."""
+    camera = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2, resolution=(48, 48))
+    plane, hiding = brdf.Rectangle([0, 0, 0], [0.9, 0, 0], [0, 0.9, 0]), brdf.Sphere([0.3, 0, 0.6], 0.3, fitted=False)
+    scene = brdf.Scene(camera, [plane, hiding], ambient=[0.2], lights=[brdf.DirectionalLight([0.3, 0.4, 0.8], 0.9)])
+    for k_d in (0.523, 0.411, 0.357):
+        picture = encode(np.asarray(brdf.render(brdf.Lambert(k_a=0.31, k_d=k_d), scene)), curve)
+        result = fitting.fit(np.rint(255 * picture).astype(np.uint8), scene, encoding=curve)
+        assert result.surface == "lambert"
+        for name, true in (("k_a", 0.31), ("k_d", k_d)):
+            assert abs(result[name][0].value - true) < 3 * result[name][0].error < 0.5
 
 
 def test_a_small_highlight_none_of_whose_values_lies_near_an_edge_is_there_all_the_same(tmp_path: Path):
