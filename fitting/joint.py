@@ -74,7 +74,7 @@ class JointResult(FitResult):
 def fit_jointly(
     target: Any,
     scene: brdf.Scene | Sequence[brdf.Scene],
-    material: brdf.Material | type[brdf.Material] | str = "auto",
+    material: brdf.Material | FitResult | type[brdf.Material] | str = "auto",
     free: Callable[[brdf.Material, list[brdf.Scene]], Sequence[Any]] | str | Sequence[str] | None = None,
     *,
     solver: Literal["lm", "bfgs"] | None = None,
@@ -91,8 +91,8 @@ def fit_jointly(
     Args:
         target: linear values, (H, W, C), or a list of pictures.
         scene: what the picture shows, or a list of as many.
-        material: to start from; or a model, from whose separable optimum it starts; or "auto" for the simplest
-            adequate model under the scenes that were found.
+        material: to start from, or a result that has one; or a model, from whose separable optimum it starts; or "auto"
+            for the simplest adequate model under the scenes that were found.
         free: from material and list of scenes to the leaves to fit, for example
             ``lambda m, s: (m.k_d, m.n, s[0].lights[0].direction)``; all others are held. Or what `FitResult.diagnosis`
             names beside the whole material: "light", "intensity", "ball" or "radius", also "light 1 of picture 0".
@@ -129,6 +129,7 @@ def fit_jointly(
     if not (callable(names) or names is None or isinstance(names, Sequence)):
         came = f"must be a function or names, got {type(free).__name__}"
         raise InputError("free", came, "Write lambda material, scenes: (material.n,), or light")
+    material = material.material if isinstance(material, FitResult) else material
     freed = named_leaves(names) if isinstance(names, Sequence) else names
     stated = state_problem(
         target, scene, mask, rounding=rounding, encoding=encoding, precision=precision, saturation=saturation

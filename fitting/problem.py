@@ -120,7 +120,7 @@ def model_name(model: Any) -> str:
     names = {_letters(name): name for name in ("auto", *brdf.MODELS)}
     name = names.get(_letters(model)) if isinstance(model, str) else None
     if name is None:
-        came = f"{type(model).__name__}, no name" if isinstance(model, brdf.Material) else repr(model)
+        came = repr(model) if isinstance(model, str) else f"{type(model).__name__}, no name"
         raise InputError("model", f"is unknown, got {came}", f"Use auto or one of {', '.join(brdf.MODELS)}")
     return name
 

@@ -191,11 +191,21 @@ def uncertainty(
 def _without_trace(optimum: Optimum, gain: float, visible: float, *, grey: bool) -> str:
     """Why there is no specular term to speak of; empty where there is one."""
     if optimum.flat:
-        return "the picture has no highlight"
+        return "" if _adds_evenly(optimum) else "the picture has no highlight"
     if visible < NO_TRACE:
         return f"the highlight is below {NO_TRACE:g} of the picture"
     unknowns = 2 if grey else 1 + np.count_nonzero(optimum.x[2] > 0)
     return "" if gain > SIGNIFICANT * unknowns else "the highlight does not stand out of the noise"
+
+
+def _adds_evenly(optimum: Optimum) -> bool:
+    """Whether a highlight shows in each channel what ambient and diffuse light show, as on a plane far away."""
+    for gram in optimum.gram[:, :3, :3]:
+        others, cross = gram[:2, :2], gram[:2, 2]
+        left = gram[2, 2] - cross @ np.linalg.lstsq(others, cross, rcond=DEPENDENT_DOUBLE)[0]
+        if not 0 < gram[2, 2] * DEPENDENT_SINGLE >= left:
+            return False
+    return True
 
 
 def specular_gain(optimum: Optimum, noise: Float[np.ndarray, " C"]) -> float:

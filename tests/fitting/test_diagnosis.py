@@ -118,7 +118,7 @@ def test_of_several_pictures_the_one_is_named():
 
 def test_what_was_named_is_freed():
     target, told, _ = WRONG["light"]
-    result = fitting.fit_jointly(target, told, fitted(target, told).material, "light")
+    result = fitting.fit_jointly(target, told, fitted(target, told), "light")
     np.testing.assert_allclose(float(result.parameters[-1]), 2.0, atol=0.15)
     assert result.diagnosis == ()
     ball = fitting.fit_jointly(target, with_ball(radius=1.01), MATERIAL, ["radius"])

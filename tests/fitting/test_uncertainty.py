@@ -184,6 +184,18 @@ def test_a_broad_highlight_whose_middle_does_not_count_is_not_called_small():
     assert not [text for text in result.warnings if "smaller than a pixel" in text]
 
 
+@pytest.mark.parametrize("ambient", [None, [0.2]])
+def test_a_highlight_that_is_as_even_as_diffuse_light_is_not_denied(ambient):
+    """A plane far away, under a distant light; a shadow tells ambient light."""
+    shapes = brdf.Rectangle([0, 0, 0], [1, 0, 0], [0, 1, 0]), brdf.Sphere([0.3, 0, 0.6], 0.3, fitted=False)
+    scene = brdf.Scene(CAMERA, shapes, ambient=ambient, lights=[LIGHT])
+    for seed in range(3):
+        result = fitting.fit(noisy(GLOSS, 0.01, seed, scene), scene, model="blinn-phong", **OPTIONS)
+        assert result["k_d"][0].reason == result["k_s"][0].reason
+        assert re.search(r"only .* k_d \+ .* k_s = .* is determined", result["k_d"][0].reason)
+        np.testing.assert_allclose(result.fitted()[18, 18], noisy(GLOSS, 0.0, 0, scene)[18, 18], rtol=0.01)
+
+
 def test_a_coefficient_at_its_bound_is_zero_with_a_one_sided_interval():
     for seed in range(20):
         truth = brdf.BlinnPhong(k_a=0.0, k_d=0.5, k_s=0.6, n=30.0)

@@ -85,6 +85,7 @@ MISUSES = {
     "fitting.fit(target[:10], scene)": r"target: is 48 x 10, the scene's camera 48 x 48\.",
     "fitting.fit([target, target], [scene])": r"scene: has 1 entries for 2 pictures\.",
     "fitting.fit(target, scene, model=material)": r"model: is unknown, got BlinnPhong, no name\. Use auto or one of",
+    "fitting.fit(target, scene, model=scene)": r"model: is unknown, got Scene, no name\. Use auto or one of",
     "fitting.fit(target, scene, model='ward')": r"model: is unknown, got 'ward'\.",
     "fitting.fit(target, scene, loss='l2')": r"loss: is unknown, got 'l2'\.",
     "fitting.fit(target, scene, n_range=5)": r"n_range: must be 0 < lower < upper, got 5\.",
