@@ -12,6 +12,7 @@ only the pixels near an edge are gathered for the last steps.
 import dataclasses
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -154,7 +155,7 @@ def most_likely(
 
 def _deviation(pictures: Sequence[Picture], at: Numbers) -> float:
     """Standard deviation of what is left, in codes."""
-    return residual_deviation(map(_bounds, pictures), (_codes(picture, at) for picture in pictures))
+    return residual_deviation(map(_bounds, pictures), map(partial(_codes, at=at), pictures))
 
 
 def _in_light(fit: ModelFit) -> ModelFit:
@@ -575,7 +576,10 @@ def _near(picture: Picture, at: Estimate, reach: float) -> Bool[np.ndarray, " P"
 
 def _gathered(pictures: Sequence[Picture], at: Estimate) -> list[_Pixels]:
     """Those of whole pictures."""
-    return [_Pixels.of(picture.in_double(np.flatnonzero(_near(picture, at, REACH)))) for picture in pictures]
+    found = []
+    for picture in pictures:
+        found.append(_Pixels.of(picture.in_double(np.flatnonzero(_near(picture, at, REACH)))))
+    return found
 
 
 def _stratum(picture: Picture, size: int) -> _Pixels:
