@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from brdf.checks import direction_value
+from brdf.checks import direction_value, spectrum
 from brdf.errors import InputError
 from brdf.files import read_toml, write_text
 from brdf.geometry.base import Shape
@@ -167,6 +167,7 @@ def read_parts(path: Path, within: str | Path | None, tables: dict[str, Any] | N
         table.done("intensity")
         if not given:
             raise InputError(table.place, "has no intensity", "Add intensity = [r, g, b]")
+        ambient = table.made(spectrum, "intensity", ambient)
     lights, masks = [], []
     for table in _tables(path, "lights", values, within):
         masks.append(_read_mask(table))

@@ -84,13 +84,14 @@ def read_lights(path: str | Path) -> tuple[list[Path], Float[np.ndarray, "P 3"]]
 
     Args:
         path: an ``.lp`` file: a count, then a line ``name x y z`` a photograph. The last three words are the numbers:
-            a name may hold blanks, and folders, which are looked for beside the file and then left out.
+            a name may hold blanks, and folders, which are looked for beside the file and then left out. Lines that
+            begin with ``#`` are remarks.
 
     Raises:
         InputError: naming file and line.
     """
     lines = [line.strip() for line in read_text(path, MOST_BYTES).replace("\\", "/").splitlines()]
-    numbered = [(number, line) for number, line in enumerate(lines, start=1) if line]
+    numbered = [(number, line) for number, line in enumerate(lines, start=1) if line.partition("#")[0]]
     names, directions = [], []
     for number, line in numbered[1:]:
         words = line.replace(",", " ").replace("\t", " ").split()

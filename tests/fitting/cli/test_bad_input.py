@@ -69,7 +69,7 @@ SCENES = {
     "negative falloff": (SCENE + scene("[0, 0, 1]", "[1, 0, -1]", POINT), r"lights\[1\]\.attenuation"),
     "channels": (SCENE + scene("[1.0]", "[1.0, 1.0]", POINT), r"intensity: lights have 2 and 3 channels"),
     "ambient without intensity": (SCENE + "[ambient]\n", r"ambient: has no intensity"),
-    "negative ambient": (SCENE + "[ambient]\nintensity = -1\n", r"ambient|intensity: must be at least 0"),
+    "negative ambient": (SCENE + "[ambient]\nintensity = -1\n", r"ambient\.intensity: must be at least 0"),
     "unknown table": (SCENE + "[fog]\ndensity = 1\n", r"fog: is not a known key"),
     "not TOML": ("this is none", r"is not TOML"),
     "deep": ("a = " + "[" * 5000, r"is not TOML"),

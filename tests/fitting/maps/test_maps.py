@@ -294,7 +294,7 @@ def test_clipped_values_are_no_data():
     ],
 )
 def test_lines_of_a_light_file(tmp_path, line, name):
-    (tmp_path / "x.lp").write_text(f"1\r\n{line}\r\n")
+    (tmp_path / "x.lp").write_text(f"# of today\r\n1\r\n{line}\r\n")
     names, directions = read_lights(tmp_path / "x.lp")
     assert names[0].name == name
     assert directions.shape == (1, 3)
