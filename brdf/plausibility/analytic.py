@@ -109,7 +109,8 @@ def _energy(material: Material) -> Finding:
     albedo = np.asarray(directional_albedo(material, angle))
     channel = int(np.argmax(albedo))
     value, light, named = float(albedo[channel]), Angles(worst), in_channel(channel, albedo.size)
-    bound = _ROUNDING * abs(value)
+    # towards 90 degrees the cosine knows the rounding of the angle
+    bound = float((_ROUNDING + np.finfo(float).eps * angle / np.cos(angle)) * abs(value))
     if isinstance(material, SpecularMaterial):
         divisor = normalized_form(type(material)).scale(material.n) * np.cos(angle) if classic else 1.0
         bound += float(ACCURACY["float64"] * material.k_s[channel] / divisor)
