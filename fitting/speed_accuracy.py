@@ -31,7 +31,7 @@ from brdf.checks import positive
 from brdf.files import atomic_folder, write_text
 from brdf.models.base import SpecularMaterial
 from fitting.budget.configurations import Configuration, run
-from fitting.budget.error_estimate import SMALLEST
+from fitting.budget.error_estimate import sizes
 from fitting.budget.escalation import WHOLE
 from fitting.budget.light_samples import with_enough_samples
 from fitting.budget.sampling import sample_counts, sample_pixels
@@ -44,9 +44,9 @@ from fitting.uncertainty.covariance import TERMS
 PIXELS, SAMPLES = (1024, 8192, 65536, 524288), (4, 16, 64, 256, 1024)
 # Of pictures that are compared, and of solvers that keep a Jacobian.
 FEW_PIXELS = 1024
-# Where the general solvers start, which they are, the relative changes at which they stop, and how slow they may be.
-START = 30.0
-SOLVERS, SLOWER = (("lm", 1e-8), ("bfgs", 1e-8)), 100
+# The general solvers, the exponent where they start, the relative change at which they stop, and how slow they may be.
+SOLVERS = ("lm", "bfgs")
+START, TOLERANCE, SLOWER = 30.0, 1e-8, 100
 ROUNDS = 6
 # Among fits whose times are within this factor the least work is recommended, which is the same on every machine.
 CLEARLY = 2.0
@@ -111,20 +111,24 @@ class Row:
         return self.taken[0].compiling
 
     @property
+    def times(self) -> list[float]:
+        """Seconds without the compiler of the runs after the first, whose caches were cold, or of the only one."""
+        return [one.seconds for one in self.taken[1:] or self.taken]
+
+    @property
     def runs(self) -> int:
-        """How many runs tell the time: those after the first, whose caches were cold, or the only one."""
-        return max(len(self.taken) - 1, 1)
+        """How many they are."""
+        return len(self.times)
 
     @property
     def seconds(self) -> float:
-        """Their median, without the compiler."""
-        return float(np.median([one.seconds for one in self.taken[-self.runs :]]))
+        """Their median."""
+        return float(np.median(self.times))
 
     @property
     def spread(self) -> float:
         """Half the distance of their quartiles."""
-        low, high = np.quantile([one.seconds for one in self.taken[-self.runs :]], [0.25, 0.75])
-        return float(high - low) / 2
+        return float(np.subtract(*np.quantile(self.times, [0.75, 0.25]))) / 2
 
     @property
     def error(self) -> float:
@@ -361,19 +365,18 @@ def tradeoff(
 def parameter_deviation(material: brdf.Material, best: FitResult) -> float:
     """How far the parameters of a fit are from a reference: what an estimated error is an estimate of.
 
-    Of a coefficient: its difference over the largest channel of its kind in the reference (or over `SMALLEST` of its
-    largest coefficient, if that is more); of n: the difference of its logarithms; infinite where the models differ in
-    their highlight. What the reference does not determine is left out.
+    Of a coefficient: its difference over the largest of its kind in the reference, see `sizes`; of n: the difference of
+    its logarithms; infinite where the models differ in their highlight. What the reference does not determine is left
+    out.
     """
-    largest = {name: float(np.max(getattr(best.material, name, 0.0))) for name in TERMS}
-    least = max(SMALLEST * max(largest.values()), np.finfo(float).tiny)
+    size: dict[str, float] = dict(zip(TERMS, sizes(best), strict=True))
     worst = 0.0
     for one in best.parameters:
         if one.value is None:
             continue
         value = np.asarray(getattr(material, one.name, np.zeros(best.material.k_d.shape)))
         if one.name != "n":
-            off = abs(float(value[one.channel]) - one.value) / max(largest[one.name], least)
+            off = abs(float(value[one.channel]) - one.value) / size[one.name]
         elif type(material) is type(best.material):
             off = abs(float(np.log(value / one.value)))
         else:
@@ -413,8 +416,8 @@ class Bench:
             found += [("rounding", change(least_squares=True))]
         found += [("model", change(model="lambert", pixels=few))] if self.model != "lambert" else []
         if isinstance(self.best.material, SpecularMaterial):
-            solver = functools.partial(change, precision="float64", pixels=FEW_PIXELS)
-            found += [("solver", solver(solver=name, tolerance=tolerance)) for name, tolerance in SOLVERS]
+            solvers = (change(precision="float64", pixels=FEW_PIXELS, solver=name) for name in SOLVERS)
+            found += [("solver", how) for how in solvers]
         return [
             Row(axis, how, (4096 + how.work(self.scene)) * (SLOWER if axis == "solver" else 1)) for axis, how in found
         ]
@@ -446,15 +449,15 @@ class Bench:
             target, mask = sample.of(target), sample.of(mask)
             scene = brdf.some_pixels(scene, sample.pixel, precision="float64")
         half = np.full(self.best.material.k_d.shape, 0.5)
+        names = (*TERMS[scene.ambient is None :], "n")
         start = brdf.MODELS[self.model](k_a=half, k_d=half, k_s=half, n=START)  # pyright: ignore[reportCallIssue]
-        names = ("k_d", "k_s", "n") if scene.ambient is None else ("k_a", "k_d", "k_s", "n")
         return fit_jointly(
             target,
             scene,
             start,
             lambda material, scenes: [getattr(material, name) for name in names],
             solver=how.solver,  # pyright: ignore[reportArgumentType]
-            tolerance=how.tolerance or 1e-8,
+            tolerance=TOLERANCE,
             mask=mask,
             saturation=self.problem.saturation,
         ).material
@@ -467,6 +470,9 @@ def take(run: Callable[[], Any]) -> tuple[Any, Taken]:
     def listen(event: str, duration_secs: float, **_: Any) -> None:
         if event.startswith("/jax/core/compile/"):
             now = time.perf_counter()
+            # Spans of tracing, lowering and compiling lie within each other, and the inner ones end first.
+            while spans and spans[-1][0] >= now - duration_secs:
+                spans.pop()
             spans.append((now - duration_secs, now))
 
     jax.monitoring.register_event_duration_secs_listener(listen)
@@ -476,9 +482,5 @@ def take(run: Callable[[], Any]) -> tuple[Any, Taken]:
         seconds = time.perf_counter() - start
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
-    compiling, end = 0.0, start
-    # Spans of tracing, lowering and compiling lie within each other.
-    for first, last in sorted(spans):
-        compiling += max(0.0, last - max(first, end))
-        end = max(end, last)
+    compiling = sum(end - begin for begin, end in spans)
     return outcome, Taken(max(seconds - compiling, 0.0), compiling)

@@ -29,7 +29,6 @@ class Configuration:
         pixels: about how many of each picture are fitted; None for all.
         samples: of each light with an extent; None for as many as the problem says.
         solver: "separable", "lm" or "bfgs".
-        tolerance: of the latter two, relative.
         least_squares: also where the picture holds codes, whose likelihood is the default.
     """
 
@@ -38,7 +37,6 @@ class Configuration:
     pixels: int | None = None
     samples: int | None = None
     solver: str = "separable"
-    tolerance: float | None = None
     least_squares: bool = False
 
     def __str__(self) -> str:
@@ -46,7 +44,7 @@ class Configuration:
         words = [self.model, self.precision, "all pixels" if self.pixels is None else f"{self.pixels} pixels"]
         words += [f"{self.samples} light samples"] if self.samples is not None else []
         words += ["least squares"] if self.least_squares else []
-        words += [] if self.solver == "separable" else [f"{self.solver} to {self.tolerance:g}"]
+        words += [] if self.solver == "separable" else [self.solver]
         return ", ".join(words)
 
     def work(self, scene: brdf.Scene) -> float:

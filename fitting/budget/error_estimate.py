@@ -25,7 +25,9 @@ from fitting.budget.choice import Attempt
 from fitting.budget.configurations import Run
 from fitting.budget.sampling import PixelSample, sample_pixels
 from fitting.light_colour import coefficient_factors, take_colour_out
+from fitting.result import FitResult
 from fitting.solver.nnls import inverse_diagonal, scaled_inverse
+from fitting.uncertainty.covariance import TERMS
 
 # Pixels at which the model is evaluated, of all pictures together and of each at least; filled up to a multiple of
 # `FILLED`, so that few programs are compiled.
@@ -37,6 +39,15 @@ DEPENDENT = 1e-4
 SMALLEST = 0.01
 # Of log n, for the difference that stands for the lobe's derivative: to 1e-6 of it.
 STEP = 1e-4
+
+
+def sizes(result: FitResult) -> Float[np.ndarray, " 3"]:
+    """Of k_a, k_d, k_s the largest channel, but no less than `SMALLEST` of the largest coefficient of all."""
+    largest = np.zeros(3)
+    for one in result.parameters:
+        if one.name in TERMS and one.value is not None:
+            largest[TERMS.index(one.name)] = max(largest[TERMS.index(one.name)], one.value)
+    return np.maximum(largest, max(SMALLEST * largest.max(), np.finfo(float).tiny))
 
 
 class Probes:
@@ -89,9 +100,7 @@ class Probes:
         self.known = np.zeros(3 * channels + 1, bool)
         self.known[: len(result.parameters)] = [one.value is not None for one in result.parameters]
         factors = coefficient_factors(self.model, n, take_colour_out(problem.scenes, channels).colour)
-        largest = np.max(np.where(self.known[:-1].reshape(factors.shape), x / factors, 0.0), axis=1)
-        least = max(SMALLEST * float(np.max(largest)), np.finfo(float).tiny)
-        self.scale = np.append((np.maximum(largest, least)[:, None] * factors).ravel(), 1.0)
+        self.scale = np.append((sizes(result)[:, None] * factors).ravel(), 1.0)
 
     def _columns(self, scenes: Sequence[brdf.Scene], n: float) -> Float[np.ndarray, "M C 3"]:
         """Ambient, diffuse and lobe at an exponent under the lights of some scenes."""
@@ -136,21 +145,13 @@ def estimate(run: Run) -> Attempt:
     if samples is None and not any(run.samples):
         return Attempt(rounding, 3 * rounding, 0.0, 0.0, rounding)
     probes = Probes(run)
-    at_bound = np.append((optimum.x <= 0).ravel(), False)
-    told = probes.known | ~at_bound
+    # Coefficients at their bound count as if they were free, which makes no error smaller.
+    told = probes.known | np.append((optimum.x > 0).ravel(), True)
     inverse = scaled_inverse(probes.hessian * np.outer(told, told))
-
-    def above_bound(shift):
-        """Coefficients at their bound leave it upwards only."""
-        return np.where(at_bound, np.maximum(shift, 0.0), shift)
-
     scores = probes.scores(probes.residual)
     value, vector = np.linalg.eigh(inverse @ (probes.left_out * scores.T) @ scores @ inverse)
-    draws = np.random.default_rng(0).standard_normal((DRAWS, value.size)) * np.sqrt(np.maximum(value, 0.0))
-    # What the bound held back is part of it: without it such a coefficient would be off by chance alone.
-    held = inverse @ np.where(at_bound, scores.sum(axis=0), 0.0)
-    drawn = above_bound(draws @ vector.T + held) - above_bound(held)
-    missed = np.zeros(at_bound.size) if samples is None else samples.shift(told & ~at_bound)
+    drawn = np.random.default_rng(0).standard_normal((DRAWS, value.size)) * np.sqrt(np.maximum(value, 0.0)) @ vector.T
+    missed = np.zeros(value.size) if samples is None else samples.shift(told)
     error, bound = np.quantile(np.hypot(probes.error(drawn + missed), rounding), [0.5, 0.95])
     pixels = np.quantile(probes.error(drawn), 0.95)
     return Attempt(float(error), float(bound), float(pixels), float(probes.error(missed)), rounding)

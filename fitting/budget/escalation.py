@@ -35,8 +35,6 @@ COARSE = 1e-4
 # An attempt aims at this share of the accuracy in the pixels that it leaves out, the others are for the light samples;
 # without an accuracy at this share of the error of the one before.
 AIM, LESS = 0.8, 0.4
-# What a fit takes whatever its size, in pixels times samples.
-FIXED = 1e5
 
 # Why all pixels are fitted.
 REASON_FEW = "choosing among so few takes as long as looking at them"
@@ -75,25 +73,25 @@ def fit_within(problem: FitProblem, accuracy: float | None, seconds: float | Non
     for target, size, mask, scene in zip(problem.targets, sizes, problem.masks, scenes, strict=True):
         each = max(sum(sample_counts(scene)), 1) * (1 if target.codes is None else OF_CODES)
         work += each * (size if mask is None else np.count_nonzero(mask))
-    now, reason, attempts = Configuration(problem.model, precision, FIRST_PIXELS), "", []
-    if work <= FEW:
-        now, reason = dataclasses.replace(now, pixels=None), REASON_FEW
+    now, attempts = Configuration(problem.model, precision, None if work <= FEW else FIRST_PIXELS), list[Attempt]()
     while True:
         begun = time.perf_counter()
         done = run(problem, now)
-        if now.pixels is not None and not any(done.samples):
-            now, reason = dataclasses.replace(now, pixels=None), REASON_EMPTY
+        if not any(done.samples):
+            now = dataclasses.replace(now, pixels=None)
         told = estimate(done)
         took = time.perf_counter() - begun
         attempts.append(dataclasses.replace(told, configuration=str(now), seconds=took))
         after = _better(now, told, accuracy, WHOLE * max(sizes))
         if after is None or (accuracy is not None and told.bound <= accuracy):
             break
-        before, then = (FIXED + sum(map(how.work, scenes)) for how in (now, after))
-        if seconds is not None and time.perf_counter() - start + took * max(then / before, 1.0) > seconds:
+        before, then = (sum(map(how.work, scenes)) for how in (now, after))
+        if seconds is not None and time.perf_counter() - start + took * then / before > seconds:
             break
-        reason = REASON_MANY if after.pixels is None and now.pixels is not None else reason
         now = after
+    reason = ""
+    if now.pixels is None:
+        reason = REASON_FEW if work <= FEW else REASON_MANY if len(attempts) > 1 else REASON_EMPTY
     fitted = [size if sample is None else sample.pixel.size for size, sample in zip(sizes, done.samples, strict=True)]
     met = None if accuracy is None else told.bound <= accuracy
     choice = BudgetChoice(accuracy, seconds, tuple(attempts), sum(fitted), sum(sizes), met, reason)

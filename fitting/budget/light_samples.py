@@ -6,7 +6,7 @@ J'(fine - coarse), the Hessian H tells how far that puts each number off. Taken 
 a third of what noise leaves of all pixels, or below a thousandth of the number, and which leaves no structure in the
 residual that noise would not hide; fewer than the lights themselves say only where noise allows it, so that a picture
 without noise is fitted with the samples that it was drawn with. Where an accuracy is asked for, the error is to be a
-small part of that instead. What remains is told in the errors.
+small part of that instead, told by the largest count. What remains is told in the errors.
 
 The first fit also says where n is, so that all pixels see their light samples in one pass (`brdf.lobes.Near`).
 """
@@ -100,7 +100,12 @@ class _Ladder:
         return self.probes.scores(change).sum(axis=0), float(np.sqrt(square))
 
     def _missed(self, samples: int) -> tuple[np.ndarray, float]:
-        """The same for all samples beyond so many: of the next count, and of those after it as changes fall off."""
+        """The same for all samples beyond so many: of the next count, and of those after it as changes fall off.
+
+        Beside an accuracy, of those up to `MOST_SAMPLES`, which is dearer and surer.
+        """
+        if self.accuracy is not None:
+            return self._change(samples, self.counts[-1])
         index, last = self.counts.index(samples), len(self.counts) - 2
         step = min(index, last)
         coarse, fine = self.counts[step : step + 2]

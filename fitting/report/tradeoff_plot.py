@@ -1,6 +1,6 @@
 """The picture of a trade of speed for accuracy: error against time, both logarithmic."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -35,35 +35,28 @@ def error_against_time(tradeoff: "Tradeoff") -> Figure:
     figure = Figure(figsize=(6.4, 4.0), layout="constrained")
     axes = figure.add_subplot()
     axes.set(xscale="log", yscale="log", xlabel="time of a fit, compiled (ms)", ylabel="relative error of the fit")
-    axes.axhline(tradeoff.accuracy, color="0.2", lw=0.9, ls=(0, (4, 3)), label=f"accuracy {tradeoff.accuracy:g}")
+    axes.axhline(tradeoff.accuracy, color="0.2", lw=0.9, ls="--", label=f"accuracy {tradeoff.accuracy:g}")
     rows = [row for row in tradeoff.rows if np.isfinite(row.error)]
     least = min([row.error for row in rows if row.error > 0] + [tradeoff.accuracy]) / BELOW
     points = {row: (1e3 * row.seconds, max(row.error, least)) for row in rows}
-    beside: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8, "color": "0.3", "zorder": 5}
-    for axis, (colour, marker) in MARKS.items():
-        for row in (row for row in rows if row.axis == axis):
-            time, height = points[row]
-            reach = min(1e3 * row.spread, 0.5 * time)
-            axes.errorbar(time, height, xerr=reach, fmt=marker, color=colour, elinewidth=0.8, zorder=3, label=axis)
-            if row.error == 0:
-                axes.annotate("error 0: the reference", points[row], xytext=(9, -3), **beside)
+    for axis, (colour, mark) in MARKS.items():
+        if some := [row for row in rows if row.axis == axis]:
+            times, heights = np.array([points[row] for row in some]).T
+            reach = np.minimum([1e3 * row.spread for row in some], 0.5 * times)
+            axes.errorbar(times, heights, xerr=reach, fmt=mark, color=colour, elinewidth=0.8, zorder=3, label=axis)
     if tradeoff.front:
         front = np.array([points[row] for row in tradeoff.front]).T
-        axes.step(*front, where="post", color="0.6", lw=1.2, zorder=1, label="Pareto front")
+        axes.step(*front, where="post", c="0.6", label="Pareto front")
     words = {row: tradeoff.marks(row).removesuffix("front").rstrip(", ") for row in rows}
     for number, row in enumerate(dict.fromkeys([*tradeoff.front, *filter(words.get, rows)]), start=1):
-        axes.annotate(str(number), points[row], xytext=(-7, -5), ha="right", va="top", **beside)
-        name = tradeoff.brief(row)
+        axes.annotate(str(number), points[row], (-7, -5), textcoords="offset points", ha="right", va="top", fontsize=8)
+        name = tradeoff.brief(row) + (" = reference" if row.error == 0 else "")
         if words[row]:
-            axes.plot(*points[row], "o", zorder=4, markersize=11, markerfacecolor="none", markeredgecolor="0.1")
+            axes.plot(*points[row], "o", markersize=11, markerfacecolor="none", markeredgecolor="0.1")
             name += f"\n({words[row]})"
         axes.plot([], [], color="0.3", marker=f"${number}$", linestyle="", label=name)
     axes.margins(0.12)
     legible(axes.xaxis)
-    axes.grid(visible=True, which="major", color="0.9", linewidth=0.6)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-    labels = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
-    place: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.0}
-    axes.legend(labels.values(), labels.keys(), frameon=False, fontsize=8, **place)
+    axes.grid(visible=True, color="0.9", linewidth=0.6)
+    axes.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0)
     return figure

@@ -75,7 +75,7 @@ def test_a_table_cut_short_recommends_only_what_keeps_the_accuracy():
 
 def test_only_the_axes_that_a_scene_has_are_tried(tmp_path, monkeypatch):
     # One solver tells as much as two, and two rounds as much as six.
-    monkeypatch.setattr(speed_accuracy, "SOLVERS", (("lm", 1e-4),))
+    monkeypatch.setattr(speed_accuracy, "SOLVERS", ("lm",))
     monkeypatch.setattr(speed_accuracy, "ROUNDS", 1)
     scene = ball(64)
     found = fitting.tradeoff(noisy(scene, 0.01), scene, seconds=600.0)
