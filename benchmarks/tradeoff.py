@@ -1,15 +1,13 @@
-"""Does ``fit(accuracy=...)`` keep its word, and at what price? Twenty scenes of different kinds.
+"""Does ``fit(accuracy=...)`` keep its word? Twenty scenes of different kinds.
 
 ``python -m benchmarks.tradeoff [NAME ...]`` prints one line for each scene and accuracy: the error against a reference
-(float64, all pixels, 4096 light samples), the estimate, and the time over that of the cheapest of a grid of plain
-configurations that meets the accuracy, all compiled before and measured in turns. A summary follows.
-``python -m benchmarks.tradeoff unlike`` does the same without the times for a dozen scenes of other kinds.
+(float64, all pixels, 4096 light samples), the estimate, and what was chosen. A summary follows.
+``python -m benchmarks.tradeoff unlike`` does the same for a dozen scenes of other kinds.
 """
 
 import dataclasses
 import sys
 import tempfile
-import time
 import zlib
 from pathlib import Path
 
@@ -25,8 +23,6 @@ from fitting.speed_accuracy import parameter_deviation
 ACCURACIES = (1e-1, 1e-2, 1e-3, 1e-4)
 OPTIONS = {"n_range": (0.1, 1e6), "mask": None, "saturation": None}
 SIZE, SMALL = 1200, 48
-# Rounds of timing: the most, the fewest, and the seconds after which no more than the fewest are begun.
-REPEATS, FEWEST_REPEATS, PATIENCE = 40, 3, 12.0
 # What the reference resolves: its steps end there.
 RESOLVED = 1e-9
 SUN = brdf.DirectionalLight(direction=(0.5, 0.6, 0.7), intensity=1.0)
@@ -100,32 +96,6 @@ def scenes():
     yield "sky", scene(brdf.EnvironmentMap(sky(3)), look=small), material(20.0), "blinn-phong", 0.01
 
 
-def samples_of(place):
-    """Whether a light's number of samples can be chosen."""
-    return any(hasattr(light, "samples") for light in place.lights)
-
-
-def configurations(place, model):
-    """The grid of plain configurations that the price is compared with."""
-    pixels = (1024, 4096, 16384, None) if place.resolution[0] > SMALL else (None,)
-    samples = (16, 64, 256, 1024) if samples_of(place) else (None,)
-    found = [Configuration(model, "float32", p, s) for p in pixels for s in samples]
-    return found if samples_of(place) else [*found, Configuration(model, "float64")]
-
-
-def measure(jobs):
-    """The best of each job's times, in turns: the machine is shared with others."""
-    times, begun = {name: [] for name in jobs}, time.perf_counter()
-    for repeat in range(REPEATS):
-        if repeat >= FEWEST_REPEATS and time.perf_counter() - begun > PATIENCE:
-            break
-        for name, job in jobs.items():
-            start = time.perf_counter()
-            job()
-            times[name].append(time.perf_counter() - start)
-    return {name: min(each) for name, each in times.items()}
-
-
 def photograph(name, place, true, noise):
     """What a scene shows under 4096 light samples, with noise, a share of the mean."""
     picture = np.asarray(brdf.render(true, with_samples(place, 4096), precision="float64"))
@@ -144,35 +114,21 @@ def deviation(result, best):
     return max(parameter_deviation(result.material, best), float(np.sqrt(square / total)))
 
 
-def study(name, place, picture, model, options=OPTIONS, *, timed=True):
+def study(name, place, picture, model, options=OPTIONS):
     """All accuracies on one scene."""
     given = {key: value for key, value in options.items() if value is not None}
     problem = state_problem(picture, place, model=model, **given)
     best = run(problem, Configuration(model, "float64", samples=4096)).result
-    jobs, errors, rows = {}, {}, []
-    for how in configurations(place, model) if timed else ():
-        jobs[how] = lambda how=how: run(problem, how)
-        errors[how] = deviation(jobs[how]().result, best)
-    for accuracy in ACCURACIES:
-        jobs[accuracy] = lambda e=accuracy: fitting.fit(picture, place, model=model, accuracy=e, **given)
-        result = jobs[accuracy]()
-        rows.append([accuracy, deviation(result, best), result.choice])
-    times = measure(jobs) if timed else {}
     found = []
-    for accuracy, actual, choice in rows:
-        meeting = [times[how] for how, error in errors.items() if error <= accuracy]
-        took, cheapest = times.get(accuracy, np.nan), min(meeting) if meeting else np.nan
-        one = {
-            "held": actual <= accuracy,
-            "agrees": choice.chosen.error / 3 <= actual <= 3 * choice.chosen.error
-            or max(actual, choice.chosen.error) < RESOLVED,
-            "price": took / cheapest,
-        }
-        found.append(one)
-        price = f"price {one['price']:5.2f}  {1e3 * took:7.1f} ms  " if timed else ""
+    for accuracy in ACCURACIES:
+        result = fitting.fit(picture, place, model=model, accuracy=accuracy, **given)
+        actual, choice = deviation(result, best), result.choice
+        told = choice.chosen.error
+        held, agrees = actual <= accuracy, told / 3 <= actual <= 3 * told or max(actual, told) < RESOLVED
+        found.append((held, agrees))
         print(
-            f"{name:<18}{accuracy:>8.0e}  error {actual:.1e}  estimate {choice.chosen.error:.1e}  "
-            f"{'held' if one['held'] else 'BROKEN':<6} {'' if one['agrees'] else 'far off '}{price}"
+            f"{name:<18}{accuracy:>8.0e}  error {actual:.1e}  estimate {told:.1e}  "
+            f"{'held' if held else 'BROKEN':<6} {'' if agrees else 'far off '}"
             f"attempts {len(choice.attempts)}  {choice.chosen.configuration} ({choice.pixels} of {choice.of_pixels})",
             flush=True,
         )
@@ -245,13 +201,8 @@ def unlike(folder):
 
 def summary(found):
     """Of the cases so far."""
-    held, agrees = (np.mean([one[name] for one in found]) for name in ("held", "agrees"))
-    words = f"  so far {len(found)} cases: held {held:.1%}, estimate within a factor of 3 {agrees:.1%}"
-    prices = np.array([one["price"] for one in found])
-    prices = prices[np.isfinite(prices)]
-    if prices.size:
-        words += f", price median {np.median(prices):.2f}, at most 1.5 in {np.mean(prices <= 1.5):.1%}"
-    print(words, flush=True)
+    held, agrees = np.mean(found, axis=0)
+    print(f"  so far {len(found)} cases: held {held:.1%}, estimate within a factor of 3 {agrees:.1%}", flush=True)
 
 
 def main(names):
@@ -260,7 +211,7 @@ def main(names):
     if names == ["unlike"]:
         with tempfile.TemporaryDirectory() as folder:
             for name, place, picture, model, options in unlike(folder):
-                found += study(name, place, picture, model, options, timed=False)
+                found += study(name, place, picture, model, options)
                 summary(found)
         return
     for name, place, true, model, noise in scenes():
