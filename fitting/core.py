@@ -1,6 +1,7 @@
 """One fit: the pictures of a problem under one model, or under the simplest adequate one."""
 
 import dataclasses
+import math
 import time
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -23,7 +24,7 @@ from fitting.plausible import fit_plausible, is_plausible
 from fitting.problem import FitProblem
 from fitting.result import FitResult
 from fitting.sample_error import MOST, SampleError, between, near_exponent, nearer
-from fitting.selection import FAMILIES, Choice, choose
+from fitting.selection import FAMILIES, Choice, choose, is_better
 from fitting.solver.devices import placed
 from fitting.solver.losses import reweight
 from fitting.solver.normal_equations import Picture
@@ -32,7 +33,7 @@ from fitting.solver.streams import Stream, each
 from fitting.solver.tied import NormalEquations, design_of, join_channels
 from fitting.uncertainty.covariance import residual_noise
 from fitting.uncertainty.highlight import nearest_peak
-from fitting.uncertainty.interpretation import Interpretation, interpret, shared_errors
+from fitting.uncertainty.interpretation import Interpretation, alone_covariance, interpret, shared_errors
 from fitting.uncertainty.noise_model import weighted_sums
 from fitting.uncertainty.residual_correlation import residual_correlation
 from fitting.uncertainty.structure import CHANCE, Errors, shared
@@ -45,6 +46,8 @@ UNSEEN = 60.0
 EXPLAINED = 0.35
 # A highlight that changes no value by this share of a code is none: rounding hides it.
 HIDDEN = 0.5
+# A highlight in a colour JPEG has a colour where that is so many deviations of what the codec leaves.
+COLOURED = 4.0
 # As many independent values a picture has at least.
 FEWEST_MEASUREMENTS = 30.0
 # A highlight that leaves so many times the squares of another one is not made likelier than it by rounding.
@@ -76,7 +79,7 @@ def fit_pictures(problem: FitProblem) -> FitResult:
             fit, choice = _fit_simplest(seen)
         else:
             fit, choice = most_likely(_fit_model(brdf.MODELS[problem.model], seen), copies=seen.copies), None
-        fit, seen = _less_codec_errors(fit, seen)
+        fit, choice, seen = _less_codec_errors(fit, choice, seen)
         fit = _held_plausible(fit, seen)
         told, optimum = _interpreted(fit, seen, choice), fit.optimum
         hidden = told.hidden_highlight
@@ -265,16 +268,42 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
     return most_likely(chosen, copies=seen.copies), choice
 
 
-def _less_codec_errors(fit: ModelFit, seen: Observed) -> tuple[ModelFit, Observed]:
-    """The same model again, where compression erred in its colours, and the pixels without these errors.
+def _less_codec_errors(
+    fit: ModelFit, choice: Choice | None, seen: Observed
+) -> tuple[ModelFit, Choice | None, Observed]:
+    """The same terms again, where compression erred in their colours, and the pixels without these errors.
 
-    What a codec takes away its look-alike does not show: which terms there are is decided before.
+    What a codec takes away its look-alike does not show: which terms there are is decided before. But a highlight that
+    was found in brightness may have any colour, and by that its model shows.
     """
     codecs = [codec_of(target) for target in seen.problem.targets]
     if fit.evidence is None or not any(codecs):
-        return fit, seen
+        return fit, choice, seen
+    if choice is not None and fit.tied is not None:
+        fits = [_fit_model(brdf.MODELS[name], seen, fit.free.copy()) for name in seen.problem.families]
+        clean = without_codec_errors(seen, min(fits, key=lambda one: float(np.sum(one.optimum.cost))), codecs)
+        fits = [most_likely(_fit_model(one.model, clean, fit.free.copy())) for one in fits]
+        best = max(fits, key=lambda one: -math.inf if one.evidence is None else one.evidence.value)
+        if _coloured(best, clean):
+            return best, choice.of(best.model.name, best.free, grey=False), clean
     seen = without_codec_errors(seen, _by_squares(fit, seen), codecs)
-    return most_likely(_by_squares(fit, seen), copies=seen.copies), seen
+    return most_likely(_by_squares(fit, seen), copies=seen.copies), choice, seen
+
+
+def _coloured(fit: ModelFit, seen: Observed) -> bool:
+    """Whether the channels' k_s differ by more than their errors, and by more codes than a codec errs in colours."""
+    said = fit.evidence
+    if said is None or not np.all(said.optimum.x[2] > 0):
+        return False
+    lobe = slice(2 * seen.colour.size, -1)
+    grey = coefficient_factors(fit.model, fit.optimum.n, seen.colour)[2]
+    scatter, alone = shared_errors(said, seen)[0], alone_covariance(said.optimum, None)
+    covariance = (alone if scatter is None else alone @ scatter @ alone)[lobe, lobe] / np.outer(grey, grey)
+    k_s, precision = said.optimum.x[2] / grey, np.linalg.pinv(covariance, hermitian=True)
+    left = k_s - np.sum(precision @ k_s) / np.sum(precision)
+    seen_as = max(highlight_in_codes(picture, fit.optimum.x, fit.optimum.n) for picture in fit.pictures)
+    differs = seen_as * float(np.max(np.abs(left)) / np.max(k_s)) > COLOURED * said.noise
+    return differs and is_better(float(left @ precision @ left), k_s.size - 1)
 
 
 def _by_squares(fit: ModelFit, seen: Observed) -> ModelFit:

@@ -18,7 +18,7 @@ shows the Bayesian information criterion (Schwarz 1978), which asks more of larg
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -89,6 +89,31 @@ class Choice(NamedTuple):
     grey: bool
     rivals: tuple[str, ...]
     dropped: Float[np.ndarray, " U"]
+
+    def of(self, model: str, free: Bool[np.ndarray, "3 C"], *, grey: bool) -> "Choice":
+        """The same with another candidate of a highlight.
+
+        Args:
+            model: its name.
+            free: its coefficients.
+            grey: whether its k_s is the same in all channels.
+        """
+        wanted = model, bool(free[0].any()), "grey" if grey else "coloured"
+        candidates = tuple(
+            replace(one, chosen=(one.model, one.ambient, one.highlight) == wanted) for one in self.candidates
+        )
+        rivals = tuple(sorted({self.model, *self.rivals} - {model})) if self.rivals else ()
+        return Choice(candidates, model, free, grey, rivals, np.zeros_like(self.dropped))
+
+
+def is_better(gain: float, unknowns: int) -> bool:
+    """Whether so many further unknowns earn what they gain: more than a standard error, where held out.
+
+    Args:
+        gain: by how much they lower the cost, in noise variances.
+        unknowns: how many.
+    """
+    return gain - 2 * unknowns > 2 * np.sqrt(max(gain, 0.0))
 
 
 class _Trial(NamedTuple):

@@ -104,7 +104,9 @@ def interpret(
         # Of a small highlight the pixels near an edge may tell next to nothing.
         gain = specular_gain(optimum, noise)
         fit, optimum, deviation = fit._replace(pictures=said.pictures, optimum=said.optimum), said.optimum, noise**0
-        shared, together = shared_errors(said, seen, _alone(optimum, fit.tied) if said.together is None else None)
+        shared, together = shared_errors(
+            said, seen, alone_covariance(optimum, fit.tied) if said.together is None else None
+        )
         # What errs together by less than codes tell apart is in the errors, and no more need be said.
         together = None if said.noise < ROUNDED else together
         widening = said.widening
@@ -115,7 +117,7 @@ def interpret(
         together = _structure(pictures, seen, optimum, noise, rounding, even=known.noise is None)
         # What a bound of the material leaves is no error of the pixels.
         if together is not None and together.significant and not fit.capped:
-            shared = _scattered(pictures, optimum, _left(pictures, seen, optimum), _alone(optimum, fit.tied))
+            shared = _scattered(pictures, optimum, _left(pictures, seen, optimum), alone_covariance(optimum, fit.tied))
     if fit.evidence is None and shared is None and known.noise is not None:
         spread = fit.noise_factor**2 * weighted_sums(pictures, optimum, known.noise, inverse=False).gram
     # What the light reaches but the simplest model does without is 0, with the error that it would have.
@@ -220,8 +222,13 @@ def _scattered(
     return np.sum([scatter(picture, optimum, one, covariance) for picture, one in both], axis=0)
 
 
-def _alone(optimum: Optimum, tied: np.ndarray | None) -> Float[np.ndarray, "U U"]:
-    """Covariance of independent pixels whose weights are inverse variances."""
+def alone_covariance(optimum: Optimum, tied: np.ndarray | None) -> Float[np.ndarray, "U U"]:
+    """Covariance of independent pixels whose weights are inverse variances.
+
+    Args:
+        optimum: with the sums of these.
+        tied: see `fitting.model_fit.ModelFit`.
+    """
     design = design_of(optimum.x > 0, tied)
     whole = join_channels(optimum.gram, optimum.product, optimum.square, optimum.x[2]).gram
     return design @ scaled_inverse(design.T @ whole @ design) @ design.T

@@ -57,6 +57,18 @@ def test_what_the_codec_takes_from_colours_is_made_good(tmp_path, monkeypatch):
     assert k_s < 0.75
 
 
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+def test_a_highlight_that_was_found_in_brightness_keeps_its_colour(tmp_path, noise):
+    for seed in (0, 3, 4):
+        one = ball(seed, channels=3)
+        kept = File(noise, curve="srgb", suffix=".jpg", quality=QUALITY, channels=3)
+        result = fitting.fit(kept.picture(one.drawn(), seed, tmp_path), one.scene())
+        assert result.surface == one.model
+        (chosen,) = (candidate for candidate in result.candidates if candidate.chosen)
+        assert (chosen.model, chosen.highlight) == (one.model, "coloured")
+        np.testing.assert_allclose(result.material.k_s, one.k[2], rtol=0.15)
+
+
 def test_bands_of_rows_make_no_difference(tmp_path, monkeypatch):
     one = ball(3, channels=3, size=128)
     picture = COLOUR.picture(one.drawn(), 3, tmp_path)
