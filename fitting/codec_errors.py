@@ -71,13 +71,13 @@ def _predicted(tile: Tile, fit: ModelFit, index: int) -> Float[np.ndarray, "P C"
 def _codec_errors(codec: Jpeg, codes: Codes, shown: Float[np.ndarray, "P C"]) -> Float[np.ndarray, "P C"]:
     """What compression does to each code of a picture, 0 where nothing is predicted."""
     counts, unit, random = np.isfinite(shown), TOP / codes.scale, np.random.default_rng(0)
-    # Beside the object stands what the file shows there.
-    shows = codes.values.reshape(shown.shape) * unit
+    # Beside the object stands what the file shows there; values that were taken out were clipped.
+    shows = np.nan_to_num(codes.values.reshape(shown.shape) * unit, nan=TOP)
     clean = np.where(counts, shown * unit, shows)
 
     def look_alike(noise: float) -> tuple[np.ndarray, np.ndarray]:
         """Before the codec and after it."""
-        before = clean + noise * counts * random.standard_normal(clean.shape, np.float32)
+        before = clean + counts * random.standard_normal(clean.shape, np.float32) * np.float32(noise)
         given = np.clip(np.rint(before), 0, TOP).astype(np.uint8)
         return before, codec.through(given.reshape(codes.values.shape)).reshape(shown.shape)
 

@@ -274,10 +274,10 @@ def _less_codec_errors(
     """The same terms again, where compression erred in their colours, and the pixels without these errors.
 
     What a codec takes away its look-alike does not show: which terms there are is decided before. But a highlight that
-    was found in brightness may have any colour, and by that its model shows.
+    was found in brightness may have any colour, and by that its model shows. Grey saved as colour has none to lose.
     """
     codecs = [codec_of(target) for target in seen.problem.targets]
-    if fit.evidence is None or not any(codecs):
+    if fit.evidence is None or seen.copies or not any(codecs):
         return fit, choice, seen
     if choice is not None and fit.tied is not None:
         fits = [_fit_model(brdf.MODELS[name], seen, fit.free.copy()) for name in seen.problem.families]

@@ -242,7 +242,10 @@ def _of_picture(picture: brdf.Picture, rounding: Rounding) -> Target:
     if rounding is not None or not picture.lossy or steps is not None:
         of_file = (picture.encoding, picture.bits) if steps is not None else (None, None)
         codes = find_codes(picture.pixels, *of_file, rounding, picture.factor)
-    codes = None if codes is None else codes._replace(lossy=picture.lossy, jpeg=picture.jpeg)
+    if codes is not None:
+        # Steps that the user states are not the codes that were compressed.
+        jpeg = picture.jpeg if rounding is None or isinstance(rounding, str) else None
+        codes = codes._replace(lossy=picture.lossy, jpeg=jpeg)
     least, file = rounding is not None and codes is None, None
     if picture.path is not None:
         file = {"path": str(picture.path), "encoding": picture.encoding, "source": picture.source}

@@ -12,14 +12,14 @@ from jaxtyping import UInt8
 
 from brdf.files import utf8_name
 
-_TABLES, _SCAN = 0xDB, 0xDA
+_TABLES, _SCAN, _FILL = 0xDB, 0xDA, 0xFF
 
 
 class Jpeg(NamedTuple):
     """How a JPEG was written.
 
     Attributes:
-        steps: sum of its tables of steps.
+        steps: sum of its tables of steps, of brightness and of colours.
         subsampling: of the colours, "4:4:4" for none.
     """
 
@@ -66,15 +66,24 @@ def _steps_of(quality: int) -> int:
 
 
 def steps(path: Path) -> int:
-    """The sum of a file's tables of steps (ITU T.81, B.2.4.1).
+    """The sum of a file's first two tables of steps, of brightness and of colours; 0 where it has fewer.
+
+    Source: ITU T.81, B.1.1.2 and B.2.4.1.
 
     Args:
         path: of a JPEG.
     """
-    data, at, total = path.read_bytes(), 2, 0
+    data, at, tables = path.read_bytes(), 2, []
     while at + 4 <= len(data) and data[at + 1] != _SCAN:
+        if data[at + 1] == _FILL:
+            at += 1
+            continue
         end = at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-        if data[at + 1] == _TABLES:
-            total += sum(data[at + 4 : end])
+        segment = data[at + 4 : end] if data[at + 1] == _TABLES else b""
+        while segment:
+            wide = segment[0] >> 4
+            size = 1 + (64 << wide)
+            tables.append(int(np.frombuffer(segment[1:size], ">u2" if wide else "u1").sum()))
+            segment = segment[size:]
         at = end
-    return total
+    return sum(tables[:2]) if len(tables) > 1 else 0

@@ -47,7 +47,7 @@ class Picture:
         factor: what the linear values of the file were multiplied by, a number or (C,).
         path: the file; None where it came from none.
         lossy: the file was compressed with losses, so that neighbours share errors.
-        jpeg: how a JPEG was; None for other files.
+        jpeg: how a JPEG in colour was; None for other files.
 
     Example:
         >>> picture = brdf.read_picture("target.exr")
@@ -144,8 +144,9 @@ class ImageReader:
         packed = spec.get_string_attribute("compression")
         self.lossy = name in ("jpeg", "webp", "heif") or packed.startswith(("jpeg", "dwa", "b44"))
         self.jpeg = None
-        if name == "jpeg":
-            self.jpeg = Jpeg(steps(self.path), spec.get_string_attribute("jpeg:subsampling", "4:4:4"))
+        # Of brightness and colours apart, as most are; inks are not.
+        if name == "jpeg" and not spec.get_string_attribute("jpeg:ColorSpace") and (found := steps(self.path)):
+            self.jpeg = Jpeg(found, spec.get_string_attribute("jpeg:subsampling", "4:4:4"))
         self._top = LOSSY_TOP if self.lossy else 1.0
         turn = spec.get_int_attribute("Orientation", 1)
         self._turn = turn if turn in range(2, 9) else 1

@@ -1,21 +1,24 @@
 """What a JPEG does to colours, against the truth."""
 
+import dataclasses
+
 import numpy as np
 import OpenImageIO as oiio  # noqa: N813
 import pytest
 
 import brdf
 import fitting
-from benchmarks.truth import File, ball
+from benchmarks.truth import File, ball, encoded
 from brdf.images.jpeg import Jpeg, steps
 from fitting import codec_errors, core, pixels
+from fitting.problem import as_target
 
 QUALITY = 90
 COLOUR = File(curve="srgb", suffix=".jpg", quality=QUALITY, channels=3)
 
 
 def written(path, codes, quality, subsampling):
-    spec = oiio.ImageSpec(codes.shape[1], codes.shape[0], 3, "uint8")
+    spec = oiio.ImageSpec(codes.shape[1], codes.shape[0], codes.shape[2], "uint8")
     spec["CompressionQuality"], spec["jpeg:subsampling"] = quality, subsampling
     file = oiio.ImageOutput.create(str(path))
     assert file is not None
@@ -100,3 +103,47 @@ def test_the_noise_of_a_look_alike_is_that_of_the_picture(tmp_path, monkeypatch)
         fitting.fit(picture, one.scene(), model=one.model)
         tried.append(len(seen) - codec_errors.LOOK_ALIKES)
     assert tried[0] < tried[1] <= len(codec_errors.NOISES)
+
+
+@pytest.mark.parametrize("lost", ["taken out", "clipped in one channel"])
+def test_values_that_are_no_numbers_are_no_codes(tmp_path, lost):
+    one = ball(3, channels=3, size=64)
+    picture = COLOUR.picture(one.drawn() * (1.3 if lost.startswith("clipped") else 1.0), 3, tmp_path)
+    if lost == "taken out":
+        pixels = picture.pixels.copy()
+        pixels[30:34, 30:34] = np.nan
+        picture = dataclasses.replace(picture, pixels=pixels)
+    else:
+        picture = picture.scaled([1 / 1.3, 0.9 / 1.3, 1 / 1.3])
+    assert np.isnan(picture.pixels).any()
+    found = fitting.fit(picture, one.scene(), model=one.model).material
+    np.testing.assert_allclose(found.k_d, one.k[1] * ([1, 0.9, 1] if lost != "taken out" else 1.0), rtol=0.03)
+
+
+def test_grey_saved_as_colour_stays_grey(tmp_path):
+    one = ball(3, size=64)
+    codes = np.rint(255 * encoded(one.drawn(), "srgb")).astype(np.uint8)
+    written(tmp_path / "grey.jpg", codes.repeat(3, axis=2), QUALITY, "4:4:4")
+    found = fitting.fit(tmp_path / "grey.jpg", one.scene(), model=one.model).material
+    np.testing.assert_allclose(found.k_d, found.k_d[0], rtol=1e-7)
+
+
+def test_steps_that_are_stated_were_not_compressed(tmp_path):
+    picture = COLOUR.picture(ball(3, channels=3, size=64).drawn(), 3, tmp_path)
+    for rounding, kept in [(None, True), ("floor", True), (1 / 255, False)]:
+        codes = as_target(picture, rounding).codes
+        assert codes is not None
+        assert (codes.jpeg is not None) == kept
+
+
+def test_bytes_that_fill_up_before_a_marker_are_skipped(tmp_path):
+    path = tmp_path / "picture.jpg"
+    written(path, np.full((16, 16, 3), 99, np.uint8), QUALITY, "4:4:4")
+    found, data = steps(path), path.read_bytes()
+    path.write_bytes(data[:2] + b"\xff\xff" + data[2:])
+    assert steps(path) == found
+
+
+def test_one_table_of_steps_for_all_is_no_such_codec(tmp_path):
+    written(tmp_path / "grey.jpg", np.full((16, 16, 1), 99, np.uint8), QUALITY, "4:4:4")
+    assert brdf.read_picture(tmp_path / "grey.jpg").jpeg is None
