@@ -109,16 +109,18 @@ class Bounds(eqx.Module):
         """Distances of the ends, of values that have both."""
         return (self.upper - self.lower)[np.isfinite(self.lower) & np.isfinite(self.upper)]
 
-    def in_light(self) -> "Bounds":
-        """The same ends in linear light, in units of their median distance."""
+    def in_light(self, size: float = 1.0) -> "Bounds":
+        """The same ends in linear light.
+
+        Args:
+            size: the unit, as a share of white.
+        """
         steps = float(self.scale)
         lower, upper = (
-            np.where(np.isfinite(end), decode(np.where(np.isfinite(end), end, 0.0) / steps, self.encoding), end)
+            np.where(np.isfinite(end), decode(np.where(np.isfinite(end), end, 0.0) / steps, self.encoding) / size, end)
             for end in (self.lower, self.upper)
         )
-        light = dataclasses.replace(self, lower=lower, upper=upper, scale=np.ones(()), encoding="linear")
-        size = float(np.median(light.widths))
-        return dataclasses.replace(light, lower=lower / size, upper=upper / size, scale=np.asarray(1 / size))
+        return dataclasses.replace(self, lower=lower, upper=upper, scale=np.asarray(1 / size), encoding="linear")
 
     def near(self, code: Float[np.ndarray, "P C"], distance: float) -> Bool[np.ndarray, " P"]:
         """Which pixels have a value that is predicted beyond an end or near it.

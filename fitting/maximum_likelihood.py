@@ -105,10 +105,6 @@ class _Pixels(NamedTuple):
         bounds = _bounds(picture)
         return cls(picture, Intervals(bounds.lower, bounds.upper, bounds.spread))
 
-    def in_light(self) -> "_Pixels":
-        """The same with ends in linear light."""
-        return _Pixels.of(dataclasses.replace(self.picture, bounds=_bounds(self.picture).in_light()))
-
 
 def most_likely(
     fit: ModelFit, *, copies: bool = False, grey: np.ndarray | None = None, precision: np.ndarray | None = None
@@ -158,22 +154,34 @@ def _deviation(pictures: Sequence[Picture], at: Numbers) -> float:
     return residual_deviation(map(_bounds, pictures), map(partial(_codes, at=at), pictures))
 
 
-def _in_light(fit: ModelFit) -> ModelFit:
-    """With the ends in linear light, for noise that came before the encoding: that of a camera or a path tracer."""
-    pictures = [dataclasses.replace(picture, bounds=_bounds(picture).in_light()) for picture in fit.pictures]
-    return fit._replace(pictures=pictures)
+def _is_curved(pictures: Sequence[Picture]) -> bool:
+    """Whether rounded values are not linear in light, and some have both ends."""
+    bounds = list(map(_bounds, pictures))
+    return (
+        any(own.encoding != "linear" for own in bounds)
+        and any(own.widths.size for own in bounds)
+        and not any(own.exact for own in bounds)
+    )
+
+
+def _in_light(pictures: Sequence[Picture]) -> list[Picture]:
+    """With the ends in linear light, for noise that came before the encoding: that of a camera or a path tracer.
+
+    The unit is their median distance in all pictures, or noise of one size would be another one in each.
+    """
+    size = float(np.median(np.concatenate([_bounds(picture).in_light().widths for picture in pictures])))
+    return [dataclasses.replace(picture, bounds=_bounds(picture).in_light(size)) for picture in pictures]
 
 
 def _where_noise_is_even(fit: ModelFit, at: Numbers, noise: float) -> tuple[ModelFit, float]:
     """A fit and its noise in codes, or in light where noise of one size there is likelier and more than rounding."""
-    before = list(map(_bounds, fit.pictures))
-    if all(bounds.encoding == "linear" for bounds in before) or not all(bounds.widths.size for bounds in before):
+    if not _is_curved(fit.pictures):
         return fit, noise
-    light = _in_light(fit)
+    light = fit._replace(pictures=_in_light(fit.pictures))
     after = _deviation(light.pictures, at)
     if not min(noise, after) > 0:
         return fit, noise
-    widths = zip(before, map(_bounds, light.pictures), strict=True)
+    widths = zip(map(_bounds, fit.pictures), map(_bounds, light.pictures), strict=True)
     narrower = np.concatenate([np.log(own.widths / other.widths) for own, other in widths])
     gain = narrower.size * math.log(noise / after) - float(np.sum(narrower))
     return (light, after) if gain > LIKELIER else (fit, noise)
@@ -181,10 +189,10 @@ def _where_noise_is_even(fit: ModelFit, at: Numbers, noise: float) -> tuple[Mode
 
 def _evener_in_light(problem: "_Separable", at: Estimate) -> Estimate | None:
     """The most likely numbers with noise of one size in light, where they are likelier than any with it in codes."""
-    linear = all(_bounds(part.picture).encoding == "linear" for part in problem.pixels)
-    if linear or at.noise < FAINT:
+    pictures = [part.picture for part in problem.pixels]
+    if at.noise < FAINT or not _is_curved(pictures):
         return None
-    light = [part.in_light() for part in problem.pixels]
+    light = list(map(_Pixels.of, _in_light(pictures)))
     start = Estimate(at.unknowns, max(at.noise, FIRST_NOISE))
     even, _ = maximise(_Separable(light, problem.design, problem.bounds, problem.copies), start, ROUGHLY_KNOWN)
     return even if even.value > at.value + LIKELIER else None
@@ -231,7 +239,7 @@ def _near_edges(fit: ModelFit, at: Estimate, *, copies: bool) -> Evidence:
     problem = _Separable(some, design, bounds, copies)
     at, known = maximise(problem, at, ROUGHLY_KNOWN if large else ENOUGH_KNOWN)
     if (even := _evener_in_light(problem, at)) is not None:
-        return _near_edges(_in_light(fit), even, copies=copies)
+        return _near_edges(fit._replace(pictures=_in_light(pictures)), even, copies=copies)
     if large:
         # The whole picture has the pixels near an edge that a part of it lacks.
         at = at._replace(noise=telling(known).noise)

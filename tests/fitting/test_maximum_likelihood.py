@@ -1,5 +1,6 @@
 """Numbers behind rounded values: balls of another renderer, saved as files are, against what they were drawn with."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 import brdf
 import fitting
 from benchmarks.truth import COVERAGE, LAMBERT, ball, meshed
-from brdf.images.encoding import Encoding, encode
+from brdf.images.encoding import Encoding, decode, encode
 
 # In standard errors: five of some two hundred numbers would be chance once in ten thousand runs.
 FAR = 5.0
@@ -47,6 +48,35 @@ def test_noise_that_comes_before_the_encoding_is_larger_in_dark_codes(row: str, 
     one = ball(3, ambient=False)
     result = fitting.fit(COVERAGE[row].picture(one.drawn(), 3, tmp_path), one.scene(), model=one.model)
     assert not any("structure" in words for words in result.warnings)
+
+
+def test_a_dark_picture_beside_a_bright_one_takes_nothing_from_what_that_says():
+    """Noise of one size in light is the same in both: the dark one tells next to nothing."""
+    size, random, errors = 64, np.random.default_rng(0), []
+    for seed in range(3):
+        one = ball(seed, size=size)
+        bright, drawn = one.scene(), one.drawn()
+        lamp = dataclasses.replace(bright.lights[0], intensity=[0.03])
+        dark, pictures = dataclasses.replace(bright, ambient=[0.03], lights=(lamp,)), []
+        for share in (1.0, 0.03):
+            noisy = drawn * share + random.normal(0, 0.004, drawn.shape) * (drawn > 0)
+            pictures.append(np.rint(255 * encode(np.clip(noisy, 0, 1), "srgb")).astype(np.uint8))
+        both = fitting.fit(pictures, [bright, dark], model=one.model, encoding="srgb").material
+        alone = fitting.fit(pictures[0], bright, model=one.model, encoding="srgb").material
+        errors.append([np.abs(found.k_d - one.k[1])[0] for found in (both, alone)])
+    both, alone = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert both < 1.2 * alone
+
+
+def test_codes_beside_floats_whose_noise_was_cut_off_at_black():
+    one = ball(0, ambient=False)
+    drawn, random = one.drawn(), np.random.default_rng(0)
+    codes = brdf.Picture(
+        np.float32(decode(np.rint(255 * encode(drawn, "srgb")) / 255, "srgb")), None, "srgb", "given", 8, 1.0
+    )
+    floats = np.maximum(drawn + random.normal(0, 0.02, drawn.shape), 0)
+    found = fitting.fit([codes, floats], [one.scene(), one.scene()], model=one.model).material
+    np.testing.assert_allclose(found.k_d, one.k[1], rtol=1e-3)
 
 
 @pytest.mark.parametrize("curve", ["linear", "srgb"])
