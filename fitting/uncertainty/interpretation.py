@@ -205,7 +205,8 @@ def _structure(
     if device_count() > 1 or seen.problem.loss != "squared" or not tell.any():
         return None
     for errors in _left(pictures, seen, optimum):
-        errors = errors._replace(values=(errors.values / noise)[:, tell].astype(np.float32))
+        values = (errors.values / noise).astype(np.float32)
+        errors = errors._replace(values=values if tell.all() else values[:, tell])
         found.append(_once(errors, seen))
     return structure(found, even=even)
 

@@ -129,8 +129,9 @@ def over_blocks(errors: Errors, size: int) -> tuple[np.ndarray, np.ndarray, np.n
 
 def _coarser(grid: np.ndarray, factor: int) -> np.ndarray:
     padded = np.pad(grid, np.array([(0, -grid.shape[0] % factor), (0, -grid.shape[1] % factor), (0, 0)]))
-    blocks = padded.reshape(-1, factor, padded.shape[1] // factor, factor, padded.shape[2])
-    return blocks.sum(axis=(1, 3), dtype=np.float64)
+    # Rows first: their sums are as long as the picture is wide.
+    rows = padded.reshape(-1, factor, padded.shape[1] * padded.shape[2]).sum(axis=1, dtype=np.float64)
+    return rows.reshape(len(rows), -1, factor, padded.shape[2]).sum(axis=2)
 
 
 def shared(pictures: Sequence[Errors], size: int = 8) -> tuple[float, float]:
