@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from brdf.checks import direction_value
@@ -69,8 +70,13 @@ class SurfacePoints(eqx.Module):
 
     def flat(self) -> "SurfacePoints":
         """The points of a picture as one row, (H W,), without their areas."""
-        centres = dataclasses.replace(self, area=None)
-        return jax.tree.map(lambda leaf: jnp.asarray(leaf).reshape(-1, *leaf.shape[self.mask.ndim :]), centres)
+
+        def row(leaf: Any) -> Any:
+            # On the host where it can be, or each shape would be compiled.
+            values = leaf if isinstance(leaf, Tracer) else np.asarray(leaf)
+            return values.reshape(-1, *leaf.shape[self.mask.ndim :])
+
+        return jax.tree.map(row, dataclasses.replace(self, area=None))
 
     @classmethod
     def from_normals(
