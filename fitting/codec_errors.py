@@ -27,7 +27,8 @@ from fitting.solver.streams import each
 # In codes: the noise is no larger than the first of these with which a look-alike is left with as much as the picture.
 NOISES = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 LOOK_ALIKES = 4
-TOP = 255.0
+# Of a JPEG.
+LARGEST_CODE = 255.0
 
 
 def codec_of(target: Target) -> Jpeg | None:
@@ -70,15 +71,15 @@ def _predicted(tile: Tile, fit: ModelFit, index: int) -> Float[np.ndarray, "P C"
 
 def _codec_errors(codec: Jpeg, codes: Codes, shown: Float[np.ndarray, "P C"]) -> Float[np.ndarray, "P C"]:
     """What compression does to each code of a picture, 0 where nothing is predicted."""
-    counts, unit, random = np.isfinite(shown), TOP / codes.scale, np.random.default_rng(0)
+    counts, unit, random = np.isfinite(shown), LARGEST_CODE / codes.scale, np.random.default_rng(0)
     # Beside the object stands what the file shows there; values that were taken out were clipped.
-    shows = np.nan_to_num(codes.values.reshape(shown.shape) * unit, nan=TOP)
+    shows = np.nan_to_num(codes.values.reshape(shown.shape) * unit, nan=LARGEST_CODE)
     clean = np.where(counts, shown * unit, shows)
 
     def look_alike(noise: float) -> tuple[np.ndarray, np.ndarray]:
         """Before the codec and after it."""
         before = clean + counts * random.standard_normal(clean.shape, np.float32) * np.float32(noise)
-        given = np.clip(np.rint(before), 0, TOP).astype(np.uint8)
+        given = np.clip(np.rint(before), 0, LARGEST_CODE).astype(np.uint8)
         return before, codec.through(given.reshape(codes.values.shape)).reshape(shown.shape)
 
     def left(after: np.ndarray) -> float:

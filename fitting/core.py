@@ -280,12 +280,12 @@ def _less_codec_errors(
     if fit.evidence is None or seen.copies or not any(codecs):
         return fit, choice, seen
     if choice is not None and fit.tied is not None:
-        fits = [_fit_model(brdf.MODELS[name], seen, fit.free.copy()) for name in seen.problem.families]
+        fits = [_fit_model(brdf.MODELS[name], seen, fit.free) for name in seen.problem.families]
         clean = without_codec_errors(seen, min(fits, key=lambda one: float(np.sum(one.optimum.cost))), codecs)
-        fits = [most_likely(_fit_model(one.model, clean, fit.free.copy())) for one in fits]
+        fits = [most_likely(_fit_model(one.model, clean, fit.free)) for one in fits]
         best = max(fits, key=lambda one: -math.inf if one.evidence is None else one.evidence.value)
         if _coloured(best, clean):
-            return best, choice.of(best.model.name, best.free, grey=False), clean
+            return best, choice.coloured(best.model.name, best.free), clean
     seen = without_codec_errors(seen, _by_squares(fit, seen), codecs)
     return most_likely(_by_squares(fit, seen), copies=seen.copies), choice, seen
 

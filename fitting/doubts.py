@@ -23,6 +23,7 @@ CLEARLY, LESS = 0.25, 0.9
 RADIANS, BADLY = 2.1, 0.05
 # A picture of noise: the fit leaves this share of what varies, and that is much.
 NOISE, MUCH = 0.95, 0.2
+# So many pixels tell of most pictures that they are not one value.
 FEW = 64
 
 

@@ -90,20 +90,19 @@ class Choice(NamedTuple):
     rivals: tuple[str, ...]
     dropped: Float[np.ndarray, " U"]
 
-    def of(self, model: str, free: Bool[np.ndarray, "3 C"], *, grey: bool) -> "Choice":
-        """The same with another candidate of a highlight.
+    def coloured(self, model: str, free: Bool[np.ndarray, "3 C"]) -> "Choice":
+        """The same terms with a coloured highlight.
 
         Args:
             model: its name.
             free: its coefficients.
-            grey: whether its k_s is the same in all channels.
         """
-        wanted = model, bool(free[0].any()), "grey" if grey else "coloured"
+        wanted = model, bool(free[0].any()), "coloured"
         candidates = tuple(
             replace(one, chosen=(one.model, one.ambient, one.highlight) == wanted) for one in self.candidates
         )
         rivals = tuple(sorted({self.model, *self.rivals} - {model})) if self.rivals else ()
-        return Choice(candidates, model, free, grey, rivals, np.zeros_like(self.dropped))
+        return Choice(candidates, model, free, False, rivals, np.zeros_like(self.dropped))
 
 
 def is_better(gain: float, unknowns: int) -> bool:

@@ -26,6 +26,17 @@ class Jpeg(NamedTuple):
     steps: int
     subsampling: str
 
+    @classmethod
+    def of(cls, path: Path, spec: oiio.ImageSpec) -> "Jpeg | None":
+        """Read how a JPEG was written; None where it does not keep brightness and colours apart, as inks.
+
+        Args:
+            path: of the file.
+            spec: its header.
+        """
+        found = 0 if spec.get_string_attribute("jpeg:ColorSpace") else _steps(path)
+        return cls(found, spec.get_string_attribute("jpeg:subsampling", "4:4:4")) if found else None
+
     @property
     def quality(self) -> int:
         """1 to 100, as libjpeg counts: that with the nearest steps."""
@@ -62,16 +73,13 @@ def _written(codes: np.ndarray, quality: int, subsampling: str, folder: str) -> 
 @functools.cache
 def _steps_of(quality: int) -> int:
     with tempfile.TemporaryDirectory() as folder:
-        return steps(_written(np.zeros((16, 16, 3), np.uint8), quality, "4:4:4", folder))
+        return _steps(_written(np.zeros((16, 16, 3), np.uint8), quality, "4:4:4", folder))
 
 
-def steps(path: Path) -> int:
+def _steps(path: Path) -> int:
     """The sum of a file's first two tables of steps, of brightness and of colours; 0 where it has fewer.
 
     Source: ITU T.81, B.1.1.2 and B.2.4.1.
-
-    Args:
-        path: of a JPEG.
     """
     data, at, tables = path.read_bytes(), 2, []
     while at + 4 <= len(data) and data[at + 1] != _SCAN:

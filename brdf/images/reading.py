@@ -21,7 +21,7 @@ from brdf.errors import InputError
 from brdf.files import AnyPath, input_file, utf8_name
 from brdf.images.damage import check_content, check_header, check_memory
 from brdf.images.encoding import FLOATS, Encoding, EncodingSource, decode, decode_table, find_encoding, parse_encoding
-from brdf.images.jpeg import Jpeg, steps
+from brdf.images.jpeg import Jpeg
 
 LOSSY_TOP = 250 / 255
 """Share of the largest code from which on a file compressed with losses is clipped: at quality 75 a clipped area has
@@ -143,10 +143,7 @@ class ImageReader:
         self.encoding, self.source = find_encoding(given, self.path, name, spec, self.bits)
         packed = spec.get_string_attribute("compression")
         self.lossy = name in ("jpeg", "webp", "heif") or packed.startswith(("jpeg", "dwa", "b44"))
-        self.jpeg = None
-        # Of brightness and colours apart, as most are; inks are not.
-        if name == "jpeg" and not spec.get_string_attribute("jpeg:ColorSpace") and (found := steps(self.path)):
-            self.jpeg = Jpeg(found, spec.get_string_attribute("jpeg:subsampling", "4:4:4"))
+        self.jpeg = Jpeg.of(self.path, spec) if name == "jpeg" else None
         self._top = LOSSY_TOP if self.lossy else 1.0
         turn = spec.get_int_attribute("Orientation", 1)
         self._turn = turn if turn in range(2, 9) else 1

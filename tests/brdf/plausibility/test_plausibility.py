@@ -14,7 +14,7 @@ from brdf.albedo import directional_albedo
 from brdf.errors import InputError
 from brdf.models import BlinnPhong, NormalizedBlinnPhong, NormalizedPhong, Phong
 from brdf.plausibility.numeric import check_black_box, integrate
-from brdf.plausibility.report import Angles, judged
+from brdf.plausibility.report import ENERGY_LIMIT, Angles, judged
 from brdf.plausibility.verdicts import check
 
 WORD = {True: "pass", False: "fail"}
@@ -148,6 +148,10 @@ def test_quadrature_bounds_its_error(n):
         value, bound = integrate(evaluate, axis[None], tolerance=1e-9 / (n + 1), budget=3_000_000)
         np.testing.assert_allclose(value, 2 * np.pi / (n + 1), rtol=0, atol=float(bound[0]))
         assert bound < 1e-5 / (n + 1)
+
+
+def test_limit_leaves_room_for_a_lossless_material():
+    assert check(NormalizedPhong(k_d=0.3, k_s=0.7, n=1e6)).energy.value <= ENERGY_LIMIT
 
 
 def test_a_registered_model_that_nobody_knows_on_paper_is_measured(monkeypatch):
