@@ -37,6 +37,7 @@ import numpy as np
 
 import brdf
 import fitting
+from benchmarks.stability import stability_map
 
 ROOT = Path(__file__).resolve().parent.parent
 DATA = ROOT / "data"
@@ -802,7 +803,7 @@ def _albedo() -> Any:
 
 @case("stability map", "float32")
 def _stability() -> Any:
-    found = brdf.stability_map(brdf.NormalizedPhong, np.array([0.5, 50.0, 1e5]), np.array([0.0, 45.0, 89.0]))
+    found = stability_map(brdf.NormalizedPhong, np.array([0.5, 50.0, 1e5]), np.array([0.0, 45.0, 89.0]))
     return [found.model, bool(np.all(found.finite)), bool(np.all(found.error < 1e-5))]
 
 

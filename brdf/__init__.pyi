@@ -49,7 +49,6 @@ from .models import NormalizedBlinnPhong as NormalizedBlinnPhong
 from .models import NormalizedPhong as NormalizedPhong
 from .models import Phong as Phong
 from .plausibility.report import Report as Report
-from .plausibility.stability import stability_map as stability_map
 from .plausibility.verdicts import check as check
 from .precision import cast as cast
 from .rendering import basis_images as basis_images

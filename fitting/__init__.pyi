@@ -20,7 +20,6 @@ from .report.material_plots import overview as overview
 from .report.material_plots import plot_albedo as plot_albedo
 from .report.material_plots import plot_lobe as plot_lobe
 from .report.material_plots import plot_reciprocity as plot_reciprocity
-from .report.material_plots import plot_stability as plot_stability
 from .report.saving import load_result as load_result
 from .result import Cause as Cause
 from .result import Parameter as Parameter

@@ -1,1 +1,1 @@
-"""Positivity, reciprocity, energy; stability."""
+"""Positivity, reciprocity, energy."""

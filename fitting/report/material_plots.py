@@ -1,4 +1,4 @@
-"""Pictures of a material: albedo against angle, the lobe, the reciprocity error, and the stability map.
+"""Pictures of a material: albedo against angle, the lobe, and the reciprocity error.
 
 They return a matplotlib figure and show nothing.
 """
@@ -8,20 +8,16 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from brdf.albedo import directional_albedo
 from brdf.channels import channel_names, in_channel
-from brdf.checks import several
 from brdf.display import lit_sphere
 from brdf.measured.table import MeasuredBRDF, from_angles
 from brdf.models.base import Material, SpecularMaterial
 from brdf.plausibility.numeric import Sampler, albedo_of
 from brdf.plausibility.report import Report
-from brdf.plausibility.stability import StabilityMap
 from fitting.report.plots import CHANNEL_COLOURS, CHANNELS, OTHERS, PRINT, SIGNED
 
 Brdf = Material | Callable[[Any, Any], Any]
@@ -158,38 +154,6 @@ def plot_reciprocity(brdf: Brdf, channel: int = 0, figure: Any = None) -> Any:
     figure.colorbar(image, label="(f_r(light→view) − f_r(view→light)) / the larger")
     axes.set(xlabel=LIGHT, ylabel="angle of the view in degrees", aspect="equal")
     axes.set_title(f"Reciprocity error ≤ {most:.2g}{in_channel(channel, sample.channels)}")
-    return figure
-
-
-def plot_stability(maps: list[StabilityMap]) -> Figure:
-    """Error of float32 over exponent and angle, a panel for each model; a cross where a derivative is not finite.
-
-    Args:
-        maps: from `brdf.stability_map`, one a model.
-
-    Returns:
-        The figure.
-
-    Example:
-        >>> errors = brdf.stability_map(brdf.Lambert, np.array([0.0]), np.array([0.0, 60.0]))
-        >>> fitting.plot_stability([errors]).savefig("stability.png")
-    """
-    several("maps", maps)
-    figure = Figure(figsize=(3.0 * len(maps) + 1, 3.4), layout="constrained")
-    panels = figure.subplots(1, len(maps), sharey=True, squeeze=False)[0]
-    scale = LogNorm(1e-8, 1e-4)
-    for axes, found in zip(panels, maps, strict=True):
-        axes.pcolormesh(np.clip(found.error, 1e-8, None), norm=scale, cmap=SIGNED)
-        row, column = np.nonzero(~found.finite)
-        axes.plot(column + 0.5, row + 0.5, "rx")
-        axes.set_xticks(np.arange(len(found.angles))[::6] + 0.5, [f"{angle:g}" for angle in found.angles[::6]])
-        axes.set_yticks(np.arange(len(found.exponents))[::3] + 0.5, [f"{n:.3g}" for n in found.exponents[::3]])
-        said = f"{len(row)} not finite" if len(row) else "all derivatives finite"
-        axes.set_title(f"{found.model}\n{said}", fontsize=10)
-        axes.set_xlabel(LIGHT)
-    panels[0].set_ylabel("exponent n")
-    colours = ScalarMappable(scale, SIGNED)
-    figure.colorbar(colours, ax=list(panels), label="error of float32, of the peak", extend="both")
     return figure
 
 

@@ -26,7 +26,6 @@ MISUSES = {
     "brdf.relight(target, [1.0])": r"images: must be of shape \(L, H, W, C\), got .* Give what brdf\.render_lights",
     "brdf.basis_images('blinn-phong', scene)": r"model: must be the class of a material, got blinn-phong\. Write",
     "brdf.basis_images(material, scene)": r"model: must be the class of a material, got BlinnPhong\.",
-    "brdf.stability_map(material)": r"model: must be the class of a material, got BlinnPhong\.",
     "brdf.cast(material, 'double')": r"precision: is unknown, got 'double'\.",
     "brdf.directional_albedo('gold', 0.5)": r"material: must be a Material, got str\.",
     "brdf.nearest_normalized('gold')": r"material: must be a Material, got str\.",

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from benchmarks.stability import StabilityMap, plot_stability, stability_map
 from brdf.models import MODELS
-from brdf.plausibility.stability import stability_map
 
 
 @pytest.mark.parametrize("model", MODELS.values())
@@ -15,3 +15,13 @@ def test_float32_holds_and_derivatives_are_finite(model):
     assert found.error[usual].max() < 1e-5
     # n < 1 is steep at R.V = 0, and n = 1e8 is a hundred times beyond the contract
     assert found.error.max() < 1e-3
+
+
+def test_stability_picture_has_a_panel_for_each_map():
+    exponents, angles = np.array([1.0, 1e6]), np.array([0.0, 45.0, 90.0])
+    finite = np.ones((2, 3), bool)
+    holds = StabilityMap("phong", exponents, angles, np.full((2, 3), 1e-7), finite)
+    fails = StabilityMap("blinn-phong", exponents, angles, np.full((2, 3), 1e-2), finite & (angles < 90))
+    figure = plot_stability([holds, fails])
+    titles = [axes.get_title() for axes in figure.axes[:2]]
+    assert titles == ["phong\nall derivatives finite", "blinn-phong\n2 not finite"]

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from brdf.models import BlinnPhong, NormalizedPhong
-from brdf.plausibility.stability import StabilityMap
 from brdf.plausibility.verdicts import check
-from fitting.report.material_plots import plot_albedo, plot_lobe, plot_reciprocity, plot_stability
+from fitting.report.material_plots import plot_albedo, plot_lobe, plot_reciprocity
 
 
 def test_albedo_curves_cross_the_limit_where_the_report_says():
@@ -33,13 +32,3 @@ def test_reciprocity_map_is_antisymmetric():
     values = plot_reciprocity(BlinnPhong(k_d=0.3, k_s=0.5, n=8.0)).axes[0].collections[0].get_array()
     np.testing.assert_allclose(values, -np.transpose(values), atol=1e-9)
     assert np.max(values) > 0.5
-
-
-def test_stability_picture_has_a_panel_for_each_map():
-    exponents, angles = np.array([1.0, 1e6]), np.array([0.0, 45.0, 90.0])
-    finite = np.ones((2, 3), bool)
-    holds = StabilityMap("phong", exponents, angles, np.full((2, 3), 1e-7), finite)
-    fails = StabilityMap("blinn-phong", exponents, angles, np.full((2, 3), 1e-2), finite & (angles < 90))
-    figure = plot_stability([holds, fails])
-    titles = [axes.get_title() for axes in figure.axes[:2]]
-    assert titles == ["phong\nall derivatives finite", "blinn-phong\n2 not finite"]
