@@ -56,8 +56,6 @@ def share_seen(
 def _at_each(shape: Shape, start: Components, to_light: Any, before: Scalar, radius: Scalar | None) -> Scalar:
     """The same for points whose vectors are in components, by a shape that takes one point."""
     vectors = start.stacked(), to_light.stacked()
-    *numbers, size = jnp.broadcast_arrays(before, 0.0 if radius is None else radius, vectors[0][..., 0])
-    vectors = jnp.broadcast_to(vectors[0], (*size.shape, 3)), jnp.broadcast_to(vectors[1], (*size.shape, 3))
     if radius is None:
-        return jax.vmap(shape.cover)(*vectors, numbers[0])
-    return jax.vmap(shape.cover_patch)(*vectors, numbers[0], numbers[1])
+        return jnp.vectorize(shape.cover, signature="(3),(3),()->()")(*vectors, before)
+    return jnp.vectorize(shape.cover_patch, signature="(3),(3),(),()->()")(*vectors, before, radius)

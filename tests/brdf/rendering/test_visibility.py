@@ -149,3 +149,15 @@ def test_a_mesh_casts_shadows_on_itself(tmp_path: Path):
     np.testing.assert_allclose(row[(x > -1.4) & (x < -0.6)], 0)
     np.testing.assert_allclose(row[(x > -0.4) & (x < 0.4)], lit, rtol=1e-5)
     np.testing.assert_allclose(row[x > 0.6], lit, rtol=1e-5)
+
+
+def test_five_lights_on_a_mesh_are_the_sum_of_each(tmp_path: Path):
+    pytest.importorskip("trimesh", reason="trimesh reads and intersects meshes")
+    # so many light samples are looped over
+    (tmp_path / "tent.obj").write_text("v -1 -1 0\nv 1 -1 0\nv 0 0 1\nv -1 1 0.8\nv 1 1 0\nf 1 2 3\nf 1 3 4\nf 3 5 4\n")
+    mesh = brdf.Triangles(brdf.load_mesh(tmp_path / "tent.obj", smooth=False))
+    suns = [brdf.DirectionalLight([x, y, 1.0], intensity=1.0) for x, y in [(-2, 1), (1, 3), (2, -1), (0, -3), (0, 0)]]
+    got = brdf.render(WHITE, scene(*suns, shapes=[mesh]), precision="float64")
+    each = [brdf.render(WHITE, scene(sun, shapes=[mesh]), precision="float64") for sun in suns]
+    np.testing.assert_allclose(got, np.sum(each, axis=0), rtol=1e-12, atol=1e-12)
+    assert np.count_nonzero(np.max(each, axis=(0, 3)) > np.min(each, axis=(0, 3))) > 100
