@@ -6,7 +6,6 @@ are taken tile by tile, which also keeps a tile in the processor's cache while i
 
 import dataclasses
 import math
-import operator
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -347,7 +346,7 @@ class Lobe(eqx.Module):
             for weight, log_cosine in self.kept:
                 xp: Any = np if isinstance(log_cosine, np.ndarray) else jnp
                 exponent = xp.minimum(log_cosine - xp.asarray(peak, log_cosine.dtype), 0)
-                power = xp.exp(n * exponent if xp is np else jnp.asarray(n, exponent.dtype) * exponent)
+                power = xp.exp(xp.asarray(n, exponent.dtype) * exponent)
                 if xp is np:
                     value = value + _over_samples(power, weight)
                     slope = slope + _over_samples(power * exponent, weight)
@@ -403,7 +402,7 @@ class Lobe(eqx.Module):
 
     def on_host(self, pixel: Int[np.ndarray, " K"]) -> "Lobe":
         """The same for some of the pixels, all terms kept in NumPy."""
-        lobe = jax.tree.map(np.asarray, self).pixels(operator.itemgetter(pixel))
+        lobe = jax.tree.map(np.asarray, self).pixels(partial(np.take, indices=pixel, axis=0))
         if self.source is not None and self.model is not None:
             # Of one size for few numbers of pixels, or each would be compiled.
             padded = np.resize(pixel, 1 << max(pixel.size - 1, 0).bit_length())

@@ -73,10 +73,15 @@ def cast(tree: Any, precision: Precision | None) -> Any:
         # Through NumPy, or each kind of number would be compiled.
         array = np.asarray(value)
         floating = jnp.result_type(float) if precision is None else precision
-        return jax.device_put(array.astype(floating) if array.dtype.kind == "f" else array)
+        return array.astype(floating) if array.dtype.kind == "f" else array
 
     with working_precision(precision):  # float64 stays what it is outside of it
-        return jax.tree.map(leaf, tree)
+        leaves, structure = jax.tree.flatten(tree)
+        leaves = list(map(leaf, leaves))
+        # Those on the host go together.
+        on_host = [value for value in leaves if isinstance(value, np.ndarray)]
+        put = iter(jax.device_put(on_host))
+        return structure.unflatten(next(put) if isinstance(value, np.ndarray) else value for value in leaves)
 
 
 def apart(function: Callable[..., Any], *arguments: Any) -> Any:

@@ -163,8 +163,11 @@ def open_ends(
         spread: noise of each pixel over that of the picture, a number or (P, 1).
         width: of the picture.
     """
+    low, high = values <= floor, values >= (np.inf if level is None else level)
+    if np.count_nonzero(low) < _FEWEST_ENDS and not high.any():
+        return None
     good = valid[:, None]
-    low, high = good & (values <= floor), good & (values >= (np.inf if level is None else level))
+    low, high = good & low, good & high
     images = np.moveaxis(values.reshape(-1, width, values.shape[1]), -1, 0)
     low &= np.array([single_values_at_end(image, valid.reshape(-1, width), floor) for image in images])
     if not (low.any() or high.any()):
@@ -235,16 +238,17 @@ def _integers(pixels: np.ndarray, encoding: Encoding, top: int) -> Codes | None:
 
 def _levels(pixels: np.ndarray) -> Codes | None:
     """Of a float array: those of a file whose levels hold all values."""
-    good = np.isfinite(pixels)
     stride = max(1, pixels.size // _FIRST)
-    for some in (pixels[good][::stride][:_FIRST] if good.any() else pixels.ravel()[:0], pixels[good]):
+    for every in (stride, 1):
+        some = pixels.ravel()[::every]
+        some = some[np.isfinite(some)]
         if some.size == 0 or np.any(some < 0):
             return None
         fitting: list[tuple[int, Encoding]]
         fitting = [(top, curve) for top in _TOLERANCE for curve in _CURVES if _on_levels(some, curve, top)]
         with np.errstate(over="ignore", under="ignore"):
             half = bool(np.all(some == some.astype(np.float16)))
-        rgbe = _is_rgbe(pixels) if some.size > _FIRST else True
+        rgbe = every > 1 or _is_rgbe(pixels)
         if not (fitting or half or rgbe):
             return None
     if all(np.unique(values).size < _FEWEST for values in (some[::stride], some)):

@@ -23,7 +23,7 @@ CLEARLY, LESS = 0.25, 0.9
 RADIANS, BADLY = 2.1, 0.05
 # A picture of noise: the fit leaves this share of what varies, and that is much.
 NOISE, MUCH = 0.95, 0.2
-# So many pixels tell of most pictures that they are not one value.
+# So many pixels tell of most pictures that they are neither one value nor whole numbers.
 FEW = 64
 
 
@@ -39,10 +39,9 @@ def doubts(
         refit: fits a model to what was seen.
         structure: whether the residual has some.
     """
-    shown = [image[counted] for image, counted in zip(seen.shown, seen.counted, strict=True)]
     floats = [one for one in seen.problem.targets if one.file is None and not one.streamed]
     brightest = float(np.max(seen.brightest))
-    if floats and 2 < brightest <= 65535 and all(np.all(values == np.rint(values)) for values in shown):
+    if floats and 2 < brightest <= 65535 and _all(seen, lambda values: values == np.rint(values)):
         yield (
             f"the picture holds whole numbers up to {brightest:g}: if they are codes of a file, give them as uint8 or "
             'uint16, with encoding="srgb" where they are for a screen'
@@ -53,12 +52,13 @@ def doubts(
             "light's intensity in one unit? Values of 0 to 255 want dividing by 255, dim lights their true intensity"
         )
     yield from _field_of_view(seen.scenes, fit.residual)
-    if all(len(values) > 1 and _same(values) for values in shown) and _shaded(fit.pictures):
+    if _all(seen, lambda values: len(values) > 1 and values == values[0]) and _shaded(fit.pictures):
         yield (
             "the picture is the same in every pixel, under light that is not: is it the one that was meant? "
             "Numbers from it say nothing of the surface"
         )
     if fit.residual > MUCH:
+        shown = list(_counted_values(seen))
         varies = sum(float(np.sum((values - values.mean(axis=0)) ** 2, dtype=np.float64)) for values in shown)
         total = sum(float(np.sum(values**2, dtype=np.float64)) for values in shown)
         if fit.residual**2 * total > NOISE * varies and not any(map(_follows_light, fit.pictures)):
@@ -74,9 +74,17 @@ def doubts(
         )
 
 
-def _same(values: np.ndarray) -> bool:
-    """Whether all pixels are; a few tell at once that they are not."""
-    return all(bool(np.all(some == values[0])) for some in (values[:: -(-len(values) // FEW)], values))
+def _all(seen: Observed, holds: Callable[[np.ndarray], np.ndarray | bool]) -> bool:
+    """Whether something holds for the values of all pixels that count; a few tell at once that it does not."""
+    return all(np.all(holds(values)) for most in (FEW, None) for values in _counted_values(seen, most))
+
+
+def _counted_values(seen: Observed, most: int | None = None) -> Iterator[np.ndarray]:
+    """Of each picture the values of pixels that count, (K, C); of no more than so many."""
+    for image, counted in zip(seen.shown, seen.counted, strict=True):
+        index = np.flatnonzero(counted)
+        step = 1 if most is None else max(1, -(-index.size // most))
+        yield np.take(image.reshape(-1, image.shape[-1]), index[::step], axis=0)
 
 
 def _field_of_view(scenes: Sequence[brdf.Scene], residual: float) -> Iterator[str]:

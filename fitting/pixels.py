@@ -213,11 +213,13 @@ def _observe(
             weight = jax.device_put(stated if weight is None else stated * np.asarray(weight))
         bounds = None
         if plain:
-            valid = np.asarray(band.allowed) & np.all(np.isfinite(np.asarray(band.values)), axis=-1)
+            valid, (_, allowed, finite, *_) = np.asarray(band.allowed), counted[1].counts
+            if finite < allowed:
+                valid = valid & np.all(np.isfinite(np.asarray(band.values)), axis=-1)
             spread = 1.0
             if weight is not None and (given is not None or noise is not None):
                 heavy = np.asarray(weight)
-                valid &= heavy > 0
+                valid = valid & (heavy > 0)
                 spread = 1.0 / np.sqrt(np.where(heavy > 0, heavy, 1.0))[:, None]
             if target.codes is not None:
                 bounds = target.codes.bounds(band.rows, valid, level, spread)

@@ -68,7 +68,7 @@ class Picture(eqx.Module):
         """The same picture, some of its pixels, in NumPy: an XLA gather is ten times slower."""
         lobe = None if self.lobe is None else self.lobe.on_host(pixel)
         here = jax.tree.map(np.asarray, replace(self, lobe=None))
-        return replace(here.pixels(operator.itemgetter(pixel)), lobe=lobe)
+        return replace(here.pixels(partial(np.take, indices=pixel, axis=0)), lobe=lobe)
 
     def in_double(self, pixel: Int[np.ndarray, " K"]) -> "Picture":
         """The same picture, some of its pixels, in NumPy and double precision.
@@ -82,7 +82,7 @@ class Picture(eqx.Module):
         else:
             filled = -pixel.size % (_FEW if pixel.size <= _FEW else 8 * _FEW)
             pixel = np.append(pixel, np.zeros(filled, pixel.dtype))
-            some = jax.tree.map(np.asarray, self).pixels(operator.itemgetter(pixel))
+            some = jax.tree.map(np.asarray, self).pixels(partial(np.take, indices=pixel, axis=0))
         some = jax.tree.map(lambda a: np.asarray(a, np.float64) if eqx.is_inexact_array_like(a) else a, some)
         if filled and some.bounds is not None:
             some.bounds.lower[-filled:], some.bounds.upper[-filled:] = -np.inf, np.inf
@@ -121,16 +121,15 @@ class Picture(eqx.Module):
         """
         return np.asarray(self._convenient.predicted(np.asarray(n), x))
 
-    def lobe_shown(self, n: float) -> Float[np.ndarray, "P C"]:
-        """The specular basis image, on the host; of a few pixels by NumPy.
+    def lobe_extent(self, n: float) -> tuple[float, float]:
+        """The largest value of the specular basis image in a pixel that counts, and the sum of squares over its square.
 
         Args:
             n: the exponent.
         """
         picture = self._convenient
-        assert picture.lobe is not None
-        found = picture.lobe(cast(Any, n)) if picture._all_on_host else _lobe(picture.lobe, np.asarray(n))
-        return np.asarray(found[0])
+        largest, pixels = (_lobe_extent if picture._all_on_host else _lobe_extent_many)(picture, np.asarray(n))
+        return float(largest), float(pixels)
 
     @property
     def _convenient(self) -> "Picture":
@@ -178,6 +177,19 @@ def _predicted(picture: Picture, n: AnyArray, x: Float[AnyArray, "3 C"]) -> Floa
 def _lobe(lobe: Lobe, n: AnyArray) -> tuple[Array, Array]:
     return lobe(jnp.asarray(n))
 
+
+def _lobe_extent(picture: Picture, n: AnyArray) -> tuple[AnyArray, AnyArray]:
+    assert picture.lobe is not None
+    value, _ = picture.lobe(n)
+    xp: Any = np if isinstance(value, np.ndarray) else jnp
+    counts = xp.any(picture.weights > 0, axis=1)
+    values = xp.where(counts, xp.max(value, axis=1), 0)
+    largest = xp.max(values)
+    # Squares of a highlight that no pixel sees would fall below the smallest number.
+    return largest, xp.sum((values / xp.where(largest > 0, largest, 1)) ** 2)
+
+
+_lobe_extent_many = eqx.filter_jit(_lobe_extent)
 
 # Of a lobe that is made anew at each evaluation this many pixels, or multiples of eight times as many.
 _FEW = 2048

@@ -10,6 +10,7 @@ So few pixels are dealt with on the host, in float64: nothing is compiled for th
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple, cast
 
 import jax
@@ -59,20 +60,27 @@ class Subsample(NamedTuple):
         for part in self.parts:
             weight = part.weights.astype(np.float64)
             target = np.where(weight > 0, part.target, 0.0).astype(np.float64)
-            fixed = np.stack(np.broadcast_arrays(part.ambient, part.diffuse.astype(np.float64)))
-            groups = 1 if fixed.shape[2] == weight.shape[1] == 1 else target.shape[1]
+            diffuse = part.diffuse.astype(np.float64)
+            groups = 1 if diffuse.shape[1] == weight.shape[1] == 1 else target.shape[1]
             gram = np.zeros((log_n.size, groups, 4, 4))
             product = np.zeros((log_n.size, target.shape[1], 4))
-            for index, *moving in _lobes(part, log_n, peak):
+            for index, value, slope in _lobes(part, log_n, peak):
                 for group in range(groups):
                     own = slice(None) if groups == 1 else slice(group, group + 1)
-                    still, moved = (
-                        [one[..., min(group, one.shape[-1] - 1)] for one in some] for some in (fixed, moving)
+                    heavy = weight[:, min(group, weight.shape[1] - 1)]
+                    ambient, lit, *moving = (
+                        one[..., min(group, one.shape[-1] - 1)] for one in (part.ambient, diffuse, value, slope)
                     )
-                    columns = np.stack(np.broadcast_arrays(*still, *moved), axis=1)
-                    heavy = columns * weight[:, min(group, weight.shape[1] - 1)]
-                    gram[index, group] = heavy @ columns.swapaxes(1, 2)
-                    product[index, own] = (heavy @ target[:, own]).swapaxes(1, 2)
+                    still = np.stack(np.broadcast_arrays(ambient, lit))
+                    fixed = heavy * np.concatenate([still, target[:, own].T])
+                    gram[index, group, :2, :2], product[index, own, :2] = fixed[:2] @ still.T, fixed[2:] @ still.T
+                    for row, moved in enumerate(moving, 2):
+                        by_fixed = moved @ fixed.T
+                        gram[index, group, row, :2] = gram[index, group, :2, row] = by_fixed[:, :2]
+                        product[index, own, row] = by_fixed[:, 2:]
+                        for column, other in enumerate(moving[: row - 1], 2):
+                            both = np.einsum("nm,nm,m->n", moved, other, heavy)
+                            gram[index, group, row, column] = gram[index, group, column, row] = both
             pixels = np.broadcast_to(np.count_nonzero(weight, axis=0), target.shape[1])
             square = np.sum(weight * target**2, axis=0)
             whole = np.broadcast_to(gram, (*product.shape, 4))
@@ -99,7 +107,7 @@ class Subsample(NamedTuple):
                 continue
             # A pixel that was certain to be kept adds nothing to the uncertainty.
             unsure = np.flatnonzero(factor > 1)
-            part = part.pixels(lambda a, unsure=unsure: a[unsure])
+            part = part.pixels(partial(np.take, indices=unsure, axis=0))
             chance = (1 - 1 / factor[unsure]).astype(np.float32)
             # Fourth powers stay in the range of single precision; NumPy is slow where the last axis is short.
             target = np.where(part.weights > 0, part.target, 0.0)

@@ -4,8 +4,6 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import numpy as np
-
 from fitting.solver.normal_equations import Picture
 
 # A highlight on fewer pixels, counted by the squares of its values, is sampled too coarsely to trust its shape.
@@ -50,11 +48,8 @@ def highlight(pictures: Sequence[Picture], n: float) -> Highlight:
     largest, pixels = 0.0, 0.0
     for picture in pictures:
         if picture.lobe is not None:
-            values = np.where(picture.counts, np.max(picture.lobe_shown(n), axis=1), 0.0).astype(np.float64)
-            value, squares = float(np.max(values)), float(np.sum(values**2))
-            largest = max(largest, value)
-            # Squares of a highlight that no pixel sees fall below the smallest number.
-            pixels += squares / value**2 if squares > 0 and value**2 > 0 else 0.0
+            value, carrying = picture.lobe_extent(n)
+            largest, pixels = max(largest, value), pixels + carrying
     peak = min(nearest_peak(pictures), 0.0)
     return Highlight(largest, pixels, peak, math.exp(n * peak))
 

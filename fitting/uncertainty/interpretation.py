@@ -34,7 +34,17 @@ from fitting.uncertainty.highlight import OFF_CENTRE, Highlight, highlight
 from fitting.uncertainty.intervals import exponent_interval
 from fitting.uncertainty.noise_model import weighted_sums
 from fitting.uncertainty.residual_correlation import ResidualCorrelation, residual_correlation
-from fitting.uncertainty.structure import Errors, Structure, errors_of, of_blocks, scatter, structure
+from fitting.uncertainty.structure import (
+    SIZES,
+    Errors,
+    Structure,
+    errors_of,
+    left_over_blocks,
+    of_blocks,
+    over_blocks,
+    scatter,
+    structure,
+)
 
 # With less noise than this, in codes, rounding hides more than errs together.
 ROUNDED = 0.25
@@ -182,10 +192,11 @@ def shared_errors(
     ]
     if lossy:
         # The pixels of a block err together in any case.
-        together = structure([of_blocks(_once(one, seen)) for one in errors], (2, 4))
+        together = structure([over_blocks(of_blocks(_once(one, seen)), 2) for one in errors], (2, 4))
     else:
         # With little noise few pixels of a block say much.
-        together = structure([_once(one, seen) for one in errors], even=said.noise >= ROUNDED)
+        grids = [over_blocks(_once(one, seen), SIZES[0]) for one in errors]
+        together = structure(grids, even=said.noise >= ROUNDED)
     if not (lossy or together.significant):
         return None, together
     return _scattered(said.pictures, said.optimum, errors, covariance), together
@@ -204,10 +215,10 @@ def _structure(
     tell, found = noise > 2 * rounding, []
     if device_count() > 1 or seen.problem.loss != "squared" or not tell.any():
         return None
-    for errors in _left(pictures, seen, optimum):
-        values = (errors.values / noise).astype(np.float32)
-        errors = errors._replace(values=values if tell.all() else values[:, tell])
-        found.append(_once(errors, seen))
+    tell = np.flatnonzero(tell)[: 1 if seen.copies else None]
+    for picture, tile in zip(pictures, seen.tiles, strict=True):
+        blocks = left_over_blocks(picture, optimum, noise, tile.points.mask.shape[1])
+        found.append(blocks.channels(tell))
     return structure(found, even=even)
 
 

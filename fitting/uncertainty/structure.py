@@ -5,13 +5,17 @@ the sum of the squares. A light that stands elsewhere, a ball whose circle is of
 """
 
 import math
+import operator
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
-from fitting.solver.normal_equations import Picture
+from fitting.solver.normal_equations import FEW_VALUES, Picture
 from fitting.solver.profile import Optimum
 
 SIZES = (8, 16, 32)
@@ -47,6 +51,24 @@ class Errors(NamedTuple):
         return (row // size) * -(-self.width // size) + column // size
 
 
+class Blocks(NamedTuple):
+    """Sums over blocks of pixels.
+
+    Attributes:
+        sums: of errors.
+        squares: of their squares.
+        pixels: how many are not 0.
+    """
+
+    sums: Float[np.ndarray, "R Q C"]
+    squares: Float[np.ndarray, "R Q C"]
+    pixels: Float[np.ndarray, "R Q C"]
+
+    def channels(self, some: Any) -> "Blocks":
+        """The same of some channels."""
+        return Blocks(*(part[..., some] for part in self))
+
+
 class Structure(NamedTuple):
     """How much errs together.
 
@@ -65,16 +87,15 @@ class Structure(NamedTuple):
         return self.excess > SIGNIFICANT
 
 
-def structure(pictures: Sequence[Errors], sizes: Sequence[int] = SIZES, *, even: bool = True) -> Structure:
+def structure(grids: Sequence[Blocks], sizes: Sequence[int] = SIZES, *, even: bool = True) -> Structure:
     """Compare sums over blocks with independent errors.
 
     Args:
-        pictures: their errors.
+        grids: of each picture, over the smallest blocks.
         even: the noise is the same everywhere. Where it is not, blocks count by their noise: what least squares leaves
             where there is little of it is the noise of other places.
         sizes: of the blocks, pixels on a side; multiples of the first.
     """
-    grids = [over_blocks(errors, sizes[0]) for errors in pictures]
     excess, share = -math.inf, 0.0
     for size in sizes:
         total, blocks, variance, together, apart, chance = 0.0, 0, 0.0, 0.0, 0.0, 0.0
@@ -109,8 +130,8 @@ def of_blocks(errors: Errors) -> Errors:
     return Errors(sums.reshape(-1, sums.shape[2]), np.arange(sums.shape[0] * sums.shape[1]), sums.shape[1])
 
 
-def over_blocks(errors: Errors, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sums of errors, of their squares, and how many pixels, over blocks; (rows, columns, C) each.
+def over_blocks(errors: Errors, size: int) -> Blocks:
+    """Sums over blocks.
 
     Args:
         errors: of one picture.
@@ -123,8 +144,33 @@ def over_blocks(errors: Errors, size: int) -> tuple[np.ndarray, np.ndarray, np.n
     else:
         image = np.zeros((int(np.max(errors.pixel)) // errors.width + 1, errors.width, values.shape[1]), values.dtype)
         image[np.divmod(errors.pixel, errors.width)] = values
-    sums, squares, count = (_coarser(part, size) for part in (image, image**2, image != 0))
-    return sums, squares, count
+    return Blocks(*(_coarser(part, size) for part in (image, image**2, image != 0)))
+
+
+def left_over_blocks(picture: Picture, optimum: Optimum, noise: Float[np.ndarray, " C"], width: int) -> Blocks:
+    """Sums of what a fit leaves, over the smallest blocks of `structure`.
+
+    Args:
+        picture: all pixels of one, row by row.
+        optimum: of the fit.
+        noise: the unit of the errors.
+        width: of the picture.
+    """
+    if picture.target.size > FEW_VALUES:
+        return Blocks(*map(np.asarray, _left_over_blocks(picture, np.asarray(optimum.n), optimum.x, noise, width)))
+    errors = errors_of(picture, optimum, (np.arange(len(picture.target)), width))
+    return over_blocks(errors._replace(values=(errors.values / noise).astype(np.float32)), SIZES[0])
+
+
+@eqx.filter_jit
+def _left_over_blocks(picture: Picture, n: Any, x: Any, noise: Any, width: int) -> tuple[Array, ...]:
+    size, weight = SIZES[0], picture.weights
+    left = jnp.where(weight > 0, picture.target - picture.predicted(n, x), 0) * jnp.sqrt(weight)
+    image = (left / noise).astype(np.float32).reshape(-1, width, left.shape[1])
+    image = jnp.pad(image, [(0, -image.shape[0] % size), (0, -width % size), (0, 0)])
+    blocks = image.reshape(image.shape[0] // size, size, image.shape[1] // size, size, -1)
+    terms, zero = (blocks, blocks**2, (blocks != 0).astype(np.float32)), np.float32(0)
+    return jax.lax.reduce(terms, (zero, zero, zero), lambda one, other: tuple(map(operator.add, one, other)), (1, 3))
 
 
 def _coarser(grid: np.ndarray, factor: int) -> np.ndarray:
