@@ -31,12 +31,12 @@ from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum, refit, search
 from fitting.solver.streams import Stream, each
 from fitting.solver.tied import NormalEquations, design_of, join_channels
-from fitting.uncertainty.covariance import residual_noise
-from fitting.uncertainty.highlight import nearest_peak
+from fitting.uncertainty.covariance import NO_TRACE, residual_noise
+from fitting.uncertainty.highlight import highlight, nearest_peak
 from fitting.uncertainty.interpretation import Interpretation, alone_covariance, interpret, shared_errors
 from fitting.uncertainty.noise_model import weighted_sums
 from fitting.uncertainty.residual_correlation import residual_correlation
-from fitting.uncertainty.structure import CHANCE, Errors, shared
+from fitting.uncertainty.structure import CHANCE, SIZES, Blocks, Errors, left_over_blocks, over_blocks, shared
 
 # A residual above this share of the picture: what the scene says is probably not what the picture shows.
 UNEXPLAINED = 0.5
@@ -369,12 +369,15 @@ def _inflation(fit: ModelFit, seen: Observed, grey: np.ndarray) -> tuple[float, 
 def _explains_structure(fit: ModelFit, seen: Observed) -> bool:
     """Whether a highlight can be seen, and explains a good part of what errs together without it, if something does.
 
-    One that changes no value by a good part of a code is hidden by rounding: normals that are a little off would do as
-    well. Where the scene is not what it is said to be, or a codec has smoothed, a highlight however significant mends
-    some of that: in trials up to a third of it, where true highlights of 1 % explained more.
+    One that changes no value by a good part of a code, or none by more than a trace of the brightest, is hidden by
+    rounding: normals that are a little off would do as well. Where the scene is not what it is said to be, or a codec
+    has smoothed, a highlight however significant mends some of that: in trials up to a third of it, where true
+    highlights of 1 % explained more.
     """
     optimum = fit.optimum
     if max(highlight_in_codes(picture, optimum.x, optimum.n) for picture in fit.pictures) < HIDDEN:
+        return False
+    if highlight(fit.pictures, optimum.n).share(optimum.x, seen.brightest) < NO_TRACE:
         return False
     if fit.evidence is not None and fit.evidence.precision is not None:
         return True  # what errs together has been weighed by the channels' covariance
@@ -384,12 +387,16 @@ def _explains_structure(fit: ModelFit, seen: Observed) -> bool:
     return left < CHANCE * chance or before - left > EXPLAINED * before
 
 
-def _unexplained(pictures: Sequence[Picture], optimum: Optimum, seen: Observed) -> list[Errors]:
+def _unexplained(pictures: Sequence[Picture], optimum: Optimum, seen: Observed) -> list[Blocks]:
     found = []
-    with jax.enable_x64(True):
-        for picture, tile in zip(pictures, seen.tiles, strict=True):
+    for picture, tile in zip(pictures, seen.tiles, strict=True):
+        width = tile.points.mask.shape[1]
+        if picture.bounds is None:
+            found.append(left_over_blocks(picture, optimum, np.ones(seen.colour.size), width))
+            continue
+        with jax.enable_x64(True):
             values = unexplained(picture, optimum.x, optimum.n)
-            found.append(Errors(values, np.arange(len(values)), tile.points.mask.shape[1]))
+        found.append(over_blocks(Errors(values, np.arange(len(values)), width), SIZES[0]))
     return found
 
 

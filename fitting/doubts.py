@@ -12,7 +12,7 @@ from fitting.model_fit import ModelFit
 from fitting.pixels import FLAT, Observed
 from fitting.solver.devices import device_count
 from fitting.solver.normal_equations import Picture
-from fitting.uncertainty.structure import CHANCE, Errors, shared
+from fitting.uncertainty.structure import CHANCE, SIZES, Errors, over_blocks, shared
 
 # Diffuse reflection of this size is none: light of intensity 1 that is pi, or one at twice its distance, stays below.
 FAR_ABOVE = 10.0
@@ -139,7 +139,7 @@ def _is_encoded(fit: ModelFit, seen: Observed, refit: Callable[..., ModelFit]) -
         pictures = [dataclasses.replace(picture, target=tile.target, bounds=None) for picture, tile in pairs]
     as_srgb = _left(refit(model, seen._replace(tiles=decoded), pictures=pictures), seen, "srgb")
     share = sum(np.sum(one.values**2) for one in as_srgb) / sum(np.sum(one.values**2) for one in as_given)
-    together, chance = shared(as_srgb)
+    together, chance = shared([over_blocks(one, SIZES[0]) for one in as_srgb])
     return bool(share < CLEARLY or (share < LESS and together < CHANCE * chance))
 
 

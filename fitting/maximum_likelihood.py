@@ -641,15 +641,13 @@ def highlight_in_codes(picture: Picture, x: np.ndarray, n: float) -> float:
 
 
 def unexplained(picture: Picture, x: np.ndarray, n: float) -> np.ndarray:
-    """By how much predictions miss the values, or the bounds between which these lay, times the root of the weight.
+    """By how much predictions miss the bounds between which the values lay.
 
     Args:
-        picture: of a fit.
+        picture: of a fit, with bounds.
         x: coefficients, (3, C).
         n: exponent.
     """
-    if picture.bounds is None:
-        left = np.asarray(picture.target) - picture.shown(n, x)
-        return np.where(np.asarray(picture.weights) > 0, left, 0.0) * np.sqrt(np.asarray(picture.weights))
+    assert picture.bounds is not None
     code = _codes(picture, Numbers(x, math.log(n)))
     return np.maximum(picture.bounds.lower - code, 0.0) - np.maximum(code - picture.bounds.upper, 0.0)

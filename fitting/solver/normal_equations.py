@@ -53,7 +53,7 @@ class Picture(eqx.Module):
     ambient: Float[AnyArray, " Ca"] = eqx.field(default_factory=lambda: np.ones(1))
     bounds: Bounds | None = None
 
-    def pixels(self, choose: Callable[[Array], Array]) -> "Picture":
+    def pixels(self, choose: Callable[[Any], Any]) -> "Picture":
         """The same picture, some of its pixels."""
         return Picture(
             target=choose(self.target),
@@ -108,7 +108,8 @@ class Picture(eqx.Module):
         """What the model shows, in the dtype of the target; in NumPy where the picture is."""
         if not self._all_on_host:
             return _predicted(self, n, x)
-        shown = x[0] * self.ambient + x[1] * self.diffuse
+        x = np.asarray(x, self.target.dtype)
+        shown = x[0] * np.asarray(self.ambient, x.dtype) + x[1] * self.diffuse
         shown = shown if self.lobe is None else shown + x[2] * self.lobe(cast(Any, n))[0]
         return cast(Any, np.broadcast_to(shown, self.target.shape))
 

@@ -4,6 +4,9 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
+from jaxtyping import Float
+
 from fitting.solver.normal_equations import Picture
 
 # A highlight on fewer pixels, counted by the squares of its values, is sampled too coarsely to trust its shape.
@@ -36,6 +39,15 @@ class Highlight(NamedTuple):
     def broad(self) -> bool:
         """More pixels see it than the four around a peak that falls between them."""
         return self.pixels > 2 * FEW_PIXELS
+
+    def share(self, x: Float[np.ndarray, "3 C"], brightest: Float[np.ndarray, " C"]) -> float:
+        """The largest value of the specular term over that of the picture.
+
+        Args:
+            x: coefficients.
+            brightest: value of each channel.
+        """
+        return float(np.max(x[2]) * self.largest / max(np.max(brightest), np.finfo(float).tiny))
 
 
 def highlight(pictures: Sequence[Picture], n: float) -> Highlight:

@@ -102,9 +102,7 @@ def interpret(
     rounding, columns = seen.rounding * weight, rms_columns(optimum, weight)
     noise = np.maximum(residual_noise(optimum, rounding) * fit.noise_factor, rounding)
     lobe = None if optimum.flat else highlight(pictures, optimum.n)
-    visible = 0.0
-    if lobe is not None:
-        visible = float(np.max(optimum.x[2]) * lobe.largest / max(np.max(seen.brightest), np.finfo(float).tiny))
+    visible = 0.0 if lobe is None else lobe.share(optimum.x, seen.brightest)
     known = residual_correlation(pictures, seen.tiles, optimum, rounding)
     resolution = RESOLUTION if fit.single else 0.0
     spread, shared, widening, deviation, together, gain, joined = None, None, 1.0, noise, None, 0.0, None

@@ -180,19 +180,14 @@ def _coarser(grid: np.ndarray, factor: int) -> np.ndarray:
     return rows.reshape(len(rows), -1, factor, padded.shape[2]).sum(axis=2)
 
 
-def shared(pictures: Sequence[Errors], size: int = 8) -> tuple[float, float]:
+def shared(grids: Sequence[Blocks]) -> tuple[float, float]:
     """What errs together within blocks: squares of sums less sums of squares; and what chance makes of it.
 
     Args:
-        pictures: their errors.
-        size: of a block, pixels on a side.
+        grids: of each picture.
     """
-    excess, variance = 0.0, 0.0
-    for errors in pictures:
-        sums, apart, _ = over_blocks(errors, size)
-        excess += float(np.sum(sums**2 - apart))
-        variance += float(np.sum(2 * apart**2))
-    return excess, math.sqrt(variance)
+    excess = sum(float(np.sum(grid.sums**2 - grid.squares)) for grid in grids)
+    return excess, math.sqrt(sum(float(np.sum(2 * grid.squares**2)) for grid in grids))
 
 
 def errors_of(picture: Picture, optimum: Optimum, place: tuple[np.ndarray, int]) -> Errors:

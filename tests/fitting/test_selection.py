@@ -41,6 +41,13 @@ def test_the_true_family_is_named(material: brdf.Material, model: str, words: st
     assert str(results[0]).startswith(words)
 
 
+@pytest.mark.parametrize("k_d", [0.05, 0.3, 0.5, 0.6, 0.9])
+def test_no_highlight_is_made_of_the_rounding_of_single_precision(k_d: float):
+    for k_a in (0.0, 0.1):
+        clean = brdf.render(brdf.Lambert(k_a=[k_a] * 3, k_d=[k_d] * 3), SCENE, precision="float32")
+        assert fitting.fit(np.asarray(clean), SCENE).surface == "lambert"
+
+
 def test_a_grey_highlight_is_told_from_a_coloured_one():
     grey = fit(brdf.BlinnPhong(**K, k_s=GREY, n=30.0))
     assert chosen(grey).highlight == "grey"
