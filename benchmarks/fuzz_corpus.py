@@ -77,14 +77,8 @@ def _lights(path: Path) -> Any:
     return read_directions(path)
 
 
-def _archive(path: Path) -> Any:
-    from fitting.photographs.archives import read_archive
-
-    return read_archive(path)
-
-
 def _array(path: Path) -> Any:
-    from fitting.photographs.archives import read_array
+    from fitting.photographs.arrays import read_array
 
     with path.open("rb") as file:
         return read_array(file, path, path.stat().st_size)
@@ -130,18 +124,6 @@ def array(folder: Path) -> bytes:
     return content
 
 
-def archive(folder: Path) -> bytes:
-    """A small archive of photographs."""
-    import numpy as np
-
-    np.savez(
-        folder / "sound.npz", images=np.ones((1, 2, 2), np.uint8), normal=np.ones((2, 2, 3)), light_dirs=np.ones((1, 3))
-    )
-    content = (folder / "sound.npz").read_bytes()
-    (folder / "sound.npz").unlink()
-    return content
-
-
 def corpus(folder: Path) -> list[tuple[str, bytes, Callable[[Path], Any]]]:
     """Suffix, sound content and reader of each format.
 
@@ -159,6 +141,6 @@ def corpus(folder: Path) -> list[tuple[str, bytes, Callable[[Path], Any]]]:
         (".txt", LIGHTS, _lights),
     ]
     merl = struct.pack("<3i", *measured_merl.SHAPE) + bytes(64)
-    binary = [(".binary", merl, load_measured), (".bsdf", tensor(), load_measured), (".npz", archive(folder), _archive)]
+    binary = [(".binary", merl, load_measured), (".bsdf", tensor(), load_measured)]
     binary += [(".npy", array(folder), _array), *pictures(folder)]
     return [(suffix, content.encode(), reader) for suffix, content, reader in text] + binary

@@ -13,7 +13,7 @@ from jaxtyping import Float, Num
 import brdf
 from brdf.errors import InputError
 from brdf.files import parse_number, read_text
-from fitting.photographs.archives import read_array
+from fitting.photographs.arrays import read_array
 from fitting.photographs.light_files import MOST_BYTES, read_directions, read_intensities
 
 PICTURES = (".exr", ".hdr", ".png", ".tif", ".tiff", ".jpg", ".jpeg")
