@@ -263,28 +263,27 @@ def _slopes(numbers, free, mirror, normal) -> np.ndarray:
 
 
 def _refine(numbers, free, mirror, scale, value, normal) -> tuple[np.ndarray, float]:
-    """The nearest minimum of Huber's cost, by Levenberg's and Marquardt's damped Newton steps; and the cost."""
+    """The nearest minimum of Huber's cost over the free numbers; and the cost."""
+    from scipy.optimize import least_squares  # it takes long to load
 
-    def at(numbers):
-        residual = value - _shown(numbers, mirror, normal)
-        off = np.abs(residual) / scale
-        return np.sum(np.where(off <= 1, off**2, 2 * off - 1)), residual
+    def among(some):
+        every = numbers.copy()
+        every[free] = some
+        return every
 
-    (cost, residual), columns, damping = at(numbers), _slopes(numbers, free, mirror, normal), 1e-3
-    for _ in range(50):
-        weight = np.minimum(1.0, scale / np.maximum(np.abs(residual), 1e-300))
-        pull = columns.T @ (weight * residual)
-        gram = (columns.T * weight) @ columns
-        step = np.linalg.pinv(gram + damping * np.diag(np.diag(gram)), 1e-13, hermitian=True) @ pull
-        trial_cost, trial_residual = at(numbers + step)
-        if trial_cost < cost:
-            numbers, cost, residual, damping = numbers + step, trial_cost, trial_residual, damping / 10
-            columns = _slopes(numbers, free, mirror, normal)
-        else:
-            damping *= 10
-        if np.max(np.abs(step)) < CLOSE:
-            break
-    return numbers, cost
+    found = least_squares(
+        lambda some: _shown(among(some), mirror, normal) - value,
+        numbers[free],
+        lambda some: _slopes(among(some), free, mirror, normal)[:, free],
+        loss="huber",
+        f_scale=scale,
+        x_scale="jac",
+        ftol=None,
+        gtol=None,
+        xtol=CLOSE,
+        max_nfev=50,
+    )
+    return among(found.x), found.cost
 
 
 def _error(light, residual, slopes, scale, block) -> float:
