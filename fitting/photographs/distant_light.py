@@ -271,18 +271,12 @@ def _refine(numbers, free, mirror, scale, value, normal) -> tuple[np.ndarray, fl
         every[free] = some
         return every
 
-    found = least_squares(
-        lambda some: _shown(among(some), mirror, normal) - value,
-        numbers[free],
-        lambda some: _slopes(among(some), free, mirror, normal)[:, free],
-        loss="huber",
-        f_scale=scale,
-        x_scale="jac",
-        ftol=None,
-        gtol=None,
-        xtol=CLOSE,
-        max_nfev=50,
-    )
+    def left(some):
+        return _shown(among(some), mirror, normal) - value
+
+    how: Any = {"loss": "huber", "f_scale": scale, "x_scale": "jac", "ftol": None, "gtol": None, "xtol": CLOSE}
+    how |= {"jac": lambda some: _slopes(among(some), free, mirror, normal)[:, free], "max_nfev": 50}
+    found = least_squares(left, numbers[free], **how)
     return among(found.x), found.cost
 
 
