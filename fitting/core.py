@@ -27,8 +27,10 @@ from fitting.sample_error import MOST, SampleError, between, near_exponent, near
 from fitting.selection import FAMILIES, Choice, choose, is_better
 from fitting.solver.devices import placed
 from fitting.solver.losses import reweight
+from fitting.solver.nnls import nonnegative_minima
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum, refit, search
+from fitting.solver.refinement import TOLERANCE_DOUBLE
 from fitting.solver.streams import Stream, each
 from fitting.solver.tied import NormalEquations, design_of, join_channels
 from fitting.uncertainty.covariance import NO_TRACE, residual_noise
@@ -381,7 +383,10 @@ def _explains_structure(fit: ModelFit, seen: Observed) -> bool:
         return False
     if fit.evidence is not None and fit.evidence.precision is not None:
         return True  # what errs together has been weighed by the channels' covariance
-    matt = _search(fit.pictures, fit.free & [[True], [True], [False]], fit.n_range)
+    x = nonnegative_minima(
+        optimum.gram[:, :2, :2], optimum.product[:, :2], np.zeros((1, 2)), fit.free[:2].T, TOLERANCE_DOUBLE
+    )
+    matt = dataclasses.replace(optimum, x=np.vstack([x.T, np.zeros((1, len(x)))]))
     left, chance = shared(_unexplained(fit.pictures, optimum, seen))
     before, _ = shared(_unexplained(fit.pictures, matt, seen))
     return left < CHANCE * chance or before - left > EXPLAINED * before

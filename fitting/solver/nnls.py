@@ -127,6 +127,10 @@ def nonnegative_minimum(
     scale = np.sqrt(np.where(usable, np.diag(gram), 1.0))
     gram, product = gram / np.outer(scale, scale), np.where(usable, product / scale, 0.0)
     signed = np.zeros(product.size, bool) if signed is None else signed
+    # Mostly no bound is reached.
+    x, _, rank, _ = np.linalg.lstsq(gram, product, rcond=1e-13)
+    if rank == product.size and np.all(signed | (x > 0)):
+        return x / scale
     passive, x = signed & usable, np.zeros(product.size)
     tolerance = 1e-13 * np.max(np.abs(product), initial=np.finfo(float).tiny)
     for _ in range(4 * product.size + 4):
