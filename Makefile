@@ -35,6 +35,7 @@ lab: $(VENV)/installed-lab
 $(VENV)/installed: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e .
+	$(BIN)/python -m compileall -q brdf fitting  # as pip does of what it copies
 	touch $@
 
 $(VENV)/installed-tests: $(VENV)/installed

@@ -74,7 +74,8 @@ def command(pairs: int) -> None:
 
     def python(code: str, *arguments: str, cache: str) -> None:
         environment = os.environ | {"XDG_CACHE_HOME": cache}
-        environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+        for name in ("JAX_COMPILATION_CACHE_DIR", "PYTHONDONTWRITEBYTECODE"):
+            environment.pop(name, None)
         called = [sys.executable, "-c", code, *arguments]
         subprocess.run(called, env=environment, check=False, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
