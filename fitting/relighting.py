@@ -7,7 +7,8 @@ same. That factor, one for each channel, no picture can determine; here the mean
 value it has in the scene, and the result says so.
 """
 
-from collections.abc import Callable
+import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,21 +21,16 @@ from brdf.checks import instance
 from brdf.errors import InputError
 from brdf.models.base import SpecularMaterial
 from brdf.precision import Precision, working_precision
-from fitting.joint import left_over
+from fitting.joint import fit_jointly, left_over
 from fitting.pixels import Observed, observe
 from fitting.problem import model_name, state_problem
-from fitting.progress import waiting
 from fitting.report import FitResult
 from fitting.result import Parameter, free_parameters
 from fitting.solver.nnls import inverse_diagonal, nonnegative_minimum
-from fitting.solver.refinement import GRID_STEP
 from fitting.uncertainty.intervals import above_zero
 
 FACTOR = "one factor per channel between material and lights"
 KEPT = "no picture determines it; the lights' mean intensity was kept at that of the scene"
-N_RANGE = (0.5, 1e5)
-CLOSE = 1e-5
-_ROUNDS = 200
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +99,28 @@ def fit_lights(
     images = np.asarray(brdf.render_lights(material, scene, precision=precision), np.float64)[:, place]
     columns = np.broadcast_to(images, (*images.shape[:2], pixels.shape[1]))
     factors, errors = _intensities(columns, pixels)
-    return _result(seen, material, columns, pixels, factors, errors, has_material=False)
+    before = _emittances(scene, pixels.shape[1])
+    emittances = before * factors
+    fields = ("radiance" if "radiance" in vars(light) else "intensity" for light in scene.lights)
+    names = [f"lights[{index}].{field}" for index, field in enumerate(fields)]
+    names += ["ambient"] * (len(emittances) - len(names))
+    parameters = [
+        _emittance(name, channel, *numbers)
+        for name, *rows in zip(names, emittances, before * errors, strict=True)
+        for channel, numbers in enumerate(zip(*rows, strict=True))
+    ]
+    residual = np.zeros((*place.shape, pixels.shape[1]))
+    residual[place] = pixels - np.einsum("lc,lpc->pc", factors, columns)
+    return LightFit(
+        **left_over(seen, [residual], factors.size, ()),
+        material=material,
+        parameters=tuple(parameters),
+        correlation=np.eye(len(free_parameters(parameters))),
+        scenes=[_with_emittances(scene, emittances)],
+        emittances=emittances,
+        factors=factors,
+        errors=errors,
+    )
 
 
 def fit_lights_and_material(
@@ -113,13 +130,11 @@ def fit_lights_and_material(
     model: str = "blinn-phong",
     precision: Precision = "float32",
     mask: Any = None,
-    n_range: tuple[float, float] = N_RANGE,
 ) -> LightFit:
     """Fit the lights and the material together, up to the one factor per channel that no picture determines.
 
-    For each exponent of a grid, and then around the best, the intensities and the coefficients are
-    found in turn, each a non-negative linear problem, until the residual stands still. The ambient coefficient cannot
-    be told from the ambient intensity: it is that of the scene, and k_a takes the rest.
+    They are found by `fitting.fit_jointly`, from the best material under the scene's own lights. The ambient
+    coefficient cannot be told from the ambient intensity: it is that of the scene, and k_a takes the rest.
 
     Args:
         target: linear values, (H, W, C), or a `brdf.Picture`.
@@ -127,7 +142,6 @@ def fit_lights_and_material(
         model: the name of the model.
         precision: as for `fit_lights`.
         mask: (H, W), pixels to look at.
-        n_range: bounds of the exponent.
 
     Returns:
         Lights and material; ``undetermined`` names the factor. The material's numbers come without errors.
@@ -147,35 +161,36 @@ def fit_lights_and_material(
     seen = _observed(target, scene, mask, precision)
     if not scene.lights:
         raise InputError("scene", "has no lights", "Add a [[lights]] table")
-    pixels, place = seen.shown[0][seen.counted[0]].astype(np.float64), seen.counted[0]
-    cls: Any = brdf.MODELS[name]
-    names = ["k_d", "k_s"] if issubclass(cls, SpecularMaterial) else ["k_d"]
-    lights = len(scene.lights)
+    keys = ["k_a"] * (scene.ambient is not None) + ["k_d"]
+    keys += ["k_s", "n"] * issubclass(brdf.MODELS[name], SpecularMaterial)
 
-    def surface(k: Any, n: float) -> brdf.Material:
-        return cls(**dict(zip([*names, "k_a"], k, strict=True)), **{"n": n} if len(names) > 1 else {})
+    def leaves(material: Any, scenes: Sequence[brdf.Scene]) -> list[Any]:
+        return [*(getattr(material, key) for key in keys), *(light.emittance for light in scenes[0].lights)]
 
-    def terms(n: float) -> np.ndarray:
-        """One picture per light, and of the ambient light, for k_d = 1, for k_s = 1 and for k_a = 1; (L, T, P, C)."""
-        units = [surface(k, n) for k in np.eye(len(names), len(names) + 1)]
-        images = [np.asarray(brdf.render_lights(one, scene, precision=precision))[:, place] for one in units]
-        found = np.zeros((len(images[0]), len(names) + 1, *pixels.shape))
-        found[:, :-1] = np.stack(images, axis=1)
-        if scene.ambient is not None:
-            found[-1, -1] = scene.ambient
-        return found
-
-    with waiting("fitting lights and material"):
-        n = _best_exponent(lambda n: _in_turn(terms(n), pixels, lights)[0], n_range) if len(names) > 1 else 1.0
-        images = terms(n)
-        _, factors, k = _in_turn(images, pixels, lights)
-    mean = factors[:lights].mean(axis=0)
+    before = _emittances(scene, seen.shown[0].shape[-1])
+    joint = fit_jointly(target, _with_emittances(scene, before), name, leaves, mask=mask)
+    now = _emittances(joint.scenes[0], before.shape[1])
+    lights = slice(len(scene.lights))
+    mean = np.divide(now, before, out=np.zeros_like(now), where=before > 0)[lights].mean(axis=0)
     scale = np.where(mean > 0, mean, 1.0)
-    factors[:lights] /= scale
-    k[:-1] *= scale
-    columns = np.einsum("ltpc,tc->lpc", images, k)
-    _, errors = _intensities(columns, pixels)
-    return _result(seen, surface(k, n), columns, pixels, factors, errors, has_material=True)
+    scaled = {key: getattr(joint.material, key) * scale for key in {"k_d", "k_s"}.intersection(keys)}
+    material = dataclasses.replace(joint.material, **scaled)
+    found = fit_lights(target, scene, material, precision=precision, mask=mask)
+    numbers = {key: np.atleast_1d(value) for key, value in vars(material).items()}
+    parameters = [
+        *found.parameters,
+        *(
+            Parameter(key, None if key == "n" else channel, float(value), None)
+            for key, values in numbers.items()
+            for channel, value in enumerate(values)
+        ),
+    ]
+    return dataclasses.replace(
+        found,
+        parameters=tuple(parameters),
+        correlation=np.eye(len(free_parameters(parameters))),
+        warnings=(f"{FACTOR}: {KEPT}", *found.warnings),
+    )
 
 
 def _observed(target: Any, scene: Any, mask: Any, precision: Precision) -> Observed:
@@ -198,90 +213,19 @@ def _intensities(columns: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, n
     return factors, errors
 
 
-def _in_turn(terms: np.ndarray, pixels: np.ndarray, lights: int) -> tuple[float, np.ndarray, np.ndarray]:
-    """Least cost at one exponent, the lights' factors, (L, C), and the coefficients with k_a last, (T, C)."""
-    shape, channels = terms.shape[:2], pixels.shape[1]
-    cost, factors, coefficients = 0.0, np.ones((shape[0], channels)), np.zeros((shape[1], channels))
-    for c in range(channels):
-        columns = terms[..., c].reshape(-1, len(pixels))
-        gram, product = (columns @ columns.T).reshape(*shape, *shape), (columns @ pixels[:, c]).reshape(shape)
-        square, last, light = float(pixels[:, c] @ pixels[:, c]), np.inf, np.ones(shape[0])
-        now, k = square, np.zeros(shape[1])
-        for _ in range(_ROUNDS):
-            k = nonnegative_minimum(np.einsum("l,ltms,m->ts", light, gram, light), light @ product)
-            by_light = np.einsum("t,ltms,s->lm", k, gram, k)
-            light = nonnegative_minimum(by_light, product @ k)
-            now = max(float(square - 2 * light @ product @ k + light @ by_light @ light), 0.0)
-            # The ambient light keeps its intensity.
-            k[-1] *= light[lights:].sum()
-            light[lights:] = 1.0
-            if last - now <= 1e-12 * square:
-                break
-            last = now
-        cost, factors[:, c], coefficients[:, c] = cost + now, light, k
-    return cost, factors, coefficients
+def _emittances(scene: brdf.Scene, channels: int) -> Float[np.ndarray, "L C"]:
+    """Of each light and then of the ambient light, in so many channels."""
+    return np.stack([np.broadcast_to(np.asarray(one, float), channels) for one in scene.emittances()])
 
 
-def _best_exponent(cost: Callable[[float], float], n_range: tuple[float, float]) -> float:
-    """The exponent of least cost: a grid over log n, and finer ones around the best, down to `CLOSE`."""
-    low, high = np.log(n_range)
-    grid = np.linspace(low, high, 2 + int((high - low) / GRID_STEP))
-    while True:
-        best = int(np.argmin([cost(float(n)) for n in np.exp(grid)]))
-        low, high = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
-        if high - low <= CLOSE:
-            return float(np.exp(grid[best]))
-        grid = np.linspace(low, high, 9)
-
-
-def _result(
-    seen: Observed,
-    material: brdf.Material,
-    columns: np.ndarray,
-    pixels: np.ndarray,
-    factors: np.ndarray,
-    errors: np.ndarray,
-    *,
-    has_material: bool,
-) -> LightFit:
-    """The result; ``has_material`` where the material was found too."""
-    scene, channels = seen.problem.scenes[0], pixels.shape[1]
-    before = np.stack([np.broadcast_to(np.asarray(one, float), channels) for one in scene.emittances()])
-    emittances = before * factors
+def _with_emittances(scene: brdf.Scene, emittances: Float[np.ndarray, "L C"]) -> brdf.Scene:
+    """The scene under lights, and ambient light where it has any, of these emittances."""
     lights = tuple(
         eqx.tree_at(lambda one: one.emittance, light, emittance)
         for light, emittance in zip(scene.lights, emittances, strict=False)
     )
     found = eqx.tree_at(lambda s: s.lights, scene, lights)
-    if scene.ambient is not None:
-        found = eqx.tree_at(lambda s: s.ambient, found, emittances[-1])
-    fields = ("radiance" if "radiance" in vars(light) else "intensity" for light in lights)
-    names = [f"lights[{index}].{field}" for index, field in enumerate(fields)]
-    names += ["ambient"] * (len(emittances) - len(names))
-    parameters = [
-        _emittance(name, channel, *numbers)
-        for name, *rows in zip(names, emittances, before * errors, strict=True)
-        for channel, numbers in enumerate(zip(*rows, strict=True))
-    ]
-    if has_material:
-        numbers = {name: np.atleast_1d(value) for name, value in vars(material).items()}
-        parameters += [
-            Parameter(name, None if name == "n" else channel, float(value), None)
-            for name, values in numbers.items()
-            for channel, value in enumerate(values)
-        ]
-    residual = np.zeros((*seen.counted[0].shape, channels))
-    residual[seen.counted[0]] = pixels - np.einsum("lc,lpc->pc", factors, columns)
-    return LightFit(
-        **left_over(seen, [residual], factors.size, (f"{FACTOR}: {KEPT}",) * has_material),
-        material=material,
-        parameters=tuple(parameters),
-        correlation=np.eye(len(free_parameters(parameters))),
-        scenes=[found],
-        emittances=emittances,
-        factors=factors,
-        errors=errors,
-    )
+    return found if scene.ambient is None else eqx.tree_at(lambda s: s.ambient, found, emittances[-1])
 
 
 def _emittance(name: str, channel: int, value: float, error: float) -> Parameter:
