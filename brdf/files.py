@@ -14,7 +14,7 @@ import secrets
 import shutil
 import stat
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ try:
 except ImportError:  # on Windows, where nothing is removed
     fcntl = None
 
-_STAGED = re.compile(r"\.brdf-[0-9a-f]{12}(\..*)?")
+_STAGED = re.compile(r"\.brdf-[0-9a-f]{12}")
 _FREE, _ELSEWHERE = "Free some space or write elsewhere", "Change the permissions or choose another place"
 _REMEDIES = {
     errno.ENOSPC: ("there is no space left to write it", _FREE),
@@ -117,7 +117,7 @@ def utf8_name(path: AnyPath) -> str:
 
 @contextmanager
 def atomic_path(path: AnyPath) -> Iterator[Path]:
-    """A temporary name beside ``path``, with the same suffix, that becomes ``path`` when the block ends well.
+    """A temporary name near ``path``, with the same suffix, that becomes ``path`` when the block ends well.
 
     On any exception, Ctrl-C among them, the temporary file is deleted and ``path`` stays as it was. An existing file
     is replaced and keeps its permissions; a link keeps pointing at the file that is replaced.
@@ -140,38 +140,37 @@ def atomic_path(path: AnyPath) -> Iterator[Path]:
         raise InputError(
             path, f"cannot be written, there is no folder {os.path.dirname(_plain(path))}", "Make it first"
         )
-    temporary, lock = target.with_name(f".brdf-{secrets.token_hex(6)}{target.suffix}"), None
+    with _staging(target.parent, path) as stage:
+        temporary = stage / f"new{target.suffix}"
+        temporary.touch()
+        yield temporary
+        if target.exists():
+            shutil.copymode(target, temporary)
+        temporary.replace(target)
+
+
+@contextmanager
+def _staging(folder: Path, path: AnyPath) -> Iterator[Path]:
+    """A hidden folder in another one, that nobody else removes while it is written into, and that is gone then."""
+    name, lock = secrets.token_hex(6), None
+    # Locked before it has the name by which it could be found abandoned.
+    new, stage = folder / f".brdf-new-{name}", folder / f".brdf-{name}"
     try:
         with _told(path):
-            _remove_abandoned(target.parent)
-            lock = _hold(temporary, lambda new: os.close(os.open(new, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)))
-            yield temporary
-            if target.exists():
-                shutil.copymode(target, temporary)
-            temporary.replace(target)
+            _remove_abandoned(folder)
+            new.mkdir()
+            lock = _lock(new)
+            new.rename(stage)
+            yield stage
     finally:
-        # After success the name is gone already.
-        with suppress(OSError):
-            temporary.unlink()
+        for place in (new, stage):
+            shutil.rmtree(place, ignore_errors=True)
         if lock is not None:
             os.close(lock)
 
 
-def _hold(staged: Path, make: Callable[[Path], Any]) -> int | None:
-    """Make a file or folder and lock it, and only then give it the name by which it could be found abandoned."""
-    new = staged.with_name(staged.name.replace("-", "-new-", 1))
-    make(new)
-    try:
-        lock = _lock(new)
-        new.rename(staged)
-    except BaseException:
-        shutil.rmtree(new) if new.is_dir() else new.unlink()
-        raise
-    return lock
-
-
 def _lock(place: Path) -> int | None:
-    """What holds a file or folder until it is closed or this process ends; None where that cannot be had."""
+    """What holds a folder until it is closed or this process ends; None where that cannot be had."""
     if fcntl is None:
         return None
     with suppress(OSError):
@@ -192,7 +191,7 @@ def _remove_abandoned(folder: Path) -> None:
         with suppress(OSError):
             lock = _lock(place)
             if lock is not None:
-                shutil.rmtree(place) if place.is_dir() else place.unlink()
+                shutil.rmtree(place)
                 os.close(lock)
 
 
@@ -228,13 +227,12 @@ def atomic_folder(path: AnyPath) -> Iterator[Path]:
     """
     folder = Path(os.path.realpath(_plain(path)))
     missing = [parent for parent in (folder, *folder.parents) if not os.path.exists(parent)]
-    stage, lock = folder / f".brdf-{secrets.token_hex(6)}", None
-    new, old = stage / "new", stage / "old"
+    new = folder
     try:
         with _told(path):
             folder.mkdir(parents=True, exist_ok=True)
-            _remove_abandoned(folder)
-            lock = _hold(stage, Path.mkdir)
+        with _staging(folder, path) as stage:
+            new, old = stage / "new", stage / "old"
             for place in (new, old):
                 place.mkdir()
             yield new
@@ -246,9 +244,6 @@ def atomic_folder(path: AnyPath) -> Iterator[Path]:
             raise
         raise InputError(Path(path) / staged.relative_to(new), error.what, error.remedy) from None
     finally:
-        shutil.rmtree(stage, ignore_errors=True)
-        if lock is not None:
-            os.close(lock)
         for parent in missing:
             with suppress(OSError):
                 parent.rmdir()  # refused where there is something in it

@@ -29,9 +29,9 @@ def test_text_is_written_as_it_is(tmp_path):
     assert everything(tmp_path) == ["a.json"]
 
 
-def test_the_temporary_name_is_a_neighbour_with_the_same_suffix(tmp_path):
+def test_the_temporary_name_is_near_with_the_same_suffix(tmp_path):
     with atomic_path(tmp_path / "a.tar.exr") as temporary:
-        assert temporary.parent == tmp_path
+        assert temporary.parent.parent == tmp_path
         assert temporary.suffix == ".exr"
         temporary.write_bytes(b"x")
         assert not (tmp_path / "a.tar.exr").exists()
