@@ -206,32 +206,24 @@ def rounded(mesh: Mesh) -> Float[np.ndarray, "F 3 3"]:
     Args:
         mesh: its own normals are not looked at.
     """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     # One vertex in each place, also where a file repeats it.
-    _, place = np.unique(mesh.vertices, axis=0, return_inverse=True)
-    faces, front = place.reshape(-1)[mesh.faces], mesh.front
-    corner = np.arange(faces.size).reshape(faces.shape)
-    ends = np.stack([corner, np.roll(corner, -1, axis=1)], axis=-1).reshape(-1, 2)
-    vertices = faces.ravel()[ends]
-    turned = vertices[:, 0] > vertices[:, 1]
-    ends[turned], vertices[turned] = ends[turned, ::-1], vertices[turned, ::-1]
-    order = np.lexsort(vertices.T)
-    ends, vertices = ends[order], vertices[order]
-    one, other = ends[:-1], ends[1:]
-    bend = np.sum(front[one[:, 0] // 3] * front[other[:, 0] // 3], axis=-1)
-    joined = np.all(vertices[:-1] == vertices[1:], axis=-1) & (bend > np.cos(CREASE))
-    one, other = one[joined].ravel(), other[joined].ravel()
-    group, before = corner.ravel(), None
-    while before is None or np.any(group != before):
-        before, group = group, group.copy()
-        np.minimum.at(group, other, before[one])
-        np.minimum.at(group, one, before[other])
-    corners = mesh.vertices[mesh.faces]
-    to_next, to_last = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
-    across = np.linalg.norm(np.cross(to_next, to_last), axis=-1)
-    angle = np.arctan2(across, np.sum(to_next * to_last, axis=-1))
-    total = np.zeros((faces.size, 3))
-    np.add.at(total, group, (angle[..., None] * front[:, None, :]).reshape(-1, 3))
-    return total[group].reshape(*faces.shape, 3)
+    vertices, place = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    merged = _trimesh().Trimesh(vertices, place.reshape(-1)[mesh.faces], process=False)
+    pairs, edges, front = merged.face_adjacency, merged.face_adjacency_edges, mesh.front
+    smooth = np.sum(np.prod(front[pairs], axis=1), axis=-1) > np.cos(CREASE)
+    pairs, edges = pairs[smooth], edges[smooth]
+    # Of both faces the corners at both ends of the edge.
+    ends = 3 * pairs[:, :, None] + np.argmax(merged.faces[pairs][:, :, None] == edges[:, None, :, None], axis=-1)
+    one, other = ends[:, 0].ravel(), ends[:, 1].ravel()
+    corners = mesh.faces.size
+    joined = coo_array((np.ones(one.size), (one, other)), shape=(corners, corners))
+    _, group = connected_components(joined, directed=False)
+    total = np.zeros((corners, 3))
+    np.add.at(total, group, (merged.face_angles[..., None] * front[:, None]).reshape(-1, 3))
+    return total[group].reshape(*mesh.faces.shape, 3)
 
 
 class Triangles(Shape):
