@@ -226,7 +226,7 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
     if whitened:
         inflation, colour_inflation = _inflation(best, seen, grey[best.model.name])
     else:
-        known = residual_correlation(best.pictures, seen.tiles, best.optimum, seen.rounding)
+        known = residual_correlation(best.pictures, seen.widths, best.optimum, seen.rounding)
         inflation = known.inflation
         if known.noise is not None:
             # Each pixel by its own variance, or noise in bright pixels would pass for a highlight.
@@ -394,8 +394,7 @@ def _explains_structure(fit: ModelFit, seen: Observed) -> bool:
 
 def _unexplained(pictures: Sequence[Picture], optimum: Optimum, seen: Observed) -> list[Blocks]:
     found = []
-    for picture, tile in zip(pictures, seen.tiles, strict=True):
-        width = tile.points.mask.shape[1]
+    for picture, width in zip(pictures, seen.widths, strict=True):
         if picture.bounds is None:
             found.append(left_over_blocks(picture, optimum, np.ones(seen.colour.size), width))
             continue

@@ -146,8 +146,8 @@ def _is_encoded(fit: ModelFit, seen: Observed, refit: Callable[..., ModelFit]) -
 def _left(fit: ModelFit, seen: Observed, encoding: Encoding) -> list[Errors]:
     """By how much a fit misses the values that were given."""
     found = []
-    for picture, tile in zip(fit.pictures, seen.tiles, strict=True):
+    for picture, tile, width in zip(fit.pictures, seen.tiles, seen.widths, strict=True):
         shown = picture.shown(fit.optimum.n, fit.optimum.x).astype(np.float64)
         left = np.where(np.asarray(picture.weights) > 0, np.asarray(tile.target) - encode(shown, encoding), 0.0)
-        found.append(Errors(left, np.arange(len(left)), tile.points.mask.shape[1]))
+        found.append(Errors(left, np.arange(len(left)), width))
     return found

@@ -68,6 +68,7 @@ class Observed(NamedTuple):
         problem: what is fitted.
         colour: what all lights share, taken out of the tiles' scenes, (C,).
         tiles: of all pictures, made when asked for; a stream where one of them is.
+        widths: of the picture of each tile.
         rounding: standard deviation of the error that rounding puts into a value, (C,).
         brightest: largest size of a value that counts, (C,).
         left_out: how many pixels were left out, by reason.
@@ -79,6 +80,7 @@ class Observed(NamedTuple):
     problem: FitProblem
     colour: Float[np.ndarray, " C"]
     tiles: Sequence[Tile]
+    widths: Sequence[int]
     rounding: Float[np.ndarray, " C"]
     brightest: Float[np.ndarray, " C"]
     left_out: dict[str, int]
@@ -154,6 +156,7 @@ def observe(problem: FitProblem, *, at_once: bool = False) -> Observed:
         problem,
         light.colour,
         joined(tiles),
+        [target.pixels.shape[1] for target, some in zip(problem.targets, tiles, strict=True) for _ in range(len(some))],
         np.max(rounding, axis=0),
         np.max(brightest, axis=0),
         dict(left_out),

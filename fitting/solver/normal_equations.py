@@ -102,7 +102,7 @@ class Picture(eqx.Module):
 
     @property
     def _all_on_host(self) -> bool:
-        return isinstance(self.target, np.ndarray) and (self.lobe is None or self.lobe.source is None)
+        return isinstance(self.diffuse, np.ndarray) and (self.lobe is None or self.lobe.source is None)
 
     def predicted(self, n: AnyArray, x: Float[AnyArray, "3 C"]) -> Float[AnyArray, "P C"]:
         """What the model shows, in the dtype of the target; in NumPy where the picture is."""
@@ -153,8 +153,8 @@ class Picture(eqx.Module):
         """The largest logarithm of the lobe's cosine of any pixel that counts; minus infinity without a lobe."""
         if self.lobe is None:
             return -np.inf
-        where = True if self.weight is None else self.counts
-        return float(np.max(np.asarray(self.lobe.peak), initial=-np.inf, where=where))
+        peak = np.asarray(self.lobe.peak)
+        return float(np.max(peak if self.weight is None else np.where(self.counts, peak, -np.inf), initial=-np.inf))
 
     @property
     def weights(self) -> Float[AnyArray, "P Cw"]:

@@ -103,7 +103,7 @@ def interpret(
     noise = np.maximum(residual_noise(optimum, rounding) * fit.noise_factor, rounding)
     lobe = None if optimum.flat else highlight(pictures, optimum.n)
     visible = 0.0 if lobe is None else lobe.share(optimum.x, seen.brightest)
-    known = residual_correlation(pictures, seen.tiles, optimum, rounding)
+    known = residual_correlation(pictures, seen.widths, optimum, rounding)
     resolution = RESOLUTION if fit.single else 0.0
     spread, shared, widening, deviation, together, gain, joined = None, None, 1.0, noise, None, 0.0, None
     if fit.evidence is not None:
@@ -214,9 +214,8 @@ def _structure(
     if device_count() > 1 or seen.problem.loss != "squared" or not tell.any():
         return None
     tell = np.flatnonzero(tell)[: 1 if seen.copies else None]
-    for picture, tile in zip(pictures, seen.tiles, strict=True):
-        blocks = left_over_blocks(picture, optimum, noise, tile.points.mask.shape[1])
-        found.append(blocks.channels(tell))
+    for picture, width in zip(pictures, seen.widths, strict=True):
+        found.append(left_over_blocks(picture, optimum, noise, width).channels(tell))
     return structure(found, even=even)
 
 
@@ -246,8 +245,8 @@ def alone_covariance(optimum: Optimum, tied: np.ndarray | None) -> Float[np.ndar
 
 def _left(pictures: Sequence[Picture], seen: Observed, optimum: Optimum) -> Iterator[Errors]:
     """What a fit leaves of whole pictures."""
-    for picture, tile in zip(pictures, seen.tiles, strict=True):
-        yield errors_of(picture, optimum, (np.arange(tile.target.shape[0]), tile.points.mask.shape[1]))
+    for picture, width in zip(pictures, seen.widths, strict=True):
+        yield errors_of(picture, optimum, (np.arange(picture.target.shape[0]), width))
 
 
 def _typical_weight(pictures: Sequence[Picture]) -> float:

@@ -6,7 +6,6 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from jaxtyping import Float
 
-from fitting.pixels import Tile
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
 from fitting.uncertainty.noise_model import noise_model
@@ -46,13 +45,13 @@ class ResidualCorrelation(NamedTuple):
 
 
 def residual_correlation(
-    pictures: Sequence[Picture], tiles: Sequence[Tile], optimum: Optimum, rounding: Float[np.ndarray, " C"]
+    pictures: Sequence[Picture], widths: Sequence[int], optimum: Optimum, rounding: Float[np.ndarray, " C"]
 ) -> ResidualCorrelation:
     """Correlate the residuals of some neighbouring pixels.
 
     Args:
         pictures: pixels row by row.
-        tiles: what they were made of.
+        widths: of the whole of each.
         optimum: what was fitted.
         rounding: standard deviation of a value's rounding, (C,): a residual no larger is not looked at.
     """
@@ -64,10 +63,10 @@ def residual_correlation(
     most = max(FEWEST_PAIRS, PAIRS // len(some))
     products, count, residuals, values = np.zeros((3, noise.size)), 0, [], []
     for index in some:
-        picture, shape = pictures[index], tiles[index].points.mask.shape
+        picture = pictures[index]
         weight = np.ones((1, 1)) if picture.weight is None else np.asarray(picture.weight)
         weight = np.broadcast_to(weight.reshape(len(weight), -1).min(axis=1), picture.target.shape[0])
-        first, second = _neighbours((weight > 0).reshape(shape), most)
+        first, second = _neighbours((weight > 0).reshape(-1, widths[index]), most)
         count += first.size
         pairs = np.zeros((2, most), np.int32)
         pairs[:, : first.size] = first, second
