@@ -2,7 +2,6 @@
 
 import os
 
-import pytest
 from project_paths import ROOT
 
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / "out" / "compiled"))
@@ -11,13 +10,3 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 # A program that another process is just writing is compiled again.
 os.environ.setdefault("PYTHONWARNINGS", "ignore:Error reading persistent compilation cache entry")
-
-
-@pytest.fixture
-def quick_compilation():
-    """For tests of what comes out, not of its last digits: what this process compiles is optimised little."""
-    import jax
-
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)

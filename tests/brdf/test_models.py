@@ -119,7 +119,6 @@ CORNERS = {
 }
 
 
-@pytest.mark.usefixtures("quick_compilation")
 @pytest.mark.parametrize("x64", [False, True])
 @pytest.mark.parametrize("model", ALL)
 def test_derivatives_are_finite_at_the_corners(model, x64):

@@ -65,7 +65,6 @@ def documentation(package: str, name: str) -> str:
     return ""
 
 
-@pytest.mark.usefixtures("quick_compilation")
 @pytest.mark.parametrize(("package", "name"), NAMES, ids=lambda value: value)
 def test_a_public_name_has_an_example_that_runs(package, name, folder, monkeypatch):
     import matplotlib

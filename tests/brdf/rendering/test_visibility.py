@@ -71,7 +71,7 @@ def test_soft_shadows_need_few_samples():
         )
         return np.asarray(brdf.render(WHITE, scene(light), precision="float32"))
 
-    dense = picture(128 * 128)
+    dense = picture(64 * 64)
     assert np.max(np.abs(picture(64) - dense)) < 0.003 * dense.max()
 
 
