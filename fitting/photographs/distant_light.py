@@ -79,28 +79,27 @@ def light_from_highlight(picture: Any, circle: Circle, *, mask: Any = True) -> F
     Raises:
         InputError: where the ball is not in the picture or shows no highlight.
     """
+    from scipy.ndimage import label  # it takes long to load
+
     grey = _values(picture).mean(axis=-1)
     inside = (ball_normals(grey.shape, circle)[..., 2] > 0) & np.isfinite(grey) & mask
     largest = float(np.max(grey, where=inside, initial=-np.inf))
     if not largest > 0:
         raise InputError("picture", "is black on the mirror ball", "Give a picture with a highlight")
-    rows, columns = np.nonzero(inside & (grey >= CORE * largest))
-    if rows.size > 0.25 * np.count_nonzero(inside):
+    core = inside & (grey >= CORE * largest)
+    if np.count_nonzero(core) > 0.25 * np.count_nonzero(inside):
         raise InputError("picture", "has no highlight: a quarter of the ball is as bright", "Give a darker exposure")
-    x, y = float(np.median(columns)), float(np.median(rows))
-    if not np.any(np.hypot(columns - x, rows - y) <= HIGHLIGHT_RADIUS * circle.radius):
-        # The median fell between two lights.
-        x, y = float(columns[0]), float(rows[0])
-    rows, columns = np.nonzero(inside & (grey >= HIGHLIGHT * largest))
-    near = np.ones(rows.shape, bool)
-    for _ in range(20):
-        near = np.hypot(columns - x, rows - y) <= HIGHLIGHT_RADIUS * circle.radius
-        x, y = float(columns[near].mean()), float(rows[near].mean())
+    bright = inside & (grey >= HIGHLIGHT * largest)
+    patches, _ = label(bright, np.ones((3, 3)))
+    y, x = np.argwhere(patches == np.bincount(patches[core]).argmax()).mean(axis=0)
+    rows, columns = np.nonzero(bright)
+    near = np.hypot(columns - x, rows - y) <= HIGHLIGHT_RADIUS * circle.radius
     if np.mean(near) < IN_HIGHLIGHT:
         came = (
             f"is bright in many places: {100 * np.mean(near):.0f} % of it lie where a mirror ball's highlight would be"
         )
         raise InputError("picture", came, "Give a photograph of a mirror ball and its circle; of a matt one use --matt")
+    x, y = float(columns[near].mean()), float(rows[near].mean())
     across, up = (x - circle.x) / circle.radius, (circle.y - y) / circle.radius
     z = max(1 - across**2 - up**2, 0.0) ** 0.5
     return 2 * z * np.array([across, up, z]) - TO_VIEW
