@@ -87,13 +87,23 @@ class Camera(Checked):
             row: from 0 at its upper edge, in pixels.
         """
 
-    def off_axis(self, column: Any, row: Any, half_width: Array) -> tuple[Array, Array]:
-        """How far places lie from the middle of the picture, whose half width is in any unit; and the way forward."""
-        width, height = self.resolution
+    @property
+    @abc.abstractmethod
+    def half_width(self) -> Array:
+        """Half the picture's width; of a perspective camera at a distance of 1."""
+
+    def axes(self) -> tuple[Vector, Vector, Vector]:
+        """Unit vectors to the right, up and forward in the picture, (3,) each."""
         forward = normalize(self.target - self.position)
         right = normalize(jnp.cross(forward, self.up))
+        return right, jnp.cross(right, forward), forward
+
+    def off_axis(self, column: Any, row: Any) -> tuple[Array, Array]:
+        """How far places lie from the middle of the picture, in the unit of its half width; and the way forward."""
+        width, height = self.resolution
+        right, up, forward = self.axes()
         x, y = column * 2.0 / width - 1.0, height / width - row * 2.0 / width
-        return half_width * (x[..., None] * right + y[..., None] * jnp.cross(right, forward)), forward
+        return self.half_width * (x[..., None] * right + y[..., None] * up), forward
 
     def to_view(self, position: Vectors) -> Vectors:
         """Unit directions from surface points towards the eye."""
@@ -124,9 +134,14 @@ class OrthographicCamera(Camera):
     type_name: ClassVar[str] = "orthographic"
     default_viewer: ClassVar[str] = "infinite"
 
+    @property
+    def half_width(self) -> Array:
+        """In world units."""
+        return self.width / 2
+
     def rays(self, column: Numbers, row: Numbers) -> tuple[Vectors, Vectors]:
         """Origins on the plane through ``position``, one direction."""
-        offset, forward = self.off_axis(column, row, self.width / 2)
+        offset, forward = self.off_axis(column, row)
         origins = self.position + offset
         return origins, jnp.broadcast_to(forward, origins.shape)
 
@@ -153,11 +168,15 @@ class PerspectiveCamera(Camera):
     type_name: ClassVar[str] = "perspective"
     default_viewer: ClassVar[str] = "local"
 
+    @property
+    def half_width(self) -> Array:
+        """The tangent of half the horizontal angle."""
+        width, height = self.resolution
+        return jnp.tan(jnp.deg2rad(self.fov) / 2) * (width / height)
+
     def rays(self, column: Numbers, row: Numbers) -> tuple[Vectors, Vectors]:
         """One origin, a direction per place."""
-        width, height = self.resolution
-        half_width = jnp.tan(jnp.deg2rad(self.fov) / 2) * (width / height)
-        offset, forward = self.off_axis(column, row, half_width)
+        offset, forward = self.off_axis(column, row)
         directions = normalize(forward + offset)
         return jnp.broadcast_to(self.position, directions.shape), directions
 

@@ -37,6 +37,19 @@ def load_material(path: str | Path, name: str | None = None) -> Material:
         >>> brdf.load_material("grey.json")
         Lambert(k_a=[0], k_d=[0.5])
     """
+    return read_material(path, name)[0]
+
+
+def read_material(path: str | Path, name: str | None = None) -> tuple[Material, str]:
+    """One material, and what its file says that it leaves open; empty where it says nothing.
+
+    Args:
+        path: as for `load_material`.
+        name: likewise.
+
+    Raises:
+        InputError: likewise.
+    """
     entries = _entries(path)
     names = ", ".join(known[:SHOWN] for known in list(entries)[:10]) + (" or another" if len(entries) > 10 else "")
     if name is None and len(entries) > 1:
@@ -61,23 +74,19 @@ def load_materials(path: str | Path) -> dict[str, Material]:
         >>> list(brdf.load_materials("gold.mtl"))
         ['fitted']
     """
-    return {name: _material(path, name, entry) for name, entry in _entries(path).items()}
+    return {name: material for name, (material, _) in read_materials(path).items()}
 
 
-def load_note(path: str | Path, name: str | None = None) -> str:
-    """What a file says that its material leaves open; empty where it says nothing.
+def read_materials(path: str | Path) -> dict[str, tuple[Material, str]]:
+    """All materials of a file, by name, each with what the file says that it leaves open.
 
     Args:
         path: as for `load_material`.
-        name: which one, where an MTL file holds several.
 
     Raises:
-        InputError: where the file cannot be read.
+        InputError: naming file and key.
     """
-    entries = _entries(path)
-    entry = entries.get(name) if name else next(iter(entries.values()))
-    note = entry.get("note") if isinstance(entry, dict) else None
-    return note if isinstance(note, str) else ""
+    return {name: _material(path, name, entry) for name, entry in _entries(path).items()}
 
 
 def save_material(material: Material, path: str | Path, *, undetermined: Collection[str] = ()) -> None:
@@ -214,10 +223,11 @@ def _entries(path: str | Path) -> dict[str, Any]:
     return {Path(path).stem: values["material"] if is_report else values}
 
 
-def _material(path: str | Path, name: str, entry: Any) -> Material:
+def _material(path: str | Path, name: str, entry: Any) -> tuple[Material, str]:
     """What is wrong with one material keeps nobody from another of the file."""
     is_mtl = Path(path).suffix.lower() == ".mtl"
     try:
-        return material_from_mtl(entry) if is_mtl else material_from_dict(entry)
+        material = material_from_mtl(entry) if is_mtl else material_from_dict(entry)
+        return material, entry["note"] if isinstance(entry.get("note"), str) else ""
     except InputError as error:
         raise error.inside(f"{path}: material {name[:SHOWN]}" if is_mtl else path) from None

@@ -151,7 +151,10 @@ def find_material(text: str, name: str | None = None) -> tuple["brdf.Material", 
     """
     key = _table_name(text)
     if key is None:
-        return brdf.load_material(text, name), name or Path(text).stem, _note(text, name)
+        from brdf.materials.material_file import read_material
+
+        material, note = read_material(text, name)
+        return material, name or Path(text).stem, note
     if name is not None:
         raise InputError("--name", f"chooses from a file, and {key} is one material", "Leave it out")
     return brdf.preset(key), key, ""
@@ -169,13 +172,9 @@ def find_materials(text: str) -> dict[str, tuple["brdf.Material", str]]:
     key = _table_name(text)
     if key is not None:
         return {key: (brdf.preset(key), "")}
-    return {name: (material, _note(text, name)) for name, material in brdf.load_materials(text).items()}
+    from brdf.materials.material_file import read_materials
 
-
-def _note(text: str, name: str | None) -> str:
-    from brdf.materials.material_file import load_note
-
-    return load_note(text, name)
+    return read_materials(text)
 
 
 def _table_name(text: str) -> str | None:

@@ -185,19 +185,12 @@ def _camera(camera, home, unit):
         axes = {"right": [1.0, 0.0, 0.0], "up": [0.0, 1.0, 0.0], "forward": [0.0, 0.0, -1.0]}
         place = {"position": [0.0, 0.0, 4.0], "half_width": 1.1, "resolution": [2, 2]}
         return axes | place | {"perspective": False, "local": False}
-    position, target, up = (np.asarray(x, np.float64) for x in (camera.position, camera.target, camera.up))
-    forward = (target - position) / np.linalg.norm(target - position)
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    width, height = camera.resolution
     perspective = isinstance(camera, brdf.PerspectiveCamera)
-    if perspective:
-        half_width = math.tan(math.radians(float(camera.fov)) / 2) * width / height
-    else:
-        half_width = float(camera.width) / 2 / unit
-    axes = {"right": right.tolist(), "up": np.cross(right, forward).tolist(), "forward": forward.tolist()}
+    with working_precision("float64"):
+        axes = {name: axis.tolist() for name, axis in zip(("right", "up", "forward"), camera.axes(), strict=True)}
+        half_width = float(camera.half_width) / (1.0 if perspective else unit)
     local = (camera.viewer or camera.default_viewer) == "local"
-    place = {"position": home(position), "half_width": half_width, "resolution": [width, height]}
+    place = {"position": home(camera.position), "half_width": half_width, "resolution": [*camera.resolution]}
     return axes | place | {"perspective": perspective, "local": local}
 
 

@@ -9,7 +9,7 @@ from small_ball import ball_scene, pictured
 
 import brdf
 import fitting
-from brdf.materials.material_file import load_note, material_from_dict, material_to_dict
+from brdf.materials.material_file import material_from_dict, material_to_dict, read_material
 from fitting.uncertainty.intervals import above_zero
 from fitting.uncertainty.structure import LEAST_HELD, MOST_HELD, Errors, block_scatter
 
@@ -151,9 +151,9 @@ def test_files_and_exports_say_that_a_number_stands_for_a_sum(tmp_path):
     assert material_to_dict(material, undetermined=reasons)["k_a"] == [0.1, None]
     for name in ("material.json", "material.mtl"):
         brdf.save_material(grey, tmp_path / name, undetermined={"k_a[0]": "only a sum"})
-        assert load_note(tmp_path / name) == "not determined: k_a[0]: only a sum"
+        assert read_material(tmp_path / name)[1] == "not determined: k_a[0]: only a sum"
         brdf.save_material(grey, tmp_path / name)
-        assert load_note(tmp_path / name) == ""
+        assert read_material(tmp_path / name)[1] == ""
     for to in ("json", "mtl", "glsl", "pytorch3d", "three", "gltf", "mitsuba"):
         assert "only a sum" in brdf.export_material(grey, to, note="only a sum").text
 
