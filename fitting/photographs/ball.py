@@ -68,22 +68,22 @@ def find_circle(mask: Any) -> Circle:
     Raises:
         InputError: where the mask is empty or its outline no circle.
     """
+    from scipy.optimize import least_squares  # it takes long to load
+
     inside = np.asarray(mask, bool)
     if not inside.any():
         raise InputError("mask", "is empty", "Give a mask that is white on the ball")
     outline = np.concatenate([_sides(inside), _sides(inside.T)[::-1]], axis=1)
+
+    def beyond(circle: Any) -> np.ndarray:
+        return np.hypot(outline[0] - circle[0], outline[1] - circle[1]) - circle[2]
+
     # Area and centroid are the start, which holes and specks hardly move.
-    y, x = np.argwhere(inside).mean(axis=0).tolist()
-    circle = Circle(x, y, float(np.sqrt(np.count_nonzero(inside) / np.pi)))
-    distance, near = np.zeros(0), np.zeros(0, bool)
-    for _ in range(10):
-        distance = np.abs(np.hypot(outline[0] - circle.x, outline[1] - circle.y) - circle.radius)
-        near = distance <= max(1.0, 3 * np.median(distance))
-        x, y = outline[:, near]
-        # The circle of least algebraic distance (Kåsa 1976).
-        columns = np.stack([x, y, np.ones_like(x)], axis=1)
-        a, b, c = np.linalg.lstsq(columns, x * x + y * y, rcond=None)[0].tolist()
-        circle = Circle(0.5 * a, 0.5 * b, max(c + 0.25 * (a * a + b * b), 0.0) ** 0.5)
+    y, x = np.argwhere(inside).mean(axis=0)
+    start = x, y, np.sqrt(np.count_nonzero(inside) / np.pi)
+    circle = Circle(*least_squares(beyond, start, loss="cauchy").x.tolist())
+    distance = np.abs(beyond(circle))
+    near = distance <= max(1.0, 3 * np.median(distance))
     if np.mean(near) >= OUTLINE:
         distance = distance[near]
     off = np.sqrt(np.mean(distance**2)) / max(circle.radius, 1e-9)
