@@ -4,7 +4,6 @@ The HTML needs nothing from a network and takes its colours from the page it sta
 """
 
 import base64
-import functools
 import html
 import io
 import math
@@ -19,7 +18,6 @@ from brdf.images.encoding import encode
 from brdf.models import Material
 from brdf.plausibility.report import Report
 
-_FINEST = 65535
 _CELL = "padding:0.15em 0.8em;text-align:right;white-space:nowrap"
 _MARKS = {"pass": "✓ pass", "fail": "✗ fail", "cannot tell": "? cannot tell"}
 
@@ -28,8 +26,7 @@ def displayed(linear: Float[np.ndarray, "H W C"], white: float = 1.0) -> Float[n
     """Values for a screen, 0 to 1: linear radiance through the sRGB encoding (IEC 61966-2-1).
 
     Args:
-        linear: radiance; one or three channels are shown as they are, others as their mean, NaN as black;
-            rounded to 16 bits.
+        linear: radiance; one or three channels are shown as they are, others as their mean, NaN as black.
         white: the radiance that is shown as white.
 
     Example:
@@ -39,15 +36,7 @@ def displayed(linear: Float[np.ndarray, "H W C"], white: float = 1.0) -> Float[n
     linear = np.asarray(linear, np.float32)
     if linear.shape[-1] != 3:
         linear = np.repeat(np.nan_to_num(linear).mean(axis=-1, keepdims=True), 3, axis=-1)
-    # fmax and fmin take the number where the other is NaN.
-    place = np.fmin(np.fmax(linear * np.float32(_FINEST / white), 0.0), _FINEST) + np.float32(0.5)
-    return _encoding_table()[place.astype(np.uint16)]
-
-
-@functools.cache
-def _encoding_table() -> Float[np.ndarray, " 65536"]:
-    """The curve at as many places as a screen's 8 bits could tell, and a hundred times more: a frame has 50 ms."""
-    return np.clip(encode(np.linspace(0.0, 1.0, _FINEST + 1, dtype=np.float32), "srgb"), 0.0, 1.0)
+    return encode(np.clip(np.nan_to_num(linear / np.float32(white)), 0.0, 1.0), "srgb")
 
 
 def lit_sphere(material: Material | Callable[[Any, Any], Any], size: int = 128) -> Float[np.ndarray, "H W 3"]:
