@@ -143,7 +143,7 @@ class ImageReader:
         self.encoding, self.source = find_encoding(given, self.path, name, spec, self.bits)
         packed = spec.get_string_attribute("compression")
         self.lossy = name in ("jpeg", "webp", "heif") or packed.startswith(("jpeg", "dwa", "b44"))
-        self.jpeg = Jpeg.of(self.path, spec) if name == "jpeg" else None
+        self.jpeg = Jpeg.of(self.path) if name == "jpeg" else None
         self._top = LOSSY_TOP if self.lossy else 1.0
         turn = spec.get_int_attribute("Orientation", 1)
         self._turn = turn if turn in range(2, 9) else 1
