@@ -90,7 +90,8 @@ def light_from_highlight(picture: Any, circle: Circle, *, mask: Any = True) -> F
     if np.count_nonzero(core) > 0.25 * np.count_nonzero(inside):
         raise InputError("picture", "has no highlight: a quarter of the ball is as bright", "Give a darker exposure")
     bright = inside & (grey >= HIGHLIGHT * largest)
-    patches, _ = label(bright, np.ones((3, 3)))
+    found: Any = label(bright, np.ones((3, 3)))
+    patches = found[0]
     y, x = np.argwhere(patches == np.bincount(patches[core]).argmax()).mean(axis=0)
     rows, columns = np.nonzero(bright)
     near = np.hypot(columns - x, rows - y) <= HIGHLIGHT_RADIUS * circle.radius
