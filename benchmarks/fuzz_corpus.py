@@ -78,10 +78,9 @@ def _lights(path: Path) -> Any:
 
 
 def _array(path: Path) -> Any:
-    from fitting.photographs.arrays import read_array
+    from fitting.maps.map_inputs import read_normal_map
 
-    with path.open("rb") as file:
-        return read_array(file, path, path.stat().st_size)
+    return read_normal_map(path)
 
 
 def pictures(folder: Path) -> list[tuple[str, bytes, Callable[[Path], Any]]]:

@@ -1,6 +1,7 @@
 """With what losses a JPEG was written, and what these do to another picture."""
 
 import io
+import warnings
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,7 +30,8 @@ class Jpeg(NamedTuple):
         from PIL import JpegImagePlugin  # late: few files are JPEGs
 
         try:
-            with JpegImagePlugin.JpegImageFile(path) as image:
+            # Of damaged remarks there is no need to warn.
+            with warnings.catch_warnings(action="ignore"), JpegImagePlugin.JpegImageFile(path) as image:
                 steps = tuple(tuple(table) for table in image.quantization.values())
                 return cls(steps, JpegImagePlugin.get_sampling(image)) if image.mode == "RGB" and steps[1:] else None
         except (OSError, ValueError, SyntaxError):  # damaged: it is read all the same, or refused, elsewhere
