@@ -35,6 +35,8 @@ ALIGNED_ROWS = 64
 # times smaller, and sums over millions of pixels have to stay in its range of 1e-38 to 3e38; double precision reaches
 # far beyond what a file can hold.
 SINGLE, DOUBLE = 1e12, 1e140
+# What is left of a picture without noise in double precision, over its brightest value, tells where the search stopped.
+CONVERGED = 1e-10
 # A file is shown by no more pixels than this along each side.
 SHOWN_PIXELS = 1024
 # A plateau of exactly equal largest values has to be larger than symmetry makes it before it counts as clipping.
@@ -69,7 +71,7 @@ class Observed(NamedTuple):
         colour: what all lights share, taken out of the tiles' scenes, (C,).
         tiles: of all pictures, made when asked for; a stream where one of them is.
         widths: of the picture of each tile.
-        rounding: standard deviation of the error that rounding puts into a value, (C,).
+        rounding: standard deviation of the error that rounding, or the search, puts into a value, (C,).
         brightest: largest size of a value that counts, (C,).
         left_out: how many pixels were left out, by reason.
         shown: the pictures for people, (H, W, C) each: of a large file every so many pixels.
@@ -232,7 +234,7 @@ def _observe(
 
     tiles = each(tile, bands, found)
     brightest = total.scale.astype(np.float64)
-    resolution = float(np.finfo(dtype).eps)
+    resolution = max(float(np.finfo(dtype).eps), CONVERGED)
     if target.streamed:
         shown = _shown(bands, found, scene, problem.precision)
     else:

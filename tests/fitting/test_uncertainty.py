@@ -291,3 +291,11 @@ def test_blocks_that_hold_much_count_as_a_fit_without_them_leaves_them():
     told, before = block_scatter(scores, errors, (slopes, covariance)), block_scatter(scores, errors)
     np.testing.assert_allclose(told, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
     assert np.all(np.diag(told)[4:] > 1.2 * np.diag(before)[4:])
+
+
+@pytest.mark.parametrize("seed", [15, 21])
+def test_where_the_search_stopped_is_no_structure(seed: int):
+    """Of a picture without noise in double precision only that is left."""
+    rng, scene = np.random.default_rng(seed), ball_scene()
+    material = brdf.Phong(k_a=0.2, n=float(np.exp(rng.uniform(1, 4))), k_d=rng.uniform(0.1, 0.6, 3), k_s=0.3)
+    assert not fitting.fit(pictured(material, scene), scene, precision="float64", model="phong").warnings
