@@ -458,24 +458,29 @@ def basis_program(
 ) -> Callable[[], tuple[Float[Array, "P C"], Lobe | None]]:
     """What makes the diffuse basis of P points, of any shape, and the specular one where the model has one."""
     points = points.flat()
-    if issubclass(model, SpecularMaterial) and is_sampled(lighting):
+    if not is_sampled(lighting):
+        return partial(_diffuse_and_terms, OneOf.of(model), points, lighting)
+    if issubclass(model, SpecularMaterial):
         if _size(jax.eval_shape(partial(_stacked_terms, model, lighting), points)) <= STACKED_VALUES:
             return partial(_diffuse_and_kept, OneOf.of(model), points, lighting)
-    return partial(_diffuse_and_lobe, model, points, lighting)
+    return partial(_diffuse_and_peak, model, points, lighting)
 
 
 @eqx.filter_jit
-def _diffuse_and_lobe(model: type[Material], points: SurfacePoints, lighting: Lighting) -> tuple[Array, Lobe | None]:
-    specular = issubclass(model, SpecularMaterial)
-    if is_sampled(lighting):
-        diffuse, peak = over_samples(model, points, lighting, lambda terms: terms.diffuse)
-        return diffuse, Lobe(peak, model, source=(points, lighting)) if specular else None
+def _diffuse_and_terms(model: Model, points: SurfacePoints, lighting: Lighting) -> tuple[Array, Lobe | None]:
     diffuse: Any = 0.0
     kept: tuple[Any, ...] = ()
     for kind, row in lighting.each():
         terms = jax.vmap(partial(light_terms, model, lighting.occluders, kind, row))(points)
         diffuse, kept = diffuse + terms.diffuse, (*kept, (terms.weight[:, None], terms.log_cosine[:, None]))
-    return diffuse, Lobe.of_terms(kept) if specular else None
+    return diffuse, Lobe.of_terms(kept) if has_lobe(model) else None
+
+
+@eqx.filter_jit
+def _diffuse_and_peak(model: type[Material], points: SurfacePoints, lighting: Lighting) -> tuple[Array, Lobe | None]:
+    diffuse, peak = over_samples(model, points, lighting, lambda terms: terms.diffuse)
+    lobe = Lobe(peak, model, source=(points, lighting)) if issubclass(model, SpecularMaterial) else None
+    return diffuse, lobe
 
 
 @eqx.filter_jit
