@@ -41,6 +41,7 @@ from fitting.report import FitResult
 from fitting.result import Parameter
 from fitting.solver.nnls import inverse_diagonal, scaled_inverse
 from fitting.uncertainty.intervals import NORMAL_95, above_zero
+from fitting.uncertainty.noise_model import value_variance
 from fitting.uncertainty.residual_correlation import correlation_in_rows, structure_warning
 
 LARGEST_JACOBIAN = 1 << 27
@@ -172,6 +173,7 @@ def _run(
     problem: JointProblem, vector: Array, held: Array, solver: str, tolerance: float, max_steps: int
 ) -> optx.Solution:
     """The solver's answer with some of the freed numbers held."""
+    tolerance = max(tolerance, 10 * float(jnp.finfo(vector.dtype).eps))  # no step is known more closely
 
     def residuals(free: Array, problem: JointProblem) -> Array:
         return problem.residuals(jnp.where(held, vector, free))
@@ -216,7 +218,7 @@ def _solve(problem: JointProblem, seen: Observed, solver: str, tolerance: float,
     material, scenes = jax.tree.map(np.asarray, found.content())
     given = jax.tree.leaves((material, seen.problem.scenes))
     given = [given[place] for place in problem.places]
-    known = likely or Likely(vector, columns @ columns.T / np.mean(left["noise"] ** 2))
+    known = likely or _by_least_squares(problem, seen, vector, residual, columns, left["noise"])
     parameters, errors, correlation = _with_errors(problem, given, known, held)
     return JointResult(
         **left,
@@ -230,6 +232,27 @@ def _solve(problem: JointProblem, seen: Observed, solver: str, tolerance: float,
         converged=converged,
         solver=solver,
     )
+
+
+def _by_least_squares(
+    problem: JointProblem,
+    seen: Observed,
+    vector: Float[np.ndarray, " U"],
+    residual: Float[np.ndarray, " N"],
+    columns: Float[np.ndarray, "U N"],
+    noise: Float[np.ndarray, " C"],
+) -> Likely:
+    """What is known of the numbers where each channel has its noise, which may grow with brightness."""
+    counts = np.concatenate([counted.ravel() for counted in seen.counted])
+    own = residual.reshape(counts.size, -1)[counts]
+    told = np.concatenate([np.asarray(target, np.float64) for target in problem.targets])[counts]
+    variance = np.zeros((counts.size, noise.size))
+    variance[counts] = value_variance(own, told + own, noise)
+    moves = columns.reshape(len(columns), *variance.shape)
+    if seen.copies:  # they err together
+        moves, variance = moves.sum(axis=2, keepdims=True), variance[:, :1]
+    scatter = np.einsum("upc,vpc->uv", moves * variance, moves, optimize=True)
+    return Likely(vector, columns @ columns.T, scatter)
 
 
 def left_over(

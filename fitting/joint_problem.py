@@ -157,12 +157,17 @@ def named_leaves(names: Sequence[str]) -> Callable[[Any, list[brdf.Scene]], list
         found = [material.k_d] if any(scene.lights for scene in scenes) else []
         found += [material.k_a] if any(scene.ambient is not None for scene in scenes) else []
         found += [material.k_s, material.n] if np.any(getattr(material, "k_s", 0.0)) else []
-        for match in asked:
+        for name, match in zip(names, asked, strict=True):
             assert match is not None
             index, picture = (None if part is None else int(part) for part in match.groups()[1:])
+            own: list[Any] = []
             for place, scene in enumerate(scenes):
                 if picture in (None, place):
-                    found += _leaves_of(match[1], scene, index, first=place == 0)
+                    own += _leaves_of(match[1], scene, index, first=place == 0)
+            if not own:
+                remedy = "Free what they have; the first light's intensity is the unit of the material"
+                raise InputError("free", f"names {name!r}, which is not in the scenes: light is a direction", remedy)
+            found += own
         return found
 
     return leaves

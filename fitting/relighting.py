@@ -26,8 +26,9 @@ from fitting.pixels import Observed, observe
 from fitting.problem import model_name, state_problem
 from fitting.report import FitResult
 from fitting.result import Parameter, free_parameters
-from fitting.solver.nnls import inverse_diagonal, nonnegative_minimum
+from fitting.solver.nnls import inverse_diagonal, nonnegative_minimum, scaled_inverse
 from fitting.uncertainty.intervals import above_zero
+from fitting.uncertainty.noise_model import value_variance
 
 FACTOR = "one factor per channel between material and lights"
 KEPT = "no picture determines it; the lights' mean intensity was kept at that of the scene"
@@ -204,12 +205,15 @@ def _intensities(columns: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, n
     """Factors and their standard errors, channel by channel, (L, C) each; the columns are (L, P, C)."""
     lights, count, channels = columns.shape
     factors, errors = np.zeros((2, lights, channels))
-    for c in range(channels):
-        gram = columns[..., c] @ columns[..., c].T
+    grams = np.einsum("lpc,mpc->clm", columns, columns, optimize=True)
+    for c, gram in enumerate(grams):
         factors[:, c] = nonnegative_minimum(gram, columns[..., c] @ pixels[:, c])
-        residual = pixels[:, c] - factors[:, c] @ columns[..., c]
-        noise = max(float(np.sum(residual**2)), np.finfo(float).tiny) / max(count - lights, 1)
-        errors[:, c] = np.sqrt(noise * inverse_diagonal(gram))
+    value = np.einsum("lc,lpc->pc", factors, columns)
+    squares = np.maximum(np.sum((pixels - value) ** 2, axis=0), np.finfo(float).tiny)
+    variance = value_variance(pixels - value, value, np.sqrt(squares / max(count - lights, 1)))
+    for c, gram in enumerate(grams):
+        moves = scaled_inverse(gram) @ columns[..., c]
+        errors[:, c] = np.sqrt(np.where(np.isfinite(inverse_diagonal(gram)), moves**2 @ variance[:, c], np.inf))
     return factors, errors
 
 

@@ -65,6 +65,20 @@ def noise_model(
     return coefficients if np.any(varied & (np.array([rise for _, rise in found]) > RISE)) else None
 
 
+def value_variance(
+    residual: Float[np.ndarray, "M C"], value: Float[np.ndarray, "M C"], noise: Float[np.ndarray, " C"]
+) -> Float[np.ndarray, "M C"]:
+    """The variance of each value: as it grows with brightness, or that of its channel where it does not.
+
+    Args:
+        residual: of the pixels that count.
+        value: what was fitted there.
+        noise: standard deviation of the residual, (C,).
+    """
+    model = noise_model(residual, value, np.finfo(float).eps * np.max(np.abs(value), axis=0, initial=0.0))
+    return np.broadcast_to(noise**2, value.shape) if model is None else _variance(model, np.maximum(value, 0.0))
+
+
 def _variance(coefficients: Any, value: Any) -> Any:
     a, b, c = coefficients.T
     return a + value * (b + value * c)

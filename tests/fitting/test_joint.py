@@ -120,6 +120,30 @@ def test_options_of_the_solver_are_checked(target: np.ndarray, options):
         fitting.fit_jointly(target, known, MATERIAL, lambda m, s: (m.n,), **options)
 
 
+@pytest.mark.parametrize("name", ["light 2", "light 0 of picture 1", "radius 1 of picture 3"])
+def test_a_name_that_no_scene_has_is_an_error(target: np.ndarray, name):
+    with pytest.raises(brdf.InputError, match=f"names '{name}', which is not in the scenes"):
+        fitting.fit_jointly(target, scene(TRUE_DIRECTION, [1.0] * 3), MATERIAL, name)
+
+
+@pytest.mark.parametrize("kind", ["by channel", "by brightness", "copies"])
+def test_noise_that_is_not_even_is_in_the_errors_as_in_those_of_a_fit(target: np.ndarray, kind):
+    known, noise = scene(TRUE_DIRECTION, [1.0, 0.9, 0.8]), np.random.default_rng(3).standard_normal(target.shape)
+    if kind == "copies":
+        known = scene(TRUE_DIRECTION, [1.0] * 3)
+        picture = np.repeat(target[..., :1] + 0.01 * noise[..., :1], 3, axis=2)
+    else:
+        picture = target + noise * ([0.001, 0.001, 0.02] if kind == "by channel" else 0.001 + 0.1 * target)
+    fitted = fitting.fit(picture, known, model="blinn-phong", precision="float64")
+    result = fitting.fit_jointly(picture, known, fitted, lambda m, s: (m.k_d, m.n), precision="float32")
+    assert result.converged
+    held = fitting.fit_jointly(picture, known, fitted, lambda m, s: (m.k_a, m.k_d, m.k_s, m.n))
+    for name, index in (("k_a", 0), ("k_d", 0), ("k_d", 1), ("k_d", 2), ("k_s", 0)):
+        # the fit asks some pixels about its noise, this one all
+        assert held[name][index].error == pytest.approx(fitted[name][index].error, rel=0.06), name
+    assert held["n"].error == pytest.approx(fitted["n"].error, rel=0.06)
+
+
 @pytest.mark.slow
 def test_a_joint_fit_chooses_the_model_and_tells_errors_as_a_fit_does(target: np.ndarray, tmp_path):
     sigma = 0.005

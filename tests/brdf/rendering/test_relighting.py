@@ -61,6 +61,19 @@ def test_lights_are_told_saved_and_drawn_as_a_fit_is(tmp_path):
     np.testing.assert_allclose(fitting.load_result(tmp_path).fitted(), found.fitted(), rtol=1e-5)
 
 
+def test_errors_of_lights_know_noise_that_grows_with_brightness():
+    clean = np.asarray(brdf.render(MATERIAL, scene(INTENSITIES), precision="float64"))
+    deviation = 0.001 + 0.2 * clean
+    noisy = clean + deviation * np.random.default_rng(0).standard_normal(clean.shape)
+    found = fitting.fit_lights(noisy, scene(np.ones((3, 3))), MATERIAL)
+    columns = brdf.render_lights(MATERIAL, scene(np.ones((3, 3))), precision="float64")
+    for channel in range(3):
+        own = np.asarray(columns)[..., channel].reshape(3, -1)
+        inverse = np.linalg.inv(own @ own.T)
+        scatter = own * deviation[..., channel].ravel() ** 2 @ own.T
+        np.testing.assert_allclose(found.errors[:, channel] ** 2, np.diag(inverse @ scatter @ inverse), rtol=0.3)
+
+
 def test_lights_that_look_alike_are_not_told_apart():
     light = brdf.DirectionalLight(direction=[0, 0, 1], intensity=[1, 1, 1])
     twice = brdf.Scene(camera=CAMERA, shapes=BALL, lights=[light, light])
