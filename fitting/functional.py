@@ -277,9 +277,7 @@ def solve(
         value, slope, _ = _derivatives(relative, log_n)
         # With k_s itself held, and not k_s relative to the peak.
         lobes = jnp.stack([value, slope + n * nearest * value], axis=1)
-    error, n_error = _errors(
-        pixels, lobes, *jax.lax.stop_gradient((x, least)), bounded=(log_n <= low) | (log_n >= high)
-    )
+    error, n_error = _errors(pixels, lobes, x, least, bounded=(log_n <= low) | (log_n >= high))
     errors = error[0] / unit, error[1], error[2] * seen, n * n_error
     return Solution(x_a / unit, x_d, x_s * seen, n, least.reshape(channels), errors)
 
@@ -423,4 +421,9 @@ def _errors(pixels: _Pixels, lobes: Array, x: Array, cost: Array, bounded: Array
     own = noise[..., None] * jnp.diagonal(inverse, axis1=-2, axis2=-1)
     variance = own + jnp.where(along == 0, 0, along**2 * by_n)
     variance = jnp.where(active & ((kept[..., None] <= 0) | ~(variance >= 0)), jnp.inf, variance)
-    return jnp.sqrt(variance).reshape(-1, 3).T, jnp.sqrt(by_n)
+    return _root(variance).reshape(-1, 3).T, _root(by_n)
+
+
+def _root(variance: Array) -> Array:
+    """Its square root, of derivative 0 at 0."""
+    return jnp.where(variance > 0, jnp.sqrt(jnp.where(variance > 0, variance, 1)), 0)

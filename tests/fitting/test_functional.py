@@ -50,11 +50,11 @@ def test_derivatives_by_picture_and_light_are_those_of_differences():
     def ravelled(moved, scaled):
         light = brdf.DirectionalLight(direction=direction + moved, intensity=jnp.array([1.0, 0.8, 0.6]))
         scene = brdf.Scene(camera=CAMERA, shapes=[BALL], ambient=AMBIENT, lights=[light])
-        found = functional.fit(PICTURES[0] * (1 + scaled * pattern), scene).material
-        return jnp.concatenate([found.k_a, found.k_d, found.k_s, found.n[None]])
+        found, solution = functional.fit(PICTURES[0] * (1 + scaled * pattern), scene)
+        return jnp.concatenate([found.k_a, found.k_d, found.k_s, found.n[None], *map(jnp.ravel, solution.errors)])
 
     rng = np.random.default_rng(1)
-    pattern, mixture, along = rng.standard_normal(PICTURES[0].shape), rng.standard_normal(10), rng.standard_normal(4)
+    pattern, mixture, along = rng.standard_normal(PICTURES[0].shape), rng.standard_normal(20), rng.standard_normal(4)
 
     def mixed(known):
         return mixture @ ravelled(known[:3], known[3])
