@@ -48,6 +48,10 @@ LARGEST_JACOBIAN = 1 << 27
 ROUNDS = 8
 TINY = np.finfo(float).tiny
 OPEN = "only a combination with other freed numbers is determined"
+# So many steps in a row, each a quarter of the one before, that lower the cost no more.
+STALLED = 16
+# A minimum is met where no more than this part of their errors parts the numbers from it.
+MET = 0.1
 # Of the largest eigenvalue of the normal equations: a smaller one determines nothing.
 DEPENDENT = 1e-12
 
@@ -168,12 +172,19 @@ def _of_model(stated: FitProblem, model: str, solve: Callable[..., JointResult])
     return best
 
 
+class _UntilNothingIsLeft(optx.LevenbergMarquardt):
+    """Ends, too, where rounding hides what a step would gain: a tolerance may ask for less than that."""
+
+    def terminate(self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: Any) -> tuple[Any, Any]:
+        done, result = optx.LevenbergMarquardt.terminate(self, fn, y, args, options, state, tags)
+        return done | (state.num_steps_since_acceptance >= STALLED), result
+
+
 @eqx.filter_jit
 def _run(
     problem: JointProblem, vector: Array, held: Array, solver: str, tolerance: float, max_steps: int
 ) -> optx.Solution:
     """The solver's answer with some of the freed numbers held."""
-    tolerance = max(tolerance, 10 * float(jnp.finfo(vector.dtype).eps))  # no step is known more closely
 
     def residuals(free: Array, problem: JointProblem) -> Array:
         return problem.residuals(jnp.where(held, vector, free))
@@ -182,7 +193,8 @@ def _run(
         return 0.5 * jnp.sum(residuals(free, problem) ** 2)
 
     if solver == "lm":
-        method = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
+        solver_class: Any = _UntilNothingIsLeft  # its fields are not what it is made of
+        method = solver_class(rtol=tolerance, atol=tolerance)
         return optx.least_squares(residuals, method, vector, problem, max_steps=max_steps, throw=False)
     method = optx.BFGS(rtol=tolerance, atol=tolerance)
     return optx.minimise(cost, method, vector, problem, max_steps=max_steps, throw=False)
@@ -200,7 +212,12 @@ def _solve(problem: JointProblem, seen: Observed, solver: str, tolerance: float,
         below = bounded & np.asarray(vector < 0)
         vector = jnp.where(below, 0, vector)
         residual, columns = (np.asarray(a, np.float64) for a in linearised(problem, vector))
-        inwards = held & (columns @ residual < 0)
+        slope = columns @ residual
+        if solver == "lm" and int(solution.state.num_steps_since_acceptance) >= STALLED:
+            own = np.where(held, 0.0, slope)
+            left = float(own @ scaled_inverse(columns @ columns.T) @ own)
+            converged = left <= MET**2 * float(np.mean(residual**2))
+        inwards = held & (slope < 0)
         if not below.any() and not inwards.any():
             break
         held = (held | below) & ~inwards

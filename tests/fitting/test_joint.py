@@ -126,6 +126,28 @@ def test_a_name_that_no_scene_has_is_an_error(target: np.ndarray, name):
         fitting.fit_jointly(target, scene(TRUE_DIRECTION, [1.0] * 3), MATERIAL, name)
 
 
+@pytest.mark.parametrize(("precision", "seed"), [("float64", 4), ("float64", 7), ("float32", 0)])
+def test_the_solver_ends_where_rounding_hides_the_rest(precision, seed):
+    def lit(direction) -> brdf.Scene:
+        return brdf.Scene(CAMERA, [BALL], lights=[brdf.DirectionalLight(direction, 1.0)])
+
+    picture = np.asarray(
+        brdf.render(brdf.BlinnPhong(k_d=0.5, k_s=0.3, n=25), lit([0.5, 0.6, 0.7]), precision="float64")
+    )
+    picture = picture + 0.01 * np.random.default_rng(seed).standard_normal(picture.shape)
+    start = brdf.BlinnPhong(k_d=0.4, k_s=0.2, n=20)
+    result = fitting.fit_jointly(
+        picture,
+        lit([0.55, 0.55, 0.7]),
+        start,
+        lambda m, s: (m.k_d, m.k_s, m.n, s[0].lights[0].direction),
+        precision=precision,
+    )
+    assert result.converged
+    assert not result.warnings
+    assert result.steps < 60
+
+
 @pytest.mark.parametrize("kind", ["by channel", "by brightness", "copies"])
 def test_noise_that_is_not_even_is_in_the_errors_as_in_those_of_a_fit(target: np.ndarray, kind):
     known, noise = scene(TRUE_DIRECTION, [1.0, 0.9, 0.8]), np.random.default_rng(3).standard_normal(target.shape)
