@@ -2,31 +2,41 @@
 
 A JPEG keeps brightness well and colours coarsely: in half the resolution, in large steps, and without the changes
 within a block that are below half a step. That errs the same way all over a smoothly lit object, so that no residual
-shows it and no error of blocks holds it. What it is a look-alike says: the prediction of a first fit, with noise,
-through the same codec. The mean of what that changes is taken off the codes.
+shows it and no error of blocks holds it. What it is a look-alike says: the prediction of a fit, with noise, through the
+same codec. The mean of what that changes is taken off the codes and the rest fitted again, until the picture differs
+from its look-alikes by no more than chance.
 
-Source: C. Gourieroux, A. Monfort and E. Renault, "Indirect inference", J. Applied Econometrics 8 (1993) S85.
+Sources: C. Gourieroux, A. Monfort and E. Renault, "Indirect inference", J. Applied Econometrics 8 (1993) S85;
+D. McFadden, "A method of simulated moments", Econometrica 57 (1989) 995.
 """
 
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import cast
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from brdf.images.encoding import decode
 from brdf.images.jpeg import Jpeg
-from fitting.codes import Codes
+from fitting.maximum_likelihood import bounds_of, change, most_likely
 from fitting.model_fit import ModelFit
-from fitting.pixels import Observed, Tile
+from fitting.pixels import Observed
 from fitting.problem import Target
+from fitting.solver.normal_equations import Picture
+from fitting.solver.profile import Optimum, refit
 from fitting.solver.streams import each
 
-# In codes: the noise is no larger than the first of these with which a look-alike is left with as much as the picture.
-NOISES = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
-LOOK_ALIKES = 4
+# In codes: the noise is that of these with which two look-alikes are nearest to the picture; their mean is of more.
+NOISES, FIRST_NOISE = (0.0, 0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0), 3
+COMPARED, LOOK_ALIKES = 2, 4
+# Fits and shorter steps at most; the last is one that changes no number by more than this, in standard errors that the
+# others leave, or brings the picture nearer to its look-alikes by less than this share.
+MOST_FITS, ENOUGH_CHANGE, ENOUGH_NEARER = 8, 0.5, 2e-3
+# What is still to come is up to so many times the last change.
+APPROACH = 2.0
+# Of a picture of several bands this share is fitted first, in rows of the blocks of colours; then all, so often.
+PART, BLOCK, MOST_WHOLE_FITS = 8, 16, 2
 # Of a JPEG.
 LARGEST_CODE = 255.0
 
@@ -41,69 +51,191 @@ def codec_of(target: Target) -> Jpeg | None:
     return None if codes is None or codes.values.shape[2] != 3 else codes.jpeg
 
 
-def without_codec_errors(seen: Observed, fit: ModelFit, codecs: Sequence[Jpeg | None]) -> Observed:
-    """The pixels of a problem, less what compression does to a look-alike of each picture.
+def without_codec_errors(seen: Observed, fit: ModelFit) -> tuple[ModelFit, Observed]:
+    """The most likely fit to the pixels of a problem, less what compression does to look-alikes; and these pixels.
 
     Args:
         seen: the pixels.
         fit: a first fit to them.
-        codecs: of each picture; those without one stay as they are.
     """
-    shown = [_predicted(tile, fit, index) for index, tile in enumerate(seen.tiles)]
-    sizes = [math.prod(target.pixels.shape[:2]) for target in seen.problem.targets]
-    whole = np.split(np.concatenate(shown), np.cumsum(sizes)[:-1])
-    parts = [
-        np.zeros_like(some) if codec is None else _codec_errors(codec, cast(Codes, target.codes), some)
-        for codec, target, some in zip(codecs, seen.problem.targets, whole, strict=True)
-    ]
-    errors = np.split(np.concatenate(parts), np.cumsum([len(some) for some in shown])[:-1])
-    return seen._replace(tiles=each(_less, seen.tiles, errors))
+    pictures, targets = list(fit.pictures), seen.problem.targets
+    ends = np.cumsum([len(picture.target) for picture in pictures])
+    compressed = [_Compressed.of(target) for target in targets]
+    fit, most, count = fit._replace(pictures=pictures), MOST_FITS, LOOK_ALIKES
+    made_anew = any(picture.lobe is not None and picture.lobe.source is not None for picture in pictures)
+    if len(pictures) > len(targets) and not made_anew:
+        some = list(map(_part, pictures))
+        whole = np.concatenate(
+            [own + end - len(one.target) for own, end, one in zip(some, ends, pictures, strict=True)]
+        )
+        starts = np.cumsum([0, *(one.size for one in compressed)])
+        parts = [
+            one.part(whole[(whole >= start) & (whole < start + one.size)] - start)
+            for one, start in zip(compressed, starts[:-1], strict=True)
+        ]
+        few = [picture.on_host(own) for picture, own in zip(pictures, some, strict=True)]
+        fit = fit._replace(optimum=_nearest(fit._replace(pictures=few), parts, most, count).optimum)
+        compressed = [
+            dataclasses.replace(one, kind=part.kind, settled=True) for one, part in zip(compressed, parts, strict=True)
+        ]
+        most, count = MOST_WHOLE_FITS, COMPARED
+    fit = _nearest(fit, compressed, most, count)
+    tiles = each(lambda tile, own: tile._replace(target=own.target, bounds=own.bounds), seen.tiles, fit.pictures)
+    return fit, seen._replace(tiles=tiles)
 
 
-def _predicted(tile: Tile, fit: ModelFit, index: int) -> Float[np.ndarray, "P C"]:
+def _part(picture: Picture) -> np.ndarray:
+    """Indices of those pixels of a band of rows that are nearest to the middle of the highlight, in whole rows."""
+    width, count = int(bounds_of(picture).width), len(picture.target)
+    size = min(width * max(BLOCK, count // width // PART // BLOCK * BLOCK), count)
+    middle = 0 if picture.lobe is None else int(np.argmax(picture.lobe.peak))
+    start = min(middle // size, count // size - 1) * size
+    return np.arange(start, start + size)
+
+
+def _nearest(fit: ModelFit, compressed: Sequence["_Compressed"], most: int, count: int) -> ModelFit:
+    """The fit whose look-alikes are nearest to the pictures, these less what compression does to those."""
+    at, best, least, found = fit.optimum, fit.optimum, math.inf, fit
+    for _ in range(most):
+        shown = [_predicted(picture, at) for picture in fit.pictures]
+        errors, left = _codec_errors(shown, compressed, count)
+        if left > least:
+            # The steps of the codec bend what look-alikes show: nearer by it may be better.
+            at = _moved(at, (_unknowns(best) - _unknowns(at)) / 2)
+            continue
+        pictures = list(map(_less, fit.pictures, shown, errors))
+        found = fit._replace(pictures=pictures, optimum=refit(pictures, at, fit.free, fit.n_range, fit.tied))
+        nearer, best, least, found = least - left, at, left, most_likely(found)
+        at = found.optimum
+        assert found.evidence is not None
+        if change(best, found.evidence.optimum) < ENOUGH_CHANGE or nearer < ENOUGH_NEARER * left:
+            break
+    said = found.evidence
+    assert said is not None
+    # Their mean has a share of what each errs by, which is no more than what the picture errs by.
+    said = said._replace(widening=said.widening * math.sqrt(1 + 1 / count))
+    return found._replace(evidence=said, moved=APPROACH * (_unknowns(found.optimum) - _unknowns(best)))
+
+
+def _unknowns(at: Optimum) -> Float[np.ndarray, " U"]:
+    return np.append(at.x.ravel(), at.n)
+
+
+def _moved(at: Optimum, step: Float[np.ndarray, " U"]) -> Optimum:
+    return dataclasses.replace(at, x=at.x + step[:-1].reshape(at.x.shape), n=at.n + float(step[-1]))
+
+
+def _codec_errors(
+    shown: Sequence[Float[np.ndarray, "P C"]], compressed: Sequence["_Compressed"], count: int
+) -> tuple[list[Float[np.ndarray, "P C"]], float]:
+    """What compression does to each code, and the squares of what else the pictures show."""
+    whole = np.split(np.concatenate(shown), np.cumsum([one.size for one in compressed])[:-1])
+    errors, left = zip(*(one.errors(some, count) for one, some in zip(compressed, whole, strict=True)), strict=True)
+    ends = np.cumsum([len(some) for some in shown])[:-1]
+    return np.split(np.concatenate(errors), ends), math.fsum(left)
+
+
+def _predicted(picture: Picture, at: Optimum) -> Float[np.ndarray, "P C"]:
     """In codes; NaN where a value says nothing."""
-    optimum, bounds = fit.optimum, tile.bounds
-    if bounds is None:
-        return np.full(tile.target.shape, np.nan, np.float32)
-    code, _ = bounds.codes(fit.pictures[index].shown(optimum.n, optimum.x).astype(np.float32))
+    bounds = bounds_of(picture)
+    code, _ = bounds.codes(picture.shown(at.n, at.x).astype(np.float32))
     return np.where(np.isfinite(bounds.lower) | np.isfinite(bounds.upper), code, np.float32(np.nan))
 
 
-def _codec_errors(codec: Jpeg, codes: Codes, shown: Float[np.ndarray, "P C"]) -> Float[np.ndarray, "P C"]:
-    """What compression does to each code of a picture, 0 where nothing is predicted."""
-    counts, unit, random = np.isfinite(shown), LARGEST_CODE / codes.scale, np.random.default_rng(0)
-    # Beside the object stands what the file shows there; values that were taken out were clipped.
-    shows = np.nan_to_num(codes.values.reshape(shown.shape) * unit, nan=LARGEST_CODE)
-    clean = np.where(counts, shown * unit, shows)
+@dataclasses.dataclass
+class _Compressed:
+    """A picture, or some of its rows, and how it was compressed.
 
-    def look_alike(noise: float) -> tuple[np.ndarray, np.ndarray]:
-        """Before the codec and after it."""
-        before = clean + counts * random.standard_normal(clean.shape, np.float32) * np.float32(noise)
-        given = np.clip(np.rint(before), 0, LARGEST_CODE).astype(np.uint8)
-        return before, codec.through(given.reshape(codes.values.shape)).reshape(shown.shape)
+    Attributes:
+        codec: None where it was not.
+        shows: the codes, (P, C); of values that were taken out, as they were clipped, the largest.
+        width: of the picture.
+        unit: codes of a JPEG for one of the file's.
+        kind: which of `NOISES` it has.
+        settled: no other is tried.
+    """
 
-    def left(after: np.ndarray) -> float:
-        return float(np.mean((after - clean)[counts] ** 2))
+    codec: Jpeg | None
+    shows: Float[np.ndarray, "P C"]
+    width: int
+    unit: float
+    kind: int = FIRST_NOISE
+    settled: bool = False
 
-    wanted, known = left(shows), [left(look_alike(NOISES[0])[1])]
-    for more in NOISES[1:]:
-        if known[-1] >= wanted:
-            break
-        known.append(left(look_alike(more)[1]))
-    noise = float(np.interp(wanted, known, NOISES[: len(known)]))
-    some = [look_alike(noise) for _ in range(LOOK_ALIKES)]
-    mean = np.mean([after - before for before, after in some], axis=0)
-    return np.where(counts, mean / unit, 0.0).astype(np.float32)
+    @classmethod
+    def of(cls, target: Target) -> "_Compressed":
+        """A whole picture."""
+        shows, unit, width = np.asarray(target.pixels), 1.0, target.pixels.shape[1]
+        if (codec := codec_of(target)) is not None and target.codes is not None:
+            unit = LARGEST_CODE / target.codes.scale
+            shows = np.nan_to_num(target.codes.values * unit, nan=LARGEST_CODE)
+        return cls(codec, shows.reshape(-1, shows.shape[2]), width, unit)
+
+    @property
+    def size(self) -> int:
+        """How many pixels it has."""
+        return len(self.shows)
+
+    def part(self, pixels: np.ndarray) -> "_Compressed":
+        """Those of whole rows."""
+        return dataclasses.replace(self, shows=self.shows[pixels])
+
+    def errors(self, shown: Float[np.ndarray, "P C"], count: int) -> tuple[Float[np.ndarray, "P C"], float]:
+        """What compression does to each code that is predicted, and the squares of what else the picture shows.
+
+        Args:
+            shown: predictions in codes; NaN where there is none.
+            count: of look-alikes.
+        """
+        if self.codec is None:
+            return np.zeros_like(shown), 0.0
+        counts, known = np.isfinite(shown), {}
+        clean = np.where(counts, shown * np.float32(self.unit), self.shows).astype(np.float32)
+        while not self.settled:
+            for kind in range(max(self.kind - 1, 0), min(self.kind + 2, len(NOISES))):
+                if kind not in known:
+                    known[kind] = self._look_alikes(clean, counts, NOISES[kind], COMPARED)[1]
+            last, self.kind = self.kind, min(known, key=known.__getitem__)
+            if last == self.kind:
+                break
+        errors, left = self._look_alikes(clean, counts, NOISES[self.kind], count)
+        return errors / np.float32(self.unit), left
+
+    def _look_alikes(
+        self, clean: Float[np.ndarray, "P C"], counts: Bool[np.ndarray, "P C"], noise: float, count: int
+    ) -> tuple[Float[np.ndarray, "P C"], float]:
+        """Their mean change, and the squares of what the picture differs by from the mean of all there could be."""
+        assert self.codec is not None
+        random, shape = np.random.default_rng(0), (-1, self.width, clean.shape[1])
+        mean, off, squares = np.zeros_like(clean), np.zeros_like(clean), 0.0
+        for _ in range(count):
+            before = clean + counts * random.standard_normal(clean.shape, np.float32) * np.float32(noise)
+            given = np.clip(np.rint(before), 0, LARGEST_CODE).astype(np.uint8)
+            after = self.codec.through(given.reshape(shape)).reshape(clean.shape).astype(np.float32)
+            mean += (after - before) / np.float32(count)
+            after -= self.shows
+            off, squares = off + after, squares + float(np.sum(np.where(counts, after, 0) ** 2, dtype=float))
+        # Each look-alike has errors of its own: the product of two differences has neither's in the mean.
+        together = float(np.sum(np.where(counts, off, 0) ** 2, dtype=float))
+        return np.where(counts, mean, np.float32(0)), (together - squares) / (count * (count - 1))
 
 
-def _less(tile: Tile, errors: Float[np.ndarray, "P C"]) -> Tile:
-    bounds = tile.bounds
-    if bounds is None or not errors.any():
-        return tile
-    target = np.asarray(tile.target)
-    code = np.maximum(bounds.codes(target)[0] - errors, 0.0)
-    moved = np.where(errors != 0, decode(code / bounds.scale, bounds.encoding) * bounds.unit, target)
-    lower, upper = (end - errors.astype(end.dtype) for end in (bounds.lower, bounds.upper))
-    return tile._replace(
-        target=moved.astype(target.dtype), bounds=dataclasses.replace(bounds, lower=lower, upper=upper)
+def _less(picture: Picture, shown: Float[np.ndarray, "P C"], errors: Float[np.ndarray, "P C"]) -> Picture:
+    """A picture less what compression does where so much is predicted.
+
+    Look-alikes are clipped as the picture is: of its values near an end only those are open that lie beyond it.
+    """
+    if not errors.any():
+        return picture
+    bounds, target = bounds_of(picture), np.asarray(picture.target)
+    code, half = bounds.codes(target)[0], 0.5 * np.median(bounds.widths)
+    open_end = np.isinf(bounds.lower) ^ np.isinf(bounds.upper)
+    beyond = open_end & np.where(np.isinf(bounds.upper), shown >= bounds.scale, shown <= 0)
+    errors = np.where(beyond, np.float32(0), errors)
+    moved = decode(np.maximum(code - errors, 0.0) / bounds.scale, bounds.encoding) * bounds.unit
+    lower, upper = (
+        np.where(open_end & ~beyond, code + sign * half, end) - errors.astype(end.dtype)
+        for sign, end in ((-1, bounds.lower), (1, bounds.upper))
     )
+    bounds, moved = dataclasses.replace(bounds, lower=lower, upper=upper), np.where(errors != 0, moved, target)
+    return dataclasses.replace(picture, target=moved.astype(target.dtype), bounds=bounds)

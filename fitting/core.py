@@ -80,7 +80,7 @@ def fit_pictures(problem: FitProblem) -> FitResult:
         if problem.model == "auto":
             fit, choice = _fit_simplest(seen)
         else:
-            fit, choice = most_likely(_fit_model(brdf.MODELS[problem.model], seen), copies=seen.copies), None
+            fit, choice = _fit_model(brdf.MODELS[problem.model], seen), None
         fit, choice, seen = _less_codec_errors(fit, choice, seen)
         fit = _held_plausible(fit, seen)
         told, optimum = _interpreted(fit, seen, choice), fit.optimum
@@ -278,18 +278,29 @@ def _less_codec_errors(
     What a codec takes away its look-alike does not show: which terms there are is decided before. But a highlight that
     was found in brightness may have any colour, and by that its model shows. Grey saved as colour has none to lose.
     """
-    codecs = [codec_of(target) for target in seen.problem.targets]
-    if fit.evidence is None or seen.copies or not any(codecs):
-        return fit, choice, seen
+    if (
+        seen.copies
+        or fit.capped
+        or not any(map(codec_of, seen.problem.targets))
+        or any(picture.bounds is None for picture in fit.pictures)
+    ):
+        return most_likely(fit, copies=seen.copies) if choice is None else fit, choice, seen
     if choice is not None and fit.tied is not None:
         fits = [_fit_model(brdf.MODELS[name], seen, fit.free) for name in seen.problem.families]
-        clean = without_codec_errors(seen, min(fits, key=lambda one: float(np.sum(one.optimum.cost))), codecs)
-        fits = [most_likely(_fit_model(one.model, clean, fit.free)) for one in fits]
-        best = max(fits, key=lambda one: -math.inf if one.evidence is None else one.evidence.value)
+        found = [without_codec_errors(seen, one) for one in fits]
+        # Each family is nearest to its own look-alikes: it is judged beside those of all.
+        value = [sum(_value(one, clean) for _, clean in found) for one in fits]
+        best, clean = found[int(np.argmax(value))]
         if _coloured(best, clean):
             return best, choice.coloured(best.model.name, best.free), clean
-    seen = without_codec_errors(seen, _by_squares(fit, seen), codecs)
-    return most_likely(_by_squares(fit, seen), copies=seen.copies), choice, seen
+    fit, seen = without_codec_errors(seen, fit)
+    return fit, choice, seen
+
+
+def _value(fit: ModelFit, seen: Observed) -> float:
+    """The logarithm of the likelihood of such a fit to some pixels."""
+    said = most_likely(_fit_model(fit.model, seen, fit.free)).evidence
+    return -math.inf if said is None else said.value
 
 
 def _coloured(fit: ModelFit, seen: Observed) -> bool:
@@ -306,15 +317,6 @@ def _coloured(fit: ModelFit, seen: Observed) -> bool:
     seen_as = max(highlight_in_codes(picture, fit.optimum.x, fit.optimum.n) for picture in fit.pictures)
     differs = seen_as * float(np.max(np.abs(left)) / np.max(k_s)) > COLOURED * said.noise
     return differs and is_better(float(left @ precision @ left), k_s.size - 1)
-
-
-def _by_squares(fit: ModelFit, seen: Observed) -> ModelFit:
-    """A fit with the same terms by least squares, which takes all pixels."""
-    found = _fit_model(fit.model, seen, fit.free)
-    if fit.tied is None:
-        return found
-    near = dataclasses.replace(found.optimum, n=fit.optimum.n, x=fit.optimum.x)
-    return found._replace(optimum=refit(found.pictures, near, fit.free, found.n_range, fit.tied), tied=fit.tied)
 
 
 def _likely_sums(fits: Mapping[str, ModelFit]) -> dict[str, NormalEquations]:
@@ -418,7 +420,8 @@ def _held_plausible(fit: ModelFit, seen: Observed) -> ModelFit:
 
 
 def _interpreted(fit: ModelFit, seen: Observed, choice: Choice | None, hidden: str = "") -> Interpretation:
-    told = interpret(fit, seen, hidden, None if choice is None else choice.dropped)
+    off = [some for some in (fit.moved, None if choice is None else choice.dropped) if some is not None]
+    told = interpret(fit, seen, hidden, np.array(off) if off else None)
     warnings, share = list(told.warnings), fit.residual
     if share > UNEXPLAINED:
         words = f"the model leaves {100 * share:.0f} % of the picture: are light, camera and encoding what they were?"

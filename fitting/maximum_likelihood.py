@@ -19,13 +19,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from fitting.channel_errors import can_be_coupled, coupled, each_alone, improved, precision_of, replaced, residuals
 from fitting.continuation import (
     ENOUGH_KNOWN,
     LARGEST_SHIFT,
-    LEAST_NOISE,
     REACH,
     Estimate,
     Score,
@@ -49,6 +48,8 @@ ROUGHLY_KNOWN = 1.2
 # In codes: with more noise than this, and no code at an end, a linear picture says what least squares says.
 ENOUGH_NOISE = 0.5
 FIRST_NOISE = 0.3
+# As much of the variance of what is left is noise at least, and not rounding.
+LEAST_SHARE = 0.25
 # Noise of one size in light, not in codes, where the logarithm of the likelihood is so much larger.
 LIKELIER = 2.0
 # Less noise than this, in codes, is the same in both.
@@ -57,7 +58,7 @@ FAINT = 0.02
 # errors, and this one of the noise.
 MOST_ROUNDS, ENOUGH_CHANGE, ENOUGH_NOISE_CHANGE = 10, 2.0, 0.02
 # Predictions are the same to such a share of a code, where these are so many values, and so many times as usual.
-ALIKE, FEWEST_ALIKE, MORE_ALIKE = 1024, 64, 10
+ALIKE, FEWEST_ALIKE, MORE_ALIKE, MOST_COUNTED = 1024, 64, 10, 1 << 20
 # A picture of fewer different predictions is one of planes; so many pixels tell.
 MOST_LEVELS, MOST_PIXELS = 32, 4096
 # An open end tells where a value is predicted within so many s of it; noise below this share of the picture is none.
@@ -102,7 +103,7 @@ class _Pixels(NamedTuple):
     @classmethod
     def of(cls, picture: Picture) -> "_Pixels":
         """All of a picture on the host."""
-        bounds = _bounds(picture)
+        bounds = bounds_of(picture)
         return cls(picture, Intervals(bounds.lower, bounds.upper, bounds.spread))
 
 
@@ -119,22 +120,22 @@ def most_likely(
     """
     if fit.capped or any(picture.bounds is None for picture in fit.pictures):
         return fit
-    optimum, exact = fit.optimum, all(bounds.exact for bounds in map(_bounds, fit.pictures))
+    optimum, exact = fit.optimum, all(bounds.exact for bounds in map(bounds_of, fit.pictures))
     deviation = math.sqrt(float(np.sum(optimum.cost)) / max(float(np.sum(optimum.pixels)), 1.0))
     if exact and deviation <= NO_NOISE * float(np.max(optimum.square / np.maximum(optimum.pixels, 1))) ** 0.5:
         return fit
     at = Numbers.of(optimum)
-    lossy = any(bounds.lossy for bounds in map(_bounds, fit.pictures))
+    lossy = any(bounds.lossy for bounds in map(bounds_of, fit.pictures))
     noise = _deviation(fit.pictures, at)
     if not lossy:
         fit, noise = _where_noise_is_even(fit, at, noise)
     # Weights of least squares leave out what is clipped, which says something here.
-    weights = [alike(_bounds(picture), _codes(picture, at), noise) if lossy else None for picture in fit.pictures]
+    weights = [alike(bounds_of(picture), _codes(picture, at), noise) if lossy else None for picture in fit.pictures]
     pictures = list(map(_with_weight, fit.pictures, weights))
     rounding = 0.0 if exact else 1 / 12
     widest = 1.0 if exact else max(_widest(picture) for picture in pictures)
     if exact or lossy or noise**2 > (ENOUGH_NOISE**2 + rounding) * widest**2:
-        linear = all(bounds.encoding == "linear" for bounds in map(_bounds, pictures))
+        linear = all(bounds.encoding == "linear" for bounds in map(bounds_of, pictures))
         if linear and not lossy and not any(_open_ends_tell(picture, at, noise) for picture in pictures):
             return fit
         together = lossy and not copies and (grey is not None or fit.tied is not None) and can_be_coupled(pictures)
@@ -151,12 +152,12 @@ def most_likely(
 
 def _deviation(pictures: Sequence[Picture], at: Numbers) -> float:
     """Standard deviation of what is left, in codes."""
-    return residual_deviation(map(_bounds, pictures), map(partial(_codes, at=at), pictures))
+    return residual_deviation(map(bounds_of, pictures), map(partial(_codes, at=at), pictures))
 
 
 def _is_curved(pictures: Sequence[Picture]) -> bool:
     """Whether rounded values are not linear in light, and some have both ends."""
-    bounds = list(map(_bounds, pictures))
+    bounds = list(map(bounds_of, pictures))
     return (
         any(own.encoding != "linear" for own in bounds)
         and any(own.widths.size for own in bounds)
@@ -169,8 +170,8 @@ def _in_light(pictures: Sequence[Picture]) -> list[Picture]:
 
     The unit is their median distance in all pictures, or noise of one size would be another one in each.
     """
-    size = float(np.median(np.concatenate([_bounds(picture).in_light().widths for picture in pictures])))
-    return [dataclasses.replace(picture, bounds=_bounds(picture).in_light(size)) for picture in pictures]
+    size = float(np.median(np.concatenate([bounds_of(picture).in_light().widths for picture in pictures])))
+    return [dataclasses.replace(picture, bounds=bounds_of(picture).in_light(size)) for picture in pictures]
 
 
 def _where_noise_is_even(fit: ModelFit, at: Numbers, noise: float) -> tuple[ModelFit, float]:
@@ -181,7 +182,7 @@ def _where_noise_is_even(fit: ModelFit, at: Numbers, noise: float) -> tuple[Mode
     after = _deviation(light.pictures, at)
     if not min(noise, after) > 0:
         return fit, noise
-    widths = zip(map(_bounds, fit.pictures), map(_bounds, light.pictures), strict=True)
+    widths = zip(map(bounds_of, fit.pictures), map(bounds_of, light.pictures), strict=True)
     narrower = np.concatenate([np.log(own.widths / other.widths) for own, other in widths])
     gain = narrower.size * math.log(noise / after) - float(np.sum(narrower))
     return (light, after) if gain > LIKELIER else (fit, noise)
@@ -220,14 +221,27 @@ def alike(
     code = np.rint(codes * ALIKE).astype(np.int64)
     tells, weight = np.isfinite(bounds.lower) | np.isfinite(bounds.upper), np.ones(code.shape)
     for channel, (one, some) in enumerate(zip(code.T, tells.T, strict=True)):
-        _, kind, count = np.unique(one[some], return_inverse=True, return_counts=True)
-        many = count > max(FEWEST_ALIKE, MORE_ALIKE * np.median(count) * (not level)) if count.size else count > 0
+        kind, count = _kinds(one[some])
+        many = (
+            count > max(FEWEST_ALIKE, MORE_ALIKE * np.median(count[count > 0]) * (not level))
+            if some.any()
+            else count > 0
+        )
         if level:
-            shown = bounds.lower[some, channel] + bounds.upper[some, channel]
-            first = shown[np.unique(kind, return_index=True)[1]]
-            many &= np.bincount(kind, weights=shown != first[kind]) == 0
+            shown, one_of = bounds.lower[some, channel] + bounds.upper[some, channel], np.zeros(count.size)
+            one_of[kind] = shown
+            many &= np.bincount(kind, shown != one_of[kind], count.size) == 0
         weight[some, channel] = np.where(many, 1 / (1 + count / (12 * noise**2)), 1.0)[kind]
     return weight
+
+
+def _kinds(code: Int[np.ndarray, " P"]) -> tuple[Int[np.ndarray, " P"], Int[np.ndarray, " K"]]:
+    """Which kind each code is, and how many are of each; few are counted, which is quicker than sorting."""
+    least = np.min(code, initial=0)
+    if np.max(code, initial=0) - least < MOST_COUNTED:
+        return code - least, np.bincount(code - least)
+    _, kind, count = np.unique(code, return_inverse=True, return_counts=True)
+    return kind, count
 
 
 def _near_edges(fit: ModelFit, at: Estimate, *, copies: bool) -> Evidence:
@@ -257,7 +271,7 @@ def _of_planes(pictures: Sequence[Picture], at: Estimate, problem: "_Separable")
     codes = [_codes(picture, Numbers.of(at)) for picture in pictures]
     if any(np.unique(np.rint(code[:: 1 + len(code) // MOST_PIXELS] * ALIKE)).size >= MOST_LEVELS for code in codes):
         return 0.0
-    weights = [alike(_bounds(one), code, FIRST_NOISE, level=True) for one, code in zip(pictures, codes, strict=True)]
+    weights = [alike(bounds_of(one), code, FIRST_NOISE, level=True) for one, code in zip(pictures, codes, strict=True)]
     weighted = map(_with_weight, pictures, weights)
     pixels = [_Pixels.of(picture.in_double(np.arange(len(picture.target)))) for picture in weighted]
     at, alone = at._replace(noise=FIRST_NOISE), _Separable(pixels, problem.design, problem.bounds, problem.copies)
@@ -319,7 +333,7 @@ def _reweighted(
                 optimum = refit(working, optimum, fit.free, fit.n_range, fit.tied)
             last, stated = noise, [_stated(picture, optimum, noise, rounding) for picture in pictures]
             noise = math.sqrt(sum(part.squares for part in stated) / max(sum(part.count for part in stated), 1))
-            if _change(before, optimum) < ENOUGH_CHANGE and abs(noise / last - 1) < ENOUGH_NOISE_CHANGE:
+            if change(before, optimum) < ENOUGH_CHANGE and abs(noise / last - 1) < ENOUGH_NOISE_CHANGE:
                 break
         if together:
             assert precision is not None
@@ -349,8 +363,13 @@ def _together(
     return Evidence(parts, optimum, noise, value, places, np.ones(len(normal.gram)), normal, precision)
 
 
-def _change(before: Optimum, after: Optimum) -> float:
-    """The largest change of a number, in standard errors that the others leave."""
+def change(before: Optimum, after: Optimum) -> float:
+    """The largest change of a number, in standard errors that the others leave.
+
+    Args:
+        before: numbers.
+        after: others, with the sums of their pixels.
+    """
     noise = np.maximum(after.cost, np.finfo(float).tiny) / np.maximum(after.pixels, 1)
     x = np.abs(after.x - before.x) * np.sqrt(np.diagonal(after.gram, axis1=1, axis2=2)[:, :3].T / noise)
     by_n = abs(after.n - before.n) * np.sqrt(np.sum(after.gauss_newton[:, 3, 3] / noise))
@@ -379,7 +398,7 @@ class _Stated:
 
 
 def _stated(picture: Picture, optimum: Optimum, noise: float, rounding: float) -> _Stated:
-    bounds = _bounds(picture)
+    bounds = bounds_of(picture)
     made = jax.device_get(_linearised(picture, np.asarray(optimum.n), optimum.x))
     target, weight = np.array(made[0]), np.array(made[1])
     squares, closed = float(made[2]), float(made[3])
@@ -387,7 +406,7 @@ def _stated(picture: Picture, optimum: Optimum, noise: float, rounding: float) -
     half = np.isfinite(bounds.lower) ^ np.isfinite(bounds.upper)
     index = np.flatnonzero(half.any(axis=1))
     if index.size:
-        s = math.sqrt(max(noise**2 - rounding, LEAST_NOISE**2))
+        s = math.sqrt(max(noise**2 - rounding, LEAST_SHARE * noise**2))
         pixels = _Pixels.of(picture.in_double(index))
         shown = _Shown.of(pixels, Numbers.of(optimum))
         told = pixels.intervals.said(shown.code, s)
@@ -409,7 +428,7 @@ def _stated(picture: Picture, optimum: Optimum, noise: float, rounding: float) -
 @eqx.filter_jit
 def _linearised(picture: Picture, n: AnyArray, x: AnyArray) -> tuple[Array, Array, Array, Array]:
     """Working targets and weights of values with both ends, squares of their residuals in codes, their count."""
-    bounds, dtype = _bounds(picture), picture.target.dtype
+    bounds, dtype = bounds_of(picture), picture.target.dtype
     radiance = picture.predicted(n, x)
     code, slope = bounds.codes(radiance)
     closed = jnp.isfinite(bounds.lower) & jnp.isfinite(bounds.upper)
@@ -423,7 +442,7 @@ def _linearised(picture: Picture, n: AnyArray, x: AnyArray) -> tuple[Array, Arra
 
 def _place(picture: Picture) -> tuple[np.ndarray, int]:
     """Index of the pixels in their picture, and its width."""
-    bounds = _bounds(picture)
+    bounds = bounds_of(picture)
     return np.asarray(bounds.index), int(bounds.width)
 
 
@@ -458,7 +477,7 @@ class _Separable:
             x, log_n = Numbers.of(at)
             for part in self.pixels:
                 radiance = np.asarray(part.picture.predicted(np.asarray(math.exp(log_n)), x))
-                self._last[1].append(_bounds(part.picture).codes(radiance)[0])
+                self._last[1].append(bounds_of(part.picture).codes(radiance)[0])
         return self._last[1]
 
     @property
@@ -469,7 +488,7 @@ class _Separable:
     def near(self, at: Estimate, reach: float, beside: list[_Some] | None = None) -> list[_Some]:
         """The pixels that say something, and those beside."""
         both = zip(self.pixels, self._codes(at), strict=True)
-        which = [_bounds(part.picture).near(code, reach * at.noise) for part, code in both]
+        which = [bounds_of(part.picture).near(code, reach * at.noise) for part, code in both]
         if beside is not None:
             which = together(which, [one.which for one in beside])
         if which is None:
@@ -504,7 +523,9 @@ class _Separable:
         weight, score = np.sum([one[0] for one in sums], axis=0), np.sum([one[1] for one in sums], axis=0)
         normal = join_channels(weight, score, np.zeros(len(score)), Numbers.of(at).x[2])
         by_noise = [
-            noise_score(one.told, at.noise * _bounds(one.shown.pixels.picture).spread, one.shown.pixels.picture.weights)
+            noise_score(
+                one.told, at.noise * bounds_of(one.shown.pixels.picture).spread, one.shown.pixels.picture.weights
+            )
             for one in said
         ]
         value, by_log_noise, information = np.array(by_noise).sum(axis=0).tolist()
@@ -550,7 +571,7 @@ class _Shown(NamedTuple):
         columns = pixels.picture.columns(n)
         columns[3] *= n
         radiance = columns[0] * x[0] + columns[1] * x[1] + columns[2] * x[2]
-        code, slope = _bounds(pixels.picture).codes(radiance)
+        code, slope = bounds_of(pixels.picture).codes(radiance)
         return cls(pixels, code, radiance, slope, columns)
 
 
@@ -579,7 +600,7 @@ class _Said(NamedTuple):
 
 def _near(picture: Picture, at: Estimate, reach: float) -> Bool[np.ndarray, " P"]:
     """Which pixels say something: those with a value not surely inside its bounds, by so many s."""
-    return _bounds(picture).near(_codes(picture, Numbers.of(at)), reach * at.noise)
+    return bounds_of(picture).near(_codes(picture, Numbers.of(at)), reach * at.noise)
 
 
 def _gathered(pictures: Sequence[Picture], at: Estimate) -> list[_Pixels]:
@@ -603,7 +624,12 @@ def _stratum(picture: Picture, size: int) -> _Pixels:
     return some._replace(picture=dataclasses.replace(some.picture, weight=weight))
 
 
-def _bounds(picture: Picture) -> Bounds:
+def bounds_of(picture: Picture) -> Bounds:
+    """Between which codes its values lay.
+
+    Args:
+        picture: with such.
+    """
     assert picture.bounds is not None
     return picture.bounds
 
@@ -611,18 +637,18 @@ def _bounds(picture: Picture) -> Bounds:
 def _codes(picture: Picture, at: Numbers) -> np.ndarray:
     """What is predicted, in codes, (P, C)."""
     radiance = picture.shown(math.exp(at.log_n), at.x).astype(np.float64)
-    return _bounds(picture).codes(radiance)[0]
+    return bounds_of(picture).codes(radiance)[0]
 
 
 def _widest(picture: Picture) -> float:
     """The largest distance of two ends: of floats that grows with brightness."""
-    width = _bounds(picture).upper - _bounds(picture).lower
+    width = bounds_of(picture).upper - bounds_of(picture).lower
     return float(np.max(width, where=np.isfinite(width), initial=0.0))
 
 
 def _open_ends_tell(picture: Picture, at: Numbers, noise: float) -> bool:
     """Whether some value is known by one end only and is predicted near it."""
-    half = np.any(np.isfinite(_bounds(picture).lower) ^ np.isfinite(_bounds(picture).upper), axis=1)
+    half = np.any(np.isfinite(bounds_of(picture).lower) ^ np.isfinite(bounds_of(picture).upper), axis=1)
     return bool(half.any()) and bool(np.any(_near(picture, Estimate(at.unknowns, noise), END_REACH)[half]))
 
 

@@ -110,7 +110,7 @@ def uncertainty(
     resolution: float = 0.0,
     missed: SampleError | None = None,
     joined: Float[np.ndarray, "U U"] | None = None,
-    dropped: Float[np.ndarray, " U"] | None = None,
+    moved: Float[np.ndarray, "K U"] | None = None,
 ) -> Uncertainty:
     """Errors of an optimum.
 
@@ -135,7 +135,7 @@ def uncertainty(
         gain: see `specular_gain`, where more pixels tell of it than those of the optimum's sums.
         missed: what light samples leave out; None where there are none.
         joined: the Hessian of all channels, whose noise is 1, where these err together.
-        dropped: by how much terms that were left out may have moved the unknowns.
+        moved: by how much each of some causes may have moved the unknowns.
     """
     gain = max(gain, specular_gain(optimum, noise))
     columns = rms_columns(optimum) if columns is None else columns
@@ -167,7 +167,7 @@ def uncertainty(
         resolution,
         missed,
         joined,
-        dropped,
+        moved,
     )
     sums = {c: some._replace(error=some.columns[0] * x_error[some.terms[0], c]) for c, some in sums.items()}
     alone = x_error
@@ -270,7 +270,7 @@ def _errors(
     resolution: float,
     missed: SampleError | None,
     joined: np.ndarray | None,
-    dropped: np.ndarray | None = None,
+    moved: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, float, np.ndarray, float]:
     """Errors and intervals of x, the error of n, the correlation of all unknowns, and the rise of the cost.
 
@@ -315,8 +315,8 @@ def _errors(
     if missed is not None:
         off = missed.shift(np.append(active.ravel(), with_n)) * np.append(np.ones(size - 1), optimum.n)
         covariance = covariance + np.outer(off, off)
-    if dropped is not None:
-        covariance = covariance + np.outer(dropped, dropped)
+    if moved is not None:
+        covariance = covariance + moved.T @ moved
     variance = np.maximum(np.diag(covariance), 0.0)
     error, interval = np.full((3, channels), np.inf), np.zeros((3, channels, 2))
     interval[..., 1] = np.inf

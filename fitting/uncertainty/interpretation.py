@@ -87,7 +87,7 @@ class Interpretation(NamedTuple):
 
 
 def interpret(
-    fit: ModelFit, seen: Observed, hidden: str = "", dropped: Float[np.ndarray, " U"] | None = None
+    fit: ModelFit, seen: Observed, hidden: str = "", moved: Float[np.ndarray, "K U"] | None = None
 ) -> Interpretation:
     """Tell what a fit says.
 
@@ -95,7 +95,7 @@ def interpret(
         fit: of one model.
         seen: what was fitted.
         hidden: why there is no highlight, where a fit with one has told.
-        dropped: by how much terms that were left out may have moved x_a, x_d, x_s, channel after channel, and n.
+        moved: by how much each of some causes may have moved x_a, x_d, x_s, channel after channel, and n.
     """
     optimum, pictures = fit.optimum, fit.pictures
     weight = _typical_weight(pictures)
@@ -147,7 +147,7 @@ def interpret(
         missed=seen.problem.sample_error(fit.model.name),
         resolution=resolution,
         joined=joined,
-        dropped=dropped,
+        moved=moved,
     )
     interval = None
     # At k_d + k_s = 1 the cost still falls across the bound: a profile that does not know it has its least elsewhere.
