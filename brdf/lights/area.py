@@ -143,13 +143,13 @@ class PolygonLight(Light):
     """A flat polygon that shines to the side from which its vertices run counter-clockwise.
 
     Args:
-        vertices: (V, 3) corners in order, at least 3, in one plane, of a convex polygon.
+        vertices: (V, 3) corners in order, at least 3, in one plane; it need not be convex but must not cross itself.
         radiance: (C,), the same in all directions of the front side.
         samples: how many light samples at most, the same number for each triangle it is cut into.
 
     Raises:
-        InputError: where a value is not finite, the polygon has no area, is not flat or not convex, or a radiance is
-            negative.
+        InputError: where a value is not finite, the polygon has no area, is not flat or crosses itself, or a radiance
+            is negative.
 
     Example:
         >>> lamp = brdf.PolygonLight([[0, 0, 2], [0, 1, 2], [1, 0, 2]], radiance=3.0)  # shines down
@@ -160,24 +160,23 @@ class PolygonLight(Light):
     vertices: Float[Array, "V 3"] = checked(vertex_list, "vertices")
     radiance: Spectrum = checked(spectrum, "radiance")
     samples: int = eqx.field(static=True, converter=sample_number, default=SAMPLES)
+    triangles: tuple[tuple[int, int, int], ...] = eqx.field(static=True, init=False)
     type_name: ClassVar[str] = "polygon"
     emits: ClassVar[tuple[int, ...]] = (1,)
 
-    def __check_init__(self):
-        """Refuse what is no convex polygon, and fewer samples than triangles."""
-        triangles = self.vertices.shape[0] - 2
-        if self.samples < triangles:
-            came = f"must be at least {triangles} for {triangles + 2} vertices, got {self.samples}"
+    def __post_init__(self):
+        """Cut it into triangles, once."""
+        self.vertices = vertex_list("vertices", self.vertices)  # a field's converter would run after this
+        self.samples = sample_number(self.samples)
+        self.triangles = triangulate(self.vertices)
+        if self.samples < len(self.triangles):
+            came = f"must be at least {len(self.triangles)} for {len(self.vertices)} vertices, got {self.samples}"
             raise InputError("samples", came, "Give one sample for each triangle at least")
-        if isinstance(self.vertices, np.ndarray):
-            _check_convex(self.vertices)
 
     def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        """The corners of the triangles about the last vertex, and a product rule over the unit square of each."""
-        count = self.vertices.shape[0] - 2
-        rule, first = square_rule(self.samples // count), np.arange(count)
-        triangles = np.stack([0 * first - 1, first, first + 1], axis=1)
-        corners = self.vertices[np.repeat(triangles, rule.weight.size, axis=0)]
+        """The corners of each triangle, and a product rule over the unit square of each."""
+        rule, count = square_rule(self.samples // len(self.triangles)), len(self.triangles)
+        corners = self.vertices[np.repeat(np.array(self.triangles), rule.weight.size, axis=0)]
         tiled = [np.tile(values, count) for values in rule]
         return (_newell_normal(self.vertices), self.radiance), (corners, *tiled)
 
@@ -200,7 +199,10 @@ def _newell_normal(vertices: Any) -> Any:
     return xp.sum(xp.cross(relative, xp.roll(relative, -1, axis=0)), axis=0)
 
 
-def _check_convex(vertices: np.ndarray) -> None:
+def triangulate(vertices: Any) -> tuple[tuple[int, int, int], ...]:
+    """Cut off ears until a triangle is left (G. H. Meisters, 1975); a fan where JAX is tracing the vertices."""
+    if not isinstance(vertices, np.ndarray):
+        return tuple((0, last - 1, last) for last in range(2, vertices.shape[0]))
     size = float(np.max(np.abs(vertices - vertices.mean(axis=0))))
     area_vector = _newell_normal(vertices)
     double_area = float(np.linalg.norm(area_vector))
@@ -209,12 +211,25 @@ def _check_convex(vertices: np.ndarray) -> None:
     normal, relative = area_vector / double_area, vertices - vertices[0]
     if np.max(np.abs(relative @ normal)) > FLAT * size:
         raise InputError("vertices", "do not lie in one plane", "Cut the light into flat polygons")
-    # Twice the areas of the triangles about one vertex, and at each vertex: a star turns left everywhere, too.
-    edges = np.roll(vertices, -1, axis=0) - vertices
-    areas = [np.cross(relative, edges), np.cross(edges, np.roll(edges, -1, axis=0))]
-    if np.min(areas @ normal) < -FLAT * size * size:
-        remedy = "Give the corners of a convex polygon in order, of another shape those of its convex parts"
-        raise InputError("vertices", "are not the corners of a convex polygon", remedy)
+    left, triangles = list(range(len(vertices))), []
+
+    def turn(a: int, b: int, c: int) -> float:
+        """Twice the area of the triangle a b c, positive where it turns left."""
+        return float(normal @ np.cross(vertices[b] - vertices[a], vertices[c] - vertices[a]))
+
+    def is_ear(a: int, b: int, c: int) -> bool:
+        others = [d for d in left if d not in (a, b, c)]
+        return turn(a, b, c) >= 0 and not any(min(turn(a, b, d), turn(b, c, d), turn(c, a, d)) > 0 for d in others)
+
+    while len(left) > 3:
+        corners = [(left[i - 1], left[i], left[(i + 1) % len(left)]) for i in range(len(left))]
+        ear = next((corner for corner in corners if is_ear(*corner)), None)
+        if ear is None:
+            raise InputError("vertices", "cross each other's edges", "Give the corners of a simple polygon in order")
+        if turn(*ear) > 0:
+            triangles.append(ear)
+        left.remove(ear[1])
+    return (*triangles, (left[0], left[1], left[2]))
 
 
 class SphereLight(Light):

@@ -55,7 +55,7 @@ def _with_samples(light: Light, samples: int) -> Light:
             same = light.pixels, plain.radiance * light.radiance
             made = eqx.tree_at(lambda one: (one.pixels, one.radiance), plain, same)
         else:
-            made = dataclasses.replace(light, samples=max(samples, len(getattr(light, "vertices", ())) - 2))
+            made = dataclasses.replace(light, samples=max(samples, len(getattr(light, "triangles", ()))))
         _made[key] = made
         weakref.finalize(light, _made.pop, key)
     return _made[key]
