@@ -11,5 +11,5 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 # A program that another process is just writing is compiled again.
 os.environ.setdefault("PYTHONWARNINGS", "ignore:Error reading persistent compilation cache entry")
-# Tracing makes many objects that live: looking for cycles as often as Python does takes a fifth of what is not compiling.
+# Tracing makes many objects that live: to look for cycles as often as Python does is a fifth of what is not compiling.
 gc.set_threshold(200_000, 20, 100)
