@@ -98,12 +98,11 @@ class Camera(Checked):
         right = normalize(jnp.cross(forward, self.up))
         return right, jnp.cross(right, forward), forward
 
-    def off_axis(self, column: Any, row: Any) -> tuple[Array, Array]:
-        """How far places lie from the middle of the picture, in the unit of its half width; and the way forward."""
+    def off_axis(self, column: Any, row: Any, right: Vector, up: Vector) -> Array:
+        """How far places lie from the middle of the picture, in the unit of its half width."""
         width, height = self.resolution
-        right, up, forward = self.axes()
         x, y = column * 2.0 / width - 1.0, height / width - row * 2.0 / width
-        return self.half_width * (x[..., None] * right + y[..., None] * up), forward
+        return self.half_width * (x[..., None] * right + y[..., None] * up)
 
     def to_view(self, position: Vectors) -> Vectors:
         """Unit directions from surface points towards the eye."""
@@ -141,8 +140,8 @@ class OrthographicCamera(Camera):
 
     def rays(self, column: Numbers, row: Numbers) -> tuple[Vectors, Vectors]:
         """Origins on the plane through ``position``, one direction."""
-        offset, forward = self.off_axis(column, row)
-        origins = self.position + offset
+        right, up, forward = self.axes()
+        origins = self.position + self.off_axis(column, row, right, up)
         return origins, jnp.broadcast_to(forward, origins.shape)
 
 
@@ -176,8 +175,8 @@ class PerspectiveCamera(Camera):
 
     def rays(self, column: Numbers, row: Numbers) -> tuple[Vectors, Vectors]:
         """One origin, a direction per place."""
-        offset, forward = self.off_axis(column, row)
-        directions = normalize(forward + offset)
+        right, up, forward = self.axes()
+        directions = normalize(forward + self.off_axis(column, row, right, up))
         return jnp.broadcast_to(self.position, directions.shape), directions
 
 
