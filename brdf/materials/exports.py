@@ -128,7 +128,7 @@ def _with_note(text: str, to: str, note: str) -> str:
     """The text with a note where its format has a place for one."""
     if not text.startswith("{"):
         start, end = {"glsl": ("//", ""), "mitsuba": ("<!--", " -->")}.get(to, ("#", ""))
-        return f"{start} note: {note.replace('--', '- -')}{end}\n{text}"
+        return f"{start} note: {note.replace('--', '')}{end}\n{text}"
     values = json.loads(text)
     if to == "gltf":
         values["materials"][0].setdefault("extras", {})["note"] = note

@@ -5,7 +5,8 @@ hemisphere for several directions of the other vector, both ways round, and wher
 and normal direction). The worst are then improved by a random search at all scales, with a fixed seed. For the energy
 the peaks found announce the lobes to an adaptive quadrature.
 
-What that cannot see: a feature narrower than half a degree in light *and* view at once, away from those places.
+What that cannot see, away from those places: a feature of light, view or half vector narrower than half a degree, and
+one narrower than some ten degrees in light *and* view at once, of which 2^17 random pairs hardly one meets.
 
 The quadrature. A smooth map carries the square [-1, 1]^2 to the hemisphere. It is cut into small ones, which are
 halved again and again where the function asks for it. Each is integrated by a Gauss-Legendre product rule; a square

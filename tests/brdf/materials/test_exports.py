@@ -8,6 +8,7 @@ import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -295,3 +296,9 @@ def test_mitsuba_reads_lambert_exactly():
     interaction.wi = mitsuba.Vector3f(0, 0, 1)
     value = plugin.eval(mitsuba.BSDFContext(), interaction, mitsuba.Vector3f(0, 0, 1))
     np.testing.assert_allclose(np.array(value) * np.pi, RGB["k_d"], rtol=1e-6)
+
+
+def test_a_note_in_a_mitsuba_scene_leaves_it_readable():
+    text = brdf.export_material(LAMBERT, "mitsuba", note="only 0.2 k_a --- see --plausible").text
+    assert ElementTree.fromstring(text).tag == "scene"
+    assert "see plausible" in text
