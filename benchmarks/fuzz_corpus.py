@@ -77,10 +77,17 @@ def _lights(path: Path) -> Any:
     return read_directions(path)
 
 
-def _array(path: Path) -> Any:
-    from fitting.maps.map_inputs import read_normal_map
+def _archive(path: Path) -> Any:
+    from fitting.photographs.archives import read_archive
 
-    return read_normal_map(path)
+    return read_archive(path)
+
+
+def _array(path: Path) -> Any:
+    from fitting.photographs.archives import read_array
+
+    with path.open("rb") as file:
+        return read_array(file, path, path.stat().st_size)
 
 
 def pictures(folder: Path) -> list[tuple[str, bytes, Callable[[Path], Any]]]:
@@ -123,6 +130,18 @@ def array(folder: Path) -> bytes:
     return content
 
 
+def archive(folder: Path) -> bytes:
+    """A small archive of photographs."""
+    import numpy as np
+
+    np.savez(
+        folder / "sound.npz", images=np.ones((1, 2, 2), np.uint8), normal=np.ones((2, 2, 3)), light_dirs=np.ones((1, 3))
+    )
+    content = (folder / "sound.npz").read_bytes()
+    (folder / "sound.npz").unlink()
+    return content
+
+
 def corpus(folder: Path) -> list[tuple[str, bytes, Callable[[Path], Any]]]:
     """Suffix, sound content and reader of each format.
 
@@ -140,6 +159,6 @@ def corpus(folder: Path) -> list[tuple[str, bytes, Callable[[Path], Any]]]:
         (".txt", LIGHTS, _lights),
     ]
     merl = struct.pack("<3i", *measured_merl.SHAPE) + bytes(64)
-    binary = [(".binary", merl, load_measured), (".bsdf", tensor(), load_measured)]
+    binary = [(".binary", merl, load_measured), (".bsdf", tensor(), load_measured), (".npz", archive(folder), _archive)]
     binary += [(".npy", array(folder), _array), *pictures(folder)]
     return [(suffix, content.encode(), reader) for suffix, content, reader in text] + binary

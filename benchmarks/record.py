@@ -827,8 +827,10 @@ def _views() -> Any:
     shapes = [brdf.Sphere(center=(0, 0, 0), radius=1.0)]
     shapes.append(brdf.Sphere(center=(0.9, 0.9, 1.5), radius=0.3, fitted=False))
     scene = brdf.Scene(camera=perspective, shapes=shapes, lights=LIGHTS["point"]())
+    shown = np.linspace(0, 1, SIZE * SIZE).reshape(SIZE, SIZE)
+    masked_scene = brdf.Scene(camera=ball().camera, shapes=shapes[:1], lights=(SUN,), visibility=(shown,))
     area = ball("sphere", wall=True, samples=4)
-    scenes = {"perspective": scene, "area": area}
+    scenes = {"perspective": scene, "visibility": masked_scene, "area": area}
     return {name: numbers(brdf.render(MATERIAL, one, precision="float64")) for name, one in scenes.items()}
 
 

@@ -64,9 +64,10 @@ def light_terms(
     occluders: tuple[Shape, ...],
     kind: type[Light],
     row: tuple[Array, ...],
+    light: Int[Array, ""],
     point: SurfacePoints,
 ) -> LightTerms:
-    """The terms at one point of one sample, a row of a stack."""
+    """The terms at one point of one sample, a row of a stack, of the scene's light of that number."""
     sample = kind.sample(point, *row)
     if sample.moments is None:
         cosine, above = dot(point.normal, sample.to_light), 1.0
@@ -76,6 +77,8 @@ def light_terms(
     intensity = sample.intensity
     if occluders:
         intensity = intensity * share_seen(occluders, point, sample.to_light, sample.distance, sample.radius)
+    if point.visibility is not None:
+        intensity = intensity * point.visibility[light]
     matt = lit if sample.lobe_only is None else lit & (sample.lobe_only == 0)
     diffuse = intensity * jnp.where(matt, cosine, 0)
     if not has_lobe(model):
@@ -154,19 +157,19 @@ def over_samples(
     def of_tile(tile: Any) -> Any:
         dtype = tile.normal.parts[0].dtype
 
-        def add(kind: type[Light], numbers: Any, total: Any, chunk: tuple[Any, Any]) -> tuple[Any, None]:
-            nodes, emitted = chunk
+        def add(kind: type[Light], numbers: Any, light: Any, total: Any, chunk: tuple[Any, ...]) -> tuple[Any, None]:
+            nodes, emitted = chunk[:2]
             shines = emitted.any(axis=1)
-            if numbers:
+            if light is not None:
                 shines &= nodes[kind.weighs].reshape(shines.size, -1).any(axis=1)
-            added = partial(add_lit, kind, numbers)
+            added = partial(add_lit, kind, numbers, light)
             return jax.lax.cond(jnp.any(shines), added, lambda before, _: before, total, chunk), None
 
-        def add_lit(kind: type[Light], numbers: Any, total: Any, chunk: tuple[Any, Any]) -> Any:
-            nodes, emitted = chunk
+        def add_lit(kind: type[Light], numbers: Any, light: Any, total: Any, chunk: tuple[Any, ...]) -> Any:
+            nodes, emitted = chunk[:2]
             row = (*map(_apart, numbers), *map(_chunk_apart, nodes))
             grey: Any = tuple(1.0 if place in kind.emits else part for place, part in enumerate(row))
-            terms = light_terms(model, occluders, kind, grey, tile)
+            terms = light_terms(model, occluders, kind, grey, light if len(chunk) == 2 else chunk[2], tile)
             terms = LightTerms(*(jnp.broadcast_to(part, (len(emitted), *tile.mask.shape)) for part in terms))
             terms = jax.lax.optimization_barrier(terms)  # or each of the sums would make them anew
             peak = jnp.max(jnp.where(emitted.max(axis=1, keepdims=True) > 0, _peak(terms), NO_LOBE), axis=0)
@@ -179,15 +182,16 @@ def over_samples(
         for stack in lighting.stacks:
             kind = stack.kind
             if not stack.nodes:
-                chunks = _chunks((stack.numbers, stack.emitted(channels)[:, 0]))
-                total, _ = jax.lax.scan(jax.checkpoint(partial(add, kind, ())), total, chunks)
+                chunks = _chunks((stack.numbers, stack.emitted(channels)[:, 0], stack.light))
+                total, _ = jax.lax.scan(jax.checkpoint(partial(add, kind, (), None)), total, chunks)
                 continue
 
             def add_light(total: Any, one: Any, kind: type[Light] = kind) -> tuple[Any, None]:
-                numbers, *samples = one
-                return jax.lax.scan(jax.checkpoint(partial(add, kind, numbers)), total, _chunks(samples))
+                numbers, light, *samples = one
+                step = jax.checkpoint(partial(add, kind, numbers, light))
+                return jax.lax.scan(step, total, _chunks(tuple(samples)))
 
-            each = stack.numbers, stack.nodes, stack.emitted(channels)
+            each = stack.numbers, stack.light, stack.nodes, stack.emitted(channels)
             total, _ = jax.lax.scan(add_light, total, each)
         return jax.tree.map(lambda leaf: leaf.T, total)
 
@@ -218,15 +222,18 @@ def _chunks(samples: Any) -> Any:
     chunks = -(-count // CHUNK)
     size = -(-count // chunks)
     index = np.minimum(np.arange(chunks * size), count - 1).reshape(chunks, size)
-    numbers, emitted = jax.tree.map(lambda leaf: leaf[index], tuple(samples))
+    numbers, emitted, *light = jax.tree.map(lambda leaf: leaf[index], samples)
     beyond = np.arange(chunks * size).reshape(chunks, size, 1) >= count
-    return numbers, jnp.where(beyond, 0, emitted)
+    return numbers, jnp.where(beyond, 0, emitted), *light
 
 
 def _points_apart(points: SurfacePoints, rough: bool) -> Any:
-    """The vectors of (P,) points in components."""
-    apart = jax.tree.map(lambda leaf: Components.of(leaf) if leaf.ndim == 2 else leaf, points)
-    return dataclasses.replace(apart, normal=dataclasses.replace(apart.normal, rough=rough))
+    """The vectors of (P,) points in components, and the lights that they see along the first axis."""
+    seen = None if points.visibility is None else points.visibility.T
+    plain = dataclasses.replace(points, visibility=None)
+    apart = jax.tree.map(lambda leaf: Components.of(leaf) if leaf.ndim == 2 else leaf, plain)
+    normal = dataclasses.replace(apart.normal, rough=rough)
+    return dataclasses.replace(apart, normal=normal, visibility=seen)
 
 
 def _by_tiles(of_tile: Callable[[SurfacePoints], Any], points: SurfacePoints, rough: bool) -> Any:
@@ -470,8 +477,8 @@ def basis_program(
 def _diffuse_and_terms(model: Model, points: SurfacePoints, lighting: Lighting) -> tuple[Array, Lobe | None]:
     diffuse: Any = 0.0
     kept: tuple[Any, ...] = ()
-    for kind, row in lighting.each():
-        terms = jax.vmap(partial(light_terms, model, lighting.occluders, kind, row))(points)
+    for kind, row, light in lighting.each():
+        terms = jax.vmap(partial(light_terms, model, lighting.occluders, kind, row, light))(points)
         diffuse, kept = diffuse + terms.diffuse, (*kept, (terms.weight[:, None], terms.log_cosine[:, None]))
     return diffuse, Lobe.of_terms(kept) if has_lobe(model) else None
 
@@ -515,15 +522,15 @@ def _stacked_terms(model: Model, lighting: Lighting, points: SurfacePoints) -> t
     for stack in lighting.stacks:
 
         def of_light(one: Any, kind: type[Light] = stack.kind) -> LightTerms:
-            numbers, nodes = one
+            numbers, nodes, light = one
 
             def of_sample(node: tuple[Array, ...]) -> LightTerms:
-                of_point = partial(light_terms, model, lighting.occluders, kind, (*numbers, *node))
+                of_point = partial(light_terms, model, lighting.occluders, kind, (*numbers, *node), light)
                 return jax.vmap(of_point)(points)
 
             return jax.lax.map(of_sample, nodes) if nodes else of_sample(())
 
-        terms = jax.lax.map(of_light, (stack.numbers, stack.nodes))
+        terms = jax.lax.map(of_light, (stack.numbers, stack.nodes, stack.light))
         terms = jax.tree.map(lambda leaf, count=stack.samples: leaf.reshape(count, points.mask.size, -1), terms)
         diffuse = diffuse + jnp.sum(terms.diffuse, axis=0)
         kept = (*kept, (terms.weight.swapaxes(0, 1), terms.log_cosine[..., 0].T))

@@ -93,7 +93,7 @@ def _matters(points: SurfacePoints, camera: Camera, shapes: tuple[Shape, ...], l
         def or_light(found: Array, row: tuple[Array, ...], kind: type[Light] = stack.kind) -> tuple[Array, None]:
             return found | _light_matters(points, lighting.occluders, kind, row), None
 
-        matters, _ = jax.lax.scan(or_light, matters, stack.rows())
+        matters, _ = jax.lax.scan(or_light, matters, stack.rows()[0])
     return jnp.stack([edge, matters & points.mask])
 
 
@@ -123,6 +123,10 @@ def _averaged(points: SurfacePoints, camera: Camera, shapes: tuple[Shape, ...], 
     rule, side = square_rule(camera.samples**2), 3 * camera.samples
     column, row = (pixel % width)[:, None], (pixel // width)[:, None]
     fine = apart(trace, camera, shapes, column + rule.s, row + rule.t)
+    if points.visibility is not None:
+        seen = jnp.take(points.visibility.reshape(count, -1), pixel, axis=0, mode="clip")[:, None]
+        seen = jnp.broadcast_to(seen, (*fine.mask.shape, seen.shape[-1]))
+        fine = dataclasses.replace(fine, visibility=seen)
     right, down = (grid.ravel() for grid in np.meshgrid(*[(np.arange(side) + 0.5) / side] * 2))
     counted = apart(shapes_met, camera, shapes, column[:edges] + right, row[:edges] + down)
     weight = jnp.broadcast_to(jnp.asarray(rule.weight, fine.position.dtype), fine.mask.shape)

@@ -247,9 +247,10 @@ def render_lights(material: Material, scene: Scene, *, precision: Precision | No
         scene, points = _seen(scene, precision)
         material = cast(material, precision)
         images = []
-        for light in scene.lights:
-            alone = Lighting(stacked((light,), points.position.dtype), scene.occluders)
-            images.append(_shade(material, points, None, alone))
+        for index, light in enumerate(scene.lights):
+            (stack,) = stacked((light,), points.position.dtype)
+            stack = dataclasses.replace(stack, light=stack.light + index)  # its own mask, where masks are given
+            images.append(_shade(material, points, None, Lighting((stack,), scene.occluders)))
         if scene.ambient is not None:
             images.append(_shade(material, points, scene.ambient, Lighting(())))
         return jnp.stack([jnp.broadcast_to(image, shape) for image in images]) if images else jnp.zeros((0, *shape))

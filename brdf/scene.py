@@ -8,9 +8,10 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
 from brdf.checks import Checked, Spectrum, instance, several, spectrum
 from brdf.errors import InputError
@@ -28,6 +29,21 @@ def _ambient(value: Any) -> Any:
     return None if value is None else spectrum("intensity", value)
 
 
+def _masks(value: Any) -> tuple[Any, ...]:
+    """Given shadow masks: (H, W) values from 0 to 1, or None, one for each light."""
+    masks = []
+    for mask in several("visibility", value):
+        if mask is not None and not isinstance(mask, jax.Array):
+            mask = np.asarray(mask, dtype=np.float64)
+            if mask.ndim != 2:
+                raise InputError("visibility", f"must be of shape (H, W), got {mask.shape}", "Give a value per pixel")
+            if not np.all((mask >= 0) & (mask <= 1)):
+                came = f"must lie between 0 and 1, got {np.min(mask):g} to {np.max(mask):g}"
+                raise InputError("visibility", came, "Give the share of the light that each pixel sees")
+        masks.append(mask)
+    return tuple(masks)
+
+
 class Scene(Checked):
     """Camera and shapes, or surface points in their place; lights; ambient light.
 
@@ -40,6 +56,8 @@ class Scene(Checked):
         points: (H, W) surface points from elsewhere, instead of camera and shapes.
         ambient: intensity of the ambient light, (C,), or None.
         lights: the lights.
+        visibility: for each light (H, W) values from 0 to 1, how much of it each pixel sees, where that is known, or
+            None where the shapes tell; () where they tell for all. It multiplies whatever shadows the shapes cast.
 
     Raises:
         InputError: where the parts do not belong together.
@@ -55,6 +73,7 @@ class Scene(Checked):
     points: SurfacePoints | None = None
     ambient: Spectrum | None = eqx.field(converter=_ambient, default=None)
     lights: tuple[Light, ...] = eqx.field(converter=partial(several, "lights"), default=())
+    visibility: tuple[Float[Array, "H W"] | None, ...] = eqx.field(converter=_masks, default=())
 
     def __check_init__(self):
         """Refuse parts that do not belong together."""
@@ -74,6 +93,14 @@ class Scene(Checked):
         if self.points is not None and self.shapes and all(shape.fitted for shape in self.shapes):
             remedy = "Set fitted = false: beside surface points, shapes are occluders only"
             raise InputError("shapes", "must not be fitted where surface points are given", remedy)
+        if self.visibility and len(self.visibility) != len(self.lights):
+            came = f"has {len(self.visibility)} entries for {len(self.lights)} lights"
+            raise InputError("visibility", came, "Give one for each light, None where the shapes tell")
+        width, height = self.resolution
+        for mask in self.visibility:
+            if mask is not None and mask.shape != (height, width):
+                came = f"must be of shape {(height, width)}, got {mask.shape}"
+                raise InputError("visibility", came, "Give a value per pixel")
         counts = sorted({emittance.shape[0] for emittance in self.emittances()})
         if len([count for count in counts if count != 1]) > 1:
             came = f"lights have {' and '.join(map(str, counts))} channels"
@@ -122,6 +149,11 @@ class Scene(Checked):
         else:
             column, row = np.arange(width)[None, :] + 0.5, np.arange(first, stop)[:, None] + 0.5
             points = tracing(self.camera, self.shapes)(self.camera, self.shapes, column, row)
+        visibility, given = None, [mask for mask in self.visibility if mask is not None]
+        if given:
+            masks = [jnp.ones_like(given[0]) if mask is None else mask for mask in self.visibility]
+            visibility = jnp.stack([mask[first:stop] for mask in masks], axis=-1)
+        points = dataclasses.replace(points, visibility=visibility)
         if rows is not None or self.camera is None or self.camera.samples == 1:
             return points
         return with_area(points, self.camera, self.shapes, self.lights, self.occluders)
@@ -143,7 +175,7 @@ class Scene(Checked):
         """Write a scene file that `load` reads back to the same scene.
 
         Args:
-            path: a ``.toml`` file; surface points, meshes and environment maps are written beside it, as
+            path: a ``.toml`` file; surface points, meshes, environment maps and shadow masks are written beside it, as
                 ``<name>.aov.exr`` and so on.
             aov: the name of a file beside it that holds the surface points already, where several scenes share them.
 
@@ -208,7 +240,9 @@ def some_pixels(
             points = _chosen(cast(scene, precision).surface_points(), pixel)
         # The points know which shape they lie on by its place in the list, so all shapes stay.
         hiding = tuple(dataclasses.replace(shape, fitted=False) for shape in scene.occluders)
-        return Scene(points=points, shapes=hiding, ambient=scene.ambient, lights=scene.lights)
+        choose = partial(_of_picture, pixel)
+        visibility = tuple(None if mask is None else choose(np.asarray(mask, np.float64)) for mask in scene.visibility)
+        return Scene(points=points, shapes=hiding, ambient=scene.ambient, lights=scene.lights, visibility=visibility)
 
 
 def _of_picture(pixel: Any, leaf: Any) -> np.ndarray:
@@ -219,7 +253,8 @@ def _of_picture(pixel: Any, leaf: Any) -> np.ndarray:
 def _chosen(points: SurfacePoints, pixel: Any) -> SurfacePoints:
     """Some of the points, in the shape of ``pixel``."""
     area = points.area
-    some = jax.tree.map(partial(_of_picture, pixel), dataclasses.replace(points, area=None))
+    plain = dataclasses.replace(points, visibility=None, area=None)
+    some = jax.tree.map(partial(_of_picture, pixel), plain)
     if area is None:
         return some
     slot = _of_picture(pixel, area.slot)
@@ -229,5 +264,6 @@ def _chosen(points: SurfacePoints, pixel: Any) -> SurfacePoints:
     place: Any = averaged if averaged.size else np.array([slot.size])
     new: Any = np.full(slot.size, -1, np.int32)
     new[averaged] = np.arange(averaged.size, dtype=np.int32)
-    fine, weight = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], (area.points, area.weight))
+    fine = dataclasses.replace(area.points, visibility=None)
+    fine, weight = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], (fine, area.weight))
     return dataclasses.replace(some, area=PixelArea(place.astype(np.int32), new.reshape(slot.shape), fine, weight))

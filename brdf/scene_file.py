@@ -168,8 +168,9 @@ def read_parts(path: Path, within: str | Path | None, tables: dict[str, Any] | N
         if not given:
             raise InputError(table.place, "has no intensity", "Add intensity = [r, g, b]")
         ambient = table.made(spectrum, "intensity", ambient)
-    lights = []
+    lights, masks = [], []
     for table in _tables(path, "lights", values, within):
+        masks.append(_read_mask(table))
         lights.append(_read_light(table))
         if not has_position and not isinstance(lights[-1], DirectionalLight | ConstantEnvironment | EnvironmentMap):
             came = f"stands somewhere, but {path}: aov has no layer of positions"
@@ -177,7 +178,9 @@ def read_parts(path: Path, within: str | Path | None, tables: dict[str, Any] | N
     for key in values:
         known = "camera, shapes, aov, ambient, lights"
         raise InputError(f"{path}: {key}", "is not a known key", f"Known here: {known}")
-    return {"camera": camera, "shapes": shapes, "points": points, "ambient": ambient, "lights": lights}
+    visibility = () if all(mask is None for mask in masks) else masks
+    parts = {"camera": camera, "shapes": shapes, "points": points, "ambient": ambient, "lights": lights}
+    return parts | {"visibility": visibility}
 
 
 def _tables(path: Path, name: str, values: dict[str, Any], within: Path | None) -> list[_Table]:
@@ -203,8 +206,17 @@ def _read_light(table: _Table) -> Light:
         return table.build(cls)
     path = table.file("file", "sky.exr")
     values = {key: table.plain(key) for key in ("radiance", "samples") if key in table.values}
-    table.done("type", "file", "radiance", "samples")
+    table.done("type", "file", "radiance", "samples", "visibility", "visibility_layer")
     return table.made(EnvironmentMap, read_image(path), **values)
+
+
+def _read_mask(table: _Table) -> Any:
+    """How much of the light each pixel sees, where a file tells; the first channel of the picture or layer."""
+    if "visibility" not in table.values:
+        return None
+    path, layer = table.file("visibility", "shadow.exr"), table.layer("visibility_layer")
+    pixels = read_image(path, encoding="linear") if layer is None else _layer(read_layers(path), layer, (), path)
+    return pixels[..., 0]
 
 
 def _read_points(table: _Table) -> tuple[SurfacePoints, bool]:
@@ -300,6 +312,9 @@ def write_parts(path: str | Path, parts: dict[str, Any], aov: str | None = None)
             values |= {"radiance": light.radiance, "samples": light.samples}
         else:
             values |= _fields(light)
+        if parts["visibility"] and parts["visibility"][index] is not None:
+            values["visibility"], file = beside(f"visibility{index}.exr")
+            write_image(file, np.asarray(parts["visibility"][index], np.float32)[..., None])
         section("[[lights]]", values)
     write_text(path, "\n".join(sections))
 

@@ -157,7 +157,7 @@ def next_light(result: Any, candidates: Sequence[Any] | None = None, count: int 
             return float(np.sqrt(np.mean(variance[wanted[active]])))
 
         def told_by(light: Light) -> np.ndarray:
-            return told(dataclasses.replace(first, lights=(light,)), share)
+            return told(dataclasses.replace(first, lights=(light,), visibility=()), share)
 
         first, share = scenes[0]
         to_view = np.asarray(first.surface_points().to_view, np.float64).reshape(-1, 3).mean(axis=0)

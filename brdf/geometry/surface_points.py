@@ -43,6 +43,7 @@ class SurfacePoints(eqx.Module):
         mask: (...), whether the pixel sees a fitted surface; elsewhere the other values are finite and mean nothing.
             Where a pixel is averaged over its area, whether all of it does.
         shape: (...), index of the shape that each pixel sees; None where the points come from elsewhere.
+        visibility: for each of L lights, how much of it each point sees, (..., L), 0 to 1; None where nothing is given.
         area: the pixels that are averaged over their area; None where every pixel's centre stands for it.
         facet: (..., 3), the unit normal of the flat piece that a smooth mesh is made of there; None where that is
             ``normal``. No light comes from behind it, and shadow rays start above it.
@@ -58,6 +59,7 @@ class SurfacePoints(eqx.Module):
     to_view: Float[Array, "*pixels 3"]
     mask: Bool[Array, "*pixels"]
     shape: Int[Array, "*pixels"] | None = None
+    visibility: Float[Array, "*pixels L"] | None = None
     area: PixelArea | None = None
     facet: Float[Array, "*pixels 3"] | None = None
 

@@ -119,14 +119,14 @@ class LightStack(eqx.Module):
         product = functools.reduce(operator.mul, self.spectra)
         return jnp.broadcast_to(product, (self.light.shape[0], each, channels))
 
-    def rows(self) -> tuple[Array, ...]:
-        """What `Light.sample` takes, one row for each sample."""
+    def rows(self) -> tuple[tuple[Array, ...], Array]:
+        """What `Light.sample` takes, one row for each sample, and the light that each belongs to."""
         if not self.nodes:
-            return self.numbers
+            return self.numbers, self.light
         each = self.nodes[0].shape[1]
         numbers = tuple(jnp.repeat(values, each, axis=0) for values in self.numbers)
         nodes = tuple(values.reshape(-1, *values.shape[2:]) for values in self.nodes)
-        return *numbers, *nodes
+        return (*numbers, *nodes), jnp.repeat(self.light, each)
 
 
 class Lighting(eqx.Module):
@@ -145,12 +145,12 @@ class Lighting(eqx.Module):
         """Of all lights together."""
         return sum(map(operator.attrgetter("samples"), self.stacks))
 
-    def each(self) -> Iterator[tuple[type[Light], tuple[Array, ...]]]:
-        """Every sample on its own: the kind of its light, and its row."""
+    def each(self) -> Iterator[tuple[type[Light], tuple[Array, ...], Array]]:
+        """Every sample on its own: the kind of its light, its row, which light it belongs to."""
         for stack in self.stacks:
-            rows = stack.rows()
+            rows, light = stack.rows()
             for index in range(stack.samples):
-                yield stack.kind, tuple(values[index] for values in rows)
+                yield stack.kind, tuple(values[index] for values in rows), light[index]
 
 
 def stacked(lights: Sequence[Light], dtype: Any, fill_above: float = math.inf) -> tuple[LightStack, ...]:

@@ -1,4 +1,4 @@
-"""``brdf fit``: pictures, photographs of a ball and measured BRDFs."""
+"""``brdf fit``: pictures, photographs of a ball, archives and measured BRDFs."""
 
 import dataclasses
 import json
@@ -41,7 +41,7 @@ LOSS_NAMES = "squared, relative, log, huber or cauchy; for a measured BRDF cosin
 def fit(
     target: Annotated[
         list[Path],
-        typer.Argument(help="A picture; a folder with target.* and scene.toml; photographs; a measured BRDF."),
+        typer.Argument(help="A picture; a folder with target.* and scene.toml; photographs; an .npz; a measured BRDF."),
     ],
     pictures: PictureOptions,
     model: Model = "auto",

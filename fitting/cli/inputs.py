@@ -1,4 +1,4 @@
-"""What the command is given: a picture with its scene, or photographs of a ball.
+"""What the command is given: a picture with its scene, photographs of a ball, a photometric-stereo archive.
 
 `read_inputs` refuses, before JAX is imported, which takes longer than reading a picture, what does not go together;
 `collect` makes pictures and scenes of the rest.
@@ -14,6 +14,7 @@ import brdf
 from brdf.errors import InputError
 from brdf.files import input_file, read_toml
 from fitting.cli.common import PictureOptions, named_as
+from fitting.photographs.archives import read_archive
 from fitting.photographs.ball import Circle, ball_normals, ball_points, find_circle, parse_circle
 from fitting.photographs.light_files import parse_numbers, read_directions, read_intensities
 
@@ -29,9 +30,9 @@ class Given(NamedTuple):
     """What was typed, read as far as that needs no JAX.
 
     Attributes:
-        targets: the files of the pictures.
+        targets: the files of the pictures, or the archive.
         options: what they show.
-        pictures: by file.
+        pictures: by file; none for an archive.
         scene: the scene file and its tables, where there is one.
     """
 
@@ -63,7 +64,7 @@ def read_inputs(targets: list[Path], options: PictureOptions) -> Given:
     """Read the pictures, and refuse those that cannot be what the options or the scene file say.
 
     Args:
-        targets: what was given: pictures, or a folder.
+        targets: what was given: pictures, a folder or an archive.
         options: what they show.
 
     Raises:
@@ -73,6 +74,8 @@ def read_inputs(targets: list[Path], options: PictureOptions) -> Given:
     for beside in (options.mask, options.normals, options.lights, options.intensities):
         if beside is not None:
             input_file(beside)
+    if _is_archive(targets):
+        return Given(targets, options, {})
     circle = None if options.sphere in (None, "mask") else parse_circle(options.sphere)
     scene, resolution = None, None
     if options.sphere is None and options.normals is None:
@@ -94,6 +97,10 @@ def read_inputs(targets: list[Path], options: PictureOptions) -> Given:
     return Given(targets, options, pictures, scene)
 
 
+def _is_archive(targets: list[Path]) -> bool:
+    return len(targets) == 1 and targets[0].suffix.lower() == ".npz"
+
+
 def _require(fine: Any, where: object, came: str, remedy: str) -> None:
     if not fine:
         raise InputError(where, came, remedy)
@@ -101,20 +108,25 @@ def _require(fine: Any, where: object, came: str, remedy: str) -> None:
 
 def _check_options(targets: list[Path], options: PictureOptions) -> None:
     """Refuse options that do not belong together."""
-    if options.sphere is not None or options.normals is not None:
+    refused = ("light", "lights", "intensities")
+    came, remedy = "says where the light is, but nothing what the picture shows", "Add --sphere x,y,radius"
+    if _is_archive(targets):
+        refused += ("scene", "sphere", "normals", "encoding")
+        came, remedy = f"is what {targets[0].name} says itself", "Leave it out"
+    elif options.sphere is not None or options.normals is not None:
         remedy = "Give one of them"
         _require(options.scene is None, "--scene", "says what --sphere or --normals says too", remedy)
         _require(None in (options.sphere, options.normals), "--normals", "says what --sphere says too", remedy)
         came, remedy = "or --lights has to say where the light is", "Give x,y,z, fit, or a file of directions"
         _require((options.light is None) != (options.lights is None), "--light", came, remedy)
         return
-    came, remedy = "says where the light is, but nothing what the picture shows", "Add --sphere x,y,radius"
-    for name in ("light", "lights", "intensities"):
+    for name in refused:
         _require(getattr(options, name) is None, f"--{name}", came, remedy)
-    remedy = "Leave it out, or add [ambient] to the scene"
-    _require(not options.ambient, "--ambient", "is what the scene file says", remedy)
-    remedy = "Several pictures are fitted with --sphere or --normals, and --lights"
-    _require(len(targets) == 1, "--sphere", f"{len(targets)} pictures come without their geometry", remedy)
+    if not _is_archive(targets):
+        remedy = "Leave it out, or add [ambient] to the scene"
+        _require(not options.ambient, "--ambient", "is what the scene file says", remedy)
+        remedy = "Several pictures are fitted with --sphere or --normals, and --lights"
+        _require(len(targets) == 1, "--sphere", f"{len(targets)} pictures come without their geometry", remedy)
 
 
 def _target_and_scene(target: Path, scene: Path | None) -> tuple[Path, Path]:
@@ -146,23 +158,32 @@ def collect(given: Given) -> FitInputs:
     """
     targets, options, read, scene = given
     mask = None if options.mask is None else brdf.read_mask(options.mask)
-    pictures = _exposed([read[target] for target in targets], options.exposure)
-    masks = visible(mask, pictures)
-    if scene is not None:
-        from brdf.scene import load_scene
+    masks: Any
+    named: dict[str, Any] = {}
+    if _is_archive(targets):
+        pictures, points, directions, intensities = _read_photographs(targets[0], mask)
+        pictures, masks, notes = _exposed(pictures, options.exposure), [None] * len(pictures), ()
+        light_errors = ()
+        named = {"direction": f"{targets[0]}: light_dirs", "intensity": f"{targets[0]}: light_intensities"}
+    else:
+        pictures = _exposed([read[target] for target in targets], options.exposure)
+        masks = visible(mask, pictures)
+        if scene is not None:
+            from brdf.scene import load_scene
 
-        return FitInputs(pictures, [load_scene(scene[0], options.within, scene[1])], masks)
-    points, directions, intensities, light_errors, notes = _photographs(targets, options, pictures, mask, masks)
+            return FitInputs(pictures, [load_scene(scene[0], options.within, scene[1])], masks)
+        points, directions, intensities, light_errors, notes = _photographs(targets, options, pictures, mask, masks)
     from fitting.photographs.distant_light import photograph_scene
 
     around = np.ones((len(pictures), 1))
     if np.all(intensities > 0):
         pictures = [picture.scaled(1.0 / intensity) for picture, intensity in zip(pictures, intensities, strict=True)]
         intensities, around = around, 1.0 / intensities
-    scenes = [
-        photograph_scene(points, direction, intensity, ambient=ambient if options.ambient else None)
-        for direction, intensity, ambient in zip(directions, intensities, around, strict=True)
-    ]
+    with named_as(named):
+        scenes = [
+            photograph_scene(points, direction, intensity, ambient=ambient if options.ambient else None)
+            for direction, intensity, ambient in zip(directions, intensities, around, strict=True)
+        ]
     return FitInputs(pictures, scenes, masks, notes, light_errors)
 
 
@@ -292,3 +313,39 @@ def stated_error(light: Any) -> str:
         share = 100 * light.unexplained
         doubt = f" (the shading leaves {share:.0f} % of the light unexplained: it can be off by several times that)"
     return f"± {light.error:.2g}°{doubt}"
+
+
+def _read_photographs(path: Path, mask: Any) -> Any:
+    """Pictures, points, directions and intensities of an archive.
+
+    It holds images (K, H, W[, C]), normal (H, W, 3) and light_dirs (K, 3), and may hold light_intensities (K, C) and
+    mask (H, W). Unsigned images span their type.
+    """
+    arrays = read_archive(path)
+    images, normal, directions = arrays["images"], arrays["normal"], arrays["light_dirs"]
+    came = f"holds {images.dtype}, of which it is not clear what is white"
+    remedy = "Save unsigned integers, which span their type, or floats"
+    _require(images.dtype.kind not in "bi", f"{path}: images", came, remedy)
+    images = images[..., None] if images.ndim == 3 else images
+    remedy = "Give (pictures, height, width, channels)"
+    _require(images.ndim == 4 and images.size > 0, f"{path}: images", f"is of shape {images.shape}", remedy)
+    count, height, width, channels = images.shape
+    intensities = arrays.get("light_intensities", np.ones(count))
+    intensities = intensities[:, None] if intensities.ndim == 1 else intensities
+    mask = arrays.get("mask", np.ones((height, width))) if mask is None else mask
+    for name, array, shape in (
+        ("normal", normal, (height, width, 3)),
+        ("light_dirs", directions, (count, 3)),
+        ("light_intensities", intensities, (count, 1 if intensities.shape[1:] == (1,) else channels)),
+        ("mask", mask, (height, width)),
+    ):
+        _require(array.shape == shape, f"{path}: {name}", f"is of shape {array.shape}", f"Give {shape}")
+    points = brdf.SurfacePoints.from_normals(normal, mask=mask != 0)
+    came = "has no normal" if np.all(mask) else "has no normal inside the mask"
+    _require(np.any(points.mask), f"{path}: normal", came, "Give a direction (x, y, z) where the surface is")
+    # As in a file: linear, integers with their largest code.
+    is_code = images.dtype.kind == "u"
+    bits, pixels = 8 * images.dtype.itemsize, images / float(np.iinfo(images.dtype).max if is_code else 1)
+    top = 1.0 if is_code else None
+    pictures = [brdf.Picture(one, None, "linear", "format", bits, top) for one in pixels.astype(np.float32)]
+    return pictures, points, directions, intensities

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from brdf.errors import InputError
 from brdf.files import check_folder
 from fitting.cli.common import AsJson, Model, PictureOptions, named_as, show, use_compilation_cache
 
@@ -39,6 +40,9 @@ def tradeoff(
     import fitting
 
     inputs = collect(given)
+    if len(inputs.pictures) > 1:
+        came = f"holds {len(inputs.pictures)} pictures, and one is measured"
+        raise InputError(target, came, "Give one picture with its scene or its light")
     with named_as({"target": given.targets[0]}):
         found = fitting.tradeoff(
             inputs.pictures[0],

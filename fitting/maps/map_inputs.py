@@ -1,7 +1,6 @@
 """What maps are made of, in one form: photographs that are read by bands of rows, their lights, and what texels see."""
 
 import dataclasses
-import warnings
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
 from functools import partial
@@ -13,7 +12,8 @@ from jaxtyping import Float, Num
 
 import brdf
 from brdf.errors import InputError
-from brdf.files import input_file, parse_number, read_text
+from brdf.files import parse_number, read_text
+from fitting.photographs.archives import read_array
 from fitting.photographs.light_files import MOST_BYTES, read_directions, read_intensities
 
 PICTURES = (".exr", ".hdr", ".png", ".tif", ".tiff", ".jpg", ".jpeg")
@@ -156,7 +156,8 @@ def read_normal_map(path: str | Path, *, flip_y: bool = False) -> Float[np.ndarr
         InputError: naming the file.
     """
     if Path(path).suffix.lower() == ".npy":
-        normal = _array(path)
+        with Path(path).open("rb") as file:
+            normal = np.array(read_array(file, path, Path(path).stat().st_size), np.float32)
     else:
         with brdf.ImageReader(path, encoding="linear") as reader:
             normal = reader.read()
@@ -166,18 +167,6 @@ def read_normal_map(path: str | Path, *, flip_y: bool = False) -> Float[np.ndarr
     if normal.ndim != 3 or normal.shape[2] != 3:
         raise InputError(path, f"must be of shape (H, W, 3), got {normal.shape}", "Give a normal map")
     return normal * np.array([1, -1 if flip_y else 1, 1], np.float32)
-
-
-def _array(path: str | Path) -> np.ndarray:
-    """From NumPy's format; mapped, so that its claims take no memory."""
-    file = input_file(path)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of what a damaged header looks like as Python
-            return np.load(file, mmap_mode="r").astype(np.float32, casting="same_kind")
-    except Exception as error:  # NumPy reads the header as Python: a damaged one raises what its parser does
-        reason = str(error).partition("\n")[0][:120] or type(error).__name__
-        raise InputError(path, f"is no array of numbers ({reason})", "Save a plain one") from None
 
 
 def photographs(

@@ -198,11 +198,13 @@ def _near_columns(model: Any, points: Any, stacks: Any, occluders: Any, ambient:
     """Columns of lights of any kind at the points of a tile, (T,)."""
     terms, order = [], []
     for stack in stacks:
+        rows, lights = stack.rows()
 
-        def of_sample(row: Any, kind: Any = stack.kind) -> Any:
-            return jax.vmap(partial(light_terms, model, occluders, kind, row))(points)
+        def of_sample(one: Any, kind: Any = stack.kind) -> Any:
+            row, light = one
+            return jax.vmap(partial(light_terms, model, occluders, kind, row, light))(points)
 
-        found = jax.lax.map(of_sample, stack.rows())
+        found = jax.lax.map(of_sample, (rows, lights))
         terms.append(jax.tree.map(partial(_by_light, stack.light.shape[0]), found))
         order.append(stack.light)
     every = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[jnp.argsort(jnp.concatenate(order))], *terms)

@@ -142,6 +142,8 @@ def _scene(scene: brdf.Scene, shown: Shown) -> tuple[dict[str, Any], list[str]]:
     notes = [f"A light of the type {kind} is not drawn: it has an extent." for kind in missing]
     if scene.occluders and scene.lights:
         notes.append("Shadows are not drawn.")
+    if any(mask is not None for mask in scene.visibility):
+        notes.append("Given shadow masks are not drawn.")
     if scene.camera is None:
         notes.append("What the picture shows came as surface points: it does not turn, a ball stands for it.")
     drawable = not notes

@@ -41,6 +41,7 @@ MISUSES = {
     "brdf.Scene(shapes=[ball])": r"scene: must have a camera or surface points",
     "brdf.Scene(points=np.zeros((3, 3, 3)))": r"points: must be a SurfacePoints.*from_normals",
     "brdf.Scene(camera, [ball], ambient='grey')": r"intensity: must be a number per channel, got 'grey'\.",
+    "brdf.Scene(camera, [ball], lights=[sun], visibility=mask)": r"visibility: must be a list, got ndarray\.",
     "brdf.Scene.load({'camera': 1})": r"path: must be text, got dict\.",
     "brdf.DirectionalLight([1, 0], 1)": r"direction: must be three numbers, got \[1, 0\]\. Give \[x, y, z\]",
     "brdf.DirectionalLight([0, 0, 1])": r"DirectionalLight: missing .*'intensity'\. Write DirectionalLight\(direction=",

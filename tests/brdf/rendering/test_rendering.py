@@ -150,7 +150,8 @@ def test_lights_of_any_kind_and_channels_add_up():
         brdf.PointLight(position=[1, 2, 3], intensity=[5.0, 4.0, 3.0]),
         brdf.SphereLight(center=[-1, 1, 3], radius=0.4, radiance=5, samples=9),
     ]
-    scene = ball(1, size=16, lights=kinds)
+    masks = np.random.default_rng(0).uniform(size=(len(kinds), 16, 16))
+    scene = ball(1, size=16, lights=kinds, visibility=list(masks))
     image = np.asarray(brdf.render(glossy(9.0), scene, precision="float64"))
     each = np.asarray(brdf.render_lights(glossy(9.0), scene, precision="float64"))
     np.testing.assert_allclose(each.sum(axis=0), image, rtol=1e-12)

@@ -267,11 +267,13 @@ def test_a_missing_scene_is_said(tmp_path: Path):
 
 
 AOV = '[aov]\nfile = "n.exr"\n'
+SHADOW = LIGHT + 'visibility = "n.exr"\n'
 ENVIRONMENT = CAMERA + SPHERE + '[[lights]]\ntype = "environment"\n'
 REFUSED = {
     "layer is a list": (AOV + 'normal = ["a"]\n' + LIGHT, r"aov\.normal: must be the name of a layer, got \['a'\]"),
     "layer is a number": (AOV + "position = 3\n" + LIGHT, r"aov\.position: must be the name of a layer, got 3"),
     "layer is missing": (AOV + 'position = "P"\n' + LIGHT, r"n\.exr: has no layer 'P', got the unnamed one, normal"),
+    "shadow's layer": (CAMERA + SPHERE + SHADOW + "visibility_layer = []\n", r"lights\[0\]\.visibility_layer: must be"),
     "to_view is text": (AOV + 'to_view = "x"\n' + LIGHT, r"aov\.to_view: must be a number, got 'x'"),
     "to_view is zero": (AOV + "to_view = [0, 0, 0]\n" + LIGHT, r"aov\.to_view: must not have zero length"),
     "to_view is ragged": (AOV + "to_view = [[0], 0, 1]\n" + LIGHT, r"aov\.to_view: must be three numbers"),

@@ -88,6 +88,22 @@ def test_a_scene_that_casts_no_shadow_has_no_shadow_rays():
     assert operations(ball) < 0.6 * operations(scene(light))
 
 
+def test_a_given_mask_stands_in_for_geometry(tmp_path: Path):
+    lights = [brdf.DirectionalLight(direction=[0, 0, 1], intensity=1), brdf.PointLight(position=[1, 1, 3], intensity=4)]
+    shapes = [brdf.Sphere(center=[0, 0, 0], radius=0.8)]
+    mask = np.random.default_rng(0).uniform(size=(48, 48)).astype(np.float32)
+    masked = scene(*lights, shapes=shapes, visibility=[None, mask])
+    each = np.asarray(brdf.render_lights(WHITE, scene(*lights, shapes=shapes), precision="float32"))
+    got = np.asarray(brdf.render(WHITE, masked, precision="float32"))
+    np.testing.assert_allclose(got, each[0] + mask[..., None] * each[1], atol=1e-6)
+    np.testing.assert_allclose(brdf.render_lights(WHITE, masked, precision="float32").sum(axis=0), got, atol=1e-6)
+    masked.save(tmp_path / "scene.toml")
+    again = brdf.Scene.load(tmp_path / "scene.toml")
+    np.testing.assert_allclose(brdf.render(WHITE, again, precision="float32"), got, atol=1e-6)
+    with pytest.raises(brdf.InputError, match="visibility: has 1 entries for 2 lights"):
+        scene(*lights, shapes=shapes, visibility=[mask])
+
+
 def test_occluders_shadow_points_from_elsewhere():
     normal = np.zeros((3, 3, 3))
     normal[..., 2] = 1

@@ -127,6 +127,16 @@ def test_the_command_measures_a_photograph_of_a_ball(tmp_path, capsys):
     assert told["advice"].startswith("recommended")
 
 
+def test_the_command_measures_one_picture(tmp_path, capsys):
+    normal = np.zeros((8, 8, 3))
+    normal[..., 2] = 1.0
+    np.savez(tmp_path / "two.npz", images=np.ones((2, 8, 8)), normal=normal, light_dirs=np.ones((2, 3)))
+    with pytest.raises(SystemExit) as ended:
+        main(["tradeoff", str(tmp_path / "two.npz")])
+    assert ended.value.code == 2
+    assert "two.npz: holds 2 pictures, and one is measured" in capsys.readouterr().err
+
+
 def test_fits_of_the_front_are_numbered_and_named():
     rows = (
         row("blinn-phong", 0.014, 8e-3, 1, pixels=1024),

@@ -87,6 +87,18 @@ def numpy_file(header: bytes) -> bytes:
     return b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
 
 
+def bomb(path: Path) -> None:
+    """An archive whose directory claims 2^31 bytes for an entry."""
+    np.savez_compressed(path, images=np.zeros((20_000, 1000), np.uint8), normal=[0], light_dirs=[0])
+    content = path.read_bytes()
+    place = content.rindex(b"PK\x01\x02", 0, content.rindex(b"normal.npy"))
+    path.write_bytes(content[: place + 24] + (2**31 - 1).to_bytes(4, "little") + content[place + 28 :])
+
+
+def archive(**arrays: Any) -> dict[str, Any]:
+    return {"images": np.ones((3, 4, 5)), "normal": np.ones((4, 5, 3)), "light_dirs": np.ones((3, 3))} | arrays
+
+
 def picture(value: float = 1.0, shape: tuple[int, int] = (8, 8), channels: int = 3) -> np.ndarray:
     return np.full((*shape, channels), value, np.float32)
 
@@ -230,11 +242,11 @@ CASES: list[tuple[dict[str, Any], str, str]] = [
     ({}, f"{LIT} --scene a.toml", "--scene: says what --sphere or --normals says too"),
     ({"n.npy": np.ones((2, 2, 3))}, "fit 0.png --normals n.npy --light 0,0,1", "n.npy: is 2 x 2, the pictures 60 x 52"),
     ({"n.npy": np.ones(3)}, "fit 0.png --normals n.npy --light 0,0,1", r"n.npy: must be of shape \(H, W, 3\)"),
-    ({"n.npy": OBJECTS}, "fit 0.png --normals n.npy --light 0,0,1", "n.npy: is no array of numbers"),
+    ({"n.npy": OBJECTS}, "fit 0.png --normals n.npy --light 0,0,1", "n.npy: holds object, not numbers"),
     (
         {"n.npy": numpy_file(b"{'descr': '<f8', 'fortran_order': False, 'shape': (100000, 100000, 3), }")},
         "fit 0.png --normals n.npy --light 0,0,1",
-        "n.npy: is no array of numbers .mmap length",
+        "n.npy: claims 30000000000 values in",
     ),
     # Found by fuzzing: NumPy tokenizes a header that is no literal, and lets the tokenizer's error pass.
     (
@@ -253,6 +265,24 @@ CASES: list[tuple[dict[str, Any], str, str]] = [
     ({"a.exr": picture(1e-30, SHAPE)}, "fit a.exr --sphere 30,24,9 --light 0,0,1", "a.exr: has 1e-3. as its largest"),
     ({"a.exr": picture(0.0, SHAPE)}, "fit a.exr --sphere 30,24,9 --light fit", "a.exr: has fewer than ten lit pixels"),
     ({}, f"{BALL} --light fit --saturation nan", "--saturation: must be a linear"),
+    # archives
+    ({"a.npz": {"a": np.ones(3)}}, "fit a.npz", "a.npz: holds no array images"),
+    ({"a.npz": "PK\x03\x04 this is none"}, "fit a.npz", "a.npz: is no readable archive"),
+    ({"a.npz": bomb}, "fit a.npz", "a.npz: claims more than can be in it"),
+    ({"a.npz": archive(images=OBJECTS)}, "fit a.npz", "a.npz: images: holds object, not numbers"),
+    ({"a.npz": archive(images=np.ones((3, 4, 5), np.int8))}, "fit a.npz", "a.npz: images: holds int8, of which"),
+    ({"a.npz": archive(images=np.ones((3, 4, 5), bool))}, "fit a.npz", "a.npz: images: holds bool"),
+    ({"a.npz": archive(images=np.ones((3, 4)))}, "fit a.npz", r"a.npz: images: is of shape \(3, 4\)"),
+    ({"a.npz": archive(normal=np.ones((4, 4, 3)))}, "fit a.npz", r"a.npz: normal: is of shape \(4, 4, 3\)"),
+    ({"a.npz": archive(light_dirs=np.ones((2, 3)))}, "fit a.npz", r"a.npz: light_dirs: is of shape \(2, 3\)"),
+    ({"a.npz": archive(light_dirs=np.zeros((3, 3)))}, "fit a.npz", "a.npz: light_dirs: must not have zero length"),
+    ({"a.npz": archive(light_dirs=np.full((3, 3), np.nan))}, "fit a.npz", "a.npz: light_dirs: must be finite"),
+    ({"a.npz": archive(light_intensities=-np.ones(3))}, "fit a.npz", "a.npz: light_intensities: must be at least 0"),
+    ({"a.npz": archive(mask=np.ones((2, 2)))}, "fit a.npz", r"a.npz: mask: is of shape \(2, 2\)"),
+    ({"a.npz": archive(mask=np.zeros((4, 5)))}, "fit a.npz", "a.npz: normal: has no normal inside the mask"),
+    ({"a.npz": archive()}, "fit a.npz --encoding srgb", "--encoding: is what a.npz says itself"),
+    ({"a.npz": archive()}, "fit a.npz --sphere 1,2,9", "--sphere: is what a.npz says itself"),
+    ({"a.npz": archive()}, "tradeoff a.npz", "a.npz: holds 3 pictures, and one is measured"),
     # lights of a ball
     ({}, "lights 0.png --sphere 30,24,9 --ambient", "--ambient: says nothing of a mirror ball's highlight"),
     ({}, "lights 0.png --sphere 30,24,9 --saturation 0.9", "--saturation: says nothing of a mirror ball's highlight"),

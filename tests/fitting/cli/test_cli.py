@@ -15,6 +15,7 @@ from sound_files import sound_files
 
 import brdf
 from benchmarks.fuzz_corpus import LIGHT
+from fitting.photographs.archives import read_archive
 
 SCENE = (ROOT / "data" / "gold-ball" / "scene.toml").read_text().replace("[256, 256]", "[48, 48]")
 
@@ -124,3 +125,9 @@ def test_a_scene_may_be_allowed_to_reach_further(tmp_path, capsys):
     words = "fit", tmp_path / "target.exr", "--scene", file
     refused(capsys, tmp_path, "or allow more with within", *words)
     refused(capsys, tmp_path, "has no layer of normals", *words, "--within", tmp_path)  # it was opened
+
+
+def test_nothing_else_of_an_archive_is_read(tmp_path):
+    arrays = {"images": np.ones((1, 2, 2)), "normal": np.ones((2, 2, 3)), "light_dirs": np.ones((1, 3))}
+    np.savez(tmp_path / "a.npz", **arrays, evil=np.array([print], dtype=object))
+    assert set(read_archive(tmp_path / "a.npz")) == set(arrays)

@@ -17,6 +17,7 @@ from sound_files import scene, sound_files
 
 import brdf
 from fitting.cli.interrupts import interruptible
+from fitting.photographs.archives import read_archive
 from fitting.photographs.light_files import read_directions
 
 CHECK = "import sys; from fitting.cli.main import main; main(['check', 'emerald'])"
@@ -60,6 +61,23 @@ def test_memory_that_does_not_suffice(tmp_path, capsys, monkeypatch, error):
     monkeypatch.setattr("brdf.render", render)
     words = "render", "emerald", "--scene", sound_files(tmp_path) / "scene.toml", "-o", tmp_path / "out.exr"
     refused(capsys, tmp_path, "^error: memory: ", *words)
+
+
+def test_an_archive_whose_compressed_bytes_are_damaged(tmp_path):
+    path = tmp_path / "ball.npz"
+    random = np.random.default_rng(0)
+    np.savez_compressed(path, images=random.random((2, 9, 9)), normal=np.zeros((9, 9, 3)), light_dirs=np.eye(3)[:2])
+    content = path.read_bytes()
+    refusals = []
+    for place in range(50, 90):
+        path.write_bytes(content[:place] + bytes([content[place] ^ 0xFF]) + content[place + 1 :])
+        try:
+            read_archive(path)  # some bytes say nothing
+        except brdf.InputError as error:
+            refusals.append(str(error))
+    assert len(refusals) > 10
+    assert all("ball.npz" in one for one in refusals)
+    assert any("no readable archive (error)" in one or "no array" in one for one in refusals)
 
 
 @pytest.mark.parametrize("word", ["1_0", "١"])  # the second is a digit of another script

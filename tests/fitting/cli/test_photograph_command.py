@@ -1,4 +1,4 @@
-"""Photographs of a ball through the command: encodings, masks, lights."""
+"""Photographs of a ball through the command: encodings, masks, lights, archives."""
 
 import json
 import re
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio  # noqa: N813
 import pytest
-from ball_pictures import BALL, SHAPE, angle, photographs_in, shaded
+from ball_pictures import BALL, SHAPE, angle, disc, photographs_in, shaded
 from command_runs import run
 
 import brdf
@@ -141,19 +141,24 @@ def test_a_picture_that_fits_both_ways_says_that_its_encoding_is_a_guess(tmp_pat
     assert len(re.findall(r"sRGB is a guess\. Under it .* linear", out)) == 1
 
 
-def test_normals_say_the_same_in_either_file(photographs, capsys, monkeypatch):
+def test_normals_and_archives_say_the_same(photographs, capsys, monkeypatch):
     monkeypatch.chdir(photographs)
     points = ball_points(SHAPE, BALL)
     normal = np.where(np.asarray(points.mask)[..., None], np.asarray(points.normal), 0)
     np.save("normal.npy", normal)
     brdf.write_image("normal.exr", normal.astype(np.float32))
+    lights = np.loadtxt("lights.txt")
+    images = np.stack([np.round(shaded(light) * 65535) for light in lights]).astype(np.uint16)
+    np.savez("ball.npz", images=images, normal=normal, light_dirs=lights, mask=disc(BALL))
     found = []
     for index, file in enumerate(("normal.npy", "normal.exr")):
         words = ["fit", "0.png", "--light", "0.3,0.4,0.86", "--normals", file, "--encoding", "linear"]
         status, out, err = run(capsys, *words, "--model", "lambert", "--json")
         assert status == 0, (index, err)
         found.append(k_d(out))
-    assert np.allclose(found, 0.8, rtol=1e-3)
+    status, out, err = run(capsys, "fit", "ball.npz", "--model", "lambert", "--json")
+    assert status == 0, err
+    assert np.allclose([*found, k_d(out)], 0.8, rtol=1e-3)
 
 
 def test_lights_from_a_matt_ball_in_one_command(photographs, capsys, monkeypatch):
