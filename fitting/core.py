@@ -14,8 +14,8 @@ import brdf
 from brdf.lobes import Near
 from brdf.precision import working_precision
 from brdf.rendering import basis
-from fitting.codec_errors import codec_of, without_codec_errors
 from fitting.doubts import doubts
+from fitting.jpeg_errors import codec_of, without_codec_errors
 from fitting.light_colour import coefficient_factors
 from fitting.maximum_likelihood import highlight_in_codes, most_likely, unexplained
 from fitting.model_fit import ModelFit

@@ -1,5 +1,7 @@
 """A model that a program learns when it runs: one program serves all, where making it costs more than running it."""
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any, TypeGuard
 
 import equinox as eqx
@@ -29,11 +31,12 @@ class OneOf(eqx.Module):
         models = tuple(one for one in MODELS.values() if issubclass(one, SpecularMaterial))
         return cls(models, np.int32(models.index(model))) if model in models else model
 
-    def log_cosine(self, *directions: Any) -> Array:
+    @property
+    def log_cosine(self) -> Callable[..., Array]:
         """See `SpecularMaterial.log_cosine`."""
         kinds = list(dict.fromkeys(model.log_cosine for model in self.models))
         kind = jnp.asarray([kinds.index(model.log_cosine) for model in self.models])[self.index]
-        return jax.lax.switch(kind, kinds, *directions)
+        return partial(jax.lax.switch, kind, kinds)
 
     def scale(self, n: Array) -> Array:
         """See `SpecularMaterial.scale`."""

@@ -9,7 +9,7 @@ import pytest
 import brdf
 import fitting
 from benchmarks.truth import File, ball, encoded
-from fitting import codec_errors, core, pixels
+from fitting import core, jpeg_errors, pixels
 from fitting.problem import as_target
 
 QUALITY = 90
@@ -82,14 +82,14 @@ def test_bands_of_rows_make_no_difference(tmp_path, monkeypatch):
 
 
 def test_look_alikes_of_a_noisy_picture_have_more_noise(tmp_path, monkeypatch):
-    seen, made = [], codec_errors._Compressed._look_alikes
+    seen, made = [], jpeg_errors._Compressed._look_alikes
 
     def noted(self, clean, counts, noise, count):
         errors, left = made(self, clean, counts, noise, count)
-        seen.extend([(left, noise)] * (count == codec_errors.LOOK_ALIKES))
+        seen.extend([(left, noise)] * (count == jpeg_errors.LOOK_ALIKES))
         return errors, left
 
-    monkeypatch.setattr(codec_errors._Compressed, "_look_alikes", noted)
+    monkeypatch.setattr(jpeg_errors._Compressed, "_look_alikes", noted)
     nearest = []
     for noise in (0.0, 2.0):
         one, kept = ball(4, channels=3, size=96), dataclasses.replace(COLOUR, noise=noise)
