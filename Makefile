@@ -7,8 +7,8 @@ EXAMPLE := data/gold-ball
 # and these tests run through: fits of what other programs and closed forms draw, sums, searches, the bundled example.
 LIGHTLY_COMPILED := --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true
 COMPILED_AS_FOR_USERS := tests/interop tests/brdf/plausibility tests/fitting/solver tests/fitting/test_fit.py \
-	tests/fitting/test_jpeg_errors.py tests/brdf/rendering/test_lights.py tests/project/test_bundled_examples.py \
-	tests/project/test_sound_jax.py
+	tests/fitting/test_jpeg_errors.py tests/fitting/test_maximum_likelihood.py tests/brdf/rendering/test_lights.py \
+	tests/project/test_bundled_examples.py tests/project/test_sound_jax.py
 
 .PHONY: fit test check docs lab wheel clean
 

@@ -35,8 +35,8 @@ COMPARED, LOOK_ALIKES = 2, 4
 MOST_FITS, ENOUGH_CHANGE, ENOUGH_NEARER = 8, 0.5, 2e-3
 # What is still to come is up to so many times the last change.
 APPROACH = 2.0
-# Of a picture of several bands this share is fitted first, in rows of the blocks of colours; then all, so often.
-PART, BLOCK, MOST_WHOLE_FITS = 8, 16, 2
+# Of more pixels than this a part is fitted first, in rows of the blocks of colours; then all, so often.
+MANY, PART, BLOCK, MOST_WHOLE_FITS = 1 << 17, 4, 16, 2
 # Of a JPEG.
 LARGEST_CODE = 255.0
 
@@ -63,7 +63,7 @@ def without_codec_errors(seen: Observed, fit: ModelFit) -> tuple[ModelFit, Obser
     compressed = [_Compressed.of(target) for target in targets]
     fit, most, count = fit._replace(pictures=pictures), MOST_FITS, LOOK_ALIKES
     made_anew = any(picture.lobe is not None and picture.lobe.source is not None for picture in pictures)
-    if len(pictures) > len(targets) and not made_anew:
+    if ends[-1] > MANY and not made_anew:
         some = list(map(_part, pictures))
         whole = np.concatenate(
             [own + end - len(one.target) for own, end, one in zip(some, ends, pictures, strict=True)]
