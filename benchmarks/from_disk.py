@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-import OpenImageIO as oiio  # noqa: N813
+import OpenImageIO as oiio
 
 import brdf
 import fitting

@@ -85,7 +85,7 @@ def without_codec_errors(seen: Observed, fit: ModelFit) -> tuple[ModelFit, Obser
 
 
 def _part(picture: Picture) -> np.ndarray:
-    """Indices of those pixels of a band of rows that are nearest to the middle of the highlight, in whole rows."""
+    """Indices of those whole rows of a picture, or of a band of it, that are nearest to the middle of the highlight."""
     width, count = int(bounds_of(picture).width), len(picture.target)
     size = min(width * max(BLOCK, count // width // PART // BLOCK * BLOCK), count)
     middle = 0 if picture.lobe is None else int(np.argmax(picture.lobe.peak))

@@ -61,7 +61,7 @@ def ceres(problem: Problem) -> Run:
                 self.set_num_residuals(problem.target.size)
                 self.set_parameter_block_sizes([10])
 
-            def Evaluate(self, parameters: Any, residuals: Any, jacobians: Any) -> bool:  # noqa: N802
+            def Evaluate(self, parameters: Any, residuals: Any, jacobians: Any) -> bool:  # noqa: N802  # Ceres calls it so
                 x = np.array(parameters[0])
                 trace(x)
                 residuals[:] = problem.residual(x)

@@ -11,7 +11,7 @@ import struct
 import zlib
 from pathlib import Path
 
-import OpenImageIO as oiio  # noqa: N813
+import OpenImageIO as oiio
 
 from brdf.channels import MOST_CHANNELS
 from brdf.errors import InputError

@@ -3,7 +3,7 @@
 import dataclasses
 
 import numpy as np
-import OpenImageIO as oiio  # noqa: N813
+import OpenImageIO as oiio
 import pytest
 
 import brdf

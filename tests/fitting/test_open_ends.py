@@ -1,7 +1,7 @@
 """Noise that is cut off at black or white: such a value says that it was no larger, or no smaller, and no more."""
 
 import numpy as np
-import OpenImageIO as oiio  # noqa: N813
+import OpenImageIO as oiio
 import pytest
 
 import brdf

@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-import OpenImageIO as oiio  # noqa: N813
+import OpenImageIO as oiio
 import pytest
 from image_files import BAD_IMAGES, REAL, ROOT, chunk, codes, needs, png, random, raw, raw_png
 

@@ -3,7 +3,7 @@
 import warnings
 
 import numpy as np
-import OpenImageIO as oiio  # noqa: N813
+import OpenImageIO as oiio
 import pytest
 from image_files import REAL, codes, needs, png, random, raw, raw_png
 

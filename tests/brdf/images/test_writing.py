@@ -5,7 +5,7 @@ import subprocess
 import sys
 
 import numpy as np
-import OpenImageIO as oiio  # noqa: N813
+import OpenImageIO as oiio
 import pytest
 from image_files import ROOT, random
 

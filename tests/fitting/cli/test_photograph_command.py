@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import OpenImageIO as oiio  # noqa: N813
+import OpenImageIO as oiio
 import pytest
 from ball_pictures import BALL, SHAPE, angle, disc, photographs_in, shaded
 from command_runs import run
