@@ -75,10 +75,8 @@ def test_bands_of_rows_make_no_difference(tmp_path, monkeypatch):
     whole = fitting.fit(picture, one.scene(), model=one.model)
     monkeypatch.setattr(pixels, "TILE_PIXELS", 128 * pixels.ALIGNED_ROWS)
     banded = fitting.fit(picture, one.scene(), model=one.model)
-    for name in ("k_a", "k_d", "k_s"):
-        first, other = getattr(whole.material, name), getattr(banded.material, name)
-        errors = [[part.error for part in result[name]] for result in (whole, banded)]
-        assert np.all(np.abs(first - other) < 2 * np.linalg.norm(errors, axis=0))
+    np.testing.assert_allclose(banded.material.k_d, whole.material.k_d, rtol=1e-4)  # a rounding error may turn a code
+    np.testing.assert_allclose(banded.material.n, whole.material.n, rtol=1e-3)
 
 
 def test_look_alikes_of_a_noisy_picture_have_more_noise(tmp_path, monkeypatch):
