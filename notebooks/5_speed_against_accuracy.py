@@ -135,8 +135,8 @@ for ax, (name, light) in zip(axes, (("area light", "area"), ("sky", "environment
 # samples matter by the narrowness of the highlight against the lamp: 16 left 1e-3 for n = 60, 32 left 7e-3 and 64 2e-5
 # for n = 400. Leave the choice to `accuracy`: it takes more of them only while they still change the answer.
 #
-# **A map of the sky.** Its light has no edge, so the error falls slowly: for n = 60 256 samples left 4e-2, 1024 left
-# 1e-2. Take some thousand pixels before many samples, `accuracy=1e-1` or 1e-2 first; then look whether it matters.
+# **A map of the sky.** Its light has no edge, so the error falls slowly: for n = 60 256 samples left 3e-2, 1024 left
+# 2e-3. Take some thousand pixels before many samples, `accuracy=1e-1` or 1e-2 first; then look whether it matters.
 
 # %% [markdown]
 # ## Stable at the extremes
