@@ -58,8 +58,9 @@ def fit_maps(
             Blinn-Phong that serves each texel, by the Bayesian information criterion.
         specular: "coloured", or "grey": the channels share k_s.
         mask: (H, W), or a file: texels to look at. None for the folder's ``mask.*``, else all.
-        encoding: of the files: "linear", "srgb" or a gamma; None for what they say. Where files of 8 bits say nothing,
-            the one is taken that the model explains better, and a note says so.
+        encoding: of files and arrays: "linear", "srgb" or a gamma; None for what files say, and linear arrays. Where
+            files of 8 bits say nothing, a note says as what they were read: under distant lights as that which the
+            model explains better, else as sRGB.
         flip_y: whether y goes down in a file of normals.
         precision: "float32" or "float64".
         labels: (H, W) whole numbers, or a file of them as codes: texels with the same one share n, which then is known
@@ -103,9 +104,8 @@ def fit_maps(
     to_view = np.asarray(direction_value("to_view", to_view))
     how = How(models, specular == "grey", _ambient(ambient, given), to_view, precision)
     notes: tuple[str, ...] = ()
-    if given.silent and given.to_light is not None:
-        other = map_inputs.photographs(pictures, lights, intensities, exposures, "linear")
-        given, notes = likelier(given, other, surface, how)
+    if given.silent:
+        given, notes = likelier(given, surface, how)
     with spread_over(mesh):
         if labels is not None:
             surface = with_shared_n(given, surface, how, labels)

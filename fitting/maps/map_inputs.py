@@ -13,6 +13,7 @@ from jaxtyping import Float, Num
 import brdf
 from brdf.errors import InputError
 from brdf.files import parse_number, read_text
+from brdf.images.encoding import decode, parse_encoding
 from fitting.photographs.archives import read_array
 from fitting.photographs.light_files import MOST_BYTES, read_directions, read_intensities
 
@@ -38,7 +39,7 @@ class Photographs:
         scale: what values are multiplied with, (P, C): the inverse of ``unit``, and of the largest code.
         silent: names of files of 8 bits that do not say how they are encoded, which were read as sRGB.
         names: of the photographs.
-        encoding: as which files were read, None for what they say.
+        encoding: as which files and arrays were read, None for what they say.
     """
 
     rows: tuple[Callable[[int, int], Num[np.ndarray, "rows W C"]], ...]
@@ -52,6 +53,15 @@ class Photographs:
     silent: tuple[str, ...]
     names: tuple[str, ...]
     encoding: Any
+
+    def as_linear(self) -> "Photographs":
+        """The same, silent files read as linear light."""
+        readers = {name: brdf.ImageReader(name, encoding="linear") for name in self.silent}
+        rows = [
+            readers[name].rows if name in readers else read for name, read in zip(self.names, self.rows, strict=True)
+        ]
+        top = [_top(readers[name]) if name in readers else top for name, top in zip(self.names, self.top, strict=True)]
+        return dataclasses.replace(self, rows=tuple(rows), top=np.array(top), encoding="linear")
 
     def band(
         self, rows: np.ndarray, texels: int, precision: str, pool: Executor | None = None
@@ -180,7 +190,7 @@ def photographs(
         lights: (P, 3) towards the lights, P lights, P scenes with one light each, or an ``.lp`` or text file.
         intensities: (P,) or (P, C), which the photographs are divided by.
         exposures: (P,), likewise.
-        encoding: of files.
+        encoding: of files and arrays.
 
     Raises:
         InputError: naming the photograph or argument.
@@ -238,12 +248,15 @@ def _open(name: str, picture: Any, encoding: Any) -> tuple[Any, tuple[int, int, 
         How to read rows of it; height, width and channels; its name, and that again where it is silent on its encoding;
         the type of the rows, and from where on they are clipped.
     """
-    if isinstance(picture, str | Path):
+    of_path = isinstance(picture, str | Path)
+    if of_path:
         name, picture = str(picture), brdf.ImageReader(picture, encoding=encoding)
+    curve = parse_encoding("encoding", encoding) or "linear"
+    if not of_path and encoding is not None and isinstance(picture, brdf.ImageReader | brdf.Picture):
+        raise InputError("encoding", f"is that of files and arrays, {name} is decoded", "Leave it out")
     if isinstance(picture, brdf.ImageReader):
-        silent = picture.is_integer and picture.bits <= 8 and picture.source in ("assumed", "format")
-        top = (picture.codes[0] or np.inf) * BELOW_TOP
-        return picture.rows, picture.shape, name, name if silent else "", np.dtype(np.float32), top
+        silent = of_path and picture.is_integer and picture.bits <= 8 and picture.source in ("assumed", "format")
+        return picture.rows, picture.shape, name, name if silent else "", np.dtype(np.float32), _top(picture)
     top = np.inf
     if isinstance(picture, brdf.Picture):
         picture, top = picture.pixels, (picture.saturation or np.inf) * BELOW_TOP
@@ -252,8 +265,16 @@ def _open(name: str, picture: Any, encoding: Any) -> tuple[Any, tuple[int, int, 
     if values.ndim != 3 or 0 in values.shape or values.dtype.kind not in "fu":
         came = f"is of shape {values.shape} and type {values.dtype}"
         raise InputError(name, came, "Give (H, W, C) floats, or unsigned integers that span their type")
+    if curve != "linear":
+        top = BELOW_TOP if values.dtype.kind == "u" else top
+        read = partial(_linear, lambda start, stop: values[start:stop], values.dtype)
+        return lambda start, stop: decode(read(start, stop), curve), values.shape, name, "", np.dtype(np.float32), top
     top = np.iinfo(values.dtype).max if values.dtype.kind == "u" else top
     return lambda start, stop: values[start:stop], values.shape, name, "", values.dtype, top
+
+
+def _top(reader: brdf.ImageReader) -> float:
+    return (reader.codes[0] or np.inf) * BELOW_TOP
 
 
 def plain_numbers(name: str, given: Any, remedy: str) -> np.ndarray:

@@ -9,10 +9,12 @@ import sys
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from PIL import Image
 from project_paths import ROOT
 
 import brdf
 import fitting
+from brdf.images.encoding import encode
 from brdf.images.writing import write_image
 from fitting.maps import map_bands
 from fitting.maps.kept_bands import KeptBands
@@ -231,6 +233,20 @@ def test_auto_takes_the_simplest():
     assert np.mean(maps.chosen[0, 20:] != 0) > 0.9
 
 
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float64])
+def test_arrays_hold_values_as_is_told(kind):
+    lights = dome(16)
+    pictures, truth = texels(12, 0.0, lights)
+    shown = encode(np.clip(pictures / 2, 0, 1), "srgb")
+    given = shown if kind is np.float64 else np.round(shown * np.iinfo(kind).max).astype(kind)
+    maps = fitting.fit_maps(given, lights, truth["normal"][None], encoding="srgb", precision="float64")
+    tolerance = {np.uint8: 0.02, np.uint16: 1e-4, np.float64: 1e-9}[kind]
+    np.testing.assert_allclose(2 * maps.k_d[0], truth["k_d"], atol=tolerance)
+    picture = brdf.Picture(given[0].astype(np.float32), None, "linear", "given", 32, None)
+    with pytest.raises(brdf.InputError, match=r"encoding: is that of files and arrays, pictures\[0\] is decoded"):
+        fitting.fit_maps([picture] * 16, lights, encoding="srgb")
+
+
 # -- folders and files -------------------------------------------------------------------------------------------------
 
 
@@ -282,6 +298,28 @@ def test_clipped_values_are_no_data():
     known = maps.determined[0]
     assert np.any(pictures > 1)
     assert np.median(np.abs(np.log(maps.n[0] / truth["n"]))[known]) < 1e-3
+
+
+@pytest.mark.parametrize("encoding", ["linear", "srgb"])
+@pytest.mark.parametrize("beside", [0, 20])
+def test_how_silent_files_are_encoded_is_told_by_the_texels_that_count(tmp_path, encoding, beside):
+    lights = dome(12)
+    pictures, truth = texels(30, 0.0, lights)
+    paths = []
+    for index, picture in enumerate(pictures):
+        codes = np.full((8, 30, 3), beside, np.uint8)
+        codes[6] = np.round(255 * encode(np.clip(picture[0] / 2, 0, 1), encoding))
+        paths.append(tmp_path / f"{index}.png")
+        Image.fromarray(codes).save(paths[-1])
+    normals, mask = np.broadcast_to(truth["normal"], (8, 30, 3)), np.arange(8)[:, None] + np.zeros(30) == 6
+    maps = fitting.fit_maps((path for path in paths), lights, normals, mask=mask)
+    assert f"read as {'sRGB' if encoding == 'srgb' else 'linear'}," in maps.notes[0]
+    assert np.median(np.abs(2 * maps.k_d[6] / truth["k_d"] - 1)) < 0.01
+    with pytest.raises(brdf.InputError, match="no texel that counts"):
+        fitting.fit_maps(paths, lights, normals, mask=np.zeros((8, 30)))
+    points = brdf.SurfacePoints.from_normals(normals)
+    scenes = [brdf.Scene(points=points, lights=[brdf.DirectionalLight(light, 1.0)]) for light in lights]
+    assert fitting.fit_maps(paths, scenes).notes[0].endswith("read as sRGB. Where you know, say so with the encoding")
 
 
 @pytest.mark.parametrize(
