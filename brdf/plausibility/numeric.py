@@ -271,10 +271,11 @@ def _energy(scan: _Scan) -> Finding:
     # the lowest along an axis of the quadrature's square, which is halved less often there
     lights = from_angles(_POLAR, 0.75 * np.pi * np.arange(len(_POLAR)) * (_POLAR < _FIXED[-1]))
     lights = np.concatenate([lights, scan.bright[0, :: 4 * _KEPT]])
-    top = lights[np.argmax(_albedos(scan, lights)[0].max(axis=1))]
+    known = _albedos(scan, lights)
+    top = lights[np.argmax(known[0].max(axis=1))]
     found = scan.improved(lambda tried: _albedos(scan, tried)[0].max(axis=1), top[None, None], rounds=10, tries=6)
-    lights = np.append(lights, found[0], axis=0)
-    albedo, bound = found = _albedos(scan, lights)
+    lights, added = np.append(lights, found[0], axis=0), _albedos(scan, found[0])
+    albedo, bound = found = np.append(known, added, axis=1)
     score = albedo - bound
     if np.all(score <= ENERGY_LIMIT):
         for row in np.flatnonzero(np.any(albedo + bound > ENERGY_LIMIT, axis=1)):
@@ -324,32 +325,45 @@ def integrate(
     size = 0.25
     edges = np.arange(-1, 1, size)
     corner = np.stack(np.meshgrid(edges, edges), axis=-1).reshape(-1, 2)
-    values = _rule(evaluate, corner, size)
+    halved = _holds(centres, corner, size)
+    values = _rule(evaluate, corner, size, ~halved)
     total = bound = 0.0 * values[0]
     while len(corner):
-        middle, _ = _from_square(*(corner.T + 0.5 * size))
-        # the map stretches by 0.7 to 2: at least the square that holds the centre, and those around it
-        announced = np.min(np.linalg.norm(middle[:, None] - centres, axis=2), axis=1) < 2 * size
         size *= 0.5
-        quarters = corner[:, None] + size * _QUARTERS
-        parts = _rule(evaluate, quarters.reshape(-1, 2), size).reshape(len(corner), 4, -1)
-        sums = parts.sum(axis=1)
+        quarters = (corner[:, None] + size * _QUARTERS).reshape(-1, 2)
+        # One that is halved whatever it holds is not integrated, and only in such a one lie others.
+        inner = np.repeat(halved, 4)
+        inner[inner] = _holds(centres, quarters[inner], size)
+        parts = _rule(evaluate, quarters, size, ~inner)
+        budget -= np.count_nonzero(~inner) * _NODES**2
+        sums = parts.reshape(len(corner), 4, -1).sum(axis=1)
         differences = np.abs(sums - values)
-        budget -= 4 * len(corner) * _NODES**2
-        refine = (np.max(differences, axis=1) > tolerance) | announced & (size >= FINEST)
+        refine = (np.max(differences, axis=1) > tolerance) | halved
         refine &= budget >= 0
         total, bound = total + sums[~refine].sum(axis=0), bound + differences[~refine].sum(axis=0)
-        corner, values = quarters[refine].reshape(-1, 2), parts[refine].reshape(-1, len(total))
+        again = np.repeat(refine, 4)
+        corner, values, halved = quarters[again], parts[again], inner[again]
     return total, bound + 1e-15 * _NODES * np.abs(total)
 
 
-def _rule(evaluate: Evaluate, corner: np.ndarray, size: float) -> np.ndarray:
-    """Integrals over squares, (m, C)."""
+def _holds(centres: np.ndarray, corner: np.ndarray, size: float) -> np.ndarray:
+    """Whether squares that are not the finest hold one of the centres, or are beside one that does."""
+    middle, _ = _from_square(*(corner.T + 0.5 * size))
+    # the map stretches by 0.7 to 2
+    return (np.min(np.linalg.norm(middle[:, None] - centres, axis=2), axis=1) < 2 * size) & (size > FINEST)
+
+
+def _rule(evaluate: Evaluate, corner: np.ndarray, size: float, some: np.ndarray) -> np.ndarray:
+    """Integrals over some squares, and 0 for the others, (m, C)."""
     nodes, weights = gauss_legendre(_NODES)
+    corner = corner[some]
     u, v = corner[:, 0, None, None] + size * nodes[:, None], corner[:, 1, None, None] + size * nodes
     directions, solid_angle = _from_square(u, v)
     weight = size**2 * solid_angle * np.outer(weights, weights)
-    return np.einsum("muv,muvc->mc", weight, evaluate(directions.reshape(-1, 3)).reshape(*weight.shape, -1))
+    found = np.einsum("muv,muvc->mc", weight, evaluate(directions.reshape(-1, 3)).reshape(*weight.shape, -1))
+    integrals = np.zeros((len(some), found.shape[1]))
+    integrals[some] = found
+    return integrals
 
 
 def _from_square(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
