@@ -335,7 +335,7 @@ def integrate(
         inner = np.repeat(halved, 4)
         inner[inner] = _holds(centres, quarters[inner], size)
         parts = _rule(evaluate, quarters, size, ~inner)
-        budget -= np.count_nonzero(~inner) * _NODES**2
+        budget -= int(np.count_nonzero(~inner)) * _NODES**2
         sums = parts.reshape(len(corner), 4, -1).sum(axis=1)
         differences = np.abs(sums - values)
         refine = (np.max(differences, axis=1) > tolerance) | halved

@@ -27,8 +27,10 @@ MOST_PIXELS = 1 << 14
 # With a smaller exponent a lobe cannot be told from Lambert's law, with a larger one it cannot be seen. Where to start.
 LOWEST_N, LARGEST_N = 3.0, 1e4
 STARTS = (8.0, 60.0)
-# Where a descent ends, in units of the brightest pixel.
-CLOSE = 1e-8
+# Where a descent ends: the slope of the mean cost, in units of the brightest pixel.
+CLOSE = 1e-10
+# Which pixels the light reaches is settled where no number changes by more.
+CHANGE = 1e-7
 # A highlight is believed where the logarithm of the likelihood rises by so much.
 RISE = 20.0
 # The surface is cut into so many blocks along each side; residuals of one block may go together.
@@ -169,8 +171,8 @@ def light_from_shading(
     for _ in range(100):
         before, scale = numbers, _bound(residual[lit])
         numbers, cost = _refine(numbers, free, False, scale, value[lit], normal[lit])
-        residual = value - _shown(numbers, False, normal)
-        if np.allclose(before, numbers, rtol=0, atol=10 * CLOSE):
+        residual = value - _shown(numbers, free, False, normal)[0]
+        if np.allclose(before, numbers, rtol=0, atol=CHANGE):
             break
         lit = _reached(normal, numbers)
     found = []
@@ -182,13 +184,17 @@ def light_from_shading(
     shiny, left, mirror = min(found, key=lambda one: one[1])
     if np.count_nonzero(lit) * np.log(max(cost, 1e-300) / max(left, 1e-300)) > 2 * RISE:
         # Lambert's law alone may have looked at pixels that the light does not reach.
-        lit, free, residual = _reached(normal, shiny), with_highlight, value - _shown(shiny, mirror, normal)
+        lit, free, residual = (
+            _reached(normal, shiny),
+            with_highlight,
+            value - _shown(shiny, with_highlight, mirror, normal)[0],
+        )
         scale = _bound(residual[lit])
         numbers, _ = _refine(shiny, free, mirror, scale, value[lit], normal[lit])
-        residual = value - _shown(numbers, mirror, normal)
+        residual = value - _shown(numbers, free, mirror, normal)[0]
     pixel -= pixel.min(axis=0)
     block = pixel // -(-(pixel.max() + 1) // BLOCKS) @ [BLOCKS, 1]
-    slopes = _slopes(numbers, free, mirror, normal[lit])
+    slopes = _shown(numbers, free, mirror, normal[lit])[1]
     error = _error(numbers[:3], residual[lit], slopes, scale, block[lit])
     if not error < GUESS:
         raise _too_little()
@@ -229,42 +235,48 @@ def _reached(normal, numbers) -> np.ndarray:
     return lit
 
 
-def _shown(numbers, mirror, normal) -> np.ndarray:
+def _shown(numbers, free, mirror, normal) -> tuple[np.ndarray, np.ndarray]:
     """What pixels with these normals show, the light reaching them: ambient light, Lambert's law and a highlight.
 
     Args:
         numbers: the light's vector, as long as what a pixel that faces it shows; ambient light; strength of the
             highlight, either sign meaning the same, and logarithm of what its exponent has beyond the lowest.
+        free: by which numbers the derivatives are wanted; without a free highlight there is none.
         mirror: whether its lobe is about the mirror direction, not the half vector.
         normal: of the pixels.
+
+    Returns:
+        The values, and their derivatives by the numbers, 0 by those that are not free.
     """
     light, (ambient, specular, log_beyond) = numbers[:3], numbers[3:]
-    shown = ambient + normal @ light
-    if not specular:
-        return shown
-    to_light = light / max(np.linalg.norm(light), 1e-300)
+    columns = np.zeros((len(normal), 6))
+    columns[:, :3], columns[:, 3] = normal, 1.0
+    if not free[4]:
+        return ambient + normal @ light, columns * free
+    length = max(np.linalg.norm(light), 1e-300)
+    to_light = light / length
+    turned = (np.eye(3) - np.outer(to_light, to_light)) / length  # derivative of to_light by the light
     if mirror:
         cosine = 2 * (normal @ to_light) * normal[:, 2] - to_light[2]
+        by_light = (2 * normal[:, 2:] * normal - TO_VIEW) @ turned
     else:
         half = to_light + TO_VIEW
-        cosine = normal @ half / max(np.linalg.norm(half), 1e-9)
-    n = LOWEST_N + np.exp(min(log_beyond, np.log(LARGEST_N)))
-    return shown + abs(specular) * np.clip(cosine, 1e-9, 1.0) ** n
-
-
-def _slopes(numbers, free, mirror, normal) -> np.ndarray:
-    """The derivatives of `_shown` by the numbers that are free, 0 by the others."""
-    columns = np.zeros((len(normal), 6))
-    for index in np.flatnonzero(free):
-        step = 1e-5 * max(abs(numbers[index]), 1e-3) * np.eye(6)[index]
-        above, below = _shown(numbers + step, mirror, normal), _shown(numbers - step, mirror, normal)
-        columns[:, index] = (above - below) / (2 * step[index])
-    return columns
+        size = max(np.linalg.norm(half), 1e-9)
+        half /= size
+        cosine = normal @ half
+        by_light = (normal - cosine[:, None] * half) @ turned / size
+    beyond = np.exp(min(log_beyond, np.log(LARGEST_N)))
+    cosine = np.clip(cosine, 1e-9, 1.0)
+    lobe = cosine ** (LOWEST_N + beyond)
+    columns[:, :3] += (abs(specular) * (LOWEST_N + beyond) * lobe / cosine)[:, None] * by_light
+    columns[:, 4] = np.sign(specular) * lobe
+    columns[:, 5] = abs(specular) * lobe * np.log(cosine) * beyond
+    return ambient + normal @ light + abs(specular) * lobe, columns * free
 
 
 def _refine(numbers, free, mirror, scale, value, normal) -> tuple[np.ndarray, float]:
     """The nearest minimum of Huber's cost over the free numbers; and the cost."""
-    from scipy.optimize import least_squares  # it takes long to load
+    from scipy.optimize import minimize  # it takes long to load
 
     def among(some):
         every = numbers.copy()
@@ -272,12 +284,22 @@ def _refine(numbers, free, mirror, scale, value, normal) -> tuple[np.ndarray, fl
         return every
 
     def left(some):
-        return _shown(among(some), mirror, normal) - value
+        shown, columns = _shown(among(some), free, mirror, normal)
+        return shown - value, columns[:, free]
 
-    how: Any = {"loss": "huber", "f_scale": scale, "x_scale": "jac", "ftol": None, "gtol": None, "xtol": CLOSE}
-    how |= {"jac": lambda some: _slopes(among(some), free, mirror, normal)[:, free], "max_nfev": 50}
-    found = least_squares(left, numbers[free], **how)
-    return among(found.x), found.cost
+    def cost(some):
+        residual, columns = left(some)
+        pull = np.clip(residual, -scale, scale)
+        return np.mean(pull * (residual - 0.5 * pull)), pull @ columns / len(value)
+
+    def curvature(some):
+        residual, columns = left(some)
+        weight = scale / np.maximum(np.abs(residual), scale)
+        return (columns.T * weight) @ columns / len(value)
+
+    how: Any = {"method": "trust-exact", "jac": True, "hess": curvature, "options": {"gtol": CLOSE, "maxiter": 50}}
+    found = minimize(cost, numbers[free], **how)
+    return among(found.x), found.fun
 
 
 def _error(light, residual, slopes, scale, block) -> float:
