@@ -46,14 +46,15 @@ def fit_maps(
         pictures: photographs of one size, (P, H, W, C) linear values or a list of arrays, `brdf.Picture`,
             `brdf.ImageReader` or files; or a folder with an ``.lp`` file, or with DiLiGenT's text files.
         lights: towards the lights, (P, 3), x right, y up, z to the camera; or directional lights; or scenes with one
-            light of any kind each, whose camera and shapes tell what texels see, cast shadows left out; or an ``.lp``
-            or text file. None for the folder's.
+            light of any kind each, whose camera and shapes, the same in all, tell what texels see, cast shadows left
+            out; or an ``.lp`` or text file. None for the folder's.
         normals: (H, W, 3); a file (.npy, .exr, or an image with n·0.5 + 0.5, y up); "fit" to find them too, under
             distant lights. None for the scene's or the folder's ``normals.*``, else they are found.
         intensities: of the lights, (P,) or (P, C): photographs are divided by them.
         exposures: of the photographs, (P,), likewise.
-        ambient: intensity of the ambient light, a number or (C,), where there is some: k_a is found too.
-        to_view: towards the camera, which is far away.
+        ambient: intensity of the ambient light, a number or (C,), where there is some: k_a is found too. None for the
+            scenes'.
+        to_view: towards the camera, which is far away; scenes tell it themselves.
         model: "lambert", "phong", "blinn-phong" or a normalised form; "auto" for the simplest of Lambert, Phong and
             Blinn-Phong that serves each texel, by the Bayesian information criterion.
         specular: "coloured", or "grey": the channels share k_s.
@@ -102,6 +103,8 @@ def fit_maps(
     given = map_inputs.photographs(pictures, lights, intensities, exposures, encoding)
     surface = _surface(given, normals, mask, to_view, flip_y)
     to_view = np.asarray(direction_value("to_view", to_view))
+    if surface.points is not None:
+        to_view = np.sum(np.asarray(surface.points.to_view, float)[np.asarray(surface.mask)], axis=0)
     how = How(models, specular == "grey", _ambient(ambient, given), to_view, precision)
     notes: tuple[str, ...] = ()
     if given.silent:
@@ -121,12 +124,14 @@ def _models(model: Any) -> tuple[Any, ...]:
 
 
 def _ambient(ambient: Any, given: Photographs) -> np.ndarray | None:
-    if ambient is None:
+    if ambient is None and given.ambient is None:
         return None
-    values = map_inputs.plain_numbers("ambient", ambient, "Give the intensity of the ambient light").reshape(-1)
-    if values.size not in (1, given.shape[3]) or not np.all((values > 0) & np.isfinite(values)):
-        came = f"must be 1 or {given.shape[3]} numbers above 0, got {ambient!r:.60}"
-        raise InputError("ambient", came, "Give the intensity of the ambient light")
+    values = given.ambient
+    if ambient is not None:
+        values = map_inputs.plain_numbers("ambient", ambient, "Give the intensity of the ambient light").reshape(-1)
+        if values.size not in (1, given.shape[3]) or not np.all((values > 0) & np.isfinite(values)):
+            came = f"must be 1 or {given.shape[3]} numbers above 0, got {ambient!r:.60}"
+            raise InputError("ambient", came, "Give the intensity of the ambient light")
     columns = values / given.unit
     return columns[:, :1] if np.all(columns == columns[:, :1]) else columns
 
@@ -147,7 +152,10 @@ def _surface(given: Photographs, normals: Any, mask: Any, to_view: Any, flip_y: 
         if points.mask.shape != (height, width):
             came = f"show {points.mask.shape[1]} x {points.mask.shape[0]} pixels, the photographs {width} x {height}"
             raise InputError("lights", came, "Give scenes of the photographs' size")
-        points = dataclasses.replace(points, mask=points.mask & mask, area=None)
+        shadows, known = None, [one for scene in given.scenes for one in scene.visibility or [None]]
+        if any(one is not None for one in known):
+            shadows = np.stack([np.ones((height, width)) if one is None else one for one in known], axis=-1)
+        points = dataclasses.replace(points, mask=points.mask & mask, visibility=shadows, area=None)
         return Surface(points.normal, points.mask, points)
     if normals is None or (isinstance(normals, str) and normals == "fit"):
         return Surface(None, mask, None)

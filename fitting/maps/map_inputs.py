@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import Float, Num
 
@@ -33,6 +34,7 @@ class Photographs:
         shape: count, height, width, channels.
         to_light: unit, (P, 3); None where ``scenes`` tell.
         scenes: of each photograph with its one light, of intensity 1; None where all lights are distant.
+        ambient: what the scenes say of ambient light, (P, C); None where they say nothing.
         unit: what each photograph is divided by, (P, C).
         codes: the type of ``rows`` where these are codes; None for linear values.
         top: values from which on they are clipped, (P,).
@@ -46,6 +48,7 @@ class Photographs:
     shape: tuple[int, int, int, int]
     to_light: Float[np.ndarray, "P 3"] | None
     scenes: tuple[brdf.Scene, ...] | None
+    ambient: Float[np.ndarray, "P C"] | None
     unit: Float[np.ndarray, "P C"]
     codes: np.dtype | None
     top: Float[np.ndarray, " P"]
@@ -216,8 +219,10 @@ def photographs(
     for name, given in (("intensities", intensities), ("exposures", exposures)):
         if given is not None:
             unit = unit * _factors(name, given, count, channels)
-    to_light, scenes = None, None
+    to_light, scenes, ambient = None, None, None
     if all(isinstance(light, brdf.Scene) for light in lights):
+        _refuse_other_views(lights)
+        ambient = _ambient(lights, channels)
         scenes, colours = zip(*(_white(f"lights[{i}]", scene) for i, scene in enumerate(lights)), strict=True)
         unit = unit * [_factors(f"lights[{i}]", one[None], 1, channels)[0] for i, one in enumerate(colours)]
     elif all(isinstance(light, brdf.DirectionalLight) for light in lights):
@@ -232,7 +237,18 @@ def photographs(
     scale = 1 / (unit if codes is None else unit * np.iinfo(codes).max)
     told = tuple(filter(None, silent))
     return Photographs(
-        tuple(rows), (count, *shapes[0]), to_light, scenes, unit, codes, np.array(tops), scale, told, names, encoding
+        tuple(rows),
+        (count, *shapes[0]),
+        to_light,
+        scenes,
+        ambient,
+        unit,
+        codes,
+        np.array(tops),
+        scale,
+        told,
+        names,
+        encoding,
     )
 
 
@@ -314,6 +330,36 @@ def _directions(given: Any) -> Float[np.ndarray, "P 3"]:
         worst = int(np.argmin(np.where(np.isfinite(length), length, -1)))
         raise InputError(f"lights[{worst}]", f"has no direction, got {vectors[worst].tolist()}", "Give x, y, z")
     return vectors / length[:, None]
+
+
+def _ambient(scenes: list[brdf.Scene], channels: int) -> Float[np.ndarray, "P C"] | None:
+    """Intensities of the scenes' ambient light; None where there is none."""
+    found = np.zeros((len(scenes), channels))
+    for index, scene in enumerate(scenes):
+        if scene.ambient is not None:
+            if len(scene.ambient) not in (1, channels):
+                came = f"has ambient light of {len(scene.ambient)} channels, the photographs have {channels}"
+                raise InputError(f"lights[{index}]", came, "Give as many as the photographs have, or one for all")
+            found[index] = scene.ambient
+    return found if np.any(found) else None
+
+
+def _refuse_other_views(scenes: list[brdf.Scene]) -> None:
+    """What texels see is asked of the first scene."""
+    views = [jax.tree.flatten(dataclasses.replace(one, ambient=None, lights=(), visibility=())) for one in scenes]
+    leaves, structure = views[0]
+    for index, (others, form) in enumerate(views[1:], start=1):
+        same = form == structure and all(
+            one is other or np.array_equal(one, other, equal_nan=True)
+            for one, other in zip(leaves, others, strict=True)
+        )
+        if not same:
+            came = "has another camera, or other shapes or points, than lights[0]"
+            raise InputError(f"lights[{index}]", came, "Give scenes of one view that differ in their lights")
+
+
+def _equal(one: Any, other: Any) -> bool:
+    return one is other or np.array_equal(one, other, equal_nan=True)
 
 
 def _white(name: str, scene: brdf.Scene) -> tuple[brdf.Scene, np.ndarray]:

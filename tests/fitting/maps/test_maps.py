@@ -220,6 +220,37 @@ def test_near_lights_and_cast_shadows_of_a_scene():
     )
 
 
+def test_scenes_tell_ambient_light_shadow_masks_and_the_view():
+    camera = brdf.OrthographicCamera(position=[3, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=(12, 12))
+    ball, lights, random = brdf.Sphere([0, 0, 0], 1), dome(20), np.random.default_rng(1)
+    truth = brdf.BlinnPhong(k_a=[0.3, 0.2, 0.1], k_d=[0.4, 0.3, 0.2], k_s=0.3, n=15.0)
+    scenes = [
+        brdf.Scene(
+            camera,
+            [ball],
+            lights=[brdf.DirectionalLight(light, [2.0, 1.0, 0.5])],
+            ambient=[0.1, 0.2, 0.3],
+            visibility=[random.uniform(size=(12, 12)) > 0.2],
+        )
+        for light in lights
+    ]
+    pictures = [np.asarray(brdf.render(truth, scene, precision="float64")) for scene in scenes]
+    maps = fitting.fit_maps(pictures, scenes, precision="float64")
+    known = maps.determined
+    assert known.mean() > 0.5
+    for found, true in ((maps.k_a, truth.k_a), (maps.k_d, truth.k_d), (maps.n, truth.n)):
+        np.testing.assert_allclose(found[known], np.broadcast_to(true, found[known].shape), rtol=5e-3)
+    alone = brdf.Scene(camera, [ball], lights=[brdf.DirectionalLight(lights[3], [2.0, 1.0, 0.5])])
+    shown = maps.render(alone.lights[0])
+    np.testing.assert_allclose(shown[known], np.asarray(brdf.render(truth, alone))[known], atol=1e-3)
+    other = dataclasses.replace(scenes[4], shapes=[brdf.Sphere([0.1, 0, 0], 1)])
+    with pytest.raises(brdf.InputError, match=r"lights\[4\]: has another camera, or other shapes .* than lights\[0\]"):
+        fitting.fit_maps(pictures, [*scenes[:4], other, *scenes[5:]])
+    other = dataclasses.replace(scenes[4], lights=[brdf.DirectionalLight(lights[4], 1.0)], ambient=[0.1, 0.2])
+    with pytest.raises(brdf.InputError, match=r"lights\[4\]: has ambient light of 2 channels"):
+        fitting.fit_maps(pictures, [*scenes[:4], other, *scenes[5:]])
+
+
 def test_auto_takes_the_simplest():
     lights, normal = dome(24), np.broadcast_to(VIEW, (1, 40, 3))
     random = np.random.default_rng(0)
