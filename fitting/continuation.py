@@ -7,14 +7,15 @@ squares leaves, and follows its own score from there, by a factor of two at most
 """
 
 import math
-from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
-from fitting.likelihood import LogLikelihood
+from fitting.likelihood import Bounds, Intervals, LogLikelihood
 from fitting.solver.nnls import nonnegative_minimum
+from fitting.solver.normal_equations import Picture
 
 # In codes: below this the edges of codes are as sharp as the arithmetic of the pictures.
 LEAST_NOISE = 1e-4
@@ -60,7 +61,7 @@ class Score(NamedTuple):
             above `MOST_TELLING`: those that the model misses would hide what the others say.
         gradient: of the likelihood by the unknowns, (U,).
         hessian: minus the second derivative, (U, U).
-        said: of each picture, for the problem's own use.
+        said: of each picture.
     """
 
     value: float
@@ -68,75 +69,153 @@ class Score(NamedTuple):
     noise_information: float
     gradient: Float[np.ndarray, " U"]
     hessian: Float[np.ndarray, "U U"]
-    said: Sequence[Any]
+    said: "Sequence[Said]"
 
 
-def noise_score(told: LogLikelihood, noise: Any, weight: Any = 1.0) -> tuple[float, float, float]:
-    """The logarithm of the likelihood of values, its derivative by log s, and what they tell of that.
+class Values(NamedTuple):
+    """Some pixels of a picture, whose values say something.
 
-    Args:
-        told: of each.
-        noise: of each, in units of its interval.
-        weight: how many values each stands for.
+    Attributes:
+        which: of its pixels.
+        weight: how many each stands for.
+        intervals: between which codes they lay.
+        picture: these pixels alone, where predictions are made of them.
     """
-    each = (told.score**2 - told.weight) * noise**2
-    parts = told.value, each, np.minimum(each**2, MOST_TELLING)
-    value, by_log_noise, information = (float(np.sum(weight * part)) for part in parts)
-    return value, by_log_noise, information
+
+    which: Bool[np.ndarray, " P"]
+    weight: Float[np.ndarray, "P C"]
+    intervals: Intervals
+    picture: Picture | None = None
+
+    def said(self, radiance: Float[np.ndarray, "P C"], columns: Float[np.ndarray, "V P C"], noise: float) -> "Said":
+        """What they say of a prediction."""
+        code, slope = self.intervals.bounds.codes(radiance)
+        return Said(self, radiance, slope, columns, self.intervals.said(code, noise))
 
 
-def together(
-    which: Sequence[Bool[np.ndarray, " P"]], beside: Sequence[Bool[np.ndarray, " P"]]
-) -> list[Bool[np.ndarray, " P"]] | None:
-    """Pixels of each picture and those beside; None where the latter are all.
+class Said(NamedTuple):
+    """What values say of what is shown there.
 
-    Args:
-        which: pixels of each picture.
-        beside: others.
+    Attributes:
+        values: which.
+        radiance: that is predicted, (P, C).
+        slope: of the code by it, (P, C).
+        columns: derivatives of the radiance by the unknowns that move each channel, (V, P, C).
+        told: by the code.
     """
-    if not any(np.any(some & ~other) for some, other in zip(which, beside, strict=True)):
-        return None
-    return [some | other for some, other in zip(which, beside, strict=True)]
 
-
-class Problem(Protocol):
-    """Values, and a model that predicts them."""
+    values: Values
+    radiance: Float[np.ndarray, "P C"]
+    slope: Float[np.ndarray, "P C"]
+    columns: Float[np.ndarray, "V P C"]
+    told: LogLikelihood
 
     @property
-    def design(self) -> Float[np.ndarray, "U V"]:
-        """What each free number moves of the unknowns."""
-        ...
+    def score(self) -> Float[np.ndarray, "P C"]:
+        """By radiance."""
+        return self.values.weight * self.told.score * self.slope
+
+    @property
+    def weight(self) -> Float[np.ndarray, "P C"]:
+        """By radiance."""
+        return self.values.weight * self.told.weight * self.slope**2
+
+    def of_noise(self, noise: float) -> tuple[float, float, float]:
+        """The logarithm of the likelihood, its derivative by log s, and what the values tell of that."""
+        each = (self.told.score**2 - self.told.weight) * (noise * self.values.intervals.bounds.spread) ** 2
+        parts = self.told.value, each, np.minimum(each**2, MOST_TELLING)
+        value, by_log_noise, information = (float(np.sum(self.values.weight * part)) for part in parts)
+        return value, by_log_noise, information
+
+    def sums(self) -> tuple[Float[np.ndarray, "C V V"], Float[np.ndarray, "C V"]]:
+        """Products of the columns weighted by the values' weights, and with their scores."""
+        columns = np.moveaxis(self.columns, -1, 0)  # (C, V, P)
+        products = (columns * self.weight.T[:, None]) @ np.swapaxes(columns, 1, 2)
+        return products, (columns @ self.score.T[..., None])[..., 0]
+
+
+class Problem:
+    """Values, and a model that predicts them.
+
+    Attributes:
+        bounds: of each picture, between which codes its values lay.
+        design: what each free number moves of the unknowns, (U, V).
+        exponents: which unknowns are logarithms of exponents.
+        lower: bound of each.
+        upper: likewise.
+        copies: the channels are copies of each other, and tell of a number once.
+        places: of the unknowns that move each channel, (C, V).
+    """
+
+    bounds: Sequence[Bounds]
+    design: Float[np.ndarray, "U V"]
+    exponents: Bool[np.ndarray, " U"]
+    lower: Float[np.ndarray, " U"]
+    upper: Float[np.ndarray, " U"]
+    copies: bool
+    places: Int[np.ndarray, "C V"]
+
+    def codes(self, unknowns: Float[np.ndarray, " U"]) -> list[Float[np.ndarray, "P C"]]:
+        """What is predicted of all pixels, in codes."""
+        raise NotImplementedError
+
+    def taken(self, picture: int, which: Bool[np.ndarray, " P"]) -> Values:
+        """Some pixels of a picture."""
+        raise NotImplementedError
+
+    def shown(self, unknowns: Float[np.ndarray, " U"], values: Sequence[Values]) -> Iterator[tuple[Any, Any]]:
+        """What is predicted of some pixels of each picture: radiance, (P, C), and its columns, (V, P, C)."""
+        raise NotImplementedError
 
     @property
     def signed(self) -> Bool[np.ndarray, " U"]:
-        """Which unknowns may be below 0, and move relative to where they are."""
-        ...
+        """Which unknowns have no bound at 0, and move relative to where they are."""
+        return self.exponents | (self.lower < 0)
 
-    def near(self, at: Estimate, reach: float, beside: Any = None) -> Any:
+    def near(self, at: Estimate, reach: float, beside: list[Values] | None = None) -> list[Values]:
         """The values that say something: those not surely in their codes, by so many s, and those given beside.
 
         The latter themselves where there are no others.
         """
-        ...
+        both = zip(self.bounds, self.codes(at.unknowns), strict=True)
+        which = [bounds.near(code, reach * at.noise) for bounds, code in both]
+        if beside is not None:
+            if not any(np.any(some & ~other.which) for some, other in zip(which, beside, strict=True)):
+                return beside
+            which = [some | other.which for some, other in zip(which, beside, strict=True)]
+        return [self.taken(picture, some) for picture, some in enumerate(which)]
 
-    def score(self, at: Estimate, values: Any) -> Score:
+    def score(self, at: Estimate, values: Sequence[Values]) -> Score:
         """What these values say of an estimate."""
-        ...
+        size = len(self.design)
+        said, totals, gradient, hessian = [], np.zeros(3), np.zeros(size), np.zeros((size, size))
+        for some, parts in zip(values, self.shown(at.unknowns, values), strict=True):
+            one = some.said(*parts, at.noise)
+            said.append(one)
+            totals += one.of_noise(at.noise)
+            for place, products, scores in zip(self.places, *one.sums(), strict=True):
+                hessian[np.ix_(place, place)] += products
+                gradient[place] += scores
+        value, by_log_noise, information = totals.tolist()
+        return Score(value, by_log_noise, information, gradient, hessian, said)
 
     def moved(self, at: Estimate, step: Float[np.ndarray, " U"]) -> Estimate:
         """An estimate with other unknowns, within their bounds."""
-        ...
+        step = np.where(self.exponents, np.clip(step, -LARGEST_SHIFT, LARGEST_SHIFT), step)
+        return at._replace(unknowns=np.clip(at.unknowns + step, self.lower, self.upper))
 
-    def active(self, at: Estimate) -> Bool[np.ndarray, " U"]:
-        """Which unknowns have an error: those that are not at a bound."""
-        ...
-
-    def squared_shares(self, at: Estimate, said: Score, influence: Float[np.ndarray, "U U"]) -> Float[np.ndarray, " U"]:
+    def squared_shares(self, said: Score, influence: Float[np.ndarray, "U U"]) -> Float[np.ndarray, " U"]:
         """Sums of squares of each value's share in what is known of each unknown.
 
         The share is its weight times the square of the product of the influence and its derivatives by the unknowns.
         """
-        ...
+        squares = np.zeros(len(influence))
+        for one in said.said:
+            both = zip(self.places, np.moveaxis(one.columns, -1, 0), one.weight.T, strict=True)
+            shares = [(influence[:, place] @ columns) ** 2 * weight for place, columns, weight in both]
+            for share in [sum(shares)] if self.copies else shares:
+                squares += np.einsum("up,up->u", share, share)
+        return squares
 
 
 class Precision(NamedTuple):
@@ -228,7 +307,7 @@ def _climb(problem: Problem, at: Estimate, enough: float, known: Sequence[Precis
 
 def precision(problem: Problem, at: Estimate, said: Score) -> Precision:
     """Variance of each unknown, and how many values tell of it."""
-    moved = problem.design[:, problem.active(at) @ np.abs(problem.design) > 0]
+    moved = problem.design[:, (problem.signed | (at.unknowns > 0)) @ np.abs(problem.design) > 0]
     moved = moved[:, np.einsum("uv,uw,wv->v", moved, said.hessian, moved) > NOTHING]
     hessian = moved.T @ said.hessian @ moved
     scale = np.sqrt(np.diag(hessian))
@@ -241,7 +320,7 @@ def precision(problem: Problem, at: Estimate, said: Score) -> Precision:
     own = np.sqrt(np.diag(influence))
     relative = influence / np.where(own > 0, own, 1.0)[:, None]
     total = np.einsum("uv,vw,uw->u", relative, said.hessian, relative)
-    squares = problem.squared_shares(at, said, relative)
+    squares = problem.squared_shares(said, relative)
     count = np.divide(total**2, squares, out=np.zeros_like(total), where=squares > 0)
     return Precision(at.noise, information, np.diag(influence), count)
 

@@ -2,15 +2,15 @@
 
 import dataclasses
 import operator
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from fitting.continuation import LARGEST_SHIFT, Estimate, Score, maximise, noise_score, together, where_most_is_told
+from fitting.continuation import Estimate, Problem, Score, Values, maximise, where_most_is_told
 from fitting.joint_problem import NOT_NEGATIVE, JointProblem, linearised
 from fitting.likelihood import Bounds, Intervals, residual_deviation
 from fitting.maximum_likelihood import FIRST_NOISE, alike
@@ -61,26 +61,8 @@ def most_likely_numbers(problem: JointProblem, seen: Observed, vector: Float[np.
     return Likely(at.unknowns, said.hessian, pictures.scatter(said), wider * np.sqrt(copies))
 
 
-class _Some(NamedTuple):
-    """Some pixels of a picture, and between which codes their values lay."""
-
-    which: Bool[np.ndarray, " P"]
-    weight: Float[np.ndarray, "P C"]
-    bounds: Bounds
-    intervals: Intervals
-
-
-class _Said(NamedTuple):
-    """What values of some pixels say: score and weight by radiance, (P, C), and its derivatives by the numbers."""
-
-    some: _Some
-    score: Float[np.ndarray, "P C"]
-    weight: Float[np.ndarray, "P C"]
-    columns: Float[np.ndarray, "U P C"]
-
-
-class RenderedPictures:
-    """Rounded pictures and the freed numbers of the scenes that they show: a `fitting.continuation.Problem`."""
+class RenderedPictures(Problem):
+    """Rounded pictures and the freed numbers of the scenes that they show."""
 
     def __init__(
         self, problem: JointProblem, bounds: Sequence[Bounds], start: Float[np.ndarray, " U"], *, copies: bool
@@ -94,71 +76,27 @@ class RenderedPictures:
             copies: the channels are copies of each other, and tell of a number once.
         """
         self._problem = dataclasses.replace(problem, weights=[None] * len(bounds))
-        self._bounds, self.design, self.signed = bounds, problem.design(start), ~problem.bounded
-        self._exponents, self._copies = problem.exponents, copies
+        self.bounds, self.design, self.exponents, self.copies = bounds, problem.design(start), problem.exponents, copies
+        self.lower, self.upper = np.where(problem.bounded, 0.0, -np.inf), np.full(start.shape, np.inf)
         self.weights = [np.ones(own.lower.shape) for own in bounds]
+        self.places = np.broadcast_to(np.arange(start.size), (bounds[0].lower.shape[1], start.size))
 
-    def codes(self, vector: Float[np.ndarray, " U"]) -> list[Float[np.ndarray, "P C"]]:
-        """What is predicted, in codes.
+    def codes(self, unknowns: Float[np.ndarray, " U"]) -> list[Float[np.ndarray, "P C"]]:
+        """What is predicted, in codes."""
+        radiance = self._radiance(np.asarray(_residuals(self._problem, jnp.asarray(unknowns))))
+        return [own.codes(part)[0] for own, part in zip(self.bounds, radiance, strict=True)]
 
-        Args:
-            vector: freed numbers.
-        """
-        radiance = self._radiance(np.asarray(_residuals(self._problem, jnp.asarray(vector))))
-        return [own.codes(part)[0] for own, part in zip(self._bounds, radiance, strict=True)]
+    def taken(self, picture: int, which: Bool[np.ndarray, " P"]) -> Values:
+        """Some pixels of a picture."""
+        some = self.bounds[picture].pixels(operator.itemgetter(which))
+        return Values(which, self.weights[picture][which], Intervals(some))
 
-    def near(self, at: Estimate, reach: float, beside: list[_Some] | None = None) -> list[_Some]:
-        """The pixels that say something, and those beside."""
-        both = zip(self._bounds, self.codes(at.unknowns), strict=True)
-        which = [bounds.near(code, reach * at.noise) for bounds, code in both]
-        if beside is not None:
-            which = together(which, [one.which for one in beside])
-        if which is None:
-            return beside or []
-        found = []
-        for some, weight, bounds in zip(which, self.weights, self._bounds, strict=True):
-            part = bounds.pixels(operator.itemgetter(some))
-            found.append(_Some(some, weight[some], part, Intervals(part.lower, part.upper, part.spread)))
-        return found
-
-    def score(self, at: Estimate, values: Sequence[_Some]) -> Score:
-        """What some pixels say."""
-        residuals, columns = (
-            np.asarray(part, np.float64) for part in linearised(self._problem, jnp.asarray(at.unknowns))
-        )
+    def shown(self, unknowns: Float[np.ndarray, " U"], values: Sequence[Values]) -> Iterator[tuple[Any, Any]]:
+        """What is predicted, and its derivatives by all numbers."""
+        residuals, columns = (np.asarray(part, np.float64) for part in linearised(self._problem, jnp.asarray(unknowns)))
         parts = np.split(columns, np.cumsum([target.size for target in self._problem.targets])[:-1], axis=1)
-        said, totals, gradient, hessian = [], np.zeros(3), np.zeros(len(columns)), np.zeros((len(columns),) * 2)
         for some, radiance, part in zip(values, self._radiance(residuals), parts, strict=True):
-            code, slope = some.bounds.codes(radiance[some.which])
-            told = some.intervals.said(code, at.noise)
-            totals += noise_score(told, at.noise * some.bounds.spread, some.weight)
-            own = part.reshape(len(part), *radiance.shape)[:, some.which]
-            one = _Said(some, some.weight * told.score * slope, some.weight * told.weight * slope**2, own)
-            flat = own.reshape(len(own), -1)
-            gradient += flat @ one.score.ravel()
-            hessian += (flat * one.weight.ravel()) @ flat.T
-            said.append(one)
-        value, by_log_noise, information = totals.tolist()
-        return Score(value, by_log_noise, information, gradient, hessian, said)
-
-    def moved(self, at: Estimate, step: Float[np.ndarray, " U"]) -> Estimate:
-        """Another estimate, within the bounds."""
-        step = np.where(self._exponents, np.clip(step, -LARGEST_SHIFT, LARGEST_SHIFT), step)
-        unknowns = at.unknowns + step
-        return at._replace(unknowns=np.where(self.signed, unknowns, np.maximum(unknowns, 0.0)))
-
-    def active(self, at: Estimate) -> Bool[np.ndarray, " U"]:
-        """Those that are not at their bound."""
-        return self.signed | (at.unknowns > 0)
-
-    def squared_shares(self, at: Estimate, said: Score, influence: Float[np.ndarray, "U U"]) -> Float[np.ndarray, " U"]:
-        """Sums of squares of each value's share."""
-        squares = np.zeros(len(influence))
-        for one in said.said:
-            share = np.einsum("uv,vpc->upc", influence, one.columns, optimize=True) ** 2 * one.weight
-            share = share.sum(axis=-1, keepdims=True) if self._copies else share
-            squares += np.einsum("upc,upc->u", share, share)
-        return squares
+            yield radiance[some.which], part.reshape(len(part), *radiance.shape)[:, some.which]
 
     def scatter(self, said: Score) -> Float[np.ndarray, "U U"] | None:
         """What takes the place of the Hessian where the pixels of a block err together; None where they do not.
@@ -168,11 +106,11 @@ class RenderedPictures:
         Args:
             said: of the pixels.
         """
-        if not any(bounds.lossy for bounds in self._bounds):
+        if not any(bounds.lossy for bounds in self.bounds):
             return None
         parts = []
         for one in said.said:
-            bounds, scores = one.some.bounds, np.einsum("upc,pc->up", one.columns, one.score)
+            bounds, scores = one.values.intervals.bounds, np.einsum("upc,pc->up", one.columns, one.score)
             parts.append(block_scatter(scores, Errors(one.score, np.asarray(bounds.index), int(bounds.width))))
         return np.sum(parts, axis=0)
 

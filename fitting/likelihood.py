@@ -303,17 +303,13 @@ class Intervals:
     first terms of the tail's series, right to 1e-6 of it.
     """
 
-    def __init__(
-        self, lower: Float[np.ndarray, "P C"], upper: Float[np.ndarray, "P C"], spread: Float[np.ndarray, "*P"]
-    ):
+    def __init__(self, bounds: Bounds):
         """Sort the values by the width of their intervals.
 
         Args:
-            lower: their lower ends, minus infinity for open ones.
-            upper: their upper ends, infinity for open ones.
-            spread: noise of each pixel over that of the picture, a number or (P, 1).
+            bounds: of each.
         """
-        self._ends, self._spread = (lower, upper), spread
+        self.bounds, lower, upper = bounds, bounds.lower, bounds.upper
         below, above = np.isfinite(lower), np.isfinite(upper)
         closed = below & above & (upper > lower)
         self._tells = closed | (below ^ above)
@@ -323,7 +319,7 @@ class Intervals:
         width = (self._high - self._low)[closed]
         least = float(np.min(width, initial=1.0 if not width.size else np.inf))
         power = np.rint(np.log2(width / least)).astype(np.intp)
-        self._tabulated = not spread.ndim and bool(np.all(np.abs(width / least / 2.0**power - 1) < _ALIKE))
+        self._tabulated = not bounds.spread.ndim and bool(np.all(np.abs(width / least / 2.0**power - 1) < _ALIKE))
         # The first kind has one end.
         self._kinds = np.append(np.inf, least * 2.0 ** np.arange(np.max(power, initial=0) + 1))
         self._kind = np.zeros(lower.shape, np.intp)
@@ -336,10 +332,10 @@ class Intervals:
             predicted: z, in units of the ends.
             noise: standard deviation of the noise before rounding.
         """
-        s = noise * self._spread
+        s = noise * self.bounds.spread
         if not self._tabulated:
             filled = np.array([(0, (1 << max(len(predicted) - 1, 0).bit_length()) - len(predicted)), (0, 0)])
-            parts = (*self._ends, predicted, np.broadcast_to(s, predicted.shape))
+            parts = (self.bounds.lower, self.bounds.upper, predicted, np.broadcast_to(s, predicted.shape))
             with jax.enable_x64(True):
                 found = jax.device_get(_interval(*(np.pad(part, filled, mode="edge") for part in parts)))
             return LogLikelihood(*(part[: len(predicted)] for part in found))

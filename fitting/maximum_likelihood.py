@@ -11,7 +11,7 @@ only the pixels near an edge are gathered for the last steps.
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -24,23 +24,23 @@ from jaxtyping import Array, Bool, Float, Int
 from fitting.channel_errors import can_be_coupled, coupled, each_alone, improved, precision_of, replaced, residuals
 from fitting.continuation import (
     ENOUGH_KNOWN,
-    LARGEST_SHIFT,
     REACH,
     Estimate,
+    Problem,
+    Said,
     Score,
+    Values,
     maximise,
-    noise_score,
     telling,
-    together,
     where_most_is_told,
 )
 from fitting.continuation import precision as precision_at
-from fitting.likelihood import AnyArray, Bounds, Intervals, LogLikelihood, residual_deviation
+from fitting.likelihood import AnyArray, Bounds, Intervals, residual_deviation
 from fitting.model_fit import Evidence, ModelFit
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum, refit
 from fitting.solver.subsample import stratified
-from fitting.solver.tied import design_of, join_channels
+from fitting.solver.tied import design_of
 
 SUBSAMPLE = 16384
 # The noise of a part of the pixels is known well enough to this factor.
@@ -77,34 +77,16 @@ class Numbers(NamedTuple):
     log_n: float
 
     @classmethod
-    def of(cls, at: Optimum | Estimate) -> "Numbers":
-        """Those of an optimum, or of an estimate: coefficients, channel after channel each, and log n."""
+    def of(cls, at: Optimum | Float[np.ndarray, " U"]) -> "Numbers":
+        """Those of an optimum, or the unknowns: coefficients, channel after channel each, and log n."""
         if isinstance(at, Optimum):
             return cls(at.x, math.log(at.n))
-        return cls(at.unknowns[:-1].reshape(3, -1), float(at.unknowns[-1]))
+        return cls(at[:-1].reshape(3, -1), float(at[-1]))
 
     @property
     def unknowns(self) -> Float[np.ndarray, " U"]:
         """All of them."""
         return np.append(self.x.ravel(), self.log_n)
-
-
-class _Pixels(NamedTuple):
-    """Some pixels of a picture, on the host in double precision.
-
-    Attributes:
-        picture: its weight is how many pixels each stands for; None for one.
-        intervals: between which codes the values lay.
-    """
-
-    picture: Picture
-    intervals: Intervals
-
-    @classmethod
-    def of(cls, picture: Picture) -> "_Pixels":
-        """All of a picture on the host."""
-        bounds = bounds_of(picture)
-        return cls(picture, Intervals(bounds.lower, bounds.upper, bounds.spread))
 
 
 def most_likely(
@@ -190,12 +172,12 @@ def _where_noise_is_even(fit: ModelFit, at: Numbers, noise: float) -> tuple[Mode
 
 def _evener_in_light(problem: "_Separable", at: Estimate) -> Estimate | None:
     """The most likely numbers with noise of one size in light, where they are likelier than any with it in codes."""
-    pictures = [part.picture for part in problem.pixels]
+    pictures = list(map(_picture, problem.pixels))
     if at.noise < FAINT or not _is_curved(pictures):
         return None
-    light = list(map(_Pixels.of, _in_light(pictures)))
+    light = list(map(_values, _in_light(pictures)))
     start = Estimate(at.unknowns, max(at.noise, FIRST_NOISE))
-    even, _ = maximise(_Separable(light, problem.design, problem.bounds, problem.copies), start, ROUGHLY_KNOWN)
+    even, _ = maximise(_Separable(light, problem.design, problem.n_range, problem.copies), start, ROUGHLY_KNOWN)
     return even if even.value > at.value + LIKELIER else None
 
 
@@ -246,47 +228,46 @@ def _kinds(code: Int[np.ndarray, " P"]) -> tuple[Int[np.ndarray, " P"], Int[np.n
 
 def _near_edges(fit: ModelFit, at: Estimate, *, copies: bool) -> Evidence:
     """Where rounding is most of the noise: what pixels near the edge of a code say."""
-    design, bounds = design_of(fit.free, fit.tied), (math.log(fit.n_range[0]), math.log(fit.n_range[1]))
-    pictures = fit.pictures
+    design, pictures = design_of(fit.free, fit.tied), fit.pictures
     large = sum(picture.target.shape[0] for picture in pictures) > 2 * SUBSAMPLE
     some = [_stratum(picture, SUBSAMPLE // len(pictures)) for picture in pictures] if large else _gathered(pictures, at)
-    problem = _Separable(some, design, bounds, copies)
+    problem = _Separable(some, design, fit.n_range, copies)
     at, known = maximise(problem, at, ROUGHLY_KNOWN if large else ENOUGH_KNOWN)
     if (even := _evener_in_light(problem, at)) is not None:
         return _near_edges(fit._replace(pictures=_in_light(pictures)), even, copies=copies)
     if large:
         # The whole picture has the pixels near an edge that a part of it lacks.
         at = at._replace(noise=telling(known).noise)
-        problem = _Separable(_gathered(pictures, at), design, bounds, copies)
+        problem = _Separable(_gathered(pictures, at), design, fit.n_range, copies)
         at, known = maximise(problem, at, first=ROUGHLY_KNOWN)
     said, wider = where_most_is_told(problem, at, known, _of_planes(pictures, at, problem))
-    working = [one.working() for one in said.said]
-    optimum = _optimum(working, said, fit, Numbers.of(at))
-    places = [_place(one.shown.pixels.picture) for one in said.said]
+    working = list(map(_working, said.said))
+    optimum = _optimum(working, said, fit, Numbers.of(at.unknowns))
+    places = [_place(_picture(one.values)) for one in said.said]
     return Evidence(working, optimum, at.noise, at.value, places, wider)
 
 
 def _of_planes(pictures: Sequence[Picture], at: Estimate, problem: "_Separable") -> Float[np.ndarray, " U"] | float:
     """The least variance of each unknown where values on a plane show one code, and share a rounding error."""
-    codes = [_codes(picture, Numbers.of(at)) for picture in pictures]
+    codes = [_codes(picture, Numbers.of(at.unknowns)) for picture in pictures]
     if any(np.unique(np.rint(code[:: 1 + len(code) // MOST_PIXELS] * ALIKE)).size >= MOST_LEVELS for code in codes):
         return 0.0
     weights = [alike(bounds_of(one), code, FIRST_NOISE, level=True) for one, code in zip(pictures, codes, strict=True)]
     weighted = map(_with_weight, pictures, weights)
-    pixels = [_Pixels.of(picture.in_double(np.arange(len(picture.target)))) for picture in weighted]
-    at, alone = at._replace(noise=FIRST_NOISE), _Separable(pixels, problem.design, problem.bounds, problem.copies)
+    pixels = [_values(picture.in_double(np.arange(len(picture.target)))) for picture in weighted]
+    at, alone = at._replace(noise=FIRST_NOISE), _Separable(pixels, problem.design, problem.n_range, problem.copies)
     return precision_at(alone, at, alone.score(at, alone.near(at, REACH))).variance
 
 
 def _optimum(working: Sequence[Picture], said: Score, fit: ModelFit, at: Numbers) -> Optimum:
     """The optimum of the least squares that takes Newton's step, at which it rests."""
-    scale, steps = np.ones(4), np.zeros(at.x.shape[1])
-    # By n, not by its logarithm.
-    scale[3] = math.exp(-at.log_n)
+    steps, scale = np.zeros(at.x.shape[1]), np.ones((at.x.shape[1], 4))
+    # By n, not by its logarithm, and of the lobe, not of the highlight.
+    scale[:, 3] = math.exp(-at.log_n) * np.divide(1.0, at.x[2], out=np.zeros_like(steps), where=at.x[2] > 0)
     if not fit.free[2].any():
-        scale[2:] = 0.0
+        scale[:, 2] = 0.0
     weight, score = (sum(parts) for parts in zip(*(one.sums() for one in said.said), strict=True))
-    gram, score = weight * scale[:, None] * scale, score * scale
+    gram, score = weight * scale[:, :, None] * scale[:, None, :], score * scale
     product = score + np.einsum("cij,jc->ci", gram[..., :3], at.x)
     square, count = np.zeros_like(steps), np.zeros_like(steps)
     for picture in working:
@@ -407,12 +388,11 @@ def _stated(picture: Picture, optimum: Optimum, noise: float, rounding: float) -
     index = np.flatnonzero(half.any(axis=1))
     if index.size:
         s = math.sqrt(max(noise**2 - rounding, LEAST_SHARE * noise**2))
-        pixels = _Pixels.of(picture.in_double(index))
-        shown = _Shown.of(pixels, Numbers.of(optimum))
-        told = pixels.intervals.said(shown.code, s)
-        told, radiance, slope = jax.tree.map(lambda part: part[: index.size], (told, shown.radiance, shown.slope))
+        values = _values(picture.in_double(index))
+        said = values.said(*_shown(_picture(values), Numbers.of(optimum)), s)
+        told, radiance, slope = jax.tree.map(lambda part: part[: index.size], (said.told, said.radiance, said.slope))
         at_end, own = half[index], s * bounds.spread[index if bounds.spread.ndim else ...]
-        weighs = np.broadcast_to(pixels.picture.weights, told.value.shape)[: index.size]
+        weighs = np.broadcast_to(values.weight, said.radiance.shape)[: index.size]
         curvature = told.weight * slope**2
         step = np.divide(told.score * slope, curvature, out=np.zeros_like(curvature), where=curvature > 0)
         target[index] = np.where(at_end, radiance + step, target[index])
@@ -446,182 +426,97 @@ def _place(picture: Picture) -> tuple[np.ndarray, int]:
     return np.asarray(bounds.index), int(bounds.width)
 
 
-class _Some(NamedTuple):
-    """Some pixels, and which of a picture's they are."""
-
-    which: Bool[np.ndarray, " P"]
-    pixels: _Pixels
-
-
-class _Separable:
+class _Separable(Problem):
     """Rounded values, and the model of which they show the coefficients and the exponent."""
 
     def __init__(
-        self, pixels: Sequence[_Pixels], design: Float[np.ndarray, "U V"], bounds: tuple[float, float], copies: bool
+        self, pixels: Sequence[Values], design: Float[np.ndarray, "U V"], n_range: tuple[float, float], copies: bool
     ):
         """State what is fitted.
 
         Args:
             pixels: of each picture.
             design: what each free number moves of x_a, x_d, x_s, channel after channel, and log n.
-            bounds: of log n.
+            n_range: of the exponent.
             copies: the channels are copies of each other, and tell of a number once.
         """
-        self.pixels, self.design, self.bounds, self.copies = pixels, design, bounds, copies
+        self.pixels, self.design, self.copies, self.n_range = pixels, design, copies, n_range
+        self.bounds, size = [part.intervals.bounds for part in pixels], len(design)
+        self.exponents, channels = np.arange(size) == size - 1, size // 3
+        self.lower, self.upper = (
+            np.where(self.exponents, math.log(n), x) for n, x in zip(n_range, (0.0, math.inf), strict=True)
+        )
+        own = np.arange(3 * channels).reshape(3, channels).T
+        self.places = np.column_stack([own, np.full(channels, size - 1)])
         self._last: tuple[Any, list[np.ndarray]] = (None, [])
 
-    def _codes(self, at: Estimate) -> list[Float[np.ndarray, "P C"]]:
+    def codes(self, unknowns: Float[np.ndarray, " U"]) -> list[Float[np.ndarray, "P C"]]:
         """What is predicted, in codes; kept while only the noise changes."""
-        if self._last[0] is not at.unknowns:
-            self._last = at.unknowns, []
-            x, log_n = Numbers.of(at)
-            for part in self.pixels:
-                radiance = np.asarray(part.picture.predicted(np.asarray(math.exp(log_n)), x))
-                self._last[1].append(bounds_of(part.picture).codes(radiance)[0])
+        if self._last[0] is not unknowns:
+            self._last = unknowns, [_codes(_picture(part), Numbers.of(unknowns)) for part in self.pixels]
         return self._last[1]
 
-    @property
-    def signed(self) -> Bool[np.ndarray, " U"]:
-        """Log n may be below 0."""
-        return np.arange(len(self.design)) == len(self.design) - 1
+    def taken(self, picture: int, which: Bool[np.ndarray, " P"]) -> Values:
+        """Some pixels of a picture."""
+        whole = self.pixels[picture]
+        return whole if which.all() else _values(_picture(whole).in_double(np.flatnonzero(which)), which)
 
-    def near(self, at: Estimate, reach: float, beside: list[_Some] | None = None) -> list[_Some]:
-        """The pixels that say something, and those beside."""
-        both = zip(self.pixels, self._codes(at), strict=True)
-        which = [bounds_of(part.picture).near(code, reach * at.noise) for part, code in both]
-        if beside is not None:
-            which = together(which, [one.which for one in beside])
-        if which is None:
-            return beside or []
-        found = []
-        for part, some in zip(self.pixels, which, strict=True):
-            chosen = part if some.all() else _Pixels.of(part.picture.in_double(np.flatnonzero(some)))
-            found.append(_Some(some, chosen))
-        return found
-
-    def active(self, at: Estimate) -> Bool[np.ndarray, " U"]:
-        """Coefficients above 0, and the exponent where there is a highlight."""
-        x = Numbers.of(at).x
-        return np.append(x.ravel() > 0, x[2].any())
-
-    def moved(self, at: Estimate, step: Float[np.ndarray, " U"]) -> Estimate:
-        """Another estimate, within the bounds."""
-        unknowns = np.maximum(at.unknowns + step, 0.0)
-        unknowns[-1] = at.unknowns[-1]
-        if self.design[-1].any():
-            shift = np.clip(step[-1], -LARGEST_SHIFT, LARGEST_SHIFT)
-            unknowns[-1] = np.clip(unknowns[-1] + shift, *self.bounds)
-        return at._replace(unknowns=unknowns)
-
-    def score(self, at: Estimate, values: Sequence[_Some]) -> Score:
-        """What some pixels say."""
-        said = []
+    def shown(self, unknowns: Float[np.ndarray, " U"], values: Sequence[Values]) -> Iterator[tuple[Any, Any]]:
+        """What is predicted, and its derivatives by the coefficients and log n."""
         for some in values:
-            shown = _Shown.of(some.pixels, Numbers.of(at))
-            said.append(_Said(shown, some.pixels.intervals.said(shown.code, at.noise)))
-        sums = [one.sums() for one in said]
-        weight, score = np.sum([one[0] for one in sums], axis=0), np.sum([one[1] for one in sums], axis=0)
-        normal = join_channels(weight, score, np.zeros(len(score)), Numbers.of(at).x[2])
-        by_noise = [
-            noise_score(
-                one.told, at.noise * bounds_of(one.shown.pixels.picture).spread, one.shown.pixels.picture.weights
-            )
-            for one in said
-        ]
-        value, by_log_noise, information = np.array(by_noise).sum(axis=0).tolist()
-        return Score(value, by_log_noise, information, normal.product, normal.gram, said)
-
-    def squared_shares(self, at: Estimate, said: Score, influence: Float[np.ndarray, "U U"]) -> Float[np.ndarray, " U"]:
-        """Sums of squares of each value's share."""
-        squares, x_s = np.zeros(len(influence)), Numbers.of(at).x[2]
-        for one in said.said:
-            weight, together = one.told.weight * one.shown.slope**2, np.zeros(1)
-            for channel, factor in enumerate(x_s):
-                rows = influence[:, [channel, x_s.size + channel, 2 * x_s.size + channel, -1]]
-                share = (rows * np.array([1.0, 1.0, 1.0, factor])) @ one.shown.columns[..., channel]  # (U, P)
-                share *= share
-                share *= weight[:, channel]
-                together = share + together if self.copies else share
-                if not self.copies or channel == x_s.size - 1:
-                    squares += np.einsum("up,up->u", together, together)
-        return squares
+            yield _shown(_picture(some), Numbers.of(unknowns))
 
 
-class _Shown(NamedTuple):
-    """What an estimate shows at some pixels.
-
-    Attributes:
-        pixels: which.
-        code: that is predicted, (P, C).
-        radiance: likewise.
-        slope: of the code by it, (P, C).
-        columns: ambient, diffuse, lobe and derivative of the lobe by log n, (4, P, C).
-    """
-
-    pixels: _Pixels
-    code: Float[np.ndarray, "P C"]
-    radiance: Float[np.ndarray, "P C"]
-    slope: Float[np.ndarray, "P C"]
-    columns: Float[np.ndarray, "4 P C"]
-
-    @classmethod
-    def of(cls, pixels: _Pixels, at: Numbers) -> "_Shown":
-        """By coefficients and an exponent."""
-        x, n = at.x, math.exp(at.log_n)
-        columns = pixels.picture.columns(n)
-        columns[3] *= n
-        radiance = columns[0] * x[0] + columns[1] * x[1] + columns[2] * x[2]
-        code, slope = bounds_of(pixels.picture).codes(radiance)
-        return cls(pixels, code, radiance, slope, columns)
+def _shown(picture: Picture, at: Numbers) -> tuple[Float[np.ndarray, "P C"], Float[np.ndarray, "4 P C"]]:
+    """Radiance, and its derivatives by x_a, x_d, x_s and log n."""
+    n = math.exp(at.log_n)
+    columns = picture.columns(n)
+    columns[3] *= n * at.x[2]
+    return columns[0] * at.x[0] + columns[1] * at.x[1] + columns[2] * at.x[2], columns
 
 
-class _Said(NamedTuple):
-    """What each value of some pixels says of what is shown there: log-likelihood, score and weight by the code."""
-
-    shown: _Shown
-    told: LogLikelihood
-
-    def sums(self) -> tuple[Float[np.ndarray, "C 4 4"], Float[np.ndarray, "C 4"]]:
-        """Products of the columns weighted by the values' weights, and with their scores."""
-        weight, told = self.shown.pixels.picture.weights, self.told
-        score, curvature = weight * told.score * self.shown.slope, weight * told.weight * self.shown.slope**2
-        columns = np.moveaxis(self.shown.columns, -1, 0)  # (C, 4, P)
-        products = (columns * curvature.T[:, None]) @ np.swapaxes(columns, 1, 2)
-        return products, (columns @ score.T[..., None])[..., 0]
-
-    def working(self) -> Picture:
-        """Targets and weights with which least squares takes Newton's step."""
-        weight = self.told.weight * self.shown.slope**2
-        step = np.divide(self.told.score * self.shown.slope, weight, out=np.zeros_like(weight), where=weight > 0)
-        return dataclasses.replace(
-            self.shown.pixels.picture, target=self.shown.radiance + step, weight=weight, bounds=None
-        )
+def _values(picture: Picture, which: Bool[np.ndarray, " P"] | None = None) -> Values:
+    """All of a picture on the host in double precision, which is some pixels of another one."""
+    which = np.ones(len(picture.target), bool) if which is None else which
+    return Values(which, np.asarray(picture.weights), Intervals(bounds_of(picture)), picture)
 
 
-def _near(picture: Picture, at: Estimate, reach: float) -> Bool[np.ndarray, " P"]:
-    """Which pixels say something: those with a value not surely inside its bounds, by so many s."""
-    return bounds_of(picture).near(_codes(picture, Numbers.of(at)), reach * at.noise)
+def _picture(values: Values) -> Picture:
+    assert values.picture is not None
+    return values.picture
 
 
-def _gathered(pictures: Sequence[Picture], at: Estimate) -> list[_Pixels]:
+def _working(said: Said) -> Picture:
+    """Targets and weights with which least squares takes Newton's step."""
+    step = np.divide(said.score, said.weight, out=np.zeros_like(said.radiance), where=said.weight > 0)
+    return dataclasses.replace(_picture(said.values), target=said.radiance + step, weight=said.weight, bounds=None)
+
+
+def _near(picture: Picture, at: Numbers, distance: float) -> Bool[np.ndarray, " P"]:
+    """Which pixels say something: those with a value not surely inside its bounds."""
+    return bounds_of(picture).near(_codes(picture, at), distance)
+
+
+def _gathered(pictures: Sequence[Picture], at: Estimate) -> list[Values]:
     """Those of whole pictures."""
     found = []
     for picture in pictures:
-        found.append(_Pixels.of(picture.in_double(np.flatnonzero(_near(picture, at, REACH)))))
+        some = np.flatnonzero(_near(picture, Numbers.of(at.unknowns), REACH * at.noise))
+        found.append(_values(picture.in_double(some)))
     return found
 
 
-def _stratum(picture: Picture, size: int) -> _Pixels:
+def _stratum(picture: Picture, size: int) -> Values:
     """Some of the pixels, weighted by how many each stands for."""
     count = picture.target.shape[0]
     if count <= size:
-        return _Pixels.of(picture.in_double(np.arange(count)))
+        return _values(picture.in_double(np.arange(count)))
     nearness = np.zeros(count) if picture.lobe is None else -np.asarray(picture.lobe.peak)
     index, factor = stratified(nearness, np.ones(count, bool), size)
-    some = _Pixels.of(picture.in_double(index))
-    weight = np.zeros(some.picture.target.shape[0])
+    some = picture.in_double(index)
+    weight = np.zeros(len(some.target))
     weight[: index.size] = factor
-    return some._replace(picture=dataclasses.replace(some.picture, weight=weight))
+    return _values(dataclasses.replace(some, weight=weight))
 
 
 def bounds_of(picture: Picture) -> Bounds:
@@ -649,7 +544,7 @@ def _widest(picture: Picture) -> float:
 def _open_ends_tell(picture: Picture, at: Numbers, noise: float) -> bool:
     """Whether some value is known by one end only and is predicted near it."""
     half = np.any(np.isfinite(bounds_of(picture).lower) ^ np.isfinite(bounds_of(picture).upper), axis=1)
-    return bool(half.any()) and bool(np.any(_near(picture, Estimate(at.unknowns, noise), END_REACH)[half]))
+    return bool(half.any()) and bool(np.any(_near(picture, at, END_REACH * noise)[half]))
 
 
 def highlight_in_codes(picture: Picture, x: np.ndarray, n: float) -> float:
