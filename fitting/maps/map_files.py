@@ -1,6 +1,5 @@
 """Maps as files for this program and for others, and as a figure."""
 
-import base64
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +10,7 @@ import brdf
 from brdf.files import atomic_folder, write_text
 from brdf.images.writing import write_layers
 from fitting.maps.texels import OCTAVES
+from fitting.report.page import asset
 
 if TYPE_CHECKING:
     from fitting.maps.map_result import Maps
@@ -66,50 +66,8 @@ def write_maps(maps: "Maps", folder: str | Path, *, plot: bool = False) -> None:
         if plot:
             draw_maps(maps).savefig(stage / "maps.png", dpi=110)
         write_text(stage / "maps.json", json.dumps(told, indent=2) + "\n")
-        write_text(stage / "material.gltf", json.dumps(_gltf(width / height), indent=2) + "\n")
+        write_text(stage / "material.gltf", asset("maps.gltf").replace("ASPECT", str(width / height)))
         write_text(stage / "info.json", json.dumps(_openlime(width, height, scale), indent=2) + "\n")
-
-
-def _gltf(aspect: float) -> dict[str, Any]:
-    """A glTF 2.0 material with textures, on a rectangle of the picture's shape."""
-    names = ("base_color", "metallic_roughness", "normals")
-    corners = np.array([[-aspect, -1, 0], [aspect, -1, 0], [aspect, 1, 0], [-aspect, 1, 0]], "<f4")
-    texture = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], "<f4")
-    faces = np.array([0, 1, 2, 0, 2, 3], "<u2")
-    parts = [array.tobytes() for array in (corners, texture, faces)]
-    views, offset = [], 0
-    for part in parts:
-        views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(part)})
-        offset += len(part)
-    data = base64.b64encode(b"".join(parts)).decode()
-    ends = {"min": corners.min(axis=0).tolist(), "max": corners.max(axis=0).tolist()}
-    return {
-        "asset": {"version": "2.0", "generator": "brdf-fitting"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0}]}],
-        "materials": [
-            {
-                "name": "maps",
-                "pbrMetallicRoughness": {
-                    "baseColorTexture": {"index": 0},
-                    "metallicRoughnessTexture": {"index": 1},
-                    "metallicFactor": 0.0,
-                },
-                "normalTexture": {"index": 2},
-            }
-        ],
-        "textures": [{"source": i} for i in range(3)],
-        "images": [{"uri": f"{name}.png"} for name in names],
-        "accessors": [
-            {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3", **ends},
-            {"bufferView": 1, "componentType": 5126, "count": 4, "type": "VEC2"},
-            {"bufferView": 2, "componentType": 5123, "count": 6, "type": "SCALAR"},
-        ],
-        "bufferViews": views,
-        "buffers": [{"byteLength": offset, "uri": f"data:application/octet-stream;base64,{data}"}],
-    }
 
 
 def _openlime(width: int, height: int, scale: dict[str, float]) -> dict[str, Any]:
