@@ -56,7 +56,7 @@ def fit_maps(
             scenes'.
         to_view: towards the camera, which is far away; scenes tell it themselves.
         model: "lambert", "phong", "blinn-phong" or a normalised form; "auto" for the simplest of Lambert, Phong and
-            Blinn-Phong that serves each texel, by the Bayesian information criterion.
+            Blinn-Phong that serves each texel, by the Bayesian information criterion for few values.
         specular: "coloured", or "grey": the channels share k_s.
         mask: (H, W), or a file: texels to look at. None for the folder's ``mask.*``, else all.
         encoding: of files and arrays: "linear", "srgb" or a gamma; None for what files say, and linear arrays. Where

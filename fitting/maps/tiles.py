@@ -21,6 +21,7 @@ from fitting.maps.map_inputs import Photographs
 from fitting.maps.map_light_choice import MOST_ERROR
 from fitting.maps.map_result import REASONS, Maps
 from fitting.maps.texels import (
+    OUTLIER,
     Columns,
     Distant,
     Target,
@@ -158,8 +159,9 @@ def _program(
     ) -> dict[str, Array]:
         tied = grey and issubclass(model, SpecularMaterial)
         if normal is None:
-            fit, normal, normal_error, seen = fit_with_normals(model, target, seen, distant, tied, finer)
-            return _layers(model, fit, Target.of(target.shown * seen[:, None]), seen, mask, tied, normal, normal_error)
+            fit, normal, tilt, inliers = fit_with_normals(model, target, seen, distant, tied, finer)
+            target, outliers = Target.of(target.shown * inliers[:, None]), jnp.sum(seen - inliers, axis=0)
+            return _layers(model, fit, target, inliers, mask, tied, normal, tilt, outliers=outliers)
         if points is None:
             columns = distant.columns(model, normal, seen)
         else:
@@ -227,8 +229,14 @@ def _layers(
     normal: Array,
     tilt: Array | None,
     shared: Array | None = None,
+    outliers: Any = 0,
 ) -> dict[str, Array]:
-    """The layers of a model's maps, texels last."""
+    """The layers of a model's maps, texels last.
+
+    Models are compared by the information criterion of Schwarz as McQuarrie corrects it for few values ("A small-sample
+    correction for the Schwarz SIC model selection criterion", Statistics & Probability Letters 44, 1999). What a model
+    left out as outliers, each its own, counts with the least residual of such.
+    """
     channels, lanes = target.shown.shape[1:]
     glossy = issubclass(model, SpecularMaterial)
     k_s, k_s_error = (fit.k[-1], fit.k_error[-1]) if glossy else (jnp.zeros((channels, lanes)),) * 2
@@ -236,7 +244,7 @@ def _layers(
     unknowns = len(linear) * channels + glossy * (2 if grey else channels + 1) + 2 * (tilt is not None)
     values = channels * jnp.sum(seen, axis=0)
     freedom = values - unknowns
-    noise = jnp.sqrt(fit.cost / jnp.maximum(freedom, 1))
+    noise = jnp.where(freedom < 1, jnp.nan, jnp.sqrt(fit.cost / jnp.maximum(freedom, 1)))
     n = jnp.exp(fit.log_n)
     error = noise * fit.log_n_error if shared is None else shared
     shows = jnp.any(k_s > LEAST_HIGHLIGHT * noise * k_s_error, axis=0)
@@ -251,6 +259,9 @@ def _layers(
     layers = {name: jnp.where(inside, k, jnp.nan) for name, k in zip(names, linear, strict=True)}
     layers |= {f"{name}_error": noise * e for name, e in zip(names, fit.k_error, strict=False)}
     square = over_channels(jnp.sum(target.shown * target.shown, axis=0))[0]
+    spare, every = freedom - 2, values + channels * outliers
+    whole = jnp.maximum(fit.cost + outliers * (OUTLIER * noise) ** 2, jnp.finfo(n.dtype).tiny)
+    price = unknowns * jnp.log(jnp.maximum(values, 1)) * values / jnp.maximum(spare, 1)
     return layers | {
         "n": jnp.where(known, n, jnp.nan),
         "k_s": jnp.where(known, k_s, jnp.nan),
@@ -264,7 +275,7 @@ def _layers(
         "determined": known,
         "reason": reason,
         "residual": jnp.where(inside, jnp.sqrt(fit.cost / jnp.where(square > 0, square, 1)), jnp.nan),
-        "criterion": values * jnp.log(jnp.maximum(fit.cost, jnp.finfo(n.dtype).tiny)) + unknowns * jnp.log(values + 1),
+        "criterion": jnp.where(spare < 1, jnp.inf, every * jnp.log(whole) + price),
     }
 
 

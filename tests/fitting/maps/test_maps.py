@@ -19,6 +19,7 @@ from brdf.images.writing import write_image
 from fitting.maps import map_bands
 from fitting.maps.kept_bands import KeptBands
 from fitting.maps.map_inputs import read_lights
+from fitting.maps.map_result import REASONS
 from fitting.maps.texels import nonnegative
 from fitting.solver.nnls import nonnegative_minimum
 
@@ -276,6 +277,30 @@ def test_arrays_hold_values_as_is_told(kind):
     picture = brdf.Picture(given[0].astype(np.float32), None, "linear", "given", 32, None)
     with pytest.raises(brdf.InputError, match=r"encoding: is that of files and arrays, pictures\[0\] is decoded"):
         fitting.fit_maps([picture] * 16, lights, encoding="srgb")
+
+
+def test_of_few_photographs_auto_invents_no_highlight():
+    lights, random = dome(6), np.random.default_rng(2)
+    pictures = 0.5 * lights[:, 2][:, None, None, None] + 0.01 * random.normal(size=(6, 1, 200, 1))
+    for count in (3, 6):
+        maps = fitting.fit_maps(pictures[:count], lights[:count], np.broadcast_to(VIEW, (1, 200, 3)), model="auto")
+        assert np.mean(maps.chosen) < 0.05
+
+
+def test_auto_does_not_ask_for_the_unit():
+    pictures, _ = texels(40, 0.01, dome(24), seed=8, n=(80, 120))
+    chosen = [fitting.fit_maps(unit * pictures, dome(24), "fit", model="auto").chosen for unit in (1.0, 1e4)]
+    assert np.mean(chosen[0] != 0) > 0.8
+    assert np.mean(chosen[0] == chosen[1]) > 0.95
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_too_few_photographs_tell_no_error(count):
+    pictures, truth = texels(8, 0.01, dome(24))
+    maps = fitting.fit_maps(pictures[:count], dome(24)[:count], truth["normal"][None])
+    assert np.all(maps.reason == REASONS.index("too few photographs"))
+    assert np.all(np.isnan(maps.k_d_error))
+    assert np.all(np.isnan(maps.noise))
 
 
 # -- folders and files -------------------------------------------------------------------------------------------------
