@@ -5,10 +5,12 @@ BIN := $(VENV)/bin
 EXAMPLE := data/gold-ball
 # The compiler is most of the tests' time, and takes a third of its own with these. What they leave out the documentation
 # and these tests run through: fits of what other programs and closed forms draw, sums, searches, the bundled example.
-LIGHTLY_COMPILED := --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true
-COMPILED_AS_FOR_USERS := tests/interop tests/brdf/plausibility tests/fitting/solver tests/fitting/test_fit.py \
-	tests/fitting/test_jpeg_errors.py tests/fitting/test_maximum_likelihood.py tests/brdf/rendering/test_lights.py \
-	tests/project/test_bundled_examples.py tests/project/test_sound_jax.py
+LIGHTLY_COMPILED := --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 \
+	--xla_llvm_disable_expensive_passes=true --xla_cpu_parallel_codegen_split_count=1
+# The longest test stands first, or one core would wait for it.
+COMPILED_AS_FOR_USERS := tests/project/test_bundled_examples.py tests/project/test_sound_jax.py tests/interop \
+	tests/brdf/plausibility tests/fitting/solver tests/fitting/test_fit.py tests/fitting/test_jpeg_errors.py \
+	tests/fitting/test_maximum_likelihood.py tests/brdf/rendering/test_lights.py
 
 .PHONY: fit test check docs lab wheel clean
 
