@@ -105,6 +105,7 @@ def fit_pictures(problem: FitProblem) -> FitResult:
         targets=seen.shown,
         scenes=problem.shown or seen.scenes,
         counted=seen.counted,
+        weights=seen.weights,
         files=[target.file for target in problem.targets],
     )
 

@@ -60,7 +60,8 @@ def sensitivity(result: FitResult, by: Callable[[list[brdf.Scene]], Sequence[Any
     """The derivative of a fitted material by what the fit took as known about the scenes.
 
     Args:
-        result: of `fitting.fit` with the squared loss and without weights; masks and clipped pixels are respected.
+        result: of `fitting.fit` with the squared loss, whose sum of squares is differentiated; masks, weights and
+            clipped pixels are respected.
         by: from the list of scenes to their leaves, for example ``lambda scenes: (scenes[0].lights[0].direction,)``.
             A direction's own length changes nothing: the derivative along it is 0.
 
@@ -89,7 +90,7 @@ def sensitivity(result: FitResult, by: Callable[[list[brdf.Scene]], Sequence[Any
     with working_precision("float64"), waiting("differentiating the fit"):
         start = brdf.cast((result.material, list(result.scenes)), "float64")
         targets = [jnp.asarray(target, jnp.float64).reshape(-1, target.shape[-1]) for target in result.targets]
-        weights: list[Array | None] = [jnp.asarray(counted, jnp.float64).ravel() for counted in result.counted]
+        weights: list[Array | None] = [jnp.asarray(weight, jnp.float64).ravel() for weight in result.weighed]
 
         def freed(material: brdf.Material, scenes: list[brdf.Scene]) -> tuple[Any, ...]:
             return (*(getattr(material, name) for name in names), *by(scenes))

@@ -145,9 +145,9 @@ def next_light(result: Any, candidates: Sequence[Any] | None = None, count: int 
         material = brdf.cast(result.material, "float64")
         variance = np.asarray(result.noise, np.float64) ** 2
 
-        def told(scene: brdf.Scene, share: float) -> np.ndarray:
+        def told(scene: brdf.Scene, weight: np.ndarray) -> np.ndarray:
             """Fisher's information by k_a, k_d, k_s, channel after channel each, and n."""
-            gram = np.asarray(_gram(material, brdf.cast(scene, "float64"))) / share
+            gram = np.asarray(_gram(material, brdf.cast(scene, "float64"), weight))
             none, k_s = np.zeros(gram.shape[:2]), np.asarray(getattr(material, "k_s", np.zeros(len(gram))))
             return join_channels(gram, none, none[:, 0], k_s, variance).gram
 
@@ -157,9 +157,9 @@ def next_light(result: Any, candidates: Sequence[Any] | None = None, count: int 
             return float(np.sqrt(np.mean(variance[wanted[active]])))
 
         def told_by(light: Light) -> np.ndarray:
-            return told(dataclasses.replace(first, lights=(light,), visibility=()), share)
+            return told(dataclasses.replace(first, lights=(light,), visibility=()), weight)
 
-        first, share = scenes[0]
+        first, weight = scenes[0]
         to_view = np.asarray(first.surface_points().to_view, np.float64).reshape(-1, 3).mean(axis=0)
         information = np.sum([told(*scene) for scene in scenes], axis=0)
         return choose_lights(candidates, count, of, known, to_view, information, told_by, error)
@@ -243,9 +243,12 @@ def _numbers(result: FitResult, of: str) -> tuple[np.ndarray, np.ndarray]:
 def _light(given: Any, shining: np.ndarray) -> Light:
     if isinstance(given, Light):
         return given
-    direction = np.asarray(given, np.float64)
+    try:
+        direction = np.asarray(given, np.float64)
+    except (TypeError, ValueError):
+        direction = np.zeros(())
     if direction.shape != (3,):
-        came = f"must hold lights or directions of 3 numbers, got shape {direction.shape}"
+        came = f"must hold lights or directions of 3 numbers, got {given!r:.60}"
         raise InputError("candidates", came, "Give brdf lights, or (K, 3) directions towards the light")
     return _towards(direction, shining)
 
@@ -266,11 +269,12 @@ def direction_of(light: Light) -> np.ndarray:
     return direction / np.linalg.norm(direction)
 
 
-def _scene(result: FitResult, index: int) -> tuple[brdf.Scene, float]:
-    """The pixels of a picture that counted, or some of them, and which share these are."""
+def _scene(result: FitResult, index: int) -> tuple[brdf.Scene, np.ndarray]:
+    """The pixels of a picture that counted, or some of them, and the weights of these, which stand for all."""
     pixel = np.flatnonzero(result.counted[index])
     some = pixel[:: -(-pixel.size // MOST_PIXELS)]
-    return brdf.some_pixels(result.scenes[index], some, precision="float64"), some.size / pixel.size
+    weight = result.weighed[index].ravel()[some] * (pixel.size / some.size)
+    return brdf.some_pixels(result.scenes[index], some, precision="float64"), weight
 
 
 def _cap(middle: np.ndarray, size: float, count: int) -> list[np.ndarray]:
@@ -284,12 +288,12 @@ def _cap(middle: np.ndarray, size: float, count: int) -> list[np.ndarray]:
 
 
 @eqx.filter_jit
-def _gram(material: brdf.Material, scene: brdf.Scene) -> Float[Array, "C 4 4"]:
-    """Products of the columns of a picture: ambient, diffuse, lobe, and the lobe's derivative by n."""
+def _gram(material: brdf.Material, scene: brdf.Scene, weight: Float[Any, " W"]) -> Float[Array, "C 4 4"]:
+    """Weighted products of the columns of a picture: ambient, diffuse, lobe, and the lobe's derivative by n."""
     n = material.n if isinstance(material, SpecularMaterial) else jnp.ones(())
     images, slopes = jax.jvp(partial(brdf.basis_images, type(material), scene), (n,), (jnp.ones_like(n),))
     width, height = scene.resolution
     nothing = jnp.zeros((height, width, material.k_d.shape[0]))
     shown = (images.ambient, images.diffuse, images.specular, slopes.specular)
     columns = jnp.stack([nothing if image is None else nothing + image for image in shown])
-    return jnp.einsum("ihwc,jhwc->cij", columns, columns)
+    return jnp.einsum("ihwc,w,jhwc->cij", columns, weight, columns)

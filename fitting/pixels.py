@@ -77,6 +77,7 @@ class Observed(NamedTuple):
         shown: the pictures for people, (H, W, C) each: of a large file every so many pixels.
         scenes: what these show.
         counted: which of their pixels counted, (H, W) each.
+        weights: how much they did, (H, W) each; None where all alike.
     """
 
     problem: FitProblem
@@ -89,6 +90,7 @@ class Observed(NamedTuple):
     shown: list[np.ndarray]
     scenes: list[brdf.Scene]
     counted: list[np.ndarray]
+    weights: list[np.ndarray | None]
 
     @property
     def copies(self) -> bool:
@@ -150,7 +152,7 @@ def observe(problem: FitProblem, *, at_once: bool = False) -> Observed:
     light = take_colour_out(problem.scenes, problem.targets[0].pixels.shape[-1])
     given = zip(problem.targets, problem.scenes, light.scenes, problem.masks, problem.weights, strict=True)
     parts = itertools.starmap(functools.partial(_observe, problem, at_once), given)
-    tiles, rounding, brightest, counts, shown, scenes, counted = (list(part) for part in zip(*parts, strict=True))
+    tiles, rounding, brightest, counts, shown, scenes, counted, weights = map(list, zip(*parts, strict=True))
     left_out: Counter[str] = Counter()
     for some in counts:
         left_out.update(some)
@@ -165,6 +167,7 @@ def observe(problem: FitProblem, *, at_once: bool = False) -> Observed:
         shown,
         scenes,
         counted,
+        weights,
     )
 
 
@@ -235,14 +238,18 @@ def _observe(
     tiles = each(tile, bands, found)
     brightest = total.scale.astype(np.float64)
     resolution = max(float(np.finfo(dtype).eps), CONVERGED)
+    weights = None
     if target.streamed:
-        shown = _shown(bands, found, scene, problem.precision)
+        *shown, stride = _shown(bands, found, scene, problem.precision)
+        weights = None if given is None else given[::stride, ::stride] * shown[-1]
     else:
         resolution = max(resolution, float(np.finfo(target.pixels.dtype).eps))
         counted = np.concatenate([good for good, _ in found]).reshape(height, width)
         shown = target.pixels.astype(dtype, copy=False), scene, counted
+        if given is not None or noise is not None:
+            weights = np.concatenate([np.asarray(one.weight) for one in tiles]).reshape(height, width)
     rounding = np.maximum(brightest * resolution, target.step / np.sqrt(12.0))
-    return tiles, rounding, brightest, left_out, *shown
+    return tiles, rounding, brightest, left_out, *shown, weights
 
 
 def _bands(
@@ -358,8 +365,8 @@ def _left_out(
 
 def _shown(
     bands: Sequence[_Band], found: Sequence[tuple[np.ndarray, Statistics]], scene: brdf.Scene, precision: Precision
-) -> tuple[np.ndarray, brdf.Scene, np.ndarray]:
-    """Every so many pixels of a picture that is not in memory, what they show, and which of them counted."""
+) -> tuple[np.ndarray, brdf.Scene, np.ndarray, int]:
+    """Every so many pixels of a picture that is not in memory, what they show, which of them counted, how many."""
     width, height = scene.resolution
     stride = -(-max(width, height) // SHOWN_PIXELS)
 
@@ -374,7 +381,7 @@ def _shown(
     ]
     shown, counted = (np.concatenate(part) for part in zip(*parts, strict=True))
     pixel = np.arange(0, height, stride)[:, None] * width + np.arange(0, width, stride)
-    return shown, brdf.some_pixels(scene, pixel, precision=precision), counted
+    return shown, brdf.some_pixels(scene, pixel, precision=precision), counted, stride
 
 
 @functools.partial(jax.jit, static_argnums=2)

@@ -207,6 +207,7 @@ class FitResult(Parameters):
         targets: the pictures, (H, W, C) each.
         scenes: their scenes.
         counted: which pixels counted, (H, W) each.
+        weights: how much they did, (H, W) each, None where all alike; () where no picture says.
         files: path, encoding and factor of each picture; None where it came without a file.
         choice: what an accuracy or a time to spend made of the fit; None without one.
 
@@ -237,6 +238,7 @@ class FitResult(Parameters):
     targets: Sequence[np.ndarray] = field(repr=False)
     scenes: Sequence[brdf.Scene] = field(repr=False)
     counted: Sequence[np.ndarray] = field(repr=False)
+    weights: Sequence[np.ndarray | None] = field(default=(), repr=False)
     files: Sequence[dict[str, Any] | None] = ()
     choice: BudgetChoice | None = None
 
@@ -247,6 +249,12 @@ class FitResult(Parameters):
         # Where no more than a sum is determined, ambient light alone shows as well what the material shows with k_d.
         words = {"none": "none (black)", "ambient": "ambient (no shading)"}
         return self.material.name if np.any(self.material.k_d) else words.get(chosen, chosen)
+
+    @property
+    def weighed(self) -> list[np.ndarray]:
+        """How much each pixel counted, (H, W) each: 0 or 1, or its weight."""
+        weights = self.weights or [None] * len(self.counted)
+        return [np.asarray(a if w is None else w) for a, w in zip(self.counted, weights, strict=True)]
 
     @cached_property
     def diagnosis(self) -> tuple[Cause, ...]:

@@ -102,13 +102,21 @@ def run(problem: FitProblem, configuration: Configuration) -> Run:
             raise
         # Nothing to fit among so few pixels: all of them tell, or tell what is wrong.
         return run(problem, dataclasses.replace(how, pixels=None))
-    counted = list(result.counted)
+    counted, weights = list(result.counted), list(result.weights)
     for index, sample in enumerate(samples):
         if sample is not None:
-            counted[index] = np.zeros(shown[index].resolution[::-1], bool)
-            counted[index].ravel()[sample.pixel] = result.counted[index].ravel()
-    targets = [target.pixels for target in problem.targets]
-    return Run(problem, samples, dataclasses.replace(result, targets=targets, scenes=shown, counted=counted))
+            counted[index] = _scattered(counted[index], sample, shown[index])
+            weight = weights[index]
+            weights[index] = None if weight is None else _scattered(weight, sample, shown[index])
+    whole = {"targets": [target.pixels for target in problem.targets], "scenes": shown}
+    return Run(problem, samples, dataclasses.replace(result, **whole, counted=counted, weights=weights))
+
+
+def _scattered(values: np.ndarray, sample: PixelSample, scene: brdf.Scene) -> np.ndarray:
+    """Of some pixels, in the whole picture."""
+    found = np.zeros(scene.resolution[::-1], values.dtype)
+    found.ravel()[sample.pixel] = values.ravel()
+    return found
 
 
 def _subsampled(problem, samples):

@@ -48,6 +48,7 @@ def save(result: FitResult, folder: str | Path, plot: bool) -> None:
         pictures = [_write_picture(stage, result, index) for index in range(len(result.scenes))]
         write_report(stage, result, pictures=pictures)
         counted = {f"counted{index}": counted for index, counted in enumerate(result.counted)}
+        counted |= {f"weights{index}": one for index, one in enumerate(result.weights) if one is not None}
         np.savez_compressed(stage / "fit.npz", **counted, **({} if result.optimum is None else vars(result.optimum)))
         brdf.write_image(stage / "fitted.exr", result.fitted())
         if plot:
@@ -128,6 +129,7 @@ def load_result(folder: str | Path) -> FitResult:
         pictures, choice = values.pop("pictures"), values["choice"]
         with np.load(folder / "fit.npz") as arrays:
             counted = [arrays[f"counted{index}"] for index in range(len(pictures))]
+            weights = [arrays.get(f"weights{index}") for index in range(len(pictures))]
             optimum = {name: arrays[name] for name in Optimum.__dataclass_fields__ if name in arrays}
         if choice is not None:
             del choice["basis"]
@@ -147,6 +149,7 @@ def load_result(folder: str | Path) -> FitResult:
                 "targets": _Pictures(folder, pictures, values["precision"]),
                 "scenes": [brdf.Scene.load(folder / picture["scene"]) for picture in pictures],
                 "counted": counted,
+                "weights": weights,
                 "files": pictures,
             }
         )

@@ -1,5 +1,7 @@
 """The derivative of a fit by what it took as known, against fits at shifted lights."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -34,25 +36,28 @@ def numbers(material: brdf.Material) -> np.ndarray:
     return np.concatenate([np.ravel(getattr(material, key)) for key in ("k_a", "k_d", "k_s", "n")])
 
 
-def fitted(target: np.ndarray, **lamp: object) -> np.ndarray:
-    return numbers(fitting.fit(target, scene(**lamp), model="blinn-phong", precision="float64").material)
+def fitted(target: np.ndarray, how: dict[str, Any], **lamp: Any) -> np.ndarray:
+    return numbers(fitting.fit(target, scene(**lamp), model="blinn-phong", precision="float64", **how).material)
 
 
 def row(found: fitting.Sensitivity, *place: int) -> np.ndarray:
     return np.array([*found.k_a[:, *place], *found.k_d[:, *place], *found.k_s[:, *place], found.n[place]])
 
 
-@pytest.mark.parametrize("case", ["noise", "another model"])
+@pytest.mark.parametrize("case", ["noise", "another model", "weights", "noise of a camera"])
 def test_light_direction_moves_the_fit_as_fits_at_shifted_lights_say(case: str):
-    target = picture(case)
-    result = fitting.fit(target, scene(), model="blinn-phong", precision="float64")
+    target, how = picture(case), {}
+    if case == "weights":
+        how = {"weight": np.linspace(0.1, 1, SIZE * SIZE).reshape(SIZE, SIZE)}
+    elif case == "noise of a camera":
+        how = {"noise": (0.005, 0.01)}
+    result = fitting.fit(target, scene(), model="blinn-phong", precision="float64", **how)
     found = fitting.sensitivity(result, lambda scenes: (scenes[0].lights[0].direction,))[0]
     step = 1e-4
     for axis in range(3):
         shift = step * np.eye(3)[axis]
-        expected = (fitted(target, direction=DIRECTION + shift) - fitted(target, direction=DIRECTION - shift)) / (
-            2 * step
-        )
+        ends = [fitted(target, how, direction=DIRECTION + sign * shift) for sign in (1, -1)]
+        expected = (ends[0] - ends[1]) / (2 * step)
         # The central difference is off by step², the fits by 1e-10 / step.
         np.testing.assert_allclose(row(found, axis), expected, rtol=1e-3, atol=1e-3 * np.abs(expected).max() * 1e-2)
     np.testing.assert_allclose(found.n @ DIRECTION, 0, atol=1e-8 * np.abs(found.n).max())

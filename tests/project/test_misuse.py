@@ -106,6 +106,7 @@ MISUSES = {
     "fitting.sensitivity(fitted(), lambda s: (2 * s[0].lights[0].direction,))": r"by: gives what is no number of",
     "fitting.sensitivity(material, lambda s: (s[0].ambient,))": r"result: must be a FitResult, got BlinnPhong\.",
     "fitting.next_light(material)": r"result: must be of fitting\.fit or fit_maps, got BlinnPhong\.",
+    "fitting.next_light(fitted(), 'up', of='k_d')": r"candidates: must hold lights or directions .* got 'u'\.",
     "fitting.fit_lights(target, material, scene)": r"scene: must be a brdf\.Scene, got BlinnPhong\.",
     "fitting.fit_lights(target, scene, brdf.Phong)": r"material: must be a Material, got the class Phong\.",
     "fitting.fit_lights('target.exr', scene, material)": r"target\.exr: there is no such file or folder\.",
