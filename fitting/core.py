@@ -110,7 +110,14 @@ def fit_pictures(problem: FitProblem) -> FitResult:
     )
 
 
-def _picture(model: type[brdf.Material], tile: Tile, near: Near | None = None) -> Picture:
+def picture_of(model: type[brdf.Material], tile: Tile, near: Near | None = None) -> Picture:
+    """A tile as the solver takes it.
+
+    Args:
+        model: whose basis images it has.
+        tile: of a picture.
+        near: see `brdf.rendering.basis`.
+    """
     ambient = np.zeros(1) if tile.scene.ambient is None else np.asarray(tile.scene.ambient, np.float64)
     # What a file's largest code stands for has no weight, but a say.
     counts = None if tile.weight is None or tile.bounds is not None else np.asarray(tile.weight) > 0
@@ -144,7 +151,7 @@ def _fit_model(
     near, trial = None if error is None else error.near, -1
     while True:
         trial += 1
-        pictures = each(partial(_picture, model, near=near), seen.tiles)
+        pictures = each(partial(picture_of, model, near=near), seen.tiles)
         if not problem.streamed:
             pictures = [placed(index, picture) for index, picture in enumerate(pictures)]
         fit = _fit_about(model, seen, free.copy(), pictures, near)
@@ -199,7 +206,7 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
         if isinstance(seen.tiles, Stream) and problem.loss == "squared":
             # The pictures of one model at a time are in memory; those of the others are made anew where asked for.
             fits = {
-                done: fit._replace(pictures=each(partial(_picture, fit.model), seen.tiles))
+                done: fit._replace(pictures=each(partial(picture_of, fit.model), seen.tiles))
                 for done, fit in fits.items()
             }
         fits[name] = _fit_model(brdf.MODELS[name], seen)

@@ -4,24 +4,29 @@ Noise has no shape. Where the residual has one, something that the scene says is
 a ball whose circle is off, a curve that was not undone. The renderer tells how the picture changes with each of them;
 what of that change the material cannot follow is compared with the residual. That is a score test (Rao 1948, Proc.
 Camb. Phil. Soc. 44, 50): one linear least squares for each cause, and nothing is fitted again. A mirrored picture is no
-small change: it is fitted, the coefficients linearly for a range of exponents.
+small change: it is fitted.
 
 Pictures are compared in the codes of their file where it has a curve, since noise and rounding are even there.
 """
 
 import dataclasses
 import math
+import operator
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 import brdf
 from brdf.images.encoding import encode
-from brdf.models.base import SpecularMaterial
 from brdf.precision import working_precision
+from fitting.core import picture_of
+from fitting.pixels import Tile
 from fitting.result import Cause, FitResult
+from fitting.solver.profile import search
 from fitting.uncertainty.structure import Errors, over_blocks
 
 # A cause is named where it explains this share of the structure, and is this many times its error.
@@ -43,10 +48,10 @@ RIM = 1.5
 DARK = 3.0
 # Of a step between codes: noise below that is mostly rounding.
 ROUNDED = 0.5
-# A mirrored picture explains more than this share of the structure. It is fitted with these exponents, and around the
-# best of them, the distance halved so often; coefficients so often, with weights from the slope of a file's curve. Some
-# of the exponents come first, by this stride.
-MIRRORED, EXPONENTS, FIRST, HALVINGS, PASSES, CURVED = 0.5, np.geomspace(2, 1000, 16), 5, 8, 2, 1e-4
+# A mirrored picture explains more than this share of the structure.
+MIRRORED = 0.5
+# Half the difference of the values that make the slope of a file's curve.
+CURVED = 1e-4
 
 Images = list[Float[np.ndarray, "H W C"]]
 Masks = Sequence[Bool[np.ndarray, "H W"]]
@@ -176,7 +181,7 @@ class _Residual:
             if 2 * sum(map(np.count_nonzero, good)) < sum(map(np.count_nonzero, self.counted)):
                 continue
             before, size = self._squares(self.targets, self.fitted, good)
-            gain = before - self._least([np.flip(target, axis) for target in self.targets], good, before)
+            gain = before - self._least([np.flip(target, axis) for target in self.targets], good)
             share = min(gain / max(before - size, gain, 1.0), 1.0)
             if share > MIRRORED and gain > LEAST_SIZE**2:
                 remedy = "flip the picture, or the lights and the shape"
@@ -202,12 +207,8 @@ class _Residual:
         found, n = [], float(getattr(self.material, "n", 1.0))
         k = [np.asarray(getattr(self.material, name, 0.0), np.float64) for name in ("k_a", "k_d", "k_s")]
         for index, scene in enumerate(scenes):
-            if scene is self.scenes[index] and hasattr(self, "fitted"):
-                found.append(self.fitted[index])
-            else:
-                found.append(
-                    np.sum([one * image for one, image in zip(k, self._basis(index, n, scene), strict=True)], axis=0)
-                )
+            same = scene is self.scenes[index] and hasattr(self, "fitted")
+            found.append(self.fitted[index] if same else sum(map(operator.mul, k, self._basis(index, n, scene))))
         return found
 
     def _codes(self, images: Images) -> Images:
@@ -299,33 +300,19 @@ class _Residual:
         left = np.concatenate([(one - other)[some] for one, other, some in both]) / self.noise
         return float(np.sum(left**2)), left.size
 
-    def _least(self, targets: Images, good: Masks, enough: float) -> float:
-        """Squares that the model leaves of other pictures: by all exponents, then around the best.
-
-        Infinite where some exponents far apart all leave more than is enough.
-        """
-
-        def leaves(n: float) -> float:
-            parts = [self._basis(index, n) for index in range(len(self.scenes))]
-            images, weights = targets, [np.ones_like(target) for target in targets]
-            for _ in range(PASSES):
-                k = [_coefficients(parts, targets, weights, good, channel) for channel in range(self.noise.size)]
-                images = [np.einsum("tijc,ct->ijc", np.stack(part), np.stack(k)) for part in parts]
-                weights = self._curves(images)
-            return self._squares(targets, images, good)[0]
-
-        if not isinstance(self.material, SpecularMaterial):
-            return leaves(1.0)
-        some, others = EXPONENTS[FIRST::FIRST], np.delete(EXPONENTS, slice(FIRST, None, FIRST))
-        tried = [(leaves(n), n) for n in some.tolist()]
-        if min(tried)[0] > enough:
-            return math.inf
-        least, n = min([*tried, *((leaves(n), n) for n in others.tolist())])
-        step = EXPONENTS[1] / EXPONENTS[0]
-        for _ in range(HALVINGS):
-            step = math.sqrt(step)
-            least, n = min([(least, n), *((leaves(other), other) for other in (n * step, n / step))])
-        return least
+    def _least(self, targets: Images, good: Masks) -> float:
+        """Squares that the model leaves of other pictures."""
+        pictures = []
+        both = zip(targets, good, self._curves(targets), self.scenes, self.pixels, strict=True)
+        for target, some, curve, scene, pixel in both:
+            seen = _seen(scene, pixel)
+            values, weight = (a.reshape(-1, self.noise.size) for a in (target, some[..., None] * curve**2))
+            tile = Tile(jnp.asarray(values), jnp.asarray(weight), seen.surface_points(), seen)
+            pictures.append(picture_of(type(self.material), tile))
+        best = search(pictures)
+        images = [picture.shown(best.n, best.x) for picture in pictures]
+        images = [image.reshape(target.shape) for image, target in zip(images, targets, strict=True)]
+        return self._squares(targets, images, good)[0]
 
     def _unfollowed(self, values: Float[np.ndarray, "P C"]) -> Float[np.ndarray, "P C"]:
         """What the material cannot follow; 0 where that is next to nothing."""
@@ -367,18 +354,6 @@ def _white_noise(residuals: Images, counted: Masks) -> Float[np.ndarray, " C"]:
             total, count = total + np.sum(differences**2, axis=0), count + 2 * len(differences)
     scale = max(float(np.max(np.abs(residual), initial=0.0)) for residual in residuals)
     return np.sqrt(total / max(count, 1)) + np.float64(1e-7 * scale + np.finfo(float).tiny)
-
-
-def _coefficients(
-    parts: Sequence[Sequence[np.ndarray]], targets: Images, weights: Images, good: Masks, channel: int
-) -> Float[np.ndarray, "3"]:
-    """Of the three terms, in one channel of all pictures, by weighted least squares."""
-    rows, values = [], []
-    for part, target, weight, some in zip(parts, targets, weights, good, strict=True):
-        root = weight[some][:, channel]
-        rows.append(np.stack([image[some][:, channel] * root for image in part], axis=1))
-        values.append(target[some][:, channel] * root)
-    return np.linalg.lstsq(np.concatenate(rows), np.concatenate(values))[0]
 
 
 def _power(values: Any, percent: float) -> Any:
@@ -436,8 +411,7 @@ def _turned(scenes: Scenes, places: Sequence[int], index: int, axis: int) -> Cal
 
 def _brighter(scenes: Scenes, places: Sequence[int], index: int) -> Callable[[float], Scenes]:
     def change(light: Any, percent: float) -> Any:
-        name = "intensity" if hasattr(light, "intensity") else "radiance"
-        return dataclasses.replace(light, **{name: np.asarray(getattr(light, name)) * (1 + percent / 100)})
+        return eqx.tree_at(lambda one: one.emittance, light, np.asarray(light.emittance) * (1 + percent / 100))
 
     return lambda percent: _with_light(scenes, places, index, lambda light: change(light, percent))
 

@@ -181,7 +181,7 @@ def _leaves_of(kind: str, scene: brdf.Scene, index: int | None, *, first: bool) 
         return [light.direction for light in lights if isinstance(light, brdf.DirectionalLight)]
     if kind == "intensity":
         shining = lights[1:] if first and index is None else lights
-        return [light.intensity if hasattr(light, "intensity") else light.radiance for light in shining]
+        return [light.emittance for light in shining]
     return [sphere.center if kind == "ball" else sphere.radius for sphere in spheres]
 
 

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float, Num
@@ -368,6 +369,5 @@ def _white(name: str, scene: brdf.Scene) -> tuple[brdf.Scene, np.ndarray]:
         came = f"has {len(scene.lights)} lights" if len(scene.lights) != 1 else "is lit by an environment map"
         raise InputError(name, came, "Give scenes with one light each, of one colour")
     (light,) = scene.lights
-    field = "intensity" if "intensity" in vars(light) else "radiance"
-    white = dataclasses.replace(light, **{field: 1.0})
+    white = eqx.tree_at(lambda one: one.emittance, light, np.ones(1))
     return dataclasses.replace(scene, lights=(white,), ambient=None), np.asarray(light.emittance)
