@@ -212,17 +212,3 @@ def each_alone(
     own = weight * np.diag(precision)
     step = np.divide(np.sqrt(weight) * (left @ precision), own, out=np.zeros_like(own), where=own > 0)
     return dataclasses.replace(picture, target=picture.shown(optimum.n, optimum.x) + step, weight=own)
-
-
-def specular_gain(gram: Float[np.ndarray, "U U"], x: Float[np.ndarray, "3 C"]) -> float:
-    """By how many noise variances the cost rises without the specular term.
-
-    Args:
-        gram: of all channels, by x_a, x_d, x_s, channel after channel, and the exponent.
-        x: coefficients.
-    """
-    lobe = np.append(np.zeros(x[:2].size), x[2])
-    others = np.flatnonzero(x[:2].ravel() > 0)
-    pull = gram[:-1, :-1] @ lobe
-    along = np.linalg.lstsq(gram[np.ix_(others, others)], pull[others])[0]
-    return float(lobe @ pull - pull[others] @ along)

@@ -343,8 +343,7 @@ def _likely_sums(fits: Mapping[str, ModelFit]) -> dict[str, NormalEquations]:
     noise = np.maximum(best.optimum.cost / best.optimum.pixels, np.finfo(float).tiny)
     for name, fit in fits.items():
         if fit.evidence is None:
-            one = fit.optimum
-            found[name] = join_channels(one.gram, one.product, one.square, one.x[2], noise)
+            found[name] = fit.optimum.normal(noise)
             continue
         one, normal = fit.evidence.optimum, fit.evidence.normal
         at = np.append(one.x.ravel(), 0.0)

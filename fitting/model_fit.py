@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 import brdf
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
-from fitting.solver.tied import NormalEquations, join_channels
+from fitting.solver.tied import NormalEquations
 
 
 class Evidence(NamedTuple):
@@ -39,10 +39,7 @@ class Evidence(NamedTuple):
     @property
     def normal(self) -> NormalEquations:
         """Of all channels, by x_a, x_d, x_s, channel after channel, and n."""
-        optimum = self.optimum
-        if self.together is not None:
-            return self.together
-        return join_channels(optimum.gram, optimum.product, optimum.square, optimum.x[2])
+        return self.optimum.normal() if self.together is None else self.together
 
 
 class ModelFit(NamedTuple):

@@ -26,7 +26,7 @@ from jaxtyping import Bool, Float
 
 from fitting.solver.nnls import nonnegative_minimum
 from fitting.solver.profile import Optimum
-from fitting.solver.tied import NormalEquations, design_of, join_channels
+from fitting.solver.tied import NormalEquations, design_of
 
 # How many unknowns a searched exponent counts.
 SEARCHED = 4.0
@@ -195,8 +195,8 @@ def choose(
             one, all_ = whitened[name], inflation**2
             normals[name] = NormalEquations(one.gram / all_, one.product / all_, one.square / all_)
         else:
-            normals[name] = join_channels(fit.gram, fit.product, fit.square, fit.x[2], variance)
-        plain[name] = join_channels(fit.gram, fit.product, fit.square, fit.x[2])
+            normals[name] = fit.normal(variance)
+        plain[name] = fit.normal()
     first = next(iter(fits))
     terms = [("none", no, no), *([("ambient", free[0], no)] if ambient else []), ("lambert", no, free[1])]
     terms += [("lambert", free[0], free[1])] if ambient else []

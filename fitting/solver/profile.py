@@ -42,6 +42,7 @@ from fitting.solver.refinement import (
 )
 from fitting.solver.streams import Stream
 from fitting.solver.subsample import Subsample, subsample
+from fitting.solver.tied import NormalEquations, join_channels
 
 # Six standard deviations: one wrong rejection in 1e9, and the variance itself is an estimate.
 DEVIATIONS = 6.0
@@ -90,6 +91,14 @@ class Optimum(eqx.Module):
         scale = np.ones((self.x.shape[1], 4))
         scale[:, 3] = self.x[2]
         return self.gram * scale[:, :, None] * scale[:, None, :]
+
+    def normal(self, variance: Float[np.ndarray, " C"] | float = 1.0) -> NormalEquations:
+        """Normal equations of all channels.
+
+        Args:
+            variance: of each channel's noise.
+        """
+        return join_channels(self.gram, self.product, self.square, self.x[2], variance)
 
 
 def search(

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from fitting.sample_error import SampleError
 from fitting.solver.nnls import scaled_inverse
 from fitting.solver.profile import Optimum
-from fitting.solver.tied import design_of
+from fitting.solver.tied import design_of, join_channels
 from fitting.uncertainty.intervals import NORMAL_95, above_zero
 
 # A squared column keeps less than this of itself when the others are taken out: the two tell the same story.
@@ -137,7 +137,7 @@ def uncertainty(
         joined: the Hessian of all channels, whose noise is 1, where these err together.
         moved: by how much each of some causes may have moved the unknowns.
     """
-    gain = max(gain, specular_gain(optimum, noise))
+    gain = max(gain, specular_gain(optimum.normal(noise**2).gram, optimum.x))
     columns = rms_columns(optimum) if columns is None else columns
     dependent = DEPENDENT_SINGLE if single else DEPENDENT_DOUBLE
     reasons = np.full(free.shape, "", object)
@@ -154,37 +154,67 @@ def uncertainty(
         stand_in[some.terms, channel] = 0.0
         stand_in[first, channel], determined[first, channel] = some.value / some.columns[0], True
     optimum = dataclasses.replace(optimum, x=stand_in)
-    x_error, x_interval, n_error, correlation, rise = _errors(
-        optimum,
-        determined,
-        noise,
-        tied,
-        spread,
-        scatter,
-        widening,
-        copies,
-        dependent,
-        resolution,
-        missed,
-        joined,
-        moved,
-    )
-    sums = {c: some._replace(error=some.columns[0] * x_error[some.terms[0], c]) for c, some in sums.items()}
-    alone = x_error
+    x, size, active = optimum.x, 3 * noise.size + 1, determined & (optimum.x > 0)
+    hessian = optimum.normal().gram if joined is None else joined
+    middle = _of_scores(optimum, noise, spread, copies=copies) if joined is None else joined
+    inverse, along, with_n = _inverted(hessian, active, tied, dependent)
+    widening = widening * np.ones(size)
+    independent = inverse @ middle @ inverse * np.outer(widening, widening)
+    covariance, middles = independent, np.stack([middle, middle])
     if scatter is not None:
-        # What errs together makes errors larger, but not the numbers less determined.
-        alone, *_ = _errors(
-            optimum, determined, noise, tied, spread, None, widening, copies, dependent, 0.0, None, joined
-        )
-    for term, channel in np.argwhere(known):
+        # What is left may be the dust of arithmetic, which errs together and says nothing.
+        middles[0] = scatter + LEAST_SCATTER * middle
+        covariance = inverse @ middles[0] @ inverse * np.outer(widening, widening)
+        # Of a few blocks the scatter alone says too little.
+        more = max(np.trace(inverse @ scatter) / max(np.trace(inverse @ middle), np.finfo(float).tiny), 1.0)
+        variance, least = np.diag(covariance), np.diag(independent) * more
+        ratio = np.divide(least, variance, out=np.ones(size), where=variance > 0)
+        wider = np.sqrt(np.maximum(ratio, 1.0))
+        covariance = covariance * np.outer(wider, wider)
+    if missed is not None:
+        off = missed.shift(np.append(active.ravel(), with_n)) * np.append(np.ones(size - 1), optimum.n)
+        covariance = covariance + np.outer(off, off)
+    if moved is not None:
+        covariance = covariance + moved.T @ moved
+    variance = np.maximum(np.diag(covariance), 0.0)
+    # What errs together makes errors larger, but not the numbers less determined.
+    deviations = np.sqrt(np.stack([variance, np.maximum(np.diag(independent), 0.0)]))
+    x_error, x_interval = np.full(x.shape, np.inf), np.zeros((*x.shape, 2))
+    x_interval[..., 1] = np.inf
+    for term, channel in np.argwhere(determined):
+        index = term * noise.size + channel
+        value, deviation, alone = float(x[term, channel]), *deviations[:, index].tolist()
+        # Where n is open, what moves along with it is open too.
+        if value > 0 and active[2].any() and not with_n and abs(along[index]) * optimum.n > deviation:
+            deviation = alone = math.inf
+        if not value > 0:
+            # Value and error that it would have without the bound.
+            direction = np.eye(size)[index] - inverse @ hessian[:, index]
+            left = direction @ hessian @ direction
+            deviation = alone = math.inf
+            if left > dependent * hessian[index, index]:
+                score = optimum.product[channel, term] - optimum.gram[channel, term, :3] @ x[:, channel]
+                value = float(score / left)
+                deviation, alone = (np.sqrt(direction @ middles @ direction) / left).tolist()
         largest = max(optimum.square[channel], brightest[channel] ** 2)
-        if alone[term, channel] ** 2 * optimum.gram[channel, term, term] > largest:
+        deviation = math.hypot(deviation, resolution * value)
+        x_interval[term, channel], x_error[term, channel] = above_zero(value, deviation), deviation
+        alone = deviation if scatter is None else alone
+        if known[term, channel] and alone**2 * optimum.gram[channel, term, term] > largest:
             reasons[term, channel] = "its error is larger than the whole picture"
             x_error[term, channel] = np.inf
-    if not n_reason and not np.isfinite(n_error):
+    sums = {c: some._replace(error=some.columns[0] * x_error[some.terms[0], c]) for c, some in sums.items()}
+    scale = np.divide(1.0, deviations[0], out=np.zeros(size), where=variance > 0)
+    n_error, rise = math.inf, 0.0
+    if with_n:
+        # The noise variance, averaged over channels as n feels it, times the 95 % quantile of chi squared.
+        rise = float(NORMAL_95**2 * covariance[-1, -1] / inverse[-1, -1])
+        n_error = math.hypot(deviations[0, -1], resolution * optimum.n)
+    elif not n_reason:
         n_reason = "the highlight fits as well with other exponents and another k_s"
     if n_reason:
         n_error = math.inf
+    correlation = covariance * np.outer(scale, scale)
     return Uncertainty(x_error, x_interval, n_error, correlation, rise, reasons, n_reason, sums)
 
 
@@ -208,21 +238,18 @@ def _adds_evenly(optimum: Optimum) -> bool:
     return True
 
 
-def specular_gain(optimum: Optimum, noise: Float[np.ndarray, " C"]) -> float:
+def specular_gain(gram: Float[np.ndarray, "U U"], x: Float[np.ndarray, "3 C"]) -> float:
     """By how many noise variances the cost rises without the specular term.
 
     Args:
-        optimum: of the engine.
-        noise: standard deviation of the residual, (C,).
+        gram: of all channels, by x_a, x_d, x_s, channel after channel, and the exponent; the noise of each is 1.
+        x: coefficients.
     """
-    gain = 0.0
-    for gram, x, deviation in zip(optimum.gram, optimum.x.T, noise, strict=True):
-        others = np.flatnonzero(x[:2] > 0)
-        cross = gram[others, 2]
-        block = gram[np.ix_(others, others)]
-        left = gram[2, 2] - cross @ np.linalg.lstsq(block, cross, rcond=DEPENDENT_DOUBLE)[0]
-        gain += x[2] ** 2 * max(left, 0.0) / deviation**2
-    return gain
+    lobe = np.append(np.zeros(x[:2].size), x[2])
+    others = np.flatnonzero(x[:2].ravel() > 0)
+    pull = gram[:-1, :-1] @ lobe
+    along = scaled_inverse(gram[np.ix_(others, others)], DEPENDENT_DOUBLE) @ pull[others]
+    return max(float(lobe @ pull - pull[others] @ along), 0.0)
 
 
 def rms_columns(optimum: Optimum, weight: float = 1.0) -> Float[np.ndarray, "3 C"]:
@@ -257,95 +284,38 @@ def _dependent(optimum: Optimum, reasons: np.ndarray, dependent: float, columns:
     return sums
 
 
-def _errors(
-    optimum: Optimum,
-    known: np.ndarray,
-    noise: np.ndarray,
-    tied: np.ndarray | None,
-    spread: np.ndarray | None,
-    scatter: np.ndarray | None,
-    widening: np.ndarray | float,
-    copies: bool,
-    dependent: float,
-    resolution: float,
-    missed: SampleError | None,
-    joined: np.ndarray | None,
-    moved: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray, float, np.ndarray, float]:
-    """Errors and intervals of x, the error of n, the correlation of all unknowns, and the rise of the cost.
+def _of_scores(
+    optimum: Optimum, noise: Float[np.ndarray, " C"], spread: Float[np.ndarray, "C 4 4"] | None, *, copies: bool
+) -> Float[np.ndarray, "U U"]:
+    """The covariance of the scores by x_a, x_d, x_s, channel after channel, and n, where pixels err alone."""
+    channels = noise.size
+    scores = noise[:, None, None] ** 2 * optimum.gram if spread is None else spread
+    found = join_channels(scores, optimum.product, optimum.square, optimum.x[2]).gram
+    if copies:
+        # What one channel errs all do.
+        same = np.pad(np.kron(np.eye(3), np.ones((channels, channels))), (0, 1))
+        same[-1, -1] = channels
+        found = found @ same
+    return found
 
-    The unknowns are x_a, x_d, x_s, channel after channel each, then n.
-    """
-    x, channels = optimum.x, noise.size
-    size = 3 * channels + 1
-    hessian, middle = np.zeros((size, size)), np.zeros((size, size))
-    places = [[channel, channels + channel, 2 * channels + channel, size - 1] for channel in range(channels)]
-    for channel, block in enumerate(optimum.gauss_newton):
-        hessian[np.ix_(places[channel], places[channel])] += block
-        scale = np.array([1.0, 1.0, 1.0, x[2, channel]])
-        scores = noise[channel] ** 2 * block if spread is None else spread[channel] * np.outer(scale, scale)
-        for place in places if copies else places[channel : channel + 1]:
-            middle[np.ix_(places[channel], place)] += scores
-    if joined is not None:
-        hessian = middle = joined
-    # What is left may be the dust of arithmetic, which errs together and says nothing.
-    alone, middle = middle, middle if scatter is None else scatter + LEAST_SCATTER * middle
-    active = known & (x > 0)
-    has_n, with_n = bool(active[2].any()), False
-    unit = np.eye(size)
-    basis = unit[:, np.append(active.ravel(), False)]
-    if tied is not None and has_n:
-        basis = design_of(active, tied)[:, :-1]
-    inverse = _inverse(hessian, basis)
+
+def _inverted(
+    hessian: Float[np.ndarray, "U U"], active: Bool[np.ndarray, "3 C"], tied: np.ndarray | None, dependent: float
+) -> tuple[Float[np.ndarray, "U U"], Float[np.ndarray, " U"], bool]:
+    """The inverse of the Hessian in what is active, what n moves along, and whether n is determined."""
+    has_n = bool(active[2].any())
+    design = design_of(active, tied if has_n else None)
+    inverse = inverse_among(hessian, design[:, :-1] if has_n else design)
     along = inverse @ hessian[:, -1]
-    if has_n:
-        left = hessian[-1, -1] - hessian[-1] @ along
-        with_n = bool(left > dependent * hessian[-1, -1])
-        if with_n:
-            inverse = _inverse(hessian, np.column_stack([basis, unit[:, -1]]))
-    covariance = inverse @ middle @ inverse
-    if scatter is not None:
-        # Of a few blocks the scatter alone says too little.
-        alike = inverse @ alone @ inverse
-        more = max(np.trace(inverse @ scatter) / max(np.trace(inverse @ alone), np.finfo(float).tiny), 1.0)
-        variance, least = np.diag(covariance), np.diag(alike) * more
-        ratio = np.divide(least, variance, out=np.ones(size), where=variance > 0)
-        widening = widening * np.sqrt(np.maximum(ratio, 1.0))
-    covariance = covariance * np.outer(widening * np.ones(size), widening * np.ones(size))
-    if missed is not None:
-        off = missed.shift(np.append(active.ravel(), with_n)) * np.append(np.ones(size - 1), optimum.n)
-        covariance = covariance + np.outer(off, off)
-    if moved is not None:
-        covariance = covariance + moved.T @ moved
-    variance = np.maximum(np.diag(covariance), 0.0)
-    error, interval = np.full((3, channels), np.inf), np.zeros((3, channels, 2))
-    interval[..., 1] = np.inf
-    for term, channel in np.argwhere(known):
-        index = term * channels + channel
-        value, deviation = float(x[term, channel]), math.sqrt(variance[index])
-        # Where n is open, what moves along with it is open too.
-        if value > 0 and has_n and not with_n and abs(along[index]) * optimum.n > deviation:
-            deviation = math.inf
-        if not value > 0:
-            # Value and error that it would have without the bound.
-            direction = unit[index] - inverse @ hessian[:, index]
-            left = direction @ hessian @ direction
-            deviation = math.inf
-            if left > dependent * hessian[index, index]:
-                score = optimum.product[channel, term] - optimum.gram[channel, term, :3] @ x[:, channel]
-                value, deviation = float(score / left), float(np.sqrt(direction @ middle @ direction) / left)
-        deviation = math.hypot(deviation, resolution * value)
-        error[term, channel] = deviation
-        interval[term, channel] = above_zero(value, deviation)
-    scale = np.divide(1.0, np.sqrt(variance), out=np.zeros(size), where=variance > 0)
-    n_error, rise = math.inf, 0.0
-    if with_n:
-        n_error = math.hypot(math.sqrt(variance[-1]), resolution * optimum.n)
-        # The noise variance, averaged over channels as n feels it, times the 95 % quantile of chi squared.
-        rise = float(NORMAL_95**2 * covariance[-1, -1] / inverse[-1, -1])
-    return error, interval, n_error, covariance * np.outer(scale, scale), rise
+    with_n = has_n and bool(hessian[-1, -1] - hessian[-1] @ along > dependent * hessian[-1, -1])
+    return inverse_among(hessian, design) if with_n else inverse, along, with_n
 
 
-def _inverse(hessian: np.ndarray, basis: np.ndarray) -> np.ndarray:
-    """The inverse of the Hessian among the columns of a basis, 0 beside them."""
+def inverse_among(hessian: Float[np.ndarray, "U U"], basis: Float[np.ndarray, "U V"]) -> Float[np.ndarray, "U U"]:
+    """The inverse of a Hessian among the columns of a basis, 0 beside them.
+
+    Args:
+        hessian: positive semidefinite.
+        basis: any columns.
+    """
     return basis @ scaled_inverse(basis.T @ hessian @ basis, 1e-14) @ basis.T

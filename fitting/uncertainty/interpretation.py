@@ -9,22 +9,21 @@ from jaxtyping import Float
 import brdf
 from brdf.channels import channel_names
 from brdf.models.base import SpecularMaterial
-from fitting import channel_errors
 from fitting.light_colour import coefficient_factors
 from fitting.model_fit import Evidence, ModelFit
 from fitting.pixels import Observed
 from fitting.result import Parameter, free_parameters
 from fitting.solver.devices import device_count
-from fitting.solver.nnls import scaled_inverse
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
-from fitting.solver.tied import design_of, join_channels
+from fitting.solver.tied import design_of
 from fitting.uncertainty.covariance import (
     AMBIENT_SHARE,
     RESOLUTION,
     TERMS,
     Sum,
     Uncertainty,
+    inverse_among,
     residual_noise,
     rms_columns,
     specular_gain,
@@ -110,7 +109,7 @@ def interpret(
         # Each working target has the noise 1; what least squares leaves is rounding, which goes together.
         said, known = fit.evidence, known._replace(significant=False, noise=None)
         # Of a small highlight the pixels near an edge may tell next to nothing.
-        gain = specular_gain(optimum, noise)
+        gain = specular_gain(optimum.normal(noise**2).gram, optimum.x)
         fit, optimum, deviation = fit._replace(pictures=said.pictures, optimum=said.optimum), said.optimum, noise**0
         shared, together = shared_errors(
             said, seen, alone_covariance(optimum, fit.tied) if said.together is None else None
@@ -120,7 +119,7 @@ def interpret(
         widening = said.widening
         if said.together is not None:
             joined = said.together.gram
-            gain = max(gain, channel_errors.specular_gain(joined, optimum.x))
+            gain = max(gain, specular_gain(joined, optimum.x))
     else:
         together = _structure(pictures, seen, optimum, noise, rounding, even=known.noise is None)
         # What a bound of the material leaves is no error of the pixels.
@@ -238,9 +237,7 @@ def alone_covariance(optimum: Optimum, tied: np.ndarray | None) -> Float[np.ndar
         optimum: with the sums of these.
         tied: see `fitting.model_fit.ModelFit`.
     """
-    design = design_of(optimum.x > 0, tied)
-    whole = join_channels(optimum.gram, optimum.product, optimum.square, optimum.x[2]).gram
-    return design @ scaled_inverse(design.T @ whole @ design) @ design.T
+    return inverse_among(optimum.normal().gram, design_of(optimum.x > 0, tied))
 
 
 def _left(pictures: Sequence[Picture], seen: Observed, optimum: Optimum) -> Iterator[Errors]:
