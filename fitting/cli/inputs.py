@@ -125,6 +125,11 @@ def _check_options(targets: list[Path], options: PictureOptions) -> None:
     if not _is_archive(targets):
         remedy = "Leave it out, or add [ambient] to the scene"
         _require(not options.ambient, "--ambient", "is what the scene file says", remedy)
+        for path in targets[1:]:
+            _require(path.suffix != ".toml", path, "is a scene, no picture", f"Write --scene {path}")
+        remedy = "Give one; in Python fitting.fit takes lists of pictures and of scenes"
+        told = f"tells what one picture shows, {len(targets)} are given"
+        _require(options.scene is None or len(targets) == 1, "--scene", told, remedy)
         remedy = "Several pictures are fitted with --sphere or --normals, and --lights"
         _require(len(targets) == 1, "--sphere", f"{len(targets)} pictures come without their geometry", remedy)
 
@@ -245,9 +250,9 @@ def _photographs(targets: list[Path], options: PictureOptions, pictures: Any, ma
         circle, notes = ball_in(options.sphere or "", mask)
         points = ball_points((height, width), circle)
     else:
-        from fitting.maps.map_inputs import read_normal_map
+        from fitting.maps.map_inputs import normal_map
 
-        points = brdf.SurfacePoints.from_normals(read_normal_map(options.normals))
+        points = brdf.SurfacePoints.from_normals(normal_map(options.normals))
         came = f"is {points.mask.shape[1]} x {points.mask.shape[0]}, the pictures {width} x {height}"
         _require(points.mask.shape == (height, width), options.normals, came, "Give a normal for each pixel")
     if options.lights is not None:

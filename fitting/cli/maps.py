@@ -54,6 +54,9 @@ def maps(
     check_page(report)
     if out is not None:
         check_folder(out)
+        if out.resolve() == target.resolve():
+            came = "is the folder of the photographs, whose normals.* and mask.* are read"
+            raise InputError("--out", came, "Give another folder")
     mesh = all_devices(devices)
     use_compilation_cache()
     import fitting

@@ -48,8 +48,8 @@ def fit_maps(
         lights: towards the lights, (P, 3), x right, y up, z to the camera; or directional lights; or scenes with one
             light of any kind each, whose camera and shapes, the same in all, tell what texels see, cast shadows left
             out; or an ``.lp`` or text file. None for the folder's.
-        normals: (H, W, 3); a file (.npy, .exr, or an image with n·0.5 + 0.5, y up); "fit" to find them too, under
-            distant lights. None for the scene's or the folder's ``normals.*``, else they are found.
+        normals: (H, W, 3), y up, codes being n·0.5 + 0.5; or a file of them (.npy, .exr, or an image); "fit" to find
+            them too, under distant lights. None for the scene's or the folder's ``normals.*``, else they are found.
         intensities: of the lights, (P,) or (P, C): photographs are divided by them.
         exposures: of the photographs, (P,), likewise.
         ambient: intensity of the ambient light, a number or (C,), where there is some: k_a is found too. None for the
@@ -62,7 +62,7 @@ def fit_maps(
         encoding: of files and arrays: "linear", "srgb" or a gamma; None for what files say, and linear arrays. Where
             files of 8 bits say nothing, a note says as what they were read: under distant lights as that which the
             model explains better, else as sRGB.
-        flip_y: whether y goes down in a file of normals.
+        flip_y: whether y goes down in the normals.
         precision: "float32" or "float64".
         labels: (H, W) whole numbers, or a file of them as codes: texels with the same one share n, which then is known
             far better than each could tell; 0 for all texels. None for an n of each.
@@ -159,10 +159,8 @@ def _surface(given: Photographs, normals: Any, mask: Any, to_view: Any, flip_y: 
         return Surface(points.normal, points.mask, points)
     if normals is None or (isinstance(normals, str) and normals == "fit"):
         return Surface(None, mask, None)
-    name = "normals"
-    if isinstance(normals, str | Path):
-        name, normals = str(normals), map_inputs.read_normal_map(normals, flip_y=flip_y)
-    normals = np.asarray(normals)
+    name = str(normals) if isinstance(normals, str | Path) else "normals"
+    normals = map_inputs.normal_map(normals, flip_y=flip_y)
     if normals.shape != (height, width, 3):
         came = f"are of shape {normals.shape}, the photographs of {(height, width)}"
         raise InputError(name, came, "Give a normal for each pixel")

@@ -159,28 +159,45 @@ def read_folder(folder: Path) -> dict[str, Any]:
     return found
 
 
-def read_normal_map(path: str | Path, *, flip_y: bool = False) -> Float[np.ndarray, "H W 3"]:
-    """Normals from a file: floats as they are, codes as n·0.5 + 0.5; 0 where there is no surface.
+def normal_map(given: Any, *, flip_y: bool = False) -> Float[np.ndarray, "H W 3"]:
+    """Normals from an array or a file: floats as they are, codes as n·0.5 + 0.5; 0 where there is no surface.
 
     Args:
-        path: .npy, .exr, or an image of 8 or 16 bits.
-        flip_y: whether y goes down in the file.
+        given: (H, W, 3); or .npy, .exr, or an image of 8 or 16 bits.
+        flip_y: whether y goes down there.
 
     Raises:
-        InputError: naming the file.
+        InputError: naming the file or the argument.
     """
-    if Path(path).suffix.lower() == ".npy":
-        with Path(path).open("rb") as file:
-            normal = np.array(read_array(file, path, Path(path).stat().st_size), np.float32)
+    name, coded = "normals", False
+    if not isinstance(given, str | Path):
+        normal = np.asarray(given)
+    elif Path(given).suffix.lower() == ".npy":
+        name = str(given)
+        with Path(given).open("rb") as file:
+            normal = np.array(read_array(file, given, Path(given).stat().st_size))
     else:
-        with brdf.ImageReader(path, encoding="linear") as reader:
-            normal = reader.read()
-            if reader.is_integer:
-                empty, normal = np.all(normal == 0, axis=-1), 2 * normal - 1
-                normal[empty | (np.sum(normal * normal, axis=-1) < NO_SURFACE)] = 0
-    if normal.ndim != 3 or normal.shape[2] != 3:
-        raise InputError(path, f"must be of shape (H, W, 3), got {normal.shape}", "Give a normal map")
+        name = str(given)
+        with brdf.ImageReader(given, encoding="linear") as reader:
+            normal, coded = reader.read(), reader.is_integer
+    if normal.ndim != 3 or normal.shape[2] != 3 or normal.dtype.kind not in "fiu":
+        came = f"must be of shape (H, W, 3), got {normal.shape} of {normal.dtype}"
+        raise InputError(name, came, "Give a normal for each pixel")
+    if normal.dtype.kind == "u":
+        normal, coded = normal / np.float32(np.iinfo(normal.dtype).max), True
+    if coded:
+        empty, normal = np.all(normal == 0, axis=-1), 2 * normal - 1
+        normal[empty | (np.sum(normal * normal, axis=-1) < NO_SURFACE)] = 0
+    elif _looks_coded(normal):
+        came = "hold n·0.5 + 0.5, as images do: 2 n - 1 is of length 1, and nothing is below 0"
+        raise InputError(name, came, "Give 2 n - 1, or the codes of the image")
     return normal * np.array([1, -1 if flip_y else 1, 1], np.float32)
+
+
+def _looks_coded(normal: np.ndarray) -> bool:
+    there = normal[np.all(np.isfinite(normal), axis=-1) & np.any(normal != 0, axis=-1)].astype(float)
+    plain, decoded = (np.median(np.abs(np.sum(n * n, axis=-1) - 1)) if n.size else 0.0 for n in (there, 2 * there - 1))
+    return bool(np.all(there >= 0) and decoded < 0.05 < plain)
 
 
 def photographs(

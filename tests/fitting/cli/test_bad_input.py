@@ -217,6 +217,8 @@ CASES: list[tuple[dict[str, Any], str, str]] = [
     ({}, f"{FIT} --light 0,0,1", "--light: says where the light is, but nothing what the picture shows"),
     # photographs
     ({}, "fit 0.png 1.png", "--sphere: 2 pictures come without their geometry"),
+    ({}, "fit 0.png 1.png --scene scene.toml", "--scene: tells what one picture shows, 2 are given"),
+    ({}, "fit 0.png scene.toml", "scene.toml: is a scene, no picture. Write --scene scene.toml"),
     ({}, "fit 0.png --sphere 1,2", "--light: or --lights has to say"),
     ({}, "fit 0.png --sphere 1,2 --light 0,0,1", "--sphere: must be 3 finite numbers"),
     ({}, "fit 0.png --sphere nan,2,9 --light 0,0,1", "--sphere: must be 3 finite numbers"),

@@ -22,6 +22,8 @@ def test_a_folder_without_lights_is_told_and_nothing_is_written(tmp_path, capsys
     assert list(tmp_path.iterdir()) == []
     assert run("maps", tmp_path, "--report", tmp_path / "page.txt") == 2
     assert "page.txt: is no name of a page. Name it .html" in capsys.readouterr().err
+    assert run("maps", tmp_path, "--out", tmp_path / "out" / "..") == 2
+    assert "--out: is the folder of the photographs" in capsys.readouterr().err
 
 
 def test_diligent_text_files_are_read_and_maps_written(tmp_path, capsys):

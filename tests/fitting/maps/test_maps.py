@@ -265,6 +265,19 @@ def test_auto_takes_the_simplest():
     assert np.mean(maps.chosen[0, 20:] != 0) > 0.9
 
 
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_normals_may_be_codes_and_upside_down(kind):
+    lights = dome(16)
+    pictures, truth = texels(12, 0.0, lights)
+    down = truth["normal"][None] * [1, -1, 1]
+    codes = np.round((0.5 * down + 0.5) * np.iinfo(kind).max).astype(kind)
+    maps = fitting.fit_maps(pictures, lights, codes, flip_y=True)
+    np.testing.assert_allclose(maps.normal[0], truth["normal"], atol=2 / np.iinfo(kind).max)
+    np.testing.assert_allclose(maps.k_d[0], truth["k_d"], rtol=0.05 if kind is np.uint8 else 1e-3)
+    with pytest.raises(brdf.InputError, match=r"normals: hold n·0\.5 \+ 0\.5, as images do"):
+        fitting.fit_maps(pictures, lights, codes / np.iinfo(kind).max)
+
+
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float64])
 def test_arrays_hold_values_as_is_told(kind):
     lights = dome(16)
