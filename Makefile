@@ -17,6 +17,8 @@ COMPILED_AS_FOR_USERS := tests/project/test_bundled_examples.py tests/project/te
 fit: $(VENV)/installed
 	$(BIN)/brdf fit $(EXAMPLE) --out out/gold-ball --plot
 
+# As many tests run at a time as there are cores: matrix products that share all of these wait for each other.
+test: export OPENBLAS_NUM_THREADS = 1
 test: $(VENV)/installed-tests
 	XLA_FLAGS="$(LIGHTLY_COMPILED)" $(BIN)/python -m pytest -n auto --dist worksteal $(COMPILED_AS_FOR_USERS:%=--ignore=%)
 	$(BIN)/python -m pytest -n auto --dist worksteal $(COMPILED_AS_FOR_USERS)

@@ -209,10 +209,16 @@ class Problem:
 
         The share is its weight times the square of the product of the influence and its derivatives by the unknowns.
         """
+
+        def of_channel(place: Any, columns: Any, weight: Any) -> np.ndarray:
+            share = influence[:, place] @ columns
+            share *= share
+            share *= weight
+            return share
+
         squares = np.zeros(len(influence))
         for one in said.said:
-            both = zip(self.places, np.moveaxis(one.columns, -1, 0), one.weight.T, strict=True)
-            shares = [(influence[:, place] @ columns) ** 2 * weight for place, columns, weight in both]
+            shares = map(of_channel, self.places, np.moveaxis(one.columns, -1, 0), one.weight.T)
             for share in [sum(shares)] if self.copies else shares:
                 squares += np.einsum("up,up->u", share, share)
         return squares
@@ -236,8 +242,8 @@ class Precision(NamedTuple):
 
 def maximise(
     problem: Problem, start: Estimate, enough: float = ENOUGH_KNOWN, first: float = 2.0
-) -> tuple[Estimate, list[Precision]]:
-    """The most likely unknowns and noise, and what was known of the unknowns with more noise.
+) -> tuple[Estimate, list[Precision], Score]:
+    """The most likely unknowns and noise, what was known of the unknowns with more noise, and what the values say.
 
     Args:
         problem: values and their model.
@@ -247,7 +253,7 @@ def maximise(
     """
     at, known, before, low, high, largest = start, [], None, -math.inf, math.inf, math.log(first)
     for _ in range(MOST_NOISES):
-        at, said = _climb(problem, at, ROUGH_GAIN, known)
+        at, values, said = _climb(problem, at, ROUGH_GAIN, known, *_scored(problem, at))
         known.append(precision(problem, at, said))
         now, score = math.log(at.noise), said.by_log_noise
         low, high = (max(low, now), high) if score > 0 else (low, min(high, now))
@@ -260,11 +266,23 @@ def maximise(
         if abs(step) < math.log(enough):
             break
         at = at._replace(noise=math.exp(now + step))
-    at, said = _climb(problem, at, LEAST_GAIN, known)
-    return at, [*(entry for entry in known if entry.noise > at.noise), precision(problem, at, said)]
+    else:
+        values, said = _scored(problem, at)
+    rough = said
+    at, _, said = _climb(problem, at, LEAST_GAIN, known, values, rough)
+    last = known[-1] if said is rough and known[-1].noise == at.noise else precision(problem, at, said)
+    return at, [*(entry for entry in known if entry.noise > at.noise), last], said
 
 
-def _climb(problem: Problem, at: Estimate, enough: float, known: Sequence[Precision]) -> tuple[Estimate, Score]:
+def _scored(problem: Problem, at: Estimate) -> tuple[list[Values], Score]:
+    """The pixels that say something of an estimate, and what."""
+    values = problem.near(at, REACH)
+    return values, problem.score(at, values)
+
+
+def _climb(
+    problem: Problem, at: Estimate, enough: float, known: Sequence[Precision], values: list[Values], now: Score
+) -> tuple[Estimate, list[Values], Score]:
     """Newton's method at a given noise, with the pixels that say something there, to what gains next to nothing.
 
     What they say nothing of stays where more noise has put it, as a small highlight none of whose pixels lies near an
@@ -272,8 +290,6 @@ def _climb(problem: Problem, at: Estimate, enough: float, known: Sequence[Precis
     """
     design, start = problem.design, at
     damping = 1 / (STEADY**2 * least_variance(known)) if known else np.zeros(len(design))
-    values = problem.near(at, REACH)
-    now = problem.score(at, values)
     while True:
         for _ in range(MOST_STEPS):
             base = np.where(problem.signed, 0.0, at.unknowns)
@@ -298,7 +314,7 @@ def _climb(problem: Problem, at: Estimate, enough: float, known: Sequence[Precis
         # Others may say something at the new numbers.
         before, values = values, problem.near(at, NEARER, values)
         if values is before:
-            return at._replace(value=now.value), now
+            return at._replace(value=now.value), values, now
         now, first = problem.score(at, values), problem.score(start, values)
         if first.value > now.value:
             # What was left out would have held it back.
@@ -366,7 +382,11 @@ def widening(
 
 
 def where_most_is_told(
-    problem: Problem, at: Estimate, known: Sequence[Precision], alone: Float[np.ndarray, " U"] | float = 0.0
+    problem: Problem,
+    at: Estimate,
+    known: Sequence[Precision],
+    said: Score,
+    alone: Float[np.ndarray, " U"] | float = 0.0,
 ) -> tuple[Score, Float[np.ndarray, " U"]]:
     """What the values say of an estimate at the noise of which errors are, and what to multiply these by.
 
@@ -374,8 +394,12 @@ def where_most_is_told(
         problem: values and their model.
         at: the most likely unknowns.
         known: what was known of them on the way.
+        said: what the values say of them.
         alone: variance of each that is left in any case.
     """
-    at = at._replace(noise=telling(known).noise)
-    said = problem.score(at, problem.near(at, REACH))
-    return said, widening(known, precision(problem, at, said), alone)
+    most = telling(known)
+    if most is not known[-1]:
+        at = at._replace(noise=most.noise)
+        _, said = _scored(problem, at)
+        most = precision(problem, at, said)
+    return said, widening(known, most, alone)

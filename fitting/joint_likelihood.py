@@ -50,8 +50,8 @@ def most_likely_numbers(problem: JointProblem, seen: Observed, vector: Float[np.
     noise = max(residual_deviation(bounds, codes), FIRST_NOISE)
     if any(own.lossy for own in bounds):
         pictures.weights = [alike(own, code, noise) for own, code in zip(bounds, codes, strict=True)]
-    at, known = maximise(pictures, Estimate(vector, noise))
-    said, wider = where_most_is_told(pictures, at, known)
+    at, known, said = maximise(pictures, Estimate(vector, noise))
+    said, wider = where_most_is_told(pictures, at, known, said)
     freed = list(zip(problem.names, problem.freed(), strict=True))
     shared = np.repeat(
         [name not in NOT_NEGATIVE or not leaf.ndim for name, leaf in freed], [leaf.size for _, leaf in freed]

@@ -177,7 +177,7 @@ def _evener_in_light(problem: "_Separable", at: Estimate) -> Estimate | None:
         return None
     light = list(map(_values, _in_light(pictures)))
     start = Estimate(at.unknowns, max(at.noise, FIRST_NOISE))
-    even, _ = maximise(_Separable(light, problem.design, problem.n_range, problem.copies), start, ROUGHLY_KNOWN)
+    even, *_ = maximise(_Separable(light, problem.design, problem.n_range, problem.copies), start, ROUGHLY_KNOWN)
     return even if even.value > at.value + LIKELIER else None
 
 
@@ -232,15 +232,15 @@ def _near_edges(fit: ModelFit, at: Estimate, *, copies: bool) -> Evidence:
     large = sum(picture.target.shape[0] for picture in pictures) > 2 * SUBSAMPLE
     some = [_stratum(picture, SUBSAMPLE // len(pictures)) for picture in pictures] if large else _gathered(pictures, at)
     problem = _Separable(some, design, fit.n_range, copies)
-    at, known = maximise(problem, at, ROUGHLY_KNOWN if large else ENOUGH_KNOWN)
+    at, known, said = maximise(problem, at, ROUGHLY_KNOWN if large else ENOUGH_KNOWN)
     if (even := _evener_in_light(problem, at)) is not None:
         return _near_edges(fit._replace(pictures=_in_light(pictures)), even, copies=copies)
     if large:
         # The whole picture has the pixels near an edge that a part of it lacks.
         at = at._replace(noise=telling(known).noise)
         problem = _Separable(_gathered(pictures, at), design, fit.n_range, copies)
-        at, known = maximise(problem, at, first=ROUGHLY_KNOWN)
-    said, wider = where_most_is_told(problem, at, known, _of_planes(pictures, at, problem))
+        at, known, said = maximise(problem, at, first=ROUGHLY_KNOWN)
+    said, wider = where_most_is_told(problem, at, known, said, _of_planes(pictures, at, problem))
     working = list(map(_working, said.said))
     optimum = _optimum(working, said, fit, Numbers.of(at.unknowns))
     places = [_place(_picture(one.values)) for one in said.said]
