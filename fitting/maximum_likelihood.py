@@ -28,7 +28,6 @@ from fitting.continuation import (
     Estimate,
     Problem,
     Said,
-    Score,
     Values,
     maximise,
     telling,
@@ -37,9 +36,9 @@ from fitting.continuation import (
 from fitting.continuation import precision as precision_at
 from fitting.likelihood import AnyArray, Bounds, Intervals, residual_deviation
 from fitting.model_fit import Evidence, ModelFit
-from fitting.solver.normal_equations import Picture
+from fitting.solver.normal_equations import Picture, Sums
 from fitting.solver.profile import Optimum, refit
-from fitting.solver.subsample import stratified
+from fitting.solver.subsample import Subsample, stratified
 from fitting.solver.tied import design_of
 
 SUBSAMPLE = 16384
@@ -242,7 +241,7 @@ def _near_edges(fit: ModelFit, at: Estimate, *, copies: bool) -> Evidence:
         at, known, said = maximise(problem, at, first=ROUGHLY_KNOWN)
     said, wider = where_most_is_told(problem, at, known, said, _of_planes(pictures, at, problem))
     working = list(map(_working, said.said))
-    optimum = _optimum(working, said, fit, Numbers.of(at.unknowns))
+    optimum = _optimum(working, fit, Numbers.of(at.unknowns))
     places = [_place(_picture(one.values)) for one in said.said]
     return Evidence(working, optimum, at.noise, at.value, places, wider)
 
@@ -259,30 +258,14 @@ def _of_planes(pictures: Sequence[Picture], at: Estimate, problem: "_Separable")
     return precision_at(alone, at, alone.score(at, alone.near(at, REACH))).variance
 
 
-def _optimum(working: Sequence[Picture], said: Score, fit: ModelFit, at: Numbers) -> Optimum:
+def _optimum(working: Sequence[Picture], fit: ModelFit, at: Numbers) -> Optimum:
     """The optimum of the least squares that takes Newton's step, at which it rests."""
-    steps, scale = np.zeros(at.x.shape[1]), np.ones((at.x.shape[1], 4))
-    # By n, not by its logarithm, and of the lobe, not of the highlight.
-    scale[:, 3] = math.exp(-at.log_n) * np.divide(1.0, at.x[2], out=np.zeros_like(steps), where=at.x[2] > 0)
-    if not fit.free[2].any():
-        scale[:, 2] = 0.0
-    weight, score = (sum(parts) for parts in zip(*(one.sums() for one in said.said), strict=True))
-    gram, score = weight * scale[:, :, None] * scale[:, None, :], score * scale
-    product = score + np.einsum("cij,jc->ci", gram[..., :3], at.x)
-    square, count = np.zeros_like(steps), np.zeros_like(steps)
-    for picture in working:
-        weight = np.asarray(picture.weights)
-        left = np.asarray(picture.target) - picture.shown(math.exp(at.log_n), at.x)
-        steps += np.sum(weight * left**2, axis=0)
-        square += np.sum(weight * np.asarray(picture.target) ** 2, axis=0)
-        count += np.count_nonzero(weight, axis=0)
-    flat = not np.any(at.x[2] > 0)
-    return dataclasses.replace(
-        fit.optimum,
-        **{"n": math.exp(at.log_n), "x": at.x, "cost": steps, "pixels": count, "gram": gram, "product": product},
-        square=square,
-        flat=flat,
-    )
+    n, lobe = math.exp(at.log_n), bool(fit.free[2].any())
+    parts = Subsample(list(working), [None] * len(working), 0.0).sums(np.array([at.log_n]), 0.0)
+    # By n, not by its logarithm.
+    about = Sums(*(leaf[0] for leaf in parts)).columns(np.diag([1.0, 1.0, lobe, lobe / n]))
+    cost, flat = np.maximum(about.about(-at.x.T).square, 0.0), not np.any(at.x[2] > 0)
+    return dataclasses.replace(fit.optimum, n=n, x=at.x, cost=cost, flat=flat, **about._asdict())
 
 
 def _reweighted(
