@@ -100,7 +100,7 @@ def sensitivity(result: FitResult, by: Callable[[list[brdf.Scene]], Sequence[Any
         except brdf.InputError as error:
             raise brdf.InputError("by", error.what, "Return leaves of the scenes, each once") from None
         vector = np.array(problem.start())
-        blocks = np.split(np.arange(vector.size), np.cumsum([leaf.size for leaf in problem.freed()])[:-1])
+        blocks = np.split(np.arange(vector.size), problem.ends)
         index, known = dict(zip(names, blocks, strict=False)), blocks[len(names) :]
         unknowns = _unknowns(result, index, vector.size)
         # A fit in float32 stops a little beside the stationary point; Newton's steps go there.

@@ -229,7 +229,7 @@ def _solve(problem: JointProblem, seen: Observed, solver: str, tolerance: float,
         residual = np.asarray(problem.residuals(jnp.asarray(vector)), np.float64)
     found = problem.at(jnp.asarray(vector))
     warnings = () if converged else (f"the solver stopped after {steps} steps without an end: raise max_steps",)
-    parts = np.split(residual, np.cumsum([target.size for target in problem.targets])[:-1])
+    parts = problem.by_picture(residual)
     residuals = [part.reshape(shown.shape) for part, shown in zip(parts, seen.shown, strict=True)]
     left = left_over(seen, residuals, vector.size, warnings)
     material, scenes = jax.tree.map(np.asarray, found.content())
@@ -315,8 +315,7 @@ def _with_errors(
     Of a direction the length is no unknown: its errors are those of two small turns across it.
     """
     vector, design = known.vector, np.where(held[:, None], 0.0, problem.design(known.vector))
-    blocks = np.split(np.arange(vector.size), np.cumsum([leaf.size for leaf in problem.freed()])[:-1])
-    both = list(zip(problem.names, blocks, strict=True))
+    both = list(zip(problem.names, np.split(np.arange(vector.size), problem.ends), strict=True))
     sizes = [2 if name in DIRECTIONS else len(block) for name, block in both]
     hessian, ends = design.T @ known.hessian @ design, np.cumsum(sizes)[:-1]
     covariance, variance = scaled_inverse(hessian, DEPENDENT), inverse_diagonal(hessian, DEPENDENT)

@@ -93,10 +93,10 @@ class RenderedPictures(Problem):
 
     def shown(self, unknowns: Float[np.ndarray, " U"], values: Sequence[Values]) -> Iterator[tuple[Any, Any]]:
         """What is predicted, and its derivatives by all numbers."""
-        residuals, columns = (np.asarray(part, np.float64) for part in linearised(self._problem, jnp.asarray(unknowns)))
-        parts = np.split(columns, np.cumsum([target.size for target in self._problem.targets])[:-1], axis=1)
+        residuals, columns = map(np.asarray, linearised(self._problem, jnp.asarray(unknowns)))
+        parts = self._problem.by_picture(columns)
         for some, radiance, part in zip(values, self._radiance(residuals), parts, strict=True):
-            yield radiance[some.which], part.reshape(len(part), *radiance.shape)[:, some.which]
+            yield radiance[some.which], part[:, some.which]
 
     def scatter(self, said: Score) -> Float[np.ndarray, "U U"] | None:
         """What takes the place of the Hessian where the pixels of a block err together; None where they do not.
@@ -115,9 +115,7 @@ class RenderedPictures(Problem):
         return np.sum(parts, axis=0)
 
     def _radiance(self, residuals: Float[np.ndarray, " N"]) -> list[Float[np.ndarray, "P C"]]:
-        targets = [np.asarray(target, np.float64) for target in self._problem.targets]
-        parts = np.split(np.asarray(residuals, np.float64), np.cumsum([target.size for target in targets])[:-1])
-        return [part.reshape(target.shape) + target for part, target in zip(parts, targets, strict=True)]
+        return [*map(operator.add, self._problem.by_picture(residuals), map(np.asarray, self._problem.targets))]
 
 
 @eqx.filter_jit

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 import brdf
 from brdf.errors import InputError
@@ -47,6 +47,21 @@ class JointProblem(eqx.Module):
         """The freed leaves."""
         return [self.leaves[place] for place in self.places]
 
+    @property
+    def ends(self) -> Int[np.ndarray, " L"]:
+        """Where in the vector each freed leaf but the last one ends."""
+        return np.cumsum([leaf.size for leaf in self.freed()])[:-1]
+
+    def by_picture(self, values: Float[np.ndarray, "*B N"]) -> list[Float[np.ndarray, "*B P C"]]:
+        """What the residuals of each picture are, or their derivatives.
+
+        Args:
+            values: of all pictures, one after the other.
+        """
+        parts = np.split(values, np.cumsum([target.size for target in self.targets])[:-1], axis=-1)
+        both = zip(parts, self.targets, strict=True)
+        return [np.asarray(part, np.float64).reshape(*part.shape[:-1], *target.shape) for part, target in both]
+
     def _each(self, of: Callable[[str], bool]) -> Bool[np.ndarray, " U"]:
         return np.repeat([of(name) for name in self.names], [leaf.size for leaf in self.freed()])
 
@@ -62,16 +77,12 @@ class JointProblem(eqx.Module):
 
     def design(self, vector: Float[np.ndarray, " U"]) -> Float[np.ndarray, "U V"]:
         """What each small change moves of the numbers: of a direction two small turns, its length is no unknown."""
-        blocks, begin = [], 0
-        for leaf, name in zip(self.freed(), self.names, strict=True):
-            own = vector[begin : begin + leaf.size]
-            blocks.append(_across(own).T if name in DIRECTIONS else np.eye(leaf.size))
-            begin += leaf.size
-        found, row, column = np.zeros((begin, sum(block.shape[1] for block in blocks))), 0, 0
-        for block in blocks:
-            found[row : row + len(block), column : column + block.shape[1]] = block
-            row, column = row + len(block), column + block.shape[1]
-        return found
+        from scipy.linalg import block_diag  # late: few commands fit jointly
+
+        both = zip(np.split(vector, self.ends), self.names, strict=True)
+        return np.asarray(
+            block_diag(*(_across(own).T if name in DIRECTIONS else np.eye(own.size) for own, name in both))
+        )
 
     def start(self) -> Array:
         """The freed numbers as they are searched: n by its logarithm."""
@@ -80,10 +91,9 @@ class JointProblem(eqx.Module):
 
     def at(self, vector: Array) -> "JointProblem":
         """The problem with other freed numbers."""
-        leaves, begin = list(self.leaves), 0
-        for place, name in zip(self.places, self.names, strict=True):
-            part = vector[begin : begin + leaves[place].size].reshape(leaves[place].shape)
-            leaves[place], begin = jnp.exp(part) if name == "n" else part, begin + part.size
+        leaves = list(self.leaves)
+        for place, name, part in zip(self.places, self.names, jnp.split(vector, self.ends), strict=True):
+            leaves[place] = (jnp.exp(part) if name == "n" else part).reshape(leaves[place].shape)
         return eqx.tree_at(lambda problem: problem.leaves, self, leaves)
 
     def content(self) -> tuple[brdf.Material, list[brdf.Scene]]:
