@@ -1,6 +1,5 @@
 """Which light to add to those of maps: the texels' information on their exponents, light by light."""
 
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -10,8 +9,8 @@ import numpy as np
 import brdf
 from brdf.errors import InputError
 from brdf.models.base import SpecularMaterial
-from brdf.vectors import dot
 from fitting.light_choice import LightChoice, choose_lights, direction_of
+from fitting.maps.texels import Distant
 
 if TYPE_CHECKING:
     from fitting.maps.map_result import Maps
@@ -23,18 +22,14 @@ MOST_TEXELS = 4096
 """Of the maps at most so many texels are looked at, evenly spread."""
 
 
-def _lobe(model: type[SpecularMaterial], weight: Any, log_cosine: Any, log_n: Any) -> Any:
-    n = jnp.exp(log_n)
-    return model.scale(n) * weight * jnp.exp(n * log_cosine)
-
-
 def next_light(maps: "Maps", candidates: Any, count: int, of: str) -> LightChoice:
     """See `Maps.next_light`."""
     if of not in ("n", "undetermined"):
         raise InputError("of", f"must be n or undetermined, got {of!r}", "Ask for one of these")
     if maps.to_light is None or maps.noise is None:
         raise InputError("maps", "do not know directions of their lights", "Fit them under distant lights")
-    glossy = [issubclass(brdf.MODELS[name], SpecularMaterial) for name in maps.models]
+    models = [brdf.MODELS[name] for name in maps.models]
+    glossy = [issubclass(model, SpecularMaterial) for model in models]
     shows = np.any(maps.fitted_k_s > 0, axis=-1) & np.array(glossy)[maps.chosen] & (maps.noise > 0)
     texel = np.flatnonzero(shows)
     if not texel.size:
@@ -48,18 +43,13 @@ def next_light(maps: "Maps", candidates: Any, count: int, of: str) -> LightChoic
     @jax.jit
     def products(to_light: Any) -> Any:
         """Of the columns of k_d and k_s and the derivative by ln n: the upper triangle of their Gram matrix, (6, T)."""
-        cosine = jnp.maximum(dot(normal, to_light), 0)
-        lobe = slope = jnp.zeros_like(cosine)
-        for index, name in enumerate(maps.models):
-            model = brdf.MODELS[name]
-            if not issubclass(model, SpecularMaterial):
-                continue
-            log_cosine, weight = model.log_cosine(normal, to_light, to_view), cosine if model.cosine_weighted else 1.0
-            at = jnp.asarray(log_n)
-            found = jax.jvp(partial(_lobe, model, weight, log_cosine), (at,), (jnp.ones_like(at),))
-            here = (chosen == index) & (cosine > 0)
-            lobe, slope = (jnp.where(here, new, old) for new, old in zip(found, (lobe, slope), strict=True))
-        columns = cosine, lobe, slope
+        lights, seen = Distant(to_light[None], to_view, None), jnp.ones((1, len(normal)))
+        columns = [jnp.zeros(len(normal))] * 3
+        for index, model in enumerate(models):
+            if issubclass(model, SpecularMaterial):
+                told = lights.columns(model, normal.T, seen)
+                found = *told.linear, *told.lobe(model, jnp.asarray(log_n))
+                columns = [jnp.where(chosen == index, new[0, 0], old) for new, old in zip(found, columns, strict=True)]
         return jnp.stack([a * b for i, a in enumerate(columns) for b in columns[i:]])
 
     def told_by(light: Any) -> np.ndarray:
