@@ -341,7 +341,9 @@ class Intervals:
             return LogLikelihood(*(part[: len(predicted)] for part in found))
         up = 2 * predicted >= self._turn
         beyond = np.where(up, predicted - self._high, self._low - predicted) / s
-        tables = list(map(_table, (self._kinds / s).tolist()))
+        ratios = self._kinds / s
+        # Of two ends so far apart one tells.
+        tables = list(map(_table, np.where(ratios < 2 * _INSIDE, ratios, np.inf).tolist()))
         first, step = (np.array([getattr(one, name) for one in tables])[self._kind] for name in ("first", "step"))
         position = np.clip((beyond - first) / step, 0.0, _KNOTS - 1.000001)
         index = position.astype(np.intp)
