@@ -40,7 +40,7 @@ CAP = 32.0
 """k_s is at most so many times the brightest value of its texel: where no light comes near the mirror direction, k_s
 and n would go up together without end."""
 
-JOINT_STEPS = 3
+JOINT_STEPS = 5
 """Gauss-Newton steps of material and normal together."""
 
 HIGHLIGHTS = (4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0)

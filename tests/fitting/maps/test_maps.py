@@ -155,6 +155,18 @@ def test_normals_are_found_beside_the_material():
     assert 0.5 < np.median(angle) / np.median(maps.normal_error) < 2
 
 
+def test_normals_and_highlight_are_at_their_common_optimum():
+    random, lights = np.random.default_rng(40), dome(40)
+    place = random.uniform(-0.45, 0.45, (600, 2))
+    normal = np.column_stack([place, np.sqrt(1 - np.sum(place**2, axis=1))])
+    pictures = seen_by_equation(lights, normal, 0.5, 0.3, 20.0)
+    pictures = pictures + 0.01 * random.normal(size=pictures.shape)
+    found, given = (fitting.fit_maps(pictures, lights, one) for one in ("fit", normal[None]))
+    angle = np.degrees(np.arccos(np.clip(np.sum(found.normal[0] * normal, axis=-1), -1, 1)))
+    assert np.mean(found.residual > 1.02 * given.residual) < 0.01
+    assert np.mean(angle > 3 * found.normal_error[0]) < 0.01
+
+
 def seen_by_equation(lights, normal, k_d, k_s, n):
     """Photographs (P, 1, T, 3) of texels of one material, grey but for three factors of k_d."""
     half = (lights + VIEW) / np.linalg.norm(lights + VIEW, axis=1)[:, None]
