@@ -101,10 +101,8 @@ class Codes(NamedTuple):
             )
         lower = np.where(good & (code > self.ends[0]), np.minimum(code, top) - flat(self.below), -np.inf)
         upper = np.where(good & (code < top), code + flat(self.above), np.inf)
-        scale, unit, spread = (np.asarray(part, np.float64) for part in (self.scale, self.unit, spread))
-        index, width = np.arange(len(code)), np.asarray(self.values.shape[1])
-        lower, upper = _stored(lower), _stored(upper)
-        return Bounds(lower, upper, scale, unit, index, width, spread, self.encoding, self.lossy)
+        coded = {"scale": self.scale, "unit": self.unit, "encoding": self.encoding, "lossy": self.lossy}
+        return _bounds(lower, upper, self.values.shape[1], spread, **coded)
 
 
 def _mixed(beside: Bool[np.ndarray, "H W"], size: int) -> Bool[np.ndarray, " P"]:
@@ -174,14 +172,16 @@ def open_ends(
         return None
     lower = np.where(good & ~low, np.where(high, min(level or np.inf, np.inf), values), -np.inf)
     upper = np.where(good & ~high, values, np.inf)
-    index, one, spread = np.arange(len(values)), np.ones(()), np.asarray(spread, np.float64)
-    lower, upper, pitch = _stored(lower), _stored(upper), np.asarray(width)
-    return Bounds(lower, upper, one, one, index, pitch, spread, "linear", lossy=False, exact=True)
+    return _bounds(lower, upper, width, spread, exact=True)
 
 
-def _stored(bound: np.ndarray) -> np.ndarray:
-    """In the precision of the fit."""
-    return bound.astype(jnp.result_type(float))
+def _bounds(
+    lower: np.ndarray, upper: np.ndarray, width: int, spread: Any, scale: Any = 1.0, unit: Any = 1.0, **how: Any
+) -> Bounds:
+    """Of all pixels, row by row; in the precision of the fit."""
+    lower, upper = (end.astype(jnp.result_type(float)) for end in (lower, upper))
+    scale, unit, spread = (np.asarray(part, np.float64) for part in (scale, unit, spread))
+    return Bounds(lower, upper, scale, unit, np.arange(len(lower)), np.asarray(width), spread, **how)
 
 
 def single_values_at_end(

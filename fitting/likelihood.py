@@ -79,8 +79,8 @@ class Bounds(eqx.Module):
     index: Int[np.ndarray, " P"]
     width: Int[np.ndarray, ""]
     spread: Float[np.ndarray, "*P"]
-    encoding: Encoding = eqx.field(static=True)
-    lossy: bool = eqx.field(static=True)
+    encoding: Encoding = eqx.field(static=True, default="linear")
+    lossy: bool = eqx.field(static=True, default=False)
     exact: bool = eqx.field(static=True, default=False)
 
     def codes(self, radiance: Float[AnyArray, "*shape"]) -> tuple[Any, Any]:
