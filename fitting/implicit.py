@@ -29,8 +29,11 @@ from brdf.precision import working_precision
 from fitting.joint_problem import JointProblem, joint_problem
 from fitting.progress import waiting
 from fitting.result import FitResult
+from fitting.solver.nnls import inverse_diagonal, scaled_inverse
 
 NEWTON_STEPS = 3
+# Of the largest eigenvalue of the Hessian: a smaller one determines nothing.
+DEPENDENT = 1e-13
 
 
 @dataclass(frozen=True)
@@ -149,11 +152,8 @@ def _unknowns(result: FitResult, index: dict[str, np.ndarray], size: int) -> Flo
 
 def _solve(hessian: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Scaled by the diagonal, since coefficients and exponent differ by orders of magnitude in what they move."""
-    diagonal = np.diag(hessian)
-    if not np.all(np.isfinite(hessian)) or np.any(diagonal <= 0):
+    if not np.all(np.isfinite(hessian)) or np.any(np.diag(hessian) <= 0):
         raise brdf.InputError("result", "lies at no minimum that the picture determines", "Hold or mask less")
-    scale = 1.0 / np.sqrt(diagonal)[:, None]
-    normed = hessian * scale * scale.T
-    if np.linalg.eigvalsh(normed)[0] <= 1e-13:
+    if np.any(np.isinf(inverse_diagonal(hessian, DEPENDENT))):
         raise brdf.InputError("result", "is determined only in combinations of its numbers", "Fit a simpler model")
-    return scale * np.linalg.solve(normed, scale * right)
+    return scaled_inverse(hessian, DEPENDENT) @ right
