@@ -250,9 +250,7 @@ def _layers(
     shows = jnp.any(k_s > LEAST_HIGHLIGHT * noise * k_s_error, axis=0)
     capped = jnp.any(k_s >= target.cap, axis=0)
     tests = (~mask | (values == 0), freedom < 1, ~shows | (not glossy), capped, ~(error <= MOST_ERROR))
-    reason = jnp.zeros(lanes, jnp.uint8)
-    for number, holds in reversed([*enumerate(tests, start=1)]):
-        reason = jnp.where(holds, jnp.uint8(number), reason)
+    reason = jnp.select(tests, [jnp.uint8(number) for number in range(1, len(REASONS))], jnp.uint8(0))
     known = reason == 0
     inside = reason != REASONS.index("outside")
     names = ("k_a", "k_d")[-len(linear) :]
