@@ -28,7 +28,7 @@ from brdf.files import atomic_folder
 from brdf.lobes import Lobe
 from brdf.materials.material_file import material_to_dict
 from brdf.models.base import SpecularMaterial
-from fitting.model_fit import ModelFit
+from fitting.model_fit import N_RANGE, ModelFit
 from fitting.problem import check_choice, model_name
 from fitting.progress import waiting
 from fitting.report.saving import write_report
@@ -41,7 +41,6 @@ from fitting.uncertainty.interpretation import material_and_parameters
 from fitting.uncertainty.intervals import exponent_interval
 
 Loss = Literal["cosine", "squared", "log"]
-N_RANGE = (0.1, 1e6)
 
 # A lobe has to leave less than this share of the squares that Lambert leaves before it is worth its unknowns: half of
 # them where Lambert itself explains half of the table, else nine tenths.
@@ -411,7 +410,10 @@ def _fit_model(model, samples, loss, n_range):
     fit = ModelFit(model, [], optimum, free, n_range)
     interval = None
     if specular and not sure.n_reason:
-        interval = exponent_interval(fit, sure.n_error, sure.rise, 0.0, parabolic=True)
+        interval, sure = (
+            exponent_interval(fit, sure.n_error, sure.rise, 0.0, parabolic=True),
+            sure._replace(n_reason=fit.held),
+        )
     material, parameters = material_and_parameters(fit, sure, np.ones(channels), interval)
     parameters = tuple(one for one in parameters if one.name != "k_a")
     return BrdfCandidate(material, parameters, _losses(samples, modelled(optimum)))

@@ -42,6 +42,13 @@ class Evidence(NamedTuple):
         return self.optimum.normal() if self.together is None else self.together
 
 
+N_RANGE = (0.1, 1e6)
+"""Between which exponents is sought where nobody says."""
+
+HELD = 1e-6
+"""Of log n: nearer to a bound of its range n is held there."""
+
+
 class ModelFit(NamedTuple):
     """One model fitted to the pictures.
 
@@ -69,6 +76,12 @@ class ModelFit(NamedTuple):
     capped: bool = False
     evidence: Evidence | None = None
     moved: Float[np.ndarray, " U"] | None = None
+
+    @property
+    def held(self) -> str:
+        """Why n is none of the pixels': a bound that the user set holds it; empty where none does."""
+        bounds = [one for one in self.n_range if one not in N_RANGE and abs(np.log(self.optimum.n / one)) < HELD]
+        return f"it is held at {bounds[0]:g}, a bound of n_range" if bounds else ""
 
     @property
     def single(self) -> bool:

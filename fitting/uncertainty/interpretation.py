@@ -152,7 +152,7 @@ def interpret(
     # At k_d + k_s = 1 the cost still falls across the bound: a profile that does not know it has its least elsewhere.
     if lobe is not None and not sure.n_reason and not fit.capped:
         interval = exponent_interval(fit, sure.n_error, sure.rise, lobe.peak, parabolic=joined is not None)
-        sure = sure._replace(n_reason=_open_exponent(interval))
+        sure = sure._replace(n_reason=fit.held or _open_exponent(interval))
     if hidden:
         sure.reasons[2], sure = hidden, sure._replace(n_reason=hidden)
     material, parameters = material_and_parameters(fit, sure, seen.colour, interval)

@@ -206,3 +206,11 @@ def test_what_is_plausible_stays_so_without_its_highlight():
         picture = pictured(brdf.Lambert(k_d=[1.0]), white, 0.02, seed)
         material = fitting.fit(picture, white, model="normalized-phong", plausible=True).material
         assert float(material.k_d[0] + material.k_s[0]) <= 1 + 1e-6
+
+
+@pytest.mark.parametrize(("n", "bounds", "at"), [(400.0, (1, 128), "128"), (20.0, (50, 1000), "50")])
+def test_an_exponent_that_its_range_holds_is_told_as_that(n, bounds, at):
+    picture = pictured(brdf.BlinnPhong(k_a=0.1, k_d=0.5, k_s=0.3, n=n), SCENE, 0.01)
+    result = fitting.fit(picture, SCENE, model="blinn-phong", n_range=bounds)
+    assert result["n"].reason == f"it is held at {at}, a bound of n_range"
+    assert float(result.material.n) == pytest.approx(float(at))

@@ -148,6 +148,12 @@ def test_angles_beyond_the_limit_and_negative_values():
     assert any("below 0" in reason for reason in logarithmic.left_out)
 
 
+def test_an_exponent_that_its_range_holds_has_no_error():
+    result = fitting.fit_brdf(noisy_table(), "blinn-phong", n_range=(1e4, 1e5))
+    assert result["n"].error is None
+    assert result["n"].reason == "it is held at 10000, a bound of n_range"
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
