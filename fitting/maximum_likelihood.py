@@ -65,27 +65,20 @@ END_REACH, NO_NOISE = 4.0, 1e-5
 
 
 class Numbers(NamedTuple):
-    """What a picture is predicted from.
+    """What a picture is predicted from; an optimum has both, too.
 
     Attributes:
+        n: exponent.
         x: coefficients x_a, x_d, x_s, at least 0, (3, C).
-        log_n: logarithm of the exponent.
     """
 
+    n: float
     x: Float[np.ndarray, "3 C"]
-    log_n: float
 
     @classmethod
-    def of(cls, at: Optimum | Float[np.ndarray, " U"]) -> "Numbers":
-        """Those of an optimum, or the unknowns: coefficients, channel after channel each, and log n."""
-        if isinstance(at, Optimum):
-            return cls(at.x, math.log(at.n))
-        return cls(at[:-1].reshape(3, -1), float(at[-1]))
-
-    @property
-    def unknowns(self) -> Float[np.ndarray, " U"]:
-        """All of them."""
-        return np.append(self.x.ravel(), self.log_n)
+    def of(cls, unknowns: Float[np.ndarray, " U"]) -> "Numbers":
+        """The unknowns: coefficients, channel after channel each, and log n."""
+        return cls(math.exp(unknowns[-1]), unknowns[:-1].reshape(3, -1))
 
 
 def most_likely(
@@ -105,33 +98,34 @@ def most_likely(
     deviation = math.sqrt(float(np.sum(optimum.cost)) / max(float(np.sum(optimum.pixels)), 1.0))
     if exact and deviation <= NO_NOISE * float(np.max(optimum.square / np.maximum(optimum.pixels, 1))) ** 0.5:
         return fit
-    at = Numbers.of(optimum)
     lossy = any(bounds.lossy for bounds in map(bounds_of, fit.pictures))
-    noise = _deviation(fit.pictures, at)
+    noise = _deviation(fit.pictures, optimum)
     if not lossy:
-        fit, noise = _where_noise_is_even(fit, at, noise)
+        fit, noise = _where_noise_is_even(fit, noise)
     # Weights of least squares leave out what is clipped, which says something here.
-    weights = [alike(bounds_of(picture), _codes(picture, at), noise) if lossy else None for picture in fit.pictures]
+    weights = [
+        alike(bounds_of(picture), _codes(picture, optimum), noise) if lossy else None for picture in fit.pictures
+    ]
     pictures = list(map(_with_weight, fit.pictures, weights))
     rounding = 0.0 if exact else 1 / 12
     widest = 1.0 if exact else max(_widest(picture) for picture in pictures)
     if exact or lossy or noise**2 > (ENOUGH_NOISE**2 + rounding) * widest**2:
         linear = all(bounds.encoding == "linear" for bounds in map(bounds_of, pictures))
-        if linear and not lossy and not any(_open_ends_tell(picture, at, noise) for picture in pictures):
+        if linear and not lossy and not any(_open_ends_tell(picture, optimum, noise) for picture in pictures):
             return fit
         together = lossy and not copies and (grey is not None or fit.tied is not None) and can_be_coupled(pictures)
         if together and grey is not None:
             fit = fit._replace(tied=np.where(fit.free[2], grey, 0.0))
         said = _reweighted(fit._replace(pictures=pictures), noise, rounding, precision, together=together)
     else:
-        start = Estimate(at.unknowns, max(noise, FIRST_NOISE))
+        start = Estimate(np.append(optimum.x.ravel(), math.log(optimum.n)), max(noise, FIRST_NOISE))
         said = _near_edges(fit._replace(pictures=pictures), start, copies=copies)
     found = said.optimum
     optimum = dataclasses.replace(optimum, x=found.x, n=found.n, flat=found.flat)
     return fit._replace(optimum=optimum, evidence=said)
 
 
-def _deviation(pictures: Sequence[Picture], at: Numbers) -> float:
+def _deviation(pictures: Sequence[Picture], at: Optimum) -> float:
     """Standard deviation of what is left, in codes."""
     return residual_deviation(map(bounds_of, pictures), map(partial(_codes, at=at), pictures))
 
@@ -155,12 +149,12 @@ def _in_light(pictures: Sequence[Picture]) -> list[Picture]:
     return [dataclasses.replace(picture, bounds=bounds_of(picture).in_light(size)) for picture in pictures]
 
 
-def _where_noise_is_even(fit: ModelFit, at: Numbers, noise: float) -> tuple[ModelFit, float]:
+def _where_noise_is_even(fit: ModelFit, noise: float) -> tuple[ModelFit, float]:
     """A fit and its noise in codes, or in light where noise of one size there is likelier and more than rounding."""
     if not _is_curved(fit.pictures):
         return fit, noise
     light = fit._replace(pictures=_in_light(fit.pictures))
-    after = _deviation(light.pictures, at)
+    after = _deviation(light.pictures, fit.optimum)
     if not min(noise, after) > 0:
         return fit, noise
     widths = zip(map(bounds_of, fit.pictures), map(bounds_of, light.pictures), strict=True)
@@ -260,12 +254,12 @@ def _of_planes(pictures: Sequence[Picture], at: Estimate, problem: "_Separable")
 
 def _optimum(working: Sequence[Picture], fit: ModelFit, at: Numbers) -> Optimum:
     """The optimum of the least squares that takes Newton's step, at which it rests."""
-    n, lobe = math.exp(at.log_n), bool(fit.free[2].any())
-    parts = Subsample(list(working), [None] * len(working), 0.0).sums(np.array([at.log_n]), 0.0)
+    lobe = bool(fit.free[2].any())
+    parts = Subsample(list(working), [None] * len(working), 0.0).sums(np.log([at.n]), 0.0)
     # By n, not by its logarithm.
-    about = Sums(*(leaf[0] for leaf in parts)).columns(np.diag([1.0, 1.0, lobe, lobe / n]))
+    about = Sums(*(leaf[0] for leaf in parts)).columns(np.diag([1.0, 1.0, lobe, lobe / at.n]))
     cost, flat = np.maximum(about.about(-at.x.T).square, 0.0), not np.any(at.x[2] > 0)
-    return dataclasses.replace(fit.optimum, n=n, x=at.x, cost=cost, flat=flat, **about._asdict())
+    return dataclasses.replace(fit.optimum, n=at.n, x=at.x, cost=cost, flat=flat, **about._asdict())
 
 
 def _reweighted(
@@ -372,7 +366,7 @@ def _stated(picture: Picture, optimum: Optimum, noise: float, rounding: float) -
     if index.size:
         s = math.sqrt(max(noise**2 - rounding, LEAST_SHARE * noise**2))
         values = _values(picture.in_double(index))
-        said = values.said(*_shown(_picture(values), Numbers.of(optimum)), s)
+        said = values.said(*_shown(_picture(values), optimum), s)
         told, radiance, slope = jax.tree.map(lambda part: part[: index.size], (said.told, said.radiance, said.slope))
         at_end, own = half[index], s * bounds.spread[index if bounds.spread.ndim else ...]
         weighs = np.broadcast_to(values.weight, said.radiance.shape)[: index.size]
@@ -450,11 +444,10 @@ class _Separable(Problem):
             yield _shown(_picture(some), Numbers.of(unknowns))
 
 
-def _shown(picture: Picture, at: Numbers) -> tuple[Float[np.ndarray, "P C"], Float[np.ndarray, "4 P C"]]:
+def _shown(picture: Picture, at: Numbers | Optimum) -> tuple[Float[np.ndarray, "P C"], Float[np.ndarray, "4 P C"]]:
     """Radiance, and its derivatives by x_a, x_d, x_s and log n."""
-    n = math.exp(at.log_n)
-    columns = picture.columns(n)
-    columns[3] *= n * at.x[2]
+    columns = picture.columns(at.n)
+    columns[3] *= at.n * at.x[2]
     return columns[0] * at.x[0] + columns[1] * at.x[1] + columns[2] * at.x[2], columns
 
 
@@ -475,7 +468,7 @@ def _working(said: Said) -> Picture:
     return dataclasses.replace(_picture(said.values), target=said.radiance + step, weight=said.weight, bounds=None)
 
 
-def _near(picture: Picture, at: Numbers, distance: float) -> Bool[np.ndarray, " P"]:
+def _near(picture: Picture, at: Numbers | Optimum, distance: float) -> Bool[np.ndarray, " P"]:
     """Which pixels say something: those with a value not surely inside its bounds."""
     return bounds_of(picture).near(_codes(picture, at), distance)
 
@@ -512,9 +505,9 @@ def bounds_of(picture: Picture) -> Bounds:
     return picture.bounds
 
 
-def _codes(picture: Picture, at: Numbers) -> np.ndarray:
+def _codes(picture: Picture, at: Numbers | Optimum) -> np.ndarray:
     """What is predicted, in codes, (P, C)."""
-    radiance = picture.shown(math.exp(at.log_n), at.x).astype(np.float64)
+    radiance = picture.shown(at.n, at.x).astype(np.float64)
     return bounds_of(picture).codes(radiance)[0]
 
 
@@ -524,7 +517,7 @@ def _widest(picture: Picture) -> float:
     return float(np.max(width, where=np.isfinite(width), initial=0.0))
 
 
-def _open_ends_tell(picture: Picture, at: Numbers, noise: float) -> bool:
+def _open_ends_tell(picture: Picture, at: Optimum, noise: float) -> bool:
     """Whether some value is known by one end only and is predicted near it."""
     half = np.any(np.isfinite(bounds_of(picture).lower) ^ np.isfinite(bounds_of(picture).upper), axis=1)
     return bool(half.any()) and bool(np.any(_near(picture, at, END_REACH * noise)[half]))
@@ -540,7 +533,7 @@ def highlight_in_codes(picture: Picture, x: np.ndarray, n: float) -> float:
     """
     if picture.bounds is None or picture.bounds.exact:
         return math.inf
-    shown = [_codes(picture, Numbers(some, math.log(n))) for some in (x, x * [[1], [1], [0]])]
+    shown = [_codes(picture, Numbers(n, some)) for some in (x, x * [[1], [1], [0]])]
     return float(np.max(shown[0] - shown[1]))
 
 
@@ -553,5 +546,5 @@ def unexplained(picture: Picture, x: np.ndarray, n: float) -> np.ndarray:
         n: exponent.
     """
     assert picture.bounds is not None
-    code = _codes(picture, Numbers(x, math.log(n)))
+    code = _codes(picture, Numbers(n, x))
     return np.maximum(picture.bounds.lower - code, 0.0) - np.maximum(code - picture.bounds.upper, 0.0)
