@@ -161,7 +161,8 @@ def interpret(
     correlation = sure.correlation[np.ix_(index, index)]
     warnings = [_capped(material)] if fit.capped else []
     warnings += _missing_ambient(pictures)
-    warnings += _warnings(known, together, None if all(sure.reasons[2]) else lobe)
+    weighed = seen.problem.noise is not None or any(one is not None for one in seen.problem.weights)
+    warnings += _warnings(known, together, None if all(sure.reasons[2]) else lobe, weighed)
     warnings += _hard_to_tell(free, correlation)
     if sure.sums:
         words = "no more than a sum of several numbers is determined, see there: the material shows it with "
@@ -353,7 +354,9 @@ def _missing_ambient(pictures: Sequence[Picture]) -> Iterator[str]:
         )
 
 
-def _warnings(known: ResidualCorrelation, together: Structure | None, seen: Highlight | None) -> Iterator[str]:
+def _warnings(
+    known: ResidualCorrelation, together: Structure | None, seen: Highlight | None, weighed: bool
+) -> Iterator[str]:
     if known.significant or (together is not None and together.significant):
         words = "the residual has structure: neighbouring pixels err alike"
         if known.correlation > 0.05:
@@ -367,9 +370,10 @@ def _warnings(known: ResidualCorrelation, together: Structure | None, seen: High
             )
         yield words
     if known.noise is not None:
+        how = "the weights do not" if weighed else "pixels are weighed alike"
         yield (
-            "the noise grows with brightness; the errors allow for it, but pixels are weighed alike: told of the "
-            "camera's noise, or with the relative loss, the same picture says more"
+            f"the noise grows with brightness; the errors allow for it, but {how}: told of the camera's noise, or with "
+            "the relative loss, the same picture says more"
         )
     if seen is not None and seen.smaller_than_pixel:
         # Below this share of the peak the distance from the centre says more than the number of pixels.

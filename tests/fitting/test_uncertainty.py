@@ -101,7 +101,10 @@ def test_noise_in_proportion_to_the_value_is_allowed_for():
         result = fitting.fit(noisy(truth, 0.02 * clean, seed), SCENE, model="blinn-phong", **OPTIONS)
         low, high = result.parameters[-1].interval
         inside.append(low <= 60.0 <= high)
-    assert any("grows with brightness" in text for text in result.warnings)
+    assert any("grows with brightness" in text and "weighed alike" in text for text in result.warnings)
+    weight = np.linspace(0.5, 1, clean[..., 0].size).reshape(clean.shape[:2])
+    result = fitting.fit(noisy(truth, 0.02 * clean, 0), SCENE, model="blinn-phong", weight=weight, **OPTIONS)
+    assert any("grows with brightness" in text and "but the weights do not" in text for text in result.warnings)
     # 3 standard deviations of 100 draws; with a single variance it is about a half.
     assert np.mean(inside) > 0.88
 
