@@ -9,7 +9,7 @@ import numpy as np
 import brdf
 from brdf.checks import direction_value
 from brdf.errors import InputError
-from brdf.precision import Precision
+from brdf.precision import Precision, working_precision
 from fitting.maps import map_inputs
 from fitting.maps.encoding_guess import likelier
 from fitting.maps.map_bands import Bands
@@ -101,7 +101,8 @@ def fit_maps(
         raise InputError("specular", f"must be coloured or grey, got {specular!r}", "Choose one of them")
     models = _models(model)
     given = map_inputs.photographs(pictures, lights, intensities, exposures, encoding)
-    surface = _surface(given, normals, mask, to_view, flip_y)
+    with working_precision(precision):
+        surface = _surface(given, normals, mask, precision, flip_y)
     to_view = np.asarray(direction_value("to_view", to_view))
     if surface.points is not None:
         to_view = np.sum(np.asarray(surface.points.to_view, float)[np.asarray(surface.mask)], axis=0)
@@ -136,7 +137,7 @@ def _ambient(ambient: Any, given: Photographs) -> np.ndarray | None:
     return columns[:, :1] if np.all(columns == columns[:, :1]) else columns
 
 
-def _surface(given: Photographs, normals: Any, mask: Any, to_view: Any, flip_y: bool) -> Surface:
+def _surface(given: Photographs, normals: Any, mask: Any, precision: Precision, flip_y: bool) -> Surface:
     """What the texels see."""
     _, height, width, _ = given.shape
     if mask is None:
@@ -148,7 +149,7 @@ def _surface(given: Photographs, normals: Any, mask: Any, to_view: Any, flip_y: 
     if given.scenes is not None:
         if normals is not None:
             raise InputError("normals", "are told by the scenes", "Leave them out")
-        points = given.scenes[0].surface_points()
+        points = brdf.cast(given.scenes[0], precision).surface_points()
         if points.mask.shape != (height, width):
             came = f"show {points.mask.shape[1]} x {points.mask.shape[0]} pixels, the photographs {width} x {height}"
             raise InputError("lights", came, "Give scenes of the photographs' size")

@@ -255,7 +255,7 @@ def test_scenes_tell_ambient_light_shadow_masks_and_the_view():
     known = maps.determined
     assert known.mean() > 0.5
     for found, true in ((maps.k_a, truth.k_a), (maps.k_d, truth.k_d), (maps.n, truth.n)):
-        np.testing.assert_allclose(found[known], np.broadcast_to(true, found[known].shape), rtol=5e-3)
+        np.testing.assert_allclose(found[known], np.broadcast_to(true, found[known].shape), rtol=1e-6)
     alone = brdf.Scene(camera, [ball], lights=[brdf.DirectionalLight(lights[3], [2.0, 1.0, 0.5])])
     shown = maps.render(alone.lights[0])
     np.testing.assert_allclose(shown[known], np.asarray(brdf.render(truth, alone))[known], atol=1e-3)
