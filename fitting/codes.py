@@ -86,9 +86,8 @@ class Codes(NamedTuple):
         """
         channels = self.values.shape[2]
 
-        def flat(values: Any) -> np.ndarray:
-            values = np.broadcast_to(values, self.values.shape)[rows]
-            return values.reshape(-1, channels).astype(np.float64)
+        def flat(values: Any) -> Any:
+            return values[rows].reshape(-1, channels) if np.ndim(values) else values
 
         if self.lossy:
             inside = valid & ~_mixed(~valid.reshape(-1, self.values.shape[1]), BLOCK if channels == 1 else 2 * BLOCK)

@@ -33,7 +33,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from brdf.images.encoding import Encoding, decode
 
@@ -132,7 +132,7 @@ class Bounds(eqx.Module):
         inside = np.minimum(code - self.lower, self.upper - code)
         return np.any(inside < distance * self.spread, axis=1)
 
-    def pixels(self, choose: Callable[[Any], Array]) -> "Bounds":
+    def pixels(self, choose: Callable[[Any], Any]) -> "Bounds":
         """Those of some pixels."""
         lower, upper, index = choose(self.lower), choose(self.upper), choose(self.index)
         spread = choose(self.spread) if self.spread.ndim else self.spread

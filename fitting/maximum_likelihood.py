@@ -41,7 +41,7 @@ from fitting.solver.profile import Optimum, refit
 from fitting.solver.subsample import Subsample, stratified
 from fitting.solver.tied import design_of
 
-SUBSAMPLE = 16384
+SUBSAMPLE = 8192
 # The noise of a part of the pixels is known well enough to this factor.
 ROUGHLY_KNOWN = 1.2
 # In codes: with more noise than this, and no code at an end, a linear picture says what least squares says.
@@ -108,7 +108,7 @@ def most_likely(
     ]
     pictures = list(map(_with_weight, fit.pictures, weights))
     rounding = 0.0 if exact else 1 / 12
-    widest = 1.0 if exact else max(_widest(picture) for picture in pictures)
+    widest = 1.0 if exact else max(_widest(picture) for picture in map(_thinned, pictures))
     if exact or lossy or noise**2 > (ENOUGH_NOISE**2 + rounding) * widest**2:
         linear = all(bounds.encoding == "linear" for bounds in map(bounds_of, pictures))
         if linear and not lossy and not any(_open_ends_tell(picture, optimum, noise) for picture in pictures):
@@ -127,7 +127,14 @@ def most_likely(
 
 def _deviation(pictures: Sequence[Picture], at: Optimum) -> float:
     """Standard deviation of what is left, in codes."""
-    return residual_deviation(map(bounds_of, pictures), map(partial(_codes, at=at), pictures))
+    some = list(map(_thinned, pictures))
+    return residual_deviation(map(bounds_of, some), map(partial(_codes, at=at), some))
+
+
+def _thinned(picture: Picture) -> Picture:
+    """Every so many of the pixels that say something, which tell the noise as well."""
+    tell = np.flatnonzero(np.isfinite(bounds_of(picture).lower[:, 0]) | np.isfinite(bounds_of(picture).upper[:, 0]))
+    return picture if tell.size <= 2 * SUBSAMPLE else picture.in_double(tell[:: tell.size // SUBSAMPLE])
 
 
 def _is_curved(pictures: Sequence[Picture]) -> bool:
@@ -151,16 +158,19 @@ def _in_light(pictures: Sequence[Picture]) -> list[Picture]:
 
 def _where_noise_is_even(fit: ModelFit, noise: float) -> tuple[ModelFit, float]:
     """A fit and its noise in codes, or in light where noise of one size there is likelier and more than rounding."""
-    if not _is_curved(fit.pictures):
+    some = list(map(_thinned, fit.pictures))
+    if not _is_curved(some):
         return fit, noise
-    light = fit._replace(pictures=_in_light(fit.pictures))
-    after = _deviation(light.pictures, fit.optimum)
+    light = _in_light(some)
+    after = _deviation(light, fit.optimum)
     if not min(noise, after) > 0:
         return fit, noise
-    widths = zip(map(bounds_of, fit.pictures), map(bounds_of, light.pictures), strict=True)
+    widths = zip(map(bounds_of, some), map(bounds_of, light), strict=True)
     narrower = np.concatenate([np.log(own.widths / other.widths) for own, other in widths])
-    gain = narrower.size * math.log(noise / after) - float(np.sum(narrower))
-    return (light, after) if gain > LIKELIER else (fit, noise)
+    if narrower.size * math.log(noise / after) - float(np.sum(narrower)) < LIKELIER:
+        return fit, noise
+    fit = fit._replace(pictures=_in_light(fit.pictures))
+    return fit, _deviation(fit.pictures, fit.optimum)
 
 
 def _evener_in_light(problem: "_Separable", at: Estimate) -> Estimate | None:
@@ -242,9 +252,14 @@ def _near_edges(fit: ModelFit, at: Estimate, *, copies: bool) -> Evidence:
 
 def _of_planes(pictures: Sequence[Picture], at: Estimate, problem: "_Separable") -> Float[np.ndarray, " U"] | float:
     """The least variance of each unknown where values on a plane show one code, and share a rounding error."""
-    codes = [_codes(picture, Numbers.of(at.unknowns)) for picture in pictures]
-    if any(np.unique(np.rint(code[:: 1 + len(code) // MOST_PIXELS] * ALIKE)).size >= MOST_LEVELS for code in codes):
+    numbers = Numbers.of(at.unknowns)
+    some = [
+        picture.in_double(np.arange(0, len(picture.target), 1 + len(picture.target) // MOST_PIXELS))
+        for picture in pictures
+    ]
+    if any(np.unique(np.rint(_codes(one, numbers) * ALIKE)).size >= MOST_LEVELS for one in some):
         return 0.0
+    codes = [_codes(picture, numbers) for picture in pictures]
     weights = [alike(bounds_of(one), code, FIRST_NOISE, level=True) for one, code in zip(pictures, codes, strict=True)]
     weighted = map(_with_weight, pictures, weights)
     pixels = [_values(picture.in_double(np.arange(len(picture.target)))) for picture in weighted]
@@ -277,7 +292,8 @@ def _reweighted(
     pictures, optimum, places = fit.pictures, fit.optimum, [_place(picture) for picture in fit.pictures]
     known = precision is not None
     with jax.enable_x64(True):
-        stated = [_stated(picture, optimum, noise, rounding) for picture in pictures]
+        both = [(picture, np.flatnonzero(_half_open(bounds_of(picture)).any(axis=1))) for picture in pictures]
+        stated = [_stated(*one, optimum, noise, rounding) for one in both]
         for trial in range(MOST_ROUNDS):
             working, before = [part.picture for part in stated], optimum
             if together:
@@ -289,7 +305,7 @@ def _reweighted(
                 optimum = improved(working, precision, optimum, fit, anew=trial == 0)
             else:
                 optimum = refit(working, optimum, fit.free, fit.n_range, fit.tied)
-            last, stated = noise, [_stated(picture, optimum, noise, rounding) for picture in pictures]
+            last, stated = noise, [_stated(*one, optimum, noise, rounding) for one in both]
             noise = math.sqrt(sum(part.squares for part in stated) / max(sum(part.count for part in stated), 1))
             if change(before, optimum) < ENOUGH_CHANGE and abs(noise / last - 1) < ENOUGH_NOISE_CHANGE:
                 break
@@ -355,20 +371,24 @@ class _Stated:
     value: float
 
 
-def _stated(picture: Picture, optimum: Optimum, noise: float, rounding: float) -> _Stated:
-    bounds = bounds_of(picture)
-    made = jax.device_get(_linearised(picture, np.asarray(optimum.n), optimum.x))
-    target, weight = np.array(made[0]), np.array(made[1])
-    squares, closed = float(made[2]), float(made[3])
+def _half_open(bounds: Bounds) -> Bool[np.ndarray, "P C"]:
+    """Which values have one end."""
+    return np.isfinite(bounds.lower) ^ np.isfinite(bounds.upper)
+
+
+def _stated(picture: Picture, index: Int[np.ndarray, " K"], optimum: Optimum, noise: float, rounding: float) -> _Stated:
+    """With the pixels that have a value with one end."""
+    target, weight, *sums = _linearised(picture, np.asarray(optimum.n), optimum.x)
+    squares, closed = map(float, sums)
     plain, value, count = squares, 0.0, closed
-    half = np.isfinite(bounds.lower) ^ np.isfinite(bounds.upper)
-    index = np.flatnonzero(half.any(axis=1))
     if index.size:
+        target, weight = np.array(target), np.array(weight)
         s = math.sqrt(max(noise**2 - rounding, LEAST_SHARE * noise**2))
         values = _values(picture.in_double(index))
         said = values.said(*_shown(_picture(values), optimum), s)
         told, radiance, slope = jax.tree.map(lambda part: part[: index.size], (said.told, said.radiance, said.slope))
-        at_end, own = half[index], s * bounds.spread[index if bounds.spread.ndim else ...]
+        bounds = bounds_of(picture).pixels(partial(np.take, indices=index, axis=0))
+        at_end, own = _half_open(bounds), s * bounds.spread
         weighs = np.broadcast_to(values.weight, said.radiance.shape)[: index.size]
         curvature = told.weight * slope**2
         step = np.divide(told.score * slope, curvature, out=np.zeros_like(curvature), where=curvature > 0)
@@ -469,8 +489,9 @@ def _working(said: Said) -> Picture:
 
 
 def _near(picture: Picture, at: Numbers | Optimum, distance: float) -> Bool[np.ndarray, " P"]:
-    """Which pixels say something: those with a value not surely inside its bounds."""
-    return bounds_of(picture).near(_codes(picture, at), distance)
+    """Which pixels say something: those with a value not surely inside its bounds; in the precision of the picture."""
+    bounds = bounds_of(picture)
+    return bounds.near(bounds.codes(picture.shown(at.n, at.x))[0], distance)
 
 
 def _gathered(pictures: Sequence[Picture], at: Estimate) -> list[Values]:
@@ -519,7 +540,7 @@ def _widest(picture: Picture) -> float:
 
 def _open_ends_tell(picture: Picture, at: Optimum, noise: float) -> bool:
     """Whether some value is known by one end only and is predicted near it."""
-    half = np.any(np.isfinite(bounds_of(picture).lower) ^ np.isfinite(bounds_of(picture).upper), axis=1)
+    half = _half_open(bounds_of(picture)).any(axis=1)
     return bool(half.any()) and bool(np.any(_near(picture, at, END_REACH * noise)[half]))
 
 
