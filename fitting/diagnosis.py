@@ -180,8 +180,9 @@ class _Residual:
             good = [counted & np.flip(counted, axis) for counted in self.counted]
             if 2 * sum(map(np.count_nonzero, good)) < sum(map(np.count_nonzero, self.counted)):
                 continue
-            before, size = self._squares(self.targets, self.fitted, good)
-            gain = before - self._least([np.flip(target, axis) for target in self.targets], good)
+            # Fitted alike: a picture that is its own mirror image gains nothing.
+            before, size = self._least(self.targets, good)
+            gain = before - self._least([np.flip(target, axis) for target in self.targets], good)[0]
             share = min(gain / max(before - size, gain, 1.0), 1.0)
             if share > MIRRORED and gain > LEAST_SIZE**2:
                 remedy = "flip the picture, or the lights and the shape"
@@ -300,8 +301,8 @@ class _Residual:
         left = np.concatenate([(one - other)[some] for one, other, some in both]) / self.noise
         return float(np.sum(left**2)), left.size
 
-    def _least(self, targets: Images, good: Masks) -> float:
-        """Squares that the model leaves of other pictures."""
+    def _least(self, targets: Images, good: Masks) -> tuple[float, int]:
+        """Squares that the model leaves of some pixels of pictures, and how many values these are."""
         pictures = []
         both = zip(targets, good, self._curves(targets), self.scenes, self.pixels, strict=True)
         for target, some, curve, scene, pixel in both:
@@ -312,7 +313,7 @@ class _Residual:
         best = search(pictures)
         images = [picture.shown(best.n, best.x) for picture in pictures]
         images = [image.reshape(target.shape) for image, target in zip(images, targets, strict=True)]
-        return self._squares(targets, images, good)[0]
+        return self._squares(targets, images, good)
 
     def _unfollowed(self, values: Float[np.ndarray, "P C"]) -> Float[np.ndarray, "P C"]:
         """What the material cannot follow; 0 where that is next to nothing."""
