@@ -14,7 +14,6 @@ that stands beside them. Numbers in lines of text may also differ by one in thei
 
 import argparse
 import contextlib
-import dataclasses
 import fnmatch
 import io
 import json
@@ -127,10 +126,7 @@ def fitted(result: Any) -> dict[str, Any]:
 
 def measured(result: Any) -> dict[str, Any]:
     """All of a fit of a measured BRDF but its time."""
-    candidates = [
-        {"model": one.model, "losses": one.losses._asdict()}
-        for one in result.candidates
-    ]
+    candidates = [{"model": one.model, "losses": one.losses._asdict()} for one in result.candidates]
     return {
         "material": material(result.material),
         "parameters": parameters(result),
