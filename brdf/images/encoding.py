@@ -32,6 +32,19 @@ _HOW_TO_SAY = 'Say how it is encoded: "linear", "srgb" or a gamma like 2.2'
 _CURVE_TOLERANCE = 2e-3
 # Chunks with their lengths; a gAMA of 0 means nothing (PNG, 11.3.2.2).
 _PNG_SAYS = re.compile(rb"\0\0\0\x01sRGB|\0\0\0\x04gAMA(?!\0{4})")
+# By the code for transfer characteristics (ITU-T H.273, table 3); the curve of a BT.709 display is that of BT.1886.
+_CICP_TRANSFERS: dict[int, Encoding] = {
+    1: 2.4,
+    4: 2.2,
+    5: 2.8,
+    6: 2.4,
+    8: "linear",
+    13: "srgb",
+    14: 2.4,
+    15: 2.4,
+    17: 2.6,
+}
+_CICP_UNSPECIFIED = 2
 
 
 def parse_encoding(where: object, value: Any) -> Encoding | None:
@@ -123,13 +136,18 @@ def find_encoding(
 
 def _stated(path: Path, format_name: str, spec: Any) -> Encoding | None:
     attributes = {attribute.name: attribute.value for attribute in spec.extra_attribs}
-    if "ICCProfile" in attributes and "CICP" not in attributes:
+    _, transfer, *_ = attributes.get("CICP", (0, _CICP_UNSPECIFIED))
+    if transfer != _CICP_UNSPECIFIED:
+        if transfer not in _CICP_TRANSFERS:
+            raise InputError(path, f"is encoded by transfer {transfer} of cICP, which is not known here", _HOW_TO_SAY)
+        return _CICP_TRANSFERS[transfer]
+    if "ICCProfile" in attributes:
         return _of_profile(path, np.asarray(attributes["ICCProfile"], np.uint8).tobytes())
     if attributes.get("Exif:ColorSpace") == 1:
         return "srgb"
     space = str(attributes.get("oiio:ColorSpace", "")).lower()
     # OpenImageIO names sRGB for silent files of these formats too.
-    if format_name == "png" and "CICP" not in attributes:
+    if format_name == "png":
         with path.open("rb") as file:
             space = space if _PNG_SAYS.search(file.read(1 << 20).partition(b"IDAT")[0]) else ""
     if not space or format_name in (*_DISPLAY_FORMATS, "bmp", "pnm", "ico", "psd"):

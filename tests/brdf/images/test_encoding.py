@@ -45,6 +45,8 @@ def icc(curve):
         ([(b"gAMA", struct.pack(">I", 45455)), (b"sRGB", b"\0")], SRGB, "srgb", "file"),
         ([(b"cICP", bytes([1, 13, 0, 1]))], SRGB, "srgb", "file"),
         ([(b"cICP", bytes([1, 8, 0, 1]))], LINEAR, "linear", "file"),
+        ([(b"cICP", bytes([12, 4, 0, 1]))], GAMMA_22, 2.2, "file"),
+        ([(b"cICP", bytes([1, 2, 0, 1])), (b"gAMA", struct.pack(">I", 100000))], LINEAR, "linear", "file"),
         ([icc(parametric(3, *SRGB_CURVE))], SRGB, "srgb", "file"),
         ([icc(parametric(0, 2.2))], GAMMA_22, pytest.approx(2.2, abs=1e-4), "file"),
         ([icc(parametric(3, 1, 1, 0, 1, 0))], LINEAR, "linear", "file"),
@@ -68,7 +70,15 @@ def test_a_png_is_decoded_as_it_says(tmp_path, chunks, expected, encoding, sourc
 
 
 @pytest.mark.parametrize(
-    "chunks", [[(b"cICP", bytes([9, 16, 0, 1]))], [icc(table(np.linspace(0, 1, 64) ** 5))], [icc(b"mft2" + bytes(40))]]
+    "chunks",
+    [
+        *(
+            [(b"cICP", bytes([primaries, transfer, 0, 1]))]
+            for primaries, transfer in [(9, 16), (1, 16), (12, 18), (9, 10)]
+        ),
+        [icc(table(np.linspace(0, 1, 64) ** 5))],
+        [icc(b"mft2" + bytes(40))],
+    ],
 )
 def test_an_encoding_that_is_not_known_is_asked_for(tmp_path, chunks):
     (tmp_path / "a.png").write_bytes(png(GRADIENT, *chunks))
