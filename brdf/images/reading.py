@@ -9,6 +9,7 @@ Sizes are checked before memory is taken (`brdf.images.damage`); `ImageReader` r
 """
 
 import dataclasses
+import itertools
 import re
 from pathlib import Path
 from typing import Any, Self
@@ -147,6 +148,9 @@ class ImageReader:
         self._top = LOSSY_TOP if self.lossy else 1.0
         turn = spec.get_int_attribute("Orientation", 1)
         self._turn = turn if turn in range(2, 9) else 1
+        # A turned photograph cannot be had by rows, and OpenImageIO 3.2 reads 64-bit TIFFs wrongly by rows; kept whole,
+        # it is read once.
+        self._by_rows = self._turn == 1 and not _is_double_tiff(self._image)
         self._upright = None
         height, width = spec.full_height, spec.full_width
         self.shape = (*((width, height) if self._turn > 4 else (height, width)), len(self._colour))
@@ -192,10 +196,9 @@ class ImageReader:
         """
         if not 0 <= start <= stop <= self.shape[0]:
             raise IndexError(f"rows {start} to {stop} of a picture with {self.shape[0]} rows")
-        if self._turn == 1:
+        if self._by_rows:
             return self._shown(start, stop, self._colour, self.encoding)
         if self._upright is None:
-            # A turned photograph cannot be had by rows; kept, it is read once.
             self._upright = _turned(self._shown(0, self._spec.full_height, self._colour, self.encoding), self._turn)
         return self._upright[start:stop].copy()
 
@@ -258,8 +261,18 @@ def _open(path: Path) -> oiio.ImageInput:
         what = f"cannot be read as an image ({said(oiio, path)})"
         raise InputError(path, what, "Give an EXR, HDR, PNG, TIFF or JPEG file")
     said(image)  # remarks on metadata; the pixels may be sound
-    check_header(path, image.spec())
+    spec = image.spec()
+    check_header(path, spec)
+    if _is_double_tiff(image) and (spec.tile_width or spec.height == 1):
+        raise InputError(path, "holds 64-bit floats, which OpenImageIO reads wrongly", "Save it as 32-bit floats")
     return image
+
+
+def _is_double_tiff(image: oiio.ImageInput) -> bool:
+    """Whether OpenImageIO 3.2 reads it right only as a whole: rows and tiles of such files come as garbage."""
+    spec = image.spec()
+    separate = spec.get_string_attribute("planarconfig") == "separate"
+    return image.format_name() == "tiff" and str(spec.format) == "double" and not separate
 
 
 def said(source: Any, path: AnyPath = "") -> str:
@@ -294,9 +307,9 @@ def _layers(image: oiio.ImageInput) -> dict[tuple[int, str], dict[str, int]]:
 def _choose_channels(image: oiio.ImageInput) -> tuple[int, list[int], int | None]:
     """The part and channels that are the picture, and its alpha; depth and further layers are left apart.
 
-    Only OpenEXR files name their channels reliably: R, G, B or Y of the unnamed layer are the picture, in the first
-    part that has them, else those of the first layer that has them, else (a spectral file) all channels in the order
-    of the file. In other formats the picture is what comes before alpha.
+    Only OpenEXR files name their channels reliably: R, G, B, else Y of the unnamed layer are the picture, in the first
+    part that has them, else those of the first layer that has them (not the Y of X, Y, Z), else (a spectral
+    file) all channels in the order of the file. In other formats the picture is what comes before alpha.
     """
     spec = image.spec()
     every = list(range(spec.nchannels))
@@ -305,9 +318,10 @@ def _choose_channels(image: oiio.ImageInput) -> tuple[int, list[int], int | None
         alpha = spec.channelnames.index("A") if "A" in spec.channelnames[1:] else None
         return 0, every[:alpha], alpha
     layers = _layers(image)
-    for (part, _), at in sorted(layers.items(), key=lambda item: item[0][1] != ""):
-        for wanted in ("RGB", "Y"):
-            if set(wanted) <= set(at):
+    for named, wanted in itertools.product((False, True), ("RGB", "Y")):
+        for (part, layer), at in layers.items():
+            axis = named and wanted == "Y" and "X" in at  # of a position or a normal
+            if bool(layer) == named and set(wanted) <= set(at) and not axis:
                 return part, [at[letter] for letter in wanted], at.get("A")
     apart = layers.get((0, ""), {})
     rest = [channel for channel in every if channel not in (apart.get("A"), apart.get("Z"))]

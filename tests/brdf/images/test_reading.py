@@ -7,6 +7,7 @@ import OpenImageIO as oiio
 import pytest
 from image_files import REAL, codes, needs, png, random, raw, raw_png
 
+from brdf.errors import InputError
 from brdf.images.reading import ImageReader, read_image, read_layers, read_mask, read_picture
 from brdf.images.writing import write_image, write_layers
 
@@ -70,6 +71,42 @@ def test_layers_there_and_back(tmp_path):
     for name, values in layers.items():
         np.testing.assert_array_equal(back[name], values.reshape(6, 5, -1))
     np.testing.assert_array_equal(read_image(tmp_path / "a.exr"), layers[""])
+
+
+def test_the_picture_among_layers_is_coloured(tmp_path):
+    colour, position = random(6, 5, 3), random(6, 5, 3, seed=1)
+    write_layers(tmp_path / "a.exr", {"N": position, "image": colour[..., :1]})
+    np.testing.assert_array_equal(read_image(tmp_path / "a.exr"), colour[..., :1])
+    names = [*("N.X", "N.Y", "N.Z"), *("diffuse.R", "diffuse.G", "diffuse.B")]
+    raw(tmp_path / "b.exr", np.dstack([position, colour]), names)
+    np.testing.assert_array_equal(read_image(tmp_path / "b.exr"), colour)
+
+
+@pytest.mark.parametrize(("planes", "tile"), [("contig", 0), ("separate", 0), ("separate", 16)])
+def test_a_tiff_of_doubles(tmp_path, planes, tile):
+    values = random(37, 41, 3).astype(np.float64)
+    doubles(tmp_path / "a.tif", values, planes, tile)
+    np.testing.assert_allclose(read_image(tmp_path / "a.tif"), values, rtol=1e-6)
+    with ImageReader(tmp_path / "a.tif") as reader:
+        bands = [reader.rows(start, min(start + 4, 37)) for start in range(0, 37, 4)]
+    np.testing.assert_allclose(np.concatenate(bands), values, rtol=1e-6)
+
+
+def test_a_tiff_of_doubles_that_comes_wrong(tmp_path):
+    doubles(tmp_path / "a.tif", np.ones((37, 41, 3)), "contig", 16)
+    for read in (read_image, read_layers):
+        with pytest.raises(InputError, match="64-bit floats"):
+            read(tmp_path / "a.tif")
+
+
+def doubles(path, values, planes, tile):
+    spec = oiio.ImageSpec(values.shape[1], values.shape[0], values.shape[2], "double")
+    spec.tile_width = spec.tile_height = tile
+    spec.attribute("planarconfig", planes)
+    file = oiio.ImageOutput.create(str(path))
+    assert file.open(str(path), spec)
+    assert file.write_image(values)
+    assert file.close()
 
 
 @needs("aov")
