@@ -1,11 +1,12 @@
 """What a person waits for: the command and the fit, as ratios within one run.
 
-    python -m benchmarks.felt            # all rows; or some of: command fit lights accuracy
+    python -m benchmarks.felt            # all rows; or some of: command fit codes lights accuracy
 
 | row | over |
 | --- | --- |
 | the command, second run, whole process | the import of jax, optimistix and OpenImageIO, whole process |
 | `fitting.fit`, compiled, float arrays with 1 % noise | a pass over the pixels that count (`benchmarks.engine`) |
+| the same from 8-bit sRGB, without noise and with noise of a code | the same pass |
 | area light and sky, default, 512² | the same pass; and seconds |
 | `accuracy=1e-2` at 3 % noise | the default's time |
 
@@ -32,6 +33,7 @@ from benchmarks.calibration import ball
 from benchmarks.engine import observe, one_pass
 from benchmarks.front_door import MATERIAL
 from benchmarks.tradeoff_fronts import write as write_scenes
+from brdf.images.encoding import encode
 from brdf.precision import Precision
 
 IMPORTS = "import jax, optimistix, OpenImageIO"
@@ -119,6 +121,21 @@ def fit(pairs: int, sizes: tuple[int, ...] = (128, 512, 2048)) -> None:
                 told(f"fitting.fit, {size}², {precision}, {model}", ratio(unit, run, pairs))
 
 
+def codes(pairs: int, size: int = 512) -> None:
+    """`fitting.fit` of an 8-bit sRGB picture, in passes."""
+    scene = ball(size)
+    image = np.asarray(brdf.render(MATERIAL, scene, precision="float64"))
+    shown = 255 * np.asarray(encode(0.97 * image / image.max(), "srgb"))
+    unit = counted_pass(scene)
+    for noise in (0, 1):
+        drawn = np.rint(shown + noise * np.random.default_rng(0).standard_normal(shown.shape))
+        picture = np.clip(drawn, 0, 255).astype(np.uint8)
+        for model in ("blinn-phong", "auto"):
+            run = partial(fitting.fit, picture, scene, model=model, encoding="srgb")
+            run()
+            told(f"fitting.fit, {size}², 8-bit sRGB, noise of {noise} codes, {model}", ratio(unit, run, pairs))
+
+
 def lights(pairs: int) -> None:
     """The area light and the sky of README's table."""
     with tempfile.TemporaryDirectory() as folder:
@@ -144,7 +161,7 @@ def accuracy(pairs: int) -> None:
             told(f"accuracy=1e-2 over the default, {size}², {100 * noise:.0f} % noise", ratio(default, quick, pairs))
 
 
-ROWS = {"command": command, "fit": fit, "lights": lights, "accuracy": accuracy}
+ROWS = {"command": command, "fit": fit, "codes": codes, "lights": lights, "accuracy": accuracy}
 
 
 def main() -> None:
