@@ -157,7 +157,7 @@ def load_mesh(path: str | os.PathLike[str], *, smooth: bool = True) -> Mesh:
     values: dict[str, list[list[float]]] = {"v": [], "vn": []}
     faces, normal_of = [], []
     for line, text in enumerate(read_text(path).replace("\\\n", "  ").splitlines(), start=1):
-        kind, *words = text.split() or [""]
+        kind, *words = text.partition("#")[0].split() or [""]
         try:
             if kind in values:
                 x, y, z, *_ = map(parse_number, words)

@@ -123,7 +123,7 @@ def test_what_is_no_mesh_is_refused(text, words, tmp_path):
 
 def test_corners_are_named_in_every_way_that_the_format_knows(tmp_path):
     ways = ["f 1 2 3 4", "f 1/1 2/1 3/1 4/1", "f 1//1 2//1 3//1 4//1", "f 1/1/1 2/1/1 3/1/1 4/1/1", "f -4//-1 -3 -2 -1"]
-    square = f"# a square\n{TRIANGLE.replace('v 0 1', 'v 1 1')}v 0 1 0 0.5 0.5 0.5\nvt 0 0\nvn 0 0 2\no it\ns 1\n"
+    square = f"# a square\n{TRIANGLE.replace('v 0 1', 'v 1 1')}v 0 1 0 0.5 0.5 0.5\nvt 0 0\nvn 0 0 2 # up\no it\ns 1\n"
     for way in [*ways, "f 1 2 \\\n3 4"]:
         mesh = load(tmp_path, f"{square}{way}\n").mesh
         np.testing.assert_array_equal(mesh.faces, [[0, 1, 2], [0, 2, 3]])
