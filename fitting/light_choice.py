@@ -190,7 +190,7 @@ def choose_lights(
     Raises:
         InputError: naming the argument.
     """
-    if not isinstance(count, int) or count < 1:
+    if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
         raise InputError("count", f"must be 1 or more, got {count}", "Say how many lights to add")
     if candidates is not None and not isinstance(candidates, Sequence | np.ndarray):
         came = f"must be a list, got {type(candidates).__name__}"

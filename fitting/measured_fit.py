@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import brdf
+from brdf.checks import number
 from brdf.errors import InputError
 from brdf.files import atomic_folder
 from brdf.lobes import Lobe
@@ -327,6 +328,7 @@ def fit_brdf(
         raise InputError("table", f"must be a brdf.MeasuredBRDF, got {type(table).__name__}", "Use brdf.load_measured")
     model = model_name(model)
     check_choice(loss, get_args(Loss), n_range)
+    max_angle = float(number("max_angle", max_angle, above=0.0, high=90.0))
     (samples, count), channels = _samples(table, max_angle), len(table.channels)
     left_out, negative = samples.left_out, int(np.count_nonzero(samples.values[:count] < 0))
     if loss == "log" and negative:
@@ -349,8 +351,6 @@ def _samples(table, max_angle):
 
     They make it a power of two, so that few programs are compiled.
     """
-    if not (isinstance(max_angle, int | float) and 0 < max_angle <= 90):
-        raise InputError("max_angle", f"must be above 0 and at most 90 degrees, got {max_angle!r}", "Correct it")
     near = np.flatnonzero(_within(table, max_angle) & (table.solid_angle > 0))
     count = len(near)
     if not count:

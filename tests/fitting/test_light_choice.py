@@ -47,7 +47,7 @@ def test_no_direction_is_better_than_the_one_it_finds(result):
 
 def test_several_are_chosen_one_after_the_other(result):
     candidates = [[0, 0, 1], [0.5, 0.5, 0.7], [-0.7, 0.1, 0.6]]
-    both = fitting.next_light(result, candidates, count=2)
+    both = fitting.next_light(result, candidates, count=np.int64(2))
     one = fitting.next_light(result, candidates)
     assert len(both.lights) == 2
     assert both.after[0] == one.after[0] == one.foretold.min()
@@ -67,6 +67,7 @@ def test_what_cannot_be_answered_is_told(result):
         (lambda: fitting.next_light(result, []), "candidates: is empty"),
         (lambda: fitting.next_light(result, [[1, 2]]), "directions of 3 numbers"),
         (lambda: fitting.next_light(result, count=0), "count: must be 1 or more"),
+        (lambda: fitting.next_light(result, count=True), "count: must be 1 or more"),
         (lambda: fitting.next_light("result"), "must be of fitting.fit"),
     ):
         with pytest.raises(brdf.InputError, match=message):

@@ -140,7 +140,7 @@ def test_angles_beyond_the_limit_and_negative_values():
     result = fitting.fit_brdf(table, "lambert")
     assert result.left_out["further than 80° from the normal"] == np.count_nonzero(grazing)
     assert result.negative == 1
-    assert fitting.fit_brdf(table, "lambert", max_angle=90).samples == len(values)
+    assert fitting.fit_brdf(table, "lambert", max_angle=np.float32(90)).samples == len(values)
     logarithmic = fitting.fit_brdf(table, "lambert", loss="log")
     # The negative value pulls the mean down; the logarithm never sees it.
     assert float(logarithmic.material.k_d[0]) == pytest.approx(0.5, rel=1e-9)
@@ -160,8 +160,9 @@ def test_an_exponent_that_its_range_holds_has_no_error():
         ({"table": 3}, "table: must be a brdf.MeasuredBRDF"),
         ({"model": "ward"}, "model: is unknown"),
         ({"loss": "l1"}, "loss: is unknown"),
-        ({"max_angle": 0}, "max_angle: must be above 0"),
-        ({"max_angle": float("nan")}, "max_angle: must be above 0"),
+        ({"max_angle": 0}, "max_angle: must be greater than 0"),
+        ({"max_angle": float("nan")}, "max_angle: must be finite"),
+        ({"max_angle": True}, "max_angle: must be one number"),
         ({"max_angle": 1e-3}, "no sample within"),
         ({"n_range": (5, 1)}, "n_range: must be"),
     ],
