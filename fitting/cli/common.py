@@ -83,7 +83,9 @@ class PictureOptions(NamedTuple):
     light: Annotated[
         str | None, _option("Towards the light: x,y,z (right, up, to the camera), or fit: from the shading.")
     ] = None
-    lights: Annotated[Path | None, _option("A text file with such a direction for each picture.")] = None
+    lights: Annotated[
+        Path | None, _option("A text file with such a direction for each picture, or an .lp file that names them.")
+    ] = None
     intensities: Annotated[Path | None, _option("A text file with the light's intensity for each picture.")] = None
     ambient: Annotated[
         bool, _option("A photograph is lit from all around too: find k_a for that light as 1.", "--ambient")

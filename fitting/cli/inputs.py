@@ -256,7 +256,7 @@ def _photographs(targets: list[Path], options: PictureOptions, pictures: Any, ma
         came = f"is {points.mask.shape[1]} x {points.mask.shape[0]}, the pictures {width} x {height}"
         _require(points.mask.shape == (height, width), options.normals, came, "Give a normal for each pixel")
     if options.lights is not None:
-        directions = read_directions(options.lights, count)
+        directions = _directions(options.lights, targets)
     elif options.light == "fit":
         found = [light_of(*one, points, options) for one in zip(targets, pictures, masks, strict=True)]
         directions, mean = [light.direction for light in found], sum(light.strength for light in found) / count
@@ -275,6 +275,19 @@ def _photographs(targets: list[Path], options: PictureOptions, pictures: Any, ma
         came = f"has {intensities.shape[1]} numbers a line, the pictures {channels} channels"
         _require(intensities.shape[1] in (1, channels), options.intensities, came, "Give one intensity per channel")
     return points, directions, intensities, light_errors, notes
+
+
+def _directions(path: Path, targets: list[Path]) -> Any:
+    """The light of each photograph: by its name from an ``.lp`` file, else line by line."""
+    if path.suffix.lower() != ".lp":
+        return read_directions(path, len(targets))
+    from fitting.maps.map_inputs import read_lights
+
+    names, directions = read_lights(path)
+    by_name = {name.name: direction for name, direction in zip(names, directions, strict=True)}
+    for target in targets:
+        _require(target.name in by_name, path, f"names no {target.name}", "Name the photographs as the file does")
+    return [by_name[target.name] for target in targets]
 
 
 def light_of(

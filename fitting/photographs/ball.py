@@ -20,6 +20,8 @@ ROUND = 0.05
 # So much of the outline has to be on it; the rest may be specks.
 OUTLINE = 0.8
 SMALLEST_RADIUS = 4.0
+# In sides of the picture: of a larger ball it shows normals within some ten degrees, which tell no light.
+LARGEST_RADIUS = 5.0
 
 
 class Circle(NamedTuple):
@@ -113,10 +115,15 @@ def ball_normals(shape: tuple[int, int], circle: Circle) -> Float[np.ndarray, "H
         Normals; 0 beside the ball and where the outline runs through a pixel: a camera mixes what lies behind into it.
 
     Raises:
-        InputError: where the circle is none or lies outside the picture.
+        InputError: where the circle is none, lies outside the picture, or is far larger.
     """
     _check(circle, "circle")
     height, width = shape
+    if circle.radius > LARGEST_RADIUS * max(shape):
+        came = (
+            f"has a radius of {circle.radius:g} pixels in a picture of {width} x {height}, which is nearly flat there"
+        )
+        raise InputError("circle", came, "Give x,y,radius in pixels of this picture")
     x = (np.arange(width) - circle.x) / circle.radius
     y = -(np.arange(height)[:, None] - circle.y) / circle.radius
     half = 0.5 / circle.radius

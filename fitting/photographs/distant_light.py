@@ -79,7 +79,7 @@ def light_from_highlight(picture: Any, circle: Circle, *, mask: Any = True) -> F
         The unit direction, 2 (N.V) N - V at the middle of the highlight.
 
     Raises:
-        InputError: where the ball is not in the picture or shows no highlight.
+        InputError: where the ball is not in the picture or shows no highlight, or not the whole of it.
     """
     from scipy.ndimage import label  # it takes long to load
 
@@ -102,6 +102,8 @@ def light_from_highlight(picture: Any, circle: Circle, *, mask: Any = True) -> F
             f"is bright in many places: {100 * np.mean(near):.0f} % of it lie where a mirror ball's highlight would be"
         )
         raise InputError("picture", came, "Give a photograph of a mirror ball and its circle; of a matt one use --matt")
+    if np.any(near & ((np.minimum(rows, columns) == 0) | (rows == grey.shape[0] - 1) | (columns == grey.shape[1] - 1))):
+        raise InputError("picture", "cuts through the highlight with its edge", "Give a photograph of all of it")
     x, y = float(columns[near].mean()), float(rows[near].mean())
     across, up = (x - circle.x) / circle.radius, (circle.y - y) / circle.radius
     z = max(1 - across**2 - up**2, 0.0) ** 0.5

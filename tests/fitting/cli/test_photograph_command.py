@@ -62,6 +62,15 @@ def test_several_photographs_in_one_command(photographs, capsys, monkeypatch):
     status, out, _ = run(capsys, *shared, "--sphere", circle, "--lights", "lights.txt")
     assert status == 0
     assert k_d(out) == pytest.approx(0.8, rel=1e-3)  # 16-bit codes
+    directions = Path("lights.txt").read_text().splitlines()
+    listed = [f"{name}.png {directions[name]}" for name in (2, 0, 1)]
+    Path("rti.lp").write_text("\n".join(["3", *listed]))
+    status, out, _ = run(capsys, *shared, "--sphere", circle, "--lights", "rti.lp")
+    assert k_d(out) == pytest.approx(0.8, rel=1e-3)
+    Path("other.lp").write_text(f"1\n{listed[0]}")
+    status, _, told = run(capsys, *shared, "--sphere", circle, "--lights", "other.lp")
+    assert status == 2
+    assert "other.lp: names no 0.png" in told
     status, out, _ = run(capsys, *shared, "--sphere", circle, "--light", "fit")
     assert k_d(out) == pytest.approx(0.8, rel=1e-3)
     assert len(re.findall("from its shading", out)) == 3

@@ -63,7 +63,15 @@ def test_normals_point_right_up_and_to_the_camera():
 
 
 @pytest.mark.parametrize(
-    "circle", [Circle(np.nan, 1, 9), Circle(1, 1, -5), Circle(1, 1, 2), Circle(500, 1, 9), Circle(1, np.inf, 9)]
+    "circle",
+    [
+        Circle(np.nan, 1, 9),
+        Circle(1, 1, -5),
+        Circle(1, 1, 2),
+        Circle(500, 1, 9),
+        Circle(1, np.inf, 9),
+        Circle(9, 9, 4e4),
+    ],
 )
 def test_circles_that_are_none(circle):
     with pytest.raises(InputError, match="circle"):
@@ -121,6 +129,16 @@ def test_the_highlight_tells_the_light(direction):
     found = light_from_highlight(np.where(points.mask, np.minimum(glow, 1.0), 0)[..., None], circle)
     # The picture of a round light on a ball is not quite symmetric about its centre.
     assert angle(found, direction) < 1.0
+
+
+def test_a_highlight_at_the_edge_of_the_picture_is_refused():
+    circle = Circle(20.0, 50.0, 60.0)
+    normal = np.asarray(ball_points((100, 100), circle).normal)
+    mirrored = 2 * normal[..., 2:] * normal - [0, 0, 1]
+    light = np.array([-0.6, 0.0, 0.8])  # its mirror image stands at x = 1
+    glow = np.where(normal[..., 2:] > 0, np.exp(400 * (mirrored @ light - 1))[..., None], 0)
+    with pytest.raises(InputError, match="cuts through the highlight"):
+        light_from_highlight(glow, circle)
 
 
 def test_a_direction_of_no_length_is_told_as_what_came():
