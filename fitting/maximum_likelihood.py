@@ -489,9 +489,8 @@ def _working(said: Said) -> Picture:
 
 
 def _near(picture: Picture, at: Numbers | Optimum, distance: float) -> Bool[np.ndarray, " P"]:
-    """Which pixels say something: those with a value not surely inside its bounds; in the precision of the picture."""
-    bounds = bounds_of(picture)
-    return bounds.near(bounds.codes(picture.shown(at.n, at.x))[0], distance)
+    """Which pixels say something: those with a value not surely inside its bounds."""
+    return bounds_of(picture).near(_codes(picture, at), distance)
 
 
 def _gathered(pictures: Sequence[Picture], at: Estimate) -> list[Values]:
@@ -527,9 +526,8 @@ def bounds_of(picture: Picture) -> Bounds:
 
 
 def _codes(picture: Picture, at: Numbers | Optimum) -> np.ndarray:
-    """What is predicted, in codes, (P, C)."""
-    radiance = picture.shown(at.n, at.x).astype(np.float64)
-    return bounds_of(picture).codes(radiance)[0]
+    """What is predicted, in codes, (P, C), in the precision of the picture."""
+    return bounds_of(picture).codes(picture.shown(at.n, at.x))[0]
 
 
 def _widest(picture: Picture) -> float:
