@@ -137,12 +137,12 @@ def over_blocks(errors: Errors, size: int) -> Blocks:
         errors: of one picture.
         size: of a block, pixels on a side.
     """
-    row, column = np.divmod(errors.pixel[-1], errors.width)
+    rows = int(np.max(errors.pixel, initial=0)) // errors.width + 1
     values = errors.values
-    if errors.pixel.size == (row + 1) * errors.width and column == errors.width - 1:
-        image = values.reshape(row + 1, errors.width, -1)
-    else:
-        image = np.zeros((int(np.max(errors.pixel)) // errors.width + 1, errors.width, values.shape[1]), values.dtype)
+    if errors.pixel.size == rows * errors.width:
+        image = values.reshape(rows, errors.width, -1)
+    else:  # of a picture whose roundings leave nothing open it has no pixel
+        image = np.zeros((rows, errors.width, values.shape[1]), values.dtype)
         image[np.divmod(errors.pixel, errors.width)] = values
     return Blocks(*(_coarser(part, size) for part in (image, image**2, image != 0)))
 

@@ -302,3 +302,16 @@ def test_where_the_search_stopped_is_no_structure(seed: int):
     rng, scene = np.random.default_rng(seed), ball_scene()
     material = brdf.Phong(k_a=0.2, n=float(np.exp(rng.uniform(1, 4))), k_d=rng.uniform(0.1, 0.6, 3), k_s=0.3)
     assert not fitting.fit(pictured(material, scene), scene, precision="float64", model="phong").warnings
+
+
+def test_a_picture_whose_roundings_leave_nothing_open_does_not_end_the_fit():
+    x, y = np.meshgrid(np.linspace(-0.7, 0.7, 30), np.linspace(0.7, -0.7, 30))
+    normal = np.dstack([x, y, np.sqrt(1 - x * x - y * y)])
+    directions = np.array([[0, 0, 1], [0.5, 0, 1], [0, 0.5, 1], [-0.5, -0.3, 1]])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    codes = [np.round(0.6 * np.clip(normal @ one, 0, None) * 65535).astype(np.uint16) for one in directions]
+    points = brdf.SurfacePoints.from_normals(normal)
+    scenes = [brdf.Scene(points=points, lights=[brdf.DirectionalLight(one, 1.0)]) for one in directions]
+    result = fitting.fit(codes, scenes, model="lambert", encoding="linear")
+    k_d = result["k_d"][0]
+    assert abs(k_d.value - 0.6) < 4 * k_d.error < 1e-6
