@@ -156,7 +156,8 @@ def _scene(scene: brdf.Scene, shown: Shown) -> tuple[dict[str, Any], list[str]]:
     elif scene.camera is not None and scene.camera.samples > 1:
         notes.append("Each pixel is drawn at its centre; the fit averaged over the pixel’s area.")
     ambient = [0.0] * 3 if scene.ambient is None else _colour(scene.ambient, shown)
-    frame = {"camera": _camera(scene.camera, home, unit), "pivot": pivot.tolist(), "unit": unit}
+    camera = _camera_of_a_ball(shown) if scene.camera is None else _camera(scene.camera, home, unit)
+    frame = {"camera": camera, "pivot": pivot.tolist(), "unit": unit}
     frame |= {"traced": scene.camera is not None, "drawable": drawable, "lights": lights, "ambient": ambient}
     return frame | shapes, notes
 
@@ -182,11 +183,16 @@ def _outline(shape):
     return np.array([center + a * u + b * v for a in (-1, 1) for b in (-1, 1)])
 
 
+def _camera_of_a_ball(shown):
+    """From which a ball of radius 1 stands in the middle of what is shown."""
+    left, top, width, height, stride = shown.data["window"]
+    resolution = [2 * first + stride * (count - 1) + 1 for first, count in ((left, width), (top, height))]
+    axes = {"right": [1.0, 0.0, 0.0], "up": [0.0, 1.0, 0.0], "forward": [0.0, 0.0, -1.0], "position": [0.0, 0.0, 4.0]}
+    half_width = 1.1 * resolution[0] / (stride * min(width, height))
+    return axes | {"half_width": half_width, "resolution": resolution, "perspective": False, "local": False}
+
+
 def _camera(camera, home, unit):
-    if camera is None:
-        axes = {"right": [1.0, 0.0, 0.0], "up": [0.0, 1.0, 0.0], "forward": [0.0, 0.0, -1.0]}
-        place = {"position": [0.0, 0.0, 4.0], "half_width": 1.1, "resolution": [2, 2]}
-        return axes | place | {"perspective": False, "local": False}
     perspective = isinstance(camera, brdf.PerspectiveCamera)
     with working_precision("float64"):
         axes = {name: axis.tolist() for name, axis in zip(("right", "up", "forward"), camera.axes(), strict=True)}

@@ -159,6 +159,17 @@ def test_the_page_draws_what_render_draws(name: str, pages: dict[str, tuple[list
         assert off(codes, material, scene) <= (MESH_LIMIT if name == "mesh" else LIMIT), state
 
 
+def test_a_ball_stands_for_surface_points(glossy: fitting.FitResult, tmp_path: Path):
+    seen = SCENES["directional"]
+    points = dataclasses.replace(seen, camera=None, shapes=(), points=seen.surface_points())
+    state = f"{PLAIN}&yaw=20&light0={','.join(map(str, DIRECTIONS[1]))}"
+    (answer,) = drawn([(shown_as(glossy, MODELS[1], points).view().text, [state])], tmp_path)
+    (codes,) = answer["codes"]
+    scene = turned(seen, 20, 0, 1, DIRECTIONS[1])
+    camera = dataclasses.replace(scene.camera, resolution=codes.shape[1::-1])
+    assert off(codes, MODELS[1], dataclasses.replace(scene, camera=camera)) <= LIMIT
+
+
 def test_a_bare_power_would_be_seen(glossy: fitting.FitResult, tmp_path: Path):
     """Shows that the limit tells: from n = 1000 on pow(N·H, n) in single precision exceeds it."""
     page = shown_as(glossy, MODELS[1], SCENES["directional"]).view().text
