@@ -35,7 +35,7 @@ from brdf.lobes import (
     sum_over_samples,
     tabulated,
 )
-from brdf.models.base import Material, SpecularMaterial, check_model
+from brdf.models.base import Material, SpecularMaterial, check_model, check_single
 from brdf.models.one_of import Model, OneOf, has_lobe
 from brdf.precision import Precision, cast, working_precision
 from brdf.scene import Scene
@@ -310,9 +310,7 @@ def _shape(material: Material, scene: Scene) -> tuple[int, int, int]:
     words = "Write brdf.render(material, scene)"
     instance("material", material, Material, words)
     instance("scene", scene, Scene, words)
-    if jnp.ndim(material.k_d) != 1:
-        words = "Write jax.vmap(lambda material: brdf.render(material, scene))(materials)"
-        raise InputError("material", f"is a stack of {material.k_d.shape[0]} materials", words)
+    check_single(material, "Write jax.vmap(lambda material: brdf.render(material, scene))(materials)")
     own, lit = material.k_d.shape[0], scene.channels
     if own != lit and 1 not in (own, lit):
         came = f"has {own} channels, the light has {lit}"

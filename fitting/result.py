@@ -120,6 +120,10 @@ class Parameter:
         """The value; NaN where it is not determined."""
         return math.nan if self.value is None else float(self.value)
 
+    def __format__(self, spec: str) -> str:
+        """The value by a format of numbers; without one as `str` has it."""
+        return format(float(self), spec) if spec else str(self)
+
     def __str__(self) -> str:
         """Value ± error (relative), or why there is none."""
         if self.value is None:
@@ -182,7 +186,7 @@ class Parameters:
         return free_parameters(self.parameters)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class FitResult(Parameters):
     """The outcome of a fit.
 
@@ -275,6 +279,10 @@ class FitResult(Parameters):
         with contextlib.suppress(InputError):  # of a saved result whose picture has gone
             return self.diagnosis if any("structure" in words for words in self.warnings) else ()
         return ()
+
+    def __repr__(self) -> str:
+        """In a line; the report is what `print` shows."""
+        return f"<FitResult: {self.surface}, {', '.join(f'{one.key} {one}' for one in self.parameters)}>"
 
     def __str__(self) -> str:
         """The report."""

@@ -42,6 +42,7 @@ from brdf.images.encoding import decode, encode
 from brdf.materials.material_file import to_json
 from brdf.materials.mtl import half_exponent, height, to_mtl
 from brdf.models import BlinnPhong, Material, NormalizedBlinnPhong, NormalizedPhong, Phong, SpecularMaterial
+from brdf.models.base import check_single
 
 # The lobes that are written as they are; those of other models as Blinn-Phong's.
 WRITTEN = (Phong, BlinnPhong, NormalizedPhong, NormalizedBlinnPhong)
@@ -82,6 +83,7 @@ def export_material(material: Material, to: str, *, name: str = "fitted", note: 
         'k_a is left out: the format has no ambient coefficient'
     """
     instance("material", material, Material, "Write brdf.export_material(material, to)")
+    check_single(material)
     if to not in EXPORTS:
         raise InputError("to", f"is unknown, got {to!r}", f"Use one of {', '.join(EXPORTS)}")
     channels = np.asarray(material.k_d).size

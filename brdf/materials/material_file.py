@@ -18,6 +18,7 @@ from brdf.errors import InputError
 from brdf.files import as_path, read_text, write_text
 from brdf.materials.mtl import SHOWN, material_from_mtl, read_mtl, to_mtl
 from brdf.models import MODELS, Material
+from brdf.models.base import check_single
 
 _MOST_BYTES = 1 << 22
 
@@ -105,6 +106,7 @@ def save_material(material: Material, path: str | Path, *, undetermined: Collect
         >>> brdf.save_material(brdf.preset("gold"), "gold.mtl")
     """
     instance("material", material, Material, "Write brdf.save_material(material, path)")
+    check_single(material)
     channels = material.k_d.shape[0]
     if _suffix(path, "Name it .json or .mtl") == ".json":
         text = to_json(material, undetermined=undetermined)

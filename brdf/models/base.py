@@ -148,6 +148,16 @@ class SpecularMaterial(Material):
         return jnp.where(above, self.scale(self.n) * lobe, 0.0)
 
 
+def check_single(material: "Material", remedy: str = "Give one: jax.tree.map(lambda leaf: leaf[0], materials)") -> None:
+    """Refuse several materials in one.
+
+    Raises:
+        InputError: where it is such a stack.
+    """
+    if jnp.ndim(material.k_d) != 1:
+        raise InputError("material", f"is a stack of {jnp.shape(material.k_d)[0]} materials", remedy)
+
+
 def check_model(model: Any) -> None:
     """Refuse what is not the class of a material.
 

@@ -82,7 +82,9 @@ def _positivity(table: MeasuredBRDF, noise: float) -> Finding:
     sentence = f"no value is below 0, the least is {value:.3g}/sr"
     if value < 0:
         where = f"for light {light}, view {view}, channel {table.channels[channel]}"
-        sentence = f"{table.negative} of {table.values.size} values are below 0, the least, {value:.3g}/sr, {where}"
+        why = f", {table.below_zero}" if table.below_zero else ""
+        count = f"{table.negative} of {table.values.size} values are below 0{why}"
+        sentence = f"{count}; the least, {value:.3g}/sr, {where}"
         if not math.isnan(noise):
             bound = noise * float(np.median(np.abs(table.values[:, channel])))
             sentence += f"; the noise of a typical value is {bound:.2g}/sr"

@@ -6,6 +6,7 @@ from typing import Any
 from brdf.errors import InputError
 from brdf.measured.table import MeasuredBRDF
 from brdf.models import Material
+from brdf.models.base import check_single
 from brdf.plausibility.analytic import KNOWN, check_material
 from brdf.plausibility.numeric import check_black_box
 from brdf.plausibility.report import Report
@@ -34,6 +35,7 @@ def check(brdf: Material | MeasuredBRDF | Callable[[Any, Any], Any], *, name: st
         (False, 'fail')
     """
     if isinstance(brdf, Material):
+        check_single(brdf)
         if type(brdf) in KNOWN:
             return check_material(brdf, name or repr(brdf))
         return check_black_box(brdf.reflectance, name or repr(brdf))

@@ -47,6 +47,9 @@ def test_a_result_that_another_process_made_shows_itself(glossy: fitting.FitResu
 
 def test_results_show_themselves_in_jupyter(glossy: fitting.FitResult):
     assert "95 % interval" in glossy._repr_html_()
+    assert repr(glossy).startswith("<FitResult: blinn-phong, k_a[0] not determined: ")
+    assert "\n" not in repr(glossy)
+    assert f"{glossy['n']:.1f}" == f"{float(glossy['n']):.1f}"
     assert "data:image/png;base64," in (glossy.material._repr_html_() or "")
     assert "not plausible" in brdf.check(glossy.material)._repr_html_()
 
