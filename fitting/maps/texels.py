@@ -71,14 +71,14 @@ class Columns(NamedTuple):
 
     def lobe(self, model: Any, log_n: Float[Array, " T"]) -> tuple[Float[Array, "P 1 T"], Float[Array, "P 1 T"]]:
         """The lobe's column and its derivative by log n."""
+        n = jnp.exp(log_n)
+        scale, change = jax.jvp(model.scale, (n,), (n,))
 
         def of_photograph(photograph: tuple[Array, Array]) -> tuple[Array, Array]:
-            def value(log_n: Array) -> Array:
-                n = jnp.exp(log_n)
-                lobes = photograph[0] * jnp.exp(jnp.maximum(n * photograph[1], _lowest(n.dtype)))
-                return model.scale(n) * jnp.sum(lobes, axis=0, keepdims=True)
-
-            return jax.jvp(value, (log_n,), (jnp.ones_like(log_n),))
+            exponent = jnp.maximum(n * photograph[1], _lowest(n.dtype))
+            lobes = photograph[0] * jnp.exp(exponent)
+            value, slope = (jnp.sum(one, axis=0, keepdims=True) for one in (lobes, lobes * exponent))
+            return scale * value, scale * slope + change * value
 
         return jax.lax.map(of_photograph, (self.weight, self.log_cosine))
 
@@ -230,9 +230,15 @@ class Bracket(NamedTuple):
     @classmethod
     def about_best(cls, gains: Float[Array, "G T"], finer: int) -> "Bracket":
         """About the best sample of the grid, from there: what is downhill of it is lower than all samples."""
+
+        def look(best: tuple[Array, Array], sample: tuple[Array, Array]) -> tuple[Any, None]:
+            index, gain = sample
+            return (jnp.where(gain > best[1], index, best[0]), jnp.maximum(gain, best[1])), None
+
         order = np.argsort(grid(finer))
         log_n = jnp.minimum(jnp.log(jnp.asarray(grid(finer)[order], gains.dtype)), OCTAVES * math.log(2.0))
-        best = jnp.argmax(gains[order], axis=0)
+        start = jnp.zeros(gains.shape[1:], int), gains[0]
+        (best, _), _ = jax.lax.scan(look, start, (jnp.arange(len(gains)), gains[order]))
         return cls(*(log_n[jnp.clip(best + side, 0, len(log_n) - 1)] for side in (0, -1, 1)))
 
     def narrowed(self, slope: Array, curvature: Array) -> "Bracket":
