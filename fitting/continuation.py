@@ -7,6 +7,7 @@ squares leaves, and follows its own score from there, by a factor of two at most
 """
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -134,7 +135,7 @@ class Said(NamedTuple):
         return products, (columns @ self.score.T[..., None])[..., 0]
 
 
-class Problem:
+class Problem(ABC):
     """Values, and a model that predicts them.
 
     Attributes:
@@ -155,17 +156,17 @@ class Problem:
     copies: bool
     places: Int[np.ndarray, "C V"]
 
+    @abstractmethod
     def codes(self, unknowns: Float[np.ndarray, " U"]) -> list[Float[np.ndarray, "P C"]]:
         """What is predicted of all pixels, in codes."""
-        raise NotImplementedError
 
+    @abstractmethod
     def taken(self, picture: int, which: Bool[np.ndarray, " P"]) -> Values:
         """Some pixels of a picture."""
-        raise NotImplementedError
 
+    @abstractmethod
     def shown(self, unknowns: Float[np.ndarray, " U"], values: Sequence[Values]) -> Iterator[tuple[Any, Any]]:
         """What is predicted of some pixels of each picture: radiance, (P, C), and its columns, (V, P, C)."""
-        raise NotImplementedError
 
     @property
     def signed(self) -> Bool[np.ndarray, " U"]:
