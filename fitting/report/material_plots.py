@@ -153,7 +153,7 @@ def plot_reciprocity(brdf: Brdf, channel: int = 0, figure: Any = None) -> Any:
     image = axes.pcolormesh(angles, angles, difference.T, cmap=SIGNED, vmin=-bound, vmax=bound, rasterized=True)
     figure.colorbar(image, label="(f_r(light→view) − f_r(view→light)) / the larger")
     axes.set(xlabel=LIGHT, ylabel="angle of the view in degrees", aspect="equal")
-    axes.set_title(f"Reciprocity error to 89.5°: {most:.2g}{in_channel(channel, sample.channels)}")
+    axes.set_title(f"Reciprocity error to 89.5°:\n{most:.2g}{in_channel(channel, sample.channels)}")
     return figure
 
 
