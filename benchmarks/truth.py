@@ -31,7 +31,8 @@ import OpenImageIO as oiio
 
 import brdf
 import fitting
-from fitting.diagnosis import possible_causes
+from brdf.precision import working_precision
+from fitting.diagnosis import Residual
 
 WIDTH = 2.2  # of the picture, the ball's radius being 1
 
@@ -435,7 +436,7 @@ def diagnosis(pattern: str, draws: int, size: int, first: int) -> list[dict[str,
             wrong = 0.0
             if kind in LINEAR:
                 sound = _fitted(file, shown, scene, one.model, seed)
-                errors = [cause.error for cause in possible_causes(sound) if cause.name.split()[0] == kind]
+                errors = _errors_of_causes(sound, kind)
                 wrong = TIMES * max(errors, default=np.inf)
                 if wrong > LINEAR[kind]:
                     continue
@@ -444,7 +445,7 @@ def diagnosis(pattern: str, draws: int, size: int, first: int) -> list[dict[str,
                 axis = 0 if "left" in kind else 1
                 moved = 2 * np.degrees(np.arcsin(abs(one.to_light[axis])))
                 sound = _fitted(file, shown, scene, one.model, seed)
-                if moved < TIMES * next(cause.error for cause in possible_causes(sound) if cause.name == "light"):
+                if moved < TIMES * _errors_of_causes(sound, "light")[0]:
                     continue
             shown, told = made_wrong(kind, shown, scene, wrong, seed)
             causes = _fitted(file, shown, told, one.model, seed).diagnosis
@@ -513,6 +514,13 @@ def drawn(said: list[dict[str, Any]], path: Path) -> None:
         axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False)
     figure.savefig(path, dpi=150)
+
+
+def _errors_of_causes(result: fitting.FitResult, kind: str) -> list[float]:
+    """Of all small changes of a kind that the scene determines, whatever they explain."""
+    with working_precision("float64"):
+        causes = [test.cause for test in Residual(result).tests()]
+    return [cause.error for cause in causes if cause.name.split()[0] == kind]
 
 
 def _fitted(file: File, shown: np.ndarray, scene: brdf.Scene, model: str, seed: int) -> Any:

@@ -10,15 +10,17 @@ Pictures are compared in the codes of their file where it has a curve, since noi
 """
 
 import dataclasses
+import itertools
 import math
 import operator
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 import brdf
 from brdf.images.encoding import encode
@@ -53,8 +55,6 @@ MIRRORED = 0.5
 # Half the difference of the values that make the slope of a file's curve.
 CURVED = 1e-4
 
-Images = list[Float[np.ndarray, "H W C"]]
-Masks = Sequence[Bool[np.ndarray, "H W"]]
 Scenes = Sequence[brdf.Scene]
 
 
@@ -66,16 +66,16 @@ class _Change(NamedTuple):
         unit: of its size.
         remedy: what to do.
         most: a larger size, or error, is no small change.
-        scenes: for each direction, from a size to other scenes; those that stay are the same objects.
-        values: from linear values and a size to others, where it is the picture that is wrong.
+        ways: for each direction, from a scene and a size to another scene; or from linear values to others.
+        places: the pictures whose scene it changes; None where it changes the values of all.
     """
 
     name: str
     unit: str
     remedy: str
     most: float
-    scenes: tuple[Callable[[float], Scenes], ...] = ()
-    values: Callable[[Any, float], Any] | None = None
+    ways: tuple[Callable[[Any, float], Any], ...]
+    places: Sequence[int] | None = None
 
 
 class _Test(NamedTuple):
@@ -94,7 +94,7 @@ def diagnose(result: FitResult) -> tuple[Cause, ...]:
         result: of a fit.
     """
     with working_precision("float64"):
-        residual = _Residual(result)
+        residual = Residual(result)
         if residual.rounded and not any("structure" in words for words in result.warnings):
             return ()
         tests = [test for test in residual.tests() if _stands_out(test.cause)]
@@ -107,40 +107,72 @@ def diagnose(result: FitResult) -> tuple[Cause, ...]:
     return (dataclasses.replace(first, name=name), *others)
 
 
-def possible_causes(result: FitResult) -> tuple[Cause, ...]:
-    """All small changes that the scenes determine, however small and whatever they explain.
-
-    Args:
-        result: of a fit.
-    """
-    with working_precision("float64"):
-        return tuple(test.cause for test in _Residual(result).tests())
-
-
 def _stands_out(cause: Cause) -> bool:
     return cause.share > LEAST_SHARE and abs(cause.size) > LEAST_SIZE * cause.error
 
 
-class _Residual:
-    """What all pictures leave, in units of their noise, and what of it the material cannot follow."""
+class _Picture:
+    """Some pixels of a picture, evenly spread, which of them count, and what the fitted material shows there."""
+
+    def __init__(self, result: FitResult, index: int, side: float):
+        self.material, self.scene = brdf.cast((result.material, result.scenes[index]), "float64")
+        self.file = result.files[index] if result.files else None
+        counted, target = result.counted[index], np.asarray(result.targets[index], np.float64)
+        some = (slice(None, None, math.ceil(max(counted.shape) / side)),) * 2
+        self.pixel, finite = np.arange(counted.size).reshape(counted.shape)[some], np.isfinite(target[some])
+        self.counted, self.target = counted[some] & np.all(finite, axis=-1), np.where(finite, target[some], 0.0)
+        self.fitted = self.shown(self.scene)
+
+    def seen(self, scene: brdf.Scene) -> brdf.Scene:
+        """These pixels of a scene."""
+        whole = self.pixel.size == math.prod(scene.resolution)
+        return scene if whole else brdf.some_pixels(scene, self.pixel, precision="float64")
+
+    def basis(self, scene: brdf.Scene, n: float) -> Float[np.ndarray, "3 H W C"]:
+        """What ambient, diffuse and specular term show of a scene; 0 where there is none."""
+        images = brdf.basis_images(type(self.material), self.seen(scene), n)
+        parts = (images.ambient, images.diffuse, images.specular)
+        return np.stack([np.broadcast_to(0.0 if one is None else one, self.target.shape) for one in parts])
+
+    def shown(self, scene: brdf.Scene) -> Float[np.ndarray, "H W C"]:
+        """What the material shows of a scene."""
+        k = [getattr(self.material, name, 0.0) for name in ("k_a", "k_d", "k_s")]
+        return sum(map(operator.mul, map(np.asarray, k), self.basis(scene, float(getattr(self.material, "n", 1.0)))))
+
+    def codes(self, values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+        """As the file holds them, full scale 1."""
+        if self.file is None or self.file["encoding"] == "linear":
+            return values
+        return encode(np.maximum(values / np.asarray(self.file["factor"]), 0.0), self.file["encoding"])
+
+    def slope(self, change: Callable[[float], np.ndarray], step: float) -> Float[np.ndarray, "*shape"]:
+        """The derivative of the codes of what a size makes."""
+        return (self.codes(change(step)) - self.codes(change(-step))) / (2 * step)
+
+    def curve(self, values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+        """The derivative of the codes by the values."""
+        return self.slope(lambda step: values + step, CURVED)
+
+
+class Residual:
+    """What all pictures leave, in units of their noise, and what of it the material cannot follow; in float64."""
 
     def __init__(self, result: FitResult):
-        self.material = brdf.cast(result.material, "float64")
-        self.scenes = [brdf.cast(scene, "float64") for scene in result.scenes]
-        self.files = result.files or [None] * len(self.scenes)
-        side = max(MOST_PIXELS / math.sqrt(len(self.scenes)), FEWEST_PIXELS)
-        self.pixels = [_evenly(counted.shape, side) for counted in result.counted]
-        self.counted = [counted.ravel()[pixel] for counted, pixel in zip(result.counted, self.pixels, strict=True)]
-        self.targets = [
-            np.asarray(target, np.float64).reshape(-1, target.shape[-1])[pixel]
-            for target, pixel in zip(result.targets, self.pixels, strict=True)
-        ]
-        self.changes = [*_light_changes(self.scenes), *_ball_changes(self.scenes), *VALUE_CHANGES]
-        self._leave_out_rims()
-        self.fitted = self._rendered(self.scenes)
-        raw = [one - other for one, other in zip(self._codes(self.targets), self._codes(self.fitted), strict=True)]
-        self.noise = _white_noise(raw, self.counted)
-        self._leave_out_dark()
+        """Look at some of the pixels."""
+        side = max(MOST_PIXELS / math.sqrt(len(result.scenes)), FEWEST_PIXELS)
+        self.pictures = [_Picture(result, index, side) for index in range(len(result.scenes))]
+        scenes = [picture.scene for picture in self.pictures]
+        self.changes = [*_light_changes(scenes), *_ball_changes(scenes), *VALUE_CHANGES]
+        # Pixels that a step of the circle would move beside the ball.
+        for way in (way for change in self.changes if change.unit == "pixels" for way in change.ways):
+            for picture, size in itertools.product(self.pictures, (RIM, -RIM)):
+                picture.counted &= np.asarray(picture.seen(way(picture.scene, size)).surface_points().mask)
+        raw = [picture.codes(picture.target) - picture.codes(picture.fitted) for picture in self.pictures]
+        self.noise = _white_noise(raw, [picture.counted for picture in self.pictures])
+        for picture in self.pictures:
+            # Where noise was cut off at 0 dark pixels are too bright.
+            if np.min(picture.target[picture.counted], initial=np.inf) == 0:
+                picture.counted &= np.all(picture.codes(picture.fitted) > DARK * self.noise, axis=-1)
         self.tangent = self._material_tangent()
         self.left = self._unfollowed(self._flat(raw)).ravel()
         self.excess = float(np.sum(self.left**2)) - self.left.size
@@ -148,8 +180,8 @@ class _Residual:
     @property
     def rounded(self) -> bool:
         """Whether rounding to codes is most of the noise: it has a shape of its own, as a wrong scene does."""
-        for codes, counted in zip(self._codes(self.targets), self.counted, strict=True):
-            used = np.unique(codes[counted].astype(np.float32))
+        for picture in self.pictures:
+            used = np.unique(picture.codes(picture.target)[picture.counted].astype(np.float32))
             if used.size > 1 and ROUNDED * float(np.median(np.diff(used))) > float(np.max(self.noise)):
                 return True
         return False
@@ -177,12 +209,13 @@ class _Residual:
         if self.excess < LEAST_SIZE**2:
             return
         for words, axis in (("left-right", 1), ("upside down", 0)):
-            good = [counted & np.flip(counted, axis) for counted in self.counted]
-            if 2 * sum(map(np.count_nonzero, good)) < sum(map(np.count_nonzero, self.counted)):
+            good = [picture.counted & np.flip(picture.counted, axis) for picture in self.pictures]
+            size = sum(map(np.count_nonzero, good)) * self.noise.size
+            if 2 * size < self.left.size:
                 continue
             # Fitted alike: a picture that is its own mirror image gains nothing.
-            before, size = self._least(self.targets, good)
-            gain = before - self._least([np.flip(target, axis) for target in self.targets], good)[0]
+            before = self._least([picture.target for picture in self.pictures], good)
+            gain = before - self._least([np.flip(picture.target, axis) for picture in self.pictures], good)
             share = min(gain / max(before - size, gain, 1.0), 1.0)
             if share > MIRRORED and gain > LEAST_SIZE**2:
                 remedy = "flip the picture, or the lights and the shape"
@@ -203,81 +236,33 @@ class _Residual:
         size = np.linalg.pinv(gram, rcond=1e-10, hermitian=True) @ product
         return size, float(size @ product)
 
-    def _rendered(self, scenes: Scenes) -> Images:
-        """Pictures of the fitted material; of scenes that stayed what they are already."""
-        found, n = [], float(getattr(self.material, "n", 1.0))
-        k = [np.asarray(getattr(self.material, name, 0.0), np.float64) for name in ("k_a", "k_d", "k_s")]
-        for index, scene in enumerate(scenes):
-            same = scene is self.scenes[index] and hasattr(self, "fitted")
-            found.append(self.fitted[index] if same else sum(map(operator.mul, k, self._basis(index, n, scene))))
-        return found
-
-    def _codes(self, images: Images) -> Images:
-        """As their files hold them, full scale 1."""
-        return [
-            image
-            if file is None or file["encoding"] == "linear"
-            else encode(np.maximum(image / np.asarray(file["factor"]), 0.0), file["encoding"])
-            for image, file in zip(images, self.files, strict=True)
-        ]
-
-    def _flat(self, images: Images) -> Float[np.ndarray, "P C"]:
+    def _flat(self, images: Sequence[Float[np.ndarray, "H W C"]]) -> Float[np.ndarray, "P C"]:
         """Of the pixels that count, in units of the noise."""
-        return (
-            np.concatenate([image[counted] for image, counted in zip(images, self.counted, strict=True)]) / self.noise
-        )
-
-    def _curves(self, images: Images) -> Images:
-        """The derivatives of the codes by the values."""
-        ahead, behind = (self._codes([image + step for image in images]) for step in (CURVED, -CURVED))
-        return [(one - other) / (2 * CURVED) for one, other in zip(ahead, behind, strict=True)]
-
-    def _slope(self, ahead: Images, behind: Images, step: float) -> Float[np.ndarray, "P C"]:
-        both = zip(self._codes(ahead), self._codes(behind), strict=True)
-        return self._flat([(one - other) / (2 * step) for one, other in both])
+        both = zip(images, self.pictures, strict=True)
+        return np.concatenate([image[picture.counted] for image, picture in both]) / self.noise
 
     def _derivatives(self, change: _Change) -> Iterator[Float[np.ndarray, "P C"]]:
         """Of the pictures by each direction of a change."""
-        if change.values is not None:
-            ahead, behind = ([change.values(image, step) for image in self.fitted] for step in (STEP, -STEP))
-            yield self._slope(ahead, behind, STEP)
-        for scenes in change.scenes:
-            yield self._slope(self._rendered(scenes(STEP)), self._rendered(scenes(-STEP)), STEP)
-
-    def _leave_out_rims(self) -> None:
-        """Pixels that a step of the circle would move beside the ball, and those that are not finite."""
-        self.counted = [
-            counted & np.all(np.isfinite(target), axis=-1)
-            for counted, target in zip(self.counted, self.targets, strict=True)
-        ]
-        for step in (step for change in self.changes if change.unit == "pixels" for step in change.scenes):
-            for size in (RIM, -RIM):
-                for index, scene in enumerate(step(size)):
-                    seen = _seen(scene, self.pixels[index]).surface_points()
-                    self.counted[index] &= np.asarray(seen.mask)
-        self.targets = [np.where(np.isfinite(target), target, 0.0) for target in self.targets]
-
-    def _leave_out_dark(self) -> None:
-        """Where noise was cut off at 0 dark pixels are too bright."""
-        for index, (target, counted) in enumerate(zip(self.targets, self.counted, strict=True)):
-            least = np.min(target[counted], initial=np.inf)
-            if least == 0:
-                level = self._codes(self.fitted)[index]
-                self.counted[index] = counted & np.all(level > DARK * self.noise, axis=-1)
+        for way in change.ways:
+            images = []
+            for index, picture in enumerate(self.pictures):
+                if change.places is None:
+                    images.append(picture.slope(partial(way, picture.fitted), STEP))
+                elif index in change.places:
+                    images.append(picture.slope(lambda size, p=picture, w=way: p.shown(w(p.scene, size)), STEP))
+                else:
+                    images.append(np.zeros_like(picture.target))
+            yield self._flat(images)
 
     def _material_tangent(self) -> list[Float[np.ndarray, "P K"]]:
         """What the coefficients of each channel, and the exponent, move; orthonormal."""
-        n, step = float(getattr(self.material, "n", 1.0)), 1e-4
-        k_s = np.asarray(getattr(self.material, "k_s", 0.0), np.float64)
         moves = []
-        for index in range(len(self.scenes)):
-            here, ahead, behind = (self._basis(index, n * factor) for factor in (1.0, 1 + step, 1 - step))
-            moves.append([*here, k_s * (ahead[2] - behind[2]) / step])
-        curves = self._curves(self.fitted)
-        columns = [
-            self._flat([curve * image for curve, image in zip(curves, images, strict=True)])
-            for images in zip(*moves, strict=True)
-        ]
+        for picture in self.pictures:
+            n, curve = float(getattr(picture.material, "n", 1.0)), picture.curve(picture.fitted)
+            here, ahead, behind = (picture.basis(picture.scene, n * factor) for factor in (1.0, 1 + 1e-4, 1 - 1e-4))
+            by_n = np.asarray(getattr(picture.material, "k_s", 0.0)) * (ahead[2] - behind[2]) / 1e-4
+            moves.append([curve * image for image in (*here, by_n)])
+        columns = list(map(self._flat, zip(*moves, strict=True)))
         tangents = []
         for channel in range(self.noise.size):
             matrix = np.stack([column[:, channel] for column in columns], axis=1)
@@ -286,34 +271,19 @@ class _Residual:
             tangents.append(vectors[:, values > 1e-6])
         return tangents
 
-    def _basis(self, index: int, n: float, scene: brdf.Scene | None = None) -> tuple[np.ndarray, ...]:
-        """What ambient, diffuse and specular term show of a scene, or of one in its place; 0 where there is none."""
-        seen = _seen(scene or self.scenes[index], self.pixels[index])
-        images = brdf.basis_images(type(self.material), seen, n)
-        shape = self.targets[index].shape
-        parts = (images.ambient, images.diffuse, images.specular)
-        ambient, diffuse, specular = (np.zeros(shape) if one is None else np.broadcast_to(one, shape) for one in parts)
-        return ambient, diffuse, specular
-
-    def _squares(self, targets: Images, images: Images, good: Masks) -> tuple[float, int]:
-        """Squares of what images leave of some pixels, in units of the noise, and how many values these are."""
-        both = zip(self._codes(targets), self._codes(images), good, strict=True)
-        left = np.concatenate([(one - other)[some] for one, other, some in both]) / self.noise
-        return float(np.sum(left**2)), left.size
-
-    def _least(self, targets: Images, good: Masks) -> tuple[float, int]:
-        """Squares that the model leaves of some pixels of pictures, and how many values these are."""
-        pictures = []
-        both = zip(targets, good, self._curves(targets), self.scenes, self.pixels, strict=True)
-        for target, some, curve, scene, pixel in both:
-            seen = _seen(scene, pixel)
-            values, weight = (a.reshape(-1, self.noise.size) for a in (target, some[..., None] * curve**2))
-            tile = Tile(jnp.asarray(values), jnp.asarray(weight), seen.surface_points(), seen)
-            pictures.append(picture_of(type(self.material), tile))
-        best = search(pictures)
-        images = [picture.shown(best.n, best.x) for picture in pictures]
-        images = [image.reshape(target.shape) for image, target in zip(images, targets, strict=True)]
-        return self._squares(targets, images, good)
+    def _least(self, targets: list[Float[np.ndarray, "H W C"]], good: list[Bool[np.ndarray, "H W"]]) -> float:
+        """Squares that the model leaves of some pixels of pictures, in units of the noise."""
+        solved, both = [], list(zip(self.pictures, targets, good, strict=True))
+        for picture, target, some in both:
+            seen, weight = picture.seen(picture.scene), some[..., None] * picture.curve(target) ** 2
+            values, weight = (jnp.asarray(a.reshape(-1, self.noise.size)) for a in (target, weight))
+            tile = Tile(values, weight, seen.surface_points(), seen)
+            solved.append(picture_of(type(picture.material), tile))
+        best, left = search(solved), 0.0
+        for (picture, target, some), one in zip(both, solved, strict=True):
+            shown = one.shown(best.n, best.x).reshape(target.shape)
+            left += float(np.sum(((picture.codes(target) - picture.codes(shown))[some] / self.noise) ** 2))
+        return left
 
     def _unfollowed(self, values: Float[np.ndarray, "P C"]) -> Float[np.ndarray, "P C"]:
         """What the material cannot follow; 0 where that is next to nothing."""
@@ -326,26 +296,18 @@ class _Residual:
 
         Channels of a pixel, and pixels of a block, may err together: squares of their sums, over those of each.
         """
-        ends = np.cumsum([np.count_nonzero(counted) for counted in self.counted])[:-1]
-        together = 0.0
-        for counted, part in zip(self.counted, np.split(scores.reshape(-1, self.noise.size), ends), strict=True):
+        every = [picture.counted for picture in self.pictures]
+        ends, together = np.cumsum(list(map(np.count_nonzero, every)))[:-1], 0.0
+        for counted, part in zip(every, np.split(scores.reshape(-1, self.noise.size), ends), strict=True):
             if len(part):
                 errors = Errors(np.sum(part, axis=1, keepdims=True), np.flatnonzero(counted), counted.shape[1])
                 together += float(np.sum(over_blocks(errors, BLOCK)[0] ** 2))
         return max(together / max(float(np.sum(scores**2)), np.finfo(float).tiny), 1.0)
 
 
-def _evenly(shape: tuple[int, int], side: float) -> Int[np.ndarray, "H W"]:
-    """Pixels of a picture, row by row, evenly spread."""
-    stride = math.ceil(max(shape) / side)
-    return np.arange(shape[0])[::stride, None] * shape[1] + np.arange(shape[1])[::stride]
-
-
-def _seen(scene: brdf.Scene, pixel: Int[np.ndarray, "H W"]) -> brdf.Scene:
-    return scene if pixel.size == math.prod(scene.resolution) else brdf.some_pixels(scene, pixel, precision="float64")
-
-
-def _white_noise(residuals: Images, counted: Masks) -> Float[np.ndarray, " C"]:
+def _white_noise(
+    residuals: list[Float[np.ndarray, "H W C"]], counted: list[Bool[np.ndarray, "H W"]]
+) -> Float[np.ndarray, " C"]:
     """Standard deviation of what single pixels err: from differences of neighbours, which know no wide structure."""
     total, count = 0.0, 0
     for residual, good in zip(residuals, counted, strict=True):
@@ -361,16 +323,14 @@ def _power(values: Any, percent: float) -> Any:
     return np.where(values > 0, np.where(values > 0, values, 1.0) ** (1 + percent / 100), 0.0)
 
 
+def _raised(values: Any, percent: float) -> Any:
+    return values + percent / 100
+
+
+BLACK = "subtract the camera's black level, or give the scene the ambient light that it lacks"
 VALUE_CHANGES = (
-    _Change("gamma", "%", "state how the file is encoded: --encoding srgb, linear or a gamma", math.inf, (), _power),
-    _Change(
-        "black",
-        "% of white",
-        "subtract the camera's black level, or give the scene the ambient light that it lacks",
-        50.0,
-        (),
-        lambda values, percent: values + percent / 100,
-    ),
+    _Change("gamma", "%", "state how the file is encoded: --encoding srgb, linear or a gamma", math.inf, (_power,)),
+    _Change("black", "% of white", BLACK, 50.0, (_raised,)),
 )
 
 
@@ -385,36 +345,31 @@ def _light_changes(scenes: Scenes) -> Iterator[_Change]:
         for places in [having] if same else [[place] for place in having]:
             name = which if len(places) == len(scenes) else f"{which} of picture {places[0]}"
             if isinstance(scenes[places[0]].lights[index], brdf.DirectionalLight):
-                turns = tuple(_turned(scenes, places, index, axis) for axis in (0, 1))
-                yield _Change(f"light{name}", "degrees", "free its direction: fit_jointly, --free light", 30.0, turns)
+                remedy, turns = (
+                    "free its direction: fit_jointly, --free light",
+                    (partial(_turned, index, 0), partial(_turned, index, 1)),
+                )
+                yield _Change(f"light{name}", "degrees", remedy, 30.0, turns, places)
             remedy = "free it: fit_jointly or fit_lights, --free intensity"
-            yield _Change(f"intensity{name}", "%", remedy, 100.0, (_brighter(scenes, places, index),))
+            yield _Change(f"intensity{name}", "%", remedy, 100.0, (partial(_brighter, index),), places)
 
 
-def _with_light(scenes: Scenes, places: Sequence[int], index: int, change: Callable[[Any], Any]) -> list[brdf.Scene]:
-    changed = list(scenes)
-    for place in places:
-        lights = list(scenes[place].lights)
-        lights[index] = change(lights[index])
-        changed[place] = dataclasses.replace(scenes[place], lights=tuple(lights))
-    return changed
+def _with_light(scene: brdf.Scene, index: int, light: Any) -> brdf.Scene:
+    return dataclasses.replace(scene, lights=(*scene.lights[:index], light, *scene.lights[index + 1 :]))
 
 
-def _turned(scenes: Scenes, places: Sequence[int], index: int, axis: int) -> Callable[[float], Scenes]:
-    def turn(light: Any, degrees: float) -> Any:
-        direction = np.asarray(light.direction, np.float64)
-        across = np.linalg.svd(direction[None])[2][1 + axis] * np.linalg.norm(direction)
-        angle = math.radians(degrees)
-        return dataclasses.replace(light, direction=math.cos(angle) * direction + math.sin(angle) * across)
-
-    return lambda degrees: _with_light(scenes, places, index, lambda light: turn(light, degrees))
+def _turned(index: int, axis: int, scene: brdf.Scene, degrees: float) -> brdf.Scene:
+    light: Any = scene.lights[index]
+    direction, angle = np.asarray(light.direction), math.radians(degrees)
+    across = np.linalg.svd(direction[None])[2][1 + axis] * np.linalg.norm(direction)
+    turned = math.cos(angle) * direction + math.sin(angle) * across
+    return _with_light(scene, index, dataclasses.replace(light, direction=turned))
 
 
-def _brighter(scenes: Scenes, places: Sequence[int], index: int) -> Callable[[float], Scenes]:
-    def change(light: Any, percent: float) -> Any:
-        return eqx.tree_at(lambda one: one.emittance, light, np.asarray(light.emittance) * (1 + percent / 100))
-
-    return lambda percent: _with_light(scenes, places, index, lambda light: change(light, percent))
+def _brighter(index: int, scene: brdf.Scene, percent: float) -> brdf.Scene:
+    light = scene.lights[index]
+    emittance = np.asarray(light.emittance) * (1 + percent / 100)
+    return _with_light(scene, index, eqx.tree_at(lambda one: one.emittance, light, emittance))
 
 
 def _ball_changes(scenes: Scenes) -> Iterator[_Change]:
@@ -423,24 +378,20 @@ def _ball_changes(scenes: Scenes) -> Iterator[_Change]:
         return
     if any(scene.camera is None for scene in scenes):
         return
-    most = 0.1 * min(scenes[0].resolution)
-    moves = tuple(_moved(scenes, axis, 1.0, 0.0) for axis in (0, 1))
-    yield _Change("ball", "pixels", "find its circle again, or free it: fit_jointly, --free ball", most, moves)
-    grows = (_moved(scenes, 0, 0.0, 1.0),)
-    yield _Change("radius", "pixels", "find its circle again, or free it: fit_jointly, --free radius", most, grows)
+    most, places = 0.1 * min(scenes[0].resolution), range(len(scenes))
+    for name, ways in {"ball": [(0, 1.0, 0.0), (1, 1.0, 0.0)], "radius": [(0, 0.0, 1.0)]}.items():
+        remedy = f"find its circle again, or free it: fit_jointly, --free {name}"
+        yield _Change(name, "pixels", remedy, most, tuple(partial(_moved, *way) for way in ways), places)
 
 
-def _moved(scenes: Scenes, axis: int, shift: float, growth: float) -> Callable[[float], Scenes]:
-    def move(scene: brdf.Scene, pixels: float) -> brdf.Scene:
-        sphere: Any = scene.shapes[0]
-        camera: Any = scene.camera
-        width, height = camera.resolution
-        column, row = np.array([0.0, 1.0, 0.0]) + width / 2, np.array([0.0, 0.0, 1.0]) + height / 2
-        origin, direction = (np.asarray(part, np.float64) for part in camera.rays(column, row))
-        far = origin + direction * np.linalg.norm(np.asarray(sphere.center) - np.asarray(camera.position))
-        pixel = far[1 + axis] - far[0]
-        centre = np.asarray(sphere.center) + shift * pixels * pixel
-        radius = np.asarray(sphere.radius) + growth * pixels * np.linalg.norm(pixel)
-        return dataclasses.replace(scene, shapes=(dataclasses.replace(sphere, center=centre, radius=radius),))
-
-    return lambda pixels: [move(scene, pixels) for scene in scenes]
+def _moved(axis: int, shift: float, growth: float, scene: brdf.Scene, pixels: float) -> brdf.Scene:
+    sphere: Any = scene.shapes[0]
+    camera: Any = scene.camera
+    width, height = camera.resolution
+    column, row = np.array([0.0, 1.0, 0.0]) + width / 2, np.array([0.0, 0.0, 1.0]) + height / 2
+    origin, direction = (np.asarray(part, np.float64) for part in camera.rays(column, row))
+    far = origin + direction * np.linalg.norm(np.asarray(sphere.center) - np.asarray(camera.position))
+    pixel = far[1 + axis] - far[0]
+    centre = np.asarray(sphere.center) + shift * pixels * pixel
+    radius = np.asarray(sphere.radius) + growth * pixels * np.linalg.norm(pixel)
+    return dataclasses.replace(scene, shapes=(dataclasses.replace(sphere, center=centre, radius=radius),))
