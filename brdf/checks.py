@@ -116,13 +116,28 @@ def checked(check: Callable[[str, Any], Any], name: str, **field: Any) -> Any:
     return eqx.field(converter=partial(check, name), **field)
 
 
+def as_numbers(name: str, value: Any, what: str = "numbers", remedy: str = "Give plain numbers") -> np.ndarray:
+    """What a person gives for numbers, float64 of any shape.
+
+    Args:
+        name: of the argument.
+        value: what came.
+        what: it must be.
+        remedy: what to do.
+
+    Raises:
+        InputError: where it is none.
+    """
+    try:
+        return np.asarray(value, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(name, f"must be {what}, got {_shown(value)}", remedy) from None
+
+
 def _array(name: str, value: Any, shape_words: str, largest: float = LARGEST) -> Any:
     if isinstance(value, jax.Array):
         return value
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise InputError(name, f"must be {shape_words}, got {_shown(value)}", "Give plain numbers") from None
+    array = as_numbers(name, value, shape_words)
     if not np.all(np.isfinite(array)):
         raise InputError(name, f"must be finite, got {_shown(value)}", "Give finite numbers")
     if np.any(np.abs(array) > largest):
@@ -279,10 +294,7 @@ def _not_negative(name: str, given: Any) -> Any:
         given = jnp.stack([jnp.asarray(v) for v in given])
     if isinstance(given, Tracer):
         return given
-    try:
-        value = np.asarray(given, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise InputError(name, f"must be numbers, got {given!r:.60}") from None
+    value = as_numbers(name, given)
     for channel, number in enumerate(value.ravel()):
         where = f" in channel {channel}" if value.size > 1 else ""
         if not np.isfinite(number):

@@ -23,7 +23,7 @@ from fitting.solver.nnls import nonnegative_minimum
 from fitting.solver.normal_equations import Picture, sums
 from fitting.solver.profile import Optimum
 from fitting.solver.refinement import GRID_STEP
-from fitting.solver.tied import NormalEquations, design_of
+from fitting.solver.tied import NormalEquations, design_of, join_channels
 
 # Pixels on a side of what errors are summed over. The larger ones are the blocks of a codec that keeps colours at half
 # the resolution: over these errors of the colours go together. What is kept best errs as over the smaller ones, which
@@ -53,17 +53,8 @@ class Coupled(NamedTuple):
             x: coefficients, at which the residual was taken.
             by: what the last unknown is times log n.
         """
-        channels = x.shape[1]
-        scale = np.ones((channels, 4))
-        scale[:, 3] = x[2] / by
-        whole, score = np.zeros((3 * channels + 1,) * 2), np.zeros(3 * channels + 1)
-        index = [[c, channels + c, 2 * channels + c, 3 * channels] for c in range(channels)]
-        for c in range(channels):
-            score[index[c]] += self.score[c] * scale[c]
-            for other in range(channels):
-                whole[np.ix_(index[c], index[other])] += self.gram[c, other] * np.outer(scale[c], scale[other])
-        base = np.append(x.ravel(), 0.0)
-        return NormalEquations(whole, score + whole @ base, 0.0)
+        whole, score, _ = join_channels(self.gram, self.score, np.zeros(1), x[2] / by)
+        return NormalEquations(whole, score + whole @ np.append(x.ravel(), 0.0), 0.0)
 
 
 def can_be_coupled(pictures: Sequence[Picture]) -> bool:

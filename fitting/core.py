@@ -20,17 +20,16 @@ from fitting.light_colour import coefficient_factors
 from fitting.maximum_likelihood import highlight_in_codes, most_likely, unexplained
 from fitting.model_fit import ModelFit
 from fitting.pixels import Observed, Tile, observe
-from fitting.plausible import fit_plausible, is_plausible
 from fitting.problem import FitProblem
 from fitting.result import FitResult
 from fitting.sample_error import MOST, SampleError, between, near_exponent, nearer
 from fitting.selection import FAMILIES, Choice, choose, is_better
 from fitting.solver.devices import placed
 from fitting.solver.losses import reweight
-from fitting.solver.nnls import nonnegative_minima
+from fitting.solver.nnls import ROUNDING, nonnegative_minima
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum, refit, search
-from fitting.solver.refinement import TOLERANCE_DOUBLE
+from fitting.solver.refinement import TOLERANCE_DOUBLE, Cap
 from fitting.solver.streams import Stream, each
 from fitting.solver.tied import NormalEquations, design_of, join_channels
 from fitting.uncertainty.covariance import NO_TRACE, residual_noise
@@ -128,8 +127,10 @@ def picture_of(model: type[brdf.Material], tile: Tile, near: Near | None = None)
     return Picture(tile.target, diffuse, images.lobe, tile.weight, ambient, tile.bounds)
 
 
-def _search(pictures: Sequence[Picture], free: np.ndarray, n_range: tuple[float, float]) -> Optimum:
-    return search(pictures, n_min=n_range[0], n_max=n_range[1], free=free)
+def _search(
+    pictures: Sequence[Picture], free: np.ndarray, n_range: tuple[float, float], cap: Cap | None = None
+) -> Optimum:
+    return search(pictures, n_min=n_range[0], n_max=n_range[1], free=free, cap=cap)
 
 
 def _fit_model(
@@ -418,9 +419,19 @@ def _with_weight_of(picture: Picture, other: Picture) -> Picture:
 
 
 def _held_plausible(fit: ModelFit, seen: Observed) -> ModelFit:
-    if not seen.problem.plausible or is_plausible(fit.optimum, fit.model, seen.colour):
+    """With k_d + k_s <= 1 in every channel held inside the search, where that is asked for and not so by itself.
+
+    The bound moves with n, since k_s is x_s over the lobe's scale(n); clipping the unbounded optimum afterwards would
+    miss the best n. `brdf.check` allows 1e-6 more.
+    """
+
+    def cap(n: float) -> np.ndarray:
+        return 1.0 / coefficient_factors(fit.model, n, seen.colour) * [[0], [1], [1]]
+
+    optimum = fit.optimum
+    if not seen.problem.plausible or np.all(np.sum(cap(optimum.n) * optimum.x, axis=0) <= 1.0 + ROUNDING):
         return fit
-    optimum = fit_plausible(fit.pictures, fit.optimum, fit.free, fit.model, seen.colour, fit.n_range)
+    optimum = _search(fit.pictures, fit.free, fit.n_range, cap)
     # What the bound adds to the residual is no noise: that of the fit without it says what stands out.
     noise = fit.noise_factor * float(np.sqrt(np.sum(fit.optimum.cost) / np.sum(optimum.cost)))
     return fit._replace(optimum=optimum, tied=None, capped=True, noise_factor=noise)

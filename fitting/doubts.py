@@ -102,20 +102,16 @@ def _field_of_view(scenes: Sequence[brdf.Scene], residual: float) -> Iterator[st
 def _shaded(pictures: Sequence[Picture]) -> bool:
     """Whether light falls unevenly on what counts."""
     for picture in pictures:
-        counts = _counted(picture)
+        counts = picture.counts
         light = np.asarray(picture.diffuse)[counts]
         if light.size and np.max(np.ptp(light, axis=0)) > FLAT * np.max(light):
             return True
     return False
 
 
-def _counted(picture: Picture) -> np.ndarray:
-    return np.broadcast_to(np.all(np.asarray(picture.weights) > 0, axis=1), len(picture.target))
-
-
 def _follows_light(picture: Picture) -> bool:
     """Whether what counts varies with the light that falls on it, or that does not vary."""
-    counts = _counted(picture)
+    counts = picture.counts
     light, value = (np.asarray(part)[counts].mean(axis=1, dtype=float) for part in (picture.diffuse, picture.target))
     light, value = light - light.mean(), value - value.mean()
     return bool((light @ value) ** 2 >= (1 - NOISE) * (light @ light) * (value @ value))

@@ -230,13 +230,9 @@ def _numbers(result: FitResult, of: str) -> tuple[np.ndarray, np.ndarray]:
     if missing:
         why = missing[0].reason or "is at its bound"
         raise InputError("of", f"{missing[0].key} has no error to shrink: {why}", "Ask for another number")
-    channels, order = result.material.k_d.shape[0], ("k_a", "k_d", "k_s")
-    places = {
-        one.key: 3 * channels if one.channel is None else order.index(one.name) * channels + one.channel for one in free
-    }
-    wanted, active = np.zeros((2, 3 * channels + 1), bool)
-    wanted[[places[one.key] for one in asked]] = True
-    active[list(places.values())] = True
+    channels = result.material.k_d.shape[0]
+    every = np.arange(3 * channels + 1)
+    wanted, active = (np.isin(every, [one.place(channels) for one in some]) for some in (asked, free))
     return wanted, active
 
 

@@ -39,7 +39,7 @@ from fitting.model_fit import Evidence, ModelFit
 from fitting.solver.normal_equations import Picture, Sums
 from fitting.solver.profile import Optimum, refit
 from fitting.solver.subsample import Subsample, stratified
-from fitting.solver.tied import design_of
+from fitting.solver.tied import design_of, places_of
 
 SUBSAMPLE = 8192
 # The noise of a part of the pixels is known well enough to this factor.
@@ -443,8 +443,7 @@ class _Separable(Problem):
         self.lower, self.upper = (
             np.where(self.exponents, math.log(n), x) for n, x in zip(n_range, (0.0, math.inf), strict=True)
         )
-        own = np.arange(3 * channels).reshape(3, channels).T
-        self.places = np.column_stack([own, np.full(channels, size - 1)])
+        self.places = places_of(channels)
         self._last: tuple[Any, list[np.ndarray]] = (None, [])
 
     def codes(self, unknowns: Float[np.ndarray, " U"]) -> list[Float[np.ndarray, "P C"]]:

@@ -100,6 +100,16 @@ class Parameter:
         """Its name, with the channel where it has one: "n", "k_s[2]"."""
         return self.name if self.channel is None else f"{self.name}[{self.channel}]"
 
+    def place(self, channels: int) -> int:
+        """Where it stands among k_a, k_d, k_s, channel after channel each, and n.
+
+        Args:
+            channels: how many there are.
+        """
+        return (
+            3 * channels if self.channel is None else ("k_a", "k_d", "k_s").index(self.name) * channels + self.channel
+        )
+
     def label(self, channels: int) -> str:
         """The channel in words: its colour, or of a position its axis.
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from brdf.checks import as_numbers
 from brdf.errors import InputError
 
 Vectors = Float[np.ndarray, "P 3"]
@@ -91,12 +92,12 @@ class MeasuredBRDF:
             InputError: naming the argument, where shapes do not fit or no sample is left.
         """
         light, view = _directions("to_light", to_light), _directions("to_view", to_view)
-        numbers = _numbers("values", values)
+        numbers = as_numbers("values", values)
         numbers = numbers[:, None] if numbers.ndim == 1 else numbers
         if numbers.ndim != 2 or numbers.shape[1] == 0:
             raise InputError("values", f"must be of shape (P, C), got {numbers.shape}", "Give a row per sample")
         samples, count = numbers.shape
-        weight = np.ones(samples) if solid_angle is None else _numbers("solid_angle", solid_angle)
+        weight = np.ones(samples) if solid_angle is None else as_numbers("solid_angle", solid_angle)
         for what, array in (("to_light", light), ("to_view", view), ("solid_angle", weight)):
             if len(array) != samples:
                 raise InputError(what, f"has {len(array)} rows for {samples} samples", "Give one per sample")
@@ -117,15 +118,8 @@ class MeasuredBRDF:
         return cls(name, *kept, left_out=counts, evaluate=evaluate)
 
 
-def _numbers(name, value):
-    try:
-        return np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise InputError(name, f"must be numbers, got {type(value).__name__}", "Give an array") from None
-
-
 def _directions(name, value):
-    vectors = _numbers(name, value)
+    vectors = as_numbers(name, value)
     if vectors.ndim != 2 or vectors.shape[1] != 3:
         raise InputError(name, f"must be of shape (P, 3), got {vectors.shape}", "Give a direction per sample")
     size = np.linalg.norm(vectors, axis=1, keepdims=True)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 import brdf
-from brdf.checks import direction_value
+from brdf.checks import as_numbers, direction_value
 from brdf.errors import InputError
 from brdf.precision import Precision, working_precision
 from fitting.maps import map_inputs
@@ -129,7 +129,7 @@ def _ambient(ambient: Any, given: Photographs) -> np.ndarray | None:
         return None
     values = given.ambient
     if ambient is not None:
-        values = map_inputs.plain_numbers("ambient", ambient, "Give the intensity of the ambient light").reshape(-1)
+        values = as_numbers("ambient", ambient, remedy="Give the intensity of the ambient light").reshape(-1)
         if values.size not in (1, given.shape[3]) or not np.all((values > 0) & np.isfinite(values)):
             came = f"must be 1 or {given.shape[3]} numbers above 0, got {ambient!r:.60}"
             raise InputError("ambient", came, "Give the intensity of the ambient light")

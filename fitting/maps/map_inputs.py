@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Num
 
 import brdf
+from brdf.checks import as_numbers
 from brdf.errors import InputError
 from brdf.files import parse_number, read_text
 from brdf.images.encoding import decode, parse_encoding
@@ -311,25 +312,8 @@ def _top(reader: brdf.ImageReader) -> float:
     return (reader.codes[0] or np.inf) * BELOW_TOP
 
 
-def plain_numbers(name: str, given: Any, remedy: str) -> np.ndarray:
-    """What a person gives for numbers, float64.
-
-    Args:
-        name: of the argument.
-        given: numbers, or lists of them.
-        remedy: what to give.
-
-    Raises:
-        InputError: naming the argument.
-    """
-    try:
-        return np.asarray(given, np.float64)
-    except (TypeError, ValueError):
-        raise InputError(name, f"must be numbers, got {given!r:.60}", remedy) from None
-
-
 def _factors(name: str, given: Any, count: int, channels: int) -> Float[np.ndarray, "P C"]:
-    values = plain_numbers(name, given, "Give a number for each photograph")
+    values = as_numbers(name, given, remedy="Give a number for each photograph")
     values = values[:, None] if values.ndim == 1 else values
     if values.ndim != 2 or values.shape[0] != count or values.shape[1] not in (1, channels):
         came = f"is of shape {np.shape(given)} for {count} photographs of {channels} channels"
@@ -340,7 +324,7 @@ def _factors(name: str, given: Any, count: int, channels: int) -> Float[np.ndarr
 
 
 def _directions(given: Any) -> Float[np.ndarray, "P 3"]:
-    vectors = plain_numbers("lights", given, "Give directions, or for lights that are near a scene with each")
+    vectors = as_numbers("lights", given, remedy="Give directions, or for lights that are near a scene with each")
     if vectors.ndim != 2 or vectors.shape[1] != 3:
         raise InputError("lights", f"are of shape {vectors.shape}", "Give (P, 3) directions towards the lights")
     length = np.sqrt(np.sum(vectors * vectors, axis=1))
@@ -374,10 +358,6 @@ def _refuse_other_views(scenes: list[brdf.Scene]) -> None:
         if not same:
             came = "has another camera, or other shapes or points, than lights[0]"
             raise InputError(f"lights[{index}]", came, "Give scenes of one view that differ in their lights")
-
-
-def _equal(one: Any, other: Any) -> bool:
-    return one is other or np.array_equal(one, other, equal_nan=True)
 
 
 def _white(name: str, scene: brdf.Scene) -> tuple[brdf.Scene, np.ndarray]:

@@ -7,7 +7,7 @@ channels' sums are gathered here into one system; no pixel is touched for that.
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 
 class NormalEquations(NamedTuple):
@@ -25,7 +25,7 @@ class NormalEquations(NamedTuple):
 
 
 def join_channels(
-    gram: Float[np.ndarray, "C 4 4"],
+    gram: Float[np.ndarray, "C 4 4"] | Float[np.ndarray, "C C 4 4"],
     product: Float[np.ndarray, "C 4"],
     square: Float[np.ndarray, " C"],
     x_s: Float[np.ndarray, " C"],
@@ -34,7 +34,7 @@ def join_channels(
     """Gather the channels.
 
     Args:
-        gram: of ambient, diffuse, lobe, derivative.
+        gram: of ambient, diffuse, lobe, derivative; or of those of any two channels, where these err together.
         product: of these with the target.
         square: of the target.
         x_s: what multiplies the derivative.
@@ -43,13 +43,20 @@ def join_channels(
     channels = x_s.size
     scale = np.ones((channels, 4))
     scale[:, 3] = x_s
-    variance = np.broadcast_to(variance, channels)
+    variance, places = np.broadcast_to(variance, channels), places_of(channels)
     whole, right = np.zeros((3 * channels + 1,) * 2), np.zeros(3 * channels + 1)
-    for c in range(channels):
-        index = [c, channels + c, 2 * channels + c, 3 * channels]
-        whole[np.ix_(index, index)] += gram[c] * np.outer(scale[c], scale[c]) / variance[c]
+    for c, index in enumerate(places):
         right[index] += product[c] * scale[c] / variance[c]
+        for other in range(channels) if gram.ndim == 4 else [c]:
+            own = gram[c, other] if gram.ndim == 4 else gram[c]
+            whole[np.ix_(index, places[other])] += own * np.outer(scale[c], scale[other]) / variance[c]
     return NormalEquations(whole, right, float(np.sum(square / variance)))
+
+
+def places_of(channels: int) -> Int[np.ndarray, "C 4"]:
+    """Where x_a, x_d, x_s of each channel and the shift of n stand among the unknowns of all."""
+    own = np.arange(3 * channels).reshape(3, channels)
+    return np.vstack([own, np.full(channels, 3 * channels)]).T
 
 
 def design_of(free: Bool[np.ndarray, "3 C"], tied: Float[np.ndarray, " C"] | None) -> Float[np.ndarray, "U V"]:

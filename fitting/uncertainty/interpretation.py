@@ -157,7 +157,7 @@ def interpret(
         sure.reasons[2], sure = hidden, sure._replace(n_reason=hidden)
     material, parameters = material_and_parameters(fit, sure, seen.colour, interval)
     free, channels = free_parameters(parameters), material.k_d.shape[0]
-    index = [3 * channels if p.channel is None else TERMS.index(p.name) * channels + p.channel for p in free]
+    index = [one.place(channels) for one in free]
     correlation = sure.correlation[np.ix_(index, index)]
     warnings = [_capped(material)] if fit.capped else []
     warnings += _missing_ambient(pictures)
@@ -335,9 +335,7 @@ def _missing_ambient(pictures: Sequence[Picture]) -> Iterator[str]:
         some = slice(None, None, -(-picture.target.shape[0] // MOST_PIXELS))
         # Through NumPy: a slice of an array on the device would be compiled.
         target, diffuse = np.asarray(picture.target)[some].astype(np.float64), np.asarray(picture.diffuse)[some]
-        counted = np.all(np.isfinite(target), axis=1)
-        if picture.weight is not None:
-            counted &= np.asarray(picture.weight)[some].reshape(len(target), -1).min(axis=1) > 0
+        counted = picture.counts[some] & np.all(np.isfinite(target), axis=1)
         reached = np.any(diffuse > 0, axis=1)
         dark.append(target[counted & ~reached])
         lit.append(target[counted & reached])

@@ -64,9 +64,7 @@ def residual_correlation(
     products, count, residuals, values = np.zeros((3, noise.size)), 0, [], []
     for index in some:
         picture = pictures[index]
-        weight = np.ones((1, 1)) if picture.weight is None else np.asarray(picture.weight)
-        weight = np.broadcast_to(weight.reshape(len(weight), -1).min(axis=1), picture.target.shape[0])
-        first, second = _neighbours((weight > 0).reshape(-1, widths[index]), most)
+        first, second = _neighbours(picture.counts.reshape(-1, widths[index]), most)
         count += first.size
         pairs = np.zeros((2, most), np.int32)
         pairs[:, : first.size] = first, second

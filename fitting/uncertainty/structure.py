@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from fitting.solver.normal_equations import FEW_VALUES, Picture
 from fitting.solver.profile import Optimum
+from fitting.solver.tied import places_of
 
 SIZES = (8, 16, 32)
 # Pixels on a side of the blocks of JPEG, whose errors go together by themselves.
@@ -257,8 +258,7 @@ def _left_out(
     covariance: Float[np.ndarray, "U U"],
 ) -> Float[np.ndarray, "U B"]:
     """Scores of blocks, each about the fit without it."""
-    channels = slopes.shape[2]
-    index = np.array([[c, channels + c, 2 * channels + c, 3 * channels] for c in range(channels)])
+    index = places_of(slopes.shape[2])
     own = np.array([covariance[np.ix_(some, some)] for some in index])
     held = np.einsum("ipc,cij,jpc->p", slopes, own, slopes, optimize=True)
     root = np.linalg.svd(covariance, hermitian=True)
