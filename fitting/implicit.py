@@ -103,7 +103,7 @@ def sensitivity(result: FitResult, by: Callable[[list[brdf.Scene]], Sequence[Any
         except brdf.InputError as error:
             raise brdf.InputError("by", error.what, "Return leaves of the scenes, each once") from None
         vector = np.array(problem.start())
-        blocks = np.split(np.arange(vector.size), problem.ends)
+        blocks = [np.arange(vector.size)[leaf.numbers] for leaf in problem.freed]
         index, known = dict(zip(names, blocks, strict=False)), blocks[len(names) :]
         unknowns = _unknowns(result, index, vector.size)
         # A fit in float32 stops a little beside the stationary point; Newton's steps go there.

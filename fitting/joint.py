@@ -234,7 +234,6 @@ def _solve(problem: JointProblem, seen: Observed, solver: str, tolerance: float,
     left = left_over(seen, residuals, vector.size, warnings)
     material, scenes = jax.tree.map(np.asarray, found.content())
     given = jax.tree.leaves((material, seen.problem.scenes))
-    given = [given[place] for place in problem.places]
     known = likely or _by_least_squares(problem, seen, vector, residual, columns, left["noise"])
     parameters, errors, correlation = _with_errors(problem, given, known, held)
     return JointResult(
@@ -243,7 +242,7 @@ def _solve(problem: JointProblem, seen: Observed, solver: str, tolerance: float,
         parameters=parameters,
         correlation=correlation,
         scenes=scenes,
-        values=tuple(np.asarray(leaf) for leaf in found.freed()),
+        values=tuple(np.asarray(found.leaves[leaf.place]) for leaf in problem.freed),
         errors=errors,
         steps=steps,
         converged=converged,
@@ -315,36 +314,35 @@ def _with_errors(
     Of a direction the length is no unknown: its errors are those of two small turns across it.
     """
     vector, design = known.vector, np.where(held[:, None], 0.0, problem.design(known.vector))
-    both = list(zip(problem.names, np.split(np.arange(vector.size), problem.ends), strict=True))
-    sizes = [2 if name in DIRECTIONS else len(block) for name, block in both]
-    hessian, ends = design.T @ known.hessian @ design, np.cumsum(sizes)[:-1]
+    hessian = design.T @ known.hessian @ design
     covariance, variance = scaled_inverse(hessian, DEPENDENT), inverse_diagonal(hessian, DEPENDENT)
     if known.scatter is not None:
         covariance = covariance @ design.T @ known.scatter @ design @ covariance
         variance = np.where(np.isfinite(variance), np.diag(covariance), variance)
     # A turn is as much wider as the part of the direction of which least is known.
     wider = np.max(np.where(design != 0, known.widening[:, None], 0.0), axis=0)
-    deviation = np.split(np.sqrt(variance) * np.where(wider > 0, wider, 1.0), ends)
-    parameters, errors, at = [], [], []
-    for word, (name, block), leaf, own, place in zip(
-        problem.words, both, given, deviation, np.split(np.arange(len(hessian)), ends), strict=True
-    ):
-        if name in DIRECTIONS:
+    deviation = np.sqrt(variance) * np.where(wider > 0, wider, 1.0)
+    parameters, errors, at, end = [], [], [], 0
+    for leaf in problem.freed:
+        first, end = end, end + (2 if leaf.name in DIRECTIONS else leaf.size)
+        values, own, bound = vector[leaf.numbers], deviation[first:end], held[leaf.numbers]
+        if leaf.name in DIRECTIONS:
             error = float(np.degrees(np.linalg.norm(own)))
-            before, after = (one / np.linalg.norm(one) for one in (np.asarray(leaf, np.float64), vector[block]))
+            before, after = (one / np.linalg.norm(one) for one in (np.asarray(given[leaf.place], np.float64), values))
             turned = float(np.degrees(np.arctan2(np.linalg.norm(np.cross(before, after)), before @ after)))
-            parameters.append(_parameter(word, None, turned, error, direction=tuple(after.tolist())))
+            parameters.append(_parameter(leaf.words, None, turned, error, direction=tuple(after.tolist())))
             errors.append(np.asarray(error))
             at.append(-1)
             continue
-        values = np.exp(vector[block]) if name == "n" else vector[block]
-        own = np.where(held[block], 0.0, own * (values if name == "n" else 1.0))
-        errors.append(own.reshape(np.shape(leaf)))
-        at += place.tolist()
+        values = np.exp(values) if leaf.name == "n" else values
+        own = np.where(bound, 0.0, own * (values if leaf.name == "n" else 1.0))
+        errors.append(own.reshape(leaf.shape))
+        at += range(first, end)
         for index, (value, error) in enumerate(zip(values.tolist(), own.tolist(), strict=True)):
-            at_bound = bool(held[block][index])
-            interval = _interval(name, value, error) if np.isfinite(error) and not at_bound else None
-            parameters.append(_parameter(word, index if np.ndim(leaf) else None, value, error, interval, at_bound))
+            at_bound = bool(bound[index])
+            interval = _interval(leaf.name, value, error) if np.isfinite(error) and not at_bound else None
+            channel = index if leaf.shape else None
+            parameters.append(_parameter(leaf.words, channel, value, error, interval, at_bound))
     at = np.array(at)[[one.value is not None and not one.at_bound for one in parameters]]
     error = np.sqrt(np.diag(covariance)[at])
     correlation = np.where((at >= 0)[:, None] & (at >= 0), covariance[np.ix_(at, at)] / np.outer(error, error), 0.0)

@@ -52,10 +52,7 @@ def most_likely_numbers(problem: JointProblem, seen: Observed, vector: Float[np.
         pictures.weights = [alike(own, code, noise) for own, code in zip(bounds, codes, strict=True)]
     at, known, said = maximise(pictures, Estimate(vector, noise))
     said, wider = where_most_is_told(pictures, at, known, said)
-    freed = list(zip(problem.names, problem.freed(), strict=True))
-    shared = np.repeat(
-        [name not in NOT_NEGATIVE or not leaf.ndim for name, leaf in freed], [leaf.size for _, leaf in freed]
-    )
+    shared = problem.each(lambda leaf: leaf.name not in NOT_NEGATIVE or not leaf.shape)
     # Copies of a value tell no more of what all channels share.
     copies = np.where(shared & seen.copies, seen.colour.size, 1)
     return Likely(at.unknowns, said.hessian, pictures.scatter(said), wider * np.sqrt(copies))
@@ -76,7 +73,8 @@ class RenderedPictures(Problem):
             copies: the channels are copies of each other, and tell of a number once.
         """
         self._problem = dataclasses.replace(problem, weights=[None] * len(bounds))
-        self.bounds, self.design, self.exponents, self.copies = bounds, problem.design(start), problem.exponents, copies
+        self.bounds, self.design, self.copies = bounds, problem.design(start), copies
+        self.exponents = problem.each(lambda leaf: leaf.name == "n")
         self.lower, self.upper = np.where(problem.bounded, 0.0, -np.inf), np.full(start.shape, np.inf)
         self.weights = [np.ones(own.lower.shape) for own in bounds]
         self.places = np.broadcast_to(np.arange(start.size), (bounds[0].lower.shape[1], start.size))

@@ -1,14 +1,15 @@
 """What a joint fit frees: leaves of material and scenes as one vector of numbers, and the pictures that they show."""
 
+import math
 import re
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 import brdf
 from brdf.errors import InputError
@@ -22,35 +23,50 @@ NOT_NEGATIVE = ("k_a", "k_d", "k_s", "intensity", "radiance", "ambient", "attenu
 DIRECTIONS = ("direction",)
 
 
+class Leaf(NamedTuple):
+    """A freed leaf of material and scenes.
+
+    Attributes:
+        place: among all leaves.
+        name: of its field.
+        words: what a person calls it.
+        shape: of the leaf.
+        start: where its numbers begin in the vector of all.
+    """
+
+    place: int
+    name: str
+    words: str
+    shape: tuple[int, ...]
+    start: int
+
+    @property
+    def size(self) -> int:
+        """How many numbers it has."""
+        return math.prod(self.shape)
+
+    @property
+    def numbers(self) -> slice:
+        """Its part of the vector."""
+        return slice(self.start, self.start + self.size)
+
+
 class JointProblem(eqx.Module):
     """From a vector of freed numbers to weighted residuals; a pytree, so that its programs are compiled once a shape.
 
     Attributes:
-        leaves: of material and list of scenes.
-        targets: what is compared with, (P, C) each.
-        weights: of their pixels, (P,) each; None where all count, and alike.
-        shape: of material and scenes.
-        places: of the freed leaves.
-        names: of the fields that they are.
-        words: what a person calls them.
+        leaves: all of material and scenes.
+        targets: (H W, C) each.
+        weights: (H W,) each, or None where each pixel weighs 1.
+        shape: of the tree.
+        freed: the leaves to fit.
     """
 
     leaves: list[Array]
     targets: list[Array]
     weights: list[Array | None]
     shape: Any = eqx.field(static=True)
-    places: tuple[int, ...] = eqx.field(static=True)
-    names: tuple[str, ...] = eqx.field(static=True)
-    words: tuple[str, ...] = eqx.field(static=True)
-
-    def freed(self) -> list[Array]:
-        """The freed leaves."""
-        return [self.leaves[place] for place in self.places]
-
-    @property
-    def ends(self) -> Int[np.ndarray, " L"]:
-        """Where in the vector each freed leaf but the last one ends."""
-        return np.cumsum([leaf.size for leaf in self.freed()])[:-1]
+    freed: tuple[Leaf, ...] = eqx.field(static=True)
 
     def by_picture(self, values: Float[np.ndarray, "*B N"]) -> list[Float[np.ndarray, "*B P C"]]:
         """What the residuals of each picture are, or their derivatives.
@@ -62,38 +78,35 @@ class JointProblem(eqx.Module):
         both = zip(parts, self.targets, strict=True)
         return [np.asarray(part, np.float64).reshape(*part.shape[:-1], *target.shape) for part, target in both]
 
-    def _each(self, of: Callable[[str], bool]) -> Bool[np.ndarray, " U"]:
-        return np.repeat([of(name) for name in self.names], [leaf.size for leaf in self.freed()])
+    def each(self, of: Callable[[Leaf], bool]) -> Bool[np.ndarray, " U"]:
+        """What is so of the leaf that each number belongs to."""
+        return np.repeat([of(leaf) for leaf in self.freed], [leaf.size for leaf in self.freed])
 
     @property
     def bounded(self) -> Bool[np.ndarray, " U"]:
         """Which numbers may not be negative."""
-        return self._each(lambda name: name in NOT_NEGATIVE)
-
-    @property
-    def exponents(self) -> Bool[np.ndarray, " U"]:
-        """Which are exponents, by their logarithm."""
-        return self._each(lambda name: name == "n")
+        return self.each(lambda leaf: leaf.name in NOT_NEGATIVE)
 
     def design(self, vector: Float[np.ndarray, " U"]) -> Float[np.ndarray, "U V"]:
         """What each small change moves of the numbers: of a direction two small turns, its length is no unknown."""
         from scipy.linalg import block_diag  # late: few commands fit jointly
 
-        both = zip(np.split(vector, self.ends), self.names, strict=True)
-        return np.asarray(
-            block_diag(*(_across(own).T if name in DIRECTIONS else np.eye(own.size) for own, name in both))
-        )
+        parts = [
+            _across(vector[leaf.numbers]).T if leaf.name in DIRECTIONS else np.eye(leaf.size) for leaf in self.freed
+        ]
+        return np.asarray(block_diag(*parts))
 
     def start(self) -> Array:
         """The freed numbers as they are searched: n by its logarithm."""
-        both = zip(self.freed(), self.names, strict=True)
-        return jnp.concatenate([jnp.ravel(jnp.log(leaf) if name == "n" else leaf) for leaf, name in both])
+        parts = [(self.leaves[leaf.place], leaf.name == "n") for leaf in self.freed]
+        return jnp.concatenate([jnp.ravel(jnp.log(part) if by_log else part) for part, by_log in parts])
 
     def at(self, vector: Array) -> "JointProblem":
         """The problem with other freed numbers."""
         leaves = list(self.leaves)
-        for place, name, part in zip(self.places, self.names, jnp.split(vector, self.ends), strict=True):
-            leaves[place] = (jnp.exp(part) if name == "n" else part).reshape(leaves[place].shape)
+        for leaf in self.freed:
+            part = vector[leaf.numbers].reshape(leaf.shape)
+            leaves[leaf.place] = jnp.exp(part) if leaf.name == "n" else part
         return eqx.tree_at(lambda problem: problem.leaves, self, leaves)
 
     def content(self) -> tuple[brdf.Material, list[brdf.Scene]]:
@@ -150,9 +163,11 @@ def joint_problem(
         raise InputError("free", "gives what is no number of material or scenes as a whole", remedy)
     if len(set(freed)) < len(freed):
         raise InputError("free", "gives a leaf twice", remedy)
-    places, names, words = zip(*(own[leaf] for leaf in freed), strict=True)
-    leaves, shape = jax.tree.flatten(start)
-    return JointProblem(leaves, targets, weights, shape, places, names, words)
+    (leaves, shape), found = jax.tree.flatten(start), list[Leaf]()
+    for place, *called in (own[leaf] for leaf in freed):
+        begin = found[-1].numbers.stop if found else 0
+        found.append(Leaf(place, *called, leaves[place].shape, begin))
+    return JointProblem(leaves, targets, weights, shape, tuple(found))
 
 
 def named_leaves(names: Sequence[str]) -> Callable[[Any, list[brdf.Scene]], list[Any]]:
