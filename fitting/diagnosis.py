@@ -327,7 +327,10 @@ def _raised(values: Any, percent: float) -> Any:
     return values + percent / 100
 
 
-BLACK = "subtract the camera's black level, or give the scene the ambient light that it lacks"
+BLACK = (
+    "subtract the camera's black level, or give the scene the [ambient] light that it lacks, a photograph --ambient, "
+    "and k_a takes it up"
+)
 VALUE_CHANGES = (
     _Change("gamma", "%", "state how the file is encoded: --encoding srgb, linear or a gamma", math.inf, (_power,)),
     _Change("black", "% of white", BLACK, 50.0, (_raised,)),

@@ -49,12 +49,6 @@ from fitting.uncertainty.structure import (
 ROUNDED = 0.25
 # An interval of n wider than this factor says nothing but its order of magnitude.
 WIDEST_INTERVAL = 100.0
-# Two parameters whose errors go together more than this are hard to tell apart, if an error is also large.
-CORRELATED, LARGE_ERROR = 0.98, 0.05
-# Light is missing where the dark side shows at least this share of the mean of the lit one, and so many of its own
-# standard errors. That many pixels of that many pictures are looked at; a mean needs no more.
-SHARE, DEVIATIONS = 0.02, 5.0
-FEWEST_PIXELS, MOST_PIXELS, MOST_PICTURES = 30, 8192, 16
 
 
 class Interpretation(NamedTuple):
@@ -160,10 +154,8 @@ def interpret(
     index = [one.place(channels) for one in free]
     correlation = sure.correlation[np.ix_(index, index)]
     warnings = [_capped(material)] if fit.capped else []
-    warnings += _missing_ambient(pictures)
     weighed = seen.problem.noise is not None or any(one is not None for one in seen.problem.weights)
     warnings += _warnings(known, together, None if all(sure.reasons[2]) else lobe, weighed)
-    warnings += _hard_to_tell(free, correlation)
     if sure.sums:
         words = "no more than a sum of several numbers is determined, see there: the material shows it with "
         words += f"{100 * AMBIENT_SHARE:g} % of it as ambient light, if there is any, and the rest as k_d. "
@@ -325,33 +317,6 @@ def _capped(material: brdf.Material) -> str:
     )
 
 
-def _missing_ambient(pictures: Sequence[Picture]) -> Iterator[str]:
-    """Where pixels that no light of the scene reaches are bright, although it has no ambient light."""
-    dark, lit = [], []
-    for index in range(0, len(pictures), -(-len(pictures) // MOST_PICTURES)):
-        picture = pictures[index]
-        if np.any(np.asarray(picture.ambient)):
-            return
-        some = slice(None, None, -(-picture.target.shape[0] // MOST_PIXELS))
-        # Through NumPy: a slice of an array on the device would be compiled.
-        target, diffuse = np.asarray(picture.target)[some].astype(np.float64), np.asarray(picture.diffuse)[some]
-        counted = picture.counts[some] & np.all(np.isfinite(target), axis=1)
-        reached = np.any(diffuse > 0, axis=1)
-        dark.append(target[counted & ~reached])
-        lit.append(target[counted & reached])
-    unlit, bright = np.concatenate(dark), np.concatenate(lit)
-    if min(len(unlit), len(bright)) < FEWEST_PIXELS:
-        return
-    # The middle of each channel: the mean of noise that was cut off at black is above 0.
-    shown = float(np.mean(np.median(unlit, axis=0)))
-    share = shown / max(float(bright.mean()), np.finfo(float).tiny)
-    if share >= SHARE and shown >= DEVIATIONS * unlit.mean(axis=1).std() / np.sqrt(len(unlit)):
-        yield (
-            f"where no light of the scene arrives the picture still shows {100 * share:.2g} % of its lit side: give "
-            "the scene an [ambient] light, or a photograph --ambient, and k_a takes that up"
-        )
-
-
 def _warnings(
     known: ResidualCorrelation, together: Structure | None, seen: Highlight | None, weighed: bool
 ) -> Iterator[str]:
@@ -387,21 +352,4 @@ def _warnings(
         yield (
             f"the highlight is smaller than a pixel, or nearly so ({amount}): k_s and n hang on each pixel being "
             "sampled at its centre, and a camera averages over pixels. A larger picture or a larger light would tell"
-        )
-
-
-def _hard_to_tell(free: Sequence[Parameter], correlation: np.ndarray) -> Iterator[str]:
-    """Pairs whose errors go together so much that they are known worse apart than together; of channels the worst."""
-    pairs: dict[tuple[str, str], float] = {}
-    for i, first in enumerate(free):
-        for j, second in enumerate(free[i + 1 :], start=i + 1):
-            large = max((p.error or 0.0) / p.value for p in (first, second) if p.value)
-            if second.channel in (None, first.channel) and abs(correlation[i, j]) > CORRELATED and large > LARGE_ERROR:
-                key = first.name, second.name
-                pairs[key] = max(pairs.get(key, 0.0), float(correlation[i, j]), key=abs)
-    for (first, second), value in pairs.items():
-        known = "sum" if value < 0 else "difference"
-        yield (
-            f"{first} and {second} are hard to tell apart (correlation {value:.3f}): "
-            f"their {known} is known better than either"
         )

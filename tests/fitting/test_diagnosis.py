@@ -74,6 +74,13 @@ def test_a_black_level_and_one_of_two_lights_are_named():
     assert fitted(target, told).diagnosis[0].name in ("intensity 0 or intensity 1", "intensity 1 or intensity 0")
 
 
+def test_ambient_light_that_a_scene_lacks_is_told_as_such():
+    cause = fitted(drawn(), dataclasses.replace(SCENE, ambient=None)).diagnosis[0]
+    assert cause.name == "black"
+    assert abs(cause.size - 100 * MATERIAL.k_a[0]) < 4 * cause.error
+    assert "give the scene the [ambient] light that it lacks" in cause.remedy
+
+
 def test_nothing_is_named_where_nothing_is_wrong():
     result = fitted(drawn())
     assert result.diagnosis == ()

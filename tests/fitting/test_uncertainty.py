@@ -233,34 +233,6 @@ def test_a_flat_sheet_under_a_distant_light_tells_only_a_sum_of_ambient_and_diff
         assert abs(highlight.value - 0.3) < 4 * highlight.error
 
 
-SIDE, FRONT = [0.8, 0.5, 0.4], [0.0, 0.0, 1.0]
-
-
-@pytest.mark.parametrize(
-    ("direction", "there", "known", "told"),
-    [
-        (SIDE, 0.2, None, True),
-        (SIDE, None, None, False),
-        (SIDE, 0.2, 0.2, False),
-        (SIDE, 0.004, None, False),  # 0.7 % of the lit side: less than is worth a word
-        (FRONT, 0.2, None, False),  # nothing is dark that could tell
-    ],
-    ids=["missing", "not there", "known", "a trace", "no dark side"],
-)
-def test_missing_ambient_light_is_hinted_at_where_the_dark_side_is_bright(direction, there, known, told: bool):
-    material = brdf.BlinnPhong(k_a=[0.4] * 3, k_d=[0.5, 0.4, 0.3], k_s=[0.3] * 3, n=30.0)
-    light = brdf.DirectionalLight(direction=direction, intensity=[0.9] * 3)
-    truth, stated = (ball_scene(light, ambient=None if value is None else [value] * 3) for value in (there, known))
-    target = pictured(material, truth, 0.01)
-    hints = [w for w in fitting.fit(target, stated, model="blinn-phong").warnings if "[ambient]" in w]
-    assert len(hints) == told
-    if told:
-        points = stated.surface_points()
-        on_ball, cosine = np.asarray(points.mask), np.asarray(points.normal) @ np.array(direction)
-        share = target[on_ball & (cosine <= 0)].mean() / target[on_ball & (cosine > 0)].mean()
-        assert f"still shows {100 * share:.2g} % of its lit side" in hints[0]
-
-
 def test_blocks_that_hold_much_count_as_a_fit_without_them_leaves_them():
     # A lobe in one corner of 48 x 48 pixels, of two channels that share an exponent: a linear problem, fitted again
     # without each block of 8 x 8.
