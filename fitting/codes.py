@@ -50,10 +50,9 @@ class Codes(NamedTuple):
         scale: codes where the encoding is 1.
         encoding: "linear", "srgb" or a gamma.
         unit: radiance where the encoding is 1, a number or (C,).
-        name: for people.
         lossy: the file was compressed with losses.
         jpeg: how a JPEG was.
-        found: it was not said that there are codes: the values lie on their levels.
+        levels: the files on whose levels all values lie, in words; empty where it was said that there are codes.
     """
 
     values: Float[np.ndarray, "H W C"]
@@ -62,11 +61,10 @@ class Codes(NamedTuple):
     ends: tuple[float, float]
     scale: float
     encoding: Encoding
-    name: str
     unit: float | np.ndarray = 1.0
     lossy: bool = False
     jpeg: Jpeg | None = None
-    found: bool = False
+    levels: str = ""
 
     @property
     def fine(self) -> bool:
@@ -213,7 +211,7 @@ def _stated(pixels: np.ndarray, rounding: Any) -> Codes | None:
     size = float(np.median(step[step > 0]))
     half = 0.5 * np.maximum(step, 1e-6 * size) / size
     half = float(half) if half.ndim == 0 else np.broadcast_to(half, pixels.shape)
-    return Codes(pixels / size, half, half, (-np.inf, np.inf), 1 / size, "linear", "steps as stated")
+    return Codes(pixels / size, half, half, (-np.inf, np.inf), 1 / size, "linear")
 
 
 def _integers(pixels: np.ndarray, encoding: Encoding, top: int) -> Codes | None:
@@ -231,8 +229,7 @@ def _integers(pixels: np.ndarray, encoding: Encoding, top: int) -> Codes | None:
         # Clipped to the largest number of the file, not to a code of the sensor.
         codes = np.where(codes == top, np.ceil(top / step) * step, codes)
     largest = float(top // step)
-    name = f"{'sRGB ' if encoding == 'srgb' else ''}{int(np.ceil(np.log2(largest + 1)))} bit"
-    return Codes((codes / step).astype(np.float32), 0.5, 0.5, (0.0, largest), top / step, encoding, name)
+    return Codes((codes / step).astype(np.float32), 0.5, 0.5, (0.0, largest), top / step, encoding)
 
 
 def _levels(pixels: np.ndarray) -> Codes | None:
@@ -255,7 +252,8 @@ def _levels(pixels: np.ndarray) -> Codes | None:
     for top, curve in fitting:
         found = _integers(pixels, curve, top)
         if found is not None:
-            return found._replace(found=True)
+            bits = int(np.ceil(np.log2(found.ends[1] + 1)))
+            return found._replace(levels=f"{bits}-bit {'sRGB' if curve == 'srgb' else curve} files")
     # A float's 0 is no end of its own, but noise may have been cut off there.
     images = np.moveaxis(pixels, -1, 0)
     cut = any(single_values_at_end(image, np.isfinite(image), 0.0) for image in images)
@@ -264,12 +262,12 @@ def _levels(pixels: np.ndarray) -> Codes | None:
         step = np.broadcast_to(_shared_step(pixels)[..., None], pixels.shape)
         unit = float(np.median(step[step > 0]))
         above = np.maximum(step, 1e-30) / unit
-        return Codes((pixels / unit).astype(np.float32), 0.0, above, ends, 1 / unit, "linear", "RGBE")
+        return Codes((pixels / unit).astype(np.float32), 0.0, above, ends, 1 / unit, "linear", levels="RGBE files")
     if half:
         ulp = np.spacing(np.maximum(pixels, 6e-5).astype(np.float16)).astype(np.float64)
         unit = float(np.median(ulp[pixels > 0])) if np.any(pixels > 0) else 1.0
         around = 0.5 * ulp / unit
-        return Codes((pixels / unit).astype(np.float32), around, around, ends, 1 / unit, "linear", "half")
+        return Codes((pixels / unit).astype(np.float32), around, around, ends, 1 / unit, "linear", levels="half floats")
     return None
 
 

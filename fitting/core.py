@@ -106,6 +106,7 @@ def fit_pictures(problem: FitProblem) -> FitResult:
         counted=seen.counted,
         weights=seen.weights,
         files=[target.file for target in problem.targets],
+        levels=next((one.codes.levels for one in problem.targets if one.codes is not None), ""),
     )
 
 

@@ -136,8 +136,9 @@ class _Picture:
 
     def shown(self, scene: brdf.Scene) -> Float[np.ndarray, "H W C"]:
         """What the material shows of a scene."""
-        k = [getattr(self.material, name, 0.0) for name in ("k_a", "k_d", "k_s")]
-        return sum(map(operator.mul, map(np.asarray, k), self.basis(scene, float(getattr(self.material, "n", 1.0)))))
+        k = [np.asarray(getattr(self.material, name, 0.0)) for name in ("k_a", "k_d", "k_s")]
+        images = self.basis(scene, float(getattr(self.material, "n", 1.0)))
+        return np.sum(list(map(operator.mul, k, images)), axis=0)
 
     def codes(self, values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
         """As the file holds them, full scale 1."""

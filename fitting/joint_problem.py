@@ -164,9 +164,9 @@ def joint_problem(
     if len(set(freed)) < len(freed):
         raise InputError("free", "gives a leaf twice", remedy)
     (leaves, shape), found = jax.tree.flatten(start), list[Leaf]()
-    for place, *called in (own[leaf] for leaf in freed):
+    for place, name, words in (own[leaf] for leaf in freed):
         begin = found[-1].numbers.stop if found else 0
-        found.append(Leaf(place, *called, leaves[place].shape, begin))
+        found.append(Leaf(place, name, words, leaves[place].shape, begin))
     return JointProblem(leaves, targets, weights, shape, tuple(found))
 
 

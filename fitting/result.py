@@ -223,6 +223,7 @@ class FitResult(Parameters):
         counted: which pixels counted, (H, W) each.
         weights: how much they did, (H, W) each, None where all alike; () where no picture says.
         files: path, encoding and factor of each picture; None where it came without a file.
+        levels: the files on whose levels all values of a float picture lie, in words: these are fitted as codes.
         choice: what an accuracy or a time to spend made of the fit; None without one.
 
     Example:
@@ -254,6 +255,7 @@ class FitResult(Parameters):
     counted: Sequence[np.ndarray] = field(repr=False)
     weights: Sequence[np.ndarray | None] = field(default=(), repr=False)
     files: Sequence[dict[str, Any] | None] = ()
+    levels: str = ""
     choice: BudgetChoice | None = None
 
     @property
@@ -323,6 +325,7 @@ class FitResult(Parameters):
             "loss": self.loss,
             "precision": self.precision,
             "seconds": self.seconds,
+            "levels": self.levels,
             "choice": None if self.choice is None else self.choice.to_dict(),
         }
 

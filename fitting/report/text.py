@@ -33,6 +33,7 @@ def report(result: FitResult) -> str:
     lines.append(f"  residual    {100 * result.residual:.3g} % of the picture (rms)")
     lines += [f"  left out    {pixels} pixels {reason}" for reason, pixels in result.left_out.items() if pixels]
     lines += _silent(result.files)
+    lines += [f"  read as     codes: all values lie on the levels of {result.levels}"] if result.levels else []
     if result.highlight_pixels is not None:
         lines.append(f"  highlight   on {result.highlight_pixels:.3g} pixels")
     lines += [] if result.choice is None else result.choice.lines()

@@ -1,6 +1,7 @@
 """Numbers behind rounded values: balls of another renderer, saved as files are, against what they were drawn with."""
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +39,22 @@ def test_files_without_noise_are_read_within_their_errors(row: str, tmp_path: Pa
         assert max(abs(far) for _, far in found.values()) < FAR, (seed, found)
         if not row.startswith("JPEG"):
             assert abs(found["k_d[0]"][0]) < 3e-5, (seed, found)
+
+
+@pytest.mark.parametrize(
+    ("values", "levels"),
+    [
+        (lambda drawn: decode(np.rint(255 * encode(drawn, "srgb")) / 255, "srgb"), "8-bit sRGB files"),
+        (lambda drawn: np.rint(4095 * drawn) * 16 / 65535, "12-bit linear files"),
+        (lambda drawn: drawn.astype(np.float16).astype(np.float32), "half floats"),
+        (lambda drawn: drawn, ""),
+    ],
+)
+def test_floats_on_the_levels_of_files_are_said_to_be_codes(values: Callable[[np.ndarray], np.ndarray], levels: str):
+    one = ball(1, size=48)
+    result = fitting.fit(values(one.drawn()), one.scene(), model=one.model)
+    assert result.levels == levels
+    assert (f"read as     codes: all values lie on the levels of {levels}" in str(result)) == bool(levels)
 
 
 @pytest.mark.parametrize("row", ["sRGB 8 bit, light noise 0.0005", "sRGB 8 bit, light noise 0.01"])
