@@ -7,10 +7,10 @@ from its whole solid angle, (cos θ₁ - cos θ₂) Δφ.
 
 Where the samples go. The map is cut along rows and columns into as many rectangles as there are samples, always the one
 next whose light is spread most (energy times variance of its directions), through its centre of mass. So samples crowd
-where the light is, and a map with one bright texel costs one sample. A sample keeps energy, mean and covariance of the
-directions in its rectangle: the irradiance of rectangles above the horizon is exact however few there are, and those
-that the horizon crosses fade in as their spread says. What is sampled is the shape of shadows and of highlights: a lobe
-needs the rectangles in its reach to be narrower than itself.
+where the light is; a map with one bright texel costs one sample, unless the texels are wide and are cut up themselves.
+A sample keeps energy, mean and covariance of the directions in its rectangle: the irradiance of rectangles above the
+horizon is exact however few there are, and those that the horizon crosses fade in as their spread says. What is sampled
+is the shape of shadows and of highlights: a lobe needs the rectangles in its reach to be narrower than itself.
 
 Source of the idea: P. Debevec, A median cut algorithm for light probe sampling, SIGGRAPH 2005 posters.
 """
@@ -37,6 +37,8 @@ STEEPNESS = 7.0
 """The innermost samples of a lobe are exp(-this) times as far from its centre as the horizon."""
 LARGEST_MAP = 1 << 21
 """Texels from which on a map is averaged before it is cut: 2048 × 1024."""
+FEWEST_ROWS = 64
+"""A map of fewer has wide texels, which are cut up too: in so many rows, and twice as many columns, at least."""
 
 
 class ConstantEnvironment(Light):
@@ -215,6 +217,8 @@ def map_directions(height: int, width: int) -> Float[np.ndarray, "H W 3"]:
 
 def cut(pixels: Float[np.ndarray, "H W C"], samples: int) -> Patches:
     """Cut a map into rectangles, see the module."""
+    for axis, fewest in enumerate((FEWEST_ROWS, 2 * FEWEST_ROWS)):
+        pixels = np.repeat(pixels, -(-fewest // pixels.shape[axis]), axis)
     moments = _texel_moments(pixels * _solid_angles(*pixels.shape[:2])[..., None])
     while moments.shape[0] * moments.shape[1] > LARGEST_MAP:
         for axis in (0, 1):

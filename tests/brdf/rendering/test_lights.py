@@ -148,6 +148,13 @@ def test_one_bright_texel_is_a_directional_light():
     np.testing.assert_allclose(radiance(brdf.EnvironmentMap(pixels), GLOSSY), radiance(sun, GLOSSY), rtol=1e-12)
 
 
+def test_a_wide_texel_shines_from_its_whole_solid_angle():
+    texels = np.random.default_rng(3).gamma(0.5, size=(4, 8, 1))
+    fine = np.repeat(np.repeat(texels, 32, axis=0), 32, axis=1)
+    few, many = (radiance(brdf.EnvironmentMap(each), GLOSSY) for each in (texels, fine))
+    np.testing.assert_allclose(few, many, rtol=2e-3)  # a point for each texel is 5 % off
+
+
 def test_a_map_of_one_colour_gives_it_to_the_emittance():
     pixels = np.random.default_rng(0).uniform(size=(8, 16, 1)) * np.array([1.0, 0.5, 0.25])
     light = brdf.EnvironmentMap(pixels)
