@@ -9,6 +9,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 import brdf
 from brdf.lobes import Near
@@ -23,7 +24,7 @@ from fitting.pixels import Observed, Tile, observe
 from fitting.problem import FitProblem
 from fitting.result import FitResult
 from fitting.sample_error import MOST, SampleError, between, near_exponent, nearer
-from fitting.selection import FAMILIES, Choice, choose, is_better
+from fitting.selection import FAMILIES, Choice, choose, is_better, may_be_off
 from fitting.solver.devices import placed
 from fitting.solver.losses import reweight
 from fitting.solver.nnls import ROUNDING, nonnegative_minima
@@ -32,7 +33,7 @@ from fitting.solver.profile import Optimum, refit, search
 from fitting.solver.refinement import TOLERANCE_DOUBLE, Cap
 from fitting.solver.streams import Stream, each
 from fitting.solver.tied import NormalEquations, design_of, join_channels
-from fitting.uncertainty.covariance import NO_TRACE, residual_noise
+from fitting.uncertainty.covariance import NO_TRACE, residual_noise, specular_gain
 from fitting.uncertainty.highlight import highlight, nearest_peak
 from fitting.uncertainty.interpretation import Interpretation, alone_covariance, interpret, shared_errors
 from fitting.uncertainty.noise_model import weighted_sums
@@ -89,7 +90,8 @@ def fit_pictures(problem: FitProblem) -> FitResult:
             # anew.
             free = fit.free & [[True], [True], [False]]
             pictures = fit.pictures if problem.loss == "squared" else None
-            fit = _held_plausible(most_likely(_fit_model(fit.model, seen, free, pictures), copies=seen.copies), seen)
+            rest = _held_plausible(most_likely(_fit_model(fit.model, seen, free, pictures), copies=seen.copies), seen)
+            fit = rest._replace(moved=_by_highlight(fit, rest, seen))
             told = _interpreted(fit, seen, choice, hidden)
     return FitResult(
         **told._asdict(),
@@ -436,6 +438,14 @@ def _held_plausible(fit: ModelFit, seen: Observed) -> ModelFit:
     # What the bound adds to the residual is no noise: that of the fit without it says what stands out.
     noise = fit.noise_factor * float(np.sqrt(np.sum(fit.optimum.cost) / np.sum(optimum.cost)))
     return fit._replace(optimum=optimum, tied=None, capped=True, noise_factor=noise)
+
+
+def _by_highlight(fit: ModelFit, rest: ModelFit, seen: Observed) -> Float[np.ndarray, " U"]:
+    """By how much a highlight that does not stand out may have moved the rest, were it there."""
+    x, said = fit.optimum.x, fit.evidence
+    normal = fit.optimum.normal(residual_noise(fit.optimum, seen.rounding) ** 2) if said is None else said.normal
+    step = np.where(rest.optimum.x > 0, x - rest.optimum.x, 0.0)
+    return may_be_off(np.append(step.ravel(), 0.0), specular_gain(normal.gram, x), 1 + int(np.count_nonzero(x[2])))
 
 
 def _interpreted(fit: ModelFit, seen: Observed, choice: Choice | None, hidden: str = "") -> Interpretation:

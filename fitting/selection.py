@@ -255,12 +255,7 @@ def _decide(trials: list[_Trial], normals: Mapping[str, NormalEquations], varian
 
 
 def _dropped(chosen: _Trial, trials: list[_Trial]) -> Float[np.ndarray, " U"]:
-    """By how much the likeliest term that was left out may have moved what stays.
-
-    Its estimate moves it by that much, with an error of its own; it is there as probably as Akaike's criterion says, by
-    which nothing has to stand out (Buckland, Burnham and Augustin, Biometrics 53 (1997) 603: the variance of an average
-    over models).
-    """
+    """By how much the likeliest term that was left out may have moved what stays."""
     fuller = [
         trial
         for trial in trials
@@ -269,9 +264,24 @@ def _dropped(chosen: _Trial, trials: list[_Trial]) -> Float[np.ndarray, " U"]:
     if not fuller:
         return np.zeros_like(chosen.solution)
     other = min(fuller, key=lambda trial: trial.expected)
-    gain = max(chosen.cost - other.cost, 1.0)
-    odds = np.exp(np.clip(0.5 * gain - (other.unknowns - chosen.unknowns), -50.0, 50.0))
     step = np.where(chosen.solution > 0, other.solution - chosen.solution, 0.0)
+    return may_be_off(step, chosen.cost - other.cost, other.unknowns - chosen.unknowns)
+
+
+def may_be_off(step: Float[np.ndarray, " U"], gain: float, unknowns: int) -> Float[np.ndarray, " U"]:
+    """By how much a term that was left out may have moved what stays.
+
+    Its estimate moves it by that much, with an error of its own; it is there as probably as Akaike's criterion says, by
+    which nothing has to stand out (Buckland, Burnham and Augustin, Biometrics 53 (1997) 603: the variance of an average
+    over models).
+
+    Args:
+        step: by which the term's estimate moves what stays.
+        gain: by how much it lowers the cost, in noise variances.
+        unknowns: how many more it has.
+    """
+    gain = max(gain, 1.0)
+    odds = np.exp(np.clip(0.5 * gain - unknowns, -50.0, 50.0))
     return step * np.sqrt(odds / (1 + odds) * (1 + 1 / gain))
 
 
