@@ -5,6 +5,7 @@ the half vector or the mirror direction is fitted with it: left to robust weight
 several degrees. Only where the light comes in at an angle is looked at, so that shadows say nothing.
 """
 
+import functools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -163,7 +164,7 @@ def light_from_shading(
     pixel = np.argwhere(counts)
     pixel = pixel[:: max(1, -(-len(pixel) // MOST_PIXELS))]
     row, column = pixel.T
-    normal, value = np.asarray(points.normal, np.float64)[row, column], grey[row, column]
+    normal, value = np.asarray(points.normal, np.float64)[row, column].T.copy(), grey[row, column]
     unit = float(np.max(value, initial=0.0))
     lit = value > BRIGHT * unit
     if np.count_nonzero(lit) < FEWEST:
@@ -172,7 +173,7 @@ def light_from_shading(
     numbers, cost, scale, free = np.zeros(6), 0.0, 0.0, np.array([True, True, True, ambient, False, False])
     for _ in range(100):
         before, scale = numbers, _bound(residual[lit])
-        numbers, cost = _refine(numbers, free, False, scale, value[lit], normal[lit])
+        numbers, cost = _refine(numbers, free, False, scale, value[lit], normal[:, lit])
         residual = value - _shown(numbers, free, False, normal)[0]
         if np.allclose(before, numbers, rtol=0, atol=CHANGE):
             break
@@ -182,7 +183,7 @@ def light_from_shading(
     for mirror in (False, True):
         for n in STARTS:
             start = np.array([*numbers[:3], 0.02 * ambient, 0.1, np.log(n - LOWEST_N)])
-            found.append((*_refine(start, with_highlight, mirror, scale, value[lit], normal[lit]), mirror))
+            found.append((*_refine(start, with_highlight, mirror, scale, value[lit], normal[:, lit]), mirror))
     shiny, left, mirror = min(found, key=lambda one: one[1])
     if np.count_nonzero(lit) * np.log(max(cost, 1e-300) / max(left, 1e-300)) > 2 * RISE:
         # Lambert's law alone may have looked at pixels that the light does not reach.
@@ -192,11 +193,11 @@ def light_from_shading(
             value - _shown(shiny, with_highlight, mirror, normal)[0],
         )
         scale = _bound(residual[lit])
-        numbers, _ = _refine(shiny, free, mirror, scale, value[lit], normal[lit])
+        numbers, _ = _refine(shiny, free, mirror, scale, value[lit], normal[:, lit])
         residual = value - _shown(numbers, free, mirror, normal)[0]
     pixel -= pixel.min(axis=0)
     block = pixel // -(-(pixel.max() + 1) // BLOCKS) @ [BLOCKS, 1]
-    slopes = _shown(numbers, free, mirror, normal[lit])[1]
+    slopes = _shown(numbers, free, mirror, normal[:, lit])[1] * free[:, None]
     error = _error(numbers[:3], residual[lit], slopes, scale, block[lit])
     if not error < GUESS:
         raise _too_little()
@@ -231,7 +232,7 @@ def _bound(residual) -> float:
 
 def _reached(normal, numbers) -> np.ndarray:
     """Pixels that the light reaches at an angle."""
-    lit = normal @ numbers[:3] > LIT * np.linalg.norm(numbers[:3])
+    lit = numbers[:3] @ normal > LIT * np.linalg.norm(numbers[:3])
     if np.count_nonzero(lit) < FEWEST:
         raise _too_little()
     return lit
@@ -243,37 +244,38 @@ def _shown(numbers, free, mirror, normal) -> tuple[np.ndarray, np.ndarray]:
     Args:
         numbers: the light's vector, as long as what a pixel that faces it shows; ambient light; strength of the
             highlight, either sign meaning the same, and logarithm of what its exponent has beyond the lowest.
-        free: by which numbers the derivatives are wanted; without a free highlight there is none.
+        free: which numbers may change; without a free highlight there is none.
         mirror: whether its lobe is about the mirror direction, not the half vector.
-        normal: of the pixels.
+        normal: of P pixels, (3, P).
 
     Returns:
-        The values, and their derivatives by the numbers, 0 by those that are not free.
+        The values, and their derivatives by all numbers, (6, P).
     """
     light, (ambient, specular, log_beyond) = numbers[:3], numbers[3:]
-    columns = np.zeros((len(normal), 6))
-    columns[:, :3], columns[:, 3] = normal, 1.0
+    slopes = np.zeros((6, normal.shape[1]))
+    slopes[:3], slopes[3] = normal, 1.0
     if not free[4]:
-        return ambient + normal @ light, columns * free
+        return ambient + light @ normal, slopes
     length = max(np.linalg.norm(light), 1e-300)
     to_light = light / length
     turned = (np.eye(3) - np.outer(to_light, to_light)) / length  # derivative of to_light by the light
     if mirror:
-        cosine = 2 * (normal @ to_light) * normal[:, 2] - to_light[2]
-        by_light = (2 * normal[:, 2:] * normal - TO_VIEW) @ turned
+        cosine = 2 * (to_light @ normal) * normal[2] - to_light[2]
+        by_light = 2 * normal[2] * (turned @ normal) - turned[:, 2:]
     else:
         half = to_light + TO_VIEW
         size = max(np.linalg.norm(half), 1e-9)
         half /= size
-        cosine = normal @ half
-        by_light = (normal - cosine[:, None] * half) @ turned / size
+        cosine = half @ normal
+        by_light = (turned @ normal - np.outer(turned @ half, cosine)) / size
     beyond = np.exp(min(log_beyond, np.log(LARGEST_N)))
     cosine = np.clip(cosine, 1e-9, 1.0)
-    lobe = cosine ** (LOWEST_N + beyond)
-    columns[:, :3] += (abs(specular) * (LOWEST_N + beyond) * lobe / cosine)[:, None] * by_light
-    columns[:, 4] = np.sign(specular) * lobe
-    columns[:, 5] = abs(specular) * lobe * np.log(cosine) * beyond
-    return ambient + normal @ light + abs(specular) * lobe, columns * free
+    log_cosine = np.log(cosine)
+    lobe = np.exp((LOWEST_N + beyond) * log_cosine)
+    slopes[:3] += (abs(specular) * (LOWEST_N + beyond) * lobe / cosine) * by_light
+    slopes[4] = np.sign(specular) * lobe
+    slopes[5] = abs(specular) * beyond * lobe * log_cosine
+    return ambient + light @ normal + abs(specular) * lobe, slopes
 
 
 def _refine(numbers, free, mirror, scale, value, normal) -> tuple[np.ndarray, float]:
@@ -285,19 +287,20 @@ def _refine(numbers, free, mirror, scale, value, normal) -> tuple[np.ndarray, fl
         every[free] = some
         return every
 
-    def left(some):
-        shown, columns = _shown(among(some), free, mirror, normal)
-        return shown - value, columns[:, free]
+    @functools.lru_cache(1)  # cost and curvature are asked at the same numbers
+    def left(*some):
+        shown, slopes = _shown(among(some), free, mirror, normal)
+        return shown - value, slopes[free]
 
     def cost(some):
-        residual, columns = left(some)
+        residual, slopes = left(*some)
         pull = np.clip(residual, -scale, scale)
-        return np.mean(pull * (residual - 0.5 * pull)), pull @ columns / len(value)
+        return np.mean(pull * (residual - 0.5 * pull)), slopes @ pull / len(value)
 
     def curvature(some):
-        residual, columns = left(some)
+        residual, slopes = left(*some)
         weight = scale / np.maximum(np.abs(residual), scale)
-        return (columns.T * weight) @ columns / len(value)
+        return (slopes * weight) @ slopes.T / len(value)
 
     how: Any = {"method": "trust-exact", "jac": True, "hess": curvature, "options": {"gtol": CLOSE, "maxiter": 50}}
     found = minimize(cost, numbers[free], **how)
@@ -312,18 +315,25 @@ def _error(light, residual, slopes, scale, block) -> float:
 
     Source: Huber 1981, section 7.6; Bell and McCaffrey 2002.
     """
-    length = np.maximum(np.linalg.norm(slopes, axis=0), 1e-300)
-    columns, pull, within = slopes / length, np.clip(residual, -scale, scale), np.abs(residual) <= scale
-    moves = []
-    for here in np.unique(block):
-        others = columns[within & (block != here)]
-        hessian = others.T @ others
-        inverse = np.linalg.pinv(hessian, 1e-9, hermitian=True)
-        # A highlight may lie in one block; without it the others still tell the light, or they do not.
-        if not np.allclose((inverse @ hessian)[:3], np.eye(6)[:3], rtol=0, atol=1e-3):
-            return np.inf
-        moves.append(inverse @ (columns[block == here].T @ pull[block == here]) / length)
-    moved = np.array(moves)[:, :3]
+    length = np.maximum(np.linalg.norm(slopes, axis=1), 1e-300)
+    columns, pull, within = slopes.T / length, np.clip(residual, -scale, scale), np.abs(residual) <= scale
+    order = np.argsort(block, kind="stable")
+    first = np.flatnonzero(np.diff(block[order], prepend=-1))
+
+    def over_blocks(values):
+        return np.add.reduceat(values[order], first)
+
+    near = columns * within[:, None]
+    gram = over_blocks(near[:, :, None] * near[:, None])
+    # Those of all but one as sums: of a single block that is 0, and a difference would be rounding.
+    nothing = np.zeros((1, 6, 6))
+    before, after = (np.cumsum(np.concatenate([nothing, one]), axis=0) for one in (gram[:-1], gram[:0:-1]))
+    hessian = before + after[::-1]
+    inverse = np.linalg.pinv(hessian, 1e-9, hermitian=True)
+    # A highlight may lie in one block; without it the others still tell the light, or they do not.
+    if not np.allclose((inverse @ hessian)[:, :3], np.eye(6)[:3], rtol=0, atol=1e-3):
+        return np.inf
+    moved = (inverse @ over_blocks(columns * pull[:, None])[..., None])[:, :3, 0] / length[:3]
     size = np.linalg.norm(light)
     across = np.sum(moved**2) - np.sum((moved @ light / size) ** 2)
     return float(np.degrees(np.sqrt((1 - 1 / len(moved)) * across) / size))
