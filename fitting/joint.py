@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 import brdf
 from brdf.errors import InputError
@@ -46,6 +46,8 @@ from fitting.uncertainty.residual_correlation import correlation_in_rows, struct
 
 LARGEST_JACOBIAN = 1 << 27
 ROUNDS = 8
+# Pixels so near to an outline that moves do not count: their shading bends, and they may come to see another shape.
+AWAY = 2
 TINY = np.finfo(float).tiny
 OPEN = "only a combination with other freed numbers is determined"
 # So many steps in a row, each a quarter of the one before, that lower the cost no more.
@@ -101,6 +103,7 @@ def fit_jointly(
         free: from material and list of scenes to the leaves to fit, for example
             ``lambda m, s: (m.k_d, m.n, s[0].lights[0].direction)``; all others are held. Or what `FitResult.diagnosis`
             names beside the whole material: "light", "intensity", "ball" or "radius", also "light 1 of picture 0".
+            Where camera or shapes are freed, pixels near an outline do not count.
         solver: "lm", "bfgs", or None to choose by size.
         precision: "float32" or "float64".
         mask: (H, W), pixels to look at, or a list, such as ``fitting.fit(target, scene).counted[0]``.
@@ -140,21 +143,49 @@ def fit_jointly(
         target, scene, mask, rounding=rounding, encoding=encoding, precision=precision, saturation=saturation
     )
     with working_precision(precision), waiting("fitting jointly"):
-        seen = observe(stated, at_once=True)
+        whole = observe(stated, at_once=True)
+
+        def stated_by(start: brdf.Material, scenes: Sequence[brdf.Scene], seen: Observed) -> JointProblem:
+            targets, weights = zip(*((tile.target, tile.weight) for tile in seen.tiles), strict=True)
+            return joint_problem(brdf.cast((start, list(scenes)), precision), freed, list(targets), list(weights))
 
         def solve(start: brdf.Material, scenes: Sequence[brdf.Scene]) -> JointResult:
-            weights = [tile.weight for tile in seen.tiles]
-            targets = [tile.target for tile in seen.tiles]
-            problem = joint_problem(brdf.cast((start, list(scenes)), precision), freed, targets, weights)
-            jacobian = sum(tile.target.size for tile in seen.tiles) * problem.start().size
-            chosen = solver or ("lm" if jacobian <= LARGEST_JACOBIAN else "bfgs")
-            return _solve(problem, seen, chosen, tolerance, max_steps)
+            problem, seen, rounds = stated_by(start, scenes, whole), whole, 0
+            while True:
+                if problem.moves_outlines:
+                    seen = _away_from_outlines(whole, scenes)
+                    problem = stated_by(start, scenes, seen)
+                result = _solve(problem, seen, solver, tolerance, max_steps)
+                start, scenes, rounds = result.material, result.scenes, rounds + 1
+                if not problem.moves_outlines or rounds == ROUNDS or _inside(scenes, seen.counted):
+                    return result
 
         if isinstance(material, brdf.Material):
             result = solve(material, stated.scenes)
         else:
             result = _of_model(stated, model_name(material), solve)
     return dataclasses.replace(result, seconds=time.perf_counter() - begun)
+
+
+def _away_from_outlines(whole: Observed, scenes: Sequence[brdf.Scene]) -> Observed:
+    """What is fitted where outlines move: a pixel that comes to see another shape, or none, is no small change."""
+    inner = [_alike(scene, AWAY) & counted for scene, counted in zip(scenes, whole.counted, strict=True)]
+    seen = observe(dataclasses.replace(whole.problem, masks=inner), at_once=True)
+    lost = sum(map(np.count_nonzero, whole.counted)) - sum(map(np.count_nonzero, seen.counted))
+    return seen._replace(left_out=whole.left_out | {"near an outline that moves": lost})
+
+
+def _inside(scenes: Sequence[brdf.Scene], counted: Sequence[np.ndarray]) -> bool:
+    """Whether no pixel that counts lies at an outline."""
+    return all(np.all(_alike(scene, 1) | ~some) for scene, some in zip(scenes, counted, strict=True))
+
+
+def _alike(scene: brdf.Scene, reach: int) -> Bool[np.ndarray, "H W"]:
+    """Which pixels see what all see that are so many pixels around."""
+    from scipy.ndimage import maximum_filter, minimum_filter  # it takes long to load
+
+    met = np.asarray(scene.surface_points().met)
+    return minimum_filter(met, 2 * reach + 1, mode="nearest") == maximum_filter(met, 2 * reach + 1, mode="nearest")
 
 
 def _of_model(stated: FitProblem, model: str, solve: Callable[..., JointResult]) -> JointResult:
@@ -200,8 +231,10 @@ def _run(
     return optx.minimise(cost, method, vector, problem, max_steps=max_steps, throw=False)
 
 
-def _solve(problem: JointProblem, seen: Observed, solver: str, tolerance: float, max_steps: int) -> JointResult:
+def _solve(problem: JointProblem, seen: Observed, solver: str | None, tolerance: float, max_steps: int) -> JointResult:
     vector = problem.start()
+    jacobian = sum(target.size for target in problem.targets) * vector.size
+    solver = solver or ("lm" if jacobian <= LARGEST_JACOBIAN else "bfgs")
     bounded, held = problem.bounded, np.zeros(vector.shape, bool)
     steps, converged, residual, columns = 0, False, np.zeros(0), np.zeros((0, 0))
     for _ in range(ROUNDS):

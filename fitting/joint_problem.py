@@ -87,6 +87,11 @@ class JointProblem(eqx.Module):
         """Which numbers may not be negative."""
         return self.each(lambda leaf: leaf.name in NOT_NEGATIVE)
 
+    @property
+    def moves_outlines(self) -> bool:
+        """Whether pixels may come to see another shape, or none: something of the camera or of a shape is freed."""
+        return any("camera." in leaf.words or "shapes[" in leaf.words for leaf in self.freed)
+
     def design(self, vector: Float[np.ndarray, " U"]) -> Float[np.ndarray, "U V"]:
         """What each small change moves of the numbers: of a direction two small turns, its length is no unknown."""
         from scipy.linalg import block_diag  # late: few commands fit jointly

@@ -126,6 +126,26 @@ def test_a_name_that_no_scene_has_is_an_error(target: np.ndarray, name):
         fitting.fit_jointly(target, scene(TRUE_DIRECTION, [1.0] * 3), MATERIAL, name)
 
 
+@pytest.mark.parametrize(("name", "off"), [("ball", 0.6), ("ball", 4.0), ("radius", 0.6)])
+def test_an_outline_that_moves_leads_the_material_nowhere(name, off):
+    def seen(center, radius=1.0) -> brdf.Scene:
+        camera = brdf.PerspectiveCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], fov=33, resolution=(48, 48))
+        light = brdf.DirectionalLight(direction=TRUE_DIRECTION, intensity=1.0)
+        return brdf.Scene(camera, [brdf.Sphere(center, radius)], ambient=[1.0], lights=[light])
+
+    truth, pixel = {"k_a": 0.05, "k_d": 0.5, "k_s": 0.3, "n": 12.0}, 2.3 / 48
+    told = seen([off * pixel, -off * pixel, 0]) if name == "ball" else seen([0, 0, 0], 1 + off * pixel)
+    for seed in range(2):
+        clean = np.asarray(brdf.render(brdf.BlinnPhong(**truth), seen([0, 0, 0]), precision="float64"))
+        noisy = clean + 0.005 * np.random.default_rng(seed).standard_normal(clean.shape)
+        result = fitting.fit_jointly(noisy, told, "blinn-phong", name)
+        off_by = [
+            (one.value - truth.get(one.name, float("radius" in one.name))) / one.error for one in result.parameters
+        ]
+        assert np.max(np.abs(off_by)) < 4  # standard errors; 27 to 65 where pixels at the outline count
+        assert result.left_out["near an outline that moves"] > 100
+
+
 @pytest.mark.parametrize(("precision", "seed"), [("float64", 4), ("float64", 7), ("float32", 0)])
 def test_the_solver_ends_where_rounding_hides_the_rest(precision, seed):
     def lit(direction) -> brdf.Scene:
