@@ -1,6 +1,6 @@
 """Maps: time a texel beside SciPy's and Adam's, the optimum, its errors, a photographed ball, RTI beside PTM, HSH.
 
-    python -m benchmarks.maps [speed] [files] [errors] [ball] [rti]
+    python -m benchmarks.maps [speed] [files] [errors] [photographs] [ball] [rti]
 
 Real data lie where the environment variable ``BRDF_REAL_DATA`` says (default: ../shared/data).
 """
@@ -232,6 +232,43 @@ def errors(count: int = 20_000) -> None:
         print(f"    coverage of ln n {covered[0]:.3f}, k_s {covered[1]:.3f}, k_d {covered[2]:.3f}")
 
 
+def photographs(side: int = 48, k_s: float = 0.4) -> None:
+    """8-bit photographs of a ball with noise in codes, some of it in cast shadows that leave 4 % of the light."""
+    across = (np.arange(side) + 0.5) / side * 2 - 1
+    x, y = np.meshgrid(across, -across)
+    inside = x * x + y * y < 0.95
+    normal = np.stack([x, y, np.sqrt(np.maximum(1 - x * x - y * y, 0))], axis=-1)
+    k_d = np.array([0.5, 0.3, 0.2])
+    for count, n, encoding, shadow in [
+        *((count, 40.0, encoding, 0.0) for count in (16, 48) for encoding in ("linear", "srgb")),
+        *((32, n, "srgb", shadow) for n in (40.0, 8.0) for shadow in (0.1, 0.25, 0.4)),
+    ]:
+        random, lights = np.random.default_rng(5), dome(count)
+        pictures = np.zeros((count, side, side, 3))
+        for picture, light in zip(pictures, lights, strict=True):
+            cosine, lobe = columns(light, normal[inside], n)
+            picture[inside] = cosine[:, None] * k_d + k_s * lobe[:, None]
+        white = 0.97 / pictures[:, inside].max()
+        pictures *= white * np.where(random.random(pictures.shape[:3]) < shadow, 0.04, 1)[..., None]
+        codes = 255 * encode(pictures, encoding) + random.normal(0, 0.7, pictures.shape)
+        codes = np.clip(np.round(codes), 0, 255).astype(np.uint8)
+        for given in (normal, "fit"):
+            maps = fitting.fit_maps(codes, lights, given, mask=inside, encoding=encoding)
+            known = maps.determined
+            off = [
+                np.abs(np.log(maps.n / n) / (maps.n_error / maps.n))[known],
+                np.abs((maps.k_d - white * k_d) / maps.k_d_error)[known],
+                np.abs((maps.k_s - white * k_s) / maps.k_s_error)[known],
+            ]
+            cover = " ".join(f"{100 * np.mean(one < 1.96):3.0f}" for one in off)
+            print(
+                f"{count} lights, n {n:g}, {encoding}, {100 * shadow:2.0f} % in shadow, normals "
+                f"{'sought' if given is not normal else 'given '}: determined {np.mean(known[inside]):.2f}, coverage "
+                f"of ln n, k_d, k_s {cover} %, ln n beyond six errors {100 * np.mean(off[0] > 6):.2f} %",
+                flush=True,
+            )
+
+
 def least_cost(pictures, lights, truth, some, log_n) -> np.ndarray:
     """The least cost of some texels at given n, float64."""
     values = pictures[:, 0, some].astype(float)
@@ -366,6 +403,7 @@ def rbf(centres):
 
 
 if __name__ == "__main__":
-    parts = {"speed": speed, "files": files, "errors": errors, "ball": ball, "rti": rti}
+    every = (speed, files, errors, photographs, ball, rti)
+    parts = {part.__name__: part for part in every}
     for part in sys.argv[1:] or parts:
         parts[part]()

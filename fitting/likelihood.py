@@ -56,6 +56,31 @@ _LOG_ROOT_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 AnyArray: TypeAlias = jax.Array | np.ndarray
 
 
+def encoded_and_slope(light: AnyArray, encoding: Encoding, steps: Any) -> tuple[Any, Any]:
+    """Linear light as it is encoded, and the derivative of that; on the host where the light is.
+
+    Args:
+        light: 1 where the encoding is 1.
+        encoding: "linear", "srgb" or a gamma.
+        steps: codes where the encoding is 1.
+    """
+    xp: Any = np if isinstance(light, np.ndarray) else jnp
+    if encoding == "linear":
+        return light, xp.ones_like(light)
+    if encoding == "srgb":
+        bright = light > 0.0031308
+        base, power = xp.where(bright, light, 1.0), 1.0 / 2.4
+        curved = 1.055 * base**power
+        return xp.where(bright, curved - 0.055, 12.92 * light), xp.where(bright, power * curved / base, 12.92)
+    # A power is infinitely steep at 0; below a quarter of a code it goes on straight, to no code's edge.
+    power = 1.0 / encoding
+    least = (0.25 / steps) ** encoding
+    base = xp.maximum(light, least)
+    curved = base**power
+    slope = power * curved / base
+    return curved + slope * xp.minimum(light - least, 0.0), slope
+
+
 class Bounds(eqx.Module):
     """Between which codes the values of a picture lay before rounding.
 
@@ -88,21 +113,8 @@ class Bounds(eqx.Module):
         xp: Any = np if isinstance(radiance, np.ndarray) else jnp
         unit, steps = (xp.asarray(part, radiance.dtype) for part in (self.unit, self.scale))
         light, scale = radiance / unit, steps / unit
-        if self.encoding == "linear":
-            return light * steps, xp.broadcast_to(scale, radiance.shape)
-        if self.encoding == "srgb":
-            bright = light > 0.0031308
-            base, power = xp.where(bright, light, 1.0), 1.0 / 2.4
-            curved = 1.055 * base**power
-            code = xp.where(bright, curved - 0.055, 12.92 * light)
-            return code * steps, xp.where(bright, power * curved / base, 12.92) * scale
-        # A power is infinitely steep at 0; below a quarter of a code it goes on straight, to no code's edge.
-        power = 1.0 / self.encoding
-        least = (0.25 / steps) ** self.encoding
-        base = xp.maximum(light, least)
-        curved = base**power
-        slope = power * curved / base
-        return (curved + slope * xp.minimum(light - least, 0.0)) * steps, slope * scale
+        encoded, slope = encoded_and_slope(light, self.encoding, steps)
+        return encoded * steps, slope * scale
 
     @property
     def widths(self) -> Float[np.ndarray, " K"]:

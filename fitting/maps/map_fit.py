@@ -42,6 +42,8 @@ def fit_maps(
 ) -> Maps:
     """Fit a material to every texel of one view under many lights: the global optimum of each, with errors.
 
+    Values that are clipped, face away from their light or lie in a cast shadow do not count.
+
     Args:
         pictures: photographs of one size, (P, H, W, C) linear values or a list of arrays, `brdf.Picture`,
             `brdf.ImageReader` or files; or a folder with an ``.lp`` file, or with DiLiGenT's text files.

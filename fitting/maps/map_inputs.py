@@ -16,7 +16,7 @@ import brdf
 from brdf.checks import as_numbers
 from brdf.errors import InputError
 from brdf.files import parse_number, read_text
-from brdf.images.encoding import decode, parse_encoding
+from brdf.images.encoding import Encoding, decode, parse_encoding
 from fitting.photographs.archives import read_array
 from fitting.photographs.light_files import MOST_BYTES, read_directions, read_intensities
 
@@ -41,6 +41,7 @@ class Photographs:
         codes: the type of ``rows`` where these are codes; None for linear values.
         top: values from which on they are clipped, (P,).
         scale: what values are multiplied with, (P, C): the inverse of ``unit``, and of the largest code.
+        curves: how each photograph is encoded, which tells how exact its values are: noise is even in codes.
         silent: names of files of 8 bits that do not say how they are encoded, which were read as sRGB.
         names: of the photographs.
         encoding: as which files and arrays were read, None for what they say.
@@ -55,6 +56,7 @@ class Photographs:
     codes: np.dtype | None
     top: Float[np.ndarray, " P"]
     scale: Float[np.ndarray, "P C"]
+    curves: tuple[Encoding, ...]
     silent: tuple[str, ...]
     names: tuple[str, ...]
     encoding: Any
@@ -66,7 +68,8 @@ class Photographs:
             readers[name].rows if name in readers else read for name, read in zip(self.names, self.rows, strict=True)
         ]
         top = [_top(readers[name]) if name in readers else top for name, top in zip(self.names, self.top, strict=True)]
-        return dataclasses.replace(self, rows=tuple(rows), top=np.array(top), encoding="linear")
+        curves = ["linear" if name in readers else curve for name, curve in zip(self.names, self.curves, strict=True)]
+        return dataclasses.replace(self, rows=tuple(rows), top=np.array(top), curves=tuple(curves), encoding="linear")
 
     def band(
         self, rows: np.ndarray, texels: int, precision: str, pool: Executor | None = None
@@ -224,7 +227,7 @@ def photographs(
     opened = [_open(f"pictures[{i}]", picture, encoding) for i, picture in enumerate(pictures)]
     if not opened:
         raise InputError("pictures", "is empty", "Give a photograph for each light")
-    rows, shapes, names, silent, types, tops = zip(*opened, strict=True)
+    rows, shapes, names, silent, types, tops, curves = zip(*opened, strict=True)
     for name, shape in zip(names, shapes, strict=True):
         if shape != shapes[0]:
             raise InputError(name, f"is of shape {shape}, {names[0]} of {shapes[0]}", "Give photographs of one size")
@@ -265,6 +268,7 @@ def photographs(
         codes,
         np.array(tops),
         scale,
+        curves,
         told,
         names,
         encoding,
@@ -276,12 +280,14 @@ def _linear(read: Any, kind: np.dtype, start: int, stop: int) -> np.ndarray:
     return values / np.float32(np.iinfo(kind).max) if kind.kind == "u" else values
 
 
-def _open(name: str, picture: Any, encoding: Any) -> tuple[Any, tuple[int, int, int], str, str, np.dtype, float]:
+def _open(
+    name: str, picture: Any, encoding: Any
+) -> tuple[Any, tuple[int, int, int], str, str, np.dtype, float, Encoding]:
     """A photograph.
 
     Returns:
         How to read rows of it; height, width and channels; its name, and that again where it is silent on its encoding;
-        the type of the rows, and from where on they are clipped.
+        the type of the rows, from where on they are clipped, and how they were encoded.
     """
     of_path = isinstance(picture, str | Path)
     if of_path:
@@ -291,10 +297,13 @@ def _open(name: str, picture: Any, encoding: Any) -> tuple[Any, tuple[int, int, 
         raise InputError("encoding", f"is that of files and arrays, {name} is decoded", "Leave it out")
     if isinstance(picture, brdf.ImageReader):
         silent = of_path and picture.is_integer and picture.bits <= 8 and picture.source in ("assumed", "format")
-        return picture.rows, picture.shape, name, name if silent else "", np.dtype(np.float32), _top(picture)
+        silent = name if silent else ""
+        return picture.rows, picture.shape, name, silent, np.dtype(np.float32), _top(picture), picture.encoding
     top = np.inf
     if isinstance(picture, brdf.Picture):
-        picture, top = picture.pixels, (picture.saturation or np.inf) * BELOW_TOP
+        curve, top = picture.encoding, (picture.saturation or np.inf) * BELOW_TOP
+        picture = picture.pixels
+        return lambda start, stop: picture[start:stop], picture.shape, name, "", picture.dtype, top, curve
     values = np.asarray(picture)
     values = values[..., None] if values.ndim == 2 else values
     if values.ndim != 3 or 0 in values.shape or values.dtype.kind not in "fu":
@@ -303,9 +312,10 @@ def _open(name: str, picture: Any, encoding: Any) -> tuple[Any, tuple[int, int, 
     if curve != "linear":
         top = BELOW_TOP if values.dtype.kind == "u" else top
         read = partial(_linear, lambda start, stop: values[start:stop], values.dtype)
-        return lambda start, stop: decode(read(start, stop), curve), values.shape, name, "", np.dtype(np.float32), top
+        kind = np.dtype(np.float32)
+        return lambda start, stop: decode(read(start, stop), curve), values.shape, name, "", kind, top, curve
     top = np.iinfo(values.dtype).max if values.dtype.kind == "u" else top
-    return lambda start, stop: values[start:stop], values.shape, name, "", values.dtype, top
+    return lambda start, stop: values[start:stop], values.shape, name, "", values.dtype, top, curve
 
 
 def _top(reader: brdf.ImageReader) -> float:

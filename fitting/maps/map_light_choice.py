@@ -43,7 +43,7 @@ def next_light(maps: "Maps", candidates: Any, count: int, of: str) -> LightChoic
     @jax.jit
     def products(to_light: Any) -> Any:
         """Of the columns of k_d and k_s and the derivative by ln n: the upper triangle of their Gram matrix, (6, T)."""
-        lights, seen = Distant(to_light[None], to_view, None), jnp.ones((1, len(normal)))
+        lights, seen = Distant(to_light[None], to_view, None), jnp.ones((1, 1, len(normal)))
         columns = [jnp.zeros(len(normal))] * 3
         for index, model in enumerate(models):
             if issubclass(model, SpecularMaterial):

@@ -4,7 +4,7 @@ The photographs of a texel are ``y_p = k_a A_p + k_d D_p + k_s S_p(n)``. The coe
 the best non-negative ones are a closed form and the search is one-dimensional (variable projection, Golub and Pereyra
 1973). It is global: the octaves of n, where the lobe's column is the square of the one before, then Gauss-Newton inside
 the bracket about the best of them. The same sums give the standard errors. Where the normal is sought too, Gauss-Newton
-takes it and the material together.
+takes it and the material together. Noise is even in codes: a value's weight is the square of the slope of its encoding.
 
 Texels lie in the lanes of the processor, the last axis of every array, T. The C channels share the columns, whose
 channel axis then is 1. What is more than a product is computed photograph by photograph, a loop over (T,) lanes whose
@@ -57,27 +57,32 @@ DEPENDENT = 16.0
 
 
 class Columns(NamedTuple):
-    """What each photograph's light makes of the texels; 0 where a value does not count.
+    """What each photograph's light makes of the texels, times the root of the weight of its value: 0 without any.
 
     Attributes:
         linear: k_a's where there is ambient light, and k_d's, I (N·L)+, U of (P, D, T).
-        weight: of the lobe of each of the light's S samples, (P, S, T).
+        weight: of the lobe of each of the light's S samples, (P, S, D, T).
         log_cosine: of the lobe, (P, S, T); ``vectors.BELOW_HORIZON`` or anything finite where there is none.
     """
 
     linear: list[Float[Array, "P D T"]]
-    weight: Float[Array, "P S T"]
+    weight: Float[Array, "P S D T"]
     log_cosine: Float[Array, "P S T"]
 
-    def lobe(self, model: Any, log_n: Float[Array, " T"]) -> tuple[Float[Array, "P 1 T"], Float[Array, "P 1 T"]]:
+    def where(self, counts: Float[Array, "P T"]) -> "Columns":
+        """Of values that count."""
+        counts = counts[:, None]
+        return Columns([column * counts for column in self.linear], self.weight * counts[:, None], self.log_cosine)
+
+    def lobe(self, model: Any, log_n: Float[Array, " T"]) -> tuple[Float[Array, "P D T"], Float[Array, "P D T"]]:
         """The lobe's column and its derivative by log n."""
         n = jnp.exp(log_n)
         scale, change = jax.jvp(model.scale, (n,), (n,))
 
         def of_photograph(photograph: tuple[Array, Array]) -> tuple[Array, Array]:
             exponent = jnp.maximum(n * photograph[1], _lowest(n.dtype))
-            lobes = photograph[0] * jnp.exp(exponent)
-            value, slope = (jnp.sum(one, axis=0, keepdims=True) for one in (lobes, lobes * exponent))
+            lobes = photograph[0] * jnp.exp(exponent)[:, None]
+            value, slope = (jnp.sum(one, axis=0) for one in (lobes, lobes * exponent[:, None]))
             return scale * value, scale * slope + change * value
 
         return jax.lax.map(of_photograph, (self.weight, self.log_cosine))
@@ -89,11 +94,11 @@ def _lowest(dtype: Any) -> float:
 
 
 class Target(NamedTuple):
-    """What the photographs show of the texels; 0 where a value does not count.
+    """What the photographs show of the texels, times the root of the weight of each value; 0 without any.
 
     Attributes:
         shown: (P, C, T).
-        summed: over the channels, (P, T): all that tells of a k_s which these share.
+        summed: over the channels, (P, T): where they have one weight, all that tells of a k_s which these share.
         cap: what k_s may be at most, (T,).
     """
 
@@ -102,11 +107,24 @@ class Target(NamedTuple):
     cap: Float[Array, " T"]
 
     @classmethod
-    def of(cls, shown: Float[Array, "P C T"]) -> "Target":
-        """With what follows from it."""
-        channels = [shown[:, c] for c in range(shown.shape[1])]
-        brightest = jnp.max(functools.reduce(jnp.maximum, channels), axis=0)
-        return cls(shown, functools.reduce(operator.add, channels), CAP * jnp.maximum(brightest, 0))
+    def of(cls, shown: Float[Array, "P C T"], root: Any = 1.0) -> "Target":
+        """With what follows from it.
+
+        Args:
+            shown: not weighted yet.
+            root: of the weights, (P, D, T).
+        """
+        brightest = jnp.max(functools.reduce(jnp.maximum, [shown[:, c] for c in range(shown.shape[1])]), axis=0)
+        shown = shown * root
+        return cls(shown, over_channels(shown)[:, 0], CAP * jnp.maximum(brightest, 0))
+
+    def where(self, counts: Float[Array, "P T"]) -> "Target":
+        """Of values that count."""
+        return Target(self.shown * counts[:, None], self.summed * counts, self.cap)
+
+    def grey(self, root: Float[Array, "P D T"]) -> Float[Array, "P T"]:
+        """Summed over the channels, without the weights whose root this is."""
+        return self.summed if root.shape[1] == 1 else over_channels(divide(self.shown, root))[:, 0]
 
 
 class TexelFit(NamedTuple):
@@ -118,6 +136,8 @@ class TexelFit(NamedTuple):
         log_n: (T,).
         log_n_error: (T,).
         cost: sum of squared residuals, (T,).
+        gain: by how much the last column lowers it, (T,).
+        residual: summed over the channels, (P, T).
     """
 
     k: list[Float[Array, "C T"]]
@@ -125,6 +145,8 @@ class TexelFit(NamedTuple):
     log_n: Float[Array, " T"]
     log_n_error: Float[Array, " T"]
     cost: Float[Array, " T"]
+    gain: Float[Array, " T"]
+    residual: Float[Array, "P T"]
 
 
 class Distant(NamedTuple):
@@ -140,23 +162,30 @@ class Distant(NamedTuple):
     to_view: Float[Any, "3"]
     ambient: Float[Any, "P D 1"] | None
 
-    def columns(self, model: Any, normal: Any, seen: Float[Array, "P T"]) -> Columns:
-        """Of texels with these normals, (3, T), that count where seen."""
+    def columns(self, model: Any, normal: Any, root: Float[Array, "P D T"]) -> Columns:
+        """Of texels with these normals, (3, T), and roots of the weights of their values."""
         axis = jnp.stack(tuple(normal), axis=-1)  # which XLA takes apart again: a transposed array it would copy
-        photographs = jnp.asarray(self.to_light), seen
+        photographs = jnp.asarray(self.to_light), root
         diffuse, weight, log_cosine = jax.lax.map(lambda one: self.of_light(model, axis, *one), photographs)
-        ambient = [] if self.ambient is None else [self.ambient * seen[:, None]]
-        return Columns([*ambient, diffuse], weight, log_cosine)
+        ambient = [] if self.ambient is None else [self.ambient * root]
+        return Columns([*ambient, diffuse], weight[:, None], log_cosine[:, None])
 
-    def of_light(self, model: Any, axis: Array, to_light: Array, counts: Array) -> tuple[Array, Array, Array]:
-        """I (N·L)+, the lobe's weight and the logarithm of its cosine under one light, (1, T), for normals (T, 3)."""
+    def of_light(self, model: Any, axis: Array, to_light: Array, root: Array) -> tuple[Array, Array, Array]:
+        """I (N·L)+ and the lobe's weight under one light, (D, T), and the logarithm of its cosine, (T,).
+
+        Args:
+            model: class of the material.
+            axis: normals, (T, 3).
+            to_light: (3,).
+            root: of the values' weights, (D, T).
+        """
         cosine = dot(axis, to_light)
-        diffuse = counts * jnp.maximum(cosine, 0)
+        diffuse = root * jnp.maximum(cosine, 0)
         if not issubclass(model, SpecularMaterial):
-            return diffuse[None], diffuse[None], diffuse[None]
-        shines = jnp.where((cosine > 0) & (dot(axis, self.to_view) > 0), counts, 0)
+            return diffuse, diffuse, cosine
+        shines = jnp.where((cosine > 0) & (dot(axis, self.to_view) > 0), root, 0)
         weight = shines * cosine if model.cosine_weighted else shines
-        return diffuse[None], weight[None], model.log_cosine(axis, to_light, self.to_view)[None]
+        return diffuse, weight, model.log_cosine(axis, to_light, self.to_view)
 
 
 # -- normals given -----------------------------------------------------------------------------------------------------
@@ -182,21 +211,63 @@ def fit_texels(model: Any, target: Target, columns: Columns, grey: bool, finer: 
     return fit_at(model, target, columns, grey, jax.lax.fori_loop(0, STEPS, step, bracket).log_n)
 
 
+def fit_unshadowed(
+    model: Any, target: Target, columns: Columns, root: Float[Array, "P D T"], grey: bool, finer: int
+) -> tuple[TexelFit, Float[Array, "P T"]]:
+    """`fit_texels` where some values may lie in cast shadows, and what counted in the end, (P, T).
+
+    Where values look like that the others are fitted without them, then all that is no outlier of that fit. This is
+    kept where it explains the values better than a fit of all.
+    """
+    seen = counted(root)
+    shown, diffuse = target.grey(root), divide(columns.linear[-1], root)[:, 0]
+    dark = shadows(shown, seen, diffuse)
+    column = over_channels(columns.linear[-1])[:, 0] / columns.linear[-1].shape[1]
+    square, whole = jnp.sum(dark * column**2, axis=0), jnp.sum(column**2, axis=0)
+
+    def more(state: Any) -> Array:
+        return (state[0] == 0) | ((state[0] < 3) & jnp.any(state[2]))
+
+    def fitted(state: Any) -> Any:
+        trial, counts, worth, best = state
+        fit = fit_texels(model, target.where(counts), columns.where(counts), grey, finer)
+        found = fit, counts, *penalised(model, fit, seen, counts, grey)
+        better = (trial == 0) | (worth & (found[2] < best[2]))
+        best = jax.tree.map(lambda a, b: jnp.where(better, a, b), found, best)
+
+        def first() -> tuple[Array, Array]:
+            # a k_d of their own, by its score: how far below the other one, in standard errors
+            score, freedom = jnp.sum(dark * column * fit.residual, axis=0), found[3]
+            variance = len(fit.k[0]) * divide(fit.cost, freedom) * square * (1 - divide(square, whole))
+            return seen - dark, (score < 0) & (score**2 > jnp.minimum(OUTLIER**2, 0.5 * freedom) * variance)
+
+        def second() -> tuple[Array, Array]:
+            return _inliers(residual(model, target, columns, fit), seen, counts), worth
+
+        return trial + 1, *jax.lax.cond(trial == 0, first, second), best
+
+    fit = jax.eval_shape(lambda: fit_texels(model, target, columns, grey, finer))
+    empty = jax.tree.map(lambda one: jnp.zeros(one.shape, one.dtype), fit)
+    start = 0, seen, target.cap > 0, (empty, seen, target.cap, target.cap)
+    *_, best = jax.lax.while_loop(more, fitted, start)
+    return best[0], best[1]
+
+
 def octave_gains(model: Any, target: Target, columns: Columns, grey: bool, finer: int) -> Float[Array, "G T"]:
     """By how much the best material lowers the cost, at each n of the grid: see `fit_texels`."""
     dtype = target.cap.dtype
     gram, moment = _sums(columns.linear, target)
     floor = jnp.exp(_lowest(dtype))
     # all that the loop sums is a column times the lobe's cosine to a power: one multiplication less at each n
-    weighted = [
-        column[:, None] * columns.weight[:, :, None]
-        for column in (*columns.linear, target.summed[:, None] if grey else target.shown)
-    ]
+    one_weight = columns.weight.shape[2] == 1
+    shown = target.summed[:, None] if grey and one_weight else target.shown
+    weighted = [column[:, None] * columns.weight for column in (*columns.linear, shown)]
 
     def gain(power: Array, scale: Array) -> Array:
         *across, shown = (jnp.sum(column * power[:, :, None], axis=(0, 1)) for column in weighted)
-        lobe = jnp.sum(columns.weight * power, axis=1, keepdims=True)
-        square, moments = jnp.sum(lobe * lobe, axis=0), [*moment, _of_all(shown, target) if grey else shown]
+        lobe = jnp.sum(columns.weight * power[:, :, None], axis=1)
+        moments = [*moment, _of_all(over_channels(shown)[0], target) if grey else shown]
+        square = jnp.sum(lobe * lobe, axis=0)
         whole = [*([*row, x] for row, x in zip(gram, across, strict=True)), [*across, square]]
         k = nonnegative(whole, moments, target.cap * scale, grey, steps=1)
         left = [b - 0.5 * sum(map(operator.mul, row, k)) for b, row in zip(moments, whole, strict=True)]
@@ -270,11 +341,12 @@ def fit_at(
     """The best coefficients for a given n; their errors allow for that of n, unless n is sure."""
     if not issubclass(model, SpecularMaterial):
         point = _evaluate(columns.linear, [], target, False)
-        return TexelFit(point.k, point.k_error, log_n, jnp.full_like(log_n, jnp.inf), point.cost)
+        return TexelFit(point.k, point.k_error, log_n, jnp.full_like(log_n, jnp.inf), *point[-3:])
     lobe, slope = columns.lobe(model, log_n)
     unknowns = [] if sure else [{len(columns.linear): slope}]
     point = _evaluate([*columns.linear, lobe], unknowns, target, grey, free=True)
-    return TexelFit(point.k, point.k_error, log_n, jnp.zeros_like(log_n) if sure else point.error[0], point.cost)
+    log_n_error = jnp.zeros_like(log_n) if sure else point.error[0]
+    return TexelFit(point.k, point.k_error, log_n, log_n_error, *point[-3:])
 
 
 # -- normals sought ----------------------------------------------------------------------------------------------------
@@ -283,11 +355,11 @@ def fit_at(
 def fit_with_normals(
     model: Any,
     target: Target,
-    seen: Float[Array, "P T"],
+    root: Float[Array, "P D T"],
     lights: Distant,
     grey: bool,
     finer: int,
-) -> tuple[TexelFit, Array, Array, Array]:
+) -> tuple[TexelFit, Array, Array, Array, Array]:
     """The best material and normal of each texel.
 
     Lambert's law, fitted to what is neither highlight nor shadow, gives a normal, and a highlight alone, as of metals,
@@ -297,46 +369,110 @@ def fit_with_normals(
     Args:
         model: class of the material.
         target: what the photographs show.
-        seen: 1 where it counts.
+        root: of the weights, 0 where a value does not count.
         lights: which are distant.
         grey: whether the channels share k_s.
         finer: see `fit_texels`.
 
     Returns:
-        The fit; the normals, (3, T); their standard errors in units of the noise, (T,), the root mean square angle; and
-        what counted in the end, (P, T).
+        The fit; the normals, (3, T); their standard errors in units of the noise, (T,), the root mean square angle;
+        what is lit and what of it is no outlier, (P, T): neither counts in the fit otherwise.
     """
+    seen, shown, to_light = counted(root), target.grey(root), jnp.asarray(lights.to_light)
 
     def again(_: Any, state: Any) -> Any:
-        fit, normal, _, _ = state
-        columns = lights.columns(model, normal, seen)
-        lobe = [columns.lobe(model, fit.log_n)[0]] if issubclass(model, SpecularMaterial) else []
-        residual = target.shown - sum(map(operator.mul, fit.k, [*columns.linear, *lobe]))
-        counts = _inliers(jnp.sum(residual, axis=1), seen)
-        some = Target.of(target.shown * counts[:, None])
-        fit = fit_texels(model, some, lights.columns(model, normal, counts), grey, finer)
-        return *_jointly(model, some, counts, lights, grey, fit, normal), counts
+        fit, normal, _, _, counts = state
+        columns = lights.columns(model, normal, root)
+        lit = seen if lights.ambient is not None else jnp.where(columns.linear[0][:, 0] > 0, seen, 0)
+        counts = _inliers(residual(model, target, columns, fit), lit, lit * counts)
+        some, roots = target.where(counts), root * counts[:, None]
+        fit = fit_texels(model, some, lights.columns(model, normal, roots), grey, finer)
+        return *_jointly(model, some, roots, lights, grey, fit, normal), lit, counts
 
-    def first(normal: Array) -> tuple[TexelFit, Array]:
-        return fit_texels(model, target, lights.columns(model, normal, seen), grey, finer), normal
+    def first(start: tuple[Array, Array]) -> tuple[TexelFit, Array, Array, Array]:
+        normal, counts = start
+        fit = fit_texels(
+            model, target.where(counts), lights.columns(model, normal, root * counts[:, None]), grey, finer
+        )
+        return fit, normal, counts, penalised(model, fit, seen, counts, grey)[0]
 
-    start = first(lambert_normals(target.summed, seen, lights.to_light))
+    def unshadowed(_: Any, start: tuple[Array, Array]) -> tuple[Array, Array]:
+        counts = seen - shadows(shown, seen, to_light @ start[0])
+        return lambert_normals(shown, counts, to_light), counts
+
+    plain = lambert_normals(shown, seen, to_light), seen
+    starts = [plain, jax.lax.fori_loop(0, 2, unshadowed, plain)]
     if issubclass(model, SpecularMaterial):
-        shiny = first(highlight_normals(model, target.summed, seen, lights))
-        better = shiny[0].cost < start[0].cost
-        start = jax.tree.map(lambda a, b: jnp.where(better, a, b), shiny, start)
-    return jax.lax.fori_loop(0, 2, again, (*start, seen[0], seen))
+        starts.append((highlight_normals(model, shown, seen, lights), seen))
+    found = jax.lax.map(first, jax.tree.map(lambda *some: jnp.stack(some), *starts))
+    best = jnp.argmin(found[-1], axis=0)
+    fit, normal, counts, _ = jax.tree.map(
+        lambda some: jnp.squeeze(jnp.take_along_axis(some, best.reshape(1, *[1] * (some.ndim - 2), -1), 0), 0), found
+    )
+    return jax.lax.fori_loop(0, 2, again, (fit, normal, seen[0], seen, counts))
 
 
-def _inliers(residual: Float[Array, "P T"], seen: Float[Array, "P T"]) -> Float[Array, "P T"]:
-    """1 where a residual is no outlier: within `OUTLIER` standard deviations of those that are none."""
+def counted(root: Float[Array, "P D T"]) -> Float[Array, "P T"]:
+    """1 where a value has a weight, whose root this is."""
+    return jnp.where(root[:, 0] > 0, 1, jnp.zeros((), root.dtype))
+
+
+def residual(model: Any, target: Target, columns: Columns, fit: TexelFit) -> Float[Array, "P T"]:
+    """What a fit leaves of the photographs, summed over the channels."""
+    lobe = [columns.lobe(model, fit.log_n)[0]] if issubclass(model, SpecularMaterial) else []
+    return over_channels(target.shown - sum(map(operator.mul, fit.k, [*columns.linear, *lobe])))[:, 0]
+
+
+def penalised(model: Any, fit: TexelFit, seen: Array, counts: Array, grey: bool) -> tuple[Array, Array]:
+    """The cost of a fit and of what it left out, outliers with the least residual of such; and its freedom; (T,)."""
+    channels = len(fit.k[0])
+    of_lobe = (1 if grey else channels) if issubclass(model, SpecularMaterial) else 0
+    freedom = channels * jnp.sum(counts, axis=0) - (len(fit.k) - (of_lobe > 0)) * channels - of_lobe
+    left_out = jnp.sum(seen - counts, axis=0)
+    cost = jnp.where(freedom < 3, jnp.inf, fit.cost * (1 + OUTLIER**2 * left_out / jnp.maximum(freedom, 1)))
+    return cost, freedom
+
+
+def shadows(grey: Float[Array, "P T"], seen: Float[Array, "P T"], diffuse: Float[Array, "P T"]) -> Float[Array, "P T"]:
+    """1 where a value is less than half of what the middle one and Lambert's law tell.
+
+    Args:
+        grey: what the photographs show.
+        seen: 1 where it counts.
+        diffuse: column of k_d.
+    """
+    weight = jnp.where(diffuse > 0, seen * diffuse, 0)
+    half = 0.5 * jnp.sum(weight, axis=0)
+
+    def halved(_: Any, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = ends
+        middle = 0.5 * (low + high)
+        above = jnp.sum(jnp.where(grey > middle * diffuse, weight, 0), axis=0) > half
+        return jnp.where(above, middle, low), jnp.where(above, high, middle)
+
+    # the middle of what is positive is at most twice its mean
+    most = divide(jnp.sum(jnp.where(weight > 0, jnp.maximum(grey, 0), 0), axis=0), half)
+    middle, _ = jax.lax.fori_loop(0, 8, halved, (jnp.zeros_like(most), most))
+    return jnp.where((weight > 0) & (grey < 0.5 * middle * diffuse), seen, 0)
+
+
+def _inliers(
+    residual: Float[Array, "P T"], seen: Float[Array, "P T"], counts: Float[Array, "P T"]
+) -> Float[Array, "P T"]:
+    """1 where a residual is no outlier: within `OUTLIER` standard deviations of those that are none.
+
+    Args:
+        residual: of all.
+        seen: 1 where it counts.
+        counts: 1 where none is expected.
+    """
     square = residual * residual
 
     def clip(_: Any, counts: Array) -> Array:
         size = divide(jnp.sum(counts * square, axis=0), jnp.sum(counts, axis=0))
         return jnp.where(square <= OUTLIER**2 * size, seen, 0)
 
-    return jax.lax.fori_loop(0, 4, clip, seen)
+    return jax.lax.fori_loop(0, 4, clip, counts)
 
 
 def lambert_normals(grey: Float[Array, "P T"], seen: Float[Array, "P T"], to_light: Array) -> Float[Array, "3 T"]:
@@ -390,7 +526,7 @@ def _linear(axes: Array, weight: Float[Array, "P T"], value: Float[Array, "P T"]
 
 
 def _jointly(
-    model: Any, target: Target, seen: Array, lights: Distant, grey: bool, fit: TexelFit, normal: Array
+    model: Any, target: Target, root: Array, lights: Distant, grey: bool, fit: TexelFit, normal: Array
 ) -> tuple[TexelFit, Array, Array]:
     """Gauss-Newton of material and normal together; a step that does not lower the cost is cut to a quarter."""
     glossy = issubclass(model, SpecularMaterial)
@@ -419,8 +555,8 @@ def _jointly(
                 *([t[0], scale * power * t[1] + lobe * n * t[2]] for t in tilts),
             ]
 
-        basis, slopes = jax.lax.map(of_light, (jnp.asarray(lights.to_light), seen))
-        basis = [*([] if lights.ambient is None else [lights.ambient * seen[:, None]]), *basis]
+        basis, slopes = jax.lax.map(of_light, (jnp.asarray(lights.to_light), root))
+        basis = [*([] if lights.ambient is None else [lights.ambient * root]), *basis]
         first, last = int(lights.ambient is not None), len(basis) - 1
         by_n = [{last: slopes[0][1]}] if glossy else []
         tilts = [dict(enumerate(slope, start=first)) for slope in slopes[-2:]]
@@ -442,7 +578,7 @@ def _jointly(
     point = at(log_n, normal, free=True)
     angle = square_root(point.error[-2] ** 2 + point.error[-1] ** 2)
     log_n_error = point.error[0] if glossy else fit.log_n_error
-    return TexelFit(point.k, point.k_error, log_n, log_n_error, point.cost), normal, angle
+    return TexelFit(point.k, point.k_error, log_n, log_n_error, *point[-3:]), normal, angle
 
 
 # -- least squares, one in each lane -----------------------------------------------------------------------------------
@@ -458,6 +594,8 @@ class _Point(NamedTuple):
         step: of each.
         error: of each, in units of the noise.
         cost: sum of squared residuals, (T,).
+        gain: by how much the last column lowers it, (T,).
+        residual: summed over the channels, (P, T).
     """
 
     k: list[Array]
@@ -466,6 +604,8 @@ class _Point(NamedTuple):
     step: list[Array]
     error: list[Array]
     cost: Array
+    gain: Array
+    residual: Array
 
 
 def _evaluate(
@@ -499,12 +639,17 @@ def _evaluate(
     right = [sum(a * left[i] for i, a in part) for part in parts]
     active = [(x > 0) | (free and i < count - 1) for i, x in enumerate(k)]
     active[-1] &= k[-1] < target.cap
-    slope, step, error = _solve(matrix, right, active, count - grey)
-    residual = jax.lax.map(lambda one: one[0] - sum(map(operator.mul, k, one[1])), (target.shown, columns))
-    cost = over_channels(jnp.sum(residual * residual, axis=0))[0]
+    slope, step, error, variance = _solve(matrix, right, active, count - grey)
+
+    def left_of(photograph: Any) -> tuple[Array, Array]:
+        residual = photograph[0] - sum(map(operator.mul, k, photograph[1]))
+        return over_channels(residual)[0], over_channels(residual * residual)[0]
+
+    residual, square = jax.lax.map(left_of, (target.shown, columns))
     errors = [jnp.broadcast_to(value, target.shown.shape[1:]) for value in error[:count]]
     slope, step, error = (some[len(some) - len(unknowns) :] for some in (slope, step, error))
-    return _Point(k, errors, slope, step, error, cost)
+    gain = over_channels(divide(k[-1] ** 2, variance[count - 1]))[0] / (len(k[-1]) if grey else 1)
+    return _Point(k, errors, slope, step, error, jnp.sum(square, axis=0), gain, residual)
 
 
 def _sums(
@@ -527,7 +672,8 @@ def _moment(column: Float[Array, "P D T"], target: Target, shared: bool) -> Floa
     """Of a column with what the photographs show; where channels share its coefficient the first has that of all."""
     if not shared:
         return jnp.sum(column * target.shown, axis=0)
-    return _of_all(jnp.sum(column[:, 0] * target.summed, axis=0), target)
+    shown = target.summed[:, None] if column.shape[1] == 1 else target.shown
+    return _of_all(over_channels(jnp.sum(column * shown, axis=0))[0], target)
 
 
 def _of_all(moment: Array, target: Target) -> Float[Array, "C T"]:
@@ -624,8 +770,9 @@ def _solve(
         shared: the first that all channels share.
 
     Returns:
-        Of each unknown that all share what is left of b for it after those before it, and x, (T,); and of all the
-        square roots of the diagonal of the inverse, (C, T) or (T,).
+        Of each unknown that all share what is left of b for it after those before it, and x, (T,); of all the square
+        roots of the diagonal of the inverse, (C, T) or (T,), and the squares of what these are where the unknowns after
+        are known.
     """
     shape, count = right[0].shape, len(right)
     always = [jnp.ones(shape, bool)] * (count - len(active))
@@ -642,7 +789,8 @@ def _solve(
             covariance[i, j] = covariance[j, i] = -sum(row[k] * covariance[k, j] for k in row)
         covariance[i, i] = inverse - sum(row[k] * covariance[k, i] for k in row)
         error.insert(0, jnp.where(inverse > 0, square_root(covariance[i, i]), jnp.inf))
-    return [left for _, left, *_ in common.values()], [x[i] for i in common], error
+    left = [left for _, left, *_ in common.values()]
+    return left, [x[i] for i in common], error, [inverse for inverse, *_ in (own | common).values()]
 
 
 def _eliminate(matrix: Any, right: Any, active: Any, first: range) -> tuple[Any, Any]:

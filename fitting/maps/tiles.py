@@ -12,11 +12,13 @@ import numpy as np
 from jaxtyping import Array
 
 import brdf
+from brdf.images.encoding import Encoding
 from brdf.lights.base import LightStack, stacked
 from brdf.lobes import light_terms
 from brdf.models.base import SpecularMaterial
 from brdf.precision import Precision, working_precision
 from brdf.vectors import Components, normalize
+from fitting.likelihood import encoded_and_slope
 from fitting.maps.map_inputs import Photographs
 from fitting.maps.map_light_choice import MOST_ERROR
 from fitting.maps.map_result import REASONS, Maps
@@ -26,8 +28,9 @@ from fitting.maps.texels import (
     Distant,
     Target,
     TexelFit,
+    counted,
     fit_at,
-    fit_texels,
+    fit_unshadowed,
     fit_with_normals,
     octave_gains,
     over_channels,
@@ -111,9 +114,8 @@ def fit_band(given: Photographs, how: How, codes: np.ndarray, surface: Surface) 
         ambient = None if how.ambient is None else how.ambient[..., None].astype(dtype)
         distant = Distant(to_light.astype(dtype), (how.to_view / np.linalg.norm(how.to_view)).astype(dtype), ambient)
         photographs = codes, given.top.astype(dtype), given.scale.astype(dtype)
-        layers = _program(
-            how.models, how.grey, steps_of_grid(given), how.seek, photographs, surface, distant, stacks, occluders
-        )
+        static = how.models, how.grey, steps_of_grid(given), how.seek, given.curves
+        layers = _program(*static, photographs, surface, distant, stacks, occluders)
         return {name: np.asarray(layer) for name, layer in layers.items()}
 
 
@@ -123,6 +125,7 @@ def _program(
     grey: bool,
     finer: int,
     seek: str,
+    curves: tuple[Encoding, ...],
     photographs: tuple[Any, Any, Any],
     surface: Surface,
     distant: Distant,
@@ -143,39 +146,48 @@ def _program(
         def decoded(tile: Array) -> tuple[Target, Array]:
             shown = [tile[:, :, c].astype(scale.dtype) for c in range(tile.shape[2])]
             counts = functools.reduce(jnp.logical_and, (jnp.isfinite(x) & (x < top[:, None]) for x in shown)) & mask
+            # what no light reaches is 0 whatever the texel is, in codes without noise even
+            if normal is not None and points is None and distant.ambient is None:
+                counts &= sum(distant.to_light[:, i, None] * normal[i] for i in range(3)) > 0
+            root, weights = counts[:, None].astype(scale.dtype), 1.0
+            if set(curves) != {"linear"}:
+                weights = jnp.stack([_slopes(curves, jnp.where(counts, x, 0)) for x in shown], axis=1)
             shown = [jnp.where(counts, x * scale[:, c, None], 0) for c, x in enumerate(shown)]
-            return Target.of(jnp.stack(shown, axis=1)), counts.astype(scale.dtype)
+            return Target.of(jnp.stack(shown, axis=1), weights), root * weights
 
         # under a condition XLA stores what comes out, and does not decode it anew for each sum
         tile = jax.lax.dynamic_slice_in_dim(codes, start, TILE, axis=1)
         empty = jax.tree.map(lambda one: jnp.zeros(one.shape, one.dtype), jax.eval_shape(decoded, tile))
-        target, seen = jax.lax.cond(jnp.any(mask), decoded, lambda _: empty, tile)
-        found = [_of_model(model, target, seen, mask, normal, points, shared) for model in models]
+        target, root = jax.lax.cond(jnp.any(mask), decoded, lambda _: empty, tile)
+        found = [_of_model(model, target, root, mask, normal, points, shared) for model in models]
         layers = _simplest(found) if seek == "layers" else found[0]
         return {name: layer.T for name, layer in layers.items()}
 
     def _of_model(
-        model: Any, target: Target, seen: Array, mask: Array, normal: Any, points: Any, shared: Any
+        model: Any, target: Target, root: Array, mask: Array, normal: Any, points: Any, shared: Any
     ) -> dict[str, Array]:
         tied = grey and issubclass(model, SpecularMaterial)
+        seen = counted(root)
         if normal is None:
-            fit, normal, tilt, inliers = fit_with_normals(model, target, seen, distant, tied, finer)
-            target, outliers = Target.of(target.shown * inliers[:, None]), jnp.sum(seen - inliers, axis=0)
-            return _layers(model, fit, target, inliers, mask, tied, normal, tilt, outliers=outliers)
+            fit, normal, tilt, lit, inliers = fit_with_normals(model, target, root, distant, tied, finer)
+            left_out = [jnp.sum(a - b, axis=0) for a, b in ((seen, lit), (lit, inliers))]
+            return _layers(model, fit, target.where(inliers), inliers, mask, tied, normal, tilt, left_out=left_out)
         if points is None:
-            columns = distant.columns(model, normal, seen)
+            columns = distant.columns(model, normal, root)
         else:
             columns = _near_columns(model, points, stacks, occluders, distant.ambient)
             if distant.ambient is None:
                 seen *= columns.linear[0][:, 0] > 0
-            linear = [column * seen[:, None] for column in columns.linear]
-            columns = columns._replace(linear=linear, weight=columns.weight * seen[:, None])
-            target = Target.of(target.shown * seen[:, None])
+            linear = [column * root for column in columns.linear]
+            columns = columns._replace(linear=linear, weight=columns.weight * root[:, None])
+            target = target.where(seen)
+        fit, inliers = fit_unshadowed(model, target, columns, root, tied, finer)
+        left_out = 0, jnp.sum(seen - inliers, axis=0)
+        target, columns, seen = target.where(inliers), columns.where(inliers), inliers
         if seek == "gains":
             return {"gains": jnp.where(mask, octave_gains(model, target, columns, tied, finer), 0)}
         if shared is None:
-            fit = fit_texels(model, target, columns, tied, finer)
-            return _layers(model, fit, target, seen, mask, tied, normal, None)
+            return _layers(model, fit, target, seen, mask, tied, normal, None, left_out=left_out)
         log_n, error = shared.T
         if seek == "slope":
             slope, curvature = slope_and_curvature(model, target, columns, tied, log_n)
@@ -186,7 +198,7 @@ def _program(
             sums = jnp.stack([slope, curvature, cost, jnp.maximum(freedom, 0)])
             return {"sums": jnp.where(mask, sums, 0)}
         fit = fit_at(model, target, columns, tied, log_n, sure=True)
-        return _layers(model, fit, target, seen, mask, tied, normal, None, error)
+        return _layers(model, fit, target, seen, mask, tied, normal, None, error, left_out)
 
     starts = jnp.arange(0, codes.shape[1], TILE)
     surface = jax.tree.map(lambda leaf: leaf.reshape(-1, TILE, *leaf.shape[1:]), surface)
@@ -194,6 +206,13 @@ def _program(
         surface = surface._replace(normal=jnp.swapaxes(surface.normal, 1, 2))
     tiles = jax.lax.map(of_tile, (starts, surface))
     return {name: layer.reshape(-1, *layer.shape[2:]) for name, layer in tiles.items()}
+
+
+def _slopes(curves: tuple[Encoding, ...], light: Array) -> Array:
+    """How much codes change with light, (P, T): what the roots of weights are, for noise is even in codes."""
+    kinds = sorted(set(curves), key=str)
+    which = [np.array([curve == kind for curve in curves])[:, None] for kind in kinds]
+    return jnp.select(which, [encoded_and_slope(light, kind, 255.0)[1] for kind in kinds])
 
 
 def _near_columns(model: Any, points: Any, stacks: Any, occluders: Any, ambient: Any) -> Columns:
@@ -212,7 +231,7 @@ def _near_columns(model: Any, points: Any, stacks: Any, occluders: Any, ambient:
     every = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[jnp.argsort(jnp.concatenate(order))], *terms)
     diffuse = jnp.swapaxes(jnp.sum(every.diffuse, axis=1), 1, 2)
     linear = [] if ambient is None else [ambient * jnp.ones_like(diffuse)]
-    return Columns([*linear, diffuse], every.weight[..., 0], every.log_cosine)
+    return Columns([*linear, diffuse], jnp.swapaxes(every.weight, 2, 3), every.log_cosine)
 
 
 def _by_light(lights: int, samples: Array) -> Array:
@@ -229,25 +248,33 @@ def _layers(
     normal: Array,
     tilt: Array | None,
     shared: Array | None = None,
-    outliers: Any = 0,
+    left_out: Any = (0, 0),
 ) -> dict[str, Array]:
     """The layers of a model's maps, texels last.
 
     Models are compared by the information criterion of Schwarz as McQuarrie corrects it for few values ("A small-sample
     correction for the Schwarz SIC model selection criterion", Statistics & Probability Letters 44, 1999). What a model
-    left out as outliers, each its own, counts with the least residual of such.
+    left out as outliers, each its own, counts with the least residual of such, and what it leaves unlit as noise. A
+    highlight is seen where the criterion wants it: of so many exponents one serves noise better than its errors expect.
     """
     channels, lanes = target.shown.shape[1:]
     glossy = issubclass(model, SpecularMaterial)
     k_s, k_s_error = (fit.k[-1], fit.k_error[-1]) if glossy else (jnp.zeros((channels, lanes)),) * 2
     linear = fit.k[:-1] if glossy else fit.k
-    unknowns = len(linear) * channels + glossy * (2 if grey else channels + 1) + 2 * (tilt is not None)
+    of_lobe = glossy * ((1 if grey else channels) + (shared is None))
+    unknowns = len(linear) * channels + of_lobe + 2 * (tilt is not None)
     values = channels * jnp.sum(seen, axis=0)
+
+    def price(unknowns: int) -> Array:
+        return unknowns * jnp.log(jnp.maximum(values, 1)) * values / jnp.maximum(values - unknowns - 2, 1)
+
     freedom = values - unknowns
     noise = jnp.where(freedom < 1, jnp.nan, jnp.sqrt(fit.cost / jnp.maximum(freedom, 1)))
     n = jnp.exp(fit.log_n)
     error = noise * fit.log_n_error if shared is None else shared
+    gain = values * jnp.log1p(fit.gain / jnp.maximum(fit.cost, jnp.finfo(n.dtype).tiny))
     shows = jnp.any(k_s > LEAST_HIGHLIGHT * noise * k_s_error, axis=0)
+    shows &= gain > price(unknowns) - price(unknowns - of_lobe)
     capped = jnp.any(k_s >= target.cap, axis=0)
     tests = (~mask | (values == 0), freedom < 1, ~shows | (not glossy), capped, ~(error <= MOST_ERROR))
     reason = jnp.select(tests, [jnp.uint8(number) for number in range(1, len(REASONS))], jnp.uint8(0))
@@ -257,9 +284,10 @@ def _layers(
     layers = {name: jnp.where(inside, k, jnp.nan) for name, k in zip(names, linear, strict=True)}
     layers |= {f"{name}_error": noise * e for name, e in zip(names, fit.k_error, strict=False)}
     square = over_channels(jnp.sum(target.shown * target.shown, axis=0))[0]
-    spare, every = freedom - 2, values + channels * outliers
-    whole = jnp.maximum(fit.cost + outliers * (OUTLIER * noise) ** 2, jnp.finfo(n.dtype).tiny)
-    price = unknowns * jnp.log(jnp.maximum(values, 1)) * values / jnp.maximum(spare, 1)
+    unlit, outliers = left_out
+    every = values + channels * (unlit + outliers)
+    whole = fit.cost + (channels * unlit + OUTLIER**2 * outliers) * noise**2
+    whole = jnp.maximum(whole, jnp.finfo(n.dtype).tiny)
     return layers | {
         "n": jnp.where(known, n, jnp.nan),
         "k_s": jnp.where(known, k_s, jnp.nan),
@@ -273,7 +301,7 @@ def _layers(
         "determined": known,
         "reason": reason,
         "residual": jnp.where(inside, jnp.sqrt(fit.cost / jnp.where(square > 0, square, 1)), jnp.nan),
-        "criterion": jnp.where(spare < 1, jnp.inf, every * jnp.log(whole) + price),
+        "criterion": jnp.where(freedom < 3, jnp.inf, every * jnp.log(whole) + price(unknowns)),
     }
 
 

@@ -71,6 +71,42 @@ def test_errors_cover_the_truth(noisy):
         assert 0.88 < np.mean(off[known] < 1.96) <= 1
 
 
+def photographed(encoding: str, shadowed: float, gloss: float = 1.0) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Codes of 8 bits with noise of 0.7 of them; of some values a cast shadow leaves 5 % of the light."""
+    pictures, truth = texels(256, 0.0, dome(32), n=(10, 80))
+    matte, _ = texels(256, 0.0, dome(32), n=(1e9, 1e9))
+    pictures = 0.5 * (matte + gloss * (pictures - matte))
+    random = np.random.default_rng(2)
+    pictures *= np.where(random.random(pictures.shape[:3]) < shadowed, 0.05, 1)[..., None]
+    codes = 255 * encode(pictures, encoding) + random.normal(0, 0.7, pictures.shape)
+    return np.clip(np.round(codes), 0, 255).astype(np.uint8), truth
+
+
+@pytest.mark.parametrize(("encoding", "normals"), [("srgb", "given"), ("linear", "fit")])
+def test_photographs_of_eight_bits_with_cast_shadows(encoding, normals):
+    codes, truth = photographed(encoding, 0.2)
+    given = truth["normal"][None] if normals == "given" else "fit"
+    maps = fitting.fit_maps(codes, dome(32), given, encoding=encoding)
+    known = maps.determined[0]
+    assert known.mean() > 0.85
+    off = np.log(maps.n[0] / truth["n"])[known]
+    assert np.median(np.abs(off)) < 0.04
+    for values, errors in (
+        (off, (maps.n_error / maps.n)[0][known]),
+        ((maps.k_d[0] - 0.5 * truth["k_d"])[known], maps.k_d_error[0][known]),
+        ((maps.k_s[0] - 0.5 * truth["k_s"])[known], maps.k_s_error[0][known]),
+    ):
+        assert 0.88 < np.mean(np.abs(values) < 1.96 * errors) < 0.99
+        assert np.mean(np.abs(values) > 6 * errors) < 0.02
+
+
+def test_noise_of_matte_texels_is_no_highlight():
+    """Of all exponents one serves it better than its errors let expect."""
+    codes, truth = photographed("srgb", 0.0, gloss=0.0)
+    maps = fitting.fit_maps(codes, dome(32), truth["normal"][None], encoding="srgb")
+    assert np.mean(maps.determined) < 0.01
+
+
 def test_the_optimum_is_global(noisy):
     pictures, truth, maps = noisy
     lights, known = dome(32), maps.determined[0]
