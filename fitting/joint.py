@@ -171,7 +171,7 @@ def _away_from_outlines(whole: Observed, scenes: Sequence[brdf.Scene]) -> Observ
     """What is fitted where outlines move: a pixel that comes to see another shape, or none, is no small change."""
     inner = [_alike(scene, AWAY) & counted for scene, counted in zip(scenes, whole.counted, strict=True)]
     seen = observe(dataclasses.replace(whole.problem, masks=inner), at_once=True)
-    lost = sum(map(np.count_nonzero, whole.counted)) - sum(map(np.count_nonzero, seen.counted))
+    lost = int(sum(map(np.count_nonzero, whole.counted)) - sum(map(np.count_nonzero, seen.counted)))
     return seen._replace(left_out=whole.left_out | {"near an outline that moves": lost})
 
 

@@ -77,6 +77,10 @@ def fit(
 
     if plot and out is None:
         raise InputError("--plot", "needs a folder to draw into", "Add --out DIR")
+    apart = {"--noise": noise, "--plausible": plausible, "--loss": loss, "--accuracy": accuracy, "--seconds": seconds}
+    if free and any(apart.values()):
+        came = f"knows nothing of {' and '.join(option for option, given in apart.items() if given)}"
+        raise InputError("--free", came, "Leave one of them out")
     check_page(report)
     if out is not None:
         # Told now instead of after the fit.

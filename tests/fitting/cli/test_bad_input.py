@@ -211,6 +211,11 @@ CASES: list[tuple[dict[str, Any], str, str]] = [
     ({}, f"{FIT} --noise 1", "^error: --noise: must be 2 finite numbers"),
     ({}, f"{FIT} --noise -1,0", "^error: --noise: must be two numbers of 0"),
     ({}, f"{FIT} --plot", "^error: --plot: needs a folder"),
+    (
+        {},
+        f"{FIT} --free light --plausible --loss huber",
+        "^error: --free: knows nothing of --plausible and --loss. Leave one",
+    ),
     ({}, f"{FIT} --report o.pdf", "o.pdf: is no name of a page"),
     ({}, f"{FIT} --out fitted --report nodir/o.html", "nodir/o.html: cannot be written, .*nodir is no folder"),
     ({}, f"{FIT} --ambient", "--ambient: is what the scene file says"),
