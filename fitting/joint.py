@@ -58,7 +58,7 @@ MET = 0.1
 DEPENDENT = 1e-12
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class JointResult(FitResult):
     """The outcome of a joint fit: a `FitResult` whose parameters are the freed numbers, and what the solver says.
 

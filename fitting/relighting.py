@@ -34,7 +34,7 @@ FACTOR = "one factor per channel between material and lights"
 KEPT = "no picture determines it; the lights' mean intensity was kept at that of the scene"
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class LightFit(FitResult):
     """Lights found in a picture: a `FitResult` whose parameters are their emittances.
 

@@ -56,6 +56,7 @@ def test_lights_are_told_saved_and_drawn_as_a_fit_is(tmp_path):
         assert abs(float(one) - true) < 4.5 * one.error
     np.testing.assert_allclose(found.noise, 0.01, rtol=0.1)
     assert not found.warnings
+    assert repr(found).startswith("<FitResult: blinn-phong, lights[0].intensity[0] ")
     assert f"  {found.parameters[0].name} red    {found.parameters[0]}" in str(found)
     found.save(tmp_path, plot=True)
     np.testing.assert_allclose(fitting.load_result(tmp_path).fitted(), found.fitted(), rtol=1e-5)
