@@ -35,7 +35,7 @@ from fitting.solver.streams import Stream, each
 from fitting.solver.tied import NormalEquations, design_of, join_channels
 from fitting.uncertainty.covariance import NO_TRACE, residual_noise, specular_gain
 from fitting.uncertainty.highlight import highlight, nearest_peak
-from fitting.uncertainty.interpretation import Interpretation, alone_covariance, interpret, shared_errors
+from fitting.uncertainty.interpretation import alone_covariance, interpret, shared_errors
 from fitting.uncertainty.noise_model import weighted_sums
 from fitting.uncertainty.residual_correlation import residual_correlation
 from fitting.uncertainty.structure import CHANCE, SIZES, Blocks, Errors, left_over_blocks, over_blocks, shared
@@ -84,7 +84,9 @@ def fit_pictures(problem: FitProblem) -> FitResult:
         fit, choice, seen = _less_codec_errors(fit, choice, seen)
         fit = _held_plausible(fit, seen)
         told, optimum = _interpreted(fit, seen, choice), fit.optimum
-        hidden = told.hidden_highlight
+        # Why there is a highlight in the numbers but none in the material.
+        reasons = {one.reason for one in told.parameters if one.name in ("k_s", "n")}
+        hidden = reasons.pop() if len(reasons) == 1 else ""
         if hidden and not fit.capped and optimum.x[2].any():
             # Or ambient and diffuse would be the ones that go with the highlight. Weights of a robust loss are made
             # anew.
@@ -93,23 +95,8 @@ def fit_pictures(problem: FitProblem) -> FitResult:
             rest = _held_plausible(most_likely(_fit_model(fit.model, seen, free, pictures), copies=seen.copies), seen)
             fit = rest._replace(moved=_by_highlight(fit, rest, seen))
             told = _interpreted(fit, seen, choice, hidden)
-    return FitResult(
-        **told._asdict(),
-        residual=fit.residual,
-        pixels=int(fit.optimum.pixels[0]),
-        left_out=seen.left_out,
-        candidates=() if choice is None else choice.candidates,
-        optimum=optimum,
-        loss=problem.loss,
-        precision=problem.precision,
-        seconds=time.perf_counter() - start,
-        targets=seen.shown,
-        scenes=problem.shown or seen.scenes,
-        counted=seen.counted,
-        weights=seen.weights,
-        files=[target.file for target in problem.targets],
-        levels=next((one.codes.levels for one in problem.targets if one.codes is not None), ""),
-    )
+    candidates = () if choice is None else choice.candidates
+    return dataclasses.replace(told, candidates=candidates, optimum=optimum, seconds=time.perf_counter() - start)
 
 
 def picture_of(model: type[brdf.Material], tile: Tile, near: Near | None = None) -> Picture:
@@ -448,7 +435,7 @@ def _by_highlight(fit: ModelFit, rest: ModelFit, seen: Observed) -> Float[np.nda
     return may_be_off(np.append(step.ravel(), 0.0), specular_gain(normal.gram, x), 1 + int(np.count_nonzero(x[2])))
 
 
-def _interpreted(fit: ModelFit, seen: Observed, choice: Choice | None, hidden: str = "") -> Interpretation:
+def _interpreted(fit: ModelFit, seen: Observed, choice: Choice | None, hidden: str = "") -> FitResult:
     off = [some for some in (fit.moved, None if choice is None else choice.dropped) if some is not None]
     told = interpret(fit, seen, hidden, np.array(off) if off else None)
     warnings, share = list(told.warnings), fit.residual
@@ -461,4 +448,4 @@ def _interpreted(fit: ModelFit, seen: Observed, choice: Choice | None, hidden: s
         warnings.append(words)
     structure = any("structure" in text for text in told.warnings)
     warnings += doubts(fit, told.material, seen, _fit_model, structure=structure)
-    return told._replace(warnings=tuple(warnings))
+    return dataclasses.replace(told, warnings=tuple(warnings))

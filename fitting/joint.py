@@ -264,8 +264,8 @@ def _solve(problem: JointProblem, seen: Observed, solver: str | None, tolerance:
     warnings = () if converged else (f"the solver stopped after {steps} steps without an end: raise max_steps",)
     parts = problem.by_picture(residual)
     residuals = [part.reshape(shown.shape) for part, shown in zip(parts, seen.shown, strict=True)]
-    left = left_over(seen, residuals, vector.size, warnings)
     material, scenes = jax.tree.map(np.asarray, found.content())
+    left = left_over(seen, scenes, residuals, vector.size, warnings)
     given = jax.tree.leaves((material, seen.problem.scenes))
     known = likely or _by_least_squares(problem, seen, vector, residual, columns, left["noise"])
     parameters, errors, correlation = _with_errors(problem, given, known, held)
@@ -274,7 +274,6 @@ def _solve(problem: JointProblem, seen: Observed, solver: str | None, tolerance:
         material=material,
         parameters=parameters,
         correlation=correlation,
-        scenes=scenes,
         values=tuple(np.asarray(found.leaves[leaf.place]) for leaf in problem.freed),
         errors=errors,
         steps=steps,
@@ -305,12 +304,17 @@ def _by_least_squares(
 
 
 def left_over(
-    seen: Observed, residuals: Sequence[Float[np.ndarray, "H W C"]], unknowns: int, warnings: tuple[str, ...]
+    seen: Observed,
+    scenes: Sequence[brdf.Scene],
+    residuals: Sequence[Float[np.ndarray, "H W C"]],
+    unknowns: int,
+    warnings: tuple[str, ...],
 ) -> dict[str, Any]:
     """What a `FitResult` says of the pictures and of what a fit leaves of them.
 
     Args:
         seen: what was fitted.
+        scenes: that were found.
         residuals: of each picture, 0 where a pixel does not count.
         unknowns: how many numbers were found.
         warnings: that come before those of the residual.
@@ -320,22 +324,13 @@ def left_over(
     pixels = sum(map(len, told))
     share = (float(np.sum(squares)) / max(sum(float(np.sum(values**2)) for values in told), TINY)) ** 0.5
     known = correlation_in_rows(residuals, share)
-    return {
+    return seen.told() | {
+        "scenes": scenes,
         "noise": np.sqrt(squares / max(pixels - unknowns / squares.size, 1)),
         "structure": known.correlation,
-        "highlight_pixels": None,
         "residual": share,
         "pixels": pixels,
-        "left_out": seen.left_out,
         "warnings": (*warnings, *structure_warning(known)),
-        "candidates": (),
-        "optimum": None,
-        "loss": seen.problem.loss,
-        "precision": seen.problem.precision,
-        "seconds": 0.0,
-        "targets": seen.shown,
-        "counted": seen.counted,
-        "files": [target.file for target in seen.problem.targets],
     }
 
 

@@ -97,6 +97,21 @@ class Observed(NamedTuple):
         """Whether the channels are copies of each other: grey that was saved as colour."""
         return all(_grey(picture) for picture in self.shown)
 
+    def told(self) -> dict[str, Any]:
+        """What a `FitResult` says of the pictures."""
+        targets = self.problem.targets
+        return {
+            "left_out": self.left_out,
+            "loss": self.problem.loss,
+            "precision": self.problem.precision,
+            "targets": self.shown,
+            "scenes": self.problem.shown or self.scenes,
+            "counted": self.counted,
+            "weights": self.weights,
+            "files": [target.file for target in targets],
+            "levels": next((one.codes.levels for one in targets if one.codes is not None), ""),
+        }
+
     def reached(self, model: type[brdf.Material]) -> Bool[np.ndarray, "3 C"]:
         """Which coefficients of a model the light reaches.
 

@@ -113,11 +113,10 @@ def fit_lights(
     residual = np.zeros((*place.shape, pixels.shape[1]))
     residual[place] = pixels - np.einsum("lc,lpc->pc", factors, columns)
     return LightFit(
-        **left_over(seen, [residual], factors.size, ()),
+        **left_over(seen, [_with_emittances(scene, emittances)], [residual], factors.size, ()),
         material=material,
         parameters=tuple(parameters),
         correlation=np.eye(len(free_parameters(parameters))),
-        scenes=[_with_emittances(scene, emittances)],
         emittances=emittances,
         factors=factors,
         errors=errors,

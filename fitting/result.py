@@ -3,7 +3,7 @@
 import contextlib
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -196,7 +196,7 @@ class Parameters:
         return free_parameters(self.parameters)
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, kw_only=True)
 class FitResult(Parameters):
     """The outcome of a fit.
 
@@ -239,21 +239,21 @@ class FitResult(Parameters):
     parameters: tuple[Parameter, ...]
     noise: Float[np.ndarray, " C"]
     structure: float
-    highlight_pixels: float | None
     residual: float
     pixels: int
     left_out: dict[str, int]
     warnings: tuple[str, ...]
-    candidates: tuple[Candidate, ...]
     correlation: Float[np.ndarray, "F F"]
-    optimum: Optimum | None
     loss: str
     precision: Precision
-    seconds: float
-    targets: Sequence[np.ndarray] = field(repr=False)
-    scenes: Sequence[brdf.Scene] = field(repr=False)
-    counted: Sequence[np.ndarray] = field(repr=False)
-    weights: Sequence[np.ndarray | None] = field(default=(), repr=False)
+    targets: Sequence[np.ndarray]
+    scenes: Sequence[brdf.Scene]
+    counted: Sequence[np.ndarray]
+    weights: Sequence[np.ndarray | None] = ()
+    highlight_pixels: float | None = None
+    candidates: tuple[Candidate, ...] = ()
+    optimum: Optimum | None = None
+    seconds: float = 0.0
     files: Sequence[dict[str, Any] | None] = ()
     levels: str = ""
     choice: BudgetChoice | None = None

@@ -1,7 +1,7 @@
 """From the solver's numbers to a material, its errors, and what a user should know of them."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -12,7 +12,7 @@ from brdf.models.base import SpecularMaterial
 from fitting.light_colour import coefficient_factors
 from fitting.model_fit import Evidence, ModelFit
 from fitting.pixels import Observed
-from fitting.result import Parameter, free_parameters
+from fitting.result import FitResult, Parameter, free_parameters
 from fitting.solver.devices import device_count
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
@@ -51,37 +51,9 @@ ROUNDED = 0.25
 WIDEST_INTERVAL = 100.0
 
 
-class Interpretation(NamedTuple):
-    """What a fit says.
-
-    Attributes:
-        material: in the units of the user.
-        parameters: each with its error and interval, or why it has none.
-        noise: standard deviation of the residual, (C,), never below what rounding alone gives.
-        structure: correlation of neighbouring residuals.
-        highlight_pixels: how many pixels carry the highlight; None without one.
-        correlation: of the parameters that are free.
-        warnings: what a user should know before using the numbers.
-    """
-
-    material: brdf.Material
-    parameters: tuple[Parameter, ...]
-    noise: Float[np.ndarray, " C"]
-    structure: float
-    highlight_pixels: float | None
-    correlation: Float[np.ndarray, "F F"]
-    warnings: tuple[str, ...]
-
-    @property
-    def hidden_highlight(self) -> str:
-        """Why there is a highlight in the numbers but none in the material; empty where it is not so."""
-        reasons = {parameter.reason for parameter in self.parameters if parameter.name in ("k_s", "n")}
-        return reasons.pop() if len(reasons) == 1 else ""
-
-
 def interpret(
     fit: ModelFit, seen: Observed, hidden: str = "", moved: Float[np.ndarray, "K U"] | None = None
-) -> Interpretation:
+) -> FitResult:
     """Tell what a fit says.
 
     Args:
@@ -90,7 +62,8 @@ def interpret(
         hidden: why there is no highlight, where a fit with one has told.
         moved: by how much each of some causes may have moved x_a, x_d, x_s, channel after channel, and n.
     """
-    optimum, pictures = fit.optimum, fit.pictures
+    optimum, pictures, residual = fit.optimum, fit.pictures, fit.residual
+    about = seen.told() | {"optimum": optimum, "pixels": int(optimum.pixels[0])}
     weight = _typical_weight(pictures)
     rounding, columns = seen.rounding * weight, rms_columns(optimum, weight)
     noise = np.maximum(residual_noise(optimum, rounding) * fit.noise_factor, rounding)
@@ -160,8 +133,17 @@ def interpret(
         words = "no more than a sum of several numbers is determined, see there: the material shows it with "
         words += f"{100 * AMBIENT_SHARE:g} % of it as ambient light, if there is any, and the rest as k_d. "
         warnings.append(words + "Another light, or a curved surface, would tell them apart")
-    pixels = None if lobe is None else lobe.pixels
-    return Interpretation(material, parameters, noise, known.correlation, pixels, correlation, tuple(warnings))
+    return FitResult(
+        material=material,
+        parameters=parameters,
+        noise=noise,
+        structure=known.correlation,
+        highlight_pixels=None if lobe is None else lobe.pixels,
+        residual=residual,
+        warnings=tuple(warnings),
+        correlation=correlation,
+        **about,
+    )
 
 
 def shared_errors(
