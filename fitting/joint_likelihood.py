@@ -72,7 +72,9 @@ class RenderedPictures(Problem):
             start: the freed numbers, or nearly so.
             copies: the channels are copies of each other, and tell of a number once.
         """
-        self._problem = dataclasses.replace(problem, weights=[None] * len(bounds))
+        # What is left of pictures that are black is what the renderer shows.
+        black = [jnp.zeros_like(target) for target in problem.targets]
+        self._problem = dataclasses.replace(problem, targets=black, weights=[None] * len(bounds))
         self.bounds, self.design, self.copies = bounds, problem.design(start), copies
         self.exponents = problem.each(lambda leaf: leaf.name == "n")
         self.lower, self.upper = np.where(problem.bounded, 0.0, -np.inf), np.full(start.shape, np.inf)
@@ -81,7 +83,7 @@ class RenderedPictures(Problem):
 
     def codes(self, unknowns: Float[np.ndarray, " U"]) -> list[Float[np.ndarray, "P C"]]:
         """What is predicted, in codes."""
-        radiance = self._radiance(np.asarray(_residuals(self._problem, jnp.asarray(unknowns))))
+        radiance = self._problem.by_picture(np.asarray(_residuals(self._problem, jnp.asarray(unknowns))))
         return [own.codes(part)[0] for own, part in zip(self.bounds, radiance, strict=True)]
 
     def taken(self, picture: int, which: Bool[np.ndarray, " P"]) -> Values:
@@ -91,9 +93,8 @@ class RenderedPictures(Problem):
 
     def shown(self, unknowns: Float[np.ndarray, " U"], values: Sequence[Values]) -> Iterator[tuple[Any, Any]]:
         """What is predicted, and its derivatives by all numbers."""
-        residuals, columns = map(np.asarray, linearised(self._problem, jnp.asarray(unknowns)))
-        parts = self._problem.by_picture(columns)
-        for some, radiance, part in zip(values, self._radiance(residuals), parts, strict=True):
+        found = map(np.asarray, linearised(self._problem, jnp.asarray(unknowns)))
+        for some, radiance, part in zip(values, *map(self._problem.by_picture, found), strict=True):
             yield radiance[some.which], part[:, some.which]
 
     def scatter(self, said: Score) -> Float[np.ndarray, "U U"] | None:
@@ -111,9 +112,6 @@ class RenderedPictures(Problem):
             bounds, scores = one.values.intervals.bounds, np.einsum("upc,pc->up", one.columns, one.score)
             parts.append(block_scatter(scores, Errors(one.score, np.asarray(bounds.index), int(bounds.width))))
         return np.sum(parts, axis=0)
-
-    def _radiance(self, residuals: Float[np.ndarray, " N"]) -> list[Float[np.ndarray, "P C"]]:
-        return [*map(operator.add, self._problem.by_picture(residuals), map(np.asarray, self._problem.targets))]
 
 
 @eqx.filter_jit
