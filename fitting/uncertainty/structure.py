@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from fitting.channel_errors import residuals
 from fitting.solver.normal_equations import FEW_VALUES, Picture
 from fitting.solver.profile import Optimum
 from fitting.solver.tied import places_of
@@ -199,9 +200,7 @@ def errors_of(picture: Picture, optimum: Optimum, place: tuple[np.ndarray, int])
         optimum: of the fit.
         place: index of the pixels and width of the picture.
     """
-    left = np.asarray(picture.target) - picture.shown(optimum.n, optimum.x)
-    weight = np.asarray(picture.weights)
-    return Errors(np.where(weight > 0, left, 0.0) * np.sqrt(weight), *place)
+    return Errors(residuals(picture, optimum), *place)
 
 
 def scatter(
