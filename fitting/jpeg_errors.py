@@ -139,7 +139,7 @@ def _predicted(picture: Picture, at: Optimum) -> Float[np.ndarray, "P C"]:
     """In codes; NaN where a value says nothing."""
     bounds = bounds_of(picture)
     code, _ = bounds.codes(picture.shown(at.n, at.x).astype(np.float32))
-    return np.where(np.isfinite(bounds.lower) | np.isfinite(bounds.upper), code, np.float32(np.nan))
+    return np.where(bounds.ends > 0, code, np.float32(np.nan))
 
 
 @dataclasses.dataclass
@@ -229,7 +229,7 @@ def _less(picture: Picture, shown: Float[np.ndarray, "P C"], errors: Float[np.nd
         return picture
     bounds, target = bounds_of(picture), np.asarray(picture.target)
     code, half = bounds.codes(target)[0], 0.5 * np.median(bounds.widths)
-    open_end = np.isinf(bounds.lower) ^ np.isinf(bounds.upper)
+    open_end = bounds.ends == 1
     beyond = open_end & np.where(np.isinf(bounds.upper), shown >= bounds.scale, shown <= 0)
     errors = np.where(beyond, np.float32(0), errors)
     moved = decode(np.maximum(code - errors, 0.0) / bounds.scale, bounds.encoding) * bounds.unit

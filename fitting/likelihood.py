@@ -33,7 +33,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
 from brdf.images.encoding import Encoding, decode
 
@@ -119,7 +119,12 @@ class Bounds(eqx.Module):
     @property
     def widths(self) -> Float[np.ndarray, " K"]:
         """Distances of the ends, of values that have both."""
-        return (self.upper - self.lower)[np.isfinite(self.lower) & np.isfinite(self.upper)]
+        return (self.upper - self.lower)[self.ends == 2]
+
+    @property
+    def ends(self) -> UInt8[np.ndarray, "P C"]:
+        """How many ends of each value are known: none, one or both."""
+        return np.isfinite(self.lower).astype(np.uint8) + np.isfinite(self.upper)
 
     def in_light(self, size: float = 1.0) -> "Bounds":
         """The same ends in linear light.
@@ -160,7 +165,7 @@ def residual_deviation(bounds: Iterable[Bounds], codes: Iterable[Float[np.ndarra
     """
     squares, count = 0.0, 0
     for own, code in zip(bounds, codes, strict=True):
-        closed = np.isfinite(own.lower) & np.isfinite(own.upper)
+        closed = own.ends == 2
         middle = 0.5 * np.add(own.lower, own.upper, out=np.zeros(closed.shape), where=closed)
         left = np.where(closed, middle - code, 0.0) / own.spread
         squares, count = squares + float(np.sum(left**2)), count + int(np.count_nonzero(closed))

@@ -133,7 +133,7 @@ def _deviation(pictures: Sequence[Picture], at: Optimum) -> float:
 
 def _thinned(picture: Picture) -> Picture:
     """Every so many of the pixels that say something, which tell the noise as well."""
-    tell = np.flatnonzero(np.isfinite(bounds_of(picture).lower[:, 0]) | np.isfinite(bounds_of(picture).upper[:, 0]))
+    tell = np.flatnonzero(bounds_of(picture).ends[:, 0])
     return picture if tell.size <= 2 * SUBSAMPLE else picture.in_double(tell[:: tell.size // SUBSAMPLE])
 
 
@@ -204,7 +204,7 @@ def alike(
             between codes they lie.
     """
     code = np.rint(codes * ALIKE).astype(np.int64)
-    tells, weight = np.isfinite(bounds.lower) | np.isfinite(bounds.upper), np.ones(code.shape)
+    tells, weight = bounds.ends > 0, np.ones(code.shape)
     for channel, (one, some) in enumerate(zip(code.T, tells.T, strict=True)):
         kind, count = _kinds(one[some])
         many = (
@@ -292,7 +292,7 @@ def _reweighted(
     pictures, optimum, places = fit.pictures, fit.optimum, [_place(picture) for picture in fit.pictures]
     known = precision is not None
     with jax.enable_x64(True):
-        both = [(picture, np.flatnonzero(_half_open(bounds_of(picture)).any(axis=1))) for picture in pictures]
+        both = [(picture, np.flatnonzero(np.any(bounds_of(picture).ends == 1, axis=1))) for picture in pictures]
         stated = [_stated(*one, optimum, noise, rounding) for one in both]
         for trial in range(MOST_ROUNDS):
             working, before = [part.picture for part in stated], optimum
@@ -371,11 +371,6 @@ class _Stated:
     value: float
 
 
-def _half_open(bounds: Bounds) -> Bool[np.ndarray, "P C"]:
-    """Which values have one end."""
-    return np.isfinite(bounds.lower) ^ np.isfinite(bounds.upper)
-
-
 def _stated(picture: Picture, index: Int[np.ndarray, " K"], optimum: Optimum, noise: float, rounding: float) -> _Stated:
     """With the pixels that have a value with one end."""
     target, weight, *sums = _linearised(picture, np.asarray(optimum.n), optimum.x)
@@ -388,7 +383,7 @@ def _stated(picture: Picture, index: Int[np.ndarray, " K"], optimum: Optimum, no
         said = values.said(*_shown(_picture(values), optimum), s)
         told, radiance, slope = jax.tree.map(lambda part: part[: index.size], (said.told, said.radiance, said.slope))
         bounds = bounds_of(picture).pixels(partial(np.take, indices=index, axis=0))
-        at_end, own = _half_open(bounds), s * bounds.spread
+        at_end, own = bounds.ends == 1, s * bounds.spread
         weighs = np.broadcast_to(values.weight, said.radiance.shape)[: index.size]
         curvature = told.weight * slope**2
         step = np.divide(told.score * slope, curvature, out=np.zeros_like(curvature), where=curvature > 0)
@@ -537,7 +532,7 @@ def _widest(picture: Picture) -> float:
 
 def _open_ends_tell(picture: Picture, at: Optimum, noise: float) -> bool:
     """Whether some value is known by one end only and is predicted near it."""
-    half = _half_open(bounds_of(picture)).any(axis=1)
+    half = np.any(bounds_of(picture).ends == 1, axis=1)
     return bool(half.any()) and bool(np.any(_near(picture, at, END_REACH * noise)[half]))
 
 
