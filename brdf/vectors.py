@@ -131,7 +131,7 @@ def _components(v: Any) -> tuple[Array, ...]:
 # -- lengths and directions --------------------------------------------------------------------------------------------
 
 
-def dot(a: Directions, b: Directions) -> Scalars:
+def dot(a: Directions | Components, b: Directions | Components) -> Scalars:
     """Scalar product over the last axis."""
     (ax, ay, az), (bx, by, bz) = _components(a), _components(b)
     return ax * bx + ay * by + az * bz  # the order is fixed, unlike that of a reduction
@@ -264,18 +264,18 @@ def _from_tangent_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array
 
 # -- products that float32 does not round ------------------------------------------------------------------------------
 
-# Components are kept apart here: a compiler that sees (..., 3) arrays stacked again computes each of them three times.
-_Components = tuple[Array, ...]
-
 _GRID = 2048.0  # products of two leading parts are multiples of 2^-22, so sums of a few stay below 2^24 steps
 
 
 class _Split(NamedTuple):
-    """A vector as an exact sum of a leading part on a coarse grid and a rest; in float64 the leading part is all."""
+    """A vector as an exact sum of a leading part on a coarse grid and a rest; in float64 the leading part is all.
 
-    value: _Components
-    high: _Components
-    low: _Components | None
+    Components are kept apart: a compiler that sees (..., 3) arrays stacked again computes each of them three times.
+    """
+
+    value: Components
+    high: Components
+    low: Components | None
 
 
 def _split(*vectors: ArrayLike) -> list[_Split]:
@@ -284,42 +284,36 @@ def _split(*vectors: ArrayLike) -> list[_Split]:
     rough = any(isinstance(vector, Components) and vector.rough for vector in vectors)
     dtype = jnp.result_type(*(one for vector in given for one in vector), 1.0)
     for vector in given:
-        value = tuple(one.astype(dtype) for one in vector)
+        value = Components(tuple(one.astype(dtype) for one in vector))
         if dtype != jnp.float32 or rough:
             parts.append(_Split(value, value, None))
             continue
-        high = tuple(map(jnp.round, map(operator.mul, value, (_GRID,) * 3)))  # no derivative: the rest carries it
-        high = tuple(map(operator.mul, high, (1.0 / _GRID,) * 3))
-        parts.append(_Split(value, high, tuple(map(operator.sub, value, high))))
+        # no derivative: the rest carries it
+        high = Components(tuple(map(jnp.round, value * _GRID))) * (1.0 / _GRID)
+        parts.append(_Split(value, high, value - high))
     return parts
 
 
 def _dot(a: _Split, b: _Split) -> Array:
     """Scalar product of vectors whose components lie within +-2."""
-    (ax, ay, az), (bx, by, bz) = a.high, b.high
-    product = ax * bx + ay * by + az * bz
+    product = dot(a.high, b.high)
     if a.low is None or b.low is None:
         return product
-    (cx, cy, cz), (dx, dy, dz), (vx, vy, vz) = a.low, b.low, b.value
-    return product + ((ax * dx + ay * dy + az * dz) + (cx * vx + cy * vy + cz * vz))
+    return product + (dot(a.high, b.low) + dot(a.low, b.value))
 
 
 def _cross_squared(a: _Split, b: _Split) -> Array:
     """Squared length of the cross product of vectors whose components lie within +-2."""
-    (ax, ay, az), (bx, by, bz) = a.high, b.high
-    x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    product = cross(a.high, b.high)
     if a.low is not None and b.low is not None:
-        (cx, cy, cz), (dx, dy, dz), (vx, vy, vz) = a.low, b.low, b.value
-        x = x + ((ay * dz - az * dy) + (cy * vz - cz * vy))
-        y = y + ((az * dx - ax * dz) + (cz * vx - cx * vz))
-        z = z + ((ax * dy - ay * dx) + (cx * vy - cy * vx))
-    return x * x + y * y + z * z
+        product = product + (cross(a.high, b.low) + cross(a.low, b.value))
+    return dot(product, product)
 
 
 def _combined(operation: Any, a: _Split, b: _Split) -> _Split:
     """Sum or difference."""
-    low = None if a.low is None or b.low is None else tuple(map(operation, a.low, b.low))
-    return _Split(tuple(map(operation, a.value, b.value)), tuple(map(operation, a.high, b.high)), low)
+    low = None if a.low is None or b.low is None else operation(a.low, b.low)
+    return _Split(operation(a.value, b.value), operation(a.high, b.high), low)
 
 
 def _shortened(a: _Split, b: _Split, excess: Array) -> _Split:
@@ -328,6 +322,6 @@ def _shortened(a: _Split, b: _Split, excess: Array) -> _Split:
     With a and b sum and difference of two unit vectors, and the excess (|L|^2 - |V|^2) / 4 = (a . b) / 4, it is the sum
     or difference after giving L and V one length: rounding makes those differ by 1e-7.
     """
-    less = tuple(map(operator.mul, b.value, (excess,) * 3))
-    value = tuple(map(operator.sub, a.value, less))
-    return _Split(value, value, None) if a.low is None else _Split(value, a.high, tuple(map(operator.sub, a.low, less)))
+    less = b.value * excess
+    value = a.value - less
+    return _Split(value, value, None) if a.low is None else _Split(value, a.high, a.low - less)
