@@ -28,7 +28,7 @@ from brdf.checks import instance
 from brdf.precision import working_precision
 from fitting.joint_problem import JointProblem, joint_problem
 from fitting.progress import waiting
-from fitting.result import FitResult
+from fitting.result import FitResult, of_material_alone
 from fitting.solver.nnls import inverse_diagonal, scaled_inverse
 
 NEWTON_STEPS = 3
@@ -81,6 +81,7 @@ def sensitivity(result: FitResult, by: Callable[[list[brdf.Scene]], Sequence[Any
         (3,)
     """
     instance("result", result, FitResult, "Give what fitting.fit returns")
+    of_material_alone(result)
     if not callable(by):
         came = f"must be a function, got {by!r}"
         raise brdf.InputError("by", came, "Write lambda scenes: (scenes[0].lights[0].direction,)")

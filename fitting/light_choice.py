@@ -26,7 +26,7 @@ from brdf.lights.base import Light
 from brdf.models.base import SpecularMaterial
 from brdf.precision import working_precision
 from fitting.progress import waiting
-from fitting.result import FitResult
+from fitting.result import FitResult, of_material_alone
 from fitting.solver.nnls import inverse_diagonal
 from fitting.solver.tied import join_channels
 
@@ -138,6 +138,7 @@ def next_light(result: Any, candidates: Sequence[Any] | None = None, count: int 
     if not isinstance(result, FitResult):
         came = f"must be of fitting.fit or fit_maps, got {type(result).__name__}"
         raise InputError("result", came, "Fit the pictures first")
+    of_material_alone(result)
     wanted, active = _numbers(result, of)
     known = tuple(light for scene in result.scenes for light in scene.lights)
     scenes = [_scene(result, index) for index in range(len(result.scenes))]

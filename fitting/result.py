@@ -367,6 +367,14 @@ class FitResult(Parameters):
         return REPORTS["view"](self, picture)
 
 
+def of_material_alone(result: FitResult) -> None:
+    """Refuse the result of a fit that found numbers of the scenes too: their errors go together with the material's."""
+    others = [one.key for one in result.parameters if not hasattr(result.material, one.name)]
+    if others:
+        remedy = "Fit the material under the scenes that it found, with fitting.fit"
+        raise InputError("result", f"is not of a material alone: it tells {others[0]} too", remedy)
+
+
 def free_parameters(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
     """Those of a material's parameters that are determined and at no bound.
 

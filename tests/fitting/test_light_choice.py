@@ -62,7 +62,10 @@ def test_a_lamp_that_is_near_can_be_chosen_and_told(result):
 
 def test_what_cannot_be_answered_is_told(result):
     matt = fitting.fit(pictured(brdf.Lambert(k_d=[0.5] * 3), ball_scene(), NOISE), ball_scene(), model="lambert")
+    lit = fitting.fit_lights(result.targets[0], result.scenes[0], MATERIAL)
     for wrong, message in (
+        (lambda: fitting.next_light(lit, of="ambient"), r"material alone: it tells lights\[0\].intensity\[0\] too"),
+        (lambda: fitting.sensitivity(lit, lambda s: (s[0].ambient,)), "not of a material alone"),
         (lambda: fitting.next_light(matt), "has no number 'n'"),
         (lambda: fitting.next_light(result, []), "candidates: is empty"),
         (lambda: fitting.next_light(result, [[1, 2]]), "directions of 3 numbers"),
