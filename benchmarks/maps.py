@@ -333,9 +333,7 @@ def rti() -> None:
             test_codes, test_lights = codes[tried], lights[tried]
             codes, lights = codes[~tried], lights[~tried]
         normals = folder / "Dome" / "normals.png"
-        linear = decode(codes / np.float32(255), encoding)
-        linear[codes == 255] = np.nan
-        maps = fitting.fit_maps(linear, lights, normals if normals.is_file() else "fit")
+        maps = fitting.fit_maps(codes, lights, normals if normals.is_file() else "fit", encoding=encoding)
         ours = [encode(maps.render(light), encoding) * 255 for light in test_lights]
         row = [psnr(ours, test_codes)]
         for terms in (ptm, lambda v: hsh(v, 9), lambda v: hsh(v, 16), rbf(lights)):
@@ -351,15 +349,6 @@ def read_codes(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     names, lights = read_lights(folder / "dirs.lp")
     pictures = [np.round(255 * brdf.read_image(name, encoding="linear")).astype(np.uint8) for name in names]
     return np.stack(pictures), lights / np.linalg.norm(lights, axis=1)[:, None]
-
-
-def decode(values, encoding):
-    """To linear light."""
-    return (
-        values
-        if encoding == "linear"
-        else np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
-    )
 
 
 def encode(values, encoding):

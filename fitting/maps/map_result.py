@@ -51,6 +51,7 @@ class Maps:
         k_a_error: standard error.
         to_light: unit vectors towards the lights, where all are distant.
         noise: of a value, its standard deviation.
+        left_out: share of a texel's values that were left out as cast shadows or other outliers.
 
     Example:
         >>> maps = fitting.load_maps("maps")
@@ -79,6 +80,7 @@ class Maps:
     k_a_error: Float[np.ndarray, "H W C"] | None = None
     to_light: Float[np.ndarray, "P 3"] | None = None
     noise: Float[np.ndarray, "H W"] | None = None
+    left_out: Float[np.ndarray, "H W"] | None = None
 
     def layers(self) -> dict[str, np.ndarray]:
         """Every map by name."""
@@ -104,6 +106,9 @@ class Maps:
             lines.append(
                 f"  {name:<9} median {quartiles[1]:.4g}, half of it from {quartiles[0]:.4g} to {quartiles[2]:.4g}"
             )
+        if self.left_out is not None and np.any(self.left_out > 0):
+            left_out = 100 * np.mean(self.left_out[inside])
+            lines.append(f"  cast shadows and other outliers: {left_out:.1f} % of the values left out")
         return "\n".join([*lines, *(f"  note: {note}" for note in self.notes)])
 
     def render(self, light: Any) -> Float[np.ndarray, "H W C"]:

@@ -298,6 +298,7 @@ def _layers(
         "normal": jnp.where(inside, normal, 0),
         "normal_error": jnp.zeros_like(n) if tilt is None else jnp.degrees(noise * tilt),
         "noise": jnp.where(inside, noise, jnp.nan),
+        "left_out": channels * outliers / jnp.maximum(every, 1),
         "determined": known,
         "reason": reason,
         "residual": jnp.where(inside, jnp.sqrt(fit.cost / jnp.where(square > 0, square, 1)), jnp.nan),
