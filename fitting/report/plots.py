@@ -202,7 +202,7 @@ def _profile(axes, result):
         if percent.max() > 5 * max(percent.min(), 1e-9):
             axes.set_yscale("log")
             legible(axes.yaxis)
-    found = next(parameter for parameter in result.parameters if parameter.name == "n")
+    found = result["n"]
     if found.value is None:
         axes.set_title("profile of n: not determined")
         return

@@ -106,12 +106,7 @@ class Picture(eqx.Module):
 
     def predicted(self, n: AnyArray, x: Float[AnyArray, "3 C"]) -> Float[AnyArray, "P C"]:
         """What the model shows, in the dtype of the target; in NumPy where the picture is."""
-        if not self._all_on_host:
-            return _predicted(self, n, x)
-        x = np.asarray(x, self.target.dtype)
-        shown = x[0] * np.asarray(self.ambient, x.dtype) + x[1] * self.diffuse
-        shown = shown if self.lobe is None else shown + x[2] * self.lobe(cast(Any, n))[0]
-        return cast(Any, np.broadcast_to(shown, self.target.shape))
+        return (_predicted if self._all_on_host else _predicted_many)(self, n, x)
 
     def shown(self, n: float, x: Float[np.ndarray, "3 C"]) -> Float[np.ndarray, "P C"]:
         """What the model shows, on the host; of a few pixels by NumPy.
@@ -164,14 +159,16 @@ class Picture(eqx.Module):
         return self.weight if self.weight.ndim == 2 else self.weight[:, None]
 
 
-@eqx.filter_jit
-def _predicted(picture: Picture, n: AnyArray, x: Float[AnyArray, "3 C"]) -> Float[Array, "P C"]:
-    dtype = picture.target.dtype
-    x = jnp.asarray(x).astype(dtype)
-    model = x[0] * jnp.asarray(picture.ambient).astype(dtype) + x[1] * picture.diffuse
+def _predicted(picture: Picture, n: Any, x: Float[AnyArray, "3 C"]) -> Any:
+    xp: Any = np if isinstance(picture.diffuse, np.ndarray) else jnp
+    x_a, x_d, x_s = xp.asarray(x, picture.target.dtype)
+    shown = x_a * xp.asarray(picture.ambient, picture.target.dtype) + x_d * picture.diffuse
     if picture.lobe is not None:
-        model = model + x[2] * picture.lobe(jnp.asarray(n))[0]
-    return jnp.broadcast_to(model, picture.target.shape)
+        shown = shown + x_s * picture.lobe(n)[0]
+    return xp.broadcast_to(shown, picture.target.shape)
+
+
+_predicted_many = eqx.filter_jit(_predicted)
 
 
 @eqx.filter_jit
