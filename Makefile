@@ -31,12 +31,13 @@ check: $(VENV)/installed-tests
 docs: $(VENV)/installed-docs
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going -q -j 2 -b html -d out/docs-cache docs out/docs
 
-# The wheel, built and used where nothing else of the project is: in an empty environment, outside of this folder.
+# The wheel, built and used where nothing else of the project is: in an empty environment, outside of this folder. Three
+# programs need byte code of a small part of it.
 wheel: $(VENV)/installed
 	rm -rf out/wheel && mkdir -p out/wheel
 	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps -w out/wheel .
 	$(PYTHON) -m venv out/wheel/venv
-	out/wheel/venv/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt out/wheel/*.whl
+	out/wheel/venv/bin/python -m pip install --no-compile --quiet --disable-pip-version-check -c constraints.txt out/wheel/*.whl
 	cd out/wheel && venv/bin/brdf fit ../../$(EXAMPLE) --model blinn-phong --out fit && venv/bin/brdf render fit -o again.exr
 	cd out/wheel && venv/bin/python -c "import brdf, fitting; print(brdf.__version__, fitting.load_result('fit')['n'])"
 

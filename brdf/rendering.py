@@ -299,8 +299,9 @@ def _seen(scene: Scene, precision: Precision | None) -> tuple[Scene, SurfacePoin
     """
     samples = 1 if scene.camera is None else scene.camera.samples
     traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(scene))
-    now = jax.ensure_compile_time_eval() if samples > 1 and not traced else contextlib.nullcontext()
-    with now:
+    # Where nothing is being traced at all, that would make a program of every constant.
+    inside = samples > 1 and not traced and isinstance(jnp.zeros(()), Tracer)
+    with jax.ensure_compile_time_eval() if inside else contextlib.nullcontext():
         scene = cast(scene, precision)
         return scene, scene.surface_points()
 
