@@ -316,9 +316,18 @@ def _reweighted(
     working = [dataclasses.replace(part.picture, weight=part.picture.weights * scale) for part in stated]
     sums = {name: getattr(optimum, name) * scale for name in ("cost", "gram", "product", "square")}
     value = sum(part.value - part.closed * math.log(noise) - part.closed_squares * scale / 2 for part in stated)
+    value += sum(_of_codes(bounds_of(picture)) for picture in pictures)
     widening = np.ones(3 * fit.free.shape[1] + 1)
     optimum = dataclasses.replace(optimum, **sums)
     return Evidence(working, optimum, noise, value, places, widening)
+
+
+def _of_codes(bounds: Bounds) -> float:
+    """The logarithm of what makes a density at noise 1 the probability of codes, as `_near_edges` has it."""
+    both = bounds.ends == 2
+    width = np.where(bounds.exact, 1.0, bounds.upper - bounds.lower)[both]
+    spread = np.broadcast_to(bounds.spread, both.shape)[both]
+    return float(np.sum(np.log(width / (spread * math.sqrt(2 * math.pi)))))
 
 
 def _together(

@@ -149,3 +149,12 @@ def test_what_rounding_leaves_does_not_make_up_for_the_wrong_highlight(tmp_path:
     assert all(rival.excess > 1000 for rival in rivals)
     (chosen,) = (candidate for candidate in result.candidates if candidate.chosen)
     assert chosen.rms < chosen.held_out < 1.1 * chosen.rms
+
+
+def test_highlights_near_edges_and_beyond_are_compared_by_one_likelihood():
+    # With noise of half a code the wrong highlight leaves enough for least squares in codes, the right one does not.
+    for seed in (6, 11, 12, 21):
+        drawn = ball(seed, channels=3, size=48)
+        noisy = np.random.default_rng(seed).normal(255 * encode(drawn.drawn(), "srgb"), 0.5)
+        codes = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+        assert fitting.fit(codes, drawn.scene(), encoding="srgb").surface == drawn.model
