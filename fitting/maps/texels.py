@@ -219,38 +219,28 @@ def fit_unshadowed(
     Where values look like that the others are fitted without them, then all that is no outlier of that fit. This is
     kept where it explains the values better than a fit of all.
     """
-    seen = counted(root)
-    shown, diffuse = target.grey(root), divide(columns.linear[-1], root)[:, 0]
-    dark = shadows(shown, seen, diffuse)
-    column = over_channels(columns.linear[-1])[:, 0] / columns.linear[-1].shape[1]
-    square, whole = jnp.sum(dark * column**2, axis=0), jnp.sum(column**2, axis=0)
+    seen, column = counted(root), over_channels(columns.linear[-1])[:, 0] / root.shape[1]
+    diffuse = column if root.shape[1] == 1 else divide(columns.linear[-1], root)[:, 0]
+    dark = shadowed(target.grey(root), diffuse, column)
+    square, whole = (jnp.sum(one * one, axis=0) for one in (dark, column))
 
-    def more(state: Any) -> Array:
-        return (state[0] == 0) | ((state[0] < 3) & jnp.any(state[2]))
+    fit = fit_texels(model, target, columns, grey, finer)
+    cost, freedom = penalised(model, fit, seen, seen, grey)
+    # a k_d of their own, by its score: how far below the other one, in standard errors
+    score = jnp.sum(dark * fit.residual, axis=0)
+    variance = len(fit.k[0]) * divide(fit.cost, freedom) * square * (1 - divide(square, whole))
+    worth = (score < 0) & (score**2 > jnp.minimum(OUTLIER**2, 0.25 * freedom) * variance)
 
-    def fitted(state: Any) -> Any:
-        trial, counts, worth, best = state
+    def without(_: Any, state: Any) -> Any:
+        counts, best = state
         fit = fit_texels(model, target.where(counts), columns.where(counts), grey, finer)
-        found = fit, counts, *penalised(model, fit, seen, counts, grey)
-        better = (trial == 0) | (worth & (found[2] < best[2]))
-        best = jax.tree.map(lambda a, b: jnp.where(better, a, b), found, best)
+        found = fit, counts, penalised(model, fit, seen, counts, grey)[0]
+        best = jax.tree.map(lambda a, b: jnp.where(worth & (found[2] < best[2]), a, b), found, best)
+        return _inliers(residual(model, target, columns, fit), seen, counts), best
 
-        def first() -> tuple[Array, Array]:
-            # a k_d of their own, by its score: how far below the other one, in standard errors
-            score, freedom = jnp.sum(dark * column * fit.residual, axis=0), found[3]
-            variance = len(fit.k[0]) * divide(fit.cost, freedom) * square * (1 - divide(square, whole))
-            return seen - dark, (score < 0) & (score**2 > jnp.minimum(OUTLIER**2, 0.5 * freedom) * variance)
-
-        def second() -> tuple[Array, Array]:
-            return _inliers(residual(model, target, columns, fit), seen, counts), worth
-
-        return trial + 1, *jax.lax.cond(trial == 0, first, second), best
-
-    fit = jax.eval_shape(lambda: fit_texels(model, target, columns, grey, finer))
-    empty = jax.tree.map(lambda one: jnp.zeros(one.shape, one.dtype), fit)
-    start = 0, seen, target.cap > 0, (empty, seen, target.cap, target.cap)
-    *_, best = jax.lax.while_loop(more, fitted, start)
-    return best[0], best[1]
+    trials = jnp.where(jnp.any(worth), 2, 0)
+    _, (fit, counts, _) = jax.lax.fori_loop(0, trials, without, (jnp.where(dark > 0, 0, seen), (fit, seen, cost)))
+    return fit, counts
 
 
 def octave_gains(model: Any, target: Target, columns: Columns, grey: bool, finer: int) -> Float[Array, "G T"]:
@@ -397,7 +387,7 @@ def fit_with_normals(
         return fit, normal, counts, penalised(model, fit, seen, counts, grey)[0]
 
     def unshadowed(_: Any, start: tuple[Array, Array]) -> tuple[Array, Array]:
-        counts = seen - shadows(shown, seen, to_light @ start[0])
+        counts = seen - shadowed(shown, seen * jnp.maximum(to_light @ start[0], 0), seen)
         return lambert_normals(shown, counts, to_light), counts
 
     plain = lambert_normals(shown, seen, to_light), seen
@@ -433,27 +423,18 @@ def penalised(model: Any, fit: TexelFit, seen: Array, counts: Array, grey: bool)
     return cost, freedom
 
 
-def shadows(grey: Float[Array, "P T"], seen: Float[Array, "P T"], diffuse: Float[Array, "P T"]) -> Float[Array, "P T"]:
-    """1 where a value is less than half of what the middle one and Lambert's law tell.
+def shadowed(
+    grey: Float[Array, "P T"], diffuse: Float[Array, "P T"], column: Float[Array, "P T"]
+) -> Float[Array, "P T"]:
+    """A column where the value is less than half of what Lambert's law, fitted to all, tells; elsewhere 0.
 
     Args:
         grey: what the photographs show.
-        seen: 1 where it counts.
         diffuse: column of k_d.
+        column: the one.
     """
-    weight = jnp.where(diffuse > 0, seen * diffuse, 0)
-    half = 0.5 * jnp.sum(weight, axis=0)
-
-    def halved(_: Any, ends: tuple[Array, Array]) -> tuple[Array, Array]:
-        low, high = ends
-        middle = 0.5 * (low + high)
-        above = jnp.sum(jnp.where(grey > middle * diffuse, weight, 0), axis=0) > half
-        return jnp.where(above, middle, low), jnp.where(above, high, middle)
-
-    # the middle of what is positive is at most twice its mean
-    most = divide(jnp.sum(jnp.where(weight > 0, jnp.maximum(grey, 0), 0), axis=0), half)
-    middle, _ = jax.lax.fori_loop(0, 8, halved, (jnp.zeros_like(most), most))
-    return jnp.where((weight > 0) & (grey < 0.5 * middle * diffuse), seen, 0)
+    level = divide(jnp.sum(diffuse * grey, axis=0), jnp.sum(diffuse * diffuse, axis=0))
+    return jax.lax.map(lambda one: jnp.where(one[0] < 0.5 * level * one[1], one[2], 0), (grey, diffuse, column))
 
 
 def _inliers(
