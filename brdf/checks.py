@@ -18,7 +18,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from brdf.errors import InputError
+from brdf.errors import InputError, as_numbers, what_came
 
 # Any: a constructor takes numbers, lists and arrays, of which the checks make arrays.
 Parameter = Any
@@ -116,45 +116,22 @@ def checked(check: Callable[[str, Any], Any], name: str, **field: Any) -> Any:
     return eqx.field(converter=partial(check, name), **field)
 
 
-def as_numbers(name: str, value: Any, what: str = "numbers", remedy: str = "Give plain numbers") -> np.ndarray:
-    """What a person gives for numbers, float64 of any shape.
-
-    Args:
-        name: of the argument.
-        value: what came.
-        what: it must be.
-        remedy: what to do.
-
-    Raises:
-        InputError: where it is none.
-    """
-    try:
-        return np.asarray(value, np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise InputError(name, f"must be {what}, got {_shown(value)}", remedy) from None
-
-
 def _array(name: str, value: Any, shape_words: str, largest: float = LARGEST) -> Any:
     if isinstance(value, jax.Array):
         return value
     array = as_numbers(name, value, shape_words)
     if not np.all(np.isfinite(array)):
-        raise InputError(name, f"must be finite, got {_shown(value)}", "Give finite numbers")
+        raise InputError(name, f"must be finite, got {what_came(value)}", "Give finite numbers")
     if np.any(np.abs(array) > largest):
-        raise InputError(name, f"must be within ± {largest:g}, got {_shown(value)}", "Use another unit")
+        raise InputError(name, f"must be within ± {largest:g}, got {what_came(value)}", "Use another unit")
     return array
-
-
-def _shown(value: Any) -> str:
-    text = repr(value.tolist() if isinstance(value, np.ndarray) else value)
-    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def vector(name: str, value: Any, largest: float = LARGEST) -> Any:
     """A position or an edge: three finite numbers up to ``largest``."""
     array = _array(name, value, "three numbers", largest)
     if array.shape != (3,):
-        raise InputError(name, f"must be three numbers, got {_shown(value)}", "Give [x, y, z]")
+        raise InputError(name, f"must be three numbers, got {what_came(value)}", "Give [x, y, z]")
     return array
 
 
@@ -174,7 +151,7 @@ def edge_value(name: str, value: Any) -> Any:
     """An edge: three numbers, in a unit in which areas, their squares, and those times a distance stay in float32."""
     array = vector(name, value)
     if isinstance(array, np.ndarray) and not 1e-8 <= np.max(np.abs(array)) <= 1e8:
-        raise InputError(name, f"must be between 1e-08 and 1e+08 long, got {_shown(value)}", "Use another unit")
+        raise InputError(name, f"must be between 1e-08 and 1e+08 long, got {what_came(value)}", "Use another unit")
     return array
 
 
@@ -184,7 +161,7 @@ def number(
     """One number with ``low`` <= x <= ``high`` and ``above`` < x < ``below``."""
     array = _array(name, value, "a number")
     if array.shape != () or isinstance(value, bool):
-        raise InputError(name, f"must be one number, got {_shown(value)}", "Give a single number")
+        raise InputError(name, f"must be one number, got {what_came(value)}", "Give a single number")
     if isinstance(array, np.ndarray):
         limits = [
             (array < low, f"at least {low:g}"),
@@ -209,7 +186,7 @@ def spectrum(name: str, value: Any) -> Any:
     if array.ndim == 0:
         array = array.reshape(1)
     if array.ndim != 1 or array.shape[0] == 0:
-        raise InputError(name, f"must be a number per channel, got {_shown(value)}", "Give a list of numbers")
+        raise InputError(name, f"must be a number per channel, got {what_came(value)}", "Give a list of numbers")
     if isinstance(array, np.ndarray) and np.any(array < 0):
         channel = int(np.argmax(array < 0))
         came = f"must be at least 0, got {array[channel]:g} in channel {channel}"
@@ -221,7 +198,7 @@ def vertex_list(name: str, value: Any) -> Any:
     """Corners of a polygon: three points or more."""
     array = _array(name, value, "a list of points")
     if array.ndim != 2 or array.shape[0] < 3 or array.shape[1] != 3:
-        raise InputError(name, f"must be three points or more, got {_shown(value)}", "Give [[x, y, z], ...]")
+        raise InputError(name, f"must be three points or more, got {what_came(value)}", "Give [[x, y, z], ...]")
     return array
 
 

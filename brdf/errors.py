@@ -1,4 +1,6 @@
-"""The one error that bad input raises."""
+"""The one error that bad input raises, and numbers that have to be such. JAX is not needed to say so."""
+
+from typing import Any
 
 
 class InputError(ValueError):
@@ -35,3 +37,33 @@ class InputError(ValueError):
         """
         separator = "." if ": " in str(place) else ": "
         return InputError(f"{place}{separator}{self.where}", self.what, self.remedy)
+
+
+def as_numbers(name: str, value: Any, what: str = "numbers", remedy: str = "Give plain numbers") -> Any:
+    """What a person gives for numbers, a float64 array of any shape.
+
+    Args:
+        name: of the argument.
+        value: what came.
+        what: it must be.
+        remedy: what to do.
+
+    Raises:
+        InputError: where it is none.
+    """
+    import numpy as np
+
+    try:
+        return np.asarray(value, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(name, f"must be {what}, got {what_came(value)}", remedy) from None
+
+
+def what_came(value: Any) -> str:
+    """A value in so many letters as a line has room for.
+
+    Args:
+        value: any.
+    """
+    text = repr(value.tolist() if hasattr(value, "tolist") else value)
+    return text if len(text) <= 60 else text[:57] + "..."

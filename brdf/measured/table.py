@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from brdf.checks import as_numbers
-from brdf.errors import InputError
+from brdf.errors import InputError, as_numbers
 
 Vectors = Float[np.ndarray, "P 3"]
 Values = Float[np.ndarray, "P C"]

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 import brdf
-from brdf.checks import as_numbers, direction_value
-from brdf.errors import InputError
+from brdf.checks import direction_value
+from brdf.errors import InputError, as_numbers
 from brdf.precision import Precision, working_precision
 from fitting.maps import map_inputs
 from fitting.maps.encoding_guess import likelier

@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Float, Num
 
 import brdf
-from brdf.checks import as_numbers
-from brdf.errors import InputError
+from brdf.errors import InputError, as_numbers
 from brdf.files import parse_number, read_text
 from brdf.images.encoding import Encoding, decode, parse_encoding
 from fitting.photographs.archives import read_array
