@@ -9,11 +9,19 @@ import numpy as np
 import brdf
 from brdf.files import atomic_folder, write_text
 from brdf.images.writing import write_layers
+from brdf.models.base import SpecularMaterial
+from brdf.vectors import mirror_log_cosine
 from fitting.maps.texels import OCTAVES
 from fitting.report.page import asset
 
 if TYPE_CHECKING:
     from fitting.maps.map_result import Maps
+
+DIELECTRIC = 0.04
+"""Reflectance at normal incidence that glTF takes for granted; KHR_materials_specular multiplies it."""
+
+MOST_REFLECTANCE = 0.98
+"""The diffuse part is what facets let through: some has to be left."""
 
 
 def write_maps(maps: "Maps", folder: str | Path, *, plot: bool = False) -> None:
@@ -32,7 +40,10 @@ def write_maps(maps: "Maps", folder: str | Path, *, plot: bool = False) -> None:
     # some outliers must not darken the rest
     scale = {name: float(np.percentile(k, 99.9)) or 1.0 for name, k in (("k_d", k_d), ("k_s", k_s))}
     gloss = np.log2(np.maximum(maps.fitted_n, 1)) / OCTAVES
-    roughness = (2 / (maps.fitted_n + 2)) ** 0.25
+    half_n, f_0 = _as_facets(maps)
+    roughness = np.asarray(brdf.roughness_from_exponent(half_n))
+    strongest = float(np.percentile(f_0, 99.9)) or 1.0
+    base = k_d / (1 - np.max(f_0, axis=-1, keepdims=True))  # what glTF's mixing takes from the diffuse part
     inside = np.any(maps.normal != 0, axis=-1)
     normals = np.where(inside[..., None], 0.5 * maps.normal + 0.5, 0.5)
     images = {
@@ -40,8 +51,9 @@ def write_maps(maps: "Maps", folder: str | Path, *, plot: bool = False) -> None:
         "k_s": (k_s / scale["k_s"], "linear"),
         "normals": (normals, "linear"),
         "gloss": (gloss, "linear"),
-        "base_color": (k_d / max(1.0, scale["k_d"]), "srgb"),
-        "metallic_roughness": (np.stack([np.zeros_like(gloss), roughness, np.zeros_like(gloss)], axis=-1), "linear"),
+        "base_color": (base / max(1.0, scale["k_d"]), "srgb"),
+        "metallic_roughness": (np.stack([0 * gloss, roughness, 0 * gloss], axis=-1), "linear"),
+        "specular_color": (f_0 / strongest, "srgb"),
         "residual": (np.nan_to_num(maps.residual), "linear"),
     }
     height, width = maps.n.shape
@@ -66,8 +78,21 @@ def write_maps(maps: "Maps", folder: str | Path, *, plot: bool = False) -> None:
         if plot:
             draw_maps(maps).savefig(stage / "maps.png", dpi=110)
         write_text(stage / "maps.json", json.dumps(told, indent=2) + "\n")
-        write_text(stage / "material.gltf", asset("maps.gltf").replace("ASPECT", str(width / height)))
+        gltf = asset("maps.gltf").replace("ASPECT", str(width / height))
+        write_text(stage / "material.gltf", gltf.replace("SPECULAR", str(strongest / DIELECTRIC)))
         write_text(stage / "info.json", json.dumps(_openlime(width, height, scale), indent=2) + "\n")
+
+
+def _as_facets(maps: "Maps") -> tuple[np.ndarray, np.ndarray]:
+    """Half-vector exponents, and the reflectance at normal incidence with which facets shine as brightly."""
+    half_n, height = np.copy(maps.fitted_n), np.ones_like(maps.fitted_n)
+    for index, model in enumerate(brdf.MODELS[name] for name in maps.models):
+        if issubclass(model, SpecularMaterial):
+            own = maps.chosen == index
+            half_n[own] *= 4 if model.log_cosine is mirror_log_cosine else 1
+            height[own] = model.scale(maps.fitted_n[own])
+    # facets of slope alpha show F_0 / (4 alpha²) where the classic highlight shows k_s, and alpha² is 2 / (n+2)
+    return half_n, np.minimum(maps.fitted_k_s * (8 * height / (half_n + 2))[..., None], MOST_REFLECTANCE)
 
 
 def _openlime(width: int, height: int, scale: dict[str, float]) -> dict[str, Any]:

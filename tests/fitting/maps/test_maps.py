@@ -404,6 +404,24 @@ def test_a_folder_is_fitted_saved_and_loaded(folder, tmp_path):
     assert brdf.read_picture(tmp_path / "out" / "normals.png").bits == 16
 
 
+@pytest.mark.parametrize("model", ["phong", "blinn-phong"])
+def test_gltf_shows_the_highlights_of_maps(folder, tmp_path, model):
+    path, _ = folder
+    maps = fitting.fit_maps(path, model=model)
+    maps.save(tmp_path / "out")
+    (written,) = json.loads((tmp_path / "out" / "material.gltf").read_text())["materials"]
+    images = {
+        name: brdf.read_image(tmp_path / "out" / f"{name}.png") for name in ("specular_color", "metallic_roughness")
+    }
+    (factor, *_) = written["extensions"]["KHR_materials_specular"]["specularColorFactor"]
+    square = images["metallic_roughness"][..., 1:2] ** 4  # of the slope
+    n = maps.fitted_n[..., None] * (4 if model == "phong" else 1)
+    np.testing.assert_allclose(2 / square - 2, n, rtol=5e-3)
+    shown = 0.04 * factor * images["specular_color"] / (4 * square)  # appendix B.3 of the specification
+    common = maps.determined & (maps.fitted_k_s[..., 0] < np.percentile(maps.fitted_k_s, 90))
+    np.testing.assert_allclose(shown[common], maps.fitted_k_s[common], rtol=1e-2)
+
+
 def test_texels_that_show_less_than_nothing_are_black():
     pictures = -np.abs(np.random.default_rng(0).normal(size=(5, 2, 8, 1)))  # a dark frame was taken off
     maps = fitting.fit_maps(pictures, dome(5), np.broadcast_to(VIEW, (2, 8, 3)))
