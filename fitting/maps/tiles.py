@@ -167,8 +167,8 @@ def _program(
         model: Any, target: Target, root: Array, mask: Array, normal: Any, points: Any, shared: Any
     ) -> dict[str, Array]:
         tied = grey and issubclass(model, SpecularMaterial)
-        seen = counted(root)
         if normal is None:
+            seen = counted(root)
             fit, normal, tilt, lit, inliers = fit_with_normals(model, target, root, distant, tied, finer)
             left_out = [jnp.sum(a - b, axis=0) for a, b in ((seen, lit), (lit, inliers))]
             return _layers(model, fit, target.where(inliers), inliers, mask, tied, normal, tilt, left_out=left_out)
@@ -177,13 +177,13 @@ def _program(
         else:
             columns = _near_columns(model, points, stacks, occluders, distant.ambient)
             if distant.ambient is None:
-                seen *= columns.linear[0][:, 0] > 0
+                root *= columns.linear[0][:, :1] > 0
+                target = target.where(counted(root))
             linear = [column * root for column in columns.linear]
             columns = columns._replace(linear=linear, weight=columns.weight * root[:, None])
-            target = target.where(seen)
-        fit, inliers = fit_unshadowed(model, target, columns, root, tied, finer)
-        left_out = 0, jnp.sum(seen - inliers, axis=0)
-        target, columns, seen = target.where(inliers), columns.where(inliers), inliers
+        fit, seen = fit_unshadowed(model, target, columns, root, tied, finer)
+        left_out = 0, jnp.sum(counted(root) - seen, axis=0)
+        target, columns = target.where(seen), columns.where(seen)
         if seek == "gains":
             return {"gains": jnp.where(mask, octave_gains(model, target, columns, tied, finer), 0)}
         if shared is None:

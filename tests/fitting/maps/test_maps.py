@@ -267,6 +267,8 @@ def test_near_lights_and_cast_shadows_of_a_scene():
     pictures = [np.asarray(brdf.render(truth, scene)) for scene in scenes]
     maps = fitting.fit_maps(pictures, scenes)
     assert maps.determined.mean() > 0.5
+    assert maps.left_out is not None
+    assert not maps.left_out.any()  # what the scene knows to be in shadow is no value of the texel
     np.testing.assert_allclose(maps.n[maps.determined], 15, rtol=1e-2)
     np.testing.assert_allclose(
         maps.k_d[maps.determined], np.broadcast_to([0.4, 0.3, 0.2], (maps.determined.sum(), 3)), rtol=1e-3
