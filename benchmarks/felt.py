@@ -37,7 +37,7 @@ from brdf.images.encoding import encode
 from brdf.precision import Precision
 
 IMPORTS = "import jax, optimistix, OpenImageIO"
-COMMAND = "import sys; from fitting.cli.main import main; main(sys.argv[1:])"
+COMMAND = "from fitting.cli.main import run; run()"
 TARGETS = {
     "fit": ["fit", "data/gold-ball", "--out", "OUT"],
     "check": ["check", "OUT/material.json"],

@@ -27,7 +27,7 @@ SIZE, NOISE, SECONDS = 512, 0.01, 60.0
 SCENES = ("directional", "area", "environment")
 LABELS = {"directional": "one directional light", "area": "area light", "environment": "environment map"}
 ACCURACIES = (1e-1, 1e-2, 1e-3)
-COMMAND = "from fitting.cli.main import main; main()"
+COMMAND = "from fitting.cli.main import run; run()"
 SCENE = """
 [camera]
 type = "orthographic"

@@ -35,7 +35,7 @@ def command(*words: object, cwd: Path, prefix: str = "", **options) -> subproces
     """The command in a process of its own; the prefix runs before it."""
     # A shell that runs the tests in the background has them ignore Ctrl-C, and what they start.
     listen = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-    code = listen + prefix + "from fitting.cli.main import main; main()"
+    code = listen + prefix + "from fitting.cli import main; main.run()"
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(cwd / ".cache")}
     return subprocess.Popen(
         [sys.executable, "-c", code, *map(str, words)],

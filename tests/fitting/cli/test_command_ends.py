@@ -20,14 +20,14 @@ from fitting.cli.interrupts import interruptible
 from fitting.photographs.archives import read_archive
 from fitting.photographs.light_files import read_directions
 
-CHECK = "import sys; from fitting.cli.main import main; main(['check', 'emerald'])"
+COMMAND = "from fitting.cli.main import run; run()"
 
 
 def checked(**options) -> subprocess.CompletedProcess[str]:
     """``brdf check emerald`` in a process of its own."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), **options.pop("env", {})}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
-    words = [sys.executable, "-c", CHECK]
+    words = [sys.executable, "-c", COMMAND, "check", "emerald"]
     return subprocess.run(
         words, env=environment, stderr=subprocess.PIPE, text=True, timeout=120, check=False, **options
     )
