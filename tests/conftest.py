@@ -1,8 +1,10 @@
 """Compiled programs are kept in out/compiled for all processes and the next run; docs/conf.py names the same folder."""
 
+import atexit
 import gc
 import os
 
+import pytest
 from project_paths import ROOT
 
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / "out" / "compiled"))
@@ -13,3 +15,10 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 os.environ.setdefault("PYTHONWARNINGS", "ignore:Error reading persistent compilation cache entry")
 # Tracing makes many objects that live: to look for cycles as often as Python does is a fifth of what is not compiling.
 gc.set_threshold(200_000, 20, 100)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """A worker is not taken apart piece by piece at its end, which took several seconds of each."""
+    if hasattr(session.config, "workerinput"):
+        gc.freeze()
+        atexit.register(os._exit, 0)

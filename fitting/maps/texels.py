@@ -273,7 +273,7 @@ def octave_gains(model: Any, target: Target, columns: Columns, grey: bool, finer
     exponents = jnp.asarray(grid(finer), dtype)
     octaves, between = exponents[: -len(NARROW)].reshape(-1, finer), exponents[-len(NARROW) :]
     gains = jax.lax.scan(octave, [at(n) for n in octaves[0]], octaves)[1].reshape(-1, *target.cap.shape)
-    return jnp.concatenate([gains, jnp.stack([gain(at(n), model.scale(n)) for n in between])])
+    return jnp.concatenate([gains, jax.lax.map(lambda n: gain(at(n), model.scale(n)), between)])
 
 
 def grid(finer: int) -> np.ndarray:
