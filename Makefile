@@ -3,8 +3,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 EXAMPLE := data/gold-ball
-# The compiler is most of the tests' time, and takes a third of its own with these. What they leave out the documentation
-# and these tests run through: fits of what other programs and closed forms draw, sums, searches, the bundled example.
+# The compiler is most of the tests' time, and takes a third of its own with these. What they leave out these tests run
+# through: fits of what other programs and closed forms draw, sums, searches, the bundled example.
 LIGHTLY_COMPILED := --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 \
 	--xla_llvm_disable_expensive_passes=true --xla_cpu_parallel_codegen_split_count=1
 # The longest test stands first, or one core would wait for it.
@@ -28,6 +28,8 @@ check: $(VENV)/installed-tests
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
+# What its notebooks measure of speed is true as users compile; who wants no more than to see it built says LIGHTLY=yes.
+docs: export XLA_FLAGS := $(if $(LIGHTLY),$(LIGHTLY_COMPILED),$(XLA_FLAGS))
 docs: $(VENV)/installed-docs
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going -q -j 2 -b html -d out/docs-cache docs out/docs
 
