@@ -243,11 +243,14 @@ def _near_edges(fit: ModelFit, at: Estimate, *, copies: bool) -> Evidence:
         at = at._replace(noise=telling(known).noise)
         problem = _Separable(_gathered(pictures, at), design, fit.n_range, copies)
         at, known, said = maximise(problem, at, first=ROUGHLY_KNOWN)
+    scores = [(one.score, one.weight, _place(_picture(one.values))) for one in said.said]
+    steps = [(one.values.intervals.bounds.spread / one.slope).ravel() for one in said.said]
+    light = at.noise * float(np.median(np.concatenate(steps))) if any(map(np.size, steps)) else 0.0
     said, wider = where_most_is_told(problem, at, known, said, _of_planes(pictures, at, problem))
     working = list(map(_working, said.said))
     optimum = _optimum(working, fit, Numbers.of(at.unknowns))
     places = [_place(_picture(one.values)) for one in said.said]
-    return Evidence(working, optimum, at.noise, at.value, places, wider)
+    return Evidence(working, optimum, at.noise, at.value, places, wider, scores=scores, light=light)
 
 
 def _of_planes(pictures: Sequence[Picture], at: Estimate, problem: "_Separable") -> Float[np.ndarray, " U"] | float:

@@ -25,6 +25,9 @@ class Evidence(NamedTuple):
         together: normal equations of all channels at the optimum, where these err together; see
             `fitting.channel_errors`.
         precision: W there, (C, C).
+        scores: of each picture at the noise, of whose values few say something: by radiance, with their information and
+            the place of their pixels. The pictures are at the noise at which most is told.
+        light: the noise in light, of the middle one of these values.
     """
 
     pictures: Sequence[Picture]
@@ -35,6 +38,8 @@ class Evidence(NamedTuple):
     widening: Float[np.ndarray, " U"]
     together: NormalEquations | None = None
     precision: Float[np.ndarray, "C C"] | None = None
+    scores: Sequence[tuple[Float[np.ndarray, "P C"], Float[np.ndarray, "P C"], tuple[np.ndarray, int]]] = ()
+    light: float = np.inf
 
     @property
     def normal(self) -> NormalEquations:

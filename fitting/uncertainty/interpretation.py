@@ -35,6 +35,7 @@ from fitting.uncertainty.noise_model import weighted_sums
 from fitting.uncertainty.residual_correlation import ResidualCorrelation, residual_correlation
 from fitting.uncertainty.structure import (
     SIZES,
+    Blocks,
     Errors,
     Structure,
     errors_of,
@@ -45,8 +46,10 @@ from fitting.uncertainty.structure import (
     structure,
 )
 
-# With less noise than this, in codes, rounding hides more than errs together.
-ROUNDED = 0.25
+# With less noise than this, in codes, few values say something.
+ROUNDED = 0.5
+# So little of the brightest value is the arithmetic of the program that drew it, whose errors go together.
+ARITHMETIC = 2.0**-15
 # An interval of n wider than this factor says nothing but its order of magnitude.
 WIDEST_INTERVAL = 100.0
 
@@ -81,8 +84,7 @@ def interpret(
         shared, together = shared_errors(
             said, seen, alone_covariance(optimum, fit.tied) if said.together is None else None
         )
-        # What errs together by less than codes tell apart is in the errors, and no more need be said.
-        together = None if said.noise < ROUNDED else together
+        together = None if said.light < ARITHMETIC * np.max(seen.brightest) else together
         widening = said.widening
         if said.together is not None:
             joined = said.together.gram
@@ -166,9 +168,14 @@ def shared_errors(
         # The pixels of a block err together in any case.
         together = structure([over_blocks(of_blocks(_once(one, seen)), 2) for one in errors], (2, 4))
     else:
-        # With little noise few pixels of a block say much.
-        grids = [over_blocks(_once(one, seen), SIZES[0]) for one in errors]
-        together = structure(grids, even=said.noise >= ROUNDED)
+        # With little noise few values say much.
+        few, some = said.noise < ROUNDED, slice(1 if seen.copies else None)
+        grids = (
+            [_scores(*one) for one in said.scores]
+            if few and said.scores
+            else [over_blocks(one, SIZES[0]) for one in errors]
+        )
+        together = structure([grid.channels(some) for grid in grids], even=not few)
     if not (lossy or together.significant):
         return None, together
     return _scattered(said.pictures, said.optimum, errors, covariance), together
@@ -191,6 +198,15 @@ def _structure(
     for picture, width in zip(pictures, seen.widths, strict=True):
         found.append(left_over_blocks(picture, optimum, noise, width).channels(tell))
     return structure(found, even=even)
+
+
+def _scores(score: np.ndarray, information: np.ndarray, place: tuple[np.ndarray, int]) -> Blocks:
+    """Sums of scores, whose variance is no less than their information.
+
+    Each of many values may say that it is not beyond an edge, which one in a thousand would be.
+    """
+    found, told = (over_blocks(Errors(part, *place), SIZES[0]) for part in (score, np.sqrt(information)))
+    return found._replace(squares=np.maximum(found.squares, told.squares))
 
 
 def _once(errors: Errors, seen: Observed) -> Errors:

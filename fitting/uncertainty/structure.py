@@ -105,7 +105,7 @@ def structure(grids: Sequence[Blocks], sizes: Sequence[int] = SIZES, *, even: bo
             factor = size // sizes[0]
             joined, alone, pixels = (_coarser(part, factor) for part in (sums, squares, count))
             # In a block with few pixels the ratio says little.
-            seen = (pixels >= FULL * size**2) & (alone > 0)
+            seen = (pixels >= FULL * size**2 * even) & (alone > 0)
             ratio = joined[seen] ** 2 / alone[seen]
             total, blocks = total + float(np.sum(ratio)), blocks + int(np.count_nonzero(seen))
             together, apart = together + float(np.sum(joined[seen] ** 2)), apart + float(np.sum(alone[seen]))

@@ -96,6 +96,25 @@ def test_codes_of_srgb(tmp_path: Path):
     assert abs(cause.size - 2.0) < 0.1
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.05])
+def test_a_small_error_of_the_scene_is_seen_behind_rounding_and_rounding_is_none(noise: float):
+    codes = 255 * CLEAN / CLEAN.max() + np.random.default_rng(3).normal(0, noise, CLEAN.shape)
+    target = np.clip(np.rint(codes), 0, 255).astype(np.uint8)
+    assert not any("structure" in words for words in fitted(target).warnings)
+    result = fitted(target, with_light(0.15))
+    assert any("structure" in words for words in result.warnings)
+    assert result.diagnosis[0].name == "light"
+    assert abs(result.diagnosis[0].size - 0.15) < 0.05
+
+
+def test_what_errs_together_in_a_clipped_float_picture_is_told():
+    target = np.minimum(drawn(noise=0.002), 0.6)
+    assert not any("structure" in words for words in fitted(target).warnings)
+    result = fitted(target, with_light(1.0))
+    assert any("structure" in words for words in result.warnings)
+    assert result.diagnosis[0].name == "light"
+
+
 AREA = brdf.RectangleLight(center=[0, 2, 2], edge_u=[0.5, 0, 0], edge_v=[0, 0, 0.5], radiance=[3.0], samples=4)
 ODD = {
     "no light": dataclasses.replace(SCENE, lights=()),
