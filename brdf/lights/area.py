@@ -233,7 +233,7 @@ def triangulate(vertices: Any) -> tuple[tuple[int, int, int], ...]:
 
 
 class SphereLight(Light):
-    """A sphere of uniform radiance.
+    """A sphere of uniform radiance, which shines outward: what lies inside sees none of it.
 
     Args:
         center: (3,), world units.
@@ -268,7 +268,7 @@ class SphereLight(Light):
         offset = center - point.position
         distance = norm(offset)
         axis = normalize(offset)
-        squared_sine = jnp.minimum(divide(radius * radius, distance * distance), 1.0)
+        squared_sine = jnp.where(distance > radius, divide(radius * radius, distance * distance), 0.0)
         height = divide(squared_sine, 1.0 + square_root(1.0 - squared_sine))  # 1 - cos, without cancellation
         across, along = perpendicular(axis)
         outward = jnp.cos(2 * np.pi * t) * across + jnp.sin(2 * np.pi * t) * along

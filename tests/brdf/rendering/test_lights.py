@@ -104,6 +104,12 @@ def test_rectangles_and_polygons_shine_from_their_front_only():
     np.testing.assert_array_equal(radiance(brdf.PolygonLight(vertices=QUAD[::-1], radiance=1)), 0)
 
 
+@pytest.mark.parametrize("height", [-0.5, 0.0, 0.5])
+def test_a_sphere_shines_outward_only(height: float):
+    around = brdf.SphereLight(center=[0.1, 0, height], radius=1, radiance=1)
+    np.testing.assert_array_equal(radiance(around), 0)
+
+
 @pytest.mark.parametrize(("angle", "factor"), [(0.0, 1.0), (20.0, math.cos(math.radians(20)) ** 8), (31.0, 0.0)])
 def test_a_spot_falls_off_as_opengl_has_it(angle: float, factor: float):
     tilted = [math.sin(math.radians(angle)), 0, -math.cos(math.radians(angle))]
