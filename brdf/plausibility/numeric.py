@@ -23,7 +23,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from brdf.albedo import gauss_legendre
 from brdf.channels import in_channel
@@ -42,7 +42,7 @@ from brdf.plausibility.report import (
 )
 
 BRDF = Callable[[Any, Any], Any]
-Evaluate = Callable[[Float[np.ndarray, "m 3"]], Float[np.ndarray, "m C"]]
+Evaluate = Callable[[Int[np.ndarray, " m"], Float[np.ndarray, "m 3"]], Float[np.ndarray, "m C"]]
 
 FINEST = 2.0**-13
 """Size of the squares around an announced lobe, about 1e-4 rad: a lobe of n = 1e7 is 3e-4 wide."""
@@ -58,6 +58,7 @@ _POLAR = np.radians([*np.arange(0, 90, 2.5), 89.0, 89.9, *(90.0 - np.geomspace(1
 _BATCH = 2**12  # one size, so one compilation
 # Tolerance of the quadrature, and how many values it may take: for all directions, then where that does not decide.
 _COARSE, _FINE = (1e-5, 200_000), (1e-10, 3_000_000)
+_TOGETHER = 8  # lights whose albedos are refined together: fuller batches
 _NODES = 5
 _QUARTERS = np.array([(0, 0), (0, 1), (1, 0), (1, 1)])
 
@@ -279,7 +280,7 @@ def _energy(scan: _Scan) -> Finding:
     score = albedo - bound
     if np.all(score <= ENERGY_LIMIT):
         for row in np.flatnonzero(np.any(albedo + bound > ENERGY_LIMIT, axis=1)):
-            found[:, row] = _albedo(scan, lights[row], *_FINE)
+            found[:, [row]] = _albedos(scan, lights[[row]], *_FINE)
         score = albedo + bound
     row, channel = largest(score)
     value, light = float(albedo[row, channel]), Angles.of(lights[row])
@@ -291,76 +292,83 @@ def _energy(scan: _Scan) -> Finding:
 # -- albedo ------------------------------------------------------------------------------------------------------------
 
 
-def _albedos(scan: _Scan, lights: np.ndarray) -> np.ndarray:
-    """Albedos for lights (K, 3), and bounds on their errors, (2, K, C)."""
-    return np.stack([_albedo(scan, light, *_COARSE) for light in lights], axis=1)
+def _albedos(
+    scan: _Scan, lights: Float[np.ndarray, "K 3"], tolerance: float = _COARSE[0], budget: int = _COARSE[1]
+) -> Float[np.ndarray, "2 K C"]:
+    """Albedos for some lights, and bounds on their errors."""
+    groups = (lights[first : first + _TOGETHER] for first in range(0, len(lights), _TOGETHER))
+    return np.concatenate([_albedos_together(scan, some, tolerance, budget) for some in groups], axis=1)
 
 
-def _albedo(scan: _Scan, light: np.ndarray, tolerance: float, budget: int) -> np.ndarray:
-    """The albedo for one light, and a bound on its error, (2, C)."""
+def _albedos_together(scan: _Scan, lights: np.ndarray, tolerance: float, budget: int) -> np.ndarray:
     # A narrow lobe may sit where it is bright for other lights, too: about the same view or the same half vector.
     halves = _lifted(scan.bright.sum(axis=0))
-    same_half = _lifted(2 * (halves @ light)[:, None] * halves - light)
-    views = np.concatenate([same_half, scan.bright[1], _fibonacci(3500)])
-    brightest = views[np.argsort(scan.seen(light, views).max(axis=1))[-5:]]
-    centres = np.stack([*brightest, light * _MIRRORED, light])
-    value, bound = integrate(lambda views: scan.seen(light, views), centres, tolerance, budget)
+    same_half = _lifted(2 * (lights @ halves.T)[..., None] * halves - lights[:, None])
+    others = np.concatenate([scan.bright[1], _fibonacci(3500)])
+    views = np.concatenate([same_half, np.broadcast_to(others, (len(lights), *others.shape))], axis=1)
+    seen = scan.seen(np.repeat(lights, views.shape[1], axis=0), views.reshape(-1, 3))
+    brightest = np.argsort(seen.max(axis=1).reshape(len(lights), -1))[:, -5:]
+    peaks = np.stack([lights * _MIRRORED, lights], axis=1)
+    centres = np.concatenate([np.take_along_axis(views, brightest[..., None], axis=1), peaks], axis=1)
+    value, bound = integrate(lambda which, views: scan.seen(lights[which], views), centres, tolerance, budget)
     return np.stack([value, bound + 50 * scan.sample.epsilon * np.abs(value)])
 
 
 def integrate(
-    evaluate: Evaluate, centres: Float[np.ndarray, "p 3"], tolerance: float, budget: int
-) -> tuple[Float[np.ndarray, " C"], Float[np.ndarray, " C"]]:
-    """Integral of a function over the hemisphere about +z.
+    evaluate: Evaluate, centres: Float[np.ndarray, "K p 3"], tolerance: float, budget: int
+) -> tuple[Float[np.ndarray, "K C"], Float[np.ndarray, "K C"]]:
+    """Integrals of some functions over the hemisphere about +z.
 
     Args:
-        evaluate: called with directions, (m, 3); returns values, (m, C).
-        centres: directions (unit vectors) around which the function may have narrow lobes.
+        evaluate: called with which function, (m,), and directions, (m, 3); returns values, (m, C).
+        centres: of each function the directions (unit vectors) around which it may have narrow lobes.
         tolerance: the difference at which a square is refined no more.
-        budget: the number of function values after which refinement stops.
+        budget: the number of values of a function after which its refinement stops.
 
     Returns:
-        The integral, with a bound that also covers whatever the budget left unrefined.
+        The integrals, with bounds that also cover whatever the budget left unrefined.
     """
     size = 0.25
-    edges = np.arange(-1, 1, size)
-    corner = np.stack(np.meshgrid(edges, edges), axis=-1).reshape(-1, 2)
-    halved = _holds(centres, corner, size)
-    values = _rule(evaluate, corner, size, ~halved)
-    total = bound = 0.0 * values[0]
+    edges, count = np.arange(-1, 1, size), len(centres)
+    corner = np.tile(np.stack(np.meshgrid(edges, edges), axis=-1).reshape(-1, 2), (count, 1))
+    which = np.repeat(np.arange(count), len(corner) // count)
+    halved = _holds(centres[which], corner, size)
+    values = _rule(evaluate, which, corner, size, ~halved)
+    total, bound, left = np.zeros((count, values.shape[1])), np.zeros((count, values.shape[1])), np.full(count, budget)
     while len(corner):
         size *= 0.5
-        quarters = (corner[:, None] + size * _QUARTERS).reshape(-1, 2)
+        quarters, whose = (corner[:, None] + size * _QUARTERS).reshape(-1, 2), np.repeat(which, 4)
         # One that is halved whatever it holds is not integrated, and only in such a one lie others.
         inner = np.repeat(halved, 4)
-        inner[inner] = _holds(centres, quarters[inner], size)
-        parts = _rule(evaluate, quarters, size, ~inner)
-        budget -= int(np.count_nonzero(~inner)) * _NODES**2
+        inner[inner] = _holds(centres[whose[inner]], quarters[inner], size)
+        parts = _rule(evaluate, whose, quarters, size, ~inner)
+        left -= np.bincount(whose[~inner], minlength=count) * _NODES**2
         sums = parts.reshape(len(corner), 4, -1).sum(axis=1)
         differences = np.abs(sums - values)
-        refine = (np.max(differences, axis=1) > tolerance) | halved
-        refine &= budget >= 0
-        total, bound = total + sums[~refine].sum(axis=0), bound + differences[~refine].sum(axis=0)
+        refine = ((np.max(differences, axis=1) > tolerance) | halved) & (left >= 0)[which]
+        np.add.at(total, which[~refine], sums[~refine])
+        np.add.at(bound, which[~refine], differences[~refine])
         again = np.repeat(refine, 4)
-        corner, values, halved = quarters[again], parts[again], inner[again]
+        corner, which, values, halved = quarters[again], whose[again], parts[again], inner[again]
     return total, bound + 1e-15 * _NODES * np.abs(total)
 
 
 def _holds(centres: np.ndarray, corner: np.ndarray, size: float) -> np.ndarray:
-    """Whether squares that are not the finest hold one of the centres, or are beside one that does."""
+    """Whether squares that are not the finest hold one of their centres, (m, p, 3), or are beside one that does."""
     middle, _ = _from_square(*(corner.T + 0.5 * size))
     # the map stretches by 0.7 to 2
     return (np.min(np.linalg.norm(middle[:, None] - centres, axis=2), axis=1) < 2 * size) & (size > FINEST)
 
 
-def _rule(evaluate: Evaluate, corner: np.ndarray, size: float, some: np.ndarray) -> np.ndarray:
+def _rule(evaluate: Evaluate, which: np.ndarray, corner: np.ndarray, size: float, some: np.ndarray) -> np.ndarray:
     """Integrals over some squares, and 0 for the others, (m, C)."""
     nodes, weights = gauss_legendre(_NODES)
     corner = corner[some]
     u, v = corner[:, 0, None, None] + size * nodes[:, None], corner[:, 1, None, None] + size * nodes
     directions, solid_angle = _from_square(u, v)
     weight = size**2 * solid_angle * np.outer(weights, weights)
-    found = np.einsum("muv,muvc->mc", weight, evaluate(directions.reshape(-1, 3)).reshape(*weight.shape, -1))
+    values = evaluate(np.repeat(which[some], _NODES**2), directions.reshape(-1, 3))
+    found = np.einsum("muv,muvc->mc", weight, values.reshape(*weight.shape, -1))
     integrals = np.zeros((len(some), found.shape[1]))
     integrals[some] = found
     return integrals

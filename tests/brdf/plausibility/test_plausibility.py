@@ -139,15 +139,15 @@ def test_what_cannot_be_checked(brdf, message):
 @pytest.mark.parametrize("n", [0.0, 12.0, 1e4, 1e6])
 def test_quadrature_bounds_its_error(n):
     """Any mean of lobes anywhere, against the closed form of the integral of cos^n over its hemisphere."""
-    for axis in (direction(0, 0), direction(40, 70)) if n >= 1e4 else (direction(0, 0),):  # lobes that are whole
+    axes = np.stack([direction(0, 0), direction(40, 70)])[: 1 + (n >= 1e4)]  # lobes that are whole
 
-        def evaluate(directions, axis=axis):
-            cosine = directions @ axis
-            return np.where(cosine > 0, np.maximum(cosine, 1e-300) ** n, 0.0)[:, None]
+    def evaluate(which, directions):
+        cosine = np.sum(directions * axes[which], axis=1)
+        return np.where(cosine > 0, np.maximum(cosine, 1e-300) ** n, 0.0)[:, None]
 
-        value, bound = integrate(evaluate, axis[None], tolerance=1e-9 / (n + 1), budget=3_000_000)
-        np.testing.assert_allclose(value, 2 * np.pi / (n + 1), rtol=0, atol=float(bound[0]))
-        assert bound < 1e-5 / (n + 1)
+    value, bound = integrate(evaluate, axes[:, None], tolerance=1e-9 / (n + 1), budget=3_000_000)
+    np.testing.assert_allclose(value, 2 * np.pi / (n + 1), rtol=0, atol=float(np.max(bound)))
+    assert np.all(bound < 1e-5 / (n + 1))
 
 
 def test_limit_leaves_room_for_a_lossless_material():
