@@ -69,12 +69,18 @@ def _block(writer: Any, node: nodes.math_block) -> None:
     raise nodes.SkipNode
 
 
+def _spread(names: list[str]) -> None:
+    """Notebooks, which take the time, far from each other: what are neighbours one part of the build reads."""
+    names[:] = [name for first in range(4) for name in names[first::4]]
+
+
 def setup(app: Any) -> None:
     """Formulas as MathML, which browsers draw without a program; pages written from the code itself."""
     app.add_html_math_renderer("mathml", inline_renderers=(_inline, None), block_renderers=(_block, None))
     app.connect("autodoc-process-docstring", reference.tables)
     app.connect("autodoc-skip-member", reference.skip)
     app.connect("builder-inited", lambda app: reference.write(Path(app.srcdir)))
+    app.connect("env-before-read-docs", lambda app, env, names: _spread(names))
 
 
 html_math_renderer = "mathml"
