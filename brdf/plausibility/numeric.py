@@ -154,11 +154,13 @@ class Sampler:
         """Values, (m, C); where they are not finite that is remembered, and 0 stands for them."""
         pairs = np.stack(np.broadcast_arrays(to_light, to_view))
         count = pairs.shape[1]
-        values = np.empty((self.channels, count)).T  # channel by channel: what is compared are channels of many pairs
+        whole = np.pad(pairs, np.array([(0, 0), (0, -count % _BATCH), (0, 0)]), mode="edge")
+        batches = whole.reshape(2, -1, _BATCH, 3).swapaxes(0, 1)
+        values = np.empty((self.channels, whole.shape[1]))  # what is compared are channels of many pairs
         with jax.enable_x64(True):
-            for first in range(0, count, _BATCH):
-                rows = np.minimum(np.arange(first, first + _BATCH), count - 1)
-                values[first : first + _BATCH] = np.asarray(self._batch(*pairs[:, rows]))[: count - first]
+            for index, batch in enumerate(batches):
+                values[:, index * _BATCH : (index + 1) * _BATCH] = np.asarray(self._batch(*batch)).T
+        values = values[:, :count].T
         finite = np.isfinite(values).all(axis=1)
         if not finite.all():
             self.not_finite = pairs[:, np.argmin(finite)]
