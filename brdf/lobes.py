@@ -294,7 +294,9 @@ def _lagrange(xp: Any, nodes: Any, at: Any) -> Any:
     return xp.stack([xp.stack(weights), xp.stack(slopes)])
 
 
-class Lobe(eqx.Module):
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class Lobe:
     """The specular basis as a function of the exponent, which a fit evaluates again and again.
 
     The terms of few light samples, or of few pixels, are kept as arrays; those of many are made anew at each
@@ -314,7 +316,7 @@ class Lobe(eqx.Module):
     """
 
     peak: Float[Array, " P"]
-    model: type[Material] | None = eqx.field(static=True, default=None)
+    model: type[Material] | None = dataclasses.field(default=None, metadata={"static": True})
     kept: tuple[tuple[Float[Array, "P S C"], Float[Array, "P S"]], ...] = ()
     source: tuple[SurfacePoints, Lighting] | None = None
     fine: "Lobe | None" = None

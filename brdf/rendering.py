@@ -44,7 +44,9 @@ from brdf.scene import Scene
 FEW_PIXELS = 4096
 
 
-class Basis(eqx.Module):
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class Basis:
     """What the pixels show before any material: flat over the picture's pixels, row by row.
 
     Attributes:

@@ -18,12 +18,12 @@ multiply-adds). The leading part has no derivative, the rest has all of it, and 
 differentiation gives the derivative of the plain product. In float64 there is nothing to gain, and nothing is split.
 """
 
+import dataclasses
 import functools
 import operator
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -44,7 +44,9 @@ Scalars = Float[Array, "*batch"]
 # -- vectors in components -----------------------------------------------------------------------------------------
 
 
-class Components(eqx.Module):
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class Components:
     """A vector, or a spectrum, whose components are arrays of their own, which broadcast.
 
     A loop over thousands of points reads such components in one run each, and is some ten times as fast as one over
@@ -57,7 +59,7 @@ class Components(eqx.Module):
     """
 
     parts: tuple[Array, ...]
-    rough: bool = eqx.field(static=True, default=False)
+    rough: bool = dataclasses.field(default=False, metadata={"static": True})
     __array_ufunc__ = None  # an operation with an array of NumPy is ours too
 
     @classmethod

@@ -29,7 +29,6 @@ import math
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple, TypeAlias
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -81,7 +80,9 @@ def encoded_and_slope(light: AnyArray, encoding: Encoding, steps: Any) -> tuple[
     return curved + slope * xp.minimum(light - least, 0.0), slope
 
 
-class Bounds(eqx.Module):
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class Bounds:
     """Between which codes the values of a picture lay before rounding.
 
     Attributes:
@@ -104,9 +105,9 @@ class Bounds(eqx.Module):
     index: Int[np.ndarray, " P"]
     width: Int[np.ndarray, ""]
     spread: Float[np.ndarray, "*P"]
-    encoding: Encoding = eqx.field(static=True, default="linear")
-    lossy: bool = eqx.field(static=True, default=False)
-    exact: bool = eqx.field(static=True, default=False)
+    encoding: Encoding = dataclasses.field(default="linear", metadata={"static": True})
+    lossy: bool = dataclasses.field(default=False, metadata={"static": True})
+    exact: bool = dataclasses.field(default=False, metadata={"static": True})
 
     def codes(self, radiance: Float[AnyArray, "*shape"]) -> tuple[Any, Any]:
         """Predictions in codes before rounding, and their derivative by radiance; on the host where these are."""

@@ -10,13 +10,14 @@ is no larger for a thousand lights than for two.
 """
 
 import abc
+import dataclasses
 import functools
 import math
 import operator
 from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar, NamedTuple
 
-import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -87,7 +88,9 @@ class Light(Checked):
 FILLED = 4096
 
 
-class LightStack(eqx.Module):
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class LightStack:
     """The L lights of one kind, with S samples each.
 
     Attributes:
@@ -97,7 +100,7 @@ class LightStack(eqx.Module):
         light: which of the scene's lights each is, (L,).
     """
 
-    kind: type[Light] = eqx.field(static=True)
+    kind: type[Light] = dataclasses.field(metadata={"static": True})
     numbers: tuple[Array, ...]
     nodes: tuple[Array, ...]
     light: Int[Array, " L"]
@@ -129,7 +132,9 @@ class LightStack(eqx.Module):
         return (*numbers, *nodes), jnp.repeat(self.light, each)
 
 
-class Lighting(eqx.Module):
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class Lighting:
     """The lights, and the shapes that stand in their way.
 
     Attributes:

@@ -18,7 +18,7 @@ ambient one, would else seem to differ from it by the rounding of the sums.
 
 import operator
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple, cast
 
@@ -33,7 +33,9 @@ from fitting.likelihood import AnyArray, Bounds
 from fitting.solver.devices import device_count, gathered, own, placed
 
 
-class Picture(eqx.Module):
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class Picture:
     """One picture, or one tile of one: ``target ~ x_a * ambient + x_d * diffuse + x_s * lobe(n)``.
 
     Attributes:
@@ -50,7 +52,7 @@ class Picture(eqx.Module):
     diffuse: Float[Array, "P Cb"]
     lobe: Lobe | None = None
     weight: Float[Array, " P"] | Float[Array, "P C"] | None = None
-    ambient: Float[AnyArray, " Ca"] = eqx.field(default_factory=lambda: np.ones(1))
+    ambient: Float[AnyArray, " Ca"] = field(default_factory=lambda: np.ones(1))
     bounds: Bounds | None = None
 
     def pixels(self, choose: Callable[[Any], Any]) -> "Picture":

@@ -19,9 +19,9 @@ the same search under it is as global.
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -54,7 +54,8 @@ UNRESOLVED = 0.1
 GRID_ERROR = 0.02
 
 
-class Optimum(eqx.Module):
+@dataclass(frozen=True, eq=False)
+class Optimum:
     """The global optimum, and what error bars, reports and plots need.
 
     Columns of ``gram`` and ``product`` are ambient, diffuse, lobe, and the lobe's derivative by n (0 without a lobe).
