@@ -148,13 +148,23 @@ class Bounds:
             distance: from an end, where the noise is that of the picture.
         """
         inside = np.minimum(code - self.lower, self.upper - code)
-        return np.any(inside < distance * self.spread, axis=1)
+        return in_any_channel(inside < distance * self.spread)
+
+    @property
+    def half_open(self) -> Bool[np.ndarray, " P"]:
+        """Which pixels have a value of which one end is known."""
+        return in_any_channel(self.ends == 1)
 
     def pixels(self, choose: Callable[[Any], Any]) -> "Bounds":
         """Those of some pixels."""
         lower, upper, index = choose(self.lower), choose(self.upper), choose(self.index)
         spread = choose(self.spread) if self.spread.ndim else self.spread
         return dataclasses.replace(self, lower=lower, upper=upper, index=index, spread=spread)
+
+
+def in_any_channel(which: Bool[np.ndarray, "P C"]) -> Bool[np.ndarray, " P"]:
+    """Of which pixels some value is meant; a reduction over so short an axis would take fifteen times as long."""
+    return functools.reduce(np.logical_or, which.T)
 
 
 def residual_deviation(bounds: Iterable[Bounds], codes: Iterable[Float[np.ndarray, "P C"]]) -> float:

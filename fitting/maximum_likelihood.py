@@ -295,7 +295,7 @@ def _reweighted(
     pictures, optimum, places = fit.pictures, fit.optimum, [_place(picture) for picture in fit.pictures]
     known = precision is not None
     with jax.enable_x64(True):
-        both = [(picture, np.flatnonzero(np.any(bounds_of(picture).ends == 1, axis=1))) for picture in pictures]
+        both = [(picture, np.flatnonzero(bounds_of(picture).half_open)) for picture in pictures]
         stated = [_stated(*one, optimum, noise, rounding) for one in both]
         for trial in range(MOST_ROUNDS):
             working, before = [part.picture for part in stated], optimum
@@ -544,7 +544,7 @@ def _widest(picture: Picture) -> float:
 
 def _open_ends_tell(picture: Picture, at: Optimum, noise: float) -> bool:
     """Whether some value is known by one end only and is predicted near it."""
-    half = np.any(bounds_of(picture).ends == 1, axis=1)
+    half = bounds_of(picture).half_open
     return bool(half.any()) and bool(np.any(_near(picture, at, END_REACH * noise)[half]))
 
 

@@ -29,7 +29,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from brdf.lobes import Lobe
-from fitting.likelihood import AnyArray, Bounds
+from fitting.likelihood import AnyArray, Bounds, in_any_channel
 from fitting.solver.devices import device_count, gathered, own, placed
 
 
@@ -143,7 +143,7 @@ class Picture:
         if self.weight is None:
             return np.ones(self.target.shape[0], bool)
         above = np.asarray(self.weight) > 0
-        return above if above.ndim == 1 else np.any(above, axis=1)
+        return above if above.ndim == 1 else in_any_channel(above)
 
     @property
     def nearest_peak(self) -> float:
