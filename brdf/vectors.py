@@ -21,7 +21,7 @@ differentiation gives the derivative of the plain product. In float64 there is n
 import dataclasses
 import functools
 import operator
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -42,6 +42,15 @@ Scalars = Float[Array, "*batch"]
 
 
 # -- vectors in components -----------------------------------------------------------------------------------------
+
+
+def _componentwise(operation: Callable[[Any, Any], Any]) -> Callable[["Components", Any], "Components"]:
+    def applied(one: "Components", other: Any) -> "Components":
+        parts, others = one.parts, other.parts if isinstance(other, Components) else (other,)
+        count = max(len(parts), len(others))
+        return Components(tuple(map(operation, parts * (count // len(parts)), others * (count // len(others)))))
+
+    return applied
 
 
 @jax.tree_util.register_dataclass
@@ -75,29 +84,14 @@ class Components:
         """Component after component."""
         return iter(self.parts)
 
-    def _with(self, operation: Any, other: Any) -> "Components":
-        others = other.parts if isinstance(other, Components) else (other,)
-        count = max(len(self.parts), len(others))
-        pairs = (parts * (count // len(parts)) for parts in (self.parts, others))
-        return Components(tuple(map(operation, *pairs)))
-
-    def __add__(self, other: Any) -> "Components":
-        """Of a vector; one of a single component counts for each."""
-        return self._with(operator.add, other)
-
-    def __sub__(self, other: Any) -> "Components":
-        """Likewise."""
-        return self._with(operator.sub, other)
+    # Of vectors, or of one and a number; a vector of a single component counts for each.
+    __add__ = __radd__ = _componentwise(operator.add)
+    __sub__ = _componentwise(operator.sub)
+    __mul__ = __rmul__ = _componentwise(operator.mul)
 
     def __rsub__(self, other: Any) -> "Components":
-        """Likewise."""
+        """The opposite of the difference."""
         return -self + other
-
-    def __mul__(self, other: Any) -> "Components":
-        """By a number or component by component."""
-        return self._with(operator.mul, other)
-
-    __radd__, __rmul__ = __add__, __mul__
 
     def __neg__(self) -> "Components":
         """The opposite."""
