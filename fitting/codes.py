@@ -91,11 +91,11 @@ class Codes(NamedTuple):
             inside = valid & ~_mixed(~valid.reshape(-1, self.values.shape[1]), BLOCK if channels == 1 else 2 * BLOCK)
             # Or the picture is too small to do without.
             valid = inside if 2 * np.count_nonzero(inside) >= np.count_nonzero(valid) else valid
-        code, good, top = flat(self.values), valid[:, None], np.full(channels, self.ends[1])
+        code, good = flat(self.values), valid[:, None]
+        top = np.full(channels, self.ends[1], code.dtype)
         if level is not None and np.isfinite(level):
-            top = np.minimum(
-                top, np.rint(self.scale * encode(level / np.asarray(self.unit, np.float64), self.encoding))
-            )
+            clipped = np.rint(self.scale * encode(level / np.asarray(self.unit, np.float64), self.encoding))
+            top = np.minimum(top, clipped.astype(code.dtype))
         lower = np.where(good & (code > self.ends[0]), np.minimum(code, top) - flat(self.below), -np.inf)
         upper = np.where(good & (code < top), code + flat(self.above), np.inf)
         coded = {"scale": self.scale, "unit": self.unit, "encoding": self.encoding, "lossy": self.lossy}

@@ -3,7 +3,7 @@
 For a given noise s the logarithm of the likelihood of rounded values (`fitting.likelihood`) is concave in the numbers,
 or nearly so, and Newton's step needs of each value its score and weight. With less noise fewer values say something,
 those that are predicted near the edge of a code, and the reach of Newton's method shrinks. So s starts at what least
-squares leaves, and follows its own score from there, by a factor of two at most, each time from the last answer.
+squares leaves, and follows its own score from there, by steps of some factor at most, each time from the last answer.
 """
 
 import math
@@ -24,7 +24,7 @@ LEAST_NOISE = 1e-4
 # than the second on the way is taken in.
 REACH, NEARER = 7.0, 5.0
 # Newton's steps at one s; a step that gains less ends them, at the last s and on the way there.
-MOST_STEPS, LEAST_GAIN, ROUGH_GAIN = 12, 1e-3, 0.1
+MOST_STEPS, LEAST_GAIN, ROUGH_GAIN = 12, 1e-3, 1.0
 # The largest change of the logarithm of an exponent in one step.
 LARGEST_SHIFT = 0.5
 # Steps of so many of the errors that were known with more noise cost something.
@@ -34,6 +34,8 @@ ENOUGH_KNOWN, MOST_NOISES = 1.02, 60
 MOST_TELLING = 10.0
 # So many values have to tell of a number before the Hessian is taken for its error.
 FEWEST_VALUES = 6.0
+# Steps of the noise are no larger than this factor; where at least so many values tell of each number, than that.
+STEP, MANY_VALUES, LONG_STEP = 2.0, 50.0, 4.0
 # Where the Hessian is no larger all values are surely inside their codes.
 NOTHING = 1e-100
 
@@ -242,7 +244,7 @@ class Precision(NamedTuple):
 
 
 def maximise(
-    problem: Problem, start: Estimate, enough: float = ENOUGH_KNOWN, first: float = 2.0
+    problem: Problem, start: Estimate, enough: float = ENOUGH_KNOWN, least: float = 0.0
 ) -> tuple[Estimate, list[Precision], Score]:
     """The most likely unknowns and noise, what was known of the unknowns with more noise, and what the values say.
 
@@ -250,18 +252,22 @@ def maximise(
         problem: values and their model.
         start: from which to go; its noise is not much too small.
         enough: the noise is known well enough where its step is no larger than this factor.
-        first: the first step is no larger than this factor; later ones no larger than 2.
+        least: noise of which fewer values than this tell of a number is not gone below.
     """
-    at, known, before, low, high, largest = start, [], None, -math.inf, math.inf, math.log(first)
+    at, known, before, low, high = start, [], None, -math.inf, math.inf
     for _ in range(MOST_NOISES):
         at, values, said = _climb(problem, at, ROUGH_GAIN, known, *_scored(problem, at))
         known.append(precision(problem, at, said))
+        fewest = float(np.min(known[-1].values, where=known[0].variance > 0, initial=math.inf))
+        if fewest < least:
+            break
+        largest = math.log(LONG_STEP if fewest > MANY_VALUES else STEP)
         now, score = math.log(at.noise), said.by_log_noise
         low, high = (max(low, now), high) if score > 0 else (low, min(high, now))
         # By the last two scores, of which one takes the place of the other; at first by what is known of the noise.
         slope = -said.noise_information if before is None else (score - before[1]) / (now - before[0])
         step, before = -score / slope if slope < 0 else math.copysign(math.inf, score), (now, score)
-        step, largest = min(max(step, -largest, math.log(LEAST_NOISE) - now), largest), math.log(2)
+        step = min(max(step, -largest, math.log(LEAST_NOISE) - now), largest)
         if not low <= now + step <= high:
             step = 0.5 * (low + high) - now
         if abs(step) < math.log(enough):

@@ -372,11 +372,15 @@ class Intervals:
         ratios = self._kinds / s
         # Of two ends so far apart one tells.
         tables = list(map(_table, np.where(ratios < 2 * _INSIDE, ratios, np.inf).tolist()))
-        first, step = (np.array([getattr(one, name) for one in tables])[self._kind] for name in ("first", "step"))
-        position = np.clip((beyond - first) / step, 0.0, _KNOTS - 1.000001)
+        firsts, steps = (np.array([getattr(one, name) for one in tables]) for name in ("first", "step"))
+        # The others are sure.
+        some = np.flatnonzero(self._tells & (beyond >= firsts[self._kind]))
+        beyond, kind = beyond.ravel()[some], self._kind.ravel()[some]
+        step = steps[kind]
+        position = np.minimum((beyond - firsts[kind]) / step, _KNOTS - 1.000001)
         index = position.astype(np.intp)
         share = position - index
-        index += _KNOTS * self._kind
+        index += _KNOTS * kind
         values, scores, weights = np.concatenate([one.values for one in tables], axis=1)
         weight = weights[index]
         after = weights[index + 1]
@@ -390,10 +394,10 @@ class Intervals:
             value[tail] = -0.5 * square - np.log(x) - _LOG_ROOT_TWO_PI + np.log1p((3 / square - 1) / square)
             score[tail] = -(x + (1 - 2 / square) / x)
             weight[tail] = 1 - (1 - 6 / square) / square
-        nothing = ~self._tells | (beyond < first)
-        for part in (value, score, weight):
-            part[nothing] = 0.0
-        return LogLikelihood(value, np.where(up, score, -score) / s, weight / s**2)
+        score = np.where(up.ravel()[some], score, -score) / s
+        found = np.zeros((3, *predicted.shape))
+        found.reshape(3, -1)[:, some] = value, score, weight / s**2
+        return LogLikelihood(found[0], found[1], found[2])
 
 
 def _hermite(low: Any, high: Any, start: Any, end: Any, share: Any) -> np.ndarray:

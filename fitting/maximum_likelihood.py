@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from fitting.channel_errors import can_be_coupled, coupled, each_alone, improved, precision_of, replaced, residuals
 from fitting.continuation import (
-    ENOUGH_KNOWN,
+    FEWEST_VALUES,
     REACH,
     Estimate,
     Problem,
@@ -133,7 +133,8 @@ def _deviation(pictures: Sequence[Picture], at: Optimum) -> float:
 
 def _thinned(picture: Picture) -> Picture:
     """Every so many of the pixels that say something, which tell the noise as well."""
-    tell = np.flatnonzero(bounds_of(picture).ends[:, 0])
+    bounds = bounds_of(picture)
+    tell = np.flatnonzero(np.isfinite(bounds.lower[:, 0]) | np.isfinite(bounds.upper[:, 0]))
     return picture if tell.size <= 2 * SUBSAMPLE else picture.in_double(tell[:: tell.size // SUBSAMPLE])
 
 
@@ -235,14 +236,14 @@ def _near_edges(fit: ModelFit, at: Estimate, *, copies: bool) -> Evidence:
     large = sum(picture.target.shape[0] for picture in pictures) > 2 * SUBSAMPLE
     some = [_stratum(picture, SUBSAMPLE // len(pictures)) for picture in pictures] if large else _gathered(pictures, at)
     problem = _Separable(some, design, fit.n_range, copies)
-    at, known, said = maximise(problem, at, ROUGHLY_KNOWN if large else ENOUGH_KNOWN)
+    at, known, said = maximise(problem, at, ROUGHLY_KNOWN, FEWEST_VALUES) if large else maximise(problem, at)
     if (even := _evener_in_light(problem, at)) is not None:
         return _near_edges(fit._replace(pictures=_in_light(pictures)), even, copies=copies)
     if large:
         # The whole picture has the pixels near an edge that a part of it lacks.
         at = at._replace(noise=telling(known).noise)
         problem = _Separable(_gathered(pictures, at), design, fit.n_range, copies)
-        at, known, said = maximise(problem, at, first=ROUGHLY_KNOWN)
+        at, known, said = maximise(problem, at)
     scores = [(one.score, one.weight, _place(_picture(one.values))) for one in said.said]
     steps = [(one.values.intervals.bounds.spread / one.slope).ravel() for one in said.said]
     light = at.noise * float(np.median(np.concatenate(steps))) if any(map(np.size, steps)) else 0.0

@@ -139,14 +139,20 @@ def over_blocks(errors: Errors, size: int) -> Blocks:
         errors: of one picture.
         size: of a block, pixels on a side.
     """
-    rows = int(np.max(errors.pixel, initial=0)) // errors.width + 1
-    values = errors.values
-    if errors.pixel.size == rows * errors.width:
-        image = values.reshape(rows, errors.width, -1)
-    else:  # of a picture whose roundings leave nothing open it has no pixel
-        image = np.zeros((rows, errors.width, values.shape[1]), values.dtype)
-        image[np.divmod(errors.pixel, errors.width)] = values
-    return Blocks(*(_coarser(part, size) for part in (image, image**2, image != 0)))
+    values, width = errors.values, errors.width
+    rows = int(np.max(errors.pixel, initial=0)) // width + 1
+    if errors.pixel.size == rows * width:
+        image = values.reshape(rows, width, -1)
+        return Blocks(*(_coarser(part, size) for part in (image, image**2, image != 0)))
+    # Of a picture whose roundings leave nothing open it has no pixel, and few where little is open.
+    shape = -(-rows // size), -(-width // size)
+    block = errors.pixel // width // size * shape[1] + errors.pixel % width // size
+    return Blocks(
+        *(
+            np.stack([np.bincount(block, one, math.prod(shape)).reshape(shape) for one in part.T], axis=-1)
+            for part in (values, values**2, values != 0)
+        )
+    )
 
 
 def left_over_blocks(picture: Picture, optimum: Optimum, noise: Float[np.ndarray, " C"], width: int) -> Blocks:
