@@ -39,7 +39,7 @@ from fitting.problem import CLASSIC, FitProblem, model_name, state_problem
 from fitting.progress import waiting
 from fitting.report import FitResult
 from fitting.result import Parameter
-from fitting.solver.nnls import inverse_diagonal, scaled_inverse
+from fitting.solver.nnls import scaled_inverse
 from fitting.uncertainty.intervals import NORMAL_95, above_zero
 from fitting.uncertainty.noise_model import value_variance
 from fitting.uncertainty.residual_correlation import correlation_in_rows, structure_warning
@@ -54,8 +54,6 @@ OPEN = "only a combination with other freed numbers is determined"
 STALLED = 16
 # A minimum is met where no more than this part of their errors parts the numbers from it.
 MET = 0.1
-# Of the largest eigenvalue of the normal equations: a smaller one determines nothing.
-DEPENDENT = 1e-12
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -342,14 +340,7 @@ def _with_errors(
     Of a direction the length is no unknown: its errors are those of two small turns across it.
     """
     vector, design = known.vector, np.where(held[:, None], 0.0, problem.design(known.vector))
-    hessian = design.T @ known.hessian @ design
-    covariance, variance = scaled_inverse(hessian, DEPENDENT), inverse_diagonal(hessian, DEPENDENT)
-    if known.scatter is not None:
-        covariance = covariance @ design.T @ known.scatter @ design @ covariance
-        variance = np.where(np.isfinite(variance), np.diag(covariance), variance)
-    # A turn is as much wider as the part of the direction of which least is known.
-    wider = np.max(np.where(design != 0, known.widening[:, None], 0.0), axis=0)
-    deviation = np.sqrt(variance) * np.where(wider > 0, wider, 1.0)
+    covariance, deviation = known.errors(design)
     parameters, errors, at, end = [], [], [], 0
     for leaf in problem.freed:
         first, end = end, end + (2 if leaf.name in DIRECTIONS else leaf.size)

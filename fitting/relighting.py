@@ -5,23 +5,29 @@ each channel. With the material unknown too the picture is linear in the product
 and with k_s. Those products say everything but one thing: lights twice as bright on a surface half as bright look the
 same. That factor, one for each channel, no picture can determine; here the mean of the lights' intensities keeps the
 value it has in the scene, and the result says so.
+
+Least squares is the whole answer for floats; of rounded values it is the start: `fitting.joint_likelihood`.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 import brdf
 from brdf.checks import instance
 from brdf.errors import InputError
 from brdf.models.base import SpecularMaterial
 from brdf.precision import Precision, working_precision
+from fitting.continuation import Values
 from fitting.joint import fit_jointly, left_over
+from fitting.joint_likelihood import RoundedPictures, rounded
+from fitting.likelihood import Bounds, in_any_channel
 from fitting.pixels import Observed, observe
 from fitting.problem import model_name, state_problem
 from fitting.report import FitResult
@@ -97,9 +103,12 @@ def fit_lights(
     seen = _observed(target, scene, mask, precision)
     instance("material", material, brdf.Material, "Write fitting.fit_lights(target, scene, material)")
     pixels, place = seen.shown[0][seen.counted[0]].astype(np.float64), seen.counted[0]
-    images = np.asarray(brdf.render_lights(material, scene, precision=precision), np.float64)[:, place]
-    columns = np.broadcast_to(images, (*images.shape[:2], pixels.shape[1]))
+    images = np.asarray(brdf.render_lights(material, scene, precision=precision), np.float64)
+    images = np.broadcast_to(images, (*images.shape[:3], pixels.shape[1])).reshape(len(images), -1, pixels.shape[1])
+    columns = images[:, place.ravel()]
     factors, errors = _intensities(columns, pixels)
+    if (bounds := rounded(seen)) is not None:
+        factors, errors = _of_codes(bounds[0], images, factors, np.isfinite(errors))
     before = _emittances(scene, pixels.shape[1])
     emittances = before * factors
     fields = ("radiance" if "radiance" in vars(light) else "intensity" for light in scene.lights)
@@ -111,7 +120,7 @@ def fit_lights(
         for channel, numbers in enumerate(zip(*rows, strict=True))
     ]
     residual = np.zeros((*place.shape, pixels.shape[1]))
-    residual[place] = pixels - np.einsum("lc,lpc->pc", factors, columns)
+    residual[place] = pixels - _sum(factors, columns)
     return LightFit(
         **left_over(seen, [_with_emittances(scene, emittances)], [residual], factors.size, ()),
         material=material,
@@ -207,13 +216,46 @@ def _intensities(columns: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, n
     grams = np.einsum("lpc,mpc->clm", columns, columns, optimize=True)
     for c, gram in enumerate(grams):
         factors[:, c] = nonnegative_minimum(gram, columns[..., c] @ pixels[:, c])
-    value = np.einsum("lc,lpc->pc", factors, columns)
+    value = _sum(factors, columns)
     squares = np.maximum(np.sum((pixels - value) ** 2, axis=0), np.finfo(float).tiny)
     variance = value_variance(pixels - value, value, np.sqrt(squares / max(count - lights, 1)))
     for c, gram in enumerate(grams):
         moves = scaled_inverse(gram) @ columns[..., c]
         errors[:, c] = np.sqrt(np.where(np.isfinite(inverse_diagonal(gram)), moves**2 @ variance[:, c], np.inf))
     return factors, errors
+
+
+def _of_codes(bounds: Bounds, images: np.ndarray, factors: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Factors and errors by what rounded values say, from those of least squares; the images are (L, P, C)."""
+    tell = np.flatnonzero(in_any_channel(bounds.ends > 0))
+    picture = _LitPicture(bounds.pixels(partial(np.take, indices=tell, axis=0)), images[:, tell], known)
+    likely, errors = picture.most_likely(factors.ravel()), np.full(known.shape, np.inf)
+    errors[known] = likely.errors(picture.design)[1]
+    return likely.vector.reshape(known.shape), errors
+
+
+class _LitPicture(RoundedPictures):
+    """A rounded picture that is linear in its lights, channel by channel."""
+
+    def __init__(self, bounds: Bounds, columns: Float[np.ndarray, "L P C"], known: Bool[np.ndarray, "L C"]):
+        """Take the picture of each light, and which of their factors are determined."""
+        self._columns, none = columns, np.zeros(known.size, bool)
+        places = np.arange(known.size).reshape(known.shape).T
+        super().__init__([bounds], np.eye(known.size)[:, known.ravel()], places, bounded=~none, exponents=none)
+
+    def codes(self, unknowns: Float[np.ndarray, " U"]) -> list[Float[np.ndarray, "P C"]]:
+        """What is predicted, in codes."""
+        return [self.bounds[0].codes(_sum(unknowns, self._columns))[0]]
+
+    def shown(self, unknowns: Float[np.ndarray, " U"], values: Sequence[Values]) -> Iterator[tuple[Any, Any]]:
+        """What is predicted, and its derivatives by each channel's factors."""
+        for some in values:
+            columns = self._columns[:, some.which]
+            yield _sum(unknowns, columns), columns
+
+
+def _sum(factors: np.ndarray, images: Float[np.ndarray, "L P C"]) -> Float[np.ndarray, "P C"]:
+    return np.einsum("lc,lpc->pc", factors.reshape(len(images), -1), images)
 
 
 def _emittances(scene: brdf.Scene, channels: int) -> Float[np.ndarray, "L C"]:

@@ -62,6 +62,17 @@ def test_lights_are_told_saved_and_drawn_as_a_fit_is(tmp_path):
     np.testing.assert_allclose(fitting.load_result(tmp_path).fitted(), found.fitted(), rtol=1e-5)
 
 
+def test_lights_of_rounded_pictures_are_known_by_the_edges_of_codes():
+    clean = np.asarray(brdf.render(MATERIAL, scene(INTENSITIES / 10), precision="float64"))
+    codes = np.rint(255 * clean / clean.max()).astype(np.uint8)
+    found = fitting.fit_lights(codes, scene(np.ones((3, 3))), MATERIAL)
+    truth = (INTENSITIES / 10 * np.array([[1.0], [20.0], [1.0]])).ravel() / clean.max()
+    for one, true in zip(found.parameters, truth, strict=True):
+        assert abs(float(one) - true) < 4.5 * one.error
+    # Of least squares it is four times as much.
+    assert np.mean(found.errors.ravel() * found.emittances.ravel() / found.factors.ravel() / truth) < 7e-4
+
+
 def test_errors_of_lights_know_noise_that_grows_with_brightness():
     clean = np.asarray(brdf.render(MATERIAL, scene(INTENSITIES), precision="float64"))
     deviation = 0.001 + 0.2 * clean
