@@ -6,6 +6,7 @@ are taken tile by tile, which also keeps a tile in the processor's cache while i
 
 import dataclasses
 import math
+import operator
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -349,12 +350,14 @@ class Lobe:
                 xp: Any = np if isinstance(log_cosine, np.ndarray) else jnp
                 exponent = xp.minimum(log_cosine - xp.asarray(peak, log_cosine.dtype), 0)
                 power = xp.exp(xp.asarray(n, exponent.dtype) * exponent)
-                if xp is np:
-                    value = value + _over_samples(power, weight)
-                    slope = slope + _over_samples(power * exponent, weight)
-                    continue
-                value = value + jnp.sum(power[..., None] * weight, axis=-2)
-                slope = slope + jnp.sum((power * exponent)[..., None] * weight, axis=-2)
+                both = power, power * exponent
+                if xp is jnp:
+                    parts = (jnp.sum(one[..., None] * weight, axis=-2) for one in both)
+                elif weight.shape[1:] == (1, 1):  # NumPy is slow where the last axes are short
+                    parts = map(operator.mul, both, (weight[:, 0],) * 2)
+                else:
+                    parts = map(partial(np.einsum, "...ps,psc->...pc"), both, (weight,) * 2)
+                value, slope = map(operator.add, (value, slope), parts)
         else:
             assert self.model is not None
             value, slope = sum_over_samples(self.model, *self.source, partial(_relative, n, peak))
@@ -437,12 +440,6 @@ class Lobe:
         if centre.ndim == 1:
             return xp.where(slot >= 0, fine[xp.maximum(slot, 0)], centre)
         return xp.where((slot >= 0)[:, None], xp.take(fine, xp.maximum(slot, 0), axis=-2), centre)
-
-
-def _over_samples(power: np.ndarray, weight: Any) -> np.ndarray:
-    # NumPy is slow where the last axes are short.
-    alone = weight.shape[1:] == (1, 1)
-    return (power[..., 0] * weight[:, 0, 0])[..., None] if alone else np.einsum("...ps,psc->...pc", power, weight)
 
 
 def _relative(n: Scalar, peak: Scalar | float, terms: LightTerms) -> tuple[Array, Array]:

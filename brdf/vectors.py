@@ -97,6 +97,16 @@ class Components:
         """The opposite."""
         return self * -1
 
+    def __matmul__(self, other: "Components") -> Array:
+        """Scalar product."""
+        (ax, ay, az), (bx, by, bz) = self.parts, other.parts
+        return ax * bx + ay * by + az * bz  # the order is fixed, unlike that of a reduction
+
+    def cross(self, other: "Components") -> "Components":
+        """Vector product."""
+        (ax, ay, az), (bx, by, bz) = self.parts, other.parts
+        return Components((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))
+
 
 def largest(v: Any) -> Array:
     """The largest component."""
@@ -105,8 +115,7 @@ def largest(v: Any) -> Array:
 
 def cross(a: Any, b: Any) -> Any:
     """Vector product."""
-    (ax, ay, az), (bx, by, bz) = _components(a), _components(b)
-    product = Components((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))
+    product = Components(_components(a)).cross(Components(_components(b)))
     return product if isinstance(a, Components) or isinstance(b, Components) else product.stacked()
 
 
@@ -129,8 +138,7 @@ def _components(v: Any) -> tuple[Array, ...]:
 
 def dot(a: Directions | Components, b: Directions | Components) -> Scalars:
     """Scalar product over the last axis."""
-    (ax, ay, az), (bx, by, bz) = _components(a), _components(b)
-    return ax * bx + ay * by + az * bz  # the order is fixed, unlike that of a reduction
+    return Components(_components(a)) @ Components(_components(b))
 
 
 def normalize(v: Any) -> Any:
@@ -292,18 +300,18 @@ def _split(*vectors: ArrayLike) -> list[_Split]:
 
 def _dot(a: _Split, b: _Split) -> Array:
     """Scalar product of vectors whose components lie within +-2."""
-    product = dot(a.high, b.high)
+    product = a.high @ b.high
     if a.low is None or b.low is None:
         return product
-    return product + (dot(a.high, b.low) + dot(a.low, b.value))
+    return product + (a.high @ b.low + a.low @ b.value)
 
 
 def _cross_squared(a: _Split, b: _Split) -> Array:
     """Squared length of the cross product of vectors whose components lie within +-2."""
-    product = cross(a.high, b.high)
+    product = a.high.cross(b.high)
     if a.low is not None and b.low is not None:
-        product = product + (cross(a.high, b.low) + cross(a.low, b.value))
-    return dot(product, product)
+        product = product + (a.high.cross(b.low) + a.low.cross(b.value))
+    return product @ product
 
 
 def _combined(operation: Any, a: _Split, b: _Split) -> _Split:

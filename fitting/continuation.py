@@ -186,7 +186,7 @@ class Problem(ABC):
             if not any(np.any(some & ~other.which) for some, other in zip(which, beside, strict=True)):
                 return beside
             which = [some | other.which for some, other in zip(which, beside, strict=True)]
-        return [self.taken(picture, some) for picture, some in enumerate(which)]
+        return list(map(self.taken, range(len(which)), which))
 
     def score(self, at: Estimate, values: Sequence[Values]) -> Score:
         """What these values say of an estimate."""
@@ -256,7 +256,8 @@ def maximise(
     """
     at, known, before, low, high = start, [], None, -math.inf, math.inf
     for _ in range(MOST_NOISES):
-        at, values, said = _climb(problem, at, ROUGH_GAIN, known, *_scored(problem, at))
+        values = problem.near(at, REACH)
+        at, values, said = _climb(problem, at, ROUGH_GAIN, known, values, problem.score(at, values))
         known.append(precision(problem, at, said))
         fewest = float(np.min(known[-1].values, where=known[0].variance > 0, initial=math.inf))
         if fewest < least:
@@ -274,17 +275,12 @@ def maximise(
             break
         at = at._replace(noise=math.exp(now + step))
     else:
-        values, said = _scored(problem, at)
+        values = problem.near(at, REACH)
+        said = problem.score(at, values)
     rough = said
     at, _, said = _climb(problem, at, LEAST_GAIN, known, values, rough)
     last = known[-1] if said is rough and known[-1].noise == at.noise else precision(problem, at, said)
     return at, [*(entry for entry in known if entry.noise > at.noise), last], said
-
-
-def _scored(problem: Problem, at: Estimate) -> tuple[list[Values], Score]:
-    """The pixels that say something of an estimate, and what."""
-    values = problem.near(at, REACH)
-    return values, problem.score(at, values)
 
 
 def _climb(
@@ -407,6 +403,6 @@ def where_most_is_told(
     most = telling(known)
     if most is not known[-1]:
         at = at._replace(noise=most.noise)
-        _, said = _scored(problem, at)
+        said = problem.score(at, problem.near(at, REACH))
         most = precision(problem, at, said)
     return said, widening(known, most, alone)

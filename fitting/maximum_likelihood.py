@@ -457,7 +457,10 @@ class _Separable(Problem):
     def codes(self, unknowns: Float[np.ndarray, " U"]) -> list[Float[np.ndarray, "P C"]]:
         """What is predicted, in codes; kept while only the noise changes."""
         if self._last[0] is not unknowns:
-            self._last = unknowns, [_codes(_picture(part), Numbers.of(unknowns)) for part in self.pixels]
+            at, found = Numbers.of(unknowns), []
+            for bounds, part in zip(self.bounds, self.pixels, strict=True):
+                found.append(bounds.codes(_picture(part).shown(at.n, at.x))[0])
+            self._last = unknowns, found
         return self._last[1]
 
     def taken(self, picture: int, which: Bool[np.ndarray, " P"]) -> Values:

@@ -78,13 +78,15 @@ class Picture:
         Where the lobe is made anew at each evaluation some of them are repeated, with bounds that say nothing: programs
         are compiled for a few numbers of pixels only.
         """
-        lobe = self.lobe
-        if lobe is None or lobe.source is None:
-            some, filled = self.on_host(pixel), 0
-        else:
+        lobe, filled = self.lobe, 0
+        if lobe is not None and lobe.source is not None:
             filled = -pixel.size % (_FEW if pixel.size <= _FEW else 8 * _FEW)
             pixel = np.append(pixel, np.zeros(filled, pixel.dtype))
-            some = jax.tree.map(np.asarray, self).pixels(partial(np.take, indices=pixel, axis=0))
+            lobe = jax.tree.map(np.asarray, lobe).pixels(partial(np.take, indices=pixel, axis=0))
+        elif lobe is not None:
+            lobe = lobe.on_host(pixel)
+        here = jax.tree.map(np.asarray, replace(self, lobe=None))
+        some = replace(here.pixels(partial(np.take, indices=pixel, axis=0)), lobe=lobe)
         some = jax.tree.map(lambda a: np.asarray(a, np.float64) if eqx.is_inexact_array_like(a) else a, some)
         if filled and some.bounds is not None:
             some.bounds.lower[-filled:], some.bounds.upper[-filled:] = -np.inf, np.inf
@@ -117,7 +119,8 @@ class Picture:
             n: the exponent.
             x: coefficients.
         """
-        return np.asarray(self._convenient.predicted(np.asarray(n), x))
+        picture = self._convenient
+        return np.asarray((_predicted if picture._all_on_host else _predicted_many)(picture, np.asarray(n), x))
 
     def lobe_extent(self, n: float) -> tuple[float, float]:
         """The largest value of the specular basis image in a pixel that counts, and the sum of squares over its square.

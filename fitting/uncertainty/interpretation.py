@@ -1,5 +1,6 @@
 """From the solver's numbers to a material, its errors, and what a user should know of them."""
 
+import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
@@ -161,9 +162,7 @@ def shared_errors(
         covariance: see `fitting.uncertainty.structure.scatter`.
     """
     lossy = any(tile.bounds is not None and tile.bounds.lossy for tile in seen.tiles)
-    errors = [
-        errors_of(picture, said.optimum, place) for picture, place in zip(said.pictures, said.places, strict=True)
-    ]
+    errors = list(map(errors_of, said.pictures, itertools.repeat(said.optimum), said.places))
     if lossy:
         # The pixels of a block err together in any case.
         together = structure([over_blocks(of_blocks(_once(one, seen)), 2) for one in errors], (2, 4))
