@@ -307,9 +307,11 @@ def _search(
     profile = jax.vmap(lambda t: _point(pixels, jnp.stack(_derivatives(relative, t)[:2], 1), residual, matt))(grid)
     cost = jnp.sum(profile.cost, axis=(1, 2))
     position, lowest = lowest_in_cells(grid, cost, profile.slope)
+    # What rounding leaves is no valley: of exponents that fit alike the smallest, whose lobe most pixels see.
+    lowest = jnp.maximum(lowest, jnp.finfo(cost.dtype).eps ** 2 * jnp.sum(pixels.target**2))
     # Of the two lowest valleys the better one, after a step in each.
     beside = jnp.pad(lowest, 1, constant_values=jnp.inf)
-    valleys = jnp.where((lowest <= beside[:-2]) & (lowest < beside[2:]), lowest, jnp.inf)
+    valleys = jnp.where((lowest < beside[:-2]) & (lowest <= beside[2:]), lowest, jnp.inf)
     _, best = jax.lax.top_k(-valleys, min(2, count - 1))
     points = jax.vmap(lambda cell: at(position[cell], profile.x[cell]))(best)
     gain = points.slope**2 / jnp.where(points.curvature > 0, 2 * points.curvature, jnp.inf)

@@ -257,8 +257,8 @@ def _of_array(values: np.ndarray, rounding: Rounding, encoding: Encoding) -> Tar
     kind, step, bits = values.dtype, 0.0, None
     if kind in (np.uint8, np.uint16):
         bits = 8 * kind.itemsize
-        values = decode_table(encoding, bits)[values].astype(np.float32)
-        step = float(np.max(np.diff(decode_table(encoding, bits))))
+        table = decode_table(encoding, bits)
+        values, step = table.astype(np.float32)[values], float(np.max(np.diff(table)))
     elif kind.kind != "f":
         came = f"must hold floating-point values, or codes of 8 or 16 bits, got {kind}"
         raise InputError("target", came, "Read it with brdf.read_picture, or divide by the largest code")

@@ -250,6 +250,8 @@ def lowest_in_cells(log_n: Any, cost: Any, slope: Any) -> tuple[Any, Any]:
     xp: Any = np if isinstance(cost, np.ndarray) else jnp
     t, step = xp.linspace(0.0, 1.0, 33, dtype=log_n.dtype), xp.diff(log_n)
     bent = step[:, None] * t * (1 - t) * ((1 - t) * slope[:-1, None] - t * slope[1:, None])
+    # Between slopes of one sign an end is lowest: where a coefficient comes to 0 the cubic would dip below it.
+    bent = xp.where(slope[:-1, None] * slope[1:, None] > 0, 0.0, bent)
     values = cost[:-1, None] + t * t * (3 - 2 * t) * xp.diff(cost)[:, None] + bent
     return log_n[:-1] + t[xp.argmin(values, axis=1)] * step, xp.min(values, axis=1)
 

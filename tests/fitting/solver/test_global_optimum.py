@@ -138,3 +138,32 @@ def test_basis_images_that_nearly_add_up_to_one_another_are_told_apart_in_double
     assert isinstance(found, brdf.BlinnPhong)
     np.testing.assert_allclose(found.n, 10.0, rtol=1e-4)
     np.testing.assert_allclose(found.k_s, [0.4, 0.4, 0.32], rtol=1e-3)
+
+
+def plane(n: float) -> tuple[np.ndarray, brdf.Scene]:
+    """A plane under two near lights, whose basis images are much alike."""
+    camera = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2, resolution=[96, 96])
+    lights = [
+        brdf.PointLight(position=[-0.3, -0.8, 3.5], intensity=[0.8], attenuation=[1, 0, 0]),
+        brdf.PointLight(position=[0.3, -2.2, 2.7], intensity=[0.8], attenuation=[1, 0, 0]),
+    ]
+    shapes = [brdf.Rectangle(center=[0, 0, 0], edge_u=[1.2, 0, 0], edge_v=[0, 1.2, 0])]
+    scene = brdf.Scene(camera=camera, shapes=shapes, lights=lights, ambient=[0.5])
+    material = brdf.BlinnPhong(k_a=[0.35], k_d=[0.5], k_s=[0.25], n=n)
+    return np.asarray(brdf.render(material, scene, precision="float64")), scene
+
+
+@pytest.mark.parametrize("n", [10, 20, 33, 60])
+def test_a_valley_is_not_missed_beside_a_coefficient_that_comes_to_0(n: float):
+    image, scene = plane(n)
+    result = fitting.fit(image, scene, model="blinn-phong", precision="float64")
+    np.testing.assert_allclose([float(one) for one in result.parameters], [0.35, 0.5, 0.25, n], rtol=1e-6)
+
+
+@pytest.mark.parametrize("n", [8, 33, 60])
+def test_codes_of_16_bits_are_met_where_basis_images_are_much_alike(n: float):
+    image, scene = plane(n)
+    codes = np.rint(60000 * image / image.max())
+    result = fitting.fit(codes.astype(np.uint16), scene, model="blinn-phong")
+    missed = np.abs(65535 * np.asarray(brdf.render(result.material, scene, precision="float64")) - codes) - 0.5
+    assert np.max(missed) < 1e-4
