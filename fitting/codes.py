@@ -37,6 +37,8 @@ FINE = 8192
 # Pixels on a side of what a codec for photographs transforms together; twice that where colours have half the
 # resolution.
 BLOCK = 8
+# Bits of a half float.
+HALF = 16
 
 
 class Codes(NamedTuple):
@@ -123,7 +125,7 @@ def find_codes(
     Args:
         pixels: linear values.
         encoding: of the codes, where a file says so.
-        bits: of an integer file; None where it is not known to be one.
+        bits: of an integer file, and `HALF`, without an encoding, of half floats; None where neither is known.
         rounding: the full step between neighbouring values in the unit of the pixels; 0 for none, "floor" where the
             writer truncated, None finds out.
         unit: radiance of the largest code of a file, a number or (C,).
@@ -134,7 +136,7 @@ def find_codes(
         found = _integers(pixels / unit, encoding, 255 if bits <= 8 else 65535)
         found = None if found is None else found._replace(unit=unit)
     else:
-        found = _levels(pixels)
+        found = _levels(pixels, half=bits == HALF)
     if found is not None and rounding == "floor":
         found = found._replace(below=0.0, above=1.0)
     return found
@@ -214,17 +216,18 @@ def _stated(pixels: np.ndarray, rounding: Any) -> Codes | None:
     return Codes(pixels / size, half, half, (-np.inf, np.inf), 1 / size, "linear")
 
 
-def _integers(pixels: np.ndarray, encoding: Encoding, top: int) -> Codes | None:
-    """Of an integer file; the step is the greatest common divisor of what is used."""
+def _integers(pixels: np.ndarray, encoding: Encoding, top: int, fewest: int = 1) -> Codes | None:
+    """Of an integer file with so many different ones; the step is the greatest common divisor of what is used."""
     with np.errstate(invalid="ignore"):
         codes = np.rint(encode(np.asarray(pixels, np.float32), encoding) * np.float32(top))
     whole = codes[np.isfinite(codes)].astype(np.int64)
     least = np.min(whole, initial=0)
     used = np.flatnonzero(np.bincount(whole - least)) + least
-    if used.size < 2:
+    if used.size < fewest:
         return None
     inside = used[(used > 0) & (used < top)]
-    step = int(np.gcd.reduce(inside)) if inside.size else 1
+    # Few codes may have a divisor by chance.
+    step = int(np.gcd.reduce(inside)) if inside.size >= _FEWEST else 1
     if step > 1 and used[-1] == top and top % step:
         # Clipped to the largest number of the file, not to a code of the sensor.
         codes = np.where(codes == top, np.ceil(top / step) * step, codes)
@@ -232,8 +235,8 @@ def _integers(pixels: np.ndarray, encoding: Encoding, top: int) -> Codes | None:
     return Codes((codes / step).astype(np.float32), 0.5, 0.5, (0.0, largest), top / step, encoding)
 
 
-def _levels(pixels: np.ndarray) -> Codes | None:
-    """Of a float array: those of a file whose levels hold all values."""
+def _levels(pixels: np.ndarray, *, half: bool) -> Codes | None:
+    """Of a float array, which may be known to hold half floats: those of a file whose levels hold all values."""
     stride = max(1, pixels.size // _FIRST)
     for every in (stride, 1):
         some = pixels.ravel()[::every]
@@ -243,14 +246,16 @@ def _levels(pixels: np.ndarray) -> Codes | None:
         fitting: list[tuple[int, Encoding]]
         fitting = [(top, curve) for top in _TOLERANCE for curve in _CURVES if _on_levels(some, curve, top)]
         with np.errstate(over="ignore", under="ignore"):
-            half = bool(np.all(some == some.astype(np.float16)))
+            halves = bool(np.all(some == some.astype(np.float16)))
         rgbe = every > 1 or _is_rgbe(pixels)
-        if not (fitting or half or rgbe):
+        if not (fitting or halves or rgbe):
             return None
     if all(np.unique(values).size < _FEWEST for values in (some[::stride], some)):
-        return None
+        if not half:
+            return None
+        fitting, rgbe = [], False
     for top, curve in fitting:
-        found = _integers(pixels, curve, top)
+        found = _integers(pixels, curve, top, _FEWEST)
         if found is not None:
             bits = int(np.ceil(np.log2(found.ends[1] + 1)))
             return found._replace(levels=f"{bits}-bit {'sRGB' if curve == 'srgb' else curve} files")
@@ -263,7 +268,7 @@ def _levels(pixels: np.ndarray) -> Codes | None:
         unit = float(np.median(step[step > 0]))
         above = np.maximum(step, 1e-30) / unit
         return Codes((pixels / unit).astype(np.float32), 0.0, above, ends, 1 / unit, "linear", levels="RGBE files")
-    if half:
+    if halves:
         ulp = np.spacing(np.maximum(pixels, 6e-5).astype(np.float16)).astype(np.float64)
         unit = float(np.median(ulp[pixels > 0])) if np.any(pixels > 0) else 1.0
         around = 0.5 * ulp / unit

@@ -15,7 +15,7 @@ import brdf
 from brdf.errors import InputError
 from brdf.images.encoding import Encoding, decode, decode_table, parse_encoding
 from brdf.precision import Precision
-from fitting.codes import Codes, Rounding, find_codes
+from fitting.codes import HALF, Codes, Rounding, find_codes
 from fitting.sample_error import SampleError
 from fitting.solver.losses import LOSSES, Loss
 
@@ -240,7 +240,7 @@ def _of_picture(picture: brdf.Picture, rounding: Rounding) -> Target:
     steps = picture.quantisation()
     codes, step, top = None, 0.0 if steps is None else float(np.nanmax(steps)), picture.saturation
     if rounding is not None or not picture.lossy or steps is not None:
-        of_file = (picture.encoding, picture.bits) if steps is not None else (None, None)
+        of_file = None if steps is None else picture.encoding, picture.bits
         codes = find_codes(picture.pixels, *of_file, rounding, picture.factor)
     if codes is not None:
         # Steps that the user states are not the codes that were compressed.
@@ -265,13 +265,14 @@ def _of_array(values: np.ndarray, rounding: Rounding, encoding: Encoding) -> Tar
     elif encoding != "linear":
         values = decode(values, encoding)
     if kind == np.float16:
-        step, values = float(np.finfo(np.float16).eps), values.astype(np.float32)
+        bits, step, values = HALF, float(np.finfo(np.float16).eps), values.astype(np.float32)
     if values.ndim == 2:
         values = values[..., None]
     if values.ndim != 3 or 0 in values.shape:
         raise InputError("target", f"must be of shape (H, W, C), got {values.shape}", "Give one picture")
-    codes = find_codes(values, encoding if bits else None, bits, rounding)
-    return Target(values, TOP if bits else None, step, codes, least_squares=rounding is not None and codes is None)
+    integer = kind.kind == "u"
+    codes = find_codes(values, encoding if integer else None, bits, rounding)
+    return Target(values, TOP if integer else None, step, codes, least_squares=rounding is not None and codes is None)
 
 
 def _per_pixel(name: str, values: Any, shape: tuple[int, int]) -> np.ndarray:

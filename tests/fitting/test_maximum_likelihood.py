@@ -158,3 +158,20 @@ def test_highlights_near_edges_and_beyond_are_compared_by_one_likelihood():
         noisy = np.random.default_rng(seed).normal(255 * encode(drawn.drawn(), "srgb"), 0.5)
         codes = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
         assert fitting.fit(codes, drawn.scene(), encoding="srgb").surface == drawn.model
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float16])
+@pytest.mark.parametrize("half_edge", [0.7, 1.2])
+def test_a_plane_of_one_code_is_known_to_half_a_code(kind: type, half_edge: float):
+    camera = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2, resolution=[48, 48])
+    shapes = [brdf.Rectangle(center=[0, 0, 0], edge_u=[half_edge, 0, 0], edge_v=[0, half_edge, 0])]
+    lights = [brdf.DirectionalLight(direction=[0, 0, 1], intensity=[1.0])]
+    scene = brdf.Scene(camera=camera, shapes=shapes, lights=lights)
+    drawn = np.asarray(brdf.render(brdf.Lambert(k_d=[0.80503]), scene, precision="float64"))
+    top = np.iinfo(kind).max if issubclass(kind, np.integer) else 1
+    picture = (np.rint(top * drawn) if top > 1 else drawn).astype(kind)
+    found = fitting.fit(picture, scene, model="lambert")["k_d"][0]
+    half_step = 0.5 / top if top > 1 else 0.25 * np.finfo(np.float16).eps
+    assert found.error is not None
+    assert 0.5 * half_step < found.error < half_step
+    assert abs(float(found) - 0.80503) < 1.8 * found.error
