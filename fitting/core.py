@@ -37,8 +37,8 @@ from fitting.uncertainty.covariance import NO_TRACE, residual_noise, specular_ga
 from fitting.uncertainty.highlight import highlight, nearest_peak
 from fitting.uncertainty.interpretation import alone_covariance, interpret, shared_errors
 from fitting.uncertainty.noise_model import weighted_sums
-from fitting.uncertainty.residual_correlation import residual_correlation
-from fitting.uncertainty.structure import CHANCE, SIZES, Blocks, Errors, left_over_blocks, over_blocks, shared
+from fitting.uncertainty.residual import Residual, survey
+from fitting.uncertainty.structure import CHANCE, SIZES, Blocks, Errors, over_blocks, shared
 
 # A residual above this share of the picture: what the scene says is probably not what the picture shows.
 UNEXPLAINED = 0.5
@@ -161,7 +161,7 @@ def _fit_model(
 
 def _is_made_anew(picture: Picture) -> bool:
     """Whether its lobe is, for each exponent, and rounded values ask for many."""
-    return picture.bounds is not None and picture.lobe is not None and picture.lobe.source is not None
+    return picture.bounds is not None and picture.is_sampled
 
 
 def _fit_about(
@@ -225,8 +225,8 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
     if whitened:
         inflation, colour_inflation = _inflation(best, seen, grey[best.model.name])
     else:
-        known = residual_correlation(best.pictures, seen.widths, best.optimum, seen.rounding)
-        inflation = known.inflation
+        known = survey(best.pictures, seen.widths, best.optimum, noise, seen.rounding)
+        inflation = known.neighbours.inflation
         if known.noise is not None:
             # Each pixel by its own variance, or noise in bright pixels would pass for a highlight.
             for name, fit in fits.items():
@@ -379,24 +379,26 @@ def _explains_structure(fit: ModelFit, seen: Observed) -> bool:
     optimum = fit.optimum
     if max(highlight_in_codes(picture, optimum.x, optimum.n) for picture in fit.pictures) < HIDDEN:
         return False
-    if highlight(fit.pictures, optimum.n).share(optimum.x, seen.brightest) < NO_TRACE:
-        return False
-    if fit.evidence is not None and fit.evidence.precision is not None:
-        return True  # what errs together has been weighed by the channels' covariance
     x = nonnegative_minima(
         optimum.gram[:, :2, :2], optimum.product[:, :2], np.zeros((1, 2)), fit.free[:2].T, TOLERANCE_DOUBLE
     )
     matt = dataclasses.replace(optimum, x=np.vstack([x.T, np.zeros((1, len(x)))]))
-    left, chance = shared(_unexplained(fit.pictures, optimum, seen))
-    before, _ = shared(_unexplained(fit.pictures, matt, seen))
-    return left < CHANCE * chance or before - left > EXPLAINED * before
+    noise = residual_noise(optimum, seen.rounding)
+    after, before = (survey(fit.pictures, seen.widths, one, noise, seen.rounding) for one in (optimum, matt))
+    if highlight(fit.pictures, optimum.n, after).share(optimum.x, seen.brightest) < NO_TRACE:
+        return False
+    if fit.evidence is not None and fit.evidence.precision is not None:
+        return True  # what errs together has been weighed by the channels' covariance
+    left, chance = shared(_unexplained(fit.pictures, optimum, seen, after))
+    gone = shared(_unexplained(fit.pictures, matt, seen, before))[0] - left
+    return left < CHANCE * chance or gone > EXPLAINED * (gone + left)
 
 
-def _unexplained(pictures: Sequence[Picture], optimum: Optimum, seen: Observed) -> list[Blocks]:
+def _unexplained(pictures: Sequence[Picture], optimum: Optimum, seen: Observed, left: Residual) -> list[Blocks]:
     found = []
-    for picture, width in zip(pictures, seen.widths, strict=True):
+    for picture, width, blocks in zip(pictures, seen.widths, left.blocks, strict=True):
         if picture.bounds is None:
-            found.append(left_over_blocks(picture, optimum, np.ones(seen.colour.size), width))
+            found.append(blocks)
             continue
         with jax.enable_x64(True):
             values = unexplained(picture, optimum.x, optimum.n)

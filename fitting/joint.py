@@ -42,7 +42,7 @@ from fitting.result import Parameter
 from fitting.solver.nnls import scaled_inverse
 from fitting.uncertainty.intervals import NORMAL_95, above_zero
 from fitting.uncertainty.noise_model import value_variance
-from fitting.uncertainty.residual_correlation import correlation_in_rows, structure_warning
+from fitting.uncertainty.residual import NEGLIGIBLE, Neighbours, neighbours_of, structure_warning
 
 LARGEST_JACOBIAN = 1 << 27
 ROUNDS = 8
@@ -321,7 +321,7 @@ def left_over(
     told = [np.asarray(shown, np.float64)[counted] for shown, counted in zip(seen.shown, seen.counted, strict=True)]
     pixels = sum(map(len, told))
     share = (float(np.sum(squares)) / max(sum(float(np.sum(values**2)) for values in told), TINY)) ** 0.5
-    known = correlation_in_rows(residuals, share)
+    known = neighbours_of(residuals) if share > NEGLIGIBLE else Neighbours()
     return seen.told() | {
         "scenes": scenes,
         "noise": np.sqrt(squares / max(pixels - unknowns / squares.size, 1)),

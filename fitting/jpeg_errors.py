@@ -62,7 +62,7 @@ def without_codec_errors(seen: Observed, fit: ModelFit) -> tuple[ModelFit, Obser
     ends = np.cumsum([len(picture.target) for picture in pictures])
     compressed = [_Compressed.of(target) for target in targets]
     fit, most, count = fit._replace(pictures=pictures), MOST_FITS, LOOK_ALIKES
-    made_anew = any(picture.lobe is not None and picture.lobe.source is not None for picture in pictures)
+    made_anew = any(picture.is_sampled for picture in pictures)
     if ends[-1] > MANY and not made_anew:
         some = list(map(_part, pictures))
         whole = np.concatenate(

@@ -79,7 +79,7 @@ class Picture:
         are compiled for a few numbers of pixels only.
         """
         lobe, filled = self.lobe, 0
-        if lobe is not None and lobe.source is not None:
+        if lobe is not None and self.is_sampled:
             filled = -pixel.size % (_FEW if pixel.size <= _FEW else 8 * _FEW)
             pixel = np.append(pixel, np.zeros(filled, pixel.dtype))
             lobe = jax.tree.map(np.asarray, lobe).pixels(partial(np.take, indices=pixel, axis=0))
@@ -105,8 +105,21 @@ class Picture:
         return found
 
     @property
+    def is_sampled(self) -> bool:
+        """Whether the lobe is made anew from its light samples at each evaluation."""
+        return self.lobe is not None and self.lobe.source is not None
+
+    @property
     def _all_on_host(self) -> bool:
-        return isinstance(self.diffuse, np.ndarray) and (self.lobe is None or self.lobe.source is None)
+        return isinstance(self.diffuse, np.ndarray) and not self.is_sampled
+
+    def shown_and_lobe(self, n: Any, x: Float[AnyArray, "3 C"]) -> tuple[Any, Any]:
+        """What the model shows, (P, C), and the lobe, (P, Cb), as a part of a program or by NumPy."""
+        xp: Any = np if isinstance(self.diffuse, np.ndarray) else jnp
+        x_a, x_d, x_s = xp.asarray(x, self.target.dtype)
+        lobe = xp.zeros_like(self.diffuse) if self.lobe is None else self.lobe(n)[0]
+        shown = x_a * xp.asarray(self.ambient, self.target.dtype) + x_d * self.diffuse + x_s * lobe
+        return xp.broadcast_to(shown, self.target.shape), lobe
 
     def predicted(self, n: AnyArray, x: Float[AnyArray, "3 C"]) -> Float[AnyArray, "P C"]:
         """What the model shows, in the dtype of the target; in NumPy where the picture is."""
@@ -122,21 +135,10 @@ class Picture:
         picture = self._convenient
         return np.asarray((_predicted if picture._all_on_host else _predicted_many)(picture, np.asarray(n), x))
 
-    def lobe_extent(self, n: float) -> tuple[float, float]:
-        """The largest value of the specular basis image in a pixel that counts, and the sum of squares over its square.
-
-        Args:
-            n: the exponent.
-        """
-        picture = self._convenient
-        largest, pixels = (_lobe_extent if picture._all_on_host else _lobe_extent_many)(picture, np.asarray(n))
-        return float(largest), float(pixels)
-
     @property
     def _convenient(self) -> "Picture":
         """The same picture; in NumPy where that takes less time than tracing and loading a program would."""
-        made = self.lobe is not None and self.lobe.source is not None
-        if self.target.size > FEW_VALUES or device_count() > 1 or made:
+        if self.target.size > FEW_VALUES or device_count() > 1 or self.is_sampled:
             return self
         return jax.tree.map(np.asarray, self)
 
@@ -165,12 +167,7 @@ class Picture:
 
 
 def _predicted(picture: Picture, n: Any, x: Float[AnyArray, "3 C"]) -> Any:
-    xp: Any = np if isinstance(picture.diffuse, np.ndarray) else jnp
-    x_a, x_d, x_s = xp.asarray(x, picture.target.dtype)
-    shown = x_a * xp.asarray(picture.ambient, picture.target.dtype) + x_d * picture.diffuse
-    if picture.lobe is not None:
-        shown = shown + x_s * picture.lobe(n)[0]
-    return xp.broadcast_to(shown, picture.target.shape)
+    return picture.shown_and_lobe(n, x)[0]
 
 
 _predicted_many = eqx.filter_jit(_predicted)
@@ -180,19 +177,6 @@ _predicted_many = eqx.filter_jit(_predicted)
 def _lobe(lobe: Lobe, n: AnyArray) -> tuple[Array, Array]:
     return lobe(jnp.asarray(n))
 
-
-def _lobe_extent(picture: Picture, n: AnyArray) -> tuple[AnyArray, AnyArray]:
-    assert picture.lobe is not None
-    value, _ = picture.lobe(n)
-    xp: Any = np if isinstance(value, np.ndarray) else jnp
-    counts = xp.any(picture.weights > 0, axis=1)
-    values = xp.where(counts, xp.max(value, axis=1), 0)
-    largest = xp.max(values)
-    # Squares of a highlight that no pixel sees would fall below the smallest number.
-    return largest, xp.sum((values / xp.where(largest > 0, largest, 1)) ** 2)
-
-
-_lobe_extent_many = eqx.filter_jit(_lobe_extent)
 
 # Of a lobe that is made anew at each evaluation this many pixels, or multiples of eight times as many.
 _FEW = 2048

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitting.solver.normal_equations import Picture
+from fitting.uncertainty.residual import Residual
 
 # A highlight on fewer pixels, counted by the squares of its values, is sampled too coarsely to trust its shape.
 FEW_PIXELS = 4.0
@@ -50,20 +51,16 @@ class Highlight(NamedTuple):
         return float(np.max(x[2]) * self.largest / max(np.max(brightest), np.finfo(float).tiny))
 
 
-def highlight(pictures: Sequence[Picture], n: float) -> Highlight:
-    """Measure the highlight.
+def highlight(pictures: Sequence[Picture], n: float, left: Residual) -> Highlight:
+    """What there is to know of a highlight.
 
     Args:
         pictures: with a lobe.
         n: exponent.
+        left: by the fit.
     """
-    largest, pixels = 0.0, 0.0
-    for picture in pictures:
-        if picture.lobe is not None:
-            value, carrying = picture.lobe_extent(n)
-            largest, pixels = max(largest, value), pixels + carrying
     peak = min(nearest_peak(pictures), 0.0)
-    return Highlight(largest, pixels, peak, math.exp(n * peak))
+    return Highlight(left.largest, left.carrying, peak, math.exp(n * peak))
 
 
 def nearest_peak(pictures: Sequence[Picture]) -> float:

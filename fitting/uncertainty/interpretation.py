@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 import brdf
 from brdf.channels import channel_names
@@ -33,14 +33,13 @@ from fitting.uncertainty.covariance import (
 from fitting.uncertainty.highlight import OFF_CENTRE, Highlight, highlight
 from fitting.uncertainty.intervals import exponent_interval
 from fitting.uncertainty.noise_model import weighted_sums
-from fitting.uncertainty.residual_correlation import ResidualCorrelation, residual_correlation
+from fitting.uncertainty.residual import Residual, survey
 from fitting.uncertainty.structure import (
     SIZES,
     Blocks,
     Errors,
     Structure,
     errors_of,
-    left_over_blocks,
     of_blocks,
     over_blocks,
     scatter,
@@ -71,14 +70,14 @@ def interpret(
     weight = _typical_weight(pictures)
     rounding, columns = seen.rounding * weight, rms_columns(optimum, weight)
     noise = np.maximum(residual_noise(optimum, rounding) * fit.noise_factor, rounding)
-    lobe = None if optimum.flat else highlight(pictures, optimum.n)
+    left = survey(pictures, seen.widths, optimum, noise, rounding)
+    lobe = None if optimum.flat else highlight(pictures, optimum.n, left)
     visible = 0.0 if lobe is None else lobe.share(optimum.x, seen.brightest)
-    known = residual_correlation(pictures, seen.widths, optimum, rounding)
     resolution = RESOLUTION if fit.single else 0.0
     spread, shared, widening, deviation, together, gain, joined = None, None, 1.0, noise, None, 0.0, None
     if fit.evidence is not None:
         # Each working target has the noise 1; what least squares leaves is rounding, which goes together.
-        said, known = fit.evidence, known._replace(significant=False, noise=None)
+        said, left = fit.evidence, left._replace(neighbours=left.neighbours._replace(significant=False), noise=None)
         # Of a small highlight the pixels near an edge may tell next to nothing.
         gain = specular_gain(optimum.normal(noise**2).gram, optimum.x)
         fit, optimum, deviation = fit._replace(pictures=said.pictures, optimum=said.optimum), said.optimum, noise**0
@@ -91,12 +90,12 @@ def interpret(
             joined = said.together.gram
             gain = max(gain, specular_gain(joined, optimum.x))
     else:
-        together = _structure(pictures, seen, optimum, noise, rounding, even=known.noise is None)
+        together = _structure(left, seen, noise > 2 * rounding)
         # What a bound of the material leaves is no error of the pixels.
         if together is not None and together.significant and not fit.capped:
             shared = _scattered(pictures, optimum, _left(pictures, seen, optimum), alone_covariance(optimum, fit.tied))
-    if fit.evidence is None and shared is None and known.noise is not None:
-        spread = fit.noise_factor**2 * weighted_sums(pictures, optimum, known.noise, inverse=False).gram
+    if fit.evidence is None and shared is None and left.noise is not None:
+        spread = fit.noise_factor**2 * weighted_sums(pictures, optimum, left.noise, inverse=False).gram
     # What the light reaches but the simplest model does without is 0, with the error that it would have.
     reached = seen.reached(fit.model)
     sure = uncertainty(
@@ -131,7 +130,7 @@ def interpret(
     correlation = sure.correlation[np.ix_(index, index)]
     warnings = [_capped(material)] if fit.capped else []
     weighed = seen.problem.noise is not None or any(one is not None for one in seen.problem.weights)
-    warnings += _warnings(known, together, None if all(sure.reasons[2]) else lobe, weighed)
+    warnings += _warnings(left, together, None if all(sure.reasons[2]) else lobe, weighed)
     if sure.sums:
         words = "no more than a sum of several numbers is determined, see there: the material shows it with "
         words += f"{100 * AMBIENT_SHARE:g} % of it as ambient light, if there is any, and the rest as k_d. "
@@ -140,7 +139,7 @@ def interpret(
         material=material,
         parameters=parameters,
         noise=noise,
-        structure=known.correlation,
+        structure=left.neighbours.correlation,
         highlight_pixels=None if lobe is None else lobe.pixels,
         residual=residual,
         warnings=tuple(warnings),
@@ -180,23 +179,12 @@ def shared_errors(
     return _scattered(said.pictures, said.optimum, errors, covariance), together
 
 
-def _structure(
-    pictures: Sequence[Picture],
-    seen: Observed,
-    optimum: Optimum,
-    noise: Float[np.ndarray, " C"],
-    rounding: Float[np.ndarray, " C"],
-    *,
-    even: bool,
-) -> Structure | None:
+def _structure(left: Residual, seen: Observed, tell: Bool[np.ndarray, " C"]) -> Structure | None:
     """That of a fit by least squares; None where it cannot be told, or weights are part of what is fitted."""
-    tell, found = noise > 2 * rounding, []
     if device_count() > 1 or seen.problem.loss != "squared" or not tell.any():
         return None
-    tell = np.flatnonzero(tell)[: 1 if seen.copies else None]
-    for picture, width in zip(pictures, seen.widths, strict=True):
-        found.append(left_over_blocks(picture, optimum, noise, width).channels(tell))
-    return structure(found, even=even)
+    some = np.flatnonzero(tell)[: 1 if seen.copies else None]
+    return structure([grid.channels(some) for grid in left.blocks], even=left.noise is None)
 
 
 def _scores(score: np.ndarray, information: np.ndarray, place: tuple[np.ndarray, int]) -> Blocks:
@@ -314,22 +302,20 @@ def _capped(material: brdf.Material) -> str:
     )
 
 
-def _warnings(
-    known: ResidualCorrelation, together: Structure | None, seen: Highlight | None, weighed: bool
-) -> Iterator[str]:
-    if known.significant or (together is not None and together.significant):
+def _warnings(left: Residual, together: Structure | None, seen: Highlight | None, weighed: bool) -> Iterator[str]:
+    known, shared = left.neighbours, together is not None and together.significant
+    if known.significant or shared:
         words = "the residual has structure: neighbouring pixels err alike"
         if known.correlation > 0.05:
             words += f" (correlation {known.correlation:.2f})"
         words += ", so the model or the scene is not the whole truth, or the picture was smoothed. "
-        if together is None or not together.significant:
-            words += f"The errors are too small, by a factor of {known.inflation:.2g} or more"
+        if shared:
+            words += "The errors allow for that among neighbours, not for what it does to the numbers: "
+            words += "they may be too small"
         else:
-            words += (
-                "The errors allow for that among neighbours, not for what it does to the numbers: they may be too small"
-            )
+            words += f"The errors are too small, by a factor of {known.inflation:.2g} or more"
         yield words
-    if known.noise is not None:
+    if left.noise is not None:
         how = "the weights do not" if weighed else "pixels are weighed alike"
         yield (
             f"the noise grows with brightness; the errors allow for it, but {how}: told of the camera's noise, or with "

@@ -5,18 +5,14 @@ the sum of the squares. A light that stands elsewhere, a ball whose circle is of
 """
 
 import math
-import operator
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from fitting.channel_errors import residuals
-from fitting.solver.normal_equations import FEW_VALUES, Picture
+from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
 from fitting.solver.tied import places_of
 
@@ -70,6 +66,11 @@ class Blocks(NamedTuple):
         """The same of some channels."""
         return Blocks(*(part[..., some] for part in self))
 
+    @property
+    def stacked(self) -> Float[np.ndarray, "R Q 3*C"]:
+        """All three, of each channel one after the other."""
+        return np.stack(self, axis=-1).reshape(*self.sums.shape[:2], -1)
+
 
 class Structure(NamedTuple):
     """How much errs together.
@@ -77,11 +78,9 @@ class Structure(NamedTuple):
     Attributes:
         excess: of the squares of the blocks' sums over what independent errors give, in standard deviations; the
             largest over the sizes.
-        share: of the squares that errs together in the largest blocks.
     """
 
     excess: float
-    share: float
 
     @property
     def significant(self) -> bool:
@@ -94,31 +93,28 @@ def structure(grids: Sequence[Blocks], sizes: Sequence[int] = SIZES, *, even: bo
 
     Args:
         grids: of each picture, over the smallest blocks.
+        sizes: of the blocks, pixels on a side, each twice the one before.
         even: the noise is the same everywhere. Where it is not, blocks count by their noise: what least squares leaves
             where there is little of it is the noise of other places.
-        sizes: of the blocks, pixels on a side; multiples of the first.
     """
-    excess, share = -math.inf, 0.0
+    excess, parts = -math.inf, [grid.stacked for grid in grids]
     for size in sizes:
-        total, blocks, variance, together, apart, chance = 0.0, 0, 0.0, 0.0, 0.0, 0.0
-        for sums, squares, count in grids:
-            factor = size // sizes[0]
-            joined, alone, pixels = (_coarser(part, factor) for part in (sums, squares, count))
-            # In a block with few pixels the ratio says little.
-            seen = (pixels >= FULL * size**2 * even) & (alone > 0)
-            ratio = joined[seen] ** 2 / alone[seen]
-            total, blocks = total + float(np.sum(ratio)), blocks + int(np.count_nonzero(seen))
-            together, apart = together + float(np.sum(joined[seen] ** 2)), apart + float(np.sum(alone[seen]))
-            variance += float(np.sum(2 * (pixels[seen] - 1) / (pixels[seen] + 2)))
-            chance += float(np.sum(2 * alone[seen] ** 2))
-        if blocks and not even:
-            excess = max(excess, SIGNIFICANT / CHANCE * (together - apart) / math.sqrt(chance))
-        elif blocks:
+        if size > sizes[0]:
+            parts = [coarser(part, 2) for part in parts]
+        joined, alone, pixels = np.concatenate([part.reshape(-1, 3) for part in parts]).T
+        # In a block with few pixels the ratio says little.
+        seen = (pixels >= FULL * size**2 * even) & (alone > 0)
+        joined, alone, pixels = joined[seen], alone[seen], pixels[seen]
+        if not joined.size:
+            continue
+        if even:
             # Wilson and Hilferty (1931): the cube root of chi squared is nearly normal.
-            spread = variance / (9 * blocks**2)
-            excess = max(excess, ((total / blocks) ** (1 / 3) - (1 - spread)) / math.sqrt(spread))
-            share = max(share, (together - apart) / max(apart, np.finfo(float).tiny) / (size**2 * FULL))
-    return Structure(excess, share)
+            spread = np.sum(2 * (pixels - 1) / (pixels + 2)) / (9 * joined.size**2)
+            found = (np.mean(joined**2 / alone) ** (1 / 3) - (1 - spread)) / math.sqrt(spread)
+        else:
+            found = SIGNIFICANT / CHANCE * np.sum(joined**2 - alone) / math.sqrt(np.sum(2 * alone**2))
+        excess = max(excess, float(found))
+    return Structure(excess)
 
 
 def of_blocks(errors: Errors) -> Errors:
@@ -143,7 +139,7 @@ def over_blocks(errors: Errors, size: int) -> Blocks:
     rows = int(np.max(errors.pixel, initial=0)) // width + 1
     if errors.pixel.size == rows * width:
         image = values.reshape(rows, width, -1)
-        return Blocks(*(_coarser(part, size) for part in (image, image**2, image != 0)))
+        return Blocks(*(coarser(part, size) for part in (image, image**2, image != 0)))
     # Of a picture whose roundings leave nothing open it has no pixel, and few where little is open.
     shape = -(-rows // size), -(-width // size)
     block = errors.pixel // width // size * shape[1] + errors.pixel % width // size
@@ -155,33 +151,8 @@ def over_blocks(errors: Errors, size: int) -> Blocks:
     )
 
 
-def left_over_blocks(picture: Picture, optimum: Optimum, noise: Float[np.ndarray, " C"], width: int) -> Blocks:
-    """Sums of what a fit leaves, over the smallest blocks of `structure`.
-
-    Args:
-        picture: all pixels of one, row by row.
-        optimum: of the fit.
-        noise: the unit of the errors.
-        width: of the picture.
-    """
-    if picture.target.size > FEW_VALUES:
-        return Blocks(*map(np.asarray, _left_over_blocks(picture, np.asarray(optimum.n), optimum.x, noise, width)))
-    errors = errors_of(picture, optimum, (np.arange(len(picture.target)), width))
-    return over_blocks(errors._replace(values=(errors.values / noise).astype(np.float32)), SIZES[0])
-
-
-@eqx.filter_jit
-def _left_over_blocks(picture: Picture, n: Any, x: Any, noise: Any, width: int) -> tuple[Array, ...]:
-    size, weight = SIZES[0], picture.weights
-    left = jnp.where(weight > 0, picture.target - picture.predicted(n, x), 0) * jnp.sqrt(weight)
-    image = (left / noise).astype(np.float32).reshape(-1, width, left.shape[1])
-    image = jnp.pad(image, [(0, -image.shape[0] % size), (0, -width % size), (0, 0)])
-    blocks = image.reshape(image.shape[0] // size, size, image.shape[1] // size, size, -1)
-    terms, zero = (blocks, blocks**2, (blocks != 0).astype(np.float32)), np.float32(0)
-    return jax.lax.reduce(terms, (zero, zero, zero), lambda one, other: tuple(map(operator.add, one, other)), (1, 3))
-
-
-def _coarser(grid: np.ndarray, factor: int) -> np.ndarray:
+def coarser(grid: Float[np.ndarray, "H W C"], factor: int) -> Float[np.ndarray, "R Q C"]:
+    """Sums over blocks of so many pixels on a side."""
     padded = np.pad(grid, np.array([(0, -grid.shape[0] % factor), (0, -grid.shape[1] % factor), (0, 0)]))
     # Rows first: their sums are as long as the picture is wide.
     rows = padded.reshape(-1, factor, padded.shape[1] * padded.shape[2]).sum(axis=1, dtype=np.float64)
