@@ -25,7 +25,7 @@ from fitting.light_colour import take_colour_out
 from fitting.likelihood import Bounds
 from fitting.problem import TOP, FitProblem, Target, has_pixel_areas
 from fitting.solver.devices import device_count
-from fitting.solver.normal_equations import FEW_VALUES
+from fitting.solver.normal_equations import COMPILER_OPTIONS, FEW_VALUES
 from fitting.solver.streams import Stream, each, joined
 
 # How many pixels are taken together; of a file at least as many rows as its blocks hold, or these are read twice.
@@ -203,7 +203,8 @@ def _observe(
     """Tiles, rounding, brightest value, pixels left out, and what is shown: see `Observed`."""
     dtype, noise, dark = np.dtype(problem.precision), problem.noise, problem.dark
     height, width = target.pixels.shape[:2]
-    bands = _bands(target, brdf.cast(scene, problem.precision), dtype, mask, at_once or noise is not None)
+    grey = brdf.cast(grey, problem.precision)
+    bands = _bands(target, grey, dtype, mask, at_once or noise is not None)
     level = target.saturation if problem.saturation is None else problem.saturation
     found, total = _statistics(bands, level, dark, keep=not target.streamed)
     reach = SINGLE if dtype == np.float32 else DOUBLE
@@ -213,11 +214,10 @@ def _observe(
         raise InputError("target", came, "Bring it nearer to 1 (another exposure), or fit in float64")
     # Where all share one value nothing is below it: it is a constant, not a level.
     if level is None and total.largest > 0 and SYMMETRIC_PIXELS < total.top < total.counts[2] and scene.lights:
-        level = _plateau(bands, found, float(total.largest), scene)
+        level = _plateau(bands, found, float(total.largest), grey)
         if level is not None:
             found, total = _statistics(bands, level, dark, keep=not target.streamed)
     left_out = _left_out(total, height * width, level, dark, masked=mask is not None)
-    grey = brdf.cast(grey, problem.precision)
 
     # Other losses, dark levels and steps of 0 are ways of one's own to say what pixels say.
     plain = dark is None and problem.loss == "squared" and not target.least_squares
@@ -322,15 +322,33 @@ def _count(values: Any, seen: Any, allowed: Any, level: float, dark: float, *, x
     """Which pixels count, and what there is to know of them, in NumPy or JAX."""
     brightest = _over_channels(xp.maximum, values)
     finite = allowed & xp.isfinite(_over_channels(xp.add, values))
-    largest = xp.max(xp.where(finite, brightest, -xp.inf))
     below = finite & (brightest < level)
     good = below & (brightest > dark)
-    counts = xp.stack([xp.count_nonzero(some) for some in (seen, allowed, finite, below, good)])
-    top = xp.count_nonzero(finite & (brightest >= largest * TOP))
-    return good, Statistics(counts, largest, top, xp.max(xp.where(good[:, None], xp.abs(values), 0), axis=0))
+    masks, bright = (seen, allowed, finite, below, good), xp.where(finite, brightest, -xp.inf)
+    sizes = [xp.where(good, xp.abs(values[:, channel]), 0) for channel in range(values.shape[1])]
+    if xp is np:
+        counts, largest, scale = list(map(np.count_nonzero, masks)), np.max(bright), list(map(np.max, sizes))
+    else:
+        counts, largest, scale = _totals(masks, bright, sizes)
+    top = xp.count_nonzero(bright >= largest * TOP)
+    return good, Statistics(xp.stack(counts), largest, top, xp.stack(scale))
 
 
-_count_many = jax.jit(partial(_count, xp=jnp))
+def _totals(masks: Sequence[Array], bright: Array, sizes: Sequence[Array]) -> tuple[list[Array], Array, list[Array]]:
+    """Counts and largest values, in one loop as in `fitting.solver.normal_equations`."""
+    terms = [*(mask.astype(np.int32) for mask in masks), bright, *sizes]
+    start = [np.full((), -np.inf if term is bright else 0, term.dtype) for term in terms]
+    combine = [jnp.add] * len(masks) + [jnp.maximum] * (1 + len(sizes))
+
+    def both(one: tuple[Array, ...], other: tuple[Array, ...]) -> tuple[Array, ...]:
+        return tuple(add(*parts) for add, *parts in zip(combine, one, other, strict=True))
+
+    found = jax.lax.reduce(tuple(terms), tuple(start), both, (0,))
+    count = len(masks)
+    return list(found[:count]), found[count], list(found[count + 1 :])
+
+
+_count_many = jax.jit(partial(_count, xp=jnp), compiler_options=COMPILER_OPTIONS)
 
 
 def _plateau(

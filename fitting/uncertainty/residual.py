@@ -135,9 +135,12 @@ def _neighbours(image: Float[np.ndarray, "H W C"], most: int) -> Float[np.ndarra
     rows = np.unique(np.linspace(0, max(height - 2, 0), max(FEWEST_ROWS, most // (2 * width))).astype(int))
     some, found = image[rows], np.zeros((4, channels))
     for one, other in ((some[:, :-1], some[:, 1:]), (some, image[np.minimum(rows + 1, height - 1)])):
-        both = (one != 0) & (other != 0) & (height > 1 or one is not some)
-        parts = one * other, one**2, other**2, both
-        found += [np.sum(part, axis=(0, 1), where=both, dtype=float) for part in parts]
+        if height == 1 and one is some:
+            continue
+        both = (one != 0) & (other != 0)
+        one, other = one * both, other * both
+        products = (np.einsum("hwc,hwc->c", *pair) for pair in ((one, other), (one, one), (other, other)))
+        found += [*products, np.count_nonzero(both, axis=(0, 1))]
     return found
 
 
