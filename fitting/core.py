@@ -227,10 +227,11 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
     else:
         known = survey(best.pictures, seen.widths, best.optimum, noise, seen.rounding)
         inflation = known.neighbours.inflation
-        if known.noise is not None:
+        growing = known.growing_noise(noise, seen.rounding)
+        if growing is not None:
             # Each pixel by its own variance, or noise in bright pixels would pass for a highlight.
             for name, fit in fits.items():
-                parts = weighted_sums(fit.pictures, fit.optimum, known.noise, inverse=True)
+                parts = weighted_sums(fit.pictures, fit.optimum, growing, inverse=True)
                 whitened[name] = join_channels(parts.gram, parts.product, parts.square, fit.optimum.x[2])
     if seen.copies:
         inflation *= np.sqrt(seen.colour.size)

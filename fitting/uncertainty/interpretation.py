@@ -33,7 +33,7 @@ from fitting.uncertainty.covariance import (
 from fitting.uncertainty.highlight import OFF_CENTRE, Highlight, highlight
 from fitting.uncertainty.intervals import exponent_interval
 from fitting.uncertainty.noise_model import weighted_sums
-from fitting.uncertainty.residual import Residual, survey
+from fitting.uncertainty.residual import Neighbours, Residual, survey
 from fitting.uncertainty.structure import (
     SIZES,
     Blocks,
@@ -50,6 +50,10 @@ from fitting.uncertainty.structure import (
 ROUNDED = 0.5
 # So little of the brightest value is the arithmetic of the program that drew it, whose errors go together.
 ARITHMETIC = 2.0**-15
+GROWING = (
+    "the noise grows with brightness; the errors allow for it, but {}: told of the camera's noise, or with the "
+    "relative loss, the same picture says more"
+)
 # An interval of n wider than this factor says nothing but its order of magnitude.
 WIDEST_INTERVAL = 100.0
 
@@ -74,10 +78,10 @@ def interpret(
     lobe = None if optimum.flat else highlight(pictures, optimum.n, left)
     visible = 0.0 if lobe is None else lobe.share(optimum.x, seen.brightest)
     resolution = RESOLUTION if fit.single else 0.0
-    spread, shared, widening, deviation, together, gain, joined = None, None, 1.0, noise, None, 0.0, None
+    spread, shared, widening, deviation, gain, joined, growing = None, None, 1.0, noise, 0.0, None, None
     if fit.evidence is not None:
         # Each working target has the noise 1; what least squares leaves is rounding, which goes together.
-        said, left = fit.evidence, left._replace(neighbours=left.neighbours._replace(significant=False), noise=None)
+        said, left = fit.evidence, left._replace(neighbours=left.neighbours._replace(significant=False))
         # Of a small highlight the pixels near an edge may tell next to nothing.
         gain = specular_gain(optimum.normal(noise**2).gram, optimum.x)
         fit, optimum, deviation = fit._replace(pictures=said.pictures, optimum=said.optimum), said.optimum, noise**0
@@ -90,12 +94,13 @@ def interpret(
             joined = said.together.gram
             gain = max(gain, specular_gain(joined, optimum.x))
     else:
-        together = _structure(left, seen, noise > 2 * rounding)
+        growing = left.growing_noise(noise, rounding)
+        together = _structure(left, seen, noise > 2 * rounding, even=growing is None)
         # What a bound of the material leaves is no error of the pixels.
         if together is not None and together.significant and not fit.capped:
             shared = _scattered(pictures, optimum, _left(pictures, seen, optimum), alone_covariance(optimum, fit.tied))
-    if fit.evidence is None and shared is None and left.noise is not None:
-        spread = fit.noise_factor**2 * weighted_sums(pictures, optimum, left.noise, inverse=False).gram
+    if shared is None and growing is not None:
+        spread = fit.noise_factor**2 * weighted_sums(pictures, optimum, growing, inverse=False).gram
     # What the light reaches but the simplest model does without is 0, with the error that it would have.
     reached = seen.reached(fit.model)
     sure = uncertainty(
@@ -130,7 +135,9 @@ def interpret(
     correlation = sure.correlation[np.ix_(index, index)]
     warnings = [_capped(material)] if fit.capped else []
     weighed = seen.problem.noise is not None or any(one is not None for one in seen.problem.weights)
-    warnings += _warnings(left, together, None if all(sure.reasons[2]) else lobe, weighed)
+    warnings += _warnings(left.neighbours, together, None if all(sure.reasons[2]) else lobe)
+    if growing is not None:
+        warnings.append(GROWING.format("the weights do not" if weighed else "pixels are weighed alike"))
     if sure.sums:
         words = "no more than a sum of several numbers is determined, see there: the material shows it with "
         words += f"{100 * AMBIENT_SHARE:g} % of it as ambient light, if there is any, and the rest as k_d. "
@@ -161,30 +168,32 @@ def shared_errors(
         covariance: see `fitting.uncertainty.structure.scatter`.
     """
     lossy = any(tile.bounds is not None and tile.bounds.lossy for tile in seen.tiles)
-    errors = list(map(errors_of, said.pictures, itertools.repeat(said.optimum), said.places))
+    few, some = said.noise < ROUNDED, slice(1 if seen.copies else None)
+    errors = map(errors_of, said.pictures, itertools.repeat(said.optimum), said.places)
     if lossy:
         # The pixels of a block err together in any case.
+        errors = list(errors)
         together = structure([over_blocks(of_blocks(_once(one, seen)), 2) for one in errors], (2, 4))
     else:
         # With little noise few values say much.
-        few, some = said.noise < ROUNDED, slice(1 if seen.copies else None)
-        grids = (
-            [_scores(*one) for one in said.scores]
-            if few and said.scores
-            else [over_blocks(one, SIZES[0]) for one in errors]
-        )
+        if said.scores:
+            errors = list(errors)
+            grids = [_scores(*one) for one in said.scores] if few else [over_blocks(one, SIZES[0]) for one in errors]
+        else:
+            unit = np.ones(seen.colour.size)
+            grids = survey(said.pictures, seen.widths, said.optimum, unit, 0 * unit).blocks
         together = structure([grid.channels(some) for grid in grids], even=not few)
     if not (lossy or together.significant):
         return None, together
     return _scattered(said.pictures, said.optimum, errors, covariance), together
 
 
-def _structure(left: Residual, seen: Observed, tell: Bool[np.ndarray, " C"]) -> Structure | None:
+def _structure(left: Residual, seen: Observed, tell: Bool[np.ndarray, " C"], *, even: bool) -> Structure | None:
     """That of a fit by least squares; None where it cannot be told, or weights are part of what is fitted."""
     if device_count() > 1 or seen.problem.loss != "squared" or not tell.any():
         return None
     some = np.flatnonzero(tell)[: 1 if seen.copies else None]
-    return structure([grid.channels(some) for grid in left.blocks], even=left.noise is None)
+    return structure([grid.channels(some) for grid in left.blocks], even=even)
 
 
 def _scores(score: np.ndarray, information: np.ndarray, place: tuple[np.ndarray, int]) -> Blocks:
@@ -302,8 +311,8 @@ def _capped(material: brdf.Material) -> str:
     )
 
 
-def _warnings(left: Residual, together: Structure | None, seen: Highlight | None, weighed: bool) -> Iterator[str]:
-    known, shared = left.neighbours, together is not None and together.significant
+def _warnings(known: Neighbours, together: Structure | None, seen: Highlight | None) -> Iterator[str]:
+    shared = together is not None and together.significant
     if known.significant or shared:
         words = "the residual has structure: neighbouring pixels err alike"
         if known.correlation > 0.05:
@@ -315,12 +324,6 @@ def _warnings(left: Residual, together: Structure | None, seen: Highlight | None
         else:
             words += f"The errors are too small, by a factor of {known.inflation:.2g} or more"
         yield words
-    if left.noise is not None:
-        how = "the weights do not" if weighed else "pixels are weighed alike"
-        yield (
-            f"the noise grows with brightness; the errors allow for it, but {how}: told of the camera's noise, or with "
-            "the relative loss, the same picture says more"
-        )
     if seen is not None and seen.smaller_than_pixel:
         # Below this share of the peak the distance from the centre says more than the number of pixels.
         amount = f"the nearest pixel shows {100 * seen.centre:.2g} % of its peak"

@@ -52,16 +52,24 @@ class Residual(NamedTuple):
     Attributes:
         blocks: sums over the smallest blocks, of each picture.
         neighbours: correlation of channels whose noise is more than rounding.
-        noise: how the noise grows with brightness, see `fitting.uncertainty.noise_model`; None where it does not.
+        errors: of some pixels that count, (M, C).
+        values: that the model shows there.
         largest: value of the lobe in any pixel that counts.
         carrying: how many pixels carry the highlight: the sum of its squares over the largest, over all pictures.
     """
 
     blocks: list[Blocks]
     neighbours: Neighbours
-    noise: Float[np.ndarray, "C 3"] | None
+    errors: Float[np.ndarray, "M C"]
+    values: Float[np.ndarray, "M C"]
     largest: float
     carrying: float
+
+    def growing_noise(
+        self, noise: Float[np.ndarray, " C"], rounding: Float[np.ndarray, " C"]
+    ) -> Float[np.ndarray, "C 3"] | None:
+        """How the noise grows with brightness, see `fitting.uncertainty.noise_model`; None where it does not."""
+        return noise_model(self.errors * noise, self.values, rounding)
 
 
 def survey(
@@ -98,8 +106,7 @@ def survey(
         values.append(shown[::stride][counts])
         largest, carrying = max(largest, float(top)), carrying + float(squares)
     error, value = (np.concatenate(parts).astype(np.float64) for parts in (errors, values))
-    growing = noise_model(error * noise, value, rounding)
-    return Residual(blocks, _going_together(pairs, noise > 2 * rounding), growing, largest, carrying)
+    return Residual(blocks, _going_together(pairs, noise > 2 * rounding), error, value, largest, carrying)
 
 
 def neighbours_of(images: Sequence[Float[np.ndarray, "H W C"]]) -> Neighbours:
