@@ -274,7 +274,8 @@ def _of_planes(pictures: Sequence[Picture], at: Estimate, problem: "_Separable")
 def _optimum(working: Sequence[Picture], fit: ModelFit, at: Numbers) -> Optimum:
     """The optimum of the least squares that takes Newton's step, at which it rests."""
     lobe = bool(fit.free[2].any())
-    parts = Subsample(list(working), [None] * len(working), 0.0).sums(np.log([at.n]), 0.0)
+    whole = Subsample(list(working), [None] * len(working), 0.0)
+    parts = whole.sums(whole.lobes(np.log([at.n]), 0.0))
     # By n, not by its logarithm.
     about = Sums(*(leaf[0] for leaf in parts)).columns(np.diag([1.0, 1.0, lobe, lobe / at.n]))
     cost, flat = np.maximum(about.about(-at.x.T).square, 0.0), not np.any(at.x[2] > 0)

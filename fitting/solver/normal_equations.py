@@ -16,6 +16,7 @@ pixels, which is put back in float64: a surface that is lit alike all over, whos
 ambient one, would else seem to differ from it by the rounding of the sums.
 """
 
+import functools
 import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -150,7 +151,7 @@ class Picture:
         above = np.asarray(self.weight) > 0
         return above if above.ndim == 1 else in_any_channel(above)
 
-    @property
+    @functools.cached_property
     def nearest_peak(self) -> float:
         """The largest logarithm of the lobe's cosine of any pixel that counts; minus infinity without a lobe."""
         if self.lobe is None:

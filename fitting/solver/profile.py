@@ -41,7 +41,7 @@ from fitting.solver.refinement import (
     solve_linear,
 )
 from fitting.solver.streams import Stream
-from fitting.solver.subsample import Subsample, subsample
+from fitting.solver.subsample import Lobes, Subsample, subsample
 from fitting.solver.tied import NormalEquations, join_channels
 
 # Six standard deviations: one wrong rejection in 1e9, and the variance itself is an estimate.
@@ -136,7 +136,8 @@ def search(
             return _optimum(*gauss_newton(problem, start), problem)
         problem = problem._replace(peak=-sample.nearest)
         log_n = np.linspace(lower, upper, max(2, 1 + math.ceil((upper - lower) / GRID_STEP)))
-        few = sample.sums(log_n, problem.peak)
+        lobes = sample.lobes(log_n, problem.peak)
+        few = sample.sums(lobes)
         profile = solve_linear(few, log_n, np.zeros(problem.free.shape), problem)
         about = np.exp(log_n), profile.cost.sum(axis=1), not sample.whole
         rough = _without_lobe(few)
@@ -148,7 +149,7 @@ def search(
             return _optimum(*gauss_newton(problem, Point(*(leaf[0] for leaf in profile))), problem, *about)
         minimum = gauss_newton if cap is None else capped_minimum
         if not sample.whole:
-            error = _sampling_errors(profile, sample, problem.peak)
+            error = _sampling_errors(profile, sample, lobes)
             position, lowest, possible = _cells(profile, error)
             cell = int(np.argmin(lowest))
             first, last = np.flatnonzero(possible)[[0, -1]]
@@ -229,13 +230,13 @@ def _resolved(profile: Point, few: Sums, rough: np.ndarray) -> bool:
     return bool(rounding <= UNRESOLVED * max(rise, noise))
 
 
-def _sampling_errors(profile: Point, sample: Subsample, peak: float) -> np.ndarray:
+def _sampling_errors(profile: Point, sample: Subsample, lobes: Sequence[Lobes]) -> np.ndarray:
     """Standard deviation of a subsample's cost relative to its best sample, over the grid."""
     size, best = profile.log_n.size, int(np.argmin(profile.cost.sum(axis=1)))
     # It varies slowly; every fourth sample will do, and those about the best.
     near = np.clip(np.arange(best - 2, best + 3), 0, size - 1)
     few = np.unique(np.concatenate([np.arange(0, size, 4), near, [size - 1]]))
-    variance = sample.spread(profile.log_n[few], profile.x[few], int(np.searchsorted(few, best)), peak)
+    variance = sample.spread(lobes, few, profile.x[few], int(np.searchsorted(few, best)))
     return np.interp(profile.log_n, profile.log_n[few], np.sqrt(variance))
 
 

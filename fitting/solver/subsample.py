@@ -8,7 +8,7 @@ So few pixels are dealt with on the host, in float64: nothing is compiled for th
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple, cast
@@ -32,8 +32,8 @@ _EXCLUDED = 255
 # No more terms than this, pixels times light samples, of one picture.
 _TERMS = 1 << 20
 
-# Lobes are evaluated at so many values at a time, which stay in the second-level cache.
-_VALUES = 1 << 16
+# Lobes are evaluated at so many values at a time.
+_VALUES = 1 << 18
 
 
 class Subsample(NamedTuple):
@@ -54,55 +54,34 @@ class Subsample(NamedTuple):
         """Every pixel that counts was kept."""
         return all(factor is None for factor in self.factor)
 
-    def sums(self, log_n: Float[np.ndarray, " N"], peak: float) -> Sums:
+    def lobes(self, log_n: Float[np.ndarray, " N"], peak: float) -> list["Lobes"]:
+        """Of each picture the lobe at some exponents.
+
+        Args:
+            log_n: Natural logarithms of the exponents.
+            peak: See :class:`brdf.lobes.Lobe`.
+        """
+        return [_lobes(part, log_n, peak) for part in self.parts]
+
+    def sums(self, lobes: Sequence["Lobes"]) -> Sums:
         """What `fitting.solver.normal_equations.sums` gives for all pixels, the reference being 0."""
-        totals: list[Sums] = []
-        for part in self.parts:
-            weight = part.weights.astype(np.float64)
-            target = np.where(weight > 0, part.target, 0.0).astype(np.float64)
-            diffuse = part.diffuse.astype(np.float64)
-            groups = 1 if diffuse.shape[1] == weight.shape[1] == 1 else target.shape[1]
-            gram = np.zeros((log_n.size, groups, 4, 4))
-            product = np.zeros((log_n.size, target.shape[1], 4))
-            for index, value, slope in _lobes(part, log_n, peak):
-                for group in range(groups):
-                    own = slice(None) if groups == 1 else slice(group, group + 1)
-                    heavy = weight[:, min(group, weight.shape[1] - 1)]
-                    ambient, lit, *moving = (
-                        one[..., min(group, one.shape[-1] - 1)] for one in (part.ambient, diffuse, value, slope)
-                    )
-                    still = np.stack(np.broadcast_arrays(ambient, lit))
-                    fixed = heavy * np.concatenate([still, target[:, own].T])
-                    gram[index, group, :2, :2], product[index, own, :2] = fixed[:2] @ still.T, fixed[2:] @ still.T
-                    for row, moved in enumerate(moving, 2):
-                        by_fixed = moved @ fixed.T
-                        gram[index, group, row, :2] = gram[index, group, :2, row] = by_fixed[:, :2]
-                        product[index, own, row] = by_fixed[:, 2:]
-                        for column, other in enumerate(moving[: row - 1], 2):
-                            both = np.einsum("nm,nm,m->n", moved, other, heavy)
-                            gram[index, group, row, column] = gram[index, group, column, row] = both
-            pixels = np.broadcast_to(np.count_nonzero(weight, axis=0), target.shape[1])
-            square = np.sum(weight * target**2, axis=0)
-            whole = np.broadcast_to(gram, (*product.shape, 4))
-            totals.append(Sums(whole, product, *np.broadcast_arrays(square, pixels, product[..., 0])[:2]))
+        totals = map(_sums, self.parts, lobes)
         return Sums(*(np.sum(leaf, axis=0) for leaf in zip(*totals, strict=True)))
 
-    def spread(
-        self, log_n: Float[np.ndarray, " N"], x: Float[np.ndarray, "N C 3"], best: int, peak: float
-    ) -> np.ndarray:
+    def spread(self, lobes: Sequence["Lobes"], few: np.ndarray, x: Float[np.ndarray, "N C 3"], best: int) -> np.ndarray:
         """How far the subsample's profile may be from that of all pixels.
 
         Args:
-            log_n: Natural logarithms of some exponents.
-            x: Best coefficients at each.
+            lobes: At all exponents.
+            few: Which of these to look at.
+            x: Best coefficients at each of them.
             best: Which to compare with.
-            peak: See :class:`brdf.lobes.Lobe`.
 
         Returns:
             Horvitz-Thompson variances of the cost at each exponent minus that at the best.
         """
-        total = np.zeros(log_n.size)
-        for part, factor in zip(self.parts, self.factor, strict=True):
+        total = np.zeros(few.size)
+        for part, factor, lobe in zip(self.parts, self.factor, lobes, strict=True):
             if factor is None:
                 continue
             # A pixel that was certain to be kept adds nothing to the uncertainty.
@@ -113,29 +92,58 @@ class Subsample(NamedTuple):
             target = np.where(part.weights > 0, part.target, 0.0)
             scale = float(np.max(np.abs(target), initial=0.0)) or 1.0
             target, weight, diffuse = (a.T.astype(np.float32) for a in (target / scale, part.weights, part.diffuse))
-            value = np.concatenate([value for _, value, _ in _lobes(part, log_n, peak)])
+            value = lobe.value[np.ix_(few, np.arange(len(lobe.value[0])), unsure)].astype(np.float32)
             x_a, x_d, x_s = (x / scale).astype(np.float32).transpose(2, 0, 1)[..., None]
             still = x_a * np.asarray(part.ambient, np.float32)[:, None] + x_d * diffuse
-            residual = target - still - x_s * value.astype(np.float32).swapaxes(1, 2)
+            residual = target - still - x_s * value
             rise = (residual - residual[best]) * (residual + residual[best]) * weight
             total += scale**4 * np.sum(rise, axis=1, dtype=np.float64) ** 2 @ chance
         return total
 
 
-def _lobes(part: Picture, log_n: np.ndarray, peak: float) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
-    """Values and derivatives by log n of the lobe, (N, M, Cb), some exponents at a time."""
+class Lobes(NamedTuple):
+    """The lobe of some pixels at some exponents, and its derivative by log n."""
+
+    value: Float[np.ndarray, "N Cb M"]
+    slope: Float[np.ndarray, "N Cb M"]
+
+
+def _lobes(part: Picture, log_n: np.ndarray, peak: float) -> Lobes:
     lobe = part.lobe
     if lobe is None:
-        nothing = np.zeros((log_n.size, *part.diffuse.shape))
-        yield slice(None), nothing, nothing
-        return
+        return Lobes(*2 * [np.zeros((log_n.size, *part.diffuse.T.shape))])
     values = sum(leaf.size for leaf in jax.tree.leaves((lobe.kept, lobe.fine)))
-    step = max(1, _VALUES // max(values, 1))
-    for first in range(0, log_n.size, step):
-        index = slice(first, first + step)
-        n = np.exp(log_n[index])[:, None, None]
+    step, found = max(1, _VALUES // max(values, 1)), []
+    for n in np.split(np.exp(log_n), range(step, log_n.size, step)):
+        n = n[:, None, None]
         value, slope = map(np.asarray, lobe(cast(Any, n), peak))
-        yield index, value, slope * n
+        found.append((value.swapaxes(1, 2), (slope * n).swapaxes(1, 2)))
+    return Lobes(*map(np.concatenate, zip(*found, strict=True)))
+
+
+def _sums(part: Picture, lobes: Lobes) -> Sums:
+    weight = part.weights.T.astype(np.float64)
+    target = np.where(weight > 0, part.target.T, 0.0).astype(np.float64)
+    diffuse = part.diffuse.T.astype(np.float64)
+    channels, exponents, shared = len(target), len(lobes.value), len(diffuse) == len(weight) == 1
+    gram, product = np.zeros((exponents, channels, 4, 4)), np.zeros((exponents, channels, 4))
+    for group in range(1 if shared else channels):
+        own = slice(None) if shared else slice(group, group + 1)
+        heavy, lit, ambient = (one[min(group, len(one) - 1)] for one in (weight, diffuse, part.ambient))
+        moving = [one[:, min(group, one.shape[1] - 1)].astype(np.float64) for one in lobes]
+        columns = np.stack([np.full_like(lit, ambient), lit, *target[own]])
+        fixed = heavy * columns
+        gram[:, own, :2, :2], product[:, own, :2] = fixed[:2] @ columns[:2].T, fixed[2:] @ columns[:2].T
+        for row, moved in enumerate(moving, 2):
+            across = moved @ fixed.T
+            gram[:, own, row, :2] = gram[:, own, :2, row] = across[:, None, :2]
+            product[:, own, row] = across[:, 2:]
+            weighted = moved * heavy
+            for column in range(2, row + 1):
+                both = np.einsum("nm,nm->n", weighted, moving[column - 2])
+                gram[:, own, row, column] = gram[:, own, column, row] = both[:, None]
+    pixels, square = np.count_nonzero(weight, axis=1), np.sum(weight * target**2, axis=1)
+    return Sums(gram, product, *(np.broadcast_to(one, (exponents, channels)) for one in (square, pixels)))
 
 
 def subsample(pictures: Sequence[Picture]) -> Subsample:
