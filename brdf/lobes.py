@@ -5,25 +5,25 @@ are taken tile by tile, which also keeps a tile in the processor's cache while i
 """
 
 import dataclasses
+import functools
 import math
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from brdf.checks import Scalar, Vector
-from brdf.geometry.base import Shape
-from brdf.geometry.surface_points import SurfacePoints
+from brdf.checks import Scalar
+from brdf.geometry.rays import Sight
+from brdf.geometry.surface_points import Points, SurfacePoints
 from brdf.geometry.visibility import share_seen
 from brdf.lights.base import Light, Lighting
 from brdf.models.base import Material, SpecularMaterial
-from brdf.models.one_of import Model, OneOf, has_lobe
+from brdf.models.one_of import OneOf
 from brdf.vectors import BELOW_HORIZON, Components, divide, dot, quadratic_form, square_root
 
 STORED_SAMPLES = 4
@@ -47,28 +47,41 @@ NO_LOBE = -1e9
 
 
 class LightTerms(NamedTuple):
-    """What one light sample adds to the basis images at one point.
+    """What light samples of strength 1 add to the basis images at some points.
 
     Attributes:
-        diffuse: I (N·L)+, (C,).
-        weight: I, times N·L where the model says so, 0 where the lobe is gated, (C,).
+        diffuse: (N·L)+ times the share of the light that arrives.
+        weight: that share, times N·L where the model says so, 0 where the lobe is gated.
         log_cosine: logarithm of the lobe's cosine; 0 where the lobe is gated.
     """
 
-    diffuse: Float[Array, "*pixels C"]
-    weight: Float[Array, "*pixels C"]
-    log_cosine: Float[Array, "*pixels"]
+    diffuse: Float[Array, "S P"]
+    weight: Float[Array, "S P"]
+    log_cosine: Float[Array, "S P"]
 
 
 def light_terms(
-    model: Model,
-    occluders: tuple[Shape, ...],
+    model: OneOf,
+    lighting: Lighting,
+    point: Points,
     kind: type[Light],
-    row: tuple[Array, ...],
-    light: Int[Array, ""],
-    point: SurfacePoints,
+    numbers: tuple[Array, ...],
+    nodes: tuple[Array, ...],
+    light: Int[Array, " S"],
 ) -> LightTerms:
-    """The terms at one point of one sample, a row of a stack, of the scene's light of that number."""
+    """The terms of samples of a light.
+
+    Args:
+        model: the class of the material.
+        lighting: with the shapes that cast shadows.
+        point: (P,).
+        kind: of light.
+        numbers: of the light, (...) each.
+        nodes: of its samples, (S, ...) each.
+        light: which of the scene's lights each of them is.
+    """
+    row = (*(_in_components(values[None]) for values in numbers), *map(_in_components, nodes))
+    row = tuple(1.0 if place in kind.emits else part for place, part in enumerate(row))
     sample = kind.sample(point, *row)
     if sample.moments is None:
         cosine, above = dot(point.normal, sample.to_light), 1.0
@@ -76,22 +89,32 @@ def light_terms(
         cosine, above = patch_cosine(point.normal, *sample.moments)
     lit = point.mask & (cosine > 0)
     intensity = sample.intensity
-    if occluders:
-        intensity = intensity * share_seen(occluders, point, sample.to_light, sample.distance, sample.radius)
+    if lighting.occluders:
+        seen = share_seen(lighting.occluders, point, sample.to_light, sample.distance, sample.radius)
+        intensity = intensity * seen
     if point.visibility is not None:
-        intensity = intensity * point.visibility[light]
+        intensity = intensity * point.visibility[:, light].T
     matt = lit if sample.lobe_only is None else lit & (sample.lobe_only == 0)
     diffuse = intensity * jnp.where(matt, cosine, 0)
-    if not has_lobe(model):
-        return LightTerms(diffuse, 0.0 * diffuse, jnp.zeros_like(cosine))
-    log_cosine = model.log_cosine(point.normal, sample.to_light, point.to_view)
-    glossy = lit if sample.lobe_only is None else lit & (sample.lobe_only > 0)
-    shines = glossy & (dot(point.normal, point.to_view) > 0) & (log_cosine > 0.5 * BELOW_HORIZON)
-    weight = intensity * jnp.where(shines, jnp.where(model.cosine_weighted, cosine, above), 0)
-    return LightTerms(diffuse, weight, jnp.where(shines, log_cosine, 0))
+    weight, log_cosine = jnp.zeros_like(diffuse), jnp.zeros_like(diffuse)
+    if model.lobes:
+        log_cosine = model.log_cosine(point.normal, sample.to_light, point.to_view)
+        glossy = lit if sample.lobe_only is None else lit & (sample.lobe_only > 0)
+        shines = glossy & (dot(point.normal, point.to_view) > 0) & (log_cosine > 0.5 * BELOW_HORIZON)
+        weight = intensity * jnp.where(shines, jnp.where(model.cosine_weighted, cosine, above), 0)
+        log_cosine = jnp.where(shines, log_cosine, 0)
+    shape = light.size, point.mask.size
+    return LightTerms(*(jnp.broadcast_to(part, shape) for part in (diffuse, weight, log_cosine)))
 
 
-def patch_cosine(normal: Vector, mean: Vector, covariance: Float[Array, "3 3"]) -> tuple[Scalar, Scalar]:
+def _in_components(values: Array) -> Any:
+    """Numbers of S samples as (S, 1), vectors as components of that form, a matrix as rows of such."""
+    if values.ndim == 3:
+        return tuple(map(_in_components, jnp.unstack(values, axis=1)))
+    return values[:, None] if values.ndim == 1 else Components.of(values[:, None])
+
+
+def patch_cosine(normal: Components, mean: Components, covariance: tuple[Components, ...]) -> tuple[Array, Array]:
     """Mean of (N·L)+ over a patch of the sky, and the share of its light above the horizon.
 
     Exact where the patch does not cross the horizon. Where it does, N·L is taken to be spread by the parabola
@@ -107,147 +130,138 @@ def patch_cosine(normal: Vector, mean: Vector, covariance: Float[Array, "3 3"]) 
     return jnp.where(crosses, partly, middle), jnp.where(crosses, share, 1.0)
 
 
-def sum_over_samples(
-    model: Model, points: SurfacePoints, lighting: Lighting, of_terms: Callable[[LightTerms], Any]
-) -> Any:
-    """Add up a function of one sample's terms at one point, linear in diffuse and weight, over all samples.
-
-    Args:
-        model: the class of the material.
-        points: (P,).
-        lighting: with at least one light.
-        of_terms: gives values without an axis of channels where it gets such; of any structure.
-
-    Returns:
-        The sums in that structure, (P, C) each.
-    """
-    if is_sampled(lighting):
-        return over_samples(model, points, lighting, of_terms)[0]
-
-    def at_point(point: SurfacePoints) -> Any:
-        total = None
-        for sample in lighting.each():
-            value = of_terms(light_terms(model, lighting.occluders, *sample, point))
-            total = value if total is None else jax.tree.map(jnp.add, total, value)
-        return total
-
-    return jax.vmap(at_point)(points)
-
-
 def is_sampled(lighting: Lighting) -> bool:
     """Whether the samples are so many that they are looped over."""
     return lighting.samples > STORED_SAMPLES
 
 
 def over_samples(
-    model: Model,
-    points: SurfacePoints,
+    model: OneOf,
+    points: Points,
     lighting: Lighting,
     of_terms: Callable[[LightTerms], Any],
     *,
     rough: bool = False,
 ) -> tuple[Any, Float[Array, " P"]]:
-    """Sums as of `sum_over_samples` for many samples, and the peak of the lobe.
+    """Add up a function of samples' terms, linear in diffuse and weight, times what the samples emit.
 
-    All is done for a tile of pixels and a chunk of samples at a time, which the processor's cache holds, with light of
-    strength 1; what a chunk's samples emit, in C channels, is multiplied with that as a matrix.
+    Of many samples all is done for a tile of pixels and a chunk of samples at a time, which the processor's cache
+    holds; what a chunk's samples emit is multiplied with that as a matrix.
+
+    Args:
+        model: the class of the material.
+        points: any.
+        lighting: with at least one light.
+        of_terms: gives (S, P) values, in any structure.
+        rough: whether products of vectors may be rounded; see `brdf.vectors.Components`.
+
+    Returns:
+        The sums in that structure, (P, C) each, and the peak of the lobe.
     """
-    occluders = tuple(_apart(shape) if shape.in_components else shape for shape in lighting.occluders)
-    channels = max(one.shape[-1] for stack in lighting.stacks for one in stack.spectra)
+    points, parts = points.flat(), []
+    if is_sampled(lighting):
+        return _by_tiles(partial(_over_tile, model, lighting, of_terms), points, rough)
+    for emitted, terms in _few_terms(model, points, lighting):
+        parts.append((jax.tree.map(partial(_times_emitted, emitted), of_terms(terms)), _peak(terms, emitted)))
+    return parts[0] if len(parts) == 1 else functools.reduce(_together, parts)
 
-    def of_tile(tile: Any) -> Any:
-        dtype = tile.normal.parts[0].dtype
 
-        def add(kind: type[Light], numbers: Any, light: Any, total: Any, chunk: tuple[Any, ...]) -> tuple[Any, None]:
-            nodes, emitted = chunk[:2]
-            shines = emitted.any(axis=1)
-            if light is not None:
-                shines &= nodes[kind.weighs].reshape(shines.size, -1).any(axis=1)
-            added = partial(add_lit, kind, numbers, light)
-            return jax.lax.cond(jnp.any(shines), added, lambda before, _: before, total, chunk), None
+def _together(one: tuple[Any, Array], other: tuple[Any, Array]) -> tuple[Any, Array]:
+    return jax.tree.map(jnp.add, one[0], other[0]), jnp.maximum(one[1], other[1])
 
-        def add_lit(kind: type[Light], numbers: Any, light: Any, total: Any, chunk: tuple[Any, ...]) -> Any:
-            nodes, emitted = chunk[:2]
-            row = (*map(_apart, numbers), *map(_chunk_apart, nodes))
-            grey: Any = tuple(1.0 if place in kind.emits else part for place, part in enumerate(row))
-            terms = light_terms(model, occluders, kind, grey, light if len(chunk) == 2 else chunk[2], tile)
-            terms = LightTerms(*(jnp.broadcast_to(part, (len(emitted), *tile.mask.shape)) for part in terms))
+
+def _few_terms(model: OneOf, points: Points, lighting: Lighting) -> Iterator[tuple[Array, LightTerms]]:
+    """What the samples of each light emit, (S, C), and their terms."""
+    for stack in lighting.stacks:
+        for index, emitted in enumerate(stack.emitted()):
+            one: Any = jax.tree.map(operator.itemgetter(index), (stack.numbers, stack.nodes, stack.light))
+            yield emitted, light_terms(model, lighting, points, stack.kind, *one)
+
+
+def _many_terms(model: OneOf, points: Points, lighting: Lighting) -> Iterator[tuple[Array, LightTerms]]:
+    """The same of all lights of a kind; all samples at once would be made in many steps of their own size."""
+    for stack in lighting.stacks:
+        nodes, light, emitted = stack.chunks(CHUNK)
+
+        def of_light(one: Any, kind: type[Light] = stack.kind) -> LightTerms:
+            numbers, *chunks = one
+            return jax.lax.map(lambda chunk: light_terms(model, lighting, points, kind, numbers, *chunk), (*chunks,))
+
+        terms = jax.lax.map(of_light, (stack.numbers, nodes, light))
+        yield emitted.reshape(-1, stack.channels), jax.tree.map(lambda leaf: leaf.reshape(-1, leaf.shape[-1]), terms)
+
+
+def _times_emitted(emitted: Float[Array, "S C"], value: Float[Array, "S P"]) -> Float[Array, "P C"]:
+    """The sum over samples of values times what they emit."""
+    if len(emitted) > STORED_SAMPLES:
+        return _emitted(emitted, value).T
+    return functools.reduce(operator.add, (one[:, None] * light for one, light in zip(value, emitted, strict=True)))
+
+
+def _peak(terms: LightTerms, emitted: Float[Array, "S C"]) -> Float[Array, " P"]:
+    shines = (terms.weight > 0) & jnp.any(emitted > 0, axis=1, keepdims=True)
+    return jnp.max(jnp.where(shines, terms.log_cosine, NO_LOBE), axis=0)
+
+
+def _over_tile(
+    model: OneOf, lighting: Lighting, of_terms: Callable[[LightTerms], Any], tile: Points
+) -> tuple[Any, Array]:
+    channels = max(stack.channels for stack in lighting.stacks)
+    nothing = jnp.zeros((channels, tile.mask.size), jnp.result_type(*tile.normal))
+
+    def add(total: Any, kind: type[Light], numbers: Any, nodes: Any, light: Array, emitted: Array) -> Any:
+        shines = jnp.any(emitted) & (True if kind.weighs is None else jnp.any(nodes[kind.weighs]))
+
+        def add_lit(total: Any) -> Any:
+            terms = light_terms(model, lighting, tile, kind, numbers, nodes, light)
             terms = jax.lax.optimization_barrier(terms)  # or each of the sums would make them anew
-            peak = jnp.max(jnp.where(emitted.max(axis=1, keepdims=True) > 0, _peak(terms), NO_LOBE), axis=0)
-            added = jax.tree.map(partial(_emitted, emitted), of_terms(terms))
-            return jax.tree.map(jnp.add, total[0], added), jnp.maximum(total[1], peak)
+            return _together(total, (jax.tree.map(partial(_emitted, emitted), of_terms(terms)), _peak(terms, emitted)))
 
-        nothing = jnp.zeros((channels, *tile.mask.shape), dtype)
-        shapes = jax.eval_shape(of_terms, LightTerms(*3 * [nothing[:1]]))
-        total = jax.tree.map(lambda _: nothing, shapes), jnp.full(tile.mask.shape, NO_LOBE, dtype)
-        for stack in lighting.stacks:
-            kind = stack.kind
-            if not stack.nodes:
-                chunks = _chunks((stack.numbers, stack.emitted(channels)[:, 0], stack.light))
-                total, _ = jax.lax.scan(jax.checkpoint(partial(add, kind, (), None)), total, chunks)
-                continue
+        return jax.lax.cond(shines, add_lit, lambda total: total, total)
 
-            def add_light(total: Any, one: Any, kind: type[Light] = kind) -> tuple[Any, None]:
-                numbers, light, *samples = one
-                step = jax.checkpoint(partial(add, kind, numbers, light))
-                return jax.lax.scan(step, total, _chunks(tuple(samples)))
+    shapes = jax.eval_shape(of_terms, LightTerms(*3 * [nothing[:1]]))
+    total = jax.tree.map(lambda _: nothing, shapes), jnp.full(tile.mask.shape, NO_LOBE, nothing.dtype)
+    return jax.tree.map(lambda leaf: leaf.T, over_chunks(add, lighting, CHUNK, total))
 
-            each = stack.numbers, stack.light, stack.nodes, stack.emitted(channels)
-            total, _ = jax.lax.scan(add_light, total, each)
-        return jax.tree.map(lambda leaf: leaf.T, total)
 
-    return _by_tiles(of_tile, points, rough)
+def over_chunks(add: Callable[..., Any], lighting: Lighting, size: int, total: Any) -> Any:
+    """Add up over all samples: ``add(total, kind, numbers, nodes, light, emitted)``, so many samples at a time."""
+    for stack in lighting.stacks:
+
+        def add_light(total: Any, one: Any, kind: type[Light] = stack.kind) -> tuple[Any, None]:
+            numbers, *chunks = one
+
+            @jax.checkpoint
+            def add_chunk(total: Any, chunk: Any) -> tuple[Any, None]:
+                return add(total, kind, numbers, *chunk), None
+
+            return jax.lax.scan(add_chunk, total, tuple(chunks))
+
+        total, _ = jax.lax.scan(add_light, total, (stack.numbers, *stack.chunks(size)))
+    return total
 
 
 def _emitted(emitted: Float[Array, "B C"], value: Float[Array, "B P"]) -> Float[Array, "C P"]:
-    """The sum over samples; a product with a matrix of one row would be slow."""
+    """The sum over samples of values times what they emit; a product with a matrix of one row would be slow."""
     rows = jnp.pad(emitted.T, ((0, max(0, ROWS - emitted.shape[1])), (0, 0)))
     return jnp.matmul(rows, value, precision="highest")[: emitted.shape[1]]
 
 
-def _apart(tree: Any) -> Any:
-    """Vectors in components."""
-    return jax.tree.map(lambda leaf: Components.of(leaf) if jnp.ndim(leaf) == 1 else leaf, tree)
-
-
-def _chunk_apart(values: Array) -> Any:
-    """Numbers of B samples as (B, 1), vectors as components of that form, a matrix as rows of such."""
-    if values.ndim == 3:
-        return tuple(map(_chunk_apart, jnp.unstack(values, axis=1)))
-    return values[:, None] if values.ndim == 1 else Components.of(values[:, None])
-
-
-def _chunks(samples: Any) -> Any:
-    """Arrays (S, ...) as (S / B, B, ...); samples of no light fill up the last chunk."""
-    count = jax.tree.leaves(samples)[0].shape[0]
-    chunks = -(-count // CHUNK)
-    size = -(-count // chunks)
-    index = np.minimum(np.arange(chunks * size), count - 1).reshape(chunks, size)
-    numbers, emitted, *light = jax.tree.map(lambda leaf: leaf[index], samples)
-    beyond = np.arange(chunks * size).reshape(chunks, size, 1) >= count
-    return numbers, jnp.where(beyond, 0, emitted), *light
-
-
-def _points_apart(points: SurfacePoints, rough: bool) -> Any:
-    """The vectors of (P,) points in components, and the lights that they see along the first axis."""
-    seen = None if points.visibility is None else points.visibility.T
-    plain = dataclasses.replace(points, visibility=None)
-    apart = jax.tree.map(lambda leaf: Components.of(leaf) if leaf.ndim == 2 else leaf, plain)
-    normal = dataclasses.replace(apart.normal, rough=rough)
-    return dataclasses.replace(apart, normal=normal, visibility=seen)
-
-
-def _by_tiles(of_tile: Callable[[SurfacePoints], Any], points: SurfacePoints, rough: bool) -> Any:
+def _by_tiles(of_tile: Callable[[Points], Any], points: Points, rough: bool) -> Any:
     """``of_tile`` of all points, tile by tile; the last point fills up the last tile."""
     count = points.mask.size
     tiles = -(-count // TILE)
     size = -(-count // tiles)
 
     def cut(leaf: Array) -> Array:
-        padded = jnp.pad(leaf, [(0, tiles * size - count)] + [(0, 0)] * (leaf.ndim - 1), mode="edge")
-        return padded.reshape(tiles, size, *leaf.shape[1:])
+        whole = leaf if leaf.ndim else jnp.broadcast_to(leaf, (count,))
+        padded = jnp.pad(whole, [(0, tiles * size - count)] + [(0, 0)] * (whole.ndim - 1), mode="edge")
+        return padded.reshape(tiles, size, *whole.shape[1:])
 
-    done = jax.lax.map(lambda tile: of_tile(_points_apart(tile, rough)), jax.tree.map(cut, points))
+    def of_cut(tile: Points) -> Any:
+        return of_tile(dataclasses.replace(tile, normal=dataclasses.replace(tile.normal, rough=rough)))
+
+    done = jax.lax.map(of_cut, jax.tree.map(cut, points))
     return jax.tree.map(lambda leaf: leaf.reshape(tiles * size, *leaf.shape[2:])[:count], done)
 
 
@@ -360,7 +374,9 @@ class Lobe:
                 value, slope = map(operator.add, (value, slope), parts)
         else:
             assert self.model is not None
-            value, slope = sum_over_samples(self.model, *self.source, partial(_relative, n, peak))
+            points, lighting = self.source
+            of_terms = partial(_relative, n, peak)
+            (value, slope), _ = over_samples(OneOf((self.model,)), points.in_components(), lighting, of_terms)
         if self.fine is None or self.share is None:
             return value, slope
         fine_value, fine_slope = (average(self.share, fine) for fine in self.fine(n, peak))
@@ -412,9 +428,9 @@ class Lobe:
             # Of one size for few numbers of pixels, or each would be compiled.
             padded = np.resize(pixel, 1 << max(pixel.size - 1, 0).bit_length())
             points = jax.tree.map(lambda leaf: np.asarray(leaf)[padded], self.source[0])
-            terms = _diffuse_and_kept(OneOf.of(self.model), points, self.source[1])[1].kept
+            terms: Any = _diffuse_and_kept(OneOf.of(self.model), points, self.source[1])[1]
             lobe = dataclasses.replace(
-                lobe, source=None, kept=jax.tree.map(lambda a: np.asarray(a)[: pixel.size], terms)
+                lobe, source=None, kept=jax.tree.map(lambda a: np.asarray(a)[: pixel.size], terms.kept)
             )
         if self.fine is None or self.share is None:
             return lobe
@@ -449,93 +465,50 @@ def _relative(n: Scalar, peak: Scalar | float, terms: LightTerms) -> tuple[Array
     return value, value * exponent
 
 
-def _peak(terms: LightTerms) -> Array:
-    return jnp.where(terms.weight > 0, terms.log_cosine, NO_LOBE)
-
-
 def average(weight: Float[Array, "K M"], values: Float[Array, "*N K*M C"]) -> Float[Array, "*N K C"]:
     """The mean of each pixel's points."""
     xp: Any = np if isinstance(values, np.ndarray) else jnp
     return xp.sum(weight[..., None] * values.reshape(*values.shape[:-2], *weight.shape, values.shape[-1]), axis=-2)
 
 
-def basis_program(
-    model: type[Material], points: SurfacePoints, lighting: Lighting
-) -> Callable[[], tuple[Float[Array, "P C"], Lobe | None]]:
-    """What makes the diffuse basis of P points, of any shape, and the specular one where the model has one."""
-    points = points.flat()
-    if not is_sampled(lighting):
-        return partial(_diffuse_and_terms, OneOf.of(model), points, lighting)
-    if issubclass(model, SpecularMaterial):
-        if _size(jax.eval_shape(partial(_stacked_terms, model, lighting), points)) <= STACKED_VALUES:
-            return partial(_diffuse_and_kept, OneOf.of(model), points, lighting)
-    return partial(_diffuse_and_peak, model, points, lighting)
+def basis_terms(model: type[Material], points: Sight, lighting: Lighting) -> tuple[Float[Array, "P C"], Lobe | None]:
+    """The diffuse basis of P points, of any shape, and the specular one where the model has one."""
+    values = (
+        math.prod(points.shape_of_picture) * lighting.samples * (1 + max(stack.channels for stack in lighting.stacks))
+    )
+    if is_sampled(lighting) and (values > STACKED_VALUES or not issubclass(model, SpecularMaterial)):
+        return _diffuse_and_peak(OneOf((model,)), points.stored().pixels(), lighting)
+    return _diffuse_and_kept(OneOf.of(model), points, lighting)
 
 
-@eqx.filter_jit
-def _diffuse_and_terms(model: Model, points: SurfacePoints, lighting: Lighting) -> tuple[Array, Lobe | None]:
-    diffuse: Any = 0.0
-    kept: tuple[Any, ...] = ()
-    for kind, row, light in lighting.each():
-        terms = jax.vmap(partial(light_terms, model, lighting.occluders, kind, row, light))(points)
-        diffuse, kept = diffuse + terms.diffuse, (*kept, (terms.weight[:, None], terms.log_cosine[:, None]))
-    return diffuse, Lobe.of_terms(kept) if has_lobe(model) else None
+@jax.jit
+def _diffuse_and_peak(model: OneOf, points: SurfacePoints, lighting: Lighting) -> tuple[Array, Lobe | None]:
+    diffuse, peak = over_samples(model, points.in_components(), lighting, lambda terms: terms.diffuse)
+    return diffuse, Lobe(peak, model.lobes[0], source=(points, lighting)) if model.lobes else None
 
 
-@eqx.filter_jit
-def _diffuse_and_peak(model: type[Material], points: SurfacePoints, lighting: Lighting) -> tuple[Array, Lobe | None]:
-    diffuse, peak = over_samples(model, points, lighting, lambda terms: terms.diffuse)
-    lobe = Lobe(peak, model, source=(points, lighting)) if issubclass(model, SpecularMaterial) else None
-    return diffuse, lobe
+@jax.jit
+def _diffuse_and_kept(model: OneOf, points: Sight, lighting: Lighting) -> tuple[Array, Lobe | None]:
+    flat, diffuse, kept = points.in_components().flat(), jnp.zeros(()), []
+    for emitted, terms in (_many_terms if is_sampled(lighting) else _few_terms)(model, flat, lighting):
+        diffuse = diffuse + _times_emitted(emitted, terms.diffuse)
+        one = terms.weight.T[..., None] * emitted, terms.log_cosine.T
+        # Of few samples each is an array of its own, which takes less time to read.
+        kept += [one] if is_sampled(lighting) else zip(*(jnp.split(part, len(emitted), 1) for part in one), strict=True)
+    return diffuse, Lobe.of_terms(tuple(kept)) if model.lobes else None
 
 
-@eqx.filter_jit
-def _diffuse_and_kept(model: Model, points: SurfacePoints, lighting: Lighting) -> tuple[Array, Lobe]:
-    diffuse, kept = _stacked_terms(model, lighting, points)
-    return diffuse, Lobe.of_terms(kept)
-
-
-@eqx.filter_jit
+@partial(jax.jit, static_argnames="rough")
 def tabulated(
-    model: Model, points: SurfacePoints, lighting: Lighting, near: Near, *, rough: bool
+    model: OneOf, points: SurfacePoints, lighting: Lighting, near: Near, *, rough: bool
 ) -> tuple[Float[Array, "P C"], Float[Array, " P"], Float[Array, "P N C"] | None]:
     """Of (P,) points under many samples the diffuse basis, the peak and the lobe at some exponents, in one pass."""
 
     def of_terms(terms: LightTerms) -> Any:
         dtype = terms.log_cosine.dtype
         exponent = jnp.minimum(terms.log_cosine - jnp.asarray(near.peak, dtype), 0)
-        n = jnp.exp(jnp.asarray(near.log_n)).astype(dtype) if has_lobe(model) else []
+        n = jnp.exp(jnp.asarray(near.log_n)).astype(dtype) if model.lobes else []
         return terms.diffuse, [terms.weight * jnp.exp(one * exponent) for one in n]
 
-    (diffuse, values), peak = over_samples(model, points, lighting, of_terms, rough=rough)
+    (diffuse, values), peak = over_samples(model, points.in_components(), lighting, of_terms, rough=rough)
     return diffuse, peak, jnp.stack(values, axis=1) if values else None
-
-
-def _stacked_terms(model: Model, lighting: Lighting, points: SurfacePoints) -> tuple[Any, Any]:
-    """Sum of the diffuse terms, and weights and cosines of the lobe, of all samples at once.
-
-    The loop over samples is the outer one: an array of all of them would be made in many steps of its own size.
-    """
-    diffuse: Any = 0.0
-    kept: tuple[Any, ...] = ()
-    for stack in lighting.stacks:
-
-        def of_light(one: Any, kind: type[Light] = stack.kind) -> LightTerms:
-            numbers, nodes, light = one
-
-            def of_sample(node: tuple[Array, ...]) -> LightTerms:
-                of_point = partial(light_terms, model, lighting.occluders, kind, (*numbers, *node), light)
-                return jax.vmap(of_point)(points)
-
-            return jax.lax.map(of_sample, nodes) if nodes else of_sample(())
-
-        terms = jax.lax.map(of_light, (stack.numbers, stack.nodes, stack.light))
-        terms = jax.tree.map(lambda leaf, count=stack.samples: leaf.reshape(count, points.mask.size, -1), terms)
-        diffuse = diffuse + jnp.sum(terms.diffuse, axis=0)
-        kept = (*kept, (terms.weight.swapaxes(0, 1), terms.log_cosine[..., 0].T))
-    return diffuse, kept
-
-
-def _size(tree: Any) -> int:
-    """The number of values in all arrays."""
-    return sum(leaf.size for leaf in jax.tree.leaves(tree))

@@ -18,7 +18,6 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,14 +26,15 @@ from jaxtyping import Array
 
 from brdf.geometry.base import Shape
 from brdf.geometry.camera import Camera
-from brdf.geometry.rays import shapes_met, trace
+from brdf.geometry.rays import shapes_met, surface_points
 from brdf.geometry.surface_points import NO_SHAPE, PixelArea, SurfacePoints
-from brdf.geometry.visibility import share_seen
 from brdf.lights.base import Light, Lighting, stacked
 from brdf.lights.sample_sets import square_rule
-from brdf.lobes import STORED_SAMPLES
+from brdf.lobes import STORED_SAMPLES, light_terms, over_chunks
+from brdf.models import BlinnPhong
+from brdf.models.one_of import OneOf
 from brdf.precision import apart
-from brdf.vectors import dot, half_log_cosine
+from brdf.vectors import dot
 
 NARROW = 0.2
 """Pixel size over distance from a lobe's centre from which on a pixel is averaged: 0.2 % of the lobe's peak."""
@@ -55,7 +55,7 @@ def with_area(
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((points, camera, shapes, lights))):
         return _averaged(points, camera, shapes, np.arange(count, dtype=np.int32), np.zeros(0, np.int32))
     stacks = stacked(lights, points.position.dtype)
-    sharp = tuple(stack for stack in stacks if stack.samples <= STORED_SAMPLES * stack.light.shape[0])
+    sharp = tuple(stack for stack in stacks if stack.light.shape[1] <= STORED_SAMPLES or not stack.numbers)
     lighting = Lighting(sharp, occluders)
     edge, other = np.asarray(_matters(points, camera, shapes, lighting)).reshape(2, count)
     return _averaged(points, camera, shapes, _padded(edge), _padded(other & ~edge))
@@ -76,7 +76,7 @@ def _over_neighbours(change: Any, values: Array) -> Array:
     return found.at[:, 1:].max(right).at[:, :-1].max(right)
 
 
-@eqx.filter_jit
+@jax.jit
 def _matters(points: SurfacePoints, camera: Camera, shapes: tuple[Shape, ...], lighting: Lighting) -> Array:
     """Through which pixels an edge of a shape passes, and which others are to be averaged."""
     width, height = camera.resolution
@@ -88,41 +88,25 @@ def _matters(points: SurfacePoints, camera: Camera, shapes: tuple[Shape, ...], l
     matters = jnp.zeros_like(edge)
     if not all(shape.convex for shape in shapes):
         matters |= _over_neighbours(lambda a, b: dot(a, b) < BENT, points.normal)
-    for stack in lighting.stacks:
+    flat = points.in_components().flat()
 
-        def or_light(found: Array, row: tuple[Array, ...], kind: type[Light] = stack.kind) -> tuple[Array, None]:
-            return found | _light_matters(points, lighting.occluders, kind, row), None
+    def or_sample(found: Array, kind: type[Light], numbers: Any, nodes: Any, light: Array, emitted: Array) -> Array:
+        terms = light_terms(OneOf((BlinnPhong,)), lighting, flat, kind, numbers, nodes, light)
+        lit, log_cosine = (one.reshape(edge.shape) for one in ((terms.diffuse > 0) & jnp.any(emitted > 0), terms[2]))
+        narrow = _over_neighbours(lambda a, b: jnp.abs(a - b), log_cosine) > 2 * NARROW * jnp.abs(log_cosine)
+        return found | (lit & narrow) | _over_neighbours(jnp.not_equal, lit)
 
-        matters, _ = jax.lax.scan(or_light, matters, stack.rows()[0])
-    return jnp.stack([edge, matters & points.mask])
-
-
-def _light_matters(
-    points: SurfacePoints, occluders: tuple[Shape, ...], kind: type[Light], row: tuple[Array, ...]
-) -> Array:
-    """Whether a highlight is narrow or a light's edge passes."""
-
-    def at_point(point: SurfacePoints) -> tuple[Array, Array]:
-        sample = kind.sample(point, *row)
-        lit = (dot(point.normal, sample.to_light) > 0) & jnp.any(sample.intensity > 0)
-        if occluders:
-            lit &= share_seen(occluders, point, sample.to_light, sample.distance, sample.radius) > 0
-        return lit, half_log_cosine(point.normal, sample.to_light, point.to_view)
-
-    lit, log_cosine = jax.vmap(jax.vmap(at_point))(points)
-    steps = _over_neighbours(lambda a, b: jnp.abs(a - b), log_cosine)
-    narrow = lit & (steps > 2 * NARROW * jnp.abs(log_cosine))
-    return narrow | _over_neighbours(jnp.not_equal, lit)
+    return jnp.stack([edge, over_chunks(or_sample, lighting, 1, matters) & points.mask])
 
 
-@eqx.filter_jit
+@jax.jit
 def _averaged(points: SurfacePoints, camera: Camera, shapes: tuple[Shape, ...], edge: Any, other: Any) -> SurfacePoints:
     """The points of the given pixels, those with an edge first, beside those of the centres."""
     pixel = jnp.concatenate([edge, other])
     width, count, edges = camera.resolution[0], points.mask.size, edge.size
     rule, side = square_rule(camera.samples**2), 3 * camera.samples
     column, row = (pixel % width)[:, None], (pixel // width)[:, None]
-    fine = apart(trace, camera, shapes, column + rule.s, row + rule.t)
+    fine = surface_points(camera, shapes, column + rule.s, row + rule.t)
     if points.visibility is not None:
         seen = jnp.take(points.visibility.reshape(count, -1), pixel, axis=0, mode="clip")[:, None]
         seen = jnp.broadcast_to(seen, (*fine.mask.shape, seen.shape[-1]))

@@ -19,7 +19,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from brdf.checks import Scalar, instance
 from brdf.errors import InputError
-from brdf.geometry.surface_points import SurfacePoints
+from brdf.geometry.rays import PrimaryRays, Sight
 from brdf.lights.base import Lighting, stacked
 from brdf.lobes import (
     NO_LOBE,
@@ -30,13 +30,13 @@ from brdf.lobes import (
     Lobe,
     Near,
     average,
-    basis_program,
+    basis_terms,
     is_sampled,
-    sum_over_samples,
+    over_samples,
     tabulated,
 )
 from brdf.models.base import Material, SpecularMaterial, check_model, check_single
-from brdf.models.one_of import Model, OneOf, has_lobe
+from brdf.models.one_of import OneOf
 from brdf.precision import Precision, cast, working_precision
 from brdf.scene import Scene
 
@@ -55,7 +55,7 @@ class Basis:
         lobe: the specular basis as a function of n; None without lights or for a model without a specular term.
     """
 
-    points: SurfacePoints
+    points: Sight
     diffuse: Float[Array, "P C"] | None
     lobe: Lobe | None
 
@@ -64,7 +64,7 @@ def basis(
     model: type[Material],
     scene: Scene,
     *,
-    points: SurfacePoints | None = None,
+    points: Sight | None = None,
     near: Near | None = None,
     counts: Bool[np.ndarray, " P"] | None = None,
 ) -> Basis:
@@ -73,19 +73,19 @@ def basis(
     Args:
         model: the class of the material.
         scene: what is seen, and the light on it.
-        points: what the pixels see, where that is known already.
+        points: what the pixels see, where that is known already, or `Scene.sight`, which is also what None stands for.
         near: which exponents will be asked for, so that many light samples are gone through once; None for any.
         counts: which pixels will be looked at, where ``near`` is given; the others may be 0. None for all.
     """
-    points = scene.surface_points() if points is None else points
+    points = scene.sight() if points is None else points
     lighting, area = _lighting(scene, points), points.area
     if not lighting.stacks:
         return Basis(points, None, None)
     if near is not None and area is None and is_sampled(lighting):
         return _tabulated(model, points, lighting, near, counts)
-    diffuse, lobe = basis_program(model, dataclasses.replace(points, area=None), lighting)()
+    diffuse, lobe = basis_terms(model, points if area is None else dataclasses.replace(points, area=None), lighting)
     if area is not None:
-        fine_diffuse, fine_lobe = basis_program(model, area.points, lighting)()
+        fine_diffuse, fine_lobe = basis_terms(model, area.points, lighting)
         diffuse = diffuse.at[area.pixel].set(average(area.weight, fine_diffuse), mode="drop")
         if lobe is not None and fine_lobe is not None:
             lobe = lobe.over_areas(fine_lobe, area.weight, area.slot.ravel())
@@ -93,14 +93,14 @@ def basis(
 
 
 def _tabulated(
-    model: type[Material], points: SurfacePoints, lighting: Lighting, near: Near, counts: np.ndarray | None
+    model: type[Material], points: Sight, lighting: Lighting, near: Near, counts: np.ndarray | None
 ) -> Basis:
-    flat = jax.tree.map(np.asarray, points.flat())
+    flat = points.stored().pixels()
     index = np.flatnonzero(flat.mask if counts is None else flat.mask & counts)
     # Of one size for few numbers of pixels, or each would be compiled.
     padded = np.resize(index, -(-max(index.size, 1) // TILE) * TILE) if index.size else np.zeros(TILE, int)
     rough = near.ends[1] <= math.log(ROUGH) or not near.narrow
-    found = tabulated(OneOf.of(model), jax.tree.map(lambda leaf: leaf[padded], flat), lighting, near, rough=rough)
+    found = tabulated(OneOf.of(model), flat.pixels(padded), lighting, near, rough=rough)
 
     def spread(values: Any, outside: float = 0.0) -> Array:
         some = np.asarray(values)[: index.size]
@@ -113,8 +113,9 @@ def _tabulated(
     return Basis(points, spread(diffuse), lobe)
 
 
-def _lighting(scene: Scene, points: SurfacePoints, fill_above: float = math.inf) -> Lighting:
-    return Lighting(stacked(scene.lights, jnp.asarray(points.position).dtype, fill_above), scene.occluders)
+def _lighting(scene: Scene, points: Sight, fill_above: float = math.inf) -> Lighting:
+    some = points.camera.position if isinstance(points, PrimaryRays) else points.position
+    return Lighting(stacked(scene.lights, jnp.result_type(some), fill_above), scene.occluders)
 
 
 class BasisImages(eqx.Module):
@@ -132,7 +133,7 @@ class BasisImages(eqx.Module):
 
 
 def basis_images(
-    model: type[Material], scene: Scene, n: Float[ArrayLike, ""] = 1.0, *, points: SurfacePoints | None = None
+    model: type[Material], scene: Scene, n: Float[ArrayLike, ""] = 1.0, *, points: Sight | None = None
 ) -> BasisImages:
     """The basis images of a scene under a model, all in one pass over the light samples.
 
@@ -149,38 +150,37 @@ def basis_images(
     """
     check_model(model)
     instance("scene", scene, Scene, "Write brdf.basis_images(brdf.BlinnPhong, scene)")
-    points = scene.surface_points() if points is None else points
-    lighting = _lighting(scene, points, STORED_SAMPLES if points.mask.size <= FEW_PIXELS else math.inf)
-    lobe = OneOf.of(model) if is_sampled(lighting) else model
+    points = scene.sight() if points is None else points
+    lighting = _lighting(scene, points, STORED_SAMPLES if math.prod(scene.resolution) <= FEW_PIXELS else math.inf)
+    lobe = OneOf.of(model) if is_sampled(lighting) else OneOf((model,))
     return _basis_images(lobe, points, scene.ambient, lighting, jnp.asarray(n))
 
 
-@eqx.filter_jit
-def _basis_images(model: Model, points: SurfacePoints, ambient: Any, lighting: Lighting, n: Scalar) -> BasisImages:
+@jax.jit
+def _basis_images(model: OneOf, points: Sight, ambient: Any, lighting: Lighting, n: Scalar) -> BasisImages:
     def of_terms(terms: LightTerms) -> tuple[Array, Array | None]:
-        if not has_lobe(model):
+        if not model.lobes:
             return terms.diffuse, None
         return terms.diffuse, terms.weight * (model.scale(n) * jnp.exp(n * terms.log_cosine))
 
     area, parts = points.area, []
     for part in (points,) if area is None else (points, area.points):
-        flat = part.flat()
-        seen = None if ambient is None else jnp.where(flat.mask[:, None], ambient, 0)
-        lit = sum_over_samples(model, flat, lighting, of_terms) if lighting.stacks else (None, None)
-        parts.append((seen, *lit))
+        seen = part.in_components()
+        lit = over_samples(model, seen, lighting, of_terms)[0] if lighting.stacks else (None, None)
+        parts.append((None if ambient is None else jnp.where(seen.mask.reshape(-1, 1), ambient, 0), *lit))
     images = parts[0]
     if area is not None:
         images = jax.tree.map(
             lambda centre, fine: centre.at[area.pixel].set(average(area.weight, fine), mode="drop"), *parts
         )
-    return BasisImages(*jax.tree.map(lambda image: image.reshape(*points.mask.shape, -1), images))
+    return BasisImages(*jax.tree.map(lambda image: image.reshape(*points.shape_of_picture, -1), images))
 
 
-@eqx.filter_jit
-def _shade(material: Material, points: SurfacePoints, ambient: Any, lighting: Lighting) -> Any:
+@jax.jit
+def _shade(material: Material, points: Sight, ambient: Any, lighting: Lighting) -> Any:
     """The picture k_a B_a + k_d B_d + k_s B_s of surface points; None where there is no light at all."""
     n = jnp.asarray(material.n) if isinstance(material, SpecularMaterial) else jnp.ones(())
-    images = _basis_images(type(material), points, ambient, lighting, n)
+    images = _basis_images(OneOf((type(material),)), points, ambient, lighting, n)
     picture = None
     for k, image in (
         (material.k_a, images.ambient),
@@ -216,9 +216,10 @@ def render(material: Material, scene: Scene, *, precision: Precision | None = No
     with working_precision(precision):
         shape = _shape(material, scene)
         scene, points = _seen(scene, precision)
-        _check_reach(material, np.dtype(points.normal.dtype))
+        lighting = _lighting(scene, points)
+        _check_reach(material, jnp.result_type(float))
         material = cast(material, precision)
-        image = _shade(material, points, scene.ambient, _lighting(scene, points))
+        image = _shade(material, points, scene.ambient, lighting)
         return jnp.zeros(shape) if image is None else image
 
 
@@ -250,7 +251,7 @@ def render_lights(material: Material, scene: Scene, *, precision: Precision | No
         material = cast(material, precision)
         images = []
         for index, light in enumerate(scene.lights):
-            (stack,) = stacked((light,), points.position.dtype)
+            (stack,) = _lighting(dataclasses.replace(scene, lights=(light,), visibility=()), points).stacks
             stack = dataclasses.replace(stack, light=stack.light + index)  # its own mask, where masks are given
             images.append(_shade(material, points, None, Lighting((stack,), scene.occluders)))
         if scene.ambient is not None:
@@ -293,7 +294,7 @@ def _check_reach(material: Material, dtype: np.dtype) -> None:
             raise InputError(name, came, "Use another unit of light, or float64")
 
 
-def _seen(scene: Scene, precision: Precision | None) -> tuple[Scene, SurfacePoints]:
+def _seen(scene: Scene, precision: Precision | None) -> tuple[Scene, Sight]:
     """A scene in a precision, and what each pixel sees.
 
     Where pixels are averaged over their area, and nothing of the scene is being traced, the pixels that need it are
@@ -305,7 +306,7 @@ def _seen(scene: Scene, precision: Precision | None) -> tuple[Scene, SurfacePoin
     inside = samples > 1 and not traced and isinstance(jnp.zeros(()), Tracer)
     with jax.ensure_compile_time_eval() if inside else contextlib.nullcontext():
         scene = cast(scene, precision)
-        return scene, scene.surface_points()
+        return scene, scene.sight()
 
 
 def _shape(material: Material, scene: Scene) -> tuple[int, int, int]:

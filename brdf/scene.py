@@ -18,7 +18,7 @@ from brdf.errors import InputError
 from brdf.files import as_path
 from brdf.geometry.base import Shape
 from brdf.geometry.camera import Camera
-from brdf.geometry.rays import tracing
+from brdf.geometry.rays import PrimaryRays, Sight, surface_points
 from brdf.geometry.surface_points import PixelArea, SurfacePoints
 from brdf.lights.base import Light
 from brdf.pixel_area import with_area
@@ -141,14 +141,13 @@ class Scene(Checked):
         Returns:
             (H, W) points, or as many rows.
         """
-        width, height = self.resolution
-        first, stop = (0, height) if rows is None else rows
+        first, stop = (0, self.resolution[1]) if rows is None else rows
         if self.points is not None:
             assert rows is None or self.points.area is None
             points = self.points if rows is None else jax.tree.map(lambda leaf: leaf[first:stop], self.points)
         else:
-            column, row = np.arange(width)[None, :] + 0.5, np.arange(first, stop)[:, None] + 0.5
-            points = tracing(self.camera, self.shapes)(self.camera, self.shapes, column, row)
+            assert self.camera is not None
+            points = PrimaryRays(self.camera, self.shapes, (first, stop)).stored()
         visibility, given = None, [mask for mask in self.visibility if mask is not None]
         if given:
             masks = [jnp.ones_like(given[0]) if mask is None else mask for mask in self.visibility]
@@ -157,6 +156,18 @@ class Scene(Checked):
         if rows is not None or self.camera is None or self.camera.samples == 1:
             return points
         return with_area(points, self.camera, self.shapes, self.lights, self.occluders)
+
+    def sight(self, rows: tuple[int, int] | None = None) -> Sight:
+        """What each pixel sees, for programs that shade it: the rays alone where to trace them takes little time.
+
+        Args:
+            rows: as for `surface_points`.
+        """
+        camera = self.camera
+        if camera is None or (rows is None and camera.samples > 1) or any(mask is not None for mask in self.visibility):
+            return self.surface_points(rows)
+        rays = PrimaryRays(camera, self.shapes, (0, self.resolution[1]) if rows is None else rows)
+        return rays if rays.quick else rays.stored()
 
     @classmethod
     def load(cls, path: str | Path, *, within: str | Path | None = None) -> "Scene":
@@ -235,7 +246,7 @@ def some_pixels(
         elif scene.camera.samples == 1:
             width = scene.camera.resolution[0]
             column, row = pixel % width + 0.5, pixel // width + 0.5
-            points = tracing(scene.camera, scene.shapes, pixel)(scene.camera, scene.shapes, column, row)
+            points = surface_points(scene.camera, scene.shapes, column, row)
         else:
             points = _chosen(cast(scene, precision).surface_points(), pixel)
         # The points know which shape they lie on by its place in the list, so all shapes stay.

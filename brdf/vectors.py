@@ -35,7 +35,6 @@ BELOW_HORIZON = -1e9
 _SMALLEST = {np.dtype(np.float32): 1e-18, np.dtype(np.float64): 1e-153}
 """The smallest cosine told from zero: its inverse square is finite."""
 
-Directions = Float[ArrayLike, "*#batch 3"]
 Numbers = Float[ArrayLike, "*#batch"]
 Vectors = Float[Array, "*batch 3"]
 Scalars = Float[Array, "*batch"]
@@ -76,9 +75,10 @@ class Components:
         """The components along the last axis."""
         return cls(tuple(jnp.unstack(jnp.asarray(array), axis=-1)))
 
-    def stacked(self) -> Array:
-        """As an array, the components along its last axis."""
-        return jnp.stack(jnp.broadcast_arrays(*self.parts), axis=-1)
+    def stacked(self, shape: tuple[int, ...] = ()) -> Array:
+        """As an array, the components along its last axis; they are broadcast to a shape."""
+        shape = np.broadcast_shapes(shape, *(one.shape for one in self.parts))
+        return jnp.stack([jnp.broadcast_to(one, shape) for one in self.parts], axis=-1)
 
     def __iter__(self) -> Iterator[Array]:
         """Component after component."""
@@ -106,6 +106,14 @@ class Components:
         """Vector product."""
         (ax, ay, az), (bx, by, bz) = self.parts, other.parts
         return Components((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))
+
+
+Directions = Float[ArrayLike, "*#batch 3"] | Components
+
+
+def select(condition: ArrayLike, a: Components, b: Components) -> Components:
+    """One vector where a condition holds, else the other."""
+    return Components(tuple(jnp.where(condition, one, other) for one, other in zip(a, b, strict=True)))
 
 
 def largest(v: Any) -> Array:
@@ -136,7 +144,7 @@ def _components(v: Any) -> tuple[Array, ...]:
 # -- lengths and directions --------------------------------------------------------------------------------------------
 
 
-def dot(a: Directions | Components, b: Directions | Components) -> Scalars:
+def dot(a: Directions, b: Directions) -> Scalars:
     """Scalar product over the last axis."""
     return Components(_components(a)) @ Components(_components(b))
 
@@ -146,9 +154,11 @@ def normalize(v: Any) -> Any:
     parts = v.parts if isinstance(v, Components) else jnp.unstack(_floating(v), axis=-1)
     size = jax.lax.stop_gradient(functools.reduce(jnp.maximum, map(jnp.abs, parts)))  # a mere unit: it cancels
     nonzero = size > 4 * jnp.finfo(size.dtype).tiny  # so that 1 / size is finite too
-    unscaled = [jnp.where(nonzero, one, 1.0) / jnp.where(nonzero, size, 1.0) for one in parts]
-    length = jnp.sqrt(functools.reduce(operator.add, map(operator.mul, unscaled, unscaled)))
-    found = Components(tuple(jnp.where(nonzero, one / length, 0.0) for one in unscaled))
+    unscaled = [jnp.where(nonzero, one, 0.0) / jnp.where(nonzero, size, 1.0) for one in parts]
+    squared = functools.reduce(operator.add, map(operator.mul, unscaled, unscaled))
+    length = jnp.sqrt(jnp.where(nonzero, squared, 1.0))
+    # A division last: XLA's CPU compiler repeats all but divisions and roots in each loop that reads them.
+    found = Components(tuple(one / length for one in unscaled))
     return found if isinstance(v, Components) else found.stacked()
 
 
@@ -251,7 +261,7 @@ def log_cosine_of(cosine: Numbers, sine: Numbers) -> Scalars:
 def _from_tangent(p: Array, q: Array) -> Array:
     """-1/2 log(1 + p / q^2) for p >= 0, ``BELOW_HORIZON`` where q <= 0."""
     above = jnp.maximum(q, _SMALLEST[q.dtype])
-    return jnp.where(q > 0, -0.5 * jnp.log1p(jnp.where(q > 0, p, 0.0) / (above * above)), BELOW_HORIZON)
+    return jnp.maximum(-0.5 * jnp.log1p(jnp.where(q > 0, p / (above * above), jnp.inf)), BELOW_HORIZON)
 
 
 @_from_tangent.defjvp
@@ -282,7 +292,7 @@ class _Split(NamedTuple):
     low: Components | None
 
 
-def _split(*vectors: ArrayLike) -> list[_Split]:
+def _split(*vectors: Directions) -> list[_Split]:
     """The parts of vectors whose components lie within +-1, in one common floating-point type."""
     given, parts = list(map(_components, vectors)), []
     rough = any(isinstance(vector, Components) and vector.rough for vector in vectors)

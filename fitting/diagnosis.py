@@ -393,7 +393,7 @@ def _moved(axis: int, shift: float, growth: float, scene: brdf.Scene, pixels: fl
     camera: Any = scene.camera
     width, height = camera.resolution
     column, row = np.array([0.0, 1.0, 0.0]) + width / 2, np.array([0.0, 0.0, 1.0]) + height / 2
-    origin, direction = (np.asarray(part, np.float64) for part in camera.rays(column, row))
+    origin, direction = (np.asarray(part.stacked(), np.float64) for part in camera.rays(column, row))
     far = origin + direction * np.linalg.norm(np.asarray(sphere.center) - np.asarray(camera.position))
     pixel = far[1 + axis] - far[0]
     centre = np.asarray(sphere.center) + shift * pixels * pixel

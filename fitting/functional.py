@@ -156,7 +156,7 @@ def fit(
         came = f"must be of shape ({height}, {width}, C), got {target.shape}"
         raise InputError("target", came, "Give the picture that the scene shows")
     scene = brdf.cast(scene, "float64" if target.dtype == jnp.float64 else "float32")
-    points = scene.surface_points()
+    points = scene.sight()
     seen = jnp.ravel(points.mask)
     weight = seen if weight is None else seen * jnp.ravel(jnp.asarray(weight))
     solution = fit_basis(target, basis(model, scene, points=points), weight, scene.ambient, n_range)

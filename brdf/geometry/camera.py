@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from brdf.checks import Checked, Scalar, Vector, checked, direction_value, number, positive, sample_number, vector
 from brdf.errors import InputError
-from brdf.vectors import Numbers, Vectors, normalize
+from brdf.vectors import Components, Numbers, normalize
 
 MAX_RESOLUTION = 1 << 16
 MAX_SAMPLES = 256
@@ -79,8 +79,8 @@ class Camera(Checked):
             raise InputError("up", came, "Give a direction that points up in the picture")
 
     @abc.abstractmethod
-    def rays(self, column: Numbers, row: Numbers) -> tuple[Vectors, Vectors]:
-        """Origin and unit direction of the rays through places of the picture.
+    def rays(self, column: Numbers, row: Numbers) -> tuple[Components, Components]:
+        """Origin and unit direction of the rays through places of the picture; what all of them share is a number.
 
         Args:
             column: from 0 at the picture's left edge, in pixels.
@@ -98,17 +98,17 @@ class Camera(Checked):
         right = normalize(jnp.cross(forward, self.up))
         return right, jnp.cross(right, forward), forward
 
-    def off_axis(self, column: Any, row: Any, right: Vector, up: Vector) -> Array:
+    def off_axis(self, column: Numbers, row: Numbers) -> Components:
         """How far places lie from the middle of the picture, in the unit of its half width."""
-        width, height = self.resolution
-        x, y = column * 2.0 / width - 1.0, height / width - row * 2.0 / width
-        return self.half_width * (x[..., None] * right + y[..., None] * up)
+        (width, height), (right, up, _) = self.resolution, map(Components.of, self.axes())
+        x, y = jnp.asarray(column) * 2.0 / width - 1.0, height / width - jnp.asarray(row) * 2.0 / width
+        return (right * x + up * y) * self.half_width
 
-    def to_view(self, position: Vectors) -> Vectors:
+    def to_view(self, position: Components) -> Components:
         """Unit directions from surface points towards the eye."""
         if (self.viewer or self.default_viewer) == "local":
-            return normalize(self.position - position)
-        return jnp.broadcast_to(-normalize(self.target - self.position), position.shape)
+            return normalize(Components.of(self.position) - position)
+        return Components.of(-self.axes()[2])
 
 
 class OrthographicCamera(Camera):
@@ -138,11 +138,9 @@ class OrthographicCamera(Camera):
         """In world units."""
         return self.width / 2
 
-    def rays(self, column: Numbers, row: Numbers) -> tuple[Vectors, Vectors]:
+    def rays(self, column: Numbers, row: Numbers) -> tuple[Components, Components]:
         """Origins on the plane through ``position``, one direction."""
-        right, up, forward = self.axes()
-        origins = self.position + self.off_axis(column, row, right, up)
-        return origins, jnp.broadcast_to(forward, origins.shape)
+        return Components.of(self.position) + self.off_axis(column, row), Components.of(self.axes()[2])
 
 
 class PerspectiveCamera(Camera):
@@ -173,11 +171,9 @@ class PerspectiveCamera(Camera):
         width, height = self.resolution
         return jnp.tan(jnp.deg2rad(self.fov) / 2) * (width / height)
 
-    def rays(self, column: Numbers, row: Numbers) -> tuple[Vectors, Vectors]:
+    def rays(self, column: Numbers, row: Numbers) -> tuple[Components, Components]:
         """One origin, a direction per place."""
-        right, up, forward = self.axes()
-        directions = normalize(forward + self.off_axis(column, row, right, up))
-        return jnp.broadcast_to(self.position, directions.shape), directions
+        return Components.of(self.position), normalize(Components.of(self.axes()[2]) + self.off_axis(column, row))
 
 
 CAMERAS: dict[str, type[Camera]] = {camera.type_name: camera for camera in (OrthographicCamera, PerspectiveCamera)}

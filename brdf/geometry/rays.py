@@ -1,52 +1,119 @@
 """What a camera's rays meet first."""
 
-from collections.abc import Callable
-from functools import partial
-from typing import Any
+import dataclasses
+import functools
+from typing import Any, ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.core import Tracer
-from jaxtyping import Array, Int
+import numpy as np
+from jaxtyping import Array, Bool, Int
 
 from brdf.geometry.base import Shape
 from brdf.geometry.camera import Camera
-from brdf.geometry.surface_points import NO_SHAPE, SurfacePoints
+from brdf.geometry.surface_points import NO_SHAPE, Points, SurfacePoints
 from brdf.precision import apart
+from brdf.vectors import select
 
 
-def trace(camera: Camera, shapes: tuple[Shape, ...], column: Any, row: Any) -> SurfacePoints:
-    """What the rays through places of the picture meet first, columns and rows in pixels from its upper left corner."""
-    origins, directions = camera.rays(column, row)
-    distance = jnp.full(origins.shape[:-1], jnp.inf)
-    mask = jnp.zeros(origins.shape[:-1], bool)
-    index = jnp.full(origins.shape[:-1], NO_SHAPE, jnp.int32)
-    position, normal, facet, has_facets = origins, -directions, -directions, False
+def trace(camera: Camera, shapes: tuple[Shape, ...], column: Any, row: Any) -> Points:
+    """What the rays through places of the picture meet first.
+
+    Args:
+        camera: where the rays begin.
+        shapes: one or more.
+        column: in pixels from the picture's left edge.
+        row: in pixels from its upper edge.
+    """
+    origin, direction = camera.rays(column, row)
+    position, normal, facet, has_facets = origin, -direction, -direction, False
+    distance = jnp.full(jnp.broadcast_shapes(jnp.shape(column), jnp.shape(row)), jnp.inf)
+    mask, index = jnp.zeros(distance.shape, bool), jnp.full(distance.shape, NO_SHAPE, jnp.int32)
     for number, shape in enumerate(shapes):
-        hit = jax.vmap(jax.vmap(shape.intersect))(origins, directions)
+        hit = shape.intersect(origin, direction)
         nearer = hit.hit & (hit.distance < distance)
         distance = jnp.where(nearer, hit.distance, distance)
         mask = jnp.where(nearer, shape.fitted, mask)
         index = jnp.where(nearer, number, index)
-        position = jnp.where(nearer[..., None], hit.position, position)
+        position = select(nearer, hit.position, position)
         has_facets |= hit.shading is not None
-        facet = jnp.where(nearer[..., None], hit.normal, facet)
-        normal = jnp.where(nearer[..., None], hit.normal if hit.shading is None else hit.shading, normal)
-    to_view = jnp.where(mask[..., None], camera.to_view(position), normal)
+        facet = select(nearer, hit.normal, facet)
+        normal = select(nearer, hit.normal if hit.shading is None else hit.shading, normal)
     shape = index if len(shapes) > 1 else None
-    return SurfacePoints(position, normal, to_view, mask, shape, facet=facet if has_facets else None)
+    return Points(position, normal, camera.to_view(position), mask, shape, facet=facet if has_facets else None)
 
 
 def shapes_met(camera: Camera, shapes: tuple[Shape, ...], column: Any, row: Any) -> Int[Array, "..."]:
     """Index of the shape that each ray meets first, `NO_SHAPE` for none: what is left of `trace` for counting."""
-    return trace(camera, shapes, column, row).met
+    return trace(camera, shapes, column, row).stacked().met
 
 
-_compiled = eqx.filter_jit(trace)
+FEW_SHAPES = 4
+"""Up to so many spheres and rectangles are traced anew sooner than what they look like is read."""
 
 
-def tracing(*arguments: Any) -> Callable[..., SurfacePoints]:
-    """`trace` as a program of its own, inside a program of its arguments that is being made too."""
-    inside = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments))
-    return partial(apart, _compiled) if inside else _compiled
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class PrimaryRays:
+    """The rays through the pixels' centres, whose `SurfacePoints` are made in each program that asks for them.
+
+    To trace a picture's rays against a few spheres and rectangles takes less time than to keep what they meet.
+
+    Attributes:
+        camera: where they begin.
+        shapes: what they may meet.
+        rows: the first row of the picture, and the one after the last.
+        area: none: the centres stand for the pixels.
+    """
+
+    camera: Camera
+    shapes: tuple[Shape, ...]
+    rows: tuple[int, int] = dataclasses.field(metadata={"static": True})
+    area: ClassVar[None] = None
+
+    @property
+    def shape_of_picture(self) -> tuple[int, ...]:
+        """Of the picture."""
+        return self.rows[1] - self.rows[0], self.camera.resolution[0]
+
+    def traced(self) -> Points:
+        """What they meet, (rows, W)."""
+        return trace(self.camera, self.shapes, *self.places)
+
+    def in_components(self) -> Points:
+        """The same, made once however often it is read."""
+        return apart(PrimaryRays.traced, self)
+
+    @property
+    def quick(self) -> bool:
+        """Whether to trace them takes less time than to read what they met."""
+        return len(self.shapes) <= FEW_SHAPES and all(shape.quick for shape in self.shapes)
+
+    def stored(self) -> SurfacePoints:
+        """The same as arrays, to be kept."""
+        return surface_points(self.camera, self.shapes, *self.places)
+
+    @property
+    def places(self) -> tuple[np.ndarray, np.ndarray]:
+        """Columns and rows of the pixels' centres."""
+        return np.arange(self.camera.resolution[0])[None, :] + 0.5, np.arange(*self.rows)[:, None] + 0.5
+
+    @functools.cached_property
+    def mask(self) -> Bool[Array, "rows W"]:
+        """Which pixels see a fitted surface."""
+        return _mask(self)
+
+
+Sight = SurfacePoints | PrimaryRays
+"""What the pixels of a picture see, for programs: points, or the rays that meet them."""
+
+
+@jax.jit
+def _mask(rays: PrimaryRays) -> Array:
+    return rays.traced().mask
+
+
+@jax.jit
+def surface_points(camera: Camera, shapes: tuple[Shape, ...], column: Any, row: Any) -> SurfacePoints:
+    """What the rays through places of the picture meet first."""
+    return apart(lambda *rays: trace(*rays).stacked(), camera, shapes, column, row)

@@ -1,13 +1,11 @@
 """The sphere."""
 
-from typing import ClassVar
-
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from brdf.checks import Scalar, Vector, checked, positive, vector
 from brdf.geometry.base import Hit, Shape, share_beyond
-from brdf.vectors import divide, dot, norm, normalize, square_root
+from brdf.vectors import Components, divide, norm, normalize, square_root
 
 
 class Sphere(Shape):
@@ -26,7 +24,6 @@ class Sphere(Shape):
         >>> pillar = brdf.Sphere(center=[1, 1, 1], radius=0.2, fitted=False)  # only casts a shadow
     """
 
-    in_components: ClassVar[bool] = True
     center: Vector = checked(vector, "center")
     radius: Scalar = checked(positive, "radius")
 
@@ -34,30 +31,31 @@ class Sphere(Shape):
         """The radius."""
         return jnp.asarray(self.radius)
 
-    def intersect(self, origin: Vector, direction: Vector) -> Hit:
+    def intersect(self, origin: Components, direction: Components) -> Hit:
         """The nearest hit in front of ``origin``.
 
         The half chord comes from the distance of the ray to the centre, not from the quadratic's discriminant, which
         cancels for a small far sphere (Haines, Günther and Akenine-Möller, Ray Tracing Gems 2019, chapter 7).
         """
-        to_origin = origin - self.center
-        along = dot(to_origin, direction)
-        nearest = to_origin - along * direction
-        squared_half_chord = self.radius * self.radius - dot(nearest, nearest)
+        center, radius = Components.of(self.center), jnp.asarray(self.radius)
+        to_origin = origin - center
+        along = to_origin @ direction
+        nearest = to_origin - direction * along
+        squared_half_chord = radius * radius - nearest @ nearest
         half_chord = square_root(squared_half_chord)
         outside = -along - half_chord > 0
         signed = jnp.where(outside, -half_chord, half_chord)
         hit = (squared_half_chord > 0) & (signed - along > 0)
-        normal = normalize(nearest + signed * direction)
-        return Hit(hit, jnp.where(hit, signed - along, jnp.inf), self.center + self.radius * normal, normal)
+        normal = normalize(nearest + direction * signed)
+        return Hit(hit, jnp.where(hit, signed - along, jnp.inf), center + normal * radius, normal)
 
-    def cover_patch(self, origin: Vector, direction: Vector, distance: Scalar, radius: Array) -> Scalar:
+    def cover_patch(self, origin: Components, direction: Components, distance: Array, radius: Array) -> Array:
         """The share of the patch within the cone that the sphere fills; see `Shape.cover_patch`."""
-        to_center = self.center - origin
-        along = dot(to_center, direction)
-        miss = norm(to_center - along * direction)
+        to_center = Components.of(self.center) - origin
+        along = to_center @ direction
+        miss = norm(to_center - direction * along)
         # of the angle between the direction and the sphere's rim
-        tangent = square_root(dot(to_center, to_center) - self.radius * self.radius)
-        sine = divide(self.radius * along - miss * tangent, dot(to_center, to_center))
+        tangent = square_root(to_center @ to_center - self.radius * self.radius)
+        sine = divide(self.radius * along - miss * tangent, to_center @ to_center)
         in_front = (along > 0) & (along < distance)
         return jnp.where(in_front, share_beyond(sine, radius), 0.0)

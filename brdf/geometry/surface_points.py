@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from brdf.checks import direction_value
 from brdf.errors import InputError
+from brdf.vectors import Components
 
 NO_SHAPE = -1
 """The index of what is no shape: the background, or points that come from elsewhere."""
@@ -68,15 +69,30 @@ class SurfacePoints(eqx.Module):
         """Index of the shape that each pixel sees, `NO_SHAPE` for none; where one shape is all there is, that is 0."""
         return jnp.where(self.mask, 0, NO_SHAPE) if self.shape is None else self.shape
 
-    def flat(self) -> "SurfacePoints":
-        """The points of a picture as one row, (H W,), without their areas."""
+    @property
+    def shape_of_picture(self) -> tuple[int, ...]:
+        """Of the picture."""
+        return self.mask.shape
 
-        def row(leaf: Any) -> Any:
-            # On the host where it can be, or each shape would be compiled.
+    def in_components(self) -> "Points":
+        """The same points, without areas, as programs compute with them."""
+        position, normal, to_view = map(Components.of, (self.position, self.normal, self.to_view))
+        facet = None if self.facet is None else Components.of(self.facet)
+        return Points(position, normal, to_view, self.mask, self.shape, self.visibility, facet)
+
+    def stored(self) -> "SurfacePoints":
+        """These points, as those that `brdf.geometry.rays.PrimaryRays` meet."""
+        return self
+
+    def pixels(self, index: Any = slice(None)) -> "SurfacePoints":
+        """Some of the points of a picture without areas, by their indices row by row."""
+
+        def some(leaf: Any) -> Any:
+            # On the host where it can be: XLA compiles each shape, and its gather is ten times slower.
             values = leaf if isinstance(leaf, Tracer) else np.asarray(leaf)
-            return values.reshape(-1, *leaf.shape[self.mask.ndim :])
+            return values.reshape(-1, *values.shape[self.mask.ndim :])[index]
 
-        return jax.tree.map(row, dataclasses.replace(self, area=None))
+        return jax.tree.map(some, self)
 
     @classmethod
     def from_normals(
@@ -119,3 +135,32 @@ class SurfacePoints(eqx.Module):
             "to_view": np.where(seen[..., None], to_view / np.where(view_length > 0, view_length, 1.0), upward),
         }
         return cls(**values, mask=seen)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class Points:
+    """Surface points as programs compute with them: see `SurfacePoints`, whose numbers these are.
+
+    A component that is the same for all of them, as where the eye is infinitely far, may be a single number.
+    """
+
+    position: Components
+    normal: Components
+    to_view: Components
+    mask: Bool[Array, "*pixels"]
+    shape: Int[Array, "*pixels"] | None = None
+    visibility: Float[Array, "*pixels L"] | None = None
+    facet: Components | None = None
+
+    def stacked(self) -> SurfacePoints:
+        """The same as arrays."""
+        vectors = (self.position, self.normal, self.to_view)
+        position, normal, to_view = (vector.stacked(self.mask.shape) for vector in vectors)
+        facet = None if self.facet is None else self.facet.stacked(self.mask.shape)
+        return SurfacePoints(position, normal, to_view, self.mask, self.shape, self.visibility, facet=facet)
+
+    def flat(self) -> "Points":
+        """As one row, (P,)."""
+        pixels = self.mask.ndim
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[pixels:]) if leaf.ndim else leaf, self)

@@ -15,7 +15,7 @@ import hashlib
 import itertools
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -23,11 +23,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from brdf.checks import LARGEST, Scalar, Vector, instance
+from brdf.checks import LARGEST, Scalar, instance
 from brdf.errors import InputError
 from brdf.files import parse_number, read_text
 from brdf.geometry.base import Hit, Shape
-from brdf.vectors import divide, dot, normalize
+from brdf.vectors import Components, divide, normalize, select
 
 CREASE = np.radians(30.0)
 """Faces that meet at this angle or more meet in an edge, not in a rounding."""
@@ -239,6 +239,7 @@ class Triangles(Shape):
         False
     """
 
+    quick: ClassVar[bool] = False
     mesh: Mesh = eqx.field(static=True)
 
     def __check_init__(self):
@@ -254,24 +255,26 @@ class Triangles(Shape):
         """The largest absolute coordinate."""
         return jnp.asarray(float(np.max(np.abs(self.mesh.vertices))))
 
-    def intersect(self, origin: Vector, direction: Vector) -> Hit:
+    def intersect(self, origin: Components, direction: Components) -> Hit:
         """The nearest hit in front of ``origin``, from either side; the normals are those of the front side."""
-        rays = (jax.lax.stop_gradient(jnp.asarray(origin)), jax.lax.stop_gradient(jnp.asarray(direction)))
-        shape = jax.ShapeDtypeStruct((), np.int32)
-        triangle = jax.pure_callback(self.mesh.first_hit, shape, *rays, vmap_method="broadcast_all")
+        shape = jnp.broadcast_shapes(*(part.shape for part in (*origin, *direction)))
+        rays = [jax.lax.stop_gradient(vector.stacked(shape)) for vector in (origin, direction)]
+        result = jax.ShapeDtypeStruct(shape, np.int32)
+        triangle = jax.pure_callback(self.mesh.first_hit, result, *rays, vmap_method="broadcast_all")
         corners = jnp.asarray(self.mesh.vertices, rays[0].dtype)[jnp.asarray(self.mesh.faces)[triangle]]
-        edge, other_edge = corners[1] - corners[0], corners[2] - corners[0]
-        area = jnp.cross(edge, other_edge)
+        first, second, third = (Components.of(corner) for corner in jnp.unstack(corners, axis=-2))
+        edge, other_edge = second - first, third - first
+        area = edge.cross(other_edge)
         normal = normalize(area)
-        slope = dot(direction, normal)
-        distance = divide(dot(corners[0] - origin, normal) * slope, slope * slope)
-        hit, position = (triangle >= 0) & (distance > 0), origin + distance * direction
+        slope = direction @ normal
+        distance = divide((first - origin) @ normal * slope, slope * slope)
+        hit, position = (triangle >= 0) & (distance > 0), origin + direction * distance
         shading = None
         if self.mesh.normals is not None:
-            offset, size = position - corners[0], dot(area, area)
-            second = divide(dot(jnp.cross(offset, other_edge), area), size)
-            third = divide(dot(jnp.cross(edge, offset), area), size)
-            weights = jnp.stack([1.0 - second - third, second, third])
-            shading = normalize(weights @ jnp.asarray(self.mesh.normals, position.dtype)[triangle])
-            shading = jnp.where(slope < 0, shading, normal)  # the back is not lit, however its normals lean
+            offset, size = position - first, area @ area
+            weights = [divide(offset.cross(other_edge) @ area, size), divide(edge.cross(offset) @ area, size)]
+            normals = jnp.asarray(self.mesh.normals, corners.dtype)[triangle]
+            a, b, c = (Components.of(one) for one in jnp.unstack(normals, axis=-2))
+            shading = normalize(a * (1.0 - weights[0] - weights[1]) + b * weights[0] + c * weights[1])
+            shading = select(slope < 0, shading, normal)  # the back is not lit, however its normals lean
         return Hit(hit, jnp.where(hit, distance, jnp.inf), position, normal, shading)

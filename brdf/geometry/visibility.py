@@ -9,41 +9,40 @@ A hard shadow edge has no derivative: gradients by positions of lights and shape
 They are exact for pixels that no edge passes, for soft shadows of spheres and rectangles, and by intensities.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
-from brdf.checks import Scalar, Vector
 from brdf.geometry.base import Shape
-from brdf.geometry.surface_points import SurfacePoints
-from brdf.vectors import Components, dot, largest
+from brdf.geometry.surface_points import Points
+from brdf.vectors import Components, largest
 
 OFFSET = 300
 """Shadow rays start this many rounding errors above the surface: 4e-5 of the coordinates in float32."""
 
 
 def share_seen(
-    occluders: tuple[Shape, ...],
-    point: SurfacePoints,
-    to_light: Vector,
-    distance: Scalar,
-    radius: Scalar | None,
-) -> Scalar:
-    """The share of a light sample that a point sees between the shapes: 0 or 1 for a sample without a radius.
+    occluders: tuple[Shape, ...], point: Points, to_light: Components, distance: Array, radius: Array | None
+) -> Array:
+    """The share of a light sample that points see between the shapes: 0 or 1 for a sample without a radius.
 
-    All shapes of the scene are given, in its order: the point knows by that which of them it lies on.
+    All shapes of the scene are given, in its order: a point knows by that which of them it lies on.
+
+    Args:
+        occluders: the shapes.
+        point: in components.
+        to_light: unit direction of the sample.
+        distance: of the sample.
+        radius: the angle of the patch of light that the sample stands for, or None.
     """
     position, normal = point.position, point.normal if point.facet is None else point.facet
     size = jnp.maximum(largest(position), largest(-position))
     rounding = OFFSET * jnp.finfo(size.dtype).eps
     before = distance * (1 - 4 * rounding)
-    seen = jnp.ones_like(size) if point.facet is None else jnp.where(dot(normal, to_light) > 0, 1.0, 0.0)
+    seen = jnp.ones_like(size) if point.facet is None else jnp.where(normal @ to_light > 0, 1.0, 0.0)
     for index, shape in enumerate(occluders):
-        start = position + jax.lax.stop_gradient(rounding * jnp.maximum(size, shape.extent())) * normal
-        if isinstance(start, Components) and not shape.in_components:
-            covered = _at_each(shape, start, to_light, before, radius)
-        elif radius is None:
+        start = position + normal * jax.lax.stop_gradient(rounding * jnp.maximum(size, shape.extent()))
+        if radius is None:
             covered = shape.cover(start, to_light, before)
         else:
             covered = shape.cover_patch(start, to_light, before, radius)
@@ -51,11 +50,3 @@ def share_seen(
             covered = jnp.where(point.shape == index, 0.0, covered)  # the horizon has dealt with that
         seen *= 1.0 - covered
     return seen
-
-
-def _at_each(shape: Shape, start: Components, to_light: Any, before: Scalar, radius: Scalar | None) -> Scalar:
-    """The same for points whose vectors are in components, by a shape that takes one point."""
-    vectors = start.stacked(), to_light.stacked()
-    if radius is None:
-        return jnp.vectorize(shape.cover, signature="(3),(3),()->()")(*vectors, before)
-    return jnp.vectorize(shape.cover_patch, signature="(3),(3),(),()->()")(*vectors, before, radius)

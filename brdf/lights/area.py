@@ -37,10 +37,10 @@ from brdf.checks import (
     vertex_list,
 )
 from brdf.errors import InputError
-from brdf.geometry.surface_points import SurfacePoints
+from brdf.geometry.surface_points import Points
 from brdf.lights.base import Light, LightSample
 from brdf.lights.sample_sets import disc_rule, square_rule
-from brdf.vectors import cross, divide, dot, norm, normalize, perpendicular, square_root
+from brdf.vectors import Components, cross, divide, dot, norm, normalize, perpendicular, square_root
 
 SAMPLES = 64
 
@@ -58,8 +58,8 @@ def _positive_range(at_0: Array, at_1: Array) -> tuple[Array, Array]:
 
 
 def _above_horizon(
-    point: SurfacePoints, starts: tuple[Array, Array], edges: tuple[Array, Array], node: tuple[Array, Array]
-) -> tuple[Array, Array, Array]:
+    point: Points, starts: tuple[Components, ...], edges: tuple[Components, ...], node: tuple[Array, Array]
+) -> tuple[Array, Components, Array]:
     """The place of a node (s, t) of the unit square in that part of a patch which stands above the horizon.
 
     The points of the patch are a(t) + s b(t), with a and b linear in t and given at t = 0 and t = 1: a parallelogram
@@ -83,7 +83,9 @@ def _above_horizon(
     return s, start + s * edge, width * (top - bottom)
 
 
-def _from_patch(radiance: Array, patch: Array, area: Array, light_normal: Array, position: Array) -> LightSample:
+def _from_patch(
+    radiance: Any, patch: Components, area: Array, light_normal: Components, position: Components
+) -> LightSample:
     """The sample of a patch of a flat light that shines along ``light_normal``."""
     offset = patch - position
     to_light = normalize(offset)
@@ -118,17 +120,19 @@ class RectangleLight(Light):
     samples: int = eqx.field(static=True, converter=sample_number, default=SAMPLES)
     type_name: ClassVar[str] = "rectangle"
     emits: ClassVar[tuple[int, ...]] = (3,)
+    weighs: ClassVar[int | None] = -1
 
     def __check_init__(self):
         """Refuse edges that span no area."""
         spans_area(self.edge_u, self.edge_v)
 
+    @property
     def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """The light, and a product rule over the unit square."""
         return (self.center, self.edge_u, self.edge_v, self.radiance), square_rule(self.samples)
 
     @staticmethod
-    def sample(point: SurfacePoints, *row: Any) -> LightSample:
+    def sample(point: Points, *row: Any) -> LightSample:
         """From a patch of the light above the horizon."""
         center, edge_u, edge_v, radiance, s, t, weight = row
         corner = center - edge_u - edge_v
@@ -163,6 +167,7 @@ class PolygonLight(Light):
     triangles: tuple[tuple[int, int, int], ...] = eqx.field(static=True, init=False)
     type_name: ClassVar[str] = "polygon"
     emits: ClassVar[tuple[int, ...]] = (1,)
+    weighs: ClassVar[int | None] = -1
 
     def __post_init__(self):
         """Cut it into triangles, once."""
@@ -173,6 +178,7 @@ class PolygonLight(Light):
             came = f"must be at least {len(self.triangles)} for {len(self.vertices)} vertices, got {self.samples}"
             raise InputError("samples", came, "Give one sample for each triangle at least")
 
+    @property
     def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """The corners of each triangle, and a product rule over the unit square of each."""
         rule, count = square_rule(self.samples // len(self.triangles)), len(self.triangles)
@@ -181,7 +187,7 @@ class PolygonLight(Light):
         return (_newell_normal(self.vertices), self.radiance), (corners, *tiled)
 
     @staticmethod
-    def sample(point: SurfacePoints, *row: Any) -> LightSample:
+    def sample(point: Points, *row: Any) -> LightSample:
         """From a patch of one triangle above the horizon."""
         area_vector, radiance, (a, b, c), s, t, weight = row
         place, patch, share = _above_horizon(point, (a, a), (b - a, c - a), (s, t))
@@ -256,13 +262,15 @@ class SphereLight(Light):
     samples: int = eqx.field(static=True, converter=sample_number, default=SAMPLES)
     type_name: ClassVar[str] = "sphere"
     emits: ClassVar[tuple[int, ...]] = (2,)
+    weighs: ClassVar[int | None] = -1
 
+    @property
     def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """The light, and a rule over the cap of directions in which a point sees it."""
         return (self.center, self.radius, self.radiance), disc_rule(self.samples)
 
     @staticmethod
-    def sample(point: SurfacePoints, *row: Any) -> LightSample:
+    def sample(point: Points, *row: Any) -> LightSample:
         """From a patch of the cap of directions, above the horizon."""
         center, radius, radiance, s, t, weight = row
         offset = center - point.position

@@ -14,7 +14,7 @@ import dataclasses
 import functools
 import math
 import operator
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import jax
@@ -23,31 +23,32 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
-from brdf.checks import Checked, Scalar, Spectrum, Vector
+from brdf.checks import Checked, Spectrum
 from brdf.geometry.base import Shape
-from brdf.geometry.surface_points import SurfacePoints
+from brdf.geometry.surface_points import Points
+from brdf.vectors import Components
 
 
 class LightSample(NamedTuple):
-    """What one sample of a light sends to one surface point.
+    """What samples of a light that emit 1 send to surface points.
 
     Attributes:
-        to_light: unit direction towards the light, (3,).
-        intensity: what arrives, (C,), without the cosine at the surface.
+        to_light: unit direction towards the light.
+        intensity: what arrives, without the cosine at the surface.
         distance: to the light, in world units; infinite for a light at infinity.
         radius: angular radius, in radians, of a disc as large as the patch that the sample stands for: shadow edges
             sweep over it. None for light without extent, whose shadows are hard.
-        moments: where the sample stands for a patch of the sky, the mean of its directions weighted by radiance, (3,),
-            shorter than 1, and their covariance, (3, 3); None for a single direction.
+        moments: where the sample stands for a patch of the sky, the mean of its directions weighted by radiance,
+            shorter than 1, and the rows of their covariance; None for a single direction.
         lobe_only: 1 where the sample counts for the specular term alone, 0 where for the diffuse alone; None for both.
     """
 
-    to_light: Vector
-    intensity: Spectrum
-    distance: Scalar
-    radius: Scalar | None = None
-    moments: tuple[Vector, Float[Array, "3 3"]] | None = None
-    lobe_only: Scalar | None = None
+    to_light: Components
+    intensity: Any
+    distance: Array
+    radius: Array | None = None
+    moments: tuple[Components, tuple[Components, ...]] | None = None
+    lobe_only: Array | None = None
 
 
 class Light(Checked):
@@ -56,25 +57,26 @@ class Light(Checked):
     Attributes:
         type_name: what ``type`` in a scene file says.
         emits: the places in a row whose product is a spectrum that the sample's intensity is proportional to.
-        weighs: the place among a sample's own numbers that its intensity is proportional to.
+        weighs: the place among a sample's own numbers that its intensity is proportional to; None for a light of one.
     """
 
     type_name: ClassVar[str]
     emits: ClassVar[tuple[int, ...]]
-    weighs: ClassVar[int] = -1
+    weighs: ClassVar[int | None] = None
 
+    @property
     @abc.abstractmethod
     def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """Its numbers, and those of its samples: arrays with one leading axis, none for a light of a single sample."""
 
     @staticmethod
     @abc.abstractmethod
-    def sample(point: SurfacePoints, *row: Any) -> LightSample:
-        """What one sample sends to one point; lights with an extent put their samples above its horizon.
+    def sample(point: Points, *row: Any) -> LightSample:
+        """What samples send to points; lights with an extent put their samples above the horizon.
 
         Args:
-            point: where.
-            row: the light's numbers and those of one of its samples.
+            point: where, (P,).
+            row: the light's numbers, and those of its samples, (S, 1) each; 1 for what it emits.
         """
 
     @property
@@ -84,6 +86,8 @@ class Light(Checked):
         return fields["intensity" if "intensity" in fields else "radiance"]
 
 
+AnyArray = Array | np.ndarray
+
 # Where samples are filled up, to a multiple of this.
 FILLED = 4096
 
@@ -91,45 +95,46 @@ FILLED = 4096
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
 class LightStack:
-    """The L lights of one kind, with S samples each.
+    """The L lights of one kind with S samples each; those of a single sample are together the samples of one.
 
     Attributes:
         kind: their class.
         numbers: of each light, arrays (L, ...).
-        nodes: of each light's samples, arrays (L, S, ...); none where S is 1.
-        light: which of the scene's lights each is, (L,).
+        nodes: of each light's samples, arrays (L, S, ...).
+        light: which of the scene's lights each sample belongs to, (L, S).
     """
 
     kind: type[Light] = dataclasses.field(metadata={"static": True})
-    numbers: tuple[Array, ...]
-    nodes: tuple[Array, ...]
-    light: Int[Array, " L"]
+    numbers: tuple[AnyArray, ...]
+    nodes: tuple[AnyArray, ...]
+    light: Int[AnyArray, "L S"]
 
     @property
     def samples(self) -> int:
         """Of all the lights."""
-        return self.light.shape[0] * (self.nodes[0].shape[1] if self.nodes else 1)
+        return math.prod(self.light.shape)
 
     @property
-    def spectra(self) -> list[Array]:
-        """What multiplies each other to what a sample emits, (L, 1 or S, C) each."""
-        found, count = [*self.numbers, *self.nodes], len(self.numbers)
-        return [found[place] if place >= count else found[place][:, None] for place in self.kind.emits]
+    def channels(self) -> int:
+        """Of what is emitted."""
+        row = *self.numbers, *self.nodes
+        return max(row[place].shape[-1] for place in self.kind.emits)
 
-    def emitted(self, channels: int) -> Float[Array, "L S C"]:
-        """What each sample emits, in so many channels, for an intensity of 1."""
-        each = self.nodes[0].shape[1] if self.nodes else 1
-        product = functools.reduce(operator.mul, self.spectra)
-        return jnp.broadcast_to(product, (self.light.shape[0], each, channels))
+    def emitted(self) -> Float[Array, "L S C"]:
+        """What each sample emits, for an intensity of 1."""
+        row = [*(values[:, None] for values in self.numbers), *self.nodes]
+        product = functools.reduce(operator.mul, (row[place] for place in self.kind.emits))
+        return jnp.broadcast_to(product, (*self.light.shape, self.channels))
 
-    def rows(self) -> tuple[tuple[Array, ...], Array]:
-        """What `Light.sample` takes, one row for each sample, and the light that each belongs to."""
-        if not self.nodes:
-            return self.numbers, self.light
-        each = self.nodes[0].shape[1]
-        numbers = tuple(jnp.repeat(values, each, axis=0) for values in self.numbers)
-        nodes = tuple(values.reshape(-1, *values.shape[2:]) for values in self.nodes)
-        return (*numbers, *nodes), jnp.repeat(self.light, each)
+    def chunks(self, largest: int) -> tuple[tuple[Array, ...], Int[Array, "L K B"], Float[Array, "L K B C"]]:
+        """Nodes, lights and emission by chunks of up to so many samples; samples of no light fill up the last one."""
+        count = self.light.shape[1]
+        chunks = -(-count // largest)
+        place = np.arange(chunks * -(-count // chunks)).reshape(chunks, -1)
+        nodes, light, emitted = jax.tree.map(
+            lambda leaf: jnp.asarray(leaf)[:, np.minimum(place, count - 1)], (self.nodes, self.light, self.emitted())
+        )
+        return nodes, light, jnp.where((place < count)[..., None], emitted, 0)
 
 
 @jax.tree_util.register_dataclass
@@ -148,14 +153,7 @@ class Lighting:
     @property
     def samples(self) -> int:
         """Of all lights together."""
-        return sum(map(operator.attrgetter("samples"), self.stacks))
-
-    def each(self) -> Iterator[tuple[type[Light], tuple[Array, ...], Array]]:
-        """Every sample on its own: the kind of its light, its row, which light it belongs to."""
-        for stack in self.stacks:
-            rows, light = stack.rows()
-            for index in range(stack.samples):
-                yield stack.kind, tuple(values[index] for values in rows), light[index]
+        return sum(stack.samples for stack in self.stacks)
 
 
 def stacked(lights: Sequence[Light], dtype: Any, fill_above: float = math.inf) -> tuple[LightStack, ...]:
@@ -168,29 +166,37 @@ def stacked(lights: Sequence[Light], dtype: Any, fill_above: float = math.inf) -
     """
     kinds: dict[Any, list[tuple[Any, ...]]] = {}
     for index, light in enumerate(lights):
-        numbers, nodes = light.rows()
-        shapes = tuple(values.shape for values in (*numbers, *nodes))
-        kinds.setdefault((type(light), len(numbers), shapes), []).append((np.int32(index), *numbers, *nodes))
+        numbers, nodes = light.rows
+        shapes = tuple(np.shape(values) for values in (*numbers, *nodes))
+        kinds.setdefault((type(light), len(numbers), shapes), []).append((index, *numbers, *nodes))
     stacks = []
     for (kind, count, _), members in kinds.items():
-        light, *values = map(_stack, zip(*members, strict=True))
-        values[count:] = _filled(values[count:], kind.weighs, fill_above)
-        values = tuple(jnp.asarray(value, dtype) for value in values)
-        stacks.append(LightStack(kind, values[:count], values[count:], light))
+        index, *values = zip(*members, strict=True)
+        values = [_stack(each, dtype) for each in values]
+        light = np.array(index, np.int32)
+        if len(values) == count:
+            stacks.append(LightStack(kind, (), tuple(each[None] for each in values), light[None]))
+            continue
+        numbers, nodes = values[:count], values[count:]
+        if (
+            kind.weighs is not None
+            and nodes[0].shape[1] > fill_above
+            and all(isinstance(each, np.ndarray) for each in nodes)
+        ):
+            nodes = _filled(nodes, kind.weighs)
+        each = np.broadcast_to(light[:, None], nodes[0].shape[:2])
+        stacks.append(LightStack(kind, tuple(numbers), tuple(nodes), each))
     return tuple(stacks)
 
 
-def _filled(nodes: Sequence[Any], weighs: int, above: float) -> list[Any]:
-    """Samples of lights, and further ones that send nothing, where there are more than so many."""
-    each = nodes[0].shape[1] if nodes else 0
-    if each <= above or not all(isinstance(values, np.ndarray) for values in nodes):
-        return list(nodes)
-    more = -each % FILLED
-    found = [np.concatenate([values, np.repeat(values[:, -1:], more, axis=1)], axis=1) for values in nodes]
+def _filled(nodes: Sequence[np.ndarray], weighs: int) -> list[np.ndarray]:
+    """Samples of lights, and further ones that send nothing."""
+    each = nodes[0].shape[1]
+    found = [np.pad(one, [(0, 0), (0, -each % FILLED)] + [(0, 0)] * (one.ndim - 2), mode="edge") for one in nodes]
     found[weighs][:, each:] = 0
     return found
 
 
-def _stack(values: Sequence[Any]) -> Any:
+def _stack(values: Sequence[Any], dtype: Any) -> Any:
     traced = any(isinstance(value, Tracer) for value in values)
-    return jnp.stack(values) if traced else np.stack(values)
+    return jnp.stack(values).astype(dtype) if traced else np.stack(values).astype(dtype)

@@ -26,7 +26,7 @@ from jaxtyping import Array, Float
 
 from brdf.checks import Spectrum, checked, sample_number, spectrum
 from brdf.errors import InputError
-from brdf.geometry.surface_points import SurfacePoints
+from brdf.geometry.surface_points import Points
 from brdf.lights.base import Light, LightSample
 from brdf.lights.sample_sets import hemisphere_rule, ring_rule
 from brdf.vectors import dot, normalize, perpendicular, square_root, trace
@@ -72,13 +72,14 @@ class ConstantEnvironment(Light):
     samples: int = eqx.field(static=True, converter=sample_number, default=CONSTANT_SAMPLES)
     type_name: ClassVar[str] = "environment"
     emits: ClassVar[tuple[int, ...]] = (0,)
-    weighs: ClassVar[int] = 2
+    weighs: ClassVar[int | None] = 2
 
     def __check_init__(self):
         """Refuse a single sample."""
         if self.samples < 2:
             raise InputError("samples", "must be at least 2 here, got 1", "Give more")
 
+    @property
     def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """The light, two rules over the hemisphere, and which of the two a row belongs to."""
         half = max(1, self.samples // 2)
@@ -88,7 +89,7 @@ class ConstantEnvironment(Light):
         return (self.radiance,), (*rule, lobe_only)
 
     @staticmethod
-    def sample(point: SurfacePoints, *row: Any) -> LightSample:
+    def sample(point: Points, *row: Any) -> LightSample:
         """From a patch of the hemisphere above the point."""
         radiance, s, t, weight, lobe_only = row
         normal, to_view = point.normal, point.to_view
@@ -151,7 +152,7 @@ class EnvironmentMap(Light):
     samples: int = eqx.field(static=True)
     type_name: ClassVar[str] = "environment"
     emits: ClassVar[tuple[int, ...]] = (0, 1)
-    weighs: ClassVar[int] = 0
+    weighs: ClassVar[int | None] = 0
 
     def __init__(self, pixels: Any, *, radiance: Any = 1.0, samples: int = MAP_SAMPLES):
         """Take a map's colour out where it has only one, and cut it up."""
@@ -170,12 +171,13 @@ class EnvironmentMap(Light):
         self.radiance = factor * colour
         self.patches = cut(np.asarray(self.pixels), self.samples)
 
+    @property
     def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """The factor and the rectangles of the map."""
         return (self.radiance,), self.patches
 
     @staticmethod
-    def sample(point: SurfacePoints, *row: Any) -> LightSample:
+    def sample(point: Points, *row: Any) -> LightSample:
         """The same at every point: the light of one rectangle of the map."""
         radiance, intensity, mean, covariance = row
         radius = square_root(2.0 * trace(covariance))  # that of a disc of the same variance

@@ -9,7 +9,7 @@ import numpy as np
 
 from brdf.checks import Scalar, Spectrum, Vector, checked, direction_value, number, spectrum, vector
 from brdf.errors import InputError
-from brdf.geometry.surface_points import SurfacePoints
+from brdf.geometry.surface_points import Points
 from brdf.lights.base import Light, LightSample
 from brdf.vectors import cosine_lobe, divide, dot, norm, normalize
 
@@ -36,12 +36,13 @@ class DirectionalLight(Light):
     type_name: ClassVar[str] = "directional"
     emits: ClassVar[tuple[int, ...]] = (1,)
 
+    @property
     def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """It is a single sample."""
         return (self.direction, self.intensity), ()
 
     @staticmethod
-    def sample(point: SurfacePoints, *row: Any) -> LightSample:
+    def sample(point: Points, *row: Any) -> LightSample:
         """The same at every point."""
         direction, intensity = row
         return LightSample(normalize(direction), intensity, jnp.asarray(jnp.inf))
@@ -81,12 +82,13 @@ class PointLight(Light):
     type_name: ClassVar[str] = "point"
     emits: ClassVar[tuple[int, ...]] = (1,)
 
+    @property
     def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """It is a single sample."""
         return (self.position, self.intensity, self.attenuation), ()
 
     @staticmethod
-    def sample(point: SurfacePoints, *row: Any) -> LightSample:
+    def sample(point: Points, *row: Any) -> LightSample:
         """From the light's distance and direction."""
         position, intensity, (a, b, c) = row
         offset = position - point.position
@@ -135,13 +137,14 @@ class SpotLight(Light):
             came = f"must be 0 to 90 degrees, or 180, got {float(self.cutoff_angle):g}"
             raise InputError("cutoff_angle", came, "A spot of more than 90 degrees is a point light")
 
+    @property
     def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """It is a single sample."""
         cone = (self.direction, self.cutoff_angle, self.exponent)
         return (self.position, self.intensity, self.attenuation, *cone), ()
 
     @staticmethod
-    def sample(point: SurfacePoints, *row: Any) -> LightSample:
+    def sample(point: Points, *row: Any) -> LightSample:
         """A point light's, times the spot's factor."""
         *light, direction, cutoff_angle, exponent = row
         sample = PointLight.sample(point, *light)

@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from brdf import formatters, vectors
 from brdf.checks import Checked, Parameter, coefficients, exponent
@@ -141,7 +141,7 @@ class SpecularMaterial(Material):
         above = (to_light[..., 2] > 0) & (to_view[..., 2] > 0)
         return jnp.where(above[..., None], self.k_d + self.k_s * lobe[..., None], 0.0) / math.pi
 
-    def _lobe(self, normal: ArrayLike, to_light: ArrayLike, to_view: ArrayLike) -> Array:
+    def _lobe(self, normal: Directions, to_light: Directions, to_view: Directions) -> Array:
         """scale(n) cos^n, gated: light does not come through the surface."""
         above = (vectors.dot(normal, to_light) > 0) & (vectors.dot(normal, to_view) > 0)
         lobe = vectors.lobe(self.log_cosine(normal, to_light, to_view), self.n)

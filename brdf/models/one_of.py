@@ -1,10 +1,9 @@
 """A model that a program learns when it runs: one program serves all, where making it costs more than running it."""
 
+import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import Any, TypeGuard
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,43 +13,42 @@ from brdf.models import MODELS
 from brdf.models.base import Material, SpecularMaterial
 
 
-class OneOf(eqx.Module):
-    """A model with a lobe, with what light samples ask of its class.
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class OneOf:
+    """A model, with what light samples ask of its class.
 
     Attributes:
         models: those it may be.
         index: which of them it is.
     """
 
-    models: tuple[type[SpecularMaterial], ...] = eqx.field(static=True)
-    index: Int[Any, ""]
+    models: tuple[type[Material], ...] = dataclasses.field(metadata={"static": True})
+    index: Int[Array, ""] | int | np.int32 = 0
 
     @classmethod
-    def of(cls, model: type[Material]) -> "type[Material] | OneOf":
-        """Of all models that have a name; the model itself where it is none of them or has no lobe."""
+    def of(cls, model: type[Material]) -> "OneOf":
+        """Of all models that have a name; the model alone where it is none of them or has no lobe."""
         models = tuple(one for one in MODELS.values() if issubclass(one, SpecularMaterial))
-        return cls(models, np.int32(models.index(model))) if model in models else model
+        return cls(models, np.int32(models.index(model))) if model in models else cls((model,))
+
+    @property
+    def lobes(self) -> tuple[type[SpecularMaterial], ...]:
+        """The models, where they have a lobe."""
+        return tuple(model for model in self.models if issubclass(model, SpecularMaterial))
 
     @property
     def log_cosine(self) -> Callable[..., Array]:
         """See `SpecularMaterial.log_cosine`."""
-        kinds = list(dict.fromkeys(model.log_cosine for model in self.models))
-        kind = jnp.asarray([kinds.index(model.log_cosine) for model in self.models])[self.index]
+        kinds = list(dict.fromkeys(model.log_cosine for model in self.lobes))
+        kind = jnp.asarray([kinds.index(model.log_cosine) for model in self.lobes])[self.index]
         return partial(jax.lax.switch, kind, kinds)
 
     def scale(self, n: Array) -> Array:
         """See `SpecularMaterial.scale`."""
-        return jax.lax.switch(self.index, [model.scale for model in self.models], n)
+        return jax.lax.switch(self.index, [model.scale for model in self.lobes], n)
 
     @property
     def cosine_weighted(self) -> Array:
         """See `SpecularMaterial`."""
-        return jnp.asarray([model.cosine_weighted for model in self.models])[self.index]
-
-
-Model = type[Material] | OneOf
-
-
-def has_lobe(model: Model) -> "TypeGuard[type[SpecularMaterial] | OneOf]":
-    """Whether it has a specular term."""
-    return isinstance(model, OneOf) or issubclass(model, SpecularMaterial)
+        return jnp.asarray([model.cosine_weighted for model in self.lobes])[self.index]

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -13,9 +12,10 @@ from jaxtyping import Array
 
 import brdf
 from brdf.images.encoding import Encoding
-from brdf.lights.base import LightStack, stacked
+from brdf.lights.base import Lighting, LightStack, stacked
 from brdf.lobes import light_terms
 from brdf.models.base import SpecularMaterial
+from brdf.models.one_of import OneOf
 from brdf.precision import Precision, working_precision
 from brdf.vectors import Components, normalize
 from fitting.likelihood import encoded_and_slope
@@ -219,23 +219,22 @@ def _near_columns(model: Any, points: Any, stacks: Any, occluders: Any, ambient:
     """Columns of lights of any kind at the points of a tile, (T,)."""
     terms, order = [], []
     for stack in stacks:
-        rows, lights = stack.rows()
 
-        def of_sample(one: Any, kind: Any = stack.kind) -> Any:
-            row, light = one
-            return jax.vmap(partial(light_terms, model, occluders, kind, row, light))(points)
+        def of_samples(one: Any, kind: Any = stack.kind) -> Any:
+            *samples, emitted = one
+            found = light_terms(OneOf((model,)), Lighting((), occluders), points.in_components(), kind, *samples)
+            weighted = [part[..., None] * emitted[:, None] for part in (found.diffuse, found.weight)]
+            return found._replace(diffuse=weighted[0], weight=weighted[1])
 
-        found = jax.lax.map(of_sample, (rows, lights))
-        terms.append(jax.tree.map(partial(_by_light, stack.light.shape[0]), found))
-        order.append(stack.light)
+        each = stack.numbers, stack.nodes, stack.light, stack.emitted()
+        if not stack.numbers:  # lights of one sample each
+            each = jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), each)
+        terms.append(jax.lax.map(of_samples, each))
+        order.append(each[2][:, 0])
     every = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[jnp.argsort(jnp.concatenate(order))], *terms)
     diffuse = jnp.swapaxes(jnp.sum(every.diffuse, axis=1), 1, 2)
     linear = [] if ambient is None else [ambient * jnp.ones_like(diffuse)]
     return Columns([*linear, diffuse], jnp.swapaxes(every.weight, 2, 3), every.log_cosine)
-
-
-def _by_light(lights: int, samples: Array) -> Array:
-    return samples.reshape(lights, -1, *samples.shape[1:])
 
 
 def _layers(

@@ -120,6 +120,26 @@ def test_an_averaged_basis_makes_the_averaged_picture():
     np.testing.assert_allclose(few(jnp.asarray(200.0))[0], value[100:200], atol=1e-7)
 
 
+@pytest.mark.parametrize("shapes", [1, 2])
+def test_rays_that_are_traced_anew_see_what_points_that_are_kept_see(shapes: int):
+    both = [
+        brdf.Sphere(center=[0, 0, 0], radius=1),
+        brdf.Rectangle(center=[0, 0, -1], edge_u=[2, 0, 0], edge_v=[0, 2, 0]),
+    ]
+    camera = brdf.PerspectiveCamera(position=[0, 1, 5], target=[0, 0, 0], up=[0, 1, 0], fov=30, resolution=(24, 20))
+    scene = brdf.cast(brdf.Scene(camera, both[:shapes], lights=ball(1).lights), "float32")
+    rays, points = scene.sight(), scene.surface_points()
+    assert len(jax.tree.leaves(rays)) < len(jax.tree.leaves(scene))  # no pixels
+    np.testing.assert_array_equal(rays.mask, points.mask)
+    traced, kept = (basis(brdf.BlinnPhong, scene, points=one) for one in (rays, points))
+    np.testing.assert_allclose(traced.diffuse, kept.diffuse, atol=1e-6)
+    assert traced.lobe is not None
+    assert kept.lobe is not None
+    np.testing.assert_allclose(traced.lobe(jnp.asarray(20.0))[0], kept.lobe(jnp.asarray(20.0))[0], atol=1e-5)
+    some = scene.sight((5, 9))
+    np.testing.assert_array_equal(some.mask, np.asarray(points.mask)[5:9])
+
+
 def directional(count: int, **more) -> list[brdf.DirectionalLight]:
     turns = 2.4 * np.arange(count)
     directions = np.stack([np.cos(turns), np.sin(turns), 1.0 + np.arange(count) / count], axis=-1)
@@ -182,8 +202,8 @@ def test_one_program_under_many_samples_serves_every_lobe_and_number(model):
     material = model(k_d=0.3, k_s=[0.2, 0.3, 0.4], n=20.0)
     shown = 0.3 * images.diffuse + np.array([0.2, 0.3, 0.4]) * images.specular
     np.testing.assert_allclose(shown, brdf.render(material, scene), rtol=2e-6, atol=1e-7)
-    before = rendering._basis_images._cached._cache_size()
+    before = rendering._basis_images._cache_size()
     for other, samples in ((brdf.BlinnPhong, 64), (model, 400)):
         more = dataclasses.replace(scene, lights=(dataclasses.replace(light, samples=samples), scene.lights[1]))
         brdf.basis_images(other, more, 30.0)
-    assert rendering._basis_images._cached._cache_size() == before
+    assert rendering._basis_images._cache_size() == before
