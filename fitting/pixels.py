@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float
 
 import brdf
 from brdf.errors import InputError
+from brdf.geometry.rays import Sight
 from brdf.models.base import SpecularMaterial
 from brdf.precision import Precision
 from fitting.codes import open_ends
@@ -58,7 +59,7 @@ class Tile(NamedTuple):
 
     target: Float[Array, "P C"]
     weight: Float[Array, " P"] | None
-    points: brdf.SurfacePoints
+    points: Sight
     scene: brdf.Scene
     bounds: Bounds | None = None
 
@@ -133,7 +134,7 @@ class _Band(NamedTuple):
 
     rows: slice
     values: Any
-    points: brdf.SurfacePoints
+    points: Sight
     allowed: Any
 
 
@@ -274,7 +275,7 @@ def _bands(
     pixels = target.pixels if target.streamed else np.asarray(target.pixels, dtype)
 
     def band(first: int, last: int) -> _Band:
-        points = scene.surface_points(None if last - first == height else (first, last))
+        points = scene.sight(None if last - first == height else (first, last))
         # Here and below through NumPy, or each conversion would be compiled.
         allowed = np.asarray(points.mask).ravel()
         if mask is not None:

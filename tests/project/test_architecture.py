@@ -35,7 +35,8 @@ fitting.cli
 # What fitting needs of brdf and no user calls.
 OPEN_TO_FITTING = set(
     """
-brdf.albedo brdf.channels brdf.checks brdf.conversions brdf.display brdf.errors brdf.files brdf.images.encoding
+brdf.albedo brdf.channels brdf.checks brdf.conversions brdf.display brdf.errors brdf.files brdf.geometry.rays
+    brdf.images.encoding
     brdf.images.jpeg brdf.images.writing brdf.lights.base brdf.lobes
     brdf.materials.exports brdf.materials.material_file brdf.measured.loading brdf.measured.table brdf.models.base
     brdf.models.one_of brdf.plausibility.numeric brdf.plausibility.report brdf.precision brdf.rendering
