@@ -9,7 +9,7 @@ from project_paths import ROOT
 
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / "out" / "compiled"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-# jaxlib warns of programs that it takes from there, see `fitting.cli.common.use_compilation_cache`.
+# jaxlib warns of programs that it takes from there, see `fitting.cli.main`.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 # A program that another process is just writing is compiled again.
 os.environ.setdefault("PYTHONWARNINGS", "ignore:Error reading persistent compilation cache entry")

@@ -1,4 +1,4 @@
-"""What the commands share: options, errors that name what was typed, materials, output, the compiler's cache.
+"""What the commands share: how a function becomes a command, materials by name, devices, output.
 
 Help does not import JAX or NumPy; each command imports what it needs.
 """
@@ -7,123 +7,100 @@ import contextlib
 import difflib
 import functools
 import inspect
+import json
 import os
-import sys
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, get_args
+from typing import Annotated, Any, NamedTuple
 
 import typer
 
 import brdf
 from brdf.errors import InputError
+from brdf.files import check_folder
 
-# As `fitting.fit` takes them; help is shown without importing it.
-MODEL_NAMES = ("auto", "lambert", "phong", "blinn-phong", "normalized-phong", "normalized-blinn-phong")
-
-
-# What help shows that an option takes.
-TAKES = ((bool, ""), (Path, "PATH"), (float, "NUMBER"), (int, "NUMBER"), (str, "TEXT"), (Any, "TEXT"))
-
-
-Encoding = Annotated[
-    Any,
-    typer.Option(
-        help="linear, srgb or a gamma; default: what the file says.",
-        rich_help_panel="What the pictures show",
-        parser=str,
-    ),
-]
-
-
-Model = Annotated[str, typer.Option(help=f"One of {', '.join(MODEL_NAMES)}.")]
-Precision = Annotated[str, typer.Option(help="float32 or float64.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
-AMaterial = Annotated[
-    str, typer.Argument(help="A .json or .mtl file, a folder of brdf fit --out, or a name of the classic table.")
-]
-
-
-Report = Annotated[Path | None, typer.Option(help="One .html page with everything, to keep or to send.")]
-
-
-def check_page(path: Path | None) -> None:
-    """Tell before the work that a page cannot be written.
-
-    Args:
-        path: of the page, or None.
-
-    Raises:
-        InputError: naming it.
-    """
-    if path is not None and path.suffix.lower() not in (".html", ".htm"):
-        raise InputError(path, "is no name of a page", "Name it .html")
-    if path is not None and not path.absolute().parent.is_dir():
-        raise InputError(path, f"cannot be written, {path.parent} is no folder", "Make it first")
-
-
-def _option(said: str, *names: str) -> Any:
-    return typer.Option(*names, help=said, rich_help_panel="What the pictures show")
+# By what Slurm, Open MPI and `jax.distributed` itself say how many processes there are.
+PROCESSES = ("SLURM_NTASKS", "OMPI_COMM_WORLD_SIZE", "JAX_NUM_PROCESSES")
 
 
 class PictureOptions(NamedTuple):
-    """What the options say of the pictures, as typed; None where not given. Their help is their description."""
+    """What the options say of the pictures, as typed; None where not given. Their help is what stands here.
 
-    scene: Annotated[Path | None, _option("The scene file; in a folder, scene.toml.")] = None
-    within: Annotated[
-        Path | None, _option("The folder that paths in the scene file may not leave; default: its own.")
-    ] = None
-    sphere: Annotated[
-        str | None,
-        _option("A ball in the photograph: x,y,radius in pixels from the upper left one, or mask: found in --mask."),
-    ] = None
-    normals: Annotated[
-        Path | None, _option("Normals of the pixels: an image or .npy; x right, y up, z to the camera.")
-    ] = None
-    light: Annotated[
-        str | None, _option("Towards the light: x,y,z (right, up, to the camera), or fit: from the shading.")
-    ] = None
-    lights: Annotated[
-        Path | None, _option("A text file with such a direction for each picture, or an .lp file that names them.")
-    ] = None
-    intensities: Annotated[Path | None, _option("A text file with the light's intensity for each picture.")] = None
-    ambient: Annotated[
-        bool, _option("A photograph is lit from all around too: find k_a for that light as 1.", "--ambient")
-    ] = False
-    encoding: Encoding = None
-    exposure: Annotated[str | None, _option("Relative exposure to divide by, one or one each.")] = None
-    mask: Annotated[Path | None, _option("An image: pixels that are 0 there are left out.")] = None
-    saturation: Annotated[float | None, _option("Linear values from here on are clipped, not data.")] = None
+    Attributes:
+        scene: the scene file; in a folder, scene.toml.
+        within: the folder that paths in the scene file may not leave; default: its own.
+        sphere: a ball in the photograph: x,y,radius in pixels from the upper left one, or mask: found in --mask.
+        normals: normals of the pixels: an image or .npy; x right, y up, z to the camera.
+        light: towards the light: x,y,z (right, up, to the camera), or fit: from the shading.
+        lights: a text file with such a direction for each picture, or an .lp file that names them.
+        intensities: a text file with the light's intensity for each picture.
+        ambient: a photograph is lit from all around too: find k_a for that light as 1.
+        encoding: linear, srgb or a gamma; default: what the file says.
+        exposure: relative exposure to divide by, one or one each.
+        mask: an image: pixels that are 0 there are left out.
+        saturation: linear values from here on are clipped, not data.
+    """
+
+    scene: Path | None = None
+    within: Path | None = None
+    sphere: str | None = None
+    normals: Path | None = None
+    light: str | None = None
+    lights: Path | None = None
+    intensities: Path | None = None
+    ambient: bool = False
+    encoding: Any = None
+    exposure: str | None = None
+    mask: Path | None = None
+    saturation: float | None = None
 
 
-def as_command(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A command whose errors name the options that were typed, not the arguments of the functions behind.
+def add_command(app: typer.Typer, function: Callable[..., Any]) -> None:
+    """Make a command of a function, whose docstring is the help.
 
-    In place of a parameter ``pictures`` it takes an option for each field of `PictureOptions`.
+    Before ``*`` stand arguments, behind it options; in place of ``pictures`` there is an option for each field of
+    `PictureOptions`. An error names the file or option that was typed, not the argument of the function behind.
 
     Args:
-        function: what the command does.
+        app: takes the command.
+        function: what it does.
     """
     own = inspect.signature(function).parameters
-    shown = inspect.signature(PictureOptions).parameters if "pictures" in own else {}
+    fields = inspect.signature(PictureOptions).parameters if "pictures" in own else {}
+    shown = [_typed(one, function, None) for name, one in own.items() if name != "pictures"]
+    shown += [_typed(one, PictureOptions, "What the pictures show") for one in fields.values()]
 
     @functools.wraps(function)
-    def command(**given: Any) -> Any:
+    def command(**given):
         options = {name: value for name, value in given.items() if name not in ("target", "material")}
-        typed = {name: value if isinstance(value, Path) else f"--{name}" for name, value in options.items()}
-        if shown:
-            given["pictures"] = PictureOptions(**{name: given.pop(name) for name in shown})
+        typed = {name: value if isinstance(value, Path) else _flag(name) for name, value in options.items()}
+        if fields:
+            given["pictures"] = PictureOptions(**{name: given.pop(name) for name in fields})
         with named_as(typed | {"circle": "--sphere"}):
             return function(**given)
 
-    every = [one.replace(kind=one.KEYWORD_ONLY) for one in (*own.values(), *shown.values()) if one.name != "pictures"]
-    for one in every:
-        kind, about, *_ = (*get_args(one.annotation), None, None)
-        if isinstance(about, typer.models.OptionInfo) and about.metavar is None:
-            # A switch takes nothing, so nothing is shown behind it.
-            about.metavar = next((word for type_, word in TAKES if type_ in (kind, *get_args(kind))), None)
-    command.__signature__ = inspect.Signature(every)  # pyright: ignore[reportAttributeAccessIssue]
-    return command
+    command.__signature__ = inspect.Signature(shown)  # pyright: ignore[reportAttributeAccessIssue]
+    text = inspect.getdoc(function) or ""
+    examples = re.sub(r"(brdf .+)", r"[bold]\1[/bold]\n", inspect.cleandoc(text.partition("\nExample:\n")[2]))
+    app.command(help=text.partition("\n\nArgs:")[0], epilog=f"Example: {examples}")(command)
+
+
+def _typed(one, documented, panel):
+    """A parameter as it is typed: an argument, or an option where it has to be named."""
+    kind = str if one.annotation is Any else one.annotation
+    said = re.search(rf"^    {one.name}: (.+(\n     .+)*)", inspect.getdoc(documented) or "", re.MULTILINE)
+    words = " ".join(said[1].split()) if said else ""
+    if panel is None and one.kind is not one.KEYWORD_ONLY:
+        about = typer.Argument(help=words)
+    else:
+        names = [_flag(one.name), *(["-o"] if one.name == "out" else [])]
+        about = typer.Option(*names, help=words, metavar="" if kind is bool else None, rich_help_panel=panel)
+    return one.replace(kind=one.KEYWORD_ONLY, annotation=Annotated[kind, about])
+
+
+def _flag(name):
+    return f"--{name.replace('_', '-')}"
 
 
 @contextlib.contextmanager
@@ -141,32 +118,11 @@ def named_as(typed: dict[str, Any]) -> Iterator[None]:
         raise InputError(typed[error.where], error.what, error.remedy) from None
 
 
-def find_material(text: str, name: str | None = None) -> tuple["brdf.Material", str, str]:
-    """One material, what it is called, and what its file says that it leaves open.
-
-    Args:
-        text: a file, or a name of the classic table such as emerald; a file goes before a name.
-        name: which one, where an MTL file holds several.
-
-    Raises:
-        InputError: naming the file or the option.
-    """
-    key = _table_name(text)
-    if key is None:
-        from brdf.materials.material_file import read_material
-
-        material, note = read_material(text, name)
-        return material, name or Path(text).stem, note
-    if name is not None:
-        raise InputError("--name", f"chooses from a file, and {key} is one material", "Leave it out")
-    return brdf.preset(key), key, ""
-
-
 def find_materials(text: str) -> dict[str, tuple["brdf.Material", str]]:
     """Every material of a file, or the one of the classic table, by name, with what its file says that it leaves open.
 
     Args:
-        text: see `find_material`.
+        text: a file, or a name of the classic table such as emerald; a file goes before a name.
 
     Raises:
         InputError: naming the file.
@@ -179,7 +135,27 @@ def find_materials(text: str) -> dict[str, tuple["brdf.Material", str]]:
     return read_materials(text)
 
 
-def _table_name(text: str) -> str | None:
+def find_material(text: str, name: str | None = None) -> tuple["brdf.Material", str]:
+    """One material, and what its file says that it leaves open.
+
+    Args:
+        text: see `find_materials`.
+        name: which one, where an MTL file holds several.
+
+    Raises:
+        InputError: naming the file or the option.
+    """
+    key = _table_name(text)
+    if key is None:
+        from brdf.materials.material_file import read_material
+
+        return read_material(text, name)
+    if name is not None:
+        raise InputError("--name", f"chooses from a file, and {key} is one material", "Leave it out")
+    return brdf.preset(key), ""
+
+
+def _table_name(text):
     """The name in the classic table; None where a file is meant."""
     if not text.strip():
         raise InputError("MATERIAL", "is empty", "Give a .json or .mtl file, or a name such as emerald")
@@ -193,38 +169,66 @@ def _table_name(text: str) -> str | None:
     raise InputError(text, "is no material file and no name of the classic table", remedy)
 
 
-def use_compilation_cache() -> None:
-    """Keep compiled programs in the user's cache folder: the second run of the same kind skips the compiler."""
-    # Of each program that it takes from there jaxlib 0.10.1 says, at length, that the compiler's own settings are no
-    # features of the machine. What is an error comes as an exception.
-    os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
+def all_devices(devices: str | None) -> Any:
+    """The mesh of every core or accelerator, and every process that a scheduler has started; None where not asked for.
+
+    Args:
+        devices: "all", or None.
+
+    Raises:
+        InputError: where it is something else.
+    """
+    if devices is None:
+        return None
+    if devices != "all":
+        raise InputError("--devices", f"must be all, got {devices!r}", "Write --devices all, or leave it out")
+    flags = os.environ.get("XLA_FLAGS", "")
+    if "xla_force_host_platform_device_count" not in flags:
+        # Of the host platform alone: where there is an accelerator it is that that is taken.
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        os.environ["XLA_FLAGS"] = f"{flags} --xla_force_host_platform_device_count={cores}".strip()
     import jax
 
-    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    if jax.config.values["jax_compilation_cache_dir"] is None:
-        jax.config.update("jax_compilation_cache_dir", str(Path(base) / "brdf" / "jax"))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    if any(int(os.environ.get(name, "1")) > 1 for name in PROCESSES) and not jax.distributed.is_initialized():
+        jax.config.update("jax_cpu_collectives_implementation", "gloo")
+        jax.distributed.initialize()
+    return jax.make_mesh((jax.device_count(),), ("pixels",))
 
 
-def show(text: str) -> None:
+def is_first_process(mesh: Any) -> bool:
+    """Whether this process is the one that writes and prints.
+
+    Args:
+        mesh: of `all_devices`.
+    """
+    return mesh is None or mesh.local_devices[0].process_index == 0
+
+
+def check_outputs(out: Path | None, plot: bool = False, page: Path | None = None) -> None:
+    """Refuse before the work what could not be written after it.
+
+    Args:
+        out: the folder of results.
+        plot: whether a picture is to be drawn into it.
+        page: of a report.
+
+    Raises:
+        InputError: naming the file or option.
+    """
+    if plot and out is None:
+        raise InputError("--plot", "needs a folder to draw into", "Add --out DIR")
+    if page is not None and page.suffix.lower() not in (".html", ".htm"):
+        raise InputError(page, "is no name of a page", "Name it .html")
+    if page is not None and not page.absolute().parent.is_dir():
+        raise InputError(page, f"cannot be written, {page.parent} is no folder", "Make it first")
+    if out is not None:
+        check_folder(out)
+
+
+def show(told: Any) -> None:
     """Print the command's output.
 
     Args:
-        text: to print.
-
-    Raises:
-        InputError: where it cannot be written.
+        told: text; or what JSON holds.
     """
-    try:
-        print(text, flush=True)  # noqa: T201  # this is the command's output
-    except BrokenPipeError:
-        raise
-    except OSError as error:
-        forget_output()
-        raise InputError("output", f"cannot be written ({error.strerror})", "Send it elsewhere") from None
-
-
-def forget_output() -> None:
-    """Let what could not be written go, or Python would try once more when it ends."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    print(told if isinstance(told, str) else json.dumps(told, indent=2), flush=True)  # noqa: T201  # the one place

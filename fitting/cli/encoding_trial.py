@@ -7,30 +7,33 @@ leaves is compared in the codes of the file, the same numbers under both, with t
 
 import dataclasses
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-import brdf
 import fitting
 from brdf.errors import InputError
 from brdf.images.encoding import encode
 from fitting.cli.common import named_as
-from fitting.cli.inputs import FitInputs, Given, collect
+from fitting.cli.inputs import FitInputs
 from fitting.result import FitResult
 
 # The other encoding is taken where it leaves less than this share of the squares that the assumed one leaves...
 LESS = 0.9
 # ... and one of them is no guess where it leaves less than this share of what the other leaves.
 CLEARLY = 0.5
+OTHER: dict[Any, str] = {"linear": "srgb", "srgb": "linear"}
+NAMES: dict[Any, str] = {"linear": "linear", "srgb": "sRGB"}
 
 
-def fit_either(given: Given, say: Callable[[str], None] = lambda what: None, **how: Any) -> tuple[FitResult, FitInputs]:
+def fit_either(
+    inputs: FitInputs, again: Callable[..., FitInputs], say: Callable[[str], None], **how: Any
+) -> tuple[FitResult, FitInputs]:
     """Fit, where a file does not say how it is encoded under both interpretations.
 
     Args:
-        given: to the command.
+        inputs: as they were read.
+        again: reads them with other encodings, by file.
         say: what is being done.
         how: further arguments of `fitting.fit`; seconds are shared by the two fits.
 
@@ -40,80 +43,68 @@ def fit_either(given: Given, say: Callable[[str], None] = lambda what: None, **h
     Raises:
         InputError: naming the file or option.
     """
-    silent = {path: picture for path, picture in given.pictures.items() if picture.source == "assumed"}
-    if silent and how["seconds"] is not None:
-        how["seconds"] /= 2
-    count = len(given.pictures)
+    count = len(inputs.pictures)
     what = f"fitting {count} pictures" if count > 1 else "fitting"
-    say(f"{what} as {_name(next(iter(silent.values())).encoding)}" if silent else what)
-    inputs, result = _fit(given, {}, how)
-    if not silent:
-        return result, inputs
-    say(f"{what} as {_name(_other(next(iter(silent.values()))))}")
+    if not inputs.silent:
+        say(what)
+        return _fit(inputs, how), inputs
+    path, assumed = next(iter(inputs.silent.items()))
+    if how["seconds"] is not None:
+        how["seconds"] /= 2
+    say(f"{what} as {NAMES[assumed]}")
+    result = _fit(inputs, how)
+    say(f"{what} as {NAMES[OTHER[assumed]]}")
     try:
-        others = {path: brdf.read_picture(path, encoding=_other(picture)) for path, picture in silent.items()}
-        other_inputs, other = _fit(given, others, how)
+        others = again({path: OTHER[encoding] for path, encoding in inputs.silent.items()})
+        other = _fit(others, how)
     except InputError:
         return result, inputs  # under the other encoding it cannot be fitted at all
     # To be compared where both count: each leaves out what under its own encoding is cut off.
     both = [mine & its for mine, its in zip(result.counted, other.counted, strict=True)]
-    common = both if all(counted.any() for counted in both) else None
-    shares = _unexplained(inputs, result, common), _unexplained(other_inputs, other, common)
-    is_other, warning = judge(given.targets[0], next(iter(silent.values())), shares)
+    both = both if all(counted.any() for counted in both) else None
+    shares = [_unexplained(fit, its, both or fit.counted) for fit, its in ((result, inputs), (other, others))]
+    is_other, warning = judge(assumed, *shares)
     if is_other:
-        result, inputs = other, other_inputs
-    return dataclasses.replace(result, warnings=(*result.warnings, *warning)), inputs
+        result, inputs = other, others
+    warnings = [f"{path.name} does not say how its values are encoded: {warning}"] if warning else []
+    return dataclasses.replace(result, warnings=(*result.warnings, *warnings)), inputs
 
 
-def _fit(given: Given, others: dict[Path, brdf.Picture], how: dict[str, Any]) -> tuple[FitInputs, FitResult]:
-    inputs = collect(given._replace(pictures=given.pictures | others))
-    with named_as({"target": given.targets[0]}):
-        return inputs, fitting.fit(inputs.pictures, inputs.scenes, mask=inputs.masks, **how)
+def _fit(inputs, how):
+    with named_as({"target": inputs.targets[0]}):
+        return fitting.fit(inputs.pictures, inputs.scenes, mask=inputs.masks, **how)
 
 
-def _other(picture: brdf.Picture) -> Any:
-    return "srgb" if picture.encoding == "linear" else "linear"
-
-
-def _name(encoding: Any) -> str:
-    return "sRGB" if encoding == "srgb" else str(encoding)
-
-
-def _unexplained(inputs: FitInputs, result: FitResult, counted: list[np.ndarray] | None) -> float:
-    """What a fit leaves of the codes in the files: the share of their squares; None for the pixels that it counts."""
+def _unexplained(result, inputs, counted):
+    """What a fit leaves of the codes in the files: the share of their squares."""
     left = total = 0.0
-    for picture, scene, some in zip(inputs.pictures, result.scenes, counted or result.counted, strict=True):
-        model = np.broadcast_to(brdf.render(result.material, scene), picture.pixels.shape)
-        codes, fitted = (
+    for index, (picture, some) in enumerate(zip(inputs.pictures, counted, strict=True)):
+        fitted = np.broadcast_to(result.fitted(index), picture.pixels.shape)
+        codes, model = (
             encode(np.ascontiguousarray((values / picture.factor)[some], np.float32), picture.encoding)
-            for values in (picture.pixels, model)
+            for values in (picture.pixels, fitted)
         )
         codes = codes.astype(np.float64)
-        left += np.sum((codes - fitted) ** 2) + codes.size * (picture.code_step or 0) ** 2 / 12
+        left += np.sum((codes - model) ** 2) + codes.size * (picture.code_step or 0) ** 2 / 12
         total += np.sum(codes**2)
     return left / total
 
 
-def judge(target: Path, picture: brdf.Picture, shares: tuple[float, float]) -> tuple[bool, list[str]]:
-    """Which of two encodings to keep, and what to say about it.
+def judge(assumed: str, left: float, left_other: float) -> tuple[bool, str]:
+    """Whether to keep the other encoding; and what to say, nothing where the pictures speak clearly for the assumed.
 
     Args:
-        target: the first file.
-        picture: one that does not say how it is encoded, as assumed.
-        shares: what is left as assumed, and the other way.
-
-    Returns:
-        Whether it is the other one; and the warning, none where the pictures speak clearly for what was assumed.
+        assumed: encoding.
+        left: share of the squares that it leaves.
+        left_other: that the other one leaves.
     """
-    assumed, other = shares
-    if assumed < CLEARLY * other:
-        return False, []
-    is_other, is_clear = other < LESS * assumed, other < CLEARLY * assumed
-    names = [_name(one) for one in (picture.encoding, _other(picture))]
-    left = [f"{100 * share**0.5:.{2 if share < 0.99 else 3}g} %" for share in shares]
-    (taken, refused), (least, most) = (names[::-1], left[::-1]) if is_other else (names, left)
+    if left < CLEARLY * left_other:
+        return False, ""
+    is_other, is_clear = left_other < LESS * left, left_other < CLEARLY * left
+    names = [NAMES[assumed], NAMES[OTHER[assumed]]]
+    shares = [f"{100 * share**0.5:.{2 if share < 0.99 else 3}g} %" for share in (left, left_other)]
+    (taken, refused), (least, most) = (names[::-1], shares[::-1]) if is_other else (names, shares)
     reads = f"read as {taken}, under which" if is_clear else f"{taken} is a guess. Under it"
     off = f"the fit is off by {least} of the values in the file (rms), under {refused} by {most}"
     know = "Where you know better" if is_clear else "Where you know"
-    silent = f"{target.name} does not say how its values are encoded"
-    return is_other, [f"{silent}: {reads} {off}. {know}, say so with --encoding"]
+    return is_other, f"{reads} {off}. {know}, say so with --encoding"

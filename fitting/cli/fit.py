@@ -1,90 +1,71 @@
 """``brdf fit``: pictures, photographs of a ball, archives and measured BRDFs."""
 
 import dataclasses
-import json
+import functools
 import shlex
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import Any
 
 import brdf
 from brdf.errors import InputError
-from brdf.files import check_folder, write_text
-from fitting.cli.common import (
-    AsJson,
-    Model,
-    PictureOptions,
-    Precision,
-    Report,
-    check_page,
-    named_as,
-    show,
-    use_compilation_cache,
-)
-from fitting.cli.devices import all_devices, is_first_process
+from brdf.files import write_text
+from fitting.cli.common import PictureOptions, all_devices, check_outputs, is_first_process, named_as, show
 from fitting.progress import waiting
-
-EXAMPLE = "\n\n".join(
-    [
-        "Example: [bold]brdf fit photo.exr --scene scene.toml --out result/[/bold]",
-        "A folder with target.exr and scene.toml: [bold]brdf fit data/gold-ball[/bold]",
-        "A photo of a ball: [bold]brdf fit ball.png --sphere 244.5,144.5,108 --light fit[/bold]",
-        "A measured BRDF: [bold]brdf fit gold.binary[/bold]",
-    ]
-)
-LOSS_NAMES = "squared, relative, log, huber or cauchy; for a measured BRDF cosine (its default), squared or log"
 
 
 def fit(
-    target: Annotated[
-        list[Path],
-        typer.Argument(help="A picture; a folder with target.* and scene.toml; photographs; an .npz; a measured BRDF."),
-    ],
+    target: list[Path],
     pictures: PictureOptions,
-    model: Model = "auto",
-    out: Annotated[Path | None, typer.Option(help="A folder for material.json, material.mtl, fitted.exr, ...")] = None,
-    precision: Precision = "float32",
-    dark: Annotated[float | None, typer.Option(help="Linear values up to here are too dark to count.")] = None,
-    noise: Annotated[
-        str | None, typer.Option(help="READ,SHOT of the camera: the variance is READ² + SHOT·value.")
-    ] = None,
-    plausible: Annotated[
-        bool, typer.Option("--plausible", help="Hold k_d + k_s <= 1 with a normalised form: brdf check then passes.")
-    ] = False,
-    loss: Annotated[str | None, typer.Option(help=f"{LOSS_NAMES}.")] = None,
-    accuracy: Annotated[
-        float | None, typer.Option(help="Relative error that is good enough: as few pixels and samples as keep it.")
-    ] = None,
-    seconds: Annotated[float | None, typer.Option(help="Time to spend: the most accurate fit that it buys.")] = None,
-    free: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME", help="light, intensity, ball or radius: fitted as well, from where the scene says."
-        ),
-    ] = None,
-    devices: Annotated[
-        str | None, typer.Option(help="all: spread the pixels over all cores or accelerators, and processes.")
-    ] = None,
-    plot: Annotated[bool, typer.Option("--plot", help="Also draw comparison.png into --out.")] = False,
-    report: Report = None,
-    as_json: AsJson = False,
+    *,
+    model: str = "auto",
+    out: Path | None = None,
+    precision: str = "float32",
+    dark: float | None = None,
+    noise: str | None = None,
+    plausible: bool = False,
+    loss: Any = None,
+    accuracy: float | None = None,
+    seconds: float | None = None,
+    free: list[str] | None = None,
+    devices: str | None = None,
+    plot: bool = False,
+    report: Path | None = None,
+    json: bool = False,
 ) -> None:
-    """Fit a model to a picture: value ± error of every parameter, with no guess to give."""
+    """Fit a model to a picture: value ± error of every parameter, with no guess to give.
+
+    Args:
+        target: a picture; a folder with target.* and scene.toml; photographs; an .npz; a measured BRDF.
+        pictures: what they show.
+        model: one of auto, lambert, phong, blinn-phong, normalized-phong, normalized-blinn-phong.
+        out: a folder for material.json, material.mtl, fitted.exr, ...
+        precision: float32 or float64.
+        dark: linear values up to here are too dark to count.
+        noise: READ,SHOT of the camera: the variance is READ² + SHOT·value.
+        plausible: hold k_d + k_s <= 1 with a normalised form: brdf check then passes.
+        loss: squared, relative, log, huber or cauchy; for a measured BRDF cosine (its default), squared or log.
+        accuracy: relative error that is good enough: as few pixels and samples as keep it.
+        seconds: time to spend: the most accurate fit that it buys.
+        free: light, intensity, ball or radius: fitted as well, from where the scene says.
+        devices: all: spread the pixels over all cores or accelerators, and processes.
+        plot: also draw comparison.png into --out.
+        report: one .html page with everything, to keep or to send.
+        json: print JSON instead of text.
+
+    Example:
+        brdf fit photo.exr --scene scene.toml --out result/
+        A folder with target.exr and scene.toml: brdf fit data/gold-ball
+        A photo of a ball: brdf fit ball.png --sphere 244.5,144.5,108 --light fit
+        A measured BRDF: brdf fit gold.binary
+    """
     from brdf.measured.loading import is_measured
 
-    if plot and out is None:
-        raise InputError("--plot", "needs a folder to draw into", "Add --out DIR")
     apart = {"--noise": noise, "--plausible": plausible, "--loss": loss, "--accuracy": accuracy, "--seconds": seconds}
     if free and any(apart.values()):
         came = f"knows nothing of {' and '.join(option for option, given in apart.items() if given)}"
         raise InputError("--free", came, "Leave one of them out")
-    check_page(report)
-    if out is not None:
-        # Told now instead of after the fit.
-        check_folder(out)
+    check_outputs(out, plot, report)
     notes: tuple[str, ...] = ()
     mesh = all_devices(devices)
     with waiting("reading") as say:
@@ -93,12 +74,11 @@ def fit(
                 came = "is a measured BRDF; of the options only --model, --loss, --out, --plot and --json concern it"
                 raise InputError(target[0], came, "Leave the others out")
             table = brdf.load_measured(target[0])
-            use_compilation_cache()
             import fitting
 
             say("fitting")
             with named_as({table.name: target[0]}):
-                result = fitting.fit_brdf(table, model, loss=loss or "cosine")  # pyright: ignore[reportArgumentType]
+                result: Any = fitting.fit_brdf(table, model, loss=loss or "cosine")
         else:
             result, notes = _fit_pictures(
                 target,
@@ -128,17 +108,16 @@ def fit(
             from fitting.report.html import report_page
 
             command = shlex.join(["brdf", *sys.argv[1:]])
-            page = report_page(result, source=target[0].name, command=command)  # pyright: ignore[reportArgumentType]
-            write_text(report, page)
-    if as_json:
-        show(json.dumps(result.to_dict() | ({"notes": notes} if notes else {}), indent=2))
+            write_text(report, report_page(result, source=target[0].name, command=command))
+    if json:
+        show(result.to_dict() | ({"notes": notes} if notes else {}))
         return
     saved = [] if out is None else [f"saved in {out}"]
     written = [] if report is None else [f"wrote {report}"]
     show("\n".join([*notes, str(result), *saved, *written]))
 
 
-def _freed(result: Any, names: list[str]) -> Any:
+def _freed(result, names):
     """The fit again, with what the names say of the scenes freed; where a command was told so, beside the material."""
     import fitting
 
@@ -152,19 +131,17 @@ def _freed(result: Any, names: list[str]) -> Any:
     return dataclasses.replace(found, files=result.files, candidates=result.candidates)
 
 
-def _fit_pictures(
-    target: Any, pictures: Any, noise: Any, say: Callable[[str], None], **how: Any
-) -> tuple[Any, tuple[str, ...]]:
+def _fit_pictures(target, pictures, noise, say, **how):
     """The fit, and what was found out on the way."""
     from fitting.cli.inputs import read_inputs
     from fitting.photographs.light_files import parse_numbers
 
-    given = read_inputs(target, pictures)
-    use_compilation_cache()
+    read = functools.partial(read_inputs, target, pictures)
+    inputs = read()
     from fitting.cli.encoding_trial import fit_either
 
     how["noise"] = None if noise is None else tuple(parse_numbers(noise, "--noise", 2, "READ,SHOT"))
-    result, inputs = fit_either(given, say, **how)
+    result, inputs = fit_either(inputs, read, say, **how)
     if not inputs.light_errors:
         return result, inputs.notes
     from fitting.photographs.light_error import with_light_errors

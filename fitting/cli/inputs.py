@@ -1,10 +1,8 @@
 """What the command is given: a picture with its scene, photographs of a ball, a photometric-stereo archive.
 
-`read_inputs` refuses, before JAX is imported, which takes longer than reading a picture, what does not go together;
-`collect` makes pictures and scenes of the rest.
+What does not go together is refused before JAX is imported, which takes longer than reading a picture.
 """
 
-import itertools
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,195 +13,173 @@ from brdf.errors import InputError
 from brdf.files import input_file, read_toml
 from fitting.cli.common import PictureOptions, named_as
 from fitting.photographs.archives import read_archive
-from fitting.photographs.ball import Circle, ball_normals, ball_points, find_circle, parse_circle
+from fitting.photographs.ball import Circle, ball_normals, ball_points, find_circle
 from fitting.photographs.light_files import parse_numbers, read_directions, read_intensities
 
-Array = np.ndarray
-
-# A light from so far behind leaves a crescent of less than three fifths of the ball's radius. On a thin one ambient
-# light and a highlight can be taken for each other and for shading, and the jackknife does not see that.
-BEHIND = -0.4
-THIN_CRESCENT = " (it comes from behind: a highlight on the thin crescent can turn it by several times that)"
-
-
-class Given(NamedTuple):
-    """What was typed, read as far as that needs no JAX.
-
-    Attributes:
-        targets: the files of the pictures, or the archive.
-        options: what they show.
-        pictures: by file; none for an archive.
-        scene: the scene file and its tables, where there is one.
-    """
-
-    targets: list[Path]
-    options: PictureOptions
-    pictures: dict[Path, brdf.Picture]
-    scene: tuple[Path, dict[str, Any]] | None = None
+# Of each kind of input: the options that say what it says itself or nothing of it, why, and what to do.
+REFUSED = {
+    "archive": (
+        ("light", "lights", "intensities", "scene", "sphere", "normals", "encoding"),
+        "is what {} says itself",
+        "Leave it out",
+    ),
+    "photographs": (("scene",), "says what --sphere or --normals says too", "Give one of them"),
+    "scene": (
+        ("light", "lights", "intensities"),
+        "says where the light is, but nothing what the picture shows",
+        "Add --sphere x,y,radius",
+    ),
+}
 
 
 class FitInputs(NamedTuple):
     """Pictures and scenes to fit.
 
     Attributes:
+        targets: the files of the pictures, or the archive.
         pictures: as many as scenes.
         scenes: what they show.
         masks: pixels that count in each, or None for all.
+        silent: the files that do not say how they are encoded, and as what they were read.
         notes: what was found out on the way, for the person who waits.
         light_errors: of the directions of lights that were found from the shading, in degrees.
     """
 
+    targets: list[Path]
     pictures: list[brdf.Picture]
     scenes: list["brdf.Scene"]
-    masks: list[Array | None]
+    masks: list[Any]
+    silent: dict[Path, Any]
     notes: tuple[str, ...] = ()
     light_errors: tuple[float, ...] = ()
 
 
-def read_inputs(targets: list[Path], options: PictureOptions) -> Given:
-    """Read the pictures, and refuse those that cannot be what the options or the scene file say.
-
-    Args:
-        targets: what was given: pictures, a folder or an archive.
-        options: what they show.
-
-    Raises:
-        InputError: naming the file or option.
-    """
-    _check_options(targets, options)
-    for beside in (options.mask, options.normals, options.lights, options.intensities):
-        if beside is not None:
-            input_file(beside)
-    if _is_archive(targets):
-        return Given(targets, options, {})
-    circle = None if options.sphere in (None, "mask") else parse_circle(options.sphere)
-    scene, resolution = None, None
-    if options.sphere is None and options.normals is None:
-        target, file = _target_and_scene(targets[0], options.scene)
-        targets, scene = [target], (file, read_toml(file))
-        camera = scene[1].get("camera")
-        resolution = camera.get("resolution") if isinstance(camera, dict) else None
-    pictures = {path: brdf.read_picture(path, encoding=options.encoding) for path in targets}
-    shapes = sorted({picture.pixels.shape for picture in pictures.values()})
-    height, width, _ = shapes[0]
-    sizes = ", ".join(f"{shape[1]} x {shape[0]} x {shape[2]}" for shape in shapes)
-    came = f"and the others differ in size ({sizes})"
-    _require(len(shapes) == 1, targets[0], came, "Give pictures of one camera")
-    if isinstance(resolution, list) and resolution != [width, height]:
-        came = f"is {width} x {height}, the scene's camera {' x '.join(map(str, resolution))}"
-        raise InputError(targets[0], came, "Give a picture and a camera of the same resolution")
-    if circle is not None:
-        ball_normals((height, width), circle)
-    return Given(targets, options, pictures, scene)
-
-
-def _is_archive(targets: list[Path]) -> bool:
-    return len(targets) == 1 and targets[0].suffix.lower() == ".npz"
-
-
-def _require(fine: Any, where: object, came: str, remedy: str) -> None:
+def _require(fine, where, what, remedy):
     if not fine:
-        raise InputError(where, came, remedy)
+        raise InputError(where, what, remedy)
 
 
-def _check_options(targets: list[Path], options: PictureOptions) -> None:
-    """Refuse options that do not belong together."""
-    refused = ("light", "lights", "intensities")
-    came, remedy = "says where the light is, but nothing what the picture shows", "Add --sphere x,y,radius"
-    if _is_archive(targets):
-        refused += ("scene", "sphere", "normals", "encoding")
-        came, remedy = f"is what {targets[0].name} says itself", "Leave it out"
-    elif options.sphere is not None or options.normals is not None:
-        remedy = "Give one of them"
-        _require(options.scene is None, "--scene", "says what --sphere or --normals says too", remedy)
-        _require(None in (options.sphere, options.normals), "--normals", "says what --sphere says too", remedy)
-        came, remedy = "or --lights has to say where the light is", "Give x,y,z, fit, or a file of directions"
-        _require((options.light is None) != (options.lights is None), "--light", came, remedy)
-        return
-    for name in refused:
-        _require(getattr(options, name) is None, f"--{name}", came, remedy)
-    if not _is_archive(targets):
-        remedy = "Leave it out, or add [ambient] to the scene"
-        _require(not options.ambient, "--ambient", "is what the scene file says", remedy)
-        for path in targets[1:]:
-            _require(path.suffix != ".toml", path, "is a scene, no picture", f"Write --scene {path}")
-        remedy = "Give one; in Python fitting.fit takes lists of pictures and of scenes"
-        told = f"tells what one picture shows, {len(targets)} are given"
-        _require(options.scene is None or len(targets) == 1, "--scene", told, remedy)
-        remedy = "Several pictures are fitted with --sphere or --normals, and --lights"
-        _require(len(targets) == 1, "--sphere", f"{len(targets)} pictures come without their geometry", remedy)
-
-
-def _target_and_scene(target: Path, scene: Path | None) -> tuple[Path, Path]:
-    """The picture and the scene file that a file, or a folder with both, stands for."""
-    if target.is_dir():
-        found = sorted(path for path in target.glob("target.*") if path.is_file())
-        _require(found, target, "has no file target.*", "Give the picture, or a folder that holds it")
-        came = f"has several targets, {', '.join(path.name for path in found)}"
-        _require(len(found) == 1, target, came, "Name the picture instead of the folder")
-        return found[0], scene or target / "scene.toml"
-    input_file(target)
-    if scene is None:
-        remedy = "Add --scene SCENE.toml, or --sphere for a photo of a ball"
-        raise InputError(target, "comes without a scene", remedy)
-    return target, scene
-
-
-def collect(given: Given) -> FitInputs:
-    """What the command was given, ready to fit.
+def read_inputs(targets: list[Path], options: PictureOptions, encodings: dict[Path, Any] | None = None) -> FitInputs:
+    """Read what the command was given, ready to fit.
 
     Photographs come as under light of intensity 1, so that each counts alike however bright its light was. Ambient
     light is taken to be the same in all of them, and its intensity, which nobody knows, as 1.
 
     Args:
-        given: as `read_inputs` read it, or with other interpretations of its files.
+        targets: pictures, a folder or an archive.
+        options: what they show.
+        encodings: as what to read some files that do not say it; None for what is assumed of them.
 
     Raises:
         InputError: naming the file or option.
     """
-    targets, options, read, scene = given
+    kind = "scene" if options.sphere is None and options.normals is None else "photographs"
+    kind = "archive" if len(targets) == 1 and targets[0].suffix.lower() == ".npz" else kind
+    _check_options(kind, targets, options)
+    for beside in (options.normals, options.lights, options.intensities):
+        if beside is not None:
+            input_file(beside)
     mask = None if options.mask is None else brdf.read_mask(options.mask)
-    masks: Any
-    named: dict[str, Any] = {}
-    if _is_archive(targets):
-        pictures, points, directions, intensities = _read_photographs(targets[0], mask)
-        pictures, masks, notes = _exposed(pictures, options.exposure), [None] * len(pictures), ()
-        light_errors = ()
-        named = {"direction": f"{targets[0]}: light_dirs", "intensity": f"{targets[0]}: light_intensities"}
+    if kind == "archive":
+        (path,) = targets
+        pictures, points, directions, intensities = _archived(path, mask)
+        inputs = FitInputs(targets, _exposed(pictures, options), [], [None] * len(pictures), {})
+        names = {"direction": f"{path}: light_dirs", "intensity": f"{path}: light_intensities"}
     else:
-        pictures = _exposed([read[target] for target in targets], options.exposure)
-        masks = visible(mask, pictures)
-        if scene is not None:
+        inputs, file, tables = _read_pictures(kind, targets, options, encodings or {}, mask)
+        if file is not None:
             from brdf.scene import load_scene
 
-            return FitInputs(pictures, [load_scene(scene[0], options.within, scene[1])], masks)
-        points, directions, intensities, light_errors, notes = _photographs(targets, options, pictures, mask, masks)
+            return inputs._replace(scenes=[load_scene(file, options.within, tables)])
+        points, notes = _points(inputs.pictures[0].pixels.shape[:2], options, mask)
+        directions, inputs = _directions(inputs._replace(notes=notes), points, options)
+        intensities, names = _intensities(options.intensities, inputs.pictures), {}
     from fitting.photographs.distant_light import photograph_scene
 
-    around = np.ones((len(pictures), 1))
+    pictures, around = inputs.pictures, np.ones((len(inputs.pictures), 1))
     if np.all(intensities > 0):
         pictures = [picture.scaled(1.0 / intensity) for picture, intensity in zip(pictures, intensities, strict=True)]
         intensities, around = around, 1.0 / intensities
-    with named_as(named):
+    with named_as(names):
         scenes = [
             photograph_scene(points, direction, intensity, ambient=ambient if options.ambient else None)
             for direction, intensity, ambient in zip(directions, intensities, around, strict=True)
         ]
-    return FitInputs(pictures, scenes, masks, notes, light_errors)
+    return inputs._replace(pictures=pictures, scenes=scenes)
 
 
-def _exposed(pictures: list[brdf.Picture], exposure: str | None) -> list[brdf.Picture]:
+def _check_options(kind, targets, options):
+    """Refuse options that do not belong together."""
+    names, what, remedy = REFUSED[kind]
+    for name in names:
+        _require(getattr(options, name) is None, f"--{name}", what.format(targets[0].name), remedy)
+    if kind == "photographs":
+        alone = None in (options.sphere, options.normals)
+        _require(alone, "--normals", "says what --sphere says too", "Give one of them")
+        alone, remedy = (options.light is None) != (options.lights is None), "Give x,y,z, fit, or a file of directions"
+        _require(alone, "--light", "or --lights has to say where the light is", remedy)
+    if kind == "scene":
+        remedy = "Leave it out, or add [ambient] to the scene"
+        _require(not options.ambient, "--ambient", "is what the scene file says", remedy)
+        for path in targets[1:]:
+            _require(path.suffix != ".toml", path, "is a scene, no picture", f"Write --scene {path}")
+        remedy = "Give one; in Python fitting.fit takes lists of pictures and of scenes"
+        what = f"tells what one picture shows, {len(targets)} are given"
+        _require(options.scene is None or len(targets) == 1, "--scene", what, remedy)
+        remedy = "Several pictures are fitted with --sphere or --normals, and --lights"
+        _require(len(targets) == 1, "--sphere", f"{len(targets)} pictures come without their geometry", remedy)
+
+
+def _read_pictures(kind, targets, options, encodings, mask):
+    """Pictures of one size, which is that of their scene; and the scene file with its tables, where there is one."""
+    file = tables = resolution = None
+    if kind == "scene":
+        target, file = _target_and_scene(targets[0], options.scene)
+        targets, tables = [target], read_toml(file)
+        camera = tables.get("camera")
+        resolution = camera.get("resolution") if isinstance(camera, dict) else None
+    pictures = [brdf.read_picture(path, encoding=encodings.get(path, options.encoding)) for path in targets]
+    shapes = sorted({picture.pixels.shape for picture in pictures})
+    height, width, _ = shapes[0]
+    sizes = ", ".join(f"{shape[1]} x {shape[0]} x {shape[2]}" for shape in shapes)
+    what = f"and the others differ in size ({sizes})"
+    _require(len(shapes) == 1, targets[0], what, "Give pictures of one camera")
+    if isinstance(resolution, list):
+        what = f"is {width} x {height}, the scene's camera {' x '.join(map(str, resolution))}"
+        remedy = "Give a picture and a camera of the same resolution"
+        _require(resolution == [width, height], targets[0], what, remedy)
+    if options.sphere not in (None, "mask"):
+        ball_normals((height, width), _circle(options.sphere))
+    silent = {path: one.encoding for path, one in zip(targets, pictures, strict=True) if one.source == "assumed"}
+    pictures = _exposed(pictures, options)
+    return FitInputs(targets, pictures, [], visible(mask, pictures), silent), file, tables
+
+
+def _target_and_scene(target, scene):
+    """The picture and the scene file that a file, or a folder with both, stands for."""
+    if target.is_dir():
+        found = sorted(path for path in target.glob("target.*") if path.is_file())
+        _require(found, target, "has no file target.*", "Give the picture, or a folder that holds it")
+        what = f"has several targets, {', '.join(path.name for path in found)}"
+        _require(len(found) == 1, target, what, "Name the picture instead of the folder")
+        return found[0], scene or target / "scene.toml"
+    input_file(target)
+    _require(scene, target, "comes without a scene", "Add --scene SCENE.toml, or --sphere for a photo of a ball")
+    return target, scene
+
+
+def _exposed(pictures, options):
     """Pictures in one unit, by one relative exposure or one for each, as typed."""
-    if exposure is None:
+    typed, count = options.exposure, len(pictures)
+    if typed is None:
         return pictures
-    count = len(pictures) if len(exposure.replace(",", " ").split()) == len(pictures) else 1
-    factors = parse_numbers(exposure, "--exposure", count, "one number, or one each")
-    came = f"must be above 0, got {exposure[:60]!r}"
-    _require(min(factors) > 0, "--exposure", came, "Give a relative exposure time")
-    return [picture.scaled(1.0 / factor) for picture, factor in zip(pictures, itertools.cycle(factors), strict=False)]
+    wanted = count if len(typed.replace(",", " ").split()) == count else 1
+    factors = parse_numbers(typed, "--exposure", wanted, "one number, or one each")
+    _require(min(factors) > 0, "--exposure", f"must be above 0, got {typed[:60]!r}", "Give a relative exposure time")
+    return [picture.scaled(1.0 / factor) for picture, factor in zip(pictures, np.resize(factors, count), strict=True)]
 
 
-def visible(mask: Array | None, pictures: list[brdf.Picture]) -> list[Array | None]:
+def visible(mask: Any, pictures: list[brdf.Picture]) -> list[Any]:
     """Pixels that count in each picture: those of the mask without the fully transparent ones, which show nothing.
 
     Args:
@@ -218,14 +194,14 @@ def visible(mask: Array | None, pictures: list[brdf.Picture]) -> list[Array | No
         shape, alpha = picture.pixels.shape[:2], picture.alpha
         counts = alpha > 0 if alpha is not None and alpha.any() else None
         if mask is not None:
-            came = f"is of shape {mask.shape}, the target {shape}"
-            _require(mask.shape == shape, "mask", came, "Give a value per pixel")
+            what = f"is of shape {mask.shape}, the target {shape}"
+            _require(mask.shape == shape, "mask", what, "Give a value per pixel")
             counts = mask if counts is None else counts & mask
         masks.append(counts)
     return masks
 
 
-def ball_in(sphere: str, mask: Array | None) -> tuple[Circle, tuple[str, ...]]:
+def ball_in(sphere: str, mask: Any) -> tuple[Circle, tuple[str, ...]]:
     """The ball that --sphere names, and what to tell where it was found in a mask.
 
     Args:
@@ -236,134 +212,100 @@ def ball_in(sphere: str, mask: Array | None) -> tuple[Circle, tuple[str, ...]]:
         InputError: where there is no mask, or no ball in it.
     """
     if sphere != "mask":
-        return parse_circle(sphere), ()
+        return _circle(sphere), ()
     _require(mask is not None, "--sphere", "is to be found in the mask, but there is none", "Add --mask MASK.png")
     circle = find_circle(mask)
     return circle, (f"ball found at {circle.x:.2f},{circle.y:.2f},{circle.radius:.2f}",)
 
 
-def _photographs(targets: list[Path], options: PictureOptions, pictures: Any, mask: Any, masks: Any) -> Any:
-    """What the pixels of photographs under one distant light each see, the lights, and what to tell of it."""
-    count, (height, width, channels), notes = len(targets), pictures[0].pixels.shape, ()
-    light_errors: tuple[float, ...] = ()
+def _circle(sphere):
+    return Circle(*parse_numbers(sphere, "--sphere", 3, "x,y,radius in pixels"))
+
+
+def _points(shape, options, mask):
+    """What the pixels of photographs see, and what to tell of it."""
     if options.normals is None:
-        circle, notes = ball_in(options.sphere or "", mask)
-        points = ball_points((height, width), circle)
-    else:
-        from fitting.maps.map_inputs import normal_map
+        circle, notes = ball_in(options.sphere, mask)
+        return ball_points(shape, circle), notes
+    from fitting.maps.map_inputs import normal_map
 
-        points = brdf.SurfacePoints.from_normals(normal_map(options.normals))
-        came = f"is {points.mask.shape[1]} x {points.mask.shape[0]}, the pictures {width} x {height}"
-        _require(points.mask.shape == (height, width), options.normals, came, "Give a normal for each pixel")
-    if options.lights is not None:
-        directions = _directions(options.lights, targets)
-    elif options.light == "fit":
-        found = [light_of(*one, points, options) for one in zip(targets, pictures, masks, strict=True)]
-        directions, mean = [light.direction for light in found], sum(light.strength for light in found) / count
-        for target, light in zip(targets, found, strict=True):
-            brighter = f", {100 * (light.strength / mean - 1):+.1f} % bright" if count > 1 else ""
-            direction = ",".join(f"{value:.4f}" for value in light.direction)
-            notes += (f"light of {target.name} from its shading: {direction} {stated_error(light)}{brighter}",)
-        light_errors = tuple(light.error for light in found)
-    else:
-        direction = parse_numbers(options.light or "", "--light", 3, "x,y,z: x right, y up, z to the camera; or fit")
+    points = brdf.SurfacePoints.from_normals(normal_map(options.normals))
+    height, width = points.mask.shape
+    what = f"is {width} x {height}, the pictures {shape[1]} x {shape[0]}"
+    _require(points.mask.shape == shape, options.normals, what, "Give a normal for each pixel")
+    return points, ()
+
+
+def _directions(inputs, points, options):
+    """The direction of the light of each photograph; and the inputs with what the shading tells of it."""
+    targets, file = inputs.targets, options.lights
+    if file is not None and file.suffix.lower() == ".lp":
+        from fitting.maps.map_inputs import read_lights
+
+        by_name = {path.name: direction for path, direction in zip(*read_lights(file), strict=True)}
+        for target in targets:
+            remedy = "Name the photographs as the file does"
+            _require(target.name in by_name, file, f"names no {target.name}", remedy)
+        return [by_name[target.name] for target in targets], inputs
+    if file is not None:
+        return read_directions(file, len(targets)), inputs
+    if options.light != "fit":
+        direction = parse_numbers(options.light, "--light", 3, "x,y,z: x right, y up, z to the camera; or fit")
         _require(any(direction), "--light", "must not have zero length, got 0,0,0", "Give a direction")
-        directions = [direction] * count
-    intensities = np.ones((count, 1))
-    if options.intensities is not None:
-        intensities = read_intensities(options.intensities, count)
-        came = f"has {intensities.shape[1]} numbers a line, the pictures {channels} channels"
-        _require(intensities.shape[1] in (1, channels), options.intensities, came, "Give one intensity per channel")
-    return points, directions, intensities, light_errors, notes
-
-
-def _directions(path: Path, targets: list[Path]) -> Any:
-    """The light of each photograph: by its name from an ``.lp`` file, else line by line."""
-    if path.suffix.lower() != ".lp":
-        return read_directions(path, len(targets))
-    from fitting.maps.map_inputs import read_lights
-
-    names, directions = read_lights(path)
-    by_name = {name.name: direction for name, direction in zip(names, directions, strict=True)}
-    for target in targets:
-        _require(target.name in by_name, path, f"names no {target.name}", "Name the photographs as the file does")
-    return [by_name[target.name] for target in targets]
-
-
-def light_of(
-    target: Path,
-    picture: brdf.Picture,
-    mask: Array | None,
-    points: "brdf.SurfacePoints",
-    options: PictureOptions,
-) -> Any:
-    """The light of a photograph from its shading, a `fitting.photographs.distant_light.ShadingLight`.
-
-    Args:
-        target: the file.
-        picture: of it.
-        mask: pixels that count, as `visible` gives them, or None.
-        points: what its pixels see.
-        options: what it shows.
-
-    Raises:
-        InputError: naming the file.
-    """
+        return [direction] * len(targets), inputs
     from fitting.photographs.distant_light import light_from_shading
 
-    counts = True if mask is None else mask
-    with named_as({"picture": target}):
-        return light_from_shading(picture, points, saturation=options.saturation, mask=counts, ambient=options.ambient)
+    found, how = [], {"saturation": options.saturation, "ambient": options.ambient}
+    for target, picture, mask in zip(targets, inputs.pictures, inputs.masks, strict=True):
+        with named_as({"picture": target}):
+            found.append(light_from_shading(picture, points, mask=mask, **how))
+    mean, notes = np.mean([light.strength for light in found]), [*inputs.notes]
+    for target, light in zip(targets, found, strict=True):
+        brighter = f", {100 * (light.strength / mean - 1):+.1f} % bright" if len(found) > 1 else ""
+        direction = ",".join(f"{value:.4f}" for value in light.direction)
+        notes.append(f"light of {target.name} from its shading: {direction} {light.stated_error}{brighter}")
+    errors = tuple(light.error for light in found)
+    return [light.direction for light in found], inputs._replace(notes=tuple(notes), light_errors=errors)
 
 
-def stated_error(light: Any) -> str:
-    """What to say of the error of a light's direction.
-
-    Args:
-        light: as the shading tells it.
-    """
-    from fitting.photographs.distant_light import DOUBTFUL
-
-    doubt = ""
-    if light.direction[2] < BEHIND:
-        doubt = THIN_CRESCENT
-    elif light.unexplained > DOUBTFUL:
-        share = 100 * light.unexplained
-        doubt = f" (the shading leaves {share:.0f} % of the light unexplained: it can be off by several times that)"
-    return f"± {light.error:.2g}°{doubt}"
+def _intensities(path, pictures):
+    """Of the light of each photograph, 1 where no file says them."""
+    if path is None:
+        return np.ones((len(pictures), 1))
+    intensities, channels = read_intensities(path, len(pictures)), pictures[0].pixels.shape[2]
+    what = f"has {intensities.shape[1]} numbers a line, the pictures {channels} channels"
+    _require(intensities.shape[1] in (1, channels), path, what, "Give one intensity per channel")
+    return intensities
 
 
-def _read_photographs(path: Path, mask: Any) -> Any:
+def _archived(path, mask):
     """Pictures, points, directions and intensities of an archive.
 
     It holds images (K, H, W[, C]), normal (H, W, 3) and light_dirs (K, 3), and may hold light_intensities (K, C) and
     mask (H, W). Unsigned images span their type.
     """
     arrays = read_archive(path)
-    images, normal, directions = arrays["images"], arrays["normal"], arrays["light_dirs"]
-    came = f"holds {images.dtype}, of which it is not clear what is white"
+    images = arrays["images"]
+    what = f"holds {images.dtype}, of which it is not clear what is white"
     remedy = "Save unsigned integers, which span their type, or floats"
-    _require(images.dtype.kind not in "bi", f"{path}: images", came, remedy)
+    _require(images.dtype.kind not in "bi", f"{path}: images", what, remedy)
     images = images[..., None] if images.ndim == 3 else images
     remedy = "Give (pictures, height, width, channels)"
     _require(images.ndim == 4 and images.size > 0, f"{path}: images", f"is of shape {images.shape}", remedy)
     count, height, width, channels = images.shape
-    intensities = arrays.get("light_intensities", np.ones(count))
-    intensities = intensities[:, None] if intensities.ndim == 1 else intensities
-    mask = arrays.get("mask", np.ones((height, width))) if mask is None else mask
-    for name, array, shape in (
-        ("normal", normal, (height, width, 3)),
-        ("light_dirs", directions, (count, 3)),
-        ("light_intensities", intensities, (count, 1 if intensities.shape[1:] == (1,) else channels)),
-        ("mask", mask, (height, width)),
-    ):
-        _require(array.shape == shape, f"{path}: {name}", f"is of shape {array.shape}", f"Give {shape}")
-    points = brdf.SurfacePoints.from_normals(normal, mask=mask != 0)
-    came = "has no normal" if np.all(mask) else "has no normal inside the mask"
-    _require(np.any(points.mask), f"{path}: normal", came, "Give a direction (x, y, z) where the surface is")
+    arrays = {"mask": np.ones((height, width)), "light_intensities": np.ones(count)} | arrays
+    arrays |= {} if mask is None else {"mask": mask}
+    intensities = arrays["light_intensities"]
+    arrays["light_intensities"] = intensities = intensities[:, None] if intensities.ndim == 1 else intensities
+    each = 1 if intensities.shape[1:] == (1,) else channels
+    shapes = {"normal": (height, width, 3), "light_dirs": (count, 3), "light_intensities": (count, each)}
+    for name, shape in (shapes | {"mask": (height, width)}).items():
+        _require(arrays[name].shape == shape, f"{path}: {name}", f"is of shape {arrays[name].shape}", f"Give {shape}")
+    points = brdf.SurfacePoints.from_normals(arrays["normal"], mask=arrays["mask"] != 0)
+    what = "has no normal" if np.all(arrays["mask"]) else "has no normal inside the mask"
+    _require(np.any(points.mask), f"{path}: normal", what, "Give a direction (x, y, z) where the surface is")
     # As in a file: linear, integers with their largest code.
-    is_code = images.dtype.kind == "u"
-    bits, pixels = 8 * images.dtype.itemsize, images / float(np.iinfo(images.dtype).max if is_code else 1)
-    top = 1.0 if is_code else None
-    pictures = [brdf.Picture(one, None, "linear", "format", bits, top) for one in pixels.astype(np.float32)]
-    return pictures, points, directions, intensities
+    top, bits = 1.0 if images.dtype.kind == "u" else None, 8 * images.dtype.itemsize
+    pixels = (images / (np.iinfo(images.dtype).max if top else 1)).astype(np.float32)
+    pictures = [brdf.Picture(one, None, "linear", "format", bits, top) for one in pixels]
+    return pictures, points, arrays["light_dirs"], intensities

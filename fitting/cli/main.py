@@ -7,13 +7,14 @@ import io
 import os
 import signal
 import sys
-from typing import Annotated, Any, NoReturn
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 
 from brdf.errors import InputError
 from fitting.cli import check, convert, fit, lights, maps, render, tradeoff
-from fitting.cli.common import as_command, forget_output, show
+from fitting.cli.common import add_command, show
 from fitting.cli.interrupts import interruptible
 
 # What a wrong option raises, wherever typer keeps its parser.
@@ -29,7 +30,7 @@ app = typer.Typer(
 )
 
 
-def _version(wanted: bool) -> None:
+def _version(wanted):
     if wanted:
         show(f"brdf-fitting {importlib.metadata.version('brdf-fitting')}")
         raise typer.Exit
@@ -44,9 +45,8 @@ def about(
     """Which few numbers make this surface look like that picture."""
 
 
-COMMANDS = (fit.fit, maps.maps, lights.lights, render.render, check.check, convert.convert, tradeoff.tradeoff)
-for function in COMMANDS:
-    app.command(epilog=sys.modules[function.__module__].EXAMPLE)(as_command(function))
+for function in (fit.fit, maps.maps, lights.lights, render.render, check.check, convert.convert, tradeoff.tradeoff):
+    add_command(app, function)
 
 
 def main(arguments: list[str] | None = None) -> Any:
@@ -60,6 +60,7 @@ def main(arguments: list[str] | None = None) -> Any:
             stream.reconfigure(errors="replace")  # ± on a terminal that knows ASCII alone
     # What importing and tracing make mostly stays: looking for garbage among it takes a tenth of the time.
     gc.set_threshold(100_000, 20, 20)
+    _keep_compiled_programs()
     command, words = typer.main.get_command(app), sys.argv[1:] if arguments is None else arguments
     try:
         with interruptible(), command.make_context("brdf", [*words]) as context:
@@ -77,14 +78,33 @@ def main(arguments: list[str] | None = None) -> Any:
     except KeyboardInterrupt as interrupt:
         # As shells expect it of a command that a signal ended: 130 after Ctrl-C, 143 after SIGTERM.
         _fail("interrupted.", 128 + (interrupt.args[0] if interrupt.args else signal.SIGINT))
-    except BrokenPipeError:
-        forget_output()
-        sys.exit(1)
+    except OSError as error:
+        if error.filename is not None:
+            raise
+        # Standard output; what could not be written goes, or Python would try once more when it ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if isinstance(error, BrokenPipeError):
+            sys.exit(1)
+        _fail(f"output: cannot be written ({error.strerror}). Send it elsewhere.")
     except (MemoryError, RuntimeError) as error:
         # So XLA says it.
         if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
             raise
         _fail("memory: there is not enough for this. Use fewer pixels or light samples.")
+
+
+def _keep_compiled_programs():
+    """Have JAX keep compiled programs in the user's cache folder: the second run of a kind skips the compiler."""
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    settings = {
+        "JAX_COMPILATION_CACHE_DIR": f"{base}/brdf/jax",
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+        # Of each program that it takes from there jaxlib 0.10.1 says, at length, that the compiler's own settings are
+        # no features of the machine. What is an error comes as an exception.
+        "TF_CPP_MIN_LOG_LEVEL": "3",
+    }
+    os.environ.update(settings | dict(os.environ))
 
 
 def run() -> None:
@@ -94,7 +114,7 @@ def run() -> None:
     """
     status: list[int] = []
 
-    def end() -> None:
+    def end():
         if status:  # else: a traceback
             sys.stdout.flush()
             sys.stderr.flush()
@@ -108,6 +128,6 @@ def run() -> None:
         raise
 
 
-def _fail(message: str, status: int = 2) -> NoReturn:
+def _fail(message, status=2):
     print(f"error: {message}", file=sys.stderr)  # noqa: T201  # this is the command's one line of failure
     sys.exit(status)

@@ -2,63 +2,59 @@
 
 import shutil
 from pathlib import Path
-from typing import Annotated
+from typing import Any
 
-import typer
-
-from brdf.files import check_folder
-from fitting.cli.common import Encoding, Precision, Report, check_page, named_as, show, use_compilation_cache
-from fitting.cli.devices import all_devices, is_first_process
+from brdf.errors import InputError
+from fitting.cli.common import all_devices, check_outputs, is_first_process, named_as, show
 from fitting.progress import waiting
-
-EXAMPLE = "Example: [bold]brdf maps photographs/ --normals fit --out maps/[/bold]"
 
 # Below --out, while the maps are being fitted: what is done, from which the same command goes on after an interruption.
 BANDS = "bands"
 
 
 def maps(
-    target: Annotated[
-        Path, typer.Argument(help="A folder of photographs with an .lp file, or with light_directions.txt.")
-    ],
-    normals: Annotated[
-        str | None,
-        typer.Option(help="An image or .npy of normals, or fit; default: the folder's normals.*, else fit."),
-    ] = None,
-    out: Annotated[Path | None, typer.Option(help="A folder for maps.exr, 16-bit images, glTF and OpenLIME.")] = None,
-    model: Annotated[
-        str, typer.Option(help="blinn-phong, phong, a normalised form, lambert, or auto.")
-    ] = "blinn-phong",
-    grey: Annotated[bool, typer.Option("--grey", help="All channels share k_s.")] = False,
-    labels: Annotated[
-        str | None, typer.Option(help="An image: pixels of one value there share n; or all: every pixel does.")
-    ] = None,
-    mask: Annotated[Path | None, typer.Option(help="An image: pixels that are 0 there are left out.")] = None,
-    ambient: Annotated[
-        bool, typer.Option("--ambient", help="The view is lit from all around too: find k_a for that light as 1.")
-    ] = False,
-    flip_y: Annotated[bool, typer.Option("--flip-y", help="y goes down in the file of normals.")] = False,
-    encoding: Encoding = None,
-    plot: Annotated[bool, typer.Option("--plot", help="Also draw maps.png into --out.")] = False,
-    report: Report = None,
-    precision: Precision = "float32",
-    devices: Annotated[
-        str | None, typer.Option(help="all: every core, accelerator and process that Slurm or mpirun has started.")
-    ] = None,
+    target: Path,
+    *,
+    normals: str | None = None,
+    out: Path | None = None,
+    model: str = "blinn-phong",
+    grey: bool = False,
+    labels: str | None = None,
+    mask: Path | None = None,
+    ambient: bool = False,
+    flip_y: bool = False,
+    encoding: Any = None,
+    plot: bool = False,
+    report: Path | None = None,
+    precision: Any = "float32",
+    devices: str | None = None,
 ) -> None:
-    """Fit k_d, k_s, n and normals to every pixel of photographs under many lights."""
-    from brdf.errors import InputError
+    """Fit k_d, k_s, n and normals to every pixel of photographs under many lights.
 
-    if plot and out is None:
-        raise InputError("--plot", "needs a folder to draw into", "Add --out DIR")
-    check_page(report)
-    if out is not None:
-        check_folder(out)
-        if out.resolve() == target.resolve():
-            came = "is the folder of the photographs, whose normals.* and mask.* are read"
-            raise InputError("--out", came, "Give another folder")
+    Args:
+        target: a folder of photographs with an .lp file, or with light_directions.txt.
+        normals: an image or .npy of normals, or fit; default: the folder's normals.*, else fit.
+        out: a folder for maps.exr, 16-bit images, glTF and OpenLIME.
+        model: blinn-phong, phong, a normalised form, lambert, or auto.
+        grey: all channels share k_s.
+        labels: an image: pixels of one value there share n; or all: every pixel does.
+        mask: an image: pixels that are 0 there are left out.
+        ambient: the view is lit from all around too: find k_a for that light as 1.
+        flip_y: y goes down in the file of normals.
+        encoding: linear, srgb or a gamma; default: what the file says.
+        plot: also draw maps.png into --out.
+        report: one .html page with everything, to keep or to send.
+        precision: float32 or float64.
+        devices: all: every core, accelerator and process that Slurm or mpirun has started.
+
+    Example:
+        brdf maps photographs/ --normals fit --out maps/
+    """
+    check_outputs(out, plot, report)
+    if out is not None and out.resolve() == target.resolve():
+        came = "is the folder of the photographs, whose normals.* and mask.* are read"
+        raise InputError("--out", came, "Give another folder")
     mesh = all_devices(devices)
-    use_compilation_cache()
     import fitting
 
     with waiting("fitting"), named_as({"pictures": target}):
@@ -72,7 +68,7 @@ def maps(
             ambient=1.0 if ambient else None,
             flip_y=flip_y,
             encoding=encoding,
-            precision=precision,  # pyright: ignore[reportArgumentType]
+            precision=precision,
             mesh=mesh,
             keep=None if out is None else out / BANDS,
         )

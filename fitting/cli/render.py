@@ -1,38 +1,33 @@
 """``brdf render``: a picture of a material in a scene."""
 
 from pathlib import Path
-from typing import Annotated
-
-import typer
+from typing import Any
 
 import brdf
 from brdf.errors import InputError
-from fitting.cli.common import AMaterial, Precision, find_material, named_as, show, use_compilation_cache
+from fitting.cli.common import find_material, named_as, show
 from fitting.progress import waiting
 
-EXAMPLE = (
-    "Example: [bold]brdf render material.json --scene scene.toml -o picture.exr[/bold]\n\n"
-    "What brdf fit --out wrote: [bold]brdf render out/ -o picture.exr[/bold]\n\n"
-    "From the classic table: [bold]brdf render emerald --scene scene.toml -o emerald.png[/bold]"
-)
 
+def render(material: str, *, out: Path, scene: Path | None = None, precision: Any = "float32") -> None:
+    """Render a material in a scene.
 
-def render(
-    material: AMaterial,
-    out: Annotated[Path, typer.Option("--out", "-o", help="The picture to write: .exr, .hdr, .png, .tiff or .jpg.")],
-    scene: Annotated[
-        Path | None, typer.Option(help="The scene file; default: that of a folder that brdf fit wrote.")
-    ] = None,
-    precision: Precision = "float32",
-) -> None:
-    """Render a material in a scene."""
+    Args:
+        material: a .json or .mtl file, a folder of brdf fit --out, or a name of the classic table.
+        out: the picture to write: .exr, .hdr, .png, .tiff or .jpg.
+        scene: the scene file; default: that of a folder that brdf fit wrote.
+        precision: float32 or float64.
+
+    Example:
+        brdf render material.json --scene scene.toml -o picture.exr
+        What brdf fit --out wrote: brdf render out/ -o picture.exr
+        From the classic table: brdf render emerald --scene scene.toml -o emerald.png
+    """
     with waiting("rendering"), named_as({"material": material}):
-        use_compilation_cache()
-        loaded, *_ = find_material(material)
+        loaded, _ = find_material(material)
         if scene is None:
             scene = (Path(material) if Path(material).is_dir() else Path(material).parent) / "scene.toml"
             if Path(material).suffix == ".mtl" or not scene.is_file():
                 raise InputError("--scene", "is missing", "Add --scene SCENE.toml")
-        image = brdf.render(loaded, brdf.Scene.load(scene), precision=precision)  # pyright: ignore[reportArgumentType]
-        brdf.write_image(out, image)
+        brdf.write_image(out, brdf.render(loaded, brdf.Scene.load(scene), precision=precision))
     show(f"wrote {out}")

@@ -1,5 +1,6 @@
 """Arrays in files, ``.npy`` and ``.npz``: sizes are checked before memory is taken, and nothing is unpickled."""
 
+import contextlib
 import math
 import warnings
 import zipfile
@@ -14,6 +15,19 @@ from brdf.files import input_file
 # What an archive may unpack to: 8 GiB of values, as for pictures; and how far Deflate can expand its bytes.
 MOST_BYTES, EXPANSION = 1 << 33, 1032
 REQUIRED, OPTIONAL = ("images", "normal", "light_dirs"), ("light_intensities", "mask")
+DAMAGED = "The file is damaged; make it again"
+
+
+@contextlib.contextmanager
+def _told(where, what, remedy):
+    """Whatever the readers of damaged files raise, as one line."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        reason = str(error).partition("\n")[0][:120] or type(error).__name__
+        raise InputError(where, f"{what} ({reason})", remedy) from None
 
 
 def read_array(file: Any, where: object, size: int) -> np.ndarray:
@@ -27,24 +41,16 @@ def read_array(file: Any, where: object, size: int) -> np.ndarray:
     Raises:
         InputError: where it holds no plain numbers or is damaged.
     """
-    damaged = "The file is damaged; make it again"
-    try:
+    # NumPy reads the header as Python: a damaged one raises what its parser does, or warns.
+    with _told(where, "is no array", DAMAGED), warnings.catch_warnings(action="ignore"):
         headers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-        read_header = headers[np.lib.format.read_magic(file)]
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of what a damaged header looks like as Python
-            shape, fortran, kind = read_header(file)
+        shape, fortran, kind = headers[np.lib.format.read_magic(file)](file)
         if kind.kind not in "biuf":
             raise InputError(where, f"holds {kind}, not numbers", "Save plain arrays")
         count = math.prod(shape)
         if not 0 <= count * kind.itemsize <= size:
-            raise InputError(where, f"claims {count} values in {size} bytes", damaged)
+            raise InputError(where, f"claims {count} values in {size} bytes", DAMAGED)
         return np.frombuffer(file.read(count * kind.itemsize), kind).reshape(shape, order="F" if fortran else "C")
-    except InputError:
-        raise
-    except Exception as error:  # NumPy reads the header as Python: a damaged one raises what its parser does
-        reason = str(error).partition("\n")[0][:120] or type(error).__name__
-        raise InputError(where, f"is no array ({reason})", damaged) from None
 
 
 def read_archive(path: Path) -> dict[str, np.ndarray]:
@@ -56,22 +62,21 @@ def read_archive(path: Path) -> dict[str, np.ndarray]:
     Raises:
         InputError: where it is no archive, an array is missing, or its claims do not fit its size.
     """
-    try:
-        with zipfile.ZipFile(input_file(path)) as archive:
-            sizes = {info.filename.removesuffix(".npy"): info.file_size for info in archive.infolist()}
-            missing = [name for name in REQUIRED if name not in sizes]
-            if missing:
-                remedy = f"Photographs need {', '.join(REQUIRED)}, and may have {' and '.join(OPTIONAL)}"
-                raise InputError(path, f"holds no array {missing[0]}", remedy)
-            wanted = [name for name in (*REQUIRED, *OPTIONAL) if name in sizes]
-            if sum(sizes[name] for name in wanted) > min(MOST_BYTES, EXPANSION * path.stat().st_size + (1 << 20)):
-                raise InputError(path, "claims more than can be in it", "The file is damaged; make it again")
-            arrays = {}
-            for name in wanted:
-                with archive.open(f"{name}.npy") as file:
-                    arrays[name] = read_array(file, f"{path}: {name}", sizes[name])
-            return arrays
-    except InputError:
-        raise
-    except Exception as error:  # damaged, cut short, with a password, of an unknown method
-        raise InputError(path, f"is no readable archive ({type(error).__name__})", "Save it with numpy.savez") from None
+    # Damaged, cut short, with a password, of an unknown method.
+    with (
+        _told(path, "is no readable archive", "Save it with numpy.savez"),
+        zipfile.ZipFile(input_file(path)) as archive,
+    ):
+        sizes = {info.filename.removesuffix(".npy"): info.file_size for info in archive.infolist()}
+        missing = [name for name in REQUIRED if name not in sizes]
+        if missing:
+            remedy = f"Photographs need {', '.join(REQUIRED)}, and may have {' and '.join(OPTIONAL)}"
+            raise InputError(path, f"holds no array {missing[0]}", remedy)
+        wanted = {name: sizes[name] for name in (*REQUIRED, *OPTIONAL) if name in sizes}
+        if sum(wanted.values()) > min(MOST_BYTES, EXPANSION * path.stat().st_size + (1 << 20)):
+            raise InputError(path, "claims more than can be in it", DAMAGED)
+        arrays = {}
+        for name, size in wanted.items():
+            with archive.open(f"{name}.npy") as file:
+                arrays[name] = read_array(file, f"{path}: {name}", size)
+        return arrays

@@ -13,7 +13,6 @@ from jaxtyping import Float
 
 import brdf
 from brdf.errors import InputError
-from fitting.photographs.light_files import parse_numbers
 
 # A mask whose outline is further from a circle than this share of its radius, rms, is no ball.
 ROUND = 0.05
@@ -38,29 +37,6 @@ class Circle(NamedTuple):
     radius: float
 
 
-def parse_circle(text: str) -> Circle:
-    """A circle as a person types it.
-
-    Args:
-        text: "x,y,radius".
-
-    Raises:
-        InputError: where it is none.
-    """
-    circle = Circle(*parse_numbers(text, "--sphere", 3, "x,y,radius in pixels"))
-    _check(circle, "--sphere")
-    return circle
-
-
-def _check(circle: Circle, where: str) -> None:
-    """Refuse a circle that is not finite, or too small to tell a normal."""
-    if not np.all(np.isfinite(circle)):
-        raise InputError(where, f"must be finite, got {tuple(circle)}", "Give x, y and radius in pixels")
-    if circle.radius < SMALLEST_RADIUS:
-        came = f"has a radius of {circle.radius:g} pixels, at least {SMALLEST_RADIUS:g} are needed"
-        raise InputError(where, came, "Give a ball that is larger in the picture")
-
-
 def find_circle(mask: Any) -> Circle:
     """The ball in a mask: the circle through the outline, holes and specks disregarded.
 
@@ -77,7 +53,7 @@ def find_circle(mask: Any) -> Circle:
         raise InputError("mask", "is empty", "Give a mask that is white on the ball")
     outline = np.concatenate([_sides(inside), _sides(inside.T)[::-1]], axis=1)
 
-    def beyond(circle: Any) -> np.ndarray:
+    def beyond(circle):
         return np.hypot(outline[0] - circle[0], outline[1] - circle[1]) - circle[2]
 
     # Area and centroid are the start, which holes and specks hardly move.
@@ -86,17 +62,15 @@ def find_circle(mask: Any) -> Circle:
     circle = Circle(*least_squares(beyond, start, loss="cauchy").x.tolist())
     distance = np.abs(beyond(circle))
     near = distance <= max(1.0, 3 * np.median(distance))
-    if np.mean(near) >= OUTLINE:
-        distance = distance[near]
+    distance = distance[near] if np.mean(near) >= OUTLINE else distance
     off = np.sqrt(np.mean(distance**2)) / max(circle.radius, 1e-9)
     if off > ROUND:
         came = f"is no ball: its outline is {100 * off:.0f} % of the radius off a circle"
         raise InputError("mask", came, "Give the mask of a whole ball, or its circle")
-    _check(circle, "mask")
     return circle
 
 
-def _sides(inside: np.ndarray) -> np.ndarray:
+def _sides(inside):
     """The outer edges of the first and the last pixel in each row that has one: x and y, (2, K)."""
     rows = np.flatnonzero(inside.any(axis=1))
     first = np.argmax(inside[rows], axis=1) - 0.5
@@ -115,14 +89,16 @@ def ball_normals(shape: tuple[int, int], circle: Circle) -> Float[np.ndarray, "H
         Normals; 0 beside the ball and where the outline runs through a pixel: a camera mixes what lies behind into it.
 
     Raises:
-        InputError: where the circle is none, lies outside the picture, or is far larger.
+        InputError: where the circle is none, too small to tell a normal, far larger than the picture, or outside.
     """
-    _check(circle, "circle")
-    height, width = shape
+    (height, width), size = shape, f"has a radius of {circle.radius:g} pixels"
+    if not np.all(np.isfinite(circle)):
+        raise InputError("circle", f"must be finite, got {tuple(circle)}", "Give x, y and radius in pixels")
+    if circle.radius < SMALLEST_RADIUS:
+        came = f"{size}, at least {SMALLEST_RADIUS:g} are needed"
+        raise InputError("circle", came, "Give a ball that is larger in the picture")
     if circle.radius > LARGEST_RADIUS * max(shape):
-        came = (
-            f"has a radius of {circle.radius:g} pixels in a picture of {width} x {height}, which is nearly flat there"
-        )
+        came = f"{size} in a picture of {width} x {height}, which is nearly flat there"
         raise InputError("circle", came, "Give x,y,radius in pixels of this picture")
     x = (np.arange(width) - circle.x) / circle.radius
     y = -(np.arange(height)[:, None] - circle.y) / circle.radius
@@ -147,7 +123,7 @@ def ball_points(shape: tuple[int, int], circle: Circle) -> "brdf.SurfacePoints":
         Points on the unit ball, (H, W); the mask is true where a whole pixel is on the ball.
 
     Raises:
-        InputError: where the circle is none or lies outside the picture.
+        InputError: as `ball_normals`.
     """
     normal = ball_normals(shape, circle)
     return brdf.SurfacePoints.from_normals(normal, position=normal)

@@ -5,7 +5,6 @@ the half vector or the mirror direction is fitted with it: left to robust weight
 several degrees. Only where the light comes in at an angle is looked at, so that shadows say nothing.
 """
 
-import functools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -44,6 +43,10 @@ TO_VIEW = np.array([0.0, 0.0, 1.0])
 # What is no ball. Of balls the shading leaves up to 0.05 of the light unexplained, of reliefs and coins 0.05 to 3; of
 # what is bright on mirror balls all lies in the highlight, elsewhere up to 0.4 does (photographs of shared/data).
 DOUBTFUL, NO_BALL, IN_HIGHLIGHT = 0.04, 0.08, 0.5
+# A light from so far behind leaves a crescent of less than three fifths of the ball's radius. On a thin one ambient
+# light and a highlight can be taken for each other and for shading, and the jackknife does not see that.
+BEHIND = -0.4
+TOO_LITTLE = InputError("picture", "shows too little of the lit surface to tell the light", "Give its direction")
 
 
 def photograph_scene(
@@ -64,17 +67,17 @@ def photograph_scene(
     return brdf.Scene(points=points, lights=(light,), ambient=ambient)
 
 
-def _values(picture: Any) -> np.ndarray:
+def _values(picture):
     return np.atleast_3d(np.asarray(getattr(picture, "pixels", picture), np.float64))
 
 
-def light_from_highlight(picture: Any, circle: Circle, *, mask: Any = True) -> Float[np.ndarray, "3"]:
+def light_from_highlight(picture: Any, circle: Circle, *, mask: Any = None) -> Float[np.ndarray, "3"]:
     """Direction towards a distant light from its reflection in a mirror ball.
 
     Args:
         picture: linear values, (H, W, C) or (H, W), or a `brdf.Picture`, of the mirror ball.
         circle: its outline.
-        mask: (H, W), pixels that count; or True.
+        mask: (H, W), pixels that count; None for all.
 
     Returns:
         The unit direction, 2 (N.V) N - V at the middle of the highlight.
@@ -85,27 +88,25 @@ def light_from_highlight(picture: Any, circle: Circle, *, mask: Any = True) -> F
     from scipy.ndimage import label  # it takes long to load
 
     grey = _values(picture).mean(axis=-1)
-    inside = (ball_normals(grey.shape, circle)[..., 2] > 0) & np.isfinite(grey) & mask
+    inside = (ball_normals(grey.shape, circle)[..., 2] > 0) & np.isfinite(grey) & (True if mask is None else mask)
     largest = float(np.max(grey, where=inside, initial=-np.inf))
     if not largest > 0:
         raise InputError("picture", "is black on the mirror ball", "Give a picture with a highlight")
-    core = inside & (grey >= CORE * largest)
+    core, bright = (inside & (grey >= share * largest) for share in (CORE, HIGHLIGHT))
     if np.count_nonzero(core) > 0.25 * np.count_nonzero(inside):
         raise InputError("picture", "has no highlight: a quarter of the ball is as bright", "Give a darker exposure")
-    bright = inside & (grey >= HIGHLIGHT * largest)
-    found: Any = label(bright, np.ones((3, 3)))
-    patches = found[0]
-    y, x = np.argwhere(patches == np.bincount(patches[core]).argmax()).mean(axis=0)
-    rows, columns = np.nonzero(bright)
-    near = np.hypot(columns - x, rows - y) <= HIGHLIGHT_RADIUS * circle.radius
+    patches: Any = label(bright, np.ones((3, 3)))
+    y, x = np.argwhere(patches[0] == np.bincount(patches[0][core]).argmax()).mean(axis=0)
+    place = np.argwhere(bright)
+    near = np.hypot(place[:, 1] - x, place[:, 0] - y) <= HIGHLIGHT_RADIUS * circle.radius
     if np.mean(near) < IN_HIGHLIGHT:
-        came = (
-            f"is bright in many places: {100 * np.mean(near):.0f} % of it lie where a mirror ball's highlight would be"
-        )
-        raise InputError("picture", came, "Give a photograph of a mirror ball and its circle; of a matt one use --matt")
-    if np.any(near & ((np.minimum(rows, columns) == 0) | (rows == grey.shape[0] - 1) | (columns == grey.shape[1] - 1))):
+        share = f"{100 * np.mean(near):.0f} % of it lie where a mirror ball's highlight would be"
+        remedy = "Give a photograph of a mirror ball and its circle; of a matt one use --matt"
+        raise InputError("picture", f"is bright in many places: {share}", remedy)
+    place = place[near]
+    if np.any((place == 0) | (place == np.array(grey.shape) - 1)):
         raise InputError("picture", "cuts through the highlight with its edge", "Give a photograph of all of it")
-    x, y = float(columns[near].mean()), float(rows[near].mean())
+    y, x = place.mean(axis=0)
     across, up = (x - circle.x) / circle.radius, (circle.y - y) / circle.radius
     z = max(1 - across**2 - up**2, 0.0) ** 0.5
     return 2 * z * np.array([across, up, z]) - TO_VIEW
@@ -129,13 +130,24 @@ class ShadingLight(NamedTuple):
     error: float
     unexplained: float
 
+    @property
+    def stated_error(self) -> str:
+        """The error, and why it may be too small."""
+        doubt = ""
+        if self.direction[2] < BEHIND:
+            doubt = " (it comes from behind: a highlight on the thin crescent can turn it by several times that)"
+        elif self.unexplained > DOUBTFUL:
+            share = f"{100 * self.unexplained:.0f} % of the light unexplained"
+            doubt = f" (the shading leaves {share}: it can be off by several times that)"
+        return f"± {self.error:.2g}°{doubt}"
+
 
 def light_from_shading(
     picture: Any,
     points: brdf.SurfacePoints,
     *,
     saturation: float | None = None,
-    mask: Any = True,
+    mask: Any = None,
     ambient: bool = False,
 ) -> ShadingLight:
     """Direction of a distant light from the shading: Lambert's law and a highlight where the light comes in.
@@ -144,11 +156,11 @@ def light_from_shading(
         picture: linear values, (H, W, C) or (H, W), or a `brdf.Picture`.
         points: what each pixel sees, the viewer being far away along z.
         saturation: linear value from which on pixels are clipped; None takes the largest code of an integer file.
-        mask: (H, W), pixels that count; or True.
+        mask: (H, W), pixels that count; None for all.
         ambient: whether the surface is lit from all around as well.
 
     Returns:
-        Direction and strength, found robustly so that highlights and cast shadows do not pull.
+        The light.
 
     Raises:
         InputError: where fewer than ten pixels are lit, they do not determine a direction, or are not shaded as these
@@ -159,8 +171,8 @@ def light_from_shading(
     elif not saturation > 0:
         raise InputError("saturation", f"must be a linear value above 0, got {saturation!r}", "Give a number")
     values = _values(picture)
-    grey, top = values.mean(axis=-1), values.max(axis=-1)
-    counts = np.asarray(points.mask) & np.isfinite(grey) & mask & (top < (np.inf if saturation is None else saturation))
+    grey, clipped = values.mean(axis=-1), values.max(axis=-1) >= (saturation or np.inf)
+    counts = np.asarray(points.mask) & np.isfinite(grey) & ~clipped & (True if mask is None else mask)
     pixel = np.argwhere(counts)
     pixel = pixel[:: max(1, -(-len(pixel) // MOST_PIXELS))]
     row, column = pixel.T
@@ -170,170 +182,141 @@ def light_from_shading(
     if np.count_nonzero(lit) < FEWEST:
         raise InputError("picture", "has fewer than ten lit pixels on the surface", "Give a brighter picture")
     value = residual = value / unit
-    numbers, cost, scale, free = np.zeros(6), 0.0, 0.0, np.array([True, True, True, ambient, False, False])
+    # By Lambert's law alone, which tells which pixels the light reaches, and how far they are off.
+    numbers, cost, scale, mirror = np.zeros(4 if ambient else 3), 0.0, 0.0, False
     for _ in range(100):
         before, scale = numbers, _bound(residual[lit])
-        numbers, cost = _refine(numbers, free, False, scale, value[lit], normal[:, lit])
-        residual = value - _shown(numbers, free, False, normal)[0]
+        numbers, cost = _refine(numbers, mirror, scale, value[lit], normal[:, lit])
+        residual = value - _shown(numbers, mirror, normal)[0]
         if np.allclose(before, numbers, rtol=0, atol=CHANGE):
             break
         lit = _reached(normal, numbers)
     found = []
-    with_highlight = free | (np.arange(6) > 3)
-    for mirror in (False, True):
+    for about_mirror in (False, True):
         for n in STARTS:
-            start = np.array([*numbers[:3], 0.02 * ambient, 0.1, np.log(n - LOWEST_N)])
-            found.append((*_refine(start, with_highlight, mirror, scale, value[lit], normal[:, lit]), mirror))
-    shiny, left, mirror = min(found, key=lambda one: one[1])
+            start = np.array([*numbers[:3], *([0.02] if ambient else []), 0.1, np.log(n - LOWEST_N)])
+            found.append((*_refine(start, about_mirror, scale, value[lit], normal[:, lit]), about_mirror))
+    shiny, left, about_mirror = min(found, key=lambda one: one[1])
     if np.count_nonzero(lit) * np.log(max(cost, 1e-300) / max(left, 1e-300)) > 2 * RISE:
         # Lambert's law alone may have looked at pixels that the light does not reach.
-        lit, free, residual = (
-            _reached(normal, shiny),
-            with_highlight,
-            value - _shown(shiny, with_highlight, mirror, normal)[0],
-        )
-        scale = _bound(residual[lit])
-        numbers, _ = _refine(shiny, free, mirror, scale, value[lit], normal[:, lit])
-        residual = value - _shown(numbers, free, mirror, normal)[0]
+        lit, mirror = _reached(normal, shiny), about_mirror
+        scale = _bound((value - _shown(shiny, mirror, normal)[0])[lit])
+        numbers, _ = _refine(shiny, mirror, scale, value[lit], normal[:, lit])
     pixel -= pixel.min(axis=0)
-    block = pixel // -(-(pixel.max() + 1) // BLOCKS) @ [BLOCKS, 1]
-    slopes = _shown(numbers, free, mirror, normal[:, lit])[1] * free[:, None]
-    error = _error(numbers[:3], residual[lit], slopes, scale, block[lit])
+    block = (pixel // -(-(pixel.max() + 1) // BLOCKS) @ [BLOCKS, 1])[lit]
+    shown, slopes = _shown(numbers, mirror, normal[:, lit])
+    residual = value[lit] - shown
+    pull, parts = np.clip(residual, -scale, scale), [block == one for one in np.unique(block)]
+    error = _error(numbers[:3], slopes, pull, np.abs(residual) <= scale, parts)
     if not error < GUESS:
-        raise _too_little()
+        raise TOO_LITTLE
     length = float(np.linalg.norm(numbers[:3]))
-    unexplained = _left_over_parts(np.clip(residual[lit], -scale, scale), block[lit]) / length
+    unexplained = _common(pull, parts) / length
     if unexplained > NO_BALL:
         came = f"is not shaded like this surface: {100 * unexplained:.0f} % of the light is left unexplained"
-        raise InputError(
-            "picture", came, "Give a matt ball and its circle; check encoding, saturation and ambient light"
-        )
+        remedy = "Give a matt ball and its circle; check encoding, saturation and ambient light"
+        raise InputError("picture", came, remedy)
     return ShadingLight(numbers[:3] / length, length * unit, error, unexplained)
 
 
-def _left_over_parts(residual, block) -> float:
-    """Root mean square of what residuals of one block have in common, less what their scatter makes of their mean."""
-    _, index, count = np.unique(block, return_inverse=True, return_counts=True)
-    mean = np.bincount(index, residual) / count
-    spread = np.bincount(index, (residual - mean[index]) ** 2) / np.maximum(count - 1, 1)
-    known = count > 1
-    between = np.sum((count * mean**2 - spread)[known]) / max(np.sum(count[known]), 1)
-    return float(np.sqrt(max(between, 0.0)))
-
-
-def _too_little() -> InputError:
-    return InputError("picture", "shows too little of the lit surface to tell the light", "Give its direction")
-
-
-def _bound(residual) -> float:
+def _bound(residual):
     """Beyond which a residual's pull is constant."""
     return max(HUBER * np.median(np.abs(residual)), ROUNDING)
 
 
-def _reached(normal, numbers) -> np.ndarray:
+def _reached(normal, numbers):
     """Pixels that the light reaches at an angle."""
     lit = numbers[:3] @ normal > LIT * np.linalg.norm(numbers[:3])
     if np.count_nonzero(lit) < FEWEST:
-        raise _too_little()
+        raise TOO_LITTLE
     return lit
 
 
-def _shown(numbers, free, mirror, normal) -> tuple[np.ndarray, np.ndarray]:
-    """What pixels with these normals show, the light reaching them: ambient light, Lambert's law and a highlight.
+def _unit(vector):
+    """A vector at length 1, and the derivative of that by the vector."""
+    length = max(np.linalg.norm(vector), 1e-9)
+    unit = vector / length
+    return unit, (np.eye(3) - np.outer(unit, unit)) / length
+
+
+def _shown(numbers, mirror, normal):
+    """What pixels with these normals show, the light reaching them: Lambert's law, ambient light and a highlight.
 
     Args:
-        numbers: the light's vector, as long as what a pixel that faces it shows; ambient light; strength of the
-            highlight, either sign meaning the same, and logarithm of what its exponent has beyond the lowest.
-        free: which numbers may change; without a free highlight there is none.
+        numbers: the light's vector, as long as what a pixel that faces it shows; of an even count ambient light; of
+            more than four the strength of a highlight, either sign meaning the same, and the logarithm of what its
+            exponent has beyond the lowest.
         mirror: whether its lobe is about the mirror direction, not the half vector.
         normal: of P pixels, (3, P).
 
     Returns:
-        The values, and their derivatives by all numbers, (6, P).
+        The values, and their derivatives by the numbers, (F, P).
     """
-    light, (ambient, specular, log_beyond) = numbers[:3], numbers[3:]
-    slopes = np.zeros((6, normal.shape[1]))
-    slopes[:3], slopes[3] = normal, 1.0
-    if not free[4]:
-        return ambient + light @ normal, slopes
-    length = max(np.linalg.norm(light), 1e-300)
-    to_light = light / length
-    turned = (np.eye(3) - np.outer(to_light, to_light)) / length  # derivative of to_light by the light
-    if mirror:
-        cosine = 2 * (to_light @ normal) * normal[2] - to_light[2]
-        by_light = 2 * normal[2] * (turned @ normal) - turned[:, 2:]
-    else:
-        half = to_light + TO_VIEW
-        size = max(np.linalg.norm(half), 1e-9)
-        half /= size
-        cosine = half @ normal
-        by_light = (turned @ normal - np.outer(turned @ half, cosine)) / size
-    beyond = np.exp(min(log_beyond, np.log(LARGEST_N)))
-    cosine = np.clip(cosine, 1e-9, 1.0)
-    log_cosine = np.log(cosine)
-    lobe = np.exp((LOWEST_N + beyond) * log_cosine)
-    slopes[:3] += (abs(specular) * (LOWEST_N + beyond) * lobe / cosine) * by_light
-    slopes[4] = np.sign(specular) * lobe
-    slopes[5] = abs(specular) * beyond * lobe * log_cosine
-    return ambient + light @ normal + abs(specular) * lobe, slopes
+    light = numbers[:3]
+    shown, slopes = light @ normal, normal
+    if len(numbers) % 2 == 0:
+        shown, slopes = shown + numbers[3], np.vstack([slopes, np.ones_like(shown)])
+    if len(numbers) > 4:
+        specular, log_beyond = numbers[-2:]
+        axis, turns = _unit(light)
+        if mirror:
+            about = 2 * normal[2] * normal - TO_VIEW[:, None]  # to the light, mirrored, as the view is
+        else:
+            axis, again = _unit(axis + TO_VIEW)
+            turns, about = again @ turns, normal
+        beyond = np.exp(min(log_beyond, np.log(LARGEST_N)))
+        cosine = np.clip(axis @ about, 1e-9, 1.0)
+        lobe = cosine ** (LOWEST_N + beyond)
+        by_light = abs(specular) * (LOWEST_N + beyond) * lobe / cosine * (turns.T @ about)
+        slopes = np.vstack([slopes, np.sign(specular) * lobe, abs(specular) * beyond * lobe * np.log(cosine)])
+        shown, slopes[:3] = shown + abs(specular) * lobe, slopes[:3] + by_light
+    return shown, slopes
 
 
-def _refine(numbers, free, mirror, scale, value, normal) -> tuple[np.ndarray, float]:
-    """The nearest minimum of Huber's cost over the free numbers; and the cost."""
+def _refine(numbers, mirror, scale, value, normal):
+    """The nearest minimum of Huber's cost; and the cost."""
     from scipy.optimize import minimize  # it takes long to load
 
-    def among(some):
-        every = numbers.copy()
-        every[free] = some
-        return every
+    def cost(numbers):
+        shown, slopes = _shown(numbers, mirror, normal)
+        pull = np.clip(shown - value, -scale, scale)
+        return np.mean(pull * (shown - value - 0.5 * pull)), slopes @ pull / len(value)
 
-    @functools.lru_cache(1)  # cost and curvature are asked at the same numbers
-    def left(*some):
-        shown, slopes = _shown(among(some), free, mirror, normal)
-        return shown - value, slopes[free]
-
-    def cost(some):
-        residual, slopes = left(*some)
-        pull = np.clip(residual, -scale, scale)
-        return np.mean(pull * (residual - 0.5 * pull)), slopes @ pull / len(value)
-
-    def curvature(some):
-        residual, slopes = left(*some)
-        weight = scale / np.maximum(np.abs(residual), scale)
+    def curvature(numbers):
+        shown, slopes = _shown(numbers, mirror, normal)
+        weight = scale / np.maximum(np.abs(shown - value), scale)
         return (slopes * weight) @ slopes.T / len(value)
 
     how: Any = {"method": "trust-exact", "jac": True, "hess": curvature, "options": {"gtol": CLOSE, "maxiter": 50}}
-    found = minimize(cost, numbers[free], **how)
-    return among(found.x), found.fun
+    found = minimize(cost, numbers, **how)
+    return found.x, found.fun
 
 
-def _error(light, residual, slopes, scale, block) -> float:
-    """Root mean square angle to the true direction in degrees, where residuals of one block go together as they like.
+def _common(residual, parts):
+    """Root mean square of what residuals of one part have in common, less what their scatter makes of their mean."""
+    known = [residual[part] for part in parts if np.count_nonzero(part) > 1]
+    between = sum(len(one) * np.mean(one) ** 2 - np.var(one, ddof=1) for one in known) / max(sum(map(len, known)), 1)
+    return max(between, 0.0) ** 0.5
 
-    The jackknife over blocks: how far leaving one out moves the light, by one Newton step. A pixel pulls with its
+
+def _error(light, slopes, pull, within, parts):
+    """Root mean square angle to the true direction in degrees, where residuals of one part go together as they like.
+
+    The jackknife over parts: how far leaving one out moves the light, by one Newton step. A pixel pulls with its
     residual up to Huber's bound, and with the bound beyond; the derivative of that is 1 and 0.
 
     Source: Huber 1981, section 7.6; Bell and McCaffrey 2002.
     """
-    length = np.maximum(np.linalg.norm(slopes, axis=1), 1e-300)
-    columns, pull, within = slopes.T / length, np.clip(residual, -scale, scale), np.abs(residual) <= scale
-    order = np.argsort(block, kind="stable")
-    first = np.flatnonzero(np.diff(block[order], prepend=-1))
-
-    def over_blocks(values):
-        return np.add.reduceat(values[order], first)
-
-    near = columns * within[:, None]
-    gram = over_blocks(near[:, :, None] * near[:, None])
-    # Those of all but one as sums: of a single block that is 0, and a difference would be rounding.
-    nothing = np.zeros((1, 6, 6))
-    before, after = (np.cumsum(np.concatenate([nothing, one]), axis=0) for one in (gram[:-1], gram[:0:-1]))
-    hessian = before + after[::-1]
+    length = np.maximum(np.linalg.norm(slopes, axis=1, keepdims=True), 1e-300)
+    slopes = slopes / length
+    gram = np.stack([(slopes * within)[:, part] @ slopes[:, part].T for part in parts])
+    hessian = gram.sum(axis=0) - gram
     inverse = np.linalg.pinv(hessian, 1e-9, hermitian=True)
-    # A highlight may lie in one block; without it the others still tell the light, or they do not.
-    if not np.allclose((inverse @ hessian)[:, :3], np.eye(6)[:3], rtol=0, atol=1e-3):
+    # A highlight may lie in one part; without it the others still tell the light, or they do not.
+    if not np.allclose((inverse @ hessian)[:, :3], np.eye(len(slopes))[:3], rtol=0, atol=1e-3):
         return np.inf
-    moved = (inverse @ over_blocks(columns * pull[:, None])[..., None])[:, :3, 0] / length[:3]
+    pulls = np.stack([slopes[:, part] @ pull[part] for part in parts])
+    moved = (inverse @ pulls[..., None])[:, :3, 0] / length[:3, 0]
     size = np.linalg.norm(light)
     across = np.sum(moved**2) - np.sum((moved @ light / size) ** 2)
     return float(np.degrees(np.sqrt((1 - 1 / len(moved)) * across) / size))

@@ -44,12 +44,7 @@ def read_directions(path: str | Path, count: int | None = None) -> Float[np.ndar
     Raises:
         InputError: naming file and line.
     """
-    rows = _read_rows(path, count)
-    for line, row in rows.items():
-        if len(row) != 3 or not any(row):
-            came = f"must be three numbers that are not all 0, got {row}"
-            raise InputError(line, came, "Give x y z of the direction towards the light")
-    return np.array(list(rows.values()))
+    return _read_rows(path, count, 3, any, "that are not all 0", "Give x y z of the direction towards the light")
 
 
 def read_intensities(path: str | Path, count: int | None = None) -> Float[np.ndarray, "K C"]:
@@ -62,28 +57,37 @@ def read_intensities(path: str | Path, count: int | None = None) -> Float[np.nda
     Raises:
         InputError: naming file and line.
     """
-    rows = _read_rows(path, count)
-    channels = len(next(iter(rows.values())))
-    for line, row in rows.items():
-        if len(row) != channels or min(row) < 0 or not any(row):
-            came = f"must be {channels} numbers of 0 or more, got {row}"
-            raise InputError(line, came, "Give the intensity of each channel")
-    return np.array(list(rows.values()))
+
+    def is_fine(row):
+        return min(row) >= 0 and any(row)
+
+    return _read_rows(path, count, None, is_fine, "of 0 or more", "Give the intensity of each channel")
 
 
-def _read_rows(path: str | Path, count: int | None) -> dict[str, list[float]]:
-    """The numbers of each line, by what a message calls it."""
-    rows = {}
-    for number, line in enumerate(read_text(path, MOST_BYTES).splitlines(), start=1):
-        text = line.partition("#")[0].replace(",", " ").strip()
-        if text:
-            where = f"{path}: line {number}"
-            rows[where] = parse_numbers(text, where, len(text.split()), "plain numbers")
+def _read_rows(
+    path,
+    count,
+    width,
+    is_fine,
+    words,
+    remedy,
+):
+    """The numbers of the lines, of the same width each."""
+    lines = [line.partition("#")[0].replace(",", " ") for line in read_text(path, MOST_BYTES).splitlines()]
+    rows = {
+        f"{path}: line {number}": parse_numbers(line, f"{path}: line {number}", len(line.split()), "plain numbers")
+        for number, line in enumerate(lines, start=1)
+        if line.strip()
+    }
     if not rows:
         raise InputError(path, "holds no numbers", "Give a line per picture")
-    first, *others = rows
-    if others and len(rows[first]) == 1 < len(rows[others[0]]) and rows[first][0] == len(others):
-        del rows[first]
+    first, *others = rows.values()
+    if others and len(others[0]) > 1 and first == [len(others)]:
+        del rows[next(iter(rows))]
+    width = width or len(next(iter(rows.values())))
+    for line, row in rows.items():
+        if len(row) != width or not is_fine(row):
+            raise InputError(line, f"must be {width} numbers {words}, got {row}", remedy)
     if count is not None and len(rows) != count:
         raise InputError(path, f"has {len(rows)} lines for {count} pictures", "Give a line per picture")
-    return rows
+    return np.array(list(rows.values()))

@@ -241,8 +241,7 @@ def test_lights_from_a_mirror_ball_in_one_command(tmp_path, capsys, monkeypatch)
 
 @pytest.mark.parametrize("share", [0.2, 0.7, 0.95])
 def test_the_encoding_that_leaves_less_is_taken_and_called_a_guess_unless_it_is_clear(share):
-    picture = brdf.Picture(np.ones((2, 2, 1), np.float32), None, "srgb", "assumed", 8, 1.0)
-    is_other, (words,) = encoding_trial.judge(Path("a.png"), picture, (0.01, 0.01 * share))
+    is_other, words = encoding_trial.judge("srgb", 0.01, 0.01 * share)
     assert is_other == (share < 0.9)
     assert ("a guess" in words) == (share >= 0.5)
     assert words.endswith("say so with --encoding")
