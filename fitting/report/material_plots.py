@@ -39,12 +39,13 @@ def overview(brdf: Brdf, report: Report | None = None) -> Figure:
     Example:
         >>> fitting.overview(brdf.preset("gold")).savefig("gold.png")
     """
-    figure: Any = Figure(figsize=(7.2, 6.0), layout="constrained")
+    figure: Any = Figure(figsize=(7.2, 6.0))
     (ball, lobe), (albedo, reciprocity) = figure.subfigures(2, 2)
+    is_material = isinstance(brdf, Material)
     axes = ball.add_subplot()
     axes.set_axis_off()
-    axes.imshow(lit_sphere(brdf if isinstance(brdf, Material) else _sampler(brdf), 256))
-    name = brdf.name if isinstance(brdf, Material) else getattr(brdf, "__name__", type(brdf).__name__)
+    axes.imshow(lit_sphere(brdf if is_material else Sampler(brdf), 256))
+    name = brdf.name if is_material else getattr(brdf, "__name__", type(brdf).__name__)
     axes.set_title(f"{name}, n = {brdf.n:.4g}" if isinstance(brdf, SpecularMaterial) else name)
     plot_lobe(brdf, figure=lobe)
     plot_albedo(brdf, report, figure=albedo)
@@ -68,26 +69,23 @@ def plot_albedo(brdf: Brdf, report: Report | None = None, figure: Any = None) ->
     """
     known = isinstance(brdf, Material)
     degrees = np.append(np.arange(0.0, 89.0, 0.5 if known else 2.0), [89.0, 89.5, 89.7, 89.8, 89.9, 89.95, 89.99])
-    if known:
-        albedo = np.asarray(directional_albedo(brdf, np.radians(degrees), precision="float64"))
-    else:
-        albedo = albedo_of(brdf, degrees)
+    exact = directional_albedo(brdf, np.radians(degrees), precision="float64") if known else albedo_of(brdf, degrees)
+    albedo = np.asarray(exact)
     count = albedo.shape[1]
     figure, axes = _axes(figure, (6, 4))
     axes.axhspan(1, 2, color="0.92", zorder=0)
-    axes.axhline(1, color="black", linewidth=1)
+    axes.axhline(1, color="black")
     axes.annotate("more than arrives", (1, 1), (0, 4), textcoords="offset points", fontsize="small")
     axes.set_prop_cycle(CHANNELS if count == 3 else OTHERS)
-    axes.plot(degrees, albedo, linewidth=1.8, label=channel_names(count))
+    axes.plot(degrees, albedo, label=channel_names(count))
     if count > 1:
         axes.legend(loc="best")
     energy = report.energy if report else None
     if energy and energy.crossing:
-        axes.axvline(energy.crossing, color="0.4", linestyle=":", linewidth=1)
-        text = f"exceeds 1 beyond {energy.crossing:.4g}°"
-        axes.annotate(text, (energy.crossing, 1.2), (-5, 0), textcoords="offset points", ha="right")
+        axes.axvline(energy.crossing, color="0.4", linestyle=":")
+        axes.text(energy.crossing - 1, 1.2, f"exceeds 1 beyond {energy.crossing:.4g}°", ha="right")
     if energy and energy.value < 1.5:
-        axes.plot(energy.to_light.polar, energy.value, "ko", markerfacecolor="none", clip_on=False)
+        axes.plot(energy.to_light.polar, energy.value, "ko", fillstyle="none", clip_on=False)
     axes.set(xlabel=LIGHT, ylabel="albedo", xlim=(0, 90), ylim=(0, 1.5), title="Light reflected, of that arriving")
     return figure
 
@@ -116,7 +114,7 @@ def plot_lobe(brdf: Brdf, angles: tuple[float, ...] = (0.0, 30.0, 60.0), channel
         views = np.radians(views[np.abs(views) <= 90])
         view = from_angles(views, 0.0)
         value = sample(from_angles(np.radians([-angle]), 0.0), view)[:, channel] * view[:, 2]
-        axes.plot(views, np.sign(value) * np.abs(value) ** 0.5, linewidth=1.8, label=f"light at {angle:g}°")
+        axes.plot(views, np.sign(value) * np.abs(value) ** 0.5, label=f"light at {angle:g}°")
     axes.set_theta_zero_location("N")
     axes.set_theta_direction(-1)
     axes.set_thetalim(-np.pi / 2, np.pi / 2)
@@ -178,21 +176,21 @@ def plot_table(table: MeasuredBRDF, material: Material, counted: np.ndarray) -> 
         material: to it.
         counted: which samples, (P,).
     """
-    light, view = table.to_light[counted], table.to_view[counted]
+    light, view, values = table.to_light[counted], table.to_view[counted], table.values[counted]
     half = light + view
     angle = np.degrees(np.arctan2(np.linalg.norm(half[:, :2], axis=1), half[:, 2]))
-    fitted = np.broadcast_to(material.reflectance(light, view), table.values[counted].shape)
+    fitted = np.broadcast_to(material.reflectance(light, view), values.shape)
     parts = np.array_split(np.argsort(angle), min(PARTS, len(angle)))
     across = [np.mean(angle[part]) for part in parts]
-    figure = Figure(figsize=(4.6, 3.2), layout="constrained")
-    axes = figure.add_subplot(yscale="log", xlabel="half vector from the normal (°)", ylabel="f_r cos θ (1/sr)")
+    figure, axes = _axes(None, (4.6, 3.2))
+    axes.set(yscale="log", xlabel="half vector from the normal (°)", ylabel="f_r cos θ (1/sr)")
     shown = np.unique(np.linspace(0, len(table.channels) - 1, 3).round().astype(int))
     for colour, channel in zip(CHANNEL_COLOURS, shown, strict=False):
-        measured, modelled = (values[:, channel] * light[:, 2] for values in (table.values[counted], fitted))
+        measured, modelled = values[:, channel] * light[:, 2], fitted[:, channel] * light[:, 2]
         low, middle, high = np.transpose([np.quantile(measured[part], (0.1, 0.5, 0.9)) for part in parts])
         axes.fill_between(across, low, high, color=colour, alpha=0.2, linewidth=0)
         axes.plot(across, middle, color=colour, label=f"{table.channels[channel]}, table")
         axes.plot(across, [np.median(modelled[part]) for part in parts], "--", color=colour, label="fit")
     axes.set_title(f"{table.name}: {material.name}")
-    axes.legend(frameon=False, bbox_to_anchor=(1.0, 1.0), loc="upper left")
+    axes.legend(bbox_to_anchor=(1.0, 1.0), loc="upper left")
     return figure

@@ -26,17 +26,6 @@ from brdf.channels import channel_names
 from brdf.display import png_address
 from brdf.files import write_text
 
-_STYLE = """
-:root { color-scheme: light dark; }
-body { font: 16px/1.45 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; }
-h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2rem; border-bottom: 1px solid #8888; }
-.wide { overflow-x: auto; } table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-th, td { padding: 0.15em 0.6em; text-align: right; border-bottom: 1px solid #8884; }
-img { max-width: 100%; height: auto; background: white; }
-.warning { border-left: 4px solid #d55e00; padding: 0.3em 0.8em; margin: 0.6em 0; }
-pre { overflow-x: auto; background: #8882; padding: 0.6em; }
-"""
-
 
 @dataclasses.dataclass(frozen=True)
 class Page:
@@ -48,7 +37,7 @@ class Page:
 
     text: str = dataclasses.field(repr=False)
 
-    def _repr_html_(self) -> str:
+    def _repr_html_(self):
         """For Jupyter: the page in a frame."""
         frame = "width:100%;height:46rem;border:0"
         return f'<iframe style="{frame}" sandbox="allow-scripts" srcdoc="{html.escape(self.text)}"></iframe>'
@@ -73,9 +62,9 @@ def secure_page(title: str, body: str, script: str) -> str:
         body: as HTML, with a `stage`.
         script: asset that draws on it.
     """
-    style, script = _STYLE + asset("viewer.css"), asset("page.js") + asset(script)
+    style, script = asset("viewer.css"), asset("page.js") + asset(script)
 
-    def digest(text: str) -> str:
+    def digest(text):
         return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
     policy = f"default-src 'none'; img-src data:; style-src-elem {digest(style)}; style-src-attr 'unsafe-inline'"

@@ -20,7 +20,16 @@ from brdf.models.base import SpecularMaterial
 if TYPE_CHECKING:
     from fitting.result import FitResult
 
-PRINT: dict[Any, Any] = {"font.size": 8, "axes.titlesize": 9, "legend.fontsize": 7, "figure.dpi": 120}
+PRINT: dict[Any, Any] = {
+    "font.size": 8,
+    "axes.titlesize": 9,
+    "legend.fontsize": 7,
+    "legend.frameon": False,
+    "lines.linewidth": 1.2,
+    "markers.fillstyle": "none",
+    "figure.dpi": 120,
+    "figure.constrained_layout.use": True,
+}
 """Sizes in points for a figure as wide as a page, 7.2 inches."""
 
 CHANNEL_COLOURS = ("#D55E00", "#009E73", "#0072B2", "#CC79A7", "#E69F00", "#56B4E9")
@@ -54,17 +63,15 @@ def comparison(result: "FitResult", picture: int | None = None) -> Figure:
     count, why = len(result.targets), " (explained worst)" if picture is None else ""
     picture = shown_picture(result, picture)
     file = result.files[picture] if result.files else None
-    name = "" if file is None else Path(file["path"]).name
-    title = name if count == 1 else f"picture {picture + 1} of {count}{', ' if name else ''}{name}{why}"
-    target, fitted = np.asarray(result.targets[picture]), result.fitted(picture)
-    counted = np.asarray(result.counted[picture])
+    name = Path(file["path"]).name if file else ""
+    title = f"picture {picture + 1} of {count}{', ' if name else ''}{name}{why}" if count > 1 else name
+    target, fitted, counted = np.asarray(result.targets[picture]), result.fitted(picture), result.counted[picture]
     white = max(float(np.quantile(target[counted], 0.999)), 1e-12) if counted.any() else 1.0
-    specular = isinstance(result.material, SpecularMaterial) and bool(np.any(np.asarray(result.material.k_s)))
+    specular = isinstance(result.material, SpecularMaterial) and bool(np.any(result.material.k_s))
     row, rows, columns = _highlight(result, picture, counted, specular)
-    figure = Figure(figsize=(7.2, 4.9), layout="constrained")
+    figure = Figure(figsize=(7.2, 4.9))
     figure.suptitle(title, fontsize=PRINT["axes.titlesize"])
-    last = "scanline" if result.optimum is None else "profile"
-    below = ["highlight", "scanline", last] if specular else ["scanline"] * 3
+    below = ["highlight", "scanline", "profile" if result.optimum else "scanline"] if specular else ["scanline"] * 3
     mosaic: Any = [["target", "fit", "residual"], below]
     panels: Any = figure.subplot_mosaic(mosaic)
     for key, image, title in ("target", target, "target"), ("fit", fitted, f"fit, {result.surface}"):
@@ -73,21 +80,19 @@ def comparison(result: "FitResult", picture: int | None = None) -> Figure:
         panels[key].set_title(title)
     _residual(panels["residual"], target, fitted, counted)
     down, across = window(counted)
-    limits = {"xlim": (across.start - 0.5, across.stop - 0.5), "ylim": (down.stop - 0.5, down.start - 0.5)}
     for key in ("target", "fit", "residual"):
-        panels[key].set(xticks=[], yticks=[], **limits)
+        panels[key].set_xlim(across.start - 0.5, across.stop - 0.5)
+        panels[key].set_ylim(down.stop - 0.5, down.start - 0.5)
+        panels[key].set(xticks=[], yticks=[])
     if specular:
-        if result.optimum is not None:
-            _profile(panels["profile"], result)
         axes, width = panels["highlight"], columns.stop - columns.start
         crop = np.concatenate([image[rows, columns] for image in (target, fitted)], axis=1)
         axes.imshow(brdf.displayed(crop, max(white, float(np.nanmax(crop)))), interpolation="nearest")
-        axes.axvline(width - 0.5, color="white", linewidth=1)
+        axes.axvline(width - 0.5, color="white")
         axes.set(xticks=[0.5 * width, 1.5 * width], xticklabels=["target", "fit"], yticks=[])
-        axes.tick_params(length=0)
         axes.set_title(f"highlight, {width} pixels wide")
-    else:
-        columns = slice(0, target.shape[1])
+    if "profile" in panels:
+        _profile(panels["profile"], result)
     _scanline(panels["scanline"], target, fitted, counted, row, columns)
     return figure
 
@@ -104,7 +109,7 @@ def shown_picture(result: "FitResult", picture: int | None) -> int:
     """
     count = len(result.targets)
     if picture is None:
-        return max(range(count), key=lambda index: _unexplained(result, index)) if count > 1 else 0
+        return 0 if count == 1 else int(np.argmax([_unexplained(result, index) for index in range(count)]))
     if not 0 <= picture < count:
         raise InputError("picture", f"must be from 0 to {count - 1}, got {picture}", "Count the pictures from 0")
     return picture
@@ -112,9 +117,8 @@ def shown_picture(result: "FitResult", picture: int | None) -> int:
 
 def _unexplained(result, picture):
     """Squares of the residual of a picture, over its own."""
-    counted = np.asarray(result.counted[picture])
-    values = np.asarray(result.targets[picture], np.float64)[counted]
-    return np.sum((result.fitted(picture)[counted] - values) ** 2) / max(np.sum(values**2), 1e-300)
+    values, fitted = (image[result.counted[picture]] for image in (result.targets[picture], result.fitted(picture)))
+    return np.sum((fitted - values) ** 2, dtype=float) / max(np.sum(values**2, dtype=float), 1e-300)
 
 
 def window(counted: np.ndarray) -> tuple[slice, slice]:
@@ -123,29 +127,28 @@ def window(counted: np.ndarray) -> tuple[slice, slice]:
     Args:
         counted: (H, W).
     """
-    height, width = counted.shape
     if not counted.any():
-        return slice(0, height), slice(0, width)
-    (top, bottom), (left, right) = (np.flatnonzero(counted.any(axis=axis))[[0, -1]] for axis in (1, 0))
-    margin = 2 + max(bottom - top, right - left) // 16
-    rows = slice(max(top - margin, 0), min(bottom + margin + 1, height))
-    return rows, slice(max(left - margin, 0), min(right + margin + 1, width))
+        counted = ~counted
+    ends = [np.flatnonzero(counted.any(axis=axis))[[0, -1]] for axis in (1, 0)]
+    margin = 2 + max(last - first for first, last in ends) // 16
+    spans = zip(ends, counted.shape, strict=True)
+    rows, columns = (slice(max(first - margin, 0), min(last + margin + 1, size)) for (first, last), size in spans)
+    return rows, columns
 
 
 def _highlight(result, picture, counted, specular):
-    """The row of the highlight's peak, and the rows and columns worth enlarging."""
+    """The row of the highlight's peak, and the rows and columns worth enlarging; all columns where there is none."""
     material = result.material
-    image = np.nan_to_num(np.asarray(result.targets[picture]))
+    image = np.nan_to_num(result.targets[picture])
     if specular:
-        dark = type(material)(k_d=0.0 * np.asarray(material.k_d), k_s=material.k_s, n=material.n)
+        dark = type(material)(k_d=np.zeros_like(material.k_d), k_s=material.k_s, n=material.n)
         image = np.asarray(brdf.render(dark, result.scenes[picture], precision=result.precision))
     image = np.where(counted, image.max(axis=-1), 0.0)
     peak = np.array(np.unravel_index(np.argmax(image), image.shape))
-    bright = np.argwhere(image > 0.2 * image.max())
-    reach = np.max(np.abs(bright - peak), initial=0) + 2
+    reach = np.max(np.abs(np.argwhere(image > 0.2 * image.max()) - peak), initial=0) + 2
     reach = min(max(reach, 8), max(image.shape) // 2)
     (top, left), (bottom, right) = np.maximum(peak - reach, 0), np.minimum(peak + reach + 1, image.shape)
-    return peak[0], slice(top, bottom), slice(left, right)
+    return peak[0], slice(top, bottom), slice(left, right) if specular else slice(0, image.shape[1])
 
 
 def _residual(axes, target, fitted, counted):
@@ -162,21 +165,22 @@ def _residual(axes, target, fitted, counted):
 
 
 def _scanline(axes, target, fitted, counted, row, columns):
+    """Lines are the fit, circles some of the pixels that count."""
     axes.set_prop_cycle(CHANNELS)
     target, fitted, counted = target[row, columns], fitted[row, columns], counted[row, columns, None]
     across, count = np.arange(columns.start, columns.stop), target.shape[-1]
-    names, some = channel_names(count), slice(None, None, max(1, len(across) // 30))
-    lines = np.where(counted | np.any(fitted != 0, axis=-1, keepdims=True), fitted, np.nan)
-    known = np.where(counted, target, np.nan)
-    circles: dict[str, Any] = {"marker": "o", "linestyle": "", "markersize": 2.5, "markerfacecolor": "none"}
+    some = slice(None, None, max(1, len(across) // 30))
+    fitted = np.where(counted | np.any(fitted != 0, axis=-1, keepdims=True), fitted, np.nan)
+    target = np.where(counted, target, np.nan)
+    circles: dict[str, Any] = {"marker": "o", "linestyle": "", "markersize": 2.5}
     # Of a spectrum, as many channels as there are colours, from the first to the last.
     for channel in np.unique(np.linspace(0, count - 1, min(count, len(CHANNELS))).round().astype(int)):
-        label = "fit" if count == 1 else names[channel] if count == 3 else f"channel {names[channel]}"
-        (line,) = axes.plot(across, lines[:, channel], linewidth=1.2, label=label)
-        axes.plot(across[some], known[some, channel], color=line.get_color(), **circles)
+        label = {1: "fit", 3: channel_names(count)[channel]}.get(count, f"channel {channel}")
+        (line,) = axes.plot(across, fitted[:, channel], label=label)
+        axes.plot(across[some], target[some, channel], color=line.get_color(), **circles)
     axes.plot([], [], color="0.3", label="target", **circles)
     axes.set(xlabel=f"column, in row {row}", ylabel="radiance (linear)", title="scanline")
-    axes.legend(frameon=False, handlelength=2.2, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.2))
+    axes.legend(ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.2))
 
 
 def legible(axis: Any) -> None:
@@ -188,25 +192,23 @@ def legible(axis: Any) -> None:
 
 def _profile(axes, result):
     """The least residual at each exponent: how deep the minimum is, and whether there are others."""
-    optimum = result.optimum
-    grid, profile = np.asarray(optimum.grid), np.asarray(optimum.profile)
-    exact = np.sum(optimum.cost)
+    optimum, found = result.optimum, result["n"]
+    grid, profile, exact = optimum.grid, optimum.profile, np.sum(optimum.cost)
     if grid.size and not optimum.flat and exact < profile.min():  # the grid steps over a sharp minimum
         place = np.searchsorted(grid, optimum.n)
         grid, profile = np.insert(grid, place, optimum.n), np.insert(profile, place, exact)
     axes.set(xscale="log", xlabel="exponent n", title="profile of n")
     if grid.size > 1:
         percent = 100 * np.sqrt(np.maximum(profile, 0.0) / np.sum(optimum.square))
-        axes.plot(grid, percent, color="black", linewidth=1.2)
+        axes.plot(grid, percent, color="black")
         axes.set(ylabel="least residual, % of the picture", xlim=(grid[0], grid[-1]))
         if percent.max() > 5 * max(percent.min(), 1e-9):
             axes.set_yscale("log")
             legible(axes.yaxis)
-    found = result["n"]
     if found.value is None:
         axes.set_title("profile of n: not determined")
         return
-    axes.axvline(found.value, color=CHANNEL_COLOURS[0], linewidth=1)
+    axes.axvline(found.value, color=CHANNEL_COLOURS[0])
     text = f"exponent n\nn = {found.value:.5g}"
     if found.interval is not None:
         low, high = found.interval

@@ -4,6 +4,7 @@ import hashlib
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +28,8 @@ def write_report(stage: Path, result: Any, **further: Any) -> None:
         result: with ``material``, ``undetermined`` and ``to_dict()``.
         further: what else fit.json is to hold.
     """
-    names = ["material.json", *(["material.mtl"] if result.material.k_d.shape[0] in (1, 3) else [])]
-    for name in names:
-        brdf.save_material(result.material, stage / name, undetermined=result.undetermined)
+    for suffix in ("json", "mtl") if result.material.k_d.size in (1, 3) else ("json",):
+        brdf.save_material(result.material, stage / f"material.{suffix}", undetermined=result.undetermined)
     write_text(stage / "fit.json", json.dumps(result.to_dict() | further, indent=2) + "\n")
 
 
@@ -47,21 +47,22 @@ def save(result: FitResult, folder: str | Path, plot: bool) -> None:
     with atomic_folder(folder) as stage:
         pictures = [_write_picture(stage, result, index) for index in range(len(result.scenes))]
         write_report(stage, result, pictures=pictures)
-        counted = {f"counted{index}": counted for index, counted in enumerate(result.counted)}
-        counted |= {f"weights{index}": one for index, one in enumerate(result.weights) if one is not None}
-        np.savez_compressed(stage / "fit.npz", **counted, **({} if result.optimum is None else vars(result.optimum)))
+        arrays = dict(vars(result.optimum)) if result.optimum else {}
+        for name, images in (("counted", result.counted), ("weights", result.weights)):
+            arrays |= {f"{name}{index}": image for index, image in enumerate(images) if image is not None}
+        np.savez_compressed(stage / "fit.npz", **arrays)
         brdf.write_image(stage / "fitted.exr", result.fitted())
         if plot:
             result.plot().savefig(stage / "comparison.png", dpi=150)
 
 
-def _write_picture(stage: Path, result: FitResult, index: int) -> dict[str, Any]:
+def _write_picture(stage, result, index):
     """Write one scene, and its picture where no file holds it; what fit.json says of them."""
-    scene, file, number = result.scenes[index], (result.files or [None] * (index + 1))[index], index or ""
-    is_shared = scene.points is not None and scene.points is result.scenes[0].points and index > 0
+    scene, file, number = result.scenes[index], result.files[index] if result.files else None, index or ""
+    is_shared = index > 0 and scene.points is not None and scene.points is result.scenes[0].points
     scene.save(stage / f"scene{number}.toml", aov="scene.aov.exr" if is_shared else None)
-    path = stage / f"target{number}.exr"
     if file is None:
+        path = stage / f"target{number}.exr"
         brdf.write_image(path, np.asarray(result.targets[index], np.float32))
         file = {"path": path.name, "encoding": "linear", "factor": 1.0}
     else:
@@ -70,7 +71,7 @@ def _write_picture(stage: Path, result: FitResult, index: int) -> dict[str, Any]
     return file | {"sha256": _digest(path), "scene": f"scene{number}.toml"}
 
 
-def _digest(path: Path) -> str:
+def _digest(path):
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
@@ -79,11 +80,13 @@ def _digest(path: Path) -> str:
         raise InputError(path, f"which was fitted, cannot be read ({error.strerror})", remedy) from None
 
 
+@dataclass(frozen=True)
 class _Pictures(Sequence[np.ndarray]):
     """The pictures of a saved fit, read when they are asked for, if they still are what was fitted."""
 
-    def __init__(self, folder: Path, files: list[dict[str, Any]], precision: str):
-        self.folder, self.files, self.precision = folder, files, precision
+    folder: Path
+    files: list[dict[str, Any]]
+    precision: str
 
     def __len__(self) -> int:
         return len(self.files)
@@ -126,40 +129,37 @@ def load_result(folder: str | Path) -> FitResult:
         if "table" in values:
             remedy = "Its material is what brdf.load_material reads"
             raise InputError(path, "is the fit of a measured BRDF, which holds no picture", remedy)
-        pictures, choice = values.pop("pictures"), values["choice"]
+        pictures = values.pop("pictures")
         with np.load(folder / "fit.npz") as arrays:
-            counted = [arrays[f"counted{index}"] for index in range(len(pictures))]
-            weights = [arrays.get(f"weights{index}") for index in range(len(pictures))]
-            optimum = {name: arrays[name] for name in Optimum.__dataclass_fields__ if name in arrays}
-        if choice is not None:
-            del choice["basis"]
-            choice = BudgetChoice(**choice | {"attempts": tuple(Attempt(**one) for one in choice["attempts"])})
-        known = {name: value for name, value in values.items() if name in FitResult.__dataclass_fields__}
-        return FitResult(
-            **known
-            | {
-                "material": material_from_dict(values["material"]),
-                "parameters": tuple(map(_parameter, values["parameters"])),
-                "noise": np.array(values["noise"]),
-                "warnings": tuple(values["warnings"]),
-                "candidates": tuple(Candidate(**one) for one in values["candidates"]),
-                "correlation": np.array(values["correlation"]["matrix"]),
-                "optimum": Optimum(**{name: value[()] for name, value in optimum.items()}) if optimum else None,
-                "choice": choice,
-                "targets": _Pictures(folder, pictures, values["precision"]),
-                "scenes": [brdf.Scene.load(folder / picture["scene"]) for picture in pictures],
-                "counted": counted,
-                "weights": weights,
-                "files": pictures,
-            }
-        )
+            arrays = dict(arrays)
+        optimum = {name: arrays[name][()] for name in Optimum.__dataclass_fields__ if name in arrays}
+        values |= {
+            "material": material_from_dict(values["material"]),
+            "parameters": tuple(map(_parameter, values["parameters"])),
+            "noise": np.array(values["noise"]),
+            "warnings": tuple(values["warnings"]),
+            "candidates": tuple(Candidate(**one) for one in values["candidates"]),
+            "correlation": np.array(values["correlation"]["matrix"]),
+            "optimum": Optimum(**optimum) if optimum else None,
+            "choice": _choice(**values["choice"]) if values["choice"] else None,
+            "targets": _Pictures(folder, pictures, values["precision"]),
+            "scenes": [brdf.Scene.load(folder / picture["scene"]) for picture in pictures],
+            "counted": [arrays[f"counted{index}"] for index in range(len(pictures))],
+            "weights": [arrays.get(f"weights{index}") for index in range(len(pictures))],
+            "files": pictures,
+        }
+        return FitResult(**{name: values[name] for name in FitResult.__dataclass_fields__ if name in values})
     except InputError:
         raise
     except (KeyError, TypeError, ValueError, OSError) as error:
         raise InputError(path, f"is no fit that this version saved ({error})", "Fit and save again") from None
 
 
-def _parameter(values: dict[str, Any]) -> Parameter:
+def _parameter(values):
     low, high = values["interval"] or (None, None)
     ends = (-math.inf if low is None else low, math.inf if high is None else high)
     return Parameter(**values | {"interval": values["interval"] and ends, "reason": values["reason"] or ""})
+
+
+def _choice(basis, attempts, **values):
+    return BudgetChoice(**values, attempts=tuple(Attempt(**one) for one in attempts))

@@ -1,7 +1,46 @@
-// The page that turns: draws the fitted surface with WebGL2, and lets its numbers, light and view be moved. Lengths in
-// its data are in units of the scene, the pivot is the origin. Before this stands page.js.
+// The page that turns: draws the fitted surface with WebGL2, and lets its numbers, light and view be moved. The scene is
+// told as a scene file tells it; here lengths are in units of what is fitted, and the pivot, its middle, is the origin.
+// Before this stands page.js.
 (() => {
   if (!able) return;
+
+  // -- the scene ----------------------------------------------------------------------------------------------------
+
+  const [, , width, height, stride] = data.window;
+  const home = (place) => scaled(add(place, data.pivot, -1), 1 / data.unit);
+  const rgb = (values) => data.shown.map((channel) => values[Math.min(channel, values.length - 1)]);
+
+  // Of surface points a ball of radius 1 stands in the middle of what is shown.
+  const ball = {
+    ...{ position: [0, 0, 4], target: [0, 0, 0], up: [0, 1, 0], perspective: false, local: false },
+    resolution: [width, height].map((count, i) => 2 * data.window[i] + stride * (count - 1) + 1),
+  };
+  ball.half_width = (1.1 * ball.resolution[0]) / (stride * Math.min(width, height));
+
+  function viewed({ position, target, up, ...others }) {
+    const forward = unit(add(target, position, -1));
+    const right = unit(cross(forward, up));
+    const half_width = others.half_width / (others.perspective ? 1 : data.unit);
+    return { ...others, forward, right, up: cross(right, forward), position: home(position), half_width };
+  }
+
+  function lit(light) {
+    // a distant one's place is its direction; one that is no spot has a cone that holds everything
+    const kind = ["directional", "point", "spot"].indexOf(light.type);
+    const axis = unit(light.direction ?? [0, 0, -1]);
+    const cone = [Math.cos(((light.cutoff_angle ?? 180) * Math.PI) / 180), light.exponent ?? 0];
+    const place = kind ? home(light.position) : axis;
+    return { kind, place, axis, cone, intensity: rgb(light.intensity), attenuation: light.attenuation ?? [1, 0, 0] };
+  }
+
+  const own = viewed(data.camera ?? ball);
+  const lights = data.lights.map(lit);
+  const having = (key) => data.shapes.filter((shape) => key in shape);
+  const spheres = having("radius").map((one) => [...home(one.center), one.radius / data.unit, one.fitted]);
+  const rectangles = having("edge_u").map((one) => [
+    ...[home(one.center), ...[one.edge_u, one.edge_v].map((edge) => scaled(edge, 1 / data.unit))],
+    one.fitted,
+  ]);
 
   // -- state --------------------------------------------------------------------------------------------------------
 
@@ -12,7 +51,7 @@
     pitch: 0,
     shape: "scene",
     selected: 0,
-    places: data.lights.map((light) => light.place),
+    places: lights.map((light) => light.place),
     exposure: data.exposure,
     srgb: true,
     marked: true,
@@ -31,9 +70,8 @@
   }
 
   // The state in the address: what differs from the fit. A light's place there is in the scene's own units.
-  const worldly = (light, place) => (data.lights[light].kind ? add(data.pivot, place, data.unit) : place);
-  const homely = (light, place) =>
-    data.lights[light].kind ? scaled(add(place, data.pivot, -1), 1 / data.unit) : unit(place);
+  const worldly = (light, place) => (lights[light].kind ? add(data.pivot, place, data.unit) : place);
+  const homely = (light, place) => (lights[light].kind ? home(place) : unit(place));
 
   function told() {
     const places = state.places.map((place, i) => [`light${i}`, worldly(i, place)]);
@@ -47,7 +85,7 @@
       if (light === undefined) state[key] = value;
       else state.places[light] = homely(light, value);
     }
-    if (!data.traced && (state.yaw || state.pitch || !same(state.places, first.places)) && state.shape === "scene")
+    if (!data.camera && (state.yaw || state.pitch || !same(state.places, first.places)) && state.shape === "scene")
       state.shape = "ball";
   }
 
@@ -59,9 +97,9 @@
     ["plane", "plane, near eye"],
   ];
   const counts = {
-    SPHERES: Math.max(1, data.spheres.length),
-    RECTANGLES: Math.max(1, data.rectangles.length),
-    LIGHTS: Math.max(1, data.lights.length),
+    SPHERES: Math.max(1, spheres.length),
+    RECTANGLES: Math.max(1, rectangles.length),
+    LIGHTS: Math.max(1, lights.length),
   };
   const programs = {};
   const corners = ["corner", "corner_a", "corner_b", "corner_c", "normal_a", "normal_b", "normal_c"];
@@ -74,7 +112,6 @@
   }
 
   const floats = async (text) => new Float32Array(await unpacked(text));
-  const [, , width, height, stride] = data.window;
   const finer = Math.max(1, Math.ceil(512 / Math.max(width, height)));
   let pictures = [];
   let meshes = [];
@@ -86,7 +123,7 @@
       texture(at, width, height, [gl.RGBA32F, gl.RGBA, gl.FLOAT], pictures[at]);
     }
     meshes = await Promise.all(
-      data.meshes.map(async (mesh) => {
+      having("corners").map(async (mesh) => {
         const [corners, normals] = [await floats(mesh.corners), await floats(mesh.normals)];
         const vertices = gl.createVertexArray();
         gl.bindVertexArray(vertices);
@@ -111,7 +148,6 @@
   }
 
   function camera() {
-    const own = data.camera;
     const turned = (v) => rotated(rotated(v, own.right, state.pitch), own.up, state.yaw);
     const [right, up, forward, position] = [own.right, own.up, own.forward, own.position].map(turned);
     const depth = Math.max(-dot(position, forward), 1e-3);
@@ -121,8 +157,8 @@
 
   function geometry() {
     if (state.shape === "ball") return { spheres: [[0, 0, 0, 1, true]], rectangles: [], meshes: [] };
-    if (state.shape === "scene") return { ...data, meshes };
-    const { right, up, forward } = data.camera; // a plane that lies half way back
+    if (state.shape === "scene") return { spheres, rectangles, meshes };
+    const { right, up, forward } = own; // a plane that lies half way back
     return { spheres: [], rectangles: [[[0, 0, 0], right, unit(add(up, forward)), true]], meshes: [] };
   }
 
@@ -170,7 +206,7 @@
         still: 1,
         spheres: shown.spheres.length,
         rectangles: shown.rectangles.length,
-        lights: data.lights.length,
+        lights: lights.length,
         mesh_fitted: mesh?.fitted,
       };
       const triples = {
@@ -179,15 +215,15 @@
         up: view.up,
         forward: view.forward,
         eye: view.position,
-        ambient: data.ambient,
+        ambient: rgb(data.ambient),
         BRDF_K_A: rgb(state.k_a),
         BRDF_K_D: rgb(state.k_d),
         BRDF_K_S: rgb(state.k_s ?? [0]),
         light_place: state.places.flat(),
-        light_intensity: data.lights.flatMap((light) => light.intensity),
-        light_attenuation: data.lights.flatMap((light) => light.attenuation),
-        light_axis: data.lights.flatMap((light, i) => axis(light, i)),
-        light_kind: data.lights.flatMap((light) => [light.kind, ...light.cone]),
+        light_intensity: lights.flatMap((light) => light.intensity),
+        light_attenuation: lights.flatMap((light) => light.attenuation),
+        light_axis: lights.flatMap((light, i) => axis(light, i)),
+        light_kind: lights.flatMap((light) => [light.kind, ...light.cone]),
         rectangle: shown.rectangles.flatMap((one) => one.slice(0, 3).flat()),
       };
       uniforms(place, numbers, truths, triples);
@@ -213,8 +249,6 @@
       gl.drawArrays(gl.TRIANGLES, 0, mesh ? mesh.count : 3);
     }
   }
-
-  const rgb = (values) => data.shown.map((channel) => values[Math.min(channel, values.length - 1)]);
 
   function axis(light, i) {
     // a spot that is moved goes on aiming at what it aimed at
@@ -269,16 +303,16 @@
   function light_at(seen) {
     const to_view = toEye(seen.position);
     const facing = dot(seen.normal, to_view);
-    if (facing <= 0 || !data.lights.length) return;
+    if (facing <= 0 || !lights.length) return;
     const mirror = unit(add(scaled(seen.normal, 2 * facing), to_view, -1));
     const i = state.selected;
     const apart = Math.hypot(...add(state.places[i], seen.position, -1));
-    state.places[i] = data.lights[i].kind ? add(seen.position, mirror, apart) : mirror;
+    state.places[i] = lights[i].kind ? add(seen.position, mirror, apart) : mirror;
   }
 
   function leave_scene() {
     // surface points from a file cannot be turned
-    if (!data.traced && state.shape === "scene") state.shape = "ball";
+    if (!data.camera && state.shape === "scene") state.shape = "ball";
   }
 
   function turn(yaw, pitch) {
@@ -292,7 +326,7 @@
     const pixel = pixelOf(event);
     if (!pixel) return;
     canvas.setPointerCapture(event.pointerId);
-    const seen = data.traced || state.shape !== "scene" ? probe(...pixel) : { hit: false };
+    const seen = data.camera || state.shape !== "scene" ? probe(...pixel) : { hit: false };
     drag = { light: seen.hit, x: event.clientX, y: event.clientY };
     canvas.style.cursor = seen.hit ? "crosshair" : "grabbing";
   });
@@ -320,7 +354,7 @@
     const step = arrow(event);
     if (!step) return;
     event.preventDefault();
-    if (event.shiftKey && data.lights.length) {
+    if (event.shiftKey && lights.length) {
       leave_scene();
       const [{ right, up }, i] = [camera(), state.selected];
       state.places[i] = rotated(rotated(state.places[i], up, step[0]), right, step[1]);
@@ -332,7 +366,7 @@
     const [x, y] = [column, row].map((at, i) => Math.round(data.window[i] + (stride * at * width) / canvas.width));
     const place = `column ${x}, row ${y}`;
     const comparing = compared();
-    let value = data.traced || state.shape !== "scene" ? probe(column, row).value : [0, 0, 0];
+    let value = data.camera || state.shape !== "scene" ? probe(column, row).value : [0, 0, 0];
     if (!comparing) return void (find("pointer").textContent = `${place}\n${digits(value)}`);
     const at = 4 * (row * width + column);
     const [target, still] = pictures.map((picture) => [...picture.slice(at, at + 4)]);
@@ -380,6 +414,15 @@
   }
 
   // -- numbers ------------------------------------------------------------------------------------------------------
+
+  // Each number of the material; of one that was held in the fit nothing but its value is known.
+  const numbers = Object.keys(fitted).flatMap((name) => {
+    const channels = name === "n" ? [null] : [...new Set(data.shown)].filter((channel) => channel < fitted[name].length);
+    return channels.map((channel) => {
+      const told = data.parameters.find((one) => one.name === name && one.channel === channel);
+      return told ?? { name, channel, value: name === "n" ? fitted.n : fitted[name][channel] };
+    });
+  });
 
   const rows = [];
   function number_row(number) {
@@ -698,14 +741,14 @@
     options(find("shape"), shapes);
     options(
       find("light"),
-      data.lights.map((light, i) => [i, `${i + 1}: ${["directional", "point", "spot"][light.kind]}`]),
+      lights.map((light, i) => [i, `${i + 1}: ${data.lights[i].type}`]),
     );
-    find("light-label").hidden = data.lights.length < 2;
+    find("light-label").hidden = lights.length < 2;
     find("model").textContent = data.model;
-    find("sliders").append(...data.numbers.map(number_row));
+    find("sliders").append(...numbers.map(number_row));
     find("shape").addEventListener("change", (event) => {
       state.shape = event.target.value;
-      if (!data.traced && state.shape === "scene") to_own();
+      if (!data.camera && state.shape === "scene") to_own();
       update();
     });
     find("light").addEventListener("change", (event) => {
