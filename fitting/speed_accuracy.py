@@ -25,6 +25,9 @@ from typing import Any, NamedTuple
 
 import jax.monitoring
 import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
 
 import brdf
 from brdf.checks import positive
@@ -36,7 +39,7 @@ from fitting.budget.escalation import WHOLE
 from fitting.budget.light_samples import with_enough_samples
 from fitting.budget.sampling import sample_counts, sample_pixels
 from fitting.core import fit_pictures
-from fitting.problem import FitProblem, state_problem
+from fitting.problem import state_problem
 from fitting.progress import waiting
 from fitting.result import FitResult
 from fitting.uncertainty.covariance import TERMS
@@ -57,83 +60,38 @@ COLUMNS = {
     "picture": "error of the picture that the fit draws, root mean square, relative",
     "parameters": "largest relative error of n and of the coefficients; inf: of another model",
 }
-# Of a row, in files.
-TOLD: tuple[str, ...] = (
-    "axis",
-    "name",
-    "compile_seconds",
-    "seconds",
-    "spread",
-    "runs",
-    "rms",
-    "parameters",
-    "error",
-    "work",
-)
 MARKS = "front: no fit is both quicker and closer; recommended: a quick one of these that keeps {:g}"
+WIDTH = 100
 
 
-class Taken(NamedTuple):
-    """Seconds that a run took without the compiler, and those of the compiler."""
-
-    seconds: float
-    compiling: float
-
-
-@dataclasses.dataclass(eq=False)
-class Row:
+class Row(NamedTuple):
     """One configuration, measured.
 
     Attributes:
         axis: what it was tried for: "default", "pixels", "samples", ...
-        configuration: in which the fit ran.
-        work: about what the time grows with.
-        taken: by the runs so far.
+        name: the configuration in words.
+        compile_seconds: of tracing and compiling in the first run.
+        seconds: of a run without the compiler: the median of those after the first, whose caches were cold.
+        spread: half the distance of their quartiles; 0 of a single run.
         rms: error of the picture, root mean square over that of the reference's picture.
         parameters: error of the parameters, see `parameter_deviation`.
+        error: the larger of both.
+        work: about what the time grows with.
     """
 
     axis: str
-    configuration: Configuration
+    name: str
+    compile_seconds: float
+    seconds: float
+    spread: float
+    rms: float
+    parameters: float
+    error: float
     work: float
-    taken: list[Taken] = dataclasses.field(default_factory=list)
-    rms: float = np.inf
-    parameters: float = np.inf
 
-    @property
-    def name(self) -> str:
-        """The configuration in words."""
-        return str(self.configuration)
-
-    @property
-    def compile_seconds(self) -> float:
-        """Of tracing and compiling in the first run."""
-        return self.taken[0].compiling
-
-    @property
-    def times(self) -> list[float]:
-        """Seconds without the compiler of the runs after the first, whose caches were cold, or of the only one."""
-        return [one.seconds for one in self.taken[1:] or self.taken]
-
-    @property
-    def runs(self) -> int:
-        """How many they are."""
-        return len(self.times)
-
-    @property
-    def seconds(self) -> float:
-        """Their median."""
-        return float(np.median(self.times))
-
-    @property
-    def spread(self) -> float:
-        """Half the distance of their quartiles."""
-        return float(np.subtract(*np.quantile(self.times, [0.75, 0.25]))) / 2
-
-    @property
-    def error(self) -> float:
-        """The larger of the errors of picture (RMS) and parameters."""
-        return max(self.rms, self.parameters)
+    def __str__(self) -> str:
+        """The configuration, its time and its error."""
+        return f"{self.name} ({_milliseconds(self.seconds)} ms, error {self.error:.1g})"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -174,10 +132,8 @@ class Tradeoff:
     def front(self) -> tuple[Row, ...]:
         """The fits than which none is both quicker and closer, quickest first."""
         found: list[Row] = []
-        for row in sorted(
-            filter(lambda row: np.isfinite(row.error), self.rows), key=lambda row: (row.seconds, row.error)
-        ):
-            if not found or row.error < found[-1].error:
+        for row in sorted(self.rows, key=lambda row: (row.seconds, row.error)):
+            if row.error < min([one.error for one in found], default=np.inf):
                 found.append(row)
         return tuple(found)
 
@@ -199,16 +155,15 @@ class Tradeoff:
     @property
     def advice(self) -> str:
         """What to use, in words; where nothing keeps the accuracy that is said, and what comes closest."""
-        best, closest = self.recommended, self.closest
-        words = f"nothing is recommended: no configuration that was measured keeps the accuracy of {self.accuracy:g}"
-        if best is not None:
-            words = f"recommended: {_result(best)}"
-        elif closest is not None:
-            words += f"; the most accurate is {_result(closest)}"
-        if self.complete:
-            return words
-        measured = f"{len(self.rows)} of {self.planned} configurations were measured"
-        return f"{words}\n{measured}; more time measures the others"
+        words = f"recommended: {self.recommended}"
+        if self.recommended is None:
+            words = (
+                f"nothing is recommended: no configuration that was measured keeps the accuracy of {self.accuracy:g}"
+            )
+            words += f"; the most accurate is {self.closest}" if self.closest else ""
+        if not self.complete:
+            words += f"\n{len(self.rows)} of {self.planned} configurations were measured; more time measures the others"
+        return words
 
     def marks(self, row: Row) -> str:
         """What is to be said of a row.
@@ -218,8 +173,8 @@ class Tradeoff:
         """
         best = self.recommended
         marked = {"default": self.default, "recommended": best, "most accurate": None if best else self.closest}
-        words = [word for word, one in marked.items() if one is row]
-        return ", ".join([*words, "front"] if row in self.front and row is not best else words)
+        words = [word for word, one in marked.items() if one == row]
+        return ", ".join([*words, "front"] if row in self.front and row != best else words)
 
     def brief(self, row: Row) -> str:
         """The pixels of a configuration, and in what else it differs from the default.
@@ -227,42 +182,40 @@ class Tradeoff:
         Args:
             row: of the table.
         """
-        usual = [] if self.default is None else self.default.name.split(", ")
+        usual = self.default.name.split(", ") if self.default else []
         return ", ".join(word for word in row.name.split(", ") if word not in usual or word.endswith("pixels"))
 
     def __str__(self) -> str:
         """The table as text, its numbers and marks explained beneath."""
-        lines = [("configuration", *COLUMNS, "")]
+        table = Table(box=SIMPLE_HEAD, show_edge=False, pad_edge=False)
+        for name in ("configuration", *COLUMNS, ""):
+            table.add_column(name, justify="right" if name in COLUMNS else "left", no_wrap=True)
         for row in self.rows:
-            name = row.name if row is self.default else self.brief(row)
-            times = [row.seconds, row.spread] if row.runs > 1 else [row.seconds]
-            numbers = f"{row.compile_seconds:.2f}", " ± ".join(map(_milliseconds, times))
-            lines.append((name, *numbers, f"{row.rms:.1e}", f"{row.parameters:.1e}", self.marks(row)))
-        first, *widths, _ = (max(map(len, column)) for column in zip(*lines, strict=True))
-        text = []
-        for name, *numbers, marks in lines:
-            cells = [f"{number:>{width}}" for number, width in zip(numbers, widths, strict=True)]
-            text.append("  ".join([f"{name:<{first}}", *cells, marks]).rstrip())
-        text.insert(1, "─" * max(map(len, text)))
+            name = row.name if row.axis == "default" else self.brief(row)
+            taken = " ± ".join(map(_milliseconds, filter(None, (row.seconds, row.spread))))
+            errors = f"{row.rms:.1e}", f"{row.parameters:.1e}"
+            table.add_row(name, f"{row.compile_seconds:.2f}", taken, *errors, self.marks(row))
+        text = io.StringIO()
+        Console(file=text, width=WIDTH).print(table)
+        lines = [line.rstrip() for line in text.getvalue().splitlines()]
         told = [f"{name}: {words}" for name, words in COLUMNS.items()]
-        return "\n".join([*text, *told, MARKS.format(self.accuracy), f"errors are against {self.reference}"])
+        return "\n".join([*lines, *told, MARKS.format(self.accuracy), f"errors are against {self.reference}"])
 
-    def _told(self, row: Row) -> dict[str, Any]:
-        return {name: getattr(row, name) for name in TOLD} | {"marks": self.marks(row)}
+    def _told(self):
+        return [row._asdict() | {"marks": self.marks(row)} for row in self.rows]
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON holds it; what is infinite is None."""
         names = ("reference", "accuracy", "complete", "planned", "seconds", "advice")
-        rows = [self._told(row) | {"configuration": vars(row.configuration)} for row in self.rows]
-        finite = [{name: None if value == np.inf else value for name, value in row.items()} for row in rows]
-        return {name: getattr(self, name) for name in names} | {"rows": finite}
+        rows = [{name: None if value == np.inf else value for name, value in row.items()} for row in self._told()]
+        return {name: getattr(self, name) for name in names} | {"rows": rows}
 
     def to_csv(self) -> str:
         """One line for each row, a header above."""
         stream = io.StringIO()
-        writer = csv.DictWriter(stream, (*TOLD, "marks"), lineterminator="\n")
+        writer = csv.DictWriter(stream, (*Row._fields, "marks"), lineterminator="\n")
         writer.writeheader()
-        writer.writerows(map(self._told, self.rows))
+        writer.writerows(self._told())
         return stream.getvalue()
 
     def plot(self) -> Any:
@@ -284,16 +237,12 @@ class Tradeoff:
             write_text(stage / "tradeoff.csv", self.to_csv())
             write_text(stage / "tradeoff.json", json.dumps(self.to_dict(), indent=2) + "\n")
             figure = self.plot()
-            figure.savefig(stage / "tradeoff.png", dpi=200)
-            figure.savefig(stage / "tradeoff.pdf")
+            for suffix in ("png", "pdf"):
+                figure.savefig(stage / f"tradeoff.{suffix}", dpi=200)
 
 
-def _milliseconds(seconds: float) -> str:
+def _milliseconds(seconds):
     return f"{1e3 * seconds:.{0 if seconds >= 0.1 else 1}f}"
-
-
-def _result(row: Row) -> str:
-    return f"{row.name} ({_milliseconds(row.seconds)} ms, error {row.error:.1g})"
 
 
 def tradeoff(
@@ -334,32 +283,25 @@ def tradeoff(
     begun = time.perf_counter()
     positive("accuracy", accuracy)
     positive("seconds", seconds)
-    bench = Bench(state_problem(target, scene, mask, model=model, saturation=saturation), accuracy)
-    rows = bench.rows()
+    problem = state_problem(target, scene, mask, model=model, saturation=saturation)
+    trials, measure, reference = _bench(problem, accuracy)
     # Everything once, so that the errors, which decide what is recommended, are known however slow the compiler is:
-    # the default, twice, for its first run tells little; what can be recommended, from little to much work, so that
-    # what would take too long is known before; last what compiles anew each time. Then rounds, each shuffled.
+    # the default, twice, for its first run tells little; what can be recommended, from little to much work; last what
+    # compiles anew each time. Then rounds, each shuffled.
     ranks, random = {"default": 0, "model": 2, "solver": 3}, np.random.default_rng(0)
-    by_work = sorted(rows, key=lambda row: (ranks.get(row.axis, 1), row.work))
-    again = [row for row in by_work if row.axis != "solver"]
+    by_work = sorted(trials, key=lambda one: (ranks.get(one.axis, 1), one.work))
+    again = [one for one in by_work if one.axis != "solver"]
     order = [by_work[0], *by_work, *(again[i] for _ in range(ROUNDS) for i in random.permutation(len(again)))]
     with contextlib.suppress(KeyboardInterrupt), waiting("measuring") as say:
-        for done, row in enumerate(order, start=1):
-            known, expected = [one for one in rows if one.taken], 0.0
-            if row.taken:
-                expected = row.taken[-1].seconds
-            elif known:
-                # By the fit of the most work so far, and by the compiler.
-                most = max(known, key=lambda one: one.work)
-                expected = most.taken[-1].seconds * row.work / most.work + max(one.compile_seconds for one in known)
-            if time.perf_counter() - begun + expected > seconds and known:
-                continue
-            bench.measure(row)
+        for done, trial in enumerate(order, start=1):
+            measure(trial)
             say(f"measuring, {done} of {len(order)} runs")
             if progress is not None:
                 progress(done, len(order))
-    measured = tuple(row for row in rows if row.taken)
-    return Tradeoff(measured, bench.reference, accuracy, len(rows), time.perf_counter() - begun)
+            if time.perf_counter() - begun > seconds:
+                break
+    rows = tuple(trial.row() for trial in trials if trial.taken)
+    return Tradeoff(rows, reference, accuracy, len(trials), time.perf_counter() - begun)
 
 
 def parameter_deviation(material: brdf.Material, best: FitResult) -> float:
@@ -369,110 +311,129 @@ def parameter_deviation(material: brdf.Material, best: FitResult) -> float:
     its logarithms; infinite where the models differ in their highlight. What the reference does not determine is left
     out.
     """
-    size: dict[str, float] = dict(zip(TERMS, sizes(best), strict=True))
-    worst = 0.0
+    size, worst = dict(zip(TERMS, sizes(best), strict=True)), 0.0
     for one in best.parameters:
         if one.value is None:
             continue
-        value = np.asarray(getattr(material, one.name, np.zeros(best.material.k_d.shape)))
-        if one.name != "n":
-            off = abs(float(value[one.channel]) - one.value) / size[one.name]
-        elif type(material) is type(best.material):
-            off = abs(float(np.log(value / one.value)))
+        if one.name in size:
+            value = np.broadcast_to(getattr(material, one.name, 0.0), best.material.k_d.shape)
+            off = abs(value[one.channel] - one.value) / size[one.name]
         else:
-            off = np.inf
-        worst = max(worst, off)
+            off = abs(np.log(material.n / one.value)) if type(material) is type(best.material) else np.inf
+        worst = max(worst, float(off))
     return worst
 
 
-class Bench:
-    """The configurations that a scene offers, and the measure of their errors."""
+class Taken(NamedTuple):
+    """Seconds that a run took without the compiler, and those of the compiler."""
 
-    def __init__(self, problem: FitProblem, accuracy: float):
-        """Fit the reference: in float64, all pixels, so many light samples that they err far less than is allowed."""
-        dear = with_enough_samples(dataclasses.replace(problem, precision="float64"), accuracy / 2)
-        self.problem, self.scene, self.best = problem, problem.scenes[0], fit_pictures(dear)
-        self.model = self.best.material.name if problem.model == "auto" else problem.model
-        self.reference, self.samples = "float64, all pixels", max(sample_counts(dear.scenes[0]), default=1)
-        if self.samples > 1:
-            self.reference += f", {self.samples} light samples"
-        # Pictures are compared at some pixels, by their weights.
-        compared, weight = dear.scenes[0], 1.0
-        if sample := sample_pixels(compared, brdf.BlinnPhong, FEW_PIXELS):
-            compared, weight = brdf.some_pixels(compared, sample.pixel, precision="float64"), sample.stands_for[:, None]
-        self.picture, self.weight = functools.partial(brdf.render, scene=compared, precision="float64"), weight
+    seconds: float
+    compiling: float
 
-    def rows(self) -> list[Row]:
-        """What there is to try, and what for, the most telling first."""
-        default, found = Configuration(self.model), list[tuple[str, Configuration]]()
-        change = functools.partial(dataclasses.replace, default)
-        sizes = [size for size in PIXELS if size <= WHOLE * np.prod(self.scene.resolution)]
-        few = (sizes or [None])[:2][-1]
-        found += [("default", default), *(("pixels", change(pixels=size)) for size in sizes)]
-        # On few pixels: what samples change does not hang on how many these are.
-        found += [("samples", change(pixels=few, samples=count)) for count in SAMPLES if count < self.samples]
-        found += [("precision", change(precision="float64"))]
-        if self.problem.targets[0].codes is not None:
-            found += [("rounding", change(least_squares=True))]
-        found += [("model", change(model="lambert", pixels=few))] if self.model != "lambert" else []
-        if isinstance(self.best.material, SpecularMaterial):
-            solvers = (change(precision="float64", pixels=FEW_PIXELS, solver=name) for name in SOLVERS)
-            found += [("solver", how) for how in solvers]
-        return [
-            Row(axis, how, (4096 + how.work(self.scene)) * (SLOWER if axis == "solver" else 1)) for axis, how in found
-        ]
 
-    def measure(self, row: Row) -> None:
-        """Run a configuration once more; of the first run also the error is told."""
-        first = not row.taken
-        material, took = take(functools.partial(self.solve if row.axis == "solver" else self.fit, row.configuration))
-        row.taken.append(took)
-        if first:
-            true = np.asarray(self.picture(self.best.material))
-            change = np.asarray(self.picture(material)) - true
-            row.rms = float(np.sqrt(np.mean(self.weight * change**2) / np.mean(self.weight * true**2)))
-            row.parameters = parameter_deviation(material, self.best)
+class Trial(NamedTuple):
+    """A configuration that is being measured: what it took, run by run, and its errors, of picture and parameters."""
 
-    def fit(self, how: Configuration) -> brdf.Material:
-        """By the separable solver, with as many light samples as a plain fit takes where no number is named."""
-        problem = dataclasses.replace(self.problem, model=how.model)
-        return run(with_enough_samples(problem) if how.samples is None else problem, how).result.material
+    axis: str
+    configuration: Configuration
+    work: float
+    taken: list[Taken]
+    errors: list[float]
 
-    def solve(self, how: Configuration) -> brdf.Material:
-        """By Levenberg-Marquardt or BFGS on a few pixels, from a guess."""
-        from fitting.joint import fit_jointly
+    def row(self) -> Row:
+        """What was measured so far."""
+        times = [one.seconds for one in self.taken[1:] or self.taken]
+        low, middle, high = np.quantile(times, [0.25, 0.5, 0.75]).tolist()
+        name, compiling, spread = str(self.configuration), self.taken[0].compiling, (high - low) / 2
+        rms, parameters = self.errors
+        error = max(self.errors)
+        return Row(self.axis, name, compiling, middle, spread, rms, parameters, error, self.work)
 
-        # They leave out what the reference left out, such as pixels whose noise is cut off.
-        target, scene, mask = self.problem.targets[0].pixels, self.scene, self.best.counted[0]
-        # Evenly spread: these solvers know no weights.
-        if sample := sample_pixels(scene, brdf.Lambert, FEW_PIXELS):
-            target, mask = sample.of(target), sample.of(mask)
-            scene = brdf.some_pixels(scene, sample.pixel, precision="float64")
-        half = np.full(self.best.material.k_d.shape, 0.5)
-        names = (*TERMS[scene.ambient is None :], "n")
-        start = brdf.MODELS[self.model](k_a=half, k_d=half, k_s=half, n=START)  # pyright: ignore[reportCallIssue]
-        return fit_jointly(
-            target,
-            scene,
-            start,
-            lambda material, scenes: [getattr(material, name) for name in names],
-            solver=how.solver,  # pyright: ignore[reportArgumentType]
-            tolerance=TOLERANCE,
-            mask=mask,
-            saturation=self.problem.saturation,
-        ).material
+
+def _bench(problem, accuracy):
+    """What there is to try on a scene, the function that runs a trial once more, and what errors are against.
+
+    The reference is fitted in float64 to all pixels, with so many light samples that they err far less than is allowed.
+    """
+    dear = with_enough_samples(dataclasses.replace(problem, precision="float64"), accuracy / 2)
+    scene, best = problem.scenes[0], fit_pictures(dear)
+    reference, most = "float64, all pixels", max(sample_counts(dear.scenes[0]), default=1)
+    if most > 1:
+        reference += f", {most} light samples"
+    # Pictures are compared at some pixels, by their weights.
+    compared, weight = dear.scenes[0], 1.0
+    if sample := sample_pixels(compared, brdf.BlinnPhong, FEW_PIXELS):
+        compared, weight = brdf.some_pixels(compared, sample.pixel, precision="float64"), sample.stands_for[:, None]
+    picture = functools.partial(brdf.render, scene=compared, precision="float64")
+    true = np.asarray(picture(best.material))
+
+    def measure(trial):
+        function = _solved if trial.axis == "solver" else _fitted
+        material, took = take(functools.partial(function, problem, trial.configuration, best))
+        trial.taken.append(took)
+        if not trial.errors:
+            change = np.asarray(picture(material)) - true
+            rms = float(np.sqrt(np.mean(weight * change**2) / np.mean(weight * true**2)))
+            trial.errors.extend([rms, parameter_deviation(material, best)])
+
+    model = best.material.name if problem.model == "auto" else problem.model
+    change = functools.partial(dataclasses.replace, Configuration(model))
+    counts = [count for count in PIXELS if count <= WHOLE * np.prod(scene.resolution)]
+    few = (counts or [None])[:2][-1]
+    # The most telling first. Light samples on few pixels: what they change does not hang on how many these are.
+    axes = {
+        "default": [change()],
+        "pixels": [change(pixels=count) for count in counts],
+        "samples": [change(pixels=few, samples=count) for count in SAMPLES if count < most],
+        "precision": [change(precision="float64")],
+        "rounding": [change(least_squares=True)] if problem.targets[0].codes is not None else [],
+        "model": [change(model="lambert", pixels=few)] if model != "lambert" else [],
+        "solver": [change(precision="float64", pixels=FEW_PIXELS, solver=name) for name in SOLVERS],
+    }
+    if not isinstance(best.material, SpecularMaterial):
+        del axes["solver"]
+    slower = {"solver": SLOWER}
+    trials = [
+        Trial(axis, how, (4096 + how.work(scene)) * slower.get(axis, 1), [], [])
+        for axis, configurations in axes.items()
+        for how in configurations
+    ]
+    return trials, measure, reference
+
+
+def _fitted(problem, how, best):
+    """By the separable solver, with as many light samples as a plain fit takes where no number is named."""
+    problem = dataclasses.replace(problem, model=how.model)
+    return run(with_enough_samples(problem) if how.samples is None else problem, how).result.material
+
+
+def _solved(problem, how, best):
+    """By Levenberg-Marquardt or BFGS on a few pixels, from a guess."""
+    from fitting.joint import fit_jointly
+
+    # They leave out what the reference left out, such as pixels whose noise is cut off.
+    target, scene, mask = problem.targets[0].pixels, problem.scenes[0], best.counted[0]
+    # Evenly spread: these solvers know no weights.
+    if sample := sample_pixels(scene, brdf.Lambert, FEW_PIXELS):
+        target, mask = sample.of(target), sample.of(mask)
+        scene = brdf.some_pixels(scene, sample.pixel, precision="float64")
+    names = (*TERMS[scene.ambient is None :], "n")
+    half: dict[str, Any] = dict.fromkeys(TERMS, np.full(best.material.k_d.shape, 0.5))
+    start = brdf.MODELS[how.model](**half, n=START)  # pyright: ignore[reportCallIssue]
+    options: dict[str, Any] = {"solver": how.solver, "tolerance": TOLERANCE, "saturation": problem.saturation}
+    freed = fit_jointly(
+        target, scene, start, lambda one, _: [getattr(one, name) for name in names], mask=mask, **options
+    )
+    return freed.material
 
 
 def take(run: Callable[[], Any]) -> tuple[Any, Taken]:
     """Run something: what it returned, and what it took."""
     spans: list[tuple[float, float]] = []
 
-    def listen(event: str, duration_secs: float, **_: Any) -> None:
+    def listen(event, duration_secs, **_):
         if event.startswith("/jax/core/compile/"):
             now = time.perf_counter()
-            # Spans of tracing, lowering and compiling lie within each other, and the inner ones end first.
-            while spans and spans[-1][0] >= now - duration_secs:
-                spans.pop()
             spans.append((now - duration_secs, now))
 
     jax.monitoring.register_event_duration_secs_listener(listen)
@@ -482,5 +443,8 @@ def take(run: Callable[[], Any]) -> tuple[Any, Taken]:
         seconds = time.perf_counter() - start
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
-    compiling = sum(end - begin for begin, end in spans)
+    # Spans of tracing, lowering and compiling lie within each other.
+    compiling, end = 0.0, 0.0
+    for begin, stop in sorted(spans):
+        compiling, end = compiling + max(stop - max(begin, end), 0.0), max(end, stop)
     return outcome, Taken(max(seconds - compiling, 0.0), compiling)

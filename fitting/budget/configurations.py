@@ -82,13 +82,13 @@ def run(problem: FitProblem, configuration: Configuration) -> Run:
         configuration: how.
     """
     how, shown = configuration, problem.shown or problem.scenes
+    problem = dataclasses.replace(problem, model=how.model, precision=how.precision)
     if how.samples is not None:
         scenes = [with_samples(scene, how.samples) for scene in problem.scenes]
         problem = dataclasses.replace(problem, scenes=scenes, shown=shown, sample_errors=None)
     if how.least_squares:
         targets = [target._replace(codes=None, least_squares=True) for target in problem.targets]
         problem = dataclasses.replace(problem, targets=targets)
-    problem = dataclasses.replace(problem, model=how.model, precision=how.precision)
     samples: list[PixelSample | None] = [None] * len(shown)
     if how.pixels is not None:
         kind = brdf.BlinnPhong if how.model == "auto" else brdf.MODELS[how.model]
@@ -102,43 +102,43 @@ def run(problem: FitProblem, configuration: Configuration) -> Run:
             raise
         # Nothing to fit among so few pixels: all of them tell, or tell what is wrong.
         return run(problem, dataclasses.replace(how, pixels=None))
-    counted, weights = list(result.counted), list(result.weights)
-    for index, sample in enumerate(samples):
-        if sample is not None:
-            counted[index] = _scattered(counted[index], sample, shown[index])
-            weight = weights[index]
-            weights[index] = None if weight is None else _scattered(weight, sample, shown[index])
-    whole = {"targets": [target.pixels for target in problem.targets], "scenes": shown}
-    return Run(problem, samples, dataclasses.replace(result, **whole, counted=counted, weights=weights))
+    of_whole = {"targets": [target.pixels for target in problem.targets], "scenes": shown}
+    for name in ("counted", "weights"):
+        every = zip(getattr(result, name), samples, problem.targets, strict=True)
+        of_whole[name] = [_in_whole(values, sample, target.pixels.shape[:2]) for values, sample, target in every]
+    return Run(problem, samples, dataclasses.replace(result, **of_whole))
 
 
-def _scattered(values: np.ndarray, sample: PixelSample, scene: brdf.Scene) -> np.ndarray:
-    """Of some pixels, in the whole picture."""
-    found = np.zeros(scene.resolution[::-1], values.dtype)
-    found.ravel()[sample.pixel] = values.ravel()
+def _in_whole(values, sample, shape):
+    """What belongs to the pixels of a sample, in the whole picture."""
+    if values is None or sample is None:
+        return values
+    found = np.zeros(shape, values.dtype)
+    found.flat[sample.pixel] = values.ravel()
     return found
 
 
 def _subsampled(problem, samples):
     """The problem of some pixels of its pictures, each of which weighs as many as it stands for."""
-    targets, scenes, saturation = list(problem.targets), list(problem.scenes), problem.saturation
-    masks, weights = list(problem.masks), list(problem.weights)
-    for index, sample in enumerate(samples):
-        target, weight, mask = targets[index], weights[index], masks[index]
+    pictures, saturation = [], problem.saturation
+    given = zip(samples, problem.targets, problem.scenes, problem.masks, problem.weights, strict=True)
+    for sample, target, scene, mask, weight in given:
         # Beside a picture of which some pixels are fitted, a pixel of a whole one stands for itself.
-        weights[index] = np.ones(target.pixels.shape[:2]) if weight is None else weight
+        weight = np.ones(target.pixels.shape[:2]) if weight is None else weight
         if sample is None:
+            pictures.append((target, scene, mask, weight))
             continue
         pixels = sample.of(target.pixels)
-        # Of pixels that stand for many the codes are a small part of what is not known.
-        targets[index] = target._replace(pixels=pixels, codes=None, least_squares=True)
-        scenes[index] = brdf.some_pixels(scenes[index], sample.pixel, precision=problem.precision)
-        weights[index] = sample.of(weights[index]) * sample.stands_for
-        masks[index] = None if mask is None else sample.of(mask)
         if saturation is None and target.saturation is None:
             # Pixels may be clipped, so few of them in the sample that the fit would not notice.
             top = TOP * np.max(pixels, initial=-np.inf, where=np.isfinite(pixels))
             if 2 <= np.count_nonzero(pixels >= top) <= SYMMETRIC_PIXELS < np.count_nonzero(target.pixels >= top):
                 saturation = float(top)
+        # Of pixels that stand for many the codes are a small part of what is not known.
+        target = target._replace(pixels=pixels, codes=None, least_squares=True)
+        scene = brdf.some_pixels(scene, sample.pixel, precision=problem.precision)
+        mask = None if mask is None else sample.of(mask)
+        pictures.append((target, scene, mask, sample.of(weight) * sample.stands_for))
+    targets, scenes, masks, weights = map(list, zip(*pictures, strict=True))
     how = {"targets": targets, "scenes": scenes, "masks": masks, "weights": weights, "saturation": saturation}
     return dataclasses.replace(problem, **how)

@@ -43,10 +43,8 @@ STEP = 1e-4
 
 def sizes(result: FitResult) -> Float[np.ndarray, " 3"]:
     """Of k_a, k_d, k_s the largest channel, but no less than `SMALLEST` of the largest coefficient of all."""
-    largest = np.zeros(3)
-    for one in result.parameters:
-        if one.name in TERMS and one.value is not None:
-            largest[TERMS.index(one.name)] = max(largest[TERMS.index(one.name)], one.value)
+    values = [[one.value or 0.0 for one in result.parameters if one.name == term] for term in TERMS]
+    largest = np.array([max(of_term, default=0.0) for of_term in values])
     return np.maximum(largest, max(SMALLEST * largest.max(), np.finfo(float).tiny))
 
 
@@ -68,10 +66,9 @@ class Probes:
 
     def __init__(self, run: Run):
         """Choose them, and look at them."""
-        problem, result, x, n = run.problem, run.result, run.optimum.x, run.optimum.n
-        self.model, self.n, self.x = type(result.material), n, x
-        channels, most = x.shape[1], max(FEWEST_PROBES, PROBES // len(problem.targets))
-        self.seen, parts = list[tuple[brdf.Scene, int]](), []
+        problem, result, (self.x, self.n) = run.problem, run.result, (run.optimum.x, run.optimum.n)
+        self.model, channels = type(result.material), self.x.shape[1]
+        self.seen, parts, most = [], [], max(FEWEST_PROBES, PROBES // len(problem.targets))
         pictures = zip(problem.targets, problem.scenes, result.counted, run.samples, problem.weights, strict=True)
         for target, scene, counted, sample, weight in pictures:
             some = sample or sample_pixels(scene, self.model, most / float(np.mean(counted)))
@@ -88,21 +85,19 @@ class Probes:
             heavy = part.stands_for * (1.0 if weight is None else part.of(weight)[0])
             parts.append((heavy, left_out, part.of(target.pixels)[0]))
         self.weight, self.left_out, values = map(np.concatenate, zip(*parts, strict=True))
-        columns, below, above = (self._columns(problem.scenes, n * np.exp(step)) for step in (0.0, -STEP, STEP))
-        self.shown = np.einsum("mck,kc->mc", columns, x)
+        columns, below, above = (self._columns(problem.scenes, self.n * np.exp(step)) for step in (0.0, -STEP, STEP))
+        self.shown = np.einsum("mck,kc->mc", columns, self.x)
         self.residual = values - self.shown
-        self.jacobian = np.zeros((*self.shown.shape, 3 * channels + 1))
-        for channel in range(channels):
-            self.jacobian[:, channel, channel + channels * np.arange(3)] = columns[:, channel]
-        self.jacobian[..., -1] = x[2] * (above[..., 2] - below[..., 2]) / (2 * STEP)
+        by_log_n = self.x[2] * (above[..., 2] - below[..., 2]) / (2 * STEP)
+        by_x = columns[..., None] * np.eye(channels)[:, None]  # (M, C, 3, C): of a channel its own coefficients alone
+        self.jacobian = np.concatenate([by_x.reshape(*by_log_n.shape, -1), by_log_n[..., None]], axis=-1)
         self.hessian = np.einsum("m,mcp,mcq->pq", self.weight, self.jacobian, self.jacobian, optimize=True)
-
         self.known = np.zeros(3 * channels + 1, bool)
         self.known[: len(result.parameters)] = [one.value is not None for one in result.parameters]
-        factors = coefficient_factors(self.model, n, take_colour_out(problem.scenes, channels).colour)
+        factors = coefficient_factors(self.model, self.n, take_colour_out(problem.scenes, channels).colour)
         self.scale = np.append((sizes(result)[:, None] * factors).ravel(), 1.0)
 
-    def _columns(self, scenes: Sequence[brdf.Scene], n: float) -> Float[np.ndarray, "M C 3"]:
+    def _columns(self, scenes, n):
         """Ambient, diffuse and lobe at an exponent under the lights of some scenes."""
         found, channels = [], self.x.shape[1]
         factors = coefficient_factors(self.model, n, np.ones(channels))

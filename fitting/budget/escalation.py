@@ -64,8 +64,8 @@ def fit_within(problem: FitProblem, accuracy: float | None, seconds: float | Non
             raise InputError(name, came, "Leave one of them out")
     problem = with_enough_samples(problem, accuracy)
     scenes, precision = problem.scenes, problem.precision
-    hard_shadows = any(scene.lights and scene.occluders for scene in scenes)
-    if (hard_shadows and problem.sample_errors is None) or (accuracy or COARSE) < COARSE:
+    hard_shadows = any(scene.lights and scene.occluders for scene in scenes) and problem.sample_errors is None
+    if hard_shadows or (accuracy or COARSE) < COARSE:
         # In float32 some pixels fall on the other side of a shadow's edge, each of which weighs much in a sample.
         precision = "float64"
     sizes = [target.pixels[..., 0].size for target in problem.targets]
@@ -73,12 +73,10 @@ def fit_within(problem: FitProblem, accuracy: float | None, seconds: float | Non
     for target, size, mask, scene in zip(problem.targets, sizes, problem.masks, scenes, strict=True):
         each = max(sum(sample_counts(scene)), 1) * (1 if target.codes is None else OF_CODES)
         work += each * (size if mask is None else np.count_nonzero(mask))
-    now, attempts = Configuration(problem.model, precision, None if work <= FEW else FIRST_PIXELS), list[Attempt]()
+    now, attempts = Configuration(problem.model, precision, None if work <= FEW else FIRST_PIXELS), []
     while True:
-        begun = time.perf_counter()
-        done = run(problem, now)
-        if not any(done.samples):
-            now = dataclasses.replace(now, pixels=None)
+        begun, done = time.perf_counter(), run(problem, now)
+        now = now if any(done.samples) else dataclasses.replace(now, pixels=None)
         told = estimate(done)
         took = time.perf_counter() - begun
         attempts.append(dataclasses.replace(told, configuration=str(now), seconds=took))
