@@ -28,8 +28,11 @@ def check(material: str, *, json: bool = False, plot: Path | None = None) -> int
     with waiting("checking"):
         is_table = is_measured(material)
         if is_table and plot is not None:
-            remedy = f"Fit a material to it with brdf fit {material} --out DIR, and check DIR/material.json"
-            raise InputError("--plot", f"draws materials, and {material} is a measured table", remedy)
+            raise InputError(
+                "--plot",
+                f"draws materials, and {material} is a measured table",
+                f"Fit a material to it with brdf fit {material} --out DIR, and check DIR/material.json",
+            )
         found: dict[str, tuple[Any, str]] = (
             {Path(material).stem: (brdf.load_measured(material), "")} if is_table else find_materials(material)
         )

@@ -63,16 +63,22 @@ def fit(
 
     apart = {"--noise": noise, "--plausible": plausible, "--loss": loss, "--accuracy": accuracy, "--seconds": seconds}
     if free and any(apart.values()):
-        came = f"knows nothing of {' and '.join(option for option, given in apart.items() if given)}"
-        raise InputError("--free", came, "Leave one of them out")
+        raise InputError(
+            "--free",
+            f"knows nothing of {' and '.join(option for option, given in apart.items() if given)}",
+            "Leave one of them out",
+        )
     check_outputs(out, plot, report)
     notes: tuple[str, ...] = ()
     mesh = all_devices(devices)
     with waiting("reading") as say:
         if len(target) == 1 and is_measured(target[0]):
             if any([*pictures, dark, noise, plausible, accuracy, seconds, free, report, mesh, precision != "float32"]):
-                came = "is a measured BRDF; of the options only --model, --loss, --out, --plot and --json concern it"
-                raise InputError(target[0], came, "Leave the others out")
+                raise InputError(
+                    target[0],
+                    "is a measured BRDF; of the options only --model, --loss, --out, --plot and --json concern it",
+                    "Leave the others out",
+                )
             table = brdf.load_measured(target[0])
             import fitting
 
@@ -150,5 +156,4 @@ def _fit_pictures(target, pictures, noise, say, **how):
     try:
         return with_light_errors(result, inputs.light_errors), inputs.notes
     except brdf.InputError:
-        words = "the errors of the numbers are those under this light: its own is not in them"
-        return result, (*inputs.notes, words)
+        return result, (*inputs.notes, "the errors of the numbers are those under this light: its own is not in them")

@@ -119,15 +119,26 @@ def _check_options(kind, targets, options):
         alone, remedy = (options.light is None) != (options.lights is None), "Give x,y,z, fit, or a file of directions"
         _require(alone, "--light", "or --lights has to say where the light is", remedy)
     if kind == "scene":
-        remedy = "Leave it out, or add [ambient] to the scene"
-        _require(not options.ambient, "--ambient", "is what the scene file says", remedy)
+        _require(
+            not options.ambient,
+            "--ambient",
+            "is what the scene file says",
+            "Leave it out, or add [ambient] to the scene",
+        )
         for path in targets[1:]:
             _require(path.suffix != ".toml", path, "is a scene, no picture", f"Write --scene {path}")
-        remedy = "Give one; in Python fitting.fit takes lists of pictures and of scenes"
-        what = f"tells what one picture shows, {len(targets)} are given"
-        _require(options.scene is None or len(targets) == 1, "--scene", what, remedy)
-        remedy = "Several pictures are fitted with --sphere or --normals, and --lights"
-        _require(len(targets) == 1, "--sphere", f"{len(targets)} pictures come without their geometry", remedy)
+        _require(
+            options.scene is None or len(targets) == 1,
+            "--scene",
+            f"tells what one picture shows, {len(targets)} are given",
+            "Give one; in Python fitting.fit takes lists of pictures and of scenes",
+        )
+        _require(
+            len(targets) == 1,
+            "--sphere",
+            f"{len(targets)} pictures come without their geometry",
+            "Several pictures are fitted with --sphere or --normals, and --lights",
+        )
 
 
 def _read_pictures(kind, targets, options, encodings, mask):
@@ -142,12 +153,14 @@ def _read_pictures(kind, targets, options, encodings, mask):
     shapes = sorted({picture.pixels.shape for picture in pictures})
     height, width, _ = shapes[0]
     sizes = ", ".join(f"{shape[1]} x {shape[0]} x {shape[2]}" for shape in shapes)
-    what = f"and the others differ in size ({sizes})"
-    _require(len(shapes) == 1, targets[0], what, "Give pictures of one camera")
+    _require(len(shapes) == 1, targets[0], f"and the others differ in size ({sizes})", "Give pictures of one camera")
     if isinstance(resolution, list):
-        what = f"is {width} x {height}, the scene's camera {' x '.join(map(str, resolution))}"
-        remedy = "Give a picture and a camera of the same resolution"
-        _require(resolution == [width, height], targets[0], what, remedy)
+        _require(
+            resolution == [width, height],
+            targets[0],
+            f"is {width} x {height}, the scene's camera {' x '.join(map(str, resolution))}",
+            "Give a picture and a camera of the same resolution",
+        )
     if options.sphere not in (None, "mask"):
         ball_normals((height, width), _circle(options.sphere))
     silent = {path: one.encoding for path, one in zip(targets, pictures, strict=True) if one.source == "assumed"}
@@ -160,8 +173,12 @@ def _target_and_scene(target, scene):
     if target.is_dir():
         found = sorted(path for path in target.glob("target.*") if path.is_file())
         _require(found, target, "has no file target.*", "Give the picture, or a folder that holds it")
-        what = f"has several targets, {', '.join(path.name for path in found)}"
-        _require(len(found) == 1, target, what, "Name the picture instead of the folder")
+        _require(
+            len(found) == 1,
+            target,
+            f"has several targets, {', '.join(path.name for path in found)}",
+            "Name the picture instead of the folder",
+        )
         return found[0], scene or target / "scene.toml"
     input_file(target)
     _require(scene, target, "comes without a scene", "Add --scene SCENE.toml, or --sphere for a photo of a ball")
@@ -194,8 +211,9 @@ def visible(mask: Any, pictures: list[brdf.Picture]) -> list[Any]:
         shape, alpha = picture.pixels.shape[:2], picture.alpha
         counts = alpha > 0 if alpha is not None and alpha.any() else None
         if mask is not None:
-            what = f"is of shape {mask.shape}, the target {shape}"
-            _require(mask.shape == shape, "mask", what, "Give a value per pixel")
+            _require(
+                mask.shape == shape, "mask", f"is of shape {mask.shape}, the target {shape}", "Give a value per pixel"
+            )
             counts = mask if counts is None else counts & mask
         masks.append(counts)
     return masks
@@ -231,8 +249,12 @@ def _points(shape, options, mask):
 
     points = brdf.SurfacePoints.from_normals(normal_map(options.normals))
     height, width = points.mask.shape
-    what = f"is {width} x {height}, the pictures {shape[1]} x {shape[0]}"
-    _require(points.mask.shape == shape, options.normals, what, "Give a normal for each pixel")
+    _require(
+        points.mask.shape == shape,
+        options.normals,
+        f"is {width} x {height}, the pictures {shape[1]} x {shape[0]}",
+        "Give a normal for each pixel",
+    )
     return points, ()
 
 
@@ -244,8 +266,7 @@ def _directions(inputs, points, options):
 
         by_name = {path.name: direction for path, direction in zip(*read_lights(file), strict=True)}
         for target in targets:
-            remedy = "Name the photographs as the file does"
-            _require(target.name in by_name, file, f"names no {target.name}", remedy)
+            _require(target.name in by_name, file, f"names no {target.name}", "Name the photographs as the file does")
         return [by_name[target.name] for target in targets], inputs
     if file is not None:
         return read_directions(file, len(targets)), inputs
@@ -273,8 +294,12 @@ def _intensities(path, pictures):
     if path is None:
         return np.ones((len(pictures), 1))
     intensities, channels = read_intensities(path, len(pictures)), pictures[0].pixels.shape[2]
-    what = f"has {intensities.shape[1]} numbers a line, the pictures {channels} channels"
-    _require(intensities.shape[1] in (1, channels), path, what, "Give one intensity per channel")
+    _require(
+        intensities.shape[1] in (1, channels),
+        path,
+        f"has {intensities.shape[1]} numbers a line, the pictures {channels} channels",
+        "Give one intensity per channel",
+    )
     return intensities
 
 
@@ -286,12 +311,19 @@ def _archived(path, mask):
     """
     arrays = read_archive(path)
     images = arrays["images"]
-    what = f"holds {images.dtype}, of which it is not clear what is white"
-    remedy = "Save unsigned integers, which span their type, or floats"
-    _require(images.dtype.kind not in "bi", f"{path}: images", what, remedy)
+    _require(
+        images.dtype.kind not in "bi",
+        f"{path}: images",
+        f"holds {images.dtype}, of which it is not clear what is white",
+        "Save unsigned integers, which span their type, or floats",
+    )
     images = images[..., None] if images.ndim == 3 else images
-    remedy = "Give (pictures, height, width, channels)"
-    _require(images.ndim == 4 and images.size > 0, f"{path}: images", f"is of shape {images.shape}", remedy)
+    _require(
+        images.ndim == 4 and images.size > 0,
+        f"{path}: images",
+        f"is of shape {images.shape}",
+        "Give (pictures, height, width, channels)",
+    )
     count, height, width, channels = images.shape
     arrays = {"mask": np.ones((height, width)), "light_intensities": np.ones(count)} | arrays
     arrays |= {} if mask is None else {"mask": mask}

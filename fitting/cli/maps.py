@@ -52,8 +52,9 @@ def maps(
     """
     check_outputs(out, plot, report)
     if out is not None and out.resolve() == target.resolve():
-        came = "is the folder of the photographs, whose normals.* and mask.* are read"
-        raise InputError("--out", came, "Give another folder")
+        raise InputError(
+            "--out", "is the folder of the photographs, whose normals.* and mask.* are read", "Give another folder"
+        )
     mesh = all_devices(devices)
     import fitting
 

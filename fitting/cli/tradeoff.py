@@ -38,8 +38,11 @@ def tradeoff(
     check_outputs(out)
     inputs = read_inputs([target], pictures)
     if len(inputs.pictures) > 1:
-        came = f"holds {len(inputs.pictures)} pictures, and one is measured"
-        raise InputError(target, came, "Give one picture with its scene or its light")
+        raise InputError(
+            target,
+            f"holds {len(inputs.pictures)} pictures, and one is measured",
+            "Give one picture with its scene or its light",
+        )
     import fitting
 
     with named_as({"target": inputs.targets[0]}):

@@ -70,8 +70,11 @@ def read_archive(path: Path) -> dict[str, np.ndarray]:
         sizes = {info.filename.removesuffix(".npy"): info.file_size for info in archive.infolist()}
         missing = [name for name in REQUIRED if name not in sizes]
         if missing:
-            remedy = f"Photographs need {', '.join(REQUIRED)}, and may have {' and '.join(OPTIONAL)}"
-            raise InputError(path, f"holds no array {missing[0]}", remedy)
+            raise InputError(
+                path,
+                f"holds no array {missing[0]}",
+                f"Photographs need {', '.join(REQUIRED)}, and may have {' and '.join(OPTIONAL)}",
+            )
         wanted = {name: sizes[name] for name in (*REQUIRED, *OPTIONAL) if name in sizes}
         if sum(wanted.values()) > min(MOST_BYTES, EXPANSION * path.stat().st_size + (1 << 20)):
             raise InputError(path, "claims more than can be in it", DAMAGED)

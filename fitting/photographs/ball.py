@@ -65,8 +65,11 @@ def find_circle(mask: Any) -> Circle:
     distance = distance[near] if np.mean(near) >= OUTLINE else distance
     off = np.sqrt(np.mean(distance**2)) / max(circle.radius, 1e-9)
     if off > ROUND:
-        came = f"is no ball: its outline is {100 * off:.0f} % of the radius off a circle"
-        raise InputError("mask", came, "Give the mask of a whole ball, or its circle")
+        raise InputError(
+            "mask",
+            f"is no ball: its outline is {100 * off:.0f} % of the radius off a circle",
+            "Give the mask of a whole ball, or its circle",
+        )
     return circle
 
 
@@ -95,18 +98,25 @@ def ball_normals(shape: tuple[int, int], circle: Circle) -> Float[np.ndarray, "H
     if not np.all(np.isfinite(circle)):
         raise InputError("circle", f"must be finite, got {tuple(circle)}", "Give x, y and radius in pixels")
     if circle.radius < SMALLEST_RADIUS:
-        came = f"{size}, at least {SMALLEST_RADIUS:g} are needed"
-        raise InputError("circle", came, "Give a ball that is larger in the picture")
+        raise InputError(
+            "circle", f"{size}, at least {SMALLEST_RADIUS:g} are needed", "Give a ball that is larger in the picture"
+        )
     if circle.radius > LARGEST_RADIUS * max(shape):
-        came = f"{size} in a picture of {width} x {height}, which is nearly flat there"
-        raise InputError("circle", came, "Give x,y,radius in pixels of this picture")
+        raise InputError(
+            "circle",
+            f"{size} in a picture of {width} x {height}, which is nearly flat there",
+            "Give x,y,radius in pixels of this picture",
+        )
     x = (np.arange(width) - circle.x) / circle.radius
     y = -(np.arange(height)[:, None] - circle.y) / circle.radius
     half = 0.5 / circle.radius
     inside = (np.abs(x) + half) ** 2 + (np.abs(y) + half) ** 2 <= 1
     if not inside.any():
-        came = f"{tuple(circle)} lies outside the picture of {width} x {height} pixels, or is smaller than one of them"
-        raise InputError("circle", came, "x is to the right, y down, from the upper left pixel")
+        raise InputError(
+            "circle",
+            f"{tuple(circle)} lies outside the picture of {width} x {height} pixels, or is smaller than one of them",
+            "x is to the right, y down, from the upper left pixel",
+        )
     z = np.sqrt(np.maximum(1 - (x * x + y * y), 0.0))
     normal = np.stack(np.broadcast_arrays(x, y, z), axis=-1)
     return np.where(inside[..., None], normal, 0.0)

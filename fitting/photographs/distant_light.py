@@ -5,6 +5,7 @@ the half vector or the mirror direction is fitted with it: left to robust weight
 several degrees. Only where the light comes in at an angle is looked at, so that shadows say nothing.
 """
 
+import functools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -85,8 +86,6 @@ def light_from_highlight(picture: Any, circle: Circle, *, mask: Any = None) -> F
     Raises:
         InputError: where the ball is not in the picture or shows no highlight, or not the whole of it.
     """
-    from scipy.ndimage import label  # it takes long to load
-
     grey = _values(picture).mean(axis=-1)
     inside = (ball_normals(grey.shape, circle)[..., 2] > 0) & np.isfinite(grey) & (True if mask is None else mask)
     largest = float(np.max(grey, where=inside, initial=-np.inf))
@@ -95,9 +94,8 @@ def light_from_highlight(picture: Any, circle: Circle, *, mask: Any = None) -> F
     core, bright = (inside & (grey >= share * largest) for share in (CORE, HIGHLIGHT))
     if np.count_nonzero(core) > 0.25 * np.count_nonzero(inside):
         raise InputError("picture", "has no highlight: a quarter of the ball is as bright", "Give a darker exposure")
-    patches: Any = label(bright, np.ones((3, 3)))
-    y, x = np.argwhere(patches[0] == np.bincount(patches[0][core]).argmax()).mean(axis=0)
     place = np.argwhere(bright)
+    y, x = np.median(np.argwhere(core), axis=0)
     near = np.hypot(place[:, 1] - x, place[:, 0] - y) <= HIGHLIGHT_RADIUS * circle.radius
     if np.mean(near) < IN_HIGHLIGHT:
         share = f"{100 * np.mean(near):.0f} % of it lie where a mirror ball's highlight would be"
@@ -266,9 +264,10 @@ def _shown(numbers, mirror, normal):
             turns, about = again @ turns, normal
         beyond = np.exp(min(log_beyond, np.log(LARGEST_N)))
         cosine = np.clip(axis @ about, 1e-9, 1.0)
-        lobe = cosine ** (LOWEST_N + beyond)
+        log_cosine = np.log(cosine)
+        lobe = np.exp((LOWEST_N + beyond) * log_cosine)
         by_light = abs(specular) * (LOWEST_N + beyond) * lobe / cosine * (turns.T @ about)
-        slopes = np.vstack([slopes, np.sign(specular) * lobe, abs(specular) * beyond * lobe * np.log(cosine)])
+        slopes = np.vstack([slopes, np.sign(specular) * lobe, abs(specular) * beyond * lobe * log_cosine])
         shown, slopes[:3] = shown + abs(specular) * lobe, slopes[:3] + by_light
     return shown, slopes
 
@@ -277,15 +276,19 @@ def _refine(numbers, mirror, scale, value, normal):
     """The nearest minimum of Huber's cost; and the cost."""
     from scipy.optimize import minimize  # it takes long to load
 
+    @functools.lru_cache(1)  # cost and curvature are asked at the same numbers
+    def off(*numbers):
+        shown, slopes = _shown(np.array(numbers), mirror, normal)
+        return shown - value, slopes
+
     def cost(numbers):
-        shown, slopes = _shown(numbers, mirror, normal)
-        pull = np.clip(shown - value, -scale, scale)
-        return np.mean(pull * (shown - value - 0.5 * pull)), slopes @ pull / len(value)
+        residual, slopes = off(*numbers)
+        pull = np.clip(residual, -scale, scale)
+        return np.mean(pull * (residual - 0.5 * pull)), slopes @ pull / len(value)
 
     def curvature(numbers):
-        shown, slopes = _shown(numbers, mirror, normal)
-        weight = scale / np.maximum(np.abs(shown - value), scale)
-        return (slopes * weight) @ slopes.T / len(value)
+        residual, slopes = off(*numbers)
+        return slopes * (scale / np.maximum(np.abs(residual), scale)) @ slopes.T / len(value)
 
     how: Any = {"method": "trust-exact", "jac": True, "hess": curvature, "options": {"gtol": CLOSE, "maxiter": 50}}
     found = minimize(cost, numbers, **how)

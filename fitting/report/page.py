@@ -121,14 +121,12 @@ class Shown(NamedTuple):
     Attributes:
         rows: of them.
         columns: of them.
-        channels: shown as red, green and blue.
-        data: what the script is told of it.
+        data: what the script is told of it: of ``channels`` those ``shown`` as red, green and blue, and the ``window``.
         notes: of what is left out.
     """
 
     rows: slice
     columns: slice
-    channels: list[int]
     data: dict[str, Any]
     notes: list[str]
 
@@ -155,23 +153,16 @@ class Shown(NamedTuple):
         if stride > 1:
             notes.append(f"Of the picture every {stride}th column and row is held here.")
         data = {"channels": names, "shown": chosen, "window": [left, top, width, height, stride]}
-        return cls(rows, columns, chosen, data, notes)
+        return cls(rows, columns, data, notes)
 
     def pixels(self, image: np.ndarray) -> np.ndarray:
         """Those of an image, (H, W, ...), in three colours.
 
         Args:
-            image: of the whole.
+            image: of the whole; of all channels, or of one.
         """
-        return self.colours(np.asarray(image)[self.rows, self.columns])
-
-    def colours(self, values: np.ndarray) -> np.ndarray:
-        """Three colours of values, (..., C), or of one.
-
-        Args:
-            values: of the channels.
-        """
-        return np.take(values, [min(channel, values.shape[-1] - 1) for channel in self.channels], axis=-1)
+        image = np.asarray(image)[self.rows, self.columns]
+        return image[..., np.minimum(self.data["shown"], image.shape[-1] - 1)]
 
 
 def white(image: Float[np.ndarray, "..."]) -> float:

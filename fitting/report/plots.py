@@ -144,11 +144,8 @@ def _highlight(result, picture, counted, specular):
         dark = type(material)(k_d=np.zeros_like(material.k_d), k_s=material.k_s, n=material.n)
         image = np.asarray(brdf.render(dark, result.scenes[picture], precision=result.precision))
     image = np.where(counted, image.max(axis=-1), 0.0)
-    peak = np.array(np.unravel_index(np.argmax(image), image.shape))
-    reach = np.max(np.abs(np.argwhere(image > 0.2 * image.max()) - peak), initial=0) + 2
-    reach = min(max(reach, 8), max(image.shape) // 2)
-    (top, left), (bottom, right) = np.maximum(peak - reach, 0), np.minimum(peak + reach + 1, image.shape)
-    return peak[0], slice(top, bottom), slice(left, right) if specular else slice(0, image.shape[1])
+    rows, columns = window(image > 0.2 * image.max())
+    return np.argmax(image.max(axis=1)), rows, columns if specular else slice(0, image.shape[1])
 
 
 def _residual(axes, target, fitted, counted):
