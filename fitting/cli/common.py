@@ -10,7 +10,7 @@ import inspect
 import json
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -232,3 +232,18 @@ def show(told: Any) -> None:
         told: text; or what JSON holds.
     """
     print(told if isinstance(told, str) else json.dumps(told, indent=2), flush=True)  # noqa: T201  # the one place
+
+
+def show_result(result: Any, notes: Sequence[str], as_json: bool, *lines: str) -> None:
+    """Print a result, with what was found out on the way.
+
+    Args:
+        result: with ``str`` and ``to_dict``.
+        notes: what was found out.
+        as_json: print JSON, and no further line.
+        lines: below the result.
+    """
+    if as_json:
+        show(result.to_dict() | ({"notes": notes} if notes else {}))
+    else:
+        show("\n".join([*notes, str(result), *lines]))

@@ -10,7 +10,7 @@ from typing import Any
 import brdf
 from brdf.errors import InputError
 from brdf.files import write_text
-from fitting.cli.common import PictureOptions, all_devices, check_outputs, is_first_process, named_as, show
+from fitting.cli.common import PictureOptions, all_devices, check_outputs, is_first_process, named_as, show_result
 from fitting.progress import waiting
 
 
@@ -115,12 +115,9 @@ def fit(
 
             command = shlex.join(["brdf", *sys.argv[1:]])
             write_text(report, report_page(result, source=target[0].name, command=command))
-    if json:
-        show(result.to_dict() | ({"notes": notes} if notes else {}))
-        return
     saved = [] if out is None else [f"saved in {out}"]
     written = [] if report is None else [f"wrote {report}"]
-    show("\n".join([*notes, str(result), *saved, *written]))
+    show_result(result, notes, json, *saved, *written)
 
 
 def _freed(result, names):

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from brdf.errors import InputError
-from fitting.cli.common import PictureOptions, check_outputs, named_as, show
+from fitting.cli.common import PictureOptions, check_outputs, named_as, show_result
 
 
 def tradeoff(
@@ -56,11 +56,7 @@ def tradeoff(
             seconds=seconds,
         )
     guess = [f"{path.name} does not say how its values are encoded; --encoding decides" for path in inputs.silent]
-    notes = [*inputs.notes, *guess]
     if out is not None:
         found.save(out)
-    if json:
-        show(found.to_dict() | ({"notes": notes} if notes else {}))
-        return
     saved = [] if out is None else [f"saved in {out}"]
-    show("\n".join([*notes, str(found), "", found.advice, *saved]))
+    show_result(found, [*inputs.notes, *guess], json, "", found.advice, *saved)

@@ -145,18 +145,18 @@ def _camera(camera):
 
 def _extent(scene):
     """The middle of what is fitted, and half its size."""
-    ends = [np.zeros((0, 3))]
+    boxes = []
     for shape in scene.shapes if scene.camera is not None else ():
-        if shape.fitted and isinstance(shape, brdf.Triangles):
-            ends.append(shape.mesh.vertices)
-        elif shape.fitted:
+        if isinstance(shape, brdf.Triangles):
+            box = np.min(shape.mesh.vertices, axis=0), np.max(shape.mesh.vertices, axis=0)
+        else:
             sphere = isinstance(shape, brdf.Sphere)
             reach = shape.radius if sphere else np.abs(shape.edge_u) + np.abs(shape.edge_v)
-            ends.append(np.array([shape.center - reach, shape.center + reach], np.float64))
-    ends = np.concatenate(ends)
-    if not ends.size:
+            box = shape.center - reach, shape.center + reach
+        boxes += [box] if shape.fitted else []
+    if not boxes:
         return np.zeros(3), 1.0
-    low, high = np.min(ends, axis=0), np.max(ends, axis=0)
+    low, high = (np.asarray(end(boxes, axis=(0, 1)), np.float64) for end in (np.min, np.max))
     return 0.5 * (low + high), float(0.5 * np.max(high - low))
 
 
