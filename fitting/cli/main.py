@@ -79,9 +79,10 @@ def main(arguments: list[str] | None = None) -> Any:
         # As shells expect it of a command that a signal ended: 130 after Ctrl-C, 143 after SIGTERM.
         _fail("interrupted.", 128 + (interrupt.args[0] if interrupt.args else signal.SIGINT))
     except OSError as error:
-        if error.filename is not None:
+        if error.filename is not None or error.errno is None:
             raise
-        # Standard output; what could not be written goes, or Python would try once more when it ends.
+        # What the system says of no file is of standard output. What could not be written goes, or Python would try
+        # once more when it ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if isinstance(error, BrokenPipeError):
             sys.exit(1)
