@@ -27,7 +27,7 @@ Vector = Float[Any, "3"]
 Spectrum = Float[Any, " C"]
 
 LARGEST = 1e15
-"""Of any number of a scene: squares and products of a few of them stay within float32's 3e38."""
+"""Of any number of a scene or material: squares and products of a few of them stay within float32's 3e38."""
 
 MAX_SAMPLES = 1 << 20
 
@@ -43,17 +43,13 @@ class _Named(_Meta):
 
     def __call__(self, *given: Any, **named: Any) -> Any:
         """Construct it."""
+        signature = inspect.signature(self)
         try:
-            return super().__call__(*given, **named)
-        except TypeError:
-            signature = inspect.signature(self)
-            try:
-                signature.bind(*given, **named)
-            except TypeError as error:
-                needed = (name for name, one in signature.parameters.items() if one.default is one.empty)
-                remedy = f"Write {self.__name__}({', '.join(f'{name}=...' for name in needed)})"
-                raise InputError(self.__name__, str(error), remedy) from None
-            raise
+            signature.bind(*given, **named)
+        except TypeError as error:
+            needed = [f"{name}=..." for name, one in signature.parameters.items() if one.default is one.empty]
+            raise InputError(self.__name__, str(error), f"Write {self.__name__}({', '.join(needed)})") from None
+        return super().__call__(*given, **named)
 
 
 class Checked(eqx.Module, metaclass=_Named):
@@ -61,29 +57,26 @@ class Checked(eqx.Module, metaclass=_Named):
 
     def __repr__(self) -> str:
         """Its parts, as one would write them; those that are as usual are left out."""
-        values = {
-            name: getattr(self, name)
+        parts = [
+            f"{name}={shown(value)}"
             for name, one in inspect.signature(type(self)).parameters.items()
             if not (isinstance(value := getattr(self, name), tuple | int | None) and value == one.default)
-        }
-        parts = [f"{name}={shown(value)}" for name, value in values.items()]
-        inner = [one for value in values.values() for one in (value if isinstance(value, tuple) else (value,))]
-        if not any(isinstance(one, Checked) for one in inner):
-            return f"{type(self).__name__}({', '.join(parts)})"
-        lines = "".join(f"{part},\n" for part in parts)
-        return f"{type(self).__name__}(\n{textwrap.indent(lines, '    ')})"
+        ]
+        if "(" in "".join(parts):  # other such things stand on lines of their own
+            lines = textwrap.indent(",\n".join([*parts, ""]), "    ")
+            return f"{type(self).__name__}(\n{lines})"
+        return f"{type(self).__name__}({', '.join(parts)})"
 
 
 def shown(value: Any) -> str:
     """A value as a person writes it: numbers to six digits, of large arrays the shape, of long lists the beginning."""
+    if isinstance(value, np.ndarray | jax.Array) and not isinstance(value, Tracer):
+        if value.size > LARGE:
+            return f"<{' x '.join(map(str, value.shape))} {value.dtype}>"
+        value = tuple(value) if value.ndim else float(value)
     if isinstance(value, tuple):
         more = f", ... {len(value) - SHOWN} more" if len(value) > SHOWN else ""
         return f"[{', '.join(map(shown, value[:SHOWN]))}{more}]"
-    if isinstance(value, np.ndarray | jax.Array) and not isinstance(value, Tracer):
-        array = np.asarray(value)
-        if array.size > LARGE:
-            return f"<{' x '.join(map(str, array.shape))} {array.dtype}>"
-        return f"{array:.6g}" if array.ndim == 0 else shown(tuple(array))
     return f"{value:.6g}" if isinstance(value, float | np.floating) else repr(value)
 
 
@@ -116,33 +109,50 @@ def checked(check: Callable[[str, Any], Any], name: str, **field: Any) -> Any:
     return eqx.field(converter=partial(check, name), **field)
 
 
-def _array(name: str, value: Any, shape_words: str, largest: float = LARGEST) -> Any:
+def _numbers(name, value, words="numbers"):
+    """Finite numbers of any shape."""
     if isinstance(value, jax.Array):
         return value
-    array = as_numbers(name, value, shape_words)
-    if not np.all(np.isfinite(array)):
-        raise InputError(name, f"must be finite, got {what_came(value)}", "Give finite numbers")
-    if np.any(np.abs(array) > largest):
-        raise InputError(name, f"must be within ± {largest:g}, got {what_came(value)}", "Use another unit")
+    array = as_numbers(name, value, words)
+    _refuse(name, array, {"finite": np.isfinite(array), f"within ± {LARGEST:g}": ~(np.abs(array) > LARGEST)})
     return array
 
 
-def vector(name: str, value: Any, largest: float = LARGEST) -> Any:
-    """A position or an edge: three finite numbers up to ``largest``."""
-    array = _array(name, value, "three numbers", largest)
-    if array.shape != (3,):
-        raise InputError(name, f"must be three numbers, got {what_came(value)}", "Give [x, y, z]")
+def _refuse(name, array, limits, place=""):
+    """Refuse known numbers of which one is not good, by the words for that."""
+    for words, good in limits.items():
+        if isinstance(array, np.ndarray) and not np.all(good):
+            first = int(np.argmin(good))
+            where = place.format(first) if array.size > 1 else ""
+            raise InputError(name, f"must be {words}, got {array.flat[first]:g}{where}", "Correct the value")
+
+
+def _shaped(name, value, fits, words, remedy):
+    """Finite numbers of a shape that fits."""
+    array = _numbers(name, value, words)
+    if not fits(array.shape):
+        raise InputError(name, f"must be {words}, got {what_came(value)}", remedy)
     return array
+
+
+def _not_negative(name, array):
+    _refuse(name, array, {"at least 0": array >= 0}, " in channel {}")
+    return array
+
+
+def vector(name: str, value: Any) -> Any:
+    """A position or an edge: three finite numbers."""
+    return _shaped(name, value, lambda shape: shape == (3,), "three numbers", "Give [x, y, z]")
 
 
 def direction_value(name: str, value: Any) -> Any:
     """A direction of any length: three finite numbers, not all zero."""
-    array = vector(name, value, np.inf)
+    array = vector(name, value)
     if not isinstance(array, np.ndarray):
         return array
-    if not np.any(array):
-        raise InputError(name, "must not have zero length, got [0, 0, 0]", "Give a direction")
     size = np.max(np.abs(array))
+    if size == 0:
+        raise InputError(name, "must not have zero length, got [0, 0, 0]", "Give a direction")
     # Its squares must not leave float32; else it stays as it was given.
     return array if 1e-6 <= size <= 1e6 else array / size
 
@@ -159,19 +169,11 @@ def number(
     name: str, value: Any, low: float = -np.inf, high: float = np.inf, above: float = -np.inf, below: float = np.inf
 ) -> Any:
     """One number with ``low`` <= x <= ``high`` and ``above`` < x < ``below``."""
-    array = _array(name, value, "a number")
+    array = _numbers(name, value, "a number")
     if array.shape != () or isinstance(value, bool):
         raise InputError(name, f"must be one number, got {what_came(value)}", "Give a single number")
-    if isinstance(array, np.ndarray):
-        limits = [
-            (array < low, f"at least {low:g}"),
-            (array > high, f"at most {high:g}"),
-            (array <= above, f"greater than {above:g}"),
-            (array >= below, f"less than {below:g}"),
-        ]
-        for is_broken, words in limits:
-            if is_broken:
-                raise InputError(name, f"must be {words}, got {array:g}", "Correct the value")
+    limits = {f"at least {low:g}": array >= low, f"at most {high:g}": array <= high}
+    _refuse(name, array, limits | {f"greater than {above:g}": array > above, f"less than {below:g}": array < below})
     return array
 
 
@@ -182,24 +184,18 @@ def positive(name: str, value: Any) -> Any:
 
 def spectrum(name: str, value: Any) -> Any:
     """One value per channel, at least 0; a single number becomes one channel."""
-    array = _array(name, value, "a number per channel")
-    if array.ndim == 0:
-        array = array.reshape(1)
-    if array.ndim != 1 or array.shape[0] == 0:
-        raise InputError(name, f"must be a number per channel, got {what_came(value)}", "Give a list of numbers")
-    if isinstance(array, np.ndarray) and np.any(array < 0):
-        channel = int(np.argmax(array < 0))
-        came = f"must be at least 0, got {array[channel]:g} in channel {channel}"
-        raise InputError(name, came, "Give values of 0 or more")
-    return array
+    words = "a number per channel"
+    array = _shaped(name, value, lambda shape: len(shape) < 2 and 0 not in shape, words, "Give a list of numbers")
+    return _not_negative(name, array.reshape(-1))
 
 
 def vertex_list(name: str, value: Any) -> Any:
     """Corners of a polygon: three points or more."""
-    array = _array(name, value, "a list of points")
-    if array.ndim != 2 or array.shape[0] < 3 or array.shape[1] != 3:
-        raise InputError(name, f"must be three points or more, got {what_came(value)}", "Give [[x, y, z], ...]")
-    return array
+
+    def fits(shape):
+        return len(shape) == 2 and shape[0] >= 3 and shape[1] == 3
+
+    return _shaped(name, value, fits, "three points or more", "Give [[x, y, z], ...]")
 
 
 def sample_number(value: Any, most: int = MAX_SAMPLES) -> int:
@@ -217,12 +213,11 @@ def spans_area(edge_u: Any, edge_v: Any) -> None:
     Raises:
         InputError: where they are parallel.
     """
-    if not (isinstance(edge_u, np.ndarray) and isinstance(edge_v, np.ndarray)):
-        return
-    area = float(np.linalg.norm(np.cross(edge_u, edge_v)))
-    if area <= 1e-12 * float(np.linalg.norm(edge_u) * np.linalg.norm(edge_v)):
-        came = f"got {edge_u.tolist()} and {edge_v.tolist()}"
-        raise InputError("edge_v", f"must not be parallel to edge_u, {came}", "Give two edges that span an area")
+    if isinstance(edge_u, np.ndarray) and isinstance(edge_v, np.ndarray):
+        area, *lengths = map(np.linalg.norm, (np.cross(edge_u, edge_v), edge_u, edge_v))
+        if area <= 1e-12 * np.prod(lengths):
+            came = f"got {edge_u.tolist()} and {edge_v.tolist()}"
+            raise InputError("edge_v", f"must not be parallel to edge_u, {came}", "Give two edges that span an area")
 
 
 def coefficients(**given: Any) -> list[Array | np.ndarray]:
@@ -234,18 +229,19 @@ def coefficients(**given: Any) -> list[Array | np.ndarray]:
     Raises:
         InputError: naming the one that is not finite, is negative, or does not go with the others.
     """
-    checked = {name: _not_negative(name, value) for name, value in given.items()}
-    for name, value in checked.items():
-        if value.ndim > 1 or value.size == 0:
-            raise InputError(name, f"must be one number or one number per channel, got shape {value.shape}")
-    channels = max(value.size for value in checked.values())
-    for name, value in checked.items():
-        if value.size not in (1, channels):
-            sizes = ", ".join(f"{n} {v.size}" for n, v in checked.items())
+    arrays = {name: _material_numbers(name, value) for name, value in given.items()}
+    channels = max(array.size for array in arrays.values())
+    for name, array in arrays.items():
+        if array.ndim > 1 or array.size == 0:
+            raise InputError(name, f"must be one number or one number per channel, got shape {array.shape}")
+        if array.size not in (1, channels):
+            sizes = ", ".join(f"{n} {v.size}" for n, v in arrays.items())
             came = f"the coefficients differ in their number of channels ({sizes})"
             raise InputError(name, came, "Give each the same")
-    each = checked.values()
-    return [(np if isinstance(one, np.ndarray) else jnp).broadcast_to(one, (channels,)).copy() for one in each]
+    return [
+        (np if isinstance(array, np.ndarray) else jnp).broadcast_to(array, (channels,)).copy()
+        for array in arrays.values()
+    ]
 
 
 def exponent(given: Any) -> Array | np.ndarray:
@@ -257,25 +253,15 @@ def exponent(given: Any) -> Array | np.ndarray:
     Raises:
         InputError: where it is not finite, negative or beyond `LARGEST`.
     """
-    value = _not_negative("n", given)
-    if isinstance(value, np.ndarray) and np.any(value > LARGEST):
-        raise InputError("n", f"must be at most {LARGEST:g}, got {np.max(value):g}", "Such a lobe is a mirror")
+    value = _material_numbers("n", given)
     if value.size != 1:
         raise InputError("n", f"must be one number, got shape {value.shape}", "All channels share one exponent")
     return value.reshape(())
 
 
-def _not_negative(name: str, given: Any) -> Any:
-    """As float64 numpy if the values are known, after checking them; what JAX is tracing passes through."""
-    if isinstance(given, list | tuple) and any(isinstance(v, Tracer) for v in given):
-        given = jnp.stack([jnp.asarray(v) for v in given])
-    if isinstance(given, Tracer):
-        return given
-    value = as_numbers(name, given)
-    for channel, number in enumerate(value.ravel()):
-        where = f" in channel {channel}" if value.size > 1 else ""
-        if not np.isfinite(number):
-            raise InputError(name, f"must be finite, got {number}{where}")
-        if number < 0:
-            raise InputError(name, f"must be at least 0, got {number:g}{where}")
-    return value
+def _material_numbers(name, given):
+    """At least 0, and float64 of NumPy where they are known; what JAX is tracing passes through."""
+    if isinstance(given, list | tuple) and any(isinstance(value, Tracer) for value in given):
+        given = jnp.stack([jnp.asarray(value) for value in given])
+    known = given if isinstance(given, Tracer) else as_numbers(name, given)
+    return _not_negative(name, _numbers(name, known))

@@ -318,7 +318,9 @@ def read_toml(path: AnyPath, most: int = MAX_TEXT_BYTES) -> dict[str, Any]:
     """
     text = read_text(path, most)
     try:
-        return tomllib.loads(text)
+        tables = tomllib.loads(text)
+        repr(tables)  # numbers of more digits than Python writes
+        return tables
     except (ValueError, RecursionError) as error:  # ValueError: also of more digits than Python reads
         raise InputError(path, f"is not TOML ({error})", "Correct the file") from None
 

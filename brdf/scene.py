@@ -25,23 +25,19 @@ from brdf.pixel_area import with_area
 from brdf.precision import Precision, cast, working_precision
 
 
-def _ambient(value: Any) -> Any:
-    return None if value is None else spectrum("intensity", value)
-
-
-def _masks(value: Any) -> tuple[Any, ...]:
-    """Given shadow masks: (H, W) values from 0 to 1, or None, one for each light."""
+def _masks(value):
+    """Given shadow masks: (H, W) values from 0 to 1, or None, one for each light; () where there are none."""
     masks = []
     for mask in several("visibility", value):
         if mask is not None and not isinstance(mask, jax.Array):
-            mask = np.asarray(mask, dtype=np.float64)
+            mask = np.asarray(mask, np.float64)
             if mask.ndim != 2:
                 raise InputError("visibility", f"must be of shape (H, W), got {mask.shape}", "Give a value per pixel")
             if not np.all((mask >= 0) & (mask <= 1)):
                 came = f"must lie between 0 and 1, got {np.min(mask):g} to {np.max(mask):g}"
                 raise InputError("visibility", came, "Give the share of the light that each pixel sees")
         masks.append(mask)
-    return tuple(masks)
+    return () if all(mask is None for mask in masks) else tuple(masks)
 
 
 class Scene(Checked):
@@ -71,38 +67,39 @@ class Scene(Checked):
     camera: Camera | None = None
     shapes: tuple[Shape, ...] = eqx.field(converter=partial(several, "shapes"), default=())
     points: SurfacePoints | None = None
-    ambient: Spectrum | None = eqx.field(converter=_ambient, default=None)
+    ambient: Spectrum | None = eqx.field(
+        converter=lambda value: None if value is None else spectrum("intensity", value), default=None
+    )
     lights: tuple[Light, ...] = eqx.field(converter=partial(several, "lights"), default=())
     visibility: tuple[Float[Array, "H W"] | None, ...] = eqx.field(converter=_masks, default=())
 
     def __check_init__(self):
         """Refuse parts that do not belong together."""
-        words = "Write Scene(camera, shapes=[...], lights=[...])"
-        if self.camera is not None:
-            instance("camera", self.camera, Camera, words)
-        if self.points is not None:
-            instance("points", self.points, SurfacePoints, "Use brdf.SurfacePoints.from_normals")
-        for name, parts, kind in (("shapes", self.shapes, Shape), ("lights", self.lights, Light)):
-            for index, part in enumerate(parts):
-                instance(f"{name}[{index}]", part, kind, words)
+        words = "Write Scene(camera, shapes=[...], lights=[...]), or points=brdf.SurfacePoints.from_normals(...)"
+        for name, kind in {"camera": Camera, "points": SurfacePoints, "shapes": Shape, "lights": Light}.items():
+            part = getattr(self, name)
+            parts = {f"{name}[{index}]": one for index, one in enumerate(part)} if isinstance(part, tuple) else {name: part}
+            for place, one in parts.items():
+                if one is not None:
+                    instance(place, one, kind, words)
+        fitted = [shape.fitted for shape in self.shapes]
         if (self.camera is None) == (self.points is None):
             remedy = "Give either a camera and shapes, or an aov file"
             raise InputError("scene", "must have a camera or surface points, and not both", remedy)
-        if self.camera is not None and not any(shape.fitted for shape in self.shapes):
+        if self.camera is not None and not any(fitted):
             raise InputError("shapes", "has no shape that is fitted", "Add a [[shapes]] table")
-        if self.points is not None and self.shapes and all(shape.fitted for shape in self.shapes):
+        if self.points is not None and fitted and all(fitted):
             remedy = "Set fitted = false: beside surface points, shapes are occluders only"
             raise InputError("shapes", "must not be fitted where surface points are given", remedy)
         if self.visibility and len(self.visibility) != len(self.lights):
             came = f"has {len(self.visibility)} entries for {len(self.lights)} lights"
             raise InputError("visibility", came, "Give one for each light, None where the shapes tell")
-        width, height = self.resolution
         for mask in self.visibility:
-            if mask is not None and mask.shape != (height, width):
-                came = f"must be of shape {(height, width)}, got {mask.shape}"
+            if mask is not None and mask.shape != self.resolution[::-1]:
+                came = f"must be of shape {self.resolution[::-1]}, got {mask.shape}"
                 raise InputError("visibility", came, "Give a value per pixel")
-        counts = sorted({emittance.shape[0] for emittance in self.emittances()})
-        if len([count for count in counts if count != 1]) > 1:
+        counts = sorted({emittance.shape[0] for emittance in self.emittances()} - {1})
+        if len(counts) > 1:
             came = f"lights have {' and '.join(map(str, counts))} channels"
             raise InputError("intensity", came, "Give all lights and the ambient light the same number of channels")
 
@@ -141,16 +138,18 @@ class Scene(Checked):
         Returns:
             (H, W) points, or as many rows.
         """
-        first, stop = (0, self.resolution[1]) if rows is None else rows
+        height = self.resolution[1]
+        first, stop = rows or (0, height)
         if self.points is not None:
             assert rows is None or self.points.area is None
             points = self.points if rows is None else jax.tree.map(lambda leaf: leaf[first:stop], self.points)
         else:
             assert self.camera is not None
             points = PrimaryRays(self.camera, self.shapes, (first, stop)).stored()
-        visibility, given = None, [mask for mask in self.visibility if mask is not None]
-        if given:
-            masks = [jnp.ones_like(given[0]) if mask is None else mask for mask in self.visibility]
+        visibility = None
+        if self.visibility:
+            unshadowed = np.ones((height, self.resolution[0]), bool)
+            masks = [unshadowed if mask is None else mask for mask in self.visibility]
             visibility = jnp.stack([mask[first:stop] for mask in masks], axis=-1)
         points = dataclasses.replace(points, visibility=visibility)
         if rows is not None or self.camera is None or self.camera.samples == 1:
@@ -170,17 +169,26 @@ class Scene(Checked):
         return rays if rays.quick else rays.stored()
 
     @classmethod
-    def load(cls, path: str | Path, *, within: str | Path | None = None) -> "Scene":
+    def load(
+        cls, path: str | Path, *, within: str | Path | None = None, tables: dict[str, Any] | None = None
+    ) -> "Scene":
         """Read a scene file.
 
         Args:
             path: a ``scene.toml``; the paths in it are relative to its folder.
             within: a folder that these paths may not leave; None takes the scene's own.
+            tables: what is in the file, where it has been parsed already.
 
         Raises:
             InputError: naming file, table and key.
         """
-        return load_scene(path, within)
+        from brdf.scene_file import read_parts  # late: it brings the picture library
+
+        parts = read_parts(as_path(path), within, tables)
+        try:
+            return cls(**parts)
+        except InputError as error:
+            raise error.inside(path) from None
 
     def save(self, path: str | Path, *, aov: str | None = None) -> None:
         """Write a scene file that `load` reads back to the same scene.
@@ -193,20 +201,9 @@ class Scene(Checked):
         Raises:
             InputError: where the file cannot be written.
         """
-        from brdf.scene_file import write_parts
+        from brdf.scene_file import write_scene
 
-        write_parts(path, {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}, aov)
-
-
-def load_scene(path: str | Path, within: str | Path | None = None, tables: dict[str, Any] | None = None) -> Scene:
-    """Read a scene file; see `Scene.load`. ``tables`` are what is in it, where it has been parsed already."""
-    from brdf.scene_file import read_parts  # late: it brings the picture library
-
-    parts = read_parts(as_path(path), within, tables)
-    try:
-        return Scene(**parts)
-    except InputError as error:
-        raise error.inside(str(path)) from None
+        write_scene(path, self, aov)
 
 
 def some_pixels(
@@ -256,25 +253,20 @@ def some_pixels(
         return Scene(points=points, shapes=hiding, ambient=scene.ambient, lights=scene.lights, visibility=visibility)
 
 
-def _of_picture(pixel: Any, leaf: Any) -> np.ndarray:
+def _of_picture(pixel, leaf):
     """Some pixels of (H, W, ...) values; through NumPy: an XLA gather is ten times slower."""
     return np.asarray(leaf).reshape(-1, *leaf.shape[2:])[np.asarray(pixel)]
 
 
-def _chosen(points: SurfacePoints, pixel: Any) -> SurfacePoints:
+def _chosen(points, pixel):
     """Some of the points, in the shape of ``pixel``."""
     area = points.area
-    plain = dataclasses.replace(points, visibility=None, area=None)
-    some = jax.tree.map(partial(_of_picture, pixel), plain)
-    if area is None:
-        return some
-    slot = _of_picture(pixel, area.slot)
+    some = jax.tree.map(partial(_of_picture, pixel), dataclasses.replace(points, visibility=None, area=None))
+    slot = np.full(pixel.shape, -1) if area is None else _of_picture(pixel, area.slot)
     averaged = np.flatnonzero(slot >= 0)
-    # An entry that is not used lies beyond the last pixel.
-    rows = slot.ravel()[averaged] if averaged.size else np.zeros(1, slot.dtype)
-    place: Any = averaged if averaged.size else np.array([slot.size])
-    new: Any = np.full(slot.size, -1, np.int32)
-    new[averaged] = np.arange(averaged.size, dtype=np.int32)
-    fine = dataclasses.replace(area.points, visibility=None)
-    fine, weight = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], (fine, area.weight))
-    return dataclasses.replace(some, area=PixelArea(place.astype(np.int32), new.reshape(slot.shape), fine, weight))
+    if not averaged.size:
+        return some
+    fine = dataclasses.replace(area.points, visibility=None), area.weight
+    fine, weight = jax.tree.map(lambda leaf: np.asarray(leaf)[slot.ravel()[averaged]], fine)
+    new = np.where(slot < 0, -1, np.cumsum(slot >= 0).reshape(slot.shape) - 1)
+    return dataclasses.replace(some, area=PixelArea(averaged.astype(np.int32), new.astype(np.int32), fine, weight))

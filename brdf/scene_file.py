@@ -1,9 +1,17 @@
-"""scene.toml in and out. Strict: an unknown key, a wrong type or a missing value names file, table and key."""
+"""scene.toml in and out. Strict: an unknown key, a wrong type or a missing value names file, table and key.
+
+A table holds the arguments of a class or function, whose annotations say what is no number: a path, which must stay
+within the scene's folder, the name of a layer, a truth value.
+"""
 
 import dataclasses
+import inspect
+import itertools
 import json
+import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NewType
 
 import jax
 import numpy as np
@@ -21,59 +29,48 @@ from brdf.images.reading import read_image, read_layers
 from brdf.images.writing import write_image, write_layers
 from brdf.lights.area import PolygonLight, RectangleLight, SphereLight
 from brdf.lights.base import Light
-from brdf.lights.environment import ConstantEnvironment, EnvironmentMap
+from brdf.lights.environment import MAP_SAMPLES, ConstantEnvironment, EnvironmentMap
 from brdf.lights.punctual import DirectionalLight, PointLight, SpotLight
 
 SHAPES: dict[str, type[Shape]] = {"sphere": Sphere, "rectangle": Rectangle, "triangles": Triangles}
 _LIGHTS = (DirectionalLight, PointLight, SpotLight, RectangleLight, PolygonLight, SphereLight, ConstantEnvironment)
 LIGHTS: dict[str, type[Light]] = {light.type_name: light for light in _LIGHTS}
-POSITION_LAYERS = ("position", "P")
-NORMAL_LAYERS = ("normal", "sh_normal", "N")
-VIEW_LAYERS = ("to_view",)
+_DISTANT = DirectionalLight | ConstantEnvironment | EnvironmentMap
 
 MOST_NUMBERS = 4096
 """Longer lists are no spectrum, no polygon that anybody draws."""
 
 MOST_BYTES = 1 << 22
 
+_Layer = NewType("_Layer", str)
+_WORDS: dict[Any, str] = {Path: "a path", _Layer | None: "the name of a layer", bool: "true or false"}
+
 
 # -- reading -----------------------------------------------------------------------------------------------------------
 
 
+@dataclasses.dataclass
 class _Table:
-    """One table of the file: hands out its keys, and knows which nobody asked for.
+    """One table of the file.
 
     Attributes:
         place: file and table, for messages.
-        values: by key, those that have not been handed out.
-        within: the folder that no path may leave; None for the scene's own.
+        values: by key.
+        folder: of the file.
+        within: the folder that no path may leave.
     """
 
-    def __init__(self, path: Path, name: str, values: Any, within: Path | None):
-        self.path, self.place, self.within = path, f"{path}: {name}", within
-        if not isinstance(values, dict):
-            raise InputError(self.place, f"must be a table, got {values!r}", "Write it as a [table]")
-        self.values = dict(values)
+    place: str
+    values: dict[str, Any]
+    folder: Path
+    within: Path
 
-    def plain(self, key: str) -> Any:
-        """A value, refused where Python would silently read a truth value or text as a number; None where missing."""
-        value, place = self.values.pop(key, None), f"{self.place}.{key}"
-        if isinstance(value, list) and len(value) > MOST_NUMBERS:
-            raise InputError(place, f"has {len(value)} entries", f"Give at most {MOST_NUMBERS}")
-        if key in ("fitted", "smooth"):
-            if not isinstance(value, bool):
-                raise InputError(place, f"must be true or false, got {value!r}", "Correct the value")
-            return value
-        leaves = jax.tree.leaves(value)
-        if any(isinstance(leaf, bool) for leaf in leaves):
-            raise InputError(place, f"must be a number, got {json.dumps(value, default=str)}", "Give numbers")
-        if key != "viewer" and any(isinstance(leaf, str) for leaf in leaves):
-            words = "numbers" if isinstance(value, list) else "a number"
-            raise InputError(place, f"must be {words}, got {value!r}", "Give numbers without quotes")
-        return value
+    def __post_init__(self):
+        if not isinstance(self.values, dict):
+            raise InputError(self.place, f"must be a table, got {self.values!r}", "Write it as a [table]")
 
-    def choose(self, choices: dict[str, Any]) -> Any:
-        """The class that the table's ``type`` names."""
+    def choose(self, choices):
+        """What the table's ``type`` names."""
         known = ", ".join(choices)
         if "type" not in self.values:
             raise InputError(self.place, "has no type", f"Add type = one of {known}")
@@ -82,54 +79,48 @@ class _Table:
             raise InputError(f"{self.place}.type", f"is unknown, got {value!r}", f"Use one of {known}")
         return choices[value]
 
-    def done(self, *known: str) -> None:
-        """Refuse a key that nobody asked for."""
+    def make(self, maker):
+        """What a class or function makes of the values, which bear its parameters' names."""
+        parameters = inspect.signature(maker).parameters
         for key in self.values:
-            raise InputError(f"{self.place}.{key}", "is not a known key", f"Known here: {', '.join(known)}")
-
-    def build(self, cls: type) -> Any:
-        """An object from the keys that bear its fields' names."""
-        fields = {field.name: field for field in dataclasses.fields(cls) if field.init}
-        values = {name: self.plain(name) for name in fields if name in self.values}
-        self.done(*fields)
-        for name, field in fields.items():
-            if name not in values and field.default is dataclasses.MISSING:
+            if key not in parameters:
+                raise InputError(f"{self.place}.{key}", "is not a known key", f"Known here: {', '.join(parameters)}")
+        values = {key: self._value(key, parameters[key].annotation) for key in self.values}
+        for name, one in parameters.items():
+            if name not in values and one.default is one.empty:
                 raise InputError(self.place, f"has no {name}", f"Add {name} = ...")
-        return self.made(cls, **values)
-
-    def made(self, make: Any, *arguments: Any, **values: Any) -> Any:
-        """What a constructor makes; the table is named where it refuses."""
+        files = tuple(str(value) for value in values.values() if isinstance(value, Path))
         try:
-            return make(*arguments, **values)
+            return maker(**values)
         except InputError as error:
-            raise error.inside(self.place) from None
+            raise error if error.where.startswith(files) else error.inside(self.place) from None
 
-    def file(self, key: str, example: str) -> Path:
-        """The file that a key names, which must lie within the folder."""
-        if key not in self.values:
-            raise InputError(self.place, f"has no {key}", f'Add {key} = "{example}"')
-        name, place = self.values.pop(key), f"{self.place}.{key}"
-        if not isinstance(name, str) or not name:
-            raise InputError(place, f"must be a path, got {name!r}", f'Give a path like "{example}"')
-        own = self.path.parent
-        within = own if self.within is None else self.within
+    def _value(self, key, kind):
+        """A value, refused where Python would silently read a truth value or text as a number."""
+        value, place = self.values[key], f"{self.place}.{key}"
+        if kind in _WORDS:
+            if not isinstance(value, bool if kind is bool else str) or value == "":
+                raise InputError(place, f"must be {_WORDS[kind]}, got {value!r}", "Correct the value")
+            return self._path(place, value) if kind is Path else value
+        if isinstance(value, list) and len(value) > MOST_NUMBERS:
+            raise InputError(place, f"has {len(value)} entries", f"Give at most {MOST_NUMBERS}")
+        for leaf in jax.tree.leaves(value):
+            if isinstance(leaf, bool) or (isinstance(leaf, str) and key != "viewer"):
+                came = repr(leaf) if isinstance(leaf, str) else str(leaf).lower()
+                raise InputError(place, f"must be a number, got {came}", "Give numbers without quotes")
+        return value
+
+    def _path(self, place, name):
+        """The path of a file within the folder."""
+        path, own = self.folder / name, self.within == self.folder
         try:
-            stays = (own / name).resolve().is_relative_to(within.resolve())
-        except (ValueError, OSError, RuntimeError):
+            stays = Path(os.path.realpath(path)).is_relative_to(self.within.resolve())
+        except ValueError:
             raise InputError(place, f"is no path, got {name!r}", "Correct the path") from None
         if not stays:
-            where = "the scene's folder" if own == within else str(within)
-            remedy = "Move the file there" + (", or allow more with within" if own == within else "")
-            raise InputError(place, f"must stay within {where}, got {name!r}", remedy)
-        return own / name
-
-    def layer(self, key: str) -> str | None:
-        """The name of a layer."""
-        name = self.values.pop(key, None)
-        if not isinstance(name, str | None):
-            came = f"must be the name of a layer, got {name!r}"
-            raise InputError(f"{self.place}.{key}", came, "Give a name in quotes")
-        return name
+            where, remedy = ("the scene's folder", ", or allow more with within") if own else (self.within, "")
+            raise InputError(place, f"must stay within {where}, got {name!r}", f"Move the file there{remedy}")
+        return path
 
 
 def read_parts(path: Path, within: str | Path | None, tables: dict[str, Any] | None) -> dict[str, Any]:
@@ -146,184 +137,159 @@ def read_parts(path: Path, within: str | Path | None, tables: dict[str, Any] | N
     Raises:
         InputError: naming file, table and key.
     """
-    within = None if within is None else Path(within)
-    values = read_toml(path, MOST_BYTES) if tables is None else dict(tables)
-    if any(isinstance(leaf, int) and abs(leaf) >> 1000 for leaf in jax.tree.leaves(values)):
-        raise InputError(path, "has a whole number of more than 300 digits", "Correct the file")
-    camera, points, ambient, has_position = None, None, None, True
-    if "camera" in values:
-        table = _Table(path, "camera", values.pop("camera"), within)
-        camera = table.build(table.choose(CAMERAS))
-    shapes = [_read_shape(table) for table in _tables(path, "shapes", values, within)]
-    if "aov" in values:
-        points, has_position = _read_points(_Table(path, "aov", values.pop("aov"), within))
-        if shapes and not has_position:
-            came = f"stand somewhere, but {path}: aov has no layer of positions"
-            raise InputError(f"{path}: shapes", came, "Add the layer, or leave the shapes out")
-    if "ambient" in values:
-        table = _Table(path, "ambient", values.pop("ambient"), within)
-        given, ambient = "intensity" in table.values, table.plain("intensity")
-        # A misspelt key is named before the one that it should have been.
-        table.done("intensity")
-        if not given:
-            raise InputError(table.place, "has no intensity", "Add intensity = [r, g, b]")
-        ambient = table.made(spectrum, "intensity", ambient)
-    lights, masks = [], []
-    for table in _tables(path, "lights", values, within):
-        masks.append(_read_mask(table))
-        lights.append(_read_light(table))
-        if not has_position and not isinstance(lights[-1], DirectionalLight | ConstantEnvironment | EnvironmentMap):
-            came = f"stands somewhere, but {path}: aov has no layer of positions"
-            raise InputError(table.place, came, "Add the layer, or use directional lights")
-    for key in values:
-        known = "camera, shapes, aov, ambient, lights"
-        raise InputError(f"{path}: {key}", "is not a known key", f"Known here: {known}")
-    visibility = () if all(mask is None for mask in masks) else masks
-    parts = {"camera": camera, "shapes": shapes, "points": points, "ambient": ambient, "lights": lights}
-    return parts | {"visibility": visibility}
+    folders = path.parent, path.parent if within is None else Path(within)
+    parts: dict[str, Any] = {}
+    for name, value in (read_toml(path, MOST_BYTES) if tables is None else tables).items():
+        if name not in _READERS:
+            raise InputError(f"{path}: {name}", "is not a known key", f"Known here: {', '.join(_READERS)}")
+        several = name in ("shapes", "lights")
+        if several and not isinstance(value, list):
+            raise InputError(f"{path}: {name}", "must be a list of tables", f"Write [[{name}]]")
+        found = {f"{name}[{index}]": one for index, one in enumerate(value)} if several else {name: value}
+        read = [_READERS[name](_Table(f"{path}: {place}", one, *folders)) for place, one in found.items()]
+        parts[name] = read if several else read[0]
+    if "aov" in parts:
+        parts["points"], has_position = parts.pop("aov")
+        far = all(isinstance(light, _DISTANT) for light, _ in parts.get("lights", []))
+        if not has_position and not (far and "shapes" not in parts):
+            came = "has no layer of positions, but shapes or lights stand somewhere"
+            raise InputError(f"{path}: aov", came, "Add the layer, or use directional lights alone")
+    if parts.get("lights"):
+        parts["lights"], parts["visibility"] = zip(*parts["lights"], strict=True)
+    return parts
 
 
-def _tables(path: Path, name: str, values: dict[str, Any], within: Path | None) -> list[_Table]:
-    tables = values.pop(name, [])
-    if not isinstance(tables, list):
-        raise InputError(f"{path}: {name}", "must be a list of tables", f"Write [[{name}]]")
-    return [_Table(path, f"{name}[{index}]", table, within) for index, table in enumerate(tables)]
-
-
-def _read_shape(table: _Table) -> Shape:
+def _read_shape(table):
     cls = table.choose(SHAPES)
-    if cls is not Triangles:
-        return table.build(cls)
-    path = table.file("file", "mesh.obj")
-    fitted, smooth = (table.plain(key) if key in table.values else True for key in ("fitted", "smooth"))
-    table.done("type", "file", "fitted", "smooth")
-    return Triangles(load_mesh(path, smooth=smooth), fitted=fitted)
+    return table.make(_triangles if cls is Triangles else cls)
 
 
-def _read_light(table: _Table) -> Light:
-    cls = table.choose(LIGHTS)
-    if cls is not ConstantEnvironment or "file" not in table.values:
-        return table.build(cls)
-    path = table.file("file", "sky.exr")
-    values = {key: table.plain(key) for key in ("radiance", "samples") if key in table.values}
-    table.done("type", "file", "radiance", "samples", "visibility", "visibility_layer")
-    return table.made(EnvironmentMap, read_image(path), **values)
+def _triangles(file: Path, fitted: bool = True, smooth: bool = True):
+    return Triangles(load_mesh(file, smooth=smooth), fitted=fitted)
 
 
-def _read_mask(table: _Table) -> Any:
-    """How much of the light each pixel sees, where a file tells; the first channel of the picture or layer."""
-    if "visibility" not in table.values:
-        return None
-    path, layer = table.file("visibility", "shadow.exr"), table.layer("visibility_layer")
-    pixels = read_image(path, encoding="linear") if layer is None else _layer(read_layers(path), layer, (), path)
-    return pixels[..., 0]
+def _read_light(table):
+    """A light, and how much of it each pixel sees where a file tells."""
+    cls, values = table.choose(LIGHTS), table.values
+    told = {key: values.pop(key) for key in ("visibility", "visibility_layer") if key in values}
+    mask = dataclasses.replace(table, values=told).make(_mask) if told else None
+    return table.make(_map if cls is ConstantEnvironment and "file" in values else cls), mask
 
 
-def _read_points(table: _Table) -> tuple[SurfacePoints, bool]:
+def _map(file: Path, radiance=1.0, samples=MAP_SAMPLES):
+    return EnvironmentMap(read_image(file), radiance=radiance, samples=samples)
+
+
+def _mask(visibility: Path, visibility_layer: _Layer | None = None):
+    """The first channel of the picture or layer."""
+    if visibility_layer is None:
+        return read_image(visibility, encoding="linear")[..., 0]
+    return _layer(visibility, read_layers(visibility), visibility_layer)[..., 0]
+
+
+def _points(file: Path, position: _Layer | None = None, normal: _Layer | None = None, to_view=None):
     """Surface points from the layers of an image file, and whether their positions are among them."""
-    path = table.file("file", "aovs.exr")
-    to_view = table.plain("to_view")
-    if to_view is not None:
-        to_view = direction_value(f"{table.place}.to_view", to_view)
-    names = {key: table.layer(key) for key in ("position", "normal")}
-    table.done("file", "position", "normal", "to_view")
-    layers = read_layers(path)
-    normal = _layer(layers, names["normal"], NORMAL_LAYERS, path)
-    if normal is None:
-        raise InputError(path, f"has no layer of normals, got {_named(layers)}", 'Name the layer: normal = "..."')
-    position = _layer(layers, names["position"], POSITION_LAYERS, path)
-    if to_view is None:
-        to_view = _layer(layers, None, VIEW_LAYERS, path)
-    try:
-        towards = (0, 0, 1) if to_view is None else to_view
-        return SurfacePoints.from_normals(normal, position=position, to_view=towards), position is not None
-    except InputError as error:
-        raise error.inside(str(path)) from None
+    towards = (0, 0, 1) if to_view is None else direction_value("to_view", to_view)
+    layers = read_layers(file)
+    normals = _layer(file, layers, normal, "normal", "sh_normal", "N")
+    if normals is None:
+        raise InputError(file, f"has no layer of normals, got {_named(layers)}", 'Name the layer: normal = "..."')
+    positions = _layer(file, layers, position, "position", "P")
+    towards = layers.get("to_view", towards) if to_view is None else towards
+    return SurfacePoints.from_normals(normals, position=positions, to_view=towards), positions is not None
 
 
-def _named(layers: dict[str, Any]) -> str:
+def _named(layers):
     return ", ".join(name or "the unnamed one" for name in layers)
 
 
-def _layer(layers: dict[str, Any], name: str | None, known: tuple[str, ...], path: Path) -> Any:
+def _layer(file, layers, name, *usual):
+    """The layer that is named, or the first of the usual ones that there is."""
     if name is not None and name not in layers:
-        raise InputError(path, f"has no layer {name!r}, got {_named(layers)}", "Correct the layer's name")
-    candidates = known if name is None else (name,)
-    return next((layers[candidate] for candidate in candidates if candidate in layers), None)
+        raise InputError(file, f"has no layer {name!r}, got {_named(layers)}", "Correct the layer's name")
+    return next((layers[one] for one in ((name,) if name is not None else usual) if one in layers), None)
+
+
+_READERS: dict[str, Callable[[_Table], Any]] = {
+    "camera": lambda table: table.make(table.choose(CAMERAS)),
+    "shapes": _read_shape,
+    "aov": lambda table: table.make(_points),
+    "ambient": lambda table: table.make(lambda intensity: spectrum("intensity", intensity)),
+    "lights": _read_light,
+}
 
 
 # -- writing -----------------------------------------------------------------------------------------------------------
 
 
-def write_parts(path: str | Path, parts: dict[str, Any], aov: str | None = None) -> None:
+def write_scene(path: str | Path, scene: Any, aov: str | None = None) -> None:
     """Write a scene file; see `brdf.Scene.save`.
 
     Args:
         path: the file.
-        parts: the arguments of `brdf.Scene`.
+        scene: a `brdf.Scene`.
         aov: the file beside it that holds the points already; None writes one.
 
     Raises:
         InputError: where the file cannot be written.
     """
-    path = Path(path)
-    kinds = {cls: name for name, cls in (CAMERAS | SHAPES).items()}
-    sections = []
+    path, sections = Path(path), []
 
-    def section(header: str, values: dict[str, Any]) -> None:
-        sections.append("\n".join([header, *(f"{key} = {_toml(value)}" for key, value in values.items())]) + "\n")
+    def beside(ending, write, content):
+        """The name of a file beside the scene's, which is written."""
+        file = path.with_name(f"{path.stem}.{ending}")
+        write(file, content)
+        return file.name
 
-    def beside(ending: str) -> tuple[str, Path]:
-        return f"{path.stem}.{ending}", path.with_name(f"{path.stem}.{ending}")
+    def section(header, fields, **values):
+        values = fields | values
+        lines = [f"{key} = {_toml(value)}" for key, value in values.items() if value is not None and value is not True]
+        sections.append("\n".join([header, *lines, ""]))
 
-    camera, points = parts["camera"], parts["points"]
-    if camera is not None:
-        section("[camera]", {"type": kinds[type(camera)]} | _fields(camera))
-    if points is not None and aov is None:
-        aov, file = beside("aov.exr")
-        normal = np.where(np.asarray(points.mask)[..., None], np.asarray(points.normal), 0.0)
-        layers = {"position": np.asarray(points.position), "normal": normal, "to_view": np.asarray(points.to_view)}
-        write_layers(file, layers)
-    if points is not None:
-        section("[aov]", {"file": aov})
-    for index, shape in enumerate(parts["shapes"]):
-        values = {"type": kinds[type(shape)]} | _fields(shape)
+    if scene.camera is not None:
+        section("[camera]", _fields(scene.camera), type=scene.camera.type_name)
+    if scene.points is not None:
+        layers = {name: np.asarray(getattr(scene.points, name)) for name in ("position", "normal", "to_view")}
+        layers["normal"] = layers["normal"] * np.asarray(scene.points.mask)[..., None]
+        section("[aov]", {}, file=aov or beside("aov.exr", write_layers, layers))
+    for index, shape in enumerate(scene.shapes):
+        values = {"type": next(name for name, cls in SHAPES.items() if cls is type(shape))}
         if isinstance(shape, Triangles):
-            values["file"], file = beside(f"shape{index}.obj")
-            mesh = shape.mesh
-            del values["mesh"]
-            lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in mesh.vertices.tolist()]
-            if mesh.normals is None:
-                values["smooth"] = False
-                lines += [f"f {a} {b} {c}" for a, b, c in (mesh.faces + 1).tolist()]
-            else:
-                lines += [f"vn {x!r} {y!r} {z!r}" for x, y, z in mesh.normals.reshape(-1, 3).tolist()]
-                corners = [f"{vertex}//{at}" for at, vertex in enumerate((mesh.faces + 1).ravel().tolist(), start=1)]
-                lines += [f"f {a} {b} {c}" for a, b, c in zip(*[iter(corners)] * 3, strict=True)]
-            write_text(file, "\n".join(lines) + "\n")
-        section("[[shapes]]", values)
-    if parts["ambient"] is not None:
-        section("[ambient]", {"intensity": parts["ambient"]})
-    for index, light in enumerate(parts["lights"]):
+            file = beside(f"shape{index}.obj", write_text, _obj(shape.mesh))
+            values |= {"mesh": None, "file": file, "smooth": shape.mesh.normals is not None}
+        section("[[shapes]]", _fields(shape), **values)
+    if scene.ambient is not None:
+        section("[ambient]", {}, intensity=scene.ambient)
+    for index, (light, mask) in enumerate(itertools.zip_longest(scene.lights, scene.visibility)):
         values = {"type": light.type_name}
         if isinstance(light, EnvironmentMap):
-            values["file"], file = beside(f"light{index}.exr")
-            write_image(file, np.asarray(light.pixels, np.float32))
-            values |= {"radiance": light.radiance, "samples": light.samples}
-        else:
-            values |= _fields(light)
-        if parts["visibility"] and parts["visibility"][index] is not None:
-            values["visibility"], file = beside(f"visibility{index}.exr")
-            write_image(file, np.asarray(parts["visibility"][index], np.float32)[..., None])
-        section("[[lights]]", values)
+            values |= {"pixels": None, "file": beside(f"light{index}.exr", write_image, light.pixels)}
+        if mask is not None:
+            values["visibility"] = beside(f"visibility{index}.exr", write_image, mask)
+        section("[[lights]]", _fields(light), **values)
     write_text(path, "\n".join(sections))
 
 
-def _fields(item: Any) -> dict[str, Any]:
-    values = {field.name: getattr(item, field.name) for field in dataclasses.fields(item) if field.init}
-    return {name: value for name, value in values.items() if value is not None and (name, value) != ("fitted", True)}
+def _fields(item):
+    return {name: getattr(item, name) for name in inspect.signature(type(item)).parameters}
 
 
-def _toml(value: Any) -> str:
+def _obj(mesh):
+    """A mesh as Wavefront ``.obj``."""
+
+    def rows(word, array):
+        return [f"{word} {' '.join(map(repr, row))}" for row in array.tolist()]
+
+    lines = rows("v", mesh.vertices)
+    if mesh.normals is None:
+        lines += rows("f", mesh.faces + 1)
+    else:
+        lines += rows("vn", mesh.normals.reshape(-1, 3))
+        corner = itertools.count(1)
+        lines += [f"f {' '.join(f'{vertex}//{next(corner)}' for vertex in face)}" for face in (mesh.faces + 1).tolist()]
+    return "\n".join([*lines, ""])
+
+
+def _toml(value):
     """A TOML value: what JSON and TOML write alike."""
     return json.dumps(np.asarray(value, dtype=np.float64).tolist() if hasattr(value, "shape") else value)

@@ -88,9 +88,7 @@ def read_inputs(targets: list[Path], options: PictureOptions, encodings: dict[Pa
     else:
         inputs, file, tables = _read_pictures(kind, targets, options, encodings or {}, mask)
         if file is not None:
-            from brdf.scene import load_scene
-
-            return inputs._replace(scenes=[load_scene(file, options.within, tables)])
+            return inputs._replace(scenes=[brdf.Scene.load(file, within=options.within, tables=tables)])
         points, notes = _points(inputs.pictures[0].pixels.shape[:2], options, mask)
         directions, inputs = _directions(inputs._replace(notes=notes), points, options)
         intensities, names = _intensities(options.intensities, inputs.pictures), {}
