@@ -1,21 +1,19 @@
 """Files in and out: what may be read, and results that appear whole or not at all.
 
-A result is written under a temporary name beside its place and renamed when it is complete, so that an error, a full
-disk or Ctrl-C leaves whatever was there before, and nothing else. Renaming guards against a dying program, not against
-a power cut: nothing is forced to the disk. What a program leaves that is killed on the spot, the next that writes into
-the same folder removes: a writer holds a lock on what it stages, and the system lets go of it when the writer ends.
+A result is written into a hidden folder beside its place and moved when it is complete, so that an error, a full disk
+or Ctrl-C leaves whatever was there before, and nothing else. Renaming guards against a dying program, not against a
+power cut: nothing is forced to the disk. What a program leaves that is killed on the spot, the next that writes into
+the same folder removes: who writes there shares a lock on it, which the system lets go of when the writer ends.
 """
 
 import errno
-import functools
 import os
-import re
-import secrets
 import shutil
 import stat
+import tempfile
 import tomllib
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +24,7 @@ try:
 except ImportError:  # on Windows, where nothing is removed
     fcntl = None
 
-_STAGED = re.compile(r"\.brdf-[0-9a-f]{12}")
+_STAGED = ".brdf-staged-"
 _FREE, _ELSEWHERE = "Free some space or write elsewhere", "Change the permissions or choose another place"
 _REMEDIES = {
     errno.ENOSPC: ("there is no space left to write it", _FREE),
@@ -47,34 +45,13 @@ AnyPath = str | os.PathLike[str]
 
 
 @contextmanager
-def _told(path: AnyPath) -> Iterator[None]:
+def _told(path):
     """What the operating system refuses, as the one line that names what the user gave."""
     try:
         yield
     except OSError as error:
         what, remedy = _REMEDIES.get(error.errno or 0, (error.strerror or type(error).__name__, "Check the path"))
         raise InputError(path, what, remedy) from None
-
-
-def input_file(path: AnyPath) -> Path:
-    """The path of an ordinary, readable file that is not empty.
-
-    Args:
-        path: the file.
-
-    Raises:
-        InputError: if the file is missing, a folder, a device or a pipe, unreadable or empty.
-    """
-    # A named pipe without a writer would block the plain open for ever.
-    flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0)
-    name = _plain(path)
-    with _told(path), open(name, "rb", opener=lambda name, _: os.open(name, flags)) as file:
-        status = os.fstat(file.fileno())
-    if not stat.S_ISREG(status.st_mode):
-        raise InputError(name, "is not an ordinary file", "Give the path of a file")
-    if status.st_size == 0:
-        raise InputError(name, "is empty", "Give a file with content")
-    return Path(path)
 
 
 def as_path(path: Any) -> Path:
@@ -86,16 +63,12 @@ def as_path(path: Any) -> Path:
     Raises:
         InputError: where it is something else.
     """
-    return Path(_plain(path))
-
-
-def _plain(path: AnyPath) -> str:
     if not isinstance(path, str | os.PathLike) or not isinstance(os.fspath(path), str):
         raise InputError("path", f"must be text, got {type(path).__name__}", "Give the path of a file")
     text = os.fspath(path)
     with suppress(UnicodeEncodeError):
         if text and b"\0" not in os.fsencode(text):
-            return text
+            return Path(path)
     raise InputError(repr(text), "is not a path", "Give the path of a file")
 
 
@@ -115,6 +88,32 @@ def utf8_name(path: AnyPath) -> str:
     return os.fspath(path)
 
 
+def input_file(path: AnyPath) -> Path:
+    """The path of an ordinary, readable file that is not empty.
+
+    Args:
+        path: the file.
+
+    Raises:
+        InputError: if the file is missing, a folder, a device or a pipe, unreadable or empty.
+    """
+    file = as_path(path)
+    with _told(path):
+        if _ordinary(path, file).st_size == 0:
+            raise InputError(path, "is empty", "Give a file with content")
+        file.open("rb").close()
+    return file
+
+
+def _ordinary(path, file):
+    """The status of what has to be an ordinary file: a pipe without a writer would block an open for ever."""
+    status = file.stat()
+    if not stat.S_ISREG(status.st_mode):
+        what = "is a folder, not a file" if stat.S_ISDIR(status.st_mode) else "is not an ordinary file"
+        raise InputError(path, what, "Give the path of a file")
+    return status
+
+
 @contextmanager
 def atomic_path(path: AnyPath) -> Iterator[Path]:
     """A temporary name near ``path``, with the same suffix, that becomes ``path`` when the block ends well.
@@ -131,68 +130,37 @@ def atomic_path(path: AnyPath) -> Iterator[Path]:
     Raises:
         InputError: if the folder is missing or not writable, the disk is full, or ``path`` is no ordinary file.
     """
-    target = Path(os.path.realpath(_plain(path)))
-    if os.path.isdir(target):
-        raise InputError(path, "is a folder, not a file", "Give the path of a file")
-    if os.path.exists(target) and not os.path.isfile(target):
-        raise InputError(path, "is not an ordinary file", "Give the path of a file")
-    if not os.path.lexists(target.parent):
-        raise InputError(
-            path, f"cannot be written, there is no folder {os.path.dirname(_plain(path))}", "Make it first"
-        )
-    with _staging(target.parent, path) as stage:
-        temporary = stage / f"new{target.suffix}"
-        temporary.touch()
-        yield temporary
+    target = Path(os.path.realpath(as_path(path)))
+    with _told(path):
         if target.exists():
-            shutil.copymode(target, temporary)
-        temporary.replace(target)
+            _ordinary(path, target)
+        if not os.path.lexists(target.parent):
+            came = f"cannot be written, there is no folder {as_path(path).parent}"
+            raise InputError(path, came, "Make it first")
+        with _staging(target.parent) as stage:
+            temporary = stage / f"new{target.suffix}"
+            temporary.touch()
+            yield temporary
+            if target.exists():
+                shutil.copymode(target, temporary)
+            temporary.replace(target)
 
 
 @contextmanager
-def _staging(folder: Path, path: AnyPath) -> Iterator[Path]:
-    """A hidden folder in another one, that nobody else removes while it is written into, and that is gone then."""
-    name, lock = secrets.token_hex(6), None
-    # Locked before it has the name by which it could be found abandoned.
-    new, stage = folder / f".brdf-new-{name}", folder / f".brdf-{name}"
-    try:
-        with _told(path):
-            _remove_abandoned(folder)
-            new.mkdir()
-            lock = _lock(new)
-            new.rename(stage)
-            yield stage
-    finally:
-        for place in (new, stage):
-            shutil.rmtree(place, ignore_errors=True)
-        if lock is not None:
-            os.close(lock)
-
-
-def _lock(place: Path) -> int | None:
-    """What holds a folder until it is closed or this process ends; None where that cannot be had."""
-    if fcntl is None:
-        return None
-    with suppress(OSError):
-        descriptor = os.open(place, os.O_RDONLY)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return descriptor
-        except OSError:
-            os.close(descriptor)
-    return None
-
-
-@functools.cache
-def _remove_abandoned(folder: Path) -> None:
-    """Remove what writers that are gone have staged there, once for each folder."""
-    staged = [place for place in folder.glob(".brdf-*") if _STAGED.fullmatch(place.name)]
-    for place in staged:
-        with suppress(OSError):
-            lock = _lock(place)
-            if lock is not None:
-                shutil.rmtree(place)
-                os.close(lock)
+def _staging(folder):
+    """A hidden folder in another one, gone at the end; what writers that are no more have staged there goes first."""
+    with ExitStack() as lock:
+        if fcntl is not None:
+            descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+            lock.callback(os.close, descriptor)
+            with suppress(OSError):  # others write there, or the file system knows no locks
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                for abandoned in folder.glob(f"{_STAGED}*"):
+                    shutil.rmtree(abandoned)
+            with suppress(OSError):
+                fcntl.flock(descriptor, fcntl.LOCK_SH)
+        with tempfile.TemporaryDirectory(prefix=_STAGED, dir=folder, ignore_cleanup_errors=True) as stage:
+            yield Path(stage)
 
 
 def write_text(path: AnyPath, text: str) -> None:
@@ -225,18 +193,18 @@ def atomic_folder(path: AnyPath) -> Iterator[Path]:
     Raises:
         InputError: if the folder cannot be made or written, or a folder stands where a file of the set belongs.
     """
-    folder = Path(os.path.realpath(_plain(path)))
+    folder = Path(os.path.realpath(as_path(path)))
     missing = [parent for parent in (folder, *folder.parents) if not os.path.exists(parent)]
     new = folder
     try:
         with _told(path):
             folder.mkdir(parents=True, exist_ok=True)
-        with _staging(folder, path) as stage:
-            new, old = stage / "new", stage / "old"
-            for place in (new, old):
-                place.mkdir()
-            yield new
-            _move_together(new, old, folder)
+            with _staging(folder) as stage:
+                new, old = stage / "new", stage / "old"
+                new.mkdir()
+                old.mkdir()
+                yield new
+                _move_together(new, old, folder)
     except InputError as error:
         # Named as it would have been in its place: where it was written is gone by now.
         staged = Path(error.where)
@@ -262,23 +230,20 @@ def check_folder(path: AnyPath) -> None:
         pass
 
 
-def _move_together(new: Path, old: Path, folder: Path) -> None:
+def _move_together(new, old, folder):
     """Move the new files into place; if one fails, put back the old ones."""
-    names = os.listdir(new)
-    try:
-        for name in names:
-            if (folder / name).is_dir():
-                raise InputError(folder / name, "is a folder, not a file", "Move it away or choose another folder")
-            with suppress(FileNotFoundError):
-                (folder / name).rename(old / name)
-            (new / name).rename(folder / name)
-    except BaseException:
-        for name in names:
-            if not (new / name).exists():
-                (folder / name).unlink(missing_ok=True)
-            if (old / name).exists():
-                (old / name).replace(folder / name)
-        raise
+    with ExitStack() as undo:
+        for file in list(new.iterdir()):
+            place = folder / file.name
+            if place.is_dir():
+                raise InputError(place, "is a folder, not a file", "Move it away or choose another folder")
+            if place.exists():
+                undo.callback((old / file.name).replace, place)
+                place.rename(old / file.name)
+            else:
+                undo.callback(place.unlink, missing_ok=True)
+            file.rename(place)
+        undo.pop_all()
 
 
 def read_text(path: AnyPath, most: int = MAX_TEXT_BYTES) -> str:
