@@ -4,10 +4,10 @@ OpenImageIO and the libraries below it refuse most. Left to be found here are si
 that take the libraries seconds, and damage that libpng would tell on standard error itself.
 """
 
+import math
 import mmap
 import os
 import re
-import struct
 import zlib
 from pathlib import Path
 
@@ -31,9 +31,10 @@ oiio.attribute("limits:channels", MOST_CHANNELS)
 _UNSUSPICIOUS_BYTES = 1 << 26
 _AGAIN = "The file is damaged; make it again"
 _SEVERAL_PARTS = 0x10
-# A name, a null and 16 bytes of what it is (OpenEXR file layout).
+# Name and kind with a null behind each, and the size of the value; of a channel a name, a null and 16 bytes of what it
+# is (OpenEXR file layout).
+_ATTRIBUTE = re.compile(rb"[^\0]+\0([^\0]+)\0(.{4})", re.DOTALL)
 _CHANNEL = re.compile(rb"[^\0]+\0.{16}", re.DOTALL)
-_SCAN = re.compile(rb"\xff\xda")
 
 
 def check_content(path: Path) -> None:
@@ -45,59 +46,49 @@ def check_content(path: Path) -> None:
     Raises:
         InputError: naming the file, what there is too much of, and the most that is read; or where a PNG is damaged.
     """
+    checks = {b"v/1\x01": _check_openexr, b"\xff\xd8\xff": _check_jpeg, b"\x89PNG": _check_png}
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        if content[:4] == b"v/1\x01":
-            _check_openexr(path, content)
-        elif content[:3] == b"\xff\xd8\xff":
-            _check_jpeg(path, content)
-        elif content[:4] == b"\x89PNG":
-            _check_png(path, content)
+        for magic, check in checks.items():
+            if content[: len(magic)] == magic:
+                check(path, content)
 
 
-def _check_openexr(path: Path, content: mmap.mmap) -> None:
-    """Walk along the headers: name, kind, size and value of each attribute, a null at the end."""
+def _check_openexr(path, content):
+    """Count attributes and channels in the header of each part, behind which is a null."""
     at, attributes = 8, 0
-    while at < len(content):
-        if content[at] == 0:
-            at, attributes = at + 1, 0
-            if not content[5] & _SEVERAL_PARTS or content[at : at + 1] == b"\0":
-                return
-        kind = content.find(b"\0", at) + 1
-        value = content.find(b"\0", kind) + 5
-        if kind == 0 or value == 4 or value > len(content):
-            return
-        (size,) = struct.unpack_from("<I", content, value - 4)
+    while found := _ATTRIBUTE.match(content, at):
+        at = found.end() + int.from_bytes(found[2], "little")
         attributes += 1
         _check_count(path, "attributes", attributes, MOST_ATTRIBUTES)
-        if content[kind : value - 4] == b"chlist\0":
-            _check_count(path, "channels", len(_CHANNEL.findall(content, value, value + size)), MOST_CHANNELS)
-        at = value + size
+        if found[1] == b"chlist":
+            _check_count(path, "channels", len(_CHANNEL.findall(content, found.end(), at)), MOST_CHANNELS)
+        if content[at : at + 1] == b"\0":
+            at, attributes = at + 1, 0
+            if not content[5] & _SEVERAL_PARTS:
+                return
 
 
-def _check_jpeg(path: Path, content: mmap.mmap) -> None:
+def _check_jpeg(path, content):
     """Count the scans between the segments, which may hold thumbnails, and the end, behind which may be a film."""
     at = 2
     while content[at : at + 1] == b"\xff" and content[at + 1 : at + 2] != b"\xda":
         at += 2 + int.from_bytes(content[at + 2 : at + 4])
-    end = content.find(b"\xff\xd9", at)
-    _check_count(path, "scans", len(_SCAN.findall(content, at, end if end > 0 else len(content))), MOST_SCANS)
+    scans = content[at:].partition(b"\xff\xd9")[0].count(b"\xff\xda")
+    _check_count(path, "scans", scans, MOST_SCANS)
 
 
-def _check_png(path: Path, content: mmap.mmap) -> None:
+def _check_png(path, content):
     """Compare the checksums of what a picture needs; libpng leaves other chunks out where theirs are wrong."""
-    at = 8
-    while at + 8 <= len(content):
-        length, kind = struct.unpack_from(">I4s", content, at)
-        if not kind.isalpha():
-            raise InputError(path, "is damaged: it holds a chunk of no type", _AGAIN)
-        body, at = slice(at + 4, at + 8 + length), at + 12 + length
-        if kind[:1].isupper() and content[body.stop : at] != struct.pack(">I", zlib.crc32(content[body])):
+    at, kind = 8, b""
+    while kind != b"IEND" and at + 8 <= len(content):
+        end = at + 8 + int.from_bytes(content[at : at + 4])
+        kind = content[at + 4 : at + 8]
+        if not kind[:1].islower() and zlib.crc32(content[at + 4 : end]) != int.from_bytes(content[end : end + 4]):
             raise InputError(path, f"is damaged: the checksum of its {kind.decode('latin-1')} is wrong", _AGAIN)
-        if kind == b"IEND":
-            return
+        at = end + 4
 
 
-def _check_count(path: Path, what: str, count: int, most: int) -> None:
+def _check_count(path, what, count, most):
     if count > most:
         raise InputError(path, f"holds more than {most} {what}", _AGAIN)
 
@@ -118,7 +109,7 @@ def check_header(path: Path, spec: oiio.ImageSpec) -> None:
         raise InputError(path, f"holds a volume of depth {spec.depth}, not a picture", "Give one slice of it")
     # A tile is unpacked whole.
     sizes = [(spec.width, spec.height), (spec.full_width, spec.full_height), (spec.tile_width, spec.tile_height)]
-    width, height = max(sizes, key=lambda size: size[0] * size[1])
+    width, height = max(sizes, key=math.prod)
     claimed, size = width * height * spec.pixel_bytes(native=True), path.stat().st_size
     if claimed > max(_UNSUSPICIOUS_BYTES, MAX_RATIO * size) or min(spec.width, spec.height, spec.nchannels) < 1:
         what = f"claims {width} × {height} pixels of {spec.nchannels} channels in {size} bytes"

@@ -27,23 +27,14 @@ EncodingSource = Literal["given", "file", "format", "assumed"]
 
 FLOATS = ("float", "half", "double")
 _DISPLAY_FORMATS = ("jpeg", "gif", "webp")
+_SPACES: dict[str, Encoding] = {**dict.fromkeys(("lin", "raw", "data", "unknown"), "linear"), "srgb": "srgb"}
 _HOW_TO_SAY = 'Say how it is encoded: "linear", "srgb" or a gamma like 2.2'
 # Profiles hold 16-bit or s15Fixed16 numbers, tables of 256 entries are common; the curves lie 2e-2 apart.
 _CURVE_TOLERANCE = 2e-3
 # Chunks with their lengths; a gAMA of 0 means nothing (PNG, 11.3.2.2).
 _PNG_SAYS = re.compile(rb"\0\0\0\x01sRGB|\0\0\0\x04gAMA(?!\0{4})")
 # By the code for transfer characteristics (ITU-T H.273, table 3); the curve of a BT.709 display is that of BT.1886.
-_CICP_TRANSFERS: dict[int, Encoding] = {
-    1: 2.4,
-    4: 2.2,
-    5: 2.8,
-    6: 2.4,
-    8: "linear",
-    13: "srgb",
-    14: 2.4,
-    15: 2.4,
-    17: 2.6,
-}
+_CICP_TRANSFERS: dict[int, Encoding] = {1: 2.4, 4: 2.2, 5: 2.8, 6: 2.4, 8: "linear", 13: "srgb", 14: 2.4, 15: 2.4}
 _CICP_UNSPECIFIED = 2
 
 
@@ -60,13 +51,13 @@ def parse_encoding(where: object, value: Any) -> Encoding | None:
     if value is None:
         return None
     text = str(value).strip().lower()
-    if text in ("linear", "srgb"):
-        return "linear" if text == "linear" else "srgb"
+    if text == "linear" or text == "srgb":
+        return text
     try:
         gamma = float(text)
     except ValueError:
         gamma = 0.0
-    if isinstance(value, bool) or not 0.1 <= gamma <= 10.0:
+    if not 0.1 <= gamma <= 10.0:
         raise InputError(where, f"encoding must be linear, srgb or a gamma from 0.1 to 10, got {value!r}", _HOW_TO_SAY)
     return "linear" if gamma == 1.0 else gamma
 
@@ -134,7 +125,7 @@ def find_encoding(
     return ("srgb" if bits <= 8 else "linear"), "assumed"
 
 
-def _stated(path: Path, format_name: str, spec: Any) -> Encoding | None:
+def _stated(path, format_name, spec):
     attributes = {attribute.name: attribute.value for attribute in spec.extra_attribs}
     _, transfer, *_ = attributes.get("CICP", (0, _CICP_UNSPECIFIED))
     if transfer != _CICP_UNSPECIFIED:
@@ -152,23 +143,20 @@ def _stated(path: Path, format_name: str, spec: Any) -> Encoding | None:
             space = space if _PNG_SAYS.search(file.read(1 << 20).partition(b"IDAT")[0]) else ""
     if not space or format_name in (*_DISPLAY_FORMATS, "bmp", "pnm", "ico", "psd"):
         return None
-    power = re.match(r"g(\d)(\d)_", space)
-    if "oiio:Gamma" in attributes or power:
-        gamma = float(f"{power[1]}.{power[2]}") if power else round(float(attributes["oiio:Gamma"]), 6)
-        return parse_encoding(path, gamma)
-    if space.startswith(("lin", "raw", "data", "unknown")):
-        return "linear"
-    if space.startswith("srgb"):
-        return "srgb"
+    named = re.match(r"g(\d\d)_", space)
+    if named or "oiio:Gamma" in attributes:
+        return parse_encoding(path, round(attributes.get("oiio:Gamma") or int(named[1]) / 10, 6))
+    for start, encoding in _SPACES.items():
+        if space.startswith(start):
+            return encoding
     raise InputError(path, f"is encoded as {attributes['oiio:ColorSpace']}, which is not known here", _HOW_TO_SAY)
 
 
-def _of_profile(path: Path, profile: bytes) -> Encoding | None:
+def _of_profile(path, profile):
     """The curve that an ICC profile holds (ICC.1:2022, 7.3); None if it is damaged and so says nothing."""
     try:
         (count,) = struct.unpack_from(">I", profile, 128)
         tags = [struct.unpack_from(">4sII", profile, 132 + 12 * tag) for tag in range(min(count, 100))]
-        curves: set[Encoding | None]
         curves = {_of_curve(profile[start : start + size]) for kind, start, size in tags if kind[1:] == b"TRC"}
     except (struct.error, ValueError):
         return None
@@ -177,7 +165,7 @@ def _of_profile(path: Path, profile: bytes) -> Encoding | None:
     return curves.pop()
 
 
-def _of_curve(curve: bytes) -> Encoding | None:
+def _of_curve(curve):
     """The encoding whose curve this is (ICC.1:2022, 10.6 and 10.18), None where it is none of those known."""
     at, gamma = np.linspace(0, 1, 256), 1.0
     (number,) = struct.unpack_from(">I", curve, 8)

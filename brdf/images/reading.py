@@ -8,11 +8,12 @@ multiplied by alpha. NaN and infinite values are passed on; who fits leaves them
 Sizes are checked before memory is taken (`brdf.images.damage`); `ImageReader` reads pictures larger than memory.
 """
 
+import contextlib
 import dataclasses
 import itertools
-import re
+import textwrap
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
@@ -101,7 +102,7 @@ class Picture:
         return (np.interp(self.pixels / self.factor, table, np.gradient(table)) * self.factor).astype(np.float32)
 
 
-class ImageReader:
+class ImageReader(contextlib.AbstractContextManager):
     """A picture in a file, read by bands of rows, so that it may be larger than memory.
 
     Attributes:
@@ -145,11 +146,9 @@ class ImageReader:
         packed = spec.get_string_attribute("compression")
         self.lossy = name in ("jpeg", "webp", "heif") or packed.startswith(("jpeg", "dwa", "b44"))
         self.jpeg = Jpeg.of(self.path) if name == "jpeg" else None
-        self._top = LOSSY_TOP if self.lossy else 1.0
         turn = spec.get_int_attribute("Orientation", 1)
         self._turn = turn if turn in range(2, 9) else 1
-        # A turned photograph cannot be had by rows, and OpenImageIO 3.2 reads 64-bit TIFFs wrongly by rows; kept whole,
-        # it is read once.
+        # A turned photograph cannot be had by rows, and OpenImageIO 3.2 reads 64-bit TIFFs wrongly by rows.
         self._by_rows = self._turn == 1 and not _is_double_tiff(self._image)
         self._upright = None
         height, width = spec.full_height, spec.full_width
@@ -166,12 +165,8 @@ class ImageReader:
         """
         if not self.is_integer:
             return None, 0.0
-        step = np.max(np.diff(decode_table(self.encoding, min(self.bits, 16))))
-        return float(decode(np.array(self._top), self.encoding)), float(step)
-
-    def __enter__(self) -> Self:
-        """The reader itself."""
-        return self
+        top = decode(np.array(LOSSY_TOP if self.lossy else 1.0), self.encoding)
+        return float(top), float(np.max(np.diff(decode_table(self.encoding, min(self.bits, 16)))))
 
     def __exit__(self, *raised: object) -> None:
         """Close the file."""
@@ -198,9 +193,9 @@ class ImageReader:
             raise IndexError(f"rows {start} to {stop} of a picture with {self.shape[0]} rows")
         if self._by_rows:
             return self._shown(start, stop, self._colour, self.encoding)
-        if self._upright is None:
+        if self._upright is None:  # kept whole, it is read once
             self._upright = _turned(self._shown(0, self._spec.full_height, self._colour, self.encoding), self._turn)
-        return self._upright[start:stop].copy()
+        return self._upright[start:stop]
 
     def read(self) -> Float32[np.ndarray, "height width channels"]:
         """The whole picture, linear.
@@ -218,31 +213,30 @@ class ImageReader:
         check_memory(self.path, self.shape[0] * self.shape[1])
         return _turned(self._shown(0, self._spec.full_height, [self._alpha], "linear"), self._turn)[..., 0]
 
-    def _shown(self, start: int, stop: int, channels: list[int], encoding: Encoding) -> np.ndarray:
+    def _shown(self, start, stop, channels, encoding):
         """Rows of the display window, not turned; NaN where there are no data."""
         spec = self._spec
         top, left = spec.y - spec.full_y, spec.x - spec.full_x
-        first, last = max(start, top), min(stop, top + spec.height)
-        if first >= last:
-            return np.full((stop - start, spec.full_width, len(channels)), np.nan, np.float32)
+        first = min(max(start, top), stop)
+        last = max(min(stop, top + spec.height), first)
         begin, end = max(left, 0), min(left + spec.width, spec.full_width)
         data = self._data(first - top, last - top, channels, encoding)[:, begin - left : end - left]
         margins = np.array([(first - start, stop - last), (begin, spec.full_width - end), (0, 0)])
         return np.pad(data, margins, constant_values=np.nan) if margins.any() else data
 
-    def _data(self, first: int, last: int, channels: list[int], encoding: Encoding) -> np.ndarray:
+    def _data(self, first, last, channels, encoding):
         """Rows of the data window."""
         coded = self.is_integer and encoding != "linear"
         pixels = _read_rows(self.path, self._image, self._part, first, last, channels, "uint16" if coded else "float")
         if not coded:
             return decode(pixels, encoding)
         table, values = decode_table(encoding, 16), np.empty(pixels.shape, np.float32)
-        for row, codes in enumerate(pixels):
-            values[row] = table[codes]  # a row at a time: NumPy makes eight bytes of every code
+        for row, codes in zip(values, pixels, strict=True):
+            row[:] = table[codes]  # a row at a time: NumPy makes eight bytes of every code
         return values
 
 
-def _turned(stored: np.ndarray, turn: int) -> np.ndarray:
+def _turned(stored, turn):
     """Turn a picture as the Exif orientation says (CIPA DC-008, 4.6.4.A)."""
     if turn > 4:
         stored = stored.swapaxes(0, 1)
@@ -251,7 +245,7 @@ def _turned(stored: np.ndarray, turn: int) -> np.ndarray:
     return np.ascontiguousarray(stored[::-1] if turn in (3, 4, 7, 8) else stored)
 
 
-def _open(path: Path) -> oiio.ImageInput:
+def _open(path):
     check_content(path)
     request = oiio.ImageSpec()
     # Colour as stored: what a half-transparent pixel shows is not darkened.
@@ -260,7 +254,7 @@ def _open(path: Path) -> oiio.ImageInput:
     if image is None or image.format_name() in ("null", "term"):
         what = f"cannot be read as an image ({said(oiio, path)})"
         raise InputError(path, what, "Give an EXR, HDR, PNG, TIFF or JPEG file")
-    said(image)  # remarks on metadata; the pixels may be sound
+    said(image, path)  # remarks on metadata; the pixels may be sound
     spec = image.spec()
     check_header(path, spec)
     if _is_double_tiff(image) and (spec.tile_width or spec.height == 1):
@@ -268,15 +262,15 @@ def _open(path: Path) -> oiio.ImageInput:
     return image
 
 
-def _is_double_tiff(image: oiio.ImageInput) -> bool:
+def _is_double_tiff(image):
     """Whether OpenImageIO 3.2 reads it right only as a whole: rows and tiles of such files come as garbage."""
     spec = image.spec()
     separate = spec.get_string_attribute("planarconfig") == "separate"
     return image.format_name() == "tiff" and str(spec.format) == "double" and not separate
 
 
-def said(source: Any, path: AnyPath = "") -> str:
-    """What OpenImageIO says went wrong, the first line of it, and forgets then.
+def said(source: Any, path: AnyPath) -> str:
+    """What OpenImageIO says went wrong, in a line, and forgets then.
 
     Args:
         source: the image input or output, or the module itself for a file that did not open.
@@ -287,14 +281,12 @@ def said(source: Any, path: AnyPath = "") -> str:
     except UnicodeDecodeError as error:
         # Bytes of a damaged header, quoted by the reader.
         message = error.object.decode("utf-8", "replace")
-    if path:
-        name = re.escape(str(path))
-        message = re.sub(f'( for)? [("]+{name}[)"]+|"{name}":? ', "", message).replace(str(path), "it")
-    line, *_ = [line.strip() for line in message.splitlines() if line.strip()] or ["no reason given"]
-    return (line if len(line) <= 200 else line[:197] + "...").rstrip(". ")
+    for name in (f'"{path}"', str(path)):
+        message = message.replace(name, "it")
+    return textwrap.shorten(message, 200, placeholder="...").rstrip(". ")
 
 
-def _layers(image: oiio.ImageInput) -> dict[tuple[int, str], dict[str, int]]:
+def _layers(image):
     """The channels of each part and layer, by what comes after the last dot of their names."""
     layers = {}
     for part in range(max(1, image.spec().get_int_attribute("oiio:subimages"))):
@@ -304,18 +296,18 @@ def _layers(image: oiio.ImageInput) -> dict[tuple[int, str], dict[str, int]]:
     return layers
 
 
-def _choose_channels(image: oiio.ImageInput) -> tuple[int, list[int], int | None]:
+def _choose_channels(image):
     """The part and channels that are the picture, and its alpha; depth and further layers are left apart.
 
     Only OpenEXR files name their channels reliably: R, G, B, else Y of the unnamed layer are the picture, in the first
     part that has them, else those of the first layer that has them (not the Y of X, Y, Z), else (a spectral
     file) all channels in the order of the file. In other formats the picture is what comes before alpha.
     """
-    spec = image.spec()
-    every = list(range(spec.nchannels))
+    names = image.spec().channelnames
+    every = list(range(len(names)))
     if image.format_name() != "openexr":
         # By its name: some readers number an alpha channel beyond the last one.
-        alpha = spec.channelnames.index("A") if "A" in spec.channelnames[1:] else None
+        alpha = names.index("A") if "A" in names[1:] else None
         return 0, every[:alpha], alpha
     layers = _layers(image)
     for named, wanted in itertools.product((False, True), ("RGB", "Y")):
@@ -328,27 +320,28 @@ def _choose_channels(image: oiio.ImageInput) -> tuple[int, list[int], int | None
     return 0, rest or every, apart.get("A") if rest else None
 
 
-def _read_rows(path, image, part: int, start: int, stop: int, channels: list[int], kind: str) -> np.ndarray:
+def _read_rows(path, image, part, start, stop, channels, kind):
     """Rows of the data window of a part, (rows, width, channels); OpenImageIO converts them to "float" or codes."""
     spec = image.spec(part)
     low, high = min(channels), max(channels) + 1
-    first, last, skip = spec.y + start, spec.y + stop, 0
+    if start == stop:
+        return np.empty((0, spec.width, len(channels)), np.float32)
+    # OpenImageIO takes whole tiles only.
+    tile = spec.tile_height if spec.tile_width else 1
+    skip, last = start % tile, min(-(-stop // tile) * tile, spec.height)
+    rows = spec.y + start - skip, spec.y + last
     if spec.tile_width:
-        # OpenImageIO takes whole tiles only.
-        skip = start % spec.tile_height
-        last = min(spec.y - (-stop // spec.tile_height) * spec.tile_height, spec.y + spec.height)
-        sides = (spec.x, spec.x + spec.width, first - skip, last, spec.z, spec.z + 1)
-        pixels = image.read_tiles(part, 0, *sides, low, high, kind)
+        columns = spec.x, spec.x + spec.width
+        pixels = image.read_tiles(part, 0, *columns, *rows, spec.z, spec.z + 1, low, high, kind)
     else:
-        pixels = image.read_scanlines(part, 0, first, last, spec.z, low, high, kind)
-    complaint = said(image, path) if image.has_error else ""
+        pixels = image.read_scanlines(part, 0, *rows, spec.z, low, high, kind)
+    complaint = said(image, path)
     if pixels is None or (complaint and not any(remark in complaint for remark in _HARMLESS)):
         what = f"is damaged: rows {start} to {stop} of {spec.height} cannot be read ({complaint or 'no data'})"
         raise InputError(path, what, "Make the file again")
     pixels = pixels.reshape(-1, spec.width, high - low)[skip : skip + stop - start]
-    if channels == list(range(low, high)):
-        return pixels
-    return pixels[..., [channel - low for channel in channels]]
+    contiguous = channels == list(range(low, high))
+    return pixels if contiguous else pixels[..., [channel - low for channel in channels]]
 
 
 def read_image(path: AnyPath, *, encoding: Encoding | None = None) -> Float32[np.ndarray, "height width channels"]:
@@ -390,10 +383,8 @@ def read_picture(path: AnyPath, *, encoding: Encoding | None = None) -> Picture:
         ('srgb', 8, 1.0)
     """
     with ImageReader(path, encoding=encoding) as reader:
-        top, _ = reader.codes
-        about = reader.encoding, reader.source, reader.bits, top
-        pixels, alpha = reader.read(), reader.read_alpha()
-        return Picture(pixels, alpha, *about, path=reader.path, lossy=reader.lossy, jpeg=reader.jpeg)
+        about = {name: getattr(reader, name) for name in ("encoding", "source", "bits", "path", "lossy", "jpeg")}
+        return Picture(reader.read(), reader.read_alpha(), saturation=reader.codes[0], **about)
 
 
 def read_mask(path: AnyPath) -> Bool[np.ndarray, "height width"]:
@@ -446,20 +437,19 @@ def read_layers(path: AnyPath) -> dict[str, Float32[np.ndarray, "height width ch
         >>> {name: values.shape for name, values in brdf.read_layers("target.exr").items()}
         {'': (32, 32, 3)}
     """
-    file = input_file(path)
+    file, layers = input_file(path), {}
     image = _open(file)
     found = _layers(image)
     specs = {part: image.spec(part) for part, _ in found}
     for spec in specs.values():
         check_header(file, spec)
     check_memory(file, sum(spec.width * spec.height * spec.nchannels for spec in specs.values()))
-    layers = {}
     for part, spec in specs.items():
         own = spec.get_string_attribute("oiio:subimagename", str(part)) if len(specs) > 1 else ""
         pixels = _read_rows(file, image, part, 0, spec.height, list(range(spec.nchannels)), "float")
         for (of_part, layer), at in found.items():
-            usual = sorted(at, key="RGBAXYZUV".find) if set(at) <= set("RGBAXYZUV") else list(at)
             if of_part == part:
+                usual = sorted(at, key=lambda ending: "RGBAXYZUV".find(ending) % 10)  # others last
                 layers[layer or own] = pixels[..., [at[ending] for ending in usual]]
     image.close()
     return layers

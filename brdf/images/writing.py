@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -32,19 +31,9 @@ _WRITABLE: dict[str, Mapping[str, tuple[Any, ...]]] = {
     ".jpeg": _JPEG,
 }
 _SPACES = {"linear": "lin_rec709_scene", "srgb": "srgb_rec709_scene"}
-# The last bytes of formats whose writers do not report a full disk.
-_ENDINGS = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
-_LARGEST_HALF = 65504.0
 
 
-def write_image(
-    path: AnyPath,
-    array: Any,
-    *,
-    dtype: DataType | None = None,
-    encoding: Encoding | None = None,
-    alpha: Any = None,
-) -> None:
+def write_image(path: AnyPath, array: Any, *, dtype: DataType | None = None, encoding: Encoding | None = None) -> None:
     """Write linear values as a picture, whole or not at all.
 
     Args:
@@ -54,7 +43,6 @@ def write_image(
             in PNG and JPEG.
         encoding: integers only: "srgb" (the default), "linear" or a gamma. The file says which; where the format has no
             words for it, that is an error.
-        alpha: coverage (H, W) to store beside the colour, not in JPEG and HDR.
 
     Raises:
         InputError: if format, data type, encoding and shape do not go together, or the file cannot be written.
@@ -63,29 +51,23 @@ def write_image(
         >>> ball = brdf.render(brdf.preset("gold"), brdf.Scene.load("scene.toml"))
         >>> brdf.write_image("ball.png", ball)
     """
-    suffix, kind = _format(path, dtype)
-    pixels, sayable = _pixels(path, array), _WRITABLE[suffix][kind]
-    channels = pixels.shape[2]
-    names = _endings(channels, "RGB")
-    if suffix not in (".exr", ".tif", ".tiff") and channels not in (1, 3):
-        raise InputError(path, f"a {suffix} file holds 1 or 3 channels, got {channels}", "Write .exr or .tif instead")
-    if suffix == ".hdr" and channels == 1:
-        pixels, names = pixels.repeat(3, axis=2), _endings(3, "RGB")
+    suffix, kinds = _format(path)
+    kind = dtype or next(iter(kinds))
+    if kind not in kinds:
+        raise InputError(path, f"{suffix} cannot hold {kind}", f"Use {' or '.join(kinds)}")
+    pixels, sayable = _pixels(path, array), kinds[kind]
+    if suffix not in (".exr", ".tif", ".tiff") and pixels.shape[2] not in (1, 3):
+        came = f"a {suffix} file holds 1 or 3 channels, got {pixels.shape[2]}"
+        raise InputError(path, came, "Write .exr or .tif instead")
+    if suffix == ".hdr":
+        pixels = np.broadcast_to(pixels, (*pixels.shape[:2], 3))
     encoded = parse_encoding("encoding", encoding) or sayable[0]
     if encoded not in sayable:
         words = f"Use {', '.join(map(str, sayable))}"
         raise InputError(path, f"a {suffix} of {kind} cannot say that it is encoded as {encoded}", words)
     if kind.startswith("uint"):
         pixels = encode(np.clip(np.nan_to_num(pixels, nan=0.0), 0.0, 1.0), encoded)
-    elif kind == "half" and np.any(np.abs(pixels[np.isfinite(pixels)]) > _LARGEST_HALF):
-        raise InputError(path, f"half floats end at {_LARGEST_HALF:.0f}", 'Write dtype "float" instead')
-    if alpha is not None:
-        coverage = _pixels(path, alpha)
-        if suffix in (".hdr", ".jpg", ".jpeg") or coverage.shape != (*pixels.shape[:2], 1):
-            what = f"alpha of shape {coverage.shape[:2]} cannot go with a {suffix} of shape {pixels.shape[:2]}"
-            raise InputError(path, what, "Give alpha as (H, W), and a file that can hold it")
-        pixels, names = np.concatenate([pixels, np.clip(coverage, 0, 1)], axis=2), [*names, "A"]
-    _write(path, pixels, names, kind, encoded)
+    _write(path, {"": pixels}, kind, encoded)
 
 
 def write_layers(path: AnyPath, layers: Mapping[str, Any]) -> None:
@@ -98,79 +80,62 @@ def write_layers(path: AnyPath, layers: Mapping[str, Any]) -> None:
     Raises:
         InputError: if sizes differ, there is no layer, or the file cannot be written.
     """
-    suffix, kind = _format(path, None)
     arrays = {layer: _pixels(path, array) for layer, array in layers.items()}
-    if suffix != ".exr" or len({array.shape[:2] for array in arrays.values()}) != 1:
+    if _format(path)[0] != ".exr" or len({array.shape[:2] for array in arrays.values()}) != 1:
         raise InputError(path, "layers need an .exr file and one size", "Give arrays of one height and width")
-    names: list[str] = []
-    for layer, array in arrays.items():
-        endings = _endings(array.shape[2], "XYZ" if layer else "RGB")
-        names += [f"{layer}.{ending}" if layer else ending for ending in endings]
-    _write(path, np.concatenate(list(arrays.values()), axis=2), names, kind, "linear")
+    _write(path, arrays, "float", "linear")
 
 
-def _endings(count: int, three: str) -> list[str]:
-    return list({1: "Y", 3: three}.get(count, "")) or [f"C{index:04d}" for index in range(count)]
-
-
-def _format(path: AnyPath, dtype: str | None) -> tuple[str, str]:
+def _format(path):
     suffix = as_path(path).suffix.lower()
     if suffix not in _WRITABLE:
         raise InputError(path, f"{suffix or 'no suffix'} is no image format", f"Use one of {' '.join(_WRITABLE)}")
-    kinds = _WRITABLE[suffix]
-    if dtype is not None and dtype not in kinds:
-        raise InputError(path, f"{suffix} cannot hold {dtype}", f"Use {' or '.join(kinds)}")
-    return suffix, dtype or next(iter(kinds))
+    return suffix, _WRITABLE[suffix]
 
 
-def _pixels(path: object, array: Any) -> np.ndarray:
+def _pixels(path, array):
     try:
         pixels = np.asarray(array)
-        pixels = np.asarray(pixels, np.float32) if pixels.dtype.kind in "fiub" else None
+        shape = f"shape {pixels.shape}" if pixels.dtype.kind in "fiub" else "no numbers"
     except (TypeError, ValueError):
-        pixels = None
-    if pixels is None or pixels.ndim not in (2, 3) or 0 in pixels.shape:
-        shape = "no numbers" if pixels is None else f"shape {pixels.shape}"
+        pixels, shape = np.empty(0), "no numbers"
+    if pixels.ndim not in (2, 3) or 0 in pixels.shape or shape == "no numbers":
         raise InputError(path, f"a picture is (H, W) or (H, W, C) numbers, got {shape}", "Give such an array")
-    return np.ascontiguousarray(pixels[..., None] if pixels.ndim == 2 else pixels)
+    return np.atleast_3d(pixels).astype(np.float32, copy=False)
 
 
-def _write(path: AnyPath, pixels: np.ndarray, names: list[str], kind: str, encoding: Encoding) -> None:
+def _write(path, layers, kind, encoding):
+    names = []
+    for layer, array in layers.items():
+        channels = array.shape[2]
+        endings = {1: "Y", 3: "XYZ" if layer else "RGB"}.get(channels) or [f"C{index:04d}" for index in range(channels)]
+        names += [f"{layer}.{ending}" if layer else ending for ending in endings]
     if len(names) > MOST_CHANNELS:
         came = f"would have {len(names)} channels, which nothing reads back"
         raise InputError(path, came, f"Write at most {MOST_CHANNELS} into a file")
+    pixels = np.concatenate(list(layers.values()), axis=2)
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
     spec.channelnames = tuple(names)
-    spec.alpha_channel = names.index("A") if "A" in names else -1
-    spec.attribute("oiio:UnassociatedAlpha", 1)
-    if Path(path).suffix.lower() in (".jpg", ".jpeg"):
+    spec.alpha_channel = -1
+    if as_path(path).suffix.lower().startswith(".jp"):
         spec.attribute("CompressionQuality", 95)
         spec.attribute("jpeg:subsampling", "4:4:4")
     if kind.startswith("uint"):
         power = "" if isinstance(encoding, str) else f"g{round(10 * encoding)}_rec709_scene"
-        spec.attribute("oiio:ColorSpace", power or _SPACES[str(encoding)])
+        spec.attribute("oiio:ColorSpace", power or _SPACES[encoding])
     with atomic_path(path) as temporary:
         _ask_for_space(temporary, spec)
         file = oiio.ImageOutput.create(utf8_name(temporary))
         assert file is not None  # of a format that OpenImageIO has
         ok = file.open(str(temporary), spec) and file.write_image(pixels)
-        ok = file.close() and ok
         # A remark without a failure does not count: TIFF complains of Exif data that nobody asked for.
-        if not ok or not _is_complete(temporary):
-            what = f"cannot be written ({said(file, temporary)})"
+        if not (file.close() and ok):
+            what = f"cannot be written ({said(file, temporary) or 'no reason given'})"
             raise InputError(path, what, "Check the space left and the size of the picture")
 
 
-def _ask_for_space(temporary: Path, spec: oiio.ImageSpec) -> None:
-    """Find a full disk, a quota or a limit out first: libjpeg ends the program then, others do not tell the reason."""
+def _ask_for_space(temporary, spec):
+    """Find a full disk, a quota or a limit out first: libjpeg ends the program then, libpng and others do not tell."""
     if hasattr(os, "posix_fallocate"):
         with temporary.open("r+b") as file:
             os.posix_fallocate(file.fileno(), 0, 3 * spec.image_bytes() // 2 + (1 << 16))
-
-
-def _is_complete(temporary: Path) -> bool:
-    """Whether a file ends as its format does; libpng's failures to write are not reported."""
-    ending = _ENDINGS.get(temporary.suffix.lower(), b"")
-    with temporary.open("rb") as file:
-        file.seek(max(0, file.seek(0, os.SEEK_END) - len(ending)))
-        return file.read() == ending

@@ -205,9 +205,8 @@ def test_as_many_channels_are_read_as_are_written(tmp_path, suffix):
     values = random(2, 3, damage.MOST_CHANNELS)
     write_image(tmp_path / f"a{suffix}", values)
     np.testing.assert_array_equal(read_image(tmp_path / f"a{suffix}"), values)
-    for array, alpha in ((random(2, 3, damage.MOST_CHANNELS + 1), None), (values, values[..., 0])):
-        with pytest.raises(InputError, match=r"would have 4097 channels, .*at most 4096"):
-            write_image(tmp_path / f"b{suffix}", array, alpha=alpha)
+    with pytest.raises(InputError, match=r"would have 4097 channels, .*at most 4096"):
+        write_image(tmp_path / f"b{suffix}", random(2, 3, damage.MOST_CHANNELS + 1))
     assert damage.MOST_CHANNELS == materials.MOST_CHANNELS
 
 
