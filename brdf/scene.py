@@ -78,7 +78,9 @@ class Scene(Checked):
         words = "Write Scene(camera, shapes=[...], lights=[...]), or points=brdf.SurfacePoints.from_normals(...)"
         for name, kind in {"camera": Camera, "points": SurfacePoints, "shapes": Shape, "lights": Light}.items():
             part = getattr(self, name)
-            parts = {f"{name}[{index}]": one for index, one in enumerate(part)} if isinstance(part, tuple) else {name: part}
+            parts = (
+                {f"{name}[{index}]": one for index, one in enumerate(part)} if isinstance(part, tuple) else {name: part}
+            )
             for place, one in parts.items():
                 if one is not None:
                     instance(place, one, kind, words)

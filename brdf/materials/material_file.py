@@ -6,7 +6,7 @@ stands for a sum, of which the picture says no more, is a number, and ``note`` s
 
 import dataclasses
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from brdf.models import MODELS, Material
 from brdf.models.base import check_single
 
 _MOST_BYTES = 1 << 22
+_NOTHING: Mapping[str, str] = {}
 
 
 def load_material(path: str | Path, name: str | None = None) -> Material:
@@ -52,7 +53,7 @@ def read_material(path: str | Path, name: str | None = None) -> tuple[Material, 
         InputError: likewise.
     """
     entries = _entries(path)
-    names = ", ".join(known[:SHOWN] for known in list(entries)[:10]) + (" or another" if len(entries) > 10 else "")
+    names = ", ".join(known[:SHOWN] for known in list(entries)[:10]) + " or another" * (len(entries) > 10)
     if name is None and len(entries) > 1:
         raise InputError(path, f"holds {len(entries)} materials", f"Name one of {names}")
     wanted = next(iter(entries)) if name is None else name
@@ -90,14 +91,14 @@ def read_materials(path: str | Path) -> dict[str, tuple[Material, str]]:
     return {name: _material(path, name, entry) for name, entry in _entries(path).items()}
 
 
-def save_material(material: Material, path: str | Path, *, undetermined: Collection[str] = ()) -> None:
+def save_material(material: Material, path: str | Path, *, undetermined: Mapping[str, str] = _NOTHING) -> None:
     """Write a material that `load_material` reads back.
 
     Args:
         material: any of the models; MTL holds three channels, so one channel is written three times.
         path: a ``.json`` or ``.mtl`` file.
         undetermined: what a picture could not determine, written as ``null`` where it is 0: "n", "k_s" or "k_s[2]" for
-            one channel; a dictionary says why.
+            one channel, and why.
 
     Raises:
         InputError: where the file cannot be written or cannot hold the material.
@@ -107,24 +108,23 @@ def save_material(material: Material, path: str | Path, *, undetermined: Collect
     """
     instance("material", material, Material, "Write brdf.save_material(material, path)")
     check_single(material)
-    channels = material.k_d.shape[0]
+    channels = material.k_d.size
     if _suffix(path, "Name it .json or .mtl") == ".json":
         text = to_json(material, undetermined=undetermined)
     elif channels in (1, 3):
         note = material_to_dict(material, undetermined=undetermined).get("note", "")
         text = to_mtl(material, undetermined=undetermined, note=note)
     else:
-        came = f"cannot hold {channels} channels, MTL knows RGB alone"
-        raise InputError(path, came, "Save the material as .json")
+        raise InputError(path, f"cannot hold {channels} channels, MTL knows RGB alone", "Save the material as .json")
     write_text(path, text)
 
 
-def to_json(material: Material, *, undetermined: Collection[str] = ()) -> str:
+def to_json(material: Material, *, undetermined: Mapping[str, str] = _NOTHING) -> str:
     """The text of a JSON file; see `save_material`."""
     return json.dumps(material_to_dict(material, undetermined=undetermined), indent=2) + "\n"
 
 
-def material_to_dict(material: Material, *, undetermined: Collection[str] = ()) -> dict[str, Any]:
+def material_to_dict(material: Material, *, undetermined: Mapping[str, str] = _NOTHING) -> dict[str, Any]:
     """The material as JSON holds it; numbers that are not 0 although no picture determined them are told in a note.
 
     Args:
@@ -132,20 +132,21 @@ def material_to_dict(material: Material, *, undetermined: Collection[str] = ()) 
         undetermined: see `save_material`.
     """
     values: dict[str, Any] = {"model": material.name}
-    reasons = undetermined if isinstance(undetermined, Mapping) else {}
-    open_keys: dict[str, list[str]] = {}
+    told: dict[str, dict[str, None]] = {}
     for key in _parameters(type(material)):
         numbers = np.asarray(getattr(material, key), np.float64)
         listed: list[Any] = numbers.ravel().tolist()
         for channel, number in enumerate(listed):
             for name in {key, f"{key}[{channel}]"}.intersection(undetermined):
                 if number:
-                    open_keys.setdefault(reasons.get(name, "the picture leaves them open"), []).append(name)
+                    told.setdefault(undetermined[name], {})[name] = None
                 else:
                     listed[channel] = None
         values[key] = listed if numbers.ndim else listed[0]
-    told = "; ".join(f"{', '.join(dict.fromkeys(keys))}: {reason}" for reason, keys in open_keys.items())
-    return values | ({"note": f"not determined: {told}"} if told else {})
+    if told:
+        reasons = "; ".join(f"{', '.join(names)}: {reason}" for reason, names in told.items())
+        values["note"] = f"not determined: {reasons}"
+    return values
 
 
 def material_from_dict(values: Any) -> Material:
@@ -175,38 +176,29 @@ def material_from_dict(values: Any) -> Material:
     return MODELS[name](**numbers)
 
 
-def _parameters(model: type[Material]) -> list[str]:
+def _parameters(model):
     return [field.name for field in dataclasses.fields(model)]
 
 
-def _numbers(key: str, value: Any) -> Any:
+def _numbers(key, value):
     several = value if isinstance(value, list) else [value]
     if len(several) > MOST_CHANNELS:
         raise InputError(key, f"has {len(several)} channels", f"Give at most {MOST_CHANNELS}")
     for number in several:
-        if number is not None and (isinstance(number, bool) or not isinstance(number, int | float)):
+        if type(number) not in (int, float, type(None)):
             raise InputError(key, f"must be a number, got {json.dumps(number)[:SHOWN]}", "Give numbers or null")
-    numbers = [0.0 if number is None else number for number in several]
+    numbers = [number or 0.0 for number in several]
     return numbers if isinstance(value, list) else numbers[0]
 
 
-def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    entries: dict[str, Any] = {}
-    for key, value in pairs:
-        if key in entries:
-            raise InputError(key[:SHOWN], "is given twice", "Give it once")
-        entries[key] = value
-    return entries
-
-
-def _suffix(path: str | Path, remedy: str) -> str:
+def _suffix(path, remedy):
     suffix = as_path(path).suffix.lower()
     if suffix not in (".json", ".mtl"):
         raise InputError(path, f"is no material file, got {suffix or 'no suffix'}", remedy)
     return suffix
 
 
-def _entries(path: str | Path) -> dict[str, Any]:
+def _entries(path):
     """What a file says of each of its materials, by name."""
     if as_path(path).is_dir():
         folder, path = path, Path(path) / "material.json"
@@ -216,16 +208,14 @@ def _entries(path: str | Path) -> dict[str, Any]:
     if suffix == ".mtl":
         return read_mtl(path, text)
     try:
-        values = json.loads(text, object_pairs_hook=_without_repetition)
-    except InputError as error:
-        raise error.inside(path) from None
+        values = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise InputError(path, f"is not JSON ({error})", "Correct the file") from None
     is_report = isinstance(values, dict) and "model" not in values and "material" in values
     return {Path(path).stem: values["material"] if is_report else values}
 
 
-def _material(path: str | Path, name: str, entry: Any) -> tuple[Material, str]:
+def _material(path, name, entry):
     """What is wrong with one material keeps nobody from another of the file."""
     is_mtl = Path(path).suffix.lower() == ".mtl"
     try:

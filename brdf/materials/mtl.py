@@ -4,8 +4,7 @@ A highlight that MTL has no word for is written as the nearest one it has, and a
 names the model, so that what was saved reads back.
 """
 
-import math
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -16,8 +15,7 @@ from brdf.files import parse_number
 from brdf.models import MODELS, BlinnPhong, Lambert, Material, NormalizedPhong, Phong, SpecularMaterial
 
 SHOWN = 40  # the first letters of a word that messages show
-_MODEL_COMMENT = "# brdf model:"
-_NOTE_COMMENT = "# note:"
+_COMMENTS = {"model": "# brdf model:", "note": "# note:"}
 _TEXTURE = "map_kd"
 _COEFFICIENTS = {"ka": "k_a", "kd": "k_d", "ks": "k_s"}
 
@@ -44,11 +42,11 @@ def to_mtl(material: Material, *, name: str = "fitted", undetermined: Collection
     """
     lines = ["# Wavefront material, linear values"]
     if type(material) is not BlinnPhong:
-        lines.append(f"{_MODEL_COMMENT} {material.name}")
+        lines.append(f"{_COMMENTS['model']} {material.name}")
     if undetermined:
         lines.append(f"# not determined by the picture: {', '.join(undetermined)}")
     if note:
-        lines.append(f"{_NOTE_COMMENT} {note}")
+        lines.append(f"{_COMMENTS['note']} {note}")
     lines.append(f"newmtl {name}")
     colours, illum = [material.k_a, material.k_d, 0.0], 1
     if isinstance(material, SpecularMaterial):
@@ -71,56 +69,47 @@ def read_mtl(path: Any, text: str) -> dict[str, dict[str, Any]]:
         InputError: naming the line.
     """
     entries: dict[str, dict[str, Any]] = {}
-    name = model = note = None
-    for number, line in _logical_lines(text):
-        place = f"{path}: line {number}"
-        if line.startswith(_MODEL_COMMENT):
-            model = line.removeprefix(_MODEL_COMMENT).strip()
-        elif line.startswith(_NOTE_COMMENT):
-            note = line.removeprefix(_NOTE_COMMENT).strip()
-        words = line.partition("#")[0].split()
-        key = words[0].lower() if words else ""
+    name, told, start, begun = None, {}, 0, ""
+    for number, line in enumerate(text.splitlines(), start=1):
+        start = start if begun else number
+        line = begun + line.strip()
+        begun = line[:-1] + " " if line.endswith("\\") and not line.startswith("#") else ""
+        if begun:
+            continue
+        place = f"{path}: line {start}"
+        for key, comment in _COMMENTS.items():
+            if line.startswith(comment):
+                told[key] = line.removeprefix(comment).strip()
+        word, *given = line.partition("#")[0].split() or [""]
+        key = word.lower()
         if key == "newmtl":
-            name = line[len("newmtl") :].strip() or "unnamed"
+            name = line[len(word) :].strip() or "unnamed"
             if name in entries:
                 came = f"names the material {name[:SHOWN]} a second time"
                 raise InputError(place, came, "Give each a name of its own")
-            entries[name], note = {"model": model, "note": note}, None
+            entries[name] = dict(told)
+            told.pop("note", None)
         elif key in (*_COEFFICIENTS, "ns", "illum", _TEXTURE):
             if name is None:
-                raise InputError(place, f"has {words[0]} before any newmtl", "Start the material with newmtl NAME")
-            entries[name][key] = words[-1] if key == _TEXTURE else _numbers(place, words)
+                raise InputError(place, f"has {word} before any newmtl", "Start the material with newmtl NAME")
+            entries[name][key] = given[-1:] if key == _TEXTURE else _numbers(place, word, given)
     if not entries:
         raise InputError(path, "holds no material", "Give a file with a newmtl line")
     return entries
 
 
-def _logical_lines(text: str) -> Iterator[tuple[int, str]]:
-    """Lines by the number of their first, those that end in a backslash joined with the next."""
-    joined, first = "", 1
-    for number, line in enumerate(text.splitlines(), start=1):
-        joined += line.strip()
-        if joined.endswith("\\") and not joined.startswith("#"):
-            joined = joined[:-1] + " "
-            continue
-        yield first, joined
-        joined, first = "", number + 1
-    yield first, joined
-
-
-def _numbers(place: str, words: list[str]) -> list[float]:
-    key, *given = words
-    wanted, remedy = ((1, 3), "Give RGB values") if key.lower() in _COEFFICIENTS else ((1,), "Give one number")
+def _numbers(place, word, given):
+    wanted, remedy = ((1, 3), "Give RGB values") if word.lower() in _COEFFICIENTS else ((1,), "Give one number")
     came = f"got {' '.join(given)[:SHOWN]!r}"
     try:
-        numbers = [parse_number(word) for word in given]
+        numbers = [parse_number(number) for number in given]
     except ValueError:
         more = "; spectral curves and XYZ are not read" if given[0].lower() in ("spectral", "xyz") else ""
-        raise InputError(place, f"{key} must be numbers, {came}", f"{remedy}{more}") from None
-    if not all(map(math.isfinite, numbers)):
-        raise InputError(place, f"{key} must be finite numbers, {came}", "Give finite numbers")
+        raise InputError(place, f"{word} must be numbers, {came}", f"{remedy}{more}") from None
+    if not np.all(np.isfinite(numbers)):
+        raise InputError(place, f"{word} must be finite numbers, {came}", "Give finite numbers")
     if len(numbers) not in wanted:
-        raise InputError(place, f"{key} has {len(numbers)} values", f"Give {' or '.join(map(str, wanted))}")
+        raise InputError(place, f"{word} has {len(numbers)} values", f"Give {' or '.join(map(str, wanted))}")
     return numbers
 
 
@@ -131,13 +120,13 @@ def material_from_mtl(entry: dict[str, Any]) -> Material:
         InputError: naming the key.
     """
     if _TEXTURE in entry and "kd" not in entry:
-        came = f"is missing beside the texture {entry[_TEXTURE][:SHOWN]}, which is not read"
+        came = f"is missing beside the texture {''.join(entry[_TEXTURE])[:SHOWN]}, which is not read"
         raise InputError("Kd", came, "Add the mean colour as Kd")
-    name, (illum,), (exponent,) = entry["model"], entry.get("illum", [2.0]), entry.get("ns", [1.0])
-    colours = {name: np.broadcast_to(entry.get(key, [0.0]), 3) for key, name in _COEFFICIENTS.items()}
+    name, (illum,), (exponent,) = entry.get("model"), entry.get("illum", [2.0]), entry.get("ns", [1.0])
+    colours = {key: np.broadcast_to(entry.get(word, [0.0]), 3) for word, key in _COEFFICIENTS.items()}
     if name is not None and name not in MODELS:
         raise InputError("model", f"is unknown, got {name!r}", f"Use one of {', '.join(MODELS)}")
-    model = BlinnPhong if name is None else MODELS[name]
+    model = MODELS[name or "blinn-phong"]
     if not issubclass(model, SpecularMaterial) or illum < 2 or (name is None and "ks" not in entry):
         return Lambert(k_a=colours["k_a"], k_d=colours["k_d"])
     if exponent < 0:
