@@ -87,8 +87,7 @@ def read_mtl(path: Any, text: str) -> dict[str, dict[str, Any]]:
             if name in entries:
                 came = f"names the material {name[:SHOWN]} a second time"
                 raise InputError(place, came, "Give each a name of its own")
-            entries[name] = dict(told)
-            told.pop("note", None)
+            entries[name], told = told, {}
         elif key in (*_COEFFICIENTS, "ns", "illum", _TEXTURE):
             if name is None:
                 raise InputError(place, f"has {word} before any newmtl", "Start the material with newmtl NAME")

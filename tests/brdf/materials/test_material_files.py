@@ -121,6 +121,15 @@ def test_what_an_mtl_file_says_is_the_model_it_means(tmp_path: Path, text: str, 
     np.testing.assert_array_equal(material.k_d, [0.5] * 3)
 
 
+def test_a_comment_names_the_model_of_the_next_material_alone(tmp_path: Path):
+    brdf.save_material(MATERIALS[1], tmp_path / "phong.mtl")
+    brdf.save_material(MATERIALS[2], tmp_path / "blinn.mtl")
+    both = (tmp_path / "phong.mtl").read_text() + (tmp_path / "blinn.mtl").read_text().replace("fitted", "other")
+    (tmp_path / "both.mtl").write_text(both)
+    read = brdf.load_materials(tmp_path / "both.mtl")
+    assert [type(material) for material in read.values()] == [brdf.Phong, brdf.BlinnPhong]
+
+
 # -- malformed materials -----------------------------------------------------------------------------------------------
 
 LIMIT_OF_CHANNELS = json.dumps({"model": "lambert", "k_d": [0.5] * 5000})
