@@ -22,8 +22,8 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 from string import Template
-from typing import Any
-from xml.sax.saxutils import quoteattr
+from typing import Any, NamedTuple
+from xml.etree import ElementTree
 
 import numpy as np
 from jaxtyping import Float
@@ -39,7 +39,7 @@ from brdf.conversions import (
 from brdf.errors import InputError
 from brdf.files import as_path, write_text
 from brdf.images.encoding import decode, encode
-from brdf.materials.material_file import to_json
+from brdf.materials.material_file import material_to_dict
 from brdf.materials.mtl import half_exponent, height, to_mtl
 from brdf.models import BlinnPhong, Material, NormalizedBlinnPhong, NormalizedPhong, Phong, SpecularMaterial
 from brdf.models.base import check_single
@@ -47,9 +47,27 @@ from brdf.models.base import check_single
 # The lobes that are written as they are; those of other models as Blinn-Phong's.
 WRITTEN = (Phong, BlinnPhong, NormalizedPhong, NormalizedBlinnPhong)
 Colour = Float[np.ndarray, "3"]
-Written = tuple[str, list[str]]
 
 _GRAZING = 60.0  # degrees from the normal: far out, and still seen on a tenth of a ball
+_COMMENTS = {"glsl": "// {}", "mitsuba": "<!-- {} -->"}  # of other texts "# {}"
+_FRESNEL = "{} adds a Fresnel term: the highlight turns white where light and view are far apart"
+
+
+class Written(NamedTuple):
+    """A material in another program's words.
+
+    Attributes:
+        content: what the file holds: text, or values of JSON.
+        losses: what the format cannot carry, a sentence each.
+        drawn: the radiance that the program shows of a light of intensity 1 where light and view mirror each other at
+            an angle of this cosine, (3,); None where it draws the material as it is.
+        extras: among the values of JSON, where remarks go; None where the format has no place for them.
+    """
+
+    content: Any
+    losses: list[str]
+    drawn: Callable[[float], Colour] | None = None
+    extras: dict[str, Any] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,10 +107,21 @@ def export_material(material: Material, to: str, *, name: str = "fitted", note: 
     channels = np.asarray(material.k_d).size
     if to != "json" and channels not in (1, 3):
         raise InputError("material", f"has {channels} channels, {to} knows RGB alone", "Use the format json")
-    text, losses = EXPORTS[to](material, name)
+    content, losses, drawn, extras = EXPORTS[to](material, name)
     if to != "json" and isinstance(material, SpecularMaterial) and not isinstance(material, WRITTEN):
         losses = [f"the format has no word for the lobe of {material.name}: it is written as Blinn-Phong's", *losses]
-    return Export(_with_note(text, to, note) if note else text, tuple(losses))
+    if drawn is not None:
+        losses += _brightness(material, drawn)
+    remarks = ({"losses": losses} if losses else {}) | ({"note": note} if note else {})
+    if isinstance(content, str):
+        lines = [*losses, f"note: {note}"] if note else losses
+        comment = _COMMENTS.get(to, "# {}")
+        content = "".join(comment.format(line.replace("--", "")) + "\n" for line in lines) + content
+    else:
+        if extras is not None:
+            extras.update(remarks)
+        content = json.dumps(content, indent=2) + "\n"
+    return Export(content, tuple(losses))
 
 
 def save_export(
@@ -126,40 +155,15 @@ def save_export(
     return export
 
 
-def _with_note(text: str, to: str, note: str) -> str:
-    """The text with a note where its format has a place for one."""
-    if not text.startswith("{"):
-        start, end = {"glsl": ("//", ""), "mitsuba": ("<!--", " -->")}.get(to, ("#", ""))
-        return f"{start} note: {note.replace('--', '')}{end}\n{text}"
-    values = json.loads(text)
-    if to == "gltf":
-        values["materials"][0].setdefault("extras", {})["note"] = note
-    elif to == "three":
-        values.setdefault("userData", {})["note"] = note
-    elif to == "json":
-        values["note"] = note
-    return _json_text(values)
-
-
 # -- what several formats need -----------------------------------------------------------------------------------------
 
 
-def _rgb(values: Any) -> Colour:
+def _rgb(values):
     return np.broadcast_to(np.asarray(values, np.float64), 3)
 
 
-def _json_text(values: Any) -> str:
-    return json.dumps(values, indent=2) + "\n"
-
-
-def _brightness(material: Material, drawn: Callable[[float], Colour]) -> list[str]:
-    """How bright another program draws the peak of the highlight, in words; nothing where it draws it as it is.
-
-    Args:
-        material: of 1 or 3 channels.
-        drawn: the radiance that the other program shows of a light of intensity 1 where light and view mirror each
-            other at an angle of this cosine, (3,).
-    """
+def _brightness(material, drawn):
+    """How bright another program draws the peak of the highlight, in words; nothing where it draws it as it is."""
     if not isinstance(material, SpecularMaterial) or not np.any(material.k_s):
         return []
     ratios = []
@@ -175,10 +179,29 @@ def _brightness(material: Material, drawn: Callable[[float], Colour]) -> list[st
     ]
 
 
-def _normalised(material: Material) -> tuple[Material, list[str]]:
-    """The form that a physically based renderer has words for, and what that costs."""
+class _Normalised(NamedTuple):
+    """The form that a physically based renderer has words for, and what that costs.
+
+    Attributes:
+        k_d: (3,).
+        k_s: (3,); 0 without a highlight.
+        peak: k_s times what stands before the lobe, (3,).
+        n: exponent of N·H.
+        losses: a sentence each.
+    """
+
+    k_d: Colour
+    k_s: Colour
+    peak: Colour
+    n: float
+    losses: list[str]
+
+
+def _normalised(material):
     losses = ["k_a is left out: the format has no ambient coefficient"] if np.any(material.k_a) else []
-    if isinstance(material, SpecularMaterial) and not material.cosine_weighted:
+    if not isinstance(material, SpecularMaterial):
+        return _Normalised(_rgb(material.k_d), np.zeros(3), np.zeros(3), 0.0, losses)
+    if not material.cosine_weighted:
         material = nearest_normalized(material)
         losses.append(
             "the classic highlight is not multiplied by N·L, and here it is: k_d and k_s are those of the nearest "
@@ -187,10 +210,11 @@ def _normalised(material: Material) -> tuple[Material, list[str]]:
         )
     if isinstance(material, NormalizedPhong):
         losses.append("the highlight is one of N·H: its exponent is 4 n, of nearly the same highlight as (R·V)^n")
-    return material, losses
+    k_s = _rgb(material.k_s)
+    return _Normalised(_rgb(material.k_d), k_s, k_s * height(material), half_exponent(material), losses)
 
 
-def _cut(**colours: Colour) -> list[str]:
+def _cut(**colours):
     return [
         f"{key} is cut at 1, it would be {' '.join(f'{value:.3g}' for value in colour)}"
         for key, colour in colours.items()
@@ -201,38 +225,41 @@ def _cut(**colours: Colour) -> list[str]:
 # -- JSON, MTL, PyTorch3D ----------------------------------------------------------------------------------------------
 
 
-def _json(material: Material, name: str) -> Written:
-    return to_json(material), []
+def _json(material, name):
+    values = material_to_dict(material)
+    return Written(values, [], extras=values)
 
 
-def _mtl(material: Material, name: str) -> Written:
-    losses = []
+def _mtl(material, name):
+    losses, drawn = [], None
     if isinstance(material, Phong | NormalizedPhong):
         losses.append("MTL's highlight is (N·H)^Ns: Ns is 4 n, of nearly the same highlight as (R·V)^n")
     if isinstance(material, SpecularMaterial) and material.cosine_weighted:
         losses.append("the factor N·L of the highlight is left out: it is brighter towards grazing light")
         bare = _rgb(material.k_s) * height(material)
-        losses += _brightness(material, lambda cosine: _rgb(material.k_d) * cosine + bare)
-    return to_mtl(material, name=name), losses
+
+        def drawn(cosine):
+            return _rgb(material.k_d) * cosine + bare
+
+    return Written(to_mtl(material, name=name), losses, drawn)
 
 
-def _pytorch3d(material: Material, name: str) -> Written:
+def _pytorch3d(material, name):
     losses = []
     classic = nearest_classic(material)
     if type(classic) is not type(material):
         losses.append("the factor N·L of the highlight is left out: k_d and k_s are those of the nearest classic form")
-    k_s, shininess = np.zeros(3), 64.0
+    k_d, k_s, shininess = _rgb(classic.k_d), np.zeros(3), 64.0
     if isinstance(classic, SpecularMaterial):
         k_s, shininess = _rgb(classic.k_s), float(classic.n)
         if isinstance(classic, BlinnPhong):
             losses.append("PyTorch3D's highlight is (R·V)^shininess: shininess is n / 4, of nearly the same highlight")
             shininess = float(mirror_from_half(shininess))
-    losses += _brightness(material, lambda cosine: _rgb(classic.k_d) * cosine + k_s)
-    lines = ["# Materials(device=device, **MATERIALS) of pytorch3d.renderer, written by brdf."]
-    lines += [*(f"# {loss}." for loss in losses), "MATERIALS = {"]
-    for key, value in {"ambient": classic.k_a, "diffuse": classic.k_d, "specular": k_s}.items():
-        lines.append(f'    "{key}_color": ({tuple(_rgb(value).tolist())!r},),')
-    return "\n".join([*lines, f'    "shininess": {shininess!r},', "}", ""]), losses
+    lines = ["# Materials(device=device, **MATERIALS) of pytorch3d.renderer, written by brdf.", "MATERIALS = {"]
+    for key, value in {"ambient": _rgb(classic.k_a), "diffuse": k_d, "specular": k_s}.items():
+        lines.append(f'    "{key}_color": ({tuple(value.tolist())!r},),')
+    text = "\n".join([*lines, f'    "shininess": {shininess!r},', "}", ""])
+    return Written(text, losses, lambda cosine: k_d * cosine + k_s)
 
 
 # -- GLSL: the exact formula -------------------------------------------------------------------------------------------
@@ -294,8 +321,8 @@ def shader(model: type[Material], declarations: str) -> str:
     return _SHADER.substitute(model=model.name, constants=declarations, lobe=lobe, reflected=reflected)
 
 
-def _glsl(material: Material, name: str) -> Written:
-    def number(value: float) -> str:
+def _glsl(material, name):
+    def number(value):
         text = f"{value:.9g}"
         return text if "." in text or "e" in text else text + ".0"
 
@@ -305,155 +332,130 @@ def _glsl(material: Material, name: str) -> Written:
         if hasattr(material, key)
     ]
     if isinstance(material, SpecularMaterial):
-        numbers = {"N": float(material.n), "SCALE": height(material)}
-        constants += [f"const float BRDF_{key} = {number(value)};" for key, value in numbers.items()]
-    return shader(type(material), "\n".join(constants)), []
+        constants.append(f"const float BRDF_N = {number(float(material.n))};")
+        constants.append(f"const float BRDF_SCALE = {number(height(material))};")
+    return Written(shader(type(material), "\n".join(constants)), [])
 
 
 # -- three.js ----------------------------------------------------------------------------------------------------------
 
 
-def _three(material: Material, name: str) -> Written:
-    plausible, losses = _normalised(material)
-    k_s, n = np.zeros(3), 30.0
-    if isinstance(plausible, SpecularMaterial):
-        n = half_exponent(plausible)
-        # three.js draws specular (n+2)/8 (N·H)^n N·L times Schlick's Fresnel term, which is 1 at normal incidence.
-        k_s = _rgb(plausible.k_s) * height(plausible) * 8.0 / (n + 2.0)
-        losses.append("three.js adds a Fresnel term: the highlight turns white where light and view are far apart")
+def _three(material, name):
+    k_d, _, peak, n, losses = _normalised(material)
+    if isinstance(material, SpecularMaterial):
+        losses.append(_FRESNEL.format("three.js"))
     losses.append("colours are 8-bit sRGB, as MaterialLoader reads them; userData.linear holds them in full")
-    linear = {"color": _rgb(plausible.k_d), "specular": k_s}
+    # three.js draws specular (n+2)/8 (N·H)^n N·L times Schlick's Fresnel term, which is 1 at normal incidence.
+    linear = {"color": k_d, "specular": peak * 8.0 / (n + 2.0)}
     losses += _cut(**linear)
     codes = {key: np.round(255 * encode(np.clip(colour, 0.0, 1.0), "srgb")) for key, colour in linear.items()}
     color, specular = (decode(code / 255, "srgb") for code in codes.values())
 
-    def drawn(cosine: float) -> Colour:
+    def drawn(cosine):
         fresnel = 2.0 ** ((-5.55473 * cosine - 6.98316) * cosine)
         return (color + (specular * (1 - fresnel) + fresnel) * (n + 2.0) / 8.0) * cosine
 
-    losses += _brightness(material, drawn)
+    user_data = {"linear": {key: colour.tolist() for key, colour in linear.items()}}
     values = {
         "metadata": {"version": 4.7, "type": "Material", "generator": "brdf"},
         "uuid": "brdf-" + name,
         "type": "MeshPhongMaterial",
         "name": name,
         **{key: int(code @ [1 << 16, 1 << 8, 1]) for key, code in codes.items()},  # 0xRRGGBB
-        "shininess": n,
-        "userData": {"linear": {key: colour.tolist() for key, colour in linear.items()}, "losses": losses},
+        "shininess": n if np.any(peak) else 30.0,
+        "userData": user_data,
     }
-    return _json_text(values), losses
+    return Written(values, losses, drawn, user_data)
 
 
 # -- glTF --------------------------------------------------------------------------------------------------------------
 
 
-def _gltf(material: Material, name: str) -> Written:
-    plausible, losses = _normalised(material)
-    f_0, roughness = np.zeros(3), 1.0
-    if isinstance(plausible, SpecularMaterial):
-        f_0 = _rgb(plausible.k_s)
-        roughness = float(roughness_from_exponent(half_exponent(plausible)))
+def _gltf(material, name):
+    k_d, f_0, _, n, losses = _normalised(material)
+    roughness = float(roughness_from_exponent(n))
+    if isinstance(material, SpecularMaterial):
         losses += [
             "roughness is (2 / (n+2))^(1/4): GGX has nearly the lobe's curvature at its peak, but long tails",
-            "glTF adds a Fresnel term: the highlight turns white where light and view are far apart",
+            _FRESNEL.format("glTF"),
             "the diffuse part is k_d / (1 - F0), as the specification mixes; where a viewer adds, it is brighter",
             "without KHR_materials_specular a viewer shows a colourless highlight of reflectance 0.04",
         ]
-    base = _rgb(plausible.k_d) / np.maximum(1.0 - f_0.max(), 1e-6)  # what the Fresnel layer takes from the diffuse part
+    base = k_d / np.maximum(1.0 - f_0.max(), 1e-6)  # what the Fresnel layer takes from the diffuse part
     losses += _cut(baseColorFactor=base)
     base = np.minimum(base, 1.0)
 
-    def drawn(cosine: float) -> Colour:  # appendix B.3 of the specification
+    def drawn(cosine):  # appendix B.3 of the specification
         square = roughness**4  # of the slope alpha
         fresnel = f_0 + (1.0 - f_0) * (1.0 - cosine) ** 5
         visible = 0.25 / (cosine * np.sqrt(cosine**2 * (1.0 - square) + square))
         return (base * (1.0 - fresnel.max()) + fresnel * visible / square) * cosine
 
-    losses += _brightness(material, drawn)
     factors = {"baseColorFactor": [*base.tolist(), 1.0], "metallicFactor": 0.0, "roughnessFactor": roughness}
     specular = {"specularColorFactor": (f_0 / 0.04).tolist()}  # times the reflectance of a dielectric
-    values = {
-        "asset": {"version": "2.0", "generator": "brdf"},
-        "extensionsUsed": ["KHR_materials_specular"],
-        "materials": [
-            {
-                "name": name,
-                "pbrMetallicRoughness": factors,
-                "extensions": {"KHR_materials_specular": specular},
-                "extras": {"losses": losses},
-            }
-        ],
-    }
-    return _json_text(values), losses
+    entry: dict[str, Any] = {"name": name, "pbrMetallicRoughness": factors, "extras": {}}
+    entry["extensions"] = {"KHR_materials_specular": specular}
+    asset = {"version": "2.0", "generator": "brdf"}
+    values = {"asset": asset, "extensionsUsed": ["KHR_materials_specular"], "materials": [entry]}
+    return Written(values, losses, drawn, entry["extras"])
 
 
 # -- Mitsuba -----------------------------------------------------------------------------------------------------------
 
 
-def _mitsuba_json(material: Material, name: str) -> Written:
-    plugin, losses = _mitsuba(material)
-    return _json_text(plugin), losses
+def _mitsuba_xml(material, name):
+    plugin, *rest = _mitsuba(material, name)
+    scene = ElementTree.Element("scene", version="3.0.0")
+    scene.append(_element(plugin, id=name))
+    ElementTree.indent(scene)
+    return Written(ElementTree.tostring(scene, "unicode") + "\n", *rest)
 
 
-def _mitsuba_xml(material: Material, name: str) -> Written:
-    plugin, losses = _mitsuba(material)
-    comments = [f"  <!-- {loss.replace('--', '')} -->" for loss in losses]  # XML allows no -- in a comment
-    body = _elements(plugin, f"id={quoteattr(name)}", "  ")
-    return "\n".join(['<scene version="3.0.0">', *comments, *body, "</scene>", ""]), losses
+def _element(plugin, **attributes):
+    element = ElementTree.Element("bsdf", type=plugin["type"], **attributes)
+    for key, value in plugin.items():
+        kind = "float" if isinstance(value, float) else "string"
+        if isinstance(value, dict) and value["type"] == "rgb":
+            kind, value = "rgb", ", ".join(map(repr, value["value"]))
+        if isinstance(value, dict):
+            element.append(_element(value, name=key))
+        elif key != "type":
+            ElementTree.SubElement(element, kind, name=key, value=str(value))
+    return element
 
 
-def _mitsuba(material: Material) -> tuple[dict[str, Any], list[str]]:
+def _mitsuba(material, name):
     """The nearest BSDF of Mitsuba 3, and what it cannot carry.
 
     ``diffuse``, or ``blendbsdf`` of ``diffuse`` and a ``roughconductor`` without Fresnel term (Beckmann, slope
     sqrt(2 / (n+2))): its lobe is (n+2)/(8 π) (N·H)^n near the normal, as that of normalised Blinn-Phong.
     """
 
-    def reflecting(colour: Colour) -> dict[str, Any]:
+    def reflecting(colour):
         return {"type": "rgb", "value": np.clip(colour, 0.0, 1.0).tolist()}
 
-    plausible, losses = _normalised(material)
-    k_d = _rgb(plausible.k_d)
-    if not isinstance(plausible, SpecularMaterial) or not np.any(plausible.k_s):
-        return {"type": "diffuse", "reflectance": reflecting(k_d)}, losses + _cut(reflectance=k_d)
-    k_s, alpha = _rgb(plausible.k_s), float(slope_from_exponent(half_exponent(plausible)))
-    weight = float(k_s.max() / (k_s.max() + k_d.max()))
+    k_d, k_s, _, n, losses = _normalised(material)
+    if not np.any(k_s):
+        return Written({"type": "diffuse", "reflectance": reflecting(k_d)}, losses + _cut(reflectance=k_d))
+    alpha, weight = float(slope_from_exponent(n)), float(k_s.max() / (k_s.max() + k_d.max()))
     diffuse, specular = k_d / max(1.0 - weight, 1e-12), k_s / weight
     losses.append("the lobe is that of microfacets (Beckmann, slope sqrt(2 / (n+2))), narrower and brighter if grazing")
     losses += _cut(reflectance=diffuse, specular_reflectance=specular)
 
-    def drawn(cosine: float) -> Colour:
+    def drawn(cosine):
         lobe = (_beckmann_shadowing(alpha, cosine) / (2.0 * alpha * cosine)) ** 2
         return ((1.0 - weight) * np.clip(diffuse, 0.0, 1.0) + weight * np.clip(specular, 0.0, 1.0) * lobe) * cosine
 
-    losses += _brightness(material, drawn)
     conductor = {"type": "roughconductor", "material": "none", "distribution": "beckmann", "alpha": alpha}
     conductor |= {"specular_reflectance": reflecting(specular)}
     parts = {"diffuse": {"type": "diffuse", "reflectance": reflecting(diffuse)}, "conductor": conductor}
-    return {"type": "blendbsdf", "weight": weight, **parts}, losses
+    return Written({"type": "blendbsdf", "weight": weight, **parts}, losses, drawn)
 
 
-def _beckmann_shadowing(alpha: float, cosine: float) -> float:
+def _beckmann_shadowing(alpha, cosine):
     """Walter et al., "Microfacet models for refraction", EGSR 2007: the rational fit that Mitsuba uses."""
-    sine = float(np.sqrt(1.0 - cosine**2))
-    if cosine >= 1.6 * alpha * sine:
-        return 1.0
-    a = cosine / (alpha * sine)
-    return (3.535 * a + 2.181 * a**2) / (1.0 + 2.276 * a + 2.577 * a**2)
-
-
-def _elements(plugin: dict[str, Any], mark: str, indent: str) -> list[str]:
-    """A plugin as lines of XML."""
-    lines = [f"{indent}<bsdf type={quoteattr(plugin['type'])} {mark}>"]
-    for key, value in plugin.items():
-        kind = "string" if isinstance(value, str) else "float"
-        if isinstance(value, dict) and value["type"] == "rgb":
-            kind, value = "rgb", ", ".join(map(repr, value["value"]))
-        if isinstance(value, dict):
-            lines += _elements(value, f'name="{key}"', indent + "  ")
-        elif key != "type":
-            lines.append(f'{indent}  <{kind} name="{key}" value="{value}"/>')
-    return [*lines, f"{indent}</bsdf>"]
+    a = cosine / (alpha * np.sqrt(1.0 - cosine**2)) if cosine < 1.0 else np.inf
+    return 1.0 if a >= 1.6 else (3.535 * a + 2.181 * a**2) / (1.0 + 2.276 * a + 2.577 * a**2)
 
 
 EXPORTS: dict[str, Callable[[Material, str], Written]] = {
@@ -462,10 +464,10 @@ EXPORTS: dict[str, Callable[[Material, str], Written]] = {
     "three": _three,
     "gltf": _gltf,
     "mitsuba": _mitsuba_xml,
-    "mitsuba-dict": _mitsuba_json,
+    "mitsuba-dict": _mitsuba,
     "pytorch3d": _pytorch3d,
     "glsl": _glsl,
 }
-"""The formats by name: each gives what the file holds, and a sentence for each thing that it cannot carry."""
+"""The formats by name."""
 
 _SUFFIXES = {".json": "json", ".mtl": "mtl", ".gltf": "gltf", ".xml": "mitsuba", ".py": "pytorch3d", ".glsl": "glsl"}
