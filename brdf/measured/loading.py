@@ -49,9 +49,8 @@ def load_measured(path: str | os.PathLike[str]) -> MeasuredBRDF:
             raise InputError(path, what, "Give a MERL .binary, RGL .bsdf, Cornell or ALTA text file")
         return text.load(file)
     except InputError as error:
-        if error.where == file.stem:  # the name of the table, which is that of the file
-            raise InputError(path, error.what, error.remedy) from None
-        raise error if error.where.startswith(str(path)) else error.inside(path) from None
+        told = error.where.startswith(str(path))  # else it is the table that is named
+        raise error if told else InputError(path, error.what, error.remedy) from None
 
 
 def is_measured(path: str | os.PathLike[str]) -> bool:

@@ -6,6 +6,7 @@ acquisition and rendering", SIGGRAPH Asia 2018; the layout is Mitsuba's ``tensor
 """
 
 import dataclasses
+import io
 import math
 import struct
 import threading
@@ -24,8 +25,11 @@ _MOST_FIELDS = 64
 _MOST_BYTES = 1 << 31
 _TYPES = {5: np.dtype("<u4"), 10: np.dtype("<f4")}  # others count in bytes
 _BYTE, _FLOAT = 1, 10
-# Dimensions of a field, and the least size of each.
-_LAYOUT = {"phi_i": (1, 1), "theta_i": (1, 2), "sigma": (2, 2), "ndf": (2, 2), "vndf": (4, 1), "luminance": (4, 1)}
+# The dimensions of a field, those of one letter as long as each other: azimuths and polar angles of the light, channels,
+# and others.
+_LAYOUT = {"phi_i": "p", "theta_i": "t", "sigma": "..", "ndf": "..", "vndf": "pt..", "luminance": "ptxy"}
+_SPECTRAL = {"wavelengths": "c", "spectra": "ptcxy"}
+_ONE_IS_ENOUGH = "pc"
 _REPAIR = "The file is damaged; get it again"
 # Half angle, difference angle and azimuth: the samples that a fit sees. The files hold 32 x 32 views for 8 lights.
 _GRID = (90, 30, 36)
@@ -45,22 +49,21 @@ def read_fields(content: bytes, place: object) -> dict[str, tuple[int, np.ndarra
     Raises:
         InputError: where the file is damaged.
     """
+    stream, fields = io.BytesIO(content), {}
+    stream.seek(len(MAGIC))
+
+    def take(layout):
+        return struct.unpack(f"<{layout}", stream.read(struct.calcsize(f"<{layout}")))
+
     try:
-        *version, count = struct.unpack_from("<BBI", content, len(MAGIC))
-        if version != [1, 0] or count > _MOST_FIELDS:
-            what = f"is of version {version[0]}.{version[1]} with {count} fields"
-            raise InputError(place, what, "Version 1.0 is read")
-        at, fields = 18, {}
+        major, minor, count = take("BBI")
+        if (major, minor) != (1, 0) or count > _MOST_FIELDS:
+            raise InputError(place, f"is of version {major}.{minor} with {count} fields", "Version 1.0 is read")
         for _ in range(count):
-            (length,) = struct.unpack_from("<H", content, at)
-            name = content[at + 2 : at + 2 + length].decode("ascii", "replace")
-            dimensions, kind, start = struct.unpack_from("<HBQ", content, at + 2 + length)
-            if dimensions > 8:
-                raise InputError(f"{place}: {name[:40]}", f"has {dimensions} dimensions", _REPAIR)
-            shape = struct.unpack_from(f"<{dimensions}Q", content, at + 13 + length)
-            at += 13 + length + 8 * dimensions
-            dtype, least = _TYPES.get(kind, np.dtype("u1")), math.prod(max(length, 1) for length in shape)
-            if start + least * dtype.itemsize > len(content):
+            name = stream.read(*take("H")).decode("ascii", "replace")
+            dimensions, kind, start = take("HBQ")
+            shape, dtype = take(f"{dimensions}Q"), _TYPES.get(kind, np.dtype("u1"))
+            if dimensions > 8 or start + math.prod(max(length, 1) for length in shape) * dtype.itemsize > len(content):
                 raise InputError(f"{place}: {name[:40]}", "reaches beyond the end of the file", _REPAIR)
             fields[name] = kind, np.frombuffer(content, dtype, math.prod(shape), start).reshape(shape)
     except struct.error:
@@ -76,35 +79,27 @@ def _check(content, place):
         if not good:
             raise InputError(f"{place}: {name}", what, _REPAIR)
 
-    colour = "spectra" if "spectra" in fields and "rgb" not in fields else "rgb"
-    layout = _LAYOUT | {colour: (5, 1)} | ({"wavelengths": (1, 2)} if colour == "spectra" else {})
-    for name, (dimensions, least) in layout.items():
+    spectral = "spectra" in fields and "rgb" not in fields
+    sizes = {} if spectral else {"c": 3}
+    for name, letters in (_LAYOUT | (_SPECTRAL if spectral else {"rgb": "ptcxy"})).items():
         if name not in fields:
             raise InputError(place, f"has no field {name}", "Give an isotropic or anisotropic file of the RGL database")
         kind, values = fields[name]
-        came = f"must be {dimensions}-dimensional and of type float32, got {list(values.shape)} of type {kind}"
-        demand(name, kind == _FLOAT and values.ndim == dimensions and min(values.shape) >= least, came)
+        fits = kind == _FLOAT and values.ndim == len(letters)
+        for letter, size in zip(letters, values.shape, strict=False):
+            fits &= size >= (1 if letter in _ONE_IS_ENOUGH else 2)
+            fits &= letter == "." or sizes.setdefault(letter, size) == size
+        came = f"got {list(values.shape)} of type {kind}"
+        demand(name, fits, f"must be {len(letters)}-dimensional float32 that fits to the other fields, {came}")
         demand(name, np.isfinite(values).all(), "holds values that are not finite")
+        demand(name, len(letters) > 1 or np.all(np.diff(values) > 0), "does not grow from entry to entry")
     for name, what in (("jacobian", "one byte"), ("description", "text")):
         kind, values = fields.get(name, (0, np.empty(0)))
         sound = kind == _BYTE and values.ndim == 1 and (name == "description" or values.size == 1)
         demand(name, sound, f"must be {what}")
-    for name in ("phi_i", "theta_i"):
-        demand(name, np.all(np.diff(fields[name][1]) > 0), "does not grow from entry to entry")
-    phi, theta = fields["phi_i"][1].size, fields["theta_i"][1].size
-    for name in ("vndf", "luminance", colour):
-        shape = fields[name][1].shape
-        came = f"has {shape[0]} x {shape[1]} slices for {phi} x {theta} directions of light"
-        demand(name, shape[:2] == (phi, theta), came)
-        demand(name, min(shape[-2:]) >= 2, f"is of shape {list(shape)}")
-    demand(colour, shape[3:] == fields["luminance"][1].shape[2:], f"is of shape {list(shape)}")
-    if colour == "rgb":
-        demand(colour, shape[2] == 3, f"has {shape[2]} channels instead of 3")
-        return ("red", "green", "blue")
-    wavelengths = fields["wavelengths"][1]
-    grows = wavelengths.size == shape[2] and np.all(np.diff(wavelengths) > 0)
-    demand("wavelengths", grows, "does not fit to the spectra")
-    return tuple(f"{wavelength:g} nm" for wavelength in wavelengths)
+    if spectral:
+        return tuple(f"{wavelength:g} nm" for wavelength in fields["wavelengths"][1])
+    return ("red", "green", "blue")
 
 
 def load(path: Path) -> MeasuredBRDF:
@@ -137,9 +132,7 @@ def _evaluation(path, channels):
             # The vectorised variants compile through LLVM, which ends the process where its version does not suit them.
             mitsuba.set_variant("scalar_spectral" if wavelengths else "scalar_rgb")
             plugin: Any = mitsuba.load_dict({"type": "measured", "filename": utf8_name(path)})
-            context: Any = mitsuba.BSDFContext()
-            interaction: Any = mitsuba.SurfaceInteraction3f()
-            vector = mitsuba.Vector3f
+            context, interaction, vector = mitsuba.BSDFContext(), mitsuba.SurfaceInteraction3f(), mitsuba.Vector3f
         except (RuntimeError, ImportError) as error:
             raise InputError(path, f"Mitsuba cannot read it ({str(error).splitlines()[0]})", _REPAIR) from None
         finally:
@@ -151,11 +144,10 @@ def _evaluation(path, channels):
         to_light, to_view = np.broadcast_arrays(to_light, to_view)
         values = np.zeros((len(to_light), len(channels)))
         for first in range(0, len(channels), together):
-            part = values[:, first : first + together]
             if wavelengths:
-                four = wavelengths[first : first + 4]
-                interaction.wavelengths = four + four[-1:] * (4 - len(four))
-            for row, light, view in zip(part, to_light.tolist(), to_view.tolist(), strict=True):
+                interaction.wavelengths = (wavelengths[first:] + wavelengths[-1:] * 3)[:4]
+            rows = values[:, first : first + together]
+            for row, light, view in zip(rows, to_light.tolist(), to_view.tolist(), strict=True):
                 # The files hold views for directions of light; Mitsuba's "wi" is the one, its "wo" the other.
                 interaction.wi = vector(*light)
                 row[:] = list(plugin.eval(context, interaction, vector(*view)))[: len(row)]

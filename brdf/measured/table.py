@@ -91,16 +91,13 @@ class MeasuredBRDF:
             InputError: naming the argument, where shapes do not fit or no sample is left.
         """
         light, view = _directions("to_light", to_light), _directions("to_view", to_view)
-        numbers = as_numbers("values", values)
-        numbers = numbers[:, None] if numbers.ndim == 1 else numbers
-        if numbers.ndim != 2 or numbers.shape[1] == 0:
-            raise InputError("values", f"must be of shape (P, C), got {numbers.shape}", "Give a row per sample")
+        numbers = _rows("values", values)
         samples, count = numbers.shape
-        weight = np.ones(samples) if solid_angle is None else as_numbers("solid_angle", solid_angle)
+        weight = np.ones((samples, 1)) if solid_angle is None else _rows("solid_angle", solid_angle, 1)
         for what, array in (("to_light", light), ("to_view", view), ("solid_angle", weight)):
             if len(array) != samples:
                 raise InputError(what, f"has {len(array)} rows for {samples} samples", "Give one per sample")
-        if weight.ndim != 1 or not np.all((weight >= 0) & (weight < np.inf)):
+        if not np.all((weight >= 0) & (weight < np.inf)):
             raise InputError("solid_angle", "must be a finite number of 0 or more per sample", "Correct the values")
         channels = channels or tuple(map(str, range(count)))
         if len(channels) != count:
@@ -113,14 +110,20 @@ class MeasuredBRDF:
             gone = ", ".join(f"{number} {reason}" for reason, number in counts.items())
             came = f"has no finite sample above the horizon ({gone or 'none at all'})"
             raise InputError(name, came, "Give a table with samples")
-        kept = light[good], view[good], numbers[good], channels, weight[good]
+        kept = light[good], view[good], numbers[good], channels, weight[good, 0]
         return cls(name, *kept, left_out=counts, evaluate=evaluate)
 
 
+def _rows(name, value, columns=None):
+    rows = as_numbers(name, value)
+    rows = rows[:, None] if rows.ndim == 1 else rows
+    if rows.ndim != 2 or 0 == rows.shape[1] or (columns or rows.shape[1]) != rows.shape[1]:
+        raise InputError(name, f"must be of shape (P, {columns or 'C'}), got {rows.shape}", "Give a row per sample")
+    return rows
+
+
 def _directions(name, value):
-    vectors = as_numbers(name, value)
-    if vectors.ndim != 2 or vectors.shape[1] != 3:
-        raise InputError(name, f"must be of shape (P, 3), got {vectors.shape}", "Give a direction per sample")
+    vectors = _rows(name, value, 3)
     size = np.linalg.norm(vectors, axis=1, keepdims=True)
     if not np.all(np.isfinite(size) & (size > 0)):
         raise InputError(name, "must be finite directions that are not zero", "Correct the values")

@@ -1,6 +1,6 @@
 """Measured BRDFs as text: Cornell's goniometer tables and ALTA's formats.
 
-Cornell: ``#`` starts a comment; the number of wavelengths, the wavelengths in nm, then rows of
+Cornell: ``#`` starts a comment; the number of wavelengths, the wavelengths in nm, then a line for each sample,
 ``theta_i phi_i theta_s phi_s v_1 .. v_N`` (radians, 1/sr).
 
 ALTA: a header of ``#KEY value`` lines (``DIM``: numbers per row of input and output; ``PARAM_IN``, ``PARAM_OUT``;
@@ -33,7 +33,6 @@ _PARAMETRISATIONS = {
     "ISOTROPIC_TV_PROJ_DPHI": "x_v y_v",
     "ISOTROPIC_TL_TV_PROJ_DPHI": "theta_l x_v y_v",
     "SPHERICAL_TL_PL_TV_PV": "theta_l phi_l theta_v phi_v",
-    "CARTESIAN": "x_v y_v z_v x_l y_l z_l",
 }
 _NOT_SAID = {"RUSIN_TH_TD": {"phi_d": 0.5 * np.pi}, "COS_TLR": {"phi_v": np.pi}}
 _OUTPUTS = ("INV_STERADIAN", "INV_STERADIAN_COSINE_FACTOR", "RGB_COLOR", "UNKNOWN_OUTPUT")
@@ -65,57 +64,36 @@ def load(path: Path) -> MeasuredBRDF:
     # Lines that hold something, each with its place.
     rows = [(f"{path}: line {number}", line.partition("#")[0].split()) for number, line in enumerate(lines, start=1)]
     rows = [row for row in rows if row[1]]
-    heads = [line[1:].partition(" ") for line in lines if line.startswith("#")]
-    header = {key: value.strip() for key, _, value in reversed(heads) if key.isupper()}  # the first of a key counts
-    is_alta = any(line.startswith("#DIM") for line in lines)
-    light, view, values, names = _alta(path, header, rows) if is_alta else _cornell(path, rows)
+    if any(line.startswith("#DIM") for line in lines):
+        heads = [line[1:].partition(" ") for line in lines if line.startswith("#")]
+        header = {key: value.strip() for key, _, value in reversed(heads) if key.isupper()}  # the first of a key counts
+        light, view, values, names = _alta(path, header, rows)
+    else:
+        light, view, values, names = _cornell(path, rows)
     return MeasuredBRDF.from_samples(light, view, values, name=path.stem, channels=names)
 
 
 def _cornell(path, rows):
     if not rows:
         raise InputError(path, "holds no numbers", "Give a table of a measured BRDF")
-    values, places = _numbers(rows), [place for place, words in rows for _ in words]
-    if not (1 <= values[0] <= MOST_CHANNELS and values[0] == int(values[0])):
+    place, (first, *_) = rows[0]
+    count = int(first) if first.isdecimal() and len(first) < 9 else 0
+    if not 1 <= count <= MOST_CHANNELS:
         remedy = "The first number says how many wavelengths follow; ALTA files have a #DIM line"
-        raise InputError(places[0], f"is no measured BRDF, got {rows[0][1][0][:40]!r}", remedy)
-    count = int(values[0])
-    width, first = 4 + count, 1 + count
-    table = values[first:]
-    if not table.size or table.size % width:
-        came = f"has {table.size} numbers after {count} wavelengths, not a multiple of {width}"
-        raise InputError(path, came, "Give rows of theta_i phi_i theta_s phi_s and a value per wavelength")
-    starts = places[first::width]
-    for start, before in zip(starts, places[count::width], strict=False):
-        if start == before:
-            came = f"holds the end of a row and the start of the next, as if rows had {width} numbers"
-            remedy = "Give a row of theta_i phi_i theta_s phi_s and a value per wavelength on a line of its own"
-            raise InputError(start, came, remedy)
-    table = table.reshape(-1, width)
-    theta_i, phi_i, theta_s, phi_s = _within(starts, table[:, :4].T)
-    names = tuple(f"{wavelength:g} nm" for wavelength in values[1:first])
+        raise InputError(place, f"is no measured BRDF, got {first[:40]!r}", remedy)
+    head = []
+    while rows and len(head) <= count:
+        (place, words), *rows = rows
+        _table(path, [(place, words)], len(words))  # what is no number is told where it stands
+        head += words
+    wavelengths = _table(path, [(place, head)], 1 + count)[0, 1:]
+    table = _table(path, rows, 4 + count)
+    theta_i, phi_i, theta_s, phi_s = _within(rows, table[:, :4].T)
+    names = tuple(f"{wavelength:g} nm" for wavelength in wavelengths)
     return from_angles(theta_i, phi_i), from_angles(theta_s, phi_s), table[:, 4:], names
 
 
 def _alta(path, header, rows):
-    inputs, outputs = _dimensions(path, header)
-    width, confidence = inputs + outputs, int(header["VS"])
-    for place, words in rows:
-        if not width <= len(words) <= width + confidence * outputs:
-            came = f"has {len(words)} numbers instead of {width}"
-            raise InputError(place, came, "Give as many as the #DIM line says")
-    if not rows:
-        raise InputError(path, "holds no samples", "Give a table with rows of numbers")
-    table = _numbers([(place, words[:width]) for place, words in rows]).reshape(-1, width)
-    view, light = _directions(header["PARAM_IN"], [place for place, _ in rows], table[:, :inputs].T)
-    values, unit = table[:, inputs:], header["PARAM_OUT"]
-    if unit == "INV_STERADIAN_COSINE_FACTOR":
-        values = values / np.where(view[:, 2:] > 0, view[:, 2:], 1.0)
-    return light, view, values, ("red", "green", "blue") if unit == "RGB_COLOR" and outputs == 3 else None
-
-
-def _dimensions(path, header):
-    """How many columns are input and output, after finding that the header can be read."""
     for key, (default, pattern, what, remedy) in _HEADER.items():
         value = header.setdefault(key, default)
         if not re.fullmatch(pattern, value):
@@ -123,55 +101,53 @@ def _dimensions(path, header):
             raise InputError(f"{path}: {key}", what, remedy)
     inputs, outputs = map(int, header["DIM"].split())
     columns = len(_PARAMETRISATIONS[header["PARAM_IN"]].split())
-    if not (1 <= inputs <= 6 and 1 <= outputs <= MOST_CHANNELS):
-        remedy = f"There are 1 to 6 inputs and 1 to {MOST_CHANNELS} outputs"
-        raise InputError(f"{path}: DIM", f"says {inputs} and {outputs} columns", remedy)
-    if columns != inputs:
-        came = f"says {inputs} input columns, {header['PARAM_IN']} has {columns}"
-        raise InputError(f"{path}: DIM", came, "Correct the header")
-    return inputs, outputs
+    if columns != inputs or not 1 <= outputs <= MOST_CHANNELS:
+        came = f"says {inputs} input and {outputs} output columns, {header['PARAM_IN']} has {columns}"
+        raise InputError(f"{path}: DIM", came, f"Correct the header; there are 1 to {MOST_CHANNELS} outputs")
+    table = _table(path, rows, inputs + outputs, int(header["VS"]) * outputs)
+    view, light = _directions(header["PARAM_IN"], rows, table[:, :inputs].T)
+    values, unit = table[:, inputs:], header["PARAM_OUT"]
+    if unit == "INV_STERADIAN_COSINE_FACTOR":
+        values = values / np.where(view[:, 2:] > 0, view[:, 2:], 1.0)
+    return light, view, values, ("red", "green", "blue") if unit == "RGB_COLOR" and outputs == 3 else None
 
 
-def _numbers(rows):
-    """All values, row after row."""
+def _table(path, rows, width, more=0):
+    """The first numbers of every row, which may have some more."""
     values = []
     for place, words in rows:
-        for word in words:
+        if not width <= len(words) <= width + more:
+            raise InputError(place, f"has {len(words)} numbers instead of {width}", "Give as many as the header says")
+        for word in words[:width]:
             try:
                 values.append(parse_number(word))
             except ValueError:
                 remedy = "Numbers have a decimal point and spaces between them; # starts a comment"
                 raise InputError(place, f"must be a number, got {word[:40]!r}", remedy) from None
-    return np.array(values)
+    if not values:
+        raise InputError(path, "holds no samples", "Give a table with rows of numbers")
+    return np.array(values).reshape(-1, width)
 
 
-def _directions(kind, places, columns):
+def _directions(kind, rows, columns):
     """View and light of each row."""
-    if kind == "CARTESIAN":
-        length = np.linalg.norm(columns.reshape(2, 3, -1), axis=1)
-        sound = np.all(np.isfinite(length) & (length > 0), axis=0)
-        if not sound.all():
-            came = "has a direction that is zero or not finite"
-            raise InputError(places[np.argmin(sound)], came, "Correct the file")
-        return [columns[:3].T, columns[3:].T]
     if kind.startswith("COS_"):
-        _within(places, columns, 1.0, "a cosine", "It is within -1 and 1")
+        _within(rows, columns, 1.0, "a cosine", "It is within -1 and 1")
         columns = 2 * np.arctan2(np.sqrt(1 - columns), np.sqrt(1 + columns))
-    names = _PARAMETRISATIONS[kind].split()
-    columns = dict(zip(names, _within(places, columns), strict=True))
+    columns = dict(zip(_PARAMETRISATIONS[kind].split(), _within(rows, columns), strict=True))
     angles = defaultdict(float, _NOT_SAID.get(kind, {}) | columns)
-    if "x_v" in names:  # the parts of the polar angle along two axes
-        x, y = angles["x_v"], angles["y_v"]
+    if "x_v" in columns:  # the parts of the polar angle along two axes
+        x, y = columns["x_v"], columns["y_v"]
         angles |= {"theta_v": np.hypot(x, y), "phi_v": np.arctan2(y, x)}
-    if "theta_h" in names:
+    if "theta_h" in columns:
         pair = from_half_angles(angles["theta_h"], angles["theta_d"], angles["phi_d"], angles["phi_h"])
     else:
         pair = from_angles(angles["theta_v"], angles["phi_v"]), from_angles(angles["theta_l"], angles["phi_l"])
     return np.broadcast_arrays(*pair)
 
 
-def _within(places, columns, largest=2 * np.pi + 1e-6, what="an angle", remedy="Angles are in radians, at most 2 pi"):
+def _within(rows, columns, largest=2 * np.pi + 1e-6, what="an angle", remedy="Angles are in radians, at most 2 pi"):
     """Columns that hold nothing larger."""
     for row, column in np.argwhere(~(np.abs(columns.T) <= largest)):
-        raise InputError(places[row], f"has {what} of {columns[column, row]:g}", remedy)
+        raise InputError(rows[row][0], f"has {what} of {columns[column, row]:g}", remedy)
     return columns

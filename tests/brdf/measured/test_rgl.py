@@ -22,14 +22,14 @@ def test_rgl_fields_are_checked_before_mitsuba_sees_them(tmp_path):
         "no field rgb": tensor_file(rgb=None),
         "theta_i: does not grow": tensor_file(theta_i=np.zeros(4, "<f4")),
         "not finite": tensor_file(ndf=np.full((2, 8), np.nan, "<f4")),
-        "2 channels instead of 3": tensor_file(rgb=np.ones((1, 4, 2, 4, 4), "<f4")),
-        "1 x 9 slices": tensor_file(vndf=np.ones((1, 9, 8, 8), "<f4")),
+        "rgb: must be 5-dimensional float32 that fits": tensor_file(rgb=np.ones((1, 4, 2, 4, 4), "<f4")),
+        r"vndf: must be .* got \[1, 9, 8, 8\]": tensor_file(vndf=np.ones((1, 9, 8, 8), "<f4")),
         "jacobian: must be one byte": tensor_file(jacobian=np.zeros(2, "u1")),
         "description: must be text": tensor_file(description=None),
         "sigma: must be 2-dimensional": tensor_file(sigma=np.ones(8, "<f4")),
-        "luminance: is of shape": tensor_file(luminance=np.ones((1, 4, 1, 4), "<f4")),
-        "rgb: is of shape": tensor_file(rgb=np.ones((1, 4, 3, 4, 5), "<f4")),
-        "wavelengths: does not fit": tensor_file(
+        "luminance: must be 4-dim": tensor_file(luminance=np.ones((1, 4, 1, 4), "<f4")),
+        r"rgb: must be .* got \[1, 4, 3, 4, 5\]": tensor_file(rgb=np.ones((1, 4, 3, 4, 5), "<f4")),
+        "wavelengths: does not grow": tensor_file(
             rgb=None, spectra=np.ones((1, 4, 6, 4, 4), "<f4"), wavelengths=np.ones(6, "<f4")
         ),
         "phi_i: must be 1-dimensional": tensor_file(phi_i=np.ones(0, "<f4")),
