@@ -191,7 +191,7 @@ def nearest_classic(material: Material) -> Material:
     return _nearest(material, model, bounded=False)
 
 
-def _nearest(material: SpecularMaterial, model: type[SpecularMaterial], *, bounded: bool) -> SpecularMaterial:
+def _nearest(material, model, *, bounded):
     n = float(np.asarray(material.n))
     gram, cross = nearest_equations(type(material), model, n)
     k_d, k_s = np.asarray(material.k_d, np.float64), np.asarray(material.k_s, np.float64)
@@ -223,12 +223,11 @@ def nearest_equations(
     return gram, np.array([np.sum(weights * cosine * of * single), np.sum(weights * to * of * double)])
 
 
-def _constrained(gram: Float[np.ndarray, "2 2"], right: Float[np.ndarray, " 2"], bounded: bool) -> np.ndarray:
+def _constrained(gram, right, bounded):
     """The x >= 0 (with sum <= 1 if bounded) of least x' gram x / 2 - right' x: a bound that is broken is reached."""
     best = np.linalg.lstsq(gram, right, rcond=1e-12)[0]  # at n = 0 a lobe may be the diffuse term: they share it
     if best.min() <= 1e-12 * best.max():
-        kept = np.argmax(best)
-        best = np.where([kept == 0, kept == 1], right / np.diag(gram), 0.0)
+        best = np.where(best == best.max(), right / np.diag(gram), 0.0)
     if bounded and best.sum() > 1:
         along = np.array([-1.0, 1.0])  # from (1, 0) to (0, 1)
         share = np.clip(along @ (right - gram[:, 0]) / max(along @ gram @ along, 1e-12), 0.0, 1.0)
