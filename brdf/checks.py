@@ -130,19 +130,14 @@ def _refuse(name, array, limits, place=""):
 def _shaped(name, value, fits, words, remedy):
     """Finite numbers of a shape that fits."""
     array = _numbers(name, value, words)
-    if not fits(array.shape):
+    if not fits(*array.shape):
         raise InputError(name, f"must be {words}, got {what_came(value)}", remedy)
-    return array
-
-
-def _not_negative(name, array):
-    _refuse(name, array, {"at least 0": array >= 0}, " in channel {}")
     return array
 
 
 def vector(name: str, value: Any) -> Any:
     """A position or an edge: three finite numbers."""
-    return _shaped(name, value, lambda shape: shape == (3,), "three numbers", "Give [x, y, z]")
+    return _shaped(name, value, lambda *shape: shape == (3,), "three numbers", "Give [x, y, z]")
 
 
 def direction_value(name: str, value: Any) -> Any:
@@ -185,25 +180,24 @@ def positive(name: str, value: Any) -> Any:
 def spectrum(name: str, value: Any) -> Any:
     """One value per channel, at least 0; a single number becomes one channel."""
     words = "a number per channel"
-    array = _shaped(name, value, lambda shape: len(shape) < 2 and 0 not in shape, words, "Give a list of numbers")
-    return _not_negative(name, array.reshape(-1))
+    array = _shaped(name, value, lambda count=1, *more: count > 0 and not more, words, "Give a list of numbers")
+    _refuse(name, array, {"at least 0": array >= 0}, " in channel {}")
+    return array.reshape(-1)
 
 
 def vertex_list(name: str, value: Any) -> Any:
     """Corners of a polygon: three points or more."""
 
-    def fits(shape):
-        return len(shape) == 2 and shape[0] >= 3 and shape[1] == 3
+    def fits(count=0, axes=0, *more):
+        return count >= 3 and axes == 3 and not more
 
     return _shaped(name, value, fits, "three points or more", "Give [[x, y, z], ...]")
 
 
 def sample_number(value: Any, most: int = MAX_SAMPLES) -> int:
     """A number of samples: a whole number from 1 to ``most``."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise InputError("samples", f"must be a whole number, got {value!r}", "Give a whole number")
-    if not 1 <= value <= most:
-        raise InputError("samples", f"must be between 1 and {most}, got {value}", "Give a whole number")
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 1 <= value <= most:
+        raise InputError("samples", f"must be a whole number between 1 and {most}, got {value!r}", "Correct the value")
     return int(value)
 
 
@@ -229,11 +223,9 @@ def coefficients(**given: Any) -> list[Array | np.ndarray]:
     Raises:
         InputError: naming the one that is not finite, is negative, or does not go with the others.
     """
-    arrays = {name: _material_numbers(name, value) for name, value in given.items()}
+    arrays = {name: spectrum(name, _known(name, value)) for name, value in given.items()}
     channels = max(array.size for array in arrays.values())
     for name, array in arrays.items():
-        if array.ndim > 1 or array.size == 0:
-            raise InputError(name, f"must be one number or one number per channel, got shape {array.shape}")
         if array.size not in (1, channels):
             sizes = ", ".join(f"{n} {v.size}" for n, v in arrays.items())
             came = f"the coefficients differ in their number of channels ({sizes})"
@@ -253,15 +245,14 @@ def exponent(given: Any) -> Array | np.ndarray:
     Raises:
         InputError: where it is not finite, negative or beyond `LARGEST`.
     """
-    value = _material_numbers("n", given)
+    value = _known("n", given)
     if value.size != 1:
         raise InputError("n", f"must be one number, got shape {value.shape}", "All channels share one exponent")
-    return value.reshape(())
+    return number("n", value.reshape(()), low=0.0)
 
 
-def _material_numbers(name, given):
-    """At least 0, and float64 of NumPy where they are known; what JAX is tracing passes through."""
+def _known(name, given):
+    """In float64 of NumPy, but for what JAX is tracing."""
     if isinstance(given, list | tuple) and any(isinstance(value, Tracer) for value in given):
         given = jnp.stack([jnp.asarray(value) for value in given])
-    known = given if isinstance(given, Tracer) else as_numbers(name, given)
-    return _not_negative(name, _numbers(name, known))
+    return given if isinstance(given, Tracer) else as_numbers(name, given)

@@ -206,7 +206,7 @@ def test_a_material_is_a_pytree_and_can_be_made_inside_a_transformation():
         (dict(n=-1), "n: must be at least 0, got -1."),
         (dict(n=[1, 2]), "n: must be one number, got shape (2,). All channels share one exponent."),
         (dict(k_a="red"), "k_a: must be numbers, got 'red'."),
-        (dict(k_d=[[0.1]]), "k_d: must be one number or one number per channel, got shape (1, 1)."),
+        (dict(k_d=[[0.1]]), "k_d: must be a number per channel, got [[0.1]]."),
         (dict(k_d=[0.1, 0.2]), "k_d: the coefficients differ in their number of channels (k_a 1, k_d 2, k_s 3)."),
     ],
 )

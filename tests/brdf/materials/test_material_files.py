@@ -157,7 +157,7 @@ MALFORMED = {
     "words": (".json", '{"model": "lambert", "k_d": ["red"]}', "k_d: must be a number"),
     "truth": (".json", '{"model": "lambert", "k_d": [true]}', "k_d: must be a number, got true"),
     "nested": (".json", '{"model": "lambert", "k_d": [[1]]}', "k_d: must be a number"),
-    "empty": (".json", '{"model": "lambert", "k_d": []}', "k_d: must be one number"),
+    "empty": (".json", '{"model": "lambert", "k_d": []}', "k_d: must be a number per channel"),
     "two n": (".json", '{"model": "phong", "k_d": [1], "k_s": [1], "n": [1, 2]}', "n: must be one number"),
     "channels": (".json", '{"model": "lambert", "k_a": [1, 2], "k_d": [1, 2, 3]}', "number of channels"),
     "many channels": (".json", LIMIT_OF_CHANNELS, "k_d: has 5000 channels. Give at most 4096."),
