@@ -66,22 +66,14 @@ def cast(tree: Any, precision: Precision | None) -> Any:
         dtype('float32')
     """
 
-    def leaf(value: Any) -> Any:
-        if isinstance(value, jax.Array):
-            floating = jnp.issubdtype(value.dtype, np.floating)
-            return value if precision is None or not floating else value.astype(precision)
+    def leaf(value):
         # Through NumPy, or each kind of number would be compiled.
-        array = np.asarray(value)
-        floating = jnp.result_type(float) if precision is None else precision
-        return array.astype(floating) if array.dtype.kind == "f" else array
+        array = value if isinstance(value, jax.Array) else np.asarray(value)
+        kept = not jnp.issubdtype(array.dtype, np.floating) or (precision is None and array is value)
+        return array if kept else array.astype(precision or jnp.result_type(float))
 
     with working_precision(precision):  # float64 stays what it is outside of it
-        leaves, structure = jax.tree.flatten(tree)
-        leaves = list(map(leaf, leaves))
-        # Those on the host go together.
-        on_host = [value for value in leaves if isinstance(value, np.ndarray)]
-        put = iter(jax.device_put(on_host))
-        return structure.unflatten(next(put) if isinstance(value, np.ndarray) else value for value in leaves)
+        return jax.device_put(jax.tree.map(leaf, tree))
 
 
 def apart(function: Callable[..., Any], *arguments: Any) -> Any:

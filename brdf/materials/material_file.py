@@ -108,20 +108,14 @@ def save_material(material: Material, path: str | Path, *, undetermined: Mapping
     """
     instance("material", material, Material, "Write brdf.save_material(material, path)")
     check_single(material)
-    channels = material.k_d.size
+    channels, values = material.k_d.size, material_to_dict(material, undetermined=undetermined)
     if _suffix(path, "Name it .json or .mtl") == ".json":
-        text = to_json(material, undetermined=undetermined)
+        text = json.dumps(values, indent=2) + "\n"
     elif channels in (1, 3):
-        note = material_to_dict(material, undetermined=undetermined).get("note", "")
-        text = to_mtl(material, undetermined=undetermined, note=note)
+        text = to_mtl(material, undetermined=undetermined, note=values.get("note", ""))
     else:
         raise InputError(path, f"cannot hold {channels} channels, MTL knows RGB alone", "Save the material as .json")
     write_text(path, text)
-
-
-def to_json(material: Material, *, undetermined: Mapping[str, str] = _NOTHING) -> str:
-    """The text of a JSON file; see `save_material`."""
-    return json.dumps(material_to_dict(material, undetermined=undetermined), indent=2) + "\n"
 
 
 def material_to_dict(material: Material, *, undetermined: Mapping[str, str] = _NOTHING) -> dict[str, Any]:

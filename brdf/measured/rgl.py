@@ -9,7 +9,6 @@ import dataclasses
 import io
 import math
 import struct
-import threading
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +32,6 @@ _ONE_IS_ENOUGH = "pc"
 _REPAIR = "The file is damaged; get it again"
 # Half angle, difference angle and azimuth: the samples that a fit sees. The files hold 32 x 32 views for 8 lights.
 _GRID = (90, 30, 36)
-_variant_lock = threading.Lock()
 
 
 def read_fields(content: bytes, place: object) -> dict[str, tuple[int, np.ndarray]]:
@@ -126,18 +124,17 @@ def _evaluation(path, channels):
         remedy = "Install it: pip install brdf-fitting[measured]"
         raise InputError(path, "is read through Mitsuba, which is not installed", remedy) from None
     wavelengths = [float(name.removesuffix(" nm")) for name in channels if name.endswith("nm")]
-    with _variant_lock:
-        before = mitsuba.variant()
-        try:
-            # The vectorised variants compile through LLVM, which ends the process where its version does not suit them.
-            mitsuba.set_variant("scalar_spectral" if wavelengths else "scalar_rgb")
-            plugin: Any = mitsuba.load_dict({"type": "measured", "filename": utf8_name(path)})
-            context, interaction, vector = mitsuba.BSDFContext(), mitsuba.SurfaceInteraction3f(), mitsuba.Vector3f
-        except (RuntimeError, ImportError) as error:
-            raise InputError(path, f"Mitsuba cannot read it ({str(error).splitlines()[0]})", _REPAIR) from None
-        finally:
-            if before:
-                mitsuba.set_variant(before)
+    before = mitsuba.variant()
+    try:
+        # The vectorised variants compile through LLVM, which ends the process where its version does not suit them.
+        mitsuba.set_variant("scalar_spectral" if wavelengths else "scalar_rgb")
+        plugin: Any = mitsuba.load_dict({"type": "measured", "filename": utf8_name(path)})
+        context, interaction, vector = mitsuba.BSDFContext(), mitsuba.SurfaceInteraction3f(), mitsuba.Vector3f
+    except (RuntimeError, ImportError) as error:
+        raise InputError(path, f"Mitsuba cannot read it ({str(error).splitlines()[0]})", _REPAIR) from None
+    finally:
+        if before:
+            mitsuba.set_variant(before)
     together = 4 if wavelengths else 3  # channels that Mitsuba evaluates at once
 
     def evaluate(to_light, to_view):
