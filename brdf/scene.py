@@ -262,13 +262,15 @@ def _of_picture(pixel, leaf):
 
 def _chosen(points, pixel):
     """Some of the points, in the shape of ``pixel``."""
-    area = points.area
-    some = jax.tree.map(partial(_of_picture, pixel), dataclasses.replace(points, visibility=None, area=None))
-    slot = np.full(pixel.shape, -1) if area is None else _of_picture(pixel, area.slot)
-    averaged = np.flatnonzero(slot >= 0)
-    if not averaged.size:
+    area, choose = points.area, partial(_of_picture, pixel)
+    some = jax.tree.map(choose, dataclasses.replace(points, visibility=None, area=None))
+    if area is None or not np.any(choose(area.slot) >= 0):
         return some
+    slot: Any = choose(area.slot)
+    averaged: Any = np.flatnonzero(slot >= 0)
+    rows = slot.ravel()[averaged]
     fine = dataclasses.replace(area.points, visibility=None), area.weight
-    fine, weight = jax.tree.map(lambda leaf: np.asarray(leaf)[slot.ravel()[averaged]], fine)
-    new = np.where(slot < 0, -1, np.cumsum(slot >= 0).reshape(slot.shape) - 1)
-    return dataclasses.replace(some, area=PixelArea(averaged.astype(np.int32), new.astype(np.int32), fine, weight))
+    fine, weight = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], fine)
+    slot = np.where(slot < 0, -1, np.cumsum(slot >= 0).reshape(slot.shape) - 1)
+    area = PixelArea(averaged.astype(np.int32), slot.astype(np.int32), fine, weight)
+    return dataclasses.replace(some, area=area)

@@ -1,21 +1,16 @@
-"""scene.toml in and out. Strict: an unknown key, a wrong type or a missing value names file, table and key.
-
-A table holds the arguments of a class or function, whose annotations say what is no number: a path, which must stay
-within the scene's folder, the name of a layer, a truth value.
-"""
+"""scene.toml in and out. Strict: an unknown key, a wrong type or a missing value names file, table and key."""
 
 import dataclasses
 import inspect
 import itertools
 import json
-import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NewType
+from typing import Any
 
-import jax
 import numpy as np
 
+from brdf.arguments import Layer, Table
 from brdf.checks import direction_value, spectrum
 from brdf.errors import InputError
 from brdf.files import read_toml, write_text
@@ -37,90 +32,10 @@ _LIGHTS = (DirectionalLight, PointLight, SpotLight, RectangleLight, PolygonLight
 LIGHTS: dict[str, type[Light]] = {light.type_name: light for light in _LIGHTS}
 _DISTANT = DirectionalLight | ConstantEnvironment | EnvironmentMap
 
-MOST_NUMBERS = 4096
-"""Longer lists are no spectrum, no polygon that anybody draws."""
-
 MOST_BYTES = 1 << 22
-
-_Layer = NewType("_Layer", str)
-_WORDS: dict[Any, str] = {Path: "a path", _Layer | None: "the name of a layer", bool: "true or false"}
 
 
 # -- reading -----------------------------------------------------------------------------------------------------------
-
-
-@dataclasses.dataclass
-class _Table:
-    """One table of the file.
-
-    Attributes:
-        place: file and table, for messages.
-        values: by key.
-        folder: of the file.
-        within: the folder that no path may leave.
-    """
-
-    place: str
-    values: dict[str, Any]
-    folder: Path
-    within: Path
-
-    def __post_init__(self):
-        if not isinstance(self.values, dict):
-            raise InputError(self.place, f"must be a table, got {self.values!r}", "Write it as a [table]")
-
-    def choose(self, choices):
-        """What the table's ``type`` names."""
-        known = ", ".join(choices)
-        if "type" not in self.values:
-            raise InputError(self.place, "has no type", f"Add type = one of {known}")
-        value = self.values.pop("type")
-        if not isinstance(value, str) or value not in choices:
-            raise InputError(f"{self.place}.type", f"is unknown, got {value!r}", f"Use one of {known}")
-        return choices[value]
-
-    def make(self, maker):
-        """What a class or function makes of the values, which bear its parameters' names."""
-        parameters = inspect.signature(maker).parameters
-        for key in self.values:
-            if key not in parameters:
-                raise InputError(f"{self.place}.{key}", "is not a known key", f"Known here: {', '.join(parameters)}")
-        values = {key: self._value(key, parameters[key].annotation) for key in self.values}
-        for name, one in parameters.items():
-            if name not in values and one.default is one.empty:
-                raise InputError(self.place, f"has no {name}", f"Add {name} = ...")
-        files = tuple(str(value) for value in values.values() if isinstance(value, Path))
-        try:
-            return maker(**values)
-        except InputError as error:
-            raise error if error.where.startswith(files) else error.inside(self.place) from None
-
-    def _value(self, key, kind):
-        """A value, refused where Python would silently read a truth value or text as a number."""
-        value, place = self.values[key], f"{self.place}.{key}"
-        if kind in _WORDS:
-            if not isinstance(value, bool if kind is bool else str) or value == "":
-                raise InputError(place, f"must be {_WORDS[kind]}, got {value!r}", "Correct the value")
-            return self._path(place, value) if kind is Path else value
-        if isinstance(value, list) and len(value) > MOST_NUMBERS:
-            raise InputError(place, f"has {len(value)} entries", f"Give at most {MOST_NUMBERS}")
-        for leaf in jax.tree.leaves(value):
-            if isinstance(leaf, bool) or (isinstance(leaf, str) and key != "viewer"):
-                came = repr(leaf) if isinstance(leaf, str) else str(leaf).lower()
-                raise InputError(place, f"must be a number, got {came}", "Give numbers without quotes")
-        return value
-
-    def _path(self, place, name):
-        """The path of a file within the folder."""
-        path, own = self.folder / name, self.within == self.folder
-        try:
-            stays = Path(os.path.realpath(path)).is_relative_to(self.within.resolve())
-        except ValueError:
-            raise InputError(place, f"is no path, got {name!r}", "Correct the path") from None
-        if not stays:
-            where, remedy = ("the scene's folder", ", or allow more with within") if own else (self.within, "")
-            raise InputError(place, f"must stay within {where}, got {name!r}", f"Move the file there{remedy}")
-        return path
 
 
 def read_parts(path: Path, within: str | Path | None, tables: dict[str, Any] | None) -> dict[str, Any]:
@@ -146,7 +61,7 @@ def read_parts(path: Path, within: str | Path | None, tables: dict[str, Any] | N
         if several and not isinstance(value, list):
             raise InputError(f"{path}: {name}", "must be a list of tables", f"Write [[{name}]]")
         found = {f"{name}[{index}]": one for index, one in enumerate(value)} if several else {name: value}
-        read = [_READERS[name](_Table(f"{path}: {place}", one, *folders)) for place, one in found.items()]
+        read = [_READERS[name](Table(f"{path}: {place}", one, *folders)) for place, one in found.items()]
         parts[name] = read if several else read[0]
     if "aov" in parts:
         parts["points"], has_position = parts.pop("aov")
@@ -160,7 +75,7 @@ def read_parts(path: Path, within: str | Path | None, tables: dict[str, Any] | N
 
 
 def _read_shape(table):
-    cls = table.choose(SHAPES)
+    cls = table.choose("type", SHAPES)
     return table.make(_triangles if cls is Triangles else cls)
 
 
@@ -170,7 +85,7 @@ def _triangles(file: Path, fitted: bool = True, smooth: bool = True):
 
 def _read_light(table):
     """A light, and how much of it each pixel sees where a file tells."""
-    cls, values = table.choose(LIGHTS), table.values
+    cls, values = table.choose("type", LIGHTS), table.values
     told = {key: values.pop(key) for key in ("visibility", "visibility_layer") if key in values}
     mask = dataclasses.replace(table, values=told).make(_mask) if told else None
     return table.make(_map if cls is ConstantEnvironment and "file" in values else cls), mask
@@ -180,14 +95,14 @@ def _map(file: Path, radiance=1.0, samples=MAP_SAMPLES):
     return EnvironmentMap(read_image(file), radiance=radiance, samples=samples)
 
 
-def _mask(visibility: Path, visibility_layer: _Layer | None = None):
+def _mask(visibility: Path, visibility_layer: Layer | None = None):
     """The first channel of the picture or layer."""
     if visibility_layer is None:
         return read_image(visibility, encoding="linear")[..., 0]
     return _layer(visibility, read_layers(visibility), visibility_layer)[..., 0]
 
 
-def _points(file: Path, position: _Layer | None = None, normal: _Layer | None = None, to_view=None):
+def _points(file: Path, position: Layer | None = None, normal: Layer | None = None, to_view=None):
     """Surface points from the layers of an image file, and whether their positions are among them."""
     towards = (0, 0, 1) if to_view is None else direction_value("to_view", to_view)
     layers = read_layers(file)
@@ -203,15 +118,16 @@ def _named(layers):
     return ", ".join(name or "the unnamed one" for name in layers)
 
 
-def _layer(file, layers, name, *usual):
+def _layer(file, layers, name, *usual) -> Any:
     """The layer that is named, or the first of the usual ones that there is."""
-    if name is not None and name not in layers:
+    found = [layers[one] for one in (usual if name is None else [name]) if one in layers]
+    if name is not None and not found:
         raise InputError(file, f"has no layer {name!r}, got {_named(layers)}", "Correct the layer's name")
-    return next((layers[one] for one in ((name,) if name is not None else usual) if one in layers), None)
+    return found[0] if found else None
 
 
-_READERS: dict[str, Callable[[_Table], Any]] = {
-    "camera": lambda table: table.make(table.choose(CAMERAS)),
+_READERS: dict[str, Callable[[Table], Any]] = {
+    "camera": lambda table: table.make(table.choose("type", CAMERAS)),
     "shapes": _read_shape,
     "aov": lambda table: table.make(_points),
     "ambient": lambda table: table.make(lambda intensity: spectrum("intensity", intensity)),

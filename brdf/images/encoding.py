@@ -125,7 +125,7 @@ def find_encoding(
     return ("srgb" if bits <= 8 else "linear"), "assumed"
 
 
-def _stated(path, format_name, spec):
+def _stated(path, format_name, spec) -> Encoding | None:
     attributes = {attribute.name: attribute.value for attribute in spec.extra_attribs}
     _, transfer, *_ = attributes.get("CICP", (0, _CICP_UNSPECIFIED))
     if transfer != _CICP_UNSPECIFIED:
@@ -144,19 +144,21 @@ def _stated(path, format_name, spec):
     if not space or format_name in (*_DISPLAY_FORMATS, "bmp", "pnm", "ico", "psd"):
         return None
     named = re.match(r"g(\d\d)_", space)
-    if named or "oiio:Gamma" in attributes:
-        return parse_encoding(path, round(attributes.get("oiio:Gamma") or int(named[1]) / 10, 6))
+    gamma = attributes.get("oiio:Gamma") or (named and int(named[1]) / 10)
+    if gamma:
+        return parse_encoding(path, round(gamma, 6))
     for start, encoding in _SPACES.items():
         if space.startswith(start):
             return encoding
     raise InputError(path, f"is encoded as {attributes['oiio:ColorSpace']}, which is not known here", _HOW_TO_SAY)
 
 
-def _of_profile(path, profile):
+def _of_profile(path, profile) -> Encoding | None:
     """The curve that an ICC profile holds (ICC.1:2022, 7.3); None if it is damaged and so says nothing."""
     try:
         (count,) = struct.unpack_from(">I", profile, 128)
         tags = [struct.unpack_from(">4sII", profile, 132 + 12 * tag) for tag in range(min(count, 100))]
+        curves: set[Encoding | None]
         curves = {_of_curve(profile[start : start + size]) for kind, start, size in tags if kind[1:] == b"TRC"}
     except (struct.error, ValueError):
         return None
@@ -165,7 +167,7 @@ def _of_profile(path, profile):
     return curves.pop()
 
 
-def _of_curve(curve):
+def _of_curve(curve) -> Encoding | None:
     """The encoding whose curve this is (ICC.1:2022, 10.6 and 10.18), None where it is none of those known."""
     at, gamma = np.linspace(0, 1, 256), 1.0
     (number,) = struct.unpack_from(">I", curve, 8)

@@ -320,7 +320,7 @@ def _choose_channels(image):
     return 0, rest or every, apart.get("A") if rest else None
 
 
-def _read_rows(path, image, part, start, stop, channels, kind):
+def _read_rows(path, image, part, start, stop, channels, kind) -> Any:
     """Rows of the data window of a part, (rows, width, channels); OpenImageIO converts them to "float" or codes."""
     spec = image.spec(part)
     low, high = min(channels), max(channels) + 1

@@ -197,7 +197,7 @@ class _Normalised(NamedTuple):
     losses: list[str]
 
 
-def _normalised(material):
+def _normalised(material: Any):
     losses = ["k_a is left out: the format has no ambient coefficient"] if np.any(material.k_a) else []
     if not isinstance(material, SpecularMaterial):
         return _Normalised(_rgb(material.k_d), np.zeros(3), np.zeros(3), 0.0, losses)
@@ -231,15 +231,14 @@ def _json(material, name):
 
 
 def _mtl(material, name):
-    losses, drawn = [], None
+    losses = []
     if isinstance(material, Phong | NormalizedPhong):
         losses.append("MTL's highlight is (N·H)^Ns: Ns is 4 n, of nearly the same highlight as (R·V)^n")
     if isinstance(material, SpecularMaterial) and material.cosine_weighted:
         losses.append("the factor N·L of the highlight is left out: it is brighter towards grazing light")
-        bare = _rgb(material.k_s) * height(material)
 
-        def drawn(cosine):
-            return _rgb(material.k_d) * cosine + bare
+    def drawn(cosine):
+        return _rgb(material.k_d) * cosine + _rgb(material.k_s) * height(material)
 
     return Written(to_mtl(material, name=name), losses, drawn)
 
@@ -404,11 +403,11 @@ def _gltf(material, name):
 
 
 def _mitsuba_xml(material, name):
-    plugin, *rest = _mitsuba(material, name)
+    written = _mitsuba(material, name)
     scene = ElementTree.Element("scene", version="3.0.0")
-    scene.append(_element(plugin, id=name))
+    scene.append(_element(written.content, id=name))
     ElementTree.indent(scene)
-    return Written(ElementTree.tostring(scene, "unicode") + "\n", *rest)
+    return written._replace(content=ElementTree.tostring(scene, "unicode") + "\n")
 
 
 def _element(plugin, **attributes):

@@ -4,15 +4,16 @@ In JSON a value that a picture could not determine is ``null``; it reads back as
 stands for a sum, of which the picture says no more, is a number, and ``note`` says so.
 """
 
-import dataclasses
+import inspect
 import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
-from brdf.channels import MOST_CHANNELS
+from brdf.arguments import Table
 from brdf.checks import instance
 from brdf.errors import InputError
 from brdf.files import as_path, read_text, write_text
@@ -127,7 +128,7 @@ def material_to_dict(material: Material, *, undetermined: Mapping[str, str] = _N
     """
     values: dict[str, Any] = {"model": material.name}
     told: dict[str, dict[str, None]] = {}
-    for key in _parameters(type(material)):
+    for key in inspect.signature(type(material)).parameters:
         numbers = np.asarray(getattr(material, key), np.float64)
         listed: list[Any] = numbers.ravel().tolist()
         for channel, number in enumerate(listed):
@@ -143,46 +144,26 @@ def material_to_dict(material: Material, *, undetermined: Mapping[str, str] = _N
     return values
 
 
-def material_from_dict(values: Any) -> Material:
+def material_from_dict(values: Any, place: object = "material") -> Material:
     """The material that JSON holds.
 
     Args:
         values: what `material_to_dict` gives.
+        place: where it stands, for messages.
 
     Raises:
         InputError: naming the key.
     """
     if not isinstance(values, dict):
-        raise InputError("material", "must be a JSON object", 'Write {"model": ..., "k_d": ...}')
-    name = values.get("model")
-    if not isinstance(name, str) or name not in MODELS:
-        raise InputError("model", f"is unknown, got {repr(name)[:SHOWN]}", f"Use one of {', '.join(MODELS)}")
-    known = _parameters(MODELS[name])
-    for key in values:
-        if key not in ("model", "note", *known):
-            raise InputError(key[:SHOWN], "is not a known key", f"Known here: model, {', '.join(known)}")
-    for key in known:
-        if key not in values and key != "k_a":
-            raise InputError(key, "is missing", f"{name} needs {', '.join(known)}")
-    numbers = {key: _numbers(key, values[key]) for key in known if key in values}
-    if values.get("n", 0) is None and np.any(numbers["k_s"]):
-        raise InputError("n", "is null (not determined) although k_s is not 0", "Give n, or k_s = 0")
-    return MODELS[name](**numbers)
-
-
-def _parameters(model):
-    return [field.name for field in dataclasses.fields(model)]
-
-
-def _numbers(key, value):
-    several = value if isinstance(value, list) else [value]
-    if len(several) > MOST_CHANNELS:
-        raise InputError(key, f"has {len(several)} channels", f"Give at most {MOST_CHANNELS}")
-    for number in several:
-        if type(number) not in (int, float, type(None)):
-            raise InputError(key, f"must be a number, got {json.dumps(number)[:SHOWN]}", "Give numbers or null")
-    numbers = [number or 0.0 for number in several]
-    return numbers if isinstance(value, list) else numbers[0]
+        raise InputError(place, "must be a JSON object", 'Write {"model": ..., "k_d": ...}')
+    given = {key: value for key, value in values.items() if key != "note"}
+    table = Table(
+        str(place), jax.tree.map(lambda leaf: 0.0 if leaf is None else leaf, given, is_leaf=lambda leaf: leaf is None)
+    )
+    material = table.make(table.choose("model", MODELS))
+    if values.get("n", 0) is None and np.any(material.k_s):
+        raise InputError(f"{place}: n", "is null (not determined) although k_s is not 0", "Give n, or k_s = 0")
+    return material
 
 
 def _suffix(path, remedy):
@@ -211,9 +192,9 @@ def _entries(path):
 
 def _material(path, name, entry):
     """What is wrong with one material keeps nobody from another of the file."""
-    is_mtl = Path(path).suffix.lower() == ".mtl"
     try:
-        material = material_from_mtl(entry) if is_mtl else material_from_dict(entry)
+        is_mtl = Path(path).suffix.lower() == ".mtl"
+        material = material_from_mtl(entry) if is_mtl else material_from_dict(entry, path)
         return material, entry["note"] if isinstance(entry.get("note"), str) else ""
     except InputError as error:
-        raise error.inside(f"{path}: material {name[:SHOWN]}" if is_mtl else path) from None
+        raise error if error.where.startswith(str(path)) else error.inside(f"{path}: material {name[:SHOWN]}") from None

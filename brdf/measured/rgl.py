@@ -24,8 +24,7 @@ _MOST_FIELDS = 64
 _MOST_BYTES = 1 << 31
 _TYPES = {5: np.dtype("<u4"), 10: np.dtype("<f4")}  # others count in bytes
 _BYTE, _FLOAT = 1, 10
-# The dimensions of a field, those of one letter as long as each other: azimuths and polar angles of the light, channels,
-# and others.
+# The dimensions of a field, those of one letter alike: azimuths and polar angles of the light, channels, others.
 _LAYOUT = {"phi_i": "p", "theta_i": "t", "sigma": "..", "ndf": "..", "vndf": "pt..", "luminance": "ptxy"}
 _SPECTRAL = {"wavelengths": "c", "spectra": "ptcxy"}
 _ONE_IS_ENOUGH = "pc"
@@ -129,7 +128,8 @@ def _evaluation(path, channels):
         # The vectorised variants compile through LLVM, which ends the process where its version does not suit them.
         mitsuba.set_variant("scalar_spectral" if wavelengths else "scalar_rgb")
         plugin: Any = mitsuba.load_dict({"type": "measured", "filename": utf8_name(path)})
-        context, interaction, vector = mitsuba.BSDFContext(), mitsuba.SurfaceInteraction3f(), mitsuba.Vector3f
+        context, vector = mitsuba.BSDFContext(), mitsuba.Vector3f
+        interaction: Any = mitsuba.SurfaceInteraction3f()
     except (RuntimeError, ImportError) as error:
         raise InputError(path, f"Mitsuba cannot read it ({str(error).splitlines()[0]})", _REPAIR) from None
     finally:

@@ -18,7 +18,7 @@ PACKAGES = ("brdf", "fitting")
 
 # From the bottom to the top; a name stands for all below it that have no line of their own.
 LAYERS = """
-brdf.errors brdf.formatters brdf.checks brdf.files brdf.channels brdf.precision brdf.vectors
+brdf.errors brdf.formatters brdf.checks brdf.files brdf.channels brdf.arguments brdf.precision brdf.vectors
 brdf.models brdf.albedo brdf.conversions
 brdf.geometry brdf.lights brdf.lobes brdf.pixel_area brdf.images brdf.scene_file brdf.scene brdf.rendering
 brdf.materials brdf.measured brdf.plausibility brdf.display
@@ -40,7 +40,7 @@ brdf.albedo brdf.channels brdf.checks brdf.conversions brdf.display brdf.errors 
     brdf.images.jpeg brdf.images.writing brdf.lights.base brdf.lobes
     brdf.materials.exports brdf.materials.material_file brdf.measured.loading brdf.measured.table brdf.models.base
     brdf.models.one_of brdf.plausibility.numeric brdf.plausibility.report brdf.precision brdf.rendering
-    brdf.scene brdf.vectors
+    brdf.vectors
 """.split()
 )
 

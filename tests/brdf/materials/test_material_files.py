@@ -135,23 +135,23 @@ def test_a_comment_names_the_model_of_the_next_material_alone(tmp_path: Path):
 LIMIT_OF_CHANNELS = json.dumps({"model": "lambert", "k_d": [0.5] * 5000})
 
 MALFORMED = {
-    "list": (".json", "[1]", "material: must be a JSON object"),
+    "list": (".json", "[1]", "a.json: must be a JSON object"),
     "no JSON": (".json", "{", "is not JSON"),
     "nested too deeply": (".json", "[" * 100_000, "is not JSON"),
     "number of 5,000 digits": (".json", '{"model": "lambert", "k_d": %s}' % ("9" * 5000), "is not JSON"),
-    "no model": (".json", "{}", "model: is unknown, got None"),
+    "no model": (".json", "{}", "a.json: has no model. Add model = one of lambert, phong"),
     "unknown model": (".json", '{"model": "ward"}', "model: is unknown, got 'ward'"),
     "unknown key": (
         ".json",
         '{"model": "lambert", "k_d": [1], "gloss": 1}',
-        "a.json: gloss: is not a known key. Known here: model, k_a, k_d.",
+        "a.json: gloss: is not a known key. Known here: k_a, k_d.",
     ),
     "key of another model": (
         ".json",
         '{"model": "lambert", "k_d": [1], "n": 3}',
-        "n: is not a known key. Known here: model, k_a, k_d.",
+        "n: is not a known key. Known here: k_a, k_d.",
     ),
-    "missing": (".json", '{"model": "phong", "k_d": [1], "n": 3}', "k_s: is missing. phong needs k_a, k_d, k_s, n."),
+    "missing": (".json", '{"model": "phong", "k_d": [1], "n": 3}', "a.json: has no k_s. Add k_s = "),
     "negative": (".json", '{"model": "lambert", "k_d": [0.5, -0.2]}', "k_d: must be at least 0, got -0.2 in channel 1"),
     "not a number": (".json", '{"model": "lambert", "k_d": [NaN]}', "k_d: must be finite"),
     "words": (".json", '{"model": "lambert", "k_d": ["red"]}', "k_d: must be a number"),
@@ -160,7 +160,7 @@ MALFORMED = {
     "empty": (".json", '{"model": "lambert", "k_d": []}', "k_d: must be a number per channel"),
     "two n": (".json", '{"model": "phong", "k_d": [1], "k_s": [1], "n": [1, 2]}', "n: must be one number"),
     "channels": (".json", '{"model": "lambert", "k_a": [1, 2], "k_d": [1, 2, 3]}', "number of channels"),
-    "many channels": (".json", LIMIT_OF_CHANNELS, "k_d: has 5000 channels. Give at most 4096."),
+    "many channels": (".json", LIMIT_OF_CHANNELS, "k_d: has 5000 entries. Give at most 4096."),
     "unknown n": (
         ".json",
         '{"model": "phong", "k_d": [1], "k_s": [1], "n": null}',
