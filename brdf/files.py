@@ -25,21 +25,17 @@ except ImportError:  # on Windows, where nothing is removed
     fcntl = None
 
 _STAGED = ".brdf-staged-"
-_FREE, _ELSEWHERE = "Free some space or write elsewhere", "Change the permissions or choose another place"
+# Where the system's own words would not do.
 _REMEDIES = {
-    errno.ENOSPC: ("there is no space left to write it", _FREE),
-    errno.EDQUOT: ("the disk quota is used up", _FREE),
+    errno.ENOSPC: ("there is no space left to write it", "Free some space or write elsewhere"),
     errno.EFBIG: ("the file would be larger than allowed here", "Write elsewhere or raise the limit"),
-    errno.EACCES: ("permission denied", _ELSEWHERE),
-    errno.EPERM: ("permission denied", _ELSEWHERE),
-    errno.EROFS: ("the file system is read-only", "Choose another place"),
     errno.ENOENT: ("there is no such file or folder", "Check the path"),
     errno.ENOTDIR: ("a part of the path is not a folder", "Check the path"),
     errno.EEXIST: ("a part of the path is not a folder", "Check the path"),
     errno.EISDIR: ("is a folder, not a file", "Give the path of a file"),
-    errno.ENAMETOOLONG: ("the name is too long", "Choose a shorter name"),
     errno.ELOOP: ("the links lead in a circle", "Check the path"),
 }
+_REMEDY = "Check the path, its permissions and the space left there"
 MAX_TEXT_BYTES = 1 << 24
 AnyPath = str | os.PathLike[str]
 
@@ -50,7 +46,8 @@ def _told(path):
     try:
         yield
     except OSError as error:
-        what, remedy = _REMEDIES.get(error.errno or 0, (error.strerror or type(error).__name__, "Check the path"))
+        words = (error.strerror or type(error).__name__).lower()
+        what, remedy = _REMEDIES.get(error.errno or 0, (words, _REMEDY))
         raise InputError(path, what, remedy) from None
 
 

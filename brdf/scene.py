@@ -240,9 +240,7 @@ def some_pixels(
             raise InputError("pixel", came, "Of a mask, give np.flatnonzero(mask)")
     pixel = pixel.reshape(1, -1) if pixel.ndim == 1 else pixel
     with working_precision(precision):
-        if scene.camera is None:
-            points = _chosen(cast(scene.points, precision), pixel)
-        elif scene.camera.samples == 1:
+        if scene.camera is not None and scene.camera.samples == 1:
             width = scene.camera.resolution[0]
             column, row = pixel % width + 0.5, pixel // width + 0.5
             points = surface_points(scene.camera, scene.shapes, column, row)

@@ -231,8 +231,8 @@ class ImageReader(contextlib.AbstractContextManager):
         if not coded:
             return decode(pixels, encoding)
         table, values = decode_table(encoding, 16), np.empty(pixels.shape, np.float32)
-        for row, codes in zip(values, pixels, strict=True):
-            row[:] = table[codes]  # a row at a time: NumPy makes eight bytes of every code
+        for row, codes in enumerate(pixels):
+            values[row] = table[codes]  # a row at a time: NumPy makes eight bytes of every code
         return values
 
 
