@@ -179,28 +179,11 @@ def _brightness(material, drawn):
     ]
 
 
-class _Normalised(NamedTuple):
-    """The form that a physically based renderer has words for, and what that costs.
-
-    Attributes:
-        k_d: (3,).
-        k_s: (3,); 0 without a highlight.
-        peak: k_s times what stands before the lobe, (3,).
-        n: exponent of N·H.
-        losses: a sentence each.
-    """
-
-    k_d: Colour
-    k_s: Colour
-    peak: Colour
-    n: float
-    losses: list[str]
-
-
 def _normalised(material: Any):
+    """The form that a physically based renderer has words for: k_d, k_s, its peak, n of N·H; and what that costs."""
     losses = ["k_a is left out: the format has no ambient coefficient"] if np.any(material.k_a) else []
     if not isinstance(material, SpecularMaterial):
-        return _Normalised(_rgb(material.k_d), np.zeros(3), np.zeros(3), 0.0, losses)
+        return _rgb(material.k_d), np.zeros(3), np.zeros(3), 0.0, losses
     if not material.cosine_weighted:
         material = nearest_normalized(material)
         losses.append(
@@ -211,7 +194,7 @@ def _normalised(material: Any):
     if isinstance(material, NormalizedPhong):
         losses.append("the highlight is one of N·H: its exponent is 4 n, of nearly the same highlight as (R·V)^n")
     k_s = _rgb(material.k_s)
-    return _Normalised(_rgb(material.k_d), k_s, k_s * height(material), half_exponent(material), losses)
+    return _rgb(material.k_d), k_s, k_s * height(material), half_exponent(material), losses
 
 
 def _cut(**colours):
@@ -254,11 +237,11 @@ def _pytorch3d(material, name):
         if isinstance(classic, BlinnPhong):
             losses.append("PyTorch3D's highlight is (R·V)^shininess: shininess is n / 4, of nearly the same highlight")
             shininess = float(mirror_from_half(shininess))
-    lines = ["# Materials(device=device, **MATERIALS) of pytorch3d.renderer, written by brdf.", "MATERIALS = {"]
-    for key, value in {"ambient": _rgb(classic.k_a), "diffuse": k_d, "specular": k_s}.items():
-        lines.append(f'    "{key}_color": ({tuple(value.tolist())!r},),')
-    text = "\n".join([*lines, f'    "shininess": {shininess!r},', "}", ""])
-    return Written(text, losses, lambda cosine: k_d * cosine + k_s)
+    colours = {"ambient": _rgb(classic.k_a), "diffuse": k_d, "specular": k_s}
+    values = {f"{key}_color": (tuple(colour.tolist()),) for key, colour in colours.items()}
+    lines = [f'    "{key}": {value!r},' for key, value in (values | {"shininess": shininess}).items()]
+    head = "# Materials(device=device, **MATERIALS) of pytorch3d.renderer, written by brdf."
+    return Written("\n".join([head, "MATERIALS = {", *lines, "}", ""]), losses, lambda cosine: k_d * cosine + k_s)
 
 
 # -- GLSL: the exact formula -------------------------------------------------------------------------------------------
@@ -321,18 +304,14 @@ def shader(model: type[Material], declarations: str) -> str:
 
 
 def _glsl(material, name):
-    def number(value):
-        text = f"{value:.9g}"
-        return text if "." in text or "e" in text else text + ".0"
-
     constants = [
-        f"const vec3 BRDF_{key.upper()} = vec3({', '.join(map(number, _rgb(getattr(material, key))))});"
+        f"const vec3 BRDF_{key.upper()} = vec3({', '.join(map(repr, _rgb(getattr(material, key)).tolist()))});"
         for key in ("k_a", "k_d", "k_s")
         if hasattr(material, key)
     ]
     if isinstance(material, SpecularMaterial):
-        constants.append(f"const float BRDF_N = {number(float(material.n))};")
-        constants.append(f"const float BRDF_SCALE = {number(height(material))};")
+        constants.append(f"const float BRDF_N = {float(material.n)!r};")
+        constants.append(f"const float BRDF_SCALE = {height(material)!r};")
     return Written(shader(type(material), "\n".join(constants)), [])
 
 
