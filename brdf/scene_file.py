@@ -201,8 +201,8 @@ def _obj(mesh):
         lines += rows("f", mesh.faces + 1)
     else:
         lines += rows("vn", mesh.normals.reshape(-1, 3))
-        corner = itertools.count(1)
-        lines += [f"f {' '.join(f'{vertex}//{next(corner)}' for vertex in face)}" for face in (mesh.faces + 1).tolist()]
+        corners = [f"{vertex}//{at}" for at, vertex in enumerate((mesh.faces + 1).ravel().tolist(), start=1)]
+        lines += [f"f {' '.join(face)}" for face in np.reshape(corners, (-1, 3))]
     return "\n".join([*lines, ""])
 
 
