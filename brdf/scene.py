@@ -14,7 +14,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from brdf.checks import Checked, Spectrum, instance, several, spectrum
-from brdf.errors import InputError
+from brdf.errors import InputError, as_numbers
 from brdf.files import as_path
 from brdf.geometry.base import Shape
 from brdf.geometry.camera import Camera
@@ -30,9 +30,7 @@ def _masks(value):
     masks = []
     for mask in several("visibility", value):
         if mask is not None and not isinstance(mask, jax.Array):
-            mask = np.asarray(mask, np.float64)
-            if mask.ndim != 2:
-                raise InputError("visibility", f"must be of shape (H, W), got {mask.shape}", "Give a value per pixel")
+            mask = as_numbers("visibility", mask)
             if not np.all((mask >= 0) & (mask <= 1)):
                 came = f"must lie between 0 and 1, got {np.min(mask):g} to {np.max(mask):g}"
                 raise InputError("visibility", came, "Give the share of the light that each pixel sees")
