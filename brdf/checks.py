@@ -109,12 +109,12 @@ def checked(check: Callable[[str, Any], Any], name: str, **field: Any) -> Any:
     return eqx.field(converter=partial(check, name), **field)
 
 
-def _numbers(name, value, words="numbers"):
+def _numbers(name, value, words, largest=LARGEST):
     """Finite numbers of any shape."""
     if isinstance(value, jax.Array):
         return value
     array = as_numbers(name, value, words)
-    _refuse(name, array, {"finite": np.isfinite(array), f"within ± {LARGEST:g}": ~(np.abs(array) > LARGEST)})
+    _refuse(name, array, {"finite": np.isfinite(array), f"within ± {largest:g}": ~(np.abs(array) > largest)})
     return array
 
 
@@ -127,22 +127,22 @@ def _refuse(name, array, limits, place=""):
             raise InputError(name, f"must be {words}, got {array.flat[first]:g}{where}", "Correct the value")
 
 
-def _shaped(name, value, fits, words, remedy):
+def _shaped(name, value, fits, words, remedy, largest=LARGEST):
     """Finite numbers of a shape that fits."""
-    array = _numbers(name, value, words)
+    array = _numbers(name, value, words, largest)
     if not fits(*array.shape):
         raise InputError(name, f"must be {words}, got {what_came(value)}", remedy)
     return array
 
 
-def vector(name: str, value: Any) -> Any:
-    """A position or an edge: three finite numbers."""
-    return _shaped(name, value, lambda *shape: shape == (3,), "three numbers", "Give [x, y, z]")
+def vector(name: str, value: Any, largest: float = LARGEST) -> Any:
+    """A position or an edge: three finite numbers up to ``largest``."""
+    return _shaped(name, value, lambda *shape: shape == (3,), "three numbers", "Give [x, y, z]", largest)
 
 
 def direction_value(name: str, value: Any) -> Any:
     """A direction of any length: three finite numbers, not all zero."""
-    array = vector(name, value)
+    array = vector(name, value, np.inf)
     if not isinstance(array, np.ndarray):
         return array
     size = np.max(np.abs(array))
