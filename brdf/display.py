@@ -51,15 +51,14 @@ def lit_sphere(material: Material | Callable[[Any, Any], Any], size: int = 128) 
     x, y = np.meshgrid(place, -place)
     inside = x * x + y * y < 1
     x, y = x[inside], y[inside]
-    normal = np.stack([x, y, np.sqrt(1 - x * x - y * y)], axis=-1)
-    tangent = np.cross([0.0, 1.0, 0.0], normal)
-    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
+    z = np.sqrt(1 - x * x - y * y)
+    normal, tangent = np.stack([x, y, z], axis=-1), np.stack([z, 0 * x, -x], axis=-1) / np.hypot(x, z)[:, None]
     frame = np.stack([tangent, np.cross(normal, tangent), normal], axis=1)
     to_light = frame @ np.array([-0.5, 0.6, 0.8]) / math.sqrt(1.25)
-    f_r, k_a = (material.reflectance, material.k_a) if isinstance(material, Material) else (material, 0.0)
+    f_r: Any = getattr(material, "reflectance", material)
     lit = np.asarray(f_r(to_light, frame[:, :, 2])) * np.maximum(to_light[:, 2:], 0)
     image = np.ones((size, size, 3))
-    image[inside] = displayed(np.nan_to_num(0.2 * np.asarray(k_a) + 0.9 * np.pi * lit)[None])[0]
+    image[inside] = displayed((0.2 * np.asarray(getattr(material, "k_a", 0.0)) + 0.9 * np.pi * lit)[None])[0]
     return image
 
 
