@@ -27,7 +27,7 @@ Vector = Float[Any, "3"]
 Spectrum = Float[Any, " C"]
 
 LARGEST = 1e15
-"""Of any number of a scene or material: squares and products of a few of them stay within float32's 3e38."""
+"""Of any number of a scene, and of an exponent: squares and products of a few of them stay within float32's 3e38."""
 
 MAX_SAMPLES = 1 << 20
 
@@ -177,10 +177,10 @@ def positive(name: str, value: Any) -> Any:
     return number(name, value, above=0.0)
 
 
-def spectrum(name: str, value: Any) -> Any:
-    """One value per channel, at least 0; a single number becomes one channel."""
-    words = "a number per channel"
-    array = _shaped(name, value, lambda count=1, *more: count > 0 and not more, words, "Give a list of numbers")
+def spectrum(name: str, value: Any, largest: float = LARGEST) -> Any:
+    """One value per channel, from 0 to ``largest``; a single number becomes one channel."""
+    words, remedy = "a number per channel", "Give a list of numbers"
+    array = _shaped(name, value, lambda count=1, *more: count > 0 and not more, words, remedy, largest)
     _refuse(name, array, {"at least 0": array >= 0}, " in channel {}")
     return array.reshape(-1)
 
@@ -225,7 +225,7 @@ def coefficients(**given: Any) -> list[Array | np.ndarray]:
     Raises:
         InputError: naming the one that is not finite, is negative, or does not go with the others.
     """
-    arrays = {name: spectrum(name, _known(name, value)) for name, value in given.items()}
+    arrays = {name: spectrum(name, _known(name, value), np.inf) for name, value in given.items()}
     channels = max(array.size for array in arrays.values())
     for name, array in arrays.items():
         if array.size not in (1, channels):
