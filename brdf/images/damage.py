@@ -83,8 +83,10 @@ def _check_png(path, content):
     while kind != b"IEND" and at + 8 <= len(content):
         end = at + 8 + int.from_bytes(content[at : at + 4])
         kind = content[at + 4 : at + 8]
-        if not kind[:1].islower() and zlib.crc32(content[at + 4 : end]) != int.from_bytes(content[end : end + 4]):
-            raise InputError(path, f"is damaged: the checksum of its {kind.decode('latin-1')} is wrong", _AGAIN)
+        if not kind.isalpha():
+            raise InputError(path, "is damaged: it holds a chunk of no type", _AGAIN)
+        if kind[:1].isupper() and zlib.crc32(content[at + 4 : end]) != int.from_bytes(content[end : end + 4]):
+            raise InputError(path, f"is damaged: the checksum of its {kind.decode()} is wrong", _AGAIN)
         at = end + 4
 
 

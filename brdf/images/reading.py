@@ -11,7 +11,7 @@ Sizes are checked before memory is taken (`brdf.images.damage`); `ImageReader` r
 import contextlib
 import dataclasses
 import itertools
-import textwrap
+import re
 from pathlib import Path
 from typing import Any
 
@@ -252,7 +252,7 @@ def _open(path):
     request.attribute("oiio:UnassociatedAlpha", 1)
     image = oiio.ImageInput.open(utf8_name(path), request)
     if image is None or image.format_name() in ("null", "term"):
-        what = f"cannot be read as an image ({said(oiio, path)})"
+        what = f"cannot be read as an image ({said(oiio, path) or 'no reason given'})"
         raise InputError(path, what, "Give an EXR, HDR, PNG, TIFF or JPEG file")
     said(image, path)  # remarks on metadata; the pixels may be sound
     spec = image.spec()
@@ -270,7 +270,7 @@ def _is_double_tiff(image):
 
 
 def said(source: Any, path: AnyPath) -> str:
-    """What OpenImageIO says went wrong, in a line, and forgets then.
+    """What OpenImageIO says went wrong, the first line of it, and forgets then.
 
     Args:
         source: the image input or output, or the module itself for a file that did not open.
@@ -281,9 +281,10 @@ def said(source: Any, path: AnyPath) -> str:
     except UnicodeDecodeError as error:
         # Bytes of a damaged header, quoted by the reader.
         message = error.object.decode("utf-8", "replace")
-    for name in (f'"{path}"', str(path)):
-        message = message.replace(name, "it")
-    return textwrap.shorten(message, 200, placeholder="...").rstrip(". ")
+    name = re.escape(str(path))
+    message = re.sub(f'( for)? [("]+{name}[)"]+|"{name}":? ', "", message).replace(str(path), "it")
+    line = next(filter(None, map(str.strip, message.splitlines())), "")
+    return (line if len(line) <= 200 else line[:197] + "...").rstrip(". ")
 
 
 def _layers(image):

@@ -112,7 +112,7 @@ def export_material(material: Material, to: str, *, name: str = "fitted", note: 
         losses = [f"the format has no word for the lobe of {material.name}: it is written as Blinn-Phong's", *losses]
     if drawn is not None:
         losses += _brightness(material, drawn)
-    remarks = ({"losses": losses} if losses else {}) | ({"note": note} if note else {})
+    remarks = ({} if to == "json" else {"losses": losses}) | ({"note": note} if note else {})
     if isinstance(content, str):
         lines = [*losses, f"note: {note}"] if note else losses
         comment = _COMMENTS.get(to, "# {}")
@@ -371,8 +371,8 @@ def _gltf(material, name):
 
     factors = {"baseColorFactor": [*base.tolist(), 1.0], "metallicFactor": 0.0, "roughnessFactor": roughness}
     specular = {"specularColorFactor": (f_0 / 0.04).tolist()}  # times the reflectance of a dielectric
-    entry: dict[str, Any] = {"name": name, "pbrMetallicRoughness": factors, "extras": {}}
-    entry["extensions"] = {"KHR_materials_specular": specular}
+    entry: dict[str, Any] = {"name": name, "pbrMetallicRoughness": factors}
+    entry |= {"extensions": {"KHR_materials_specular": specular}, "extras": {}}
     asset = {"version": "2.0", "generator": "brdf"}
     values = {"asset": asset, "extensionsUsed": ["KHR_materials_specular"], "materials": [entry]}
     return Written(values, losses, drawn, entry["extras"])
