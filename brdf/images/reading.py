@@ -192,9 +192,9 @@ class ImageReader(contextlib.AbstractContextManager):
         if not 0 <= start <= stop <= self.shape[0]:
             raise IndexError(f"rows {start} to {stop} of a picture with {self.shape[0]} rows")
         if self._by_rows:
-            return self._shown(start, stop, self._colour, self.encoding)
+            return _shown(self.path, self._image, self._part, self._colour, start, stop, self.encoding)
         if self._upright is None:  # kept whole, it is read once
-            self._upright = _turned(self._shown(0, self._spec.full_height, self._colour, self.encoding), self._turn)
+            self._upright = self._whole(self._colour, self.encoding)
         return self._upright[start:stop]
 
     def read(self) -> Float32[np.ndarray, "height width channels"]:
@@ -211,38 +211,17 @@ class ImageReader(contextlib.AbstractContextManager):
         if self._alpha is None:
             return None
         check_memory(self.path, self.shape[0] * self.shape[1])
-        return _turned(self._shown(0, self._spec.full_height, [self._alpha], "linear"), self._turn)[..., 0]
+        return self._whole([self._alpha], "linear")[..., 0]
 
-    def _shown(self, start, stop, channels, encoding):
-        """Rows of the display window, not turned; NaN where there are no data."""
-        spec = self._spec
-        top, left = spec.y - spec.full_y, spec.x - spec.full_x
-        first = min(max(start, top), stop)
-        last = max(min(stop, top + spec.height), first)
-        begin, end = max(left, 0), min(left + spec.width, spec.full_width)
-        data = self._data(first - top, last - top, channels, encoding)[:, begin - left : end - left]
-        margins = np.array([(first - start, stop - last), (begin, spec.full_width - end), (0, 0)])
-        return np.pad(data, margins, constant_values=np.nan) if margins.any() else data
-
-    def _data(self, first, last, channels, encoding):
-        """Rows of the data window."""
-        coded = self.is_integer and encoding != "linear"
-        pixels = _read_rows(self.path, self._image, self._part, first, last, channels, "uint16" if coded else "float")
-        if not coded:
-            return decode(pixels, encoding)
-        table, values = decode_table(encoding, 16), np.empty(pixels.shape, np.float32)
-        for row, codes in enumerate(pixels):
-            values[row] = table[codes]  # a row at a time: NumPy makes eight bytes of every code
-        return values
-
-
-def _turned(stored, turn):
-    """Turn a picture as the Exif orientation says (CIPA DC-008, 4.6.4.A)."""
-    if turn > 4:
-        stored = stored.swapaxes(0, 1)
-    if turn in (2, 3, 6, 7):
-        stored = stored[:, ::-1]
-    return np.ascontiguousarray(stored[::-1] if turn in (3, 4, 7, 8) else stored)
+    def _whole(self, channels, encoding):
+        """All rows, turned as the Exif orientation says (CIPA DC-008, 4.6.4.A)."""
+        turn, height = self._turn, self._spec.full_height
+        stored = _shown(self.path, self._image, self._part, channels, 0, height, encoding)
+        if turn > 4:
+            stored = stored.swapaxes(0, 1)
+        if turn in (2, 3, 6, 7):
+            stored = stored[:, ::-1]
+        return np.ascontiguousarray(stored[::-1] if turn in (3, 4, 7, 8) else stored)
 
 
 def _open(path):
@@ -321,16 +300,21 @@ def _choose_channels(image):
     return 0, rest or every, apart.get("A") if rest else None
 
 
-def _read_rows(path, image, part, start, stop, channels, kind) -> Any:
-    """Rows of the data window of a part, (rows, width, channels); OpenImageIO converts them to "float" or codes."""
+def _shown(path, image, part, channels, start, stop, encoding: Encoding = "linear"):
+    """Rows of the display window of a part, linear, (rows, width, channels); NaN where there are no data."""
     spec = image.spec(part)
+    shown = np.full((stop - start, spec.full_width, len(channels)), np.nan, np.float32)
+    top, left = spec.y - spec.full_y, spec.x - spec.full_x
+    first, last = max(start - top, 0), min(stop - top, spec.height)
+    if first >= last:
+        return shown
     low, high = min(channels), max(channels) + 1
-    if start == stop:
-        return np.empty((0, spec.width, len(channels)), np.float32)
+    coded = encoding != "linear" and str(spec.channelformat(low)) not in FLOATS
+    kind = "uint16" if coded else "float"
     # OpenImageIO takes whole tiles only.
     tile = spec.tile_height if spec.tile_width else 1
-    skip, last = start % tile, min(-(-stop // tile) * tile, spec.height)
-    rows = spec.y + start - skip, spec.y + last
+    skip, end = first % tile, min(-(-last // tile) * tile, spec.height)
+    rows = spec.y + first - skip, spec.y + end
     if spec.tile_width:
         columns = spec.x, spec.x + spec.width
         pixels = image.read_tiles(part, 0, *columns, *rows, spec.z, spec.z + 1, low, high, kind)
@@ -338,11 +322,17 @@ def _read_rows(path, image, part, start, stop, channels, kind) -> Any:
         pixels = image.read_scanlines(part, 0, *rows, spec.z, low, high, kind)
     complaint = said(image, path)
     if pixels is None or (complaint and not any(remark in complaint for remark in _HARMLESS)):
-        what = f"is damaged: rows {start} to {stop} of {spec.height} cannot be read ({complaint or 'no data'})"
+        what = f"is damaged: rows {first} to {last} of {spec.height} cannot be read ({complaint or 'no data'})"
         raise InputError(path, what, "Make the file again")
-    pixels = pixels.reshape(-1, spec.width, high - low)[skip : skip + stop - start]
-    contiguous = channels == list(range(low, high))
-    return pixels if contiguous else pixels[..., [channel - low for channel in channels]]
+    pixels = pixels.reshape(-1, spec.width, high - low)[
+        skip : skip + last - first, max(-left, 0) : spec.full_width - left
+    ]
+    if channels != list(range(low, high)):
+        pixels = pixels[..., [channel - low for channel in channels]]
+    table = decode_table(encoding, 16).astype(np.float32) if coded else None
+    for row, stored in enumerate(pixels, start=first + top - start):  # NumPy makes eight bytes of every code
+        shown[row, max(left, 0) :][: len(stored)] = decode(stored, encoding) if table is None else table[stored]
+    return shown
 
 
 def read_image(path: AnyPath, *, encoding: Encoding | None = None) -> Float32[np.ndarray, "height width channels"]:
@@ -444,10 +434,10 @@ def read_layers(path: AnyPath) -> dict[str, Float32[np.ndarray, "height width ch
     specs = {part: image.spec(part) for part, _ in found}
     for spec in specs.values():
         check_header(file, spec)
-    check_memory(file, sum(spec.width * spec.height * spec.nchannels for spec in specs.values()))
+    check_memory(file, sum(spec.full_width * spec.full_height * spec.nchannels for spec in specs.values()))
     for part, spec in specs.items():
         own = spec.get_string_attribute("oiio:subimagename", str(part)) if len(specs) > 1 else ""
-        pixels = _read_rows(file, image, part, 0, spec.height, list(range(spec.nchannels)), "float")
+        pixels = _shown(file, image, part, list(range(spec.nchannels)), 0, spec.full_height)
         for (of_part, layer), at in found.items():
             if of_part == part:
                 usual = sorted(at, key=lambda ending: "RGBAXYZUV".find(ending) % 10)  # others last

@@ -268,3 +268,13 @@ def test_a_mask_of_odd_values_is_read_without_a_warning(tmp_path, odd):
         inside = read_mask(tmp_path / "a.exr")
     assert inside[2:4, 2:5].all()
     assert inside.sum() == 6 + (not np.isnan(odd))
+
+
+def test_layers_of_a_cropped_file_lie_on_its_picture(tmp_path):
+    values = random(4, 5, 6)
+    names = [*"RGB", *(f"normal.{axis}" for axis in "XYZ")]
+    path = raw(tmp_path / "a.exr", values, names, data_at=(2, 1), display=(0, 0, 8, 6))
+    layers = read_layers(path)
+    np.testing.assert_array_equal(layers[""], read_image(path))
+    np.testing.assert_array_equal(layers["normal"][1:5, 2:7], values[..., 3:])
+    assert np.isnan(layers["normal"]).sum() == 3 * (6 * 8 - 4 * 5)
