@@ -15,6 +15,7 @@ points.
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -51,13 +52,12 @@ def with_area(
     occluders: tuple[Shape, ...],
 ) -> SurfacePoints:
     """Add the points of those pixels that their centres do not stand for."""
-    count = points.mask.size
+    count = points.count
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((points, camera, shapes, lights))):
         return _averaged(points, camera, shapes, np.arange(count, dtype=np.int32), np.zeros(0, np.int32))
-    stacks = stacked(lights, points.position.dtype)
-    sharp = tuple(stack for stack in stacks if stack.light.shape[1] <= STORED_SAMPLES or not stack.numbers)
-    lighting = Lighting(sharp, occluders)
-    edge, other = np.asarray(_matters(points, camera, shapes, lighting)).reshape(2, count)
+    index = [place for place, light in enumerate(lights) if light.rows[1][0].shape[0] <= STORED_SAMPLES]
+    sharp = stacked([lights[place] for place in index], points.position.dtype, index=index)
+    edge, other = np.asarray(_matters(points, camera, shapes, Lighting(sharp, occluders))).reshape(2, count)
     return _averaged(points, camera, shapes, _padded(edge), _padded(other & ~edge))
 
 
@@ -79,20 +79,20 @@ def _over_neighbours(change: Any, values: Array) -> Array:
 @jax.jit
 def _matters(points: SurfacePoints, camera: Camera, shapes: tuple[Shape, ...], lighting: Lighting) -> Array:
     """Through which pixels an edge of a shape passes, and which others are to be averaged."""
-    width, height = camera.resolution
-    corners = apart(shapes_met, camera, shapes, np.arange(width + 1.0)[None, :], np.arange(height + 1.0)[:, None])
-    corner = corners[1:, 1:]
-    edge = points.met != corner
-    for other in (corners[:-1, :-1], corners[1:, :-1], corners[:-1, 1:]):
-        edge |= other != corner
+    column, row = (np.arange(size + 1.0) for size in camera.resolution)
+    corners = apart(shapes_met, camera, shapes, column[None], row[:, None])
+    seen = [corners[:-1, :-1], corners[1:, :-1], corners[:-1, 1:], corners[1:, 1:], points.met]
+    edge = functools.reduce(jnp.logical_or, (one != seen[0] for one in seen))
     matters = jnp.zeros_like(edge)
     if not all(shape.convex for shape in shapes):
         matters |= _over_neighbours(lambda a, b: dot(a, b) < BENT, points.normal)
     flat = points.in_components().flat()
 
-    def or_sample(found: Array, kind: type[Light], numbers: Any, nodes: Any, light: Array, emitted: Array) -> Array:
+    def or_sample(found: Array, kind: type[Light], numbers: Any, nodes: Any, emitted: Array, light: Array) -> Array:
+        """Whether a highlight is narrow or a light's edge passes."""
         terms = light_terms(OneOf((BlinnPhong,)), lighting, flat, kind, numbers, nodes, light)
-        lit, log_cosine = (one.reshape(edge.shape) for one in ((terms.diffuse > 0) & jnp.any(emitted > 0), terms[2]))
+        lit = ((terms.diffuse > 0) & jnp.any(emitted > 0)).reshape(edge.shape)
+        log_cosine = terms.log_cosine.reshape(edge.shape)
         narrow = _over_neighbours(lambda a, b: jnp.abs(a - b), log_cosine) > 2 * NARROW * jnp.abs(log_cosine)
         return found | (lit & narrow) | _over_neighbours(jnp.not_equal, lit)
 
@@ -103,25 +103,25 @@ def _matters(points: SurfacePoints, camera: Camera, shapes: tuple[Shape, ...], l
 def _averaged(points: SurfacePoints, camera: Camera, shapes: tuple[Shape, ...], edge: Any, other: Any) -> SurfacePoints:
     """The points of the given pixels, those with an edge first, beside those of the centres."""
     pixel = jnp.concatenate([edge, other])
-    width, count, edges = camera.resolution[0], points.mask.size, edge.size
-    rule, side = square_rule(camera.samples**2), 3 * camera.samples
+    width, count, edges = camera.resolution[0], points.count, edge.size
+    rule, side = square_rule(camera.samples**2), (np.arange(3 * camera.samples) + 0.5) / (3 * camera.samples)
     column, row = (pixel % width)[:, None], (pixel // width)[:, None]
     fine = surface_points(camera, shapes, column + rule.s, row + rule.t)
-    if points.visibility is not None:
-        seen = jnp.take(points.visibility.reshape(count, -1), pixel, axis=0, mode="clip")[:, None]
-        seen = jnp.broadcast_to(seen, (*fine.mask.shape, seen.shape[-1]))
-        fine = dataclasses.replace(fine, visibility=seen)
-    right, down = (grid.ravel() for grid in np.meshgrid(*[(np.arange(side) + 0.5) / side] * 2))
+    right, down = (grid.ravel() for grid in np.meshgrid(side, side))
     counted = apart(shapes_met, camera, shapes, column[:edges] + right, row[:edges] + down)
-    weight = jnp.broadcast_to(jnp.asarray(rule.weight, fine.position.dtype), fine.mask.shape)
-    weight = weight.at[:edges].set(_by_shares(weight[:edges], fine.met[:edges], counted, len(shapes)))
-    weight = jnp.where((pixel < count)[:, None], weight, 0.0)
+    share = jnp.broadcast_to(jnp.asarray(rule.weight, fine.position.dtype), fine.mask.shape)
+    share = share.at[:edges].set(_by_shares(share[:edges], fine.met[:edges], counted, len(shapes)))
+    share = jnp.where((pixel < count)[:, None], share, 0.0)
+    visibility = points.visibility
+    if visibility is not None:
+        seen = jnp.take(visibility.reshape(count, 1, -1), pixel, axis=0, mode="clip")
+        visibility = jnp.broadcast_to(seen, (*share.shape, seen.shape[-1]))
+    fine = dataclasses.replace(fine, share=share, visibility=visibility)
     slot = jnp.full(count, -1, jnp.int32).at[pixel].set(jnp.arange(pixel.size, dtype=jnp.int32), mode="drop")
     fitted = jnp.array([shape.fitted for shape in shapes] + [False])  # the last is NO_SHAPE
     whole = jnp.all(fine.mask, axis=1).at[:edges].min(jnp.all(fitted[counted], axis=1))
     mask = points.mask.ravel().at[pixel].set(whole, mode="drop").reshape(points.mask.shape)
-    area = PixelArea(pixel, slot.reshape(points.mask.shape), fine, weight)
-    return dataclasses.replace(points, mask=mask, area=area)
+    return dataclasses.replace(points, mask=mask, area=PixelArea(slot.reshape(mask.shape), fine))
 
 
 def _by_shares(weight: Array, met: Array, counted: Array, shapes: int) -> Array:
@@ -129,7 +129,7 @@ def _by_shares(weight: Array, met: Array, counted: Array, shapes: int) -> Array:
     result = jnp.zeros_like(weight)
     for index in range(NO_SHAPE, shapes):
         mine = met == index
-        share = jnp.mean(counted == index, axis=1, dtype=weight.dtype)
-        total = jnp.sum(jnp.where(mine, weight, 0.0), axis=1)
-        result = jnp.where(mine, weight * (share / jnp.where(total > 0, total, 1.0))[:, None], result)
+        share = jnp.mean(counted == index, axis=1, dtype=weight.dtype, keepdims=True)
+        total = jnp.sum(jnp.where(mine, weight, 0.0), axis=1, keepdims=True)
+        result = jnp.where(mine, weight * share / jnp.where(total > 0, total, 1.0), result)
     return result

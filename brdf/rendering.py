@@ -7,7 +7,10 @@ ambient light, lights, a specular term or occluders there is no arithmetic for i
 
 import contextlib
 import dataclasses
+import functools
 import math
+import operator
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -20,16 +23,16 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from brdf.checks import Scalar, instance
 from brdf.errors import InputError
 from brdf.geometry.rays import PrimaryRays, Sight
+from brdf.geometry.surface_points import Points, SurfacePoints
 from brdf.lights.base import Lighting, stacked
 from brdf.lobes import (
     NO_LOBE,
-    ROUGH,
     STORED_SAMPLES,
     TILE,
     LightTerms,
     Lobe,
     Near,
-    average,
+    averaged,
     basis_terms,
     is_sampled,
     over_samples,
@@ -82,40 +85,38 @@ def basis(
     if not lighting.stacks:
         return Basis(points, None, None)
     if near is not None and area is None and is_sampled(lighting):
-        return _tabulated(model, points, lighting, near, counts)
+        return Basis(points, *_tabulated(model, points.stored().pixels(), lighting, near, counts))
     diffuse, lobe = basis_terms(model, points if area is None else dataclasses.replace(points, area=None), lighting)
     if area is not None:
-        fine_diffuse, fine_lobe = basis_terms(model, area.points, lighting)
-        diffuse = diffuse.at[area.pixel].set(average(area.weight, fine_diffuse), mode="drop")
-        if lobe is not None and fine_lobe is not None:
-            lobe = lobe.over_areas(fine_lobe, area.weight, area.slot.ravel())
+        slot, (fine_diffuse, fine_lobe) = area.slot.ravel(), basis_terms(model, area.points, lighting)
+        diffuse = averaged(slot, diffuse, fine_diffuse)
+        lobe = None if lobe is None or fine_lobe is None else lobe.over_areas(fine_lobe, slot)
     return Basis(points, diffuse, lobe)
 
 
 def _tabulated(
-    model: type[Material], points: Sight, lighting: Lighting, near: Near, counts: np.ndarray | None
-) -> Basis:
-    flat = points.stored().pixels()
-    index = np.flatnonzero(flat.mask if counts is None else flat.mask & counts)
+    model: type[Material], points: SurfacePoints, lighting: Lighting, near: Near, counts: np.ndarray | None
+) -> tuple[Array, Lobe | None]:
+    index = np.flatnonzero(points.mask if counts is None else points.mask & counts)
     # Of one size for few numbers of pixels, or each would be compiled.
-    padded = np.resize(index, -(-max(index.size, 1) // TILE) * TILE) if index.size else np.zeros(TILE, int)
-    rough = near.ends[1] <= math.log(ROUGH) or not near.narrow
-    found = tabulated(OneOf.of(model), flat.pixels(padded), lighting, near, rough=rough)
+    padded = np.resize(index if index.size else np.zeros(1, int), -(-max(index.size, 1) // TILE) * TILE)
+    found = tabulated(OneOf.of(model), points.pixels(padded), lighting, near)
 
     def spread(values: Any, outside: float = 0.0) -> Array:
-        some = np.asarray(values)[: index.size]
-        image = np.full((flat.mask.size, *some.shape[1:]), outside, some.dtype)
-        image[index] = some
+        image = np.full((points.count, *values.shape[1:]), outside, values.dtype)
+        image[index] = np.asarray(values)[: index.size]
         return jax.device_put(image)
 
     diffuse, peak, table = found
-    lobe = None if table is None else Lobe(spread(peak, NO_LOBE), table=spread(table), near=near)
-    return Basis(points, spread(diffuse), lobe)
+    return spread(diffuse), None if table is None else Lobe(spread(peak, NO_LOBE), table=spread(table), near=near)
 
 
 def _lighting(scene: Scene, points: Sight, fill_above: float = math.inf) -> Lighting:
-    some = points.camera.position if isinstance(points, PrimaryRays) else points.position
-    return Lighting(stacked(scene.lights, jnp.result_type(some), fill_above), scene.occluders)
+    return Lighting(stacked(scene.lights, _dtype(points), fill_above), scene.occluders)
+
+
+def _dtype(points: Sight) -> np.dtype:
+    return jnp.result_type(points.camera.position if isinstance(points, PrimaryRays) else points.position)
 
 
 class BasisImages(eqx.Module):
@@ -163,17 +164,17 @@ def _basis_images(model: OneOf, points: Sight, ambient: Any, lighting: Lighting,
             return terms.diffuse, None
         return terms.diffuse, terms.weight * (model.scale(n) * jnp.exp(n * terms.log_cosine))
 
-    area, parts = points.area, []
-    for part in (points,) if area is None else (points, area.points):
-        seen = part.in_components()
+    def of_points(seen: Points) -> tuple[Any, ...]:
+        share = seen.mask if seen.share is None else seen.mask * seen.share
+        ambience = None if ambient is None else seen.per_pixel(share.reshape(-1, 1) * ambient)
         lit = over_samples(model, seen, lighting, of_terms)[0] if lighting.stacks else (None, None)
-        parts.append((None if ambient is None else jnp.where(seen.mask.reshape(-1, 1), ambient, 0), *lit))
-    images = parts[0]
+        return ambience, *lit
+
+    centres, area = points.in_components(), points.area
+    images = of_points(centres)
     if area is not None:
-        images = jax.tree.map(
-            lambda centre, fine: centre.at[area.pixel].set(average(area.weight, fine), mode="drop"), *parts
-        )
-    return BasisImages(*jax.tree.map(lambda image: image.reshape(*points.shape_of_picture, -1), images))
+        images = jax.tree.map(partial(averaged, area.slot.ravel()), images, of_points(area.points.in_components()))
+    return BasisImages(*jax.tree.map(lambda image: image.reshape(*centres.mask.shape, -1), images))
 
 
 @jax.jit
@@ -181,15 +182,13 @@ def _shade(material: Material, points: Sight, ambient: Any, lighting: Lighting) 
     """The picture k_a B_a + k_d B_d + k_s B_s of surface points; None where there is no light at all."""
     n = jnp.asarray(material.n) if isinstance(material, SpecularMaterial) else jnp.ones(())
     images = _basis_images(OneOf((type(material),)), points, ambient, lighting, n)
-    picture = None
-    for k, image in (
+    terms = (
         (material.k_a, images.ambient),
         (material.k_d, images.diffuse),
-        (getattr(material, "k_s", 0.0), images.specular),
-    ):
-        if image is not None:
-            picture = k * image if picture is None else picture + k * image
-    return picture
+        (getattr(material, "k_s", 0), images.specular),
+    )
+    parts = [k * image for k, image in terms if image is not None]
+    return functools.reduce(operator.add, parts) if parts else None
 
 
 def render(material: Material, scene: Scene, *, precision: Precision | None = None) -> Float[Array, "H W C"]:
@@ -251,9 +250,8 @@ def render_lights(material: Material, scene: Scene, *, precision: Precision | No
         material = cast(material, precision)
         images = []
         for index, light in enumerate(scene.lights):
-            (stack,) = _lighting(dataclasses.replace(scene, lights=(light,), visibility=()), points).stacks
-            stack = dataclasses.replace(stack, light=stack.light + index)  # its own mask, where masks are given
-            images.append(_shade(material, points, None, Lighting((stack,), scene.occluders)))
+            own = stacked((light,), _dtype(points), index=(index,))  # with its own mask, where masks are given
+            images.append(_shade(material, points, None, Lighting(own, scene.occluders)))
         if scene.ambient is not None:
             images.append(_shade(material, points, scene.ambient, Lighting(())))
         return jnp.stack([jnp.broadcast_to(image, shape) for image in images]) if images else jnp.zeros((0, *shape))

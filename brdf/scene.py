@@ -258,15 +258,14 @@ def _of_picture(pixel, leaf):
 
 def _chosen(points, pixel):
     """Some of the points, in the shape of ``pixel``."""
-    area, choose = points.area, partial(_of_picture, pixel)
-    some = jax.tree.map(choose, dataclasses.replace(points, visibility=None, area=None))
-    if area is None or not np.any(choose(area.slot) >= 0):
+    area = points.area
+    some = dataclasses.replace(points, visibility=None, area=None).pixels(pixel)
+    if area is None:
         return some
-    slot: Any = choose(area.slot)
-    averaged: Any = np.flatnonzero(slot >= 0)
-    rows = slot.ravel()[averaged]
-    fine = dataclasses.replace(area.points, visibility=None), area.weight
-    fine, weight = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], fine)
-    slot = np.where(slot < 0, -1, np.cumsum(slot >= 0).reshape(slot.shape) - 1)
-    area = PixelArea(averaged.astype(np.int32), slot.astype(np.int32), fine, weight)
-    return dataclasses.replace(some, area=area)
+    slot = _of_picture(pixel, area.slot)
+    has, new = slot >= 0, np.full_like(slot, -1)
+    if not has.any():
+        return some
+    new[has] = np.arange(np.count_nonzero(has))
+    fine = dataclasses.replace(area.points, visibility=None).pixels(slot[has])
+    return dataclasses.replace(some, area=PixelArea(new, fine))

@@ -21,7 +21,8 @@ differentiation gives the derivative of the plain product. In float64 there is n
 import dataclasses
 import functools
 import operator
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -62,18 +63,15 @@ class Components:
 
     Attributes:
         parts: the components.
-        rough: products with it may be rounded: a lobe's error in float32 grows as the root of its exponent, to 2e-5 at
-            10 000, and its cosine takes a third of the time.
     """
 
     parts: tuple[Array, ...]
-    rough: bool = dataclasses.field(default=False, metadata={"static": True})
     __array_ufunc__ = None  # an operation with an array of NumPy is ours too
 
     @classmethod
-    def of(cls, array: ArrayLike) -> "Components":
-        """The components along the last axis."""
-        return cls(tuple(jnp.unstack(jnp.asarray(array), axis=-1)))
+    def of(cls, vector: Any) -> "Components":
+        """The components along an array's last axis."""
+        return vector if isinstance(vector, cls) else cls(tuple(jnp.unstack(jnp.asarray(vector), axis=-1)))
 
     def stacked(self, shape: tuple[int, ...] = ()) -> Array:
         """As an array, the components along its last axis; they are broadcast to a shape."""
@@ -99,46 +97,29 @@ class Components:
 
     def __matmul__(self, other: "Components") -> Array:
         """Scalar product."""
-        (ax, ay, az), (bx, by, bz) = self.parts, other.parts
-        return ax * bx + ay * by + az * bz  # the order is fixed, unlike that of a reduction
+        return _sum(self * other)  # the order is fixed, unlike that of a reduction
 
     def cross(self, other: "Components") -> "Components":
         """Vector product."""
-        (ax, ay, az), (bx, by, bz) = self.parts, other.parts
+        (ax, ay, az), (bx, by, bz) = self, other
         return Components((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))
 
 
 Directions = Float[ArrayLike, "*#batch 3"] | Components
 
 
+def _sum(parts: Iterable[Array]) -> Array:
+    return functools.reduce(operator.add, parts)
+
+
 def select(condition: ArrayLike, a: Components, b: Components) -> Components:
     """One vector where a condition holds, else the other."""
-    return Components(tuple(jnp.where(condition, one, other) for one, other in zip(a, b, strict=True)))
+    return Components(tuple(map(partial(jnp.where, condition), a, b)))
 
 
-def largest(v: Any) -> Array:
+def largest(v: Directions) -> Array:
     """The largest component."""
-    return functools.reduce(jnp.maximum, _components(v))
-
-
-def cross(a: Any, b: Any) -> Any:
-    """Vector product."""
-    product = Components(_components(a)).cross(Components(_components(b)))
-    return product if isinstance(a, Components) or isinstance(b, Components) else product.stacked()
-
-
-def quadratic_form(v: Any, matrix: Any) -> Array:
-    """The product v . M v, the matrix being its rows."""
-    return functools.reduce(operator.add, (one * dot(row, v) for one, row in zip(_components(v), matrix, strict=True)))
-
-
-def trace(matrix: Any) -> Array:
-    """The sum of a matrix's diagonal."""
-    return functools.reduce(operator.add, (_components(row)[i] for i, row in enumerate(matrix)))
-
-
-def _components(v: Any) -> tuple[Array, ...]:
-    return v.parts if isinstance(v, Components) else tuple(jnp.unstack(jnp.asarray(v), axis=-1))
+    return functools.reduce(jnp.maximum, Components.of(v))
 
 
 # -- lengths and directions --------------------------------------------------------------------------------------------
@@ -146,16 +127,16 @@ def _components(v: Any) -> tuple[Array, ...]:
 
 def dot(a: Directions, b: Directions) -> Scalars:
     """Scalar product over the last axis."""
-    return Components(_components(a)) @ Components(_components(b))
+    return Components.of(a) @ Components.of(b)
 
 
 def normalize(v: Any) -> Any:
     """Unit vectors of the same direction, without underflow or overflow; zero stays zero, with a zero gradient."""
-    parts = v.parts if isinstance(v, Components) else jnp.unstack(_floating(v), axis=-1)
+    parts = v if isinstance(v, Components) else Components.of(_floating(v))
     size = jax.lax.stop_gradient(functools.reduce(jnp.maximum, map(jnp.abs, parts)))  # a mere unit: it cancels
     nonzero = size > 4 * jnp.finfo(size.dtype).tiny  # so that 1 / size is finite too
     unscaled = [jnp.where(nonzero, one, 0.0) / jnp.where(nonzero, size, 1.0) for one in parts]
-    squared = functools.reduce(operator.add, map(operator.mul, unscaled, unscaled))
+    squared = _sum(map(operator.mul, unscaled, unscaled))
     length = jnp.sqrt(jnp.where(nonzero, squared, 1.0))
     # A division last: XLA's CPU compiler repeats all but divisions and roots in each loop that reads them.
     found = Components(tuple(one / length for one in unscaled))
@@ -221,15 +202,15 @@ def lobe(log_cosine: Numbers, n: Numbers) -> Scalars:
 def log_cosine(a: Directions, b: Directions) -> Scalars:
     """Logarithm of the cosine of the angle between two directions, accurate near the peak and near the horizon."""
     first, second = _split(a, b)
-    return _from_tangent(_cross_squared(first, second), _dot(first, second))
+    across = _cross(first, second)
+    return _from_tangent(across @ across, _dot(first, second))
 
 
 def half_log_cosine(normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
     """Logarithm of N.H, of normal and half vector, which is never formed: float32 would round it too coarsely."""
-    axis, light, view = _split(normal, to_light, to_view)
-    total, difference = _combined(operator.add, light, view), _combined(operator.sub, light, view)
-    total = _shortened(total, difference, 0.25 * _dot(difference, total))
-    return _from_tangent(_cross_squared(axis, total), _dot(axis, total))
+    axis, _, total, _ = _about(normal, to_light, to_view)
+    across = _cross(axis, total)
+    return _from_tangent(across @ across, _dot(axis, total))
 
 
 def mirror_log_cosine(normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
@@ -238,15 +219,12 @@ def mirror_log_cosine(normal: Directions, to_light: Directions, to_view: Directi
     With s = L + V and d = L - V the distance to the peak is ‖R - V‖² = ‖N × s‖² + (N.d)², and
     log(R.V) = -log(1 + ‖R - V‖² / (2 R.V)).
     """
-    axis, light, view = _split(normal, to_light, to_view)
-    total, difference = _combined(operator.add, light, view), _combined(operator.sub, light, view)
-    excess = 0.25 * _dot(difference, total)
-    total, difference = _shortened(total, difference, excess), _shortened(difference, total, excess)
-    along_total, along_difference = _dot(axis, total), _dot(axis, difference)
-    distance = _cross_squared(axis, total) + along_difference * along_difference
+    axis, product, total, difference = _about(normal, to_light, to_view)
+    along_total, along_difference, across = _dot(axis, total), _dot(axis, difference), _cross(axis, total)
+    distance = across @ across + along_difference * along_difference
     # R.V |N|^2 = 2 (N.L)(N.V) - (L.V) |N|^2, where 4 (N.L)(N.V) = (N.s)^2 - (N.d)^2
     twice_product = 0.5 * (along_total - along_difference) * (along_total + along_difference)
-    cosine = twice_product - _dot(light, view) * _dot(axis, axis)
+    cosine = twice_product - product * _dot(axis, axis)
     # (1 + distance / (2 cos))^2 = 1 + (distance cos + distance^2 / 4) / cos^2
     return _from_tangent(distance * (cosine + 0.25 * distance), cosine)
 
@@ -294,48 +272,43 @@ class _Split(NamedTuple):
 
 def _split(*vectors: Directions) -> list[_Split]:
     """The parts of vectors whose components lie within +-1, in one common floating-point type."""
-    given, parts = list(map(_components, vectors)), []
-    rough = any(isinstance(vector, Components) and vector.rough for vector in vectors)
+    given, parts = list(map(Components.of, vectors)), []
     dtype = jnp.result_type(*(one for vector in given for one in vector), 1.0)
     for vector in given:
         value = Components(tuple(one.astype(dtype) for one in vector))
-        if dtype != jnp.float32 or rough:
-            parts.append(_Split(value, value, None))
-            continue
         # no derivative: the rest carries it
-        high = Components(tuple(map(jnp.round, value * _GRID))) * (1.0 / _GRID)
-        parts.append(_Split(value, high, value - high))
+        high = Components(tuple(map(jnp.round, value * _GRID))) * (1.0 / _GRID) if dtype == jnp.float32 else value
+        parts.append(_Split(value, high, None if high is value else value - high))
     return parts
 
 
-def _dot(a: _Split, b: _Split) -> Array:
-    """Scalar product of vectors whose components lie within +-2."""
-    product = a.high @ b.high
-    if a.low is None or b.low is None:
-        return product
-    return product + (a.high @ b.low + a.low @ b.value)
+def _product(product: Callable[[Any, Any], Any], a: _Split, b: _Split) -> Any:
+    """The scalar or vector product of vectors whose components lie within +-2."""
+    leading = product(a.high, b.high)
+    return leading if a.low is None else leading + (product(a.high, b.low) + product(a.low, b.value))
 
 
-def _cross_squared(a: _Split, b: _Split) -> Array:
-    """Squared length of the cross product of vectors whose components lie within +-2."""
-    product = a.high.cross(b.high)
-    if a.low is not None and b.low is not None:
-        product = product + (a.high.cross(b.low) + a.low.cross(b.value))
-    return product @ product
+_dot, _cross = partial(_product, operator.matmul), partial(_product, Components.cross)
 
 
-def _combined(operation: Any, a: _Split, b: _Split) -> _Split:
+def _combined(operation: Callable[[Any, Any], Any], a: _Split, b: _Split) -> _Split:
     """Sum or difference."""
-    low = None if a.low is None or b.low is None else operation(a.low, b.low)
+    low = None if a.low is None else operation(a.low, b.low)
     return _Split(operation(a.value, b.value), operation(a.high, b.high), low)
 
 
-def _shortened(a: _Split, b: _Split, excess: Array) -> _Split:
-    """The vector a - excess b.
+def _about(normal: Directions, to_light: Directions, to_view: Directions) -> tuple[_Split, Array, _Split, _Split]:
+    """The normal, L . V, and sum and difference of L and V after giving both one length.
 
-    With a and b sum and difference of two unit vectors, and the excess (|L|^2 - |V|^2) / 4 = (a . b) / 4, it is the sum
-    or difference after giving L and V one length: rounding makes those differ by 1e-7.
+    Rounding makes their lengths differ by 1e-7: by the excess (|L|^2 - |V|^2) / 4 = (s . d) / 4.
     """
-    less = b.value * excess
-    value = a.value - less
-    return _Split(value, value, None) if a.low is None else _Split(value, a.high, a.low - less)
+    axis, light, view = _split(normal, to_light, to_view)
+    total, difference = _combined(operator.add, light, view), _combined(operator.sub, light, view)
+    excess = 0.25 * _dot(difference, total)
+    return axis, _dot(light, view), _less(total, difference.value * excess), _less(difference, total.value * excess)
+
+
+def _less(vector: _Split, small: Components) -> _Split:
+    """The difference."""
+    value = vector.value - small
+    return _Split(value, value, None) if vector.low is None else vector._replace(value=value, low=vector.low - small)

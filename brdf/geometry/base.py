@@ -34,16 +34,11 @@ class Shape(Checked):
 
     Attributes:
         fitted: False for an occluder, which casts shadows and hides what lies behind it, but is not fitted.
-        quick: whether a ray is met in no more than a few operations.
+        convex: whether it cannot cast a shadow on its own lit side (class variable).
     """
 
-    quick: ClassVar[bool] = True
     fitted: bool = eqx.field(static=True, default=True, kw_only=True)
-
-    @property
-    def convex(self) -> bool:
-        """Whether it cannot cast a shadow on its own lit side."""
-        return True
+    convex: ClassVar[bool] = True
 
     @abc.abstractmethod
     def extent(self) -> Scalar:

@@ -19,18 +19,12 @@ MAX_SAMPLES = 256
 
 def _resolution(value: Any) -> tuple[int, int]:
     """Two whole numbers, width and height in pixels."""
-    remedy = "Give [width, height] in pixels"
-    whole = f"must be two whole numbers, got {value!r}"
-    try:
-        width, height = value
-    except (TypeError, ValueError):
-        raise InputError("resolution", whole, remedy) from None
-    for size in (width, height):
-        if isinstance(size, bool) or not isinstance(size, int | np.integer):
-            raise InputError("resolution", whole, remedy)
-        if not 1 <= size <= MAX_RESOLUTION:
-            raise InputError("resolution", f"must be between 1 and {MAX_RESOLUTION}, got {value!r}", remedy)
-    return int(width), int(height)
+    remedy, size = "Give [width, height] in pixels", tuple(value) if np.iterable(value) else ()
+    if len(size) != 2 or any(isinstance(one, bool) or not isinstance(one, int | np.integer) for one in size):
+        raise InputError("resolution", f"must be two whole numbers, got {value!r}", remedy)
+    if not all(1 <= one <= MAX_RESOLUTION for one in size):
+        raise InputError("resolution", f"must be between 1 and {MAX_RESOLUTION}, got {value!r}", remedy)
+    return int(size[0]), int(size[1])
 
 
 def _viewer(value: Any) -> str | None:
@@ -68,14 +62,14 @@ class Camera(Checked):
         """Refuse a camera without a picture plane."""
         if not all(isinstance(value, np.ndarray) for value in (self.position, self.target, self.up)):
             return
-        forward = np.asarray(self.target) - np.asarray(self.position)
-        length = float(np.linalg.norm(forward))
+        forward = self.target - self.position
+        length = np.linalg.norm(forward)
         if length == 0:
-            came = f"must differ from position, got {np.asarray(self.target).tolist()} for both"
-            raise InputError("target", came, "Move one of them")
-        area = float(np.linalg.norm(np.cross(forward, self.up)))
-        if area <= 1e-9 * length * float(np.linalg.norm(self.up)):
-            came = f"must not be parallel to the view, got {np.asarray(self.up).tolist()}"
+            raise InputError(
+                "target", f"must differ from position, got {self.target.tolist()} for both", "Move one of them"
+            )
+        if np.linalg.norm(np.cross(forward, self.up)) <= 1e-9 * length * np.linalg.norm(self.up):
+            came = f"must not be parallel to the view, got {self.up.tolist()}"
             raise InputError("up", came, "Give a direction that points up in the picture")
 
     @abc.abstractmethod

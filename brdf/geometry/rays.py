@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool
 
 from brdf.geometry.base import Shape
 from brdf.geometry.camera import Camera
@@ -39,13 +39,12 @@ def trace(camera: Camera, shapes: tuple[Shape, ...], column: Any, row: Any) -> P
         has_facets |= hit.shading is not None
         facet = select(nearer, hit.normal, facet)
         normal = select(nearer, hit.normal if hit.shading is None else hit.shading, normal)
-    shape = index if len(shapes) > 1 else None
-    return Points(position, normal, camera.to_view(position), mask, shape, facet=facet if has_facets else None)
+    return Points(position, normal, camera.to_view(position), mask, index, facet=facet if has_facets else None)
 
 
-def shapes_met(camera: Camera, shapes: tuple[Shape, ...], column: Any, row: Any) -> Int[Array, "..."]:
+def shapes_met(camera: Camera, shapes: tuple[Shape, ...], column: Any, row: Any) -> Any:
     """Index of the shape that each ray meets first, `NO_SHAPE` for none: what is left of `trace` for counting."""
-    return trace(camera, shapes, column, row).stacked().met
+    return trace(camera, shapes, column, row).shape
 
 
 FEW_SHAPES = 4
@@ -72,9 +71,19 @@ class PrimaryRays:
     area: ClassVar[None] = None
 
     @property
-    def shape_of_picture(self) -> tuple[int, ...]:
-        """Of the picture."""
-        return self.rows[1] - self.rows[0], self.camera.resolution[0]
+    def quick(self) -> bool:
+        """Whether to trace them takes less time than to read what they met; meshes are asked on the host."""
+        return len(self.shapes) <= FEW_SHAPES and all(shape.convex for shape in self.shapes)
+
+    @property
+    def places(self) -> tuple[np.ndarray, np.ndarray]:
+        """Columns and rows of the pixels' centres."""
+        return np.arange(self.camera.resolution[0])[None, :] + 0.5, np.arange(*self.rows)[:, None] + 0.5
+
+    @property
+    def count(self) -> int:
+        """How many rays there are."""
+        return self.camera.resolution[0] * (self.rows[1] - self.rows[0])
 
     def traced(self) -> Points:
         """What they meet, (rows, W)."""
@@ -84,19 +93,9 @@ class PrimaryRays:
         """The same, made once however often it is read."""
         return apart(PrimaryRays.traced, self)
 
-    @property
-    def quick(self) -> bool:
-        """Whether to trace them takes less time than to read what they met."""
-        return len(self.shapes) <= FEW_SHAPES and all(shape.quick for shape in self.shapes)
-
     def stored(self) -> SurfacePoints:
         """The same as arrays, to be kept."""
         return surface_points(self.camera, self.shapes, *self.places)
-
-    @property
-    def places(self) -> tuple[np.ndarray, np.ndarray]:
-        """Columns and rows of the pixels' centres."""
-        return np.arange(self.camera.resolution[0])[None, :] + 0.5, np.arange(*self.rows)[:, None] + 0.5
 
     @functools.cached_property
     def mask(self) -> Bool[Array, "rows W"]:

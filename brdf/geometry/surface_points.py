@@ -22,16 +22,12 @@ class PixelArea(eqx.Module):
     """Several surface points for each of those pixels where one does not stand for the pixel's area.
 
     Attributes:
-        pixel: (K,) which pixels, indices row by row; beyond the last one where an entry is not used.
-        slot: (...), for every pixel its place in ``pixel``, -1 where its centre is enough.
-        points: (K, M) what those pixels see.
-        weight: (K, M) the share of the pixel's area that each point stands for; adds up to 1 with what no shape covers.
+        slot: (...), for every pixel its place among those, -1 where its centre is enough.
+        points: (K, M) what those pixels see, with the share of the pixel's area that each point stands for.
     """
 
-    pixel: Int[Array, " K"]
-    slot: Int[Array, "*pixels"]
+    slot: Int[Any, "*pixels"]
     points: "SurfacePoints"
-    weight: Float[Array, "K M"]
 
 
 class SurfacePoints(eqx.Module):
@@ -48,6 +44,7 @@ class SurfacePoints(eqx.Module):
         area: the pixels that are averaged over their area; None where every pixel's centre stands for it.
         facet: (..., 3), the unit normal of the flat piece that a smooth mesh is made of there; None where that is
             ``normal``. No light comes from behind it, and shadow rays start above it.
+        share: of several points in a pixel, (K, M), what each counts for; None for one in each.
 
     Example:
         >>> points = brdf.Scene.load("scene.toml").surface_points()
@@ -63,34 +60,36 @@ class SurfacePoints(eqx.Module):
     visibility: Float[Array, "*pixels L"] | None = None
     area: PixelArea | None = None
     facet: Float[Array, "*pixels 3"] | None = None
+    share: Float[Array, "K M"] | None = None
 
     @property
     def met(self) -> Int[Array, "*pixels"]:
-        """Index of the shape that each pixel sees, `NO_SHAPE` for none; where one shape is all there is, that is 0."""
+        """Index of the shape that each pixel sees, `NO_SHAPE` for none; 0 where the points come from elsewhere."""
         return jnp.where(self.mask, 0, NO_SHAPE) if self.shape is None else self.shape
 
     @property
-    def shape_of_picture(self) -> tuple[int, ...]:
-        """Of the picture."""
-        return self.mask.shape
-
-    def in_components(self) -> "Points":
-        """The same points, without areas, as programs compute with them."""
-        position, normal, to_view = map(Components.of, (self.position, self.normal, self.to_view))
-        facet = None if self.facet is None else Components.of(self.facet)
-        return Points(position, normal, to_view, self.mask, self.shape, self.visibility, facet)
+    def count(self) -> int:
+        """How many points there are."""
+        return self.mask.size
 
     def stored(self) -> "SurfacePoints":
         """These points, as those that `brdf.geometry.rays.PrimaryRays` meet."""
         return self
 
+    def in_components(self) -> "Points":
+        """The same points, without areas, as programs compute with them."""
+        position, normal, to_view = map(Components.of, (self.position, self.normal, self.to_view))
+        facet, more = None if self.facet is None else Components.of(self.facet), (self.shape, self.visibility)
+        return Points(position, normal, to_view, self.mask, *more, facet, self.share)
+
     def pixels(self, index: Any = slice(None)) -> "SurfacePoints":
-        """Some of the points of a picture without areas, by their indices row by row."""
+        """Some of the pixels of a picture without areas, by their indices row by row."""
+        pixels = self.mask.ndim - (self.share is not None)
 
         def some(leaf: Any) -> Any:
             # On the host where it can be: XLA compiles each shape, and its gather is ten times slower.
             values = leaf if isinstance(leaf, Tracer) else np.asarray(leaf)
-            return values.reshape(-1, *values.shape[self.mask.ndim :])[index]
+            return values.reshape(-1, *values.shape[pixels:])[index]
 
         return jax.tree.map(some, self)
 
@@ -109,30 +108,28 @@ class SurfacePoints(eqx.Module):
         Raises:
             InputError: where the shapes do not belong together.
         """
-        normal = np.asarray(normal, dtype=np.float64)
+        normal, to_view = np.asarray(normal, np.float64), np.asarray(to_view, np.float64)
         if normal.ndim != 3 or normal.shape[-1] != 3:
             raise InputError("normal", f"must be of shape (H, W, 3), got {normal.shape}", "Give a normal map")
-        length = np.sqrt(np.sum(normal * normal, axis=-1))
-        seen = np.isfinite(length) & (length > 0)
-        position = np.asarray(np.zeros(normal.shape) if position is None else position, dtype=np.float64)
-        to_view = np.asarray(to_view, dtype=np.float64)
         if to_view.shape == (3,):
             to_view = np.broadcast_to(direction_value("to_view", to_view), normal.shape)
-        for name, value in (("position", position), ("to_view", to_view)):
-            if value.shape != normal.shape:
-                raise InputError(name, f"must be of shape {normal.shape}, got {value.shape}", "Give a value per pixel")
-            seen &= np.all(np.isfinite(value), axis=-1)
-        if mask is not None:
-            mask = np.asarray(mask, dtype=bool)
-            if mask.shape != seen.shape:
-                raise InputError("mask", f"must be of shape {seen.shape}, got {mask.shape}", "Give a value per pixel")
-            seen &= mask
-        view_length = np.sqrt(np.sum(to_view * to_view, axis=-1, keepdims=True))
-        upward = np.array([0.0, 0.0, 1.0])
+        position = np.zeros(normal.shape) if position is None else np.asarray(position, np.float64)
+        seen = np.ones(normal.shape[:2], bool) if mask is None else np.asarray(mask, bool)
+        for name, value, shape in (
+            ("position", position, normal.shape),
+            ("to_view", to_view, normal.shape),
+            ("mask", seen, normal.shape[:2]),
+        ):
+            if value.shape != shape:
+                raise InputError(name, f"must be of shape {shape}, got {value.shape}", "Give a value per pixel")
+        length, view_length = (np.sqrt(np.sum(v * v, axis=-1, keepdims=True)) for v in (normal, to_view))
+        finite = (np.isfinite(value).all(axis=-1) for value in (length, position, to_view))
+        seen = np.logical_and.reduce([seen, length[..., 0] > 0, *finite])
+        upward, inside = np.array([0.0, 0.0, 1.0]), seen[..., None]
         values: dict[str, Any] = {
-            "position": np.where(seen[..., None], position, 0.0),
-            "normal": np.where(seen[..., None], normal / np.where(seen, length, 1.0)[..., None], upward),
-            "to_view": np.where(seen[..., None], to_view / np.where(view_length > 0, view_length, 1.0), upward),
+            "position": np.where(inside, position, 0.0),
+            "normal": np.where(inside, normal / np.where(inside, length, 1.0), upward),
+            "to_view": np.where(inside, to_view / np.where(view_length > 0, view_length, 1.0), upward),
         }
         return cls(**values, mask=seen)
 
@@ -148,19 +145,29 @@ class Points:
     position: Components
     normal: Components
     to_view: Components
-    mask: Bool[Array, "*pixels"]
-    shape: Int[Array, "*pixels"] | None = None
-    visibility: Float[Array, "*pixels L"] | None = None
+    mask: Array
+    shape: Array | None = None
+    visibility: Array | None = None
     facet: Components | None = None
+    share: Array | None = None
 
     def stacked(self) -> SurfacePoints:
         """The same as arrays."""
-        vectors = (self.position, self.normal, self.to_view)
+        facet, vectors = self.facet, (self.position, self.normal, self.to_view)
         position, normal, to_view = (vector.stacked(self.mask.shape) for vector in vectors)
-        facet = None if self.facet is None else self.facet.stacked(self.mask.shape)
+        facet = None if facet is None else facet.stacked(self.mask.shape)
         return SurfacePoints(position, normal, to_view, self.mask, self.shape, self.visibility, facet=facet)
 
     def flat(self) -> "Points":
         """As one row, (P,)."""
         pixels = self.mask.ndim
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[pixels:]) if leaf.ndim else leaf, self)
+
+    @property
+    def each(self) -> int:
+        """How many points a pixel has."""
+        return 1 if self.share is None else self.mask.shape[-1]
+
+    def per_pixel(self, values: Array) -> Array:
+        """The sums of (P, C) values of points over those of each pixel."""
+        return jnp.sum(values.reshape(-1, self.each, values.shape[-1]), axis=1) if self.each > 1 else values

@@ -239,17 +239,12 @@ class Triangles(Shape):
         False
     """
 
-    quick: ClassVar[bool] = False
+    convex: ClassVar[bool] = False
     mesh: Mesh = eqx.field(static=True)
 
     def __check_init__(self):
         """Refuse what is no mesh."""
         instance("mesh", self.mesh, Mesh, 'Write Triangles(brdf.load_mesh("mesh.obj"))')
-
-    @property
-    def convex(self) -> bool:
-        """A mesh may cast shadows on itself."""
-        return False
 
     def extent(self) -> Scalar:
         """The largest absolute coordinate."""

@@ -16,6 +16,7 @@ n = 1000, S = 64 leaves 1e-3, 2e-2 and 3e-3, S = 256 less than 1e-5 for each, an
 it takes.
 """
 
+import operator
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -40,7 +41,7 @@ from brdf.errors import InputError
 from brdf.geometry.surface_points import Points
 from brdf.lights.base import Light, LightSample
 from brdf.lights.sample_sets import disc_rule, square_rule
-from brdf.vectors import Components, cross, divide, dot, norm, normalize, perpendicular, square_root
+from brdf.vectors import Components, divide, norm, normalize, perpendicular, square_root
 
 SAMPLES = 64
 
@@ -58,40 +59,35 @@ def _positive_range(at_0: Array, at_1: Array) -> tuple[Array, Array]:
 
 
 def _above_horizon(
-    point: Points, starts: tuple[Components, ...], edges: tuple[Components, ...], node: tuple[Array, Array]
+    point: Points, starts: tuple[Components, ...], edges: tuple[Components, ...], s: Array, t: Any
 ) -> tuple[Array, Components, Array]:
     """The place of a node (s, t) of the unit square in that part of a patch which stands above the horizon.
 
     The points of the patch are a(t) + s b(t), with a and b linear in t and given at t = 0 and t = 1: a parallelogram
     has a constant b, a triangle a constant a. Returned are s, the point, and the share of the weight that is left.
     """
-    heights = [dot(a - point.position, point.normal) for a in starts]
-    slopes = [dot(b, point.normal) for b in edges]
-    (low, high), (other_low, other_high) = (
-        _positive_range(heights[0], heights[1]),
-        _positive_range(heights[0] + slopes[0], heights[1] + slopes[1]),
-    )
+    heights = [(a - point.position) @ point.normal for a in starts]
+    slopes = [b @ point.normal for b in edges]
+    sides = _positive_range(*heights), _positive_range(*map(operator.add, heights, slopes))
     # a side that is wholly below the horizon has no say
-    lowest = jnp.minimum(jnp.where(high <= low, 1.0, low), jnp.where(other_high <= other_low, 1.0, other_low))
-    highest = jnp.maximum(jnp.where(high <= low, 0.0, high), jnp.where(other_high <= other_low, 0.0, other_high))
+    lowest = jnp.minimum(*(jnp.where(high <= low, 1.0, low) for low, high in sides))
+    highest = jnp.maximum(*(jnp.where(high <= low, 0.0, high) for low, high in sides))
     width = jnp.maximum(highest - lowest, 0.0)
-    t = lowest + node[1] * width
-    height, slope = (first + t * (second - first) for first, second in (heights, slopes))
+    t = lowest + t * width
+    ends: Any = heights, slopes, starts, edges
+    height, slope, start, edge = (first + (second - first) * t for first, second in ends)
     bottom, top = _positive_range(height, height + slope)
-    s = bottom + node[0] * (top - bottom)
-    start, edge = (first + t * (second - first) for first, second in (starts, edges))
-    return s, start + s * edge, width * (top - bottom)
+    s = bottom + s * (top - bottom)
+    return s, start + edge * s, width * (top - bottom)
 
 
-def _from_patch(
-    radiance: Any, patch: Components, area: Array, light_normal: Components, position: Components
-) -> LightSample:
+def _from_patch(patch: Components, area: Array, light_normal: Components, position: Components) -> LightSample:
     """The sample of a patch of a flat light that shines along ``light_normal``."""
     offset = patch - position
     to_light = normalize(offset)
-    facing = jnp.maximum(-dot(to_light, light_normal), 0.0)
-    squared_radius = divide(area * facing, np.pi * dot(offset, offset))
-    return LightSample(to_light, radiance * squared_radius, norm(offset), square_root(squared_radius))
+    facing = jnp.maximum(-(to_light @ light_normal), 0.0)
+    squared_radius = divide(area * facing, np.pi * (offset @ offset))
+    return LightSample(to_light, squared_radius, norm(offset), square_root(squared_radius))
 
 
 class RectangleLight(Light):
@@ -119,28 +115,24 @@ class RectangleLight(Light):
     radiance: Spectrum = checked(spectrum, "radiance")
     samples: int = eqx.field(static=True, converter=sample_number, default=SAMPLES)
     type_name: ClassVar[str] = "rectangle"
-    emits: ClassVar[tuple[int, ...]] = (3,)
-    weighs: ClassVar[int | None] = -1
 
     def __check_init__(self):
         """Refuse edges that span no area."""
         spans_area(self.edge_u, self.edge_v)
 
     @property
-    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...], Any]:
         """The light, and a product rule over the unit square."""
-        return (self.center, self.edge_u, self.edge_v, self.radiance), square_rule(self.samples)
+        return (self.center, self.edge_u, self.edge_v), square_rule(self.samples), self.radiance
 
     @staticmethod
     def sample(point: Points, *row: Any) -> LightSample:
         """From a patch of the light above the horizon."""
-        center, edge_u, edge_v, radiance, s, t, weight = row
+        center, edge_u, edge_v, s, t, weight = row
         corner = center - edge_u - edge_v
-        starts, edges = (corner, corner + 2 * edge_v), (2 * edge_u, 2 * edge_u)
-        _, patch, share = _above_horizon(point, starts, edges, (s, t))
-        area_vector = cross(edge_u, edge_v)
-        area = 4 * norm(area_vector) * weight * share
-        return _from_patch(radiance, patch, area, normalize(area_vector), point.position)
+        _, patch, share = _above_horizon(point, (corner, corner + edge_v * 2), (edge_u * 2, edge_u * 2), s, t)
+        area_vector = edge_u.cross(edge_v)
+        return _from_patch(patch, 4 * norm(area_vector) * weight * share, normalize(area_vector), point.position)
 
 
 class PolygonLight(Light):
@@ -166,8 +158,6 @@ class PolygonLight(Light):
     samples: int = eqx.field(static=True, converter=sample_number, default=SAMPLES)
     triangles: tuple[tuple[int, int, int], ...] = eqx.field(static=True, init=False)
     type_name: ClassVar[str] = "polygon"
-    emits: ClassVar[tuple[int, ...]] = (1,)
-    weighs: ClassVar[int | None] = -1
 
     def __post_init__(self):
         """Cut it into triangles, once."""
@@ -179,20 +169,20 @@ class PolygonLight(Light):
             raise InputError("samples", came, "Give one sample for each triangle at least")
 
     @property
-    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...], Any]:
         """The corners of each triangle, and a product rule over the unit square of each."""
         rule, count = square_rule(self.samples // len(self.triangles)), len(self.triangles)
         corners = self.vertices[np.repeat(np.array(self.triangles), rule.weight.size, axis=0)]
-        tiled = [np.tile(values, count) for values in rule]
-        return (_newell_normal(self.vertices), self.radiance), (corners, *tiled)
+        nodes = *(corners[:, corner] for corner in range(3)), *(np.tile(values, count) for values in rule)
+        return (_newell_normal(self.vertices),), nodes, self.radiance
 
     @staticmethod
     def sample(point: Points, *row: Any) -> LightSample:
         """From a patch of one triangle above the horizon."""
-        area_vector, radiance, (a, b, c), s, t, weight = row
-        place, patch, share = _above_horizon(point, (a, a), (b - a, c - a), (s, t))
-        area = norm(cross(b - a, c - a)) * place * weight * share
-        return _from_patch(radiance, patch, area, normalize(area_vector), point.position)
+        area_vector, a, b, c, s, t, weight = row
+        place, patch, share = _above_horizon(point, (a, a), (b - a, c - a), s, t)
+        area = norm((b - a).cross(c - a)) * place * weight * share
+        return _from_patch(patch, area, normalize(area_vector), point.position)
 
 
 def _newell_normal(vertices: Any) -> Any:
@@ -214,22 +204,23 @@ def triangulate(vertices: Any) -> tuple[tuple[int, int, int], ...]:
     double_area = float(np.linalg.norm(area_vector))
     if double_area <= 1e-12 * size * size:
         raise InputError("vertices", "span no area", "Give the corners of a polygon in order")
-    normal, relative = area_vector / double_area, vertices - vertices[0]
-    if np.max(np.abs(relative @ normal)) > FLAT * size:
+    normal = area_vector / double_area
+    if np.max(np.abs((vertices - vertices[0]) @ normal)) > FLAT * size:
         raise InputError("vertices", "do not lie in one plane", "Cut the light into flat polygons")
-    left, triangles = list(range(len(vertices))), []
 
     def turn(a: int, b: int, c: int) -> float:
         """Twice the area of the triangle a b c, positive where it turns left."""
         return float(normal @ np.cross(vertices[b] - vertices[a], vertices[c] - vertices[a]))
 
-    def is_ear(a: int, b: int, c: int) -> bool:
-        others = [d for d in left if d not in (a, b, c)]
-        return turn(a, b, c) >= 0 and not any(min(turn(a, b, d), turn(b, c, d), turn(c, a, d)) > 0 for d in others)
+    def holds(corner: tuple[int, int, int], d: int) -> bool:
+        a, b, c = corner
+        return d not in corner and min(turn(a, b, d), turn(b, c, d), turn(c, a, d)) > 0
 
+    left, triangles = list(range(len(vertices))), []
     while len(left) > 3:
-        corners = [(left[i - 1], left[i], left[(i + 1) % len(left)]) for i in range(len(left))]
-        ear = next((corner for corner in corners if is_ear(*corner)), None)
+        corners = zip(left[-1:] + left[:-1], left, left[1:] + left[:1], strict=True)
+        ears = (one for one in corners if turn(*one) >= 0 and not any(holds(one, d) for d in left))
+        ear = next(ears, None)
         if ear is None:
             raise InputError("vertices", "cross each other's edges", "Give the corners of a simple polygon in order")
         if turn(*ear) > 0:
@@ -261,33 +252,29 @@ class SphereLight(Light):
     radiance: Spectrum = checked(spectrum, "radiance")
     samples: int = eqx.field(static=True, converter=sample_number, default=SAMPLES)
     type_name: ClassVar[str] = "sphere"
-    emits: ClassVar[tuple[int, ...]] = (2,)
-    weighs: ClassVar[int | None] = -1
 
     @property
-    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...], Any]:
         """The light, and a rule over the cap of directions in which a point sees it."""
-        return (self.center, self.radius, self.radiance), disc_rule(self.samples)
+        return (self.center, self.radius), disc_rule(self.samples), self.radiance
 
     @staticmethod
     def sample(point: Points, *row: Any) -> LightSample:
         """From a patch of the cap of directions, above the horizon."""
-        center, radius, radiance, s, t, weight = row
+        center, radius, s, t, weight = row
         offset = center - point.position
-        distance = norm(offset)
-        axis = normalize(offset)
+        distance, axis = norm(offset), normalize(offset)
         squared_sine = jnp.where(distance > radius, divide(radius * radius, distance * distance), 0.0)
         height = divide(squared_sine, 1.0 + square_root(1.0 - squared_sine))  # 1 - cos, without cancellation
         across, along = perpendicular(axis)
-        outward = jnp.cos(2 * np.pi * t) * across + jnp.sin(2 * np.pi * t) * along
-        low, high = _arc_above_horizon(dot(axis, point.normal), dot(outward, point.normal), height)
+        outward = across * jnp.cos(2 * np.pi * t) + along * jnp.sin(2 * np.pi * t)
+        low, high = _arc_above_horizon(axis @ point.normal, outward @ point.normal, height)
         below_axis = (low + s * (high - low)) * height  # 1 - cos of the angle to the axis
-        to_light = (1.0 - below_axis) * axis + square_root(below_axis * (2.0 - below_axis)) * outward
+        to_light = axis * (1.0 - below_axis) + outward * square_root(below_axis * (2.0 - below_axis))
         squared_radius = 2.0 * height * (high - low) * weight
         along_ray = distance * (1.0 - below_axis)
         half_chord = square_root(along_ray * along_ray - (distance * distance - radius * radius))
-        intensity, patch_radius = radiance * squared_radius, square_root(squared_radius)
-        return LightSample(normalize(to_light), intensity, along_ray - half_chord, patch_radius)
+        return LightSample(normalize(to_light), squared_radius, along_ray - half_chord, square_root(squared_radius))
 
 
 def _arc_above_horizon(axial: Array, outward: Array, height: Array) -> tuple[Array, Array]:
@@ -298,8 +285,6 @@ def _arc_above_horizon(axial: Array, outward: Array, height: Array) -> tuple[Arr
     """
     cosine = divide(jnp.abs(outward), square_root(axial * axial + outward * outward))
     crossing = jnp.clip(divide(1.0 - cosine, height), 0.0, 1.0)
-    low = jnp.where(axial > 0, 0.0, jnp.where(outward > 0, crossing, 0.0))
-    high = jnp.where(
-        (axial > 0) & (outward >= 0), 1.0, jnp.where(axial > 0, crossing, jnp.where(outward > 0, 1.0, 0.0))
-    )
+    low = jnp.where((axial <= 0) & (outward > 0), crossing, 0.0)
+    high = jnp.where(axial > 0, jnp.where(outward >= 0, 1.0, crossing), jnp.where(outward > 0, 1.0, 0.0))
     return low, high

@@ -11,9 +11,7 @@ is no larger for a thousand lights than for two.
 
 import abc
 import dataclasses
-import functools
 import math
-import operator
 from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
@@ -38,17 +36,18 @@ class LightSample(NamedTuple):
         distance: to the light, in world units; infinite for a light at infinity.
         radius: angular radius, in radians, of a disc as large as the patch that the sample stands for: shadow edges
             sweep over it. None for light without extent, whose shadows are hard.
-        moments: where the sample stands for a patch of the sky, the mean of its directions weighted by radiance,
-            shorter than 1, and the rows of their covariance; None for a single direction.
-        lobe_only: 1 where the sample counts for the specular term alone, 0 where for the diffuse alone; None for both.
+        cosine: (N·L)+, where the sample stands for a patch of the sky, its mean over that; None for a single direction.
+        above: the share of such a patch above the horizon.
+        lobe_intensity: what arrives for the specular term, where that is another.
     """
 
     to_light: Components
     intensity: Any
     distance: Array
     radius: Array | None = None
-    moments: tuple[Components, tuple[Components, ...]] | None = None
-    lobe_only: Array | None = None
+    cosine: Array | None = None
+    above: Array | float = 1.0
+    lobe_intensity: Any = None
 
 
 class Light(Checked):
@@ -56,18 +55,14 @@ class Light(Checked):
 
     Attributes:
         type_name: what ``type`` in a scene file says.
-        emits: the places in a row whose product is a spectrum that the sample's intensity is proportional to.
-        weighs: the place among a sample's own numbers that its intensity is proportional to; None for a light of one.
     """
 
     type_name: ClassVar[str]
-    emits: ClassVar[tuple[int, ...]]
-    weighs: ClassVar[int | None] = None
 
     @property
     @abc.abstractmethod
-    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        """Its numbers, and those of its samples: arrays with one leading axis, none for a light of a single sample."""
+    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...], Any]:
+        """Its numbers; those of its samples, (S, ...) each; the spectrum they emit, (C,), or (S, C)."""
 
     @staticmethod
     @abc.abstractmethod
@@ -76,7 +71,7 @@ class Light(Checked):
 
         Args:
             point: where, (P,).
-            row: the light's numbers, and those of its samples, (S, 1) each; 1 for what it emits.
+            row: the light's numbers, and those of its samples, (S, 1) each.
         """
 
     @property
@@ -88,53 +83,43 @@ class Light(Checked):
 
 AnyArray = Array | np.ndarray
 
-# Where samples are filled up, to a multiple of this.
 FILLED = 4096
+"""Samples are filled up to a multiple of this."""
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
 class LightStack:
-    """The L lights of one kind with S samples each; those of a single sample are together the samples of one.
+    """The L lights of one kind with S samples each.
 
     Attributes:
         kind: their class.
         numbers: of each light, arrays (L, ...).
         nodes: of each light's samples, arrays (L, S, ...).
+        emitted: what each sample emits, (L, S, C).
         light: which of the scene's lights each sample belongs to, (L, S).
     """
 
     kind: type[Light] = dataclasses.field(metadata={"static": True})
     numbers: tuple[AnyArray, ...]
     nodes: tuple[AnyArray, ...]
+    emitted: Float[AnyArray, "L S C"]
     light: Int[AnyArray, "L S"]
 
-    @property
-    def samples(self) -> int:
-        """Of all the lights."""
-        return math.prod(self.light.shape)
+    def chunks(self, largest: int) -> tuple[Any, Array, Array]:
+        """Nodes, emission and lights by chunks of up to so many samples, (L, K, B, ...).
 
-    @property
-    def channels(self) -> int:
-        """Of what is emitted."""
-        row = *self.numbers, *self.nodes
-        return max(row[place].shape[-1] for place in self.kind.emits)
-
-    def emitted(self) -> Float[Array, "L S C"]:
-        """What each sample emits, for an intensity of 1."""
-        row = [*(values[:, None] for values in self.numbers), *self.nodes]
-        product = functools.reduce(operator.mul, (row[place] for place in self.kind.emits))
-        return jnp.broadcast_to(product, (*self.light.shape, self.channels))
-
-    def chunks(self, largest: int) -> tuple[tuple[Array, ...], Int[Array, "L K B"], Float[Array, "L K B C"]]:
-        """Nodes, lights and emission by chunks of up to so many samples; samples of no light fill up the last one."""
-        count = self.light.shape[1]
+        Lights that are a sample each are taken together, as the samples of one. Samples of no light fill up the last
+        chunk.
+        """
+        each: Any = jax.tree.map(jnp.asarray, (self.nodes, self.emitted, self.light))
+        if not self.numbers and self.light.shape[1] == 1:
+            each = jax.tree.map(lambda leaf: leaf.swapaxes(0, 1), each)
+        count = each[2].shape[1]
         chunks = -(-count // largest)
         place = np.arange(chunks * -(-count // chunks)).reshape(chunks, -1)
-        nodes, light, emitted = jax.tree.map(
-            lambda leaf: jnp.asarray(leaf)[:, np.minimum(place, count - 1)], (self.nodes, self.light, self.emitted())
-        )
-        return nodes, light, jnp.where((place < count)[..., None], emitted, 0)
+        nodes, emitted, light = jax.tree.map(lambda leaf: leaf[:, np.minimum(place, count - 1)], each)
+        return nodes, jnp.where((place < count)[..., None], emitted, 0), light
 
 
 @jax.tree_util.register_dataclass
@@ -153,48 +138,44 @@ class Lighting:
     @property
     def samples(self) -> int:
         """Of all lights together."""
-        return sum(stack.samples for stack in self.stacks)
+        return sum(math.prod(stack.light.shape) for stack in self.stacks)
+
+    @property
+    def channels(self) -> int:
+        """Of what is emitted."""
+        return max(stack.emitted.shape[-1] for stack in self.stacks)
 
 
-def stacked(lights: Sequence[Light], dtype: Any, fill_above: float = math.inf) -> tuple[LightStack, ...]:
+def stacked(
+    lights: Sequence[Light], dtype: Any, fill_above: float = math.inf, *, index: Sequence[int] | None = None
+) -> tuple[LightStack, ...]:
     """Lights as arrays, kind by kind; those of one kind that have no common shape, as of other channels, apart.
 
     Args:
         lights: of a scene.
         dtype: of the arrays.
         fill_above: lights of more samples get further ones that send nothing, so that one program serves many numbers.
+        index: which of the scene's lights they are; None for all.
     """
-    kinds: dict[Any, list[tuple[Any, ...]]] = {}
-    for index, light in enumerate(lights):
-        numbers, nodes = light.rows
-        shapes = tuple(np.shape(values) for values in (*numbers, *nodes))
-        kinds.setdefault((type(light), len(numbers), shapes), []).append((index, *numbers, *nodes))
+    kinds: dict[Any, list[Any]] = {}
+    for place, light in zip(range(len(lights)) if index is None else index, lights, strict=True):
+        shapes = tuple(np.shape(values) for values in jax.tree.leaves(light.rows))
+        kinds.setdefault((type(light), shapes), []).append((place, light.rows))
     stacks = []
-    for (kind, count, _), members in kinds.items():
-        index, *values = zip(*members, strict=True)
-        values = [_stack(each, dtype) for each in values]
-        light = np.array(index, np.int32)
-        if len(values) == count:
-            stacks.append(LightStack(kind, (), tuple(each[None] for each in values), light[None]))
-            continue
-        numbers, nodes = values[:count], values[count:]
-        if (
-            kind.weighs is not None
-            and nodes[0].shape[1] > fill_above
-            and all(isinstance(each, np.ndarray) for each in nodes)
-        ):
-            nodes = _filled(nodes, kind.weighs)
-        each = np.broadcast_to(light[:, None], nodes[0].shape[:2])
-        stacks.append(LightStack(kind, tuple(numbers), tuple(nodes), each))
+    for (kind, _), members in kinds.items():
+        places, rows = zip(*members, strict=True)
+        numbers, nodes, emitted = jax.tree.map(lambda *values: _stack(values, dtype), *rows)
+        samples = nodes[0].shape[1]
+        xp: Any = np if isinstance(emitted, np.ndarray) else jnp
+        each = emitted[:, None] if emitted.ndim == 2 else emitted
+        emitted = xp.broadcast_to(each, (len(places), samples, each.shape[-1]))
+        if samples > fill_above and all(isinstance(one, np.ndarray) for one in (*nodes, emitted)):
+            more = [(0, 0), (0, -samples % FILLED)]
+            *nodes, emitted = (np.pad(one, more + [(0, 0)] * (one.ndim - 2), mode="edge") for one in (*nodes, emitted))
+            emitted[:, samples:] = 0
+        light = np.broadcast_to(np.array(places, np.int32)[:, None], emitted.shape[:2])
+        stacks.append(LightStack(kind, numbers, tuple(nodes), emitted, light))
     return tuple(stacks)
-
-
-def _filled(nodes: Sequence[np.ndarray], weighs: int) -> list[np.ndarray]:
-    """Samples of lights, and further ones that send nothing."""
-    each = nodes[0].shape[1]
-    found = [np.pad(one, [(0, 0), (0, -each % FILLED)] + [(0, 0)] * (one.ndim - 2), mode="edge") for one in nodes]
-    found[weighs][:, each:] = 0
-    return found
 
 
 def _stack(values: Sequence[Any], dtype: Any) -> Any:

@@ -29,7 +29,7 @@ from brdf.errors import InputError
 from brdf.geometry.surface_points import Points
 from brdf.lights.base import Light, LightSample
 from brdf.lights.sample_sets import hemisphere_rule, ring_rule
-from brdf.vectors import dot, normalize, perpendicular, square_root, trace
+from brdf.vectors import Components, divide, normalize, perpendicular, square_root
 
 CONSTANT_SAMPLES = 512
 MAP_SAMPLES = 1024
@@ -71,8 +71,6 @@ class ConstantEnvironment(Light):
     radiance: Spectrum = checked(spectrum, "radiance")
     samples: int = eqx.field(static=True, converter=sample_number, default=CONSTANT_SAMPLES)
     type_name: ClassVar[str] = "environment"
-    emits: ClassVar[tuple[int, ...]] = (0,)
-    weighs: ClassVar[int | None] = 2
 
     def __check_init__(self):
         """Refuse a single sample."""
@@ -80,38 +78,38 @@ class ConstantEnvironment(Light):
             raise InputError("samples", "must be at least 2 here, got 1", "Give more")
 
     @property
-    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...], Any]:
         """The light, two rules over the hemisphere, and which of the two a row belongs to."""
         half = max(1, self.samples // 2)
         diffuse, lobe = hemisphere_rule(half), ring_rule(self.samples - half)
         rule = [np.concatenate(pair) for pair in zip(diffuse, lobe, strict=True)]
         lobe_only = np.repeat([0.0, 1.0], [diffuse.weight.size, lobe.weight.size])
-        return (self.radiance,), (*rule, lobe_only)
+        return (), (*rule, lobe_only), self.radiance
 
     @staticmethod
     def sample(point: Points, *row: Any) -> LightSample:
         """From a patch of the hemisphere above the point."""
-        radiance, s, t, weight, lobe_only = row
+        s, t, weight, lobe_only = row
         normal, to_view = point.normal, point.to_view
         across, along = perpendicular(normal)
-        outward = jnp.cos(2 * np.pi * t) * across + jnp.sin(2 * np.pi * t) * along
-        even = s * normal + square_root(1.0 - s * s) * outward
-        view = jnp.maximum(dot(normal, to_view), 1e-6)
-        end = 0.25 * np.pi + 0.5 * jnp.arctan2(dot(outward, to_view), view)
+        outward = across * jnp.cos(2 * np.pi * t) + along * jnp.sin(2 * np.pi * t)
+        even = normal * s + outward * square_root(1.0 - s * s)
+        end = 0.25 * np.pi + 0.5 * jnp.arctan2(outward @ to_view, jnp.maximum(normal @ to_view, 1e-6))
         angle = end * jnp.expm1(STEEPNESS * s) / np.expm1(STEEPNESS)
-        half = jnp.cos(angle) * normal + jnp.sin(angle) * outward
-        view_half = dot(half, to_view)
-        mirrored = 2.0 * view_half * half - to_view
+        half = normal * jnp.cos(angle) + outward * jnp.sin(angle)
+        view_half = half @ to_view
+        mirrored = half * (2.0 * view_half) - to_view
         stretch = end * STEEPNESS * jnp.exp(STEEPNESS * s) / np.expm1(STEEPNESS)
         share = 8.0 * jnp.maximum(view_half, 0.0) * jnp.sin(angle) * stretch
         squared_radius = jnp.where(lobe_only > 0, share, 2.0) * weight
-        to_light = normalize(even + lobe_only * (mirrored - even))
-        intensity, radius = radiance * squared_radius, square_root(squared_radius)
-        return LightSample(to_light, intensity, jnp.asarray(jnp.inf), radius, lobe_only=lobe_only)
-
-
-Box = tuple[int, int, int, int]
-"""A rectangle of the map: first row, row after the last, first column, column after the last."""
+        to_light = normalize(even + (mirrored - even) * lobe_only)
+        return LightSample(
+            to_light,
+            squared_radius * (1.0 - lobe_only),
+            jnp.asarray(jnp.inf),
+            square_root(squared_radius),
+            lobe_intensity=squared_radius * lobe_only,
+        )
 
 
 class Patches(NamedTuple):
@@ -151,8 +149,6 @@ class EnvironmentMap(Light):
     patches: Patches
     samples: int = eqx.field(static=True)
     type_name: ClassVar[str] = "environment"
-    emits: ClassVar[tuple[int, ...]] = (0, 1)
-    weighs: ClassVar[int | None] = 0
 
     def __init__(self, pixels: Any, *, radiance: Any = 1.0, samples: int = MAP_SAMPLES):
         """Take a map's colour out where it has only one, and cut it up."""
@@ -172,17 +168,35 @@ class EnvironmentMap(Light):
         self.patches = cut(np.asarray(self.pixels), self.samples)
 
     @property
-    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        """The factor and the rectangles of the map."""
-        return (self.radiance,), self.patches
+    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...], Any]:
+        """The rectangles of the map, means and rows of covariances."""
+        intensity, mean, covariance = self.patches
+        return (), (mean, *(covariance[:, axis] for axis in range(3))), self.radiance * intensity
 
     @staticmethod
     def sample(point: Points, *row: Any) -> LightSample:
         """The same at every point: the light of one rectangle of the map."""
-        radiance, intensity, mean, covariance = row
-        radius = square_root(2.0 * trace(covariance))  # that of a disc of the same variance
-        moments = (mean, covariance)
-        return LightSample(normalize(mean), radiance * intensity, jnp.asarray(jnp.inf), radius, moments)
+        mean, *covariance = row
+        (xx, _, _), (_, yy, _), (_, _, zz) = covariance
+        radius = square_root(2.0 * (xx + yy + zz))  # that of a disc of the same variance
+        spread = Components(tuple(row @ point.normal for row in covariance)) @ point.normal
+        cosine, above = patch_cosine(point.normal @ mean, spread)
+        return LightSample(normalize(mean), 1.0, jnp.asarray(jnp.inf), radius, cosine, above)
+
+
+def patch_cosine(middle: Array, variance: Array) -> tuple[Array, Array]:
+    """Mean of (N·L)+ over a patch of the sky, and the share of its light above the horizon.
+
+    Exact where the patch does not cross the horizon. Where it does, N·L is taken to be spread by the parabola
+    3/4 (1 - x²) that has the patch's mean and variance.
+    """
+    half_width = square_root(5.0 * variance)
+    x = divide(middle, half_width)
+    crosses = (half_width > 0) & (jnp.abs(x) < 1)
+    x = jnp.where(crosses, x, 0.0)
+    partly = half_width * (3 / 16 + x * (1 / 2 + x * (3 / 8 - x * x / 16)))
+    share = 1 / 2 + x * (3 / 4 - x * x / 4)
+    return jnp.where(crosses, partly, middle), jnp.where(crosses, share, 1.0)
 
 
 def _checked(pixels: Any) -> np.ndarray:
@@ -225,29 +239,23 @@ def cut(pixels: Float[np.ndarray, "H W C"], samples: int) -> Patches:
     while moments.shape[0] * moments.shape[1] > LARGEST_MAP:
         for axis in (0, 1):
             moments = np.add.reduceat(moments, np.arange(0, moments.shape[axis], 2), axis=axis)
-    table = np.pad(moments, np.array([(1, 0), (1, 0), (0, 0)])).cumsum(axis=0).cumsum(axis=1)
 
-    def entry(box: Box) -> tuple[float, Box]:
+    def entry(*box: tuple[int, int]) -> tuple[float, Any]:
         """Largest spread first: energy times variance of the directions, which is what is left of their length 1."""
-        top, bottom, left, right = box
-        sums = table[bottom, right] - table[top, right] - table[bottom, left] + table[top, left]
-        if sums[0] <= 0:
-            return 0.0, box
-        variance = 1.0 - float(np.sum((sums[1:4] / sums[0]) ** 2))
-        return -float(sums[0]) * variance if variance > 1e-12 else 0.0, box  # rounding aside
+        energy, *first = moments[slice(*box[0]), slice(*box[1]), :4].sum(axis=(0, 1))
+        variance = 1.0 - np.sum((np.array(first) / energy) ** 2) if energy > 0 else 0.0
+        return -energy * variance if variance > 1e-12 else 0.0, box  # rounding aside
 
-    heap = [entry((0, moments.shape[0], 0, moments.shape[1]))]
-    done: list[Box] = []
+    heap, done = [entry((0, moments.shape[0]), (0, moments.shape[1]))], []
     while heap and len(heap) + len(done) < samples:
         negative_spread, box = heapq.heappop(heap)
-        halves = None if negative_spread == 0 else _halves(moments, box)
+        halves = _halves(moments[..., 0], box) if negative_spread else None
         if halves is None:
             done.append(box)
-            continue
-        for half in halves:
-            heapq.heappush(heap, entry(half))
+        for half in halves or ():
+            heapq.heappush(heap, entry(*half))
     boxes = sorted(done + [box for _, box in heap])
-    sums = np.stack([moments[top:bottom, left:right].sum(axis=(0, 1)) for top, bottom, left, right in boxes])
+    sums = np.stack([moments[slice(*rows), slice(*columns)].sum(axis=(0, 1)) for rows, columns in boxes])
     return _patches(sums[sums[:, 0] > 0], pixels.shape[2])
 
 
@@ -259,29 +267,22 @@ def _texel_moments(energy: np.ndarray) -> np.ndarray:
     return np.concatenate([weight, weight * directions, weight * pairs, energy], axis=-1)
 
 
-def _halves(moments: np.ndarray, box: Box) -> list[Box] | None:
+def _halves(weight: np.ndarray, box: Any) -> list[Any] | None:
     """Two rectangles, cut across the longer side at the centre of mass; None for a single texel."""
-    top, bottom, left, right = box
-    weight = moments[top:bottom, left:right, 0]
-    by_row, by_column = weight.sum(axis=1), weight.sum(axis=0)
-    height, width = moments.shape[:2]
-    row_mean, row_variance = _mean_and_variance(by_row)
-    column_mean, column_variance = _mean_and_variance(by_column)
-    shrink = np.sin(np.pi * (top + row_mean + 0.5) / height) * 2 * height / width
-    if row_variance == 0 and column_variance == 0:
+    height, width = weight.shape
+    some, means, variances = weight[slice(*box[0]), slice(*box[1])], [], []
+    for axis in (0, 1):
+        along, index = some.sum(axis=1 - axis), np.arange(some.shape[axis])
+        means.append(np.sum(index * along) / np.sum(along))
+        variances.append(np.sum((index - means[-1]) ** 2 * along))
+    shrink = np.sin(np.pi * (box[0][0] + means[0] + 0.5) / height) * 2 * height / width
+    axis = int(variances[0] < variances[1] * shrink**2)
+    axis = axis if variances[axis] else 1 - axis
+    if not variances[axis]:
         return None
-    if column_variance == 0 or (row_variance >= column_variance * shrink**2 and row_variance > 0):
-        middle = top + int(np.clip(np.floor(row_mean) + 1, 1, bottom - top - 1))
-        return [(top, middle, left, right), (middle, bottom, left, right)]
-    middle = left + int(np.clip(np.floor(column_mean) + 1, 1, right - left - 1))
-    return [(top, bottom, left, middle), (top, bottom, middle, right)]
-
-
-def _mean_and_variance(weight: np.ndarray) -> tuple[float, float]:
-    """Of the index, weighted."""
-    index, total = np.arange(len(weight)), weight.sum()
-    mean = float(np.sum(index * weight) / total)
-    return mean, float(np.sum((index - mean) ** 2 * weight) / total)
+    first, last = box[axis]
+    middle = first + int(np.clip(np.floor(means[axis]) + 1, 1, last - first - 1))
+    return [[*box[:axis], part, *box[axis + 1 :]] for part in ((first, middle), (middle, last))]
 
 
 def _patches(sums: np.ndarray, channels: int) -> Patches:

@@ -11,7 +11,7 @@ from brdf.checks import Scalar, Spectrum, Vector, checked, direction_value, numb
 from brdf.errors import InputError
 from brdf.geometry.surface_points import Points
 from brdf.lights.base import Light, LightSample
-from brdf.vectors import cosine_lobe, divide, dot, norm, normalize
+from brdf.vectors import cosine_lobe, divide, norm, normalize
 
 
 class DirectionalLight(Light):
@@ -34,18 +34,17 @@ class DirectionalLight(Light):
     direction: Vector = checked(direction_value, "direction")
     intensity: Spectrum = checked(spectrum, "intensity")
     type_name: ClassVar[str] = "directional"
-    emits: ClassVar[tuple[int, ...]] = (1,)
 
     @property
-    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...], Any]:
         """It is a single sample."""
-        return (self.direction, self.intensity), ()
+        return (), (self.direction[None],), self.intensity
 
     @staticmethod
     def sample(point: Points, *row: Any) -> LightSample:
         """The same at every point."""
-        direction, intensity = row
-        return LightSample(normalize(direction), intensity, jnp.asarray(jnp.inf))
+        (direction,) = row
+        return LightSample(normalize(direction), 1.0, jnp.asarray(jnp.inf))
 
 
 def _attenuation(value: Any) -> Any:
@@ -80,21 +79,20 @@ class PointLight(Light):
     intensity: Spectrum = checked(spectrum, "intensity")
     attenuation: Vector = eqx.field(converter=_attenuation, default=(0.0, 0.0, 1.0))
     type_name: ClassVar[str] = "point"
-    emits: ClassVar[tuple[int, ...]] = (1,)
 
     @property
-    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...], Any]:
         """It is a single sample."""
-        return (self.position, self.intensity, self.attenuation), ()
+        return (), (self.position[None], self.attenuation[None]), self.intensity
 
     @staticmethod
     def sample(point: Points, *row: Any) -> LightSample:
         """From the light's distance and direction."""
-        position, intensity, (a, b, c) = row
+        position, (a, b, c) = row
         offset = position - point.position
         distance = norm(offset)
         falloff = divide(1.0, a + b * distance + c * distance * distance)
-        return LightSample(normalize(offset), intensity * falloff, distance)
+        return LightSample(normalize(offset), falloff, distance)
 
 
 class SpotLight(Light):
@@ -129,7 +127,6 @@ class SpotLight(Light):
     exponent: Scalar = eqx.field(converter=partial(number, "exponent", low=0.0), default=0.0)
     attenuation: Vector = eqx.field(converter=_attenuation, default=(0.0, 0.0, 1.0))
     type_name: ClassVar[str] = "spot"
-    emits: ClassVar[tuple[int, ...]] = (1,)
 
     def __check_init__(self):
         """Refuse what OpenGL does not define."""
@@ -138,17 +135,17 @@ class SpotLight(Light):
             raise InputError("cutoff_angle", came, "A spot of more than 90 degrees is a point light")
 
     @property
-    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...], Any]:
         """It is a single sample."""
-        cone = (self.direction, self.cutoff_angle, self.exponent)
-        return (self.position, self.intensity, self.attenuation, *cone), ()
+        each = self.position, self.attenuation, self.direction, self.cutoff_angle, self.exponent
+        return (), tuple(one[None] for one in each), self.intensity
 
     @staticmethod
     def sample(point: Points, *row: Any) -> LightSample:
         """A point light's, times the spot's factor."""
-        *light, direction, cutoff_angle, exponent = row
-        sample = PointLight.sample(point, *light)
+        position, attenuation, direction, cutoff_angle, exponent = row
+        sample = PointLight.sample(point, position, attenuation)
         axis = normalize(direction)
-        inside = (cutoff_angle >= 180) | (-dot(sample.to_light, axis) >= jnp.cos(jnp.deg2rad(cutoff_angle)))
+        inside = (cutoff_angle >= 180) | (-(sample.to_light @ axis) >= jnp.cos(jnp.deg2rad(cutoff_angle)))
         aligned = jnp.where(exponent > 0, cosine_lobe(-sample.to_light, axis, exponent), 1.0)
         return sample._replace(intensity=jnp.where(inside, aligned, 0.0) * sample.intensity)

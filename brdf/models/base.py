@@ -69,7 +69,6 @@ class Material(Checked):
             (...), at least 0; 0 where N.L <= 0 or N.V <= 0.
         """
 
-    @abstractmethod
     def reflectance(self, to_light: Directions, to_view: Directions) -> Float[Array, "*batch C"]:
         """The BRDF f_r in 1/sr, in the local frame whose +z axis is the normal.
 
@@ -80,6 +79,13 @@ class Material(Checked):
         Returns:
             (..., C), at least 0; 0 where either direction is not above the horizon.
         """
+        to_light, to_view = jnp.asarray(to_light), jnp.asarray(to_view)
+        above = (to_light[..., 2] > 0) & (to_view[..., 2] > 0)
+        return jnp.where(above[..., None], self._albedo(to_light, to_view), 0.0) / math.pi
+
+    def _albedo(self, to_light: Array, to_view: Array) -> Any:
+        """Pi times the BRDF above the horizon."""
+        return self.k_d
 
     def _repr_html_(self) -> str | None:
         """For Jupyter: a lit sphere and the numbers; nothing while JAX traces them."""
@@ -126,20 +132,17 @@ class SpecularMaterial(Material):
         return jnp.ones_like(n) if isinstance(n, jax.Array) else np.ones_like(n, float)
 
     def specular(self, normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
-        """The specular term S; see ``Material.specular``."""
+        """The specular term S; see `Material.specular`."""
         lobe = self._lobe(normal, to_light, to_view)
         return lobe * vectors.dot(normal, to_light) if self.cosine_weighted else lobe
 
-    def reflectance(self, to_light: Directions, to_view: Directions) -> Float[Array, "*batch C"]:
-        """The BRDF f_r in 1/sr; see ``Material.reflectance``."""
-        to_light, to_view = jnp.asarray(to_light), jnp.asarray(to_view)
+    def _albedo(self, to_light: Array, to_view: Array) -> Any:
         lobe = self._lobe(jnp.array([0.0, 0.0, 1.0], to_light.dtype), to_light, to_view)
         if not self.cosine_weighted:
             # eps^2 is zero for a direction, whose horizon is known to eps; below, derivatives would overflow
             cosine = to_light[..., 2]
             lobe = vectors.divide(lobe, jnp.where(cosine > jnp.finfo(cosine.dtype).eps ** 2, cosine, 0.0))
-        above = (to_light[..., 2] > 0) & (to_view[..., 2] > 0)
-        return jnp.where(above[..., None], self.k_d + self.k_s * lobe[..., None], 0.0) / math.pi
+        return self.k_d + self.k_s * lobe[..., None]
 
     def _lobe(self, normal: Directions, to_light: Directions, to_view: Directions) -> Array:
         """scale(n) cos^n, gated: light does not come through the surface."""

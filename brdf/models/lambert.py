@@ -8,15 +8,12 @@
 Reciprocal. Conserves energy when k_d <= 1. Source: J. H. Lambert, Photometria, 1760.
 """
 
-import math
 from typing import ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
-from brdf import vectors
 from brdf.models.base import Material
-from brdf.vectors import Directions, Scalars
+from brdf.vectors import Directions, Scalars, dot
 
 
 class Lambert(Material):
@@ -39,10 +36,5 @@ class Lambert(Material):
     name: ClassVar[str] = "lambert"
 
     def specular(self, normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
-        """The specular term S, which is 0; see ``Material.specular``."""
-        return jnp.zeros_like(vectors.dot(normal, to_light) + vectors.dot(normal, to_view))
-
-    def reflectance(self, to_light: Directions, to_view: Directions) -> Float[Array, "*batch C"]:
-        """The BRDF f_r in 1/sr; see ``Material.reflectance``."""
-        above = (jnp.asarray(to_light)[..., 2] > 0) & (jnp.asarray(to_view)[..., 2] > 0)
-        return jnp.where(above[..., None], self.k_d, 0.0) / math.pi
+        """The specular term S, which is 0; see `Material.specular`."""
+        return jnp.zeros_like(dot(normal, to_light) + dot(normal, to_view))

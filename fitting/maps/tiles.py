@@ -221,16 +221,14 @@ def _near_columns(model: Any, points: Any, stacks: Any, occluders: Any, ambient:
     for stack in stacks:
 
         def of_samples(one: Any, kind: Any = stack.kind) -> Any:
-            *samples, emitted = one
+            emitted, *samples = one
             found = light_terms(OneOf((model,)), Lighting((), occluders), points.in_components(), kind, *samples)
             weighted = [part[..., None] * emitted[:, None] for part in (found.diffuse, found.weight)]
             return found._replace(diffuse=weighted[0], weight=weighted[1])
 
-        each = stack.numbers, stack.nodes, stack.light, stack.emitted()
-        if not stack.numbers:  # lights of one sample each
-            each = jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), each)
+        each = stack.emitted, stack.numbers, stack.nodes, stack.light
         terms.append(jax.lax.map(of_samples, each))
-        order.append(each[2][:, 0])
+        order.append(stack.light[:, 0])
     every = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[jnp.argsort(jnp.concatenate(order))], *terms)
     diffuse = jnp.swapaxes(jnp.sum(every.diffuse, axis=1), 1, 2)
     linear = [] if ambient is None else [ambient * jnp.ones_like(diffuse)]

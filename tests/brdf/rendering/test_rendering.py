@@ -59,7 +59,7 @@ def test_a_pixel_is_an_area(n: float):
 def test_few_pixels_cost_more_than_one_sample():
     area = ball(4).surface_points().area
     assert area is not None
-    assert area.weight.shape[1] == 16
+    assert area.points.mask.shape[1] == 16
     assert np.count_nonzero(np.asarray(area.slot) >= 0) < 0.08 * SIZE * SIZE
 
 
