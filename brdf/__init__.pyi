@@ -11,8 +11,8 @@ from .display import displayed as displayed
 from .errors import InputError as InputError
 from .geometry.camera import OrthographicCamera as OrthographicCamera
 from .geometry.camera import PerspectiveCamera as PerspectiveCamera
-from .geometry.rectangle import Rectangle as Rectangle
-from .geometry.sphere import Sphere as Sphere
+from .geometry.shapes import Rectangle as Rectangle
+from .geometry.shapes import Sphere as Sphere
 from .geometry.surface_points import SurfacePoints as SurfacePoints
 from .geometry.triangles import Triangles as Triangles
 from .geometry.triangles import load_mesh as load_mesh

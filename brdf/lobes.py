@@ -15,14 +15,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+from numpy.polynomial import chebyshev
 
 from brdf.checks import Scalar
-from brdf.geometry.rays import Sight
+from brdf.geometry.rays import Sight, share_seen
 from brdf.geometry.surface_points import Points, SurfacePoints
-from brdf.geometry.visibility import share_seen
 from brdf.lights.base import Light, Lighting
-from brdf.models.base import Material, SpecularMaterial
-from brdf.models.one_of import OneOf
+from brdf.models import MODELS, Material, SpecularMaterial
 from brdf.vectors import BELOW_HORIZON, Components
 
 STORED_SAMPLES = 4
@@ -46,8 +45,48 @@ NO_LOBE = -1e9
 # -- the terms of samples, and their sums ------------------------------------------------------------------------------
 
 
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class OneOf:
+    """A model that a program learns when it runs: one program serves all, where making it costs more than running it.
+
+    Attributes:
+        models: those it may be.
+        index: which of them it is.
+    """
+
+    models: tuple[type[Material], ...] = dataclasses.field(metadata={"static": True})
+    index: Any = 0
+
+    @classmethod
+    def of(cls, model: type[Material]) -> "OneOf":
+        """Of all models that have a name; the model alone where it is none of them or has no lobe."""
+        models = cls(tuple(MODELS.values())).lobes
+        return cls(models, np.int32(models.index(model))) if model in models else cls((model,))
+
+    @property
+    def lobes(self) -> tuple[type[SpecularMaterial], ...]:
+        """The models that have a lobe."""
+        return tuple(model for model in self.models if issubclass(model, SpecularMaterial))
+
+    def log_cosine(self, *directions: Components) -> Array:
+        """See `SpecularMaterial.log_cosine`."""
+        kinds = list(dict.fromkeys(model.log_cosine for model in self.lobes))
+        kind = jnp.array([kinds.index(model.log_cosine) for model in self.lobes])[self.index]
+        return jax.lax.switch(kind, kinds, *directions)
+
+    def scale(self, n: Array) -> Array:
+        """See `SpecularMaterial.scale`."""
+        return jax.lax.switch(self.index, [model.scale for model in self.lobes], n)
+
+    @property
+    def cosine_weighted(self) -> Array:
+        """See `SpecularMaterial`."""
+        return jnp.array([model.cosine_weighted for model in self.lobes])[self.index]
+
+
 class LightTerms(NamedTuple):
-    """What light samples of strength 1 add to the basis images at some points.
+    """What light samples of strength 1 add to the basis images at some points, (S, P) each.
 
     Attributes:
         diffuse: (N·L)+ times the share of the light that arrives.
@@ -55,19 +94,13 @@ class LightTerms(NamedTuple):
         log_cosine: logarithm of the lobe's cosine; 0 where the lobe is gated.
     """
 
-    diffuse: Float[Array, "S P"]
-    weight: Float[Array, "S P"]
-    log_cosine: Float[Array, "S P"]
+    diffuse: Array
+    weight: Array
+    log_cosine: Array
 
 
 def light_terms(
-    model: OneOf,
-    lighting: Lighting,
-    point: Points,
-    kind: type[Light],
-    numbers: tuple[Array, ...],
-    nodes: tuple[Array, ...],
-    light: Int[Array, " S"],
+    model: OneOf, lighting: Lighting, point: Points, kind: type[Light], numbers: Any, nodes: Any, light: Array
 ) -> LightTerms:
     """The terms of samples of a light.
 
@@ -78,10 +111,10 @@ def light_terms(
         kind: of light.
         numbers: of the light, (...) each.
         nodes: of its samples, (S, ...) each.
-        light: which of the scene's lights each of them is.
+        light: which of the scene's lights each of them is, (S,).
     """
-    row = (*(_in_components(values[None]) for values in numbers), *map(_in_components, nodes))
-    sample = kind.sample(point, *row)
+    row = [values[:, None] for values in (*(one[None] for one in numbers), *nodes)]
+    sample = kind.sample(point, *(Components.of(one) if one.ndim == 3 else one for one in row))
     cosine = point.normal @ sample.to_light if sample.cosine is None else sample.cosine
     lit, arrives = point.mask & (cosine > 0), 1.0 if point.share is None else point.share
     if lighting.occluders:
@@ -100,19 +133,12 @@ def light_terms(
     return LightTerms(*(jnp.broadcast_to(part, shape) for part in (diffuse, weight, log_cosine)))
 
 
-def _in_components(values: Array) -> Any:
-    """Numbers of S samples as (S, 1), vectors as components of that form."""
-    return values[:, None] if values.ndim == 1 else Components.of(values[:, None])
-
-
 def is_sampled(lighting: Lighting) -> bool:
     """Whether the samples are so many that they are looped over."""
     return lighting.samples > STORED_SAMPLES
 
 
-def over_samples(
-    model: OneOf, points: Points, lighting: Lighting, of_terms: Callable[[LightTerms], Any]
-) -> tuple[Any, Float[Array, " P"]]:
+def over_samples(model: OneOf, points: Points, lighting: Lighting, of_terms: Any) -> tuple[Any, Array]:
     """Add up a function of samples' terms, linear in diffuse and weight, times what the samples emit.
 
     Of many samples all is done for a tile of pixels and a chunk of samples at a time, which the processor's cache
@@ -125,22 +151,37 @@ def over_samples(
         of_terms: gives (S, P) values, in any structure.
 
     Returns:
-        The sums in that structure, (P, C) each, and the peak of the lobe.
+        The sums in that structure, (P, C) each, and the peak of the lobe, (P,).
     """
+
+    def added(times: Any, emitted: Array, terms: LightTerms) -> tuple[Any, Array]:
+        shines = (terms.weight > 0) & jnp.any(emitted > 0, axis=1, keepdims=True)
+        peak = jnp.max(jnp.where(shines, terms.log_cosine, NO_LOBE), axis=0)
+        return jax.tree.map(partial(times, emitted), of_terms(terms)), peak
+
+    def together(one: Any, other: Any) -> tuple[Any, Array]:
+        return jax.tree.map(jnp.add, one[0], other[0]), jnp.maximum(one[1], other[1])
+
+    def of_tile(tile: Points) -> Any:
+        def add(total: Any, emitted: Array, *samples: Any) -> Any:
+            def add_lit(total: Any) -> Any:
+                terms = light_terms(model, lighting, tile, *samples)
+                # or each of the sums would make them anew
+                return together(total, added(_emitted, emitted, jax.lax.optimization_barrier(terms)))
+
+            return jax.lax.cond(jnp.any(emitted), add_lit, lambda total: total, total)
+
+        nothing = jnp.zeros((lighting.channels, tile.mask.size), jnp.result_type(*tile.normal))
+        shapes = jax.eval_shape(of_terms, LightTerms(*3 * [nothing[:1]]))
+        total = jax.tree.map(lambda _: nothing, shapes), jnp.full_like(nothing[0], NO_LOBE)
+        return jax.tree.map(lambda leaf: leaf.T, over_chunks(add, lighting, CHUNK, total))
+
     flat = points.flat()
     if is_sampled(lighting):
-        sums, peak = _by_tiles(partial(_over_tile, model, lighting, of_terms), flat)
+        sums, peak = _by_tiles(of_tile, flat)
     else:
-        parts = [
-            (jax.tree.map(partial(_times_emitted, emitted), of_terms(terms)), _peak(terms, emitted))
-            for emitted, terms in _terms(model, flat, lighting)
-        ]
-        sums, peak = functools.reduce(_together, parts)
+        sums, peak = functools.reduce(together, (added(_times_emitted, *one) for one in _terms(model, flat, lighting)))
     return jax.tree.map(points.per_pixel, sums), jnp.max(peak.reshape(-1, points.each), axis=1)
-
-
-def _together(one: tuple[Any, Array], other: tuple[Any, Array]) -> tuple[Any, Array]:
-    return jax.tree.map(jnp.add, one[0], other[0]), jnp.maximum(one[1], other[1])
 
 
 def _terms(model: OneOf, points: Points, lighting: Lighting) -> Iterator[tuple[Array, LightTerms]]:
@@ -153,55 +194,34 @@ def _terms(model: OneOf, points: Points, lighting: Lighting) -> Iterator[tuple[A
 
         nodes, emitted, light = stack.chunks(CHUNK)
         terms = jax.lax.map(of_light, (stack.numbers, nodes, light))
-        yield emitted.reshape(-1, emitted.shape[-1]), jax.tree.map(lambda leaf: leaf.reshape(-1, leaf.shape[-1]), terms)
-
-
-def _times_emitted(emitted: Float[Array, "S C"], value: Float[Array, "S P"]) -> Float[Array, "P C"]:
-    """The sum over samples of values times what they emit."""
-    if len(emitted) > STORED_SAMPLES:
-        return _emitted(emitted, value).T
-    parts = (one[:, None] * light for one, light in zip(value, emitted, strict=True))
-    return functools.reduce(jnp.add, parts)
-
-
-def _peak(terms: LightTerms, emitted: Float[Array, "S C"]) -> Float[Array, " P"]:
-    shines = (terms.weight > 0) & jnp.any(emitted > 0, axis=1, keepdims=True)
-    return jnp.max(jnp.where(shines, terms.log_cosine, NO_LOBE), axis=0)
-
-
-def _over_tile(
-    model: OneOf, lighting: Lighting, of_terms: Callable[[LightTerms], Any], tile: Points
-) -> tuple[Any, Array]:
-    nothing = jnp.zeros((lighting.channels, tile.mask.size), jnp.result_type(*tile.normal))
-
-    def add(total: Any, kind: type[Light], numbers: Any, nodes: Any, emitted: Array, light: Array) -> Any:
-        def add_lit(total: Any) -> Any:
-            terms = light_terms(model, lighting, tile, kind, numbers, nodes, light)
-            terms = jax.lax.optimization_barrier(terms)  # or each of the sums would make them anew
-            return _together(total, (jax.tree.map(partial(_emitted, emitted), of_terms(terms)), _peak(terms, emitted)))
-
-        return jax.lax.cond(jnp.any(emitted), add_lit, lambda total: total, total)
-
-    shapes = jax.eval_shape(of_terms, LightTerms(*3 * [nothing[:1]]))
-    total = jax.tree.map(lambda _: nothing, shapes), jnp.full(tile.mask.shape, NO_LOBE, nothing.dtype)
-    return jax.tree.map(lambda leaf: leaf.T, over_chunks(add, lighting, CHUNK, total))
+        yield emitted.reshape(-1, emitted.shape[-1]), jax.tree.map(lambda one: one.reshape(-1, one.shape[-1]), terms)
 
 
 def over_chunks(add: Callable[..., Any], lighting: Lighting, size: int, total: Any) -> Any:
-    """Add up over all samples: ``add(total, kind, numbers, nodes, emitted, light)``, so many samples at a time."""
+    """Add up over all samples: ``add(total, emitted, kind, numbers, nodes, light)``, so many samples at a time."""
     for stack in lighting.stacks:
 
         def add_light(total: Any, one: Any, kind: type[Light] = stack.kind) -> tuple[Any, None]:
-            numbers, *chunks = one
-            add_chunk = jax.checkpoint(lambda total, chunk: (add(total, kind, numbers, *chunk), None))
-            return jax.lax.scan(add_chunk, total, (*chunks,))
+            @jax.checkpoint
+            def add_chunk(total: Any, chunk: Any) -> tuple[Any, None]:
+                nodes, emitted, light = chunk
+                return add(total, emitted, kind, one[0], nodes, light), None
 
-        total, _ = jax.lax.scan(add_light, total, (stack.numbers, *stack.chunks(size)))
+            return jax.lax.scan(add_chunk, total, one[1])
+
+        total, _ = jax.lax.scan(add_light, total, (stack.numbers, stack.chunks(size)))
     return total
 
 
-def _emitted(emitted: Float[Array, "B C"], value: Float[Array, "B P"]) -> Float[Array, "C P"]:
-    """The sum over samples of values times what they emit; a product with a matrix of one row would be slow."""
+def _times_emitted(emitted: Array, value: Array) -> Array:
+    """The sum over samples of values, (S, P), times what they emit, (S, C), as (P, C)."""
+    if len(emitted) > STORED_SAMPLES:
+        return _emitted(emitted, value).T
+    return functools.reduce(jnp.add, (one[:, None] * light for one, light in zip(value, emitted, strict=True)))
+
+
+def _emitted(emitted: Array, value: Array) -> Array:
+    """The same as (C, P); a product with a matrix of one row would be slow."""
     rows = jnp.pad(emitted.T, ((0, max(0, ROWS - emitted.shape[1])), (0, 0)))
     return jnp.matmul(rows, value, precision="highest")[: emitted.shape[1]]
 
@@ -218,7 +238,7 @@ def _by_tiles(of_tile: Callable[[Points], Any], points: Points) -> Any:
         return padded.reshape(tiles, size, *whole.shape[1:])
 
     done = jax.lax.map(of_tile, jax.tree.map(cut, points))
-    return jax.tree.map(lambda leaf: leaf.reshape(tiles * size, *leaf.shape[2:])[:count], done)
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:count], done)
 
 
 # -- the lobe as a function of the exponent ----------------------------------------------------------------------------
@@ -232,46 +252,43 @@ class Near(NamedTuple):
         peak: about the largest logarithm of the lobe's cosine in any pixel, which the values are relative to.
     """
 
-    log_n: Float[Any, " N"]
-    peak: Float[Any, ""]
+    log_n: Any
+    peak: Any
 
     @property
     def narrow(self) -> bool:
         """Whether the polynomial through them is as good as the lobe itself."""
-        return self.log_n.shape[0] == NODES
+        return self.log_n.size == NODES
 
     @property
     def ends(self) -> tuple[Any, Any]:
         """Logarithms of the exponents between which it serves; the nodes end short of that."""
         low, high = self.log_n[0], self.log_n[-1]
-        beyond = 0.5 * (high - low) * (1 / math.cos(0.5 * math.pi / self.log_n.shape[0]) - 1)
+        beyond = 0.5 * (high - low) * (1 / math.cos(0.5 * math.pi / self.log_n.size) - 1)
         return low - beyond, high + beyond
 
     @classmethod
     def between(cls, low: float, high: float, peak: float) -> "Near":
         """The nodes between two logarithms of n."""
         count = NODES + (math.ceil((high - low) / STEP) if high - low > WIDEST else 0)
-        turn = np.cos(np.pi * (np.arange(count) + 0.5) / count)[::-1]
         # Nodes too close to each other would make slopes of rounding.
-        return cls(0.5 * (low + high) + 0.5 * max(high - low, NARROWEST) * turn, np.float64(peak))
+        log_n = 0.5 * (low + high) + 0.5 * max(high - low, NARROWEST) * chebyshev.chebpts1(count)
+        return cls(log_n, np.float64(peak))
 
     def weights(self, xp: Any, log_n: Any) -> tuple[Any, Any]:
-        """What multiplies the values at the nodes to give that of their polynomial, and its derivative, (..., N).
-
-        By the discrete orthogonality of Chebyshev polynomials T_m at their nodes: T_m(cos x) = cos(m x).
-        """
-        low, high = self.ends
-        half, count = 0.5 * (high - low), self.log_n.shape[0]
-        u = (xp.clip(log_n, low, high) - 0.5 * (low + high)) / half
-        values, slopes = [xp.ones_like(u), u], [xp.zeros_like(u), xp.ones_like(u)]
-        for _ in range(count - 2):
-            slopes.append(2 * values[-1] + 2 * u * slopes[-1] - slopes[-2])
-            values.append(2 * u * values[-1] - values[-2])
-        order, place = np.arange(count), np.arange(count)[::-1]
-        at_nodes = np.cos(np.outer(order, np.pi * (place + 0.5) / count)) * (2 / count)
+        """What multiplies the values at the nodes to give that of their polynomial, and its derivative, (..., N)."""
+        count, (low, high) = self.log_n.size, self.ends
+        nodes, half = chebyshev.chebpts1(count), 0.5 * (high - low)
+        # The polynomials of Chebyshev are orthogonal over the nodes.
+        at_nodes = chebyshev.chebvander(nodes, count - 1).T * (2 / count)
         at_nodes[0] /= 2
-        of_nodes = xp.asarray(at_nodes, u.dtype)
-        return xp.stack(values, axis=-1) @ of_nodes, xp.stack(slopes, axis=-1) @ of_nodes / half
+        slopes = chebyshev.chebval(nodes, chebyshev.chebder(np.eye(count))).T @ at_nodes
+        u = (xp.clip(log_n, low, high) - 0.5 * (low + high)) / half
+        values = [xp.ones_like(u), u]
+        for _ in range(count - 2):
+            values.append(2 * u * values[-1] - values[-2])
+        weights = xp.stack(values, axis=-1) @ xp.asarray(at_nodes, u.dtype)
+        return weights, weights @ xp.asarray(slopes, u.dtype) / half
 
 
 @jax.tree_util.register_dataclass
@@ -296,7 +313,7 @@ class Lobe:
 
     peak: Float[Array, " P"]
     model: type[Material] | None = dataclasses.field(default=None, metadata={"static": True})
-    kept: tuple[tuple[Float[Array, "P S C"], Float[Array, "P S"]], ...] = ()
+    kept: tuple[tuple[Array, Array], ...] = ()
     source: tuple[SurfacePoints, Lighting] | None = None
     table: Float[Array, "P N C"] | None = None
     near: Near | None = None
@@ -304,7 +321,7 @@ class Lobe:
     slot: Int[Array, " P"] | None = None
 
     @classmethod
-    def of_terms(cls, kept: tuple[tuple[Float[Array, "P S C"], Float[Array, "P S"]], ...]) -> "Lobe":
+    def of_terms(cls, kept: tuple[tuple[Array, Array], ...]) -> "Lobe":
         """The lobe of terms that are kept."""
         peaks = [jnp.where(jnp.max(weight, axis=-1) > 0, log_cosine, NO_LOBE) for weight, log_cosine in kept]
         return cls(jnp.max(jnp.concatenate(peaks, axis=1), axis=1), kept=kept)
@@ -318,37 +335,33 @@ class Lobe:
                 a lobe itself falls by many powers of ten within a step of log n, but its shape does not change faster
                 than elsewhere. What lies nearer to the centre than that counts as if it were there.
         """
-        found: Any
-        if self.table is not None:
-            found = self._interpolated(n, peak)
-        elif self.source is not None:
-            assert self.model is not None
+        value, slope = self._centres(n, peak)
+        if self.fine is None:
+            return value, slope
+        fine_value, fine_slope = self.fine(n, peak)
+        return averaged(self.slot, value, fine_value), averaged(self.slot, slope, fine_slope)
+
+    def _centres(self, n: Any, peak: Any) -> tuple[Any, ...]:
+        if self.table is not None and self.near is not None:
+            near, table, dtype = self.near, self.table, self.table.dtype
+            xp: Any = np if isinstance(table, np.ndarray) else jnp
+            n = xp.asarray(n, float if xp is np else None)
+            value, slope = (
+                xp.einsum("...k,pkc->...pc", one.astype(dtype), table) for one in near.weights(xp, xp.log(n))
+            )
+            if n.ndim:
+                value, slope = value[:, 0, 0], slope[:, 0, 0]
+            more = near.peak - peak
+            factor = xp.asarray(xp.exp(n * more), dtype)
+            return factor * value, factor * (slope / xp.asarray(n, dtype) + xp.asarray(more, dtype) * value)
+        if self.source is not None and self.model is not None:
             points, lighting = self.source
-            found, _ = over_samples(OneOf((self.model,)), points.in_components(), lighting, partial(_relative, n, peak))
-        else:
-            parts = [_summed(n, peak, *terms) for terms in self.kept]
-            found = tuple(map(sum, zip(*parts, strict=True)))
-        if self.fine is not None:
-            found = tuple(averaged(self.slot, *both) for both in zip(found, self.fine(n, peak), strict=True))
-        return found
+            of_terms = partial(_relative, n, peak)
+            return over_samples(OneOf((self.model,)), points.in_components(), lighting, of_terms)[0]
+        parts = [_summed(weight, _powers(n, peak, log_cosine)) for weight, log_cosine in self.kept]
+        return tuple(map(sum, zip(*parts, strict=True)))
 
-    def _interpolated(self, n: Scalar, peak: Scalar | float) -> tuple[Array, Array]:
-        near, table = self.near, self.table
-        assert near is not None
-        assert table is not None
-        xp: Any = np if isinstance(table, np.ndarray) else jnp
-        n = xp.asarray(n, float if xp is np else None)
-        weights = near.weights(xp, xp.log(n).reshape(-1))
-        value, slope = (
-            xp.einsum("nk,pkc->npc", one.astype(table.dtype), table).reshape(*n.shape[:-2], *table[:, 0].shape)
-            for one in weights
-        )
-        more = near.peak - peak
-        factor = xp.asarray(xp.exp(n * more), table.dtype)
-        slope = slope / xp.asarray(n, table.dtype)
-        return factor * value, factor * (slope + xp.asarray(more, table.dtype) * value)
-
-    def pixels(self, choose: Callable[[Array], Array]) -> "Lobe":
+    def pixels(self, choose: Callable[[Any], Any]) -> "Lobe":
         """The same for some of the pixels: ``choose`` is applied to each array whose first axis is the pixels."""
         source = None if self.source is None else (jax.tree.map(choose, self.source[0]), self.source[1])
         peak, kept, table, slot = jax.tree.map(choose, (self.peak, self.kept, self.table, self.slot))
@@ -357,23 +370,25 @@ class Lobe:
     @property
     def samples(self) -> int:
         """How many light samples add up at a point."""
-        if self.table is not None:
-            return NODES
-        return sum(terms[1].shape[1] for terms in self.kept) if self.source is None else self.source[1].samples
+        if self.source is not None:
+            return self.source[1].samples
+        return NODES if self.table is not None else sum(log_cosine.shape[1] for _, log_cosine in self.kept)
 
     def on_host(self, pixel: Int[np.ndarray, " K"]) -> "Lobe":
         """The same for some of the pixels, all terms kept in NumPy."""
         # Where they are made anew, of one size for few numbers of pixels, or each would be compiled.
         count = pixel.size if self.source is None else 1 << max(pixel.size - 1, 0).bit_length()
-        take = partial(np.take, indices=np.resize(pixel, count), axis=0)
-        lobe = jax.tree.map(np.asarray, dataclasses.replace(self, fine=None)).pixels(take)
-        if lobe.source is not None:
-            assert self.model is not None
-            made = diffuse_and_kept(OneOf.of(self.model), *lobe.source)[1]
-            lobe = jax.tree.map(np.asarray, made).pixels(lambda leaf: leaf[: pixel.size])
+        filled = np.resize(pixel, count)
+        lobe = jax.tree.map(np.asarray, dataclasses.replace(self, fine=None)).pixels(
+            lambda leaf: np.take(leaf, filled, 0)
+        )
+        if lobe.source is not None and lobe.model is not None:
+            made = diffuse_and_kept(OneOf.of(lobe.model), *lobe.source)[1]
+            lobe = jax.tree.map(np.asarray, dataclasses.replace(lobe, source=None, kept=made and made.kept))
+        lobe = lobe.pixels(lambda leaf: leaf[: pixel.size])
         if self.fine is None:
             return lobe
-        slot = take(np.asarray(self.slot))[: pixel.size]
+        slot: Any = lobe.slot
         rows = np.unique(slot[slot >= 0])
         if not rows.size:
             return dataclasses.replace(lobe, slot=None)
@@ -388,35 +403,39 @@ class Lobe:
 def averaged(slot: Any, centre: Any, fine: Any) -> Any:
     """Values at pixels' centres, (P,) or (..., P, C), and in their place those of the pixels that have finer ones."""
     xp: Any = np if isinstance(fine, np.ndarray) else jnp
-    axis = 0 if centre.ndim == 1 else -2
-    has, there = slot >= 0, xp.take(fine, xp.maximum(slot, 0), axis=axis)
-    return xp.where(has if centre.ndim == 1 else has[:, None], there, centre)
+    axis, has = (0, slot >= 0) if centre.ndim == 1 else (-2, (slot >= 0)[:, None])
+    return xp.where(has, xp.take(fine, xp.maximum(slot, 0), axis=axis), centre)
 
 
-def _summed(n: Any, peak: Any, weight: Any, log_cosine: Any) -> Iterator[Any]:
-    """The lobe of terms that are kept, and its derivative."""
+def _powers(n: Any, peak: Any, log_cosine: Any) -> tuple[Any, Any]:
+    """The lobe of a cosine relative to a peak, and its derivative."""
     xp: Any = np if isinstance(log_cosine, np.ndarray) else jnp
     exponent = xp.minimum(log_cosine - xp.asarray(peak, log_cosine.dtype), 0)
     power = xp.exp(xp.asarray(n, exponent.dtype) * exponent)
-    for one in (power, power * exponent):
+    return power, power * exponent
+
+
+def _relative(n: Any, peak: Any, terms: LightTerms) -> tuple[Array, Array]:
+    value, slope = _powers(n, peak, terms.log_cosine)
+    return terms.weight * value, terms.weight * slope
+
+
+def _summed(weight: Any, powers: Any) -> Iterator[Any]:
+    """The sums over samples of what is multiplied by their weights."""
+    for one in powers:
         if weight.shape[1] == 1:  # NumPy is slow where the last axes are short
             yield one * weight[:, 0]
+        elif isinstance(one, np.ndarray):
+            yield np.einsum("...ps,psc->...pc", one, weight)
         else:
-            yield np.einsum("...ps,psc->...pc", one, weight) if xp is np else jnp.sum(one[..., None] * weight, axis=-2)
-
-
-def _relative(n: Scalar, peak: Scalar | float, terms: LightTerms) -> tuple[Array, Array]:
-    """What samples add to the lobe relative to a peak, and to its derivative."""
-    exponent = jnp.minimum(terms.log_cosine - jnp.asarray(peak, terms.log_cosine.dtype), 0)
-    value = terms.weight * jnp.exp(jnp.asarray(n, exponent.dtype) * exponent)
-    return value, value * exponent
+            yield jnp.sum(one[..., None] * weight, axis=-2)
 
 
 # -- programs ----------------------------------------------------------------------------------------------------------
 
 
-def basis_terms(model: type[Material], points: Sight, lighting: Lighting) -> tuple[Float[Array, "P C"], Lobe | None]:
-    """The diffuse basis of pixels, and the specular one where the model has one."""
+def basis_terms(model: type[Material], points: Sight, lighting: Lighting) -> tuple[Array, Lobe | None]:
+    """The diffuse basis of pixels, (P, C), and the specular one where the model has one."""
     values = points.count * lighting.samples * (1 + lighting.channels)
     if is_sampled(lighting) and (values > STACKED_VALUES or not issubclass(model, SpecularMaterial)):
         return _diffuse_and_peak(OneOf((model,)), points.stored().pixels(), lighting)
@@ -430,26 +449,25 @@ def _diffuse_and_peak(model: OneOf, points: SurfacePoints, lighting: Lighting) -
 
 
 @jax.jit
-def diffuse_and_kept(model: OneOf, sight: Sight, lighting: Lighting) -> tuple[Float[Array, "P C"], Lobe | None]:
+def diffuse_and_kept(model: OneOf, sight: Sight, lighting: Lighting) -> tuple[Array, Lobe | None]:
     """The diffuse basis of pixels, and the lobe of the terms of all samples."""
     points = sight.in_components()
     diffuse, kept = jnp.zeros(()), []
     for emitted, terms in _terms(model, points.flat(), lighting):
         diffuse = diffuse + _times_emitted(emitted, terms.diffuse)
-        weight, log_cosine = terms.weight.T[..., None] * emitted, terms.log_cosine.T
-        # Of few samples each is an array of its own, which takes less time to read.
-        each = 1 if not is_sampled(lighting) and points.each == 1 else len(emitted)
-        for first in range(0, len(emitted), each):
-            some = weight[:, first : first + each], log_cosine[:, first : first + each]
-            rows = points.mask.size // points.each, points.each * each
-            kept.append((some[0].reshape(*rows, -1), some[1].reshape(rows)))
+        # Of few samples each is an array of its own, which takes less time to read; of an averaged pixel all are one.
+        step = len(emitted) if is_sampled(lighting) or points.each > 1 else 1
+        for first in range(0, len(emitted), step):
+            some = slice(first, first + step)
+            weight = (terms.weight[some].T[..., None] * emitted[some]).reshape(-1, points.each * step, emitted.shape[1])
+            kept.append((weight, terms.log_cosine[some].T.reshape(weight.shape[:2])))
     return points.per_pixel(diffuse), Lobe.of_terms(tuple(kept)) if model.lobes else None
 
 
 @jax.jit
 def tabulated(
     model: OneOf, points: SurfacePoints, lighting: Lighting, near: Near
-) -> tuple[Float[Array, "P C"], Float[Array, " P"], Float[Array, "P N C"] | None]:
+) -> tuple[Array, Array, Float[Array, "P N C"] | None]:
     """Of (P,) points under many samples the diffuse basis, the peak and the lobe at some exponents, in one pass."""
 
     def of_terms(terms: LightTerms) -> Any:

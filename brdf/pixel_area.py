@@ -25,15 +25,14 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
-from brdf.geometry.base import Shape
 from brdf.geometry.camera import Camera
 from brdf.geometry.rays import shapes_met, surface_points
+from brdf.geometry.shapes import Shape
 from brdf.geometry.surface_points import NO_SHAPE, PixelArea, SurfacePoints
 from brdf.lights.base import Light, Lighting, stacked
 from brdf.lights.sample_sets import square_rule
-from brdf.lobes import STORED_SAMPLES, light_terms, over_chunks
+from brdf.lobes import STORED_SAMPLES, OneOf, light_terms, over_chunks
 from brdf.models import BlinnPhong
-from brdf.models.one_of import OneOf
 from brdf.precision import apart
 from brdf.vectors import dot
 
@@ -88,9 +87,9 @@ def _matters(points: SurfacePoints, camera: Camera, shapes: tuple[Shape, ...], l
         matters |= _over_neighbours(lambda a, b: dot(a, b) < BENT, points.normal)
     flat = points.in_components().flat()
 
-    def or_sample(found: Array, kind: type[Light], numbers: Any, nodes: Any, emitted: Array, light: Array) -> Array:
+    def or_sample(found: Array, emitted: Array, *samples: Any) -> Array:
         """Whether a highlight is narrow or a light's edge passes."""
-        terms = light_terms(OneOf((BlinnPhong,)), lighting, flat, kind, numbers, nodes, light)
+        terms = light_terms(OneOf((BlinnPhong,)), lighting, flat, *samples)
         lit = ((terms.diffuse > 0) & jnp.any(emitted > 0)).reshape(edge.shape)
         log_cosine = terms.log_cosine.reshape(edge.shape)
         narrow = _over_neighbours(lambda a, b: jnp.abs(a - b), log_cosine) > 2 * NARROW * jnp.abs(log_cosine)

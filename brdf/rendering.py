@@ -32,6 +32,7 @@ from brdf.lobes import (
     LightTerms,
     Lobe,
     Near,
+    OneOf,
     averaged,
     basis_terms,
     is_sampled,
@@ -39,7 +40,6 @@ from brdf.lobes import (
     tabulated,
 )
 from brdf.models.base import Material, SpecularMaterial, check_model, check_single
-from brdf.models.one_of import OneOf
 from brdf.precision import Precision, cast, working_precision
 from brdf.scene import Scene
 

@@ -16,9 +16,9 @@ from jaxtyping import Array, Float, Int
 from brdf.checks import Checked, Spectrum, instance, several, spectrum
 from brdf.errors import InputError, as_numbers
 from brdf.files import as_path
-from brdf.geometry.base import Shape
 from brdf.geometry.camera import Camera
 from brdf.geometry.rays import PrimaryRays, Sight, surface_points
+from brdf.geometry.shapes import Shape
 from brdf.geometry.surface_points import PixelArea, SurfacePoints
 from brdf.lights.base import Light
 from brdf.pixel_area import with_area

@@ -14,10 +14,8 @@ from brdf.arguments import Layer, Table
 from brdf.checks import direction_value, spectrum
 from brdf.errors import InputError
 from brdf.files import read_toml, write_text
-from brdf.geometry.base import Shape
 from brdf.geometry.camera import CAMERAS
-from brdf.geometry.rectangle import Rectangle
-from brdf.geometry.sphere import Sphere
+from brdf.geometry.shapes import Rectangle, Shape, Sphere
 from brdf.geometry.surface_points import SurfacePoints
 from brdf.geometry.triangles import Triangles, load_mesh
 from brdf.images.reading import read_image, read_layers

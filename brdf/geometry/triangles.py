@@ -14,6 +14,7 @@ import functools
 import hashlib
 import itertools
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -26,7 +27,7 @@ from jaxtyping import Float, Int
 from brdf.checks import LARGEST, Scalar, instance
 from brdf.errors import InputError
 from brdf.files import parse_number, read_text
-from brdf.geometry.base import Hit, Shape
+from brdf.geometry.shapes import Hit, Shape, meet_plane
 from brdf.vectors import Components, divide, normalize, select
 
 CREASE = np.radians(30.0)
@@ -256,20 +257,19 @@ class Triangles(Shape):
         rays = [jax.lax.stop_gradient(vector.stacked(shape)) for vector in (origin, direction)]
         result = jax.ShapeDtypeStruct(shape, np.int32)
         triangle = jax.pure_callback(self.mesh.first_hit, result, *rays, vmap_method="broadcast_all")
-        corners = jnp.asarray(self.mesh.vertices, rays[0].dtype)[jnp.asarray(self.mesh.faces)[triangle]]
-        first, second, third = (Components.of(corner) for corner in jnp.unstack(corners, axis=-2))
+
+        def corners(values: Any) -> Iterator[Components]:
+            return map(Components.of, jnp.unstack(jnp.asarray(values, rays[0].dtype)[triangle], axis=-2))
+
+        first, second, third = corners(self.mesh.vertices[self.mesh.faces])
         edge, other_edge = second - first, third - first
         area = edge.cross(other_edge)
-        normal = normalize(area)
-        slope = direction @ normal
-        distance = divide((first - origin) @ normal * slope, slope * slope)
-        hit, position = (triangle >= 0) & (distance > 0), origin + direction * distance
-        shading = None
+        position, distance, normal, slope = meet_plane(origin, direction, first, area)
+        hit, shading = (triangle >= 0) & (distance > 0), None
         if self.mesh.normals is not None:
-            offset, size = position - first, area @ area
-            weights = [divide(offset.cross(other_edge) @ area, size), divide(edge.cross(offset) @ area, size)]
-            normals = jnp.asarray(self.mesh.normals, corners.dtype)[triangle]
-            a, b, c = (Components.of(one) for one in jnp.unstack(normals, axis=-2))
-            shading = normalize(a * (1.0 - weights[0] - weights[1]) + b * weights[0] + c * weights[1])
+            offset = position - first
+            u, v = (divide(one @ area, area @ area) for one in (offset.cross(other_edge), edge.cross(offset)))
+            a, b, c = corners(self.mesh.normals)
+            shading = normalize(a * (1.0 - u - v) + b * u + c * v)
             shading = select(slope < 0, shading, normal)  # the back is not lit, however its normals lean
         return Hit(hit, jnp.where(hit, distance, jnp.inf), position, normal, shading)

@@ -40,7 +40,7 @@ from brdf.checks import (
 from brdf.errors import InputError
 from brdf.geometry.surface_points import Points
 from brdf.lights.base import Light, LightSample
-from brdf.lights.sample_sets import disc_rule, square_rule
+from brdf.lights.sample_sets import square_rule, turned_rule
 from brdf.vectors import Components, divide, norm, normalize, perpendicular, square_root
 
 SAMPLES = 64
@@ -256,7 +256,7 @@ class SphereLight(Light):
     @property
     def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...], Any]:
         """The light, and a rule over the cap of directions in which a point sees it."""
-        return (self.center, self.radius), disc_rule(self.samples), self.radiance
+        return (self.center, self.radius), turned_rule(self.samples, 1 / 4), self.radiance
 
     @staticmethod
     def sample(point: Points, *row: Any) -> LightSample:

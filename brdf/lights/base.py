@@ -22,7 +22,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from brdf.checks import Checked, Spectrum
-from brdf.geometry.base import Shape
+from brdf.geometry.shapes import Shape
 from brdf.geometry.surface_points import Points
 from brdf.vectors import Components
 

@@ -28,7 +28,7 @@ from brdf.checks import Spectrum, checked, sample_number, spectrum
 from brdf.errors import InputError
 from brdf.geometry.surface_points import Points
 from brdf.lights.base import Light, LightSample
-from brdf.lights.sample_sets import hemisphere_rule, ring_rule
+from brdf.lights.sample_sets import turned_rule
 from brdf.vectors import Components, divide, normalize, perpendicular, square_root
 
 CONSTANT_SAMPLES = 512
@@ -81,7 +81,7 @@ class ConstantEnvironment(Light):
     def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...], Any]:
         """The light, two rules over the hemisphere, and which of the two a row belongs to."""
         half = max(1, self.samples // 2)
-        diffuse, lobe = hemisphere_rule(half), ring_rule(self.samples - half)
+        diffuse, lobe = turned_rule(half, 1 / 2), turned_rule(self.samples - half, 4 / 3)
         rule = [np.concatenate(pair) for pair in zip(diffuse, lobe, strict=True)]
         lobe_only = np.repeat([0.0, 1.0], [diffuse.weight.size, lobe.weight.size])
         return (), (*rule, lobe_only), self.radiance

@@ -7,7 +7,6 @@ no noise, so a picture is a smooth function of every parameter of its lights. No
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from brdf.albedo import gauss_legendre
 
@@ -21,9 +20,9 @@ class SquareRule(NamedTuple):
         weight: (S,), adds up to 1.
     """
 
-    s: Float[np.ndarray, " S"]
-    t: Float[np.ndarray, " S"]
-    weight: Float[np.ndarray, " S"]
+    s: np.ndarray
+    t: np.ndarray
+    weight: np.ndarray
 
 
 def square_rule(samples: int) -> SquareRule:
@@ -32,31 +31,21 @@ def square_rule(samples: int) -> SquareRule:
     return _product(gauss_legendre(samples // rows), gauss_legendre(rows))
 
 
-def disc_rule(samples: int) -> SquareRule:
-    """A rule for a disc or cap: s is its share of the area, t its turn.
+def turned_rule(samples: int, ratio: float) -> SquareRule:
+    """A rule of circles: s is which, t the turn.
 
-    With four times as many turns as radii it is exact for polynomials over the disc of equal degree in both.
+    With s a share of a disc's area it is exact for polynomials over the disc, of equal degree in both for a ratio of
+    1/4; with s the cosine to the pole of a hemisphere, for one of 1/2.
+
+    Args:
+        samples: how many nodes at most.
+        ratio: of the number of circles to that of the nodes on each.
     """
-    return _turned(samples, round(np.sqrt(samples / 4)))
-
-
-def hemisphere_rule(samples: int) -> SquareRule:
-    """A rule for a hemisphere: s is the cosine to the pole, t the turn, with twice as many turns as cosines."""
-    return _turned(samples, round(np.sqrt(samples / 2)))
-
-
-def ring_rule(samples: int) -> SquareRule:
-    """A rule for rings around a centre: s is which ring, t the turn; four rings for every three turns."""
-    return _turned(samples, min(samples, round(np.sqrt(samples * 4 / 3))))
-
-
-def _turned(samples: int, count: int) -> SquareRule:
-    count = max(1, count)
+    count = int(np.clip(np.round(np.sqrt(samples * ratio)), 1, samples))
     turns = samples // count
     return _product(gauss_legendre(count), ((np.arange(turns) + 0.5) / turns, np.full(turns, 1.0 / turns)))
 
 
 def _product(first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray]) -> SquareRule:
-    (s, s_weight), (t, t_weight) = first, second
-    s_all, t_all = (x.ravel() for x in np.meshgrid(s, t, indexing="ij"))
-    return SquareRule(s_all, t_all, np.outer(s_weight, t_weight).ravel())
+    s, t = np.meshgrid(first[0], second[0], indexing="ij")
+    return SquareRule(s.ravel(), t.ravel(), np.outer(first[1], second[1]).ravel())

@@ -109,11 +109,15 @@ def _fibonacci(count: int) -> np.ndarray:
     return from_angles(np.arccos(np.maximum((index + 0.5) / count, _LOWEST)), _TURN * index)
 
 
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
 def _lifted(vectors: np.ndarray) -> np.ndarray:
     """Unit vectors above the horizon."""
-    vectors = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    vectors = _unit(vectors)
     vectors[..., 2] = np.maximum(np.abs(vectors[..., 2]), _LOWEST)
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return _unit(vectors)
 
 
 class Sampler:
@@ -134,11 +138,10 @@ class Sampler:
         Raises:
             InputError: it cannot be traced by JAX, or returns something else.
         """
-        self._batch = jax.jit(jax.vmap(lambda to_light, to_view: jnp.atleast_1d(f_r(to_light, to_view))))
+        self._batch = jax.jit(jax.vmap(lambda pair: jnp.atleast_1d(f_r(*pair))))
         with jax.enable_x64(True):
-            vectors = jax.ShapeDtypeStruct((1, 3), jnp.float64)
             try:
-                result = jax.eval_shape(self._batch, vectors, vectors)
+                result = jax.eval_shape(self._batch, jax.ShapeDtypeStruct((1, 2, 3), jnp.float64))
             except Exception as error:
                 reason = str(error).splitlines()[0] if str(error) else type(error).__name__
                 came = f"cannot be called with two vectors of JAX: {reason}"
@@ -150,22 +153,19 @@ class Sampler:
         self.epsilon = float(jnp.finfo(result.dtype).eps)
         self.not_finite: np.ndarray | None = None
 
-    def __call__(self, to_light: Float[np.ndarray, "m 3"], to_view: Float[np.ndarray, "m 3"]) -> np.ndarray:
-        """Values, (m, C); where they are not finite that is remembered, and 0 stands for them."""
-        pairs = np.stack(np.broadcast_arrays(to_light, to_view))
-        count = pairs.shape[1]
-        whole = np.pad(pairs, np.array([(0, 0), (0, -count % _BATCH), (0, 0)]), mode="edge")
-        batches = whole.reshape(2, -1, _BATCH, 3).swapaxes(0, 1)
-        values = np.empty((self.channels, whole.shape[1]))  # what is compared are channels of many pairs
+    def __call__(self, to_light: np.ndarray, to_view: np.ndarray) -> Float[np.ndarray, "m C"]:
+        """Values for directions (m, 3); where they are not finite that is remembered, and 0 stands for them."""
+        pairs = np.stack(np.broadcast_arrays(to_light, to_view), axis=1)
+        whole = np.pad(pairs, np.array([(0, -len(pairs) % _BATCH), (0, 0), (0, 0)]), mode="edge")
         with jax.enable_x64(True):
-            for index, batch in enumerate(batches):
-                values[:, index * _BATCH : (index + 1) * _BATCH] = np.asarray(self._batch(*batch)).T
-        values = values[:, :count].T
-        finite = np.isfinite(values).all(axis=1)
+            # Channel after channel: what is compared are channels of many pairs.
+            values = [np.asarray(self._batch(batch)).T for batch in whole.reshape(-1, _BATCH, 2, 3)]
+        found = np.concatenate(values, axis=1)[:, : len(pairs)].T
+        finite = np.isfinite(found).all(axis=1)
         if not finite.all():
-            self.not_finite = pairs[:, np.argmin(finite)]
-            values[~finite] = 0.0
-        return values
+            self.not_finite = pairs[np.argmin(finite)]
+            found[~finite] = 0.0
+        return found
 
 
 class _Scan:
@@ -188,8 +188,7 @@ class _Scan:
         lights = np.concatenate([fixed, _fibonacci(64)])
         looks = [(light, view), *((one, grid) for one in fixed)]
         looks += [(lights, peaks) for peaks in (lights * _MIRRORED, lights, np.array([0.0, 0.0, 1.0]))]
-        found = np.concatenate([self._look(*look) for look in looks], axis=2)
-        self.negative, self.unequal, bright = found
+        self.negative, self.unequal, bright = np.concatenate([self._look(*look) for look in looks], axis=2)
         self.bright = self.improved(lambda *pair: self.seen(*pair).max(axis=1), bright)
 
     def _look(self, light: np.ndarray, view: np.ndarray) -> np.ndarray:
@@ -217,18 +216,22 @@ class _Scan:
 
         It moves some of them, and widens where it succeeds, narrows where it fails.
         """
-        best, radius = score(*vectors), np.full(vectors.shape[1], 0.01)
+        best, radius, each = score(*vectors), np.full(vectors.shape[1], 0.01), np.arange(vectors.shape[1])
         for _ in range(rounds):
             shape = *vectors.shape[:2], tries
             moves = radius[:, None] * (self.random.random(shape) < 0.6)
             tried = _lifted(vectors[:, :, None] + moves[..., None] * self.random.standard_normal((*shape, 3)))
             scores = score(*tried.reshape(len(vectors), -1, 3)).reshape(-1, tries)
-            highest, chosen = np.max(scores, axis=1), np.argmax(scores, axis=1)
-            better = highest > best
-            vectors = np.where(better[:, None], tried[:, np.arange(len(best)), chosen], vectors)
-            best = np.maximum(best, highest)
+            chosen = np.argmax(scores, axis=1)
+            better = scores[each, chosen] > best
+            vectors = np.where(better[:, None], tried[:, each, chosen], vectors)
+            best = np.maximum(best, scores[each, chosen])
             radius = np.clip(radius * np.where(better, 1.5, 0.5), 1e-8, 0.5)
         return vectors
+
+    def named(self, channel: int) -> str:
+        """The channel in words, where there are several."""
+        return in_channel(channel, self.sample.channels)
 
 
 # -- the three tests ---------------------------------------------------------------------------------------------------
@@ -250,7 +253,7 @@ def _worst(scan: _Scan, function: Callable[..., np.ndarray], pairs: np.ndarray) 
 def _positivity(scan: _Scan) -> Finding:
     found, bound, pair, channel = _worst(scan, lambda a, b: -scan.sample(a, b), scan.negative)
     light, view = map(Angles.of, pair)
-    words = f"f_r is {-found:.4g}/sr for light {light}, view {view}{in_channel(channel, scan.sample.channels)}"
+    words = f"f_r is {-found:.4g}/sr for light {light}, view {view}{scan.named(channel)}"
     where = light, view, channel
     return judged(-found, -1e-9 * scan.scale, bound, where, f"the least {words}", f"negative: {words}", least=True)
 
@@ -266,7 +269,7 @@ def _reciprocity(scan: _Scan) -> Finding:
     compared = f"{there:.4g}/sr, but {back:.4g}/sr the other way round"
     if 0 < back < there < 1e4 * back:
         compared = f"{times(there / back)} f_r({view} → {light})"
-    failed = f"not reciprocal: f_r({light} → {view}) is {compared}{in_channel(channel, sample.channels)}"
+    failed = f"not reciprocal: f_r({light} → {view}) is {compared}{scan.named(channel)}"
     return judged(value, RECIPROCITY_LIMIT, bound, (light, view, channel), passed, failed)
 
 
@@ -276,17 +279,16 @@ def _energy(scan: _Scan) -> Finding:
     lights = np.concatenate([lights, scan.bright[0, :: 4 * _KEPT]])
     known = _albedos(scan, lights)
     top = lights[np.argmax(known[0].max(axis=1))]
-    found = scan.improved(lambda tried: _albedos(scan, tried)[0].max(axis=1), top[None, None], rounds=10, tries=6)
-    lights, added = np.append(lights, found[0], axis=0), _albedos(scan, found[0])
-    albedo, bound = found = np.append(known, added, axis=1)
+    (found,) = scan.improved(lambda tried: _albedos(scan, tried)[0].max(axis=1), top[None, None], rounds=10, tries=6)
+    lights, (albedo, bound) = np.append(lights, found, axis=0), np.append(known, _albedos(scan, found), axis=1)
     score = albedo - bound
     if np.all(score <= ENERGY_LIMIT):
         for row in np.flatnonzero(np.any(albedo + bound > ENERGY_LIMIT, axis=1)):
-            found[:, [row]] = _albedos(scan, lights[[row]], *_FINE)
+            (albedo[row],), (bound[row],) = _albedos(scan, lights[[row]], *_FINE)
         score = albedo + bound
     row, channel = largest(score)
     value, light = float(albedo[row, channel]), Angles.of(lights[row])
-    words = f"the largest albedo is {value:.6g} for light {light}{in_channel(channel, scan.sample.channels)}"
+    words = f"the largest albedo is {value:.6g} for light {light}{scan.named(channel)}"
     where, failed = (light, None, channel), f"does not conserve energy: {words}"
     return judged(value, ENERGY_LIMIT, float(bound[row, channel]), where, words, failed)
 
@@ -309,10 +311,11 @@ def _albedos_together(scan: _Scan, lights: np.ndarray, tolerance: float, budget:
     others = np.concatenate([scan.bright[1], _fibonacci(3500)])
     views = np.concatenate([same_half, np.broadcast_to(others, (len(lights), *others.shape))], axis=1)
     seen = scan.seen(np.repeat(lights, views.shape[1], axis=0), views.reshape(-1, 3))
-    brightest = np.argsort(seen.max(axis=1).reshape(len(lights), -1))[:, -5:]
-    peaks = np.stack([lights * _MIRRORED, lights], axis=1)
-    centres = np.concatenate([np.take_along_axis(views, brightest[..., None], axis=1), peaks], axis=1)
-    value, bound = integrate(lambda which, views: scan.seen(lights[which], views), centres, tolerance, budget)
+    brightest = np.argsort(seen.max(axis=1).reshape(len(lights), -1))[:, -5:, None]
+    centres = [np.take_along_axis(views, brightest, axis=1), np.stack([lights * _MIRRORED, lights], axis=1)]
+    value, bound = integrate(
+        lambda which, views: scan.seen(lights[which], views), np.concatenate(centres, axis=1), tolerance, budget
+    )
     return np.stack([value, bound + 50 * scan.sample.epsilon * np.abs(value)])
 
 
@@ -334,24 +337,20 @@ def integrate(
     edges, count = np.arange(-1, 1, size), len(centres)
     corner = np.tile(np.stack(np.meshgrid(edges, edges), axis=-1).reshape(-1, 2), (count, 1))
     which = np.repeat(np.arange(count), len(corner) // count)
-    halved = _holds(centres[which], corner, size)
-    values = _rule(evaluate, which, corner, size, ~halved)
+    values = _rule(evaluate, which, corner, size)
     total, bound, left = np.zeros((count, values.shape[1])), np.zeros((count, values.shape[1])), np.full(count, budget)
     while len(corner):
-        size *= 0.5
-        quarters, whose = (corner[:, None] + size * _QUARTERS).reshape(-1, 2), np.repeat(which, 4)
-        # One that is halved whatever it holds is not integrated, and only in such a one lie others.
-        inner = np.repeat(halved, 4)
-        inner[inner] = _holds(centres[whose[inner]], quarters[inner], size)
-        parts = _rule(evaluate, whose, quarters, size, ~inner)
-        left -= np.bincount(whose[~inner], minlength=count) * _NODES**2
-        sums = parts.reshape(len(corner), 4, -1).sum(axis=1)
+        holds, size = _holds(centres[which], corner, size), 0.5 * size
+        corner, whose = (corner[:, None] + size * _QUARTERS).reshape(-1, 2), np.repeat(which, 4)
+        parts = _rule(evaluate, whose, corner, size)
+        left -= np.bincount(whose, minlength=count) * _NODES**2
+        sums = parts.reshape(len(which), 4, -1).sum(axis=1)
         differences = np.abs(sums - values)
-        refine = ((np.max(differences, axis=1) > tolerance) | halved) & (left >= 0)[which]
+        refine = ((np.max(differences, axis=1) > tolerance) | holds) & (left >= 0)[which]
         np.add.at(total, which[~refine], sums[~refine])
         np.add.at(bound, which[~refine], differences[~refine])
         again = np.repeat(refine, 4)
-        corner, which, values, halved = quarters[again], whose[again], parts[again], inner[again]
+        corner, which, values = corner[again], whose[again], parts[again]
     return total, bound + 1e-15 * _NODES * np.abs(total)
 
 
@@ -362,18 +361,14 @@ def _holds(centres: np.ndarray, corner: np.ndarray, size: float) -> np.ndarray:
     return (np.min(np.linalg.norm(middle[:, None] - centres, axis=2), axis=1) < 2 * size) & (size > FINEST)
 
 
-def _rule(evaluate: Evaluate, which: np.ndarray, corner: np.ndarray, size: float, some: np.ndarray) -> np.ndarray:
-    """Integrals over some squares, and 0 for the others, (m, C)."""
+def _rule(evaluate: Evaluate, which: np.ndarray, corner: np.ndarray, size: float) -> np.ndarray:
+    """Integrals over squares, (m, C)."""
     nodes, weights = gauss_legendre(_NODES)
-    corner = corner[some]
     u, v = corner[:, 0, None, None] + size * nodes[:, None], corner[:, 1, None, None] + size * nodes
     directions, solid_angle = _from_square(u, v)
     weight = size**2 * solid_angle * np.outer(weights, weights)
-    values = evaluate(np.repeat(which[some], _NODES**2), directions.reshape(-1, 3))
-    found = np.einsum("muv,muvc->mc", weight, values.reshape(*weight.shape, -1))
-    integrals = np.zeros((len(some), found.shape[1]))
-    integrals[some] = found
-    return integrals
+    values = evaluate(np.repeat(which, _NODES**2), directions.reshape(-1, 3))
+    return np.einsum("muv,muvc->mc", weight, values.reshape(*weight.shape, -1))
 
 
 def _from_square(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -13,9 +13,8 @@ from jaxtyping import Array
 import brdf
 from brdf.images.encoding import Encoding
 from brdf.lights.base import Lighting, LightStack, stacked
-from brdf.lobes import light_terms
+from brdf.lobes import OneOf, light_terms
 from brdf.models.base import SpecularMaterial
-from brdf.models.one_of import OneOf
 from brdf.precision import Precision, working_precision
 from brdf.vectors import Components, normalize
 from fitting.likelihood import encoded_and_slope

@@ -39,7 +39,7 @@ brdf.albedo brdf.channels brdf.checks brdf.conversions brdf.display brdf.errors 
     brdf.images.encoding
     brdf.images.jpeg brdf.images.writing brdf.lights.base brdf.lobes
     brdf.materials.exports brdf.materials.material_file brdf.measured.loading brdf.measured.table brdf.models.base
-    brdf.models.one_of brdf.plausibility.numeric brdf.plausibility.report brdf.precision brdf.rendering
+    brdf.plausibility.numeric brdf.plausibility.report brdf.precision brdf.rendering
     brdf.vectors
 """.split()
 )
