@@ -22,6 +22,7 @@ from brdf.geometry.rays import Sight, share_seen
 from brdf.geometry.surface_points import Points, SurfacePoints
 from brdf.lights.base import Light, Lighting
 from brdf.models import MODELS, Material, SpecularMaterial
+from brdf.precision import pytree
 from brdf.vectors import BELOW_HORIZON, Components
 
 STORED_SAMPLES = 4
@@ -45,8 +46,7 @@ NO_LOBE = -1e9
 # -- the terms of samples, and their sums ------------------------------------------------------------------------------
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@pytree
 class OneOf:
     """A model that a program learns when it runs: one program serves all, where making it costs more than running it.
 
@@ -291,8 +291,7 @@ class Near(NamedTuple):
         return weights, weights @ xp.asarray(slopes, u.dtype) / half
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True, eq=False)
+@pytree
 class Lobe:
     """The specular basis as a function of the exponent, which a fit evaluates again and again.
 

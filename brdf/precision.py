@@ -1,7 +1,9 @@
 """How JAX computes: float32 or float64, chosen per call without touching its global setting, and in which pieces."""
 
 import contextlib
+import dataclasses
 import importlib.metadata
+import typing
 import warnings
 from collections.abc import Callable
 from typing import Any, Literal
@@ -13,6 +15,7 @@ import numpy as np
 from brdf.errors import InputError
 
 Precision = Literal["float32", "float64"]
+Kind = typing.TypeVar("Kind")
 
 UNSOUND = {
     "0.10.2": "adds up wrongly on the CPU (jax-ml/jax issue 39103)",
@@ -74,6 +77,12 @@ def cast(tree: Any, precision: Precision | None) -> Any:
 
     with working_precision(precision):  # float64 stays what it is outside of it
         return jax.device_put(jax.tree.map(leaf, tree))
+
+
+@typing.dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field,))
+def pytree(cls: type[Kind]) -> type[Kind]:
+    """A frozen dataclass that JAX takes apart itself: what programs pass from hand to hand."""
+    return jax.tree_util.register_dataclass(dataclasses.dataclass(frozen=True, eq=False)(cls))
 
 
 def apart(function: Callable[..., Any], *arguments: Any) -> Any:

@@ -40,15 +40,14 @@ from brdf.lobes import (
     tabulated,
 )
 from brdf.models.base import Material, SpecularMaterial, check_model, check_single
-from brdf.precision import Precision, cast, working_precision
+from brdf.precision import Precision, cast, pytree, working_precision
 from brdf.scene import Scene
 
 # Of so few pixels a program takes longer to make than to run: one serves lights of more or fewer samples.
 FEW_PIXELS = 4096
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True, eq=False)
+@pytree
 class Basis:
     """What the pixels show before any material: flat over the picture's pixels, row by row.
 

@@ -18,7 +18,6 @@ multiply-adds). The leading part has no derivative, the rest has all of it, and 
 differentiation gives the derivative of the plain product. In float64 there is nothing to gain, and nothing is split.
 """
 
-import dataclasses
 import functools
 import operator
 from collections.abc import Callable, Iterable, Iterator
@@ -29,6 +28,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
+
+from brdf.precision import pytree
 
 BELOW_HORIZON = -1e9
 """What the ``*log_cosine`` functions return where the cosine is not positive: exp(n * this) = 0 for any n > 1e-7."""
@@ -53,8 +54,7 @@ def _componentwise(operation: Callable[[Any, Any], Any]) -> Callable[["Component
     return applied
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True, eq=False)
+@pytree
 class Components:
     """A vector, or a spectrum, whose components are arrays of their own, which broadcast.
 

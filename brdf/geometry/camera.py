@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from brdf.checks import Checked, Scalar, Vector, checked, direction_value, number, positive, sample_number, vector
 from brdf.errors import InputError
-from brdf.vectors import Components, Numbers, normalize
+from brdf.vectors import Components, normalize
 
 MAX_RESOLUTION = 1 << 16
 MAX_SAMPLES = 256
@@ -73,7 +73,7 @@ class Camera(Checked):
             raise InputError("up", came, "Give a direction that points up in the picture")
 
     @abc.abstractmethod
-    def rays(self, column: Numbers, row: Numbers) -> tuple[Components, Components]:
+    def rays(self, column: Any, row: Any) -> tuple[Components, Components]:
         """Origin and unit direction of the rays through places of the picture; what all of them share is a number.
 
         Args:
@@ -92,7 +92,7 @@ class Camera(Checked):
         right = normalize(jnp.cross(forward, self.up))
         return right, jnp.cross(right, forward), forward
 
-    def off_axis(self, column: Numbers, row: Numbers) -> Components:
+    def off_axis(self, column: Any, row: Any) -> Components:
         """How far places lie from the middle of the picture, in the unit of its half width."""
         (width, height), (right, up, _) = self.resolution, map(Components.of, self.axes())
         x, y = jnp.asarray(column) * 2.0 / width - 1.0, height / width - jnp.asarray(row) * 2.0 / width
@@ -124,15 +124,15 @@ class OrthographicCamera(Camera):
     """
 
     width: Scalar = checked(positive, "width", kw_only=True)
-    type_name: ClassVar[str] = "orthographic"
-    default_viewer: ClassVar[str] = "infinite"
+    type_name = "orthographic"
+    default_viewer = "infinite"
 
     @property
     def half_width(self) -> Array:
         """In world units."""
         return self.width / 2
 
-    def rays(self, column: Numbers, row: Numbers) -> tuple[Components, Components]:
+    def rays(self, column: Any, row: Any) -> tuple[Components, Components]:
         """Origins on the plane through ``position``, one direction."""
         return Components.of(self.position) + self.off_axis(column, row), Components.of(self.axes()[2])
 
@@ -156,8 +156,8 @@ class PerspectiveCamera(Camera):
     """
 
     fov: Scalar = eqx.field(converter=partial(number, "fov", above=0.0, below=180.0), kw_only=True)
-    type_name: ClassVar[str] = "perspective"
-    default_viewer: ClassVar[str] = "local"
+    type_name = "perspective"
+    default_viewer = "local"
 
     @property
     def half_width(self) -> Array:
@@ -165,7 +165,7 @@ class PerspectiveCamera(Camera):
         width, height = self.resolution
         return jnp.tan(jnp.deg2rad(self.fov) / 2) * (width / height)
 
-    def rays(self, column: Numbers, row: Numbers) -> tuple[Components, Components]:
+    def rays(self, column: Any, row: Any) -> tuple[Components, Components]:
         """One origin, a direction per place."""
         return Components.of(self.position), normalize(Components.of(self.axes()[2]) + self.off_axis(column, row))
 

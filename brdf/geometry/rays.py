@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool
 from brdf.geometry.camera import Camera
 from brdf.geometry.shapes import Shape
 from brdf.geometry.surface_points import NO_SHAPE, Points, SurfacePoints
-from brdf.precision import apart
+from brdf.precision import apart, pytree
 from brdf.vectors import Components, largest, select
 
 
@@ -92,8 +92,7 @@ FEW_SHAPES = 4
 """Up to so many spheres and rectangles are traced anew sooner than what they look like is read."""
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True, eq=False)
+@pytree
 class PrimaryRays:
     """The rays through the pixels' centres, whose `SurfacePoints` are made in each program that asks for them.
 

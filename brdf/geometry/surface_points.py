@@ -1,6 +1,5 @@
 """What the pixels of a picture see."""
 
-import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -12,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from brdf.checks import direction_value
 from brdf.errors import InputError
+from brdf.precision import pytree
 from brdf.vectors import Components
 
 NO_SHAPE = -1
@@ -134,8 +134,7 @@ class SurfacePoints(eqx.Module):
         return cls(**values, mask=seen)
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True, eq=False)
+@pytree
 class Points:
     """Surface points as programs compute with them: see `SurfacePoints`, whose numbers these are.
 

@@ -17,7 +17,7 @@ it takes.
 """
 
 import operator
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -39,9 +39,9 @@ from brdf.checks import (
 )
 from brdf.errors import InputError
 from brdf.geometry.surface_points import Points
-from brdf.lights.base import Light, LightSample
+from brdf.lights.base import Light, LightSample, Rows
 from brdf.lights.sample_sets import square_rule, turned_rule
-from brdf.vectors import Components, divide, norm, normalize, perpendicular, square_root
+from brdf.vectors import divide, norm, normalize, perpendicular, square_root
 
 SAMPLES = 64
 
@@ -58,39 +58,39 @@ def _positive_range(at_0: Array, at_1: Array) -> tuple[Array, Array]:
     return low, high
 
 
-def _above_horizon(
-    point: Points, starts: tuple[Components, ...], edges: tuple[Components, ...], s: Array, t: Any
-) -> tuple[Array, Components, Array]:
-    """The place of a node (s, t) of the unit square in that part of a patch which stands above the horizon.
+class FlatLight(Light):
+    """A light of patches, whose points are a(t) + s b(t) with s and t from 0 to 1.
 
-    The points of the patch are a(t) + s b(t), with a and b linear in t and given at t = 0 and t = 1: a parallelogram
-    has a constant b, a triangle a constant a. Returned are s, the point, and the share of the weight that is left.
+    Both a and b are linear in t, and given at t = 0 and t = 1: a parallelogram has a constant b, a triangle a constant
+    a. A patch shines to the side from which b and then a grow counter-clockwise.
     """
-    heights = [(a - point.position) @ point.normal for a in starts]
-    slopes = [b @ point.normal for b in edges]
-    sides = _positive_range(*heights), _positive_range(*map(operator.add, heights, slopes))
-    # a side that is wholly below the horizon has no say
-    lowest = jnp.minimum(*(jnp.where(high <= low, 1.0, low) for low, high in sides))
-    highest = jnp.maximum(*(jnp.where(high <= low, 0.0, high) for low, high in sides))
-    width = jnp.maximum(highest - lowest, 0.0)
-    t = lowest + t * width
-    ends: Any = heights, slopes, starts, edges
-    height, slope, start, edge = (first + (second - first) * t for first, second in ends)
-    bottom, top = _positive_range(height, height + slope)
-    s = bottom + s * (top - bottom)
-    return s, start + edge * s, width * (top - bottom)
+
+    @staticmethod
+    def sample(point: Points, *row: Any) -> LightSample:
+        """From a node (s, t) of that part of a patch which stands above the horizon."""
+        start_0, start_1, edge_0, edge_1, s, t, weight = row
+        starts, edges = (start_0, start_1), (edge_0, edge_1)
+        heights = [(a - point.position) @ point.normal for a in starts]
+        slopes = [b @ point.normal for b in edges]
+        sides = _positive_range(*heights), _positive_range(*map(operator.add, heights, slopes))
+        # a side that is wholly below the horizon has no say
+        lowest = jnp.minimum(*(jnp.where(high <= low, 1.0, low) for low, high in sides))
+        highest = jnp.maximum(*(jnp.where(high <= low, 0.0, high) for low, high in sides))
+        width = jnp.maximum(highest - lowest, 0.0)
+        t = lowest + t * width
+        height, slope, start, edge = (a + (b - a) * t for a, b in (heights, slopes, starts, edges))
+        bottom, top = _positive_range(height, height + slope)
+        s = bottom + s * (top - bottom)
+        area_vector = edge.cross(start_1 - start_0 + (edge_1 - edge_0) * s)
+        offset = start + edge * s - point.position
+        to_light = normalize(offset)
+        facing = jnp.maximum(-(to_light @ normalize(area_vector)), 0.0)
+        area = norm(area_vector) * weight * width * (top - bottom)
+        squared_radius = divide(area * facing, np.pi * (offset @ offset))
+        return LightSample(to_light, squared_radius, norm(offset), square_root(squared_radius))
 
 
-def _from_patch(patch: Components, area: Array, light_normal: Components, position: Components) -> LightSample:
-    """The sample of a patch of a flat light that shines along ``light_normal``."""
-    offset = patch - position
-    to_light = normalize(offset)
-    facing = jnp.maximum(-(to_light @ light_normal), 0.0)
-    squared_radius = divide(area * facing, np.pi * (offset @ offset))
-    return LightSample(to_light, squared_radius, norm(offset), square_root(squared_radius))
-
-
-class RectangleLight(Light):
+class RectangleLight(FlatLight):
     """A parallelogram, ``center ± edge_u ± edge_v``, that shines along ``edge_u`` × ``edge_v``.
 
     Args:
@@ -114,28 +114,20 @@ class RectangleLight(Light):
     edge_v: Vector = checked(edge_value, "edge_v")
     radiance: Spectrum = checked(spectrum, "radiance")
     samples: int = eqx.field(static=True, converter=sample_number, default=SAMPLES)
-    type_name: ClassVar[str] = "rectangle"
+    type_name = "rectangle"
 
     def __check_init__(self):
         """Refuse edges that span no area."""
         spans_area(self.edge_u, self.edge_v)
 
     @property
-    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...], Any]:
+    def rows(self) -> Rows:
         """The light, and a product rule over the unit square."""
-        return (self.center, self.edge_u, self.edge_v), square_rule(self.samples), self.radiance
-
-    @staticmethod
-    def sample(point: Points, *row: Any) -> LightSample:
-        """From a patch of the light above the horizon."""
-        center, edge_u, edge_v, s, t, weight = row
-        corner = center - edge_u - edge_v
-        _, patch, share = _above_horizon(point, (corner, corner + edge_v * 2), (edge_u * 2, edge_u * 2), s, t)
-        area_vector = edge_u.cross(edge_v)
-        return _from_patch(patch, 4 * norm(area_vector) * weight * share, normalize(area_vector), point.position)
+        corner, edge_u, edge_v = self.center - self.edge_u - self.edge_v, 2 * self.edge_u, 2 * self.edge_v
+        return (corner, corner + edge_v, edge_u, edge_u), square_rule(self.samples), self.radiance
 
 
-class PolygonLight(Light):
+class PolygonLight(FlatLight):
     """A flat polygon that shines to the side from which its vertices run counter-clockwise.
 
     Args:
@@ -157,7 +149,7 @@ class PolygonLight(Light):
     radiance: Spectrum = checked(spectrum, "radiance")
     samples: int = eqx.field(static=True, converter=sample_number, default=SAMPLES)
     triangles: tuple[tuple[int, int, int], ...] = eqx.field(static=True, init=False)
-    type_name: ClassVar[str] = "polygon"
+    type_name = "polygon"
 
     def __post_init__(self):
         """Cut it into triangles, once."""
@@ -169,30 +161,11 @@ class PolygonLight(Light):
             raise InputError("samples", came, "Give one sample for each triangle at least")
 
     @property
-    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...], Any]:
-        """The corners of each triangle, and a product rule over the unit square of each."""
+    def rows(self) -> Rows:
+        """Triangles, and a product rule over the unit square of each."""
         rule, count = square_rule(self.samples // len(self.triangles)), len(self.triangles)
-        corners = self.vertices[np.repeat(np.array(self.triangles), rule.weight.size, axis=0)]
-        nodes = *(corners[:, corner] for corner in range(3)), *(np.tile(values, count) for values in rule)
-        return (_newell_normal(self.vertices),), nodes, self.radiance
-
-    @staticmethod
-    def sample(point: Points, *row: Any) -> LightSample:
-        """From a patch of one triangle above the horizon."""
-        area_vector, a, b, c, s, t, weight = row
-        place, patch, share = _above_horizon(point, (a, a), (b - a, c - a), s, t)
-        area = norm((b - a).cross(c - a)) * place * weight * share
-        return _from_patch(patch, area, normalize(area_vector), point.position)
-
-
-def _newell_normal(vertices: Any) -> Any:
-    """Twice the polygon's area times its normal, about which the vertices, (V, 3), run counter-clockwise.
-
-    Source: I. E. Sutherland, R. F. Sproull and R. A. Schumacker, ACM Computing Surveys 6 (1974), after M. Newell.
-    """
-    xp = np if isinstance(vertices, np.ndarray) else jnp
-    relative = vertices - vertices[0]
-    return xp.sum(xp.cross(relative, xp.roll(relative, -1, axis=0)), axis=0)
+        a, b, c = (self.vertices[np.repeat(corner, rule.weight.size)] for corner in np.array(self.triangles).T)
+        return (), (a, a, b - a, c - a, *(np.tile(values, count) for values in rule)), self.radiance
 
 
 def triangulate(vertices: Any) -> tuple[tuple[int, int, int], ...]:
@@ -200,12 +173,14 @@ def triangulate(vertices: Any) -> tuple[tuple[int, int, int], ...]:
     if not isinstance(vertices, np.ndarray):
         return tuple((0, last - 1, last) for last in range(2, vertices.shape[0]))
     size = float(np.max(np.abs(vertices - vertices.mean(axis=0))))
-    area_vector = _newell_normal(vertices)
+    relative = vertices - vertices[0]
+    # I. E. Sutherland, R. F. Sproull and R. A. Schumacker, ACM Computing Surveys 6 (1974), after M. Newell.
+    area_vector = np.sum(np.cross(relative, np.roll(relative, -1, axis=0)), axis=0)
     double_area = float(np.linalg.norm(area_vector))
     if double_area <= 1e-12 * size * size:
         raise InputError("vertices", "span no area", "Give the corners of a polygon in order")
     normal = area_vector / double_area
-    if np.max(np.abs((vertices - vertices[0]) @ normal)) > FLAT * size:
+    if np.max(np.abs(relative @ normal)) > FLAT * size:
         raise InputError("vertices", "do not lie in one plane", "Cut the light into flat polygons")
 
     def turn(a: int, b: int, c: int) -> float:
@@ -251,10 +226,10 @@ class SphereLight(Light):
     radius: Scalar = checked(positive, "radius")
     radiance: Spectrum = checked(spectrum, "radiance")
     samples: int = eqx.field(static=True, converter=sample_number, default=SAMPLES)
-    type_name: ClassVar[str] = "sphere"
+    type_name = "sphere"
 
     @property
-    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...], Any]:
+    def rows(self) -> Rows:
         """The light, and a rule over the cap of directions in which a point sees it."""
         return (self.center, self.radius), turned_rule(self.samples, 1 / 4), self.radiance
 

@@ -24,6 +24,7 @@ from jaxtyping import Array, Float, Int
 from brdf.checks import Checked, Spectrum
 from brdf.geometry.shapes import Shape
 from brdf.geometry.surface_points import Points
+from brdf.precision import pytree
 from brdf.vectors import Components
 
 
@@ -50,6 +51,9 @@ class LightSample(NamedTuple):
     lobe_intensity: Any = None
 
 
+Rows = tuple[tuple[Any, ...], tuple[Any, ...], Any]
+
+
 class Light(Checked):
     """A source of light.
 
@@ -61,7 +65,7 @@ class Light(Checked):
 
     @property
     @abc.abstractmethod
-    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...], Any]:
+    def rows(self) -> Rows:
         """Its numbers; those of its samples, (S, ...) each; the spectrum they emit, (C,), or (S, C)."""
 
     @staticmethod
@@ -87,8 +91,7 @@ FILLED = 4096
 """Samples are filled up to a multiple of this."""
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True, eq=False)
+@pytree
 class LightStack:
     """The L lights of one kind with S samples each.
 
@@ -122,8 +125,7 @@ class LightStack:
         return nodes, jnp.where((place < count)[..., None], emitted, 0), light
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True, eq=False)
+@pytree
 class Lighting:
     """The lights, and the shapes that stand in their way.
 

@@ -17,7 +17,7 @@ Source of the idea: P. Debevec, A median cut algorithm for light probe sampling,
 
 import heapq
 import warnings
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -27,7 +27,7 @@ from jaxtyping import Array, Float
 from brdf.checks import Spectrum, checked, sample_number, spectrum
 from brdf.errors import InputError
 from brdf.geometry.surface_points import Points
-from brdf.lights.base import Light, LightSample
+from brdf.lights.base import Light, LightSample, Rows
 from brdf.lights.sample_sets import turned_rule
 from brdf.vectors import Components, divide, normalize, perpendicular, square_root
 
@@ -70,7 +70,7 @@ class ConstantEnvironment(Light):
 
     radiance: Spectrum = checked(spectrum, "radiance")
     samples: int = eqx.field(static=True, converter=sample_number, default=CONSTANT_SAMPLES)
-    type_name: ClassVar[str] = "environment"
+    type_name = "environment"
 
     def __check_init__(self):
         """Refuse a single sample."""
@@ -78,7 +78,7 @@ class ConstantEnvironment(Light):
             raise InputError("samples", "must be at least 2 here, got 1", "Give more")
 
     @property
-    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...], Any]:
+    def rows(self) -> Rows:
         """The light, two rules over the hemisphere, and which of the two a row belongs to."""
         half = max(1, self.samples // 2)
         diffuse, lobe = turned_rule(half, 1 / 2), turned_rule(self.samples - half, 4 / 3)
@@ -148,7 +148,7 @@ class EnvironmentMap(Light):
     radiance: Spectrum
     patches: Patches
     samples: int = eqx.field(static=True)
-    type_name: ClassVar[str] = "environment"
+    type_name = "environment"
 
     def __init__(self, pixels: Any, *, radiance: Any = 1.0, samples: int = MAP_SAMPLES):
         """Take a map's colour out where it has only one, and cut it up."""
@@ -168,7 +168,7 @@ class EnvironmentMap(Light):
         self.patches = cut(np.asarray(self.pixels), self.samples)
 
     @property
-    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...], Any]:
+    def rows(self) -> Rows:
         """The rectangles of the map, means and rows of covariances."""
         intensity, mean, covariance = self.patches
         return (), (mean, *(covariance[:, axis] for axis in range(3))), self.radiance * intensity
@@ -208,8 +208,7 @@ def _checked(pixels: Any) -> np.ndarray:
         raise InputError("pixels", f"must be of shape (H, W, C), got {array.shape}", "Give a lat-long map")
     bad = ~(np.isfinite(array) & (array >= 0))
     if bad.any():
-        lowest = np.min(array, where=np.isfinite(array), initial=0.0)
-        count = np.count_nonzero(bad.any(axis=-1))
+        lowest, count = np.min(array, where=np.isfinite(array), initial=0.0), np.count_nonzero(bad.any(axis=-1))
         message = f"environment map: {count} texels are negative or not finite (down to {lowest:g}); they count as 0."
         warnings.warn(message, UserWarning, stacklevel=3)
         array[bad] = 0.0

@@ -1,7 +1,7 @@
 """Lights without extent: directional, point and spot."""
 
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ import numpy as np
 from brdf.checks import Scalar, Spectrum, Vector, checked, direction_value, number, spectrum, vector
 from brdf.errors import InputError
 from brdf.geometry.surface_points import Points
-from brdf.lights.base import Light, LightSample
+from brdf.lights.base import Light, LightSample, Rows
 from brdf.vectors import cosine_lobe, divide, norm, normalize
 
 
@@ -33,10 +33,10 @@ class DirectionalLight(Light):
 
     direction: Vector = checked(direction_value, "direction")
     intensity: Spectrum = checked(spectrum, "intensity")
-    type_name: ClassVar[str] = "directional"
+    type_name = "directional"
 
     @property
-    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...], Any]:
+    def rows(self) -> Rows:
         """It is a single sample."""
         return (), (self.direction[None],), self.intensity
 
@@ -78,10 +78,10 @@ class PointLight(Light):
     position: Vector = checked(vector, "position")
     intensity: Spectrum = checked(spectrum, "intensity")
     attenuation: Vector = eqx.field(converter=_attenuation, default=(0.0, 0.0, 1.0))
-    type_name: ClassVar[str] = "point"
+    type_name = "point"
 
     @property
-    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...], Any]:
+    def rows(self) -> Rows:
         """It is a single sample."""
         return (), (self.position[None], self.attenuation[None]), self.intensity
 
@@ -126,7 +126,7 @@ class SpotLight(Light):
     cutoff_angle: Scalar = eqx.field(converter=partial(number, "cutoff_angle", low=0.0, high=180.0), default=180.0)
     exponent: Scalar = eqx.field(converter=partial(number, "exponent", low=0.0), default=0.0)
     attenuation: Vector = eqx.field(converter=_attenuation, default=(0.0, 0.0, 1.0))
-    type_name: ClassVar[str] = "spot"
+    type_name = "spot"
 
     def __check_init__(self):
         """Refuse what OpenGL does not define."""
@@ -135,7 +135,7 @@ class SpotLight(Light):
             raise InputError("cutoff_angle", came, "A spot of more than 90 degrees is a point light")
 
     @property
-    def rows(self) -> tuple[tuple[Any, ...], tuple[Any, ...], Any]:
+    def rows(self) -> Rows:
         """It is a single sample."""
         each = self.position, self.attenuation, self.direction, self.cutoff_angle, self.exponent
         return (), tuple(one[None] for one in each), self.intensity

@@ -45,14 +45,11 @@ def check_material(material: Material, subject: str) -> Report:
     """
     with working_precision("float64"):
         double = cast(material, "float64")
-        findings = _positivity(double), _reciprocity(double), _energy(double)
+        # A lobe that is not multiplied by N.L.
+        classic = isinstance(material, SpecularMaterial) and not material.cosine_weighted and bool(np.any(material.k_s))
+        findings = _positivity(double), _reciprocity(double, classic), _energy(double, classic)
     fails = any(finding.verdict == "fail" for finding in findings)
     return Report(subject, *findings, nearest=nearest_normalized(material) if fails else None)
-
-
-def _is_classic(material: Material) -> bool:
-    """Whether there is a lobe that is not multiplied by N.L."""
-    return isinstance(material, SpecularMaterial) and not material.cosine_weighted and bool(np.any(material.k_s != 0))
 
 
 def _in_plane(material: Material, light: np.ndarray, view: np.ndarray) -> np.ndarray:
@@ -74,20 +71,19 @@ def _positivity(material: Material) -> Finding:
     return judged(value, 0.0, _ROUNDING * abs(value), where, words, least=True)
 
 
-def _reciprocity(material: Material) -> Finding:
-    if not _is_classic(material):
+def _reciprocity(material: Material, classic: bool) -> Finding:
+    if not classic:
         where = Angles(0.0), Angles(0.0), 0
         return judged(0.0, RECIPROCITY_LIMIT, 0.0, where, "f_r is the same when light and view change places")
     # For a given angle between light and view the difference is largest where they stand on opposite sides of the
     # normal, and the light as low as can be.
     lights, views = np.array([GRAZING]), np.geomspace(GRAZING - 90.0, -90.0, 100_001) + 90.0
     there, back = _in_plane(material, lights, -views)[0], _in_plane(material, views, -lights)[:, 0]
-    difference = 1.0 - back / there
-    row, channel = largest(difference)
-    value, light, view = float(difference[row, channel]), Angles(GRAZING), Angles(float(views[row]), 180.0)
+    row, channel = largest(1.0 - back / there)
+    forth, other = float(there[row, channel]), float(back[row, channel])
+    value, light, view = 1.0 - other / forth, Angles(GRAZING), Angles(float(views[row]), 180.0)
     a, b = f"{light.polar:.4g}°", f"{view.polar:.4g}°"
-    ratio = float(there[row, channel] / max(back[row, channel], 1e-300))
-    compared = f"f_r({a}→{b}) is {times(ratio)} f_r({b}→{a})"
+    compared = f"f_r({a}→{b}) is {times(forth / max(other, 1e-300))} f_r({b}→{a})"
     if value < 2 * RECIPROCITY_LIMIT:  # a trace of k_s shows only closer to 90 degrees than the angles go
         value, light, compared = 1.0, Angles(90.0), "towards grazing light the ratio grows without bound"
     sentence = f"not reciprocal: the specular term is not multiplied by N·L; {compared}"
@@ -95,29 +91,27 @@ def _reciprocity(material: Material) -> Finding:
     return judged(value, RECIPROCITY_LIMIT, _ROUNDING, (light, view, channel), sentence)
 
 
-def _energy(material: Material) -> Finding:
-    classic, within, beyond = _is_classic(material), 0.0, 0.5 * np.pi
-    if classic:
-        for _ in range(9):  # closer each time: the last angle of the light at which the albedo is within 1
-            angles = np.linspace(within, beyond, 101)
-            obeys = np.max(directional_albedo(material, angles), axis=1) <= 1.0
-            last = np.max(np.flatnonzero(obeys), initial=0)
-            within, beyond = angles[last], angles[last + 1]
+def _energy(material: Material, classic: bool) -> Finding:
+    within, beyond = 0.0, 0.5 * np.pi
+    for _ in range(9 * classic):  # closer each time: the last angle of the light at which the albedo is within 1
+        angles = np.linspace(within, beyond, 101)
+        last = np.max(np.flatnonzero(np.max(directional_albedo(material, angles), axis=1) <= 1.0), initial=0)
+        within, beyond = angles[last], angles[last + 1]
     crossing = float(np.degrees(within))
     worst = max(GRAZING, 90.0 - 0.1 * (90.0 - crossing)) if classic else 0.0
-    angle = np.radians(worst)
+    angle, light = np.radians(worst), Angles(worst)
     albedo = np.asarray(directional_albedo(material, angle))
     channel = int(np.argmax(albedo))
-    value, light, named = float(albedo[channel]), Angles(worst), in_channel(channel, albedo.size)
+    value, named = float(albedo[channel]), in_channel(channel, albedo.size)
     # towards 90 degrees the cosine knows the rounding of the angle
-    bound = float((_ROUNDING + np.finfo(float).eps * angle / np.cos(angle)) * abs(value))
+    bound = (_ROUNDING + np.finfo(float).eps * angle / np.cos(angle)) * abs(value)
     if isinstance(material, SpecularMaterial):
         divisor = normalized_form(type(material)).scale(material.n) * np.cos(angle) if classic else 1.0
-        bound += float(ACCURACY["float64"] * material.k_s[channel] / divisor)
+        bound += ACCURACY["float64"] * material.k_s[channel] / divisor
     words = f"the largest albedo is {value:.7g}, for light at {light}"
     if classic:
         words = f"the albedo exceeds 1 for light beyond {crossing:.4g}° and grows without bound, "
         words += f"to {value:.3g} at {light}"
     found = crossing if value > ENERGY_LIMIT + bound else None
-    where, failed = (light, None, channel), f"does not conserve energy: {words}{named}"
-    return judged(value, ENERGY_LIMIT, bound, where, words + named, failed, crossing=found)
+    failed = f"does not conserve energy: {words}{named}"
+    return judged(value, ENERGY_LIMIT, float(bound), (light, None, channel), words + named, failed, crossing=found)

@@ -48,7 +48,7 @@ FINEST = 2.0**-13
 """Size of the squares around an announced lobe, about 1e-4 rad: a lobe of n = 1e7 is 3e-4 wide."""
 
 _LOWEST = math.cos(math.radians(GRAZING))
-_MIRRORED = np.array([-1.0, -1.0, 1.0])  # times a direction: its mirror direction about the normal
+MIRRORED = np.array([-1.0, -1.0, 1.0])  # times a direction: its mirror direction about the normal
 _TURN = math.pi * (3.0 - math.sqrt(5.0))  # the golden angle: directions that turn by it fill a circle evenly
 _GRID = 2**18  # directions; any cap of 0.25 degree radius holds one
 _FIXED = np.radians([0.0, 7.0, 20.0, 35.0, 50.0, 65.0, 78.0, 86.0, 89.5])
@@ -187,7 +187,7 @@ class _Scan:
         fixed, grid = from_angles(_FIXED, _TURN * np.arange(len(_FIXED))), _fibonacci(_GRID)
         lights = np.concatenate([fixed, _fibonacci(64)])
         looks = [(light, view), *((one, grid) for one in fixed)]
-        looks += [(lights, peaks) for peaks in (lights * _MIRRORED, lights, np.array([0.0, 0.0, 1.0]))]
+        looks += [(lights, peaks) for peaks in (lights * MIRRORED, lights, np.array([0.0, 0.0, 1.0]))]
         self.negative, self.unequal, bright = np.concatenate([self._look(*look) for look in looks], axis=2)
         self.bright = self.improved(lambda *pair: self.seen(*pair).max(axis=1), bright)
 
@@ -312,7 +312,7 @@ def _albedos_together(scan: _Scan, lights: np.ndarray, tolerance: float, budget:
     views = np.concatenate([same_half, np.broadcast_to(others, (len(lights), *others.shape))], axis=1)
     seen = scan.seen(np.repeat(lights, views.shape[1], axis=0), views.reshape(-1, 3))
     brightest = np.argsort(seen.max(axis=1).reshape(len(lights), -1))[:, -5:, None]
-    centres = [np.take_along_axis(views, brightest, axis=1), np.stack([lights * _MIRRORED, lights], axis=1)]
+    centres = [np.take_along_axis(views, brightest, axis=1), np.stack([lights * MIRRORED, lights], axis=1)]
     value, bound = integrate(
         lambda which, views: scan.seen(lights[which], views), np.concatenate(centres, axis=1), tolerance, budget
     )

@@ -7,10 +7,12 @@ or is symmetric by its layout, its noise is not known and the check says so.
 
 import dataclasses
 import math
+from functools import partial
 
 import numpy as np
 
 from brdf.measured.table import Evaluation, MeasuredBRDF, from_angles
+from brdf.plausibility.numeric import MIRRORED, integrate
 from brdf.plausibility.report import ENERGY_LIMIT, Angles, Finding, Report, judged, largest
 
 # Samples whose angles agree within this many radians are one direction: half a degree.
@@ -21,6 +23,8 @@ PASSES, FAILS = 1.5, 3.0
 LARGEST_NOISE = 0.1
 # Angles of light, in degrees, at which the albedo is taken.
 LIGHTS = (5.0, 20.0, 35.0, 50.0, 65.0, 75.0)
+# Tolerance of the quadrature, and how many values it may take for each of them.
+_QUADRATURE = 1e-3, 10_000
 # Below this the two sides of a pair agree by construction, not by measurement.
 _BY_LAYOUT = 1e-5
 
@@ -81,10 +85,9 @@ def _positivity(table: MeasuredBRDF, noise: float) -> Finding:
     light, view = Angles.of(table.to_light[row]), Angles.of(table.to_view[row])
     sentence = f"no value is below 0, the least is {value:.3g}/sr"
     if value < 0:
-        where = f"for light {light}, view {view}, channel {table.channels[channel]}"
         why = f", {table.below_zero}" if table.below_zero else ""
-        count = f"{table.negative} of {table.values.size} values are below 0{why}"
-        sentence = f"{count}; the least, {value:.3g}/sr, {where}"
+        sentence = f"{table.negative} of {table.values.size} values are below 0{why}; the least, {value:.3g}/sr, "
+        sentence += f"for light {light}, view {view}, channel {table.channels[channel]}"
         if not math.isnan(noise):
             bound = noise * float(np.median(np.abs(table.values[:, channel])))
             sentence += f"; the noise of a typical value is {bound:.2g}/sr"
@@ -95,16 +98,14 @@ def _reciprocity(samples: MeasuredBRDF, noise: float) -> Finding:
     first, difference = _pairs(samples, exchanged=True)
     if not difference.size:
         return _cannot_tell(PASSES, "the table holds no pair of directions both ways round")
-    typical = float(np.median(difference))
-    row, channel = largest(difference)
+    typical, (row, channel) = float(np.median(difference)), largest(difference)
     light, view = Angles.of(samples.to_light[first[row]]), Angles.of(samples.to_view[first[row]])
     where = light, view, channel
     if typical < _BY_LAYOUT:
         sentence = "f_r is the same when light and view change places, as the layout of the table has it"
         return judged(0.0, PASSES, 0.0, where, sentence)
     most = f"the largest, {100 * difference[row, channel]:.3g} %, for light {light}, view {view}"
-    pairs = f"over {len(difference)} pairs; {most}"
-    said = f"the typical reciprocity error is {{}} {pairs}".format
+    said = f"the typical reciprocity error is {{}} over {len(difference)} pairs; {most}".format
     if math.isnan(noise):
         word = "fail" if typical > LARGEST_NOISE else "cannot tell"
         sentence = said(f"{100 * typical:.2g} %") + "; the noise is not known from the table"
@@ -124,23 +125,16 @@ def _cannot_tell(limit: float, sentence: str) -> Finding:
 def _energy(table: MeasuredBRDF) -> Finding:
     if table.evaluate is None:
         return _cannot_tell(ENERGY_LIMIT, "scattered samples do not say how much light they stand for")
-    coarse, fine = (np.stack([_albedo(table.evaluate, polar, fineness) for polar in LIGHTS]) for fineness in (1, 2))
-    row, channel = largest(fine)
-    value, bound, light = float(fine[row, channel]), 2 * np.abs(fine - coarse)[row, channel], Angles(LIGHTS[row])
+    lights = from_angles(np.radians(LIGHTS), 0.0)
+    values = partial(_seen, table.evaluate, lights)
+    albedo, bounds = integrate(values, np.stack([lights * MIRRORED, lights], axis=1), *_QUADRATURE)
+    row, channel = largest(albedo)
+    value, bound, light = float(albedo[row, channel]), float(bounds[row, channel]), Angles(LIGHTS[row])
     said = f"the largest albedo is {value:.4g} for light {light}, channel {table.channels[channel]}"
     failed = f"does not conserve energy: {said}"
-    return judged(value, ENERGY_LIMIT, float(bound), (light, None, channel), said, failed)
+    return judged(value, ENERGY_LIMIT, bound, (light, None, channel), said, failed)
 
 
-def _albedo(evaluate: Evaluation, polar: float, fineness: int) -> np.ndarray:
-    """Reflected share of light from one direction, (C,): midpoints in the half vector's angle, where peaks are wide."""
-    light = from_angles(math.radians(polar), 0.0)
-    root, azimuth = ((np.arange(count) + 0.5) / count for count in (60 * fineness, 24 * fineness))
-    theta = 0.5 * np.pi * root * root
-    half = from_angles(theta[:, None], 2 * np.pi * azimuth).reshape(-1, 3)
-    cell = np.repeat(np.sin(theta) * np.pi * root / len(root), len(azimuth)) * 2 * np.pi / len(azimuth)
-    along = half @ light
-    view = 2 * along[:, None] * half - light
-    seen = (along > 0) & (view[:, 2] > 0)
-    values = evaluate(np.broadcast_to(light, view[seen].shape), view[seen])
-    return (4 * cell * along * view[:, 2])[seen] @ values
+def _seen(evaluate: Evaluation, lights: np.ndarray, which: np.ndarray, views: np.ndarray) -> np.ndarray:
+    """f_r (N.V)."""
+    return evaluate(lights[which], views) * views[:, 2:]
