@@ -1,54 +1,42 @@
 """Photographs that do not say how they are encoded: read as that under which the model explains their codes better."""
 
-from typing import Any
+import dataclasses
 
 import numpy as np
 
-from brdf.images.encoding import Encoding, encode
-from fitting.maps.map_inputs import Photographs
-from fitting.maps.tiles import TILE, How, fit_band
+from fitting.maps.texels import OUTLIER
+from fitting.maps.tiles import TILE, MapProblem
 
 LESS = 0.9
 """Photographs of 8 bits that do not say so are linear where that leaves less than this share of sRGB's squares."""
 
 
-def likelier(given: Photographs, surface: Any, how: How) -> tuple[Photographs, tuple[str, ...]]:
+def likelier(problem: MapProblem) -> tuple[MapProblem, tuple[str, ...]]:
     """Silent photographs as sRGB or, under distant lights, as linear light: as is left less of the codes of some rows.
 
     Args:
-        given: read as sRGB.
-        surface: what the texels see.
-        how: they are fitted.
+        problem: with silent ones read as sRGB.
+
+    Returns:
+        The problem, and what to tell of it.
     """
-    width, mask = given.shape[2], np.asarray(surface.mask)
-    if surface.normal is not None:
-        mask = mask & np.any(np.asarray(surface.normal) != 0, axis=-1)
-    rows = np.flatnonzero(np.any(mask, axis=1))
-    silent = f"{given.silent[0]} does not say how its values are encoded: read as"
-    told = "Where you know, say so with the encoding"
+    given, (normal, mask, *_) = problem.photographs, problem.surface
+    silent = [one.name for one in given.each if one.silent]
+    if not silent:
+        return problem, ()
+    mask = np.asarray(mask) & (True if normal is None else np.any(np.asarray(normal) != 0, axis=-1))
+    rows, told = np.flatnonzero(np.any(mask, axis=1)), "Where you know, say so with the encoding"
+    note = f"{silent[0]} does not say how its values are encoded: read as"
     if given.to_light is None or not rows.size:
-        return given, (f"{silent} sRGB. {told}",)
+        return problem, (f"{note} sRGB. {told}",)
+    width = given.size[1]
     rows = rows[np.linspace(0, rows.size - 1, min(rows.size, max(1, 4 * TILE // width))).astype(int)]
-    other = given.as_linear()  # whose values are the codes
-    count, left, codes = rows.size * width, [], other.band(rows, rows.size * width, how.precision)
-    codes = np.where(codes < other.top[:, None, None], codes, np.nan)
-    readings: tuple[tuple[Photographs, Encoding], ...] = ((given, "srgb"), (other, "linear"))
-    for one, encoding in readings:
-        texels = -(-count // TILE) * TILE
-        layers = fit_band(one, how, one.band(rows, texels, how.precision), surface.some(rows, texels, how.precision))
-        shaped = {name: layer[:count].reshape(rows.size, width, *layer.shape[1:]) for name, layer in layers.items()}
-        maps, square = how.maps(shaped), np.zeros(count)
-        for p, code in enumerate(codes):
-            ambient = 0 if maps.k_a is None or how.ambient is None else maps.k_a * how.ambient[p]
-            shown = encode((maps.render(given.to_light[p]) + ambient) * one.unit[p], encoding)
-            square += np.sum(np.nan_to_num(shown.reshape(code.shape) - code) ** 2, axis=-1)
-        shown = np.nansum(codes**2, axis=(0, 2))
-        counts = mask[rows].ravel() & (shown > 0)
-        left.append(float(np.median(np.sqrt(square[counts] / shown[counts]))) if np.any(counts) else 1.0)
-    kept = int(left[1] ** 2 < LESS * left[0] ** 2)
-    names = ("sRGB", "linear")
-    note = (
-        f"{silent} {names[kept]}, under which the maps are off by {100 * left[kept]:.2g} % of a texel's codes, "
-        f"under {names[1 - kept]} by {100 * left[1 - kept]:.2g} %. {told}"
-    )
-    return (given, other)[kept], (note,)
+    readings = {"sRGB": problem, "linear": dataclasses.replace(problem, photographs=given.as_linear())}
+    left = []
+    for one in readings.values():
+        layers = one.fit(*one.tiles(rows, -(-rows.size * width // TILE) * TILE))
+        left.append(255 * np.nanmedian(layers["noise"] * np.sqrt(1 + OUTLIER**2 * layers["left_out"])))
+    names = list(readings) if left[1] ** 2 >= LESS * left[0] ** 2 else ["linear", "sRGB"]
+    less, more = (left[list(readings).index(name)] for name in names)
+    note += f" {names[0]}, under which the maps are off by {less:.2g} codes, under {names[1]} by {more:.2g}"
+    return readings[names[0]], (f"{note}. {told}",)

@@ -12,11 +12,11 @@ from brdf.errors import InputError, as_numbers
 from brdf.precision import Precision, working_precision
 from fitting.maps import map_inputs
 from fitting.maps.encoding_guess import likelier
-from fitting.maps.map_bands import Bands
+from fitting.maps.map_bands import fit_bands
 from fitting.maps.map_inputs import Photographs
 from fitting.maps.map_result import REASONS, Maps
 from fitting.maps.shared_exponent import with_shared_n
-from fitting.maps.tiles import How, Surface
+from fitting.maps.tiles import MapProblem, Surface
 from fitting.problem import model_name
 from fitting.solver.devices import spread_over
 
@@ -108,17 +108,17 @@ def fit_maps(
     to_view = np.asarray(direction_value("to_view", to_view))
     if surface.points is not None:
         to_view = np.sum(np.asarray(surface.points.to_view, float)[np.asarray(surface.mask)], axis=0)
-    how = How(models, specular == "grey", _ambient(ambient, given), to_view, precision)
-    notes: tuple[str, ...] = ()
-    if given.silent:
-        given, notes = likelier(given, surface, how)
+    problem = MapProblem(given, surface, models, specular == "grey", _ambient(ambient, given), to_view, precision)
+    problem, notes = likelier(problem)
     with spread_over(mesh):
         if labels is not None:
-            surface = with_shared_n(given, surface, how, labels)
-        layers = Bands(given, surface, how, keep).fit()
+            problem = with_shared_n(problem, labels)
+        layers = fit_bands(problem, None if keep is None else Path(keep))
+    layers.pop("criterion")
     if not np.any(layers["reason"] != REASONS.index("outside")):
         raise InputError("pictures", "show no texel that counts", "Check mask, normals and clipping")
-    return dataclasses.replace(how.maps(layers, notes), to_light=given.to_light)
+    names = tuple(one.name for one in models)
+    return Maps(models=names, to_view=to_view, notes=notes, to_light=given.to_light, **layers)
 
 
 def _models(model: Any) -> tuple[Any, ...]:
@@ -132,8 +132,8 @@ def _ambient(ambient: Any, given: Photographs) -> np.ndarray | None:
     values = given.ambient
     if ambient is not None:
         values = as_numbers("ambient", ambient, remedy="Give the intensity of the ambient light").reshape(-1)
-        if values.size not in (1, given.shape[3]) or not np.all((values > 0) & np.isfinite(values)):
-            came = f"must be 1 or {given.shape[3]} numbers above 0, got {ambient!r:.60}"
+        if values.size not in (1, given.size[2]) or not np.all((values > 0) & np.isfinite(values)):
+            came = f"must be 1 or {given.size[2]} numbers above 0, got {ambient!r:.60}"
             raise InputError("ambient", came, "Give the intensity of the ambient light")
     columns = values / given.unit
     return columns[:, :1] if np.all(columns == columns[:, :1]) else columns
@@ -141,7 +141,7 @@ def _ambient(ambient: Any, given: Photographs) -> np.ndarray | None:
 
 def _surface(given: Photographs, normals: Any, mask: Any, precision: Precision, flip_y: bool) -> Surface:
     """What the texels see."""
-    _, height, width, _ = given.shape
+    height, width, _ = given.size
     if mask is None:
         mask = np.ones((height, width), bool)
     mask = brdf.read_mask(mask) if isinstance(mask, str | Path) else np.asarray(mask, bool)

@@ -1,16 +1,16 @@
 """What maps are made of, in one form: photographs that are read by bands of rows, their lights, and what texels see."""
 
 import dataclasses
+import functools
+import hashlib
 from collections.abc import Callable, Iterable
-from concurrent.futures import Executor
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Float, Num
+from jaxtyping import Float
 
 import brdf
 from brdf.errors import InputError, as_numbers
@@ -27,73 +27,81 @@ BELOW_TOP = 1 - 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
+class Photograph:
+    """One photograph, which is read by bands of rows.
+
+    Attributes:
+        rows: linear values from one row to another.
+        shape: height, width, channels.
+        name: of the file or argument.
+        top: from which value on it is clipped.
+        curve: how it is encoded, which tells how exact its values are: noise is even in codes.
+        silent: whether it is a file of 8 bits that does not say so, and was read as sRGB.
+    """
+
+    rows: Callable[[int, int], Float[np.ndarray, "rows W C"]]
+    shape: tuple[int, ...]
+    name: str
+    top: float
+    curve: Encoding
+    silent: bool = False
+
+
+@dataclasses.dataclass(frozen=True)
 class Photographs:
     """Photographs of one view, each under its own light.
 
     Attributes:
-        rows: of each photograph, those from one to another, codes or linear values.
-        shape: count, height, width, channels.
+        each: of one size.
+        unit: what each is divided by, (P, C).
         to_light: unit, (P, 3); None where ``scenes`` tell.
         scenes: of each photograph with its one light, of intensity 1; None where all lights are distant.
         ambient: what the scenes say of ambient light, (P, C); None where they say nothing.
-        unit: what each photograph is divided by, (P, C).
-        codes: the type of ``rows`` where these are codes; None for linear values.
-        top: values from which on they are clipped, (P,).
-        scale: what values are multiplied with, (P, C): the inverse of ``unit``, and of the largest code.
-        curves: how each photograph is encoded, which tells how exact its values are: noise is even in codes.
-        silent: names of files of 8 bits that do not say how they are encoded, which were read as sRGB.
-        names: of the photographs.
-        encoding: as which files and arrays were read, None for what they say.
     """
 
-    rows: tuple[Callable[[int, int], Num[np.ndarray, "rows W C"]], ...]
-    shape: tuple[int, int, int, int]
-    to_light: Float[np.ndarray, "P 3"] | None
-    scenes: tuple[brdf.Scene, ...] | None
-    ambient: Float[np.ndarray, "P C"] | None
+    each: tuple[Photograph, ...]
     unit: Float[np.ndarray, "P C"]
-    codes: np.dtype | None
-    top: Float[np.ndarray, " P"]
-    scale: Float[np.ndarray, "P C"]
-    curves: tuple[Encoding, ...]
-    silent: tuple[str, ...]
-    names: tuple[str, ...]
-    encoding: Any
+    to_light: Float[np.ndarray, "P 3"] | None = None
+    scenes: tuple[brdf.Scene, ...] | None = None
+    ambient: Float[np.ndarray, "P C"] | None = None
+
+    @property
+    def size(self) -> tuple[int, ...]:
+        """Height, width and channels."""
+        return self.each[0].shape
 
     def as_linear(self) -> "Photographs":
         """The same, silent files read as linear light."""
-        readers = {name: brdf.ImageReader(name, encoding="linear") for name in self.silent}
-        rows = [
-            readers[name].rows if name in readers else read for name, read in zip(self.names, self.rows, strict=True)
-        ]
-        top = [_top(readers[name]) if name in readers else top for name, top in zip(self.names, self.top, strict=True)]
-        curves = ["linear" if name in readers else curve for name, curve in zip(self.names, self.curves, strict=True)]
-        return dataclasses.replace(self, rows=tuple(rows), top=np.array(top), curves=tuple(curves), encoding="linear")
+        each = (_opened(one.name, Path(one.name), "linear") if one.silent else one for one in self.each)
+        return dataclasses.replace(self, each=tuple(each))
 
-    def band(
-        self, rows: np.ndarray, texels: int, precision: str, pool: Executor | None = None
-    ) -> Num[np.ndarray, "P texels C"]:
-        """Some rows of all photographs, one after the other, padded to so many texels.
+    def tiles(self, rows: np.ndarray, shape: tuple[int, int], precision: str) -> Float[np.ndarray, "N P TILE C"]:
+        """Some rows of all photographs, one after the other, in tiles.
 
         Args:
             rows: indices that rise.
-            texels: at least as many as the rows have.
-            precision: of the result, where values are no codes.
-            pool: reads several photographs at a time.
+            shape: how many tiles of how many texels, at least as many as the rows have.
+            precision: of the result.
         """
-        runs = [(run[0], run[-1] + 1) for run in np.split(rows, np.flatnonzero(np.diff(rows) != 1) + 1)]
-        count, _, width, channels = self.shape
-        found = np.empty((count, texels, channels), self.codes or precision)
-
-        def fill(photograph: np.ndarray, read: Any) -> None:
-            end = 0
-            for start, stop in runs:
-                begin, end = end, end + (stop - start) * width
-                photograph[begin:end] = read(start, stop).reshape(-1, channels)
-            photograph[end:] = 0
-
-        list((map if pool is None else pool.map)(fill, found, self.rows))
+        channels, (count, size) = self.size[2], shape
+        found = np.zeros((count, len(self.each), size, channels), precision)
+        runs = np.split(rows, np.flatnonzero(np.diff(rows) != 1) + 1)
+        for index, one in enumerate(self.each):
+            values = np.concatenate([one.rows(run[0], run[-1] + 1) for run in runs]).reshape(-1, channels)
+            whole = len(values) // size
+            found[:whole, index] = values[: whole * size].reshape(whole, size, channels)
+            found[whole:, index].reshape(-1, channels)[: len(values) - whole * size] = values[whole * size :]
         return found
+
+
+def fingerprint(*parts: Any) -> str:
+    """By which arrays and whatever holds them are known again: by their numbers."""
+    leaves, structure = jax.tree.flatten(parts)
+    digest = hashlib.sha256(str(structure).encode())
+    for leaf in leaves:
+        array = isinstance(leaf, np.ndarray | jax.Array)
+        digest.update(np.ascontiguousarray(leaf).tobytes() if array else repr(leaf).encode())
+    return digest.hexdigest()[:16]
 
 
 def read_lights(path: str | Path) -> tuple[list[Path], Float[np.ndarray, "P 3"]]:
@@ -111,19 +119,16 @@ def read_lights(path: str | Path) -> tuple[list[Path], Float[np.ndarray, "P 3"]]
     numbered = [(number, line) for number, line in enumerate(lines, start=1) if line.partition("#")[0]]
     names, directions = [], []
     for number, line in numbered[1:]:
-        words = line.replace(",", " ").replace("\t", " ").split()
+        name, *words = line.replace(",", " ").rsplit(maxsplit=3)
         try:
-            vector = [parse_number(word) for word in words[-3:]]
+            vector = [parse_number(word) for word in words]
         except ValueError:
             vector = []
-        if len(words) < 4 or not np.all(np.isfinite(vector)) or not any(vector):
+        if len(vector) != 3 or not np.all(np.isfinite(vector)) or not any(vector):
             came = f"must be a name and three numbers that are not all 0, got {line[:60]!r}"
             raise InputError(f"{path}: line {number}", came, "Give name x y z, towards the light")
-        for word in reversed(words[-3:]):
-            line = line[: line.rindex(word)]
-        name = Path(line.rstrip(" ,\t").strip("\"'"))
-        folder = Path(path).parent
-        names.append(folder / name if (folder / name).is_file() else folder / name.name)
+        file = Path(path).parent / line[: len(name)].strip("\"'")
+        names.append(file if file.is_file() else Path(path).parent / file.name)
         directions.append(vector)
     if not names or numbered[0][1].split()[0] != str(len(names)):
         came = f"has {len(names)} lights after the count {numbered[0][1] if numbered else ''!r}"
@@ -172,17 +177,16 @@ def normal_map(given: Any, *, flip_y: bool = False) -> Float[np.ndarray, "H W 3"
     Raises:
         InputError: naming the file or the argument.
     """
-    name, coded = "normals", False
-    if not isinstance(given, str | Path):
-        normal = np.asarray(given)
-    elif Path(given).suffix.lower() == ".npy":
+    name, coded, normal = "normals", False, given
+    if isinstance(given, str | Path):
         name = str(given)
-        with Path(given).open("rb") as file:
-            normal = np.array(read_array(file, given, Path(given).stat().st_size))
-    else:
-        name = str(given)
-        with brdf.ImageReader(given, encoding="linear") as reader:
-            normal, coded = reader.read(), reader.is_integer
+        if name.lower().endswith(".npy"):
+            with Path(given).open("rb") as file:
+                normal = np.array(read_array(file, given, Path(given).stat().st_size))
+        else:
+            with brdf.ImageReader(given, encoding="linear") as reader:
+                normal, coded = reader.read(), reader.is_integer
+    normal = np.asarray(normal)
     if normal.ndim != 3 or normal.shape[2] != 3 or normal.dtype.kind not in "fiu":
         came = f"must be of shape (H, W, 3), got {normal.shape} of {normal.dtype}"
         raise InputError(name, came, "Give a normal for each pixel")
@@ -223,105 +227,69 @@ def photographs(
         if not isinstance(given, Iterable):
             came = "are missing" if given is None else f"must be a list, got {type(given).__name__}"
             raise InputError(name, came, "Give a photograph for each light, and a direction towards each light")
-    opened = [_open(f"pictures[{i}]", picture, encoding) for i, picture in enumerate(pictures)]
-    if not opened:
+    each = [_opened(f"pictures[{i}]", picture, encoding) for i, picture in enumerate(pictures)]
+    if not each:
         raise InputError("pictures", "is empty", "Give a photograph for each light")
-    rows, shapes, names, silent, types, tops, curves = zip(*opened, strict=True)
-    for name, shape in zip(names, shapes, strict=True):
-        if shape != shapes[0]:
-            raise InputError(name, f"is of shape {shape}, {names[0]} of {shapes[0]}", "Give photographs of one size")
-    count, channels = len(rows), shapes[0][2]
+    first = each[0]
+    for one in each:
+        if one.shape != first.shape:
+            came = f"is of shape {one.shape}, {first.name} of {first.shape}"
+            raise InputError(one.name, came, "Give photographs of one size")
     if isinstance(lights, str | Path):
         lights = read_lights(lights)[1] if Path(lights).suffix.lower() == ".lp" else read_directions(lights)
     lights = list(lights)
-    if len(lights) != count:
-        raise InputError("lights", f"are {len(lights)} for {count} photographs", "Give a light for each photograph")
-    unit = np.ones((count, channels))
-    for name, given in (("intensities", intensities), ("exposures", exposures)):
-        if given is not None:
-            unit = unit * _factors(name, given, count, channels)
-    to_light, scenes, ambient = None, None, None
+    if len(lights) != len(each):
+        raise InputError("lights", f"are {len(lights)} for {len(each)} photographs", "Give a light for each photograph")
+    factors = functools.partial(_factors, len(each), first.shape[2])
+    given = {"intensities": intensities, "exposures": exposures}
+    unit = factors("exposures", np.ones(len(each)))
+    for name, values in given.items():
+        unit = unit if values is None else unit * factors(name, values)
     if all(isinstance(light, brdf.Scene) for light in lights):
-        _refuse_other_views(lights)
-        ambient = _ambient(lights, channels)
-        scenes, colours = zip(*(_white(f"lights[{i}]", scene) for i, scene in enumerate(lights)), strict=True)
-        unit = unit * [_factors(f"lights[{i}]", one[None], 1, channels)[0] for i, one in enumerate(colours)]
-    elif all(isinstance(light, brdf.DirectionalLight) for light in lights):
-        to_light = _directions([light.direction for light in lights])
-        unit = unit * [_factors("lights", np.asarray(light.intensity)[None], 1, channels)[0] for light in lights]
-    else:
-        to_light = _directions(lights)
-    codes = types[0] if len(set(types)) == 1 and types[0].kind == "u" else None
-    if codes is None:
-        rows = [partial(_linear, read, kind) for read, kind in zip(rows, types, strict=True)]
-        tops = [1.0 if kind.kind == "u" else top for top, kind in zip(tops, types, strict=True)]
-    scale = 1 / (unit if codes is None else unit * np.iinfo(codes).max)
-    told = tuple(filter(None, silent))
-    return Photographs(
-        tuple(rows),
-        (count, *shapes[0]),
-        to_light,
-        scenes,
-        ambient,
-        unit,
-        codes,
-        np.array(tops),
-        scale,
-        curves,
-        told,
-        names,
-        encoding,
-    )
+        if other := next((i for i, scene in enumerate(lights) if _view(scene) != _view(lights[0])), 0):
+            came = "has another camera, or other shapes or points, than lights[0]"
+            raise InputError(f"lights[{other}]", came, "Give scenes of one view that differ in their lights")
+        scenes, colours, ambient = zip(
+            *(_of_scene(f"lights[{i}]", scene, first.shape[2]) for i, scene in enumerate(lights)), strict=True
+        )
+        unit = unit * factors("lights", colours)
+        return Photographs(tuple(each), unit, None, scenes, np.array(ambient) if np.any(ambient) else None)
+    if all(isinstance(light, brdf.DirectionalLight) for light in lights):
+        colours = [np.broadcast_to(np.asarray(light.intensity), first.shape[2:]) for light in lights]
+        unit, lights = unit * factors("lights", colours), [light.direction for light in lights]
+    return Photographs(tuple(each), unit, _directions(lights))
 
 
-def _linear(read: Any, kind: np.dtype, start: int, stop: int) -> np.ndarray:
-    values = read(start, stop)
-    return values / np.float32(np.iinfo(kind).max) if kind.kind == "u" else values
-
-
-def _open(
-    name: str, picture: Any, encoding: Any
-) -> tuple[Any, tuple[int, int, int], str, str, np.dtype, float, Encoding]:
-    """A photograph.
-
-    Returns:
-        How to read rows of it; height, width and channels; its name, and that again where it is silent on its encoding;
-        the type of the rows, from where on they are clipped, and how they were encoded.
-    """
-    of_path = isinstance(picture, str | Path)
-    if of_path:
-        name, picture = str(picture), brdf.ImageReader(picture, encoding=encoding)
+def _opened(name: str, picture: Any, encoding: Any) -> Photograph:
+    if isinstance(picture, str | Path):
+        reader = brdf.ImageReader(picture, encoding=encoding)
+        silent = reader.is_integer and reader.bits <= 8 and reader.source in ("assumed", "format")
+        return dataclasses.replace(_opened(str(picture), reader, None), silent=silent)
     curve = parse_encoding("encoding", encoding) or "linear"
-    if not of_path and encoding is not None and isinstance(picture, brdf.ImageReader | brdf.Picture):
-        raise InputError("encoding", f"is that of files and arrays, {name} is decoded", "Leave it out")
-    if isinstance(picture, brdf.ImageReader):
-        silent = of_path and picture.is_integer and picture.bits <= 8 and picture.source in ("assumed", "format")
-        silent = name if silent else ""
-        return picture.rows, picture.shape, name, silent, np.dtype(np.float32), _top(picture), picture.encoding
-    top = np.inf
-    if isinstance(picture, brdf.Picture):
-        curve, top = picture.encoding, (picture.saturation or np.inf) * BELOW_TOP
-        picture = picture.pixels
-        return lambda start, stop: picture[start:stop], picture.shape, name, "", picture.dtype, top, curve
+    if isinstance(picture, brdf.ImageReader | brdf.Picture):
+        if encoding is not None:
+            raise InputError("encoding", f"is that of files and arrays, {name} is decoded", "Leave it out")
+        if isinstance(picture, brdf.ImageReader):
+            top = (picture.codes[0] or np.inf) * BELOW_TOP
+            return Photograph(picture.rows, picture.shape, name, top, picture.encoding)
+        top = (picture.saturation or np.inf) * BELOW_TOP
+        return Photograph(lambda a, b: picture.pixels[a:b], picture.pixels.shape, name, top, picture.encoding)
     values = np.asarray(picture)
     values = values[..., None] if values.ndim == 2 else values
+    integer = values.dtype.kind == "u"
     if values.ndim != 3 or 0 in values.shape or values.dtype.kind not in "fu":
         came = f"is of shape {values.shape} and type {values.dtype}"
         raise InputError(name, came, "Give (H, W, C) floats, or unsigned integers that span their type")
-    if curve != "linear":
-        top = BELOW_TOP if values.dtype.kind == "u" else top
-        read = partial(_linear, lambda start, stop: values[start:stop], values.dtype)
-        kind = np.dtype(np.float32)
-        return lambda start, stop: decode(read(start, stop), curve), values.shape, name, "", kind, top, curve
-    top = np.iinfo(values.dtype).max if values.dtype.kind == "u" else top
-    return lambda start, stop: values[start:stop], values.shape, name, "", values.dtype, top, curve
+    white = np.float32(np.iinfo(values.dtype).max) if integer else None
+
+    def rows(start: int, stop: int) -> np.ndarray:
+        part = values[start:stop]
+        return decode(part if white is None else part / white, curve)
+
+    return Photograph(rows, values.shape, name, BELOW_TOP if integer else np.inf, curve)
 
 
-def _top(reader: brdf.ImageReader) -> float:
-    return (reader.codes[0] or np.inf) * BELOW_TOP
-
-
-def _factors(name: str, given: Any, count: int, channels: int) -> Float[np.ndarray, "P C"]:
+def _factors(count: int, channels: int, name: str, given: Any) -> Float[np.ndarray, "P C"]:
     values = as_numbers(name, given, remedy="Give a number for each photograph")
     values = values[:, None] if values.ndim == 1 else values
     if values.ndim != 2 or values.shape[0] != count or values.shape[1] not in (1, channels):
@@ -343,37 +311,21 @@ def _directions(given: Any) -> Float[np.ndarray, "P 3"]:
     return vectors / length[:, None]
 
 
-def _ambient(scenes: list[brdf.Scene], channels: int) -> Float[np.ndarray, "P C"] | None:
-    """Intensities of the scenes' ambient light; None where there is none."""
-    found = np.zeros((len(scenes), channels))
-    for index, scene in enumerate(scenes):
-        if scene.ambient is not None:
-            if len(scene.ambient) not in (1, channels):
-                came = f"has ambient light of {len(scene.ambient)} channels, the photographs have {channels}"
-                raise InputError(f"lights[{index}]", came, "Give as many as the photographs have, or one for all")
-            found[index] = scene.ambient
-    return found if np.any(found) else None
-
-
-def _refuse_other_views(scenes: list[brdf.Scene]) -> None:
+def _view(scene: brdf.Scene) -> str:
     """What texels see is asked of the first scene."""
-    views = [jax.tree.flatten(dataclasses.replace(one, ambient=None, lights=(), visibility=())) for one in scenes]
-    leaves, structure = views[0]
-    for index, (others, form) in enumerate(views[1:], start=1):
-        same = form == structure and all(
-            one is other or np.array_equal(one, other, equal_nan=True)
-            for one, other in zip(leaves, others, strict=True)
-        )
-        if not same:
-            came = "has another camera, or other shapes or points, than lights[0]"
-            raise InputError(f"lights[{index}]", came, "Give scenes of one view that differ in their lights")
+    return fingerprint(dataclasses.replace(scene, ambient=None, lights=(), visibility=()))
 
 
-def _white(name: str, scene: brdf.Scene) -> tuple[brdf.Scene, np.ndarray]:
-    """A scene whose one light is of intensity 1, and what that was."""
+def _of_scene(name: str, scene: brdf.Scene, channels: int) -> tuple[brdf.Scene, np.ndarray, np.ndarray]:
+    """A scene whose one light is of intensity 1, what that was, and its ambient light."""
     if len(scene.lights) != 1 or isinstance(scene.lights[0], brdf.EnvironmentMap):
         came = f"has {len(scene.lights)} lights" if len(scene.lights) != 1 else "is lit by an environment map"
         raise InputError(name, came, "Give scenes with one light each, of one colour")
+    ambient = np.zeros(channels) if scene.ambient is None else np.asarray(scene.ambient)
+    if len(ambient) not in (1, channels):
+        came = f"has ambient light of {len(ambient)} channels, the photographs have {channels}"
+        raise InputError(name, came, "Give as many as the photographs have, or one for all")
     (light,) = scene.lights
     white = eqx.tree_at(lambda one: one.emittance, light, np.ones(1))
-    return dataclasses.replace(scene, lights=(white,), ambient=None), np.asarray(light.emittance)
+    colour = _factors(1, channels, name, np.asarray(light.emittance)[None])[0]
+    return dataclasses.replace(scene, lights=(white,), ambient=None), colour, np.broadcast_to(ambient, channels)

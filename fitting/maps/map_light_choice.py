@@ -9,8 +9,9 @@ import numpy as np
 import brdf
 from brdf.errors import InputError
 from brdf.models.base import SpecularMaterial
+from brdf.vectors import Components
 from fitting.light_choice import LightChoice, choose_lights, direction_of
-from fitting.maps.texels import Distant
+from fitting.maps.texels import Distant, Texels
 
 if TYPE_CHECKING:
     from fitting.maps.map_result import Maps
@@ -35,21 +36,24 @@ def next_light(maps: "Maps", candidates: Any, count: int, of: str) -> LightChoic
     if not texel.size:
         raise InputError("maps", "have no texel with a highlight", "Name a model with one")
     texel = texel[:: -(-texel.size // MOST_TEXELS)]
-    normal, log_n = maps.normal.reshape(-1, 3)[texel], np.log(maps.fitted_n.ravel()[texel])
+    normal = Components(tuple(jnp.asarray(maps.normal.reshape(-1, 3)[texel].T)))
+    log_n = jnp.log(maps.fitted_n.ravel()[texel])
     strength = np.sum(maps.fitted_k_s.reshape(-1, maps.fitted_k_s.shape[-1])[texel] ** 2.0, axis=1)
     strength = strength / maps.noise.ravel()[texel] ** 2.0
     chosen, to_view = maps.chosen.ravel()[texel], maps.to_view / np.linalg.norm(maps.to_view)
 
     @jax.jit
-    def products(to_light: Any) -> Any:
+    def products(to_light):
         """Of the columns of k_d and k_s and the derivative by ln n: the upper triangle of their Gram matrix, (6, T)."""
-        lights, seen = Distant(to_light[None], to_view, None), jnp.ones((1, 1, len(normal)))
-        columns = [jnp.zeros(len(normal))] * 3
+        lights = Distant(Components(tuple(to_light[:, None])), Components(tuple(to_view)), None)
+        one, columns = jnp.ones((1, len(log_n), 1)), [jnp.zeros(len(log_n))] * 3
         for index, model in enumerate(models):
             if issubclass(model, SpecularMaterial):
-                told = lights.columns(model, normal.T, seen)
-                found = *told.linear, *told.lobe(model, jnp.asarray(log_n))
-                columns = [jnp.where(chosen == index, new[0, 0], old) for new, old in zip(found, columns, strict=True)]
+                texels = Texels(model, False, 1, one, Components(tuple(one))).facing(normal, lights)
+                found = *texels.columns(log_n), *texels.by_log_n(log_n)
+                columns = [
+                    jnp.where(chosen == index, new.parts[0][:, 0], old) for new, old in zip(found, columns, strict=True)
+                ]
         return jnp.stack([a * b for i, a in enumerate(columns) for b in columns[i:]])
 
     def told_by(light: Any) -> np.ndarray:

@@ -17,10 +17,10 @@ import fitting
 from brdf.images.encoding import encode
 from brdf.images.writing import write_image
 from fitting.maps import map_bands
-from fitting.maps.kept_bands import KeptBands
 from fitting.maps.map_inputs import read_lights
 from fitting.maps.map_result import REASONS
 from fitting.maps.texels import nonnegative
+from fitting.maps.tiles import MapProblem
 from fitting.solver.nnls import nonnegative_minimum
 
 VIEW = np.array([0.0, 0.0, 1.0])
@@ -174,11 +174,12 @@ def test_every_model_is_found_and_rendered(model, specular):
 def test_bounded_least_squares_is_exact():
     random = np.random.default_rng(1)
     columns, target = random.normal(size=(3, 8, 200)) + 0.5, random.normal(size=(8, 2, 200))
-    gram = [[np.sum(a * b, axis=0)[None] for b in columns] for a in columns]
+    gram = np.einsum("ipt,jpt->ijt", columns, columns)
     moment = [np.einsum("pt,pct->ct", a, target) for a in columns]
-    k = nonnegative(gram, moment, jnp.inf * jnp.ones(200), False, steps=0)
+    rows = [[*row[:, None], b] for row, b in zip(gram, moment, strict=True)]
+    k = nonnegative(rows, jnp.inf * jnp.ones(200), False, steps=0)
     for t in range(200):
-        matrix = np.array([[entry[0, t] for entry in row] for row in gram])
+        matrix = gram[..., t]
         for c in range(2):
             expected = nonnegative_minimum(matrix, np.array([b[c, t] for b in moment]))
             np.testing.assert_allclose([x[c, t] for x in k], expected, atol=2e-4)
@@ -562,18 +563,18 @@ def test_an_interrupted_run_goes_on_where_it_was(folder, tmp_path, monkeypatch):
     path, _ = folder
     monkeypatch.setattr(map_bands, "BAND", 16)
     whole, keep = fitting.fit_maps(path), tmp_path / "keep"
-    write, fit_band, calls = KeptBands.write, map_bands.fit_band, []
+    write_band, fit, calls = map_bands.write_band, MapProblem.fit, []
 
-    def stops(self, start, layers):
-        write(self, start, layers)
+    def stops(*all):
+        write_band(*all)
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(KeptBands, "write", stops)
+        patch.setattr(map_bands, "write_band", stops)
         with pytest.raises(KeyboardInterrupt):
             fitting.fit_maps(path, keep=keep)
     assert len(list(keep.iterdir())) == 1
-    monkeypatch.setattr(map_bands, "fit_band", lambda *all: calls.append(0) or fit_band(*all))
+    monkeypatch.setattr(MapProblem, "fit", lambda *all: calls.append(0) or fit(*all))
     again = fitting.fit_maps(path, keep=keep)
     assert len(calls) == 2
     for name, values in whole.layers().items():
