@@ -69,7 +69,9 @@ def fit_bands(problem: MapProblem, keep: Path | None = None) -> dict[str, np.nda
     if others:
         gathered({}, 1, (1,))  # until all processes have kept theirs
         for index in others:
-            place(index, read_band(kept[index]))
+            path = kept[index]
+            assert path is not None
+            place(index, read_band(path))
         gathered({}, 1, (1,))  # and have read those of the others
     return layers
 

@@ -568,7 +568,7 @@ def nearest_vectors(axes: Components, weight: Array, value: Array) -> Components
     found = sums_of(*(a * b for a in axes * weight for b in (*axes, value)))
     x, y, z = (Components(tuple(found[i : i + 3])) for i in (0, 4, 8))
     inverse = y.cross(z), z.cross(x), x.cross(y)
-    vector = sum(map(operator.mul, inverse, found[3::4]))
+    vector = functools.reduce(operator.add, map(operator.mul, inverse, found[3::4]))
     return Components(tuple(divide(one, x @ inverse[0]) for one in vector))
 
 
@@ -576,13 +576,13 @@ def joint_fit(texels: Texels, lights: Distant, log_n: Array, normal: Components,
     """At an exponent and a normal, which are not sure, as are none of the coefficients."""
 
     def columns(*angles):
-        turn = sum(map(operator.mul, perpendicular(normal), angles), start=normal)
-        return texels.facing(normalize(turn), lights).columns(log_n)
+        first, second = map(operator.mul, perpendicular(normal), angles)
+        return texels.facing(normalize(normal + first + second), lights).columns(log_n)
 
     zero, one = jnp.zeros_like(log_n), jnp.ones_like(log_n)
     turns = [jax.jvp(columns, (zero, zero), way)[1] for way in ((one, zero), (zero, one))]
     k = texels.evaluated(log_n, []).k
-    slopes = [sum(map(operator.mul, turn, map(beside, k))) for turn in turns]
+    slopes = [functools.reduce(operator.add, map(operator.mul, turn, map(beside, k))) for turn in turns]
     return texels.evaluated(log_n, [*texels.by_log_n(log_n), *slopes], errors)
 
 

@@ -4,7 +4,6 @@ import dataclasses
 import functools
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -93,7 +92,7 @@ class MapProblem:
         surface = jax.tree.map(cut, self.surface)
         return self.photographs.tiles(rows, (texels // TILE, TILE), self.precision), surface
 
-    def fit(self, values: Any, surface: Surface) -> dict[str, np.ndarray]:
+    def fit(self, values: np.ndarray, surface: Surface) -> dict[str, np.ndarray]:
         """The layers of some tiles, (N * TILE, ...)."""
         given, dtype = self.photographs, np.dtype(self.precision)
         curves = tuple(one.curve for one in given.each)
@@ -114,7 +113,9 @@ class MapProblem:
 
 # Tiles are small: dealing parts of one out to threads would take ten times as long as the work.
 @functools.partial(
-    eqx.filter_jit, compiler_options=COMPILER_OPTIONS | {"xla_disable_hlo_passes": "cpu-parallel-task-assigner"}
+    jax.jit,
+    static_argnums=range(5),
+    compiler_options=COMPILER_OPTIONS | {"xla_disable_hlo_passes": "cpu-parallel-task-assigner"},
 )
 def _program(
     models: tuple[Any, ...],
@@ -217,7 +218,7 @@ def _near(texels: Texels, stacks: Any, occluders: Any, ambient: Components | Non
     )
 
 
-def _of_normals(texels: Texels, mask: Array, normal: Components, shared: Array | None, seek: str) -> dict[str, Array]:
+def _of_normals(texels: Texels, mask: Array, normal: Components, shared: Any, seek: str) -> dict[str, Array]:
     """What is sought where normals are given."""
     best = texels.unshadowed()
     counts = best.counts.T
