@@ -130,12 +130,13 @@ def _sums(part: Picture, lobes: Lobes) -> Sums:
     for group in range(1 if shared else channels):
         own = slice(None) if shared else slice(group, group + 1)
         heavy, lit, ambient = (one[min(group, len(one) - 1)] for one in (weight, diffuse, part.ambient))
-        moving = [one[:, min(group, one.shape[1] - 1)].astype(np.float64) for one in lobes]
+        moving = [one[:, min(group, one.shape[1] - 1)].astype(np.float64, order="C") for one in lobes]
         columns = np.stack([np.full_like(lit, ambient), lit, *target[own]])
         fixed = heavy * columns
         gram[:, own, :2, :2], product[:, own, :2] = fixed[:2] @ columns[:2].T, fixed[2:] @ columns[:2].T
         for row, moved in enumerate(moving, 2):
-            across = moved @ fixed.T
+            # A few at a time: for more BLAS takes several threads, which wait for each other on a busy machine.
+            across = np.concatenate([some @ fixed.T for some in np.array_split(moved, -(-exponents // 8))])
             gram[:, own, row, :2] = gram[:, own, :2, row] = across[:, None, :2]
             product[:, own, row] = across[:, 2:]
             weighted = moved * heavy
