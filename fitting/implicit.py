@@ -21,12 +21,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 import brdf
 from brdf.checks import instance
 from brdf.precision import working_precision
-from fitting.joint_problem import JointProblem, joint_problem
+from fitting.joint_problem import residuals
 from fitting.progress import waiting
 from fitting.result import FitResult, of_material_alone
 from fitting.solver.nnls import inverse_diagonal, scaled_inverse
@@ -90,71 +91,63 @@ def sensitivity(result: FitResult, by: Callable[[list[brdf.Scene]], Sequence[Any
     leaves = by(list(result.scenes))
     if not isinstance(leaves, Sequence) or not leaves or not all(hasattr(leaf, "shape") for leaf in leaves):
         raise brdf.InputError("by", "names no leaf of the scenes", "Return the leaves to differentiate by")
-    names = list(dict.fromkeys(one.name for one in result.free_parameters))
+    unknowns = _unknowns(result)
+    count = len(unknowns)
     with working_precision("float64"), waiting("differentiating the fit"):
-        start = brdf.cast((result.material, list(result.scenes)), "float64")
-        targets = [jnp.asarray(target, jnp.float64).reshape(-1, target.shape[-1]) for target in result.targets]
-        weights: list[Array | None] = [jnp.asarray(weight, jnp.float64).ravel() for weight in result.weighed]
+        material, scenes, leaves = brdf.cast((result.material, list(result.scenes), list(leaves)), "float64")
+        flat = [target.reshape(-1, target.shape[-1]) for target in result.targets]
+        pictures = brdf.cast(list(zip(flat, map(np.ravel, result.weighed), strict=True)), "float64")
+        numbers, of_numbers = ravel_pytree(material)
+        vector, parts = ravel_pytree((jnp.zeros(count), leaves))
 
-        def freed(material: brdf.Material, scenes: list[brdf.Scene]) -> tuple[Any, ...]:
-            return (*(getattr(material, name) for name in names), *by(scenes))
+        def cost(vector: Array) -> Array:
+            moves, known = parts(vector)
+            lit = eqx.tree_at(lambda scenes: list(by(scenes)), scenes, known)
+            return 0.5 * jnp.sum(residuals(of_numbers(numbers + moves @ unknowns), lit, pictures) ** 2)
+
+        @jax.jit
+        def curvature(vector: Array) -> tuple[Array, Array]:
+            """The gradient by the unknowns, and how that by all numbers changes along each of them."""
+            slope, along = jax.linearize(jax.grad(cost), vector)
+            return slope[:count], jax.lax.map(along, jnp.eye(count, vector.size))
 
         try:
-            problem = joint_problem(start, freed, targets, weights)
-        except brdf.InputError as error:
-            raise brdf.InputError("by", error.what, "Return leaves of the scenes, each once") from None
-        vector = np.array(problem.start())
-        blocks = [np.arange(vector.size)[leaf.numbers] for leaf in problem.freed]
-        index, known = dict(zip(names, blocks, strict=False)), blocks[len(names) :]
-        unknowns = _unknowns(result, index, vector.size)
+            slope, rows = map(np.asarray, curvature(vector))
+        except (TypeError, ValueError):
+            came = "gives what is no number of the scenes as a whole, or one twice"
+            raise brdf.InputError("by", came, "Return leaves of the scenes, each once") from None
         # A fit in float32 stops a little beside the stationary point; Newton's steps go there.
-        hessian = np.eye(len(unknowns))
         for _ in range(NEWTON_STEPS):
-            gradient, rows = _curvature(problem, jnp.asarray(vector), jnp.asarray(unknowns))
-            hessian = np.asarray(rows) @ unknowns.T
-            vector -= unknowns.T @ _solve(hessian, unknowns @ np.asarray(gradient)[:, None])[:, 0]
-        directions = np.eye(vector.size)[np.concatenate(known)]
-        _, rows = _curvature(problem, jnp.asarray(vector), jnp.asarray(directions))
-    moves = -unknowns.T @ _solve(hessian, unknowns @ np.asarray(rows).T)
-    if "n" in index:
-        moves[index["n"]] *= np.exp(vector[index["n"], None])
-    channels: tuple[int, ...] = result.material.k_d.shape
-    sizes, found = dict.fromkeys(("k_a", "k_d", "k_s"), channels) | {"n": ()}, []
-    for leaf, block in zip(leaves, known, strict=True):
-        parts = {key: np.zeros((*size, *leaf.shape)) for key, size in sizes.items()}
-        for key, place in index.items():
-            parts[key] = moves[np.ix_(place, block - known[0][0])].reshape(parts[key].shape)
-        found.append(Sensitivity(**parts))
+            vector = vector.at[:count].add(-_inverse(rows[:, :count]) @ slope)
+            slope, rows = map(np.asarray, curvature(vector))
+    moves = np.zeros((3 * result.material.k_d.size + 1, rows.shape[1] - count))
+    moves[: numbers.size] = -unknowns.T @ _inverse(rows[:, :count]) @ rows[:, count:]
+    found, ends = [], np.cumsum([leaf.size for leaf in leaves])
+    for leaf, columns in zip(leaves, np.split(moves, ends[:-1], axis=1), strict=True):
+        rows = columns.reshape(-1, *leaf.shape)
+        k_a, k_d, k_s = np.split(rows[:-1], 3)
+        found.append(Sensitivity(k_a, k_d, k_s, rows[-1]))
     return tuple(found)
 
 
-@eqx.filter_jit
-def _curvature(problem: JointProblem, vector: Array, directions: Array) -> tuple[Array, Array]:
-    """The gradient of half the sum of squares by all numbers, and how it changes along each direction."""
-    gradient = jax.grad(lambda vector: 0.5 * jnp.sum(problem.residuals(vector) ** 2))
-    found, along = jax.linearize(gradient, vector)
-    return found, jax.lax.map(along, directions)
-
-
-def _unknowns(result: FitResult, index: dict[str, np.ndarray], size: int) -> Float[np.ndarray, "U S"]:
-    """What each unknown moves of all numbers.
+def _unknowns(result: FitResult) -> Float[np.ndarray, "U S"]:
+    """What each unknown moves of the material's numbers.
 
     A grey highlight is one number, and the only way for all channels to agree to the last digit.
     """
-    k_s = np.asarray(getattr(result.material, "k_s", np.zeros(1)))
-    grey = bool(np.all(k_s == k_s[0]))
-    rows = {}
+    material, rows = result.material, {}
+    size, k_s = ravel_pytree(material)[0].size, np.asarray(getattr(material, "k_s", np.zeros(1)))
     for one in result.free_parameters:
-        is_shared = one.channel is None or (grey and one.name == "k_s")
-        place = index[one.name] if is_shared else index[one.name][one.channel]
-        rows[one.name if is_shared else one.key] = np.isin(np.arange(size), place).astype(float)
+        grey = one.name == "k_s" and np.all(k_s == k_s[0])
+        row = rows.setdefault(one.name if grey else one.key, np.zeros(size))
+        row[one.place(material.k_d.size)] = 1.0
     return np.array(list(rows.values()))
 
 
-def _solve(hessian: np.ndarray, right: np.ndarray) -> np.ndarray:
+def _inverse(hessian: Float[np.ndarray, "U U"]) -> Float[np.ndarray, "U U"]:
     """Scaled by the diagonal, since coefficients and exponent differ by orders of magnitude in what they move."""
     if not np.all(np.isfinite(hessian)) or np.any(np.diag(hessian) <= 0):
         raise brdf.InputError("result", "lies at no minimum that the picture determines", "Hold or mask less")
     if np.any(np.isinf(inverse_diagonal(hessian, DEPENDENT))):
         raise brdf.InputError("result", "is determined only in combinations of its numbers", "Fit a simpler model")
-    return scaled_inverse(hessian, DEPENDENT) @ right
+    return scaled_inverse(hessian, DEPENDENT)

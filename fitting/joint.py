@@ -19,7 +19,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -32,26 +31,28 @@ from brdf.images.encoding import Encoding
 from brdf.precision import Precision, working_precision
 from fitting.codes import Rounding
 from fitting.core import fit_pictures
-from fitting.joint_likelihood import Likely, most_likely_numbers
-from fitting.joint_problem import DIRECTIONS, NOT_NEGATIVE, JointProblem, joint_problem, linearised, named_leaves
+from fitting.joint_likelihood import Known, by_least_squares, most_likely_numbers
+from fitting.joint_problem import JointProblem, Leaf, joint_problem, linearised, named_leaves
 from fitting.pixels import Observed, observe
 from fitting.problem import CLASSIC, FitProblem, model_name, state_problem
 from fitting.progress import waiting
 from fitting.report import FitResult
 from fitting.result import Parameter
-from fitting.solver.nnls import scaled_inverse
+from fitting.solver.nnls import nonnegative_minimum
 from fitting.uncertainty.intervals import NORMAL_95, above_zero
-from fitting.uncertainty.noise_model import value_variance
 from fitting.uncertainty.residual import NEGLIGIBLE, Neighbours, neighbours_of, structure_warning
 
+SOLVERS: dict[str, Any] = {"lm": optx.LevenbergMarquardt, "bfgs": optx.BFGS}
 LARGEST_JACOBIAN = 1 << 27
 ROUNDS = 8
+# A picture is linear in these: one step of Gauss and Newton is the answer, and no solver asked.
+EMITTANCES = ("intensity", "radiance", "ambient")
 # Pixels so near to an outline that moves do not count: their shading bends, and they may come to see another shape.
 AWAY = 2
 TINY = np.finfo(float).tiny
 OPEN = "only a combination with other freed numbers is determined"
-# So many steps in a row, each a quarter of the one before, that lower the cost no more.
-STALLED = 16
+# A combination of which pictures tell so little stays as it is, or as rounding errors tell.
+DAMPED = 1e-9
 # A minimum is met where no more than this part of their errors parts the numbers from it.
 MET = 0.1
 
@@ -61,16 +62,11 @@ class JointResult(FitResult):
     """The outcome of a joint fit: a `FitResult` whose parameters are the freed numbers, and what the solver says.
 
     Attributes:
-        values: of the freed leaves.
-        errors: their standard errors; of a direction the angle, in degrees; infinite where only a combination of the
-            freed numbers is determined.
         steps: of the solver.
         converged: whether the solver said so.
         solver: "lm" or "bfgs".
     """
 
-    values: tuple[np.ndarray, ...]
-    errors: tuple[np.ndarray, ...]
     steps: int
     converged: bool
     solver: str
@@ -126,37 +122,30 @@ def fit_jointly(
         51.2
     """
     begun = time.perf_counter()
-    if solver not in (None, "lm", "bfgs"):
+    if solver not in (None, *SOLVERS):
         raise InputError("solver", f"is unknown, got {solver!r}", "Use lm, bfgs or None")
     if not (0 < tolerance < 1 and max_steps >= 1):
         came = f"and max_steps must be above 0, got {tolerance!r} and {max_steps!r}"
         raise InputError("tolerance", came, "Give for example 1e-10 and 256")
-    names = [free] if isinstance(free, str) else free
-    if not (callable(names) or names is None or isinstance(names, Sequence)):
+    if not (callable(free) or free is None or isinstance(free, Sequence)):
         came = f"must be a function or names, got {type(free).__name__}"
         raise InputError("free", came, "Write lambda material, scenes: (material.n,), or light")
+    freed = named_leaves([free] if isinstance(free, str) else free) if isinstance(free, Sequence) else free
     material = material.material if isinstance(material, FitResult) else material
-    freed = named_leaves(names) if isinstance(names, Sequence) else names
     stated = state_problem(
         target, scene, mask, rounding=rounding, encoding=encoding, precision=precision, saturation=saturation
     )
     with working_precision(precision), waiting("fitting jointly"):
         whole = observe(stated, at_once=True)
 
-        def stated_by(start: brdf.Material, scenes: Sequence[brdf.Scene], seen: Observed) -> JointProblem:
-            targets, weights = zip(*((tile.target, tile.weight) for tile in seen.tiles), strict=True)
-            return joint_problem(brdf.cast((start, list(scenes)), precision), freed, list(targets), list(weights))
-
-        def solve(start: brdf.Material, scenes: Sequence[brdf.Scene]) -> JointResult:
-            problem, seen, rounds = stated_by(start, scenes, whole), whole, 0
-            while True:
-                if problem.moves_outlines:
-                    seen = _away_from_outlines(whole, scenes)
-                    problem = stated_by(start, scenes, seen)
-                result = _solve(problem, seen, solver, tolerance, max_steps)
-                start, scenes, rounds = result.material, result.scenes, rounds + 1
-                if not problem.moves_outlines or rounds == ROUNDS or _inside(scenes, seen.counted):
-                    return result
+        def solve(start: brdf.Material, scenes: Sequence[brdf.Scene], rounds: int = ROUNDS) -> JointResult:
+            problem = joint_problem(brdf.cast((start, list(scenes)), precision), freed)
+            seen = _away_from_outlines(whole, scenes) if problem.moves_outlines else whole
+            pictures = [(tile.target, tile.weight) for tile in seen.tiles]
+            result = _solve(dataclasses.replace(problem, pictures=pictures), seen, solver, tolerance, max_steps)
+            if rounds > 1 and problem.moves_outlines and not _inside(result.scenes, seen.counted):
+                return solve(result.material, result.scenes, rounds - 1)
+            return result
 
         if isinstance(material, brdf.Material):
             result = solve(material, stated.scenes)
@@ -201,129 +190,77 @@ def _of_model(stated: FitProblem, model: str, solve: Callable[..., JointResult])
     return best
 
 
-class _UntilNothingIsLeft(optx.LevenbergMarquardt):
-    """Ends, too, where rounding hides what a step would gain: a tolerance may ask for less than that."""
-
-    def terminate(self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: Any) -> tuple[Any, Any]:
-        done, result = optx.LevenbergMarquardt.terminate(self, fn, y, args, options, state, tags)
-        return done | (state.num_steps_since_acceptance >= STALLED), result
-
-
-@eqx.filter_jit
-def _run(
-    problem: JointProblem, vector: Array, held: Array, solver: str, tolerance: float, max_steps: int
-) -> optx.Solution:
-    """The solver's answer with some of the freed numbers held."""
-
-    def residuals(free: Array, problem: JointProblem) -> Array:
-        return problem.residuals(jnp.where(held, vector, free))
-
-    def cost(free: Array, problem: JointProblem) -> Array:
-        return 0.5 * jnp.sum(residuals(free, problem) ** 2)
-
-    if solver == "lm":
-        solver_class: Any = _UntilNothingIsLeft  # its fields are not what it is made of
-        method = solver_class(rtol=tolerance, atol=tolerance)
-        return optx.least_squares(residuals, method, vector, problem, max_steps=max_steps, throw=False)
-    method = optx.BFGS(rtol=tolerance, atol=tolerance)
-    return optx.minimise(cost, method, vector, problem, max_steps=max_steps, throw=False)
+def _residuals(free: Array, given: tuple[JointProblem, Array, Array]) -> Array:
+    problem, vector, held = given
+    return problem.residuals(jnp.where(held, vector, free))
 
 
 def _solve(problem: JointProblem, seen: Observed, solver: str | None, tolerance: float, max_steps: int) -> JointResult:
     vector = problem.start()
-    jacobian = sum(target.size for target in problem.targets) * vector.size
+    jacobian = sum(target.size for target, _ in problem.pictures) * vector.size
     solver = solver or ("lm" if jacobian <= LARGEST_JACOBIAN else "bfgs")
-    bounded, held = problem.bounded, np.zeros(vector.shape, bool)
+    epsilon = float(jnp.finfo(vector.dtype).eps)
+    # Of a smaller step rounding hides what it gains.
+    least, unseen = max(tolerance, epsilon**0.5), max(tolerance, epsilon) * float(np.max(seen.brightest))
+    method = SOLVERS[solver](rtol=least, atol=least)
+    bounded, held = problem.each(lambda leaf: leaf.bounded), np.zeros(vector.shape, bool)
+    ended = linear = all(leaf.name in EMITTANCES for leaf in problem.freed)
     steps, converged, residual, columns = 0, False, np.zeros(0), np.zeros((0, 0))
     for _ in range(ROUNDS):
-        solution = _run(problem, vector, jnp.asarray(held), solver, tolerance, max_steps)
-        steps += int(solution.stats["num_steps"])
-        converged = bool(solution.result == optx.RESULTS.successful)
-        vector = jnp.where(held, vector, solution.value)
-        below = bounded & np.asarray(vector < 0)
-        vector = jnp.where(below, 0, vector)
+        if not linear:
+            given = problem, vector, jnp.asarray(held)
+            solution = optx.least_squares(_residuals, method, vector, given, max_steps=max_steps, throw=False)
+            steps, ended = steps + int(solution.stats["num_steps"]), solution.result == optx.RESULTS.successful
+            vector = jnp.where(held, vector, solution.value)
+            vector = jnp.where(bounded & (vector < 0), 0, vector)
         residual, columns = (np.asarray(a, np.float64) for a in linearised(problem, vector))
-        slope = columns @ residual
-        if solver == "lm" and int(solution.state.num_steps_since_acceptance) >= STALLED:
-            own = np.where(held, 0.0, slope)
-            left = float(own @ scaled_inverse(columns @ columns.T) @ own)
-            converged = left <= MET**2 * float(np.mean(residual**2))
-        inwards = held & (slope < 0)
-        if not below.any() and not inwards.any():
+        if not ended:
             break
-        held = (held | below) & ~inwards
-    vector = np.asarray(vector, np.float64)
-    likely = most_likely_numbers(problem, seen, vector)
-    if likely is not None:
-        vector = likely.vector
-        held = bounded & (vector == 0)
-        residual = np.asarray(problem.residuals(jnp.asarray(vector)), np.float64)
-    found = problem.at(jnp.asarray(vector))
-    warnings = () if converged else (f"the solver stopped after {steps} steps without an end: raise max_steps",)
+        # Gauss and Newton's step under the bounds goes to the minimum, however little that gains.
+        gram, base = columns @ columns.T, np.where(bounded, np.asarray(vector, np.float64), 0.0)
+        gram[np.diag_indices_from(gram)] *= 1 + max(DAMPED, 10 * epsilon)
+        step = nonnegative_minimum(gram, gram @ base - columns @ residual, ~bounded) - base
+        vector, before = vector + step, held
+        held = bounded & np.asarray(vector == 0)
+        converged = bool(step @ gram @ step <= MET**2 * np.mean(residual**2) + residual.size * unseen**2)
+        if converged and np.array_equal(held, before):
+            break
+    # Turns from here on are those of what was found.
+    problem = problem.at(vector)
+    vector = np.asarray(problem.start(), np.float64)
+    known = most_likely_numbers(problem, seen, vector)
+    if known is not None:
+        problem, held = problem.at(jnp.asarray(known.vector)), bounded & (known.vector == 0)
+        residual = np.asarray(problem.residuals(problem.start()), np.float64)
     parts = problem.by_picture(residual)
     residuals = [part.reshape(shown.shape) for part, shown in zip(parts, seen.shown, strict=True)]
-    material, scenes = jax.tree.map(np.asarray, found.content())
-    left = left_over(seen, scenes, residuals, vector.size, warnings)
+    material, scenes = jax.tree.map(np.asarray, problem.content())
+    warnings = [] if converged else [f"the solver stopped after {steps} steps without an end: raise max_steps"]
+    left = _left_over(seen, residuals, vector.size, warnings)
+    known = known or by_least_squares(problem, seen, vector, residual, columns, left["noise"])
     given = jax.tree.leaves((material, seen.problem.scenes))
-    known = likely or _by_least_squares(problem, seen, vector, residual, columns, left["noise"])
-    parameters, errors, correlation = _with_errors(problem, given, known, held)
+    parameters, correlation = _parameters(problem, given, known, held)
     return JointResult(
-        **left,
+        **left | {"scenes": scenes},
         material=material,
         parameters=parameters,
         correlation=correlation,
-        values=tuple(np.asarray(found.leaves[leaf.place]) for leaf in problem.freed),
-        errors=errors,
         steps=steps,
-        converged=converged,
+        converged=bool(converged),
         solver=solver,
     )
 
 
-def _by_least_squares(
-    problem: JointProblem,
-    seen: Observed,
-    vector: Float[np.ndarray, " U"],
-    residual: Float[np.ndarray, " N"],
-    columns: Float[np.ndarray, "U N"],
-    noise: Float[np.ndarray, " C"],
-) -> Likely:
-    """What is known of the numbers where each channel has its noise, which may grow with brightness."""
-    counts = np.concatenate([counted.ravel() for counted in seen.counted])
-    own = residual.reshape(counts.size, -1)[counts]
-    told = np.concatenate([np.asarray(target, np.float64) for target in problem.targets])[counts]
-    variance = np.zeros((counts.size, noise.size))
-    variance[counts] = value_variance(own, told + own, noise)
-    moves = columns.reshape(len(columns), *variance.shape)
-    if seen.copies:  # they err together
-        moves, variance = moves.sum(axis=2, keepdims=True), variance[:, :1]
-    scatter = np.einsum("upc,vpc->uv", moves * variance, moves, optimize=True)
-    return Likely(vector, columns @ columns.T, scatter)
-
-
-def left_over(
-    seen: Observed,
-    scenes: Sequence[brdf.Scene],
-    residuals: Sequence[Float[np.ndarray, "H W C"]],
-    unknowns: int,
-    warnings: tuple[str, ...],
+def _left_over(
+    seen: Observed, residuals: Sequence[Float[np.ndarray, "H W C"]], unknowns: int, warnings: list[str]
 ) -> dict[str, Any]:
-    """What a `FitResult` says of the pictures and of what a fit leaves of them.
-
-    Args:
-        seen: what was fitted.
-        scenes: that were found.
-        residuals: of each picture, 0 where a pixel does not count.
-        unknowns: how many numbers were found.
-        warnings: that come before those of the residual.
-    """
+    """What a `FitResult` says of the pictures and of what a fit leaves of them, 0 where a pixel does not count."""
     squares = np.sum([np.sum(np.square(residual), axis=(0, 1)) for residual in residuals], axis=0)
     told = [np.asarray(shown, np.float64)[counted] for shown, counted in zip(seen.shown, seen.counted, strict=True)]
     pixels = sum(map(len, told))
     share = (float(np.sum(squares)) / max(sum(float(np.sum(values**2)) for values in told), TINY)) ** 0.5
     known = neighbours_of(residuals) if share > NEGLIGIBLE else Neighbours()
     return seen.told() | {
-        "scenes": scenes,
         "noise": np.sqrt(squares / max(pixels - unknowns / squares.size, 1)),
         "structure": known.correlation,
         "residual": share,
@@ -332,53 +269,46 @@ def left_over(
     }
 
 
-def _with_errors(
-    problem: JointProblem, given: Sequence[Any], known: Likely, held: np.ndarray
-) -> tuple[tuple[Parameter, ...], tuple[np.ndarray, ...], np.ndarray]:
-    """The freed numbers as parameters, their errors leaf by leaf, and the correlation of those that are determined.
+def _parameters(
+    problem: JointProblem, given: Sequence[Any], known: Known, held: Bool[np.ndarray, " U"]
+) -> tuple[tuple[Parameter, ...], Float[np.ndarray, "F F"]]:
+    """The freed numbers with their errors, and the correlation of those that are determined.
 
-    Of a direction the length is no unknown: its errors are those of two small turns across it.
+    Of a direction the length is no unknown: its error is that of two small turns across it.
     """
-    vector, design = known.vector, np.where(held[:, None], 0.0, problem.design(known.vector))
-    covariance, deviation = known.errors(design)
-    parameters, errors, at, end = [], [], [], 0
+    covariance, deviation = known.errors(held)
+    found: list[Parameter] = []
+    free: list[int] = []
     for leaf in problem.freed:
-        first, end = end, end + (2 if leaf.name in DIRECTIONS else leaf.size)
-        values, own, bound = vector[leaf.numbers], deviation[first:end], held[leaf.numbers]
-        if leaf.name in DIRECTIONS:
-            error = float(np.degrees(np.linalg.norm(own)))
-            before, after = (one / np.linalg.norm(one) for one in (np.asarray(given[leaf.place], np.float64), values))
+        value, own = np.asarray(problem.leaves[leaf.place], np.float64), deviation[leaf.numbers]
+        if leaf.is_direction:
+            before, after = (one / np.linalg.norm(one) for one in (np.asarray(given[leaf.place], np.float64), value))
             turned = float(np.degrees(np.arctan2(np.linalg.norm(np.cross(before, after)), before @ after)))
-            parameters.append(_parameter(leaf.words, None, turned, error, direction=tuple(after.tolist())))
-            errors.append(np.asarray(error))
-            at.append(-1)
+            error = float(np.degrees(np.linalg.norm(own)))
+            found.append(_parameter(leaf, None, turned, error, direction=tuple(after.tolist())))
+            free += [-1] * (not found[-1].reason)
             continue
-        values = np.exp(values) if leaf.name == "n" else values
-        own = np.where(bound, 0.0, own * (values if leaf.name == "n" else 1.0))
-        errors.append(own.reshape(leaf.shape))
-        at += range(first, end)
-        for index, (value, error) in enumerate(zip(values.tolist(), own.tolist(), strict=True)):
-            at_bound = bool(bound[index])
-            interval = _interval(leaf.name, value, error) if np.isfinite(error) and not at_bound else None
-            channel = index if leaf.shape else None
-            parameters.append(_parameter(leaf.words, channel, value, error, interval, at_bound))
-    at = np.array(at)[[one.value is not None and not one.at_bound for one in parameters]]
+        errors = own * value if leaf.name == "n" else own
+        numbers = zip(value.ravel().tolist(), errors.tolist(), held[leaf.numbers].tolist(), strict=True)
+        for index, (one, error, at_bound) in enumerate(numbers):
+            ends = _interval(leaf, one, error)
+            found.append(_parameter(leaf, index if leaf.shape else None, one, error, interval=ends, at_bound=at_bound))
+            free += [leaf.start + index] * (not found[-1].reason and not at_bound)
+    at = np.array(free, int)
     error = np.sqrt(np.diag(covariance)[at])
     correlation = np.where((at >= 0)[:, None] & (at >= 0), covariance[np.ix_(at, at)] / np.outer(error, error), 0.0)
     np.fill_diagonal(correlation, 1.0)
-    return tuple(parameters), tuple(errors), correlation
+    return tuple(found), correlation
 
 
-def _interval(name: str, value: float, error: float) -> tuple[float, float]:
-    if name == "n":
+def _interval(leaf: Leaf, value: float, error: float) -> tuple[float, float]:
+    if leaf.name == "n":
         return value * np.exp(-NORMAL_95 * error / value), value * np.exp(NORMAL_95 * error / value)
-    if name in NOT_NEGATIVE:
-        return above_zero(value, error)
-    return value - NORMAL_95 * error, value + NORMAL_95 * error
+    return above_zero(value, error) if leaf.bounded else (value - NORMAL_95 * error, value + NORMAL_95 * error)
 
 
-def _parameter(name: str, channel: int | None, value: float, error: float, *further: Any, **named: Any) -> Parameter:
+def _parameter(leaf: Leaf, channel: int | None, value: float, error: float, **named: Any) -> Parameter:
     """A freed number; without a value where only a combination is determined."""
-    known = bool(np.isfinite(error))
-    reason = "" if known else OPEN
-    return Parameter(name, channel, value if known else None, error, *further, reason=reason, **named)
+    if np.isfinite(error):
+        return Parameter(leaf.words, channel, value, error, **named)
+    return Parameter(leaf.words, channel, None, error, reason=OPEN)

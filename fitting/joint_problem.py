@@ -1,4 +1,9 @@
-"""What a joint fit frees: leaves of material and scenes as one vector of numbers, and the pictures that they show."""
+"""What a fit frees: leaves of material and scenes as one vector of numbers, and the pictures that they show.
+
+The numbers of a leaf are its own, but for two: n is searched by its logarithm, and a direction, whose length says
+nothing, by two small turns of it. `fitting.joint` fits them, `fitting.implicit` asks how they move with others, and
+`fitting.light_choice` and `fitting.diagnosis` what pictures tell of them.
+"""
 
 import math
 import re
@@ -13,14 +18,20 @@ from jaxtyping import Array, Bool, Float
 
 import brdf
 from brdf.errors import InputError
+from brdf.vectors import norm, normalize, perpendicular
 
 # What a diagnosis names that is a number of a scene.
 NAMED = re.compile(r"(light|intensity|ball|radius)(?: (\d+))?(?: of picture (\d+))?")
-
-
-# What freed leaves may not go below 0. A position has no bound, n is searched by its logarithm.
+# What freed leaves may not go below 0.
 NOT_NEGATIVE = ("k_a", "k_d", "k_s", "intensity", "radiance", "ambient", "attenuation")
-DIRECTIONS = ("direction",)
+# Values (P, C), and weights (P,), or None where each pixel weighs 1.
+Picture = tuple[Array, Array | None]
+REMEDY = "Return a tuple of leaves, such as (material.n, scenes[0].lights[0].direction)"
+
+
+def turns(direction: Float[Array, "3"]) -> Float[Array, "2 3"]:
+    """Two vectors across a direction, of its length: small turns of it, of an angle of 1."""
+    return jnp.stack(perpendicular(normalize(direction))) * norm(direction)
 
 
 class Leaf(NamedTuple):
@@ -41,14 +52,31 @@ class Leaf(NamedTuple):
     start: int
 
     @property
-    def size(self) -> int:
-        """How many numbers it has."""
-        return math.prod(self.shape)
+    def is_direction(self) -> bool:
+        """Whether its length says nothing."""
+        return self.name == "direction"
+
+    @property
+    def bounded(self) -> bool:
+        """Whether its numbers may not be negative."""
+        return self.name in NOT_NEGATIVE
 
     @property
     def numbers(self) -> slice:
         """Its part of the vector."""
-        return slice(self.start, self.start + self.size)
+        return slice(self.start, self.start + (2 if self.is_direction else math.prod(self.shape)))
+
+    def of(self, value: Array) -> Array:
+        """The numbers of a value: of a direction no turn."""
+        if self.is_direction:
+            return jnp.zeros(2, value.dtype)
+        return jnp.ravel(jnp.log(value) if self.name == "n" else value)
+
+    def at(self, start: Array, numbers: Array) -> Array:
+        """The value of some numbers; turns are those from the start."""
+        if self.is_direction:
+            return start + numbers @ turns(start)
+        return (jnp.exp(numbers) if self.name == "n" else numbers).reshape(self.shape)
 
 
 class JointProblem(eqx.Module):
@@ -56,62 +84,44 @@ class JointProblem(eqx.Module):
 
     Attributes:
         leaves: all of material and scenes.
-        targets: (H W, C) each.
-        weights: (H W,) each, or None where each pixel weighs 1.
         shape: of the tree.
         freed: the leaves to fit.
+        pictures: values and weights of each.
     """
 
     leaves: list[Array]
-    targets: list[Array]
-    weights: list[Array | None]
     shape: Any = eqx.field(static=True)
     freed: tuple[Leaf, ...] = eqx.field(static=True)
+    pictures: Sequence[Picture] = ()
 
-    def by_picture(self, values: Float[np.ndarray, "*B N"]) -> list[Float[np.ndarray, "*B P C"]]:
+    def by_picture(self, values: Float[Any, "*B N"]) -> list[Float[np.ndarray, "*B P C"]]:
         """What the residuals of each picture are, or their derivatives.
 
         Args:
             values: of all pictures, one after the other.
         """
-        parts = np.split(values, np.cumsum([target.size for target in self.targets])[:-1], axis=-1)
-        both = zip(parts, self.targets, strict=True)
-        return [np.asarray(part, np.float64).reshape(*part.shape[:-1], *target.shape) for part, target in both]
+        values, shapes = np.asarray(values, np.float64), [target.shape for target, _ in self.pictures]
+        parts = np.split(values, np.cumsum(list(map(math.prod, shapes)))[:-1], axis=-1)
+        return [part.reshape(*values.shape[:-1], *shape) for part, shape in zip(parts, shapes, strict=True)]
 
     def each(self, of: Callable[[Leaf], bool]) -> Bool[np.ndarray, " U"]:
         """What is so of the leaf that each number belongs to."""
-        return np.repeat([of(leaf) for leaf in self.freed], [leaf.size for leaf in self.freed])
-
-    @property
-    def bounded(self) -> Bool[np.ndarray, " U"]:
-        """Which numbers may not be negative."""
-        return self.each(lambda leaf: leaf.name in NOT_NEGATIVE)
+        return np.concatenate([np.full(leaf.numbers.stop - leaf.start, of(leaf)) for leaf in self.freed])
 
     @property
     def moves_outlines(self) -> bool:
         """Whether pixels may come to see another shape, or none: something of the camera or of a shape is freed."""
         return any("camera." in leaf.words or "shapes[" in leaf.words for leaf in self.freed)
 
-    def design(self, vector: Float[np.ndarray, " U"]) -> Float[np.ndarray, "U V"]:
-        """What each small change moves of the numbers: of a direction two small turns, its length is no unknown."""
-        from scipy.linalg import block_diag  # late: few commands fit jointly
-
-        parts = [
-            _across(vector[leaf.numbers]).T if leaf.name in DIRECTIONS else np.eye(leaf.size) for leaf in self.freed
-        ]
-        return np.asarray(block_diag(*parts))
-
     def start(self) -> Array:
-        """The freed numbers as they are searched: n by its logarithm."""
-        parts = [(self.leaves[leaf.place], leaf.name == "n") for leaf in self.freed]
-        return jnp.concatenate([jnp.ravel(jnp.log(part) if by_log else part) for part, by_log in parts])
+        """The freed numbers."""
+        return jnp.concatenate([leaf.of(self.leaves[leaf.place]) for leaf in self.freed])
 
     def at(self, vector: Array) -> "JointProblem":
-        """The problem with other freed numbers."""
+        """The problem with other freed numbers; directions turn from there."""
         leaves = list(self.leaves)
         for leaf in self.freed:
-            part = vector[leaf.numbers].reshape(leaf.shape)
-            leaves[leaf.place] = jnp.exp(part) if leaf.name == "n" else part
+            leaves[leaf.place] = leaf.at(leaves[leaf.place], vector[leaf.numbers])
         return eqx.tree_at(lambda problem: problem.leaves, self, leaves)
 
     def content(self) -> tuple[brdf.Material, list[brdf.Scene]]:
@@ -120,99 +130,62 @@ class JointProblem(eqx.Module):
 
     def residuals(self, vector: Array) -> Array:
         """Weighted residuals of all pictures, one after the other."""
-        material, scenes = self.at(vector).content()
-        found = []
-        for target, weight, scene in zip(self.targets, self.weights, scenes, strict=True):
-            residual = brdf.render(material, scene).reshape(target.shape) - target
-            if weight is not None:
-                counts = weight[:, None] > 0
-                residual = jnp.where(counts, residual * jnp.where(counts, weight[:, None], 1) ** 0.5, 0)
-            found.append(residual.ravel())
-        return jnp.concatenate(found)
+        return residuals(*self.at(vector).content(), self.pictures)
 
 
-def _across(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "2 3"]:
-    """Small turns of a direction, of an angle of 1: two vectors across it, of its length."""
-    return np.linalg.svd(direction[None])[2][1:] * np.linalg.norm(direction)
+def residuals(material: brdf.Material, scenes: Sequence[brdf.Scene], pictures: Sequence[Picture]) -> Array:
+    """Weighted residuals of all pictures, one after the other."""
+    found = []
+    for (target, weight), scene in zip(pictures, scenes, strict=True):
+        residual = brdf.render(material, scene).reshape(target.shape) - target
+        if weight is not None:
+            counts = weight[:, None] > 0
+            residual = jnp.where(counts, residual * jnp.where(counts, weight[:, None], 1) ** 0.5, 0)
+        found.append(residual.ravel())
+    return jnp.concatenate(found)
+
+
+@eqx.filter_jit
+def linearised(problem: JointProblem, vector: Array) -> tuple[Array, Array]:
+    """The residuals (N,) and their derivatives (U, N), one column of the Jacobian at a time."""
+    residuals, along = jax.linearize(problem.residuals, vector)
+    return residuals, jax.lax.map(along, jnp.eye(vector.size))
 
 
 def joint_problem(
-    start: Any, free: Callable[..., Sequence[Any]] | None, targets: list[Array], weights: list[Array | None]
+    start: Any, free: Callable[..., Sequence[Any]] | None, pictures: Sequence[Picture] = ()
 ) -> JointProblem:
     """Find the freed leaves among those of the start, each an array of its own.
 
     Args:
         start: material and list of scenes.
         free: from both to the leaves.
-        targets: see `JointProblem`.
-        weights: likewise.
+        pictures: see `JointProblem`.
 
     Raises:
         InputError: where ``free`` does not name distinct leaves.
     """
     start = jax.tree.map(jnp.array, start)
-    remedy = "Return a tuple of leaves, such as (material.n, scenes[0].lights[0].direction)"
     try:
-        freed = [id(leaf) for leaf in free(*start)]  # pyright: ignore[reportOptionalCall]  # None is refused below
+        asked = [id(leaf) for leaf in free(*start)]  # pyright: ignore[reportOptionalCall]  # None is refused below
     except (TypeError, AttributeError, IndexError) as error:
-        raise InputError("free", f"gives no tuple of leaves ({error})", remedy) from None
-    if not freed:
+        raise InputError("free", f"gives no tuple of leaves ({error})", REMEDY) from None
+    if not asked:
         raise InputError("free", "names no leaf", "Return the leaves to fit")
-    paths = jax.tree_util.tree_leaves_with_path(start)
+    paths, shape = jax.tree_util.tree_flatten_with_path(start)
     own = {
-        id(leaf): (place, getattr(path[-1], "name", ""), _words(path, len(start[1])))
+        id(leaf): (place, getattr(path[-1], "name", ""), _words(path, len(start[1])), leaf.shape)
         for place, (path, leaf) in enumerate(paths)
         if jnp.issubdtype(leaf.dtype, jnp.floating)
     }
-    if not own.keys() >= set(freed):
-        raise InputError("free", "gives what is no number of material or scenes as a whole", remedy)
-    if len(set(freed)) < len(freed):
-        raise InputError("free", "gives a leaf twice", remedy)
-    (leaves, shape), found = jax.tree.flatten(start), list[Leaf]()
-    for place, name, words in (own[leaf] for leaf in freed):
-        begin = found[-1].numbers.stop if found else 0
-        found.append(Leaf(place, name, words, leaves[place].shape, begin))
-    return JointProblem(leaves, targets, weights, shape, tuple(found))
-
-
-def named_leaves(names: Sequence[str]) -> Callable[[Any, list[brdf.Scene]], list[Any]]:
-    """The leaves of causes that a diagnosis names, after those of the material."""
-    asked = [NAMED.fullmatch(str(name)) for name in names]
-    for name, match in zip(names, asked, strict=True):
-        if match is None:
-            words = "Name light, intensity, ball or radius, or one of them as the diagnosis does"
-            raise InputError("free", f"names {name!r}, which is no number of a scene", words)
-
-    def leaves(material: Any, scenes: list[brdf.Scene]) -> list[Any]:
-        found = [material.k_d] if any(scene.lights for scene in scenes) else []
-        found += [material.k_a] if any(scene.ambient is not None for scene in scenes) else []
-        found += [material.k_s, material.n] if np.any(getattr(material, "k_s", 0.0)) else []
-        for name, match in zip(names, asked, strict=True):
-            assert match is not None
-            index, picture = (None if part is None else int(part) for part in match.groups()[1:])
-            own: list[Any] = []
-            for place, scene in enumerate(scenes):
-                if picture in (None, place):
-                    own += _leaves_of(match[1], scene, index, first=place == 0)
-            if not own:
-                remedy = "Free what they have; the first light's intensity is the unit of the material"
-                raise InputError("free", f"names {name!r}, which is not in the scenes: light is a direction", remedy)
-            found += own
-        return found
-
-    return leaves
-
-
-def _leaves_of(kind: str, scene: brdf.Scene, index: int | None, *, first: bool) -> list[Any]:
-    """Of a scene. The first light's intensity is the unit of the material."""
-    spheres: list[Any] = [shape for shape in scene.shapes if isinstance(shape, brdf.Sphere) and shape.fitted]
-    lights: list[Any] = [light for place, light in enumerate(scene.lights) if index in (None, place)]
-    if kind == "light":
-        return [light.direction for light in lights if isinstance(light, brdf.DirectionalLight)]
-    if kind == "intensity":
-        shining = lights[1:] if first and index is None else lights
-        return [light.emittance for light in shining]
-    return [sphere.center if kind == "ball" else sphere.radius for sphere in spheres]
+    if not own.keys() >= set(asked):
+        raise InputError("free", "gives what is no number of material or scenes as a whole", REMEDY)
+    if len(set(asked)) < len(asked):
+        raise InputError("free", "gives a leaf twice", REMEDY)
+    freed: list[Leaf] = []
+    for leaf in asked:
+        freed.append(Leaf(*own[leaf], start=freed[-1].numbers.stop if freed else 0))
+    return JointProblem([leaf for _, leaf in paths], shape, tuple(freed), pictures)
 
 
 def _words(path: Sequence[Any], scenes: int) -> str:
@@ -223,13 +196,42 @@ def _words(path: Sequence[Any], scenes: int) -> str:
     return words.removeprefix(".")
 
 
-@eqx.filter_jit
-def linearised(problem: JointProblem, vector: Array) -> tuple[Array, Array]:
-    """The residuals (N,) and their derivatives (U, N), one column of the Jacobian at a time.
+def named_leaves(names: Sequence[str]) -> Callable[[Any, list[brdf.Scene]], list[Any]]:
+    """The leaves of causes that a diagnosis names, after those of the material."""
+    asked = {str(name): NAMED.fullmatch(str(name)) for name in names}
+    for name, match in asked.items():
+        if match is None:
+            words = "Name light, intensity, ball or radius, or one of them as the diagnosis does"
+            raise InputError("free", f"names {name!r}, which is no number of a scene", words)
 
-    Args:
-        problem: with the pictures.
-        vector: the freed numbers.
-    """
-    residuals, along = jax.linearize(problem.residuals, vector)
-    return residuals, jax.lax.map(along, jnp.eye(vector.size))
+    def leaves(material: Any, scenes: list[brdf.Scene]) -> list[Any]:
+        found = [material.k_d] if any(scene.lights for scene in scenes) else []
+        found += [material.k_a] if any(scene.ambient is not None for scene in scenes) else []
+        found += [material.k_s, material.n] if np.any(getattr(material, "k_s", 0.0)) else []
+        for name, match in asked.items():
+            assert match is not None
+            index, picture = (None if part is None else int(part) for part in match.groups()[1:])
+            own: list[Any] = []
+            for place, scene in enumerate(scenes):
+                some = scene_leaves(match[1], scene, index) if picture in (None, place) else []
+                # The first light's intensity is the unit of the material.
+                is_unit = place == 0 and index is None and match[1] == "intensity"
+                own += some[1:] if is_unit else some
+            if not own:
+                remedy = "Free what they have; the first light's intensity is the unit of the material"
+                raise InputError("free", f"names {name!r}, which is not in the scenes: light is a direction", remedy)
+            found += own
+        return found
+
+    return leaves
+
+
+def scene_leaves(kind: str, scene: brdf.Scene, index: int | None = None) -> list[Any]:
+    """Those of a kind of cause: "light", "intensity", "ball" or "radius"; of one light or of all."""
+    lights: list[Any] = [light for place, light in enumerate(scene.lights) if index in (None, place)]
+    spheres: list[Any] = [shape for shape in scene.shapes if isinstance(shape, brdf.Sphere) and shape.fitted]
+    if kind == "light":
+        return [light.direction for light in lights if isinstance(light, brdf.DirectionalLight)]
+    if kind == "intensity":
+        return [light.emittance for light in lights]
+    return [sphere.center if kind == "ball" else sphere.radius for sphere in spheres]

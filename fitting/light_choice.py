@@ -23,7 +23,6 @@ from jaxtyping import Array, Float
 import brdf
 from brdf.errors import InputError
 from brdf.lights.base import Light
-from brdf.models.base import SpecularMaterial
 from brdf.precision import working_precision
 from fitting.progress import waiting
 from fitting.result import FitResult, of_material_alone
@@ -97,10 +96,8 @@ class LightChoice:
         colours = axes.scatter(*tried[finite, :2].T, c=self.foretold[finite], cmap="cividis_r", s=45, linewidths=0)
         axes.scatter(*tried[~finite, :2].T, facecolors="none", edgecolors="0.6", s=20, linewidths=0.5)
         for lights, marker, label in ((self.known, "x", "there already"), (self.lights, "*", "chosen")):
-            places = np.array(
-                [direction_of(light) for light in lights if isinstance(light, brdf.DirectionalLight)]
-            ).reshape(-1, 3)
-            axes.scatter(*places[:, :2].T, marker=marker, s=90, color="#D55E00", label=label)
+            places = [direction_of(light)[:2] for light in lights if isinstance(light, brdf.DirectionalLight)]
+            axes.scatter(*np.reshape(places, (-1, 2)).T, marker=marker, s=90, color="#D55E00", label=label)
         axes.set(
             title=f"error of {self.of} with one more light", xlabel="x towards the light", ylabel="y", aspect="equal"
         )
@@ -139,27 +136,32 @@ def next_light(result: Any, candidates: Sequence[Any] | None = None, count: int 
         came = f"must be of fitting.fit or fit_maps, got {type(result).__name__}"
         raise InputError("result", came, "Fit the pictures first")
     of_material_alone(result)
-    wanted, active = _numbers(result, of)
+    free, asked = result.free_parameters, result[of]
+    asked = asked if isinstance(asked, tuple) else (asked,)
+    for one in asked:
+        if one not in free:
+            came = f"{one.key} has no error to shrink: {one.reason or 'is at its bound'}"
+            raise InputError("of", came, "Ask for another number")
+    wanted, index = [one in asked for one in free], [one.place(result.noise.size) for one in free]
     known = tuple(light for scene in result.scenes for light in scene.lights)
-    scenes = [_scene(result, index) for index in range(len(result.scenes))]
     with working_precision("float64"), waiting("trying lights"):
         material = brdf.cast(result.material, "float64")
-        variance = np.asarray(result.noise, np.float64) ** 2
+        k_s = np.asarray(getattr(material, "k_s", np.zeros(result.noise.size)))
 
         def told(scene: brdf.Scene, weight: np.ndarray) -> np.ndarray:
-            """Fisher's information by k_a, k_d, k_s, channel after channel each, and n."""
+            """Fisher's information of the free numbers."""
             gram = np.asarray(_gram(material, brdf.cast(scene, "float64"), weight))
-            none, k_s = np.zeros(gram.shape[:2]), np.asarray(getattr(material, "k_s", np.zeros(len(gram))))
-            return join_channels(gram, none, none[:, 0], k_s, variance).gram
+            none = np.zeros(gram.shape[:2])
+            return join_channels(gram, none, none[:, 0], k_s, result.noise**2).gram[np.ix_(index, index)]
 
         def error(information: np.ndarray) -> float:
             """Root mean square of the standard errors of what is wanted; infinite where one is not determined."""
-            variance = inverse_diagonal(information[np.ix_(active, active)], DEPENDENT)
-            return float(np.sqrt(np.mean(variance[wanted[active]])))
+            return float(np.sqrt(np.mean(inverse_diagonal(information, DEPENDENT)[wanted])))
 
         def told_by(light: Light) -> np.ndarray:
             return told(dataclasses.replace(first, lights=(light,), visibility=()), weight)
 
+        scenes = [_scene(result, index) for index in range(len(result.scenes))]
         first, weight = scenes[0]
         to_view = np.asarray(first.surface_points().to_view, np.float64).reshape(-1, 3).mean(axis=0)
         information = np.sum([told(*scene) for scene in scenes], axis=0)
@@ -193,61 +195,39 @@ def choose_lights(
     """
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
         raise InputError("count", f"must be 1 or more, got {count}", "Say how many lights to add")
-    if candidates is not None and not isinstance(candidates, Sequence | np.ndarray):
-        came = f"must be a list, got {type(candidates).__name__}"
-        raise InputError("candidates", came, "Give lights or directions, or None for any direction")
     shining = max((np.asarray(light.emittance) for light in known), key=np.sum, default=np.ones(1))
-    given = None if candidates is None else [_light(one, shining) for one in candidates]
-    if given is not None and not given:
-        raise InputError("candidates", "is empty", "Give lights or directions, or None for any direction")
+    given = [_light(one, shining) for one in candidates] if isinstance(candidates, Sequence | np.ndarray) else []
+    if candidates is not None and not given:
+        came = f"is empty, or no list: {candidates!r:.60}"
+        raise InputError("candidates", came, "Give lights or directions, or None for any direction")
 
-    def best_of(lights: Sequence[Light]) -> tuple[Light, list[float]]:
-        errors = [error(information + told_by(light)) for light in lights]
-        return lights[int(np.argmin(errors))], errors
+    def left(light: Light) -> float:
+        return error(information + told_by(light))
 
-    before, chosen, after, foretold = error(information), [], [], np.zeros(0)
-    tried = [_towards(one, shining) for one in _cap(to_view, *HEMISPHERE)] if given is None else given
+    def around(middle: np.ndarray, size: float, number: int) -> list[Light]:
+        return [_light(one, shining) for one in _cap(middle, size, number)]
+
+    before, chosen, after, foretold = error(information), [], [], []
+    tried = given or around(to_view, *HEMISPHERE)
     for _ in range(count):
-        best, errors = best_of(tried)
-        foretold = foretold if chosen else np.array(errors)
-        for near in AROUND if given is None else ():
-            best, _ = best_of([best, *(_towards(one, shining) for one in _cap(direction_of(best), *near))])
+        errors = list(map(left, tried))
+        foretold, best = foretold or errors, tried[int(np.argmin(errors))]
+        for near in () if given else AROUND:
+            best = min([best, *around(direction_of(best), *near)], key=left)
         information = information + told_by(best)
         chosen.append(best)
         after.append(error(information))
-    return LightChoice(tuple(chosen), of, before, tuple(after), tuple(tried), foretold, known)
-
-
-def _towards(direction: np.ndarray, intensity: np.ndarray) -> Light:
-    return brdf.DirectionalLight(direction=direction, intensity=intensity)
-
-
-def _numbers(result: FitResult, of: str) -> tuple[np.ndarray, np.ndarray]:
-    """Which of k_a, k_d, k_s, channel after channel each, and n are asked for, and which are free."""
-    asked = result[of]
-    asked = asked if isinstance(asked, tuple) else (asked,)
-    free = result.free_parameters
-    missing = [one for one in asked if one not in free]
-    if missing:
-        why = missing[0].reason or "is at its bound"
-        raise InputError("of", f"{missing[0].key} has no error to shrink: {why}", "Ask for another number")
-    channels = result.material.k_d.shape[0]
-    every = np.arange(3 * channels + 1)
-    wanted, active = (np.isin(every, [one.place(channels) for one in some]) for some in (asked, free))
-    return wanted, active
+    return LightChoice(tuple(chosen), of, before, tuple(after), tuple(tried), np.array(foretold), known)
 
 
 def _light(given: Any, shining: np.ndarray) -> Light:
     if isinstance(given, Light):
         return given
     try:
-        direction = np.asarray(given, np.float64)
-    except (TypeError, ValueError):
-        direction = np.zeros(())
-    if direction.shape != (3,):
+        return brdf.DirectionalLight(direction=given, intensity=shining)
+    except InputError:
         came = f"must hold lights or directions of 3 numbers, got {given!r:.60}"
-        raise InputError("candidates", came, "Give brdf lights, or (K, 3) directions towards the light")
-    return _towards(direction, shining)
+        raise InputError("candidates", came, "Give brdf lights, or (K, 3) directions towards the light") from None
 
 
 def direction_of(light: Light) -> np.ndarray:
@@ -287,10 +267,10 @@ def _cap(middle: np.ndarray, size: float, count: int) -> list[np.ndarray]:
 @eqx.filter_jit
 def _gram(material: brdf.Material, scene: brdf.Scene, weight: Float[Any, " W"]) -> Float[Array, "C 4 4"]:
     """Weighted products of the columns of a picture: ambient, diffuse, lobe, and the lobe's derivative by n."""
-    n = material.n if isinstance(material, SpecularMaterial) else jnp.ones(())
+    n = getattr(material, "n", jnp.ones(()))
     images, slopes = jax.jvp(partial(brdf.basis_images, type(material), scene), (n,), (jnp.ones_like(n),))
-    width, height = scene.resolution
-    nothing = jnp.zeros((height, width, material.k_d.shape[0]))
-    shown = (images.ambient, images.diffuse, images.specular, slopes.specular)
-    columns = jnp.stack([nothing if image is None else nothing + image for image in shown])
-    return jnp.einsum("ihwc,w,jhwc->cij", columns, weight, columns)
+    shown, shape = (images.ambient, images.diffuse, images.specular, slopes.specular), (weight.size, material.k_d.size)
+    columns = jnp.stack(
+        [jnp.broadcast_to(0.0 if one is None else one.reshape(weight.size, -1), shape) for one in shown]
+    )
+    return jnp.einsum("iwc,w,jwc->cij", columns, weight, columns)
