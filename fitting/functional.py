@@ -32,20 +32,18 @@ Example:
 """
 
 import math
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.flatten_util
 import jax.numpy as jnp
+import lineax as lx
 from jaxtyping import Array, ArrayLike, Float
 
 import brdf
 from brdf.checks import instance
 from brdf.errors import InputError
-from brdf.lobes import Lobe
 from brdf.models.base import SpecularMaterial, check_model
 from brdf.rendering import Basis, basis
 from fitting.solver.nnls import nonnegative_minima, solve_active
@@ -53,9 +51,8 @@ from fitting.solver.profile import lowest_in_cells
 
 # As a function of log n a lobe varies on a scale of 1 or more; Hermite's cubic over such a cell finds every valley.
 GRID_STEP = 0.7
-# Newton's steps double the digits, from a cell's cubic to the end of the precision; a step below CLOSE is one of these.
+# Newton's steps double the digits, from a cell's cubic to the end of the precision.
 STEPS = {"float32": 4, "float64": 6}
-CLOSE = 1e-3
 # The nearest pixel shows exp(-UNSEEN) of a highlight's peak, or more, or the exponent is not looked at.
 UNSEEN = 60.0
 
@@ -94,13 +91,13 @@ class MaterialFit(NamedTuple):
 
 
 class _Pixels(NamedTuple):
-    """Pixels of B groups of channels that share their basis images, G channels each.
+    """Pixels of C channels, which share a basis image (B = 1) or have their own (B = C).
 
     Attributes:
-        target: (B, G, P), 0 where a pixel does not count.
+        target: (C, P), 0 where a pixel does not count.
         diffuse: (B, P).
         weight: (P,).
-        free: which of x_a, x_d, x_s may be above 0, (B, G, 3).
+        free: which of x_a, x_d, x_s may be above 0, (C, 3).
     """
 
     target: Array
@@ -108,9 +105,20 @@ class _Pixels(NamedTuple):
     weight: Array
     free: Array
 
+    def residual(self, x: Array, lobe: Array) -> Array:
+        """What coefficients (C, 3) and a lobe (B, P) leave, (C, P)."""
+        shown = x[:, :1] + x[:, 1:2] * self.diffuse + x[:, 2:] * lobe
+        return jnp.where(self.weight > 0, self.target - shown, 0)
+
+    def columns(self, *lobes: Array) -> tuple[Array, Array]:
+        """Columns ambient, diffuse and others, weighted, (B, K, P), and their products with each other, (B, K, K)."""
+        columns = jnp.stack([jnp.ones_like(self.diffuse), self.diffuse, *lobes], axis=1)
+        weighted = columns * self.weight
+        return weighted, jnp.einsum("bkp,bjp->bkj", weighted, columns, precision="highest")
+
 
 class _Point(NamedTuple):
-    """The best coefficients at an exponent: x (B, G, 3), cost (B, G), and derivatives of the whole cost by log n."""
+    """The best coefficients at an exponent, (C, 3); their cost, and its derivatives by log n."""
 
     x: Array
     cost: Array
@@ -180,17 +188,13 @@ def fit_basis(
         n_range: bounds of the exponent.
     """
     diffuse = jnp.zeros((weight.size, 1), target.dtype) if images.diffuse is None else images.diffuse
-    lobe, peak = None, None
-    if images.lobe is not None:
-        peak = jnp.max(jnp.where(weight > 0, images.lobe.peak, -jnp.inf))
-        lobe = eqx.Partial(_value, images.lobe)
-    ambient = jnp.zeros(1, target.dtype) if ambient is None else ambient
+    lobe, peak = images.lobe, None
+    if lobe is not None:
+        peak = jnp.max(jnp.where(weight > 0, lobe.peak, -jnp.inf))
+        lobe = eqx.Partial(lambda lobe, n: lobe(n)[0], lobe)
+    ambient = jnp.zeros(1) if ambient is None else ambient
     target = target.reshape(weight.size, -1)
     return solve(target, diffuse, lobe, ambient=ambient, weight=weight, n_range=n_range, peak=peak)
-
-
-def _value(lobe: Lobe, n: Array) -> Array:
-    return lobe(n)[0]
 
 
 @eqx.filter_jit
@@ -228,113 +232,88 @@ def solve(
         0.30 0.60 20.0
     """
     target = jnp.asarray(target)
-    dtype, channels = target.dtype, target.shape[1]
-    diffuse = jnp.asarray(diffuse, dtype)
-    weight = jnp.ones(len(target), dtype) if weight is None else jnp.asarray(weight, dtype)
+    dtype, (count, channels) = target.dtype, target.shape
+    weight = jnp.ones(count, dtype) if weight is None else jnp.asarray(weight, dtype)
     ambient = jnp.broadcast_to(jnp.asarray(ambient, dtype), (channels,))
-    groups = diffuse.shape[1]
-    free = jnp.stack([ambient > 0, *[jnp.ones(channels, bool)] * 2], axis=-1).reshape(groups, -1, 3)
-    counted = jnp.where(weight > 0, target.T, 0).reshape(groups, -1, len(target))
-    pixels = _Pixels(counted, diffuse.T, weight, free)
     low, high = (jnp.asarray(math.log(bound), dtype) for bound in n_range)
-    nearest = jax.lax.stop_gradient(jnp.zeros((), dtype) if peak is None else jnp.minimum(jnp.asarray(peak, dtype), 0))
+    nearest, seen = jnp.zeros((), dtype), True
     if peak is not None:
+        nearest = jax.lax.stop_gradient(jnp.minimum(jnp.asarray(peak, dtype), 0))
         high = jnp.log(UNSEEN / jnp.maximum(-nearest, UNSEEN / n_range[1]))
         # Else no exponent is seen, and there is no lobe.
-        pixels = pixels._replace(free=free & jnp.stack([True, True, high >= low]))
-        high = jnp.maximum(low, high)
-    count = max(2, 1 + math.ceil(math.log(n_range[1] / n_range[0]) / GRID_STEP))
+        seen, high = high >= low, jnp.maximum(low, high)
+    free = jnp.stack([ambient > 0, *jnp.broadcast_arrays(True, seen, ambient)[:2]], axis=-1)
+    pixels = _Pixels(jnp.where(weight > 0, target.T, 0), jnp.asarray(diffuse, dtype).T, weight, free)
+    cells = max(1, math.ceil(math.log(n_range[1] / n_range[0]) / GRID_STEP))
 
     def relative(log_n: Array) -> Array:
         """The lobe relative to its largest value, (B, P)."""
-        assert lobe is not None
+        if lobe is None:
+            return jnp.zeros_like(pixels.diffuse)
         n = jnp.exp(log_n)
         return lobe(n).T.astype(dtype) * jnp.exp(-n * nearest)
 
     def cost(log_n: Array, x: Array) -> Array:
-        residual = _residual(pixels, x, None if lobe is None else relative(log_n))
-        return jnp.sum(weight * residual * residual, axis=-1)
+        return jnp.sum(weight * pixels.residual(x, relative(log_n)) ** 2, axis=-1)
 
     def optimality(unknowns: tuple[Array, Array]) -> tuple[Array, Array]:
         """0 at the optimum: the gradient, or what is at its bound."""
         log_n, x = unknowns
         by_n, by_x = jax.grad(lambda *at: jnp.sum(cost(*at)), (0, 1))(log_n, x)
-        inside = (log_n > low) & (log_n < high) & jnp.any(x[..., 2] > 0)
+        inside = (log_n > low) & (log_n < high) & jnp.any(x[:, 2] > 0)
         return jnp.where(inside, by_n, log_n), jnp.where(x > 0, by_x, x)
 
     def search(_: Any, start: tuple[Array, Array]) -> tuple[Array, Array]:
-        return start if lobe is None else _search(pixels, relative, low, high, count, start[1])
+        return start if lobe is None else _search(pixels, relative, jnp.linspace(low, high, 1 + cells), start[1])
 
-    start = jnp.zeros((), dtype), _matt(pixels)
-    log_n, x = jax.lax.custom_root(optimality, start, search, _solve_linearised)
-    n = jnp.exp(log_n)
-    x_a, x_d, x_s = x.reshape(channels, 3).T
-    unit = jnp.where(ambient > 0, ambient, 1)
-    seen = jnp.exp(-n * nearest)
-    least = cost(log_n, x)
-    lobes = jnp.zeros((groups, 2, len(target)), dtype)
-    if lobe is not None:
-        value, slope, _ = _derivatives(relative, log_n)
-        # With k_s itself held, and not k_s relative to the peak.
-        lobes = jnp.stack([value, slope + n * nearest * value], axis=1)
-    error, n_error = _errors(pixels, lobes, x, least, bounded=(log_n <= low) | (log_n >= high))
-    errors = error[0] / unit, error[1], error[2] * seen, n * n_error
-    return Solution(x_a / unit, x_d, x_s * seen, n, least.reshape(channels), errors)
+    def tangent(apply: Callable[[Any], Any], right: Any) -> Any:
+        operator = lx.FunctionLinearOperator(apply, jax.eval_shape(lambda: right))
+        return lx.linear_solve(operator, right, lx.LU()).value
 
-
-def _solve_linearised(apply: Callable[[Any], Any], right: Any) -> Any:
-    """Solve the linearised optimality, scaled by its diagonal: coefficients and exponent move pixels differently."""
-    flat, unravel = jax.flatten_util.ravel_pytree(right)
-    columns = jax.lax.map(
-        lambda unit: jax.flatten_util.ravel_pytree(apply(unravel(unit)))[0], jnp.eye(flat.size, dtype=flat.dtype)
-    )
-    size = jnp.sqrt(jnp.abs(jnp.diagonal(columns)))
-    size = jnp.where(size > 0, size, 1)
-    return unravel(jnp.linalg.solve(columns.T / (size[:, None] * size), flat / size) / size)
+    none = jnp.zeros_like(pixels.diffuse)
+    matt = _point(pixels, (none, none, none), pixels.target, jnp.zeros((channels, 3), dtype)).x
+    log_n, x = jax.lax.custom_root(optimality, (jnp.zeros((), dtype), matt), search, tangent)
+    n, least = jnp.exp(log_n), cost(log_n, x)
+    value, slope, _ = _derivatives(relative, log_n)
+    # With k_s itself held, and not k_s relative to the peak.
+    held = (log_n <= low) | (log_n >= high)
+    error, n_error = _errors(pixels, (value, slope + n * nearest * value), x, least, held)
+    units = jnp.stack(jnp.broadcast_arrays(1 / jnp.where(ambient > 0, ambient, 1), 1, jnp.exp(-n * nearest)))
+    k_a, k_d, k_s = x.T * units
+    return Solution(k_a, k_d, k_s, n, least, (*(error.T * units), n * n_error))
 
 
-def _search(
-    pixels: _Pixels, relative: Callable[[Array], Array], low: Array, high: Array, count: int, matt: Array
-) -> tuple[Array, Array]:
+def _search(pixels: _Pixels, relative: Callable[[Array], Array], grid: Array, matt: Array) -> tuple[Array, Array]:
     """The logarithm of the best exponent, and the coefficients there."""
 
     def at(log_n: Array, x: Array) -> _Point:
-        lobes = jnp.stack(_derivatives(relative, log_n), axis=1)
-        return _point(pixels, lobes, _residual(pixels, x, lobes[:, 0]), x)
+        lobes = _derivatives(relative, log_n)
+        return _point(pixels, lobes, pixels.residual(x, lobes[0]), x)
 
-    grid = jnp.linspace(low, high, count)
-    residual = _residual(pixels, matt)
-    profile = jax.vmap(lambda t: _point(pixels, jnp.stack(_derivatives(relative, t)[:2], 1), residual, matt))(grid)
-    cost = jnp.sum(profile.cost, axis=(1, 2))
-    position, lowest = lowest_in_cells(grid, cost, profile.slope)
+    residual = pixels.residual(matt, jnp.zeros_like(pixels.diffuse))
+    profile = jax.lax.map(lambda log_n: _point(pixels, _derivatives(relative, log_n), residual, matt), grid)
+    position, lowest = lowest_in_cells(grid, profile.cost, profile.slope)
     # What rounding leaves is no valley: of exponents that fit alike the smallest, whose lobe most pixels see.
-    lowest = jnp.maximum(lowest, jnp.finfo(cost.dtype).eps ** 2 * jnp.sum(pixels.target**2))
+    lowest = jnp.maximum(lowest, jnp.finfo(lowest.dtype).eps ** 2 * jnp.sum(pixels.target**2))
     # Of the two lowest valleys the better one, after a step in each.
     beside = jnp.pad(lowest, 1, constant_values=jnp.inf)
     valleys = jnp.where((lowest < beside[:-2]) & (lowest <= beside[2:]), lowest, jnp.inf)
-    _, best = jax.lax.top_k(-valleys, min(2, count - 1))
-    points = jax.vmap(lambda cell: at(position[cell], profile.x[cell]))(best)
+    _, best = jax.lax.top_k(-valleys, min(2, lowest.size))
+    points = jax.vmap(at)(position[best], profile.x[best])
     gain = points.slope**2 / jnp.where(points.curvature > 0, 2 * points.curvature, jnp.inf)
-    first = jnp.argmin(jnp.sum(points.cost, axis=(1, 2)) - gain)
-    width = grid[1] - grid[0]
-    start = position[best[first]]
-    point = jax.tree.map(lambda leaf: leaf[first], points)
-    bracket = jnp.maximum(low, start - width), jnp.minimum(high, start + width)
+    first = jnp.argmin(points.cost - gain)
+    log_n, width = position[best[first]], grid[1] - grid[0]
+    bracket = jnp.maximum(grid[0], log_n - width), jnp.minimum(grid[-1], log_n + width)
 
     def step(state: tuple[Any, ...], _: None) -> tuple[tuple[Any, ...], None]:
         log_n, (below, above), point = state
-        below, above = jnp.where(point.slope < 0, log_n, below), jnp.where(point.slope > 0, log_n, above)
-        newton = log_n - point.slope / jnp.where(point.curvature > 0, point.curvature, 1)
-        # What is left at the end is rounding, which respects no bracket.
-        inside = ((newton > below) & (newton < above)) | (jnp.abs(newton - log_n) < CLOSE)
-        inside &= (point.curvature > 0) & (newton >= low) & (newton <= high)
-        # A bound is met at once, and left again where the slope points inwards.
-        edge = jnp.where(point.slope < 0, above, below)
-        outside = jnp.where((edge == low) | (edge == high), edge, (below + above) / 2)
-        log_n = jnp.where(point.slope == 0, log_n, jnp.where(inside, newton, outside))
-        return (log_n, (below, above), at(log_n, point.x)), None
+        bracket = jnp.where(point.slope < 0, log_n, below), jnp.where(point.slope > 0, log_n, above)
+        down = -jnp.sign(point.slope) * jnp.where(point.curvature > 0, jnp.abs(point.slope) / point.curvature, width)
+        log_n = jnp.clip(log_n + down, *bracket)
+        return (log_n, bracket, at(log_n, point.x)), None
 
-    (log_n, _, point), _ = jax.lax.scan(step, (start, bracket, point), None, length=STEPS[pixels.target.dtype.name])
+    start = log_n, bracket, jax.tree.map(lambda leaf: leaf[first], points)
+    (log_n, _, point), _ = jax.lax.scan(step, start, None, length=STEPS[pixels.target.dtype.name])
     return log_n, point.x
 
 
@@ -348,82 +327,50 @@ def _derivatives(function: Callable[[Array], Array], at: Array) -> tuple[Array, 
     return value, first, second
 
 
-def _residual(pixels: _Pixels, x: Array, lobe: Array | None = None) -> Array:
-    """Of a model, (B, G, P)."""
-    shown = x[..., :1] + x[..., 1:2] * pixels.diffuse[:, None]
-    if lobe is not None:
-        shown = shown + x[..., 2:] * lobe[:, None]
-    return jnp.where(pixels.weight > 0, pixels.target - shown, 0)
-
-
-def _matt(pixels: _Pixels) -> Array:
-    """The best ambient and diffuse coefficients, (B, G, 3)."""
-    nothing = jnp.zeros((*pixels.free.shape[:2], 3), pixels.target.dtype)
-    empty = jnp.zeros((len(pixels.diffuse), 2, len(pixels.weight)), pixels.target.dtype)
-    return _point(pixels, empty, pixels.target, nothing).x
-
-
-def _point(pixels: _Pixels, lobes: Array, residual: Array, x: Array) -> _Point:
+def _point(pixels: _Pixels, lobes: Sequence[Array], residual: Array, x: Array) -> _Point:
     """The best coefficients where the columns are ambient, diffuse, and a lobe with its derivatives by log n.
 
     Args:
         pixels: what is fitted.
-        lobes: the lobe and one or two derivatives, (B, 2 or 3, P).
+        lobes: the lobe and two derivatives, (B, P).
         residual: of the coefficients ``x``, so that rounding scales with what is left and not with the picture.
-        x: (B, G, 3).
+        x: (C, 3).
     """
-    fixed = jnp.stack([jnp.ones_like(pixels.diffuse), pixels.diffuse], axis=1)
-    gram = _gram(pixels, fixed, lobes)[:, None]
-    weighted = pixels.weight * residual
-    product = jnp.concatenate([jnp.einsum("bkp,bgp->bgk", some, weighted) for some in (fixed, lobes)], axis=-1)
+    columns, gram = pixels.columns(*lobes)
+    by_group = residual.reshape(len(gram), -1, residual.shape[1])
+    product = jnp.einsum("bkp,bgp->bgk", columns, by_group).reshape(len(x), -1)
     tolerance = 2e-6 if gram.dtype == jnp.float32 else 1e-14
-    best = nonnegative_minima(gram[..., :3, :3], product[..., :3], x, pixels.free, tolerance)
+    best = nonnegative_minima(gram[:, :3, :3], product[:, :3], x, pixels.free, tolerance)
     step = best - x
-    pull = product - (step[..., None, :] @ gram[..., :3, :])[..., 0, :]
-    cost = jnp.sum(weighted * residual, axis=-1) - jnp.sum(step * (product + pull)[..., :3], axis=-1)
-    x_s = best[..., 2]
-    slope = -2 * jnp.sum(x_s * pull[..., 3])
-    if lobes.shape[1] < 3:
-        return _Point(best, jnp.maximum(cost, 0), slope, jnp.zeros_like(slope))
+    pull = product - (step[:, None] @ gram[:, :3])[:, 0]
+    cost = jnp.sum(pixels.weight * residual**2, axis=-1) - jnp.sum(step * (product + pull)[:, :3], axis=-1)
+    x_s, active = best[:, 2], best > 0
+    cost, slope = jnp.sum(jnp.maximum(cost, 0)), -2 * jnp.sum(x_s * pull[:, 3])
     # The Schur complement of the exact Hessian in what is above 0.
-    cross = x_s[..., None] * gram[..., 3, :3] - jnp.array([0, 0, 1]) * pull[..., 3:4]
-    active = best > 0
-    along, _ = solve_active(gram[..., :3, :3], jnp.where(active, cross, 0), active)
-    own = x_s**2 * gram[..., 3, 3] - x_s * pull[..., 4]
-    return _Point(best, jnp.maximum(cost, 0), slope, 2 * jnp.sum(own - jnp.sum(cross * along, axis=-1)))
+    cross = x_s[:, None] * gram[:, 3, :3] - jnp.array([0, 0, 1]) * pull[:, 3:4]
+    along, _ = solve_active(gram[:, :3, :3], jnp.where(active, cross, 0), active)
+    own = x_s**2 * gram[:, 3, 3] - x_s * pull[:, 4]
+    return _Point(best, cost, slope, 2 * jnp.sum(own - jnp.sum(cross * along, axis=-1)))
 
 
-def _gram(pixels: _Pixels, fixed: Array, lobes: Array) -> Array:
-    """Products of the columns, (B, K, K); those that no lobe enters are the same at every exponent."""
-    products = partial(jnp.einsum, "bkp,bjp->bkj", precision="highest")
-    lit = products(fixed * pixels.weight, lobes)
-    above = jnp.concatenate([products(fixed * pixels.weight, fixed), lit], axis=2)
-    below = jnp.concatenate([lit.swapaxes(1, 2), products(lobes * pixels.weight, lobes)], axis=2)
-    return jnp.concatenate([above, below], axis=1)
-
-
-def _errors(pixels: _Pixels, lobes: Array, x: Array, cost: Array, bounded: Array) -> tuple[Array, Array]:
-    """Standard errors of x_a, x_d, x_s, (3, C), and of log n: channels share n but not their noise.
+def _errors(pixels: _Pixels, lobes: Sequence[Array], x: Array, cost: Array, held: Array) -> tuple[Array, Array]:
+    """Standard errors of x_a, x_d, x_s, (C, 3), and of log n: channels share n but not their noise.
 
     With the coefficients eliminated each channel tells log n with the weight of its Schur complement; what log n errs
     moves the coefficients along.
     """
-    fixed = jnp.stack([jnp.ones_like(pixels.diffuse), pixels.diffuse], axis=1)
-    gram = jnp.broadcast_to(_gram(pixels, fixed, lobes)[:, None], (*x.shape[:2], 4, 4))
-    active, x_s = x > 0, x[..., 2:]
+    gram, active, x_s = pixels.columns(*lobes)[1], x > 0, x[:, 2]
     noise = cost / jnp.maximum(jnp.count_nonzero(pixels.weight) - jnp.count_nonzero(active, axis=-1), 1)
-    cross = jnp.where(active, x_s * gram[..., :3, 3], 0)
-    along, kept = solve_active(gram[..., :3, :3], cross, active)
-    told = x_s[..., 0] ** 2 * gram[..., 3, 3] - jnp.sum(cross * along, axis=-1)
+    both = active[:, :, None] & active[:, None]
+    inverse = jnp.where(both, jnp.linalg.inv(jnp.where(both, gram[:, :3, :3], jnp.eye(3, dtype=x.dtype))), 0)
+    cross = x_s[:, None] * gram[:, :3, 3]
+    along = (inverse @ cross[..., None])[..., 0]
+    told = x_s**2 * gram[:, 3, 3] - jnp.sum(cross * along, axis=-1)
     total = jnp.sum(told)
     by_n = jnp.where(total > 0, jnp.sum(noise * told) / jnp.where(total > 0, total, 1) ** 2, jnp.inf)
-    by_n = jnp.where(jnp.any(x_s > 0) & ~bounded, by_n, 0)
-    units = jnp.broadcast_to(jnp.eye(3, dtype=x.dtype)[:, None, None], (3, *x.shape))
-    inverse, _ = jax.vmap(solve_active, (None, 0, None), -1)(gram[..., :3, :3], units, active)
-    own = noise[..., None] * jnp.diagonal(inverse, axis1=-2, axis2=-1)
-    variance = own + jnp.where(along == 0, 0, along**2 * by_n)
-    variance = jnp.where(active & ((kept[..., None] <= 0) | ~(variance >= 0)), jnp.inf, variance)
-    return _root(variance).reshape(-1, 3).T, _root(by_n)
+    by_n = jnp.where(jnp.any(x_s > 0) & ~held, by_n, 0)
+    variance = noise[:, None] * jnp.diagonal(inverse, axis1=1, axis2=2) + jnp.where(along == 0, 0, along**2 * by_n)
+    return _root(jnp.where(variance >= 0, variance, jnp.inf)), _root(by_n)
 
 
 def _root(variance: Array) -> Array:
