@@ -194,11 +194,12 @@ class BrdfFitResult(Parameters):
         return f"; the best lobe, {lobe.model}, explains {_percent(explained)} of the squares that Lambert leaves"
 
     def _brightest(self):
-        sums = np.where(_within(self.table, self.max_angle), self.table.values.sum(axis=1), -np.inf)
-        light, view = self.table.to_light[np.argmax(sums)], self.table.to_view[np.argmax(sums)]
-        places = "direction back to the light", "mirror direction of the light"
-        apart, place = min(zip((_apart(light, view), _apart(light * [-1, -1, 1], view)), places, strict=True))
-        return f"{apart:.2g}° from the {place}, which stands at {_apart(light, _NORMAL):.3g}°"
+        table, counted = self.table, _within(self.table, self.max_angle)
+        index = np.argmax(np.where(counted, table.values.sum(axis=1), -np.inf))
+        light, view = table.to_light[index], table.to_view[index]
+        ways = {"direction back to the light": light, "mirror direction of the light": light * [-1, -1, 1]}
+        name = min(ways, key=lambda way: _apart(ways[way], view))
+        return f"{_apart(ways[name], view):.2g}° from the {name}, which stands at {_apart(light, _NORMAL):.3g}°"
 
     def __str__(self) -> str:
         """The report."""
@@ -237,7 +238,6 @@ class BrdfFitResult(Parameters):
             "candidates": [
                 {
                     "model": candidate.model,
-                    "unknowns": sum(1 for parameter in candidate.parameters if parameter.value),
                     "losses": candidate.losses._asdict(),
                     "material": material_to_dict(candidate.material),
                     "chosen": index == self.chosen,
@@ -287,8 +287,7 @@ def _apart(a, b):
 
 def _within(table, max_angle):
     """Which samples have light and view so near the normal; angles carry rounding: one at the limit counts."""
-    lowest = np.cos(np.radians(max_angle + 1e-4)) if max_angle < 90 else 0.0
-    return np.minimum(table.to_light[:, 2], table.to_view[:, 2]) > lowest
+    return np.minimum(table.to_light[:, 2], table.to_view[:, 2]) > np.cos(np.radians(max_angle + 1e-4))
 
 
 def fit_brdf(
@@ -329,52 +328,41 @@ def fit_brdf(
     model = model_name(model)
     check_choice(loss, get_args(Loss), n_range)
     max_angle = float(number("max_angle", max_angle, above=0.0, high=90.0))
-    (samples, count), channels = _samples(table, max_angle), len(table.channels)
-    left_out, negative = samples.left_out, int(np.count_nonzero(samples.values[:count] < 0))
-    if loss == "log" and negative:
-        left_out = left_out | {"values below 0, out of reach of the logarithm": negative}
-    with waiting(f"fitting {table.name}"):
-        candidates = [
-            _fit_model(kind, samples, loss, n_range)
-            for kind in (brdf.MODELS.values() if model == "auto" else [brdf.MODELS[model]])
-            if count * channels > (2 * channels + 1 if issubclass(kind, SpecularMaterial) else channels)
-        ]
-    if not candidates:
+    samples = _samples(table, max_angle)
+    (count, channels), negative = samples.values.shape, samples.negative
+    left_out = table.left_out | {f"further than {max_angle:g}° from the normal": len(table.values) - count}
+    if loss == "log":
+        left_out |= {"values below 0, out of reach of the logarithm": negative}
+    left_out = {reason: number for reason, number in left_out.items() if number}
+    kinds = brdf.MODELS.values() if model == "auto" else [brdf.MODELS[model]]
+    kinds = [
+        kind for kind in kinds if count * channels > channels + issubclass(kind, SpecularMaterial) * (channels + 1)
+    ]
+    if not kinds:
         came = f"has {count} samples that count, no more than there are numbers to find"
         raise InputError(table.name, came, "Give a table with more samples, or a model with fewer numbers")
+    with waiting(f"fitting {table.name}"):
+        candidates = tuple(_fit_model(kind, samples, loss, n_range) for kind in kinds)
     chosen, seconds = _choose(candidates, loss), time.perf_counter() - start
-    return BrdfFitResult(table, loss, tuple(candidates), chosen, count, negative, left_out, max_angle, seconds)
+    return BrdfFitResult(table, loss, candidates, chosen, count, negative, left_out, max_angle, seconds)
 
 
 def _samples(table, max_angle):
-    """The samples that count, their solid angles of mean 1, and how many; more of solid angle 0 follow.
-
-    They make it a power of two, so that few programs are compiled.
-    """
-    near = np.flatnonzero(_within(table, max_angle) & (table.solid_angle > 0))
-    count = len(near)
-    if not count:
-        raise InputError(table.name, f"has no sample within {max_angle:g}° of the normal", "Raise max_angle")
-    values = table.values[near]
-    largest = np.max(np.abs(values))
-    if not largest:
-        raise InputError(table.name, "is black", "Give a table with values")
-    if not np.any(values > 0):
-        raise InputError(table.name, f"has no value above 0 within {max_angle:g}° of the normal", "Check its sign")
-    if not 1 / FAR <= largest <= FAR:
-        raise InputError(table.name, f"holds values of up to {largest:.3g}/sr, as no BRDF does", "Check its unit")
-    more = (1 << max(10, (count - 1).bit_length())) - count
-    share, near = table.solid_angle[near], np.pad(near, (0, more), mode="edge")
-    left_out = table.left_out | {f"further than {max_angle:g}° from the normal": len(table.values) - count}
-    samples = dataclasses.replace(
-        table,
-        to_light=table.to_light[near],
-        to_view=table.to_view[near],
-        values=table.values[near],
-        solid_angle=np.pad(share / np.mean(share), (0, more)),
-        left_out={reason: number for reason, number in left_out.items() if number},
-    )
-    return samples, count
+    """The samples that count, their solid angles of mean 1."""
+    near = _within(table, max_angle) & (table.solid_angle > 0)
+    values, share = table.values[near], table.solid_angle[near]
+    largest = np.max(np.abs(values), initial=0.0)
+    within = f"within {max_angle:g}° of the normal"
+    for fails, came, remedy in (
+        (not values.size, f"has no sample {within}", "Raise max_angle"),
+        (not largest, "is black", "Give a table with values"),
+        (not np.any(values > 0), f"has no value above 0 {within}", "Check its sign"),
+        (not 1 / FAR <= largest <= FAR, f"holds values of up to {largest:.3g}/sr, as no BRDF does", "Check its unit"),
+    ):
+        if fails:
+            raise InputError(table.name, came, remedy)
+    directions = {"to_light": table.to_light[near], "to_view": table.to_view[near]}
+    return dataclasses.replace(table, **directions, values=values, solid_angle=share / np.mean(share))
 
 
 def _fit_model(model, samples, loss, n_range):
@@ -391,32 +379,33 @@ def _fit_model(model, samples, loss, n_range):
             ones, target = jnp.ones((len(values), 1)), jnp.asarray(np.pi * values)
             picture = Picture(target, ones, lobe, jnp.asarray(weight), ambient=jnp.zeros(1))
         optimum = search([picture], n_min=n_range[0], n_max=n_range[1], free=free)
-        return dataclasses.replace(optimum, x=np.where(optimum.x > [[0], [SEARCH], [0]] * brightest, optimum.x, 0.0))
+        x = np.where(optimum.x > [[0], [SEARCH], [0]] * brightest, optimum.x, 0.0)
+        highlight = x[2] * reach * np.exp(optimum.n * log_cos)
+        return dataclasses.replace(optimum, x=x), highlight, (x[1] + highlight) / np.pi
 
-    def highlight(optimum):
-        return optimum.x[2] * reach * np.exp(optimum.n * log_cos)
-
-    def modelled(optimum):
-        return (optimum.x[1] + highlight(optimum)) / np.pi
-
-    optimum = solve((share if loss == "squared" else share * cosine**2)[:, 0])
+    optimum, highlight, f_r = solve((share if loss == "squared" else share * cosine**2)[:, 0])
     if loss == "log":
-        optimum = _logarithmic(samples, solve, modelled) or optimum
+        # By reweighting, as that of pictures, of values 1 + f cos. The first round's weights are those of a perfect
+        # model, which sees the tails that the peak would drown.
+        positive, least, model_value = values >= 0, np.inf, np.maximum(values, 0.0) * cosine
+        value = model_value
+        for _ in range(_MOST_ROUNDS):
+            found = solve(cosine**2 * weights("log", 1 + value, 1 + model_value, share * positive, np.zeros(1)))
+            deviation, model_value = _losses(samples, found[2]).log, found[2] * cosine
+            if deviation >= least * (1 - _ENOUGH):
+                break
+            (optimum, highlight, f_r), least = found, deviation
     noise = residual_noise(optimum, brightest * np.finfo(float).eps)
-    visible = float(np.max(highlight(optimum)) / np.max(brightest))
+    visible = float(np.max(highlight) / np.max(brightest))
     # A lobe that hardly reaches a sample needs a k_s whose square is out of range; it is found to be undetermined.
     with np.errstate(over="ignore", invalid="ignore"):
         sure = uncertainty(optimum, free, noise, brightest, visible, single=False)
-    fit = ModelFit(model, [], optimum, free, n_range)
-    interval = None
+    fit, interval = ModelFit(model, [], optimum, free, n_range), None
     if specular and not sure.n_reason:
-        interval, sure = (
-            exponent_interval(fit, sure.n_error, sure.rise, 0.0, parabolic=True),
-            sure._replace(n_reason=fit.held),
-        )
+        interval = exponent_interval(fit, sure.n_error, sure.rise, 0.0, parabolic=True)
+        sure = sure._replace(n_reason=fit.held)
     material, parameters = material_and_parameters(fit, sure, np.ones(channels), interval)
-    parameters = tuple(one for one in parameters if one.name != "k_a")
-    return BrdfCandidate(material, parameters, _losses(samples, modelled(optimum)))
+    return BrdfCandidate(material, tuple(one for one in parameters if one.name != "k_a"), _losses(samples, f_r))
 
 
 def _lobe(model, samples):
@@ -428,43 +417,25 @@ def _lobe(model, samples):
     return np.maximum(log_cos, _LEAST), np.where(log_cos > _DARK, reach, 0.0)
 
 
-def _logarithmic(samples, solve, modelled):
-    """Least logarithmic loss by reweighting: that of pictures, of values 1 + f cos."""
-    positive, cosine = samples.values >= 0, samples.to_light[:, 2:]
-    share = samples.solid_angle[:, None] * positive
-    value = np.where(positive, samples.values, 0.0) * cosine
-    # The first round's weights are those of a perfect model, which sees the tails that the peak would drown.
-    best, least, model = None, np.inf, value
-    for _ in range(_MOST_ROUNDS):
-        found = solve(cosine**2 * weights("log", 1 + value, 1 + model, share, np.zeros(1)))
-        f_r = modelled(found)
-        deviation, model = _losses(samples, f_r).log, f_r * cosine
-        if deviation >= least * (1 - _ENOUGH):
-            break
-        best, least = found, deviation
-    return best
-
-
 def _losses(samples, model):
     values, cosine, share = samples.values, samples.to_light[:, 2:], samples.solid_angle[:, None]
-    deviation, counted = values - model, share * (values >= 0)
+    counted = share * (values >= 0)
     logarithms = np.log1p(np.maximum(values, 0.0) * cosine) - np.log1p(model * cosine)
 
-    def relative(weight):
-        return float((np.sum(weight * deviation**2) / np.sum(weight * values**2)) ** 0.5)
+    def relative(weight, power=2):
+        return float(np.sum(weight * np.abs(values - model) ** power) / np.sum(weight * np.abs(values) ** power))
 
     return Losses(
-        cosine=relative(share * cosine**2),
-        squared=relative(share),
-        log=float((np.sum(counted * logarithms**2) / np.sum(counted)) ** 0.5),
-        misplaced=float(np.sum(share * cosine * np.abs(deviation)) / np.sum(share * cosine * np.abs(values))),
+        cosine=relative(share * cosine**2) ** 0.5,
+        squared=relative(share) ** 0.5,
+        log=float(np.sum(counted * logarithms**2) / np.sum(counted)) ** 0.5,
+        misplaced=relative(share * cosine, 1),
     )
 
 
 def _choose(candidates, loss):
     """Lambert, which comes first, unless a lobe explains enough of the squares that it leaves."""
-    lambert = candidates[0].losses
     losses = [getattr(candidate.losses, loss) for candidate in candidates]
     best = int(np.argmin(losses))
-    worth = WORTH if 1 - lambert.cosine**2 >= HALF else WORTH_WITHOUT_LAMBERT
+    worth = WORTH if candidates[0].losses.cosine ** 2 <= HALF else WORTH_WITHOUT_LAMBERT
     return best if losses[best] ** 2 + EXACT**2 <= worth * losses[0] ** 2 else 0
