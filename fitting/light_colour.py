@@ -5,7 +5,7 @@ The colour is taken out of the scenes, so that all channels share their basis im
 
 import functools
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -35,7 +35,7 @@ def take_colour_out(scenes: Sequence[brdf.Scene], channels: int) -> LightColour:
         scenes: any number.
         channels: of the picture.
     """
-    emittances = [np.asarray(light.emittance, np.float64) for scene in scenes for light in scene.lights]
+    emittances = [np.asarray(emittance, np.float64) for emittance in _emittances(scenes)]
     unchanged = LightColour(np.ones(channels), list(scenes))
     if all(emittance.shape[0] == 1 for emittance in emittances):
         return unchanged
@@ -47,14 +47,11 @@ def take_colour_out(scenes: Sequence[brdf.Scene], channels: int) -> LightColour:
     strength = table @ colour / (colour @ colour)
     if np.max(np.abs(table - strength[:, None] * colour)) > 1e-12 * np.max(table):
         return unchanged
-    strengths = iter(strength)
-    grey = []
-    for scene in scenes:
-        lights = [
-            eqx.tree_at(lambda light: light.emittance, light, np.array([next(strengths)])) for light in scene.lights
-        ]
-        grey.append(eqx.tree_at(lambda scene: scene.lights, scene, tuple(lights)))
-    return LightColour(colour, grey)
+    return LightColour(colour, eqx.tree_at(_emittances, list(scenes), list(strength[:, None])))
+
+
+def _emittances(scenes: Sequence[brdf.Scene]) -> list[Any]:
+    return [light.emittance for scene in scenes for light in scene.lights]
 
 
 def coefficient_factors(

@@ -8,7 +8,6 @@ value it has in the scene, and the result says so.
 """
 
 import dataclasses
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +18,6 @@ from jaxtyping import Float
 import brdf
 from brdf.checks import instance
 from brdf.errors import InputError
-from brdf.models.base import SpecularMaterial
 from brdf.precision import Precision
 from fitting.joint import fit_jointly
 from fitting.problem import model_name, state_problem
@@ -143,23 +141,20 @@ def fit_lights_and_material(
     targets = state_problem([target], [scene], [mask]).targets
     if not scene.lights:
         raise InputError("scene", "has no lights", "Add a [[lights]] table")
-    keys = ["k_a"] * (scene.ambient is not None) + ["k_d"]
-    keys += ["k_s", "n"] * issubclass(brdf.MODELS[name], SpecularMaterial)
-
-    def leaves(material: Any, scenes: Sequence[brdf.Scene]) -> list[Any]:
-        return [*(getattr(material, key) for key in keys), *(light.emittance for light in scenes[0].lights)]
-
     before = _emittances(scene, targets[0].pixels.shape[-1])
-    joint = fit_jointly(targets, _with_emittances(scene, before), name, leaves, mask=mask)
+    # The first light stays what it is, until the mean of all takes its place.
+    free = ["intensity"][: len(scene.lights) - 1]
+    joint = fit_jointly(targets, _with_emittances(scene, before), name, free, mask=mask)
     now = _emittances(joint.scenes[0], before.shape[1])
-    mean = np.divide(now, before, out=np.zeros_like(now), where=before > 0)[: len(scene.lights)].mean(axis=0)
+    factors = np.divide(now, before, out=np.zeros_like(now), where=before > 0)
+    mean = factors[: len(scene.lights)].mean(axis=0)
     scale = np.where(mean > 0, mean, 1.0)
-    scaled = {key: getattr(joint.material, key) * scale for key in {"k_d", "k_s"}.intersection(keys)}
-    material = dataclasses.replace(joint.material, **scaled)
+    k = {key: value * scale if key in ("k_d", "k_s") else value for key, value in vars(joint.material).items()}
+    material = dataclasses.replace(joint.material, **k)
     found = fit_lights(targets[0], scene, material, precision=precision, mask=mask)
     parameters = [
         Parameter(key, channel if value.ndim else None, float(one), None)
-        for key, value in vars(material).items()
+        for key, value in k.items()
         for channel, one in enumerate(np.ravel(value))
     ]
     correlation = np.eye(len(found.correlation) + len(parameters))
