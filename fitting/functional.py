@@ -46,7 +46,7 @@ from brdf.checks import instance
 from brdf.errors import InputError
 from brdf.models.base import SpecularMaterial, check_model
 from brdf.rendering import Basis, basis
-from fitting.solver.nnls import nonnegative_minima, solve_active
+from fitting.solver.nnls import nonnegative_minima
 from fitting.solver.profile import lowest_in_cells
 
 # As a function of log n a lobe varies on a scale of 1 or more; Hermite's cubic over such a cell finds every valley.
@@ -118,12 +118,11 @@ class _Pixels(NamedTuple):
 
 
 class _Point(NamedTuple):
-    """The best coefficients at an exponent, (C, 3); their cost, and its derivatives by log n."""
+    """The best coefficients at an exponent, (C, 3); their cost, and its derivative by log n."""
 
     x: Array
     cost: Array
     slope: Array
-    curvature: Array
 
 
 def fit(
@@ -271,10 +270,10 @@ def solve(
         return lx.linear_solve(operator, right, lx.LU()).value
 
     none = jnp.zeros_like(pixels.diffuse)
-    matt = _point(pixels, (none, none, none), pixels.target, jnp.zeros((channels, 3), dtype)).x
+    matt = _point(pixels, (none, none), pixels.target, jnp.zeros((channels, 3), dtype)).x
     log_n, x = jax.lax.custom_root(optimality, (jnp.zeros((), dtype), matt), search, tangent)
     n, least = jnp.exp(log_n), cost(log_n, x)
-    value, slope, _ = _derivatives(relative, log_n)
+    value, slope = _with_slope(relative, log_n)
     # With k_s itself held, and not k_s relative to the peak.
     held = (log_n <= low) | (log_n >= high)
     error, n_error = _errors(pixels, (value, slope + n * nearest * value), x, least, held)
@@ -286,12 +285,18 @@ def solve(
 def _search(pixels: _Pixels, relative: Callable[[Array], Array], grid: Array, matt: Array) -> tuple[Array, Array]:
     """The logarithm of the best exponent, and the coefficients there."""
 
-    def at(log_n: Array, x: Array) -> _Point:
-        lobes = _derivatives(relative, log_n)
-        return _point(pixels, lobes, pixels.residual(x, lobes[0]), x)
+    def at(log_n: Array, x: Array) -> tuple[Array, Array, _Point]:
+        """The slope of the least cost, its derivative, and more of what is there; told about some coefficients."""
+
+        def slope(log_n: Array) -> tuple[Array, _Point]:
+            lobes = _with_slope(relative, log_n)
+            point = _point(pixels, lobes, pixels.residual(x, lobes[0]), x)
+            return point.slope, point
+
+        return jax.jvp(slope, (log_n,), (jnp.ones_like(log_n),), has_aux=True)
 
     residual = pixels.residual(matt, jnp.zeros_like(pixels.diffuse))
-    profile = jax.lax.map(lambda log_n: _point(pixels, _derivatives(relative, log_n), residual, matt), grid)
+    profile = jax.lax.map(lambda log_n: _point(pixels, _with_slope(relative, log_n), residual, matt), grid)
     position, lowest = lowest_in_cells(grid, profile.cost, profile.slope)
     # What rounding leaves is no valley: of exponents that fit alike the smallest, whose lobe most pixels see.
     lowest = jnp.maximum(lowest, jnp.finfo(lowest.dtype).eps ** 2 * jnp.sum(pixels.target**2))
@@ -299,40 +304,35 @@ def _search(pixels: _Pixels, relative: Callable[[Array], Array], grid: Array, ma
     beside = jnp.pad(lowest, 1, constant_values=jnp.inf)
     valleys = jnp.where((lowest < beside[:-2]) & (lowest <= beside[2:]), lowest, jnp.inf)
     _, best = jax.lax.top_k(-valleys, min(2, lowest.size))
-    points = jax.vmap(at)(position[best], profile.x[best])
-    gain = points.slope**2 / jnp.where(points.curvature > 0, 2 * points.curvature, jnp.inf)
+    found = jax.vmap(at)(position[best], profile.x[best])
+    slope, curvature, points = found
+    gain = slope**2 / jnp.where(curvature > 0, 2 * curvature, jnp.inf)
     first = jnp.argmin(points.cost - gain)
     log_n, width = position[best[first]], grid[1] - grid[0]
     bracket = jnp.maximum(grid[0], log_n - width), jnp.minimum(grid[-1], log_n + width)
 
     def step(state: tuple[Any, ...], _: None) -> tuple[tuple[Any, ...], None]:
-        log_n, (below, above), point = state
-        bracket = jnp.where(point.slope < 0, log_n, below), jnp.where(point.slope > 0, log_n, above)
-        down = -jnp.sign(point.slope) * jnp.where(point.curvature > 0, jnp.abs(point.slope) / point.curvature, width)
+        log_n, (below, above), (slope, curvature, point) = state
+        bracket = jnp.where(slope < 0, log_n, below), jnp.where(slope > 0, log_n, above)
+        down = -jnp.sign(slope) * jnp.where(curvature > 0, jnp.abs(slope) / curvature, width)
         log_n = jnp.clip(log_n + down, *bracket)
         return (log_n, bracket, at(log_n, point.x)), None
 
-    start = log_n, bracket, jax.tree.map(lambda leaf: leaf[first], points)
-    (log_n, _, point), _ = jax.lax.scan(step, start, None, length=STEPS[pixels.target.dtype.name])
+    start = log_n, bracket, jax.tree.map(lambda leaf: leaf[first], found)
+    (log_n, _, (*_, point)), _ = jax.lax.scan(step, start, None, length=STEPS[pixels.target.dtype.name])
     return log_n, point.x
 
 
-def _derivatives(function: Callable[[Array], Array], at: Array) -> tuple[Array, Array, Array]:
-    """A function of one number, and its first two derivatives."""
-
-    def slope(t: Array) -> tuple[Array, Array]:
-        return jax.jvp(function, (t,), (jnp.ones_like(t),))
-
-    (value, first), (_, second) = jax.jvp(slope, (at,), (jnp.ones_like(at),))
-    return value, first, second
+def _with_slope(relative: Callable[[Array], Array], log_n: Array) -> tuple[Array, Array]:
+    return jax.jvp(relative, (log_n,), (jnp.ones_like(log_n),))
 
 
 def _point(pixels: _Pixels, lobes: Sequence[Array], residual: Array, x: Array) -> _Point:
-    """The best coefficients where the columns are ambient, diffuse, and a lobe with its derivatives by log n.
+    """The best coefficients where the columns are ambient, diffuse, and a lobe with its derivative by log n.
 
     Args:
         pixels: what is fitted.
-        lobes: the lobe and two derivatives, (B, P).
+        lobes: the lobe and its derivative, (B, P).
         residual: of the coefficients ``x``, so that rounding scales with what is left and not with the picture.
         x: (C, 3).
     """
@@ -344,13 +344,7 @@ def _point(pixels: _Pixels, lobes: Sequence[Array], residual: Array, x: Array) -
     step = best - x
     pull = product - (step[:, None] @ gram[:, :3])[:, 0]
     cost = jnp.sum(pixels.weight * residual**2, axis=-1) - jnp.sum(step * (product + pull)[:, :3], axis=-1)
-    x_s, active = best[:, 2], best > 0
-    cost, slope = jnp.sum(jnp.maximum(cost, 0)), -2 * jnp.sum(x_s * pull[:, 3])
-    # The Schur complement of the exact Hessian in what is above 0.
-    cross = x_s[:, None] * gram[:, 3, :3] - jnp.array([0, 0, 1]) * pull[:, 3:4]
-    along, _ = solve_active(gram[:, :3, :3], jnp.where(active, cross, 0), active)
-    own = x_s**2 * gram[:, 3, 3] - x_s * pull[:, 4]
-    return _Point(best, cost, slope, 2 * jnp.sum(own - jnp.sum(cross * along, axis=-1)))
+    return _Point(best, jnp.sum(jnp.maximum(cost, 0)), -2 * jnp.sum(best[:, 2] * pull[:, 3]))
 
 
 def _errors(pixels: _Pixels, lobes: Sequence[Array], x: Array, cost: Array, held: Array) -> tuple[Array, Array]:

@@ -32,7 +32,7 @@ from brdf.precision import Precision, working_precision
 from fitting.codes import Rounding
 from fitting.core import fit_pictures
 from fitting.joint_likelihood import Known, by_least_squares, most_likely_numbers
-from fitting.joint_problem import JointProblem, Leaf, joint_problem, linearised, named_leaves
+from fitting.joint_problem import JointProblem, Leaf, degrees_between, joint_problem, linearised, named_leaves
 from fitting.pixels import Observed, observe
 from fitting.problem import CLASSIC, FitProblem, model_name, state_problem
 from fitting.progress import waiting
@@ -278,24 +278,28 @@ def _parameters(
     """
     covariance, deviation = known.errors(held)
     found: list[Parameter] = []
-    free: list[int] = []
+    places: list[int] = []
     for leaf in problem.freed:
         value, own = np.asarray(problem.leaves[leaf.place], np.float64), deviation[leaf.numbers]
         if leaf.is_direction:
-            before, after = (one / np.linalg.norm(one) for one in (np.asarray(given[leaf.place], np.float64), value))
-            turned = float(np.degrees(np.arctan2(np.linalg.norm(np.cross(before, after)), before @ after)))
-            error = float(np.degrees(np.linalg.norm(own)))
-            found.append(_parameter(leaf, None, turned, error, direction=tuple(after.tolist())))
-            free += [-1] * (not found[-1].reason)
-            continue
-        errors = own * value if leaf.name == "n" else own
-        numbers = zip(value.ravel().tolist(), errors.tolist(), held[leaf.numbers].tolist(), strict=True)
-        for index, (one, error, at_bound) in enumerate(numbers):
-            ends = _interval(leaf, one, error)
-            found.append(_parameter(leaf, index if leaf.shape else None, one, error, interval=ends, at_bound=at_bound))
-            free += [leaf.start + index] * (not found[-1].reason and not at_bound)
-    at = np.array(free, int)
-    error = np.sqrt(np.diag(covariance)[at])
+            size, start = np.degrees(np.linalg.norm(own)), np.asarray(given[leaf.place], np.float64)
+            towards = {"direction": tuple((value / np.linalg.norm(value)).tolist())}
+            rows = [(None, degrees_between(start, value), float(size), -1, towards)]
+        else:
+            errors = own * value if leaf.name == "n" else own
+            rows = []
+            for index, (one, error) in enumerate(zip(value.ravel().tolist(), errors.tolist(), strict=True)):
+                place, channel = leaf.start + index, index if leaf.shape else None
+                ends = {"interval": _interval(leaf, one, error), "at_bound": bool(held[place])}
+                rows.append((channel, one, error, place, ends))
+        for channel, one, error, place, further in rows:
+            if not np.isfinite(error):
+                found.append(Parameter(leaf.words, channel, None, error, reason=OPEN))
+                continue
+            found.append(Parameter(leaf.words, channel, one, error, **further))
+            places += [place] * (not found[-1].at_bound)
+    error = np.sqrt(np.diag(covariance)[places])
+    at = np.array(places, int)
     correlation = np.where((at >= 0)[:, None] & (at >= 0), covariance[np.ix_(at, at)] / np.outer(error, error), 0.0)
     np.fill_diagonal(correlation, 1.0)
     return tuple(found), correlation
@@ -305,10 +309,3 @@ def _interval(leaf: Leaf, value: float, error: float) -> tuple[float, float]:
     if leaf.name == "n":
         return value * np.exp(-NORMAL_95 * error / value), value * np.exp(NORMAL_95 * error / value)
     return above_zero(value, error) if leaf.bounded else (value - NORMAL_95 * error, value + NORMAL_95 * error)
-
-
-def _parameter(leaf: Leaf, channel: int | None, value: float, error: float, **named: Any) -> Parameter:
-    """A freed number; without a value where only a combination is determined."""
-    if np.isfinite(error):
-        return Parameter(leaf.words, channel, value, error, **named)
-    return Parameter(leaf.words, channel, None, error, reason=OPEN)

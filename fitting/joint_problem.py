@@ -34,6 +34,11 @@ def turns(direction: Float[Array, "3"]) -> Float[Array, "2 3"]:
     return jnp.stack(perpendicular(normalize(direction))) * norm(direction)
 
 
+def degrees_between(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]) -> float:
+    """The angle between two directions of any length."""
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
+
+
 class Leaf(NamedTuple):
     """A freed leaf of material and scenes.
 

@@ -79,7 +79,7 @@ class LightChoice:
         return f"{shown} brings the error of {self.of} from {self.before:.3g} to {self.after[0]:.3g}"
 
     def plot(self) -> Any:
-        """The hemisphere of lights seen from the camera, coloured by the error that each would leave.
+        """The hemisphere of lights seen from the camera, coloured by the error that each would leave, if it leaves one.
 
         Returns:
             A matplotlib figure.
@@ -92,9 +92,7 @@ class LightChoice:
         figure = Figure(figsize=(4.6, 3.8), layout="constrained")
         axes = figure.subplots()
         tried = np.array([direction_of(light) for light in self.candidates])
-        finite = np.isfinite(self.foretold)
-        colours = axes.scatter(*tried[finite, :2].T, c=self.foretold[finite], cmap="cividis_r", s=45, linewidths=0)
-        axes.scatter(*tried[~finite, :2].T, facecolors="none", edgecolors="0.6", s=20, linewidths=0.5)
+        colours = axes.scatter(*tried[:, :2].T, c=self.foretold, cmap="cividis_r", s=45, linewidths=0)
         for lights, marker, label in ((self.known, "x", "there already"), (self.lights, "*", "chosen")):
             places = [direction_of(light)[:2] for light in lights if isinstance(light, brdf.DirectionalLight)]
             axes.scatter(*np.reshape(places, (-1, 2)).T, marker=marker, s=90, color="#D55E00", label=label)

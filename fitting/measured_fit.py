@@ -29,6 +29,7 @@ from brdf.files import atomic_folder
 from brdf.lobes import Lobe
 from brdf.materials.material_file import material_to_dict
 from brdf.models.base import SpecularMaterial
+from fitting.joint_problem import degrees_between
 from fitting.model_fit import N_RANGE, ModelFit
 from fitting.problem import check_choice, model_name
 from fitting.progress import waiting
@@ -198,8 +199,9 @@ class BrdfFitResult(Parameters):
         index = np.argmax(np.where(counted, table.values.sum(axis=1), -np.inf))
         light, view = table.to_light[index], table.to_view[index]
         ways = {"direction back to the light": light, "mirror direction of the light": light * [-1, -1, 1]}
-        name = min(ways, key=lambda way: _apart(ways[way], view))
-        return f"{_apart(ways[name], view):.2g}° from the {name}, which stands at {_apart(light, _NORMAL):.3g}°"
+        name = min(ways, key=lambda way: degrees_between(ways[way], view))
+        height = degrees_between(light, _NORMAL)
+        return f"{degrees_between(ways[name], view):.2g}° from the {name}, which stands at {height:.3g}°"
 
     def __str__(self) -> str:
         """The report."""
@@ -279,10 +281,6 @@ def _percent(share):
     if share < ROUNDING:
         return f"{100 * ROUNDING:g} %" if share > 0 else "0 %"
     return f"{100 * share:.{2 if share < 0.995 else 3}g} %"
-
-
-def _apart(a, b):
-    return np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
 
 
 def _within(table, max_angle):
