@@ -105,7 +105,7 @@ class _Picture:
 
     Attributes:
         moves: by the name of a cause what a change of size 1 adds to freed numbers, which are called by their leaves,
-            or how it changes what is shown; beside what a light must share with that of another picture to be the same.
+            or to what is shown; beside what a light must share with that of another picture to be the same.
     """
 
     def __init__(self, result: FitResult, index: int, side: float):
@@ -138,8 +138,10 @@ class _Picture:
             for move in self.moves["ball"][1] + self.moves["radius"][1]:
                 for size in (RIM, -RIM):
                     self.counted &= np.asarray(self.moved(move, size)[1].surface_points().mask)
-        self.moves |= {"gamma": (None, [_log]), "black": (None, [lambda shown: shown * 0 + 0.01])}
         self.fitted = self.shown({}, 0.0)
+        logarithm = np.log(np.where(self.fitted > 0, self.fitted, 1.0))
+        self.moves["gamma"] = None, [0.01 * self.fitted * logarithm]
+        self.moves["black"] = None, [np.full(self.fitted.shape, 0.01)]
 
     def moved(self, move: dict[str, Any], size: float) -> tuple[brdf.Material, brdf.Scene]:
         """The material, and these pixels of the scene, with some numbers moved."""
@@ -156,7 +158,7 @@ class _Picture:
     def slopes(self, moves: Sequence[Any]) -> Float[np.ndarray, "K H W C"]:
         """The derivatives of the codes by the sizes of moves."""
         found = [
-            move(self.fitted) if callable(move) else (self.shown(move, STEP) - self.shown(move, -STEP)) / (2 * STEP)
+            (self.shown(move, STEP) - self.shown(move, -STEP)) / (2 * STEP) if isinstance(move, dict) else move
             for move in moves
         ]
         return self.curve(self.fitted) * np.stack(found)
@@ -175,11 +177,6 @@ class _Picture:
 def _leaves(material: brdf.Material, scenes: Sequence[brdf.Scene]) -> list[Any]:
     kinds = "light", "intensity", "ball", "radius"
     return [*jax.tree.leaves(material), *(leaf for kind in kinds for leaf in scene_leaves(kind, scenes[0]))]
-
-
-def _log(values: np.ndarray) -> np.ndarray:
-    """The derivative of a power by per cent, at the power 1."""
-    return 0.01 * values * np.log(np.where(values > 0, values, 1.0))
 
 
 class Residual:

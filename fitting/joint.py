@@ -140,10 +140,11 @@ def fit_jointly(
 
         def solve(start: brdf.Material, scenes: Sequence[brdf.Scene], rounds: int = ROUNDS) -> JointResult:
             problem = joint_problem(brdf.cast((start, list(scenes)), precision), freed)
-            seen = _away_from_outlines(whole, scenes) if problem.moves_outlines else whole
+            moves = any("camera." in leaf.words or "shapes[" in leaf.words for leaf in problem.freed)
+            seen = _away_from_outlines(whole, scenes) if moves else whole
             pictures = [(tile.target, tile.weight) for tile in seen.tiles]
             result = _solve(dataclasses.replace(problem, pictures=pictures), seen, solver, tolerance, max_steps)
-            if rounds > 1 and problem.moves_outlines and not _inside(result.scenes, seen.counted):
+            if rounds > 1 and moves and not _inside(result.scenes, seen.counted):
                 return solve(result.material, result.scenes, rounds - 1)
             return result
 
@@ -202,29 +203,29 @@ def _solve(problem: JointProblem, seen: Observed, solver: str | None, tolerance:
     epsilon = float(jnp.finfo(vector.dtype).eps)
     # Of a smaller step rounding hides what it gains.
     least, unseen = max(tolerance, epsilon**0.5), max(tolerance, epsilon) * float(np.max(seen.brightest))
-    method = SOLVERS[solver](rtol=least, atol=least)
+    # Steps that rounding hides the gains of are tried for ever: it is asked several times.
+    method, most = SOLVERS[solver](rtol=least, atol=least), -(-max_steps // ROUNDS) if solver == "lm" else max_steps
     bounded, held = problem.each(lambda leaf: leaf.bounded), np.zeros(vector.shape, bool)
-    ended = linear = all(leaf.name in EMITTANCES for leaf in problem.freed)
-    steps, converged, residual, columns = 0, False, np.zeros(0), np.zeros((0, 0))
+    linear = all(leaf.name in EMITTANCES for leaf in problem.freed)
+    steps, converged, near, residual, columns = 0, False, linear, np.zeros(0), np.zeros((0, 0))
     for _ in range(ROUNDS):
         if not linear:
             given = problem, vector, jnp.asarray(held)
-            solution = optx.least_squares(_residuals, method, vector, given, max_steps=max_steps, throw=False)
-            steps, ended = steps + int(solution.stats["num_steps"]), solution.result == optx.RESULTS.successful
+            solution = optx.least_squares(_residuals, method, vector, given, max_steps=most, throw=False)
+            steps, near = steps + int(solution.stats["num_steps"]), solution.result == optx.RESULTS.successful
             vector = jnp.where(held, vector, solution.value)
             vector = jnp.where(bounded & (vector < 0), 0, vector)
         residual, columns = (np.asarray(a, np.float64) for a in linearised(problem, vector))
-        if not ended:
-            break
         # Gauss and Newton's step under the bounds goes to the minimum, however little that gains.
         gram, base = columns @ columns.T, np.where(bounded, np.asarray(vector, np.float64), 0.0)
         gram[np.diag_indices_from(gram)] *= 1 + max(DAMPED, 10 * epsilon)
         step = nonnegative_minimum(gram, gram @ base - columns @ residual, ~bounded) - base
-        vector, before = vector + step, held
-        held = bounded & np.asarray(vector == 0)
-        converged = bool(step @ gram @ step <= MET**2 * np.mean(residual**2) + residual.size * unseen**2)
-        if converged and np.array_equal(held, before):
-            break
+        met = step @ gram @ step <= MET**2 * np.mean(residual**2) + residual.size * unseen**2
+        if met or near:
+            vector, before = vector + step, held
+            held = bounded & np.asarray(vector == 0)
+            if converged := bool(met) and np.array_equal(held, before):
+                break
     # Turns from here on are those of what was found.
     problem = problem.at(vector)
     vector = np.asarray(problem.start(), np.float64)
@@ -283,14 +284,14 @@ def _parameters(
         value, own = np.asarray(problem.leaves[leaf.place], np.float64), deviation[leaf.numbers]
         if leaf.is_direction:
             size, start = np.degrees(np.linalg.norm(own)), np.asarray(given[leaf.place], np.float64)
-            towards = {"direction": tuple((value / np.linalg.norm(value)).tolist())}
+            towards: dict[str, Any] = {"direction": tuple((value / np.linalg.norm(value)).tolist())}
             rows = [(None, degrees_between(start, value), float(size), -1, towards)]
         else:
             errors = own * value if leaf.name == "n" else own
-            rows = []
+            rows: list[Any] = []
             for index, (one, error) in enumerate(zip(value.ravel().tolist(), errors.tolist(), strict=True)):
-                place, channel = leaf.start + index, index if leaf.shape else None
-                ends = {"interval": _interval(leaf, one, error), "at_bound": bool(held[place])}
+                place, channel = leaf.numbers.start + index, index if value.ndim else None
+                ends: dict[str, Any] = {"interval": _interval(leaf, one, error), "at_bound": bool(held[place])}
                 rows.append((channel, one, error, place, ends))
         for channel, one, error, place, further in rows:
             if not np.isfinite(error):

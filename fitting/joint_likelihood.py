@@ -99,7 +99,7 @@ def most_likely_numbers(problem: JointProblem, seen: Observed, vector: Float[np.
     at, known, said = maximise(pictures, Estimate(vector, noise))
     said, wider = where_most_is_told(pictures, at, known, said)
     # Copies of a value tell no more of what all channels share.
-    shared = problem.each(lambda leaf: not leaf.bounded or not leaf.shape) & seen.copies
+    shared = problem.each(lambda leaf: not leaf.bounded) & seen.copies
     scatter = pictures.scatter(said) if pictures.lossy else None
     return Known(at.unknowns, said.hessian, scatter, wider * np.sqrt(np.where(shared, seen.colour.size, 1)))
 

@@ -1,8 +1,7 @@
 """What a fit frees: leaves of material and scenes as one vector of numbers, and the pictures that they show.
 
 The numbers of a leaf are its own, but for two: n is searched by its logarithm, and a direction, whose length says
-nothing, by two small turns of it. `fitting.joint` fits them, `fitting.implicit` asks how they move with others, and
-`fitting.light_choice` and `fitting.diagnosis` what pictures tell of them.
+nothing, by two small turns of it.
 """
 
 import math
@@ -26,17 +25,6 @@ NAMED = re.compile(r"(light|intensity|ball|radius)(?: (\d+))?(?: of picture (\d+
 NOT_NEGATIVE = ("k_a", "k_d", "k_s", "intensity", "radiance", "ambient", "attenuation")
 # Values (P, C), and weights (P,), or None where each pixel weighs 1.
 Picture = tuple[Array, Array | None]
-REMEDY = "Return a tuple of leaves, such as (material.n, scenes[0].lights[0].direction)"
-
-
-def turns(direction: Float[Array, "3"]) -> Float[Array, "2 3"]:
-    """Two vectors across a direction, of its length: small turns of it, of an angle of 1."""
-    return jnp.stack(perpendicular(normalize(direction))) * norm(direction)
-
-
-def degrees_between(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]) -> float:
-    """The angle between two directions of any length."""
-    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
 
 
 class Leaf(NamedTuple):
@@ -44,17 +32,18 @@ class Leaf(NamedTuple):
 
     Attributes:
         place: among all leaves.
-        name: of its field.
-        words: what a person calls it.
-        shape: of the leaf.
-        start: where its numbers begin in the vector of all.
+        words: what a person calls it, at the end its field.
+        numbers: its part of the vector of all.
     """
 
     place: int
-    name: str
     words: str
-    shape: tuple[int, ...]
-    start: int
+    numbers: slice
+
+    @property
+    def name(self) -> str:
+        """Of its field."""
+        return self.words.rpartition(".")[2]
 
     @property
     def is_direction(self) -> bool:
@@ -66,11 +55,6 @@ class Leaf(NamedTuple):
         """Whether its numbers may not be negative."""
         return self.name in NOT_NEGATIVE
 
-    @property
-    def numbers(self) -> slice:
-        """Its part of the vector."""
-        return slice(self.start, self.start + (2 if self.is_direction else math.prod(self.shape)))
-
     def of(self, value: Array) -> Array:
         """The numbers of a value: of a direction no turn."""
         if self.is_direction:
@@ -81,7 +65,7 @@ class Leaf(NamedTuple):
         """The value of some numbers; turns are those from the start."""
         if self.is_direction:
             return start + numbers @ turns(start)
-        return (jnp.exp(numbers) if self.name == "n" else numbers).reshape(self.shape)
+        return (jnp.exp(numbers) if self.name == "n" else numbers).reshape(start.shape)
 
 
 class JointProblem(eqx.Module):
@@ -111,12 +95,7 @@ class JointProblem(eqx.Module):
 
     def each(self, of: Callable[[Leaf], bool]) -> Bool[np.ndarray, " U"]:
         """What is so of the leaf that each number belongs to."""
-        return np.concatenate([np.full(leaf.numbers.stop - leaf.start, of(leaf)) for leaf in self.freed])
-
-    @property
-    def moves_outlines(self) -> bool:
-        """Whether pixels may come to see another shape, or none: something of the camera or of a shape is freed."""
-        return any("camera." in leaf.words or "shapes[" in leaf.words for leaf in self.freed)
+        return np.concatenate([np.full(leaf.numbers.stop - leaf.numbers.start, of(leaf)) for leaf in self.freed])
 
     def start(self) -> Array:
         """The freed numbers."""
@@ -124,10 +103,8 @@ class JointProblem(eqx.Module):
 
     def at(self, vector: Array) -> "JointProblem":
         """The problem with other freed numbers; directions turn from there."""
-        leaves = list(self.leaves)
-        for leaf in self.freed:
-            leaves[leaf.place] = leaf.at(leaves[leaf.place], vector[leaf.numbers])
-        return eqx.tree_at(lambda problem: problem.leaves, self, leaves)
+        moved = [leaf.at(self.leaves[leaf.place], vector[leaf.numbers]) for leaf in self.freed]
+        return eqx.tree_at(lambda problem: [problem.leaves[leaf.place] for leaf in self.freed], self, moved)
 
     def content(self) -> tuple[brdf.Material, list[brdf.Scene]]:
         """Material and scenes."""
@@ -153,8 +130,18 @@ def residuals(material: brdf.Material, scenes: Sequence[brdf.Scene], pictures: S
 @eqx.filter_jit
 def linearised(problem: JointProblem, vector: Array) -> tuple[Array, Array]:
     """The residuals (N,) and their derivatives (U, N), one column of the Jacobian at a time."""
-    residuals, along = jax.linearize(problem.residuals, vector)
-    return residuals, jax.lax.map(along, jnp.eye(vector.size))
+    found, along = jax.linearize(problem.residuals, vector)
+    return found, jax.lax.map(along, jnp.eye(vector.size))
+
+
+def turns(direction: Float[Array, "3"]) -> Float[Array, "2 3"]:
+    """Two vectors across a direction, of its length: small turns of it, of an angle of 1."""
+    return jnp.stack(perpendicular(normalize(direction))) * norm(direction)
+
+
+def degrees_between(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]) -> float:
+    """The angle between two directions of any length."""
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
 
 
 def joint_problem(
@@ -171,72 +158,73 @@ def joint_problem(
         InputError: where ``free`` does not name distinct leaves.
     """
     start = jax.tree.map(jnp.array, start)
+    remedy = "Return a tuple of leaves, such as (material.n, scenes[0].lights[0].direction)"
     try:
         asked = [id(leaf) for leaf in free(*start)]  # pyright: ignore[reportOptionalCall]  # None is refused below
     except (TypeError, AttributeError, IndexError) as error:
-        raise InputError("free", f"gives no tuple of leaves ({error})", REMEDY) from None
-    if not asked:
-        raise InputError("free", "names no leaf", "Return the leaves to fit")
+        raise InputError("free", f"gives no tuple of leaves ({error})", remedy) from None
     paths, shape = jax.tree_util.tree_flatten_with_path(start)
     own = {
-        id(leaf): (place, getattr(path[-1], "name", ""), _words(path, len(start[1])), leaf.shape)
+        id(leaf): (place, _words(path, len(start[1])), leaf.size)
         for place, (path, leaf) in enumerate(paths)
         if jnp.issubdtype(leaf.dtype, jnp.floating)
     }
-    if not own.keys() >= set(asked):
-        raise InputError("free", "gives what is no number of material or scenes as a whole", REMEDY)
-    if len(set(asked)) < len(asked):
-        raise InputError("free", "gives a leaf twice", REMEDY)
-    freed: list[Leaf] = []
-    for leaf in asked:
-        freed.append(Leaf(*own[leaf], start=freed[-1].numbers.stop if freed else 0))
+    for fails, came in (
+        (not asked, "names no leaf"),
+        (not own.keys() >= set(asked), "gives what is no number of material or scenes as a whole"),
+        (len(set(asked)) < len(asked), "gives a leaf twice"),
+    ):
+        if fails:
+            raise InputError("free", came, remedy)
+    freed, begin = [], 0
+    for place, words, size in map(own.__getitem__, asked):
+        end = begin + (2 if words.endswith(".direction") else size)
+        freed.append(Leaf(place, words, slice(begin, end)))
+        begin = end
     return JointProblem([leaf for _, leaf in paths], shape, tuple(freed), pictures)
 
 
-def _words(path: Sequence[Any], scenes: int) -> str:
+def _words(path: tuple[Any, ...], scenes: int) -> str:
     """What a person calls a leaf: n, lights[0].direction, or scenes[1].ambient where there are several."""
-    words = jax.tree_util.keystr(tuple(path[1:]))  # without the number that says material or scenes
-    if path[0].idx == 1:
-        words = f"scenes{words}" if scenes > 1 else words.partition("]")[2]
-    return words.removeprefix(".")
+    words = jax.tree_util.keystr(path).replace("[1]", "scenes", 1) if path[0].idx else path[-1].name
+    return words if scenes > 1 else words.removeprefix("scenes[0].")
 
 
 def named_leaves(names: Sequence[str]) -> Callable[[Any, list[brdf.Scene]], list[Any]]:
     """The leaves of causes that a diagnosis names, after those of the material."""
-    asked = {str(name): NAMED.fullmatch(str(name)) for name in names}
-    for name, match in asked.items():
-        if match is None:
-            words = "Name light, intensity, ball or radius, or one of them as the diagnosis does"
-            raise InputError("free", f"names {name!r}, which is no number of a scene", words)
+    asked = [NAMED.fullmatch(str(name)) for name in names]
+    if None in asked:
+        words = "Name light, intensity, ball or radius, or one of them as the diagnosis does"
+        raise InputError("free", f"names {names[asked.index(None)]!r}, which is no number of a scene", words)
 
     def leaves(material: Any, scenes: list[brdf.Scene]) -> list[Any]:
         found = [material.k_d] if any(scene.lights for scene in scenes) else []
         found += [material.k_a] if any(scene.ambient is not None for scene in scenes) else []
         found += [material.k_s, material.n] if np.any(getattr(material, "k_s", 0.0)) else []
-        for name, match in asked.items():
-            assert match is not None
+        for match in filter(None, asked):
             index, picture = (None if part is None else int(part) for part in match.groups()[1:])
-            own: list[Any] = []
-            for place, scene in enumerate(scenes):
-                some = scene_leaves(match[1], scene, index) if picture in (None, place) else []
-                # The first light's intensity is the unit of the material.
-                is_unit = place == 0 and index is None and match[1] == "intensity"
-                own += some[1:] if is_unit else some
-            if not own:
+            # Of all intensities that of the first light is the unit of the material.
+            shown = scenes if picture is None else scenes[picture : picture + 1]
+            own = [leaf for scene in shown for leaf in scene_leaves(match[1], scene, index)]
+            is_unit = match[1] == "intensity" and index is None and not picture
+            if not own[is_unit:]:
                 remedy = "Free what they have; the first light's intensity is the unit of the material"
-                raise InputError("free", f"names {name!r}, which is not in the scenes: light is a direction", remedy)
-            found += own
+                raise InputError(
+                    "free", f"names {match[0]!r}, which is not in the scenes: light is a direction", remedy
+                )
+            found += own[is_unit:]
         return found
 
     return leaves
 
 
 def scene_leaves(kind: str, scene: brdf.Scene, index: int | None = None) -> list[Any]:
-    """Those of a kind of cause: "light", "intensity", "ball" or "radius"; of one light or of all."""
+    """Those of a kind of cause; of one light or of all."""
     lights: list[Any] = [light for place, light in enumerate(scene.lights) if index in (None, place)]
     spheres: list[Any] = [shape for shape in scene.shapes if isinstance(shape, brdf.Sphere) and shape.fitted]
-    if kind == "light":
-        return [light.direction for light in lights if isinstance(light, brdf.DirectionalLight)]
-    if kind == "intensity":
-        return [light.emittance for light in lights]
-    return [sphere.center if kind == "ball" else sphere.radius for sphere in spheres]
+    return {
+        "light": [light.direction for light in lights if isinstance(light, brdf.DirectionalLight)],
+        "intensity": [light.emittance for light in lights],
+        "ball": [sphere.center for sphere in spheres],
+        "radius": [sphere.radius for sphere in spheres],
+    }[kind]
