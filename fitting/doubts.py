@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import brdf
-from brdf.images.encoding import Encoding, decode, encode
+from brdf.images.encoding import decode, encode
 from fitting.model_fit import ModelFit
 from fitting.pixels import FLAT, Observed
 from fitting.solver.devices import device_count
@@ -51,16 +51,22 @@ def doubts(
             f"k_d is {np.max(material.k_d):.3g}, and a surface reflects no more than 1: are the picture and the "
             "light's intensity in one unit? Values of 0 to 255 want dividing by 255, dim lights their true intensity"
         )
-    yield from _field_of_view(seen.scenes, fit.residual)
+    cameras = [scene.camera for scene in seen.scenes if isinstance(scene.camera, brdf.PerspectiveCamera)]
+    narrow = [float(camera.fov) for camera in cameras if camera.fov <= RADIANS]
+    if narrow and fit.residual > BADLY:
+        yield (
+            f"the camera's field of view is {narrow[0]:.3g} degrees, and the fit is poor: if these are radians, give "
+            f"fov={np.degrees(narrow[0]):.4g}"
+        )
     if _all(seen, lambda values: len(values) > 1 and values == values[0]) and _shaded(fit.pictures):
         yield (
             "the picture is the same in every pixel, under light that is not: is it the one that was meant? "
             "Numbers from it say nothing of the surface"
         )
     if fit.residual > MUCH:
-        shown = list(_counted_values(seen))
-        varies = sum(float(np.sum((values - values.mean(axis=0)) ** 2, dtype=np.float64)) for values in shown)
-        total = sum(float(np.sum(values**2, dtype=np.float64)) for values in shown)
+        shown = [values.astype(np.float64) for values in _counted_values(seen)]
+        varies = sum(len(values) * np.sum(np.var(values, axis=0)) for values in shown)
+        total = sum(np.sum(values**2) for values in shown)
         if fit.residual**2 * total > NOISE * varies and not any(map(_follows_light, fit.pictures)):
             yield (
                 "light and shape explain nothing of what varies in the picture, which may be noise: is it a picture of "
@@ -87,33 +93,16 @@ def _counted_values(seen: Observed, most: int | None = None) -> Iterator[np.ndar
         yield np.take(image.reshape(-1, image.shape[-1]), index[::step], axis=0)
 
 
-def _field_of_view(scenes: Sequence[brdf.Scene], residual: float) -> Iterator[str]:
-    for scene in scenes:
-        camera = scene.camera
-        if isinstance(camera, brdf.PerspectiveCamera) and camera.fov <= RADIANS and residual > BADLY:
-            fov = float(camera.fov)
-            yield (
-                f"the camera's field of view is {fov:.3g} degrees, and the fit is poor: if these are radians, give "
-                f"fov={np.degrees(fov):.4g}"
-            )
-            return
-
-
 def _shaded(pictures: Sequence[Picture]) -> bool:
     """Whether light falls unevenly on what counts."""
-    for picture in pictures:
-        counts = picture.counts
-        light = np.asarray(picture.diffuse)[counts]
-        if light.size and np.max(np.ptp(light, axis=0)) > FLAT * np.max(light):
-            return True
-    return False
+    lights = (np.asarray(picture.diffuse)[picture.counts] for picture in pictures)
+    return any(light.size and np.max(np.ptp(light, axis=0)) > FLAT * np.max(light) for light in lights)
 
 
 def _follows_light(picture: Picture) -> bool:
     """Whether what counts varies with the light that falls on it, or that does not vary."""
-    counts = picture.counts
-    light, value = (np.asarray(part)[counts].mean(axis=1, dtype=float) for part in (picture.diffuse, picture.target))
-    light, value = light - light.mean(), value - value.mean()
+    parts = (np.asarray(part)[picture.counts].mean(axis=1, dtype=float) for part in (picture.diffuse, picture.target))
+    light, value = (part - part.mean() for part in parts)
     return bool((light @ value) ** 2 >= (1 - NOISE) * (light @ light) * (value @ value))
 
 
@@ -123,27 +112,19 @@ def _is_encoded(fit: ModelFit, seen: Observed, refit: Callable[..., ModelFit]) -
     A highlight is allowed under both, as the wrong encoding may have hidden one.
     """
     model = brdf.BlinnPhong if seen.problem.model == "auto" and fit.model is brdf.Lambert else fit.model
-    decoded = []
+    as_given, pictures, decoded = fit if model is fit.model else refit(model, seen), None, []
     for tile in seen.tiles:
         values = decode(np.clip(np.asarray(tile.target, np.float32), 0.0, None), "srgb")
         decoded.append(tile._replace(target=jnp.asarray(values, tile.target.dtype), bounds=None))
-    as_given = _left(fit if model is fit.model else refit(model, seen), seen, "linear")
-    pictures = None
     if seen.problem.sample_errors and model is fit.model:
         # Lobes of many light samples are not made anew for a doubt.
         pairs = zip(fit.pictures, decoded, strict=True)
         pictures = [dataclasses.replace(picture, target=tile.target, bounds=None) for picture, tile in pairs]
-    as_srgb = _left(refit(model, seen._replace(tiles=decoded), pictures=pictures), seen, "srgb")
-    share = sum(np.sum(one.values**2) for one in as_srgb) / sum(np.sum(one.values**2) for one in as_given)
-    together, chance = shared([over_blocks(one, SIZES[0]) for one in as_srgb])
+    as_srgb, left = refit(model, seen._replace(tiles=decoded), pictures=pictures), []
+    for picture, tile, width in zip(as_srgb.pictures, seen.tiles, seen.widths, strict=True):
+        shown = encode(picture.shown(as_srgb.optimum.n, as_srgb.optimum.x).astype(np.float64), "srgb")
+        errors = np.where(np.asarray(picture.weights) > 0, np.asarray(tile.target) - shown, 0.0)
+        left.append(over_blocks(Errors(errors, np.arange(len(errors)), width), SIZES[0]))
+    share = sum(np.sum(grid.squares) for grid in left) / np.sum(as_given.optimum.cost)
+    together, chance = shared(left)
     return bool(share < CLEARLY or (share < LESS and together < CHANCE * chance))
-
-
-def _left(fit: ModelFit, seen: Observed, encoding: Encoding) -> list[Errors]:
-    """By how much a fit misses the values that were given."""
-    found = []
-    for picture, tile, width in zip(fit.pictures, seen.tiles, seen.widths, strict=True):
-        shown = picture.shown(fit.optimum.n, fit.optimum.x).astype(np.float64)
-        left = np.where(np.asarray(picture.weights) > 0, np.asarray(tile.target) - encode(shown, encoding), 0.0)
-        found.append(Errors(left, np.arange(len(left)), width))
-    return found
