@@ -105,7 +105,7 @@ class _Picture:
 
     Attributes:
         moves: by the name of a cause what a change of size 1 adds to freed numbers, which are called by their leaves,
-            or to what is shown; beside what a light must share with that of another picture to be the same.
+            or to what is shown.
     """
 
     def __init__(self, result: FitResult, index: int, side: float):
@@ -116,15 +116,14 @@ class _Picture:
         self._pixel, finite = np.arange(counted.size).reshape(counted.shape)[some], np.isfinite(target[some])
         self.counted, self.target = counted[some] & np.all(finite, axis=-1), np.where(finite, target[some], 0.0)
         several = max(len(scene.lights) for scene in result.scenes) > 1
-        self.moves: dict[str, tuple[Any, Sequence[Any]]] = {}
+        one_of = f" of picture {index}" if len(result.scenes) > 1 else ""
+        self.moves: dict[str, Sequence[Any]] = {}
         for place, light in enumerate(self.scene.lights):
-            which, leaf = f" {place}" if several else "", f"lights[{place}]"
-            own = type(light), *np.ravel(getattr(light, "direction", 0.0))
+            which, leaf = (f" {place}" if several else "") + one_of, f"lights[{place}]"
             if isinstance(light, brdf.DirectionalLight):
-                turns = math.radians(1) * np.eye(2)
-                self.moves[f"light{which}"] = own, [{f"{leaf}.direction": turn} for turn in turns]
+                self.moves[f"light{which}"] = [{f"{leaf}.direction": turn} for turn in math.radians(1) * np.eye(2)]
             field = "intensity" if "intensity" in vars(light) else "radiance"
-            self.moves[f"intensity{which}"] = own, [{f"{leaf}.{field}": np.asarray(light.emittance) / 100}]
+            self.moves[f"intensity{which}"] = [{f"{leaf}.{field}": np.asarray(light.emittance) / 100}]
         camera, shapes = self.scene.camera, self.scene.shapes
         if camera is not None and len(shapes) == 1 and isinstance(shapes[0], brdf.Sphere):
             width, height = camera.resolution
@@ -132,16 +131,16 @@ class _Picture:
             origin, direction = (np.asarray(part, np.float64) for part in rays)
             far = origin + direction * np.linalg.norm(np.asarray(shapes[0].center) - np.asarray(camera.position))
             pixels = far[1:] - far[0]
-            self.moves["ball"] = None, [{"shapes[0].center": pixel} for pixel in pixels]
-            self.moves["radius"] = None, [{"shapes[0].radius": np.linalg.norm(pixels[0])}]
+            self.moves["ball"] = [{"shapes[0].center": pixel} for pixel in pixels]
+            self.moves["radius"] = [{"shapes[0].radius": np.linalg.norm(pixels[0])}]
             # Pixels that a step of the circle would move beside the ball.
-            for move in self.moves["ball"][1] + self.moves["radius"][1]:
+            for move in (*self.moves["ball"], *self.moves["radius"]):
                 for size in (RIM, -RIM):
                     self.counted &= np.asarray(self.moved(move, size)[1].surface_points().mask)
         self.fitted = self.shown({}, 0.0)
         logarithm = np.log(np.where(self.fitted > 0, self.fitted, 1.0))
-        self.moves["gamma"] = None, [0.01 * self.fitted * logarithm]
-        self.moves["black"] = None, [np.full(self.fitted.shape, 0.01)]
+        self.moves["gamma"] = [0.01 * self.fitted * logarithm]
+        self.moves["black"] = [np.full(self.fitted.shape, 0.01)]
 
     def moved(self, move: dict[str, Any], size: float) -> tuple[brdf.Material, brdf.Scene]:
         """The material, and these pixels of the scene, with some numbers moved."""
@@ -217,13 +216,12 @@ class Residual:
 
     def tests(self) -> Iterator[_Test]:
         """Each cause that the scenes determine, as large as it explains most."""
-        for name, places in self._changes():
+        for name in dict.fromkeys(name for picture in self.pictures for name in picture.moves):
             unit, remedy, most = KINDS[name.split()[0]]
-            key = name.partition(" of ")[0]
-            ways = len(self.pictures[places[0]].moves[key][1])
+            ways = max(len(picture.moves.get(name, ())) for picture in self.pictures)
             slopes = [
-                picture.slopes(picture.moves[key][1]) if index in places else np.zeros((ways, *picture.target.shape))
-                for index, picture in enumerate(self.pictures)
+                picture.slopes(picture.moves.get(name, [np.zeros(picture.target.shape)] * ways))
+                for picture in self.pictures
             ]
             columns = np.array([left for left in map(self._unfollowed, self._flat(slopes)) if np.any(left)]).T
             if not columns.size:
@@ -241,15 +239,6 @@ class Residual:
                 size = float(size[0]) if len(size) == 1 else length
                 share = min(gain / max(self.excess, gain), 1.0)
                 yield _Test(Cause(name, size, error, unit, share, remedy), columns, gain, inflation)
-
-    def _changes(self) -> Iterator[tuple[str, list[int]]]:
-        """The names of causes, and the pictures of each: a light that is the same in all that have it is one."""
-        for name in dict.fromkeys(name for picture in self.pictures for name in picture.moves):
-            having = [place for place, picture in enumerate(self.pictures) if name in picture.moves]
-            same = len({self.pictures[place].moves[name][0] for place in having}) == 1
-            for places in [having] if same else [[place] for place in having]:
-                whole = len(places) == len(self.pictures)
-                yield name if whole else f"{name} of picture {places[0]}", places
 
     def mirrored(self) -> Iterator[_Test]:
         """Whether the pictures show the scenes mirrored."""
