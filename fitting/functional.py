@@ -187,7 +187,7 @@ def fit_basis(
         n_range: bounds of the exponent.
     """
     diffuse = jnp.zeros((weight.size, 1), target.dtype) if images.diffuse is None else images.diffuse
-    lobe, peak = images.lobe, None
+    lobe, peak = images.lobe, jnp.zeros(())
     if lobe is not None:
         peak = jnp.max(jnp.where(weight > 0, lobe.peak, -jnp.inf))
         lobe = eqx.Partial(lambda lobe, n: lobe(n)[0], lobe)
@@ -205,7 +205,7 @@ def solve(
     ambient: Float[ArrayLike, " Ca"] = 0.0,
     weight: Float[ArrayLike, " P"] | None = None,
     n_range: tuple[float, float] = (0.1, 1e6),
-    peak: Float[ArrayLike, ""] | None = None,
+    peak: Float[ArrayLike, ""] = 0.0,
 ) -> Solution:
     """The optimum of ``target ~ k_a ambient + k_d diffuse + k_s lobe(n)``, all k at least 0.
 
@@ -217,7 +217,7 @@ def solve(
         weight: of each squared residual; None for 1.
         n_range: bounds of the exponent, numbers.
         peak: the largest logarithm of the lobe's cosine in any pixel, so that exponents that no pixel sees are left
-            out; None for 0, a highlight whose centre is seen.
+            out; 0 for a highlight whose centre is seen.
 
     Returns:
         The optimum; differentiable in all arrays, those that ``lobe`` closes over too.
@@ -234,14 +234,11 @@ def solve(
     dtype, (count, channels) = target.dtype, target.shape
     weight = jnp.ones(count, dtype) if weight is None else jnp.asarray(weight, dtype)
     ambient = jnp.broadcast_to(jnp.asarray(ambient, dtype), (channels,))
-    low, high = (jnp.asarray(math.log(bound), dtype) for bound in n_range)
-    nearest, seen = jnp.zeros((), dtype), True
-    if peak is not None:
-        nearest = jax.lax.stop_gradient(jnp.minimum(jnp.asarray(peak, dtype), 0))
-        high = jnp.log(UNSEEN / jnp.maximum(-nearest, UNSEEN / n_range[1]))
-        # Else no exponent is seen, and there is no lobe.
-        seen, high = high >= low, jnp.maximum(low, high)
-    free = jnp.stack([ambient > 0, *jnp.broadcast_arrays(True, seen, ambient)[:2]], axis=-1)
+    nearest = jax.lax.stop_gradient(jnp.minimum(jnp.asarray(peak, dtype), 0))
+    low, high = jnp.asarray(math.log(n_range[0]), dtype), jnp.log(UNSEEN / jnp.maximum(-nearest, UNSEEN / n_range[1]))
+    # Where high is below low no exponent is seen, and there is no lobe.
+    free = jnp.stack(jnp.broadcast_arrays(ambient > 0, True, high >= low), axis=-1)
+    high = jnp.maximum(low, high)
     pixels = _Pixels(jnp.where(weight > 0, target.T, 0), jnp.asarray(diffuse, dtype).T, weight, free)
     cells = max(1, math.ceil(math.log(n_range[1] / n_range[0]) / GRID_STEP))
 

@@ -255,11 +255,9 @@ def _scene(result: FitResult, index: int) -> tuple[brdf.Scene, np.ndarray]:
 def _cap(middle: np.ndarray, size: float, count: int) -> list[np.ndarray]:
     """Evenly spread directions around another one, up to an angle from it: Vogel's spiral, of equal areas."""
     height = 1 - (1 - np.cos(size)) * (np.arange(count) + 0.5) / count
-    angle = np.arange(count) * np.pi * (3 - np.sqrt(5))
-    radius = np.sqrt(1 - height**2)
-    across = np.linalg.svd(middle[None])[2][1:]
-    around = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1) @ across
-    return list(height[:, None] * middle / np.linalg.norm(middle) + around)
+    around = np.sqrt(1 - height**2) * np.exp(1j * np.pi * (3 - np.sqrt(5)) * np.arange(count))
+    axes = np.vstack([middle / np.linalg.norm(middle), np.linalg.svd(middle[None])[2][1:]])
+    return list(np.stack([height, around.real, around.imag], axis=1) @ axes)
 
 
 @eqx.filter_jit

@@ -107,8 +107,8 @@ def fit_many(
     Args:
         pictures: (N, H, W, C) linear values, or a list of what `fitting.fit` takes.
         scenes: one scene that all show, or a list of one for each.
-        model: the name of a model: then all are fitted together. "auto" compares models for each picture, one by one,
-            when its result is asked for.
+        model: the name of a model: then all are fitted together. "auto" compares models for each picture, one by
+            one.
         precision: "float32" or "float64".
         mask: (H, W), pixels to look at in every picture, or a list of one for each.
         n_range: bounds of the exponent.

@@ -40,7 +40,7 @@ def test_one_scene_for_all():
 
 
 def test_scenes_of_their_own_masks_and_a_normalised_model():
-    # Two groups of scenes of one structure, of two each: they share a program.
+    # Those of a structure of their own, point lights, are fitted by themselves.
     lights = [brdf.DirectionalLight(direction=[x, 0.4, 0.8], intensity=[1.0, 0.8, 0.6]) for x in (-1, -0.5, 0.5, 1)]
     lights[1:3] = [brdf.PointLight(position=[x, 2, 3], intensity=[10.0, 8.0, 6.0]) for x in (-1, 1)]
     scenes = [ball_scene(light) for light in lights]
