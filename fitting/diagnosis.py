@@ -14,6 +14,7 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,7 +24,7 @@ import brdf
 from brdf.images.encoding import encode
 from brdf.precision import working_precision
 from fitting.core import picture_of
-from fitting.joint_problem import joint_problem, scene_leaves
+from fitting.joint_problem import JointProblem, joint_problem, scene_leaves
 from fitting.pixels import Tile
 from fitting.result import Cause, FitResult
 from fitting.solver.profile import search
@@ -147,7 +148,7 @@ class _Picture:
         vector = np.array(self._problem.start())
         for leaf in self._problem.freed:
             vector[leaf.numbers] += size * move.get(leaf.words, 0.0)
-        material, (scene,) = self._problem.at(jnp.asarray(vector)).content()
+        material, (scene,) = _content(self._problem, vector)
         return material, brdf.some_pixels(scene, self._pixel, precision="float64")
 
     def shown(self, move: dict[str, Any], size: float) -> Float[np.ndarray, "H W C"]:
@@ -171,6 +172,11 @@ class _Picture:
     def curve(self, values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
         """The derivative of the codes by the values."""
         return (self.codes(values + CURVED) - self.codes(values - CURVED)) / (2 * CURVED)
+
+
+@eqx.filter_jit
+def _content(problem: JointProblem, vector: Any) -> Any:
+    return problem.at(vector).content()
 
 
 def _leaves(material: brdf.Material, scenes: Sequence[brdf.Scene]) -> list[Any]:
