@@ -40,6 +40,7 @@ from fitting.report import FitResult
 from fitting.result import Parameter
 from fitting.solver.nnls import nonnegative_minimum
 from fitting.uncertainty.intervals import NORMAL_95, above_zero
+from fitting.uncertainty.noise_model import value_variance
 from fitting.uncertainty.residual import NEGLIGIBLE, Neighbours, neighbours_of, structure_warning
 
 SOLVERS: dict[str, Any] = {"lm": optx.LevenbergMarquardt, "bfgs": optx.BFGS}
@@ -233,41 +234,35 @@ def _solve(problem: JointProblem, seen: Observed, solver: str | None, tolerance:
     if known is not None:
         problem, held = problem.at(jnp.asarray(known.vector)), bounded & (known.vector == 0)
         residual = np.asarray(problem.residuals(problem.start()), np.float64)
-    parts = problem.by_picture(residual)
-    residuals = [part.reshape(shown.shape) for part, shown in zip(parts, seen.shown, strict=True)]
+    counts = np.concatenate([counted.ravel() for counted in seen.counted])
+    left = residual.reshape(counts.size, -1)[counts]
+    told = np.concatenate([np.asarray(target, np.float64) for target, _ in problem.pictures])[counts]
+    squares = np.sum(left**2, axis=0)
+    noise = np.sqrt(squares / max(len(left) - vector.size / squares.size, 1))
+    share = float(np.sum(squares) / max(np.sum(told**2), TINY)) ** 0.5
+    images = map(np.reshape, problem.by_picture(residual), (shown.shape for shown in seen.shown))
+    neighbours = neighbours_of(list(images)) if share > NEGLIGIBLE else Neighbours()
+    if known is None:
+        variance = value_variance(left, told + left, noise)
+        known = by_least_squares(vector, columns, counts, variance, copies=seen.copies)
     material, scenes = jax.tree.map(np.asarray, problem.content())
-    warnings = [] if converged else [f"the solver stopped after {steps} steps without an end: raise max_steps"]
-    left = _left_over(seen, residuals, vector.size, warnings)
-    known = known or by_least_squares(problem, seen, vector, residual, columns, left["noise"])
     given = jax.tree.leaves((material, seen.problem.scenes))
     parameters, correlation = _parameters(problem, given, known, held)
+    warnings = () if converged else (f"the solver stopped after {steps} steps without an end: raise max_steps",)
     return JointResult(
-        **left | {"scenes": scenes},
+        **seen.told() | {"scenes": scenes},
         material=material,
         parameters=parameters,
         correlation=correlation,
+        noise=noise,
+        structure=neighbours.correlation,
+        residual=share,
+        pixels=len(left),
+        warnings=(*warnings, *structure_warning(neighbours)),
         steps=steps,
-        converged=bool(converged),
+        converged=converged,
         solver=solver,
     )
-
-
-def _left_over(
-    seen: Observed, residuals: Sequence[Float[np.ndarray, "H W C"]], unknowns: int, warnings: list[str]
-) -> dict[str, Any]:
-    """What a `FitResult` says of the pictures and of what a fit leaves of them, 0 where a pixel does not count."""
-    squares = np.sum([np.sum(np.square(residual), axis=(0, 1)) for residual in residuals], axis=0)
-    told = [np.asarray(shown, np.float64)[counted] for shown, counted in zip(seen.shown, seen.counted, strict=True)]
-    pixels = sum(map(len, told))
-    share = (float(np.sum(squares)) / max(sum(float(np.sum(values**2)) for values in told), TINY)) ** 0.5
-    known = neighbours_of(residuals) if share > NEGLIGIBLE else Neighbours()
-    return seen.told() | {
-        "noise": np.sqrt(squares / max(pixels - unknowns / squares.size, 1)),
-        "structure": known.correlation,
-        "residual": share,
-        "pixels": pixels,
-        "warnings": (*warnings, *structure_warning(known)),
-    }
 
 
 def _parameters(

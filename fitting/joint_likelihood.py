@@ -19,7 +19,6 @@ from fitting.likelihood import Bounds, Intervals, residual_deviation
 from fitting.maximum_likelihood import FIRST_NOISE, alike
 from fitting.pixels import Observed
 from fitting.solver.nnls import inverse_diagonal, scaled_inverse
-from fitting.uncertainty.noise_model import value_variance
 from fitting.uncertainty.structure import Errors, block_scatter
 
 # Of the largest eigenvalue of the normal equations: a smaller one determines nothing.
@@ -60,23 +59,28 @@ class Known(NamedTuple):
 
 
 def by_least_squares(
-    problem: JointProblem,
-    seen: Observed,
     vector: Float[np.ndarray, " U"],
-    residual: Float[np.ndarray, " N"],
     columns: Float[np.ndarray, "U N"],
-    noise: Float[np.ndarray, " C"],
+    counts: Bool[np.ndarray, " P"],
+    variance: Float[np.ndarray, "K C"],
+    *,
+    copies: bool,
 ) -> Known:
-    """What is known where each channel has its noise, which may grow with brightness."""
-    counts = np.concatenate([counted.ravel() for counted in seen.counted])
-    own = residual.reshape(counts.size, -1)[counts]
-    told = np.concatenate([np.asarray(target, np.float64) for target, _ in problem.pictures])[counts]
-    variance = np.zeros((counts.size, noise.size))
-    variance[counts] = value_variance(own, told + own, noise)
-    moves = columns.reshape(len(columns), *variance.shape)
-    if seen.copies:  # they err together
-        moves, variance = moves.sum(axis=2, keepdims=True), variance[:, :1]
-    scatter = np.einsum("upc,vpc->uv", moves * variance, moves, optimize=True)
+    """What is known of numbers by least squares.
+
+    Args:
+        vector: the numbers.
+        columns: derivatives of the residuals by them.
+        counts: which pixels count.
+        variance: of the values of those that do.
+        copies: the channels are copies of each other, and err together.
+    """
+    every = np.zeros((counts.size, variance.shape[1]))
+    every[counts] = variance
+    moves = columns.reshape(len(columns), *every.shape)
+    if copies:
+        moves, every = moves.sum(axis=2, keepdims=True), every[:, :1]
+    scatter = np.einsum("upc,vpc->uv", moves * every, moves, optimize=True)
     return Known(vector, columns @ columns.T, scatter)
 
 
