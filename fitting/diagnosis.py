@@ -129,7 +129,7 @@ class _Picture:
         if camera is not None and len(shapes) == 1 and isinstance(shapes[0], brdf.Sphere):
             width, height = camera.resolution
             rays = camera.rays(np.array([0.0, 1.0, 0.0]) + width / 2, np.array([0.0, 0.0, 1.0]) + height / 2)
-            origin, direction = (np.asarray(part, np.float64) for part in rays)
+            origin, direction = (np.asarray(part.stacked(), np.float64) for part in rays)
             far = origin + direction * np.linalg.norm(np.asarray(shapes[0].center) - np.asarray(camera.position))
             pixels = far[1:] - far[0]
             self.moves["ball"] = [{"shapes[0].center": pixel} for pixel in pixels]

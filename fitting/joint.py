@@ -296,7 +296,8 @@ def _parameters(
             places += [place] * (not found[-1].at_bound)
     error = np.sqrt(np.diag(covariance)[places])
     at = np.array(places, int)
-    correlation = np.where((at >= 0)[:, None] & (at >= 0), covariance[np.ix_(at, at)] / np.outer(error, error), 0.0)
+    both, unit = (at >= 0)[:, None] & (at >= 0), np.outer(error, error)
+    correlation = np.divide(covariance[np.ix_(at, at)], unit, out=np.zeros_like(unit), where=both & (unit > 0))
     np.fill_diagonal(correlation, 1.0)
     return tuple(found), correlation
 

@@ -304,14 +304,18 @@ def shader(model: type[Material], declarations: str) -> str:
 
 
 def _glsl(material, name):
+    def number(value):
+        text = f"{value:.9g}"
+        return text if "." in text or "e" in text else f"{text}.0"
+
     constants = [
-        f"const vec3 BRDF_{key.upper()} = vec3({', '.join(map(repr, _rgb(getattr(material, key)).tolist()))});"
+        f"const vec3 BRDF_{key.upper()} = vec3({', '.join(map(number, _rgb(getattr(material, key))))});"
         for key in ("k_a", "k_d", "k_s")
         if hasattr(material, key)
     ]
     if isinstance(material, SpecularMaterial):
-        constants.append(f"const float BRDF_N = {float(material.n)!r};")
-        constants.append(f"const float BRDF_SCALE = {height(material)!r};")
+        constants.append(f"const float BRDF_N = {number(float(material.n))};")
+        constants.append(f"const float BRDF_SCALE = {number(height(material))};")
     return Written(shader(type(material), "\n".join(constants)), [])
 
 

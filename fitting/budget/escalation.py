@@ -98,7 +98,7 @@ def fit_within(problem: FitProblem, accuracy: float | None, seconds: float | Non
 
 def _better(now: Configuration, told: Attempt, accuracy: float | None, most: float) -> Configuration | None:
     """The next configuration to try; None where nothing is left to improve."""
-    if now.precision == "float32" and told.rounding > (accuracy or told.bound) / 4:
+    if now.precision == "float32" and told.rounding > (accuracy or told.bound) / 8:
         return dataclasses.replace(now, precision="float64")
     aim = LESS * told.pixels if accuracy is None else AIM * accuracy
     if now.pixels is None or told.pixels <= aim:
