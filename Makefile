@@ -28,10 +28,11 @@ check: $(VENV)/installed-tests
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-# What its notebooks measure of speed is true as users compile; who wants no more than to see it built says LIGHTLY=yes.
+# One notebook at a time: kernels that start together may choose the same port, and one of them ends.
+# What the notebooks measure of speed is true as users compile; who wants no more than to see it built says LIGHTLY=yes.
 docs: export XLA_FLAGS := $(if $(LIGHTLY),$(LIGHTLY_COMPILED),$(XLA_FLAGS))
 docs: $(VENV)/installed-docs
-	$(BIN)/python -m sphinx --fail-on-warning --keep-going -q -j 2 -b html -d out/docs-cache docs out/docs
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going -q -b html -d out/docs-cache docs out/docs
 
 # The wheel, built and used where nothing else of the project is: in an empty environment, outside of this folder. Three
 # programs need byte code of a small part of it.

@@ -96,7 +96,7 @@ class Table:
                 raise InputError(key, f"must be a number, got {came}", "Give numbers without quotes")
         return value
 
-    def _path(self, key, name):
+    def _path(self, key, name) -> Path:
         """The path of a file within the folder."""
         path, own = self.folder / name, self.within == self.folder
         try:

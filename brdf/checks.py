@@ -188,7 +188,7 @@ def spectrum(name: str, value: Any, largest: float = LARGEST) -> Any:
 def vertex_list(name: str, value: Any) -> Any:
     """Corners of a polygon: three points or more."""
 
-    def fits(count=0, axes=0, *more):
+    def fits(count=0, axes=0, *more) -> bool:
         return count >= 3 and axes == 3 and not more
 
     return _shaped(name, value, fits, "three points or more", "Give [[x, y, z], ...]")

@@ -191,7 +191,7 @@ def nearest_classic(material: Material) -> Material:
     return _nearest(material, model, bounded=False)
 
 
-def _nearest(material, model, *, bounded):
+def _nearest(material: SpecularMaterial, model: type[SpecularMaterial], *, bounded: bool) -> SpecularMaterial:
     n = float(np.asarray(material.n))
     gram, cross = nearest_equations(type(material), model, n)
     k_d, k_s = np.asarray(material.k_d, np.float64), np.asarray(material.k_s, np.float64)
@@ -223,7 +223,7 @@ def nearest_equations(
     return gram, np.array([np.sum(weights * cosine * of * single), np.sum(weights * to * of * double)])
 
 
-def _constrained(gram, right, bounded):
+def _constrained(gram: Float[np.ndarray, "2 2"], right: Float[np.ndarray, " 2"], bounded: bool) -> np.ndarray:
     """The x >= 0 (with sum <= 1 if bounded) of least x' gram x / 2 - right' x: a bound that is broken is reached."""
     best = np.linalg.lstsq(gram, right, rcond=1e-12)[0]  # at n = 0 a lobe may be the diffuse term: they share it
     if best.min() <= 1e-12 * best.max():

@@ -41,7 +41,7 @@ AnyPath = str | os.PathLike[str]
 
 
 @contextmanager
-def _told(path):
+def _told(path: AnyPath) -> Iterator[None]:
     """What the operating system refuses, as the one line that names what the user gave."""
     try:
         yield
@@ -144,7 +144,7 @@ def atomic_path(path: AnyPath) -> Iterator[Path]:
 
 
 @contextmanager
-def _staging(folder):
+def _staging(folder: Path) -> Iterator[Path]:
     """A hidden folder in another one, gone at the end; what writers that are no more have staged there goes first."""
     with ExitStack() as lock:
         if fcntl is not None:
@@ -227,7 +227,7 @@ def check_folder(path: AnyPath) -> None:
         pass
 
 
-def _move_together(new, old, folder):
+def _move_together(new: Path, old: Path, folder: Path) -> None:
     """Move the new files into place; if one fails, put back the old ones."""
     with ExitStack() as undo:
         for file in list(new.iterdir()):

@@ -69,7 +69,7 @@ def cast(tree: Any, precision: Precision | None) -> Any:
         dtype('float32')
     """
 
-    def leaf(value):
+    def leaf(value: Any) -> Any:
         # Through NumPy, or each kind of number would be compiled.
         array = value if isinstance(value, jax.Array) else np.asarray(value)
         kept = not jnp.issubdtype(array.dtype, np.floating) or (precision is None and array is value)

@@ -25,7 +25,7 @@ from brdf.pixel_area import with_area
 from brdf.precision import Precision, cast, working_precision
 
 
-def _masks(value):
+def _masks(value: Any) -> tuple[Any, ...]:
     """Given shadow masks: (H, W) values from 0 to 1, or None, one for each light; () where there are none."""
     masks = []
     for mask in several("visibility", value):
@@ -251,12 +251,12 @@ def some_pixels(
         return Scene(points=points, shapes=hiding, ambient=scene.ambient, lights=scene.lights, visibility=visibility)
 
 
-def _of_picture(pixel, leaf):
+def _of_picture(pixel: Any, leaf: Any) -> np.ndarray:
     """Some pixels of (H, W, ...) values; through NumPy: an XLA gather is ten times slower."""
     return np.asarray(leaf).reshape(-1, *leaf.shape[2:])[np.asarray(pixel)]
 
 
-def _chosen(points, pixel):
+def _chosen(points: SurfacePoints, pixel: Any) -> SurfacePoints:
     """Some of the points, in the shape of ``pixel``."""
     area = points.area
     some = dataclasses.replace(points, visibility=None, area=None).pixels(pixel)

@@ -72,7 +72,7 @@ def read_parts(path: Path, within: str | Path | None, tables: dict[str, Any] | N
     return parts
 
 
-def _read_shape(table):
+def _read_shape(table: Any) -> Shape:
     cls = table.choose("type", SHAPES)
     return table.make(_triangles if cls is Triangles else cls)
 
@@ -112,11 +112,11 @@ def _points(file: Path, position: Layer | None = None, normal: Layer | None = No
     return SurfacePoints.from_normals(normals, position=positions, to_view=towards), positions is not None
 
 
-def _named(layers):
+def _named(layers: dict[str, Any]) -> str:
     return ", ".join(name or "the unnamed one" for name in layers)
 
 
-def _layer(file, layers, name, *usual) -> Any:
+def _layer(file, layers: dict[str, Any], name: str | None, *usual) -> Any:
     """The layer that is named, or the first of the usual ones that there is."""
     found = [layers[one] for one in (usual if name is None else [name]) if one in layers]
     if name is not None and not found:
@@ -155,7 +155,7 @@ def write_scene(path: str | Path, scene: Any, aov: str | None = None) -> None:
         write(file, content)
         return file.name
 
-    def section(header, fields, **values):
+    def section(header: str, fields, **values) -> None:
         values = fields | values
         lines = [f"{key} = {_toml(value)}" for key, value in values.items() if value is not None and value is not True]
         sections.append("\n".join([header, *lines, ""]))
@@ -184,7 +184,7 @@ def write_scene(path: str | Path, scene: Any, aov: str | None = None) -> None:
     write_text(path, "\n".join(sections))
 
 
-def _fields(item):
+def _fields(item: Any) -> dict[str, Any]:
     return {name: getattr(item, name) for name in inspect.signature(type(item)).parameters}
 
 
@@ -204,6 +204,6 @@ def _obj(mesh):
     return "\n".join([*lines, ""])
 
 
-def _toml(value):
+def _toml(value: Any) -> str:
     """A TOML value: what JSON and TOML write alike."""
     return json.dumps(np.asarray(value, dtype=np.float64).tolist() if hasattr(value, "shape") else value)

@@ -8,7 +8,6 @@ from typing import Any
 
 from docutils import nodes
 from docutils.utils.math.latex2mathml import tex2mathml
-from jupyter_cache import get_cache
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
@@ -39,8 +38,6 @@ smartquotes = False  # -- begins an option
 nb_custom_formats = {".py": ["jupytext.reads", {"fmt": "py:percent"}]}
 nb_execution_mode = "cache"
 nb_execution_cache_path = str(ROOT / "out" / ".jupyter_cache")
-# Made before the build parts, or two parts of it make its tables at once, and one fails.
-_ = get_cache(nb_execution_cache_path).db
 nb_execution_timeout = 300
 nb_execution_raise_on_error = True
 nb_output_stderr = "remove-warn"
@@ -69,18 +66,12 @@ def _block(writer: Any, node: nodes.math_block) -> None:
     raise nodes.SkipNode
 
 
-def _spread(names: list[str]) -> None:
-    """Notebooks, which take the time, far from each other: what are neighbours one part of the build reads."""
-    names[:] = [name for first in range(4) for name in names[first::4]]
-
-
 def setup(app: Any) -> None:
     """Formulas as MathML, which browsers draw without a program; pages written from the code itself."""
     app.add_html_math_renderer("mathml", inline_renderers=(_inline, None), block_renderers=(_block, None))
     app.connect("autodoc-process-docstring", reference.tables)
     app.connect("autodoc-skip-member", reference.skip)
     app.connect("builder-inited", lambda app: reference.write(Path(app.srcdir)))
-    app.connect("env-before-read-docs", lambda app, env, names: _spread(names))
 
 
 html_math_renderer = "mathml"

@@ -33,7 +33,7 @@ def waiting(what: str) -> Iterator[Callable[[str], None]]:
         return
     doing, done, begun = [what], threading.Event(), time.monotonic()
 
-    def tell():
+    def tell() -> None:
         ended = done.wait(PATIENCE)
         if ended:
             return
@@ -53,7 +53,7 @@ def waiting(what: str) -> Iterator[Callable[[str], None]]:
         _line.release()
 
 
-def _terminal():
+def _terminal() -> Callable[[str], None] | None:
     stream: Any = sys.stderr
     try:
         if not stream.isatty():
@@ -61,7 +61,7 @@ def _terminal():
     except (AttributeError, ValueError):  # there is none, or it is closed
         return None
 
-    def write(text):
+    def write(text: str) -> None:
         with contextlib.suppress(OSError, ValueError):  # the terminal has gone
             stream.write(f"\r\x1b[2K{text}")
             stream.flush()
@@ -69,13 +69,13 @@ def _terminal():
     return write
 
 
-def _notebook():
+def _notebook() -> Callable[[str], None] | None:
     ipython: Any = sys.modules.get("IPython")
     if ipython is None or not hasattr(ipython.get_ipython(), "kernel"):
         return None
     handles = []
 
-    def write(text):
+    def write(text: str) -> None:
         shown = {"text/html": f"<i>{text}</i>" if text else "", "text/plain": text}
         if handles:
             handles[0].update(shown, raw=True)

@@ -241,7 +241,7 @@ class Tradeoff:
                 figure.savefig(stage / f"tradeoff.{suffix}", dpi=200)
 
 
-def _milliseconds(seconds):
+def _milliseconds(seconds: float) -> str:
     return f"{1e3 * seconds:.{0 if seconds >= 0.1 else 1}f}"
 
 
@@ -367,7 +367,7 @@ def _bench(problem, accuracy):
     picture = functools.partial(brdf.render, scene=compared, precision="float64")
     true = np.asarray(picture(best.material))
 
-    def measure(trial):
+    def measure(trial) -> None:
         function = _solved if trial.axis == "solver" else _fitted
         material, took = take(functools.partial(function, problem, trial.configuration, best))
         trial.taken.append(took)
@@ -431,7 +431,7 @@ def take(run: Callable[[], Any]) -> tuple[Any, Taken]:
     """Run something: what it returned, and what it took."""
     spans: list[tuple[float, float]] = []
 
-    def listen(event, duration_secs, **_):
+    def listen(event: str, duration_secs: float, **_) -> None:
         if event.startswith("/jax/core/compile/"):
             now = time.perf_counter()
             spans.append((now - duration_secs, now))

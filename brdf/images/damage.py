@@ -53,7 +53,7 @@ def check_content(path: Path) -> None:
                 check(path, content)
 
 
-def _check_openexr(path, content):
+def _check_openexr(path: Path, content: mmap.mmap) -> None:
     """Count attributes and channels in the header of each part, behind which is a null."""
     at, attributes = 8, 0
     while found := _ATTRIBUTE.match(content, at):
@@ -68,7 +68,7 @@ def _check_openexr(path, content):
                 return
 
 
-def _check_jpeg(path, content):
+def _check_jpeg(path: Path, content: mmap.mmap) -> None:
     """Count the scans between the segments, which may hold thumbnails, and the end, behind which may be a film."""
     at = 2
     while content[at : at + 1] == b"\xff" and content[at + 1 : at + 2] != b"\xda":
@@ -77,7 +77,7 @@ def _check_jpeg(path, content):
     _check_count(path, "scans", scans, MOST_SCANS)
 
 
-def _check_png(path, content):
+def _check_png(path: Path, content: mmap.mmap) -> None:
     """Compare the checksums of what a picture needs; libpng leaves other chunks out where theirs are wrong."""
     at, kind = 8, b""
     while kind != b"IEND" and at + 8 <= len(content):
@@ -90,7 +90,7 @@ def _check_png(path, content):
         at = end + 4
 
 
-def _check_count(path, what, count, most):
+def _check_count(path: Path, what: str, count: int, most: int) -> None:
     if count > most:
         raise InputError(path, f"holds more than {most} {what}", _AGAIN)
 

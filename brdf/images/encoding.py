@@ -125,7 +125,7 @@ def find_encoding(
     return ("srgb" if bits <= 8 else "linear"), "assumed"
 
 
-def _stated(path, format_name, spec) -> Encoding | None:
+def _stated(path: Path, format_name: str, spec: Any) -> Encoding | None:
     attributes = {attribute.name: attribute.value for attribute in spec.extra_attribs}
     _, transfer, *_ = attributes.get("CICP", (0, _CICP_UNSPECIFIED))
     if transfer != _CICP_UNSPECIFIED:
@@ -153,7 +153,7 @@ def _stated(path, format_name, spec) -> Encoding | None:
     raise InputError(path, f"is encoded as {attributes['oiio:ColorSpace']}, which is not known here", _HOW_TO_SAY)
 
 
-def _of_profile(path, profile) -> Encoding | None:
+def _of_profile(path: Path, profile: bytes) -> Encoding | None:
     """The curve that an ICC profile holds (ICC.1:2022, 7.3); None if it is damaged and so says nothing."""
     try:
         (count,) = struct.unpack_from(">I", profile, 128)
@@ -167,7 +167,7 @@ def _of_profile(path, profile) -> Encoding | None:
     return curves.pop()
 
 
-def _of_curve(curve) -> Encoding | None:
+def _of_curve(curve: bytes) -> Encoding | None:
     """The encoding whose curve this is (ICC.1:2022, 10.6 and 10.18), None where it is none of those known."""
     at, gamma = np.linspace(0, 1, 256), 1.0
     (number,) = struct.unpack_from(">I", curve, 8)

@@ -224,7 +224,7 @@ class ImageReader(contextlib.AbstractContextManager):
         return np.ascontiguousarray(stored[::-1] if turn in (3, 4, 7, 8) else stored)
 
 
-def _open(path):
+def _open(path: Path) -> oiio.ImageInput:
     check_content(path)
     request = oiio.ImageSpec()
     # Colour as stored: what a half-transparent pixel shows is not darkened.
@@ -241,7 +241,7 @@ def _open(path):
     return image
 
 
-def _is_double_tiff(image):
+def _is_double_tiff(image: oiio.ImageInput) -> bool:
     """Whether OpenImageIO 3.2 reads it right only as a whole: rows and tiles of such files come as garbage."""
     spec = image.spec()
     separate = spec.get_string_attribute("planarconfig") == "separate"
@@ -266,7 +266,7 @@ def said(source: Any, path: AnyPath) -> str:
     return (line if len(line) <= 200 else line[:197] + "...").rstrip(". ")
 
 
-def _layers(image):
+def _layers(image: oiio.ImageInput) -> dict[tuple[int, str], dict[str, int]]:
     """The channels of each part and layer, by what comes after the last dot of their names."""
     layers = {}
     for part in range(max(1, image.spec().get_int_attribute("oiio:subimages"))):
@@ -276,7 +276,7 @@ def _layers(image):
     return layers
 
 
-def _choose_channels(image):
+def _choose_channels(image: oiio.ImageInput) -> tuple[int, list[int], int | None]:
     """The part and channels that are the picture, and its alpha; depth and further layers are left apart.
 
     Only OpenEXR files name their channels reliably: R, G, B, else Y of the unnamed layer are the picture, in the first
@@ -300,7 +300,7 @@ def _choose_channels(image):
     return 0, rest or every, apart.get("A") if rest else None
 
 
-def _shown(path, image, part, channels, start, stop, encoding: Encoding = "linear"):
+def _shown(path, image, part, channels: list[int], start: int, stop: int, encoding: Encoding = "linear") -> np.ndarray:
     """Rows of the display window of a part, linear, (rows, width, channels); NaN where there are no data."""
     spec = image.spec(part)
     shown = np.full((stop - start, spec.full_width, len(channels)), np.nan, np.float32)

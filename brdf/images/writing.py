@@ -93,7 +93,7 @@ def _format(path):
     return suffix, _WRITABLE[suffix]
 
 
-def _pixels(path, array):
+def _pixels(path: object, array: Any) -> np.ndarray:
     try:
         pixels = np.asarray(array)
         shape = f"shape {pixels.shape}" if pixels.dtype.kind in "fiub" else "no numbers"
@@ -134,7 +134,7 @@ def _write(path, layers, kind, encoding):
             raise InputError(path, what, "Check the space left and the size of the picture")
 
 
-def _ask_for_space(temporary, spec):
+def _ask_for_space(temporary: Any, spec: oiio.ImageSpec) -> None:
     """Find a full disk, a quota or a limit out first: libjpeg ends the program then, libpng and others do not tell."""
     if hasattr(os, "posix_fallocate"):
         with temporary.open("r+b") as file:

@@ -158,11 +158,11 @@ def save_export(
 # -- what several formats need -----------------------------------------------------------------------------------------
 
 
-def _rgb(values):
+def _rgb(values: Any) -> Colour:
     return np.broadcast_to(np.asarray(values, np.float64), 3)
 
 
-def _brightness(material, drawn):
+def _brightness(material: Material, drawn: Callable[[float], Colour]) -> list[str]:
     """How bright another program draws the peak of the highlight, in words; nothing where it draws it as it is."""
     if not isinstance(material, SpecularMaterial) or not np.any(material.k_s):
         return []
@@ -197,7 +197,7 @@ def _normalised(material: Any):
     return _rgb(material.k_d), k_s, k_s * height(material), half_exponent(material), losses
 
 
-def _cut(**colours):
+def _cut(**colours) -> list[str]:
     return [
         f"{key} is cut at 1, it would be {' '.join(f'{value:.3g}' for value in colour)}"
         for key, colour in colours.items()
@@ -208,7 +208,7 @@ def _cut(**colours):
 # -- JSON, MTL, PyTorch3D ----------------------------------------------------------------------------------------------
 
 
-def _json(material, name):
+def _json(material: Material, name: str) -> Written:
     values = material_to_dict(material)
     return Written(values, [], extras=values)
 
@@ -226,7 +226,7 @@ def _mtl(material, name):
     return Written(to_mtl(material, name=name), losses, drawn)
 
 
-def _pytorch3d(material, name):
+def _pytorch3d(material: Material, name: str) -> Written:
     losses = []
     classic = nearest_classic(material)
     if type(classic) is not type(material):
@@ -303,8 +303,8 @@ def shader(model: type[Material], declarations: str) -> str:
     return _SHADER.substitute(model=model.name, constants=declarations, lobe=lobe, reflected=reflected)
 
 
-def _glsl(material, name):
-    def number(value):
+def _glsl(material: Material, name: str) -> Written:
+    def number(value: float) -> str:
         text = f"{value:.9g}"
         return text if "." in text or "e" in text else f"{text}.0"
 
@@ -333,7 +333,7 @@ def _three(material, name):
     codes = {key: np.round(255 * encode(np.clip(colour, 0.0, 1.0), "srgb")) for key, colour in linear.items()}
     color, specular = (decode(code / 255, "srgb") for code in codes.values())
 
-    def drawn(cosine):
+    def drawn(cosine: float) -> Colour:
         fresnel = 2.0 ** ((-5.55473 * cosine - 6.98316) * cosine)
         return (color + (specular * (1 - fresnel) + fresnel) * (n + 2.0) / 8.0) * cosine
 
@@ -413,7 +413,7 @@ def _mitsuba(material, name):
     sqrt(2 / (n+2))): its lobe is (n+2)/(8 π) (N·H)^n near the normal, as that of normalised Blinn-Phong.
     """
 
-    def reflecting(colour):
+    def reflecting(colour: Colour) -> dict[str, Any]:
         return {"type": "rgb", "value": np.clip(colour, 0.0, 1.0).tolist()}
 
     k_d, k_s, _, n, losses = _normalised(material)
@@ -424,7 +424,7 @@ def _mitsuba(material, name):
     losses.append("the lobe is that of microfacets (Beckmann, slope sqrt(2 / (n+2))), narrower and brighter if grazing")
     losses += _cut(reflectance=diffuse, specular_reflectance=specular)
 
-    def drawn(cosine):
+    def drawn(cosine: float) -> Colour:
         lobe = (_beckmann_shadowing(alpha, cosine) / (2.0 * alpha * cosine)) ** 2
         return ((1.0 - weight) * np.clip(diffuse, 0.0, 1.0) + weight * np.clip(specular, 0.0, 1.0) * lobe) * cosine
 
@@ -434,7 +434,7 @@ def _mitsuba(material, name):
     return Written({"type": "blendbsdf", "weight": weight, **parts}, losses, drawn)
 
 
-def _beckmann_shadowing(alpha, cosine):
+def _beckmann_shadowing(alpha: float, cosine: float) -> float:
     """Walter et al., "Microfacet models for refraction", EGSR 2007: the rational fit that Mitsuba uses."""
     a = cosine / (alpha * np.sqrt(1.0 - cosine**2)) if cosine < 1.0 else np.inf
     return 1.0 if a >= 1.6 else (3.535 * a + 2.181 * a**2) / (1.0 + 2.276 * a + 2.577 * a**2)

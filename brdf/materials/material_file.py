@@ -166,14 +166,14 @@ def material_from_dict(values: Any, place: object = "material") -> Material:
     return material
 
 
-def _suffix(path, remedy):
+def _suffix(path: str | Path, remedy: str) -> str:
     suffix = as_path(path).suffix.lower()
     if suffix not in (".json", ".mtl"):
         raise InputError(path, f"is no material file, got {suffix or 'no suffix'}", remedy)
     return suffix
 
 
-def _entries(path):
+def _entries(path: str | Path) -> dict[str, Any]:
     """What a file says of each of its materials, by name."""
     if as_path(path).is_dir():
         folder, path = path, Path(path) / "material.json"
@@ -190,7 +190,7 @@ def _entries(path):
     return {Path(path).stem: values["material"] if is_report else values}
 
 
-def _material(path, name, entry):
+def _material(path: str | Path, name: str, entry: Any) -> tuple[Material, str]:
     """What is wrong with one material keeps nobody from another of the file."""
     try:
         is_mtl = Path(path).suffix.lower() == ".mtl"

@@ -97,7 +97,7 @@ def read_mtl(path: Any, text: str) -> dict[str, dict[str, Any]]:
     return entries
 
 
-def _numbers(place, word, given):
+def _numbers(place: str, word, given) -> list[float]:
     wanted, remedy = ((1, 3), "Give RGB values") if word.lower() in _COEFFICIENTS else ((1,), "Give one number")
     came = f"got {' '.join(given)[:SHOWN]!r}"
     try:

@@ -49,7 +49,7 @@ def read_fields(content: bytes, place: object) -> dict[str, tuple[int, np.ndarra
     stream, fields = io.BytesIO(content), {}
     stream.seek(len(MAGIC))
 
-    def take(layout):
+    def take(layout: str) -> tuple[Any, ...]:
         return struct.unpack(f"<{layout}", stream.read(struct.calcsize(f"<{layout}")))
 
     try:

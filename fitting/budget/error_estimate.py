@@ -97,7 +97,7 @@ class Probes:
         factors = coefficient_factors(self.model, self.n, take_colour_out(problem.scenes, channels).colour)
         self.scale = np.append((sizes(result)[:, None] * factors).ravel(), 1.0)
 
-    def _columns(self, scenes, n):
+    def _columns(self, scenes: Sequence[brdf.Scene], n: float) -> Float[np.ndarray, "M C 3"]:
         """Ambient, diffuse and lobe at an exponent under the lights of some scenes."""
         found, channels = [], self.x.shape[1]
         factors = coefficient_factors(self.model, n, np.ones(channels))

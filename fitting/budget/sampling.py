@@ -45,7 +45,7 @@ def with_samples(scene: brdf.Scene, samples: int) -> brdf.Scene:
     return dataclasses.replace(scene, lights=tuple(_with_samples(light, samples) for light in scene.lights))
 
 
-def _with_samples(light, samples):
+def _with_samples(light: Light, samples: int) -> Light:
     if getattr(light, "samples", samples) == samples:
         return light
     key = id(light), samples

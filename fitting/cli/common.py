@@ -72,7 +72,7 @@ def add_command(app: typer.Typer, function: Callable[..., Any]) -> None:
     shown += [_typed(one, PictureOptions, "What the pictures show") for one in fields.values()]
 
     @functools.wraps(function)
-    def command(**given):
+    def command(**given) -> Any:
         options = {name: value for name, value in given.items() if name not in ("target", "material")}
         typed = {name: value if isinstance(value, Path) else _flag(name) for name, value in options.items()}
         if fields:
@@ -155,7 +155,7 @@ def find_material(text: str, name: str | None = None) -> tuple["brdf.Material", 
     return brdf.preset(key), ""
 
 
-def _table_name(text):
+def _table_name(text: str) -> str | None:
     """The name in the classic table; None where a file is meant."""
     if not text.strip():
         raise InputError("MATERIAL", "is empty", "Give a .json or .mtl file, or a name such as emerald")

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import shlex
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -120,7 +121,7 @@ def fit(
     show_result(result, notes, json, *saved, *written)
 
 
-def _freed(result, names):
+def _freed(result: Any, names: list[str]) -> Any:
     """The fit again, with what the names say of the scenes freed; where a command was told so, beside the material."""
     import fitting
 
@@ -134,7 +135,9 @@ def _freed(result, names):
     return dataclasses.replace(found, files=result.files, candidates=result.candidates)
 
 
-def _fit_pictures(target, pictures, noise, say, **how):
+def _fit_pictures(
+    target: Any, pictures: Any, noise: Any, say: Callable[[str], None], **how
+) -> tuple[Any, tuple[str, ...]]:
     """The fit, and what was found out on the way."""
     from fitting.cli.inputs import read_inputs
     from fitting.photographs.light_files import parse_numbers

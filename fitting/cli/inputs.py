@@ -54,7 +54,7 @@ class FitInputs(NamedTuple):
     light_errors: tuple[float, ...] = ()
 
 
-def _require(fine, where, what, remedy):
+def _require(fine: Any, where: object, what, remedy: str) -> None:
     if not fine:
         raise InputError(where, what, remedy)
 
@@ -106,7 +106,7 @@ def read_inputs(targets: list[Path], options: PictureOptions, encodings: dict[Pa
     return inputs._replace(pictures=pictures, scenes=scenes)
 
 
-def _check_options(kind, targets, options):
+def _check_options(kind, targets: list[Path], options: PictureOptions) -> None:
     """Refuse options that do not belong together."""
     names, what, remedy = REFUSED[kind]
     for name in names:
@@ -183,7 +183,7 @@ def _target_and_scene(target, scene):
     return target, scene
 
 
-def _exposed(pictures, options):
+def _exposed(pictures: list[brdf.Picture], options) -> list[brdf.Picture]:
     """Pictures in one unit, by one relative exposure or one for each, as typed."""
     typed, count = options.exposure, len(pictures)
     if typed is None:
@@ -256,7 +256,7 @@ def _points(shape, options, mask):
     return points, ()
 
 
-def _directions(inputs, points, options):
+def _directions(inputs, points, options) -> Any:
     """The direction of the light of each photograph; and the inputs with what the shading tells of it."""
     targets, file = inputs.targets, options.lights
     if file is not None and file.suffix.lower() == ".lp":

@@ -11,6 +11,8 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
+from types import FrameType
+from typing import Any
 
 # In seconds; callbacks of the collector take microseconds, modules some milliseconds.
 LATER = 0.01
@@ -29,17 +31,17 @@ def interruptible() -> Iterator[None]:
     ours = [number for number, own in handlers.items() if own in (signal.default_int_handler, signal.SIG_DFL)]
     hook, ended = sys.unraisablehook, threading.Event()
 
-    def send_later(number):
+    def send_later(number: int) -> None:
         threading.Timer(LATER, lambda: ended.is_set() or os.kill(os.getpid(), number)).start()
 
-    def interrupt(number, frame):
+    def interrupt(number: int, frame: FrameType | None) -> None:
         while frame is not None:
             if frame.f_code.co_filename.startswith("<frozen importlib"):
                 return send_later(number)
             frame = frame.f_back
         raise KeyboardInterrupt(number)
 
-    def unraisable(lost):
+    def unraisable(lost: Any) -> None:
         if isinstance(lost.exc_value, KeyboardInterrupt) and lost.exc_value.args:
             send_later(*lost.exc_value.args)
         else:

@@ -8,7 +8,7 @@ import os
 import signal
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 
@@ -30,7 +30,7 @@ app = typer.Typer(
 )
 
 
-def _version(wanted):
+def _version(wanted: bool) -> None:
     if wanted:
         show(f"brdf-fitting {importlib.metadata.version('brdf-fitting')}")
         raise typer.Exit
@@ -115,7 +115,7 @@ def run() -> None:
     """
     status: list[int] = []
 
-    def end():
+    def end() -> None:
         if status:  # else: a traceback
             sys.stdout.flush()
             sys.stderr.flush()
@@ -129,6 +129,6 @@ def run() -> None:
         raise
 
 
-def _fail(message, status=2):
+def _fail(message: str, status: int = 2) -> NoReturn:
     print(f"error: {message}", file=sys.stderr)  # noqa: T201  # this is the command's one line of failure
     sys.exit(status)

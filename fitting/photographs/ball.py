@@ -53,7 +53,7 @@ def find_circle(mask: Any) -> Circle:
         raise InputError("mask", "is empty", "Give a mask that is white on the ball")
     outline = np.concatenate([_sides(inside), _sides(inside.T)[::-1]], axis=1)
 
-    def beyond(circle):
+    def beyond(circle: Any) -> np.ndarray:
         return np.hypot(outline[0] - circle[0], outline[1] - circle[1]) - circle[2]
 
     # Area and centroid are the start, which holes and specks hardly move.
@@ -73,7 +73,7 @@ def find_circle(mask: Any) -> Circle:
     return circle
 
 
-def _sides(inside):
+def _sides(inside: np.ndarray) -> np.ndarray:
     """The outer edges of the first and the last pixel in each row that has one: x and y, (2, K)."""
     rows = np.flatnonzero(inside.any(axis=1))
     first = np.argmax(inside[rows], axis=1) - 0.5

@@ -68,7 +68,7 @@ def photograph_scene(
     return brdf.Scene(points=points, lights=(light,), ambient=ambient)
 
 
-def _values(picture):
+def _values(picture: Any) -> np.ndarray:
     return np.atleast_3d(np.asarray(getattr(picture, "pixels", picture), np.float64))
 
 
@@ -217,12 +217,12 @@ def light_from_shading(
     return ShadingLight(numbers[:3] / length, length * unit, error, unexplained)
 
 
-def _bound(residual):
+def _bound(residual) -> float:
     """Beyond which a residual's pull is constant."""
     return max(HUBER * np.median(np.abs(residual)), ROUNDING)
 
 
-def _reached(normal, numbers):
+def _reached(normal, numbers) -> np.ndarray:
     """Pixels that the light reaches at an angle."""
     lit = numbers[:3] @ normal > LIT * np.linalg.norm(numbers[:3])
     if np.count_nonzero(lit) < FEWEST:
@@ -237,7 +237,7 @@ def _unit(vector):
     return unit, (np.eye(3) - np.outer(unit, unit)) / length
 
 
-def _shown(numbers, mirror, normal):
+def _shown(numbers, mirror, normal) -> tuple[np.ndarray, np.ndarray]:
     """What pixels with these normals show, the light reaching them: Lambert's law, ambient light and a highlight.
 
     Args:
@@ -272,7 +272,7 @@ def _shown(numbers, mirror, normal):
     return shown, slopes
 
 
-def _refine(numbers, mirror, scale, value, normal):
+def _refine(numbers, mirror, scale, value, normal) -> tuple[np.ndarray, float]:
     """The nearest minimum of Huber's cost; and the cost."""
     from scipy.optimize import minimize  # it takes long to load
 
@@ -302,7 +302,7 @@ def _common(residual, parts):
     return max(between, 0.0) ** 0.5
 
 
-def _error(light, slopes, pull, within, parts):
+def _error(light, slopes, pull, within, parts) -> float:
     """Root mean square angle to the true direction in degrees, where residuals of one part go together as they like.
 
     The jackknife over parts: how far leaving one out moves the light, by one Newton step. A pixel pulls with its

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from fitting.implicit import sensitivity
-from fitting.result import FitResult
+from fitting.result import FitResult, Parameter
 from fitting.uncertainty.intervals import above_zero
 
 
@@ -35,7 +35,7 @@ def with_light_errors(result: FitResult, degrees: Sequence[float]) -> FitResult:
     return dataclasses.replace(result, parameters=tuple(parameters))
 
 
-def _widened(one, by):
+def _widened(one: Parameter, by: float) -> Parameter:
     if one.value is None or one.error is None or one.at_bound or one.interval is None:
         return one
     error = math.hypot(one.error, by)

@@ -4,6 +4,8 @@
 makes a result takes the class from here, and a pickled one names the package, which does as well.
 """
 
+from typing import Any
+
 from fitting.diagnosis import diagnose
 from fitting.report import html, saving, text, viewer
 from fitting.result import REPORTS, FitResult
@@ -11,7 +13,7 @@ from fitting.result import REPORTS, FitResult
 __all__ = ["FitResult"]
 
 
-def _plot(result, picture):
+def _plot(result: FitResult, picture: int | None) -> Any:
     from fitting.report.plots import comparison  # Matplotlib takes long to load
 
     return comparison(result, picture)

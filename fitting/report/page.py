@@ -37,7 +37,7 @@ class Page:
 
     text: str = dataclasses.field(repr=False)
 
-    def _repr_html_(self):
+    def _repr_html_(self) -> str:
         """For Jupyter: the page in a frame."""
         frame = "width:100%;height:46rem;border:0"
         return f'<iframe style="{frame}" sandbox="allow-scripts" srcdoc="{html.escape(self.text)}"></iframe>'
@@ -64,7 +64,7 @@ def secure_page(title: str, body: str, script: str) -> str:
     """
     style, script = asset("viewer.css"), asset("page.js") + asset(script)
 
-    def digest(text):
+    def digest(text: str) -> str:
         return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
     policy = f"default-src 'none'; img-src data:; style-src-elem {digest(style)}; style-src-attr 'unsafe-inline'"

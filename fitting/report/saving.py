@@ -56,7 +56,7 @@ def save(result: FitResult, folder: str | Path, plot: bool) -> None:
             result.plot().savefig(stage / "comparison.png", dpi=150)
 
 
-def _write_picture(stage, result, index):
+def _write_picture(stage: Path, result: FitResult, index: int) -> dict[str, Any]:
     """Write one scene, and its picture where no file holds it; what fit.json says of them."""
     scene, file, number = result.scenes[index], result.files[index] if result.files else None, index or ""
     is_shared = index > 0 and scene.points is not None and scene.points is result.scenes[0].points
@@ -71,7 +71,7 @@ def _write_picture(stage, result, index):
     return file | {"sha256": _digest(path), "scene": f"scene{number}.toml"}
 
 
-def _digest(path):
+def _digest(path: Path) -> str:
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
@@ -155,7 +155,7 @@ def load_result(folder: str | Path) -> FitResult:
         raise InputError(path, f"is no fit that this version saved ({error})", "Fit and save again") from None
 
 
-def _parameter(values):
+def _parameter(values: dict[str, Any]) -> Parameter:
     low, high = values["interval"] or (None, None)
     ends = (-math.inf if low is None else low, math.inf if high is None else high)
     return Parameter(**values | {"interval": values["interval"] and ends, "reason": values["reason"] or ""})

@@ -128,7 +128,7 @@ def _packed(values):
     return packed(values.astype(np.float32))
 
 
-def _fields(item):
+def _fields(item: Any) -> dict[str, Any]:
     return {name: np.asarray(value, np.float64).tolist() for name, value in vars(item).items()}
 
 
@@ -168,10 +168,10 @@ def _shaders(model):
 
 
 @functools.cache
-def _tables(name):
+def _tables(name: str) -> dict[str, Any]:
     """What the page interpolates in log n: the lobe's albedo, and what the nearest normalised form takes."""
 
-    def rounded(values):
+    def rounded(values: Any) -> Any:
         return [[float(f"{value:.5g}") for value in row] for row in values]
 
     model: Any = brdf.MODELS[name]
