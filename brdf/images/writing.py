@@ -30,10 +30,18 @@ _WRITABLE: dict[str, Mapping[str, tuple[Any, ...]]] = {
     ".jpg": _JPEG,
     ".jpeg": _JPEG,
 }
+_LARGEST_HALF = 65504.0
 _SPACES = {"linear": "lin_rec709_scene", "srgb": "srgb_rec709_scene"}
 
 
-def write_image(path: AnyPath, array: Any, *, dtype: DataType | None = None, encoding: Encoding | None = None) -> None:
+def write_image(
+    path: AnyPath,
+    array: Any,
+    *,
+    dtype: DataType | None = None,
+    encoding: Encoding | None = None,
+    alpha: Any = None,
+) -> None:
     """Write linear values as a picture, whole or not at all.
 
     Args:
@@ -43,6 +51,7 @@ def write_image(path: AnyPath, array: Any, *, dtype: DataType | None = None, enc
             in PNG and JPEG.
         encoding: integers only: "srgb" (the default), "linear" or a gamma. The file says which; where the format has no
             words for it, that is an error.
+        alpha: coverage (H, W) to store beside the colour, not in JPEG and HDR.
 
     Raises:
         InputError: if format, data type, encoding and shape do not go together, or the file cannot be written.
@@ -67,7 +76,13 @@ def write_image(path: AnyPath, array: Any, *, dtype: DataType | None = None, enc
         raise InputError(path, f"a {suffix} of {kind} cannot say that it is encoded as {encoded}", words)
     if kind.startswith("uint"):
         pixels = encode(np.clip(np.nan_to_num(pixels, nan=0.0), 0.0, 1.0), encoded)
-    _write(path, {"": pixels}, kind, encoded)
+    elif kind == "half" and np.any(np.abs(pixels[np.isfinite(pixels)]) > _LARGEST_HALF):
+        raise InputError(path, f"half floats end at {_LARGEST_HALF:.0f}", 'Write dtype "float" instead')
+    coverage = [] if alpha is None else [np.clip(_pixels(path, alpha), 0.0, 1.0)]
+    if coverage and (suffix in (".hdr", ".jpg", ".jpeg") or coverage[0].shape != (*pixels.shape[:2], 1)):
+        came = f"alpha of shape {coverage[0].shape[:2]} cannot go with a {suffix} of shape {pixels.shape[:2]}"
+        raise InputError(path, came, "Give alpha as (H, W), and a file that can hold it")
+    _write(path, {"": pixels}, kind, encoded, coverage)
 
 
 def write_layers(path: AnyPath, layers: Mapping[str, Any]) -> None:
@@ -104,19 +119,21 @@ def _pixels(path: object, array: Any) -> np.ndarray:
     return np.atleast_3d(pixels).astype(np.float32, copy=False)
 
 
-def _write(path, layers, kind, encoding):
+def _write(path, layers, kind, encoding, coverage=()):
     names = []
     for layer, array in layers.items():
         channels = array.shape[2]
         endings = {1: "Y", 3: "XYZ" if layer else "RGB"}.get(channels) or [f"C{index:04d}" for index in range(channels)]
         names += [f"{layer}.{ending}" if layer else ending for ending in endings]
+    names += ["A"] * len(coverage)
     if len(names) > MOST_CHANNELS:
         came = f"would have {len(names)} channels, which nothing reads back"
         raise InputError(path, came, f"Write at most {MOST_CHANNELS} into a file")
-    pixels = np.concatenate(list(layers.values()), axis=2)
+    pixels = np.concatenate([*layers.values(), *coverage], axis=2)
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
     spec.channelnames = tuple(names)
-    spec.alpha_channel = -1
+    spec.alpha_channel = names.index("A") if coverage else -1
+    spec.attribute("oiio:UnassociatedAlpha", 1)
     if as_path(path).suffix.lower().startswith(".jp"):
         spec.attribute("CompressionQuality", 95)
         spec.attribute("jpeg:subsampling", "4:4:4")

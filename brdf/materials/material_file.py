@@ -6,6 +6,7 @@ stands for a sum, of which the picture says no more, is a number, and ``note`` s
 
 import inspect
 import json
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -183,11 +184,20 @@ def _entries(path: str | Path) -> dict[str, Any]:
     if suffix == ".mtl":
         return read_mtl(path, text)
     try:
-        values = json.loads(text)
+        values = json.loads(text, object_pairs_hook=_each_once)
+    except InputError as error:
+        raise error.inside(path) from None
     except (ValueError, RecursionError) as error:
         raise InputError(path, f"is not JSON ({error})", "Correct the file") from None
     is_report = isinstance(values, dict) and "model" not in values and "material" in values
     return {Path(path).stem: values["material"] if is_report else values}
+
+
+def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    for key, times in Counter(key for key, _ in pairs).items():
+        if times > 1:
+            raise InputError(key[:SHOWN], "is given twice", "Give it once")
+    return dict(pairs)
 
 
 def _material(path: str | Path, name: str, entry: Any) -> tuple[Material, str]:

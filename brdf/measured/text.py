@@ -33,6 +33,7 @@ _PARAMETRISATIONS = {
     "ISOTROPIC_TV_PROJ_DPHI": "x_v y_v",
     "ISOTROPIC_TL_TV_PROJ_DPHI": "theta_l x_v y_v",
     "SPHERICAL_TL_PL_TV_PV": "theta_l phi_l theta_v phi_v",
+    "CARTESIAN": "x_v y_v z_v x_l y_l z_l",
 }
 _NOT_SAID = {"RUSIN_TH_TD": {"phi_d": 0.5 * np.pi}, "COS_TLR": {"phi_v": np.pi}}
 _OUTPUTS = ("INV_STERADIAN", "INV_STERADIAN_COSINE_FACTOR", "RGB_COLOR", "UNKNOWN_OUTPUT")
@@ -131,6 +132,11 @@ def _table(path, rows, width, more=0):
 
 def _directions(kind, rows, columns):
     """View and light of each row."""
+    if kind == "CARTESIAN":
+        length = np.linalg.norm(columns.reshape(2, 3, -1), axis=1)
+        for row, _ in np.argwhere(~((length > 0) & (length < np.inf)).T):
+            raise InputError(rows[row][0], "has a direction that is zero or not finite", "Correct the file")
+        return columns[:3].T, columns[3:].T
     if kind.startswith("COS_"):
         _within(rows, columns, 1.0, "a cosine", "It is within -1 and 1")
         columns = 2 * np.arctan2(np.sqrt(1 - columns), np.sqrt(1 + columns))

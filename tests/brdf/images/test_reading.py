@@ -229,7 +229,7 @@ def test_a_photograph_comes_upright(tmp_path, turn):
     ("suffix", "kind"), [(".exr", "float"), (".exr", "half"), (".png", "uint8"), (".png", "uint16"), (".tif", "uint16")]
 )
 def test_bands_are_the_picture(tmp_path, suffix, kind):
-    write_image(tmp_path / f"a{suffix}", random(133, 57, 3), dtype=kind)
+    write_image(tmp_path / f"a{suffix}", random(133, 57, 3), dtype=kind, alpha=random(133, 57))
     whole = read_picture(tmp_path / f"a{suffix}")
     with ImageReader(tmp_path / f"a{suffix}") as reader:
         assert reader.shape == (133, 57, 3)

@@ -72,9 +72,13 @@ def test_numbers_that_are_no_codes(tmp_path):
 @pytest.mark.parametrize("channels", [2, 4, 31, 100])
 @pytest.mark.parametrize("suffix", [".exr", ".tif"])
 def test_any_number_of_channels(tmp_path, channels, suffix):
-    values = random(4, 5, channels)
+    values, alpha = random(4, 5, channels), random(4, 5, seed=1)
     write_image(tmp_path / f"a{suffix}", values)
     np.testing.assert_array_equal(read_image(tmp_path / f"a{suffix}"), values)
+    write_image(tmp_path / "a.exr", values, alpha=alpha)
+    picture = read_picture(tmp_path / "a.exr")
+    np.testing.assert_array_equal(picture.pixels, values)
+    np.testing.assert_array_equal(picture.alpha, alpha)
 
 
 @pytest.mark.parametrize(
@@ -87,11 +91,14 @@ def test_any_number_of_channels(tmp_path, channels, suffix):
         ("a.exr", np.ones((2, 2)), {"encoding": "srgb"}, "cannot say"),
         ("a.tif", np.ones((2, 2)), {"dtype": "uint8", "encoding": "linear"}, "cannot say"),
         ("a.jpg", np.ones((2, 2)), {"encoding": 2.2}, "cannot say"),
+        ("a.exr", np.full((2, 2), 1e5), {"dtype": "half"}, "half floats end"),
         ("a.exr", np.ones(3), {}, r"got shape \(3,\)"),
         ("a.exr", np.ones((0, 3)), {}, r"got shape \(0, 3\)"),
         ("a.exr", "pixels", {}, "no numbers"),
         ("a.exr", [[1, 2], [3]], {}, "no numbers"),
         ("a.exr", np.ones((2, 2), complex), {}, "no numbers"),
+        ("a.exr", np.ones((2, 2)), {"alpha": np.ones((2, 3))}, "alpha of shape"),
+        ("a.jpg", np.ones((2, 2)), {"alpha": np.ones((2, 2))}, "alpha of shape"),
         ("missing/a.exr", np.ones((2, 2)), {}, "there is no folder"),
     ],
 )

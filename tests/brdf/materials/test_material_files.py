@@ -161,6 +161,7 @@ MALFORMED = {
     "two n": (".json", '{"model": "phong", "k_d": [1], "k_s": [1], "n": [1, 2]}', "n: must be one number"),
     "channels": (".json", '{"model": "lambert", "k_a": [1, 2], "k_d": [1, 2, 3]}', "number of channels"),
     "many channels": (".json", LIMIT_OF_CHANNELS, "k_d: has 5000 entries. Give at most 4096."),
+    "key twice": (".json", '{"model": "lambert", "k_d": [1], "k_d": [0]}', "a.json: k_d: is given twice"),
     "unknown n": (
         ".json",
         '{"model": "phong", "k_d": [1], "k_s": [1], "n": null}',

@@ -13,6 +13,7 @@ from brdf.measured.table import from_angles
 
 CORNELL = "# paint\n2\n400 500\n# rows\n0.2 0 0.3 0 0.5 -0.25\n0.4 0.1 1.9 0 1 2\n"
 ALTA = '#SAMPLE "x"\n#DIM 3 1\n#PARAM_IN ISOTROPIC_TL_TV_PROJ_DPHI\n0.3 0.4 0.0 2.5\n0.3 0.0 -0.2 1.5\n'
+CARTESIAN = "#DIM 6 1\n#PARAM_IN CARTESIAN\n0 0 1 0 0 1 0.3\n"
 COSINE = "#DIM 1 1\n#PARAM_IN COS_TH\n"
 
 
@@ -57,6 +58,7 @@ def test_alta_projected_angles(load, end):
         ("ISOTROPIC_TV_TL_DPHI", [0.2, 0.3, 1.0], (0.3, 1.0), (0.2, 0)),
         ("ISOTROPIC_TV_PROJ_DPHI", [0.3, 0.4], (0, 0), (0.5, np.arctan2(0.4, 0.3))),
         ("SPHERICAL_TL_PL_TV_PV", [0.1, 0.2, 0.3, 0.4], (0.1, 0.2), (0.3, 0.4)),
+        ("CARTESIAN", [0, 0, 2.0, 0.6, 0, 0.8], (np.arctan2(0.6, 0.8), 0), (0, 0)),
     ],
 )
 def test_alta_parametrisations(load, kind, row, light, view):
@@ -112,6 +114,8 @@ REFUSED = [
     (f"{COSINE}#FORMAT binary\n0.5 1", "FORMAT"),
     (f"{ALTA}0.3 70 0 1", "line 6: has an angle of 70"),
     (f"{ALTA}0.3 inf 0 1", "line 6: has an angle of inf"),
+    (f"{CARTESIAN}0 0 0 0 0 1 1", "line 4: has a direction that is zero or not finite"),
+    (CARTESIAN.replace("0 0 1 0", "0 0 -1 0"), r"table.txt: has no finite sample above the horizon"),
 ]
 
 
