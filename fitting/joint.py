@@ -63,11 +63,16 @@ class JointResult(FitResult):
     """The outcome of a joint fit: a `FitResult` whose parameters are the freed numbers, and what the solver says.
 
     Attributes:
+        values: of the freed leaves.
+        errors: their standard errors; of a direction the angle, in degrees; infinite where only a combination of the
+            freed numbers is determined.
         steps: of the solver.
         converged: whether the solver said so.
         solver: "lm" or "bfgs".
     """
 
+    values: tuple[np.ndarray, ...]
+    errors: tuple[np.ndarray, ...]
     steps: int
     converged: bool
     solver: str
@@ -248,6 +253,8 @@ def _solve(problem: JointProblem, seen: Observed, solver: str | None, tolerance:
     material, scenes = jax.tree.map(np.asarray, problem.content())
     given = jax.tree.leaves((material, seen.problem.scenes))
     parameters, correlation = _parameters(problem, given, known, held)
+    errors = [[one.error for one in parameters if one.name == leaf.words] for leaf in problem.freed]
+    shapes = [() if leaf.is_direction else problem.leaves[leaf.place].shape for leaf in problem.freed]
     warnings = () if converged else (f"the solver stopped after {steps} steps without an end: raise max_steps",)
     return JointResult(
         **seen.told() | {"scenes": scenes},
@@ -259,6 +266,8 @@ def _solve(problem: JointProblem, seen: Observed, solver: str | None, tolerance:
         residual=share,
         pixels=len(left),
         warnings=(*warnings, *structure_warning(neighbours)),
+        values=tuple(np.asarray(problem.leaves[leaf.place]) for leaf in problem.freed),
+        errors=tuple(np.array(own, float).reshape(shape) for own, shape in zip(errors, shapes, strict=True)),
         steps=steps,
         converged=converged,
         solver=solver,

@@ -86,9 +86,9 @@ def test_the_factor_between_light_and_material_is_not_determined():
     target = target + np.random.default_rng(3).normal(0, 1e-3, target.shape)
     result = fitting.fit_jointly(target, alone, brdf.Lambert(k_d=[0.4]), lambda m, s: (m.k_d, s[0].lights[0].intensity))
     assert result.undetermined.keys() == {"k_d[0]", "lights[0].intensity[0]"}
-    assert all(np.isinf(one.error) for one in result.parameters)
-    found = result.material.k_d * result.scenes[0].lights[0].intensity
-    np.testing.assert_allclose(found, 0.5, rtol=1e-3)
+    assert np.isinf(result.errors[0]).all()
+    assert np.isinf(result.errors[1]).all()
+    np.testing.assert_allclose(result.values[0] * result.values[1], 0.5, rtol=1e-3)
 
 
 def test_nothing_to_free_is_an_error(target: np.ndarray):
