@@ -222,6 +222,7 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
     fits = dict(sorted(fits.items(), key=lambda one: float(np.sum(one[1].optimum.cost))))
     best = next(iter(fits.values()))
     noise, whitened, colour_inflation = residual_noise(best.optimum, seen.rounding), _likely_sums(fits), 1.0
+    known = None
     if whitened:
         inflation, colour_inflation = _inflation(best, seen, grey[best.model.name])
     else:
@@ -240,7 +241,8 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
     free = np.logical_or.reduce([fit.free for fit in fits.values()])
     optima = {name: fit.optimum for name, fit in fits.items()}
     choice = choose(optima, free, grey, noise, inflation, whitened, colour_inflation)
-    if choice.model not in FAMILIES and not _explains_structure(fits[choice.model], seen):
+    known = known if choice.model == best.model.name else None
+    if choice.model not in FAMILIES and not _explains_structure(fits[choice.model], seen, known):
         shown = fits[choice.model].optimum.x
         fits = {"lambert": most_likely(_fit_model(brdf.Lambert, seen), copies=seen.copies)}
         best = fits["lambert"]
@@ -369,30 +371,38 @@ def _inflation(fit: ModelFit, seen: Observed, grey: np.ndarray) -> tuple[float, 
     return bright, max(every / bright, 1.0)
 
 
-def _explains_structure(fit: ModelFit, seen: Observed) -> bool:
+def _explains_structure(fit: ModelFit, seen: Observed, after: Residual | None) -> bool:
     """Whether a highlight can be seen, and explains a good part of what errs together without it, if something does.
 
     One that changes no value by a good part of a code, or none by more than a trace of the brightest, is hidden by
     rounding: normals that are a little off would do as well. Where the scene is not what it is said to be, or a codec
     has smoothed, a highlight however significant mends some of that: in trials up to a third of it, where true
     highlights of 1 % explained more.
+
+    Args:
+        fit: with the highlight.
+        seen: what was fitted.
+        after: what it leaves, where that has been gone over.
     """
     optimum = fit.optimum
     if max(highlight_in_codes(picture, optimum.x, optimum.n) for picture in fit.pictures) < HIDDEN:
         return False
-    x = nonnegative_minima(
-        optimum.gram[:, :2, :2], optimum.product[:, :2], np.zeros((1, 2)), fit.free[:2].T, TOLERANCE_DOUBLE
-    )
-    matt = dataclasses.replace(optimum, x=np.vstack([x.T, np.zeros((1, len(x)))]))
     noise = residual_noise(optimum, seen.rounding)
-    after, before = (survey(fit.pictures, seen.widths, one, noise, seen.rounding) for one in (optimum, matt))
+    after = after or survey(fit.pictures, seen.widths, optimum, noise, seen.rounding)
     if highlight(fit.pictures, optimum.n, after).share(optimum.x, seen.brightest) < NO_TRACE:
         return False
     if fit.evidence is not None and fit.evidence.precision is not None:
         return True  # what errs together has been weighed by the channels' covariance
     left, chance = shared(_unexplained(fit.pictures, optimum, seen, after))
+    if left < CHANCE * chance:
+        return True
+    x = nonnegative_minima(
+        optimum.gram[:, :2, :2], optimum.product[:, :2], np.zeros((1, 2)), fit.free[:2].T, TOLERANCE_DOUBLE
+    )
+    matt = dataclasses.replace(optimum, x=np.vstack([x.T, np.zeros((1, len(x)))]))
+    before = survey(fit.pictures, seen.widths, matt, noise, seen.rounding)
     gone = shared(_unexplained(fit.pictures, matt, seen, before))[0] - left
-    return left < CHANCE * chance or gone > EXPLAINED * (gone + left)
+    return gone > EXPLAINED * (gone + left)
 
 
 def _unexplained(pictures: Sequence[Picture], optimum: Optimum, seen: Observed, left: Residual) -> list[Blocks]:

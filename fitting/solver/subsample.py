@@ -20,7 +20,7 @@ from jaxtyping import Float
 from fitting.solver.normal_equations import Picture, Sums
 
 # How many pixels of all pictures together are taken, and how many of each picture at least.
-SAMPLE_SIZE = 4096
+SAMPLE_SIZE = 2048
 SMALLEST_SAMPLE = 256
 
 # The strata are counted on every 16th pixel.

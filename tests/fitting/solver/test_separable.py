@@ -166,7 +166,7 @@ def test_dependent_columns():
 
 
 def test_what_comes_with_the_optimum():
-    one = picture(64, noise=0.02)
+    one = picture(40, noise=0.02)
     found = search([one])
     with jax.enable_x64(True):
         value, slope = (np.asarray(a)[:, 0] for a in one.lobe(np.float64(found.n)))
