@@ -76,7 +76,7 @@ class Table:
                 values[key] = self._value(key, value, parameters[key].annotation)
             for name, one in parameters.items():
                 if name not in values and one.default is one.empty:
-                    raise InputError(self.place, f"has no {name}", f"Add {name} = ...")
+                    raise InputError(self.place, f"has no {name}", f"Add {name}")
             return maker(**values)
         except InputError as error:
             known = (self.place, *(str(value) for value in values.values() if isinstance(value, Path)))
@@ -85,15 +85,16 @@ class Table:
     def _value(self, key, value, kind):
         """A value, refused where Python would silently read a truth value or text as a number."""
         if kind in _WORDS:
-            if not isinstance(value, bool if kind is bool else str) or value == "":
+            if not isinstance(value, bool if kind is bool else str) or (kind is Path and value == ""):
                 raise InputError(key, f"must be {_WORDS[kind]}, got {value!r}", "Correct the value")
             return self._path(key, value) if kind is Path else value
         if isinstance(value, list) and len(value) > MOST_CHANNELS:
             raise InputError(key, f"has {len(value)} entries", f"Give at most {MOST_CHANNELS}")
         for leaf in jax.tree.leaves(value):
             if isinstance(leaf, bool) or (isinstance(leaf, str) and key != "viewer"):
-                came = repr(leaf)[:40] if isinstance(leaf, str) else str(leaf).lower()
-                raise InputError(key, f"must be a number, got {came}", "Give numbers without quotes")
+                is_text = isinstance(leaf, str)
+                came, quoted = repr(leaf)[:40] if is_text else str(leaf).lower(), " without quotes" * is_text
+                raise InputError(key, f"must be a number, got {came}", f"Give numbers{quoted}")
         return value
 
     def _path(self, key, name) -> Path:

@@ -197,9 +197,9 @@ def vertex_list(name: str, value: Any) -> Any:
 def sample_number(value: Any, most: int = MAX_SAMPLES) -> int:
     """A number of samples: a whole number from 1 to ``most``."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise InputError("samples", f"must be a whole number, got {value!r}", "Give a whole number")
+        raise InputError("samples", f"must be a whole number, got {repr(value)[:60]}", "Give a whole number")
     if not 1 <= value <= most:
-        raise InputError("samples", f"must be between 1 and {most}, got {value}", "Give a whole number")
+        raise InputError("samples", f"must be between 1 and {most}, got {repr(value)[:60]}", "Give a whole number")
     return int(value)
 
 

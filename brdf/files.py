@@ -147,14 +147,14 @@ def atomic_path(path: AnyPath) -> Iterator[Path]:
 def _staging(folder: Path) -> Iterator[Path]:
     """A hidden folder in another one, gone at the end; what writers that are no more have staged there goes first."""
     with ExitStack() as lock:
-        if fcntl is not None:
-            descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-            lock.callback(os.close, descriptor)
-            with suppress(OSError):  # others write there, or the file system knows no locks
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                for abandoned in folder.glob(f"{_STAGED}*"):
-                    shutil.rmtree(abandoned)
-            with suppress(OSError):
+        with suppress(OSError):  # nobody may look, or the file system knows no locks
+            if fcntl is not None:
+                descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+                lock.callback(os.close, descriptor)
+                with suppress(OSError):  # others write there
+                    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    for abandoned in folder.glob(f"{_STAGED}*"):
+                        shutil.rmtree(abandoned)
                 fcntl.flock(descriptor, fcntl.LOCK_SH)
         with tempfile.TemporaryDirectory(prefix=_STAGED, dir=folder, ignore_cleanup_errors=True) as stage:
             yield Path(stage)

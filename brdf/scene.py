@@ -80,7 +80,7 @@ class Scene(Checked):
                 {f"{name}[{index}]": one for index, one in enumerate(part)} if isinstance(part, tuple) else {name: part}
             )
             for place, one in parts.items():
-                if one is not None:
+                if one is not None or isinstance(part, tuple):
                     instance(place, one, kind, words)
         fitted = [shape.fitted for shape in self.shapes]
         if (self.camera is None) == (self.points is None):

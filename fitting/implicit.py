@@ -91,6 +91,8 @@ def sensitivity(result: FitResult, by: Callable[[list[brdf.Scene]], Sequence[Any
     leaves = by(list(result.scenes))
     if not isinstance(leaves, Sequence) or not leaves or not all(hasattr(leaf, "shape") for leaf in leaves):
         raise brdf.InputError("by", "names no leaf of the scenes", "Return the leaves to differentiate by")
+    if len({id(leaf) for leaf in leaves}) < len(leaves):
+        raise brdf.InputError("by", "gives a leaf twice", "Return each once")
     unknowns = _unknowns(result)
     count = len(unknowns)
     with working_precision("float64"), waiting("differentiating the fit"):
@@ -114,8 +116,8 @@ def sensitivity(result: FitResult, by: Callable[[list[brdf.Scene]], Sequence[Any
         try:
             slope, rows = map(np.asarray, curvature(vector))
         except (TypeError, ValueError):
-            came = "gives what is no number of the scenes as a whole, or one twice"
-            raise brdf.InputError("by", came, "Return leaves of the scenes, each once") from None
+            came = "gives what is no number of the scenes as a whole"
+            raise brdf.InputError("by", came, "Return leaves of the scenes") from None
         # A fit in float32 stops a little beside the stationary point; Newton's steps go there.
         for _ in range(NEWTON_STEPS):
             vector = vector.at[:count].add(-_inverse(rows[:, :count]) @ slope)

@@ -45,7 +45,7 @@ from fitting.uncertainty.residual import NEGLIGIBLE, Neighbours, neighbours_of, 
 
 SOLVERS: dict[str, Any] = {"lm": optx.LevenbergMarquardt, "bfgs": optx.BFGS}
 LARGEST_JACOBIAN = 1 << 27
-ROUNDS = 8
+ROUNDS, FEWEST_STEPS = 8, 32
 # A picture is linear in these: one step of Gauss and Newton is the answer, and no solver asked.
 EMITTANCES = ("intensity", "radiance", "ambient")
 # Pixels so near to an outline that moves do not count: their shading bends, and they may come to see another shape.
@@ -209,14 +209,15 @@ def _solve(problem: JointProblem, seen: Observed, solver: str | None, tolerance:
     epsilon = float(jnp.finfo(vector.dtype).eps)
     # Of a smaller step rounding hides what it gains.
     least, unseen = max(tolerance, epsilon**0.5), max(tolerance, epsilon) * float(np.max(seen.brightest))
+    method = SOLVERS[solver](rtol=least, atol=least)
     # Steps that rounding hides the gains of are tried for ever: it is asked several times.
-    method, most = SOLVERS[solver](rtol=least, atol=least), -(-max_steps // ROUNDS) if solver == "lm" else max_steps
+    each = max(FEWEST_STEPS, -(-max_steps // ROUNDS)) if solver == "lm" else max_steps
     bounded, held = problem.each(lambda leaf: leaf.bounded), np.zeros(vector.shape, bool)
     linear = all(leaf.name in EMITTANCES for leaf in problem.freed)
     steps, converged, near, residual, columns = 0, False, linear, np.zeros(0), np.zeros((0, 0))
     for _ in range(ROUNDS):
         if not linear:
-            given = problem, vector, jnp.asarray(held)
+            given, most = (problem, vector, jnp.asarray(held)), min(each, max_steps - steps)
             solution = optx.least_squares(_residuals, method, vector, given, max_steps=most, throw=False)
             steps, near = steps + int(solution.stats["num_steps"]), solution.result == optx.RESULTS.successful
             vector = jnp.where(held, vector, solution.value)
@@ -232,6 +233,8 @@ def _solve(problem: JointProblem, seen: Observed, solver: str | None, tolerance:
             held = bounded & np.asarray(vector == 0)
             if converged := bool(met) and np.array_equal(held, before):
                 break
+        if steps >= max_steps:
+            break
     # Turns from here on are those of what was found.
     problem = problem.at(vector)
     vector = np.asarray(problem.start(), np.float64)
@@ -281,7 +284,7 @@ def _parameters(
 
     Of a direction the length is no unknown: its error is that of two small turns across it.
     """
-    covariance, deviation = known.errors(held)
+    covariance, deviation = known.errors()
     found: list[Parameter] = []
     places: list[int] = []
     for leaf in problem.freed:

@@ -40,22 +40,16 @@ class Known(NamedTuple):
     scatter: Float[np.ndarray, "U U"] | None = None
     widening: Float[np.ndarray, "*U"] = np.ones(1)
 
-    def errors(self, held: Bool[np.ndarray, " U"]) -> tuple[Float[np.ndarray, "U U"], Float[np.ndarray, " U"]]:
+    def errors(self) -> tuple[Float[np.ndarray, "U U"], Float[np.ndarray, " U"]]:
         """Covariance of the numbers and their errors, infinite where nothing tells of one alone.
 
-        Args:
-            held: which are at a bound; their errors are those that they would have without it.
+        What is at a bound is as unknown as it would be without it, to itself and to the others: noise holds it there.
         """
-        free = np.outer(~held, ~held)
-        covariance = scaled_inverse(self.hessian * free, DEPENDENT)
-        variance = inverse_diagonal(self.hessian * free, DEPENDENT)
+        covariance, variance = scaled_inverse(self.hessian, DEPENDENT), inverse_diagonal(self.hessian, DEPENDENT)
         if self.scatter is not None:
             covariance = covariance @ self.scatter @ covariance
             variance = np.where(np.isfinite(variance), np.diag(covariance), variance)
-        errors = np.sqrt(variance) * self.widening
-        for one in np.flatnonzero(held):
-            errors[one] = self.errors(held & (np.arange(held.size) != one))[1][one]
-        return covariance, errors
+        return covariance, np.sqrt(variance) * self.widening
 
 
 def by_least_squares(

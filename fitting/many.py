@@ -11,7 +11,9 @@ that show signs of it are fitted by `fitting.fit`, one by one.
 import dataclasses
 import functools
 import math
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -190,13 +192,20 @@ def _fit_together(problem: FitProblem) -> tuple[Bool[np.ndarray, " N"], dict[str
         weight = seen.reshape(count, -1).astype(targets.dtype)
         pictures = {"target": targets, "images": _bases(model, stack), "weight": weight, "ambient": stack.ambient}
         shared = {}
-    rows, devices = {}, device_count()
-    parts = {}
-    for device in own(min(devices, count)):
-        mine = jax.tree.map(lambda leaf, device=device: leaf[device::devices], pictures)
-        parts[device] = _solved(placed(device, mine), placed(device, shared), problem.n_range)
-    for device, part in parts.items():
-        rows |= {device + devices * place: row for place, row in enumerate(np.asarray(part, np.float64))}
+    lanes, cores = device_count(), os.cpu_count() or 1
+    # Equal parts, or each size would be compiled.
+    lanes = cores if lanes == 1 and count % (cores * BATCH) == 0 else min(lanes, count)
+    mine = own(lanes)
+    parts = [placed(lane, (jax.tree.map(lambda leaf, lane=lane: leaf[lane::lanes], pictures), shared)) for lane in mine]
+
+    def solve(part: Any) -> Float[np.ndarray, "N K"]:
+        with working_precision(problem.precision):  # each thread has its own
+            return np.asarray(_solved(*part, problem.n_range), np.float64)
+
+    rows = {}
+    with ThreadPoolExecutor(len(mine) or 1) as pool:
+        for lane, part in zip(mine, pool.map(solve, parts), strict=True):
+            rows |= {lane + lanes * place: row for place, row in enumerate(part)}
     channels = targets.shape[-1]
     table = gathered(rows, count, (7 * channels + 3,))
     ends = np.cumsum([channels] * 3 + [1] + [channels] * 4 + [1])

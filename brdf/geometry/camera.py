@@ -21,9 +21,9 @@ def _resolution(value: Any) -> tuple[int, int]:
     """Two whole numbers, width and height in pixels."""
     remedy, size = "Give [width, height] in pixels", tuple(value) if np.iterable(value) else ()
     if len(size) != 2 or any(isinstance(one, bool) or not isinstance(one, int | np.integer) for one in size):
-        raise InputError("resolution", f"must be two whole numbers, got {value!r}", remedy)
+        raise InputError("resolution", f"must be two whole numbers, got {repr(value)[:60]}", remedy)
     if not all(1 <= one <= MAX_RESOLUTION for one in size):
-        raise InputError("resolution", f"must be between 1 and {MAX_RESOLUTION}, got {value!r}", remedy)
+        raise InputError("resolution", f"must be between 1 and {MAX_RESOLUTION}, got {repr(value)[:60]}", remedy)
     return int(size[0]), int(size[1])
 
 

@@ -34,7 +34,8 @@ _CURVE_TOLERANCE = 2e-3
 # Chunks with their lengths; a gAMA of 0 means nothing (PNG, 11.3.2.2).
 _PNG_SAYS = re.compile(rb"\0\0\0\x01sRGB|\0\0\0\x04gAMA(?!\0{4})")
 # By the code for transfer characteristics (ITU-T H.273, table 3); the curve of a BT.709 display is that of BT.1886.
-_CICP_TRANSFERS: dict[int, Encoding] = {1: 2.4, 4: 2.2, 5: 2.8, 6: 2.4, 8: "linear", 13: "srgb", 14: 2.4, 15: 2.4}
+_CICP_TRANSFERS: dict[int, Encoding] = {8: "linear", 13: "srgb", **dict.fromkeys((1, 6, 14, 15), 2.4)}
+_CICP_TRANSFERS |= {4: 2.2, 5: 2.8, 17: 2.6}
 _CICP_UNSPECIFIED = 2
 
 
@@ -144,7 +145,7 @@ def _stated(path: Path, format_name: str, spec: Any) -> Encoding | None:
     if not space or format_name in (*_DISPLAY_FORMATS, "bmp", "pnm", "ico", "psd"):
         return None
     named = re.match(r"g(\d\d)_", space)
-    gamma = attributes.get("oiio:Gamma") or (named and int(named[1]) / 10)
+    gamma = (named and int(named[1]) / 10) or attributes.get("oiio:Gamma")
     if gamma:
         return parse_encoding(path, round(gamma, 6))
     for start, encoding in _SPACES.items():

@@ -325,7 +325,7 @@ def _shown(path, image, part, channels: list[int], start: int, stop: int, encodi
         what = f"is damaged: rows {first} to {last} of {spec.height} cannot be read ({complaint or 'no data'})"
         raise InputError(path, what, "Make the file again")
     pixels = pixels.reshape(-1, spec.width, high - low)[
-        skip : skip + last - first, max(-left, 0) : spec.full_width - left
+        skip : skip + last - first, max(-left, 0) : max(spec.full_width - left, 0)
     ]
     if channels != list(range(low, high)):
         pixels = pixels[..., [channel - low for channel in channels]]

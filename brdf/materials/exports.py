@@ -344,7 +344,7 @@ def _three(material, name):
         "type": "MeshPhongMaterial",
         "name": name,
         **{key: int(code @ [1 << 16, 1 << 8, 1]) for key, code in codes.items()},  # 0xRRGGBB
-        "shininess": n if np.any(peak) else 30.0,
+        "shininess": n if isinstance(material, SpecularMaterial) else 30.0,
         "userData": user_data,
     }
     return Written(values, losses, drawn, user_data)

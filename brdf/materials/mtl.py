@@ -70,7 +70,7 @@ def read_mtl(path: Any, text: str) -> dict[str, dict[str, Any]]:
     """
     entries: dict[str, dict[str, Any]] = {}
     name, told, start, begun = None, {}, 0, ""
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate([*text.splitlines(), ""], start=1):  # which ends a line that would go on
         start = start if begun else number
         line = begun + line.strip()
         begun = line[:-1] + " " if line.endswith("\\") and not line.startswith("#") else ""
@@ -91,7 +91,7 @@ def read_mtl(path: Any, text: str) -> dict[str, dict[str, Any]]:
         elif key in (*_COEFFICIENTS, "ns", "illum", _TEXTURE):
             if name is None:
                 raise InputError(place, f"has {word} before any newmtl", "Start the material with newmtl NAME")
-            entries[name][key] = given[-1:] if key == _TEXTURE else _numbers(place, word, given)
+            entries[name][key] = given[-1:] or [word] if key == _TEXTURE else _numbers(place, word, given)
     if not entries:
         raise InputError(path, "holds no material", "Give a file with a newmtl line")
     return entries

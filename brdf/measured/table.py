@@ -115,10 +115,10 @@ class MeasuredBRDF:
 
 
 def _rows(name, value, columns=None):
-    rows = as_numbers(name, value)
-    rows = rows[:, None] if rows.ndim == 1 else rows
+    given = as_numbers(name, value)
+    rows = given[:, None] if given.ndim == 1 and columns in (None, 1) else given
     if rows.ndim != 2 or 0 == rows.shape[1] or (columns or rows.shape[1]) != rows.shape[1]:
-        raise InputError(name, f"must be of shape (P, {columns or 'C'}), got {rows.shape}", "Give a row per sample")
+        raise InputError(name, f"must be of shape (P, {columns or 'C'}), got {given.shape}", "Give a row per sample")
     return rows
 
 

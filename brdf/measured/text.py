@@ -78,11 +78,14 @@ def _cornell(path, rows):
     if not rows:
         raise InputError(path, "holds no numbers", "Give a table of a measured BRDF")
     place, (first, *_) = rows[0]
-    count = int(first) if first.isdecimal() and len(first) < 9 else 0
-    if not 1 <= count <= MOST_CHANNELS:
+    try:
+        count = parse_number(first)
+    except ValueError:
+        count = 0
+    if not 1 <= count <= MOST_CHANNELS or count % 1:
         remedy = "The first number says how many wavelengths follow; ALTA files have a #DIM line"
         raise InputError(place, f"is no measured BRDF, got {first[:40]!r}", remedy)
-    head = []
+    count, head = int(count), []
     while rows and len(head) <= count:
         (place, words), *rows = rows
         _table(path, [(place, words)], len(words))  # what is no number is told where it stands

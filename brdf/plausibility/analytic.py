@@ -79,9 +79,11 @@ def _reciprocity(material: Material, classic: bool) -> Finding:
     # normal, and the light as low as can be.
     lights, views = np.array([GRAZING]), np.geomspace(GRAZING - 90.0, -90.0, 100_001) + 90.0
     there, back = _in_plane(material, lights, -views)[0], _in_plane(material, views, -lights)[:, 0]
-    row, channel = largest(1.0 - back / there)
-    forth, other = float(there[row, channel]), float(back[row, channel])
-    value, light, view = 1.0 - other / forth, Angles(GRAZING), Angles(float(views[row]), 180.0)
+    # A black channel is reciprocal.
+    difference = np.divide(there - back, there, out=np.zeros_like(there), where=there > 0)
+    row, channel = largest(difference)
+    forth, other, value = (float(one[row, channel]) for one in (there, back, difference))
+    light, view = Angles(GRAZING), Angles(float(views[row]), 180.0)
     a, b = f"{light.polar:.4g}°", f"{view.polar:.4g}°"
     compared = f"f_r({a}→{b}) is {times(forth / max(other, 1e-300))} f_r({b}→{a})"
     if value < 2 * RECIPROCITY_LIMIT:  # a trace of k_s shows only closer to 90 degrees than the angles go

@@ -12,7 +12,7 @@ import os
 import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, get_args
 
 import typer
 
@@ -22,6 +22,9 @@ from brdf.files import check_folder
 
 # By what Slurm, Open MPI and `jax.distributed` itself say how many processes there are.
 PROCESSES = ("SLURM_NTASKS", "OMPI_COMM_WORLD_SIZE", "JAX_NUM_PROCESSES")
+
+# What help shows that an option takes, where that is no text.
+TAKES = {bool: "", Path: "PATH", float: "NUMBER", int: "NUMBER"}
 
 
 class PictureOptions(NamedTuple):
@@ -95,7 +98,8 @@ def _typed(one, documented, panel):
         about = typer.Argument(help=words)
     else:
         names = [_flag(one.name), *(["-o"] if one.name == "out" else [])]
-        about = typer.Option(*names, help=words, metavar="" if kind is bool else None, rich_help_panel=panel)
+        takes = next((word for known, word in TAKES.items() if known in (kind, *get_args(kind))), "TEXT")
+        about = typer.Option(*names, help=words, metavar=takes, rich_help_panel=panel)
     return one.replace(kind=one.KEYWORD_ONLY, annotation=Annotated[kind, about])
 
 
@@ -127,7 +131,7 @@ def find_materials(text: str) -> dict[str, tuple["brdf.Material", str]]:
     Raises:
         InputError: naming the file.
     """
-    key = _table_name(text)
+    key = table_name(text)
     if key is not None:
         return {key: (brdf.preset(key), "")}
     from brdf.materials.material_file import read_materials
@@ -145,7 +149,7 @@ def find_material(text: str, name: str | None = None) -> tuple["brdf.Material", 
     Raises:
         InputError: naming the file or the option.
     """
-    key = _table_name(text)
+    key = table_name(text)
     if key is None:
         from brdf.materials.material_file import read_material
 
@@ -155,8 +159,15 @@ def find_material(text: str, name: str | None = None) -> tuple["brdf.Material", 
     return brdf.preset(key), ""
 
 
-def _table_name(text: str) -> str | None:
-    """The name in the classic table; None where a file is meant."""
+def table_name(text: str) -> str | None:
+    """The name in the classic table; None where a file is meant.
+
+    Args:
+        text: as it is typed.
+
+    Raises:
+        InputError: where it is neither.
+    """
     if not text.strip():
         raise InputError("MATERIAL", "is empty", "Give a .json or .mtl file, or a name such as emerald")
     path, key = Path(text), text.strip().lower().replace(" ", "_").replace("-", "_")

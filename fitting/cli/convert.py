@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import brdf
-from fitting.cli.common import find_material, show
+from fitting.cli.common import find_material, show, table_name
 
 
 def convert(material: str, out: Path, *, to: str | None = None, name: str | None = None) -> None:
@@ -20,7 +20,7 @@ def convert(material: str, out: Path, *, to: str | None = None, name: str | None
         From the classic table: brdf convert emerald emerald.json --to three
     """
     loaded, note = find_material(material, name)
-    called = name or Path(material).stem
+    called = name or table_name(material) or Path(material).stem
     export = brdf.save_export(loaded, out, to=to, name="_".join(called.split()), note=note)
     notes = [f"  note: {note}"] if note else []
     show("\n".join([f"wrote {out}", *notes, *(f"  not carried: {loss}" for loss in export.losses)]))

@@ -119,11 +119,11 @@ def read_lights(path: str | Path) -> tuple[list[Path], Float[np.ndarray, "P 3"]]
     numbered = [(number, line) for number, line in enumerate(lines, start=1) if line.partition("#")[0]]
     names, directions = [], []
     for number, line in numbered[1:]:
-        name, *words = line.replace(",", " ").rsplit(maxsplit=3)
         try:
+            name, *words = line.replace(",", " ").rsplit(maxsplit=3)
             vector = [parse_number(word) for word in words]
         except ValueError:
-            vector = []
+            name, vector = "", []
         if len(vector) != 3 or not np.all(np.isfinite(vector)) or not any(vector):
             came = f"must be a name and three numbers that are not all 0, got {line[:60]!r}"
             raise InputError(f"{path}: line {number}", came, "Give name x y z, towards the light")

@@ -356,7 +356,7 @@ class Texels(eqx.Module):
             log_n: where.
             slopes: derivatives of what is explained by the nonlinear unknowns; by log n, the first of a model with a
                 lobe, of the lobe.
-            errors: whether a k_a or k_d of 0 is as unknown as others, as errors want it: what holds it there is noise,
+            errors: whether what is at a bound is as unknown as others, as errors want it: what holds it there is noise,
                 and n would seem determined by light that the next draw gives to k_d. In a step it stays where it is.
         """
         columns = self.columns(log_n)
@@ -368,8 +368,8 @@ class Texels(eqx.Module):
             [*(a * x * b for x, b in zip(row, factors, strict=True)), a * (moment - sum(map(operator.mul, row, k)))]
             for a, (*row, moment) in zip(factors, rows, strict=True)
         ]
-        active = [(x > 0) | (errors and i < count - 1) for i, x in enumerate(k)]
-        active[-1] &= k[-1] < self.cap
+        active = [(x > 0) | errors for x in k]
+        active[-1] &= (k[-1] < self.cap) | errors
         solved = solve(rows, [*active, *[True] * len(slopes)], count - self.grey)
         gain = jnp.sum(divide(k[-1] ** 2, solved[count - 1].inverse), axis=0)
         of_channels = k, [one.error for one in solved[:count]]

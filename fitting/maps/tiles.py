@@ -294,7 +294,7 @@ def _layers(
         "fitted_n": n,
         "fitted_k_s": jnp.where(inside, k_s, 0),
         "normal": jnp.where(inside, jnp.stack(normal.parts), 0),
-        "normal_error": jnp.degrees(jnp.where(inside & bool(angles), noise * tilt, 0)),
+        "normal_error": jnp.degrees(jnp.where(inside, noise * tilt, jnp.nan)) if angles else jnp.zeros_like(n),
         "noise": jnp.where(inside, noise, jnp.nan),
         "left_out": outliers / jnp.maximum(every, 1),
         "determined": known,

@@ -82,14 +82,15 @@ class Uncertainty(NamedTuple):
 
 
 def residual_noise(optimum: Optimum, rounding: Float[np.ndarray, " C"]) -> Float[np.ndarray, " C"]:
-    """Standard deviation of the residual, never below that of rounding.
+    """Standard deviation of the residual, never below that of rounding: in a black channel that of the brightest one.
 
     Args:
         optimum: of the engine.
         rounding: standard deviation of a value's rounding, (C,).
     """
     degrees = np.maximum(optimum.pixels - np.count_nonzero(optimum.x > 0, axis=0), 1)
-    return np.sqrt(np.maximum(optimum.cost / degrees, np.maximum(rounding**2, np.finfo(float).tiny)))
+    least = np.max(optimum.square / degrees) * np.finfo(float).eps ** 2 + np.finfo(float).tiny
+    return np.sqrt(np.maximum(optimum.cost / degrees, np.maximum(rounding**2, least)))
 
 
 def uncertainty(

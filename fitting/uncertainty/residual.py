@@ -19,6 +19,7 @@ from fitting.uncertainty.structure import SIZES, Blocks, coarser
 
 # Pairs of neighbours that are looked at in all, about: a correlation is then known to 1 %.
 PAIRS, FEWEST_PAIRS, FEWEST_ROWS = 8192, 256, 16
+GOLDEN = 0.6180339887498949
 # A correlation above this, and above so many of its own standard errors, is structure.
 CORRELATED, DEVIATIONS = 0.1, 5.0
 # Up to this share of the picture a residual shows where a solver stopped.
@@ -97,13 +98,15 @@ def survey(
         picture = jax.tree.map(np.asarray, picture) if small else picture
         unit = np.maximum(noise, np.finfo(picture.target.dtype).tiny)
         found = make(picture, np.asarray(optimum.n), optimum.x, unit, width=width)
-        left, shown, parts, top, squares = jax.device_get(found)
+        left, counts, shown, parts, top, squares = jax.device_get(found)
         blocks.append(Blocks(*parts))
-        pairs.append(_neighbours(left.reshape(-1, width, left.shape[1]), most))
-        stride = max(1, len(left) // most)
-        counts = np.any(left[::stride] != 0, axis=1)
-        errors.append(left[::stride][counts])
-        values.append(shown[::stride][counts])
+        pairs.append(_neighbours(left.reshape(-1, width, left.shape[1]), counts.reshape(-1, width), most))
+        index = np.flatnonzero(counts)
+        if len(index) > most:
+            # Multiples of the golden ratio keep to no column of the picture.
+            index = index[(np.arange(most) * GOLDEN % 1 * len(index)).astype(int)]
+        errors.append(left[index])
+        values.append(shown[index])
         largest, carrying = max(largest, float(top)), carrying + float(squares)
     error, value = (np.concatenate(parts).astype(np.float64) for parts in (errors, values))
     return Residual(blocks, _going_together(pairs, noise > 2 * rounding), error, value, largest, carrying)
@@ -115,7 +118,8 @@ def neighbours_of(images: Sequence[Float[np.ndarray, "H W C"]]) -> Neighbours:
     Args:
         images: 0 where a pixel does not count.
     """
-    return _going_together([_neighbours(image, PAIRS) for image in images], np.ones(images[0].shape[2], bool))
+    pairs = [_neighbours(image, np.any(image != 0, axis=2), PAIRS) for image in images]
+    return _going_together(pairs, np.ones(images[0].shape[2], bool))
 
 
 def structure_warning(known: Neighbours) -> tuple[str, ...]:
@@ -136,10 +140,14 @@ def _going_together(pairs: Sequence[np.ndarray], channels: Bool[np.ndarray, " C"
     return Neighbours(correlation, correlation > least)
 
 
-def _neighbours(image: Float[np.ndarray, "H W C"], most: int) -> Float[np.ndarray, "4 C"]:
+def _neighbours(
+    image: Float[np.ndarray, "H W C"], counts: Bool[np.ndarray, "H W"], most: int
+) -> Float[np.ndarray, "4 C"]:
     """Of pairs side by side and one above the other in some rows: products, squares of both, how many pairs."""
     height, width, channels = image.shape
-    rows = np.unique(np.linspace(0, max(height - 2, 0), max(FEWEST_ROWS, most // (2 * width))).astype(int))
+    lit = np.flatnonzero(counts.any(axis=1))
+    count = min(len(lit), max(FEWEST_ROWS, most // (2 * width)))
+    rows = lit[np.linspace(0, max(len(lit) - 2, 0), count).astype(int)]
     some, found = image[rows], np.zeros((4, channels))
     for one, other in ((some[:, :-1], some[:, 1:]), (some, image[np.minimum(rows + 1, height - 1)])):
         if height == 1 and one is some:
@@ -152,7 +160,7 @@ def _neighbours(image: Float[np.ndarray, "H W C"], most: int) -> Float[np.ndarra
 
 
 def _survey(picture: Picture, n: AnyArray, x: AnyArray, noise: AnyArray, width: int) -> tuple[Any, ...]:
-    """Errors, what is shown, sums over the smallest blocks, the lobe's largest value, and its squares over that."""
+    """Errors, where they count, what is shown, sums over blocks, the lobe's largest value, its squares over that."""
     xp: Any = np if isinstance(picture.diffuse, np.ndarray) else jnp
     shown, lobe = picture.shown_and_lobe(n, x)
     weights = picture.weights
@@ -165,7 +173,14 @@ def _survey(picture: Picture, n: AnyArray, x: AnyArray, noise: AnyArray, width: 
     value = xp.max(xp.where(xp.any(weights > 0, axis=1, keepdims=True), lobe, 0), axis=1)
     largest = xp.max(value, initial=0)
     # Squares of a highlight that no pixel sees would fall below the smallest number.
-    return left, shown, blocks, largest, xp.sum((value / xp.where(largest > 0, largest, 1)) ** 2)
+    return (
+        left,
+        xp.any(left != 0, axis=1),
+        shown,
+        blocks,
+        largest,
+        xp.sum((value / xp.where(largest > 0, largest, 1)) ** 2),
+    )
 
 
 _survey_many = jax.jit(_survey, static_argnames="width", compiler_options=COMPILER_OPTIONS)

@@ -231,3 +231,30 @@ def test_a_freed_light_is_found_behind_rounded_values_as_the_material_is(row: st
             assert off < 4 * np.array(parameter.error), parameter
     plain = fitting.fit_jointly(picture, wrong, "blinn-phong", "light", rounding=0)
     assert np.array(plain[light.name].error) > closest * light.error
+
+
+def test_few_steps_lead_away_from_the_start(target: np.ndarray):
+    start = brdf.BlinnPhong(k_a=MATERIAL.k_a, k_d=MATERIAL.k_d, k_s=MATERIAL.k_s, n=18)
+    known = scene(TRUE_DIRECTION, [1.0, 0.9, 0.8])
+    result = fitting.fit_jointly(target, known, start, lambda m, _: (m.n,), max_steps=4)
+    assert abs(result.material.n - 25) < 1
+    assert result.steps <= 4
+
+
+def test_many_lights_that_are_dark_are_told_as_quickly_as_few():
+    """Numbers at their bound once took a time that grew as their factorial."""
+    random = np.random.default_rng(5)
+    directions = np.add(random.normal(size=(16, 3)), [0, 0, 2])
+    lights = [brdf.DirectionalLight(direction=direction, intensity=[0.0]) for direction in directions]
+    lights[0] = brdf.DirectionalLight(direction=[0.5, 0.6, 0.7], intensity=[1.0])
+    lit = brdf.Scene(camera=CAMERA, shapes=[BALL], lights=lights)
+    picture = np.asarray(brdf.render(brdf.Lambert(k_d=[0.5]), lit, precision="float64"))
+    picture = picture + 0.005 * random.normal(size=picture.shape)
+    known = brdf.Scene(
+        camera=CAMERA,
+        shapes=[BALL],
+        lights=[brdf.DirectionalLight(direction=one.direction, intensity=[0.5]) for one in lights],
+    )
+    result = fitting.fit_lights(picture, known, brdf.Lambert(k_d=[0.5]))
+    assert sum(one.at_bound for one in result.parameters) >= 4
+    assert all(one.error > 0 for one in result.parameters)

@@ -92,3 +92,5 @@ def test_what_cannot_be_differentiated_is_named():
     result = fitting.fit(picture("noise"), scene(), model="blinn-phong")
     with pytest.raises(brdf.InputError, match="by: names no leaf"):
         fitting.sensitivity(result, lambda s: ())
+    with pytest.raises(brdf.InputError, match="by: gives a leaf twice"):
+        fitting.sensitivity(result, lambda s: (s[0].ambient, s[0].ambient))

@@ -287,3 +287,20 @@ def test_a_picture_whose_roundings_leave_nothing_open_does_not_end_the_fit():
     result = fitting.fit(codes, scenes, model="lambert", encoding="linear")
     k_d = result["k_d"][0]
     assert abs(k_d.value - 0.6) < 4 * k_d.error < 1e-6
+
+
+def test_noise_that_grows_is_seen_on_a_small_ball_in_a_large_picture():
+    camera = brdf.OrthographicCamera(
+        position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=(512, 512)
+    )
+    small = brdf.Sphere(center=[0.62, -0.6, 0], radius=0.07)
+    scene = brdf.Scene(camera=camera, shapes=[small], lights=[LIGHT])
+    clean = np.asarray(brdf.render(brdf.BlinnPhong(k_d=0.5, k_s=0.4, n=20), scene, precision="float64"))
+    result = fitting.fit(clean * (1 + 0.1 * np.random.default_rng(0).normal(size=clean.shape)), scene, model="phong")
+    assert any("grows with brightness" in text for text in result.warnings)
+
+
+def test_a_channel_that_is_black_in_a_noisy_picture_does_not_end_the_fit():
+    truth = brdf.BlinnPhong(k_a=[0, 0, 0], k_d=[0.5, 0.3, 0], k_s=[0.4, 0.4, 0], n=40)
+    picture = noisy(truth, np.array([0.01, 0.01, 0.0]), 0)
+    assert fitting.fit(picture, SCENE).surface in ("blinn-phong", "phong")

@@ -58,6 +58,7 @@ MISUSES = {
     "brdf.EnvironmentMap('sky.exr')": r"pixels: must be numbers\.",
     "brdf.some_pixels(scene, mask)": r"pixel: must be whole numbers .* Of a mask, give np\.flatnonzero\(mask\)",
     "brdf.some_pixels(scene, np.array([10**6]))": r"pixel: must be whole numbers from 0 to 2303",
+    "brdf.Scene(scene.camera, shapes=[None])": r"shapes\[0\]: must be a Shape, got NoneType\.",
     # materials
     "brdf.BlinnPhong(0.3, 0.5, 50)": r"BlinnPhong: too many positional arguments\. Write BlinnPhong\(k_d=\.\.\., k_s=",
     "brdf.BlinnPhong(k_d=0.3, n=4)": r"BlinnPhong: missing a required argument: 'k_s'\.",

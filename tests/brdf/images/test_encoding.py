@@ -46,6 +46,7 @@ def icc(curve):
         ([(b"cICP", bytes([1, 13, 0, 1]))], SRGB, "srgb", "file"),
         ([(b"cICP", bytes([1, 8, 0, 1]))], LINEAR, "linear", "file"),
         ([(b"cICP", bytes([12, 4, 0, 1]))], GAMMA_22, 2.2, "file"),
+        ([(b"cICP", bytes([1, 17, 0, 1]))], (GRADIENT / 255) ** 2.6, 2.6, "file"),
         ([(b"cICP", bytes([1, 2, 0, 1])), (b"gAMA", struct.pack(">I", 100000))], LINEAR, "linear", "file"),
         ([icc(parametric(3, *SRGB_CURVE))], SRGB, "srgb", "file"),
         ([icc(parametric(0, 2.2))], GAMMA_22, pytest.approx(2.2, abs=1e-4), "file"),

@@ -278,3 +278,5 @@ def test_layers_of_a_cropped_file_lie_on_its_picture(tmp_path):
     np.testing.assert_array_equal(layers[""], read_image(path))
     np.testing.assert_array_equal(layers["normal"][1:5, 2:7], values[..., 3:])
     assert np.isnan(layers["normal"]).sum() == 3 * (6 * 8 - 4 * 5)
+    beside = raw(tmp_path / "b.exr", values, names, data_at=(12, 1), display=(0, 0, 8, 6))
+    assert np.isnan(read_layers(beside)["normal"]).all()

@@ -110,6 +110,7 @@ def test_lines_of_an_mtl_file_may_go_on(tmp_path: Path, start: str, end: str):
     [
         ("newmtl a\nKd .5\nKs .2\nNs 2\n", brdf.BlinnPhong),
         ("newmtl a\nKd .5 .5 .5\n", brdf.Lambert),
+        ("newmtl a\nKd .5 .5 .5\nKs .1 .1 .1 \\", brdf.BlinnPhong),
         ("newmtl a\nKd .5 .5 .5\nKs 1 1 1\nillum 1\n", brdf.Lambert),
         ("# brdf model: normalized-phong\nnewmtl a\nKd .5 .5 .5\nNs 8\n", brdf.NormalizedPhong),
         ("# brdf model: lambert\nnewmtl a\nKd .5 .5 .5\nKs 1 1 1\n", brdf.Lambert),
@@ -151,7 +152,7 @@ MALFORMED = {
         '{"model": "lambert", "k_d": [1], "n": 3}',
         "n: is not a known key. Known here: k_a, k_d.",
     ),
-    "missing": (".json", '{"model": "phong", "k_d": [1], "n": 3}', "a.json: has no k_s. Add k_s = "),
+    "missing": (".json", '{"model": "phong", "k_d": [1], "n": 3}', "a.json: has no k_s. Add k_s"),
     "negative": (".json", '{"model": "lambert", "k_d": [0.5, -0.2]}', "k_d: must be at least 0, got -0.2 in channel 1"),
     "not a number": (".json", '{"model": "lambert", "k_d": [NaN]}', "k_d: must be finite"),
     "words": (".json", '{"model": "lambert", "k_d": ["red"]}', "k_d: must be a number"),

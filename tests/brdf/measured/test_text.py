@@ -76,6 +76,10 @@ def test_alta_confidence_columns_cosine_factor_and_colours(load):
     assert load("#DIM 1 3\n#PARAM_IN COS_TH\n#PARAM_OUT RGB_COLOR\n0.5 1 2 3").channels == ("red", "green", "blue")
 
 
+def test_a_count_of_wavelengths_may_have_a_decimal_point(load):
+    assert load(CORNELL.replace("\n2\n", "\n2.0\n")).channels == ("400 nm", "500 nm")
+
+
 REFUSED = [
     ("# only this", "no numbers"),
     (" ", "no numbers"),

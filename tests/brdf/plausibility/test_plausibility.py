@@ -165,3 +165,9 @@ def test_a_registered_model_that_nobody_knows_on_paper_is_measured(monkeypatch):
 
     monkeypatch.setitem(brdf.MODELS, "bright", Bright)
     assert brdf.check(Bright(k_d=0.9)).energy.verdict == "fail"
+
+
+def test_a_black_channel_is_reciprocal():
+    report = check(Phong(k_d=[0, 0.2, 0.3], k_s=[0, 0.1, 0.1], n=5))
+    assert report.reciprocity.verdict == "fail"
+    assert report.reciprocity.margin < 0

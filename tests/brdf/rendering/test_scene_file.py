@@ -195,6 +195,14 @@ def test_layers_of_an_aov_file_can_be_named(tmp_path: Path):
     np.testing.assert_array_equal(points.position[0, 0], [0, 0, 2])
 
 
+def test_the_unnamed_layer_of_an_aov_file_is_named_by_nothing(tmp_path: Path):
+    normal = np.broadcast_to([0.0, 0.0, 1.0], (4, 5, 3))
+    write_layers(tmp_path / "aovs.exr", {"": normal, "position": normal})
+    (tmp_path / "scene.toml").write_text('[aov]\nfile = "aovs.exr"\nnormal = ""\n' + LIGHT)
+    points = brdf.Scene.load(tmp_path / "scene.toml").surface_points()
+    np.testing.assert_array_equal(points.normal, normal)
+
+
 WRONG = {
     "unknown key": (SHORT + "colour = 3\n", "lights[0].colour: is not a known key"),
     "unknown table": (SHORT + "[sky]\n", "sky: is not a known key"),

@@ -478,6 +478,9 @@ def test_lines_of_a_light_file(tmp_path, line, name):
     names, directions = read_lights(tmp_path / "x.lp")
     assert names[0].name == name
     assert directions.shape == (1, 3)
+    (tmp_path / "x.lp").write_text(f"2\n{line}\n,\n")
+    with pytest.raises(brdf.InputError, match="line 3: must be a name and three numbers"):
+        read_lights(tmp_path / "x.lp")
 
 
 def _break(path, what):
@@ -670,3 +673,18 @@ def test_the_light_that_is_added_is_where_it_tells_most():
         fitting.next_light(maps, of="k_d")
     with pytest.raises(brdf.InputError, match="candidates: hold a PointLight"):
         fitting.next_light(maps, [brdf.PointLight([0, 0, 3], 9.0)])
+
+
+def test_errors_of_k_d_hold_what_a_highlight_at_its_bound_may_take():
+    lights = dome(16)
+    pictures, truth = texels(256, 0.0, lights, n=(5, 5.001))
+    half = (lights + VIEW) / np.linalg.norm(lights + VIEW, axis=1)[:, None]
+    cosine = np.maximum(lights @ truth["normal"].T, 0)
+    lobe = np.where(cosine > 0, (half @ truth["normal"].T) ** 5, 0)
+    clean = truth["k_d"] * cosine[..., None] + 0.01 * lobe[..., None]
+    pictures = (clean + 0.01 * np.random.default_rng(1).normal(size=clean.shape))[:, None]
+    maps = fitting.fit_maps(pictures, lights, truth["normal"].reshape(1, -1, 3), model="blinn-phong")
+    none = maps.fitted_k_s[0, :, 0] == 0
+    assert none.sum() > 20
+    inside = np.abs(maps.k_d[0] - truth["k_d"]) < 1.96 * maps.k_d_error[0]
+    assert inside[none].mean() > 0.85
