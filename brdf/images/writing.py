@@ -129,7 +129,7 @@ def _write(path, layers, kind, encoding, coverage=()):
     if len(names) > MOST_CHANNELS:
         came = f"would have {len(names)} channels, which nothing reads back"
         raise InputError(path, came, f"Write at most {MOST_CHANNELS} into a file")
-    pixels = np.concatenate([*layers.values(), *coverage], axis=2)
+    pixels = np.ascontiguousarray(np.concatenate([*layers.values(), *coverage], axis=2))
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
     spec.channelnames = tuple(names)
     spec.alpha_channel = names.index("A") if coverage else -1

@@ -79,6 +79,9 @@ def test_any_number_of_channels(tmp_path, channels, suffix):
     picture = read_picture(tmp_path / "a.exr")
     np.testing.assert_array_equal(picture.pixels, values)
     np.testing.assert_array_equal(picture.alpha, alpha)
+    for other in (values.transpose(1, 0, 2), values[::-1, ::2], np.broadcast_to(values[:1, :1], values.shape)):
+        write_image(tmp_path / "b.exr", other)
+        np.testing.assert_array_equal(read_image(tmp_path / "b.exr"), other)
 
 
 @pytest.mark.parametrize(
