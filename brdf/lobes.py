@@ -69,11 +69,12 @@ class OneOf:
         """The models that have a lobe."""
         return tuple(model for model in self.models if issubclass(model, SpecularMaterial))
 
-    def log_cosine(self, *directions: Components) -> Array:
+    @property
+    def log_cosine(self) -> Callable[..., Array]:
         """See `SpecularMaterial.log_cosine`."""
         kinds = list(dict.fromkeys(model.log_cosine for model in self.lobes))
         kind = jnp.array([kinds.index(model.log_cosine) for model in self.lobes])[self.index]
-        return jax.lax.switch(kind, kinds, *directions)
+        return partial(jax.lax.switch, kind, kinds)
 
     def scale(self, n: Array) -> Array:
         """See `SpecularMaterial.scale`."""
@@ -100,7 +101,7 @@ class LightTerms(NamedTuple):
 
 
 def light_terms(
-    model: OneOf, lighting: Lighting, point: Points, kind: type[Light], numbers: Any, nodes: Any, light: Array
+    model: OneOf, lighting: Lighting, point: Points, kind: type[Light], samples: tuple[Any, Any, Array]
 ) -> LightTerms:
     """The terms of samples of a light.
 
@@ -109,10 +110,10 @@ def light_terms(
         lighting: with the shapes that cast shadows.
         point: (P,).
         kind: of light.
-        numbers: of the light, (...) each.
-        nodes: of its samples, (S, ...) each.
-        light: which of the scene's lights each of them is, (S,).
+        samples: numbers of the light, (...) each; nodes of its samples, (S, ...) each; which of the scene's lights each
+            of them is, (S,).
     """
+    numbers, nodes, light = samples
     row = [values[:, None] for values in (*(one[None] for one in numbers), *nodes)]
     sample = kind.sample(point, *(Components.of(one) if one.ndim == 3 else one for one in row))
     cosine = point.normal @ sample.to_light if sample.cosine is None else sample.cosine
@@ -180,36 +181,35 @@ def over_samples(model: OneOf, points: Points, lighting: Lighting, of_terms: Any
     if is_sampled(lighting):
         sums, peak = _by_tiles(of_tile, flat)
     else:
-        sums, peak = functools.reduce(together, (added(_times_emitted, *one) for one in _terms(model, flat, lighting)))
+        parts = []
+        for emitted, program, samples in _programs(model, flat, lighting):
+            parts.append(added(_times_emitted, emitted, _joined(jax.lax.map(program, samples))))
+        sums, peak = functools.reduce(together, parts)
     return jax.tree.map(points.per_pixel, sums), jnp.max(peak.reshape(-1, points.each), axis=1)
 
 
-def _terms(model: OneOf, points: Points, lighting: Lighting) -> Iterator[tuple[Array, LightTerms]]:
-    """Of the lights of each kind what the samples emit, (S, C), and their terms, chunk by chunk."""
+def _programs(model: OneOf, points: Points, lighting: Lighting) -> Iterator[tuple[Array, Callable[..., Any], Any]]:
+    """Of the lights of each kind what the samples emit, (S, C), what makes terms of a chunk of them, and the chunks."""
     for stack in lighting.stacks:
+        emitted, chunks = stack.chunks(CHUNK)
+        yield emitted.reshape(-1, emitted.shape[-1]), partial(light_terms, model, lighting, points, stack.kind), chunks
 
-        def of_light(one: Any, kind: type[Light] = stack.kind) -> LightTerms:
-            numbers, *chunks = one
-            return jax.lax.map(lambda chunk: light_terms(model, lighting, points, kind, numbers, *chunk), (*chunks,))
 
-        nodes, emitted, light = stack.chunks(CHUNK)
-        terms = jax.lax.map(of_light, (stack.numbers, nodes, light))
-        yield emitted.reshape(-1, emitted.shape[-1]), jax.tree.map(lambda one: one.reshape(-1, one.shape[-1]), terms)
+def _joined(terms: LightTerms) -> LightTerms:
+    """Of the samples of all chunks, (S, P)."""
+    return jax.tree.map(lambda one: one.reshape(-1, one.shape[-1]), terms)
 
 
 def over_chunks(add: Callable[..., Any], lighting: Lighting, size: int, total: Any) -> Any:
-    """Add up over all samples: ``add(total, emitted, kind, numbers, nodes, light)``, so many samples at a time."""
+    """Add up over all samples: ``add(total, emitted, kind, samples)``, so many at a time; see `light_terms`."""
     for stack in lighting.stacks:
 
-        def add_light(total: Any, one: Any, kind: type[Light] = stack.kind) -> tuple[Any, None]:
-            @jax.checkpoint
-            def add_chunk(total: Any, chunk: Any) -> tuple[Any, None]:
-                nodes, emitted, light = chunk
-                return add(total, emitted, kind, one[0], nodes, light), None
+        @jax.checkpoint
+        def add_chunk(total: Any, chunk: Any, kind: type[Light] = stack.kind) -> tuple[Any, None]:
+            emitted, samples = chunk
+            return add(total, emitted, kind, samples), None
 
-            return jax.lax.scan(add_chunk, total, one[1])
-
-        total, _ = jax.lax.scan(add_light, total, (stack.numbers, stack.chunks(size)))
+        total, _ = jax.lax.scan(add_chunk, total, stack.chunks(size))
     return total
 
 
@@ -452,7 +452,8 @@ def diffuse_and_kept(model: OneOf, sight: Sight, lighting: Lighting) -> tuple[Ar
     """The diffuse basis of pixels, and the lobe of the terms of all samples."""
     points = sight.in_components()
     diffuse, kept = jnp.zeros(()), []
-    for emitted, terms in _terms(model, points.flat(), lighting):
+    for emitted, program, samples in _programs(model, points.flat(), lighting):
+        terms = _joined(jax.lax.map(program, samples))
         diffuse = diffuse + _times_emitted(emitted, terms.diffuse)
         # Of few samples each is an array of its own, which takes less time to read; of an averaged pixel all are one.
         step = len(emitted) if is_sampled(lighting) or points.each > 1 else 1

@@ -23,7 +23,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from brdf.checks import Scalar, instance
 from brdf.errors import InputError
 from brdf.geometry.rays import PrimaryRays, Sight
-from brdf.geometry.surface_points import Points, SurfacePoints
+from brdf.geometry.surface_points import SurfacePoints
 from brdf.lights.base import Lighting, stacked
 from brdf.lobes import (
     NO_LOBE,
@@ -163,16 +163,13 @@ def _basis_images(model: OneOf, points: Sight, ambient: Any, lighting: Lighting,
             return terms.diffuse, None
         return terms.diffuse, terms.weight * (model.scale(n) * jnp.exp(n * terms.log_cosine))
 
-    def of_points(seen: Points) -> tuple[Any, ...]:
+    centres, area, made = points.in_components(), points.area, []
+    for seen in (centres, *([] if area is None else [area.points.in_components()])):
         share = seen.mask if seen.share is None else seen.mask * seen.share
         ambience = None if ambient is None else seen.per_pixel(share.reshape(-1, 1) * ambient)
         lit = over_samples(model, seen, lighting, of_terms)[0] if lighting.stacks else (None, None)
-        return ambience, *lit
-
-    centres, area = points.in_components(), points.area
-    images = of_points(centres)
-    if area is not None:
-        images = jax.tree.map(partial(averaged, area.slot.ravel()), images, of_points(area.points.in_components()))
+        made.append((ambience, *lit))
+    images = made[0] if area is None else jax.tree.map(partial(averaged, area.slot.ravel()), *made)
     return BasisImages(*jax.tree.map(lambda image: image.reshape(*centres.mask.shape, -1), images))
 
 

@@ -20,7 +20,7 @@ differentiation gives the derivative of the plain product. In float64 there is n
 
 import functools
 import operator
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -97,19 +97,16 @@ class Components:
 
     def __matmul__(self, other: "Components") -> Array:
         """Scalar product."""
-        return _sum(self * other)  # the order is fixed, unlike that of a reduction
+        # The order is fixed, unlike that of a reduction.
+        return functools.reduce(operator.add, map(operator.mul, self.parts, other.parts))
 
     def cross(self, other: "Components") -> "Components":
         """Vector product."""
-        (ax, ay, az), (bx, by, bz) = self, other
+        (ax, ay, az), (bx, by, bz) = self.parts, other.parts
         return Components((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))
 
 
 Directions = Float[ArrayLike, "*#batch 3"] | Components
-
-
-def _sum(parts: Iterable[Array]) -> Array:
-    return functools.reduce(operator.add, parts)
 
 
 def select(condition: ArrayLike, a: Components, b: Components) -> Components:
@@ -136,7 +133,7 @@ def normalize(v: Any) -> Any:
     size = jax.lax.stop_gradient(functools.reduce(jnp.maximum, map(jnp.abs, parts)))  # a mere unit: it cancels
     nonzero = size > 4 * jnp.finfo(size.dtype).tiny  # so that 1 / size is finite too
     unscaled = [jnp.where(nonzero, one, 0.0) / jnp.where(nonzero, size, 1.0) for one in parts]
-    squared = _sum(map(operator.mul, unscaled, unscaled))
+    squared = functools.reduce(operator.add, map(operator.mul, unscaled, unscaled))
     length = jnp.sqrt(jnp.where(nonzero, squared, 1.0))
     # A division last: XLA's CPU compiler repeats all but divisions and roots in each loop that reads them.
     found = Components(tuple(one / length for one in unscaled))
@@ -273,22 +270,31 @@ class _Split(NamedTuple):
 def _split(*vectors: Directions) -> list[_Split]:
     """The parts of vectors whose components lie within +-1, in one common floating-point type."""
     given, parts = list(map(Components.of, vectors)), []
-    dtype = jnp.result_type(*(one for vector in given for one in vector), 1.0)
+    dtype = jnp.result_type(*(one for vector in given for one in vector.parts), 1.0)
     for vector in given:
-        value = Components(tuple(one.astype(dtype) for one in vector))
+        value = Components(tuple(one.astype(dtype) for one in vector.parts))
         # no derivative: the rest carries it
-        high = Components(tuple(map(jnp.round, value * _GRID))) * (1.0 / _GRID) if dtype == jnp.float32 else value
+        high = (
+            Components(tuple(map(jnp.round, (value * _GRID).parts))) * (1.0 / _GRID) if dtype == jnp.float32 else value
+        )
         parts.append(_Split(value, high, None if high is value else value - high))
     return parts
 
 
-def _product(product: Callable[[Any, Any], Any], a: _Split, b: _Split) -> Any:
-    """The scalar or vector product of vectors whose components lie within +-2."""
-    leading = product(a.high, b.high)
-    return leading if a.low is None else leading + (product(a.high, b.low) + product(a.low, b.value))
+def _dot(a: _Split, b: _Split) -> Array:
+    """The scalar product of vectors whose components lie within +-2."""
+    leading = functools.reduce(operator.add, map(operator.mul, a.high.parts, b.high.parts))
+    if a.low is None or b.low is None:
+        return leading
+    return leading + functools.reduce(
+        operator.add, map(operator.mul, (*a.high.parts, *a.low.parts), (*b.low.parts, *b.value.parts))
+    )
 
 
-_dot, _cross = partial(_product, operator.matmul), partial(_product, Components.cross)
+def _cross(a: _Split, b: _Split) -> Components:
+    """The vector product of such."""
+    leading = a.high.cross(b.high)
+    return leading if a.low is None or b.low is None else leading + (a.high.cross(b.low) + a.low.cross(b.value))
 
 
 def _combined(operation: Callable[[Any, Any], Any], a: _Split, b: _Split) -> _Split:

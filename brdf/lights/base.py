@@ -109,8 +109,8 @@ class LightStack:
     emitted: Float[AnyArray, "L S C"]
     light: Int[AnyArray, "L S"]
 
-    def chunks(self, largest: int) -> tuple[Any, Array, Array]:
-        """Nodes, emission and lights by chunks of up to so many samples, (L, K, B, ...).
+    def chunks(self, largest: int) -> tuple[Array, tuple[Any, Any, Array]]:
+        """Emission, (K, B, C), and numbers, nodes and lights by chunks of up to so many samples of one light, (K, ...).
 
         Lights that are a sample each are taken together, as the samples of one. Samples of no light fill up the last
         chunk.
@@ -122,7 +122,9 @@ class LightStack:
         chunks = -(-count // largest)
         place = np.arange(chunks * -(-count // chunks)).reshape(chunks, -1)
         nodes, emitted, light = jax.tree.map(lambda leaf: leaf[:, np.minimum(place, count - 1)], each)
-        return nodes, jnp.where((place < count)[..., None], emitted, 0), light
+        emitted = jnp.where((place < count)[..., None], emitted, 0)
+        nodes, emitted, light = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), (nodes, emitted, light))
+        return emitted, (jax.tree.map(lambda leaf: jnp.repeat(leaf, chunks, axis=0), self.numbers), nodes, light)
 
 
 @pytree

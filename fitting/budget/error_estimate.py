@@ -132,13 +132,13 @@ def estimate(run: Run) -> Attempt:
     """The error of a fit."""
     optimum, problem = run.optimum, run.problem
     # More for a lobe so narrow that the rounding of directions counts against its width.
-    rounding = float(np.finfo(problem.precision).eps * (1.5 + 0.005 * np.sqrt(max(optimum.n, 0.0))))
+    rounding = float(np.finfo(problem.precision).eps * (1 + 0.005 * np.sqrt(max(optimum.n, 0.0))))
     errors = [inverse_diagonal(gram, DEPENDENT)[np.diag(gram) > 0] for gram in optimum.gauss_newton]
     if problem.precision == "float32" and np.isinf(np.concatenate(errors)).any():
         return Attempt(1.0, 1.0, 0.0, 0.0, 1.0)
     samples = problem.sample_error(run.result.material.name)
     if samples is None and not any(run.samples):
-        return Attempt(rounding, 6 * rounding, 0.0, 0.0, rounding)
+        return Attempt(rounding, 9 * rounding, 0.0, 0.0, rounding)
     probes = Probes(run)
     # Coefficients at their bound count as if they were free, which makes no error smaller.
     told = probes.known | np.append((optimum.x > 0).ravel(), True)

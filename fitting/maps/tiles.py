@@ -196,7 +196,7 @@ def _near(texels: Texels, stacks: Any, occluders: Any, ambient: Components | Non
             def of_samples(one, kind=stack.kind):
                 emitted, *samples = one
                 model = OneOf((texels.model,))
-                found = light_terms(model, Lighting((), occluders), points.in_components(), kind, *samples)
+                found = light_terms(model, Lighting((), occluders), points.in_components(), kind, tuple(samples))
                 diffuse, weight = (part[..., None] * emitted[:, None] for part in (found.diffuse, found.weight))
                 return found._replace(diffuse=diffuse, weight=weight)
 
