@@ -269,7 +269,8 @@ def _levels(pixels: np.ndarray, *, half: bool) -> Codes | None:
         above = np.maximum(step, 1e-30) / unit
         return Codes((pixels / unit).astype(np.float32), 0.0, above, ends, 1 / unit, "linear", levels="RGBE files")
     if halves:
-        ulp = np.spacing(np.maximum(pixels, 6e-5).astype(np.float16)).astype(np.float64)
+        known = np.where(np.isfinite(pixels), np.maximum(pixels, 6e-5), 1.0)
+        ulp = np.spacing(known.astype(np.float16)).astype(np.float64)
         unit = float(np.median(ulp[pixels > 0])) if np.any(pixels > 0) else 1.0
         around = 0.5 * ulp / unit
         return Codes((pixels / unit).astype(np.float32), around, around, ends, 1 / unit, "linear", levels="half floats")

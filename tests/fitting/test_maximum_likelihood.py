@@ -55,6 +55,10 @@ def test_floats_on_the_levels_of_files_are_said_to_be_codes(values: Callable[[np
     result = fitting.fit(values(one.drawn()), one.scene(), model=one.model)
     assert result.levels == levels
     assert (f"read as     codes: all values lie on the levels of {levels}" in str(result)) == bool(levels)
+    # Neither does what is no number say anything, nor is there a warning of it.
+    broken = values(one.drawn())
+    broken[20:24], broken[24] = np.nan, np.inf
+    assert fitting.fit(broken, one.scene(), model=one.model).levels == levels
 
 
 @pytest.mark.parametrize("row", ["sRGB 8 bit, light noise 0.0005", "sRGB 8 bit, light noise 0.01"])
