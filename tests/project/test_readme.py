@@ -24,3 +24,11 @@ def test_links_lead_somewhere(page: Path):
 def test_every_page_is_on_the_documentation_s_list():
     index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
     assert [page.name for page in DOCS if page.stem != "index" and f"\n{page.stem}\n" not in index] == []
+
+
+def test_the_map_of_the_code_names_files_that_are_there():
+    there = {
+        path.name for folder in ("brdf", "fitting", "benchmarks", "tests") for path in (ROOT / folder).rglob("*.py")
+    }
+    named = set(re.findall(r"\w+\.py\b", (ROOT / "docs" / "code_map.md").read_text(encoding="utf-8")))
+    assert named - there == set()
