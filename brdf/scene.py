@@ -145,7 +145,7 @@ class Scene(Checked):
             points = self.points if rows is None else jax.tree.map(lambda leaf: leaf[first:stop], self.points)
         else:
             assert self.camera is not None
-            points = PrimaryRays(self.camera, self.shapes, (first, stop)).stored()
+            points = PrimaryRays.of_rows(self.camera, self.shapes, first, stop).stored()
         visibility = None
         if self.visibility:
             unshadowed = np.ones((height, self.resolution[0]), bool)
@@ -165,7 +165,7 @@ class Scene(Checked):
         camera = self.camera
         if camera is None or (rows is None and camera.samples > 1) or any(mask is not None for mask in self.visibility):
             return self.surface_points(rows)
-        rays = PrimaryRays(camera, self.shapes, (0, self.resolution[1]) if rows is None else rows)
+        rays = PrimaryRays.of_rows(camera, self.shapes, *((0, self.resolution[1]) if rows is None else rows))
         return rays if rays.quick else rays.stored()
 
     @classmethod

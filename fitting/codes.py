@@ -160,8 +160,8 @@ def open_ends(
         spread: noise of each pixel over that of the picture, a number or (P, 1).
         width: of the picture.
     """
-    low, high = values <= floor, values >= (np.inf if level is None else level)
-    if np.count_nonzero(low) < _FEWEST_ENDS and not high.any():
+    low, high = values <= floor, level is not None and values >= level
+    if np.count_nonzero(low) < _FEWEST_ENDS and not np.any(high):
         return None
     good = valid[:, None]
     low, high = good & low, good & high

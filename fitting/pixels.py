@@ -26,7 +26,7 @@ from fitting.light_colour import take_colour_out
 from fitting.likelihood import Bounds
 from fitting.problem import TOP, FitProblem, Target, has_pixel_areas
 from fitting.solver.devices import device_count
-from fitting.solver.normal_equations import COMPILER_OPTIONS, FEW_VALUES
+from fitting.solver.normal_equations import COMPILER_OPTIONS, FEW_VALUES, totals
 from fitting.solver.streams import Stream, each, joined
 
 # How many pixels are taken together; of a file at least as many rows as its blocks hold, or these are read twice.
@@ -146,12 +146,14 @@ class Statistics(NamedTuple):
             these not too dark.
         largest: finite value of any channel.
         top: how many pixels share it.
+        least: value of any pixel, seen or not.
         scale: largest size of a value that counts, (C,).
     """
 
     counts: Any
     largest: Any
     top: Any
+    least: Any
     scale: Any
 
 
@@ -223,7 +225,6 @@ def _observe(
     # Other losses, dark levels and steps of 0 are ways of one's own to say what pixels say.
     plain = dark is None and problem.loss == "squared" and not target.least_squares
     plain = plain and not target.streamed and device_count() == 1
-    floor = float(np.nanmin(target.pixels)) if plain and target.codes is None else -np.inf
 
     def tile(band: _Band, counted: tuple[np.ndarray, Statistics]) -> Tile:
         good, weight = counted[0], None
@@ -248,7 +249,7 @@ def _observe(
             if target.codes is not None:
                 bounds = target.codes.bounds(band.rows, valid, level, spread)
             else:
-                bounds = open_ends(np.asarray(band.values), valid, floor, level, spread, width)
+                bounds = open_ends(np.asarray(band.values), valid, total.least, level, spread, width)
         return Tile(band.values, weight, band.points, grey, bounds)
 
     tiles = each(tile, bands, found)
@@ -303,50 +304,41 @@ def _statistics(
     limits = np.inf if level is None else level, -np.inf if dark is None else dark
 
     def of_band(band: _Band) -> tuple[np.ndarray, Statistics]:
-        given = np.asarray(band.points.mask).ravel(), band.allowed, *limits
+        seen = np.count_nonzero(band.points.mask), np.count_nonzero(band.allowed)
         if band.values.size > FEW_VALUES:
-            return jax.device_get(_count_many(band.values, *given))
-        with np.errstate(invalid="ignore", over="ignore"):
-            return _count(np.asarray(band.values), *given, xp=np)
+            good, own = _count_many(band.values, band.allowed, *limits)
+        else:
+            with np.errstate(invalid="ignore", over="ignore"):
+                good, own = _count(np.asarray(band.values), band.allowed, *limits, xp=np)
+        return good, own._replace(counts=(*seen, *own.counts))
 
     def together(one: Statistics, other: Statistics) -> Statistics:
         largest = max(one.largest, other.largest)
         top = sum(int(part.top) for part in (one, other) if part.largest >= largest * TOP)
-        return Statistics(one.counts + other.counts, largest, top, np.maximum(one.scale, other.scale))
+        least, scale = min(one.least, other.least), np.maximum(one.scale, other.scale)
+        return Statistics(np.add(one.counts, other.counts), largest, top, least, scale)
 
     found = each(of_band, bands)
-    found = list(found) if keep else found
+    # Those that are kept are under way together.
+    found = jax.device_get(list(found)) if keep else each(jax.device_get, found)
     return found, functools.reduce(together, (statistics for _, statistics in found))
 
 
-def _count(values: Any, seen: Any, allowed: Any, level: float, dark: float, *, xp: Any) -> tuple[Any, Statistics]:
+def _count(values: Any, allowed: Any, level: float, dark: float, *, xp: Any) -> tuple[Any, Statistics]:
     """Which pixels count, and what there is to know of them, in NumPy or JAX."""
     brightest = _over_channels(xp.maximum, values)
-    finite = allowed & xp.isfinite(_over_channels(xp.add, values))
+    whole = xp.isfinite(_over_channels(xp.add, values))
+    finite = allowed & whole
     below = finite & (brightest < level)
     good = below & (brightest > dark)
-    masks, bright = (seen, allowed, finite, below, good), xp.where(finite, brightest, -xp.inf)
+    masks, bright = (finite, below, good), xp.where(finite, brightest, -xp.inf)
     sizes = [xp.where(good, xp.abs(values[:, channel]), 0) for channel in range(values.shape[1])]
-    if xp is np:
-        counts, largest, scale = list(map(np.count_nonzero, masks)), np.max(bright), list(map(np.max, sizes))
-    else:
-        counts, largest, scale = _totals(masks, bright, sizes)
-    top = xp.count_nonzero(bright >= largest * TOP)
-    return good, Statistics(xp.stack(counts), largest, top, xp.stack(scale))
-
-
-def _totals(masks: Sequence[Array], bright: Array, sizes: Sequence[Array]) -> tuple[list[Array], Array, list[Array]]:
-    """Counts and largest values, in one loop as in `fitting.solver.normal_equations`."""
     terms = [*(mask.astype(np.int32) for mask in masks), bright, *sizes]
-    start = [np.full((), -np.inf if term is bright else 0, term.dtype) for term in terms]
-    combine = [jnp.add] * len(masks) + [jnp.maximum] * (1 + len(sizes))
-
-    def both(one: tuple[Array, ...], other: tuple[Array, ...]) -> tuple[Array, ...]:
-        return tuple(add(*parts) for add, *parts in zip(combine, one, other, strict=True))
-
-    found = jax.lax.reduce(tuple(terms), tuple(start), both, (0,))
-    count = len(masks)
-    return list(found[:count]), found[count], list(found[count + 1 :])
+    found = totals(terms, ["add"] * len(masks) + ["maximum"] * (1 + len(sizes)), (0,))
+    counts, (largest, *scale) = found[: len(masks)], found[len(masks) :]
+    top = xp.count_nonzero(bright >= largest * TOP)
+    least = xp.min(xp.where(whole, _over_channels(xp.minimum, values), xp.inf))
+    return good, Statistics(tuple(counts), largest, top, least, xp.stack(scale))
 
 
 _count_many = jax.jit(partial(_count, xp=jnp), compiler_options=COMPILER_OPTIONS)

@@ -101,14 +101,21 @@ class PrimaryRays:
     Attributes:
         camera: where they begin.
         shapes: what they may meet.
-        rows: the first row of the picture, and the one after the last.
+        first: row of the picture; no part of a program, or each band of a large picture would be compiled.
+        height: how many rows.
         area: none: the centres stand for the pixels.
     """
 
     camera: Camera
     shapes: tuple[Shape, ...]
-    rows: tuple[int, int] = dataclasses.field(metadata={"static": True})
+    first: Any
+    height: int = dataclasses.field(metadata={"static": True})
     area: ClassVar[None] = None
+
+    @classmethod
+    def of_rows(cls, camera: Camera, shapes: tuple[Shape, ...], first: int, stop: int) -> "PrimaryRays":
+        """Those of some rows."""
+        return cls(camera, shapes, np.int32(first), stop - first)
 
     @property
     def quick(self) -> bool:
@@ -116,14 +123,15 @@ class PrimaryRays:
         return len(self.shapes) <= FEW_SHAPES and all(shape.convex for shape in self.shapes)
 
     @property
-    def places(self) -> tuple[np.ndarray, np.ndarray]:
+    def places(self) -> tuple[Any, Any]:
         """Columns and rows of the pixels' centres."""
-        return np.arange(self.camera.resolution[0])[None, :] + 0.5, np.arange(*self.rows)[:, None] + 0.5
+        rows = self.first + np.arange(self.height, dtype=np.int32)
+        return np.arange(self.camera.resolution[0])[None, :] + 0.5, rows[:, None] + 0.5
 
     @property
     def count(self) -> int:
         """How many rays there are."""
-        return self.camera.resolution[0] * (self.rows[1] - self.rows[0])
+        return self.camera.resolution[0] * self.height
 
     def traced(self) -> Points:
         """What they meet, (rows, W)."""

@@ -157,7 +157,9 @@ class Picture:
         if self.lobe is None:
             return -np.inf
         peak = np.asarray(self.lobe.peak)
-        return float(np.max(peak if self.weight is None else np.where(self.counts, peak, -np.inf), initial=-np.inf))
+        if self.weight is not None and not np.all(np.asarray(self.weight[np.argmax(peak)]) > 0):
+            peak = np.where(self.counts, peak, -np.inf)
+        return float(np.max(peak))
 
     @property
     def weights(self) -> Float[AnyArray, "P Cw"]:
@@ -241,6 +243,30 @@ class Sums(NamedTuple):
         return self._replace(gram=basis @ self.gram @ basis.swapaxes(-1, -2), product=product)
 
 
+def totals(terms: Sequence[Any], combine: Sequence[str], axes: tuple[int, ...]) -> list[Any]:
+    """The total of each array over some axes, under JAX in one loop.
+
+    Args:
+        terms: of one shape, in NumPy or JAX.
+        combine: "add" or "maximum", of each.
+        axes: to reduce; the last ones first where it matters, as in NumPy.
+    """
+    if isinstance(terms[0], np.ndarray):
+        # One axis after the other: sums over the first are as long as the others.
+        found = list(terms)
+        for place, axis in enumerate(axes):
+            found = [getattr(np, how).reduce(one, axis - place) for how, one in zip(combine, found, strict=True)]
+        return found
+    start = tuple(
+        np.full((), 0 if how == "add" else -np.inf, one.dtype) for how, one in zip(combine, terms, strict=True)
+    )
+
+    def both(one: tuple[Array, ...], other: tuple[Array, ...]) -> tuple[Array, ...]:
+        return tuple(getattr(jnp, how)(*pair) for how, *pair in zip(combine, one, other, strict=True))
+
+    return list(jax.lax.reduce(tuple(terms), start, both, axes))
+
+
 def _summed(columns: int, residuals: int) -> list[tuple[int, int]]:
     """Which products of the columns and of the residuals after them are summed: of two residuals none."""
     size = columns + residuals
@@ -292,9 +318,8 @@ def _pass(picture: Picture, log_n: Array, count: Array, reference: Array, peak: 
         weighted = [weight * one for one in parts]
         products = [weighted[i] * parts[j] for i, j in _summed(4, target.shape[1])]
         products.append(jnp.where(weight > 0, columns[0], 0))
-        zeros = (np.zeros((), dtype),) * len(products)
-        totals = jax.lax.reduce(tuple(products), zeros, lambda left, right: tuple(map(operator.add, left, right)), (1,))
-        found = jnp.stack(totals, axis=1).astype(jnp.float64), jnp.stack(means)
+        summed = totals(products, ["add"] * len(products), (1,))
+        found = jnp.stack(summed, axis=1).astype(jnp.float64), jnp.stack(means)
         return jax.tree.map(lambda all_, one: all_.at[index, block].set(one), state, found)
 
     kinds = len(_summed(4, channels // groups)) + 1

@@ -7,6 +7,7 @@ stratum; sparse ones are kept whole, the others sample to about equal numbers. W
 So few pixels are dealt with on the host, in float64: nothing is compiled for them.
 """
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -163,7 +164,7 @@ def subsample(pictures: Sequence[Picture]) -> Subsample:
         nearest = min(nearest, -picture.nearest_peak)
         wanted = size if picture.lobe is None else max(SMALLEST_SAMPLE, min(size, _TERMS // picture.lobe.samples))
         if picture.lobe is not None and np.count_nonzero(counts) > wanted + wanted // 4:
-            index, factor = stratified(-np.asarray(picture.lobe.peak), counts, wanted)
+            index, factor = stratified(np.asarray(picture.lobe.peak), counts, wanted)
         else:
             index = np.flatnonzero(counts)
         part = picture.on_host(index)
@@ -173,17 +174,23 @@ def subsample(pictures: Sequence[Picture]) -> Subsample:
     return Subsample(parts, factors, nearest)
 
 
-def stratified(distance: np.ndarray, counts: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+@functools.lru_cache(maxsize=2)
+def _spread(count: int) -> np.ndarray:
+    """Multiples of the golden ratio modulo 1, in units of 2^-32: they spread evenly over any run of pixels."""
+    return np.arange(count, dtype=np.uint32) * np.uint32(2654435769)
+
+
+def stratified(log_cos: np.ndarray, counts: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Some pixels, and how many each stands for.
 
     Args:
-        distance: ``-log_cos`` of each pixel.
+        log_cos: of each pixel, its size the distance from the peak.
         counts: which may be taken.
         size: about how many.
     """
     # The octave of a number is its binary exponent, 0 at the peak itself.
-    octave = ((distance.astype(np.float32).view(np.int32) >> 23) & 0xFF).astype(np.uint8)
-    octave[~counts] = _EXCLUDED
+    octave = ((log_cos.astype(np.float32, copy=False).view(np.int32) >> 23) & 0xFF).astype(np.uint8)
+    octave = np.where(counts, octave, np.uint8(_EXCLUDED))
     preview = octave[::_PREVIEW_STRIDE]
     count = np.bincount(preview, minlength=256) * (octave.size / preview.size)
     count[_EXCLUDED] = 0
@@ -192,7 +199,5 @@ def stratified(distance: np.ndarray, counts: np.ndarray, size: int) -> tuple[np.
     most = (size - np.cumsum(ordered) + ordered) / np.arange(ordered.size, 0, -1)
     share = np.minimum(1.0, np.max(most, initial=0.0) / np.maximum(count, 1.0))
     share[_EXCLUDED] = 0.0
-    # Multiples of the golden ratio modulo 1 spread evenly over any run of pixels, without a regular pattern.
-    step = np.arange(octave.size, dtype=np.uint32) * np.uint32(2654435769)
-    index = np.flatnonzero(step < (share * 0xFFFFFFFF).astype(np.uint32)[octave])
+    index = np.flatnonzero(_spread(octave.size) < (share * 0xFFFFFFFF).astype(np.uint32)[octave])
     return index, 1 / share[octave[index]]

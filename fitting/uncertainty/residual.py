@@ -3,22 +3,24 @@
 Errors are taken in units of the noise, 0 where a pixel does not count.
 """
 
-import operator
+import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float, Int
 
-from fitting.solver.normal_equations import COMPILER_OPTIONS, FEW_VALUES, AnyArray, Picture
+from fitting.likelihood import AnyArray
+from fitting.solver.normal_equations import COMPILER_OPTIONS, FEW_VALUES, UNROLLED_CHANNELS, Picture, totals
 from fitting.solver.profile import Optimum
 from fitting.uncertainty.noise_model import noise_model
-from fitting.uncertainty.structure import SIZES, Blocks, coarser
+from fitting.uncertainty.structure import SIZES, Blocks
 
-# Pairs of neighbours that are looked at in all, about: a correlation is then known to 1 %.
-PAIRS, FEWEST_PAIRS, FEWEST_ROWS = 8192, 256, 16
+# So many pixels are looked at one by one, with those beside and below them: in all, and of each picture at least.
+SOME_PIXELS, FEWEST_PIXELS = 4096, 128
 GOLDEN = 0.6180339887498949
 # A correlation above this, and above so many of its own standard errors, is structure.
 CORRELATED, DEVIATIONS = 0.1, 5.0
@@ -89,26 +91,35 @@ def survey(
         noise: standard deviation of the weighted residual, (C,).
         rounding: that of a value's rounding, (C,): neighbours in a channel with no more noise are not looked at.
     """
-    most = max(FEWEST_PAIRS, PAIRS // len(pictures))
+    most = max(FEWEST_PIXELS, SOME_PIXELS // len(pictures))
     blocks, pairs, errors, values = [], [], [], []
     largest, carrying = 0.0, 0.0
     for picture, width in zip(pictures, widths, strict=True):
         small = picture.target.size <= FEW_VALUES and not picture.is_sampled
-        make = _survey if small else _survey_many
         picture = jax.tree.map(np.asarray, picture) if small else picture
-        unit = np.maximum(noise, np.finfo(picture.target.dtype).tiny)
-        found = make(picture, np.asarray(optimum.n), optimum.x, unit, width=width)
-        left, counts, shown, parts, top, squares = jax.device_get(found)
-        blocks.append(Blocks(*parts))
-        pairs.append(_neighbours(left.reshape(-1, width, left.shape[1]), counts.reshape(-1, width), most))
-        index = np.flatnonzero(counts)
-        if len(index) > most:
-            # Multiples of the golden ratio keep to no column of the picture.
-            index = index[(np.arange(most) * GOLDEN % 1 * len(index)).astype(int)]
-        errors.append(left[index])
-        values.append(shown[index])
-        largest, carrying = max(largest, float(top)), carrying + float(squares)
-    error, value = (np.concatenate(parts).astype(np.float64) for parts in (errors, values))
+        unit, peak = np.maximum(noise, np.finfo(picture.target.dtype).tiny), min(picture.nearest_peak, 0.0)
+        decay = math.exp(optimum.n * peak)
+        at = np.asarray(optimum.n), peak, optimum.x * np.array([[1.0], [1.0], [decay]]), unit
+        places = _places(picture.counts, width, most)
+        if small:
+            *seen, lobe = _seen(picture, *at)
+            found = _over_blocks(seen[0], lobe, width)
+            left, shown = (np.concatenate(part)[:, places] for part in seen)
+        else:
+            found = _over_blocks_many(picture, *at, width=width)
+            few = picture.in_double(places.ravel())
+            seen = (_seen_many if few.is_sampled else _seen)(few, *at)[:2]
+            left, shown = (np.concatenate(part)[:, : places.size].reshape(-1, *places.shape) for part in seen)
+        *sums, squares, top = jax.device_get(found)
+        # Of each channel or group sums, squares and counts, one after the other: (R, Q, C) of each kind.
+        blocks.append(Blocks(*(np.moveaxis(np.concatenate(sums[kind::3]), 0, -1) for kind in range(3))))
+        top = float(np.max(top))
+        largest, carrying = max(largest, decay * top), carrying + float(np.sum(squares[0])) / (top or 1.0) ** 2
+        pairs.append(_pairs(left, places))
+        counts = np.any(left[:, 0] != 0, axis=0)
+        errors.append(left[:, 0, counts])
+        values.append(shown[:, 0, counts])
+    error, value = (np.concatenate(parts, axis=1).T.astype(np.float64) for parts in (errors, values))
     return Residual(blocks, _going_together(pairs, noise > 2 * rounding), error, value, largest, carrying)
 
 
@@ -118,7 +129,11 @@ def neighbours_of(images: Sequence[Float[np.ndarray, "H W C"]]) -> Neighbours:
     Args:
         images: 0 where a pixel does not count.
     """
-    pairs = [_neighbours(image, np.any(image != 0, axis=2), PAIRS) for image in images]
+    pairs = []
+    for image in images:
+        left = image.reshape(-1, image.shape[2])
+        places = _places(np.any(left != 0, axis=1), image.shape[1], SOME_PIXELS)
+        pairs.append(_pairs(left.T[:, places], places))
     return _going_together(pairs, np.ones(images[0].shape[2], bool))
 
 
@@ -140,57 +155,71 @@ def _going_together(pairs: Sequence[np.ndarray], channels: Bool[np.ndarray, " C"
     return Neighbours(correlation, correlation > least)
 
 
-def _neighbours(
-    image: Float[np.ndarray, "H W C"], counts: Bool[np.ndarray, "H W"], most: int
-) -> Float[np.ndarray, "4 C"]:
-    """Of pairs side by side and one above the other in some rows: products, squares of both, how many pairs."""
-    height, width, channels = image.shape
-    lit = np.flatnonzero(counts.any(axis=1))
-    count = min(len(lit), max(FEWEST_ROWS, most // (2 * width)))
-    rows = lit[np.linspace(0, max(len(lit) - 2, 0), count).astype(int)]
-    some, found = image[rows], np.zeros((4, channels))
-    for one, other in ((some[:, :-1], some[:, 1:]), (some, image[np.minimum(rows + 1, height - 1)])):
-        if height == 1 and one is some:
-            continue
-        both = (one != 0) & (other != 0)
-        one, other = one * both, other * both
-        products = (np.einsum("hwc,hwc->c", *pair) for pair in ((one, other), (one, one), (other, other)))
-        found += [*products, np.count_nonzero(both, axis=(0, 1))]
-    return found
+def _places(counts: Bool[np.ndarray, " P"], width: int, most: int) -> Int[np.ndarray, "3 M"]:
+    """Some pixels that count, those beside them and those below; where there is none, themselves."""
+    index = np.flatnonzero(counts)
+    if len(index) > most:
+        # Multiples of the golden ratio keep to no column of the picture.
+        index = index[np.sort((np.arange(most) * GOLDEN % 1 * len(index)).astype(int))]
+    below = index + width
+    return np.stack([index, index + ((index + 1) % width > 0), np.where(below < counts.size, below, index)])
 
 
-def _survey(picture: Picture, n: AnyArray, x: AnyArray, noise: AnyArray, width: int) -> tuple[Any, ...]:
-    """Errors, where they count, what is shown, sums over blocks, the lobe's largest value, its squares over that."""
+def _pairs(left: Float[np.ndarray, "C 3 M"], places: Int[np.ndarray, "3 M"]) -> Float[np.ndarray, "4 C"]:
+    """Of pairs side by side and one above the other: products, squares of both, how many pairs."""
+    one, other = left[:, :1], left[:, 1:]
+    both = (one != 0) & (other != 0) & (places[1:] > places[0])
+    one, other = one * both, other * both
+    return np.array([np.sum(term, axis=(1, 2)) for term in (one * other, one * one, other * other, both)])
+
+
+def _seen(
+    picture: Picture, n: AnyArray, peak: AnyArray, x: Float[AnyArray, "3 C"], noise: AnyArray
+) -> tuple[list[Any], list[Any], Any]:
+    """Of each channel, or of all together where they are many, errors and what is shown, (G, P); and the lobe, (P,).
+
+    Args:
+        picture: in NumPy or JAX.
+        n: the exponent.
+        peak: the logarithm of a cosine: lobe and x_s are relative to its power.
+        x: coefficients.
+        noise: of each channel.
+    """
     xp: Any = np if isinstance(picture.diffuse, np.ndarray) else jnp
-    shown, lobe = picture.shown_and_lobe(n, x)
-    weights = picture.weights
-    left = xp.where(weights > 0, picture.target - shown, 0) * xp.sqrt(weights) / xp.asarray(noise, shown.dtype)
-    if xp is jnp:
-        left, shown, lobe = jax.lax.optimization_barrier((left, shown, lobe))
-    image = left.reshape(-1, width, left.shape[1])
-    terms = image, image * image, (image != 0).astype(image.dtype)
-    blocks = tuple(coarser(part, SIZES[0]) for part in terms) if xp is np else _over_blocks(terms)
-    value = xp.max(xp.where(xp.any(weights > 0, axis=1, keepdims=True), lobe, 0), axis=1)
-    largest = xp.max(value, initial=0)
-    # Squares of a highlight that no pixel sees would fall below the smallest number.
-    return (
-        left,
-        xp.any(left != 0, axis=1),
-        shown,
-        blocks,
-        largest,
-        xp.sum((value / xp.where(largest > 0, largest, 1)) ** 2),
-    )
+    channels, dtype = picture.target.shape[1], picture.target.dtype
+    lobe = xp.zeros_like(picture.diffuse) if picture.lobe is None else picture.lobe(n, peak)[0]
+    values = picture.target, xp.asarray(picture.ambient, dtype)[None], picture.diffuse, lobe, picture.weights
+    x, noise = xp.asarray(x, dtype), xp.asarray(noise, dtype)
+    left, shown, step = [], [], 1 if channels <= UNROLLED_CHANNELS else channels
+    for first in range(0, channels, step):
+        some = slice(first, first + step)
+        target, ambient, diffuse, value, weight = (one.T[some] if one.shape[1] > 1 else one.T for one in values)
+        x_a, x_d, x_s, unit = (one[some, None] for one in (*x, noise))
+        shown.append(xp.broadcast_to(x_a * ambient + x_d * diffuse + x_s * value, target.shape))
+        left.append(xp.where(weight > 0, target - shown[-1], 0) * xp.sqrt(weight) / unit)
+    return left, shown, xp.max(xp.where(picture.weights > 0, lobe, 0), axis=1)
 
 
-_survey_many = jax.jit(_survey, static_argnames="width", compiler_options=COMPILER_OPTIONS)
+def _over_blocks(left: list[Any], lobe: Any, width: int) -> list[Any]:
+    """Over blocks, (G, R, Q): of each group of channels sums of errors, of their squares, and how many count.
+
+    Then the sum of the lobe's squares, and its largest value.
+    """
+    xp: Any = np if isinstance(lobe, np.ndarray) else jnp
+    terms = [term for error in left for term in (error, error * error, (error != 0).astype(error.dtype))]
+    terms += [xp.broadcast_to(one, left[0].shape) for one in (lobe * lobe, lobe)]
+    size, (step, pixels) = SIZES[0], left[0].shape
+    rows = pixels // width
+    pad = [(0, 0), (0, -rows % size), (0, -width % size)]
+    shape = step, -(-rows // size), size, -(-width // size), size
+    blocks = [xp.pad(term.reshape(step, rows, width), pad).reshape(shape) for term in terms]
+    return totals(blocks, [*["add"] * (len(terms) - 1), "maximum"], (2, 4))
 
 
-def _over_blocks(images: tuple[Array, ...]) -> tuple[Array, ...]:
-    """One loop for all sums, as in `fitting.solver.normal_equations`."""
-    size, (height, width, channels) = SIZES[0], images[0].shape
-    shape = -(-height // size), size, -(-width // size), size, channels
-    pad = [(0, -height % size), (0, -width % size), (0, 0)]
-    terms = tuple(jnp.pad(image, pad).reshape(shape) for image in images)
-    zeros = (np.zeros((), terms[0].dtype),) * len(terms)
-    return jax.lax.reduce(terms, zeros, lambda one, other: tuple(map(operator.add, one, other)), (1, 3))
+_seen_many = jax.jit(_seen)
+
+
+@partial(jax.jit, static_argnames="width", compiler_options=COMPILER_OPTIONS)
+def _over_blocks_many(picture: Picture, *at: Any, width: int) -> list[Any]:
+    left, _, lobe = _seen(picture, *at)
+    return _over_blocks(left, lobe, width)

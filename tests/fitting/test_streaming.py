@@ -1,5 +1,6 @@
 """A picture that is read by bands of rows gives the fit of the picture in memory."""
 
+import dataclasses
 import weakref
 from pathlib import Path
 
@@ -8,6 +9,8 @@ import pytest
 
 import brdf
 import fitting
+from brdf import lobes
+from brdf.geometry import rays
 from fitting import core, pixels
 from fitting.solver.streams import Stream, each, joined
 
@@ -88,21 +91,32 @@ def test_one_model_at_a_time_is_in_memory(monkeypatch, true):
 
     fit_model = core._fit_model
 
-    def watched(model, seen):
-        alive.append(sum(reference() is not None for reference in lobes))
-        fit = fit_model(model, seen)
-        lobes.extend(weakref.ref(picture.diffuse) for picture in fit.pictures)
+    def watched(model, observed):
+        alive.append(sum(reference() is not None for reference in seen))
+        fit = fit_model(model, observed)
+        seen.extend(weakref.ref(picture.diffuse) for picture in fit.pictures)
         return fit
 
-    lobes: list[weakref.ref] = []
+    seen: list[weakref.ref] = []
     monkeypatch.setattr(core, "_fit_model", watched)
     cut = fitting.fit(noisy, scene())
     assert alive == [0, 0]
     monkeypatch.setattr(pixels, "TILE_PIXELS", noisy[..., 0].size)
-    lobes.clear()
+    seen.clear()
     whole = fitting.fit(noisy, scene())
     assert alive[2:] == [0, 1]
     same(cut, whole)
+
+
+def test_bands_share_their_programs():
+    """Or the first fit of a picture of 64 bands would compile each of them."""
+    programs = lobes.diffuse_and_kept, rays._mask
+    before = [program._cache_size() for program in programs]
+    cameras = dataclasses.replace(scene().camera, resolution=(50, 60))
+    place = scene(camera=cameras)
+    fitting.fit(np.asarray(brdf.render(MATERIAL, place)), place, model="blinn-phong")
+    # The picture is rendered, and its bands are fitted.
+    assert [program._cache_size() - count for program, count in zip(programs, before, strict=True)] == [1, 1]
 
 
 def test_mask_weight_and_several_pictures(tmp_path: Path):
