@@ -157,7 +157,7 @@ class Picture:
         if self.lobe is None:
             return -np.inf
         peak = np.asarray(self.lobe.peak)
-        if self.weight is not None and not np.all(np.asarray(self.weight[np.argmax(peak)]) > 0):
+        if self.weight is not None and not np.all(np.asarray(self.weight)[np.argmax(peak)] > 0):
             peak = np.where(self.counts, peak, -np.inf)
         return float(np.max(peak))
 

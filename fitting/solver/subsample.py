@@ -190,7 +190,7 @@ def stratified(log_cos: np.ndarray, counts: np.ndarray, size: int) -> tuple[np.n
     """
     # The octave of a number is its binary exponent, 0 at the peak itself.
     octave = ((log_cos.astype(np.float32, copy=False).view(np.int32) >> 23) & 0xFF).astype(np.uint8)
-    octave = np.where(counts, octave, np.uint8(_EXCLUDED))
+    octave |= (~counts).view(np.uint8) * np.uint8(_EXCLUDED)
     preview = octave[::_PREVIEW_STRIDE]
     count = np.bincount(preview, minlength=256) * (octave.size / preview.size)
     count[_EXCLUDED] = 0
@@ -199,5 +199,5 @@ def stratified(log_cos: np.ndarray, counts: np.ndarray, size: int) -> tuple[np.n
     most = (size - np.cumsum(ordered) + ordered) / np.arange(ordered.size, 0, -1)
     share = np.minimum(1.0, np.max(most, initial=0.0) / np.maximum(count, 1.0))
     share[_EXCLUDED] = 0.0
-    index = np.flatnonzero(_spread(octave.size) < (share * 0xFFFFFFFF).astype(np.uint32)[octave])
+    index = np.flatnonzero(_spread(octave.size) < (share * 0xFFFFFFFF).astype(np.uint32).take(octave))
     return index, 1 / share[octave[index]]

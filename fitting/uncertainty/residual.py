@@ -174,7 +174,7 @@ def _pairs(left: Float[np.ndarray, "C 3 M"], places: Int[np.ndarray, "3 M"]) -> 
 
 
 def _seen(
-    picture: Picture, n: AnyArray, peak: AnyArray, x: Float[AnyArray, "3 C"], noise: AnyArray
+    picture: Picture, n: AnyArray, peak: AnyArray | float, x: Float[AnyArray, "3 C"], noise: AnyArray
 ) -> tuple[list[Any], list[Any], Any]:
     """Of each channel, or of all together where they are many, errors and what is shown, (G, P); and the lobe, (P,).
 
