@@ -1,5 +1,6 @@
 """The one error that bad input raises, and numbers that have to be such. JAX is not needed to say so."""
 
+from pathlib import Path
 from typing import Any
 
 
@@ -25,6 +26,7 @@ class InputError(ValueError):
             remedy: what to do about it, a sentence without its full stop.
         """
         self.where, self.what, self.remedy = str(where), what, remedy
+        self.of_file = isinstance(where, Path)
         message = f"{where}: {what}." + (f" {remedy}." if remedy else "")
         printable = "".join(letter if letter.isprintable() else " " for letter in message)
         super().__init__(" ".join(printable.split()))

@@ -8,7 +8,7 @@
 | float32 | none | where it is |
 
 The largest code of an integer picture has no upper bound and 0 no lower one: that is clipping and cut-off noise.
-A float array whose values all lie on the levels of one of these is taken as such.
+A float array whose values all lie on the levels of one of these, or are whole numbers, is taken as such.
 """
 
 from typing import Any, Literal, NamedTuple
@@ -248,17 +248,23 @@ def _levels(pixels: np.ndarray, *, half: bool) -> Codes | None:
         with np.errstate(over="ignore", under="ignore"):
             halves = bool(np.all(some == some.astype(np.float16)))
         rgbe = every > 1 or _is_rgbe(pixels)
-        if not (fitting or halves or rgbe):
+        whole = some.max() > 1 and some.max() <= max(_TOLERANCE) and bool(np.all(some == np.rint(some)))
+        if not (fitting or halves or rgbe or whole):
             return None
     if all(np.unique(values).size < _FEWEST for values in (some[::stride], some)):
         if not half:
             return None
-        fitting, rgbe = [], False
+        fitting, rgbe, whole = [], False, False
     for top, curve in fitting:
         found = _integers(pixels, curve, top, _FEWEST)
         if found is not None:
             bits = int(np.ceil(np.log2(found.ends[1] + 1)))
             return found._replace(levels=f"{bits}-bit {'sRGB' if curve == 'srgb' else curve} files")
+    if whole and not (rgbe and some.max() > min(_TOLERANCE)):
+        # Codes that nobody divided by the largest; those of RGBE are whole only where they are bright.
+        top = min(top for top in _TOLERANCE if some.max() <= top)
+        found = _integers(pixels / top, "linear", top, _FEWEST)
+        return None if found is None else found._replace(unit=float(top), levels="whole numbers")
     # A float's 0 is no end of its own, but noise may have been cut off there.
     images = np.moveaxis(pixels, -1, 0)
     cut = any(single_values_at_end(image, np.isfinite(image), 0.0) for image in images)

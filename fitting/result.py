@@ -145,14 +145,14 @@ class Parameter:
             return "0 (at its bound" + (f"; below {self.interval[1]:.2g} with 95 %)" if self.interval else ")")
         if not self.error:
             return f"{self.value:.6g}"
-        text = f"{_rounded(self.value, self.error)} ± {self.error:.2g} ({_percent(self.error / self.value)})"
+        text = f"{_rounded(self.value, self.error)} ± {self.error:.2g} ({_percent(abs(self.error / self.value))})"
         if self.interval and self.channel is None and self.error > LOPSIDED * self.value:
             text += f", 95 %: {self.interval[0]:.4g} to {self.interval[1]:.4g}"
         return text
 
 
 def _percent(share: float) -> str:
-    return f"{100 * share:.2g} %"
+    return f"{100 * share:.2g} %" if share < 1 else f"{100 * share:.0f} %"
 
 
 def _rounded(value: float, error: float) -> str:

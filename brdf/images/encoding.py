@@ -59,7 +59,7 @@ def parse_encoding(where: object, value: Any) -> Encoding | None:
     except ValueError:
         gamma = 0.0
     if not 0.1 <= gamma <= 10.0:
-        raise InputError(where, f"encoding must be linear, srgb or a gamma from 0.1 to 10, got {value!r}", _HOW_TO_SAY)
+        raise InputError(where, f"must be linear, srgb or a gamma from 0.1 to 10, got {value!r}", _HOW_TO_SAY)
     return "linear" if gamma == 1.0 else gamma
 
 
@@ -147,7 +147,7 @@ def _stated(path: Path, format_name: str, spec: Any) -> Encoding | None:
     named = re.match(r"g(\d\d)_", space)
     gamma = (named and int(named[1]) / 10) or attributes.get("oiio:Gamma")
     if gamma:
-        return parse_encoding(path, round(gamma, 6))
+        return parse_encoding(f"{path}: encoding", round(gamma, 6))
     for start, encoding in _SPACES.items():
         if space.startswith(start):
             return encoding
@@ -184,5 +184,5 @@ def _of_curve(curve: bytes) -> Encoding | None:
         return None
     for known in (float(gamma), "srgb", 2.2, 1.8):
         if np.allclose(decode(at, known), values, rtol=0, atol=_CURVE_TOLERANCE):
-            return parse_encoding("ICC profile", known)
+            return parse_encoding("ICC profile: encoding", known)
     return None

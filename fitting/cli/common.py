@@ -117,7 +117,7 @@ def named_as(typed: dict[str, Any]) -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        if error.where not in typed:
+        if error.of_file or error.where not in typed:  # a file may be called as an option is
             raise
         raise InputError(typed[error.where], error.what, error.remedy) from None
 
@@ -232,6 +232,8 @@ def check_outputs(out: Path | None, plot: bool = False, page: Path | None = None
         raise InputError(page, "is no name of a page", "Name it .html")
     if page is not None and not page.absolute().parent.is_dir():
         raise InputError(page, f"cannot be written, {page.parent} is no folder", "Make it first")
+    if page is not None and not os.access(page.absolute().parent, os.W_OK):
+        raise InputError(page, f"cannot be written into {page.parent}", "Name another folder")
     if out is not None:
         check_folder(out)
 

@@ -96,9 +96,13 @@ def main(arguments: list[str] | None = None) -> Any:
 
 def _keep_compiled_programs():
     """Have JAX keep compiled programs in the user's cache folder: the second run of a kind skips the compiler."""
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "brdf", "jax")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return  # JAX would say so for each program
     settings = {
-        "JAX_COMPILATION_CACHE_DIR": f"{base}/brdf/jax",
+        "JAX_COMPILATION_CACHE_DIR": str(folder),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
         # Of each program that it takes from there jaxlib 0.10.1 says, at length, that the compiler's own settings are

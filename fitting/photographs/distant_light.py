@@ -273,7 +273,7 @@ def _shown(numbers, mirror, normal) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _refine(numbers, mirror, scale, value, normal) -> tuple[np.ndarray, float]:
-    """The nearest minimum of Huber's cost; and the cost."""
+    """The nearest minimum of Huber's cost; and the cost. An error where there is none within reach."""
     from scipy.optimize import minimize  # it takes long to load
 
     @functools.lru_cache(1)  # cost and curvature are asked at the same numbers
@@ -291,7 +291,10 @@ def _refine(numbers, mirror, scale, value, normal) -> tuple[np.ndarray, float]:
         return slopes * (scale / np.maximum(np.abs(residual), scale)) @ slopes.T / len(value)
 
     how: Any = {"method": "trust-exact", "jac": True, "hess": curvature, "options": {"gtol": CLOSE, "maxiter": 50}}
-    found = minimize(cost, numbers, **how)
+    try:
+        found = minimize(cost, numbers, **how)
+    except ValueError:  # of a curvature that no pixel bends, which leads out of reach
+        raise TOO_LITTLE from None
     return found.x, found.fun
 
 

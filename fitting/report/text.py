@@ -18,7 +18,7 @@ def report(result: FitResult) -> str:
     Args:
         result: of a fit.
     """
-    channels = result.material.k_d.shape[0]
+    channels = len(result.noise)
     labels = channel_names(channels)
     count = f"{len(result.targets)} pictures, " if len(result.targets) > 1 else ""
     plural = "channel" if channels == 1 else "channels"
@@ -35,7 +35,7 @@ def report(result: FitResult) -> str:
     lines += _silent(result.files)
     lines += [f"  read as     codes: all values lie on the levels of {result.levels}"] if result.levels else []
     if result.highlight_pixels is not None:
-        lines.append(f"  highlight   on {result.highlight_pixels:.3g} pixels")
+        lines.append(f"  highlight   on {result.highlight_pixels:.{0 if result.highlight_pixels >= 10 else 1}f} pixels")
     lines += [] if result.choice is None else result.choice.lines()
     lines += _correlations(result, labels)
     lines += _candidates(result.candidates) if result.candidates else []
@@ -79,14 +79,15 @@ def _correlations(result, labels):
 
 
 def _candidates(candidates):
+    width = max(len(one.name) for one in candidates)
     lines = [
         "  what the scene requires (squared error expected on held-out pixels, over the best, in noise variances):",
-        f"    {'model':<40}{'unknowns':>9}{'rms':>11}{'held out':>11}{'excess ± its error':>26}{'BIC':>12}",
+        f"    {'model':<{width}}{'unknowns':>9}{'rms':>11}{'held out':>11}{'excess ± its error':>26}{'BIC':>12}",
     ]
     for one in candidates:
         mark = f"  {'<- ' * one.chosen}{standing(one)}"
         excess = f"{one.excess:.1f} ± {one.excess_error:.1f}" if one.excess < 1e6 else f"{one.excess:.2e}"
         bic = f"{one.bic:.1f}" if one.bic < 1e6 else f"{one.bic:.2e}"
         errors = f"{one.rms:>11.3e}{one.held_out:>11.3e}{excess:>26}{bic:>12}"
-        lines.append(f"    {one.name:<40}{one.unknowns:>9}{errors}{mark}".rstrip())
+        lines.append(f"    {one.name:<{width}}{one.unknowns:>9}{errors}{mark}".rstrip())
     return lines

@@ -91,15 +91,20 @@ def exponent_interval(
     if parabolic or (relative < PARABOLIC and inside):
         return optimum.n * math.exp(-NORMAL_95 * relative), optimum.n * math.exp(NORMAL_95 * relative)
     first = min(max(1.1 * NORMAL_95 * relative, 1e-3), WIDEST)
-    least = float(np.sum(optimum.cost))
     problem = problem_of(fit.pictures, fit.n_range, fit.free)._replace(peak=peak, tied=fit.tied)
     # Relative to the nearest pixel the lobe keeps its size where no pixel sees the centre.
     reference = optimum.x.T * [1.0, 1.0, math.exp(optimum.n * peak)]
 
-    def rise_at(log_n: float) -> float:
+    def cost(log_n: float) -> float:
         with jax.enable_x64(True):
             parts = sums(problem.pictures, np.array([log_n]), reference, peak)
-            return float(np.sum(solve_linear(parts, np.array([log_n]), reference, problem).cost)) - least
+            return float(np.sum(solve_linear(parts, np.array([log_n]), reference, problem).cost))
+
+    # By the same sums: those of an optimum may be scaled to the noise.
+    least = cost(centre)
+
+    def rise_at(log_n: float) -> float:
+        return cost(log_n) - least
 
     low, high = (_end(rise_at, centre, sign, bound, first, rise) for sign, bound in zip((-1, 1), bounds, strict=True))
     return math.exp(low), math.exp(high)

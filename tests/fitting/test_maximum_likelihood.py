@@ -41,12 +41,21 @@ def test_files_without_noise_are_read_within_their_errors(row: str, tmp_path: Pa
             assert abs(found["k_d[0]"][0]) < 3e-5, (seed, found)
 
 
+def test_whole_numbers_in_floats_are_codes_that_were_rounded():
+    """They lie on the levels of RGBE too, which truncates: half a code of bias."""
+    one = ball(1, size=48)
+    result = fitting.fit(np.rint(200 * one.drawn()), one.scene(), model=one.model)
+    for found, true in zip(result["k_d"], one.k[1], strict=True):
+        assert abs(found.value - 200 * true) < 5 * found.error < 0.1
+
+
 @pytest.mark.parametrize(
     ("values", "levels"),
     [
         (lambda drawn: decode(np.rint(255 * encode(drawn, "srgb")) / 255, "srgb"), "8-bit sRGB files"),
         (lambda drawn: np.rint(4095 * drawn) * 16 / 65535, "12-bit linear files"),
         (lambda drawn: drawn.astype(np.float16).astype(np.float32), "half floats"),
+        (lambda drawn: np.rint(200 * drawn), "whole numbers"),
         (lambda drawn: drawn, ""),
     ],
 )

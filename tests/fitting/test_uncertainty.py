@@ -9,6 +9,7 @@ from small_ball import ball_scene, pictured
 
 import brdf
 import fitting
+from brdf.images.encoding import encode
 from brdf.materials.material_file import material_from_dict, material_to_dict, read_material
 from fitting.uncertainty.intervals import above_zero
 from fitting.uncertainty.structure import LEAST_HELD, MOST_HELD, Errors, block_scatter
@@ -298,6 +299,21 @@ def test_noise_that_grows_is_seen_on_a_small_ball_in_a_large_picture():
     clean = np.asarray(brdf.render(brdf.BlinnPhong(k_d=0.5, k_s=0.4, n=20), scene, precision="float64"))
     result = fitting.fit(clean * (1 + 0.1 * np.random.default_rng(0).normal(size=clean.shape)), scene, model="phong")
     assert any("grows with brightness" in text for text in result.warnings)
+
+
+def test_the_interval_of_n_is_as_wide_as_its_error_where_a_circle_is_off_in_a_rounded_picture():
+    camera = brdf.OrthographicCamera(
+        position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=(200, 200)
+    )
+    true, told = (
+        brdf.Scene(camera=camera, shapes=[brdf.Sphere(center=[off, off, 0], radius=1 + off)], lights=[LIGHT])
+        for off in (0.0, 0.01)
+    )
+    clean = np.asarray(brdf.render(brdf.BlinnPhong(k_d=[0.4, 0.3, 0.2], k_s=0.3, n=40), true))
+    codes = np.rint(255 * encode(clean, "srgb")).astype(np.uint8)
+    n = fitting.fit(codes, told, encoding="srgb", model="blinn-phong")["n"]
+    assert n.error > 0.01 * n.value
+    assert n.interval[0] < n.value - 1.5 * n.error < n.value + 1.5 * n.error < n.interval[1]
 
 
 def test_a_channel_that_is_black_in_a_noisy_picture_does_not_end_the_fit():

@@ -108,7 +108,7 @@ def test_the_user_overrules_the_file(tmp_path, encoding, expected, chunks):
 @pytest.mark.parametrize("encoding", ["rec709", "", 0, -2.2, float("nan"), float("inf"), True, [2.2], 100])
 def test_an_encoding_that_is_none(tmp_path, encoding):
     (tmp_path / "a.png").write_bytes(png(GRADIENT))
-    with pytest.raises(InputError, match="encoding must be linear, srgb or a gamma"):
+    with pytest.raises(InputError, match="encoding: must be linear, srgb or a gamma"):
         read_image(tmp_path / "a.png", encoding=encoding)
 
 

@@ -47,6 +47,12 @@ def test_lights_are_found_given_the_material():
     np.testing.assert_allclose(np.asarray(found["lights[1].radiance"], float), found.emittances[1])
 
 
+def test_lights_of_a_grey_material_are_told_by_their_colours():
+    grey = brdf.BlinnPhong(k_a=0.1, k_d=0.5, k_s=0.4, n=30)
+    found = fitting.fit_lights(np.asarray(brdf.render(grey, scene(INTENSITIES))), scene(np.ones((3, 3))), grey)
+    assert "lights[1].radiance  blue" in str(found)
+
+
 def test_lights_are_told_saved_and_drawn_as_a_fit_is(tmp_path):
     clean = np.asarray(brdf.render(MATERIAL, scene(INTENSITIES), precision="float64"))
     noisy = clean + np.random.default_rng(0).normal(0, 0.01, clean.shape)

@@ -203,7 +203,7 @@ CASES: list[tuple[dict[str, Any], str, str]] = [
     # options of a fit
     ({}, f"{FIT} --model ward", "^error: --model: is unknown, got 'ward'"),
     ({}, f"{FIT} --precision half", "^error: --precision: is unknown, got 'half'"),
-    ({}, f"{FIT} --encoding log", "^error: --encoding: encoding must be"),
+    ({}, f"{FIT} --encoding log", "^error: --encoding: must be"),
     ({}, f"{FIT} --loss l1", "^error: --loss: is unknown"),
     ({}, f"{FIT} --saturation nan", "^error: --saturation: must be a linear value"),
     ({}, f"{FIT} --saturation 1e-6", "target.exr: is clipped at 1e-06"),
@@ -335,6 +335,11 @@ def test_whatever_else_is_wrong(place, capsys, files, words, said):
     for name, content in files.items():
         make(place / name, content)
     refused(capsys, place, said, *words.split())
+
+
+def test_a_folder_may_be_called_as_an_option_is(place, capsys):
+    (place / "out").mkdir()
+    refused(capsys, place, "^error: out: has no file target", "fit", "out")
 
 
 def test_an_empty_name_of_a_material(place, capsys):

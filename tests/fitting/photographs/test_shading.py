@@ -142,6 +142,15 @@ def test_a_relief_is_not_taken_for_a_matt_ball(light, ambient):
         light_of(relief(light), ambient=ambient)
 
 
+def test_a_plate_is_no_part_of_a_large_ball():
+    """Where all normals are nearly alike the search for the light had no curvature, and ended in a traceback."""
+    row, column = np.mgrid[:160, :160] / 80 - 1
+    picture = np.round(255 * 0.8 * (1 + (column - 0.3) ** 2 + (row + 0.2) ** 2) ** -3) / 255
+    points = ball_points(picture.shape, Circle(80, 80, 500))
+    with pytest.raises(InputError, match=r"not shaded like this surface|too little of the lit surface"):
+        light_from_shading(picture, points)
+
+
 def test_highlights_all_over_are_not_taken_for_a_mirror_ball():
     picture = np.zeros((SIDE, SIDE))
     picture[ON_BALL] = relief((0.4, 0.3, 0.87), k_s=3.0)
