@@ -13,7 +13,7 @@ from brdf.errors import InputError
 from brdf.files import input_file, read_toml
 from fitting.cli.common import PictureOptions, named_as
 from fitting.photographs.archives import read_archive
-from fitting.photographs.ball import Circle, ball_normals, ball_points, find_circle
+from fitting.photographs.ball import Circle, ball_normals, ball_points, ball_seen, find_circle
 from fitting.photographs.light_files import parse_numbers, read_directions, read_intensities
 
 # Of each kind of input: the options that say what it says itself or nothing of it, why, and what to do.
@@ -84,13 +84,17 @@ def read_inputs(targets: list[Path], options: PictureOptions, encodings: dict[Pa
         (path,) = targets
         pictures, points, directions, intensities = _archived(path, mask)
         inputs = FitInputs(targets, _exposed(pictures, options), [], [None] * len(pictures), {})
+        seen = brdf.Scene(points=points)
         names = {"direction": f"{path}: light_dirs", "intensity": f"{path}: light_intensities"}
     else:
         inputs, file, tables = _read_pictures(kind, targets, options, encodings or {}, mask)
         if file is not None:
             return inputs._replace(scenes=[brdf.Scene.load(file, within=options.within, tables=tables)])
-        points, notes = _points(inputs.pictures[0].pixels.shape[:2], options, mask)
-        directions, inputs = _directions(inputs._replace(notes=notes), points, options)
+        points, seen, notes = _seen(inputs.pictures[0].pixels.shape[:2], options, mask)
+        # A pixel that the ball's outline runs through shows what lies behind, too.
+        on_it = np.asarray(points.mask)
+        masks = [on_it if mask is None else on_it & mask for mask in inputs.masks]
+        directions, inputs = _directions(inputs._replace(notes=notes, masks=masks), points, options)
         intensities, names = _intensities(options.intensities, inputs.pictures), {}
     from fitting.photographs.distant_light import photograph_scene
 
@@ -100,7 +104,7 @@ def read_inputs(targets: list[Path], options: PictureOptions, encodings: dict[Pa
         intensities, around = around, 1.0 / intensities
     with named_as(names):
         scenes = [
-            photograph_scene(points, direction, intensity, ambient=ambient if options.ambient else None)
+            photograph_scene(seen, direction, intensity, ambient=ambient if options.ambient else None)
             for direction, intensity, ambient in zip(directions, intensities, around, strict=True)
         ]
     return inputs._replace(pictures=pictures, scenes=scenes)
@@ -238,11 +242,11 @@ def _circle(sphere):
     return Circle(*parse_numbers(sphere, "--sphere", 3, "x,y,radius in pixels"))
 
 
-def _points(shape, options, mask):
-    """What the pixels of photographs see, and what to tell of it."""
+def _seen(shape, options, mask):
+    """What the pixels of photographs see, the same as a scene without lights, and what to tell of it."""
     if options.normals is None:
         circle, notes = ball_in(options.sphere, mask)
-        return ball_points(shape, circle), notes
+        return ball_points(shape, circle), ball_seen(shape, circle), notes
     from fitting.maps.map_inputs import normal_map
 
     points = brdf.SurfacePoints.from_normals(normal_map(options.normals))
@@ -253,7 +257,7 @@ def _points(shape, options, mask):
         f"is {width} x {height}, the pictures {shape[1]} x {shape[0]}",
         "Give a normal for each pixel",
     )
-    return points, ()
+    return points, brdf.Scene(points=points), ()
 
 
 def _directions(inputs, points, options) -> Any:

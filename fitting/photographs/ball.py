@@ -137,3 +137,17 @@ def ball_points(shape: tuple[int, int], circle: Circle) -> "brdf.SurfacePoints":
     """
     normal = ball_normals(shape, circle)
     return brdf.SurfacePoints.from_normals(normal, position=normal)
+
+
+def ball_seen(shape: tuple[int, int], circle: Circle) -> "brdf.Scene":
+    """A photograph of a ball as a scene without lights: the unit ball, and a camera far away to whom it is the circle.
+
+    Args:
+        shape: height and width of the picture.
+        circle: the ball's outline, as `ball_normals` takes it.
+    """
+    (height, width), radius = shape, circle.radius
+    x, y = (0.5 * (width - 1) - circle.x) / radius, (circle.y - 0.5 * (height - 1)) / radius
+    place = {"position": [x, y, 4.0], "target": [x, y, 0.0], "up": [0.0, 1.0, 0.0]}
+    camera = brdf.OrthographicCamera(**place, width=width / radius, resolution=(width, height))
+    return brdf.Scene(camera=camera, shapes=(brdf.Sphere(center=[0.0, 0.0, 0.0], radius=1.0),))

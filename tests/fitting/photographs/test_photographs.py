@@ -24,7 +24,9 @@ def test_pixels_that_the_outline_runs_through_do_not_count():
     light = (0.3, 0.4, 0.86)
     drawn = np.where(disc(small, shape)[..., None], 0.1 + shaded(light, 0.6, small, shape), 1.0)
     picture = drawn.reshape(SHAPE[0], fine, SHAPE[1], fine, 1).mean(axis=(1, 3)).astype(np.float32)
-    result = fitting.fit(picture, photograph_scene(ball_points(SHAPE, BALL), light, ambient=[1.0]), model="lambert")
+    result = fitting.fit(
+        picture, photograph_scene(brdf.Scene(points=ball_points(SHAPE, BALL)), light, ambient=[1.0]), model="lambert"
+    )
     # The mean over a pixel of the shading is not that at its centre, where the terminator runs.
     assert result.residual < 5e-3
     assert float(result.material.k_a[0]) == pytest.approx(0.1, abs=1e-3)
@@ -109,7 +111,7 @@ def test_ambient_light_and_highlights_do_not_pull_the_light(ambient, model, k_s,
     material = brdf.MODELS[model](k_a=[ambient], k_d=[0.5], k_s=[k_s], n=n)  # pyright: ignore
     shares = []
     for seed, direction in enumerate([(0.3, 0.4, 0.9), (0.5, 0.4, 0.7), (-0.8, 0.2, 0.4), (0.6, -0.6, 0.25)]):
-        clean = np.asarray(brdf.render(material, photograph_scene(points, direction, ambient=[1.0])))
+        clean = np.asarray(brdf.render(material, photograph_scene(brdf.Scene(points=points), direction, ambient=[1.0])))
         noisy = clean + np.random.default_rng(seed).normal(0, 0.01, clean.shape)
         found = light_from_shading(noisy, points, ambient=ambient > 0)
         assert found.error < 0.1
@@ -143,7 +145,7 @@ def test_a_highlight_at_the_edge_of_the_picture_is_refused():
 
 def test_a_direction_of_no_length_is_told_as_what_came():
     with pytest.raises(InputError, match="must not have zero length, got"):
-        photograph_scene(ball_points(SHAPE, BALL), [0, 0, 0])
+        photograph_scene(brdf.Scene(points=ball_points(SHAPE, BALL)), [0, 0, 0])
 
 
 def test_pictures_that_tell_no_light():
@@ -162,7 +164,7 @@ def test_pictures_that_tell_no_light():
 def test_the_length_of_a_direction_does_not_matter():
     picture, points = shaded((0.3, 0.4, 0.86)), ball_points(SHAPE, BALL)
     for length in (1e-300, 1e3, 1e308):
-        scene = photograph_scene(points, np.array([0.3, 0.4, 0.86]) * length)
+        scene = photograph_scene(brdf.Scene(points=points), np.array([0.3, 0.4, 0.86]) * length)
         k_d = fitting.fit(picture, scene, model="lambert").material.k_d
         assert np.allclose(k_d, 0.8, rtol=1e-5)
 
@@ -190,7 +192,7 @@ def test_light_files(tmp_path):
 
 def test_dark_pixels_are_left_out():
     picture = shaded((0.3, 0.4, 0.86))
-    scene = photograph_scene(ball_points(SHAPE, BALL), (0.3, 0.4, 0.86))
+    scene = photograph_scene(brdf.Scene(points=ball_points(SHAPE, BALL)), (0.3, 0.4, 0.86))
     result = fitting.fit(picture, scene, model="lambert", dark=0.2)
     assert result.left_out["dark"] == np.count_nonzero(ball_points(SHAPE, BALL).mask & (picture[..., 0] <= 0.2))
     with pytest.raises(InputError, match="no brighter than 5"):
@@ -200,7 +202,7 @@ def test_dark_pixels_are_left_out():
 def test_noise_weights_give_the_errors_of_the_camera():
     direction, read, shot = (0.3, 0.4, 0.86), 0.002, 0.003
     clean = shaded(direction)
-    scene = photograph_scene(ball_points(SHAPE, BALL), direction)
+    scene = photograph_scene(brdf.Scene(points=ball_points(SHAPE, BALL)), direction)
     estimates, errors = [], []
     for seed in range(60):
         sigma = np.sqrt(read**2 + shot * clean)
@@ -245,7 +247,7 @@ def test_the_gray_sphere_is_matt_and_equally_bright_under_twelve_lights():
     directions = read_directions(REAL / "uw-spheres" / "lights.txt", 12)
     found = []
     for picture, direction in zip(photographs("gray"), directions, strict=True):
-        scene = photograph_scene(ball_points(picture.pixels.shape[:2], GRAY), direction)
+        scene = photograph_scene(brdf.Scene(points=ball_points(picture.pixels.shape[:2], GRAY)), direction)
         found.append(fitting.fit(picture, scene, model="lambert").material.k_d.mean())
     assert np.max(np.abs(found / np.mean(found) - 1)) < 0.02
 
@@ -272,7 +274,7 @@ def test_lambert_is_chosen_for_the_gray_sphere():
     directions = read_directions(REAL / "uw-spheres" / "lights.txt", 12)[::3]
     pictures = photographs("gray")[::3]
     points = ball_points(pictures[0].pixels.shape[:2], GRAY)
-    result = fitting.fit(pictures, [photograph_scene(points, direction) for direction in directions])
+    result = fitting.fit(pictures, [photograph_scene(brdf.Scene(points=points), direction) for direction in directions])
     assert result.material.name == "lambert"
 
 
