@@ -7,7 +7,7 @@ import base64
 import html
 import io
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from typing import Any
 
 import numpy as np
@@ -75,19 +75,23 @@ def png_address(picture: Float[np.ndarray, "H W 3"]) -> str:
     return "data:image/png;base64," + base64.b64encode(file.getvalue()).decode()
 
 
-def material_html(material: Material) -> str:
+def material_html(material: Material, undetermined: Container[str] = ()) -> str:
     """A material as HTML: a lit sphere and its numbers.
 
     Args:
         material: any of the models, of known numbers.
+        undetermined: those that are 0 for want of a value: "k_a[0]", "n".
     """
     cell = f'<td style="{_CELL}">{{}}</td>'.format
     head = f'<th style="{_CELL}">{{}}</th>'.format
     rows = [["", *map(head, channel_names(np.asarray(material.k_d).size))]]
     for key in ("k_a", "k_d", "k_s", "n"):
         if hasattr(material, key):
-            digits = 5 if key == "n" else 4
-            rows.append([key, *(cell(f"{value:.{digits}g}") for value in np.ravel(getattr(material, key)))])
+            digits, values = 5 if key == "n" else 4, np.ravel(getattr(material, key))
+            names = ["n"] if key == "n" else [f"{key}[{channel}]" for channel in range(len(values))]
+            unknown = [name in undetermined and not value for name, value in zip(names, values, strict=True)]
+            shown = ["–" if open_ else f"{value:.{digits}g}" for open_, value in zip(unknown, values, strict=True)]
+            rows.append([key, *map(cell, shown)])
     table = "".join(f"<tr>{head(first)}{''.join(cells)}</tr>" for first, *cells in rows)
     picture = f'<img alt="a lit sphere" width="128" height="128" src="{png_address(lit_sphere(material))}">'
     style = "display:flex;flex-wrap:wrap;gap:1em;align-items:center"

@@ -15,7 +15,7 @@ def render(material: str, *, out: Path, scene: Path | None = None, precision: An
     Args:
         material: a .json or .mtl file, a folder of brdf fit --out, or a name of the classic table.
         out: the picture to write: .exr, .hdr, .png, .tiff or .jpg.
-        scene: the scene file; default: that of a folder that brdf fit wrote.
+        scene: the scene file; default: scene.toml beside the file of the material, where brdf fit writes it.
         precision: float32 or float64.
 
     Example:
@@ -27,7 +27,7 @@ def render(material: str, *, out: Path, scene: Path | None = None, precision: An
         loaded, _ = find_material(material)
         if scene is None:
             scene = (Path(material) if Path(material).is_dir() else Path(material).parent) / "scene.toml"
-            if Path(material).suffix == ".mtl" or not scene.is_file():
+            if Path(material).suffix == ".mtl" or not (Path(material).exists() and scene.is_file()):
                 raise InputError("--scene", "is missing", "Add --scene SCENE.toml")
         brdf.write_image(out, brdf.render(loaded, brdf.Scene.load(scene), precision=precision))
     show(f"wrote {out}")

@@ -27,7 +27,7 @@ def result_html(result: FitResult) -> str:
         result: of a fit.
     """
     summary = f"residual {100 * result.residual:.3g} % of the picture, {result.pixels} pixels, {result.seconds:.2g} s"
-    return f"{material_html(result.material)}<p>{summary}, {result.precision}</p>{_numbers(result)}{_warnings(result)}"
+    return f"{_material(result)}<p>{summary}, {result.precision}</p>{_numbers(result)}{_warnings(result)}"
 
 
 def report_page(result: FitResult, *, source: str = "", command: str = "") -> str:
@@ -59,7 +59,7 @@ def report_page(result: FitResult, *, source: str = "", command: str = "") -> st
     made = "".join(f"<dt>{name}</dt><dd>{escape(words)}</dd>" for name, words in made.items() if words)
     alternative = "target, fit, residual, the highlight enlarged, a scanline through it, and the profile of n"
     body = f"""<h1>{escape(title)}</h1>
-{material_html(result.material)}
+{_material(result)}
 <p>{escape(summary)}</p>
 {_warnings(result)}
 <h2>The surface, to turn</h2>
@@ -77,6 +77,10 @@ def report_page(result: FitResult, *, source: str = "", command: str = "") -> st
     return secure_page(title, body, "viewer.js")
 
 
+def _material(result):
+    return material_html(result.material, result.undetermined)
+
+
 def _numbers(result):
     """A table without the columns that are empty below their head."""
     rows = [["number", "channel", "value", "± error", "95 % interval", "remark"]]
@@ -85,7 +89,7 @@ def _numbers(result):
         value = NOT_DETERMINED if one.value is None else f"{one.value:.6g}"
         error = f"{one.error:.2g}" if one.error else ""
         remark = "at its bound" if one.at_bound else one.reason
-        rows.append([one.name, one.label(result.material.k_d.size), value, error, " to ".join(ends), remark])
+        rows.append([one.name, one.label(len(result.noise)), value, error, " to ".join(ends), remark])
     filled = [column for column in zip(*rows, strict=True) if any(column[1:])]
     lines = ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in zip(*filled, strict=True)]
     table = "</tr><tr>".join([lines[0].replace("td>", "th>"), *lines[1:]])
