@@ -133,13 +133,9 @@ class PrimaryRays:
         """How many rays there are."""
         return self.camera.resolution[0] * self.height
 
-    def traced(self) -> Points:
-        """What they meet, (rows, W)."""
-        return trace(self.camera, self.shapes, *self.places)
-
     def in_components(self) -> Points:
-        """The same, made once however often it is read."""
-        return apart(PrimaryRays.traced, self)
+        """What they meet, (rows, W), made once however often it is read."""
+        return apart(_traced, self)
 
     def stored(self) -> SurfacePoints:
         """The same as arrays, to be kept."""
@@ -156,8 +152,14 @@ Sight = SurfacePoints | PrimaryRays
 
 
 @jax.jit
+def _traced(rays: PrimaryRays) -> Points:
+    """A program of its own also inside others: what it does is found out once for all of them."""
+    return trace(rays.camera, rays.shapes, *rays.places)
+
+
+@jax.jit
 def _mask(rays: PrimaryRays) -> Array:
-    return rays.traced().mask
+    return _traced(rays).mask
 
 
 @jax.jit
