@@ -37,7 +37,7 @@ from fitting.continuation import precision as precision_at
 from fitting.likelihood import AnyArray, Bounds, Intervals, residual_deviation
 from fitting.model_fit import Evidence, ModelFit
 from fitting.solver.normal_equations import Picture, Sums
-from fitting.solver.profile import Optimum, refit
+from fitting.solver.profile import Optimum, refit, search
 from fitting.solver.subsample import Subsample, stratified
 from fitting.solver.tied import design_of, places_of
 
@@ -308,6 +308,9 @@ def _reweighted(
                     precision = precision_of(left, places, count, rounding)
                 assert precision is not None
                 optimum = improved(working, precision, optimum, fit, anew=trial == 0)
+            elif trial == 0 and fit.tied is None:
+                # All alike in light, pixels may have led to another exponent.
+                optimum = search(working, n_min=fit.n_range[0], n_max=fit.n_range[1], free=fit.free)
             else:
                 optimum = refit(working, optimum, fit.free, fit.n_range, fit.tied)
             last, stated = noise, [_stated(*one, optimum, noise, rounding) for one in both]
