@@ -12,7 +12,7 @@ from fitting.photographs.distant_light import photograph_scene
 
 SIZE = 96
 POINTS = ball_points((SIZE, SIZE), Circle(47.5, 47.5, 44.0))
-SCENE = photograph_scene(POINTS, (0.5, 0.4, 0.7), ambient=[1.0])
+SCENE = photograph_scene(brdf.Scene(points=POINTS), (0.5, 0.4, 0.7), ambient=[1.0])
 DULL = brdf.BlinnPhong(k_a=[0.02], k_d=[0.5], k_s=[0.3], n=30.0)
 BRIGHT = brdf.BlinnPhong(k_a=[0.1], k_d=[1.0], k_s=[0.2], n=30.0)
 DRAWS = 6
