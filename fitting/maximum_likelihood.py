@@ -15,7 +15,6 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -36,7 +35,7 @@ from fitting.continuation import (
 from fitting.continuation import precision as precision_at
 from fitting.likelihood import AnyArray, Bounds, Intervals, residual_deviation
 from fitting.model_fit import Evidence, ModelFit
-from fitting.solver.normal_equations import Picture, Sums
+from fitting.solver.normal_equations import COMPILER_OPTIONS, Picture, Sums
 from fitting.solver.profile import Optimum, refit, search
 from fitting.solver.subsample import Subsample, stratified
 from fitting.solver.tied import design_of, places_of
@@ -414,12 +413,13 @@ def _stated(picture: Picture, index: Int[np.ndarray, " K"], optimum: Optimum, no
     return _Stated(taken, squares, count, closed, plain, value)
 
 
-@eqx.filter_jit
+@partial(jax.jit, compiler_options=COMPILER_OPTIONS)
 def _linearised(picture: Picture, n: AnyArray, x: AnyArray) -> tuple[Array, Array, Array, Array]:
     """Working targets and weights of values with both ends, squares of their residuals in codes, their count."""
     bounds, dtype = bounds_of(picture), picture.target.dtype
     radiance = picture.predicted(n, x)
-    code, slope = bounds.codes(radiance)
+    # Made once, and not for each of what is asked for.
+    radiance, code, slope = jax.lax.optimization_barrier((radiance, *bounds.codes(radiance)))
     closed = jnp.isfinite(bounds.lower) & jnp.isfinite(bounds.upper)
     middle = 0.5 * (jnp.where(closed, bounds.lower, 0.0) + jnp.where(closed, bounds.upper, 0.0))
     residual = jnp.where(closed, middle - code, 0.0)
