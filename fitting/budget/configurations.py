@@ -114,7 +114,7 @@ def _in_whole(values, sample, shape):
     if values is None or sample is None:
         return values
     found = np.zeros(shape, values.dtype)
-    found.flat[sample.pixel] = values.ravel()
+    found.reshape(-1)[sample.pixel] = values.ravel()
     return found
 
 
@@ -123,9 +123,9 @@ def _subsampled(problem, samples):
     pictures, saturation = [], problem.saturation
     given = zip(samples, problem.targets, problem.scenes, problem.masks, problem.weights, strict=True)
     for sample, target, scene, mask, weight in given:
-        # Beside a picture of which some pixels are fitted, a pixel of a whole one stands for itself.
-        weight = np.ones(target.pixels.shape[:2]) if weight is None else weight
         if sample is None:
+            # Beside a picture of which some pixels are fitted, a pixel of a whole one stands for itself.
+            weight = np.ones(target.pixels.shape[:2]) if weight is None else weight
             pictures.append((target, scene, mask, weight))
             continue
         pixels = sample.of(target.pixels)
@@ -138,7 +138,8 @@ def _subsampled(problem, samples):
         target = target._replace(pixels=pixels, codes=None, least_squares=True)
         scene = brdf.some_pixels(scene, sample.pixel, precision=problem.precision)
         mask = None if mask is None else sample.of(mask)
-        pictures.append((target, scene, mask, sample.of(weight) * sample.stands_for))
+        stands_for = sample.stands_for[None]
+        pictures.append((target, scene, mask, stands_for if weight is None else sample.of(weight) * stands_for))
     targets, scenes, masks, weights = map(list, zip(*pictures, strict=True))
     how = {"targets": targets, "scenes": scenes, "masks": masks, "weights": weights, "saturation": saturation}
     return dataclasses.replace(problem, **how)
