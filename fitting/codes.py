@@ -260,11 +260,15 @@ def _levels(pixels: np.ndarray, *, half: bool) -> Codes | None:
         if found is not None:
             bits = int(np.ceil(np.log2(found.ends[1] + 1)))
             return found._replace(levels=f"{bits}-bit {'sRGB' if curve == 'srgb' else curve} files")
-    if whole and not (rgbe and some.max() > min(_TOLERANCE)):
-        # Codes that nobody divided by the largest; those of RGBE are whole only where they are bright.
+    if whole and (some.max() <= min(_TOLERANCE) or not (rgbe or halves)):
+        # Codes that nobody divided by the largest; those of half floats and RGBE are whole only where they are bright.
         top = min(top for top in _TOLERANCE if some.max() <= top)
         found = _integers(pixels / top, "linear", top, _FEWEST)
-        return None if found is None else found._replace(unit=float(top), levels="whole numbers")
+        if found is None:
+            return None
+        # How many codes there are beyond those of 8 bits nobody says.
+        ends = found.ends if top == min(_TOLERANCE) else (found.ends[0], np.inf)
+        return found._replace(unit=float(top), ends=ends, levels="whole numbers")
     # A float's 0 is no end of its own, but noise may have been cut off there.
     images = np.moveaxis(pixels, -1, 0)
     cut = any(single_values_at_end(image, np.isfinite(image), 0.0) for image in images)

@@ -389,7 +389,7 @@ def _explains_structure(fit: ModelFit, seen: Observed, after: Residual | None) -
         return False
     noise = residual_noise(optimum, seen.rounding)
     after = after or survey(fit.pictures, seen.widths, optimum, noise, seen.rounding)
-    if highlight(fit.pictures, optimum.n, after).share(optimum.x, seen.brightest) < NO_TRACE:
+    if highlight(optimum.n, after).share(optimum.x, seen.brightest) < NO_TRACE:
         return False
     if fit.evidence is not None and fit.evidence.precision is not None:
         return True  # what errs together has been weighed by the channels' covariance

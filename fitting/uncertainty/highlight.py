@@ -51,16 +51,14 @@ class Highlight(NamedTuple):
         return float(np.max(x[2]) * self.largest / max(np.max(brightest), np.finfo(float).tiny))
 
 
-def highlight(pictures: Sequence[Picture], n: float, left: Residual) -> Highlight:
+def highlight(n: float, left: Residual) -> Highlight:
     """What there is to know of a highlight.
 
     Args:
-        pictures: with a lobe.
         n: exponent.
         left: by the fit.
     """
-    peak = min(nearest_peak(pictures), 0.0)
-    return Highlight(left.largest, left.carrying, peak, math.exp(n * peak))
+    return Highlight(left.largest, left.carrying, left.peak, math.exp(n * left.peak))
 
 
 def nearest_peak(pictures: Sequence[Picture]) -> float:

@@ -75,7 +75,7 @@ def interpret(
     rounding, columns = seen.rounding * weight, rms_columns(optimum, weight)
     noise = np.maximum(residual_noise(optimum, rounding) * fit.noise_factor, rounding)
     left = survey(pictures, seen.widths, optimum, noise, rounding)
-    lobe = None if optimum.flat else highlight(pictures, optimum.n, left)
+    lobe = None if optimum.flat else highlight(optimum.n, left)
     visible = 0.0 if lobe is None else lobe.share(optimum.x, seen.brightest)
     resolution = RESOLUTION if fit.single else 0.0
     spread, shared, widening, deviation, gain, joined, growing = None, None, 1.0, noise, 0.0, None, None

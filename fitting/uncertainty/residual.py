@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from brdf.lobes import NO_LOBE
 from fitting.likelihood import AnyArray
 from fitting.solver.normal_equations import COMPILER_OPTIONS, FEW_VALUES, UNROLLED_CHANNELS, Picture, totals
 from fitting.solver.profile import Optimum
@@ -59,6 +60,7 @@ class Residual(NamedTuple):
         values: that the model shows there.
         largest: value of the lobe in any pixel that counts.
         carrying: how many pixels carry the highlight: the sum of its squares over the largest, over all pictures.
+        peak: logarithm of the lobe's cosine in the pixel nearest to its centre.
     """
 
     blocks: list[Blocks]
@@ -67,6 +69,7 @@ class Residual(NamedTuple):
     values: Float[np.ndarray, "M C"]
     largest: float
     carrying: float
+    peak: float
 
     def growing_noise(
         self, noise: Float[np.ndarray, " C"], rounding: Float[np.ndarray, " C"]
@@ -93,12 +96,15 @@ def survey(
     """
     most = max(FEWEST_PIXELS, SOME_PIXELS // len(pictures))
     blocks, pairs, errors, values = [], [], [], []
-    largest, carrying = 0.0, 0.0
+    # The lobe is taken relative to its largest value in any picture, or squares of a highlight that no pixel sees would
+    # fall below the smallest number.
+    nearest = min(max(picture.nearest_peak for picture in pictures), 0.0)
+    peak = nearest if nearest > 0.5 * NO_LOBE else 0.0
+    decay, largest, squares = math.exp(optimum.n * peak), 0.0, 0.0
     for picture, width in zip(pictures, widths, strict=True):
         small = picture.target.size <= FEW_VALUES and not picture.is_sampled
         picture = jax.tree.map(np.asarray, picture) if small else picture
-        unit, peak = np.maximum(noise, np.finfo(picture.target.dtype).tiny), min(picture.nearest_peak, 0.0)
-        decay = math.exp(optimum.n * peak)
+        unit = np.maximum(noise, np.finfo(picture.target.dtype).tiny)
         at = np.asarray(optimum.n), peak, optimum.x * np.array([[1.0], [1.0], [decay]]), unit
         places = _places(picture.counts, width, most)
         if small:
@@ -109,18 +115,21 @@ def survey(
             found = _over_blocks_many(picture, *at, width=width)
             few = picture.in_double(places.ravel())
             seen = (_seen_many if few.is_sampled else _seen)(few, *at)[:2]
-            left, shown = (np.concatenate(part)[:, : places.size].reshape(-1, *places.shape) for part in seen)
-        *sums, squares, top = jax.device_get(found)
+            shape = len(noise), *places.shape
+            left, shown = (np.concatenate(part)[:, : places.size].reshape(shape) for part in seen)
+        *sums, own, top = jax.device_get(found)
         # Of each channel or group sums, squares and counts, one after the other: (R, Q, C) of each kind.
         blocks.append(Blocks(*(np.moveaxis(np.concatenate(sums[kind::3]), 0, -1) for kind in range(3))))
-        top = float(np.max(top))
-        largest, carrying = max(largest, decay * top), carrying + float(np.sum(squares[0])) / (top or 1.0) ** 2
+        largest, squares = max(largest, float(np.max(top))), squares + float(np.sum(own[0]))
         pairs.append(_pairs(left, places))
         counts = np.any(left[:, 0] != 0, axis=0)
         errors.append(left[:, 0, counts])
         values.append(shown[:, 0, counts])
     error, value = (np.concatenate(parts, axis=1).T.astype(np.float64) for parts in (errors, values))
-    return Residual(blocks, _going_together(pairs, noise > 2 * rounding), error, value, largest, carrying)
+    carrying = squares / (largest or 1.0) ** 2
+    return Residual(
+        blocks, _going_together(pairs, noise > 2 * rounding), error, value, decay * largest, carrying, nearest
+    )
 
 
 def neighbours_of(images: Sequence[Float[np.ndarray, "H W C"]]) -> Neighbours:

@@ -56,6 +56,7 @@ def test_whole_numbers_in_floats_are_codes_that_were_rounded():
         (lambda drawn: np.rint(4095 * drawn) * 16 / 65535, "12-bit linear files"),
         (lambda drawn: drawn.astype(np.float16).astype(np.float32), "half floats"),
         (lambda drawn: np.rint(200 * drawn), "whole numbers"),
+        (lambda drawn: (4e4 * drawn).astype(np.float16).astype(np.float32), "half floats"),
         (lambda drawn: drawn, ""),
     ],
 )

@@ -119,6 +119,22 @@ def test_bands_share_their_programs():
     assert [program._cache_size() - count for program, count in zip(programs, before, strict=True)] == [1, 1]
 
 
+@pytest.mark.parametrize("light", ["area", "distant"])
+def test_bands_without_a_pixel_and_far_from_the_highlight(light: str):
+    """Relative to the peak of a band beside the highlight a lobe that is tabulated would be infinite."""
+    lights = {"distant": scene().lights[0]}
+    lights["area"] = brdf.RectangleLight(
+        center=[1.5, 2.0, 3.0], edge_u=[0.05, 0, 0], edge_v=[0, -0.05, 0], radiance=[900.0] * 3, samples=16
+    )
+    place = scene(lights=[lights[light]], shapes=[brdf.Sphere(center=[0.0, 0.0, 0.0], radius=1.0)])
+    sharp = brdf.BlinnPhong(k_a=0.1, k_d=0.4, k_s=0.5, n=800)
+    target = np.asarray(brdf.render(sharp, place)) + 0.003 * np.random.default_rng(0).standard_normal((60, 64, 3))
+    target[-13:] = np.nan
+    n = fitting.fit(target, place, model="blinn-phong")["n"]
+    assert n.value is not None, n.reason
+    assert abs(n.value - 800) < 4 * n.error
+
+
 def test_mask_weight_and_several_pictures(tmp_path: Path):
     path = tmp_path / "target.exr"
     brdf.write_image(path, picture())
