@@ -61,6 +61,8 @@ def _write_picture(stage: Path, result: FitResult, index: int) -> dict[str, Any]
     scene, file, number = result.scenes[index], result.files[index] if result.files else None, index or ""
     is_shared = index > 0 and scene.points is not None and scene.points is result.scenes[0].points
     scene.save(stage / f"scene{number}.toml", aov="scene.aov.exr" if is_shared else None)
+    if result.left_out.get("masked"):
+        brdf.write_image(stage / f"mask{number}.png", np.asarray(result.counted[index], np.float32)[..., None])
     if file is None:
         path = stage / f"target{number}.exr"
         brdf.write_image(path, np.asarray(result.targets[index], np.float32))

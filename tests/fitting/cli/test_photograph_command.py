@@ -133,6 +133,20 @@ def test_transparent_pixels_show_nothing_unless_all_are(tmp_path, capsys, monkey
         assert json.loads(out)["left_out"]["masked"] == rim + (0 if whole else 200)
 
 
+def test_a_saved_fit_is_made_again_from_its_scene_and_mask(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    scene = photograph_scene(ball_seen((80, 80), Circle(40, 39, 30.3)), (0.3, 0.4, 0.9))
+    picture = np.asarray(brdf.render(brdf.BlinnPhong(k_d=[0.4, 0.3, 0.2], k_s=0.3, n=40), scene))
+    on_ball = np.asarray(ball_points((80, 80), Circle(40, 39, 30.3)).mask)
+    brdf.write_image("ball.png", np.where(on_ball[..., None], picture, 0.9))  # a bright background, and a mixed rim
+    words = ["--model", "blinn-phong", "--json"]
+    first = run(capsys, "fit", "ball.png", "--sphere", "40,39,30.3", "--light", "0.3,0.4,0.9", "--out", "out", *words)
+    again = run(capsys, "fit", "ball.png", "--scene", "out/scene.toml", "--mask", "out/mask.png", *words)
+    before, after = (json.loads(out)["parameters"] for _, out, _ in (first, again))
+    for one, other in zip(before, after, strict=True):
+        assert one["value"] == (other["value"] and pytest.approx(other["value"], rel=1e-6))
+
+
 def test_a_circle_that_is_off_is_named_and_freed(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     true = brdf.BlinnPhong(k_d=[0.4, 0.3, 0.2], k_s=0.3, n=40)
