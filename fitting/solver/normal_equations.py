@@ -157,9 +157,10 @@ class Picture:
         if self.lobe is None:
             return -np.inf
         peak = np.asarray(self.lobe.peak)
-        if self.weight is not None and not np.all(np.asarray(self.weight)[np.argmax(peak)] > 0):
+        # Mostly the nearest pixel counts; a rounded picture may have none that says something.
+        if self.weight is not None and peak.size and not np.all(np.asarray(self.weight)[np.argmax(peak)] > 0):
             peak = np.where(self.counts, peak, -np.inf)
-        return float(np.max(peak))
+        return float(np.max(peak, initial=-np.inf))
 
     @property
     def weights(self) -> Float[AnyArray, "P Cw"]:

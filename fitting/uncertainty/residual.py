@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from brdf.lobes import NO_LOBE
 from fitting.likelihood import AnyArray
 from fitting.solver.normal_equations import COMPILER_OPTIONS, FEW_VALUES, UNROLLED_CHANNELS, Picture, totals
 from fitting.solver.profile import Optimum
@@ -98,8 +97,7 @@ def survey(
     blocks, pairs, errors, values = [], [], [], []
     # The lobe is taken relative to its largest value in any picture, or squares of a highlight that no pixel sees would
     # fall below the smallest number.
-    nearest = min(max(picture.nearest_peak for picture in pictures), 0.0)
-    peak = nearest if nearest > 0.5 * NO_LOBE else 0.0
+    peak = 0.0 if optimum.flat else min(max(picture.nearest_peak for picture in pictures), 0.0)
     decay, largest, squares = math.exp(optimum.n * peak), 0.0, 0.0
     for picture, width in zip(pictures, widths, strict=True):
         small = picture.target.size <= FEW_VALUES and not picture.is_sampled
@@ -127,9 +125,7 @@ def survey(
         values.append(shown[:, 0, counts])
     error, value = (np.concatenate(parts, axis=1).T.astype(np.float64) for parts in (errors, values))
     carrying = squares / (largest or 1.0) ** 2
-    return Residual(
-        blocks, _going_together(pairs, noise > 2 * rounding), error, value, decay * largest, carrying, nearest
-    )
+    return Residual(blocks, _going_together(pairs, noise > 2 * rounding), error, value, decay * largest, carrying, peak)
 
 
 def neighbours_of(images: Sequence[Float[np.ndarray, "H W C"]]) -> Neighbours:

@@ -70,6 +70,16 @@ def test_nonnegative_solver_against_scipy():
         assert np.all(found[k] >= 0)
 
 
+@pytest.mark.parametrize("weight", [None, "even", "none nearest"])
+def test_the_nearest_pixel_is_one_that_counts_if_there_is_any(weight):
+    one = picture(64)
+    peak = np.asarray(one.lobe.peak)
+    heavy = None if weight is None else np.where((weight == "even") | (peak < np.max(peak)), 1.0, 0.0)
+    one = Picture(one.target, one.diffuse, one.lobe, heavy)
+    assert one.nearest_peak == np.max(peak if heavy is None else peak[heavy > 0])
+    assert one.pixels(lambda a: a[:0]).nearest_peak == -np.inf
+
+
 def test_subsample_keeps_the_innermost_pixels_and_the_totals():
     one = picture(512, light=(0.2, 0.1, 1.0))
     with jax.enable_x64(True):
