@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float32, UInt
 
 from brdf.errors import InputError
 from brdf.images.encoding import Encoding, encode
@@ -93,8 +93,9 @@ class Codes(NamedTuple):
             inside = valid & ~_mixed(~valid.reshape(-1, self.values.shape[1]), BLOCK if channels == 1 else 2 * BLOCK)
             # Or the picture is too small to do without.
             valid = inside if 2 * np.count_nonzero(inside) >= np.count_nonzero(valid) else valid
-        code, good = flat(self.values), valid[:, None]
-        top = np.full(channels, self.ends[1], code.dtype)
+        # Of each value: to stretch something over so short an axis takes several times as long.
+        code, good = flat(self.values), np.repeat(valid, channels).reshape(-1, channels)
+        top = np.asarray(self.ends[1], code.dtype)
         if level is not None and np.isfinite(level):
             clipped = np.rint(self.scale * encode(level / np.asarray(self.unit, np.float64), self.encoding))
             top = np.minimum(top, clipped.astype(code.dtype))
@@ -119,6 +120,7 @@ def find_codes(
     bits: int | None,
     rounding: Rounding,
     unit: float | np.ndarray = 1.0,
+    stored: UInt[np.ndarray, "H W C"] | None = None,
 ) -> Codes | None:
     """The codes behind linear values; None where no rounding touched them.
 
@@ -129,11 +131,13 @@ def find_codes(
         rounding: the full step between neighbouring values in the unit of the pixels; 0 for none, "floor" where the
             writer truncated, None finds out.
         unit: radiance of the largest code of a file, a number or (C,).
+        stored: the codes themselves, of integers that are at hand.
     """
     if rounding is not None and not (isinstance(rounding, str) and rounding == "floor"):
         return _stated(pixels, rounding)
     if bits is not None and encoding is not None:
-        found = _integers(pixels / unit, encoding, 255 if bits <= 8 else 65535)
+        top = 255 if bits <= 8 else 65535
+        found = _integers(_nearest_codes(pixels / unit, encoding, top) if stored is None else stored, encoding, top)
         found = None if found is None else found._replace(unit=unit)
     else:
         found = _levels(pixels, half=bits == HALF)
@@ -178,7 +182,7 @@ def _bounds(
     lower: np.ndarray, upper: np.ndarray, width: int, spread: Any, scale: Any = 1.0, unit: Any = 1.0, **how: Any
 ) -> Bounds:
     """Of all pixels, row by row; in the precision of the fit."""
-    lower, upper = (end.astype(jnp.result_type(float)) for end in (lower, upper))
+    lower, upper = (end.astype(jnp.result_type(float), copy=False) for end in (lower, upper))
     scale, unit, spread = (np.asarray(part, np.float64) for part in (scale, unit, spread))
     return Bounds(lower, upper, scale, unit, np.arange(len(lower)), np.asarray(width), spread, **how)
 
@@ -216,23 +220,27 @@ def _stated(pixels: np.ndarray, rounding: Any) -> Codes | None:
     return Codes(pixels / size, half, half, (-np.inf, np.inf), 1 / size, "linear")
 
 
-def _integers(pixels: np.ndarray, encoding: Encoding, top: int, fewest: int = 1) -> Codes | None:
-    """Of an integer file with so many different ones; the step is the greatest common divisor of what is used."""
+def _nearest_codes(pixels: np.ndarray, encoding: Encoding, top: int) -> Float32[np.ndarray, "H W C"]:
     with np.errstate(invalid="ignore"):
-        codes = np.rint(encode(np.asarray(pixels, np.float32), encoding) * np.float32(top))
-    whole = codes[np.isfinite(codes)].astype(np.int64)
-    least = np.min(whole, initial=0)
-    used = np.flatnonzero(np.bincount(whole - least)) + least
+        return np.rint(encode(np.asarray(pixels, np.float32), encoding) * np.float32(top))
+
+
+def _integers(codes: np.ndarray, encoding: Encoding, top: int, fewest: int = 1) -> Codes | None:
+    """Of an integer file with so many different ones; the step is the greatest common divisor of what is used."""
+    whole = codes.ravel() if codes.dtype.kind == "u" else codes[np.isfinite(codes)].astype(np.int64)
+    least = int(np.min(whole, initial=0))
+    used = np.flatnonzero(np.bincount(whole - least if least else whole)) + least
     if used.size < fewest:
         return None
     inside = used[(used > 0) & (used < top)]
     # Few codes may have a divisor by chance.
     step = int(np.gcd.reduce(inside)) if inside.size >= _FEWEST else 1
+    codes = codes.astype(np.float32)
     if step > 1 and used[-1] == top and top % step:
         # Clipped to the largest number of the file, not to a code of the sensor.
-        codes = np.where(codes == top, np.ceil(top / step) * step, codes)
+        codes[codes == top] = np.ceil(top / step) * step
     largest = float(top // step)
-    return Codes((codes / step).astype(np.float32), 0.5, 0.5, (0.0, largest), top / step, encoding)
+    return Codes(codes / np.float32(step), 0.5, 0.5, (0.0, largest), top / step, encoding)
 
 
 def _levels(pixels: np.ndarray, *, half: bool) -> Codes | None:
@@ -256,14 +264,14 @@ def _levels(pixels: np.ndarray, *, half: bool) -> Codes | None:
             return None
         fitting, rgbe, whole = [], False, False
     for top, curve in fitting:
-        found = _integers(pixels, curve, top, _FEWEST)
+        found = _integers(_nearest_codes(pixels, curve, top), curve, top, _FEWEST)
         if found is not None:
             bits = int(np.ceil(np.log2(found.ends[1] + 1)))
             return found._replace(levels=f"{bits}-bit {'sRGB' if curve == 'srgb' else curve} files")
     if whole and (some.max() <= min(_TOLERANCE) or not (rgbe or halves)):
         # Codes that nobody divided by the largest; those of half floats and RGBE are whole only where they are bright.
         top = min(top for top in _TOLERANCE if some.max() <= top)
-        found = _integers(pixels / top, "linear", top, _FEWEST)
+        found = _integers(_nearest_codes(pixels / top, "linear", top), "linear", top, _FEWEST)
         if found is None:
             return None
         # How many codes there are beyond those of 8 bits nobody says.

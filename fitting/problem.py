@@ -13,7 +13,7 @@ from jax.core import Tracer
 
 import brdf
 from brdf.errors import InputError
-from brdf.images.encoding import Encoding, decode, decode_table, parse_encoding
+from brdf.images.encoding import Encoding, decode, decode_table, largest_step, parse_encoding
 from brdf.precision import Precision
 from fitting.codes import HALF, Codes, Rounding, find_codes
 from fitting.sample_error import SampleError
@@ -237,11 +237,12 @@ def as_target(given: Any, rounding: Rounding = None, encoding: Encoding | None =
 
 
 def _of_picture(picture: brdf.Picture, rounding: Rounding) -> Target:
-    steps = picture.quantisation()
-    codes, step, top = None, 0.0 if steps is None else float(np.nanmax(steps)), picture.saturation
-    if rounding is not None or not picture.lossy or steps is not None:
-        of_file = None if steps is None else picture.encoding, picture.bits
-        codes = find_codes(picture.pixels, *of_file, rounding, picture.factor)
+    codes, step, top = None, 0.0, picture.saturation
+    if top is not None:
+        step = largest_step(picture.encoding, picture.bits) * float(np.max(picture.factor))
+    if rounding is not None or not picture.lossy or top is not None:
+        encoding = None if top is None else picture.encoding
+        codes = find_codes(picture.pixels, encoding, picture.bits, rounding, picture.factor)
     if codes is not None:
         # Steps that the user states are not the codes that were compressed.
         jpeg = picture.jpeg if rounding is None or isinstance(rounding, str) else None
@@ -254,11 +255,11 @@ def _of_picture(picture: brdf.Picture, rounding: Rounding) -> Target:
 
 
 def _of_array(values: np.ndarray, rounding: Rounding, encoding: Encoding) -> Target:
-    kind, step, bits = values.dtype, 0.0, None
+    kind, step, bits, stored = values.dtype, 0.0, None, None
     if kind in (np.uint8, np.uint16):
-        bits = 8 * kind.itemsize
+        bits, stored = 8 * kind.itemsize, np.atleast_3d(values)
         table = decode_table(encoding, bits)
-        values, step = table.astype(np.float32)[values], float(np.max(np.diff(table)))
+        values, step = table.astype(np.float32)[values], largest_step(encoding, bits)
     elif kind.kind != "f":
         came = f"must hold floating-point values, or codes of 8 or 16 bits, got {kind}"
         raise InputError("target", came, "Read it with brdf.read_picture, or divide by the largest code")
@@ -270,8 +271,8 @@ def _of_array(values: np.ndarray, rounding: Rounding, encoding: Encoding) -> Tar
         values = values[..., None]
     if values.ndim != 3 or 0 in values.shape:
         raise InputError("target", f"must be of shape (H, W, C), got {values.shape}", "Give one picture")
-    integer = kind.kind == "u"
-    codes = find_codes(values, encoding if integer else None, bits, rounding)
+    integer = stored is not None
+    codes = find_codes(values, encoding if integer else None, bits, rounding, stored=stored)
     return Target(values, TOP if integer else None, step, codes, least_squares=rounding is not None and codes is None)
 
 

@@ -96,6 +96,11 @@ def decode_table(encoding: Encoding, bits: int) -> Float[np.ndarray, " codes"]:
     return table
 
 
+def largest_step(encoding: Encoding, bits: int) -> float:
+    """The largest distance of two neighbouring codes of an integer file, in linear values."""
+    return float(np.max(np.diff(decode_table(encoding, min(bits, 16)))))
+
+
 def find_encoding(
     given: Encoding | None, path: Path, format_name: str, spec: Any, bits: int
 ) -> tuple[Encoding, EncodingSource]:

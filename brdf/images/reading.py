@@ -22,7 +22,16 @@ from jaxtyping import Bool, Float32
 from brdf.errors import InputError
 from brdf.files import AnyPath, input_file, utf8_name
 from brdf.images.damage import check_content, check_header, check_memory
-from brdf.images.encoding import FLOATS, Encoding, EncodingSource, decode, decode_table, find_encoding, parse_encoding
+from brdf.images.encoding import (
+    FLOATS,
+    Encoding,
+    EncodingSource,
+    decode,
+    decode_table,
+    find_encoding,
+    largest_step,
+    parse_encoding,
+)
 from brdf.images.jpeg import Jpeg
 
 LOSSY_TOP = 250 / 255
@@ -89,18 +98,6 @@ class Picture:
         """The distance of two codes before decoding, full scale 1; None for floats."""
         return None if self.saturation is None else 1.0 / ((1 << self.bits) - 1)
 
-    def quantisation(self) -> Float32[np.ndarray, "height width channels"] | None:
-        """The distance of neighbouring codes at each pixel after decoding, in the unit of the pixels; None for floats.
-
-        The rounding error of a pixel is uniform within ± half of it.
-        """
-        if self.code_step is None:
-            return None
-        if self.encoding == "linear":
-            return np.broadcast_to(np.float32(self.code_step) * np.float32(self.factor), self.pixels.shape)
-        table = decode_table(self.encoding, min(self.bits, 16))
-        return (np.interp(self.pixels / self.factor, table, np.gradient(table)) * self.factor).astype(np.float32)
-
 
 class ImageReader(contextlib.AbstractContextManager):
     """A picture in a file, read by bands of rows, so that it may be larger than memory.
@@ -166,7 +163,7 @@ class ImageReader(contextlib.AbstractContextManager):
         if not self.is_integer:
             return None, 0.0
         top = decode(np.array(LOSSY_TOP if self.lossy else 1.0), self.encoding)
-        return float(top), float(np.max(np.diff(decode_table(self.encoding, min(self.bits, 16)))))
+        return float(top), largest_step(self.encoding, self.bits)
 
     def __exit__(self, *raised: object) -> None:
         """Close the file."""
@@ -359,7 +356,7 @@ def read_image(path: AnyPath, *, encoding: Encoding | None = None) -> Float32[np
 
 
 def read_picture(path: AnyPath, *, encoding: Encoding | None = None) -> Picture:
-    """Read a picture with alpha, saturation level and quantisation step.
+    """Read a picture with alpha, saturation level and distance of its codes.
 
     Args:
         path: the file, as for `read_image`.

@@ -20,7 +20,7 @@ from image_files import (
 )
 
 from brdf.errors import InputError
-from brdf.images.encoding import decode, encode
+from brdf.images.encoding import decode, encode, largest_step
 from brdf.images.reading import read_image, read_picture
 
 GRADIENT = np.arange(256, dtype=np.uint8).reshape(16, 16, 1).repeat(3, axis=2)
@@ -123,14 +123,9 @@ def test_sixteen_bits(tmp_path, chunks, expected):
     np.testing.assert_allclose(picture.pixels, linear, rtol=1e-6, atol=0 if expected == "linear" else CURVE_TOLERANCE)
 
 
-@pytest.mark.parametrize("encoding", ["linear", "srgb", 2.2])
-def test_the_quantisation_is_the_distance_of_the_codes(tmp_path, encoding):
-    (tmp_path / "a.png").write_bytes(png(GRADIENT))
-    picture = read_picture(tmp_path / "a.png", encoding=encoding)
-    curve = {"linear": lambda x: x, "srgb": srgb_to_linear, 2.2: lambda x: x**2.2}[encoding]
-    middle = np.arange(1, 255)
-    expected = (curve((middle + 1) / 255) - curve((middle - 1) / 255)) / 2
-    np.testing.assert_allclose(picture.quantisation()[..., 0].ravel()[1:-1], expected, rtol=2e-3, atol=2e-7)
+def test_the_largest_step_is_that_of_the_brightest_codes():
+    assert largest_step("linear", 8) == pytest.approx(1 / 255)
+    assert largest_step("srgb", 8) == pytest.approx(1 - srgb_to_linear(np.array(254 / 255)))
 
 
 @pytest.mark.parametrize("encoding", ["srgb", 2.2, 1.8])

@@ -216,19 +216,15 @@ def test_noise_weights_give_the_errors_of_the_camera():
     assert np.mean(estimates) == pytest.approx(0.8, abs=2 * np.mean(errors))
 
 
-def test_a_picture_in_another_unit_keeps_its_clipping_and_its_step(tmp_path):
+def test_a_picture_in_another_unit_keeps_its_clipping(tmp_path):
     codes = np.arange(256, dtype=np.float32).reshape(16, 16, 1).repeat(3, axis=2) / 255
     brdf.write_image(tmp_path / "a.png", codes, encoding="linear")
     picture = brdf.read_picture(tmp_path / "a.png", encoding="linear")
     double = picture.scaled(2.0)
     assert double.saturation == 2.0
-    assert np.allclose(double.quantisation(), 2 / 255)
     coloured = picture.scaled(np.array([1.0, 2.0, 4.0]))
     assert np.isnan(coloured.pixels[-1, -1]).all()
     assert np.isfinite(coloured.pixels[-1, -2]).all()
-    assert np.allclose(coloured.quantisation()[0, 0], np.array([1, 2, 4]) / 255)
-    decoded = brdf.read_picture(tmp_path / "a.png", encoding="srgb")
-    assert np.allclose(decoded.scaled(3.0).quantisation(), 3 * decoded.quantisation(), rtol=1e-4)
 
 
 # -- real photographs --------------------------------------------------------------------------------------------------
