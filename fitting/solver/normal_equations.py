@@ -373,7 +373,7 @@ def sums(
     totals: list[Sums] = []
     for first in range(0, len(log_n), _MOST_EXPONENTS):
         some = log_n[first : first + _MOST_EXPONENTS]
-        padded = np.pad(some, (0, _MOST_EXPONENTS - some.size))
+        padded = np.resize(some, _MOST_EXPONENTS)
         passed = {}
         for index in own(len(pictures)):
             picture = placed(index, pictures[index])

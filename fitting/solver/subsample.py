@@ -131,18 +131,18 @@ def _sums(part: Picture, lobes: Lobes) -> Sums:
     for group in range(1 if shared else channels):
         own = slice(None) if shared else slice(group, group + 1)
         heavy, lit, ambient = (one[min(group, len(one) - 1)] for one in (weight, diffuse, part.ambient))
-        moving = [one[:, min(group, one.shape[1] - 1)].astype(np.float64, order="C") for one in lobes]
-        columns = np.stack([np.full_like(lit, ambient), lit, *target[own]])
-        fixed = heavy * columns
-        gram[:, own, :2, :2], product[:, own, :2] = fixed[:2] @ columns[:2].T, fixed[2:] @ columns[:2].T
+        # Half of the weight on each side of a product: no array of all exponents is made for it.
+        root = np.sqrt(heavy)
+        moving = [one[:, min(group, one.shape[1] - 1)] * root for one in lobes]
+        fixed = root * np.stack([np.full_like(lit, ambient), lit, *target[own]])
+        gram[:, own, :2, :2], product[:, own, :2] = fixed[:2] @ fixed[:2].T, fixed[2:] @ fixed[:2].T
         for row, moved in enumerate(moving, 2):
             # A few at a time: for more BLAS takes several threads, which wait for each other on a busy machine.
             across = np.concatenate([some @ fixed.T for some in np.array_split(moved, -(-exponents // 8))])
             gram[:, own, row, :2] = gram[:, own, :2, row] = across[:, None, :2]
             product[:, own, row] = across[:, 2:]
-            weighted = moved * heavy
             for column in range(2, row + 1):
-                both = np.einsum("nm,nm->n", weighted, moving[column - 2])
+                both = np.einsum("nm,nm->n", moved, moving[column - 2])
                 gram[:, own, row, column] = gram[:, own, column, row] = both[:, None]
     pixels, square = np.count_nonzero(weight, axis=1), np.sum(weight * target**2, axis=1)
     return Sums(gram, product, *(np.broadcast_to(one, (exponents, channels)) for one in (square, pixels)))
