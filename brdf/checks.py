@@ -225,7 +225,9 @@ def coefficients(**given: Any) -> list[Array | np.ndarray]:
     Raises:
         InputError: naming the one that is not finite, is negative, or does not go with the others.
     """
-    arrays = {name: spectrum(name, _known(name, value), np.inf) for name, value in given.items()}
+    arrays: dict[str, Array | np.ndarray] = {}
+    for name, value in given.items():
+        arrays[name] = spectrum(name, _known(name, value), np.inf)
     channels = max(array.size for array in arrays.values())
     for name, array in arrays.items():
         if array.size not in (1, channels):

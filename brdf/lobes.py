@@ -7,6 +7,7 @@ are taken tile by tile, which also keeps a tile in the processor's cache while i
 import dataclasses
 import functools
 import math
+import operator
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, NamedTuple
@@ -334,31 +335,22 @@ class Lobe:
                 a lobe itself falls by many powers of ten within a step of log n, but its shape does not change faster
                 than elsewhere. What lies nearer to the centre than that counts as if it were there.
         """
-        value, slope = self._centres(n, peak)
+        if self.table is not None and self.near is not None:
+            value, slope = _of_table(self.table, self.near, n, peak)
+        elif self.source is not None and self.model is not None:
+            points, of_terms = self.source[0].in_components(), partial(_relative, n, peak)
+            value, slope = over_samples(OneOf((self.model,)), points, self.source[1], of_terms)[0]
+        else:
+            values, slopes = [], []
+            for weight, log_cosine in self.kept:
+                power, change = _powers(n, peak, log_cosine)
+                values.append(_over_samples(weight, power))
+                slopes.append(_over_samples(weight, change))
+            value, slope = functools.reduce(operator.add, values), functools.reduce(operator.add, slopes)
         if self.fine is None:
             return value, slope
         fine_value, fine_slope = self.fine(n, peak)
         return averaged(self.slot, value, fine_value), averaged(self.slot, slope, fine_slope)
-
-    def _centres(self, n: Any, peak: Any) -> tuple[Any, ...]:
-        if self.table is not None and self.near is not None:
-            near, table, dtype = self.near, self.table, self.table.dtype
-            xp: Any = np if isinstance(table, np.ndarray) else jnp
-            n = xp.asarray(n, float if xp is np else None)
-            value, slope = (
-                xp.einsum("...k,pkc->...pc", one.astype(dtype), table) for one in near.weights(xp, xp.log(n))
-            )
-            if n.ndim:
-                value, slope = value[:, 0, 0], slope[:, 0, 0]
-            more = near.peak - peak
-            factor = xp.asarray(xp.exp(n * more), dtype)
-            return factor * value, factor * (slope / xp.asarray(n, dtype) + xp.asarray(more, dtype) * value)
-        if self.source is not None and self.model is not None:
-            points, lighting = self.source
-            of_terms = partial(_relative, n, peak)
-            return over_samples(OneOf((self.model,)), points.in_components(), lighting, of_terms)[0]
-        parts = [_summed(weight, _powers(n, peak, log_cosine)) for weight, log_cosine in self.kept]
-        return tuple(map(sum, zip(*parts, strict=True)))
 
     def pixels(self, choose: Callable[[Any], Any]) -> "Lobe":
         """The same for some of the pixels: ``choose`` is applied to each array whose first axis is the pixels."""
@@ -378,13 +370,12 @@ class Lobe:
         # Where they are made anew, of one size for few numbers of pixels, or each would be compiled.
         count = pixel.size if self.source is None else 1 << max(pixel.size - 1, 0).bit_length()
         filled = np.resize(pixel, count)
-        lobe = jax.tree.map(np.asarray, dataclasses.replace(self, fine=None)).pixels(
-            lambda leaf: np.take(leaf, filled, 0)
-        )
+        lobe = jax.tree.map(np.asarray, dataclasses.replace(self, fine=None))
+        lobe = lobe.pixels(partial(np.take, indices=filled, axis=0))
         if lobe.source is not None and lobe.model is not None:
             made = diffuse_and_kept(OneOf.of(lobe.model), *lobe.source)[1]
             lobe = jax.tree.map(np.asarray, dataclasses.replace(lobe, source=None, kept=made and made.kept))
-        lobe = lobe.pixels(lambda leaf: leaf[: pixel.size])
+        lobe = lobe.pixels(operator.itemgetter(slice(pixel.size)))
         if self.fine is None:
             return lobe
         slot: Any = lobe.slot
@@ -419,30 +410,33 @@ def _relative(n: Any, peak: Any, terms: LightTerms) -> tuple[Array, Array]:
     return terms.weight * value, terms.weight * slope
 
 
-def _summed(weight: Any, powers: Any) -> Iterator[Any]:
-    """The sums over samples of what is multiplied by their weights."""
-    for one in powers:
-        if weight.shape[1] == 1:  # NumPy is slow where the last axes are short
-            yield one * weight[:, 0]
-        elif isinstance(one, np.ndarray):
-            yield np.einsum("...ps,psc->...pc", one, weight, optimize=True)  # as matrices: ten times as fast
-        else:
-            yield jnp.sum(one[..., None] * weight, axis=-2)
+def _over_samples(weight: Any, value: Any) -> Any:
+    """The sum over samples of values, (..., P, S), times weights, (P, S, C)."""
+    if weight.shape[1] == 1:  # NumPy is slow where the last axes are short
+        return value * weight[:, 0]
+    if isinstance(value, np.ndarray):
+        return np.einsum("...ps,psc->...pc", value, weight, optimize=True)  # as matrices: ten times as fast
+    return jnp.sum(value[..., None] * weight, axis=-2)
+
+
+def _of_table(table: Any, near: Near, n: Any, peak: Any) -> tuple[Any, Any]:
+    """The lobe and its derivative by the polynomial through what is tabulated."""
+    xp: Any = np if isinstance(table, np.ndarray) else jnp
+    n, dtype = xp.asarray(n, float if xp is np else None), table.dtype
+    value, slope = (xp.einsum("...k,pkc->...pc", one.astype(dtype), table) for one in near.weights(xp, xp.log(n)))
+    if n.ndim:
+        value, slope = value[:, 0, 0], slope[:, 0, 0]
+    more = near.peak - peak
+    factor = xp.asarray(xp.exp(n * more), dtype)
+    return factor * value, factor * (slope / xp.asarray(n, dtype) + xp.asarray(more, dtype) * value)
 
 
 # -- programs ----------------------------------------------------------------------------------------------------------
 
 
-def basis_terms(model: type[Material], points: Sight, lighting: Lighting) -> tuple[Array, Lobe | None]:
-    """The diffuse basis of pixels, (P, C), and the specular one where the model has one."""
-    values = points.count * lighting.samples * (1 + lighting.channels)
-    if is_sampled(lighting) and (values > STACKED_VALUES or not issubclass(model, SpecularMaterial)):
-        return _diffuse_and_peak(OneOf((model,)), points.stored().pixels(), lighting)
-    return diffuse_and_kept(OneOf.of(model), points, lighting)
-
-
 @jax.jit
-def _diffuse_and_peak(model: OneOf, points: SurfacePoints, lighting: Lighting) -> tuple[Array, Lobe | None]:
+def diffuse_and_peak(model: OneOf, points: SurfacePoints, lighting: Lighting) -> tuple[Array, Lobe | None]:
+    """The diffuse basis of pixels, (P, C), and the lobe, where the model has one, of terms that are made anew."""
     diffuse, peak = over_samples(model, points.in_components(), lighting, lambda terms: terms.diffuse)
     return diffuse, Lobe(peak, model.lobes[0], source=(points, lighting)) if model.lobes else None
 

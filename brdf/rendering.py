@@ -27,6 +27,7 @@ from brdf.geometry.surface_points import SurfacePoints
 from brdf.lights.base import Lighting, stacked
 from brdf.lobes import (
     NO_LOBE,
+    STACKED_VALUES,
     STORED_SAMPLES,
     TILE,
     LightTerms,
@@ -34,7 +35,8 @@ from brdf.lobes import (
     Near,
     OneOf,
     averaged,
-    basis_terms,
+    diffuse_and_kept,
+    diffuse_and_peak,
     is_sampled,
     over_samples,
     tabulated,
@@ -85,9 +87,16 @@ def basis(
         return Basis(points, None, None)
     if near is not None and area is None and is_sampled(lighting):
         return Basis(points, *_tabulated(model, points.stored().pixels(), lighting, near, counts))
-    diffuse, lobe = basis_terms(model, points if area is None else dataclasses.replace(points, area=None), lighting)
+    made = []
+    for seen in [points] if area is None else [dataclasses.replace(points, area=None), area.points]:
+        values = seen.count * lighting.samples * (1 + lighting.channels)
+        if is_sampled(lighting) and (values > STACKED_VALUES or not issubclass(model, SpecularMaterial)):
+            made.append(diffuse_and_peak(OneOf((model,)), seen.stored().pixels(), lighting))
+        else:
+            made.append(diffuse_and_kept(OneOf.of(model), seen, lighting))
+    diffuse, lobe = made[0]
     if area is not None:
-        slot, (fine_diffuse, fine_lobe) = area.slot.ravel(), basis_terms(model, area.points, lighting)
+        slot, (fine_diffuse, fine_lobe) = area.slot.ravel(), made[1]
         diffuse = averaged(slot, diffuse, fine_diffuse)
         lobe = None if lobe is None or fine_lobe is None else lobe.over_areas(fine_lobe, slot)
     return Basis(points, diffuse, lobe)

@@ -137,7 +137,7 @@ def normalize(v: Any) -> Any:
     length = jnp.sqrt(jnp.where(nonzero, squared, 1.0))
     # A division last: XLA's CPU compiler repeats all but divisions and roots in each loop that reads them.
     found = Components(tuple(one / length for one in unscaled))
-    return found if isinstance(v, Components) else found.stacked()
+    return found if isinstance(v, Components) else jnp.stack(found.parts, axis=-1)
 
 
 def norm(v: Directions) -> Scalars:

@@ -175,13 +175,14 @@ class Problem(ABC):
         """Which unknowns have no bound at 0, and move relative to where they are."""
         return self.exponents | (self.lower < 0)
 
-    def near(self, at: Estimate, reach: float, beside: list[Values] | None = None) -> list[Values]:
-        """The values that say something: those not surely in their codes, by so many s, and those given beside.
+    def near(
+        self, codes: Sequence[Float[np.ndarray, "P C"]], distance: float, beside: list[Values] | None = None
+    ) -> list[Values]:
+        """The values that say something: those not surely in their codes, by this distance, and those given beside.
 
         The latter themselves where there are no others.
         """
-        both = zip(self.bounds, self.codes(at.unknowns), strict=True)
-        which = [bounds.near(code, reach * at.noise) for bounds, code in both]
+        which = [bounds.near(code, distance) for bounds, code in zip(self.bounds, codes, strict=True)]
         if beside is not None:
             if not any(np.any(some & ~other.which) for some, other in zip(which, beside, strict=True)):
                 return beside
@@ -256,7 +257,7 @@ def maximise(
     """
     at, known, before, low, high = start, [], None, -math.inf, math.inf
     for _ in range(MOST_NOISES):
-        values = problem.near(at, REACH)
+        values = problem.near(problem.codes(at.unknowns), REACH * at.noise)
         at, values, said = _climb(problem, at, ROUGH_GAIN, known, values, problem.score(at, values))
         known.append(precision(problem, at, said))
         fewest = float(np.min(known[-1].values, where=known[0].variance > 0, initial=math.inf))
@@ -275,7 +276,7 @@ def maximise(
             break
         at = at._replace(noise=math.exp(now + step))
     else:
-        values = problem.near(at, REACH)
+        values = problem.near(problem.codes(at.unknowns), REACH * at.noise)
         said = problem.score(at, values)
     rough = said
     at, _, said = _climb(problem, at, LEAST_GAIN, known, values, rough)
@@ -315,7 +316,7 @@ def _climb(
             if gain < enough:
                 break
         # Others may say something at the new numbers.
-        before, values = values, problem.near(at, NEARER, values)
+        before, values = values, problem.near(problem.codes(at.unknowns), NEARER * at.noise, values)
         if values is before:
             return at._replace(value=now.value), values, now
         now, first = problem.score(at, values), problem.score(start, values)
@@ -403,6 +404,6 @@ def where_most_is_told(
     most = telling(known)
     if most is not known[-1]:
         at = at._replace(noise=most.noise)
-        said = problem.score(at, problem.near(at, REACH))
+        said = problem.score(at, problem.near(problem.codes(at.unknowns), REACH * at.noise))
         most = precision(problem, at, said)
     return said, widening(known, most, alone)

@@ -1,6 +1,7 @@
 """One fit: the pictures of a problem under one model, or under the simplest adequate one."""
 
 import dataclasses
+import itertools
 import math
 import time
 from collections.abc import Mapping, Sequence
@@ -142,9 +143,11 @@ def _fit_model(
     near, trial = None if error is None else error.near, -1
     while True:
         trial += 1
-        pictures = each(partial(picture_of, model, near=near), seen.tiles)
-        if not problem.streamed:
-            pictures = [placed(index, picture) for index, picture in enumerate(pictures)]
+        made = partial(picture_of, model, near=near)
+        if problem.streamed:
+            pictures = each(made, seen.tiles)
+        else:
+            pictures = list(map(placed, itertools.count(), map(made, seen.tiles)))
         fit = _fit_about(model, seen, free.copy(), pictures, near)
         if fit.optimum.flat:
             break
@@ -316,7 +319,7 @@ def _coloured(fit: ModelFit, seen: Observed) -> bool:
     covariance = (alone if scatter is None else alone @ scatter @ alone)[lobe, lobe] / np.outer(grey, grey)
     k_s, precision = said.optimum.x[2] / grey, np.linalg.pinv(covariance, hermitian=True)
     left = k_s - np.sum(precision @ k_s) / np.sum(precision)
-    seen_as = max(highlight_in_codes(picture, fit.optimum.x, fit.optimum.n) for picture in fit.pictures)
+    seen_as = highlight_in_codes(fit.pictures, fit.optimum)
     differs = seen_as * float(np.max(np.abs(left)) / np.max(k_s)) > COLOURED * said.noise
     return differs and is_better(float(left @ precision @ left), k_s.size - 1)
 
@@ -385,7 +388,7 @@ def _explains_structure(fit: ModelFit, seen: Observed, after: Residual | None) -
         after: what it leaves, where that has been gone over.
     """
     optimum = fit.optimum
-    if max(highlight_in_codes(picture, optimum.x, optimum.n) for picture in fit.pictures) < HIDDEN:
+    if highlight_in_codes(fit.pictures, optimum) < HIDDEN:
         return False
     noise = residual_noise(optimum, seen.rounding)
     after = after or survey(fit.pictures, seen.widths, optimum, noise, seen.rounding)

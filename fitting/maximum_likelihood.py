@@ -267,7 +267,7 @@ def _of_planes(pictures: Sequence[Picture], at: Estimate, problem: "_Separable")
     weighted = map(_with_weight, pictures, weights)
     pixels = [_values(picture.in_double(np.arange(len(picture.target)))) for picture in weighted]
     at, alone = at._replace(noise=FIRST_NOISE), _Separable(pixels, problem.design, problem.n_range, problem.copies)
-    return precision_at(alone, at, alone.score(at, alone.near(at, REACH))).variance
+    return precision_at(alone, at, alone.score(at, alone.near(alone.codes(at.unknowns), REACH * at.noise))).variance
 
 
 def _optimum(working: Sequence[Picture], fit: ModelFit, at: Numbers) -> Optimum:
@@ -474,8 +474,7 @@ class _Separable(Problem):
 
     def shown(self, unknowns: Float[np.ndarray, " U"], values: Sequence[Values]) -> Iterator[tuple[Any, Any]]:
         """What is predicted, and its derivatives by the coefficients and log n."""
-        for some in values:
-            yield _shown(_picture(some), Numbers.of(unknowns))
+        return map(partial(_shown, at=Numbers.of(unknowns)), map(_picture, values))
 
 
 def _shown(picture: Picture, at: Numbers | Optimum) -> tuple[Float[np.ndarray, "P C"], Float[np.ndarray, "4 P C"]]:
@@ -556,18 +555,19 @@ def _open_ends_tell(picture: Picture, at: Optimum, noise: float) -> bool:
     return bool(half.any()) and bool(np.any(_near(picture, at, END_REACH * noise)[half]))
 
 
-def highlight_in_codes(picture: Picture, x: np.ndarray, n: float) -> float:
-    """By how many codes of its file a highlight changes a value at most; infinite without codes.
+def highlight_in_codes(pictures: Sequence[Picture], optimum: Optimum) -> float:
+    """By how many codes of its file a highlight changes a value at most; infinite where a picture is without codes.
 
     Args:
-        picture: of a fit.
-        x: coefficients, (3, C).
-        n: exponent.
+        pictures: of a fit.
+        optimum: its numbers.
     """
-    if picture.bounds is None or picture.bounds.exact:
-        return math.inf
-    shown = [_codes(picture, Numbers(n, some)) for some in (x, x * [[1], [1], [0]])]
-    return float(np.max(shown[0] - shown[1]))
+    matt, most = Numbers(optimum.n, optimum.x * [[1], [1], [0]]), -math.inf
+    for picture in pictures:
+        if picture.bounds is None or picture.bounds.exact:
+            return math.inf
+        most = max(most, float(np.max(_codes(picture, optimum) - _codes(picture, matt))))
+    return most
 
 
 def unexplained(picture: Picture, x: np.ndarray, n: float) -> np.ndarray:

@@ -92,9 +92,9 @@ class Camera(Checked):
         right = normalize(jnp.cross(forward, self.up))
         return right, jnp.cross(right, forward), forward
 
-    def off_axis(self, column: Any, row: Any) -> Components:
-        """How far places lie from the middle of the picture, in the unit of its half width."""
-        (width, height), (right, up, _) = self.resolution, map(Components.of, self.axes())
+    def off_axis(self, right: Vector, up: Vector, column: Any, row: Any) -> Components:
+        """How far places lie from the middle of the picture along two of its axes, in world units as `half_width`."""
+        (width, height), (right, up) = self.resolution, map(Components.of, (right, up))
         x, y = jnp.asarray(column) * 2.0 / width - 1.0, height / width - jnp.asarray(row) * 2.0 / width
         return (right * x + up * y) * self.half_width
 
@@ -134,7 +134,8 @@ class OrthographicCamera(Camera):
 
     def rays(self, column: Any, row: Any) -> tuple[Components, Components]:
         """Origins on the plane through ``position``, one direction."""
-        return Components.of(self.position) + self.off_axis(column, row), Components.of(self.axes()[2])
+        right, up, forward = self.axes()
+        return Components.of(self.position) + self.off_axis(right, up, column, row), Components.of(forward)
 
 
 class PerspectiveCamera(Camera):
@@ -167,7 +168,9 @@ class PerspectiveCamera(Camera):
 
     def rays(self, column: Any, row: Any) -> tuple[Components, Components]:
         """One origin, a direction per place."""
-        return Components.of(self.position), normalize(Components.of(self.axes()[2]) + self.off_axis(column, row))
+        right, up, forward = self.axes()
+        toward = Components.of(forward) + self.off_axis(right, up, column, row)
+        return Components.of(self.position), normalize(toward)
 
 
 CAMERAS: dict[str, type[Camera]] = {camera.type_name: camera for camera in (OrthographicCamera, PerspectiveCamera)}

@@ -25,8 +25,11 @@ from brdf.precision import apart, pytree
 from brdf.vectors import Components, largest, select
 
 
+@jax.jit
 def trace(camera: Camera, shapes: tuple[Shape, ...], column: Any, row: Any) -> Points:
     """What the rays through places of the picture meet first.
+
+    A program of its own also inside others: what it does is found out once for all of them.
 
     Args:
         camera: where the rays begin.
@@ -135,31 +138,21 @@ class PrimaryRays:
 
     def in_components(self) -> Points:
         """What they meet, (rows, W), made once however often it is read."""
-        return apart(_traced, self)
+        return apart(trace, self.camera, self.shapes, *self.places)
 
     def stored(self) -> SurfacePoints:
         """The same as arrays, to be kept."""
         return surface_points(self.camera, self.shapes, *self.places)
 
     @functools.cached_property
+    @jax.jit
     def mask(self) -> Bool[Array, "rows W"]:
         """Which pixels see a fitted surface."""
-        return _mask(self)
+        return trace(self.camera, self.shapes, *self.places).mask
 
 
 Sight = SurfacePoints | PrimaryRays
 """What the pixels of a picture see, for programs: points, or the rays that meet them."""
-
-
-@jax.jit
-def _traced(rays: PrimaryRays) -> Points:
-    """A program of its own also inside others: what it does is found out once for all of them."""
-    return trace(rays.camera, rays.shapes, *rays.places)
-
-
-@jax.jit
-def _mask(rays: PrimaryRays) -> Array:
-    return _traced(rays).mask
 
 
 @jax.jit

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 
 import brdf
 from brdf.lights.base import Light, Lighting, stacked
-from brdf.lobes import basis_terms
+from brdf.lobes import OneOf, over_samples
 from brdf.models.base import SpecularMaterial
 from brdf.precision import working_precision
 
@@ -81,8 +81,8 @@ class PixelSample(NamedTuple):
 @eqx.filter_jit
 def _peaks(points, lights, model):
     """The largest log cosine of the lobe at each pixel, of lights that nothing shadows."""
-    lobe: Any = basis_terms(model, points, Lighting(stacked(lights, points.position.dtype)))[1]
-    return lobe.peak
+    lighting = Lighting(stacked(lights, points.position.dtype))
+    return over_samples(OneOf.of(model), points.in_components(), lighting, lambda _: ())[1]
 
 
 def sample_pixels(scene: brdf.Scene, model: type[brdf.Material], size: float) -> PixelSample | None:

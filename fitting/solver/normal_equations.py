@@ -114,34 +114,26 @@ class Picture:
     def _all_on_host(self) -> bool:
         return isinstance(self.diffuse, np.ndarray) and not self.is_sampled
 
-    def shown_and_lobe(self, n: Any, x: Float[AnyArray, "3 C"]) -> tuple[Any, Any]:
-        """What the model shows, (P, C), and the lobe, (P, Cb), as a part of a program or by NumPy."""
+    def predicted(self, n: Any, x: Float[AnyArray, "3 C"]) -> Float[AnyArray, "P C"]:
+        """What the model shows, in the dtype of the target, as a part of a program or by NumPy."""
         xp: Any = np if isinstance(self.diffuse, np.ndarray) else jnp
         x_a, x_d, x_s = xp.asarray(x, self.target.dtype)
-        lobe = xp.zeros_like(self.diffuse) if self.lobe is None else self.lobe(n)[0]
-        shown = x_a * xp.asarray(self.ambient, self.target.dtype) + x_d * self.diffuse + x_s * lobe
-        return xp.broadcast_to(shown, self.target.shape), lobe
-
-    def predicted(self, n: AnyArray, x: Float[AnyArray, "3 C"]) -> Float[AnyArray, "P C"]:
-        """What the model shows, in the dtype of the target; in NumPy where the picture is."""
-        return (_predicted if self._all_on_host else _predicted_many)(self, n, x)
+        shown = x_a * xp.asarray(self.ambient, self.target.dtype) + x_d * self.diffuse
+        if self.lobe is not None:
+            shown += x_s * self.lobe(n)[0]
+        return xp.broadcast_to(shown, self.target.shape)
 
     def shown(self, n: float, x: Float[np.ndarray, "3 C"]) -> Float[np.ndarray, "P C"]:
-        """What the model shows, on the host; of a few pixels by NumPy.
+        """What the model shows, on the host; by NumPy where that takes less time than to trace and load a program.
 
         Args:
             n: the exponent.
             x: coefficients.
         """
-        picture = self._convenient
-        return np.asarray((_predicted if picture._all_on_host else _predicted_many)(picture, np.asarray(n), x))
-
-    @property
-    def _convenient(self) -> "Picture":
-        """The same picture; in NumPy where that takes less time than tracing and loading a program would."""
-        if self.target.size > FEW_VALUES or device_count() > 1 or self.is_sampled:
-            return self
-        return jax.tree.map(np.asarray, self)
+        picture = self
+        if self.target.size <= FEW_VALUES and device_count() == 1 and not self.is_sampled:
+            picture = jax.tree.map(np.asarray, self)
+        return np.asarray((Picture.predicted if picture._all_on_host else _predicted)(picture, np.asarray(n), x))
 
     @property
     def counts(self) -> Bool[np.ndarray, " P"]:
@@ -170,11 +162,7 @@ class Picture:
         return self.weight if self.weight.ndim == 2 else self.weight[:, None]
 
 
-def _predicted(picture: Picture, n: Any, x: Float[AnyArray, "3 C"]) -> Any:
-    return picture.shown_and_lobe(n, x)[0]
-
-
-_predicted_many = eqx.filter_jit(_predicted)
+_predicted = eqx.filter_jit(Picture.predicted)
 
 
 @eqx.filter_jit
@@ -261,9 +249,10 @@ def totals(terms: Sequence[Any], combine: Sequence[str], axes: tuple[int, ...]) 
     start = tuple(
         np.full((), 0 if how == "add" else -np.inf, one.dtype) for how, one in zip(combine, terms, strict=True)
     )
+    combined, call = [getattr(jnp, how) for how in combine], cast(Any, operator.call)
 
     def both(one: tuple[Array, ...], other: tuple[Array, ...]) -> tuple[Array, ...]:
-        return tuple(getattr(jnp, how)(*pair) for how, *pair in zip(combine, one, other, strict=True))
+        return tuple(map(call, combined, one, other))
 
     return list(jax.lax.reduce(tuple(terms), start, both, axes))
 

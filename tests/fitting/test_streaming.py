@@ -3,6 +3,7 @@
 import dataclasses
 import weakref
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -110,7 +111,7 @@ def test_one_model_at_a_time_is_in_memory(monkeypatch, true):
 
 def test_bands_share_their_programs():
     """Or the first fit of a picture of 64 bands would compile each of them."""
-    programs = lobes.diffuse_and_kept, rays._mask
+    programs: tuple[Any, ...] = lobes.diffuse_and_kept, rays.PrimaryRays.__dict__["mask"].func
     before = [program._cache_size() for program in programs]
     cameras = dataclasses.replace(scene().camera, resolution=(50, 60))
     place = scene(camera=cameras)
