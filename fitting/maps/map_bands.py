@@ -1,4 +1,4 @@
-"""Maps by bands of rows: read, fitted and kept one after the other, on all cores, devices and processes."""
+"""Maps by bands of texels: read, fitted and kept one after the other, on all cores, devices and processes."""
 
 import os
 import threading
@@ -6,17 +6,20 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Int
 
 from brdf.errors import InputError
 from brdf.files import atomic_path
-from brdf.precision import working_precision
-from fitting.maps.map_inputs import fingerprint
-from fitting.maps.tiles import TILE, MapProblem
+from fitting.maps.map_inputs import fingerprint, places
+from fitting.maps.tiles import CHUNK, TILE, MapProblem
 from fitting.progress import waiting
-from fitting.solver.devices import device_count, gathered, own, placed
+from fitting.solver.devices import device_count, gathered, own
 
-BAND = 152 * TILE
-"""Texels that are read and laid out at a time."""
+BAND = 10 * CHUNK * TILE - 1
+"""Texels that are read and laid out at a time; a lane is left over."""
+
+SPARSE = 16
+"""Of so many pixels for each of these at most: the others see nothing."""
 
 
 def fit_bands(problem: MapProblem, keep: Path | None = None) -> dict[str, np.ndarray]:
@@ -29,17 +32,18 @@ def fit_bands(problem: MapProblem, keep: Path | None = None) -> dict[str, np.nda
     Raises:
         InputError: where the folder cannot be used, or is missing and there are several processes.
     """
-    height, width, _ = problem.photographs.size
-    rows = -(-height // min(height, max(-(-height * width // BAND), device_count())))
-    starts, texels = range(0, height, rows), -(-rows * width // TILE) * TILE
-    mine, reading = own(len(starts)), threading.Lock()
-    others = sorted(set(range(len(starts))) - set(mine))
+    (height, width, _), texels = problem.photographs.size, problem.texels
+    if not texels.size:
+        raise InputError("pictures", "show no texel that counts", "Check mask and normals")
+    bands = _bands(texels, width, min(BAND, -(-texels.size // device_count())))
+    mine, reading = own(len(bands)), threading.Lock()
+    others = sorted(set(range(len(bands))) - set(mine))
     if others and keep is None:
         raise InputError("keep", "is missing", "Give a folder that all processes see, for the bands of each")
     if others:
         gathered({}, 1, (1,))  # connected before the work begins, processes notice at once where one is lost
     key = "" if keep is None else _key(problem)
-    kept = [None if keep is None else keep / f"{key}-{start:08d}-{rows}.npz" for start in starts]
+    kept = [None if keep is None else keep / f"{key}-{some[0]:010d}-{some.size}.npz" for some in bands]
     layers: dict[str, np.ndarray] = {}
 
     def band(index):
@@ -47,17 +51,16 @@ def fit_bands(problem: MapProblem, keep: Path | None = None) -> dict[str, np.nda
         if path is not None and path.is_file():
             return read_band(path)
         with reading:
-            tiles = problem.tiles(np.arange(starts[index], min(starts[index] + rows, height)), texels)
-        with working_precision(problem.precision):
-            tiles = placed(index, tiles)
-        return problem.fit(*tiles)
+            tiles = problem.tiles(bands[index])
+        return problem.fit(*tiles, index)
 
     def place(index, found):
         for name, values in found.items():
             if name not in layers:
-                layers[name] = np.empty((height, width, *values.shape[1:]), values.dtype)
-            part = layers[name][starts[index] : starts[index] + rows]
-            part[:] = values[: len(part) * width].reshape(part.shape)
+                layers[name] = np.empty((height * width, *values.shape[1:]), values.dtype)
+                if texels.size < height * width:
+                    layers[name][:] = values[-1]
+            layers[name][places(bands[index])] = values[: bands[index].size]
 
     with waiting("fitting maps") as say, ThreadPoolExecutor(os.cpu_count()) as pool:
         for done, (index, found) in enumerate(zip(mine, pool.map(band, mine), strict=True), start=1):
@@ -73,7 +76,20 @@ def fit_bands(problem: MapProblem, keep: Path | None = None) -> dict[str, np.nda
             assert path is not None
             place(index, read_band(path))
         gathered({}, 1, (1,))  # and have read those of the others
-    return layers
+    return {name: values.reshape(height, width, *values.shape[1:]) for name, values in layers.items()}
+
+
+def _bands(texels: Int[np.ndarray, " K"], width: int, most: int) -> list[Int[np.ndarray, " B"]]:
+    """So many texels each at most, of whole rows where these are as many."""
+    found = []
+    while texels.size:
+        row = texels[0] // width + max(1, SPARSE * most // width)
+        count = min(most, np.searchsorted(texels, row * width))
+        if count < texels.size:
+            count = np.searchsorted(texels, texels[count] // width * width) or count
+        found.append(texels[:count])
+        texels = texels[count:]
+    return found
 
 
 def _key(problem: MapProblem) -> str:

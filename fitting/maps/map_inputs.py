@@ -10,7 +10,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 import brdf
 from brdf.errors import InputError, as_numbers
@@ -75,23 +75,37 @@ class Photographs:
         each = (_opened(one.name, Path(one.name), "linear") if one.silent else one for one in self.each)
         return dataclasses.replace(self, each=tuple(each))
 
-    def tiles(self, rows: np.ndarray, shape: tuple[int, int], precision: str) -> Float[np.ndarray, "N P TILE C"]:
-        """Some rows of all photographs, one after the other, in tiles.
+    def tiles(
+        self, texels: Int[np.ndarray, " K"], shape: tuple[int, int], lanes: int, precision: str
+    ) -> Float[np.ndarray, "N P TILE C"]:
+        """What some texels show in all photographs, in tiles.
 
         Args:
-            rows: indices that rise.
-            shape: how many tiles of how many texels, at least as many as the rows have.
+            texels: indices, row by row, that rise.
+            shape: how many tiles of how many texels, more than are given.
+            lanes: black photographs are added up to a multiple of this.
             precision: of the result.
         """
-        channels, (count, size) = self.size[2], shape
-        found = np.zeros((count, len(self.each), size, channels), precision)
+        (_, width, channels), (count, size) = self.size, shape
+        found = np.zeros((count, -(-len(self.each) // lanes) * lanes, size, channels), precision)
+        row, column = np.divmod(texels, width)
+        rows = row[np.diff(row, prepend=-1) != 0]
+        some = places(np.searchsorted(rows, row) * width + column)
         runs = np.split(rows, np.flatnonzero(np.diff(rows) != 1) + 1)
         for index, one in enumerate(self.each):
-            values = np.concatenate([one.rows(run[0], run[-1] + 1) for run in runs]).reshape(-1, channels)
+            parts = [one.rows(run[0], run[-1] + 1) for run in runs]
+            values = parts[0] if len(parts) == 1 else np.concatenate(parts)
+            values = values.reshape(-1, channels)[some]
             whole = len(values) // size
             found[:whole, index] = values[: whole * size].reshape(whole, size, channels)
-            found[whole:, index].reshape(-1, channels)[: len(values) - whole * size] = values[whole * size :]
+            found[whole, index, : len(values) - whole * size] = values[whole * size :]
         return found
+
+
+def places(index: Int[np.ndarray, " K"]) -> Any:
+    """Indices that rise, as a slice where they follow each other: that is not gathered."""
+    follow = index.size and index[-1] - index[0] + 1 == index.size
+    return slice(int(index[0]), int(index[-1]) + 1) if follow else index
 
 
 def fingerprint(*parts: Any) -> str:

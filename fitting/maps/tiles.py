@@ -2,12 +2,14 @@
 
 import dataclasses
 import functools
+import operator
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jaxtyping import Int
 
 import brdf
 from brdf.images.encoding import Encoding
@@ -17,14 +19,21 @@ from brdf.models.base import SpecularMaterial
 from brdf.precision import Precision, apart, working_precision
 from brdf.vectors import Components, divide, normalize, square_root
 from fitting.likelihood import encoded_and_slope
-from fitting.maps.map_inputs import Photographs
+from fitting.maps.map_inputs import Photographs, places
 from fitting.maps.map_light_choice import MOST_ERROR
 from fitting.maps.map_result import REASONS
 from fitting.maps.texels import OUTLIER, Distant, TexelFit, Texels, sums, sums_of, with_normals
+from fitting.solver.devices import placed
 from fitting.solver.normal_equations import COMPILER_OPTIONS
 
 TILE = 432
 """Texels that go through the program in step: what they need stays in the processor's cache."""
+
+CHUNK = 16
+"""Tiles that a program goes through: one serves maps of all sizes."""
+
+LANES = 8
+"""Photographs are as many as a multiple of this: what is left over a processor would take one by one."""
 
 RING = 0.15
 """Lights whose heights z spread by less than this are a ring: n shows less well, and the grid is finer."""
@@ -34,7 +43,7 @@ LEAST_HIGHLIGHT = 2.0
 
 
 class Surface(NamedTuple):
-    """What texels see, (H, W, ...) or tiles of them, (N, TILE, ...).
+    """What texels see, (H, W, ...), or tiles of some, (N, TILE, ...).
 
     Attributes:
         normal: of any length, 0 or not finite where there is no surface; None where it is sought.
@@ -79,24 +88,40 @@ class MapProblem:
         to_light = self.photographs.to_light
         return 2 if to_light is not None and np.ptp(to_light[:, 2]) < RING else 1
 
-    def tiles(self, rows: np.ndarray, texels: int) -> tuple[np.ndarray, Surface]:
-        """Some rows, one after the other: values, (N, P, TILE, C), and what is seen, padded to so many texels."""
+    @property
+    def texels(self) -> Int[np.ndarray, " K"]:
+        """Indices of those that see something, row by row."""
+        seen, normal = np.asarray(self.surface.mask), self.surface.normal
+        if normal is not None:
+            square = np.einsum("ijk,ijk->ij", normal, normal, dtype=float)
+            seen = seen & (square > 0) & (square < np.inf)
+        return np.flatnonzero(seen)
+
+    def tiles(self, texels: Int[np.ndarray, " K"]) -> tuple[np.ndarray, Surface]:
+        """What some texels show, (N, P, TILE, C), and see, (N, TILE, ...); one lane at least is left over."""
+        size = -(-(texels.size + 1) // (CHUNK * TILE)) * CHUNK * TILE
 
         def cut(leaf: Any) -> np.ndarray:
             leaf = np.asarray(leaf)
-            part = leaf[rows].reshape(-1, *leaf.shape[2:])
-            found = np.zeros((texels, *part.shape[1:]), self.precision if part.dtype.kind == "f" else part.dtype)
+            part = leaf.reshape(-1, *leaf.shape[2:])[places(texels)]
+            found = np.zeros((size, *part.shape[1:]), self.precision if part.dtype.kind == "f" else part.dtype)
             found[: len(part)] = part
             return found.reshape(-1, TILE, *part.shape[1:])
 
-        surface = jax.tree.map(cut, self.surface)
-        return self.photographs.tiles(rows, (texels // TILE, TILE), self.precision), surface
+        values = self.photographs.tiles(texels, (size // TILE, TILE), LANES, self.precision)
+        return values, jax.tree.map(cut, self.surface)
 
-    def fit(self, values: np.ndarray, surface: Surface) -> dict[str, np.ndarray]:
-        """The layers of some tiles, (N * TILE, ...)."""
+    def fit(self, values: np.ndarray, surface: Surface, band: int = 0) -> dict[str, np.ndarray]:
+        """The layers of some tiles, (N * TILE, ...); what a lane without a texel has comes last.
+
+        Args:
+            values: what they show.
+            surface: what they see.
+            band: whose they are, which has its device.
+        """
         given, dtype = self.photographs, np.dtype(self.precision)
         curves = tuple(one.curve for one in given.each)
-        static = self.models, self.grey, self.finer, self.seek, curves
+        static = self.models, self.grey, self.finer, self.seek, (*curves, *curves[-1:] * (-len(curves) % LANES))
         with working_precision(self.precision):
             stacks, occluders = (), ()
             if given.scenes is not None:
@@ -106,9 +131,13 @@ class MapProblem:
             of_photographs = [np.array([one.top for one in given.each]), (1 / given.unit).T[:, None], to_light.T]
             of_photographs += [] if self.ambient is None else [self.ambient.T[:, None]]
             view = self.to_view / np.linalg.norm(self.to_view)
-            *of_photographs, view = (one.astype(dtype) for one in (*of_photographs, view))
-            layers = _program(*static, values, surface, of_photographs, view, stacks, occluders)
-            return {name: np.asarray(layer) for name, layer in layers.items()}
+            of_photographs = [_padded(one, np).astype(dtype) for one in of_photographs]
+            found = []
+            for first in range(0, len(values), CHUNK):
+                part = jax.tree.map(operator.itemgetter(slice(first, first + CHUNK)), (values, surface))
+                part = placed(band, part)
+                found.append(_program(*static, *part, of_photographs, view.astype(dtype), stacks, occluders))
+            return {name: np.concatenate([np.asarray(layers[name]) for layers in found]) for name in found[0]}
 
 
 # Tiles are small: dealing parts of one out to threads would take ten times as long as the work.
@@ -130,8 +159,8 @@ def _program(
     stacks: tuple[LightStack, ...],
     occluders: tuple[Any, ...],
 ) -> dict[str, Array]:
-    """The layers of a band, tile by tile."""
-    top, scale, to_light, *ambient = map(_padded, of_photographs)
+    """The layers of some tiles, one by one."""
+    top, scale, to_light, *ambient = of_photographs
     ambient = Components(tuple(ambient[0])) if ambient else None
     lights = Distant(Components(tuple(to_light)), Components(tuple(to_view)), ambient)
 
@@ -143,7 +172,7 @@ def _program(
             normal = normalize(Components.of(jnp.where(mask[:, None], normal, upright)))
 
         def decoded(values, number):
-            shown = _padded(jnp.transpose(values[number], (2, 1, 0)))
+            shown = jnp.transpose(values[number], (2, 1, 0))
             counts = jnp.all(jnp.isfinite(shown) & (shown < top), axis=0) & mask[:, None]
             # what no light reaches is 0 whatever the texel is, in codes without noise even
             if normal is not None and points is None and ambient is None:
@@ -173,10 +202,10 @@ def _program(
     return {name: layer.reshape(-1, *layer.shape[2:]) for name, layer in tiles.items()}
 
 
-def _padded(of_photographs: Array) -> Array:
-    """With photographs that are 0, up to a multiple of 8: what is left over a processor would take one by one."""
+def _padded(of_photographs: Any, xp: Any = jnp) -> Any:
+    """With photographs that are 0, up to a multiple of `LANES`."""
     before = [(0, 0)] * (of_photographs.ndim - 1)
-    return jnp.pad(of_photographs, [*before, (0, -of_photographs.shape[-1] % 8)])
+    return xp.pad(of_photographs, [*before, (0, -of_photographs.shape[-1] % LANES)])
 
 
 def _slopes(curves: tuple[Encoding, ...], light: Array) -> Array:

@@ -16,7 +16,7 @@ import brdf
 import fitting
 from brdf.images.encoding import encode
 from brdf.images.writing import write_image
-from fitting.maps import map_bands
+from fitting.maps import map_bands, tiles
 from fitting.maps.map_inputs import read_lights
 from fitting.maps.map_result import REASONS
 from fitting.maps.texels import nonnegative
@@ -430,6 +430,33 @@ def test_texels_that_show_less_than_nothing_are_black():
     maps = fitting.fit_maps(pictures, dome(5), np.broadcast_to(VIEW, (2, 8, 3)))
     assert not maps.render(VIEW).any()
     assert not maps.fitted_k_s.any()
+
+
+def test_texels_outside_cost_nothing_and_change_nothing(monkeypatch):
+    """Also of bands that end in the middle of rows, and with photographs of another size, one program serves."""
+    monkeypatch.setattr(map_bands, "BAND", 7)
+    monkeypatch.setattr(map_bands, "SPARSE", 4)
+    lights = dome(16)
+    pictures, truth = texels(12, 0.01, lights)
+    mask = np.random.default_rng(0).random((9, 20)) < 0.3
+    inside = np.flatnonzero(mask)
+    rows = np.full((16, 9 * 20, 3), np.nan)
+    rows[:, inside] = pictures[:, 0, np.arange(inside.size) % 12]
+    normals = np.zeros((9 * 20, 3))
+    normals[inside] = truth["normal"][np.arange(inside.size) % 12]
+    whole, before = fitting.fit_maps(pictures, lights, truth["normal"][None]), tiles._program._cache_size()
+    fitted, fit = [], MapProblem.fit
+    monkeypatch.setattr(
+        MapProblem, "fit", lambda self, values, *more: fitted.append(values) or fit(self, values, *more)
+    )
+    maps = fitting.fit_maps(rows.reshape(16, 9, 20, 3), lights, normals.reshape(9, 20, 3))
+    assert tiles._program._cache_size() == before
+    assert sum(np.count_nonzero(values[:, 0, :, 0]) for values in fitted) == inside.size
+    for name, values in maps.layers().items():
+        found = values.reshape(9 * 20, -1)
+        np.testing.assert_array_equal(found[inside], whole.layers()[name].reshape(12, -1)[np.arange(inside.size) % 12])
+        assert np.all(np.isnan(found[~mask.ravel()]) | (found[~mask.ravel()] == found[~mask.ravel()][0]))
+    assert np.all((maps.reason == REASONS.index("outside")) == ~mask)
 
 
 def test_clipped_values_are_no_data():
