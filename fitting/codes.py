@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt
 
 from brdf.errors import InputError
-from brdf.images.encoding import Encoding, encode
+from brdf.images.encoding import Encoding, decode, encode
 from brdf.images.jpeg import Jpeg
 from fitting.likelihood import AnyArray, Bounds
 
@@ -72,6 +72,18 @@ class Codes(NamedTuple):
     def fine(self) -> bool:
         """Single precision does not resolve a small share of a step."""
         return self.ends[1] < np.inf and self.ends[1] > FINE
+
+    def middle(self, pixels: Float[np.ndarray, "H W C"]) -> Float[np.ndarray, "H W C"]:
+        """Linear values where they most likely lay: those of a writer that truncated half a step above their codes.
+
+        Args:
+            pixels: as the codes say.
+        """
+        if np.ndim(self.below) or self.below > 0:
+            return pixels
+        inside = (self.values > self.ends[0]) & (self.values < self.ends[1])
+        moved = decode((self.values + 0.5 * self.above) / self.scale, self.encoding) * self.unit
+        return np.where(inside, moved, pixels).astype(pixels.dtype)
 
     def bounds(
         self, rows: slice, valid: Bool[np.ndarray, " P"], level: float | None, spread: np.ndarray | float

@@ -283,22 +283,22 @@ def _less_codec_errors(
     What a codec takes away its look-alike does not show: which terms there are is decided before. But a highlight that
     was found in brightness may have any colour, and by that its model shows. Grey saved as colour has none to lose.
     """
-    if (
-        seen.copies
-        or fit.capped
-        or not any(map(codec_of, seen.problem.targets))
-        or any(picture.bounds is None for picture in fit.pictures)
-    ):
+    bounds, known = [picture.bounds for picture in fit.pictures], any(map(codec_of, seen.problem.targets))
+    lossy = any(one is not None and one.lossy for one in bounds)
+    if seen.copies or fit.capped or not lossy or any(one is None for one in bounds):
         return most_likely(fit, copies=seen.copies) if choice is None else fit, choice, seen
     if choice is not None and fit.tied is not None:
         fits = [_fit_model(brdf.MODELS[name], seen, fit.free) for name in seen.problem.families]
-        found = [without_codec_errors(seen, one) for one in fits]
+        found = [without_codec_errors(seen, one) if known else (most_likely(one), seen) for one in fits]
         # Each family is nearest to its own look-alikes: it is judged beside those of all.
         value = [sum(_value(one, clean) for _, clean in found) for one in fits]
         best, clean = found[int(np.argmax(value))]
         if _coloured(best, clean):
             return best, choice.coloured(best.model.name, best.free), clean
-    fit, seen = without_codec_errors(seen, fit)
+    if known:
+        fit, seen = without_codec_errors(seen, fit)
+    elif choice is None:
+        fit = most_likely(fit)
     return fit, choice, seen
 
 

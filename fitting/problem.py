@@ -237,7 +237,7 @@ def as_target(given: Any, rounding: Rounding = None, encoding: Encoding | None =
 
 
 def _of_picture(picture: brdf.Picture, rounding: Rounding) -> Target:
-    codes, step, top = None, 0.0, picture.saturation
+    codes, step, top, pixels = None, 0.0, picture.saturation, picture.pixels
     if top is not None:
         step = largest_step(picture.encoding, picture.bits) * float(np.max(picture.factor))
     if rounding is not None or not picture.lossy or top is not None:
@@ -247,11 +247,12 @@ def _of_picture(picture: brdf.Picture, rounding: Rounding) -> Target:
         # Steps that the user states are not the codes that were compressed.
         jpeg = picture.jpeg if rounding is None or isinstance(rounding, str) else None
         codes = codes._replace(lossy=picture.lossy, jpeg=jpeg)
+        pixels = codes.middle(pixels)
     least, file = rounding is not None and codes is None, None
     if picture.path is not None:
         file = {"path": str(picture.path), "encoding": picture.encoding, "source": picture.source}
         file |= {"factor": np.asarray(picture.factor).tolist()}
-    return Target(picture.pixels, None if top is None else top * TOP, step, codes, least, file)
+    return Target(pixels, None if top is None else top * TOP, step, codes, least, file)
 
 
 def _of_array(values: np.ndarray, rounding: Rounding, encoding: Encoding) -> Target:
@@ -273,6 +274,7 @@ def _of_array(values: np.ndarray, rounding: Rounding, encoding: Encoding) -> Tar
         raise InputError("target", f"must be of shape (H, W, C), got {values.shape}", "Give one picture")
     integer = stored is not None
     codes = find_codes(values, encoding if integer else None, bits, rounding, stored=stored)
+    values = values if codes is None else codes.middle(values)
     return Target(values, TOP if integer else None, step, codes, least_squares=rounding is not None and codes is None)
 
 

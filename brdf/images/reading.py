@@ -142,6 +142,8 @@ class ImageReader(contextlib.AbstractContextManager):
         self.encoding, self.source = find_encoding(given, self.path, name, spec, self.bits)
         packed = spec.get_string_attribute("compression")
         self.lossy = name in ("jpeg", "webp", "heif") or packed.startswith(("jpeg", "dwa", "b44"))
+        if name == "webp":
+            self.lossy = not _is_lossless_webp(self.path)
         self.jpeg = Jpeg.of(self.path) if name == "jpeg" else None
         turn = spec.get_int_attribute("Orientation", 1)
         self._turn = turn if turn in range(2, 9) else 1
@@ -441,3 +443,18 @@ def read_layers(path: AnyPath) -> dict[str, Float32[np.ndarray, "height width ch
                 layers[layer or own] = pixels[..., [at[ending] for ending in usual]]
     image.close()
     return layers
+
+
+def _is_lossless_webp(path: Path) -> bool:
+    """Whether the first picture of a WebP file is in a chunk of that kind.
+
+    Source: RFC 9649, section 2.
+    """
+    with path.open("rb") as file:
+        file.seek(12)
+        while len(head := file.read(8)) == 8:
+            if head[:4] in (b"VP8L", b"VP8 "):
+                return head[:4] == b"VP8L"
+            size = int.from_bytes(head[4:], "little")
+            file.seek(size + size % 2, 1)
+    return False

@@ -3,9 +3,11 @@
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import brdf
 import fitting
@@ -122,6 +124,49 @@ def test_a_plane_that_shows_one_code_is_known_to_a_rounding_error(curve: Encodin
         assert result.surface == "lambert"
         for name, true in (("k_a", 0.31), ("k_d", k_d)):
             assert abs(result[name][0].value - true) < 3 * result[name][0].error < 0.5
+
+
+def lit_ball() -> brdf.Scene:
+    camera = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=(96, 96))
+    light = brdf.DirectionalLight([0.4, 0.5, 0.8], [1.0] * 3)
+    return brdf.Scene(camera, [brdf.Sphere([0, 0, 0], 1)], ambient=[0.2] * 3, lights=[light])
+
+
+@pytest.mark.parametrize("kind", ["webp", "tiff", "lossless"])
+def test_a_highlight_keeps_its_colour_in_files_whose_codec_is_not_known(kind: str, tmp_path: Path):
+    scene, material = lit_ball(), brdf.BlinnPhong(k_a=[0.5, 0.3, 0.2], k_d=[0.4, 0.2, 0.1], k_s=[0.3, 0.2, 0.3], n=40)
+    clean, path = np.asarray(brdf.render(material, scene)), tmp_path / f"target.{'tif' if kind == 'tiff' else 'webp'}"
+    noisy = np.clip(clean + 0.005 * np.random.default_rng(0).standard_normal(clean.shape), 0, 1)
+    codes = np.rint(255 * encode(noisy, "srgb")).astype(np.uint8)
+    how: dict[str, dict[str, Any]] = {"tiff": {"compression": "jpeg", "quality": 90}, "lossless": {"lossless": True}}
+    Image.fromarray(codes).save(path, **how.get(kind, {"quality": 90}))
+    found = fitting.fit(path, scene)
+    for name in ("k_a", "k_d", "k_s"):
+        for channel, true in enumerate(np.asarray(getattr(material, name))):
+            one = found[name][channel]
+            assert abs(one.value - true) < 4 * one.error
+    if kind == "lossless":
+        assert found["k_d"][0].error == fitting.fit(codes, scene, encoding="srgb")["k_d"][0].error
+
+
+@pytest.mark.parametrize("writer", ["hdr", "floor"])
+@pytest.mark.parametrize("noise", [0.002, 0.01])
+def test_what_a_writer_truncated_is_half_a_step_darker(writer: str, noise: float, tmp_path: Path):
+    """Of noise that is larger than the steps least squares is enough, of the middle of what a code stands for."""
+    scene, material = lit_ball(), brdf.BlinnPhong(k_a=0.5, k_d=[0.4, 0.3, 0.2], k_s=0.3, n=40)
+    truth, off = {"k_a": [0.5] * 3, "k_d": [0.4, 0.3, 0.2], "k_s": [0.3] * 3, "n": [40.0]}, []
+    clean = np.asarray(brdf.render(material, scene))
+    for seed in range(4):
+        values = np.maximum(clean + noise * np.random.default_rng(seed).standard_normal(clean.shape), 0)
+        if writer == "hdr":
+            brdf.write_image(tmp_path / "target.hdr", values.astype(np.float32))
+            found = fitting.fit(tmp_path / "target.hdr", scene, model="blinn-phong")
+        else:
+            codes = np.floor(255 * np.clip(values, 0, 1)).astype(np.uint8)
+            found = fitting.fit(codes, scene, model="blinn-phong", rounding="floor")
+        for one in found.parameters:
+            off.append((one.value - truth[one.name][one.channel or 0]) / one.error)
+    assert np.sqrt(np.mean(np.square(off))) < 1.5
 
 
 def test_a_small_highlight_none_of_whose_values_lies_near_an_edge_is_there_all_the_same(tmp_path: Path):
