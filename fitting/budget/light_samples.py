@@ -32,6 +32,8 @@ MOST_SAMPLES = 4096
 LADDER = (16, 36, 64, 144, 256, 576, 1024, 2048, MOST_SAMPLES)
 # Of what noise leaves of a number, of the number, and of an accuracy.
 OF_NOISE, OF_VALUE, OF_ACCURACY = 1 / 3, 1e-3, 0.2
+# Counts differ by such a factor at least.
+APART = 1.5
 # Of the noise, root mean square over pixels: less shows in no sum over blocks of them; more than the other is no noise.
 HIDDEN, NO_NOISE = 0.02, 0.3
 # Each count changes at most so much of what the one before changed.
@@ -88,7 +90,8 @@ class _Ladder:
         active = np.append((self.x > 0).ravel(), bool((self.x[2] > 0).any()))
         self.inverse = scaled_inverse(self.probes.hessian * np.outer(active, active))
         self.shown = {first: self.probes.shown}
-        self.counts = sorted({*LADDER, own})
+        # What a count hardly larger than another one changes tells nothing of what both leave out.
+        self.counts = sorted({own, *(some for some in LADDER if max(some / own, own / some) >= APART)})
         self.samples = next(filter(self._enough, self.counts), self.counts[-1])
 
     def _change(self, coarse: int, fine: int) -> tuple[np.ndarray, float]:
@@ -137,10 +140,24 @@ class _Ladder:
         for one in self.done.result.parameters:
             if one.name == "n" and one.value is not None and one.error is not None:
                 reach, value = max(ERRORS * one.error / one.value + abs(move), LEAST), one.value
-        if reach <= MOST:
+        low, high = map(math.log, self._likely(samples))
+        if reach <= MOST and high - low <= 2 * MOST:
             return near_exponent(value * math.exp(move), reach, self.peak)
-        low, high = self.problem.n_range
-        return Near.between(math.log(low), math.log(high), self.peak)
+        least, most = map(math.log, self.problem.n_range)
+        return Near.between(max(low - MOST, least), min(high + MOST, most), self.peak)
+
+    def _likely(self, samples: int) -> tuple[float, float]:
+        """Between which exponents all pixels may find theirs.
+
+        Of two valleys a few samples may show the wrong one as the lower: what they leave out may be all of its misfit
+        and be missing in the other.
+        """
+        grid, cost = self.optimum.grid, self.optimum.profile
+        if not grid.size:
+            return self.problem.n_range
+        missed = 3 * self._change(samples, self.first)[1] ** 2 * np.sum(self.optimum.pixels)
+        some = grid[cost <= np.min(cost) * (1 + ERRORS**2 / (self.probes.weight.size * self.x.shape[1])) + missed]
+        return float(np.min(some)), float(np.max(some))
 
     def error(self, samples: int) -> SampleError:
         """What so many samples leave out."""

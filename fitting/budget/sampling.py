@@ -55,7 +55,8 @@ def _with_samples(light: Light, samples: int) -> Light:
             same = light.pixels, plain.radiance * light.radiance
             made = eqx.tree_at(lambda one: (one.pixels, one.radiance), plain, same)
         else:
-            made = dataclasses.replace(light, samples=max(samples, len(getattr(light, "triangles", ()))))
+            least = 2 if isinstance(light, brdf.ConstantEnvironment) else len(getattr(light, "triangles", ()))
+            made = dataclasses.replace(light, samples=max(samples, least))
         _made[key] = made
         weakref.finalize(light, _made.pop, key)
     return _made[key]

@@ -41,6 +41,26 @@ def test_the_truth_under_all_light_is_within_the_errors(light: brdf.RectangleLig
         assert abs(one.value - truth) < 3.5 * one.error, one
 
 
+@pytest.mark.parametrize(
+    ("material", "light", "noise"),
+    [
+        (brdf.Phong(k_d=0.4, k_s=0.3, n=8), brdf.ConstantEnvironment([1.0]), 0.003),
+        (brdf.BlinnPhong(k_d=0.4, k_s=0.3, n=20), brdf.ConstantEnvironment([1.0]), 0.003),
+        (brdf.BlinnPhong(k_d=0.4, k_s=0.3, n=20), brdf.EnvironmentMap(np.ones((32, 64, 1))), 0.001),
+    ],
+    ids=["samples that leave out much", "a first fit that determines no n", "a first fit in the wrong valley"],
+)
+def test_under_an_even_sky_n_is_within_its_error(
+    material: brdf.Phong | brdf.BlinnPhong, light: brdf.ConstantEnvironment | brdf.EnvironmentMap, noise: float
+):
+    camera = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=[64, 64])
+    scene = brdf.Scene(camera=camera, shapes=[brdf.Sphere([0, 0, 0], radius=1)], lights=[light])
+    clean = np.asarray(brdf.render(material, with_samples(scene, 4096)))
+    target = clean + noise * np.random.default_rng(0).standard_normal(clean.shape)
+    found = fitting.fit(target, scene, model=type(material))["n"]
+    assert abs(found.value - material.n) < 3.5 * found.error
+
+
 def test_without_noise_the_samples_that_a_picture_was_drawn_with_are_taken_and_told_of():
     scene = ball(WINDOW)
     picture = np.asarray(brdf.render(MATERIAL, scene, precision="float64"))
