@@ -38,7 +38,7 @@ from fitting.uncertainty.covariance import NO_TRACE, residual_noise, specular_ga
 from fitting.uncertainty.highlight import highlight, nearest_peak
 from fitting.uncertainty.interpretation import alone_covariance, interpret, shared_errors
 from fitting.uncertainty.noise_model import weighted_sums
-from fitting.uncertainty.residual import Residual, survey
+from fitting.uncertainty.residual import Residual, gone_together, survey
 from fitting.uncertainty.structure import CHANCE, SIZES, Blocks, Errors, over_blocks, shared
 
 # A residual above this share of the picture: what the scene says is probably not what the picture shows.
@@ -231,6 +231,8 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
     else:
         known = survey(best.pictures, seen.widths, best.optimum, noise, seen.rounding)
         inflation = known.neighbours.inflation
+        if not seen.copies:
+            inflation *= gone_together(known.channels(noise > 2 * seen.rounding))
         growing = known.growing_noise(noise, seen.rounding)
         if growing is not None:
             # Each pixel by its own variance, or noise in bright pixels would pass for a highlight.
@@ -357,9 +359,9 @@ def _inflation(fit: ModelFit, seen: Observed, grey: np.ndarray) -> tuple[float, 
     """
     said = fit.evidence
     assert said is not None
-    scatter, _ = shared_errors(said, seen)
+    scatter, _, channels = shared_errors(said, seen)
     if scatter is None:
-        return 1.0, 1.0
+        return gone_together(channels), 1.0
 
     def largest(tied: np.ndarray | None, some: slice) -> float:
         design = design_of(said.optimum.x > 0, tied)

@@ -24,13 +24,13 @@ class SampleError(NamedTuple):
     """What light samples leave out, for one model.
 
     Attributes:
-        near: where to tabulate its lobe.
+        near: where to tabulate its lobe; None where its terms are kept.
         hessian: of x_a, x_d, x_s, channel after channel each, and log n, (U, U).
         score: what more samples would change, (U,).
         profile: exponents, and the least cost at each by the first fit, (2, G).
     """
 
-    near: Near
+    near: Near | None
     hessian: Float[np.ndarray, "U U"]
     score: Float[np.ndarray, " U"]
     profile: Float[np.ndarray, "2 G"]

@@ -17,7 +17,7 @@ import math
 import numpy as np
 
 from brdf.errors import InputError
-from brdf.lobes import STORED_SAMPLES, Near
+from brdf.lobes import STACKED_VALUES, STORED_SAMPLES, Near
 from fitting.budget.configurations import Configuration, run
 from fitting.budget.error_estimate import Probes
 from fitting.budget.sampling import sample_counts, with_samples
@@ -36,10 +36,14 @@ OF_NOISE, OF_VALUE, OF_ACCURACY = 1 / 3, 1e-3, 0.2
 APART = 1.5
 # Of the noise, root mean square over pixels: less shows in no sum over blocks of them; more than the other is no noise.
 HIDDEN, NO_NOISE = 0.02, 0.3
+# Samples that leave out so many times what a fit with them leaves are those that the picture was drawn with.
+DRAWN = 10.0
 # Each count changes at most so much of what the one before changed.
 SLOWEST = 0.7
 # Where more samples move log n so far the first fit is made again, of more of them, but no more than so many.
 FAR, MOST_FIRST = 0.1, 1024
+# Up to so many values are kept rather than tabulated: exact, for every exponent.
+KEPT = STACKED_VALUES >> 3
 # To either side of n all pixels may find it by so many errors of the first fit; of log n at least.
 ERRORS, LEAST = 6.0, 0.02
 
@@ -70,9 +74,12 @@ def _ladder(problem: FitProblem, model: str, own: int, accuracy: float | None) -
     first = min(FIRST_SAMPLES, own)
     while True:
         found = _Ladder(problem, model, own, first, accuracy)
-        if abs(found.move(found.samples)) <= FAR or min(found.samples, MOST_FIRST) <= first:
+        # What its own samples leave out is no noise of the picture.
+        enough = abs(found.move(found.samples)) <= FAR and found.missed(first)[1] <= NO_NOISE * found.noise
+        if enough or min(found.samples, MOST_FIRST) <= first:
             return found
-        first = min(found.samples, MOST_FIRST)
+        most = min(found.samples, MOST_FIRST)
+        first = own if first < own <= most else most
 
 
 class _Ladder:
@@ -89,7 +96,7 @@ class _Ladder:
         self.peak = -UNSEEN / highest if 0 < highest < 0.999 * problem.n_range[1] else 0.0
         active = np.append((self.x > 0).ravel(), bool((self.x[2] > 0).any()))
         self.inverse = scaled_inverse(self.probes.hessian * np.outer(active, active))
-        self.shown = {first: self.probes.shown}
+        self.shown, self.noise = {first: self.probes.shown}, float(np.sqrt(np.mean(done.result.noise**2)))
         # What a count hardly larger than another one changes tells nothing of what both leave out.
         self.counts = sorted({own, *(some for some in LADDER if max(some / own, own / some) >= APART)})
         self.samples = next(filter(self._enough, self.counts), self.counts[-1])
@@ -102,7 +109,7 @@ class _Ladder:
         square = weight @ np.mean(change**2, axis=1) / np.sum(weight)
         return self.probes.scores(change).sum(axis=0), float(np.sqrt(square))
 
-    def _missed(self, samples: int) -> tuple[np.ndarray, float]:
+    def missed(self, samples: int) -> tuple[np.ndarray, float]:
         """The same for all samples beyond so many: of the next count, and of those after it as changes fall off.
 
         Beside an accuracy, of those up to `MOST_SAMPLES`, which is dearer and surer.
@@ -121,11 +128,13 @@ class _Ladder:
         return more * score, more * size
 
     def _enough(self, samples: int) -> bool:
-        score, size = self._missed(samples)
+        score, size = self.missed(samples)
         off = self.inverse @ score
         if self.accuracy is not None:
             return bool(self.probes.error(off) <= OF_ACCURACY * self.accuracy)
-        noise, given = float(np.sqrt(np.mean(self.done.result.noise**2))), samples >= self.own
+        noise, given = self.noise, samples >= self.own
+        if samples == self.own == self.first and size > DRAWN * noise:
+            return True  # the picture shows these very samples
         rest, value = noise * np.sqrt(np.diag(self.inverse)), np.append(self.x.ravel(), 1.0) * given
         hidden = size <= HIDDEN * noise or (given and size > NO_NOISE * noise)
         return hidden and bool(np.all(np.abs(off) <= np.maximum(OF_NOISE * rest, OF_VALUE * value)))
@@ -134,8 +143,10 @@ class _Ladder:
         """By how much so many samples move log n."""
         return float((self.inverse @ self._change(samples, self.first)[0])[-1])
 
-    def near(self, samples: int) -> Near:
-        """About the exponent that all pixels will find under so many samples."""
+    def near(self, samples: int) -> Near | None:
+        """About the exponent that all pixels will find under so many samples; None where all terms may be kept."""
+        if sum(math.prod(one.resolution) * (1 + one.channels) for one in self.problem.scenes) * samples <= KEPT:
+            return None
         reach, value, move = math.inf, 1.0, float(np.clip(self.move(samples), -MOST, MOST))
         for one in self.done.result.parameters:
             if one.name == "n" and one.value is not None and one.error is not None:
@@ -162,4 +173,4 @@ class _Ladder:
     def error(self, samples: int) -> SampleError:
         """What so many samples leave out."""
         profile = np.stack([self.optimum.grid, self.optimum.profile])
-        return SampleError(self.near(samples), self.probes.hessian, self._missed(samples)[0], profile)
+        return SampleError(self.near(samples), self.probes.hessian, self.missed(samples)[0], profile)

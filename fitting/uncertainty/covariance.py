@@ -105,7 +105,7 @@ def uncertainty(
     spread: Float[np.ndarray, "C 4 4"] | None = None,
     scatter: Float[np.ndarray, "U U"] | None = None,
     widening: Float[np.ndarray, " U"] | float = 1.0,
-    copies: bool = False,
+    channels: Float[np.ndarray, "C C"] | None = None,
     columns: Float[np.ndarray, "3 C"] | None = None,
     gain: float = 0.0,
     resolution: float = 0.0,
@@ -130,7 +130,7 @@ def uncertainty(
         spread: sums of the columns' products times the variance of each pixel, where it is not the same in all.
         scatter: what takes the place of the Hessian times the noise, over all unknowns, where pixels err together.
         widening: what to multiply errors by.
-        copies: the channels are copies of each other, and err together.
+        channels: correlation of the channels' errors; None where they err alone.
         columns: root mean square over pixels of what each term shows at 1; None where no pixel weighs more.
         resolution: relative error of a number that is left by the arithmetic of the basis images.
         gain: see `specular_gain`, where more pixels tell of it than those of the optimum's sums.
@@ -157,7 +157,7 @@ def uncertainty(
     optimum = dataclasses.replace(optimum, x=stand_in)
     x, size, active = optimum.x, 3 * noise.size + 1, determined & (optimum.x > 0)
     hessian = optimum.normal().gram if joined is None else joined
-    middle = _of_scores(optimum, noise, spread, copies=copies) if joined is None else joined
+    middle = _of_scores(optimum, noise, spread, channels) if joined is None else joined
     inverse, along, with_n = _inverted(hessian, active, tied, dependent)
     widening = widening * np.ones(size)
     independent = inverse @ middle @ inverse * np.outer(widening, widening)
@@ -286,18 +286,17 @@ def _dependent(optimum: Optimum, reasons: np.ndarray, dependent: float, columns:
 
 
 def _of_scores(
-    optimum: Optimum, noise: Float[np.ndarray, " C"], spread: Float[np.ndarray, "C 4 4"] | None, *, copies: bool
+    optimum: Optimum,
+    noise: Float[np.ndarray, " C"],
+    spread: Float[np.ndarray, "C 4 4"] | None,
+    channels: Float[np.ndarray, "C C"] | None,
 ) -> Float[np.ndarray, "U U"]:
     """The covariance of the scores by x_a, x_d, x_s, channel after channel, and n, where pixels err alone."""
-    channels = noise.size
     scores = noise[:, None, None] ** 2 * optimum.gram if spread is None else spread
-    found = join_channels(scores, optimum.product, optimum.square, optimum.x[2]).gram
-    if copies:
-        # What one channel errs all do.
-        same = np.pad(np.kron(np.eye(3), np.ones((channels, channels))), (0, 1))
-        same[-1, -1] = channels
-        found = found @ same
-    return found
+    if channels is not None:
+        # The sums of the products of two channels' columns, which are alike but for a factor.
+        scores = np.sign(scores) * np.sqrt(np.abs(scores * scores[:, None])) * channels[..., None, None]
+    return join_channels(scores, optimum.product, optimum.square, optimum.x[2]).gram
 
 
 def _inverted(

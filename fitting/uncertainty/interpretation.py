@@ -79,15 +79,17 @@ def interpret(
     visible = 0.0 if lobe is None else lobe.share(optimum.x, seen.brightest)
     resolution = RESOLUTION if fit.single else 0.0
     spread, shared, widening, deviation, gain, joined, growing = None, None, 1.0, noise, 0.0, None, None
+    channels = left.channels(noise > 2 * rounding)
     if fit.evidence is not None:
         # Each working target has the noise 1; what least squares leaves is rounding, which goes together.
         said, left = fit.evidence, left._replace(neighbours=left.neighbours._replace(significant=False))
         # Of a small highlight the pixels near an edge may tell next to nothing.
         gain = specular_gain(optimum.normal(noise**2).gram, optimum.x)
         fit, optimum, deviation = fit._replace(pictures=said.pictures, optimum=said.optimum), said.optimum, noise**0
-        shared, together = shared_errors(
+        shared, together, of_codes = shared_errors(
             said, seen, alone_covariance(optimum, fit.tied) if said.together is None else None
         )
+        channels = channels if said.scores else of_codes
         together = None if said.light < ARITHMETIC * np.max(seen.brightest) else together
         widening = said.widening
         if said.together is not None:
@@ -95,10 +97,12 @@ def interpret(
             gain = max(gain, specular_gain(joined, optimum.x))
     else:
         growing = left.growing_noise(noise, rounding)
-        together = _structure(left, seen, noise > 2 * rounding, even=growing is None)
+        once = seen.copies or channels is not None
+        together = _structure(left, seen, noise > 2 * rounding, even=growing is None, once=once)
         # What a bound of the material leaves is no error of the pixels.
         if together is not None and together.significant and not fit.capped:
             shared = _scattered(pictures, optimum, _left(pictures, seen, optimum), alone_covariance(optimum, fit.tied))
+    channels = np.ones((noise.size,) * 2) if seen.copies else channels
     if shared is None and growing is not None:
         spread = fit.noise_factor**2 * weighted_sums(pictures, optimum, growing, inverse=False).gram
     # What the light reaches but the simplest model does without is 0, with the error that it would have.
@@ -115,7 +119,7 @@ def interpret(
         scatter=shared,
         widening=widening,
         columns=columns,
-        copies=seen.copies,
+        channels=channels,
         gain=gain,
         missed=seen.problem.sample_error(fit.model.name),
         resolution=resolution,
@@ -157,8 +161,10 @@ def interpret(
 
 def shared_errors(
     said: Evidence, seen: Observed, covariance: Float[np.ndarray, "U U"] | None = None
-) -> tuple[Float[np.ndarray, "U U"] | None, Structure]:
+) -> tuple[Float[np.ndarray, "U U"] | None, Structure, Float[np.ndarray, "C C"] | None]:
     """What takes the place of the Hessian where neighbours share errors, None where they do not; and how much they do.
+
+    Last how the channels' errors go together, where that is known of all values, and neighbours' are not looked at.
 
     They do in a file that was compressed with losses, or where the residual shows it.
 
@@ -168,7 +174,7 @@ def shared_errors(
         covariance: see `fitting.uncertainty.structure.scatter`.
     """
     lossy = any(tile.bounds is not None and tile.bounds.lossy for tile in seen.tiles)
-    few, some = said.noise < ROUNDED, slice(1 if seen.copies else None)
+    channels, few = None, said.noise < ROUNDED
     errors = map(errors_of, said.pictures, itertools.repeat(said.optimum), said.places)
     if lossy:
         # The pixels of a block err together in any case.
@@ -181,18 +187,23 @@ def shared_errors(
             grids = [_scores(*one) for one in said.scores] if few else [over_blocks(one, SIZES[0]) for one in errors]
         else:
             unit = np.ones(seen.colour.size)
-            grids = survey(said.pictures, seen.widths, said.optimum, unit, 0 * unit).blocks
+            left = survey(said.pictures, seen.widths, said.optimum, unit, 0 * unit)
+            grids, channels = left.blocks, None if seen.copies else left.channels(unit > 0)
+        # Channels that err together count once.
+        some = slice(1 if seen.copies or channels is not None else None)
         together = structure([grid.channels(some) for grid in grids], even=not few)
     if not (lossy or together.significant):
-        return None, together
-    return _scattered(said.pictures, said.optimum, errors, covariance), together
+        return None, together, channels
+    return _scattered(said.pictures, said.optimum, errors, covariance), together, channels
 
 
-def _structure(left: Residual, seen: Observed, tell: Bool[np.ndarray, " C"], *, even: bool) -> Structure | None:
+def _structure(
+    left: Residual, seen: Observed, tell: Bool[np.ndarray, " C"], *, even: bool, once: bool
+) -> Structure | None:
     """That of a fit by least squares; None where it cannot be told, or weights are part of what is fitted."""
     if device_count() > 1 or seen.problem.loss != "squared" or not tell.any():
         return None
-    some = np.flatnonzero(tell)[: 1 if seen.copies else None]
+    some = np.flatnonzero(tell)[: 1 if once else None]
     return structure([grid.channels(some) for grid in left.blocks], even=even)
 
 

@@ -70,11 +70,32 @@ class Residual(NamedTuple):
     carrying: float
     peak: float
 
+    def channels(self, tell: Bool[np.ndarray, " C"]) -> Float[np.ndarray, "C C"] | None:
+        """Correlation of the channels' errors; None where no two channels err together.
+
+        Args:
+            tell: channels whose noise is more than rounding.
+        """
+        size = np.sqrt(np.maximum(np.sum(self.errors**2, axis=0), np.finfo(float).tiny))
+        found, own = (self.errors.T @ self.errors) / np.outer(size, size), np.eye(size.size)
+        least = max(CORRELATED, DEVIATIONS / max(len(self.errors), 1) ** 0.5)
+        together = (np.abs(found) > least) & np.outer(tell, tell)
+        return np.where(together, found, own) if np.any(together & (own == 0)) else None
+
     def growing_noise(
         self, noise: Float[np.ndarray, " C"], rounding: Float[np.ndarray, " C"]
     ) -> Float[np.ndarray, "C 3"] | None:
         """How the noise grows with brightness, see `fitting.uncertainty.noise_model`; None where it does not."""
         return noise_model(self.errors * noise, self.values, rounding)
+
+
+def gone_together(channels: Float[np.ndarray, "C C"] | None) -> float:
+    """By what factor errors of what all channels share are too small at most, where each counts as one of its own.
+
+    Args:
+        channels: correlation of their errors; None where they err alone.
+    """
+    return 1.0 if channels is None else float(np.sqrt(np.linalg.eigvalsh(channels)[-1]))
 
 
 def survey(

@@ -82,6 +82,25 @@ def test_the_interval_above_zero_covers_wherever_the_truth_lies(truth: float):
     assert 0.945 <= covered <= 0.965
 
 
+@pytest.mark.parametrize("codes", [False, True])
+@pytest.mark.parametrize("model", ["blinn-phong", "auto"])
+def test_noise_that_channels_share_counts_once(codes: bool, model: str):
+    """As a path tracer's; three channels of it say no more of n than one."""
+    camera = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=[48, 48])
+    light = brdf.DirectionalLight([0.4, 0.5, 0.8], [1.0] * 3)
+    scene = brdf.Scene(camera, [brdf.Sphere([0, 0, 0], 1)], ambient=[0.2] * 3, lights=[light])
+    clean = np.asarray(brdf.render(brdf.BlinnPhong(k_a=0.5, k_d=[0.4, 0.3, 0.2], k_s=0.3, n=40), scene))
+    curved, off = encode(clean, "srgb"), []
+    for seed in range(30):
+        noise = 0.01 * np.random.default_rng(seed).standard_normal((48, 48, 1))
+        target = np.rint(255 * np.clip(curved + noise, 0, 1)).astype(np.uint8) if codes else clean + noise
+        found = fitting.fit(target, scene, model=model, encoding="srgb" if codes else None)
+        if isinstance(found.material, brdf.BlinnPhong):  # now and then Phong's highlight fits as well
+            off.append((found["n"].value - 40) / found["n"].error)
+    assert len(off) > 25
+    assert 0.7 < np.sqrt(np.mean(np.square(off))) < 1.3
+
+
 def test_intervals_cover_the_truth_in_95_percent_of_draws_at_a_bound_too():
     truth = brdf.BlinnPhong(k_a=0.0, k_d=0.5, k_s=0.6, n=30.0)
     inside = []
