@@ -38,8 +38,9 @@ from fitting.uncertainty.covariance import NO_TRACE, residual_noise, specular_ga
 from fitting.uncertainty.highlight import highlight, nearest_peak
 from fitting.uncertainty.interpretation import alone_covariance, interpret, shared_errors
 from fitting.uncertainty.noise_model import weighted_sums
-from fitting.uncertainty.residual import Residual, gone_together, survey
+from fitting.uncertainty.residual import SOME_PIXELS, Residual, gone_together, survey
 from fitting.uncertainty.structure import CHANCE, SIZES, Blocks, Errors, over_blocks, shared
+from fitting.uneven_noise import evened, noise_of_each
 
 # A residual above this share of the picture: what the scene says is probably not what the picture shows.
 UNEXPLAINED = 0.5
@@ -77,7 +78,7 @@ def fit_pictures(problem: FitProblem) -> FitResult:
     problem = dataclasses.replace(problem, weights=weights)
 
     with working_precision(problem.precision):
-        seen = observe(problem)
+        seen = _evenly_noisy(observe(problem))
         if problem.model == "auto":
             fit, choice = _fit_simplest(seen)
         else:
@@ -160,6 +161,28 @@ def _fit_model(
         if near is None:
             break
     return _with_profile(fit, error if model.name in (problem.sample_errors or {}) else None)
+
+
+def _evenly_noisy(seen: Observed) -> Observed:
+    """Pictures of different noise count by what they know, where the user does not say how."""
+    problem = seen.problem
+    weighed = problem.loss != "squared" or problem.noise is not None or any(w is not None for w in problem.weights)
+    if len(problem.targets) == 1 or weighed:
+        return seen
+    left = []
+    for name in problem.families if problem.model == "auto" else (problem.model,):
+        model, pictures = brdf.MODELS[name], []
+        for tile in seen.tiles:
+            picture = picture_of(model, tile)
+            some = np.flatnonzero(picture.counts)
+            pictures.append(picture.in_double(some[:: 1 + some.size * len(seen.owner) // SOME_PIXELS]))
+        with jax.enable_x64(True):
+            left.append(noise_of_each(pictures, seen, partial(_least_squares, model, seen)))
+    return evened(seen, min(left, key=lambda noise: noise.cost))
+
+
+def _least_squares(model: type[brdf.Material], seen: Observed, pictures: Sequence[Picture]) -> Optimum:
+    return _fit_about(model, seen, seen.reached(model), pictures, None).optimum
 
 
 def _is_made_anew(picture: Picture) -> bool:
@@ -457,13 +480,14 @@ def _interpreted(fit: ModelFit, seen: Observed, choice: Choice | None, hidden: s
     off = [some for some in (fit.moved, None if choice is None else choice.dropped) if some is not None]
     told = interpret(fit, seen, hidden, np.array(off) if off else None)
     warnings, share = list(told.warnings), fit.residual
-    if share > UNEXPLAINED:
+    structure = any("structure" in text for text in warnings)
+    # What errs by itself is noise, however much.
+    if structure and share > UNEXPLAINED:
         words = f"the model leaves {100 * share:.0f} % of the picture: are light, camera and encoding what they were?"
         warnings.insert(0, words)
     if choice is not None and choice.rivals:
         names = " and ".join(choice.rivals)
         words = f"{names} fits as well as {fit.model.name}: the picture does not tell the two highlights apart"
         warnings.append(words)
-    structure = any("structure" in text for text in told.warnings)
     warnings += doubts(fit, told.material, seen, _fit_model, structure=structure)
     return dataclasses.replace(told, warnings=tuple(warnings))

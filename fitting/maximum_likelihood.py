@@ -22,8 +22,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from fitting.channel_errors import can_be_coupled, coupled, each_alone, improved, precision_of, replaced, residuals
 from fitting.continuation import (
+    ENOUGH_KNOWN,
     FEWEST_VALUES,
+    LEAST_NOISE,
     REACH,
+    STEP,
     Estimate,
     Problem,
     Said,
@@ -53,8 +56,9 @@ LIKELIER = 2.0
 # Less noise than this, in codes, is the same in both.
 FAINT = 0.02
 # Rounds of least squares in codes; each leaves some hundredth of its change. What ends them: such a change, in standard
-# errors, and this one of the noise.
-MOST_ROUNDS, ENOUGH_CHANGE, ENOUGH_NOISE_CHANGE = 10, 2.0, 0.02
+# errors, and this one of the noise, or what moves a number by such a part of its error where many ends are open. Then a
+# round leaves a good part of the noise's own change, and is taken for so many rounds at most.
+MOST_ROUNDS, ENOUGH_CHANGE, ENOUGH_NOISE_CHANGE, ENOUGH_MOVED, MOST_AHEAD = 15, 2.0, 0.02, 0.1, 10.0
 # Predictions are the same to such a share of a code, where these are so many values, and so many times as usual.
 ALIKE, FEWEST_ALIKE, MORE_ALIKE, MOST_COUNTED = 1024, 64, 10, 1 << 20
 # A picture of fewer different predictions is one of planes; so many pixels tell.
@@ -184,7 +188,7 @@ def _evener_in_light(problem: "_Separable", at: Estimate) -> Estimate | None:
     return even if even.value > at.value + LIKELIER else None
 
 
-def _with_weight(picture: Picture, weight: np.ndarray | None) -> Picture:
+def _with_weight(picture: Picture, weight: AnyArray | None) -> Picture:
     return dataclasses.replace(picture, weight=weight)
 
 
@@ -243,14 +247,40 @@ def _near_edges(fit: ModelFit, at: Estimate, *, copies: bool) -> Evidence:
         at = at._replace(noise=telling(known).noise)
         problem = _Separable(_gathered(pictures, at), design, fit.n_range, copies)
         at, known, said = maximise(problem, at)
+    known, problems = list(known), [problem] * len(known)
+    for _ in range(MOST_ROUNDS if len(pictures) > 1 else 0):
+        factors = [_own_noise(one, at.noise) for one in said.said]
+        if set(factors) == {1.0}:
+            break
+        problem = _Separable(list(map(_noisier, problem.pixels, factors)), design, fit.n_range, copies)
+        at, more, said = maximise(problem, at)
+        known, problems = known + more, problems + [problem] * len(more)
     scores = [(one.score, one.weight, _place(_picture(one.values))) for one in said.said]
     steps = [(one.values.intervals.bounds.spread / one.slope).ravel() for one in said.said]
     light = at.noise * float(np.median(np.concatenate(steps))) if any(map(np.size, steps)) else 0.0
-    said, wider = where_most_is_told(problem, at, known, said, _of_planes(pictures, at, problem))
+    most = problems[next(i for i, one in enumerate(known) if one is telling(known))]
+    said, wider = where_most_is_told(most, at, known, said, _of_planes(pictures, at, problem))
     working = list(map(_working, said.said))
     optimum = _optimum(working, fit, Numbers.of(at.unknowns))
     places = [_place(_picture(one.values)) for one in said.said]
     return Evidence(working, optimum, at.noise, at.value, places, wider, scores=scores, light=light)
+
+
+def _own_noise(said: Said, noise: float) -> float:
+    """By what factor a picture has more noise than is said; 1 where that is near enough."""
+    _, slope, information = said.of_noise(noise)
+    step = slope / max(information, 1.0)
+    if abs(step) < math.log(ENOUGH_KNOWN) or step**2 * information < ENOUGH_MOVED:
+        return 1.0
+    least = LEAST_NOISE / (noise * float(np.max(bounds_of(_picture(said.values)).spread)))
+    return min(max(math.exp(step), 1 / STEP, least), STEP)
+
+
+def _noisier(values: Values, factor: float) -> Values:
+    picture = _picture(values)
+    bounds = bounds_of(picture)
+    bounds = dataclasses.replace(bounds, spread=bounds.spread * factor)
+    return _values(dataclasses.replace(picture, bounds=bounds), values.which)
 
 
 def _of_planes(pictures: Sequence[Picture], at: Estimate, problem: "_Separable") -> Float[np.ndarray, " U"] | float:
@@ -297,7 +327,7 @@ def _reweighted(
     known = precision is not None
     with jax.enable_x64(True):
         both = [(picture, np.flatnonzero(bounds_of(picture).half_open)) for picture in pictures]
-        stated = [_stated(*one, optimum, noise, rounding) for one in both]
+        stated, gone = [_stated(*one, optimum, noise, rounding) for one in both], math.inf
         for trial in range(MOST_ROUNDS):
             working, before = [part.picture for part in stated], optimum
             if together:
@@ -312,21 +342,30 @@ def _reweighted(
                 optimum = search(working, n_min=fit.n_range[0], n_max=fit.n_range[1], free=fit.free)
             else:
                 optimum = refit(working, optimum, fit.free, fit.n_range, fit.tied)
-            last, stated = noise, [_stated(*one, optimum, noise, rounding) for one in both]
-            noise = math.sqrt(sum(part.squares for part in stated) / max(sum(part.count for part in stated), 1))
-            if change(before, optimum) < ENOUGH_CHANGE and abs(noise / last - 1) < ENOUGH_NOISE_CHANGE:
+            stated = [_stated(*one, optimum, noise, rounding) for one in both]
+            count, closed = (sum(getattr(part, name) for part in stated) for name in ("count", "closed"))
+            last, gone = gone, 0.5 * math.log(sum(part.squares for part in stated) / max(count, 1) / noise**2)
+            # The rest of a geometric series (Aitken 1926).
+            gone_on = gone / max(1 - max(gone / (last or math.inf), 0.0), 1 / MOST_AHEAD)
+            noise *= math.exp(gone_on)
+            enough = min(ENOUGH_NOISE_CHANGE, ENOUGH_MOVED * math.sqrt(count) / max(count - closed, 1))
+            if change(before, optimum) < ENOUGH_CHANGE and abs(gone_on) < enough:
                 break
         if together:
             assert precision is not None
             return _together([part.picture for part in stated], optimum, noise, places, precision)
     scale = 1 / noise**2
-    working = [dataclasses.replace(part.picture, weight=part.picture.weights * scale) for part in stated]
+    working = [_with_weight(part.picture, part.picture.weights * scale) for part in stated]
+    completed = [
+        own if part.completed is part.picture else _with_weight(part.completed, part.completed.weights * scale)
+        for own, part in zip(working, stated, strict=True)
+    ]
     sums = {name: getattr(optimum, name) * scale for name in ("cost", "gram", "product", "square")}
     value = sum(part.value - part.closed * math.log(noise) - part.closed_squares * scale / 2 for part in stated)
     value += sum(_of_codes(bounds_of(picture)) for picture in pictures)
     widening = np.ones(3 * fit.free.shape[1] + 1)
     optimum = dataclasses.replace(optimum, **sums)
-    return Evidence(working, optimum, noise, value, places, widening)
+    return Evidence(working, optimum, noise, value, places, widening, completed=completed)
 
 
 def _of_codes(bounds: Bounds) -> float:
@@ -372,6 +411,7 @@ class _Stated:
 
     Attributes:
         picture: with working targets, and weights in codes².
+        completed: with what is to be expected of a value with one end in its place, and all weights those of both.
         squares: of the residual in codes times the weight; of a value at an open end what is to be expected.
         count: of how many values, by their weight.
         closed: how many of these have both ends.
@@ -380,6 +420,7 @@ class _Stated:
     """
 
     picture: Picture
+    completed: Picture
     squares: float
     count: float
     closed: float
@@ -392,8 +433,9 @@ def _stated(picture: Picture, index: Int[np.ndarray, " K"], optimum: Optimum, no
     target, weight, *sums = _linearised(picture, np.asarray(optimum.n), optimum.x)
     squares, closed = map(float, sums)
     plain, value, count = squares, 0.0, closed
+    taken = completed = dataclasses.replace(picture, target=target, weight=weight, bounds=None)
     if index.size:
-        target, weight = np.array(target), np.array(weight)
+        target, weight, expected, full = (np.array(part) for part in (target, weight) * 2)
         s = math.sqrt(max(noise**2 - rounding, LEAST_SHARE * noise**2))
         values = _values(picture.in_double(index))
         said = values.said(*_shown(_picture(values), optimum), s)
@@ -405,12 +447,17 @@ def _stated(picture: Picture, index: Int[np.ndarray, " K"], optimum: Optimum, no
         step = np.divide(told.score * slope, curvature, out=np.zeros_like(curvature), where=curvature > 0)
         target[index] = np.where(at_end, radiance + step, target[index])
         weight[index] = np.where(at_end, weighs * curvature * noise**2, weight[index])
+        expected[index] = np.where(at_end, radiance + told.score * own**2 / slope, expected[index])
+        full[index] = np.where(at_end, weighs * (slope / bounds.spread) ** 2, full[index])
         # Mean square of what the value may have been, about the prediction.
-        expected = ((told.score * own) ** 2 + 1 - told.weight * own**2) * noise**2
-        squares += float(np.sum(weighs * expected, where=at_end))
+        square = ((told.score * own) ** 2 + 1 - told.weight * own**2) * noise**2
+        squares += float(np.sum(weighs * square, where=at_end))
         value, count = float(np.sum(weighs * told.value, where=at_end)), closed + float(np.sum(weighs, where=at_end))
-    taken = dataclasses.replace(picture, target=jnp.asarray(target), weight=jnp.asarray(weight), bounds=None)
-    return _Stated(taken, squares, count, closed, plain, value)
+        taken, completed = (
+            dataclasses.replace(taken, target=jnp.asarray(some), weight=jnp.asarray(weights))
+            for some, weights in ((target, weight), (expected, full))
+        )
+    return _Stated(taken, completed, squares, count, closed, plain, value)
 
 
 @partial(jax.jit, compiler_options=COMPILER_OPTIONS)

@@ -28,6 +28,8 @@ class Evidence(NamedTuple):
         scores: of each picture at the noise, of whose values few say something: by radiance, with their information and
             the place of their pixels. The pictures are at the noise at which most is told.
         light: the noise in light, of the middle one of these values.
+        completed: the pictures with, in the place of a value with one end, what is to be expected of it: the mean of
+            these errors is none (generalised residuals; Gourieroux et al., J. Econometrics 34 (1987) 5).
     """
 
     pictures: Sequence[Picture]
@@ -40,6 +42,7 @@ class Evidence(NamedTuple):
     precision: Float[np.ndarray, "C C"] | None = None
     scores: Sequence[tuple[Float[np.ndarray, "P C"], Float[np.ndarray, "P C"], tuple[np.ndarray, int]]] = ()
     light: float = np.inf
+    completed: Sequence[Picture] = ()
 
     @property
     def normal(self) -> NormalEquations:

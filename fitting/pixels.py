@@ -71,7 +71,7 @@ class Observed(NamedTuple):
         problem: what is fitted.
         colour: what all lights share, taken out of the tiles' scenes, (C,).
         tiles: of all pictures, made when asked for; a stream where one of them is.
-        widths: of the picture of each tile.
+        owner: of which picture each tile is.
         rounding: standard deviation of the error that rounding, or the search, puts into a value, (C,).
         brightest: largest size of a value that counts, (C,).
         left_out: how many pixels were left out, by reason.
@@ -84,7 +84,7 @@ class Observed(NamedTuple):
     problem: FitProblem
     colour: Float[np.ndarray, " C"]
     tiles: Sequence[Tile]
-    widths: Sequence[int]
+    owner: Sequence[int]
     rounding: Float[np.ndarray, " C"]
     brightest: Float[np.ndarray, " C"]
     left_out: dict[str, int]
@@ -92,6 +92,11 @@ class Observed(NamedTuple):
     scenes: list[brdf.Scene]
     counted: list[np.ndarray]
     weights: list[np.ndarray | None]
+
+    @property
+    def widths(self) -> list[int]:
+        """Of the picture of each tile."""
+        return [self.problem.targets[picture].pixels.shape[1] for picture in self.owner]
 
     @property
     def copies(self) -> bool:
@@ -178,7 +183,7 @@ def observe(problem: FitProblem, *, at_once: bool = False) -> Observed:
         problem,
         light.colour,
         joined(tiles),
-        [target.pixels.shape[1] for target, some in zip(problem.targets, tiles, strict=True) for _ in range(len(some))],
+        [picture for picture, some in enumerate(tiles) for _ in range(len(some))],
         np.max(rounding, axis=0),
         np.max(brightest, axis=0),
         dict(left_out),

@@ -140,7 +140,7 @@ def interpret(
     warnings = [_capped(material)] if fit.capped else []
     weighed = seen.problem.noise is not None or any(one is not None for one in seen.problem.weights)
     warnings += _warnings(left.neighbours, together, None if all(sure.reasons[2]) else lobe)
-    if growing is not None:
+    if growing is not None and not any("structure" in text for text in warnings):
         warnings.append(GROWING.format("the weights do not" if weighed else "pixels are weighed alike"))
     if sure.sums:
         words = "no more than a sum of several numbers is determined, see there: the material shows it with "
@@ -187,7 +187,7 @@ def shared_errors(
             grids = [_scores(*one) for one in said.scores] if few else [over_blocks(one, SIZES[0]) for one in errors]
         else:
             unit = np.ones(seen.colour.size)
-            left = survey(said.pictures, seen.widths, said.optimum, unit, 0 * unit)
+            left = survey(said.completed, seen.widths, said.optimum, unit, 0 * unit)
             grids, channels = left.blocks, None if seen.copies else left.channels(unit > 0)
         # Channels that err together count once.
         some = slice(1 if seen.copies or channels is not None else None)

@@ -80,6 +80,24 @@ def test_noise_may_be_cut_off_at_the_0_of_any_file_of_floats(name, kind, tmp_pat
     assert np.all(np.abs(np.mean(found, axis=0)) < 1.2)
 
 
+@pytest.mark.parametrize("bits", [8, None])
+@pytest.mark.parametrize(("k_d", "k_s"), [(0.03, 0.0), (0.0, 0.2)])
+def test_of_a_dark_surface_whose_noise_is_cut_off_nothing_is_said_to_err_together(k_d, k_s, bits):
+    """Half of the values are 0: a residual whose mean is none only where what they may have been takes their place."""
+    material = brdf.BlinnPhong(k_a=[0.0], k_d=[k_d], k_s=[k_s], n=30.0)
+    scene, deviation = brdf.Scene(lights=SCENE.lights, points=SCENE.points), []
+    for seed in range(2 * DRAWS):
+        clean = np.asarray(brdf.render(material, scene))
+        values = np.maximum(clean + np.random.default_rng(seed).normal(0, 0.01, clean.shape), 0)
+        values = np.rint(values * 255).astype(np.uint8) if bits else values.astype(np.float32)
+        result = fitting.fit(values, scene)
+        assert not [words for words in result.warnings if "structure" in words]
+        found = result["k_d"][0]
+        deviation.append((found.value - k_d) / found.error)
+    # Of a bound at 0 the upper half of the errors is left, whose mean is 0.4.
+    assert np.mean(deviation) < (0.4 if k_d == 0 else 0.0) + 3 / len(deviation) ** 0.5
+
+
 @pytest.mark.parametrize("by", ["mask", "weight"])
 def test_what_is_masked_says_nothing(by):
     picture = seen(DULL, 0.03, 0, low=0.0, bits=None).pixels

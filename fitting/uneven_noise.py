@@ -1,0 +1,106 @@
+"""Pictures of different noise, as of other exposures: each counts by what it knows."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from fitting.channel_errors import residuals
+from fitting.likelihood import residual_deviation
+from fitting.pixels import Observed, Tile
+from fitting.solver.normal_equations import Picture
+from fitting.solver.profile import Optimum
+from fitting.solver.streams import each
+
+# The noise of one picture is this factor of another's, and more than chance would make it by so many deviations.
+UNEVEN, DEVIATIONS = 1.2, 5.0
+# All alike, noisy pictures lead the others astray, whose noise then seems larger: so many rounds.
+ROUNDS = 2
+# In codes: less noise before rounding than this is not told from none.
+ROUNDING_HIDES = 0.05
+
+
+class NoiseOfEach(NamedTuple):
+    """What least squares leaves of each picture.
+
+    Attributes:
+        cost: minus twice the logarithm of the likelihood, each picture having its own.
+        variance: in light, over that of the others.
+        spread: the noise over that of the others, in codes before rounding where there are such.
+        pixels: how many.
+    """
+
+    cost: float
+    variance: Float[np.ndarray, " K"]
+    spread: Float[np.ndarray, " K"]
+    pixels: Float[np.ndarray, " K"]
+
+    @property
+    def even(self) -> bool:
+        """Whether all have the same, but for chance."""
+        chance = DEVIATIONS / math.sqrt(np.min(self.pixels))
+        return bool(np.max(self.variance) < (UNEVEN + chance) ** 2 * np.min(self.variance))
+
+
+def noise_of_each(
+    pictures: Sequence[Picture], seen: Observed, optimise: Callable[[Sequence[Picture]], Optimum]
+) -> NoiseOfEach:
+    """What least squares leaves, with weights by what it leaves where that is not even.
+
+    Args:
+        pictures: some pixels of each tile, on the host.
+        seen: of which they are.
+        optimise: least squares.
+    """
+    found, owner = _left(pictures, optimise(pictures), seen), np.array(seen.owner)
+    for _ in range(0 if found.even else ROUNDS):
+        now = [
+            dataclasses.replace(picture, weight=picture.weights / found.variance[one])
+            for picture, one in zip(pictures, owner, strict=True)
+        ]
+        found = _left(pictures, optimise(now), seen)
+    return found
+
+
+def _left(pictures: Sequence[Picture], optimum: Optimum, seen: Observed) -> NoiseOfEach:
+    owner = np.array(seen.owner)
+    count = np.bincount(owner, [len(picture.target) for picture in pictures])
+    squares = np.array([np.sum(residuals(picture, optimum) ** 2, axis=0) for picture in pictures])
+    variance = np.array([np.bincount(owner, of_channel) / count for of_channel in squares.T])
+    variance = np.maximum(variance, seen.rounding[:, None] ** 2)
+    cost = float(np.sum(count * np.log(variance)))
+    variance = np.mean(variance / np.mean(variance, axis=1, keepdims=True), axis=0)
+    spread = np.sqrt(variance)
+    for one in range(len(count)) if all(picture.bounds for picture in pictures) else ():
+        own = [picture for picture, of in zip(pictures, owner, strict=True) if of == one]
+        bounds = [picture.bounds for picture in own if picture.bounds is not None]
+        codes = [some.codes(picture.shown(optimum.n, optimum.x))[0] for some, picture in zip(bounds, own, strict=True)]
+        step = float(np.mean(np.concatenate([np.zeros(1), *(some.widths for some in bounds)])))
+        noise = residual_deviation(bounds, codes) ** 2 - step**2 / 12
+        spread[one] = math.sqrt(max(noise, (ROUNDING_HIDES * step) ** 2))
+    return NoiseOfEach(cost, variance, spread / np.min(spread), count)
+
+
+def evened(seen: Observed, noise: NoiseOfEach) -> Observed:
+    """The same with weights by which each picture counts by what it knows; as it is where all have the same noise.
+
+    Args:
+        seen: several pictures.
+        noise: of each.
+    """
+    if noise.even:
+        return seen
+    weight = 1 / (noise.variance * np.average(1 / noise.variance, weights=noise.pixels))
+
+    def of_tile(tile: Tile, one: int) -> Tile:
+        own = jnp.ones(len(tile.target), tile.target.dtype) if tile.weight is None else tile.weight
+        bounds = tile.bounds
+        if bounds is not None:
+            bounds = dataclasses.replace(bounds, spread=bounds.spread * noise.spread[one])
+        return tile._replace(weight=own * float(weight[one]), bounds=bounds)
+
+    return seen._replace(tiles=each(of_tile, seen.tiles, seen.owner))

@@ -1,0 +1,51 @@
+"""Several pictures of different noise, as of other exposures: each counts by what it knows."""
+
+import numpy as np
+import pytest
+from small_ball import SUN, ball_scene, pictured
+
+import brdf
+import fitting
+
+OTHER = brdf.DirectionalLight(direction=[-0.5, 0.3, 0.8], intensity=[1.0, 0.8, 0.6])
+SCENES = [ball_scene(SUN), ball_scene(OTHER)]
+MATERIAL = brdf.BlinnPhong(k_a=[0.3] * 3, k_d=[0.4, 0.3, 0.2], k_s=[0.2] * 3, n=30.0)
+DRAWS = 8
+
+
+def drawn(noises, seed: int, *, codes: bool) -> list[np.ndarray]:
+    parts = zip(SCENES, noises, (2 * seed, 2 * seed + 1), strict=True)
+    values = [pictured(MATERIAL, *part) for part in parts]
+    return [np.clip(np.rint(255 * one), 0, 255).astype(np.uint8) if codes else one.astype(np.float32) for one in values]
+
+
+def deviations(result: fitting.FitResult) -> np.ndarray:
+    numbers = MATERIAL.k_a, MATERIAL.k_d, MATERIAL.k_s, MATERIAL.n
+    true = dict(zip(("k_a", "k_d", "k_s", "n"), map(np.atleast_1d, numbers), strict=True))
+    return np.array([(one.value - true[one.name][one.channel or 0]) / one.error for one in result.parameters])
+
+
+# In codes 0, 0.2, 0.8, 13: rounding hides the noise, or not.
+@pytest.mark.parametrize(
+    ("noises", "codes"),
+    [((0.003, 0.05), False), ((0.003, 0.05), True), ((0.0, 0.0008), True), ((0.05, 0.0008), True)],
+)
+def test_pictures_of_different_noise_count_by_what_they_know(noises, codes):
+    quiet, found = int(np.argmin(noises)), []
+    for seed in range(DRAWS):
+        pictures = drawn(noises, seed, codes=codes)
+        result = fitting.fit(pictures, SCENES)
+        assert result.warnings == ()
+        alone = fitting.fit(pictures[quiet], SCENES[quiet], model="blinn-phong")
+        # All alike, the noisy picture would make these errors many times as large.
+        assert all(both.error < 1.05 * one.error for both, one in zip(result.parameters, alone.parameters, strict=True))
+        found.append(deviations(result))
+    # Nearly as many within two of their errors as should be.
+    assert np.mean(np.abs(found) < 2) > 0.88
+    assert np.max(np.abs(found)) < 5
+
+
+def test_pictures_of_one_noise_are_weighed_alike():
+    pictures = drawn((0.01, 0.01), 0, codes=False)
+    both, alike = (fitting.fit(pictures, SCENES, weight=one) for one in (None, [np.ones(pictures[0].shape[:2])] * 2))
+    assert [one.value for one in both.parameters] == pytest.approx([one.value for one in alike.parameters], rel=1e-6)
