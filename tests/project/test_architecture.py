@@ -26,8 +26,8 @@ fitting.progress fitting.likelihood fitting.codes fitting.solver fitting.functio
 fitting.channel_errors fitting.continuation fitting.maximum_likelihood fitting.light_colour fitting.sample_error
 fitting.problem fitting.pixels fitting.uneven_noise fitting.selection fitting.budget.choice fitting.result
 fitting.uncertainty fitting.doubts fitting.jpeg_errors fitting.core fitting.joint_problem fitting.diagnosis
-fitting.report fitting.light_choice fitting.joint_likelihood fitting.joint fitting.implicit fitting.relighting fitting.measured_fit
-fitting.photographs fitting.budget fitting.speed_accuracy
+fitting.report fitting.light_choice fitting.joint_likelihood fitting.joint fitting.implicit fitting.relighting
+fitting.measured_fit fitting.photographs fitting.budget fitting.speed_accuracy
 fitting.front_door fitting.many fitting.maps
 fitting.cli
 """.split()
