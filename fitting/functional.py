@@ -351,7 +351,8 @@ def _errors(pixels: _Pixels, lobes: Sequence[Array], x: Array, cost: Array, held
     moves the coefficients along.
     """
     gram, active, x_s = pixels.columns(*lobes)[1], x > 0, x[:, 2]
-    noise = cost / jnp.maximum(jnp.count_nonzero(pixels.weight) - jnp.count_nonzero(active, axis=-1), 1)
+    unknowns = jnp.count_nonzero(active, axis=-1) + jnp.any(x_s > 0) / x_s.size
+    noise = cost / jnp.maximum(jnp.count_nonzero(pixels.weight) - unknowns, 1)
     both = active[:, :, None] & active[:, None]
     inverse = jnp.where(both, jnp.linalg.inv(jnp.where(both, gram[:, :3, :3], jnp.eye(3, dtype=x.dtype))), 0)
     cross = x_s[:, None] * gram[:, :3, 3]

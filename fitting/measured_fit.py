@@ -400,7 +400,7 @@ def _fit_model(model, samples, loss, n_range):
         sure = uncertainty(optimum, free, noise, brightest, visible, single=False)
     fit, interval = ModelFit(model, [], optimum, free, n_range), None
     if specular and not sure.n_reason:
-        interval = exponent_interval(fit, sure.n_error, sure.rise, 0.0, parabolic=True)
+        interval = exponent_interval(fit, sure.n_error, sure.reach, sure.rise, 0.0, parabolic=True)
         sure = sure._replace(n_reason=fit.held)
     material, parameters = material_and_parameters(fit, sure, np.ones(channels), interval)
     return BrdfCandidate(material, tuple(one for one in parameters if one.name != "k_a"), _losses(samples, f_r))

@@ -11,7 +11,7 @@ from fitting.sample_error import SampleError
 from fitting.solver.nnls import scaled_inverse
 from fitting.solver.profile import Optimum
 from fitting.solver.tied import design_of, join_channels
-from fitting.uncertainty.intervals import NORMAL_95, above_zero
+from fitting.uncertainty.intervals import NORMAL_95, above_zero, student_95
 
 # A squared column keeps less than this of itself when the others are taken out: the two tell the same story.
 # Float32 sums leave some 1e-7 of a column that depends on the others.
@@ -24,6 +24,10 @@ LEAST_SCATTER = 1e-6
 NO_TRACE = 1e-6
 # A specular term counts when leaving it out raises the cost by so many noise variances for each of its unknowns.
 SIGNIFICANT = 10.0
+
+# With less than this of values less unknowns nothing is left to tell an error by.
+FEWEST_DEGREES = 0.5
+FEW_PIXELS = "as few pixels count as there are numbers: nothing is left to tell its error by"
 
 TERMS = ("k_a", "k_d", "k_s")
 LIGHT = ("no ambient light", "no light", "no light")
@@ -65,6 +69,7 @@ class Uncertainty(NamedTuple):
         n_error: of n; infinite where the picture does not determine it.
         correlation: of x_a, x_d, x_s (channel after channel each) and n, (3C + 1, 3C + 1); 0 for what is at its bound
             or not determined.
+        reach: by how many of its errors a 95 % interval of n reaches.
         rise: by how much the cost, summed over channels, rises at the ends of a 95 % interval of n.
         reasons: why a coefficient is not determined, (3, C) of texts; empty where it is.
         n_reason: why n is not; empty where it is.
@@ -75,6 +80,7 @@ class Uncertainty(NamedTuple):
     x_interval: Float[np.ndarray, "3 C 2"]
     n_error: float
     correlation: Float[np.ndarray, "P P"]
+    reach: float
     rise: float
     reasons: np.ndarray
     n_reason: str
@@ -88,9 +94,14 @@ def residual_noise(optimum: Optimum, rounding: Float[np.ndarray, " C"]) -> Float
         optimum: of the engine.
         rounding: standard deviation of a value's rounding, (C,).
     """
-    degrees = np.maximum(optimum.pixels - np.count_nonzero(optimum.x > 0, axis=0), 1)
+    degrees = np.maximum(_degrees(optimum), 1)
     least = np.max(optimum.square / degrees) * np.finfo(float).eps ** 2 + np.finfo(float).tiny
     return np.sqrt(np.maximum(optimum.cost / degrees, np.maximum(rounding**2, least)))
+
+
+def _degrees(optimum: Optimum) -> Float[np.ndarray, " C"]:
+    """Values less unknowns of each channel, which have their part in n."""
+    return optimum.pixels - np.count_nonzero(optimum.x > 0, axis=0) - np.any(optimum.x[2] > 0) / optimum.x.shape[1]
 
 
 def uncertainty(
@@ -146,6 +157,13 @@ def uncertainty(
     for term, channel in np.argwhere(~free & (reasons == "")):
         where = "this channel" if free[term].any() else "the scene"
         reasons[term, channel] = f"{LIGHT[term]} in {where}"
+    degrees = _degrees(optimum)
+    apart = degrees.size if channels is None else 1
+    reaches = [student_95(max(one, FEWEST_DEGREES)) for one in degrees.tolist()]
+    reasons[(reasons == "") & (degrees < FEWEST_DEGREES)] = FEW_PIXELS
+    n_reason = n_reason or FEW_PIXELS * bool(np.all(degrees < FEWEST_DEGREES))
+    # Of n the channels tell together, where they err alone.
+    reach = student_95(max(apart * float(np.mean(degrees)), FEWEST_DEGREES))
     sums = _dependent(optimum, reasons, dependent, columns)
     known, stand_in = reasons == "", optimum.x.copy()
     determined = known.copy()
@@ -199,7 +217,8 @@ def uncertainty(
                 deviation, alone = (np.sqrt(direction @ middles @ direction) / left).tolist()
         largest = max(optimum.square[channel], brightest[channel] ** 2)
         deviation = math.hypot(deviation, resolution * value)
-        x_interval[term, channel], x_error[term, channel] = above_zero(value, deviation), deviation
+        wide = deviation * reaches[channel] / NORMAL_95
+        x_interval[term, channel], x_error[term, channel] = above_zero(value, wide), deviation
         alone = deviation if scatter is None else alone
         if known[term, channel] and alone**2 * optimum.gram[channel, term, term] > largest:
             reasons[term, channel] = "its error is larger than the whole picture"
@@ -208,15 +227,15 @@ def uncertainty(
     scale = np.divide(1.0, deviations[0], out=np.zeros(size), where=variance > 0)
     n_error, rise = math.inf, 0.0
     if with_n:
-        # The noise variance, averaged over channels as n feels it, times the 95 % quantile of chi squared.
-        rise = float(NORMAL_95**2 * covariance[-1, -1] / inverse[-1, -1])
+        # The noise variance, averaged over channels as n feels it, times the square of that reach.
+        rise = float(reach**2 * covariance[-1, -1] / inverse[-1, -1])
         n_error = math.hypot(deviations[0, -1], resolution * optimum.n)
     elif not n_reason:
         n_reason = "the highlight fits as well with other exponents and another k_s"
     if n_reason:
         n_error = math.inf
     correlation = covariance * np.outer(scale, scale)
-    return Uncertainty(x_error, x_interval, n_error, correlation, rise, reasons, n_reason, sums)
+    return Uncertainty(x_error, x_interval, n_error, correlation, reach, rise, reasons, n_reason, sums)
 
 
 def _without_trace(optimum: Optimum, gain: float, visible: float, *, grey: bool) -> str:

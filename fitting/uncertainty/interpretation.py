@@ -129,7 +129,7 @@ def interpret(
     interval = None
     # At k_d + k_s = 1 the cost still falls across the bound: a profile that does not know it has its least elsewhere.
     if lobe is not None and not sure.n_reason and not fit.capped:
-        interval = exponent_interval(fit, sure.n_error, sure.rise, lobe.peak, parabolic=joined is not None)
+        interval = exponent_interval(fit, sure.n_error, sure.reach, sure.rise, lobe.peak, parabolic=joined is not None)
         sure = sure._replace(n_reason=fit.held or _open_exponent(interval))
     if hidden:
         sure.reasons[2], sure = hidden, sure._replace(n_reason=hidden)

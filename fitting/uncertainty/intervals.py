@@ -40,6 +40,25 @@ def _acceptance() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return truths, np.append(-np.inf, lower), np.append(ONE_SIDED_95, high)
 
 
+def student_95(degrees: float) -> float:
+    """By how many standard errors a 95 % interval reaches where these are known from so many degrees of freedom.
+
+    Source: M. Abramowitz and I. A. Stegun, Handbook of Mathematical Functions, 26.7.5; a tenth short for one degree, a
+    hundredth for two.
+
+    Args:
+        degrees: values less unknowns, above 0.
+    """
+    z = NORMAL_95
+    terms = (
+        (z**3 + z) / 4,
+        (5 * z**5 + 16 * z**3 + 3 * z) / 96,
+        (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384,
+        (79 * z**9 + 776 * z**7 + 1482 * z**5 - 1920 * z**3 - 945 * z) / 92160,
+    )
+    return z + sum(term / degrees ** (power + 1) for power, term in enumerate(terms))
+
+
 def above_zero(value: float, error: float) -> tuple[float, float]:
     """The 95 % interval of a coefficient that cannot be negative.
 
@@ -66,7 +85,7 @@ def above_zero(value: float, error: float) -> tuple[float, float]:
 
 
 def exponent_interval(
-    fit: ModelFit, n_error: float, rise: float, peak: float, *, parabolic: bool = False
+    fit: ModelFit, n_error: float, reach: float, rise: float, peak: float, *, parabolic: bool = False
 ) -> tuple[float, float]:
     """The 95 % profile-likelihood interval of n: where the least cost rises by ``rise``.
 
@@ -76,7 +95,8 @@ def exponent_interval(
     Args:
         fit: of a model with a lobe.
         n_error: standard error of n.
-        rise: of the cost; see `fitting.uncertainty.covariance.Uncertainty`.
+        reach: see `fitting.uncertainty.covariance.Uncertainty`.
+        rise: of the cost; likewise.
         peak: logarithm of the lobe's cosine in the pixel nearest to its centre.
         parabolic: the profile is taken for a parabola in any case.
 
@@ -89,8 +109,8 @@ def exponent_interval(
     centre = math.log(optimum.n)
     inside = bounds[0] < centre - 3 * relative and centre + 3 * relative < bounds[1]
     if parabolic or (relative < PARABOLIC and inside):
-        return optimum.n * math.exp(-NORMAL_95 * relative), optimum.n * math.exp(NORMAL_95 * relative)
-    first = min(max(1.1 * NORMAL_95 * relative, 1e-3), WIDEST)
+        return optimum.n * math.exp(-reach * relative), optimum.n * math.exp(reach * relative)
+    first = min(max(1.1 * reach * relative, 1e-3), WIDEST)
     problem = problem_of(fit.pictures, fit.n_range, fit.free)._replace(peak=peak, tied=fit.tied)
     # Relative to the nearest pixel the lobe keeps its size where no pixel sees the centre.
     reference = optimum.x.T * [1.0, 1.0, math.exp(optimum.n * peak)]

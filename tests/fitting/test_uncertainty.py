@@ -11,7 +11,7 @@ import brdf
 import fitting
 from brdf.images.encoding import encode
 from brdf.materials.material_file import material_from_dict, material_to_dict, read_material
-from fitting.uncertainty.intervals import above_zero
+from fitting.uncertainty.intervals import above_zero, student_95
 from fitting.uncertainty.structure import LEAST_HELD, MOST_HELD, Errors, block_scatter
 
 CAMERA = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=(36, 36))
@@ -48,7 +48,7 @@ def test_errors_and_correlations_are_those_of_dense_least_squares():
     basis, mask = columns(n)
     jacobian = basis * np.array([1, 1, 1, k_s])[:, None]
     residual = noisy(GLOSS, 0.01, 0)[mask][:, 0] - np.array([k_a, k_d, k_s]) @ basis[:3]
-    variance = residual @ residual / (residual.size - 3)
+    variance = residual @ residual / (residual.size - 4)
     covariance = variance * np.linalg.inv(jacobian @ jacobian.T)
     error = np.sqrt(np.diag(covariance))
     # Geometry in float64 on both sides; the sums of the engine reorder additions.
@@ -339,3 +339,30 @@ def test_a_channel_that_is_black_in_a_noisy_picture_does_not_end_the_fit():
     truth = brdf.BlinnPhong(k_a=[0, 0, 0], k_d=[0.5, 0.3, 0], k_s=[0.4, 0.4, 0], n=40)
     picture = noisy(truth, np.array([0.01, 0.01, 0.0]), 0)
     assert fitting.fit(picture, SCENE).surface in ("blinn-phong", "phong")
+
+
+def test_the_reach_of_an_interval_is_that_of_students_distribution():
+    degrees = np.array([2.0, 3.0, 5.5, 20.0, 1000.0])
+    assert [student_95(one) for one in degrees] == pytest.approx(stats.t.ppf(0.975, degrees), rel=0.012)
+    assert 0.85 < student_95(1.0) / stats.t.ppf(0.975, 1.0) < 1
+
+
+@pytest.mark.parametrize("pixels", [3, 6])
+def test_few_pixels_say_how_little_they_know(pixels):
+    dull = brdf.Lambert(k_a=0.5, k_d=0.5)
+    seen, held = np.flatnonzero(pictured(dull, SCENE) > 0), []
+    for seed in range(60):
+        mask = np.zeros(CAMERA.resolution, bool)
+        mask.ravel()[np.random.default_rng(seed).choice(seen, pixels, replace=False)] = True
+        result = fitting.fit(noisy(dull, 0.01, seed), SCENE, mask=mask, model="lambert")
+        held += [low <= 0.5 <= high for low, high in (one.interval for one in result.parameters if one.interval)]
+    # By the normal distribution 73 and 86 %.
+    assert np.mean(held) > 0.9
+
+
+def test_as_few_pixels_as_numbers_leave_no_error_to_tell():
+    mask = np.zeros(CAMERA.resolution, bool)
+    mask[[18, 30], [22, 12]] = True
+    result = fitting.fit(noisy(brdf.Lambert(k_a=0.5, k_d=0.5), 0.01, 0), SCENE, mask=mask, model="lambert")
+    assert [one.value for one in result.parameters] == [None, None]
+    assert "as few pixels" in result.parameters[0].reason
