@@ -190,6 +190,33 @@ class Parameters:
         """What is not determined, and why: "n", or "k_s[2]" for one channel."""
         return {one.key: one.reason for one in self.parameters if one.value is None}
 
+    def to_dataframe(self) -> Any:
+        """The numbers as a pandas table: a row for each, named as `Parameter.key` has it.
+
+        Returns:
+            A `pandas.DataFrame`: value, error, low and high (ends of the 95 % interval), at_bound, reason.
+
+        Raises:
+            InputError: where pandas is not installed.
+        """
+        try:
+            from pandas import DataFrame  # late: an extra
+        except ImportError:
+            raise InputError(
+                "to_dataframe", "needs pandas, which is not here", "Install it: pip install pandas"
+            ) from None
+        rows = [
+            {
+                "value": float(one),
+                "error": math.nan if one.error is None else one.error,
+                **dict(zip(("low", "high"), one.interval or (math.nan, math.nan), strict=True)),
+                "at_bound": one.at_bound,
+                "reason": one.reason,
+            }
+            for one in self.parameters
+        ]
+        return DataFrame(rows, index=[one.key for one in self.parameters])
+
     @property
     def free_parameters(self) -> tuple[Parameter, ...]:
         """Those that are determined and that no bound holds."""

@@ -11,7 +11,7 @@ def convert(material: str, out: Path, *, to: str | None = None, name: str | None
 
     Args:
         material: a .json or .mtl file, a folder of brdf fit --out, or a name of the classic table.
-        out: the file to write: .json .mtl .gltf .xml (Mitsuba) .glsl .py (PyTorch3D).
+        out: the file to write: .json .mtl .gltf .xml (Mitsuba) .glsl .py (PyTorch3D); - for standard output.
         to: json, mtl, three, gltf, mitsuba, mitsuba-dict, pytorch3d, glsl; default: by the suffix.
         name: which material, where an MTL file holds several.
 
@@ -21,6 +21,10 @@ def convert(material: str, out: Path, *, to: str | None = None, name: str | None
     """
     loaded, note = find_material(material, name)
     called = name or table_name(material) or Path(material).stem
-    export = brdf.save_export(loaded, out, to=to, name="_".join(called.split()), note=note)
+    named = {"name": "_".join(called.split()), "note": note}
+    if str(out) == "-":
+        show(brdf.export_material(loaded, to or "json", **named).text.rstrip("\n"))
+        return
+    export = brdf.save_export(loaded, out, to=to, **named)
     notes = [f"  note: {note}"] if note else []
     show("\n".join([f"wrote {out}", *notes, *(f"  not carried: {loss}" for loss in export.losses)]))

@@ -43,6 +43,13 @@ def test_convert_by_suffix_says_what_is_lost(capsys, tmp_path: Path):
     assert json.loads((tmp_path / "gold.gltf").read_text())["materials"][0]["name"] == "gold"
 
 
+def test_convert_to_standard_output_writes_no_file(capsys, tmp_path: Path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert json.loads(run(capsys, "convert", "gold", "-"))["model"] == "blinn-phong"
+    assert "const vec3" in run(capsys, "convert", "gold", "-", "--to", "glsl")
+    assert not list(tmp_path.iterdir())
+
+
 def test_convert_reads_what_it_wrote(capsys, tmp_path: Path):
     run(capsys, "convert", "cyan plastic", tmp_path / "a.mtl")
     run(capsys, "convert", tmp_path / "a.mtl", tmp_path / "a.json")

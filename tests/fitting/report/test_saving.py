@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -34,6 +35,17 @@ def test_numbers_are_had_by_name(folder):
     assert np.isnan(float(unknown))
     with pytest.raises(brdf.InputError, match=r"has no number 'k_x'. It has k_a, k_d, k_s, n"):
         result["k_x"]
+
+
+def test_numbers_are_a_table_where_pandas_is_there(folder, monkeypatch):
+    result = folder[1]
+    table = result.to_dataframe()
+    assert list(table.index) == [one.key for one in result.parameters]
+    assert table.loc["n", ["value", "error"]].tolist() == [float(result["n"]), result["n"].error]
+    assert tuple(table.loc["n", ["low", "high"]]) == result["n"].interval
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(brdf.InputError, match="needs pandas"):
+        result.to_dataframe()
 
 
 def test_a_saved_fit_comes_back(folder):
