@@ -3,8 +3,9 @@
 The separable fit is faster and needs no start, but knows only k_a, k_d, k_s and n. Here a light's direction, a position
 or an intensity can be freed as well. It starts from a material and scenes that are near, usually the separable optimum.
 
-Which solver: Levenberg-Marquardt (Levenberg 1944, Marquardt 1963) while the Jacobian of pixels x freed numbers fits
-into `LARGEST_JACOBIAN`, since it needs some ten steps; BFGS beyond, which keeps no Jacobian and needs some hundred.
+Which solver: Gauss and Newton's steps, while each gains. Where one does not, Levenberg-Marquardt (Levenberg 1944,
+Marquardt 1963) while the Jacobian of pixels x freed numbers fits into `LARGEST_JACOBIAN`, since it needs some ten
+steps; BFGS beyond, which keeps no Jacobian and needs some hundred.
 
 Bounds: coefficients and emittances may not be negative. A number that leaves its range is held at the bound and the
 rest fitted again; it is let go where the cost falls inwards. So a solution at a bound is exactly there.
@@ -46,7 +47,7 @@ from fitting.uncertainty.residual import NEGLIGIBLE, Neighbours, neighbours_of, 
 SOLVERS: dict[str, Any] = {"lm": optx.LevenbergMarquardt, "bfgs": optx.BFGS}
 LARGEST_JACOBIAN = 1 << 27
 ROUNDS, FEWEST_STEPS = 8, 32
-# A picture is linear in these: one step of Gauss and Newton is the answer, and no solver asked.
+# A picture is linear in these: one step of Gauss and Newton is the answer.
 EMITTANCES = ("intensity", "radiance", "ambient")
 # Pixels so near to an outline that moves do not count: their shading bends, and they may come to see another shape.
 AWAY = 2
@@ -104,7 +105,7 @@ def fit_jointly(
             ``lambda m, s: (m.k_d, m.n, s[0].lights[0].direction)``; all others are held. Or what `FitResult.diagnosis`
             names beside the whole material: "light", "intensity", "ball" or "radius", also "light 1 of picture 0".
             Where camera or shapes are freed, pixels near an outline do not count.
-        solver: "lm", "bfgs", or None to choose by size.
+        solver: "lm", "bfgs", or None for Gauss and Newton's steps, and where they do not gain one of these by size.
         precision: "float32" or "float64".
         mask: (H, W), pixels to look at, or a list, such as ``fitting.fit(target, scene).counted[0]``.
         saturation: see `fitting.fit`.
@@ -204,25 +205,34 @@ def _residuals(free: Array, given: tuple[JointProblem, Array, Array]) -> Array:
 
 def _solve(problem: JointProblem, seen: Observed, solver: str | None, tolerance: float, max_steps: int) -> JointResult:
     vector = problem.start()
+    # Gauss and Newton's steps lead to the minimum from most starts, and compile half as much as a solver.
+    whole = solver is None or all(leaf.name in EMITTANCES for leaf in problem.freed)
     jacobian = sum(target.size for target, _ in problem.pictures) * vector.size
     solver = solver or ("lm" if jacobian <= LARGEST_JACOBIAN else "bfgs")
     epsilon = float(jnp.finfo(vector.dtype).eps)
     # Of a smaller step rounding hides what it gains.
-    least, unseen = max(tolerance, epsilon**0.5), max(tolerance, epsilon) * float(np.max(seen.brightest))
-    method = SOLVERS[solver](rtol=least, atol=least)
+    close, unseen = max(tolerance, epsilon**0.5), max(tolerance, epsilon) * float(np.max(seen.brightest))
+    method = SOLVERS[solver](rtol=close, atol=close)
     # Steps that rounding hides the gains of are tried for ever: it is asked several times.
     each = max(FEWEST_STEPS, -(-max_steps // ROUNDS)) if solver == "lm" else max_steps
     bounded, held = problem.each(lambda leaf: leaf.bounded), np.zeros(vector.shape, bool)
-    linear = all(leaf.name in EMITTANCES for leaf in problem.freed)
-    steps, converged, near, residual, columns = 0, False, linear, np.zeros(0), np.zeros((0, 0))
-    for _ in range(ROUNDS):
-        if not linear:
+    steps, converged, near, residual, columns = 0, False, whole, np.zeros(0), np.zeros((0, 0))
+    least, best = np.inf, vector
+    for trial in range(ROUNDS * (1 + whole)):
+        whole = whole and trial < ROUNDS
+        if not whole:
             given, most = (problem, vector, jnp.asarray(held)), min(each, max_steps - steps)
             solution = optx.least_squares(_residuals, method, vector, given, max_steps=most, throw=False)
             steps, near = steps + int(solution.stats["num_steps"]), solution.result == optx.RESULTS.successful
             vector = jnp.where(held, vector, solution.value)
             vector = jnp.where(bounded & (vector < 0), 0, vector)
         residual, columns = (np.asarray(a, np.float64) for a in linearised(problem, vector))
+        if whole:
+            cost = float(residual @ residual)
+            if not cost <= least * (1 + epsilon**0.5):
+                vector, near, whole = best, False, False
+                continue
+            least, best, steps = cost, vector, steps + 1
         # Gauss and Newton's step under the bounds goes to the minimum, however little that gains.
         gram, base = columns @ columns.T, np.where(bounded, np.asarray(vector, np.float64), 0.0)
         gram[np.diag_indices_from(gram)] *= 1 + max(DAMPED, 10 * epsilon)
