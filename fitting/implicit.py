@@ -15,6 +15,7 @@ optimisation.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -27,7 +28,7 @@ from jaxtyping import Array, Float
 import brdf
 from brdf.checks import instance
 from brdf.precision import working_precision
-from fitting.joint_problem import residuals
+from fitting.joint_problem import QUICKLY_COMPILED, residuals
 from fitting.progress import waiting
 from fitting.result import FitResult, of_material_alone
 from fitting.solver.nnls import inverse_diagonal, scaled_inverse
@@ -107,7 +108,7 @@ def sensitivity(result: FitResult, by: Callable[[list[brdf.Scene]], Sequence[Any
             lit = eqx.tree_at(lambda scenes: list(by(scenes)), scenes, known)
             return 0.5 * jnp.sum(residuals(of_numbers(numbers + moves @ unknowns), lit, pictures) ** 2)
 
-        @jax.jit
+        @partial(jax.jit, compiler_options=QUICKLY_COMPILED)
         def curvature(vector: Array) -> tuple[Array, Array]:
             """The gradient by the unknowns, and how that by all numbers changes along each of them."""
             slope, along = jax.linearize(jax.grad(cost), vector)
