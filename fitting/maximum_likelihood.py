@@ -400,7 +400,9 @@ def change(before: Optimum, after: Optimum) -> float:
         after: others, with the sums of their pixels.
     """
     noise = np.maximum(after.cost, np.finfo(float).tiny) / np.maximum(after.pixels, 1)
-    x = np.abs(after.x - before.x) * np.sqrt(np.diagonal(after.gram, axis1=1, axis2=2)[:, :3].T / noise)
+    # Sums of a column that no pixel shows may end a little below 0.
+    told = np.maximum(np.diagonal(after.gram, axis1=1, axis2=2)[:, :3].T, 0.0)
+    x = np.abs(after.x - before.x) * np.sqrt(told / noise)
     by_n = abs(after.n - before.n) * np.sqrt(np.sum(after.gauss_newton[:, 3, 3] / noise))
     return float(max(np.max(x), by_n))
 

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 
+from brdf.images.encoding import Encoding
 from fitting.maps.texels import OUTLIER
 from fitting.maps.tiles import TILE, MapProblem
 
@@ -11,37 +12,39 @@ SOME = 4 * TILE
 """Texels that tell, of few rows."""
 
 LESS = 0.9
-"""Photographs of 8 bits that do not say so are linear where that leaves less than this share of sRGB's squares."""
+"""Silent photographs are read in the unusual way where that leaves less than this share of the squares."""
 
 
 def likelier(problem: MapProblem) -> tuple[MapProblem, tuple[str, ...]]:
-    """Silent photographs as sRGB or, under distant lights, as linear light: as is left less of some texels' codes.
+    """Silent photographs as sRGB or linear light: under distant lights as is left less of some texels' codes.
 
     Args:
-        problem: with silent ones read as sRGB.
+        problem: with silent ones read as is usual for their bits.
 
     Returns:
         The problem, and what to tell of it.
     """
     given, texels = problem.photographs, problem.texels
-    silent = [one.name for one in given.each if one.silent]
-    if not silent:
+    silent = next((one for one in given.each if one.silent), None)
+    if silent is None:
         return problem, ()
     told = "Where you know, say so with the encoding"
-    note = f"{silent[0]} does not say how its values are encoded: read as"
+    note = f"{silent.name} does not say how its values are encoded: read as"
+    usual, other = ("linear", "sRGB") if silent.curve == "linear" else ("sRGB", "linear")
     if given.to_light is None or not texels.size:
-        return problem, (f"{note} sRGB. {told}",)
+        return problem, (f"{note} {usual}. {told}",)
     row = texels // given.size[1]
     rows = np.unique(row)
     rows = rows[np.linspace(0, rows.size - 1, -(-min(SOME, texels.size) * rows.size // texels.size)).astype(int)]
     texels = texels[np.isin(row, rows)]
     texels = texels[:: -(-texels.size // SOME)]
-    readings = {"sRGB": problem, "linear": dataclasses.replace(problem, photographs=given.as_linear())}
-    left = []
-    for one in readings.values():
+    readings, left = {}, {}
+    encodings: dict[str, Encoding] = {"sRGB": "srgb", "linear": "linear"}
+    for name, encoding in encodings.items():
+        readings[name] = one = dataclasses.replace(problem, photographs=given.read_as(encoding))
         layers = one.fit(*one.tiles(texels))
-        left.append(255 * np.nanmedian(layers["noise"] * np.sqrt(1 + OUTLIER**2 * layers["left_out"])))
-    names = list(readings) if left[1] ** 2 >= LESS * left[0] ** 2 else ["linear", "sRGB"]
-    less, more = (left[list(readings).index(name)] for name in names)
-    note += f" {names[0]}, under which the maps are off by {less:.2g} codes, under {names[1]} by {more:.2g}"
-    return readings[names[0]], (f"{note}. {told}",)
+        left[name] = 255 * np.nanmedian(layers["noise"] * np.sqrt(1 + OUTLIER**2 * layers["left_out"]))
+    if left[other] ** 2 < LESS * left[usual] ** 2:
+        usual, other = other, usual
+    note += f" {usual}, under which the maps are off by {left[usual]:.2g} codes, under {other} by {left[other]:.2g}"
+    return readings[usual], (f"{note}. {told}",)

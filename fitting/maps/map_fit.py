@@ -14,11 +14,16 @@ from fitting.maps import map_inputs
 from fitting.maps.encoding_guess import likelier
 from fitting.maps.map_bands import fit_bands
 from fitting.maps.map_inputs import Photographs
-from fitting.maps.map_result import REASONS, Maps
+from fitting.maps.map_result import Maps
 from fitting.maps.shared_exponent import with_shared_n
 from fitting.maps.tiles import MapProblem, Surface
 from fitting.problem import model_name
 from fitting.solver.devices import spread_over
+
+LOSSY = (
+    "{} was compressed with losses, by which neighbours err together, in every photograph alike: errors may be four "
+    "times too small, and a faint highlight may be the codec's"
+)
 
 
 def fit_maps(
@@ -62,8 +67,8 @@ def fit_maps(
         specular: "coloured", or "grey": the channels share k_s.
         mask: (H, W), or a file: texels to look at. None for the folder's ``mask.*``, else all.
         encoding: of files and arrays: "linear", "srgb" or a gamma; None for what files say, and linear arrays. Where
-            files of 8 bits say nothing, a note says as what they were read: under distant lights as that which the
-            model explains better, else as sRGB.
+            files of integers say nothing, a note says as what they were read: under distant lights as that which the
+            model explains better, else those of 8 bits as sRGB, of more as linear.
         flip_y: whether y goes down in the normals.
         precision: "float32" or "float64".
         labels: (H, W) whole numbers, or a file of them as codes: texels with the same one share n, which then is known
@@ -110,12 +115,14 @@ def fit_maps(
         to_view = np.sum(np.asarray(surface.points.to_view, float)[np.asarray(surface.mask)], axis=0)
     problem = MapProblem(given, surface, models, specular == "grey", _ambient(ambient, given), to_view, precision)
     problem, notes = likelier(problem)
+    if lossy := [one.name for one in given.each if one.lossy]:
+        notes += (LOSSY.format(lossy[0]),)
     with spread_over(mesh):
         if labels is not None:
             problem = with_shared_n(problem, labels)
         layers = fit_bands(problem, None if keep is None else Path(keep))
     layers.pop("criterion")
-    if not np.any(layers["reason"] != REASONS.index("outside")):
+    if np.all(np.isnan(layers["k_d"])):
         raise InputError("pictures", "show no texel that counts", "Check mask, normals and clipping")
     names = tuple(one.name for one in models)
     return Maps(models=names, to_view=to_view, notes=notes, to_light=given.to_light, **layers)

@@ -36,7 +36,8 @@ class Photograph:
         name: of the file or argument.
         top: from which value on it is clipped.
         curve: how it is encoded, which tells how exact its values are: noise is even in codes.
-        silent: whether it is a file of 8 bits that does not say so, and was read as sRGB.
+        silent: whether it is a file of integers that does not say so.
+        lossy: whether it was compressed with losses.
     """
 
     rows: Callable[[int, int], Float[np.ndarray, "rows W C"]]
@@ -45,6 +46,7 @@ class Photograph:
     top: float
     curve: Encoding
     silent: bool = False
+    lossy: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,9 +72,9 @@ class Photographs:
         """Height, width and channels."""
         return self.each[0].shape
 
-    def as_linear(self) -> "Photographs":
-        """The same, silent files read as linear light."""
-        each = (_opened(one.name, Path(one.name), "linear") if one.silent else one for one in self.each)
+    def read_as(self, encoding: Encoding) -> "Photographs":
+        """The same, silent files read so."""
+        each = (_opened(one.name, Path(one.name), encoding) if one.silent else one for one in self.each)
         return dataclasses.replace(self, each=tuple(each))
 
     def tiles(
@@ -277,8 +279,8 @@ def photographs(
 def _opened(name: str, picture: Any, encoding: Any) -> Photograph:
     if isinstance(picture, str | Path):
         reader = brdf.ImageReader(picture, encoding=encoding)
-        silent = reader.is_integer and reader.bits <= 8 and reader.source in ("assumed", "format")
-        return dataclasses.replace(_opened(str(picture), reader, None), silent=silent)
+        silent = reader.is_integer and reader.source in ("assumed", "format")
+        return dataclasses.replace(_opened(str(picture), reader, None), silent=silent, lossy=reader.lossy)
     curve = parse_encoding("encoding", encoding) or "linear"
     if isinstance(picture, brdf.ImageReader | brdf.Picture):
         if encoding is not None:
@@ -322,6 +324,8 @@ def _directions(given: Any) -> Float[np.ndarray, "P 3"]:
     if not np.all((length > 0) & np.isfinite(length)):
         worst = int(np.argmin(np.where(np.isfinite(length), length, -1)))
         raise InputError(f"lights[{worst}]", f"has no direction, got {vectors[worst].tolist()}", "Give x, y, z")
+    if np.all(vectors[:, 2] < 0):
+        raise InputError("lights", "all come from behind the surface", "Give directions towards the lights: z > 0")
     return vectors / length[:, None]
 
 

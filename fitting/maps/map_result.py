@@ -42,7 +42,7 @@ class Maps:
         reason: why not, as a number; `REASONS` has the words.
         residual: root mean square of what is left, over that of the photographs.
         fitted_n: the exponent that fits best, also where it is not determined: what renders.
-        fitted_k_s: the specular coefficient to it.
+        fitted_k_s: the specular coefficient to it; 0 where no highlight is seen.
         chosen: which of ``models`` each texel has.
         models: names.
         to_view: towards the camera.

@@ -128,7 +128,8 @@ class MapProblem:
                 stacks = stacked([scene.lights[0] for scene in given.scenes], dtype)
                 occluders = given.scenes[0].occluders
             to_light = np.zeros((len(curves), 3)) if given.to_light is None else given.to_light
-            of_photographs = [np.array([one.top for one in given.each]), (1 / given.unit).T[:, None], to_light.T]
+            of_photographs = [np.array([one.top for one in given.each]), (1 / given.unit).T[:, None]]
+            of_photographs += [_weights(given.unit).T[:, None], to_light.T]
             of_photographs += [] if self.ambient is None else [self.ambient.T[:, None]]
             view = self.to_view / np.linalg.norm(self.to_view)
             of_photographs = [_padded(one, np).astype(dtype) for one in of_photographs]
@@ -160,7 +161,7 @@ def _program(
     occluders: tuple[Any, ...],
 ) -> dict[str, Array]:
     """The layers of some tiles, one by one."""
-    top, scale, to_light, *ambient = of_photographs
+    top, scale, weight, to_light, *ambient = of_photographs
     ambient = Components(tuple(ambient[0])) if ambient else None
     lights = Distant(Components(tuple(to_light)), Components(tuple(to_view)), ambient)
 
@@ -178,7 +179,7 @@ def _program(
             if normal is not None and points is None and ambient is None:
                 counts &= lights.terms(brdf.Lambert, normal)[0] > 0
             shown = jnp.where(counts, shown, 0)
-            root = counts * _slopes(curves, shown) if set(curves) != {"linear"} else counts[None].astype(shown.dtype)
+            root = counts * (weight if set(curves) == {"linear"} else weight * _slopes(curves, shown))
             return shown * scale * root, Components(tuple(root))
 
         shown, root = apart(decoded, values, number)
@@ -187,7 +188,7 @@ def _program(
             texels = Texels(model, grey and issubclass(model, SpecularMaterial), finer, shown, root)
             if normal is None:
                 fit, normals, lit, counts = with_normals(texels, lights)
-                layers = _layers(texels, fit, lit, counts, mask, normals)
+                layers = _layers(texels.facing(normals, lights), fit, lit, counts, mask, normals)
             else:
                 near = points is not None
                 texels = _near(texels, stacks, occluders, ambient, points) if near else texels.facing(normal, lights)
@@ -206,6 +207,12 @@ def _padded(of_photographs: Any, xp: Any = jnp) -> Any:
     """With photographs that are 0, up to a multiple of `LANES`."""
     before = [(0, 0)] * (of_photographs.ndim - 1)
     return xp.pad(of_photographs, [*before, (0, -of_photographs.shape[-1] % LANES)])
+
+
+def _weights(unit: np.ndarray) -> np.ndarray:
+    """What the roots of weights are by the unit, (P, C) or (P, 1): noise is even before photographs are divided."""
+    weight = unit / np.sqrt(np.mean(unit**2, axis=0))
+    return weight[:, :1] if np.allclose(weight, weight[:, :1], rtol=1e-6) else weight
 
 
 def _slopes(curves: tuple[Encoding, ...], light: Array) -> Array:
@@ -299,18 +306,26 @@ def _layers(
     shows = jnp.any(k_s > LEAST_HIGHLIGHT * noise * k_s_error, axis=0)
     shows &= gain > price(unknowns) - price(unknowns - of_lobe)
     capped = jnp.any(k_s >= some.cap, axis=0)
+    moved = [jnp.zeros_like(k) for k in linear]
+    if glossy:
+        # Where none is seen noise has put one between the lights, where it could be anything: k_d is that without it.
+        matt = dataclasses.replace(some, model=brdf.Lambert, grey=False).at(fit.log_n, errors=False)
+        moved = [jnp.where(shows, 0, plain - k) for k, plain in zip(linear, matt.k, strict=True)]
+        linear = list(map(operator.add, linear, moved))
     # the first that holds
     reason = jnp.zeros(mask.shape, jnp.uint8)
     for number, test in zip(
         range(len(REASONS) - 1, 0, -1),
-        (~(error <= MOST_ERROR), capped, ~shows | (not glossy), freedom < 1, ~mask | (values == 0)),
+        (~(error <= MOST_ERROR), capped, ~shows | (not glossy), freedom < 1, ~mask),
         strict=True,
     ):
         reason = jnp.where(test, jnp.uint8(number), reason)
     known, inside = reason == 0, reason != REASONS.index("outside")
     names = ("k_a", "k_d")[-len(linear) :]
-    layers = {name: jnp.where(inside, k, jnp.nan) for name, k in zip(names, linear, strict=True)}
-    layers |= {f"{name}_error": noise * e for name, e in zip(names, fit.k_error, strict=False)}
+    layers = {name: jnp.where(inside & (values > 0), k, jnp.nan) for name, k in zip(names, linear, strict=True)}
+    # Errors allow for what was dropped.
+    errors = [jnp.hypot(noise * error, step) for error, step in zip(fit.k_error, moved, strict=False)]
+    layers |= {f"{name}_error": one for name, one in zip(names, errors, strict=True)}
     square = jnp.sum(*sums(some.values * some.values), axis=0)
     every = values + unlit + outliers
     whole = jnp.maximum(fit.cost + (unlit + OUTLIER**2 * outliers) * noise**2, tiny)
@@ -321,7 +336,7 @@ def _layers(
         "n_error": jnp.where(known, n * error, jnp.nan),
         "k_s_error": jnp.where(known, noise * k_s_error, jnp.nan),
         "fitted_n": n,
-        "fitted_k_s": jnp.where(inside, k_s, 0),
+        "fitted_k_s": jnp.where(inside & shows, k_s, 0),
         "normal": jnp.where(inside, jnp.stack(normal.parts), 0),
         "normal_error": jnp.degrees(jnp.where(inside, noise * tilt, jnp.nan)) if angles else jnp.zeros_like(n),
         "noise": jnp.where(inside, noise, jnp.nan),

@@ -313,8 +313,12 @@ def _of_scores(
     """The covariance of the scores by x_a, x_d, x_s, channel after channel, and n, where pixels err alone."""
     scores = noise[:, None, None] ** 2 * optimum.gram if spread is None else spread
     if channels is not None:
-        # The sums of the products of two channels' columns, which are alike but for a factor.
-        scores = np.sign(scores) * np.sqrt(np.abs(scores * scores[:, None])) * channels[..., None, None]
+        # The columns of two channels are alike but for their sizes, or nearly so: by the root of each one's products
+        # what they share is never more than either has.
+        size = np.sqrt(np.maximum(np.diagonal(scores, axis1=1, axis2=2), np.finfo(float).tiny))
+        values, vectors = np.linalg.eigh(scores / (size[:, :, None] * size[:, None]))
+        roots = (vectors * np.sqrt(np.maximum(values, 0.0))[:, None]) @ np.swapaxes(vectors, 1, 2) * size[..., None]
+        scores = (roots[:, None] @ np.swapaxes(roots, 1, 2)) * channels[..., None, None]
     return join_channels(scores, optimum.product, optimum.square, optimum.x[2]).gram
 
 

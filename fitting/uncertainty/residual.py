@@ -80,7 +80,12 @@ class Residual(NamedTuple):
         found, own = (self.errors.T @ self.errors) / np.outer(size, size), np.eye(size.size)
         least = max(CORRELATED, DEVIATIONS / max(len(self.errors), 1) ** 0.5)
         together = (np.abs(found) > least) & np.outer(tell, tell)
-        return np.where(together, found, own) if np.any(together & (own == 0)) else None
+        if not np.any(together & (own == 0)):
+            return None
+        # Without those that chance makes it may be no correlation: the nearest that is one.
+        values, vectors = np.linalg.eigh(np.where(together, found, own))
+        nearest = (vectors * np.maximum(values, 0.0)) @ vectors.T
+        return nearest / np.sqrt(np.outer(np.diag(nearest), np.diag(nearest)))
 
     def growing_noise(
         self, noise: Float[np.ndarray, " C"], rounding: Float[np.ndarray, " C"]
