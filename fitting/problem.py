@@ -233,6 +233,9 @@ def as_target(given: Any, rounding: Rounding = None, encoding: Encoding | None =
     if isinstance(given, bytes) or not hasattr(given, "__array__"):
         came = f"must be an array or the path of a picture, got {type(given).__name__}"
         raise InputError("target", came, "Read it with brdf.read_picture")
+    if np.ma.is_masked(given):
+        remedy = "Give its data, and mask=~np.any(target.mask, axis=-1)"
+        raise InputError("target", "is a masked array, whose mask would be lost", remedy)
     return _of_array(np.asarray(given), rounding, curve or "linear")
 
 

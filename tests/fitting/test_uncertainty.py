@@ -341,6 +341,24 @@ def test_a_channel_that_is_black_in_a_noisy_picture_does_not_end_the_fit():
     assert fitting.fit(picture, SCENE).surface in ("blinn-phong", "phong")
 
 
+def test_under_several_lights_channels_that_err_together_have_a_covariance():
+    """Their columns are no multiples of each other there."""
+    lights = [brdf.DirectionalLight(direction=[0.4, 0.5, 0.8], intensity=[1.0, 0.9, 0.8])]
+    lights.append(brdf.DirectionalLight(direction=[-0.8, 0.3, 0.6], intensity=[0.6, 0.6, 0.9]))
+    scene, true = ball_scene(*lights, ambient=[0.3, 0.2, 0.1], camera=CAMERA), [0.2, 0.3, 0.4, 0.5, 0.2, 0.1]
+    wide, held = brdf.BlinnPhong(k_a=true[:3], k_d=true[3:], k_s=[0.3, 0.3, 0.2], n=1.2), []
+    for seed in range(6):
+        own, shared = (np.random.default_rng(2 * seed + i).normal(0, 0.007, (36, 36, 3)) for i in range(2))
+        result = fitting.fit(pictured(wide, scene) + own + shared[..., :1], scene, model="blinn-phong")
+        assert np.min(np.linalg.eigvalsh(result.correlation)) > -1e-6
+        assert all(one.error > 1e-4 for one in result.parameters if one.value)
+        held += [
+            low <= k <= high
+            for k, (low, high) in zip(true, (one.interval for one in result.parameters[:6]), strict=True)
+        ]
+    assert np.mean(held) > 0.85
+
+
 def test_the_reach_of_an_interval_is_that_of_students_distribution():
     degrees = np.array([2.0, 3.0, 5.5, 20.0, 1000.0])
     assert [student_95(one) for one in degrees] == pytest.approx(stats.t.ppf(0.975, degrees), rel=0.012)
