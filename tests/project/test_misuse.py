@@ -83,7 +83,7 @@ MISUSES = {
     "fitting.fit(target, material)": r"scene: must be a brdf\.Scene, got BlinnPhong\.",
     "fitting.fit('target.exr', scene)": r"target\.exr: there is no such file or folder\.",
     "fitting.fit(np.full_like(target, np.nan), scene)": r"target: has no finite value on the object\.",
-    "fitting.fit(np.ma.masked_less(target, 0.1), scene)": r"target: is a masked array.*Give its data, and mask=",
+    "fitting.fit(np.ma.masked_greater(target, -1), scene)": r"target: is a masked array.*Give its data, and mask=",
     "fitting.fit(target[..., :1], scene)": r"target: has 1 channels, the scene's light 3\. .*light of one serves every",
     "fitting.fit((255 * target).astype(np.int64), scene)": r"target: must hold floating-point .* got int64",
     "fitting.fit(target[:10], scene)": r"target: is 48 x 10, the scene's camera 48 x 48\.",
