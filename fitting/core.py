@@ -171,13 +171,15 @@ def _evenly_noisy(seen: Observed) -> Observed:
         return seen
     left = []
     for name in problem.families if problem.model == "auto" else (problem.model,):
-        model, pictures = brdf.MODELS[name], []
-        for tile in seen.tiles:
+        model, some = brdf.MODELS[name], []
+        for tile, owner in zip(seen.tiles, seen.owner, strict=True):
             picture = picture_of(model, tile)
-            some = np.flatnonzero(picture.counts)
-            pictures.append(picture.in_double(some[:: 1 + some.size * len(seen.owner) // SOME_PIXELS]))
+            pixels = np.flatnonzero(picture.counts)[:: 1 + len(picture.target) * len(seen.owner) // SOME_PIXELS]
+            some += [(picture.in_double(pixels), owner)] if pixels.size else []
+        pictures, owner = zip(*some, strict=True)
         with jax.enable_x64(True):
-            left.append(noise_of_each(pictures, seen, partial(_least_squares, model, seen)))
+            fitted = partial(_least_squares, model, seen)
+            left.append(noise_of_each(pictures, np.array(owner), seen.rounding, fitted))
     return evened(seen, min(left, key=lambda noise: noise.cost))
 
 
@@ -204,7 +206,8 @@ def _fit_about(
             free[2] = False
     optimise = partial(search, n_min=n_range[0], n_max=n_range[1], free=free)
     found = reweight(pictures, optimise(pictures), optimise, seen.problem.loss, seen.rounding)
-    return ModelFit(model, found.pictures, found.optimum, free, n_range, None, found.noise_factor)
+    factor = found.noise_factor
+    return ModelFit(model, found.pictures, found.optimum, free, n_range, None, factor, owner=seen.owner)
 
 
 def _with_profile(fit: ModelFit, error: SampleError | None) -> ModelFit:

@@ -69,7 +69,7 @@ class JointResult(FitResult):
             freed numbers is determined.
         steps: of the solver.
         converged: whether the solver said so.
-        solver: "lm" or "bfgs".
+        solver: "lm", "bfgs", or "gauss-newton" where its steps were enough.
     """
 
     values: tuple[np.ndarray, ...]
@@ -283,7 +283,7 @@ def _solve(problem: JointProblem, seen: Observed, solver: str | None, tolerance:
         errors=tuple(np.array(own, float).reshape(shape) for own, shape in zip(errors, shapes, strict=True)),
         steps=steps,
         converged=converged,
-        solver=solver,
+        solver="gauss-newton" if whole else solver,
     )
 
 

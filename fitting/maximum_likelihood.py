@@ -30,6 +30,7 @@ from fitting.continuation import (
     Estimate,
     Problem,
     Said,
+    Score,
     Values,
     maximise,
     telling,
@@ -247,39 +248,42 @@ def _near_edges(fit: ModelFit, at: Estimate, *, copies: bool) -> Evidence:
         at = at._replace(noise=telling(known).noise)
         problem = _Separable(_gathered(pictures, at), design, fit.n_range, copies)
         at, known, said = maximise(problem, at)
-    known, problems = list(known), [problem] * len(known)
-    for _ in range(MOST_ROUNDS if len(pictures) > 1 else 0):
-        factors = [_own_noise(one, at.noise) for one in said.said]
-        if set(factors) == {1.0}:
-            break
-        problem = _Separable(list(map(_noisier, problem.pixels, factors)), design, fit.n_range, copies)
-        at, more, said = maximise(problem, at)
-        known, problems = known + more, problems + [problem] * len(more)
+    rounds = [(problem, known)]
+    while len(rounds) <= MOST_ROUNDS and (factors := _more_noise(said, at.noise, fit.owner)).any():
+        pixels = [_noisier(values, math.exp(factor)) for values, factor in zip(problem.pixels, factors, strict=True)]
+        problem = _Separable(pixels, design, fit.n_range, copies)
+        at, known, said = maximise(problem, at)
+        rounds.append((problem, known))
     scores = [(one.score, one.weight, _place(_picture(one.values))) for one in said.said]
     steps = [(one.values.intervals.bounds.spread / one.slope).ravel() for one in said.said]
     light = at.noise * float(np.median(np.concatenate(steps))) if any(map(np.size, steps)) else 0.0
-    most = problems[next(i for i, one in enumerate(known) if one is telling(known))]
-    said, wider = where_most_is_told(most, at, known, said, _of_planes(pictures, at, problem))
+    known = [entry for _, some in rounds for entry in some]
+    most = telling(known)
+    then = next(one for one, some in rounds if any(entry is most for entry in some))
+    said, wider = where_most_is_told(then, at, known, said, _of_planes(pictures, at, problem))
     working = list(map(_working, said.said))
     optimum = _optimum(working, fit, Numbers.of(at.unknowns))
     places = [_place(_picture(one.values)) for one in said.said]
     return Evidence(working, optimum, at.noise, at.value, places, wider, scores=scores, light=light)
 
 
-def _own_noise(said: Said, noise: float) -> float:
-    """By what factor a picture has more noise than is said; 1 where that is near enough."""
-    _, slope, information = said.of_noise(noise)
-    step = slope / max(information, 1.0)
-    if abs(step) < math.log(ENOUGH_KNOWN) or step**2 * information < ENOUGH_MOVED:
-        return 1.0
-    least = LEAST_NOISE / (noise * float(np.max(bounds_of(_picture(said.values)).spread)))
-    return min(max(math.exp(step), 1 / STEP, least), STEP)
+def _more_noise(said: Score, noise: float, owner: Sequence[int]) -> Float[np.ndarray, " T"]:
+    """Logarithms of the factor by which the picture of each tile has more noise than is said; 0 where that will do."""
+    if max(owner, default=0) == 0:
+        return np.zeros(len(said.said))
+    _, slope, information = (
+        np.bincount(owner, some) for some in zip(*(one.of_noise(noise) for one in said.said), strict=True)
+    )
+    step, largest = slope / np.maximum(information, 1.0), math.log(STEP)
+    known = (np.abs(step) < math.log(ENOUGH_KNOWN)) | (step**2 * information < ENOUGH_MOVED)
+    own = [noise * float(np.max(bounds_of(_picture(one.values)).spread)) for one in said.said]
+    least = np.minimum(np.log(LEAST_NOISE / np.array(own)), 0.0)
+    return np.maximum(np.clip(np.where(known, 0.0, step), -largest, largest)[np.array(owner)], least)
 
 
 def _noisier(values: Values, factor: float) -> Values:
     picture = _picture(values)
-    bounds = bounds_of(picture)
-    bounds = dataclasses.replace(bounds, spread=bounds.spread * factor)
+    bounds = dataclasses.replace(bounds_of(picture), spread=bounds_of(picture).spread * factor)
     return _values(dataclasses.replace(picture, bounds=bounds), values.which)
 
 

@@ -70,6 +70,7 @@ class ModelFit(NamedTuple):
         noise_factor: see `fitting.solver.losses.Reweighted`.
         capped: k_d + k_s is held at 1 in some channel.
         evidence: what rounded values say; None where least squares is the whole answer.
+        owner: of which picture each of ``pictures`` is, which may be a band of it.
         moved: by how much x_a, x_d, x_s, channel after channel, and n may be off beside what pixels leave; None for not
             at all.
     """
@@ -83,6 +84,7 @@ class ModelFit(NamedTuple):
     noise_factor: float = 1.0
     capped: bool = False
     evidence: Evidence | None = None
+    owner: Sequence[int] = ()
     moved: Float[np.ndarray, " U"] | None = None
 
     @property

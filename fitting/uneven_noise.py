@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from fitting.channel_errors import residuals
 from fitting.likelihood import residual_deviation
@@ -47,31 +47,36 @@ class NoiseOfEach(NamedTuple):
 
 
 def noise_of_each(
-    pictures: Sequence[Picture], seen: Observed, optimise: Callable[[Sequence[Picture]], Optimum]
+    pictures: Sequence[Picture],
+    owner: Int[np.ndarray, " T"],
+    rounding: Float[np.ndarray, " C"],
+    optimise: Callable[[Sequence[Picture]], Optimum],
 ) -> NoiseOfEach:
     """What least squares leaves, with weights by what it leaves where that is not even.
 
     Args:
         pictures: some pixels of each tile, on the host.
-        seen: of which they are.
+        owner: of which picture each tile is.
+        rounding: standard deviation of a value's rounding, (C,): no picture has less noise.
         optimise: least squares.
     """
-    found, owner = _left(pictures, optimise(pictures), seen), np.array(seen.owner)
+    found = _left(pictures, owner, rounding, optimise(pictures))
     for _ in range(0 if found.even else ROUNDS):
         now = [
             dataclasses.replace(picture, weight=picture.weights / found.variance[one])
             for picture, one in zip(pictures, owner, strict=True)
         ]
-        found = _left(pictures, optimise(now), seen)
+        found = _left(pictures, owner, rounding, optimise(now))
     return found
 
 
-def _left(pictures: Sequence[Picture], optimum: Optimum, seen: Observed) -> NoiseOfEach:
-    owner = np.array(seen.owner)
+def _left(
+    pictures: Sequence[Picture], owner: Int[np.ndarray, " T"], rounding: Float[np.ndarray, " C"], optimum: Optimum
+) -> NoiseOfEach:
     count = np.bincount(owner, [len(picture.target) for picture in pictures])
     squares = np.array([np.sum(residuals(picture, optimum) ** 2, axis=0) for picture in pictures])
     variance = np.array([np.bincount(owner, of_channel) / count for of_channel in squares.T])
-    variance = np.maximum(variance, seen.rounding[:, None] ** 2)
+    variance = np.maximum(variance, rounding[:, None] ** 2)
     cost = float(np.sum(count * np.log(variance)))
     variance = np.mean(variance / np.mean(variance, axis=1, keepdims=True), axis=0)
     spread = np.sqrt(variance)

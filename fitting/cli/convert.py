@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import typer
+
 import brdf
 from fitting.cli.common import find_material, show, table_name
 
@@ -11,8 +13,8 @@ def convert(material: str, out: Path, *, to: str | None = None, name: str | None
 
     Args:
         material: a .json or .mtl file, a folder of brdf fit --out, or a name of the classic table.
-        out: the file to write: .json .mtl .gltf .xml (Mitsuba) .glsl .py (PyTorch3D); - for standard output.
-        to: json, mtl, three, gltf, mitsuba, mitsuba-dict, pytorch3d, glsl; default: by the suffix.
+        out: the file to write: .json .mtl .gltf .xml (Mitsuba) .glsl .py (PyTorch3D); or - for standard output.
+        to: json, mtl, three, gltf, mitsuba, mitsuba-dict, pytorch3d, glsl; default: by the suffix, json with -.
         name: which material, where an MTL file holds several.
 
     Example:
@@ -22,9 +24,12 @@ def convert(material: str, out: Path, *, to: str | None = None, name: str | None
     loaded, note = find_material(material, name)
     called = name or table_name(material) or Path(material).stem
     named = {"name": "_".join(called.split()), "note": note}
-    if str(out) == "-":
-        show(brdf.export_material(loaded, to or "json", **named).text.rstrip("\n"))
-        return
-    export = brdf.save_export(loaded, out, to=to, **named)
+    piped = str(out) == "-"
+    if piped:
+        export = brdf.export_material(loaded, to or "json", **named)
+        show(export.text.rstrip("\n"))
+    else:
+        export = brdf.save_export(loaded, out, to=to, **named)
     notes = [f"  note: {note}"] if note else []
-    show("\n".join([f"wrote {out}", *notes, *(f"  not carried: {loss}" for loss in export.losses)]))
+    notes += [f"  not carried: {loss}" for loss in export.losses]
+    typer.echo("\n".join([f"wrote {out}", *notes]), err=piped)

@@ -45,6 +45,17 @@ def test_pictures_of_different_noise_count_by_what_they_know(noises, codes):
     assert np.max(np.abs(found)) < 5
 
 
+@pytest.mark.parametrize("codes", [False, True])
+def test_bands_of_a_picture_have_its_noise_and_some_see_nothing(codes, monkeypatch):
+    pictures = drawn((0.001, 0.02), 0, codes=codes)
+    whole = fitting.fit(pictures, SCENES, model="blinn-phong")
+    monkeypatch.setattr(fitting.pixels, "TILE_PIXELS", 96)
+    bands = fitting.fit(pictures, SCENES, model="blinn-phong")
+    for one, other in zip(whole.parameters, bands.parameters, strict=True):
+        assert abs(one.value - other.value) < 0.3 * one.error
+        assert other.error == pytest.approx(one.error, rel=0.1)
+
+
 def test_pictures_of_one_noise_are_weighed_alike():
     pictures = drawn((0.01, 0.01), 0, codes=False)
     both, alike = (fitting.fit(pictures, SCENES, weight=one) for one in (None, [np.ones(pictures[0].shape[:2])] * 2))

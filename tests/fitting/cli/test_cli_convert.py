@@ -47,6 +47,9 @@ def test_convert_to_standard_output_writes_no_file(capsys, tmp_path: Path, monke
     monkeypatch.chdir(tmp_path)
     assert json.loads(run(capsys, "convert", "gold", "-"))["model"] == "blinn-phong"
     assert "const vec3" in run(capsys, "convert", "gold", "-", "--to", "glsl")
+    _, out, err = command_runs.run(capsys, "convert", "gold", "-", "--to", "gltf")
+    assert json.loads(out)["materials"]
+    assert "not carried: k_a is left out" in err
     assert not list(tmp_path.iterdir())
 
 
