@@ -32,18 +32,20 @@ class NoiseOfEach(NamedTuple):
         variance: in light, over that of the others.
         spread: the noise over that of the others, in codes before rounding where there are such.
         pixels: how many.
+        alike: codes of all stand for the same, or there are none.
     """
 
     cost: float
     variance: Float[np.ndarray, " K"]
     spread: Float[np.ndarray, " K"]
     pixels: Float[np.ndarray, " K"]
+    alike: bool
 
     @property
     def even(self) -> bool:
         """Whether all have the same, but for chance."""
         chance = DEVIATIONS / math.sqrt(np.min(self.pixels))
-        return bool(np.max(self.variance) < (UNEVEN + chance) ** 2 * np.min(self.variance))
+        return self.alike and bool(np.max(self.variance) < (UNEVEN + chance) ** 2 * np.min(self.variance))
 
 
 def noise_of_each(
@@ -79,15 +81,16 @@ def _left(
     variance = np.maximum(variance, rounding[:, None] ** 2)
     cost = float(np.sum(count * np.log(variance)))
     variance = np.mean(variance / np.mean(variance, axis=1, keepdims=True), axis=0)
-    spread = np.sqrt(variance)
+    spread, kinds = np.sqrt(variance), {()}
     for one in range(len(count)) if all(picture.bounds for picture in pictures) else ():
         own = [picture for picture, of in zip(pictures, owner, strict=True) if of == one]
         bounds = [picture.bounds for picture in own if picture.bounds is not None]
+        kinds |= {(*np.ravel(some.scale / some.unit), some.encoding) for some in bounds}
         codes = [some.codes(picture.shown(optimum.n, optimum.x))[0] for some, picture in zip(bounds, own, strict=True)]
         step = float(np.mean(np.concatenate([np.zeros(1), *(some.widths for some in bounds)])))
         noise = residual_deviation(bounds, codes) ** 2 - step**2 / 12
         spread[one] = math.sqrt(max(noise, (ROUNDING_HIDES * step) ** 2))
-    return NoiseOfEach(cost, variance, spread / np.min(spread), count)
+    return NoiseOfEach(cost, variance, spread / np.min(spread), count, len(kinds) <= 2)
 
 
 def evened(seen: Observed, noise: NoiseOfEach) -> Observed:
