@@ -40,7 +40,7 @@ from fitting.uncertainty.interpretation import alone_covariance, interpret, shar
 from fitting.uncertainty.noise_model import weighted_sums
 from fitting.uncertainty.residual import SOME_PIXELS, Residual, gone_together, survey
 from fitting.uncertainty.structure import CHANCE, SIZES, Blocks, Errors, over_blocks, shared
-from fitting.uneven_noise import evened, noise_of_each
+from fitting.uneven_noise import evened, in_codes, noise_of_each
 
 # A residual above this share of the picture: what the scene says is probably not what the picture shows.
 UNEXPLAINED = 0.5
@@ -169,7 +169,7 @@ def _evenly_noisy(seen: Observed) -> Observed:
     weighed = problem.loss != "squared" or problem.noise is not None or any(w is not None for w in problem.weights)
     if len(problem.targets) == 1 or weighed:
         return seen
-    left = []
+    seen, left = in_codes(seen), []
     for name in problem.families if problem.model == "auto" else (problem.model,):
         model, some = brdf.MODELS[name], []
         for tile, owner in zip(seen.tiles, seen.owner, strict=True):

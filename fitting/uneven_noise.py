@@ -1,8 +1,8 @@
 """Pictures of different noise, as of other exposures: each counts by what it knows."""
 
-import dataclasses
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from fitting.channel_errors import residuals
-from fitting.likelihood import residual_deviation
+from fitting.likelihood import Bounds, residual_deviation
 from fitting.pixels import Observed, Tile
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
@@ -22,6 +22,35 @@ UNEVEN, DEVIATIONS = 1.2, 5.0
 ROUNDS = 2
 # In codes: less noise before rounding than this is not told from none.
 ROUNDING_HIDES = 0.05
+# Steps of single precision, as a share of the brightest value.
+ROUNDED = 2.0**-22
+
+
+def in_codes(seen: Observed) -> Observed:
+    """The same, floats beside pictures of codes as codes too: those that single precision rounds them to.
+
+    Args:
+        seen: several pictures.
+    """
+    targets = seen.problem.targets
+    floats = [one.codes is None for one in targets]
+    if all(floats) or not any(floats) or any(one.streamed or one.least_squares for one in targets):
+        return seen
+    step = ROUNDED * float(np.max(seen.brightest))
+
+    def of_tile(tile: Tile, one: int) -> Tile:
+        if not floats[one]:
+            return tile
+        values, bounds = np.asarray(tile.target), tile.bounds
+        if bounds is None:
+            says = np.full((len(values), 1), True) if tile.weight is None else np.asarray(tile.weight)[:, None] > 0
+            lower, upper = np.where(says, values, -np.inf), np.where(says, values, np.inf)
+            index, width, unit = np.arange(len(values)), np.array(targets[one].pixels.shape[1]), np.ones(())
+            bounds = Bounds(lower, upper, scale=unit, unit=unit, index=index, width=width, spread=unit)
+        lower, upper = bounds.lower / step - 0.5, bounds.upper / step + 0.5
+        return tile._replace(bounds=replace(bounds, lower=lower, upper=upper, scale=np.array(1 / step), exact=False))
+
+    return seen._replace(tiles=each(of_tile, seen.tiles, seen.owner))
 
 
 class NoiseOfEach(NamedTuple):
@@ -65,7 +94,7 @@ def noise_of_each(
     found = _left(pictures, owner, rounding, optimise(pictures))
     for _ in range(0 if found.even else ROUNDS):
         now = [
-            dataclasses.replace(picture, weight=picture.weights / found.variance[one])
+            replace(picture, weight=picture.weights / found.variance[one])
             for picture, one in zip(pictures, owner, strict=True)
         ]
         found = _left(pictures, owner, rounding, optimise(now))
@@ -108,7 +137,7 @@ def evened(seen: Observed, noise: NoiseOfEach) -> Observed:
         own = jnp.ones(len(tile.target), tile.target.dtype) if tile.weight is None else tile.weight
         bounds = tile.bounds
         if bounds is not None:
-            bounds = dataclasses.replace(bounds, spread=bounds.spread * noise.spread[one])
+            bounds = replace(bounds, spread=bounds.spread * noise.spread[one])
         return tile._replace(weight=own * float(weight[one]), bounds=bounds)
 
     return seen._replace(tiles=each(of_tile, seen.tiles, seen.owner))
