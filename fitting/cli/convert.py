@@ -30,6 +30,7 @@ def convert(material: str, out: Path, *, to: str | None = None, name: str | None
         show(export.text.rstrip("\n"))
     else:
         export = brdf.save_export(loaded, out, to=to, **named)
-    notes = [f"  note: {note}"] if note else []
-    notes += [f"  not carried: {loss}" for loss in export.losses]
-    typer.echo("\n".join([f"wrote {out}", *notes]), err=piped)
+        show(f"wrote {out}")
+    notes = [f"note: {note}"] if note else []
+    for line in [*notes, *(f"not carried: {loss}" for loss in export.losses)]:
+        typer.echo(f"  {line}", err=piped)
