@@ -58,7 +58,7 @@ def maps(
     mesh = all_devices(devices)
     import fitting
 
-    with waiting("fitting"), named_as({"pictures": target}):
+    with named_as({"pictures": target}):
         found = fitting.fit_maps(
             target,
             normals=normals,
@@ -73,8 +73,9 @@ def maps(
             mesh=mesh,
             keep=None if out is None else out / BANDS,
         )
-        if not is_first_process(mesh):
-            return
+    if not is_first_process(mesh):
+        return
+    with waiting("saving"):
         if out is not None:
             found.save(out, plot=plot)
             shutil.rmtree(out / BANDS, ignore_errors=True)

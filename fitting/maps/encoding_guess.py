@@ -7,6 +7,7 @@ import numpy as np
 from brdf.images.encoding import Encoding
 from fitting.maps.texels import OUTLIER
 from fitting.maps.tiles import TILE, MapProblem
+from fitting.progress import waiting
 
 SOME = 4 * TILE
 """Texels that tell, of few rows."""
@@ -42,7 +43,8 @@ def likelier(problem: MapProblem) -> tuple[MapProblem, tuple[str, ...]]:
     encodings: dict[str, Encoding] = {"sRGB": "srgb", "linear": "linear"}
     for name, encoding in encodings.items():
         readings[name] = one = dataclasses.replace(problem, photographs=given.read_as(encoding))
-        layers = one.fit(*one.tiles(texels))
+        with waiting(f"fitting some texels as {name}"):
+            layers = one.fit(*one.tiles(texels))
         left[name] = 255 * np.nanmedian(layers["noise"] * np.sqrt(1 + OUTLIER**2 * layers["left_out"]))
     if left[other] ** 2 < LESS * left[usual] ** 2:
         usual, other = other, usual

@@ -5,35 +5,14 @@ import io
 import sys
 import time
 import types
-from collections.abc import Callable
 
 import pytest
+from terminals import Terminal, impatient, until
 
 from fitting import progress
 from fitting.progress import waiting
 
 CLEARED = "\r\x1b[2K"
-
-
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
-
-
-def impatient(monkeypatch: pytest.MonkeyPatch, stream: io.StringIO) -> None:
-    """Within the test: between a fixture and the test pytest sets the streams anew."""
-    monkeypatch.setattr(sys, "stderr", stream)
-    monkeypatch.setattr(progress, "PATIENCE", 0.0)
-    monkeypatch.setattr(progress, "EVERY", 0.01)
-
-
-def until(true: Callable[[], bool]) -> None:
-    """Wait for what another thread does, on a slow machine too."""
-    for _ in range(1000):
-        if true():
-            return
-        time.sleep(0.01)
-    raise AssertionError("was not told")
 
 
 def test_what_is_done_is_told_and_nothing_stays(monkeypatch: pytest.MonkeyPatch):
