@@ -94,7 +94,7 @@ def noise_of_each(
     found = _left(pictures, owner, rounding, optimise(pictures))
     for _ in range(0 if found.even else ROUNDS):
         now = [
-            replace(picture, weight=picture.weights / found.variance[one])
+            replace(picture, weight=picture.weights * np.full((len(picture.target), 1), 1 / found.variance[one]))
             for picture, one in zip(pictures, owner, strict=True)
         ]
         found = _left(pictures, owner, rounding, optimise(now))

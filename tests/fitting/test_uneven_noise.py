@@ -79,3 +79,13 @@ def test_pictures_of_one_noise_are_weighed_alike():
     pictures = drawn((0.01, 0.01), 0, codes=False)
     both, alike = (fitting.fit(pictures, SCENES, weight=one) for one in (None, [np.ones(pictures[0].shape[:2])] * 2))
     assert [one.value for one in both.parameters] == pytest.approx([one.value for one in alike.parameters], rel=1e-6)
+
+
+def test_pictures_all_of_whose_pixels_count_differ_in_noise():
+    normals = np.stack(np.broadcast_arrays(*np.mgrid[-0.5:0.5:24j, -0.5:0.5:24j], 1.0), axis=-1)
+    points = brdf.SurfacePoints.from_normals(normals / np.linalg.norm(normals, axis=-1, keepdims=True))
+    scenes = [brdf.Scene(points=points, lights=scene.lights) for scene in SCENES]
+    pictures = [pictured(brdf.Lambert(k_d=0.4), *part) for part in zip(scenes, (0.001, 0.02), (0, 1), strict=True)]
+    pictures = [one.astype(np.float32) for one in pictures]
+    both, alone = (fitting.fit(*some, model="lambert") for some in ((pictures, scenes), (pictures[0], scenes[0])))
+    assert both["k_d"][0].error == pytest.approx(alone["k_d"][0].error, rel=0.05)
