@@ -44,7 +44,7 @@ def likelier(problem: MapProblem) -> tuple[MapProblem, tuple[str, ...]]:
     for name, encoding in encodings.items():
         readings[name] = one = dataclasses.replace(problem, photographs=given.read_as(encoding))
         with waiting(f"fitting some texels as {name}"):
-            layers = one.fit(*one.tiles(texels))
+            layers = {key: layer[: texels.size] for key, layer in one.fit(*one.tiles(texels)).items()}
         left[name] = 255 * np.nanmedian(layers["noise"] * np.sqrt(1 + OUTLIER**2 * layers["left_out"]))
     if left[other] ** 2 < LESS * left[usual] ** 2:
         usual, other = other, usual

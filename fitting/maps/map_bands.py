@@ -59,7 +59,7 @@ def fit_bands(problem: MapProblem, keep: Path | None = None) -> dict[str, np.nda
             if name not in layers:
                 layers[name] = np.empty((height * width, *values.shape[1:]), values.dtype)
                 if texels.size < height * width:
-                    layers[name][:] = values[-1]
+                    layers[name][:] = values[bands[index].size]
             layers[name][places(bands[index])] = values[: bands[index].size]
 
     with waiting("fitting maps") as say, ThreadPoolExecutor(os.cpu_count()) as pool:

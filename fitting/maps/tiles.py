@@ -112,7 +112,7 @@ class MapProblem:
         return values, jax.tree.map(cut, self.surface)
 
     def fit(self, values: np.ndarray, surface: Surface, band: int = 0) -> dict[str, np.ndarray]:
-        """The layers of some tiles, (N * TILE, ...); what a lane without a texel has comes last.
+        """The layers of some tiles, (N * TILE, ...); what a lane without a texel has comes after those with one.
 
         Args:
             values: what they show.
@@ -133,9 +133,11 @@ class MapProblem:
             of_photographs += [] if self.ambient is None else [self.ambient.T[:, None]]
             view = self.to_view / np.linalg.norm(self.to_view)
             of_photographs = [_padded(one, np).astype(dtype) for one in of_photographs]
+            # All tiles that hold a texel, and the first lane that holds none.
+            used = np.arange(len(values)) <= np.count_nonzero(surface.mask) // TILE
             found = []
             for first in range(0, len(values), CHUNK):
-                part = jax.tree.map(operator.itemgetter(slice(first, first + CHUNK)), (values, surface))
+                part = jax.tree.map(operator.itemgetter(slice(first, first + CHUNK)), (used, values, surface))
                 part = placed(band, part)
                 found.append(_program(*static, *part, of_photographs, view.astype(dtype), stacks, occluders))
             return {name: np.concatenate([np.asarray(layers[name]) for layers in found]) for name in found[0]}
@@ -153,6 +155,7 @@ def _program(
     finer: int,
     seek: str,
     curves: tuple[Encoding, ...],
+    used: Array,
     values: Array,
     surface: Surface,
     of_photographs: list[Array],
@@ -160,11 +163,12 @@ def _program(
     stacks: tuple[LightStack, ...],
     occluders: tuple[Any, ...],
 ) -> dict[str, Array]:
-    """The layers of some tiles, one by one."""
+    """The layers of some tiles, one by one; 0 of those that are not used."""
     top, scale, weight, to_light, *ambient = of_photographs
     ambient = Components(tuple(ambient[0])) if ambient else None
     lights = Distant(Components(tuple(to_light)), Components(tuple(to_view)), ambient)
 
+    @functools.partial(jax.jit, inline=True)  # its shapes are asked for below: it is traced once
     def of_tile(tile):
         number, (normal, mask, points, shared) = tile
         if normal is not None:
@@ -199,7 +203,11 @@ def _program(
         )
         return {name: layer.T for name, layer in layers.items()}
 
-    tiles = jax.lax.map(of_tile, (jnp.arange(len(values)), surface))
+    def of_used(tile):
+        empty = jax.tree.map(lambda layer: jnp.zeros(layer.shape, layer.dtype), jax.eval_shape(of_tile, tile[1:]))
+        return jax.lax.cond(tile[0], of_tile, lambda _: empty, tile[1:])
+
+    tiles = jax.lax.map(of_used, (used, jnp.arange(len(values)), surface))
     return {name: layer.reshape(-1, *layer.shape[2:]) for name, layer in tiles.items()}
 
 
