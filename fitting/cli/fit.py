@@ -6,13 +6,17 @@ import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import brdf
 from brdf.errors import InputError
 from brdf.files import write_text
 from fitting.cli.common import PictureOptions, all_devices, check_outputs, is_first_process, named_as, show_result
 from fitting.progress import waiting
+
+if TYPE_CHECKING:
+    from fitting.cli.inputs import FitInputs
+    from fitting.result import FitResult
 
 
 def fit(
@@ -87,7 +91,7 @@ def fit(
             with named_as({table.name: target[0]}):
                 result: Any = fitting.fit_brdf(table, model, loss=loss or "cosine")
         else:
-            result, notes = _fit_pictures(
+            result, inputs = _fit_pictures(
                 target,
                 pictures,
                 noise,
@@ -104,7 +108,8 @@ def fit(
             )
             if free:
                 say("fitting jointly")
-                result = _freed(result, free)
+                result = _freed(result, inputs, free)
+            notes = inputs.notes
         if not is_first_process(mesh):
             return
         if out is not None:
@@ -121,24 +126,19 @@ def fit(
     show_result(result, notes, json, *saved, *written)
 
 
-def _freed(result: Any, names: list[str]) -> Any:
+def _freed(result: "FitResult", inputs: "FitInputs", names: list[str]) -> "FitResult":
     """The fit again, with what the names say of the scenes freed; where a command was told so, beside the material."""
     import fitting
 
-    # As in their files: what was read has forgotten its codes.
-    targets = [
-        target if file is None else brdf.read_picture(file["path"], encoding=file["encoding"]).scaled(file["factor"])
-        for target, file in zip(result.targets, result.files or [None] * len(result.targets), strict=True)
-    ]
     with named_as({"free": "--free"}):
-        found = fitting.fit_jointly(targets, result.scenes, result.material, names, mask=result.counted)
-    return dataclasses.replace(found, files=result.files, candidates=result.candidates)
+        found = fitting.fit_jointly(inputs.pictures, result.scenes, result.material, names, mask=result.counted)
+    return dataclasses.replace(found, candidates=result.candidates)
 
 
 def _fit_pictures(
     target: Any, pictures: Any, noise: Any, say: Callable[[str], None], **how
-) -> tuple[Any, tuple[str, ...]]:
-    """The fit, and what was found out on the way."""
+) -> tuple["FitResult", "FitInputs"]:
+    """The fit, and what was fitted with what was found out on the way."""
     from fitting.cli.inputs import read_inputs
     from fitting.photographs.light_files import parse_numbers
 
@@ -149,11 +149,12 @@ def _fit_pictures(
     how["noise"] = None if noise is None else tuple(parse_numbers(noise, "--noise", 2, "READ,SHOT"))
     result, inputs = fit_either(inputs, read, say, **how)
     if not inputs.light_errors:
-        return result, inputs.notes
+        return result, inputs
     from fitting.photographs.light_error import with_light_errors
 
     say("carrying the errors of the lights into those of the numbers")
     try:
-        return with_light_errors(result, inputs.light_errors), inputs.notes
+        return with_light_errors(result, inputs.light_errors), inputs
     except brdf.InputError:
-        return result, (*inputs.notes, "the errors of the numbers are those under this light: its own is not in them")
+        note = "the errors of the numbers are those under this light: its own is not in them"
+        return result, inputs._replace(notes=(*inputs.notes, note))

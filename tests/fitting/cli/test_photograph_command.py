@@ -204,6 +204,20 @@ def test_normals_and_archives_say_the_same(photographs, capsys, monkeypatch):
     assert np.allclose([*found, k_d(out)], 0.8, rtol=1e-3)
 
 
+def test_codes_of_an_archive_count_where_its_lights_are_freed(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    lights, intensities = np.array([[0.3, 0.4, 0.86], [-0.5, 0.1, 0.86]]), [0.7, 1.2]
+    pictures = [shaded(light) * intensity for light, intensity in zip(lights, intensities, strict=True)]
+    images, points = np.round(np.stack(pictures) * 255).astype(np.uint8), ball_points(SHAPE, BALL)
+    normal = np.where(np.asarray(points.mask)[..., None], np.asarray(points.normal), 0)
+    np.savez("ball.npz", images=images, normal=normal, light_dirs=lights, light_intensities=intensities)
+    status, out, err = run(capsys, "fit", "ball.npz", "--model", "lambert", "--free", "light", "--json")
+    assert status == 0, err
+    found = next(one for one in json.loads(out)["parameters"] if one["name"] == "k_d")
+    # By least squares 4e-5.
+    assert abs(found["value"] - 0.8) < 4 * found["error"] < 1e-4
+
+
 def test_lights_from_a_matt_ball_in_one_command(photographs, capsys, monkeypatch):
     monkeypatch.chdir(photographs)
     words = ["lights", "0.png", "1.png", "--sphere", f"{BALL.x},{BALL.y},{BALL.radius}", "--encoding", "linear"]
