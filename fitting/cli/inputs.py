@@ -3,6 +3,7 @@
 What does not go together is refused before JAX is imported, which takes longer than reading a picture.
 """
 
+import dataclasses
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -96,15 +97,17 @@ def read_inputs(targets: list[Path], options: PictureOptions, encodings: dict[Pa
         masks = [on_it if mask is None else on_it & mask for mask in inputs.masks]
         directions, inputs = _directions(inputs._replace(notes=notes, masks=masks), points, options)
         intensities, names = _intensities(options.intensities, inputs.pictures), {}
-    from fitting.photographs.distant_light import photograph_scene
-
     pictures, around = inputs.pictures, np.ones((len(inputs.pictures), 1))
     if np.all(intensities > 0):
         pictures = [picture.scaled(1.0 / intensity) for picture, intensity in zip(pictures, intensities, strict=True)]
         intensities, around = around, 1.0 / intensities
     with named_as(names):
         scenes = [
-            photograph_scene(seen, direction, intensity, ambient=ambient if options.ambient else None)
+            dataclasses.replace(
+                seen,
+                lights=(brdf.DirectionalLight(direction=direction, intensity=intensity),),
+                ambient=ambient if options.ambient else None,
+            )
             for direction, intensity, ambient in zip(directions, intensities, around, strict=True)
         ]
     return inputs._replace(pictures=pictures, scenes=scenes)

@@ -50,22 +50,6 @@ BEHIND = -0.4
 TOO_LITTLE = InputError("picture", "shows too little of the lit surface to tell the light", "Give its direction")
 
 
-def photograph_scene(seen: brdf.Scene, direction: Any, intensity: Any = 1.0, *, ambient: Any = None) -> brdf.Scene:
-    """The scene of a photograph under one distant light.
-
-    Args:
-        seen: what the pixels see, without lights.
-        direction: towards the light, (3,), of any length but 0.
-        intensity: of it, a number or one per channel; where it is not known, 1: k_d then is k_d times the intensity.
-        ambient: intensity of the ambient light, or None.
-
-    Raises:
-        InputError: naming the argument.
-    """
-    light = brdf.DirectionalLight(direction=direction, intensity=intensity)
-    return brdf.Scene(seen.camera, seen.shapes, lights=(light,), ambient=ambient, points=seen.points)
-
-
 def _values(picture: Any) -> np.ndarray:
     return np.atleast_3d(np.asarray(getattr(picture, "pixels", picture), np.float64))
 

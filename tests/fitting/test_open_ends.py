@@ -3,12 +3,12 @@
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from ball_pictures import photograph_scene
 
 import brdf
 import fitting
 from brdf.images.encoding import encode
 from fitting.photographs.ball import Circle, ball_points
-from fitting.photographs.distant_light import photograph_scene
 
 SIZE = 96
 POINTS = ball_points((SIZE, SIZE), Circle(47.5, 47.5, 44.0))

@@ -1,5 +1,6 @@
 """Photographs of a matt ball, made in plain NumPy."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,12 @@ def shaded(direction, k_d=0.8, circle: Circle = BALL, shape=SHAPE) -> np.ndarray
     light = np.asarray(direction) / np.linalg.norm(direction)
     value = k_d * np.maximum(normal_x * light[0] + normal_y * light[1] + normal_z * light[2], 0)
     return np.where(disc(circle, shape), value, 0.0)[..., None].astype(np.float32)
+
+
+def photograph_scene(seen: brdf.Scene, direction, *, ambient=None) -> brdf.Scene:
+    """What pixels see under one distant light."""
+    light = brdf.DirectionalLight(direction=direction, intensity=1.0)
+    return dataclasses.replace(seen, lights=(light,), ambient=ambient)
 
 
 def photographs_in(folder: Path) -> Path:

@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from ball_pictures import BALL, SHAPE, angle, disc, photographs_in, shaded
+from ball_pictures import BALL, SHAPE, angle, disc, photograph_scene, photographs_in, shaded
 from command_runs import run
 
 import brdf
 from brdf.images.encoding import encode
 from fitting.cli import encoding_trial
 from fitting.photographs.ball import Circle, ball_points, ball_seen
-from fitting.photographs.distant_light import photograph_scene
 from fitting.photographs.light_files import read_directions
 
 
