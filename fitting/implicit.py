@@ -13,8 +13,9 @@ Use it to know what an error of a light's direction does to the exponent, or as 
 optimisation.
 """
 
+import dataclasses
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -30,15 +31,16 @@ from brdf.checks import instance
 from brdf.precision import working_precision
 from fitting.joint_problem import QUICKLY_COMPILED, residuals
 from fitting.progress import waiting
-from fitting.result import FitResult, of_material_alone
+from fitting.result import FitResult, Parameter, of_material_alone
 from fitting.solver.nnls import inverse_diagonal, scaled_inverse
+from fitting.uncertainty.intervals import above_zero
 
 NEWTON_STEPS = 3
 # Of the largest eigenvalue of the Hessian: a smaller one determines nothing.
 DEPENDENT = 1e-13
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Sensitivity:
     """Derivatives of the fitted numbers by one known leaf of shape (S...).
 
@@ -154,3 +156,38 @@ def _inverse(hessian: Float[np.ndarray, "U U"]) -> Float[np.ndarray, "U U"]:
     if np.any(np.isinf(inverse_diagonal(hessian, DEPENDENT))):
         raise brdf.InputError("result", "is determined only in combinations of its numbers", "Fit a simpler model")
     return scaled_inverse(hessian, DEPENDENT)
+
+
+def with_light_errors(result: FitResult, degrees: Sequence[float]) -> FitResult:
+    """A fit whose errors hold those of its lights, to first order and as if they were independent of the picture's.
+
+    Args:
+        result: of pictures under one distant light each.
+        degrees: standard error of each light's direction, root mean square of the angle.
+
+    Raises:
+        InputError: where the fit does not determine how its numbers move.
+    """
+    found = sensitivity(result, lambda scenes: [scene.lights[0].direction for scene in scenes])
+    variance = np.zeros(len(result.parameters))
+    for scene, moves, error in zip(result.scenes, found, degrees, strict=True):
+        direction = np.asarray(scene.lights[0].direction, np.float64)  # pyright: ignore[reportAttributeAccessIssue]
+        # Two small turns of it share the angle; it does not matter how long it is.
+        turns = np.linalg.svd(direction[None])[2][1:] * np.linalg.norm(direction) * math.radians(error) / math.sqrt(2)
+        for place, one in enumerate(result.parameters):
+            slope = getattr(moves, one.name)
+            variance[place] += np.sum((turns @ (slope if one.channel is None else slope[one.channel])) ** 2)
+    return dataclasses.replace(result, parameters=tuple(map(_widened, result.parameters, np.sqrt(variance))))
+
+
+def _widened(one: Parameter, by: float) -> Parameter:
+    if one.value is None or one.error is None or one.at_bound or one.interval is None:
+        return one
+    error = math.hypot(one.error, by)
+    if one.name == "n":
+        # Its interval need not be even about it: each end moves out by the same factor.
+        ends = np.log(np.array(one.interval) / one.value) * error / one.error if one.error else np.zeros(2)
+        interval = tuple((one.value * np.exp(ends)).tolist())
+    else:
+        interval = above_zero(one.value, error)
+    return dataclasses.replace(one, error=error, interval=interval)

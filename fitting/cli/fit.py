@@ -150,7 +150,7 @@ def _fit_pictures(
     result, inputs = fit_either(inputs, read, say, **how)
     if not inputs.light_errors:
         return result, inputs
-    from fitting.photographs.light_error import with_light_errors
+    from fitting.implicit import with_light_errors
 
     say("carrying the errors of the lights into those of the numbers")
     try:

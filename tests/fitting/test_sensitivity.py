@@ -7,6 +7,7 @@ import pytest
 
 import brdf
 import fitting
+from fitting.implicit import with_light_errors
 
 DIRECTION = np.array([0.4, 0.5, 0.8])
 SIZE = 64
@@ -72,6 +73,24 @@ def test_several_leaves_and_a_fit_in_float32():
     np.testing.assert_allclose(by_light.k_d, np.diag(-k_d / 0.9), atol=2e-5)
     np.testing.assert_allclose(by_ambient.k_a, np.diag(-k_a / 0.3), atol=2e-5)
     np.testing.assert_allclose(by_ambient.n, 0, atol=1e-6)
+
+
+def test_errors_hold_what_turned_lights_change():
+    target, degrees, squares = picture("noise"), 0.3, np.zeros(10)
+    result = fitting.fit(target, scene(), model="blinn-phong", precision="float64")
+    wider = with_light_errors(result, [degrees])
+    for turn in np.linalg.svd(DIRECTION[None])[2][1:]:
+        # Half the difference of fits under lights turned by one standard error each way, of each of two turns.
+        step = np.radians(degrees) / np.sqrt(2) * np.linalg.norm(DIRECTION) * turn
+        ahead, behind = (fitted(target, {}, direction=DIRECTION + sign * step) for sign in (1, -1))
+        squares += ((ahead - behind) / 2) ** 2
+    grown = []
+    for before, after in zip(result.parameters, wider.parameters, strict=True):
+        error, low, high = np.array([after.error, *(after.interval or (np.nan, np.nan))], float)
+        np.testing.assert_allclose(error, np.hypot(np.array(before.error), squares[before.place(3)] ** 0.5), rtol=0.05)
+        assert low < np.min(before.interval or np.nan) < np.max(before.interval or np.nan) < high
+        grown.append(error / np.array(before.error))
+    assert max(grown) > 2
 
 
 def test_numbers_at_their_bound_stay_there():
