@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 
 import brdf
 from brdf.lights.base import Light, Lighting, stacked
-from brdf.lobes import OneOf, over_samples
+from brdf.lobes import OneOf, diffuse_and_peak
 from brdf.models.base import SpecularMaterial
 from brdf.precision import working_precision
 
@@ -79,13 +79,6 @@ class PixelSample(NamedTuple):
         return values.reshape(-1, *values.shape[2:])[self.pixel][None]
 
 
-@eqx.filter_jit
-def _peaks(points, lights, model):
-    """The largest log cosine of the lobe at each pixel, of lights that nothing shadows."""
-    lighting = Lighting(stacked(lights, points.position.dtype))
-    return over_samples(OneOf.of(model), points.in_components(), lighting, lambda _: ())[1]
-
-
 def sample_pixels(scene: brdf.Scene, model: type[brdf.Material], size: float) -> PixelSample | None:
     """Choose about ``size`` pixels of a scene's picture.
 
@@ -119,8 +112,9 @@ def sample_pixels(scene: brdf.Scene, model: type[brdf.Material], size: float) ->
             padded = np.resize(pixel, 1 << int(pixel.size - 1).bit_length())
             points = dataclasses.replace(brdf.some_pixels(scene, padded).surface_points(), area=None)
             with working_precision("float32"):
-                peak = np.asarray(_peaks(points, lights, model))[: pixel.size]
-            cut[np.argpartition(-peak, most)[:most]] = True
+                lighting = Lighting(stacked(lights, points.position.dtype))
+                lobe: Any = diffuse_and_peak(OneOf.of(model), points, lighting)[1]
+            cut[np.argpartition(-np.asarray(lobe.peak)[: pixel.size], most)[:most]] = True
         pixels.append(pixel[~cut])
         areas.append(area[~cut])
         if not cut.any():
