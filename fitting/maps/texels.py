@@ -25,6 +25,7 @@ from jax import Array
 from brdf.models.base import SpecularMaterial
 from brdf.precision import apart
 from brdf.vectors import Components, divide, dot, largest, mirror_log_cosine, normalize, perpendicular, square_root
+from fitting.solver.normal_equations import totals
 
 OCTAVES = 16
 """The exponent is sought from 1 to 2^16: beyond, a lobe is narrower than the step between any two lights."""
@@ -72,8 +73,7 @@ def sums(*terms: Components) -> list[Array]:
     if not terms:
         return []
     rows = [row for term in terms for row in term]
-    zeros = [jnp.zeros((), row.dtype) for row in rows]
-    found = iter(jax.lax.reduce(rows, zeros, lambda a, b: list(map(operator.add, a, b)), (1,)))
+    found = iter(totals(rows, ["add"] * len(rows), (1,)))
     return [jnp.stack([next(found) for _ in term]) for term in terms]
 
 
