@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from fitting.continuation import Estimate, Problem, Score, Values, maximise, where_most_is_told
 from fitting.joint_problem import JointProblem, linearised
@@ -20,6 +20,8 @@ from fitting.maximum_likelihood import FIRST_NOISE, alike
 from fitting.pixels import Observed
 from fitting.solver.nnls import inverse_diagonal, scaled_inverse
 from fitting.uncertainty.structure import Errors, block_scatter
+
+_residuals = eqx.filter_jit(JointProblem.residuals)
 
 # Of the largest eigenvalue of the normal equations: a smaller one determines nothing.
 DEPENDENT = 1e-12
@@ -139,8 +141,3 @@ class _RoundedPictures(Problem):
             bounds, scores = one.values.intervals.bounds, np.einsum("upc,pc->up", one.columns, one.score)
             parts.append(block_scatter(scores, Errors(one.score, np.asarray(bounds.index), int(bounds.width))))
         return np.sum(parts, axis=0)
-
-
-@eqx.filter_jit
-def _residuals(problem: JointProblem, vector: Array) -> Array:
-    return problem.residuals(vector)

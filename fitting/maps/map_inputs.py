@@ -177,8 +177,8 @@ def read_folder(folder: Path) -> dict[str, Any]:
     else:
         came = f"has {len(tables)} .lp files and no light_directions.txt" if tables else "has no file of lights"
         raise InputError(folder, came, "Put one lights.lp, or light_directions.txt, beside the photographs")
-    for key, stem in (("mask", "mask"), ("normals", "normals")):
-        beside = [path for path in sorted(folder.glob(f"{stem}.*")) if path.suffix.lower() in (*PICTURES, ".npy")]
+    for key in ("mask", "normals"):
+        beside = [path for path in sorted(folder.glob(f"{key}.*")) if path.suffix.lower() in (*PICTURES, ".npy")]
         found |= {key: beside[0]} if beside else {}
     return found
 

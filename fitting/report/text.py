@@ -6,7 +6,6 @@ import numpy as np
 
 from brdf.channels import channel_names
 from fitting.result import FitResult
-from fitting.selection import Candidate
 
 # Correlations above this are told, so many at most.
 STRONG, MOST_CORRELATIONS = 0.9, 3
@@ -44,15 +43,6 @@ def report(result: FitResult) -> str:
     return "\n".join(lines)
 
 
-def standing(candidate: Candidate) -> str:
-    """What the comparison of models says of one: "chosen", "adequate" or nothing.
-
-    Args:
-        candidate: one of them.
-    """
-    return "chosen" if candidate.chosen else "adequate" if candidate.excess <= candidate.excess_error else ""
-
-
 def _silent(files):
     """How files were read that do not say how they hold light."""
     silent = [file for file in files if file is not None and file.get("source") == "assumed"]
@@ -85,7 +75,7 @@ def _candidates(candidates):
         f"    {'model':<{width}}{'unknowns':>9}{'rms':>11}{'held out':>11}{'excess ± its error':>26}{'BIC':>12}",
     ]
     for one in candidates:
-        mark = f"  {'<- ' * one.chosen}{standing(one)}"
+        mark = "  <- chosen" if one.chosen else "  adequate" if one.excess <= one.excess_error else ""
         excess = f"{one.excess:.1f} ± {one.excess_error:.1f}" if one.excess < 1e6 else f"{one.excess:.2e}"
         bic = f"{one.bic:.1f}" if one.bic < 1e6 else f"{one.bic:.2e}"
         errors = f"{one.rms:>11.3e}{one.held_out:>11.3e}{excess:>26}{bic:>12}"

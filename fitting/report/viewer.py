@@ -16,6 +16,7 @@ from brdf.albedo import lobe_albedo, normalized_form
 from brdf.conversions import nearest_equations
 from brdf.errors import InputError
 from brdf.materials.exports import shader
+from brdf.materials.material_file import material_to_dict
 from brdf.models.base import SpecularMaterial
 from brdf.precision import working_precision
 from fitting.report.page import Page, Shown, asset, packed, secure_page, stage, white
@@ -60,11 +61,12 @@ def viewer(result: FitResult, picture: int | None = None) -> str:
     still = [np.concatenate([np.nan_to_num(image), counted[..., None]], axis=-1) for image in (target, fitted)]
     target_data, fitted_data = map(_packed, still)
     mirror = isinstance(material, SpecularMaterial) and normalized_form(type(material)) is brdf.NormalizedPhong
+    numbers = material_to_dict(material)
     data = {
-        "model": material.name,
+        "model": numbers.pop("model"),
         "family": "mirror" if mirror else "half",
         "weighted": getattr(material, "cosine_weighted", False),
-        "material": _numbers(material),
+        "material": numbers,
         "parameters": [one.to_dict() for one in result.parameters],
         "target": target_data,
         "still": "" if drawn["drawable"] else fitted_data,
@@ -79,11 +81,6 @@ def viewer(result: FitResult, picture: int | None = None) -> str:
     return stage(
         "surface.html", shown.data | drawn | data | {"albedo": {"degrees": _DEGREES.tolist()}} | tables, beside
     )
-
-
-def _numbers(material):
-    keys = [key for key in ("k_a", "k_d", "k_s", "n") if hasattr(material, key)]
-    return {key: np.asarray(getattr(material, key), np.float64).tolist() for key in keys}
 
 
 def _scene(scene):
