@@ -26,7 +26,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from brdf.geometry.camera import Camera
-from brdf.geometry.rays import shapes_met, surface_points
+from brdf.geometry.rays import surface_points, trace
 from brdf.geometry.shapes import Shape
 from brdf.geometry.surface_points import NO_SHAPE, PixelArea, SurfacePoints
 from brdf.lights.base import Light, Lighting, stacked
@@ -79,7 +79,7 @@ def _over_neighbours(change: Any, values: Array) -> Array:
 def _matters(points: SurfacePoints, camera: Camera, shapes: tuple[Shape, ...], lighting: Lighting) -> Array:
     """Through which pixels an edge of a shape passes, and which others are to be averaged."""
     column, row = (np.arange(size + 1.0) for size in camera.resolution)
-    corners = apart(shapes_met, camera, shapes, column[None], row[:, None])
+    corners = apart(lambda *rays: trace(*rays).shape, camera, shapes, column[None], row[:, None])
     seen = [corners[:-1, :-1], corners[1:, :-1], corners[:-1, 1:], corners[1:, 1:], points.met]
     edge = functools.reduce(jnp.logical_or, (one != seen[0] for one in seen))
     matters = jnp.zeros_like(edge)
@@ -107,7 +107,7 @@ def _averaged(points: SurfacePoints, camera: Camera, shapes: tuple[Shape, ...], 
     column, row = (pixel % width)[:, None], (pixel // width)[:, None]
     fine = surface_points(camera, shapes, column + rule.s, row + rule.t)
     right, down = (grid.ravel() for grid in np.meshgrid(side, side))
-    counted = apart(shapes_met, camera, shapes, column[:edges] + right, row[:edges] + down)
+    counted = apart(lambda *rays: trace(*rays).shape, camera, shapes, column[:edges] + right, row[:edges] + down)
     share = jnp.broadcast_to(jnp.asarray(rule.weight, fine.position.dtype), fine.mask.shape)
     share = share.at[:edges].set(_by_shares(share[:edges], fine.met[:edges], counted, len(shapes)))
     share = jnp.where((pixel < count)[:, None], share, 0.0)

@@ -24,6 +24,9 @@ from brdf.lights.base import Light
 from brdf.pixel_area import with_area
 from brdf.precision import Precision, cast, working_precision
 
+FEW_SHAPES = 4
+"""Up to so many spheres and rectangles are traced anew sooner than what they look like is read."""
+
 
 def _masks(value: Any) -> tuple[Any, ...]:
     """Given shadow masks: (H, W) values from 0 to 1, or None, one for each light; () where there are none."""
@@ -74,14 +77,12 @@ class Scene(Checked):
     def __check_init__(self):
         """Refuse parts that do not belong together."""
         words = "Write Scene(camera, shapes=[...], lights=[...]), or points=brdf.SurfacePoints.from_normals(...)"
-        for name, kind in {"camera": Camera, "points": SurfacePoints, "shapes": Shape, "lights": Light}.items():
-            part = getattr(self, name)
-            parts = (
-                {f"{name}[{index}]": one for index, one in enumerate(part)} if isinstance(part, tuple) else {name: part}
-            )
-            for place, one in parts.items():
-                if one is not None or isinstance(part, tuple):
-                    instance(place, one, kind, words)
+        for name, part, kind in (("camera", self.camera, Camera), ("points", self.points, SurfacePoints)):
+            if part is not None:
+                instance(name, part, kind, words)
+        for name, parts, kind in (("shapes", self.shapes, Shape), ("lights", self.lights, Light)):
+            for index, part in enumerate(parts):
+                instance(f"{name}[{index}]", part, kind, words)
         fitted = [shape.fitted for shape in self.shapes]
         if (self.camera is None) == (self.points is None):
             remedy = "Give either a camera and shapes, or an aov file"
@@ -128,45 +129,36 @@ class Scene(Checked):
         alone = self.camera is not None and len(self.shapes) == 1 and self.shapes[0].convex
         return () if alone else self.shapes
 
-    def surface_points(self, rows: tuple[int, int] | None = None) -> SurfacePoints:
-        """What each pixel sees: traced by the camera, or as given.
-
-        Args:
-            rows: the first one, and the one after the last, where not all are wanted; then pixels are seen at their
-                centres.
-
-        Returns:
-            (H, W) points, or as many rows.
-        """
-        height = self.resolution[1]
-        first, stop = rows or (0, height)
-        if self.points is not None:
-            assert rows is None or self.points.area is None
-            points = self.points if rows is None else jax.tree.map(lambda leaf: leaf[first:stop], self.points)
-        else:
-            assert self.camera is not None
-            points = PrimaryRays.of_rows(self.camera, self.shapes, first, stop).stored()
-        visibility = None
-        if self.visibility:
-            unshadowed = np.ones((height, self.resolution[0]), bool)
-            masks = [unshadowed if mask is None else mask for mask in self.visibility]
-            visibility = jnp.stack([mask[first:stop] for mask in masks], axis=-1)
-        points = dataclasses.replace(points, visibility=visibility)
-        if rows is not None or self.camera is None or self.camera.samples == 1:
-            return points
-        return with_area(points, self.camera, self.shapes, self.lights, self.occluders)
+    def surface_points(self) -> SurfacePoints:
+        """What each pixel sees, (H, W): traced by the camera, or as given."""
+        return self.sight().stored()
 
     def sight(self, rows: tuple[int, int] | None = None) -> Sight:
         """What each pixel sees, for programs that shade it: the rays alone where to trace them takes little time.
 
         Args:
-            rows: as for `surface_points`.
+            rows: the first one, and the one after the last, where not all are wanted; then pixels are seen at their
+                centres.
         """
-        camera = self.camera
-        if camera is None or (rows is None and camera.samples > 1) or any(mask is not None for mask in self.visibility):
-            return self.surface_points(rows)
-        rays = PrimaryRays.of_rows(camera, self.shapes, *((0, self.resolution[1]) if rows is None else rows))
-        return rays if rays.quick else rays.stored()
+        first, stop = rows or (0, self.resolution[1])
+        visibility = None
+        if self.visibility:
+            unshadowed = np.ones(self.resolution[::-1], bool)
+            masks = [unshadowed if mask is None else mask for mask in self.visibility]
+            visibility = jnp.stack([mask[first:stop] for mask in masks], axis=-1)
+        if self.camera is None:
+            assert self.points is not None
+            assert rows is None or self.points.area is None
+            points = self.points if rows is None else jax.tree.map(lambda leaf: leaf[first:stop], self.points)
+            return dataclasses.replace(points, visibility=visibility)
+        rays = PrimaryRays(self.camera, self.shapes, np.int32(first), stop - first)
+        averaged = rows is None and self.camera.samples > 1
+        # To trace them takes less time than to read what they met; meshes are asked on the host.
+        quick = len(self.shapes) <= FEW_SHAPES and all(shape.convex for shape in self.shapes)
+        if quick and visibility is None and not averaged:
+            return rays
+        points = dataclasses.replace(rays.stored(), visibility=visibility)
+        return with_area(points, self.camera, self.shapes, self.lights, self.occluders) if averaged else points
 
     @classmethod
     def load(
@@ -246,14 +238,8 @@ def some_pixels(
             points = _chosen(cast(scene, precision).surface_points(), pixel)
         # The points know which shape they lie on by its place in the list, so all shapes stay.
         hiding = tuple(dataclasses.replace(shape, fitted=False) for shape in scene.occluders)
-        choose = partial(_of_picture, pixel)
-        visibility = tuple(None if mask is None else choose(np.asarray(mask, np.float64)) for mask in scene.visibility)
+        visibility = [None if mask is None else np.asarray(mask).ravel()[pixel] for mask in scene.visibility]
         return Scene(points=points, shapes=hiding, ambient=scene.ambient, lights=scene.lights, visibility=visibility)
-
-
-def _of_picture(pixel: Any, leaf: Any) -> np.ndarray:
-    """Some pixels of (H, W, ...) values; through NumPy: an XLA gather is ten times slower."""
-    return np.asarray(leaf).reshape(-1, *leaf.shape[2:])[np.asarray(pixel)]
 
 
 def _chosen(points: SurfacePoints, pixel: Any) -> SurfacePoints:
@@ -262,7 +248,7 @@ def _chosen(points: SurfacePoints, pixel: Any) -> SurfacePoints:
     some = dataclasses.replace(points, visibility=None, area=None).pixels(pixel)
     if area is None:
         return some
-    slot = _of_picture(pixel, area.slot)
+    slot = np.asarray(area.slot).ravel()[pixel]  # an XLA gather is ten times slower
     has, new = slot >= 0, np.full_like(slot, -1)
     if not has.any():
         return some

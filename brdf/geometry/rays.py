@@ -54,11 +54,6 @@ def trace(camera: Camera, shapes: tuple[Shape, ...], column: Any, row: Any) -> P
     return Points(position, normal, camera.to_view(position), mask, index, facet=facet if has_facets else None)
 
 
-def shapes_met(camera: Camera, shapes: tuple[Shape, ...], column: Any, row: Any) -> Any:
-    """Index of the shape that each ray meets first, `NO_SHAPE` for none: what is left of `trace` for counting."""
-    return trace(camera, shapes, column, row).shape
-
-
 OFFSET = 300
 """Shadow rays start this many rounding errors above the surface: 4e-5 of the coordinates in float32."""
 
@@ -91,10 +86,6 @@ def share_seen(
     return seen
 
 
-FEW_SHAPES = 4
-"""Up to so many spheres and rectangles are traced anew sooner than what they look like is read."""
-
-
 @pytree
 class PrimaryRays:
     """The rays through the pixels' centres, whose `SurfacePoints` are made in each program that asks for them.
@@ -114,16 +105,6 @@ class PrimaryRays:
     first: Any
     height: int = dataclasses.field(metadata={"static": True})
     area: ClassVar[None] = None
-
-    @classmethod
-    def of_rows(cls, camera: Camera, shapes: tuple[Shape, ...], first: int, stop: int) -> "PrimaryRays":
-        """Those of some rows."""
-        return cls(camera, shapes, np.int32(first), stop - first)
-
-    @property
-    def quick(self) -> bool:
-        """Whether to trace them takes less time than to read what they met; meshes are asked on the host."""
-        return len(self.shapes) <= FEW_SHAPES and all(shape.convex for shape in self.shapes)
 
     @property
     def places(self) -> tuple[Any, Any]:
