@@ -187,11 +187,8 @@ def spectrum(name: str, value: Any, largest: float = LARGEST) -> Any:
 
 def vertex_list(name: str, value: Any) -> Any:
     """Corners of a polygon: three points or more."""
-
-    def fits(count=0, axes=0, *more) -> bool:
-        return count >= 3 and axes == 3 and not more
-
-    return _shaped(name, value, fits, "three points or more", "Give [[x, y, z], ...]")
+    words, remedy = "three points or more", "Give [[x, y, z], ...]"
+    return _shaped(name, value, lambda count=0, axes=0, *more: count >= 3 and axes == 3 and not more, words, remedy)
 
 
 def sample_number(value: Any, most: int = MAX_SAMPLES) -> int:
@@ -201,19 +198,6 @@ def sample_number(value: Any, most: int = MAX_SAMPLES) -> int:
     if not 1 <= value <= most:
         raise InputError("samples", f"must be between 1 and {most}, got {repr(value)[:60]}", "Give a whole number")
     return int(value)
-
-
-def spans_area(edge_u: Any, edge_v: Any) -> None:
-    """Refuse two edges, (3,) each, that are parallel; values under a JAX transformation pass.
-
-    Raises:
-        InputError: where they are parallel.
-    """
-    if isinstance(edge_u, np.ndarray) and isinstance(edge_v, np.ndarray):
-        area, *lengths = map(np.linalg.norm, (np.cross(edge_u, edge_v), edge_u, edge_v))
-        if area <= 1e-12 * np.prod(lengths):
-            came = f"got {edge_u.tolist()} and {edge_v.tolist()}"
-            raise InputError("edge_v", f"must not be parallel to edge_u, {came}", "Give two edges that span an area")
 
 
 def coefficients(**given: Any) -> list[Array | np.ndarray]:

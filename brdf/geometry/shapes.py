@@ -5,9 +5,11 @@ from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
-from brdf.checks import Checked, Scalar, Vector, checked, edge_value, positive, spans_area, vector
+from brdf.checks import Checked, Scalar, Vector, checked, edge_value, positive, vector
+from brdf.errors import InputError
 from brdf.vectors import Components, divide, norm, normalize, square_root
 
 
@@ -120,7 +122,25 @@ class Sphere(Shape):
         return jnp.where((along > 0) & (along < distance), share_beyond(sine, radius), 0.0)
 
 
-class Rectangle(Shape):
+class Parallelogram(Checked):
+    """A flat piece, ``center ± edge_u ± edge_v``, whose front side looks along ``edge_u`` × ``edge_v``."""
+
+    center: Vector = checked(vector, "center")
+    edge_u: Vector = checked(edge_value, "edge_u")
+    edge_v: Vector = checked(edge_value, "edge_v")
+
+    def __check_init__(self):
+        """Refuse edges that are parallel; values under a JAX transformation pass."""
+        edge_u, edge_v = self.edge_u, self.edge_v
+        if isinstance(edge_u, np.ndarray) and isinstance(edge_v, np.ndarray):
+            area, *lengths = map(np.linalg.norm, (np.cross(edge_u, edge_v), edge_u, edge_v))
+            if area <= 1e-12 * np.prod(lengths):
+                came = f"got {edge_u.tolist()} and {edge_v.tolist()}"
+                remedy = "Give two edges that span an area"
+                raise InputError("edge_v", f"must not be parallel to edge_u, {came}", remedy)
+
+
+class Rectangle(Shape, Parallelogram):
     """A parallelogram, ``center ± edge_u ± edge_v``, whose front side looks along ``edge_u`` × ``edge_v``.
 
     Args:
@@ -135,14 +155,6 @@ class Rectangle(Shape):
     Example:
         >>> floor = brdf.Rectangle(center=[0, -1, 0], edge_u=[0, 0, 2], edge_v=[2, 0, 0])  # looks up, along y
     """
-
-    center: Vector = checked(vector, "center")
-    edge_u: Vector = checked(edge_value, "edge_u")
-    edge_v: Vector = checked(edge_value, "edge_v")
-
-    def __check_init__(self):
-        """Refuse edges that span no area."""
-        spans_area(self.edge_u, self.edge_v)
 
     def extent(self) -> Array:
         """The larger half-edge's largest component."""

@@ -29,15 +29,14 @@ from brdf.checks import (
     Spectrum,
     Vector,
     checked,
-    edge_value,
     positive,
     sample_number,
-    spans_area,
     spectrum,
     vector,
     vertex_list,
 )
 from brdf.errors import InputError
+from brdf.geometry.shapes import Parallelogram
 from brdf.geometry.surface_points import Points
 from brdf.lights.base import Light, LightSample, Rows
 from brdf.lights.sample_sets import square_rule, turned_rule
@@ -90,7 +89,7 @@ class FlatLight(Light):
         return LightSample(to_light, squared_radius, norm(offset), square_root(squared_radius))
 
 
-class RectangleLight(FlatLight):
+class RectangleLight(FlatLight, Parallelogram):
     """A parallelogram, ``center ± edge_u ± edge_v``, that shines along ``edge_u`` × ``edge_v``.
 
     Args:
@@ -109,16 +108,9 @@ class RectangleLight(FlatLight):
         64
     """
 
-    center: Vector = checked(vector, "center")
-    edge_u: Vector = checked(edge_value, "edge_u")
-    edge_v: Vector = checked(edge_value, "edge_v")
     radiance: Spectrum = checked(spectrum, "radiance")
     samples: int = eqx.field(static=True, converter=sample_number, default=SAMPLES)
     type_name = "rectangle"
-
-    def __check_init__(self):
-        """Refuse edges that span no area."""
-        spans_area(self.edge_u, self.edge_v)
 
     @property
     def rows(self) -> Rows:

@@ -64,9 +64,13 @@ class Light(Checked):
     type_name: ClassVar[str]
 
     @property
-    @abc.abstractmethod
     def rows(self) -> Rows:
-        """Its numbers; those of its samples, (S, ...) each; the spectrum they emit, (C,), or (S, C)."""
+        """Its numbers; those of its samples, (S, ...) each; the spectrum they emit, (C,), or (S, C).
+
+        A light without extent is a single sample, of all its numbers in the order of its fields.
+        """
+        each = [value[None] for name, value in vars(self).items() if name != "intensity"]
+        return (), tuple(each), self.emittance
 
     @staticmethod
     @abc.abstractmethod

@@ -10,7 +10,7 @@ import numpy as np
 from brdf.checks import Scalar, Spectrum, Vector, checked, direction_value, number, spectrum, vector
 from brdf.errors import InputError
 from brdf.geometry.surface_points import Points
-from brdf.lights.base import Light, LightSample, Rows
+from brdf.lights.base import Light, LightSample
 from brdf.vectors import cosine_lobe, divide, norm, normalize
 
 
@@ -34,11 +34,6 @@ class DirectionalLight(Light):
     direction: Vector = checked(direction_value, "direction")
     intensity: Spectrum = checked(spectrum, "intensity")
     type_name = "directional"
-
-    @property
-    def rows(self) -> Rows:
-        """It is a single sample."""
-        return (), (self.direction[None],), self.intensity
 
     @staticmethod
     def sample(point: Points, *row: Any) -> LightSample:
@@ -79,11 +74,6 @@ class PointLight(Light):
     intensity: Spectrum = checked(spectrum, "intensity")
     attenuation: Vector = eqx.field(converter=_attenuation, default=(0.0, 0.0, 1.0))
     type_name = "point"
-
-    @property
-    def rows(self) -> Rows:
-        """It is a single sample."""
-        return (), (self.position[None], self.attenuation[None]), self.intensity
 
     @staticmethod
     def sample(point: Points, *row: Any) -> LightSample:
@@ -134,16 +124,10 @@ class SpotLight(Light):
             came = f"must be 0 to 90 degrees, or 180, got {float(self.cutoff_angle):g}"
             raise InputError("cutoff_angle", came, "A spot of more than 90 degrees is a point light")
 
-    @property
-    def rows(self) -> Rows:
-        """It is a single sample."""
-        each = self.position, self.attenuation, self.direction, self.cutoff_angle, self.exponent
-        return (), tuple(one[None] for one in each), self.intensity
-
     @staticmethod
     def sample(point: Points, *row: Any) -> LightSample:
         """A point light's, times the spot's factor."""
-        position, attenuation, direction, cutoff_angle, exponent = row
+        position, direction, cutoff_angle, exponent, attenuation = row
         sample = PointLight.sample(point, position, attenuation)
         axis = normalize(direction)
         inside = (cutoff_angle >= 180) | (-(sample.to_light @ axis) >= jnp.cos(jnp.deg2rad(cutoff_angle)))
