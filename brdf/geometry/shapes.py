@@ -18,7 +18,7 @@ class Hit(NamedTuple):
 
     Attributes:
         hit: whether they do, in front of the origin.
-        distance: along the ray, in units of its direction's length; infinite where it misses.
+        distance: along the ray, in units of its direction's length; any number where it misses.
         position: the point, finite also where the ray misses.
         normal: the unit normal there, finite also where the ray misses.
         shading: the normal of the surface that a flat piece stands for; None where that is ``normal``.
@@ -107,7 +107,7 @@ class Sphere(Shape):
         signed = jnp.where(-along - half_chord > 0, -half_chord, half_chord)
         hit = (squared_half_chord > 0) & (signed - along > 0)
         normal = normalize(nearest + direction * signed)
-        return Hit(hit, jnp.where(hit, signed - along, jnp.inf), center + normal * radius, normal)
+        return Hit(hit, signed - along, center + normal * radius, normal)
 
     def cover(self, origin: Components, direction: Components, distance: Any, radius: Any) -> Array:
         """The share of the patch within the cone that the sphere fills; see `Shape.cover`."""
@@ -163,12 +163,9 @@ class Rectangle(Shape, Parallelogram):
     def intersect(self, origin: Components, direction: Components) -> Hit:
         """The hit, from either side; the normal always is that of the front side."""
         center, edge_u, edge_v = map(Components.of, (self.center, self.edge_u, self.edge_v))
-        area = edge_u.cross(edge_v)
-        position, distance, normal, slope = meet_plane(origin, direction, center, area)
-        offset = position - center
-        u, v = (one @ area / (area @ area) for one in (offset.cross(edge_v), edge_u.cross(offset)))
+        position, distance, normal, slope, (u, v) = meet_plane(origin, direction, center, edge_u, edge_v)
         hit = (slope != 0) & (distance > 0) & (jnp.abs(u) <= 1) & (jnp.abs(v) <= 1)
-        return Hit(hit, jnp.where(hit, distance, jnp.inf), position, normal)
+        return Hit(hit, distance, position, normal)
 
     def cover(self, origin: Components, direction: Components, distance: Any, radius: Any) -> Array:
         """The share of the patch within the pyramid over the rectangle; see `Shape.cover`."""
@@ -189,14 +186,20 @@ class Rectangle(Shape, Parallelogram):
 
 
 def meet_plane(
-    origin: Components, direction: Components, place: Components, area: Components
-) -> tuple[Components, Array, Components, Array]:
-    """Where rays meet the plane through a place at right angles to a vector.
+    origin: Components, direction: Components, place: Components, edge_u: Components, edge_v: Components
+) -> tuple[Components, Array, Components, Array, tuple[Array, Array]]:
+    """Where rays meet the plane through a place and two edges that begin there.
 
     Returns:
-        Position, distance, unit normal, and the cosine between that and the ray; 0 where they never meet.
+        Position, distance, unit normal, the cosine between that and the ray, 0 where they never meet, and how many of
+        each edge lead from the place to the position.
     """
+    area = edge_u.cross(edge_v)
     normal = normalize(area)
     slope = direction @ normal
     distance = divide((place - origin) @ normal * slope, slope * slope)
-    return origin + direction * distance, distance, normal, slope
+    position = origin + direction * distance
+    offset = position - place
+    # By the normal: the square of a small triangle's area is below all that float32 divides by.
+    u, v = (divide(one @ normal, area @ normal) for one in (offset.cross(edge_v), edge_u.cross(offset)))
+    return position, distance, normal, slope, (u, v)

@@ -28,7 +28,7 @@ from brdf.checks import LARGEST, Scalar, instance
 from brdf.errors import InputError
 from brdf.files import parse_number, read_text
 from brdf.geometry.shapes import Hit, Shape, meet_plane
-from brdf.vectors import Components, divide, normalize, select
+from brdf.vectors import Components, normalize, select
 
 CREASE = np.radians(30.0)
 """Faces that meet at this angle or more meet in an edge, not in a rounding."""
@@ -262,14 +262,10 @@ class Triangles(Shape):
             return map(Components.of, jnp.unstack(jnp.asarray(values, rays[0].dtype)[triangle], axis=-2))
 
         first, second, third = corners(self.mesh.vertices[self.mesh.faces])
-        edge, other_edge = second - first, third - first
-        area = edge.cross(other_edge)
-        position, distance, normal, slope = meet_plane(origin, direction, first, area)
+        position, distance, normal, slope, (u, v) = meet_plane(origin, direction, first, second - first, third - first)
         hit, shading = (triangle >= 0) & (distance > 0), None
         if self.mesh.normals is not None:
-            offset = position - first
-            u, v = (divide(one @ area, area @ area) for one in (offset.cross(other_edge), edge.cross(offset)))
             a, b, c = corners(self.mesh.normals)
             shading = normalize(a * (1.0 - u - v) + b * u + c * v)
             shading = select(slope < 0, shading, normal)  # the back is not lit, however its normals lean
-        return Hit(hit, jnp.where(hit, distance, jnp.inf), position, normal, shading)
+        return Hit(hit, distance, position, normal, shading)

@@ -42,6 +42,18 @@ def test_a_sphere_of_triangles_is_shaded_as_a_sphere(tmp_path):
     assert np.mean(flat) > 5 * max(np.mean(given), np.mean(found))
 
 
+def test_triangles_of_any_size_are_shaded_smoothly(tmp_path):
+    normals = []
+    for unit in (1.0, 1e-6):
+        ball = trimesh.creation.icosphere(subdivisions=1, radius=unit)
+        camera = brdf.OrthographicCamera(
+            position=[0, 0, 4 * unit], target=[0, 0, 0], up=[0, 1, 0], width=2.2 * unit, resolution=(8, 8)
+        )
+        scene = brdf.cast(brdf.Scene(camera, [load(tmp_path, obj(ball))]), "float32")
+        normals.append(scene.surface_points().normal)
+    np.testing.assert_allclose(*normals, atol=1e-4)
+
+
 def test_the_faces_around_a_vertex_weigh_by_their_angle(tmp_path):
     # A flat pyramid of three sides, one of them cut in many thin triangles: equal angles, equal weights.
     tilt, fan = np.radians(5.0), 16
