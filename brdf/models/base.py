@@ -56,9 +56,8 @@ class Material(Checked):
         if isinstance(self, SpecularMaterial):
             self.n = exponent(self.n)
 
-    @abstractmethod
     def specular(self, normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
-        """The specular term S of the shading equation, without k_s.
+        """The specular term S of the shading equation, without k_s; 0 everywhere for a model that has none.
 
         Args:
             normal: unit vectors, (..., 3).
@@ -68,6 +67,7 @@ class Material(Checked):
         Returns:
             (...), at least 0; 0 where N.L <= 0 or N.V <= 0.
         """
+        return jnp.zeros_like(vectors.dot(normal, to_light) + vectors.dot(normal, to_view))
 
     def reflectance(self, to_light: Directions, to_view: Directions) -> Float[Array, "*batch C"]:
         """The BRDF f_r in 1/sr, in the local frame whose +z axis is the normal.

@@ -4,16 +4,11 @@
 | --- | --- | --- | --- |
 | k_a | 0 | ambient coefficient, a number or (C,), at least 0 | yes |
 | k_d | | diffuse coefficient, a number or (C,), at least 0: the albedo | yes |
-
-Reciprocal. Conserves energy when k_d <= 1. Source: J. H. Lambert, Photometria, 1760.
 """
 
 from typing import ClassVar
 
-import jax.numpy as jnp
-
 from brdf.models.base import Material
-from brdf.vectors import Directions, Scalars, dot
 
 
 class Lambert(Material):
@@ -34,7 +29,3 @@ class Lambert(Material):
     """
 
     name: ClassVar[str] = "lambert"
-
-    def specular(self, normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
-        """The specular term S, which is 0; see `Material.specular`."""
-        return jnp.zeros_like(dot(normal, to_light) + dot(normal, to_view))
