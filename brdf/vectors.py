@@ -18,11 +18,12 @@ multiply-adds). The leading part has no derivative, the rest has all of it, and 
 differentiation gives the derivative of the plain product. In float64 there is nothing to gain, and nothing is split.
 """
 
+import dataclasses
 import functools
 import operator
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +39,6 @@ _SMALLEST = {np.dtype(np.float32): 1e-18, np.dtype(np.float64): 1e-153}
 """The smallest cosine told from zero: its inverse square is finite."""
 
 Numbers = Float[ArrayLike, "*#batch"]
-Vectors = Float[Array, "*batch 3"]
 Scalars = Float[Array, "*batch"]
 
 
@@ -199,15 +199,15 @@ def lobe(log_cosine: Numbers, n: Numbers) -> Scalars:
 def log_cosine(a: Directions, b: Directions) -> Scalars:
     """Logarithm of the cosine of the angle between two directions, accurate near the peak and near the horizon."""
     first, second = _split(a, b)
-    across = _cross(first, second)
-    return _from_tangent(across @ across, _dot(first, second))
+    across = first.cross(second)
+    return _from_tangent(across @ across, first @ second)
 
 
 def half_log_cosine(normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
     """Logarithm of N.H, of normal and half vector, which is never formed: float32 would round it too coarsely."""
     axis, _, total, _ = _about(normal, to_light, to_view)
-    across = _cross(axis, total)
-    return _from_tangent(across @ across, _dot(axis, total))
+    across = axis.cross(total)
+    return _from_tangent(across @ across, axis @ total)
 
 
 def mirror_log_cosine(normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
@@ -217,11 +217,11 @@ def mirror_log_cosine(normal: Directions, to_light: Directions, to_view: Directi
     log(R.V) = -log(1 + ‖R - V‖² / (2 R.V)).
     """
     axis, product, total, difference = _about(normal, to_light, to_view)
-    along_total, along_difference, across = _dot(axis, total), _dot(axis, difference), _cross(axis, total)
+    along_total, along_difference, across = axis @ total, axis @ difference, axis.cross(total)
     distance = across @ across + along_difference * along_difference
     # R.V |N|^2 = 2 (N.L)(N.V) - (L.V) |N|^2, where 4 (N.L)(N.V) = (N.s)^2 - (N.d)^2
     twice_product = 0.5 * (along_total - along_difference) * (along_total + along_difference)
-    cosine = twice_product - product * _dot(axis, axis)
+    cosine = twice_product - product * (axis @ axis)
     # (1 + distance / (2 cos))^2 = 1 + (distance cos + distance^2 / 4) / cos^2
     return _from_tangent(distance * (cosine + 0.25 * distance), cosine)
 
@@ -256,7 +256,8 @@ def _from_tangent_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array
 _GRID = 2048.0  # products of two leading parts are multiples of 2^-22, so sums of a few stay below 2^24 steps
 
 
-class _Split(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class _Split:
     """A vector as an exact sum of a leading part on a coarse grid and a rest; in float64 the leading part is all.
 
     Components are kept apart: a compiler that sees (..., 3) arrays stacked again computes each of them three times.
@@ -265,6 +266,35 @@ class _Split(NamedTuple):
     value: Components
     high: Components
     low: Components | None
+
+    def __matmul__(self, other: "_Split") -> Array:
+        """The scalar product of vectors whose components lie within +-2."""
+        leading = self.high @ other.high
+        if self.low is None or other.low is None:
+            return leading
+        return leading + Components((*self.high, *self.low)) @ Components((*other.low, *other.value))
+
+    def cross(self, other: "_Split") -> Components:
+        """The vector product of such."""
+        leading = self.high.cross(other.high)
+        if self.low is None or other.low is None:
+            return leading
+        return leading + (self.high.cross(other.low) + self.low.cross(other.value))
+
+    def __add__(self, other: "_Split") -> "_Split":
+        return self._combined(operator.add, other)
+
+    def __sub__(self, other: "_Split") -> "_Split":
+        return self._combined(operator.sub, other)
+
+    def _combined(self, operation: Callable[[Any, Any], Any], other: "_Split") -> "_Split":
+        low = None if self.low is None else operation(self.low, other.low)
+        return _Split(operation(self.value, other.value), operation(self.high, other.high), low)
+
+    def less(self, small: Components) -> "_Split":
+        """The difference from a small vector."""
+        value = self.value - small
+        return _Split(value, value, None) if self.low is None else _Split(value, self.high, self.low - small)
 
 
 def _split(*vectors: Directions) -> list[_Split]:
@@ -281,40 +311,12 @@ def _split(*vectors: Directions) -> list[_Split]:
     return parts
 
 
-def _dot(a: _Split, b: _Split) -> Array:
-    """The scalar product of vectors whose components lie within +-2."""
-    leading = functools.reduce(operator.add, map(operator.mul, a.high.parts, b.high.parts))
-    if a.low is None or b.low is None:
-        return leading
-    return leading + functools.reduce(
-        operator.add, map(operator.mul, (*a.high.parts, *a.low.parts), (*b.low.parts, *b.value.parts))
-    )
-
-
-def _cross(a: _Split, b: _Split) -> Components:
-    """The vector product of such."""
-    leading = a.high.cross(b.high)
-    return leading if a.low is None or b.low is None else leading + (a.high.cross(b.low) + a.low.cross(b.value))
-
-
-def _combined(operation: Callable[[Any, Any], Any], a: _Split, b: _Split) -> _Split:
-    """Sum or difference."""
-    low = None if a.low is None else operation(a.low, b.low)
-    return _Split(operation(a.value, b.value), operation(a.high, b.high), low)
-
-
 def _about(normal: Directions, to_light: Directions, to_view: Directions) -> tuple[_Split, Array, _Split, _Split]:
     """The normal, L . V, and sum and difference of L and V after giving both one length.
 
     Rounding makes their lengths differ by 1e-7: by the excess (|L|^2 - |V|^2) / 4 = (s . d) / 4.
     """
     axis, light, view = _split(normal, to_light, to_view)
-    total, difference = _combined(operator.add, light, view), _combined(operator.sub, light, view)
-    excess = 0.25 * _dot(difference, total)
-    return axis, _dot(light, view), _less(total, difference.value * excess), _less(difference, total.value * excess)
-
-
-def _less(vector: _Split, small: Components) -> _Split:
-    """The difference."""
-    value = vector.value - small
-    return _Split(value, value, None) if vector.low is None else vector._replace(value=value, low=vector.low - small)
+    total, difference = light + view, light - view
+    excess = 0.25 * (difference @ total)
+    return axis, light @ view, total.less(difference.value * excess), difference.less(total.value * excess)
