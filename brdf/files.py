@@ -214,19 +214,6 @@ def atomic_folder(path: AnyPath) -> Iterator[Path]:
                 parent.rmdir()  # refused where there is something in it
 
 
-def check_folder(path: AnyPath) -> None:
-    """Refuse a folder of results that cannot be made or written, before there are any; nothing of the trial stays.
-
-    Args:
-        path: the folder.
-
-    Raises:
-        InputError: if it cannot be made or written.
-    """
-    with atomic_folder(path):
-        pass
-
-
 def _move_together(new: Path, old: Path, folder: Path) -> None:
     """Move the new files into place; if one fails, put back the old ones."""
     with ExitStack() as undo:

@@ -51,7 +51,11 @@ FLAT = 1e-6
 def _positive_range(at_0: Array, at_1: Array) -> tuple[Array, Array]:
     """Where in [0, 1] a linear function is positive, given its ends: lower and upper bound, equal where it never is."""
     slope = at_1 - at_0
-    crossing = jnp.clip(divide(-at_0 * jnp.sign(slope), jnp.abs(slope)), 0.0, 1.0)
+    return _between(at_0, at_1, jnp.clip(divide(-at_0 * jnp.sign(slope), jnp.abs(slope)), 0.0, 1.0))
+
+
+def _between(at_0: Array, at_1: Array, crossing: Array) -> tuple[Array, Array]:
+    """The same of any function that changes its sign once at most."""
     low = jnp.where(at_0 > 0, 0.0, jnp.where(at_1 > 0, crossing, 0.0))
     high = jnp.where(at_1 > 0, 1.0, jnp.where(at_0 > 0, crossing, 0.0))
     return low, high
@@ -251,7 +255,4 @@ def _arc_above_horizon(axial: Array, outward: Array, height: Array) -> tuple[Arr
     outward``, which changes its sign where the cosine is |outward| / √(axial² + outward²).
     """
     cosine = divide(jnp.abs(outward), square_root(axial * axial + outward * outward))
-    crossing = jnp.clip(divide(1.0 - cosine, height), 0.0, 1.0)
-    low = jnp.where((axial <= 0) & (outward > 0), crossing, 0.0)
-    high = jnp.where(axial > 0, jnp.where(outward >= 0, 1.0, crossing), jnp.where(outward > 0, 1.0, 0.0))
-    return low, high
+    return _between(axial, outward, jnp.clip(divide(1.0 - cosine, height), 0.0, 1.0))

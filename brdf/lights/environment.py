@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from brdf.checks import Spectrum, checked, sample_number, spectrum
-from brdf.errors import InputError
+from brdf.errors import InputError, as_numbers
 from brdf.geometry.surface_points import Points
 from brdf.lights.base import Light, LightSample, Rows
 from brdf.lights.sample_sets import turned_rule
@@ -200,10 +200,7 @@ def patch_cosine(middle: Array, variance: Array) -> tuple[Array, Array]:
 
 
 def _checked(pixels: Any) -> np.ndarray:
-    try:
-        array = np.array(pixels, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError("pixels", "must be numbers", "Give an array of shape (H, W, C)") from None
+    array = np.array(as_numbers("pixels", pixels, remedy="Give an array of shape (H, W, C)"))
     if array.ndim != 3 or 0 in array.shape:
         raise InputError("pixels", f"must be of shape (H, W, C), got {array.shape}", "Give a lat-long map")
     bad = ~(np.isfinite(array) & (array >= 0))

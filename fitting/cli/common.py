@@ -18,7 +18,7 @@ import typer
 
 import brdf
 from brdf.errors import InputError
-from brdf.files import check_folder
+from brdf.files import atomic_folder
 
 # By what Slurm, Open MPI and `jax.distributed` itself say how many processes there are.
 PROCESSES = ("SLURM_NTASKS", "OMPI_COMM_WORLD_SIZE", "JAX_NUM_PROCESSES")
@@ -235,7 +235,8 @@ def check_outputs(out: Path | None, plot: bool = False, page: Path | None = None
     if page is not None and not os.access(page.absolute().parent, os.W_OK):
         raise InputError(page, f"cannot be written into {page.parent}", "Name another folder")
     if out is not None:
-        check_folder(out)
+        with atomic_folder(out):
+            pass  # refused before there are any results; nothing of the trial stays
 
 
 def show(told: Any) -> None:

@@ -55,7 +55,7 @@ MISUSES = {
     "brdf.OrthographicCamera([0, 0, 4], [0, 0, 0])": r"OrthographicCamera: too many positional .*position=\.\.\.",
     "brdf.Triangles('mesh.obj')": r"mesh: must be a Mesh, got str\. Write Triangles\(brdf\.load_mesh",
     "brdf.load_mesh(3)": r"path: must be text, got int\.",
-    "brdf.EnvironmentMap('sky.exr')": r"pixels: must be numbers\.",
+    "brdf.EnvironmentMap('sky.exr')": r"pixels: must be numbers, got 'sky\.exr'\.",
     "brdf.some_pixels(scene, mask)": r"pixel: must be whole numbers .* Of a mask, give np\.flatnonzero\(mask\)",
     "brdf.some_pixels(scene, np.array([10**6]))": r"pixel: must be whole numbers from 0 to 2303",
     "brdf.Scene(scene.camera, shapes=[None])": r"shapes\[0\]: must be a Shape, got NoneType\.",
