@@ -385,10 +385,6 @@ class Lobe:
         slot = np.where(slot >= 0, np.searchsorted(rows, slot), -1)
         return dataclasses.replace(lobe, fine=self.fine.on_host(rows), slot=slot)
 
-    def over_areas(self, fine: "Lobe", slot: Int[Array, " P"]) -> "Lobe":
-        """The lobe where some pixels are averaged: the finer one, and the place of each pixel in it."""
-        return dataclasses.replace(self, peak=averaged(slot, self.peak, fine.peak), fine=fine, slot=slot)
-
 
 def averaged(slot: Any, centre: Any, fine: Any) -> Any:
     """Values at pixels' centres, (P,) or (..., P, C), and in their place those of the pixels that have finer ones."""

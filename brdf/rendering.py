@@ -54,12 +54,10 @@ class Basis:
     """What the pixels show before any material: flat over the picture's pixels, row by row.
 
     Attributes:
-        points: what the pixels see, (H, W) or (P,).
         diffuse: sum of I (N·L)+, (P, C); None without lights.
         lobe: the specular basis as a function of n; None without lights or for a model without a specular term.
     """
 
-    points: Sight
     diffuse: Float[Array, "P C"] | None
     lobe: Lobe | None
 
@@ -84,9 +82,9 @@ def basis(
     points = scene.sight() if points is None else points
     lighting, area = _lighting(scene, points), points.area
     if not lighting.stacks:
-        return Basis(points, None, None)
+        return Basis(None, None)
     if near is not None and area is None and is_sampled(lighting):
-        return Basis(points, *_tabulated(model, points.stored().pixels(), lighting, near, counts))
+        return Basis(*_tabulated(model, points.stored().pixels(), lighting, near, counts))
     made = []
     for seen in [points] if area is None else [dataclasses.replace(points, area=None), area.points]:
         values = seen.count * lighting.samples * (1 + lighting.channels)
@@ -98,8 +96,10 @@ def basis(
     if area is not None:
         slot, (fine_diffuse, fine_lobe) = area.slot.ravel(), made[1]
         diffuse = averaged(slot, diffuse, fine_diffuse)
-        lobe = None if lobe is None or fine_lobe is None else lobe.over_areas(fine_lobe, slot)
-    return Basis(points, diffuse, lobe)
+        if lobe is not None and fine_lobe is not None:
+            peak = averaged(slot, lobe.peak, fine_lobe.peak)
+            lobe = dataclasses.replace(lobe, peak=peak, fine=fine_lobe, slot=slot)
+    return Basis(diffuse, lobe)
 
 
 def _tabulated(

@@ -7,6 +7,8 @@
   that of the classic forms grows without bound towards grazing light for k_s > 0.
 """
 
+import dataclasses
+
 import jax
 import numpy as np
 
@@ -114,6 +116,6 @@ def _energy(material: Material, classic: bool) -> Finding:
     if classic:
         words = f"the albedo exceeds 1 for light beyond {crossing:.4g}° and grows without bound, "
         words += f"to {value:.3g} at {light}"
-    found = crossing if value > ENERGY_LIMIT + bound else None
     failed = f"does not conserve energy: {words}{named}"
-    return judged(value, ENERGY_LIMIT, float(bound), (light, None, channel), words + named, failed, crossing=found)
+    finding = judged(value, ENERGY_LIMIT, float(bound), (light, None, channel), words + named, failed)
+    return dataclasses.replace(finding, crossing=crossing if value > ENERGY_LIMIT + bound else None)

@@ -229,10 +229,6 @@ class _Scan:
             radius = np.clip(radius * np.where(better, 1.5, 0.5), 1e-8, 0.5)
         return vectors
 
-    def named(self, channel: int) -> str:
-        """The channel in words, where there are several."""
-        return in_channel(channel, self.sample.channels)
-
 
 # -- the three tests ---------------------------------------------------------------------------------------------------
 
@@ -253,7 +249,7 @@ def _worst(scan: _Scan, function: Callable[..., np.ndarray], pairs: np.ndarray) 
 def _positivity(scan: _Scan) -> Finding:
     found, bound, pair, channel = _worst(scan, lambda a, b: -scan.sample(a, b), scan.negative)
     light, view = map(Angles.of, pair)
-    words = f"f_r is {-found:.4g}/sr for light {light}, view {view}{scan.named(channel)}"
+    words = f"f_r is {-found:.4g}/sr for light {light}, view {view}{in_channel(channel, scan.sample.channels)}"
     where = light, view, channel
     return judged(-found, -1e-9 * scan.scale, bound, where, f"the least {words}", f"negative: {words}", least=True)
 
@@ -269,7 +265,7 @@ def _reciprocity(scan: _Scan) -> Finding:
     compared = f"{there:.4g}/sr, but {back:.4g}/sr the other way round"
     if 0 < back < there < 1e4 * back:
         compared = f"{times(there / back)} f_r({view} → {light})"
-    failed = f"not reciprocal: f_r({light} → {view}) is {compared}{scan.named(channel)}"
+    failed = f"not reciprocal: f_r({light} → {view}) is {compared}{in_channel(channel, scan.sample.channels)}"
     return judged(value, RECIPROCITY_LIMIT, bound, (light, view, channel), passed, failed)
 
 
@@ -288,7 +284,7 @@ def _energy(scan: _Scan) -> Finding:
         score = albedo + bound
     row, channel = largest(score)
     value, light = float(albedo[row, channel]), Angles.of(lights[row])
-    words = f"the largest albedo is {value:.6g} for light {light}{scan.named(channel)}"
+    words = f"the largest albedo is {value:.6g} for light {light}{in_channel(channel, scan.sample.channels)}"
     where, failed = (light, None, channel), f"does not conserve energy: {words}"
     return judged(value, ENERGY_LIMIT, float(bound[row, channel]), where, words, failed)
 

@@ -149,7 +149,6 @@ def judged(
     failed: str | None = None,
     *,
     least: bool = False,
-    crossing: float | None = None,
 ) -> Finding:
     """A finding, its verdict read off its numbers.
 
@@ -161,12 +160,11 @@ def judged(
         passed: the finding in words.
         failed: that of one that fails, where it is another.
         least: whether the limit is one from below.
-        crossing: see `Finding`.
     """
     margin = value - limit if least else limit - value
     verdict: Verdict = "pass" if margin >= bound else "fail" if -margin > bound else "cannot tell"
     sentence = failed if failed and verdict == "fail" else passed
-    return Finding(verdict, value, limit, margin, bound, *where, sentence, crossing)
+    return Finding(verdict, value, limit, margin, bound, *where, sentence)
 
 
 def largest(values: np.ndarray) -> tuple[int, ...]:
