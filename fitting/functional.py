@@ -39,6 +39,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 import brdf
@@ -46,6 +48,7 @@ from brdf.checks import instance
 from brdf.errors import InputError
 from brdf.models.base import SpecularMaterial, check_model
 from brdf.rendering import Basis, basis
+from fitting.problem import check_choice
 from fitting.solver.nnls import nonnegative_minima
 from fitting.solver.profile import lowest_in_cells
 
@@ -146,7 +149,8 @@ def fit(
         The material, and cost and errors.
 
     Raises:
-        InputError: where the model is no class of a material, or the picture is not what the scene shows.
+        InputError: where the model is no class of a material, the picture is not what the scene shows or holds codes,
+            or another argument cannot be used.
 
     Example:
         >>> import jax, jax.numpy as jnp
@@ -158,10 +162,22 @@ def fit(
     """
     check_model(model)
     instance("scene", scene, brdf.Scene, "Write fitting.functional.fit(target, scene)")
+    check_choice("squared", ("squared",), n_range)
     target, (width, height) = jnp.asarray(target), scene.resolution
-    if target.shape[:2] != (height, width) or target.ndim != 3:
-        came = f"must be of shape ({height}, {width}, C), got {target.shape}"
+    channels = target.shape[-1] if scene.channels == 1 and target.ndim == 3 else scene.channels
+    if target.shape != (height, width, channels):
+        shown = "C" if scene.channels == 1 else channels
+        came = f"must be of shape ({height}, {width}, {shown}), got {target.shape}"
         raise InputError("target", came, "Give the picture that the scene shows")
+    if not jnp.issubdtype(target.dtype, jnp.floating):
+        remedy = "Decode it, as brdf.read_image does, or use fitting.fit, which knows what codes say"
+        raise InputError("target", f"must hold linear values, got codes of type {target.dtype}", remedy)
+    target = target.astype(jnp.promote_types(target.dtype, jnp.float32))
+    if weight is not None:
+        counts = isinstance(weight, Tracer) or np.all(np.asarray(weight) >= 0)
+        if np.shape(weight) != (height, width) or not counts:
+            came = f"must be of shape ({height}, {width}) and at least 0, got shape {np.shape(weight)}"
+            raise InputError("weight", came, "Give a weight for each pixel, 0 for those that do not count")
     scene = brdf.cast(scene, "float64" if target.dtype == jnp.float64 else "float32")
     points = scene.sight()
     seen = jnp.ravel(points.mask)

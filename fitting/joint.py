@@ -103,7 +103,8 @@ def fit_jointly(
             for the simplest adequate model under the scenes that were found.
         free: from material and list of scenes to the leaves to fit, for example
             ``lambda m, s: (m.k_d, m.n, s[0].lights[0].direction)``; all others are held. Or what `FitResult.diagnosis`
-            names beside the whole material: "light", "intensity", "ball" or "radius", also "light 1 of picture 0".
+            names beside the whole material: "light", "intensity", "ball" or "radius", also "light 1 of picture 0"; None
+            for the material alone.
             Where camera or shapes are freed, pixels near an outline do not count.
         solver: "lm", "bfgs", or None for Gauss and Newton's steps, and where they do not gain one of these by size.
         precision: "float32" or "float64".
@@ -137,7 +138,8 @@ def fit_jointly(
     if not (callable(free) or free is None or isinstance(free, Sequence)):
         came = f"must be a function or names, got {type(free).__name__}"
         raise InputError("free", came, "Write lambda material, scenes: (material.n,), or light")
-    freed = named_leaves([free] if isinstance(free, str) else free) if isinstance(free, Sequence) else free
+    if not callable(free):
+        free = named_leaves([free] if isinstance(free, str) else free or ())
     material = material.material if isinstance(material, FitResult) else material
     stated = state_problem(
         target, scene, mask, rounding=rounding, encoding=encoding, precision=precision, saturation=saturation
@@ -146,7 +148,7 @@ def fit_jointly(
         whole = observe(stated, at_once=True)
 
         def solve(start: brdf.Material, scenes: Sequence[brdf.Scene], rounds: int = ROUNDS) -> JointResult:
-            problem = joint_problem(brdf.cast((start, list(scenes)), precision), freed)
+            problem = joint_problem(brdf.cast((start, list(scenes)), precision), free)
             moves = any("camera." in leaf.words or "shapes[" in leaf.words for leaf in problem.freed)
             seen = _away_from_outlines(whole, scenes) if moves else whole
             pictures = [(tile.target, tile.weight) for tile in seen.tiles]

@@ -128,6 +128,9 @@ def fit_many(
         >>> fitting.fit_many(pictures, scene, model="blinn-phong").k_d.shape
         (2, 3)
     """
+    if not (isinstance(pictures, list | tuple) or np.ndim(pictures) == 4):
+        came = f"must be an array (N, H, W, C) or a list, got {type(pictures).__name__} {np.shape(pictures) or ''}"
+        raise InputError("pictures", came.rstrip(), "Stack them, or call fitting.fit for one")
     pictures = list(pictures)
     scenes = [scenes] * len(pictures) if isinstance(scenes, brdf.Scene) else scenes
     mask = mask if isinstance(mask, list | tuple) else [mask] * len(pictures)

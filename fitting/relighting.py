@@ -91,6 +91,8 @@ def fit_lights(
     """
     targets = state_problem([target], [scene], [mask]).targets
     instance("material", material, brdf.Material, "Write fitting.fit_lights(target, scene, material)")
+    if not scene.emittances():
+        raise InputError("scene", "has no lights", "Add a [[lights]] table, or [ambient]")
     before = _emittances(scene, targets[0].pixels.shape[-1])
     start = _with_emittances(scene, before)
     found = fit_jointly(targets, start, material, lambda _, s: s[0].emittances(), precision=precision, mask=mask)
@@ -174,4 +176,6 @@ def _emittances(scene: brdf.Scene, channels: int) -> Float[np.ndarray, "L C"]:
 
 def _with_emittances(scene: brdf.Scene, emittances: Float[np.ndarray, "L C"]) -> brdf.Scene:
     """The scene under lights, and ambient light where it has any, of these emittances."""
-    return eqx.tree_at(lambda one: one.emittances(), scene, list(emittances))
+    pairs = zip(scene.lights, emittances, strict=False)
+    lights = [eqx.tree_at(lambda one: one.emittance, light, value) for light, value in pairs]
+    return dataclasses.replace(scene, lights=lights, ambient=None if scene.ambient is None else emittances[-1])

@@ -70,16 +70,26 @@ def _write_picture(stage: Path, result: FitResult, index: int) -> dict[str, Any]
     else:
         path = Path(file["path"]).absolute()
         file = file | {"path": str(path)}
-    return file | {"sha256": _digest(path), "scene": f"scene{number}.toml"}
+    return file | {"sha256": _digest(path, file), "scene": f"scene{number}.toml"}
 
 
-def _digest(path: Path) -> str:
+def _digest(path: Path, file: dict[str, Any]) -> str:
+    """Of a picture, which is what was fitted where that is known."""
     try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+        with path.open("rb") as opened:
+            found = hashlib.file_digest(opened, "sha256").hexdigest()
     except OSError as error:
         remedy = "Put it there again, or beside fit.json"
         raise InputError(path, f"which was fitted, cannot be read ({error.strerror})", remedy) from None
+    if file.get("sha256", found) != found:
+        raise InputError(path, "is not what was fitted, it has changed since", "Put that back, or fit again")
+    return found
+
+
+def _place(folder: Path, file: dict[str, Any]) -> Path:
+    """Where a picture is, or beside fit.json where it has moved."""
+    path, beside = folder / file["path"], folder / Path(file["path"]).name
+    return beside if beside.is_file() and not path.is_file() else path
 
 
 @dataclass(frozen=True)
@@ -95,10 +105,8 @@ class _Pictures(Sequence[np.ndarray]):
 
     def __getitem__(self, index: Any) -> Any:
         file = self.files[index]
-        path, beside = self.folder / file["path"], self.folder / Path(file["path"]).name
-        path = beside if beside.is_file() and not path.is_file() else path
-        if _digest(path) != file["sha256"]:
-            raise InputError(path, "is not what was fitted, it has changed since", "Put that back, or fit again")
+        path = _place(self.folder, file)
+        _digest(path, file)
         picture = brdf.read_picture(path, encoding=file["encoding"]).scaled(np.asarray(file["factor"]))
         return picture.pixels.astype(self.precision)
 
@@ -148,7 +156,11 @@ def load_result(folder: str | Path) -> FitResult:
             "scenes": [brdf.Scene.load(folder / picture["scene"]) for picture in pictures],
             "counted": [arrays[f"counted{index}"] for index in range(len(pictures))],
             "weights": [arrays.get(f"weights{index}") for index in range(len(pictures))],
-            "files": pictures,
+            # What was an array is one again, and stands in no file of its own.
+            "files": [
+                file | {"path": str(_place(folder, file))} if Path(file["path"]).is_absolute() else None
+                for file in pictures
+            ],
         }
         return FitResult(**{name: values[name] for name in FitResult.__dataclass_fields__ if name in values})
     except InputError:

@@ -34,6 +34,17 @@ def test_foretold_errors_are_those_of_fits(result, of):
     np.testing.assert_allclose(choice.after[0], error(after), rtol=0.05)  # noise moves n by some of its errors
 
 
+def test_what_codes_tell_is_foretold_as_it_comes():
+    lights = [dataclasses.replace(SUN, direction=np.array(one)) for one in ([0.4, 0.5, 0.8], [0.0, 0.0, 1.0])]
+    scenes = [ball_scene(light) for light in lights]
+    codes = [np.rint(255 * pictured(MATERIAL, scene, 0.0)).astype(np.uint8) for scene in scenes]
+    one, both = (fitting.fit(*some, model="blinn-phong") for some in ((codes[0], scenes[0]), (codes, scenes)))
+    choice = fitting.next_light(one, lights[1:])
+    np.testing.assert_allclose(choice.before, one["n"].error, rtol=1e-6)
+    # Of edges there are few, and where they lie is chance.
+    np.testing.assert_allclose(choice.after[0], both["n"].error, rtol=0.5)
+
+
 def test_no_direction_is_better_than_the_one_it_finds(result):
     choice = fitting.next_light(result)
     rng = np.random.default_rng(3)

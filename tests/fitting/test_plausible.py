@@ -117,3 +117,16 @@ def test_a_classic_form_is_refused():
     target, scene = random_case(0)
     with pytest.raises(brdf.InputError, match="phong is neither reciprocal nor energy conserving"):
         fitting.fit(target, scene, model="phong", plausible=True)
+
+
+def test_what_moves_along_the_bound_is_not_differentiated_as_if_it_were_free():
+    scene = brdf.Scene(camera=CAMERA, shapes=[BALL], lights=[brdf.DirectionalLight([0.4, 0.5, 0.8], [1.0, 1.0, 1.0])])
+    bright = brdf.NormalizedBlinnPhong(k_d=[0.8, 0.3, 0.2], k_s=0.5, n=10)
+    target = np.asarray(brdf.render(bright, scene, precision="float64"))
+    result = fitting.fit(target, scene, model="normalized-blinn-phong", plausible=True)
+    for ask in (
+        lambda: fitting.sensitivity(result, lambda s: (s[0].lights[0].intensity,)),
+        lambda: fitting.next_light(result),
+    ):
+        with pytest.raises(brdf.InputError, match=r"result: has a bound: k_d \+ k_s is held at 1"):
+            ask()

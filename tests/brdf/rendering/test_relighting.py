@@ -100,6 +100,12 @@ def test_errors_of_lights_know_noise_that_grows_with_brightness():
         np.testing.assert_allclose(found.errors[:, channel] ** 2, np.diag(inverse @ scatter @ inverse), rtol=0.3)
 
 
+def test_ambient_light_alone_is_found():
+    dim, lit = (brdf.Scene(camera=CAMERA, shapes=BALL, ambient=one) for one in ([0.2] * 3, [0.4, 0.3, 0.1]))
+    found = fitting.fit_lights(np.asarray(brdf.render(MATERIAL, lit)), dim, MATERIAL)
+    np.testing.assert_allclose(found.emittances, [[0.4, 0.3, 0.1]], rtol=1e-5)
+
+
 def test_lights_that_look_alike_are_not_told_apart():
     light = brdf.DirectionalLight(direction=[0, 0, 1], intensity=[1, 1, 1])
     twice = brdf.Scene(camera=CAMERA, shapes=BALL, lights=[light, light])

@@ -110,6 +110,24 @@ def test_photographs_without_a_file_are_saved_beside_the_fit(tmp_path):
     again.plot()
 
 
+def test_a_loaded_fit_is_saved_again_with_the_picture_that_was_fitted(folder, tmp_path, monkeypatch):
+    _, result = folder
+    target = np.asarray(result.targets[0])
+    fitting.fit(target, result.scenes[0], model="lambert").save(tmp_path / "array")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    # A stranger of the same name, where relative paths begin.
+    brdf.write_image("target.exr", 0.5 * target)
+    fitting.load_result(tmp_path / "array").save("again")
+    np.testing.assert_array_equal(fitting.load_result("again").targets[0], target)
+    brdf.write_image("photo.exr", target)
+    fitting.fit(brdf.read_picture("photo.exr"), result.scenes[0], model="lambert").save("file")
+    loaded = fitting.load_result("file")
+    brdf.write_image("photo.exr", 0.5 * target)
+    with pytest.raises(brdf.InputError, match=r"photo.exr: is not what was fitted"):
+        loaded.save("changed")
+
+
 def test_what_is_no_saved_fit_is_refused(folder, tmp_path):
     with pytest.raises(brdf.InputError, match=r"fit.json: there is no such file"):
         fitting.load_result(tmp_path)
