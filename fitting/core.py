@@ -28,7 +28,7 @@ from fitting.sample_error import MOST, SampleError, between, near_exponent, near
 from fitting.selection import FAMILIES, Choice, choose, is_better, may_be_off
 from fitting.solver.devices import placed
 from fitting.solver.losses import reweight
-from fitting.solver.nnls import ROUNDING, nonnegative_minima
+from fitting.solver.nnls import nonnegative_minima
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum, refit, search
 from fitting.solver.refinement import TOLERANCE_DOUBLE, Cap
@@ -60,6 +60,8 @@ HOPELESS = 3.0
 TRIALS = 4
 # An exponent up to this multiple of the lower bound is at the bound.
 WIDEST = 1.01
+# By so much rounding may lift a sum over its bound.
+ROUNDING = 1e-12
 
 
 def fit_pictures(problem: FitProblem) -> FitResult:

@@ -2,11 +2,10 @@
 
 | problem | function | how |
 | --- | --- | --- |
-| many of a few unknowns: a channel at an exponent | `nonnegative_minima` | every active set, best one taken |
+| many of a few unknowns: a channel at an exponent | `nonnegative_minima` | one unknown after the other, by recursion |
 | one of any size: what channels share, lights | `nonnegative_minimum` | Lawson and Hanson choose the sets |
 """
 
-import itertools
 from typing import Any
 
 import jax.numpy as jnp
@@ -15,36 +14,41 @@ from jaxtyping import Bool, Float
 
 from fitting.likelihood import AnyArray
 
-# By so much rounding may lift a sum that has a cap over it.
-ROUNDING = 1e-12
+# Points where diffuse and lobe have a cap to themselves, in units of that: one, and how ambient and lobe move it; then
+# those where the lobe has all of it.
+_SHARED = np.array([0.0, 1.0, 0.0]), np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 1.0]])
+_OF_LOBE = np.array([0.0, 0.0, 1.0]), np.array([[1.0, 0.0, 0.0]])
 
 
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")
-def solve_active(gram: Any, right: Any, active: Any) -> tuple[Any, Any]:
-    """Solve a symmetric system among the active unknowns, 0 beside them, by NumPy or JAX.
+def above(gram: Any, product: Any, low: Any, free: Any, least: Any) -> Any:
+    """Minimise x G x - 2 b x over x at least ``low``, exactly, by NumPy or JAX.
 
-    Gauss and Jordan; a symmetric definite system needs no pivoting. On a cap the last pivot is below 0.
+    The others are solved for with the first unknown eliminated. The problem is convex: where that puts the first below
+    its bound, the minimum lies on the bound, and the others are solved for there.
 
     Args:
-        gram: (..., U, U).
-        right: (..., U).
-        active: (..., U).
-
-    Returns:
-        The solution, and the smallest share of its diagonal entry that a pivot keeps.
+        gram: G, (..., U, U).
+        product: b, (..., U).
+        low: the bounds, (..., U).
+        free: which unknowns may be above it, (..., U).
+        least: of each unknown, (..., U): what elimination leaves of its diagonal entry is above that, or the unknown
+            stays at its bound.
     """
     xp: Any = np if isinstance(gram, np.ndarray) else jnp
-    size = gram.shape[-1]
-    system = xp.where(active[..., :, None] & active[..., None, :], gram, xp.eye(size, dtype=gram.dtype))
-    right = xp.broadcast_to(xp.where(active, right, 0), system.shape[:-1])
-    whole, kept = xp.concatenate([system, right[..., None]], axis=-1), xp.inf
-    for i in range(size):
-        pivot, diagonal = whole[..., i, i], system[..., i, i]
-        share = xp.where(diagonal > 0, pivot / xp.where(diagonal > 0, diagonal, 1), xp.where(pivot < 0, xp.inf, 0))
-        row = (whole[..., i, :] / xp.where(pivot == 0, 1, pivot)[..., None])[..., None, :]
-        others = whole - whole[..., :, i, None] * row
-        kept, whole = xp.minimum(kept, share), xp.where(np.arange(size)[:, None] == i, row, others)
-    return xp.where(active, whole[..., -1], 0), kept
+    moves = free[..., :1] & (gram[..., :1, 0] > least[..., :1])
+    pivot, across = xp.where(moves, gram[..., :1, 0], 1), gram[..., 0, 1:]
+    slope, first = across / pivot, product[..., :1] / pivot
+    if product.shape[-1] == 1:
+        return xp.where(moves & (first > low), first, low)
+    others = low[..., 1:], free[..., 1:], least[..., 1:]
+    left = gram[..., 1:, 1:] - slope[..., :, None] * across[..., None, :]
+    rest = above(left, product[..., 1:] - first * across, *others)
+    first = first - xp.sum(slope * rest, axis=-1, keepdims=True)
+    moves, inside = moves & (first > low[..., :1]), xp.concatenate([first, rest], axis=-1)
+    if xp is np and moves.all():
+        return inside
+    rest = above(gram[..., 1:, 1:], product[..., 1:] - across * low[..., :1], *others)
+    return xp.where(moves, inside, xp.concatenate([low[..., :1], rest], axis=-1))
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
@@ -54,13 +58,12 @@ def nonnegative_minima(
     start: Float[AnyArray, "*#K U"],
     free: Bool[AnyArray, "*#K U"],
     tolerance: float,
-    cap: Float[np.ndarray, "*#K U"] | None = None,
+    cap: Float[np.ndarray, "*#K 3"] | None = None,
 ) -> Any:
     """Minimise (x - s) G (x - s) - 2 b (x - s) over x at least 0, and w x at most 1 where there is a cap, exactly.
 
-    A few unknowns have a few active sets: all are solved and the best feasible one is taken. That has no iterations and
-    no tolerance on the answer. The step from the start is what is solved for, so no digits are lost near the optimum.
-    The multiplier of a cap is one more unknown, which starts at 0.
+    That has no iterations and no tolerance on the answer. The step from the start is what is solved for, so no digits
+    are lost near the optimum.
 
     Args:
         gram: G, of any number of problems; by NumPy, or by JAX where it is an array of that.
@@ -69,46 +72,31 @@ def nonnegative_minima(
         free: which unknowns may be above 0.
         tolerance: share of a diagonal entry below which what elimination leaves of it counts as rounding: the column
             then depends on the others, and a smaller active set does as well.
-        cap: w, at least 0; by NumPy alone.
+        cap: w, of ambient, diffuse and lobe: 0, and two numbers above it; by NumPy alone.
 
     Returns:
         x, (..., U).
-
-    Source: for the sets on the cap, Nocedal and Wright, Numerical Optimization, 2006, section 16.5.
     """
     xp: Any = np if isinstance(gram, np.ndarray) else jnp
-    unknowns = product.shape[-1]
-    start, scale = xp.broadcast_to(start, product.shape), 1.0
-    if cap is not None:
-        # In units in which each counts 1, or rounding would lift a small one that counts much over the cap.
-        scale = np.where(cap > 0, 1 / np.where(cap > 0, cap, 1.0), 1.0)
-        gram, product, start = gram * scale[..., :, None] * scale[..., None, :], product * scale, start / scale
-        cap = (cap > 0).astype(float)
-    system, right, begin = gram, product, start
-    if cap is not None:
-        more = [(0, 0)] * (product.ndim - 1)
-        system = np.pad(gram, np.array([*more, (0, 1), (0, 1)]))
-        system[..., -1, :-1] = system[..., :-1, -1] = cap
-        right = np.concatenate([product, 1 - np.sum(cap * start, axis=-1, keepdims=True)], axis=-1)
-        begin = np.pad(start, np.array([*more, (0, 1)]))
-    every = np.array(list(itertools.product([False, True], repeat=right.shape[-1])))
-    x, feasible = start, np.zeros(0, bool)
-    # Mostly all that may be above 0 are; where one is not, every set is tried.
-    for sets in (every[-1:], every) if cap is None and xp is np else (every,):
-        active = sets.reshape(-1, *(1,) * (product.ndim - 1), right.shape[-1])
-        if cap is None:
-            active = active & free
-        move, kept = solve_active(system, right + (system @ xp.where(active, 0, begin)[..., None])[..., 0], active)
-        x = xp.where(active, begin + move, 0)[..., :unknowns]
-        feasible = (kept > tolerance) & xp.all(~active[..., :unknowns] | (free & (x >= 0)), axis=-1)
-        if len(sets) == 1 and feasible.all():
-            return x[0]
-    if cap is not None:
-        feasible &= np.sum(cap * x, axis=-1) <= 1 + ROUNDING
-    step = x - start
-    change = xp.sum(step * ((gram @ step[..., None])[..., 0] - 2 * product), axis=-1)
-    best = xp.argmin(xp.where(feasible, change, xp.inf), axis=0)
-    return xp.take_along_axis(x, best[None, ..., None], axis=0)[0] * scale
+    start, square = xp.broadcast_to(start, product.shape), xp.diagonal(gram, axis1=-2, axis2=-1)
+    x = start + above(gram, product, -start, free, tolerance * square)
+    if cap is None or not (over := np.sum(cap * x, axis=-1, keepdims=True) > 1).any():
+        return x
+    # Where the minimum is beyond the cap, that below it lies on it. In units in which each counts 1, or rounding would
+    # lift a small one that counts much over the cap.
+    unit = np.where(cap > 0, 1 / np.where(cap > 0, cap, 1.0), 1.0)
+    gram, product, start = gram * unit[..., :, None] * unit[..., None, :], product * unit, start / unit
+    shared, of_lobe = (_on_face(gram, product, start, free, tolerance, *face) for face in (_SHARED, _OF_LOBE))
+    return np.where(over, unit * np.where(free[..., 1:2] & (shared[..., 1:2] >= 0), shared, of_lobe), x)
+
+
+def _on_face(gram: Any, product: Any, start: Any, free: Any, tolerance: float, point: Any, moves: Any) -> np.ndarray:
+    """The minimum among the points that some unknowns at least 0 lead to."""
+    some = moves.max(axis=0) > 0
+    begin, square = start[..., some], np.diagonal(gram, axis1=-2, axis2=-1)
+    pull = product - (gram @ (point + begin @ moves - start)[..., None])[..., 0]
+    step = above(moves @ gram @ moves.T, pull @ moves.T, -begin, free[..., some], tolerance * square @ moves.T**2)
+    return point + (begin + step) @ moves
 
 
 def nonnegative_minimum(
