@@ -120,10 +120,9 @@ class Codes(NamedTuple):
 def _mixed(beside: Bool[np.ndarray, "H W"], size: int) -> Bool[np.ndarray, " P"]:
     """Pixels of blocks into which compression mixes what lies beside the object."""
     height, width = beside.shape
-    padded = np.pad(beside, np.array([(0, -height % size), (0, -width % size)]))
-    blocks = padded.reshape(-1, size, padded.shape[1] // size, size)
-    mixed = np.broadcast_to(blocks.any(axis=(1, 3), keepdims=True), blocks.shape)
-    return mixed.reshape(padded.shape)[:height, :width].ravel()
+    rows = np.logical_or.reduceat(beside, np.arange(0, height, size), axis=0)
+    blocks = np.logical_or.reduceat(rows, np.arange(0, width, size), axis=1)
+    return blocks.repeat(size, axis=0).repeat(size, axis=1)[:height, :width].ravel()
 
 
 def find_codes(

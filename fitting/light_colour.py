@@ -5,7 +5,7 @@ The colour is taken out of the scenes, so that all channels share their basis im
 
 import functools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,27 +16,19 @@ import brdf
 from brdf.models.base import SpecularMaterial
 
 
-class LightColour(NamedTuple):
-    """The colour that all lights of some scenes share, and the scenes with grey lights in their place.
-
-    Attributes:
-        colour: (C,), what to multiply the grey light by; all 1 where the lights differ in colour.
-        scenes: with lights of one channel, or as they were where the lights differ in colour.
-    """
-
-    colour: Float[np.ndarray, " C"]
-    scenes: list[brdf.Scene]
-
-
-def take_colour_out(scenes: Sequence[brdf.Scene], channels: int) -> LightColour:
+def take_colour_out(scenes: Sequence[brdf.Scene], channels: int) -> tuple[Float[np.ndarray, " C"], list[brdf.Scene]]:
     """Split lights of one chromaticity into grey lights and a colour.
 
     Args:
         scenes: any number.
         channels: of the picture.
+
+    Returns:
+        The colour, what to multiply the grey light by, and the scenes with lights of one channel; 1 and the scenes as
+        they were where the lights differ in colour.
     """
     emittances = [np.asarray(emittance, np.float64) for emittance in _emittances(scenes)]
-    unchanged = LightColour(np.ones(channels), list(scenes))
+    unchanged = np.ones(channels), list(scenes)
     if all(emittance.shape[0] == 1 for emittance in emittances):
         return unchanged
     table = np.stack([np.broadcast_to(emittance, channels) for emittance in emittances])
@@ -47,7 +39,7 @@ def take_colour_out(scenes: Sequence[brdf.Scene], channels: int) -> LightColour:
     strength = table @ colour / (colour @ colour)
     if np.max(np.abs(table - strength[:, None] * colour)) > 1e-12 * np.max(table):
         return unchanged
-    return LightColour(colour, eqx.tree_at(_emittances, list(scenes), list(strength[:, None])))
+    return colour, eqx.tree_at(_emittances, list(scenes), list(strength[:, None]))
 
 
 def _emittances(scenes: Sequence[brdf.Scene]) -> list[Any]:

@@ -173,8 +173,8 @@ def _fit_together(problem: FitProblem) -> tuple[Bool[np.ndarray, " N"], dict[str
     (scene, *others), masks, count = problem.scenes, list(map(np.asarray, problem.masks)), len(problem.targets)
     alike = all(one is scene for one in others) and all(np.array_equal(one, masks[0]) for one in masks)
     targets = np.stack([target.pixels for target in problem.targets]).astype(problem.precision, copy=False)
-    light = take_colour_out(problem.scenes[:1] if alike else problem.scenes, targets.shape[-1])
-    scenes = [brdf.cast(scene, problem.precision) for scene in light.scenes]
+    colour, scenes = take_colour_out(problem.scenes[:1] if alike else problem.scenes, targets.shape[-1])
+    scenes = [brdf.cast(scene, problem.precision) for scene in scenes]
     both = zip(scenes, problem.masks, strict=False)
     seen = np.stack([np.asarray(one.surface_points().mask) & (True if some is None else some) for one, some in both])
     exact = [target.codes is None and target.saturation is None for target in problem.targets]
@@ -213,7 +213,7 @@ def _fit_together(problem: FitProblem) -> tuple[Bool[np.ndarray, " N"], dict[str
     table = gathered(rows, count, (7 * channels + 3,))
     ends = np.cumsum([channels] * 3 + [1] + [channels] * 4 + [1])
     k_a, k_d, k_s, n, cost, *errors, square = np.split(table, ends, axis=1)
-    factor = np.where(light.colour > 0, light.colour, 1.0)
+    factor = np.where(colour > 0, colour, 1.0)
     scale = np.asarray(model.scale(n)) if issubclass(model, SpecularMaterial) else 1.0
     numbers = {"n": np.where(k_s.any(axis=1), n[:, 0], 0), "n_error": errors[3][:, 0]}
     for name, value, error, by in zip(NAMES, (k_a, k_d, k_s), errors, (1.0, factor, factor * scale), strict=False):

@@ -172,8 +172,8 @@ def observe(problem: FitProblem, *, at_once: bool = False) -> Observed:
     Raises:
         InputError: where nothing is left to fit.
     """
-    light = take_colour_out(problem.scenes, problem.targets[0].pixels.shape[-1])
-    given = zip(problem.targets, problem.scenes, light.scenes, problem.masks, problem.weights, strict=True)
+    colour, grey = take_colour_out(problem.scenes, problem.targets[0].pixels.shape[-1])
+    given = zip(problem.targets, problem.scenes, grey, problem.masks, problem.weights, strict=True)
     parts = itertools.starmap(functools.partial(_observe, problem, at_once), given)
     tiles, rounding, brightest, counts, shown, scenes, counted, weights = map(list, zip(*parts, strict=True))
     left_out: Counter[str] = Counter()
@@ -181,7 +181,7 @@ def observe(problem: FitProblem, *, at_once: bool = False) -> Observed:
         left_out.update(some)
     return Observed(
         problem,
-        light.colour,
+        colour,
         joined(tiles),
         [picture for picture, some in enumerate(tiles) for _ in range(len(some))],
         np.max(rounding, axis=0),

@@ -189,14 +189,10 @@ def choose(
     channels = free.shape[1]
     no, ambient = np.zeros(channels, bool), bool(free[0].any())
     variance = (noise * inflation) ** 2
-    normals, plain = {}, {}
-    for name, fit in fits.items():
-        if name in whitened:
-            one, all_ = whitened[name], inflation**2
-            normals[name] = NormalEquations(one.gram / all_, one.product / all_, one.square / all_)
-        else:
-            normals[name] = fit.normal(variance)
-        plain[name] = fit.normal()
+    plain = {name: fit.normal() for name, fit in fits.items()}
+    normals = {name: fit.normal(variance) for name, fit in fits.items()}
+    for name, one in whitened.items():
+        normals[name] = NormalEquations(one.gram / inflation**2, one.product / inflation**2, one.square / inflation**2)
     first = next(iter(fits))
     terms = [("none", no, no), *([("ambient", free[0], no)] if ambient else []), ("lambert", no, free[1])]
     terms += [("lambert", free[0], free[1])] if ambient else []

@@ -94,14 +94,14 @@ class Probes:
         self.hessian = np.einsum("m,mcp,mcq->pq", self.weight, self.jacobian, self.jacobian, optimize=True)
         self.known = np.zeros(3 * channels + 1, bool)
         self.known[: len(result.parameters)] = [one.value is not None for one in result.parameters]
-        factors = coefficient_factors(self.model, self.n, take_colour_out(problem.scenes, channels).colour)
+        factors = coefficient_factors(self.model, self.n, take_colour_out(problem.scenes, channels)[0])
         self.scale = np.append((sizes(result)[:, None] * factors).ravel(), 1.0)
 
     def _columns(self, scenes: Sequence[brdf.Scene], n: float) -> Float[np.ndarray, "M C 3"]:
         """Ambient, diffuse and lobe at an exponent under the lights of some scenes."""
         found, channels = [], self.x.shape[1]
         factors = coefficient_factors(self.model, n, np.ones(channels))
-        for (seen, count), grey in zip(self.seen, take_colour_out(scenes, channels).scenes, strict=True):
+        for (seen, count), grey in zip(self.seen, take_colour_out(scenes, channels)[1], strict=True):
             with working_precision("float64"):
                 lit = brdf.cast(dataclasses.replace(seen, lights=grey.lights), "float64")
                 images = brdf.basis_images(self.model, lit, np.float64(n))
