@@ -183,9 +183,7 @@ def replaced(optimum: Optimum, said: Coupled, x: Float[np.ndarray, "3 C"], n: fl
     scale = np.array([1.0, 1.0, 1.0, 1 / n])
     gram = np.einsum("ccij->cij", said.gram) * np.outer(scale, scale)
     product = said.score * scale + (gram[..., :3] @ x.T[..., None])[..., 0]
-    return dataclasses.replace(
-        optimum, n=n, x=x, cost=optimum.pixels, gram=gram, product=product, flat=not np.any(x[2] > 0)
-    )
+    return dataclasses.replace(optimum, n=n, x=x, cost=optimum.pixels, gram=gram, product=product)
 
 
 def each_alone(

@@ -14,9 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from fitting.likelihood import Bounds, Intervals, LogLikelihood
+from fitting.likelihood import Bounds, LogLikelihood, Values
 from fitting.solver.nnls import nonnegative_minimum
-from fitting.solver.normal_equations import Picture
 
 # In codes: below this the edges of codes are as sharp as the arithmetic of the pictures.
 LEAST_NOISE = 1e-4
@@ -75,27 +74,6 @@ class Score(NamedTuple):
     said: "Sequence[Said]"
 
 
-class Values(NamedTuple):
-    """Some pixels of a picture, whose values say something.
-
-    Attributes:
-        which: of its pixels.
-        weight: how many each stands for.
-        intervals: between which codes they lay.
-        picture: these pixels alone, where predictions are made of them.
-    """
-
-    which: Bool[np.ndarray, " P"]
-    weight: Float[np.ndarray, "P C"]
-    intervals: Intervals
-    picture: Picture | None = None
-
-    def said(self, radiance: Float[np.ndarray, "P C"], columns: Float[np.ndarray, "V P C"], noise: float) -> "Said":
-        """What they say of a prediction."""
-        code, slope = self.intervals.bounds.codes(radiance)
-        return Said(self, radiance, slope, columns, self.intervals.said(code, noise))
-
-
 class Said(NamedTuple):
     """What values say of what is shown there.
 
@@ -125,7 +103,7 @@ class Said(NamedTuple):
 
     def of_noise(self, noise: float) -> tuple[float, float, float]:
         """The logarithm of the likelihood, its derivative by log s, and what the values tell of that."""
-        each = (self.told.score**2 - self.told.weight) * (noise * self.values.intervals.bounds.spread) ** 2
+        each = (self.told.score**2 - self.told.weight) * (noise * self.values.bounds.spread) ** 2
         parts = self.told.value, each, np.minimum(each**2, MOST_TELLING)
         value, by_log_noise, information = (float(np.sum(self.values.weight * part)) for part in parts)
         return value, by_log_noise, information
@@ -193,8 +171,9 @@ class Problem(ABC):
         """What these values say of an estimate."""
         size = len(self.design)
         said, totals, gradient, hessian = [], np.zeros(3), np.zeros(size), np.zeros((size, size))
-        for some, parts in zip(values, self.shown(at.unknowns, values), strict=True):
-            one = some.said(*parts, at.noise)
+        for some, (radiance, columns) in zip(values, self.shown(at.unknowns, values), strict=True):
+            code, slope = some.bounds.codes(radiance)
+            one = Said(some, radiance, slope, columns, some.said(code, at.noise))
             said.append(one)
             totals += one.of_noise(at.noise)
             for place, products, scores in zip(self.places, *one.sums(), strict=True):
@@ -256,7 +235,7 @@ def maximise(
         least: noise of which fewer values than this tell of a number is not gone below.
     """
     at, known, before, low, high = start, [], None, -math.inf, math.inf
-    for _ in range(MOST_NOISES):
+    while True:
         values = problem.near(problem.codes(at.unknowns), REACH * at.noise)
         at, values, said = _climb(problem, at, ROUGH_GAIN, known, values, problem.score(at, values))
         known.append(precision(problem, at, said))
@@ -272,15 +251,12 @@ def maximise(
         step = min(max(step, -largest, math.log(LEAST_NOISE) - now), largest)
         if not low <= now + step <= high:
             step = 0.5 * (low + high) - now
-        if abs(step) < math.log(enough):
+        if abs(step) < math.log(enough) or len(known) == MOST_NOISES:
             break
         at = at._replace(noise=math.exp(now + step))
-    else:
-        values = problem.near(problem.codes(at.unknowns), REACH * at.noise)
-        said = problem.score(at, values)
     rough = said
     at, _, said = _climb(problem, at, LEAST_GAIN, known, values, rough)
-    last = known[-1] if said is rough and known[-1].noise == at.noise else precision(problem, at, said)
+    last = known[-1] if said is rough else precision(problem, at, said)
     return at, [*(entry for entry in known if entry.noise > at.noise), last], said
 
 
@@ -370,21 +346,6 @@ def least_variance(known: Sequence[Precision]) -> Float[np.ndarray, " U"]:
     return np.min(np.where(enough & (variance > 0), variance, np.inf), axis=0)
 
 
-def widening(
-    known: Sequence[Precision], most: Precision, alone: Float[np.ndarray, " U"] | float
-) -> Float[np.ndarray, " U"]:
-    """What to multiply errors by: each unknown is known as well as where enough values still tell of it.
-
-    Args:
-        known: from much noise to little.
-        most: of which the errors are.
-        alone: variance of each that is left in any case.
-    """
-    least = np.maximum(least_variance(known), alone)
-    ratio = np.divide(least, most.variance, out=np.ones_like(least), where=(most.variance > 0) & np.isfinite(least))
-    return np.sqrt(ratio)
-
-
 def where_most_is_told(
     problem: Problem,
     at: Estimate,
@@ -406,4 +367,7 @@ def where_most_is_told(
         at = at._replace(noise=most.noise)
         said = problem.score(at, problem.near(problem.codes(at.unknowns), REACH * at.noise))
         most = precision(problem, at, said)
-    return said, widening(known, most, alone)
+    # Each unknown is known as well as where enough values still tell of it.
+    least = np.maximum(least_variance(known), alone)
+    ratio = np.divide(least, most.variance, out=np.ones_like(least), where=(most.variance > 0) & np.isfinite(least))
+    return said, np.sqrt(ratio)

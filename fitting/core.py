@@ -24,14 +24,14 @@ from fitting.model_fit import ModelFit
 from fitting.pixels import Observed, Tile, observe
 from fitting.problem import FitProblem
 from fitting.result import FitResult
-from fitting.sample_error import MOST, SampleError, between, near_exponent, nearer
+from fitting.sample_error import MOST, between, near_exponent, nearer
 from fitting.selection import FAMILIES, Choice, choose, is_better, may_be_off
 from fitting.solver.devices import placed
 from fitting.solver.losses import reweight
 from fitting.solver.nnls import nonnegative_minima
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum, refit, search
-from fitting.solver.refinement import TOLERANCE_DOUBLE, Cap
+from fitting.solver.refinement import TOLERANCE_DOUBLE
 from fitting.solver.streams import Stream, each
 from fitting.solver.tied import NormalEquations, design_of, join_channels
 from fitting.uncertainty.covariance import NO_TRACE, residual_noise, specular_gain
@@ -96,8 +96,8 @@ def fit_pictures(problem: FitProblem) -> FitResult:
             # anew.
             free = fit.free & [[True], [True], [False]]
             pictures = fit.pictures if problem.loss == "squared" else None
-            rest = _held_plausible(most_likely(_fit_model(fit.model, seen, free, pictures), copies=seen.copies), seen)
-            fit = rest._replace(moved=_by_highlight(fit, rest, seen))
+            rest = _held_plausible(most_likely(_fit_model(fit.model, seen, free, pictures)), seen)
+            fit = rest._replace(moved=(_by_highlight(fit, rest, seen),))
             told = _interpreted(fit, seen, choice, hidden)
     candidates = () if choice is None else choice.candidates
     return dataclasses.replace(told, candidates=candidates, optimum=optimum, seconds=time.perf_counter() - start)
@@ -121,12 +121,6 @@ def picture_of(model: type[brdf.Material], tile: Tile, near: Near | None = None)
     return Picture(tile.target, diffuse, images.lobe, tile.weight, ambient, tile.bounds)
 
 
-def _search(
-    pictures: Sequence[Picture], free: np.ndarray, n_range: tuple[float, float], cap: Cap | None = None
-) -> Optimum:
-    return search(pictures, n_min=n_range[0], n_max=n_range[1], free=free, cap=cap)
-
-
 def _fit_model(
     model: type[brdf.Material],
     seen: Observed,
@@ -139,11 +133,10 @@ def _fit_model(
     """
     free, problem = seen.reached(model) if free is None else free, seen.problem
     if pictures is not None:
-        return _fit_about(
-            model, seen, free, pictures, next((p.lobe.near for p in pictures if p.lobe is not None), None)
-        )
+        near = next((picture.lobe.near for picture in pictures if picture.lobe is not None), None)
+        return _fit_about(model, seen, free, pictures, near)
     error = problem.sample_error(model.name)
-    near, trial = None if error is None else error.near, -1
+    near, trial = None if error is None else error.near, 0
     while True:
         trial += 1
         made = partial(picture_of, model, near=near)
@@ -151,18 +144,22 @@ def _fit_model(
             pictures = each(made, seen.tiles)
         else:
             pictures = list(map(placed, itertools.count(), map(made, seen.tiles)))
-        fit = _fit_about(model, seen, free.copy(), pictures, near)
+        fit = _fit_about(model, seen, free, pictures, near)
         if fit.optimum.flat:
             break
-        if near is None:
-            if not any(map(_is_made_anew, pictures)):
-                break
-            near = near_exponent(fit.optimum.n, MOST, nearest_peak(pictures))
-            continue
-        near = nearer(near, fit.optimum.n, problem.n_range, nearest_peak(pictures), last=trial + 2 >= TRIALS)
+        n, peak = fit.optimum.n, nearest_peak(pictures)
+        if near is not None:
+            near = nearer(near, n, problem.n_range, peak, last=trial + 1 >= TRIALS)
+        elif any(picture.bounds is not None and picture.is_sampled for picture in pictures):
+            # Lobes are made anew for each exponent, and rounded values ask for many.
+            near = near_exponent(n, MOST, peak)
         if near is None:
             break
-    return _with_profile(fit, error if model.name in (problem.sample_errors or {}) else None)
+    if error is None or model.name not in (problem.sample_errors or {}) or not error.profile.size:
+        return fit
+    # All pixels were looked at near one exponent; the first fit's profile is over all.
+    grid, profile = error.profile
+    return fit._replace(optimum=dataclasses.replace(fit.optimum, grid=grid, profile=profile, profile_sampled=True))
 
 
 def _evenly_noisy(seen: Observed) -> Observed:
@@ -180,22 +177,17 @@ def _evenly_noisy(seen: Observed) -> Observed:
             some += [(picture.in_double(pixels), owner)] if pixels.size else []
         pictures, owner = zip(*some, strict=True)
         with jax.enable_x64(True):
-            fitted = partial(_least_squares, model, seen)
+            fitted = partial(_fit_about, model, seen, seen.reached(model))
             left.append(noise_of_each(pictures, np.array(owner), seen.rounding, fitted))
     return evened(seen, min(left, key=lambda noise: noise.cost))
 
 
-def _least_squares(model: type[brdf.Material], seen: Observed, pictures: Sequence[Picture]) -> Optimum:
-    return _fit_about(model, seen, seen.reached(model), pictures, None).optimum
-
-
-def _is_made_anew(picture: Picture) -> bool:
-    """Whether its lobe is, for each exponent, and rounded values ask for many."""
-    return picture.bounds is not None and picture.is_sampled
-
-
 def _fit_about(
-    model: type[brdf.Material], seen: Observed, free: np.ndarray, pictures: Sequence[Picture], near: Near | None
+    model: type[brdf.Material],
+    seen: Observed,
+    free: np.ndarray,
+    pictures: Sequence[Picture],
+    near: Near | None = None,
 ) -> ModelFit:
     """One model, whose lobe may be tabulated near some exponents."""
     n_range = between(near, seen.problem.n_range)
@@ -205,19 +197,11 @@ def _fit_about(
         if upper >= n_range[0]:
             n_range = n_range[0], upper
         else:
-            free[2] = False
-    optimise = partial(search, n_min=n_range[0], n_max=n_range[1], free=free)
+            free = free & [[True], [True], [False]]
+    optimise = partial(search, free=free, n_range=n_range)
     found = reweight(pictures, optimise(pictures), optimise, seen.problem.loss, seen.rounding)
-    factor = found.noise_factor
-    return ModelFit(model, found.pictures, found.optimum, free, n_range, None, factor, owner=seen.owner)
-
-
-def _with_profile(fit: ModelFit, error: SampleError | None) -> ModelFit:
-    """With the profile over all exponents, where all pixels were looked at near one."""
-    if error is None or not error.profile.size:
-        return fit
-    grid, profile = error.profile
-    return fit._replace(optimum=dataclasses.replace(fit.optimum, grid=grid, profile=profile, profile_sampled=True))
+    fit = ModelFit(model, found.pictures, found.optimum, free, n_range, owner=seen.owner, copies=seen.copies)
+    return fit._replace(noise_factor=found.noise_factor)
 
 
 def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
@@ -237,17 +221,17 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
     for name, fit in fits.items():
         if np.sum(fit.optimum.cost) <= HOPELESS * least:
             grey = coefficient_factors(fit.model, fit.optimum.n, colour)[2]
-            fits[name] = fit = most_likely(fit, copies=seen.copies, grey=grey, precision=precision)
+            fits[name] = fit = most_likely(fit, grey=grey, precision=precision)
             precision = None if fit.evidence is None else fit.evidence.precision
     # A lobe that would be wider than the search allows is no highlight: it mends what Lambert's law leaves at the rim.
     fits = {name: fit for name, fit in fits.items() if fit.optimum.flat or fit.optimum.n > WIDEST * problem.n_range[0]}
-    fits = fits or {"lambert": most_likely(_fit_model(brdf.Lambert, seen), copies=seen.copies)}
+    fits = fits or {"lambert": most_likely(_fit_model(brdf.Lambert, seen))}
     if problem.loss != "squared":
         # Weights are part of what is minimised: those of the better family serve all, or costs could not be compared.
         best = min(fits.values(), key=lambda fit: float(np.sum(residual_noise(fit.optimum, seen.rounding))))
         for name, fit in fits.items():
             pictures = each(_with_weight_of, fit.pictures, best.pictures)
-            fits[name] = fit._replace(pictures=pictures, optimum=_search(pictures, fit.free, fit.n_range))
+            fits[name] = fit._replace(pictures=pictures, optimum=search(pictures, fit.free, fit.n_range))
     grey = {name: coefficient_factors(fit.model, fit.optimum.n, colour)[2] for name, fit in fits.items()}
     # The best comes first: what is judged without a highlight is judged by its sums.
     fits = dict(sorted(fits.items(), key=lambda one: float(np.sum(one[1].optimum.cost))))
@@ -277,7 +261,7 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
     known = known if choice.model == best.model.name else None
     if choice.model not in FAMILIES and not _explains_structure(fits[choice.model], seen, known):
         shown = fits[choice.model].optimum.x
-        fits = {"lambert": most_likely(_fit_model(brdf.Lambert, seen), copies=seen.copies)}
+        fits = {"lambert": most_likely(_fit_model(brdf.Lambert, seen))}
         best = fits["lambert"]
         choice = choose({"lambert": best.optimum}, best.free, grey, noise, inflation, _likely_sums(fits))
         # It may be one after all.
@@ -297,12 +281,12 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
     elif not (matt or choice.grey) and np.array_equal(choice.free, chosen.free):
         return chosen, choice
     if matt or not np.array_equal(choice.free, chosen.free):
-        optimum = _search(pictures, choice.free, chosen.n_range)
+        optimum = search(pictures, choice.free, chosen.n_range)
     tied = grey[choice.model] if choice.grey else None
     if tied is not None:
         optimum = refit(pictures, optimum, choice.free, chosen.n_range, tied)
     chosen = chosen._replace(pictures=pictures, optimum=optimum, free=choice.free, tied=tied)
-    return most_likely(chosen, copies=seen.copies), choice
+    return most_likely(chosen), choice
 
 
 def _less_codec_errors(
@@ -316,7 +300,7 @@ def _less_codec_errors(
     bounds, known = [picture.bounds for picture in fit.pictures], any(map(codec_of, seen.problem.targets))
     lossy = any(one is not None and one.lossy for one in bounds)
     if seen.copies or fit.capped or not lossy or any(one is None for one in bounds):
-        return most_likely(fit, copies=seen.copies) if choice is None else fit, choice, seen
+        return most_likely(fit) if choice is None else fit, choice, seen
     if choice is not None and fit.tied is not None:
         fits = [_fit_model(brdf.MODELS[name], seen, fit.free) for name in seen.problem.families]
         found = [without_codec_errors(seen, one) if known else (most_likely(one), seen) for one in fits]
@@ -445,7 +429,7 @@ def _unexplained(pictures: Sequence[Picture], optimum: Optimum, seen: Observed, 
             found.append(blocks)
             continue
         with jax.enable_x64(True):
-            values = unexplained(picture, optimum.x, optimum.n)
+            values = unexplained(picture, optimum)
         found.append(over_blocks(Errors(values, np.arange(len(values)), width), SIZES[0]))
     return found
 
@@ -467,7 +451,7 @@ def _held_plausible(fit: ModelFit, seen: Observed) -> ModelFit:
     optimum = fit.optimum
     if not seen.problem.plausible or np.all(np.sum(cap(optimum.n) * optimum.x, axis=0) <= 1.0 + ROUNDING):
         return fit
-    optimum = _search(fit.pictures, fit.free, fit.n_range, cap)
+    optimum = search(fit.pictures, fit.free, fit.n_range, cap)
     # What the bound adds to the residual is no noise: that of the fit without it says what stands out.
     noise = fit.noise_factor * float(np.sqrt(np.sum(fit.optimum.cost) / np.sum(optimum.cost)))
     return fit._replace(optimum=optimum, tied=None, capped=True, noise_factor=noise)
@@ -482,8 +466,9 @@ def _by_highlight(fit: ModelFit, rest: ModelFit, seen: Observed) -> Float[np.nda
 
 
 def _interpreted(fit: ModelFit, seen: Observed, choice: Choice | None, hidden: str = "") -> FitResult:
-    off = [some for some in (fit.moved, None if choice is None else choice.dropped) if some is not None]
-    told = interpret(fit, seen, hidden, np.array(off) if off else None)
+    if choice is not None:
+        fit = fit._replace(moved=(*fit.moved, choice.dropped))
+    told = interpret(fit, seen, hidden)
     warnings, share = list(told.warnings), fit.residual
     structure = any("structure" in text for text in warnings)
     # What errs by itself is noise, however much.

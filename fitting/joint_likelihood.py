@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from fitting.continuation import Estimate, Problem, Score, Values, maximise, where_most_is_told
+from fitting.continuation import Estimate, Problem, Score, maximise, where_most_is_told
 from fitting.joint_problem import JointProblem, linearised
-from fitting.likelihood import Bounds, Intervals, residual_deviation
+from fitting.likelihood import Bounds, Values, residual_deviation
 from fitting.maximum_likelihood import FIRST_NOISE, alike
 from fitting.pixels import Observed
 from fitting.solver.nnls import inverse_diagonal, scaled_inverse
@@ -132,12 +132,12 @@ class _RoundedPictures(Problem):
     def taken(self, picture: int, which: Bool[np.ndarray, " P"]) -> Values:
         """Some pixels of a picture."""
         some = self.bounds[picture].pixels(operator.itemgetter(which))
-        return Values(which, self.weights[picture][which], Intervals(some))
+        return Values(which, self.weights[picture][which], some)
 
     def scatter(self, said: Score) -> Float[np.ndarray, "U U"]:
         """What takes the place of the Hessian in a file that was compressed: the pixels of a block err together."""
         parts = []
         for one in said.said:
-            bounds, scores = one.values.intervals.bounds, np.einsum("upc,pc->up", one.columns, one.score)
-            parts.append(block_scatter(scores, Errors(one.score, np.asarray(bounds.index), int(bounds.width))))
+            scores = np.einsum("upc,pc->up", one.columns, one.score)
+            parts.append(block_scatter(scores, Errors(one.score, *one.values.bounds.place)))
         return np.sum(parts, axis=0)

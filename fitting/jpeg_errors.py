@@ -114,7 +114,7 @@ def _nearest(fit: ModelFit, compressed: Sequence["_Compressed"], most: int, coun
     assert said is not None
     # Their mean has a share of what each errs by, which is no more than what the picture errs by.
     said = said._replace(widening=said.widening * math.sqrt(1 + 1 / count))
-    return found._replace(evidence=said, moved=APPROACH * (_unknowns(found.optimum) - _unknowns(best)))
+    return found._replace(evidence=said, moved=(APPROACH * (_unknowns(found.optimum) - _unknowns(best)),))
 
 
 def _unknowns(at: Optimum) -> Float[np.ndarray, " U"]:

@@ -153,12 +153,17 @@ class Bounds:
             distance: from an end, where the noise is that of the picture.
         """
         inside = np.minimum(code - self.lower, self.upper - code)
-        return in_any_channel(inside < distance * self.spread)
+        return over_channels(np.logical_or, inside < distance * self.spread)
 
     @property
     def half_open(self) -> Bool[np.ndarray, " P"]:
         """Which pixels have a value of which one end is known."""
-        return in_any_channel(self.ends == 1)
+        return over_channels(np.logical_or, self.ends == 1)
+
+    @property
+    def place(self) -> tuple[Int[np.ndarray, " P"], int]:
+        """Index of the pixels in their picture, and its width."""
+        return np.asarray(self.index), int(self.width)
 
     def pixels(self, choose: Callable[[Any], Any]) -> "Bounds":
         """Those of some pixels."""
@@ -167,9 +172,14 @@ class Bounds:
         return dataclasses.replace(self, lower=lower, upper=upper, index=index, spread=spread)
 
 
-def in_any_channel(which: Bool[np.ndarray, "P C"]) -> Bool[np.ndarray, " P"]:
-    """Of which pixels some value is meant; a reduction over so short an axis would take fifteen times as long."""
-    return functools.reduce(np.logical_or, which.T)
+def over_channels(combine: Callable[[Any, Any], Any], values: AnyArray) -> Any:
+    """Of each pixel's values one; a reduction over so short an axis would take fifteen times as long.
+
+    Args:
+        combine: two channels.
+        values: (P, C), on the host or the device.
+    """
+    return functools.reduce(combine, [values[:, channel] for channel in range(values.shape[1])])
 
 
 def residual_deviation(bounds: Iterable[Bounds], codes: Iterable[Float[np.ndarray, "P C"]]) -> float:
@@ -328,21 +338,27 @@ def _table(ratio: float) -> _Table:
     return _Table(first, float(step), np.stack(found))
 
 
-class Intervals:
-    """What values say that lay between bounds, of millions of them on the host.
+class Values:
+    """Some pixels of a picture, and what their values say that lay between bounds, of millions of them on the host.
 
     Where the widths are powers of two of each other, as those of integers and of floating point, by tables over the
     prediction: cubic between knots where the derivative is at hand, which is right to 1e-8; beyond the last knot the
     first terms of the tail's series, right to 1e-6 of it.
     """
 
-    def __init__(self, bounds: Bounds):
+    def __init__(
+        self, which: Bool[np.ndarray, " P"], weight: Float[np.ndarray, "#P #C"], bounds: Bounds, picture: Any = None
+    ):
         """Sort the values by the width of their intervals.
 
         Args:
-            bounds: of each.
+            which: of the picture's pixels.
+            weight: how many each stands for.
+            bounds: between which codes they lay.
+            picture: these pixels alone, where predictions are made of them.
         """
-        self.bounds, lower, upper = bounds, bounds.lower, bounds.upper
+        self.which, self.weight, self.bounds, self.picture = which, weight, bounds, picture
+        lower, upper = bounds.lower, bounds.upper
         below, above = np.isfinite(lower), np.isfinite(upper)
         closed = below & above & (upper > lower)
         self._tells = closed | (below ^ above)

@@ -31,13 +31,12 @@ from fitting.continuation import (
     Problem,
     Said,
     Score,
-    Values,
     maximise,
     telling,
     where_most_is_told,
 )
 from fitting.continuation import precision as precision_at
-from fitting.likelihood import AnyArray, Bounds, Intervals, residual_deviation
+from fitting.likelihood import AnyArray, Bounds, Values, residual_deviation
 from fitting.model_fit import Evidence, ModelFit
 from fitting.solver.normal_equations import COMPILER_OPTIONS, Picture, Sums
 from fitting.solver.profile import Optimum, refit, search
@@ -85,14 +84,11 @@ class Numbers(NamedTuple):
         return cls(math.exp(unknowns[-1]), unknowns[:-1].reshape(3, -1))
 
 
-def most_likely(
-    fit: ModelFit, *, copies: bool = False, grey: np.ndarray | None = None, precision: np.ndarray | None = None
-) -> ModelFit:
+def most_likely(fit: ModelFit, *, grey: np.ndarray | None = None, precision: np.ndarray | None = None) -> ModelFit:
     """A fit by what rounded values and open ends say, from least squares on; as it is where they say no more.
 
     Args:
         fit: by least squares.
-        copies: the channels are copies of each other.
         grey: x_s of a grey k_s, which a highlight has where channels err together; None for any colour.
         precision: see `Evidence`; None finds it out where channels err together.
     """
@@ -112,21 +108,20 @@ def most_likely(
     ]
     pictures = list(map(_with_weight, fit.pictures, weights))
     rounding = 0.0 if exact else 1 / 12
-    widest = 1.0 if exact else max(_widest(picture) for picture in map(_thinned, pictures))
+    # Of floats the distance of two ends grows with brightness.
+    widest = 1.0 if exact else max(float(np.max(bounds_of(_thinned(one)).widths, initial=0.0)) for one in pictures)
     if exact or lossy or noise**2 > (ENOUGH_NOISE**2 + rounding) * widest**2:
         linear = all(bounds.encoding == "linear" for bounds in map(bounds_of, pictures))
         if linear and not lossy and not any(_open_ends_tell(picture, optimum, noise) for picture in pictures):
             return fit
-        together = lossy and not copies and (grey is not None or fit.tied is not None) and can_be_coupled(pictures)
+        together = lossy and not fit.copies and (grey is not None or fit.tied is not None) and can_be_coupled(pictures)
         if together and grey is not None:
             fit = fit._replace(tied=np.where(fit.free[2], grey, 0.0))
         said = _reweighted(fit._replace(pictures=pictures), noise, rounding, precision, together=together)
     else:
         start = Estimate(np.append(optimum.x.ravel(), math.log(optimum.n)), max(noise, FIRST_NOISE))
-        said = _near_edges(fit._replace(pictures=pictures), start, copies=copies)
-    found = said.optimum
-    optimum = dataclasses.replace(optimum, x=found.x, n=found.n, flat=found.flat)
-    return fit._replace(optimum=optimum, evidence=said)
+        said = _near_edges(fit._replace(pictures=pictures), start)
+    return fit._replace(optimum=dataclasses.replace(optimum, x=said.optimum.x, n=said.optimum.n), evidence=said)
 
 
 def _deviation(pictures: Sequence[Picture], at: Optimum) -> float:
@@ -145,11 +140,8 @@ def _thinned(picture: Picture) -> Picture:
 def _is_curved(pictures: Sequence[Picture]) -> bool:
     """Whether rounded values are not linear in light, and some have both ends."""
     bounds = list(map(bounds_of, pictures))
-    return (
-        any(own.encoding != "linear" for own in bounds)
-        and any(own.widths.size for own in bounds)
-        and not any(own.exact for own in bounds)
-    )
+    curved = any(own.encoding != "linear" and own.widths.size for own in bounds)
+    return curved and not any(own.exact for own in bounds)
 
 
 def _in_light(pictures: Sequence[Picture]) -> list[Picture]:
@@ -180,7 +172,7 @@ def _where_noise_is_even(fit: ModelFit, noise: float) -> tuple[ModelFit, float]:
 
 def _evener_in_light(problem: "_Separable", at: Estimate) -> Estimate | None:
     """The most likely numbers with noise of one size in light, where they are likelier than any with it in codes."""
-    pictures = list(map(_picture, problem.pixels))
+    pictures = [values.picture for values in problem.pixels]
     if at.noise < FAINT or not _is_curved(pictures):
         return None
     light = list(map(_values, _in_light(pictures)))
@@ -211,12 +203,10 @@ def alike(
     code = np.rint(codes * ALIKE).astype(np.int64)
     tells, weight = bounds.ends > 0, np.ones(code.shape)
     for channel, (one, some) in enumerate(zip(code.T, tells.T, strict=True)):
+        if not some.any():
+            continue
         kind, count = _kinds(one[some])
-        many = (
-            count > max(FEWEST_ALIKE, MORE_ALIKE * np.median(count[count > 0]) * (not level))
-            if some.any()
-            else count > 0
-        )
+        many = count > max(FEWEST_ALIKE, MORE_ALIKE * np.median(count[count > 0]) * (not level))
         if level:
             shown, one_of = bounds.lower[some, channel] + bounds.upper[some, channel], np.zeros(count.size)
             one_of[kind] = shown
@@ -227,35 +217,36 @@ def alike(
 
 def _kinds(code: Int[np.ndarray, " P"]) -> tuple[Int[np.ndarray, " P"], Int[np.ndarray, " K"]]:
     """Which kind each code is, and how many are of each; few are counted, which is quicker than sorting."""
-    least = np.min(code, initial=0)
-    if np.max(code, initial=0) - least < MOST_COUNTED:
+    least = np.min(code)
+    if np.max(code) - least < MOST_COUNTED:
         return code - least, np.bincount(code - least)
     _, kind, count = np.unique(code, return_inverse=True, return_counts=True)
     return kind, count
 
 
-def _near_edges(fit: ModelFit, at: Estimate, *, copies: bool) -> Evidence:
+def _near_edges(fit: ModelFit, at: Estimate) -> Evidence:
     """Where rounding is most of the noise: what pixels near the edge of a code say."""
-    design, pictures = design_of(fit.free, fit.tied), fit.pictures
+    pictures, design = fit.pictures, design_of(fit.free, fit.tied)
+    stated = partial(_Separable, design=design, n_range=fit.n_range, copies=fit.copies)
     large = sum(picture.target.shape[0] for picture in pictures) > 2 * SUBSAMPLE
     some = [_stratum(picture, SUBSAMPLE // len(pictures)) for picture in pictures] if large else _gathered(pictures, at)
-    problem = _Separable(some, design, fit.n_range, copies)
+    problem = stated(some)
     at, known, said = maximise(problem, at, ROUGHLY_KNOWN, FEWEST_VALUES) if large else maximise(problem, at)
     if (even := _evener_in_light(problem, at)) is not None:
-        return _near_edges(fit._replace(pictures=_in_light(pictures)), even, copies=copies)
+        return _near_edges(fit._replace(pictures=_in_light(pictures)), even)
     if large:
         # The whole picture has the pixels near an edge that a part of it lacks.
         at = at._replace(noise=telling(known).noise)
-        problem = _Separable(_gathered(pictures, at), design, fit.n_range, copies)
+        problem = stated(_gathered(pictures, at))
         at, known, said = maximise(problem, at)
     rounds = [(problem, known)]
     while len(rounds) <= MOST_ROUNDS and (factors := _more_noise(said, at.noise, fit.owner)).any():
         pixels = [_noisier(values, math.exp(factor)) for values, factor in zip(problem.pixels, factors, strict=True)]
-        problem = _Separable(pixels, design, fit.n_range, copies)
+        problem = stated(pixels)
         at, known, said = maximise(problem, at)
         rounds.append((problem, known))
-    scores = [(one.score, one.weight, _place(_picture(one.values))) for one in said.said]
-    steps = [(one.values.intervals.bounds.spread / one.slope).ravel() for one in said.said]
+    scores = [(one.score, one.weight, one.values.bounds.place) for one in said.said]
+    steps = [(one.values.bounds.spread / one.slope).ravel() for one in said.said]
     light = at.noise * float(np.median(np.concatenate(steps))) if any(map(np.size, steps)) else 0.0
     known = [entry for _, some in rounds for entry in some]
     most = telling(known)
@@ -263,7 +254,7 @@ def _near_edges(fit: ModelFit, at: Estimate, *, copies: bool) -> Evidence:
     said, wider = where_most_is_told(then, at, known, said, _of_planes(pictures, at, problem))
     working = list(map(_working, said.said))
     optimum = _optimum(working, fit, Numbers.of(at.unknowns))
-    places = [_place(_picture(one.values)) for one in said.said]
+    places = [one.values.bounds.place for one in said.said]
     return Evidence(working, optimum, at.noise, at.value, places, wider, scores=scores, light=light)
 
 
@@ -276,15 +267,14 @@ def _more_noise(said: Score, noise: float, owner: Sequence[int]) -> Float[np.nda
     )
     step, largest = slope / np.maximum(information, 1.0), math.log(STEP)
     known = (np.abs(step) < math.log(ENOUGH_KNOWN)) | (step**2 * information < ENOUGH_MOVED)
-    own = [noise * float(np.max(bounds_of(_picture(one.values)).spread)) for one in said.said]
+    own = [noise * float(np.max(one.values.bounds.spread)) for one in said.said]
     least = np.minimum(np.log(LEAST_NOISE / np.array(own)), 0.0)
     return np.maximum(np.clip(np.where(known, 0.0, step), -largest, largest)[np.array(owner)], least)
 
 
 def _noisier(values: Values, factor: float) -> Values:
-    picture = _picture(values)
-    bounds = dataclasses.replace(bounds_of(picture), spread=bounds_of(picture).spread * factor)
-    return _values(dataclasses.replace(picture, bounds=bounds), values.which)
+    bounds = dataclasses.replace(values.bounds, spread=values.bounds.spread * factor)
+    return _values(dataclasses.replace(values.picture, bounds=bounds), values.which)
 
 
 def _of_planes(pictures: Sequence[Picture], at: Estimate, problem: "_Separable") -> Float[np.ndarray, " U"] | float:
@@ -311,8 +301,8 @@ def _optimum(working: Sequence[Picture], fit: ModelFit, at: Numbers) -> Optimum:
     parts = whole.sums(whole.lobes(np.log([at.n]), 0.0))
     # By n, not by its logarithm.
     about = Sums(*(leaf[0] for leaf in parts)).columns(np.diag([1.0, 1.0, lobe, lobe / at.n]))
-    cost, flat = np.maximum(about.about(-at.x.T).square, 0.0), not np.any(at.x[2] > 0)
-    return dataclasses.replace(fit.optimum, n=at.n, x=at.x, cost=cost, flat=flat, **about._asdict())
+    cost = np.maximum(about.about(-at.x.T).square, 0.0)
+    return dataclasses.replace(fit.optimum, n=at.n, x=at.x, cost=cost, **about._asdict())
 
 
 def _reweighted(
@@ -327,7 +317,7 @@ def _reweighted(
         precision: of the channels' errors together, where it is known.
         together: they err together.
     """
-    pictures, optimum, places = fit.pictures, fit.optimum, [_place(picture) for picture in fit.pictures]
+    pictures, optimum, places = fit.pictures, fit.optimum, [bounds_of(picture).place for picture in fit.pictures]
     known = precision is not None
     with jax.enable_x64(True):
         both = [(picture, np.flatnonzero(bounds_of(picture).half_open)) for picture in pictures]
@@ -343,7 +333,7 @@ def _reweighted(
                 optimum = improved(working, precision, optimum, fit, anew=trial == 0)
             elif trial == 0 and fit.tied is None:
                 # All alike in light, pixels may have led to another exponent.
-                optimum = search(working, n_min=fit.n_range[0], n_max=fit.n_range[1], free=fit.free)
+                optimum = search(working, fit.free, fit.n_range)
             else:
                 optimum = refit(working, optimum, fit.free, fit.n_range, fit.tied)
             stated = [_stated(*one, optimum, noise, rounding) for one in both]
@@ -444,11 +434,12 @@ def _stated(picture: Picture, index: Int[np.ndarray, " K"], optimum: Optimum, no
         target, weight, expected, full = (np.array(part) for part in (target, weight) * 2)
         s = math.sqrt(max(noise**2 - rounding, LEAST_SHARE * noise**2))
         values = _values(picture.in_double(index))
-        said = values.said(*_shown(_picture(values), optimum), s)
-        told, radiance, slope = jax.tree.map(lambda part: part[: index.size], (said.told, said.radiance, said.slope))
+        radiance, _ = _shown(values.picture, optimum)
+        code, slope = values.bounds.codes(radiance)
+        parts = values.said(code, s), radiance, slope, np.broadcast_to(values.weight, radiance.shape)
+        told, radiance, slope, weighs = jax.tree.map(lambda part: part[: index.size], parts)
         bounds = bounds_of(picture).pixels(partial(np.take, indices=index, axis=0))
         at_end, own = bounds.ends == 1, s * bounds.spread
-        weighs = np.broadcast_to(values.weight, said.radiance.shape)[: index.size]
         curvature = told.weight * slope**2
         step = np.divide(told.score * slope, curvature, out=np.zeros_like(curvature), where=curvature > 0)
         target[index] = np.where(at_end, radiance + step, target[index])
@@ -482,12 +473,6 @@ def _linearised(picture: Picture, n: AnyArray, x: AnyArray) -> tuple[Array, Arra
     return (radiance + residual / slope).astype(dtype), weight, squares, jnp.sum(counts.astype(jnp.float64))
 
 
-def _place(picture: Picture) -> tuple[np.ndarray, int]:
-    """Index of the pixels in their picture, and its width."""
-    bounds = bounds_of(picture)
-    return np.asarray(bounds.index), int(bounds.width)
-
-
 class _Separable(Problem):
     """Rounded values, and the model of which they show the coefficients and the exponent."""
 
@@ -503,7 +488,7 @@ class _Separable(Problem):
             copies: the channels are copies of each other, and tell of a number once.
         """
         self.pixels, self.design, self.copies, self.n_range = pixels, design, copies, n_range
-        self.bounds, size = [part.intervals.bounds for part in pixels], len(design)
+        self.bounds, size = [part.bounds for part in pixels], len(design)
         self.exponents, channels = np.arange(size) == size - 1, size // 3
         self.lower, self.upper = (
             np.where(self.exponents, math.log(n), x) for n, x in zip(n_range, (0.0, math.inf), strict=True)
@@ -515,19 +500,19 @@ class _Separable(Problem):
         """What is predicted, in codes; kept while only the noise changes."""
         if self._last[0] is not unknowns:
             at, found = Numbers.of(unknowns), []
-            for bounds, part in zip(self.bounds, self.pixels, strict=True):
-                found.append(bounds.codes(_picture(part).shown(at.n, at.x))[0])
+            for part in self.pixels:
+                found.append(part.bounds.codes(part.picture.shown(at.n, at.x))[0])
             self._last = unknowns, found
         return self._last[1]
 
     def taken(self, picture: int, which: Bool[np.ndarray, " P"]) -> Values:
         """Some pixels of a picture."""
         whole = self.pixels[picture]
-        return whole if which.all() else _values(_picture(whole).in_double(np.flatnonzero(which)), which)
+        return whole if which.all() else _values(whole.picture.in_double(np.flatnonzero(which)), which)
 
     def shown(self, unknowns: Float[np.ndarray, " U"], values: Sequence[Values]) -> Iterator[tuple[Any, Any]]:
         """What is predicted, and its derivatives by the coefficients and log n."""
-        return map(partial(_shown, at=Numbers.of(unknowns)), map(_picture, values))
+        return map(partial(_shown, at=Numbers.of(unknowns)), [some.picture for some in values])
 
 
 def _shown(picture: Picture, at: Numbers | Optimum) -> tuple[Float[np.ndarray, "P C"], Float[np.ndarray, "4 P C"]]:
@@ -540,18 +525,13 @@ def _shown(picture: Picture, at: Numbers | Optimum) -> tuple[Float[np.ndarray, "
 def _values(picture: Picture, which: Bool[np.ndarray, " P"] | None = None) -> Values:
     """All of a picture on the host in double precision, which is some pixels of another one."""
     which = np.ones(len(picture.target), bool) if which is None else which
-    return Values(which, np.asarray(picture.weights), Intervals(bounds_of(picture)), picture)
-
-
-def _picture(values: Values) -> Picture:
-    assert values.picture is not None
-    return values.picture
+    return Values(which, np.asarray(picture.weights), bounds_of(picture), picture)
 
 
 def _working(said: Said) -> Picture:
     """Targets and weights with which least squares takes Newton's step."""
     step = np.divide(said.score, said.weight, out=np.zeros_like(said.radiance), where=said.weight > 0)
-    return dataclasses.replace(_picture(said.values), target=said.radiance + step, weight=said.weight, bounds=None)
+    return dataclasses.replace(said.values.picture, target=said.radiance + step, weight=said.weight, bounds=None)
 
 
 def _near(picture: Picture, at: Numbers | Optimum, distance: float) -> Bool[np.ndarray, " P"]:
@@ -596,12 +576,6 @@ def _codes(picture: Picture, at: Numbers | Optimum) -> np.ndarray:
     return bounds_of(picture).codes(picture.shown(at.n, at.x))[0]
 
 
-def _widest(picture: Picture) -> float:
-    """The largest distance of two ends: of floats that grows with brightness."""
-    width = bounds_of(picture).upper - bounds_of(picture).lower
-    return float(np.max(width, where=np.isfinite(width), initial=0.0))
-
-
 def _open_ends_tell(picture: Picture, at: Optimum, noise: float) -> bool:
     """Whether some value is known by one end only and is predicted near it."""
     half = bounds_of(picture).half_open
@@ -623,14 +597,12 @@ def highlight_in_codes(pictures: Sequence[Picture], optimum: Optimum) -> float:
     return most
 
 
-def unexplained(picture: Picture, x: np.ndarray, n: float) -> np.ndarray:
+def unexplained(picture: Picture, optimum: Optimum) -> np.ndarray:
     """By how much predictions miss the bounds between which the values lay.
 
     Args:
         picture: of a fit, with bounds.
-        x: coefficients, (3, C).
-        n: exponent.
+        optimum: its numbers.
     """
-    assert picture.bounds is not None
-    code = _codes(picture, Numbers(n, x))
-    return np.maximum(picture.bounds.lower - code, 0.0) - np.maximum(code - picture.bounds.upper, 0.0)
+    bounds, code = bounds_of(picture), _codes(picture, optimum)
+    return np.maximum(bounds.lower - code, 0.0) - np.maximum(code - bounds.upper, 0.0)

@@ -376,7 +376,7 @@ def _fit_model(model, samples, loss, n_range):
             lobe = Lobe.of_terms(((jnp.asarray(reach)[:, None], jnp.asarray(log_cos)),))
             ones, target = jnp.ones((len(values), 1)), jnp.asarray(np.pi * values)
             picture = Picture(target, ones, lobe, jnp.asarray(weight), ambient=jnp.zeros(1))
-        optimum = search([picture], n_min=n_range[0], n_max=n_range[1], free=free)
+        optimum = search([picture], free, n_range)
         x = np.where(optimum.x > [[0], [SEARCH], [0]] * brightest, optimum.x, 0.0)
         highlight = x[2] * reach * np.exp(optimum.n * log_cos)
         return dataclasses.replace(optimum, x=x), highlight, (x[1] + highlight) / np.pi

@@ -71,8 +71,9 @@ class ModelFit(NamedTuple):
         capped: k_d + k_s is held at 1 in some channel.
         evidence: what rounded values say; None where least squares is the whole answer.
         owner: of which picture each of ``pictures`` is, which may be a band of it.
-        moved: by how much x_a, x_d, x_s, channel after channel, and n may be off beside what pixels leave; None for not
-            at all.
+        moved: by how much each of some causes may have moved x_a, x_d, x_s, channel after channel, and n, beside what
+            pixels leave.
+        copies: the channels are copies of each other.
     """
 
     model: type[brdf.Material]
@@ -85,7 +86,8 @@ class ModelFit(NamedTuple):
     capped: bool = False
     evidence: Evidence | None = None
     owner: Sequence[int] = ()
-    moved: Float[np.ndarray, " U"] | None = None
+    moved: Sequence[Float[np.ndarray, " U"]] = ()
+    copies: bool = False
 
     @property
     def held(self) -> str:

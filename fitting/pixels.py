@@ -23,7 +23,7 @@ from brdf.models.base import SpecularMaterial
 from brdf.precision import Precision
 from fitting.codes import open_ends
 from fitting.light_colour import take_colour_out
-from fitting.likelihood import Bounds
+from fitting.likelihood import Bounds, over_channels
 from fitting.problem import TOP, FitProblem, Target, has_pixel_areas
 from fitting.solver.devices import device_count
 from fitting.solver.normal_equations import COMPILER_OPTIONS, FEW_VALUES, totals
@@ -331,8 +331,8 @@ def _statistics(
 
 def _count(values: Any, allowed: Any, level: float, dark: float, *, xp: Any) -> tuple[Any, Statistics]:
     """Which pixels count, and what there is to know of them, in NumPy or JAX."""
-    brightest = _over_channels(xp.maximum, values)
-    whole = xp.isfinite(_over_channels(xp.add, values))
+    brightest = over_channels(xp.maximum, values)
+    whole = xp.isfinite(over_channels(xp.add, values))
     finite = allowed & whole
     below = finite & (brightest < level)
     good = below & (brightest > dark)
@@ -342,7 +342,7 @@ def _count(values: Any, allowed: Any, level: float, dark: float, *, xp: Any) -> 
     found = totals(terms, ["add"] * len(masks) + ["maximum"] * (1 + len(sizes)), (0,))
     counts, (largest, *scale) = found[: len(masks)], found[len(masks) :]
     top = xp.count_nonzero(bright >= largest * TOP)
-    least = xp.min(xp.where(whole, _over_channels(xp.minimum, values), xp.inf))
+    least = xp.min(xp.where(whole, over_channels(xp.minimum, values), xp.inf))
     return good, Statistics(tuple(counts), largest, top, least, xp.stack(scale))
 
 
@@ -431,7 +431,7 @@ def _inverse_variance(
         shot: variance over value.
         step: distance of two codes.
     """
-    mean = jnp.where(good, _over_channels(jnp.add, values) / values.shape[1], 0.0)
+    mean = jnp.where(good, over_channels(jnp.add, values) / values.shape[1], 0.0)
     count = good.astype(values.dtype)
     total, known = (
         jax.lax.reduce_window(
@@ -445,7 +445,3 @@ def _inverse_variance(
     variance = jnp.maximum(read * read + shot * smooth + step * step / 12.0, least)
     weight = jnp.where(good, jnp.min(jnp.where(good, variance, jnp.inf)) / variance, 0.0)
     return (weight * (jnp.sum(count) / jnp.sum(weight))).astype(values.dtype)
-
-
-def _over_channels(combine: Any, values: Array) -> Array:
-    return functools.reduce(combine, [values[:, channel] for channel in range(values.shape[1])])

@@ -223,7 +223,7 @@ class Parameters:
     @property
     def free_parameters(self) -> tuple[Parameter, ...]:
         """Those that are determined and that no bound holds."""
-        return free_parameters(self.parameters)
+        return tuple(one for one in self.parameters if one.value is not None and not one.at_bound)
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -408,12 +408,3 @@ def of_material_alone(result: FitResult) -> None:
     if others:
         remedy = "Fit the material under the scenes that it found, with fitting.fit"
         raise InputError("result", f"is not of a material alone: it tells {others[0]} too", remedy)
-
-
-def free_parameters(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
-    """Those of a material's parameters that are determined and at no bound.
-
-    Args:
-        parameters: all of them.
-    """
-    return tuple(one for one in parameters if one.value is not None and not one.at_bound)

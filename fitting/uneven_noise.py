@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 
 from fitting.channel_errors import residuals
 from fitting.likelihood import Bounds, residual_deviation
+from fitting.model_fit import ModelFit
 from fitting.pixels import Observed, Tile
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
@@ -81,7 +82,7 @@ def noise_of_each(
     pictures: Sequence[Picture],
     owner: Int[np.ndarray, " T"],
     rounding: Float[np.ndarray, " C"],
-    optimise: Callable[[Sequence[Picture]], Optimum],
+    least_squares: Callable[[Sequence[Picture]], ModelFit],
 ) -> NoiseOfEach:
     """What least squares leaves, with weights by what it leaves where that is not even.
 
@@ -89,15 +90,15 @@ def noise_of_each(
         pictures: some pixels of each tile, on the host.
         owner: of which picture each tile is.
         rounding: standard deviation of a value's rounding, (C,): no picture has less noise.
-        optimise: least squares.
+        least_squares: the fit to these.
     """
-    found = _left(pictures, owner, rounding, optimise(pictures))
+    found = _left(pictures, owner, rounding, least_squares(pictures).optimum)
     for _ in range(0 if found.even else ROUNDS):
         now = [
             replace(picture, weight=picture.weights * np.full((len(picture.target), 1), 1 / found.variance[one]))
             for picture, one in zip(pictures, owner, strict=True)
         ]
-        found = _left(pictures, owner, rounding, optimise(now))
+        found = _left(pictures, owner, rounding, least_squares(now).optimum)
     return found
 
 

@@ -30,7 +30,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from brdf.lobes import Lobe
-from fitting.likelihood import AnyArray, Bounds, in_any_channel
+from fitting.likelihood import AnyArray, Bounds, over_channels
 from fitting.solver.devices import device_count, gathered, own, placed
 
 
@@ -141,7 +141,7 @@ class Picture:
         if self.weight is None:
             return np.ones(self.target.shape[0], bool)
         above = np.asarray(self.weight) > 0
-        return above if above.ndim == 1 else in_any_channel(above)
+        return above if above.ndim == 1 else over_channels(np.logical_or, above)
 
     @functools.cached_property
     def nearest_peak(self) -> float:

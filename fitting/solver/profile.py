@@ -68,7 +68,6 @@ class Optimum:
         gram: Weighted products of the columns at the optimum.
         product: Weighted products of the columns with the target.
         square: Weighted squares of the target.
-        flat: No channel has a specular term, so every n fits equally well.
         grid: Exponents of the profile's samples; empty without a lobe.
         profile: Least cost at each, summed over channels; of the subsample, scaled, where ``profile_sampled``.
         profile_sampled: The profile is that of a subsample of the pixels.
@@ -81,10 +80,14 @@ class Optimum:
     gram: Float[np.ndarray, "C 4 4"]
     product: Float[np.ndarray, "C 4"]
     square: Float[np.ndarray, " C"]
-    flat: bool
     grid: Float[np.ndarray, " G"]
     profile: Float[np.ndarray, " G"]
     profile_sampled: bool
+
+    @property
+    def flat(self) -> bool:
+        """No channel has a specular term, so every n fits equally well."""
+        return not np.any(self.x[2] > 0)
 
     @property
     def gauss_newton(self) -> Float[np.ndarray, "C 4 4"]:
@@ -104,10 +107,8 @@ class Optimum:
 
 def search(
     pictures: Sequence[Picture],
-    *,
-    n_min: float = 0.1,
-    n_max: float = 1e6,
     free: Bool[np.ndarray, "3 C"] | None = None,
+    n_range: tuple[float, float] = (0.1, 1e6),
     cap: Cap | None = None,
 ) -> Optimum:
     """Find the global optimum over the exponent and the non-negative coefficients.
@@ -116,10 +117,9 @@ def search(
         pictures: Pictures of one material, all of one dtype and number of channels, or the tiles of a picture. They are
             gone through once per pass over the pixels (three or four times), so a stream that loads each when asked
             for keeps one in memory.
-        n_min: Smallest exponent, above 0.
-        n_max: Largest exponent.
         free: Which of x_a, x_d, x_s may be above 0, per channel; all by default. If no x_s may be, or no picture has a
             lobe, the problem is linear and n without meaning.
+        n_range: Smallest and largest exponent, above 0.
         cap: From the exponent to what x_a, x_d, x_s of each channel count in a sum of at most 1, (3, C); None for no
             such bound.
 
@@ -127,7 +127,7 @@ def search(
         The optimum.
     """
     with jax.enable_x64(True):
-        problem = problem_of(pictures, (n_min, n_max), free)._replace(cap=cap)
+        problem = problem_of(pictures, n_range, free)._replace(cap=cap)
         lower, upper = problem.bounds
         sample = subsample(pictures) if problem.free[:, 2].any() else None
         if sample is None or sample.nearest == math.inf:
@@ -145,7 +145,7 @@ def search(
             # Sums in double precision over all pixels, one picture at a time: slow, and rarely needed.
             exact = Stream(lambda i: jax.tree.map(lambda leaf: leaf.astype(np.float64), pictures[i]), len(pictures))
             problem = problem._replace(pictures=exact, tolerance=TOLERANCE_DOUBLE)
-        if n_min == n_max:
+        if lower == upper:
             return _optimum(*gauss_newton(problem, Point(*(leaf[0] for leaf in profile))), problem, *about)
         minimum = gauss_newton if cap is None else capped_minimum
         if not sample.whole:
@@ -309,7 +309,6 @@ def _optimum(
         gram=about.gram,
         product=about.product,
         square=about.square,
-        flat=not np.any(point.x[:, 2] > 0),
         grid=np.asarray(grid),
         profile=np.asarray(profile),
         profile_sampled=sampled,

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -122,7 +123,7 @@ def uncertainty(
     resolution: float = 0.0,
     missed: SampleError | None = None,
     joined: Float[np.ndarray, "U U"] | None = None,
-    moved: Float[np.ndarray, "K U"] | None = None,
+    moved: Sequence[Float[np.ndarray, " U"]] = (),
 ) -> Uncertainty:
     """Errors of an optimum.
 
@@ -193,8 +194,8 @@ def uncertainty(
     if missed is not None:
         off = missed.shift(np.append(active.ravel(), with_n)) * np.append(np.ones(size - 1), optimum.n)
         covariance = covariance + np.outer(off, off)
-    if moved is not None:
-        covariance = covariance + moved.T @ moved
+    for off in moved:
+        covariance = covariance + np.outer(off, off)
     variance = np.maximum(np.diag(covariance), 0.0)
     # What errs together makes errors larger, but not the numbers less determined.
     deviations = np.sqrt(np.stack([variance, np.maximum(np.diag(independent), 0.0)]))

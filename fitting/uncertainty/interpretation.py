@@ -1,6 +1,5 @@
 """From the solver's numbers to a material, its errors, and what a user should know of them."""
 
-import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
@@ -10,10 +9,11 @@ from jaxtyping import Bool, Float
 import brdf
 from brdf.channels import channel_names
 from brdf.models.base import SpecularMaterial
+from fitting.channel_errors import residuals
 from fitting.light_colour import coefficient_factors
 from fitting.model_fit import Evidence, ModelFit
 from fitting.pixels import Observed
-from fitting.result import HELD, FitResult, Parameter, free_parameters
+from fitting.result import HELD, FitResult, Parameter
 from fitting.solver.devices import device_count
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
@@ -39,7 +39,6 @@ from fitting.uncertainty.structure import (
     Blocks,
     Errors,
     Structure,
-    errors_of,
     of_blocks,
     over_blocks,
     scatter,
@@ -58,16 +57,13 @@ GROWING = (
 WIDEST_INTERVAL = 100.0
 
 
-def interpret(
-    fit: ModelFit, seen: Observed, hidden: str = "", moved: Float[np.ndarray, "K U"] | None = None
-) -> FitResult:
+def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> FitResult:
     """Tell what a fit says.
 
     Args:
         fit: of one model.
         seen: what was fitted.
         hidden: why there is no highlight, where a fit with one has told.
-        moved: by how much each of some causes may have moved x_a, x_d, x_s, channel after channel, and n.
     """
     optimum, pictures, residual = fit.optimum, fit.pictures, fit.residual
     about = seen.told() | {"optimum": optimum, "pixels": int(optimum.pixels[0])}
@@ -124,7 +120,7 @@ def interpret(
         missed=seen.problem.sample_error(fit.model.name),
         resolution=resolution,
         joined=joined,
-        moved=moved,
+        moved=fit.moved,
     )
     interval = None
     # At k_d + k_s = 1 the cost still falls across the bound: a profile that does not know it has its least elsewhere.
@@ -134,8 +130,8 @@ def interpret(
     if hidden:
         sure.reasons[2], sure = hidden, sure._replace(n_reason=hidden)
     material, parameters = material_and_parameters(fit, sure, seen.colour, interval)
-    free, channels = free_parameters(parameters), material.k_d.shape[0]
-    index = [one.place(channels) for one in free]
+    channels = material.k_d.shape[0]
+    index = [one.place(channels) for one in parameters if one.value is not None and not one.at_bound]
     correlation = sure.correlation[np.ix_(index, index)]
     warnings = [_capped(material)] if fit.capped else []
     weighed = seen.problem.noise is not None or any(one is not None for one in seen.problem.weights)
@@ -175,11 +171,13 @@ def shared_errors(
     """
     lossy = any(tile.bounds is not None and tile.bounds.lossy for tile in seen.tiles)
     channels, few = None, said.noise < ROUNDED
-    errors = map(errors_of, said.pictures, itertools.repeat(said.optimum), said.places)
+    both = zip(said.pictures, said.places, strict=True)
+    errors = (Errors(residuals(picture, said.optimum), *place) for picture, place in both)
     if lossy:
         # The pixels of a block err together in any case.
-        errors = list(errors)
-        together = structure([over_blocks(of_blocks(_once(one, seen)), 2) for one in errors], (2, 4))
+        errors, some = list(errors), slice(1 if seen.copies else None)
+        blocks = [of_blocks(one._replace(values=one.values[:, some])) for one in errors]
+        together = structure([over_blocks(one, 2) for one in blocks], (2, 4))
     else:
         # With little noise few values say much.
         if said.scores:
@@ -216,11 +214,6 @@ def _scores(score: np.ndarray, information: np.ndarray, place: tuple[np.ndarray,
     return found._replace(squares=np.maximum(found.squares, told.squares))
 
 
-def _once(errors: Errors, seen: Observed) -> Errors:
-    """Of channels that are copies of each other the first."""
-    return errors._replace(values=errors.values[:, :1]) if seen.copies else errors
-
-
 def _scattered(
     pictures: Sequence[Picture], optimum: Optimum, errors: Iterable[Errors], covariance: np.ndarray | None
 ) -> Float[np.ndarray, "U U"]:
@@ -241,7 +234,7 @@ def alone_covariance(optimum: Optimum, tied: np.ndarray | None) -> Float[np.ndar
 def _left(pictures: Sequence[Picture], seen: Observed, optimum: Optimum) -> Iterator[Errors]:
     """What a fit leaves of whole pictures."""
     for picture, width in zip(pictures, seen.widths, strict=True):
-        yield errors_of(picture, optimum, (np.arange(picture.target.shape[0]), width))
+        yield Errors(residuals(picture, optimum), np.arange(picture.target.shape[0]), width)
 
 
 def _typical_weight(pictures: Sequence[Picture]) -> float:

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from fitting.channel_errors import residuals
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
 from fitting.solver.tied import places_of
@@ -142,7 +141,7 @@ def over_blocks(errors: Errors, size: int) -> Blocks:
         return Blocks(*(coarser(part, size) for part in (image, image**2, image != 0)))
     # Of a picture whose roundings leave nothing open it has no pixel, and few where little is open.
     shape = -(-rows // size), -(-width // size)
-    block = errors.pixel // width // size * shape[1] + errors.pixel % width // size
+    block = errors.blocks(size)
     return Blocks(
         *(
             np.stack([np.bincount(block, one, math.prod(shape)).reshape(shape) for one in part.T], axis=-1)
@@ -167,17 +166,6 @@ def shared(grids: Sequence[Blocks]) -> tuple[float, float]:
     """
     excess = sum(float(np.sum(grid.sums**2 - grid.squares)) for grid in grids)
     return excess, math.sqrt(sum(float(np.sum(2 * grid.squares**2)) for grid in grids))
-
-
-def errors_of(picture: Picture, optimum: Optimum, place: tuple[np.ndarray, int]) -> Errors:
-    """What a fit leaves, in units of the noise.
-
-    Args:
-        picture: whose weights are inverse variances.
-        optimum: of the fit.
-        place: index of the pixels and width of the picture.
-    """
-    return Errors(residuals(picture, optimum), *place)
 
 
 def scatter(

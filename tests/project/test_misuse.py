@@ -119,7 +119,7 @@ MISUSES = {
     "fitting.sensitivity(material, lambda s: (s[0].ambient,))": r"result: must be a FitResult, got BlinnPhong\.",
     "fitting.next_light(material)": r"result: must be of fitting\.fit or fit_maps, got BlinnPhong\.",
     "fitting.next_light(fitted(), 'up', of='k_d')": r"candidates: must hold lights or directions .* got 'u'\.",
-    "fitting.next_light(fitted(), [brdf.DirectionalLight([0, 0, 1], [1, 1])], of='k_d')": r"candidates: have 2 channels",
+    "fitting.next_light(fitted(), [brdf.DirectionalLight([0, 0, 1], [1, 1])], of='k_d')": r"candidates: have 2",
     "fitting.fit_lights(target, material, scene)": r"scene: must be a brdf\.Scene, got BlinnPhong\.",
     "fitting.fit_lights(target, scene, brdf.Phong)": r"material: must be a Material, got the class Phong\.",
     "fitting.fit_lights('target.exr', scene, material)": r"target\.exr: there is no such file or folder\.",

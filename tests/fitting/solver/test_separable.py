@@ -24,14 +24,14 @@ def test_recovers_what_was_rendered(n, dtype, tolerance):
 @pytest.mark.parametrize("size", [48, 160])
 def test_exponent_at_its_bound(n, expected, size):
     one = picture(size, n, noise=0.01)
-    found = search([one], n_min=0.5, n_max=20.0)
+    found = search([one], n_range=(0.5, 20.0))
     assert found.n == expected
     np.testing.assert_allclose(np.sum(found.cost), best_at([one], expected), rtol=1e-9)
 
 
 def test_exponent_given():
     one = picture(48, 30.0, noise=0.01)
-    found = search([one], n_min=20.0, n_max=20.0)
+    found = search([one], n_range=(20.0, 20.0))
     np.testing.assert_allclose(found.n, 20.0, rtol=1e-14)
     np.testing.assert_allclose(np.sum(found.cost), best_at([one], 20.0), rtol=1e-10)
 
@@ -45,7 +45,7 @@ def test_no_specular_trace(size):
     np.testing.assert_allclose(found.x[:2], x[:2], atol=1e-12)
     # A target below the diffuse model where the lobe would be: the coefficient is exactly 0, and n without meaning.
     dip = picture(size, x=X * np.array([[1], [1], [-0.1]]))
-    found = search([dip], n_min=30.0, n_max=1e3)
+    found = search([dip], n_range=(30.0, 1e3))
     assert found.flat
     assert np.all(found.x[2] == 0)
     assert np.isfinite(found.n)
