@@ -143,6 +143,9 @@ def find_codes(
             writer truncated, None finds out.
         unit: radiance of the largest code of a file, a number or (C,).
         stored: the codes themselves, of integers that are at hand.
+
+    Raises:
+        InputError: where they were truncated to no levels that are known.
     """
     if rounding is not None and not (isinstance(rounding, str) and rounding == "floor"):
         return _stated(pixels, rounding)
@@ -152,7 +155,10 @@ def find_codes(
         found = None if found is None else found._replace(unit=unit)
     else:
         found = _levels(pixels, half=bits == HALF)
-    if found is not None and rounding == "floor":
+    if rounding == "floor":
+        if found is None:
+            came, remedy = "is floor, but the values stand on no levels of a file", "Give codes, as uint8 or uint16"
+            raise InputError("rounding", came, remedy)
         found = found._replace(below=0.0, above=1.0)
     return found
 

@@ -60,6 +60,8 @@ HOPELESS = 3.0
 TRIALS = 4
 # An exponent up to this multiple of the lower bound is at the bound.
 WIDEST = 1.01
+# There Lambert's law takes up what rounding makes of it.
+ROUNDED_AWAY = "a highlight as wide as the search allows changes no value by a code"
 # By so much rounding may lift a sum over its bound.
 ROUNDING = 1e-12
 
@@ -91,6 +93,8 @@ def fit_pictures(problem: FitProblem) -> FitResult:
         # Why there is a highlight in the numbers but none in the material.
         reasons = {one.reason for one in told.parameters if one.name in ("k_s", "n")}
         hidden = reasons.pop() if len(reasons) == 1 else ""
+        if optimum.n <= WIDEST * problem.n_range[0] and highlight_in_codes(fit.pictures, optimum) < 1.0:
+            hidden = ROUNDED_AWAY
         if hidden and not fit.capped and optimum.x[2].any():
             # Or ambient and diffuse would be the ones that go with the highlight. Weights of a robust loss are made
             # anew.

@@ -278,20 +278,27 @@ def _noisier(values: Values, factor: float) -> Values:
 
 
 def _of_planes(pictures: Sequence[Picture], at: Estimate, problem: "_Separable") -> Float[np.ndarray, " U"] | float:
-    """The least variance of each unknown where values on a plane show one code, and share a rounding error."""
+    """The least variance of each unknown where values on a plane show one code, and share a rounding error.
+
+    A channel that no light shades is such a plane too.
+    """
     numbers = Numbers.of(at.unknowns)
     some = [
         picture.in_double(np.arange(0, len(picture.target), 1 + len(picture.target) // MOST_PIXELS))
         for picture in pictures
     ]
-    if any(np.unique(np.rint(_codes(one, numbers) * ALIKE)).size >= MOST_LEVELS for one in some):
+    levels = [[np.unique(code).size for code in np.rint(_codes(one, numbers) * ALIKE).T] for one in some]
+    flat = np.max(levels, axis=0) < MOST_LEVELS
+    if not flat.any():
         return 0.0
     codes = [_codes(picture, numbers) for picture in pictures]
     weights = [alike(bounds_of(one), code, FIRST_NOISE, level=True) for one, code in zip(pictures, codes, strict=True)]
     weighted = map(_with_weight, pictures, weights)
     pixels = [_values(picture.in_double(np.arange(len(picture.target)))) for picture in weighted]
     at, alone = at._replace(noise=FIRST_NOISE), _Separable(pixels, problem.design, problem.n_range, problem.copies)
-    return precision_at(alone, at, alone.score(at, alone.near(alone.codes(at.unknowns), REACH * at.noise))).variance
+    said = alone.score(at, alone.near(alone.codes(at.unknowns), REACH * at.noise))
+    of_planes = np.append(np.tile(flat, 3), flat.all())
+    return np.where(of_planes, precision_at(alone, at, said).variance, 0.0)
 
 
 def _optimum(working: Sequence[Picture], fit: ModelFit, at: Numbers) -> Optimum:

@@ -134,9 +134,11 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> FitResult:
     index = [one.place(channels) for one in parameters if one.value is not None and not one.at_bound]
     correlation = sure.correlation[np.ix_(index, index)]
     warnings = [_capped(material)] if fit.capped else []
-    weighed = seen.problem.noise is not None or any(one is not None for one in seen.problem.weights)
+    weighed = any(one is not None for one in seen.problem.weights)
     warnings += _warnings(left.neighbours, together, None if all(sure.reasons[2]) else lobe)
-    if growing is not None and not any("structure" in text for text in warnings):
+    # What the camera says of a pixel's brightness may be off in a channel of strong colour.
+    told = seen.problem.noise is not None
+    if growing is not None and not told and not any("structure" in text for text in warnings):
         warnings.append(GROWING.format("the weights do not" if weighed else "pixels are weighed alike"))
     if sure.sums:
         words = "no more than a sum of several numbers is determined, see there: the material shows it with "

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from small_ball import ball_scene, pictured
 
 import brdf
 import fitting
@@ -234,3 +235,29 @@ def test_a_plane_of_one_code_is_known_to_half_a_code(kind: type, half_edge: floa
     assert found.error is not None
     assert 0.5 * half_step < found.error < half_step
     assert abs(float(found) - 0.80503) < 1.8 * found.error
+
+
+def test_a_channel_that_no_light_shades_is_known_to_half_a_code():
+    codes, scene = lambert_codes([1.0, 0.0, 0.5], k_a=0.25, k_d=0.5)
+    k_a = fitting.fit(codes, scene, model="lambert")["k_a"]
+    # Half a code is 0.01 of it.
+    assert 0.005 < k_a[1].error < 0.01
+    assert abs(float(k_a[1]) - 0.25) < 1.8 * k_a[1].error
+    assert max(k_a[0].error, k_a[2].error) < 2e-4
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_named_model_finds_no_highlight_that_rounding_makes(seed: int):
+    random = np.random.default_rng(seed)
+    k_a, k_d = random.uniform(0.1, 0.5, 3), random.uniform(0.05, 0.7, 3)
+    found = fitting.fit(*lambert_codes([1.0] * 3, k_a, k_d), model="blinn-phong")
+    assert not np.any(found.material.k_s)
+    for name, true in (("k_a", k_a), ("k_d", k_d)):
+        for one, value in zip(found[name], true, strict=True):
+            assert abs(float(one) - value) < 3 * one.error
+
+
+def lambert_codes(intensity, k_a, k_d) -> tuple[np.ndarray, brdf.Scene]:
+    """A ball of a Lambert surface in 8 bits, without noise."""
+    scene = ball_scene(brdf.DirectionalLight([0.4, 0.5, 0.8], intensity), ambient=[0.2] * 3)
+    return np.rint(255 * pictured(brdf.Lambert(k_a=k_a, k_d=k_d), scene)).astype(np.uint8), scene

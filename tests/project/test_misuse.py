@@ -114,6 +114,7 @@ MISUSES = {
     "fitting.fit_many('target.exr', scene)": r"pictures: must be an array \(N, H, W, C\) or a list, got str\.",
     "fitting.fit_many(target, scene)": r"pictures: must be .* or a list, got ndarray \(48, 48, 3\)\. Stack them",
     "fitting.fit_lights(target, dark, material)": r"scene: has no lights\. Add a \[\[lights\]\] table, or \[ambient\]",
+    "fitting.fit(target, scene, rounding='floor')": r"rounding: is floor, but the values stand on no levels of a file",
     "fitting.sensitivity(fitted(), 'light')": r"by: must be a function, got 'light'\. Write lambda scenes",
     "fitting.sensitivity(fitted(), lambda s: (2 * s[0].lights[0].direction,))": r"by: gives what is no number of",
     "fitting.sensitivity(material, lambda s: (s[0].ambient,))": r"result: must be a FitResult, got BlinnPhong\.",
