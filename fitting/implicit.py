@@ -19,7 +19,6 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,7 +28,7 @@ from jaxtyping import Array, Float
 import brdf
 from brdf.checks import instance
 from brdf.precision import working_precision
-from fitting.joint_problem import QUICKLY_COMPILED, residuals
+from fitting.joint_problem import QUICKLY_COMPILED, Picture, residuals
 from fitting.progress import waiting
 from fitting.result import FitResult, Parameter, of_material_alone
 from fitting.solver.nnls import inverse_diagonal, scaled_inverse
@@ -91,48 +90,66 @@ def sensitivity(result: FitResult, by: Callable[[list[brdf.Scene]], Sequence[Any
         raise brdf.InputError("by", came, "Write lambda scenes: (scenes[0].lights[0].direction,)")
     if result.loss != "squared":
         raise brdf.InputError("result", f"must be of the squared loss, got {result.loss}", "Fit without a loss")
-    leaves = by(list(result.scenes))
-    if not isinstance(leaves, Sequence) or not leaves or not all(hasattr(leaf, "shape") for leaf in leaves):
-        raise brdf.InputError("by", "names no leaf of the scenes", "Return the leaves to differentiate by")
-    if len({id(leaf) for leaf in leaves}) < len(leaves):
-        raise brdf.InputError("by", "gives a leaf twice", "Return each once")
     unknowns = _unknowns(result)
     count = len(unknowns)
     with working_precision("float64"), waiting("differentiating the fit"):
-        material, scenes, leaves = brdf.cast((result.material, list(result.scenes), list(leaves)), "float64")
+        content = jax.tree.map(jnp.array, brdf.cast((result.material, list(result.scenes)), "float64"))
         flat = [target.reshape(-1, target.shape[-1]) for target in result.targets]
         pictures = brdf.cast(list(zip(flat, map(np.ravel, result.weighed), strict=True)), "float64")
-        numbers, of_numbers = ravel_pytree(material)
-        vector, parts = ravel_pytree((jnp.zeros(count), leaves))
-
-        def cost(vector: Array) -> Array:
-            moves, known = parts(vector)
-            lit = eqx.tree_at(lambda scenes: list(by(scenes)), scenes, known)
-            return 0.5 * jnp.sum(residuals(of_numbers(numbers + moves @ unknowns), lit, pictures) ** 2)
-
-        @partial(jax.jit, compiler_options=QUICKLY_COMPILED)
-        def curvature(vector: Array) -> tuple[Array, Array]:
-            """The gradient by the unknowns, and how that by all numbers changes along each of them."""
-            slope, along = jax.linearize(jax.grad(cost), vector)
-            return slope[:count], jax.lax.map(along, jnp.eye(count, vector.size))
-
-        try:
-            slope, rows = map(np.asarray, curvature(vector))
-        except (TypeError, ValueError):
+        own = {id(leaf): place for place, leaf in enumerate(jax.tree.leaves(content[1]))}
+        leaves = by(content[1])
+        if not isinstance(leaves, Sequence) or not leaves or not all(hasattr(leaf, "shape") for leaf in leaves):
+            raise brdf.InputError("by", "names no leaf of the scenes", "Return the leaves to differentiate by")
+        if len({id(leaf) for leaf in leaves}) < len(leaves):
+            raise brdf.InputError("by", "gives a leaf twice", "Return each once")
+        if not own.keys() >= set(map(id, leaves)):
             came = "gives what is no number of the scenes as a whole"
-            raise brdf.InputError("by", came, "Return leaves of the scenes") from None
+            raise brdf.InputError("by", came, "Return leaves of the scenes")
+        curvature = partial(_curvature, content, unknowns, pictures, places=tuple(own[id(leaf)] for leaf in leaves))
+        vector = jnp.concatenate([jnp.zeros(count), *map(jnp.ravel, leaves)])
+        slope, rows = map(np.asarray, curvature(vector))
         # A fit in float32 stops a little beside the stationary point; Newton's steps go there.
         for _ in range(NEWTON_STEPS):
             vector = vector.at[:count].add(-_inverse(rows[:, :count]) @ slope)
             slope, rows = map(np.asarray, curvature(vector))
     moves = np.zeros((3 * result.material.k_d.size + 1, rows.shape[1] - count))
-    moves[: numbers.size] = -unknowns.T @ _inverse(rows[:, :count]) @ rows[:, count:]
+    moves[: unknowns.shape[1]] = -unknowns.T @ _inverse(rows[:, :count]) @ rows[:, count:]
     found, ends = [], np.cumsum([leaf.size for leaf in leaves])
     for leaf, columns in zip(leaves, np.split(moves, ends[:-1], axis=1), strict=True):
         rows = columns.reshape(-1, *leaf.shape)
         k_a, k_d, k_s = np.split(rows[:-1], 3)
         found.append(Sensitivity(k_a, k_d, k_s, rows[-1]))
     return tuple(found)
+
+
+@partial(jax.jit, static_argnames="places", compiler_options=QUICKLY_COMPILED)
+def _curvature(
+    content: tuple[brdf.Material, list[brdf.Scene]],
+    unknowns: Array,
+    pictures: Sequence[Picture],
+    vector: Array,
+    places: tuple[int, ...],
+) -> tuple[Array, Array]:
+    """The gradient of half the sum of squares by the unknowns, (U,), and how it changes along all numbers, (V, U).
+
+    Args:
+        content: material and scenes.
+        unknowns: what each moves of the material's numbers, (U, S).
+        pictures: what is fitted.
+        vector: of the unknowns, then the numbers of some leaves of the scenes.
+        places: of these among all leaves of the scenes.
+    """
+    count, (numbers, of_numbers) = len(unknowns), ravel_pytree(content[0])
+    leaves, shape = jax.tree.flatten(content[1])
+    _, of_known = ravel_pytree([leaves[place] for place in places])
+
+    def cost(vector: Array) -> Array:
+        known = dict(zip(places, of_known(vector[count:]), strict=True))
+        lit = jax.tree.unflatten(shape, [known.get(place, leaf) for place, leaf in enumerate(leaves)])
+        return 0.5 * jnp.sum(residuals(of_numbers(numbers + vector[:count] @ unknowns), lit, pictures) ** 2)
+
+    slope, along = jax.linearize(jax.grad(cost), vector)
+    return slope[:count], jax.lax.map(along, jnp.eye(count, vector.size))
 
 
 def _unknowns(result: FitResult) -> Float[np.ndarray, "U S"]:
