@@ -282,14 +282,12 @@ class _Split:
         return leading + (self.high.cross(other.low) + self.low.cross(other.value))
 
     def __add__(self, other: "_Split") -> "_Split":
-        return self._combined(operator.add, other)
+        low = None if self.low is None or other.low is None else self.low + other.low
+        return _Split(self.value + other.value, self.high + other.high, low)
 
     def __sub__(self, other: "_Split") -> "_Split":
-        return self._combined(operator.sub, other)
-
-    def _combined(self, operation: Callable[[Any, Any], Any], other: "_Split") -> "_Split":
-        low = None if self.low is None else operation(self.low, other.low)
-        return _Split(operation(self.value, other.value), operation(self.high, other.high), low)
+        low = None if self.low is None or other.low is None else self.low - other.low
+        return _Split(self.value - other.value, self.high - other.high, low)
 
     def less(self, small: Components) -> "_Split":
         """The difference from a small vector."""
