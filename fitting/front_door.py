@@ -63,6 +63,7 @@ def fit(
         noise: of the camera, (read, shot): the variance of a value is read² + shot · value, and pixels weigh by its
             inverse. None weighs all alike.
         weight: (H, W), how much each pixel counts beside that, at least 0; a list where there are several pictures.
+            Inverse variances or not, as of a soft mask or a region of interest: errors are those of the noise.
         rounding: the full step between neighbouring values of the picture, in its linear unit, a number or per value;
             0 for plain least squares; "floor" where the writer truncated. None finds out, see `fitting.codes`.
         encoding: "linear", "srgb" or a gamma: how a file or an array holds its values. None for what the file says; an

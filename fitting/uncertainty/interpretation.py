@@ -32,7 +32,7 @@ from fitting.uncertainty.covariance import (
 )
 from fitting.uncertainty.highlight import OFF_CENTRE, Highlight, highlight
 from fitting.uncertainty.intervals import exponent_interval
-from fitting.uncertainty.noise_model import weighted_sums
+from fitting.uncertainty.noise_model import sums_beside_weights, weighted_sums
 from fitting.uncertainty.residual import Neighbours, Residual, survey
 from fitting.uncertainty.structure import (
     SIZES,
@@ -74,7 +74,7 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> FitResult:
     lobe = None if optimum.flat else highlight(optimum.n, left)
     visible = 0.0 if lobe is None else lobe.share(optimum.x, seen.brightest)
     resolution = RESOLUTION if fit.single else 0.0
-    spread, shared, widening, deviation, gain, joined, growing = None, None, 1.0, noise, 0.0, None, None
+    spread, shared, widening, deviation, gain, joined, growing, beside = None, None, 1.0, noise, 0.0, None, None, None
     channels = left.channels(noise > 2 * rounding)
     if fit.evidence is not None:
         # Each working target has the noise 1; what least squares leaves is rounding, which goes together.
@@ -92,15 +92,20 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> FitResult:
             joined = said.together.gram
             gain = max(gain, specular_gain(joined, optimum.x))
     else:
-        growing = left.growing_noise(noise, rounding)
+        # Where weights are no inverse variances nothing is told of what else makes noise uneven.
+        asked = any(one is not None for one in seen.problem.weights) and seen.problem.loss == "squared"
+        beside = sums_beside_weights(pictures, optimum) if asked else None
+        growing = left.growing_noise(noise, rounding) if beside is None else None
         once = seen.copies or channels is not None
-        together = _structure(left, seen, noise > 2 * rounding, even=growing is None, once=once)
+        together = _structure(left, seen, noise > 2 * rounding, even=growing is None and beside is None, once=once)
         # What a bound of the material leaves is no error of the pixels.
         if together is not None and together.significant and not fit.capped:
             shared = _scattered(pictures, optimum, _left(pictures, seen, optimum), alone_covariance(optimum, fit.tied))
     channels = np.ones((noise.size,) * 2) if seen.copies else channels
     if shared is None and growing is not None:
-        spread = fit.noise_factor**2 * weighted_sums(pictures, optimum, growing, inverse=False).gram
+        beside = weighted_sums(pictures, optimum, growing, inverse=False)
+    if shared is None and beside is not None:
+        spread = fit.noise_factor**2 * beside.gram
     # What the light reaches but the simplest model does without is 0, with the error that it would have.
     reached = seen.reached(fit.model)
     sure = uncertainty(

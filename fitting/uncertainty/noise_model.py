@@ -10,7 +10,7 @@ highlight of three pixels).
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fitting.channel_errors import residuals
 from fitting.solver.nnls import nonnegative_minimum
 from fitting.solver.normal_equations import AnyArray, Picture, Sums, sums
 from fitting.solver.profile import Optimum
@@ -32,6 +33,8 @@ RISE = 20.0
 EVEN = 1.2
 MOST_VALUES = 4096
 ROUNDS = 6
+# Of noise that does not know of the weights: its variance is one over this power of them.
+POWERS = (0.0, 0.25, 0.5, 0.75)
 
 
 def noise_model(
@@ -125,10 +128,48 @@ def weighted_sums(
         The sums, columns ambient, diffuse, lobe, derivative by n, about the target.
     """
     n, x = np.asarray(optimum.n), optimum.x
+    return _sums_at(pictures, optimum, lambda picture: _reweighted(picture, n, x, coefficients, inverse))
+
+
+def _sums_at(pictures: Sequence[Picture], optimum: Optimum, weight: Callable[[Picture], AnyArray]) -> Sums:
+    """Sums at the optimum with other weights."""
 
     def again(picture: Picture) -> Picture:
-        return dataclasses.replace(picture, weight=_reweighted(picture, n, x, coefficients, inverse))
+        return dataclasses.replace(picture, weight=jnp.asarray(weight(picture), picture.target.dtype))
 
     with jax.enable_x64(True):
-        parts = sums(each(again, pictures), np.log([n]), x.T)
-    return Sums(*(leaf[0] for leaf in parts)).about(x.T).columns(np.diag([1.0, 1.0, 1.0, 1.0 / n]))
+        parts = sums(each(again, pictures), np.log([optimum.n]), optimum.x.T)
+    return Sums(*(leaf[0] for leaf in parts)).about(optimum.x.T).columns(np.diag([1.0, 1.0, 1.0, 1.0 / optimum.n]))
+
+
+def sums_beside_weights(pictures: Sequence[Picture], optimum: Optimum) -> Sums | None:
+    """Sums at the optimum with each pixel's weight times the variance of its weighted residual, where weights vary it.
+
+    Weights of least squares are inverse variances, unless they say what is of interest: those of a soft mask, of a
+    region. Then noise is what it is beside them, and errors are those of the sandwich.
+
+    Args:
+        pictures: as they were searched.
+        optimum: of the search.
+
+    Returns:
+        The sums as those of `weighted_sums`; None where inverse variances are as likely.
+    """
+    squared = [residuals(picture, optimum) ** 2 for picture in pictures]
+    weight = [
+        np.broadcast_to(np.asarray(picture.weights, float), (len(one), 1))
+        for picture, one in zip(pictures, squared, strict=True)
+    ]
+    squared, weight = np.concatenate(squared), np.concatenate(weight)
+    squared, weight = squared[weight[:, 0] > 0], weight[weight[:, 0] > 0]
+    variance = {power: np.mean(squared * weight ** (power - 1), axis=0) for power in (*POWERS, 1.0)}
+    if not all(np.all(one > 0) for one in variance.values()):
+        return None
+    # Twice the logarithm of the likelihood, but for a constant.
+    likely = {power: float(np.sum(power * np.log(weight) - np.log(one))) for power, one in variance.items()}
+    power = max(likely, key=lambda one: likely[one])
+    if likely[power] < likely[1.0] + RISE:
+        return None
+    return _sums_at(
+        pictures, optimum, lambda picture: np.asarray(picture.weights, float) ** (2 - power) * variance[power]
+    )

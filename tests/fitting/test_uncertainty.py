@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 from scipy import optimize, stats
-from small_ball import ball_scene, pictured
+from small_ball import SIZE, ball_scene, pictured
 
 import brdf
 import fitting
@@ -384,3 +384,23 @@ def test_as_few_pixels_as_numbers_leave_no_error_to_tell():
     result = fitting.fit(noisy(brdf.Lambert(k_a=0.5, k_d=0.5), 0.01, 0), SCENE, mask=mask, model="lambert")
     assert [one.value for one in result.parameters] == [None, None]
     assert "as few pixels" in result.parameters[0].reason
+
+
+@pytest.mark.parametrize("kind", ["soft mask", "region"])
+def test_weights_that_are_no_inverse_variances_make_nothing_surer(kind: str):
+    weight = np.full((SIZE, SIZE), 0.01)
+    if kind == "region":
+        weight[10:30, 12:34] = 1.0
+    else:
+        weight[np.random.default_rng(5).uniform(size=weight.shape) < 0.1] = 1.0
+    material, scene, inside = brdf.BlinnPhong(k_a=[0.3] * 3, k_d=[0.5] * 3, k_s=[0.3] * 3, n=20), ball_scene(), []
+    for seed in range(12):
+        result = fitting.fit(pictured(material, scene, 0.01, seed), scene, model="blinn-phong", weight=weight)
+        assert not result.warnings
+        inside += [
+            one.interval[0] <= getattr(material, one.name)[one.channel or 0] <= one.interval[1]
+            for one in result.parameters
+            if one.name != "n"
+        ]
+    # As inverse variances they would hold half.
+    assert np.mean(inside) > 0.88
