@@ -254,7 +254,9 @@ def _observe(
             if target.codes is not None:
                 bounds = target.codes.bounds(band.rows, valid, level, spread)
             else:
-                bounds = open_ends(np.asarray(band.values), valid, total.least, level, spread, width)
+                # Where a camera reads without noise no photon came to what is 0, and nothing was cut off.
+                floor = total.least if noise is None or noise[0] > 0 else -np.inf
+                bounds = open_ends(np.asarray(band.values), valid, floor, level, spread, width)
         return Tile(band.values, weight, band.points, grey, bounds)
 
     tiles = each(tile, bands, found)
