@@ -33,7 +33,7 @@ from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum, refit, search
 from fitting.solver.refinement import TOLERANCE_DOUBLE
 from fitting.solver.streams import Stream, each
-from fitting.solver.tied import NormalEquations, design_of, join_channels
+from fitting.solver.tied import NormalEquations, design_of, join_channels, places_of
 from fitting.uncertainty.covariance import NO_TRACE, residual_noise, specular_gain
 from fitting.uncertainty.highlight import highlight, nearest_peak
 from fitting.uncertainty.interpretation import alone_covariance, interpret, shared_errors
@@ -361,7 +361,15 @@ def _likely_sums(fits: Mapping[str, ModelFit]) -> dict[str, NormalEquations]:
             found[name] = fit.optimum.normal(noise)
             continue
         one, normal = fit.evidence.optimum, fit.evidence.normal
+        normal = normal._replace(gram=normal.gram.copy(), product=normal.product.copy())
         at = np.append(one.x.ravel(), 0.0)
+        # A channel all of whose values are surely inside their codes, as a black one, says nothing of small changes; of
+        # large ones least squares does.
+        for index, gram, squares in zip(places_of(one.x.shape[1]), one.gram, fit.optimum.gram, strict=True):
+            if not gram.any():
+                own = np.ix_(index[:3], index[:3])
+                normal.gram[own] += squares[:3, :3] / np.max(noise)
+                normal.product[index[:3]] += normal.gram[own] @ at[index[:3]]
         least = 2 * (value - fit.evidence.value) + float(np.sum(one.pixels))
         found[name] = normal._replace(square=least + (2 * normal.product - normal.gram @ at) @ at)
     return found

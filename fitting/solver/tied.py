@@ -9,6 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+# Of the largest of a channel.
+LEAST_VARIANCE = 1e-10
+
 
 class NormalEquations(NamedTuple):
     """Normal equations in x_a, x_d, x_s, channel after channel, and the shift of n; channels weighed by their noise.
@@ -44,6 +47,8 @@ def join_channels(
     scale = np.ones((channels, 4))
     scale[:, 3] = x_s
     variance, places = np.broadcast_to(variance, channels), places_of(channels)
+    # A black channel may have no noise at all, and still leaves the others their digits.
+    variance = np.maximum(variance, LEAST_VARIANCE * np.max(variance))
     whole, right = np.zeros((3 * channels + 1,) * 2), np.zeros(3 * channels + 1)
     for c, index in enumerate(places):
         right[index] += product[c] * scale[c] / variance[c]

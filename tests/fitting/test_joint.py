@@ -104,7 +104,6 @@ def test_nothing_to_free_is_an_error(target: np.ndarray):
         (lambda m, s: (m.k_d, m.k_d), "twice"),
         (lambda m, s: (np.ones(3),), "no number"),
         (lambda m, s: (m.k_d[0],), "no number"),
-        (None, "no tuple"),
         (lambda m, s: (m.gloss,), "no attribute 'gloss'"),
         (lambda m, s: (s[0].lights[7].direction,), "out of range"),
     ],

@@ -127,3 +127,13 @@ def test_an_exponent_whose_highlight_no_pixel_sees_is_not_looked_at():
         scene = ball_scene(light)
         picture = pictured(brdf.Lambert(k_a=0.4, k_d=0.0), scene, 0.003, seed).astype(np.float32)
         assert chosen(fitting.fit(picture, scene, saturation=np.inf)).model == "ambient"
+
+
+@pytest.mark.parametrize("intensity", [[1.0, 1.0, 1.0], [1.0, 1.0, 0.0]])
+def test_a_channel_without_light_does_not_choose_for_the_others(intensity):
+    material = brdf.BlinnPhong(k_d=[0.3, 0.5, 0.0], k_s=[0.3, 0.3, 0.0], n=20)
+    scene = ball_scene(brdf.DirectionalLight([0.4, 0.5, 0.8], intensity), ambient=None)
+    found = fitting.fit(np.rint(255 * pictured(material, scene)).astype(np.uint8), scene).material
+    np.testing.assert_allclose(found.k_d[:2], material.k_d[:2], atol=1e-4)
+    np.testing.assert_allclose(found.k_s[:2], material.k_s[:2], atol=1e-3)
+    np.testing.assert_allclose(found.n, 20, rtol=1e-3)
