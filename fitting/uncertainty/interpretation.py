@@ -93,8 +93,8 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> FitResult:
             gain = max(gain, specular_gain(joined, optimum.x))
     else:
         # Where weights are no inverse variances nothing is told of what else makes noise uneven.
-        asked = any(one is not None for one in seen.problem.weights) and seen.problem.loss == "squared"
-        beside = sums_beside_weights(pictures, optimum) if asked else None
+        asked = seen.problem.loss == "squared" and any(one is not None for one in seen.problem.weights)
+        beside = sums_beside_weights(pictures, optimum) if asked and device_count() == 1 else None
         growing = left.growing_noise(noise, rounding) if beside is None else None
         once = seen.copies or channels is not None
         together = _structure(left, seen, noise > 2 * rounding, even=growing is None and beside is None, once=once)
