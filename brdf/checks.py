@@ -187,8 +187,11 @@ def spectrum(name: str, value: Any, largest: float = LARGEST) -> Any:
 
 def vertex_list(name: str, value: Any) -> Any:
     """Corners of a polygon: three points or more."""
-    words, remedy = "three points or more", "Give [[x, y, z], ...]"
-    return _shaped(name, value, lambda count=0, axes=0, *more: count >= 3 and axes == 3 and not more, words, remedy)
+
+    def fits(count=0, axes=0, *more) -> bool:
+        return count >= 3 and axes == 3 and not more
+
+    return _shaped(name, value, fits, "three points or more", "Give [[x, y, z], ...]")
 
 
 def sample_number(value: Any, most: int = MAX_SAMPLES) -> int:

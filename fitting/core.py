@@ -93,7 +93,8 @@ def fit_pictures(problem: FitProblem) -> FitResult:
         # Why there is a highlight in the numbers but none in the material.
         reasons = {one.reason for one in told.parameters if one.name in ("k_s", "n")}
         hidden = reasons.pop() if len(reasons) == 1 else ""
-        if optimum.n <= WIDEST * problem.n_range[0] and highlight_in_codes(fit.pictures, optimum) < 1.0:
+        widest = optimum.n <= WIDEST * problem.n_range[0]
+        if widest and not hidden and highlight_in_codes(fit.pictures, optimum) < 1.0:
             hidden = ROUNDED_AWAY
         if hidden and not fit.capped and optimum.x[2].any():
             # Or ambient and diffuse would be the ones that go with the highlight. Weights of a robust loss are made

@@ -48,7 +48,7 @@ from brdf.checks import instance
 from brdf.errors import InputError
 from brdf.models.base import SpecularMaterial, check_model
 from brdf.rendering import Basis, basis
-from fitting.problem import check_choice
+from fitting.problem import check_exponents
 from fitting.solver.nnls import nonnegative_minima
 from fitting.solver.profile import lowest_in_cells
 
@@ -162,7 +162,7 @@ def fit(
     """
     check_model(model)
     instance("scene", scene, brdf.Scene, "Write fitting.functional.fit(target, scene)")
-    check_choice("squared", ("squared",), n_range)
+    check_exponents(n_range)
     target, (width, height) = jnp.asarray(target), scene.resolution
     channels = target.shape[-1] if scene.channels == 1 and target.ndim == 3 else scene.channels
     if target.shape != (height, width, channels):

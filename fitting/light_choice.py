@@ -157,13 +157,6 @@ def next_light(result: Any, candidates: Sequence[Any] | None = None, count: int 
             """Root mean square of the standard errors of what is wanted; infinite where one is not determined."""
             return float(np.sqrt(np.mean(inverse_diagonal(information, DEPENDENT)[wanted])))
 
-        def told_by(light: Light) -> np.ndarray:
-            lit, channels = dataclasses.replace(first, lights=(light,), visibility=()), result.noise.size
-            if lit.channels not in (1, channels):
-                came = f"have {lit.channels} channels, the pictures {channels}"
-                raise InputError("candidates", came, "Give both the same number, or light of one")
-            return unit * told(lit, weight)
-
         scenes = [_scene(result, index) for index in range(len(result.scenes))]
         first, weight = scenes[0]
         to_view = np.asarray(first.surface_points().to_view, np.float64).reshape(-1, 3).mean(axis=0)
@@ -171,6 +164,14 @@ def next_light(result: Any, candidates: Sequence[Any] | None = None, count: int 
         # What is known is what the fit says, of codes by their edges: another picture is taken to tell as much a pixel.
         own = math.sqrt(np.mean([one.error**2 for one in asked]))
         unit = (error(information) / own) ** 2 if own > 0 else 1.0
+
+        def told_by(light: Light) -> np.ndarray:
+            lit, channels = dataclasses.replace(first, lights=(light,), visibility=()), result.noise.size
+            if lit.channels not in (1, channels):
+                came = f"have {lit.channels} channels, the pictures {channels}"
+                raise InputError("candidates", came, "Give both the same number, or light of one")
+            return unit * told(lit, weight)
+
         return choose_lights(candidates, count, of, known, to_view, unit * information, told_by, error)
 
 

@@ -331,6 +331,18 @@ def check_choice(loss: str, losses: Iterable[str], n_range: tuple[float, float])
     """
     if loss not in losses:
         raise InputError("loss", f"is unknown, got {loss!r}", f"Use one of {', '.join(losses)}")
+    check_exponents(n_range)
+
+
+def check_exponents(n_range: tuple[float, float]) -> None:
+    """Refuse what is no range of exponents.
+
+    Args:
+        n_range: bounds of the exponent.
+
+    Raises:
+        InputError: naming the argument.
+    """
     try:
         low, high = (float(bound) for bound in n_range)
     except (TypeError, ValueError):

@@ -90,12 +90,15 @@ def write_layers(path: AnyPath, layers: Mapping[str, Any]) -> None:
 
     Args:
         path: the file, .exr.
-        layers: one or more, layer name to (H, W) or (H, W, C) values; the layer "" is the picture.
+        layers: layer name to (H, W) or (H, W, C) values; the layer "" is the picture.
 
     Raises:
-        InputError: if a layer is no picture, or the file cannot be written.
+        InputError: if sizes differ, there is no layer, or the file cannot be written.
     """
-    _write(path, {layer: _pixels(path, array) for layer, array in layers.items()}, "float", "linear")
+    arrays = {layer: _pixels(path, array) for layer, array in layers.items()}
+    if _format(path)[0] != ".exr" or len({array.shape[:2] for array in arrays.values()}) != 1:
+        raise InputError(path, "layers need an .exr file and one size", "Give arrays of one height and width")
+    _write(path, arrays, "float", "linear")
 
 
 def _format(path):

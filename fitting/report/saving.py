@@ -70,11 +70,11 @@ def _write_picture(stage: Path, result: FitResult, index: int) -> dict[str, Any]
     else:
         path = Path(file["path"]).absolute()
         file = file | {"path": str(path)}
-    return file | {"sha256": _digest(path, file), "scene": f"scene{number}.toml"}
+    return file | {"sha256": _checked(path, file), "scene": f"scene{number}.toml"}
 
 
-def _digest(path: Path, file: dict[str, Any]) -> str:
-    """Of a picture, which is what was fitted where that is known."""
+def _checked(path: Path, file: dict[str, Any]) -> str:
+    """The digest of a picture, refused where it is known not to be what was fitted."""
     try:
         with path.open("rb") as opened:
             found = hashlib.file_digest(opened, "sha256").hexdigest()
@@ -106,7 +106,7 @@ class _Pictures(Sequence[np.ndarray]):
     def __getitem__(self, index: Any) -> Any:
         file = self.files[index]
         path = _place(self.folder, file)
-        _digest(path, file)
+        _checked(path, file)
         picture = brdf.read_picture(path, encoding=file["encoding"]).scaled(np.asarray(file["factor"]))
         return picture.pixels.astype(self.precision)
 

@@ -32,7 +32,7 @@ from fitting.uncertainty.covariance import (
 )
 from fitting.uncertainty.highlight import OFF_CENTRE, Highlight, highlight
 from fitting.uncertainty.intervals import exponent_interval
-from fitting.uncertainty.noise_model import sums_beside_weights, weighted_sums
+from fitting.uncertainty.noise_model import misweighted_sums, weighted_sums
 from fitting.uncertainty.residual import Neighbours, Residual, survey
 from fitting.uncertainty.structure import (
     SIZES,
@@ -74,8 +74,8 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> FitResult:
     lobe = None if optimum.flat else highlight(optimum.n, left)
     visible = 0.0 if lobe is None else lobe.share(optimum.x, seen.brightest)
     resolution = RESOLUTION if fit.single else 0.0
-    spread, shared, widening, deviation, gain, joined, growing, beside = None, None, 1.0, noise, 0.0, None, None, None
-    channels = left.channels(noise > 2 * rounding)
+    spread, shared, widening, deviation, gain, joined, growing, uneven = None, None, 1.0, noise, 0.0, None, None, None
+    channels, weighed = left.channels(noise > 2 * rounding), any(one is not None for one in seen.problem.weights)
     if fit.evidence is not None:
         # Each working target has the noise 1; what least squares leaves is rounding, which goes together.
         said, left = fit.evidence, left._replace(neighbours=left.neighbours._replace(significant=False))
@@ -93,19 +93,19 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> FitResult:
             gain = max(gain, specular_gain(joined, optimum.x))
     else:
         # Where weights are no inverse variances nothing is told of what else makes noise uneven.
-        asked = seen.problem.loss == "squared" and any(one is not None for one in seen.problem.weights)
-        beside = sums_beside_weights(pictures, optimum) if asked and device_count() == 1 else None
-        growing = left.growing_noise(noise, rounding) if beside is None else None
+        asked = weighed and seen.problem.loss == "squared" and device_count() == 1
+        uneven = misweighted_sums(pictures, optimum) if asked else None
+        growing = left.growing_noise(noise, rounding) if uneven is None else None
         once = seen.copies or channels is not None
-        together = _structure(left, seen, noise > 2 * rounding, even=growing is None and beside is None, once=once)
+        together = _structure(left, seen, noise > 2 * rounding, even=growing is None and uneven is None, once=once)
         # What a bound of the material leaves is no error of the pixels.
         if together is not None and together.significant and not fit.capped:
             shared = _scattered(pictures, optimum, _left(pictures, seen, optimum), alone_covariance(optimum, fit.tied))
     channels = np.ones((noise.size,) * 2) if seen.copies else channels
     if shared is None and growing is not None:
-        beside = weighted_sums(pictures, optimum, growing, inverse=False)
-    if shared is None and beside is not None:
-        spread = fit.noise_factor**2 * beside.gram
+        uneven = weighted_sums(pictures, optimum, growing, inverse=False)
+    if shared is None and uneven is not None:
+        spread = fit.noise_factor**2 * uneven.gram
     # What the light reaches but the simplest model does without is 0, with the error that it would have.
     reached = seen.reached(fit.model)
     sure = uncertainty(
@@ -139,7 +139,6 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> FitResult:
     index = [one.place(channels) for one in parameters if one.value is not None and not one.at_bound]
     correlation = sure.correlation[np.ix_(index, index)]
     warnings = [_capped(material)] if fit.capped else []
-    weighed = any(one is not None for one in seen.problem.weights)
     warnings += _warnings(left.neighbours, together, None if all(sure.reasons[2]) else lobe)
     # What the camera says of a pixel's brightness may be off in a channel of strong colour.
     told = seen.problem.noise is not None

@@ -142,7 +142,7 @@ def _sums_at(pictures: Sequence[Picture], optimum: Optimum, weight: Callable[[Pi
     return Sums(*(leaf[0] for leaf in parts)).about(optimum.x.T).columns(np.diag([1.0, 1.0, 1.0, 1.0 / optimum.n]))
 
 
-def sums_beside_weights(pictures: Sequence[Picture], optimum: Optimum) -> Sums | None:
+def misweighted_sums(pictures: Sequence[Picture], optimum: Optimum) -> Sums | None:
     """Sums at the optimum with each pixel's weight times the variance of its weighted residual, where weights vary it.
 
     Weights of least squares are inverse variances, unless they say what is of interest: those of a soft mask, of a

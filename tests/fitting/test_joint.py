@@ -257,3 +257,10 @@ def test_many_lights_that_are_dark_are_told_as_quickly_as_few():
     result = fitting.fit_lights(picture, known, brdf.Lambert(k_d=[0.5]))
     assert sum(one.at_bound for one in result.parameters) >= 4
     assert all(one.error > 0 for one in result.parameters)
+
+
+def test_without_a_word_of_scenes_the_material_alone_is_freed(target: np.ndarray):
+    known = scene(TRUE_DIRECTION, [1.0, 0.9, 0.8])
+    result = fitting.fit_jointly(target, known, MATERIAL)
+    assert {one.name for one in result.parameters} == {"k_a", "k_d", "k_s", "n"}
+    np.testing.assert_allclose(float(result["n"]), 25, rtol=1e-6)

@@ -11,7 +11,7 @@ from image_files import ROOT, random
 
 from brdf.errors import InputError
 from brdf.images.reading import read_image, read_picture
-from brdf.images.writing import write_image
+from brdf.images.writing import write_image, write_layers
 
 
 @pytest.mark.parametrize("shape", [(7, 5), (7, 5, 1), (7, 5, 3)])
@@ -109,6 +109,15 @@ def test_what_cannot_be_written(tmp_path, name, array, options, said):
     with pytest.raises(InputError, match=said):
         write_image(tmp_path / name, array, **options)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("name", "layers"),
+    [("a.png", {"": np.ones((2, 2))}), ("a.exr", {}), ("a.exr", {"a": np.ones((2, 2)), "b": np.ones((2, 3))})],
+)
+def test_layers_that_cannot_be_written(tmp_path, name, layers):
+    with pytest.raises(InputError):
+        write_layers(tmp_path / name, layers)
 
 
 @pytest.mark.parametrize(("suffix", "asked"), [(".exr", 1), (".tif", 0), (".hdr", 0), (".png", 1), (".jpg", 1)])
