@@ -28,7 +28,7 @@ REPORTS: dict[str, Callable[..., Any]] = {}
 """What makes text, pictures and a diagnosis of a result; `fitting.report`, which stands above, enters it here."""
 
 # What warnings of a fit begin with that a plausible material held.
-HELD = "k_d + k_s is held at 1"
+HELD_PLAUSIBLE = "k_d + k_s is held at 1"
 
 
 @dataclass(frozen=True)
@@ -402,8 +402,8 @@ def of_material_alone(result: FitResult) -> None:
 
     And of one that a plausible material held: its numbers move along that bound.
     """
-    if any(words.startswith(HELD) for words in result.warnings):
-        raise InputError("result", f"has a bound: {HELD} in some channel", "Fit without plausible")
+    if any(words.startswith(HELD_PLAUSIBLE) for words in result.warnings):
+        raise InputError("result", f"has a bound: {HELD_PLAUSIBLE} in some channel", "Fit without plausible")
     others = [one.key for one in result.parameters if not hasattr(result.material, one.name)]
     if others:
         remedy = "Fit the material under the scenes that it found, with fitting.fit"

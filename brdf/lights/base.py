@@ -69,8 +69,8 @@ class Light(Checked):
 
         A light without extent is a single sample, of all its numbers in the order of its fields.
         """
-        each = [value[None] for name, value in vars(self).items() if name != "intensity"]
-        return (), tuple(each), self.emittance
+        names = [field.name for field in dataclasses.fields(self) if field.name != "intensity"]
+        return (), tuple(getattr(self, name)[None] for name in names), self.emittance
 
     @staticmethod
     @abc.abstractmethod

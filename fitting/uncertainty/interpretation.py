@@ -13,7 +13,7 @@ from fitting.channel_errors import residuals
 from fitting.light_colour import coefficient_factors
 from fitting.model_fit import Evidence, ModelFit
 from fitting.pixels import Observed
-from fitting.result import HELD, FitResult, Parameter
+from fitting.result import HELD_PLAUSIBLE, FitResult, Parameter
 from fitting.solver.devices import device_count
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
@@ -315,7 +315,10 @@ def _capped(material: brdf.Material) -> str:
     labels = channel_names(diffuse.shape[0])
     held = ", ".join(labels[channel] for channel in np.flatnonzero(diffuse + specular >= 1 - 1e-6))
     where = f" in channel {held}" if held else ""
-    return f"{HELD}{where}: a brighter material fits better, but is not plausible; the errors do not know of that bound"
+    return (
+        f"{HELD_PLAUSIBLE}{where}: a brighter material fits better, but is not plausible; "
+        "the errors do not know of that bound"
+    )
 
 
 def _warnings(known: Neighbours, together: Structure | None, seen: Highlight | None) -> Iterator[str]:
