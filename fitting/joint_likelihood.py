@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float
 
 from fitting.continuation import Estimate, Problem, Score, maximise, where_most_is_told
 from fitting.joint_problem import JointProblem, linearised
-from fitting.likelihood import Bounds, Values, residual_deviation
-from fitting.maximum_likelihood import FIRST_NOISE, alike
+from fitting.likelihood import Bounds, Values, in_light, is_curved, residual_deviation
+from fitting.maximum_likelihood import FAINT, FIRST_NOISE, LIKELIER, alike
 from fitting.pixels import Observed
 from fitting.solver.nnls import inverse_diagonal, scaled_inverse
 from fitting.uncertainty.structure import Errors, block_scatter
@@ -92,16 +92,25 @@ def most_likely_numbers(problem: JointProblem, seen: Observed, vector: Float[np.
     if len(bounds) < len(seen.tiles):
         return None
     pictures = _RoundedPictures(problem, bounds, seen)
-    codes = pictures.codes(vector)
-    noise = max(residual_deviation(bounds, codes), FIRST_NOISE)
-    if pictures.lossy:
-        pictures.weights = [alike(own, code, noise) for own, code in zip(bounds, codes, strict=True)]
-    at, known, said = maximise(pictures, Estimate(vector, noise))
+    at, known, said = _maximised(pictures, vector)
+    if at.noise >= FAINT and is_curved(bounds) and not pictures.lossy:
+        even = _RoundedPictures(problem, in_light(bounds), seen)
+        found = _maximised(even, at.unknowns)
+        if found[0].value > at.value + LIKELIER:
+            pictures, (at, known, said) = even, found
     said, wider = where_most_is_told(pictures, at, known, said)
     # Copies of a value tell no more of what all channels share.
     shared = problem.each(lambda leaf: not leaf.bounded) & seen.copies
     scatter = pictures.scatter(said) if pictures.lossy else None
     return Known(at.unknowns, said.hessian, scatter, wider * np.sqrt(np.where(shared, seen.colour.size, 1)))
+
+
+def _maximised(pictures: "_RoundedPictures", start: Float[np.ndarray, " U"]) -> Any:
+    codes = pictures.codes(start)
+    noise = max(residual_deviation(pictures.bounds, codes), FIRST_NOISE)
+    if pictures.lossy:
+        pictures.weights = [alike(own, code, noise) for own, code in zip(pictures.bounds, codes, strict=True)]
+    return maximise(pictures, Estimate(start, noise))
 
 
 class _RoundedPictures(Problem):

@@ -26,7 +26,7 @@ Stegun 26.2.14, the continued fraction.
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
@@ -180,6 +180,21 @@ def over_channels(combine: Callable[[Any, Any], Any], values: AnyArray) -> Any:
         values: (P, C), on the host or the device.
     """
     return functools.reduce(combine, [values[:, channel] for channel in range(values.shape[1])])
+
+
+def is_curved(bounds: Sequence[Bounds]) -> bool:
+    """Whether rounded values are not linear in light, and some have both ends."""
+    curved = any(own.encoding != "linear" and own.widths.size for own in bounds)
+    return curved and not any(own.exact for own in bounds)
+
+
+def in_light(bounds: Sequence[Bounds]) -> list[Bounds]:
+    """The same ends in linear light, for noise that came before the encoding: that of a camera or a path tracer.
+
+    The unit is their median distance in all pictures, or noise of one size would be another one in each.
+    """
+    size = float(np.median(np.concatenate([own.in_light().widths for own in bounds])))
+    return [own.in_light(size) for own in bounds]
 
 
 def residual_deviation(bounds: Iterable[Bounds], codes: Iterable[Float[np.ndarray, "P C"]]) -> float:

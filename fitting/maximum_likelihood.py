@@ -36,7 +36,7 @@ from fitting.continuation import (
     where_most_is_told,
 )
 from fitting.continuation import precision as precision_at
-from fitting.likelihood import AnyArray, Bounds, Values, residual_deviation
+from fitting.likelihood import AnyArray, Bounds, Values, in_light, is_curved, residual_deviation
 from fitting.model_fit import Evidence, ModelFit
 from fitting.solver.normal_equations import COMPILER_OPTIONS, Picture, Sums
 from fitting.solver.profile import Optimum, refit, search
@@ -137,26 +137,15 @@ def _thinned(picture: Picture) -> Picture:
     return picture if tell.size <= 2 * SUBSAMPLE else picture.in_double(tell[:: tell.size // SUBSAMPLE])
 
 
-def _is_curved(pictures: Sequence[Picture]) -> bool:
-    """Whether rounded values are not linear in light, and some have both ends."""
-    bounds = list(map(bounds_of, pictures))
-    curved = any(own.encoding != "linear" and own.widths.size for own in bounds)
-    return curved and not any(own.exact for own in bounds)
-
-
 def _in_light(pictures: Sequence[Picture]) -> list[Picture]:
-    """With the ends in linear light, for noise that came before the encoding: that of a camera or a path tracer.
-
-    The unit is their median distance in all pictures, or noise of one size would be another one in each.
-    """
-    size = float(np.median(np.concatenate([bounds_of(picture).in_light().widths for picture in pictures])))
-    return [dataclasses.replace(picture, bounds=bounds_of(picture).in_light(size)) for picture in pictures]
+    bounds = in_light(list(map(bounds_of, pictures)))
+    return [dataclasses.replace(picture, bounds=own) for picture, own in zip(pictures, bounds, strict=True)]
 
 
 def _where_noise_is_even(fit: ModelFit, noise: float) -> tuple[ModelFit, float]:
     """A fit and its noise in codes, or in light where noise of one size there is likelier and more than rounding."""
     some = list(map(_thinned, fit.pictures))
-    if not _is_curved(some):
+    if not is_curved(list(map(bounds_of, some))):
         return fit, noise
     light = _in_light(some)
     after = _deviation(light, fit.optimum)
@@ -172,10 +161,9 @@ def _where_noise_is_even(fit: ModelFit, noise: float) -> tuple[ModelFit, float]:
 
 def _evener_in_light(problem: "_Separable", at: Estimate) -> Estimate | None:
     """The most likely numbers with noise of one size in light, where they are likelier than any with it in codes."""
-    pictures = [values.picture for values in problem.pixels]
-    if at.noise < FAINT or not _is_curved(pictures):
+    if at.noise < FAINT or not is_curved(problem.bounds):
         return None
-    light = list(map(_values, _in_light(pictures)))
+    light = list(map(_values, _in_light([values.picture for values in problem.pixels])))
     start = Estimate(at.unknowns, max(at.noise, FIRST_NOISE))
     even, *_ = maximise(_Separable(light, problem.design, problem.n_range, problem.copies), start, ROUGHLY_KNOWN)
     return even if even.value > at.value + LIKELIER else None
