@@ -25,13 +25,13 @@ class Table:
     """One table of a file.
 
     Attributes:
-        place: file and table, for messages.
+        where: file and table, for messages.
         values: by key.
         folder: of the file, for paths in it.
         within: the folder that these may not leave.
     """
 
-    place: str
+    where: str
     values: Any
     folder: Path = Path()
     within: Path = Path()
@@ -39,7 +39,7 @@ class Table:
     def __post_init__(self):
         """Refuse what is no table."""
         if not isinstance(self.values, dict):
-            raise InputError(self.place, f"must be a table, got {self.values!r}", "Write it as a [table]")
+            raise InputError(self.where, f"must be a table, got {self.values!r}", "Write it as a [table]")
 
     def choose(self, key: str, choices: dict[str, Any]) -> Any:
         """What a value names, which is taken out.
@@ -53,10 +53,10 @@ class Table:
         """
         known = ", ".join(choices)
         if key not in self.values:
-            raise InputError(self.place, f"has no {key}", f"Add {key} = one of {known}")
+            raise InputError(self.where, f"has no {key}", f"Add {key} = one of {known}")
         value = self.values.pop(key)
         if not isinstance(value, str) or value not in choices:
-            raise InputError(key, f"is unknown, got {repr(value)[:60]}", f"Use one of {known}").inside(self.place)
+            raise InputError(key, f"is unknown, got {repr(value)[:60]}", f"Use one of {known}").inside(self.where)
         return choices[value]
 
     def make(self, maker: Callable[..., Any]) -> Any:
@@ -76,11 +76,11 @@ class Table:
                 values[key] = self._value(key, value, parameters[key].annotation)
             for name, one in parameters.items():
                 if name not in values and one.default is one.empty:
-                    raise InputError(self.place, f"has no {name}", f"Add {name}")
+                    raise InputError(self.where, f"has no {name}", f"Add {name}")
             return maker(**values)
         except InputError as error:
-            known = (self.place, *(str(value) for value in values.values() if isinstance(value, Path)))
-            raise error if error.where.startswith(known) else error.inside(self.place) from None
+            known = (self.where, *(str(value) for value in values.values() if isinstance(value, Path)))
+            raise error if error.where.startswith(known) else error.inside(self.where) from None
 
     def _value(self, key, value, kind):
         """A value, refused where Python would silently read a truth value or text as a number."""
@@ -93,8 +93,8 @@ class Table:
         for leaf in jax.tree.leaves(value):
             if isinstance(leaf, bool) or (isinstance(leaf, str) and key != "viewer"):
                 is_text = isinstance(leaf, str)
-                came, quoted = repr(leaf)[:40] if is_text else str(leaf).lower(), " without quotes" * is_text
-                raise InputError(key, f"must be a number, got {came}", f"Give numbers{quoted}")
+                what, quoted = repr(leaf)[:40] if is_text else str(leaf).lower(), " without quotes" * is_text
+                raise InputError(key, f"must be a number, got {what}", f"Give numbers{quoted}")
         return value
 
     def _path(self, key, name) -> Path:

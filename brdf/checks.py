@@ -93,8 +93,8 @@ def instance(name: str, value: Any, kind: type, remedy: str) -> None:
         InputError: naming the argument.
     """
     if not isinstance(value, kind):
-        came = f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
-        raise InputError(name, f"must be a {kind.__name__}, got {came}", remedy)
+        what = f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
+        raise InputError(name, f"must be a {kind.__name__}, got {what}", remedy)
 
 
 def several(name: str, value: Any) -> tuple[Any, ...]:
@@ -219,8 +219,8 @@ def coefficients(**given: Any) -> list[Array | np.ndarray]:
     for name, array in arrays.items():
         if array.size not in (1, channels):
             sizes = ", ".join(f"{n} {v.size}" for n, v in arrays.items())
-            came = f"the coefficients differ in their number of channels ({sizes})"
-            raise InputError(name, came, "Give each the same")
+            what = f"the coefficients differ in their number of channels ({sizes})"
+            raise InputError(name, what, "Give each the same")
     return [
         (np if isinstance(array, np.ndarray) else jnp).broadcast_to(array, (channels,)).copy()
         for array in arrays.values()

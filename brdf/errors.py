@@ -31,14 +31,14 @@ class InputError(ValueError):
         printable = "".join(letter if letter.isprintable() else " " for letter in message)
         super().__init__(" ".join(printable.split()))
 
-    def inside(self, place: object) -> "InputError":
+    def inside(self, where: object) -> "InputError":
         """The same error, with the file or table that the value stood in.
 
         Args:
-            place: the file or table.
+            where: the file or table.
         """
-        separator = "." if ": " in str(place) else ": "
-        return InputError(f"{place}{separator}{self.where}", self.what, self.remedy)
+        separator = "." if ": " in str(where) else ": "
+        return InputError(f"{where}{separator}{self.where}", self.what, self.remedy)
 
 
 def as_numbers(name: str, value: Any, what: str = "numbers", remedy: str = "Give plain numbers") -> Any:

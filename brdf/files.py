@@ -132,8 +132,8 @@ def atomic_path(path: AnyPath) -> Iterator[Path]:
         if target.exists():
             _ordinary(path, target)
         if not os.path.lexists(target.parent):
-            came = f"cannot be written, there is no folder {as_path(path).parent}"
-            raise InputError(path, came, "Make it first")
+            what = f"cannot be written, there is no folder {as_path(path).parent}"
+            raise InputError(path, what, "Make it first")
         with _staging(target.parent) as stage:
             temporary = stage / f"new{target.suffix}"
             temporary.touch()

@@ -279,8 +279,8 @@ def relight(images: Float[ArrayLike, "L H W C"], factors: ArrayLike) -> Float[Ar
     """
     images, factors = jnp.asarray(images), jnp.asarray(factors)
     if images.ndim != 4:
-        came = f"must be of shape (L, H, W, C), got {images.shape}"
-        raise InputError("images", came, "Give what brdf.render_lights returns")
+        what = f"must be of shape (L, H, W, C), got {images.shape}"
+        raise InputError("images", what, "Give what brdf.render_lights returns")
     lights, _, _, channels = images.shape
     fits = factors.ndim in (1, 2) and factors.shape[0] == lights
     if not fits or (factors.ndim == 2 and channels != 1 and factors.shape[1] not in (1, channels)):
@@ -293,8 +293,8 @@ def _check_reach(material: Material, dtype: np.dtype) -> None:
     for name in ("k_a", "k_d", "k_s"):
         value = getattr(material, name, None)
         if isinstance(value, np.ndarray) and np.any(value > np.finfo(dtype).max):
-            came = f"is out of reach of {dtype.name}, got {np.max(value):g}"
-            raise InputError(name, came, "Use another unit of light, or float64")
+            what = f"is out of reach of {dtype.name}, got {np.max(value):g}"
+            raise InputError(name, what, "Use another unit of light, or float64")
 
 
 def _seen(scene: Scene, precision: Precision | None) -> tuple[Scene, Sight]:
@@ -320,7 +320,7 @@ def _shape(material: Material, scene: Scene) -> tuple[int, int, int]:
     check_single(material, "Write jax.vmap(lambda material: brdf.render(material, scene))(materials)")
     own, lit = material.k_d.shape[0], scene.channels
     if own != lit and 1 not in (own, lit):
-        came = f"has {own} channels, the light has {lit}"
-        raise InputError("material", came, "Give both the same number, or one of them a single channel")
+        what = f"has {own} channels, the light has {lit}"
+        raise InputError("material", what, "Give both the same number, or one of them a single channel")
     width, height = scene.resolution
     return height, width, max(own, lit)

@@ -35,8 +35,8 @@ def _masks(value: Any) -> tuple[Any, ...]:
         if mask is not None and not isinstance(mask, jax.Array):
             mask = as_numbers("visibility", mask)
             if not np.all((mask >= 0) & (mask <= 1)):
-                came = f"must lie between 0 and 1, got {np.min(mask):g} to {np.max(mask):g}"
-                raise InputError("visibility", came, "Give the share of the light that each pixel sees")
+                what = f"must lie between 0 and 1, got {np.min(mask):g} to {np.max(mask):g}"
+                raise InputError("visibility", what, "Give the share of the light that each pixel sees")
         masks.append(mask)
     return () if all(mask is None for mask in masks) else tuple(masks)
 
@@ -93,16 +93,16 @@ class Scene(Checked):
             remedy = "Set fitted = false: beside surface points, shapes are occluders only"
             raise InputError("shapes", "must not be fitted where surface points are given", remedy)
         if self.visibility and len(self.visibility) != len(self.lights):
-            came = f"has {len(self.visibility)} entries for {len(self.lights)} lights"
-            raise InputError("visibility", came, "Give one for each light, None where the shapes tell")
+            what = f"has {len(self.visibility)} entries for {len(self.lights)} lights"
+            raise InputError("visibility", what, "Give one for each light, None where the shapes tell")
         for mask in self.visibility:
             if mask is not None and mask.shape != self.resolution[::-1]:
-                came = f"must be of shape {self.resolution[::-1]}, got {mask.shape}"
-                raise InputError("visibility", came, "Give a value per pixel")
+                what = f"must be of shape {self.resolution[::-1]}, got {mask.shape}"
+                raise InputError("visibility", what, "Give a value per pixel")
         counts = sorted({emittance.shape[0] for emittance in self.emittances()} - {1})
         if len(counts) > 1:
-            came = f"lights have {' and '.join(map(str, counts))} channels"
-            raise InputError("intensity", came, "Give all lights and the ambient light the same number of channels")
+            what = f"lights have {' and '.join(map(str, counts))} channels"
+            raise InputError("intensity", what, "Give all lights and the ambient light the same number of channels")
 
     def emittances(self) -> list[Spectrum]:
         """The emittance of each light, then the ambient intensity where there is one."""
@@ -226,8 +226,8 @@ def some_pixels(
     if not isinstance(pixel, Tracer):
         pixel = np.asarray(pixel)
         if pixel.dtype.kind not in "iu" or np.any((pixel < 0) | (pixel >= count)):
-            came = f"must be whole numbers from 0 to {count - 1}"
-            raise InputError("pixel", came, "Of a mask, give np.flatnonzero(mask)")
+            what = f"must be whole numbers from 0 to {count - 1}"
+            raise InputError("pixel", what, "Of a mask, give np.flatnonzero(mask)")
     pixel = pixel.reshape(1, -1) if pixel.ndim == 1 else pixel
     with working_precision(precision):
         if scene.camera is not None and scene.camera.samples == 1:

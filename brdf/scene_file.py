@@ -59,14 +59,14 @@ def read_parts(path: Path, within: str | Path | None, tables: dict[str, Any] | N
         if several and not isinstance(value, list):
             raise InputError(f"{path}: {name}", "must be a list of tables", f"Write [[{name}]]")
         found = {f"{name}[{index}]": one for index, one in enumerate(value)} if several else {name: value}
-        read = [_READERS[name](Table(f"{path}: {place}", one, *folders)) for place, one in found.items()]
+        read = [_READERS[name](Table(f"{path}: {where}", one, *folders)) for where, one in found.items()]
         parts[name] = read if several else read[0]
     if "aov" in parts:
         parts["points"], has_position = parts.pop("aov")
         far = all(isinstance(light, _DISTANT) for light, _ in parts.get("lights", []))
         if not has_position and not (far and "shapes" not in parts):
-            came = "has no layer of positions, but shapes or lights stand somewhere"
-            raise InputError(f"{path}: aov", came, "Add the layer, or use directional lights alone")
+            what = "has no layer of positions, but shapes or lights stand somewhere"
+            raise InputError(f"{path}: aov", what, "Add the layer, or use directional lights alone")
     if parts.get("lights"):
         parts["lights"], parts["visibility"] = zip(*parts["lights"], strict=True)
     return parts
@@ -84,8 +84,8 @@ def _triangles(file: Path, fitted: bool = True, smooth: bool = True):
 def _read_light(table):
     """A light, and how much of it each pixel sees where a file tells."""
     cls, values = table.choose("type", LIGHTS), table.values
-    told = {key: values.pop(key) for key in ("visibility", "visibility_layer") if key in values}
-    mask = dataclasses.replace(table, values=told).make(_mask) if told else None
+    given = {key: values.pop(key) for key in ("visibility", "visibility_layer") if key in values}
+    mask = dataclasses.replace(table, values=given).make(_mask) if given else None
     return table.make(_map if cls is ConstantEnvironment and "file" in values else cls), mask
 
 

@@ -71,7 +71,7 @@ def residuals(picture: Picture, optimum: Optimum) -> Float[np.ndarray, "P C"]:
         optimum: of the fit.
     """
     weight = np.asarray(picture.weights, np.float64)
-    left = np.asarray(picture.target, np.float64) - picture.shown(optimum.n, optimum.x)
+    left = np.asarray(picture.target, np.float64) - picture.predict(optimum.n, optimum.x)
     return np.where(weight > 0, left, 0.0) * np.sqrt(weight)
 
 
@@ -200,4 +200,4 @@ def each_alone(
     weight = np.broadcast_to(np.asarray(picture.weights, np.float64), left.shape)
     own = weight * np.diag(precision)
     step = np.divide(np.sqrt(weight) * (left @ precision), own, out=np.zeros_like(own), where=own > 0)
-    return dataclasses.replace(picture, target=picture.shown(optimum.n, optimum.x) + step, weight=own)
+    return dataclasses.replace(picture, target=picture.predict(optimum.n, optimum.x) + step, weight=own)

@@ -157,8 +157,8 @@ def find_codes(
         found = _levels(pixels, half=bits == HALF)
     if rounding == "floor":
         if found is None:
-            came, remedy = "is floor, but the values stand on no levels of a file", "Give codes, as uint8 or uint16"
-            raise InputError("rounding", came, remedy)
+            what, remedy = "is floor, but the values stand on no levels of a file", "Give codes, as uint8 or uint16"
+            raise InputError("rounding", what, remedy)
         found = found._replace(below=0.0, above=1.0)
     return found
 

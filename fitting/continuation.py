@@ -63,7 +63,7 @@ class Score(NamedTuple):
             above `MOST_TELLING`: those that the model misses would hide what the others say.
         gradient: of the likelihood by the unknowns, (U,).
         hessian: minus the second derivative, (U, U).
-        said: of each picture.
+        pictures: of each picture.
     """
 
     value: float
@@ -71,10 +71,10 @@ class Score(NamedTuple):
     noise_information: float
     gradient: Float[np.ndarray, " U"]
     hessian: Float[np.ndarray, "U U"]
-    said: "Sequence[Said]"
+    pictures: "Sequence[PictureScore]"
 
 
-class Said(NamedTuple):
+class PictureScore(NamedTuple):
     """What values say of what is shown there.
 
     Attributes:
@@ -82,29 +82,29 @@ class Said(NamedTuple):
         radiance: that is predicted, (P, C).
         slope: of the code by it, (P, C).
         columns: derivatives of the radiance by the unknowns that move each channel, (V, P, C).
-        told: by the code.
+        likelihood: by the code.
     """
 
     values: Values
     radiance: Float[np.ndarray, "P C"]
     slope: Float[np.ndarray, "P C"]
     columns: Float[np.ndarray, "V P C"]
-    told: LogLikelihood
+    likelihood: LogLikelihood
 
     @property
     def score(self) -> Float[np.ndarray, "P C"]:
         """By radiance."""
-        return self.values.weight * self.told.score * self.slope
+        return self.values.weight * self.likelihood.score * self.slope
 
     @property
     def weight(self) -> Float[np.ndarray, "P C"]:
         """By radiance."""
-        return self.values.weight * self.told.weight * self.slope**2
+        return self.values.weight * self.likelihood.weight * self.slope**2
 
     def of_noise(self, noise: float) -> tuple[float, float, float]:
         """The logarithm of the likelihood, its derivative by log s, and what the values tell of that."""
-        each = (self.told.score**2 - self.told.weight) * (noise * self.values.bounds.spread) ** 2
-        parts = self.told.value, each, np.minimum(each**2, MOST_TELLING)
+        each = (self.likelihood.score**2 - self.likelihood.weight) * (noise * self.values.bounds.spread) ** 2
+        parts = self.likelihood.value, each, np.minimum(each**2, MOST_TELLING)
         value, by_log_noise, information = (float(np.sum(self.values.weight * part)) for part in parts)
         return value, by_log_noise, information
 
@@ -170,24 +170,24 @@ class Problem(ABC):
     def score(self, at: Estimate, values: Sequence[Values]) -> Score:
         """What these values say of an estimate."""
         size = len(self.design)
-        said, totals, gradient, hessian = [], np.zeros(3), np.zeros(size), np.zeros((size, size))
+        pictures, totals, gradient, hessian = [], np.zeros(3), np.zeros(size), np.zeros((size, size))
         for some, (radiance, columns) in zip(values, self.shown(at.unknowns, values), strict=True):
             code, slope = some.bounds.codes(radiance)
-            one = Said(some, radiance, slope, columns, some.said(code, at.noise))
-            said.append(one)
+            one = PictureScore(some, radiance, slope, columns, some.likelihood(code, at.noise))
+            pictures.append(one)
             totals += one.of_noise(at.noise)
             for place, products, scores in zip(self.places, *one.sums(), strict=True):
                 hessian[np.ix_(place, place)] += products
                 gradient[place] += scores
         value, by_log_noise, information = totals.tolist()
-        return Score(value, by_log_noise, information, gradient, hessian, said)
+        return Score(value, by_log_noise, information, gradient, hessian, pictures)
 
     def moved(self, at: Estimate, step: Float[np.ndarray, " U"]) -> Estimate:
         """An estimate with other unknowns, within their bounds."""
         step = np.where(self.exponents, np.clip(step, -LARGEST_SHIFT, LARGEST_SHIFT), step)
         return at._replace(unknowns=np.clip(at.unknowns + step, self.lower, self.upper))
 
-    def squared_shares(self, said: Score, influence: Float[np.ndarray, "U U"]) -> Float[np.ndarray, " U"]:
+    def squared_shares(self, score: Score, influence: Float[np.ndarray, "U U"]) -> Float[np.ndarray, " U"]:
         """Sums of squares of each value's share in what is known of each unknown.
 
         The share is its weight times the square of the product of the influence and its derivatives by the unknowns.
@@ -200,7 +200,7 @@ class Problem(ABC):
             return share
 
         squares = np.zeros(len(influence))
-        for one in said.said:
+        for one in score.pictures:
             shares = map(of_channel, self.places, np.moveaxis(one.columns, -1, 0), one.weight.T)
             for share in [sum(shares)] if self.copies else shares:
                 squares += np.einsum("up,up->u", share, share)
@@ -234,34 +234,34 @@ def maximise(
         enough: the noise is known well enough where its step is no larger than this factor.
         least: noise of which fewer values than this tell of a number is not gone below.
     """
-    at, known, before, low, high = start, [], None, -math.inf, math.inf
+    at, precisions, before, low, high = start, [], None, -math.inf, math.inf
     while True:
         values = problem.near(problem.codes(at.unknowns), REACH * at.noise)
-        at, values, said = _climb(problem, at, ROUGH_GAIN, known, values, problem.score(at, values))
-        known.append(precision(problem, at, said))
-        fewest = float(np.min(known[-1].values, where=known[0].variance > 0, initial=math.inf))
+        at, values, score = _climb(problem, at, ROUGH_GAIN, precisions, values, problem.score(at, values))
+        precisions.append(precision(problem, at, score))
+        fewest = float(np.min(precisions[-1].values, where=precisions[0].variance > 0, initial=math.inf))
         if fewest < least:
             break
         largest = math.log(LONG_STEP if fewest > MANY_VALUES else STEP)
-        now, score = math.log(at.noise), said.by_log_noise
-        low, high = (max(low, now), high) if score > 0 else (low, min(high, now))
+        now, derivative = math.log(at.noise), score.by_log_noise
+        low, high = (max(low, now), high) if derivative > 0 else (low, min(high, now))
         # By the last two scores, of which one takes the place of the other; at first by what is known of the noise.
-        slope = -said.noise_information if before is None else (score - before[1]) / (now - before[0])
-        step, before = -score / slope if slope < 0 else math.copysign(math.inf, score), (now, score)
+        slope = -score.noise_information if before is None else (derivative - before[1]) / (now - before[0])
+        step, before = -derivative / slope if slope < 0 else math.copysign(math.inf, derivative), (now, derivative)
         step = min(max(step, -largest, math.log(LEAST_NOISE) - now), largest)
         if not low <= now + step <= high:
             step = 0.5 * (low + high) - now
-        if abs(step) < math.log(enough) or len(known) == MOST_NOISES:
+        if abs(step) < math.log(enough) or len(precisions) == MOST_NOISES:
             break
         at = at._replace(noise=math.exp(now + step))
-    rough = said
-    at, _, said = _climb(problem, at, LEAST_GAIN, known, values, rough)
-    last = known[-1] if said is rough else precision(problem, at, said)
-    return at, [*(entry for entry in known if entry.noise > at.noise), last], said
+    rough = score
+    at, _, score = _climb(problem, at, LEAST_GAIN, precisions, values, rough)
+    last = precisions[-1] if score is rough else precision(problem, at, score)
+    return at, [*(entry for entry in precisions if entry.noise > at.noise), last], score
 
 
 def _climb(
-    problem: Problem, at: Estimate, enough: float, known: Sequence[Precision], values: list[Values], now: Score
+    problem: Problem, at: Estimate, enough: float, precisions: Sequence[Precision], values: list[Values], now: Score
 ) -> tuple[Estimate, list[Values], Score]:
     """Newton's method at a given noise, with the pixels that say something there, to what gains next to nothing.
 
@@ -269,7 +269,7 @@ def _climb(
     edge: steps cost something by the errors that were known.
     """
     design, start = problem.design, at
-    damping = 1 / (STEADY**2 * least_variance(known)) if known else np.zeros(len(design))
+    damping = 1 / (STEADY**2 * least_variance(precisions)) if precisions else np.zeros(len(design))
     while True:
         for _ in range(MOST_STEPS):
             base = np.where(problem.signed, 0.0, at.unknowns)
@@ -284,10 +284,10 @@ def _climb(
             gain = 0.0
             for halvings in range(12):
                 trial = problem.moved(at, 0.5**halvings * step)
-                said = problem.score(trial, values)
-                gain = said.value - now.value
+                trial_score = problem.score(trial, values)
+                gain = trial_score.value - now.value
                 if gain > 0:
-                    at, now = trial, said
+                    at, now = trial, trial_score
                     break
             if gain < enough:
                 break
@@ -301,11 +301,11 @@ def _climb(
             at, now = start, first
 
 
-def precision(problem: Problem, at: Estimate, said: Score) -> Precision:
+def precision(problem: Problem, at: Estimate, score: Score) -> Precision:
     """Variance of each unknown, and how many values tell of it."""
     moved = problem.design[:, (problem.signed | (at.unknowns > 0)) @ np.abs(problem.design) > 0]
-    moved = moved[:, np.einsum("uv,uw,wv->v", moved, said.hessian, moved) > NOTHING]
-    hessian = moved.T @ said.hessian @ moved
+    moved = moved[:, np.einsum("uv,uw,wv->v", moved, score.hessian, moved) > NOTHING]
+    hessian = moved.T @ score.hessian @ moved
     scale = np.sqrt(np.diag(hessian))
     value, vector = np.linalg.eigh(hessian / np.outer(scale, scale))
     # What nothing tells of has a large variance, not none; a column of zeros is no unknown.
@@ -315,42 +315,44 @@ def precision(problem: Problem, at: Estimate, said: Score) -> Precision:
     # In units of its own error, or squares overflow where next to nothing tells.
     own = np.sqrt(np.diag(influence))
     relative = influence / np.where(own > 0, own, 1.0)[:, None]
-    total = np.einsum("uv,vw,uw->u", relative, said.hessian, relative)
-    squares = problem.squared_shares(said, relative)
+    total = np.einsum("uv,vw,uw->u", relative, score.hessian, relative)
+    squares = problem.squared_shares(score, relative)
     count = np.divide(total**2, squares, out=np.zeros_like(total), where=squares > 0)
     return Precision(at.noise, information, np.diag(influence), count)
 
 
-def telling(known: Sequence[Precision]) -> Precision:
+def most_informative(precisions: Sequence[Precision]) -> Precision:
     """Where the values say most of all unknowns together, and enough of them of each.
 
     With less noise all pixels of a small highlight may lie well inside their codes, and the Hessian there says nothing.
 
     Args:
-        known: from much noise to little.
+        precisions: from much noise to little.
     """
-    enough = [entry for entry in known[1:] if np.all((entry.values >= FEWEST_VALUES) | (known[0].variance == 0))]
-    return max([known[0], *enough], key=lambda entry: entry.information)
+    enough = [
+        entry for entry in precisions[1:] if np.all((entry.values >= FEWEST_VALUES) | (precisions[0].variance == 0))
+    ]
+    return max([precisions[0], *enough], key=lambda entry: entry.information)
 
 
-def least_variance(known: Sequence[Precision]) -> Float[np.ndarray, " U"]:
+def least_variance(precisions: Sequence[Precision]) -> Float[np.ndarray, " U"]:
     """Variance of each unknown where it is known best by enough values; infinite where it is not known at all.
 
     Args:
-        known: from much noise to little.
+        precisions: from much noise to little.
     """
-    variance = np.array([entry.variance for entry in known])
-    enough = np.array([entry.values for entry in known]) >= FEWEST_VALUES
+    variance = np.array([entry.variance for entry in precisions])
+    enough = np.array([entry.values for entry in precisions]) >= FEWEST_VALUES
     # With the most noise all values tell.
     enough[0] = True
     return np.min(np.where(enough & (variance > 0), variance, np.inf), axis=0)
 
 
-def where_most_is_told(
+def most_informative_score(
     problem: Problem,
     at: Estimate,
-    known: Sequence[Precision],
-    said: Score,
+    precisions: Sequence[Precision],
+    score: Score,
     alone: Float[np.ndarray, " U"] | float = 0.0,
 ) -> tuple[Score, Float[np.ndarray, " U"]]:
     """What the values say of an estimate at the noise of which errors are, and what to multiply these by.
@@ -358,16 +360,16 @@ def where_most_is_told(
     Args:
         problem: values and their model.
         at: the most likely unknowns.
-        known: what was known of them on the way.
-        said: what the values say of them.
+        precisions: what was known of them on the way.
+        score: what the values say of them.
         alone: variance of each that is left in any case.
     """
-    most = telling(known)
-    if most is not known[-1]:
+    most = most_informative(precisions)
+    if most is not precisions[-1]:
         at = at._replace(noise=most.noise)
-        said = problem.score(at, problem.near(problem.codes(at.unknowns), REACH * at.noise))
-        most = precision(problem, at, said)
+        score = problem.score(at, problem.near(problem.codes(at.unknowns), REACH * at.noise))
+        most = precision(problem, at, score)
     # Each unknown is known as well as where enough values still tell of it.
-    least = np.maximum(least_variance(known), alone)
+    least = np.maximum(least_variance(precisions), alone)
     ratio = np.divide(least, most.variance, out=np.ones_like(least), where=(most.variance > 0) & np.isfinite(least))
-    return said, np.sqrt(ratio)
+    return score, np.sqrt(ratio)

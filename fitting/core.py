@@ -38,7 +38,7 @@ from fitting.uncertainty.covariance import NO_TRACE, residual_noise, specular_ga
 from fitting.uncertainty.highlight import highlight, nearest_peak
 from fitting.uncertainty.interpretation import alone_covariance, interpret, shared_errors
 from fitting.uncertainty.noise_model import weighted_sums
-from fitting.uncertainty.residual import SOME_PIXELS, Residual, gone_together, survey
+from fitting.uncertainty.residual import SOME_PIXELS, Residual, residual_statistics, variance_inflation
 from fitting.uncertainty.structure import CHANCE, SIZES, Blocks, Errors, over_blocks, shared
 from fitting.uneven_noise import evened, in_codes, noise_of_each
 
@@ -82,16 +82,16 @@ def fit_pictures(problem: FitProblem) -> FitResult:
     problem = dataclasses.replace(problem, weights=weights)
 
     with working_precision(problem.precision):
-        seen = _evenly_noisy(observe(problem))
+        observed = _evenly_noisy(observe(problem))
         if problem.model == "auto":
-            fit, choice = _fit_simplest(seen)
+            fit, choice = _fit_simplest(observed)
         else:
-            fit, choice = _fit_model(brdf.MODELS[problem.model], seen), None
-        fit, choice, seen = _less_codec_errors(fit, choice, seen)
-        fit = _held_plausible(fit, seen)
-        told, optimum = _interpreted(fit, seen, choice), fit.optimum
+            fit, choice = _fit_model(brdf.MODELS[problem.model], observed), None
+        fit, choice, observed = _less_codec_errors(fit, choice, observed)
+        fit = _held_plausible(fit, observed)
+        result, optimum = _interpreted(fit, observed, choice), fit.optimum
         # Why there is a highlight in the numbers but none in the material.
-        reasons = {one.reason for one in told.parameters if one.name in ("k_s", "n")}
+        reasons = {one.reason for one in result.parameters if one.name in ("k_s", "n")}
         hidden = reasons.pop() if len(reasons) == 1 else ""
         widest = optimum.n <= WIDEST * problem.n_range[0]
         if widest and not hidden and highlight_in_codes(fit.pictures, optimum) < 1.0:
@@ -101,11 +101,11 @@ def fit_pictures(problem: FitProblem) -> FitResult:
             # anew.
             free = fit.free & [[True], [True], [False]]
             pictures = fit.pictures if problem.loss == "squared" else None
-            rest = _held_plausible(most_likely(_fit_model(fit.model, seen, free, pictures)), seen)
-            fit = rest._replace(moved=(_by_highlight(fit, rest, seen),))
-            told = _interpreted(fit, seen, choice, hidden)
+            rest = _held_plausible(most_likely(_fit_model(fit.model, observed, free, pictures)), observed)
+            fit = rest._replace(moved=(_by_highlight(fit, rest, observed),))
+            result = _interpreted(fit, observed, choice, hidden)
     candidates = () if choice is None else choice.candidates
-    return dataclasses.replace(told, candidates=candidates, optimum=optimum, seconds=time.perf_counter() - start)
+    return dataclasses.replace(result, candidates=candidates, optimum=optimum, seconds=time.perf_counter() - start)
 
 
 def picture_of(model: type[brdf.Material], tile: Tile, near: Near | None = None) -> Picture:
@@ -128,7 +128,7 @@ def picture_of(model: type[brdf.Material], tile: Tile, near: Near | None = None)
 
 def _fit_model(
     model: type[brdf.Material],
-    seen: Observed,
+    observed: Observed,
     free: np.ndarray | None = None,
     pictures: Sequence[Picture] | None = None,
 ) -> ModelFit:
@@ -136,20 +136,20 @@ def _fit_model(
 
     All that the light reaches is free where nothing else is said.
     """
-    free, problem = seen.reached(model) if free is None else free, seen.problem
+    free, problem = observed.reached(model) if free is None else free, observed.problem
     if pictures is not None:
         near = next((picture.lobe.near for picture in pictures if picture.lobe is not None), None)
-        return _fit_about(model, seen, free, pictures, near)
+        return _fit_about(model, observed, free, pictures, near)
     error = problem.sample_error(model.name)
     near, trial = None if error is None else error.near, 0
     while True:
         trial += 1
         made = partial(picture_of, model, near=near)
         if problem.streamed:
-            pictures = each(made, seen.tiles)
+            pictures = each(made, observed.tiles)
         else:
-            pictures = list(map(placed, itertools.count(), map(made, seen.tiles)))
-        fit = _fit_about(model, seen, free, pictures, near)
+            pictures = list(map(placed, itertools.count(), map(made, observed.tiles)))
+        fit = _fit_about(model, observed, free, pictures, near)
         if fit.optimum.flat:
             break
         n, peak = fit.optimum.n, nearest_peak(pictures)
@@ -167,35 +167,35 @@ def _fit_model(
     return fit._replace(optimum=dataclasses.replace(fit.optimum, grid=grid, profile=profile, profile_sampled=True))
 
 
-def _evenly_noisy(seen: Observed) -> Observed:
+def _evenly_noisy(observed: Observed) -> Observed:
     """Pictures of different noise count by what they know, where the user does not say how."""
-    problem = seen.problem
+    problem = observed.problem
     weighed = problem.loss != "squared" or problem.noise is not None or any(w is not None for w in problem.weights)
     if len(problem.targets) == 1 or weighed:
-        return seen
-    seen, left = in_codes(seen), []
+        return observed
+    observed, noises = in_codes(observed), []
     for name in problem.families if problem.model == "auto" else (problem.model,):
         model, some = brdf.MODELS[name], []
-        for tile, owner in zip(seen.tiles, seen.owner, strict=True):
+        for tile, owner in zip(observed.tiles, observed.owner, strict=True):
             picture = picture_of(model, tile)
-            pixels = np.flatnonzero(picture.counts)[:: 1 + len(picture.target) * len(seen.owner) // SOME_PIXELS]
+            pixels = np.flatnonzero(picture.counts)[:: 1 + len(picture.target) * len(observed.owner) // SOME_PIXELS]
             some += [(picture.in_double(pixels), owner)] if pixels.size else []
         pictures, owner = zip(*some, strict=True)
         with jax.enable_x64(True):
-            fitted = partial(_fit_about, model, seen, seen.reached(model))
-            left.append(noise_of_each(pictures, np.array(owner), seen.rounding, fitted))
-    return evened(seen, min(left, key=lambda noise: noise.cost))
+            fitted = partial(_fit_about, model, observed, observed.reached(model))
+            noises.append(noise_of_each(pictures, np.array(owner), observed.rounding, fitted))
+    return evened(observed, min(noises, key=lambda noise: noise.cost))
 
 
 def _fit_about(
     model: type[brdf.Material],
-    seen: Observed,
+    observed: Observed,
     free: np.ndarray,
     pictures: Sequence[Picture],
     near: Near | None = None,
 ) -> ModelFit:
     """One model, whose lobe may be tabulated near some exponents."""
-    n_range = between(near, seen.problem.n_range)
+    n_range = between(near, observed.problem.n_range)
     if free[2].any():
         # Exponents of which some pixel sees at least a trace: with larger ones k_s could be anything.
         upper = min(n_range[1], UNSEEN / max(-nearest_peak(pictures), UNSEEN / n_range[1]))
@@ -204,23 +204,23 @@ def _fit_about(
         else:
             free = free & [[True], [True], [False]]
     optimise = partial(search, free=free, n_range=n_range)
-    found = reweight(pictures, optimise(pictures), optimise, seen.problem.loss, seen.rounding)
-    fit = ModelFit(model, found.pictures, found.optimum, free, n_range, owner=seen.owner, copies=seen.copies)
+    found = reweight(pictures, optimise(pictures), optimise, observed.problem.loss, observed.rounding)
+    fit = ModelFit(model, found.pictures, found.optimum, free, n_range, owner=observed.owner, copies=observed.copies)
     return fit._replace(noise_factor=found.noise_factor)
 
 
-def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
+def _fit_simplest(observed: Observed) -> tuple[ModelFit, Choice]:
     """Every family first, then the simplest adequate candidate on its own."""
-    problem, colour = seen.problem, seen.colour
+    problem, colour = observed.problem, observed.colour
     fits: dict[str, ModelFit] = {}
-    for name in problem.families if seen.reached(brdf.Lambert)[1].any() else ("lambert",):
-        if isinstance(seen.tiles, Stream) and problem.loss == "squared":
+    for name in problem.families if observed.reached(brdf.Lambert)[1].any() else ("lambert",):
+        if isinstance(observed.tiles, Stream) and problem.loss == "squared":
             # The pictures of one model at a time are in memory; those of the others are made anew where asked for.
             fits = {
-                done: fit._replace(pictures=each(partial(picture_of, fit.model), seen.tiles))
+                done: fit._replace(pictures=each(partial(picture_of, fit.model), observed.tiles))
                 for done, fit in fits.items()
             }
-        fits[name] = _fit_model(brdf.MODELS[name], seen)
+        fits[name] = _fit_model(brdf.MODELS[name], observed)
     least = min(float(np.sum(fit.optimum.cost)) for fit in fits.values())
     by_squares, precision = dict(fits), None
     for name, fit in fits.items():
@@ -230,10 +230,10 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
             precision = None if fit.evidence is None else fit.evidence.precision
     # A lobe that would be wider than the search allows is no highlight: it mends what Lambert's law leaves at the rim.
     fits = {name: fit for name, fit in fits.items() if fit.optimum.flat or fit.optimum.n > WIDEST * problem.n_range[0]}
-    fits = fits or {"lambert": most_likely(_fit_model(brdf.Lambert, seen))}
+    fits = fits or {"lambert": most_likely(_fit_model(brdf.Lambert, observed))}
     if problem.loss != "squared":
         # Weights are part of what is minimised: those of the better family serve all, or costs could not be compared.
-        best = min(fits.values(), key=lambda fit: float(np.sum(residual_noise(fit.optimum, seen.rounding))))
+        best = min(fits.values(), key=lambda fit: float(np.sum(residual_noise(fit.optimum, observed.rounding))))
         for name, fit in fits.items():
             pictures = each(_with_weight_of, fit.pictures, best.pictures)
             fits[name] = fit._replace(pictures=pictures, optimum=search(pictures, fit.free, fit.n_range))
@@ -241,32 +241,32 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
     # The best comes first: what is judged without a highlight is judged by its sums.
     fits = dict(sorted(fits.items(), key=lambda one: float(np.sum(one[1].optimum.cost))))
     best = next(iter(fits.values()))
-    noise, whitened, colour_inflation = residual_noise(best.optimum, seen.rounding), _likely_sums(fits), 1.0
-    known = None
+    noise, whitened, colour_inflation = residual_noise(best.optimum, observed.rounding), _likely_sums(fits), 1.0
+    statistics = None
     if whitened:
-        inflation, colour_inflation = _inflation(best, seen, grey[best.model.name])
+        inflation, colour_inflation = _inflation(best, observed, grey[best.model.name])
     else:
-        known = survey(best.pictures, seen.widths, best.optimum, noise, seen.rounding)
-        inflation = known.neighbours.inflation
-        if not seen.copies:
-            inflation *= gone_together(known.channels(noise > 2 * seen.rounding))
-        growing = known.growing_noise(noise, seen.rounding)
+        statistics = residual_statistics(best.pictures, observed.widths, best.optimum, noise, observed.rounding)
+        inflation = statistics.neighbours.inflation
+        if not observed.copies:
+            inflation *= variance_inflation(statistics.channels(noise > 2 * observed.rounding))
+        growing = statistics.growing_noise(noise, observed.rounding)
         if growing is not None:
             # Each pixel by its own variance, or noise in bright pixels would pass for a highlight.
             for name, fit in fits.items():
                 parts = weighted_sums(fit.pictures, fit.optimum, growing, inverse=True)
                 whitened[name] = join_channels(parts.gram, parts.product, parts.square, fit.optimum.x[2])
-    if seen.copies:
-        inflation *= np.sqrt(seen.colour.size)
+    if observed.copies:
+        inflation *= np.sqrt(observed.colour.size)
     # However much errs together, the picture is not less than a few measurements.
     inflation = min(inflation, max(float(np.sqrt(np.sum(best.optimum.pixels) / FEWEST_MEASUREMENTS)), 1.0))
     free = np.logical_or.reduce([fit.free for fit in fits.values()])
     optima = {name: fit.optimum for name, fit in fits.items()}
     choice = choose(optima, free, grey, noise, inflation, whitened, colour_inflation)
-    known = known if choice.model == best.model.name else None
-    if choice.model not in FAMILIES and not _explains_structure(fits[choice.model], seen, known):
+    statistics = statistics if choice.model == best.model.name else None
+    if choice.model not in FAMILIES and not _explains_structure(fits[choice.model], observed, statistics):
         shown = fits[choice.model].optimum.x
-        fits = {"lambert": most_likely(_fit_model(brdf.Lambert, seen))}
+        fits = {"lambert": most_likely(_fit_model(brdf.Lambert, observed))}
         best = fits["lambert"]
         choice = choose({"lambert": best.optimum}, best.free, grey, noise, inflation, _likely_sums(fits))
         # It may be one after all.
@@ -295,51 +295,51 @@ def _fit_simplest(seen: Observed) -> tuple[ModelFit, Choice]:
 
 
 def _less_codec_errors(
-    fit: ModelFit, choice: Choice | None, seen: Observed
+    fit: ModelFit, choice: Choice | None, observed: Observed
 ) -> tuple[ModelFit, Choice | None, Observed]:
     """The same terms again, where compression erred in their colours, and the pixels without these errors.
 
     What a codec takes away its look-alike does not show: which terms there are is decided before. But a highlight that
     was found in brightness may have any colour, and by that its model shows. Grey saved as colour has none to lose.
     """
-    bounds, known = [picture.bounds for picture in fit.pictures], any(map(codec_of, seen.problem.targets))
+    bounds, known = [picture.bounds for picture in fit.pictures], any(map(codec_of, observed.problem.targets))
     lossy = any(one is not None and one.lossy for one in bounds)
-    if seen.copies or fit.capped or not lossy or any(one is None for one in bounds):
-        return most_likely(fit) if choice is None else fit, choice, seen
+    if observed.copies or fit.capped or not lossy or any(one is None for one in bounds):
+        return most_likely(fit) if choice is None else fit, choice, observed
     if choice is not None and fit.tied is not None:
-        fits = [_fit_model(brdf.MODELS[name], seen, fit.free) for name in seen.problem.families]
-        found = [without_codec_errors(seen, one) if known else (most_likely(one), seen) for one in fits]
+        fits = [_fit_model(brdf.MODELS[name], observed, fit.free) for name in observed.problem.families]
+        found = [without_codec_errors(observed, one) if known else (most_likely(one), observed) for one in fits]
         # Each family is nearest to its own look-alikes: it is judged beside those of all.
         value = [sum(_value(one, clean) for _, clean in found) for one in fits]
         best, clean = found[int(np.argmax(value))]
         if _coloured(best, clean):
             return best, choice.coloured(best.model.name, best.free), clean
     if known:
-        fit, seen = without_codec_errors(seen, fit)
+        fit, observed = without_codec_errors(observed, fit)
     elif choice is None:
         fit = most_likely(fit)
-    return fit, choice, seen
+    return fit, choice, observed
 
 
-def _value(fit: ModelFit, seen: Observed) -> float:
+def _value(fit: ModelFit, observed: Observed) -> float:
     """The logarithm of the likelihood of such a fit to some pixels."""
-    said = most_likely(_fit_model(fit.model, seen, fit.free)).evidence
-    return -math.inf if said is None else said.value
+    evidence = most_likely(_fit_model(fit.model, observed, fit.free)).evidence
+    return -math.inf if evidence is None else evidence.value
 
 
-def _coloured(fit: ModelFit, seen: Observed) -> bool:
+def _coloured(fit: ModelFit, observed: Observed) -> bool:
     """Whether the channels' k_s differ by more than their errors, and by more codes than a codec errs in colours."""
-    said = fit.evidence
-    if said is None or not np.all(said.optimum.x[2] > 0):
+    evidence = fit.evidence
+    if evidence is None or not np.all(evidence.optimum.x[2] > 0):
         return False
-    lobe = slice(2 * seen.colour.size, -1)
-    grey = coefficient_factors(fit.model, fit.optimum.n, seen.colour)[2]
-    scatter, alone = shared_errors(said, seen)[0], alone_covariance(said.optimum, None)
+    lobe = slice(2 * observed.colour.size, -1)
+    grey = coefficient_factors(fit.model, fit.optimum.n, observed.colour)[2]
+    scatter, alone = shared_errors(evidence, observed)[0], alone_covariance(evidence.optimum, None)
     covariance = (alone if scatter is None else alone @ scatter @ alone)[lobe, lobe] / np.outer(grey, grey)
-    k_s, precision = said.optimum.x[2] / grey, np.linalg.pinv(covariance, hermitian=True)
+    k_s, precision = evidence.optimum.x[2] / grey, np.linalg.pinv(covariance, hermitian=True)
     left = k_s - np.sum(precision @ k_s) / np.sum(precision)
     seen_as = highlight_in_codes(fit.pictures, fit.optimum)
-    differs = seen_as * float(np.max(np.abs(left)) / np.max(k_s)) > COLOURED * said.noise
+    differs = seen_as * float(np.max(np.abs(left)) / np.max(k_s)) > COLOURED * evidence.noise
     return differs and is_better(float(left @ precision @ left), k_s.size - 1)
 
 
@@ -376,32 +376,32 @@ def _likely_sums(fits: Mapping[str, ModelFit]) -> dict[str, NormalEquations]:
     return found
 
 
-def _inflation(fit: ModelFit, seen: Observed, grey: np.ndarray) -> tuple[float, float]:
+def _inflation(fit: ModelFit, observed: Observed, grey: np.ndarray) -> tuple[float, float]:
     """By what factor errors are too small where neighbours err together: the largest of any number.
 
     Where channels err together that of a highlight, the same in all, and by what further factor those of their colours:
     these err more, but tell little of it.
     """
-    said = fit.evidence
-    assert said is not None
-    scatter, _, channels = shared_errors(said, seen)
+    evidence = fit.evidence
+    assert evidence is not None
+    scatter, _, channels = shared_errors(evidence, observed)
     if scatter is None:
-        return gone_together(channels), 1.0
+        return variance_inflation(channels), 1.0
 
     def largest(tied: np.ndarray | None, some: slice) -> float:
-        design = design_of(said.optimum.x > 0, tied)
-        inverse = np.linalg.pinv(design.T @ said.normal.gram @ design, hermitian=True)
+        design = design_of(evidence.optimum.x > 0, tied)
+        inverse = np.linalg.pinv(design.T @ evidence.normal.gram @ design, hermitian=True)
         together = np.diag(inverse @ design.T @ scatter @ design @ inverse)[some]
         return float(np.sqrt(max(np.max(together / np.maximum(np.diag(inverse)[some], np.finfo(float).tiny)), 1.0)))
 
     every = largest(None, slice(None))
-    if said.precision is None:
+    if evidence.precision is None:
         return every, 1.0
     bright = largest(grey, slice(-2, None))
     return bright, max(every / bright, 1.0)
 
 
-def _explains_structure(fit: ModelFit, seen: Observed, after: Residual | None) -> bool:
+def _explains_structure(fit: ModelFit, observed: Observed, after: Residual | None) -> bool:
     """Whether a highlight can be seen, and explains a good part of what errs together without it, if something does.
 
     One that changes no value by a good part of a code, or none by more than a trace of the brightest, is hidden by
@@ -411,33 +411,35 @@ def _explains_structure(fit: ModelFit, seen: Observed, after: Residual | None) -
 
     Args:
         fit: with the highlight.
-        seen: what was fitted.
+        observed: what was fitted.
         after: what it leaves, where that has been gone over.
     """
     optimum = fit.optimum
     if highlight_in_codes(fit.pictures, optimum) < HIDDEN:
         return False
-    noise = residual_noise(optimum, seen.rounding)
-    after = after or survey(fit.pictures, seen.widths, optimum, noise, seen.rounding)
-    if highlight(optimum.n, after).share(optimum.x, seen.brightest) < NO_TRACE:
+    noise = residual_noise(optimum, observed.rounding)
+    after = after or residual_statistics(fit.pictures, observed.widths, optimum, noise, observed.rounding)
+    if highlight(optimum.n, after).share(optimum.x, observed.brightest) < NO_TRACE:
         return False
     if fit.evidence is not None and fit.evidence.precision is not None:
         return True  # what errs together has been weighed by the channels' covariance
-    left, chance = shared(_unexplained(fit.pictures, optimum, seen, after))
+    left, chance = shared(_unexplained(fit.pictures, optimum, observed, after))
     if left < CHANCE * chance:
         return True
     x = nonnegative_minima(
         optimum.gram[:, :2, :2], optimum.product[:, :2], np.zeros((1, 2)), fit.free[:2].T, TOLERANCE_DOUBLE
     )
     matt = dataclasses.replace(optimum, x=np.vstack([x.T, np.zeros((1, len(x)))]))
-    before = survey(fit.pictures, seen.widths, matt, noise, seen.rounding)
-    gone = shared(_unexplained(fit.pictures, matt, seen, before))[0] - left
-    return gone > EXPLAINED * (gone + left)
+    before = residual_statistics(fit.pictures, observed.widths, matt, noise, observed.rounding)
+    explained = shared(_unexplained(fit.pictures, matt, observed, before))[0] - left
+    return explained > EXPLAINED * (explained + left)
 
 
-def _unexplained(pictures: Sequence[Picture], optimum: Optimum, seen: Observed, left: Residual) -> list[Blocks]:
+def _unexplained(
+    pictures: Sequence[Picture], optimum: Optimum, observed: Observed, statistics: Residual
+) -> list[Blocks]:
     found = []
-    for picture, width, blocks in zip(pictures, seen.widths, left.blocks, strict=True):
+    for picture, width, blocks in zip(pictures, observed.widths, statistics.blocks, strict=True):
         if picture.bounds is None:
             found.append(blocks)
             continue
@@ -451,7 +453,7 @@ def _with_weight_of(picture: Picture, other: Picture) -> Picture:
     return dataclasses.replace(picture, weight=other.weight)
 
 
-def _held_plausible(fit: ModelFit, seen: Observed) -> ModelFit:
+def _held_plausible(fit: ModelFit, observed: Observed) -> ModelFit:
     """With k_d + k_s <= 1 in every channel held inside the search, where that is asked for and not so by itself.
 
     The bound moves with n, since k_s is x_s over the lobe's scale(n); clipping the unbounded optimum afterwards would
@@ -459,10 +461,10 @@ def _held_plausible(fit: ModelFit, seen: Observed) -> ModelFit:
     """
 
     def cap(n: float) -> np.ndarray:
-        return 1.0 / coefficient_factors(fit.model, n, seen.colour) * [[0], [1], [1]]
+        return 1.0 / coefficient_factors(fit.model, n, observed.colour) * [[0], [1], [1]]
 
     optimum = fit.optimum
-    if not seen.problem.plausible or np.all(np.sum(cap(optimum.n) * optimum.x, axis=0) <= 1.0 + ROUNDING):
+    if not observed.problem.plausible or np.all(np.sum(cap(optimum.n) * optimum.x, axis=0) <= 1.0 + ROUNDING):
         return fit
     optimum = search(fit.pictures, fit.free, fit.n_range, cap)
     # What the bound adds to the residual is no noise: that of the fit without it says what stands out.
@@ -470,19 +472,21 @@ def _held_plausible(fit: ModelFit, seen: Observed) -> ModelFit:
     return fit._replace(optimum=optimum, tied=None, capped=True, noise_factor=noise)
 
 
-def _by_highlight(fit: ModelFit, rest: ModelFit, seen: Observed) -> Float[np.ndarray, " U"]:
+def _by_highlight(fit: ModelFit, rest: ModelFit, observed: Observed) -> Float[np.ndarray, " U"]:
     """By how much a highlight that does not stand out may have moved the rest, were it there."""
-    x, said = fit.optimum.x, fit.evidence
-    normal = fit.optimum.normal(residual_noise(fit.optimum, seen.rounding) ** 2) if said is None else said.normal
+    x, evidence = fit.optimum.x, fit.evidence
+    normal = (
+        fit.optimum.normal(residual_noise(fit.optimum, observed.rounding) ** 2) if evidence is None else evidence.normal
+    )
     step = np.where(rest.optimum.x > 0, x - rest.optimum.x, 0.0)
     return may_be_off(np.append(step.ravel(), 0.0), specular_gain(normal.gram, x), 1 + int(np.count_nonzero(x[2])))
 
 
-def _interpreted(fit: ModelFit, seen: Observed, choice: Choice | None, hidden: str = "") -> FitResult:
+def _interpreted(fit: ModelFit, observed: Observed, choice: Choice | None, hidden: str = "") -> FitResult:
     if choice is not None:
         fit = fit._replace(moved=(*fit.moved, choice.dropped))
-    told = interpret(fit, seen, hidden)
-    warnings, share = list(told.warnings), fit.residual
+    result = interpret(fit, observed, hidden)
+    warnings, share = list(result.warnings), fit.residual
     structure = any("structure" in text for text in warnings)
     # What errs by itself is noise, however much.
     if structure and share > UNEXPLAINED:
@@ -492,5 +496,5 @@ def _interpreted(fit: ModelFit, seen: Observed, choice: Choice | None, hidden: s
         names = " and ".join(choice.rivals)
         words = f"{names} fits as well as {fit.model.name}: the picture does not tell the two highlights apart"
         warnings.append(words)
-    warnings += doubts(fit, told.material, seen, _fit_model, structure=structure)
-    return dataclasses.replace(told, warnings=tuple(warnings))
+    warnings += doubts(fit, result.material, observed, _fit_model, structure=structure)
+    return dataclasses.replace(result, warnings=tuple(warnings))

@@ -28,20 +28,20 @@ FEW = 64
 
 
 def doubts(
-    fit: ModelFit, material: brdf.Material, seen: Observed, refit: Callable[..., ModelFit], *, structure: bool
+    fit: ModelFit, material: brdf.Material, observed: Observed, refit: Callable[..., ModelFit], *, structure: bool
 ) -> Iterator[str]:
     """Warnings, each with the remedy.
 
     Args:
         fit: of one model.
         material: that it found.
-        seen: what was fitted.
+        observed: what was fitted.
         refit: fits a model to what was seen.
         structure: whether the residual has some.
     """
-    floats = [one for one in seen.problem.targets if one.file is None and not one.streamed]
-    brightest = float(np.max(seen.brightest))
-    if floats and 2 < brightest <= 65535 and _all(seen, lambda values: values == np.rint(values)):
+    floats = [one for one in observed.problem.targets if one.file is None and not one.streamed]
+    brightest = float(np.max(observed.brightest))
+    if floats and 2 < brightest <= 65535 and _all(observed, lambda values: values == np.rint(values)):
         yield (
             f"the picture holds whole numbers up to {brightest:g}: if they are codes of a file, give them as uint8 or "
             'uint16, with encoding="srgb" where they are for a screen'
@@ -51,20 +51,20 @@ def doubts(
             f"k_d is {np.max(material.k_d):.3g}, and a surface reflects no more than 1: are the picture and the "
             "light's intensity in one unit? Values of 0 to 255 want dividing by 255, dim lights their true intensity"
         )
-    cameras = [scene.camera for scene in seen.scenes if isinstance(scene.camera, brdf.PerspectiveCamera)]
+    cameras = [scene.camera for scene in observed.scenes if isinstance(scene.camera, brdf.PerspectiveCamera)]
     narrow = [float(camera.fov) for camera in cameras if camera.fov <= RADIANS]
     if narrow and fit.residual > BADLY:
         yield (
             f"the camera's field of view is {narrow[0]:.3g} degrees, and the fit is poor: if these are radians, give "
             f"fov={np.degrees(narrow[0]):.4g}"
         )
-    if _all(seen, lambda values: len(values) > 1 and values == values[0]) and _shaded(fit.pictures):
+    if _all(observed, lambda values: len(values) > 1 and values == values[0]) and _shaded(fit.pictures):
         yield (
             "the picture is the same in every pixel, under light that is not: is it the one that was meant? "
             "Numbers from it say nothing of the surface"
         )
     if fit.residual > MUCH:
-        shown = [values.astype(np.float64) for values in _counted_values(seen)]
+        shown = [values.astype(np.float64) for values in _counted_values(observed)]
         varies = sum(len(values) * np.sum(np.var(values, axis=0)) for values in shown)
         total = sum(np.sum(values**2) for values in shown)
         if fit.residual**2 * total > NOISE * varies and not any(map(_follows_light, fit.pictures)):
@@ -72,22 +72,22 @@ def doubts(
                 "light and shape explain nothing of what varies in the picture, which may be noise: is it a picture of "
                 "this scene, and neither mirrored nor shifted?"
             )
-    plain = len(floats) == len(seen.problem.targets) and device_count() == 1 and brightest <= 1
-    if structure and plain and _is_encoded(fit, seen, refit):
+    plain = len(floats) == len(observed.problem.targets) and device_count() == 1 and brightest <= 1
+    if structure and plain and _is_encoded(fit, observed, refit):
         yield (
             "the picture looks sRGB-encoded: decoded, the model explains it far better. "
             'Give encoding="srgb", or the file itself'
         )
 
 
-def _all(seen: Observed, holds: Callable[[np.ndarray], np.ndarray | bool]) -> bool:
+def _all(observed: Observed, holds: Callable[[np.ndarray], np.ndarray | bool]) -> bool:
     """Whether something holds for the values of all pixels that count; a few tell at once that it does not."""
-    return all(np.all(holds(values)) for most in (FEW, None) for values in _counted_values(seen, most))
+    return all(np.all(holds(values)) for most in (FEW, None) for values in _counted_values(observed, most))
 
 
-def _counted_values(seen: Observed, most: int | None = None) -> Iterator[np.ndarray]:
+def _counted_values(observed: Observed, most: int | None = None) -> Iterator[np.ndarray]:
     """Of each picture the values of pixels that count, (K, C); of no more than so many."""
-    for image, counted in zip(seen.shown, seen.counted, strict=True):
+    for image, counted in zip(observed.shown, observed.counted, strict=True):
         index = np.flatnonzero(counted)
         step = 1 if most is None else max(1, -(-index.size // most))
         yield np.take(image.reshape(-1, image.shape[-1]), index[::step], axis=0)
@@ -106,23 +106,23 @@ def _follows_light(picture: Picture) -> bool:
     return bool((light @ value) ** 2 >= (1 - NOISE) * (light @ light) * (value @ value))
 
 
-def _is_encoded(fit: ModelFit, seen: Observed, refit: Callable[..., ModelFit]) -> bool:
+def _is_encoded(fit: ModelFit, observed: Observed, refit: Callable[..., ModelFit]) -> bool:
     """Whether the decoded picture is explained, or far better; compared in the values that were given.
 
     A highlight is allowed under both, as the wrong encoding may have hidden one.
     """
-    model = brdf.BlinnPhong if seen.problem.model == "auto" and fit.model is brdf.Lambert else fit.model
-    as_given, pictures, decoded = fit if model is fit.model else refit(model, seen), None, []
-    for tile in seen.tiles:
+    model = brdf.BlinnPhong if observed.problem.model == "auto" and fit.model is brdf.Lambert else fit.model
+    as_given, pictures, decoded = fit if model is fit.model else refit(model, observed), None, []
+    for tile in observed.tiles:
         values = decode(np.clip(np.asarray(tile.target, np.float32), 0.0, None), "srgb")
         decoded.append(tile._replace(target=jnp.asarray(values, tile.target.dtype), bounds=None))
-    if seen.problem.sample_errors and model is fit.model:
+    if observed.problem.sample_errors and model is fit.model:
         # Lobes of many light samples are not made anew for a doubt.
         pairs = zip(fit.pictures, decoded, strict=True)
         pictures = [dataclasses.replace(picture, target=tile.target, bounds=None) for picture, tile in pairs]
-    as_srgb, left = refit(model, seen._replace(tiles=decoded), pictures=pictures), []
-    for picture, tile, width in zip(as_srgb.pictures, seen.tiles, seen.widths, strict=True):
-        shown = encode(picture.shown(as_srgb.optimum.n, as_srgb.optimum.x).astype(np.float64), "srgb")
+    as_srgb, left = refit(model, observed._replace(tiles=decoded), pictures=pictures), []
+    for picture, tile, width in zip(as_srgb.pictures, observed.tiles, observed.widths, strict=True):
+        shown = encode(picture.predict(as_srgb.optimum.n, as_srgb.optimum.x).astype(np.float64), "srgb")
         errors = np.where(np.asarray(picture.weights) > 0, np.asarray(tile.target) - shown, 0.0)
         left.append(over_blocks(Errors(errors, np.arange(len(errors)), width), SIZES[0]))
     share = sum(np.sum(grid.squares) for grid in left) / np.sum(as_given.optimum.cost)

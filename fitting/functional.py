@@ -167,8 +167,8 @@ def fit(
     channels = target.shape[-1] if scene.channels == 1 and target.ndim == 3 else scene.channels
     if target.shape != (height, width, channels):
         shown = "C" if scene.channels == 1 else channels
-        came = f"must be of shape ({height}, {width}, {shown}), got {target.shape}"
-        raise InputError("target", came, "Give the picture that the scene shows")
+        what = f"must be of shape ({height}, {width}, {shown}), got {target.shape}"
+        raise InputError("target", what, "Give the picture that the scene shows")
     if not jnp.issubdtype(target.dtype, jnp.floating):
         remedy = "Decode it, as brdf.read_image does, or use fitting.fit, which knows what codes say"
         raise InputError("target", f"must hold linear values, got codes of type {target.dtype}", remedy)
@@ -176,8 +176,8 @@ def fit(
     if weight is not None:
         counts = isinstance(weight, Tracer) or np.all(np.asarray(weight) >= 0)
         if np.shape(weight) != (height, width) or not counts:
-            came = f"must be of shape ({height}, {width}) and at least 0, got shape {np.shape(weight)}"
-            raise InputError("weight", came, "Give a weight for each pixel, 0 for those that do not count")
+            what = f"must be of shape ({height}, {width}) and at least 0, got shape {np.shape(weight)}"
+            raise InputError("weight", what, "Give a weight for each pixel, 0 for those that do not count")
     scene = brdf.cast(scene, "float64" if target.dtype == jnp.float64 else "float32")
     points = scene.sight()
     seen = jnp.ravel(points.mask)
@@ -373,9 +373,9 @@ def _errors(pixels: _Pixels, lobes: Sequence[Array], x: Array, cost: Array, held
     inverse = jnp.where(both, jnp.linalg.inv(jnp.where(both, gram[:, :3, :3], jnp.eye(3, dtype=x.dtype))), 0)
     cross = x_s[:, None] * gram[:, :3, 3]
     along = (inverse @ cross[..., None])[..., 0]
-    told = x_s**2 * gram[:, 3, 3] - jnp.sum(cross * along, axis=-1)
-    total = jnp.sum(told)
-    by_n = jnp.where(total > 0, jnp.sum(noise * told) / jnp.where(total > 0, total, 1) ** 2, jnp.inf)
+    by_channel = x_s**2 * gram[:, 3, 3] - jnp.sum(cross * along, axis=-1)
+    total = jnp.sum(by_channel)
+    by_n = jnp.where(total > 0, jnp.sum(noise * by_channel) / jnp.where(total > 0, total, 1) ** 2, jnp.inf)
     by_n = jnp.where(jnp.any(x_s > 0) & ~held, by_n, 0)
     variance = noise[:, None] * jnp.diagonal(inverse, axis1=1, axis2=2) + jnp.where(along == 0, 0, along**2 * by_n)
     return _root(jnp.where(variance >= 0, variance, jnp.inf)), _root(by_n)

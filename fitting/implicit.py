@@ -86,8 +86,8 @@ def sensitivity(result: FitResult, by: Callable[[list[brdf.Scene]], Sequence[Any
     instance("result", result, FitResult, "Give what fitting.fit returns")
     of_material_alone(result)
     if not callable(by):
-        came = f"must be a function, got {by!r}"
-        raise brdf.InputError("by", came, "Write lambda scenes: (scenes[0].lights[0].direction,)")
+        what = f"must be a function, got {by!r}"
+        raise brdf.InputError("by", what, "Write lambda scenes: (scenes[0].lights[0].direction,)")
     if result.loss != "squared":
         raise brdf.InputError("result", f"must be of the squared loss, got {result.loss}", "Fit without a loss")
     unknowns = _unknowns(result)
@@ -96,15 +96,15 @@ def sensitivity(result: FitResult, by: Callable[[list[brdf.Scene]], Sequence[Any
         content = jax.tree.map(jnp.array, brdf.cast((result.material, list(result.scenes)), "float64"))
         flat = [target.reshape(-1, target.shape[-1]) for target in result.targets]
         pictures = brdf.cast(list(zip(flat, map(np.ravel, result.weighed), strict=True)), "float64")
-        own = {id(leaf): place for place, leaf in enumerate(jax.tree.leaves(content[1]))}
+        own = {id(leaf): index for index, leaf in enumerate(jax.tree.leaves(content[1]))}
         leaves = by(content[1])
         if not isinstance(leaves, Sequence) or not leaves or not all(hasattr(leaf, "shape") for leaf in leaves):
             raise brdf.InputError("by", "names no leaf of the scenes", "Return the leaves to differentiate by")
         if len({id(leaf) for leaf in leaves}) < len(leaves):
             raise brdf.InputError("by", "gives a leaf twice", "Return each once")
         if not own.keys() >= set(map(id, leaves)):
-            came = "gives what is no number of the scenes as a whole"
-            raise brdf.InputError("by", came, "Return leaves of the scenes")
+            what = "gives what is no number of the scenes as a whole"
+            raise brdf.InputError("by", what, "Return leaves of the scenes")
         curvature = partial(_curvature, content, unknowns, pictures, places=tuple(own[id(leaf)] for leaf in leaves))
         vector = jnp.concatenate([jnp.zeros(count), *map(jnp.ravel, leaves)])
         slope, rows = map(np.asarray, curvature(vector))
@@ -141,11 +141,11 @@ def _curvature(
     """
     count, (numbers, of_numbers) = len(unknowns), ravel_pytree(content[0])
     leaves, shape = jax.tree.flatten(content[1])
-    _, of_known = ravel_pytree([leaves[place] for place in places])
+    _, of_known = ravel_pytree([leaves[index] for index in places])
 
     def cost(vector: Array) -> Array:
         known = dict(zip(places, of_known(vector[count:]), strict=True))
-        lit = jax.tree.unflatten(shape, [known.get(place, leaf) for place, leaf in enumerate(leaves)])
+        lit = jax.tree.unflatten(shape, [known.get(index, leaf) for index, leaf in enumerate(leaves)])
         return 0.5 * jnp.sum(residuals(of_numbers(numbers + vector[:count] @ unknowns), lit, pictures) ** 2)
 
     slope, along = jax.linearize(jax.grad(cost), vector)
@@ -191,9 +191,9 @@ def with_light_errors(result: FitResult, degrees: Sequence[float]) -> FitResult:
         direction = np.asarray(scene.lights[0].direction, np.float64)  # pyright: ignore[reportAttributeAccessIssue]
         # Two small turns of it share the angle; it does not matter how long it is.
         turns = np.linalg.svd(direction[None])[2][1:] * np.linalg.norm(direction) * math.radians(error) / math.sqrt(2)
-        for place, one in enumerate(result.parameters):
+        for index, one in enumerate(result.parameters):
             slope = getattr(moves, one.name)
-            variance[place] += np.sum((turns @ (slope if one.channel is None else slope[one.channel])) ** 2)
+            variance[index] += np.sum((turns @ (slope if one.channel is None else slope[one.channel])) ** 2)
     return dataclasses.replace(result, parameters=tuple(map(_widened, result.parameters, np.sqrt(variance))))
 
 

@@ -32,7 +32,7 @@ from brdf.images.encoding import Encoding
 from brdf.precision import Precision, working_precision
 from fitting.codes import Rounding
 from fitting.core import fit_pictures
-from fitting.joint_likelihood import Known, by_least_squares, most_likely_numbers
+from fitting.joint_likelihood import Information, by_least_squares, most_likely_numbers
 from fitting.joint_problem import JointProblem, Leaf, degrees_between, joint_problem, linearised, named_leaves
 from fitting.pixels import Observed, observe
 from fitting.problem import CLASSIC, FitProblem, model_name, state_problem
@@ -133,11 +133,11 @@ def fit_jointly(
     if solver not in (None, *SOLVERS):
         raise InputError("solver", f"is unknown, got {solver!r}", "Use lm, bfgs or None")
     if not (0 < tolerance < 1 and max_steps >= 1):
-        came = f"and max_steps must be above 0, got {tolerance!r} and {max_steps!r}"
-        raise InputError("tolerance", came, "Give for example 1e-10 and 256")
+        what = f"and max_steps must be above 0, got {tolerance!r} and {max_steps!r}"
+        raise InputError("tolerance", what, "Give for example 1e-10 and 256")
     if not (callable(free) or free is None or isinstance(free, Sequence)):
-        came = f"must be a function or names, got {type(free).__name__}"
-        raise InputError("free", came, "Write lambda material, scenes: (material.n,), or light")
+        what = f"must be a function or names, got {type(free).__name__}"
+        raise InputError("free", what, "Write lambda material, scenes: (material.n,), or light")
     if not callable(free):
         free = named_leaves([free] if isinstance(free, str) else free or ())
     material = material.material if isinstance(material, FitResult) else material
@@ -150,10 +150,10 @@ def fit_jointly(
         def solve(start: brdf.Material, scenes: Sequence[brdf.Scene], rounds: int = ROUNDS) -> JointResult:
             problem = joint_problem(brdf.cast((start, list(scenes)), precision), free)
             moves = any("camera." in leaf.words or "shapes[" in leaf.words for leaf in problem.freed)
-            seen = _away_from_outlines(whole, scenes) if moves else whole
-            pictures = [(tile.target, tile.weight) for tile in seen.tiles]
-            result = _solve(dataclasses.replace(problem, pictures=pictures), seen, solver, tolerance, max_steps)
-            if rounds > 1 and moves and not _inside(result.scenes, seen.counted):
+            observed = _away_from_outlines(whole, scenes) if moves else whole
+            pictures = [(tile.target, tile.weight) for tile in observed.tiles]
+            result = _solve(dataclasses.replace(problem, pictures=pictures), observed, solver, tolerance, max_steps)
+            if rounds > 1 and moves and not _inside(result.scenes, observed.counted):
                 return solve(result.material, result.scenes, rounds - 1)
             return result
 
@@ -167,9 +167,9 @@ def fit_jointly(
 def _away_from_outlines(whole: Observed, scenes: Sequence[brdf.Scene]) -> Observed:
     """What is fitted where outlines move: a pixel that comes to see another shape, or none, is no small change."""
     inner = [_alike(scene, AWAY) & counted for scene, counted in zip(scenes, whole.counted, strict=True)]
-    seen = observe(dataclasses.replace(whole.problem, masks=inner), at_once=True)
-    lost = int(sum(map(np.count_nonzero, whole.counted)) - sum(map(np.count_nonzero, seen.counted)))
-    return seen._replace(left_out=whole.left_out | {"near an outline that moves": lost})
+    observed = observe(dataclasses.replace(whole.problem, masks=inner), at_once=True)
+    lost = int(sum(map(np.count_nonzero, whole.counted)) - sum(map(np.count_nonzero, observed.counted)))
+    return observed._replace(left_out=whole.left_out | {"near an outline that moves": lost})
 
 
 def _inside(scenes: Sequence[brdf.Scene], counted: Sequence[np.ndarray]) -> bool:
@@ -205,7 +205,9 @@ def _residuals(free: Array, given: tuple[JointProblem, Array, Array]) -> Array:
     return problem.residuals(jnp.where(held, vector, free))
 
 
-def _solve(problem: JointProblem, seen: Observed, solver: str | None, tolerance: float, max_steps: int) -> JointResult:
+def _solve(
+    problem: JointProblem, observed: Observed, solver: str | None, tolerance: float, max_steps: int
+) -> JointResult:
     vector = problem.start()
     # Gauss and Newton's steps lead to the minimum from most starts, and compile half as much as a solver.
     whole = solver is None or all(leaf.name in EMITTANCES for leaf in problem.freed)
@@ -213,7 +215,7 @@ def _solve(problem: JointProblem, seen: Observed, solver: str | None, tolerance:
     solver = solver or ("lm" if jacobian <= LARGEST_JACOBIAN else "bfgs")
     epsilon = float(jnp.finfo(vector.dtype).eps)
     # Of a smaller step rounding hides what it gains.
-    close, unseen = max(tolerance, epsilon**0.5), max(tolerance, epsilon) * float(np.max(seen.brightest))
+    close, unseen = max(tolerance, epsilon**0.5), max(tolerance, epsilon) * float(np.max(observed.brightest))
     method = SOLVERS[solver](rtol=close, atol=close)
     # Steps that rounding hides the gains of are tried for ever: it is asked several times.
     each = max(FEWEST_STEPS, -(-max_steps // ROUNDS)) if solver == "lm" else max_steps
@@ -250,29 +252,29 @@ def _solve(problem: JointProblem, seen: Observed, solver: str | None, tolerance:
     # Turns from here on are those of what was found.
     problem = problem.at(vector)
     vector = np.asarray(problem.start(), np.float64)
-    known = most_likely_numbers(problem, seen, vector)
-    if known is not None:
-        problem, held = problem.at(jnp.asarray(known.vector)), bounded & (known.vector == 0)
+    information = most_likely_numbers(problem, observed, vector)
+    if information is not None:
+        problem, held = problem.at(jnp.asarray(information.vector)), bounded & (information.vector == 0)
         residual = np.asarray(problem.residuals(problem.start()), np.float64)
-    counts = np.concatenate([counted.ravel() for counted in seen.counted])
+    counts = np.concatenate([counted.ravel() for counted in observed.counted])
     left = residual.reshape(counts.size, -1)[counts]
-    told = np.concatenate([np.asarray(target, np.float64) for target, _ in problem.pictures])[counts]
+    values = np.concatenate([np.asarray(target, np.float64) for target, _ in problem.pictures])[counts]
     squares = np.sum(left**2, axis=0)
     noise = np.sqrt(squares / max(len(left) - vector.size / squares.size, 1))
-    share = float(np.sum(squares) / max(np.sum(told**2), TINY)) ** 0.5
-    images = map(np.reshape, problem.by_picture(residual), (shown.shape for shown in seen.shown))
+    share = float(np.sum(squares) / max(np.sum(values**2), TINY)) ** 0.5
+    images = map(np.reshape, problem.by_picture(residual), (shown.shape for shown in observed.shown))
     neighbours = neighbours_of(list(images)) if share > NEGLIGIBLE else Neighbours()
-    if known is None:
-        variance = value_variance(left, told + left, noise)
-        known = by_least_squares(vector, columns, counts, variance, copies=seen.copies)
+    if information is None:
+        variance = value_variance(left, values + left, noise)
+        information = by_least_squares(vector, columns, counts, variance, copies=observed.copies)
     material, scenes = jax.tree.map(np.asarray, problem.content())
-    given = jax.tree.leaves((material, seen.problem.scenes))
-    parameters, correlation = _parameters(problem, given, known, held)
+    given = jax.tree.leaves((material, observed.problem.scenes))
+    parameters, correlation = _parameters(problem, given, information, held)
     errors = [[one.error for one in parameters if one.name == leaf.words] for leaf in problem.freed]
-    shapes = [() if leaf.is_direction else problem.leaves[leaf.place].shape for leaf in problem.freed]
+    shapes = [() if leaf.is_direction else problem.leaves[leaf.position].shape for leaf in problem.freed]
     warnings = () if converged else (f"the solver stopped after {steps} steps without an end: raise max_steps",)
     return JointResult(
-        **seen.told() | {"scenes": scenes},
+        **observed.result_fields() | {"scenes": scenes},
         material=material,
         parameters=parameters,
         correlation=correlation,
@@ -281,7 +283,7 @@ def _solve(problem: JointProblem, seen: Observed, solver: str | None, tolerance:
         residual=share,
         pixels=len(left),
         warnings=(*warnings, *structure_warning(neighbours)),
-        values=tuple(np.asarray(problem.leaves[leaf.place]) for leaf in problem.freed),
+        values=tuple(np.asarray(problem.leaves[leaf.position]) for leaf in problem.freed),
         errors=tuple(np.array(own, float).reshape(shape) for own, shape in zip(errors, shapes, strict=True)),
         steps=steps,
         converged=converged,
@@ -290,19 +292,19 @@ def _solve(problem: JointProblem, seen: Observed, solver: str | None, tolerance:
 
 
 def _parameters(
-    problem: JointProblem, given: Sequence[Any], known: Known, held: Bool[np.ndarray, " U"]
+    problem: JointProblem, given: Sequence[Any], information: Information, held: Bool[np.ndarray, " U"]
 ) -> tuple[tuple[Parameter, ...], Float[np.ndarray, "F F"]]:
     """The freed numbers with their errors, and the correlation of those that are determined.
 
     Of a direction the length is no unknown: its error is that of two small turns across it.
     """
-    covariance, deviation = known.errors()
+    covariance, deviation = information.errors()
     found: list[Parameter] = []
     places: list[int] = []
     for leaf in problem.freed:
-        value, own = np.asarray(problem.leaves[leaf.place], np.float64), deviation[leaf.numbers]
+        value, own = np.asarray(problem.leaves[leaf.position], np.float64), deviation[leaf.numbers]
         if leaf.is_direction:
-            size, start = np.degrees(np.linalg.norm(own)), np.asarray(given[leaf.place], np.float64)
+            size, start = np.degrees(np.linalg.norm(own)), np.asarray(given[leaf.position], np.float64)
             towards: dict[str, Any] = {"direction": tuple((value / np.linalg.norm(value)).tolist())}
             rows = [(None, degrees_between(start, value), float(size), -1, towards)]
         else:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from fitting.continuation import Estimate, Problem, Score, maximise, where_most_is_told
+from fitting.continuation import Estimate, Problem, Score, maximise, most_informative_score
 from fitting.joint_problem import JointProblem, linearised
 from fitting.likelihood import Bounds, Values, in_light, is_curved, residual_deviation
 from fitting.maximum_likelihood import FAINT, FIRST_NOISE, LIKELIER, alike
@@ -27,7 +27,7 @@ _residuals = eqx.filter_jit(JointProblem.residuals)
 DEPENDENT = 1e-12
 
 
-class Known(NamedTuple):
+class Information(NamedTuple):
     """Freed numbers and what is known of them.
 
     Attributes:
@@ -61,7 +61,7 @@ def by_least_squares(
     variance: Float[np.ndarray, "K C"],
     *,
     copies: bool,
-) -> Known:
+) -> Information:
     """What is known of numbers by least squares.
 
     Args:
@@ -77,32 +77,34 @@ def by_least_squares(
     if copies:
         moves, every = moves.sum(axis=2, keepdims=True), every[:, :1]
     scatter = np.einsum("upc,vpc->uv", moves * every, moves, optimize=True)
-    return Known(vector, columns @ columns.T, scatter)
+    return Information(vector, columns @ columns.T, scatter)
 
 
-def most_likely_numbers(problem: JointProblem, seen: Observed, vector: Float[np.ndarray, " U"]) -> Known | None:
+def most_likely_numbers(
+    problem: JointProblem, observed: Observed, vector: Float[np.ndarray, " U"]
+) -> Information | None:
     """What rounded values say, from least squares on; None where there are others.
 
     Args:
         problem: what is freed, and the pictures.
-        seen: what is fitted.
+        observed: what is fitted.
         vector: the freed numbers by least squares.
     """
-    bounds = [tile.bounds for tile in seen.tiles if tile.bounds is not None and not tile.bounds.exact]
-    if len(bounds) < len(seen.tiles):
+    bounds = [tile.bounds for tile in observed.tiles if tile.bounds is not None and not tile.bounds.exact]
+    if len(bounds) < len(observed.tiles):
         return None
-    pictures = _RoundedPictures(problem, bounds, seen)
-    at, known, said = _maximised(pictures, vector)
+    pictures = _RoundedPictures(problem, bounds, observed)
+    at, precisions, score = _maximised(pictures, vector)
     if at.noise >= FAINT and is_curved(bounds) and not pictures.lossy:
-        even = _RoundedPictures(problem, in_light(bounds), seen)
+        even = _RoundedPictures(problem, in_light(bounds), observed)
         found = _maximised(even, at.unknowns)
         if found[0].value > at.value + LIKELIER:
-            pictures, (at, known, said) = even, found
-    said, wider = where_most_is_told(pictures, at, known, said)
+            pictures, (at, precisions, score) = even, found
+    score, wider = most_informative_score(pictures, at, precisions, score)
     # Copies of a value tell no more of what all channels share.
-    shared = problem.each(lambda leaf: not leaf.bounded) & seen.copies
-    scatter = pictures.scatter(said) if pictures.lossy else None
-    return Known(at.unknowns, said.hessian, scatter, wider * np.sqrt(np.where(shared, seen.colour.size, 1)))
+    shared = problem.each(lambda leaf: not leaf.bounded) & observed.copies
+    scatter = pictures.scatter(score) if pictures.lossy else None
+    return Information(at.unknowns, score.hessian, scatter, wider * np.sqrt(np.where(shared, observed.colour.size, 1)))
 
 
 def _maximised(pictures: "_RoundedPictures", start: Float[np.ndarray, " U"]) -> Any:
@@ -116,15 +118,15 @@ def _maximised(pictures: "_RoundedPictures", start: Float[np.ndarray, " U"]) -> 
 class _RoundedPictures(Problem):
     """Rounded pictures, and the freed numbers that move what they show."""
 
-    def __init__(self, problem: JointProblem, bounds: Sequence[Bounds], seen: Observed):
+    def __init__(self, problem: JointProblem, bounds: Sequence[Bounds], observed: Observed):
         # What is left of pictures that are black is what the renderer shows.
         black = [(jnp.zeros_like(target), None) for target, _ in problem.pictures]
         self._problem = dataclasses.replace(problem, pictures=black)
-        self.bounds, self.copies, self.lossy = bounds, seen.copies, any(own.lossy for own in bounds)
+        self.bounds, self.copies, self.lossy = bounds, observed.copies, any(own.lossy for own in bounds)
         bounded, self.exponents = problem.each(lambda leaf: leaf.bounded), problem.each(lambda leaf: leaf.name == "n")
         self.lower, self.upper = np.where(bounded, 0.0, -np.inf), np.full(bounded.size, np.inf)
         self.design = np.eye(bounded.size)
-        self.places = np.broadcast_to(np.arange(bounded.size), (seen.colour.size, bounded.size))
+        self.places = np.broadcast_to(np.arange(bounded.size), (observed.colour.size, bounded.size))
         self.weights = [np.ones(own.lower.shape) for own in bounds]
 
     def codes(self, unknowns: Float[np.ndarray, " U"]) -> list[Float[np.ndarray, "P C"]]:
@@ -143,10 +145,10 @@ class _RoundedPictures(Problem):
         some = self.bounds[picture].pixels(operator.itemgetter(which))
         return Values(which, self.weights[picture][which], some)
 
-    def scatter(self, said: Score) -> Float[np.ndarray, "U U"]:
+    def scatter(self, score: Score) -> Float[np.ndarray, "U U"]:
         """What takes the place of the Hessian in a file that was compressed: the pixels of a block err together."""
         parts = []
-        for one in said.said:
+        for one in score.pictures:
             scores = np.einsum("upc,pc->up", one.columns, one.score)
             parts.append(block_scatter(scores, Errors(one.score, *one.values.bounds.place)))
         return np.sum(parts, axis=0)

@@ -34,12 +34,12 @@ class Leaf(NamedTuple):
     """A freed leaf of material and scenes.
 
     Attributes:
-        place: among all leaves.
+        position: among all leaves.
         words: what a person calls it, at the end its field.
         numbers: its part of the vector of all.
     """
 
-    place: int
+    position: int
     words: str
     numbers: slice
 
@@ -102,12 +102,12 @@ class JointProblem(eqx.Module):
 
     def start(self) -> Array:
         """The freed numbers."""
-        return jnp.concatenate([leaf.of(self.leaves[leaf.place]) for leaf in self.freed])
+        return jnp.concatenate([leaf.of(self.leaves[leaf.position]) for leaf in self.freed])
 
     def at(self, vector: Array) -> "JointProblem":
         """The problem with other freed numbers; directions turn from there."""
-        moved = [leaf.at(self.leaves[leaf.place], vector[leaf.numbers]) for leaf in self.freed]
-        return eqx.tree_at(lambda problem: [problem.leaves[leaf.place] for leaf in self.freed], self, moved)
+        moved = [leaf.at(self.leaves[leaf.position], vector[leaf.numbers]) for leaf in self.freed]
+        return eqx.tree_at(lambda problem: [problem.leaves[leaf.position] for leaf in self.freed], self, moved)
 
     def content(self) -> tuple[brdf.Material, list[brdf.Scene]]:
         """Material and scenes."""
@@ -168,21 +168,21 @@ def joint_problem(
         raise InputError("free", f"gives no tuple of leaves ({error})", remedy) from None
     paths, shape = jax.tree_util.tree_flatten_with_path(start)
     own = {
-        id(leaf): (place, _words(path, len(start[1])), leaf.size)
-        for place, (path, leaf) in enumerate(paths)
+        id(leaf): (index, _words(path, len(start[1])), leaf.size)
+        for index, (path, leaf) in enumerate(paths)
         if jnp.issubdtype(leaf.dtype, jnp.floating)
     }
-    for fails, came in (
+    for fails, what in (
         (not asked, "names no leaf"),
         (not own.keys() >= set(asked), "gives what is no number of material or scenes as a whole"),
         (len(set(asked)) < len(asked), "gives a leaf twice"),
     ):
         if fails:
-            raise InputError("free", came, remedy)
+            raise InputError("free", what, remedy)
     freed, begin = [], 0
-    for place, words, size in map(own.__getitem__, asked):
+    for index, words, size in map(own.__getitem__, asked):
         end = begin + (2 if words.endswith(".direction") else size)
-        freed.append(Leaf(place, words, slice(begin, end)))
+        freed.append(Leaf(index, words, slice(begin, end)))
         begin = end
     return JointProblem([leaf for _, leaf in paths], shape, tuple(freed), pictures)
 

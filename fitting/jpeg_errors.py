@@ -51,14 +51,14 @@ def codec_of(target: Target) -> Jpeg | None:
     return None if codes is None or codes.values.shape[2] != 3 else codes.jpeg
 
 
-def without_codec_errors(seen: Observed, fit: ModelFit) -> tuple[ModelFit, Observed]:
+def without_codec_errors(observed: Observed, fit: ModelFit) -> tuple[ModelFit, Observed]:
     """The most likely fit to the pixels of a problem, less what compression does to look-alikes; and these pixels.
 
     Args:
-        seen: the pixels.
+        observed: the pixels.
         fit: a first fit to them.
     """
-    pictures, targets = list(fit.pictures), seen.problem.targets
+    pictures, targets = list(fit.pictures), observed.problem.targets
     ends = np.cumsum([len(picture.target) for picture in pictures])
     compressed = [_Compressed.of(target) for target in targets]
     fit, most, count = fit._replace(pictures=pictures), MOST_FITS, LOOK_ALIKES
@@ -80,8 +80,8 @@ def without_codec_errors(seen: Observed, fit: ModelFit) -> tuple[ModelFit, Obser
         ]
         most, count = MOST_WHOLE_FITS, COMPARED
     fit = _nearest(fit, compressed, most, count)
-    tiles = each(lambda tile, own: tile._replace(target=own.target, bounds=own.bounds), seen.tiles, fit.pictures)
-    return fit, seen._replace(tiles=tiles)
+    tiles = each(lambda tile, own: tile._replace(target=own.target, bounds=own.bounds), observed.tiles, fit.pictures)
+    return fit, observed._replace(tiles=tiles)
 
 
 def _part(picture: Picture) -> np.ndarray:
@@ -138,7 +138,7 @@ def _codec_errors(
 def _predicted(picture: Picture, at: Optimum) -> Float[np.ndarray, "P C"]:
     """In codes; NaN where a value says nothing."""
     bounds = bounds_of(picture)
-    code, _ = bounds.codes(picture.shown(at.n, at.x).astype(np.float32))
+    code, _ = bounds.codes(picture.predict(at.n, at.x).astype(np.float32))
     return np.where(bounds.ends > 0, code, np.float32(np.nan))
 
 

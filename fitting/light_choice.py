@@ -132,22 +132,22 @@ def next_light(result: Any, candidates: Sequence[Any] | None = None, count: int 
     if hasattr(result, "next_light"):  # maps, which stand above this module, know their own texels
         return result.next_light(candidates, count, of=of)
     if not isinstance(result, FitResult):
-        came = f"must be of fitting.fit or fit_maps, got {type(result).__name__}"
-        raise InputError("result", came, "Fit the pictures first")
+        what = f"must be of fitting.fit or fit_maps, got {type(result).__name__}"
+        raise InputError("result", what, "Fit the pictures first")
     of_material_alone(result)
     free, asked = result.free_parameters, result[of]
     asked = asked if isinstance(asked, tuple) else (asked,)
     for one in asked:
         if one not in free:
-            came = f"{one.key} has no error to shrink: {one.reason or 'is at its bound'}"
-            raise InputError("of", came, "Ask for another number")
+            what = f"{one.key} has no error to shrink: {one.reason or 'is at its bound'}"
+            raise InputError("of", what, "Ask for another number")
     wanted, index = [one in asked for one in free], [one.place(result.noise.size) for one in free]
     known = tuple(light for scene in result.scenes for light in scene.lights)
     with working_precision("float64"), waiting("trying lights"):
         material = brdf.cast(result.material, "float64")
         k_s = np.asarray(getattr(material, "k_s", np.zeros(result.noise.size)))
 
-        def told(scene: brdf.Scene, weight: np.ndarray) -> np.ndarray:
+        def information_of(scene: brdf.Scene, weight: np.ndarray) -> np.ndarray:
             """Fisher's information of the free numbers."""
             gram = np.asarray(_gram(material, brdf.cast(scene, "float64"), weight))
             none = np.zeros(gram.shape[:2])
@@ -160,19 +160,19 @@ def next_light(result: Any, candidates: Sequence[Any] | None = None, count: int 
         scenes = [_scene(result, index) for index in range(len(result.scenes))]
         first, weight = scenes[0]
         to_view = np.asarray(first.surface_points().to_view, np.float64).reshape(-1, 3).mean(axis=0)
-        information = np.sum([told(*scene) for scene in scenes], axis=0)
+        information = np.sum([information_of(*scene) for scene in scenes], axis=0)
         # What is known is what the fit says, of codes by their edges: another picture is taken to tell as much a pixel.
         own = math.sqrt(np.mean([one.error**2 for one in asked]))
         unit = (error(information) / own) ** 2 if own > 0 else 1.0
 
-        def told_by(light: Light) -> np.ndarray:
+        def information_by(light: Light) -> np.ndarray:
             lit, channels = dataclasses.replace(first, lights=(light,), visibility=()), result.noise.size
             if lit.channels not in (1, channels):
-                came = f"have {lit.channels} channels, the pictures {channels}"
-                raise InputError("candidates", came, "Give both the same number, or light of one")
-            return unit * told(lit, weight)
+                what = f"have {lit.channels} channels, the pictures {channels}"
+                raise InputError("candidates", what, "Give both the same number, or light of one")
+            return unit * information_of(lit, weight)
 
-        return choose_lights(candidates, count, of, known, to_view, unit * information, told_by, error)
+        return choose_lights(candidates, count, of, known, to_view, unit * information, information_by, error)
 
 
 def choose_lights(
@@ -182,7 +182,7 @@ def choose_lights(
     known: tuple[Light, ...],
     to_view: np.ndarray,
     information: np.ndarray,
-    told_by: Callable[[Light], np.ndarray],
+    information_by: Callable[[Light], np.ndarray],
     error: Callable[[np.ndarray], float],
 ) -> LightChoice:
     """Choose lights one after the other, each where it leaves the least error.
@@ -194,7 +194,7 @@ def choose_lights(
         known: the lights that there are.
         to_view: where a hemisphere of candidates lies around.
         information: what is told by the known lights, which adds up.
-        told_by: what one more would tell.
+        information_by: what one more would tell.
         error: that some information leaves.
 
     Raises:
@@ -205,11 +205,11 @@ def choose_lights(
     shining = max((np.asarray(light.emittance) for light in known), key=np.sum, default=np.ones(1))
     given = [_light(one, shining) for one in candidates] if isinstance(candidates, Sequence | np.ndarray) else []
     if candidates is not None and not given:
-        came = f"is empty, or no list: {candidates!r:.60}"
-        raise InputError("candidates", came, "Give lights or directions, or None for any direction")
+        what = f"is empty, or no list: {candidates!r:.60}"
+        raise InputError("candidates", what, "Give lights or directions, or None for any direction")
 
     def left(light: Light) -> float:
-        return error(information + told_by(light))
+        return error(information + information_by(light))
 
     def around(middle: np.ndarray, size: float, number: int) -> list[Light]:
         return [_light(one, shining) for one in _cap(middle, size, number)]
@@ -221,7 +221,7 @@ def choose_lights(
         foretold, best = foretold or errors, tried[int(np.argmin(errors))]
         for near in () if given else AROUND:
             best = min([best, *around(direction_of(best), *near)], key=left)
-        information = information + told_by(best)
+        information = information + information_by(best)
         chosen.append(best)
         after.append(error(information))
     return LightChoice(tuple(chosen), of, before, tuple(after), tuple(tried), np.array(foretold), known)
@@ -233,8 +233,8 @@ def _light(given: Any, shining: np.ndarray) -> Light:
     try:
         return brdf.DirectionalLight(direction=given, intensity=shining)
     except InputError:
-        came = f"must hold lights or directions of 3 numbers, got {given!r:.60}"
-        raise InputError("candidates", came, "Give brdf lights, or (K, 3) directions towards the light") from None
+        what = f"must hold lights or directions of 3 numbers, got {given!r:.60}"
+        raise InputError("candidates", what, "Give brdf lights, or (K, 3) directions towards the light") from None
 
 
 def direction_of(light: Light) -> np.ndarray:
@@ -247,8 +247,8 @@ def direction_of(light: Light) -> np.ndarray:
         InputError: where it is none.
     """
     if not isinstance(light, brdf.DirectionalLight):
-        came = f"hold a {type(light).__name__}, which has no one direction"
-        raise InputError("candidates", came, "Give directional lights, or look at foretold")
+        what = f"hold a {type(light).__name__}, which has no one direction"
+        raise InputError("candidates", what, "Give directional lights, or look at foretold")
     direction = np.asarray(light.direction, np.float64)
     return direction / np.linalg.norm(direction)
 

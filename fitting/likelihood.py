@@ -389,7 +389,7 @@ class Values:
         self._kind = np.zeros(lower.shape, np.intp)
         self._kind[closed] = 1 + power
 
-    def said(self, predicted: Float[np.ndarray, "P C"], noise: float) -> LogLikelihood:
+    def likelihood(self, predicted: Float[np.ndarray, "P C"], noise: float) -> LogLikelihood:
         """What they say of predictions.
 
         Args:

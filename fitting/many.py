@@ -129,16 +129,16 @@ def fit_many(
         (2, 3)
     """
     if not (isinstance(pictures, list | tuple) or np.ndim(pictures) == 4):
-        came = f"must be an array (N, H, W, C) or a list, got {type(pictures).__name__} {np.shape(pictures) or ''}"
-        raise InputError("pictures", came.rstrip(), "Stack them, or call fitting.fit for one")
+        what = f"must be an array (N, H, W, C) or a list, got {type(pictures).__name__} {np.shape(pictures) or ''}"
+        raise InputError("pictures", what.rstrip(), "Stack them, or call fitting.fit for one")
     pictures = list(pictures)
     scenes = [scenes] * len(pictures) if isinstance(scenes, brdf.Scene) else scenes
     mask = mask if isinstance(mask, list | tuple) else [mask] * len(pictures)
     problem = state_problem(pictures, scenes, mask, model=model, precision=precision, n_range=n_range)
     shapes = {target.pixels.shape for target in problem.targets}
     if len(shapes) > 1 or problem.streamed:
-        came = "are read by bands" if problem.streamed else f"have the shapes {sorted(shapes)}"
-        raise InputError("pictures", f"{came}, and are fitted together", "Give arrays of one size, or call fitting.fit")
+        what = "are read by bands" if problem.streamed else f"have the shapes {sorted(shapes)}"
+        raise InputError("pictures", f"{what}, and are fitted together", "Give arrays of one size, or call fitting.fit")
     with waiting(f"fitting {len(pictures)} pictures"):
         with working_precision(problem.precision), spread_over(mesh):
             plain, numbers = _fit_together(problem)

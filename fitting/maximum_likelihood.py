@@ -28,12 +28,12 @@ from fitting.continuation import (
     REACH,
     STEP,
     Estimate,
+    PictureScore,
     Problem,
-    Said,
     Score,
     maximise,
-    telling,
-    where_most_is_told,
+    most_informative,
+    most_informative_score,
 )
 from fitting.continuation import precision as precision_at
 from fitting.likelihood import AnyArray, Bounds, Values, in_light, is_curved, residual_deviation
@@ -117,11 +117,13 @@ def most_likely(fit: ModelFit, *, grey: np.ndarray | None = None, precision: np.
         together = lossy and not fit.copies and (grey is not None or fit.tied is not None) and can_be_coupled(pictures)
         if together and grey is not None:
             fit = fit._replace(tied=np.where(fit.free[2], grey, 0.0))
-        said = _reweighted(fit._replace(pictures=pictures), noise, rounding, precision, together=together)
+        evidence = _reweighted(fit._replace(pictures=pictures), noise, rounding, precision, together=together)
     else:
         start = Estimate(np.append(optimum.x.ravel(), math.log(optimum.n)), max(noise, FIRST_NOISE))
-        said = _near_edges(fit._replace(pictures=pictures), start)
-    return fit._replace(optimum=dataclasses.replace(optimum, x=said.optimum.x, n=said.optimum.n), evidence=said)
+        evidence = _near_edges(fit._replace(pictures=pictures), start)
+    return fit._replace(
+        optimum=dataclasses.replace(optimum, x=evidence.optimum.x, n=evidence.optimum.n), evidence=evidence
+    )
 
 
 def _deviation(pictures: Sequence[Picture], at: Optimum) -> float:
@@ -215,47 +217,47 @@ def _kinds(code: Int[np.ndarray, " P"]) -> tuple[Int[np.ndarray, " P"], Int[np.n
 def _near_edges(fit: ModelFit, at: Estimate) -> Evidence:
     """Where rounding is most of the noise: what pixels near the edge of a code say."""
     pictures, design = fit.pictures, design_of(fit.free, fit.tied)
-    stated = partial(_Separable, design=design, n_range=fit.n_range, copies=fit.copies)
+    separable = partial(_Separable, design=design, n_range=fit.n_range, copies=fit.copies)
     large = sum(picture.target.shape[0] for picture in pictures) > 2 * SUBSAMPLE
     some = [_stratum(picture, SUBSAMPLE // len(pictures)) for picture in pictures] if large else _gathered(pictures, at)
-    problem = stated(some)
-    at, known, said = maximise(problem, at, ROUGHLY_KNOWN, FEWEST_VALUES) if large else maximise(problem, at)
+    problem = separable(some)
+    at, precisions, score = maximise(problem, at, ROUGHLY_KNOWN, FEWEST_VALUES) if large else maximise(problem, at)
     if (even := _evener_in_light(problem, at)) is not None:
         return _near_edges(fit._replace(pictures=_in_light(pictures)), even)
     if large:
         # The whole picture has the pixels near an edge that a part of it lacks.
-        at = at._replace(noise=telling(known).noise)
-        problem = stated(_gathered(pictures, at))
-        at, known, said = maximise(problem, at)
-    rounds = [(problem, known)]
-    while len(rounds) <= MOST_ROUNDS and (factors := _more_noise(said, at.noise, fit.owner)).any():
+        at = at._replace(noise=most_informative(precisions).noise)
+        problem = separable(_gathered(pictures, at))
+        at, precisions, score = maximise(problem, at)
+    rounds = [(problem, precisions)]
+    while len(rounds) <= MOST_ROUNDS and (factors := _more_noise(score, at.noise, fit.owner)).any():
         pixels = [_noisier(values, math.exp(factor)) for values, factor in zip(problem.pixels, factors, strict=True)]
-        problem = stated(pixels)
-        at, known, said = maximise(problem, at)
-        rounds.append((problem, known))
-    scores = [(one.score, one.weight, one.values.bounds.place) for one in said.said]
-    steps = [(one.values.bounds.spread / one.slope).ravel() for one in said.said]
+        problem = separable(pixels)
+        at, precisions, score = maximise(problem, at)
+        rounds.append((problem, precisions))
+    scores = [(one.score, one.weight, one.values.bounds.place) for one in score.pictures]
+    steps = [(one.values.bounds.spread / one.slope).ravel() for one in score.pictures]
     light = at.noise * float(np.median(np.concatenate(steps))) if any(map(np.size, steps)) else 0.0
-    known = [entry for _, some in rounds for entry in some]
-    most = telling(known)
-    then = next(one for one, some in rounds if any(entry is most for entry in some))
-    said, wider = where_most_is_told(then, at, known, said, _of_planes(pictures, at, problem))
-    working = list(map(_working, said.said))
+    precisions = [entry for _, some in rounds for entry in some]
+    most = most_informative(precisions)
+    informative = next(one for one, some in rounds if any(entry is most for entry in some))
+    score, wider = most_informative_score(informative, at, precisions, score, _of_planes(pictures, at, problem))
+    working = list(map(_newton_picture, score.pictures))
     optimum = _optimum(working, fit, Numbers.of(at.unknowns))
-    places = [one.values.bounds.place for one in said.said]
+    places = [one.values.bounds.place for one in score.pictures]
     return Evidence(working, optimum, at.noise, at.value, places, wider, scores=scores, light=light)
 
 
-def _more_noise(said: Score, noise: float, owner: Sequence[int]) -> Float[np.ndarray, " T"]:
+def _more_noise(score: Score, noise: float, owner: Sequence[int]) -> Float[np.ndarray, " T"]:
     """Logarithms of the factor by which the picture of each tile has more noise than is said; 0 where that will do."""
     if max(owner, default=0) == 0:
-        return np.zeros(len(said.said))
+        return np.zeros(len(score.pictures))
     _, slope, information = (
-        np.bincount(owner, some) for some in zip(*(one.of_noise(noise) for one in said.said), strict=True)
+        np.bincount(owner, some) for some in zip(*(one.of_noise(noise) for one in score.pictures), strict=True)
     )
     step, largest = slope / np.maximum(information, 1.0), math.log(STEP)
     known = (np.abs(step) < math.log(ENOUGH_KNOWN)) | (step**2 * information < ENOUGH_MOVED)
-    own = [noise * float(np.max(one.values.bounds.spread)) for one in said.said]
+    own = [noise * float(np.max(one.values.bounds.spread)) for one in score.pictures]
     least = np.minimum(np.log(LEAST_NOISE / np.array(own)), 0.0)
     return np.maximum(np.clip(np.where(known, 0.0, step), -largest, largest)[np.array(owner)], least)
 
@@ -284,9 +286,9 @@ def _of_planes(pictures: Sequence[Picture], at: Estimate, problem: "_Separable")
     weighted = map(_with_weight, pictures, weights)
     pixels = [_values(picture.in_double(np.arange(len(picture.target)))) for picture in weighted]
     at, alone = at._replace(noise=FIRST_NOISE), _Separable(pixels, problem.design, problem.n_range, problem.copies)
-    said = alone.score(at, alone.near(alone.codes(at.unknowns), REACH * at.noise))
+    score = alone.score(at, alone.near(alone.codes(at.unknowns), REACH * at.noise))
     of_planes = np.append(np.tile(flat, 3), flat.all())
-    return np.where(of_planes, precision_at(alone, at, said).variance, 0.0)
+    return np.where(of_planes, precision_at(alone, at, score).variance, 0.0)
 
 
 def _optimum(working: Sequence[Picture], fit: ModelFit, at: Numbers) -> Optimum:
@@ -313,15 +315,15 @@ def _reweighted(
         together: they err together.
     """
     pictures, optimum, places = fit.pictures, fit.optimum, [bounds_of(picture).place for picture in fit.pictures]
-    known = precision is not None
+    is_given = precision is not None
     with jax.enable_x64(True):
         both = [(picture, np.flatnonzero(bounds_of(picture).half_open)) for picture in pictures]
-        stated, gone = [_stated(*one, optimum, noise, rounding) for one in both], math.inf
+        parts, gone = [_working_picture(*one, optimum, noise, rounding) for one in both], math.inf
         for trial in range(MOST_ROUNDS):
-            working, before = [part.picture for part in stated], optimum
+            working, before = [part.picture for part in parts], optimum
             if together:
-                if not known:
-                    count = sum(part.count for part in stated) / optimum.x.shape[1]
+                if not is_given:
+                    count = sum(part.count for part in parts) / optimum.x.shape[1]
                     left = [residuals(picture, optimum) for picture in working]
                     precision = precision_of(left, places, count, rounding)
                 assert precision is not None
@@ -331,9 +333,9 @@ def _reweighted(
                 optimum = search(working, fit.free, fit.n_range)
             else:
                 optimum = refit(working, optimum, fit.free, fit.n_range, fit.tied)
-            stated = [_stated(*one, optimum, noise, rounding) for one in both]
-            count, closed = (sum(getattr(part, name) for part in stated) for name in ("count", "closed"))
-            last, gone = gone, 0.5 * math.log(sum(part.squares for part in stated) / max(count, 1) / noise**2)
+            parts = [_working_picture(*one, optimum, noise, rounding) for one in both]
+            count, closed = (sum(getattr(part, name) for part in parts) for name in ("count", "closed"))
+            last, gone = gone, 0.5 * math.log(sum(part.squares for part in parts) / max(count, 1) / noise**2)
             # The rest of a geometric series (Aitken 1926).
             gone_on = gone / max(1 - max(gone / (last or math.inf), 0.0), 1 / MOST_AHEAD)
             noise *= math.exp(gone_on)
@@ -342,15 +344,15 @@ def _reweighted(
                 break
         if together:
             assert precision is not None
-            return _together([part.picture for part in stated], optimum, noise, places, precision)
+            return _together([part.picture for part in parts], optimum, noise, places, precision)
     scale = 1 / noise**2
-    working = [_with_weight(part.picture, part.picture.weights * scale) for part in stated]
+    working = [_with_weight(part.picture, part.picture.weights * scale) for part in parts]
     completed = [
         own if part.completed is part.picture else _with_weight(part.completed, part.completed.weights * scale)
-        for own, part in zip(working, stated, strict=True)
+        for own, part in zip(working, parts, strict=True)
     ]
     sums = {name: getattr(optimum, name) * scale for name in ("cost", "gram", "product", "square")}
-    value = sum(part.value - part.closed * math.log(noise) - part.closed_squares * scale / 2 for part in stated)
+    value = sum(part.value - part.closed * math.log(noise) - part.closed_squares * scale / 2 for part in parts)
     value += sum(_of_codes(bounds_of(picture)) for picture in pictures)
     widening = np.ones(3 * fit.free.shape[1] + 1)
     optimum = dataclasses.replace(optimum, **sums)
@@ -376,8 +378,8 @@ def _together(
     left = [residuals(picture, optimum) for picture in pictures]
     value = -0.5 * sum(float(np.sum((values @ precision) * values)) for values in left)
     parts = [each_alone(picture, some, precision, optimum) for picture, some in zip(pictures, left, strict=True)]
-    said = coupled(pictures, precision, optimum.x, np.array([math.log(optimum.n)]))[0]
-    normal, optimum = said.joined(optimum.x, optimum.n), replaced(optimum, said, optimum.x, optimum.n)
+    sums = coupled(pictures, precision, optimum.x, np.array([math.log(optimum.n)]))[0]
+    normal, optimum = sums.joined(optimum.x, optimum.n), replaced(optimum, sums, optimum.x, optimum.n)
     return Evidence(parts, optimum, noise, value, places, np.ones(len(normal.gram)), normal, precision)
 
 
@@ -390,14 +392,14 @@ def change(before: Optimum, after: Optimum) -> float:
     """
     noise = np.maximum(after.cost, np.finfo(float).tiny) / np.maximum(after.pixels, 1)
     # Sums of a column that no pixel shows may end a little below 0.
-    told = np.maximum(np.diagonal(after.gram, axis1=1, axis2=2)[:, :3].T, 0.0)
-    x = np.abs(after.x - before.x) * np.sqrt(told / noise)
+    information = np.maximum(np.diagonal(after.gram, axis1=1, axis2=2)[:, :3].T, 0.0)
+    x = np.abs(after.x - before.x) * np.sqrt(information / noise)
     by_n = abs(after.n - before.n) * np.sqrt(np.sum(after.gauss_newton[:, 3, 3] / noise))
     return float(max(np.max(x), by_n))
 
 
 @dataclasses.dataclass(frozen=True)
-class _Stated:
+class _WorkingPicture:
     """A picture as least squares takes it.
 
     Attributes:
@@ -419,7 +421,9 @@ class _Stated:
     value: float
 
 
-def _stated(picture: Picture, index: Int[np.ndarray, " K"], optimum: Optimum, noise: float, rounding: float) -> _Stated:
+def _working_picture(
+    picture: Picture, index: Int[np.ndarray, " K"], optimum: Optimum, noise: float, rounding: float
+) -> _WorkingPicture:
     """With the pixels that have a value with one end."""
     target, weight, *sums = _linearised(picture, np.asarray(optimum.n), optimum.x)
     squares, closed = map(float, sums)
@@ -429,27 +433,30 @@ def _stated(picture: Picture, index: Int[np.ndarray, " K"], optimum: Optimum, no
         target, weight, expected, full = (np.array(part) for part in (target, weight) * 2)
         s = math.sqrt(max(noise**2 - rounding, LEAST_SHARE * noise**2))
         values = _values(picture.in_double(index))
-        radiance, _ = _shown(values.picture, optimum)
+        radiance, _ = _predicted(values.picture, optimum)
         code, slope = values.bounds.codes(radiance)
-        parts = values.said(code, s), radiance, slope, np.broadcast_to(values.weight, radiance.shape)
-        told, radiance, slope, weighs = jax.tree.map(lambda part: part[: index.size], parts)
+        parts = values.likelihood(code, s), radiance, slope, np.broadcast_to(values.weight, radiance.shape)
+        likelihood, radiance, slope, weighs = jax.tree.map(lambda part: part[: index.size], parts)
         bounds = bounds_of(picture).pixels(partial(np.take, indices=index, axis=0))
         at_end, own = bounds.ends == 1, s * bounds.spread
-        curvature = told.weight * slope**2
-        step = np.divide(told.score * slope, curvature, out=np.zeros_like(curvature), where=curvature > 0)
+        curvature = likelihood.weight * slope**2
+        step = np.divide(likelihood.score * slope, curvature, out=np.zeros_like(curvature), where=curvature > 0)
         target[index] = np.where(at_end, radiance + step, target[index])
         weight[index] = np.where(at_end, weighs * curvature * noise**2, weight[index])
-        expected[index] = np.where(at_end, radiance + told.score * own**2 / slope, expected[index])
+        expected[index] = np.where(at_end, radiance + likelihood.score * own**2 / slope, expected[index])
         full[index] = np.where(at_end, weighs * (slope / bounds.spread) ** 2, full[index])
         # Mean square of what the value may have been, about the prediction.
-        square = ((told.score * own) ** 2 + 1 - told.weight * own**2) * noise**2
+        square = ((likelihood.score * own) ** 2 + 1 - likelihood.weight * own**2) * noise**2
         squares += float(np.sum(weighs * square, where=at_end))
-        value, count = float(np.sum(weighs * told.value, where=at_end)), closed + float(np.sum(weighs, where=at_end))
+        value, count = (
+            float(np.sum(weighs * likelihood.value, where=at_end)),
+            closed + float(np.sum(weighs, where=at_end)),
+        )
         taken, completed = (
             dataclasses.replace(taken, target=jnp.asarray(some), weight=jnp.asarray(weights))
             for some, weights in ((target, weight), (expected, full))
         )
-    return _Stated(taken, completed, squares, count, closed, plain, value)
+    return _WorkingPicture(taken, completed, squares, count, closed, plain, value)
 
 
 @partial(jax.jit, compiler_options=COMPILER_OPTIONS)
@@ -496,7 +503,7 @@ class _Separable(Problem):
         if self._last[0] is not unknowns:
             at, found = Numbers.of(unknowns), []
             for part in self.pixels:
-                found.append(part.bounds.codes(part.picture.shown(at.n, at.x))[0])
+                found.append(part.bounds.codes(part.picture.predict(at.n, at.x))[0])
             self._last = unknowns, found
         return self._last[1]
 
@@ -507,10 +514,10 @@ class _Separable(Problem):
 
     def shown(self, unknowns: Float[np.ndarray, " U"], values: Sequence[Values]) -> Iterator[tuple[Any, Any]]:
         """What is predicted, and its derivatives by the coefficients and log n."""
-        return map(partial(_shown, at=Numbers.of(unknowns)), [some.picture for some in values])
+        return map(partial(_predicted, at=Numbers.of(unknowns)), [some.picture for some in values])
 
 
-def _shown(picture: Picture, at: Numbers | Optimum) -> tuple[Float[np.ndarray, "P C"], Float[np.ndarray, "4 P C"]]:
+def _predicted(picture: Picture, at: Numbers | Optimum) -> tuple[Float[np.ndarray, "P C"], Float[np.ndarray, "4 P C"]]:
     """Radiance, and its derivatives by x_a, x_d, x_s and log n."""
     columns = picture.columns(at.n)
     columns[3] *= at.n * at.x[2]
@@ -523,10 +530,10 @@ def _values(picture: Picture, which: Bool[np.ndarray, " P"] | None = None) -> Va
     return Values(which, np.asarray(picture.weights), bounds_of(picture), picture)
 
 
-def _working(said: Said) -> Picture:
+def _newton_picture(score: PictureScore) -> Picture:
     """Targets and weights with which least squares takes Newton's step."""
-    step = np.divide(said.score, said.weight, out=np.zeros_like(said.radiance), where=said.weight > 0)
-    return dataclasses.replace(said.values.picture, target=said.radiance + step, weight=said.weight, bounds=None)
+    step = np.divide(score.score, score.weight, out=np.zeros_like(score.radiance), where=score.weight > 0)
+    return dataclasses.replace(score.values.picture, target=score.radiance + step, weight=score.weight, bounds=None)
 
 
 def _near(picture: Picture, at: Numbers | Optimum, distance: float) -> Bool[np.ndarray, " P"]:
@@ -568,7 +575,7 @@ def bounds_of(picture: Picture) -> Bounds:
 
 def _codes(picture: Picture, at: Numbers | Optimum) -> np.ndarray:
     """What is predicted, in codes, (P, C), in the precision of the picture."""
-    return bounds_of(picture).codes(picture.shown(at.n, at.x))[0]
+    return bounds_of(picture).codes(picture.predict(at.n, at.x))[0]
 
 
 def _open_ends_tell(picture: Picture, at: Optimum, noise: float) -> bool:

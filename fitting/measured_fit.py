@@ -170,13 +170,13 @@ class BrdfFitResult(Parameters):
         left, elsewhere = _percent(losses.cosine), f"{_percent(losses.misplaced)} of the light goes elsewhere"
         if losses.cosine**2 > HALF:
             placed = f"puts {_percent(1 - losses.misplaced)} of the light where it belongs, but not the peak"
-            told = f"{placed}, and leaves {left} of the table (rms of f_r cos θ)"
+            words = f"{placed}, and leaves {left} of the table (rms of f_r cos θ)"
         elif losses.misplaced > HALF:
-            told = f"fits the peak, its f_r cos θ is off by {left} (rms), but {elsewhere}"
+            words = f"fits the peak, its f_r cos θ is off by {left} (rms), but {elsewhere}"
         else:
             verb = "is enough" if several and name == "Lambert" else "describes it"
-            told = f"{verb}: its f_r cos θ is off by {left} (rms), and {elsewhere}"
-        return f"{name} {told}{self._beside_lambert()}"
+            words = f"{verb}: its f_r cos θ is off by {left} (rms), and {elsewhere}"
+        return f"{name} {words}{self._beside_lambert()}"
 
     def _loss(self, candidate):
         return getattr(candidate.losses, self.loss)
@@ -337,8 +337,8 @@ def fit_brdf(
         kind for kind in kinds if count * channels > channels + issubclass(kind, SpecularMaterial) * (channels + 1)
     ]
     if not kinds:
-        came = f"has {count} samples that count, no more than there are numbers to find"
-        raise InputError(table.name, came, "Give a table with more samples, or a model with fewer numbers")
+        what = f"has {count} samples that count, no more than there are numbers to find"
+        raise InputError(table.name, what, "Give a table with more samples, or a model with fewer numbers")
     with waiting(f"fitting {table.name}"):
         candidates = tuple(_fit_model(kind, samples, loss, n_range) for kind in kinds)
     chosen, seconds = _choose(candidates, loss), time.perf_counter() - start
@@ -351,14 +351,14 @@ def _samples(table, max_angle):
     values, share = table.values[near], table.solid_angle[near]
     largest = np.max(np.abs(values), initial=0.0)
     within = f"within {max_angle:g}° of the normal"
-    for fails, came, remedy in (
+    for fails, what, remedy in (
         (not values.size, f"has no sample {within}", "Raise max_angle"),
         (not largest, "is black", "Give a table with values"),
         (not np.any(values > 0), f"has no value above 0 {within}", "Check its sign"),
         (not 1 / FAR <= largest <= FAR, f"holds values of up to {largest:.3g}/sr, as no BRDF does", "Check its unit"),
     ):
         if fails:
-            raise InputError(table.name, came, remedy)
+            raise InputError(table.name, what, remedy)
     directions = {"to_light": table.to_light[near], "to_view": table.to_view[near]}
     return dataclasses.replace(table, **directions, values=values, solid_angle=share / np.mean(share))
 
@@ -397,12 +397,12 @@ def _fit_model(model, samples, loss, n_range):
     visible = float(np.max(highlight) / np.max(brightest))
     # A lobe that hardly reaches a sample needs a k_s whose square is out of range; it is found to be undetermined.
     with np.errstate(over="ignore", invalid="ignore"):
-        sure = uncertainty(optimum, free, noise, brightest, visible, single=False)
+        errors = uncertainty(optimum, free, noise, brightest, visible, single=False)
     fit, interval = ModelFit(model, [], optimum, free, n_range), None
-    if specular and not sure.n_reason:
-        interval = exponent_interval(fit, sure.n_error, sure.reach, sure.rise, 0.0, parabolic=True)
-        sure = sure._replace(n_reason=fit.held)
-    material, parameters = material_and_parameters(fit, sure, np.ones(channels), interval)
+    if specular and not errors.n_reason:
+        interval = exponent_interval(fit, errors.n_error, errors.reach, errors.delta_cost, 0.0, parabolic=True)
+        errors = errors._replace(n_reason=fit.held)
+    material, parameters = material_and_parameters(fit, errors, np.ones(channels), interval)
     return BrdfCandidate(material, tuple(one for one in parameters if one.name != "k_a"), _losses(samples, f_r))
 
 

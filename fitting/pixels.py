@@ -103,7 +103,7 @@ class Observed(NamedTuple):
         """Whether the channels are copies of each other: grey that was saved as colour."""
         return all(_grey(picture) for picture in self.shown)
 
-    def told(self) -> dict[str, Any]:
+    def result_fields(self) -> dict[str, Any]:
         """What a `FitResult` says of the pictures."""
         targets = self.problem.targets
         return {
@@ -218,8 +218,8 @@ def _observe(
     reach = SINGLE if dtype == np.float32 else DOUBLE
     size = max(float(total.largest), float(np.max(total.scale)))
     if size > 0 and not 1 / reach <= size <= reach:
-        came = f"has {size:.3g} as its largest value, out of reach of {dtype.name}"
-        raise InputError("target", came, "Bring it nearer to 1 (another exposure), or fit in float64")
+        what = f"has {size:.3g} as its largest value, out of reach of {dtype.name}"
+        raise InputError("target", what, "Bring it nearer to 1 (another exposure), or fit in float64")
     # Where all share one value nothing is below it: it is a constant, not a level.
     if level is None and total.largest > 0 and SYMMETRIC_PIXELS < total.top < total.counts[2] and scene.lights:
         level = _plateau(bands, found, float(total.largest), grey)
@@ -384,13 +384,13 @@ def _left_out(
     if level is not None:
         left_out["clipped"] = finite - below
         if not below or (below < finite and counted and black):
-            came = f"is clipped at {level:g} wherever it sees the object"
-            raise InputError("target", came, "Give a darker exposure or a higher saturation")
+            what = f"is clipped at {level:g} wherever it sees the object"
+            raise InputError("target", what, "Give a darker exposure or a higher saturation")
     if dark is not None:
         left_out["dark"] = below - counted
         if not counted:
-            came = f"is no brighter than {dark:g} wherever it counts"
-            raise InputError("target", came, "Give a brighter picture or a lower dark level")
+            what = f"is no brighter than {dark:g} wherever it counts"
+            raise InputError("target", what, "Give a brighter picture or a lower dark level")
     if black:
         raise InputError("target", "is black on the object", "Give a picture with light in it")
     return left_out

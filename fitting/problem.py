@@ -97,8 +97,8 @@ class FitProblem:
         Args:
             model: its name.
         """
-        told = self.sample_errors or {}
-        return told.get(model, next(iter(told.values()), None))
+        errors = self.sample_errors or {}
+        return errors.get(model, next(iter(errors.values()), None))
 
     @property
     def families(self) -> tuple[str, ...]:
@@ -120,8 +120,8 @@ def model_name(model: Any) -> str:
     names = {_letters(name): name for name in ("auto", *brdf.MODELS)}
     name = names.get(_letters(model)) if isinstance(model, str) else None
     if name is None:
-        came = repr(model) if isinstance(model, str) else f"{type(model).__name__}, no name"
-        raise InputError("model", f"is unknown, got {came}", f"Use auto or one of {', '.join(brdf.MODELS)}")
+        what = repr(model) if isinstance(model, str) else f"{type(model).__name__}, no name"
+        raise InputError("model", f"is unknown, got {what}", f"Use auto or one of {', '.join(brdf.MODELS)}")
     return name
 
 
@@ -177,8 +177,8 @@ def state_problem(
         listed = isinstance(values, list | tuple) and (several or name == "scene")
         lists.append(list(values) if listed else [values] * len(targets))
         if len(lists[-1]) != len(targets):
-            came = f"has {len(lists[-1])} entries for {len(targets)} pictures"
-            raise InputError(name, came, "Give one for each")
+            what = f"has {len(lists[-1])} entries for {len(targets)} pictures"
+            raise InputError(name, what, "Give one for each")
     scenes, masks, weights = lists
     for each in scenes:
         if not isinstance(each, brdf.Scene):
@@ -231,8 +231,8 @@ def as_target(given: Any, rounding: Rounding = None, encoding: Encoding | None =
     if isinstance(given, brdf.Picture):
         return _of_picture(given, rounding)
     if isinstance(given, bytes) or not hasattr(given, "__array__"):
-        came = f"must be an array or the path of a picture, got {type(given).__name__}"
-        raise InputError("target", came, "Read it with brdf.read_picture")
+        what = f"must be an array or the path of a picture, got {type(given).__name__}"
+        raise InputError("target", what, "Read it with brdf.read_picture")
     if np.ma.is_masked(given):
         remedy = "Give its data, and mask=~np.any(target.mask, axis=-1)"
         raise InputError("target", "is a masked array, whose mask would be lost", remedy)
@@ -265,8 +265,8 @@ def _of_array(values: np.ndarray, rounding: Rounding, encoding: Encoding) -> Tar
         table = decode_table(encoding, bits)
         values, step = table.astype(np.float32)[values], largest_step(encoding, bits)
     elif kind.kind != "f":
-        came = f"must hold floating-point values, or codes of 8 or 16 bits, got {kind}"
-        raise InputError("target", came, "Read it with brdf.read_picture, or divide by the largest code")
+        what = f"must hold floating-point values, or codes of 8 or 16 bits, got {kind}"
+        raise InputError("target", what, "Read it with brdf.read_picture, or divide by the largest code")
     elif encoding != "linear":
         values = decode(values, encoding)
     if kind == np.float16:
@@ -293,12 +293,12 @@ def _per_pixel(name: str, values: Any, shape: tuple[int, int]) -> np.ndarray:
 def _check_picture(target: Target, scene: brdf.Scene, problem: FitProblem) -> None:
     height, width, channels = target.pixels.shape
     if (width, height) != scene.resolution:
-        came = f"is {width} x {height}, the scene's camera {scene.resolution[0]} x {scene.resolution[1]}"
-        raise InputError("target", came, "Give a picture and a camera of the same resolution")
+        what = f"is {width} x {height}, the scene's camera {scene.resolution[0]} x {scene.resolution[1]}"
+        raise InputError("target", what, "Give a picture and a camera of the same resolution")
     if scene.channels not in (1, channels):
-        came = f"has {channels} channels, the scene's light {scene.channels}"
+        what = f"has {channels} channels, the scene's light {scene.channels}"
         remedy = "Give both the same number of channels; light of one serves every picture"
-        raise InputError("target", came, remedy)
+        raise InputError("target", what, remedy)
     if target.streamed and problem.noise is not None:
         remedy = "Give the picture in memory, or weight in place of noise"
         raise InputError("noise", "needs the whole picture at once, the target is read by bands", remedy)

@@ -100,9 +100,9 @@ def fit_lights(
     errors = np.array([one.error for one in found.parameters], float).reshape(before.shape)
     with np.errstate(divide="ignore", invalid="ignore"):
         factors, errors = emittances / before, errors / before
-    told: dict[str, Any] = {field.name: getattr(found, field.name) for field in dataclasses.fields(FitResult)}
-    told["parameters"] = tuple(dataclasses.replace(one, reason=one.reason and ALIKE) for one in found.parameters)
-    return LightFit(**told, emittances=emittances, factors=factors, errors=errors)
+    fields: dict[str, Any] = {field.name: getattr(found, field.name) for field in dataclasses.fields(FitResult)}
+    fields["parameters"] = tuple(dataclasses.replace(one, reason=one.reason and ALIKE) for one in found.parameters)
+    return LightFit(**fields, emittances=emittances, factors=factors, errors=errors)
 
 
 def fit_lights_and_material(

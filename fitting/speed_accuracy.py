@@ -198,16 +198,18 @@ class Tradeoff:
         text = io.StringIO()
         Console(file=text, width=WIDTH).print(table)
         lines = [line.rstrip() for line in text.getvalue().splitlines()]
-        told = [f"{name}: {words}" for name, words in COLUMNS.items()]
-        return "\n".join([*lines, *told, MARKS.format(self.accuracy), f"errors are against {self.reference}"])
+        legend = [f"{name}: {words}" for name, words in COLUMNS.items()]
+        return "\n".join([*lines, *legend, MARKS.format(self.accuracy), f"errors are against {self.reference}"])
 
-    def _told(self):
+    def _finite_rows(self):
         return [row._asdict() | {"marks": self.marks(row)} for row in self.rows]
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON holds it; what is infinite is None."""
         names = ("reference", "accuracy", "complete", "planned", "seconds", "advice")
-        rows = [{name: None if value == np.inf else value for name, value in row.items()} for row in self._told()]
+        rows = [
+            {name: None if value == np.inf else value for name, value in row.items()} for row in self._finite_rows()
+        ]
         return {name: getattr(self, name) for name in names} | {"rows": rows}
 
     def to_csv(self) -> str:
@@ -215,7 +217,7 @@ class Tradeoff:
         stream = io.StringIO()
         writer = csv.DictWriter(stream, (*Row._fields, "marks"), lineterminator="\n")
         writer.writeheader()
-        writer.writerows(self._told())
+        writer.writerows(self._finite_rows())
         return stream.getvalue()
 
     def plot(self) -> Any:

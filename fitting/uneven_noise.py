@@ -27,17 +27,17 @@ ROUNDING_HIDES = 0.05
 ROUNDED = 2.0**-22
 
 
-def in_codes(seen: Observed) -> Observed:
+def in_codes(observed: Observed) -> Observed:
     """The same, floats beside pictures of codes as codes too: those that single precision rounds them to.
 
     Args:
-        seen: several pictures.
+        observed: several pictures.
     """
-    targets = seen.problem.targets
+    targets = observed.problem.targets
     floats = [one.codes is None for one in targets]
     if all(floats) or not any(floats) or any(one.streamed or one.least_squares for one in targets):
-        return seen
-    step = ROUNDED * float(np.max(seen.brightest))
+        return observed
+    step = ROUNDED * float(np.max(observed.brightest))
 
     def of_tile(tile: Tile, one: int) -> Tile:
         if not floats[one]:
@@ -51,7 +51,7 @@ def in_codes(seen: Observed) -> Observed:
         lower, upper = bounds.lower / step - 0.5, bounds.upper / step + 0.5
         return tile._replace(bounds=replace(bounds, lower=lower, upper=upper, scale=np.array(1 / step), exact=False))
 
-    return seen._replace(tiles=each(of_tile, seen.tiles, seen.owner))
+    return observed._replace(tiles=each(of_tile, observed.tiles, observed.owner))
 
 
 class NoiseOfEach(NamedTuple):
@@ -116,22 +116,24 @@ def _left(
         own = [picture for picture, of in zip(pictures, owner, strict=True) if of == one]
         bounds = [picture.bounds for picture in own if picture.bounds is not None]
         kinds |= {(*np.ravel(some.scale / some.unit), some.encoding) for some in bounds}
-        codes = [some.codes(picture.shown(optimum.n, optimum.x))[0] for some, picture in zip(bounds, own, strict=True)]
+        codes = [
+            some.codes(picture.predict(optimum.n, optimum.x))[0] for some, picture in zip(bounds, own, strict=True)
+        ]
         step = float(np.mean(np.concatenate([np.zeros(1), *(some.widths for some in bounds)])))
         noise = residual_deviation(bounds, codes) ** 2 - step**2 / 12
         spread[one] = math.sqrt(max(noise, (ROUNDING_HIDES * step) ** 2))
     return NoiseOfEach(cost, variance, spread / np.min(spread), count, len(kinds) <= 2)
 
 
-def evened(seen: Observed, noise: NoiseOfEach) -> Observed:
+def evened(observed: Observed, noise: NoiseOfEach) -> Observed:
     """The same with weights by which each picture counts by what it knows; as it is where all have the same noise.
 
     Args:
-        seen: several pictures.
+        observed: several pictures.
         noise: of each.
     """
     if noise.even:
-        return seen
+        return observed
     weight = 1 / (noise.variance * np.average(1 / noise.variance, weights=noise.pixels))
 
     def of_tile(tile: Tile, one: int) -> Tile:
@@ -141,4 +143,4 @@ def evened(seen: Observed, noise: NoiseOfEach) -> Observed:
             bounds = replace(bounds, spread=bounds.spread * noise.spread[one])
         return tile._replace(weight=own * float(weight[one]), bounds=bounds)
 
-    return seen._replace(tiles=each(of_tile, seen.tiles, seen.owner))
+    return observed._replace(tiles=each(of_tile, observed.tiles, observed.owner))

@@ -69,8 +69,8 @@ class Camera(Checked):
                 "target", f"must differ from position, got {self.target.tolist()} for both", "Move one of them"
             )
         if np.linalg.norm(np.cross(forward, self.up)) <= 1e-9 * length * np.linalg.norm(self.up):
-            came = f"must not be parallel to the view, got {self.up.tolist()}"
-            raise InputError("up", came, "Give a direction that points up in the picture")
+            what = f"must not be parallel to the view, got {self.up.tolist()}"
+            raise InputError("up", what, "Give a direction that points up in the picture")
 
     @abc.abstractmethod
     def rays(self, column: Any, row: Any) -> tuple[Components, Components]:

@@ -135,9 +135,9 @@ class Parallelogram(Checked):
         if isinstance(edge_u, np.ndarray) and isinstance(edge_v, np.ndarray):
             area, *lengths = map(np.linalg.norm, (np.cross(edge_u, edge_v), edge_u, edge_v))
             if area <= 1e-12 * np.prod(lengths):
-                came = f"got {edge_u.tolist()} and {edge_v.tolist()}"
+                what = f"got {edge_u.tolist()} and {edge_v.tolist()}"
                 remedy = "Give two edges that span an area"
-                raise InputError("edge_v", f"must not be parallel to edge_u, {came}", remedy)
+                raise InputError("edge_v", f"must not be parallel to edge_u, {what}", remedy)
 
 
 class Rectangle(Shape, Parallelogram):

@@ -74,8 +74,8 @@ class Mesh:
 
     def _checked(self, normals: np.ndarray) -> np.ndarray:
         if normals.shape != (*self.faces.shape, 3):
-            came = f"must be of shape {(*self.faces.shape, 3)}, got {normals.shape}"
-            raise InputError("normals", came, "Give one for each corner of each face")
+            what = f"must be of shape {(*self.faces.shape, 3)}, got {normals.shape}"
+            raise InputError("normals", what, "Give one for each corner of each face")
         length = np.linalg.norm(normals, axis=-1, keepdims=True)
         front = self.front[:, None, :]
         normals = np.where(length > 0, normals / np.where(length > 0, length, 1.0), front)
@@ -172,8 +172,8 @@ def load_mesh(path: str | os.PathLike[str], *, smooth: bool = True) -> Mesh:
                     faces.append(vertex)
                     normal_of.append(normal)
         except ValueError as error:
-            place = f"{os.fspath(path)}: line {line}"
-            raise InputError(place, f"cannot be read ({error})", "Export the mesh again") from None
+            where = f"{os.fspath(path)}: line {line}"
+            raise InputError(where, f"cannot be read ({error})", "Export the mesh again") from None
     if not faces:
         raise InputError(os.fspath(path), "holds no triangles", "Export a mesh with faces")
     try:
@@ -192,10 +192,10 @@ def load_mesh(path: str | os.PathLike[str], *, smooth: bool = True) -> Mesh:
 def _corner(word: str, vertices: int, normals: int) -> tuple[int, int]:
     """Indices from 0 of the vertex and the normal that a corner such as 3, 3/1, 3//2 or -1 names; -1 for none."""
     vertex, _, rest = word.partition("/")
-    place, normal = int(vertex), int(rest.partition("/")[2] or 0)
-    if not place:
+    index, normal = int(vertex), int(rest.partition("/")[2] or 0)
+    if not index:
         raise ValueError("there is no vertex 0, they count from 1")
-    return place - 1 if place > 0 else vertices + place, normal - 1 if normal >= 0 else normals + normal
+    return index - 1 if index > 0 else vertices + index, normal - 1 if normal >= 0 else normals + normal
 
 
 def rounded(mesh: Mesh) -> Float[np.ndarray, "F 3 3"]:
@@ -211,8 +211,8 @@ def rounded(mesh: Mesh) -> Float[np.ndarray, "F 3 3"]:
     from scipy.sparse.csgraph import connected_components
 
     # One vertex in each place, also where a file repeats it.
-    vertices, place = np.unique(mesh.vertices, axis=0, return_inverse=True)
-    merged = _trimesh().Trimesh(vertices, place.reshape(-1)[mesh.faces], process=False)
+    vertices, index = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    merged = _trimesh().Trimesh(vertices, index.reshape(-1)[mesh.faces], process=False)
     pairs, edges, front = merged.face_adjacency, merged.face_adjacency_edges, mesh.front
     smooth = np.sum(np.prod(front[pairs], axis=1), axis=-1) > np.cos(CREASE)
     pairs, edges = pairs[smooth], edges[smooth]

@@ -66,8 +66,8 @@ def write_image(
         raise InputError(path, f"{suffix} cannot hold {kind}", f"Use {' or '.join(kinds)}")
     pixels, sayable = _pixels(path, array), kinds[kind]
     if suffix not in (".exr", ".tif", ".tiff") and pixels.shape[2] not in (1, 3):
-        came = f"a {suffix} file holds 1 or 3 channels, got {pixels.shape[2]}"
-        raise InputError(path, came, "Write .exr or .tif instead")
+        what = f"a {suffix} file holds 1 or 3 channels, got {pixels.shape[2]}"
+        raise InputError(path, what, "Write .exr or .tif instead")
     if suffix == ".hdr":
         pixels = np.broadcast_to(pixels, (*pixels.shape[:2], 3))
     encoded = parse_encoding("encoding", encoding) or sayable[0]
@@ -80,8 +80,8 @@ def write_image(
         raise InputError(path, f"half floats end at {_LARGEST_HALF:.0f}", 'Write dtype "float" instead')
     coverage = [] if alpha is None else [np.clip(_pixels(path, alpha), 0.0, 1.0)]
     if coverage and (suffix in (".hdr", ".jpg", ".jpeg") or coverage[0].shape != (*pixels.shape[:2], 1)):
-        came = f"alpha of shape {coverage[0].shape[:2]} cannot go with a {suffix} of shape {pixels.shape[:2]}"
-        raise InputError(path, came, "Give alpha as (H, W), and a file that can hold it")
+        what = f"alpha of shape {coverage[0].shape[:2]} cannot go with a {suffix} of shape {pixels.shape[:2]}"
+        raise InputError(path, what, "Give alpha as (H, W), and a file that can hold it")
     _write(path, {"": pixels}, kind, encoded, coverage)
 
 
@@ -127,8 +127,8 @@ def _write(path, layers, kind, encoding, coverage=()):
         names += [f"{layer}.{ending}" if layer else ending for ending in endings]
     names += ["A"] * len(coverage)
     if len(names) > MOST_CHANNELS:
-        came = f"would have {len(names)} channels, which nothing reads back"
-        raise InputError(path, came, f"Write at most {MOST_CHANNELS} into a file")
+        what = f"would have {len(names)} channels, which nothing reads back"
+        raise InputError(path, what, f"Write at most {MOST_CHANNELS} into a file")
     pixels = np.ascontiguousarray(np.concatenate([*layers.values(), *coverage], axis=2))
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
     spec.channelnames = tuple(names)

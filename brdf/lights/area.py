@@ -153,8 +153,8 @@ class PolygonLight(FlatLight):
         self.samples = sample_number(self.samples)
         self.triangles = triangulate(self.vertices)
         if self.samples < len(self.triangles):
-            came = f"must be at least {len(self.triangles)} for {len(self.vertices)} vertices, got {self.samples}"
-            raise InputError("samples", came, "Give one sample for each triangle at least")
+            what = f"must be at least {len(self.triangles)} for {len(self.vertices)} vertices, got {self.samples}"
+            raise InputError("samples", what, "Give one sample for each triangle at least")
 
     @property
     def rows(self) -> Rows:

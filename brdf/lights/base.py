@@ -124,9 +124,9 @@ class LightStack:
             each = jax.tree.map(lambda leaf: leaf.swapaxes(0, 1), each)
         count = each[2].shape[1]
         chunks = -(-count // largest)
-        place = np.arange(chunks * -(-count // chunks)).reshape(chunks, -1)
-        nodes, emitted, light = jax.tree.map(lambda leaf: leaf[:, np.minimum(place, count - 1)], each)
-        emitted = jnp.where((place < count)[..., None], emitted, 0)
+        index = np.arange(chunks * -(-count // chunks)).reshape(chunks, -1)
+        nodes, emitted, light = jax.tree.map(lambda leaf: leaf[:, np.minimum(index, count - 1)], each)
+        emitted = jnp.where((index < count)[..., None], emitted, 0)
         nodes, emitted, light = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), (nodes, emitted, light))
         return emitted, (jax.tree.map(lambda leaf: jnp.repeat(leaf, chunks, axis=0), self.numbers), nodes, light)
 

@@ -156,8 +156,8 @@ class EnvironmentMap(Light):
         pixels, factor = _checked(pixels), spectrum("radiance", radiance)
         channels = pixels.shape[2]
         if factor.shape[0] not in (1, channels):
-            came = f"has {factor.shape[0]} channels, the map {channels}"
-            raise InputError("radiance", came, "Give one factor, or one per channel of the map")
+            what = f"has {factor.shape[0]} channels, the map {channels}"
+            raise InputError("radiance", what, "Give one factor, or one per channel of the map")
         # normalised by each channel's mean, so that the emittance tells the colour of the light
         energy = pixels * _solid_angles(*pixels.shape[:2])[..., None]
         colour = energy.sum(axis=(0, 1)) / (4 * np.pi)

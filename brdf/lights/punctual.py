@@ -46,8 +46,8 @@ def _attenuation(value: Any) -> Any:
     """(a, b, c), none of which may let the light turn negative."""
     value = vector("attenuation", value)
     if isinstance(value, np.ndarray) and not (np.all(value >= 0) and np.any(value > 0)):
-        came = f"must be at least 0, and more somewhere, got {value.tolist()}"
-        raise InputError("attenuation", came, "Give three values of 0 or more")
+        what = f"must be at least 0, and more somewhere, got {value.tolist()}"
+        raise InputError("attenuation", what, "Give three values of 0 or more")
     return value
 
 
@@ -121,8 +121,8 @@ class SpotLight(Light):
     def __check_init__(self):
         """Refuse what OpenGL does not define."""
         if isinstance(self.cutoff_angle, np.ndarray) and 90 < self.cutoff_angle < 180:
-            came = f"must be 0 to 90 degrees, or 180, got {float(self.cutoff_angle):g}"
-            raise InputError("cutoff_angle", came, "A spot of more than 90 degrees is a point light")
+            what = f"must be 0 to 90 degrees, or 180, got {float(self.cutoff_angle):g}"
+            raise InputError("cutoff_angle", what, "A spot of more than 90 degrees is a point light")
 
     @staticmethod
     def sample(point: Points, *row: Any) -> LightSample:

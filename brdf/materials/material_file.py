@@ -128,42 +128,42 @@ def material_to_dict(material: Material, *, undetermined: Mapping[str, str] = _N
         undetermined: see `save_material`.
     """
     values: dict[str, Any] = {"model": material.name}
-    told: dict[str, dict[str, None]] = {}
+    names_by_reason: dict[str, dict[str, None]] = {}
     for key in inspect.signature(type(material)).parameters:
         numbers = np.asarray(getattr(material, key), np.float64)
         listed: list[Any] = numbers.ravel().tolist()
         for channel, number in enumerate(listed):
             for name in {key, f"{key}[{channel}]"}.intersection(undetermined):
                 if number:
-                    told.setdefault(undetermined[name], {})[name] = None
+                    names_by_reason.setdefault(undetermined[name], {})[name] = None
                 else:
                     listed[channel] = None
         values[key] = listed if numbers.ndim else listed[0]
-    if told:
-        reasons = "; ".join(f"{', '.join(names)}: {reason}" for reason, names in told.items())
+    if names_by_reason:
+        reasons = "; ".join(f"{', '.join(names)}: {reason}" for reason, names in names_by_reason.items())
         values["note"] = f"not determined: {reasons}"
     return values
 
 
-def material_from_dict(values: Any, place: object = "material") -> Material:
+def material_from_dict(values: Any, where: object = "material") -> Material:
     """The material that JSON holds.
 
     Args:
         values: what `material_to_dict` gives.
-        place: where it stands, for messages.
+        where: where it stands, for messages.
 
     Raises:
         InputError: naming the key.
     """
     if not isinstance(values, dict):
-        raise InputError(place, "must be a JSON object", 'Write {"model": ..., "k_d": ...}')
+        raise InputError(where, "must be a JSON object", 'Write {"model": ..., "k_d": ...}')
     given = {key: value for key, value in values.items() if key != "note"}
     table = Table(
-        str(place), jax.tree.map(lambda leaf: 0.0 if leaf is None else leaf, given, is_leaf=lambda leaf: leaf is None)
+        str(where), jax.tree.map(lambda leaf: 0.0 if leaf is None else leaf, given, is_leaf=lambda leaf: leaf is None)
     )
     material = table.make(table.choose("model", MODELS))
     if values.get("n", 0) is None and np.any(material.k_s):
-        raise InputError(f"{place}: n", "is null (not determined) although k_s is not 0", "Give n, or k_s = 0")
+        raise InputError(f"{where}: n", "is null (not determined) although k_s is not 0", "Give n, or k_s = 0")
     return material
 
 

@@ -69,46 +69,46 @@ def read_mtl(path: Any, text: str) -> dict[str, dict[str, Any]]:
         InputError: naming the line.
     """
     entries: dict[str, dict[str, Any]] = {}
-    name, told, start, begun = None, {}, 0, ""
+    name, comments, start, begun = None, {}, 0, ""
     for number, line in enumerate([*text.splitlines(), ""], start=1):  # which ends a line that would go on
         start = start if begun else number
         line = begun + line.strip()
         begun = line[:-1] + " " if line.endswith("\\") and not line.startswith("#") else ""
         if begun:
             continue
-        place = f"{path}: line {start}"
+        where = f"{path}: line {start}"
         for key, comment in _COMMENTS.items():
             if line.startswith(comment):
-                told[key] = line.removeprefix(comment).strip()
+                comments[key] = line.removeprefix(comment).strip()
         word, *given = line.partition("#")[0].split() or [""]
         key = word.lower()
         if key == "newmtl":
             name = line[len(word) :].strip() or "unnamed"
             if name in entries:
-                came = f"names the material {name[:SHOWN]} a second time"
-                raise InputError(place, came, "Give each a name of its own")
-            entries[name], told = told, {}
+                what = f"names the material {name[:SHOWN]} a second time"
+                raise InputError(where, what, "Give each a name of its own")
+            entries[name], comments = comments, {}
         elif key in (*_COEFFICIENTS, "ns", "illum", _TEXTURE):
             if name is None:
-                raise InputError(place, f"has {word} before any newmtl", "Start the material with newmtl NAME")
-            entries[name][key] = given[-1:] or [word] if key == _TEXTURE else _numbers(place, word, given)
+                raise InputError(where, f"has {word} before any newmtl", "Start the material with newmtl NAME")
+            entries[name][key] = given[-1:] or [word] if key == _TEXTURE else _numbers(where, word, given)
     if not entries:
         raise InputError(path, "holds no material", "Give a file with a newmtl line")
     return entries
 
 
-def _numbers(place: str, word, given) -> list[float]:
+def _numbers(where: str, word, given) -> list[float]:
     wanted, remedy = ((1, 3), "Give RGB values") if word.lower() in _COEFFICIENTS else ((1,), "Give one number")
-    came = f"got {' '.join(given)[:SHOWN]!r}"
+    what = f"got {' '.join(given)[:SHOWN]!r}"
     try:
         numbers = [parse_number(number) for number in given]
     except ValueError:
         more = "; spectral curves and XYZ are not read" if given[0].lower() in ("spectral", "xyz") else ""
-        raise InputError(place, f"{word} must be numbers, {came}", f"{remedy}{more}") from None
+        raise InputError(where, f"{word} must be numbers, {what}", f"{remedy}{more}") from None
     if not np.all(np.isfinite(numbers)):
-        raise InputError(place, f"{word} must be finite numbers, {came}", "Give finite numbers")
+        raise InputError(where, f"{word} must be finite numbers, {what}", "Give finite numbers")
     if len(numbers) not in wanted:
-        raise InputError(place, f"{word} has {len(numbers)} values", f"Give {' or '.join(map(str, wanted))}")
+        raise InputError(where, f"{word} has {len(numbers)} values", f"Give {' or '.join(map(str, wanted))}")
     return numbers
 
 
@@ -119,8 +119,8 @@ def material_from_mtl(entry: dict[str, Any]) -> Material:
         InputError: naming the key.
     """
     if _TEXTURE in entry and "kd" not in entry:
-        came = f"is missing beside the texture {''.join(entry[_TEXTURE])[:SHOWN]}, which is not read"
-        raise InputError("Kd", came, "Add the mean colour as Kd")
+        what = f"is missing beside the texture {''.join(entry[_TEXTURE])[:SHOWN]}, which is not read"
+        raise InputError("Kd", what, "Add the mean colour as Kd")
     name, (illum,), (exponent,) = entry.get("model"), entry.get("illum", [2.0]), entry.get("ns", [1.0])
     colours = {key: np.broadcast_to(entry.get(word, [0.0]), 3) for word, key in _COEFFICIENTS.items()}
     if name is not None and name not in MODELS:

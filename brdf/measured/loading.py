@@ -49,8 +49,8 @@ def load_measured(path: str | os.PathLike[str]) -> MeasuredBRDF:
             raise InputError(path, what, "Give a MERL .binary, RGL .bsdf, Cornell or ALTA text file")
         return text.load(file)
     except InputError as error:
-        told = error.where.startswith(str(path))  # else it is the table that is named
-        raise error if told else InputError(path, error.what, error.remedy) from None
+        names_the_file = error.where.startswith(str(path))  # else it is the table that is named
+        raise error if names_the_file else InputError(path, error.what, error.remedy) from None
 
 
 def is_measured(path: str | os.PathLike[str]) -> bool:

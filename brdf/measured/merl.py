@@ -46,8 +46,8 @@ def load(path: Path) -> MeasuredBRDF:
         raise InputError(path, "ends within its header", "The file is damaged; get it again")
     sizes, expected = (" x ".join(map(str, np.frombuffer(head, "<i4", 3))) for head in (content, HEADER))
     if sizes != expected:
-        came = f"says it holds {sizes} entries, MERL's hold {expected}"
-        raise InputError(path, came, "Give a file of the MERL database, or its layout")
+        what = f"says it holds {sizes} entries, MERL's hold {expected}"
+        raise InputError(path, what, "Give a file of the MERL database, or its layout")
     if size != SIZE:
         raise InputError(path, f"has {size} bytes instead of {SIZE}", "The file is damaged; get it again")
     stored = content[len(HEADER) :].view("<f8").reshape(3, -1)

@@ -33,12 +33,12 @@ _REPAIR = "The file is damaged; get it again"
 _GRID = (90, 30, 36)
 
 
-def read_fields(content: bytes, place: object) -> dict[str, tuple[int, np.ndarray]]:
+def read_fields(content: bytes, where: object) -> dict[str, tuple[int, np.ndarray]]:
     """The arrays that a tensor file says it holds, each found to lie within it.
 
     Args:
         content: of the file.
-        place: the file, for messages.
+        where: the file, for messages.
 
     Returns:
         By name, the code of its type and the array.
@@ -55,39 +55,39 @@ def read_fields(content: bytes, place: object) -> dict[str, tuple[int, np.ndarra
     try:
         major, minor, count = take("BBI")
         if (major, minor) != (1, 0) or count > _MOST_FIELDS:
-            raise InputError(place, f"is of version {major}.{minor} with {count} fields", "Version 1.0 is read")
+            raise InputError(where, f"is of version {major}.{minor} with {count} fields", "Version 1.0 is read")
         for _ in range(count):
             name = stream.read(*take("H")).decode("ascii", "replace")
             dimensions, kind, start = take("HBQ")
             shape, dtype = take(f"{dimensions}Q"), _TYPES.get(kind, np.dtype("u1"))
             if dimensions > 8 or start + math.prod(max(length, 1) for length in shape) * dtype.itemsize > len(content):
-                raise InputError(f"{place}: {name[:40]}", "reaches beyond the end of the file", _REPAIR)
+                raise InputError(f"{where}: {name[:40]}", "reaches beyond the end of the file", _REPAIR)
             fields[name] = kind, np.frombuffer(content, dtype, math.prod(shape), start).reshape(shape)
     except struct.error:
-        raise InputError(place, "ends within its header", _REPAIR) from None
+        raise InputError(where, "ends within its header", _REPAIR) from None
     return fields
 
 
-def _check(content, place):
+def _check(content, where):
     """Names of the channels, after finding that Mitsuba can read the file."""
-    fields = read_fields(content, place)
+    fields = read_fields(content, where)
 
     def demand(name, good, what):
         if not good:
-            raise InputError(f"{place}: {name}", what, _REPAIR)
+            raise InputError(f"{where}: {name}", what, _REPAIR)
 
     spectral = "spectra" in fields and "rgb" not in fields
     sizes = {} if spectral else {"c": 3}
     for name, letters in (_LAYOUT | (_SPECTRAL if spectral else {"rgb": "ptcxy"})).items():
         if name not in fields:
-            raise InputError(place, f"has no field {name}", "Give an isotropic or anisotropic file of the RGL database")
+            raise InputError(where, f"has no field {name}", "Give an isotropic or anisotropic file of the RGL database")
         kind, values = fields[name]
         fits = kind == _FLOAT and values.ndim == len(letters)
         for letter, size in zip(letters, values.shape, strict=False):
             fits &= size >= (1 if letter in _ONE_IS_ENOUGH else 2)
             fits &= letter == "." or sizes.setdefault(letter, size) == size
-        came = f"got {list(values.shape)} of type {kind}"
-        demand(name, fits, f"must be {len(letters)}-dimensional float32 that fits to the other fields, {came}")
+        given = f"got {list(values.shape)} of type {kind}"
+        demand(name, fits, f"must be {len(letters)}-dimensional float32 that fits to the other fields, {given}")
         demand(name, np.isfinite(values).all(), "holds values that are not finite")
         demand(name, len(letters) > 1 or np.all(np.diff(values) > 0), "does not grow from entry to entry")
     for name, what in (("jacobian", "one byte"), ("description", "text")):

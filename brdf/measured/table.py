@@ -108,8 +108,8 @@ class MeasuredBRDF:
         counts = {reason: int(number) for reason, number in ((left_out or {}) | counts).items() if number}
         if not good.any():
             gone = ", ".join(f"{number} {reason}" for reason, number in counts.items())
-            came = f"has no finite sample above the horizon ({gone or 'none at all'})"
-            raise InputError(name, came, "Give a table with samples")
+            what = f"has no finite sample above the horizon ({gone or 'none at all'})"
+            raise InputError(name, what, "Give a table with samples")
         kept = light[good], view[good], numbers[good], channels, weight[good, 0]
         return cls(name, *kept, left_out=counts, evaluate=evaluate)
 
@@ -177,14 +177,14 @@ def half_angle_grid(shape: tuple[int, int, int], turn: float) -> Grid:
     return light.reshape(-1, 3), view.reshape(-1, 3), share / np.mean(share)
 
 
-def sampled(grid: Grid, f_r: Evaluation, **told: Any) -> MeasuredBRDF:
+def sampled(grid: Grid, f_r: Evaluation, **options: Any) -> MeasuredBRDF:
     """The table of a BRDF at those pairs of directions of a grid that are above the horizon.
 
     Args:
         grid: light, view and solid angle.
         f_r: from light and view directions to values in 1/sr.
-        told: further arguments of `MeasuredBRDF.from_samples`.
+        options: further arguments of `MeasuredBRDF.from_samples`.
     """
     above = (grid[0][:, 2] > 0) & (grid[1][:, 2] > 0)
     light, view, share = (each[above] for each in grid)
-    return MeasuredBRDF.from_samples(light, view, f_r(light, view), solid_angle=share, **told)
+    return MeasuredBRDF.from_samples(light, view, f_r(light, view), solid_angle=share, **options)

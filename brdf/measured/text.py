@@ -77,20 +77,20 @@ def load(path: Path) -> MeasuredBRDF:
 def _cornell(path, rows):
     if not rows:
         raise InputError(path, "holds no numbers", "Give a table of a measured BRDF")
-    place, (first, *_) = rows[0]
+    where, (first, *_) = rows[0]
     try:
         count = parse_number(first)
     except ValueError:
         count = 0
     if not 1 <= count <= MOST_CHANNELS or count % 1:
         remedy = "The first number says how many wavelengths follow; ALTA files have a #DIM line"
-        raise InputError(place, f"is no measured BRDF, got {first[:40]!r}", remedy)
+        raise InputError(where, f"is no measured BRDF, got {first[:40]!r}", remedy)
     count, head = int(count), []
     while rows and len(head) <= count:
-        (place, words), *rows = rows
-        _table(path, [(place, words)], len(words))  # what is no number is told where it stands
+        (where, words), *rows = rows
+        _table(path, [(where, words)], len(words))  # what is no number is told where it stands
         head += words
-    wavelengths = _table(path, [(place, head)], 1 + count)[0, 1:]
+    wavelengths = _table(path, [(where, head)], 1 + count)[0, 1:]
     table = _table(path, rows, 4 + count)
     theta_i, phi_i, theta_s, phi_s = _within(rows, table[:, :4].T)
     names = tuple(f"{wavelength:g} nm" for wavelength in wavelengths)
@@ -106,8 +106,8 @@ def _alta(path, header, rows):
     inputs, outputs = map(int, header["DIM"].split())
     columns = len(_PARAMETRISATIONS[header["PARAM_IN"]].split())
     if columns != inputs or not 1 <= outputs <= MOST_CHANNELS:
-        came = f"says {inputs} input and {outputs} output columns, {header['PARAM_IN']} has {columns}"
-        raise InputError(f"{path}: DIM", came, f"Correct the header; there are 1 to {MOST_CHANNELS} outputs")
+        what = f"says {inputs} input and {outputs} output columns, {header['PARAM_IN']} has {columns}"
+        raise InputError(f"{path}: DIM", what, f"Correct the header; there are 1 to {MOST_CHANNELS} outputs")
     table = _table(path, rows, inputs + outputs, int(header["VS"]) * outputs)
     view, light = _directions(header["PARAM_IN"], rows, table[:, :inputs].T)
     values, unit = table[:, inputs:], header["PARAM_OUT"]
@@ -119,15 +119,15 @@ def _alta(path, header, rows):
 def _table(path, rows, width, more=0):
     """The first numbers of every row, which may have some more."""
     values = []
-    for place, words in rows:
+    for where, words in rows:
         if not width <= len(words) <= width + more:
-            raise InputError(place, f"has {len(words)} numbers instead of {width}", "Give as many as the header says")
+            raise InputError(where, f"has {len(words)} numbers instead of {width}", "Give as many as the header says")
         for word in words[:width]:
             try:
                 values.append(parse_number(word))
             except ValueError:
                 remedy = "Numbers have a decimal point and spaces between them; # starts a comment"
-                raise InputError(place, f"must be a number, got {word[:40]!r}", remedy) from None
+                raise InputError(where, f"must be a number, got {word[:40]!r}", remedy) from None
     if not values:
         raise InputError(path, "holds no samples", "Give a table with rows of numbers")
     return np.array(values).reshape(-1, width)

@@ -168,5 +168,5 @@ def check_model(model: Any) -> None:
         InputError: where it is a material, a name or anything else.
     """
     if not (isinstance(model, type) and issubclass(model, Material)):
-        came = model if isinstance(model, str) else type(model).__name__
-        raise InputError("model", f"must be the class of a material, got {came}", "Write for example brdf.BlinnPhong")
+        what = model if isinstance(model, str) else type(model).__name__
+        raise InputError("model", f"must be the class of a material, got {what}", "Write for example brdf.BlinnPhong")

@@ -144,8 +144,8 @@ class Sampler:
                 result = jax.eval_shape(self._batch, jax.ShapeDtypeStruct((1, 2, 3), jnp.float64))
             except Exception as error:
                 reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-                came = f"cannot be called with two vectors of JAX: {reason}"
-                raise InputError("f_r", came, "Write it with jax.numpy") from error
+                what = f"cannot be called with two vectors of JAX: {reason}"
+                raise InputError("f_r", what, "Write it with jax.numpy") from error
         _, *shape = result.shape
         if len(shape) > 1 or 0 in shape or not jnp.issubdtype(result.dtype, jnp.floating):
             raise InputError("f_r", f"must return one real number per channel, got {result.dtype}{shape}")

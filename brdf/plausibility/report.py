@@ -132,12 +132,12 @@ class Report:
 
     def to_json(self) -> dict[str, Any]:
         """The report as plain numbers, strings and dictionaries, for ``json.dumps``."""
-        told: dict[str, Any] = {"subject": self.subject, "plausible": self.plausible}
+        content: dict[str, Any] = {"subject": self.subject, "plausible": self.plausible}
         for name, finding in self.findings.items():
-            told[name] = dataclasses.asdict(finding)
+            content[name] = dataclasses.asdict(finding)
             for key in ("value", "margin", "error_bound"):  # JSON knows no NaN
-                told[name][key] = None if math.isnan(told[name][key]) else told[name][key]
-        return told | {"nearest": None if self.nearest is None else material_to_dict(self.nearest)}
+                content[name][key] = None if math.isnan(content[name][key]) else content[name][key]
+        return content | {"nearest": None if self.nearest is None else material_to_dict(self.nearest)}
 
 
 def judged(

@@ -42,6 +42,6 @@ def check(brdf: Material | MeasuredBRDF | Callable[[Any, Any], Any], *, name: st
     if isinstance(brdf, MeasuredBRDF):
         return check_table(brdf, name)
     if isinstance(brdf, type) or not callable(brdf):
-        came = f"the class {brdf.__name__}" if isinstance(brdf, type) else type(brdf).__name__
-        raise InputError("brdf", f"must be a material or a function, got {came}", "Give one with numbers")
+        what = f"the class {brdf.__name__}" if isinstance(brdf, type) else type(brdf).__name__
+        raise InputError("brdf", f"must be a material or a function, got {what}", "Give one with numbers")
     return check_black_box(brdf, name or getattr(brdf, "__name__", type(brdf).__name__))

@@ -141,12 +141,12 @@ def estimate(run: Run) -> Attempt:
         return Attempt(rounding, 9 * rounding, 0.0, 0.0, rounding)
     probes = Probes(run)
     # Coefficients at their bound count as if they were free, which makes no error smaller.
-    told = probes.known | np.append((optimum.x > 0).ravel(), True)
-    inverse = scaled_inverse(probes.hessian * np.outer(told, told))
+    determined = probes.known | np.append((optimum.x > 0).ravel(), True)
+    inverse = scaled_inverse(probes.hessian * np.outer(determined, determined))
     scores = probes.scores(probes.residual)
     value, vector = np.linalg.eigh(inverse @ (probes.left_out * scores.T) @ scores @ inverse)
     drawn = np.random.default_rng(0).standard_normal((DRAWS, value.size)) * np.sqrt(np.maximum(value, 0.0)) @ vector.T
-    missed = np.zeros(value.size) if samples is None else samples.shift(told)
+    missed = np.zeros(value.size) if samples is None else samples.shift(determined)
     error, bound = np.quantile(np.hypot(probes.error(drawn + missed), rounding), [0.5, 0.95])
     pixels = np.quantile(probes.error(drawn), 0.95)
     return Attempt(float(error), float(bound), float(pixels), float(probes.error(missed)), rounding)

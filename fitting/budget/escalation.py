@@ -60,8 +60,8 @@ def fit_within(problem: FitProblem, accuracy: float | None, seconds: float | Non
     beside = {"loss": problem.loss != "squared", "noise": problem.noise is not None, "plausible": problem.plausible}
     for name, given in beside.items():
         if given:
-            came = "cannot be combined with an accuracy or a time to spend, whose estimate is for plain squares"
-            raise InputError(name, came, "Leave one of them out")
+            what = "cannot be combined with an accuracy or a time to spend, whose estimate is for plain squares"
+            raise InputError(name, what, "Leave one of them out")
     problem = with_enough_samples(problem, accuracy)
     scenes, precision = problem.scenes, problem.precision
     hard_shadows = any(scene.lights and scene.occluders for scene in scenes) and problem.sample_errors is None
@@ -77,11 +77,11 @@ def fit_within(problem: FitProblem, accuracy: float | None, seconds: float | Non
     while True:
         begun, done = time.perf_counter(), run(problem, now)
         now = now if any(done.samples) else dataclasses.replace(now, pixels=None)
-        told = estimate(done)
+        estimated = estimate(done)
         took = time.perf_counter() - begun
-        attempts.append(dataclasses.replace(told, configuration=str(now), seconds=took))
-        after = _better(now, told, accuracy, WHOLE * max(sizes))
-        if after is None or (accuracy is not None and told.bound <= accuracy):
+        attempts.append(dataclasses.replace(estimated, configuration=str(now), seconds=took))
+        after = _better(now, estimated, accuracy, WHOLE * max(sizes))
+        if after is None or (accuracy is not None and estimated.bound <= accuracy):
             break
         before, then = (sum(map(how.work, scenes)) for how in (now, after))
         if seconds is not None and time.perf_counter() - start + took * then / before > seconds:
@@ -91,18 +91,18 @@ def fit_within(problem: FitProblem, accuracy: float | None, seconds: float | Non
     if now.pixels is None:
         reason = REASON_FEW if work <= FEW else REASON_MANY if len(attempts) > 1 else REASON_EMPTY
     fitted = [size if sample is None else sample.pixel.size for size, sample in zip(sizes, done.samples, strict=True)]
-    met = None if accuracy is None else told.bound <= accuracy
+    met = None if accuracy is None else estimated.bound <= accuracy
     choice = BudgetChoice(accuracy, seconds, tuple(attempts), sum(fitted), sum(sizes), met, reason)
     return dataclasses.replace(done.result, choice=choice, seconds=time.perf_counter() - start)
 
 
-def _better(now: Configuration, told: Attempt, accuracy: float | None, most: float) -> Configuration | None:
+def _better(now: Configuration, estimated: Attempt, accuracy: float | None, most: float) -> Configuration | None:
     """The next configuration to try; None where nothing is left to improve."""
-    if now.precision == "float32" and told.rounding > (accuracy or told.bound) / 8:
+    if now.precision == "float32" and estimated.rounding > (accuracy or estimated.bound) / 8:
         return dataclasses.replace(now, precision="float64")
-    aim = LESS * told.pixels if accuracy is None else AIM * accuracy
-    if now.pixels is None or told.pixels <= aim:
+    aim = LESS * estimated.pixels if accuracy is None else AIM * accuracy
+    if now.pixels is None or estimated.pixels <= aim:
         return None
     # A power of two, so that programs are compiled for few sizes.
-    pixels = now.pixels << math.ceil(2 * math.log2(told.pixels / aim))
+    pixels = now.pixels << math.ceil(2 * math.log2(estimated.pixels / aim))
     return dataclasses.replace(now, pixels=pixels if pixels <= most else None)

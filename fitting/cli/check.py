@@ -47,8 +47,8 @@ def check(material: str, *, json: bool = False, plot: Path | None = None) -> int
                     overview(one, reports[name]).savefig(path)
     notes = {name: note for name, (_, note) in found.items() if note}
     if json:
-        told = {name: report.to_json() for name, report in reports.items()}
-        show({name: one | ({"note": notes[name]} if name in notes else {}) for name, one in told.items()})
+        content = {name: report.to_json() for name, report in reports.items()}
+        show({name: one | ({"note": notes[name]} if name in notes else {}) for name, one in content.items()})
     else:
         after = {name: f"\n  note: {note}" for name, note in notes.items()}
         show("\n\n".join(f"{report}{after.get(name, '')}" for name, report in reports.items()))

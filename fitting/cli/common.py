@@ -239,13 +239,13 @@ def check_outputs(out: Path | None, plot: bool = False, page: Path | None = None
             pass  # refused before there are any results; nothing of the trial stays
 
 
-def show(told: Any) -> None:
+def show(content: Any) -> None:
     """Print the command's output.
 
     Args:
-        told: text; or what JSON holds.
+        content: text; or what JSON holds.
     """
-    print(told if isinstance(told, str) else json.dumps(told, indent=2), flush=True)  # noqa: T201  # the one place
+    print(content if isinstance(content, str) else json.dumps(content, indent=2), flush=True)  # noqa: T201  # the one place
 
 
 def show_result(result: Any, notes: Sequence[str], as_json: bool, *lines: str) -> None:

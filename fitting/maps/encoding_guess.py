@@ -29,11 +29,11 @@ def likelier(problem: MapProblem) -> tuple[MapProblem, tuple[str, ...]]:
     silent = next((one for one in given.each if one.silent), None)
     if silent is None:
         return problem, ()
-    told = "Where you know, say so with the encoding"
+    remedy = "Where you know, say so with the encoding"
     note = f"{silent.name} does not say how its values are encoded: read as"
     usual, other = ("linear", "sRGB") if silent.curve == "linear" else ("sRGB", "linear")
     if given.to_light is None or not texels.size:
-        return problem, (f"{note} {usual}. {told}",)
+        return problem, (f"{note} {usual}. {remedy}",)
     row = texels // given.size[1]
     rows = np.unique(row)
     rows = rows[np.linspace(0, rows.size - 1, -(-min(SOME, texels.size) * rows.size // texels.size)).astype(int)]
@@ -49,4 +49,4 @@ def likelier(problem: MapProblem) -> tuple[MapProblem, tuple[str, ...]]:
     if left[other] ** 2 < LESS * left[usual] ** 2:
         usual, other = other, usual
     note += f" {usual}, under which the maps are off by {left[usual]:.2g} codes, under {other} by {left[other]:.2g}"
-    return readings[usual], (f"{note}. {told}",)
+    return readings[usual], (f"{note}. {remedy}",)

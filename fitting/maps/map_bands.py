@@ -94,15 +94,15 @@ def _bands(texels: Int[np.ndarray, " K"], width: int, most: int) -> list[Int[np.
 
 def _key(problem: MapProblem) -> str:
     """Of all that maps depend on: files by name, size and time, arrays by content."""
-    told = []
+    sources = []
     for one in problem.photographs.each:
-        told.append(one.curve)
+        sources.append(one.curve)
         if Path(one.name).is_file():
             status = Path(one.name).stat()
-            told += one.name, status.st_size, status.st_mtime_ns
+            sources += one.name, status.st_size, status.st_mtime_ns
         else:
-            told.append(one.rows(0, one.shape[0]))
-    named = {**vars(problem), **vars(problem.photographs), "each": told, "photographs": None}
+            sources.append(one.rows(0, one.shape[0]))
+    named = {**vars(problem), **vars(problem.photographs), "each": sources, "photographs": None}
     return fingerprint(named)
 
 

@@ -57,7 +57,7 @@ def write_maps(maps: "Maps", folder: str | Path, *, plot: bool = False) -> None:
         "residual": (np.nan_to_num(maps.residual), "linear"),
     }
     height, width = maps.n.shape
-    told = {
+    about = {
         "models": maps.models,
         "to_view": maps.to_view.tolist(),
         "to_light": None if maps.to_light is None else maps.to_light.tolist(),
@@ -77,7 +77,7 @@ def write_maps(maps: "Maps", folder: str | Path, *, plot: bool = False) -> None:
             brdf.write_image(stage / f"{name}.png", values, dtype="uint16", encoding=encoding)
         if plot:
             draw_maps(maps).savefig(stage / "maps.png", dpi=110)
-        write_text(stage / "maps.json", json.dumps(told, indent=2) + "\n")
+        write_text(stage / "maps.json", json.dumps(about, indent=2) + "\n")
         gltf = asset("maps.gltf").replace("ASPECT", str(width / height))
         write_text(stage / "material.gltf", gltf.replace("SPECULAR", str(strongest / DIELECTRIC)))
         write_text(stage / "info.json", json.dumps(_openlime(width, height, scale), indent=2) + "\n")

@@ -140,8 +140,8 @@ def _ambient(ambient: Any, given: Photographs) -> np.ndarray | None:
     if ambient is not None:
         values = as_numbers("ambient", ambient, remedy="Give the intensity of the ambient light").reshape(-1)
         if values.size not in (1, given.size[2]) or not np.all((values > 0) & np.isfinite(values)):
-            came = f"must be 1 or {given.size[2]} numbers above 0, got {ambient!r:.60}"
-            raise InputError("ambient", came, "Give the intensity of the ambient light")
+            what = f"must be 1 or {given.size[2]} numbers above 0, got {ambient!r:.60}"
+            raise InputError("ambient", what, "Give the intensity of the ambient light")
     columns = values / given.unit
     return columns[:, :1] if np.all(columns == columns[:, :1]) else columns
 
@@ -153,15 +153,15 @@ def _surface(given: Photographs, normals: Any, mask: Any, precision: Precision, 
         mask = np.ones((height, width), bool)
     mask = brdf.read_mask(mask) if isinstance(mask, str | Path) else np.asarray(mask, bool)
     if mask.shape != (height, width):
-        came = f"is of shape {mask.shape}, the photographs of {(height, width)}"
-        raise InputError("mask", came, "Give a value for each pixel")
+        what = f"is of shape {mask.shape}, the photographs of {(height, width)}"
+        raise InputError("mask", what, "Give a value for each pixel")
     if given.scenes is not None:
         if normals is not None:
             raise InputError("normals", "are told by the scenes", "Leave them out")
         points = brdf.cast(given.scenes[0], precision).surface_points()
         if points.mask.shape != (height, width):
-            came = f"show {points.mask.shape[1]} x {points.mask.shape[0]} pixels, the photographs {width} x {height}"
-            raise InputError("lights", came, "Give scenes of the photographs' size")
+            what = f"show {points.mask.shape[1]} x {points.mask.shape[0]} pixels, the photographs {width} x {height}"
+            raise InputError("lights", what, "Give scenes of the photographs' size")
         shadows, known = None, [one for scene in given.scenes for one in scene.visibility or [None]]
         if any(one is not None for one in known):
             shadows = np.stack([np.ones((height, width)) if one is None else one for one in known], axis=-1)
@@ -172,6 +172,6 @@ def _surface(given: Photographs, normals: Any, mask: Any, precision: Precision, 
     name = str(normals) if isinstance(normals, str | Path) else "normals"
     normals = map_inputs.normal_map(normals, flip_y=flip_y)
     if normals.shape != (height, width, 3):
-        came = f"are of shape {normals.shape}, the photographs of {(height, width)}"
-        raise InputError(name, came, "Give a normal for each pixel")
+        what = f"are of shape {normals.shape}, the photographs of {(height, width)}"
+        raise InputError(name, what, "Give a normal for each pixel")
     return Surface(normals, mask, None)

@@ -141,14 +141,14 @@ def read_lights(path: str | Path) -> tuple[list[Path], Float[np.ndarray, "P 3"]]
         except ValueError:
             name, vector = "", []
         if len(vector) != 3 or not np.all(np.isfinite(vector)) or not any(vector):
-            came = f"must be a name and three numbers that are not all 0, got {line[:60]!r}"
-            raise InputError(f"{path}: line {number}", came, "Give name x y z, towards the light")
+            what = f"must be a name and three numbers that are not all 0, got {line[:60]!r}"
+            raise InputError(f"{path}: line {number}", what, "Give name x y z, towards the light")
         file = Path(path).parent / line[: len(name)].strip("\"'")
         names.append(file if file.is_file() else Path(path).parent / file.name)
         directions.append(vector)
     if not names or numbered[0][1].split()[0] != str(len(names)):
-        came = f"has {len(names)} lights after the count {numbered[0][1] if numbered else ''!r}"
-        raise InputError(path, came, "Give the count, then a line a photograph")
+        what = f"has {len(names)} lights after the count {numbered[0][1] if numbered else ''!r}"
+        raise InputError(path, what, "Give the count, then a line a photograph")
     return names, np.array(directions)
 
 
@@ -175,8 +175,8 @@ def read_folder(folder: Path) -> dict[str, Any]:
         if (folder / "light_intensities.txt").is_file():
             found["intensities"] = read_intensities(folder / "light_intensities.txt", len(found["pictures"]))
     else:
-        came = f"has {len(tables)} .lp files and no light_directions.txt" if tables else "has no file of lights"
-        raise InputError(folder, came, "Put one lights.lp, or light_directions.txt, beside the photographs")
+        what = f"has {len(tables)} .lp files and no light_directions.txt" if tables else "has no file of lights"
+        raise InputError(folder, what, "Put one lights.lp, or light_directions.txt, beside the photographs")
     for key in ("mask", "normals"):
         beside = [path for path in sorted(folder.glob(f"{key}.*")) if path.suffix.lower() in (*PICTURES, ".npy")]
         found |= {key: beside[0]} if beside else {}
@@ -204,16 +204,16 @@ def normal_map(given: Any, *, flip_y: bool = False) -> Float[np.ndarray, "H W 3"
                 normal, coded = reader.read(), reader.is_integer
     normal = np.asarray(normal)
     if normal.ndim != 3 or normal.shape[2] != 3 or normal.dtype.kind not in "fiu":
-        came = f"must be of shape (H, W, 3), got {normal.shape} of {normal.dtype}"
-        raise InputError(name, came, "Give a normal for each pixel")
+        what = f"must be of shape (H, W, 3), got {normal.shape} of {normal.dtype}"
+        raise InputError(name, what, "Give a normal for each pixel")
     if normal.dtype.kind == "u":
         normal, coded = normal / np.float32(np.iinfo(normal.dtype).max), True
     if coded:
         empty, normal = np.all(normal == 0, axis=-1), 2 * normal - 1
         normal[empty | (np.sum(normal * normal, axis=-1) < NO_SURFACE)] = 0
     elif _looks_coded(normal):
-        came = "hold n·0.5 + 0.5, as images do: 2 n - 1 is of length 1, and nothing is below 0"
-        raise InputError(name, came, "Give 2 n - 1, or the codes of the image")
+        what = "hold n·0.5 + 0.5, as images do: 2 n - 1 is of length 1, and nothing is below 0"
+        raise InputError(name, what, "Give 2 n - 1, or the codes of the image")
     return normal * np.array([1, -1 if flip_y else 1, 1], np.float32)
 
 
@@ -241,16 +241,16 @@ def photographs(
     """
     for name, given in (("pictures", pictures), ("lights", lights)):
         if not isinstance(given, Iterable):
-            came = "are missing" if given is None else f"must be a list, got {type(given).__name__}"
-            raise InputError(name, came, "Give a photograph for each light, and a direction towards each light")
+            what = "are missing" if given is None else f"must be a list, got {type(given).__name__}"
+            raise InputError(name, what, "Give a photograph for each light, and a direction towards each light")
     each = [_opened(f"pictures[{i}]", picture, encoding) for i, picture in enumerate(pictures)]
     if not each:
         raise InputError("pictures", "is empty", "Give a photograph for each light")
     first = each[0]
     for one in each:
         if one.shape != first.shape:
-            came = f"is of shape {one.shape}, {first.name} of {first.shape}"
-            raise InputError(one.name, came, "Give photographs of one size")
+            what = f"is of shape {one.shape}, {first.name} of {first.shape}"
+            raise InputError(one.name, what, "Give photographs of one size")
     if isinstance(lights, str | Path):
         lights = read_lights(lights)[1] if Path(lights).suffix.lower() == ".lp" else read_directions(lights)
     lights = list(lights)
@@ -263,8 +263,8 @@ def photographs(
         unit = unit if values is None else unit * factors(name, values)
     if all(isinstance(light, brdf.Scene) for light in lights):
         if other := next((i for i, scene in enumerate(lights) if _view(scene) != _view(lights[0])), 0):
-            came = "has another camera, or other shapes or points, than lights[0]"
-            raise InputError(f"lights[{other}]", came, "Give scenes of one view that differ in their lights")
+            what = "has another camera, or other shapes or points, than lights[0]"
+            raise InputError(f"lights[{other}]", what, "Give scenes of one view that differ in their lights")
         scenes, colours, ambient = zip(
             *(_of_scene(f"lights[{i}]", scene, first.shape[2]) for i, scene in enumerate(lights)), strict=True
         )
@@ -294,8 +294,8 @@ def _opened(name: str, picture: Any, encoding: Any) -> Photograph:
     values = values[..., None] if values.ndim == 2 else values
     integer = values.dtype.kind == "u"
     if values.ndim != 3 or 0 in values.shape or values.dtype.kind not in "fu":
-        came = f"is of shape {values.shape} and type {values.dtype}"
-        raise InputError(name, came, "Give (H, W, C) floats, or unsigned integers that span their type")
+        what = f"is of shape {values.shape} and type {values.dtype}"
+        raise InputError(name, what, "Give (H, W, C) floats, or unsigned integers that span their type")
     white = np.float32(np.iinfo(values.dtype).max) if integer else None
 
     def rows(start: int, stop: int) -> np.ndarray:
@@ -309,8 +309,8 @@ def _factors(count: int, channels: int, name: str, given: Any) -> Float[np.ndarr
     values = as_numbers(name, given, remedy="Give a number for each photograph")
     values = values[:, None] if values.ndim == 1 else values
     if values.ndim != 2 or values.shape[0] != count or values.shape[1] not in (1, channels):
-        came = f"is of shape {np.shape(given)} for {count} photographs of {channels} channels"
-        raise InputError(name, came, "Give a number for each photograph, or one for each of its channels")
+        what = f"is of shape {np.shape(given)} for {count} photographs of {channels} channels"
+        raise InputError(name, what, "Give a number for each photograph, or one for each of its channels")
     if not np.all((values > 0) & np.isfinite(values)):
         raise InputError(name, f"must be above 0, got {np.min(values):g}", "Leave that photograph out")
     return np.broadcast_to(values, (count, channels))
@@ -337,12 +337,12 @@ def _view(scene: brdf.Scene) -> str:
 def _of_scene(name: str, scene: brdf.Scene, channels: int) -> tuple[brdf.Scene, np.ndarray, np.ndarray]:
     """A scene whose one light is of intensity 1, what that was, and its ambient light."""
     if len(scene.lights) != 1 or isinstance(scene.lights[0], brdf.EnvironmentMap):
-        came = f"has {len(scene.lights)} lights" if len(scene.lights) != 1 else "is lit by an environment map"
-        raise InputError(name, came, "Give scenes with one light each, of one colour")
+        what = f"has {len(scene.lights)} lights" if len(scene.lights) != 1 else "is lit by an environment map"
+        raise InputError(name, what, "Give scenes with one light each, of one colour")
     ambient = np.zeros(channels) if scene.ambient is None else np.asarray(scene.ambient)
     if len(ambient) not in (1, channels):
-        came = f"has ambient light of {len(ambient)} channels, the photographs have {channels}"
-        raise InputError(name, came, "Give as many as the photographs have, or one for all")
+        what = f"has ambient light of {len(ambient)} channels, the photographs have {channels}"
+        raise InputError(name, what, "Give as many as the photographs have, or one for all")
     (light,) = scene.lights
     white = eqx.tree_at(lambda one: one.emittance, light, np.ones(1))
     colour = _factors(1, channels, name, np.asarray(light.emittance)[None])[0]

@@ -240,10 +240,10 @@ def load_maps(folder: str | Path) -> Maps:
     """
     path = Path(folder) / "maps.json"
     try:
-        told = json.loads(read_text(path))
-        kinds = {name: np.dtype(kind) for name, kind in told["layers"].items()}
-        texts = tuple(told["models"]), np.array(told["to_view"], float), tuple(told["notes"])
-        to_light = np.array(told["to_light"], float) if told.get("to_light") else None
+        about = json.loads(read_text(path))
+        kinds = {name: np.dtype(kind) for name, kind in about["layers"].items()}
+        texts = tuple(about["models"]), np.array(about["to_view"], float), tuple(about["notes"])
+        to_light = np.array(about["to_light"], float) if about.get("to_light") else None
     except (ValueError, KeyError, TypeError, AttributeError):
         raise InputError(path, "does not describe maps", "Give a folder that Maps.save wrote") from None
     found = brdf.read_layers(Path(folder) / "maps.exr")

@@ -34,8 +34,8 @@ def with_shared_n(problem: MapProblem, labels: Any) -> MapProblem:
             labels = np.round(reader.read()[..., 0] * (2**reader.bits - 1)).astype(int)
     labels = np.asarray(labels)
     if labels.dtype.kind not in "iub" or labels.shape not in ((), size):
-        came = f"are of shape {labels.shape} and type {labels.dtype}, the photographs of {size}"
-        raise InputError("labels", came, "Give a whole number for each texel, or 0")
+        what = f"are of shape {labels.shape} and type {labels.dtype}, the photographs of {size}"
+        raise InputError("labels", what, "Give a whole number for each texel, or 0")
     if surface.normal is None:
         surface = surface._replace(normal=fit_bands(problem)["normal"])
     names, index = np.unique(np.broadcast_to(labels, size), return_inverse=True)

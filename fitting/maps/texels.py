@@ -262,9 +262,9 @@ class Texels(eqx.Module):
         bracket = bracket_about(self.gains(), grid(self.finer))
         return self.at(jax.lax.fori_loop(0, STEPS, step, bracket)[0])
 
-    def at(self, log_n: Array, *, errors: bool = True, sure: bool = False) -> TexelFit:
+    def at(self, log_n: Array, *, errors: bool = True, n_known: bool = False) -> TexelFit:
         """The best coefficients for a given n; their errors allow for that of n, unless n is sure."""
-        return self.evaluated(log_n, [] if sure else self.by_log_n(log_n), errors)
+        return self.evaluated(log_n, [] if n_known else self.by_log_n(log_n), errors)
 
     def by_log_n(self, log_n: Array) -> list[Components]:
         """The derivative of the lobe's column, if there is one."""
@@ -669,14 +669,14 @@ def solve(rows: Rows, active: list[Any], own: int) -> list[Solved]:
         active: which may move; the error of what may not is that which it would have.
         own: how many are a channel's own.
     """
-    told = []
+    eliminated = []
     for k in range(own):
-        told.append((rows[k][-1], divide(1.0, rows[k][k])))
-        rows = swept(rows, k, jnp.where(active[k], told[-1][1], 0))
+        eliminated.append((rows[k][-1], divide(1.0, rows[k][k])))
+        rows = swept(rows, k, jnp.where(active[k], eliminated[-1][1], 0))
     common = [[jnp.sum(x, axis=0, keepdims=True) for x in row[own:]] for row in rows[own:]]
     for k in range(len(common)):
-        told.append((common[k][-1], divide(1.0, common[k][k])))
-        common = swept(common, k, jnp.where(active[own + k], told[-1][1], 0))
+        eliminated.append((common[k][-1], divide(1.0, common[k][k])))
+        common = swept(common, k, jnp.where(active[own + k], eliminated[-1][1], 0))
     steps, variances = [row[-1] for row in common], [row[i] for i, row in enumerate(common)]
     for i, row in reversed(list(enumerate(rows[:own]))):
         across = row[own:-1]
@@ -685,7 +685,7 @@ def solve(rows: Rows, active: list[Any], own: int) -> list[Solved]:
         variances.insert(0, row[i] + sum(map(operator.mul, across, beside)))
     return [
         Solved(left, inverse, step, jnp.where(inverse > 0, square_root(jnp.where(moves, variance, inverse)), jnp.inf))
-        for (left, inverse), step, variance, moves in zip(told, steps, variances, active, strict=True)
+        for (left, inverse), step, variance, moves in zip(eliminated, steps, variances, active, strict=True)
     ]
 
 

@@ -276,7 +276,7 @@ def _of_normals(texels: Texels, mask: Array, normal: Components, shared: Any, se
     if shared is None:
         return _layers(texels, best.fit, texels.seen, counts, mask, normal)
     log_n, error = shared.T
-    return _layers(texels, some.at(log_n, sure=True), texels.seen, counts, mask, normal, error)
+    return _layers(texels, some.at(log_n, n_known=True), texels.seen, counts, mask, normal, error)
 
 
 def _layers(

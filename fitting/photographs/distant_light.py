@@ -193,9 +193,9 @@ def light_from_shading(
     length = float(np.linalg.norm(numbers[:3]))
     unexplained = _common(pull, parts) / length
     if unexplained > NO_BALL:
-        came = f"is not shaded like this surface: {100 * unexplained:.0f} % of the light is left unexplained"
+        what = f"is not shaded like this surface: {100 * unexplained:.0f} % of the light is left unexplained"
         remedy = "Give a matt ball and its circle; check encoding, saturation and ambient light"
-        raise InputError("picture", came, remedy)
+        raise InputError("picture", what, remedy)
     return ShadingLight(numbers[:3] / length, length * unit, error, unexplained)
 
 

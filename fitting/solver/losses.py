@@ -123,14 +123,14 @@ def _scale(pictures: Sequence[Picture], optimum: Optimum, rounding: np.ndarray) 
         stride = max(1, picture.target.shape[0] * len(pictures) // _MEDIAN_VALUES)
         weight = _weights(picture)
         rows = np.flatnonzero(weight.min(axis=1) > 0)[::stride]
-        residual = np.asarray(picture.target) - picture.shown(optimum.n, optimum.x)
+        residual = np.asarray(picture.target) - picture.predict(optimum.n, optimum.x)
         sizes.append(np.abs(residual[rows]) * np.sqrt(weight[rows]))
     return np.maximum(np.median(np.concatenate(sizes), axis=0) / _MEDIAN, rounding)
 
 
 def _with_weight(picture: Picture, optimum: Optimum, scale: np.ndarray, loss: str) -> Picture:
     base = np.asarray(picture.weights)
-    weight = weights(loss, np.asarray(picture.target), picture.shown(optimum.n, optimum.x), base, scale)
+    weight = weights(loss, np.asarray(picture.target), picture.predict(optimum.n, optimum.x), base, scale)
     return replace(picture, weight=jnp.asarray(weight, picture.target.dtype))
 
 
@@ -182,7 +182,7 @@ def _noise_factor(now: Sequence[Picture], base: Sequence[Picture], optimum: Opti
     totals = np.zeros(5)
     for picture, original in zip(now, base, strict=True):
         channels, good = picture.target.shape[1], _weights(original) > 0
-        residual = np.asarray(picture.target - picture.shown(optimum.n, optimum.x), np.float64)[good]
+        residual = np.asarray(picture.target - picture.predict(optimum.n, optimum.x), np.float64)[good]
         start, weight = (_weights(one)[good].astype(np.float64) for one in (original, picture))
         w, squared = weight / start, start * residual**2
         # Of a pixel's C channels one direction carries the cut: there psi' is that of the loss, in the others w.

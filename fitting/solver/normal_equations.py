@@ -118,12 +118,12 @@ class Picture:
         """What the model shows, in the dtype of the target, as a part of a program or by NumPy."""
         xp: Any = np if isinstance(self.diffuse, np.ndarray) else jnp
         x_a, x_d, x_s = xp.asarray(x, self.target.dtype)
-        shown = x_a * xp.asarray(self.ambient, self.target.dtype) + x_d * self.diffuse
+        radiance = x_a * xp.asarray(self.ambient, self.target.dtype) + x_d * self.diffuse
         if self.lobe is not None:
-            shown += x_s * self.lobe(n)[0]
-        return xp.broadcast_to(shown, self.target.shape)
+            radiance += x_s * self.lobe(n)[0]
+        return xp.broadcast_to(radiance, self.target.shape)
 
-    def shown(self, n: float, x: Float[np.ndarray, "3 C"]) -> Float[np.ndarray, "P C"]:
+    def predict(self, n: float, x: Float[np.ndarray, "3 C"]) -> Float[np.ndarray, "P C"]:
         """What the model shows, on the host; by NumPy where that takes less time than to trace and load a program.
 
         Args:

@@ -71,7 +71,7 @@ class Uncertainty(NamedTuple):
         correlation: of x_a, x_d, x_s (channel after channel each) and n, (3C + 1, 3C + 1); 0 for what is at its bound
             or not determined.
         reach: by how many of its errors a 95 % interval of n reaches.
-        rise: by how much the cost, summed over channels, rises at the ends of a 95 % interval of n.
+        delta_cost: by how much the cost, summed over channels, rises at the ends of a 95 % interval of n.
         reasons: why a coefficient is not determined, (3, C) of texts; empty where it is.
         n_reason: why n is not; empty where it is.
         sums: by channel, what is determined of several terms together.
@@ -82,7 +82,7 @@ class Uncertainty(NamedTuple):
     n_error: float
     correlation: Float[np.ndarray, "P P"]
     reach: float
-    rise: float
+    delta_cost: float
     reasons: np.ndarray
     n_reason: str
     sums: dict[int, Sum]
@@ -226,17 +226,17 @@ def uncertainty(
             x_error[term, channel] = np.inf
     sums = {c: some._replace(error=some.columns[0] * x_error[some.terms[0], c]) for c, some in sums.items()}
     scale = np.divide(1.0, deviations[0], out=np.zeros(size), where=variance > 0)
-    n_error, rise = math.inf, 0.0
+    n_error, delta_cost = math.inf, 0.0
     if with_n:
         # The noise variance, averaged over channels as n feels it, times the square of that reach.
-        rise = float(reach**2 * covariance[-1, -1] / inverse[-1, -1])
+        delta_cost = float(reach**2 * covariance[-1, -1] / inverse[-1, -1])
         n_error = math.hypot(deviations[0, -1], resolution * optimum.n)
     elif not n_reason:
         n_reason = "the highlight fits as well with other exponents and another k_s"
     if n_reason:
         n_error = math.inf
     correlation = covariance * np.outer(scale, scale)
-    return Uncertainty(x_error, x_interval, n_error, correlation, reach, rise, reasons, n_reason, sums)
+    return Uncertainty(x_error, x_interval, n_error, correlation, reach, delta_cost, reasons, n_reason, sums)
 
 
 def _without_trace(optimum: Optimum, gain: float, visible: float, *, grey: bool) -> str:

@@ -33,7 +33,7 @@ from fitting.uncertainty.covariance import (
 from fitting.uncertainty.highlight import OFF_CENTRE, Highlight, highlight
 from fitting.uncertainty.intervals import exponent_interval
 from fitting.uncertainty.noise_model import misweighted_sums, weighted_sums
-from fitting.uncertainty.residual import Neighbours, Residual, survey
+from fitting.uncertainty.residual import Neighbours, Residual, residual_statistics
 from fitting.uncertainty.structure import (
     SIZES,
     Blocks,
@@ -57,62 +57,76 @@ GROWING = (
 WIDEST_INTERVAL = 100.0
 
 
-def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> FitResult:
+def interpret(fit: ModelFit, observed: Observed, hidden: str = "") -> FitResult:
     """Tell what a fit says.
 
     Args:
         fit: of one model.
-        seen: what was fitted.
+        observed: what was fitted.
         hidden: why there is no highlight, where a fit with one has told.
     """
     optimum, pictures, residual = fit.optimum, fit.pictures, fit.residual
-    about = seen.told() | {"optimum": optimum, "pixels": int(optimum.pixels[0])}
+    about = observed.result_fields() | {"optimum": optimum, "pixels": int(optimum.pixels[0])}
     weight = _typical_weight(pictures)
-    rounding, columns = seen.rounding * weight, rms_columns(optimum, weight)
+    rounding, columns = observed.rounding * weight, rms_columns(optimum, weight)
     noise = np.maximum(residual_noise(optimum, rounding) * fit.noise_factor, rounding)
-    left = survey(pictures, seen.widths, optimum, noise, rounding)
-    lobe = None if optimum.flat else highlight(optimum.n, left)
-    visible = 0.0 if lobe is None else lobe.share(optimum.x, seen.brightest)
+    statistics = residual_statistics(pictures, observed.widths, optimum, noise, rounding)
+    lobe = None if optimum.flat else highlight(optimum.n, statistics)
+    visible = 0.0 if lobe is None else lobe.share(optimum.x, observed.brightest)
     resolution = RESOLUTION if fit.single else 0.0
     spread, shared, widening, deviation, gain, joined, growing, uneven = None, None, 1.0, noise, 0.0, None, None, None
-    channels, weighed = left.channels(noise > 2 * rounding), any(one is not None for one in seen.problem.weights)
+    channels, weighed = (
+        statistics.channels(noise > 2 * rounding),
+        any(one is not None for one in observed.problem.weights),
+    )
     if fit.evidence is not None:
         # Each working target has the noise 1; what least squares leaves is rounding, which goes together.
-        said, left = fit.evidence, left._replace(neighbours=left.neighbours._replace(significant=False))
+        evidence, statistics = (
+            fit.evidence,
+            statistics._replace(neighbours=statistics.neighbours._replace(significant=False)),
+        )
         # Of a small highlight the pixels near an edge may tell next to nothing.
         gain = specular_gain(optimum.normal(noise**2).gram, optimum.x)
-        fit, optimum, deviation = fit._replace(pictures=said.pictures, optimum=said.optimum), said.optimum, noise**0
-        shared, together, of_codes = shared_errors(
-            said, seen, alone_covariance(optimum, fit.tied) if said.together is None else None
+        fit, optimum, deviation = (
+            fit._replace(pictures=evidence.pictures, optimum=evidence.optimum),
+            evidence.optimum,
+            noise**0,
         )
-        channels = channels if said.scores else of_codes
-        together = None if said.light < ARITHMETIC * np.max(seen.brightest) else together
-        widening = said.widening
-        if said.together is not None:
-            joined = said.together.gram
+        shared, together, of_codes = shared_errors(
+            evidence, observed, alone_covariance(optimum, fit.tied) if evidence.together is None else None
+        )
+        channels = channels if evidence.scores else of_codes
+        together = None if evidence.light < ARITHMETIC * np.max(observed.brightest) else together
+        widening = evidence.widening
+        if evidence.together is not None:
+            joined = evidence.together.gram
             gain = max(gain, specular_gain(joined, optimum.x))
     else:
         # Where weights are no inverse variances nothing is told of what else makes noise uneven.
-        asked = weighed and seen.problem.loss == "squared" and device_count() == 1
+        asked = weighed and observed.problem.loss == "squared" and device_count() == 1
         uneven = misweighted_sums(pictures, optimum) if asked else None
-        growing = left.growing_noise(noise, rounding) if uneven is None else None
-        once = seen.copies or channels is not None
-        together = _structure(left, seen, noise > 2 * rounding, even=growing is None and uneven is None, once=once)
+        growing = statistics.growing_noise(noise, rounding) if uneven is None else None
+        once = observed.copies or channels is not None
+        together = _structure(
+            statistics, observed, noise > 2 * rounding, even=growing is None and uneven is None, once=once
+        )
         # What a bound of the material leaves is no error of the pixels.
         if together is not None and together.significant and not fit.capped:
-            shared = _scattered(pictures, optimum, _left(pictures, seen, optimum), alone_covariance(optimum, fit.tied))
-    channels = np.ones((noise.size,) * 2) if seen.copies else channels
+            shared = _scattered(
+                pictures, optimum, _residuals(pictures, observed, optimum), alone_covariance(optimum, fit.tied)
+            )
+    channels = np.ones((noise.size,) * 2) if observed.copies else channels
     if shared is None and growing is not None:
         uneven = weighted_sums(pictures, optimum, growing, inverse=False)
     if shared is None and uneven is not None:
         spread = fit.noise_factor**2 * uneven.gram
     # What the light reaches but the simplest model does without is 0, with the error that it would have.
-    reached = seen.reached(fit.model)
-    sure = uncertainty(
+    reached = observed.reached(fit.model)
+    errors = uncertainty(
         optimum,
         reached,
         deviation,
-        seen.brightest,
+        observed.brightest,
         visible,
         single=fit.single,
         tied=fit.tied,
@@ -122,29 +136,36 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> FitResult:
         columns=columns,
         channels=channels,
         gain=gain,
-        missed=seen.problem.sample_error(fit.model.name),
+        missed=observed.problem.sample_error(fit.model.name),
         resolution=resolution,
         joined=joined,
         moved=fit.moved,
     )
     interval = None
     # At k_d + k_s = 1 the cost still falls across the bound: a profile that does not know it has its least elsewhere.
-    if lobe is not None and not sure.n_reason and not fit.capped:
-        interval = exponent_interval(fit, sure.n_error, sure.reach, sure.rise, lobe.peak, parabolic=joined is not None)
-        sure = sure._replace(n_reason=fit.held or _open_exponent(interval))
+    if lobe is not None and not errors.n_reason and not fit.capped:
+        interval = exponent_interval(
+            fit,
+            errors.n_error,
+            errors.reach,
+            errors.delta_cost,
+            lobe.peak,
+            parabolic=joined is not None,
+        )
+        errors = errors._replace(n_reason=fit.held or _open_exponent(interval))
     if hidden:
-        sure.reasons[2], sure = hidden, sure._replace(n_reason=hidden)
-    material, parameters = material_and_parameters(fit, sure, seen.colour, interval)
+        errors.reasons[2], errors = hidden, errors._replace(n_reason=hidden)
+    material, parameters = material_and_parameters(fit, errors, observed.colour, interval)
     channels = material.k_d.shape[0]
     index = [one.place(channels) for one in parameters if one.value is not None and not one.at_bound]
-    correlation = sure.correlation[np.ix_(index, index)]
+    correlation = errors.correlation[np.ix_(index, index)]
     warnings = [_capped(material)] if fit.capped else []
-    warnings += _warnings(left.neighbours, together, None if all(sure.reasons[2]) else lobe)
+    warnings += _warnings(statistics.neighbours, together, None if all(errors.reasons[2]) else lobe)
     # What the camera says of a pixel's brightness may be off in a channel of strong colour.
-    told = seen.problem.noise is not None
-    if growing is not None and not told and not any("structure" in text for text in warnings):
+    noise_is_given = observed.problem.noise is not None
+    if growing is not None and not noise_is_given and not any("structure" in text for text in warnings):
         warnings.append(GROWING.format("the weights do not" if weighed else "pixels are weighed alike"))
-    if sure.sums:
+    if errors.sums:
         words = "no more than a sum of several numbers is determined, see there: the material shows it with "
         words += f"{100 * AMBIENT_SHARE:g} % of it as ambient light, if there is any, and the rest as k_d. "
         warnings.append(words + "Another light, or a curved surface, would tell them apart")
@@ -152,7 +173,7 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> FitResult:
         material=material,
         parameters=parameters,
         noise=noise,
-        structure=left.neighbours.correlation,
+        structure=statistics.neighbours.correlation,
         highlight_pixels=None if lobe is None else lobe.pixels,
         residual=residual,
         warnings=tuple(warnings),
@@ -162,7 +183,7 @@ def interpret(fit: ModelFit, seen: Observed, hidden: str = "") -> FitResult:
 
 
 def shared_errors(
-    said: Evidence, seen: Observed, covariance: Float[np.ndarray, "U U"] | None = None
+    evidence: Evidence, observed: Observed, covariance: Float[np.ndarray, "U U"] | None = None
 ) -> tuple[Float[np.ndarray, "U U"] | None, Structure, Float[np.ndarray, "C C"] | None]:
     """What takes the place of the Hessian where neighbours share errors, None where they do not; and how much they do.
 
@@ -171,44 +192,46 @@ def shared_errors(
     They do in a file that was compressed with losses, or where the residual shows it.
 
     Args:
-        said: of a fit.
-        seen: of which its pictures were made.
+        evidence: of a fit.
+        observed: of which its pictures were made.
         covariance: see `fitting.uncertainty.structure.scatter`.
     """
-    lossy = any(tile.bounds is not None and tile.bounds.lossy for tile in seen.tiles)
-    channels, few = None, said.noise < ROUNDED
-    both = zip(said.pictures, said.places, strict=True)
-    errors = (Errors(residuals(picture, said.optimum), *place) for picture, place in both)
+    lossy = any(tile.bounds is not None and tile.bounds.lossy for tile in observed.tiles)
+    channels, few = None, evidence.noise < ROUNDED
+    both = zip(evidence.pictures, evidence.places, strict=True)
+    errors = (Errors(residuals(picture, evidence.optimum), *place) for picture, place in both)
     if lossy:
         # The pixels of a block err together in any case.
-        errors, some = list(errors), slice(1 if seen.copies else None)
+        errors, some = list(errors), slice(1 if observed.copies else None)
         blocks = [of_blocks(one._replace(values=one.values[:, some])) for one in errors]
         together = structure([over_blocks(one, 2) for one in blocks], (2, 4))
     else:
         # With little noise few values say much.
-        if said.scores:
+        if evidence.scores:
             errors = list(errors)
-            grids = [_scores(*one) for one in said.scores] if few else [over_blocks(one, SIZES[0]) for one in errors]
+            grids = (
+                [_scores(*one) for one in evidence.scores] if few else [over_blocks(one, SIZES[0]) for one in errors]
+            )
         else:
-            unit = np.ones(seen.colour.size)
-            left = survey(said.completed, seen.widths, said.optimum, unit, 0 * unit)
-            grids, channels = left.blocks, None if seen.copies else left.channels(unit > 0)
+            unit = np.ones(observed.colour.size)
+            statistics = residual_statistics(evidence.completed, observed.widths, evidence.optimum, unit, 0 * unit)
+            grids, channels = statistics.blocks, None if observed.copies else statistics.channels(unit > 0)
         # Channels that err together count once.
-        some = slice(1 if seen.copies or channels is not None else None)
+        some = slice(1 if observed.copies or channels is not None else None)
         together = structure([grid.channels(some) for grid in grids], even=not few)
     if not (lossy or together.significant):
         return None, together, channels
-    return _scattered(said.pictures, said.optimum, errors, covariance), together, channels
+    return _scattered(evidence.pictures, evidence.optimum, errors, covariance), together, channels
 
 
 def _structure(
-    left: Residual, seen: Observed, tell: Bool[np.ndarray, " C"], *, even: bool, once: bool
+    statistics: Residual, observed: Observed, tell: Bool[np.ndarray, " C"], *, even: bool, once: bool
 ) -> Structure | None:
     """That of a fit by least squares; None where it cannot be told, or weights are part of what is fitted."""
-    if device_count() > 1 or seen.problem.loss != "squared" or not tell.any():
+    if device_count() > 1 or observed.problem.loss != "squared" or not tell.any():
         return None
     some = np.flatnonzero(tell)[: 1 if once else None]
-    return structure([grid.channels(some) for grid in left.blocks], even=even)
+    return structure([grid.channels(some) for grid in statistics.blocks], even=even)
 
 
 def _scores(score: np.ndarray, information: np.ndarray, place: tuple[np.ndarray, int]) -> Blocks:
@@ -216,8 +239,8 @@ def _scores(score: np.ndarray, information: np.ndarray, place: tuple[np.ndarray,
 
     Each of many values may say that it is not beyond an edge, which one in a thousand would be.
     """
-    found, told = (over_blocks(Errors(part, *place), SIZES[0]) for part in (score, np.sqrt(information)))
-    return found._replace(squares=np.maximum(found.squares, told.squares))
+    sums, of_information = (over_blocks(Errors(part, *place), SIZES[0]) for part in (score, np.sqrt(information)))
+    return sums._replace(squares=np.maximum(sums.squares, of_information.squares))
 
 
 def _scattered(
@@ -237,9 +260,9 @@ def alone_covariance(optimum: Optimum, tied: np.ndarray | None) -> Float[np.ndar
     return inverse_among(optimum.normal().gram, design_of(optimum.x > 0, tied))
 
 
-def _left(pictures: Sequence[Picture], seen: Observed, optimum: Optimum) -> Iterator[Errors]:
+def _residuals(pictures: Sequence[Picture], observed: Observed, optimum: Optimum) -> Iterator[Errors]:
     """What a fit leaves of whole pictures."""
-    for picture, width in zip(pictures, seen.widths, strict=True):
+    for picture, width in zip(pictures, observed.widths, strict=True):
         yield Errors(residuals(picture, optimum), np.arange(picture.target.shape[0]), width)
 
 
@@ -266,7 +289,7 @@ def _open_exponent(interval: tuple[float, float]) -> str:
 
 
 def material_and_parameters(
-    fit: ModelFit, sure: Uncertainty, colour: Float[np.ndarray, " C"], interval: tuple[float, float] | None
+    fit: ModelFit, errors: Uncertainty, colour: Float[np.ndarray, " C"], interval: tuple[float, float] | None
 ) -> tuple[brdf.Material, tuple[Parameter, ...]]:
     """The material that was found, and its numbers with their errors.
 
@@ -274,7 +297,7 @@ def material_and_parameters(
 
     Args:
         fit: of one model.
-        sure: its errors, in the units of the solver.
+        errors: its errors, in the units of the solver.
         colour: what was taken out of the lights, (C,).
         interval: of the exponent.
     """
@@ -284,29 +307,29 @@ def material_and_parameters(
     factors = coefficient_factors(fit.model, optimum.n, colour)
     for term, name in enumerate(TERMS[: 2 + specular]):
         for channel, factor in enumerate(factors[term]):
-            if sure.reasons[term, channel]:
-                if channel in sure.sums and term in sure.sums[channel].terms:
-                    sure.reasons[term, channel] = _in_words(sure.sums[channel], factors[:, channel])
-                found.append(Parameter(name, channel, None, None, reason=sure.reasons[term, channel]))
+            if errors.reasons[term, channel]:
+                if channel in errors.sums and term in errors.sums[channel].terms:
+                    errors.reasons[term, channel] = _in_words(errors.sums[channel], factors[:, channel])
+                found.append(Parameter(name, channel, None, None, reason=errors.reasons[term, channel]))
                 continue
             value = float(optimum.x[term, channel] / factor)
-            low, high = sure.x_interval[term, channel] / factor
-            error = float(sure.x_error[term, channel] / factor)
+            low, high = errors.x_interval[term, channel] / factor
+            error = float(errors.x_error[term, channel] / factor)
             found.append(Parameter(name, channel, value, error, (float(low), float(high)), at_bound=value == 0))
         k[name] = np.array([parameter.value or 0.0 for parameter in found[-factors.shape[1] :]])
-        for channel, known in sure.sums.items():
-            k[name][channel] += known.stand_in[term] / factors[term, channel]
+        for channel, total in errors.sums.items():
+            k[name][channel] += total.stand_in[term] / factors[term, channel]
     if specular:
         k["n"] = optimum.n if k["k_s"].any() else 0.0
-        n, error = (None, None) if sure.n_reason else (float(optimum.n), sure.n_error)
-        found.append(Parameter("n", None, n, error, interval, reason=sure.n_reason))
+        n, error = (None, None) if errors.n_reason else (float(optimum.n), errors.n_error)
+        found.append(Parameter("n", None, n, error, interval, reason=errors.n_reason))
     return fit.model(**k), tuple(found)
 
 
-def _in_words(known: Sum, factors: Float[np.ndarray, " 3"]) -> str:
-    parts = zip(known.terms, known.columns, strict=True)
+def _in_words(total: Sum, factors: Float[np.ndarray, " 3"]) -> str:
+    parts = zip(total.terms, total.columns, strict=True)
     terms = " + ".join(f"{column * factors[term]:.4g} {TERMS[term]}" for term, column in parts)
-    value = Parameter("", None, known.value, known.error)
+    value = Parameter("", None, total.value, total.error)
     return f"only {terms} = {str(value).partition(' (')[0]} is determined"
 
 
@@ -321,25 +344,25 @@ def _capped(material: brdf.Material) -> str:
     )
 
 
-def _warnings(known: Neighbours, together: Structure | None, seen: Highlight | None) -> Iterator[str]:
+def _warnings(neighbours: Neighbours, together: Structure | None, lobe: Highlight | None) -> Iterator[str]:
     shared = together is not None and together.significant
-    if known.significant or shared:
+    if neighbours.significant or shared:
         words = "the residual has structure: neighbouring pixels err alike"
-        if known.correlation > 0.05:
-            words += f" (correlation {known.correlation:.2f})"
+        if neighbours.correlation > 0.05:
+            words += f" (correlation {neighbours.correlation:.2f})"
         words += ", so the model or the scene is not the whole truth, or the picture was smoothed. "
         if shared:
             words += "The errors allow for that among neighbours, not for what it does to the numbers: "
             words += "they may be too small"
         else:
-            words += f"The errors are too small, by a factor of {known.inflation:.2g} or more"
+            words += f"The errors are too small, by a factor of {neighbours.inflation:.2g} or more"
         yield words
-    if seen is not None and seen.smaller_than_pixel:
+    if lobe is not None and lobe.smaller_than_pixel:
         # Below this share of the peak the distance from the centre says more than the number of pixels.
-        amount = f"the nearest pixel shows {100 * seen.centre:.2g} % of its peak"
-        if seen.centre >= OFF_CENTRE:
-            amount = f"{seen.pixels:.1f} pixels carry it"
-        if seen.broad:
+        amount = f"the nearest pixel shows {100 * lobe.centre:.2g} % of its peak"
+        if lobe.centre >= OFF_CENTRE:
+            amount = f"{lobe.pixels:.1f} pixels carry it"
+        if lobe.broad:
             yield (
                 f"no pixel that counts shows the middle of the highlight ({amount}): k_s and n are told by its edge "
                 "alone. A picture that shows it, and does not clip it, would tell more"

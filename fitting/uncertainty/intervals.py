@@ -85,9 +85,9 @@ def above_zero(value: float, error: float) -> tuple[float, float]:
 
 
 def exponent_interval(
-    fit: ModelFit, n_error: float, reach: float, rise: float, peak: float, *, parabolic: bool = False
+    fit: ModelFit, n_error: float, reach: float, delta_cost: float, peak: float, *, parabolic: bool = False
 ) -> tuple[float, float]:
-    """The 95 % profile-likelihood interval of n: where the least cost rises by ``rise``.
+    """The 95 % profile-likelihood interval of n: where the least cost rises by ``delta_cost``.
 
     A relative error below a hundredth needs no pixel: there the profile is a parabola in log n. Else the cost is
     followed outwards from the optimum, a pass over the pixels at each exponent tried.
@@ -96,7 +96,7 @@ def exponent_interval(
         fit: of a model with a lobe.
         n_error: standard error of n.
         reach: see `fitting.uncertainty.covariance.Uncertainty`.
-        rise: of the cost; likewise.
+        delta_cost: of the cost; likewise.
         peak: logarithm of the lobe's cosine in the pixel nearest to its centre.
         parabolic: the profile is taken for a parabola in any case.
 
@@ -126,7 +126,9 @@ def exponent_interval(
     def rise_at(log_n: float) -> float:
         return cost(log_n) - least
 
-    low, high = (_end(rise_at, centre, sign, bound, first, rise) for sign, bound in zip((-1, 1), bounds, strict=True))
+    low, high = (
+        _end(rise_at, centre, sign, bound, first, delta_cost) for sign, bound in zip((-1, 1), bounds, strict=True)
+    )
     return math.exp(low), math.exp(high)
 
 
@@ -145,9 +147,9 @@ def _end(rise_at: Callable[[float], float], start: float, sign: int, bound: floa
             middle = inside + share * (outside - inside)
             if abs(outside - inside) < CLOSE or min(share, 1 - share) * abs(outside - inside) < CLOSE * step:
                 return middle
-            rise = rise_at(middle)
-            if rise > limit:
-                outside, above = middle, rise
+            delta_cost = rise_at(middle)
+            if delta_cost > limit:
+                outside, above = middle, delta_cost
             else:
-                inside, below = middle, max(rise, 0.0)
+                inside, below = middle, max(delta_cost, 0.0)
     return sign * math.inf

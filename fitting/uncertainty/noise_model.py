@@ -65,7 +65,7 @@ def noise_model(
     coefficients = np.array([one for one, _ in found])
     variance = _variance(coefficients, value)
     varied = np.max(variance, axis=0) > EVEN * np.mean(variance, axis=0)
-    return coefficients if np.any(varied & (np.array([rise for _, rise in found]) > RISE)) else None
+    return coefficients if np.any(varied & (np.array([gain for _, gain in found]) > RISE)) else None
 
 
 def value_variance(
@@ -100,8 +100,8 @@ def _one_channel(squared: np.ndarray, value: np.ndarray, least: float) -> tuple[
         coefficients = nonnegative_minimum(scaled @ scaled.T, scaled @ (squared / variance))
         coefficients[0] = max(coefficients[0], least, 1e-6 * constant)
         variance = coefficients @ columns
-    rise = np.sum(np.log(constant / variance) + squared / constant - squared / variance)
-    return coefficients / largest ** np.arange(3), float(rise)
+    gain = np.sum(np.log(constant / variance) + squared / constant - squared / variance)
+    return coefficients / largest ** np.arange(3), float(gain)
 
 
 @eqx.filter_jit

@@ -94,7 +94,7 @@ class Residual(NamedTuple):
         return noise_model(self.errors * noise, self.values, rounding)
 
 
-def gone_together(channels: Float[np.ndarray, "C C"] | None) -> float:
+def variance_inflation(channels: Float[np.ndarray, "C C"] | None) -> float:
     """By what factor errors of what all channels share are too small at most, where each counts as one of its own.
 
     Args:
@@ -103,7 +103,7 @@ def gone_together(channels: Float[np.ndarray, "C C"] | None) -> float:
     return 1.0 if channels is None else float(np.sqrt(np.linalg.eigvalsh(channels)[-1]))
 
 
-def survey(
+def residual_statistics(
     pictures: Sequence[Picture],
     widths: Sequence[int],
     optimum: Optimum,
@@ -132,26 +132,26 @@ def survey(
         at = np.asarray(optimum.n), peak, optimum.x * np.array([[1.0], [1.0], [decay]]), unit
         places = _places(picture.counts, width, most)
         if small:
-            *seen, lobe = _seen(picture, *at)
-            found = _over_blocks(seen[0], lobe, width)
-            left, shown = (np.concatenate(part)[:, places] for part in seen)
+            *parts, lobe = _residual_and_values(picture, *at)
+            found = _over_blocks(parts[0], lobe, width)
+            residual, predicted = (np.concatenate(part)[:, places] for part in parts)
         else:
             found = _over_blocks_many(picture, *at, width=width)
             few = picture.in_double(places.ravel())
-            seen = (_seen_many if few.is_sampled else _seen)(few, *at)[:2]
+            parts = (_residual_and_values_jitted if few.is_sampled else _residual_and_values)(few, *at)[:2]
             shape = len(noise), *places.shape
-            left, shown = (np.concatenate(part)[:, : places.size].reshape(shape) for part in seen)
+            residual, predicted = (np.concatenate(part)[:, : places.size].reshape(shape) for part in parts)
         *sums, own, top = jax.device_get(found)
         # Of each channel or group sums, squares and counts, one after the other: (R, Q, C) of each kind.
         blocks.append(Blocks(*(np.moveaxis(np.concatenate(sums[kind::3]), 0, -1) for kind in range(3))))
         largest, squares = max(largest, float(np.max(top))), squares + float(np.sum(own[0]))
-        pairs.append(_pairs(left, places))
-        counts = np.any(left[:, 0] != 0, axis=0)
-        errors.append(left[:, 0, counts])
-        values.append(shown[:, 0, counts])
+        pairs.append(_pairs(residual, places))
+        counts = np.any(residual[:, 0] != 0, axis=0)
+        errors.append(residual[:, 0, counts])
+        values.append(predicted[:, 0, counts])
     error, value = (np.concatenate(parts, axis=1).T.astype(np.float64) for parts in (errors, values))
     carrying = squares / (largest or 1.0) ** 2
-    return Residual(blocks, _going_together(pairs, noise > 2 * rounding), error, value, decay * largest, carrying, peak)
+    return Residual(blocks, _correlation(pairs, noise > 2 * rounding), error, value, decay * largest, carrying, peak)
 
 
 def neighbours_of(images: Sequence[Float[np.ndarray, "H W C"]]) -> Neighbours:
@@ -165,21 +165,21 @@ def neighbours_of(images: Sequence[Float[np.ndarray, "H W C"]]) -> Neighbours:
         left = image.reshape(-1, image.shape[2])
         places = _places(np.any(left != 0, axis=1), image.shape[1], SOME_PIXELS)
         pairs.append(_pairs(left.T[:, places], places))
-    return _going_together(pairs, np.ones(images[0].shape[2], bool))
+    return _correlation(pairs, np.ones(images[0].shape[2], bool))
 
 
-def structure_warning(known: Neighbours) -> tuple[str, ...]:
+def structure_warning(neighbours: Neighbours) -> tuple[str, ...]:
     """What to say where neighbours err alike; nothing where they do not.
 
     Args:
-        known: of the residual.
+        neighbours: of the residual.
     """
-    words = f"the residual has structure: neighbouring pixels err alike (correlation {known.correlation:.2f})"
+    words = f"the residual has structure: neighbouring pixels err alike (correlation {neighbours.correlation:.2f})"
     words = f"{words}, so model or scene are not the whole truth and the errors are too small"
-    return (words,) if known.significant else ()
+    return (words,) if neighbours.significant else ()
 
 
-def _going_together(pairs: Sequence[np.ndarray], channels: Bool[np.ndarray, " C"]) -> Neighbours:
+def _correlation(pairs: Sequence[np.ndarray], channels: Bool[np.ndarray, " C"]) -> Neighbours:
     cross, one, other, count = np.sum(pairs, axis=0) @ channels
     correlation = float(cross / max(np.sqrt(one * other), np.finfo(float).tiny))
     least = max(CORRELATED, DEVIATIONS / max(count / max(np.count_nonzero(channels), 1), 1.0) ** 0.5)
@@ -196,15 +196,15 @@ def _places(counts: Bool[np.ndarray, " P"], width: int, most: int) -> Int[np.nda
     return np.stack([index, index + ((index + 1) % width > 0), np.where(below < counts.size, below, index)])
 
 
-def _pairs(left: Float[np.ndarray, "C 3 M"], places: Int[np.ndarray, "3 M"]) -> Float[np.ndarray, "4 C"]:
+def _pairs(residual: Float[np.ndarray, "C 3 M"], places: Int[np.ndarray, "3 M"]) -> Float[np.ndarray, "4 C"]:
     """Of pairs side by side and one above the other: products, squares of both, how many pairs."""
-    one, other = left[:, :1], left[:, 1:]
+    one, other = residual[:, :1], residual[:, 1:]
     both = (one != 0) & (other != 0) & (places[1:] > places[0])
     one, other = one * both, other * both
     return np.array([np.sum(term, axis=(1, 2)) for term in (one * other, one * one, other * other, both)])
 
 
-def _seen(
+def _residual_and_values(
     picture: Picture, n: AnyArray, peak: AnyArray | float, x: Float[AnyArray, "3 C"], noise: AnyArray
 ) -> tuple[list[Any], list[Any], Any]:
     """Of each channel, or of all together where they are many, errors and what is shown, (G, P); and the lobe, (P,).
@@ -221,25 +221,25 @@ def _seen(
     lobe = xp.zeros_like(picture.diffuse) if picture.lobe is None else picture.lobe(n, peak)[0]
     values = picture.target, xp.asarray(picture.ambient, dtype)[None], picture.diffuse, lobe, picture.weights
     x, noise = xp.asarray(x, dtype), xp.asarray(noise, dtype)
-    left, shown, step = [], [], 1 if channels <= UNROLLED_CHANNELS else channels
+    residual, predicted, step = [], [], 1 if channels <= UNROLLED_CHANNELS else channels
     for first in range(0, channels, step):
         some = slice(first, first + step)
         target, ambient, diffuse, value, weight = (one.T[some] if one.shape[1] > 1 else one.T for one in values)
         x_a, x_d, x_s, unit = (one[some, None] for one in (*x, noise))
-        shown.append(xp.broadcast_to(x_a * ambient + x_d * diffuse + x_s * value, target.shape))
-        left.append(xp.where(weight > 0, target - shown[-1], 0) * xp.sqrt(weight) / unit)
-    return left, shown, xp.max(xp.where(picture.weights > 0, lobe, 0), axis=1)
+        predicted.append(xp.broadcast_to(x_a * ambient + x_d * diffuse + x_s * value, target.shape))
+        residual.append(xp.where(weight > 0, target - predicted[-1], 0) * xp.sqrt(weight) / unit)
+    return residual, predicted, xp.max(xp.where(picture.weights > 0, lobe, 0), axis=1)
 
 
-def _over_blocks(left: list[Any], lobe: Any, width: int) -> list[Any]:
+def _over_blocks(residual: list[Any], lobe: Any, width: int) -> list[Any]:
     """Over blocks, (G, R, Q): of each group of channels sums of errors, of their squares, and how many count.
 
     Then the sum of the lobe's squares, and its largest value.
     """
     xp: Any = np if isinstance(lobe, np.ndarray) else jnp
-    terms = [term for error in left for term in (error, error * error, (error != 0).astype(error.dtype))]
-    terms += [xp.broadcast_to(one, left[0].shape) for one in (lobe * lobe, lobe)]
-    size, (step, pixels) = SIZES[0], left[0].shape
+    terms = [term for error in residual for term in (error, error * error, (error != 0).astype(error.dtype))]
+    terms += [xp.broadcast_to(one, residual[0].shape) for one in (lobe * lobe, lobe)]
+    size, (step, pixels) = SIZES[0], residual[0].shape
     rows = pixels // width
     pad = [(0, 0), (0, -rows % size), (0, -width % size)]
     shape = step, -(-rows // size), size, -(-width // size), size
@@ -247,10 +247,10 @@ def _over_blocks(left: list[Any], lobe: Any, width: int) -> list[Any]:
     return totals(blocks, [*["add"] * (len(terms) - 1), "maximum"], (2, 4))
 
 
-_seen_many = jax.jit(_seen)
+_residual_and_values_jitted = jax.jit(_residual_and_values)
 
 
 @partial(jax.jit, static_argnames="width", compiler_options=COMPILER_OPTIONS)
 def _over_blocks_many(picture: Picture, *at: Any, width: int) -> list[Any]:
-    left, _, lobe = _seen(picture, *at)
-    return _over_blocks(left, lobe, width)
+    residual, _, lobe = _residual_and_values(picture, *at)
+    return _over_blocks(residual, lobe, width)
