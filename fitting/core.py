@@ -355,7 +355,8 @@ def _likely_sums(fits: Mapping[str, ModelFit]) -> dict[str, NormalEquations]:
     best, found = next(iter(fits.values())), {}
     if best.evidence is None:
         return found
-    value = max(fit.evidence.value for fit in fits.values() if fit.evidence is not None)
+    evidence = [fit.evidence for fit in fits.values() if fit.evidence is not None]
+    value, above = max(one.value for one in evidence), max(float(np.sum(one.optimum.pixels)) for one in evidence)
     noise = np.maximum(best.optimum.cost / best.optimum.pixels, np.finfo(float).tiny)
     for name, fit in fits.items():
         if fit.evidence is None:
@@ -371,7 +372,8 @@ def _likely_sums(fits: Mapping[str, ModelFit]) -> dict[str, NormalEquations]:
                 own = np.ix_(index[:3], index[:3])
                 normal.gram[own] += squares[:3, :3] / np.max(noise)
                 normal.product[index[:3]] += normal.gram[own] @ at[index[:3]]
-        least = 2 * (value - fit.evidence.value) + float(np.sum(one.pixels))
+        # The same above 0 in all: how many values lie near an edge is no part of the likelihood.
+        least = 2 * (value - fit.evidence.value) + above
         found[name] = normal._replace(square=least + (2 * normal.product - normal.gram @ at) @ at)
     return found
 

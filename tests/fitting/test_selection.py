@@ -10,6 +10,7 @@ from small_ball import ball_scene, pictured
 import brdf
 import fitting
 from benchmarks.truth import File, ball, just_found
+from brdf.images.encoding import encode
 
 SCENE = ball_scene()
 K = {"k_a": [0.5, 0.4, 0.3], "k_d": [0.5, 0.2, 0.3]}
@@ -137,3 +138,15 @@ def test_a_channel_without_light_does_not_choose_for_the_others(intensity):
     np.testing.assert_allclose(found.k_d[:2], material.k_d[:2], atol=1e-4)
     np.testing.assert_allclose(found.k_s[:2], material.k_s[:2], atol=1e-3)
     np.testing.assert_allclose(found.n, 20, rtol=1e-3)
+
+
+@pytest.mark.parametrize("n", [75.0, 116.0])
+def test_exposures_of_8_bits_tell_the_kind_of_highlight(n: float):
+    """Rounding is all the noise: the two models differ in how many values they predict near an edge of a code."""
+    material = brdf.Phong(k_a=[0.1, 0.15, 0.2], k_d=[0.5, 0.4, 0.3], k_s=[0.3, 0.2, 0.4], n=n)
+    lit = [brdf.DirectionalLight([0.2, -0.4, 1.0], exposure) for exposure in (0.25, 1.0)]
+    scenes = [ball_scene(light, ambient=0.3 * light.intensity) for light in lit]
+    pictures = [np.rint(255 * encode(pictured(material, scene), "srgb")).astype(np.uint8) for scene in scenes]
+    result = fitting.fit(pictures, scenes, encoding="srgb")
+    assert result.surface == "phong"
+    assert float(result["n"]) == pytest.approx(n, rel=0.01)
