@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt
+from jaxtyping import Bool, Float, Float32, Int, UInt
 
 from brdf.errors import InputError
 from brdf.images.encoding import Encoding, decode, encode
@@ -32,6 +32,8 @@ _CURVES: tuple[Encoding, ...] = ("linear", "srgb")
 _FEWEST_ENDS = 10
 # Fewer different codes than this may be chance.
 _FEWEST = 6
+# Half of all codes are those of one bit less.
+_FEWEST_STRETCHED = 32
 # Beyond so many codes the basis images of single precision err by a good part of what the edges of codes tell.
 FINE = 8192
 # Pixels on a side of what a codec for photographs transforms together; twice that where colours have half the
@@ -72,6 +74,12 @@ class Codes(NamedTuple):
     def fine(self) -> bool:
         """Single precision does not resolve a small share of a step."""
         return self.ends[1] < np.inf and self.ends[1] > FINE
+
+    @property
+    def largest(self) -> float:
+        """Linear value of the code from which on values are clipped; infinite where there is none."""
+        share = self.ends[1] / self.scale
+        return float(decode(np.array(share), self.encoding) * np.max(self.unit)) if np.isfinite(share) else np.inf
 
     def middle(self, pixels: Float[np.ndarray, "H W C"]) -> Float[np.ndarray, "H W C"]:
         """Linear values where they most likely lay: those of a writer that truncated half a step above their codes.
@@ -252,12 +260,32 @@ def _integers(codes: np.ndarray, encoding: Encoding, top: int, fewest: int = 1) 
     inside = used[(used > 0) & (used < top)]
     # Few codes may have a divisor by chance.
     step = int(np.gcd.reduce(inside)) if inside.size >= _FEWEST else 1
+    levels = _stretched(used, top) if step == 1 and inside.size >= _FEWEST_STRETCHED else None
+    if levels is not None:
+        counted = np.full(top + 1, np.nan, np.float32)
+        counted[levels] = np.arange(levels.size)
+        known = np.isfinite(codes)
+        codes = np.where(known, counted[np.where(known, codes, 0).astype(np.int64)], np.float32(np.nan))
+        return Codes(codes, 0.5, 0.5, (0.0, levels.size - 1.0), levels.size - 1.0, encoding)
     codes = codes.astype(np.float32)
     if step > 1 and used[-1] == top and top % step:
         # Clipped to the largest number of the file, not to a code of the sensor.
         codes[codes == top] = np.ceil(top / step) * step
     largest = float(top // step)
     return Codes(codes / np.float32(step), 0.5, 0.5, (0.0, largest), top / step, encoding)
+
+
+def _stretched(used: np.ndarray, top: int) -> Int[np.ndarray, " L"] | None:
+    """The codes of fewer bits that were spread over those of a file, its largest being theirs; None where none were."""
+    for bits in range(top.bit_length() - 1, 8, -1):
+        code, most = np.arange(1 << bits), (1 << bits) - 1
+        exact = code * top / most
+        # Rounded, truncated, or their own first bits again where they have none.
+        replicated = (code << (top.bit_length() - bits)) | (code >> max(2 * bits - top.bit_length(), 0))
+        for levels in (np.rint(exact).astype(np.int64), exact.astype(np.int64), replicated):
+            if np.array_equal(levels[np.rint(used * (most / top)).astype(np.int64)], used):
+                return levels
+    return None
 
 
 def _levels(pixels: np.ndarray, *, half: bool) -> Codes | None:

@@ -251,11 +251,27 @@ def _of_picture(picture: brdf.Picture, rounding: Rounding) -> Target:
         jpeg = picture.jpeg if rounding is None or isinstance(rounding, str) else None
         codes = codes._replace(lossy=picture.lossy, jpeg=jpeg)
         pixels = codes.middle(pixels)
+    if top is not None:
+        top = _clipped_from(top, codes, picture.pixels, picture.encoding, picture.bits, picture.factor)
     least, file = rounding is not None and codes is None, None
     if picture.path is not None:
         file = {"path": str(picture.path), "encoding": picture.encoding, "source": picture.source}
         file |= {"factor": np.asarray(picture.factor).tolist()}
-    return Target(pixels, None if top is None else top * TOP, step, codes, least, file)
+    return Target(pixels, top, step, codes, least, file)
+
+
+def _clipped_from(top: float, codes: Codes | None, *of_file: Any) -> float:
+    """The linear value from which on those of an integer file are clipped: fewer bits may end below its largest code.
+
+    Args:
+        top: of the largest code of the file.
+        codes: that are fitted; steps that a user states are not those of the file.
+        of_file: see `find_codes`.
+    """
+    pixels, encoding, bits, *further = of_file
+    if codes is None or not np.isfinite(codes.ends[1]):
+        codes = find_codes(pixels, encoding, bits, None, *further)
+    return TOP * min(top, np.inf if codes is None else codes.largest)
 
 
 def _of_array(values: np.ndarray, rounding: Rounding, encoding: Encoding) -> Target:
@@ -278,7 +294,8 @@ def _of_array(values: np.ndarray, rounding: Rounding, encoding: Encoding) -> Tar
     integer = stored is not None
     codes = find_codes(values, encoding if integer else None, bits, rounding, stored=stored)
     values = values if codes is None else codes.middle(values)
-    return Target(values, TOP if integer else None, step, codes, least_squares=rounding is not None and codes is None)
+    top = _clipped_from(1.0, codes, values, encoding, bits, 1.0, stored) if integer else None
+    return Target(values, top, step, codes, least_squares=rounding is not None and codes is None)
 
 
 def _per_pixel(name: str, values: Any, shape: tuple[int, int]) -> np.ndarray:

@@ -57,6 +57,7 @@ def test_whole_numbers_in_floats_are_codes_that_were_rounded():
     [
         (lambda drawn: decode(np.rint(255 * encode(drawn, "srgb")) / 255, "srgb"), "8-bit sRGB files"),
         (lambda drawn: np.rint(4095 * drawn) * 16 / 65535, "12-bit linear files"),
+        (lambda drawn: np.rint(np.rint(1023 * drawn) * 65535 / 1023) / 65535, "10-bit linear files"),
         (lambda drawn: drawn.astype(np.float16).astype(np.float32), "half floats"),
         (lambda drawn: np.rint(200 * drawn), "whole numbers"),
         (lambda drawn: (4e4 * drawn).astype(np.float16).astype(np.float32), "half floats"),
@@ -72,6 +73,17 @@ def test_floats_on_the_levels_of_files_are_said_to_be_codes(values: Callable[[np
     broken = values(one.drawn())
     broken[20:24], broken[24] = np.nan, np.inf
     assert fitting.fit(broken, one.scene(), model=one.model).levels == levels
+
+
+@pytest.mark.parametrize("spread", [lambda code: code << 6, lambda code: np.rint(code * 65535 / 1023)])
+@pytest.mark.parametrize("rounding", [None, 0])
+def test_10_bits_in_16_are_clipped_at_their_own_largest_code(spread: Callable[[Any], Any], rounding: int | None):
+    one = ball(1, size=64)
+    stored = spread(np.minimum(np.rint(1.3 * 1023 * one.drawn()), 1023).astype(int)).astype(np.uint16)
+    result = fitting.fit(stored, one.scene(), model=one.model, rounding=rounding)
+    assert result.left_out["clipped"] == np.count_nonzero(stored == stored.max()) > 10
+    true = 1.3 * float(stored.max()) / 65535 * one.k[1, 0]
+    assert abs(result["k_d"][0].value - true) < (1e-4 if rounding is None else 2e-3)
 
 
 @pytest.mark.parametrize("row", ["sRGB 8 bit, light noise 0.0005", "sRGB 8 bit, light noise 0.01"])
