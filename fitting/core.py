@@ -13,6 +13,8 @@ import numpy as np
 from jaxtyping import Float
 
 import brdf
+from brdf.channels import channel_names
+from brdf.errors import InputError
 from brdf.lobes import Near
 from brdf.precision import working_precision
 from brdf.rendering import basis
@@ -205,6 +207,10 @@ def _fit_about(
             free = free & [[True], [True], [False]]
     optimise = partial(search, free=free, n_range=n_range)
     found = reweight(pictures, optimise(pictures), optimise, observed.problem.loss, observed.rounding)
+    if (empty := np.flatnonzero(found.optimum.pixels == 0)).size:
+        clipped = ", ".join(channel_names(found.optimum.pixels.size)[channel] for channel in empty)
+        what = f"is clipped in channel {clipped} wherever it sees the object"
+        raise InputError("target", what, "Give a darker exposure or a higher saturation")
     fit = ModelFit(model, found.pictures, found.optimum, free, n_range, owner=observed.owner, copies=observed.copies)
     return fit._replace(noise_factor=found.noise_factor)
 

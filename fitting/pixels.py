@@ -58,7 +58,7 @@ class Tile(NamedTuple):
     """
 
     target: Float[Array, "P C"]
-    weight: Float[Array, " P"] | None
+    weight: Float[Array, " P"] | Float[Array, "P C"] | None
     points: Sight
     scene: brdf.Scene
     bounds: Bounds | None = None
@@ -147,8 +147,8 @@ class Statistics(NamedTuple):
     """What there is to know of the pixels of a picture, or of some of its bands together.
 
     Attributes:
-        counts: pixels that see a fitted shape; of these inside the mask; of these finite; of these not clipped; of
-            these not too dark.
+        counts: pixels that see a fitted shape; of these inside the mask; of these finite; of these not clipped in any
+            channel; of these, or of those with a channel that is not, not too dark.
         largest: finite value of any channel.
         top: how many pixels share it.
         least: value of any pixel, seen or not.
@@ -214,7 +214,12 @@ def _observe(
     grey = brdf.cast(grey, problem.precision)
     bands = _bands(target, grey, dtype, mask, at_once or noise is not None)
     level = target.saturation if problem.saturation is None else problem.saturation
-    found, total = _statistics(bands, level, dark, keep=not target.streamed)
+    # Other losses, dark levels and steps of 0 are ways of one's own to say what pixels say.
+    plain = dark is None and problem.loss == "squared" and not target.least_squares
+    plain = plain and not target.streamed and device_count() == 1
+    # Where one channel is clipped the others say what they say.
+    apart = plain and not at_once and target.pixels.shape[2] > 1
+    found, total = _statistics(bands, level, dark, apart=apart, keep=not target.streamed)
     reach = SINGLE if dtype == np.float32 else DOUBLE
     size = max(float(total.largest), float(np.max(total.scale)))
     if size > 0 and not 1 / reach <= size <= reach:
@@ -224,12 +229,8 @@ def _observe(
     if level is None and total.largest > 0 and SYMMETRIC_PIXELS < total.top < total.counts[2] and scene.lights:
         level = _plateau(bands, found, float(total.largest), grey)
         if level is not None:
-            found, total = _statistics(bands, level, dark, keep=not target.streamed)
+            found, total = _statistics(bands, level, dark, apart=apart, keep=not target.streamed)
     left_out = _left_out(total, height * width, level, dark, masked=mask is not None)
-
-    # Other losses, dark levels and steps of 0 are ways of one's own to say what pixels say.
-    plain = dark is None and problem.loss == "squared" and not target.least_squares
-    plain = plain and not target.streamed and device_count() == 1
 
     def tile(band: _Band, counted: tuple[np.ndarray, Statistics]) -> Tile:
         good, weight = counted[0], None
@@ -257,6 +258,11 @@ def _observe(
                 # Where a camera reads without noise no photon came to what is 0, and nothing was cut off.
                 floor = total.least if noise is None or noise[0] > 0 else -np.inf
                 bounds = open_ends(np.asarray(band.values), valid, floor, level, spread, width)
+        if apart and level is not None:
+            below = good[:, None] & (np.asarray(band.values) < level)
+            if np.count_nonzero(below) < below.shape[1] * np.count_nonzero(good):
+                each_value = below.astype(dtype)
+                weight = jax.device_put(each_value if weight is None else each_value * np.asarray(weight)[:, None])
         return Tile(band.values, weight, band.points, grey, bounds)
 
     tiles = each(tile, bands, found)
@@ -271,7 +277,8 @@ def _observe(
         counted = np.concatenate([good for good, _ in found]).reshape(height, width)
         shown = target.pixels.astype(dtype, copy=False), scene, counted
         if given is not None or noise is not None:
-            weights = np.concatenate([np.asarray(one.weight) for one in tiles]).reshape(height, width)
+            heaviest = [np.max(np.asarray(one.weight).reshape(one.target.shape[0], -1), axis=1) for one in tiles]
+            weights = np.concatenate(heaviest).reshape(height, width)
     rounding = np.maximum(brightest * resolution, target.step / np.sqrt(12.0))
     return tiles, rounding, brightest, left_out, *shown, weights
 
@@ -305,7 +312,7 @@ def _bands(
 
 
 def _statistics(
-    bands: Sequence[_Band], level: float | None, dark: float | None, *, keep: bool
+    bands: Sequence[_Band], level: float | None, dark: float | None, *, apart: bool, keep: bool
 ) -> tuple[Sequence[tuple[np.ndarray, Statistics]], Statistics]:
     """Which pixels of each band count and what there is to know of them, made anew where not kept; and of all."""
     limits = np.inf if level is None else level, -np.inf if dark is None else dark
@@ -313,10 +320,10 @@ def _statistics(
     def of_band(band: _Band) -> tuple[np.ndarray, Statistics]:
         seen = np.count_nonzero(band.points.mask), np.count_nonzero(band.allowed)
         if band.values.size > FEW_VALUES:
-            good, own = _count_many(band.values, band.allowed, *limits)
+            good, own = _count_many(band.values, band.allowed, *limits, apart=apart)
         else:
             with np.errstate(invalid="ignore", over="ignore"):
-                good, own = _count(np.asarray(band.values), band.allowed, *limits, xp=np)
+                good, own = _count(np.asarray(band.values), band.allowed, *limits, apart=apart, xp=np)
         return good, own._replace(counts=(*seen, *own.counts))
 
     def together(one: Statistics, other: Statistics) -> Statistics:
@@ -331,24 +338,24 @@ def _statistics(
     return found, functools.reduce(together, (statistics for _, statistics in found))
 
 
-def _count(values: Any, allowed: Any, level: float, dark: float, *, xp: Any) -> tuple[Any, Statistics]:
-    """Which pixels count, and what there is to know of them, in NumPy or JAX."""
-    brightest = over_channels(xp.maximum, values)
+def _count(values: Any, allowed: Any, level: float, dark: float, *, apart: bool, xp: Any) -> tuple[Any, Statistics]:
+    """Which pixels count, and what there is to know of them, in NumPy or JAX; apart, those with a channel below."""
+    brightest, dimmest = (over_channels(choose, values) for choose in (xp.maximum, xp.minimum))
     whole = xp.isfinite(over_channels(xp.add, values))
     finite = allowed & whole
     below = finite & (brightest < level)
-    good = below & (brightest > dark)
+    good = (finite & (dimmest < level) if apart else below) & (brightest > dark)
     masks, bright = (finite, below, good), xp.where(finite, brightest, -xp.inf)
     sizes = [xp.where(good, xp.abs(values[:, channel]), 0) for channel in range(values.shape[1])]
     terms = [*(mask.astype(np.int32) for mask in masks), bright, *sizes]
     found = totals(terms, ["add"] * len(masks) + ["maximum"] * (1 + len(sizes)), (0,))
     counts, (largest, *scale) = found[: len(masks)], found[len(masks) :]
     top = xp.count_nonzero(bright >= largest * TOP)
-    least = xp.min(xp.where(whole, over_channels(xp.minimum, values), xp.inf))
+    least = xp.min(xp.where(whole, dimmest, xp.inf))
     return good, Statistics(tuple(counts), largest, top, least, xp.stack(scale))
 
 
-_count_many = jax.jit(partial(_count, xp=jnp), compiler_options=COMPILER_OPTIONS)
+_count_many = jax.jit(partial(_count, xp=jnp), static_argnames="apart", compiler_options=COMPILER_OPTIONS)
 
 
 def _plateau(
@@ -383,7 +390,7 @@ def _left_out(
         raise InputError("target", "has no finite value on the object", "Give a picture with values")
     if level is not None:
         left_out["clipped"] = finite - below
-        if not below or (below < finite and counted and black):
+        if not max(below, counted) or (below < finite and counted and black):
             what = f"is clipped at {level:g} wherever it sees the object"
             raise InputError("target", what, "Give a darker exposure or a higher saturation")
     if dark is not None:

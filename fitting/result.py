@@ -238,7 +238,7 @@ class FitResult(Parameters):
         structure: correlation of neighbouring residuals.
         highlight_pixels: how many pixels carry the highlight; None without one.
         residual: root mean square of the residual over that of the picture.
-        pixels: how many pixels counted.
+        pixels: how many pixels counted in every channel.
         left_out: how many did not, by reason.
         warnings: what a user should know before using the numbers.
         candidates: the models that were compared, simplest first; empty where the user named it.

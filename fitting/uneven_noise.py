@@ -44,7 +44,8 @@ def in_codes(observed: Observed) -> Observed:
             return tile
         values, bounds = np.asarray(tile.target), tile.bounds
         if bounds is None:
-            says = np.full((len(values), 1), True) if tile.weight is None else np.asarray(tile.weight)[:, None] > 0
+            says = np.full(len(values), True) if tile.weight is None else np.asarray(tile.weight) > 0
+            says = says.reshape(len(values), -1)
             lower, upper = np.where(says, values, -np.inf), np.where(says, values, np.inf)
             index, width, unit = np.arange(len(values)), np.array(targets[one].pixels.shape[1]), np.ones(())
             bounds = Bounds(lower, upper, scale=unit, unit=unit, index=index, width=width, spread=unit)

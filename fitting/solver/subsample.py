@@ -37,6 +37,10 @@ _TERMS = 1 << 20
 _VALUES = 1 << 18
 
 
+# Single precision holds it.
+_HUGE = 1e38
+
+
 class Subsample(NamedTuple):
     """Some pixels of all pictures, and what they see.
 
@@ -94,7 +98,10 @@ class Subsample(NamedTuple):
             scale = float(np.max(np.abs(target), initial=0.0)) or 1.0
             target, weight, diffuse = (a.T.astype(np.float32) for a in (target / scale, part.weights, part.diffuse))
             value = lobe.value[np.ix_(few, np.arange(len(lobe.value[0])), unsure)].astype(np.float32)
-            x_a, x_d, x_s = (x / scale).astype(np.float32).transpose(2, 0, 1)[..., None]
+            if len(weight) > 1:
+                # Of a lobe that a channel hardly shows, where it counts, the coefficient may be huge.
+                value = value * (weight > 0)
+            x_a, x_d, x_s = np.minimum(x / scale, _HUGE).astype(np.float32).transpose(2, 0, 1)[..., None]
             still = x_a * np.asarray(part.ambient, np.float32)[:, None] + x_d * diffuse
             residual = target - still - x_s * value
             rise = (residual - residual[best]) * (residual + residual[best]) * weight

@@ -66,7 +66,7 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "") -> FitResult:
         hidden: why there is no highlight, where a fit with one has told.
     """
     optimum, pictures, residual = fit.optimum, fit.pictures, fit.residual
-    about = observed.result_fields() | {"optimum": optimum, "pixels": int(optimum.pixels[0])}
+    about = observed.result_fields() | {"optimum": optimum, "pixels": int(np.min(optimum.pixels))}
     weight = _typical_weight(pictures)
     rounding, columns = observed.rounding * weight, rms_columns(optimum, weight)
     noise = np.maximum(residual_noise(optimum, rounding) * fit.noise_factor, rounding)

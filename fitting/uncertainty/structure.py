@@ -25,8 +25,9 @@ CHANCE, SIGNIFICANT = 4.0, 3.2
 # What a block holds of all unknowns together: with less its residual is as it is. More than the other share of a number
 # is not taken for granted, or nothing would be known of it.
 LEAST_HELD, MOST_HELD = 0.1, 0.75
-# A block counts where this share of its pixels does.
-FULL = 0.5
+# A block counts where this share of its pixels does, and where its errors are not this share of the usual squares:
+# those of values that are surely clipped are next to nothing, and have one sign.
+FULL, QUIET = 0.5, 0.05
 
 
 class Errors(NamedTuple):
@@ -102,7 +103,8 @@ def structure(grids: Sequence[Blocks], sizes: Sequence[int] = SIZES, *, even: bo
             parts = [coarser(part, 2) for part in parts]
         joined, alone, pixels = np.concatenate([part.reshape(-1, 3) for part in parts]).T
         # In a block with few pixels the ratio says little.
-        seen = (pixels >= FULL * size**2 * even) & (alone > 0)
+        usual = np.sum(alone) / max(np.sum(pixels), 1.0)
+        seen = (pixels >= FULL * size**2 * even) & (alone > QUIET * usual * pixels * even)
         joined, alone, pixels = joined[seen], alone[seen], pixels[seen]
         if not joined.size:
             continue

@@ -8,6 +8,7 @@ from small_ball import ball_scene, pictured
 
 import brdf
 import fitting
+from brdf.errors import InputError
 from brdf.images.encoding import encode
 from fitting.photographs.ball import Circle, ball_points
 
@@ -160,3 +161,52 @@ def test_of_photons_that_are_counted_none_is_a_value():
         inside.append(abs(float(result["k_a"][0]) - 0.1) < 1.96 * result["k_a"][0].error)
     # Taken for noise that was cut off, zeros made it two thirds of that.
     assert sum(inside) >= 5
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("kind", ["sRGB of 8 bits", "floats"])
+@pytest.mark.parametrize("green", [2.0, 3.0])
+def test_where_one_channel_is_clipped_the_others_tell_the_highlight(green: float, kind: str):
+    """Green is clipped at and around all of it; red and blue are nowhere."""
+    material = brdf.BlinnPhong(k_a=[0.1, 0.1 * green, 0.1], k_d=[0.5, 0.5 * green, 0.4], k_s=[0.35] * 3, n=60.0)
+    sun, random = brdf.DirectionalLight([0.3, -0.4, 1.0], 1.0), np.random.default_rng(4)
+    scene = ball_scene(sun, ambient=[0.5] * 3)
+    clean = pictured(material, scene)
+    if kind == "floats":
+        picture = np.minimum(clean + random.normal(0, 0.005, clean.shape), 1.0)
+        result = fitting.fit(picture, scene)
+    else:
+        codes = 255 * encode(np.minimum(clean, 4.0), "srgb") + random.normal(0, 0.7, clean.shape)
+        picture = np.rint(np.clip(codes, 0, 255)).astype(np.uint8)
+        result = fitting.fit(picture, scene, encoding="srgb")
+    clipped = picture >= picture.max()
+    assert np.count_nonzero(clipped[..., 1]) > 100 > np.count_nonzero(clipped[..., [0, 2]])
+    assert result.surface == "blinn-phong"
+    assert not result.warnings
+    assert result.left_out["clipped"] == np.count_nonzero(clipped.any(axis=-1) & result.counted[0])
+    for parameter in result.parameters:
+        true = np.ravel(getattr(material, parameter.name))[parameter.channel or 0]
+        assert abs(float(parameter) - true) < 4 * np.array(parameter.error), parameter
+
+
+def test_of_clipped_values_nothing_is_said_to_err_together():
+    """The errors of those that are surely clipped are next to nothing, and have one sign."""
+    material, random = brdf.BlinnPhong(k_a=[0.1], k_d=[1.1], k_s=[0.4], n=20.0), np.random.default_rng(0)
+    clean, warnings = np.asarray(brdf.render(material, SCENE)), []
+    for _ in range(DRAWS):
+        picture = np.rint(np.clip(255 * clean + random.normal(0, 2.0, clean.shape), 0, 255)).astype(np.uint8)
+        assert np.mean(picture[POINTS.mask] == 255) > 0.2
+        warnings += fitting.fit(picture, SCENE, model="blinn-phong").warnings
+    assert not any("structure" in words for words in warnings)
+
+
+def test_a_channel_that_is_clipped_everywhere_is_told_by_another_picture_or_refused():
+    material = brdf.BlinnPhong(k_a=[0.1, 2.2, 0.1], k_d=[0.5, 1.0, 0.4], k_s=[0.35] * 3, n=60.0)
+    scenes = [ball_scene(brdf.DirectionalLight([0.3, -0.4, 1.0], e), ambient=[0.5 * e] * 3) for e in (1.0, 0.3)]
+    long, short = (np.rint(255 * np.minimum(pictured(material, one), 1.0)).astype(np.uint8) for one in scenes)
+    with pytest.raises(InputError, match="is clipped in channel green wherever it sees the object"):
+        fitting.fit(long, scenes[0], model="blinn-phong")
+    result = fitting.fit([long, short], scenes, model="blinn-phong")
+    for parameter in result.parameters:
+        true = np.ravel(getattr(material, parameter.name))[parameter.channel or 0]
+        assert abs(float(parameter) - true) < 4 * np.array(parameter.error), parameter
