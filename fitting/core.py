@@ -228,14 +228,15 @@ def _fit_simplest(observed: Observed) -> tuple[ModelFit, Choice]:
             }
         fits[name] = _fit_model(brdf.MODELS[name], observed)
     least = min(float(np.sum(fit.optimum.cost)) for fit in fits.values())
-    by_squares, precision = dict(fits), None
-    for name, fit in fits.items():
+    by_squares, precision, likeliest = dict(fits), None, -math.inf
+    for name, fit in sorted(fits.items(), key=lambda one: float(np.sum(one[1].optimum.cost))):
         if np.sum(fit.optimum.cost) <= HOPELESS * least:
             grey = coefficient_factors(fit.model, fit.optimum.n, colour)[2]
-            fits[name] = fit = most_likely(fit, grey=grey, precision=precision)
+            fits[name] = fit = most_likely(fit, grey=grey, precision=precision, rival=likeliest)
             precision = None if fit.evidence is None else fit.evidence.precision
-    # A lobe that would be wider than the search allows is no highlight: it mends what Lambert's law leaves at the rim.
-    fits = {name: fit for name, fit in fits.items() if fit.optimum.flat or fit.optimum.n > WIDEST * problem.n_range[0]}
+            if fit.evidence is not None and not _too_wide(fit, problem):
+                likeliest = max(likeliest, fit.evidence.value)
+    fits = {name: fit for name, fit in fits.items() if not _too_wide(fit, problem)}
     fits = fits or {"lambert": most_likely(_fit_model(brdf.Lambert, observed))}
     if problem.loss != "squared":
         # Weights are part of what is minimised: those of the better family serve all, or costs could not be compared.
@@ -298,6 +299,11 @@ def _fit_simplest(observed: Observed) -> tuple[ModelFit, Choice]:
         optimum = refit(pictures, optimum, choice.free, chosen.n_range, tied)
     chosen = chosen._replace(pictures=pictures, optimum=optimum, free=choice.free, tied=tied)
     return most_likely(chosen), choice
+
+
+def _too_wide(fit: ModelFit, problem: FitProblem) -> bool:
+    """A lobe wider than the search allows is no highlight: it mends what Lambert's law leaves at the rim."""
+    return not fit.optimum.flat and fit.optimum.n <= WIDEST * problem.n_range[0]
 
 
 def _less_codec_errors(

@@ -63,6 +63,9 @@ MOST_ROUNDS, ENOUGH_CHANGE, ENOUGH_NOISE_CHANGE, ENOUGH_MOVED, MOST_AHEAD = 15, 
 ALIKE, FEWEST_ALIKE, MORE_ALIKE, MOST_COUNTED = 1024, 64, 10, 1 << 20
 # A picture of fewer different predictions is one of planes; so many pixels tell.
 MOST_LEVELS, MOST_PIXELS = 32, 4096
+# A subsample tells that a model is hopeless where the logarithm of its likelihood is so much below that of another one,
+# and by such a share of itself: many pixels are near an edge where the model is wrong, and only there.
+HOPELESS, HOPELESS_SHARE = 1000.0, 0.5
 # An open end tells where a value is predicted within so many s of it; noise below this share of the picture is none.
 END_REACH, NO_NOISE = 4.0, 1e-5
 
@@ -84,13 +87,16 @@ class Numbers(NamedTuple):
         return cls(math.exp(unknowns[-1]), unknowns[:-1].reshape(3, -1))
 
 
-def most_likely(fit: ModelFit, *, grey: np.ndarray | None = None, precision: np.ndarray | None = None) -> ModelFit:
+def most_likely(
+    fit: ModelFit, *, grey: np.ndarray | None = None, precision: np.ndarray | None = None, rival: float = -math.inf
+) -> ModelFit:
     """A fit by what rounded values and open ends say, from least squares on; as it is where they say no more.
 
     Args:
         fit: by least squares.
         grey: x_s of a grey k_s, which a highlight has where channels err together; None for any colour.
         precision: see `Evidence`; None finds it out where channels err together.
+        rival: logarithm of the likelihood of another model; of a fit that is by far less likely a subsample tells.
     """
     if fit.capped or any(picture.bounds is None for picture in fit.pictures):
         return fit
@@ -120,7 +126,7 @@ def most_likely(fit: ModelFit, *, grey: np.ndarray | None = None, precision: np.
         evidence = _reweighted(fit._replace(pictures=pictures), noise, rounding, precision, together=together)
     else:
         start = Estimate(np.append(optimum.x.ravel(), math.log(optimum.n)), max(noise, FIRST_NOISE))
-        evidence = _near_edges(fit._replace(pictures=pictures), start)
+        evidence = _near_edges(fit._replace(pictures=pictures), start, rival)
     return fit._replace(
         optimum=dataclasses.replace(optimum, x=evidence.optimum.x, n=evidence.optimum.n), evidence=evidence
     )
@@ -214,7 +220,7 @@ def _kinds(code: Int[np.ndarray, " P"]) -> tuple[Int[np.ndarray, " P"], Int[np.n
     return kind, count
 
 
-def _near_edges(fit: ModelFit, at: Estimate) -> Evidence:
+def _near_edges(fit: ModelFit, at: Estimate, rival: float = -math.inf) -> Evidence:
     """Where rounding is most of the noise: what pixels near the edge of a code say."""
     pictures, design = fit.pictures, design_of(fit.free, fit.tied)
     separable = partial(_Separable, design=design, n_range=fit.n_range, copies=fit.copies)
@@ -223,8 +229,8 @@ def _near_edges(fit: ModelFit, at: Estimate) -> Evidence:
     problem = separable(some)
     at, precisions, score = maximise(problem, at, ROUGHLY_KNOWN, FEWEST_VALUES) if large else maximise(problem, at)
     if (even := _evener_in_light(problem, at)) is not None:
-        return _near_edges(fit._replace(pictures=_in_light(pictures)), even)
-    if large:
+        return _near_edges(fit._replace(pictures=_in_light(pictures)), even, rival)
+    if large and rival - at.value < max(HOPELESS, HOPELESS_SHARE * abs(at.value)):
         # The whole picture has the pixels near an edge that a part of it lacks.
         at = at._replace(noise=most_informative(precisions).noise)
         problem = separable(_gathered(pictures, at))
