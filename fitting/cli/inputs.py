@@ -267,12 +267,9 @@ def _directions(inputs, points, options) -> Any:
     """The direction of the light of each photograph; and the inputs with what the shading tells of it."""
     targets, file = inputs.targets, options.lights
     if file is not None and file.suffix.lower() == ".lp":
-        from fitting.maps.map_inputs import read_lights
+        from fitting.maps.map_inputs import named_directions
 
-        by_name = {path.name: direction for path, direction in zip(*read_lights(file), strict=True)}
-        for target in targets:
-            _require(target.name in by_name, file, f"names no {target.name}", "Name the photographs as the file does")
-        return [by_name[target.name] for target in targets], inputs
+        return list(named_directions(file, [target.name for target in targets])), inputs
     if file is not None:
         return read_directions(file, len(targets)), inputs
     if options.light != "fit":

@@ -54,7 +54,7 @@ def fit_maps(
             `brdf.ImageReader` or files; or a folder with an ``.lp`` file, or with DiLiGenT's text files.
         lights: towards the lights, (P, 3), x right, y up, z to the camera; or directional lights; or scenes with one
             light of any kind each, whose camera and shapes, the same in all, tell what texels see, cast shadows left
-            out; or an ``.lp`` or text file. None for the folder's.
+            out; or a text file; or an ``.lp`` file, in which files are looked for by name. None for the folder's.
         normals: (H, W, 3), y up, codes being n·0.5 + 0.5; or a file of them (.npy, .exr, or an image); "fit" to find
             them too, under distant lights. None for the scene's or the folder's ``normals.*``, else they are found.
         intensities: of the lights, (P,) or (P, C): photographs are divided by them.

@@ -3,7 +3,8 @@
 import dataclasses
 import functools
 import hashlib
-from collections.abc import Callable, Iterable
+import re
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from jaxtyping import Float, Int
 
 import brdf
 from brdf.errors import InputError, as_numbers
-from brdf.files import parse_number, read_text
+from brdf.files import input_file, parse_number, read_text
 from brdf.images.encoding import Encoding, decode, parse_encoding
 from fitting.photographs.archives import read_array
 from fitting.photographs.light_files import MOST_BYTES, read_directions, read_intensities
@@ -152,16 +153,43 @@ def read_lights(path: str | Path) -> tuple[list[Path], Float[np.ndarray, "P 3"]]
     return names, np.array(directions)
 
 
+def named_directions(path: str | Path, names: Sequence[str]) -> Float[np.ndarray, "P 3"]:
+    """The lights of some photographs, by their names.
+
+    Args:
+        path: an ``.lp`` file, as for `read_lights`.
+        names: of the photographs, without folders.
+
+    Raises:
+        InputError: where it does not name one of them, or names one twice.
+    """
+    listed, directions = read_lights(path)
+    every = [one.name for one in listed]
+    for name in names:
+        if every.count(name) != 1:
+            what = f"names {name} {every.count(name)} times" if name in every else f"names no {name}"
+            raise InputError(path, what, "Name each photograph once, as the file of lights does")
+    return directions[[every.index(name) for name in names]]
+
+
+def _by_number(path: Path) -> tuple[list[Any], str]:
+    """What sorts 2.png before 10.png."""
+    parts = re.split("([0-9]+)", path.name)
+    return [int(part) if place % 2 else part for place, part in enumerate(parts)], path.name
+
+
 def read_folder(folder: Path) -> dict[str, Any]:
     """What a folder of photographs says: ``pictures`` and ``lights``, and ``intensities``, ``mask``, ``normals``.
 
     Args:
-        folder: with one ``.lp`` file, or with ``filenames.txt`` and ``light_directions.txt`` as DiLiGenT has them.
+        folder: with one ``.lp`` file, or with ``filenames.txt`` and ``light_directions.txt`` as DiLiGenT has them;
+            without the names photographs are taken in the order of the numbers in theirs. Hidden files are left out.
 
     Raises:
         InputError: naming what is missing.
     """
-    tables, names = sorted(folder.glob("*.lp")), folder / "filenames.txt"
+    visible = sorted((path for path in folder.iterdir() if not path.name.startswith(".")), key=_by_number)
+    tables, names = [path for path in visible if path.suffix.lower() == ".lp"], folder / "filenames.txt"
     found: dict[str, Any] = {}
     if len(tables) == 1:
         found["pictures"], found["lights"] = read_lights(tables[0])
@@ -169,7 +197,7 @@ def read_folder(folder: Path) -> dict[str, Any]:
         lines = read_text(names, MOST_BYTES).split("\n") if names.is_file() else []
         listed = [folder / line.strip() for line in lines if line.strip()]
         beside = ("mask", "normal")
-        every = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in PICTURES]
+        every = [path for path in visible if path.suffix.lower() in PICTURES]
         found["pictures"] = listed or [path for path in every if not path.stem.lower().startswith(beside)]
         found["lights"] = read_directions(folder / "light_directions.txt", len(found["pictures"]))
         if (folder / "light_intensities.txt").is_file():
@@ -197,7 +225,7 @@ def normal_map(given: Any, *, flip_y: bool = False) -> Float[np.ndarray, "H W 3"
     if isinstance(given, str | Path):
         name = str(given)
         if name.lower().endswith(".npy"):
-            with Path(given).open("rb") as file:
+            with input_file(given).open("rb") as file:
                 normal = np.array(read_array(file, given, Path(given).stat().st_size))
         else:
             with brdf.ImageReader(given, encoding="linear") as reader:
@@ -231,7 +259,8 @@ def photographs(
     Args:
         pictures: (P, H, W, C) or (P, H, W) linear values; unsigned integers span their type. Or a list of such
             pictures, `brdf.Picture`, `brdf.ImageReader`, or files.
-        lights: (P, 3) towards the lights, P lights, P scenes with one light each, or an ``.lp`` or text file.
+        lights: (P, 3) towards the lights, P lights, P scenes with one light each, or a text file, or an ``.lp`` file:
+            photographs that are files have the lights of their names there, others those of their places.
         intensities: (P,) or (P, C), which the photographs are divided by.
         exposures: (P,), likewise.
         encoding: of files and arrays.
@@ -240,9 +269,10 @@ def photographs(
         InputError: naming the photograph or argument.
     """
     for name, given in (("pictures", pictures), ("lights", lights)):
-        if not isinstance(given, Iterable):
+        if not isinstance(given, Iterable | Path):
             what = "are missing" if given is None else f"must be a list, got {type(given).__name__}"
             raise InputError(name, what, "Give a photograph for each light, and a direction towards each light")
+    pictures = list(pictures)
     each = [_opened(f"pictures[{i}]", picture, encoding) for i, picture in enumerate(pictures)]
     if not each:
         raise InputError("pictures", "is empty", "Give a photograph for each light")
@@ -252,7 +282,13 @@ def photographs(
             what = f"is of shape {one.shape}, {first.name} of {first.shape}"
             raise InputError(one.name, what, "Give photographs of one size")
     if isinstance(lights, str | Path):
-        lights = read_lights(lights)[1] if Path(lights).suffix.lower() == ".lp" else read_directions(lights)
+        files = [picture if isinstance(picture, str | Path) else getattr(picture, "path", None) for picture in pictures]
+        if Path(lights).suffix.lower() != ".lp":
+            lights = read_directions(lights)
+        elif None in files:
+            lights = read_lights(lights)[1]
+        else:
+            lights = named_directions(lights, [Path(file).name for file in files if file is not None])
     lights = list(lights)
     if len(lights) != len(each):
         raise InputError("lights", f"are {len(lights)} for {len(each)} photographs", "Give a light for each photograph")

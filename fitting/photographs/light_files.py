@@ -61,7 +61,7 @@ def read_intensities(path: str | Path, count: int | None = None) -> Float[np.nda
     def is_fine(row):
         return min(row) >= 0 and any(row)
 
-    return _read_rows(path, count, None, is_fine, "of 0 or more", "Give the intensity of each channel")
+    return _read_rows(path, count, None, is_fine, "of 0 or more, not all 0", "Give the intensity of each channel")
 
 
 def _read_rows(

@@ -243,6 +243,7 @@ CASES: list[tuple[dict[str, Any], str, str]] = [
     ({}, f"{BALL} --lights none.txt", "none.txt: there is no such file"),
     ({"i.txt": "1 1"}, f"{LIT} --intensities i.txt", "i.txt: has 2 numbers a line, the pictures 1 channels"),
     ({"i.txt": "-1"}, f"{LIT} --intensities i.txt", "i.txt: line 1: must be 1 numbers of 0 or more"),
+    ({"i.txt": "0 0 0"}, f"{LIT} --intensities i.txt", "i.txt: line 1: must be 3 numbers of 0 or more, not all 0"),
     ({}, f"{LIT} --exposure 0", "--exposure: must be above 0"),
     ({}, f"{LIT} --exposure 1,2,3", "--exposure: must be 1 finite"),
     ({}, f"{LIT} --normals 0.png", "--normals: says what --sphere says too"),

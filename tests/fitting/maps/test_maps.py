@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -537,6 +538,31 @@ def test_how_silent_files_are_encoded_is_told_by_the_texels_that_count(tmp_path,
     assert fitting.fit_maps(paths, scenes).notes[0].endswith("read as sRGB. Where you know, say so with the encoding")
 
 
+def test_photographs_have_the_lights_of_their_names(folder):
+    """Sorted by letters 10 comes before 2; a Mac's hidden file beside the lights is none of them."""
+    path, _ = folder
+    maps = fitting.fit_maps(path)
+    (path / "lights.lp").rename(path / "lights.LP")
+    (path / "._lights.lp").write_bytes(b"\0\5\26\7")
+    (path / "._photo 0.png").write_bytes(b"\0\5\26\7")
+    files = sorted(path.glob("photo*.png"))
+    normals = path / "normals.png"
+    found = [fitting.fit_maps(path), fitting.fit_maps(files, path / "lights.LP", normals)]
+    found += [fitting.fit_maps(files, str(path / "lights.LP"), normals)]
+    names, directions = read_lights(path / "lights.LP")
+    assert files != names
+    (path / "lights.LP").rename(path / "lights.txt")
+    np.savetxt(path / "light_directions.txt", directions)
+    found += [fitting.fit_maps(path), fitting.fit_maps(names, path / "light_directions.txt", normals)]
+    for other in found:
+        np.testing.assert_allclose(other.k_d, maps.k_d, rtol=1e-3)
+    some = (path / "lights.txt").read_text().replace("photo 3", "photo 4")
+    (path / "lights.lp").write_text(some)
+    for given, words in ((names[3:4], "names no photo 3.png"), (names[4:5], "names photo 4.png 2 times")):
+        with pytest.raises(brdf.InputError, match=words):
+            fitting.fit_maps(given, path / "lights.lp", normals)
+
+
 @pytest.mark.parametrize(
     ("line", "name"),
     [
@@ -618,6 +644,8 @@ def test_a_broken_folder_is_told_in_one_line(folder, what, words):
         ({"ambient": "dim"}, "ambient"),
         ({"exposures": "long"}, "exposures"),
         ({"lights": 6}, "lights"),
+        ({"lights": Path("none.lp")}, "none.lp: there is no such file"),
+        ({"normals": "none.npy"}, "none.npy: there is no such file"),
         ({"lights": [brdf.PointLight(light, 1.0) for light in dome(6)]}, "for lights that are near a scene"),
         ({"pictures": None}, "pictures"),
         ({"to_view": [0, 0, 0]}, "to_view"),
