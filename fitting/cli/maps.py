@@ -23,6 +23,7 @@ def maps(
     mask: Path | None = None,
     ambient: bool = False,
     flip_y: bool = False,
+    saturation: float | None = None,
     encoding: Any = None,
     plot: bool = False,
     report: Path | None = None,
@@ -41,6 +42,7 @@ def maps(
         mask: an image: pixels that are 0 there are left out.
         ambient: the view is lit from all around too: find k_a for that light as 1.
         flip_y: y goes down in the file of normals.
+        saturation: linear values from here on are clipped, not data.
         encoding: linear, srgb or a gamma; default: what the file says.
         plot: also draw maps.png into --out.
         report: one .html page with everything, to keep or to send.
@@ -68,6 +70,7 @@ def maps(
             mask=mask,
             ambient=1.0 if ambient else None,
             flip_y=flip_y,
+            saturation=saturation,
             encoding=encoding,
             precision=precision,
             mesh=mesh,

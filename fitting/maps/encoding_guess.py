@@ -45,7 +45,8 @@ def likelier(problem: MapProblem) -> tuple[MapProblem, tuple[str, ...]]:
         readings[name] = one = dataclasses.replace(problem, photographs=given.read_as(encoding))
         with waiting(f"fitting some texels as {name}"):
             layers = {key: layer[: texels.size] for key, layer in one.fit(*one.tiles(texels)).items()}
-        left[name] = 255 * np.nanmedian(layers["noise"] * np.sqrt(1 + OUTLIER**2 * layers["left_out"]))
+        codes = 255 * np.sqrt(np.mean(given.unit**2)) * layers["noise"]
+        left[name] = np.nanmedian(codes * np.sqrt(1 + OUTLIER**2 * layers["left_out"]))
     if left[other] ** 2 < LESS * left[usual] ** 2:
         usual, other = other, usual
     note += f" {usual}, under which the maps are off by {left[usual]:.2g} codes, under {other} by {left[other]:.2g}"

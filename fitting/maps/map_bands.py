@@ -2,6 +2,8 @@
 
 import os
 import threading
+import zipfile
+import zlib
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -47,12 +49,12 @@ def fit_bands(problem: MapProblem, keep: Path | None = None) -> dict[str, np.nda
     layers: dict[str, np.ndarray] = {}
 
     def band(index):
-        path = kept[index]
-        if path is not None and path.is_file():
-            return read_band(path)
+        found = read_band(kept[index])
+        if found is not None:
+            return found, None
         with reading:
             tiles = problem.tiles(bands[index])
-        return problem.fit(*tiles, index)
+        return problem.fit(*tiles, index), kept[index]
 
     def place(index, found):
         for name, values in found.items():
@@ -63,18 +65,18 @@ def fit_bands(problem: MapProblem, keep: Path | None = None) -> dict[str, np.nda
             layers[name][places(bands[index])] = values[: bands[index].size]
 
     with waiting("fitting maps") as say, ThreadPoolExecutor(os.cpu_count()) as pool:
-        for done, (index, found) in enumerate(zip(mine, pool.map(band, mine), strict=True), start=1):
+        for done, (index, (found, path)) in enumerate(zip(mine, pool.map(band, mine), strict=True), start=1):
             place(index, found)
-            path = kept[index]
-            if path is not None and not path.is_file():
+            if path is not None:
                 write_band(path, found)
             say(f"fitting maps, {100 * done // len(mine)} % done")
     if others:
         gathered({}, 1, (1,))  # until all processes have kept theirs
         for index in others:
-            path = kept[index]
-            assert path is not None
-            place(index, read_band(path))
+            found = read_band(kept[index])
+            if found is None:
+                raise InputError(str(kept[index]), "is missing or damaged", "Give a folder that all processes see")
+            place(index, found)
         gathered({}, 1, (1,))  # and have read those of the others
     return {name: values.reshape(height, width, *values.shape[1:]) for name, values in layers.items()}
 
@@ -96,7 +98,7 @@ def _key(problem: MapProblem) -> str:
     """Of all that maps depend on: files by name, size and time, arrays by content."""
     sources = []
     for one in problem.photographs.each:
-        sources.append(one.curve)
+        sources += one.curve, one.top
         if Path(one.name).is_file():
             status = Path(one.name).stat()
             sources += one.name, status.st_size, status.st_mtime_ns
@@ -106,10 +108,15 @@ def _key(problem: MapProblem) -> str:
     return fingerprint(named)
 
 
-def read_band(path: Path) -> dict[str, np.ndarray]:
-    """The layers of a band."""
-    with np.load(path) as layers:
-        return dict(layers)
+def read_band(path: Path | None) -> dict[str, np.ndarray] | None:
+    """The layers of a band; None where they are not kept, or not whole."""
+    if path is None or not path.is_file():
+        return None
+    try:
+        with path.open("rb") as file, np.load(file) as layers:
+            return dict(layers)
+    except (OSError, ValueError, EOFError, TypeError, zipfile.BadZipFile, zlib.error):
+        return None
 
 
 def write_band(path: Path, layers: dict[str, np.ndarray]) -> None:

@@ -15,6 +15,7 @@ from fitting.maps.encoding_guess import likelier
 from fitting.maps.map_bands import fit_bands
 from fitting.maps.map_inputs import Photographs
 from fitting.maps.map_result import Maps
+from fitting.maps.photograph_levels import in_unit, with_levels
 from fitting.maps.shared_exponent import with_shared_n
 from fitting.maps.tiles import MapProblem, Surface
 from fitting.problem import model_name
@@ -24,6 +25,9 @@ LOSSY = (
     "{} was compressed with losses, by which neighbours err together, in every photograph alike: errors may be four "
     "times too small, and a faint highlight may be the codec's"
 )
+
+COPLANAR = 1e-3
+"""Singular value of the directions towards lights: in a plane the least is 0."""
 
 
 def fit_maps(
@@ -38,6 +42,7 @@ def fit_maps(
     model: Any = "blinn-phong",
     specular: str = "coloured",
     mask: Any = None,
+    saturation: Any = None,
     encoding: Any = None,
     flip_y: bool = False,
     precision: Precision = "float32",
@@ -65,7 +70,10 @@ def fit_maps(
         model: "lambert", "phong", "blinn-phong" or a normalised form; "auto" for the simplest of Lambert, Phong and
             Blinn-Phong that serves each texel, by the Bayesian information criterion for few values.
         specular: "coloured", or "grey": the channels share k_s.
-        mask: (H, W), or a file: texels to look at. None for the folder's ``mask.*``, else all.
+        mask: (H, W), or a file: texels to look at. None for the folder's ``mask.*``, else all. Those that a
+            photograph has as fully transparent are left out.
+        saturation: linear value of the photographs, as they are read, from which on they are clipped. None for the
+            largest code of integers, and for the largest value of all where many texels share it, which a note says.
         encoding: of files and arrays: "linear", "srgb" or a gamma; None for what files say, and linear arrays. Where
             files of integers say nothing, a note says as what they were read: under distant lights as that which the
             model explains better, else those of 8 bits as sRGB, of more as linear.
@@ -114,15 +122,21 @@ def fit_maps(
     if surface.points is not None:
         to_view = np.sum(np.asarray(surface.points.to_view, float)[np.asarray(surface.mask)], axis=0)
     problem = MapProblem(given, surface, models, specular == "grey", _ambient(ambient, given), to_view, precision)
+    problem, unit, clipping = with_levels(problem, saturation)
     problem, notes = likelier(problem)
+    notes += clipping
     if lossy := [one.name for one in given.each if one.lossy]:
         notes += (LOSSY.format(lossy[0]),)
     with spread_over(mesh):
         if labels is not None:
             problem = with_shared_n(problem, labels)
-        layers = fit_bands(problem, None if keep is None else Path(keep))
+        layers = in_unit(fit_bands(problem, None if keep is None else Path(keep)), unit)
     layers.pop("criterion")
     if np.all(np.isnan(layers["k_d"])):
+        to_light = given.to_light if surface.normal is None else None
+        if to_light is not None and np.linalg.svd(to_light, compute_uv=False)[-1] < COPLANAR:
+            what = "lie in a plane with the texel, of which normals are not found"
+            raise InputError("lights", what, "Give normals, or lights from all sides")
         raise InputError("pictures", "show no texel that counts", "Check mask, normals and clipping")
     names = tuple(one.name for one in models)
     return Maps(models=names, to_view=to_view, notes=notes, to_light=given.to_light, **layers)
@@ -155,6 +169,7 @@ def _surface(given: Photographs, normals: Any, mask: Any, precision: Precision, 
     if mask.shape != (height, width):
         what = f"is of shape {mask.shape}, the photographs of {(height, width)}"
         raise InputError("mask", what, "Give a value for each pixel")
+    mask = mask & given.opaque()
     if given.scenes is not None:
         if normals is not None:
             raise InputError("normals", "are told by the scenes", "Leave them out")

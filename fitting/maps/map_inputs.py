@@ -11,20 +11,19 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 import brdf
 from brdf.errors import InputError, as_numbers
 from brdf.files import input_file, parse_number, read_text
-from brdf.images.encoding import Encoding, decode, parse_encoding
+from brdf.images.encoding import Encoding, decode, encode, parse_encoding
 from fitting.photographs.archives import read_array
 from fitting.photographs.light_files import MOST_BYTES, read_directions, read_intensities
+from fitting.problem import TOP
 
 PICTURES = (".exr", ".hdr", ".png", ".tif", ".tiff", ".jpg", ".jpeg")
 # An image's code 0 in all channels, and those about the middle, are how tools write "no surface".
 NO_SURFACE = 0.25
-# Values are clipped from the largest on, but for rounding.
-BELOW_TOP = 1 - 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,6 +38,8 @@ class Photograph:
         curve: how it is encoded, which tells how exact its values are: noise is even in codes.
         silent: whether it is a file of integers that does not say so.
         lossy: whether it was compressed with losses.
+        fine: whether it is of floats, or integers of more than 8 bits.
+        alpha: reads how opaque pixels are, (H, W), or None where nobody says.
     """
 
     rows: Callable[[int, int], Float[np.ndarray, "rows W C"]]
@@ -48,6 +49,13 @@ class Photograph:
     curve: Encoding
     silent: bool = False
     lossy: bool = False
+    fine: bool = True
+    alpha: Callable[[], Float[np.ndarray, "H W"] | None] = lambda: None
+
+    def read_as(self, encoding: Encoding) -> "Photograph":
+        """The same file read so, clipped at the same code."""
+        top = float(decode(encode(np.array(self.top), self.curve), encoding))
+        return dataclasses.replace(_opened(self.name, Path(self.name), encoding), top=top)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,9 +81,17 @@ class Photographs:
         """Height, width and channels."""
         return self.each[0].shape
 
+    def opaque(self) -> Bool[np.ndarray, "H W"]:
+        """Pixels that no photograph has as fully transparent; alpha that is 0 everywhere was not meant."""
+        found = np.ones(self.size[:2], bool)
+        for alpha in (one.alpha() for one in self.each):
+            if alpha is not None and alpha.any():
+                found &= alpha > 0
+        return found
+
     def read_as(self, encoding: Encoding) -> "Photographs":
         """The same, silent files read so."""
-        each = (_opened(one.name, Path(one.name), encoding) if one.silent else one for one in self.each)
+        each = (one.read_as(encoding) if one.silent else one for one in self.each)
         return dataclasses.replace(self, each=tuple(each))
 
     def tiles(
@@ -322,10 +338,13 @@ def _opened(name: str, picture: Any, encoding: Any) -> Photograph:
         if encoding is not None:
             raise InputError("encoding", f"is that of files and arrays, {name} is decoded", "Leave it out")
         if isinstance(picture, brdf.ImageReader):
-            top = (picture.codes[0] or np.inf) * BELOW_TOP
-            return Photograph(picture.rows, picture.shape, name, top, picture.encoding)
-        top = (picture.saturation or np.inf) * BELOW_TOP
-        return Photograph(lambda a, b: picture.pixels[a:b], picture.pixels.shape, name, top, picture.encoding)
+            top = (picture.codes[0] or np.inf) * TOP
+            fine = not picture.is_integer or picture.bits > 8
+            how = {"fine": fine, "alpha": picture.read_alpha}
+            return Photograph(picture.rows, picture.shape, name, top, picture.encoding, **how)
+        top = (picture.saturation or np.inf) * TOP
+        how = {"fine": picture.saturation is None or picture.bits > 8, "alpha": lambda: picture.alpha}
+        return Photograph(lambda a, b: picture.pixels[a:b], picture.pixels.shape, name, top, picture.encoding, **how)
     values = np.asarray(picture)
     values = values[..., None] if values.ndim == 2 else values
     integer = values.dtype.kind == "u"
@@ -338,7 +357,7 @@ def _opened(name: str, picture: Any, encoding: Any) -> Photograph:
         part = values[start:stop]
         return decode(part if white is None else part / white, curve)
 
-    return Photograph(rows, values.shape, name, BELOW_TOP if integer else np.inf, curve)
+    return Photograph(rows, values.shape, name, TOP if integer else np.inf, curve, fine=values.dtype != np.uint8)
 
 
 def _factors(count: int, channels: int, name: str, given: Any) -> Float[np.ndarray, "P C"]:

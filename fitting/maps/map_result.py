@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 import brdf
-from brdf.errors import InputError
-from brdf.files import read_text
+from brdf.errors import InputError, what_came
+from brdf.files import as_path, read_text
 from brdf.models.base import SpecularMaterial
 
 REASONS = (
@@ -102,10 +102,9 @@ class Maps:
             lines += [f"  {words:<36}{100 * share:6.1f} %"] if share else []
         for name, values in (("n", self.n), ("k_d", self.k_d), ("k_s", self.k_s), ("residual", self.residual)):
             known = values[np.isfinite(values)]
-            quartiles = np.percentile(known, [25, 50, 75]) if known.size else [np.nan] * 3
-            lines.append(
-                f"  {name:<9} median {quartiles[1]:.4g}, half of it from {quartiles[0]:.4g} to {quartiles[2]:.4g}"
-            )
+            if known.size:
+                low, middle, high = np.percentile(known, [25, 50, 75])
+                lines.append(f"  {name:<9} median {middle:.4g}, half of it from {low:.4g} to {high:.4g}")
         if self.left_out is not None and np.any(self.left_out > 0):
             left_out = 100 * np.mean(self.left_out[inside])
             lines.append(f"  cast shadows and other outliers: {left_out:.1f} % of the values left out")
@@ -238,23 +237,32 @@ def load_maps(folder: str | Path) -> Maps:
         >>> fitting.load_maps("maps").models
         ('blinn-phong',)
     """
-    path = Path(folder) / "maps.json"
+    folder = as_path(folder)
+    path, remedy = folder / "maps.json", "Give a folder that Maps.save wrote"
+    text = read_text(path)
     try:
-        about = json.loads(read_text(path))
+        about = json.loads(text)
         kinds = {name: np.dtype(kind) for name, kind in about["layers"].items()}
-        texts = tuple(about["models"]), np.array(about["to_view"], float), tuple(about["notes"])
-        to_light = np.array(about["to_light"], float) if about.get("to_light") else None
+        (*models,), (*notes,) = about["models"], about["notes"]
+        unknown = [name for name in models if name not in brdf.MODELS]
+        to_view = np.array(about["to_view"], float).reshape(3)
+        to_light = np.array(about["to_light"], float).reshape(-1, 3) if about.get("to_light") else None
     except (ValueError, KeyError, TypeError, AttributeError):
-        raise InputError(path, "does not describe maps", "Give a folder that Maps.save wrote") from None
-    found = brdf.read_layers(Path(folder) / "maps.exr")
+        raise InputError(path, "does not describe maps", remedy) from None
+    if unknown or not models:
+        raise InputError(path, f"names no models that are known, got {what_came(about['models'])}", remedy)
+    fields = {field.name: field.default is dataclasses.MISSING for field in dataclasses.fields(Maps)}
+    if missing := [name for name in fields if fields[name] and name not in {"models", "to_view", *kinds}]:
+        raise InputError(path, f"names no layer {missing[0]}", remedy)
+    found = brdf.read_layers(folder / "maps.exr")
     layers = {}
     for name, kind in kinds.items():
-        if name not in found:
-            raise InputError(Path(folder) / "maps.exr", f"has no layer {name}", "Write the maps again")
+        if name not in found or name not in fields:
+            raise InputError(folder / "maps.exr", f"has no layer {name} of maps", "Write the maps again")
         values = (
             found[name]
             if name.startswith(("k_", "fitted_k", "normal")) and name != "normal_error"
             else found[name][..., 0]
         )
         layers[name] = values.astype(kind)
-    return Maps(models=texts[0], to_view=texts[1], notes=texts[2], to_light=to_light, **layers)
+    return Maps(models=tuple(models), to_view=to_view, notes=tuple(notes), to_light=to_light, **layers)

@@ -139,6 +139,8 @@ def test_noise_of_matte_texels_is_no_highlight():
     codes, truth = photographed("srgb", 0.0, gloss=0.0)
     maps = fitting.fit_maps(codes, dome(32), truth["normal"][None], encoding="srgb")
     assert np.mean(maps.determined) < 0.01
+    matt = dataclasses.replace(maps, n=np.full_like(maps.n, np.nan))
+    assert "nan" not in str(matt)
 
 
 def test_the_optimum_is_global(noisy):
@@ -447,6 +449,31 @@ def test_a_folder_is_fitted_saved_and_loaded(folder, tmp_path):
     assert brdf.read_picture(tmp_path / "out" / "normals.png").bits == 16
 
 
+def test_what_is_no_maps_is_told_in_one_line(folder, tmp_path):
+    path, _ = folder
+    fitting.fit_maps(path).save(tmp_path / "out")
+    about = json.loads((tmp_path / "out" / "maps.json").read_text())
+    some = {name: kind for name, kind in about["layers"].items() if name != "k_d"}
+    for change, words in (
+        ({"models": ["ward"]}, "names no models that are known, got ['ward']"),
+        ({"models": "phong"}, "names no models that are known, got 'phong'"),
+        ({"models": 3}, "does not describe maps"),
+        ({"to_view": [1, 2]}, "does not describe maps"),
+        ({"to_light": [[1, 2]]}, "does not describe maps"),
+        ({"notes": None}, "does not describe maps"),
+        ({"layers": []}, "does not describe maps"),
+        ({"layers": some}, "names no layer k_d"),
+        ({"layers": about["layers"] | {"f": "float32"}}, "has no layer f of maps"),
+    ):
+        (tmp_path / "out" / "maps.json").write_text(json.dumps(about | change))
+        with pytest.raises(brdf.InputError) as error:
+            fitting.load_maps(tmp_path / "out")
+        assert words in str(error.value)
+    for given, words in ((tmp_path / "none", "there is no such file"), (None, "path: must be text, got NoneType")):
+        with pytest.raises(brdf.InputError, match=words):
+            fitting.load_maps(given)
+
+
 @pytest.mark.parametrize("model", ["phong", "blinn-phong"])
 def test_gltf_shows_the_highlights_of_maps(folder, tmp_path, model):
     path, _ = folder
@@ -507,6 +534,66 @@ def test_clipped_values_are_no_data():
     known = maps.determined[0]
     assert np.any(pictures > 1)
     assert np.median(np.abs(np.log(maps.n[0] / truth["n"]))[known]) < 1e-3
+
+
+@pytest.mark.parametrize("kind", ["float", "12 bits in 16"])
+def test_clipping_that_no_type_tells_of_is_found_or_told(kind):
+    lights = dome(32)
+    pictures, truth = texels(256, 0.004, lights)
+    shown = np.clip(1.2 * pictures, 0, 1)
+    given = shown if kind == "float" else (16 * np.round(4095 * shown)).astype(np.uint16)
+    normals, unit = truth["normal"][None], 1.2 * (1 if kind == "float" else 65520 / 65535)
+    found, told = (fitting.fit_maps(given, lights, normals, saturation=top) for top in (None, unit / 1.2))
+    assert "are taken as clipped" in found.notes[0]
+    assert not told.notes
+    for maps in (found, told):
+        known = maps.determined[0]
+        off = np.abs(np.log(maps.n[0] / truth["n"]) / (maps.n_error / maps.n)[0])
+        assert known.mean() > 0.9
+        assert 0.88 < np.mean(off[known] < 1.96) <= 1  # less than half, before
+    not_clipped = fitting.fit_maps(given, lights, normals, saturation=np.inf)
+    np.testing.assert_array_less(0.02, np.nanmean(not_clipped.residual) - np.nanmean(found.residual))
+
+
+def test_what_is_fully_transparent_in_a_photograph_does_not_count(tmp_path):
+    lights = dome(12)
+    pictures, truth = texels(30, 0.0, lights)
+    alpha, paths = np.ones((1, 30), np.uint8) * 255, []
+    alpha[0, 20:] = 0
+    for index, picture in enumerate(pictures):
+        codes = np.round(255 * np.clip(picture / 2, 0, 1)).astype(np.uint8)
+        paths.append(tmp_path / f"{index}.png")
+        shown = alpha if index else 0 * alpha  # which was not meant
+        Image.fromarray(np.concatenate([codes, shown[..., None]], axis=2)).save(paths[-1])
+    normals = truth["normal"][None]
+    for given in (paths, [brdf.ImageReader(one) for one in paths], [brdf.read_picture(one) for one in paths]):
+        maps = fitting.fit_maps(given, lights, normals)
+        np.testing.assert_array_equal(maps.reason == REASONS.index("outside"), alpha == 0)
+
+
+def test_what_many_texels_share_is_not_always_clipped():
+    lights = dome(16)
+    pictures, truth = texels(256, 0.004, lights)
+    dark = np.round(200 * pictures / pictures.max())
+    two = np.where(np.arange(256) % 2, 0.8, 0.2)[:, None] * np.maximum(lights[:, 2], 0)[:, None, None, None]
+    ball = 0.8 * np.maximum(lights @ truth["normal"].T, 0)[:, None, :, None]
+    ball[:, 0, :20] = 0.8 * np.cos(np.linspace(0, 0.1, 20))[:, None]  # about a maximum
+    black_and_white = (pictures > 0.5) * 0.7
+    for given in (pictures, dark / 255, dark.astype(np.uint8), dark.astype(np.uint16), two, ball, black_and_white):
+        assert not fitting.fit_maps(given, lights, truth["normal"][None]).notes
+
+
+@pytest.mark.parametrize("unit", [1e-12, 1e12, 1e20])
+def test_the_unit_of_values_is_any(noisy, unit):
+    pictures, truth, maps = noisy
+    found = fitting.fit_maps(unit * pictures, dome(32), truth["normal"][None])
+    np.testing.assert_array_equal(found.determined, maps.determined)
+    for name in ("n", "n_error"):
+        np.testing.assert_allclose(getattr(found, name), getattr(maps, name), rtol=1e-2)
+    for name in ("k_d", "k_s", "k_d_error", "k_s_error", "fitted_k_s", "noise"):
+        np.testing.assert_allclose(getattr(found, name) / unit, getattr(maps, name), rtol=1e-2, atol=1e-4)
+    with pytest.raises(brdf.InputError, match="out of reach of float32"):
+        fitting.fit_maps(1e-31 * pictures, dome(32), truth["normal"][None])
 
 
 @pytest.mark.parametrize("encoding", ["linear", "srgb"])
@@ -643,6 +730,8 @@ def test_a_broken_folder_is_told_in_one_line(folder, what, words):
         ({"ambient": -1.0}, "ambient"),
         ({"ambient": "dim"}, "ambient"),
         ({"exposures": "long"}, "exposures"),
+        ({"saturation": 0.0}, "saturation: must be a number above 0, got 0.0"),
+        ({"saturation": "bright"}, "saturation"),
         ({"lights": 6}, "lights"),
         ({"lights": Path("none.lp")}, "none.lp: there is no such file"),
         ({"normals": "none.npy"}, "none.npy: there is no such file"),
@@ -650,6 +739,7 @@ def test_a_broken_folder_is_told_in_one_line(folder, what, words):
         ({"pictures": None}, "pictures"),
         ({"to_view": [0, 0, 0]}, "to_view"),
         ({"to_view": [0, 1]}, "to_view"),
+        ({"lights": dome(6) * [1, 0, 1], "normals": "fit"}, "lights: lie in a plane"),
     ],
 )
 def test_bad_arguments_are_told_in_one_line(change, words):
@@ -687,6 +777,14 @@ def test_an_interrupted_run_goes_on_where_it_was(folder, tmp_path, monkeypatch):
     assert len(calls) == 5
     fitting.fit_maps(path, keep=keep, encoding=2.2)
     assert len(calls) == 8
+    fitting.fit_maps(path, keep=keep, saturation=0.3)
+    assert len(calls) == 11
+    for band, size in zip(sorted(keep.iterdir()), (0, 10, 100, 1000), strict=False):
+        band.write_bytes(band.read_bytes()[:size])
+    for _ in range(2):  # those that are damaged are fitted again, and kept
+        for options in ({}, {"specular": "grey"}, {"encoding": 2.2}, {"saturation": 0.3}):
+            fitting.fit_maps(path, keep=keep, **options)
+        assert len(calls) == 15
 
 
 def test_what_is_kept_of_scenes_is_known_again_by_their_numbers(tmp_path):

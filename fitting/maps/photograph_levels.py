@@ -1,0 +1,113 @@
+"""What photographs tell of their values themselves: from which on they are clipped, and how bright they are."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from brdf.errors import InputError, as_numbers, what_came
+from fitting.likelihood import over_channels
+from fitting.maps.map_inputs import Photograph, places
+from fitting.maps.tiles import MapProblem
+from fitting.pixels import DOUBLE, FLAT, SYMMETRIC_PIXELS
+from fitting.problem import TOP
+
+SPIKE = 4
+"""Values are clipped where so many times those just below them share the largest."""
+
+JUST_BELOW = 1 / 256
+"""Share of the largest value; the next largest one is always just below."""
+
+SINGLE = 1e30
+"""Largest value, and inverse of the least, of a stack in single precision: it is of 1 when it is fitted."""
+
+
+def with_levels(problem: MapProblem, saturation: Any = None) -> tuple[MapProblem, float, tuple[str, ...]]:
+    """Photographs clipped where many texels of the stack share its largest value, and in a unit in which that is of 1.
+
+    Those of 8 bits or less end at their largest code: of so few codes many texels share any.
+
+    Args:
+        problem: in which photographs are clipped where they say so themselves.
+        saturation: linear value from which on all of them are; None finds out.
+
+    Returns:
+        The problem, the power of two by which its photographs are divided, and what to tell of it.
+
+    Raises:
+        InputError: where values are out of reach of the precision.
+    """
+    given, texels = problem.photographs, places(problem.texels)
+    each, notes = given.each, ()
+    fine = [functools.partial(_brightest, one, texels) for one in each if one.fine]
+    largest = np.ones((len(each), 2))
+    largest[[one.fine for one in each]] = [_two_largest(read()) for read in fine] or np.ones((0, 2))
+    top, size = float(np.max(largest)), float(np.max(largest[:, 0] / np.mean(given.unit, axis=1)))
+    if saturation is not None:
+        value = as_numbers("saturation", saturation)
+        if value.ndim or not value > 0:
+            what = f"must be a number above 0, got {what_came(saturation)}"
+            raise InputError("saturation", what, "Give the linear value of clipped pixels")
+        each = tuple(dataclasses.replace(one, top=float(value) * TOP) for one in each)
+    elif top < max(one.top for one in each) and _is_clipped(fine, largest[[one.fine for one in each]]):
+        each = tuple(dataclasses.replace(one, top=min(one.top, top * TOP)) for one in each)
+        notes = (f"many values share the largest, {top:.6g}: they are taken as clipped. Say otherwise with saturation",)
+    if size <= 0:
+        return problem, 1.0, ()
+    reach = SINGLE if problem.precision == "float32" else DOUBLE
+    for value in (size, top):
+        if not 1 / reach <= value <= reach:
+            what = f"have {value:.3g} as their largest value, out of reach of {problem.precision}"
+            raise InputError("pictures", what, "Bring it nearer to 1, by another unit or by the intensities")
+    unit = float(2.0 ** np.floor(np.log2(size)))
+    photographs = dataclasses.replace(given, each=each, unit=given.unit * unit)
+    return dataclasses.replace(problem, photographs=photographs), unit, notes
+
+
+def in_unit(layers: dict[str, np.ndarray], unit: float) -> dict[str, np.ndarray]:
+    """Layers of photographs that were divided by a unit, as they are of those themselves.
+
+    Args:
+        layers: by name.
+        unit: a power of two.
+    """
+    of_light = ("k_", "fitted_k_s", "noise")
+    return {
+        name: layer * layer.dtype.type(unit) if name.startswith(of_light) else layer for name, layer in layers.items()
+    }
+
+
+def _brightest(one: Photograph, texels: Any) -> Float[np.ndarray, " K"]:
+    """The brightest channel of each texel; NaN where one is missing."""
+    values = over_channels(np.maximum, one.rows(0, one.shape[0]).reshape(-1, one.shape[2])[texels])
+    return np.where(np.isfinite(values), values, np.nan)
+
+
+def _two_largest(values: Float[np.ndarray, " K"]) -> tuple[float, float]:
+    """The largest value, and the largest of those that do not share it; -infinite where there is none."""
+    largest = np.max(values, initial=-np.inf, where=values > -np.inf)
+    return float(largest), float(np.max(values, initial=-np.inf, where=values < largest * TOP))
+
+
+def _is_clipped(fine: list[Callable[[], Float[np.ndarray, " K"]]], largest: Float[np.ndarray, "P 2"]) -> bool:
+    """Whether the largest value is a plateau above which there was more, of texels that differ elsewhere.
+
+    Those of a smooth maximum have many just below; those of one material on a plane are alike under all lights.
+    """
+    level = np.max(largest) * TOP
+    edge = min(np.max(largest, initial=-np.inf, where=largest < level) * TOP, level * (1 - JUST_BELOW))
+    at_top, just_below, count = np.zeros(1, bool), 0, 0
+    for values in (read() for read, (own, _) in zip(fine, largest, strict=True) if own >= edge):
+        at_top = at_top | (values >= level)
+        count += np.count_nonzero(values >= level)
+        just_below += np.count_nonzero((values >= edge) & (values < level))
+    if count <= max(SYMMETRIC_PIXELS, SPIKE * just_below):
+        return False
+    for values in (read()[at_top] for read in fine):
+        lower = values[values < level]
+        if lower.size and np.ptp(lower) > FLAT * np.max(np.abs(lower)):
+            return True
+    return False
