@@ -43,8 +43,7 @@ def with_levels(problem: MapProblem, saturation: Any = None) -> tuple[MapProblem
     given, texels = problem.photographs, places(problem.texels)
     each, notes = given.each, ()
     fine = [functools.partial(_brightest, one, texels) for one in each if one.fine]
-    largest = np.ones((len(each), 2))
-    largest[[one.fine for one in each]] = [_two_largest(read()) for read in fine] or np.ones((0, 2))
+    largest = np.array([_two_largest(_brightest(one, texels)) if one.fine else (1.0, 1.0) for one in each])
     top, size = float(np.max(largest)), float(np.max(largest[:, 0] / np.mean(given.unit, axis=1)))
     if saturation is not None:
         value = as_numbers("saturation", saturation)
