@@ -12,7 +12,7 @@ from brdf.errors import InputError
 from brdf.models.base import SpecularMaterial
 from brdf.precision import working_precision
 from fitting.maps.map_bands import fit_bands
-from fitting.maps.texels import STEPS, bracket_about, grid, narrowed
+from fitting.maps.texels import STEPS, grid, narrowed, peaks, rivals
 from fitting.maps.tiles import MapProblem
 
 
@@ -47,13 +47,20 @@ def with_shared_n(problem: MapProblem, labels: Any) -> MapProblem:
         rows = found.reshape(-1, found.shape[2]).T.astype(float)
         return np.stack([np.bincount(index.ravel(), row, names.size) for row in rows])
 
-    with working_precision("float64"):
-        bracket = bracket_about(jnp.asarray(sums("gains", np.zeros(names.size))), grid(problem.finer))
+    def climbed(bracket: Any) -> np.ndarray:
+        """Log n of a bracket, and the sums there: the curvature, the cost and the degrees of freedom."""
         for _ in range(STEPS):
             slope, curvature, _, _ = sums("slope", bracket[0])
             bracket = narrowed(bracket, slope, np.divide(slope, curvature, out=0 * slope, where=curvature > 0))
-        log_n = np.asarray(bracket[0])
-        _, curvature, cost, freedom = sums("slope", log_n)
+        return np.stack([bracket[0], *sums("slope", bracket[0])[1:]])
+
+    with working_precision("float64"):
+        gains, brackets = peaks(jnp.asarray(sums("gains", np.zeros(names.size))), grid(problem.finer))
+        best = climbed(brackets[0])
+        if np.any(rivals(*gains, best[2])):
+            other = climbed(brackets[1])
+            best = np.where(other[2] < best[2], other, best)
+        log_n, curvature, cost, freedom = best
     noise = cost / np.maximum(freedom, 1)
     error = np.sqrt(np.divide(noise, curvature, out=np.full_like(noise, np.inf), where=curvature > 0))
     shared = np.stack([log_n[index], error[index]], axis=-1)

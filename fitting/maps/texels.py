@@ -2,9 +2,10 @@
 
 The photographs of a texel are ``y_p = k_a A_p + k_d D_p + k_s S_p(n)``. The coefficients are linear, so for a given n
 the best non-negative ones are a closed form and the search is one-dimensional (variable projection, Golub and Pereyra
-1973). It is global: the octaves of n, where the lobe's column is the square of the one before, then Gauss-Newton inside
-the bracket about the best of them. The same sums give the standard errors. Where the normal is sought too, Gauss-Newton
-takes it and the material together. Noise is even in codes: a value's weight is the square of the slope of its encoding.
+1973). It is global: a grid of octaves of n, where the lobe's column is the square of the one before, then Gauss-Newton
+in the brackets about its two highest peaks. The same sums give the standard errors. Where the normal is sought too,
+Gauss-Newton takes it and the material together. Noise is even in codes: a value's weight is the square of the slope of
+its encoding.
 
 The P photographs are the last axis of what is summed over them, (T, P), one array a channel in `Components`, or one for
 all where these are alike. What is left of T texels are arrays whose last axis these are; a channel axis stands before
@@ -14,6 +15,7 @@ it, C or 1 long. What would underflow is held above, for a processor takes a hun
 import functools
 import math
 import operator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -35,14 +37,17 @@ MOST_LOG_N = OCTAVES * math.log(2.0)
 TOGETHER = 4
 """Octaves whose sums are taken in one pass: those of more do not fit into a processor's registers."""
 
-NARROW = (5.3, 6.5)
-"""Exponents that are looked at too: about n = 4 (N·H)^n is nearly N·L, which k_d takes, and the optimum's basin is
-narrower than an octave."""
+BROAD = 4
+"""Steps of the grid in each doubling of n up to 2^`TOGETHER`: about n = 4 (N·H)^n is nearly N·L, which k_d takes, and
+the cost has minima on either side that are narrower than an octave."""
 
-FEW = 64
-"""Texels that are fitted anew at a time, without what lies in cast shadows."""
+RIVAL = 1.0
+"""The second peak is climbed too where its cost exceeds the first one's by at most so much of what that leads to."""
 
-STEPS = 5
+FEW = 32
+"""Texels that are fitted anew at a time, from the second peak or without what lies in cast shadows."""
+
+STEPS = 4
 """Gauss-Newton steps in a bracket of two steps of the grid: they converge to single precision."""
 
 CAP = 32.0
@@ -218,6 +223,10 @@ class Texels(eqx.Module):
         """Of values that count, (T, P)."""
         return jax.tree.map(functools.partial(operator.mul, counts), self)
 
+    def some(self, lanes: Array) -> "Texels":
+        """Those of some indices."""
+        return jax.tree.map(lambda one: one[..., lanes, :], self)
+
     def facing(self, normal: Components, lights: Distant) -> "Texels":
         """With the columns of distant lights."""
 
@@ -255,12 +264,20 @@ class Texels(eqx.Module):
         if not self.glossy:
             return self.at(jnp.zeros_like(self.cap))
 
-        def step(_, bracket):
-            point = self.at(bracket[0], errors=False)
-            return narrowed(bracket, point.slope[0], point.step[0])
+        def climbed(some, bracket):
+            def step(_, bracket):
+                point = some.at(bracket[0], errors=False)
+                return narrowed(bracket, point.slope[0], point.step[0])
 
-        bracket = bracket_about(self.gains(), grid(self.finer))
-        return self.at(jax.lax.fori_loop(0, STEPS, step, bracket)[0])
+            return some.at(jax.lax.fori_loop(0, STEPS, step, bracket)[0])
+
+        def again(lanes, best):
+            other = climbed(self.some(lanes), second[:, lanes])
+            return jax.tree.map(lambda a, b: jnp.where(other.cost < best.cost, b, a), best, other)
+
+        (gain, rival), (first, second) = peaks(self.gains(), grid(self.finer))
+        best = climbed(self, first)
+        return of_few(rivals(gain, rival, best.cost), best, again)
 
     def at(self, log_n: Array, *, errors: bool = True, n_known: bool = False) -> TexelFit:
         """The best coefficients for a given n; their errors allow for that of n, unless n is sure."""
@@ -286,9 +303,8 @@ class Texels(eqx.Module):
             return sums_at(powers)
 
         exponents = grid(self.finer)
-        found = jax.lax.map(octaves, jnp.asarray(exponents[: -len(NARROW) : TOGETHER], dtype))
-        both = zip(found, sums_at([self.power(n) for n in NARROW]), strict=True)
-        *across, square, shown = (jnp.concatenate([one.reshape(-1, *one.shape[2:]), more]) for one, more in both)
+        found = jax.lax.map(octaves, jnp.asarray(exponents[::TOGETHER], dtype))
+        *across, square, shown = (one.reshape(-1, *one.shape[2:]) for one in found)
         rows = [[*row, x, b] for (*row, b), x in zip(self.products(self.linear), across, strict=True)]
         rows.append([*across, square, shown])
         cap = self.cap * self.model.scale(jnp.asarray(exponents, dtype))[:, None]
@@ -311,11 +327,8 @@ class Texels(eqx.Module):
         variance = divide(first.fit.cost, first.freedom) * square * (1 - divide(square, whole))
         worth = (score < 0) & (score**2 > jnp.minimum(OUTLIER**2, 0.25 * first.freedom) * variance)
 
-        def without(state):
-            left, best = state
-            lanes = jnp.argsort(~left)[:FEW]
-            some = jax.tree.map(lambda one: one[..., lanes, :], self)
-            old = jax.tree.map(lambda one: one[..., lanes], best)
+        def without(lanes, old):
+            some = self.some(lanes)
 
             def again(_, state):
                 counts, best = state
@@ -323,10 +336,9 @@ class Texels(eqx.Module):
                 better = best.or_better(Trial.of(some, fit, some.seen, counts), worth[lanes])
                 return inliers(some.residual(fit), some.seen, counts), better
 
-            _, new = jax.lax.fori_loop(0, 2, again, ((seen - dark)[lanes], old))
-            return left.at[lanes].set(False), jax.tree.map(lambda a, b: a.at[..., lanes].set(b), best, new)
+            return jax.lax.fori_loop(0, 2, again, ((seen - dark)[lanes], old))[1]
 
-        return jax.lax.while_loop(lambda state: jnp.any(state[0]), without, (worth, first))[1]
+        return of_few(worth, first, without)
 
     # -- least squares -------------------------------------------------------------------------------------------------
 
@@ -413,22 +425,54 @@ class Trial(NamedTuple):
         return jax.tree.map(lambda a, b: jnp.where(better, b, a), self, other)
 
 
+def of_few(left: Array, best: Any, better: Callable[[Array, Any], Any]) -> Any:
+    """Fit some texels anew, `FEW` at a time: what is rarely worth it costs little.
+
+    Args:
+        left: which, (T,).
+        best: what is known of all, texels last.
+        better: of the indices of a few and of what is known of these, what is known then.
+    """
+
+    def step(state):
+        left, best = state
+        lanes = jnp.nonzero(left, size=min(FEW, left.size), fill_value=left.size - 1)[0]
+        new = better(lanes, jax.tree.map(lambda one: one[..., lanes], best))
+        return left.at[lanes].set(False), jax.tree.map(lambda a, b: a.at[..., lanes].set(b), best, new)
+
+    return jax.lax.while_loop(lambda state: jnp.any(state[0]), step, (left, best))[1]
+
+
 def grid(finer: int) -> list[float]:
-    """The exponents that the search starts with: some octaves of each start, and those of the narrow basin."""
-    starts = [2.0 ** (i + part / finer) for i in range(0, OCTAVES, TOGETHER) for part in range(finer)]
-    return [*(start * 2.0**octave for start in starts for octave in range(TOGETHER)), *NARROW]
+    """The exponents that the search starts with, some octaves of each start: broad lobes, then narrow ones."""
+    starts = [2.0 ** (part / BROAD) for part in range(BROAD)]
+    starts += [2.0 ** (i + part / finer) for i in range(TOGETHER, OCTAVES, TOGETHER) for part in range(finer)]
+    return [start * 2.0**octave for start in starts for octave in range(TOGETHER)]
 
 
-def bracket_about(gains: Array, exponents: list[float]) -> Array:
-    """Log n of the best of the exponents, of the one below and of that above, (3, T): what is downhill is between."""
-    log_n = np.log(exponents)
-    inner = np.append(np.sort(log_n), MOST_LOG_N)
-    ends = inner[np.maximum(np.searchsorted(inner, log_n) + np.array([[0], [-1], [1]]), 0)]
-    best, found = gains[0], jnp.asarray(ends[:, :1], gains.dtype)
-    for gain, end in zip(gains[1:], ends.T[1:], strict=True):
-        found = jnp.where(gain > best, jnp.asarray(end[:, None], gains.dtype), found)
-        best = jnp.maximum(gain, best)
-    return found
+def peaks(gains: Array, exponents: list[float]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """The two highest peaks of gains, (T,) each, and their brackets, (3, T).
+
+    A bracket is log n, that of the exponent below and of the one above: what is downhill is between.
+    """
+    order, number = np.argsort(exponents), np.arange(len(exponents))[:, None]
+    log_n = np.log([*np.sort(exponents), 2.0**OCTAVES])
+    ends = jnp.asarray(log_n[np.maximum(np.add(number.T, [[0], [-1], [1]]), 0)], gains.dtype)
+    gains, least = gains[order], jnp.full_like(gains[:1], -jnp.inf)
+    is_peak = (gains > jnp.concatenate([least, gains[:-1]])) & (gains >= jnp.concatenate([gains[1:], least]))
+    heights, found = jnp.where(is_peak, gains, -jnp.inf), []
+    for _ in range(2):
+        highest = jnp.max(heights, axis=0)
+        index = jnp.max(jnp.where(heights == highest, number, 0), axis=0)
+        heights = jnp.where(number == index, -jnp.inf, heights)
+        found.append((highest, ends[:, index]))
+    (first, bracket), (second, other) = found
+    return (first, second), (bracket, other)
+
+
+def rivals(gain: Array, rival: Array, cost: Array) -> Array:
+    """Whether the second peak may lead to less than the cost that the first has led to; gains are half of a fall."""
+    return gain - rival < 0.5 * RIVAL * cost
 
 
 def narrowed(bracket: Array, slope: Array, step: Array) -> Array:
