@@ -38,8 +38,6 @@ def next_light(maps: "Maps", candidates: Any, count: int, of: str) -> LightChoic
     texel = texel[:: -(-texel.size // MOST_TEXELS)]
     normal = Components(tuple(jnp.asarray(maps.normal.reshape(-1, 3)[texel].T)))
     log_n = jnp.log(maps.fitted_n.ravel()[texel])
-    strength = np.sum(maps.fitted_k_s.reshape(-1, maps.fitted_k_s.shape[-1])[texel] ** 2.0, axis=1)
-    strength = strength / maps.noise.ravel()[texel] ** 2.0
     chosen, to_view = maps.chosen.ravel()[texel], maps.to_view / np.linalg.norm(maps.to_view)
 
     @jax.jit
@@ -59,11 +57,14 @@ def next_light(maps: "Maps", candidates: Any, count: int, of: str) -> LightChoic
     def told_by(light: Any) -> np.ndarray:
         return np.asarray(products(direction_of(light)), np.float64)
 
-    def error(information: np.ndarray) -> float:
+    def left_by(information: np.ndarray) -> np.ndarray:
+        """Of the information on ln n, what k_d and k_s leave."""
         dd, ds, dx, ss, sx, xx = information
         ss, sx, xx = ss - divided(ds * ds, dd), sx - divided(ds * dx, dd), xx - divided(dx * dx, dd)
-        left = strength * np.maximum(xx - divided(sx * sx, ss), 0)
-        errors = 1 / np.sqrt(np.maximum(left, np.finfo(float).tiny))
+        return np.maximum(xx - divided(sx * sx, ss), np.finfo(float).tiny)
+
+    def error(information: np.ndarray) -> float:
+        errors = 1 / np.sqrt(strength * left_by(information))
         return float(
             np.median(errors) if of == "n" else np.count_nonzero(errors > MOST_ERROR) * shows.sum() / texel.size
         )
@@ -73,4 +74,11 @@ def next_light(maps: "Maps", candidates: Any, count: int, of: str) -> LightChoic
 
     known = tuple(brdf.DirectionalLight(light, 1.0) for light in maps.to_light)
     information = np.sum([told_by(light) for light in known], axis=0)
+    strength = np.sum(maps.fitted_k_s.reshape(-1, maps.fitted_k_s.shape[-1])[texel] ** 2.0, axis=1)
+    strength /= maps.noise.ravel()[texel] ** 2.0
+    # The maps' own errors know the weights of their values: what the texels with one say, the others are taken to say.
+    own = (maps.n_error / maps.n).ravel()[texel]
+    unit = 1 / (own**2 * strength * left_by(information))
+    has_own = np.isfinite(unit)
+    strength *= np.where(has_own, unit, np.median(unit[has_own]) if np.any(has_own) else 1)
     return choose_lights(candidates, count, of, known, to_view, information, told_by, error)

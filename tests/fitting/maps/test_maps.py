@@ -900,6 +900,16 @@ def test_the_light_that_is_added_is_where_it_tells_most():
         fitting.next_light(maps, [brdf.PointLight([0, 0, 3], 9.0)])
 
 
+def test_the_error_that_a_light_shrinks_is_the_maps_own_whatever_the_encoding():
+    codes, truth = photographed("srgb", 0.0)
+    fewer, all_of_them = (
+        fitting.fit_maps(codes[first:], dome(32)[first:], truth["normal"][None], encoding="srgb") for first in (1, 0)
+    )
+    choice = fitting.next_light(fewer, list(dome(32)[:1]))
+    np.testing.assert_allclose(choice.before, np.nanmedian(fewer.n_error / fewer.n), rtol=0.02)
+    np.testing.assert_allclose(choice.after[0], np.nanmedian(all_of_them.n_error / all_of_them.n), rtol=0.05)
+
+
 def test_errors_of_k_d_hold_what_a_highlight_at_its_bound_may_take():
     lights = dome(16)
     pictures, truth = texels(256, 0.0, lights, n=(5, 5.001))
