@@ -38,7 +38,7 @@ def maps(
         out: a folder for maps.exr, 16-bit images, glTF and OpenLIME.
         model: blinn-phong, phong, a normalised form, lambert, or auto.
         grey: all channels share k_s.
-        labels: an image: pixels of one value there share n; or all: every pixel does.
+        labels: an image: pixels of one colour there share n; or all: every pixel does.
         mask: an image: pixels that are 0 there are left out.
         ambient: the view is lit from all around too: find k_a for that light as 1.
         flip_y: y goes down in the file of normals.

@@ -79,8 +79,8 @@ def fit_maps(
             model explains better, else those of 8 bits as sRGB, of more as linear.
         flip_y: whether y goes down in the normals.
         precision: "float32" or "float64".
-        labels: (H, W) whole numbers, or a file of them as codes: texels with the same one share n, which then is known
-            far better than each could tell; 0 for all texels. None for an n of each.
+        labels: (H, W) whole numbers, or a file, where each colour is one: texels with the same one share n, which then
+            is known far better than each could tell; 0 for all texels. None for an n of each.
         mesh: a `jax.sharding.Mesh` of the devices to deal bands of rows out to, on one machine or, under
             `jax.distributed`, on many: each process reads and fits those of its own devices. None for all cores.
         keep: a folder for the bands that are done. A call with the same inputs goes on from there, where one was

@@ -21,7 +21,7 @@ def with_shared_n(problem: MapProblem, labels: Any) -> MapProblem:
 
     Args:
         problem: what is fitted.
-        labels: whole numbers, (H, W), one for all, or a file of them as codes.
+        labels: whole numbers, (H, W), one for all, or a file in which each colour is one.
 
     Raises:
         InputError: where these are none, or the model has no n.
@@ -31,7 +31,9 @@ def with_shared_n(problem: MapProblem, labels: Any) -> MapProblem:
         raise InputError("labels", "need one model with an exponent", "Name the model, as blinn-phong")
     if isinstance(labels, str | Path):
         with brdf.ImageReader(labels, encoding="linear") as reader:
-            labels = np.round(reader.read()[..., 0] * (2**reader.bits - 1)).astype(int)
+            codes = np.round(reader.read() * (2**reader.bits - 1)).astype(int)
+        colours = codes.reshape(-1, codes.shape[-1])
+        labels = np.unique(colours, axis=0, return_inverse=True)[1].reshape(codes.shape[:2])
     labels = np.asarray(labels)
     if labels.dtype.kind not in "iub" or labels.shape not in ((), size):
         what = f"are of shape {labels.shape} and type {labels.dtype}, the photographs of {size}"

@@ -910,6 +910,17 @@ def test_the_error_that_a_light_shrinks_is_the_maps_own_whatever_the_encoding():
     np.testing.assert_allclose(choice.after[0], np.nanmedian(all_of_them.n_error / all_of_them.n), rtol=0.05)
 
 
+def test_labels_painted_in_colours_are_told_apart_by_all_channels(tmp_path):
+    random, n = np.random.default_rng(3), np.array([12.0, 40.0])
+    index, normal = np.arange(60) % 2, np.broadcast_to([0.2, 0.1, 0.97], (60, 3)) / np.linalg.norm([0.2, 0.1, 0.97])
+    pictures = seen_by_equation(dome(32), normal, 0.3, 0.4, n[index])
+    pictures = pictures + 0.002 * random.normal(size=pictures.shape)
+    red_and_yellow = np.array([[200, 0, 0], [200, 200, 0]], np.uint8)
+    Image.fromarray(red_and_yellow[index][None]).save(tmp_path / "labels.png")
+    maps = fitting.fit_maps(pictures, dome(32), normal[None], labels=tmp_path / "labels.png")
+    np.testing.assert_allclose(maps.n[0], n[index], rtol=0.05)
+
+
 def test_errors_of_k_d_hold_what_a_highlight_at_its_bound_may_take():
     lights = dome(16)
     pictures, truth = texels(256, 0.0, lights, n=(5, 5.001))
