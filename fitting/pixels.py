@@ -77,7 +77,7 @@ class Observed(NamedTuple):
         left_out: how many pixels were left out, by reason.
         shown: the pictures for people, (H, W, C) each: of a large file every so many pixels.
         scenes: what these show.
-        counted: which of their pixels counted, (H, W) each.
+        counted: which of their pixels counted, in every channel, (H, W) each.
         weights: how much they did, (H, W) each; None where all alike.
     """
 
@@ -275,10 +275,14 @@ def _observe(
     else:
         resolution = max(resolution, float(np.finfo(target.pixels.dtype).eps))
         counted = np.concatenate([good for good, _ in found]).reshape(height, width)
+        if apart and level is not None:
+            # What looks at residuals looks at pixels that are whole, where there are any.
+            whole = counted & np.all(np.asarray(target.pixels) < level, axis=-1)
+            counted = whole if whole.any() else counted
         shown = target.pixels.astype(dtype, copy=False), scene, counted
         if given is not None or noise is not None:
             heaviest = [np.max(np.asarray(one.weight).reshape(one.target.shape[0], -1), axis=1) for one in tiles]
-            weights = np.concatenate(heaviest).reshape(height, width)
+            weights = np.concatenate(heaviest).reshape(height, width) * counted
     rounding = np.maximum(brightest * resolution, target.step / np.sqrt(12.0))
     return tiles, rounding, brightest, left_out, *shown, weights
 
