@@ -157,32 +157,32 @@ def improved(
         design = design[:, :-1]
     signed, base = np.arange(len(design)) == len(design) - 1, np.append(x.ravel(), 0.0)
     best = (-math.inf, base, float(log_n[0]), None)
-    for at, said in zip(log_n, coupled(pictures, precision, x, log_n), strict=True):
-        normal = said.joined(x)
+    for at, parts in zip(log_n, coupled(pictures, precision, x, log_n), strict=True):
+        normal = parts.joined(x)
         reduced = design.T @ normal.gram @ design
         found = design @ nonnegative_minimum(reduced, design.T @ normal.product, signed @ (design != 0))
         gain = float(2 * normal.product @ found - found @ normal.gram @ found)
         if gain > best[0]:
-            best = gain, found, float(at), said
-    _, found, at, said = best
-    assert said is not None
+            best = gain, found, float(at), parts
+    _, found, at, parts = best
+    assert parts is not None
     n = float(np.clip(math.exp(at + np.clip(found[-1], -GRID_STEP, GRID_STEP)), *fit.n_range))
     x = np.maximum(found[:-1].reshape(x.shape), 0.0)
-    return replaced(optimum, said, x, n)
+    return replaced(optimum, parts, x, n)
 
 
-def replaced(optimum: Optimum, said: Coupled, x: Float[np.ndarray, "3 C"], n: float) -> Optimum:
+def replaced(optimum: Optimum, parts: Coupled, x: Float[np.ndarray, "3 C"], n: float) -> Optimum:
     """An optimum with the sums of each channel for itself; each of its values has the noise 1.
 
     Args:
         optimum: whose profile and pixels stay.
-        said: the sums.
+        parts: the sums.
         x: coefficients.
         n: exponent.
     """
     scale = np.array([1.0, 1.0, 1.0, 1 / n])
-    gram = np.einsum("ccij->cij", said.gram) * np.outer(scale, scale)
-    product = said.score * scale + (gram[..., :3] @ x.T[..., None])[..., 0]
+    gram = np.einsum("ccij->cij", parts.gram) * np.outer(scale, scale)
+    product = parts.score * scale + (gram[..., :3] @ x.T[..., None])[..., 0]
     return dataclasses.replace(optimum, n=n, x=x, cost=optimum.pixels, gram=gram, product=product)
 
 

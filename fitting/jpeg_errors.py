@@ -110,11 +110,11 @@ def _nearest(fit: ModelFit, compressed: Sequence["_Compressed"], most: int, coun
         assert found.evidence is not None
         if change(best, found.evidence.optimum) < ENOUGH_CHANGE or nearer < ENOUGH_NEARER * left:
             break
-    said = found.evidence
-    assert said is not None
+    evidence = found.evidence
+    assert evidence is not None
     # Their mean has a share of what each errs by, which is no more than what the picture errs by.
-    said = said._replace(widening=said.widening * math.sqrt(1 + 1 / count))
-    return found._replace(evidence=said, moved=(APPROACH * (_unknowns(found.optimum) - _unknowns(best)),))
+    evidence = evidence._replace(widening=evidence.widening * math.sqrt(1 + 1 / count))
+    return found._replace(evidence=evidence, moved=(APPROACH * (_unknowns(found.optimum) - _unknowns(best)),))
 
 
 def _unknowns(at: Optimum) -> Float[np.ndarray, " U"]:

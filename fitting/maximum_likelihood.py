@@ -65,7 +65,7 @@ ALIKE, FEWEST_ALIKE, MORE_ALIKE, MOST_COUNTED = 1024, 64, 10, 1 << 20
 MOST_LEVELS, MOST_PIXELS = 32, 4096
 # A subsample tells that a model is hopeless where the logarithm of its likelihood is so much below that of another one,
 # and by such a share of itself: many pixels are near an edge where the model is wrong, and only there.
-HOPELESS, HOPELESS_SHARE = 1000.0, 0.5
+FAR_BELOW, FAR_BELOW_SHARE = 1000.0, 0.5
 # An open end tells where a value is predicted within so many s of it; noise below this share of the picture is none.
 END_REACH, NO_NOISE = 4.0, 1e-5
 
@@ -230,7 +230,7 @@ def _near_edges(fit: ModelFit, at: Estimate, rival: float = -math.inf) -> Eviden
     at, precisions, score = maximise(problem, at, ROUGHLY_KNOWN, FEWEST_VALUES) if large else maximise(problem, at)
     if (even := _evener_in_light(problem, at)) is not None:
         return _near_edges(fit._replace(pictures=_in_light(pictures)), even, rival)
-    if large and rival - at.value < max(HOPELESS, HOPELESS_SHARE * abs(at.value)):
+    if large and rival - at.value < max(FAR_BELOW, FAR_BELOW_SHARE * abs(at.value)):
         # The whole picture has the pixels near an edge that a part of it lacks.
         at = at._replace(noise=most_informative(precisions).noise)
         problem = separable(_gathered(pictures, at))

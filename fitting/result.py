@@ -239,7 +239,7 @@ class FitResult(Parameters):
         highlight_pixels: how many pixels carry the highlight; None without one.
         residual: root mean square of the residual over that of the picture.
         pixels: how many pixels counted in every channel.
-        left_out: how many did not, by reason.
+        left_out: how many did not, or not in every channel, by reason.
         warnings: what a user should know before using the numbers.
         candidates: the models that were compared, simplest first; empty where the user named it.
         correlation: of the parameters that are determined and not at a bound, in the order of `free_parameters`.

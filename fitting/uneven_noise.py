@@ -106,14 +106,15 @@ def noise_of_each(
 def _left(
     pictures: Sequence[Picture], owner: Int[np.ndarray, " T"], rounding: Float[np.ndarray, " C"], optimum: Optimum
 ) -> NoiseOfEach:
-    count = np.bincount(owner, [len(picture.target) for picture in pictures])
+    counted = [np.sum(np.broadcast_to(picture.weights > 0, picture.target.shape), axis=0) for picture in pictures]
+    count = np.array([np.bincount(owner, of_channel) for of_channel in np.array(counted).T])
     squares = np.array([np.sum(residuals(picture, optimum) ** 2, axis=0) for picture in pictures])
-    variance = np.array([np.bincount(owner, of_channel) / count for of_channel in squares.T])
+    variance = np.array([np.bincount(owner, of_channel) for of_channel in squares.T]) / np.maximum(count, 1)
     variance = np.maximum(variance, rounding[:, None] ** 2)
     cost = float(np.sum(count * np.log(variance)))
     variance = np.mean(variance / np.mean(variance, axis=1, keepdims=True), axis=0)
     spread, kinds = np.sqrt(variance), {()}
-    for one in range(len(count)) if all(picture.bounds for picture in pictures) else ():
+    for one in range(variance.size) if all(picture.bounds for picture in pictures) else ():
         own = [picture for picture, of in zip(pictures, owner, strict=True) if of == one]
         bounds = [picture.bounds for picture in own if picture.bounds is not None]
         kinds |= {(*np.ravel(some.scale / some.unit), some.encoding) for some in bounds}
@@ -123,7 +124,7 @@ def _left(
         step = float(np.mean(np.concatenate([np.zeros(1), *(some.widths for some in bounds)])))
         noise = residual_deviation(bounds, codes) ** 2 - step**2 / 12
         spread[one] = math.sqrt(max(noise, (ROUNDING_HIDES * step) ** 2))
-    return NoiseOfEach(cost, variance, spread / np.min(spread), count, len(kinds) <= 2)
+    return NoiseOfEach(cost, variance, spread / np.min(spread), np.max(count, axis=0), len(kinds) <= 2)
 
 
 def evened(observed: Observed, noise: NoiseOfEach) -> Observed:

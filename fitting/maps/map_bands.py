@@ -115,7 +115,7 @@ def read_band(path: Path | None) -> dict[str, np.ndarray] | None:
     try:
         with path.open("rb") as file, np.load(file) as layers:
             return dict(layers)
-    except (OSError, ValueError, EOFError, TypeError, zipfile.BadZipFile, zlib.error):
+    except (OSError, ValueError, EOFError, TypeError, RuntimeError, zipfile.BadZipFile, zlib.error):
         return None
 
 

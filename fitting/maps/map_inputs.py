@@ -40,6 +40,7 @@ class Photograph:
         lossy: whether it was compressed with losses.
         fine: whether it is of floats, or integers of more than 8 bits.
         alpha: reads how opaque pixels are, (H, W), or None where nobody says.
+        stated: whether a user says from which value on it is clipped.
     """
 
     rows: Callable[[int, int], Float[np.ndarray, "rows W C"]]
@@ -51,11 +52,12 @@ class Photograph:
     lossy: bool = False
     fine: bool = True
     alpha: Callable[[], Float[np.ndarray, "H W"] | None] = lambda: None
+    stated: bool = False
 
     def read_as(self, encoding: Encoding) -> "Photograph":
-        """The same file read so, clipped at the same code."""
-        top = float(decode(encode(np.array(self.top), self.curve), encoding))
-        return dataclasses.replace(_opened(self.name, Path(self.name), encoding), top=top)
+        """The same file read so, clipped at the same code, or at the linear value that was stated."""
+        top = self.top if self.stated else float(decode(encode(np.array(self.top), self.curve), encoding))
+        return dataclasses.replace(_opened(self.name, Path(self.name), encoding), top=top, stated=self.stated)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -169,23 +171,28 @@ def read_lights(path: str | Path) -> tuple[list[Path], Float[np.ndarray, "P 3"]]
     return names, np.array(directions)
 
 
-def named_directions(path: str | Path, names: Sequence[str]) -> Float[np.ndarray, "P 3"]:
+def named_directions(path: str | Path, files: Sequence[str | Path]) -> Float[np.ndarray, "P 3"]:
     """The lights of some photographs, by their names.
 
     Args:
         path: an ``.lp`` file, as for `read_lights`.
-        names: of the photographs, without folders.
+        files: the photographs.
 
     Raises:
         InputError: where it does not name one of them, or names one twice.
     """
     listed, directions = read_lights(path)
-    every = [one.name for one in listed]
-    for name in names:
-        if every.count(name) != 1:
-            what = f"names {name} {every.count(name)} times" if name in every else f"names no {name}"
+    index, paths = [], [one.resolve() for one in listed]
+    for file in map(Path, files):
+        # Of one name in several folders that of the folder.
+        whole = file.resolve()
+        found = [i for i, one in enumerate(paths) if one == whole]
+        found = found or [i for i, one in enumerate(listed) if one.name == file.name]
+        if len(found) != 1:
+            what = f"names {file.name} {len(found)} times" if found else f"names no {file.name}"
             raise InputError(path, what, "Name each photograph once, as the file of lights does")
-    return directions[[every.index(name) for name in names]]
+        index += found
+    return directions[index]
 
 
 def _by_number(path: Path) -> tuple[list[Any], str]:
@@ -304,7 +311,7 @@ def photographs(
         elif None in files:
             lights = read_lights(lights)[1]
         else:
-            lights = named_directions(lights, [Path(file).name for file in files if file is not None])
+            lights = named_directions(lights, [file for file in files if file is not None])
     lights = list(lights)
     if len(lights) != len(each):
         raise InputError("lights", f"are {len(lights)} for {len(each)} photographs", "Give a light for each photograph")

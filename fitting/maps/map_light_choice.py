@@ -54,7 +54,7 @@ def next_light(maps: "Maps", candidates: Any, count: int, of: str) -> LightChoic
                 ]
         return jnp.stack([a * b for i, a in enumerate(columns) for b in columns[i:]])
 
-    def told_by(light: Any) -> np.ndarray:
+    def information_by(light: Any) -> np.ndarray:
         return np.asarray(products(direction_of(light)), np.float64)
 
     def left_by(information: np.ndarray) -> np.ndarray:
@@ -73,7 +73,7 @@ def next_light(maps: "Maps", candidates: Any, count: int, of: str) -> LightChoic
         return np.divide(a, b, out=np.zeros_like(a), where=b > 0)
 
     known = tuple(brdf.DirectionalLight(light, 1.0) for light in maps.to_light)
-    information = np.sum([told_by(light) for light in known], axis=0)
+    information = np.sum([information_by(light) for light in known], axis=0)
     strength = np.sum(maps.fitted_k_s.reshape(-1, maps.fitted_k_s.shape[-1])[texel] ** 2.0, axis=1)
     strength /= maps.noise.ravel()[texel] ** 2.0
     # The maps' own errors know the weights of their values: what the texels with one say, the others are taken to say.
@@ -81,4 +81,4 @@ def next_light(maps: "Maps", candidates: Any, count: int, of: str) -> LightChoic
     unit = 1 / (own**2 * strength * left_by(information))
     has_own = np.isfinite(unit)
     strength *= np.where(has_own, unit, np.median(unit[has_own]) if np.any(has_own) else 1)
-    return choose_lights(candidates, count, of, known, to_view, information, told_by, error)
+    return choose_lights(candidates, count, of, known, to_view, information, information_by, error)

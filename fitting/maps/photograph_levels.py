@@ -21,6 +21,9 @@ SPIKE = 4
 JUST_BELOW = 1 / 256
 """Share of the largest value; the next largest one is always just below."""
 
+ROWS = 256
+"""Rows that are read at a time."""
+
 SINGLE = 1e30
 """Largest value, and inverse of the least, of a stack in single precision: it is of 1 when it is fitted."""
 
@@ -50,7 +53,7 @@ def with_levels(problem: MapProblem, saturation: Any = None) -> tuple[MapProblem
         if value.ndim or not value > 0:
             what = f"must be a number above 0, got {what_came(saturation)}"
             raise InputError("saturation", what, "Give the linear value of clipped pixels")
-        each = tuple(dataclasses.replace(one, top=float(value) * TOP) for one in each)
+        each = tuple(dataclasses.replace(one, top=float(value) * TOP, stated=True) for one in each)
     elif top < max(one.top for one in each) and _is_clipped(fine, largest[[one.fine for one in each]]):
         each = tuple(dataclasses.replace(one, top=min(one.top, top * TOP)) for one in each)
         notes = (f"many values share the largest, {top:.6g}: they are taken as clipped. Say otherwise with saturation",)
@@ -81,7 +84,10 @@ def in_unit(layers: dict[str, np.ndarray], unit: float) -> dict[str, np.ndarray]
 
 def _brightest(one: Photograph, texels: Any) -> Float[np.ndarray, " K"]:
     """The brightest channel of each texel; NaN where one is missing."""
-    values = over_channels(np.maximum, one.rows(0, one.shape[0]).reshape(-1, one.shape[2])[texels])
+    height, _, channels = one.shape
+    # By bands: in memory is one value a texel of one photograph.
+    bands = (one.rows(first, min(first + ROWS, height)) for first in range(0, height, ROWS))
+    values = np.concatenate([over_channels(np.maximum, band.reshape(-1, channels)) for band in bands])[texels]
     return np.where(np.isfinite(values), values, np.nan)
 
 

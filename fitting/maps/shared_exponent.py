@@ -32,8 +32,10 @@ def with_shared_n(problem: MapProblem, labels: Any) -> MapProblem:
     if isinstance(labels, str | Path):
         with brdf.ImageReader(labels, encoding="linear") as reader:
             codes = np.round(reader.read() * (2**reader.bits - 1)).astype(int)
-        colours = codes.reshape(-1, codes.shape[-1])
-        labels = np.unique(colours, axis=0, return_inverse=True)[1].reshape(codes.shape[:2])
+        labels = np.zeros(codes.shape[:2], int)
+        for channel in np.moveaxis(codes, -1, 0):
+            # Of rows NumPy sorts a hundred times as long.
+            labels = np.unique((labels << reader.bits) + channel, return_inverse=True)[1].reshape(labels.shape)
     labels = np.asarray(labels)
     if labels.dtype.kind not in "iub" or labels.shape not in ((), size):
         what = f"are of shape {labels.shape} and type {labels.dtype}, the photographs of {size}"

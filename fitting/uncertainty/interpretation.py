@@ -53,6 +53,8 @@ GROWING = (
     "the noise grows with brightness; the errors allow for it, but {}: told of the camera's noise, or with the "
     "relative loss, the same picture says more"
 )
+# A coefficient of which values that are not clipped tell less than this share of what they tell of another channel's.
+CLIPPED_SHARE, CLIPPED = 1e-3, "the values that would tell it are clipped"
 # An interval of n wider than this factor says nothing but its order of magnitude.
 WIDEST_INTERVAL = 100.0
 
@@ -63,7 +65,7 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "") -> FitResult:
     Args:
         fit: of one model.
         observed: what was fitted.
-        hidden: why there is no highlight, where a fit with one has told.
+        hidden: why there is no highlight, where a fit with one has found that.
     """
     optimum, pictures, residual = fit.optimum, fit.pictures, fit.residual
     about = observed.result_fields() | {"optimum": optimum, "pixels": int(np.min(optimum.pixels))}
@@ -75,23 +77,17 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "") -> FitResult:
     visible = 0.0 if lobe is None else lobe.share(optimum.x, observed.brightest)
     resolution = RESOLUTION if fit.single else 0.0
     spread, shared, widening, deviation, gain, joined, growing, uneven = None, None, 1.0, noise, 0.0, None, None, None
-    channels, weighed = (
-        statistics.channels(noise > 2 * rounding),
-        any(one is not None for one in observed.problem.weights),
-    )
+    channels = statistics.channels(noise > 2 * rounding)
+    weighed = any(one is not None for one in observed.problem.weights)
+    clipped = _clipped(optimum, fit.tied)
     if fit.evidence is not None:
         # Each working target has the noise 1; what least squares leaves is rounding, which goes together.
-        evidence, statistics = (
-            fit.evidence,
-            statistics._replace(neighbours=statistics.neighbours._replace(significant=False)),
-        )
+        evidence = fit.evidence
+        statistics = statistics._replace(neighbours=statistics.neighbours._replace(significant=False))
         # Of a small highlight the pixels near an edge may tell next to nothing.
         gain = specular_gain(optimum.normal(noise**2).gram, optimum.x)
-        fit, optimum, deviation = (
-            fit._replace(pictures=evidence.pictures, optimum=evidence.optimum),
-            evidence.optimum,
-            noise**0,
-        )
+        optimum, deviation = evidence.optimum, noise**0
+        fit = fit._replace(pictures=evidence.pictures, optimum=optimum)
         shared, together, of_codes = shared_errors(
             evidence, observed, alone_covariance(optimum, fit.tied) if evidence.together is None else None
         )
@@ -141,6 +137,7 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "") -> FitResult:
         joined=joined,
         moved=fit.moved,
     )
+    errors.reasons[clipped & (errors.reasons == "")] = CLIPPED
     interval = None
     # At k_d + k_s = 1 the cost still falls across the bound: a profile that does not know it has its least elsewhere.
     if lobe is not None and not errors.n_reason and not fit.capped:
@@ -180,6 +177,20 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "") -> FitResult:
         correlation=correlation,
         **about,
     )
+
+
+def _clipped(optimum: Optimum, tied: np.ndarray | None) -> Bool[np.ndarray, "3 C"]:
+    """Coefficients of channels that are clipped wherever another channel tells them: an open end gives no error.
+
+    Args:
+        optimum: of least squares, which leaves out what is clipped.
+        tied: see `fitting.model_fit.ModelFit`; what channels share one of them tells.
+    """
+    squares = np.diagonal(optimum.gram, axis1=1, axis2=2)[:, :3].T
+    lost = optimum.pixels < np.max(optimum.pixels)
+    found = lost & (squares < CLIPPED_SHARE * np.max(squares, axis=1, keepdims=True))
+    found[2] &= tied is None
+    return found
 
 
 def shared_errors(

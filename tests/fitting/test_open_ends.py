@@ -207,6 +207,14 @@ def test_a_channel_that_is_clipped_everywhere_is_told_by_another_picture_or_refu
     long, short = (np.rint(255 * np.minimum(pictured(material, one), 1.0)).astype(np.uint8) for one in scenes)
     with pytest.raises(InputError, match="is clipped in channel green wherever it sees the object"):
         fitting.fit(long, scenes[0], model="blinn-phong")
+    # Where only the unlit side is not clipped, ambient light alone is told.
+    material = brdf.BlinnPhong(k_a=[0.1, 1.9, 0.1], k_d=[0.5, 10.0, 0.4], k_s=[0.35] * 3, n=60.0)
+    noisy = np.minimum(pictured(material, scenes[0], 0.005), 1.0)
+    result = fitting.fit(noisy, scenes[0], model="blinn-phong")
+    assert abs(float(result["k_a"][1]) - 1.9) < 4 * np.array(result["k_a"][1].error)
+    assert result["k_d"][1].reason == "the values that would tell it are clipped"
+    assert result["k_s"][1].reason
+    material = brdf.BlinnPhong(k_a=[0.1, 2.2, 0.1], k_d=[0.5, 1.0, 0.4], k_s=[0.35] * 3, n=60.0)
     result = fitting.fit([long, short], scenes, model="blinn-phong")
     for parameter in result.parameters:
         true = np.ravel(getattr(material, parameter.name))[parameter.channel or 0]
