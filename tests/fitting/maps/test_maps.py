@@ -15,11 +15,12 @@ from project_paths import ROOT
 
 import brdf
 import fitting
+from brdf.errors import InputError
 from brdf.images.encoding import encode
 from brdf.images.writing import write_image
 from brdf.vectors import Components
 from fitting.maps import map_bands, tiles
-from fitting.maps.map_inputs import read_lights
+from fitting.maps.map_inputs import named_directions, photographs, read_lights
 from fitting.maps.map_result import REASONS
 from fitting.maps.texels import Distant, Texels, nonnegative
 from fitting.maps.tiles import MapProblem
@@ -934,3 +935,27 @@ def test_errors_of_k_d_hold_what_a_highlight_at_its_bound_may_take():
     assert none.sum() > 20
     inside = np.abs(maps.k_d[0] - truth["k_d"]) < 1.96 * maps.k_d_error[0]
     assert inside[none].mean() > 0.85
+
+
+def test_lights_of_one_name_in_several_folders_are_those_of_the_folders(tmp_path: Path):
+    files = [tmp_path / f"l{i}" / "img.png" for i in range(3)]
+    for file in files:
+        file.parent.mkdir()
+        file.touch()
+    lines = [f"l{i}/img.png 0.{i} 0.2 0.9" for i in range(3)]
+    (tmp_path / "lights.lp").write_text("\n".join(["3", *lines]))
+    found = named_directions(tmp_path / "lights.lp", files[::-1])
+    np.testing.assert_allclose(found[:, 0], [0.2, 0.1, 0.0])
+    with pytest.raises(InputError, match=r"names img\.png 3 times"):
+        named_directions(tmp_path / "lights.lp", [tmp_path / "elsewhere" / "img.png"])
+
+
+def test_a_stated_saturation_is_that_value_in_whatever_encoding_a_silent_file_is_read(tmp_path: Path):
+    path = tmp_path / "one.png"
+    brdf.write_image(path, np.full((8, 8, 3), 0.5, np.float32))
+    given = photographs([path], [[0.0, 0.0, 1.0]], encoding="srgb").each[0]
+    stated = dataclasses.replace(given, top=0.8, stated=True)
+    assert stated.read_as("linear").top == 0.8
+    assert dataclasses.replace(given, top=0.8).read_as("linear").top == pytest.approx(
+        float(encode(np.array(0.8), "srgb"))
+    )
