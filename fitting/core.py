@@ -227,10 +227,11 @@ def _fit_simplest(observed: Observed) -> tuple[ModelFit, Choice]:
                 for done, fit in fits.items()
             }
         fits[name] = _fit_model(brdf.MODELS[name], observed)
-    least = min(float(np.sum(fit.optimum.cost)) for fit in fits.values())
+    fits = _best_first(fits)
+    least = next(iter(fits.values())).cost
     by_squares, precision, likeliest = dict(fits), None, -math.inf
-    for name, fit in sorted(fits.items(), key=lambda one: float(np.sum(one[1].optimum.cost))):
-        if np.sum(fit.optimum.cost) <= HOPELESS * least:
+    for name, fit in fits.items():
+        if fit.cost <= HOPELESS * least:
             grey = coefficient_factors(fit.model, fit.optimum.n, colour)[2]
             fits[name] = fit = most_likely(fit, grey=grey, precision=precision, rival=likeliest)
             precision = None if fit.evidence is None else fit.evidence.precision
@@ -246,7 +247,7 @@ def _fit_simplest(observed: Observed) -> tuple[ModelFit, Choice]:
             fits[name] = fit._replace(pictures=pictures, optimum=search(pictures, fit.free, fit.n_range))
     grey = {name: coefficient_factors(fit.model, fit.optimum.n, colour)[2] for name, fit in fits.items()}
     # The best comes first: what is judged without a highlight is judged by its sums.
-    fits = dict(sorted(fits.items(), key=lambda one: float(np.sum(one[1].optimum.cost))))
+    fits = _best_first(fits)
     best = next(iter(fits.values()))
     noise, whitened, colour_inflation = residual_noise(best.optimum, observed.rounding), _likely_sums(fits), 1.0
     statistics = None
@@ -299,6 +300,11 @@ def _fit_simplest(observed: Observed) -> tuple[ModelFit, Choice]:
         optimum = refit(pictures, optimum, choice.free, chosen.n_range, tied)
     chosen = chosen._replace(pictures=pictures, optimum=optimum, free=choice.free, tied=tied)
     return most_likely(chosen), choice
+
+
+def _best_first(fits: Mapping[str, ModelFit]) -> dict[str, ModelFit]:
+    """By least squares."""
+    return dict(sorted(fits.items(), key=lambda one: one[1].cost))
 
 
 def _too_wide(fit: ModelFit, problem: FitProblem) -> bool:
@@ -482,7 +488,7 @@ def _held_plausible(fit: ModelFit, observed: Observed) -> ModelFit:
         return fit
     optimum = search(fit.pictures, fit.free, fit.n_range, cap)
     # What the bound adds to the residual is no noise: that of the fit without it says what stands out.
-    noise = fit.noise_factor * float(np.sqrt(np.sum(fit.optimum.cost) / np.sum(optimum.cost)))
+    noise = fit.noise_factor * float(np.sqrt(fit.cost / np.sum(optimum.cost)))
     return fit._replace(optimum=optimum, tied=None, capped=True, noise_factor=noise)
 
 

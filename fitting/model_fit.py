@@ -101,6 +101,11 @@ class ModelFit(NamedTuple):
         return np.dtype(self.pictures[0].target.dtype) == np.float32
 
     @property
+    def cost(self) -> float:
+        """Sum of weighted squared residuals."""
+        return float(np.sum(self.optimum.cost))
+
+    @property
     def residual(self) -> float:
         """Root mean square of the residual over that of the picture."""
-        return float(np.sqrt(np.sum(self.optimum.cost) / np.sum(self.optimum.square)))
+        return float(np.sqrt(self.cost / np.sum(self.optimum.square)))

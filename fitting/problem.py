@@ -3,7 +3,8 @@
 import dataclasses
 import math
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from numbers import Real
 from typing import Any, NamedTuple
 
@@ -252,7 +253,8 @@ def _of_picture(picture: brdf.Picture, rounding: Rounding) -> Target:
         codes = codes._replace(lossy=picture.lossy, jpeg=jpeg)
         pixels = codes.middle(pixels)
     if top is not None:
-        top = _clipped_from(top, codes, picture.pixels, picture.encoding, picture.bits, picture.factor)
+        own = partial(find_codes, picture.pixels, picture.encoding, picture.bits, None, picture.factor)
+        top = _clipped_from(top, codes, own)
     least, file = rounding is not None and codes is None, None
     if picture.path is not None:
         file = {"path": str(picture.path), "encoding": picture.encoding, "source": picture.source}
@@ -260,17 +262,16 @@ def _of_picture(picture: brdf.Picture, rounding: Rounding) -> Target:
     return Target(pixels, top, step, codes, least, file)
 
 
-def _clipped_from(top: float, codes: Codes | None, *of_file: Any) -> float:
+def _clipped_from(top: float, codes: Codes | None, of_file: Callable[[], Codes | None]) -> float:
     """The linear value from which on those of an integer file are clipped: fewer bits may end below its largest code.
 
     Args:
         top: of the largest code of the file.
         codes: that are fitted; steps that a user states are not those of the file.
-        of_file: see `find_codes`.
+        of_file: finds these.
     """
-    pixels, encoding, bits, *further = of_file
     if codes is None or not np.isfinite(codes.ends[1]):
-        codes = find_codes(pixels, encoding, bits, None, *further)
+        codes = of_file()
     return TOP * min(top, np.inf if codes is None else codes.largest)
 
 
@@ -294,7 +295,8 @@ def _of_array(values: np.ndarray, rounding: Rounding, encoding: Encoding) -> Tar
     integer = stored is not None
     codes = find_codes(values, encoding if integer else None, bits, rounding, stored=stored)
     values = values if codes is None else codes.middle(values)
-    top = _clipped_from(1.0, codes, values, encoding, bits, 1.0, stored) if integer else None
+    own = partial(find_codes, values, encoding, bits, None, stored=stored)
+    top = _clipped_from(1.0, codes, own) if integer else None
     return Target(values, top, step, codes, least_squares=rounding is not None and codes is None)
 
 
