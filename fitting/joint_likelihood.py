@@ -71,7 +71,8 @@ def by_least_squares(
         variance: of the values of those that do.
         copies: the channels are copies of each other, and err together.
     """
-    every = np.zeros((counts.size, variance.shape[1]))
+    # Of pixels that do not count in every channel the usual one.
+    every = np.tile(np.mean(variance, axis=0), (counts.size, 1))
     every[counts] = variance
     moves = columns.reshape(len(columns), *every.shape)
     if copies:

@@ -26,7 +26,7 @@ NAMED = re.compile(r"(light|intensity|ball|radius)(?: (\d+))?(?: of picture (\d+
 NOT_NEGATIVE = ("k_a", "k_d", "k_s", "intensity", "radiance", "ambient", "attenuation")
 # Derivatives of the renderer are as fast without, and compiled in half the time.
 QUICKLY_COMPILED: Any = {"xla_cpu_use_fusion_emitters": False}
-# Values (P, C), and weights (P,), or None where each pixel weighs 1.
+# Values (P, C), and weights (P,) or (P, C), or None where each pixel weighs 1.
 Picture = tuple[Array, Array | None]
 
 
@@ -124,8 +124,9 @@ def residuals(material: brdf.Material, scenes: Sequence[brdf.Scene], pictures: S
     for (target, weight), scene in zip(pictures, scenes, strict=True):
         residual = brdf.render(material, scene).reshape(target.shape) - target
         if weight is not None:
-            counts = weight[:, None] > 0
-            residual = jnp.where(counts, residual * jnp.where(counts, weight[:, None], 1) ** 0.5, 0)
+            weight = weight.reshape(target.shape[0], -1)
+            counts = weight > 0
+            residual = jnp.where(counts, residual * jnp.where(counts, weight, 1) ** 0.5, 0)
         found.append(residual.ravel())
     return jnp.concatenate(found)
 

@@ -218,7 +218,7 @@ def _observe(
     plain = dark is None and problem.loss == "squared" and not target.least_squares
     plain = plain and not target.streamed and device_count() == 1
     # Where one channel is clipped the others say what they say.
-    apart = plain and not at_once and target.pixels.shape[2] > 1
+    apart = plain and target.pixels.shape[2] > 1
     found, total = _statistics(bands, level, dark, apart=apart, keep=not target.streamed)
     reach = SINGLE if dtype == np.float32 else DOUBLE
     size = max(float(total.largest), float(np.max(total.scale)))

@@ -266,3 +266,21 @@ def test_without_a_word_of_scenes_the_material_alone_is_freed(target: np.ndarray
     result = fitting.fit_jointly(target, known, MATERIAL)
     assert {one.name for one in result.parameters} == {"k_a", "k_d", "k_s", "n"}
     np.testing.assert_allclose(float(result["n"]), 25, rtol=1e-6)
+
+
+def test_where_one_channel_is_clipped_the_others_tell_the_light_and_the_highlight():
+    material = brdf.BlinnPhong(k_a=[0.1, 0.22, 0.1], k_d=[0.5, 1.1, 0.4], k_s=[0.35] * 3, n=60)
+    true, ambient = np.array([0.3, -0.4, 1.0]), [0.5] * 3
+    told, wrong = (
+        brdf.Scene(CAMERA, [BALL], ambient=ambient, lights=[brdf.DirectionalLight(direction, 1.0)])
+        for direction in (true, [0.32, -0.41, 1.0])
+    )
+    clean = np.asarray(brdf.render(material, told, precision="float64"))
+    picture = np.minimum(clean + np.random.default_rng(0).normal(0, 0.005, clean.shape), 1.0)
+    result = fitting.fit_jointly(picture, wrong, "blinn-phong", "light")
+    assert result.left_out["clipped"] > 200
+    assert angle(result.scenes[0].lights[0].direction, true) < 0.1
+    for name in ("k_a", "k_d", "k_s"):
+        for parameter, value in zip(result[name], getattr(material, name), strict=True):
+            assert abs(float(parameter) - value) < 4 * np.array(parameter.error), parameter
+    assert abs(float(result["n"]) - 60) < 4 * np.array(result["n"].error) < 4
