@@ -152,6 +152,10 @@ def _fit_model(
         else:
             pictures = list(map(placed, itertools.count(), map(made, observed.tiles)))
         fit = _fit_about(model, observed, free, pictures, near)
+        if (empty := np.flatnonzero(fit.optimum.pixels == 0)).size:
+            clipped = ", ".join(channel_names(fit.optimum.pixels.size)[channel] for channel in empty)
+            what = f"is clipped in channel {clipped} wherever it sees the object"
+            raise InputError("target", what, "Give a darker exposure or a higher saturation")
         if fit.optimum.flat:
             break
         n, peak = fit.optimum.n, nearest_peak(pictures)
@@ -207,10 +211,6 @@ def _fit_about(
             free = free & [[True], [True], [False]]
     optimise = partial(search, free=free, n_range=n_range)
     found = reweight(pictures, optimise(pictures), optimise, observed.problem.loss, observed.rounding)
-    if (empty := np.flatnonzero(found.optimum.pixels == 0)).size:
-        clipped = ", ".join(channel_names(found.optimum.pixels.size)[channel] for channel in empty)
-        what = f"is clipped in channel {clipped} wherever it sees the object"
-        raise InputError("target", what, "Give a darker exposure or a higher saturation")
     fit = ModelFit(model, found.pictures, found.optimum, free, n_range, owner=observed.owner, copies=observed.copies)
     return fit._replace(noise_factor=found.noise_factor)
 
