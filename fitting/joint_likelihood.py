@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from fitting.continuation import Estimate, Problem, Score, maximise, most_informative_score
+from fitting.continuation import Estimate, Precision, Problem, Score, maximise, most_informative_score
 from fitting.joint_problem import JointProblem, linearised
 from fitting.likelihood import Bounds, Values, in_light, is_curved, residual_deviation
 from fitting.maximum_likelihood import FAINT, FIRST_NOISE, LIKELIER, alike
@@ -108,7 +108,7 @@ def most_likely_numbers(
     return Information(at.unknowns, score.hessian, scatter, wider * np.sqrt(np.where(shared, observed.colour.size, 1)))
 
 
-def _maximised(pictures: "_RoundedPictures", start: Float[np.ndarray, " U"]) -> Any:
+def _maximised(pictures: "_RoundedPictures", start: Float[np.ndarray, " U"]) -> tuple[Estimate, list[Precision], Score]:
     codes = pictures.codes(start)
     noise = max(residual_deviation(pictures.bounds, codes), FIRST_NOISE)
     if pictures.lossy:
