@@ -86,12 +86,14 @@ def fit_pictures(problem: FitProblem) -> FitResult:
     with working_precision(problem.precision):
         observed = _evenly_noisy(observe(problem))
         if problem.model == "auto":
-            fit, choice = _fit_simplest(observed)
+            fit, choice, statistics = _fit_simplest(observed)
         else:
-            fit, choice = _fit_model(brdf.MODELS[problem.model], observed), None
+            fit, choice, statistics = _fit_model(brdf.MODELS[problem.model], observed), None, None
         fit, choice, observed = _less_codec_errors(fit, choice, observed)
         fit = _held_plausible(fit, observed)
-        result, optimum = _interpreted(fit, observed, choice), fit.optimum
+        if fit.capped or problem.loss != "squared":
+            statistics = None
+        result, optimum = _interpreted(fit, observed, choice, statistics=statistics), fit.optimum
         # Why there is a highlight in the numbers but none in the material.
         reasons = {one.reason for one in result.parameters if one.name in ("k_s", "n")}
         hidden = reasons.pop() if len(reasons) == 1 else ""
@@ -215,8 +217,8 @@ def _fit_about(
     return fit._replace(noise_factor=found.noise_factor)
 
 
-def _fit_simplest(observed: Observed) -> tuple[ModelFit, Choice]:
-    """Every family first, then the simplest adequate candidate on its own."""
+def _fit_simplest(observed: Observed) -> tuple[ModelFit, Choice, Residual | None]:
+    """Every family first, then the simplest adequate candidate on its own; what it leaves, where that is known."""
     problem, colour = observed.problem, observed.colour
     fits: dict[str, ModelFit] = {}
     for name in problem.families if observed.reached(brdf.Lambert)[1].any() else ("lambert",):
@@ -292,14 +294,14 @@ def _fit_simplest(observed: Observed) -> tuple[ModelFit, Choice]:
         # Where channels err together a highlight is looked for in brightness; its colour is each channel's own.
         chosen, optimum = by_squares[choice.model], by_squares[choice.model].optimum
     elif not (matt or choice.grey) and np.array_equal(choice.free, chosen.free):
-        return chosen, choice
+        return chosen, choice, statistics
     if matt or not np.array_equal(choice.free, chosen.free):
         optimum = search(pictures, choice.free, chosen.n_range)
     tied = grey[choice.model] if choice.grey else None
     if tied is not None:
         optimum = refit(pictures, optimum, choice.free, chosen.n_range, tied)
     chosen = chosen._replace(pictures=pictures, optimum=optimum, free=choice.free, tied=tied)
-    return most_likely(chosen), choice
+    return most_likely(chosen), choice, None
 
 
 def _best_first(fits: Mapping[str, ModelFit]) -> dict[str, ModelFit]:
@@ -502,10 +504,12 @@ def _by_highlight(fit: ModelFit, rest: ModelFit, observed: Observed) -> Float[np
     return may_be_off(np.append(step.ravel(), 0.0), specular_gain(normal.gram, x), 1 + int(np.count_nonzero(x[2])))
 
 
-def _interpreted(fit: ModelFit, observed: Observed, choice: Choice | None, hidden: str = "") -> FitResult:
+def _interpreted(
+    fit: ModelFit, observed: Observed, choice: Choice | None, hidden: str = "", statistics: Residual | None = None
+) -> FitResult:
     if choice is not None:
         fit = fit._replace(moved=(*fit.moved, choice.dropped))
-    result = interpret(fit, observed, hidden)
+    result = interpret(fit, observed, hidden, statistics)
     warnings, share = list(result.warnings), fit.residual
     structure = any("structure" in text for text in warnings)
     # What errs by itself is noise, however much.

@@ -69,8 +69,9 @@ class Light(Checked):
 
         A light without extent is a single sample, of all its numbers in the order of its fields.
         """
-        names = [field.name for field in dataclasses.fields(self) if field.name != "intensity"]
-        return (), tuple(getattr(self, name)[None] for name in names), self.emittance
+        values = [getattr(self, field.name) for field in dataclasses.fields(self) if field.name != "intensity"]
+        # On the host where they are known, or each would be a program.
+        return (), tuple((one if isinstance(one, Tracer) else np.asarray(one))[None] for one in values), self.emittance
 
     @staticmethod
     @abc.abstractmethod

@@ -220,10 +220,9 @@ class Sums(NamedTuple):
         Args:
             reference: What to add to the residual, as coefficients of the first columns, (..., C, 3) or more.
         """
-        missing = self.product.shape[-1] - reference.shape[-1]
-        reference = np.pad(reference, np.array([*[(0, 0)] * (reference.ndim - 1), (0, missing)]))
-        moved = (self.gram @ reference[..., None])[..., 0]
-        square = self.square + np.sum(reference * (2 * self.product + moved), axis=-1)
+        first = slice(reference.shape[-1])
+        moved = (self.gram[..., first] @ reference[..., None])[..., 0]
+        square = self.square + np.sum(reference * (2 * self.product + moved)[..., first], axis=-1)
         return self._replace(product=self.product + moved, square=square)
 
     def columns(self, basis: np.ndarray) -> "Sums":

@@ -44,18 +44,18 @@ def join_channels(
         variance: of each channel's noise.
     """
     channels = x_s.size
-    scale = np.ones((channels, 4))
-    scale[:, 3] = x_s
-    variance, places = np.broadcast_to(variance, channels), places_of(channels)
+    variance = np.broadcast_to(variance, channels)
     # A black channel may have no noise at all, and still leaves the others their digits.
     variance = np.maximum(variance, LEAST_VARIANCE * np.max(variance))
-    whole, right = np.zeros((3 * channels + 1,) * 2), np.zeros(3 * channels + 1)
-    for c, index in enumerate(places):
-        right[index] += product[c] * scale[c] / variance[c]
-        for other in range(channels) if gram.ndim == 4 else [c]:
-            own = gram[c, other] if gram.ndim == 4 else gram[c]
-            whole[np.ix_(index, places[other])] += own * np.outer(scale[c], scale[other]) / variance[c]
-    return NormalEquations(whole, right, float(np.sum(square / variance)))
+    columns = np.zeros((channels, 4, 3 * channels + 1))
+    np.put_along_axis(columns, places_of(channels)[:, :, None], 1.0, axis=2)
+    columns[:, 3] *= x_s[:, None]
+    rows = columns.swapaxes(1, 2) / variance[:, None, None]
+    whole = rows @ gram @ columns if gram.ndim == 3 else rows[:, None] @ gram @ columns
+    right = (rows @ product[..., None])[..., 0]
+    return NormalEquations(
+        whole.reshape(-1, *whole.shape[-2:]).sum(axis=0), right.sum(axis=0), float(np.sum(square / variance))
+    )
 
 
 def places_of(channels: int) -> Int[np.ndarray, "C 4"]:

@@ -59,20 +59,22 @@ CLIPPED_SHARE, CLIPPED = 1e-3, "the values that would tell it are clipped"
 WIDEST_INTERVAL = 100.0
 
 
-def interpret(fit: ModelFit, observed: Observed, hidden: str = "") -> FitResult:
+def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: Residual | None = None) -> FitResult:
     """Tell what a fit says.
 
     Args:
         fit: of one model.
         observed: what was fitted.
         hidden: why there is no highlight, where a fit with one has found that.
+        statistics: of what least squares leaves, in the unit of the picture, where that has been gone over.
     """
     optimum, pictures, residual = fit.optimum, fit.pictures, fit.residual
     about = observed.result_fields() | {"optimum": optimum, "pixels": int(np.min(optimum.pixels))}
     weight = _typical_weight(pictures)
     rounding, columns = observed.rounding * weight, rms_columns(optimum, weight)
     noise = np.maximum(residual_noise(optimum, rounding) * fit.noise_factor, rounding)
-    statistics = residual_statistics(pictures, observed.widths, optimum, noise, rounding)
+    if statistics is None or weight != 1.0:
+        statistics = residual_statistics(pictures, observed.widths, optimum, noise, rounding)
     lobe = None if optimum.flat else highlight(optimum.n, statistics)
     visible = 0.0 if lobe is None else lobe.share(optimum.x, observed.brightest)
     resolution = RESOLUTION if fit.single else 0.0

@@ -241,9 +241,17 @@ def _over_blocks(residual: list[Any], lobe: Any, width: int) -> list[Any]:
     terms += [xp.broadcast_to(one, residual[0].shape) for one in (lobe * lobe, lobe)]
     size, (step, pixels) = SIZES[0], residual[0].shape
     rows = pixels // width
-    pad = [(0, 0), (0, -rows % size), (0, -width % size)]
-    shape = step, -(-rows // size), size, -(-width // size), size
-    blocks = [xp.pad(term.reshape(step, rows, width), pad).reshape(shape) for term in terms]
+    shape, padded = (step, rows, width), (step, rows + -rows % size, width + -width % size)
+    blocked = step, padded[1] // size, size, padded[2] // size, size
+    if xp is np:
+        whole = np.zeros((len(terms), *padded), lobe.dtype)
+        for place, term in zip(whole, terms, strict=True):
+            place[:, :rows, :width] = term.reshape(shape)
+        blocks = whole.reshape(-1, *blocked)
+        sums = np.add.reduce(np.add.reduce(blocks[:-1], axis=3), axis=4)
+        return [*sums, np.maximum.reduce(np.maximum.reduce(blocks[-1], axis=2), axis=3)]
+    pad = [(0, more - one) for one, more in zip(shape, padded, strict=True)]
+    blocks = [jnp.pad(term.reshape(shape), pad).reshape(blocked) for term in terms]
     return totals(blocks, [*["add"] * (len(terms) - 1), "maximum"], (2, 4))
 
 
