@@ -158,6 +158,7 @@ class TexelFit(NamedTuple):
         error: of each.
         cost: sum of squared residuals, (T,).
         gain: by how much the last column lowers it, (T,).
+        rival: how far k, log n and cost of another minimum are; 0 where none was climbed.
     """
 
     k: list[Array]
@@ -168,6 +169,7 @@ class TexelFit(NamedTuple):
     error: list[Array]
     cost: Array
     gain: Array
+    rival: list[Array]
 
 
 class Texels(eqx.Module):
@@ -273,7 +275,10 @@ class Texels(eqx.Module):
 
         def again(lanes, best):
             other = climbed(self.some(lanes), second[:, lanes])
-            return jax.tree.map(lambda a, b: jnp.where(other.cost < best.cost, b, a), best, other)
+            ends = ([*fit.k, fit.log_n, fit.cost] for fit in (best, other))
+            rival = [jnp.abs(b - a) for a, b in zip(*ends, strict=True)]
+            best = jax.tree.map(lambda a, b: jnp.where(other.cost < best.cost, b, a), best, other)
+            return best._replace(rival=rival)
 
         (gain, rival), (first, second) = peaks(self.gains(), grid(self.finer))
         best = climbed(self, first)
@@ -387,7 +392,8 @@ class Texels(eqx.Module):
         of_channels = k, [one.error for one in solved[:count]]
         k, k_error = ([jnp.broadcast_to(x, self.shown.shape[:2]) for x in some] for some in of_channels)
         slope, step, error = ([getattr(one, name)[0] for one in solved[count:]] for name in ("left", "step", "error"))
-        fit = TexelFit(k, k_error, log_n, slope, step, error, gain, gain)
+        rival = [jnp.zeros_like(one) for one in (*k, log_n, gain)]
+        fit = TexelFit(k, k_error, log_n, slope, step, error, gain, gain, rival)
         left = self.residual(fit)
         return fit._replace(cost=jnp.sum(*sums(left * left), axis=0))
 
@@ -549,12 +555,13 @@ def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Components,
         return lambert_normals(shown, counts, lights.to_light), counts
 
     def again(_, state):
-        log_n, normal, _, counts = state
+        log_n, normal, _, counts, _ = state
         there = texels.facing(normal, lights)
         lit = seen if lights.ambient is not None else jnp.where(there.linear[0].parts[0] > 0, seen, 0)
         counts = inliers(there.residual(there.where(counts).at(log_n)), lit, lit * counts)
         some = there.where(counts)
-        return *jointly(some, lights, some.fitted().log_n, normal), lit, counts
+        fit = some.fitted()
+        return *jointly(some, lights, fit.log_n, normal), lit, counts, fit.rival
 
     plain = lambert_normals(shown, seen, lights.to_light), seen
     starts = [plain, jax.lax.fori_loop(0, 2, unshadowed, plain)]
@@ -563,9 +570,10 @@ def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Components,
     found = jax.lax.map(tried, jax.tree.map(lambda *some: jnp.stack(some), *starts))
     trials = [jax.tree.map(operator.itemgetter(i), found) for i in range(len(starts))]
     best = functools.reduce(Trial.or_better, trials)
-    state = best.fit.log_n, best.normal, seen, best.counts.T
-    log_n, normal, lit, counts = jax.lax.fori_loop(0, 2, again, state)
-    return joint_fit(texels.where(counts).facing(normal, lights), lights, log_n, normal), normal, lit, counts
+    state = best.fit.log_n, best.normal, seen, best.counts.T, best.fit.rival
+    log_n, normal, lit, counts, rival = jax.lax.fori_loop(0, 2, again, state)
+    fit = joint_fit(texels.where(counts).facing(normal, lights), lights, log_n, normal)
+    return fit._replace(rival=rival), normal, lit, counts
 
 
 def lambert_normals(shown: Array, seen: Array, to_light: Components) -> Components:

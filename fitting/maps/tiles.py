@@ -309,7 +309,13 @@ def _layers(
     freedom = values - unknowns
     noise = jnp.where(freedom < 1, jnp.nan, jnp.sqrt(fit.cost / jnp.maximum(freedom, 1)))
     n = jnp.exp(fit.log_n)
-    error = shared if shared is not None else noise * fit.error[0] if glossy else jnp.full_like(n, jnp.inf)
+    # Of two minima either may be that of the truth, by its likelihood: errors are those of the mixture.
+    *rival, worse = fit.rival
+    share = jnp.sqrt(jax.nn.sigmoid(-0.5 * worse / jnp.maximum(noise**2, tiny)))
+    k_error = [jnp.hypot(noise * own, share * apart) for own, apart in zip(fit.k_error, rival, strict=False)]
+    error = jnp.full_like(n, jnp.inf) if shared is None else shared
+    if glossy and shared is None:
+        error = jnp.hypot(noise * fit.error[0], share * rival[-1])
     gain = values * jnp.log1p(fit.gain / jnp.maximum(fit.cost, tiny))
     shows = jnp.any(k_s > LEAST_HIGHLIGHT * noise * k_s_error, axis=0)
     shows &= gain > price(unknowns) - price(unknowns - of_lobe)
@@ -332,7 +338,7 @@ def _layers(
     names = ("k_a", "k_d")[-len(linear) :]
     layers = {name: jnp.where(inside & (values > 0), k, jnp.nan) for name, k in zip(names, linear, strict=True)}
     # Errors allow for what was dropped.
-    errors = [jnp.hypot(noise * error, step) for error, step in zip(fit.k_error, moved, strict=False)]
+    errors = map(jnp.hypot, k_error, moved)
     layers |= {f"{name}_error": one for name, one in zip(names, errors, strict=True)}
     square = jnp.sum(*sums(some.values * some.values), axis=0)
     every = values + unlit + outliers
@@ -342,7 +348,7 @@ def _layers(
         "n": jnp.where(known, n, jnp.nan),
         "k_s": jnp.where(known, k_s, jnp.nan),
         "n_error": jnp.where(known, n * error, jnp.nan),
-        "k_s_error": jnp.where(known, noise * k_s_error, jnp.nan),
+        "k_s_error": jnp.where(known, k_error[-1], jnp.nan),
         "fitted_n": n,
         "fitted_k_s": jnp.where(inside & shows, k_s, 0),
         "normal": jnp.where(inside, jnp.stack(normal.parts), 0),

@@ -197,6 +197,23 @@ def test_the_optimum_is_global_of_what_lies_flat():
     assert np.mean((most - fall(maps.fitted_n[0]) > noise**2)[some]) < 0.005
 
 
+@pytest.mark.parametrize("normals", ["given", "fit"])
+def test_errors_hold_the_other_minimum_of_what_lies_flat(normals):
+    """About n = 8 noise makes a minimum near n = 12 the lower one of every fifth texel, mostly by less than 4 σ²."""
+    lights, random, normal = dome(32), np.random.default_rng(0), np.broadcast_to(VIEW, (1000, 3))
+    k_d, k_s = random.uniform(0.03, 0.5, (1000, 1)), random.uniform(0.1, 0.8, (1000, 1))
+    pictures = seen_by_equation(lights, normal, k_d, k_s, 8.0)
+    pictures = pictures + 0.01 * random.normal(size=pictures.shape)
+    maps = fitting.fit_maps(pictures, lights, normal[None] if normals == "given" else "fit", specular="grey")
+    known = maps.determined
+    off = np.abs(np.log(maps.n / 8) * maps.n / maps.n_error)[known]
+    beside = (np.abs(maps.k_d - (k_d * np.array([1.0, 0.6, 0.4]))[None]) / maps.k_d_error)[known]
+    assert known.mean() > 0.6
+    assert np.mean(off > 4) < 0.04  # 7 %, before
+    for one in (off, beside):
+        assert np.mean(one < 1.96) > 0.82  # 77 %
+
+
 def test_a_texel_is_the_fit_of_one_material():
     lights = dome(16)
     pictures, truth = texels(1, 0.005, lights, seed=3)
