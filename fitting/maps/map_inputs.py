@@ -38,7 +38,6 @@ class Photograph:
         curve: how it is encoded, which tells how exact its values are: noise is even in codes.
         silent: whether it is a file of integers that does not say so.
         lossy: whether it was compressed with losses.
-        fine: whether it is of floats, or integers of more than 8 bits.
         alpha: reads how opaque pixels are, (H, W), or None where nobody says.
         stated: whether a user says from which value on it is clipped.
     """
@@ -50,7 +49,6 @@ class Photograph:
     curve: Encoding
     silent: bool = False
     lossy: bool = False
-    fine: bool = True
     alpha: Callable[[], Float[np.ndarray, "H W"] | None] = lambda: None
     stated: bool = False
 
@@ -346,12 +344,10 @@ def _opened(name: str, picture: Any, encoding: Any) -> Photograph:
             raise InputError("encoding", f"is that of files and arrays, {name} is decoded", "Leave it out")
         if isinstance(picture, brdf.ImageReader):
             top = (picture.codes[0] or np.inf) * TOP
-            fine = not picture.is_integer or picture.bits > 8
-            how = {"fine": fine, "alpha": picture.read_alpha}
-            return Photograph(picture.rows, picture.shape, name, top, picture.encoding, **how)
+            return Photograph(picture.rows, picture.shape, name, top, picture.encoding, alpha=picture.read_alpha)
         top = (picture.saturation or np.inf) * TOP
-        how = {"fine": picture.saturation is None or picture.bits > 8, "alpha": lambda: picture.alpha}
-        return Photograph(lambda a, b: picture.pixels[a:b], picture.pixels.shape, name, top, picture.encoding, **how)
+        rows, alpha = lambda a, b: picture.pixels[a:b], lambda: picture.alpha
+        return Photograph(rows, picture.pixels.shape, name, top, picture.encoding, alpha=alpha)
     values = np.asarray(picture)
     values = values[..., None] if values.ndim == 2 else values
     integer = values.dtype.kind == "u"
@@ -364,7 +360,7 @@ def _opened(name: str, picture: Any, encoding: Any) -> Photograph:
         part = values[start:stop]
         return decode(part if white is None else part / white, curve)
 
-    return Photograph(rows, values.shape, name, TOP if integer else np.inf, curve, fine=values.dtype != np.uint8)
+    return Photograph(rows, values.shape, name, TOP if integer else np.inf, curve)
 
 
 def _factors(count: int, channels: int, name: str, given: Any) -> Float[np.ndarray, "P C"]:

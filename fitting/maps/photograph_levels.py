@@ -12,7 +12,7 @@ from brdf.errors import InputError, as_numbers, what_came
 from fitting.likelihood import over_channels
 from fitting.maps.map_inputs import Photograph, places
 from fitting.maps.tiles import MapProblem
-from fitting.pixels import DOUBLE, FLAT, SYMMETRIC_PIXELS
+from fitting.pixels import DOUBLE, SYMMETRIC_PIXELS
 from fitting.problem import TOP
 
 SPIKE = 4
@@ -20,6 +20,9 @@ SPIKE = 4
 
 JUST_BELOW = 1 / 256
 """Share of the largest value; the next largest one is always just below."""
+
+ALIKE = 0.02
+"""Share of the largest value by which texels that are alike differ at most, as where they are rounded to 8 bits."""
 
 ROWS = 256
 """Rows that are read at a time."""
@@ -30,8 +33,6 @@ SINGLE = 1e30
 
 def with_levels(problem: MapProblem, saturation: Any = None) -> tuple[MapProblem, float, tuple[str, ...]]:
     """Photographs clipped where many texels of the stack share its largest value, and in a unit in which that is of 1.
-
-    Those of 8 bits or less end at their largest code: of so few codes many texels share any.
 
     Args:
         problem: in which photographs are clipped where they say so themselves.
@@ -45,8 +46,8 @@ def with_levels(problem: MapProblem, saturation: Any = None) -> tuple[MapProblem
     """
     given, texels = problem.photographs, places(problem.texels)
     each, notes = given.each, ()
-    fine = [functools.partial(_brightest, one, texels) for one in each if one.fine]
-    largest = np.array([_two_largest(_brightest(one, texels)) if one.fine else (1.0, 1.0) for one in each])
+    brightest = [functools.partial(_brightest, one, texels) for one in each]
+    largest = np.array([_two_largest(read()) for read in brightest])
     top, size = float(np.max(largest)), float(np.max(largest[:, 0] / np.mean(given.unit, axis=1)))
     if saturation is not None:
         value = as_numbers("saturation", saturation)
@@ -54,7 +55,7 @@ def with_levels(problem: MapProblem, saturation: Any = None) -> tuple[MapProblem
             what = f"must be a number above 0, got {what_came(saturation)}"
             raise InputError("saturation", what, "Give the linear value of clipped pixels")
         each = tuple(dataclasses.replace(one, top=float(value) * TOP, stated=True) for one in each)
-    elif top < max(one.top for one in each) and _is_clipped(fine, largest[[one.fine for one in each]]):
+    elif top < max(one.top for one in each) and _is_clipped(brightest, largest):
         each = tuple(dataclasses.replace(one, top=min(one.top, top * TOP)) for one in each)
         notes = (f"many values share the largest, {top:.6g}: they are taken as clipped. Say otherwise with saturation",)
     if size <= 0:
@@ -97,7 +98,7 @@ def _two_largest(values: Float[np.ndarray, " K"]) -> tuple[float, float]:
     return float(largest), float(np.max(values, initial=-np.inf, where=values < largest * TOP))
 
 
-def _is_clipped(fine: list[Callable[[], Float[np.ndarray, " K"]]], largest: Float[np.ndarray, "P 2"]) -> bool:
+def _is_clipped(brightest: list[Callable[[], Float[np.ndarray, " K"]]], largest: Float[np.ndarray, "P 2"]) -> bool:
     """Whether the largest value is a plateau above which there was more, of texels that differ elsewhere.
 
     Those of a smooth maximum have many just below; those of one material on a plane are alike under all lights.
@@ -105,14 +106,14 @@ def _is_clipped(fine: list[Callable[[], Float[np.ndarray, " K"]]], largest: Floa
     level = np.max(largest) * TOP
     edge = min(np.max(largest, initial=-np.inf, where=largest < level) * TOP, level * (1 - JUST_BELOW))
     at_top, just_below, count = np.zeros(1, bool), 0, 0
-    for values in (read() for read, (own, _) in zip(fine, largest, strict=True) if own >= edge):
+    for values in (read() for read, (own, _) in zip(brightest, largest, strict=True) if own >= edge):
         at_top = at_top | (values >= level)
         count += np.count_nonzero(values >= level)
         just_below += np.count_nonzero((values >= edge) & (values < level))
     if count <= max(SYMMETRIC_PIXELS, SPIKE * just_below):
         return False
-    for values in (read()[at_top] for read in fine):
+    for values in (read()[at_top] for read in brightest):
         lower = values[values < level]
-        if lower.size and np.ptp(lower) > FLAT * np.max(np.abs(lower)):
+        if lower.size and np.ptp(lower) > ALIKE * level:
             return True
     return False

@@ -580,14 +580,18 @@ def test_clipped_values_are_no_data():
     assert np.median(np.abs(np.log(maps.n[0] / truth["n"]))[known]) < 1e-3
 
 
-@pytest.mark.parametrize("kind", ["float", "12 bits in 16"])
+@pytest.mark.parametrize("kind", ["float", "12 bits in 16", "235 of 8 bits"])
 def test_clipping_that_no_type_tells_of_is_found_or_told(kind):
     lights = dome(32)
     pictures, truth = texels(256, 0.004, lights)
     shown = np.clip(1.2 * pictures, 0, 1)
-    given = shown if kind == "float" else (16 * np.round(4095 * shown)).astype(np.uint16)
-    normals, unit = truth["normal"][None], 1.2 * (1 if kind == "float" else 65520 / 65535)
-    found, told = (fitting.fit_maps(given, lights, normals, saturation=top) for top in (None, unit / 1.2))
+    given, top = {
+        "float": (shown, 1.0),
+        "12 bits in 16": ((16 * np.round(4095 * shown)).astype(np.uint16), 65520 / 65535),
+        "235 of 8 bits": (np.round(235 * shown).astype(np.uint8), 235 / 255),
+    }[kind]
+    normals = truth["normal"][None]
+    found, told = (fitting.fit_maps(given, lights, normals, saturation=level) for level in (None, top))
     assert "are taken as clipped" in found.notes[0]
     assert not told.notes
     for maps in (found, told):
