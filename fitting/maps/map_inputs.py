@@ -40,6 +40,7 @@ class Photograph:
         lossy: whether it was compressed with losses.
         alpha: reads how opaque pixels are, (H, W), or None where nobody says.
         stated: whether a user says from which value on it is clipped.
+        step: distance of two codes, the largest being 1; 0 of floats.
     """
 
     rows: Callable[[int, int], Float[np.ndarray, "rows W C"]]
@@ -51,6 +52,7 @@ class Photograph:
     lossy: bool = False
     alpha: Callable[[], Float[np.ndarray, "H W"] | None] = lambda: None
     stated: bool = False
+    step: float = 0.0
 
     def read_as(self, encoding: Encoding) -> "Photograph":
         """The same file read so, clipped at the same code, or at the linear value that was stated."""
@@ -344,23 +346,24 @@ def _opened(name: str, picture: Any, encoding: Any) -> Photograph:
             raise InputError("encoding", f"is that of files and arrays, {name} is decoded", "Leave it out")
         if isinstance(picture, brdf.ImageReader):
             top = (picture.codes[0] or np.inf) * TOP
-            return Photograph(picture.rows, picture.shape, name, top, picture.encoding, alpha=picture.read_alpha)
+            how = {"alpha": picture.read_alpha, "step": picture.is_integer / (2**picture.bits - 1)}
+            return Photograph(picture.rows, picture.shape, name, top, picture.encoding, **how)
         top = (picture.saturation or np.inf) * TOP
-        rows, alpha = lambda a, b: picture.pixels[a:b], lambda: picture.alpha
-        return Photograph(rows, picture.pixels.shape, name, top, picture.encoding, alpha=alpha)
+        how = {"alpha": lambda: picture.alpha, "step": (picture.code_step or 0.0) * np.max(picture.factor)}
+        return Photograph(lambda a, b: picture.pixels[a:b], picture.pixels.shape, name, top, picture.encoding, **how)
     values = np.asarray(picture)
     values = values[..., None] if values.ndim == 2 else values
     integer = values.dtype.kind == "u"
     if values.ndim != 3 or 0 in values.shape or values.dtype.kind not in "fu":
         what = f"is of shape {values.shape} and type {values.dtype}"
         raise InputError(name, what, "Give (H, W, C) floats, or unsigned integers that span their type")
-    white = np.float32(np.iinfo(values.dtype).max) if integer else None
+    white = np.float32(np.iinfo(values.dtype).max) if integer else np.float32(np.inf)
 
     def rows(start: int, stop: int) -> np.ndarray:
         part = values[start:stop]
-        return decode(part if white is None else part / white, curve)
+        return decode(part / white if integer else part, curve)
 
-    return Photograph(rows, values.shape, name, TOP if integer else np.inf, curve)
+    return Photograph(rows, values.shape, name, TOP if integer else np.inf, curve, step=float(1 / white))
 
 
 def _factors(count: int, channels: int, name: str, given: Any) -> Float[np.ndarray, "P C"]:

@@ -132,14 +132,16 @@ class MapProblem:
             of_photographs += [_weights(given.unit).T[:, None], to_light.T]
             of_photographs += [] if self.ambient is None else [self.ambient.T[:, None]]
             view = self.to_view / np.linalg.norm(self.to_view)
+            rounding = max(one.step for one in given.each) / np.sqrt(12 * np.mean(given.unit**2))
             of_photographs = [_padded(one, np).astype(dtype) for one in of_photographs]
+            more = dtype.type(rounding), view.astype(dtype), stacks, occluders
             # All tiles that hold a texel, and the first lane that holds none.
             used = np.arange(len(values)) <= np.count_nonzero(surface.mask) // TILE
             found = []
             for first in range(0, len(values), CHUNK):
                 part = jax.tree.map(operator.itemgetter(slice(first, first + CHUNK)), (used, values, surface))
                 part = placed(band, part)
-                found.append(_program(*static, *part, of_photographs, view.astype(dtype), stacks, occluders))
+                found.append(_program(*static, *part, of_photographs, *more))
             return {name: np.concatenate([np.asarray(layers[name]) for layers in found]) for name in found[0]}
 
 
@@ -159,6 +161,7 @@ def _program(
     values: Array,
     surface: Surface,
     of_photographs: list[Array],
+    rounding: Array,
     to_view: Array,
     stacks: tuple[LightStack, ...],
     occluders: tuple[Any, ...],
@@ -192,11 +195,11 @@ def _program(
             texels = Texels(model, grey and issubclass(model, SpecularMaterial), finer, shown, root)
             if normal is None:
                 fit, normals, lit, counts = with_normals(texels, lights)
-                layers = _layers(texels.facing(normals, lights), fit, lit, counts, mask, normals)
+                layers = _layers(texels.facing(normals, lights), fit, lit, counts, mask, normals, rounding)
             else:
                 near = points is not None
                 texels = _near(texels, stacks, occluders, ambient, points) if near else texels.facing(normal, lights)
-                layers = _of_normals(texels, mask, normal, shared, seek)
+                layers = _of_normals(texels, mask, normal, rounding, shared, seek)
             found.append(layers | {"chosen": jnp.full(mask.shape, index, jnp.uint8)})
         layers = functools.reduce(
             lambda a, b: {name: jnp.where(b["criterion"] < a["criterion"], b[name], a[name]) for name in a}, found
@@ -262,7 +265,9 @@ def _near(texels: Texels, stacks: Any, occluders: Any, ambient: Components | Non
     )
 
 
-def _of_normals(texels: Texels, mask: Array, normal: Components, shared: Any, seek: str) -> dict[str, Array]:
+def _of_normals(
+    texels: Texels, mask: Array, normal: Components, rounding: Array, shared: Any, seek: str
+) -> dict[str, Array]:
     """What is sought where normals are given."""
     best = texels.unshadowed()
     counts = best.counts.T
@@ -274,9 +279,9 @@ def _of_normals(texels: Texels, mask: Array, normal: Components, shared: Any, se
         left = [point.slope[0], divide(1.0, point.error[0] ** 2), point.cost, jnp.maximum(best.freedom, 0)]
         return {"sums": jnp.where(mask, jnp.stack(left), 0)}
     if shared is None:
-        return _layers(texels, best.fit, texels.seen, counts, mask, normal)
+        return _layers(texels, best.fit, texels.seen, counts, mask, normal, rounding)
     log_n, error = shared.T
-    return _layers(texels, some.at(log_n, n_known=True), texels.seen, counts, mask, normal, error)
+    return _layers(texels, some.at(log_n, n_known=True), texels.seen, counts, mask, normal, rounding, error)
 
 
 def _layers(
@@ -286,6 +291,7 @@ def _layers(
     counts: Array,
     mask: Array,
     normal: Components,
+    rounding: Array,
     shared: Array | None = None,
 ) -> dict[str, Array]:
     """The layers of a model's maps, texels last.
@@ -307,7 +313,9 @@ def _layers(
         return unknowns * jnp.log(jnp.maximum(values, 1)) * values / jnp.maximum(values - unknowns - 2, 1)
 
     freedom = values - unknowns
-    noise = jnp.where(freedom < 1, jnp.nan, jnp.sqrt(fit.cost / jnp.maximum(freedom, 1)))
+    # Codes that are explained exactly, as where all are 0, were rounded all the same.
+    noise = jnp.maximum(jnp.sqrt(fit.cost / jnp.maximum(freedom, 1)), rounding)
+    noise = jnp.where(freedom < 1, jnp.nan, noise)
     n = jnp.exp(fit.log_n)
     # Of two minima either may be that of the truth, by its likelihood: errors are those of the mixture.
     *rival, worse = fit.rival

@@ -135,6 +135,15 @@ def test_photographs_of_eight_bits_with_cast_shadows(encoding, normals):
         assert np.mean(np.abs(values) > 6 * errors) < 0.02
 
 
+@pytest.mark.parametrize("encoding", ["linear", "srgb"])
+def test_what_is_black_in_every_photograph_is_known_to_a_rounding_error(encoding):
+    normal = np.broadcast_to(VIEW, (1, 8, 3))
+    maps = fitting.fit_maps(np.zeros((32, 1, 8, 3), np.uint8), dome(32), normal, encoding=encoding, model="lambert")
+    step = 1 / 255 / np.sqrt(12) / {"linear": 1, "srgb": 12.92}[encoding]
+    np.testing.assert_array_equal(maps.k_d, 0)
+    np.testing.assert_allclose(maps.k_d_error, step / np.linalg.norm(dome(32)[:, 2]), rtol=1e-3)  # it was 0
+
+
 def test_noise_of_matte_texels_is_no_highlight():
     """Of all exponents one serves it better than its errors let expect."""
     codes, truth = photographed("srgb", 0.0, gloss=0.0)
