@@ -25,8 +25,11 @@ from brdf.images.encoding import encode
 from brdf.precision import working_precision
 from fitting.core import picture_of
 from fitting.joint_problem import JointProblem, joint_problem, scene_leaves
+from fitting.model_fit import N_RANGE
 from fitting.pixels import Tile
 from fitting.result import Cause, FitResult
+from fitting.sample_error import between, near_exponent
+from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import search
 
 BLACK = (
@@ -47,6 +50,8 @@ MIRRORED = {"mirrored left-right": 1, "mirrored upside down": 0}
 LEAST_SHARE, LEAST_SIZE = 0.3, 5.0
 # A mirrored picture explains more than this share.
 LEAST_MIRRORED = 0.5
+# Of log n, to either side: so far is looked at where the picture is flipped and light samples are many.
+NEAR = math.log(4.0)
 # Two causes are not told apart where beside one the other explains no more than 2 standard errors would: chi squared,
 # by how many numbers it has.
 ALIKE = {0: 4.0, 1: 4.0, 2: 6.18}
@@ -155,6 +160,14 @@ class _Picture:
         """The picture with some numbers moved."""
         return np.asarray(brdf.render(*self.moved(move, size)))
 
+    def lit(self) -> Picture:
+        """As the solver takes them; lobes of many light samples near the fitted exponent."""
+        material, scene = self.moved({}, 0.0)
+        n = getattr(material, "n", None)
+        near = None if n is None else near_exponent(float(n), NEAR, 0.0)
+        target = jnp.asarray(self.target.reshape(-1, self.target.shape[-1]))
+        return picture_of(type(material), Tile(target, None, scene.surface_points(), scene), near)
+
     def slopes(self, moves: Sequence[Any]) -> Float[np.ndarray, "K H W C"]:
         """The derivatives of the codes by the sizes of moves."""
         found = [
@@ -248,28 +261,32 @@ class Residual:
 
     def mirrored(self) -> Iterator[_Test]:
         """Whether the pictures show the scenes mirrored."""
-        for name, axis in MIRRORED.items() if self.excess > LEAST_SIZE**2 else ():
+        if self.excess <= LEAST_SIZE**2:
+            return
+        lit = [picture.lit() for picture in self.pictures]
+        for name, axis in MIRRORED.items():
             good = [picture.counted & np.flip(picture.counted, axis) for picture in self.pictures]
             size = sum(map(np.count_nonzero, good)) * self.noise.size
             if 2 * size < self.left.size:
                 continue
             # Fitted alike: a picture that is its own mirror image gains nothing.
-            before = self._least(good, ())
-            gain = before - self._least(good, axis)
+            before = self._least(lit, good, ())
+            gain = before - self._least(lit, good, axis)
             share = min(gain / max(before - size, gain, 1.0), 1.0)
             if share > LEAST_MIRRORED and gain > LEAST_SIZE**2:
                 cause = Cause(name, 1.0, 0.0, "", share, "flip the picture, or the lights and the shape")
                 yield _Test(cause, np.zeros((self.left.size, 0)), gain)
 
-    def _least(self, good: list[Bool[np.ndarray, "H W"]], axis: Any) -> float:
+    def _least(self, lit: list[Picture], good: list[Bool[np.ndarray, "H W"]], axis: Any) -> float:
         """Squares that the model leaves of some pixels of the pictures, flipped, in units of the noise."""
         solved = []
-        for picture, some in zip(self.pictures, good, strict=True):
-            target, (material, scene) = np.flip(picture.target, axis), picture.moved({}, 0.0)
+        for picture, basis, some in zip(self.pictures, lit, good, strict=True):
+            target = np.flip(picture.target, axis)
             weight = some[..., None] * picture.curve(target) ** 2
             values, weight = (jnp.asarray(a.reshape(-1, self.noise.size)) for a in (target, weight))
-            solved.append(picture_of(type(material), Tile(values, weight, scene.surface_points(), scene)))
-        return float(np.sum(search(solved).cost / self.noise**2))
+            solved.append(dataclasses.replace(basis, target=values, weight=weight))
+        near = None if lit[0].lobe is None else lit[0].lobe.near
+        return float(np.sum(search(solved, n_range=between(near, N_RANGE)).cost / self.noise**2))
 
     def alike(self, first: _Test, other: _Test) -> bool:
         """Whether the other cause would do as well: the first explains nothing beside it."""

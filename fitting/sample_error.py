@@ -28,12 +28,14 @@ class SampleError(NamedTuple):
         hessian: of x_a, x_d, x_s, channel after channel each, and log n, (U, U).
         score: what more samples would change, (U,).
         profile: exponents, and the least cost at each by the first fit, (2, G).
+        size: of what more samples would change, root mean square over pixels.
     """
 
     near: Near | None
     hessian: Float[np.ndarray, "U U"]
     score: Float[np.ndarray, " U"]
     profile: Float[np.ndarray, "2 G"]
+    size: float
 
     def shift(self, active: Bool[np.ndarray, " U"]) -> Float[np.ndarray, " U"]:
         """How far off each number is, where some of them are free."""

@@ -61,33 +61,39 @@ def with_enough_samples(problem: FitProblem, accuracy: float | None = None) -> F
     plain = dataclasses.replace(problem, loss="squared", noise=None, plausible=False)
     try:
         models = problem.families if problem.model == "auto" else (problem.model,)
-        ladders = {model: _ladder(plain, model, own, accuracy) for model in models}
+        ladders = {model: _Ladder(plain, model, own, min(FIRST_SAMPLES, own), accuracy) for model in models}
+        # What a worse model leaves beside that is no noise.
+        noise = min(one.noise for one in ladders.values())
+        ladders = {model: _refined(one, noise) for model, one in ladders.items()}
     except InputError:
         return problem  # the fit itself tells what is wrong
-    samples = max(one.samples for one in ladders.values())
+    noise = min(one.noise for one in ladders.values())
+    samples = max(one.enough(noise) for one in ladders.values())
     scenes = [with_samples(scene, samples) for scene in problem.scenes]
     errors = {model: one.error(samples) for model, one in ladders.items()}
     return dataclasses.replace(problem, scenes=scenes, shown=problem.scenes, sample_errors=errors)
 
 
-def _ladder(problem: FitProblem, model: str, own: int, accuracy: float | None) -> "_Ladder":
-    first = min(FIRST_SAMPLES, own)
+def _refined(found: "_Ladder", noise: float) -> "_Ladder":
+    """The same from a first fit of more samples, where so few leave more than the picture's noise."""
     while True:
-        found = _Ladder(problem, model, own, first, accuracy)
+        first, own, noise = found.first, found.own, min(noise, found.noise)
+        samples = found.enough(noise)
         # What its own samples leave out is no noise of the picture.
-        enough = abs(found.move(found.samples)) <= FAR and found.missed(first)[1] <= NO_NOISE * found.noise
-        if enough or min(found.samples, MOST_FIRST) <= first:
+        enough = abs(found.move(samples)) <= FAR and found.missed(first)[1] <= NO_NOISE * noise
+        most = min(samples, MOST_FIRST)
+        if enough or most <= first:
             return found
-        most = min(found.samples, MOST_FIRST)
         first = own if first < own <= most else most
+        found = _Ladder(found.problem, found.model, own, first, found.accuracy)
 
 
 class _Ladder:
     """A model of more and more light samples at some pixels."""
 
     def __init__(self, problem: FitProblem, model: str, own: int, first: int, accuracy: float | None):
-        """Fit some pixels under a first number of samples, and find how many it takes."""
-        self.problem, self.own, self.first, self.accuracy = problem, own, first, accuracy
+        """Fit some pixels under a first number of samples."""
+        self.problem, self.model, self.own, self.first, self.accuracy = problem, model, own, first, accuracy
         done = run(problem, Configuration(model, problem.precision, PIXELS, first))
         self.done, self.optimum, self.x = done, done.optimum, done.optimum.x
         self.probes = Probes(done)
@@ -99,7 +105,10 @@ class _Ladder:
         self.shown, self.noise = {first: self.probes.shown}, float(np.sqrt(np.mean(done.result.noise**2)))
         # What a count hardly larger than another one changes tells nothing of what both leave out.
         self.counts = sorted({own, *(some for some in LADDER if max(some / own, own / some) >= APART)})
-        self.samples = next(filter(self._enough, self.counts), self.counts[-1])
+
+    def enough(self, noise: float) -> int:
+        """How many samples it takes where the picture has such a noise."""
+        return next((count for count in self.counts if self._is_enough(count, noise)), self.counts[-1])
 
     def _change(self, coarse: int, fine: int) -> tuple[np.ndarray, float]:
         """The scores of what other samples change, and its root mean square over pixels."""
@@ -127,12 +136,12 @@ class _Ladder:
         more = (fall if index > last else 1.0) / (1.0 - fall)
         return more * score, more * size
 
-    def _enough(self, samples: int) -> bool:
+    def _is_enough(self, samples: int, noise: float) -> bool:
         score, size = self.missed(samples)
         off = self.inverse @ score
         if self.accuracy is not None:
             return bool(self.probes.error(off) <= OF_ACCURACY * self.accuracy)
-        noise, given = self.noise, samples >= self.own
+        given = samples >= self.own
         if samples == self.own == self.first and size > DRAWN * noise:
             return True  # the picture shows these very samples
         rest, value = noise * np.sqrt(np.diag(self.inverse)), np.append(self.x.ravel(), 1.0) * given
@@ -173,4 +182,5 @@ class _Ladder:
     def error(self, samples: int) -> SampleError:
         """What so many samples leave out."""
         profile = np.stack([self.optimum.grid, self.optimum.profile])
-        return SampleError(self.near(samples), self.probes.hessian, self.missed(samples)[0], profile)
+        score, size = self.missed(samples)
+        return SampleError(self.near(samples), self.probes.hessian, score, profile, size)

@@ -81,6 +81,8 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: R
     spread, shared, widening, deviation, gain, joined, growing, uneven = None, None, 1.0, noise, 0.0, None, None, None
     channels = statistics.channels(noise > 2 * rounding)
     weighed = any(one is not None for one in observed.problem.weights)
+    sampled = observed.problem.sample_error(fit.model.name)
+    size = 0.0 if sampled is None else sampled.size
     clipped = _clipped(optimum, fit.tied)
     if fit.evidence is not None:
         # Each working target has the noise 1; what least squares leaves is rounding, which goes together.
@@ -91,7 +93,7 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: R
         optimum, deviation = evidence.optimum, noise**0
         fit = fit._replace(pictures=evidence.pictures, optimum=optimum)
         shared, together, of_codes = shared_errors(
-            evidence, observed, alone_covariance(optimum, fit.tied) if evidence.together is None else None
+            evidence, observed, alone_covariance(optimum, fit.tied) if evidence.together is None else None, size
         )
         channels = channels if evidence.scores else of_codes
         together = None if evidence.light < ARITHMETIC * np.max(observed.brightest) else together
@@ -106,7 +108,13 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: R
         growing = statistics.growing_noise(noise, rounding) if uneven is None else None
         once = observed.copies or channels is not None
         together = _structure(
-            statistics, observed, noise > 2 * rounding, even=growing is None and uneven is None, once=once
+            statistics,
+            observed,
+            noise,
+            rounding,
+            even=growing is None and uneven is None,
+            once=once,
+            missed=size * weight,
         )
         # What a bound of the material leaves is no error of the pixels.
         if together is not None and together.significant and not fit.capped:
@@ -134,7 +142,7 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: R
         columns=columns,
         channels=channels,
         gain=gain,
-        missed=observed.problem.sample_error(fit.model.name),
+        missed=sampled,
         resolution=resolution,
         joined=joined,
         moved=fit.moved,
@@ -196,7 +204,7 @@ def _clipped(optimum: Optimum, tied: np.ndarray | None) -> Bool[np.ndarray, "3 C
 
 
 def shared_errors(
-    evidence: Evidence, observed: Observed, covariance: Float[np.ndarray, "U U"] | None = None
+    evidence: Evidence, observed: Observed, covariance: Float[np.ndarray, "U U"] | None = None, missed: float = 0.0
 ) -> tuple[Float[np.ndarray, "U U"] | None, Structure, Float[np.ndarray, "C C"] | None]:
     """What takes the place of the Hessian where neighbours share errors, None where they do not; and how much they do.
 
@@ -208,6 +216,7 @@ def shared_errors(
         evidence: of a fit.
         observed: of which its pictures were made.
         covariance: see `fitting.uncertainty.structure.scatter`.
+        missed: what light samples leave out, root mean square.
     """
     lossy = any(tile.bounds is not None and tile.bounds.lossy for tile in observed.tiles)
     channels, few = None, evidence.noise < ROUNDED
@@ -231,20 +240,30 @@ def shared_errors(
             grids, channels = statistics.blocks, None if observed.copies else statistics.channels(unit > 0)
         # Channels that err together count once.
         some = slice(1 if observed.copies or channels is not None else None)
-        together = structure([grid.channels(some) for grid in grids], even=not few)
+        missed = missed if evidence.scores and few else missed / evidence.light
+        together = structure([grid.channels(some) for grid in grids], even=not few, missed=missed)
     if not (lossy or together.significant):
         return None, together, channels
     return _scattered(evidence.pictures, evidence.optimum, errors, covariance), together, channels
 
 
 def _structure(
-    statistics: Residual, observed: Observed, tell: Bool[np.ndarray, " C"], *, even: bool, once: bool
+    statistics: Residual,
+    observed: Observed,
+    noise: Float[np.ndarray, " C"],
+    rounding: Float[np.ndarray, " C"],
+    *,
+    even: bool,
+    once: bool,
+    missed: float,
 ) -> Structure | None:
     """That of a fit by least squares; None where it cannot be told, or weights are part of what is fitted."""
+    tell = noise > 2 * rounding
     if device_count() > 1 or observed.problem.loss != "squared" or not tell.any():
         return None
     some = np.flatnonzero(tell)[: 1 if once else None]
-    return structure([grid.channels(some) for grid in statistics.blocks], even=even)
+    missed /= float(np.sqrt(np.mean(noise[some] ** 2)))
+    return structure([grid.channels(some) for grid in statistics.blocks], even=even, missed=missed)
 
 
 def _scores(score: np.ndarray, information: np.ndarray, place: tuple[np.ndarray, int]) -> Blocks:
@@ -359,7 +378,7 @@ def _capped(material: brdf.Material) -> str:
 
 def _warnings(neighbours: Neighbours, together: Structure | None, lobe: Highlight | None) -> Iterator[str]:
     shared = together is not None and together.significant
-    if neighbours.significant or shared:
+    if together.unexplained if together is not None and shared else neighbours.significant:
         words = "the residual has structure: neighbouring pixels err alike"
         if neighbours.correlation > 0.05:
             words += f" (correlation {neighbours.correlation:.2f})"

@@ -78,17 +78,26 @@ class Structure(NamedTuple):
     Attributes:
         excess: of the squares of the blocks' sums over what independent errors give, in standard deviations; the
             largest over the sizes.
+        unknown: the same less what is known to err together.
     """
 
     excess: float
+    unknown: float
 
     @property
     def significant(self) -> bool:
         """Too large for chance."""
         return self.excess > SIGNIFICANT
 
+    @property
+    def unexplained(self) -> bool:
+        """Too large for chance, and for what is known to err together."""
+        return self.unknown > SIGNIFICANT
 
-def structure(grids: Sequence[Blocks], sizes: Sequence[int] = SIZES, *, even: bool = True) -> Structure:
+
+def structure(
+    grids: Sequence[Blocks], sizes: Sequence[int] = SIZES, *, even: bool = True, missed: float = 0.0
+) -> Structure:
     """Compare sums over blocks with independent errors.
 
     Args:
@@ -96,8 +105,10 @@ def structure(grids: Sequence[Blocks], sizes: Sequence[int] = SIZES, *, even: bo
         sizes: of the blocks, pixels on a side, each twice the one before.
         even: the noise is the same everywhere. Where it is not, blocks count by their noise: what least squares leaves
             where there is little of it is the noise of other places.
+        missed: what is known to err together, root mean square, in the unit of the errors; for scores in that of what
+            they are derivatives by.
     """
-    excess, parts = -math.inf, [grid.stacked for grid in grids]
+    excess, parts = np.full(2, -math.inf), [grid.stacked for grid in grids]
     for size in sizes:
         if size > sizes[0]:
             parts = [coarser(part, 2) for part in parts]
@@ -108,14 +119,15 @@ def structure(grids: Sequence[Blocks], sizes: Sequence[int] = SIZES, *, even: bo
         joined, alone, pixels = joined[seen], alone[seen], pixels[seen]
         if not joined.size:
             continue
+        squares = joined**2 - np.array([[0.0], [missed]]) ** 2 * alone**2
         if even:
             # Wilson and Hilferty (1931): the cube root of chi squared is nearly normal.
             spread = np.sum(2 * (pixels - 1) / (pixels + 2)) / (9 * joined.size**2)
-            found = (np.mean(joined**2 / alone) ** (1 / 3) - (1 - spread)) / math.sqrt(spread)
+            found = (np.cbrt(np.mean(squares / alone, axis=1)) - (1 - spread)) / math.sqrt(spread)
         else:
-            found = SIGNIFICANT / CHANCE * np.sum(joined**2 - alone) / math.sqrt(np.sum(2 * alone**2))
-        excess = max(excess, float(found))
-    return Structure(excess)
+            found = SIGNIFICANT / CHANCE * np.sum(squares - alone, axis=1) / math.sqrt(np.sum(2 * alone**2))
+        excess = np.maximum(excess, found)
+    return Structure(*excess.tolist())
 
 
 def of_blocks(errors: Errors) -> Errors:
