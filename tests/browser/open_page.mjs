@@ -1,16 +1,13 @@
-// Opens a page as a reader would: node open_page.mjs PAGE.html SCREENSHOT.png
+// Opens a page as a reader would.
 //
-// On standard output, as JSON: every request beyond the page itself, every message of the console, the page's size, its
+// Answers every request beyond the page itself, every message of the console, the page's size, its
 // text, and how many pictures did not load.
 
-import { resolve } from "node:path";
 import { pathToFileURL } from "node:url";
-import { launch } from "./browser.mjs";
 
-const address = pathToFileURL(resolve(process.argv[2])).href;
-const browser = await launch();
-try {
-  const page = await browser.newPage({ viewport: { width: Number(process.argv[4] ?? 1000), height: 800 } });
+export default async function (browser, path, screenshot, width = 1000) {
+  const address = pathToFileURL(path).href;
+  const page = await browser.newPage({ viewport: { width, height: 800 } });
   const requests = [];
   const messages = [];
   page.on("request", (request) => {
@@ -26,8 +23,6 @@ try {
     width: document.documentElement.scrollWidth,
     height: document.documentElement.scrollHeight,
   }));
-  await page.screenshot({ path: process.argv[3], fullPage: true });
-  process.stdout.write(JSON.stringify({ requests, messages, ...seen }));
-} finally {
-  await browser.close();
+  await page.screenshot({ path: screenshot, fullPage: true });
+  return { requests, messages, ...seen };
 }

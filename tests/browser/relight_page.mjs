@@ -1,15 +1,13 @@
-// Uses a page of maps as a reader does: node relight_page.mjs PAGE.html
+// Uses a page of maps as a reader does.
 //
-// On standard output, as JSON: the light and the readout after a drag to the upper right and after a key, each map's
+// Answers the light and the readout after a drag to the upper right and after a key, each map's
 // legend, and whether the still picture shows where there is no WebGL2.
 
-import { resolve } from "node:path";
 import { pathToFileURL } from "node:url";
-import { launch, withoutWebGL } from "./browser.mjs";
+import { withoutWebGL } from "./without_webgl.mjs";
 
-const address = pathToFileURL(resolve(process.argv[2])).href;
-const browser = await launch();
-try {
+export default async function (browser, path) {
+  const address = pathToFileURL(path).href;
   const page = await browser.newPage({ viewport: { width: 1000, height: 900 } });
   const seen = { messages: [], requests: [], legends: {} };
   page.on("console", (message) => seen.messages.push(message.text()));
@@ -36,7 +34,5 @@ try {
     seen.legends[name] = await page.locator("#legend").innerText();
   }
   seen.without = await withoutWebGL(browser, address);
-  process.stdout.write(JSON.stringify(seen));
-} finally {
-  await browser.close();
+  return seen;
 }

@@ -1,24 +1,21 @@
-// Draws a lit ball with three.js: node three_ball.mjs JOB.json PICTURE.bin
+// Draws a lit ball with three.js.
 //
-// JOB holds what the ball is made of and how it is lit:
+// The job holds what the ball is made of and how it is lit:
 //   material   MeshPhongMaterial JSON, loaded with THREE.MaterialLoader; or gltf, loaded with GLTFLoader
 //   exact      take the colours from userData.linear instead of the 8-bit ones
 //   direction  towards the light; intensity and ambient as three.js counts them, RGB each
 //   size       pixels on a side; width of the picture in units of the ball's radius
-// PICTURE is size x size x 3 float32, linear, row 0 at the top. On standard output: what the loader made of the material.
+// The picture is size x size x 3 float32, linear, row 0 at the top. Answers what the loader made of the material.
 
 import { readFileSync, writeFileSync } from "node:fs";
 import { dirname, join } from "node:path";
 import { fileURLToPath } from "node:url";
-import { launch } from "./browser.mjs";
 
 const modules = join(dirname(fileURLToPath(import.meta.url)), "node_modules");
-const [job, picture] = [JSON.parse(readFileSync(process.argv[2], "utf8")), process.argv[3]];
 const page_text = `<script type="importmap">{"imports": {"three": "/three/build/three.module.js",
   "three/addons/": "/three/examples/jsm/"}}</script>`;
 
-const browser = await launch();
-try {
+export default async function (browser, job, picture) {
   const page = await browser.newPage();
   page.on("pageerror", (error) => { throw error; });
   await page.route("**/*", (route) => {
@@ -72,7 +69,5 @@ try {
     }
   }
   writeFileSync(picture, Buffer.from(flipped.buffer));
-  process.stdout.write(JSON.stringify({ material: result.words, revision: result.revision }));
-} finally {
-  await browser.close();
+  return { material: result.words, revision: result.revision };
 }

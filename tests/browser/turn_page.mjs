@@ -1,16 +1,12 @@
-// Draws a page's surface in other states: node turn_page.mjs JOB.json
+// Draws a page's surface in other states.
 //
-// JOB holds a list of {page, states}; a state is what stands after # in the page's address. On standard output, as JSON:
-// per page {canvases, requests, messages}, a canvas being {width, height, pixels}, RGBA codes in base64, row 0 at the top.
+// The job is a list of {page, states}; a state is what stands after # in the page's address. Answers, per page, {canvases, requests, messages}, a canvas being {width, height, pixels}, RGBA codes in base64, row 0 at the top.
 
-import { readFileSync } from "node:fs";
 import { pathToFileURL } from "node:url";
-import { launch } from "./browser.mjs";
 
-const browser = await launch();
-const answers = [];
-try {
-  for (const { page: path, states } of JSON.parse(readFileSync(process.argv[2], "utf8"))) {
+export default async function (browser, job) {
+  const answers = [];
+  for (const { page: path, states } of job) {
     const page = await browser.newPage({ viewport: { width: 1000, height: 800 } });
     const [requests, messages, canvases] = [[], [], []];
     page.on("console", (message) => messages.push(message.text()));
@@ -37,7 +33,5 @@ try {
     answers.push({ canvases, requests, messages });
     await page.close();
   }
-  process.stdout.write(JSON.stringify(answers));
-} finally {
-  await browser.close();
+  return answers;
 }

@@ -1,15 +1,13 @@
-// Uses a page's viewer as a reader does: node use_page.mjs PAGE.html
+// Uses a page's viewer as a reader does.
 //
-// On standard output, as JSON: the address after a drag on the surface and after one beside it, what the controls say,
+// Answers the address after a drag on the surface and after one beside it, what the controls say,
 // the copied texts with other numbers, and whether the still picture shows where there is no WebGL2.
 
-import { resolve } from "node:path";
 import { pathToFileURL } from "node:url";
-import { launch, withoutWebGL } from "./browser.mjs";
+import { withoutWebGL } from "./without_webgl.mjs";
 
-const address = pathToFileURL(resolve(process.argv[2])).href;
-const browser = await launch();
-try {
+export default async function (browser, path) {
+  const address = pathToFileURL(path).href;
   const page = await browser.newPage({ viewport: { width: 1000, height: 900 } });
   const messages = [];
   page.on("console", (message) => messages.push(message.text()));
@@ -62,7 +60,5 @@ try {
   await page.click("#reset");
   seen.reset = await restored();
   seen.without = await withoutWebGL(browser, address);
-  process.stdout.write(JSON.stringify(seen));
-} finally {
-  await browser.close();
+  return seen;
 }

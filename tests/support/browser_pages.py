@@ -1,6 +1,8 @@
 """Pages as a headless browser draws them."""
 
+import atexit
 import base64
+import functools
 import json
 import shutil
 import subprocess
@@ -17,12 +19,25 @@ needs_browser = pytest.mark.skipif(
 )
 
 
-def asked(program: str, *arguments: Any) -> Any:
+@functools.cache
+def browser() -> subprocess.Popen[str]:
+    """Started once for all pages; it ends when this process does, which ends its standard input."""
+    started = subprocess.Popen(
+        ["node", str(BROWSER / "serve.mjs")], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    atexit.register(started.communicate)
+    return started
+
+
+def asked(program: str, *called: Any) -> Any:
     """What a program of tests/browser answers."""
-    command = ["node", str(BROWSER / program), *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    asking, answering = browser().stdin, browser().stdout
+    assert asking is not None
+    assert answering is not None
+    print(json.dumps([program, *called], default=str), file=asking, flush=True)
+    answer = json.loads(answering.readline())
+    assert "error" not in answer, answer["error"]
+    return answer
 
 
 def drawn(pages: list[tuple[str, list[str]]], folder: Path) -> list[dict[str, Any]]:
@@ -31,8 +46,7 @@ def drawn(pages: list[tuple[str, list[str]]], folder: Path) -> list[dict[str, An
     for index, (text, states) in enumerate(pages):
         (folder / f"{index}.html").write_text(text)
         job.append({"page": str(folder / f"{index}.html"), "states": states})
-    (folder / "job.json").write_text(json.dumps(job))
-    answers = asked("turn_page.mjs", folder / "job.json")
+    answers = asked("turn_page", job)
     for answer in answers:
         answer["codes"] = [
             np.frombuffer(base64.b64decode(one["pixels"]), np.uint8).reshape(one["height"], one["width"], 4)[..., :3]

@@ -12,7 +12,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from project_paths import BROWSER, REAL
+from browser_pages import asked, needs_browser
+from project_paths import REAL
 
 import brdf
 from brdf.materials.exports import EXPORTS
@@ -21,11 +22,6 @@ RGB = {"k_a": [0.1, 0.2, 0.3], "k_d": [0.5, 0.4, 0.3], "k_s": [0.3, 0.35, 0.4]}
 LAMBERT = brdf.Lambert(k_a=RGB["k_a"], k_d=RGB["k_d"])
 MATERIALS = [LAMBERT] + [model(**RGB, n=24.0) for name, model in brdf.MODELS.items() if name != "lambert"]
 WIDTH, SIZE, DIRECTION = 2.2, 128, (0.4, 0.5, 0.8)
-
-needs_browser = pytest.mark.skipif(
-    not (shutil.which("node") and (BROWSER / "node_modules").exists() and any(map(shutil.which, ["chromium"]))),
-    reason="needs node, Debian's chromium, and `npm ci` in tests/browser",
-)
 
 
 def ours(material: brdf.Material, intensity: float = 1.0, ambient: float = 0.0) -> np.ndarray:
@@ -193,12 +189,9 @@ def three(tmp_path: Path, **job: Any) -> tuple[np.ndarray, dict[str, Any]]:
     """The ball as three.js draws it, and what its loader made of the material."""
     pi = np.pi  # three.js counts irradiance: a white Lambertian surface facing a light of intensity pi shows 1
     job = {"size": SIZE, "width": WIDTH, "direction": DIRECTION, "intensity": [pi] * 3, "ambient": [0.0] * 3} | job
-    (tmp_path / "job.json").write_text(json.dumps(job))
-    command = ["node", str(BROWSER / "three_ball.mjs"), str(tmp_path / "job.json"), str(tmp_path / "picture.bin")]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
-    assert done.returncode == 0, done.stderr
+    answer = asked("three_ball", job, tmp_path / "picture.bin")
     picture = np.fromfile(tmp_path / "picture.bin", np.float32).reshape(SIZE, SIZE, 3)
-    return picture, json.loads(done.stdout)
+    return picture, answer
 
 
 @needs_browser

@@ -78,7 +78,7 @@ def test_each_map_is_shown(tmp_path: Path):
 def test_a_reader_moves_the_light(tmp_path: Path):
     maps = some_maps(MODELS[0])
     maps.view("<b>maps").save(tmp_path / "page.html")
-    seen = asked("relight_page.mjs", tmp_path / "page.html")
+    seen = asked("relight_page", tmp_path / "page.html")
     assert (seen["messages"], seen["requests"]) == ([], [])
     dragged, pressed = (np.array(seen[key].split(","), float) for key in ("dragged", "pressed"))
     assert dragged[:2] == pytest.approx([0.25 * 36 / 12, 0.5], abs=0.05)  # 24 rows high, 36 columns wide

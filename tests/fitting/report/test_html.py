@@ -59,7 +59,7 @@ def test_results_show_themselves_in_jupyter(glossy: fitting.FitResult):
 def test_chromium_shows_the_page(page: str, width: int, tmp_path: Path):
     (tmp_path / "report.html").write_text(page)
     shot = tmp_path / "shot.png"
-    seen = asked("open_page.mjs", tmp_path / "report.html", shot, width)
+    seen = asked("open_page", tmp_path / "report.html", shot, width)
     assert seen["requests"] == []
     assert seen["messages"] == []
     assert (seen["pictures"], seen["broken"]) == (4, 0)
@@ -83,4 +83,4 @@ def test_columns_without_content_are_not_shown(matt: fitting.FitResult, page: st
 def test_a_spectrum_does_not_widen_the_page(tmp_path: Path):
     shown = brdf.Lambert(k_d=np.linspace(0, 1, 31))._repr_html_()
     (tmp_path / "page.html").write_text(f'<meta charset="utf-8">{shown}')
-    assert asked("open_page.mjs", tmp_path / "page.html", tmp_path / "shot.png", 700)["width"] <= 700
+    assert asked("open_page", tmp_path / "page.html", tmp_path / "shot.png", 700)["width"] <= 700

@@ -186,7 +186,7 @@ def test_a_bare_power_would_be_seen(glossy: fitting.FitResult, tmp_path: Path):
 
 def used(text: str, folder: Path) -> dict[str, Any]:
     (folder / "page.html").write_text(text)
-    return asked("use_page.mjs", folder / "page.html")
+    return asked("use_page", folder / "page.html")
 
 
 def test_a_reader_moves_light_view_and_numbers(glossy: fitting.FitResult, tmp_path: Path):
