@@ -1,4 +1,4 @@
-"""A fit over several devices, and over two processes, gives the numbers of one; a process that dies is told."""
+"""Fits over several devices, and over two processes, give the numbers of one; a process that dies is told."""
 
 import os
 import socket
@@ -72,29 +72,22 @@ def test_two_devices_of_one_process(tmp_path):
 
 
 def test_two_processes(tmp_path):
-    ended = run_two(tmp_path, "lives")
+    ended = run_two(tmp_path, "live")
     assert [status for status, _ in ended] == [0, 0], ended
-    for rank in (0, 1):
-        with np.load(tmp_path / f"{rank}.npz") as found:
-            np.testing.assert_allclose(found["numbers"], expected(), rtol=1e-12)
-            picture = pictured(MATERIAL, ball_scene(), 0.01)
-            pictures = np.stack([picture, 0.5 * picture, 2 * picture])
-            many = fitting.fit_many(pictures, ball_scene(), model="blinn-phong", precision="float64")
-            np.testing.assert_allclose(found["n"], many.n, rtol=1e-12)
-            np.testing.assert_allclose(found["k_d"], many.k_d, rtol=1e-12)
-
-
-def test_two_processes_fit_the_bands_of_maps(tmp_path):
-    ended = run_two(tmp_path, "maps")
-    assert [status for status, _ in ended] == [0, 0], ended
-    assert len(list((tmp_path / "keep").iterdir())) == 2
+    assert len(list((tmp_path / "keep").iterdir())) == 2  # bands of the maps
     to_light = np.array([[0, 0, 1], [0.5, 0, 1], [0, 0.5, 1], [-0.5, 0, 1], [0, -0.5, 1], [0.2, 0.2, 1]])
     photographs = np.random.default_rng(0).uniform(0.1, 0.9, (6, 4, 5, 3))
-    expected = fitting.fit_maps(photographs, to_light, np.ones((4, 5, 3)))
+    maps, one = fitting.fit_maps(photographs, to_light, np.ones((4, 5, 3))), expected()
+    picture = pictured(MATERIAL, ball_scene(), 0.01)
+    pictures = np.stack([picture, 0.5 * picture, 2 * picture])
+    many = fitting.fit_many(pictures, ball_scene(), model="blinn-phong", precision="float64")
     for rank in (0, 1):
         with np.load(tmp_path / f"{rank}.npz") as found:
-            for name, values in expected.layers().items():
-                np.testing.assert_allclose(found[name], values, rtol=1e-5, equal_nan=True)
+            np.testing.assert_allclose(found["numbers"], one, rtol=1e-12)
+            np.testing.assert_allclose(found["n"], many.n, rtol=1e-12)
+            np.testing.assert_allclose(found["k_d"], many.k_d, rtol=1e-12)
+            for name, values in maps.layers().items():
+                np.testing.assert_allclose(found[f"maps {name}"], values, rtol=1e-5, equal_nan=True)
 
 
 @pytest.mark.parametrize(("how", "whole"), [("dies", 0), ("maps die", 1)])

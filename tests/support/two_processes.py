@@ -53,23 +53,19 @@ if how == "dies" and rank == 1:
 material = brdf.BlinnPhong(k_a=[0.2, 0.1, 0.15], k_d=[0.5, 0.4, 0.3], k_s=[0.3, 0.3, 0.4], n=35.0)
 picture = pictured(material, ball_scene(), 0.01)
 mesh = jax.make_mesh((jax.device_count(),), ("pixels",))
-if how.startswith("maps"):
-    to_light = np.array([[0, 0, 1], [0.5, 0, 1], [0, 0.5, 1], [-0.5, 0, 1], [0, -0.5, 1], [0.2, 0.2, 1]])
-    photographs = np.random.default_rng(0).uniform(0.1, 0.9, (6, 4, 5, 3))
-    try:
-        maps = fitting.fit_maps(photographs, to_light, np.ones((4, 5, 3)), mesh=mesh, keep=folder / "keep")
-    except brdf.InputError as error:
-        told(error)
-    np.savez(folder / f"{rank}.npz", **maps.layers())
-    sys.exit()
+to_light = np.array([[0, 0, 1], [0.5, 0, 1], [0, 0.5, 1], [-0.5, 0, 1], [0, -0.5, 1], [0.2, 0.2, 1]])
+photographs = np.random.default_rng(0).uniform(0.1, 0.9, (6, 4, 5, 3))
 try:
-    result = fitting.fit(picture, ball_scene(), model="blinn-phong", precision="float64", mesh=mesh)
+    if how != "maps die":
+        result = fitting.fit(picture, ball_scene(), model="blinn-phong", precision="float64", mesh=mesh)
+    maps = fitting.fit_maps(photographs, to_light, np.ones((4, 5, 3)), mesh=mesh, keep=folder / "keep")
 except brdf.InputError as error:
     told(error)
 assert result.pixels < SIZE * SIZE
 numbers = [[float(one), one.error] for one in result.parameters]
 pictures = np.stack([picture, 0.5 * picture, 2 * picture])
+layers = {f"maps {name}": values for name, values in maps.layers().items()}
 many = fitting.fit_many(pictures, ball_scene(), model="blinn-phong", precision="float64", mesh=mesh)
 with (folder / f"{rank}.part").open("wb") as file:
-    np.savez(file, numbers=np.array(numbers), n=many.n, k_d=many.k_d)
+    np.savez(file, numbers=np.array(numbers), n=many.n, k_d=many.k_d, **layers)
 (folder / f"{rank}.part").rename(folder / f"{rank}.npz")
