@@ -74,11 +74,12 @@ def share_seen(
     """
     position, normal = point.position, point.normal if point.facet is None else point.facet
     size = jnp.maximum(largest(position), largest(-position))
-    rounding = OFFSET * jnp.finfo(size.dtype).eps
-    before = distance * (1 - 4 * rounding)
+    rounding = float(jnp.finfo(size.dtype).eps)
+    before = distance * (1 - 4 * OFFSET * rounding)
     seen = jnp.ones_like(size) if point.facet is None else jnp.where(normal @ to_light > 0, 1.0, 0.0)
     for index, shape in enumerate(occluders):
-        start = position + normal * jax.lax.stop_gradient(rounding * jnp.maximum(size, shape.extent()))
+        moved = jnp.maximum(rounding * size, max(rounding, shape.rounding) * shape.extent())
+        start = position + normal * (OFFSET * jax.lax.stop_gradient(moved))
         covered = shape.cover(start, to_light, before, radius)
         if shape.convex and point.shape is not None:
             covered = jnp.where(point.shape == index, 0.0, covered)  # the horizon has dealt with that

@@ -37,10 +37,12 @@ class Shape(Checked):
     Attributes:
         fitted: False for an occluder, which casts shadows and hides what lies behind it, but is not fitted.
         convex: whether it cannot cast a shadow on its own lit side (class variable).
+        rounding: of where rays meet it, as a share of its extent, where the program rounds less (class variable).
     """
 
     fitted: bool = eqx.field(static=True, default=True, kw_only=True)
     convex: ClassVar[bool] = True
+    rounding: ClassVar[float] = 0.0
 
     @abc.abstractmethod
     def extent(self) -> Array:

@@ -1,7 +1,7 @@
 """Triangle meshes from Wavefront ``.obj`` files, shaded smoothly; what a ray hits is trimesh's business.
 
-With embreex beside it (``pip install brdf-fitting[meshes]`` brings both) trimesh asks Intel's Embree, in float32;
-without it, its own and far slower search. The rays of a program travel to the host and back: a mesh works on any
+With embreex beside it (``pip install brdf-fitting[meshes]`` brings both) trimesh asks Intel's Embree, in float32
+whatever the program's precision; without it, its own and far slower search. The rays of a program travel to the host and back: a mesh works on any
 device, and costs no more to compile than a sphere. Which triangle a ray meets has no derivative; where on that
 triangle it meets it has, by the ray. The vertices are part of the program, not numbers that can be fitted.
 
@@ -111,8 +111,13 @@ class Mesh:
         return isinstance(other, Mesh) and self._digest == other._digest
 
     @functools.cached_property
+    def middle(self) -> Float[np.ndarray, " 3"]:
+        """Of its bounding box."""
+        return 0.5 * (self.vertices.min(axis=0) + self.vertices.max(axis=0))
+
+    @functools.cached_property
     def _tree(self) -> Any:
-        return _trimesh().Trimesh(self.vertices, self.faces, process=False)
+        return _trimesh().Trimesh(self.vertices - self.middle, self.faces, process=False)
 
     def first_hit(self, origins: Any, directions: Any) -> Int[np.ndarray, "..."]:
         """The first triangle that each ray meets, -1 for none.
@@ -121,8 +126,9 @@ class Mesh:
             origins: (..., 3).
             directions: (..., 3).
         """
-        rays = (np.asarray(vectors, np.float64).reshape(-1, 3) for vectors in (origins, directions))
-        found = np.asarray(self._tree.ray.intersects_first(*rays), np.int32)
+        # About the mesh, or single precision would hold its place in the world instead of its shape.
+        rays = np.asarray(origins, np.float64) - self.middle, np.asarray(directions, np.float64)
+        found = np.asarray(self._tree.ray.intersects_first(*(part.reshape(-1, 3) for part in rays)), np.int32)
         return found.reshape(np.shape(origins)[:-1])
 
 
@@ -241,6 +247,7 @@ class Triangles(Shape):
     """
 
     convex: ClassVar[bool] = False
+    rounding: ClassVar[float] = float(np.finfo(np.float32).eps)
     mesh: Mesh = eqx.field(static=True)
 
     def __check_init__(self):
@@ -248,8 +255,8 @@ class Triangles(Shape):
         instance("mesh", self.mesh, Mesh, 'Write Triangles(brdf.load_mesh("mesh.obj"))')
 
     def extent(self) -> Scalar:
-        """The largest absolute coordinate."""
-        return jnp.asarray(float(np.max(np.abs(self.mesh.vertices))))
+        """The longest side of the bounding box."""
+        return jnp.asarray(float(np.max(np.ptp(self.mesh.vertices, axis=0))))
 
     def intersect(self, origin: Components, direction: Components) -> Hit:
         """The nearest hit in front of ``origin``, from either side; the normals are those of the front side."""
