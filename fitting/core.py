@@ -446,7 +446,7 @@ def _explains_structure(fit: ModelFit, observed: Observed, after: Residual | Non
     if fit.evidence is not None and fit.evidence.precision is not None:
         return True  # what errs together has been weighed by the channels' covariance
     left, chance = shared(_unexplained(fit.pictures, optimum, observed, after))
-    if left < CHANCE * chance:
+    if left <= CHANCE * chance:  # both 0 where predictions lie within all the codes
         return True
     x = nonnegative_minima(
         optimum.gram[:, :2, :2], optimum.product[:, :2], np.zeros((1, 2)), fit.free[:2].T, TOLERANCE_DOUBLE

@@ -1,9 +1,10 @@
 """Triangle meshes from Wavefront ``.obj`` files, shaded smoothly; what a ray hits is trimesh's business.
 
 With embreex beside it (``pip install brdf-fitting[meshes]`` brings both) trimesh asks Intel's Embree, in float32
-whatever the program's precision; without it, its own and far slower search. The rays of a program travel to the host and back: a mesh works on any
-device, and costs no more to compile than a sphere. Which triangle a ray meets has no derivative; where on that
-triangle it meets it has, by the ray. The vertices are part of the program, not numbers that can be fitted.
+whatever the program's precision; without it, its own and far slower search. The rays of a program travel to the host
+and back: a mesh works on any device, and costs no more to compile than a sphere. Which triangle a ray meets has no
+derivative; where on that triangle it meets it has, by the ray. The vertices are part of the program, not numbers that
+can be fitted.
 
 A triangle is flat, the surface that it stands for is not: the light on it is that of the normal interpolated between
 its corners (Phong 1975). Shadows, and which side is seen, are those of the triangle. The normals are the file's; where

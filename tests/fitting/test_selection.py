@@ -150,3 +150,15 @@ def test_exposures_of_8_bits_tell_the_kind_of_highlight(n: float):
     result = fitting.fit(pictures, scenes, encoding="srgb")
     assert result.surface == "phong"
     assert float(result["n"]) == pytest.approx(n, rel=0.01)
+
+
+def test_a_highlight_of_one_pixel_is_seen_among_codes_without_noise():
+    """With it predictions lie within all the codes: nothing is left that could err together."""
+    material = brdf.BlinnPhong(k_a=0.2, k_d=0.4, k_s=0.4, n=1e4)
+    scene = ball_scene(brdf.DirectionalLight([0.4, 0.5, 0.8], intensity=1.0), ambient=0.5)
+    result = fitting.fit(
+        np.rint(255 * encode(pictured(material, scene), "srgb")).astype(np.uint8), scene, encoding="srgb"
+    )
+    assert result.surface != "lambert"
+    assert not any("structure" in warning for warning in result.warnings)
+    np.testing.assert_allclose([result.material.k_a[0], result.material.k_d[0]], [0.2, 0.4], atol=1e-4)
