@@ -128,8 +128,7 @@ def uncertainty(
     """Errors of an optimum.
 
     The covariance is H⁻¹ (Σ_c σ_c² J_cᵀJ_c) H⁻¹ with the noise σ_c of each channel: channels share n but not their
-    noise. Coefficients at their bound are held there: given that, the others are estimated as if it were known, and
-    their intervals cover as they should (the score of the bound coefficient is uncorrelated with them).
+    noise. Coefficients at their bound are held there; the others' errors hold what these may be.
 
     Args:
         optimum: of the engine.
@@ -194,8 +193,25 @@ def uncertainty(
     if missed is not None:
         off = missed.shift(np.append(active.ravel(), with_n)) * np.append(np.ones(size - 1), optimum.n)
         covariance = covariance + np.outer(off, off)
-    for off in moved:
-        covariance = covariance + np.outer(off, off)
+    bounded, offs = {}, np.zeros((0, size))
+    for term, channel in np.argwhere(determined & ~(x > 0)):
+        index = term * noise.size + channel
+        # Value and error that it would have without the bound.
+        direction = np.eye(size)[index] - inverse @ hessian[:, index]
+        left, value, deviation, alone = direction @ hessian @ direction, 0.0, math.inf, math.inf
+        if left > dependent * hessian[index, index]:
+            score = optimum.product[channel, term] - optimum.gram[channel, term, :3] @ x[:, channel]
+            value = float(score / left)
+            deviation, alone = (np.sqrt(direction @ middles @ direction) / left).tolist()
+        bounded[term, channel] = value, deviation, alone
+        # It may be more than 0, and then the others are what it leaves.
+        if math.isfinite(deviation):
+            off = (direction - np.eye(size)[index]) * above_zero(value, deviation)[1] / NORMAL_95
+            offs = np.vstack([offs, off])
+    # What was dropped is at its bound too, and counts once.
+    beside = [np.sqrt(np.maximum(off**2 - np.sum(offs**2, axis=0), 0.0)) * np.sign(off) for off in moved]
+    offs = np.vstack([offs, *beside])
+    covariance = covariance + offs.T @ offs
     variance = np.maximum(np.diag(covariance), 0.0)
     # What errs together makes errors larger, but not the numbers less determined.
     deviations = np.sqrt(np.stack([variance, np.maximum(np.diag(independent), 0.0)]))
@@ -207,15 +223,7 @@ def uncertainty(
         # Where n is open, what moves along with it is open too.
         if value > 0 and active[2].any() and not with_n and abs(along[index]) * optimum.n > deviation:
             deviation = alone = math.inf
-        if not value > 0:
-            # Value and error that it would have without the bound.
-            direction = np.eye(size)[index] - inverse @ hessian[:, index]
-            left = direction @ hessian @ direction
-            deviation = alone = math.inf
-            if left > dependent * hessian[index, index]:
-                score = optimum.product[channel, term] - optimum.gram[channel, term, :3] @ x[:, channel]
-                value = float(score / left)
-                deviation, alone = (np.sqrt(direction @ middles @ direction) / left).tolist()
+        value, deviation, alone = bounded.get((term, channel), (value, deviation, alone))
         largest = max(optimum.square[channel], brightest[channel] ** 2)
         deviation = math.hypot(deviation, resolution * value)
         wide = deviation * reaches[channel] / NORMAL_95
