@@ -11,7 +11,7 @@ from brdf.channels import channel_names
 from brdf.models.base import SpecularMaterial
 from fitting.channel_errors import residuals
 from fitting.light_colour import coefficient_factors
-from fitting.model_fit import Evidence, ModelFit
+from fitting.model_fit import N_RANGE, Evidence, ModelFit
 from fitting.pixels import Observed
 from fitting.result import HELD_PLAUSIBLE, FitResult, Parameter
 from fitting.solver.devices import device_count
@@ -159,6 +159,10 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: R
             lobe.peak,
             parabolic=joined is not None,
         )
+        # Whoever bounds n knows that it is not beyond.
+        both = zip(observed.problem.n_range, N_RANGE, (0.0, np.inf), strict=True)
+        least, most = (stated if stated != widest else open_end for stated, widest, open_end in both)
+        interval = max(interval[0], least), min(interval[1], most)
         errors = errors._replace(n_reason=fit.held or _open_exponent(interval))
     if hidden:
         errors.reasons[2], errors = hidden, errors._replace(n_reason=hidden)

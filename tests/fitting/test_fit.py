@@ -223,3 +223,5 @@ def test_an_exponent_that_its_range_holds_is_told_as_that(n, bounds, at):
     result = fitting.fit(picture, SCENE, model="blinn-phong", n_range=bounds)
     assert result["n"].reason == f"it is held at {at}, a bound of n_range"
     assert float(result.material.n) == pytest.approx(float(at))
+    low, high = result["n"].interval
+    assert bounds[0] <= low <= high <= bounds[1]
