@@ -4,9 +4,10 @@ Some thousand pixels are fitted first, with a few samples of each light with an 
 16, 64, 256 ... samples at some pixels. What the next count changes is the error of a count; with the scores it makes,
 J'(fine - coarse), the Hessian H tells how far that puts each number off. Taken is the least count whose error is below
 a third of what noise leaves of all pixels, or below a thousandth of the number, and which leaves no structure in the
-residual that noise would not hide; fewer than the lights themselves say only where noise allows it, so that a picture
-without noise is fitted with the samples that it was drawn with. Where an accuracy is asked for, the error is to be a
-small part of that instead, told by the largest count. What remains is told in the errors.
+residual that noise would not hide, noise being what the best model leaves; fewer than the lights themselves say only
+where noise allows it, so that a picture without noise is fitted with the samples that it was drawn with. Where an
+accuracy is asked for, the error is to be a small part of that instead, told by the largest count. What remains is told
+in the errors.
 
 The first fit also says where n is, so that all pixels see their light samples in one pass (`brdf.lobes.Near`).
 """

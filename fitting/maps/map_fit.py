@@ -16,7 +16,7 @@ from fitting.maps.map_bands import fit_bands
 from fitting.maps.map_inputs import Photographs
 from fitting.maps.map_result import Maps
 from fitting.maps.photograph_levels import in_unit, with_levels
-from fitting.maps.shared_exponent import with_shared_n
+from fitting.maps.shared_exponent import label_map, with_shared_n
 from fitting.maps.tiles import MapProblem, Surface
 from fitting.problem import model_name
 from fitting.solver.devices import spread_over
@@ -122,6 +122,7 @@ def fit_maps(
     if surface.points is not None:
         to_view = np.sum(np.asarray(surface.points.to_view, float)[np.asarray(surface.mask)], axis=0)
     problem = MapProblem(given, surface, models, specular == "grey", _ambient(ambient, given), to_view, precision)
+    labels = None if labels is None else label_map(labels, problem)
     problem, unit, clipping = with_levels(problem, saturation)
     problem, notes = likelier(problem)
     notes += clipping

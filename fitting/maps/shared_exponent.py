@@ -6,27 +6,28 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Int
 
 import brdf
 from brdf.errors import InputError
 from brdf.models.base import SpecularMaterial
 from brdf.precision import working_precision
 from fitting.maps.map_bands import fit_bands
-from fitting.maps.texels import STEPS, grid, narrowed, peaks, rivals
+from fitting.maps.texels import STEPS, grid, narrowed, peaks, rivals, share_of_rival
 from fitting.maps.tiles import MapProblem
 
 
-def with_shared_n(problem: MapProblem, labels: Any) -> MapProblem:
-    """The n that texels of one label share, and its error: the sums of its texels in place of those of one.
+def label_map(labels: Any, problem: MapProblem) -> Int[np.ndarray, "H W"]:
+    """Which texels share n, as whole numbers.
 
     Args:
-        problem: what is fitted.
         labels: whole numbers, (H, W), one for all, or a file in which each colour is one.
+        problem: what is fitted.
 
     Raises:
         InputError: where these are none, or the model has no n.
     """
-    (model, *more), surface, size = problem.models, problem.surface, problem.photographs.size[:2]
+    (model, *more), size = problem.models, problem.photographs.size[:2]
     if more or not issubclass(model, SpecularMaterial):
         raise InputError("labels", "need one model with an exponent", "Name the model, as blinn-phong")
     if isinstance(labels, str | Path):
@@ -40,9 +41,20 @@ def with_shared_n(problem: MapProblem, labels: Any) -> MapProblem:
     if labels.dtype.kind not in "iub" or labels.shape not in ((), size):
         what = f"are of shape {labels.shape} and type {labels.dtype}, the photographs of {size}"
         raise InputError("labels", what, "Give a whole number for each texel, or 0")
+    return np.broadcast_to(labels, size)
+
+
+def with_shared_n(problem: MapProblem, labels: Int[np.ndarray, "H W"]) -> MapProblem:
+    """The n that texels of one label share, and its error: the sums of its texels in place of those of one.
+
+    Args:
+        problem: what is fitted.
+        labels: see `label_map`.
+    """
+    surface, size = problem.surface, labels.shape
     if surface.normal is None:
         surface = surface._replace(normal=fit_bands(problem)["normal"])
-    names, index = np.unique(np.broadcast_to(labels, size), return_inverse=True)
+    names, index = np.unique(labels, return_inverse=True)
     index = index.reshape(size)
 
     def sums(seek: str, log_n: Any) -> np.ndarray:
@@ -60,12 +72,14 @@ def with_shared_n(problem: MapProblem, labels: Any) -> MapProblem:
 
     with working_precision("float64"):
         gains, brackets = peaks(jnp.asarray(sums("gains", np.zeros(names.size))), grid(problem.finer))
-        best = climbed(brackets[0])
+        best = other = climbed(brackets[0])
         if np.any(rivals(*gains, best[2])):
             other = climbed(brackets[1])
-            best = np.where(other[2] < best[2], other, best)
-        log_n, curvature, cost, freedom = best
+        (log_n, curvature, cost, freedom), rival = np.where(other[2] < best[2], [other, best], [best, other])
     noise = cost / np.maximum(freedom, 1)
     error = np.sqrt(np.divide(noise, curvature, out=np.full_like(noise, np.inf), where=curvature > 0))
+    error = np.hypot(
+        error, share_of_rival(rival[2] - cost, np.maximum(noise, np.finfo(float).tiny)) * np.abs(rival[0] - log_n)
+    )
     shared = np.stack([log_n[index], error[index]], axis=-1)
     return dataclasses.replace(problem, surface=surface._replace(shared=shared))

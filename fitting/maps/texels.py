@@ -481,6 +481,16 @@ def rivals(gain: Array, rival: Array, cost: Array) -> Array:
     return gain - rival < 0.5 * RIVAL * cost
 
 
+def share_of_rival(worse: Array, variance: Array) -> Array:
+    """Of two minima either may be that of the truth: the root of the other one's share, by its likelihood.
+
+    Args:
+        worse: by how much its cost is larger.
+        variance: of the noise, above 0.
+    """
+    return jnp.sqrt(jax.nn.sigmoid(-0.5 * worse / variance))
+
+
 def narrowed(bracket: Array, slope: Array, step: Array) -> Array:
     """A bracket after a step; one that leads out of it goes to its middle.
 

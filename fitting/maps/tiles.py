@@ -22,7 +22,7 @@ from fitting.likelihood import encoded_and_slope
 from fitting.maps.map_inputs import Photographs, places
 from fitting.maps.map_light_choice import MOST_ERROR
 from fitting.maps.map_result import REASONS
-from fitting.maps.texels import OUTLIER, Distant, TexelFit, Texels, sums, sums_of, with_normals
+from fitting.maps.texels import OUTLIER, Distant, TexelFit, Texels, share_of_rival, sums, sums_of, with_normals
 from fitting.solver.devices import placed
 from fitting.solver.normal_equations import COMPILER_OPTIONS
 
@@ -317,9 +317,9 @@ def _layers(
     noise = jnp.maximum(jnp.sqrt(fit.cost / jnp.maximum(freedom, 1)), rounding)
     noise = jnp.where(freedom < 1, jnp.nan, noise)
     n = jnp.exp(fit.log_n)
-    # Of two minima either may be that of the truth, by its likelihood: errors are those of the mixture.
+    # Errors are those of the mixture of both minima.
     *rival, worse = fit.rival
-    share = jnp.sqrt(jax.nn.sigmoid(-0.5 * worse / jnp.maximum(noise**2, tiny)))
+    share = share_of_rival(worse, jnp.maximum(noise**2, tiny))
     k_error = [jnp.hypot(noise * own, share * apart) for own, apart in zip(fit.k_error, rival, strict=False)]
     error = jnp.full_like(n, jnp.inf) if shared is None else shared
     if glossy and shared is None:

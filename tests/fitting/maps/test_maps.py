@@ -223,6 +223,19 @@ def test_errors_hold_the_other_minimum_of_what_lies_flat(normals):
         assert np.mean(one < 1.96) > 0.82  # 77 %
 
 
+def test_an_n_that_a_texel_shares_with_none_errs_as_its_own():
+    """Of both minima of what lies flat too."""
+    lights, random, normal = dome(32), np.random.default_rng(0), np.broadcast_to(VIEW, (300, 3))
+    k_d, k_s = random.uniform(0.03, 0.5, (300, 1)), random.uniform(0.1, 0.8, (300, 1))
+    pictures = seen_by_equation(lights, normal, k_d, k_s, 8.0) + 0.01 * random.normal(size=(32, 1, 300, 3))
+    options = {"specular": "grey", "precision": "float64"}
+    own = fitting.fit_maps(pictures, lights, normal[None], **options)
+    shared = fitting.fit_maps(pictures, lights, normal[None], labels=np.arange(300)[None], **options)
+    known = own.determined & np.all(own.k_d > 0, axis=-1)
+    np.testing.assert_allclose(shared.n[known], own.n[known], rtol=1e-6)
+    np.testing.assert_allclose(shared.n_error[known], own.n_error[known], rtol=0.03)
+
+
 def test_a_texel_is_the_fit_of_one_material():
     lights = dome(16)
     pictures, truth = texels(1, 0.005, lights, seed=3)
