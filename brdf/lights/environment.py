@@ -37,7 +37,7 @@ STEEPNESS = 7.0
 """The innermost samples of a lobe are exp(-this) times as far from its centre as the horizon."""
 LARGEST_MAP = 1 << 21
 """Texels from which on a map is averaged before it is cut: 2048 × 1024."""
-FEWEST_ROWS = 64
+FEWEST_ROWS = 128
 """A map of fewer has wide texels, which are cut up too: in so many rows, and twice as many columns, at least."""
 
 

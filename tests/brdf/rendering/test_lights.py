@@ -145,11 +145,11 @@ def test_axes_of_a_map_are_those_of_mitsuba(row: int, column: int, direction: tu
 
 
 def test_one_bright_texel_is_a_directional_light():
-    pixels = np.zeros((64, 128, 3))
-    pixels[10, 70] = [5, 4, 3]
-    turn, down = 2 * math.pi * 70.5 / 128, math.pi * 10.5 / 64
+    pixels = np.zeros((128, 256, 3))
+    pixels[20, 140] = [5, 4, 3]
+    turn, down = 2 * math.pi * 140.5 / 256, math.pi * 20.5 / 128
     direction = [math.sin(turn) * math.sin(down), math.cos(down), -math.cos(turn) * math.sin(down)]
-    solid_angle = 2 * math.pi / 128 * (math.cos(math.pi * 10 / 64) - math.cos(math.pi * 11 / 64))
+    solid_angle = 2 * math.pi / 256 * (math.cos(math.pi * 20 / 128) - math.cos(math.pi * 21 / 128))
     sun = brdf.DirectionalLight(direction=direction, intensity=np.array([5, 4, 3]) * solid_angle / math.pi)
     np.testing.assert_allclose(radiance(brdf.EnvironmentMap(pixels), GLOSSY), radiance(sun, GLOSSY), rtol=1e-12)
 
@@ -159,6 +159,14 @@ def test_a_wide_texel_shines_from_its_whole_solid_angle():
     fine = np.repeat(np.repeat(texels, 32, axis=0), 32, axis=1)
     few, many = (radiance(brdf.EnvironmentMap(each), GLOSSY) for each in (texels, fine))
     np.testing.assert_allclose(few, many, rtol=2e-3)  # a point for each texel is 5 % off
+
+
+def test_a_bright_texel_is_as_wide_in_a_highlight_as_it_is():
+    texel = np.zeros((8, 16, 1))
+    texel[3, 8] = 1.0
+    fine = brdf.EnvironmentMap(np.kron(texel, np.ones((128, 128, 1))), samples=16384)
+    few, many = (radiance(each, brdf.BlinnPhong(k_d=0, k_s=1, n=40)) for each in (brdf.EnvironmentMap(texel), fine))
+    np.testing.assert_allclose(few[:2], many[:2], rtol=2e-3)
 
 
 def test_a_map_of_one_colour_gives_it_to_the_emittance():
