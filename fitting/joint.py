@@ -234,7 +234,7 @@ def _solve(
         if whole:
             cost = float(residual @ residual)
             if not cost <= least * (1 + epsilon**0.5):
-                vector, near, whole = best, False, False
+                vector, near, whole, held = best, False, False, bounded & np.asarray(best == 0)
                 continue
             least, best, steps = cost, vector, steps + 1
         # Gauss and Newton's step under the bounds goes to the minimum, however little that gains.
