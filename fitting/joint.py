@@ -144,6 +144,11 @@ def fit_jointly(
     stated = state_problem(
         target, scene, mask, rounding=rounding, encoding=encoding, precision=precision, saturation=saturation
     )
+    shown = stated.targets[0].pixels.shape[-1]
+    if isinstance(material, brdf.Material) and (own := material.k_d.size) not in (1, shown):
+        raise InputError(
+            "material", f"has {own} channels, the picture {shown}", "Give both the same number of channels"
+        )
     with working_precision(precision), waiting("fitting jointly"):
         whole = observe(stated, at_once=True)
 

@@ -165,7 +165,7 @@ def fit_lights_and_material(
         found,
         parameters=(*found.parameters, *parameters),
         correlation=correlation,
-        warnings=(f"{FACTOR}: {KEPT}", *found.warnings),
+        warnings=tuple(dict.fromkeys((f"{FACTOR}: {KEPT}", *joint.warnings, *found.warnings))),
     )
 
 

@@ -123,6 +123,9 @@ MISUSES = {
     "fitting.next_light(fitted(), [brdf.DirectionalLight([0, 0, 1], [1, 1])], of='k_d')": r"candidates: have 2",
     "fitting.fit_lights(target, material, scene)": r"scene: must be a brdf\.Scene, got BlinnPhong\.",
     "fitting.fit_lights(target, scene, brdf.Phong)": r"material: must be a Material, got the class Phong\.",
+    "fitting.fit_lights(target[..., :1], brdf.Scene(scene.camera, scene.shapes, ambient=1.0), material)": (
+        r"material: has 3 channels, the picture 1\."
+    ),
     "fitting.fit_lights('target.exr', scene, material)": r"target\.exr: there is no such file or folder\.",
     "fitting.fit_lights(target, scene, material, mask=np.ones((3, 3)))": r"mask: is of shape \(3, 3\), the target",
     "fitting.fit_brdf('gold.binary')": r"table: must be a brdf\.MeasuredBRDF, got str\. Use brdf\.load_measured",
