@@ -25,10 +25,8 @@ from brdf.images.encoding import encode
 from brdf.precision import working_precision
 from fitting.core import picture_of
 from fitting.joint_problem import JointProblem, joint_problem, scene_leaves
-from fitting.model_fit import N_RANGE
 from fitting.pixels import Tile
 from fitting.result import Cause, FitResult
-from fitting.sample_error import between, near_exponent
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import search
 
@@ -50,8 +48,6 @@ MIRRORED = {"mirrored left-right": 1, "mirrored upside down": 0}
 LEAST_SHARE, LEAST_SIZE = 0.3, 5.0
 # A mirrored picture explains more than this share.
 LEAST_MIRRORED = 0.5
-# Of log n, to either side: so far is looked at where the picture is flipped and light samples are many.
-NEAR = math.log(4.0)
 # Two causes are not told apart where beside one the other explains no more than 2 standard errors would: chi squared,
 # by how many numbers it has.
 ALIKE = {0: 4.0, 1: 4.0, 2: 6.18}
@@ -161,12 +157,10 @@ class _Picture:
         return np.asarray(brdf.render(*self.moved(move, size)))
 
     def lit(self) -> Picture:
-        """As the solver takes them; lobes of many light samples near the fitted exponent."""
+        """As the solver takes them."""
         material, scene = self.moved({}, 0.0)
-        n = getattr(material, "n", None)
-        near = None if n is None else near_exponent(float(n), NEAR, 0.0)
         target = jnp.asarray(self.target.reshape(-1, self.target.shape[-1]))
-        return picture_of(type(material), Tile(target, None, scene.surface_points(), scene), near)
+        return picture_of(type(material), Tile(target, None, scene.surface_points(), scene))
 
     def slopes(self, moves: Sequence[Any]) -> Float[np.ndarray, "K H W C"]:
         """The derivatives of the codes by the sizes of moves."""
@@ -285,8 +279,7 @@ class Residual:
             weight = some[..., None] * picture.curve(target) ** 2
             values, weight = (jnp.asarray(a.reshape(-1, self.noise.size)) for a in (target, weight))
             solved.append(dataclasses.replace(basis, target=values, weight=weight))
-        near = None if lit[0].lobe is None else lit[0].lobe.near
-        return float(np.sum(search(solved, n_range=between(near, N_RANGE)).cost / self.noise**2))
+        return float(np.sum(search(solved).cost / self.noise**2))
 
     def alike(self, first: _Test, other: _Test) -> bool:
         """Whether the other cause would do as well: the first explains nothing beside it."""

@@ -33,6 +33,8 @@ MOST_SAMPLES = 4096
 LADDER = (16, 36, 64, 144, 256, 576, 1024, 2048, MOST_SAMPLES)
 # Of what noise leaves of a number, of the number, and of an accuracy.
 OF_NOISE, OF_VALUE, OF_ACCURACY = 1 / 3, 1e-3, 0.2
+# Models that leave so many times what the best one does are not asked how many they take.
+AS_GOOD = 1.1
 # Counts differ by such a factor at least.
 APART = 1.5
 # Of the noise, root mean square over pixels: less shows in no sum over blocks of them; more than the other is no noise.
@@ -69,7 +71,7 @@ def with_enough_samples(problem: FitProblem, accuracy: float | None = None) -> F
     except InputError:
         return problem  # the fit itself tells what is wrong
     noise = min(one.noise for one in ladders.values())
-    samples = max(one.enough(noise) for one in ladders.values())
+    samples = max(one.enough(noise) for one in ladders.values() if one.noise <= AS_GOOD * noise)
     scenes = [with_samples(scene, samples) for scene in problem.scenes]
     errors = {model: one.error(samples) for model, one in ladders.items()}
     return dataclasses.replace(problem, scenes=scenes, shown=problem.scenes, sample_errors=errors)

@@ -193,28 +193,20 @@ def uncertainty(
     if missed is not None:
         off = missed.shift(np.append(active.ravel(), with_n)) * np.append(np.ones(size - 1), optimum.n)
         covariance = covariance + np.outer(off, off)
-    bounded, offs = {}, np.zeros((0, size))
-    for term, channel in np.argwhere(determined & ~(x > 0)):
-        index = term * noise.size + channel
-        # Value and error that it would have without the bound.
-        direction = np.eye(size)[index] - inverse @ hessian[:, index]
-        left, value, deviation, alone = direction @ hessian @ direction, 0.0, math.inf, math.inf
-        if left > dependent * hessian[index, index]:
-            score = optimum.product[channel, term] - optimum.gram[channel, term, :3] @ x[:, channel]
-            value = float(score / left)
-            deviation, alone = (np.sqrt(direction @ middles @ direction) / left).tolist()
-        bounded[term, channel] = value, deviation, alone
-        # It may be more than 0, and then the others are what it leaves.
-        if math.isfinite(deviation):
-            off = (direction - np.eye(size)[index]) * above_zero(value, deviation)[1] / NORMAL_95
-            offs = np.vstack([offs, off])
+    # Where this is larger than the picture a number is not determined, whatever others at their bound may be.
+    own = np.diag(covariance) + np.sum(np.square([np.zeros(size), *moved]), axis=0)
+    bounded = {
+        (term, channel): _without_bound(term, channel, optimum, inverse, hessian, middles, dependent)
+        for term, channel in np.argwhere(determined & ~(x > 0)).tolist()
+    }
+    offs = np.array([np.zeros(size), *(off for *_, off in bounded.values())])
     # What was dropped is at its bound too, and counts once.
     beside = [np.sqrt(np.maximum(off**2 - np.sum(offs**2, axis=0), 0.0)) * np.sign(off) for off in moved]
     offs = np.vstack([offs, *beside])
     covariance = covariance + offs.T @ offs
     variance = np.maximum(np.diag(covariance), 0.0)
     # What errs together makes errors larger, but not the numbers less determined.
-    deviations = np.sqrt(np.stack([variance, np.maximum(np.diag(independent), 0.0)]))
+    deviations = np.sqrt(np.maximum([variance, own if scatter is None else np.diag(independent)], 0.0))
     x_error, x_interval = np.full(x.shape, np.inf), np.zeros((*x.shape, 2))
     x_interval[..., 1] = np.inf
     for term, channel in np.argwhere(determined):
@@ -223,12 +215,12 @@ def uncertainty(
         # Where n is open, what moves along with it is open too.
         if value > 0 and active[2].any() and not with_n and abs(along[index]) * optimum.n > deviation:
             deviation = alone = math.inf
-        value, deviation, alone = bounded.get((term, channel), (value, deviation, alone))
+        if (term, channel) in bounded:
+            value, deviation, alone, _ = bounded[term, channel]
         largest = max(optimum.square[channel], brightest[channel] ** 2)
         deviation = math.hypot(deviation, resolution * value)
         wide = deviation * reaches[channel] / NORMAL_95
         x_interval[term, channel], x_error[term, channel] = above_zero(value, wide), deviation
-        alone = deviation if scatter is None else alone
         if known[term, channel] and alone**2 * optimum.gram[channel, term, term] > largest:
             reasons[term, channel] = "its error is larger than the whole picture"
             x_error[term, channel] = np.inf
@@ -329,6 +321,27 @@ def _of_scores(
         roots = (vectors * np.sqrt(np.maximum(values, 0.0))[:, None]) @ np.swapaxes(vectors, 1, 2) * size[..., None]
         scores = (roots[:, None] @ np.swapaxes(roots, 1, 2)) * channels[..., None, None]
     return join_channels(scores, optimum.product, optimum.square, optimum.x[2]).gram
+
+
+def _without_bound(
+    term: int,
+    channel: int,
+    optimum: Optimum,
+    inverse: Float[np.ndarray, "U U"],
+    hessian: Float[np.ndarray, "U U"],
+    middles: Float[np.ndarray, "2 U U"],
+    dependent: float,
+) -> tuple[float, float, float, Float[np.ndarray, " U"]]:
+    """Value and errors that a coefficient would have without its bound; how far off others are if it is not at it."""
+    size = len(inverse)
+    own = np.eye(size)[term * optimum.x.shape[1] + channel]
+    direction = own - inverse @ hessian @ own
+    left = direction @ hessian @ direction
+    if left <= dependent * (own @ hessian @ own):
+        return 0.0, math.inf, math.inf, np.zeros(size)
+    score = optimum.product[channel, term] - optimum.gram[channel, term, :3] @ optimum.x[:, channel]
+    value, (deviation, alone) = float(score / left), (np.sqrt(direction @ middles @ direction) / left).tolist()
+    return value, deviation, alone, (direction - own) * above_zero(value, deviation)[1] / NORMAL_95
 
 
 def _inverted(

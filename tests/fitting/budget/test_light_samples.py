@@ -64,8 +64,9 @@ def test_under_an_even_sky_n_is_within_its_error(
 def test_without_noise_the_samples_that_a_picture_was_drawn_with_are_taken_and_told_of():
     scene = ball(WINDOW)
     picture = np.asarray(brdf.render(MATERIAL, scene, precision="float64"))
-    problem = with_enough_samples(state_problem(picture, scene, model="blinn-phong", precision="float64"))
-    assert [light.samples for light in problem.scenes[0].lights] == [64]
+    for model in ("blinn-phong", "auto"):  # the other model would take more
+        problem = with_enough_samples(state_problem(picture, scene, model=model, precision="float64"))
+        assert [light.samples for light in problem.scenes[0].lights] == [64]
     result = fitting.fit(picture, scene, model="blinn-phong", precision="float64")
     assert float(result["n"]) == pytest.approx(60.0, rel=1e-6)
     assert 0 < result["n"].error < 0.06
