@@ -160,9 +160,9 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: R
             parabolic=joined is not None,
         )
         # Whoever bounds n knows that it is not beyond.
-        both = zip(observed.problem.n_range, N_RANGE, (0.0, np.inf), strict=True)
-        least, most = (stated if stated != widest else open_end for stated, widest, open_end in both)
-        interval = max(interval[0], least), min(interval[1], most)
+        least, most = observed.problem.n_range
+        low = max(interval[0], least if least != N_RANGE[0] else 0.0)
+        interval = low, min(interval[1], most if most != N_RANGE[1] else np.inf)
         errors = errors._replace(n_reason=fit.held or _open_exponent(interval))
     if hidden:
         errors.reasons[2], errors = hidden, errors._replace(n_reason=hidden)
@@ -382,7 +382,8 @@ def _capped(material: brdf.Material) -> str:
 
 def _warnings(neighbours: Neighbours, together: Structure | None, lobe: Highlight | None) -> Iterator[str]:
     shared = together is not None and together.significant
-    if together.unexplained if together is not None and shared else neighbours.significant:
+    known = together is not None and together.significant and not together.unexplained
+    if (neighbours.significant or shared) and not known:
         words = "the residual has structure: neighbouring pixels err alike"
         if neighbours.correlation > 0.05:
             words += f" (correlation {neighbours.correlation:.2f})"

@@ -1,6 +1,8 @@
 // Draws a page's surface in other states.
 //
-// The job is a list of {page, states}; a state is what stands after # in the page's address. Answers, per page, {canvases, requests, messages}, a canvas being {width, height, pixels}, RGBA codes in base64, row 0 at the top.
+// The job is a list of {page, states}; a state is what stands after # in the page's address. Answers,
+// per page, {canvases, requests, messages}, a canvas being {width, height, pixels}, RGBA codes in
+// base64, row 0 at the top.
 
 import { pathToFileURL } from "node:url";
 
