@@ -57,10 +57,9 @@ LIGHTS: dict[str, dict[str, Any]] = {
     "map": {},
 }
 
-# All lights hand their samples to one lobe: each has one of the models, and of those with an extent and those without
-# one has both.
-CASES = [(kind, "phong") for kind in ("directional", "point", "rectangle", "polygon", "environment")]
-CASES += [(kind, "blinn-phong") for kind in ("directional", "spot", "rectangle", "sphere", "map")]
+# Of lights with an extent, which all hand their samples to one lobe, each has one of the models, and one has both.
+CASES = [(kind, "phong") for kind in ("directional", "point", "spot", "rectangle", "polygon", "environment")]
+CASES += [(kind, "blinn-phong") for kind in ("directional", "point", "spot", "rectangle", "sphere", "map")]
 
 
 def light_of(kind: str, values: dict[str, Any], folder: Path) -> tuple[dict[str, Any], Light]:
