@@ -78,8 +78,7 @@ def with_shared_n(problem: MapProblem, labels: Int[np.ndarray, "H W"]) -> MapPro
         (log_n, curvature, cost, freedom), rival = np.where(other[2] < best[2], [other, best], [best, other])
     noise = cost / np.maximum(freedom, 1)
     error = np.sqrt(np.divide(noise, curvature, out=np.full_like(noise, np.inf), where=curvature > 0))
-    error = np.hypot(
-        error, share_of_rival(rival[2] - cost, np.maximum(noise, np.finfo(float).tiny)) * np.abs(rival[0] - log_n)
-    )
+    share = share_of_rival(rival[2] - cost, np.maximum(noise, np.finfo(float).tiny))
+    error = np.hypot(error, share * np.abs(rival[0] - log_n))
     shared = np.stack([log_n[index], error[index]], axis=-1)
     return dataclasses.replace(problem, surface=surface._replace(shared=shared))

@@ -382,8 +382,7 @@ def _capped(material: brdf.Material) -> str:
 
 def _warnings(neighbours: Neighbours, together: Structure | None, lobe: Highlight | None) -> Iterator[str]:
     shared = together is not None and together.significant
-    known = together is not None and together.significant and not together.unexplained
-    if (neighbours.significant or shared) and not known:
+    if (neighbours.significant or shared) and not (together is not None and together.known):
         words = "the residual has structure: neighbouring pixels err alike"
         if neighbours.correlation > 0.05:
             words += f" (correlation {neighbours.correlation:.2f})"

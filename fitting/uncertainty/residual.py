@@ -241,18 +241,18 @@ def _over_blocks(residual: list[Any], lobe: Any, width: int) -> list[Any]:
     terms += [xp.broadcast_to(one, residual[0].shape) for one in (lobe * lobe, lobe)]
     size, (step, pixels) = SIZES[0], residual[0].shape
     rows = pixels // width
-    shape, padded = (step, rows, width), (step, rows + -rows % size, width + -width % size)
-    blocked = step, padded[1] // size, size, padded[2] // size, size
-    if xp is np:
-        whole = np.zeros((len(terms), *padded), lobe.dtype)
-        for place, term in zip(whole, terms, strict=True):
-            place[:, :rows, :width] = term.reshape(shape)
-        blocks = whole.reshape(-1, *blocked)
-        sums = np.add.reduce(np.add.reduce(blocks[:-1], axis=3), axis=4)
-        return [*sums, np.maximum.reduce(np.maximum.reduce(blocks[-1], axis=2), axis=3)]
-    pad = [(0, more - one) for one, more in zip(shape, padded, strict=True)]
-    blocks = [jnp.pad(term.reshape(shape), pad).reshape(blocked) for term in terms]
-    return totals(blocks, [*["add"] * (len(terms) - 1), "maximum"], (2, 4))
+    down, across = -(-rows // size), -(-width // size)
+
+    def blocked(term: Any) -> Any:
+        image = term.reshape(step, rows, width)
+        if xp is jnp:
+            whole = jnp.pad(image, [(0, 0), (0, down * size - rows), (0, across * size - width)])
+        else:  # np.pad takes three times as long
+            whole = np.zeros((step, down * size, across * size), term.dtype)
+            whole[:, :rows, :width] = image
+        return whole.reshape(step, down, size, across, size)
+
+    return totals(list(map(blocked, terms)), [*["add"] * (len(terms) - 1), "maximum"], (2, 4))
 
 
 _residual_and_values_jitted = jax.jit(_residual_and_values)

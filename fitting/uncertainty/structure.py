@@ -90,9 +90,9 @@ class Structure(NamedTuple):
         return self.excess > SIGNIFICANT
 
     @property
-    def unexplained(self) -> bool:
-        """Too large for chance, and for what is known to err together."""
-        return self.unknown > SIGNIFICANT
+    def known(self) -> bool:
+        """Too large for chance, but not for what is known to err together."""
+        return self.significant and not self.unknown > SIGNIFICANT
 
 
 def structure(

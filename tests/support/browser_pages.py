@@ -31,11 +31,15 @@ def browser() -> subprocess.Popen[str]:
 
 def asked(program: str, *called: Any) -> Any:
     """What a program of tests/browser answers."""
+    if browser().poll() is not None:  # one that ended tells why on standard error
+        browser.cache_clear()
     asking, answering = browser().stdin, browser().stdout
     assert asking is not None
     assert answering is not None
     print(json.dumps([program, *called], default=str), file=asking, flush=True)
-    answer = json.loads(answering.readline())
+    line = answering.readline()
+    assert line, "the browser has ended"
+    answer = json.loads(line)
     assert "error" not in answer, answer["error"]
     return answer
 
