@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 MARKERS = "os^DXv*"
 # An error of 0, that of the reference itself, is drawn so far below the least one.
 BELOW = 8.0
+# Of what is drawn, on either side: a part of its decades, and decades at least, for one fit alone has no width.
+MARGIN, AT_LEAST = 0.12, 0.3
 
 
 @matplotlib.rc_context(PRINT)
@@ -30,10 +32,12 @@ def error_against_time(tradeoff: "Tradeoff") -> Figure:
     figure = Figure(figsize=(6.4, 4.0))
     axes = figure.add_subplot()
     axes.set(xscale="log", yscale="log", xlabel="time of a fit, compiled (ms)", ylabel="relative error of the fit")
-    axes.axhline(tradeoff.accuracy, color="0.2", ls="--", label=f"accuracy {tradeoff.accuracy:g}")
     rows = [row for row in tradeoff.rows if np.isfinite(row.error)]
     least = min([row.error for row in rows if row.error > 0] + [tradeoff.accuracy]) / BELOW
     points = {row: (1e3 * row.seconds, max(row.error, least)) for row in rows}
+    axes.set(xlim=_about([time for time, _ in points.values()]))
+    axes.set(ylim=_about([tradeoff.accuracy, *(error for _, error in points.values())]))
+    axes.axhline(tradeoff.accuracy, color="0.2", ls="--", label=f"accuracy {tradeoff.accuracy:g}")
     kinds = dict.fromkeys(row.axis for row in rows)
     for axis, marker, colour in zip(kinds, MARKERS, ("black", *CHANNEL_COLOURS), strict=False):
         some = [row for row in rows if row.axis == axis]
@@ -50,8 +54,13 @@ def error_against_time(tradeoff: "Tradeoff") -> Figure:
             axes.plot(*points[row], "o", markersize=11, color="0.1")
             name += f"\n({words[row]})"
         axes.plot([], [], color="0.3", marker=f"${number}$", linestyle="", label=name)
-    axes.margins(0.12)
     legible(axes.xaxis)
     axes.grid(color="0.9")
     axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0)
     return figure
+
+
+def _about(values: list[float]) -> tuple[float, float]:
+    logarithms = np.log10(values or [1.0])
+    margin = max(MARGIN * np.ptp(logarithms), AT_LEAST)
+    return 10 ** (logarithms.min() - margin), 10 ** (logarithms.max() + margin)

@@ -149,6 +149,17 @@ def test_fits_of_the_front_are_numbered_and_named():
     assert {"1024 pixels", "all pixels\n(default)", "16384 pixels\n(recommended)"} <= set(names)
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("errors", [(), (1e-5,), (0.0,), (np.inf,), (np.inf, 1e-3)])
+def test_a_picture_of_few_fits_has_a_width(tmp_path, errors):
+    # Time was up after the first run of the first.
+    rows = [row(f"model {i}", 0.1, error, i) for i, error in enumerate(errors)]
+    figure = table(*rows).plot()
+    figure.savefig(tmp_path / "few.png")
+    for low, high in (figure.axes[0].get_xlim(), figure.axes[0].get_ylim()):
+        assert 0 < 2 * low < high
+
+
 def test_what_rounding_says_is_measured_and_drawn(tmp_path, monkeypatch):
     monkeypatch.setattr(speed_accuracy, "SOLVERS", ())
     monkeypatch.setattr(speed_accuracy, "ROUNDS", 1)
