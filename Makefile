@@ -10,7 +10,7 @@ LIGHTLY_COMPILED := --xla_cpu_use_fusion_emitters=false --xla_backend_optimizati
 # The longest test stands first, or one core would wait for it.
 COMPILED_AS_FOR_USERS := tests/project/test_bundled_examples.py tests/project/test_sound_jax.py tests/interop \
 	tests/brdf/plausibility/test_plausibility.py tests/fitting/solver tests/fitting/test_fit.py \
-	tests/fitting/test_jpeg_errors.py tests/fitting/test_maximum_likelihood.py
+	tests/brdf/rendering/test_relighting.py tests/fitting/test_jpeg_errors.py tests/fitting/test_maximum_likelihood.py
 
 .PHONY: fit test check docs lab wheel clean
 

@@ -3,8 +3,8 @@
 A picture is a sum of one picture per light, so with the material known `fitting.fit_jointly` finds its lights from any
 start. With the material unknown too the picture is linear in the products of every light's intensity with k_d
 and with k_s. Those products say everything but one thing: lights twice as bright on a surface half as bright look the
-same. That factor, one for each channel, no picture can determine; here the mean of the lights' intensities keeps the
-value it has in the scene, and the result says so.
+same. That factor, one for each channel, no picture can determine; here the mean of the lights' factors, which say how
+many times as bright as in the scene each is, is 1, and the result says so.
 """
 
 import dataclasses
@@ -26,7 +26,9 @@ from fitting.result import Parameter
 
 FACTOR = "one factor per channel between material and lights"
 ALIKE = "another light or none would look the same"
-KEPT = "no picture determines it; the lights' mean intensity was kept at that of the scene"
+# Of the brightest light: no light starts darker, for one without light would be held so.
+FAINT = 0.01
+KEPT = "no picture determines it; the mean of the lights' factors, over the scene's own intensities, was made 1"
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -115,12 +117,12 @@ def fit_lights_and_material(
 ) -> LightFit:
     """Fit the lights and the material together, up to the one factor per channel that no picture determines.
 
-    They are found by `fitting.fit_jointly`, from the best material under the scene's own lights. The ambient
+    They are found by `fitting.fit_jointly`, from the best material under the lights of a matt surface. The ambient
     coefficient cannot be told from the ambient intensity: it is that of the scene, and k_a takes the rest.
 
     Args:
         target: linear values, (H, W, C), or a `brdf.Picture`.
-        scene: what it shows; its lights are the start, and their mean stays what it is.
+        scene: what it shows; its lights' emittances are the unit of the factors, whose mean is 1.
         model: the name of the model.
         precision: as for `fit_lights`.
         mask: (H, W), pixels to look at.
@@ -143,10 +145,15 @@ def fit_lights_and_material(
     targets = state_problem([target], [scene], [mask]).targets
     if not scene.lights:
         raise InputError("scene", "has no lights", "Add a [[lights]] table")
-    before = _emittances(scene, targets[0].pixels.shape[-1])
+    channels = targets[0].pixels.shape[-1]
+    before = _emittances(scene, channels)
+    # Most of a picture is matt, which tells the lights about rightly from any start.
+    matt = fit_lights(targets[0], scene, brdf.Lambert(k_a=np.ones(channels), k_d=np.ones(channels)), mask=mask)
+    start = np.maximum(matt.emittances, FAINT * matt.emittances[: len(scene.lights)].max(axis=0))
+    start[len(scene.lights) :] = before[len(scene.lights) :]
     # The first light stays what it is, until the mean of all takes its place.
     free = ["intensity"][: len(scene.lights) - 1]
-    joint = fit_jointly(targets, _with_emittances(scene, before), name, free, mask=mask)
+    joint = fit_jointly(targets, _with_emittances(scene, start), name, free, mask=mask)
     now = _emittances(joint.scenes[0], before.shape[1])
     factors = np.divide(now, before, out=np.zeros_like(now), where=before > 0)
     mean = factors[: len(scene.lights)].mean(axis=0)
