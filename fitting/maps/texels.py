@@ -366,7 +366,9 @@ class Texels(eqx.Module):
             found |= zip(some, sums(*(columns[i] * b for (i, _), b in zip(some, others, strict=True))), strict=True)
         return [[found[min(i, j), max(i, j)] for j in range(count + 1)] for i in range(count)]
 
-    def evaluated(self, log_n: Array, slopes: list[Components], errors: bool = True) -> TexelFit:
+    def evaluated(
+        self, log_n: Array, slopes: list[Components], errors: bool = True, *, n_known: bool = False
+    ) -> TexelFit:
         """The best coefficients, and the Gauss-Newton step of these and the nonlinear unknowns together.
 
         Args:
@@ -375,12 +377,15 @@ class Texels(eqx.Module):
                 lobe, of the lobe.
             errors: whether what is at a bound is as unknown as others, as errors want it: what holds it there is noise,
                 and n would seem determined by light that the next draw gives to k_d. In a step it stays where it is.
+            n_known: whether no slope is by log n.
         """
         columns = self.columns(log_n)
         count = len(columns)
         rows = self.products([*columns, *slopes])
         k = nonnegative([[*row[:count], row[-1]] for row in rows[:count]], self.cap, self.grey, steps=2 + errors)
-        factors = [1.0] * count + [k[-1] if self.glossy and not i else 1.0 for i in range(len(slopes))]
+        factors: list[Any] = [1.0] * (count + len(slopes))
+        if self.glossy and slopes and not n_known:
+            factors[count] = k[-1]
         rows = [
             [*(a * x * b for x, b in zip(row, factors, strict=True)), a * (moment - sum(map(operator.mul, row, k)))]
             for a, (*row, moment) in zip(factors, rows, strict=True)
@@ -634,8 +639,10 @@ def nearest_vectors(axes: Components, weight: Array, value: Array) -> Components
     return Components(tuple(divide(one, x @ inverse[0]) for one in vector))
 
 
-def joint_fit(texels: Texels, lights: Distant, log_n: Array, normal: Components, errors: bool = True) -> TexelFit:
-    """At an exponent and a normal, which are not sure, as are none of the coefficients."""
+def joint_fit(
+    texels: Texels, lights: Distant, log_n: Array, normal: Components, *, errors: bool = True, n_known: bool = False
+) -> TexelFit:
+    """At an exponent, which may be sure, and a normal, which is not, as are none of the coefficients."""
 
     def columns(*angles):
         first, second = map(operator.mul, perpendicular(normal), angles)
@@ -645,23 +652,26 @@ def joint_fit(texels: Texels, lights: Distant, log_n: Array, normal: Components,
     turns = [jax.jvp(columns, (zero, zero), way)[1] for way in ((one, zero), (zero, one))]
     k = texels.evaluated(log_n, []).k
     slopes = [functools.reduce(operator.add, map(operator.mul, turn, map(beside, k))) for turn in turns]
-    return texels.evaluated(log_n, [*texels.by_log_n(log_n), *slopes], errors)
+    return texels.evaluated(log_n, slopes if n_known else [*texels.by_log_n(log_n), *slopes], errors, n_known=n_known)
 
 
-def jointly(texels: Texels, lights: Distant, log_n: Array, normal: Components) -> tuple[Array, Components]:
+def jointly(
+    texels: Texels, lights: Distant, log_n: Array, normal: Components, *, n_known: bool = False
+) -> tuple[Array, Components]:
     """Gauss-Newton of material and normal together; a step that does not lower the cost is cut to a quarter."""
+    of_n = texels.glossy and not n_known
 
     def step(_, state):
         log_n, normal, cost, change = state
         turn = sum(map(operator.mul, perpendicular(normal), change[-2:]), start=normal)
-        new = jnp.clip(log_n + change[0], 0, MOST_LOG_N), normalize(turn)
-        point = joint_fit(texels.facing(new[1], lights), lights, *new, errors=False)
-        most = [1.0] * texels.glossy + [0.2, 0.2]
+        new = jnp.clip(log_n + change[0], 0, MOST_LOG_N) if of_n else log_n, normalize(turn)
+        point = joint_fit(texels.facing(new[1], lights), lights, *new, errors=False, n_known=n_known)
+        most = [1.0] * of_n + [0.2, 0.2]
         taken = *new, point.cost, [jnp.clip(x, -limit, limit) for x, limit in zip(point.step, most, strict=True)]
         kept = log_n, normal, cost, [0.25 * x for x in change]
         return jax.tree.map(lambda a, b: jnp.where(point.cost < cost, a, b), taken, kept)
 
-    state = log_n, normal, jnp.full_like(log_n, jnp.inf), [jnp.zeros_like(log_n)] * (2 + texels.glossy)
+    state = log_n, normal, jnp.full_like(log_n, jnp.inf), [jnp.zeros_like(log_n)] * (2 + of_n)
     return jax.lax.fori_loop(0, 1 + JOINT_STEPS, step, state)[:2]
 
 

@@ -22,7 +22,18 @@ from fitting.likelihood import encoded_and_slope
 from fitting.maps.map_inputs import Photographs, places
 from fitting.maps.map_light_choice import MOST_ERROR
 from fitting.maps.map_result import REASONS
-from fitting.maps.texels import OUTLIER, Distant, TexelFit, Texels, share_of_rival, sums, sums_of, with_normals
+from fitting.maps.texels import (
+    OUTLIER,
+    Distant,
+    TexelFit,
+    Texels,
+    joint_fit,
+    jointly,
+    share_of_rival,
+    sums,
+    sums_of,
+    with_normals,
+)
 from fitting.solver.devices import placed
 from fitting.solver.normal_equations import COMPILER_OPTIONS
 
@@ -71,6 +82,7 @@ class MapProblem:
         to_view: towards the camera, of any length.
         precision: float32 or float64.
         seek: "layers", or for an n that texels share the "gains" on the grid of n, or the "slope" by log n.
+        near: whether the normals are near those that are sought at an n that texels share.
     """
 
     photographs: Photographs
@@ -81,6 +93,7 @@ class MapProblem:
     to_view: np.ndarray
     precision: Precision
     seek: str = "layers"
+    near: bool = False
 
     @property
     def finer(self) -> int:
@@ -121,7 +134,14 @@ class MapProblem:
         """
         given, dtype = self.photographs, np.dtype(self.precision)
         curves = tuple(one.curve for one in given.each)
-        static = self.models, self.grey, self.finer, self.seek, (*curves, *curves[-1:] * (-len(curves) % LANES))
+        static = (
+            self.models,
+            self.grey,
+            self.finer,
+            self.seek,
+            self.near and self.seek != "gains",
+            (*curves, *curves[-1:] * (-len(curves) % LANES)),
+        )
         with working_precision(self.precision):
             stacks, occluders = (), ()
             if given.scenes is not None:
@@ -148,7 +168,7 @@ class MapProblem:
 # Tiles are small: dealing parts of one out to threads would take ten times as long as the work.
 @functools.partial(
     jax.jit,
-    static_argnums=range(5),
+    static_argnums=range(6),
     compiler_options=COMPILER_OPTIONS | {"xla_disable_hlo_passes": "cpu-parallel-task-assigner"},
 )
 def _program(
@@ -156,6 +176,7 @@ def _program(
     grey: bool,
     finer: int,
     seek: str,
+    near: bool,
     curves: tuple[Encoding, ...],
     used: Array,
     values: Array,
@@ -197,9 +218,11 @@ def _program(
                 fit, normals, lit, counts = with_normals(texels, lights)
                 layers = _layers(texels.facing(normals, lights), fit, lit, counts, mask, normals, rounding)
             else:
-                near = points is not None
-                texels = _near(texels, stacks, occluders, ambient, points) if near else texels.facing(normal, lights)
-                layers = _of_normals(texels, mask, normal, rounding, shared, seek)
+                if points is None:
+                    texels = texels.facing(normal, lights)
+                else:
+                    texels = _near(texels, stacks, occluders, ambient, points)
+                layers = _of_normals(texels, mask, normal, rounding, shared, seek, lights if near else None)
             found.append(layers | {"chosen": jnp.full(mask.shape, index, jnp.uint8)})
         layers = functools.reduce(
             lambda a, b: {name: jnp.where(b["criterion"] < a["criterion"], b[name], a[name]) for name in a}, found
@@ -266,9 +289,15 @@ def _near(texels: Texels, stacks: Any, occluders: Any, ambient: Components | Non
 
 
 def _of_normals(
-    texels: Texels, mask: Array, normal: Components, rounding: Array, shared: Any, seek: str
+    texels: Texels,
+    mask: Array,
+    normal: Components,
+    rounding: Array,
+    shared: Any,
+    seek: str,
+    lights: Distant | None,
 ) -> dict[str, Array]:
-    """What is sought where normals are given."""
+    """What is sought where normals are given, or where they are near, lights those under which they are sought."""
     best = texels.unshadowed()
     counts = best.counts.T
     some = texels.where(counts)
@@ -276,12 +305,20 @@ def _of_normals(
         return {"sums": jnp.where(mask, some.gains(), 0)}
     if seek == "slope":
         point = some.at(shared[:, 0], errors=False)
+        if lights is not None:
+            normal = jointly(some, lights, shared[:, 0], normal, n_known=True)[1]
+            point = joint_fit(some.facing(normal, lights), lights, shared[:, 0], normal, errors=False)
         left = [point.slope[0], divide(1.0, point.error[0] ** 2), point.cost, jnp.maximum(best.freedom, 0)]
         return {"sums": jnp.where(mask, jnp.stack(left), 0)}
     if shared is None:
         return _layers(texels, best.fit, texels.seen, counts, mask, normal, rounding)
     log_n, error = shared.T
-    return _layers(texels, some.at(log_n, n_known=True), texels.seen, counts, mask, normal, rounding, error)
+    if lights is None:
+        return _layers(texels, some.at(log_n, n_known=True), texels.seen, counts, mask, normal, rounding, error)
+    normal = jointly(some, lights, log_n, normal, n_known=True)[1]
+    texels = texels.facing(normal, lights)
+    fit = joint_fit(texels.where(counts), lights, log_n, normal, n_known=True)
+    return _layers(texels, fit, texels.seen, counts, mask, normal, rounding, error)
 
 
 def _layers(
@@ -305,7 +342,7 @@ def _layers(
     channels, glossy, tiny = len(texels.shown), texels.glossy, jnp.finfo(texels.shown.dtype).tiny
     values, unlit, outliers = (channels * one for one in sums_of(counts, texels.seen - lit, lit - counts))
     *linear, k_s = fit.k if glossy else [*fit.k, jnp.zeros_like(fit.k[0])]
-    k_s_error, angles = fit.k_error[-1] if glossy else k_s, fit.error[glossy:]
+    k_s_error, angles = fit.k_error[-1] if glossy else k_s, fit.error[glossy and shared is None :]
     of_lobe = glossy * ((1 if texels.grey else channels) + (shared is None))
     unknowns = len(linear) * channels + of_lobe + len(angles)
 

@@ -956,6 +956,17 @@ def test_the_error_that_a_light_shrinks_is_the_maps_own_whatever_the_encoding():
     np.testing.assert_allclose(choice.after[0], np.nanmedian(all_of_them.n_error / all_of_them.n), rtol=0.05)
 
 
+def test_normals_that_are_sought_go_along_with_an_n_that_texels_share():
+    lights = dome(24)
+    pictures, truth = texels(144, 0.01, lights, n=(25, 25))
+    maps = fitting.fit_maps(pictures[..., :1], lights, "fit", labels=0)
+    inside = np.sum(np.cross(maps.normal[0], truth["normal"]) ** 2, axis=1) ** 0.5 / np.radians(maps.normal_error[0])
+    assert 0.85 < np.sqrt(np.mean(inside**2)) < 1.15
+    off = np.abs(maps.k_d[0] - truth["k_d"][:, :1]) / maps.k_d_error[0]
+    assert 0.9 < np.mean(off < 1.96) < 0.99
+    assert abs(maps.n[0, 0] - 25) < 3 * maps.n_error[0, 0]
+
+
 def test_labels_painted_in_colours_are_told_apart_by_all_channels(tmp_path):
     random, n = np.random.default_rng(3), np.array([12.0, 40.0])
     index, normal = np.arange(60) % 2, np.broadcast_to([0.2, 0.1, 0.97], (60, 3)) / np.linalg.norm([0.2, 0.1, 0.97])
