@@ -363,21 +363,26 @@ def _point(pixels: _Pixels, lobes: Sequence[Array], residual: Array, x: Array) -
 def _errors(pixels: _Pixels, lobes: Sequence[Array], x: Array, cost: Array, held: Array) -> tuple[Array, Array]:
     """Standard errors of x_a, x_d, x_s, (C, 3), and of log n: channels share n but not their noise.
 
-    With the coefficients eliminated each channel tells log n with the weight of its Schur complement; what log n errs
-    moves the coefficients along.
+    With the coefficients eliminated each channel tells log n by what its derivative has of its own; what log n errs
+    moves the coefficients along. Noise is alike in all pixels, whatever their weights (White, Econometrica 48, 1980).
     """
-    gram, active, x_s = pixels.columns(*lobes)[1], x > 0, x[:, 2]
-    unknowns = jnp.count_nonzero(active, axis=-1) + jnp.any(x_s > 0) / x_s.size
-    noise = cost / jnp.maximum(jnp.count_nonzero(pixels.weight) - unknowns, 1)
+    (weighted, gram), active, x_s = pixels.columns(*lobes), x > 0, x[:, 2]
+    squared = jnp.einsum("bkp,bjp->bkj", weighted, weighted, precision="highest")
     both = active[:, :, None] & active[:, None]
     inverse = jnp.where(both, jnp.linalg.inv(jnp.where(both, gram[:, :3, :3], jnp.eye(3, dtype=x.dtype))), 0)
-    cross = x_s[:, None] * gram[:, :3, 3]
-    along = (inverse @ cross[..., None])[..., 0]
-    by_channel = x_s**2 * gram[:, 3, 3] - jnp.sum(cross * along, axis=-1)
-    total = jnp.sum(by_channel)
-    by_n = jnp.where(total > 0, jnp.sum(noise * by_channel) / jnp.where(total > 0, total, 1) ** 2, jnp.inf)
-    by_n = jnp.where(jnp.any(x_s > 0) & ~held, by_n, 0)
-    variance = noise[:, None] * jnp.diagonal(inverse, axis1=1, axis2=2) + jnp.where(along == 0, 0, along**2 * by_n)
+    along = (inverse @ (x_s[:, None] * gram[:, :3, 3])[..., None])[..., 0]
+    own = jnp.concatenate([-along, x_s[:, None]], axis=-1)[..., None]
+    known = jnp.sum(jnp.swapaxes(own, 1, 2) @ gram @ own)
+    of_own = squared @ own
+    by_channel = jnp.sum(own * of_own, axis=(1, 2))
+    known = jnp.where(known > 0, known, jnp.inf)
+    unknowns = jnp.sum(inverse * squared[:, :3, :3], axis=(1, 2)) + jnp.sum(by_channel) / known / x_s.size
+    noise = cost / jnp.maximum(jnp.sum(pixels.weight) - unknowns, jnp.finfo(x.dtype).tiny)
+    moves = jnp.any(x_s > 0) & ~held
+    by_n = jnp.where(moves, jnp.where(known < jnp.inf, jnp.sum(noise * by_channel) / known**2, jnp.inf), 0)
+    variance = noise[:, None] * jnp.diagonal(inverse @ squared[:, :3, :3] @ inverse, axis1=1, axis2=2)
+    together = noise[:, None] * (inverse @ of_own[:, :3])[..., 0] / known
+    variance += jnp.where(moves & (along != 0), along * (along * by_n - 2 * together), 0)
     return _root(jnp.where(variance >= 0, variance, jnp.inf)), _root(by_n)
 
 

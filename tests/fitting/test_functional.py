@@ -37,11 +37,19 @@ def test_batched_and_jitted_it_finds_what_fit_finds_with_its_errors():
 def test_other_models_weights_and_values_that_do_not_count(kind: type[brdf.Material]):
     weight = np.ones(PICTURES[0].shape[:2])
     weight[:, :20] = 0
-    picture = np.where(weight[..., None] > 0, PICTURES[0], np.nan)
-    expected = fit(picture, ball_scene(), model=kind.name, precision="float64", mask=weight > 0)
+    weight[:, 30:] = 0.01
+    own = {key: value for key, value in vars(MATERIAL).items() if key in kind.__dataclass_fields__}
+    picture = np.where(weight[..., None] > 0, pictured(kind(**own), ball_scene(), 0.01, 0), np.nan)
+    expected = fit(picture, ball_scene(), model=kind.name, precision="float64", weight=weight)
     found = functional.fit(picture, ball_scene(), kind, weight=weight)
     for key, value in vars(expected.material).items():
         np.testing.assert_allclose(getattr(found.material, key), value, rtol=1e-7)
+    # Noise is alike in all pixels, whatever their weights: errors were half as large.
+    errors = np.concatenate([np.ravel(one) for one in found.solution.errors])
+    stated = [one.error for one in expected.parameters]
+    np.testing.assert_allclose(errors[:6], stated[:6], rtol=0.1)
+    if kind is brdf.NormalizedPhong:
+        np.testing.assert_allclose(errors[-1], stated[-1], rtol=0.1)
 
 
 def test_derivatives_by_picture_and_light_are_those_of_differences():
