@@ -66,8 +66,8 @@ def sensitivity(result: FitResult, by: Callable[[list[brdf.Scene]], Sequence[Any
     """The derivative of a fitted material by what the fit took as known about the scenes.
 
     Args:
-        result: of `fitting.fit` with the squared loss, whose sum of squares is differentiated; masks, weights and
-            clipped pixels are respected.
+        result: of `fitting.fit` with the squared loss, whose sum of squares is differentiated; masks and weights are
+            respected. A clipped value, of which the fit knows that it is no less, tells nothing here.
         by: from the list of scenes to their leaves, for example ``lambda scenes: (scenes[0].lights[0].direction,)``.
             A direction's own length changes nothing: the derivative along it is 0.
 

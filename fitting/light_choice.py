@@ -257,7 +257,7 @@ def _scene(result: FitResult, index: int) -> tuple[brdf.Scene, np.ndarray]:
     """The pixels of a picture that counted, or some of them, and the weights of these, which stand for all."""
     pixel = np.flatnonzero(result.counted[index])
     some = pixel[:: -(-pixel.size // MOST_PIXELS)]
-    weight = result.weighed[index].ravel()[some] * (pixel.size / some.size)
+    weight = result.weighed[index].reshape(result.counted[index].size, -1)[some].max(axis=1) * (pixel.size / some.size)
     return brdf.some_pixels(result.scenes[index], some, precision="float64"), weight
 
 

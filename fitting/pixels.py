@@ -280,7 +280,12 @@ def _observe(
             whole = counted & np.all(np.asarray(target.pixels) < level, axis=-1)
             counted = whole if whole.any() else counted
         shown = target.pixels.astype(dtype, copy=False), scene, counted
-        if given is not None or noise is not None:
+        # Where a channel is clipped and others are not these have weights of their own.
+        if apart and any(np.shape(tile.weight) == tile.target.shape for tile in tiles):
+            own = [np.ones(len(tile.target)) if tile.weight is None else np.asarray(tile.weight) for tile in tiles]
+            own = [np.broadcast_to(one.T, tile.target.shape[::-1]).T for one, tile in zip(own, tiles, strict=True)]
+            weights = np.concatenate(own).reshape(target.pixels.shape)
+        elif given is not None or noise is not None:
             heaviest = [np.max(np.asarray(one.weight).reshape(one.target.shape[0], -1), axis=1) for one in tiles]
             weights = np.concatenate(heaviest).reshape(height, width) * counted
     rounding = np.maximum(brightest * resolution, target.step / np.sqrt(12.0))

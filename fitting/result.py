@@ -251,7 +251,8 @@ class FitResult(Parameters):
         targets: the pictures, (H, W, C) each.
         scenes: their scenes.
         counted: which pixels counted, (H, W) each.
-        weights: how much they did, (H, W) each, None where all alike; () where no picture says.
+        weights: how much they did, (H, W) each, or (H, W, C) where only some channels of a pixel are clipped; None
+            where all alike; () where no picture says.
         files: path, encoding and factor of each picture; None where it came without a file.
         levels: the files on whose levels all values of a float picture lie, in words: these are fitted as codes.
         choice: what an accuracy or a time to spend made of the fit; None without one.
@@ -298,7 +299,7 @@ class FitResult(Parameters):
 
     @property
     def weighed(self) -> list[np.ndarray]:
-        """How much each pixel counted, (H, W) each: 0 or 1, or its weight."""
+        """How much each pixel counted: 0 or 1, or its weight, (H, W) each, or channel by channel, (H, W, C)."""
         weights = self.weights or [None] * len(self.counted)
         return [np.asarray(a if w is None else w) for a, w in zip(self.counted, weights, strict=True)]
 

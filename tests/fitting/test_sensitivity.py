@@ -33,6 +33,22 @@ def picture(case: str) -> np.ndarray:
     return clean + np.random.default_rng(7).normal(0, 0.01, clean.shape)
 
 
+def test_channels_that_are_not_clipped_count_where_another_is():
+    """Of whole pixels alone n moved by a sixth less, green k_s by 13 times as much, or nothing was determined."""
+    clean = np.minimum(picture("explained"), 0.6)
+
+    def found(x: float) -> fitting.FitResult:
+        known = scene(DIRECTION + x * np.eye(3)[0])
+        return fitting.fit(clean, known, model="blinn-phong", precision="float64", saturation=0.6)
+
+    result, step = found(0.0), 1e-4
+    assert result.weighed[0].shape == clean.shape
+    (moves,) = fitting.sensitivity(result, lambda scenes: (scenes[0].lights[0].direction,))
+    difference = (numbers(found(step).material) - numbers(found(-step).material)) / (2 * step)
+    np.testing.assert_allclose(moves.n[0], difference[-1], rtol=0.08)
+    np.testing.assert_allclose(moves.k_d[:, 0], difference[3:6], rtol=0.08, atol=0.01)
+
+
 def numbers(material: brdf.Material) -> np.ndarray:
     return np.concatenate([np.ravel(getattr(material, key)) for key in ("k_a", "k_d", "k_s", "n")])
 
