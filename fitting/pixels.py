@@ -281,7 +281,7 @@ def _observe(
             counted = whole if whole.any() else counted
         shown = target.pixels.astype(dtype, copy=False), scene, counted
         # Where a channel is clipped and others are not these have weights of their own.
-        if apart and any(np.shape(tile.weight) == tile.target.shape for tile in tiles):
+        if apart and any(getattr(tile.weight, "shape", ()) == tile.target.shape for tile in tiles):
             own = [np.ones(len(tile.target)) if tile.weight is None else np.asarray(tile.weight) for tile in tiles]
             own = [np.broadcast_to(one.T, tile.target.shape[::-1]).T for one, tile in zip(own, tiles, strict=True)]
             weights = np.concatenate(own).reshape(target.pixels.shape)
