@@ -63,6 +63,12 @@ HIGHLIGHTS = (4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0)
 GEMAN_MCCLURE = 2.0
 """Where the weight of a residual starts to fall, in deviations."""
 
+ELSEWHERE = (8.0, 32.0, 128.0)
+"""Exponents from which minima are sought once more."""
+
+STANDS_OUT = 4.0
+"""Of its tile's median: a cost that tells of a minimum that is not the least."""
+
 OUTLIER = 4.0
 """Residuals beyond so many deviations are no noise: one in 16,000 would be."""
 
@@ -570,7 +576,7 @@ def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Components,
         return lambert_normals(shown, counts, lights.to_light), counts
 
     def again(_, state):
-        log_n, normal, _, counts, _ = state
+        log_n, normal, _, _, counts, _ = state
         there = texels.facing(normal, lights)
         lit = seen if lights.ambient is not None else jnp.where(there.linear[0].parts[0] > 0, seen, 0)
         counts = inliers(there.residual(there.where(counts).at(log_n)), lit, lit * counts)
@@ -585,10 +591,36 @@ def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Components,
     found = jax.lax.map(tried, jax.tree.map(lambda *some: jnp.stack(some), *starts))
     trials = [jax.tree.map(operator.itemgetter(i), found) for i in range(len(starts))]
     best = functools.reduce(Trial.or_better, trials)
-    state = best.fit.log_n, best.normal, seen, best.counts.T, best.fit.rival
-    log_n, normal, lit, counts, rival = jax.lax.fori_loop(0, 2, again, state)
+    state = best.fit.log_n, best.normal, best.cost, seen, best.counts.T, best.fit.rival
+    log_n, normal, cost, lit, counts, rival = jax.lax.fori_loop(0, 2, again, state)
+    if texels.glossy:
+        log_n, normal, _ = elsewhere(texels.where(counts), lights, (log_n, normal, cost))
     fit = joint_fit(texels.where(counts).facing(normal, lights), lights, log_n, normal)
     return fit._replace(rival=rival), normal, lit, counts
+
+
+def elsewhere(texels: Texels, lights: Distant, found: tuple[Array, Components, Array]) -> Any:
+    """The minimum of material and normal together from other exponents, where a cost stands out of those of the tile.
+
+    A start whose normal is some degrees off favours a broad lobe, and Gauss-Newton may stay there.
+
+    Args:
+        texels: of what counts.
+        lights: which are distant.
+        found: log n, normal and cost.
+    """
+    cost = found[2]
+
+    def better(lanes, old):
+        some = texels.some(lanes)
+
+        def of_exponent(i, best):
+            other = jointly(some, lights, jnp.full_like(old[0], jnp.log(jnp.asarray(ELSEWHERE))[i]), old[1])
+            return jax.tree.map(lambda a, b: jnp.where(other[2] < best[2], b, a), best, other)
+
+        return jax.lax.fori_loop(0, len(ELSEWHERE), of_exponent, old)
+
+    return of_few(cost > STANDS_OUT * jnp.nanmedian(jnp.where(cost > 0, cost, jnp.nan)), found, better)
 
 
 def lambert_normals(shown: Array, seen: Array, to_light: Components) -> Components:
@@ -657,8 +689,8 @@ def joint_fit(
 
 def jointly(
     texels: Texels, lights: Distant, log_n: Array, normal: Components, *, n_known: bool = False
-) -> tuple[Array, Components]:
-    """Gauss-Newton of material and normal together; a step that does not lower the cost is cut to a quarter."""
+) -> tuple[Array, Components, Array]:
+    """Gauss-Newton of material and normal together, and the cost; a step that does not lower it is cut to a quarter."""
     of_n = texels.glossy and not n_known
 
     def step(_, state):
@@ -672,7 +704,7 @@ def jointly(
         return jax.tree.map(lambda a, b: jnp.where(point.cost < cost, a, b), taken, kept)
 
     state = log_n, normal, jnp.full_like(log_n, jnp.inf), [jnp.zeros_like(log_n)] * (2 + of_n)
-    return jax.lax.fori_loop(0, 1 + JOINT_STEPS, step, state)[:2]
+    return jax.lax.fori_loop(0, 1 + JOINT_STEPS, step, state)[:3]
 
 
 # -- least squares, one in each lane -----------------------------------------------------------------------------------
