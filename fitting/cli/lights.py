@@ -47,7 +47,12 @@ def lights(
         circle, notes = ball_in(sphere, inside)
         lines = [f"# {note}" for note in notes]
         from fitting.photographs.ball import ball_points
-        from fitting.photographs.distant_light import light_from_highlight, light_from_shading
+        from fitting.photographs.distant_light import (
+            FAR_BEHIND,
+            FROM_OUTLINE,
+            light_from_highlight,
+            light_from_shading,
+        )
 
         for path, picture, counts in zip(target, pictures, visible(inside, pictures), strict=True):
             with named_as({"picture": path}):
@@ -56,7 +61,8 @@ def lights(
                     light = light_from_shading(picture, points, saturation=saturation, mask=counts, **how)
                     direction, error = light.direction, f"  # {light.stated_error}"
                 else:
-                    direction, error = light_from_highlight(picture, circle, mask=counts), ""
+                    direction = light_from_highlight(picture, circle, mask=counts)
+                    error = f"  # {FROM_OUTLINE}" if direction[2] < FAR_BEHIND else ""
             lines.append(" ".join(f"{value:.6f}" for value in direction) + error)
     text = "\n".join(lines)
     if out is not None:

@@ -47,6 +47,8 @@ DOUBTFUL, NO_BALL, IN_HIGHLIGHT = 0.04, 0.08, 0.5
 # A light from so far behind leaves a crescent of less than three fifths of the ball's radius. On a thin one ambient
 # light and a highlight can be taken for each other and for shading, and the jackknife does not see that.
 BEHIND = -0.4
+# The highlight of a light more than 150 degrees from the view lies on the outline's pixels, which do not count.
+FAR_BEHIND, FROM_OUTLINE = -0.866, "it comes from behind: its highlight runs along the outline and can be degrees off"
 TOO_LITTLE = InputError("picture", "shows too little of the lit surface to tell the light", "Give its direction")
 
 
@@ -63,13 +65,15 @@ def light_from_highlight(picture: Any, circle: Circle, *, mask: Any = None) -> F
         mask: (H, W), pixels that count; None for all.
 
     Returns:
-        The unit direction, 2 (N.V) N - V at the middle of the highlight.
+        The unit direction, 2 (N.V) N - V, averaged over the highlight; from more than 150 degrees off the view it can
+        be degrees off.
 
     Raises:
         InputError: where the ball is not in the picture or shows no highlight, or not the whole of it.
     """
     grey = _values(picture).mean(axis=-1)
-    inside = (ball_normals(grey.shape, circle)[..., 2] > 0) & np.isfinite(grey) & (True if mask is None else mask)
+    normals = ball_normals(grey.shape, circle)
+    inside = (normals[..., 2] > 0) & np.isfinite(grey) & (True if mask is None else mask)
     largest = float(np.max(grey, where=inside, initial=-np.inf))
     if not largest > 0:
         raise InputError("picture", "is black on the mirror ball", "Give a picture with a highlight")
@@ -86,10 +90,9 @@ def light_from_highlight(picture: Any, circle: Circle, *, mask: Any = None) -> F
     place = place[near]
     if np.any((place == 0) | (place == np.array(grey.shape) - 1)):
         raise InputError("picture", "cuts through the highlight with its edge", "Give a photograph of all of it")
-    y, x = place.mean(axis=0)
-    across, up = (x - circle.x) / circle.radius, (circle.y - y) / circle.radius
-    z = max(1 - across**2 - up**2, 0.0) ** 0.5
-    return 2 * z * np.array([across, up, z]) - TO_VIEW
+    # A mirror ball keeps areas, 4 / radius^2 steradians a pixel: the mean over pixels is that over directions.
+    normal = normals[tuple(place.T)]
+    return _unit((2 * normal[:, 2:] * normal - TO_VIEW).mean(axis=0))[0]
 
 
 class ShadingLight(NamedTuple):

@@ -272,18 +272,20 @@ def test_a_highlight_that_is_not_to_be_seen_is_none(tmp_path, capsys, monkeypatc
     assert angle([float(one) for one in out.split()], (0, 0, 1)) < 2.6  # half a pixel
 
 
-def test_lights_from_a_mirror_ball_in_one_command(tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize(("light", "off", "doubted"), [((0.3, 0.2, 0.93), 1.0, 0), ((0.3, 0.2, -1.0), 5.0, 1)])
+def test_lights_from_a_mirror_ball_in_one_command(tmp_path, capsys, monkeypatch, light, off, doubted):
     monkeypatch.chdir(tmp_path)
     circle = Circle(60.0, 55.0, 50.0)
     points = ball_points((110, 120), circle)
-    light = np.array([0.3, 0.2, 0.93]) / np.linalg.norm([0.3, 0.2, 0.93])
+    light = np.array(light) / np.linalg.norm(light)
     mirrored = 2 * np.asarray(points.normal)[..., 2:] * np.asarray(points.normal) - [0, 0, 1]
     glow = np.where(points.mask, np.exp(300 * (mirrored @ light - 1)), 0)
     brdf.write_image("chrome.png", glow[..., None].astype(np.float32))
     status, out, _ = run(capsys, "lights", "chrome.png", "--sphere", "60,55,50", "--out", "lights.txt")
     assert status == 0
     assert "wrote lights.txt" in out
-    assert angle(read_directions("lights.txt", 1)[0], light) < 1.0
+    assert angle(read_directions("lights.txt", 1)[0], light) < off
+    assert Path("lights.txt").read_text().count("# it comes from behind") == doubted
 
 
 @pytest.mark.parametrize("share", [0.2, 0.7, 0.95])

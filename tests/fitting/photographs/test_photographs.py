@@ -10,7 +10,7 @@ from project_paths import REAL, real_data
 import brdf
 import fitting
 from brdf.errors import InputError
-from fitting.photographs.ball import Circle, ball_points, find_circle
+from fitting.photographs.ball import Circle, ball_normals, ball_points, find_circle
 from fitting.photographs.distant_light import light_from_highlight, light_from_shading
 from fitting.photographs.light_files import read_directions, read_intensities
 
@@ -133,6 +133,17 @@ def test_the_highlight_tells_the_light(direction):
     found = light_from_highlight(np.where(points.mask, np.minimum(glow, 1.0), 0)[..., None], circle)
     # The picture of a round light on a ball is not quite symmetric about its centre.
     assert angle(found, direction) < 1.0
+
+
+@pytest.mark.parametrize(("polar", "off"), [(60, 0.2), (130, 0.3), (150, 0.7)])
+def test_a_broad_highlight_tells_the_middle_of_the_light(polar, off):
+    """A disc light of 6 degrees: at the middle of its picture on the ball it was 0.7 degrees off at 130, 1.8 at 150."""
+    circle, (across, up) = Circle(101.3, 97.8, 80.4), np.cos([0.7, 0.7 - np.pi / 2]) * np.sin(np.radians(polar))
+    light = np.array([across, up, np.cos(np.radians(polar))])
+    normal = ball_normals((200, 200), circle)
+    lit = (2 * normal[..., 2:] * normal - [0, 0, 1]) @ light > np.cos(np.radians(6))
+    found = light_from_highlight(np.where(normal[..., 2] > 0, lit, 0.0), circle)
+    assert angle(found, light) < off  # whole pixels are lit or not, each some degrees wide near the outline
 
 
 def test_a_highlight_at_the_edge_of_the_picture_is_refused():
