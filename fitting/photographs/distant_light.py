@@ -44,6 +44,9 @@ TO_VIEW = np.array([0.0, 0.0, 1.0])
 # What is no ball. Of balls the shading leaves up to 0.05 of the light unexplained, of reliefs and coins 0.05 to 3; of
 # what is bright on mirror balls all lies in the highlight, elsewhere up to 0.4 does (photographs of shared/data).
 DOUBTFUL, NO_BALL, IN_HIGHLIGHT = 0.04, 0.08, 0.5
+# What faces away from the light, well inside the outline, is black or lit from elsewhere: by what surrounds a ball with
+# up to 0.014 of the light on those photographs. Noise that is cut off at 0 has a mean of 0.4 deviations.
+INSIDE, ELSEWHERE, CUT_NOISE = 0.3, 0.015, 0.4
 # A light from so far behind leaves a crescent of less than three fifths of the ball's radius. On a thin one ambient
 # light and a highlight can be taken for each other and for shading, and the jackknife does not see that.
 BEHIND = -0.4
@@ -106,18 +109,25 @@ class ShadingLight(NamedTuple):
             the direction everywhere alike.
         unexplained: root mean square of what the model leaves over parts of the surface, relative to the strength; of
             photographs of matt balls up to 0.05.
+        elsewhere: what the side that faces away from the light shows beyond ambient light that was stated, and beyond
+            noise, relative to the strength; 0 where too little of that side is seen.
     """
 
     direction: Float[np.ndarray, "3"]
     strength: float
     error: float
     unexplained: float
+    elsewhere: float
 
     @property
     def stated_error(self) -> str:
         """The error, and why it may be too small."""
         doubt = ""
-        if self.direction[2] < BEHIND:
+        if self.elsewhere > ELSEWHERE:
+            share = f"{100 * self.elsewhere:.2g} % of the light"
+            remedy = "state --ambient, or photograph one light at a time"
+            doubt = f" (the side facing away shows {share}, lit from elsewhere too: it can be far off; {remedy})"
+        elif self.direction[2] < BEHIND:
             doubt = " (it comes from behind: a highlight on the thin crescent can turn it by several times that)"
         elif self.unexplained > DOUBTFUL:
             share = f"{100 * self.unexplained:.0f} % of the light unexplained"
@@ -199,7 +209,12 @@ def light_from_shading(
         what = f"is not shaded like this surface: {100 * unexplained:.0f} % of the light is left unexplained"
         remedy = "Give a matt ball and its circle; check encoding, saturation and ambient light"
         raise InputError("picture", what, remedy)
-    return ShadingLight(numbers[:3] / length, length * unit, error, unexplained)
+    away = (numbers[:3] @ normal < -LIT * length) & (normal[2] > INSIDE)
+    count, elsewhere = np.count_nonzero(away), 0.0
+    if count >= FEWEST:
+        noise = (CUT_NOISE + 3 / count**0.5) * 1.4826 * np.median(np.abs(residual))
+        elsewhere = max(np.mean(value[away]) - (numbers[3] if ambient else 0.0) - noise, 0.0) / length
+    return ShadingLight(numbers[:3] / length, length * unit, error, unexplained, float(elsewhere))
 
 
 def _bound(residual) -> float:

@@ -164,6 +164,30 @@ def test_noise_is_no_reason_to_doubt_a_ball():
     assert found.unexplained < DOUBTFUL
 
 
+NOISE = np.random.default_rng(9).standard_normal(len(NORMAL))
+SECOND = shown((-0.6, 0.3, 0.7))
+
+
+@pytest.mark.parametrize(
+    ("value", "ambient", "doubted"),
+    [
+        pytest.param(shown(ASIDE) + 0.2 * SECOND, False, True, id="a second light"),
+        pytest.param(shown(ASIDE) + 0.2 * SECOND, True, True, id="a second light called ambient"),
+        pytest.param(shown(ASIDE, ambient=0.05), False, True, id="ambient light"),
+        pytest.param(shown(ASIDE, ambient=0.05, k_s=0.3, n=20.0), True, False, id="ambient light that was stated"),
+        pytest.param(shown(ASIDE, ambient=0.005), False, False, id="light to and fro"),
+        pytest.param(shown(ASIDE, k_s=0.3, n=20.0), False, False, id="a highlight"),
+        pytest.param(np.maximum(shown(ASIDE) + 0.05 * NOISE, 0), False, False, id="noise cut off at 0"),
+        pytest.param(shown(ASIDE) + 0.15 * NOISE, False, False, id="noise"),
+    ],
+)
+def test_light_on_the_side_that_faces_away_is_told(value, ambient, doubted):
+    """A second light of a fifth turns the direction by 3 degrees and more, and the error says 0.1."""
+    found = light_of(value + 1e-3 * NOISE, ambient=ambient)
+    assert ("lit from elsewhere too" in found.stated_error) == doubted
+    assert (angle(found.direction, ASIDE) > 2.0) == doubted
+
+
 @real_data
 @pytest.mark.parametrize("name", ["real-item2/image00.jpg", "real-item9/image17.jpg"])
 def test_a_fresco_and_a_coin_are_no_balls(name):
