@@ -18,6 +18,8 @@ from fitting.photographs.ball import Circle, ball_normals
 # What belongs to a highlight: its core is looked for above one share of the brightest pixel; it reaches down to half of
 # the brightest, within a share of the radius around it.
 CORE, HIGHLIGHT, HIGHLIGHT_RADIUS = 0.9, 0.5, 0.12
+# A patch as bright, of this share of the largest's pixels, is another light's.
+ALIKE = 0.25
 # Lambert's law is fitted where the light's cosine exceeds this, at first on pixels above this share of the brightest.
 LIT, BRIGHT = 0.15, 0.05
 # Huber's tuning constant, which keeps 95 % efficiency on Gaussian noise, times the ratio of deviation and median.
@@ -72,7 +74,7 @@ def light_from_highlight(picture: Any, circle: Circle, *, mask: Any = None) -> F
         be degrees off.
 
     Raises:
-        InputError: where the ball is not in the picture or shows no highlight, or not the whole of it.
+        InputError: where the ball is not in the picture or shows no highlight, not the whole of it, or several.
     """
     grey = _values(picture).mean(axis=-1)
     normals = ball_normals(grey.shape, circle)
@@ -86,7 +88,13 @@ def light_from_highlight(picture: Any, circle: Circle, *, mask: Any = None) -> F
     place = np.argwhere(bright)
     y, x = np.median(np.argwhere(core), axis=0)
     near = np.hypot(place[:, 1] - x, place[:, 0] - y) <= HIGHLIGHT_RADIUS * circle.radius
-    if np.mean(near) < IN_HIGHLIGHT:
+    many = np.mean(near) < IN_HIGHLIGHT
+    mirrored = 2 * normals[..., 2:] * normals - TO_VIEW
+    highlights = _highlights(bright, mirrored)
+    if highlights == 2 or (highlights > 2 and not many):
+        remedy = "Photograph one light at a time, or leave the others out by a mask"
+        raise InputError("picture", f"shows {highlights} highlights of like brightness on the mirror ball", remedy)
+    if many:
         share = f"{100 * np.mean(near):.0f} % of it lie where a mirror ball's highlight would be"
         remedy = "Give a photograph of a mirror ball and its circle; of a matt one use --matt"
         raise InputError("picture", f"is bright in many places: {share}", remedy)
@@ -94,8 +102,19 @@ def light_from_highlight(picture: Any, circle: Circle, *, mask: Any = None) -> F
     if np.any((place == 0) | (place == np.array(grey.shape) - 1)):
         raise InputError("picture", "cuts through the highlight with its edge", "Give a photograph of all of it")
     # A mirror ball keeps areas, 4 / radius^2 steradians a pixel: the mean over pixels is that over directions.
-    normal = normals[tuple(place.T)]
-    return _unit((2 * normal[:, 2:] * normal - TO_VIEW).mean(axis=0))[0]
+    return _unit(mirrored[tuple(place.T)].mean(axis=0))[0]
+
+
+def _highlights(bright, mirrored) -> int:
+    """How many patches are another light's: so large, and so far from the largest in direction; and that one."""
+    from scipy.ndimage import label  # it takes long to load
+
+    labelled: Any = label(bright, np.ones((3, 3)))
+    patch = labelled[0]
+    size = np.bincount(patch.ravel())[1:]
+    ways = [mirrored[patch == 1 + one].mean(axis=0) for one in np.flatnonzero(size >= ALIKE * size.max())]
+    first = mirrored[patch == 1 + np.argmax(size)].mean(axis=0)
+    return 1 + int(np.sum(np.linalg.norm(ways - first, axis=1) > 2 * HIGHLIGHT_RADIUS))
 
 
 class ShadingLight(NamedTuple):

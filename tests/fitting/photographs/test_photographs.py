@@ -146,6 +146,23 @@ def test_a_broad_highlight_tells_the_middle_of_the_light(polar, off):
     assert angle(found, light) < off  # whole pixels are lit or not, each some degrees wide near the outline
 
 
+@pytest.mark.parametrize(
+    ("brightness", "degrees", "refused"), [(1.0, 5.0, True), (0.7, 3.0, True), (0.3, 5.0, False), (1.0, 1.5, False)]
+)
+def test_two_highlights_are_refused_unless_one_is_faint_or_a_speck(brightness, degrees, refused):
+    """Of two alike the one with more pixels was taken, whichever that was."""
+    circle, light, other = Circle(101.3, 97.8, 80.4), np.array([0.36, 0.48, 0.8]), np.array([-0.8, 0.0, 0.6])
+    normal = ball_normals((200, 200), circle)
+    mirrored = 2 * normal[..., 2:] * normal - [0, 0, 1]
+    first, second = (mirrored @ way > np.cos(np.radians(wide)) for way, wide in ((light, 5.0), (other, degrees)))
+    picture = np.where(normal[..., 2] > 0, np.maximum(first, brightness * second), 0)
+    if refused:
+        with pytest.raises(InputError, match="shows 2 highlights"):
+            light_from_highlight(picture, circle)
+        return
+    assert angle(light_from_highlight(picture, circle), light) < 0.3
+
+
 def test_a_highlight_at_the_edge_of_the_picture_is_refused():
     circle = Circle(20.0, 50.0, 60.0)
     normal = np.asarray(ball_points((100, 100), circle).normal)
