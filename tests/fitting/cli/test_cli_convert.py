@@ -53,6 +53,20 @@ def test_convert_to_standard_output_writes_no_file(capsys, tmp_path: Path, monke
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("lines", "note"),
+    [
+        ("d 0.5\nmap_Kd -s 2 2 2 wood.png", "note: d 0.5 is not read; map_Kd -s 2 2 2 wood.png is not read"),
+        ("Tr 0.25\nmap_Bump bump.png", "note: Tr 0.25 is not read; map_Bump bump.png is not read"),
+        ("d 1.000\nTr 0.0\nNi 1.45", ""),
+    ],
+)
+def test_convert_says_what_of_an_mtl_file_it_does_not_read(capsys, tmp_path: Path, lines: str, note: str):
+    (tmp_path / "a.mtl").write_text(f"newmtl a\n{lines}\nKd 0.5 0.4 0.3\n")
+    said = run(capsys, "convert", tmp_path / "a.mtl", tmp_path / "a.json")
+    assert "\n".join(said.splitlines()[1:]).strip() == note
+
+
 def test_convert_reads_what_it_wrote(capsys, tmp_path: Path):
     run(capsys, "convert", "cyan plastic", tmp_path / "a.mtl")
     run(capsys, "convert", tmp_path / "a.mtl", tmp_path / "a.json")
