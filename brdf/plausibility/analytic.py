@@ -114,7 +114,7 @@ def _energy(material: Material, classic: bool) -> Finding:
         bound += ACCURACY["float64"] * material.k_s[channel] / divisor
     words = f"the largest albedo is {value:.7g}, for light at {light}"
     if classic:
-        words = f"the albedo exceeds 1 for light beyond {crossing:.4g}° and grows without bound, "
+        words = f"the albedo exceeds 1 for light beyond {Angles(crossing)} and grows without bound, "
         words += f"to {value:.3g} at {light}"
     failed = f"does not conserve energy: {words}{named}"
     finding = judged(value, ENERGY_LIMIT, float(bound), (light, None, channel), words + named, failed)

@@ -42,8 +42,10 @@ class Angles:
         return cls(math.degrees(math.atan2(math.hypot(x, y), z)), math.degrees(math.atan2(y, x)) % 360.0)
 
     def __str__(self) -> str:
-        """The angles with a degree sign, the azimuth only where it is not zero."""
-        return f"{self.polar:.4g}°" + (f" azimuth {self.azimuth:.4g}°" if round(self.azimuth, 3) % 360 else "")
+        """The angles with a degree sign, below 90 where they are; the azimuth only where it is not zero."""
+        left = 90.0 - self.polar
+        digits = 3 - math.floor(math.log10(left)) if 0.0 < left < 0.1 else 4
+        return f"{self.polar:.{digits}g}°" + (f" azimuth {self.azimuth:.4g}°" if round(self.azimuth, 3) % 360 else "")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,7 +17,7 @@ from brdf.display import lit_sphere
 from brdf.measured.table import MeasuredBRDF, from_angles
 from brdf.models.base import Material, SpecularMaterial
 from brdf.plausibility.numeric import Sampler, albedo_of
-from brdf.plausibility.report import Report
+from brdf.plausibility.report import Angles, Report
 from fitting.report.plots import CHANNEL_COLOURS, CHANNELS, OTHERS, PRINT, SIGNED
 
 Brdf = Material | Callable[[Any, Any], Any]
@@ -83,7 +83,7 @@ def plot_albedo(brdf: Brdf, report: Report | None = None, figure: Any = None) ->
     energy = report.energy if report else None
     if energy and energy.crossing:
         axes.axvline(energy.crossing, color="0.4", linestyle=":")
-        axes.text(energy.crossing - 1, 1.2, f"exceeds 1 beyond {energy.crossing:.4g}°", ha="right")
+        axes.text(energy.crossing - 1, 1.2, f"exceeds 1 beyond {Angles(energy.crossing)}", ha="right")
     if energy and energy.value < 1.5:
         axes.plot(energy.to_light.polar, energy.value, "ko", fillstyle="none", clip_on=False)
     axes.set(xlabel=LIGHT, ylabel="albedo", xlim=(0, 90), ylim=(0, 1.5), title="Light reflected, of that arriving")

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 
 import jax
 import jax.numpy as jnp
@@ -85,6 +86,13 @@ def test_words_for_opengls_blinn_phong():
     assert "not reciprocal: the specular term is not multiplied by N·L; f_r(89.99°→" in text
     assert "does not conserve energy: the albedo exceeds 1 for light beyond 89.88° and grows without bound" in text
     assert "Its nearest plausible form is NormalizedBlinnPhong(" in text
+
+
+def test_light_that_is_nearly_grazing_is_not_said_to_be_at_90_degrees():
+    energy = check(BlinnPhong(k_d=0.5, k_s=0.2, n=1e5)).energy
+    beyond, worst = (float(one) for one in re.findall(r"([\d.]+)°", energy.sentence))
+    assert 89.99 < beyond < worst < 90
+    np.testing.assert_allclose([90 - beyond, 90 - worst], [90 - energy.crossing, 90 - energy.to_light.polar], rtol=0.1)
 
 
 def test_the_reported_pair_shows_the_reported_ratio():
