@@ -377,7 +377,9 @@ def _errors(pixels: _Pixels, lobes: Sequence[Array], x: Array, cost: Array, held
     by_channel = jnp.sum(own * of_own, axis=(1, 2))
     known = jnp.where(known > 0, known, jnp.inf)
     unknowns = jnp.sum(inverse * squared[:, :3, :3], axis=(1, 2)) + jnp.sum(by_channel) / known / x_s.size
-    noise = cost / jnp.maximum(jnp.sum(pixels.weight) - unknowns, jnp.finfo(x.dtype).tiny)
+    whole = jnp.sum(pixels.weight)
+    left = jnp.where(whole - unknowns > jnp.finfo(x.dtype).eps * whole, whole - unknowns, 1)
+    noise = cost / left
     moves = jnp.any(x_s > 0) & ~held
     by_n = jnp.where(moves, jnp.where(known < jnp.inf, jnp.sum(noise * by_channel) / known**2, jnp.inf), 0)
     variance = noise[:, None] * jnp.diagonal(inverse @ squared[:, :3, :3] @ inverse, axis1=1, axis2=2)

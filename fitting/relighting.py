@@ -150,13 +150,15 @@ def fit_lights_and_material(
     # Most of a picture is matt, which tells the lights about rightly from any start.
     matt = fit_lights(targets[0], scene, brdf.Lambert(k_a=np.ones(channels), k_d=np.ones(channels)), mask=mask)
     start = np.maximum(matt.emittances, FAINT * matt.emittances[: len(scene.lights)].max(axis=0))
+    start = np.where(before > 0, start, 0)
     start[len(scene.lights) :] = before[len(scene.lights) :]
     # The first light stays what it is, until the mean of all takes its place.
     free = ["intensity"][: len(scene.lights) - 1]
     joint = fit_jointly(targets, _with_emittances(scene, start), name, free, mask=mask)
     now = _emittances(joint.scenes[0], before.shape[1])
     factors = np.divide(now, before, out=np.zeros_like(now), where=before > 0)
-    mean = factors[: len(scene.lights)].mean(axis=0)
+    lit = np.count_nonzero(before[: len(scene.lights)], axis=0)
+    mean = factors[: len(scene.lights)].sum(axis=0) / np.maximum(lit, 1)
     scale = np.where(mean > 0, mean, 1.0)
     k = {key: value * scale if key in ("k_d", "k_s") else value for key, value in vars(joint.material).items()}
     material = dataclasses.replace(joint.material, **k)

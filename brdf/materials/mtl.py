@@ -4,7 +4,6 @@ A highlight that MTL has no word for is written as the nearest one it has, and a
 names the model, so that what was saved reads back.
 """
 
-import re
 from collections.abc import Collection
 from typing import Any
 
@@ -19,7 +18,7 @@ SHOWN = 40  # the first letters of a word that messages show
 _COMMENTS = {"model": "# brdf model:", "note": "# note:"}
 _TEXTURE = "map_kd"
 # Opacity and transparency of what hides all behind it: other values, as textures, are told as not read.
-_OPAQUE = {"d": r"1(\.0*)?", "tr": r"0?(\.0*)?"}
+_OPAQUE = {"d": 1.0, "tr": 0.0}
 _COEFFICIENTS = {"ka": "k_a", "kd": "k_d", "ks": "k_s"}
 
 
@@ -95,13 +94,19 @@ def read_mtl(path: Any, text: str) -> dict[str, dict[str, Any]]:
             if name is None:
                 raise InputError(where, f"has {word} before any newmtl", "Start the material with newmtl NAME")
             entries[name][key] = given[-1:] or [word] if key == _TEXTURE else _numbers(where, word, given)
-        see_through = key in _OPAQUE and not re.fullmatch(_OPAQUE[key], "".join(given[-1:]))
-        if name is not None and (see_through or key.startswith("map_")):
+        if name is not None and (key.startswith("map_") or (key in _OPAQUE and not _is(given[-1:], _OPAQUE[key]))):
             unread = f"{' '.join([word, *given])[:SHOWN]} is not read"
             entries[name]["note"] = "; ".join(filter(None, [entries[name].get("note"), unread]))
     if not entries:
         raise InputError(path, "holds no material", "Give a file with a newmtl line")
     return entries
+
+
+def _is(given: list[str], number: float) -> bool:
+    try:
+        return [parse_number(one) for one in given] == [number]
+    except ValueError:
+        return False
 
 
 def _numbers(where: str, word, given) -> list[float]:

@@ -594,7 +594,8 @@ def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Components,
     state = best.fit.log_n, best.normal, best.cost, seen, best.counts.T, best.fit.rival
     log_n, normal, cost, lit, counts, rival = jax.lax.fori_loop(0, 2, again, state)
     if texels.glossy:
-        log_n, normal, _ = elsewhere(texels.where(counts), lights, (log_n, normal, cost))
+        log_n, normal, least = elsewhere(texels.where(counts), lights, (log_n, normal, cost))
+        rival = [jnp.where(least < cost, 0, one) for one in rival]
     fit = joint_fit(texels.where(counts).facing(normal, lights), lights, log_n, normal)
     return fit._replace(rival=rival), normal, lit, counts
 

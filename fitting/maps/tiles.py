@@ -308,7 +308,8 @@ def _of_normals(
         if lights is not None:
             normal = jointly(some, lights, shared[:, 0], normal, n_known=True)[1]
             point = joint_fit(some.facing(normal, lights), lights, shared[:, 0], normal, errors=False)
-        left = [point.slope[0], divide(1.0, point.error[0] ** 2), point.cost, jnp.maximum(best.freedom, 0)]
+        freedom = best.freedom - len(point.error[1:])  # of angles
+        left = [point.slope[0], divide(1.0, point.error[0] ** 2), point.cost, jnp.maximum(freedom, 0)]
         return {"sums": jnp.where(mask, jnp.stack(left), 0)}
     if shared is None:
         return _layers(texels, best.fit, texels.seen, counts, mask, normal, rounding)

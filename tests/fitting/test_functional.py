@@ -99,3 +99,13 @@ def test_of_two_valleys_the_lower_one_and_bounds_of_the_exponent():
     np.testing.assert_allclose(single.n, found.n, rtol=1e-4)
     held = functional.solve(0.5 * cosine**30, cosine, lambda n: cosine**n, n_range=(50.0, 1e3))
     np.testing.assert_allclose(held.n, 50, rtol=1e-12)
+
+
+def test_errors_have_derivatives_where_no_pixel_counts():
+    cosine = jnp.linspace(0.3, 1.0, 50)[:, None]
+    target = 0.3 * cosine + 0.6 * cosine**20
+
+    def error(weight: jax.Array) -> jax.Array:
+        return functional.solve(target, cosine, lambda n: cosine**n, weight=weight).errors[1][0]
+
+    assert np.all(np.isfinite(jax.grad(error)(jnp.zeros(50))))

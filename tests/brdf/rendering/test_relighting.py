@@ -140,3 +140,16 @@ def test_lights_and_material_are_found_from_any_start(n: float, start: tuple[flo
     np.testing.assert_allclose(found.emittances[0] / found.emittances[1], 1.8, rtol=1e-4)
     np.testing.assert_allclose(found.factors[:2].mean(), 1, rtol=1e-6)
     np.testing.assert_allclose(found.material.n, n, rtol=1e-4)
+
+
+def test_a_light_that_is_stated_to_be_dark_in_a_channel_stays_dark():
+    directions = [0.4, 0.5, 0.8], [-0.6, 0.1, 0.7]
+    lights = [
+        brdf.DirectionalLight(direction=direction, intensity=intensity)
+        for direction, intensity in zip(directions, ([0.9, 0, 0], [0.5] * 3), strict=True)
+    ]
+    known = brdf.Scene(camera=CAMERA, shapes=BALL, lights=lights, ambient=0.3)
+    found = fitting.fit_lights_and_material(np.asarray(brdf.render(MATERIAL, known)), known)
+    np.testing.assert_allclose(found.material.n, MATERIAL.n, rtol=1e-5)
+    np.testing.assert_allclose(found.emittances[0, 1:], 0, atol=1e-6)
+    np.testing.assert_allclose(found.emittances[1], 0.5, rtol=1e-4)
