@@ -73,7 +73,8 @@ def fit(
         accuracy: relative error that is good enough: the cheapest number of pixels and light samples and the cheapest
             precision that keep it are chosen, see `fitting.budget.escalation`; the result's ``choice`` says which and
             why. None looks at all pixels under the lights as they are.
-        seconds: the same for the time to spend; what it buys is the most accurate fit.
+        seconds: the same for the time to spend; what it buys is the most accurate fit. The first attempt is always
+            made, and a number of pixels that is fitted for the first time may take some seconds more to compile.
         mesh: of the devices to spread the pixels over, on one machine or, under `jax.distributed`, on many: each
             process calls this with the same arguments and has the same result. A file is read by bands of rows, of
             which every pass takes those of its own devices. None takes the one device that JAX does.
