@@ -150,7 +150,7 @@ def fit_lights_and_material(
     # Most of a picture is matt, which tells the lights about rightly from any start.
     matt = fit_lights(targets[0], scene, brdf.Lambert(k_a=np.ones(channels), k_d=np.ones(channels)), mask=mask)
     start = np.maximum(matt.emittances, FAINT * matt.emittances[: len(scene.lights)].max(axis=0))
-    start = np.where(before > 0, start, 0)
+    start = np.where(before > 0, start, 0)  # what is stated dark stays dark
     start[len(scene.lights) :] = before[len(scene.lights) :]
     # The first light stays what it is, until the mean of all takes its place.
     free = ["intensity"][: len(scene.lights) - 1]

@@ -94,7 +94,7 @@ def read_mtl(path: Any, text: str) -> dict[str, dict[str, Any]]:
             if name is None:
                 raise InputError(where, f"has {word} before any newmtl", "Start the material with newmtl NAME")
             entries[name][key] = given[-1:] or [word] if key == _TEXTURE else _numbers(where, word, given)
-        if name is not None and (key.startswith("map_") or (key in _OPAQUE and not _is(given[-1:], _OPAQUE[key]))):
+        if name is not None and (key.startswith("map_") or (key in _OPAQUE and not _equals(given[-1:], _OPAQUE[key]))):
             unread = f"{' '.join([word, *given])[:SHOWN]} is not read"
             entries[name]["note"] = "; ".join(filter(None, [entries[name].get("note"), unread]))
     if not entries:
@@ -102,7 +102,7 @@ def read_mtl(path: Any, text: str) -> dict[str, dict[str, Any]]:
     return entries
 
 
-def _is(given: list[str], number: float) -> bool:
+def _equals(given: list[str], number: float) -> bool:
     try:
         return [parse_number(one) for one in given] == [number]
     except ValueError:

@@ -54,7 +54,7 @@ def with_shared_n(problem: MapProblem, labels: Int[np.ndarray, "H W"]) -> MapPro
     surface, size = problem.surface, labels.shape
     if surface.normal is None:
         surface = surface._replace(normal=fit_bands(problem)["normal"])
-        problem = dataclasses.replace(problem, near=True)
+        problem = dataclasses.replace(problem, refine=True)
     names, index = np.unique(labels, return_inverse=True)
     index = index.reshape(size)
 

@@ -63,7 +63,7 @@ HIGHLIGHTS = (4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0)
 GEMAN_MCCLURE = 2.0
 """Where the weight of a residual starts to fall, in deviations."""
 
-ELSEWHERE = (8.0, 32.0, 128.0)
+RESTARTS = (8.0, 32.0, 128.0)
 """Exponents from which minima are sought once more."""
 
 STANDS_OUT = 4.0
@@ -594,13 +594,13 @@ def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Components,
     state = best.fit.log_n, best.normal, best.cost, seen, best.counts.T, best.fit.rival
     log_n, normal, cost, lit, counts, rival = jax.lax.fori_loop(0, 2, again, state)
     if texels.glossy:
-        log_n, normal, least = elsewhere(texels.where(counts), lights, (log_n, normal, cost))
+        log_n, normal, least = restarted(texels.where(counts), lights, (log_n, normal, cost))
         rival = [jnp.where(least < cost, 0, one) for one in rival]
     fit = joint_fit(texels.where(counts).facing(normal, lights), lights, log_n, normal)
     return fit._replace(rival=rival), normal, lit, counts
 
 
-def elsewhere(texels: Texels, lights: Distant, found: tuple[Array, Components, Array]) -> Any:
+def restarted(texels: Texels, lights: Distant, found: tuple[Array, Components, Array]) -> Any:
     """The minimum of material and normal together from other exponents, where a cost stands out of those of the tile.
 
     A start whose normal is some degrees off favours a broad lobe, and Gauss-Newton may stay there.
@@ -616,10 +616,10 @@ def elsewhere(texels: Texels, lights: Distant, found: tuple[Array, Components, A
         some = texels.some(lanes)
 
         def of_exponent(i, best):
-            other = jointly(some, lights, jnp.full_like(old[0], jnp.log(jnp.asarray(ELSEWHERE))[i]), old[1])
+            other = jointly(some, lights, jnp.full_like(old[0], jnp.log(jnp.asarray(RESTARTS))[i]), old[1])
             return jax.tree.map(lambda a, b: jnp.where(other[2] < best[2], b, a), best, other)
 
-        return jax.lax.fori_loop(0, len(ELSEWHERE), of_exponent, old)
+        return jax.lax.fori_loop(0, len(RESTARTS), of_exponent, old)
 
     return of_few(cost > STANDS_OUT * jnp.nanmedian(jnp.where(cost > 0, cost, jnp.nan)), found, better)
 

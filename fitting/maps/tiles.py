@@ -82,7 +82,7 @@ class MapProblem:
         to_view: towards the camera, of any length.
         precision: float32 or float64.
         seek: "layers", or for an n that texels share the "gains" on the grid of n, or the "slope" by log n.
-        near: whether the normals are near those that are sought at an n that texels share.
+        refine: whether the normals are refined at an n that texels share.
     """
 
     photographs: Photographs
@@ -93,7 +93,7 @@ class MapProblem:
     to_view: np.ndarray
     precision: Precision
     seek: str = "layers"
-    near: bool = False
+    refine: bool = False
 
     @property
     def finer(self) -> int:
@@ -134,14 +134,8 @@ class MapProblem:
         """
         given, dtype = self.photographs, np.dtype(self.precision)
         curves = tuple(one.curve for one in given.each)
-        static = (
-            self.models,
-            self.grey,
-            self.finer,
-            self.seek,
-            self.near and self.seek != "gains",
-            (*curves, *curves[-1:] * (-len(curves) % LANES)),
-        )
+        padded = (*curves, *curves[-1:] * (-len(curves) % LANES))
+        static = self.models, self.grey, self.finer, self.seek, self.refine, padded
         with working_precision(self.precision):
             stacks, occluders = (), ()
             if given.scenes is not None:
@@ -176,7 +170,7 @@ def _program(
     grey: bool,
     finer: int,
     seek: str,
-    near: bool,
+    refine: bool,
     curves: tuple[Encoding, ...],
     used: Array,
     values: Array,
@@ -222,7 +216,7 @@ def _program(
                     texels = texels.facing(normal, lights)
                 else:
                     texels = _near(texels, stacks, occluders, ambient, points)
-                layers = _of_normals(texels, mask, normal, rounding, shared, seek, lights if near else None)
+                layers = _of_normals(texels, mask, normal, rounding, shared, seek, lights if refine else None)
             found.append(layers | {"chosen": jnp.full(mask.shape, index, jnp.uint8)})
         layers = functools.reduce(
             lambda a, b: {name: jnp.where(b["criterion"] < a["criterion"], b[name], a[name]) for name in a}, found
@@ -297,29 +291,27 @@ def _of_normals(
     seek: str,
     lights: Distant | None,
 ) -> dict[str, Array]:
-    """What is sought where normals are given, or where they are near, lights those under which they are sought."""
+    """What is sought where normals are given, or are refined under lights."""
     best = texels.unshadowed()
     counts = best.counts.T
     some = texels.where(counts)
     if seek == "gains":
         return {"sums": jnp.where(mask, some.gains(), 0)}
+    if lights is not None:
+        normal = jointly(some, lights, shared[:, 0], normal, n_known=True)[1]
+        texels = texels.facing(normal, lights)
+        some = texels.where(counts)
+    fit = some.at if lights is None else functools.partial(joint_fit, some, lights, normal=normal)
     if seek == "slope":
-        point = some.at(shared[:, 0], errors=False)
-        if lights is not None:
-            normal = jointly(some, lights, shared[:, 0], normal, n_known=True)[1]
-            point = joint_fit(some.facing(normal, lights), lights, shared[:, 0], normal, errors=False)
+        point = fit(log_n=shared[:, 0], errors=False)
         freedom = best.freedom - len(point.error[1:])  # of angles
         left = [point.slope[0], divide(1.0, point.error[0] ** 2), point.cost, jnp.maximum(freedom, 0)]
         return {"sums": jnp.where(mask, jnp.stack(left), 0)}
     if shared is None:
         return _layers(texels, best.fit, texels.seen, counts, mask, normal, rounding)
     log_n, error = shared.T
-    if lights is None:
-        return _layers(texels, some.at(log_n, n_known=True), texels.seen, counts, mask, normal, rounding, error)
-    normal = jointly(some, lights, log_n, normal, n_known=True)[1]
-    texels = texels.facing(normal, lights)
-    fit = joint_fit(texels.where(counts), lights, log_n, normal, n_known=True)
-    return _layers(texels, fit, texels.seen, counts, mask, normal, rounding, error)
+    found = fit(log_n=log_n, n_known=True)
+    return _layers(texels, found, texels.seen, counts, mask, normal, rounding, error)
 
 
 def _layers(

@@ -20,7 +20,7 @@ _MOST_CORRECTIONS = 8
 TOLERANCE_SINGLE = 2e-7
 TOLERANCE_DOUBLE = 1e-14
 # What it leaves of a cost, over that: the squares of some hundred thousand pixels were off by 4e-7.
-SUMMED = 10.0
+COST_ROUNDING = 10.0
 
 Cap = Callable[[float], Float[np.ndarray, "3 C"]]
 """From the exponent to what x_a, x_d, x_s count in a sum that may not exceed 1, channel by channel."""
@@ -223,7 +223,7 @@ def gauss_newton(problem: Problem, point: Point, reach: float = math.inf) -> tup
         solved = solve_linear(several, np.array([point.log_n]), reference, problem)
         parts, here = Sums(*(leaf[0] for leaf in several)), Point(*(leaf[0] for leaf in solved))
         cost = np.sum(here.cost)
-        if cost - last > SUMMED * problem.tolerance * last:
+        if cost - last > COST_ROUNDING * problem.tolerance * last:
             share = np.clip(-slope / (2 * (cost - last - slope)), 0.1, 0.5)
             slope *= share
             point = Point(*(old + share * (new - old) for old, new in zip(held, here, strict=True)))
