@@ -5,8 +5,10 @@ BIN := $(VENV)/bin
 EXAMPLE := data/gold-ball
 # The compiler is most of the tests' time, and takes a third of its own with these. What they leave out these tests run
 # through: fits of what other programs and closed forms draw, sums, searches, the bundled example.
-LIGHTLY_COMPILED := --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 \
-	--xla_llvm_disable_expensive_passes=true --xla_cpu_parallel_codegen_split_count=1
+LIGHTLY_COMPILED = $(OLD_EMITTERS) --xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true \
+	--xla_cpu_parallel_codegen_split_count=1
+# From 0.11 on XLA has no others than the fusion emitters, and ends Python where it is asked to do without.
+OLD_EMITTERS = $(shell $(BIN)/python -c 'import jax; print("--xla_cpu_use_fusion_emitters=false" * (jax.__version_info__ < (0, 11)))')
 # The longest test stands first, or one core would wait for it.
 COMPILED_AS_FOR_USERS := tests/project/test_bundled_examples.py tests/project/test_sound_jax.py tests/interop \
 	tests/brdf/plausibility/test_plausibility.py tests/fitting/solver tests/fitting/test_fit.py \

@@ -24,8 +24,8 @@ from brdf.vectors import norm, normalize, perpendicular
 NAMED = re.compile(r"(light|intensity|ball|radius)(?: (\d+))?(?: of picture (\d+))?")
 # What freed leaves may not go below 0.
 NOT_NEGATIVE = ("k_a", "k_d", "k_s", "intensity", "radiance", "ambient", "attenuation")
-# Derivatives of the renderer are as fast without, and compiled in half the time.
-QUICKLY_COMPILED: Any = {"xla_cpu_use_fusion_emitters": False}
+# Derivatives of the renderer are as fast without, and compiled in half the time. From 0.11 on XLA has no such option.
+QUICKLY_COMPILED: Any = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11) else {}
 # Values (P, C), and weights (P,) or (P, C), or None where each pixel weighs 1.
 Picture = tuple[Array, Array | None]
 
