@@ -36,7 +36,7 @@ docs: export XLA_FLAGS := $(if $(LIGHTLY),$(LIGHTLY_COMPILED),$(XLA_FLAGS))
 docs: $(VENV)/installed-docs
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going -q -b html -d out/docs-cache docs out/docs
 
-# The wheel, built and used where nothing else of the project is: in an empty environment, outside of this folder. Three
+# The wheel, built and used where nothing else of the project is: in an empty environment, outside of this folder. Four
 # programs need byte code of a small part of it.
 wheel: $(VENV)/installed
 	rm -rf out/wheel && mkdir -p out/wheel
@@ -45,6 +45,8 @@ wheel: $(VENV)/installed
 	out/wheel/venv/bin/python -m pip install --no-compile --quiet --disable-pip-version-check -c constraints.txt out/wheel/*.whl
 	cd out/wheel && venv/bin/brdf fit ../../$(EXAMPLE) --model blinn-phong --out fit && venv/bin/brdf render fit -o again.exr
 	cd out/wheel && venv/bin/python -c "import brdf, fitting; print(brdf.__version__, fitting.load_result('fit')['n'])"
+	cd out/wheel && venv/bin/python -c "import sys, jax, numpy, fitting; print(sys.version, jax.__version__, numpy.__version__, \
+		fitting.sensitivity(fitting.load_result('fit'), lambda scenes: [scenes[0].lights[0].direction])[0].n)"
 
 lab: $(VENV)/installed-lab
 	JUPYTER_CONFIG_PATH=$(CURDIR)/$(VENV)/lab $(BIN)/jupyter lab notebooks
