@@ -24,6 +24,10 @@ UNSOUND = {
 """Versions of jaxlib that are not to be computed with, and why; pyproject.toml excludes them too."""
 
 
+WIDE = 80
+"""An accelerator takes so many times the values that a processor takes at a time."""
+
+
 def warn_of_unsound(version: str) -> None:
     """Warn where a version of jaxlib is known to compute wrongly.
 
@@ -77,6 +81,20 @@ def cast(tree: Any, precision: Precision | None) -> Any:
 
     with working_precision(precision):  # float64 stays what it is outside of it
         return jax.device_put(jax.tree.map(leaf, tree))
+
+
+def on_accelerator() -> bool:
+    """Whether JAX computes on a GPU or TPU."""
+    return jax.default_backend() != "cpu"
+
+
+def at_a_time(count: int) -> int:
+    """How many values a program takes at a time: what a processor's cache holds, or `WIDE` times as many.
+
+    Args:
+        count: of a processor.
+    """
+    return WIDE * count if on_accelerator() else count
 
 
 @typing.dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field,))

@@ -20,7 +20,7 @@ import brdf
 from brdf.errors import InputError
 from brdf.geometry.rays import Sight
 from brdf.models.base import SpecularMaterial
-from brdf.precision import Precision
+from brdf.precision import Precision, at_a_time
 from fitting.codes import open_ends
 from fitting.light_colour import take_colour_out
 from fitting.likelihood import Bounds, over_channels
@@ -311,7 +311,7 @@ def _bands(
             values = pixels[first:last].reshape(-1, channels)
         return _Band(slice(first, last), values, points, allowed)
 
-    rows = max(TILE_PIXELS // width, ALIGNED_ROWS if target.streamed else 1)
+    rows = max(at_a_time(TILE_PIXELS) // width, ALIGNED_ROWS if target.streamed else 1)
     rows = min(rows, -(-height // device_count()))
     if at_once or has_pixel_areas(scene) or rows >= height:
         whole = band(0, height)

@@ -25,7 +25,7 @@ import numpy as np
 from jax import Array
 
 from brdf.models.base import SpecularMaterial
-from brdf.precision import apart
+from brdf.precision import apart, at_a_time
 from brdf.vectors import Components, divide, dot, largest, mirror_log_cosine, normalize, perpendicular, square_root
 from fitting.solver.normal_equations import totals
 
@@ -453,7 +453,7 @@ def of_few(left: Array, best: Any, better: Callable[[Array, Any], Any]) -> Any:
 
     def step(state):
         left, best = state
-        lanes = jnp.nonzero(left, size=min(FEW, left.size), fill_value=left.size - 1)[0]
+        lanes = jnp.nonzero(left, size=min(at_a_time(FEW), left.size), fill_value=left.size - 1)[0]
         new = better(lanes, jax.tree.map(lambda one: one[..., lanes], best))
         return left.at[lanes].set(False), jax.tree.map(lambda a, b: a.at[..., lanes].set(b), best, new)
 

@@ -16,7 +16,7 @@ from brdf.images.encoding import Encoding
 from brdf.lights.base import Lighting, LightStack, stacked
 from brdf.lobes import OneOf, light_terms
 from brdf.models.base import SpecularMaterial
-from brdf.precision import Precision, apart, working_precision
+from brdf.precision import Precision, apart, at_a_time, working_precision
 from brdf.vectors import Components, divide, normalize, square_root
 from fitting.likelihood import encoded_and_slope
 from fitting.maps.map_inputs import Photographs, places
@@ -41,7 +41,7 @@ TILE = 432
 """Texels that go through the program in step: what they need stays in the processor's cache."""
 
 CHUNK = 16
-"""Tiles that a program goes through: one serves maps of all sizes."""
+"""Tiles that a processor's program goes through: one serves maps of all sizes."""
 
 LANES = 8
 """Photographs are as many as a multiple of this: what is left over a processor would take one by one."""
@@ -51,6 +51,11 @@ RING = 0.15
 
 LEAST_HIGHLIGHT = 2.0
 """k_s is seen where it exceeds so many of its standard errors."""
+
+
+def tiles_of_program(tile: int) -> int:
+    """How many tiles of so many texels a program goes through."""
+    return max(1, CHUNK * TILE // tile)
 
 
 class Surface(NamedTuple):
@@ -112,16 +117,18 @@ class MapProblem:
 
     def tiles(self, texels: Int[np.ndarray, " K"]) -> tuple[np.ndarray, Surface]:
         """What some texels show, (N, P, TILE, C), and see, (N, TILE, ...); one lane at least is left over."""
-        size = -(-(texels.size + 1) // (CHUNK * TILE)) * CHUNK * TILE
+        tile = at_a_time(TILE)
+        most = tile * tiles_of_program(tile)
+        size = -(-(texels.size + 1) // most) * most
 
         def cut(leaf: Any) -> np.ndarray:
             leaf = np.asarray(leaf)
             part = leaf.reshape(-1, *leaf.shape[2:])[places(texels)]
             found = np.zeros((size, *part.shape[1:]), self.precision if part.dtype.kind == "f" else part.dtype)
             found[: len(part)] = part
-            return found.reshape(-1, TILE, *part.shape[1:])
+            return found.reshape(-1, tile, *part.shape[1:])
 
-        values = self.photographs.tiles(texels, (size // TILE, TILE), LANES, self.precision)
+        values = self.photographs.tiles(texels, (size // tile, tile), LANES, self.precision)
         return values, jax.tree.map(cut, self.surface)
 
     def fit(self, values: np.ndarray, surface: Surface, band: int = 0) -> dict[str, np.ndarray]:
@@ -150,10 +157,10 @@ class MapProblem:
             of_photographs = [_padded(one, np).astype(dtype) for one in of_photographs]
             more = dtype.type(rounding), view.astype(dtype), stacks, occluders
             # All tiles that hold a texel, and the first lane that holds none.
-            used = np.arange(len(values)) <= np.count_nonzero(surface.mask) // TILE
-            found = []
-            for first in range(0, len(values), CHUNK):
-                part = jax.tree.map(operator.itemgetter(slice(first, first + CHUNK)), (used, values, surface))
+            used = np.arange(len(values)) <= np.count_nonzero(surface.mask) // values.shape[2]
+            found, some = [], tiles_of_program(values.shape[2])
+            for first in range(0, len(values), some):
+                part = jax.tree.map(operator.itemgetter(slice(first, first + some)), (used, values, surface))
                 part = placed(band, part)
                 found.append(_program(*static, *part, of_photographs, *more))
             return {name: np.concatenate([np.asarray(layers[name]) for layers in found]) for name in found[0]}

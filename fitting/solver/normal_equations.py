@@ -30,6 +30,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from brdf.lobes import Lobe
+from brdf.precision import at_a_time, on_accelerator
 from fitting.likelihood import AnyArray, Bounds, over_channels
 from fitting.solver.devices import device_count, gathered, own, placed
 
@@ -245,6 +246,9 @@ def totals(terms: Sequence[Any], combine: Sequence[str], axes: tuple[int, ...]) 
         for place, axis in enumerate(axes):
             found = [getattr(np, how).reduce(one, axis - place) for how, one in zip(combine, found, strict=True)]
         return found
+    if on_accelerator() and len(terms) > 1:
+        # What many sums share of a GPU is more than it has; it takes together what it can.
+        return [totals([one], [how], axes)[0] for one, how in zip(terms, combine, strict=True)]
     start = tuple(
         np.full((), 0 if how == "add" else -np.inf, one.dtype) for how, one in zip(combine, terms, strict=True)
     )
@@ -271,7 +275,7 @@ def _pass(picture: Picture, log_n: Array, count: Array, reference: Array, peak: 
         they share basis and weight, else one of them. And (exponents, blocks, 3, groups).
     """
     pixels, channels = picture.target.shape
-    dtype, blocks = picture.target.dtype, max(1, -(-pixels // BLOCK))
+    dtype, blocks = picture.target.dtype, max(1, -(-pixels // at_a_time(BLOCK)))
     size = -(-pixels // blocks)
     shared = picture.diffuse.shape[1] == picture.weights.shape[1] == 1 and channels <= UNROLLED_CHANNELS
     groups = 1 if shared else channels

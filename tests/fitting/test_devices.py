@@ -1,5 +1,6 @@
 """Fits over several devices, and over two processes, give the numbers of one; a process that dies is told."""
 
+import dataclasses
 import os
 import socket
 import subprocess
@@ -11,7 +12,7 @@ import jax
 import numpy as np
 import pytest
 from project_paths import ROOT
-from small_ball import ball_scene, pictured
+from small_ball import CAMERA, ball_scene, pictured
 
 import brdf
 import fitting
@@ -57,7 +58,7 @@ def run_two(folder: Path, how: str) -> list[tuple[int, str]]:
 def test_two_devices_of_one_process(tmp_path):
     program = (
         "import jax, numpy as np, test_devices as t, fitting\n"
-        "from small_ball import ball_scene, pictured\n"
+        "from small_ball import CAMERA, ball_scene, pictured\n"
         "mesh = jax.make_mesh((2,), ('pixels',))\n"
         "one = pictured(t.MATERIAL, ball_scene(), 0.01)\n"
         "fit = fitting.fit(one, ball_scene(), model='blinn-phong', precision='float64', mesh=mesh)\n"
@@ -69,6 +70,25 @@ def test_two_devices_of_one_process(tmp_path):
     subprocess.run([sys.executable, "-c", program], env=environment, cwd=tmp_path, check=True, timeout=300)
     with np.load(tmp_path / "numbers.npz") as found:
         np.testing.assert_allclose(found["numbers"], expected(), rtol=1e-12)
+
+
+def test_what_an_accelerator_takes_at_a_time_gives_the_same(monkeypatch):
+    scene = ball_scene(camera=dataclasses.replace(CAMERA, resolution=(550, 530)))
+    picture = pictured(MATERIAL, scene, 0.01)
+    lights = np.random.default_rng(0).normal([0, 0, 1], 0.5, (16, 3))
+    normals = np.broadcast_to([0.1, 0.0, 1.0], (30, 40, 3))
+    values = np.maximum(normals @ (lights / np.linalg.norm(lights, axis=1)[:, None]).T, 0).transpose(2, 0, 1)[..., None]
+    values = values * [0.5, 0.4, 0.3] + np.random.default_rng(1).normal(0, 0.01, (16, 30, 40, 3))
+
+    def found():
+        fit = fitting.fit(picture, scene, model="blinn-phong", precision="float64")
+        return numbers(fit), fitting.fit_maps(values, lights, normals, model="lambert").k_d
+
+    on_processor = found()
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(brdf.precision, "WIDE", 2)
+    for one, other in zip(found(), on_processor, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-6)
 
 
 def test_two_processes(tmp_path):
