@@ -81,6 +81,15 @@ class Codes(NamedTuple):
         share = self.ends[1] / self.scale
         return float(decode(np.array(share), self.encoding) * np.max(self.unit)) if np.isfinite(share) else np.inf
 
+    @property
+    def widest_step(self) -> float:
+        """Largest distance of the two ends of a linear value."""
+        ends = (
+            decode(np.maximum(end, 0) / self.scale, self.encoding)
+            for end in (self.values - self.below, self.values + self.above)
+        )
+        return float(np.nanmax(np.abs(np.subtract(*ends)) * self.unit))
+
     def middle(self, pixels: Float[np.ndarray, "H W C"]) -> Float[np.ndarray, "H W C"]:
         """Linear values where they most likely lay: those of a writer that truncated half a step above their codes.
 

@@ -10,7 +10,6 @@ import brdf
 from brdf.images.encoding import decode, encode
 from fitting.model_fit import ModelFit
 from fitting.pixels import FLAT, Observed
-from fitting.solver.devices import device_count
 from fitting.solver.normal_equations import Picture
 from fitting.uncertainty.structure import CHANCE, SIZES, Errors, over_blocks, shared
 
@@ -72,7 +71,7 @@ def doubts(
                 "light and shape explain nothing of what varies in the picture, which may be noise: is it a picture of "
                 "this scene, and neither mirrored nor shifted?"
             )
-    plain = len(floats) == len(observed.problem.targets) and device_count() == 1 and brightest <= 1
+    plain = len(floats) == len(observed.problem.targets) and brightest <= 1
     if structure and plain and _is_encoded(fit, observed, refit):
         yield (
             "the picture looks sRGB-encoded: decoded, the model explains it far better. "

@@ -5,6 +5,7 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 from jax.sharding import Mesh
 
 import brdf
@@ -15,6 +16,7 @@ from fitting.budget.escalation import fit_within
 from fitting.budget.light_samples import with_enough_samples
 from fitting.codes import Rounding
 from fitting.core import fit_pictures
+from fitting.pixels import in_memory
 from fitting.problem import state_problem
 from fitting.progress import waiting
 from fitting.report import FitResult
@@ -47,7 +49,8 @@ def fit(
     Args:
         target: the path of a picture, a `brdf.Picture`, or an array (H, W, C) or (H, W): linear values, or codes of
             8 or 16 bits; a `brdf.ImageReader` for a file that is larger than memory, which is read by bands of rows,
-            several times, and fitted by least squares; or a list.
+            several times, and fitted by least squares, or where codes are coarser than the noise to every so many rows
+            and columns, up to 1024 each; or a list.
         scene: what the picture shows; a list of as many where there are several pictures.
         model: "auto" for the simplest adequate of Lambert, Phong and Blinn-Phong, or a model: its class or its
             name.
@@ -115,6 +118,11 @@ def fit(
             problem = with_enough_samples(problem)
             with spread_over(mesh):
                 result = fit_pictures(problem)
+                if problem.streamed and problem.loss == "squared" and dark is None:
+                    some = in_memory(problem)
+                    steps = [target.codes.widest_step for target in some.targets if target.codes is not None]
+                    if np.min(result.noise) < max(steps, default=0.0):
+                        result = fit_pictures(with_enough_samples(some))
             return dataclasses.replace(result, seconds=time.perf_counter() - start)
     if mesh is not None:
         raise InputError(

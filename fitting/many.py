@@ -11,7 +11,6 @@ that show signs of it are fitted by `fitting.fit`, one by one.
 import dataclasses
 import functools
 import math
-import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -36,7 +35,7 @@ from fitting.pixels import SYMMETRIC_PIXELS
 from fitting.problem import TOP, FitProblem, state_problem
 from fitting.progress import waiting
 from fitting.report import FitResult
-from fitting.solver.devices import device_count, gathered, own, placed, spread_over
+from fitting.solver.devices import core_count, device_count, gathered, own, placed, spread_over
 
 # So many pictures at a time: their columns stay in the processor's cache.
 BATCH = 16
@@ -195,7 +194,7 @@ def _fit_together(problem: FitProblem) -> tuple[Bool[np.ndarray, " N"], dict[str
         weight = seen.reshape(count, -1).astype(targets.dtype)
         pictures = {"target": targets, "images": _bases(model, stack), "weight": weight, "ambient": stack.ambient}
         shared = {}
-    lanes, cores = device_count(), os.cpu_count() or 1
+    lanes, cores = device_count(), core_count()
     # Equal parts, or each size would be compiled.
     lanes = cores if lanes == 1 and count % (cores * BATCH) == 0 else min(lanes, count)
     mine = own(lanes)

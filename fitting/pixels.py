@@ -4,6 +4,7 @@ A large picture is taken a band of rows at a time: what its pixels see takes thr
 what the solver needs of that a third of it. A picture in a file is not even kept itself: `fitting.solver.streams`.
 """
 
+import dataclasses
 import functools
 import itertools
 from collections import Counter
@@ -24,7 +25,7 @@ from brdf.precision import Precision, at_a_time
 from fitting.codes import open_ends
 from fitting.light_colour import take_colour_out
 from fitting.likelihood import Bounds, over_channels
-from fitting.problem import TOP, FitProblem, Target, has_pixel_areas
+from fitting.problem import TOP, FitProblem, Target, as_target, has_pixel_areas
 from fitting.solver.devices import device_count
 from fitting.solver.normal_equations import COMPILER_OPTIONS, FEW_VALUES, totals
 from fitting.solver.streams import Stream, each, joined
@@ -215,8 +216,7 @@ def _observe(
     bands = _bands(target, grey, dtype, mask, at_once or noise is not None)
     level = target.saturation if problem.saturation is None else problem.saturation
     # Other losses, dark levels and steps of 0 are ways of one's own to say what pixels say.
-    plain = dark is None and problem.loss == "squared" and not target.least_squares
-    plain = plain and not target.streamed and device_count() == 1
+    plain = dark is None and problem.loss == "squared" and not target.least_squares and not target.streamed
     # Where one channel is clipped the others say what they say.
     apart = plain and target.pixels.shape[2] > 1
     found, total = _statistics(bands, level, dark, apart=apart, keep=not target.streamed)
@@ -431,6 +431,32 @@ def _shown(
     shown, counted = (np.concatenate(part) for part in zip(*parts, strict=True))
     pixel = np.arange(0, height, stride)[:, None] * width + np.arange(0, width, stride)
     return shown, brdf.some_pixels(scene, pixel, precision=precision), counted, stride
+
+
+def in_memory(problem: FitProblem) -> FitProblem:
+    """With some pixels, evenly spread, of the pictures that are read by bands.
+
+    Args:
+        problem: any.
+    """
+
+    def some(target: Target, scene: brdf.Scene, *of_pixels: Any) -> tuple[Any, ...]:
+        if not target.streamed:
+            return target, scene, *of_pixels
+        height, width, _ = target.pixels.shape
+        stride = -(-max(width, height) // SHOWN_PIXELS)
+        bands = [(first, min(first + ALIGNED_ROWS, height)) for first in range(0, height, ALIGNED_ROWS)]
+        values = [target.pixels.rows(*band)[-band[0] % stride :: stride, ::stride] for band in bands]
+        pixel = np.arange(0, height, stride)[:, None] * width + np.arange(0, width, stride)
+        picture = target.pixels.picture(np.concatenate(values))
+        # Pixels of a block of a JPEG are known by their neighbours.
+        picture = picture if stride == 1 else dataclasses.replace(picture, jpeg=None)
+        thinned = [None if one is None else one[::stride, ::stride] for one in of_pixels]
+        return as_target(picture), brdf.some_pixels(scene, pixel, precision=problem.precision), *thinned
+
+    parts = zip(problem.targets, problem.scenes, problem.masks, problem.weights, strict=True)
+    targets, scenes, masks, weights = map(list, zip(*(some(*one) for one in parts), strict=True))
+    return dataclasses.replace(problem, targets=targets, scenes=scenes, masks=masks, weights=weights, shown=None)
 
 
 @functools.partial(jax.jit, static_argnums=2)

@@ -205,6 +205,15 @@ class ImageReader(contextlib.AbstractContextManager):
         check_memory(self.path, int(np.prod(self.shape)))
         return self.rows(0, self.shape[0])
 
+    def picture(self, pixels: Float32[np.ndarray, "H W C"]) -> Picture:
+        """Pixels of the file, with what it tells about them.
+
+        Args:
+            pixels: as `rows` gives them.
+        """
+        about = {name: getattr(self, name) for name in ("encoding", "source", "bits", "path", "lossy", "jpeg")}
+        return Picture(pixels, None, saturation=self.codes[0], **about)
+
     def read_alpha(self) -> Float32[np.ndarray, "height width"] | None:
         """The whole alpha channel, None if there is none."""
         if self._alpha is None:
@@ -373,8 +382,7 @@ def read_picture(path: AnyPath, *, encoding: Encoding | None = None) -> Picture:
         ('srgb', 8, 1.0)
     """
     with ImageReader(path, encoding=encoding) as reader:
-        about = {name: getattr(reader, name) for name in ("encoding", "source", "bits", "path", "lossy", "jpeg")}
-        return Picture(reader.read(), reader.read_alpha(), saturation=reader.codes[0], **about)
+        return dataclasses.replace(reader.picture(reader.read()), alpha=reader.read_alpha())
 
 
 def read_mask(path: AnyPath) -> Bool[np.ndarray, "height width"]:

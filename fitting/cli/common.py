@@ -193,12 +193,14 @@ def all_devices(devices: str | None) -> Any:
         return None
     if devices != "all":
         raise InputError("--devices", f"must be all, got {devices!r}", "Write --devices all, or leave it out")
+    import jax
+
+    from fitting.solver.devices import core_count
+
     flags = os.environ.get("XLA_FLAGS", "")
     if "xla_force_host_platform_device_count" not in flags:
         # Of the host platform alone: where there is an accelerator it is that that is taken.
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        os.environ["XLA_FLAGS"] = f"{flags} --xla_force_host_platform_device_count={cores}".strip()
-    import jax
+        os.environ["XLA_FLAGS"] = f"{flags} --xla_force_host_platform_device_count={core_count()}".strip()
 
     if any(int(os.environ.get(name, "1")) > 1 for name in PROCESSES) and not jax.distributed.is_initialized():
         jax.config.update("jax_cpu_collectives_implementation", "gloo")

@@ -1,6 +1,5 @@
 """Maps by bands of texels: read, fitted and kept one after the other, on all cores, devices and processes."""
 
-import os
 import threading
 import zipfile
 import zlib
@@ -15,7 +14,7 @@ from brdf.files import atomic_path
 from fitting.maps.map_inputs import fingerprint, places
 from fitting.maps.tiles import CHUNK, TILE, MapProblem
 from fitting.progress import waiting
-from fitting.solver.devices import device_count, gathered, own
+from fitting.solver.devices import core_count, device_count, gathered, own
 
 BAND = 10 * CHUNK * TILE - 1
 """Texels that are read and laid out at a time; a lane is left over."""
@@ -64,7 +63,7 @@ def fit_bands(problem: MapProblem, keep: Path | None = None) -> dict[str, np.nda
                     layers[name][:] = values[bands[index].size]
             layers[name][places(bands[index])] = values[: bands[index].size]
 
-    with waiting("fitting maps") as say, ThreadPoolExecutor(os.cpu_count()) as pool:
+    with waiting("fitting maps") as say, ThreadPoolExecutor(core_count()) as pool:
         for done, (index, (found, path)) in enumerate(zip(mine, pool.map(band, mine), strict=True), start=1):
             place(index, found)
             if path is not None:

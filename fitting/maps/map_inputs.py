@@ -269,9 +269,11 @@ def normal_map(given: Any, *, flip_y: bool = False) -> Float[np.ndarray, "H W 3"
 
 
 def _looks_coded(normal: np.ndarray) -> bool:
+    if np.any(normal < 0):
+        return False
     there = normal[np.all(np.isfinite(normal), axis=-1) & np.any(normal != 0, axis=-1)].astype(float)
     plain, decoded = (np.median(np.abs(np.sum(n * n, axis=-1) - 1)) if n.size else 0.0 for n in (there, 2 * there - 1))
-    return bool(np.all(there >= 0) and decoded < 0.05 < plain)
+    return bool(decoded < 0.05 < plain)
 
 
 def photographs(

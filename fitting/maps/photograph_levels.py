@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from fitting.maps.map_inputs import Photograph, places
 from fitting.maps.tiles import MapProblem
 from fitting.pixels import DOUBLE, SYMMETRIC_PIXELS
 from fitting.problem import TOP
+from fitting.solver.devices import core_count
 
 SPIKE = 4
 """Values are clipped where so many times those just below them share the largest."""
@@ -47,7 +49,8 @@ def with_levels(problem: MapProblem, saturation: Any = None) -> tuple[MapProblem
     given, texels = problem.photographs, places(problem.texels)
     each, notes = given.each, ()
     brightest = [functools.partial(_brightest, one, texels) for one in each]
-    largest = np.array([_two_largest(read()) for read in brightest])
+    with ThreadPoolExecutor(core_count()) as pool:
+        largest = np.array(list(pool.map(lambda read: _two_largest(read()), brightest)))
     top, size = float(np.max(largest)), float(np.max(largest[:, 0] / np.mean(given.unit, axis=1)))
     if saturation is not None:
         value = as_numbers("saturation", saturation)

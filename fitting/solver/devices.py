@@ -6,6 +6,7 @@ and comes to the same result; the sums are added in the order of the tiles, whic
 """
 
 import contextlib
+import os
 from collections.abc import Iterator
 from contextvars import ContextVar
 from typing import Any
@@ -37,6 +38,11 @@ def spread_over(mesh: Any) -> Iterator[None]:
         yield
     finally:
         _MESH.reset(token)
+
+
+def core_count() -> int:
+    """How many cores this process may use: a scheduler may have given it some of the machine's."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def device_count() -> int:

@@ -14,7 +14,6 @@ from fitting.light_colour import coefficient_factors
 from fitting.model_fit import N_RANGE, Evidence, ModelFit
 from fitting.pixels import Observed
 from fitting.result import HELD_PLAUSIBLE, FitResult, Parameter
-from fitting.solver.devices import device_count
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
 from fitting.solver.tied import design_of
@@ -103,7 +102,7 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: R
             gain = max(gain, specular_gain(joined, optimum.x))
     else:
         # Where weights are no inverse variances nothing is told of what else makes noise uneven.
-        asked = weighed and observed.problem.loss == "squared" and device_count() == 1
+        asked = weighed and observed.problem.loss == "squared"
         uneven = misweighted_sums(pictures, optimum) if asked else None
         growing = statistics.growing_noise(noise, rounding) if uneven is None else None
         once = observed.copies or channels is not None
@@ -263,7 +262,7 @@ def _structure(
 ) -> Structure | None:
     """That of a fit by least squares; None where it cannot be told, or weights are part of what is fitted."""
     tell = noise > 2 * rounding
-    if device_count() > 1 or observed.problem.loss != "squared" or not tell.any():
+    if observed.problem.loss != "squared" or not tell.any():
         return None
     some = np.flatnonzero(tell)[: 1 if once else None]
     missed /= float(np.sqrt(np.mean(noise[some] ** 2)))

@@ -109,6 +109,22 @@ def test_one_model_at_a_time_is_in_memory(monkeypatch, true):
     same(cut, whole)
 
 
+@pytest.mark.parametrize(("most", "name"), [(1024, "linear.png"), (30, "linear.png"), (30, "half.exr")])
+def test_codes_coarser_than_noise_are_fitted_as_codes(tmp_path: Path, monkeypatch, most: int, name: str):
+    """By least squares coefficients were up to 80 of their errors off."""
+    monkeypatch.setattr(pixels, "SHOWN_PIXELS", most)
+    clean = np.asarray(brdf.render(MATERIAL, scene(), precision="float64"))
+    kind: Any = "uint8" if name.endswith("png") else "half"
+    brdf.write_image(tmp_path / name, clean, dtype=kind, encoding="linear")
+    with brdf.ImageReader(tmp_path / name, encoding="linear") as reader:
+        found = fitting.fit(reader, scene(), model="blinn-phong")
+    whole = fitting.fit(brdf.read_picture(tmp_path / name, encoding="linear"), scene(), model="blinn-phong")
+    for one, other in zip(found.parameters, whole.parameters, strict=True):
+        truth = np.ravel(getattr(MATERIAL, one.name))[one.channel or 0]
+        assert abs(float(one) - truth) < 4 * one.error
+        assert one.error == pytest.approx(other.error, rel=1e-3) if most > 60 else 1 < one.error / other.error < 40
+
+
 def test_bands_share_their_programs():
     """Or the first fit of a picture of 64 bands would compile each of them."""
     programs: tuple[Any, ...] = lobes.diffuse_and_kept, rays.PrimaryRays.__dict__["mask"].func
