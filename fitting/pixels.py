@@ -33,6 +33,8 @@ from fitting.solver.streams import Stream, each, joined
 # How many pixels are taken together; of a file at least as many rows as its blocks hold, or these are read twice.
 TILE_PIXELS = 1 << 18
 ALIGNED_ROWS = 64
+# Pictures of no more pixels are not cut into tiles, whose geometry is made anew for each pass over them.
+KEPT_PIXELS = 1 << 22
 # Largest value, and inverse of the least, of a picture in single precision: squares of it, of rounding errors a million
 # times smaller, and sums over millions of pixels have to stay in its range of 1e-38 to 3e38; double precision reaches
 # far beyond what a file can hold.
@@ -312,6 +314,7 @@ def _bands(
         return _Band(slice(first, last), values, points, allowed)
 
     rows = max(at_a_time(TILE_PIXELS) // width, ALIGNED_ROWS if target.streamed else 1)
+    rows = height if height * width <= KEPT_PIXELS and not target.streamed else rows
     rows = min(rows, -(-height // device_count()))
     if at_once or has_pixel_areas(scene) or rows >= height:
         whole = band(0, height)

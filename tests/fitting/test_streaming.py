@@ -43,6 +43,7 @@ def picture(noise: float = 0.01) -> np.ndarray:
 def small_bands(monkeypatch):
     """Five bands of one size."""
     monkeypatch.setattr(pixels, "TILE_PIXELS", 12 * SIZE[0] + 5)
+    monkeypatch.setattr(pixels, "KEPT_PIXELS", 0)
     monkeypatch.setattr(pixels, "ALIGNED_ROWS", 12)
 
 

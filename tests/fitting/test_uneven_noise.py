@@ -69,6 +69,7 @@ def test_bands_of_a_picture_have_its_noise_and_some_see_nothing(codes, monkeypat
     pictures = drawn((0.001, 0.02), 0, codes=codes)
     whole = fitting.fit(pictures, SCENES, model="blinn-phong")
     monkeypatch.setattr(fitting.pixels, "TILE_PIXELS", 96)
+    monkeypatch.setattr(fitting.pixels, "KEPT_PIXELS", 0)
     bands = fitting.fit(pictures, SCENES, model="blinn-phong")
     for one, other in zip(whole.parameters, bands.parameters, strict=True):
         assert abs(one.value - other.value) < 0.3 * one.error
