@@ -2,16 +2,19 @@
 
 A patch dA of radiance L at distance d, seen at the angle θ' to its normal, is a sample of intensity
 I = L cosθ' dA / (π d²). The samples are the nodes of product rules over that part of the light which stands above the
-horizon of the surface point, so that what is left to integrate is smooth also where the light is setting.
+horizon of the surface point, so that what is left to integrate is smooth also where the light is setting; over flat
+lights they are spread by the angles at which the point sees them, so that it is smooth too however near the light is.
 
 Rectangles and polygons shine from their front only and are invisible; lights cast no shadows.
 
-How many samples, S. For lights at a distance of twice their size, above the horizon, the error of the irradiance falls
-exponentially in √S: for a rectangle 4e-5 with S = 9, 1e-6 with 16, 1e-9 with 36; a sphere's is exact. Where a light is
-setting, a bend is left, and the largest error over a ball falls like S^-1.5 to S^-2: 3e-5, 1e-4 and 2e-4 of the
-brightest point with S = 64 for rectangle, polygon and sphere. A lobe asks for nodes closer than its width and then
-converges exponentially too: at n = 30, S = 16 leaves 2e-5 for a rectangle, 2e-3 for a polygon, 1e-6 for a sphere; at
-n = 1000, S = 64 leaves 1e-3, 2e-2 and 3e-3, S = 256 less than 1e-5 for each, and S = 16 shows the single samples
+How many samples, S. Above the horizon the error of the irradiance falls exponentially in √S, for lights at a distance
+of twice their size fast: for a rectangle 4e-6 with S = 9, 2e-8 with 16, 1e-12 with 36; S = 64 leaves 3e-7 at half
+their size and 2e-4 however near they are (a polygon of two triangles 1e-4 and 4e-3); a sphere's is exact. Where a
+light is setting, a bend is left, and the largest error over a ball falls like S^-1.5 to S^-2: 3e-5, 1e-4 and 2e-4 of
+the brightest point with S = 64 for rectangle, polygon and sphere. A lobe asks for nodes closer than its width and
+then converges exponentially too: at n = 30, S = 16 leaves 3e-6 for a rectangle, 9e-4 for a polygon, 1e-6 for a
+sphere; at n = 1000, S = 64 leaves 1e-3, 3e-2 and 3e-3, S = 256 less than 5e-5 for each, and S = 16 shows the single
+samples
 (``python -m benchmarks.light_samples``). ``samples`` is what a picture is rendered with; ``fitting.fit`` finds how many
 it takes.
 """
@@ -40,9 +43,12 @@ from brdf.geometry.shapes import Parallelogram
 from brdf.geometry.surface_points import Points
 from brdf.lights.base import Light, LightSample, Rows
 from brdf.lights.sample_sets import square_rule, turned_rule
-from brdf.vectors import divide, norm, normalize, perpendicular, square_root
+from brdf.vectors import Components, divide, norm, normalize, perpendicular, square_root
 
 SAMPLES = 64
+
+FAR = 1e4
+"""Lengths of an edge at which a point is so far from it that all of it is seen alike, and whose inverse is near."""
 
 FLAT = 1e-6
 """How far a vertex may lie off the plane, as a share of the polygon's size: what six digits in a file leave."""
@@ -59,6 +65,41 @@ def _between(at_0: Array, at_1: Array, crossing: Array) -> tuple[Array, Array]:
     low = jnp.where(at_0 > 0, 0.0, jnp.where(at_1 > 0, crossing, 0.0))
     high = jnp.where(at_1 > 0, 1.0, jnp.where(at_0 > 0, crossing, 0.0))
     return low, high
+
+
+def _foot(start: Components, edge: Components) -> tuple[Array, Array]:
+    """Where on the line start + s edge the foot of the origin is, and how far the line is, in lengths of the edge."""
+    square = edge @ edge
+    foot = -divide(start @ edge, square)
+    way = start + edge * foot
+    return foot, jnp.clip(divide(square, way @ way), FAR**-2, FAR**2) ** -0.5
+
+
+def _evenly_seen(low: Array, high: Array, foot: Array, distance: Array, u: Array) -> tuple[Array, Array]:
+    """A point of an interval and how fast it moves with u, by which the tangent of half the angle grows evenly.
+
+    The angle is that at which the interval is seen from the given distance of its line's foot: what a point receives
+    of a line of light is nearly a polynomial of it, however near that is, as it is not of the place on the line.
+
+    Args:
+        low: end of the interval.
+        high: the other end.
+        foot: on its line.
+        distance: of the line.
+        u: from 0 to 1.
+    """
+    a, b, size = (low - foot) / distance, (high - foot) / distance, (high - low) / distance
+    root = jnp.sqrt(1.0 + a * a)
+    # Differences of tangents, and 1 - tan² of half the angle, as they are free of cancellation for what is far away.
+    half = size / (root * jnp.sqrt(1.0 + b * b) + 1.0 + a * b)
+    first = a / (1.0 + root)
+    step = half * (1.0 + first * first) / (1.0 - half * first)
+    way = u * step
+    tangent = first + way
+    left = 2.0 / (1.0 + root)
+    rest = left - way * (first + tangent)
+    place = low + distance * 2.0 * way * (1.0 + tangent * first) / (rest * left)
+    return place, 2.0 * distance * step * (1.0 + tangent * tangent) / (rest * rest)
 
 
 class FlatLight(Light):
@@ -79,16 +120,24 @@ class FlatLight(Light):
         # a side that is wholly below the horizon has no say
         lowest = jnp.minimum(*(jnp.where(high <= low, 1.0, low) for low, high in sides))
         highest = jnp.maximum(*(jnp.where(high <= low, 0.0, high) for low, high in sides))
-        width = jnp.maximum(highest - lowest, 0.0)
-        t = lowest + t * width
+        highest = jnp.maximum(lowest, highest)
+        # across the strips, along the line on which the nearest one comes nearest to the point
+        way, turn = point.position - start_0, edge_1 - edge_0
+        front = edge_0.cross(turn)
+        ahead = way.cross(turn) @ front
+        near = divide(-(way.cross(edge_0) @ front) * jnp.sign(ahead), jnp.abs(ahead))
+        start, edge = (a + (b - a) * jnp.clip(near, lowest, highest) for a, b in (starts, edges))
+        along = jnp.clip(_foot(start - point.position, edge)[0], 0.0, 1.0)
+        line = start_0 + edge_0 * along - point.position, start_1 - start_0 + turn * along
+        t, of_t = _evenly_seen(lowest, highest, *_foot(*line), t)
         height, slope, start, edge = (a + (b - a) * t for a, b in (heights, slopes, starts, edges))
         bottom, top = _positive_range(height, height + slope)
-        s = bottom + s * (top - bottom)
+        s, of_s = _evenly_seen(bottom, top, *_foot(start - point.position, edge), s)
         area_vector = edge.cross(start_1 - start_0 + (edge_1 - edge_0) * s)
         offset = start + edge * s - point.position
         to_light = normalize(offset)
         facing = jnp.maximum(-(to_light @ normalize(area_vector)), 0.0)
-        area = norm(area_vector) * weight * width * (top - bottom)
+        area = norm(area_vector) * weight * of_t * of_s
         squared_radius = divide(area * facing, np.pi * (offset @ offset))
         return LightSample(to_light, squared_radius, norm(offset), square_root(squared_radius))
 

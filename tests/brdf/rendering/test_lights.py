@@ -53,6 +53,18 @@ def test_flat_lights_follow_lamberts_formula(light: Light):
     np.testing.assert_allclose(radiance(light), lambert(QUAD), rtol=1e-6)
 
 
+@pytest.mark.parametrize(("size", "height", "error"), [(2.0, 1.0, 2e-4), (20.0, 1.0, 4e-3), (0.5, 0.01, 4e-3)])
+def test_flat_lights_may_be_large_and_near(size: float, height: float, error: float):
+    """With samples spread evenly over it a light of 20 times its distance gave a tenth of what it gives."""
+    quad = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * size + [0.2 * size, 0, height]
+    edges = {"edge_u": [0, size, 0], "edge_v": [size, 0, 0]}
+    rectangle = brdf.RectangleLight(center=[0.2 * size, 0, height], **edges, radiance=1, samples=64)
+    polygon = brdf.PolygonLight(vertices=quad[::-1], radiance=1, samples=64)
+    exact = lambert(quad)[0]
+    assert radiance(rectangle)[0] == pytest.approx(exact, rel=3e-4)
+    assert radiance(polygon)[0] == pytest.approx(exact, rel=error)
+
+
 @pytest.mark.parametrize("unit", [1e-7, 1e-4, 1e4, 1e7])
 def test_a_scene_looks_the_same_in_every_unit(unit: float):
     def picture(unit: float) -> np.ndarray:
