@@ -1,5 +1,6 @@
 """The one error that bad input raises, and numbers that have to be such. JAX is not needed to say so."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,18 @@ class InputError(ValueError):
         """
         separator = "." if ": " in str(where) else ": "
         return InputError(f"{where}{separator}{self.where}", self.what, self.remedy)
+
+    def renamed(self, names: Mapping[str, object]) -> "InputError":
+        """The same error, with the name that the user knows an argument by; itself where it is of another, or a file.
+
+        Args:
+            names: by the argument that it names, without the index of one of a list.
+        """
+        name, bracket, index = self.where.partition("[")
+        if self.of_file or (self.where not in names and isinstance(names.get(name, Path()), Path)):
+            return self
+        where = names[self.where] if self.where in names else f"{names[name]}{bracket}{index}"
+        return InputError(where, self.what, self.remedy)
 
 
 def as_numbers(name: str, value: Any, what: str = "numbers", remedy: str = "Give plain numbers") -> Any:

@@ -67,7 +67,7 @@ class Solution(NamedTuple):
         k_a: (C,), of the ambient light.
         k_d: (C,), of the diffuse basis.
         k_s: (C,), of the lobe.
-        n: exponent; 1 without a highlight, where it has no meaning.
+        n: exponent; of Lambert 1. Without a highlight, k_s being 0, it has no meaning.
         cost: least sum of weighted squared residuals, (C,).
         errors: standard errors of the four under noise that is independent and alike in all pixels of a channel; of
             what is at its bound 0, infinite where the pixels do not determine it.

@@ -133,7 +133,10 @@ def fit_many(
     pictures = list(pictures)
     scenes = [scenes] * len(pictures) if isinstance(scenes, brdf.Scene) else scenes
     mask = mask if isinstance(mask, list | tuple) else [mask] * len(pictures)
-    problem = state_problem(pictures, scenes, mask, model=model, precision=precision, n_range=n_range)
+    try:
+        problem = state_problem(pictures, scenes, mask, model=model, precision=precision, n_range=n_range)
+    except InputError as error:
+        raise error.renamed({"target": "pictures", "scene": "scenes"}) from None
     shapes = {target.pixels.shape for target in problem.targets}
     if len(shapes) > 1 or problem.streamed:
         what = "are read by bands" if problem.streamed else f"have the shapes {sorted(shapes)}"

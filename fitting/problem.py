@@ -184,13 +184,16 @@ def state_problem(
     for each in scenes:
         if not isinstance(each, brdf.Scene):
             raise InputError("scene", f"must be a brdf.Scene, got {type(each).__name__}", "Use brdf.Scene.load")
-    targets = [as_target(picture, rounding, encoding) for picture in targets]
+    named = [f"target[{index}]" if len(targets) > 1 else "target" for index in range(len(targets))]
+    targets = [
+        _named(as_target, name, picture, rounding, encoding) for name, picture in zip(named, targets, strict=True)
+    ]
     if any(target.codes is not None and target.codes.fine for target in targets):
         options["precision"] = "float64"
     problem = FitProblem(targets, scenes, masks, weights, **options)
     _check_options(problem)
     for index, (picture, place) in enumerate(zip(problem.targets, scenes, strict=True)):
-        _check_picture(picture, place, problem)
+        _named(_check_picture, named[index], picture, place, problem)
         shape = picture.pixels.shape[:2]
         if masks[index] is not None:
             masks[index] = _per_pixel("mask", masks[index], shape).astype(bool)
@@ -206,6 +209,14 @@ def state_problem(
     if len(counts) > 1:
         raise InputError("target", f"pictures have {counts} channels", "Give pictures with the same number")
     return problem
+
+
+def _named(function: Callable[..., Any], name: str, *arguments: Any) -> Any:
+    """What a function of one picture gives; its errors name which one it is."""
+    try:
+        return function(*arguments)
+    except InputError as error:
+        raise error.renamed({"target": name}) from None
 
 
 def as_target(given: Any, rounding: Rounding = None, encoding: Encoding | None = None) -> Target:

@@ -114,8 +114,11 @@ def _energy(material: Material, classic: bool) -> Finding:
         bound += ACCURACY["float64"] * material.k_s[channel] / divisor
     words = f"the largest albedo is {value:.7g}, for light at {light}"
     if classic:
-        words = f"the albedo exceeds 1 for light beyond {Angles(crossing)} and grows without bound, "
-        words += f"to {value:.3g} at {light}"
+        words = f"the albedo exceeds 1 for light beyond {Angles(crossing)} and grows without bound"
+        if value > ENERGY_LIMIT + bound:
+            words += f", to {value:.3g} at {light}"
+        else:  # a trace of k_s shows only closer to 90 degrees than numbers go
+            value, bound, light = float(np.finfo(float).max), 0.0, Angles(90.0)
     failed = f"does not conserve energy: {words}{named}"
     finding = judged(value, ENERGY_LIMIT, float(bound), (light, None, channel), words + named, failed)
     return dataclasses.replace(finding, crossing=crossing if value > ENERGY_LIMIT + bound else None)

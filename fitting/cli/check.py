@@ -9,6 +9,9 @@ from brdf.files import atomic_path
 from fitting.cli.common import find_materials, show
 from fitting.progress import waiting
 
+# What a drawing may be written as.
+DRAWN = (".png", ".pdf", ".svg", ".jpg")
+
 
 def check(material: str, *, json: bool = False, plot: Path | None = None) -> int:
     """Is a material plausible: positive, reciprocal, energy conserving? Exit 0 if so, 1 if not, 2 if it cannot tell.
@@ -25,6 +28,8 @@ def check(material: str, *, json: bool = False, plot: Path | None = None) -> int
     """
     from brdf.measured.loading import is_measured
 
+    if plot is not None and plot.suffix.lower() not in DRAWN:
+        raise InputError(plot, "is no name of a picture", f"Name it {', '.join(DRAWN)}")
     with waiting("checking"):
         is_table = is_measured(material)
         if is_table and plot is not None:

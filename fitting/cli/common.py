@@ -80,7 +80,9 @@ def add_command(app: typer.Typer, function: Callable[..., Any]) -> None:
         typed = {name: value if isinstance(value, Path) else _flag(name) for name, value in options.items()}
         if fields:
             given["pictures"] = PictureOptions(**{name: given.pop(name) for name in fields})
-        with named_as(typed | {"circle": "--sphere"}):
+        targets = given["target"] if isinstance(given.get("target"), list) else []
+        typed |= {f"target[{index}]": path for index, path in enumerate(targets) if len(targets) > 1}
+        with named_as(typed | {"circle": "--sphere", "mesh": "--devices"}):
             return function(**given)
 
     command.__signature__ = inspect.Signature(shown)  # pyright: ignore[reportAttributeAccessIssue]
@@ -117,9 +119,7 @@ def named_as(typed: dict[str, Any]) -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        if error.of_file or error.where not in typed:  # a file may be called as an option is
-            raise
-        raise InputError(typed[error.where], error.what, error.remedy) from None
+        raise error.renamed(typed) from None
 
 
 def find_materials(text: str) -> dict[str, tuple["brdf.Material", str]]:

@@ -121,8 +121,11 @@ def _check_options(kind, targets: list[Path], options: PictureOptions) -> None:
     if kind == "photographs":
         alone = None in (options.sphere, options.normals)
         _require(alone, "--normals", "says what --sphere says too", "Give one of them")
-        alone, remedy = (options.light is None) != (options.lights is None), "Give x,y,z, fit, or a file of directions"
-        _require(alone, "--light", "or --lights has to say where the light is", remedy)
+        alone = None in (options.light, options.lights)
+        _require(alone, "--light", "says what --lights says too", "Give one of them")
+        some = (options.light, options.lights) != (None, None)
+        remedy = "Give x,y,z, fit, or a file of directions"
+        _require(some, "--light", "or --lights has to say where the light is", remedy)
     if kind == "scene":
         _require(
             not options.ambient,

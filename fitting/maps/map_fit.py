@@ -171,6 +171,8 @@ def _surface(given: Photographs, normals: Any, mask: Any, precision: Precision, 
         what = f"is of shape {mask.shape}, the photographs of {(height, width)}"
         raise InputError("mask", what, "Give a value for each pixel")
     mask = mask & given.opaque()
+    if flip_y and (normals is None or given.scenes is not None or (isinstance(normals, str) and normals == "fit")):
+        raise InputError("flip_y", "turns normals that are given", "Give them, or leave it out")
     if given.scenes is not None:
         if normals is not None:
             raise InputError("normals", "are told by the scenes", "Leave them out")

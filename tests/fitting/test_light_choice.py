@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_ball import SUN, ball_scene, pictured
@@ -69,6 +70,13 @@ def test_a_lamp_that_is_near_can_be_chosen_and_told(result):
     choice = fitting.next_light(result, [brdf.PointLight([0, 0, 3], 9.0)])
     assert str(choice).startswith("PointLight(position=[0, 0, 3]")
     assert choice.after[0] < choice.before
+
+
+def test_directions_may_be_an_array_of_any_kind(result):
+    given = [[-0.3, 0.2, 0.8], [0.5, 0.2, 0.8]]
+    one, other, another = (fitting.next_light(result, kind(given)).foretold for kind in (list, np.array, jnp.array))
+    np.testing.assert_allclose(one, other)
+    np.testing.assert_allclose(one, another, rtol=1e-5)
 
 
 def test_what_cannot_be_answered_is_told(result):

@@ -95,6 +95,22 @@ def test_light_that_is_nearly_grazing_is_not_said_to_be_at_90_degrees():
     np.testing.assert_allclose([90 - beyond, 90 - worst], [90 - energy.crossing, 90 - energy.to_light.polar], rtol=0.1)
 
 
+@pytest.mark.parametrize(
+    "material",
+    [
+        brdf.Phong(k_d=1.0, k_s=1e-4, n=1e6),
+        brdf.BlinnPhong(k_d=0.5, k_s=1e-20, n=10.0),
+        brdf.Phong(k_d=0.6, k_s=0.4, n=1e15),
+    ],
+)
+def test_what_shows_closer_to_grazing_light_than_numbers_go_is_judged_all_the_same(material):
+    """The albedo of a classic form grows without bound, however little k_s is."""
+    report = brdf.check(material)
+    assert report.energy.verdict == "fail"
+    assert report.energy.sentence.endswith("grows without bound")
+    json.dumps(report.to_json(), allow_nan=False)
+
+
 def test_the_reported_pair_shows_the_reported_ratio():
     material = Phong(k_d=0.1, k_s=0.4, n=7.0)
     finding = check(material).reciprocity
