@@ -82,13 +82,13 @@ class Codes(NamedTuple):
         return float(decode(np.array(share), self.encoding) * np.max(self.unit)) if np.isfinite(share) else np.inf
 
     @property
-    def widest_step(self) -> float:
-        """Largest distance of the two ends of a linear value."""
-        ends = (
-            decode(np.maximum(end, 0) / self.scale, self.encoding)
-            for end in (self.values - self.below, self.values + self.above)
-        )
-        return float(np.nanmax(np.abs(np.subtract(*ends)) * self.unit))
+    def usual_step(self) -> float:
+        """Distance of the two ends of a linear value: the median of those above 0."""
+        some = np.isfinite(self.values) & (self.values > 0)
+        code, below, above = (np.broadcast_to(x, some.shape)[some] for x in (self.values, self.below, self.above))
+        ends = (decode(np.maximum(end, 0) / self.scale, self.encoding) for end in (code + above, code - below))
+        unit = np.broadcast_to(self.unit, some.shape)[some]
+        return float(np.median(np.subtract(*ends) * unit)) if some.any() else 0.0
 
     def middle(self, pixels: Float[np.ndarray, "H W C"]) -> Float[np.ndarray, "H W C"]:
         """Linear values where they most likely lay: those of a writer that truncated half a step above their codes.

@@ -119,9 +119,10 @@ def fit(
             with spread_over(mesh):
                 result = fit_pictures(problem)
                 if problem.streamed and problem.loss == "squared" and dark is None:
-                    some = in_memory(problem)
-                    steps = [target.codes.widest_step for target in some.targets if target.codes is not None]
-                    if np.min(result.noise) < max(steps, default=0.0):
+                    some = in_memory(problem, rounding)
+                    both = zip(problem.targets, some.targets, strict=True)
+                    codes = [one.codes for given, one in both if given.streamed and one.codes is not None]
+                    if np.min(result.noise) < max((one.usual_step for one in codes), default=0.0):
                         result = fit_pictures(with_enough_samples(some))
             return dataclasses.replace(result, seconds=time.perf_counter() - start)
     if mesh is not None:

@@ -22,7 +22,7 @@ from brdf.errors import InputError
 from brdf.geometry.rays import Sight
 from brdf.models.base import SpecularMaterial
 from brdf.precision import Precision, at_a_time
-from fitting.codes import open_ends
+from fitting.codes import Rounding, open_ends
 from fitting.light_colour import take_colour_out
 from fitting.likelihood import Bounds, over_channels
 from fitting.problem import TOP, FitProblem, Target, as_target, has_pixel_areas
@@ -436,11 +436,12 @@ def _shown(
     return shown, brdf.some_pixels(scene, pixel, precision=precision), counted, stride
 
 
-def in_memory(problem: FitProblem) -> FitProblem:
+def in_memory(problem: FitProblem, rounding: Rounding) -> FitProblem:
     """With some pixels, evenly spread, of the pictures that are read by bands.
 
     Args:
         problem: any.
+        rounding: of the values, see `fitting.codes.find_codes`.
     """
 
     def some(target: Target, scene: brdf.Scene, *of_pixels: Any) -> tuple[Any, ...]:
@@ -449,13 +450,14 @@ def in_memory(problem: FitProblem) -> FitProblem:
         height, width, _ = target.pixels.shape
         stride = -(-max(width, height) // SHOWN_PIXELS)
         bands = [(first, min(first + ALIGNED_ROWS, height)) for first in range(0, height, ALIGNED_ROWS)]
-        values = [target.pixels.rows(*band)[-band[0] % stride :: stride, ::stride] for band in bands]
+        # Copies: views would keep the whole picture.
+        values = [target.pixels.rows(*band)[-band[0] % stride :: stride, ::stride].copy() for band in bands]
         pixel = np.arange(0, height, stride)[:, None] * width + np.arange(0, width, stride)
         picture = target.pixels.picture(np.concatenate(values))
         # Pixels of a block of a JPEG are known by their neighbours.
         picture = picture if stride == 1 else dataclasses.replace(picture, jpeg=None)
         thinned = [None if one is None else one[::stride, ::stride] for one in of_pixels]
-        return as_target(picture), brdf.some_pixels(scene, pixel, precision=problem.precision), *thinned
+        return as_target(picture, rounding), brdf.some_pixels(scene, pixel, precision=problem.precision), *thinned
 
     parts = zip(problem.targets, problem.scenes, problem.masks, problem.weights, strict=True)
     targets, scenes, masks, weights = map(list, zip(*(some(*one) for one in parts), strict=True))

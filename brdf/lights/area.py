@@ -9,14 +9,13 @@ Rectangles and polygons shine from their front only and are invisible; lights ca
 
 How many samples, S. Above the horizon the error of the irradiance falls exponentially in √S, for lights at a distance
 of twice their size fast: for a rectangle 4e-6 with S = 9, 2e-8 with 16, 1e-12 with 36; S = 64 leaves 3e-7 at half
-their size and 2e-4 however near they are (a polygon of two triangles 1e-4 and 4e-3); a sphere's is exact. Where a
+their size and 2e-4 however near they are (a polygon of two triangles 4e-4 and 1e-2); a sphere's is exact. Where a
 light is setting, a bend is left, and the largest error over a ball falls like S^-1.5 to S^-2: 3e-5, 1e-4 and 2e-4 of
 the brightest point with S = 64 for rectangle, polygon and sphere. A lobe asks for nodes closer than its width and
 then converges exponentially too: at n = 30, S = 16 leaves 3e-6 for a rectangle, 9e-4 for a polygon, 1e-6 for a
 sphere; at n = 1000, S = 64 leaves 1e-3, 3e-2 and 3e-3, S = 256 less than 5e-5 for each, and S = 16 shows the single
-samples
-(``python -m benchmarks.light_samples``). ``samples`` is what a picture is rendered with; ``fitting.fit`` finds how many
-it takes.
+samples (``python -m benchmarks.light_samples``). ``samples`` is what a picture is rendered with; ``fitting.fit`` finds
+how many it takes.
 """
 
 import operator
@@ -47,8 +46,8 @@ from brdf.vectors import Components, divide, norm, normalize, perpendicular, squ
 
 SAMPLES = 64
 
-FAR = 1e4
-"""Lengths of an edge at which a point is so far from it that all of it is seen alike, and whose inverse is near."""
+FAR = 1e6
+"""Lengths of an edge: points beyond see all of it alike, and points nearer than the inverse as if they were there."""
 
 FLAT = 1e-6
 """How far a vertex may lie off the plane, as a share of the polygon's size: what six digits in a file leave."""
@@ -91,7 +90,10 @@ def _evenly_seen(low: Array, high: Array, foot: Array, distance: Array, u: Array
     a, b, size = (low - foot) / distance, (high - foot) / distance, (high - low) / distance
     root = jnp.sqrt(1.0 + a * a)
     # Differences of tangents, and 1 - tan² of half the angle, as they are free of cancellation for what is far away.
-    half = size / (root * jnp.sqrt(1.0 + b * b) + 1.0 + a * b)
+    product, both = root * jnp.sqrt(1.0 + b * b), 1.0 + a * b
+    half = jnp.where(
+        both > 0, size / (product + jnp.abs(both)), (product + jnp.abs(both)) / jnp.where(both > 0, 1.0, size)
+    )
     first = a / (1.0 + root)
     step = half * (1.0 + first * first) / (1.0 - half * first)
     way = u * step
@@ -121,14 +123,17 @@ class FlatLight(Light):
         lowest = jnp.minimum(*(jnp.where(high <= low, 1.0, low) for low, high in sides))
         highest = jnp.maximum(*(jnp.where(high <= low, 0.0, high) for low, high in sides))
         highest = jnp.maximum(lowest, highest)
-        # across the strips, along the line on which the nearest one comes nearest to the point
-        way, turn = point.position - start_0, edge_1 - edge_0
-        front = edge_0.cross(turn)
-        ahead = way.cross(turn) @ front
-        near = divide(-(way.cross(edge_0) @ front) * jnp.sign(ahead), jnp.abs(ahead))
-        start, edge = (a + (b - a) * jnp.clip(near, lowest, highest) for a, b in (starts, edges))
+        # across the strips, on a line through that point of the one beneath the surface point which is nearest to it
+        unit = divide(1.0, norm(edge_0))
+        way, first, turn, step = (
+            one * unit for one in (point.position - start_0, edge_0, edge_1 - edge_0, start_1 - start_0)
+        )
+        front = first.cross(turn + step)
+        ahead = (way.cross(turn) - step.cross(first)) @ front
+        beneath = divide(-(way.cross(first) @ front) * jnp.sign(ahead), jnp.abs(ahead))
+        start, edge = (a + (b - a) * jnp.clip(beneath, lowest, highest) for a, b in (starts, edges))
         along = jnp.clip(_foot(start - point.position, edge)[0], 0.0, 1.0)
-        line = start_0 + edge_0 * along - point.position, start_1 - start_0 + turn * along
+        line = start_0 + edge_0 * along - point.position, start_1 - start_0 + (edge_1 - edge_0) * along
         t, of_t = _evenly_seen(lowest, highest, *_foot(*line), t)
         height, slope, start, edge = (a + (b - a) * t for a, b in (heights, slopes, starts, edges))
         bottom, top = _positive_range(height, height + slope)

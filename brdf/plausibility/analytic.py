@@ -113,7 +113,7 @@ def _energy(material: Material, classic: bool) -> Finding:
         divisor = normalized_form(type(material)).scale(material.n) * np.cos(angle) if classic else 1.0
         bound += ACCURACY["float64"] * material.k_s[channel] / divisor
     words = f"the largest albedo is {value:.7g}, for light at {light}"
-    if classic:
+    if classic and np.asarray(material.k_s)[channel] > 0:
         words = f"the albedo exceeds 1 for light beyond {Angles(crossing)} and grows without bound"
         if value > ENERGY_LIMIT + bound:
             words += f", to {value:.3g} at {light}"

@@ -126,6 +126,27 @@ def test_codes_coarser_than_noise_are_fitted_as_codes(tmp_path: Path, monkeypatc
         assert one.error == pytest.approx(other.error, rel=1e-3) if most > 60 else 1 < one.error / other.error < 40
 
 
+def test_a_stated_rounding_is_that_of_a_file_read_by_bands(tmp_path: Path):
+    clean = np.asarray(brdf.render(MATERIAL, scene(), precision="float64"))
+    path = tmp_path / "linear.png"
+    brdf.write_image(path, clean, dtype="uint8", encoding="linear")
+    with brdf.ImageReader(path, encoding="linear") as reader:
+        found = fitting.fit(reader, scene(), model="blinn-phong", rounding=0)
+    whole = fitting.fit(brdf.read_image(path, encoding="linear"), scene(), model="blinn-phong", rounding=0)
+    assert float(found["n"]) == pytest.approx(float(whole["n"]), rel=1e-5)
+    assert float(found["n"]) != pytest.approx(60.0, rel=1e-3)
+
+
+def test_codes_finer_than_noise_are_fitted_on_all_pixels(tmp_path: Path, monkeypatch):
+    """A bright pixel, and one that is infinite, beside the ball are no reason to look at some of the others."""
+    monkeypatch.setattr(pixels, "SHOWN_PIXELS", 30)
+    values = picture()
+    values[0, 0], values[0, 3] = 1000.0, np.inf
+    brdf.write_image(tmp_path / "half.exr", values, dtype="half")
+    with brdf.ImageReader(tmp_path / "half.exr") as reader:
+        assert fitting.fit(reader, scene(), model="blinn-phong").pixels == 2241
+
+
 def test_bands_share_their_programs():
     """Or the first fit of a picture of 64 bands would compile each of them."""
     programs: tuple[Any, ...] = lobes.diffuse_and_kept, rays.PrimaryRays.__dict__["mask"].func

@@ -34,6 +34,12 @@ def test_verdicts_on_brdfs_of_known_standing(case):
         assert abs(finding.margin) >= finding.error_bound
     assert report.plausible is all(labels)
     json.dumps(report.to_json(), allow_nan=False)
+
+
+def test_only_channels_with_a_highlight_are_said_to_grow():
+    energy = brdf.check(brdf.Phong(k_d=[1.5, 0.1], k_s=[0.0, 1e-20], n=10.0)).energy
+    assert (energy.verdict, energy.value, energy.channel) == ("fail", 1.5, 0)
+    assert "grows" not in energy.sentence
     assert jnp.ones(()).dtype == jnp.float32  # JAX is left as it was
 
 

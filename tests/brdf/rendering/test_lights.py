@@ -53,12 +53,14 @@ def test_flat_lights_follow_lamberts_formula(light: Light):
     np.testing.assert_allclose(radiance(light), lambert(QUAD), rtol=1e-6)
 
 
-@pytest.mark.parametrize(("size", "height", "error"), [(2.0, 1.0, 2e-4), (20.0, 1.0, 4e-3), (0.5, 0.01, 4e-3)])
-def test_flat_lights_may_be_large_and_near(size: float, height: float, error: float):
+@pytest.mark.parametrize("degrees", [90, 40])
+@pytest.mark.parametrize(("size", "height", "error"), [(2.0, 1.0, 6e-4), (20.0, 1.0, 1e-2), (0.5, 0.01, 1e-2)])
+def test_flat_lights_may_be_large_and_near(size: float, height: float, error: float, degrees: float):
     """With samples spread evenly over it a light of 20 times its distance gave a tenth of what it gives."""
-    quad = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * size + [0.2 * size, 0, height]
-    edges = {"edge_u": [0, size, 0], "edge_v": [size, 0, 0]}
-    rectangle = brdf.RectangleLight(center=[0.2 * size, 0, height], **edges, radiance=1, samples=64)
+    center, u = np.array([0.2 * size, 0, height]), np.array([0, size, 0])
+    v = size * np.array([math.sin(math.radians(degrees)), math.cos(math.radians(degrees)), 0])
+    quad = center + np.array([-u - v, v - u, u + v, u - v])
+    rectangle = brdf.RectangleLight(center=center, edge_u=u, edge_v=v, radiance=1, samples=64)
     polygon = brdf.PolygonLight(vertices=quad[::-1], radiance=1, samples=64)
     exact = lambert(quad)[0]
     assert radiance(rectangle)[0] == pytest.approx(exact, rel=3e-4)
