@@ -197,7 +197,8 @@ def all_devices(devices: str | None) -> Any:
 
     from fitting.solver.devices import core_count
 
-    flags = os.environ.get("XLA_FLAGS", "")
+    given = os.environ.get("XLA_FLAGS")
+    flags = given or ""
     if "xla_force_host_platform_device_count" not in flags:
         # Of the host platform alone: where there is an accelerator it is that that is taken.
         os.environ["XLA_FLAGS"] = f"{flags} --xla_force_host_platform_device_count={core_count()}".strip()
@@ -205,7 +206,13 @@ def all_devices(devices: str | None) -> Any:
     if any(int(os.environ.get(name, "1")) > 1 for name in PROCESSES) and not jax.distributed.is_initialized():
         jax.config.update("jax_cpu_collectives_implementation", "gloo")
         jax.distributed.initialize()
-    return jax.make_mesh((jax.device_count(),), ("pixels",))
+    mesh = jax.make_mesh((jax.device_count(),), ("pixels",))
+    # What this program starts has devices of its own.
+    if given is None:
+        del os.environ["XLA_FLAGS"]
+    else:
+        os.environ["XLA_FLAGS"] = given
+    return mesh
 
 
 def is_first_process(mesh: Any) -> bool:
