@@ -45,13 +45,11 @@ class InputError(ValueError):
         """The same error, with the name that the user knows an argument by; itself where it is of another, or a file.
 
         Args:
-            names: by the argument that it names, without the index of one of a list.
+            names: by the argument that it names.
         """
-        name, bracket, index = self.where.partition("[")
-        if self.of_file or (self.where not in names and isinstance(names.get(name, Path()), Path)):
+        if self.of_file or self.where not in names:  # a file may be called as an argument is
             return self
-        where = names[self.where] if self.where in names else f"{names[name]}{bracket}{index}"
-        return InputError(where, self.what, self.remedy)
+        return InputError(names[self.where], self.what, self.remedy)
 
 
 def as_numbers(name: str, value: Any, what: str = "numbers", remedy: str = "Give plain numbers") -> Any:

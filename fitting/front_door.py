@@ -118,11 +118,10 @@ def fit(
             problem = with_enough_samples(problem)
             with spread_over(mesh):
                 result = fit_pictures(problem)
-                if problem.streamed and problem.loss == "squared" and dark is None:
+                if problem.streamed and loss == "squared" and dark is None:
+                    # Beside a picture that is read by bands no codes are fitted as such.
                     some = in_memory(problem, rounding)
-                    both = zip(problem.targets, some.targets, strict=True)
-                    codes = [one.codes for given, one in both if given.streamed and one.codes is not None]
-                    if np.min(result.noise) < max((one.usual_step for one in codes), default=0.0):
+                    if np.min(result.noise) < some.usual_step:
                         result = fit_pictures(with_enough_samples(some))
             return dataclasses.replace(result, seconds=time.perf_counter() - start)
     if mesh is not None:

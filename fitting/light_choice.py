@@ -203,11 +203,8 @@ def choose_lights(
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
         raise InputError("count", f"must be 1 or more, got {count}", "Say how many lights to add")
     shining = max((np.asarray(light.emittance) for light in known), key=np.sum, default=np.ones(1))
-    given = (
-        [_light(one, shining) for one in candidates]
-        if isinstance(candidates, Sequence | np.ndarray | jax.Array)
-        else []
-    )
+    listed = isinstance(candidates, Sequence | np.ndarray | jax.Array)
+    given = [_light(one, shining) for one in candidates] if listed else []
     if candidates is not None and not given:
         what = f"is empty, or no list: {candidates!r:.60}"
         raise InputError("candidates", what, "Give lights or directions, or None for any direction")

@@ -136,7 +136,8 @@ def fit_many(
     try:
         problem = state_problem(pictures, scenes, mask, model=model, precision=precision, n_range=n_range)
     except InputError as error:
-        raise error.renamed({"target": "pictures", "scene": "scenes"}) from None
+        each = {f"target[{index}]": f"pictures[{index}]" for index in range(len(pictures))}
+        raise error.renamed({"target": "pictures", "scene": "scenes"} | each) from None
     shapes = {target.pixels.shape for target in problem.targets}
     if len(shapes) > 1 or problem.streamed:
         what = "are read by bands" if problem.streamed else f"have the shapes {sorted(shapes)}"

@@ -419,21 +419,31 @@ def _shown(
     bands: Sequence[_Band], found: Sequence[tuple[np.ndarray, Statistics]], scene: brdf.Scene, precision: Precision
 ) -> tuple[np.ndarray, brdf.Scene, np.ndarray, int]:
     """Every so many pixels of a picture that is not in memory, what they show, which of them counted, how many."""
-    width, height = scene.resolution
-    stride = -(-max(width, height) // SHOWN_PIXELS)
+    width = scene.resolution[0]
+    stride, thinned = _thinned(scene, precision)
 
     def some(values: Any, first: int) -> np.ndarray:
-        rows = np.asarray(values).reshape(-1, width, *values.shape[1:])
-        # A copy: a view would keep the whole band.
-        return rows[-first % stride :: stride, ::stride].copy()
+        return _every(stride, np.asarray(values).reshape(-1, width, *values.shape[1:]), first)
 
     parts = [
         (some(band.values, band.rows.start), some(good, band.rows.start))
         for band, (good, _) in zip(bands, found, strict=True)
     ]
     shown, counted = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return shown, thinned, counted, stride
+
+
+def _thinned(scene: brdf.Scene, precision: Precision) -> tuple[int, brdf.Scene]:
+    """Of how many rows and columns one is taken of a picture that is not in memory, and what these show."""
+    width, height = scene.resolution
+    stride = -(-max(width, height) // SHOWN_PIXELS)
     pixel = np.arange(0, height, stride)[:, None] * width + np.arange(0, width, stride)
-    return shown, brdf.some_pixels(scene, pixel, precision=precision), counted, stride
+    return stride, brdf.some_pixels(scene, pixel, precision=precision)
+
+
+def _every(stride: int, rows: np.ndarray, first: int) -> np.ndarray:
+    """Those of a band that begins with some row. A copy: a view would keep the whole band."""
+    return rows[-first % stride :: stride, ::stride].copy()
 
 
 def in_memory(problem: FitProblem, rounding: Rounding) -> FitProblem:
@@ -447,17 +457,15 @@ def in_memory(problem: FitProblem, rounding: Rounding) -> FitProblem:
     def some(target: Target, scene: brdf.Scene, *of_pixels: Any) -> tuple[Any, ...]:
         if not target.streamed:
             return target, scene, *of_pixels
-        height, width, _ = target.pixels.shape
-        stride = -(-max(width, height) // SHOWN_PIXELS)
+        stride, thinned = _thinned(scene, problem.precision)
+        height = target.pixels.shape[0]
         bands = [(first, min(first + ALIGNED_ROWS, height)) for first in range(0, height, ALIGNED_ROWS)]
-        # Copies: views would keep the whole picture.
-        values = [target.pixels.rows(*band)[-band[0] % stride :: stride, ::stride].copy() for band in bands]
-        pixel = np.arange(0, height, stride)[:, None] * width + np.arange(0, width, stride)
-        picture = target.pixels.picture(np.concatenate(values))
+        values = np.concatenate([_every(stride, target.pixels.rows(*band), band[0]) for band in bands])
+        picture = target.pixels.picture(values)
         # Pixels of a block of a JPEG are known by their neighbours.
         picture = picture if stride == 1 else dataclasses.replace(picture, jpeg=None)
-        thinned = [None if one is None else one[::stride, ::stride] for one in of_pixels]
-        return as_target(picture, rounding), brdf.some_pixels(scene, pixel, precision=problem.precision), *thinned
+        rest = [None if one is None else one[::stride, ::stride] for one in of_pixels]
+        return as_target(picture, rounding), thinned, *rest
 
     parts = zip(problem.targets, problem.scenes, problem.masks, problem.weights, strict=True)
     targets, scenes, masks, weights = map(list, zip(*(some(*one) for one in parts), strict=True))

@@ -92,6 +92,11 @@ class FitProblem:
         """Whether a picture is read by bands of rows."""
         return any(target.streamed for target in self.targets)
 
+    @property
+    def usual_step(self) -> float:
+        """Largest of the pictures' usual distances of two codes; 0 where there are none."""
+        return max((target.codes.usual_step for target in self.targets if target.codes is not None), default=0.0)
+
     def sample_error(self, model: str) -> SampleError | None:
         """What the light samples leave out of a model, or of another one; None where nothing is known of it.
 

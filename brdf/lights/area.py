@@ -75,10 +75,10 @@ def _foot(start: Components, edge: Components) -> tuple[Array, Array]:
 
 
 def _evenly_seen(low: Array, high: Array, foot: Array, distance: Array, u: Array) -> tuple[Array, Array]:
-    """A point of an interval and how fast it moves with u, by which the tangent of half the angle grows evenly.
+    """A point of an interval, and how fast it moves with u, of which the tangent of half an angle is a linear function.
 
-    The angle is that at which the interval is seen from the given distance of its line's foot: what a point receives
-    of a line of light is nearly a polynomial of it, however near that is, as it is not of the place on the line.
+    The angle is that to the foot of the interval's line, from the given distance of it. What a point receives of a line
+    of light is nearly a polynomial of that tangent however near it is, as it is not of the place on the line.
 
     Args:
         low: end of the interval.
@@ -89,19 +89,17 @@ def _evenly_seen(low: Array, high: Array, foot: Array, distance: Array, u: Array
     """
     a, b, size = (low - foot) / distance, (high - foot) / distance, (high - low) / distance
     root = jnp.sqrt(1.0 + a * a)
-    # Differences of tangents, and 1 - tan² of half the angle, as they are free of cancellation for what is far away.
-    product, both = root * jnp.sqrt(1.0 + b * b), 1.0 + a * b
-    half = jnp.where(
-        both > 0, size / (product + jnp.abs(both)), (product + jnp.abs(both)) / jnp.where(both > 0, 1.0, size)
-    )
-    first = a / (1.0 + root)
-    step = half * (1.0 + first * first) / (1.0 - half * first)
-    way = u * step
-    tangent = first + way
-    left = 2.0 / (1.0 + root)
-    rest = left - way * (first + tangent)
-    place = low + distance * 2.0 * way * (1.0 + tangent * first) / (rest * left)
-    return place, 2.0 * distance * step * (1.0 + tangent * tangent) / (rest * rest)
+    # Sums and differences of tangents as they are free of cancellation for what is far away, or all around.
+    ahead = 1.0 + a * b
+    total = root * jnp.sqrt(1.0 + b * b) + jnp.abs(ahead)
+    between = jnp.where(ahead > 0, size / total, total / jnp.where(ahead > 0, 1.0, size))
+    tangent_low = a / (1.0 + root)
+    growth = between * (1.0 + tangent_low * tangent_low) / (1.0 - between * tangent_low)
+    tangent = tangent_low + u * growth
+    left_low = 2.0 / (1.0 + root)  # 1 - tangent_low²
+    left = left_low - u * growth * (tangent_low + tangent)
+    place = low + 2.0 * distance * u * growth * (1.0 + tangent * tangent_low) / (left * left_low)
+    return place, 2.0 * distance * growth * (1.0 + tangent * tangent) / (left * left)
 
 
 class FlatLight(Light):
