@@ -22,7 +22,7 @@ import dataclasses
 import functools
 import operator
 from collections.abc import Callable, Iterator
-from functools import partial
+from functools import partial, partialmethod
 from typing import Any
 
 import jax
@@ -258,58 +258,50 @@ _GRID = 2048.0  # products of two leading parts are multiples of 2^-22, so sums 
 
 @dataclasses.dataclass(frozen=True)
 class _Split:
-    """A vector as an exact sum of a leading part on a coarse grid and a rest; in float64 the leading part is all.
+    """A float32 vector as an exact sum of a leading part on a coarse grid and a rest.
 
     Components are kept apart: a compiler that sees (..., 3) arrays stacked again computes each of them three times.
     """
 
     value: Components
     high: Components
-    low: Components | None
+    low: Components
+
+    @classmethod
+    def of(cls, value: Components) -> "_Split":
+        """The parts of a vector whose components lie within +-1."""
+        # no derivative: the rest carries it
+        high = Components(tuple(map(jnp.round, (value * _GRID).parts))) * (1.0 / _GRID)
+        return cls(value, high, value - high)
 
     def __matmul__(self, other: "_Split") -> Array:
         """The scalar product of vectors whose components lie within +-2."""
-        leading = self.high @ other.high
-        if self.low is None or other.low is None:
-            return leading
-        return leading + Components((*self.high, *self.low)) @ Components((*other.low, *other.value))
+        rest = Components((*self.high, *self.low)) @ Components((*other.low, *other.value))
+        return self.high @ other.high + rest
 
     def cross(self, other: "_Split") -> Components:
         """The vector product of such."""
-        leading = self.high.cross(other.high)
-        if self.low is None or other.low is None:
-            return leading
-        return leading + (self.high.cross(other.low) + self.low.cross(other.value))
+        return self.high.cross(other.high) + (self.high.cross(other.low) + self.low.cross(other.value))
 
-    def __add__(self, other: "_Split") -> "_Split":
-        low = None if self.low is None or other.low is None else self.low + other.low
-        return _Split(self.value + other.value, self.high + other.high, low)
+    def _with(self, operation: Any, other: "_Split | Components") -> "_Split":
+        """Sum or difference; a vector that is not split is a small one."""
+        if isinstance(other, Components):
+            return _Split(operation(self.value, other), self.high, operation(self.low, other))
+        parts = (self.value, other.value), (self.high, other.high), (self.low, other.low)
+        return _Split(*(operation(*pair) for pair in parts))
 
-    def __sub__(self, other: "_Split") -> "_Split":
-        low = None if self.low is None or other.low is None else self.low - other.low
-        return _Split(self.value - other.value, self.high - other.high, low)
-
-    def less(self, small: Components) -> "_Split":
-        """The difference from a small vector."""
-        value = self.value - small
-        return _Split(value, value, None) if self.low is None else _Split(value, self.high, self.low - small)
+    __add__, __sub__ = partialmethod(_with, operator.add), partialmethod(_with, operator.sub)
 
 
-def _split(*vectors: Directions) -> list[_Split]:
-    """The parts of vectors whose components lie within +-1, in one common floating-point type."""
-    given, parts = list(map(Components.of, vectors)), []
-    dtype = jnp.result_type(*(one for vector in given for one in vector.parts), 1.0)
-    for vector in given:
-        value = Components(tuple(one.astype(dtype) for one in vector.parts))
-        # no derivative: the rest carries it
-        high = (
-            Components(tuple(map(jnp.round, (value * _GRID).parts))) * (1.0 / _GRID) if dtype == jnp.float32 else value
-        )
-        parts.append(_Split(value, high, None if high is value else value - high))
-    return parts
+def _split(*vectors: Directions) -> Any:
+    """Vectors whose components lie within +-1 in one common floating-point type, float32 in parts."""
+    given = list(map(Components.of, vectors))
+    dtype = jnp.result_type(*(one for vector in given for one in vector), 1.0)
+    values = (Components(tuple(one.astype(dtype) for one in vector)) for vector in given)
+    return map(_Split.of, values) if dtype == jnp.float32 else values
 
 
-def _about(normal: Directions, to_light: Directions, to_view: Directions) -> tuple[_Split, Array, _Split, _Split]:
+def _about(normal: Directions, to_light: Directions, to_view: Directions) -> tuple[Any, Array, Any, Any]:
     """The normal, L . V, and sum and difference of L and V after giving both one length.
 
     Rounding makes their lengths differ by 1e-7: by the excess (|L|^2 - |V|^2) / 4 = (s . d) / 4.
@@ -317,4 +309,5 @@ def _about(normal: Directions, to_light: Directions, to_view: Directions) -> tup
     axis, light, view = _split(normal, to_light, to_view)
     total, difference = light + view, light - view
     excess = 0.25 * (difference @ total)
-    return axis, light @ view, total.less(difference.value * excess), difference.less(total.value * excess)
+    light, view = light - Components.of(to_light) * excess, view + Components.of(to_view) * excess
+    return axis, light @ view, light + view, light - view
