@@ -20,7 +20,7 @@ from numpy.polynomial import chebyshev
 
 from brdf.checks import Scalar
 from brdf.geometry.rays import Sight, share_seen
-from brdf.geometry.surface_points import Points, SurfacePoints
+from brdf.geometry.surface_points import SurfacePoints
 from brdf.lights.base import Light, Lighting
 from brdf.models import MODELS, Material, SpecularMaterial
 from brdf.precision import pytree
@@ -102,7 +102,7 @@ class LightTerms(NamedTuple):
 
 
 def light_terms(
-    model: OneOf, lighting: Lighting, point: Points, kind: type[Light], samples: tuple[Any, Any, Array]
+    model: OneOf, lighting: Lighting, point: SurfacePoints, kind: type[Light], samples: tuple[Any, Any, Array]
 ) -> LightTerms:
     """The terms of samples of a light.
 
@@ -140,7 +140,7 @@ def is_sampled(lighting: Lighting) -> bool:
     return lighting.samples > STORED_SAMPLES
 
 
-def over_samples(model: OneOf, points: Points, lighting: Lighting, of_terms: Any) -> tuple[Any, Array]:
+def over_samples(model: OneOf, points: SurfacePoints, lighting: Lighting, of_terms: Any) -> tuple[Any, Array]:
     """Add up a function of samples' terms, linear in diffuse and weight, times what the samples emit.
 
     Of many samples all is done for a tile of pixels and a chunk of samples at a time, which the processor's cache
@@ -164,7 +164,7 @@ def over_samples(model: OneOf, points: Points, lighting: Lighting, of_terms: Any
     def together(one: Any, other: Any) -> tuple[Any, Array]:
         return jax.tree.map(jnp.add, one[0], other[0]), jnp.maximum(one[1], other[1])
 
-    def of_tile(tile: Points) -> Any:
+    def of_tile(tile: SurfacePoints) -> Any:
         def add(total: Any, emitted: Array, *samples: Any) -> Any:
             def add_lit(total: Any) -> Any:
                 terms = light_terms(model, lighting, tile, *samples)
@@ -182,23 +182,19 @@ def over_samples(model: OneOf, points: Points, lighting: Lighting, of_terms: Any
     if is_sampled(lighting):
         sums, peak = _by_tiles(of_tile, flat)
     else:
-        parts = []
-        for emitted, program, samples in _programs(model, flat, lighting):
-            parts.append(added(_times_emitted, emitted, _joined(jax.lax.map(program, samples))))
+        parts = (added(_times_emitted, *one) for one in _terms_of_all(model, flat, lighting))
         sums, peak = functools.reduce(together, parts)
     return jax.tree.map(points.per_pixel, sums), jnp.max(peak.reshape(-1, points.each), axis=1)
 
 
-def _programs(model: OneOf, points: Points, lighting: Lighting) -> Iterator[tuple[Array, Callable[..., Any], Any]]:
-    """Of the lights of each kind what the samples emit, (S, C), what makes terms of a chunk of them, and the chunks."""
+def _terms_of_all(
+    model: OneOf, points: SurfacePoints, lighting: Lighting
+) -> Iterator[tuple[Float[Array, "S C"], LightTerms]]:
+    """Of the lights of each kind what the samples emit, and their terms."""
     for stack in lighting.stacks:
         emitted, chunks = stack.chunks(CHUNK)
-        yield emitted.reshape(-1, emitted.shape[-1]), partial(light_terms, model, lighting, points, stack.kind), chunks
-
-
-def _joined(terms: LightTerms) -> LightTerms:
-    """Of the samples of all chunks, (S, P)."""
-    return jax.tree.map(lambda one: one.reshape(-1, one.shape[-1]), terms)
+        terms = jax.lax.map(partial(light_terms, model, lighting, points, stack.kind), chunks)
+        yield jax.tree.map(lambda one: one.reshape(-1, one.shape[-1]), (emitted, terms))
 
 
 def over_chunks(add: Callable[..., Any], lighting: Lighting, size: int, total: Any) -> Any:
@@ -227,7 +223,7 @@ def _emitted(emitted: Array, value: Array) -> Array:
     return jnp.matmul(rows, value, precision="highest")[: emitted.shape[1]]
 
 
-def _by_tiles(of_tile: Callable[[Points], Any], points: Points) -> Any:
+def _by_tiles(of_tile: Callable[[SurfacePoints], Any], points: SurfacePoints) -> Any:
     """``of_tile`` of all points, tile by tile; the last point fills up the last tile."""
     count = points.mask.size
     tiles = -(-count // TILE)
@@ -442,8 +438,7 @@ def diffuse_and_kept(model: OneOf, sight: Sight, lighting: Lighting) -> tuple[Ar
     """The diffuse basis of pixels, and the lobe of the terms of all samples."""
     points = sight.in_components()
     diffuse, kept = jnp.zeros(()), []
-    for emitted, program, samples in _programs(model, points.flat(), lighting):
-        terms = _joined(jax.lax.map(program, samples))
+    for emitted, terms in _terms_of_all(model, points.flat(), lighting):
         diffuse = diffuse + _times_emitted(emitted, terms.diffuse)
         # Of few samples each is an array of its own, which takes less time to read; of an averaged pixel all are one.
         step = len(emitted) if is_sampled(lighting) or points.each > 1 else 1

@@ -20,13 +20,13 @@ from jaxtyping import Array, Bool
 
 from brdf.geometry.camera import Camera
 from brdf.geometry.shapes import Shape
-from brdf.geometry.surface_points import NO_SHAPE, Points, SurfacePoints
+from brdf.geometry.surface_points import NO_SHAPE, SurfacePoints
 from brdf.precision import apart, pytree
 from brdf.vectors import Components, largest, select
 
 
 @jax.jit
-def trace(camera: Camera, shapes: tuple[Shape, ...], column: Any, row: Any) -> Points:
+def trace(camera: Camera, shapes: tuple[Shape, ...], column: Any, row: Any) -> SurfacePoints:
     """What the rays through places of the picture meet first.
 
     A program of its own also inside others: what it does is found out once for all of them.
@@ -51,7 +51,7 @@ def trace(camera: Camera, shapes: tuple[Shape, ...], column: Any, row: Any) -> P
         has_facets |= hit.shading is not None
         facet = select(nearer, hit.normal, facet)
         normal = select(nearer, hit.normal if hit.shading is None else hit.shading, normal)
-    return Points(position, normal, camera.to_view(position), mask, index, facet=facet if has_facets else None)
+    return SurfacePoints(position, normal, camera.to_view(position), mask, index, facet=facet if has_facets else None)
 
 
 OFFSET = 300
@@ -59,7 +59,7 @@ OFFSET = 300
 
 
 def share_seen(
-    occluders: tuple[Shape, ...], point: Points, to_light: Components, distance: Array, radius: Array | None
+    occluders: tuple[Shape, ...], point: SurfacePoints, to_light: Components, distance: Array, radius: Array | None
 ) -> Array:
     """The share of a light sample that points see between the shapes: 0 or 1 for a sample without a radius.
 
@@ -118,7 +118,7 @@ class PrimaryRays:
         """How many rays there are."""
         return self.camera.resolution[0] * self.height
 
-    def in_components(self) -> Points:
+    def in_components(self) -> SurfacePoints:
         """What they meet, (rows, W), made once however often it is read."""
         return apart(trace, self.camera, self.shapes, *self.places)
 

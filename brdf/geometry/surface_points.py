@@ -1,5 +1,7 @@
 """What the pixels of a picture see."""
 
+import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -11,7 +13,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from brdf.checks import direction_value
 from brdf.errors import InputError
-from brdf.precision import pytree
 from brdf.vectors import Components
 
 NO_SHAPE = -1
@@ -33,6 +34,9 @@ class PixelArea(eqx.Module):
 class SurfacePoints(eqx.Module):
     """What the pixels see: one surface point each.
 
+    Programs compute with vectors in `Components`, of which one that is the same for all points, as where the eye is
+    infinitely far, may be a single number.
+
     Attributes:
         position: (..., 3), world units.
         normal: (..., 3), unit.
@@ -52,14 +56,14 @@ class SurfacePoints(eqx.Module):
         ((32, 32, 3), 656)
     """
 
-    position: Float[Array, "*pixels 3"]
-    normal: Float[Array, "*pixels 3"]
-    to_view: Float[Array, "*pixels 3"]
+    position: Float[Any, "*pixels 3"]
+    normal: Float[Any, "*pixels 3"]
+    to_view: Float[Any, "*pixels 3"]
     mask: Bool[Array, "*pixels"]
     shape: Int[Array, "*pixels"] | None = None
     visibility: Float[Array, "*pixels L"] | None = None
     area: PixelArea | None = None
-    facet: Float[Array, "*pixels 3"] | None = None
+    facet: Float[Any, "*pixels 3"] | None = None
     share: Float[Array, "K M"] | None = None
 
     @property
@@ -76,11 +80,32 @@ class SurfacePoints(eqx.Module):
         """These points, as those that `brdf.geometry.rays.PrimaryRays` meet."""
         return self
 
-    def in_components(self) -> "Points":
+    def in_components(self) -> "SurfacePoints":
         """The same points, without areas, as programs compute with them."""
-        position, normal, to_view = map(Components.of, (self.position, self.normal, self.to_view))
-        facet, more = None if self.facet is None else Components.of(self.facet), (self.shape, self.visibility)
-        return Points(position, normal, to_view, self.mask, *more, facet, self.share)
+        return self._with_vectors(Components.of)
+
+    def stacked(self) -> "SurfacePoints":
+        """The same, whose vectors were in components, as arrays."""
+        return self._with_vectors(lambda vector: vector.stacked(self.mask.shape))
+
+    def _with_vectors(self, change: Callable[[Any], Any]) -> "SurfacePoints":
+        names = "position", "normal", "to_view", "facet"
+        vectors = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        return dataclasses.replace(self, area=None, **{name: change(vector) for name, vector in vectors.items()})
+
+    def flat(self) -> "SurfacePoints":
+        """In components, as one row, (P,)."""
+        pixels = self.mask.ndim
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[pixels:]) if leaf.ndim else leaf, self)
+
+    @property
+    def each(self) -> int:
+        """How many points a pixel has."""
+        return 1 if self.share is None else self.mask.shape[-1]
+
+    def per_pixel(self, values: Array) -> Array:
+        """The sums of (P, C) values of points over those of each pixel."""
+        return jnp.sum(values.reshape(-1, self.each, values.shape[-1]), axis=1) if self.each > 1 else values
 
     def pixels(self, index: Any = slice(None)) -> "SurfacePoints":
         """Some of the pixels of a picture without areas, by their indices row by row."""
@@ -132,41 +157,3 @@ class SurfacePoints(eqx.Module):
             "to_view": np.where(inside, to_view / np.where(view_length > 0, view_length, 1.0), upward),
         }
         return cls(**values, mask=seen)
-
-
-@pytree
-class Points:
-    """Surface points as programs compute with them: see `SurfacePoints`, whose numbers these are.
-
-    A component that is the same for all of them, as where the eye is infinitely far, may be a single number.
-    """
-
-    position: Components
-    normal: Components
-    to_view: Components
-    mask: Array
-    shape: Array | None = None
-    visibility: Array | None = None
-    facet: Components | None = None
-    share: Array | None = None
-
-    def stacked(self) -> SurfacePoints:
-        """The same as arrays."""
-        facet, vectors = self.facet, (self.position, self.normal, self.to_view)
-        position, normal, to_view = (vector.stacked(self.mask.shape) for vector in vectors)
-        facet = None if facet is None else facet.stacked(self.mask.shape)
-        return SurfacePoints(position, normal, to_view, self.mask, self.shape, self.visibility, facet=facet)
-
-    def flat(self) -> "Points":
-        """As one row, (P,)."""
-        pixels = self.mask.ndim
-        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[pixels:]) if leaf.ndim else leaf, self)
-
-    @property
-    def each(self) -> int:
-        """How many points a pixel has."""
-        return 1 if self.share is None else self.mask.shape[-1]
-
-    def per_pixel(self, values: Array) -> Array:
-        """The sums of (P, C) values of points over those of each pixel."""
-        return jnp.sum(values.reshape(-1, self.each, values.shape[-1]), axis=1) if self.each > 1 else values

@@ -39,7 +39,7 @@ from brdf.checks import (
 )
 from brdf.errors import InputError
 from brdf.geometry.shapes import Parallelogram
-from brdf.geometry.surface_points import Points
+from brdf.geometry.surface_points import SurfacePoints
 from brdf.lights.base import Light, LightSample, Rows
 from brdf.lights.sample_sets import square_rule, turned_rule
 from brdf.vectors import Components, divide, norm, normalize, perpendicular, square_root
@@ -110,7 +110,7 @@ class FlatLight(Light):
     """
 
     @staticmethod
-    def sample(point: Points, *row: Any) -> LightSample:
+    def sample(point: SurfacePoints, *row: Any) -> LightSample:
         """From a node (s, t) of that part of a patch which stands above the horizon."""
         start_0, start_1, edge_0, edge_1, s, t, weight = row
         starts, edges = (start_0, start_1), (edge_0, edge_1)
@@ -282,7 +282,7 @@ class SphereLight(Light):
         return (self.center, self.radius), turned_rule(self.samples, 1 / 4), self.radiance
 
     @staticmethod
-    def sample(point: Points, *row: Any) -> LightSample:
+    def sample(point: SurfacePoints, *row: Any) -> LightSample:
         """From a patch of the cap of directions, above the horizon."""
         center, radius, s, t, weight = row
         offset = center - point.position

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float, Int
 
 from brdf.checks import Checked, Spectrum
 from brdf.geometry.shapes import Shape
-from brdf.geometry.surface_points import Points
+from brdf.geometry.surface_points import SurfacePoints
 from brdf.precision import pytree
 from brdf.vectors import Components
 
@@ -75,7 +75,7 @@ class Light(Checked):
 
     @staticmethod
     @abc.abstractmethod
-    def sample(point: Points, *row: Any) -> LightSample:
+    def sample(point: SurfacePoints, *row: Any) -> LightSample:
         """What samples send to points; lights with an extent put their samples above the horizon.
 
         Args:

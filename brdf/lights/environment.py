@@ -26,7 +26,7 @@ from jaxtyping import Array, Float
 
 from brdf.checks import Spectrum, checked, sample_number, spectrum
 from brdf.errors import InputError, as_numbers
-from brdf.geometry.surface_points import Points
+from brdf.geometry.surface_points import SurfacePoints
 from brdf.lights.base import Light, LightSample, Rows
 from brdf.lights.sample_sets import turned_rule
 from brdf.vectors import Components, divide, normalize, perpendicular, square_root
@@ -87,7 +87,7 @@ class ConstantEnvironment(Light):
         return (), (*rule, lobe_only), self.radiance
 
     @staticmethod
-    def sample(point: Points, *row: Any) -> LightSample:
+    def sample(point: SurfacePoints, *row: Any) -> LightSample:
         """From a patch of the hemisphere above the point."""
         s, t, weight, lobe_only = row
         normal, to_view = point.normal, point.to_view
@@ -174,7 +174,7 @@ class EnvironmentMap(Light):
         return (), (mean, *(covariance[:, axis] for axis in range(3))), self.radiance * intensity
 
     @staticmethod
-    def sample(point: Points, *row: Any) -> LightSample:
+    def sample(point: SurfacePoints, *row: Any) -> LightSample:
         """The same at every point: the light of one rectangle of the map."""
         mean, *covariance = row
         (xx, _, _), (_, yy, _), (_, _, zz) = covariance

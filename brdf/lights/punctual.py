@@ -9,7 +9,7 @@ import numpy as np
 
 from brdf.checks import Scalar, Spectrum, Vector, checked, direction_value, number, spectrum, vector
 from brdf.errors import InputError
-from brdf.geometry.surface_points import Points
+from brdf.geometry.surface_points import SurfacePoints
 from brdf.lights.base import Light, LightSample
 from brdf.vectors import cosine_lobe, divide, norm, normalize
 
@@ -36,7 +36,7 @@ class DirectionalLight(Light):
     type_name = "directional"
 
     @staticmethod
-    def sample(point: Points, *row: Any) -> LightSample:
+    def sample(point: SurfacePoints, *row: Any) -> LightSample:
         """The same at every point."""
         (direction,) = row
         return LightSample(normalize(direction), 1.0, jnp.asarray(jnp.inf))
@@ -76,7 +76,7 @@ class PointLight(Light):
     type_name = "point"
 
     @staticmethod
-    def sample(point: Points, *row: Any) -> LightSample:
+    def sample(point: SurfacePoints, *row: Any) -> LightSample:
         """From the light's distance and direction."""
         position, (a, b, c) = row
         offset = position - point.position
@@ -125,7 +125,7 @@ class SpotLight(Light):
             raise InputError("cutoff_angle", what, "A spot of more than 90 degrees is a point light")
 
     @staticmethod
-    def sample(point: Points, *row: Any) -> LightSample:
+    def sample(point: SurfacePoints, *row: Any) -> LightSample:
         """A point light's, times the spot's factor."""
         position, direction, cutoff_angle, exponent, attenuation = row
         sample = PointLight.sample(point, position, attenuation)
