@@ -221,7 +221,6 @@ def render(material: Material, scene: Scene, *, precision: Precision | None = No
         shape = _shape(material, scene)
         scene, points = _seen(scene, precision)
         lighting = _lighting(scene, points)
-        _check_reach(material, jnp.result_type(float))
         material = cast(material, precision)
         image = _shade(material, points, scene.ambient, lighting)
         return jnp.zeros(shape) if image is None else image
@@ -240,7 +239,7 @@ def render_lights(material: Material, scene: Scene, *, precision: Precision | No
         ambient light where the scene has any.
 
     Raises:
-        InputError: where material and light differ in their channels.
+        InputError: as for `brdf.render`.
 
     Example:
         >>> images = brdf.render_lights(brdf.preset("gold"), brdf.Scene.load("scene.toml"))
@@ -289,14 +288,6 @@ def relight(images: Float[ArrayLike, "L H W C"], factors: ArrayLike) -> Float[Ar
     return jnp.sum(images * factors.reshape(lights, 1, 1, -1), axis=0)
 
 
-def _check_reach(material: Material, dtype: np.dtype) -> None:
-    for name in ("k_a", "k_d", "k_s"):
-        value = getattr(material, name, None)
-        if isinstance(value, np.ndarray) and np.any(value > np.finfo(dtype).max):
-            what = f"is out of reach of {dtype.name}, got {np.max(value):g}"
-            raise InputError(name, what, "Use another unit of light, or float64")
-
-
 def _seen(scene: Scene, precision: Precision | None) -> tuple[Scene, Sight]:
     """A scene in a precision, and what each pixel sees.
 
@@ -313,7 +304,7 @@ def _seen(scene: Scene, precision: Precision | None) -> tuple[Scene, Sight]:
 
 
 def _shape(material: Material, scene: Scene) -> tuple[int, int, int]:
-    """Height, width and channels of a material's picture."""
+    """Height, width and channels of a material's picture, in the working precision."""
     words = "Write brdf.render(material, scene)"
     instance("material", material, Material, words)
     instance("scene", scene, Scene, words)
@@ -322,5 +313,10 @@ def _shape(material: Material, scene: Scene) -> tuple[int, int, int]:
     if own != lit and 1 not in (own, lit):
         what = f"has {own} channels, the light has {lit}"
         raise InputError("material", what, "Give both the same number, or one of them a single channel")
+    dtype = jnp.result_type(float)
+    for name, value in vars(material).items():
+        if isinstance(value, np.ndarray) and np.any(value > np.finfo(dtype).max):
+            what = f"is out of reach of {dtype.name}, got {np.max(value):g}"
+            raise InputError(name, what, "Use another unit of light, or float64")
     width, height = scene.resolution
     return height, width, max(own, lit)

@@ -202,6 +202,8 @@ def _corner(word: str, vertices: int, normals: int) -> tuple[int, int]:
     index, normal = int(vertex), int(rest.partition("/")[2] or 0)
     if not index:
         raise ValueError("there is no vertex 0, they count from 1")
+    if normal < -normals:
+        raise ValueError(f"there are {normals} normals before it")
     return index - 1 if index > 0 else vertices + index, normal - 1 if normal >= 0 else normals + normal
 
 

@@ -131,7 +131,7 @@ class EnvironmentMap(Light):
 
     Args:
         pixels: (H, W, C) radiance. What is negative or not finite counts as 0, with a warning.
-        radiance: (C,), what multiplies the map; (1,) brightens or darkens it.
+        radiance: (C,), what multiplies the map; (1,) brightens or darkens it, several colour a map of one channel.
         samples: how many light samples at most.
 
     Raises:
@@ -154,9 +154,9 @@ class EnvironmentMap(Light):
         """Take a map's colour out where it has only one, and cut it up."""
         self.samples = sample_number(samples)
         pixels, factor = _checked(pixels), spectrum("radiance", radiance)
-        channels = pixels.shape[2]
-        if factor.shape[0] not in (1, channels):
-            what = f"has {factor.shape[0]} channels, the map {channels}"
+        own, channels = factor.size, pixels.shape[2]
+        if own != channels and 1 not in (own, channels):
+            what = f"has {own} channels, the map {channels}"
             raise InputError("radiance", what, "Give one factor, or one per channel of the map")
         # normalised by each channel's mean, so that the emittance tells the colour of the light
         energy = pixels * _solid_angles(*pixels.shape[:2])[..., None]

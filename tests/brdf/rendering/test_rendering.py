@@ -207,3 +207,10 @@ def test_one_program_under_many_samples_serves_every_lobe_and_number(model):
         more = dataclasses.replace(scene, lights=(dataclasses.replace(light, samples=samples), scene.lights[1]))
         brdf.basis_images(other, more, 30.0)
     assert rendering._basis_images._cache_size() == before
+
+
+@pytest.mark.parametrize("draw", [brdf.render, brdf.render_lights])
+def test_a_coefficient_that_the_precision_cannot_hold_is_refused(draw):
+    scene = ball(1, 8)
+    with pytest.raises(brdf.InputError, match=r"k_d: is out of reach of float32, got 1e\+60"):
+        draw(brdf.Lambert(k_d=1e60), scene, precision="float32")
