@@ -187,11 +187,8 @@ def spectrum(name: str, value: Any, largest: float = LARGEST) -> Any:
 
 def vertex_list(name: str, value: Any) -> Any:
     """Corners of a polygon: three points or more."""
-
-    def fits(count=0, axes=0, *more) -> bool:
-        return count >= 3 and axes == 3 and not more
-
-    return _shaped(name, value, fits, "three points or more", "Give [[x, y, z], ...]")
+    words, remedy = "three points or more", "Give [[x, y, z], ...]"
+    return _shaped(name, value, lambda count=0, *axes: count >= 3 and axes == (3,), words, remedy)
 
 
 def sample_number(value: Any, most: int = MAX_SAMPLES) -> int:
@@ -221,10 +218,7 @@ def coefficients(**given: Any) -> list[Array | np.ndarray]:
             sizes = ", ".join(f"{n} {v.size}" for n, v in arrays.items())
             what = f"the coefficients differ in their number of channels ({sizes})"
             raise InputError(name, what, "Give each the same")
-    return [
-        (np if isinstance(array, np.ndarray) else jnp).broadcast_to(array, (channels,)).copy()
-        for array in arrays.values()
-    ]
+    return [array.repeat(channels // array.size) for array in arrays.values()]
 
 
 def exponent(given: Any) -> Array | np.ndarray:

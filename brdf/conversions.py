@@ -15,9 +15,9 @@ from jaxtyping import Float
 
 from brdf import vectors
 from brdf.albedo import gauss_legendre, lobe_albedo, normalized_form
-from brdf.checks import instance
 from brdf.errors import InputError
 from brdf.models import BlinnPhong, Lambert, Material, NormalizedPhong, Phong, SpecularMaterial
+from brdf.models.base import check_single
 from brdf.precision import working_precision
 from brdf.vectors import Numbers, Scalars
 
@@ -165,7 +165,7 @@ def nearest_normalized(material: Material) -> Material:
         >>> brdf.nearest_normalized(brdf.Phong(k_d=0.3, k_s=0.5, n=50))
         NormalizedPhong(k_a=[0], k_d=[0.3...], k_s=[0...], n=50)
     """
-    instance("material", material, Material, "Write brdf.nearest_normalized(material)")
+    check_single(material, "Write brdf.nearest_normalized(material)")
     if not isinstance(material, SpecularMaterial):
         return Lambert(k_a=material.k_a, k_d=np.clip(np.asarray(material.k_d), 0.0, 1.0))
     return _nearest(material, normalized_form(type(material)), bounded=True)
@@ -184,7 +184,7 @@ def nearest_classic(material: Material) -> Material:
         >>> brdf.nearest_classic(brdf.NormalizedPhong(k_d=0.3, k_s=0.6, n=50))
         Phong(k_a=[0], k_d=[0.354...], k_s=[10.28...], n=50)
     """
-    instance("material", material, Material, "Write brdf.nearest_classic(material)")
+    check_single(material, "Write brdf.nearest_classic(material)")
     if not isinstance(material, SpecularMaterial):
         return material
     model = Phong if normalized_form(type(material)) is NormalizedPhong else BlinnPhong

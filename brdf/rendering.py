@@ -306,9 +306,8 @@ def _seen(scene: Scene, precision: Precision | None) -> tuple[Scene, Sight]:
 def _shape(material: Material, scene: Scene) -> tuple[int, int, int]:
     """Height, width and channels of a material's picture, in the working precision."""
     words = "Write brdf.render(material, scene)"
-    instance("material", material, Material, words)
+    check_single(material, words, "Write jax.vmap(lambda material: brdf.render(material, scene))(materials)")
     instance("scene", scene, Scene, words)
-    check_single(material, "Write jax.vmap(lambda material: brdf.render(material, scene))(materials)")
     own, lit = material.k_d.shape[0], scene.channels
     if own != lit and 1 not in (own, lit):
         what = f"has {own} channels, the light has {lit}"

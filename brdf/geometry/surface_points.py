@@ -140,20 +140,17 @@ class SurfacePoints(eqx.Module):
             to_view = np.broadcast_to(direction_value("to_view", to_view), normal.shape)
         position = np.zeros(normal.shape) if position is None else np.asarray(position, np.float64)
         seen = np.ones(normal.shape[:2], bool) if mask is None else np.asarray(mask, bool)
-        for name, value, shape in (
-            ("position", position, normal.shape),
-            ("to_view", to_view, normal.shape),
-            ("mask", seen, normal.shape[:2]),
-        ):
+        for name, value in {"position": position, "to_view": to_view, "mask": seen}.items():
+            shape = normal.shape[: 2 if value is seen else 3]
             if value.shape != shape:
                 raise InputError(name, f"must be of shape {shape}, got {value.shape}", "Give a value per pixel")
-        length, view_length = (np.sqrt(np.sum(v * v, axis=-1, keepdims=True)) for v in (normal, to_view))
-        finite = (np.isfinite(value).all(axis=-1) for value in (length, position, to_view))
-        seen = np.logical_and.reduce([seen, length[..., 0] > 0, *finite])
-        upward, inside = np.array([0.0, 0.0, 1.0]), seen[..., None]
-        values: dict[str, Any] = {
-            "position": np.where(inside, position, 0.0),
-            "normal": np.where(inside, normal / np.where(inside, length, 1.0), upward),
-            "to_view": np.where(inside, to_view / np.where(view_length > 0, view_length, 1.0), upward),
-        }
-        return cls(**values, mask=seen)
+        length, view_length = (np.linalg.norm(v, axis=-1, keepdims=True) for v in (normal, to_view))
+        finite = np.isfinite(np.concatenate([length, position, to_view], axis=-1)).all(axis=-1)
+        seen = seen & (length[..., 0] > 0) & finite
+        inside, upward = seen[..., None], [0.0, 0.0, 1.0]
+        return cls(
+            np.where(inside, position, 0.0),
+            np.where(inside, normal / np.where(inside, length, 1.0), upward),
+            np.where(inside, to_view / np.where(view_length > 0, view_length, 1.0), upward),
+            seen,
+        )

@@ -175,9 +175,8 @@ def stacked(
         places, rows = zip(*members, strict=True)
         numbers, nodes, emitted = jax.tree.map(lambda *values: _stack(values, dtype), *rows)
         samples = nodes[0].shape[1]
-        xp: Any = np if isinstance(emitted, np.ndarray) else jnp
-        each = emitted[:, None] if emitted.ndim == 2 else emitted
-        emitted = xp.broadcast_to(each, (len(places), samples, each.shape[-1]))
+        each = emitted.reshape(len(places), -1, emitted.shape[-1])
+        emitted = each.repeat(samples // each.shape[1], axis=1)
         if samples > fill_above and all(isinstance(one, np.ndarray) for one in (*nodes, emitted)):
             more = [(0, 0), (0, -samples % FILLED)]
             *nodes, emitted = (np.pad(one, more + [(0, 0)] * (one.ndim - 2), mode="edge") for one in (*nodes, emitted))

@@ -28,7 +28,6 @@ from xml.etree import ElementTree
 import numpy as np
 from jaxtyping import Float
 
-from brdf.checks import instance
 from brdf.conversions import (
     mirror_from_half,
     nearest_classic,
@@ -100,8 +99,7 @@ def export_material(material: Material, to: str, *, name: str = "fitted", note: 
         >>> export.losses[0]
         'k_a is left out: the format has no ambient coefficient'
     """
-    instance("material", material, Material, "Write brdf.export_material(material, to)")
-    check_single(material)
+    check_single(material, "Write brdf.export_material(material, to)")
     if to not in EXPORTS:
         raise InputError("to", f"is unknown, got {to!r}", f"Use one of {', '.join(EXPORTS)}")
     channels = np.asarray(material.k_d).size

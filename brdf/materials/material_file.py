@@ -15,7 +15,6 @@ import jax
 import numpy as np
 
 from brdf.arguments import Table
-from brdf.checks import instance
 from brdf.errors import InputError
 from brdf.files import as_path, read_text, write_text
 from brdf.materials.mtl import SHOWN, material_from_mtl, read_mtl, to_mtl
@@ -108,8 +107,7 @@ def save_material(material: Material, path: str | Path, *, undetermined: Mapping
     Example:
         >>> brdf.save_material(brdf.preset("gold"), "gold.mtl")
     """
-    instance("material", material, Material, "Write brdf.save_material(material, path)")
-    check_single(material)
+    check_single(material, "Write brdf.save_material(material, path)")
     channels, values = material.k_d.size, material_to_dict(material, undetermined=undetermined)
     if _suffix(path, "Name it .json or .mtl") == ".json":
         text = json.dumps(values, indent=2) + "\n"

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from brdf.errors import InputError
-from brdf.measured.table import Grid, MeasuredBRDF, half_angle_grid, half_frame, sampled
+from brdf.measured.table import Grid, MeasuredBRDF, half_angle_grid, half_frame, sampled, to_angles
 
 SHAPE = (90, 90, 180)
 SCALES = np.array([1.0 / 1500.0, 1.15 / 1500.0, 1.66 / 1500.0])
@@ -86,9 +86,8 @@ def merl_table(f_r: Callable[[Any, Any], Any], *, name: str = "table") -> Measur
 
 def _look_up(values, to_light, to_view):
     """The entry that directions fall into, as the published reader does it."""
-    x, y, z = np.moveaxis(to_light + to_view, -1, 0)
-    theta_h, phi_h = np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)
-    z, x, y = (np.sum(axis * to_light, axis=-1) for axis in half_frame(theta_h, phi_h))
-    theta_d, phi_d = np.degrees(np.arctan2(np.hypot(x, y), z)), np.degrees(np.arctan2(y, x) % np.pi)
-    position = SHAPE[0] * (theta_h / (0.5 * np.pi)) ** 0.5, theta_d, phi_d
+    theta_h, phi_h = to_angles(to_light + to_view)
+    half, down, across = half_frame(theta_h, phi_h)
+    theta_d, phi_d = to_angles(np.stack([np.sum(axis * to_light, axis=-1) for axis in (down, across, half)], axis=-1))
+    position = SHAPE[0] * (theta_h / (0.5 * np.pi)) ** 0.5, np.degrees(theta_d), np.degrees(phi_d % np.pi)
     return values[np.ravel_multi_index(np.floor(position).astype(int), SHAPE, mode="clip")]

@@ -136,6 +136,12 @@ def from_angles(polar: Any, azimuth: Any) -> Vectors:
     return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine], axis=-1)
 
 
+def to_angles(vectors: Any) -> tuple[Any, Any]:
+    """Angles in radians of vectors of any length, the inverse of `from_angles`; the azimuth from -pi to pi."""
+    x, y, z = np.moveaxis(np.asarray(vectors), -1, 0)
+    return np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)
+
+
 def from_half_angles(theta_h: Any, theta_d: Any, phi_d: Any, phi_h: Any = 0.0) -> tuple[Vectors, Vectors]:
     """Light and view directions from Rusinkiewicz' angles.
 

@@ -26,7 +26,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from brdf import formatters, vectors
-from brdf.checks import Checked, Parameter, coefficients, exponent
+from brdf.checks import Checked, Parameter, coefficients, exponent, instance
 from brdf.errors import InputError
 from brdf.vectors import Directions, Numbers, Scalars
 
@@ -151,12 +151,20 @@ class SpecularMaterial(Material):
         return jnp.where(above, self.scale(self.n) * lobe, 0.0)
 
 
-def check_single(material: "Material", remedy: str = "Give one: jax.tree.map(lambda leaf: leaf[0], materials)") -> None:
-    """Refuse several materials in one.
+def check_single(
+    material: Any, usage: str, remedy: str = "Give one: jax.tree.map(lambda leaf: leaf[0], materials)"
+) -> None:
+    """Refuse what is no material, and several in one.
+
+    Args:
+        material: what came.
+        usage: what to write instead of what is none.
+        remedy: what to do with several.
 
     Raises:
-        InputError: where it is such a stack.
+        InputError: where it is no material or such a stack.
     """
+    instance("material", material, Material, usage)
     if jnp.ndim(material.k_d) != 1:
         raise InputError("material", f"is a stack of {jnp.shape(material.k_d)[0]} materials", remedy)
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from brdf import formatters
 from brdf.materials.material_file import material_to_dict
+from brdf.measured.table import to_angles
 from brdf.models import Material
 
 Verdict = Literal["pass", "fail", "cannot tell"]
@@ -38,8 +39,8 @@ class Angles:
     @classmethod
     def of(cls, direction: Any) -> "Angles":
         """The angles of a direction, (3,)."""
-        x, y, z = map(float, direction)
-        return cls(math.degrees(math.atan2(math.hypot(x, y), z)), math.degrees(math.atan2(y, x)) % 360.0)
+        polar, azimuth = map(math.degrees, to_angles(direction))
+        return cls(polar, azimuth % 360.0)
 
     def __str__(self) -> str:
         """The angles with a degree sign, below 90 where they are; the azimuth only where it is not zero."""

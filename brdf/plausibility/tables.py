@@ -11,7 +11,7 @@ from functools import partial
 
 import numpy as np
 
-from brdf.measured.table import Evaluation, MeasuredBRDF, from_angles
+from brdf.measured.table import Evaluation, MeasuredBRDF, from_angles, to_angles
 from brdf.plausibility.numeric import MIRRORED, integrate
 from brdf.plausibility.report import ENERGY_LIMIT, Angles, Finding, Report, judged, largest
 
@@ -59,8 +59,7 @@ def _pairs(samples: MeasuredBRDF, *, exchanged: bool) -> tuple[np.ndarray, np.nd
     cannot tell.
     """
     light, view, values = samples.to_light, samples.to_view, samples.values
-    a, b = (np.arctan2(np.hypot(v[:, 0], v[:, 1]), v[:, 2]) for v in (light, view))
-    start, end = (np.arctan2(v[:, 1], v[:, 0]) for v in (light, view))
+    (a, start), (b, end) = map(to_angles, (light, view))
     if samples.evaluate is not None:
         first = np.arange(len(light))
         repeated = samples.evaluate(*((view, light) if exchanged else (light, from_angles(b, 2 * start - end))))

@@ -35,7 +35,7 @@ def check(brdf: Material | MeasuredBRDF | Callable[[Any, Any], Any], *, name: st
         (False, 'fail')
     """
     if isinstance(brdf, Material):
-        check_single(brdf)
+        check_single(brdf, "Write brdf.check(material)")
         if type(brdf) in KNOWN:
             return check_material(brdf, name or repr(brdf))
         return check_black_box(brdf.reflectance, name or repr(brdf))

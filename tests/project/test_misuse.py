@@ -22,6 +22,7 @@ MISUSES = {
     "brdf.render(stack, scene)": r"material: is a stack of 2 materials\. Write jax\.vmap\(lambda material:",
     "brdf.check(stack)": r"material: is a stack of 2 materials\. Give one: jax\.tree\.map",
     "brdf.export_material(stack, 'three')": r"material: is a stack of 2 materials\. Give one",
+    "brdf.nearest_classic(stack)": r"material: is a stack of 2 materials\. Give one",
     "brdf.save_material(stack, 'stack.mtl')": r"material: is a stack of 2 materials\. Give one",
     "brdf.render(material, scene, precision='double')": r"precision: is unknown, got 'double'\. Use float32 or float64",
     "brdf.render(brdf.Lambert(k_d=[0.5, 0.5]), scene)": r"material: has 2 channels, the light has 3\. Give both",
