@@ -81,7 +81,8 @@ def lobe_albedo(model: type[SpecularMaterial], n: Numbers, theta: Numbers) -> Sc
         (...), the integral over all V of S (N.V) / pi (classic forms) or of S (N.V) / (pi N.L) (normalised forms).
     """
     normalised = normalized_form(model)
-    albedo = (_phong_albedo if normalised is NormalizedPhong else _blinn_phong_albedo)(n, theta)
+    formula = _phong_albedo if normalised is NormalizedPhong else _blinn_phong_albedo
+    albedo = formula(*jnp.broadcast_arrays(n, theta))
     return albedo if model.cosine_weighted else albedo / normalised.scale(n)
 
 
@@ -90,7 +91,7 @@ def normalized_form(model: type[SpecularMaterial]) -> type[SpecularMaterial]:
     return NormalizedPhong if issubclass(model, Phong | NormalizedPhong) else NormalizedBlinnPhong
 
 
-def _phong_albedo(n: Numbers, theta: Numbers) -> Array:
+def _phong_albedo(n: Array, theta: Array) -> Array:
     """Albedo of the normalised Phong lobe.
 
     With c = cos theta, s = sin theta, W = B((n+1)/2, 1/2), which is the integral of sin^n over (0, pi), and J_m, the
@@ -100,7 +101,6 @@ def _phong_albedo(n: Numbers, theta: Numbers) -> Array:
 
     J and W are taken at exponents raised by 2 and 4, where their integrands are smooth for every n >= 0.
     """
-    n, theta = jnp.broadcast_arrays(jnp.asarray(n), jnp.asarray(theta))
     cosine, sine = jnp.maximum(jnp.cos(theta), 0.0), jnp.sin(theta)
     power = jnp.exp((n + 2) * vectors.log_cosine_of(sine, cosine))  # s^(n+2)
     inner = ((n + 3) * _cosine_power(n + 3, 0.5 * math.pi - theta) - power * cosine) / (n + 2)
@@ -117,7 +117,7 @@ def _cosine_power(m: Array, upper: Array) -> Array:
     return jnp.sum(weights * end * jnp.exp(m[..., None] * vectors.log_cosine_of(jnp.cos(x), jnp.sin(x))), axis=-1)
 
 
-def _blinn_phong_albedo(n: Numbers, theta: Numbers) -> Array:
+def _blinn_phong_albedo(n: Array, theta: Array) -> Array:
     """Albedo of the normalised Blinn-Phong lobe.
 
     Integrated over half vectors H in polar coordinates (alpha, phi) about the normal, with dV = 4 (L.H) dH. At given
@@ -125,7 +125,6 @@ def _blinn_phong_albedo(n: Numbers, theta: Numbers) -> Array:
     alpha < 45 deg - theta/2 and 0 for alpha > 45 deg + theta/2, and behaves like a square root at both ends of what
     lies between, which a sin^2 substitution takes away.
     """
-    n, theta = jnp.broadcast_arrays(jnp.asarray(n), jnp.asarray(theta))
     theta = theta[..., None]
     nodes, weights = (jnp.asarray(x, theta.dtype) for x in gauss_legendre(_NODES))
     reach = _REACH / vectors.square_root(n + 1)[..., None]

@@ -337,12 +337,9 @@ class Lobe:
             points, of_terms = self.source[0].in_components(), partial(_relative, n, peak)
             value, slope = over_samples(OneOf((self.model,)), points, self.source[1], of_terms)[0]
         else:
-            values, slopes = [], []
-            for weight, log_cosine in self.kept:
-                power, change = _powers(n, peak, log_cosine)
-                values.append(_over_samples(weight, power))
-                slopes.append(_over_samples(weight, change))
-            value, slope = functools.reduce(operator.add, values), functools.reduce(operator.add, slopes)
+            terms = ((weight, _powers(n, peak, log_cosine)) for weight, log_cosine in self.kept)
+            parts = [[_over_samples(weight, one) for one in pair] for weight, pair in terms]
+            value, slope = (functools.reduce(operator.add, one) for one in zip(*parts, strict=True))
         if self.fine is None:
             return value, slope
         fine_value, fine_slope = self.fine(n, peak)

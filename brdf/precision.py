@@ -117,8 +117,4 @@ def apart(function: Callable[..., Any], *arguments: Any) -> Any:
     leaf = next(leaf for leaf in jax.tree.leaves(arguments) if jnp.issubdtype(jnp.result_type(leaf), jnp.floating))
     holds = ~(jnp.ravel(leaf)[0] < -jnp.inf)
     shapes = jax.eval_shape(function, *arguments)
-
-    def otherwise(*_: Any) -> Any:
-        return jax.tree.map(lambda shape: jnp.zeros(shape.shape, shape.dtype), shapes)
-
-    return jax.lax.cond(holds, function, otherwise, *arguments)
+    return jax.lax.cond(holds, function, lambda *_: jax.tree.map(jnp.zeros_like, shapes), *arguments)

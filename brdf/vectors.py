@@ -20,6 +20,7 @@ differentiation gives the derivative of the plain product. In float64 there is n
 
 import dataclasses
 import functools
+import math
 import operator
 from collections.abc import Callable, Iterator
 from functools import partial, partialmethod
@@ -156,6 +157,12 @@ def perpendicular(axis: Any) -> tuple[Any, ...]:
     b = x * y * a
     across, along = (1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
     return tuple(Components(one) if isinstance(axis, Components) else jnp.stack(one) for one in (across, along))
+
+
+def turned(axis: Components, turn: Array) -> Components:
+    """Unit vectors at right angles to unit vectors, turned about these by a share of a whole turn."""
+    across, along = perpendicular(axis)
+    return across * jnp.cos(2 * math.pi * turn) + along * jnp.sin(2 * math.pi * turn)
 
 
 def divide(numerator: ArrayLike, denominator: ArrayLike) -> Array:

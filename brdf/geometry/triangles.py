@@ -17,7 +17,7 @@ import itertools
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -249,8 +249,8 @@ class Triangles(Shape):
         False
     """
 
-    convex: ClassVar[bool] = False
-    rounding: ClassVar[float] = float(np.finfo(np.float32).eps)
+    convex = False
+    rounding = float(np.finfo(np.float32).eps)
     mesh: Mesh = eqx.field(static=True)
 
     def __check_init__(self):

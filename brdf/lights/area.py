@@ -42,7 +42,7 @@ from brdf.geometry.shapes import Parallelogram
 from brdf.geometry.surface_points import SurfacePoints
 from brdf.lights.base import Light, LightSample, Rows
 from brdf.lights.sample_sets import square_rule, turned_rule
-from brdf.vectors import Components, divide, norm, normalize, perpendicular, square_root
+from brdf.vectors import Components, divide, norm, normalize, square_root, turned
 
 SAMPLES = 64
 
@@ -289,8 +289,7 @@ class SphereLight(Light):
         distance, axis = norm(offset), normalize(offset)
         squared_sine = jnp.where(distance > radius, divide(radius * radius, distance * distance), 0.0)
         height = divide(squared_sine, 1.0 + square_root(1.0 - squared_sine))  # 1 - cos, without cancellation
-        across, along = perpendicular(axis)
-        outward = across * jnp.cos(2 * np.pi * t) + along * jnp.sin(2 * np.pi * t)
+        outward = turned(axis, t)
         low, high = _arc_above_horizon(axis @ point.normal, outward @ point.normal, height)
         below_axis = (low + s * (high - low)) * height  # 1 - cos of the angle to the axis
         to_light = axis * (1.0 - below_axis) + outward * square_root(below_axis * (2.0 - below_axis))

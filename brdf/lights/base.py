@@ -187,5 +187,5 @@ def stacked(
 
 
 def _stack(values: Sequence[Any], dtype: Any) -> Any:
-    traced = any(isinstance(value, Tracer) for value in values)
-    return jnp.stack(values).astype(dtype) if traced else np.stack(values).astype(dtype)
+    xp: Any = jnp if any(isinstance(value, Tracer) for value in values) else np
+    return xp.stack(values).astype(dtype)

@@ -29,7 +29,7 @@ from brdf.errors import InputError, as_numbers
 from brdf.geometry.surface_points import SurfacePoints
 from brdf.lights.base import Light, LightSample, Rows
 from brdf.lights.sample_sets import turned_rule
-from brdf.vectors import Components, divide, normalize, perpendicular, square_root
+from brdf.vectors import Components, divide, normalize, square_root, turned
 
 CONSTANT_SAMPLES = 512
 MAP_SAMPLES = 1024
@@ -91,8 +91,7 @@ class ConstantEnvironment(Light):
         """From a patch of the hemisphere above the point."""
         s, t, weight, lobe_only = row
         normal, to_view = point.normal, point.to_view
-        across, along = perpendicular(normal)
-        outward = across * jnp.cos(2 * np.pi * t) + along * jnp.sin(2 * np.pi * t)
+        outward = turned(normal, t)
         even = normal * s + outward * square_root(1.0 - s * s)
         end = 0.25 * np.pi + 0.5 * jnp.arctan2(outward @ to_view, jnp.maximum(normal @ to_view, 1e-6))
         angle = end * jnp.expm1(STEEPNESS * s) / np.expm1(STEEPNESS)
@@ -171,7 +170,7 @@ class EnvironmentMap(Light):
     def rows(self) -> Rows:
         """The rectangles of the map, means and rows of covariances."""
         intensity, mean, covariance = self.patches
-        return (), (mean, *(covariance[:, axis] for axis in range(3))), self.radiance * intensity
+        return (), (mean, *covariance.swapaxes(0, 1)), self.radiance * intensity
 
     @staticmethod
     def sample(point: SurfacePoints, *row: Any) -> LightSample:

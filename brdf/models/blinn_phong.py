@@ -11,7 +11,7 @@
 """
 
 import math
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -34,7 +34,7 @@ class BlinnPhong(SpecularMaterial):
         BlinnPhong(k_a=[0, 0, 0], k_d=[0.4, 0.3, 0.1], k_s=[0.5, 0.5, 0.5], n=50)
     """
 
-    name: ClassVar[str] = "blinn-phong"
+    name = "blinn-phong"
     log_cosine = staticmethod(vectors.half_log_cosine)
 
 
@@ -50,8 +50,8 @@ class NormalizedBlinnPhong(SpecularMaterial):
         True
     """
 
-    name: ClassVar[str] = "normalized-blinn-phong"
-    cosine_weighted: ClassVar[bool] = True
+    name = "normalized-blinn-phong"
+    cosine_weighted = True
     log_cosine = staticmethod(vectors.half_log_cosine)
 
     @staticmethod

@@ -6,8 +6,6 @@
 | k_d | | diffuse coefficient, a number or (C,), at least 0: the albedo | yes |
 """
 
-from typing import ClassVar
-
 from brdf.models.base import Material
 
 
@@ -28,4 +26,4 @@ class Lambert(Material):
         0.159...
     """
 
-    name: ClassVar[str] = "lambert"
+    name = "lambert"

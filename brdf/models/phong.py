@@ -10,8 +10,6 @@
 `Phong`: S = (R.V)+^n. `NormalizedPhong`: S = (n+2)/2 (R.V)+^n (N.L)+.
 """
 
-from typing import ClassVar
-
 import jax.numpy as jnp
 
 from brdf import vectors
@@ -30,7 +28,7 @@ class Phong(SpecularMaterial):
         Phong(k_a=[0], k_d=[0.3], k_s=[0.5], n=50)
     """
 
-    name: ClassVar[str] = "phong"
+    name = "phong"
     log_cosine = staticmethod(vectors.mirror_log_cosine)
 
 
@@ -47,8 +45,8 @@ class NormalizedPhong(SpecularMaterial):
         True
     """
 
-    name: ClassVar[str] = "normalized-phong"
-    cosine_weighted: ClassVar[bool] = True
+    name = "normalized-phong"
+    cosine_weighted = True
     log_cosine = staticmethod(vectors.mirror_log_cosine)
 
     @staticmethod

@@ -7,11 +7,10 @@ or is symmetric by its layout, its noise is not known and the check says so.
 
 import dataclasses
 import math
-from functools import partial
 
 import numpy as np
 
-from brdf.measured.table import Evaluation, MeasuredBRDF, from_angles, to_angles
+from brdf.measured.table import MeasuredBRDF, from_angles, to_angles
 from brdf.plausibility.numeric import MIRRORED, integrate
 from brdf.plausibility.report import ENERGY_LIMIT, Angles, Finding, Report, judged, largest
 
@@ -125,15 +124,13 @@ def _energy(table: MeasuredBRDF) -> Finding:
     if table.evaluate is None:
         return _cannot_tell(ENERGY_LIMIT, "scattered samples do not say how much light they stand for")
     lights = from_angles(np.radians(LIGHTS), 0.0)
-    values = partial(_seen, table.evaluate, lights)
-    albedo, bounds = integrate(values, np.stack([lights * MIRRORED, lights], axis=1), *_QUADRATURE)
+    evaluate, centres = table.evaluate, np.stack([lights * MIRRORED, lights], axis=1)
+    # Of f_r (N.V).
+    albedo, bounds = integrate(
+        lambda which, views: evaluate(lights[which], views) * views[:, 2:], centres, *_QUADRATURE
+    )
     row, channel = largest(albedo)
     value, bound, light = float(albedo[row, channel]), float(bounds[row, channel]), Angles(LIGHTS[row])
     said = f"the largest albedo is {value:.4g} for light {light}, channel {table.channels[channel]}"
     failed = f"does not conserve energy: {said}"
     return judged(value, ENERGY_LIMIT, bound, (light, None, channel), said, failed)
-
-
-def _seen(evaluate: Evaluation, lights: np.ndarray, which: np.ndarray, views: np.ndarray) -> np.ndarray:
-    """f_r (N.V)."""
-    return evaluate(lights[which], views) * views[:, 2:]
