@@ -206,4 +206,5 @@ def _obj(mesh):
 
 def _toml(value: Any) -> str:
     """A TOML value: what JSON and TOML write alike."""
-    return json.dumps(np.asarray(value, dtype=np.float64).tolist() if hasattr(value, "shape") else value)
+    plain = np.asarray(value, np.float64).tolist() if hasattr(value, "shape") else value
+    return json.dumps(plain, ensure_ascii=False)  # JSON's pairs of surrogates are none of TOML's escapes
