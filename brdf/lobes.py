@@ -381,14 +381,14 @@ class Lobe:
 
 def averaged(slot: Any, centre: Any, fine: Any) -> Any:
     """Values at pixels' centres, (P,) or (..., P, C), and in their place those of the pixels that have finer ones."""
-    xp: Any = np if isinstance(fine, np.ndarray) else jnp
+    xp = fine.__array_namespace__()
     axis, has = (0, slot >= 0) if centre.ndim == 1 else (-2, (slot >= 0)[:, None])
     return xp.where(has, xp.take(fine, xp.maximum(slot, 0), axis=axis), centre)
 
 
 def _powers(n: Any, peak: Any, log_cosine: Any) -> tuple[Any, Any]:
     """The lobe of a cosine relative to a peak, and its derivative."""
-    xp: Any = np if isinstance(log_cosine, np.ndarray) else jnp
+    xp = log_cosine.__array_namespace__()
     exponent = xp.minimum(log_cosine - xp.asarray(peak, log_cosine.dtype), 0)
     power = xp.exp(xp.asarray(n, exponent.dtype) * exponent)
     return power, power * exponent
@@ -410,7 +410,7 @@ def _over_samples(weight: Any, value: Any) -> Any:
 
 def _of_table(table: Any, near: Near, n: Any, peak: Any) -> tuple[Any, Any]:
     """The lobe and its derivative by the polynomial through what is tabulated."""
-    xp: Any = np if isinstance(table, np.ndarray) else jnp
+    xp = table.__array_namespace__()
     n, dtype = xp.asarray(n, float if xp is np else None), table.dtype
     value, slope = (xp.einsum("...k,pkc->...pc", one.astype(dtype), table) for one in near.weights(xp, xp.log(n)))
     if n.ndim:

@@ -185,7 +185,7 @@ def _basis_images(model: OneOf, points: Sight, ambient: Any, lighting: Lighting,
 @jax.jit
 def _shade(material: Material, points: Sight, ambient: Any, lighting: Lighting) -> Any:
     """The picture k_a B_a + k_d B_d + k_s B_s of surface points; None where there is no light at all."""
-    n = jnp.asarray(material.n) if isinstance(material, SpecularMaterial) else jnp.ones(())
+    n = jnp.asarray(getattr(material, "n", 1.0))
     images = _basis_images(OneOf((type(material),)), points, ambient, lighting, n)
     terms = (
         (material.k_a, images.ambient),

@@ -23,7 +23,7 @@ import functools
 import math
 import operator
 from collections.abc import Callable, Iterator
-from functools import partial, partialmethod
+from functools import partialmethod
 from typing import Any
 
 import jax
@@ -108,11 +108,6 @@ class Components:
 
 
 Directions = Float[ArrayLike, "*#batch 3"] | Components
-
-
-def select(condition: ArrayLike, a: Components, b: Components) -> Components:
-    """One vector where a condition holds, else the other."""
-    return Components(tuple(map(partial(jnp.where, condition), a, b)))
 
 
 def largest(v: Directions) -> Array:

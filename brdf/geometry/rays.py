@@ -11,6 +11,7 @@ They are exact for pixels that no edge passes, for soft shadows of spheres and r
 
 import dataclasses
 import functools
+from functools import partial
 from typing import Any, ClassVar
 
 import jax
@@ -22,7 +23,7 @@ from brdf.geometry.camera import Camera
 from brdf.geometry.shapes import Shape
 from brdf.geometry.surface_points import NO_SHAPE, SurfacePoints
 from brdf.precision import apart, pytree
-from brdf.vectors import Components, largest, select
+from brdf.vectors import Components, largest
 
 
 @jax.jit
@@ -38,19 +39,16 @@ def trace(camera: Camera, shapes: tuple[Shape, ...], column: Any, row: Any) -> S
         row: in pixels from its upper edge.
     """
     origin, direction = camera.rays(column, row)
-    position, normal, facet, has_facets = origin, -direction, -direction, False
-    distance = jnp.full(jnp.broadcast_shapes(jnp.shape(column), jnp.shape(row)), jnp.inf)
-    mask, index = jnp.zeros(distance.shape, bool), jnp.full(distance.shape, NO_SHAPE, jnp.int32)
+    far = jnp.full(jnp.broadcast_shapes(jnp.shape(column), jnp.shape(row)), jnp.inf)
+    nothing = jnp.zeros(far.shape, bool), jnp.full(far.shape, NO_SHAPE, jnp.int32)
+    nearest, has_facets = (far, *nothing, origin, -direction, -direction), False
     for number, shape in enumerate(shapes):
         hit = shape.intersect(origin, direction)
-        nearer = hit.hit & (hit.distance < distance)
-        distance = jnp.where(nearer, hit.distance, distance)
-        mask = jnp.where(nearer, shape.fitted, mask)
-        index = jnp.where(nearer, number, index)
-        position = select(nearer, hit.position, position)
+        normal = hit.normal if hit.shading is None else hit.shading
+        met = hit.distance, shape.fitted, number, hit.position, normal, hit.normal
+        nearest = jax.tree.map(partial(jnp.where, hit.hit & (hit.distance < nearest[0])), met, nearest)
         has_facets |= hit.shading is not None
-        facet = select(nearer, hit.normal, facet)
-        normal = select(nearer, hit.normal if hit.shading is None else hit.shading, normal)
+    _, mask, index, position, normal, facet = nearest
     return SurfacePoints(position, normal, camera.to_view(position), mask, index, facet=facet if has_facets else None)
 
 

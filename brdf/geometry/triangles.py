@@ -16,6 +16,7 @@ import hashlib
 import itertools
 import os
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from brdf.checks import LARGEST, Scalar, instance
 from brdf.errors import InputError
 from brdf.files import parse_number, read_text
 from brdf.geometry.shapes import Hit, Shape, meet_plane
-from brdf.vectors import Components, normalize, select
+from brdf.vectors import Components, normalize
 
 CREASE = np.radians(30.0)
 """Faces that meet at this angle or more meet in an edge, not in a rounding."""
@@ -277,5 +278,6 @@ class Triangles(Shape):
         if self.mesh.normals is not None:
             a, b, c = corners(self.mesh.normals)
             shading = normalize(a * (1.0 - u - v) + b * u + c * v)
-            shading = select(slope < 0, shading, normal)  # the back is not lit, however its normals lean
+            # The back is not lit, however its normals lean.
+            shading = jax.tree.map(partial(jnp.where, slope < 0), shading, normal)
         return Hit(hit, distance, position, normal, shading)
