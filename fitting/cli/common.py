@@ -197,22 +197,14 @@ def all_devices(devices: str | None) -> Any:
 
     from fitting.solver.devices import core_count
 
-    given = os.environ.get("XLA_FLAGS")
-    flags = given or ""
-    if "xla_force_host_platform_device_count" not in flags:
+    if "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
         # Of the host platform alone: where there is an accelerator it is that that is taken.
-        os.environ["XLA_FLAGS"] = f"{flags} --xla_force_host_platform_device_count={core_count()}".strip()
-
+        with contextlib.suppress(RuntimeError):  # JAX has begun, with the devices that it has
+            jax.config.update("jax_num_cpu_devices", core_count())
     if any(int(os.environ.get(name, "1")) > 1 for name in PROCESSES) and not jax.distributed.is_initialized():
         jax.config.update("jax_cpu_collectives_implementation", "gloo")
         jax.distributed.initialize()
-    mesh = jax.make_mesh((jax.device_count(),), ("pixels",))
-    # What this program starts has devices of its own.
-    if given is None:
-        del os.environ["XLA_FLAGS"]
-    else:
-        os.environ["XLA_FLAGS"] = given
-    return mesh
+    return jax.make_mesh((jax.device_count(),), ("pixels",))
 
 
 def is_first_process(mesh: Any) -> bool:
