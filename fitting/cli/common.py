@@ -20,7 +20,7 @@ import brdf
 from brdf.errors import InputError
 from brdf.files import atomic_folder
 
-# By what Slurm, Open MPI and `jax.distributed` itself say how many processes there are.
+# By what Slurm, Open MPI and, where there is neither, the user say how many processes there are.
 PROCESSES = ("SLURM_NTASKS", "OMPI_COMM_WORLD_SIZE", "JAX_NUM_PROCESSES")
 
 # What help shows that an option takes, where that is no text.
@@ -203,7 +203,10 @@ def all_devices(devices: str | None) -> Any:
             jax.config.update("jax_num_cpu_devices", core_count())
     if any(int(os.environ.get(name, "1")) > 1 for name in PROCESSES) and not jax.distributed.is_initialized():
         jax.config.update("jax_cpu_collectives_implementation", "gloo")
-        jax.distributed.initialize()
+        # JAX reads the address of the first one by itself, and asks Slurm and Open MPI for the rest.
+        names = "JAX_NUM_PROCESSES", "JAX_PROCESS_ID"
+        count, rank = (int(os.environ[name]) if name in os.environ else None for name in names)
+        jax.distributed.initialize(num_processes=count, process_id=rank)
     return jax.make_mesh((jax.device_count(),), ("pixels",))
 
 

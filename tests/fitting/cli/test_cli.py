@@ -2,6 +2,7 @@
 
 import importlib.metadata
 import json
+import socket
 import subprocess
 import sys
 import tomllib
@@ -84,6 +85,21 @@ def test_fit_render_fit_comes_round(folder, capsys):
     status, _, err = run(capsys, "render", "a/material.json", "--scene", folder / "scene.toml", "-o", "again.exr")
     assert status == 0, err
     np.testing.assert_allclose(brdf.read_image("again.exr"), brdf.read_image(folder / "target.exr"), atol=2e-6)
+
+
+def test_two_processes_that_are_told_of_each_other_fit_together(folder, monkeypatch):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        monkeypatch.setenv("JAX_COORDINATOR_ADDRESS", f"127.0.0.1:{free.getsockname()[1]}")
+    monkeypatch.setenv("JAX_NUM_PROCESSES", "2")
+    words = ["fit", folder, "--model", "lambert", "--devices", "all"]
+    pair = []
+    for rank in ("0", "1"):
+        monkeypatch.setenv("JAX_PROCESS_ID", rank)
+        pair.append(command(*words, cwd=folder.parent))
+    ended = [(*one.communicate(timeout=300), one.returncode) for one in pair]
+    assert [status for *_, status in ended] == [0, 0], ended
+    assert [out.count("lambert fitted to") for out, *_ in ended] == [1, 0]  # the first one tells
 
 
 def test_json_goes_to_standard_output(folder, capsys):
