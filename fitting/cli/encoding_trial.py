@@ -7,7 +7,7 @@ leaves is compared in the codes of the file, the same numbers under both, with t
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,7 +16,9 @@ from brdf.errors import InputError
 from brdf.images.encoding import encode
 from fitting.cli.common import named_as
 from fitting.cli.inputs import FitInputs
-from fitting.result import FitResult
+
+if TYPE_CHECKING:
+    from fitting.result import FitResult
 
 # The other encoding is taken where it leaves less than this share of the squares that the assumed one leaves...
 LESS = 0.9
@@ -26,14 +28,11 @@ OTHER: dict[Any, str] = {"linear": "srgb", "srgb": "linear"}
 NAMES: dict[Any, str] = {"linear": "linear", "srgb": "sRGB"}
 
 
-def fit_either(
-    inputs: FitInputs, again: Callable[..., FitInputs], say: Callable[[str], None], **how: Any
-) -> tuple[FitResult, FitInputs]:
-    """Fit, where a file does not say how it is encoded under both interpretations.
+def fit_either(read: Callable[..., FitInputs], say: Callable[[str], None], **how: Any) -> tuple["FitResult", FitInputs]:
+    """Read and fit, where a file does not say how it is encoded under both interpretations.
 
     Args:
-        inputs: as they were read.
-        again: reads them with other encodings, by file.
+        read: the inputs; with other encodings, by file.
         say: what is being done.
         how: further arguments of `fitting.fit`; seconds are shared by the two fits.
 
@@ -43,6 +42,7 @@ def fit_either(
     Raises:
         InputError: naming the file or option.
     """
+    inputs = read()
     count = len(inputs.pictures)
     what = f"fitting {count} pictures" if count > 1 else "fitting"
     if not inputs.silent:
@@ -55,7 +55,7 @@ def fit_either(
     result = _fit(inputs, how)
     say(f"{what} as {NAMES[OTHER[assumed]]}")
     try:
-        others = again({path: OTHER[encoding] for path, encoding in inputs.silent.items()})
+        others = read({path: OTHER[encoding] for path, encoding in inputs.silent.items()})
         other = _fit(others, how)
     except InputError:
         return result, inputs  # under the other encoding it cannot be fitted at all

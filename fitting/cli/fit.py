@@ -4,7 +4,6 @@ import dataclasses
 import functools
 import shlex
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -91,25 +90,36 @@ def fit(
             with named_as({table.name: target[0]}):
                 result: Any = fitting.fit_brdf(table, model, loss=loss or "cosine")
         else:
-            result, inputs = _fit_pictures(
-                target,
-                pictures,
-                noise,
+            from fitting.cli.encoding_trial import fit_either
+            from fitting.cli.inputs import read_inputs
+            from fitting.photographs.light_files import parse_numbers
+
+            result, inputs = fit_either(
+                functools.partial(read_inputs, target, pictures),
                 say,
                 model=model,
                 precision=precision,
                 saturation=pictures.saturation,
                 dark=dark,
+                noise=None if noise is None else tuple(parse_numbers(noise, "--noise", 2, "READ,SHOT")),
                 plausible=plausible,
                 loss=loss or "squared",
                 accuracy=accuracy,
                 seconds=seconds,
                 mesh=mesh,
             )
+            notes = inputs.notes
+            if inputs.light_errors:
+                from fitting.implicit import with_light_errors
+
+                say("carrying the errors of the lights into those of the numbers")
+                try:
+                    result = with_light_errors(result, inputs.light_errors)
+                except InputError:
+                    notes += ("the errors of the numbers are those under this light: its own is not in them",)
             if free:
                 say("fitting jointly")
                 result = _freed(result, inputs, free)
-            notes = inputs.notes
         if not is_first_process(mesh):
             return
         if out is not None:
@@ -133,28 +143,3 @@ def _freed(result: "FitResult", inputs: "FitInputs", names: list[str]) -> "FitRe
     with named_as({"free": "--free"}):
         found = fitting.fit_jointly(inputs.pictures, result.scenes, result.material, names, mask=result.counted)
     return dataclasses.replace(found, candidates=result.candidates)
-
-
-def _fit_pictures(
-    target: Any, pictures: Any, noise: Any, say: Callable[[str], None], **how
-) -> tuple["FitResult", "FitInputs"]:
-    """The fit, and what was fitted with what was found out on the way."""
-    from fitting.cli.inputs import read_inputs
-    from fitting.photographs.light_files import parse_numbers
-
-    read = functools.partial(read_inputs, target, pictures)
-    inputs = read()
-    from fitting.cli.encoding_trial import fit_either
-
-    how["noise"] = None if noise is None else tuple(parse_numbers(noise, "--noise", 2, "READ,SHOT"))
-    result, inputs = fit_either(inputs, read, say, **how)
-    if not inputs.light_errors:
-        return result, inputs
-    from fitting.implicit import with_light_errors
-
-    say("carrying the errors of the lights into those of the numbers")
-    try:
-        return with_light_errors(result, inputs.light_errors), inputs
-    except brdf.InputError:
-        note = "the errors of the numbers are those under this light: its own is not in them"
-        return result, inputs._replace(notes=(*inputs.notes, note))

@@ -14,7 +14,7 @@ from brdf.errors import InputError
 from brdf.files import input_file, read_toml
 from fitting.cli.common import PictureOptions, named_as
 from fitting.photographs.archives import read_archive
-from fitting.photographs.ball import Circle, ball_normals, ball_points, ball_seen, find_circle
+from fitting.photographs.ball import Circle, ball_points, ball_seen, find_circle
 from fitting.photographs.light_files import parse_numbers, read_directions, read_intensities
 
 # Of each kind of input: the options that say what it says itself or nothing of it, why, and what to do.
@@ -41,7 +41,6 @@ class FitInputs(NamedTuple):
         pictures: as many as scenes.
         scenes: what they show.
         masks: pixels that count in each, or None for all.
-        silent: the files that do not say how they are encoded, and as what they were read.
         notes: what was found out on the way, for the person who waits.
         light_errors: of the directions of lights that were found from the shading, in degrees.
     """
@@ -50,9 +49,13 @@ class FitInputs(NamedTuple):
     pictures: list[brdf.Picture]
     scenes: list["brdf.Scene"]
     masks: list[Any]
-    silent: dict[Path, Any]
     notes: tuple[str, ...] = ()
     light_errors: tuple[float, ...] = ()
+
+    @property
+    def silent(self) -> dict[Path, Any]:
+        """The files that do not say how they are encoded, and as what they were read."""
+        return {one.path: one.encoding for one in self.pictures if one.path and one.source == "assumed"}
 
 
 def _require(fine: Any, where: object, what, remedy: str) -> None:
@@ -84,7 +87,7 @@ def read_inputs(targets: list[Path], options: PictureOptions, encodings: dict[Pa
     if kind == "archive":
         (path,) = targets
         pictures, points, directions, intensities = _archived(path, mask)
-        inputs = FitInputs(targets, _exposed(pictures, options), [], [None] * len(pictures), {})
+        inputs = FitInputs(targets, _exposed(pictures, options), [], [None] * len(pictures))
         seen = brdf.Scene(points=points)
         names = {"direction": f"{path}: light_dirs", "intensity": f"{path}: light_intensities"}
     else:
@@ -119,13 +122,11 @@ def _check_options(kind, targets: list[Path], options: PictureOptions) -> None:
     for name in names:
         _require(getattr(options, name) is None, f"--{name}", what.format(targets[0].name), remedy)
     if kind == "photographs":
-        alone = None in (options.sphere, options.normals)
-        _require(alone, "--normals", "says what --sphere says too", "Give one of them")
-        alone = None in (options.light, options.lights)
-        _require(alone, "--light", "says what --lights says too", "Give one of them")
-        some = (options.light, options.lights) != (None, None)
+        for one, other in (("normals", "sphere"), ("light", "lights")):
+            alone = None in (getattr(options, one), getattr(options, other))
+            _require(alone, f"--{one}", f"says what --{other} says too", "Give one of them")
         remedy = "Give x,y,z, fit, or a file of directions"
-        _require(some, "--light", "or --lights has to say where the light is", remedy)
+        _require(options.light or options.lights, "--light", "or --lights has to say where the light is", remedy)
     if kind == "scene":
         _require(
             not options.ambient,
@@ -169,11 +170,8 @@ def _read_pictures(kind, targets, options, encodings, mask):
             f"is {width} x {height}, the scene's camera {' x '.join(map(str, resolution))}",
             "Give a picture and a camera of the same resolution",
         )
-    if options.sphere not in (None, "mask"):
-        ball_normals((height, width), _circle(options.sphere))
-    silent = {path: one.encoding for path, one in zip(targets, pictures, strict=True) if one.source == "assumed"}
     pictures = _exposed(pictures, options)
-    return FitInputs(targets, pictures, [], visible(mask, pictures), silent), file, tables
+    return FitInputs(targets, pictures, [], visible(mask, pictures)), file, tables
 
 
 def _target_and_scene(target, scene):
@@ -238,14 +236,10 @@ def ball_in(sphere: str, mask: Any) -> tuple[Circle, tuple[str, ...]]:
         InputError: where there is no mask, or no ball in it.
     """
     if sphere != "mask":
-        return _circle(sphere), ()
+        return Circle(*parse_numbers(sphere, "--sphere", 3, "x,y,radius in pixels")), ()
     _require(mask is not None, "--sphere", "is to be found in the mask, but there is none", "Add --mask MASK.png")
     circle = find_circle(mask)
     return circle, (f"ball found at {circle.x:.2f},{circle.y:.2f},{circle.radius:.2f}",)
-
-
-def _circle(sphere):
-    return Circle(*parse_numbers(sphere, "--sphere", 3, "x,y,radius in pixels"))
 
 
 def _seen(shape, options, mask):
