@@ -368,10 +368,18 @@ def _fit_model(model, samples, loss, n_range):
     channels, specular = values.shape[1], issubclass(model, SpecularMaterial)
     log_cos, reach = _lobe(model, samples) if specular else (0.0 * cosine, 0.0 * cosine)
     free = np.repeat([[False], [True], [specular]], channels, axis=1)
-    brightest = np.pi * np.max(np.abs(values), axis=0)
+    brightest, value = np.pi * np.max(np.abs(values), axis=0), np.maximum(values, 0.0) * cosine
 
-    def solve(weight):
-        """The least weighted squares; a diffuse coefficient that the search cannot tell from 0 is 0."""
+    def solve(modelled):
+        """The least weighted squares; a diffuse coefficient that the search cannot tell from 0 is 0.
+
+        The logarithm's are had by reweighting, as that of pictures, of values 1 + f cos. The first weights are those of
+        a perfect model, which sees the tails that the peak would drown.
+        """
+        if loss == "log":
+            weight = cosine**2 * weights("log", 1 + value, 1 + modelled, share * (values >= 0), np.zeros(1))
+        else:
+            weight = (share if loss == "squared" else share * cosine**2)[:, 0]
         with jax.enable_x64(True):
             lobe = Lobe.of_terms(((jnp.asarray(reach)[:, None], jnp.asarray(log_cos)),))
             ones, target = jnp.ones((len(values), 1)), jnp.asarray(np.pi * values)
@@ -381,18 +389,14 @@ def _fit_model(model, samples, loss, n_range):
         highlight = x[2] * reach * np.exp(optimum.n * log_cos)
         return dataclasses.replace(optimum, x=x), highlight, (x[1] + highlight) / np.pi
 
-    optimum, highlight, f_r = solve((share if loss == "squared" else share * cosine**2)[:, 0])
-    if loss == "log":
-        # By reweighting, as that of pictures, of values 1 + f cos. The first round's weights are those of a perfect
-        # model, which sees the tails that the peak would drown.
-        positive, least, model_value = values >= 0, np.inf, np.maximum(values, 0.0) * cosine
-        value = model_value
-        for _ in range(_MOST_ROUNDS):
-            found = solve(cosine**2 * weights("log", 1 + value, 1 + model_value, share * positive, np.zeros(1)))
-            deviation, model_value = _losses(samples, found[2]).log, found[2] * cosine
-            if deviation >= least * (1 - _ENOUGH):
-                break
-            (optimum, highlight, f_r), least = found, deviation
+    optimum, highlight, f_r = solve(value)
+    least = _losses(samples, f_r)
+    for _ in range(_MOST_ROUNDS if loss == "log" else 0):
+        closer = solve(f_r * cosine)
+        losses = _losses(samples, closer[2])
+        if losses.log >= least.log * (1 - _ENOUGH):
+            break
+        (optimum, highlight, f_r), least = closer, losses
     noise = residual_noise(optimum, brightest * np.finfo(float).eps)
     visible = float(np.max(highlight) / np.max(brightest))
     # A lobe that hardly reaches a sample needs a k_s whose square is out of range; it is found to be undetermined.
@@ -403,7 +407,7 @@ def _fit_model(model, samples, loss, n_range):
         interval = exponent_interval(fit, errors.n_error, errors.reach, errors.delta_cost, 0.0, parabolic=True)
         errors = errors._replace(n_reason=fit.held)
     material, parameters = material_and_parameters(fit, errors, np.ones(channels), interval)
-    return BrdfCandidate(material, tuple(one for one in parameters if one.name != "k_a"), _losses(samples, f_r))
+    return BrdfCandidate(material, tuple(one for one in parameters if one.name != "k_a"), least)
 
 
 def _lobe(model, samples):
