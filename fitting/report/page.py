@@ -24,7 +24,9 @@ from jaxtyping import Bool, Float
 
 from brdf.channels import channel_names
 from brdf.display import png_address
+from brdf.errors import InputError
 from brdf.files import write_text
+from fitting.result import FitResult
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,7 +114,46 @@ def packed(values: np.ndarray) -> str:
     return base64.b64encode(gzip.compress(np.ascontiguousarray(values).tobytes(), mtime=0)).decode()
 
 
-# -- which pixels and channels a page holds ----------------------------------------------------------------------------
+# -- which picture, which of its pixels and channels are shown ---------------------------------------------------------
+
+
+def shown_picture(result: FitResult, picture: int | None) -> int:
+    """Which of a fit's pictures is shown.
+
+    Args:
+        result: of a fit.
+        picture: from 0; None takes the one that is explained worst.
+
+    Raises:
+        InputError: where there is no such picture.
+    """
+    count = len(result.targets)
+    if picture is None:
+        return 0 if count == 1 else int(np.argmax([_unexplained(result, index) for index in range(count)]))
+    if not 0 <= picture < count:
+        raise InputError("picture", f"must be from 0 to {count - 1}, got {picture}", "Count the pictures from 0")
+    return picture
+
+
+def _unexplained(result, picture):
+    """Squares of the residual of a picture, over its own."""
+    values, fitted = (image[result.counted[picture]] for image in (result.targets[picture], result.fitted(picture)))
+    return np.sum((fitted - values) ** 2, dtype=float) / max(np.sum(values**2, dtype=float), 1e-300)
+
+
+def window(counted: np.ndarray) -> tuple[slice, slice]:
+    """Rows and columns that show what counts, and a margin around it: a thing may be small in its picture.
+
+    Args:
+        counted: (H, W).
+    """
+    if not counted.any():
+        counted = ~counted
+    ends = [np.flatnonzero(counted.any(axis=axis))[[0, -1]] for axis in (1, 0)]
+    margin = 2 + max(last - first for first, last in ends) // 16
+    spans = zip(ends, counted.shape, strict=True)
+    rows, columns = (slice(max(first - margin, 0), min(last + margin + 1, size)) for (first, last), size in spans)
+    return rows, columns
 
 
 class Shown(NamedTuple):
@@ -139,8 +180,6 @@ class Shown(NamedTuple):
             channels: how many there are.
             largest: how many pixels on a side to hold.
         """
-        from fitting.report.plots import window  # Matplotlib takes long to load
-
         names, notes = channel_names(channels), []
         chosen = [0, channels // 2, channels - 1] if channels > 3 else [min(i, channels - 1) for i in range(3)]
         rows, columns = window(counted)

@@ -19,7 +19,7 @@ from brdf.materials.exports import shader
 from brdf.materials.material_file import material_to_dict
 from brdf.models.base import SpecularMaterial
 from brdf.precision import working_precision
-from fitting.report.page import Page, Shown, asset, packed, secure_page, stage, white
+from fitting.report.page import Page, Shown, asset, packed, secure_page, shown_picture, stage, white
 from fitting.result import FitResult
 
 LARGEST = 512
@@ -48,8 +48,6 @@ def viewer(result: FitResult, picture: int | None = None) -> str:
         result: of a fit.
         picture: which of its pictures, from 0; None takes the one that is explained worst.
     """
-    from fitting.report.plots import shown_picture  # Matplotlib takes long to load
-
     picture = shown_picture(result, picture)
     material, counted = result.material, np.asarray(result.counted[picture])
     shown = Shown.of(counted, max(material.k_d.size, result.targets[picture].shape[-1]), LARGEST)
@@ -76,29 +74,28 @@ def viewer(result: FitResult, picture: int | None = None) -> str:
         "shader": _shaders(type(material)),
         "formats": {to: _format(material, to) for to in FORMATS},
     }
-    tables = _tables(material.name) if isinstance(material, SpecularMaterial) else {}
     beside = np.concatenate([brdf.displayed(image, brightest) for image in (target, fitted)], axis=1)
-    return stage(
-        "surface.html", shown.data | drawn | data | {"albedo": {"degrees": _DEGREES.tolist()}} | tables, beside
-    )
+    return stage("surface.html", shown.data | drawn | data | _tables(material.name), beside)
 
 
 def _scene(scene):
     """Camera, shapes and lights as a scene file has them, and what the page cannot draw of them."""
-    traced, (pivot, unit) = scene.camera is not None, _extent(scene)
-    shapes = [_fields(shape) for shape in scene.shapes if traced and not isinstance(shape, brdf.Triangles)]
+    traced, shapes = scene.camera is not None, []
+    pivot, unit = _extent([shape for shape in scene.shapes if traced and shape.fitted])
     for shape in scene.shapes if traced else ():
         if isinstance(shape, brdf.Triangles):
             corners, normals = shape.mesh.vertices[shape.mesh.faces], shape.mesh.normals
             normals = np.repeat(shape.mesh.front[:, None], 3, axis=1) if normals is None else normals
             mesh = {"corners": _packed((corners - pivot) / unit), "normals": _packed(normals)}
             shapes.append(mesh | {"fitted": shape.fitted})
+        else:
+            shapes.append(_fields(shape))
     lights = [light for light in scene.lights if light.type_name in KINDS]
     missing = sorted({light.type_name for light in scene.lights} - {*KINDS})
     notes = [f"A light of the type {kind} is not drawn: it has an extent." for kind in missing]
     if scene.occluders and scene.lights:
         notes.append("Shadows are not drawn.")
-    if any(mask is not None for mask in scene.visibility):
+    if scene.visibility:
         notes.append("Given shadow masks are not drawn.")
     if not traced:
         notes.append("What the picture shows came as surface points: it does not turn, a ball stands for it.")
@@ -140,20 +137,20 @@ def _camera(camera):
         }
 
 
-def _extent(scene):
+def _extent(shapes):
     """The middle of what is fitted, and half its size."""
-    boxes = []
-    for shape in scene.shapes if scene.camera is not None else ():
+    ends = []
+    for shape in shapes:
         if isinstance(shape, brdf.Triangles):
-            box = np.min(shape.mesh.vertices, axis=0), np.max(shape.mesh.vertices, axis=0)
+            ends.append(shape.mesh.vertices)
         else:
             sphere = isinstance(shape, brdf.Sphere)
             reach = shape.radius if sphere else np.abs(shape.edge_u) + np.abs(shape.edge_v)
-            box = shape.center - reach, shape.center + reach
-        boxes += [box] if shape.fitted else []
-    if not boxes:
+            ends.append([shape.center - reach, shape.center + reach])
+    if not ends:
         return np.zeros(3), 1.0
-    low, high = (np.asarray(end(boxes, axis=(0, 1)), np.float64) for end in (np.min, np.max))
+    points = np.concatenate(ends, dtype=np.float64)
+    low, high = np.min(points, axis=0), np.max(points, axis=0)
     return 0.5 * (low + high), float(0.5 * np.max(high - low))
 
 
@@ -172,6 +169,8 @@ def _tables(name: str) -> dict[str, Any]:
         return [[float(f"{value:.5g}") for value in row] for row in values]
 
     model: Any = brdf.MODELS[name]
+    if not issubclass(model, SpecularMaterial):
+        return {"albedo": {"degrees": _DEGREES.tolist()}}
     with working_precision("float64"):
         lobe = np.asarray(lobe_albedo(model, 10.0 ** _LOG_N[:, None], np.radians(_DEGREES)[None, :]))
     tables = {"albedo": {"log_n": _LOG_N.tolist(), "degrees": _DEGREES.tolist(), "lobe": rounded(lobe)}}
