@@ -96,11 +96,11 @@ def main(arguments: list[str] | None = None) -> Any:
 
 def _keep_compiled_programs():
     """Have JAX keep compiled programs in the user's cache folder: the second run of a kind skips the compiler."""
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "brdf", "jax")
     try:
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "brdf", "jax")
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return  # JAX would say so for each program
+    except (OSError, RuntimeError):  # JAX would say so for each program; a user of a container may have no home
+        return
     settings = {
         "JAX_COMPILATION_CACHE_DIR": str(folder),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",

@@ -42,6 +42,15 @@ def test_a_terminal_that_knows_ascii_alone_and_a_second_run_that_finds_its_progr
     assert list((tmp_path / "brdf" / "jax").iterdir())
 
 
+def test_a_user_without_a_home(tmp_path):
+    """As in a container that runs under a number which no name belongs to."""
+    prefix = "import os, pwd\nos.environ.pop('HOME', 0), os.environ.pop('XDG_CACHE_HOME', 0)\n"
+    prefix += "def nobody(_):\n    raise KeyError\npwd.getpwuid = nobody\n"
+    with command("--version", cwd=tmp_path, prefix=prefix) as process:
+        assert process.communicate(timeout=60)[1] == ""
+    assert process.returncode == 0
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 def test_output_that_cannot_be_written():
     with open("/dev/full", "w") as full:
