@@ -6,7 +6,7 @@ from typing import Any
 import brdf
 from brdf.errors import InputError
 from brdf.files import atomic_path
-from fitting.cli.common import find_materials, show
+from fitting.cli.common import show, table_name
 from fitting.progress import waiting
 
 # What a drawing may be written as.
@@ -31,16 +31,21 @@ def check(material: str, *, json: bool = False, plot: Path | None = None) -> int
     if plot is not None and plot.suffix.lower() not in DRAWN:
         raise InputError(plot, "is no name of a picture", f"Name it {', '.join(DRAWN)}")
     with waiting("checking"):
-        is_table = is_measured(material)
-        if is_table and plot is not None:
-            raise InputError(
-                "--plot",
-                f"draws materials, and {material} is a measured table",
-                f"Fit a material to it with brdf fit {material} --out DIR, and check DIR/material.json",
-            )
-        found: dict[str, tuple[Any, str]] = (
-            {Path(material).stem: (brdf.load_measured(material), "")} if is_table else find_materials(material)
-        )
+        found: dict[str, tuple[Any, str]]
+        if is_measured(material):
+            if plot is not None:
+                raise InputError(
+                    "--plot",
+                    f"draws materials, and {material} is a measured table",
+                    f"Fit a material to it with brdf fit {material} --out DIR, and check DIR/material.json",
+                )
+            found = {Path(material).stem: (brdf.load_measured(material), "")}
+        elif key := table_name(material):
+            found = {key: (brdf.preset(key), "")}
+        else:
+            from brdf.materials.material_file import read_materials
+
+            found = read_materials(material)
         if plot is not None and len(found) > 1:
             raise InputError("--plot", f"draws one material, {material} holds {len(found)}", "Give one")
         reports = {name: brdf.check(one, name=name) for name, (one, _) in found.items()}
@@ -50,12 +55,11 @@ def check(material: str, *, json: bool = False, plot: Path | None = None) -> int
             with atomic_path(plot) as path:
                 for name, (one, _) in found.items():
                     overview(one, reports[name]).savefig(path)
-    notes = {name: note for name, (_, note) in found.items() if note}
+    notes = {name: {"note": note} if note else {} for name, (_, note) in found.items()}
     if json:
-        content = {name: report.to_json() for name, report in reports.items()}
-        show({name: one | ({"note": notes[name]} if name in notes else {}) for name, one in content.items()})
+        show({name: report.to_json() | notes[name] for name, report in reports.items()})
     else:
-        after = {name: f"\n  note: {note}" for name, note in notes.items()}
-        show("\n\n".join(f"{report}{after.get(name, '')}" for name, report in reports.items()))
+        lines = ["\n  note: ".join([str(report), *notes[name].values()]) for name, report in reports.items()]
+        show("\n\n".join(lines))
     verdicts = [report.plausible for report in reports.values()]
     return 1 if False in verdicts else 2 if None in verdicts else 0

@@ -18,13 +18,13 @@ import typer
 
 import brdf
 from brdf.errors import InputError
-from brdf.files import atomic_folder
+from brdf.files import atomic_folder, atomic_path
 
 # By what Slurm, Open MPI and, where there is neither, the user say how many processes there are.
 PROCESSES = ("SLURM_NTASKS", "OMPI_COMM_WORLD_SIZE", "JAX_NUM_PROCESSES")
 
 # What help shows that an option takes, where that is no text.
-TAKES = {bool: "", Path: "PATH", float: "NUMBER", int: "NUMBER"}
+TAKES = {bool: "", Path: "PATH", float: "NUMBER"}
 
 
 class PictureOptions(NamedTuple):
@@ -122,28 +122,11 @@ def named_as(typed: dict[str, Any]) -> Iterator[None]:
         raise error.renamed(typed) from None
 
 
-def find_materials(text: str) -> dict[str, tuple["brdf.Material", str]]:
-    """Every material of a file, or the one of the classic table, by name, with what its file says that it leaves open.
-
-    Args:
-        text: a file, or a name of the classic table such as emerald; a file goes before a name.
-
-    Raises:
-        InputError: naming the file.
-    """
-    key = table_name(text)
-    if key is not None:
-        return {key: (brdf.preset(key), "")}
-    from brdf.materials.material_file import read_materials
-
-    return read_materials(text)
-
-
 def find_material(text: str, name: str | None = None) -> tuple["brdf.Material", str]:
     """One material, and what its file says that it leaves open.
 
     Args:
-        text: see `find_materials`.
+        text: a file, or a name of the classic table such as emerald; a file goes before a name.
         name: which one, where an MTL file holds several.
 
     Raises:
@@ -219,6 +202,10 @@ def is_first_process(mesh: Any) -> bool:
     return mesh is None or mesh.local_devices[0].process_index == 0
 
 
+class _TrialError(Exception):
+    """Ends a trial of writing, of which nothing stays."""
+
+
 def check_outputs(out: Path | None, plot: bool = False, page: Path | None = None) -> None:
     """Refuse before the work what could not be written after it.
 
@@ -234,13 +221,13 @@ def check_outputs(out: Path | None, plot: bool = False, page: Path | None = None
         raise InputError("--plot", "needs a folder to draw into", "Add --out DIR")
     if page is not None and page.suffix.lower() not in (".html", ".htm"):
         raise InputError(page, "is no name of a page", "Name it .html")
-    if page is not None and not page.absolute().parent.is_dir():
-        raise InputError(page, f"cannot be written, {page.parent} is no folder", "Make it first")
-    if page is not None and not os.access(page.absolute().parent, os.W_OK):
-        raise InputError(page, f"cannot be written into {page.parent}", "Name another folder")
+    # Refused before there are any results; nothing of the trial stays.
+    if page is not None:
+        with contextlib.suppress(_TrialError), atomic_path(page):
+            raise _TrialError
     if out is not None:
         with atomic_folder(out):
-            pass  # refused before there are any results; nothing of the trial stays
+            pass
 
 
 def show(content: Any) -> None:
