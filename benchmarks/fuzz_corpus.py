@@ -87,7 +87,7 @@ def _array(path: Path) -> Any:
     from fitting.photographs.archives import read_array
 
     with path.open("rb") as file:
-        return read_array(file, path, path.stat().st_size)
+        return read_array(file, path)
 
 
 def pictures(folder: Path) -> list[tuple[str, bytes, Callable[[Path], Any]]]:

@@ -249,7 +249,7 @@ def normal_map(given: Any, *, flip_y: bool = False) -> Float[np.ndarray, "H W 3"
         name = str(given)
         if name.lower().endswith(".npy"):
             with input_file(given).open("rb") as file:
-                normal = np.array(read_array(file, given, Path(given).stat().st_size))
+                normal = read_array(file, given)
         else:
             with brdf.ImageReader(given, encoding="linear") as reader:
                 normal, coded = reader.read(), reader.is_integer

@@ -1,7 +1,6 @@
-"""Arrays in files, ``.npy`` and ``.npz``: sizes are checked before memory is taken, and nothing is unpickled."""
+"""Arrays in files, ``.npy`` and ``.npz``: no memory is filled that the file does not, and nothing is unpickled."""
 
 import contextlib
-import math
 import warnings
 import zipfile
 from pathlib import Path
@@ -15,7 +14,6 @@ from brdf.files import input_file
 # What an archive may unpack to: 8 GiB of values, as for pictures; and how far Deflate can expand its bytes.
 MOST_BYTES, EXPANSION = 1 << 33, 1032
 REQUIRED, OPTIONAL = ("images", "normal", "light_dirs"), ("light_intensities", "mask")
-DAMAGED = "The file is damaged; make it again"
 
 
 @contextlib.contextmanager
@@ -30,27 +28,22 @@ def _told(where, what, remedy):
         raise InputError(where, f"{what} ({reason})", remedy) from None
 
 
-def read_array(file: Any, where: object, size: int) -> np.ndarray:
-    """An array from NumPy's format: its claims are held against the size of the file before memory is taken.
+def read_array(file: Any, where: object) -> np.ndarray:
+    """An array from NumPy's format; whatever a damaged one claims, no more memory is filled than there is to read.
 
     Args:
         file: open for reading bytes.
         where: the file, for messages.
-        size: of the file in bytes.
 
     Raises:
         InputError: where it holds no plain numbers or is damaged.
     """
     # NumPy reads the header as Python: a damaged one raises what its parser does, or warns.
-    with _told(where, "is no array", DAMAGED), warnings.catch_warnings(action="ignore"):
-        headers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-        shape, fortran, kind = headers[np.lib.format.read_magic(file)](file)
-        if kind.kind not in "biuf":
-            raise InputError(where, f"holds {kind}, not numbers", "Save plain arrays")
-        count = math.prod(shape)
-        if not 0 <= count * kind.itemsize <= size:
-            raise InputError(where, f"claims {count} values in {size} bytes", DAMAGED)
-        return np.frombuffer(file.read(count * kind.itemsize), kind).reshape(shape, order="F" if fortran else "C")
+    with _told(where, "is no array", "Save plain numbers with numpy.save"), warnings.catch_warnings(action="ignore"):
+        array = np.lib.format.read_array(file, allow_pickle=False)
+        if array.dtype.kind not in "biuf":
+            raise InputError(where, f"holds {array.dtype}, not numbers", "Save plain numbers")
+        return array
 
 
 def read_archive(path: Path) -> dict[str, np.ndarray]:
@@ -77,9 +70,9 @@ def read_archive(path: Path) -> dict[str, np.ndarray]:
             )
         wanted = {name: sizes[name] for name in (*REQUIRED, *OPTIONAL) if name in sizes}
         if sum(wanted.values()) > min(MOST_BYTES, EXPANSION * path.stat().st_size + (1 << 20)):
-            raise InputError(path, "claims more than can be in it", DAMAGED)
+            raise InputError(path, "claims more than can be in it", "The file is damaged; make it again")
         arrays = {}
-        for name, size in wanted.items():
+        for name in wanted:
             with archive.open(f"{name}.npy") as file:
-                arrays[name] = read_array(file, f"{path}: {name}", size)
+                arrays[name] = read_array(file, f"{path}: {name}")
         return arrays

@@ -254,11 +254,11 @@ CASES: list[tuple[dict[str, Any], str, str]] = [
     ({}, f"{LIT} --scene a.toml", "--scene: says what --sphere or --normals says too"),
     ({"n.npy": np.ones((2, 2, 3))}, "fit 0.png --normals n.npy --light 0,0,1", "n.npy: is 2 x 2, the pictures 60 x 52"),
     ({"n.npy": np.ones(3)}, "fit 0.png --normals n.npy --light 0,0,1", r"n.npy: must be of shape \(H, W, 3\)"),
-    ({"n.npy": OBJECTS}, "fit 0.png --normals n.npy --light 0,0,1", "n.npy: holds object, not numbers"),
+    ({"n.npy": OBJECTS}, "fit 0.png --normals n.npy --light 0,0,1", "n.npy: is no array .Object arrays cannot"),
     (
         {"n.npy": numpy_file(b"{'descr': '<f8', 'fortran_order': False, 'shape': (100000, 100000, 3), }")},
         "fit 0.png --normals n.npy --light 0,0,1",
-        "n.npy: claims 30000000000 values in",
+        "n.npy: is no array .*Save plain numbers",
     ),
     # Found by fuzzing: NumPy tokenizes a header that is no literal, and lets the tokenizer's error pass.
     (
@@ -281,7 +281,7 @@ CASES: list[tuple[dict[str, Any], str, str]] = [
     ({"a.npz": {"a": np.ones(3)}}, "fit a.npz", "a.npz: holds no array images"),
     ({"a.npz": "PK\x03\x04 this is none"}, "fit a.npz", "a.npz: is no readable archive"),
     ({"a.npz": bomb}, "fit a.npz", "a.npz: claims more than can be in it"),
-    ({"a.npz": archive(images=OBJECTS)}, "fit a.npz", "a.npz: images: holds object, not numbers"),
+    ({"a.npz": archive(images=OBJECTS)}, "fit a.npz", "a.npz: images: is no array .Object arrays cannot"),
     ({"a.npz": archive(images=np.ones((3, 4, 5), np.int8))}, "fit a.npz", "a.npz: images: holds int8, of which"),
     ({"a.npz": archive(images=np.ones((3, 4, 5), bool))}, "fit a.npz", "a.npz: images: holds bool"),
     ({"a.npz": archive(images=np.ones((3, 4)))}, "fit a.npz", r"a.npz: images: is of shape \(3, 4\)"),
