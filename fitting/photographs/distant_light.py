@@ -88,16 +88,15 @@ def light_from_highlight(picture: Any, circle: Circle, *, mask: Any = None) -> F
     place = np.argwhere(bright)
     y, x = np.median(np.argwhere(core), axis=0)
     near = np.hypot(place[:, 1] - x, place[:, 0] - y) <= HIGHLIGHT_RADIUS * circle.radius
-    many = np.mean(near) < IN_HIGHLIGHT
     mirrored = 2 * normals[..., 2:] * normals - TO_VIEW
     highlights = _highlights(bright, mirrored)
-    if highlights == 2 or (highlights > 2 and not many):
-        remedy = "Photograph one light at a time, or leave the others out by a mask"
-        raise InputError("picture", f"shows {highlights} highlights of like brightness on the mirror ball", remedy)
-    if many:
+    if np.mean(near) < IN_HIGHLIGHT and highlights != 2:
         share = f"{100 * np.mean(near):.0f} % of it lie where a mirror ball's highlight would be"
         remedy = "Give a photograph of a mirror ball and its circle; of a matt one use --matt"
         raise InputError("picture", f"is bright in many places: {share}", remedy)
+    if highlights > 1:
+        remedy = "Photograph one light at a time, or leave the others out by a mask"
+        raise InputError("picture", f"shows {highlights} highlights of like brightness on the mirror ball", remedy)
     place = place[near]
     if np.any((place == 0) | (place == np.array(grey.shape) - 1)):
         raise InputError("picture", "cuts through the highlight with its edge", "Give a photograph of all of it")

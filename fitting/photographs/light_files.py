@@ -64,14 +64,7 @@ def read_intensities(path: str | Path, count: int | None = None) -> Float[np.nda
     return _read_rows(path, count, None, is_fine, "of 0 or more, not all 0", "Give the intensity of each channel")
 
 
-def _read_rows(
-    path,
-    count,
-    width,
-    is_fine,
-    words,
-    remedy,
-):
+def _read_rows(path, count, width, is_fine, words, remedy):
     """The numbers of the lines, of the same width each."""
     lines = [line.partition("#")[0].replace(",", " ") for line in read_text(path, MOST_BYTES).splitlines()]
     rows = {
