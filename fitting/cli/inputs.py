@@ -86,9 +86,8 @@ def read_inputs(targets: list[Path], options: PictureOptions, encodings: dict[Pa
     mask = None if options.mask is None else brdf.read_mask(options.mask)
     if kind == "archive":
         (path,) = targets
-        pictures, points, directions, intensities = _archived(path, mask)
-        inputs = FitInputs(targets, _exposed(pictures, options), [], [None] * len(pictures))
-        seen = brdf.Scene(points=points)
+        pictures, seen, directions, intensities = _archived(path)
+        inputs = FitInputs(targets, _exposed(pictures, options), [], visible(mask, pictures))
         names = {"direction": f"{path}: light_dirs", "intensity": f"{path}: light_intensities"}
     else:
         inputs, file, tables = _read_pictures(kind, targets, options, encodings or {}, mask)
@@ -302,8 +301,8 @@ def _intensities(path, pictures):
     return intensities
 
 
-def _archived(path, mask):
-    """Pictures, points, directions and intensities of an archive.
+def _archived(path):
+    """Pictures, a scene without lights, directions and intensities of an archive.
 
     It holds images (K, H, W[, C]), normal (H, W, 3) and light_dirs (K, 3), and may hold light_intensities (K, C) and
     mask (H, W). Unsigned images span their type.
@@ -325,7 +324,6 @@ def _archived(path, mask):
     )
     count, height, width, channels = images.shape
     arrays = {"mask": np.ones((height, width)), "light_intensities": np.ones(count)} | arrays
-    arrays |= {} if mask is None else {"mask": mask}
     intensities = arrays["light_intensities"]
     arrays["light_intensities"] = intensities = intensities[:, None] if intensities.ndim == 1 else intensities
     each = 1 if intensities.shape[1:] == (1,) else channels
@@ -339,4 +337,4 @@ def _archived(path, mask):
     top, bits = 1.0 if images.dtype.kind == "u" else None, 8 * images.dtype.itemsize
     pixels = (images / (np.iinfo(images.dtype).max if top else 1)).astype(np.float32)
     pictures = [brdf.Picture(one, None, "linear", "format", bits, top) for one in pixels]
-    return pictures, points, arrays["light_dirs"], intensities
+    return pictures, brdf.Scene(points=points), arrays["light_dirs"], intensities

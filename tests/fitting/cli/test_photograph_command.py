@@ -203,6 +203,20 @@ def test_normals_and_archives_say_the_same(photographs, capsys, monkeypatch):
     assert np.allclose([*found, k_d(out)], 0.8, rtol=1e-3)
 
 
+def test_a_mask_leaves_out_more_of_an_archive_than_its_own(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    points, light = ball_points(SHAPE, BALL), (0.3, 0.4, 0.86)
+    picture, known, shown = shaded(light), np.asarray(points.mask).copy(), np.ones((*SHAPE, 1), np.float32)
+    picture[10:15, 20:30] = picture[30:35, 20:30] = 0.9
+    known[10:15, 20:30] = False
+    shown[30:35, 20:30] = 0.0
+    brdf.write_image("mask.png", shown)
+    np.savez("ball.npz", images=picture[None], normal=np.asarray(points.normal), light_dirs=[light], mask=known)
+    status, out, err = run(capsys, "fit", "ball.npz", "--mask", "mask.png", "--model", "lambert", "--json")
+    assert status == 0, err
+    assert k_d(out) == pytest.approx(0.8, rel=1e-5)
+
+
 def test_codes_of_an_archive_count_where_its_lights_are_freed(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     lights, intensities = np.array([[0.3, 0.4, 0.86], [-0.5, 0.1, 0.86]]), [0.7, 1.2]
