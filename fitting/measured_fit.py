@@ -269,9 +269,7 @@ class BrdfFitResult(Parameters):
             InputError: where the folder cannot be written.
         """
         with atomic_folder(folder) as stage:
-            write_report(stage, self)
-            if plot:
-                self.plot().savefig(stage / "comparison.png", dpi=150)
+            write_report(stage, self, plot)
 
 
 _NORMAL = np.array([0.0, 0.0, 1.0])

@@ -124,7 +124,7 @@ def fit(
             return
         if out is not None:
             say("saving and drawing" if plot else "saving")
-            result.save(out, **({"plot": True} if plot else {}))
+            result.save(out, plot=plot)
         if report is not None:
             say("drawing the page")
             from fitting.report.html import report_page

@@ -57,8 +57,8 @@ def lights(
         for path, picture, counts in zip(target, pictures, visible(inside, pictures), strict=True):
             with named_as({"picture": path}):
                 if matt:
-                    points, how = ball_points(picture.pixels.shape[:2], circle), {"ambient": ambient}
-                    light = light_from_shading(picture, points, saturation=saturation, mask=counts, **how)
+                    points = ball_points(picture.pixels.shape[:2], circle)
+                    light = light_from_shading(picture, points, saturation=saturation, mask=counts, ambient=ambient)
                     direction, error = light.direction, f"  # {light.stated_error}"
                 else:
                     direction = light_from_highlight(picture, circle, mask=counts)

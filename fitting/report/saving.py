@@ -20,17 +20,20 @@ from fitting.selection import Candidate
 from fitting.solver.profile import Optimum
 
 
-def write_report(stage: Path, result: Any, **further: Any) -> None:
+def write_report(stage: Path, result: Any, plot: bool, **further: Any) -> None:
     """Write material.json, material.mtl (of 1 or 3 channels) and fit.json.
 
     Args:
         stage: a folder that is there.
-        result: with ``material``, ``undetermined`` and ``to_dict()``.
+        result: with ``material``, ``undetermined``, ``to_dict()`` and ``plot()``.
+        plot: also comparison.png.
         further: what else fit.json is to hold.
     """
     for suffix in ("json", "mtl") if result.material.k_d.size in (1, 3) else ("json",):
         brdf.save_material(result.material, stage / f"material.{suffix}", undetermined=result.undetermined)
     write_text(stage / "fit.json", json.dumps(result.to_dict() | further, indent=2) + "\n")
+    if plot:
+        result.plot().savefig(stage / "comparison.png", dpi=150)
 
 
 def save(result: FitResult, folder: str | Path, plot: bool) -> None:
@@ -46,14 +49,12 @@ def save(result: FitResult, folder: str | Path, plot: bool) -> None:
     """
     with atomic_folder(folder) as stage:
         pictures = [_write_picture(stage, result, index) for index in range(len(result.scenes))]
-        write_report(stage, result, pictures=pictures)
+        write_report(stage, result, plot, pictures=pictures)
         arrays = dict(vars(result.optimum)) if result.optimum else {}
         for name, images in (("counted", result.counted), ("weights", result.weights)):
             arrays |= {f"{name}{index}": image for index, image in enumerate(images) if image is not None}
         np.savez_compressed(stage / "fit.npz", **arrays)
         brdf.write_image(stage / "fitted.exr", result.fitted())
-        if plot:
-            result.plot().savefig(stage / "comparison.png", dpi=150)
 
 
 def _write_picture(stage: Path, result: FitResult, index: int) -> dict[str, Any]:
