@@ -98,10 +98,9 @@ def fit_lights(
     before = _emittances(scene, targets[0].pixels.shape[-1])
     start = _with_emittances(scene, before)
     found = fit_jointly(targets, start, material, lambda _, s: s[0].emittances(), precision=precision, mask=mask)
-    emittances = _emittances(found.scenes[0], before.shape[1])
-    errors = np.array([one.error for one in found.parameters], float).reshape(before.shape)
+    emittances = np.stack(found.values)
     with np.errstate(divide="ignore", invalid="ignore"):
-        factors, errors = emittances / before, errors / before
+        factors, errors = emittances / before, np.stack(found.errors) / before
     fields: dict[str, Any] = {field.name: getattr(found, field.name) for field in dataclasses.fields(FitResult)}
     fields["parameters"] = tuple(dataclasses.replace(one, reason=one.reason and ALIKE) for one in found.parameters)
     return LightFit(**fields, emittances=emittances, factors=factors, errors=errors)
@@ -145,20 +144,19 @@ def fit_lights_and_material(
     targets = state_problem([target], [scene], [mask]).targets
     if not scene.lights:
         raise InputError("scene", "has no lights", "Add a [[lights]] table")
-    channels = targets[0].pixels.shape[-1]
+    count, channels = len(scene.lights), targets[0].pixels.shape[-1]
     before = _emittances(scene, channels)
     # Most of a picture is matt, which tells the lights about rightly from any start.
     matt = fit_lights(targets[0], scene, brdf.Lambert(k_a=np.ones(channels), k_d=np.ones(channels)), mask=mask)
-    start = np.maximum(matt.emittances, FAINT * matt.emittances[: len(scene.lights)].max(axis=0))
+    start = np.maximum(matt.emittances, FAINT * matt.emittances[:count].max(axis=0))
     start = np.where(before > 0, start, 0)  # what is stated dark stays dark
-    start[len(scene.lights) :] = before[len(scene.lights) :]
+    start[count:] = before[count:]
     # The first light stays what it is, until the mean of all takes its place.
-    free = ["intensity"][: len(scene.lights) - 1]
+    free = ["intensity"][: count - 1]
     joint = fit_jointly(targets, _with_emittances(scene, start), name, free, mask=mask)
-    now = _emittances(joint.scenes[0], before.shape[1])
-    factors = np.divide(now, before, out=np.zeros_like(now), where=before > 0)
-    lit = np.count_nonzero(before[: len(scene.lights)], axis=0)
-    mean = factors[: len(scene.lights)].sum(axis=0) / np.maximum(lit, 1)
+    lit, now = before[:count] > 0, _emittances(joint.scenes[0], channels)[:count]
+    factors = np.divide(now, before[:count], out=np.zeros_like(now), where=lit)
+    mean = factors.sum(axis=0) / np.maximum(lit.sum(axis=0), 1)
     scale = np.where(mean > 0, mean, 1.0)
     k = {key: value * scale if key in ("k_d", "k_s") else value for key, value in vars(joint.material).items()}
     material = dataclasses.replace(joint.material, **k)
