@@ -3,7 +3,6 @@
 The colour is taken out of the scenes, so that all channels share their basis images.
 """
 
-import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -47,24 +46,17 @@ def _emittances(scenes: Sequence[brdf.Scene]) -> list[Any]:
 
 
 def coefficient_factors(
-    model: type[brdf.Material], n: float, colour: Float[np.ndarray, " C"]
-) -> Float[np.ndarray, "3 C"]:
+    model: type[brdf.Material], n: float | Float[np.ndarray, "N 1"], colour: Float[np.ndarray, " C"]
+) -> Float[np.ndarray, "3 *N C"]:
     """What the solver's coefficients are divided by to give k_a, k_d, k_s.
 
     Args:
         model: the class of the material.
-        n: exponent.
+        n: exponent, or those of some fits.
         colour: what was taken out of the lights, (C,).
     """
-    colour = np.where(colour > 0, colour, 1.0)
-    factors = np.stack([np.ones_like(colour), colour, colour])
+    colour, scale = np.where(colour > 0, colour, 1.0), 1.0
     if issubclass(model, SpecularMaterial):
-        factors[2] *= _scale(model, float(n))
-    return factors
-
-
-@functools.lru_cache(maxsize=64)
-def _scale(model: type[SpecularMaterial], n: float) -> float:
-    """Of the lobe; asked for several times at one exponent."""
-    with jax.enable_x64(True):
-        return float(model.scale(np.float64(n)))
+        with jax.enable_x64(True):
+            scale = np.asarray(model.scale(np.float64(n)))
+    return np.stack(np.broadcast_arrays(1.0, colour, colour * scale))

@@ -24,13 +24,12 @@ from jaxtyping import Array, Bool, Float
 
 import brdf
 from brdf.errors import InputError
-from brdf.models.base import SpecularMaterial
 from brdf.precision import Precision, working_precision
 from brdf.rendering import Basis, basis
 from fitting import functional
 from fitting.codes import single_values_at_end
 from fitting.core import fit_pictures
-from fitting.light_colour import take_colour_out
+from fitting.light_colour import coefficient_factors, take_colour_out
 from fitting.pixels import SYMMETRIC_PIXELS
 from fitting.problem import TOP, FitProblem, state_problem
 from fitting.progress import waiting
@@ -216,10 +215,9 @@ def _fit_together(problem: FitProblem) -> tuple[Bool[np.ndarray, " N"], dict[str
     table = gathered(rows, count, (7 * channels + 3,))
     ends = np.cumsum([channels] * 3 + [1] + [channels] * 4 + [1])
     k_a, k_d, k_s, n, cost, *errors, square = np.split(table, ends, axis=1)
-    factor = np.where(colour > 0, colour, 1.0)
-    scale = np.asarray(model.scale(n)) if issubclass(model, SpecularMaterial) else 1.0
+    factors = coefficient_factors(model, n, colour)
     numbers = {"n": np.where(k_s.any(axis=1), n[:, 0], 0), "n_error": errors[3][:, 0]}
-    for name, value, error, by in zip(NAMES, (k_a, k_d, k_s), errors, (1.0, factor, factor * scale), strict=False):
+    for name, value, error, by in zip(NAMES, (k_a, k_d, k_s), errors, factors, strict=False):
         numbers |= {name: value / by, f"{name}_error": error / by}
     with np.errstate(invalid="ignore", divide="ignore"):
         return plain, numbers | {"residual": np.sqrt(cost.sum(axis=1) / square[:, 0])}
