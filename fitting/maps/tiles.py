@@ -154,7 +154,10 @@ class MapProblem:
             of_photographs += [] if self.ambient is None else [self.ambient.T[:, None]]
             view = self.to_view / np.linalg.norm(self.to_view)
             rounding = max(one.step for one in given.each) / np.sqrt(12 * np.mean(given.unit**2))
-            of_photographs = [_padded(one, np).astype(dtype) for one in of_photographs]
+            black = -len(curves) % LANES  # photographs that are added
+            of_photographs = [
+                np.append(one, np.zeros((*one.shape[:-1], black)), axis=-1).astype(dtype) for one in of_photographs
+            ]
             more = dtype.type(rounding), view.astype(dtype), stacks, occluders
             # All tiles that hold a texel, and the first lane that holds none.
             used = np.arange(len(values)) <= np.count_nonzero(surface.mask) // values.shape[2]
@@ -238,12 +241,6 @@ def _program(
     return {name: layer.reshape(-1, *layer.shape[2:]) for name, layer in tiles.items()}
 
 
-def _padded(of_photographs: Any, xp: Any = jnp) -> Any:
-    """With photographs that are 0, up to a multiple of `LANES`."""
-    before = [(0, 0)] * (of_photographs.ndim - 1)
-    return xp.pad(of_photographs, [*before, (0, -of_photographs.shape[-1] % LANES)])
-
-
 def _weights(unit: np.ndarray) -> np.ndarray:
     """What the roots of weights are by the unit, (P, C) or (P, 1): noise is even before photographs are divided."""
     weight = unit / np.sqrt(np.mean(unit**2, axis=0))
@@ -261,7 +258,7 @@ def _near(texels: Texels, stacks: Any, occluders: Any, ambient: Components | Non
     """With the columns of lights of any kind at the points of a tile, (T,)."""
 
     def columns(points):
-        terms, order = [], []
+        terms, size = [], (texels.shown.shape[-1], max(stack.light.shape[1] for stack in stacks))
         for stack in stacks:
 
             def of_samples(one, kind=stack.kind):
@@ -271,11 +268,14 @@ def _near(texels: Texels, stacks: Any, occluders: Any, ambient: Components | Non
                 diffuse, weight = (part[..., None] * emitted[:, None] for part in (found.diffuse, found.weight))
                 return found._replace(diffuse=diffuse, weight=weight)
 
-            each = stack.emitted, stack.numbers, stack.nodes, stack.light
-            terms.append(jax.lax.map(of_samples, each))
-            order.append(stack.light[:, 0])
-        order = jnp.argsort(jnp.concatenate(order))
-        every = jax.tree.map(lambda *leaves: _padded(jnp.moveaxis(jnp.concatenate(leaves)[order], 0, -1)), *terms)
+            def of_photographs(leaf, light=stack.light):
+                """0 of those with another kind of light, and of samples beyond this light's own."""
+                none = jnp.zeros((*size, *leaf.shape[2:]), leaf.dtype)
+                return none.at[light[:, 0], : light.shape[1]].set(leaf)
+
+            found = jax.lax.map(of_samples, (stack.emitted, stack.numbers, stack.nodes, stack.light))
+            terms.append(jax.tree.map(of_photographs, found))
+        every = jax.tree.map(lambda *leaves: jnp.moveaxis(sum(leaves), 0, -1), *terms)
         diffuse = jnp.moveaxis(jnp.sum(every.diffuse, axis=0), 1, 0)
         return diffuse, jnp.moveaxis(every.weight, 2, 0), every.log_cosine
 

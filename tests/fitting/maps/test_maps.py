@@ -384,6 +384,18 @@ def test_near_lights_and_cast_shadows_of_a_scene():
     )
 
 
+def test_lights_of_several_kinds_light_one_view():
+    """Of so many samples each: their columns were not of one size."""
+    camera = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=(6, 6))
+    near, truth = 4 * dome(16), brdf.BlinnPhong(k_d=0.4, k_s=0.3, n=15.0)
+    lights = [brdf.PointLight(position, 20.0) for position in near[:8]]
+    lights += [brdf.SphereLight(position, 0.5, 20.0, samples=4) for position in near[8:]]
+    scenes = [brdf.Scene(camera, [brdf.Sphere([0, 0, 0], 1)], lights=[light]) for light in lights[::-1]]
+    maps = fitting.fit_maps([np.asarray(brdf.render(truth, scene)) for scene in scenes], scenes)
+    assert maps.determined.sum() > 4
+    assert np.median(np.abs(maps.n[maps.determined] / 15 - 1)) < 1e-3
+
+
 def test_scenes_tell_ambient_light_shadow_masks_and_the_view():
     camera = brdf.OrthographicCamera(position=[3, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=(12, 12))
     ball, lights, random = brdf.Sphere([0, 0, 0], 1), dome(20), np.random.default_rng(1)
