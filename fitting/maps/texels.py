@@ -214,6 +214,11 @@ class Texels(eqx.Module):
         return Components(tuple(self.shown))
 
     @property
+    def of_lobe(self) -> int:
+        """How many coefficients the lobe of a texel has."""
+        return self.glossy * (1 if self.grey else len(self.shown))
+
+    @property
     def seen(self) -> Array:
         """1 where a value counts, (T, P)."""
         return (self.root.parts[0] > 0).astype(self.shown.dtype)
@@ -331,7 +336,7 @@ class Texels(eqx.Module):
         """
         seen, diffuse = self.seen, self.linear[-1]
         dark = seen * shadowed(*(over_channels(self.unweighted(one)) for one in (self.values, diffuse)))
-        first = Trial.of(self, self.fitted(), seen, seen)
+        first = Trial.of(self, self.fitted(), seen)
         # a k_d of their own, by its score: how far below the other one, in standard errors
         terms = sums(self.residual(first.fit) * diffuse * dark, diffuse * diffuse * dark, diffuse * diffuse)
         score, square, whole = (jnp.sum(jnp.broadcast_to(one, self.shown.shape[:2]), axis=0) for one in terms)
@@ -344,7 +349,7 @@ class Texels(eqx.Module):
             def again(_, state):
                 counts, best = state
                 fit = some.where(counts).fitted()
-                better = best.or_better(Trial.of(some, fit, some.seen, counts), worth[lanes])
+                better = best.or_better(Trial.of(some, fit, counts), worth[lanes])
                 return inliers(some.residual(fit), some.seen, counts), better
 
             return jax.lax.fori_loop(0, 2, again, ((seen - dark)[lanes], old))[1]
@@ -427,12 +432,10 @@ class Trial(NamedTuple):
     normal: Components | None = None
 
     @classmethod
-    def of(cls, texels: Texels, fit: TexelFit, seen: Array, counts: Array, normal: Any = None) -> "Trial":
+    def of(cls, texels: Texels, fit: TexelFit, counts: Array, normal: Any = None) -> "Trial":
         """Where some of the values that are seen count."""
-        channels = len(texels.shown)
-        of_lobe = (1 if texels.grey else channels) if texels.glossy else 0
-        many, left_out = sums_of(counts, seen - counts)
-        freedom = channels * many - (len(fit.k) - texels.glossy) * channels - of_lobe
+        many, left_out = sums_of(counts, texels.seen - counts)
+        freedom = len(texels.shown) * (many - len(fit.k) + texels.glossy) - texels.of_lobe
         cost = fit.cost * (1 + OUTLIER**2 * left_out / jnp.maximum(freedom, 1))
         return cls(fit, counts.T, jnp.where(freedom < 3, jnp.inf, cost), freedom, normal)
 
@@ -569,7 +572,7 @@ def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Components,
     def tried(start):
         normal, counts = start
         fit = texels.where(counts).facing(normal, lights).fitted()
-        return Trial.of(texels, fit, seen, counts, normal)
+        return Trial.of(texels, fit, counts, normal)
 
     def unshadowed(_, start):
         counts = seen * ~shadowed(shown, seen * jnp.maximum(beside(start[0]) @ lights.to_light, 0))
@@ -748,9 +751,10 @@ def nonnegative(rows: Rows, high: Array, grey: bool, steps: int) -> list[Array]:
 def bounded(rows: Rows, high: Any) -> list[Array]:
     """`nonnegative` channel by channel: where the optimum without a bound breaks it, the optimum lies on that bound."""
     (pivot, *_, moment), *rest = rows
+    inverse = divide(1.0, pivot)
     if not rest:
-        return [jnp.clip(divide(moment, pivot), 0, high)]
-    (_, *row, free), *left = swept(rows, 0, divide(1.0, pivot))
+        return [jnp.clip(moment * inverse, 0, high)]
+    (_, *row, free), *left = swept(rows, 0, inverse)
     others = bounded([line[1:] for line in left], high)
     first = free - sum(map(operator.mul, row, others))
     at_bound = [jnp.zeros_like(first), *bounded([line[1:] for line in rest], high)]
