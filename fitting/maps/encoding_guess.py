@@ -42,7 +42,8 @@ def likelier(problem: MapProblem) -> tuple[MapProblem, tuple[str, ...]]:
     readings, left = {}, {}
     encodings: dict[str, Encoding] = {"sRGB": "srgb", "linear": "linear"}
     for name, encoding in encodings.items():
-        readings[name] = one = dataclasses.replace(problem, photographs=given.read_as(encoding))
+        each = tuple(one.read_as(encoding) if one.silent else one for one in given.each)
+        readings[name] = one = dataclasses.replace(problem, photographs=dataclasses.replace(given, each=each))
         with waiting(f"fitting some texels as {name}"):
             layers = {key: layer[: texels.size] for key, layer in one.fit(*one.tiles(texels)).items()}
         codes = 255 * np.sqrt(np.mean(given.unit**2)) * layers["noise"]

@@ -114,7 +114,8 @@ def fit_maps(
         raise InputError(pictures, "is no folder", "Give a folder of photographs with their lights, or a list of files")
     if specular not in ("coloured", "grey"):
         raise InputError("specular", f"must be coloured or grey, got {specular!r}", "Choose one of them")
-    models = _models(model)
+    name = model_name(model)
+    models = (brdf.Lambert, brdf.Phong, brdf.BlinnPhong) if name == "auto" else (brdf.MODELS[name],)
     given = map_inputs.photographs(pictures, lights, intensities, exposures, encoding)
     with working_precision(precision):
         surface = _surface(given, normals, mask, precision, flip_y)
@@ -132,7 +133,6 @@ def fit_maps(
         if labels is not None:
             problem = with_shared_n(problem, labels)
         layers = in_unit(fit_bands(problem, None if keep is None else Path(keep)), unit)
-    layers.pop("criterion")
     if np.all(np.isnan(layers["k_d"])):
         to_light = given.to_light if surface.normal is None else None
         if to_light is not None and np.linalg.svd(to_light, compute_uv=False)[-1] < COPLANAR:
@@ -141,11 +141,6 @@ def fit_maps(
         raise InputError("pictures", "show no texel that counts", "Check mask, normals and clipping")
     names = tuple(one.name for one in models)
     return Maps(models=names, to_view=to_view, notes=notes, to_light=given.to_light, **layers)
-
-
-def _models(model: Any) -> tuple[Any, ...]:
-    name = model_name(model)
-    return (brdf.Lambert, brdf.Phong, brdf.BlinnPhong) if name == "auto" else (brdf.MODELS[name],)
 
 
 def _ambient(ambient: Any, given: Photographs) -> np.ndarray | None:
@@ -171,7 +166,8 @@ def _surface(given: Photographs, normals: Any, mask: Any, precision: Precision, 
         what = f"is of shape {mask.shape}, the photographs of {(height, width)}"
         raise InputError("mask", what, "Give a value for each pixel")
     mask = mask & given.opaque()
-    if flip_y and (normals is None or given.scenes is not None or (isinstance(normals, str) and normals == "fit")):
+    sought = normals is None or (isinstance(normals, str) and normals == "fit")
+    if flip_y and (sought or given.scenes is not None):
         raise InputError("flip_y", "turns normals that are given", "Give them, or leave it out")
     if given.scenes is not None:
         if normals is not None:
@@ -185,11 +181,11 @@ def _surface(given: Photographs, normals: Any, mask: Any, precision: Precision, 
             shadows = np.stack([np.ones((height, width)) if one is None else one for one in known], axis=-1)
         points = dataclasses.replace(points, mask=points.mask & mask, visibility=shadows, area=None)
         return Surface(points.normal, points.mask, points)
-    if normals is None or (isinstance(normals, str) and normals == "fit"):
-        return Surface(None, mask, None)
+    if sought:
+        return Surface(None, mask)
     name = str(normals) if isinstance(normals, str | Path) else "normals"
     normals = map_inputs.normal_map(normals, flip_y=flip_y)
     if normals.shape != (height, width, 3):
         what = f"are of shape {normals.shape}, the photographs of {(height, width)}"
         raise InputError(name, what, "Give a normal for each pixel")
-    return Surface(normals, mask, None)
+    return Surface(normals, mask)

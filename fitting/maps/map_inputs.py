@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 import brdf
+from brdf.checks import direction_value
 from brdf.errors import InputError, as_numbers
 from brdf.files import input_file, parse_number, read_text
 from brdf.images.encoding import Encoding, decode, encode, parse_encoding
@@ -36,11 +37,11 @@ class Photograph:
         name: of the file or argument.
         top: from which value on it is clipped.
         curve: how it is encoded, which tells how exact its values are: noise is even in codes.
-        silent: whether it is a file of integers that does not say so.
         lossy: whether it was compressed with losses.
         alpha: reads how opaque pixels are, (H, W), or None where nobody says.
-        stated: whether a user says from which value on it is clipped.
         step: distance of two codes, the largest being 1; 0 of floats.
+        silent: whether it is a file of integers that does not say how it is encoded.
+        stated: whether a user says from which value on it is clipped.
     """
 
     rows: Callable[[int, int], Float[np.ndarray, "rows W C"]]
@@ -48,11 +49,11 @@ class Photograph:
     name: str
     top: float
     curve: Encoding
+    lossy: bool
+    alpha: Callable[[], Float[np.ndarray, "H W"] | None]
+    step: float
     silent: bool = False
-    lossy: bool = False
-    alpha: Callable[[], Float[np.ndarray, "H W"] | None] = lambda: None
     stated: bool = False
-    step: float = 0.0
 
     def read_as(self, encoding: Encoding) -> "Photograph":
         """The same file read so, clipped at the same code, or at the linear value that was stated."""
@@ -91,36 +92,28 @@ class Photographs:
                 found &= alpha > 0
         return found
 
-    def read_as(self, encoding: Encoding) -> "Photographs":
-        """The same, silent files read so."""
-        each = (one.read_as(encoding) if one.silent else one for one in self.each)
-        return dataclasses.replace(self, each=tuple(each))
-
     def tiles(
         self, texels: Int[np.ndarray, " K"], shape: tuple[int, int], lanes: int, precision: str
-    ) -> Float[np.ndarray, "N P TILE C"]:
+    ) -> Float[np.ndarray, "P N TILE C"]:
         """What some texels show in all photographs, in tiles.
 
         Args:
             texels: indices, row by row, that rise.
-            shape: how many tiles of how many texels, more than are given.
+            shape: how many tiles of how many texels, as many as are given or more.
             lanes: black photographs are added up to a multiple of this.
             precision: of the result.
         """
         (_, width, channels), (count, size) = self.size, shape
-        found = np.zeros((count, -(-len(self.each) // lanes) * lanes, size, channels), precision)
+        found = np.zeros((-(-len(self.each) // lanes) * lanes, count * size, channels), precision)
         row, column = np.divmod(texels, width)
         rows = row[np.diff(row, prepend=-1) != 0]
         some = places(np.searchsorted(rows, row) * width + column)
         runs = np.split(rows, np.flatnonzero(np.diff(rows) != 1) + 1)
-        for index, one in enumerate(self.each):
+        for one, values in zip(self.each, found, strict=False):
             parts = [one.rows(run[0], run[-1] + 1) for run in runs]
-            values = parts[0] if len(parts) == 1 else np.concatenate(parts)
-            values = values.reshape(-1, channels)[some]
-            whole = len(values) // size
-            found[:whole, index] = values[: whole * size].reshape(whole, size, channels)
-            found[whole, index, : len(values) - whole * size] = values[whole * size :]
-        return found
+            shown = parts[0] if len(parts) == 1 else np.concatenate(parts)
+            values[: texels.size] = shown.reshape(-1, channels)[some]
+        return found.reshape(-1, count, size, channels)
 
 
 def places(index: Int[np.ndarray, " K"]) -> Any:
@@ -318,9 +311,8 @@ def photographs(
     if len(lights) != len(each):
         raise InputError("lights", f"are {len(lights)} for {len(each)} photographs", "Give a light for each photograph")
     factors = functools.partial(_factors, len(each), first.shape[2])
-    given = {"intensities": intensities, "exposures": exposures}
-    unit = factors("exposures", np.ones(len(each)))
-    for name, values in given.items():
+    unit = np.ones((len(each), first.shape[2]))
+    for name, values in (("intensities", intensities), ("exposures", exposures)):
         unit = unit if values is None else unit * factors(name, values)
     if all(isinstance(light, brdf.Scene) for light in lights):
         if other := next((i for i, scene in enumerate(lights) if _view(scene) != _view(lights[0])), 0):
@@ -341,18 +333,18 @@ def _opened(name: str, picture: Any, encoding: Any) -> Photograph:
     if isinstance(picture, str | Path):
         reader = brdf.ImageReader(picture, encoding=encoding)
         silent = reader.is_integer and reader.source in ("assumed", "format")
-        return dataclasses.replace(_opened(str(picture), reader, None), silent=silent, lossy=reader.lossy)
+        return dataclasses.replace(_opened(str(picture), reader, None), silent=silent)
     curve = parse_encoding("encoding", encoding) or "linear"
     if isinstance(picture, brdf.ImageReader | brdf.Picture):
         if encoding is not None:
             raise InputError("encoding", f"is that of files and arrays, {name} is decoded", "Leave it out")
         if isinstance(picture, brdf.ImageReader):
-            top = (picture.codes[0] or np.inf) * TOP
-            how = {"alpha": picture.read_alpha, "step": picture.is_integer / (2**picture.bits - 1)}
-            return Photograph(picture.rows, picture.shape, name, top, picture.encoding, **how)
-        top = (picture.saturation or np.inf) * TOP
-        how = {"alpha": lambda: picture.alpha, "step": (picture.code_step or 0.0) * np.max(picture.factor)}
-        return Photograph(lambda a, b: picture.pixels[a:b], picture.pixels.shape, name, top, picture.encoding, **how)
+            read, shape, top, alpha = picture.rows, picture.shape, picture.codes[0], picture.read_alpha
+            step = picture.is_integer / (2**picture.bits - 1)
+        else:
+            read, shape, top = (lambda a, b: picture.pixels[a:b]), picture.pixels.shape, picture.saturation
+            alpha, step = (lambda: picture.alpha), (picture.code_step or 0.0) * np.max(picture.factor)
+        return Photograph(read, shape, name, (top or np.inf) * TOP, picture.encoding, picture.lossy, alpha, step)
     values = np.asarray(picture)
     values = values[..., None] if values.ndim == 2 else values
     integer = values.dtype.kind == "u"
@@ -365,7 +357,8 @@ def _opened(name: str, picture: Any, encoding: Any) -> Photograph:
         part = values[start:stop]
         return decode(part / white if integer else part, curve)
 
-    return Photograph(rows, values.shape, name, TOP if integer else np.inf, curve, step=float(1 / white))
+    top = TOP if integer else np.inf
+    return Photograph(rows, values.shape, name, top, curve, lossy=False, alpha=lambda: None, step=float(1 / white))
 
 
 def _factors(count: int, channels: int, name: str, given: Any) -> Float[np.ndarray, "P C"]:
@@ -380,16 +373,11 @@ def _factors(count: int, channels: int, name: str, given: Any) -> Float[np.ndarr
 
 
 def _directions(given: Any) -> Float[np.ndarray, "P 3"]:
-    vectors = as_numbers("lights", given, remedy="Give directions, or for lights that are near a scene with each")
-    if vectors.ndim != 2 or vectors.shape[1] != 3:
-        raise InputError("lights", f"are of shape {vectors.shape}", "Give (P, 3) directions towards the lights")
-    length = np.sqrt(np.sum(vectors * vectors, axis=1))
-    if not np.all((length > 0) & np.isfinite(length)):
-        worst = int(np.argmin(np.where(np.isfinite(length), length, -1)))
-        raise InputError(f"lights[{worst}]", f"has no direction, got {vectors[worst].tolist()}", "Give x, y, z")
+    rows = as_numbers("lights", given, remedy="Give directions, or for lights that are near a scene with each")
+    vectors = np.array([direction_value(f"lights[{i}]", row) for i, row in enumerate(rows)])
     if np.all(vectors[:, 2] < 0):
         raise InputError("lights", "all come from behind the surface", "Give directions towards the lights: z > 0")
-    return vectors / length[:, None]
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
 def _view(scene: brdf.Scene) -> str:

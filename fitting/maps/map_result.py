@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -135,10 +136,8 @@ class Maps:
         for index, name in enumerate(self.models):
             model = brdf.MODELS[name]
             if issubclass(model, SpecularMaterial):
-                shape = model(k_d=0.0, k_s=1.0, n=1.0)
-                n = jnp.asarray(self.fitted_n)
-                object.__setattr__(shape, "n", n)
-                lobe = np.asarray(shape.specular(normal, jnp.asarray(to_light), jnp.asarray(to_view)))
+                each = eqx.tree_at(lambda one: one.n, model(k_d=0.0, k_s=1.0, n=1.0), jnp.asarray(self.fitted_n))
+                lobe = np.asarray(each.specular(normal, jnp.asarray(to_light), jnp.asarray(to_view)))
                 picture += np.where((self.chosen == index)[..., None], self.fitted_k_s * lobe[..., None], 0)
         return (picture * np.asarray(light.intensity)).astype(np.float32)
 

@@ -92,12 +92,13 @@ def _brightest(one: Photograph, texels: Any) -> Float[np.ndarray, " K"]:
     # By bands: in memory is one value a texel of one photograph.
     bands = (one.rows(first, min(first + ROWS, height)) for first in range(0, height, ROWS))
     values = np.concatenate([over_channels(np.maximum, band.reshape(-1, channels)) for band in bands])[texels]
-    return np.where(np.isfinite(values), values, np.nan)
+    values[~np.isfinite(values)] = np.nan
+    return values
 
 
 def _two_largest(values: Float[np.ndarray, " K"]) -> tuple[float, float]:
     """The largest value, and the largest of those that do not share it; -infinite where there is none."""
-    largest = np.max(values, initial=-np.inf, where=values > -np.inf)
+    largest = np.fmax.reduce(values, initial=-np.inf)
     return float(largest), float(np.max(values, initial=-np.inf, where=values < largest * TOP))
 
 

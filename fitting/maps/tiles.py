@@ -116,7 +116,7 @@ class MapProblem:
         return np.flatnonzero(seen)
 
     def tiles(self, texels: Int[np.ndarray, " K"]) -> tuple[np.ndarray, Surface]:
-        """What some texels show, (N, P, TILE, C), and see, (N, TILE, ...); one lane at least is left over."""
+        """What some texels show, (P, N, TILE, C), and see, (N, TILE, ...); one lane at least is left over."""
         tile = at_a_time(TILE)
         most = tile * tiles_of_program(tile)
         size = -(-(texels.size + 1) // most) * most
@@ -141,30 +141,28 @@ class MapProblem:
         """
         given, dtype = self.photographs, np.dtype(self.precision)
         curves = tuple(one.curve for one in given.each)
-        padded = (*curves, *curves[-1:] * (-len(curves) % LANES))
-        static = self.models, self.grey, self.finer, self.seek, self.refine, padded
+        black = -len(curves) % LANES  # photographs that are added
+        static = self.models, self.grey, self.finer, self.seek, self.refine, (*curves, *curves[-1:] * black)
         with working_precision(self.precision):
             stacks, occluders = (), ()
             if given.scenes is not None:
                 stacks = stacked([scene.lights[0] for scene in given.scenes], dtype)
                 occluders = given.scenes[0].occluders
             to_light = np.zeros((len(curves), 3)) if given.to_light is None else given.to_light
-            of_photographs = [np.array([one.top for one in given.each]), (1 / given.unit).T[:, None]]
-            of_photographs += [_weights(given.unit).T[:, None], to_light.T]
-            of_photographs += [] if self.ambient is None else [self.ambient.T[:, None]]
+            of_photographs = [np.array([one.top for one in given.each]), 1 / given.unit, _weights(given.unit), to_light]
+            of_photographs += [] if self.ambient is None else [self.ambient]
+            of_photographs = [
+                np.append(one, np.zeros((black, *one.shape[1:])), axis=0).T.astype(dtype) for one in of_photographs
+            ]
             view = self.to_view / np.linalg.norm(self.to_view)
             rounding = max(one.step for one in given.each) / np.sqrt(12 * np.mean(given.unit**2))
-            black = -len(curves) % LANES  # photographs that are added
-            of_photographs = [
-                np.append(one, np.zeros((*one.shape[:-1], black)), axis=-1).astype(dtype) for one in of_photographs
-            ]
             more = dtype.type(rounding), view.astype(dtype), stacks, occluders
             # All tiles that hold a texel, and the first lane that holds none.
-            used = np.arange(len(values)) <= np.count_nonzero(surface.mask) // values.shape[2]
-            found, some = [], tiles_of_program(values.shape[2])
-            for first in range(0, len(values), some):
-                part = jax.tree.map(operator.itemgetter(slice(first, first + some)), (used, values, surface))
-                part = placed(band, part)
+            _, count, tile, _ = values.shape
+            used, found, size = np.arange(count) <= np.count_nonzero(surface.mask) // tile, [], tiles_of_program(tile)
+            for first in range(0, count, size):
+                some = slice(first, first + size)
+                part = placed(band, (used[some], values[:, some], jax.tree.map(operator.itemgetter(some), surface)))
                 found.append(_program(*static, *part, of_photographs, *more))
             return {name: np.concatenate([np.asarray(layers[name]) for layers in found]) for name in found[0]}
 
@@ -193,6 +191,7 @@ def _program(
 ) -> dict[str, Array]:
     """The layers of some tiles, one by one; 0 of those that are not used."""
     top, scale, weight, to_light, *ambient = of_photographs
+    scale, weight = scale[:, None], weight[:, None]
     ambient = Components(tuple(ambient[0])) if ambient else None
     lights = Distant(Components(tuple(to_light)), Components(tuple(to_view)), ambient)
 
@@ -205,7 +204,7 @@ def _program(
             normal = normalize(Components.of(jnp.where(mask[:, None], normal, upright)))
 
         def decoded(values, number):
-            shown = jnp.transpose(values[number], (2, 1, 0))
+            shown = jnp.transpose(values[:, number], (2, 1, 0))
             counts = jnp.all(jnp.isfinite(shown) & (shown < top), axis=0) & mask[:, None]
             # what no light reaches is 0 whatever the texel is, in codes without noise even
             if normal is not None and points is None and ambient is None:
@@ -231,13 +230,13 @@ def _program(
         layers = functools.reduce(
             lambda a, b: {name: jnp.where(b["criterion"] < a["criterion"], b[name], a[name]) for name in a}, found
         )
-        return {name: layer.T for name, layer in layers.items()}
+        return {name: layer.T for name, layer in layers.items() if name != "criterion"}
 
     def of_used(tile):
         empty = jax.tree.map(lambda layer: jnp.zeros(layer.shape, layer.dtype), jax.eval_shape(of_tile, tile[1:]))
         return jax.lax.cond(tile[0], of_tile, lambda _: empty, tile[1:])
 
-    tiles = jax.lax.map(of_used, (used, jnp.arange(len(values)), surface))
+    tiles = jax.lax.map(of_used, (used, jnp.arange(len(used)), surface))
     return {name: layer.reshape(-1, *layer.shape[2:]) for name, layer in tiles.items()}
 
 
@@ -343,7 +342,7 @@ def _layers(
     values, unlit, outliers = (channels * one for one in sums_of(counts, texels.seen - lit, lit - counts))
     *linear, k_s = fit.k if glossy else [*fit.k, jnp.zeros_like(fit.k[0])]
     k_s_error, angles = fit.k_error[-1] if glossy else k_s, fit.error[glossy and shared is None :]
-    of_lobe = glossy * ((1 if texels.grey else channels) + (shared is None))
+    of_lobe = texels.of_lobe + glossy * (shared is None)
     unknowns = len(linear) * channels + of_lobe + len(angles)
 
     def price(unknowns: int) -> Array:

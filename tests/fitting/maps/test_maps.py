@@ -597,7 +597,7 @@ def test_texels_outside_cost_nothing_and_change_nothing(monkeypatch):
     )
     maps = fitting.fit_maps(rows.reshape(16, 9, 20, 3), lights, normals.reshape(9, 20, 3))
     assert tiles._program._cache_size() == before
-    assert sum(np.count_nonzero(values[:, 0, :, 0]) for values in fitted) == inside.size
+    assert sum(np.count_nonzero(values[0, ..., 0]) for values in fitted) == inside.size
     for name, values in maps.layers().items():
         found = values.reshape(9 * 20, -1)
         np.testing.assert_array_equal(found[inside], whole.layers()[name].reshape(12, -1)[np.arange(inside.size) % 12])
@@ -1043,3 +1043,10 @@ def test_a_stated_saturation_is_that_value_in_whatever_encoding_a_silent_file_is
     assert dataclasses.replace(given, top=0.8).read_as("linear").top == pytest.approx(
         float(encode(np.array(0.8), "srgb"))
     )
+
+
+def test_a_photograph_that_lost_something_says_so_however_it_is_given(tmp_path: Path):
+    path = tmp_path / "one.jpg"
+    Image.fromarray(np.full((8, 8, 3), 128, np.uint8)).save(path)
+    for given in (path, brdf.ImageReader(path), brdf.read_picture(path)):  # of the latter two nothing was said
+        assert photographs([given], [[0.0, 0.0, 1.0]]).each[0].lossy
