@@ -172,7 +172,7 @@ def _fit_model(
         return fit
     # All pixels were looked at near one exponent; the first fit's profile is over all.
     grid, profile = error.profile
-    return fit._replace(optimum=dataclasses.replace(fit.optimum, grid=grid, profile=profile, profile_sampled=True))
+    return fit._replace(optimum=dataclasses.replace(fit.optimum, grid=grid, profile=profile))
 
 
 def _evenly_noisy(observed: Observed) -> Observed:

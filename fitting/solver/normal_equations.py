@@ -59,20 +59,17 @@ class Picture:
 
     def pixels(self, choose: Callable[[Any], Any]) -> "Picture":
         """The same picture, some of its pixels."""
-        return Picture(
-            target=choose(self.target),
-            diffuse=choose(self.diffuse),
-            lobe=None if self.lobe is None else self.lobe.pixels(choose),
-            weight=None if self.weight is None else choose(self.weight),
-            ambient=self.ambient,
-            bounds=None if self.bounds is None else self.bounds.pixels(choose),
-        )
+        target, diffuse, weight = jax.tree.map(choose, (self.target, self.diffuse, self.weight))
+        lobe, bounds = (None if one is None else one.pixels(choose) for one in (self.lobe, self.bounds))
+        return Picture(target, diffuse, lobe, weight, self.ambient, bounds)
 
     def on_host(self, pixel: Int[np.ndarray, " K"]) -> "Picture":
         """The same picture, some of its pixels, in NumPy: an XLA gather is ten times slower."""
-        lobe = None if self.lobe is None else self.lobe.on_host(pixel)
-        here = jax.tree.map(np.asarray, replace(self, lobe=None))
-        return replace(here.pixels(partial(np.take, indices=pixel, axis=0)), lobe=lobe)
+        here = replace(self, lobe=None)._taken(pixel)
+        return here if self.lobe is None else replace(here, lobe=self.lobe.on_host(pixel))
+
+    def _taken(self, pixel: Int[np.ndarray, " K"]) -> "Picture":
+        return jax.tree.map(np.asarray, self).pixels(partial(np.take, indices=pixel, axis=0))
 
     def in_double(self, pixel: Int[np.ndarray, " K"]) -> "Picture":
         """The same picture, some of its pixels, in NumPy and double precision.
@@ -80,15 +77,8 @@ class Picture:
         Where the lobe is made anew at each evaluation some of them are repeated, with bounds that say nothing: programs
         are compiled for a few numbers of pixels only.
         """
-        lobe, filled = self.lobe, 0
-        if lobe is not None and self.is_sampled:
-            filled = -pixel.size % (_FEW if pixel.size <= _FEW else 8 * _FEW)
-            pixel = np.append(pixel, np.zeros(filled, pixel.dtype))
-            lobe = jax.tree.map(np.asarray, lobe).pixels(partial(np.take, indices=pixel, axis=0))
-        elif lobe is not None:
-            lobe = lobe.on_host(pixel)
-        here = jax.tree.map(np.asarray, replace(self, lobe=None))
-        some = replace(here.pixels(partial(np.take, indices=pixel, axis=0)), lobe=lobe)
+        filled = -pixel.size % (_FEW if pixel.size <= _FEW else 8 * _FEW) if self.is_sampled else 0
+        some = self._taken(np.pad(pixel, (0, filled))) if self.is_sampled else self.on_host(pixel)
         some = jax.tree.map(lambda a: np.asarray(a, np.float64) if eqx.is_inexact_array_like(a) else a, some)
         if filled and some.bounds is not None:
             some.bounds.lower[-filled:], some.bounds.upper[-filled:] = -np.inf, np.inf
@@ -373,13 +363,11 @@ def sums(
             # Under a mesh the next device begins before this one is done.
             passed[index] = jax.block_until_ready(found) if device_count() == 1 else found, picture.ambient
         parts = {}
+        shape = some.size, len(reference)
         for index, (found, ambient) in passed.items():
             packed, mean = (np.asarray(leaf)[: some.size].astype(np.float64) for leaf in found)
             part = _unpack(packed, mean, ambient, len(reference))
-            parts[index] = np.concatenate([leaf.reshape(some.size, -1) for leaf in part], axis=1)
-        channels = len(reference)
-        table = np.sum(gathered(parts, len(pictures), (some.size, 22 * channels)), axis=0)
-        gram, product, square, pixels = np.split(table, np.cumsum([16, 4, 1]) * channels, axis=1)
-        gram, product = gram.reshape(-1, channels, 4, 4), product.reshape(-1, channels, 4)
-        totals.append(Sums(gram, product, square, pixels))
+            parts[index] = np.concatenate([leaf.reshape(*shape, -1) for leaf in part], axis=2)
+        table = np.sum(gathered(parts, len(pictures), (*shape, 22)), axis=0)
+        totals.append(Sums(table[..., :16].reshape(*shape, 4, 4), table[..., 16:20], *np.moveaxis(table[..., 20:], -1, 0)))
     return Sums(*map(np.concatenate, zip(*totals, strict=True)))

@@ -69,8 +69,7 @@ class Optimum:
         product: Weighted products of the columns with the target.
         square: Weighted squares of the target.
         grid: Exponents of the profile's samples; empty without a lobe.
-        profile: Least cost at each, summed over channels; of the subsample, scaled, where ``profile_sampled``.
-        profile_sampled: The profile is that of a subsample of the pixels.
+        profile: Least cost at each, summed over channels: of a subsample of many pixels, scaled.
     """
 
     n: float
@@ -82,7 +81,6 @@ class Optimum:
     square: Float[np.ndarray, " C"]
     grid: Float[np.ndarray, " G"]
     profile: Float[np.ndarray, " G"]
-    profile_sampled: bool
 
     @property
     def flat(self) -> bool:
@@ -139,7 +137,7 @@ def search(
         lobes = sample.lobes(log_n, problem.peak)
         few = sample.sums(lobes)
         profile = solve_linear(few, log_n, np.zeros(problem.free.shape), problem)
-        about = np.exp(log_n), profile.cost.sum(axis=1), not sample.whole
+        about = np.exp(log_n), profile.cost.sum(axis=1)
         rough = _without_lobe(few)
         if problem.tolerance == TOLERANCE_SINGLE and not _resolved(profile, few, rough):
             # Sums in double precision over all pixels, one picture at a time: slow, and rarely needed.
@@ -160,10 +158,7 @@ def search(
                     return _optimum(*found, problem, *about)
             log_n = log_n[max(0, first - 1) : last + 3]
             profile = solve_linear(sums(pictures, log_n, rough, problem.peak), log_n, rough, problem)
-        position, *_ = _cells(profile)
-        candidates: list[tuple[Point, Sums]] = []
-        for cell in _valleys(profile, problem.tolerance):
-            candidates.append(minimum(problem, _start(profile, cell, float(position[cell])), GRID_STEP))
+        candidates = [minimum(problem, start, GRID_STEP) for start in _valleys(profile, problem.tolerance)]
         # Where the profile is level the best sample may be no worse than what the valleys led to.
         costs = profile.cost.sum(axis=1)
         if cap is None and np.min(costs) < min(np.sum(point.cost) for point, _ in candidates):
@@ -203,7 +198,7 @@ def refit(
         if not x[2].any():
             problem = problem._replace(free=problem.free & [True, True, False])
         found = gauss_newton(problem, Point(math.log(optimum.n), x.T, optimum.cost))
-    return _optimum(*found, problem, optimum.grid, optimum.profile, optimum.profile_sampled)
+    return _optimum(*found, problem, optimum.grid, optimum.profile)
 
 
 def _without_lobe(few: Sums) -> np.ndarray:
@@ -271,25 +266,19 @@ def _cells(profile: Point, error: Any = 0.0) -> tuple[np.ndarray, np.ndarray, np
     return position, lowest, lowest <= lowest[best] + DEVIATIONS * error + margin + margin[best]
 
 
-def _valleys(profile: Point, tolerance: float) -> np.ndarray:
-    """Every cell with a minimum of the profile of all pixels that may be the least."""
-    _, lowest, possible = _cells(profile)
+def _valleys(profile: Point, tolerance: float) -> list[Point]:
+    """A start in every cell with a minimum of the profile of all pixels that may be the least."""
+    position, lowest, possible = _cells(profile)
     # A dent no deeper than rounding is no minimum of its own: where a highlight is smaller than a pixel, the profile is
     # level over decades of n.
     low = np.min(lowest)
     depth = 1e-9 * low + 2 * tolerance * (low + np.max(profile.cost.sum(axis=1))) + np.finfo(float).tiny
     level = np.pad(np.where(possible, np.round((lowest - low) / depth), np.inf), 1, constant_values=np.inf)
-    return np.flatnonzero((level[1:-1] < level[:-2]) & (level[1:-1] <= level[2:]))
+    cells = np.flatnonzero((level[1:-1] < level[:-2]) & (level[1:-1] <= level[2:]))
+    return [_start(profile, cell, float(position[cell])) for cell in cells]
 
 
-def _optimum(
-    point: Point,
-    about: Sums,
-    problem: Problem,
-    grid: Any = (),
-    profile: Any = (),
-    sampled: bool = False,
-) -> Optimum:
+def _optimum(point: Point, about: Sums, problem: Problem, grid: Any = (), profile: Any = ()) -> Optimum:
     """Gather the answer, with the lobe and its derivative by n in place of those relative to the lobe's peak."""
     # An exponent at its bound is the bound, not the exponential of its logarithm.
     known = dict(zip(problem.bounds, problem.n_range, strict=True))
@@ -311,5 +300,4 @@ def _optimum(
         square=about.square,
         grid=np.asarray(grid),
         profile=np.asarray(profile),
-        profile_sampled=sampled,
     )
