@@ -177,7 +177,7 @@ def observe(problem: FitProblem, *, at_once: bool = False) -> Observed:
     """
     colour, grey = take_colour_out(problem.scenes, problem.targets[0].pixels.shape[-1])
     given = zip(problem.targets, problem.scenes, grey, problem.masks, problem.weights, strict=True)
-    parts = itertools.starmap(functools.partial(_observe, problem, at_once), given)
+    parts = itertools.starmap(partial(_observe, problem, at_once), given)
     tiles, rounding, brightest, counts, shown, scenes, counted, weights = map(list, zip(*parts, strict=True))
     left_out: Counter[str] = Counter()
     for some in counts:
@@ -237,13 +237,13 @@ def _observe(
     def tile(band: _Band, counted: tuple[np.ndarray, Statistics]) -> Tile:
         good, weight = counted[0], None
         if noise is not None:
-            read, shot = map(float, noise)
-            weight = _inverse_variance(band.values, jnp.asarray(good), (height, width), read, shot, target.step)
+            values, (read, shot) = np.asarray(band.values).reshape(target.pixels.shape), map(float, noise)
+            weight = _inverse_variance(values, good.reshape(height, width), read, shot, target.step)
         elif total.counts[-1] < height * width:
-            weight = jax.device_put(good.astype(dtype))
+            weight = good.astype(dtype)
         if given is not None:
             stated = given[band.rows].ravel().astype(dtype)
-            weight = jax.device_put(stated if weight is None else stated * np.asarray(weight))
+            weight = stated if weight is None else stated * weight
         bounds = None
         if plain:
             valid, (_, allowed, finite, *_) = np.asarray(band.allowed), counted[1].counts
@@ -251,9 +251,8 @@ def _observe(
                 valid = valid & np.all(np.isfinite(np.asarray(band.values)), axis=-1)
             spread = 1.0
             if weight is not None and (given is not None or noise is not None):
-                heavy = np.asarray(weight)
-                valid = valid & (heavy > 0)
-                spread = 1.0 / np.sqrt(np.where(heavy > 0, heavy, 1.0))[:, None]
+                valid = valid & (weight > 0)
+                spread = 1.0 / np.sqrt(np.where(weight > 0, weight, 1.0))[:, None]
             if target.codes is not None:
                 bounds = target.codes.bounds(band.rows, valid, level, spread)
             else:
@@ -263,17 +262,18 @@ def _observe(
         if apart and level is not None:
             below = good[:, None] & (np.asarray(band.values) < level)
             if np.count_nonzero(below) < below.shape[1] * np.count_nonzero(good):
-                each_value = below.astype(dtype)
-                weight = jax.device_put(each_value if weight is None else each_value * np.asarray(weight)[:, None])
-        return Tile(band.values, weight, band.points, grey, bounds)
+                weight = below.astype(dtype) * (1 if weight is None else weight[:, None])
+        return Tile(band.values, None if weight is None else jax.device_put(weight), band.points, grey, bounds)
 
     tiles = each(tile, bands, found)
     brightest = total.scale.astype(np.float64)
     resolution = max(float(np.finfo(dtype).eps), CONVERGED)
-    weights = None
     if target.streamed:
-        *shown, stride = _shown(bands, found, scene, problem.precision)
-        weights = None if given is None else given[::stride, ::stride] * shown[-1]
+        values, thinned, allowed, weights = _thinned(target, scene, problem.precision, mask, given)
+        thin = _bands(target._replace(pixels=values), thinned, dtype, allowed, at_once=True)
+        (counted, _), *_ = _statistics(thin, level, dark, apart=apart, keep=True)[0]
+        shown = values.astype(dtype, copy=False), thinned, counted.reshape(values.shape[:2])
+        weights = None if weights is None else weights * shown[-1]
     else:
         resolution = max(resolution, float(np.finfo(target.pixels.dtype).eps))
         counted = np.concatenate([good for good, _ in found]).reshape(height, width)
@@ -282,14 +282,15 @@ def _observe(
             whole = counted & np.all(np.asarray(target.pixels) < level, axis=-1)
             counted = whole if whole.any() else counted
         shown = target.pixels.astype(dtype, copy=False), scene, counted
-        # Where a channel is clipped and others are not these have weights of their own.
-        if apart and any(getattr(tile.weight, "shape", ()) == tile.target.shape for tile in tiles):
-            own = [np.ones(len(tile.target)) if tile.weight is None else np.asarray(tile.weight) for tile in tiles]
-            own = [np.broadcast_to(one.T, tile.target.shape[::-1]).T for one, tile in zip(own, tiles, strict=True)]
-            weights = np.concatenate(own).reshape(target.pixels.shape)
-        elif given is not None or noise is not None:
-            heaviest = [np.max(np.asarray(one.weight).reshape(one.target.shape[0], -1), axis=1) for one in tiles]
-            weights = np.concatenate(heaviest).reshape(height, width) * counted
+        weights, weighed = None, given is not None or noise is not None
+        if weighed or (apart and level is not None):
+            own = [np.ones(len(one.target)) if one.weight is None else np.asarray(one.weight) for one in tiles]
+            # Where a channel is clipped and others are not these have weights of their own.
+            several = max(one.ndim for one in own) > 1
+            if several:
+                own = [np.broadcast_to(one.T, tile.target.shape[::-1]).T for one, tile in zip(own, tiles, strict=True)]
+            if weighed or several:
+                weights = np.concatenate(own).reshape(target.pixels.shape if several else (height, width))
     rounding = np.maximum(brightest * resolution, target.step / np.sqrt(12.0))
     return tiles, rounding, brightest, left_out, *shown, weights
 
@@ -415,35 +416,17 @@ def _left_out(
     return left_out
 
 
-def _shown(
-    bands: Sequence[_Band], found: Sequence[tuple[np.ndarray, Statistics]], scene: brdf.Scene, precision: Precision
-) -> tuple[np.ndarray, brdf.Scene, np.ndarray, int]:
-    """Every so many pixels of a picture that is not in memory, what they show, which of them counted, how many."""
-    width = scene.resolution[0]
-    stride, thinned = _thinned(scene, precision)
-
-    def some(values: Any, first: int) -> np.ndarray:
-        return _every(stride, np.asarray(values).reshape(-1, width, *values.shape[1:]), first)
-
-    parts = [
-        (some(band.values, band.rows.start), some(good, band.rows.start))
-        for band, (good, _) in zip(bands, found, strict=True)
-    ]
-    shown, counted = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return shown, thinned, counted, stride
-
-
-def _thinned(scene: brdf.Scene, precision: Precision) -> tuple[int, brdf.Scene]:
-    """Of how many rows and columns one is taken of a picture that is not in memory, and what these show."""
+def _thinned(target: Target, scene: brdf.Scene, precision: Precision, *of_pixels: Any) -> tuple[Any, ...]:
+    """Of a picture that is read by bands every so many pixels, what they show, and what else there is of each."""
     width, height = scene.resolution
     stride = -(-max(width, height) // SHOWN_PIXELS)
     pixel = np.arange(0, height, stride)[:, None] * width + np.arange(0, width, stride)
-    return stride, brdf.some_pixels(scene, pixel, precision=precision)
-
-
-def _every(stride: int, rows: np.ndarray, first: int) -> np.ndarray:
-    """Those of a band that begins with some row. A copy: a view would keep the whole band."""
-    return rows[-first % stride :: stride, ::stride].copy()
+    values = []
+    for first in range(0, height, ALIGNED_ROWS):
+        rows = target.pixels.rows(first, min(first + ALIGNED_ROWS, height))
+        values.append(rows[-first % stride :: stride, ::stride].copy())  # a view would keep the whole band
+    rest = [None if one is None else one[::stride, ::stride] for one in of_pixels]
+    return np.concatenate(values), brdf.some_pixels(scene, pixel, precision=precision), *rest
 
 
 def in_memory(problem: FitProblem, rounding: Rounding) -> FitProblem:
@@ -457,25 +440,20 @@ def in_memory(problem: FitProblem, rounding: Rounding) -> FitProblem:
     def some(target: Target, scene: brdf.Scene, *of_pixels: Any) -> tuple[Any, ...]:
         if not target.streamed:
             return target, scene, *of_pixels
-        stride, thinned = _thinned(scene, problem.precision)
-        height = target.pixels.shape[0]
-        bands = [(first, min(first + ALIGNED_ROWS, height)) for first in range(0, height, ALIGNED_ROWS)]
-        values = np.concatenate([_every(stride, target.pixels.rows(*band), band[0]) for band in bands])
+        values, *rest = _thinned(target, scene, problem.precision, *of_pixels)
         picture = target.pixels.picture(values)
         # Pixels of a block of a JPEG are known by their neighbours.
-        picture = picture if stride == 1 else dataclasses.replace(picture, jpeg=None)
-        rest = [None if one is None else one[::stride, ::stride] for one in of_pixels]
-        return as_target(picture, rounding), thinned, *rest
+        picture = picture if values.shape == target.pixels.shape else dataclasses.replace(picture, jpeg=None)
+        return as_target(picture, rounding), *rest
 
     parts = zip(problem.targets, problem.scenes, problem.masks, problem.weights, strict=True)
     targets, scenes, masks, weights = map(list, zip(*(some(*one) for one in parts), strict=True))
     return dataclasses.replace(problem, targets=targets, scenes=scenes, masks=masks, weights=weights, shown=None)
 
 
-@functools.partial(jax.jit, static_argnums=2)
 def _inverse_variance(
-    values: Array, good: Array, shape: tuple[int, int], read: float, shot: float, step: float
-) -> Array:
+    values: Float[np.ndarray, "H W C"], good: Bool[np.ndarray, "H W"], read: float, shot: float, step: float
+) -> Float[np.ndarray, " P"]:
     """Inverse variances over their mean; a pixel's channels share the variance of their mean value.
 
     The value is the mean of 5 x 5 pixels: taken from the pixel itself, weights would favour what noise made darker.
@@ -483,22 +461,19 @@ def _inverse_variance(
     Args:
         values: of each pixel.
         good: which count; the others weigh 0.
-        shape: height and width of the picture.
         read: standard deviation of the noise without light.
         shot: variance over value.
         step: distance of two codes.
     """
-    mean = jnp.where(good, over_channels(jnp.add, values) / values.shape[1], 0.0)
-    count = good.astype(values.dtype)
-    total, known = (
-        jax.lax.reduce_window(
-            image.reshape(shape), np.zeros((), image.dtype), jax.lax.add, (5, 5), (1, 1), "SAME"
-        ).ravel()
-        for image in (mean, count)
-    )
-    smooth = jnp.maximum(total / jnp.maximum(known, 1.0), 0.0)
+    from scipy.ndimage import uniform_filter  # it takes long to load
+
+    mean = np.asarray(np.mean(np.where(good[..., None], values, 0.0), axis=-1, dtype=np.float64))
+    total, known = (uniform_filter(image, 5, mode="constant") for image in (mean, good.astype(np.float64)))
+    # A pixel that counts is one of its 25.
+    smooth = np.maximum(total / np.maximum(known, 1 / 25), 0.0)
     # Without read noise a black pixel would weigh infinitely much: quantisation, or a millionth of the mean, stands in.
-    least = 1e-6 * shot * jnp.sum(mean) / jnp.maximum(jnp.sum(count), 1.0) + jnp.finfo(values.dtype).tiny
-    variance = jnp.maximum(read * read + shot * smooth + step * step / 12.0, least)
-    weight = jnp.where(good, jnp.min(jnp.where(good, variance, jnp.inf)) / variance, 0.0)
-    return (weight * (jnp.sum(count) / jnp.sum(weight))).astype(values.dtype)
+    least = 1e-6 * shot * np.mean(mean[good]) + np.finfo(values.dtype).tiny
+    variance = np.maximum(read * read + shot * smooth + step * step / 12.0, least)[good]
+    weight = np.zeros(good.shape, values.dtype)
+    weight[good] = np.mean(1 / variance) ** -1 / variance
+    return weight.ravel()

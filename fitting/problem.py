@@ -3,7 +3,7 @@
 import dataclasses
 import math
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from functools import partial
 from numbers import Real
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ import brdf
 from brdf.errors import InputError
 from brdf.images.encoding import Encoding, decode, decode_table, largest_step, parse_encoding
 from brdf.precision import Precision
-from fitting.codes import HALF, Codes, Rounding, find_codes
+from fitting.codes import Codes, Rounding, find_codes
 from fitting.sample_error import SampleError
 from fitting.solver.losses import LOSSES, Loss
 
@@ -189,16 +189,12 @@ def state_problem(
     for each in scenes:
         if not isinstance(each, brdf.Scene):
             raise InputError("scene", f"must be a brdf.Scene, got {type(each).__name__}", "Use brdf.Scene.load")
-    named = [f"target[{index}]" if len(targets) > 1 else "target" for index in range(len(targets))]
-    targets = [
-        _named(as_target, name, picture, rounding, encoding) for name, picture in zip(named, targets, strict=True)
-    ]
-    if any(target.codes is not None and target.codes.fine for target in targets):
-        options["precision"] = "float64"
-    problem = FitProblem(targets, scenes, masks, weights, **options)
-    _check_options(problem)
-    for index, (picture, place) in enumerate(zip(problem.targets, scenes, strict=True)):
-        _named(_check_picture, named[index], picture, place, problem)
+    for index, (target, scene) in enumerate(zip(targets, scenes, strict=True)):
+        try:
+            targets[index] = picture = as_target(target, rounding, encoding)
+            _check_picture(picture, scene, options.get("noise"))
+        except InputError as error:
+            raise error.renamed({"target": f"target[{index}]"} if len(targets) > 1 else {}) from None
         shape = picture.pixels.shape[:2]
         if masks[index] is not None:
             masks[index] = _per_pixel("mask", masks[index], shape).astype(bool)
@@ -210,18 +206,14 @@ def state_problem(
         # What weighs nothing says nothing of clipping or rounding either.
         heavy = weights[index] > 0
         masks[index] = heavy if masks[index] is None else masks[index] & heavy
-    counts = {picture.pixels.shape[2] for picture in problem.targets}
+    counts = {picture.pixels.shape[2] for picture in targets}
     if len(counts) > 1:
         raise InputError("target", f"pictures have {counts} channels", "Give pictures with the same number")
+    if any(picture.codes is not None and picture.codes.fine for picture in targets):
+        options["precision"] = "float64"
+    problem = FitProblem(targets, scenes, masks, weights, **options)
+    _check_options(problem)
     return problem
-
-
-def _named(function: Callable[..., Any], name: str, *arguments: Any) -> Any:
-    """What a function of one picture gives; its errors name which one it is."""
-    try:
-        return function(*arguments)
-    except InputError as error:
-        raise error.renamed({"target": name}) from None
 
 
 def as_target(given: Any, rounding: Rounding = None, encoding: Encoding | None = None) -> Target:
@@ -256,21 +248,23 @@ def as_target(given: Any, rounding: Rounding = None, encoding: Encoding | None =
     return _of_array(np.asarray(given), rounding, curve or "linear")
 
 
-def _of_picture(picture: brdf.Picture, rounding: Rounding) -> Target:
+def _of_picture(picture: brdf.Picture, rounding: Rounding, stored: np.ndarray | None = None) -> Target:
+    """Of a file or an array; the codes themselves where they are at hand."""
     codes, step, top, pixels = None, 0.0, picture.saturation, picture.pixels
-    if top is not None:
-        step = largest_step(picture.encoding, picture.bits) * float(np.max(picture.factor))
+    curve = None if top is None else picture.encoding
+    find = partial(find_codes, pixels, curve, picture.bits, unit=picture.factor, stored=stored)
     if rounding is not None or not picture.lossy or top is not None:
-        encoding = None if top is None else picture.encoding
-        codes = find_codes(picture.pixels, encoding, picture.bits, rounding, picture.factor)
+        codes = find(rounding)
     if codes is not None:
         # Steps that the user states are not the codes that were compressed.
         jpeg = picture.jpeg if rounding is None or isinstance(rounding, str) else None
         codes = codes._replace(lossy=picture.lossy, jpeg=jpeg)
         pixels = codes.middle(pixels)
     if top is not None:
-        own = partial(find_codes, picture.pixels, picture.encoding, picture.bits, None, picture.factor)
-        top = _clipped_from(top, codes, own)
+        step = largest_step(picture.encoding, picture.bits) * float(np.max(picture.factor))
+        # Fewer bits may end below the file's largest code; steps that a user states are not those of the file.
+        of_file = codes if codes is not None and np.isfinite(codes.ends[1]) else find(None)
+        top = TOP * min(top, np.inf if of_file is None else of_file.largest)
     least, file = rounding is not None and codes is None, None
     if picture.path is not None:
         file = {"path": str(picture.path), "encoding": picture.encoding, "source": picture.source}
@@ -278,42 +272,23 @@ def _of_picture(picture: brdf.Picture, rounding: Rounding) -> Target:
     return Target(pixels, top, step, codes, least, file)
 
 
-def _clipped_from(top: float, codes: Codes | None, of_file: Callable[[], Codes | None]) -> float:
-    """The linear value from which on those of an integer file are clipped: fewer bits may end below its largest code.
-
-    Args:
-        top: of the largest code of the file.
-        codes: that are fitted; steps that a user states are not those of the file.
-        of_file: finds these.
-    """
-    if codes is None or not np.isfinite(codes.ends[1]):
-        codes = of_file()
-    return TOP * min(top, np.inf if codes is None else codes.largest)
-
-
 def _of_array(values: np.ndarray, rounding: Rounding, encoding: Encoding) -> Target:
-    kind, step, bits, stored = values.dtype, 0.0, None, None
+    kind, bits, stored = values.dtype, 8 * values.dtype.itemsize, None
     if kind in (np.uint8, np.uint16):
-        bits, stored = 8 * kind.itemsize, np.atleast_3d(values)
-        table = decode_table(encoding, bits)
-        values, step = table.astype(np.float32)[values], largest_step(encoding, bits)
+        stored, values = np.atleast_3d(values), decode_table(encoding, bits).astype(np.float32)[values]
     elif kind.kind != "f":
         what = f"must hold floating-point values, or codes of 8 or 16 bits, got {kind}"
         raise InputError("target", what, "Read it with brdf.read_picture, or divide by the largest code")
     elif encoding != "linear":
         values = decode(values, encoding)
-    if kind == np.float16:
-        bits, step, values = HALF, float(np.finfo(np.float16).eps), values.astype(np.float32)
+    values = values.astype(np.float32) if kind == np.float16 else values
     if values.ndim == 2:
         values = values[..., None]
     if values.ndim != 3 or 0 in values.shape:
         raise InputError("target", f"must be of shape (H, W, C), got {values.shape}", "Give one picture")
-    integer = stored is not None
-    codes = find_codes(values, encoding if integer else None, bits, rounding, stored=stored)
-    values = values if codes is None else codes.middle(values)
-    own = partial(find_codes, values, encoding, bits, None, stored=stored)
-    top = _clipped_from(1.0, codes, own) if integer else None
-    return Target(values, top, step, codes, least_squares=rounding is not None and codes is None)
+    picture = brdf.Picture(values, None, encoding, "given", bits, None if stored is None else 1.0)
+    target = _of_picture(picture, rounding, stored)
+    return target._replace(step=float(np.finfo(kind).eps)) if kind == np.float16 else target
 
 
 def _per_pixel(name: str, values: Any, shape: tuple[int, int]) -> np.ndarray:
@@ -325,7 +300,7 @@ def _per_pixel(name: str, values: Any, shape: tuple[int, int]) -> np.ndarray:
     return values
 
 
-def _check_picture(target: Target, scene: brdf.Scene, problem: FitProblem) -> None:
+def _check_picture(target: Target, scene: brdf.Scene, noise: Any) -> None:
     height, width, channels = target.pixels.shape
     if (width, height) != scene.resolution:
         what = f"is {width} x {height}, the scene's camera {scene.resolution[0]} x {scene.resolution[1]}"
@@ -334,7 +309,7 @@ def _check_picture(target: Target, scene: brdf.Scene, problem: FitProblem) -> No
         what = f"has {channels} channels, the scene's light {scene.channels}"
         remedy = "Give both the same number of channels; light of one serves every picture"
         raise InputError("target", what, remedy)
-    if target.streamed and problem.noise is not None:
+    if target.streamed and noise is not None:
         remedy = "Give the picture in memory, or weight in place of noise"
         raise InputError("noise", "needs the whole picture at once, the target is read by bands", remedy)
     if target.streamed and has_pixel_areas(scene):
