@@ -212,9 +212,9 @@ def _fit_about(
         else:
             free = free & [[True], [True], [False]]
     optimise = partial(search, free=free, n_range=n_range)
-    found = reweight(pictures, optimise(pictures), optimise, observed.problem.loss, observed.rounding)
-    fit = ModelFit(model, found.pictures, found.optimum, free, n_range, owner=observed.owner, copies=observed.copies)
-    return fit._replace(noise_factor=found.noise_factor)
+    loss, about = observed.problem.loss, {"owner": observed.owner, "copies": observed.copies}
+    pictures, optimum, factor = reweight(pictures, optimise(pictures), optimise, loss, observed.rounding)
+    return ModelFit(model, pictures, optimum, free, n_range, noise_factor=factor, **about)
 
 
 def _fit_simplest(observed: Observed) -> tuple[ModelFit, Choice, Residual | None]:

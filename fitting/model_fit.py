@@ -67,7 +67,7 @@ class ModelFit(NamedTuple):
         free: which coefficients could be above 0, (3, C).
         n_range: between which exponents the optimum was searched.
         tied: x_s is a common factor times this, (C,); None where the channels are independent.
-        noise_factor: see `fitting.solver.losses.Reweighted`.
+        noise_factor: see `fitting.solver.losses.reweight`.
         capped: k_d + k_s is held at 1 in some channel.
         evidence: what rounded values say; None where least squares is the whole answer.
         owner: of which picture each of ``pictures`` is, which may be a band of it.

@@ -22,7 +22,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -49,28 +49,13 @@ MOST_ROUNDS = 50
 ENOUGH = 1e-4
 
 
-class Reweighted(NamedTuple):
-    """The outcome of a reweighted fit.
-
-    Attributes:
-        optimum: of the last round.
-        pictures: with the weights of the last round.
-        noise_factor: what the weighted residual's standard deviation is multiplied by to give that which the formula
-            for standard errors needs: the weights know the residuals.
-    """
-
-    optimum: Optimum
-    pictures: Sequence[Picture]
-    noise_factor: float = 1.0
-
-
 def reweight(
     pictures: Sequence[Picture],
     optimum: Optimum,
     optimise: Callable[[Sequence[Picture]], Optimum],
     loss: Loss,
     rounding: Float[np.ndarray, " C"],
-) -> Reweighted:
+) -> tuple[Sequence[Picture], Optimum, float]:
     """Fit with a loss of any kind: squared fits, each with the weights of the last one's optimum, until it rests.
 
     Args:
@@ -79,10 +64,15 @@ def reweight(
         optimise: that fit.
         loss: one of `LOSSES`.
         rounding: standard deviation of a value's rounding, (C,); no scale is smaller.
+
+    Returns:
+        The pictures with the weights of the last round, its optimum, and what the weighted residual's standard
+        deviation is multiplied by to give that which the formula for standard errors needs: the weights know the
+        residuals.
     """
     now, robust = pictures, loss in ("huber", "cauchy")
     if loss == "squared":
-        return Reweighted(optimum, pictures)
+        return pictures, optimum, 1.0
     scale = rounding if robust else DARKEST * _mean(pictures)
     for round_ in range(MOST_ROUNDS):
         # Huber's loss is convex in the coefficients; the first rounds lead Cauchy's to the right one of its minima.
@@ -93,7 +83,7 @@ def reweight(
         optimum = optimise(now)
         if rule == loss and _change(before, optimum) < ENOUGH:
             break
-    return Reweighted(optimum, now, _noise_factor(now, pictures, optimum, loss) if robust else 1.0)
+    return now, optimum, _noise_factor(now, pictures, optimum, loss) if robust else 1.0
 
 
 def _change(before: Optimum, after: Optimum) -> float:

@@ -60,7 +60,8 @@ class Picture:
     def pixels(self, choose: Callable[[Any], Any]) -> "Picture":
         """The same picture, some of its pixels."""
         target, diffuse, weight = jax.tree.map(choose, (self.target, self.diffuse, self.weight))
-        lobe, bounds = (None if one is None else one.pixels(choose) for one in (self.lobe, self.bounds))
+        lobe = None if self.lobe is None else self.lobe.pixels(choose)
+        bounds = None if self.bounds is None else self.bounds.pixels(choose)
         return Picture(target, diffuse, lobe, weight, self.ambient, bounds)
 
     def on_host(self, pixel: Int[np.ndarray, " K"]) -> "Picture":
@@ -369,5 +370,6 @@ def sums(
             part = _unpack(packed, mean, ambient, len(reference))
             parts[index] = np.concatenate([leaf.reshape(*shape, -1) for leaf in part], axis=2)
         table = np.sum(gathered(parts, len(pictures), (*shape, 22)), axis=0)
-        totals.append(Sums(table[..., :16].reshape(*shape, 4, 4), table[..., 16:20], *np.moveaxis(table[..., 20:], -1, 0)))
+        gram, product = table[..., :16].reshape(*shape, 4, 4), table[..., 16:20]
+        totals.append(Sums(gram, product, table[..., 20], table[..., 21]))
     return Sums(*map(np.concatenate, zip(*totals, strict=True)))

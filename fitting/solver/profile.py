@@ -275,7 +275,7 @@ def _valleys(profile: Point, tolerance: float) -> list[Point]:
     depth = 1e-9 * low + 2 * tolerance * (low + np.max(profile.cost.sum(axis=1))) + np.finfo(float).tiny
     level = np.pad(np.where(possible, np.round((lowest - low) / depth), np.inf), 1, constant_values=np.inf)
     cells = np.flatnonzero((level[1:-1] < level[:-2]) & (level[1:-1] <= level[2:]))
-    return [_start(profile, cell, float(position[cell])) for cell in cells]
+    return [_start(profile, cell, float(position[cell])) for cell in cells.tolist()]
 
 
 def _optimum(point: Point, about: Sums, problem: Problem, grid: Any = (), profile: Any = ()) -> Optimum:
