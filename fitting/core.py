@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 import math
-import time
 from collections.abc import Mapping, Sequence
 from functools import partial
 
@@ -21,7 +20,7 @@ from brdf.rendering import basis
 from fitting.doubts import doubts
 from fitting.jpeg_errors import codec_of, without_codec_errors
 from fitting.light_colour import coefficient_factors
-from fitting.maximum_likelihood import highlight_in_codes, most_likely, unexplained
+from fitting.maximum_likelihood import bounds_of, highlight_in_codes, most_likely, unexplained
 from fitting.model_fit import ModelFit
 from fitting.pixels import Observed, Tile, observe
 from fitting.problem import FitProblem
@@ -77,7 +76,6 @@ def fit_pictures(problem: FitProblem) -> FitResult:
     Raises:
         InputError: where nothing is left to fit.
     """
-    start = time.perf_counter()
     # Over the largest of them all, so that single precision holds them.
     largest = max((float(np.max(weight)) for weight in problem.weights if weight is not None), default=1.0)
     weights = [None if weight is None else weight / largest for weight in problem.weights]
@@ -109,7 +107,7 @@ def fit_pictures(problem: FitProblem) -> FitResult:
             fit = rest._replace(moved=(_by_highlight(fit, rest, observed),))
             result = _interpreted(fit, observed, choice, hidden)
     candidates = () if choice is None else choice.candidates
-    return dataclasses.replace(result, candidates=candidates, optimum=optimum, seconds=time.perf_counter() - start)
+    return dataclasses.replace(result, candidates=candidates, optimum=optimum)
 
 
 def picture_of(model: type[brdf.Material], tile: Tile, near: Near | None = None) -> Picture:
@@ -160,12 +158,11 @@ def _fit_model(
             raise InputError("target", what, "Give a darker exposure or a higher saturation")
         if fit.optimum.flat:
             break
-        n, peak = fit.optimum.n, nearest_peak(pictures)
         if near is not None:
-            near = nearer(near, n, problem.n_range, peak, last=trial + 1 >= TRIALS)
-        elif any(picture.bounds is not None and picture.is_sampled for picture in pictures):
+            near = nearer(near, fit.optimum.n, problem.n_range, nearest_peak(pictures), last=trial + 1 >= TRIALS)
+        elif not problem.streamed and any(one.bounds is not None and one.is_sampled for one in pictures):
             # Lobes are made anew for each exponent, and rounded values ask for many.
-            near = near_exponent(n, MOST, peak)
+            near = near_exponent(fit.optimum.n, MOST, nearest_peak(pictures))
         if near is None:
             break
     if error is None or model.name not in (problem.sample_errors or {}) or not error.profile.size:
@@ -245,7 +242,7 @@ def _fit_simplest(observed: Observed) -> tuple[ModelFit, Choice, Residual | None
         # Weights are part of what is minimised: those of the better family serve all, or costs could not be compared.
         best = min(fits.values(), key=lambda fit: float(np.sum(residual_noise(fit.optimum, observed.rounding))))
         for name, fit in fits.items():
-            pictures = each(_with_weight_of, fit.pictures, best.pictures)
+            pictures = each(lambda a, b: dataclasses.replace(a, weight=b.weight), fit.pictures, best.pictures)
             fits[name] = fit._replace(pictures=pictures, optimum=search(pictures, fit.free, fit.n_range))
     grey = {name: coefficient_factors(fit.model, fit.optimum.n, colour)[2] for name, fit in fits.items()}
     # The best comes first: what is judged without a highlight is judged by its sums.
@@ -322,10 +319,11 @@ def _less_codec_errors(
     What a codec takes away its look-alike does not show: which terms there are is decided before. But a highlight that
     was found in brightness may have any colour, and by that its model shows. Grey saved as colour has none to lose.
     """
-    bounds, known = [picture.bounds for picture in fit.pictures], any(map(codec_of, observed.problem.targets))
-    lossy = any(one is not None and one.lossy for one in bounds)
-    if observed.copies or fit.capped or not lossy or any(one is None for one in bounds):
+    # Of a picture that is read by bands the first tells.
+    unrounded = any(picture.bounds is None for picture in fit.pictures)
+    if observed.copies or fit.capped or unrounded or not any(bounds_of(picture).lossy for picture in fit.pictures):
         return most_likely(fit) if choice is None else fit, choice, observed
+    known = any(map(codec_of, observed.problem.targets))
     if choice is not None and fit.tied is not None:
         fits = [_fit_model(brdf.MODELS[name], observed, fit.free) for name in observed.problem.families]
         found = [without_codec_errors(observed, one) if known else (most_likely(one), observed) for one in fits]
@@ -469,10 +467,6 @@ def _unexplained(
             values = unexplained(picture, optimum)
         found.append(over_blocks(Errors(values, np.arange(len(values)), width), SIZES[0]))
     return found
-
-
-def _with_weight_of(picture: Picture, other: Picture) -> Picture:
-    return dataclasses.replace(picture, weight=other.weight)
 
 
 def _held_plausible(fit: ModelFit, observed: Observed) -> ModelFit:
