@@ -309,22 +309,20 @@ def _parameters(
     for leaf in problem.freed:
         value, own = np.asarray(problem.leaves[leaf.position], np.float64), deviation[leaf.numbers]
         if leaf.is_direction:
-            size, start = np.degrees(np.linalg.norm(own)), np.asarray(given[leaf.position], np.float64)
-            towards: dict[str, Any] = {"direction": tuple((value / np.linalg.norm(value)).tolist())}
-            rows = [(None, degrees_between(start, value), float(size), -1, towards)]
+            turned, size = degrees_between(np.asarray(given[leaf.position], np.float64), value), np.linalg.norm(own)
+            towards = tuple((value / np.linalg.norm(value)).tolist())
+            rows = [(-1, Parameter(leaf.words, None, turned, float(np.degrees(size)), direction=towards))]
         else:
-            errors = own * value if leaf.name == "n" else own
-            rows: list[Any] = []
+            rows, errors = [], own * value if leaf.name == "n" else own
             for index, (one, error) in enumerate(zip(value.ravel().tolist(), errors.tolist(), strict=True)):
                 place, channel = leaf.numbers.start + index, index if value.ndim else None
-                ends: dict[str, Any] = {"interval": _interval(leaf, one, error), "at_bound": bool(held[place])}
-                rows.append((channel, one, error, place, ends))
-        for channel, one, error, place, further in rows:
-            if not np.isfinite(error):
-                found.append(Parameter(leaf.words, channel, None, error, reason=OPEN))
-                continue
-            found.append(Parameter(leaf.words, channel, one, error, **further))
-            places += [place] * (not found[-1].at_bound)
+                ends, at_bound = _interval(leaf, one, error), bool(held[place])
+                rows.append((place, Parameter(leaf.words, channel, one, error, ends, at_bound)))
+        for place, one in rows:
+            known = one.error is not None and np.isfinite(one.error)
+            found.append(one if known else Parameter(leaf.words, one.channel, None, one.error, reason=OPEN))
+            if known and not one.at_bound:
+                places.append(place)
     error = np.sqrt(np.diag(covariance)[places])
     at = np.array(places, int)
     both, unit = (at >= 0)[:, None] & (at >= 0), np.outer(error, error)

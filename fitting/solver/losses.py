@@ -98,11 +98,11 @@ def _weights(picture: Picture) -> np.ndarray:
 
 
 def _mean(pictures: Sequence[Picture]) -> np.ndarray:
-    total, count = 0.0, 0.0
+    sums = []
     for picture in pictures:
-        counted = _weights(picture) > 0
-        total = total + np.sum(np.abs(np.asarray(picture.target, np.float64)), axis=0, where=counted)
-        count = count + np.sum(counted, axis=0)
+        size, counted = np.abs(np.asarray(picture.target, np.float64)), _weights(picture) > 0
+        sums.append([np.sum(size, axis=0, where=counted), np.sum(counted, axis=0)])
+    total, count = np.sum(sums, axis=0)
     return np.maximum(total / np.maximum(count, 1), np.finfo(np.float32).tiny)
 
 

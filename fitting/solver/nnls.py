@@ -161,13 +161,8 @@ def inverse_diagonal(gram: Float[np.ndarray, "U U"], share: float = 1e-10) -> Fl
         gram: positive semidefinite.
         share: of the largest eigenvalue, unknowns in units of their own columns; a smaller one determines nothing.
     """
-    found = np.full(len(gram), np.inf)
-    lit = np.diag(gram) > 0
-    if lit.any():
-        scale = np.sqrt(np.diag(gram)[lit])
-        value, vector = np.linalg.eigh(gram[np.ix_(lit, lit)] / np.outer(scale, scale))
-        known = value > share * value[-1]
-        inverse = np.sum(vector[:, known] ** 2 / value[known], axis=1)
-        inverse[np.any(np.abs(vector[:, ~known]) > 1e-3, axis=1)] = np.inf
-        found[lit] = inverse / scale**2
-    return found
+    scale = np.sqrt(np.where(np.diag(gram) > 0, np.diag(gram), 1.0))
+    value, vector = np.linalg.eigh(gram / np.outer(scale, scale))
+    known = value > max(share * value[-1], 0.0)
+    inverse = np.sum(vector[:, known] ** 2 / value[known], axis=1) / scale**2
+    return np.where(np.any(np.abs(vector[:, ~known]) > 1e-3, axis=1), np.inf, inverse)

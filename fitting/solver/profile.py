@@ -143,8 +143,6 @@ def search(
             # Sums in double precision over all pixels, one picture at a time: slow, and rarely needed.
             exact = Stream(lambda i: jax.tree.map(lambda leaf: leaf.astype(np.float64), pictures[i]), len(pictures))
             problem = problem._replace(pictures=exact, tolerance=TOLERANCE_DOUBLE)
-        if lower == upper:
-            return _optimum(*gauss_newton(problem, Point(*(leaf[0] for leaf in profile))), problem, *about)
         minimum = gauss_newton if cap is None else capped_minimum
         if not sample.whole:
             error = _sampling_errors(profile, sample, lobes)
