@@ -36,9 +36,9 @@ ALIGNED_ROWS = 64
 # Pictures of no more pixels are not cut into tiles, whose geometry is made anew for each pass over them.
 KEPT_PIXELS = 1 << 22
 # Largest value, and inverse of the least, of a picture in single precision: squares of it, of rounding errors a million
-# times smaller, and sums over millions of pixels have to stay in its range of 1e-38 to 3e38; double precision reaches
-# far beyond what a file can hold.
-SINGLE, DOUBLE = 1e12, 1e140
+# times smaller, and sums over millions of pixels have to stay in its range of 1e-38 to 3e38; in double precision
+# their sixth powers do (how the noise grows with brightness), still far beyond what a file can hold.
+SINGLE, DOUBLE = 1e12, 1e48
 # What is left of a picture without noise in double precision, over its brightest value, tells where the search stopped.
 CONVERGED = 1e-10
 # A file is shown by no more pixels than this along each side.

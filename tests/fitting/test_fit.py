@@ -114,6 +114,7 @@ REFUSED = [
     ({"target": "picture.exr"}, "picture.exr: there is no such file"),
     ({"target": MATT * 1e-30}, "target: has .* out of reach of float32"),
     ({"target": MATT * 1e30}, "target: has .* out of reach of float32"),
+    ({"target": MATT * np.float64(-1e80), "precision": "float64"}, "target: has .* out of reach of float64"),
     ({"scene": "scene.toml"}, "scene: must be a brdf.Scene, got str"),
     ({"scene": [SCENE, SCENE]}, "scene: has 2 entries for 1 pictures"),
     ({"target": [MATT, MATT], "mask": [None]}, "mask: has 1 entries for 2 pictures"),
