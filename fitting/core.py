@@ -36,7 +36,6 @@ from fitting.solver.refinement import TOLERANCE_DOUBLE
 from fitting.solver.streams import Stream, each
 from fitting.solver.tied import NormalEquations, design_of, join_channels, places_of
 from fitting.uncertainty.covariance import NO_TRACE, residual_noise, specular_gain
-from fitting.uncertainty.highlight import highlight, nearest_peak
 from fitting.uncertainty.interpretation import alone_covariance, interpret, shared_errors
 from fitting.uncertainty.noise_model import weighted_sums
 from fitting.uncertainty.residual import SOME_PIXELS, Residual, residual_statistics, variance_inflation
@@ -158,11 +157,12 @@ def _fit_model(
             raise InputError("target", what, "Give a darker exposure or a higher saturation")
         if fit.optimum.flat:
             break
-        if near is not None:
-            near = nearer(near, fit.optimum.n, problem.n_range, nearest_peak(pictures), last=trial + 1 >= TRIALS)
-        elif not problem.streamed and any(one.bounds is not None and one.is_sampled for one in pictures):
-            # Lobes are made anew for each exponent, and rounded values ask for many.
-            near = near_exponent(fit.optimum.n, MOST, nearest_peak(pictures))
+        # Lobes are made anew for each exponent, and rounded values ask for many.
+        anew = not problem.streamed and any(one.bounds is not None and one.is_sampled for one in pictures)
+        if near is not None or anew:
+            n, peak = fit.optimum.n, max(picture.nearest_peak for picture in pictures)
+            last = trial + 1 >= TRIALS
+            near = near_exponent(n, MOST, peak) if near is None else nearer(near, n, problem.n_range, peak, last=last)
         if near is None:
             break
     if error is None or model.name not in (problem.sample_errors or {}) or not error.profile.size:
@@ -203,7 +203,8 @@ def _fit_about(
     n_range = between(near, observed.problem.n_range)
     if free[2].any():
         # Exponents of which some pixel sees at least a trace: with larger ones k_s could be anything.
-        upper = min(n_range[1], UNSEEN / max(-nearest_peak(pictures), UNSEEN / n_range[1]))
+        peak = max(picture.nearest_peak for picture in pictures)
+        upper = min(n_range[1], UNSEEN / max(-peak, UNSEEN / n_range[1]))
         if upper >= n_range[0]:
             n_range = n_range[0], upper
         else:
@@ -439,7 +440,7 @@ def _explains_structure(fit: ModelFit, observed: Observed, after: Residual | Non
         return False
     noise = residual_noise(optimum, observed.rounding)
     after = after or residual_statistics(fit.pictures, observed.widths, optimum, noise, observed.rounding)
-    if highlight(optimum.n, after).share(optimum.x, observed.brightest) < NO_TRACE:
+    if after.highlight.share(optimum.x, observed.brightest) < NO_TRACE:
         return False
     if fit.evidence is not None and fit.evidence.precision is not None:
         return True  # what errs together has been weighed by the channels' covariance

@@ -1,14 +1,9 @@
 """What the pixels see of the highlight."""
 
-import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-
-from fitting.solver.normal_equations import Picture
-from fitting.uncertainty.residual import Residual
 
 # A highlight on fewer pixels, counted by the squares of its values, is sampled too coarsely to trust its shape.
 FEW_PIXELS = 4.0
@@ -49,22 +44,3 @@ class Highlight(NamedTuple):
             brightest: value of each channel.
         """
         return float(np.max(x[2]) * self.largest / max(np.max(brightest), np.finfo(float).tiny))
-
-
-def highlight(n: float, left: Residual) -> Highlight:
-    """What there is to know of a highlight.
-
-    Args:
-        n: exponent.
-        left: by the fit.
-    """
-    return Highlight(left.largest, left.carrying, left.peak, math.exp(n * left.peak))
-
-
-def nearest_peak(pictures: Sequence[Picture]) -> float:
-    """Logarithm of the lobe's cosine in the pixel nearest to its centre; 0 without a lobe.
-
-    Args:
-        pictures: with or without a lobe.
-    """
-    return max((picture.nearest_peak for picture in pictures if picture.lobe is not None), default=0.0)

@@ -1,6 +1,6 @@
 """From the solver's numbers to a material, its errors, and what a user should know of them."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,7 +29,7 @@ from fitting.uncertainty.covariance import (
     specular_gain,
     uncertainty,
 )
-from fitting.uncertainty.highlight import OFF_CENTRE, Highlight, highlight
+from fitting.uncertainty.highlight import OFF_CENTRE, Highlight
 from fitting.uncertainty.intervals import exponent_interval
 from fitting.uncertainty.noise_model import misweighted_sums, weighted_sums
 from fitting.uncertainty.residual import Neighbours, Residual, residual_statistics
@@ -38,7 +38,7 @@ from fitting.uncertainty.structure import (
     Blocks,
     Errors,
     Structure,
-    of_blocks,
+    of_coded_blocks,
     over_blocks,
     scatter,
     structure,
@@ -74,11 +74,13 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: R
     noise = np.maximum(residual_noise(optimum, rounding) * fit.noise_factor, rounding)
     if statistics is None or weight != 1.0:
         statistics = residual_statistics(pictures, observed.widths, optimum, noise, rounding)
-    lobe = None if optimum.flat else highlight(optimum.n, statistics)
+    lobe = None if optimum.flat else statistics.highlight
     visible = 0.0 if lobe is None else lobe.share(optimum.x, observed.brightest)
+    # Also of what rounded values say, whose sums are in double precision.
     resolution = RESOLUTION if fit.single else 0.0
-    spread, shared, widening, deviation, gain, joined, growing, uneven = None, None, 1.0, noise, 0.0, None, None, None
-    channels = statistics.channels(noise > 2 * rounding)
+    spread = shared = joined = growing = uneven = together = None
+    widening, deviation, gain, tell = 1.0, noise, 0.0, noise > 2 * rounding
+    channels = statistics.channels(tell)
     weighed = any(one is not None for one in observed.problem.weights)
     sampled = observed.problem.sample_error(fit.model.name)
     size = 0.0 if sampled is None else sampled.size
@@ -105,21 +107,20 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: R
         asked = weighed and observed.problem.loss == "squared"
         uneven = misweighted_sums(pictures, optimum) if asked else None
         growing = statistics.growing_noise(noise, rounding) if uneven is None else None
-        once = observed.copies or channels is not None
-        together = _structure(
-            statistics,
-            observed,
-            noise,
-            rounding,
-            even=growing is None and uneven is None,
-            once=once,
-            missed=size * weight,
-        )
+        # It cannot be told where rounding is most of the noise, or weights are part of what is fitted.
+        if observed.problem.loss == "squared" and tell.any():
+            # Channels that err together count once.
+            some = np.flatnonzero(tell)[: 1 if observed.copies or channels is not None else None]
+            missed = size * weight / float(np.sqrt(np.mean(noise[some] ** 2)))
+            grids = [grid.channels(some) for grid in statistics.blocks]
+            together = structure(grids, even=growing is None and uneven is None, missed=missed)
         # What a bound of the material leaves is no error of the pixels.
         if together is not None and together.significant and not fit.capped:
-            shared = _scattered(
-                pictures, optimum, _residuals(pictures, observed, optimum), alone_covariance(optimum, fit.tied)
+            errors = (
+                Errors(residuals(picture, optimum), np.arange(len(picture.target)), width)
+                for picture, width in zip(pictures, observed.widths, strict=True)
             )
+            shared = scatter(pictures, optimum, errors, alone_covariance(optimum, fit.tied))
     channels = np.ones((noise.size,) * 2) if observed.copies else channels
     if shared is None and growing is not None:
         uneven = weighted_sums(pictures, optimum, growing, inverse=False)
@@ -228,8 +229,7 @@ def shared_errors(
     if lossy:
         # The pixels of a block err together in any case.
         errors, some = list(errors), slice(1 if observed.copies else None)
-        blocks = [of_blocks(one._replace(values=one.values[:, some])) for one in errors]
-        together = structure([over_blocks(one, 2) for one in blocks], (2, 4))
+        together = structure([of_coded_blocks(one._replace(values=one.values[:, some])) for one in errors], (2, 4))
     else:
         # With little noise few values say much.
         if evidence.scores:
@@ -247,26 +247,7 @@ def shared_errors(
         together = structure([grid.channels(some) for grid in grids], even=not few, missed=missed)
     if not (lossy or together.significant):
         return None, together, channels
-    return _scattered(evidence.pictures, evidence.optimum, errors, covariance), together, channels
-
-
-def _structure(
-    statistics: Residual,
-    observed: Observed,
-    noise: Float[np.ndarray, " C"],
-    rounding: Float[np.ndarray, " C"],
-    *,
-    even: bool,
-    once: bool,
-    missed: float,
-) -> Structure | None:
-    """That of a fit by least squares; None where it cannot be told, or weights are part of what is fitted."""
-    tell = noise > 2 * rounding
-    if observed.problem.loss != "squared" or not tell.any():
-        return None
-    some = np.flatnonzero(tell)[: 1 if once else None]
-    missed /= float(np.sqrt(np.mean(noise[some] ** 2)))
-    return structure([grid.channels(some) for grid in statistics.blocks], even=even, missed=missed)
+    return scatter(evidence.pictures, evidence.optimum, errors, covariance), together, channels
 
 
 def _scores(score: np.ndarray, information: np.ndarray, place: tuple[np.ndarray, int]) -> Blocks:
@@ -278,13 +259,6 @@ def _scores(score: np.ndarray, information: np.ndarray, place: tuple[np.ndarray,
     return sums._replace(squares=np.maximum(sums.squares, of_information.squares))
 
 
-def _scattered(
-    pictures: Sequence[Picture], optimum: Optimum, errors: Iterable[Errors], covariance: np.ndarray | None
-) -> Float[np.ndarray, "U U"]:
-    both = zip(pictures, errors, strict=True)
-    return np.sum([scatter(picture, optimum, one, covariance) for picture, one in both], axis=0)
-
-
 def alone_covariance(optimum: Optimum, tied: np.ndarray | None) -> Float[np.ndarray, "U U"]:
     """Covariance of independent pixels whose weights are inverse variances.
 
@@ -293,12 +267,6 @@ def alone_covariance(optimum: Optimum, tied: np.ndarray | None) -> Float[np.ndar
         tied: see `fitting.model_fit.ModelFit`.
     """
     return inverse_among(optimum.normal().gram, design_of(optimum.x > 0, tied))
-
-
-def _residuals(pictures: Sequence[Picture], observed: Observed, optimum: Optimum) -> Iterator[Errors]:
-    """What a fit leaves of whole pictures."""
-    for picture, width in zip(pictures, observed.widths, strict=True):
-        yield Errors(residuals(picture, optimum), np.arange(picture.target.shape[0]), width)
 
 
 def _typical_weight(pictures: Sequence[Picture]) -> float:

@@ -106,11 +106,9 @@ def _one_channel(squared: np.ndarray, value: np.ndarray, least: float) -> tuple[
 
 @eqx.filter_jit
 def _reweighted(picture: Picture, n: AnyArray, x: AnyArray, coefficients: AnyArray, inverse: bool) -> Array:
-    dtype = picture.target.dtype
     value = jnp.maximum(picture.predicted(n, x), 0.0)
-    variance = _variance(jnp.asarray(coefficients).astype(dtype), value)
-    weight = jnp.ones((1, 1), dtype) if picture.weight is None else picture.weight.reshape(value.shape[0], -1)
-    return (weight / variance if inverse else weight * variance).astype(dtype)
+    variance = _variance(jnp.asarray(coefficients, value.dtype), value)
+    return picture.weights / variance if inverse else picture.weights * variance
 
 
 def weighted_sums(

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from fitting.likelihood import AnyArray
 from fitting.solver.normal_equations import COMPILER_OPTIONS, FEW_VALUES, UNROLLED_CHANNELS, Picture, totals
 from fitting.solver.profile import Optimum
+from fitting.uncertainty.highlight import Highlight
 from fitting.uncertainty.noise_model import noise_model
 from fitting.uncertainty.structure import SIZES, Blocks
 
@@ -57,18 +58,14 @@ class Residual(NamedTuple):
         neighbours: correlation of channels whose noise is more than rounding.
         errors: of some pixels that count, (M, C).
         values: that the model shows there.
-        largest: value of the lobe in any pixel that counts.
-        carrying: how many pixels carry the highlight: the sum of its squares over the largest, over all pictures.
-        peak: logarithm of the lobe's cosine in the pixel nearest to its centre.
+        highlight: what the pixels see of it.
     """
 
     blocks: list[Blocks]
     neighbours: Neighbours
     errors: Float[np.ndarray, "M C"]
     values: Float[np.ndarray, "M C"]
-    largest: float
-    carrying: float
-    peak: float
+    highlight: Highlight
 
     def channels(self, tell: Bool[np.ndarray, " C"]) -> Float[np.ndarray, "C C"] | None:
         """Correlation of the channels' errors; None where no two channels err together.
@@ -150,8 +147,8 @@ def residual_statistics(
         errors.append(residual[:, 0, counts])
         values.append(predicted[:, 0, counts])
     error, value = (np.concatenate(parts, axis=1).T.astype(np.float64) for parts in (errors, values))
-    carrying = squares / (largest or 1.0) ** 2
-    return Residual(blocks, _correlation(pairs, noise > 2 * rounding), error, value, decay * largest, carrying, peak)
+    lobe = Highlight(decay * largest, squares / (largest or 1.0) ** 2, peak, decay)
+    return Residual(blocks, _correlation(pairs, noise > 2 * rounding), error, value, lobe)
 
 
 def neighbours_of(images: Sequence[Float[np.ndarray, "H W C"]]) -> Neighbours:

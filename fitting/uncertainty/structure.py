@@ -5,7 +5,7 @@ the sum of the squares. A light that stands elsewhere, a ball whose circle is of
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -130,15 +130,14 @@ def structure(
     return Structure(*excess.tolist())
 
 
-def of_blocks(errors: Errors) -> Errors:
-    """Sums over the blocks of a codec, which are what its errors are independent in.
+def of_coded_blocks(errors: Errors) -> Blocks:
+    """Sums over the blocks of a codec, which are what its errors are independent in, each over two on a side.
 
     Args:
         errors: of one picture.
     """
     # Colours have half the resolution.
-    sums, _, _ = over_blocks(errors, CODED_BLOCK if errors.values.shape[1] == 1 else 2 * CODED_BLOCK)
-    return Errors(sums.reshape(-1, sums.shape[2]), np.arange(sums.shape[0] * sums.shape[1]), sums.shape[1])
+    return _added(over_blocks(errors, CODED_BLOCK if errors.values.shape[1] == 1 else 2 * CODED_BLOCK).sums, 2)
 
 
 def over_blocks(errors: Errors, size: int) -> Blocks:
@@ -151,8 +150,7 @@ def over_blocks(errors: Errors, size: int) -> Blocks:
     values, width = errors.values, errors.width
     rows = int(np.max(errors.pixel, initial=0)) // width + 1
     if errors.pixel.size == rows * width:
-        image = values.reshape(rows, width, -1)
-        return Blocks(*(coarser(part, size) for part in (image, image**2, image != 0)))
+        return _added(values.reshape(rows, width, -1), size)
     # Of a picture whose roundings leave nothing open it has no pixel, and few where little is open.
     shape = -(-rows // size), -(-width // size)
     block = errors.blocks(size)
@@ -162,6 +160,10 @@ def over_blocks(errors: Errors, size: int) -> Blocks:
             for part in (values, values**2, values != 0)
         )
     )
+
+
+def _added(image: Float[np.ndarray, "H W C"], size: int) -> Blocks:
+    return Blocks(*(coarser(part, size) for part in (image, image**2, image != 0)))
 
 
 def coarser(grid: Float[np.ndarray, "H W C"], factor: int) -> Float[np.ndarray, "R Q C"]:
@@ -183,26 +185,32 @@ def shared(grids: Sequence[Blocks]) -> tuple[float, float]:
 
 
 def scatter(
-    picture: Picture, optimum: Optimum, errors: Errors, covariance: Float[np.ndarray, "U U"] | None = None
+    pictures: Iterable[Picture],
+    optimum: Optimum,
+    errors: Iterable[Errors],
+    covariance: Float[np.ndarray, "U U"] | None = None,
 ) -> Float[np.ndarray, "U U"]:
     """Products of the scores by x_a, x_d, x_s, channel after channel, and n, summed over blocks of pixels first.
 
     That is what the Hessian would be if pixels of a block err together.
 
     Args:
-        picture: whose weights are inverse variances.
+        pictures: whose weights are inverse variances.
         optimum: of the fit.
-        errors: of its pixels.
+        errors: of the pixels of each.
         covariance: of independent pixels, for the residuals that blocks would have beside a fit without them: a
             highlight in few blocks is fitted to their errors, which leave little of themselves (the jackknife; R. M.
             Bell and D. F. McCaffrey, Survey Methodology 28 (2002) 169). None for those that they have.
     """
-    slopes = picture.columns(optimum.n) * np.sqrt(np.asarray(picture.weights))
-    slopes[3] *= optimum.x[2]
-    terms = slopes * errors.values
-    by_x = np.moveaxis(terms[:3], -1, 1).reshape(-1, terms.shape[1])
-    scores = np.concatenate([by_x, terms[3].sum(axis=1)[None]])
-    return block_scatter(scores, errors, None if covariance is None else (slopes, covariance))
+    total = 0.0
+    for picture, own in zip(pictures, errors, strict=True):
+        slopes = picture.columns(optimum.n) * np.sqrt(np.asarray(picture.weights))
+        slopes[3] *= optimum.x[2]
+        terms = slopes * own.values
+        by_x = np.moveaxis(terms[:3], -1, 1).reshape(-1, terms.shape[1])
+        scores = np.concatenate([by_x, terms[3].sum(axis=1)[None]])
+        total = total + block_scatter(scores, own, None if covariance is None else (slopes, covariance))
+    return np.asarray(total)
 
 
 def block_scatter(
