@@ -131,7 +131,7 @@ class Codes(NamedTuple):
         lower = np.where(good & (code > self.ends[0]), np.minimum(code, top) - flat(self.below), -np.inf)
         upper = np.where(good & (code < top), code + flat(self.above), np.inf)
         coded = {"scale": self.scale, "unit": self.unit, "encoding": self.encoding, "lossy": self.lossy}
-        return _bounds(lower, upper, self.values.shape[1], spread, **coded)
+        return all_between(lower, upper, self.values.shape[1], spread, **coded)
 
 
 def _mixed(beside: Bool[np.ndarray, "H W"], size: int) -> Bool[np.ndarray, " P"]:
@@ -209,13 +209,23 @@ def open_ends(
         return None
     lower = np.where(good & ~low, np.where(high, min(level or np.inf, np.inf), values), -np.inf)
     upper = np.where(good & ~high, values, np.inf)
-    return _bounds(lower, upper, width, spread, exact=True)
+    return all_between(lower, upper, width, spread, exact=True)
 
 
-def _bounds(
+def all_between(
     lower: np.ndarray, upper: np.ndarray, width: int, spread: Any, scale: Any = 1.0, unit: Any = 1.0, **how: Any
 ) -> Bounds:
-    """Of all pixels, row by row; in the precision of the fit."""
+    """Bounds of all pixels, row by row, in the precision of the fit.
+
+    Args:
+        lower: ends in codes.
+        upper: likewise.
+        width: of the picture.
+        spread: noise of each pixel over that of the picture, a number or (P, 1).
+        scale: codes where the encoding is 1.
+        unit: radiance where the encoding is 1, a number or (C,).
+        how: the other attributes of `fitting.likelihood.Bounds`.
+    """
     lower, upper = (end.astype(jnp.result_type(float), copy=False) for end in (lower, upper))
     scale, unit, spread = (np.asarray(part, np.float64) for part in (scale, unit, spread))
     return Bounds(lower, upper, scale, unit, np.arange(len(lower)), np.asarray(width), spread, **how)

@@ -352,17 +352,15 @@ def _reweighted(
             assert precision is not None
             return _together([part.picture for part in parts], optimum, noise, places, precision)
     scale = 1 / noise**2
-    working = [_with_weight(part.picture, part.picture.weights * scale) for part in parts]
-    completed = [
-        own if part.completed is part.picture else _with_weight(part.completed, part.completed.weights * scale)
-        for own, part in zip(working, parts, strict=True)
-    ]
+    working, completed = (
+        [_with_weight(picture, picture.weights * scale) for picture in both]
+        for both in zip(*((part.picture, part.completed) for part in parts), strict=True)
+    )
     sums = {name: getattr(optimum, name) * scale for name in ("cost", "gram", "product", "square")}
     value = sum(part.value - part.closed * math.log(noise) - part.closed_squares * scale / 2 for part in parts)
     value += sum(_of_codes(bounds_of(picture)) for picture in pictures)
-    widening = np.ones(3 * fit.free.shape[1] + 1)
     optimum = dataclasses.replace(optimum, **sums)
-    return Evidence(working, optimum, noise, value, places, widening, completed=completed)
+    return Evidence(working, optimum, noise, value, places, np.ones(1), completed=completed)
 
 
 def _of_codes(bounds: Bounds) -> float:
@@ -386,7 +384,7 @@ def _together(
     parts = [each_alone(picture, some, precision, optimum) for picture, some in zip(pictures, left, strict=True)]
     sums = coupled(pictures, precision, optimum.x, np.array([math.log(optimum.n)]))[0]
     normal, optimum = sums.joined(optimum.x, optimum.n), replaced(optimum, sums, optimum.x, optimum.n)
-    return Evidence(parts, optimum, noise, value, places, np.ones(len(normal.gram)), normal, precision)
+    return Evidence(parts, optimum, noise, value, places, np.ones(1), normal, precision)
 
 
 def change(before: Optimum, after: Optimum) -> float:
@@ -436,28 +434,25 @@ def _working_picture(
     plain, value, count = squares, 0.0, closed
     taken = completed = dataclasses.replace(picture, target=target, weight=weight, bounds=None)
     if index.size:
-        target, weight, expected, full = (np.array(part) for part in (target, weight) * 2)
         s = math.sqrt(max(noise**2 - rounding, LEAST_SHARE * noise**2))
         values = _values(picture.in_double(index))
         radiance, _ = _predicted(values.picture, optimum)
         code, slope = values.bounds.codes(radiance)
-        parts = values.likelihood(code, s), radiance, slope, np.broadcast_to(values.weight, radiance.shape)
-        likelihood, radiance, slope, weighs = jax.tree.map(lambda part: part[: index.size], parts)
-        bounds = bounds_of(picture).pixels(partial(np.take, indices=index, axis=0))
-        at_end, own = bounds.ends == 1, s * bounds.spread
-        curvature = likelihood.weight * slope**2
-        step = np.divide(likelihood.score * slope, curvature, out=np.zeros_like(curvature), where=curvature > 0)
-        target[index] = np.where(at_end, radiance + step, target[index])
-        weight[index] = np.where(at_end, weighs * curvature * noise**2, weight[index])
-        expected[index] = np.where(at_end, radiance + likelihood.score * own**2 / slope, expected[index])
-        full[index] = np.where(at_end, weighs * (slope / bounds.spread) ** 2, full[index])
-        # Mean square of what the value may have been, about the prediction.
-        square = ((likelihood.score * own) ** 2 + 1 - likelihood.weight * own**2) * noise**2
-        squares += float(np.sum(weighs * square, where=at_end))
-        value, count = (
-            float(np.sum(weighs * likelihood.value, where=at_end)),
-            closed + float(np.sum(weighs, where=at_end)),
+        parts = radiance, slope, values.weight, values.bounds.spread, *values.likelihood(code, s)
+        at_end = values.bounds.ends == 1
+        radiance, slope, weighs, spread, log_p, score, curvature = (
+            np.broadcast_to(part, at_end.shape)[at_end] for part in parts
         )
+        target, weight, expected, full = (np.array(part) for part in (target, weight) * 2)
+        pixel, channel = np.nonzero(at_end)
+        place, own, information = (index[pixel], channel), s * spread, curvature * slope**2
+        step = np.divide(score * slope, information, out=np.zeros_like(information), where=information > 0)
+        target[place], weight[place] = radiance + step, weighs * information * noise**2
+        expected[place], full[place] = radiance + score * own**2 / slope, weighs * (slope / spread) ** 2
+        # Mean square of what the value may have been, about the prediction.
+        square = ((score * own) ** 2 + 1 - curvature * own**2) * noise**2
+        squares += float(np.sum(weighs * square))
+        value, count = float(np.sum(weighs * log_p)), closed + float(np.sum(weighs))
         taken, completed = (
             dataclasses.replace(taken, target=jnp.asarray(some), weight=jnp.asarray(weights))
             for some, weights in ((target, weight), (expected, full))

@@ -37,7 +37,7 @@ class Evidence(NamedTuple):
     noise: float
     value: float
     places: Sequence[tuple[Int[np.ndarray, " P"], int]]
-    widening: Float[np.ndarray, " U"]
+    widening: Float[np.ndarray, " #U"]
     together: NormalEquations | None = None
     precision: Float[np.ndarray, "C C"] | None = None
     scores: Sequence[tuple[Float[np.ndarray, "P C"], Float[np.ndarray, "P C"], tuple[np.ndarray, int]]] = ()

@@ -62,8 +62,8 @@ def between(near: Near | None, n_range: tuple[float, float]) -> tuple[float, flo
     """
     if near is None:
         return n_range
-    low, high = (math.exp(end) for end in near.ends)
-    return min(max(low, n_range[0]), n_range[1]), max(min(high, n_range[1]), n_range[0])
+    low, high = np.clip(np.exp(near.ends), *n_range).tolist()
+    return low, high
 
 
 def nearer(near: Near, n: float, n_range: tuple[float, float], peak: float, *, last: bool) -> Near | None:

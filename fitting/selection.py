@@ -192,7 +192,7 @@ def choose(
     plain = {name: fit.normal() for name, fit in fits.items()}
     normals = {name: fit.normal(variance) for name, fit in fits.items()}
     for name, one in whitened.items():
-        normals[name] = NormalEquations(one.gram / inflation**2, one.product / inflation**2, one.square / inflation**2)
+        normals[name] = NormalEquations(*(part / inflation**2 for part in one))
     first = next(iter(fits))
     terms = [("none", no, no), *([("ambient", free[0], no)] if ambient else []), ("lambert", no, free[1])]
     terms += [("lambert", free[0], free[1])] if ambient else []
@@ -216,6 +216,7 @@ def choose(
 
 
 def _decide(trials: list[_Trial], normals: Mapping[str, NormalEquations], variance: np.ndarray, count: float) -> Choice:
+    trials = sorted(trials, key=lambda trial: (trial.rank, trial.model, trial.unknowns))
     best = min(trials, key=lambda trial: trial.expected)
     error = [2 * np.sqrt(_distance(trial, best, normals)) for trial in trials]
     bic = [trial.cost + trial.unknowns * np.log(count) for trial in trials]
@@ -231,7 +232,6 @@ def _decide(trials: list[_Trial], normals: Mapping[str, NormalEquations], varian
         chosen = simplest([trial for trial in adequate if trial.model == likelier])
         rivals = {trial.model for trial in adequate} - {likelier}
     count = max(count, 1.0)
-    order = sorted(range(len(trials)), key=lambda i: (trials[i].rank, trials[i].model, trials[i].unknowns))
     candidates = tuple(
         Candidate(
             model=trial.model,
@@ -241,11 +241,11 @@ def _decide(trials: list[_Trial], normals: Mapping[str, NormalEquations], varian
             rms=float(np.sqrt(trial.squares / count)),
             held_out=float(np.sqrt((trial.squares + 2 * trial.effective * np.mean(variance)) / count)),
             excess=float(trial.expected - best.expected),
-            excess_error=float(error[i]),
-            bic=float(bic[i] - min(bic)),
+            excess_error=float(margin),
+            bic=float(criterion - min(bic)),
             chosen=trial is chosen,
         )
-        for i, trial in ((i, trials[i]) for i in order)
+        for trial, margin, criterion in zip(trials, error, bic, strict=True)
     )
     return Choice(candidates, chosen.model, chosen.free, chosen.grey, tuple(sorted(rivals)), _dropped(chosen, trials))
 

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from fitting.channel_errors import residuals
-from fitting.likelihood import Bounds, residual_deviation
+from fitting.codes import all_between
+from fitting.likelihood import residual_deviation
 from fitting.model_fit import ModelFit
 from fitting.pixels import Observed, Tile
 from fitting.solver.normal_equations import Picture
@@ -44,11 +45,10 @@ def in_codes(observed: Observed) -> Observed:
             return tile
         values, bounds = np.asarray(tile.target), tile.bounds
         if bounds is None:
-            says = np.full(len(values), True) if tile.weight is None else np.asarray(tile.weight) > 0
-            says = says.reshape(len(values), -1)
+            says = np.ones(1) if tile.weight is None else np.asarray(tile.weight)
+            says = says.reshape(len(says), -1) > 0
             lower, upper = np.where(says, values, -np.inf), np.where(says, values, np.inf)
-            index, width, unit = np.arange(len(values)), np.array(targets[one].pixels.shape[1]), np.ones(())
-            bounds = Bounds(lower, upper, scale=unit, unit=unit, index=index, width=width, spread=unit)
+            bounds = all_between(lower, upper, targets[one].pixels.shape[1], 1.0)
         lower, upper = bounds.lower / step - 0.5, bounds.upper / step + 0.5
         return tile._replace(bounds=replace(bounds, lower=lower, upper=upper, scale=np.array(1 / step), exact=False))
 
@@ -107,10 +107,10 @@ def _left(
     pictures: Sequence[Picture], owner: Int[np.ndarray, " T"], rounding: Float[np.ndarray, " C"], optimum: Optimum
 ) -> NoiseOfEach:
     counted = [np.sum(np.broadcast_to(picture.weights > 0, picture.target.shape), axis=0) for picture in pictures]
-    count = np.array([np.bincount(owner, of_channel) for of_channel in np.array(counted).T])
-    squares = np.array([np.sum(residuals(picture, optimum) ** 2, axis=0) for picture in pictures])
-    variance = np.array([np.bincount(owner, of_channel) for of_channel in squares.T]) / np.maximum(count, 1)
-    variance = np.maximum(variance, rounding[:, None] ** 2)
+    squares = [np.sum(residuals(picture, optimum) ** 2, axis=0) for picture in pictures]
+    of_picture = np.equal.outer(owner, np.arange(np.max(owner) + 1))
+    count = np.transpose(counted) @ of_picture
+    variance = np.maximum(np.transpose(squares) @ of_picture / np.maximum(count, 1), rounding[:, None] ** 2)
     cost = float(np.sum(count * np.log(variance)))
     variance = np.mean(variance / np.mean(variance, axis=1, keepdims=True), axis=0)
     spread, kinds = np.sqrt(variance), {()}
