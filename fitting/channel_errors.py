@@ -12,6 +12,7 @@ pass over the pixels makes them, for C x C channels.
 
 import dataclasses
 import math
+import operator
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -155,17 +156,15 @@ def improved(
         steps = max(2, 1 + math.ceil(math.log(max(most / least, 1.0)) / GRID_STEP))
         log_n = np.append(log_n, np.linspace(math.log(least), math.log(max(most, least)), steps))
         design = design[:, :-1]
-    signed, base = np.arange(len(design)) == len(design) - 1, np.append(x.ravel(), 0.0)
-    best = (-math.inf, base, float(log_n[0]), None)
+    signed = np.arange(len(design)) == len(design) - 1
+    trials = []
     for at, parts in zip(log_n, coupled(pictures, precision, x, log_n), strict=True):
         normal = parts.joined(x)
         reduced = design.T @ normal.gram @ design
         found = design @ nonnegative_minimum(reduced, design.T @ normal.product, signed @ (design != 0))
         gain = float(2 * normal.product @ found - found @ normal.gram @ found)
-        if gain > best[0]:
-            best = gain, found, float(at), parts
-    _, found, at, parts = best
-    assert parts is not None
+        trials.append((gain, found, float(at), parts))
+    _, found, at, parts = max(trials, key=operator.itemgetter(0))
     n = float(np.clip(math.exp(at + np.clip(found[-1], -GRID_STEP, GRID_STEP)), *fit.n_range))
     x = np.maximum(found[:-1].reshape(x.shape), 0.0)
     return replaced(optimum, parts, x, n)

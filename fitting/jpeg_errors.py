@@ -58,22 +58,13 @@ def without_codec_errors(observed: Observed, fit: ModelFit) -> tuple[ModelFit, O
         observed: the pixels.
         fit: a first fit to them.
     """
-    pictures, targets = list(fit.pictures), observed.problem.targets
-    ends = np.cumsum([len(picture.target) for picture in pictures])
-    compressed = [_Compressed.of(target) for target in targets]
+    pictures, compressed = list(fit.pictures), list(map(_Compressed.of, observed.problem.targets))
     fit, most, count = fit._replace(pictures=pictures), MOST_FITS, LOOK_ALIKES
-    made_anew = any(picture.is_sampled for picture in pictures)
-    if ends[-1] > MANY and not made_anew:
+    if sum(len(one.shows) for one in compressed) > MANY and not any(picture.is_sampled for picture in pictures):
         some = list(map(_part, pictures))
-        whole = np.concatenate(
-            [own + end - len(one.target) for own, end, one in zip(some, ends, pictures, strict=True)]
-        )
-        starts = np.cumsum([0, *(one.size for one in compressed)])
-        parts = [
-            one.part(whole[(whole >= start) & (whole < start + one.size)] - start)
-            for one, start in zip(compressed, starts[:-1], strict=True)
-        ]
-        few = [picture.on_host(own) for picture, own in zip(pictures, some, strict=True)]
+        of_target = _parted(some, [one.shows for one in compressed])
+        parts = [dataclasses.replace(one, shows=one.shows[own]) for one, own in zip(compressed, of_target, strict=True)]
+        few = [picture.on_host(np.flatnonzero(own)) for picture, own in zip(pictures, some, strict=True)]
         fit = fit._replace(optimum=_nearest(fit._replace(pictures=few), parts, most, count).optimum)
         compressed = [
             dataclasses.replace(one, kind=part.kind, settled=True) for one, part in zip(compressed, parts, strict=True)
@@ -84,13 +75,17 @@ def without_codec_errors(observed: Observed, fit: ModelFit) -> tuple[ModelFit, O
     return fit, observed._replace(tiles=tiles)
 
 
-def _part(picture: Picture) -> np.ndarray:
-    """Indices of those whole rows of a picture, or of a band of it, that are nearest to the middle of the highlight."""
+def _part(picture: Picture) -> Bool[np.ndarray, " P"]:
+    """Those whole rows of a picture, or of a band of it, that are nearest to the middle of the highlight."""
     width, count = int(bounds_of(picture).width), len(picture.target)
     size = min(width * max(BLOCK, count // width // PART // BLOCK * BLOCK), count)
     middle = 0 if picture.lobe is None else int(np.argmax(picture.lobe.peak))
-    start = min(middle // size, count // size - 1) * size
-    return np.arange(start, start + size)
+    return np.arange(count) // size == min(middle // size, count // size - 1)
+
+
+def _parted(parts: Sequence[np.ndarray], like: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """The same values of all pixels, parted as others are: bands of pictures, or whole ones."""
+    return np.split(np.concatenate(parts), np.cumsum([len(one) for one in like])[:-1])
 
 
 def _nearest(fit: ModelFit, compressed: Sequence["_Compressed"], most: int, count: int) -> ModelFit:
@@ -101,7 +96,7 @@ def _nearest(fit: ModelFit, compressed: Sequence["_Compressed"], most: int, coun
         errors, left = _codec_errors(shown, compressed, count)
         if left > least:
             # The steps of the codec bend what look-alikes show: nearer by it may be better.
-            at = _moved(at, (_unknowns(best) - _unknowns(at)) / 2)
+            at = dataclasses.replace(at, x=(at.x + best.x) / 2, n=(at.n + best.n) / 2)
             continue
         pictures = list(map(_less, fit.pictures, shown, errors))
         found = fit._replace(pictures=pictures, optimum=refit(pictures, at, fit.free, fit.n_range, fit.tied))
@@ -121,18 +116,13 @@ def _unknowns(at: Optimum) -> Float[np.ndarray, " U"]:
     return np.append(at.x.ravel(), at.n)
 
 
-def _moved(at: Optimum, step: Float[np.ndarray, " U"]) -> Optimum:
-    return dataclasses.replace(at, x=at.x + step[:-1].reshape(at.x.shape), n=at.n + float(step[-1]))
-
-
 def _codec_errors(
     shown: Sequence[Float[np.ndarray, "P C"]], compressed: Sequence["_Compressed"], count: int
 ) -> tuple[list[Float[np.ndarray, "P C"]], float]:
     """What compression does to each code, and the squares of what else the pictures show."""
-    whole = np.split(np.concatenate(shown), np.cumsum([one.size for one in compressed])[:-1])
+    whole = _parted(shown, [one.shows for one in compressed])
     errors, left = zip(*(one.errors(some, count) for one, some in zip(compressed, whole, strict=True)), strict=True)
-    ends = np.cumsum([len(some) for some in shown])[:-1]
-    return np.split(np.concatenate(errors), ends), math.fsum(left)
+    return _parted(errors, shown), math.fsum(left)
 
 
 def _predicted(picture: Picture, at: Optimum) -> Float[np.ndarray, "P C"]:
@@ -170,15 +160,6 @@ class _Compressed:
             unit = LARGEST_CODE / target.codes.scale
             shows = np.nan_to_num(target.codes.values * unit, nan=LARGEST_CODE)
         return cls(codec, shows.reshape(-1, shows.shape[2]), width, unit)
-
-    @property
-    def size(self) -> int:
-        """How many pixels it has."""
-        return len(self.shows)
-
-    def part(self, pixels: np.ndarray) -> "_Compressed":
-        """Those of whole rows."""
-        return dataclasses.replace(self, shows=self.shows[pixels])
 
     def errors(self, shown: Float[np.ndarray, "P C"], count: int) -> tuple[Float[np.ndarray, "P C"], float]:
         """What compression does to each code that is predicted, and the squares of what else the picture shows.
