@@ -73,7 +73,7 @@ class Codes(NamedTuple):
     @property
     def fine(self) -> bool:
         """Single precision does not resolve a small share of a step."""
-        return self.ends[1] < np.inf and self.ends[1] > FINE
+        return FINE < self.ends[1] < np.inf
 
     @property
     def largest(self) -> float:
@@ -130,8 +130,8 @@ class Codes(NamedTuple):
             top = np.minimum(top, clipped.astype(code.dtype))
         lower = np.where(good & (code > self.ends[0]), np.minimum(code, top) - flat(self.below), -np.inf)
         upper = np.where(good & (code < top), code + flat(self.above), np.inf)
-        coded = {"scale": self.scale, "unit": self.unit, "encoding": self.encoding, "lossy": self.lossy}
-        return all_between(lower, upper, self.values.shape[1], spread, **coded)
+        how = {"encoding": self.encoding, "lossy": self.lossy}
+        return all_between(lower, upper, self.values.shape[1], spread, self.scale, self.unit, **how)
 
 
 def _mixed(beside: Bool[np.ndarray, "H W"], size: int) -> Bool[np.ndarray, " P"]:
@@ -207,7 +207,7 @@ def open_ends(
     low &= np.array([single_values_at_end(image, valid.reshape(-1, width), floor) for image in images])
     if not (low.any() or high.any()):
         return None
-    lower = np.where(good & ~low, np.where(high, min(level or np.inf, np.inf), values), -np.inf)
+    lower = np.where(good & ~low, np.where(high, level or np.inf, values), -np.inf)
     upper = np.where(good & ~high, values, np.inf)
     return all_between(lower, upper, width, spread, exact=True)
 
@@ -273,7 +273,7 @@ def _integers(codes: np.ndarray, encoding: Encoding, top: int, fewest: int = 1) 
     """Of an integer file with so many different ones; the step is the greatest common divisor of what is used."""
     whole = codes.ravel() if codes.dtype.kind == "u" else codes[np.isfinite(codes)].astype(np.int64)
     least = int(np.min(whole, initial=0))
-    used = np.flatnonzero(np.bincount(whole - least if least else whole)) + least
+    used = np.flatnonzero(np.bincount(whole - least)) + least
     if used.size < fewest:
         return None
     inside = used[(used > 0) & (used < top)]

@@ -373,20 +373,15 @@ class Values:
             picture: these pixels alone, where predictions are made of them.
         """
         self.which, self.weight, self.bounds, self.picture = which, weight, bounds, picture
-        lower, upper = bounds.lower, bounds.upper
-        below, above = np.isfinite(lower), np.isfinite(upper)
-        closed = below & above & (upper > lower)
-        self._tells = closed | (below ^ above)
-        self._high, self._low = np.where(above, upper, 0.0), np.where(below, lower, 0.0)
-        # Twice the prediction below which the upper end is the farther one.
-        self._turn = np.where(below, np.where(above, self._high + self._low, np.inf), -np.inf)
-        width = (self._high - self._low)[closed]
-        least = float(np.min(width, initial=1.0 if not width.size else np.inf))
+        width = bounds.upper - bounds.lower
+        self._tells, closed = width > 0, (width > 0) & np.isfinite(width)
+        width = width[closed]
+        least = float(np.min(width, initial=np.inf))
         power = np.rint(np.log2(width / least)).astype(np.intp)
         self._tabulated = not bounds.spread.ndim and bool(np.all(np.abs(width / least / 2.0**power - 1) < _ALIKE))
         # The first kind has one end.
         self._kinds = np.append(np.inf, least * 2.0 ** np.arange(np.max(power, initial=0) + 1))
-        self._kind = np.zeros(lower.shape, np.intp)
+        self._kind = np.zeros(closed.shape, np.intp)
         self._kind[closed] = 1 + power
 
     def likelihood(self, predicted: Float[np.ndarray, "P C"], noise: float) -> LogLikelihood:
@@ -396,19 +391,20 @@ class Values:
             predicted: z, in units of the ends.
             noise: standard deviation of the noise before rounding.
         """
-        s = noise * self.bounds.spread
+        lower, upper, s = self.bounds.lower, self.bounds.upper, noise * self.bounds.spread
         if not self._tabulated:
             filled = np.array([(0, (1 << max(len(predicted) - 1, 0).bit_length()) - len(predicted)), (0, 0)])
-            parts = (self.bounds.lower, self.bounds.upper, predicted, np.broadcast_to(s, predicted.shape))
+            parts = lower, upper, predicted, np.broadcast_to(s, predicted.shape)
             with jax.enable_x64(True):
                 found = jax.device_get(_interval(*(np.pad(part, filled, mode="edge") for part in parts)))
             return LogLikelihood(*(part[: len(predicted)] for part in found))
-        up = 2 * predicted >= self._turn
-        beyond = np.where(up, predicted - self._high, self._low - predicted) / s
+        # Of the nearer end; minus infinity where there is none.
+        above, below = predicted - upper, lower - predicted
+        up, beyond = above >= below, np.maximum(above, below) / s
         ratios = self._kinds / s
         # Of two ends so far apart one tells.
-        tables = list(map(_table, np.where(ratios < 2 * _INSIDE, ratios, np.inf).tolist()))
-        firsts, steps = (np.array([getattr(one, name) for one in tables]) for name in ("first", "step"))
+        tables = map(_table, np.where(ratios < 2 * _INSIDE, ratios, np.inf).tolist())
+        firsts, steps, parts = map(np.stack, zip(*tables, strict=True))
         # The others are sure.
         some = np.flatnonzero(self._tells & (beyond >= firsts[self._kind]))
         beyond, kind = beyond.ravel()[some], self._kind.ravel()[some]
@@ -417,7 +413,7 @@ class Values:
         index = position.astype(np.intp)
         share = position - index
         index += _KNOTS * kind
-        values, scores, weights = np.concatenate([one.values for one in tables], axis=1)
+        values, scores, weights = np.concatenate(parts, axis=1)
         weight = weights[index]
         after = weights[index + 1]
         score = _hermite(scores[index], scores[index + 1], -weight * step, -after * step, share)
@@ -433,7 +429,7 @@ class Values:
         score = np.where(up.ravel()[some], score, -score) / s
         found = np.zeros((3, *predicted.shape))
         found.reshape(3, -1)[:, some] = value, score, weight / s**2
-        return LogLikelihood(found[0], found[1], found[2])
+        return LogLikelihood(*found)
 
 
 def _hermite(low: Any, high: Any, start: Any, end: Any, share: Any) -> np.ndarray:

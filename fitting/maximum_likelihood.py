@@ -100,11 +100,10 @@ def most_likely(
     """
     if fit.capped or any(picture.bounds is None for picture in fit.pictures):
         return fit
-    optimum, exact = fit.optimum, all(bounds.exact for bounds in map(bounds_of, fit.pictures))
-    deviation = math.sqrt(float(np.sum(optimum.cost)) / max(float(np.sum(optimum.pixels)), 1.0))
-    if exact and deviation <= NO_NOISE * float(np.max(optimum.square / np.maximum(optimum.pixels, 1))) ** 0.5:
+    optimum, bounds = fit.optimum, list(map(bounds_of, fit.pictures))
+    exact, lossy = all(own.exact for own in bounds), any(own.lossy for own in bounds)
+    if exact and fit.residual <= NO_NOISE:
         return fit
-    lossy = any(bounds.lossy for bounds in map(bounds_of, fit.pictures))
     noise = _deviation(fit.pictures, optimum)
     if not lossy:
         fit, noise = _where_noise_is_even(fit, noise)
@@ -242,8 +241,8 @@ def _near_edges(fit: ModelFit, at: Estimate, rival: float = -math.inf) -> Eviden
         at, precisions, score = maximise(problem, at)
         rounds.append((problem, precisions))
     scores = [(one.score, one.weight, one.values.bounds.place) for one in score.pictures]
-    steps = [(one.values.bounds.spread / one.slope).ravel() for one in score.pictures]
-    light = at.noise * float(np.median(np.concatenate(steps))) if any(map(np.size, steps)) else 0.0
+    steps = np.concatenate([(one.values.bounds.spread / one.slope).ravel() for one in score.pictures])
+    light = at.noise * float(np.median(steps)) if steps.size else 0.0
     precisions = [entry for _, some in rounds for entry in some]
     most = most_informative(precisions)
     informative = next(one for one, some in rounds if any(entry is most for entry in some))
