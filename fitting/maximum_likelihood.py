@@ -328,7 +328,7 @@ def _reweighted(
             working, before = [part.picture for part in parts], optimum
             if together:
                 if not is_given:
-                    count = sum(part.count for part in parts) / optimum.x.shape[1]
+                    count = sum(part.closed[1] + part.at_end[1] for part in parts) / optimum.x.shape[1]
                     left = [residuals(picture, optimum) for picture in working]
                     precision = precision_of(left, places, count, rounding)
                 assert precision is not None
@@ -339,12 +339,13 @@ def _reweighted(
             else:
                 optimum = refit(working, optimum, fit.free, fit.n_range, fit.tied)
             parts = [_working_picture(*one, optimum, noise, rounding) for one in both]
-            count, closed = (sum(getattr(part, name) for part in parts) for name in ("count", "closed"))
-            last, gone = gone, 0.5 * math.log(sum(part.squares for part in parts) / max(count, 1) / noise**2)
+            closed, at_end = (sum(getattr(part, name) for part in parts) for name in ("closed", "at_end"))
+            squares, count = (closed + at_end).tolist()
+            last, gone = gone, 0.5 * math.log(squares / max(count, 1) / noise**2)
             # The rest of a geometric series (Aitken 1926).
             gone_on = gone / max(1 - max(gone / (last or math.inf), 0.0), 1 / MOST_AHEAD)
             noise *= math.exp(gone_on)
-            enough = min(ENOUGH_NOISE_CHANGE, ENOUGH_MOVED * math.sqrt(count) / max(count - closed, 1))
+            enough = min(ENOUGH_NOISE_CHANGE, ENOUGH_MOVED * math.sqrt(count) / max(at_end[1], 1))
             if change(before, optimum) < ENOUGH_CHANGE and abs(gone_on) < enough:
                 break
         if together:
@@ -356,7 +357,7 @@ def _reweighted(
         for both in zip(*((part.picture, part.completed) for part in parts), strict=True)
     )
     sums = {name: getattr(optimum, name) * scale for name in ("cost", "gram", "product", "square")}
-    value = sum(part.value - part.closed * math.log(noise) - part.closed_squares * scale / 2 for part in parts)
+    value = sum(part.value - part.closed @ [scale / 2, math.log(noise)] for part in parts)
     value += sum(_of_codes(bounds_of(picture)) for picture in pictures)
     optimum = dataclasses.replace(optimum, **sums)
     return Evidence(working, optimum, noise, value, places, np.ones(1), completed=completed)
@@ -408,19 +409,15 @@ class _WorkingPicture:
     Attributes:
         picture: with working targets, and weights in codes².
         completed: with what is to be expected of a value with one end in its place, and all weights those of both.
-        squares: of the residual in codes times the weight; of a value at an open end what is to be expected.
-        count: of how many values, by their weight.
-        closed: how many of these have both ends.
-        closed_squares: of their residual.
-        value: logarithm of the likelihood of the others.
+        closed: squares of the residual in codes times the weight, and how many values that is, of those with both ends.
+        at_end: of the others; of squares what is to be expected.
+        value: logarithm of the likelihood of these.
     """
 
     picture: Picture
     completed: Picture
-    squares: float
-    count: float
-    closed: float
-    closed_squares: float
+    closed: Float[np.ndarray, "2"]
+    at_end: Float[np.ndarray, "2"]
     value: float
 
 
@@ -429,8 +426,7 @@ def _working_picture(
 ) -> _WorkingPicture:
     """With the pixels that have a value with one end."""
     target, weight, *sums = _linearised(picture, np.asarray(optimum.n), optimum.x)
-    squares, closed = map(float, sums)
-    plain, value, count = squares, 0.0, closed
+    others, value = np.zeros(2), 0.0
     taken = completed = dataclasses.replace(picture, target=target, weight=weight, bounds=None)
     if index.size:
         s = math.sqrt(max(noise**2 - rounding, LEAST_SHARE * noise**2))
@@ -450,13 +446,12 @@ def _working_picture(
         expected[place], full[place] = radiance + score * own**2 / slope, weighs * (slope / spread) ** 2
         # Mean square of what the value may have been, about the prediction.
         square = ((score * own) ** 2 + 1 - curvature * own**2) * noise**2
-        squares += float(np.sum(weighs * square))
-        value, count = float(np.sum(weighs * log_p)), closed + float(np.sum(weighs))
+        others, value = np.array([np.sum(weighs * square), np.sum(weighs)]), float(np.sum(weighs * log_p))
         taken, completed = (
             dataclasses.replace(taken, target=jnp.asarray(some), weight=jnp.asarray(weights))
             for some, weights in ((target, weight), (expected, full))
         )
-    return _WorkingPicture(taken, completed, squares, count, closed, plain, value)
+    return _WorkingPicture(taken, completed, np.array(sums), others, value)
 
 
 @partial(jax.jit, compiler_options=COMPILER_OPTIONS)

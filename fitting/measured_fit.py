@@ -397,10 +397,11 @@ def _fit_model(model, samples, loss, n_range):
         (optimum, highlight, f_r), least = closer, losses
     noise = residual_noise(optimum, brightest * np.finfo(float).eps)
     visible = float(np.max(highlight) / np.max(brightest))
+    fit = ModelFit(model, [], optimum, free, n_range)
     # A lobe that hardly reaches a sample needs a k_s whose square is out of range; it is found to be undetermined.
     with np.errstate(over="ignore", invalid="ignore"):
-        errors = uncertainty(optimum, free, noise, brightest, visible, single=False)
-    fit, interval = ModelFit(model, [], optimum, free, n_range), None
+        errors = uncertainty(fit, free, noise, brightest, visible)
+    interval = None
     if specular and not errors.n_reason:
         interval = exponent_interval(fit, errors.n_error, errors.reach, errors.delta_cost, 0.0, parabolic=True)
         errors = errors._replace(n_reason=fit.held)

@@ -98,7 +98,7 @@ class ModelFit(NamedTuple):
     @property
     def single(self) -> bool:
         """Whether the pixels are float32."""
-        return np.dtype(self.pictures[0].target.dtype) == np.float32
+        return any(np.dtype(picture.target.dtype) == np.float32 for picture in self.pictures)
 
     @property
     def cost(self) -> float:

@@ -194,8 +194,8 @@ def choose(
     for name, one in whitened.items():
         normals[name] = NormalEquations(*(part / inflation**2 for part in one))
     first = next(iter(fits))
-    terms = [("none", no, no), *([("ambient", free[0], no)] if ambient else []), ("lambert", no, free[1])]
-    terms += [("lambert", free[0], free[1])] if ambient else []
+    terms = [("none", no, no), ("lambert", no, free[1])]
+    terms += [("ambient", free[0], no), ("lambert", free[0], free[1])] if ambient else []
     trials = [_try(name, np.stack([*some, no]), None, normals[first], plain[first], 1.0) for name, *some in terms]
     for name, fit in fits.items():
         if name == "lambert" or fit.flat:

@@ -2,12 +2,12 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from fitting.model_fit import ModelFit
 from fitting.sample_error import SampleError
 from fitting.solver.nnls import scaled_inverse
 from fitting.solver.profile import Optimum
@@ -106,56 +106,50 @@ def _degrees(optimum: Optimum) -> Float[np.ndarray, " C"]:
 
 
 def uncertainty(
-    optimum: Optimum,
-    free: Bool[np.ndarray, "3 C"],
+    fit: ModelFit,
+    reached: Bool[np.ndarray, "3 C"],
     noise: Float[np.ndarray, " C"],
     brightest: Float[np.ndarray, " C"],
     visible: float,
     *,
-    single: bool,
-    tied: Float[np.ndarray, " C"] | None = None,
     spread: Float[np.ndarray, "C 4 4"] | None = None,
     scatter: Float[np.ndarray, "U U"] | None = None,
-    widening: Float[np.ndarray, " U"] | float = 1.0,
     channels: Float[np.ndarray, "C C"] | None = None,
     columns: Float[np.ndarray, "3 C"] | None = None,
     gain: float = 0.0,
     resolution: float = 0.0,
     missed: SampleError | None = None,
-    joined: Float[np.ndarray, "U U"] | None = None,
-    moved: Sequence[Float[np.ndarray, " U"]] = (),
 ) -> Uncertainty:
-    """Errors of an optimum.
+    """Errors of a fit.
 
     The covariance is H⁻¹ (Σ_c σ_c² J_cᵀJ_c) H⁻¹ with the noise σ_c of each channel: channels share n but not their
     noise. Coefficients at their bound are held there; the others' errors hold what these may be.
 
     Args:
-        optimum: of the engine.
-        free: which coefficients the light reaches, (3, C).
+        fit: of one model; where rounded values say more, with the pictures and the optimum of these.
+        reached: which coefficients the light reaches, (3, C).
         noise: standard deviation of the residual, (C,).
         brightest: largest value of the picture, (C,).
         visible: largest value of the specular term in the picture, over that of the picture.
-        single: whether the pixels were float32.
-        tied: x_s is a common factor times this, (C,); None where the channels are independent.
         spread: sums of the columns' products times the variance of each pixel, where it is not the same in all.
         scatter: what takes the place of the Hessian times the noise, over all unknowns, where pixels err together.
-        widening: what to multiply errors by.
         channels: correlation of the channels' errors; None where they err alone.
         columns: root mean square over pixels of what each term shows at 1; None where no pixel weighs more.
         resolution: relative error of a number that is left by the arithmetic of the basis images.
         gain: see `specular_gain`, where more pixels tell of it than those of the optimum's sums.
         missed: what light samples leave out; None where there are none.
-        joined: the Hessian of all channels, whose noise is 1, where these err together.
-        moved: by how much each of some causes may have moved the unknowns.
     """
-    gain = max(gain, specular_gain(optimum.normal(noise**2).gram, optimum.x))
+    optimum, tied, evidence = fit.optimum, fit.tied, fit.evidence
+    # The Hessian of all channels where these err together: the noise of each is 1.
+    joined = None if evidence is None or evidence.together is None else evidence.together.gram
+    for gram in (optimum.normal(noise**2).gram, joined):
+        gain = gain if gram is None else max(gain, specular_gain(gram, optimum.x))
     columns = rms_columns(optimum) if columns is None else columns
-    dependent = DEPENDENT_SINGLE if single else DEPENDENT_DOUBLE
-    reasons = np.full(free.shape, "", object)
+    dependent = DEPENDENT_SINGLE if fit.single else DEPENDENT_DOUBLE
+    reasons = np.full(reached.shape, "", object)
     n_reason = reasons[2, :] = _without_trace(optimum, gain, visible, grey=tied is not None)
-    for term, channel in np.argwhere(~free & (reasons == "")):
-        where = "this channel" if free[term].any() else "the scene"
+    for term, channel in np.argwhere(~reached & (reasons == "")):
+        where = "this channel" if reached[term].any() else "the scene"
         reasons[term, channel] = f"{LIGHT[term]} in {where}"
     degrees = _degrees(optimum)
     apart = degrees.size if channels is None else 1
@@ -177,7 +171,7 @@ def uncertainty(
     hessian = optimum.normal().gram if joined is None else joined
     middle = _of_scores(optimum, noise, spread, channels) if joined is None else joined
     inverse, along, with_n = _inverted(hessian, active, tied, dependent)
-    widening = widening * np.ones(size)
+    widening = np.ones(size) if evidence is None else evidence.widening * np.ones(size)
     independent = inverse @ middle @ inverse * np.outer(widening, widening)
     covariance, middles = independent, np.stack([middle, middle])
     if scatter is not None:
@@ -194,14 +188,14 @@ def uncertainty(
         off = missed.shift(np.append(active.ravel(), with_n)) * np.append(np.ones(size - 1), optimum.n)
         covariance = covariance + np.outer(off, off)
     # Where this is larger than the picture a number is not determined, whatever others at their bound may be.
-    own = np.diag(covariance) + np.sum(np.square([np.zeros(size), *moved]), axis=0)
+    own = np.diag(covariance) + np.sum(np.square([np.zeros(size), *fit.moved]), axis=0)
     bounded = {
         (term, channel): _without_bound(term, channel, optimum, inverse, hessian, middles, dependent)
         for term, channel in np.argwhere(determined & ~(x > 0)).tolist()
     }
     offs = np.array([np.zeros(size), *(off for *_, off in bounded.values())])
     # What was dropped is at its bound too, and counts once.
-    beside = [np.sqrt(np.maximum(off**2 - np.sum(offs**2, axis=0), 0.0)) * np.sign(off) for off in moved]
+    beside = [np.sqrt(np.maximum(off**2 - np.sum(offs**2, axis=0), 0.0)) * np.sign(off) for off in fit.moved]
     offs = np.vstack([offs, *beside])
     covariance = covariance + offs.T @ offs
     variance = np.maximum(np.diag(covariance), 0.0)

@@ -78,8 +78,8 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: R
     visible = 0.0 if lobe is None else lobe.share(optimum.x, observed.brightest)
     # Also of what rounded values say, whose sums are in double precision.
     resolution = RESOLUTION if fit.single else 0.0
-    spread = shared = joined = growing = uneven = together = None
-    widening, deviation, gain, tell = 1.0, noise, 0.0, noise > 2 * rounding
+    spread = shared = growing = uneven = together = None
+    deviation, gain, tell = noise, 0.0, noise > 2 * rounding
     channels = statistics.channels(tell)
     weighed = any(one is not None for one in observed.problem.weights)
     sampled = observed.problem.sample_error(fit.model.name)
@@ -98,10 +98,6 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: R
         )
         channels = channels if evidence.scores else of_codes
         together = None if evidence.light < ARITHMETIC * np.max(observed.brightest) else together
-        widening = evidence.widening
-        if evidence.together is not None:
-            joined = evidence.together.gram
-            gain = max(gain, specular_gain(joined, optimum.x))
     else:
         # Where weights are no inverse variances nothing is told of what else makes noise uneven.
         asked = weighed and observed.problem.loss == "squared"
@@ -129,23 +125,18 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: R
     # What the light reaches but the simplest model does without is 0, with the error that it would have.
     reached = observed.reached(fit.model)
     errors = uncertainty(
-        optimum,
+        fit,
         reached,
         deviation,
         observed.brightest,
         visible,
-        single=fit.single,
-        tied=fit.tied,
         spread=spread,
         scatter=shared,
-        widening=widening,
         columns=columns,
         channels=channels,
         gain=gain,
         missed=sampled,
         resolution=resolution,
-        joined=joined,
-        moved=fit.moved,
     )
     errors.reasons[clipped & (errors.reasons == "")] = CLIPPED
     interval = None
@@ -157,7 +148,7 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: R
             errors.reach,
             errors.delta_cost,
             lobe.peak,
-            parabolic=joined is not None,
+            parabolic=fit.evidence is not None and fit.evidence.together is not None,
         )
         # Whoever bounds n knows that it is not beyond.
         least, most = observed.problem.n_range
