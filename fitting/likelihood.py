@@ -36,7 +36,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from brdf.images.encoding import Encoding, decode
 
-# Distances in units of s beyond which nothing changes; squares of it stay within float32.
+# Distances in units of s beyond which nothing changes.
 _FAR = 1e18
 # Across this many powers of e ten nodes integrate the density to 1e-12.
 _STEEP, _WIDE = 3.0, 2.5
@@ -222,82 +222,76 @@ class LogLikelihood(NamedTuple):
         weight: minus its second derivative, 0 to 1 / s².
     """
 
-    value: Float[AnyArray, "*shape"]
-    score: Float[AnyArray, "*shape"]
-    weight: Float[AnyArray, "*shape"]
+    value: Float[np.ndarray, "*shape"]
+    score: Float[np.ndarray, "*shape"]
+    weight: Float[np.ndarray, "*shape"]
 
 
+# NumPy has no erfc; that of the standard library is for single numbers.
 _each_erfc = np.frompyfunc(math.erfc, 1, 1)
 
 
-class _Ends:
-    """An end of the interval: x, the normal tail beyond |x|, the density there."""
-
-    def __init__(self, x: AnyArray):
-        self.x, self.xp = x, np if isinstance(x, np.ndarray) else jnp
-        distance = self.xp.abs(x) * math.sqrt(0.5)
-        # NumPy has no erfc; that of the standard library is for single numbers.
-        found = _each_erfc(distance) if self.xp is np else jax.scipy.special.erfc(distance)
-        self.tail = 0.5 * self.xp.asarray(found, distance.dtype)
-        self.density = self.xp.exp(-0.5 * x * x - _LOG_ROOT_TWO_PI)
+def _tail(x: np.ndarray) -> np.ndarray:
+    """Of the normal distribution beyond x."""
+    return 0.5 * _each_erfc(x * math.sqrt(0.5)).astype(np.float64)
 
 
-def _mills(end: _Ends) -> tuple[AnyArray, AnyArray]:
+def _density(x: np.ndarray) -> np.ndarray:
+    return np.exp(-0.5 * x * x - _LOG_ROOT_TWO_PI)
+
+
+def _mills(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mills' ratio R = Q(x) / phi(x), and 1 - x R, for x > 0."""
-    xp, large = end.xp, end.x > _SERIES
-    at = xp.where(large, end.x, _SERIES)
+    small, large = np.minimum(x, _SERIES), np.maximum(x, _SERIES)
     # 1 / R = x + 1 / (x + 2 / (x + 3 / ...)); what follows the first x is (1 - x R) / R.
-    tail = at
+    tail = large
     for term in range(_TERMS, 1, -1):
-        tail = at + term / tail
-    far = 1.0 / (at + 1.0 / tail)
-    near = end.tail / xp.where(large, 1.0, end.density)
-    return xp.where(large, far, near), xp.where(large, far / tail, 1.0 - end.x * near)
+        tail = large + term / tail
+    near, far = _tail(small) / _density(small), 1.0 / (large + 1.0 / tail)
+    return np.where(x > _SERIES, far, near), np.where(x > _SERIES, far / tail, 1.0 - small * near)
 
 
-def _around(near: _Ends, far: _Ends, decay: AnyArray, holds: AnyArray) -> tuple[AnyArray, AnyArray, AnyArray]:
+def _around(near: np.ndarray, far: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Logarithm of P, mean, 1 - variance, for x1 <= 0 <= x2."""
-    xp = near.xp
-    outside = xp.where(holds, near.tail + far.tail, 0.25)
+    outside = _tail(-near) + _tail(far)
     mass = 1.0 - outside
-    mean = -near.density / mass * xp.expm1(-xp.where(holds, decay, 0.0))
-    return xp.log1p(-outside), mean, mean * mean + (far.x * far.density - near.x * near.density) / mass
+    mean = -_density(near) / mass * np.expm1(-0.5 * width * (near + far))
+    return np.log1p(-outside), mean, mean * mean + (far * _density(far) - near * _density(near)) / mass
 
 
-def _narrow(middle: AnyArray, width: AnyArray) -> tuple[AnyArray, AnyArray, AnyArray]:
+def _narrow(near: np.ndarray, far: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The same by quadrature about the middle."""
-    xp = np if isinstance(middle, np.ndarray) else jnp
-    total = first = second = xp.zeros_like(middle)
+    middle = 0.5 * (near + far)
+    total = first = second = np.zeros_like(middle)
     for node, part in zip(_NODES.tolist(), _WEIGHTS.tolist(), strict=True):
         # From the near end, where the density is largest.
         offset, shift = 0.5 * width * (1.0 + node), 0.5 * width * node
-        density = 0.5 * part * xp.exp(-offset * (middle - 0.5 * width + 0.5 * offset))
+        density = 0.5 * part * np.exp(-offset * (middle - 0.5 * width + 0.5 * offset))
         total, first, second = total + density, first + density * shift, second + density * shift * shift
     shift = first / total
     near = middle - 0.5 * width
-    value = xp.log(width * total) - 0.5 * near * near - _LOG_ROOT_TWO_PI
+    value = np.log(width * total) - 0.5 * near * near - _LOG_ROOT_TWO_PI
     return value, middle + shift, 1.0 - (second / total - shift * shift)
 
 
-def _beyond(
-    near: AnyArray, width: AnyArray, left: AnyArray, first: tuple[AnyArray, AnyArray], second: tuple[AnyArray, AnyArray]
-) -> tuple[AnyArray, AnyArray, AnyArray]:
-    """The same where the far end counts less: ``left`` of the density at the near one; Mills' ratios at both."""
-    xp = np if isinstance(near, np.ndarray) else jnp
-    (mills1, rest1), (mills2, rest2) = first, second
+def _beyond(near: np.ndarray, far: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The same where the far end counts less."""
+    (mills1, rest1), (mills2, rest2) = _mills(near), _mills(far)
+    # Of the density at the near end.
+    left = np.exp(-0.5 * width * (near + far))
     mass = mills1 - mills2 * left
-    value = xp.log(mass) - 0.5 * near**2 - _LOG_ROOT_TWO_PI
-    beyond = xp.where(left > 0, width * (mills1 - mills2) - rest1 - rest2, 0.0)
+    value = np.log(mass) - 0.5 * near**2 - _LOG_ROOT_TWO_PI
+    beyond = width * (mills1 - mills2) - rest1 - rest2
     return value, (1.0 - left) / mass, (rest1 + left * beyond + left * left * rest2) / mass**2
 
 
 def interval(
-    lower: Float[AnyArray, "*shape"],
-    upper: Float[AnyArray, "*shape"],
-    predicted: Float[AnyArray, "*shape"],
-    s: Float[AnyArray, ""],
+    lower: Float[np.ndarray, "*shape"],
+    upper: Float[np.ndarray, "*shape"],
+    predicted: Float[np.ndarray, "*shape"],
+    s: Float[np.ndarray, "*shape"],
 ) -> LogLikelihood:
-    """The log-likelihood of values known to lie in an interval; in NumPy where the prediction is.
+    """The log-likelihood of values known to lie in an interval.
 
     Args:
         lower: its lower end, minus infinity for an open one.
@@ -305,34 +299,20 @@ def interval(
         predicted: z, in the same units.
         s: standard deviation of the noise before rounding, above 0.
     """
-    xp = np if isinstance(predicted, np.ndarray) else jnp
-    a = xp.clip((lower - predicted) / s, -_FAR, _FAR)
-    b = xp.clip((upper - predicted) / s, -_FAR, _FAR)
+    a, b = (np.clip((end - predicted) / s, -_FAR, _FAR) for end in (lower, upper))
     above = a + b >= 0
-    near, far = xp.where(above, a, -b), xp.where(above, b, -a)
-    width = xp.clip((upper - lower) / s, 0.0, 2 * _FAR)
-    middle = 0.5 * (near + far)
-    decay = width * xp.minimum(middle, _FAR)
-    narrow, inside = (decay <= _STEEP) & (width <= _WIDE), near <= 0
-    ends = _Ends(near), _Ends(far)
-    by_quadrature = _narrow(xp.where(narrow, middle, 1.0), xp.where(narrow, width, 1.0))
-    # Where the far end counts less; other numbers stand in where that fails.
-    fails = narrow | inside
-    ratios = _mills(_Ends(xp.where(fails, 1.0, near))), _mills(_Ends(xp.where(fails, 9.0, far)))
-    apart, left = xp.where(fails, 9.0, xp.minimum(width, _FAR)), xp.exp(-xp.where(fails, 40.0, decay))
-    value, mean, weight = (
-        xp.where(narrow, one, xp.where(inside, two, three))
-        for one, two, three in zip(
-            by_quadrature,
-            _around(*ends, decay, ~narrow & inside),
-            _beyond(xp.where(fails, 1.0, near), apart, left, *ratios),
-            strict=True,
-        )
-    )
-    return LogLikelihood(value, xp.where(above, mean, -mean) / s, weight / (s * s))
-
-
-_interval = jax.jit(interval)
+    near, far = np.where(above, a, -b), np.where(above, b, -a)
+    width = np.clip((upper - lower) / s, 0.0, 2 * _FAR)
+    narrow = (width <= _WIDE) & (0.5 * width * (near + far) <= _STEEP)
+    found = np.zeros((3, *width.shape))
+    for holds, told in (
+        (narrow, _narrow),
+        (~narrow & (near <= 0), _around),
+        (~narrow & (near > 0), _beyond),
+    ):
+        found[:, holds] = told(near[holds], far[holds], width[holds])
+    value, mean, weight = found
+    return LogLikelihood(value, np.where(above, mean, -mean) / s, weight / (s * s))
 
 
 class _Table(NamedTuple):
@@ -348,8 +328,7 @@ def _table(ratio: float) -> _Table:
     """Of intervals whose width is so many s; infinite for an interval with one end."""
     first = -min(0.5 * ratio, _INSIDE)
     beyond, step = np.linspace(first, _OUTSIDE, _KNOTS, retstep=True)
-    with np.errstate(all="ignore"):
-        found = interval(np.full(_KNOTS, -ratio), np.zeros(_KNOTS), beyond, np.ones(()))
+    found = interval(np.full(_KNOTS, -ratio), np.zeros(_KNOTS), beyond, np.ones(_KNOTS))
     return _Table(first, float(step), np.stack(found))
 
 
@@ -392,15 +371,15 @@ class Values:
             noise: standard deviation of the noise before rounding.
         """
         lower, upper, s = self.bounds.lower, self.bounds.upper, noise * self.bounds.spread
-        if not self._tabulated:
-            filled = np.array([(0, (1 << max(len(predicted) - 1, 0).bit_length()) - len(predicted)), (0, 0)])
-            parts = lower, upper, predicted, np.broadcast_to(s, predicted.shape)
-            with jax.enable_x64(True):
-                found = jax.device_get(_interval(*(np.pad(part, filled, mode="edge") for part in parts)))
-            return LogLikelihood(*(part[: len(predicted)] for part in found))
         # Of the nearer end; minus infinity where there is none.
         above, below = predicted - upper, lower - predicted
         up, beyond = above >= below, np.maximum(above, below) / s
+        found = np.zeros((3, *predicted.shape))
+        if not self._tabulated:
+            some = self._tells & (beyond >= -_INSIDE)
+            parts = lower, upper, predicted, np.broadcast_to(s, predicted.shape)
+            found[:, some] = interval(*(part[some] for part in parts))
+            return LogLikelihood(*found)
         ratios = self._kinds / s
         # Of two ends so far apart one tells.
         tables = map(_table, np.where(ratios < 2 * _INSIDE, ratios, np.inf).tolist())
@@ -427,7 +406,6 @@ class Values:
             score[tail] = -(x + (1 - 2 / square) / x)
             weight[tail] = 1 - (1 - 6 / square) / square
         score = np.where(up.ravel()[some], score, -score) / s
-        found = np.zeros((3, *predicted.shape))
         found.reshape(3, -1)[:, some] = value, score, weight / s**2
         return LogLikelihood(*found)
 
