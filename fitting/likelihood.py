@@ -233,7 +233,7 @@ _each_erfc = np.frompyfunc(math.erfc, 1, 1)
 
 def _tail(x: np.ndarray) -> np.ndarray:
     """Of the normal distribution beyond x."""
-    return 0.5 * _each_erfc(x * math.sqrt(0.5)).astype(np.float64)
+    return 0.5 * np.asarray(_each_erfc(x * math.sqrt(0.5)), np.float64)
 
 
 def _density(x: np.ndarray) -> np.ndarray:
@@ -304,14 +304,14 @@ def interval(
     near, far = np.where(above, a, -b), np.where(above, b, -a)
     width = np.clip((upper - lower) / s, 0.0, 2 * _FAR)
     narrow = (width <= _WIDE) & (0.5 * width * (near + far) <= _STEEP)
-    found = np.zeros((3, *width.shape))
+    value, mean, weight = found = [np.zeros(width.shape) for _ in range(3)]
     for holds, told in (
         (narrow, _narrow),
         (~narrow & (near <= 0), _around),
         (~narrow & (near > 0), _beyond),
     ):
-        found[:, holds] = told(near[holds], far[holds], width[holds])
-    value, mean, weight = found
+        for part, own in zip(found, told(near[holds], far[holds], width[holds]), strict=True):
+            part[holds] = own
     return LogLikelihood(value, np.where(above, mean, -mean) / s, weight / (s * s))
 
 
@@ -374,12 +374,13 @@ class Values:
         # Of the nearer end; minus infinity where there is none.
         above, below = predicted - upper, lower - predicted
         up, beyond = above >= below, np.maximum(above, below) / s
-        found = np.zeros((3, *predicted.shape))
+        found = LogLikelihood(*(np.zeros(predicted.shape) for _ in range(3)))
         if not self._tabulated:
             some = self._tells & (beyond >= -_INSIDE)
             parts = lower, upper, predicted, np.broadcast_to(s, predicted.shape)
-            found[:, some] = interval(*(part[some] for part in parts))
-            return LogLikelihood(*found)
+            for part, own in zip(found, interval(*(part[some] for part in parts)), strict=True):
+                part[some] = own
+            return found
         ratios = self._kinds / s
         # Of two ends so far apart one tells.
         tables = map(_table, np.where(ratios < 2 * _INSIDE, ratios, np.inf).tolist())
@@ -406,8 +407,9 @@ class Values:
             score[tail] = -(x + (1 - 2 / square) / x)
             weight[tail] = 1 - (1 - 6 / square) / square
         score = np.where(up.ravel()[some], score, -score) / s
-        found.reshape(3, -1)[:, some] = value, score, weight / s**2
-        return LogLikelihood(*found)
+        for part, own in zip(found, (value, score, weight / s**2), strict=True):
+            part.ravel()[some] = own
+        return found
 
 
 def _hermite(low: Any, high: Any, start: Any, end: Any, share: Any) -> np.ndarray:

@@ -339,7 +339,7 @@ def _reweighted(
             else:
                 optimum = refit(working, optimum, fit.free, fit.n_range, fit.tied)
             parts = [_working_picture(*one, optimum, noise, rounding) for one in both]
-            closed, at_end = (sum(getattr(part, name) for part in parts) for name in ("closed", "at_end"))
+            closed, at_end = (np.sum([getattr(part, name) for part in parts], axis=0) for name in ("closed", "at_end"))
             squares, count = (closed + at_end).tolist()
             last, gone = gone, 0.5 * math.log(squares / max(count, 1) / noise**2)
             # The rest of a geometric series (Aitken 1926).
@@ -357,7 +357,7 @@ def _reweighted(
         for both in zip(*((part.picture, part.completed) for part in parts), strict=True)
     )
     sums = {name: getattr(optimum, name) * scale for name in ("cost", "gram", "product", "square")}
-    value = sum(part.value - part.closed @ [scale / 2, math.log(noise)] for part in parts)
+    value = sum(part.value - float(part.closed @ [scale / 2, math.log(noise)]) for part in parts)
     value += sum(_of_codes(bounds_of(picture)) for picture in pictures)
     optimum = dataclasses.replace(optimum, **sums)
     return Evidence(working, optimum, noise, value, places, np.ones(1), completed=completed)

@@ -192,7 +192,7 @@ def choose(
     plain = {name: fit.normal() for name, fit in fits.items()}
     normals = {name: fit.normal(variance) for name, fit in fits.items()}
     for name, one in whitened.items():
-        normals[name] = NormalEquations(*(part / inflation**2 for part in one))
+        normals[name] = NormalEquations(one.gram / inflation**2, one.product / inflation**2, one.square / inflation**2)
     first = next(iter(fits))
     terms = [("none", no, no), ("lambert", no, free[1])]
     terms += [("ambient", free[0], no), ("lambert", free[0], free[1])] if ambient else []
