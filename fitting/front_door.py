@@ -49,13 +49,14 @@ def fit(
     Args:
         target: the path of a picture, a `brdf.Picture`, or an array (H, W, C) or (H, W): linear values, or codes of
             8 or 16 bits; a `brdf.ImageReader` for a file that is larger than memory, which is read by bands of rows,
-            several times, and fitted by least squares, or where codes are coarser than the noise to every so many rows
-            and columns, up to 1024 each; or a list.
+            several times, and fitted by least squares, or where codes are coarser than the noise or were compressed
+            with losses to every so many rows and columns, up to 1024 each; or a list.
         scene: what the picture shows; a list of as many where there are several pictures.
         model: "auto" for the simplest adequate of Lambert, Phong and Blinn-Phong, or a model: its class or its
             name.
         precision: "float32" or "float64".
-        mask: (H, W), pixels to look at; a list where there are several pictures.
+        mask: (H, W), pixels to look at; a list where there are several pictures. Pixels that a picture has as fully
+            transparent do not count.
         saturation: linear value from which on pixels are clipped: all that they say is that they were no darker. None
             takes the largest code of an integer file, or the largest value where many pixels share it exactly.
         n_range: bounds of the exponent, 0 < lower < upper.
@@ -119,9 +120,10 @@ def fit(
             with spread_over(mesh):
                 result = fit_pictures(problem)
                 if problem.streamed and loss == "squared" and dark is None:
-                    # Beside a picture that is read by bands no codes are fitted as such.
+                    # Beside a picture that is read by bands no codes are fitted as such, and none err together.
                     some = in_memory(problem, rounding)
-                    if np.min(result.noise) < some.usual_step:
+                    lossy = any(one.codes is not None and one.codes.lossy for one in some.targets)
+                    if lossy or np.min(result.noise) < some.usual_step:
                         result = fit_pictures(with_enough_samples(some))
             return dataclasses.replace(result, seconds=time.perf_counter() - start)
     if mesh is not None:

@@ -1,7 +1,9 @@
 """What is to be fitted: pictures, their scenes, what counts of them, and how; checked once, where it is made."""
 
 import dataclasses
+import functools
 import math
+import operator
 import os
 from collections.abc import Iterable, Mapping
 from functools import partial
@@ -36,6 +38,7 @@ class Target(NamedTuple):
         codes: behind the values; None where no rounding touched these.
         least_squares: is asked for, whatever the values are.
         file: path, encoding, its source, and factor of the `brdf.Picture` that it was; None where no file holds it.
+        opaque: pixels that are not fully transparent, (H, W); None for all.
     """
 
     pixels: Any
@@ -44,6 +47,7 @@ class Target(NamedTuple):
     codes: Codes | None = None
     least_squares: bool = False
     file: dict[str, Any] | None = None
+    opaque: np.ndarray | None = None
 
     @property
     def streamed(self) -> bool:
@@ -196,16 +200,17 @@ def state_problem(
         except InputError as error:
             raise error.renamed({"target": f"target[{index}]"} if len(targets) > 1 else {}) from None
         shape = picture.pixels.shape[:2]
-        if masks[index] is not None:
-            masks[index] = _per_pixel("mask", masks[index], shape).astype(bool)
-        if weights[index] is None:
-            continue
-        weights[index] = _per_pixel("weight", weights[index], shape)
-        if not np.all(weights[index] >= 0) or not np.any(weights[index] > 0):
-            raise InputError("weight", "must be 0 or more, and more somewhere", "Give values of 0 or more")
-        # What weighs nothing says nothing of clipping or rounding either.
-        heavy = weights[index] > 0
-        masks[index] = heavy if masks[index] is None else masks[index] & heavy
+        mask, weight = masks[index], weights[index]
+        count = [] if picture.opaque is None else [picture.opaque]
+        if mask is not None:
+            count.append(_per_pixel("mask", mask, shape).astype(bool))
+        if weight is not None:
+            weights[index] = weight = _per_pixel("weight", weight, shape)
+            if not np.all(weight >= 0) or not np.any(weight > 0):
+                raise InputError("weight", "must be 0 or more, and more somewhere", "Give values of 0 or more")
+            # What weighs nothing says nothing of clipping or rounding either.
+            count.append(weight > 0)
+        masks[index] = functools.reduce(operator.and_, count) if count else None
     counts = {picture.pixels.shape[2] for picture in targets}
     if len(counts) > 1:
         raise InputError("target", f"pictures have {counts} channels", "Give pictures with the same number")
@@ -236,7 +241,7 @@ def as_target(given: Any, rounding: Rounding = None, encoding: Encoding | None =
         return given
     if isinstance(given, brdf.ImageReader):
         largest, step = given.codes
-        return Target(given, None if largest is None else largest * TOP, step)
+        return Target(given, None if largest is None else largest * TOP, step, opaque=given.read_opaque())
     if isinstance(given, brdf.Picture):
         return _of_picture(given, rounding)
     if isinstance(given, bytes) or not hasattr(given, "__array__"):
@@ -269,7 +274,7 @@ def _of_picture(picture: brdf.Picture, rounding: Rounding, stored: np.ndarray | 
     if picture.path is not None:
         file = {"path": str(picture.path), "encoding": picture.encoding, "source": picture.source}
         file |= {"factor": np.asarray(picture.factor).tolist()}
-    return Target(pixels, top, step, codes, least, file)
+    return Target(pixels, top, step, codes, least, file, picture.opaque)
 
 
 def _of_array(values: np.ndarray, rounding: Rounding, encoding: Encoding) -> Target:

@@ -94,6 +94,11 @@ class Picture:
         return dataclasses.replace(self, pixels=pixels, saturation=saturation, factor=self.factor * factors)
 
     @property
+    def opaque(self) -> Bool[np.ndarray, "height width"] | None:
+        """Pixels that are not fully transparent; None where nobody says."""
+        return _opaque(self.alpha)
+
+    @property
     def code_step(self) -> float | None:
         """The distance of two codes before decoding, full scale 1; None for floats."""
         return None if self.saturation is None else 1.0 / ((1 << self.bits) - 1)
@@ -221,6 +226,10 @@ class ImageReader(contextlib.AbstractContextManager):
         check_memory(self.path, self.shape[0] * self.shape[1])
         return self._whole([self._alpha], "linear")[..., 0]
 
+    def read_opaque(self) -> Bool[np.ndarray, "height width"] | None:
+        """Pixels that are not fully transparent; None where nobody says."""
+        return _opaque(self.read_alpha())
+
     def _whole(self, channels, encoding):
         """All rows, turned as the Exif orientation says (CIPA DC-008, 4.6.4.A)."""
         turn, height = self._turn, self._spec.full_height
@@ -230,6 +239,11 @@ class ImageReader(contextlib.AbstractContextManager):
         if turn in (2, 3, 6, 7):
             stored = stored[:, ::-1]
         return np.ascontiguousarray(stored[::-1] if turn in (3, 4, 7, 8) else stored)
+
+
+def _opaque(alpha: np.ndarray | None) -> np.ndarray | None:
+    # Alpha that is 0 everywhere was not meant.
+    return None if alpha is None or not alpha.any() else alpha > 0
 
 
 def _open(path: Path) -> oiio.ImageInput:

@@ -87,7 +87,7 @@ def read_inputs(targets: list[Path], options: PictureOptions, encodings: dict[Pa
     if kind == "archive":
         (path,) = targets
         pictures, seen, directions, intensities = _archived(path)
-        inputs = FitInputs(targets, _exposed(pictures, options), [], visible(mask, pictures))
+        inputs = FitInputs(targets, _exposed(pictures, options), [], _masks(mask, pictures))
         names = {"direction": f"{path}: light_dirs", "intensity": f"{path}: light_intensities"}
     else:
         inputs, file, tables = _read_pictures(kind, targets, options, encodings or {}, mask)
@@ -170,7 +170,7 @@ def _read_pictures(kind, targets, options, encodings, mask):
             "Give a picture and a camera of the same resolution",
         )
     pictures = _exposed(pictures, options)
-    return FitInputs(targets, pictures, [], visible(mask, pictures)), file, tables
+    return FitInputs(targets, pictures, [], _masks(mask, pictures)), file, tables
 
 
 def _target_and_scene(target, scene):
@@ -201,27 +201,12 @@ def _exposed(pictures: list[brdf.Picture], options) -> list[brdf.Picture]:
     return [picture.scaled(1.0 / factor) for picture, factor in zip(pictures, np.resize(factors, count), strict=True)]
 
 
-def visible(mask: Any, pictures: list[brdf.Picture]) -> list[Any]:
-    """Pixels that count in each picture: those of the mask without the fully transparent ones, which show nothing.
-
-    Args:
-        mask: (H, W), or None.
-        pictures: where alpha is 0 everywhere it was not meant.
-
-    Raises:
-        InputError: where the mask is not of their size.
-    """
-    masks = []
-    for picture in pictures:
-        shape, alpha = picture.pixels.shape[:2], picture.alpha
-        counts = alpha > 0 if alpha is not None and alpha.any() else None
-        if mask is not None:
-            _require(
-                mask.shape == shape, "mask", f"is of shape {mask.shape}, the target {shape}", "Give a value per pixel"
-            )
-            counts = mask if counts is None else counts & mask
-        masks.append(counts)
-    return masks
+def _masks(mask, pictures) -> list[Any]:
+    """The mask of each picture, of its size."""
+    shape = pictures[0].pixels.shape[:2]
+    if mask is not None:
+        _require(mask.shape == shape, "mask", f"is of shape {mask.shape}, the target {shape}", "Give a value per pixel")
+    return [mask] * len(pictures)
 
 
 def ball_in(sphere: str, mask: Any) -> tuple[Circle, tuple[str, ...]]:

@@ -38,7 +38,7 @@ class Photograph:
         top: from which value on it is clipped.
         curve: how it is encoded, which tells how exact its values are: noise is even in codes.
         lossy: whether it was compressed with losses.
-        alpha: reads how opaque pixels are, (H, W), or None where nobody says.
+        opaque: reads which pixels are not fully transparent, (H, W), or None where nobody says.
         step: distance of two codes, the largest being 1; 0 of floats.
         silent: whether it is a file of integers that does not say how it is encoded.
         stated: whether a user says from which value on it is clipped.
@@ -50,7 +50,7 @@ class Photograph:
     top: float
     curve: Encoding
     lossy: bool
-    alpha: Callable[[], Float[np.ndarray, "H W"] | None]
+    opaque: Callable[[], Bool[np.ndarray, "H W"] | None]
     step: float
     silent: bool = False
     stated: bool = False
@@ -85,11 +85,10 @@ class Photographs:
         return self.each[0].shape
 
     def opaque(self) -> Bool[np.ndarray, "H W"]:
-        """Pixels that no photograph has as fully transparent; alpha that is 0 everywhere was not meant."""
+        """Pixels that no photograph has as fully transparent."""
         found = np.ones(self.size[:2], bool)
-        for alpha in (one.alpha() for one in self.each):
-            if alpha is not None and alpha.any():
-                found &= alpha > 0
+        for opaque in (one.opaque() for one in self.each):
+            found &= True if opaque is None else opaque
         return found
 
     def tiles(
@@ -339,12 +338,12 @@ def _opened(name: str, picture: Any, encoding: Any) -> Photograph:
         if encoding is not None:
             raise InputError("encoding", f"is that of files and arrays, {name} is decoded", "Leave it out")
         if isinstance(picture, brdf.ImageReader):
-            read, shape, top, alpha = picture.rows, picture.shape, picture.codes[0], picture.read_alpha
+            read, shape, top, opaque = picture.rows, picture.shape, picture.codes[0], picture.read_opaque
             step = picture.is_integer / (2**picture.bits - 1)
         else:
             read, shape, top = (lambda a, b: picture.pixels[a:b]), picture.pixels.shape, picture.saturation
-            alpha, step = (lambda: picture.alpha), (picture.code_step or 0.0) * np.max(picture.factor)
-        return Photograph(read, shape, name, (top or np.inf) * TOP, picture.encoding, picture.lossy, alpha, step)
+            opaque, step = (lambda: picture.opaque), (picture.code_step or 0.0) * np.max(picture.factor)
+        return Photograph(read, shape, name, (top or np.inf) * TOP, picture.encoding, picture.lossy, opaque, step)
     values = np.asarray(picture)
     values = values[..., None] if values.ndim == 2 else values
     integer = values.dtype.kind == "u"
@@ -358,7 +357,7 @@ def _opened(name: str, picture: Any, encoding: Any) -> Photograph:
         return decode(part / white if integer else part, curve)
 
     top = TOP if integer else np.inf
-    return Photograph(rows, values.shape, name, top, curve, lossy=False, alpha=lambda: None, step=float(1 / white))
+    return Photograph(rows, values.shape, name, top, curve, lossy=False, opaque=lambda: None, step=float(1 / white))
 
 
 def _factors(count: int, channels: int, name: str, given: Any) -> Float[np.ndarray, "P C"]:

@@ -58,7 +58,11 @@ TOO_LITTLE = InputError("picture", "shows too little of the lit surface to tell 
 
 
 def _values(picture: Any) -> np.ndarray:
-    return np.atleast_3d(np.asarray(getattr(picture, "pixels", picture), np.float64))
+    """Linear values, NaN where a picture is fully transparent."""
+    values, opaque = np.array(getattr(picture, "pixels", picture), np.float64), getattr(picture, "opaque", None)
+    if opaque is not None:
+        values[~opaque] = np.nan
+    return np.atleast_3d(values)
 
 
 def light_from_highlight(picture: Any, circle: Circle, *, mask: Any = None) -> Float[np.ndarray, "3"]:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 
 import brdf
@@ -126,6 +127,15 @@ def test_codes_coarser_than_noise_are_fitted_as_codes(tmp_path: Path, monkeypatc
         assert one.error == pytest.approx(other.error, rel=1e-3) if most > 60 else 1 < one.error / other.error < 40
 
 
+def test_neighbours_of_a_lossy_file_err_together_also_where_it_is_read_by_bands(tmp_path: Path):
+    brdf.write_image(tmp_path / "ball.jpg", picture())
+    with brdf.ImageReader(tmp_path / "ball.jpg") as reader:
+        found = fitting.fit(reader, scene(), model="blinn-phong")
+    whole = fitting.fit(tmp_path / "ball.jpg", scene(), model="blinn-phong")
+    for one, other in zip(found.parameters, whole.parameters, strict=True):
+        assert (float(one), one.error) == pytest.approx((float(other), other.error), rel=1e-4)
+
+
 def test_a_stated_rounding_is_that_of_a_file_read_by_bands(tmp_path: Path):
     clean = np.asarray(brdf.render(MATERIAL, scene(), precision="float64"))
     path = tmp_path / "linear.png"
@@ -185,6 +195,20 @@ def test_mask_weight_and_several_pictures(tmp_path: Path):
     whole = fitting.fit([values, other], scene(), **options)
     with brdf.ImageReader(path) as reader:
         same(fitting.fit([reader, other], scene(), **options), whole)
+
+
+def test_what_is_fully_transparent_does_not_count(tmp_path: Path):
+    path, values = tmp_path / "target.exr", picture()
+    opaque = np.add.outer(np.arange(SIZE[1]), np.arange(SIZE[0])) % 7 > 0
+    values[~opaque] = 5.0  # what a tool writes where it cut something out
+    spec = oiio.ImageSpec(*SIZE, 4, "float")
+    buffer = oiio.ImageBuf(spec)
+    buffer.set_pixels(oiio.ROI(), np.dstack([values, opaque.astype(np.float32)]))
+    assert buffer.write(str(path))
+    whole = fitting.fit(np.where(opaque[..., None], values, 0), scene(), mask=opaque, model="blinn-phong")
+    with brdf.ImageReader(path) as reader:
+        for given in (path, brdf.read_picture(path), reader):
+            same(fitting.fit(given, scene(), model="blinn-phong"), whole)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".exr"])
