@@ -26,20 +26,21 @@ class SampleError(NamedTuple):
     Attributes:
         near: where to tabulate its lobe; None where its terms are kept.
         hessian: of x_a, x_d, x_s, channel after channel each, and log n, (U, U).
-        score: what more samples would change, (U,).
+        scores: of what more samples would change, and where the picture may show the lights' own count instead, of what
+            that would, (K, U).
         profile: exponents, and the least cost at each by the first fit, (2, G).
-        size: of what more samples would change, root mean square over pixels.
+        size: of both together, root mean square over pixels.
     """
 
     near: Near | None
     hessian: Float[np.ndarray, "U U"]
-    score: Float[np.ndarray, " U"]
+    scores: Float[np.ndarray, "K U"]
     profile: Float[np.ndarray, "2 G"]
     size: float
 
-    def shift(self, active: Bool[np.ndarray, " U"]) -> Float[np.ndarray, " U"]:
-        """How far off each number is, where some of them are free."""
-        return scaled_inverse(self.hessian * np.outer(active, active)) @ self.score
+    def shifts(self, active: Bool[np.ndarray, " U"]) -> Float[np.ndarray, "K U"]:
+        """How far off each puts the numbers, where some of them are free."""
+        return self.scores @ scaled_inverse(self.hessian * np.outer(active, active))
 
 
 def near_exponent(n: float, reach: float, peak: float) -> Near:

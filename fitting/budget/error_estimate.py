@@ -146,7 +146,7 @@ def estimate(run: Run) -> Attempt:
     scores = probes.scores(probes.residual)
     value, vector = np.linalg.eigh(inverse @ (probes.left_out * scores.T) @ scores @ inverse)
     drawn = np.random.default_rng(0).standard_normal((DRAWS, value.size)) * np.sqrt(np.maximum(value, 0.0)) @ vector.T
-    missed = np.zeros(value.size) if samples is None else samples.shift(determined)
+    missed = np.zeros(value.size) if samples is None else samples.shifts(determined)[0]
     error, bound = np.quantile(np.hypot(probes.error(drawn + missed), rounding), [0.5, 0.95])
     pixels = np.quantile(probes.error(drawn), 0.95)
     return Attempt(float(error), float(bound), float(pixels), float(probes.error(missed)), rounding)

@@ -5,9 +5,10 @@ Some thousand pixels are fitted first, with a few samples of each light with an 
 J'(fine - coarse), the Hessian H tells how far that puts each number off. Taken is the least count whose error is below
 a third of what noise leaves of all pixels, or below a thousandth of the number, and which leaves no structure in the
 residual that noise would not hide, noise being what the best model leaves; fewer than the lights themselves say only
-where noise allows it, so that a picture without noise is fitted with the samples that it was drawn with. Where an
-accuracy is asked for, the error is to be a small part of that instead, told by the largest count. What remains is told
-in the errors.
+where noise allows it. Where the residual shows that the picture was drawn with the samples that its lights say, these
+are taken. Where an accuracy is asked for, the error is to be a small part of that instead, told by the largest count.
+What remains is told in the errors, as is what another count than the lights' own changes where the residual shows
+neither.
 
 The first fit also says where n is, so that all pixels see their light samples in one pass (`brdf.lobes.Near`).
 """
@@ -39,8 +40,8 @@ AS_GOOD = 1.1
 APART = 1.5
 # Of the noise, root mean square over pixels: less shows in no sum over blocks of them; more than the other is no noise.
 HIDDEN, NO_NOISE = 0.02, 0.3
-# Samples that leave out so many times what a fit with them leaves are those that the picture was drawn with.
-DRAWN = 10.0
+# Of two counts a picture tells by which it was drawn, where the share of what they change is known so well.
+TOLD = 0.2
 # Each count changes at most so much of what the one before changed.
 SLOWEST = 0.7
 # Where more samples move log n so far the first fit is made again, of more of them, but no more than so many.
@@ -71,7 +72,10 @@ def with_enough_samples(problem: FitProblem, accuracy: float | None = None) -> F
     except InputError:
         return problem  # the fit itself tells what is wrong
     noise = min(one.noise for one in ladders.values())
-    samples = max(one.enough(noise) for one in ladders.values() if one.noise <= AS_GOOD * noise)
+    good = [one for one in ladders.values() if one.noise <= AS_GOOD * noise]
+    samples = max(one.enough(noise) for one in good)
+    if accuracy is None and min(good, key=lambda one: one.noise).shows(own, samples):
+        samples = own
     scenes = [with_samples(scene, samples) for scene in problem.scenes]
     errors = {model: one.error(samples) for model, one in ladders.items()}
     return dataclasses.replace(problem, scenes=scenes, shown=problem.scenes, sample_errors=errors)
@@ -145,11 +149,25 @@ class _Ladder:
         if self.accuracy is not None:
             return bool(self.probes.error(off) <= OF_ACCURACY * self.accuracy)
         given = samples >= self.own
-        if samples == self.own == self.first and size > DRAWN * noise:
-            return True  # the picture shows these very samples
         rest, value = noise * np.sqrt(np.diag(self.inverse)), np.append(self.x.ravel(), 1.0) * given
         hidden = size <= HIDDEN * noise or (given and size > NO_NOISE * noise)
         return hidden and bool(np.all(np.abs(off) <= np.maximum(OF_NOISE * rest, OF_VALUE * value)))
+
+    def shows(self, one: int, other: int) -> bool:
+        """Whether the picture tells that it was drawn with one number of samples, not with the other."""
+        self._change(one, other)
+        change = self._unexplained(self.shown[other] - self.shown[one])
+        left = self._unexplained(self.probes.residual + self.probes.shown - self.shown[one])
+        weighted = self.probes.weight[:, None] * change
+        square = np.sum(weighted * change)
+        noise = np.sqrt(min(np.mean(left**2), np.mean((left - change) ** 2)))
+        told = noise * np.linalg.norm(weighted) < TOLD * square
+        return bool(told and np.sum(weighted * left) < 0.5 * square)
+
+    def _unexplained(self, change: np.ndarray) -> np.ndarray:
+        """What no other material makes of a change of the picture, (M, C)."""
+        move = self.inverse @ self.probes.scores(change).sum(axis=0)
+        return change - self.probes.jacobian @ move
 
     def move(self, samples: int) -> float:
         """By how much so many samples move log n."""
@@ -185,5 +203,8 @@ class _Ladder:
     def error(self, samples: int) -> SampleError:
         """What so many samples leave out."""
         profile = np.stack([self.optimum.grid, self.optimum.profile])
-        score, size = self.missed(samples)
-        return SampleError(self.near(samples), self.probes.hessian, score, profile, size)
+        missed = [self.missed(samples)]
+        if samples != self.own and not self.shows(samples, self.own):
+            missed.append(self._change(samples, self.own))
+        scores, sizes = zip(*missed, strict=True)
+        return SampleError(self.near(samples), self.probes.hessian, np.stack(scores), profile, math.hypot(*sizes))

@@ -185,8 +185,8 @@ def uncertainty(
         wider = np.sqrt(np.maximum(ratio, 1.0))
         covariance = covariance * np.outer(wider, wider)
     if missed is not None:
-        off = missed.shift(np.append(active.ravel(), with_n)) * np.append(np.ones(size - 1), optimum.n)
-        covariance = covariance + np.outer(off, off)
+        off = missed.shifts(np.append(active.ravel(), with_n)) * np.append(np.ones(size - 1), optimum.n)
+        covariance = covariance + off.T @ off
     # Where this is larger than the picture a number is not determined, whatever others at their bound may be.
     own = np.diag(covariance) + np.sum(np.square([np.zeros(size), *fit.moved]), axis=0)
     bounded = {
