@@ -91,7 +91,7 @@ class Maps:
         }
 
     def __str__(self) -> str:
-        """How many texels are determined, why the others are not, and the middle of what was found."""
+        """How many texels are determined, why the others are not, their models, and the middle of what was found."""
         height, width = self.n.shape
         inside = self.reason != REASONS.index("outside")
         total = max(np.count_nonzero(inside), 1)
@@ -101,6 +101,8 @@ class Maps:
         for number, words in enumerate(REASONS):
             share = np.count_nonzero((self.reason == number) & inside) / total
             lines += [f"  {words:<36}{100 * share:6.1f} %"] if share else []
+        for number, name in enumerate(self.models if len(self.models) > 1 else ()):
+            lines.append(f"  {name:<36}{100 * np.count_nonzero((self.chosen == number) & inside) / total:6.1f} %")
         for name, values in (("n", self.n), ("k_d", self.k_d), ("k_s", self.k_s), ("residual", self.residual)):
             known = values[np.isfinite(values)]
             if known.size:

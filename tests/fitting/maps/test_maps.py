@@ -438,6 +438,8 @@ def test_auto_takes_the_simplest():
     maps = fitting.fit_maps(pictures, lights, normal, model="auto")
     assert np.mean(maps.chosen[0, :20] == 0) > 0.9
     assert np.mean(maps.chosen[0, 20:] != 0) > 0.9
+    shares = [float(line.split()[1]) for line in str(maps).splitlines() if line.split()[0] in maps.models]
+    np.testing.assert_allclose(shares, 100 * np.bincount(maps.chosen[0], minlength=3) / 40, atol=0.05)
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
