@@ -136,8 +136,8 @@ def read_lights(path: str | Path) -> tuple[list[Path], Float[np.ndarray, "P 3"]]
 
     Args:
         path: an ``.lp`` file: a count, then a line ``name x y z`` a photograph. The last three words are the numbers:
-            a name may hold blanks, and folders, which are looked for beside the file and then left out. Lines that
-            begin with ``#`` are remarks.
+            a name may hold blanks, and folders, which are looked for beside the file and then left out. A word that
+            begins with ``#``, at the start of a line or after its numbers, begins a remark.
 
     Raises:
         InputError: naming file and line.
@@ -146,21 +146,31 @@ def read_lights(path: str | Path) -> tuple[list[Path], Float[np.ndarray, "P 3"]]
     numbered = [(number, line) for number, line in enumerate(lines, start=1) if line.partition("#")[0]]
     names, directions = [], []
     for number, line in numbered[1:]:
-        try:
-            name, *words = line.replace(",", " ").rsplit(maxsplit=3)
-            vector = [parse_number(word) for word in words]
-        except ValueError:
-            name, vector = "", []
-        if len(vector) != 3 or not np.all(np.isfinite(vector)) or not any(vector):
+        name, vector = _named_vector(line)
+        if not np.all(np.isfinite(vector)) or not any(vector):
             what = f"must be a name and three numbers that are not all 0, got {line[:60]!r}"
             raise InputError(f"{path}: line {number}", what, "Give name x y z, towards the light")
-        file = Path(path).parent / line[: len(name)].strip("\"'")
+        file = Path(path).parent / name.strip("\"'")
         names.append(file if file.is_file() else Path(path).parent / file.name)
         directions.append(vector)
     if not names or numbered[0][1].split()[0] != str(len(names)):
         what = f"has {len(names)} lights after the count {numbered[0][1] if numbered else ''!r}"
         raise InputError(path, what, "Give the count, then a line a photograph")
     return names, np.array(directions)
+
+
+def _named_vector(line: str) -> tuple[str, list[float]]:
+    """A name and the three numbers that end the line, or that a remark follows; no numbers where there are none."""
+    words = list(re.finditer(r"[^\s,]+", line))
+    for first in range(1, len(words) - 2):
+        after = words[first + 3 : first + 4]
+        if not after or after[0].group().startswith("#"):
+            try:
+                vector = [parse_number(word.group()) for word in words[first : first + 3]]
+            except ValueError:
+                continue
+            return line[: words[first - 1].end()], vector
+    return "", []
 
 
 def named_directions(path: str | Path, files: Sequence[str | Path]) -> Float[np.ndarray, "P 3"]:
@@ -182,7 +192,7 @@ def named_directions(path: str | Path, files: Sequence[str | Path]) -> Float[np.
         found = found or [i for i, one in enumerate(listed) if one.name == file.name]
         if len(found) != 1:
             what = f"names {file.name} {len(found)} times" if found else f"names no {file.name}"
-            raise InputError(path, what, "Name each photograph once, as the file of lights does")
+            raise InputError(path, what, "Name each photograph once there, by the name of its file")
         index += found
     return directions[index]
 
@@ -207,7 +217,8 @@ def read_folder(folder: Path) -> dict[str, Any]:
     tables, names = [path for path in visible if path.suffix.lower() == ".lp"], folder / "filenames.txt"
     found: dict[str, Any] = {}
     if len(tables) == 1:
-        found["pictures"], found["lights"] = read_lights(tables[0])
+        found["pictures"] = read_lights(tables[0])[0]
+        found["lights"] = named_directions(tables[0], found["pictures"])
     elif (folder / "light_directions.txt").is_file() and not tables:
         lines = read_text(names, MOST_BYTES).split("\n") if names.is_file() else []
         listed = [folder / line.strip() for line in lines if line.strip()]

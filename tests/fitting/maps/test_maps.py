@@ -743,13 +743,17 @@ def test_photographs_have_the_lights_of_their_names(folder):
         ("b c/d.png,1,2,3", "d.png"),
         ('"e f.png"\t1\t2\t3\t', "e f.png"),
         ("1.png 1 1 1", "1.png"),
+        ("a.png 1 2 3 # lamp", "a.png"),
+        ("a.png,1,2,3,#lamp 4 5 6", "a.png"),
+        ("a #1, b#2.png 1 2 3", "a #1, b#2.png"),
+        ("a # 2.png 1 2 3 # 4 5 6", "a # 2.png"),
     ],
 )
 def test_lines_of_a_light_file(tmp_path, line, name):
     (tmp_path / "x.lp").write_text(f"# of today\r\n1\r\n{line}\r\n")
     names, directions = read_lights(tmp_path / "x.lp")
     assert names[0].name == name
-    assert directions.shape == (1, 3)
+    np.testing.assert_array_equal(directions, [[1, 1, 1] if line.endswith("1 1 1") else [1, 2, 3]])
     (tmp_path / "x.lp").write_text(f"2\n{line}\n,\n")
     with pytest.raises(brdf.InputError, match="line 3: must be a name and three numbers"):
         read_lights(tmp_path / "x.lp")
@@ -773,6 +777,7 @@ def _break(path, what):
             "count": ["11", *lines[1:]],
             "zero": [*lines[:-2], "photo 11.png 0 0 0"],
             "word": ["12", *lines[1:-2], "x"],
+            "twice": [*lines[:-2], lines[-2].replace("photo 11", "photo 3")],
         }
         (path / "lights.lp").write_text("\n".join(broken[what]))
 
@@ -788,6 +793,7 @@ def _break(path, what):
         ("count", "lights.lp"),
         ("zero", "line 13"),
         ("word", "line 13"),
+        ("twice", "lights.lp: names photo 3.png 2 times. Name each photograph once there"),
     ],
 )
 def test_a_broken_folder_is_told_in_one_line(folder, what, words):
