@@ -55,8 +55,8 @@ def fit(
         model: "auto" for the simplest adequate of Lambert, Phong and Blinn-Phong, or a model: its class or its
             name.
         precision: "float32" or "float64".
-        mask: (H, W), pixels to look at; a list where there are several pictures. Pixels that a picture has as fully
-            transparent do not count.
+        mask: (H, W), or a file as for `brdf.read_mask`: pixels to look at; a list where there are several pictures.
+            Pixels that a picture has as fully transparent do not count.
         saturation: linear value from which on pixels are clipped: all that they say is that they were no darker. None
             takes the largest code of an integer file, or the largest value where many pixels share it exactly.
         n_range: bounds of the exponent, 0 < lower < upper.

@@ -28,7 +28,7 @@ from jaxtyping import Array, Float
 import brdf
 from brdf.checks import instance
 from brdf.precision import working_precision
-from fitting.joint_problem import QUICKLY_COMPILED, Picture, residuals
+from fitting.joint_problem import QUICKLY_COMPILED, Picture, chosen_leaves, residuals
 from fitting.progress import waiting
 from fitting.result import FitResult, Parameter, of_material_alone
 from fitting.solver.nnls import inverse_diagonal, scaled_inverse
@@ -62,14 +62,15 @@ class Sensitivity:
     n: Float[np.ndarray, " *leaf"]
 
 
-def sensitivity(result: FitResult, by: Callable[[list[brdf.Scene]], Sequence[Any]]) -> tuple[Sensitivity, ...]:
+def sensitivity(result: FitResult, by: Callable[[list[brdf.Scene]], Any]) -> tuple[Sensitivity, ...]:
     """The derivative of a fitted material by what the fit took as known about the scenes.
 
     Args:
         result: of `fitting.fit` with the squared loss, whose sum of squares is differentiated; masks and weights are
             respected. A clipped value, of which the fit knows that it is no less, tells nothing here.
-        by: from the list of scenes to their leaves, for example ``lambda scenes: (scenes[0].lights[0].direction,)``.
-            A direction's own length changes nothing: the derivative along it is 0.
+        by: from the list of scenes to a leaf of theirs or several, for example
+            ``lambda scenes: (scenes[0].lights[0].direction,)``. A direction's own length changes nothing: the
+            derivative along it is 0.
 
     Returns:
         One for each leaf.
@@ -97,14 +98,7 @@ def sensitivity(result: FitResult, by: Callable[[list[brdf.Scene]], Sequence[Any
         flat = [target.reshape(-1, target.shape[-1]) for target in result.targets]
         pictures = brdf.cast(list(zip(flat, map(np.ravel, result.weighed), strict=True)), "float64")
         own = {id(leaf): index for index, leaf in enumerate(jax.tree.leaves(content[1]))}
-        leaves = by(content[1])
-        if not isinstance(leaves, Sequence) or not leaves or not all(hasattr(leaf, "shape") for leaf in leaves):
-            raise brdf.InputError("by", "names no leaf of the scenes", "Return the leaves to differentiate by")
-        if len({id(leaf) for leaf in leaves}) < len(leaves):
-            raise brdf.InputError("by", "gives a leaf twice", "Return each once")
-        if not own.keys() >= set(map(id, leaves)):
-            what = "gives what is no number of the scenes as a whole"
-            raise brdf.InputError("by", what, "Return leaves of the scenes")
+        leaves = chosen_leaves("by", by, {"scenes": content[1]}, "(scenes[0].lights[0].direction,)")
         curvature = partial(_curvature, content, unknowns, pictures, places=tuple(own[id(leaf)] for leaf in leaves))
         vector = jnp.concatenate([jnp.zeros(count), *map(jnp.ravel, leaves)])
         slope, rows = map(np.asarray, curvature(vector))

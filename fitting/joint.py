@@ -101,14 +101,14 @@ def fit_jointly(
         scene: what the picture shows, or a list of as many.
         material: to start from, or a result that has one; or a model, from whose separable optimum it starts; or "auto"
             for the simplest adequate model under the scenes that were found.
-        free: from material and list of scenes to the leaves to fit, for example
+        free: from material and list of scenes to the leaf or leaves to fit, for example
             ``lambda m, s: (m.k_d, m.n, s[0].lights[0].direction)``; all others are held. Or what `FitResult.diagnosis`
             names beside the whole material: "light", "intensity", "ball" or "radius", also "light 1 of picture 0"; None
             for the material alone.
             Where camera or shapes are freed, pixels near an outline do not count.
         solver: "lm", "bfgs", or None for Gauss and Newton's steps, and where they do not gain one of these by size.
         precision: "float32" or "float64".
-        mask: (H, W), pixels to look at, or a list, such as ``fitting.fit(target, scene).counted[0]``.
+        mask: (H, W), or a file: pixels to look at; or a list, such as ``fitting.fit(target, scene).counted[0]``.
         saturation: see `fitting.fit`.
         rounding: likewise.
         encoding: likewise.

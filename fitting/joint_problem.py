@@ -6,7 +6,7 @@ nothing, by two small turns of it.
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -148,9 +148,7 @@ def degrees_between(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]) -> flo
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
 
 
-def joint_problem(
-    start: Any, free: Callable[..., Sequence[Any]] | None, pictures: Sequence[Picture] = ()
-) -> JointProblem:
+def joint_problem(start: Any, free: Callable[..., Any] | None, pictures: Sequence[Picture] = ()) -> JointProblem:
     """Find the freed leaves among those of the start, each an array of its own.
 
     Args:
@@ -162,30 +160,46 @@ def joint_problem(
         InputError: where ``free`` does not name distinct leaves.
     """
     start = jax.tree.map(jnp.array, start)
-    remedy = "Return a tuple of leaves, such as (material.n, scenes[0].lights[0].direction)"
-    try:
-        asked = [id(leaf) for leaf in free(*start)]  # pyright: ignore[reportOptionalCall]  # None is refused below
-    except (TypeError, AttributeError, IndexError) as error:
-        raise InputError("free", f"gives no tuple of leaves ({error})", remedy) from None
+    given = {"material": start[0], "scenes": start[1]}
+    asked = map(id, chosen_leaves("free", free, given, "(material.n, scenes[0].lights[0].direction)"))
     paths, shape = jax.tree_util.tree_flatten_with_path(start)
-    own = {
-        id(leaf): (index, _words(path, len(start[1])), leaf.size)
-        for index, (path, leaf) in enumerate(paths)
-        if jnp.issubdtype(leaf.dtype, jnp.floating)
-    }
-    for fails, what in (
-        (not asked, "names no leaf"),
-        (not own.keys() >= set(asked), "gives what is no number of material or scenes as a whole"),
-        (len(set(asked)) < len(asked), "gives a leaf twice"),
-    ):
-        if fails:
-            raise InputError("free", what, remedy)
+    own = {id(leaf): (index, _words(path, len(start[1])), leaf.size) for index, (path, leaf) in enumerate(paths)}
     freed, begin = [], 0
     for index, words, size in map(own.__getitem__, asked):
         end = begin + (2 if words.endswith(".direction") else size)
         freed.append(Leaf(index, words, slice(begin, end)))
         begin = end
     return JointProblem([leaf for _, leaf in paths], shape, tuple(freed), pictures)
+
+
+def chosen_leaves(name: str, choose: Callable[..., Any] | None, given: Mapping[str, Any], example: str) -> list[Array]:
+    """The leaves that a function of a user's gives.
+
+    Args:
+        name: of the argument.
+        choose: from all that is given to one of its leaves, or several.
+        given: trees by what they are called, each leaf an array of its own.
+        example: of what the function may return.
+
+    Raises:
+        InputError: where it gives no distinct leaves of numbers.
+    """
+    remedy = f"Return a tuple of leaves, such as {example}"
+    try:
+        found = choose(*given.values())  # pyright: ignore[reportOptionalCall]  # None is refused below
+        found = [found] if isinstance(found, jax.Array) else list(found)
+    except (TypeError, AttributeError, IndexError) as error:
+        raise InputError(name, f"gives no tuple of leaves ({error})", remedy) from None
+    own = {id(leaf) for leaf in jax.tree.leaves(dict(given)) if jnp.issubdtype(leaf.dtype, jnp.floating)}
+    asked = set(map(id, found))
+    for fails, what in (
+        (not found, "names no leaf"),
+        (not own >= asked, f"gives what is no number of {' or '.join(given)} as a whole"),
+        (len(asked) < len(found), "gives a leaf twice"),
+    ):
+        if fails:
+            raise InputError(name, what, remedy)
+    return found
 
 
 def _words(path: tuple[Any, ...], scenes: int) -> str:

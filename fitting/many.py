@@ -110,7 +110,7 @@ def fit_many(
         model: the name of a model: then all are fitted together. "auto" compares models for each picture, one by
             one.
         precision: "float32" or "float64".
-        mask: (H, W), pixels to look at in every picture, or a list of one for each.
+        mask: (H, W), or a file: pixels to look at in every picture; or a list of one for each.
         n_range: bounds of the exponent.
         mesh: of the devices to deal the pictures out to, see `fitting.fit`; where a model is named.
 

@@ -1,12 +1,11 @@
 """What is to be fitted: pictures, their scenes, what counts of them, and how; checked once, where it is made."""
 
 import dataclasses
-import functools
 import math
 import operator
 import os
 from collections.abc import Iterable, Mapping
-from functools import partial
+from functools import cache, partial, reduce
 from numbers import Real
 from typing import Any, NamedTuple
 
@@ -167,7 +166,7 @@ def state_problem(
     Args:
         target: a picture or a list of them.
         scene: a scene for all, or a list.
-        mask: likewise, or None.
+        mask: likewise, an array or a file; or None.
         weight: likewise.
         rounding: of the values, see `fitting.codes.find_codes`.
         encoding: of the values of a file or an array.
@@ -193,6 +192,7 @@ def state_problem(
     for each in scenes:
         if not isinstance(each, brdf.Scene):
             raise InputError("scene", f"must be a brdf.Scene, got {type(each).__name__}", "Use brdf.Scene.load")
+    read_mask = cache(brdf.read_mask)  # of all pictures it may be one
     for index, (target, scene) in enumerate(zip(targets, scenes, strict=True)):
         try:
             targets[index] = picture = as_target(target, rounding, encoding)
@@ -202,6 +202,8 @@ def state_problem(
         shape = picture.pixels.shape[:2]
         mask, weight = masks[index], weights[index]
         count = [] if picture.opaque is None else [picture.opaque]
+        if isinstance(mask, str | os.PathLike):
+            mask = read_mask(mask)
         if mask is not None:
             count.append(_per_pixel("mask", mask, shape).astype(bool))
         if weight is not None:
@@ -210,7 +212,7 @@ def state_problem(
                 raise InputError("weight", "must be 0 or more, and more somewhere", "Give values of 0 or more")
             # What weighs nothing says nothing of clipping or rounding either.
             count.append(weight > 0)
-        masks[index] = functools.reduce(operator.and_, count) if count else None
+        masks[index] = reduce(operator.and_, count) if count else None
     counts = {picture.pixels.shape[2] for picture in targets}
     if len(counts) > 1:
         raise InputError("target", f"pictures have {counts} channels", "Give pictures with the same number")

@@ -77,7 +77,7 @@ def fit_lights(
         scene: what it shows; what it says of its lights' emittances is the unit of the factors.
         material: of the surface.
         precision: "float32" or "float64" of the pictures; sums are in float64.
-        mask: (H, W), pixels to look at.
+        mask: (H, W), or a file: pixels to look at.
 
     Returns:
         The emittances, at least 0, with their errors.
@@ -124,7 +124,7 @@ def fit_lights_and_material(
         scene: what it shows; its lights' emittances are the unit of the factors, whose mean is 1.
         model: the name of the model.
         precision: as for `fit_lights`.
-        mask: (H, W), pixels to look at.
+        mask: (H, W), or a file: pixels to look at.
 
     Returns:
         Lights and material; ``undetermined`` names the factor. The material's numbers come without errors.

@@ -264,7 +264,7 @@ def tradeoff(
         target: linear values, (H, W, C) or (H, W), or a `brdf.Picture`.
         scene: what the picture shows.
         model: the name of a model, or "auto".
-        mask: (H, W), pixels that count.
+        mask: (H, W), or a file: pixels that count.
         saturation: see `fitting.fit`.
         accuracy: relative error that the recommendation is to keep.
         seconds: that the measuring may take: no new run begins after them. A running one is waited for.

@@ -54,9 +54,8 @@ def fit_within(problem: FitProblem, accuracy: float | None, seconds: float | Non
         InputError: where one of them cannot be used.
     """
     start = time.perf_counter()
-    for name, value in {"accuracy": accuracy, "seconds": seconds}.items():
-        if value is not None:
-            positive(name, value)
+    limits = {"accuracy": accuracy, "seconds": seconds}
+    accuracy, seconds = (None if value is None else float(positive(name, value)) for name, value in limits.items())
     beside = {"loss": problem.loss != "squared", "noise": problem.noise is not None, "plausible": problem.plausible}
     for name, given in beside.items():
         if given:

@@ -32,8 +32,9 @@ def likelier(problem: MapProblem) -> tuple[MapProblem, tuple[str, ...]]:
     remedy = "Where you know, say so with the encoding"
     note = f"{silent.name} does not say how its values are encoded: read as"
     usual, other = ("linear", "sRGB") if silent.curve == "linear" else ("sRGB", "linear")
+    untold = problem, (f"{note} {usual}. {remedy}",)
     if given.to_light is None or not texels.size:
-        return problem, (f"{note} {usual}. {remedy}",)
+        return untold
     row = texels // given.size[1]
     rows = np.unique(row)
     rows = rows[np.linspace(0, rows.size - 1, -(-min(SOME, texels.size) * rows.size // texels.size)).astype(int)]
@@ -47,6 +48,8 @@ def likelier(problem: MapProblem) -> tuple[MapProblem, tuple[str, ...]]:
         with waiting(f"fitting some texels as {name}"):
             layers = {key: layer[: texels.size] for key, layer in one.fit(*one.tiles(texels)).items()}
         codes = 255 * np.sqrt(np.mean(given.unit**2)) * layers["noise"]
+        if np.all(np.isnan(codes)):
+            return untold
         left[name] = np.nanmedian(codes * np.sqrt(1 + OUTLIER**2 * layers["left_out"]))
     if left[other] ** 2 < LESS * left[usual] ** 2:
         usual, other = other, usual

@@ -29,11 +29,12 @@ def assert_alike(fits: fitting.ManyFits, pictures, scenes, **options):
         assert str(fits[index]).split("\n")[1:] == str(one).split("\n")[1:]
 
 
-def test_one_scene_for_all():
+def test_one_scene_for_all(tmp_path):
     pictures = np.stack([pictured(m, ball_scene(), 0.003, seed) for seed, m in enumerate(materials())])
     half = np.arange(48)[:, None] + np.zeros(48) < 30
     how = {"model": "blinn-phong", "precision": "float64", "mask": half}
-    fits = fitting.fit_many(pictures, ball_scene(), **how)
+    brdf.write_image(tmp_path / "half.png", np.repeat(half[..., None], 3, -1).astype(float))
+    fits = fitting.fit_many(pictures, ball_scene(), **how | {"mask": tmp_path / "half.png"})
     assert_alike(fits, pictures, [ball_scene()] * COUNT, **how)
     assert len(fits[1:3]) == 2
     assert "5 pictures, 48 x 48 x 3" in repr(fits)

@@ -89,6 +89,8 @@ def test_several_leaves_and_a_fit_in_float32():
     np.testing.assert_allclose(by_light.k_d, np.diag(-k_d / 0.9), atol=2e-5)
     np.testing.assert_allclose(by_ambient.k_a, np.diag(-k_a / 0.3), atol=2e-5)
     np.testing.assert_allclose(by_ambient.n, 0, atol=1e-6)
+    (alone,) = fitting.sensitivity(result, lambda s: s[0].ambient)
+    np.testing.assert_allclose(alone.k_a, by_ambient.k_a, atol=1e-6)
 
 
 def test_errors_hold_what_turned_lights_change():

@@ -30,7 +30,7 @@ def test_the_accuracy_holds_and_is_foretold(share):
     scene = ball(SIZE)
     picture = noisy(scene, share)
     best = fit(picture, scene, precision="float64")
-    coarse, fine = results = [fit(picture, scene, accuracy=accuracy) for accuracy in (1e-1, 1e-3)]
+    coarse, fine = results = [fit(picture, scene, accuracy=accuracy) for accuracy in ("1e-1", 1e-3)]
     for result, accuracy in zip(results, (1e-1, 1e-3), strict=True):
         assert result.choice.met
         actual = deviation(result, best)

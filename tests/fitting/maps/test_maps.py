@@ -699,6 +699,9 @@ def test_how_silent_files_are_encoded_is_told_by_the_texels_that_count(tmp_path,
     assert np.median(np.abs(2 * maps.k_d[6] / truth["k_d"] - 1)) < 0.01
     with pytest.raises(brdf.InputError, match="no texel that counts"):
         fitting.fit_maps(paths, lights, normals, mask=np.zeros((8, 30)))
+    aside = normals * [1, 0, 0] + [0.0, 0.0, 0.01]
+    with pytest.raises(brdf.InputError, match="no texel that counts"):
+        fitting.fit_maps(paths[:3], np.array([[-1, 0, 0.001], [-1, 1, 0.001], [-1, -1, 0.001]]), abs(aside))
     points = brdf.SurfacePoints.from_normals(normals)
     fine = [path.with_suffix(".tif") for path in paths]
     for path, picture in zip(fine, pictures, strict=True):
