@@ -73,11 +73,14 @@ class LightChoice:
         return direction_of(self.lights[0])
 
     def __str__(self) -> str:
-        """In words."""
-        shown = repr(self.lights[0])
-        if isinstance(self.lights[0], brdf.DirectionalLight):
-            shown = f"a light from ({', '.join(f'{value:.3f}' for value in self.direction)})"
-        return f"{shown} brings the error of {self.of} from {self.before:.3g} to {self.after[0]:.3g}"
+        """In words, a line a light."""
+        lines, befores = [], (self.before, *self.after)
+        for light, before, after in zip(self.lights, befores, self.after, strict=False):
+            shown = repr(light)
+            if isinstance(light, brdf.DirectionalLight):
+                shown = f"a light from ({', '.join(f'{value:.3f}' for value in direction_of(light))})"
+            lines.append(f"{shown} brings the error of {self.of} from {before:.3g} to {after:.3g}")
+        return "\n".join(lines)
 
     def plot(self) -> Any:
         """The hemisphere of lights seen from the camera, coloured by the error that each would leave, if it leaves one.

@@ -64,6 +64,9 @@ def test_several_are_chosen_one_after_the_other(result):
     assert len(both.lights) == 2
     assert both.after[0] == one.after[0] == one.foretold.min()
     assert both.after[1] < both.after[0]
+    first, second = str(both).split("\n")
+    assert first == str(one)
+    assert second.endswith(f"from {both.after[0]:.3g} to {both.after[1]:.3g}")
 
 
 def test_a_lamp_that_is_near_can_be_chosen_and_told(result):
