@@ -251,9 +251,11 @@ def solve(
     weight = jnp.ones(count, dtype) if weight is None else jnp.asarray(weight, dtype)
     ambient = jnp.broadcast_to(jnp.asarray(ambient, dtype), (channels,))
     nearest = jax.lax.stop_gradient(jnp.minimum(jnp.asarray(peak, dtype), 0))
+    # Where no pixel sees an exponent there is no lobe; nor one by whose peak to divide.
+    seen = -nearest * n_range[0] <= UNSEEN
+    nearest = jnp.where(seen, nearest, 0)
     low, high = jnp.asarray(math.log(n_range[0]), dtype), jnp.log(UNSEEN / jnp.maximum(-nearest, UNSEEN / n_range[1]))
-    # Where high is below low no exponent is seen, and there is no lobe.
-    free = jnp.stack(jnp.broadcast_arrays(ambient > 0, True, high >= low), axis=-1)
+    free = jnp.stack(jnp.broadcast_arrays(ambient > 0, True, seen), axis=-1)
     high = jnp.maximum(low, high)
     pixels = _Pixels(jnp.where(weight > 0, target.T, 0), jnp.asarray(diffuse, dtype).T, weight, free)
     cells = max(1, math.ceil(math.log(n_range[1] / n_range[0]) / GRID_STEP))

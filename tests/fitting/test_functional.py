@@ -101,6 +101,17 @@ def test_of_two_valleys_the_lower_one_and_bounds_of_the_exponent():
     np.testing.assert_allclose(held.n, 50, rtol=1e-12)
 
 
+def test_where_no_pixel_counts_numbers_and_derivatives_are_finite():
+    def found(picture: jax.Array, weight: jax.Array) -> jax.Array:
+        fitted = functional.fit(picture, ball_scene(), weight=weight)
+        return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(fitted)])
+
+    given = jnp.asarray(PICTURES[0]), jnp.zeros(PICTURES[0].shape[:2])
+    values, back = jax.vjp(found, *given)
+    assert np.all(np.isfinite(values))
+    assert all(np.all(np.isfinite(slope)) for slope in back(jnp.ones_like(values)))
+
+
 def test_errors_have_derivatives_where_no_pixel_counts():
     cosine = jnp.linspace(0.3, 1.0, 50)[:, None]
     target = 0.3 * cosine + 0.6 * cosine**20
