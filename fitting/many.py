@@ -52,6 +52,8 @@ class ManyFits(Sequence[FitResult]):
         n: exponents of the optima, (N,), see ``k_s``.
         errors: standard errors of these by name, under independent noise; 0 at a bound.
         residual: root mean square of each residual over that of its picture, (N,).
+        refused: of pictures that cannot be fitted, black ones or such as the mask leaves nothing of, why, by index.
+            Their numbers are NaN, and ``fits[i]`` raises that as an `InputError`.
 
     Example:
         >>> scene = brdf.Scene.load("scene.toml")
@@ -61,15 +63,23 @@ class ManyFits(Sequence[FitResult]):
         (2, (2,), 'blinn-phong', 76.8)
     """
 
-    def __init__(self, problem: FitProblem, numbers: dict[str, np.ndarray], done: dict[int, FitResult]):
+    def __init__(
+        self,
+        problem: FitProblem,
+        numbers: dict[str, np.ndarray],
+        done: dict[int, FitResult],
+        refused: dict[int, InputError],
+    ):
         """Gather what was found; `fit_many` does.
 
         Args:
             problem: all pictures.
             numbers: of all fits.
             done: results that are known already.
+            refused: why others have none.
         """
         self.problem, self._done = problem, done
+        self.refused = {index: str(error) for index, error in refused.items()}
         self.k_a, self.k_d, self.k_s, self.n, self.residual = (numbers[name] for name in (*NAMES, "residual"))
         self.errors = {name: numbers[f"{name}_error"] for name in NAMES}
 
@@ -78,7 +88,11 @@ class ManyFits(Sequence[FitResult]):
         return len(self.problem.targets)
 
     def __getitem__(self, index: Any) -> Any:
-        """The result of one picture with intervals, warnings and report: made by `fitting.fit` when first asked for."""
+        """The result of one picture with intervals, warnings and report: made by `fitting.fit` when first asked for.
+
+        Raises:
+            InputError: where the picture was refused.
+        """
         if isinstance(index, slice):
             return [self[i] for i in range(len(self))[index]]
         index = range(len(self))[index]
@@ -89,7 +103,8 @@ class ManyFits(Sequence[FitResult]):
     def __repr__(self) -> str:
         """How many, of what."""
         height, width, channels = self.problem.targets[0].pixels.shape
-        return f"ManyFits({len(self)} pictures, {width} x {height} x {channels}, {self.problem.model})"
+        refused = f", {len(self.refused)} refused" if self.refused else ""
+        return f"ManyFits({len(self)} pictures, {width} x {height} x {channels}, {self.problem.model}{refused})"
 
 
 def fit_many(
@@ -115,10 +130,11 @@ def fit_many(
         mesh: of the devices to deal the pictures out to, see `fitting.fit`; where a model is named.
 
     Returns:
-        The fits: ``fits.n``, ``fits.k_d`` are arrays, ``fits[i]`` is the result of one.
+        The fits: ``fits.n``, ``fits.k_d`` are arrays, ``fits[i]`` is the result of one. Of a picture that cannot be
+        fitted the numbers are NaN, and ``fits.refused`` says why.
 
     Raises:
-        InputError: naming the argument, where it cannot be used.
+        InputError: naming the argument, where it cannot be used, or the first picture, where none can be fitted.
 
     Example:
         >>> scene = brdf.Scene.load("scene.toml")
@@ -144,11 +160,20 @@ def fit_many(
     with waiting(f"fitting {len(pictures)} pictures"):
         with working_precision(problem.precision), spread_over(mesh):
             plain, numbers = _fit_together(problem)
-        done = {int(i): _fit_alone(problem, int(i)) for i in np.flatnonzero(~plain)}
+        done, refused = {}, {}
+        for index in map(int, np.flatnonzero(~plain)):
+            try:
+                done[index] = _fit_alone(problem, index)
+            except InputError as error:
+                refused[index] = error
+    if len(refused) == len(pictures):
+        raise refused[0]
     for index, result in done.items():
         for name, value in _numbers_of(result).items():
             numbers.setdefault(name, np.zeros((len(pictures), *value.shape)))[index] = value
-    return ManyFits(problem, numbers, done)
+    for values in numbers.values():
+        values[list(refused)] = np.nan
+    return ManyFits(problem, numbers, done, refused)
 
 
 def _fit_alone(problem: FitProblem, index: int) -> FitResult:

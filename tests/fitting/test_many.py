@@ -69,6 +69,24 @@ def test_pictures_that_need_a_closer_look_get_it():
         np.testing.assert_allclose(fits.n[index], one.material.n, rtol=1e-9)
 
 
+@pytest.mark.parametrize("model", ["lambert", "auto"])
+def test_a_picture_that_cannot_be_fitted_leaves_the_others_theirs(model):
+    picture = pictured(brdf.Lambert(k_a=0.1, k_d=[0.5, 0.4, 0.3]), ball_scene(), 0.003, 1)
+    pictures = [0 * picture, picture, np.nan * picture, picture]
+    masks = [None, None, None, np.zeros((48, 48), bool)]
+    fits = fitting.fit_many(pictures, ball_scene(), model=model, mask=masks)
+    assert list(fits.refused) == [0, 2, 3]
+    assert repr(fits).endswith(f"{model}, 3 refused)")
+    np.testing.assert_allclose(fits.k_d[1], fits[1].material.k_d, rtol=1e-4)
+    for values in (fits.k_d, fits.n, fits.residual, *fits.errors.values()):
+        assert np.isfinite(values[1]).all()
+        assert np.isnan(values[[0, 2, 3]]).all()
+    for index, words in ((0, "is black"), (2, "no finite value"), (3, "leaves no pixel")):
+        assert words in fits.refused[index]
+        with pytest.raises(brdf.InputError, match=rf"^pictures\[{index}\].*{words}"):
+            fits[index]
+
+
 def test_a_model_is_chosen_for_each_in_float32():
     matt = brdf.Lambert(k_a=[0.1, 0.1, 0.1], k_d=[0.5, 0.4, 0.3])
     pictures = np.stack([pictured(m, ball_scene(), 0.003, 1) for m in (matt, materials()[2])]).astype(np.float32)
