@@ -275,7 +275,7 @@ def _of_picture(picture: brdf.Picture, rounding: Rounding, stored: np.ndarray | 
     least, file = rounding is not None and codes is None, None
     if picture.path is not None:
         file = {"path": str(picture.path), "encoding": picture.encoding, "source": picture.source}
-        file |= {"factor": np.asarray(picture.factor).tolist()}
+        file |= {"factor": np.asarray(picture.factor).tolist(), "layer": picture.layer}
     return Target(pixels, top, step, codes, least, file, picture.opaque)
 
 

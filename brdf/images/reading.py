@@ -38,6 +38,9 @@ LOSSY_TOP = 250 / 255
 """Share of the largest code from which on a file compressed with losses is clipped: at quality 75 a clipped area has
 codes between 250 and 255, but for a few at its edge."""
 
+PICTURE_LAYERS = ("", "beauty", "c", "color", "colour", "combined", "composite", "image", "rgb", "rgba")
+"""How renderers call the layer that is the picture, in small letters; Blender's is the last part of its name."""
+
 # Remarks that libjpeg makes on sound pictures of some cameras.
 _HARMLESS = ("extraneous bytes", "Invalid SOS parameters")
 
@@ -59,6 +62,8 @@ class Picture:
         path: the file; None where it came from none.
         lossy: the file was compressed with losses, so that neighbours share errors.
         jpeg: how a JPEG in colour was; None for other files.
+        layer: the one that was taken of several where none is named as renderers name the picture (`read_layers` has
+            them all); else None.
 
     Example:
         >>> picture = brdf.read_picture("target.exr")
@@ -76,6 +81,7 @@ class Picture:
     path: Path | None = None
     lossy: bool = False
     jpeg: Jpeg | None = None
+    layer: str | None = None
 
     def scaled(self, factor: float | np.ndarray) -> "Picture":
         """The picture in another unit: of another exposure, or under light of another intensity.
@@ -114,6 +120,7 @@ class ImageReader(contextlib.AbstractContextManager):
         source: who says so.
         bits: bits per value in the file.
         is_integer: whether the file holds codes, which end somewhere, not floats.
+        layer: see `Picture`.
 
     Example:
         >>> with brdf.ImageReader("target.exr") as reader:
@@ -135,7 +142,7 @@ class ImageReader(contextlib.AbstractContextManager):
         given = parse_encoding("encoding", encoding)
         self.path = input_file(path)
         self._image = _open(self.path)
-        self._part, self._colour, self._alpha = _choose_channels(self._image)
+        self._part, self._colour, self._alpha, self.layer = _choose_channels(self._image)
         self._spec = spec = self._image.spec(self._part)
         check_header(self.path, spec)
         kind, name = spec.channelformat(self._colour[0]), self._image.format_name()
@@ -216,7 +223,7 @@ class ImageReader(contextlib.AbstractContextManager):
         Args:
             pixels: as `rows` gives them.
         """
-        about = {name: getattr(self, name) for name in ("encoding", "source", "bits", "path", "lossy", "jpeg")}
+        about = {name: getattr(self, name) for name in ("encoding", "source", "bits", "path", "lossy", "jpeg", "layer")}
         return Picture(pixels, None, saturation=self.codes[0], **about)
 
     def read_alpha(self) -> Float32[np.ndarray, "height width"] | None:
@@ -298,28 +305,37 @@ def _layers(image: oiio.ImageInput) -> dict[tuple[int, str], dict[str, int]]:
     return layers
 
 
-def _choose_channels(image: oiio.ImageInput) -> tuple[int, list[int], int | None]:
+def _choose_channels(image: oiio.ImageInput) -> tuple[int, list[int], int | None, str | None]:
     """The part and channels that are the picture, and its alpha; depth and further layers are left apart.
+
+    At the end the layer, where that is a guess, else None.
 
     Only OpenEXR files name their channels reliably: R, G, B, else Y of the unnamed layer are the picture, in the first
     part that has them, else those of the first layer that has them (not the Y of X, Y, Z), else (a spectral
-    file) all channels in the order of the file. In other formats the picture is what comes before alpha.
+    file) all channels in the order of the file. Parts and layers that are named as pictures are (`PICTURE_LAYERS`) go
+    before others that have them. In other formats the picture is what comes before alpha.
     """
     names = image.spec().channelnames
     every = list(range(len(names)))
     if image.format_name() != "openexr":
         # By its name: some readers number an alpha channel beyond the last one.
         alpha = names.index("A") if "A" in names[1:] else None
-        return 0, every[:alpha], alpha
+        return 0, every[:alpha], alpha, None
     layers = _layers(image)
     for named, wanted in itertools.product((False, True), ("RGB", "Y")):
+        found = {}
         for (part, layer), at in layers.items():
             axis = named and wanted == "Y" and "X" in at  # of a position or a normal
             if bool(layer) == named and set(wanted) <= set(at) and not axis:
-                return part, [at[letter] for letter in wanted], at.get("A")
+                found[part, layer] = layer or image.spec(part).get_string_attribute("oiio:subimagename")
+        usual = [key for key, name in found.items() if name.rpartition(".")[2].lower() in PICTURE_LAYERS]
+        if found:
+            key = (usual or list(found))[0]
+            at, guess = layers[key], None if usual or len(found) == 1 else found[key]
+            return key[0], [at[letter] for letter in wanted], at.get("A"), guess
     apart = layers.get((0, ""), {})
     rest = [channel for channel in every if channel not in (apart.get("A"), apart.get("Z"))]
-    return 0, rest or every, apart.get("A") if rest else None
+    return 0, rest or every, apart.get("A") if rest else None, None
 
 
 def _shown(path, image, part, channels: list[int], start: int, stop: int, encoding: Encoding = "linear") -> np.ndarray:

@@ -131,6 +131,8 @@ def fit_maps(
     notes += clipping
     if lossy := [one.name for one in given.each if one.lossy]:
         notes += (LOSSY.format(lossy[0]),)
+    if guessed := [one for one in given.each if one.layer is not None]:
+        notes += (f"{guessed[0].name} is read as its layer {guessed[0].layer}: it names none as the picture",)
     with spread_over(mesh):
         if labels is not None:
             problem = with_shared_n(problem, labels)

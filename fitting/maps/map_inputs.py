@@ -42,6 +42,7 @@ class Photograph:
         step: distance of two codes, the largest being 1; 0 of floats.
         silent: whether it is a file of integers that does not say how it is encoded.
         stated: whether a user says from which value on it is clipped.
+        layer: see `brdf.Picture`.
     """
 
     rows: Callable[[int, int], Float[np.ndarray, "rows W C"]]
@@ -54,6 +55,7 @@ class Photograph:
     step: float
     silent: bool = False
     stated: bool = False
+    layer: str | None = None
 
     def read_as(self, encoding: Encoding) -> "Photograph":
         """The same file read so, clipped at the same code, or at the linear value that was stated."""
@@ -354,7 +356,8 @@ def _opened(name: str, picture: Any, encoding: Any) -> Photograph:
         else:
             read, shape, top = (lambda a, b: picture.pixels[a:b]), picture.pixels.shape, picture.saturation
             opaque, step = (lambda: picture.opaque), (picture.code_step or 0.0) * np.max(picture.factor)
-        return Photograph(read, shape, name, (top or np.inf) * TOP, picture.encoding, picture.lossy, opaque, step)
+        found = Photograph(read, shape, name, (top or np.inf) * TOP, picture.encoding, picture.lossy, opaque, step)
+        return dataclasses.replace(found, layer=picture.layer)
     values = np.asarray(picture)
     values = values[..., None] if values.ndim == 2 else values
     integer = values.dtype.kind == "u"

@@ -32,6 +32,9 @@ def report(result: FitResult) -> str:
     lines.append(f"  residual    {100 * result.residual:.3g} % of the picture (rms)")
     lines += [f"  left out    {pixels} pixels {reason}" for reason, pixels in result.left_out.items() if pixels]
     lines += _silent(result.files)
+    guessed = next((file for file in result.files if file is not None and file.get("layer") is not None), None)
+    if guessed is not None:
+        lines.append(f"  read as     layer {guessed['layer']}: {Path(guessed['path']).name} names none as the picture")
     lines += [f"  read as     codes: all values lie on the levels of {result.levels}"] if result.levels else []
     if result.highlight_pixels is not None:
         lines.append(f"  highlight   on {result.highlight_pixels:.{0 if result.highlight_pixels >= 10 else 1}f} pixels")

@@ -82,6 +82,26 @@ def test_the_picture_among_layers_is_coloured(tmp_path):
     np.testing.assert_array_equal(read_image(tmp_path / "b.exr"), colour)
 
 
+@pytest.mark.parametrize(
+    ("layers", "taken", "guess"),
+    [
+        (("albedo", "beauty"), 1, None),
+        (("ViewLayer.Albedo", "ViewLayer.Combined"), 1, None),
+        (("diffuse", "RGBA", "specular"), 1, None),
+        (("albedo", "diffuse"), 0, "albedo"),
+        (("albedo", ""), 1, None),
+        (("albedo",), 0, None),
+    ],
+)
+def test_of_several_layers_the_picture_is_the_one_that_renderers_name_so(tmp_path, layers, taken, guess):
+    values = [random(6, 5, 3, seed=seed) for seed in range(len(layers))]
+    names = [f"{layer}.{channel}".lstrip(".") for layer in layers for channel in "RGB"]
+    raw(tmp_path / "a.exr", np.dstack(values), names)
+    picture = read_picture(tmp_path / "a.exr")
+    np.testing.assert_array_equal(picture.pixels, values[taken])
+    assert picture.layer == guess
+
+
 @pytest.mark.parametrize(("planes", "tile"), [("contig", 0), ("separate", 0), ("separate", 16)])
 def test_a_tiff_of_doubles(tmp_path, planes, tile):
     values = random(37, 41, 3).astype(np.float64)

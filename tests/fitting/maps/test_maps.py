@@ -714,6 +714,13 @@ def test_how_silent_files_are_encoded_is_told_by_the_texels_that_count(tmp_path,
     assert fitting.fit_maps(paths, scenes).notes[0].endswith("read as sRGB. Where you know, say so with the encoding")
 
 
+def test_the_layer_that_was_read_is_told_where_none_is_named_as_the_picture():
+    pixels = np.full((2, 2, 3), 0.5, np.float32) * dome(6)[:, 2:, None, None]
+    each = [brdf.Picture(one, None, "linear", "format", 32, None, layer="albedo") for one in pixels]
+    maps = fitting.fit_maps(each, dome(6), np.ones((2, 2, 3)) * [0, 0, 1], model="lambert")
+    assert maps.notes == ("pictures[0] is read as its layer albedo: it names none as the picture",)
+
+
 def test_photographs_have_the_lights_of_their_names(folder):
     """Sorted by letters 10 comes before 2; a Mac's hidden file beside the lights is none of them."""
     path, _ = folder
