@@ -37,6 +37,9 @@ STEEPNESS = 7.0
 """The innermost samples of a lobe are exp(-this) times as far from its centre as the horizon."""
 LARGEST_MAP = 1 << 21
 """Texels from which on a map is averaged before it is cut: 2048 × 1024."""
+SAME = 1e-3
+"""By how much variances must differ, relatively, and by how many texels a centre of mass may fall short of a whole
+number and yet count as it: rounding of pixels must not decide ties, or a map that was saved would be cut otherwise."""
 FEWEST_ROWS = 128
 """A map of fewer has wide texels, which are cut up too: in so many rows, and twice as many columns, at least."""
 
@@ -236,10 +239,14 @@ def cut(pixels: Float[np.ndarray, "H W C"], samples: int) -> Patches:
             moments = np.add.reduceat(moments, np.arange(0, moments.shape[axis], 2), axis=axis)
 
     def entry(*box: tuple[int, int]) -> tuple[float, Any]:
-        """Largest spread first: energy times variance of the directions, which is what is left of their length 1."""
+        """Largest spread first: energy times variance of the directions, which is what is left of their length 1.
+
+        Four digits of it: of rectangles that are alike the first comes first, whatever rounding makes of them.
+        """
         energy, *first = moments[slice(*box[0]), slice(*box[1]), :4].sum(axis=(0, 1))
         variance = 1.0 - np.sum((np.array(first) / energy) ** 2) if energy > 0 else 0.0
-        return -energy * variance if variance > 1e-12 else 0.0, box  # rounding aside
+        spread = energy * variance if variance > 1e-12 else 0.0  # rounding aside
+        return -float(f"{spread:.4g}"), box
 
     heap, done = [entry((0, moments.shape[0]), (0, moments.shape[1]))], []
     while heap and len(heap) + len(done) < samples:
@@ -271,12 +278,12 @@ def _halves(weight: np.ndarray, box: Any) -> list[Any] | None:
         means.append(np.sum(index * along) / np.sum(along))
         variances.append(np.sum((index - means[-1]) ** 2 * along))
     shrink = np.sin(np.pi * (box[0][0] + means[0] + 0.5) / height) * 2 * height / width
-    axis = int(variances[0] < variances[1] * shrink**2)
+    axis = int(variances[0] < variances[1] * shrink**2 * (1 - SAME))
     axis = axis if variances[axis] else 1 - axis
     if not variances[axis]:
         return None
     first, last = box[axis]
-    middle = first + int(np.clip(np.floor(means[axis]) + 1, 1, last - first - 1))
+    middle = first + int(np.clip(np.floor(means[axis] + SAME) + 1, 1, last - first - 1))
     return [[*box[:axis], part, *box[axis + 1 :]] for part in ((first, middle), (middle, last))]
 
 

@@ -168,6 +168,18 @@ def test_a_map_travels_with_the_scene(tmp_path: Path):
     )  # float32 in the file
 
 
+@pytest.mark.parametrize("samples", [20, 256])
+def test_a_symmetric_map_is_cut_as_before_when_it_was_saved(tmp_path: Path, samples: int):
+    # Of equal parts, and about centres of mass that are whole numbers, rounding to float32 decided.
+    down, across = np.linspace(-1, 1, 5)[:, None], np.cos(4 * np.pi * (np.arange(9) + 0.5) / 9)
+    for pixels in ((1.2 + across) * (1.5 - down**2), 1.5 + down + 0 * across):
+        sky = brdf.EnvironmentMap(pixels[..., None] * [0.3, 0.5, 1.0], samples=samples)
+        scene = brdf.Scene.load(write(tmp_path, SHORT))
+        brdf.Scene(scene.camera, scene.shapes, lights=[sky]).save(tmp_path / "sky.toml")
+        again = brdf.Scene.load(tmp_path / "sky.toml").lights[0]
+        np.testing.assert_allclose(again.patches.mean, sky.patches.mean, atol=1e-6)
+
+
 def test_a_map_of_one_colour_travels_with_the_scene(tmp_path: Path):
     sky = brdf.EnvironmentMap(np.ones((4, 8, 3)) * [0.25, 0.5, 1.0], samples=8)
     scene = brdf.Scene.load(write(tmp_path, SHORT))
