@@ -182,19 +182,25 @@ def over_samples(model: OneOf, points: SurfacePoints, lighting: Lighting, of_ter
     if is_sampled(lighting):
         sums, peak = _by_tiles(of_tile, flat)
     else:
-        parts = (added(_times_emitted, *one) for one in _terms_of_all(model, flat, lighting))
+        parts = []
+        for emitted, program, samples in _programs(model, flat, lighting):
+            parts.append(added(_times_emitted, emitted, _joined(jax.lax.map(program, samples))))
         sums, peak = functools.reduce(together, parts)
     return jax.tree.map(points.per_pixel, sums), jnp.max(peak.reshape(-1, points.each), axis=1)
 
 
-def _terms_of_all(
+def _programs(
     model: OneOf, points: SurfacePoints, lighting: Lighting
-) -> Iterator[tuple[Float[Array, "S C"], LightTerms]]:
-    """Of the lights of each kind what the samples emit, and their terms."""
+) -> Iterator[tuple[Array, Callable[..., Any], Any]]:
+    """Of the lights of each kind what the samples emit, (S, C), what makes terms of a chunk of them, and the chunks."""
     for stack in lighting.stacks:
         emitted, chunks = stack.chunks(CHUNK)
-        terms = jax.lax.map(partial(light_terms, model, lighting, points, stack.kind), chunks)
-        yield jax.tree.map(lambda one: one.reshape(-1, one.shape[-1]), (emitted, terms))
+        yield emitted.reshape(-1, emitted.shape[-1]), partial(light_terms, model, lighting, points, stack.kind), chunks
+
+
+def _joined(terms: LightTerms) -> LightTerms:
+    """Of the samples of all chunks, (S, P)."""
+    return jax.tree.map(lambda one: one.reshape(-1, one.shape[-1]), terms)
 
 
 def over_chunks(add: Callable[..., Any], lighting: Lighting, size: int, total: Any) -> Any:
@@ -337,9 +343,12 @@ class Lobe:
             points, of_terms = self.source[0].in_components(), partial(_relative, n, peak)
             value, slope = over_samples(OneOf((self.model,)), points, self.source[1], of_terms)[0]
         else:
-            terms = ((weight, _powers(n, peak, log_cosine)) for weight, log_cosine in self.kept)
-            parts = [[_over_samples(weight, one) for one in pair] for weight, pair in terms]
-            value, slope = (functools.reduce(operator.add, one) for one in zip(*parts, strict=True))
+            values, slopes = [], []
+            for weight, log_cosine in self.kept:
+                power, change = _powers(n, peak, log_cosine)
+                values.append(_over_samples(weight, power))
+                slopes.append(_over_samples(weight, change))
+            value, slope = functools.reduce(operator.add, values), functools.reduce(operator.add, slopes)
         if self.fine is None:
             return value, slope
         fine_value, fine_slope = self.fine(n, peak)
@@ -435,7 +444,8 @@ def diffuse_and_kept(model: OneOf, sight: Sight, lighting: Lighting) -> tuple[Ar
     """The diffuse basis of pixels, and the lobe of the terms of all samples."""
     points = sight.in_components()
     diffuse, kept = jnp.zeros(()), []
-    for emitted, terms in _terms_of_all(model, points.flat(), lighting):
+    for emitted, program, samples in _programs(model, points.flat(), lighting):
+        terms = _joined(jax.lax.map(program, samples))
         diffuse = diffuse + _times_emitted(emitted, terms.diffuse)
         # Of few samples each is an array of its own, which takes less time to read; of an averaged pixel all are one.
         step = len(emitted) if is_sampled(lighting) or points.each > 1 else 1

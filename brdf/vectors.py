@@ -269,13 +269,6 @@ class _Split:
     high: Components
     low: Components
 
-    @classmethod
-    def of(cls, value: Components) -> "_Split":
-        """The parts of a vector whose components lie within +-1."""
-        # no derivative: the rest carries it
-        high = Components(tuple(map(jnp.round, (value * _GRID).parts))) * (1.0 / _GRID)
-        return cls(value, high, value - high)
-
     def __matmul__(self, other: "_Split") -> Array:
         """The scalar product of vectors whose components lie within +-2."""
         rest = Components((*self.high, *self.low)) @ Components((*other.low, *other.value))
@@ -289,18 +282,22 @@ class _Split:
         """Sum or difference; a vector that is not split is a small one."""
         if isinstance(other, Components):
             return _Split(operation(self.value, other), self.high, operation(self.low, other))
-        parts = (self.value, other.value), (self.high, other.high), (self.low, other.low)
-        return _Split(*(operation(*pair) for pair in parts))
+        value, high = operation(self.value, other.value), operation(self.high, other.high)
+        return _Split(value, high, operation(self.low, other.low))
 
     __add__, __sub__ = partialmethod(_with, operator.add), partialmethod(_with, operator.sub)
 
 
 def _split(*vectors: Directions) -> Any:
     """Vectors whose components lie within +-1 in one common floating-point type, float32 in parts."""
-    given = list(map(Components.of, vectors))
-    dtype = jnp.result_type(*(one for vector in given for one in vector), 1.0)
-    values = (Components(tuple(one.astype(dtype) for one in vector)) for vector in given)
-    return map(_Split.of, values) if dtype == jnp.float32 else values
+    given, found = list(map(Components.of, vectors)), []
+    dtype = jnp.result_type(*jax.tree.leaves(given), 1.0)
+    for vector in given:
+        value = Components(tuple(one.astype(dtype) for one in vector.parts))
+        # no derivative: the rest carries it
+        high = Components(tuple(map(jnp.round, (value * _GRID).parts))) * (1.0 / _GRID)
+        found.append(_Split(value, high, value - high) if dtype == jnp.float32 else value)
+    return found
 
 
 def _about(normal: Directions, to_light: Directions, to_view: Directions) -> tuple[Any, Array, Any, Any]:

@@ -247,7 +247,8 @@ def _mills(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     tail = large
     for term in range(_TERMS, 1, -1):
         tail = large + term / tail
-    near, far = _tail(small) / _density(small), 1.0 / (large + 1.0 / tail)
+    complement = np.asarray(_each_erfc(small * math.sqrt(0.5)), np.float64)
+    near, far = math.sqrt(0.5 * math.pi) * np.exp(0.5 * small * small) * complement, 1.0 / (large + 1.0 / tail)
     return np.where(x > _SERIES, far, near), np.where(x > _SERIES, far / tail, 1.0 - small * near)
 
 

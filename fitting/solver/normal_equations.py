@@ -66,11 +66,9 @@ class Picture:
 
     def on_host(self, pixel: Int[np.ndarray, " K"]) -> "Picture":
         """The same picture, some of its pixels, in NumPy: an XLA gather is ten times slower."""
-        here = replace(self, lobe=None)._taken(pixel)
-        return here if self.lobe is None else replace(here, lobe=self.lobe.on_host(pixel))
-
-    def _taken(self, pixel: Int[np.ndarray, " K"]) -> "Picture":
-        return jax.tree.map(np.asarray, self).pixels(partial(np.take, indices=pixel, axis=0))
+        lobe = None if self.lobe is None else self.lobe.on_host(pixel)
+        here = jax.tree.map(np.asarray, replace(self, lobe=None))
+        return replace(here.pixels(partial(np.take, indices=pixel, axis=0)), lobe=lobe)
 
     def in_double(self, pixel: Int[np.ndarray, " K"]) -> "Picture":
         """The same picture, some of its pixels, in NumPy and double precision.
@@ -78,8 +76,15 @@ class Picture:
         Where the lobe is made anew at each evaluation some of them are repeated, with bounds that say nothing: programs
         are compiled for a few numbers of pixels only.
         """
-        filled = -pixel.size % (_FEW if pixel.size <= _FEW else 8 * _FEW) if self.is_sampled else 0
-        some = self._taken(np.pad(pixel, (0, filled))) if self.is_sampled else self.on_host(pixel)
+        lobe, filled = self.lobe, 0
+        if lobe is not None and self.is_sampled:
+            filled = -pixel.size % (_FEW if pixel.size <= _FEW else 8 * _FEW)
+            pixel = np.append(pixel, np.zeros(filled, pixel.dtype))
+            lobe = jax.tree.map(np.asarray, lobe).pixels(partial(np.take, indices=pixel, axis=0))
+        elif lobe is not None:
+            lobe = lobe.on_host(pixel)
+        here = jax.tree.map(np.asarray, replace(self, lobe=None))
+        some = replace(here.pixels(partial(np.take, indices=pixel, axis=0)), lobe=lobe)
         some = jax.tree.map(lambda a: np.asarray(a, np.float64) if eqx.is_inexact_array_like(a) else a, some)
         if filled and some.bounds is not None:
             some.bounds.lower[-filled:], some.bounds.upper[-filled:] = -np.inf, np.inf
