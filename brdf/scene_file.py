@@ -207,4 +207,5 @@ def _obj(mesh):
 def _toml(value: Any) -> str:
     """A TOML value: what JSON and TOML write alike."""
     plain = np.asarray(value, np.float64).tolist() if hasattr(value, "shape") else value
-    return json.dumps(plain, ensure_ascii=False)  # JSON's pairs of surrogates are none of TOML's escapes
+    # JSON's pairs of surrogates are none of TOML's escapes, and the one control character that it leaves is refused.
+    return json.dumps(plain, ensure_ascii=False).replace("\x7f", "\\u007f")

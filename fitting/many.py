@@ -11,6 +11,7 @@ that show signs of it are fitted by `fitting.fit`, one by one.
 import dataclasses
 import functools
 import math
+import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -178,8 +179,10 @@ def fit_many(
 
 def _fit_alone(problem: FitProblem, index: int) -> FitResult:
     lists = {name: [getattr(problem, name)[index]] for name in ("targets", "scenes", "masks", "weights")}
+    start = time.perf_counter()
     try:
-        return fit_pictures(dataclasses.replace(problem, **lists))
+        result = fit_pictures(dataclasses.replace(problem, **lists))
+        return dataclasses.replace(result, seconds=time.perf_counter() - start)
     except InputError as error:
         raise error.inside(f"pictures[{index}]") from None
 

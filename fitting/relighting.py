@@ -98,7 +98,7 @@ def fit_lights(
     before = _emittances(scene, targets[0].pixels.shape[-1])
     start = _with_emittances(scene, before)
     found = fit_jointly(targets, start, material, lambda _, s: s[0].emittances(), precision=precision, mask=mask)
-    emittances = np.stack(found.values)
+    emittances = np.stack(found.values).astype(float)
     with np.errstate(divide="ignore", invalid="ignore"):
         factors, errors = emittances / before, np.stack(found.errors) / before
     fields: dict[str, Any] = {field.name: getattr(found, field.name) for field in dataclasses.fields(FitResult)}

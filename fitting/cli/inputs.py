@@ -87,7 +87,7 @@ def read_inputs(targets: list[Path], options: PictureOptions, encodings: dict[Pa
     if kind == "archive":
         (path,) = targets
         pictures, seen, directions, intensities = _archived(path)
-        inputs = FitInputs(targets, _exposed(pictures, options), [], _masks(mask, pictures))
+        inputs = FitInputs(targets, _exposed(pictures, options), [], masks_of(pictures, mask))
         names = {"direction": f"{path}: light_dirs", "intensity": f"{path}: light_intensities"}
     else:
         inputs, file, tables = _read_pictures(kind, targets, options, encodings or {}, mask)
@@ -170,7 +170,7 @@ def _read_pictures(kind, targets, options, encodings, mask):
             "Give a picture and a camera of the same resolution",
         )
     pictures = _exposed(pictures, options)
-    return FitInputs(targets, pictures, [], _masks(mask, pictures)), file, tables
+    return FitInputs(targets, pictures, [], masks_of(pictures, mask)), file, tables
 
 
 def _target_and_scene(target, scene):
@@ -201,11 +201,20 @@ def _exposed(pictures: list[brdf.Picture], options) -> list[brdf.Picture]:
     return [picture.scaled(1.0 / factor) for picture, factor in zip(pictures, np.resize(factors, count), strict=True)]
 
 
-def _masks(mask, pictures) -> list[Any]:
-    """The mask of each picture, of its size."""
-    shape = pictures[0].pixels.shape[:2]
+def masks_of(pictures: list[brdf.Picture], mask: Any) -> list[Any]:
+    """The mask of each picture.
+
+    Args:
+        pictures: to fit.
+        mask: (H, W), or None.
+
+    Raises:
+        InputError: where it is not of their size.
+    """
     if mask is not None:
-        _require(mask.shape == shape, "mask", f"is of shape {mask.shape}, the target {shape}", "Give a value per pixel")
+        for shape in (picture.pixels.shape[:2] for picture in pictures):
+            what = f"is of shape {mask.shape}, the target {shape}"
+            _require(mask.shape == shape, "mask", what, "Give a value per pixel")
     return [mask] * len(pictures)
 
 

@@ -40,7 +40,7 @@ def lights(
         if given and not matt:
             raise InputError(name, "says nothing of a mirror ball's highlight", "Leave it out, or add --matt")
     with waiting("finding the lights"):
-        from fitting.cli.inputs import ball_in
+        from fitting.cli.inputs import ball_in, masks_of
 
         pictures = [brdf.read_picture(path, encoding=encoding) for path in target]
         inside = None if mask is None else brdf.read_mask(mask)
@@ -54,14 +54,14 @@ def lights(
             light_from_shading,
         )
 
-        for path, picture in zip(target, pictures, strict=True):
+        for path, picture, counts in zip(target, pictures, masks_of(pictures, inside), strict=True):
             with named_as({"picture": path}):
                 if matt:
                     points = ball_points(picture.pixels.shape[:2], circle)
-                    light = light_from_shading(picture, points, saturation=saturation, mask=inside, ambient=ambient)
+                    light = light_from_shading(picture, points, saturation=saturation, mask=counts, ambient=ambient)
                     direction, error = light.direction, f"  # {light.stated_error}"
                 else:
-                    direction = light_from_highlight(picture, circle, mask=inside)
+                    direction = light_from_highlight(picture, circle, mask=counts)
                     error = f"  # {FROM_OUTLINE}" if direction[2] < FAR_BEHIND else ""
             lines.append(" ".join(f"{value:.6f}" for value in direction) + error)
     text = "\n".join(lines)

@@ -19,6 +19,9 @@ from fitting.solver.devices import core_count, device_count, gathered, own
 BAND = 10 * CHUNK * TILE - 1
 """Texels that are read and laid out at a time; a lane is left over."""
 
+FORM = 2
+"""Of what is kept of a band: another number where its layers change."""
+
 SPARSE = 16
 """Of so many pixels for each of these at most: the others see nothing."""
 
@@ -103,7 +106,7 @@ def _key(problem: MapProblem) -> str:
             sources += one.name, status.st_size, status.st_mtime_ns
         else:
             sources.append(one.rows(0, one.shape[0]))
-    named = {**vars(problem), **vars(problem.photographs), "each": sources, "photographs": None}
+    named = {**vars(problem), **vars(problem.photographs), "each": sources, "photographs": None, "form": FORM}
     return fingerprint(named)
 
 

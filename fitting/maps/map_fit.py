@@ -123,7 +123,7 @@ def fit_maps(
     if surface.points is not None:
         to_view = np.sum(np.asarray(surface.points.to_view, float)[np.asarray(surface.mask)], axis=0)
     else:
-        _refuse_behind(surface, given, to_view)
+        _refuse_behind(surface, given, to_view, str(normals) if isinstance(normals, str | Path) else "normals")
     problem = MapProblem(given, surface, models, specular == "grey", _ambient(ambient, given), to_view, precision)
     labels = None if labels is None else label_map(labels, problem)
     problem, unit, clipping = with_levels(problem, saturation)
@@ -147,14 +147,14 @@ def fit_maps(
     return Maps(models=names, to_view=to_view, notes=notes, to_light=given.to_light, **layers)
 
 
-def _refuse_behind(surface: Surface, given: Photographs, to_view: np.ndarray) -> None:
+def _refuse_behind(surface: Surface, given: Photographs, to_view: np.ndarray, name: str) -> None:
     """Normals, or where they are sought lights, that all lie behind what the camera can see."""
     if surface.normal is not None:
-        name, what = "normals", "all point away from the camera"
+        what = "all point away from the camera"
         with np.errstate(invalid="ignore"):  # infinite where there is no surface
             toward = np.asarray(surface.normal)[surface.mask] @ to_view
     else:
-        name, what = "to_view", "is more than 90 degrees from every light"
+        name, what = "to_view", "is 90 degrees or more from every light"
         toward = given.to_light @ to_view
     if np.any(toward < 0) and not np.any(toward > 0):
         raise InputError(name, what, "Give both in one frame, to_view from the surface to the camera")

@@ -137,9 +137,9 @@ def read_lights(path: str | Path) -> tuple[list[Path], Float[np.ndarray, "P 3"]]
     """Photographs and their lights from a file as RTI programs write it.
 
     Args:
-        path: an ``.lp`` file: a count, then a line ``name x y z`` a photograph. The last three words are the numbers:
-            a name may hold blanks, and folders, which are looked for beside the file and then left out. A word that
-            begins with ``#``, at the start of a line or after its numbers, begins a remark.
+        path: an ``.lp`` file: a count, then a line ``name x y z`` a photograph. The last three words before a remark
+            are the numbers: a name may hold blanks, and folders, which are looked for beside the file and then left
+            out. A word that begins with ``#``, at the start of a line or after its numbers, begins a remark.
 
     Raises:
         InputError: naming file and line.
@@ -171,6 +171,8 @@ def _named_vector(line: str) -> tuple[str, list[float]]:
                 vector = [parse_number(word.group()) for word in words[first : first + 3]]
             except ValueError:
                 continue
+            if words[first - 1].group() == "#":  # these are of a remark
+                break
             return line[: words[first - 1].end()], vector
     return "", []
 

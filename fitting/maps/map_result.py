@@ -101,8 +101,9 @@ class Maps:
         for number, words in enumerate(REASONS):
             share = np.count_nonzero((self.reason == number) & inside) / total
             lines += [f"  {words:<36}{100 * share:6.1f} %"] if share else []
+        chosen = self.chosen[inside & (self.reason != REASONS.index("too few photographs"))]
         for number, name in enumerate(self.models if len(self.models) > 1 else ()):
-            lines.append(f"  {name:<36}{100 * np.count_nonzero((self.chosen == number) & inside) / total:6.1f} %")
+            lines.append(f"  {name:<36}{100 * np.count_nonzero(chosen == number) / total:6.1f} %")
         for name, values in (("n", self.n), ("k_d", self.k_d), ("k_s", self.k_s), ("residual", self.residual)):
             known = values[np.isfinite(values)]
             if known.size:

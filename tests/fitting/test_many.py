@@ -26,6 +26,7 @@ def assert_alike(fits: fitting.ManyFits, pictures, scenes, **options):
             errors = [parameter.error for parameter in one.parameters if parameter.name == name]
             np.testing.assert_allclose(np.ravel(fits.errors[name][index]), errors, rtol=1e-5)
         np.testing.assert_allclose(fits.residual[index], one.residual, rtol=1e-9)
+        assert fits[index].seconds > 0
         assert str(fits[index]).split("\n")[1:] == str(one).split("\n")[1:]
 
 
