@@ -397,7 +397,7 @@ def _left_out(
     if masked:
         left_out["masked"] = seen - allowed
         if not allowed:
-            raise InputError("mask", "leaves no pixel that sees a fitted shape", "Check the mask")
+            raise InputError("mask", "leaves no pixel that sees a fitted shape", "Check mask and alpha")
     left_out["not finite"] = allowed - finite
     if not finite:
         raise InputError("target", "has no finite value on the object", "Give a picture with values")

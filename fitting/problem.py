@@ -36,7 +36,8 @@ class Target(NamedTuple):
         step: the distance of two codes; 0 where there are none.
         codes: behind the values; None where no rounding touched these.
         least_squares: is asked for, whatever the values are.
-        file: path, encoding, its source, and factor of the `brdf.Picture` that it was; None where no file holds it.
+        file: path, encoding, its source, layer and factor of the `brdf.Picture` that it was; None where no file holds
+            it.
         opaque: pixels that are not fully transparent, (H, W); None for all.
     """
 

@@ -34,6 +34,9 @@ from brdf.images.encoding import (
 )
 from brdf.images.jpeg import Jpeg
 
+BAND = 256
+"""Rows of alpha that are read at a time."""
+
 LOSSY_TOP = 250 / 255
 """Share of the largest code from which on a file compressed with losses is clipped: at quality 75 a clipped area has
 codes between 250 and 255, but for a few at its edge."""
@@ -102,7 +105,7 @@ class Picture:
     @property
     def opaque(self) -> Bool[np.ndarray, "height width"] | None:
         """Pixels that are not fully transparent; None where nobody says."""
-        return _opaque(self.alpha)
+        return None if self.alpha is None else _told(self.alpha > 0)
 
     @property
     def code_step(self) -> float | None:
@@ -234,8 +237,17 @@ class ImageReader(contextlib.AbstractContextManager):
         return self._whole([self._alpha], "linear")[..., 0]
 
     def read_opaque(self) -> Bool[np.ndarray, "height width"] | None:
-        """Pixels that are not fully transparent; None where nobody says."""
-        return _opaque(self.read_alpha())
+        """Pixels that are not fully transparent; None where nobody says. Read by bands of rows."""
+        if self._alpha is None:
+            return None
+        if not self._by_rows:
+            return _told(self._whole([self._alpha], "linear")[..., 0] > 0)
+        edges = [*range(0, self.shape[0], BAND), self.shape[0]]
+        bands = (
+            _shown(self.path, self._image, self._part, [self._alpha], first, stop, "linear")[..., 0] > 0
+            for first, stop in itertools.pairwise(edges)
+        )
+        return _told(np.concatenate(list(bands)))
 
     def _whole(self, channels, encoding):
         """All rows, turned as the Exif orientation says (CIPA DC-008, 4.6.4.A)."""
@@ -248,9 +260,9 @@ class ImageReader(contextlib.AbstractContextManager):
         return np.ascontiguousarray(stored[::-1] if turn in (3, 4, 7, 8) else stored)
 
 
-def _opaque(alpha: np.ndarray | None) -> np.ndarray | None:
+def _told(opaque: np.ndarray) -> np.ndarray | None:
     # Alpha that is 0 everywhere was not meant.
-    return None if alpha is None or not alpha.any() else alpha > 0
+    return opaque if opaque.any() and not opaque.all() else None
 
 
 def _open(path: Path) -> oiio.ImageInput:

@@ -135,7 +135,7 @@ def _subsampled(problem, samples):
             if 2 <= np.count_nonzero(pixels >= top) <= SYMMETRIC_PIXELS < np.count_nonzero(target.pixels >= top):
                 saturation = float(top)
         # Of pixels that stand for many the codes are a small part of what is not known.
-        target = target._replace(pixels=pixels, codes=None, least_squares=True)
+        target = target._replace(pixels=pixels, codes=None, least_squares=True, opaque=None)
         scene = brdf.some_pixels(scene, sample.pixel, precision=problem.precision)
         mask = None if mask is None else sample.of(mask)
         stands_for = sample.stands_for[None]

@@ -7,7 +7,7 @@ a third of what noise leaves of all pixels, or below a thousandth of the number,
 residual that noise would not hide, noise being what the best model leaves; fewer than the lights themselves say only
 where noise allows it. Where the residual shows that the picture was drawn with the samples that its lights say, these
 are taken. Where an accuracy is asked for, the error is to be a small part of that instead, told by the largest count.
-What remains is told in the errors, as is what another count than the lights' own changes where the residual shows
+What remains is told in the errors, as is what more samples than the lights' own change where the residual shows
 neither.
 
 The first fit also says where n is, so that all pixels see their light samples in one pass (`brdf.lobes.Near`).
@@ -74,7 +74,7 @@ def with_enough_samples(problem: FitProblem, accuracy: float | None = None) -> F
     noise = min(one.noise for one in ladders.values())
     good = [one for one in ladders.values() if one.noise <= AS_GOOD * noise]
     samples = max(one.enough(noise) for one in good)
-    if accuracy is None and min(good, key=lambda one: one.noise).shows(own, samples):
+    if accuracy is None and own < samples and min(good, key=lambda one: one.noise).shows(own, samples):
         samples = own
     scenes = [with_samples(scene, samples) for scene in problem.scenes]
     errors = {model: one.error(samples) for model, one in ladders.items()}
@@ -204,7 +204,7 @@ class _Ladder:
         """What so many samples leave out."""
         profile = np.stack([self.optimum.grid, self.optimum.profile])
         missed = [self.missed(samples)]
-        if samples != self.own and not self.shows(samples, self.own):
+        if self.own < samples and not self.shows(samples, self.own):
             missed.append(self._change(samples, self.own))
         scores, sizes = zip(*missed, strict=True)
         return SampleError(self.near(samples), self.probes.hessian, np.stack(scores), profile, math.hypot(*sizes))

@@ -165,4 +165,4 @@ def inverse_diagonal(gram: Float[np.ndarray, "U U"], share: float = 1e-10) -> Fl
     value, vector = np.linalg.eigh(gram / np.outer(scale, scale))
     known = value > max(share * value[-1], 0.0)
     inverse = np.sum(vector[:, known] ** 2 / value[known], axis=1) / scale**2
-    return np.where(np.any(np.abs(vector[:, ~known]) > 1e-3, axis=1), np.inf, inverse)
+    return np.where(np.all(np.abs(vector[:, ~known]) <= 1e-3, axis=1), inverse, np.inf)

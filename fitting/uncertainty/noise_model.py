@@ -155,16 +155,19 @@ def misweighted_sums(pictures: Sequence[Picture], optimum: Optimum) -> Sums | No
     """
     squared = [residuals(picture, optimum) ** 2 for picture in pictures]
     weight = [
-        np.broadcast_to(np.asarray(picture.weights, float), (len(one), 1))
+        np.broadcast_to(np.asarray(picture.weights, float), one.shape)
         for picture, one in zip(pictures, squared, strict=True)
     ]
     squared, weight = np.concatenate(squared), np.concatenate(weight)
-    squared, weight = squared[weight[:, 0] > 0], weight[weight[:, 0] > 0]
-    variance = {power: np.mean(squared * weight ** (power - 1), axis=0) for power in (*POWERS, 1.0)}
+    counts = weight > 0
+    weight = np.where(counts, weight, 1.0)
+    variance = {power: np.mean(squared * weight ** (power - 1), axis=0, where=counts) for power in (*POWERS, 1.0)}
     if not all(np.all(one > 0) for one in variance.values()):
         return None
     # Twice the logarithm of the likelihood, but for a constant.
-    likely = {power: float(np.sum(power * np.log(weight) - np.log(one))) for power, one in variance.items()}
+    likely = {
+        power: float(np.sum(power * np.log(weight) - np.log(one), where=counts)) for power, one in variance.items()
+    }
     power = max(likely, key=lambda one: likely[one])
     if likely[power] < likely[1.0] + RISE:
         return None

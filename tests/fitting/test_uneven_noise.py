@@ -82,6 +82,14 @@ def test_pictures_of_one_noise_are_weighed_alike():
     assert [one.value for one in both.parameters] == pytest.approx([one.value for one in alike.parameters], rel=1e-6)
 
 
+def test_weights_of_a_picture_that_is_clipped_in_some_channels_stand_beside_those_of_another():
+    pictures = drawn((0.01, 0.01), 0, codes=False)
+    pictures[1] = np.minimum(pictures[1], 0.4)  # of red and green
+    weight = [np.linspace(0.5, 1.5, one[..., 0].size).reshape(one.shape[:2]) for one in pictures]
+    result = fitting.fit(pictures, SCENES, weight=weight, model="blinn-phong")
+    assert np.all(np.abs(deviations(result)) < 4)
+
+
 def test_pictures_all_of_whose_pixels_count_differ_in_noise():
     normals = np.stack(np.broadcast_arrays(*np.mgrid[-0.5:0.5:24j, -0.5:0.5:24j], 1.0), axis=-1)
     points = brdf.SurfacePoints.from_normals(normals / np.linalg.norm(normals, axis=-1, keepdims=True))
