@@ -118,7 +118,7 @@ MISUSES = {
     "fitting.fit_many([target, target[:10]], scene)": r"pictures\[1\]: is 48 x 10, the scene's camera 48 x 48\.",
     "fitting.fit_many([target, target], [scene])": r"scenes: has 1 entries for 2 pictures\.",
     "fitting.fit_maps([target] * 6, np.eye(3)[[2] * 6], 'fit', flip_y=True)": r"flip_y: turns normals that are given",
-    "fitting.fit_maps([target] * 3, np.eye(3) + [0, 0, 1], to_view=[0, 0, -1])": r"to_view: is more than 90 degrees",
+    "fitting.fit_maps([target] * 3, np.eye(3) + [0, 0, 1], to_view=[0, 0, -1])": r"to_view: is 90 degrees or more",
     "fitting.fit_maps([(255 * target).astype('uint8')] * 3, np.eye(3), -scene.surface_points().normal)": (
         r"normals: all point away from the camera\. Give both in one frame"
     ),
