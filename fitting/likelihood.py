@@ -306,12 +306,12 @@ def interval(
     width = np.clip((upper - lower) / s, 0.0, 2 * _FAR)
     narrow = (width <= _WIDE) & (0.5 * width * (near + far) <= _STEEP)
     value, mean, weight = found = [np.zeros(width.shape) for _ in range(3)]
-    for holds, told in (
+    for holds, formula in (
         (narrow, _narrow),
         (~narrow & (near <= 0), _around),
         (~narrow & (near > 0), _beyond),
     ):
-        for part, own in zip(found, told(near[holds], far[holds], width[holds]), strict=True):
+        for part, own in zip(found, formula(near[holds], far[holds], width[holds]), strict=True):
             part[holds] = own
     return LogLikelihood(value, np.where(above, mean, -mean) / s, weight / (s * s))
 

@@ -105,7 +105,7 @@ class Picture:
     @property
     def opaque(self) -> Bool[np.ndarray, "height width"] | None:
         """Pixels that are not fully transparent; None where nobody says."""
-        return None if self.alpha is None else _told(self.alpha > 0)
+        return None if self.alpha is None else _usable(self.alpha > 0)
 
     @property
     def code_step(self) -> float | None:
@@ -241,13 +241,13 @@ class ImageReader(contextlib.AbstractContextManager):
         if self._alpha is None:
             return None
         if not self._by_rows:
-            return _told(self._whole([self._alpha], "linear")[..., 0] > 0)
+            return _usable(self._whole([self._alpha], "linear")[..., 0] > 0)
         edges = [*range(0, self.shape[0], BAND), self.shape[0]]
         bands = (
             _shown(self.path, self._image, self._part, [self._alpha], first, stop, "linear")[..., 0] > 0
             for first, stop in itertools.pairwise(edges)
         )
-        return _told(np.concatenate(list(bands)))
+        return _usable(np.concatenate(list(bands)))
 
     def _whole(self, channels, encoding):
         """All rows, turned as the Exif orientation says (CIPA DC-008, 4.6.4.A)."""
@@ -260,8 +260,8 @@ class ImageReader(contextlib.AbstractContextManager):
         return np.ascontiguousarray(stored[::-1] if turn in (3, 4, 7, 8) else stored)
 
 
-def _told(opaque: np.ndarray) -> np.ndarray | None:
-    # Alpha that is 0 everywhere was not meant.
+def _usable(opaque: np.ndarray) -> np.ndarray | None:
+    # Alpha that is 0 everywhere was not meant, and what is opaque everywhere leaves nothing out.
     return opaque if opaque.any() and not opaque.all() else None
 
 

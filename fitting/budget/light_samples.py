@@ -40,8 +40,9 @@ AS_GOOD = 1.1
 APART = 1.5
 # Of the noise, root mean square over pixels: less shows in no sum over blocks of them; more than the other is no noise.
 HIDDEN, NO_NOISE = 0.02, 0.3
-# Of two counts a picture tells by which it was drawn, where the share of what they change is known so well.
-TOLD = 0.2
+# A residual holds what one of two counts leaves out, or nothing of it: a share of 1 or 0, whose standard error is to be
+# below this.
+SHARE_ERROR = 0.2
 # Each count changes at most so much of what the one before changed.
 SLOWEST = 0.7
 # Where more samples move log n so far the first fit is made again, of more of them, but no more than so many.
@@ -117,11 +118,15 @@ class _Ladder:
         """How many samples it takes where the picture has such a noise."""
         return next((count for count in self.counts if self._is_enough(count, noise)), self.counts[-1])
 
+    def _picture(self, samples: int) -> np.ndarray:
+        """What the first fit shows under so many samples, (M, C)."""
+        if samples not in self.shown:
+            self.shown[samples] = self.probes.under([with_samples(scene, samples) for scene in self.problem.scenes])
+        return self.shown[samples]
+
     def _change(self, coarse: int, fine: int) -> tuple[np.ndarray, float]:
         """The scores of what other samples change, and its root mean square over pixels."""
-        for samples in {coarse, fine} - self.shown.keys():
-            self.shown[samples] = self.probes.under([with_samples(scene, samples) for scene in self.problem.scenes])
-        change, weight = self.shown[fine] - self.shown[coarse], self.probes.weight
+        change, weight = self._picture(fine) - self._picture(coarse), self.probes.weight
         square = weight @ np.mean(change**2, axis=1) / np.sum(weight)
         return self.probes.scores(change).sum(axis=0), float(np.sqrt(square))
 
@@ -153,16 +158,15 @@ class _Ladder:
         hidden = size <= HIDDEN * noise or (given and size > NO_NOISE * noise)
         return hidden and bool(np.all(np.abs(off) <= np.maximum(OF_NOISE * rest, OF_VALUE * value)))
 
-    def shows(self, one: int, other: int) -> bool:
-        """Whether the picture tells that it was drawn with one number of samples, not with the other."""
-        self._change(one, other)
-        change = self._unexplained(self.shown[other] - self.shown[one])
-        left = self._unexplained(self.probes.residual + self.probes.shown - self.shown[one])
+    def shows(self, samples: int, rival: int) -> bool:
+        """Whether the residual tells that the picture was drawn with so many samples, and not with a rival number."""
+        change = self._unexplained(self._picture(rival) - self._picture(samples))
+        left = self._unexplained(self.probes.residual + self.probes.shown - self._picture(samples))
         weighted = self.probes.weight[:, None] * change
         square = np.sum(weighted * change)
         noise = np.sqrt(min(np.mean(left**2), np.mean((left - change) ** 2)))
-        told = noise * np.linalg.norm(weighted) < TOLD * square
-        return bool(told and np.sum(weighted * left) < 0.5 * square)
+        known = noise * np.linalg.norm(weighted) < SHARE_ERROR * square
+        return bool(known and np.sum(weighted * left) < 0.5 * square)
 
     def _unexplained(self, change: np.ndarray) -> np.ndarray:
         """What no other material makes of a change of the picture, (M, C)."""

@@ -32,9 +32,9 @@ def likelier(problem: MapProblem) -> tuple[MapProblem, tuple[str, ...]]:
     remedy = "Where you know, say so with the encoding"
     note = f"{silent.name} does not say how its values are encoded: read as"
     usual, other = ("linear", "sRGB") if silent.curve == "linear" else ("sRGB", "linear")
-    untold = problem, (f"{note} {usual}. {remedy}",)
+    as_usual = problem, (f"{note} {usual}. {remedy}",)
     if given.to_light is None or not texels.size:
-        return untold
+        return as_usual
     row = texels // given.size[1]
     rows = np.unique(row)
     rows = rows[np.linspace(0, rows.size - 1, -(-min(SOME, texels.size) * rows.size // texels.size)).astype(int)]
@@ -49,7 +49,7 @@ def likelier(problem: MapProblem) -> tuple[MapProblem, tuple[str, ...]]:
             layers = {key: layer[: texels.size] for key, layer in one.fit(*one.tiles(texels)).items()}
         codes = 255 * np.sqrt(np.mean(given.unit**2)) * layers["noise"]
         if np.all(np.isnan(codes)):
-            return untold
+            return as_usual
         left[name] = np.nanmedian(codes * np.sqrt(1 + OUTLIER**2 * layers["left_out"]))
     if left[other] ** 2 < LESS * left[usual] ** 2:
         usual, other = other, usual
