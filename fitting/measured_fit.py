@@ -44,9 +44,8 @@ from fitting.uncertainty.intervals import exponent_interval
 
 Loss = Literal["cosine", "squared", "log"]
 
-# A lobe has to leave less than this share of the squares that Lambert leaves before it is worth its unknowns: half of
-# them where Lambert itself explains half of the table, else nine tenths.
-WORTH, WORTH_WITHOUT_LAMBERT = 0.5, 0.9
+# A lobe is worth its unknowns where it explains this share of the squares that Lambert leaves, or of the table's.
+WORTH, WORTH_OF_TABLE = 0.5, 0.02
 # A model that explains this share of the squares describes the peak, one that places this share of the light the body;
 # where the mean of both is below, it does not describe the table.
 HALF = 0.5
@@ -160,11 +159,13 @@ class BrdfFitResult(Parameters):
     @property
     def verdict(self) -> str:
         """The sentence that a person needs."""
-        losses, several = self.losses, len(self.candidates) > 1
+        losses = self.losses
         name = "Lambert" if self.material.name == "lambert" else self.material.name
         if not self.fits:
             best = min(self.candidates, key=self._loss)
-            closest = f"none of these models fits: the best, {best.model}," if several else f"{name} does not fit: it"
+            closest = f"{name} does not fit: it"
+            if len(self.candidates) > 1:
+                closest = f"none of these models fits: the best, {best.model},"
             left = f"{_percent(best.losses.cosine)} of the table (rms of f_r cos θ)"
             return f"{closest} leaves {left}; the brightest sample is {self._brightest()}"
         left, elsewhere = _percent(losses.cosine), f"{_percent(losses.misplaced)} of the light goes elsewhere"
@@ -174,8 +175,7 @@ class BrdfFitResult(Parameters):
         elif losses.misplaced > HALF:
             words = f"fits the peak, its f_r cos θ is off by {left} (rms), but {elsewhere}"
         else:
-            verb = "is enough" if several and name == "Lambert" else "describes it"
-            words = f"{verb}: its f_r cos θ is off by {left} (rms), and {elsewhere}"
+            words = f"is off by {left} of f_r cos θ (rms), and {elsewhere}"
         return f"{name} {words}{self._beside_lambert()}"
 
     def _loss(self, candidate):
@@ -298,8 +298,8 @@ def fit_brdf(
 
     Args:
         table: what `brdf.load_measured` reads.
-        model: the name of a model, or "auto": Lambert, unless a lobe explains half of the squares that it leaves;
-            (a tenth, where Lambert explains less than half of the table); then the form with the least loss.
+        model: the name of a model, or "auto": Lambert, unless a lobe explains half of the squares that it leaves, or
+            2 % of the table's; then the form with the least loss.
         loss: "cosine", "squared" or "log"; see `fitting.measured_fit`.
         max_angle: light and view further than this from the normal are left out, in degrees, above 0 to 90.
         n_range: bounds of the exponent, 0 < lower < upper.
@@ -438,5 +438,5 @@ def _choose(candidates, loss):
     """Lambert, which comes first, unless a lobe explains enough of the squares that it leaves."""
     losses = [getattr(candidate.losses, loss) for candidate in candidates]
     best = int(np.argmin(losses))
-    worth = WORTH if candidates[0].losses.cosine ** 2 <= HALF else WORTH_WITHOUT_LAMBERT
-    return best if losses[best] ** 2 + EXACT**2 <= worth * losses[0] ** 2 else 0
+    worth = min(WORTH, WORTH_OF_TABLE / max(candidates[0].losses.cosine, EXACT) ** 2)
+    return best if losses[best] ** 2 + EXACT**2 <= (1 - worth) * losses[0] ** 2 else 0

@@ -14,7 +14,7 @@ import brdf
 import fitting
 from brdf.errors import InputError
 from brdf.measured.table import from_angles
-from fitting.measured_fit import BrdfCandidate, Losses
+from fitting.measured_fit import BrdfCandidate, Losses, _choose
 
 
 def directions(count: int = 900, largest: float = 78.0):
@@ -94,7 +94,7 @@ def test_auto_names_the_form_and_lambert_where_it_is_enough():
     matt = brdf.MeasuredBRDF.from_samples(light, view, f_r("phong", [0.5], [0.0], 1.0, light, view))
     result = fitting.fit_brdf(matt)
     assert result.material.name == "lambert"
-    assert result.verdict.startswith("Lambert is enough: ")
+    assert result.verdict.startswith("Lambert is off by ")
     glossy = f_r("normalized-phong", [0.2], [0.3], 30.0, light, view)
     result = fitting.fit_brdf(brdf.MeasuredBRDF.from_samples(light, view, glossy))
     assert result.material.name == "normalized-phong"
@@ -264,7 +264,7 @@ def test_published_fits_come_back_from_tables_on_the_merl_grid():
     ("name", "sentence"),
     [
         ("alta/retro-gray-tape.dat", "none of these models fits"),
-        ("rgl/colodur_napoli_4f_rgb.bsdf", "Lambert is enough: "),
+        ("rgl/colodur_napoli_4f_rgb.bsdf", "phong is off by 32 %"),  # Lambert by 42 %
         ("rgl/satin_rosaline_rgb.bsdf", "phong puts "),
     ],
 )
@@ -338,12 +338,12 @@ SENTENCES = {
     "all of it": (
         0.1,
         0.05,
-        "normalized-blinn-phong describes it: its f_r cos θ is off by 10 % (rms), and 5 % of",
+        "normalized-blinn-phong is off by 10 % of f_r cos θ (rms), and 5 % of",
     ),
     "rounding": (
         1e-12,
         0.0,
-        "normalized-blinn-phong describes it: its f_r cos θ is off by 0.0001 % (rms), and 0",
+        "normalized-blinn-phong is off by 0.0001 % of f_r cos θ (rms), and 0",
     ),
     "a plastic's body": (
         0.73,
@@ -389,8 +389,16 @@ def test_how_much_closer_the_best_lobe_comes_is_told_as_it_is(lobe, share, rest,
         dataclasses.replace(lobe.candidates[0], losses=closer),
     )
     result = dataclasses.replace(lobe, loss=loss, candidates=candidates, chosen=0)
-    start = "Lambert is enough: its f_r cos θ is off by 24 % (rms), and 10 % of the light goes elsewhere"
+    start = "Lambert is off by 24 % of f_r cos θ (rms), and 10 % of the light goes elsewhere"
     assert result.verdict == f"{start}{rest}"
+
+
+@pytest.mark.parametrize(
+    ("alone", "closer", "chosen"), [(0.42, 0.32, 1), (0.05, 0.04, 0), (0.05, 0.03, 1), (0.97, 0.969, 0)]
+)
+def test_a_lobe_is_chosen_for_what_it_explains_of_the_table_too(lobe, alone, closer, chosen):
+    losses = (Losses(each, each, each, 0.2) for each in (alone, closer))
+    assert _choose([dataclasses.replace(lobe.candidates[0], losses=each) for each in losses], "cosine") == chosen
 
 
 def test_where_no_lobe_helps_it_says_so():
@@ -417,7 +425,7 @@ def test_one_pair_of_directions_gives_no_warning():
     table = brdf.MeasuredBRDF.from_samples(light, view, np.full(50, 0.5))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert fitting.fit_brdf(table).verdict.startswith("Lambert is enough: its f_r cos θ is off by 0")
+        assert fitting.fit_brdf(table).verdict.startswith("Lambert is off by 0 % of f_r cos θ")
 
 
 @pytest.mark.parametrize("values", [-0.5, np.linspace(-1, 0, 600)])
