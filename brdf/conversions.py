@@ -225,9 +225,12 @@ def nearest_equations(
 
 def _constrained(gram: Float[np.ndarray, "2 2"], right: Float[np.ndarray, " 2"], bounded: bool) -> np.ndarray:
     """The x >= 0 (with sum <= 1 if bounded) of least x' gram x / 2 - right' x: a bound that is broken is reached."""
-    best = np.linalg.lstsq(gram, right, rcond=1e-12)[0]  # at n = 0 a lobe may be the diffuse term: they share it
+    size = np.sqrt(np.diag(gram))  # of radiance, which a lobe of n = 1e15 has a ten-millionth of
+    # At n = 0 a lobe may be the diffuse term: they share it.
+    best = np.linalg.lstsq(gram / np.outer(size, size), right / size, rcond=1e-12)[0]
     if best.min() <= 1e-12 * best.max():
-        best = np.where(best == best.max(), right / np.diag(gram), 0.0)
+        best = np.where(best == best.max(), right / size, 0.0)
+    best = best / size
     if bounded and best.sum() > 1:
         along = np.array([-1.0, 1.0])  # from (1, 0) to (0, 1)
         share = np.clip(along @ (right - gram[:, 0]) / max(along @ gram @ along, 1e-12), 0.0, 1.0)

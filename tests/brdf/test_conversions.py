@@ -98,6 +98,8 @@ def test_nearest_forms_of_what_needs_none():
     matt = NormalizedBlinnPhong(k_d=[0.3, 0.1], k_s=[0.2, 0.7], n=0.0)  # its lobe is the diffuse term
     np.testing.assert_allclose(conversions.nearest_normalized(matt).k_d, [0.25, 0.4])
     np.testing.assert_allclose(conversions.nearest_normalized(matt).k_s, [0.25, 0.4])
+    far = conversions.nearest_normalized(Phong(k_d=0.3, k_s=0.5, n=1e15))  # at an angle the lobe lights a 1e-15 of it
+    np.testing.assert_allclose([far.k_d[0], far.k_s[0]], [0.3, 4 / 3 * 1e-15], rtol=1e-3)
     classic = Phong(k_d=0.5, k_s=3.0, n=12.0)
     np.testing.assert_allclose(conversions.nearest_classic(classic).k_s, 3.0)
     np.testing.assert_allclose(conversions.nearest_normalized(Lambert(k_d=[0.5, 1.5])).k_d, [0.5, 1.0])
