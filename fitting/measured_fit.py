@@ -41,6 +41,7 @@ from fitting.solver.profile import search
 from fitting.uncertainty.covariance import residual_noise, uncertainty
 from fitting.uncertainty.interpretation import material_and_parameters
 from fitting.uncertainty.intervals import exponent_interval
+from fitting.uncertainty.noise_model import sums_at
 
 Loss = Literal["cosine", "squared", "log"]
 
@@ -385,22 +386,27 @@ def _fit_model(model, samples, loss, n_range):
         optimum = search([picture], free, n_range)
         x = np.where(optimum.x > [[0], [SEARCH], [0]] * brightest, optimum.x, 0.0)
         highlight = x[2] * reach * np.exp(optimum.n * log_cos)
-        return dataclasses.replace(optimum, x=x), highlight, (x[1] + highlight) / np.pi
+        return picture, dataclasses.replace(optimum, x=x), highlight, (x[1] + highlight) / np.pi
 
-    optimum, highlight, f_r = solve(value)
+    picture, optimum, highlight, f_r = solve(value)
     least = _losses(samples, f_r)
     for _ in range(_MOST_ROUNDS if loss == "log" else 0):
         closer = solve(f_r * cosine)
-        losses = _losses(samples, closer[2])
+        losses = _losses(samples, closer[-1])
         if losses.log >= least.log * (1 - _ENOUGH):
             break
-        (optimum, highlight, f_r), least = closer, losses
-    noise = residual_noise(optimum, brightest * np.finfo(float).eps)
+        (picture, optimum, highlight, f_r), least = closer, losses
+    rounding, weight = brightest * np.finfo(float).eps, np.asarray(picture.weights)
+    noise, left = residual_noise(optimum, rounding), np.pi * (values - f_r) * weight**0.5
+    # Instruments err by a share of the value, and alike in all channels: what is left of each sample says so (White
+    # 1980), not below rounding.
+    spread = sums_at([picture], optimum, lambda _: weight * np.maximum(left**2, rounding**2)).gram
+    left = left / np.maximum(np.linalg.norm(left, axis=0), 1 / FAR)
     visible = float(np.max(highlight) / np.max(brightest))
     fit = ModelFit(model, [], optimum, free, n_range)
     # A lobe that hardly reaches a sample needs a k_s whose square is out of range; it is found to be undetermined.
     with np.errstate(over="ignore", invalid="ignore"):
-        errors = uncertainty(fit, free, noise, brightest, visible)
+        errors = uncertainty(fit, free, noise, brightest, visible, spread=spread, channels=left.T @ left)
     interval = None
     if specular and not errors.n_reason:
         interval = exponent_interval(fit, errors.n_error, errors.reach, errors.delta_cost, 0.0, parabolic=True)

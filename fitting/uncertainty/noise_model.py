@@ -126,10 +126,10 @@ def weighted_sums(
         The sums, columns ambient, diffuse, lobe, derivative by n, about the target.
     """
     n, x = np.asarray(optimum.n), optimum.x
-    return _sums_at(pictures, optimum, lambda picture: _reweighted(picture, n, x, coefficients, inverse))
+    return sums_at(pictures, optimum, lambda picture: _reweighted(picture, n, x, coefficients, inverse))
 
 
-def _sums_at(pictures: Sequence[Picture], optimum: Optimum, weight: Callable[[Picture], AnyArray]) -> Sums:
+def sums_at(pictures: Sequence[Picture], optimum: Optimum, weight: Callable[[Picture], AnyArray]) -> Sums:
     """Sums at the optimum with other weights."""
 
     def again(picture: Picture) -> Picture:
@@ -171,6 +171,6 @@ def misweighted_sums(pictures: Sequence[Picture], optimum: Optimum) -> Sums | No
     power = max(likely, key=lambda one: likely[one])
     if likely[power] < likely[1.0] + RISE:
         return None
-    return _sums_at(
+    return sums_at(
         pictures, optimum, lambda picture: np.asarray(picture.weights, float) ** (2 - power) * variance[power]
     )
