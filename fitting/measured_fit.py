@@ -9,8 +9,8 @@ which deviations count, by one of three losses of the literature:
 | "squared" | (f - m)² | as the table stands; grazing angles count in full |
 | "log" | [log(1 + f cos θ_i) - log(1 + m cos θ_i)]² | Löw et al. 2012: high dynamic range, the tails count too |
 
-The weight is the solid angle that a sample stands for, where the table's grid says it. Negative values count in the
-squared losses as they are; the logarithmic one leaves them out. Angles beyond 80 degrees are left out by default.
+The weight is the solid angle that a sample stands for, where the table's grid says it. Negative values count as they
+are, where the logarithm has a value. Angles beyond 80 degrees are left out by default.
 """
 
 import dataclasses
@@ -217,8 +217,7 @@ class BrdfFitResult(Parameters):
             lines.append(f"  {parameter.name:<4}{label:<8} {parameter}")
         if self.negative:
             why = f", {self.table.below_zero}" if self.table.below_zero else ""
-            counted = "squared losses count them, the logarithm does not"
-            lines.append(f"  {self.negative} values are below 0{why}; {counted}")
+            lines.append(f"  {self.negative} values are below 0{why}; they count as they are")
         lines += [f"  left out    {count} {reason}" for reason, count in self.left_out.items()]
         lines.append(f"  {'deviation of':<24}{'cosine':>10}{'squared':>10}{'log':>10}{'misplaced':>11}")
         for index, candidate in enumerate(self.candidates):
@@ -329,8 +328,8 @@ def fit_brdf(
     (count, channels), negative = samples.values.shape, samples.negative
     left_out = table.left_out | {f"further than {max_angle:g}° from the normal": len(table.values) - count}
     if loss == "log":
-        left_out |= {"values below 0, out of reach of the logarithm": negative}
-    left_out = {reason: number for reason, number in left_out.items() if number}
+        left_out |= {"values out of reach of the logarithm": np.count_nonzero(~_in_reach(samples))}
+    left_out = {reason: int(number) for reason, number in left_out.items() if number}
     kinds = brdf.MODELS.values() if model == "auto" else [brdf.MODELS[model]]
     kinds = [
         kind for kind in kinds if count * channels > channels + issubclass(kind, SpecularMaterial) * (channels + 1)
@@ -367,7 +366,7 @@ def _fit_model(model, samples, loss, n_range):
     channels, specular = values.shape[1], issubclass(model, SpecularMaterial)
     log_cos, reach = _lobe(model, samples) if specular else (0.0 * cosine, 0.0 * cosine)
     free = np.repeat([[False], [True], [specular]], channels, axis=1)
-    brightest, value = np.pi * np.max(np.abs(values), axis=0), np.maximum(values, 0.0) * cosine
+    brightest, value = np.pi * np.max(np.abs(values), axis=0), values * cosine
 
     def solve(modelled):
         """The least weighted squares; a diffuse coefficient that the search cannot tell from 0 is 0.
@@ -376,7 +375,7 @@ def _fit_model(model, samples, loss, n_range):
         a perfect model, which sees the tails that the peak would drown.
         """
         if loss == "log":
-            weight = cosine**2 * weights("log", 1 + value, 1 + modelled, share * (values >= 0), np.zeros(1))
+            weight = cosine**2 * weights("log", 1 + value, 1 + modelled, share * _in_reach(samples), np.zeros(1))
         else:
             weight = (share if loss == "squared" else share * cosine**2)[:, 0]
         with jax.enable_x64(True):
@@ -388,7 +387,7 @@ def _fit_model(model, samples, loss, n_range):
         highlight = x[2] * reach * np.exp(optimum.n * log_cos)
         return picture, dataclasses.replace(optimum, x=x), highlight, (x[1] + highlight) / np.pi
 
-    picture, optimum, highlight, f_r = solve(value)
+    picture, optimum, highlight, f_r = solve(np.maximum(value, 0.0))
     least = _losses(samples, f_r)
     for _ in range(_MOST_ROUNDS if loss == "log" else 0):
         closer = solve(f_r * cosine)
@@ -424,10 +423,15 @@ def _lobe(model, samples):
     return np.maximum(log_cos, _LEAST), np.where(log_cos > _DARK, reach, 0.0)
 
 
+def _in_reach(samples):
+    """Of which values the logarithmic loss is one: of 1 + f cos θ above 0."""
+    return samples.values * samples.to_light[:, 2:] > -1
+
+
 def _losses(samples, model):
     values, cosine, share = samples.values, samples.to_light[:, 2:], samples.solid_angle[:, None]
-    counted = share * (values >= 0)
-    logarithms = np.log1p(np.maximum(values, 0.0) * cosine) - np.log1p(model * cosine)
+    counted = share * _in_reach(samples)
+    logarithms = np.log1p(np.where(counted > 0, values * cosine, 0.0)) - np.log1p(model * cosine)
 
     def relative(weight, power=2):
         return float(np.sum(weight * np.abs(values - model) ** power) / np.sum(weight * np.abs(values) ** power))
