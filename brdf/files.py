@@ -255,6 +255,21 @@ def read_text(path: AnyPath, most: int = MAX_TEXT_BYTES) -> str:
     return text
 
 
+def continued_lines(text: str) -> Iterator[tuple[int, str]]:
+    """Lines, each with those that a backslash at its end goes on with, and the number of its first; no remark goes on.
+
+    Args:
+        text: what a file holds.
+    """
+    start, begun = 0, ""
+    for number, line in enumerate([*text.splitlines(), ""], start=1):  # which ends a line that would go on
+        start = start if begun else number
+        line = begun + line.strip()
+        begun = line[:-1] + " " if line.endswith("\\") and not line.startswith("#") else ""
+        if not begun:
+            yield start, line
+
+
 def read_toml(path: AnyPath, most: int = MAX_TEXT_BYTES) -> dict[str, Any]:
     """Read a TOML file.
 

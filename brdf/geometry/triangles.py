@@ -28,7 +28,7 @@ from jaxtyping import Float, Int
 
 from brdf.checks import LARGEST, Scalar, instance
 from brdf.errors import InputError
-from brdf.files import parse_number, read_text
+from brdf.files import continued_lines, parse_number, read_text
 from brdf.geometry.shapes import Hit, Shape, meet_plane
 from brdf.vectors import Components, normalize
 
@@ -165,7 +165,7 @@ def load_mesh(path: str | os.PathLike[str], *, smooth: bool = True) -> Mesh:
     _trimesh()  # told now, not when the first ray is sent
     values: dict[str, list[list[float]]] = {"v": [], "vn": []}
     faces, normal_of = [], []
-    for line, text in enumerate(read_text(path).replace("\\\n", "  ").splitlines(), start=1):
+    for line, text in continued_lines(read_text(path)):
         kind, *words = text.partition("#")[0].split() or [""]
         try:
             if kind in values:

@@ -11,7 +11,7 @@ import numpy as np
 
 from brdf.conversions import half_from_mirror, mirror_from_half
 from brdf.errors import InputError
-from brdf.files import parse_number
+from brdf.files import continued_lines, parse_number
 from brdf.models import MODELS, BlinnPhong, Lambert, Material, NormalizedPhong, Phong, SpecularMaterial
 
 SHOWN = 40  # the first letters of a word that messages show
@@ -71,14 +71,9 @@ def read_mtl(path: Any, text: str) -> dict[str, dict[str, Any]]:
         InputError: naming the line.
     """
     entries: dict[str, dict[str, Any]] = {}
-    name, comments, start, begun = None, {}, 0, ""
-    for number, line in enumerate([*text.splitlines(), ""], start=1):  # which ends a line that would go on
-        start = start if begun else number
-        line = begun + line.strip()
-        begun = line[:-1] + " " if line.endswith("\\") and not line.startswith("#") else ""
-        if begun:
-            continue
-        where = f"{path}: line {start}"
+    name, comments = None, {}
+    for number, line in continued_lines(text):
+        where = f"{path}: line {number}"
         for key, comment in _COMMENTS.items():
             if line.startswith(comment):
                 comments[key] = line.removeprefix(comment).strip()
