@@ -173,7 +173,9 @@ def load_result(folder: str | Path) -> FitResult:
 def _parameter(values: dict[str, Any]) -> Parameter:
     low, high = values["interval"] or (None, None)
     ends = (-math.inf if low is None else low, math.inf if high is None else high)
-    return Parameter(**values | {"interval": values["interval"] and ends, "reason": values["reason"] or ""})
+    direction = values["direction"] and tuple(values["direction"])
+    values |= {"interval": values["interval"] and ends, "reason": values["reason"] or "", "direction": direction}
+    return Parameter(**values)
 
 
 def _choice(basis, attempts, **values):

@@ -208,6 +208,7 @@ def test_a_joint_fit_chooses_the_model_and_tells_errors_as_a_fit_does(target: np
     result.save(tmp_path, plot=True)
     again = fitting.load_result(tmp_path)
     assert str(again) == str(result)
+    assert again["lights[0].direction"] == found
     assert again.scenes[0].lights[0].direction == pytest.approx(result.scenes[0].lights[0].direction)
 
 
