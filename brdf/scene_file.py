@@ -13,7 +13,7 @@ import numpy as np
 from brdf.arguments import Layer, Table
 from brdf.checks import direction_value, spectrum
 from brdf.errors import InputError
-from brdf.files import read_toml, write_text
+from brdf.files import read_toml, utf8_name, write_text
 from brdf.geometry.camera import CAMERAS
 from brdf.geometry.shapes import Rectangle, Shape, Sphere
 from brdf.geometry.surface_points import SurfacePoints
@@ -152,8 +152,9 @@ def write_scene(path: str | Path, scene: Any, aov: str | None = None) -> None:
     def beside(ending, write, content):
         """The name of a file beside the scene's, which is written."""
         file = path.with_name(f"{path.stem}.{ending}")
+        name = utf8_name(file.name)  # as TOML holds it
         write(file, content)
-        return file.name
+        return name
 
     def section(header: str, fields, **values) -> None:
         values = fields | values

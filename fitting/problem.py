@@ -381,6 +381,8 @@ def _check_options(problem: FitProblem) -> None:
             raise InputError(name, f"must be a linear value, got {value!r}", "Give a number")
     if problem.saturation is not None and not problem.saturation > 0:
         raise InputError("saturation", f"must be above 0, got {problem.saturation}", "Give the value of clipped pixels")
+    if problem.dark is not None and problem.dark < 0:
+        raise InputError("dark", f"must be at least 0, got {problem.dark}", "Leave it out where no pixel is too dark")
     if problem.noise is None:
         return
     words = "Give (read, shot): the variance of a value is read² + shot · value"

@@ -184,6 +184,9 @@ def all_devices(devices: str | None) -> Any:
         # Of the host platform alone: where there is an accelerator it is that that is taken.
         with contextlib.suppress(RuntimeError):  # JAX has begun, with the devices that it has
             jax.config.update("jax_num_cpu_devices", core_count())
+    for name in (*PROCESSES, "JAX_PROCESS_ID"):
+        if not (told := os.environ.get(name, "1")).isdecimal():
+            raise InputError(name, f"must be a whole number, got {told!r}", "Correct or unset this variable")
     if any(int(os.environ.get(name, "1")) > 1 for name in PROCESSES) and not jax.distributed.is_initialized():
         jax.config.update("jax_cpu_collectives_implementation", "gloo")
         # JAX reads the address of the first one by itself, and asks Slurm and Open MPI for the rest.

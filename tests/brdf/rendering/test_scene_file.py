@@ -9,6 +9,7 @@ import pytest
 
 import brdf
 from benchmarks.fuzz_corpus import CAMERA, LIGHT, POINT, SPHERE
+from brdf.geometry.triangles import Mesh
 from brdf.images.writing import write_layers
 
 FULL = """
@@ -349,3 +350,10 @@ def test_a_scene_that_is_refused(folder_with_normals, name):
 def test_lights_from_far_away_need_no_positions(folder_with_normals, light):
     (folder_with_normals / "scene.toml").write_text(AOV + light)
     assert brdf.Scene.load(folder_with_normals / "scene.toml").points is not None
+
+
+def test_a_name_that_toml_cannot_hold_is_refused(tmp_path):
+    mesh = brdf.Triangles(Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]))
+    camera = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2, resolution=(2, 2))
+    with pytest.raises(brdf.InputError, match=r"shape0\.obj: has a name or folder that is not UTF-8"):
+        brdf.Scene(camera, [mesh]).save(tmp_path / "s\udcff.toml")

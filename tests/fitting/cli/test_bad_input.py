@@ -210,6 +210,7 @@ CASES: list[tuple[dict[str, Any], str, str]] = [
     ({}, f"{FIT} --saturation nan", "^error: --saturation: must be a linear value"),
     ({}, f"{FIT} --saturation 1e-6", "target.exr: is clipped at 1e-06"),
     ({}, f"{FIT} --dark nan", "^error: --dark: must be a linear value"),
+    ({}, f"{FIT} --dark -1", "^error: --dark: must be at least 0, got -1"),
     ({}, f"{FIT} --noise 1", "^error: --noise: must be 2 finite numbers"),
     ({}, f"{FIT} --noise -1,0", "^error: --noise: must be two numbers of 0"),
     ({}, f"{FIT} --plot", "^error: --plot: needs a folder"),

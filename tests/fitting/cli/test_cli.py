@@ -148,3 +148,8 @@ def test_nothing_else_of_an_archive_is_read(tmp_path):
     arrays = {"images": np.ones((1, 2, 2)), "normal": np.ones((2, 2, 3)), "light_dirs": np.ones((1, 3))}
     np.savez(tmp_path / "a.npz", **arrays, evil=np.array([print], dtype=object))
     assert set(read_archive(tmp_path / "a.npz")) == set(arrays)
+
+
+def test_a_number_of_processes_that_is_none_is_told(folder, monkeypatch, capsys):
+    monkeypatch.setenv("JAX_NUM_PROCESSES", "two")
+    refused(capsys, folder, "JAX_NUM_PROCESSES: must be a whole number, got 'two'", "fit", folder, "--devices", "all")
