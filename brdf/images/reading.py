@@ -467,8 +467,9 @@ def read_layers(path: AnyPath) -> dict[str, Float32[np.ndarray, "height width ch
 
     Returns:
         Layer name to values as stored, not decoded. The name is what comes before the last dot of the channels' names;
-        where they have none, it is the name of the file's part if it has several, else "". Channels are in the order
-        R G B A, X Y Z, U V, else in the order of the file.
+        where they have none, it is the name of the file's part if it has several, else "". A layer of a later part
+        whose name is taken has its part's before it. Channels are in the order R G B A, X Y Z, U V, else in the order
+        of the file.
 
     Raises:
         InputError: if the file cannot be read.
@@ -490,7 +491,9 @@ def read_layers(path: AnyPath) -> dict[str, Float32[np.ndarray, "height width ch
         for (of_part, layer), at in found.items():
             if of_part == part:
                 usual = sorted(at, key=lambda ending: "RGBAXYZUV".find(ending) % 10)  # others last
-                layers[layer or own] = pixels[..., [at[ending] for ending in usual]]
+                name = layer or own
+                name = f"{own}.{name}" if name in layers else name
+                layers[name] = pixels[..., [at[ending] for ending in usual]]
     image.close()
     return layers
 

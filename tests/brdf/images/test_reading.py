@@ -165,6 +165,19 @@ def test_parts_of_an_exr(tmp_path):
         np.testing.assert_array_equal(layers["depth"], values[1])
 
 
+def test_layers_of_one_name_in_two_parts_are_both_read(tmp_path):
+    specs, path = [oiio.ImageSpec(6, 4, 3, "float") for _ in range(2)], str(tmp_path / "a.exr")
+    file = oiio.ImageOutput.create(path)
+    for index, spec in enumerate(specs):
+        spec.attribute("oiio:subimagename", ["left", "right"][index])
+        spec.channelnames = ("N.X", "N.Y", "N.Z")
+    for index in range(2):
+        assert file.open(path, specs[1], "AppendSubimage") if index else file.open(path, tuple(specs))
+        assert file.write_image(np.full((4, 6, 3), index, np.float32))
+    assert file.close()
+    assert {name: values.mean() for name, values in read_layers(path).items()} == {"N": 0, "right.N": 1}
+
+
 def test_masks(tmp_path):
     inside = random(8, 9) > 0.5
     white = np.where(inside, 255, 0).astype(np.uint8)
