@@ -57,6 +57,12 @@ and n would go up together without end."""
 JOINT_STEPS = 5
 """Gauss-Newton steps of material and normal together."""
 
+TURNS = 2
+"""How often these are taken without the outliers of the last."""
+
+DARK = 0.15
+"""Of the level of what is lit: values below may lie in a shadow."""
+
 HIGHLIGHTS = (4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0)
 """Exponents of a highlight that tells where the search for a normal starts."""
 
@@ -555,9 +561,9 @@ def inliers(residual: Components, seen: Array, counts: Array) -> Array:
 def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Components, Array, Array]:
     """The best material and normal of each texel.
 
-    Lambert's law, fitted to what is neither highlight nor shadow, gives a normal, and a highlight alone, as of metals,
-    another. The search over n gives each a material, and Gauss-Newton takes the better of them with its normal
-    together; what no material explains is left out, n is sought once more, and both together again.
+    A highlight alone, as of metals, gives a normal, and Lambert's law, fitted to what is neither highlight nor shadow,
+    another. The search over n gives each a material, and from the better one Gauss-Newton takes it and the normal
+    together, `TURNS` times: each time without what the last one does not explain.
 
     Args:
         texels: without columns.
@@ -568,39 +574,63 @@ def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Components,
         outlier, (T, P): neither counts in the fit otherwise.
     """
     seen, shown = texels.seen, over_channels(texels.unweighted(texels.values))
+    if lights.ambient is not None:
+        ambient = over_channels(lights.ambient)
+        least = jnp.min(jnp.where(seen * ambient > 0, divide(shown, ambient), jnp.inf), axis=1, keepdims=True)
+        shown = seen * (shown - jnp.where(least < jnp.inf, least, 0) * ambient)
+    # Of a mean that what is dark does not change, and highlights little.
+    bright = seen * (shown > DARK * divide(*sums_of(shown, square_root(jnp.maximum(shown, 0))))[:, None] ** 2)
 
-    def tried(start):
-        normal, counts = start
-        fit = texels.where(counts).facing(normal, lights).fitted()
-        return Trial.of(texels, fit, counts, normal)
+    def lit(normal):
+        return seen if lights.ambient is not None else jnp.where(beside(normal) @ lights.to_light > 0, seen, 0)
 
-    def unshadowed(_, start):
-        counts = seen * ~shadowed(shown, seen * jnp.maximum(beside(start[0]) @ lights.to_light, 0))
-        return lambert_normals(shown, counts, lights.to_light), counts
+    def tried(normal, counts, turns):
+        some = texels.where(lit(normal) * counts)
+        found = some.facing(normal, lights).fitted()
+        start = found.log_n, normal
+        log_n, normal = jax.lax.cond(turns, lambda start: jointly(some, lights, *start)[:2], lambda start: start, start)
+        there, facing = texels.facing(normal, lights), lit(normal)
+        fit = there.where(facing * counts).at(log_n, errors=False)
+        residual = there.residual(fit)
+        direct = over_channels(there.values - residual)
+        if lights.ambient is not None:
+            direct -= over_channels(there.linear[0] * beside(fit.k[0]))
+        bare = facing * (over_channels(residual) >= -0.5 * direct)
+        counts = jnp.where(facing > 0, inliers(residual, facing, bare), seen - bright)
+        # What is bright is to be explained by one of the starts, be it an outlier of this one.
+        judged = jnp.maximum(counts, bright)
+        cost = jnp.sum(*sums(judged * residual * residual), axis=0)
+        trial = Trial.of(texels, fit._replace(cost=cost, rival=found.rival), judged, normal)
+        return trial._replace(counts=counts.T)
 
-    def again(_, state):
-        log_n, normal, _, _, counts, _ = state
-        there = texels.facing(normal, lights)
-        lit = seen if lights.ambient is not None else jnp.where(there.linear[0].parts[0] > 0, seen, 0)
-        counts = inliers(there.residual(there.where(counts).at(log_n)), lit, lit * counts)
-        some = there.where(counts)
-        fit = some.fitted()
-        return *jointly(some, lights, fit.log_n, normal), lit, counts, fit.rival
-
-    plain = lambert_normals(shown, seen, lights.to_light), seen
-    starts = [plain, jax.lax.fori_loop(0, 2, unshadowed, plain)]
+    normals = [lambert_normals(shown, bright, lights.to_light)]
     if texels.glossy:
-        starts.append((highlight_normals(texels.model, shown, seen, lights), seen))
-    found = jax.lax.map(tried, jax.tree.map(lambda *some: jnp.stack(some), *starts))
-    trials = [jax.tree.map(operator.itemgetter(i), found) for i in range(len(starts))]
-    best = functools.reduce(Trial.or_better, trials)
-    state = best.fit.log_n, best.normal, best.cost, seen, best.counts.T, best.fit.rival
-    log_n, normal, cost, lit, counts, rival = jax.lax.fori_loop(0, 2, again, state)
+        normals.insert(0, highlight_normals(texels.model, shown, bright, lights))
+    count = len(normals)
+    starts = jax.tree.map(lambda *some: jnp.stack(some), *normals)
+
+    def step(i, best):
+        begins = i < count
+        normal = jax.tree.map(lambda some, found: jnp.where(begins, some[i], found), starts, best.normal)
+        trial = tried(normal, jnp.where(begins, bright, best.counts.T), ~begins)
+        # The normal of a highlight alone is not good enough to tell what is none of it.
+        trial = trial._replace(counts=jnp.where(i < count - 1, bright.T, trial.counts))
+        kept = begins & (best.cost < trial.cost)
+        return jax.tree.map(lambda a, b: jnp.where(kept, a, b), best, trial)
+
+    nothing = jax.tree.map(jnp.zeros_like, jax.eval_shape(tried, normals[0], bright, True))
+    nothing = nothing._replace(cost=jnp.full_like(nothing.cost, jnp.inf))
+    best = jax.lax.fori_loop(0, count + TURNS, step, nothing)
+    facing = lit(best.normal)
+    some, rival = texels.where(facing * best.counts.T), best.fit.rival
+    found = jointly(some, lights, best.fit.log_n, best.normal)
     if texels.glossy:
-        log_n, normal, least = restarted(texels.where(counts), lights, (log_n, normal, cost))
-        rival = [jnp.where(least < cost, 0, one) for one in rival]
-    fit = joint_fit(texels.where(counts).facing(normal, lights), lights, log_n, normal)
-    return fit._replace(rival=rival), normal, lit, counts
+        cost = found[2]
+        found = restarted(some, lights, found)
+        rival = [jnp.where(found[2] < cost, 0, one) for one in rival]
+    log_n, normal, _ = found
+    fit = joint_fit(some.facing(normal, lights), lights, log_n, normal)
+    return fit._replace(rival=rival), normal, lit(normal), facing * best.counts.T
 
 
 def restarted(texels: Texels, lights: Distant, found: tuple[Array, Components, Array]) -> Any:

@@ -106,20 +106,33 @@ def test_matt_texels_show_no_highlight_that_noise_has_put_between_the_lights():
         fitting.fit_maps(matt[:, None], lights * [1, 1, -1], truth["normal"][None])
 
 
-def photographed(encoding: str, shadowed: float, gloss: float = 1.0) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Codes of 8 bits with noise of 0.7 of them; of some values a cast shadow leaves 5 % of the light."""
+def photographed(
+    encoding: str, shadowed: float | np.ndarray, gloss: float = 1.0
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Codes of 8 bits with noise of 0.7 of them; of some values a cast shadow leaves 5 % of the light.
+
+    Of a share of all, or of given ones, (P, 1, 256).
+    """
     pictures, truth = texels(256, 0.0, dome(32), n=(10, 80))
     matte, _ = texels(256, 0.0, dome(32), n=(1e9, 1e9))
     pictures = 0.5 * (matte + gloss * (pictures - matte))
     random = np.random.default_rng(2)
-    pictures *= np.where(random.random(pictures.shape[:3]) < shadowed, 0.05, 1)[..., None]
+    dark = shadowed if isinstance(shadowed, np.ndarray) else random.random(pictures.shape[:3]) < shadowed
+    pictures *= np.where(dark, 0.05, 1)[..., None]
     codes = 255 * encode(pictures, encoding) + random.normal(0, 0.7, pictures.shape)
     return np.clip(np.round(codes), 0, 255).astype(np.uint8), truth
 
 
-@pytest.mark.parametrize(("encoding", "normals"), [("srgb", "given"), ("linear", "fit")])
-def test_photographs_of_eight_bits_with_cast_shadows(encoding, normals):
-    codes, truth = photographed(encoding, 0.2)
+# A wall beside each texel, that hides all lights of its side up to some height: up to half of them.
+WALLS = np.random.default_rng(3).normal(size=(256, 2))
+WALLS = (dome(32)[:, :2] @ (WALLS / np.linalg.norm(WALLS, axis=1)[:, None]).T > 0.3 * dome(32)[:, 2:])[:, None]
+
+
+@pytest.mark.parametrize(
+    ("encoding", "normals", "shadowed"), [("srgb", "given", 0.2), ("linear", "fit", 0.2), ("linear", "fit", WALLS)]
+)
+def test_photographs_of_eight_bits_with_cast_shadows(encoding, normals, shadowed):
+    codes, truth = photographed(encoding, shadowed)
     given = truth["normal"][None] if normals == "given" else "fit"
     maps = fitting.fit_maps(codes, dome(32), given, encoding=encoding)
     known = maps.determined[0]
