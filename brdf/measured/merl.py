@@ -68,7 +68,7 @@ def load(path: Path) -> MeasuredBRDF:
 
 
 def merl_table(f_r: Callable[[Any, Any], Any], *, name: str = "table") -> MeasuredBRDF:
-    """The table that a measurement of a BRDF on MERL's grid would give.
+    """The table that a measurement of a BRDF on MERL's grid would give; checks look between its entries too.
 
     Args:
         f_r: from light and view directions, (P, 3) each, to values in 1/sr, (P, C) or (P,).
@@ -81,7 +81,12 @@ def merl_table(f_r: Callable[[Any, Any], Any], *, name: str = "table") -> Measur
         >>> brdf.merl_table(lambda to_light, to_view: np.full(len(to_light), 0.2), name="chalk")
         MeasuredBRDF('chalk', 1096216 samples x 1 channels, 0 negative values)
     """
-    return sampled(grid(), f_r, name=name)
+
+    def evaluate(to_light: Any, to_view: Any) -> Any:
+        values = np.asarray(f_r(to_light, to_view))
+        return values[:, None] if values.ndim == 1 else values
+
+    return sampled(grid(), evaluate, name=name, evaluate=evaluate)
 
 
 def _look_up(values, to_light, to_view):

@@ -103,3 +103,14 @@ def test_energy_of_a_white_merl_table(tmp_path):
     assert report.energy.value == pytest.approx(0.9, abs=max(report.energy.error_bound, 2e-3))
     assert report.energy.verdict == "pass"
     assert report.reciprocity.verdict == "pass"
+
+
+def test_a_table_of_ones_own_is_checked_between_its_entries():
+    """By its entries alone, whose partners are half a degree off, the verdict was that one cannot tell."""
+
+    def lobe(to_light, to_view):
+        half = to_light + to_view
+        return 0.1 + 0.3 * (half[:, 2] / np.linalg.norm(half, axis=1)) ** 40
+
+    report = brdf.check(brdf.merl_table(lobe))
+    assert {report.positivity.verdict, report.reciprocity.verdict, report.energy.verdict} == {"pass"}
