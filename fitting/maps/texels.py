@@ -584,11 +584,23 @@ def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Components,
     def lit(normal):
         return seen if lights.ambient is not None else jnp.where(beside(normal) @ lights.to_light > 0, seen, 0)
 
-    def tried(normal, counts, turns):
-        some = texels.where(lit(normal) * counts)
+    normals = [lambert_normals(shown, bright, lights.to_light)]
+    if texels.glossy:
+        normals.insert(0, highlight_normals(texels.model, shown, bright, lights))
+    count = len(normals)
+    starts = jax.tree.map(lambda *some: jnp.stack(some), *normals)
+
+    @functools.partial(jax.jit, inline=True)  # its shapes are asked for below: it is traced once
+    def tried(i, normal, counts):
+        before = lit(normal)
+        used = before * counts
+        some = texels.where(used)
         found = some.facing(normal, lights).fitted()
-        start = found.log_n, normal
-        log_n, normal = jax.lax.cond(turns, lambda start: jointly(some, lights, *start)[:2], lambda start: start, start)
+        start = found.log_n, normal, found.cost
+        together = functools.partial(jointly, some, lights)
+        log_n, normal, least = jax.lax.cond(
+            i < count, lambda *start: start, lambda *start: together(*start[:2]), *start
+        )
         there, facing = texels.facing(normal, lights), lit(normal)
         fit = there.where(facing * counts).at(log_n, errors=False)
         residual = there.residual(fit)
@@ -601,36 +613,26 @@ def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Components,
         judged = jnp.maximum(counts, bright)
         cost = jnp.sum(*sums(judged * residual * residual), axis=0)
         trial = Trial.of(texels, fit._replace(cost=cost, rival=found.rival), judged, normal)
-        return trial._replace(counts=counts.T)
+        return trial._replace(counts=counts.T), before.T, used.T, least
 
-    normals = [lambert_normals(shown, bright, lights.to_light)]
-    if texels.glossy:
-        normals.insert(0, highlight_normals(texels.model, shown, bright, lights))
-    count = len(normals)
-    starts = jax.tree.map(lambda *some: jnp.stack(some), *normals)
-
-    def step(i, best):
-        begins = i < count
-        normal = jax.tree.map(lambda some, found: jnp.where(begins, some[i], found), starts, best.normal)
-        trial = tried(normal, jnp.where(begins, bright, best.counts.T), ~begins)
+    def step(i, found):
+        begins, best = i < count, found[0]
+        normal = jax.tree.map(lambda some, last: jnp.where(begins, some[i], last), starts, best.normal)
+        trial, *values = tried(i, normal, jnp.where(begins, bright, best.counts.T))
         # The normal of a highlight alone is not good enough to tell what is none of it.
         trial = trial._replace(counts=jnp.where(i < count - 1, bright.T, trial.counts))
         kept = begins & (best.cost < trial.cost)
-        return jax.tree.map(lambda a, b: jnp.where(kept, a, b), best, trial)
+        return jax.tree.map(lambda a, b: jnp.where(kept, a, b), found, (trial, *values))
 
-    nothing = jax.tree.map(jnp.zeros_like, jax.eval_shape(tried, normals[0], bright, True))
-    nothing = nothing._replace(cost=jnp.full_like(nothing.cost, jnp.inf))
-    best = jax.lax.fori_loop(0, count + TURNS, step, nothing)
-    facing = lit(best.normal)
-    some, rival = texels.where(facing * best.counts.T), best.fit.rival
-    found = jointly(some, lights, best.fit.log_n, best.normal)
+    nothing, *values = jax.tree.map(jnp.zeros_like, jax.eval_shape(tried, 0, normals[0], bright))
+    nothing = nothing._replace(cost=jnp.full_like(nothing.cost, jnp.inf)), *values
+    best, facing, used, cost = jax.lax.fori_loop(0, count + TURNS, step, nothing)
+    some, log_n, normal, rival = texels.where(used.T), best.fit.log_n, best.normal, best.fit.rival
     if texels.glossy:
-        cost = found[2]
-        found = restarted(some, lights, found)
-        rival = [jnp.where(found[2] < cost, 0, one) for one in rival]
-    log_n, normal, _ = found
+        log_n, normal, least = restarted(some, lights, (log_n, normal, cost))
+        rival = [jnp.where(least < cost, 0, one) for one in rival]
     fit = joint_fit(some.facing(normal, lights), lights, log_n, normal)
-    return fit._replace(rival=rival), normal, lit(normal), facing * best.counts.T
+    return fit._replace(rival=rival), normal, facing.T, used.T
 
 
 def restarted(texels: Texels, lights: Distant, found: tuple[Array, Components, Array]) -> Any:
