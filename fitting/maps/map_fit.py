@@ -11,7 +11,7 @@ from brdf.checks import direction_value
 from brdf.errors import InputError, as_numbers
 from brdf.precision import Precision, working_precision
 from fitting.maps import map_inputs
-from fitting.maps.encoding_guess import likelier
+from fitting.maps.input_guesses import likelier, upside_down
 from fitting.maps.map_bands import fit_bands
 from fitting.maps.map_inputs import Photographs
 from fitting.maps.map_result import Maps
@@ -25,6 +25,9 @@ LOSSY = (
     "{} was compressed with losses, by which neighbours err together, in every photograph alike: errors may be four "
     "times too small, and a faint highlight may be the codec's"
 )
+
+MISFIT = 0.1
+"""Of what photographs show: where that is left normals are doubted."""
 
 COPLANAR = 1e-3
 """Singular value of the directions towards lights: in a plane the least is 0."""
@@ -143,6 +146,8 @@ def fit_maps(
             what = "lie in a plane with the texel, of which normals are not found"
             raise InputError("lights", what, "Give normals, or lights from all sides")
         raise InputError("pictures", "show no texel that counts", "Check mask, normals and clipping")
+    if np.nanmedian(layers["residual"]) > MISFIT:
+        notes += upside_down(problem)
     names = tuple(one.name for one in models)
     return Maps(models=names, to_view=to_view, notes=notes, to_light=given.to_light, **layers)
 

@@ -75,6 +75,13 @@ def test_errors_cover_the_truth(noisy):
         assert 0.88 < np.mean(off[known] < 1.96) <= 1
 
 
+def test_normals_whose_y_goes_down_are_told(noisy):
+    pictures, truth, maps = noisy
+    turned = fitting.fit_maps(pictures, dome(32), truth["normal"][None] * [1, -1, 1])
+    assert any("y turned over" in note for note in turned.notes)
+    assert not maps.notes
+
+
 def test_photographs_count_by_what_is_left_of_their_noise_when_they_are_divided():
     """Sixteen short exposures beside sixteen long ones tell next to nothing, and take nothing away."""
     lights, divided = dome(16), np.repeat([1.0, 1 / 16], 16)

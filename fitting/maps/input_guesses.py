@@ -1,0 +1,83 @@
+"""What photographs and normals do not say of themselves: of two readings that under which the model explains more."""
+
+import dataclasses
+
+import numpy as np
+
+from brdf.images.encoding import Encoding
+from fitting.maps.texels import OUTLIER
+from fitting.maps.tiles import TILE, MapProblem
+from fitting.progress import waiting
+
+SOME = 4 * TILE
+"""Texels that tell, of few rows."""
+
+LESS = 0.9
+"""Silent photographs are read in the unusual way where that leaves less than this share of the squares."""
+
+
+FAR_LESS = 0.5
+"""Normals are told to be upside down where turning them leaves less than this share."""
+
+
+def likelier(problem: MapProblem) -> tuple[MapProblem, tuple[str, ...]]:
+    """Silent photographs as sRGB or linear light: under distant lights as is left less of some texels' codes.
+
+    Args:
+        problem: with silent ones read as is usual for their bits.
+
+    Returns:
+        The problem, and what to tell of it.
+    """
+    given = problem.photographs
+    silent = next((one for one in given.each if one.silent), None)
+    if silent is None:
+        return problem, ()
+    remedy = "Where you know, say so with the encoding"
+    note = f"{silent.name} does not say how its values are encoded: read as"
+    usual, other = ("linear", "sRGB") if silent.curve == "linear" else ("sRGB", "linear")
+    encodings: dict[str, Encoding] = {"sRGB": "srgb", "linear": "linear"}
+    readings = {}
+    for name, encoding in encodings.items():
+        each = tuple(one.read_as(encoding) if one.silent else one for one in given.each)
+        readings[name] = dataclasses.replace(problem, photographs=dataclasses.replace(given, each=each))
+    left = {name: _left(one) for name, one in readings.items()}
+    if any(np.isnan(one) for one in left.values()):
+        return problem, (f"{note} {usual}. {remedy}",)
+    if left[other] ** 2 < LESS * left[usual] ** 2:
+        usual, other = other, usual
+    note += f" {usual}, under which the maps are off by {left[usual]:.2g} codes, under {other} by {left[other]:.2g}"
+    return readings[usual], (f"{note}. {remedy}",)
+
+
+def upside_down(problem: MapProblem) -> tuple[str, ...]:
+    """What to tell of given normals that explain some texels far better with y turned: of many programs it goes down.
+
+    Args:
+        problem: with normals that are given or sought.
+    """
+    surface = problem.surface
+    if surface.normal is None or surface.points is not None:
+        return ()
+    turned = surface._replace(normal=surface.normal * np.array([1, -1, 1], np.float32))
+    left, otherwise = map(_left, (problem, dataclasses.replace(problem, surface=turned)))
+    if not otherwise**2 < FAR_LESS * left**2:
+        return ()
+    what = f"the normals leave {left / otherwise:.2g} times as much of the photographs as with y turned over"
+    return (f"{what}, which seems to go down in them. Give flip_y (--flip-y)",)
+
+
+def _left(problem: MapProblem) -> float:
+    """What is left of some texels' codes, under distant lights; NaN where none of them tells."""
+    given, texels = problem.photographs, problem.texels
+    if given.to_light is None or not texels.size:
+        return np.nan
+    row = texels // given.size[1]
+    rows = np.unique(row)
+    rows = rows[np.linspace(0, rows.size - 1, -(-min(SOME, texels.size) * rows.size // texels.size)).astype(int)]
+    texels = texels[np.isin(row, rows)]
+    texels = texels[:: -(-texels.size // SOME)]
+    with waiting("fitting some texels"):
+        layers = {name: layer[: texels.size] for name, layer in problem.fit(*problem.tiles(texels)).items()}
+    codes = 255 * np.sqrt(np.mean(given.unit**2)) * layers["noise"] * np.sqrt(1 + OUTLIER**2 * layers["left_out"])
+    return float(np.nanmedian(codes)) if np.any(np.isfinite(codes)) else np.nan
