@@ -250,7 +250,7 @@ class Residual:
             most *= min(self.pictures[0].scene.resolution) if unit == "pixels" else 1
             if max(length, error) < most:
                 size = float(size[0]) if len(size) == 1 else length
-                share = min(gain / max(self.excess, gain), 1.0)
+                share = min(gain / max(self.excess, gain, TINY), 1.0)
                 yield _Test(Cause(name, size, error, unit, share, remedy), columns, gain, inflation)
 
     def mirrored(self) -> Iterator[_Test]:
@@ -314,4 +314,4 @@ def _white_noise(
     differences = np.concatenate(pairs)
     differences = differences[np.isfinite(differences[:, 0])]
     scale = max(float(np.max(np.abs(residual), initial=0.0)) for residual in residuals)
-    return np.sqrt(np.sum(differences**2, axis=0) / max(2 * len(differences), 1)) + np.float64(1e-7 * scale + TINY)
+    return np.sqrt(np.sum(differences**2, axis=0) / max(2 * len(differences), 1)) + 1e-7 * (scale or 1.0)

@@ -168,3 +168,8 @@ def test_a_picture_that_is_its_own_mirror_image_is_not_mirrored():
     causes = dataclasses.replace(result, material=other).diagnosis
     assert causes
     assert not any("mirrored" in cause.name for cause in causes)
+
+
+def test_where_nothing_is_left_nothing_is_wrong():
+    target = np.asarray(brdf.render(brdf.Lambert(k_a=0.5, k_d=0), SCENE))
+    assert fitting.fit(target, SCENE).diagnosis == ()
