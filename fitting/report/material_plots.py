@@ -18,7 +18,7 @@ from brdf.measured.table import MeasuredBRDF, from_angles
 from brdf.models.base import Material, SpecularMaterial
 from brdf.plausibility.numeric import Sampler, albedo_of
 from brdf.plausibility.report import Angles, Report
-from fitting.report.plots import CHANNEL_COLOURS, CHANNELS, OTHERS, PRINT, SIGNED
+from fitting.report.plots import CHANNEL_COLOURS, CHANNELS, OTHERS, PRINT, SIGNED, shown_channels
 
 Brdf = Material | Callable[[Any, Any], Any]
 PARTS = 60  # of the samples of a table, each a point of a line
@@ -71,13 +71,13 @@ def plot_albedo(brdf: Brdf, report: Report | None = None, figure: Any = None) ->
     degrees = np.append(np.arange(0.0, 89.0, 0.5 if known else 2.0), [89.0, 89.5, 89.7, 89.8, 89.9, 89.95, 89.99])
     exact = directional_albedo(brdf, np.radians(degrees), precision="float64") if known else albedo_of(brdf, degrees)
     albedo = np.asarray(exact)
-    count = albedo.shape[1]
+    count, shown = albedo.shape[1], shown_channels(albedo.shape[1])
     figure, axes = _axes(figure, (6, 4))
     axes.axhspan(1, 2, color="0.92", zorder=0)
     axes.axhline(1, color="black")
     axes.annotate("more than arrives", (1, 1), (0, 4), textcoords="offset points", fontsize="small")
     axes.set_prop_cycle(CHANNELS if count == 3 else OTHERS)
-    axes.plot(degrees, albedo, label=channel_names(count))
+    axes.plot(degrees, albedo[:, shown], label=np.array(channel_names(count))[shown].tolist())
     if count > 1:
         axes.legend(loc="best")
     energy = report.energy if report else None
@@ -184,8 +184,7 @@ def plot_table(table: MeasuredBRDF, material: Material, counted: np.ndarray) -> 
     across = [np.mean(angle[part]) for part in parts]
     figure, axes = _axes(None, (4.6, 3.2))
     axes.set(yscale="log", xlabel="half vector from the normal (°)", ylabel="f_r cos θ (1/sr)")
-    shown = np.unique(np.linspace(0, len(table.channels) - 1, 3).round().astype(int))
-    for colour, channel in zip(CHANNEL_COLOURS, shown, strict=False):
+    for colour, channel in zip(CHANNEL_COLOURS, shown_channels(len(table.channels), 3), strict=False):
         measured, modelled = values[:, channel] * light[:, 2], fitted[:, channel] * light[:, 2]
         low, middle, high = np.transpose([np.quantile(measured[part], (0.1, 0.5, 0.9)) for part in parts])
         axes.fill_between(across, low, high, color=colour, alpha=0.2, linewidth=0)

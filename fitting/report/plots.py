@@ -131,14 +131,18 @@ def _scanline(axes, target, fitted, counted, row, columns):
     fitted = np.where(counted | np.any(fitted != 0, axis=-1, keepdims=True), fitted, np.nan)
     target = np.where(counted, target, np.nan)
     circles: dict[str, Any] = {"marker": "o", "linestyle": "", "markersize": 2.5}
-    # Of a spectrum, as many channels as there are colours, from the first to the last.
-    for channel in np.unique(np.linspace(0, count - 1, min(count, len(CHANNELS))).round().astype(int)):
+    for channel in shown_channels(count):
         label = {1: "fit", 3: channel_names(count)[channel]}.get(count, f"channel {channel}")
         (line,) = axes.plot(across, fitted[:, channel], label=label)
         axes.plot(across[some], target[some, channel], color=line.get_color(), **circles)
     axes.plot([], [], color="0.3", label="target", **circles)
     axes.set(xlabel=f"column, in row {row}", ylabel="radiance (linear)", title="scanline")
     axes.legend(ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.2))
+
+
+def shown_channels(count: int, most: int = len(CHANNELS)) -> np.ndarray:
+    """Of a spectrum as many channels as there are colours, from the first to the last."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
 def legible(axis: Any) -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from brdf.models import BlinnPhong, NormalizedPhong
+from brdf.models import BlinnPhong, Lambert, NormalizedPhong
 from brdf.plausibility.verdicts import check
 from fitting.report.material_plots import plot_albedo, plot_lobe, plot_reciprocity
 
@@ -32,3 +32,8 @@ def test_reciprocity_map_is_antisymmetric():
     values = plot_reciprocity(BlinnPhong(k_d=0.3, k_s=0.5, n=8.0)).axes[0].collections[0].get_array()
     np.testing.assert_allclose(values, -np.transpose(values), atol=1e-9)
     assert np.max(values) > 0.5
+
+
+def test_of_a_spectrum_there_are_as_many_albedo_curves_as_colours():
+    figure = plot_albedo(Lambert(k_d=np.linspace(0.1, 0.9, 31)))
+    assert [text.get_text() for text in figure.axes[0].get_legend().get_texts()] == ["0", "6", "12", "18", "24", "30"]
