@@ -215,6 +215,8 @@ def uncertainty(
         deviation = math.hypot(deviation, resolution * value)
         wide = deviation * reaches[channel] / NORMAL_95
         x_interval[term, channel], x_error[term, channel] = above_zero(value, wide), deviation
+        # What is at its bound may be there, whatever the slope of a likelihood that is nearly flat.
+        x_interval[term, channel, 0] *= x[term, channel] > 0
         if known[term, channel] and alone**2 * optimum.gram[channel, term, term] > largest:
             reasons[term, channel] = "its error is larger than the whole picture"
             x_error[term, channel] = np.inf
