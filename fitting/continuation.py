@@ -6,6 +6,7 @@ those that are predicted near the edge of a code, and the reach of Newton's meth
 squares leaves, and follows its own score from there, by steps of some factor at most, each time from the last answer.
 """
 
+import copy
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
@@ -14,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from fitting.likelihood import Bounds, LogLikelihood, Values
+from fitting.likelihood import Bounds, LogLikelihood, Values, alike, weight_of_alike
 from fitting.solver.nnls import nonnegative_minimum
 
 # In codes: below this the edges of codes are as sharp as the arithmetic of the pictures.
@@ -335,25 +336,26 @@ def most_informative(precisions: Sequence[Precision]) -> Precision:
     return max([precisions[0], *enough], key=lambda entry: entry.information)
 
 
+def _variances(precisions: Sequence[Precision]) -> Float[np.ndarray, "N U"]:
+    """Variance of each unknown, infinite where not enough values tell of it."""
+    variance = np.array([entry.variance for entry in precisions])
+    enough = np.array([entry.values for entry in precisions]) >= FEWEST_VALUES
+    # With the most noise all values tell.
+    enough[0] = True
+    return np.where(enough & (variance > 0), variance, np.inf)
+
+
 def least_variance(precisions: Sequence[Precision]) -> Float[np.ndarray, " U"]:
     """Variance of each unknown where it is known best by enough values; infinite where it is not known at all.
 
     Args:
         precisions: from much noise to little.
     """
-    variance = np.array([entry.variance for entry in precisions])
-    enough = np.array([entry.values for entry in precisions]) >= FEWEST_VALUES
-    # With the most noise all values tell.
-    enough[0] = True
-    return np.min(np.where(enough & (variance > 0), variance, np.inf), axis=0)
+    return np.min(_variances(precisions), axis=0)
 
 
 def most_informative_score(
-    problem: Problem,
-    at: Estimate,
-    precisions: Sequence[Precision],
-    score: Score,
-    alone: Float[np.ndarray, " U"] | float = 0.0,
+    problem: Problem, at: Estimate, precisions: Sequence[Precision]
 ) -> tuple[Score, Float[np.ndarray, " U"]]:
     """What the values say of an estimate at the noise of which errors are, and what to multiply these by.
 
@@ -361,15 +363,25 @@ def most_informative_score(
         problem: values and their model.
         at: the most likely unknowns.
         precisions: what was known of them on the way.
-        score: what the values say of them.
-        alone: variance of each that is left in any case.
     """
+    codes = problem.codes(at.unknowns)
+    # In a file with losses these hide what rounding has done.
+    counts = [alike(*both, level=True) * (not both[0].lossy) for both in zip(problem.bounds, codes, strict=True)]
+
+    def here(entry: Precision) -> tuple[Score, Precision]:
+        """At these unknowns: elsewhere, as with none at its bound, they may have been told apart better."""
+        there = at._replace(noise=entry.noise)
+        values = list(map(copy.copy, problem.near(codes, REACH * entry.noise)))
+        for some, count in zip(values, counts, strict=True):
+            some.weight = some.weight * weight_of_alike(count[some.which], entry.noise)
+        score = problem.score(there, values)
+        return score, precision(problem, there, score)
+
     most = most_informative(precisions)
-    if most is not precisions[-1]:
-        at = at._replace(noise=most.noise)
-        score = problem.score(at, problem.near(problem.codes(at.unknowns), REACH * at.noise))
-        most = precision(problem, at, score)
     # Each unknown is known as well as where enough values still tell of it.
-    least = np.maximum(least_variance(precisions), alone)
-    ratio = np.divide(least, most.variance, out=np.ones_like(least), where=(most.variance > 0) & np.isfinite(least))
+    best = [precisions[index] for index in np.unique(np.argmin(_variances(precisions), axis=0))]
+    score, known = here(most)
+    again = [known, *(here(entry)[1] for entry in best if entry is not most)]
+    least = np.maximum(least_variance(again), least_variance(precisions))
+    ratio = np.divide(least, known.variance, out=np.ones_like(least), where=(known.variance > 0) & np.isfinite(least))
     return score, np.sqrt(ratio)

@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float
 
 from fitting.continuation import Estimate, Precision, Problem, Score, maximise, most_informative_score
 from fitting.joint_problem import JointProblem, linearised
-from fitting.likelihood import Bounds, Values, in_light, is_curved, residual_deviation
-from fitting.maximum_likelihood import FAINT, FIRST_NOISE, LIKELIER, alike
+from fitting.likelihood import Bounds, Values, alike, in_light, is_curved, residual_deviation, weight_of_alike
+from fitting.maximum_likelihood import FAINT, FIRST_NOISE, LIKELIER
 from fitting.pixels import Observed
 from fitting.solver.nnls import inverse_diagonal, scaled_inverse
 from fitting.uncertainty.structure import Errors, block_scatter
@@ -101,7 +101,7 @@ def most_likely_numbers(
         found = _maximised(even, at.unknowns)
         if found[0].value > at.value + LIKELIER:
             pictures, (at, precisions, score) = even, found
-    score, wider = most_informative_score(pictures, at, precisions, score)
+    score, wider = most_informative_score(pictures, at, precisions)
     # Copies of a value tell no more of what all channels share.
     shared = problem.each(lambda leaf: not leaf.bounded) & observed.copies
     scatter = pictures.scatter(score) if pictures.lossy else None
@@ -112,7 +112,8 @@ def _maximised(pictures: "_RoundedPictures", start: Float[np.ndarray, " U"]) -> 
     codes = pictures.codes(start)
     noise = max(residual_deviation(pictures.bounds, codes), FIRST_NOISE)
     if pictures.lossy:
-        pictures.weights = [alike(own, code, noise) for own, code in zip(pictures.bounds, codes, strict=True)]
+        counts = map(alike, pictures.bounds, codes)
+        pictures.weights = [weight_of_alike(count, noise) for count in counts]
     return maximise(pictures, Estimate(start, noise))
 
 

@@ -36,6 +36,11 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from brdf.images.encoding import Encoding, decode
 
+# Predictions are the same to such a share of a code, where these are so many values, or so many of one code, and so
+# many times as usual.
+ALIKE, FEWEST_ALIKE, FEWEST_LEVEL, MORE_ALIKE, MOST_COUNTED = 1024, 64, 16, 10, 1 << 20
+# A picture of fewer different predictions is one of planes.
+MOST_LEVELS = 32
 # Distances in units of s beyond which nothing changes.
 _FAR = 1e18
 # Across this many powers of e ten nodes integrate the density to 1e-12.
@@ -416,3 +421,45 @@ class Values:
 def _hermite(low: Any, high: Any, start: Any, end: Any, share: Any) -> np.ndarray:
     rise = high - low
     return low + share * (start + share * (3 * rise - 2 * start - end + share * (start + end - 2 * rise)))
+
+
+def alike(bounds: Bounds, codes: Float[np.ndarray, "P C"], *, level: bool = False) -> Float[np.ndarray, "P C"]:
+    """How many values are predicted as each is, as on an unlit side, and share its rounding error; 0 for few.
+
+    Times the square of the step between codes.
+
+    Args:
+        bounds: of the values.
+        codes: that are predicted.
+        level: only those that also show one code; where some do not, noise tells where between codes they lie.
+    """
+    code = np.rint(codes * ALIKE).astype(np.int64)
+    tells, found, width = bounds.ends > 0, np.zeros(code.shape), bounds.upper - bounds.lower
+    width = np.where(np.isfinite(width), width, np.min(width, initial=1.0, where=width > 0))
+    for channel, (one, some) in enumerate(zip(code.T, tells.T, strict=True)):
+        if not some.any():
+            continue
+        kind, count = _kinds(one[some])
+        planes = level and np.count_nonzero(count) < MOST_LEVELS
+        usual = 0 if planes else np.median(count[count > 0])
+        many = count > max(FEWEST_LEVEL if level else FEWEST_ALIKE, MORE_ALIKE * usual)
+        if level:
+            shown, one_of = bounds.lower[some, channel] + bounds.upper[some, channel], np.zeros(count.size)
+            one_of[kind] = shown
+            many &= np.bincount(kind, shown != one_of[kind], count.size) == 0
+        found[some, channel] = np.where(many, count, 0.0)[kind] * width[some, channel] ** 2
+    return found
+
+
+def weight_of_alike(count: Float[np.ndarray, "P C"], noise: float) -> Float[np.ndarray, "P C"]:
+    """Of each of N values of noise s that share a rounding error: their mean has a variance of 1 / 12 + s² / N."""
+    return 1 / (1 + count / (12 * noise**2))
+
+
+def _kinds(code: Int[np.ndarray, " P"]) -> tuple[Int[np.ndarray, " P"], Int[np.ndarray, " K"]]:
+    """Which kind each code is, and how many are of each; few are counted, which is quicker than sorting."""
+    least = np.min(code)
+    if np.max(code) - least < MOST_COUNTED:
+        return code - least, np.bincount(code - least)
+    _, kind, count = np.unique(code, return_inverse=True, return_counts=True)
+    return kind, count

@@ -35,8 +35,7 @@ from fitting.continuation import (
     most_informative,
     most_informative_score,
 )
-from fitting.continuation import precision as precision_at
-from fitting.likelihood import AnyArray, Bounds, Values, in_light, is_curved, residual_deviation
+from fitting.likelihood import AnyArray, Bounds, Values, alike, in_light, is_curved, residual_deviation, weight_of_alike
 from fitting.model_fit import Evidence, ModelFit
 from fitting.solver.normal_equations import COMPILER_OPTIONS, Picture, Sums
 from fitting.solver.profile import Optimum, refit, search
@@ -59,10 +58,6 @@ FAINT = 0.02
 # errors, and this one of the noise, or what moves a number by such a part of its error where many ends are open. Then a
 # round leaves a good part of the noise's own change, and is taken for so many rounds at most.
 MOST_ROUNDS, ENOUGH_CHANGE, ENOUGH_NOISE_CHANGE, ENOUGH_MOVED, MOST_AHEAD = 15, 2.0, 0.02, 0.1, 10.0
-# Predictions are the same to such a share of a code, where these are so many values, and so many times as usual.
-ALIKE, FEWEST_ALIKE, MORE_ALIKE, MOST_COUNTED = 1024, 64, 10, 1 << 20
-# A picture of fewer different predictions is one of planes; so many pixels tell.
-MOST_LEVELS, MOST_PIXELS = 32, 4096
 # A subsample tells that a model is hopeless where the logarithm of its likelihood is so much below that of another one,
 # and by such a share of itself: many pixels are near an edge where the model is wrong, and only there.
 FAR_BELOW, FAR_BELOW_SHARE = 1000.0, 0.5
@@ -109,7 +104,8 @@ def most_likely(
         fit, noise = _where_noise_is_even(fit, noise)
     # Weights of least squares leave out what is clipped, which says something here.
     weights = [
-        alike(bounds_of(picture), _codes(picture, optimum), noise) if lossy else None for picture in fit.pictures
+        weight_of_alike(alike(bounds_of(picture), _codes(picture, optimum)), noise) if lossy else None
+        for picture in fit.pictures
     ]
     pictures = list(map(_with_weight, fit.pictures, weights))
     rounding = 0.0 if exact else 1 / 12
@@ -180,45 +176,6 @@ def _with_weight(picture: Picture, weight: AnyArray | None) -> Picture:
     return dataclasses.replace(picture, weight=weight)
 
 
-def alike(
-    bounds: Bounds, codes: Float[np.ndarray, "P C"], noise: float, *, level: bool = False
-) -> Float[np.ndarray, "P C"]:
-    """Weights for values that are predicted alike, as on an unlit side: they share a rounding error.
-
-    In a lossy file it came before the losses, which hide it. N values of noise s whose mean has a further error of
-    variance 1 / 12 weigh 1 / (1 + N / 12 s²) each.
-
-    Args:
-        bounds: of the values.
-        codes: that are predicted.
-        noise: s.
-        level: of a picture of planes, and only those that also show one code; where some do not, noise tells where
-            between codes they lie.
-    """
-    code = np.rint(codes * ALIKE).astype(np.int64)
-    tells, weight = bounds.ends > 0, np.ones(code.shape)
-    for channel, (one, some) in enumerate(zip(code.T, tells.T, strict=True)):
-        if not some.any():
-            continue
-        kind, count = _kinds(one[some])
-        many = count > max(FEWEST_ALIKE, MORE_ALIKE * np.median(count[count > 0]) * (not level))
-        if level:
-            shown, one_of = bounds.lower[some, channel] + bounds.upper[some, channel], np.zeros(count.size)
-            one_of[kind] = shown
-            many &= np.bincount(kind, shown != one_of[kind], count.size) == 0
-        weight[some, channel] = np.where(many, 1 / (1 + count / (12 * noise**2)), 1.0)[kind]
-    return weight
-
-
-def _kinds(code: Int[np.ndarray, " P"]) -> tuple[Int[np.ndarray, " P"], Int[np.ndarray, " K"]]:
-    """Which kind each code is, and how many are of each; few are counted, which is quicker than sorting."""
-    least = np.min(code)
-    if np.max(code) - least < MOST_COUNTED:
-        return code - least, np.bincount(code - least)
-    _, kind, count = np.unique(code, return_inverse=True, return_counts=True)
-    return kind, count
-
-
 def _near_edges(fit: ModelFit, at: Estimate, rival: float = -math.inf) -> Evidence:
     """Where rounding is most of the noise: what pixels near the edge of a code say."""
     pictures, design = fit.pictures, design_of(fit.free, fit.tied)
@@ -246,7 +203,7 @@ def _near_edges(fit: ModelFit, at: Estimate, rival: float = -math.inf) -> Eviden
     precisions = [entry for _, some in rounds for entry in some]
     most = most_informative(precisions)
     informative = next(one for one, some in rounds if any(entry is most for entry in some))
-    score, wider = most_informative_score(informative, at, precisions, score, _of_planes(pictures, at, problem))
+    score, wider = most_informative_score(informative, at, precisions)
     working = list(map(_newton_picture, score.pictures))
     optimum = _optimum(working, fit, Numbers.of(at.unknowns))
     places = [one.values.bounds.place for one in score.pictures]
@@ -270,30 +227,6 @@ def _more_noise(score: Score, noise: float, owner: Sequence[int]) -> Float[np.nd
 def _noisier(values: Values, factor: float) -> Values:
     bounds = dataclasses.replace(values.bounds, spread=values.bounds.spread * factor)
     return _values(dataclasses.replace(values.picture, bounds=bounds), values.which)
-
-
-def _of_planes(pictures: Sequence[Picture], at: Estimate, problem: "_Separable") -> Float[np.ndarray, " U"] | float:
-    """The least variance of each unknown where values on a plane show one code, and share a rounding error.
-
-    A channel that no light shades is such a plane too.
-    """
-    numbers = Numbers.of(at.unknowns)
-    some = [
-        picture.in_double(np.arange(0, len(picture.target), 1 + len(picture.target) // MOST_PIXELS))
-        for picture in pictures
-    ]
-    levels = [[np.unique(code).size for code in np.rint(_codes(one, numbers) * ALIKE).T] for one in some]
-    flat = np.max(levels, axis=0) < MOST_LEVELS
-    if not flat.any():
-        return 0.0
-    codes = [_codes(picture, numbers) for picture in pictures]
-    weights = [alike(bounds_of(one), code, FIRST_NOISE, level=True) for one, code in zip(pictures, codes, strict=True)]
-    weighted = map(_with_weight, pictures, weights)
-    pixels = [_values(picture.in_double(np.arange(len(picture.target)))) for picture in weighted]
-    at, alone = at._replace(noise=FIRST_NOISE), _Separable(pixels, problem.design, problem.n_range, problem.copies)
-    score = alone.score(at, alone.near(alone.codes(at.unknowns), REACH * at.noise))
-    of_planes = np.append(np.tile(flat, 3), flat.all())
-    return np.where(of_planes, precision_at(alone, at, score).variance, 0.0)
 
 
 def _optimum(working: Sequence[Picture], fit: ModelFit, at: Numbers) -> Optimum:
