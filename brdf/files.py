@@ -265,7 +265,7 @@ def continued_lines(text: str) -> Iterator[tuple[int, str]]:
     for number, line in enumerate([*text.splitlines(), ""], start=1):  # which ends a line that would go on
         start = start if begun else number
         line = begun + line.strip()
-        begun = line[:-1] + " " if line.endswith("\\") and not line.startswith("#") else ""
+        begun = line[:-1] + " " if line.endswith("\\") and "#" not in line else ""
         if not begun:
             yield start, line
 

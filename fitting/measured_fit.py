@@ -47,6 +47,10 @@ Loss = Literal["cosine", "squared", "log"]
 
 # A lobe is worth its unknowns where it explains this share of the squares that Lambert leaves, or of the table's.
 WORTH, WORTH_OF_TABLE = 0.5, 0.02
+# By this much of twice the log-likelihood the best of all lobes gains on noise: one sample that stands out is enough.
+BY_CHANCE = 20.0
+# A sample that the fit follows altogether, and columns that depend on each other but for rounding.
+_MOST_LEVERAGE, _DEPENDENT = 0.99, 1e-10
 # A model that explains this share of the squares describes the peak, one that places this share of the light the body;
 # where the mean of both is below, it does not describe the table.
 HALF = 0.5
@@ -87,7 +91,7 @@ class BrdfCandidate:
 
     Attributes:
         material: its best material.
-        parameters: value and error of each number, or why it has none; errors hold where the deviation is noise.
+        parameters: value and error of each number, or why it has none; errors by what is left of samples.
         losses: its deviation under every loss.
     """
 
@@ -139,7 +143,7 @@ class BrdfFitResult(Parameters):
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Value and error of each of its numbers, or why it has none; errors hold where the deviation is noise."""
+        """Value and error of each of its numbers, or why it has none; errors by what is left of samples."""
         return self.candidates[self.chosen].parameters
 
     @property
@@ -339,7 +343,7 @@ def fit_brdf(
         raise InputError(table.name, what, "Give a table with more samples, or a model with fewer numbers")
     with waiting(f"fitting {table.name}"):
         candidates = tuple(_fit_model(kind, samples, loss, n_range) for kind in kinds)
-    chosen, seconds = _choose(candidates, loss), time.perf_counter() - start
+    chosen, seconds = _choose(candidates, loss, count), time.perf_counter() - start
     return BrdfFitResult(table, loss, candidates, chosen, count, negative, left_out, max_angle, seconds)
 
 
@@ -398,7 +402,8 @@ def _fit_model(model, samples, loss, n_range):
     rounding, weight = brightest * np.finfo(float).eps, np.asarray(picture.weights)
     noise, left = residual_noise(optimum, rounding), np.pi * (values - f_r) * weight**0.5
     # Instruments err by a share of the value, and alike in all channels: what is left of each sample says so (White
-    # 1980), not below rounding.
+    # 1980), not below rounding, as much larger as the fit has drawn it to itself (MacKinnon and White 1985).
+    left = left / (1 - _leverage(log_cos, reach * np.exp(optimum.n * log_cos), weight))
     spread = sums_at([picture], optimum, lambda _: weight * np.maximum(left**2, rounding**2)).gram
     left = left / np.maximum(np.linalg.norm(left, axis=0), 1 / FAR)
     visible = float(np.max(highlight) / np.max(brightest))
@@ -412,6 +417,16 @@ def _fit_model(model, samples, loss, n_range):
         errors = errors._replace(n_reason=fit.held)
     material, parameters = material_and_parameters(fit, errors, np.ones(channels), interval)
     return BrdfCandidate(material, tuple(one for one in parameters if one.name != "k_a"), least)
+
+
+def _leverage(log_cos, lobe, weight):
+    """How far a fit follows each sample, (P, 1): by the diffuse term, the lobe and the exponent, of all channels."""
+    columns = np.concatenate([np.ones_like(lobe), lobe, lobe * log_cos], axis=1)
+    columns = columns * np.mean(weight, axis=1, keepdims=True) ** 0.5
+    columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1 / FAR)
+    found, triangle = np.linalg.qr(columns)
+    independent = np.abs(np.diag(triangle)) > _DEPENDENT
+    return np.minimum(np.sum(found[:, : independent.size] ** 2 * independent, axis=1, keepdims=True), _MOST_LEVERAGE)
 
 
 def _lobe(model, samples):
@@ -444,9 +459,10 @@ def _losses(samples, model):
     )
 
 
-def _choose(candidates, loss):
-    """Lambert, which comes first, unless a lobe explains enough of the squares that it leaves."""
+def _choose(candidates, loss, count):
+    """Lambert, which comes first, unless a lobe explains enough of the squares that it leaves, and more than chance."""
     losses = [getattr(candidate.losses, loss) for candidate in candidates]
-    best = int(np.argmin(losses))
-    worth = min(WORTH, WORTH_OF_TABLE / max(candidates[0].losses.cosine, EXACT) ** 2)
+    best, plain = int(np.argmin(losses)), candidates[0].losses
+    worth = min(WORTH, WORTH_OF_TABLE / max(plain.squared if loss == "squared" else plain.cosine, EXACT) ** 2)
+    worth = max(worth, 1 - np.exp(-BY_CHANCE / count))
     return best if losses[best] ** 2 + EXACT**2 <= (1 - worth) * losses[0] ** 2 else 0

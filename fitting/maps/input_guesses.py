@@ -17,7 +17,7 @@ LESS = 0.9
 
 
 FAR_LESS = 0.5
-"""Normals are told to be upside down where turning them leaves less than this share."""
+"""Normals seem to be upside down where turning them leaves less than this share."""
 
 
 def likelier(problem: MapProblem) -> tuple[MapProblem, tuple[str, ...]]:
@@ -51,10 +51,10 @@ def likelier(problem: MapProblem) -> tuple[MapProblem, tuple[str, ...]]:
 
 
 def upside_down(problem: MapProblem) -> tuple[str, ...]:
-    """What to tell of given normals that explain some texels far better with y turned: of many programs it goes down.
+    """A note where some texels fit far better with y of the given normals turned: in many programs it goes down.
 
     Args:
-        problem: with normals that are given or sought.
+        problem: whose normals are given; of others nothing is said.
     """
     surface = problem.surface
     if surface.normal is None or surface.points is not None:
@@ -63,8 +63,8 @@ def upside_down(problem: MapProblem) -> tuple[str, ...]:
     left, otherwise = map(_left, (problem, dataclasses.replace(problem, surface=turned)))
     if not otherwise**2 < FAR_LESS * left**2:
         return ()
-    what = f"the normals leave {left / otherwise:.2g} times as much of the photographs as with y turned over"
-    return (f"{what}, which seems to go down in them. Give flip_y (--flip-y)",)
+    what = f"y of the normals and of the lights disagree: turned over, they leave {otherwise / left:.2g} of the misfit"
+    return (f"{what}. Where y goes down in the normals, flip_y (--flip-y) says so",)
 
 
 def _left(problem: MapProblem) -> float:

@@ -60,8 +60,8 @@ JOINT_STEPS = 5
 TURNS = 2
 """How often these are taken without the outliers of the last."""
 
-DARK = 0.15
-"""Of the level of what is lit: values below may lie in a shadow."""
+DARK = 0.15, 0.35
+"""Of the level of what is lit: values below the first may lie in a deep shadow, below the second in any."""
 
 HIGHLIGHTS = (4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0)
 """Exponents of a highlight that tells where the search for a normal starts."""
@@ -562,8 +562,9 @@ def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Components,
     """The best material and normal of each texel.
 
     A highlight alone, as of metals, gives a normal, and Lambert's law, fitted to what is neither highlight nor shadow,
-    another. The search over n gives each a material, and from the better one Gauss-Newton takes it and the normal
-    together, `TURNS` times: each time without what the last one does not explain.
+    two others. The search over n gives each a material, and from the best one Gauss-Newton takes it and the normal
+    together, `TURNS` times: each time without what the last one does not explain, or shows less than half as bright.
+    One loop does all of it, for a second copy of the program would take as long to compile.
 
     Args:
         texels: without columns.
@@ -571,24 +572,30 @@ def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Components,
 
     Returns:
         The fit, whose last two errors are those of the normal; the normals, (T,); what is lit and what of it is no
-        outlier, (T, P): neither counts in the fit otherwise.
+        outlier, (T, P), before the last steps: neither counts in the fit otherwise.
     """
     seen, shown = texels.seen, over_channels(texels.unweighted(texels.values))
     if lights.ambient is not None:
         ambient = over_channels(lights.ambient)
         least = jnp.min(jnp.where(seen * ambient > 0, divide(shown, ambient), jnp.inf), axis=1, keepdims=True)
         shown = seen * (shown - jnp.where(least < jnp.inf, least, 0) * ambient)
-    # Of a mean that what is dark does not change, and highlights little.
-    bright = seen * (shown > DARK * divide(*sums_of(shown, square_root(jnp.maximum(shown, 0))))[:, None] ** 2)
+    roots = square_root(jnp.maximum(shown, 0))
+    # A mean that what is dark does not change, and highlights little; theirs alone it would be where they are all.
+    level = jnp.minimum(divide(*sums_of(shown, roots)) ** 2, 2 * divide(*sums_of(roots, seen)) ** 2)
+    bright, brighter = (seen * (shown > share * level[:, None]) for share in DARK)
 
     def lit(normal):
         return seen if lights.ambient is not None else jnp.where(beside(normal) @ lights.to_light > 0, seen, 0)
 
-    normals = [lambert_normals(shown, bright, lights.to_light)]
+    def unshadowed(_, start):
+        counts = seen * ~shadowed(shown, seen * jnp.maximum(beside(start[0]) @ lights.to_light, 0))
+        return lambert_normals(shown, counts, lights.to_light), counts
+
+    starts = [(lambert_normals(shown, some, lights.to_light), some) for some in (bright, brighter)]
+    starts[1] = jax.lax.fori_loop(0, 2, unshadowed, starts[1])
     if texels.glossy:
-        normals.insert(0, highlight_normals(texels.model, shown, bright, lights))
-    count = len(normals)
-    starts = jax.tree.map(lambda *some: jnp.stack(some), *normals)
+        starts.insert(0, (highlight_normals(texels.model, shown, bright, lights), bright))
+    count, starts = len(starts), jax.tree.map(lambda *some: jnp.stack(some), *starts)
 
     @functools.partial(jax.jit, inline=True)  # its shapes are asked for below: it is traced once
     def tried(i, normal, counts):
@@ -609,30 +616,30 @@ def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Components,
             direct -= over_channels(there.linear[0] * beside(fit.k[0]))
         bare = facing * (over_channels(residual) >= -0.5 * direct)
         counts = jnp.where(facing > 0, inliers(residual, facing, bare), seen - bright)
-        # What is bright is to be explained by one of the starts, be it an outlier of this one.
-        judged = jnp.maximum(counts, bright)
-        cost = jnp.sum(*sums(judged * residual * residual), axis=0)
-        trial = Trial.of(texels, fit._replace(cost=cost, rival=found.rival), judged, normal)
-        return trial._replace(counts=counts.T), before.T, used.T, least
+        cost = jnp.sum(*sums(counts * residual * residual), axis=0)
+        trial = Trial.of(texels, fit._replace(cost=cost, rival=found.rival), counts, normal)
+        return trial, before.T, used.T, least
 
     def step(i, found):
         begins, best = i < count, found[0]
-        normal = jax.tree.map(lambda some, last: jnp.where(begins, some[i], last), starts, best.normal)
-        trial, *values = tried(i, normal, jnp.where(begins, bright, best.counts.T))
+        last = best.normal, best.counts.T
+        trial, *values = tried(i, *jax.tree.map(lambda some, last: jnp.where(begins, some[i], last), starts, last))
         # The normal of a highlight alone is not good enough to tell what is none of it.
-        trial = trial._replace(counts=jnp.where(i < count - 1, bright.T, trial.counts))
+        trial = trial._replace(counts=jnp.where(i < count - 2, bright.T, trial.counts))
         kept = begins & (best.cost < trial.cost)
         return jax.tree.map(lambda a, b: jnp.where(kept, a, b), found, (trial, *values))
 
-    nothing, *values = jax.tree.map(jnp.zeros_like, jax.eval_shape(tried, 0, normals[0], bright))
+    nothing, *values = jax.tree.map(
+        jnp.zeros_like, jax.eval_shape(tried, 0, *jax.tree.map(operator.itemgetter(0), starts))
+    )
     nothing = nothing._replace(cost=jnp.full_like(nothing.cost, jnp.inf)), *values
-    best, facing, used, cost = jax.lax.fori_loop(0, count + TURNS, step, nothing)
+    best, before, used, cost = jax.lax.fori_loop(0, count + TURNS, step, nothing)
     some, log_n, normal, rival = texels.where(used.T), best.fit.log_n, best.normal, best.fit.rival
     if texels.glossy:
         log_n, normal, least = restarted(some, lights, (log_n, normal, cost))
         rival = [jnp.where(least < cost, 0, one) for one in rival]
     fit = joint_fit(some.facing(normal, lights), lights, log_n, normal)
-    return fit._replace(rival=rival), normal, facing.T, used.T
+    return fit._replace(rival=rival), normal, before.T, used.T
 
 
 def restarted(texels: Texels, lights: Distant, found: tuple[Array, Components, Array]) -> Any:

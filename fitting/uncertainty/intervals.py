@@ -17,6 +17,8 @@ ONE_SIDED_95 = 1.6448536269514722
 LOWEST = -2.0
 # Below this relative error of n the profile is a parabola in log n to within a hundredth of the interval.
 PARABOLIC = 0.01
+# An exponent of a larger error in its logarithm may be any.
+UNKNOWN = 700.0
 # The widest step outwards in log n, and the share of a step to which an end is found.
 WIDEST, CLOSE = 0.35, 1e-3
 
@@ -109,7 +111,8 @@ def exponent_interval(
     centre = math.log(optimum.n)
     inside = bounds[0] < centre - 3 * relative and centre + 3 * relative < bounds[1]
     if parabolic or (relative < PARABOLIC and inside):
-        return optimum.n * math.exp(-reach * relative), optimum.n * math.exp(reach * relative)
+        factor = math.exp(min(reach * relative, UNKNOWN))
+        return optimum.n / factor, optimum.n * factor
     first = min(max(1.1 * reach * relative, 1e-3), WIDEST)
     problem = problem_of(fit.pictures, fit.n_range, fit.free)._replace(peak=peak, tied=fit.tied)
     # Relative to the nearest pixel the lobe keeps its size where no pixel sees the centre.

@@ -122,7 +122,10 @@ TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
         "no such normal": (f"{TRIANGLE}vn 0 0 1\nf 1//1 2//2 3//1\n", "faces: name a normal that is not there"),
         "no such normal, backwards": (f"{TRIANGLE}vn 0 0 1\nf 1//-1 2//-1 3//-4\n", "line 5: .*1 normals before"),
         "words": (f"{TRIANGLE}f one two three\n", "line 4: cannot be read"),
-        "words after a joined line": (f"# by C:\\\n{TRIANGLE}f 1 2 \\\n3\nf one two three\n", "line 7: cannot be read"),
+        "words after a joined line": (
+            f"# by C:\\\n{TRIANGLE}f 1 2 \\\n3\nf 1 2 3 # C:\\\nf one two three\n",
+            "line 8: cannot be read",
+        ),
         "two corners": (f"{TRIANGLE}f 1 2\n", "line 4: .*three corners"),
         "short vertex": (f"v 0 0\n{TRIANGLE}f 1 2 3\n", "line 1: cannot be read"),
         "inside out": (f"{TRIANGLE}vn 0 0 -1\nf 1//1 2//1 3//1\n", "normals: point to the back of the faces"),

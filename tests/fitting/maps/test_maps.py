@@ -78,7 +78,7 @@ def test_errors_cover_the_truth(noisy):
 def test_normals_whose_y_goes_down_are_told(noisy):
     pictures, truth, maps = noisy
     turned = fitting.fit_maps(pictures, dome(32), truth["normal"][None] * [1, -1, 1])
-    assert any("y turned over" in note for note in turned.notes)
+    assert any("normals and of the lights disagree" in note for note in turned.notes)
     assert not maps.notes
 
 
