@@ -7,6 +7,7 @@ squares leaves, and follows its own score from there, by steps of some factor at
 """
 
 import copy
+import functools
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
@@ -355,33 +356,45 @@ def least_variance(precisions: Sequence[Precision]) -> Float[np.ndarray, " U"]:
 
 
 def most_informative_score(
-    problem: Problem, at: Estimate, precisions: Sequence[Precision]
+    at: Estimate, rounds: Sequence[tuple[Problem, list[Precision]]]
 ) -> tuple[Score, Float[np.ndarray, " U"]]:
     """What the values say of an estimate at the noise of which errors are, and what to multiply these by.
 
     Args:
-        problem: values and their model.
         at: the most likely unknowns.
-        precisions: what was known of them on the way.
+        rounds: values and their model, and what was known of the unknowns on the way; several where the noise of one
+            picture beside another's was found in between.
     """
-    codes = problem.codes(at.unknowns)
-    # In a file with losses these hide what rounding has done.
-    counts = [alike(*both, level=True) * (not both[0].lossy) for both in zip(problem.bounds, codes, strict=True)]
+    precisions = [entry for _, some in rounds for entry in some]
+    problems = [problem for problem, some in rounds for _ in some]
 
-    def here(entry: Precision) -> tuple[Score, Precision]:
+    @functools.cache
+    def shown(problem: Problem) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Predictions, and how many are alike; in a file with losses these hide what rounding has done."""
+        codes = problem.codes(at.unknowns)
+        both = zip(problem.bounds, codes, strict=True)
+        return codes, [alike(bounds, code, level=True) * (not bounds.lossy) for bounds, code in both]
+
+    @functools.cache
+    def here(index: int) -> tuple[Score, Precision]:
         """At these unknowns: elsewhere, as with none at its bound, they may have been told apart better."""
-        there = at._replace(noise=entry.noise)
-        values = list(map(copy.copy, problem.near(codes, REACH * entry.noise)))
+        problem, there = problems[index], at._replace(noise=precisions[index].noise)
+        codes, counts = shown(problem)
+        values = list(map(copy.copy, problem.near(codes, REACH * there.noise)))
         for some, count in zip(values, counts, strict=True):
-            some.weight = some.weight * weight_of_alike(count[some.which], entry.noise)
+            some.weight = some.weight * weight_of_alike(count[some.which], there.noise * some.bounds.spread)
         score = problem.score(there, values)
         return score, precision(problem, there, score)
 
     most = most_informative(precisions)
+    score, known = here(next(index for index, entry in enumerate(precisions) if entry is most))
     # Each unknown is known as well as where enough values still tell of it.
-    best = [precisions[index] for index in np.unique(np.argmin(_variances(precisions), axis=0))]
-    score, known = here(most)
-    again = [known, *(here(entry)[1] for entry in best if entry is not most)]
+    again = [known]
+    for unknown, variance in enumerate(_variances(precisions).T):
+        for index in np.argsort(variance)[: np.count_nonzero(np.isfinite(variance))].tolist():
+            again.append(here(index)[1])
+            if again[-1].values[unknown] >= FEWEST_VALUES:
+                break
     least = np.maximum(least_variance(again), least_variance(precisions))
     ratio = np.divide(least, known.variance, out=np.ones_like(least), where=(known.variance > 0) & np.isfinite(least))
     return score, np.sqrt(ratio)

@@ -101,7 +101,7 @@ def most_likely_numbers(
         found = _maximised(even, at.unknowns)
         if found[0].value > at.value + LIKELIER:
             pictures, (at, precisions, score) = even, found
-    score, wider = most_informative_score(pictures, at, precisions)
+    score, wider = most_informative_score(at, [(pictures, precisions)])
     # Copies of a value tell no more of what all channels share.
     shared = problem.each(lambda leaf: not leaf.bounded) & observed.copies
     scatter = pictures.scatter(score) if pictures.lossy else None

@@ -451,7 +451,7 @@ def alike(bounds: Bounds, codes: Float[np.ndarray, "P C"], *, level: bool = Fals
     return found
 
 
-def weight_of_alike(count: Float[np.ndarray, "P C"], noise: float) -> Float[np.ndarray, "P C"]:
+def weight_of_alike(count: Float[np.ndarray, "P C"], noise: Any) -> Float[np.ndarray, "P C"]:
     """Of each of N values of noise s that share a rounding error: their mean has a variance of 1 / 12 + s² / N."""
     return 1 / (1 + count / (12 * noise**2))
 
