@@ -6,7 +6,6 @@ what the solver needs of that a third of it. A picture in a file is not even kep
 
 import dataclasses
 import functools
-import itertools
 from collections import Counter
 from collections.abc import Sequence
 from functools import partial
@@ -177,7 +176,13 @@ def observe(problem: FitProblem, *, at_once: bool = False) -> Observed:
     """
     colour, grey = take_colour_out(problem.scenes, problem.targets[0].pixels.shape[-1])
     given = zip(problem.targets, problem.scenes, grey, problem.masks, problem.weights, strict=True)
-    parts = itertools.starmap(partial(_observe, problem, at_once), given)
+    parts = []
+    for index, picture in enumerate(given):
+        try:
+            parts.append(_observe(problem, at_once, *picture))
+        except InputError as error:
+            names = {name: f"{name}[{index}]" for name in ("target", "mask")} if len(problem.targets) > 1 else {}
+            raise error.renamed(names) from None
     tiles, rounding, brightest, counts, shown, scenes, counted, weights = map(list, zip(*parts, strict=True))
     left_out: Counter[str] = Counter()
     for some in counts:
@@ -227,8 +232,9 @@ def _observe(
     if size > 0 and not 1 / reach <= size <= reach:
         what = f"has {size:.3g} as its largest value, out of reach of {dtype.name}"
         raise InputError("target", what, "Bring it nearer to 1 (another exposure), or fit in float64")
-    # Where all share one value nothing is below it: it is a constant, not a level.
-    if level is None and total.largest > 0 and SYMMETRIC_PIXELS < total.top < total.counts[2] and scene.lights:
+    # Where all of a single picture share one value nothing is below it: it is a constant, not a level.
+    constant = total.top == total.counts[2] and len(problem.targets) == 1
+    if level is None and total.largest > 0 and total.top > SYMMETRIC_PIXELS and not constant and scene.lights:
         level = _plateau(bands, found, float(total.largest), grey)
         if level is not None:
             found, total = _statistics(bands, level, dark, apart=apart, keep=not target.streamed)

@@ -48,6 +48,11 @@ def test_a_constant_picture_is_not_taken_for_a_clipped_one():
     assert result.pixels == np.count_nonzero(SCENE.surface_points().mask)
 
 
+def test_of_several_pictures_one_that_shows_one_value_is_clipped():
+    with pytest.raises(brdf.InputError, match=r"target\[1\]: is clipped at"):
+        fitting.fit([MATT, np.ones_like(MATT)], [SCENE, SCENE])
+
+
 def test_clipped_and_missing_pixels_are_left_out_and_counted():
     truth = brdf.BlinnPhong(k_a=0.3, k_d=[0.5, 0.4, 0.3], k_s=0.8, n=20.0)
     picture = np.minimum(pictured(truth, SCENE), 0.9)
