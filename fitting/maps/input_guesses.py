@@ -15,9 +15,9 @@ SOME = 4 * TILE
 LESS = 0.9
 """Silent photographs are read in the unusual way where that leaves less than this share of the squares."""
 
-
-FAR_LESS = 0.5
-"""Normals seem to be upside down where turning them leaves less than this share."""
+MISFIT, FAR_LESS = 0.1, 0.5
+"""Normals are doubted where they leave this share of what photographs show, and seem to be upside down where turning
+them leaves less than that share of the squares."""
 
 
 def likelier(problem: MapProblem) -> tuple[MapProblem, tuple[str, ...]]:
@@ -50,14 +50,15 @@ def likelier(problem: MapProblem) -> tuple[MapProblem, tuple[str, ...]]:
     return readings[usual], (f"{note}. {remedy}",)
 
 
-def upside_down(problem: MapProblem) -> tuple[str, ...]:
+def upside_down(problem: MapProblem, residual: np.ndarray) -> tuple[str, ...]:
     """A note where some texels fit far better with y of the given normals turned: in many programs it goes down.
 
     Args:
         problem: whose normals are given; of others nothing is said.
+        residual: of its maps, over what photographs show.
     """
     surface = problem.surface
-    if surface.normal is None or surface.points is not None:
+    if surface.normal is None or surface.points is not None or not np.nanmedian(residual) > MISFIT:
         return ()
     turned = surface._replace(normal=surface.normal * np.array([1, -1, 1], np.float32))
     left, otherwise = map(_left, (problem, dataclasses.replace(problem, surface=turned)))

@@ -26,9 +26,6 @@ LOSSY = (
     "times too small, and a faint highlight may be the codec's"
 )
 
-MISFIT = 0.1
-"""Of what photographs show: where that is left normals are doubted."""
-
 COPLANAR = 1e-3
 """Singular value of the directions towards lights: in a plane the least is 0."""
 
@@ -146,8 +143,7 @@ def fit_maps(
             what = "lie in a plane with the texel, of which normals are not found"
             raise InputError("lights", what, "Give normals, or lights from all sides")
         raise InputError("pictures", "show no texel that counts", "Check mask, normals and clipping")
-    if np.nanmedian(layers["residual"]) > MISFIT:
-        notes += upside_down(problem)
+    notes += upside_down(problem, layers["residual"])
     names = tuple(one.name for one in models)
     return Maps(models=names, to_view=to_view, notes=notes, to_light=given.to_light, **layers)
 

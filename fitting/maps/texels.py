@@ -63,6 +63,9 @@ TURNS = 2
 DARK = 0.15, 0.35
 """Of the level of what is lit: values below the first may lie in a deep shadow, below the second in any."""
 
+FEWEST_BRIGHT = 8
+"""Values that tell a material and a normal; where fewer are bright, as of metals, what is dark tells too."""
+
 HIGHLIGHTS = (4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0)
 """Exponents of a highlight that tells where the search for a normal starts."""
 
@@ -583,6 +586,7 @@ def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Components,
     # A mean that what is dark does not change, and highlights little; theirs alone it would be where they are all.
     level = jnp.minimum(divide(*sums_of(shown, roots)) ** 2, 2 * divide(*sums_of(roots, seen)) ** 2)
     bright, brighter = (seen * (shown > share * level[:, None]) for share in DARK)
+    bright = jnp.where(sums_of(bright)[0][:, None] < FEWEST_BRIGHT, seen, bright)
 
     def lit(normal):
         return seen if lights.ambient is not None else jnp.where(beside(normal) @ lights.to_light > 0, seen, 0)
@@ -595,7 +599,8 @@ def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Components,
     starts[1] = jax.lax.fori_loop(0, 2, unshadowed, starts[1])
     if texels.glossy:
         starts.insert(0, (highlight_normals(texels.model, shown, bright, lights), bright))
-    count, starts = len(starts), jax.tree.map(lambda *some: jnp.stack(some), *starts)
+    count, (first, *_) = len(starts), starts
+    starts = jax.tree.map(lambda *some: jnp.stack(some), *starts)
 
     @functools.partial(jax.jit, inline=True)  # its shapes are asked for below: it is traced once
     def tried(i, normal, counts):
@@ -604,9 +609,8 @@ def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Components,
         some = texels.where(used)
         found = some.facing(normal, lights).fitted()
         start = found.log_n, normal, found.cost
-        together = functools.partial(jointly, some, lights)
         log_n, normal, least = jax.lax.cond(
-            i < count, lambda *start: start, lambda *start: together(*start[:2]), *start
+            i < count, lambda *same: same, lambda log_n, normal, _: jointly(some, lights, log_n, normal), *start
         )
         there, facing = texels.facing(normal, lights), lit(normal)
         fit = there.where(facing * counts).at(log_n, errors=False)
@@ -614,8 +618,9 @@ def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Components,
         direct = over_channels(there.values - residual)
         if lights.ambient is not None:
             direct -= over_channels(there.linear[0] * beside(fit.k[0]))
-        bare = facing * (over_channels(residual) >= -0.5 * direct)
-        counts = jnp.where(facing > 0, inliers(residual, facing, bare), seen - bright)
+        half = facing * (over_channels(residual) >= -0.5 * direct)
+        # What is dark where no light falls is explained, too.
+        counts = jnp.where(facing > 0, inliers(residual, facing, half), seen - bright)
         cost = jnp.sum(*sums(counts * residual * residual), axis=0)
         trial = Trial.of(texels, fit._replace(cost=cost, rival=found.rival), counts, normal)
         return trial, before.T, used.T, least
@@ -629,9 +634,7 @@ def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Components,
         kept = begins & (best.cost < trial.cost)
         return jax.tree.map(lambda a, b: jnp.where(kept, a, b), found, (trial, *values))
 
-    nothing, *values = jax.tree.map(
-        jnp.zeros_like, jax.eval_shape(tried, 0, *jax.tree.map(operator.itemgetter(0), starts))
-    )
+    nothing, *values = jax.tree.map(jnp.zeros_like, jax.eval_shape(tried, 0, *first))
     nothing = nothing._replace(cost=jnp.full_like(nothing.cost, jnp.inf)), *values
     best, before, used, cost = jax.lax.fori_loop(0, count + TURNS, step, nothing)
     some, log_n, normal, rival = texels.where(used.T), best.fit.log_n, best.normal, best.fit.rival

@@ -155,6 +155,15 @@ def test_photographs_of_eight_bits_with_cast_shadows(encoding, normals, shadowed
         assert np.mean(np.abs(values) > 6 * errors) < 0.02
 
 
+def test_normals_of_what_is_dark_but_for_its_highlight():
+    """Few values are bright: what starts the search without the others ends elsewhere in every sixth texel."""
+    pictures, truth = texels(256, 0.0, dome(32), n=(100, 400))
+    matte, _ = texels(256, 0.0, dome(32), n=(1e9, 1e9))
+    gloss = 0.03 * matte + 5 * (pictures - matte) + 0.001 * np.random.default_rng(1).standard_normal(pictures.shape)
+    maps = fitting.fit_maps(gloss, dome(32), "fit")
+    assert np.mean(np.sum(maps.normal[0] * truth["normal"], axis=1) < np.cos(np.radians(2))) < 0.05
+
+
 @pytest.mark.parametrize("encoding", ["linear", "srgb"])
 def test_what_is_black_in_every_photograph_is_known_to_a_rounding_error(encoding):
     normal = np.broadcast_to(VIEW, (1, 8, 3))
