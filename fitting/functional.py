@@ -50,6 +50,7 @@ from brdf.models.base import SpecularMaterial, check_model
 from brdf.rendering import Basis, basis
 from fitting.problem import check_exponents
 from fitting.solver.nnls import nonnegative_minima
+from fitting.solver.normal_equations import totals
 from fitting.solver.profile import lowest_in_cells
 
 # As a function of log n a lobe varies on a scale of 1 or more; Hermite's cubic over such a cell finds every valley.
@@ -118,6 +119,14 @@ class _Pixels(NamedTuple):
         columns = jnp.stack([jnp.ones_like(self.diffuse), self.diffuse, *lobes], axis=1)
         weighted = columns * self.weight
         return weighted, jnp.einsum("bkp,bjp->bkj", weighted, columns, precision="highest")
+
+
+class _Sums(NamedTuple):
+    """Over pixels: of the columns' products, (B, 4, 4), of those with a residual, (C, 4), and of its square, (C,)."""
+
+    gram: Array
+    product: Array
+    square: Array
 
 
 class _Point(NamedTuple):
@@ -285,7 +294,8 @@ def solve(
         return lx.linear_solve(operator, right, lx.LU()).value
 
     none = jnp.zeros_like(pixels.diffuse)
-    matt = _point(pixels, (none, none), pixels.target, jnp.zeros((channels, 3), dtype)).x
+    still, nothing = jax.lax.stop_gradient(pixels), jnp.zeros((channels, 3), dtype)
+    matt = _point(still, _sums(still, (none, none), still.target), nothing).x
     log_n, x = jax.lax.custom_root(optimality, (jnp.zeros((), dtype), matt), search, tangent)
     n, least = jnp.exp(log_n), cost(log_n, x)
     value, slope = _with_slope(relative, log_n)
@@ -305,13 +315,14 @@ def _search(pixels: _Pixels, relative: Callable[[Array], Array], grid: Array, ma
 
         def slope(log_n: Array) -> tuple[Array, _Point]:
             lobes = _with_slope(relative, log_n)
-            point = _point(pixels, lobes, pixels.residual(x, lobes[0]), x)
+            point = _point(pixels, _sums(pixels, lobes, pixels.residual(x, lobes[0])), x)
             return point.slope, point
 
         return jax.jvp(slope, (log_n,), (jnp.ones_like(log_n),), has_aux=True)
 
     residual = pixels.residual(matt, jnp.zeros_like(pixels.diffuse))
-    profile = jax.lax.map(lambda log_n: _point(pixels, _with_slope(relative, log_n), residual, matt), grid)
+    on_grid = jax.lax.map(lambda log_n: _sums(pixels, _with_slope(relative, log_n), residual), grid)
+    profile = jax.vmap(lambda sums: _point(pixels, sums, matt))(on_grid)
     position, lowest = lowest_in_cells(grid, profile.cost, profile.slope)
     # What rounding leaves is no valley: of exponents that fit alike the smallest, whose lobe most pixels see.
     lowest = jnp.maximum(lowest, jnp.finfo(lowest.dtype).eps ** 2 * jnp.sum(pixels.target**2))
@@ -319,7 +330,7 @@ def _search(pixels: _Pixels, relative: Callable[[Array], Array], grid: Array, ma
     beside = jnp.pad(lowest, 1, constant_values=jnp.inf)
     valleys = jnp.where((lowest < beside[:-2]) & (lowest <= beside[2:]), lowest, jnp.inf)
     _, best = jax.lax.top_k(-valleys, min(2, lowest.size))
-    found = jax.vmap(at)(position[best], profile.x[best])
+    found = jax.lax.map(lambda start: at(*start), (position[best], profile.x[best]))
     slope, curvature, points = found
     gain = slope**2 / jnp.where(curvature > 0, 2 * curvature, jnp.inf)
     first = jnp.argmin(points.cost - gain)
@@ -342,23 +353,49 @@ def _with_slope(relative: Callable[[Array], Array], log_n: Array) -> tuple[Array
     return jax.jvp(relative, (log_n,), (jnp.ones_like(log_n),))
 
 
-def _point(pixels: _Pixels, lobes: Sequence[Array], residual: Array, x: Array) -> _Point:
-    """The best coefficients where the columns are ambient, diffuse, and a lobe with its derivative by log n.
+@jax.custom_jvp
+def _totals(terms: list[Array]) -> list[Array]:
+    """Sums over the last axis, and of their derivatives, all in one loop; forward mode alone."""
+    return totals(terms, ["add"] * len(terms), (terms[0].ndim - 1,))
+
+
+@_totals.defjvp
+def _totals_jvp(terms: Any, changes: Any) -> Any:
+    found = _totals([*terms[0], *changes[0]])
+    return found[: len(found) // 2], found[len(found) // 2 :]
+
+
+def _sums(pixels: _Pixels, lobes: Sequence[Array], residual: Array) -> _Sums:
+    """Of the columns ambient, diffuse, and a lobe with its derivative by log n, (B, P) each.
 
     Args:
         pixels: what is fitted.
-        lobes: the lobe and its derivative, (B, P).
-        residual: of the coefficients ``x``, so that rounding scales with what is left and not with the picture.
-        x: (C, 3).
+        lobes: the lobe and its derivative.
+        residual: of some coefficients, (C, P).
     """
-    columns, gram = pixels.columns(*lobes)
-    by_group = residual.reshape(len(gram), -1, residual.shape[1])
-    product = jnp.einsum("bkp,bgp->bgk", columns, by_group).reshape(len(x), -1)
+    columns = [jnp.ones_like(pixels.diffuse), pixels.diffuse, *lobes]
+    weighted, size = [column * pixels.weight for column in columns], range(len(columns))
+    pairs = [(i, j) for i in size for j in size if i <= j]
+    found = dict(zip(pairs, _totals([weighted[i] * columns[j] for i, j in pairs]), strict=True))
+    gram = jnp.stack([jnp.stack([found[min(i, j), max(i, j)] for j in size], axis=-1) for i in size], axis=-1)
+    *product, square = _totals([one * residual for one in (*weighted, pixels.weight * residual)])
+    return _Sums(gram, jnp.stack(product, axis=-1), square)
+
+
+def _point(pixels: _Pixels, sums: _Sums, x: Array) -> _Point:
+    """The best coefficients.
+
+    Args:
+        pixels: what is fitted.
+        sums: over these.
+        x: whose residual they tell of, (C, 3), so that rounding scales with what is left and not with the picture.
+    """
+    gram, product, square = sums
     tolerance = 2e-6 if gram.dtype == jnp.float32 else 1e-14
     best = nonnegative_minima(gram[:, :3, :3], product[:, :3], x, pixels.free, tolerance)
     step = best - x
     pull = product - (step[:, None] @ gram[:, :3])[:, 0]
-    cost = jnp.sum(pixels.weight * residual**2, axis=-1) - jnp.sum(step * (product + pull)[:, :3], axis=-1)
+    cost = square - jnp.sum(step * (product + pull)[:, :3], axis=-1)
     return _Point(best, jnp.sum(jnp.maximum(cost, 0)), -2 * jnp.sum(best[:, 2] * pull[:, 3]))
 
 

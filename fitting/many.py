@@ -36,9 +36,10 @@ from fitting.problem import TOP, FitProblem, state_problem
 from fitting.progress import waiting
 from fitting.report import FitResult
 from fitting.solver.devices import core_count, device_count, gathered, own, placed, spread_over
+from fitting.solver.normal_equations import COMPILER_OPTIONS
 
 # So many pictures at a time: their columns stay in the processor's cache.
-BATCH = 16
+BATCH = 32
 NAMES = ("k_a", "k_d", "k_s", "n")
 
 
@@ -204,24 +205,23 @@ def _fit_together(problem: FitProblem) -> tuple[Bool[np.ndarray, " N"], dict[str
     alike = all(one is scene for one in others) and all(np.array_equal(one, masks[0]) for one in masks)
     targets = np.stack([target.pixels for target in problem.targets]).astype(problem.precision, copy=False)
     colour, scenes = take_colour_out(problem.scenes[:1] if alike else problem.scenes, targets.shape[-1])
-    scenes = [brdf.cast(scene, problem.precision) for scene in scenes]
-    both = zip(scenes, problem.masks, strict=False)
-    seen = np.stack([np.asarray(one.surface_points().mask) & (True if some is None else some) for one, some in both])
-    exact = [target.codes is None and target.saturation is None for target in problem.targets]
+    # Those of another structure are fitted by themselves.
     same = [_structure(one) == _structure(scenes[0]) for one in scenes]
+    alone = [one if alike else scenes[0] for one, alike in zip(scenes, same, strict=True)]
+    stack = brdf.cast(jax.tree.map(lambda *leaves: np.stack(leaves), *alone), problem.precision)
+    both = zip(np.asarray(_seen(stack)), problem.masks, strict=False)
+    seen = np.stack([one & (True if some is None else some) for one, some in both])
+    exact = [target.codes is None and target.saturation is None for target in problem.targets]
     plain = np.array(exact) & np.array(same) & np.asarray(_plain(targets, np.broadcast_to(seen, targets.shape[:3])))
     if problem.model == "auto" or not plain.any():
         return plain & False, {}
     model = brdf.MODELS[problem.model]
     if alike:
-        pixel = np.flatnonzero(seen)
-        images = basis(model, brdf.some_pixels(scenes[0], pixel, precision=problem.precision))
+        scene, pixel = brdf.cast(scenes[0], problem.precision), np.flatnonzero(seen)
+        images = basis(model, brdf.some_pixels(scene, pixel, precision=problem.precision))
         pictures = {"target": np.take(targets.reshape(count, -1, targets.shape[-1]), pixel, axis=1)}
-        shared = {"images": images, "weight": np.ones(pixel.size, targets.dtype), "ambient": scenes[0].ambient}
+        shared = {"images": images, "weight": np.ones(pixel.size, targets.dtype), "ambient": scene.ambient}
     else:
-        # Those of another structure are fitted by themselves.
-        alone = [one if alike else scenes[0] for one, alike in zip(scenes, same, strict=True)]
-        stack = jax.tree.map(lambda *leaves: jnp.stack(leaves), *alone)
         weight = seen.reshape(count, -1).astype(targets.dtype)
         pictures = {"target": targets, "images": _bases(model, stack), "weight": weight, "ambient": stack.ambient}
         shared = {}
@@ -257,13 +257,18 @@ def _structure(scene: brdf.Scene) -> tuple[Any, ...]:
     return structure, [leaf.shape for leaf in leaves]
 
 
+@jax.jit
+def _seen(scenes: brdf.Scene) -> Bool[Array, "N H W"]:
+    return jax.lax.map(lambda scene: scene.surface_points().mask, scenes)
+
+
 @functools.partial(jax.jit, static_argnums=0)
 def _bases(model: type[brdf.Material], scenes: brdf.Scene) -> Basis:
     """A program of its own: inside that of the fits XLA would make geometry and lights anew at every step."""
     return jax.lax.map(functools.partial(basis, model), scenes)
 
 
-@functools.partial(jax.jit, static_argnums=2)
+@functools.partial(jax.jit, static_argnums=2, compiler_options=COMPILER_OPTIONS)
 def _solved(pictures: dict[str, Any], shared: dict[str, Any], n_range: tuple[float, float]) -> Float[Array, "N K"]:
     """The numbers of the solution of each picture, and the sum of its squares.
 

@@ -176,7 +176,6 @@ def state_problem(
     Raises:
         InputError: naming what cannot be used.
     """
-    refuse_traced(target, scene, mask, weight)
     options |= {"model": model_name(options["model"])} if "model" in options else {}
     several = isinstance(target, list | tuple)
     targets = list(target) if several else [target]
@@ -190,14 +189,17 @@ def state_problem(
             what = f"has {len(lists[-1])} entries for {len(targets)} pictures"
             raise InputError(name, what, "Give one for each")
     scenes, masks, weights = lists
-    for each in scenes:
+    distinct = {id(one): one for one in scenes}  # of many pictures it may be one
+    for each in distinct.values():
         if not isinstance(each, brdf.Scene):
             raise InputError("scene", f"must be a brdf.Scene, got {type(each).__name__}", "Use brdf.Scene.load")
+    refuse_traced(targets, list(distinct.values()), mask, weight)
+    sizes = {key: (*one.resolution, one.channels) for key, one in distinct.items()}
     read_mask = cache(brdf.read_mask)  # of all pictures it may be one
     for index, (target, scene) in enumerate(zip(targets, scenes, strict=True)):
         try:
             targets[index] = picture = as_target(target, rounding, encoding)
-            _check_picture(picture, scene, options.get("noise"))
+            _check_picture(picture, scene, sizes[id(scene)], options.get("noise"))
         except InputError as error:
             raise error.renamed({"target": f"target[{index}]"} if len(targets) > 1 else {}) from None
         shape = picture.pixels.shape[:2]
@@ -308,13 +310,14 @@ def _per_pixel(name: str, values: Any, shape: tuple[int, int]) -> np.ndarray:
     return values
 
 
-def _check_picture(target: Target, scene: brdf.Scene, noise: Any) -> None:
+def _check_picture(target: Target, scene: brdf.Scene, size: tuple[int, int, int], noise: Any) -> None:
     height, width, channels = target.pixels.shape
-    if (width, height) != scene.resolution:
-        what = f"is {width} x {height}, the scene's camera {scene.resolution[0]} x {scene.resolution[1]}"
+    *resolution, of_light = size
+    if [width, height] != resolution:
+        what = f"is {width} x {height}, the scene's camera {resolution[0]} x {resolution[1]}"
         raise InputError("target", what, "Give a picture and a camera of the same resolution")
-    if scene.channels not in (1, channels):
-        what = f"has {channels} channels, the scene's light {scene.channels}"
+    if of_light not in (1, channels):
+        what = f"has {channels} channels, the scene's light {of_light}"
         remedy = "Give both the same number of channels; light of one serves every picture"
         raise InputError("target", what, remedy)
     if target.streamed and noise is not None:
