@@ -76,7 +76,7 @@ class PixelSample(NamedTuple):
     def of(self, values: Any) -> np.ndarray:
         """What belongs to the pixels, as a picture of one row; of values (H, W) or (H, W, C)."""
         values = np.asarray(values)
-        return values.reshape(-1, *values.shape[2:])[self.pixel][None]
+        return np.take(values.reshape(-1, *values.shape[2:]), self.pixel, axis=0)[None]
 
 
 def sample_pixels(scene: brdf.Scene, model: type[brdf.Material], size: float) -> PixelSample | None:
@@ -91,13 +91,16 @@ def sample_pixels(scene: brdf.Scene, model: type[brdf.Material], size: float) ->
         The pixels; None where all of them are hardly more.
     """
     width, height = scene.resolution
-    side = 1
-    while -(-height // (2 * side)) * -(-width // (2 * side)) >= 0.75 * max(size, FEWEST):
-        side *= 2
-    if side == 1:
+    end, side = np.array([[height], [width]]), np.ones((2, 1), int)
+    while True:
+        larger = np.array([[side[1, 0]], [2 * side[0, 0]]])
+        if np.prod(-(-end // larger)) < 0.75 * max(size, FEWEST):
+            break
+        side = larger
+    if side.max() == 1:
         return None
-    random, end = np.random.default_rng(0), np.array([[height], [width]])
-    corner = side * np.indices((-(-height // side), -(-width // side))).reshape(2, -1)
+    random = np.random.default_rng(0)
+    corner = side * np.indices((-(-end // side)).ravel().tolist()).reshape(2, -1)
     lights = tuple(light for light in with_samples(scene, 1).lights if light.type_name != "environment")
     has_peaks = bool(lights) and issubclass(model, SpecularMaterial)
     most = max(16, 4 * round(size * CUT / 4))
@@ -107,7 +110,7 @@ def sample_pixels(scene: brdf.Scene, model: type[brdf.Material], size: float) ->
         row, column = corner + (random.random(corner.shape) * extent).astype(int)
         pixel, area = row * width + column, np.prod(extent, axis=0).astype(np.float64)
         cut = np.zeros(pixel.size, bool)
-        if has_peaks and side > 1 and pixel.size > most:
+        if has_peaks and side.max() > 1 and pixel.size > most:
             # One shape for few sizes, so that few programs are compiled.
             padded = np.resize(pixel, 1 << int(pixel.size - 1).bit_length())
             points = dataclasses.replace(brdf.some_pixels(scene, padded).surface_points(), area=None)
@@ -119,7 +122,7 @@ def sample_pixels(scene: brdf.Scene, model: type[brdf.Material], size: float) ->
         areas.append(area[~cut])
         if not cut.any():
             return PixelSample(np.concatenate(pixels), np.concatenate(areas))
-        side //= 2
-        quarters = side * np.array([[0, 0, 1, 1], [0, 1, 0, 1]])
-        corner = (corner[:, cut, None] + quarters[:, None]).reshape(2, -1)
+        whole, side = side, np.minimum(side, side.max() // 2)
+        parts = side * np.indices((whole // side).ravel().tolist()).reshape(2, -1)
+        corner = (corner[:, cut, None] + parts[:, None]).reshape(2, -1)
         corner = corner[:, np.all(corner < end, axis=0)]
