@@ -1,10 +1,11 @@
-"""What photographs and normals do not say of themselves: of two readings that under which the model explains more."""
+"""What photographs, normals and single texels do not say of themselves: of two readings that which explains more."""
 
 import dataclasses
 
 import numpy as np
 
 from brdf.images.encoding import Encoding
+from brdf.models.base import SpecularMaterial
 from fitting.maps.texels import OUTLIER
 from fitting.maps.tiles import TILE, MapProblem
 from fitting.progress import waiting
@@ -14,6 +15,9 @@ SOME = 4 * TILE
 
 LESS = 0.9
 """Silent photographs are read in the unusual way where that leaves less than this share of the squares."""
+
+ROUNDS = 50
+"""In which the shares of models settle."""
 
 MISFIT, FAR_LESS = 0.1, 0.5
 """Normals are doubted where they leave this share of what photographs show, and seem to be upside down where turning
@@ -68,17 +72,49 @@ def upside_down(problem: MapProblem, residual: np.ndarray) -> tuple[str, ...]:
     return (f"{what}. Where y goes down in the normals, flip_y (--flip-y) says so",)
 
 
+def with_prices(problem: MapProblem) -> MapProblem:
+    """The problem with a price on each lobe: of two that serve a texel alike it then has that which more texels have.
+
+    The price is minus twice the logarithm of the lobe's share over the largest, as criteria are of the likelihood. The
+    shares among texels that show a lobe are found by expectation and maximisation (Dempster, Laird and Rubin, J. R.
+    Stat. Soc. B 39, 1977) from some of them.
+
+    Args:
+        problem: of one model, which is returned as it is, or of several.
+    """
+    glossy = np.array([issubclass(model, SpecularMaterial) for model in problem.models])
+    if np.count_nonzero(glossy) < 2 or not problem.texels.size:
+        return problem
+    criteria = _of_some(problem)["criteria"].astype(float)
+    shine = criteria[np.isfinite(criteria).all(axis=1) & glossy[np.argmin(criteria, axis=1)]][:, glossy]
+    if not shine.size:
+        return problem
+    likelihood, shares = np.exp(-0.5 * (shine - np.min(shine, axis=1, keepdims=True))), np.ones(shine.shape[1])
+    for _ in range(ROUNDS):
+        parts = likelihood * shares
+        shares = np.mean(parts / np.sum(parts, axis=1, keepdims=True), axis=0) + 1 / len(shine)
+    prices = np.zeros(len(glossy))
+    prices[glossy] = np.round(-2 * np.log(shares / np.max(shares)), 1)  # the same on all machines
+    return dataclasses.replace(problem, prices=tuple(prices.tolist()))
+
+
 def _left(problem: MapProblem) -> float:
     """What is left of some texels' codes, under distant lights; NaN where none of them tells."""
-    given, texels = problem.photographs, problem.texels
-    if given.to_light is None or not texels.size:
+    given = problem.photographs
+    if given.to_light is None or not problem.texels.size:
         return np.nan
-    row = texels // given.size[1]
+    layers = _of_some(problem)
+    codes = 255 * np.sqrt(np.mean(given.unit**2)) * layers["noise"] * np.sqrt(1 + OUTLIER**2 * layers["left_out"])
+    return float(np.nanmedian(codes)) if np.any(np.isfinite(codes)) else np.nan
+
+
+def _of_some(problem: MapProblem) -> dict[str, np.ndarray]:
+    """The layers of some texels, of which there are any."""
+    texels = problem.texels
+    row = texels // problem.photographs.size[1]
     rows = np.unique(row)
     rows = rows[np.linspace(0, rows.size - 1, -(-min(SOME, texels.size) * rows.size // texels.size)).astype(int)]
     texels = texels[np.isin(row, rows)]
     texels = texels[:: -(-texels.size // SOME)]
     with waiting("fitting some texels"):
-        layers = {name: layer[: texels.size] for name, layer in problem.fit(*problem.tiles(texels)).items()}
-    codes = 255 * np.sqrt(np.mean(given.unit**2)) * layers["noise"] * np.sqrt(1 + OUTLIER**2 * layers["left_out"])
-    return float(np.nanmedian(codes)) if np.any(np.isfinite(codes)) else np.nan
+        return {name: layer[: texels.size] for name, layer in problem.fit(*problem.tiles(texels)).items()}

@@ -19,7 +19,7 @@ from fitting.solver.devices import core_count, device_count, gathered, own
 BAND = 10 * CHUNK * TILE - 1
 """Texels that are read and laid out at a time; a lane is left over."""
 
-FORM = 2
+FORM = 3
 """Of what is kept of a band: another number where its layers change."""
 
 SPARSE = 16

@@ -11,7 +11,7 @@ from brdf.checks import direction_value
 from brdf.errors import InputError, as_numbers
 from brdf.precision import Precision, working_precision
 from fitting.maps import map_inputs
-from fitting.maps.input_guesses import likelier, upside_down
+from fitting.maps.input_guesses import likelier, upside_down, with_prices
 from fitting.maps.map_bands import fit_bands
 from fitting.maps.map_inputs import Photographs
 from fitting.maps.map_result import Maps
@@ -68,7 +68,8 @@ def fit_maps(
             scenes'.
         to_view: towards the camera, which is far away; scenes tell it themselves.
         model: "lambert", "phong", "blinn-phong" or a normalised form; "auto" for the simplest of Lambert, Phong and
-            Blinn-Phong that serves each texel, by the Bayesian information criterion for few values.
+            Blinn-Phong that serves each texel, by the Bayesian information criterion for few values; where the lobe of
+            neither explains a texel better, that which more texels have.
         specular: "coloured", or "grey": the channels share k_s.
         mask: (H, W), or a file: texels to look at. None for the folder's ``mask.*``, else all. Those that a
             photograph has as fully transparent are left out.
@@ -128,6 +129,7 @@ def fit_maps(
     labels = None if labels is None else label_map(labels, problem)
     problem, unit, clipping = with_levels(problem, saturation)
     problem, notes = likelier(problem)
+    problem = with_prices(problem)
     notes += clipping
     if lossy := [one.name for one in given.each if one.lossy]:
         notes += (LOSSY.format(lossy[0]),)
@@ -137,6 +139,7 @@ def fit_maps(
         if labels is not None:
             problem = with_shared_n(problem, labels)
         layers = in_unit(fit_bands(problem, None if keep is None else Path(keep)), unit)
+    layers.pop("criteria", None)
     if np.all(np.isnan(layers["k_d"])):
         to_light = given.to_light if surface.normal is None else None
         if to_light is not None and np.linalg.svd(to_light, compute_uv=False)[-1] < COPLANAR:

@@ -82,6 +82,7 @@ class MapProblem:
         photographs: with their lights.
         surface: what all texels see.
         models: of which each texel has the simplest that serves it.
+        prices: of each model, what its criterion is raised by.
         grey: whether channels share k_s.
         ambient: columns of the ambient light, (P, C) or (P, 1); None where there is none.
         to_view: towards the camera, of any length.
@@ -97,6 +98,7 @@ class MapProblem:
     ambient: np.ndarray | None
     to_view: np.ndarray
     precision: Precision
+    prices: tuple[float, ...] = (0.0, 0.0, 0.0)
     seek: str = "layers"
     refine: bool = False
 
@@ -134,6 +136,8 @@ class MapProblem:
     def fit(self, values: np.ndarray, surface: Surface, band: int = 0) -> dict[str, np.ndarray]:
         """The layers of some tiles, (N * TILE, ...); what a lane without a texel has comes after those with one.
 
+        Where there are several models the criterion of each is a layer, "criteria".
+
         Args:
             values: what they show.
             surface: what they see.
@@ -156,7 +160,7 @@ class MapProblem:
             ]
             view = self.to_view / np.linalg.norm(self.to_view)
             rounding = max(one.step for one in given.each) / np.sqrt(12 * np.mean(given.unit**2))
-            more = dtype.type(rounding), view.astype(dtype), stacks, occluders
+            more = dtype.type(rounding), np.array(self.prices, dtype), view.astype(dtype), stacks, occluders
             # All tiles that hold a texel, and the first lane that holds none.
             _, count, tile, _ = values.shape
             used, found, size = np.arange(count) <= np.count_nonzero(surface.mask) // tile, [], tiles_of_program(tile)
@@ -185,6 +189,7 @@ def _program(
     surface: Surface,
     of_photographs: list[Array],
     rounding: Array,
+    prices: Array,
     to_view: Array,
     stacks: tuple[LightStack, ...],
     occluders: tuple[Any, ...],
@@ -226,11 +231,14 @@ def _program(
                 else:
                     texels = _near(texels, stacks, occluders, ambient, points)
                 layers = _of_normals(texels, mask, normal, rounding, shared, seek, lights if refine else None)
+            layers["price"] = layers.pop("criterion", 0.0) + prices[index]
             found.append(layers | {"chosen": jnp.full(mask.shape, index, jnp.uint8)})
+        criteria = jnp.stack([one["price"] for one in found])
         layers = functools.reduce(
-            lambda a, b: {name: jnp.where(b["criterion"] < a["criterion"], b[name], a[name]) for name in a}, found
+            lambda a, b: {name: jnp.where(b["price"] < a["price"], b[name], a[name]) for name in a}, found
         )
-        return {name: layer.T for name, layer in layers.items() if name != "criterion"}
+        layers |= {"criteria": criteria} if len(models) > 1 else {}
+        return {name: layer.T for name, layer in layers.items() if name != "price"}
 
     def of_used(tile):
         empty = jax.tree.map(lambda layer: jnp.zeros(layer.shape, layer.dtype), jax.eval_shape(of_tile, tile[1:]))

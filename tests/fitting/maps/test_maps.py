@@ -506,6 +506,23 @@ def test_of_few_photographs_auto_invents_no_highlight():
         assert np.mean(maps.chosen) < 0.05
 
 
+def test_auto_asks_all_texels_where_one_does_not_tell_which_lobe_it_has():
+    lights = dome(24)
+    pictures, truth = texels(300, 0.01, lights, seed=3, n=(4, 60))
+    maps = fitting.fit_maps(pictures[..., :1], lights, truth["normal"][None], model="auto")
+    assert np.mean(maps.chosen == 1) < 0.01  # one in ten where each texel decided by itself
+    # A quarter of another law, and little noise: both are found.
+    pictures, truth = texels(300, 0.001, lights, seed=3, n=(4, 60))
+    mirror = 2 * (lights @ truth["normal"].T)[..., None] * truth["normal"] - lights[:, None]
+    cosine = np.maximum(lights @ truth["normal"].T, 0)
+    lobe = np.where(cosine > 0, np.maximum(mirror @ VIEW, 0) ** 20, 0)
+    noise = 0.001 * np.random.default_rng(4).normal(size=lobe.shape)
+    pictures[:, 0, :75, 0] = (0.3 * cosine + 0.5 * lobe + noise)[:, :75]
+    chosen = fitting.fit_maps(pictures[..., :1], lights, truth["normal"][None], model="auto").chosen[0]
+    assert np.mean(chosen[:75] == 1) > 0.8
+    assert np.mean(chosen[75:] == 1) < 0.1
+
+
 def test_auto_does_not_ask_for_the_unit():
     pictures, truth = texels(40, 0.01, dome(24), seed=8, n=(40, 120))
     given = dome(24), truth["normal"][None]
