@@ -294,8 +294,8 @@ def solve(
         return lx.linear_solve(operator, right, lx.LU()).value
 
     none = jnp.zeros_like(pixels.diffuse)
-    still, nothing = jax.lax.stop_gradient(pixels), jnp.zeros((channels, 3), dtype)
-    matt = _point(still, _sums(still, (none, none), still.target), nothing).x
+    fixed, nothing = jax.lax.stop_gradient(pixels), jnp.zeros((channels, 3), dtype)  # a start, of no derivative
+    matt = _point(free, _sums(fixed, (none, none), fixed.target), nothing).x
     log_n, x = jax.lax.custom_root(optimality, (jnp.zeros((), dtype), matt), search, tangent)
     n, least = jnp.exp(log_n), cost(log_n, x)
     value, slope = _with_slope(relative, log_n)
@@ -315,14 +315,14 @@ def _search(pixels: _Pixels, relative: Callable[[Array], Array], grid: Array, ma
 
         def slope(log_n: Array) -> tuple[Array, _Point]:
             lobes = _with_slope(relative, log_n)
-            point = _point(pixels, _sums(pixels, lobes, pixels.residual(x, lobes[0])), x)
+            point = _point(pixels.free, _sums(pixels, lobes, pixels.residual(x, lobes[0])), x)
             return point.slope, point
 
         return jax.jvp(slope, (log_n,), (jnp.ones_like(log_n),), has_aux=True)
 
     residual = pixels.residual(matt, jnp.zeros_like(pixels.diffuse))
     on_grid = jax.lax.map(lambda log_n: _sums(pixels, _with_slope(relative, log_n), residual), grid)
-    profile = jax.vmap(lambda sums: _point(pixels, sums, matt))(on_grid)
+    profile = jax.vmap(lambda sums: _point(pixels.free, sums, matt))(on_grid)
     position, lowest = lowest_in_cells(grid, profile.cost, profile.slope)
     # What rounding leaves is no valley: of exponents that fit alike the smallest, whose lobe most pixels see.
     lowest = jnp.maximum(lowest, jnp.finfo(lowest.dtype).eps ** 2 * jnp.sum(pixels.target**2))
@@ -355,7 +355,10 @@ def _with_slope(relative: Callable[[Array], Array], log_n: Array) -> tuple[Array
 
 @jax.custom_jvp
 def _totals(terms: list[Array]) -> list[Array]:
-    """Sums over the last axis, and of their derivatives, all in one loop; forward mode alone."""
+    """Sums over the last axis, and of their derivatives, all in one loop.
+
+    In forward mode alone: the search has no other, for it is the optimum that is differentiated.
+    """
     return totals(terms, ["add"] * len(terms), (terms[0].ndim - 1,))
 
 
@@ -382,17 +385,17 @@ def _sums(pixels: _Pixels, lobes: Sequence[Array], residual: Array) -> _Sums:
     return _Sums(gram, jnp.stack(product, axis=-1), square)
 
 
-def _point(pixels: _Pixels, sums: _Sums, x: Array) -> _Point:
+def _point(free: Array, sums: _Sums, x: Array) -> _Point:
     """The best coefficients.
 
     Args:
-        pixels: what is fitted.
-        sums: over these.
+        free: which may be above 0, (C, 3).
+        sums: over pixels.
         x: whose residual they tell of, (C, 3), so that rounding scales with what is left and not with the picture.
     """
     gram, product, square = sums
     tolerance = 2e-6 if gram.dtype == jnp.float32 else 1e-14
-    best = nonnegative_minima(gram[:, :3, :3], product[:, :3], x, pixels.free, tolerance)
+    best = nonnegative_minima(gram[:, :3, :3], product[:, :3], x, free, tolerance)
     step = best - x
     pull = product - (step[:, None] @ gram[:, :3])[:, 0]
     cost = square - jnp.sum(step * (product + pull)[:, :3], axis=-1)

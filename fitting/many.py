@@ -207,8 +207,8 @@ def _fit_together(problem: FitProblem) -> tuple[Bool[np.ndarray, " N"], dict[str
     colour, scenes = take_colour_out(problem.scenes[:1] if alike else problem.scenes, targets.shape[-1])
     # Those of another structure are fitted by themselves.
     same = [_structure(one) == _structure(scenes[0]) for one in scenes]
-    alone = [one if alike else scenes[0] for one, alike in zip(scenes, same, strict=True)]
-    stack = brdf.cast(jax.tree.map(lambda *leaves: np.stack(leaves), *alone), problem.precision)
+    stackable = [one if fits else scenes[0] for one, fits in zip(scenes, same, strict=True)]
+    stack = brdf.cast(jax.tree.map(lambda *leaves: np.stack(leaves), *stackable), problem.precision)
     both = zip(np.asarray(_seen(stack)), problem.masks, strict=False)
     seen = np.stack([one & (True if some is None else some) for one, some in both])
     exact = [target.codes is None and target.saturation is None for target in problem.targets]

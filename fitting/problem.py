@@ -194,12 +194,12 @@ def state_problem(
         if not isinstance(each, brdf.Scene):
             raise InputError("scene", f"must be a brdf.Scene, got {type(each).__name__}", "Use brdf.Scene.load")
     refuse_traced(targets, list(distinct.values()), mask, weight)
-    sizes = {key: (*one.resolution, one.channels) for key, one in distinct.items()}
+    sizes = {key: (one.resolution, one.channels) for key, one in distinct.items()}
     read_mask = cache(brdf.read_mask)  # of all pictures it may be one
     for index, (target, scene) in enumerate(zip(targets, scenes, strict=True)):
         try:
             targets[index] = picture = as_target(target, rounding, encoding)
-            _check_picture(picture, scene, sizes[id(scene)], options.get("noise"))
+            _check_picture(picture, scene, *sizes[id(scene)], options.get("noise"))
         except InputError as error:
             raise error.renamed({"target": f"target[{index}]"} if len(targets) > 1 else {}) from None
         shape = picture.pixels.shape[:2]
@@ -310,10 +310,9 @@ def _per_pixel(name: str, values: Any, shape: tuple[int, int]) -> np.ndarray:
     return values
 
 
-def _check_picture(target: Target, scene: brdf.Scene, size: tuple[int, int, int], noise: Any) -> None:
+def _check_picture(target: Target, scene: brdf.Scene, resolution: tuple[int, int], of_light: int, noise: Any) -> None:
     height, width, channels = target.pixels.shape
-    *resolution, of_light = size
-    if [width, height] != resolution:
+    if (width, height) != resolution:
         what = f"is {width} x {height}, the scene's camera {resolution[0]} x {resolution[1]}"
         raise InputError("target", what, "Give a picture and a camera of the same resolution")
     if of_light not in (1, channels):

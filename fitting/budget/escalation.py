@@ -32,9 +32,9 @@ FEW, OF_CODES = 1 << 20, 16
 WHOLE = 0.25
 # Fits to an accuracy below this are in float64.
 COARSE = 1e-4
-# An attempt aims at this share of the accuracy in the pixels that it leaves out, the first where light samples are left
-# out, too; without an accuracy at this share of the error of the one before.
-AIM, LESS = (0.8, 0.95), 0.4
+# An attempt aims at this share of the accuracy in the pixels that it leaves out, where light samples are left out too
+# and where none are; without an accuracy at this share of the error of the one before.
+AIM, AIM_OF_PIXELS, LESS = 0.8, 0.95, 0.4
 
 # Why all pixels are fitted.
 REASON_FEW = "choosing among so few takes as long as looking at them"
@@ -99,7 +99,7 @@ def _better(now: Configuration, estimated: Attempt, accuracy: float | None, most
     """The next configuration to try; None where nothing is left to improve."""
     if now.precision == "float32" and estimated.rounding > (accuracy or estimated.bound) / 8:
         return dataclasses.replace(now, precision="float64")
-    aim = LESS * estimated.pixels if accuracy is None else AIM[estimated.light == 0] * accuracy
+    aim = LESS * estimated.pixels if accuracy is None else (AIM if estimated.light else AIM_OF_PIXELS) * accuracy
     if now.pixels is None or estimated.pixels <= aim:
         return None
     # A power of two, so that programs are compiled for few sizes.

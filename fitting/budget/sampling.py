@@ -1,10 +1,11 @@
 """Less of a scene: fewer samples of its lights, and some of its pixels, spread so that they see every exponent.
 
-The picture is cut into equal squares; those whose pixel lies nearest to the middle of a highlight are cut into four,
-and again, down to single pixels: a highlight of any width then lies on a good number of squares, and a lobe twice as
-narrow sees as many. Of each square one pixel is taken at random (fixed seed) and stands for all of the square: its
-weight is the square's number of pixels, the inverse of its probability (Horvitz and Thompson 1952, J. Am. Stat. Assoc.
-47, 663). The work grows with the number of pixels taken and the logarithm of the picture's size.
+The picture is cut into equal squares, or pairs of such; those whose pixel lies nearest to the middle of a highlight are
+cut into squares of half the longer side, and again, down to single pixels: a highlight of any width then lies on a good
+number of them, and a lobe twice as narrow sees as many. Of each part one pixel is taken at random (fixed seed) and
+stands for all of it: its weight is the part's number of pixels, the inverse of its probability (Horvitz and Thompson
+1952, J. Am. Stat. Assoc. 47, 663). The work grows with the number of pixels taken and the logarithm of the picture's
+size.
 """
 
 import dataclasses
@@ -85,19 +86,17 @@ def sample_pixels(scene: brdf.Scene, model: type[brdf.Material], size: float) ->
     Args:
         scene: what the picture shows.
         model: the class of the material, which tells where its highlights are.
-        size: how many; up to about the double where the picture is large and has highlights.
+        size: how many; up to 2.5 times as many where the picture is large and has highlights.
 
     Returns:
         The pixels; None where all of them are hardly more.
     """
     width, height = scene.resolution
-    end, side = np.array([[height], [width]]), np.ones((2, 1), int)
-    while True:
-        larger = np.array([[side[1, 0]], [2 * side[0, 0]]])
-        if np.prod(-(-end // larger)) < 0.75 * max(size, FEWEST):
-            break
-        side = larger
-    if side.max() == 1:
+    rows, columns = 1, 1
+    while -(-height // columns) * -(-width // (2 * rows)) >= 0.75 * max(size, FEWEST):
+        rows, columns = columns, 2 * rows
+    end, side = np.array([[height], [width]]), np.array([[rows], [columns]])
+    if not np.any((side > 1) & (end > 1)):
         return None
     random = np.random.default_rng(0)
     corner = side * np.indices((-(-end // side)).ravel().tolist()).reshape(2, -1)

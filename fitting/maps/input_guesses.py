@@ -17,7 +17,7 @@ LESS = 0.9
 """Silent photographs are read in the unusual way where that leaves less than this share of the squares."""
 
 ROUNDS = 50
-"""In which the shares of models settle."""
+"""Of expectation and maximisation."""
 
 MISFIT, FAR_LESS = 0.1, 0.5
 """Normals are doubted where they leave this share of what photographs show, and seem to be upside down where turning
@@ -92,9 +92,12 @@ def with_prices(problem: MapProblem) -> MapProblem:
     likelihood, shares = np.exp(-0.5 * (shine - np.min(shine, axis=1, keepdims=True))), np.ones(shine.shape[1])
     for _ in range(ROUNDS):
         parts = likelihood * shares
+        # No lobe is ruled out by some texels.
         shares = np.mean(parts / np.sum(parts, axis=1, keepdims=True), axis=0) + 1 / len(shine)
     prices = np.zeros(len(glossy))
-    prices[glossy] = np.round(-2 * np.log(shares / np.max(shares)), 1)  # the same on all machines
+    prices[glossy] = np.round(
+        -2 * np.log(shares / np.max(shares)), 1
+    )  # the same on most machines: what is kept is named by it
     return dataclasses.replace(problem, prices=tuple(prices.tolist()))
 
 

@@ -231,14 +231,14 @@ def _program(
                 else:
                     texels = _near(texels, stacks, occluders, ambient, points)
                 layers = _of_normals(texels, mask, normal, rounding, shared, seek, lights if refine else None)
-            layers["price"] = layers.pop("criterion", 0.0) + prices[index]
+            layers["criterion"] = layers.get("criterion", 0.0) + prices[index]  # of sums there is none
             found.append(layers | {"chosen": jnp.full(mask.shape, index, jnp.uint8)})
-        criteria = jnp.stack([one["price"] for one in found])
+        criteria = jnp.stack([one["criterion"] for one in found])
         layers = functools.reduce(
-            lambda a, b: {name: jnp.where(b["price"] < a["price"], b[name], a[name]) for name in a}, found
+            lambda a, b: {name: jnp.where(b["criterion"] < a["criterion"], b[name], a[name]) for name in a}, found
         )
         layers |= {"criteria": criteria} if len(models) > 1 else {}
-        return {name: layer.T for name, layer in layers.items() if name != "price"}
+        return {name: layer.T for name, layer in layers.items() if name != "criterion"}
 
     def of_used(tile):
         empty = jax.tree.map(lambda layer: jnp.zeros(layer.shape, layer.dtype), jax.eval_shape(of_tile, tile[1:]))

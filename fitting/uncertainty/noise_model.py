@@ -10,7 +10,6 @@ highlight of three pixels).
 """
 
 import dataclasses
-import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -33,8 +32,8 @@ RISE = 20.0
 # Below this ratio of the largest to the mean variance it makes no difference.
 EVEN = 1.2
 MOST_VALUES = 4096
-# So many pixels tell what noise knows of the weights.
-MANY_PIXELS = 1 << 15
+# Of so many pixels at most it is asked what noise knows of their weights.
+MOST_PIXELS = 1 << 15
 ROUNDS = 6
 # Of noise that does not know of the weights: its variance is one over this power of them.
 POWERS = (0.0, 0.25, 0.5, 0.75)
@@ -147,7 +146,8 @@ def misweighted_sums(pictures: Sequence[Picture], optimum: Optimum) -> Sums | No
     """Sums at the optimum with each pixel's weight times the variance of its weighted residual, where weights vary it.
 
     Weights of least squares are inverse variances, unless they say what is of interest: those of a soft mask, of a
-    region. Then noise is what it is beside them, and errors are those of the sandwich.
+    region. Then noise is what it is beside them, and errors are those of the sandwich. Some pixels tell which of both,
+    and how large noise is; the sums are of all.
 
     Args:
         pictures: as they were searched.
@@ -156,24 +156,39 @@ def misweighted_sums(pictures: Sequence[Picture], optimum: Optimum) -> Sums | No
     Returns:
         The sums as those of `weighted_sums`; None where inverse variances are as likely.
     """
-    stride = -(-sum(len(picture.target) for picture in pictures) // MANY_PIXELS)
-    few = [picture.pixels(operator.itemgetter(slice(None, None, stride))) for picture in pictures]
-    squared = np.concatenate([residuals(picture, optimum).T ** 2 for picture in few], axis=1)
-    rows = max(picture.weights.shape[1] for picture in few)
-    given = (np.asarray(picture.weights, float).T for picture in few)
-    weight = np.concatenate([np.broadcast_to(one, (rows, one.shape[1])) for one in given], axis=1)
+    stride = -(-sum(int(picture.counts.sum()) for picture in pictures) // MOST_PIXELS)
+    parts = [_squared_and_weight(picture, optimum, stride) for picture in pictures]
+    of_channels = max(weight.shape[0] for _, weight in parts)
+    squared = np.concatenate([one for one, _ in parts], axis=1)
+    weight = np.concatenate([np.broadcast_to(one, (of_channels, one.shape[1])) for _, one in parts], axis=1)
     if not squared.any(axis=1).all():
         return None
     counts = weight > 0
     log_weight, count = np.log(np.where(counts, weight, 1.0)), np.count_nonzero(counts, axis=1)
     powers = (*POWERS, 1.0)
     variance = {power: np.vecdot(squared, np.exp((power - 1) * log_weight)) / count for power in powers}
-    # Twice the logarithm of the likelihood, but for a constant.
-    whole = np.sum(log_weight) * len(squared) / rows
-    likely = {power: float(power * whole - np.sum(count * np.log(one))) for power, one in variance.items()}
+    # Twice the logarithm of the likelihood, but for a constant; a weight that channels share is that of each.
+    of_weights = np.sum(log_weight) * len(squared) / of_channels
+    likely = {power: float(power * of_weights - np.sum(count * np.log(one))) for power, one in variance.items()}
     power = max(likely, key=lambda one: likely[one])
     if likely[power] < likely[1.0] + RISE:
         return None
-    return sums_at(
-        pictures, optimum, lambda picture: np.asarray(picture.weights, float) ** (2 - power) * variance[power]
-    )
+
+    def beside(picture: Picture) -> AnyArray:
+        weight = np.asarray(picture.weights, float) ** (2 - power) * variance[power]
+        return np.broadcast_to(weight, picture.target.shape)
+
+    return sums_at(pictures, optimum, beside)
+
+
+def _squared_and_weight(
+    picture: Picture, optimum: Optimum, stride: int
+) -> tuple[Float[np.ndarray, "C K"], Float[np.ndarray, "Cw K"]]:
+    """Squares of the weighted residuals of some pixels that count, and their weights, which channels may share."""
+    pixel = np.flatnonzero(picture.counts)
+    # One at random of each so many: a fixed step could meet no more than some columns of a picture.
+    first = np.arange(0, pixel.size, stride)
+    pixel = pixel[np.minimum(first + np.random.default_rng(0).integers(stride, size=first.size), pixel.size - 1)]
+    some = picture.in_double(pixel)
+    weight = np.broadcast_to(some.weights, (len(some.target), some.weights.shape[1]))[: pixel.size]
+    return residuals(some, optimum)[: pixel.size].T ** 2, np.asarray(weight, float).T

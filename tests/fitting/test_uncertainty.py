@@ -400,6 +400,29 @@ def test_as_few_pixels_as_numbers_leave_no_error_to_tell():
     assert "as few pixels" in result.parameters[0].reason
 
 
+def test_weights_of_one_picture_beside_none_of_another_and_of_every_second_column(monkeypatch: pytest.MonkeyPatch):
+    view = brdf.PerspectiveCamera(position=[0, 0, 3], target=[0, 0, 0], up=[0, 1, 0], fov=30, resolution=(SIZE, SIZE))
+    plane = brdf.Rectangle([-2, -2, 0], [4, 0, 0], [0, 4, 0])  # in every pixel: no mask makes an array of what is None
+    scene = brdf.Scene(view, [plane], lights=[brdf.PointLight(position=[0.3, 0.4, 1], intensity=1.0)])
+    clean = np.asarray(brdf.render(brdf.BlinnPhong(k_d=0.3, k_s=0.4, n=30), scene, precision="float64"))
+    noise = 0.01 * np.random.default_rng(1).normal(size=(2, *clean.shape))
+    weight = np.random.default_rng(2).uniform(0.1, 1, (SIZE, SIZE))
+
+    def error(pictures: list[np.ndarray], weights: list[np.ndarray | None]) -> float:
+        scenes = [scene] * len(pictures)
+        return fitting.fit(pictures, scenes, model="blinn-phong", weight=weights, **OPTIONS)["n"].error
+
+    pictures = [clean + noise[0] / np.sqrt(weight)[..., None], clean + noise[1]]
+    for order in (slice(None), slice(None, None, -1)):
+        both = error(pictures[order], [weight, np.ones_like(weight)][order])
+        assert error(pictures[order], [weight, None][order]) == pytest.approx(both, rel=1e-4)
+        assert error([clean + one for one in noise], [weight, None][order]) > 0
+    columns = np.broadcast_to(np.where(np.arange(SIZE) % 2, 0.01, 1.0), weight.shape)
+    known = error([clean + noise[0]], [columns])
+    monkeypatch.setattr("fitting.uncertainty.noise_model.MOST_PIXELS", SIZE**2 // 4)
+    assert error([clean + noise[0]], [columns]) == pytest.approx(known, rel=0.1)
+
+
 @pytest.mark.parametrize("kind", ["soft mask", "region"])
 def test_weights_that_are_no_inverse_variances_make_nothing_surer(kind: str):
     weight = np.full((SIZE, SIZE), 0.01)
