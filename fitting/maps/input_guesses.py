@@ -95,9 +95,8 @@ def with_prices(problem: MapProblem) -> MapProblem:
         # No lobe is ruled out by some texels.
         shares = np.mean(parts / np.sum(parts, axis=1, keepdims=True), axis=0) + 1 / len(shine)
     prices = np.zeros(len(glossy))
-    prices[glossy] = np.round(
-        -2 * np.log(shares / np.max(shares)), 1
-    )  # the same on most machines: what is kept is named by it
+    # Rounded: what is kept of bands is named by them, also where processes on unlike machines look for it.
+    prices[glossy] = np.round(-2 * np.log(shares / np.max(shares)), 1)
     return dataclasses.replace(problem, prices=tuple(prices.tolist()))
 
 

@@ -19,7 +19,7 @@ from fitting.solver.devices import core_count, device_count, gathered, own
 BAND = 10 * CHUNK * TILE - 1
 """Texels that are read and laid out at a time; a lane is left over."""
 
-FORM = 3
+FORM = 2
 """Of what is kept of a band: another number where its layers change."""
 
 SPARSE = 16
@@ -56,7 +56,9 @@ def fit_bands(problem: MapProblem, keep: Path | None = None) -> dict[str, np.nda
             return found, None
         with reading:
             tiles = problem.tiles(bands[index])
-        return problem.fit(*tiles, index), kept[index]
+        found = problem.fit(*tiles, index)
+        found.pop("criteria", None)
+        return found, kept[index]
 
     def place(index, found):
         for name, values in found.items():

@@ -139,7 +139,6 @@ def fit_maps(
         if labels is not None:
             problem = with_shared_n(problem, labels)
         layers = in_unit(fit_bands(problem, None if keep is None else Path(keep)), unit)
-    layers.pop("criteria", None)
     if np.all(np.isnan(layers["k_d"])):
         to_light = given.to_light if surface.normal is None else None
         if to_light is not None and np.linalg.svd(to_light, compute_uv=False)[-1] < COPLANAR:

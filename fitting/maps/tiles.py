@@ -82,7 +82,7 @@ class MapProblem:
         photographs: with their lights.
         surface: what all texels see.
         models: of which each texel has the simplest that serves it.
-        prices: of each model, what its criterion is raised by.
+        prices: of each model, what its criterion is raised by; none for 0.
         grey: whether channels share k_s.
         ambient: columns of the ambient light, (P, C) or (P, 1); None where there is none.
         to_view: towards the camera, of any length.
@@ -98,7 +98,7 @@ class MapProblem:
     ambient: np.ndarray | None
     to_view: np.ndarray
     precision: Precision
-    prices: tuple[float, ...] = (0.0, 0.0, 0.0)
+    prices: tuple[float, ...] = ()
     seek: str = "layers"
     refine: bool = False
 
@@ -160,7 +160,8 @@ class MapProblem:
             ]
             view = self.to_view / np.linalg.norm(self.to_view)
             rounding = max(one.step for one in given.each) / np.sqrt(12 * np.mean(given.unit**2))
-            more = dtype.type(rounding), np.array(self.prices, dtype), view.astype(dtype), stacks, occluders
+            prices = np.array(self.prices or [0.0] * len(self.models), dtype)
+            more = dtype.type(rounding), prices, view.astype(dtype), stacks, occluders
             # All tiles that hold a texel, and the first lane that holds none.
             _, count, tile, _ = values.shape
             used, found, size = np.arange(count) <= np.count_nonzero(surface.mask) // tile, [], tiles_of_program(tile)

@@ -38,7 +38,8 @@ def test_pictures_of_different_noise_count_by_what_they_know(noises, codes):
         assert result.warnings == ()
         alone = fitting.fit(pictures[quiet], SCENES[quiet], model="blinn-phong")
         # All alike, the noisy picture would make these errors many times as large; of k_a an unlit side may tell less.
-        assert all(both.error < 1.5 * one.error for both, one in zip(result.parameters, alone.parameters, strict=True))
+        for both, one in zip(result.parameters, alone.parameters, strict=True):
+            assert both.error < (1.5 if one.name == "k_a" else 1.05) * one.error
         found.append(deviations(result))
     # Nearly as many within two of their errors as should be.
     assert np.mean(np.abs(found) < 2) > 0.88
