@@ -79,7 +79,7 @@ def plot_albedo(brdf: Brdf, report: Report | None = None, figure: Any = None) ->
     axes.set_prop_cycle(CHANNELS if count == 3 else OTHERS)
     axes.plot(degrees, albedo[:, shown], label=np.array(channel_names(count))[shown].tolist())
     if count > 1:
-        axes.legend(loc="best", title=None if count == 3 else "channel")
+        axes.legend(loc="upper left", ncols=3, title=None if count == 3 else "channel")  # where curves seldom are
     energy = report.energy if report else None
     if energy and energy.crossing:
         axes.axvline(energy.crossing, color="0.4", linestyle=":")
