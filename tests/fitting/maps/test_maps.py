@@ -510,7 +510,7 @@ def test_auto_asks_all_texels_where_one_does_not_tell_which_lobe_it_has():
     lights = dome(24)
     pictures, truth = texels(300, 0.01, lights, seed=3, n=(4, 60))
     maps = fitting.fit_maps(pictures[..., :1], lights, truth["normal"][None], model="auto")
-    assert np.mean(maps.chosen == 1) < 0.01  # one in ten where each texel decided by itself
+    assert np.mean(maps.chosen == 1) < 0.01  # one in five where each texel decides by itself
     # A quarter of another law, and little noise: both are found.
     pictures, truth = texels(300, 0.001, lights, seed=3, n=(4, 60))
     mirror = 2 * (lights @ truth["normal"].T)[..., None] * truth["normal"] - lights[:, None]
