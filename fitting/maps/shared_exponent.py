@@ -74,7 +74,7 @@ def with_shared_n(problem: MapProblem, labels: Int[np.ndarray, "H W"]) -> MapPro
     with working_precision("float64"):
         gains, brackets = peaks(jnp.asarray(sums("gains", np.zeros(names.size))), grid(problem.finer))
         best = other = climbed(brackets[0])
-        if np.any(rivals(*gains, best[2])):
+        if np.any(rivals(gains, best[2])):
             other = climbed(brackets[1])
         (log_n, curvature, cost, freedom), rival = np.where(other[2] < best[2], [other, best], [best, other])
     noise = cost / np.maximum(freedom, 1)

@@ -274,35 +274,35 @@ class Texels(eqx.Module):
         n = jnp.exp(log_n)[:, None]
         return [*self.linear, *([self.lobe(self.model.scale(n) * self.power(n))] if self.glossy else [])]
 
-    def residual(self, fit: TexelFit) -> Components:
+    def residual(self, fit: "TexelFit | Minimum") -> Components:
         """What a fit leaves of the photographs."""
         explained = (column * beside(x) for x, column in zip(fit.k, self.columns(fit.log_n), strict=True))
         return functools.reduce(operator.sub, explained, self.values)
 
     # -- normals given -------------------------------------------------------------------------------------------------
 
-    def fitted(self) -> TexelFit:
-        """The best material of each texel."""
+    def peaks(self) -> tuple[Array, Array]:
+        """Of each texel the two highest peaks of what the grid of n gains, (2, T), and their brackets, (2, 3, T)."""
         if not self.glossy:
-            return self.at(jnp.zeros_like(self.cap))
+            nothing = jnp.zeros_like(self.cap)
+            return jnp.stack([nothing, nothing - jnp.inf]), jnp.zeros((2, 3, nothing.size), nothing.dtype)
+        return peaks(self.gains(), grid(self.finer))
 
-        def climbed(some, bracket):
-            def step(_, bracket):
-                point = some.at(bracket[0], errors=False)
-                return narrowed(bracket, point.slope[0], point.step[0])
+    def minima(self, heights: Array, brackets: Array) -> "Minimum":
+        """The best material of each texel, from both peaks side by side: of a few texels, for it takes twice."""
+        lanes = jnp.arange(heights.shape[1])
+        both = self.some(jnp.tile(lanes, 2)).climbed(jnp.concatenate(tuple(brackets), axis=-1))
+        first, second = of_lanes(both, lanes), of_lanes(both, lanes.size + lanes)
+        return first.beside(second, rivals(heights, first.cost))
 
-            return some.at(jax.lax.fori_loop(0, STEPS, step, bracket)[0])
+    def climbed(self, bracket: Array) -> "Minimum":
+        """Where Gauss-Newton ends in brackets of log n, (3, T)."""
 
-        def again(lanes, best):
-            other = climbed(self.some(lanes), second[:, lanes])
-            ends = ([*fit.k, fit.log_n, fit.cost] for fit in (best, other))
-            rival = [jnp.abs(b - a) for a, b in zip(*ends, strict=True)]
-            best = jax.tree.map(lambda a, b: jnp.where(other.cost < best.cost, b, a), best, other)
-            return best._replace(rival=rival)
+        def step(_, bracket):
+            point = self.evaluated(bracket[0], self.by_log_n(bracket[0]), errors=False)
+            return narrowed(bracket, point.slope[0], point.step[0])
 
-        (gain, rival), (first, second) = peaks(self.gains(), grid(self.finer))
-        best = climbed(self, first)
-        return of_few(rivals(gain, rival, best.cost), best, again)
+        return Minimum.at(self, jax.lax.fori_loop(0, STEPS, step, bracket)[0] if self.glossy else bracket[0])
 
     def at(self, log_n: Array, *, errors: bool = True, n_known: bool = False) -> TexelFit:
         """The best coefficients for a given n; their errors allow for that of n, unless n is sure."""
@@ -338,32 +338,38 @@ class Texels(eqx.Module):
         return jnp.sum(functools.reduce(operator.add, lowered), axis=-2)
 
     def unshadowed(self) -> "Trial":
-        """`fitted` where some values may lie in cast shadows.
+        """The best material of each texel, where some values may lie in cast shadows.
 
         Where values look like that the others are fitted without them, then all that is no outlier of that fit. This is
         kept where it explains the values better than a fit of all.
         """
         seen, diffuse = self.seen, self.linear[-1]
         dark = seen * shadowed(*(over_channels(self.unweighted(one)) for one in (self.values, diffuse)))
-        first = Trial.of(self, self.fitted(), seen)
+        known = heights, brackets = self.peaks()
+        found = self.climbed(brackets[0])
+        first = Trial.of(self, found, seen)
         # a k_d of their own, by its score: how far below the other one, in standard errors
-        terms = sums(self.residual(first.fit) * diffuse * dark, diffuse * diffuse * dark, diffuse * diffuse)
+        terms = sums(self.residual(found) * diffuse * dark, diffuse * diffuse * dark, diffuse * diffuse)
         score, square, whole = (jnp.sum(jnp.broadcast_to(one, self.shown.shape[:2]), axis=0) for one in terms)
-        variance = divide(first.fit.cost, first.freedom) * square * (1 - divide(square, whole))
+        variance = divide(found.cost, first.freedom) * square * (1 - divide(square, whole))
         worth = (score < 0) & (score**2 > jnp.minimum(OUTLIER**2, 0.25 * first.freedom) * variance)
 
-        def without(lanes, old):
-            some = self.some(lanes)
+        def anew(lanes, old):
+            some, tried, every = self.some(lanes), worth[lanes], seen[lanes]
 
-            def again(_, state):
+            def again(i, state):
                 counts, best = state
-                fit = some.where(counts).fitted()
-                better = best.or_better(Trial.of(some, fit, counts), worth[lanes])
-                return inliers(some.residual(fit), some.seen, counts), better
+                part = some.where(counts)
+                start = jax.lax.cond(i == 0, lambda _: of_lanes(known, lanes), Texels.peaks, part)
+                trial = Trial.of(some, part.minima(*start), counts)
+                better = (i == 0) | (tried & (trial.cost < best.cost))
+                best = jax.tree.map(lambda a, b: jnp.where(better, b, a), best, trial)
+                left = inliers(some.residual(trial.found), every, counts)
+                return jnp.where(i == 0, every - dark[lanes], left), best
 
-            return jax.lax.fori_loop(0, 2, again, ((seen - dark)[lanes], old))[1]
+            return jax.lax.fori_loop(0, jnp.where(jnp.any(tried), 3, 1), again, (every, old))[1]
 
-        return of_few(worth, first, without)
+        return of_few(rivals(heights, found.cost) | worth, first, anew)
 
     # -- least squares -------------------------------------------------------------------------------------------------
 
@@ -423,35 +429,64 @@ class Texels(eqx.Module):
         return fit._replace(cost=jnp.sum(*sums(left * left), axis=0))
 
 
+class Minimum(NamedTuple):
+    """What a search ends at.
+
+    Attributes:
+        k: as of `TexelFit`.
+        log_n: (T,).
+        cost: sum of squared residuals, (T,).
+        rival: how far k, log n and cost of another minimum are; 0 where there may be none.
+    """
+
+    k: list[Array]
+    log_n: Array
+    cost: Array
+    rival: list[Array]
+
+    @classmethod
+    def at(cls, texels: Texels, log_n: Array) -> "Minimum":
+        """With the best coefficients for a given n."""
+        fit = texels.at(log_n, errors=False, n_known=True)
+        return cls(fit.k, log_n, fit.cost, fit.rival)
+
+    def beside(self, other: "Minimum", unsure: Array) -> "Minimum":
+        """The lower one of two, where the other may be that."""
+        ends = ([*one.k, one.log_n, one.cost] for one in (self, other))
+        rival = [jnp.where(unsure, jnp.abs(b - a), 0) for a, b in zip(*ends, strict=True)]
+        better = unsure & (other.cost < self.cost)
+        return jax.tree.map(lambda a, b: jnp.where(better, b, a), self, other)._replace(rival=rival)
+
+
 class Trial(NamedTuple):
     """A fit of some of the values, and what it is judged by.
 
     Attributes:
-        fit: the fit.
+        found: the minimum.
         counts: 1 where a value counts, (P, T).
-        cost: of the fit and of what it leaves out, which counts as outliers with the least residual of such, (T,).
-        freedom: of the fit, (T,).
+        cost: of it and of what it leaves out, which counts as outliers with the least residual of such, (T,).
+        freedom: of it, (T,).
         normal: that it is for; None where normals are given.
     """
 
-    fit: TexelFit
+    found: Minimum
     counts: Array
     cost: Array
     freedom: Array
     normal: Components | None = None
 
     @classmethod
-    def of(cls, texels: Texels, fit: TexelFit, counts: Array, normal: Any = None) -> "Trial":
+    def of(cls, texels: Texels, found: Minimum, counts: Array, normal: Any = None) -> "Trial":
         """Where some of the values that are seen count."""
         many, left_out = sums_of(counts, texels.seen - counts)
-        freedom = len(texels.shown) * (many - len(fit.k) + texels.glossy) - texels.of_lobe
-        cost = fit.cost * (1 + OUTLIER**2 * left_out / jnp.maximum(freedom, 1))
-        return cls(fit, counts.T, jnp.where(freedom < 3, jnp.inf, cost), freedom, normal)
+        freedom = len(texels.shown) * (many - len(found.k) + texels.glossy) - texels.of_lobe
+        cost = found.cost * (1 + OUTLIER**2 * left_out / jnp.maximum(freedom, 1))
+        return cls(found, counts.T, jnp.where(freedom < 3, jnp.inf, cost), freedom, normal)
 
-    def or_better(self, other: "Trial", worth: Any = True) -> "Trial":
-        """Of each texel that of less cost, where another is worth a try."""
-        better = worth & (other.cost < self.cost)
-        return jax.tree.map(lambda a, b: jnp.where(better, b, a), self, other)
+
+def of_lanes(tree: Any, lanes: Array) -> Any:
+    """Of arrays whose last axis texels are, those of some indices."""
+    return jax.tree.map(lambda one: one[..., lanes], tree)
 
 
 def of_few(left: Array, best: Any, better: Callable[[Array, Any], Any]) -> Any:
@@ -466,7 +501,7 @@ def of_few(left: Array, best: Any, better: Callable[[Array, Any], Any]) -> Any:
     def step(state):
         left, best = state
         lanes = jnp.nonzero(left, size=min(at_a_time(FEW), left.size), fill_value=left.size - 1)[0]
-        new = better(lanes, jax.tree.map(lambda one: one[..., lanes], best))
+        new = better(lanes, of_lanes(best, lanes))
         return left.at[lanes].set(False), jax.tree.map(lambda a, b: a.at[..., lanes].set(b), best, new)
 
     return jax.lax.while_loop(lambda state: jnp.any(state[0]), step, (left, best))[1]
@@ -479,8 +514,8 @@ def grid(finer: int) -> list[float]:
     return [start * 2.0**octave for start in starts for octave in range(TOGETHER)]
 
 
-def peaks(gains: Array, exponents: list[float]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """The two highest peaks of gains, (T,) each, and their brackets, (3, T).
+def peaks(gains: Array, exponents: list[float]) -> tuple[Array, Array]:
+    """The two highest peaks of gains, (2, T), and their brackets, (2, 3, T).
 
     A bracket is log n, that of the exponent below and of the one above: what is downhill is between.
     """
@@ -495,13 +530,13 @@ def peaks(gains: Array, exponents: list[float]) -> tuple[tuple[Array, Array], tu
         index = jnp.max(jnp.where(heights == highest, number, 0), axis=0)
         heights = jnp.where(number == index, -jnp.inf, heights)
         found.append((highest, ends[:, index]))
-    (first, bracket), (second, other) = found
-    return (first, second), (bracket, other)
+    highest, brackets = map(jnp.stack, zip(*found, strict=True))
+    return highest, brackets
 
 
-def rivals(gain: Array, rival: Array, cost: Array) -> Array:
+def rivals(heights: Array, cost: Array) -> Array:
     """Whether the second peak may lead to less than the cost that the first has led to; gains are half of a fall."""
-    return gain - rival < 0.5 * RIVAL * cost
+    return heights[0] - heights[1] < 0.5 * RIVAL * cost
 
 
 def share_of_rival(worse: Array, variance: Array) -> Array:
@@ -607,13 +642,17 @@ def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Components,
         before = lit(normal)
         used = before * counts
         some = texels.where(used)
-        found = some.facing(normal, lights).fitted()
+        there = some.facing(normal, lights)
+        known = heights, brackets = there.peaks()
+        found = there.climbed(brackets[0])
+        unsure = rivals(heights, found.cost)
+        found = of_few(unsure, found, lambda lanes, _: there.some(lanes).minima(*of_lanes(known, lanes)))
         start = found.log_n, normal, found.cost
         log_n, normal, least = jax.lax.cond(
             i < count, lambda *same: same, lambda log_n, normal, _: jointly(some, lights, log_n, normal), *start
         )
         there, facing = texels.facing(normal, lights), lit(normal)
-        fit = there.where(facing * counts).at(log_n, errors=False)
+        fit = Minimum.at(there.where(facing * counts), log_n)
         residual = there.residual(fit)
         direct = over_channels(there.values - residual)
         if lights.ambient is not None:
@@ -637,7 +676,7 @@ def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Components,
     nothing, *values = jax.tree.map(jnp.zeros_like, jax.eval_shape(tried, 0, *first))
     nothing = nothing._replace(cost=jnp.full_like(nothing.cost, jnp.inf)), *values
     best, before, used, cost = jax.lax.fori_loop(0, count + TURNS, step, nothing)
-    some, log_n, normal, rival = texels.where(used.T), best.fit.log_n, best.normal, best.fit.rival
+    some, log_n, normal, rival = texels.where(used.T), best.found.log_n, best.normal, best.found.rival
     if texels.glossy:
         log_n, normal, least = restarted(some, lights, (log_n, normal, cost))
         rival = [jnp.where(least < cost, 0, one) for one in rival]

@@ -323,7 +323,8 @@ def _of_normals(
         left = [point.slope[0], divide(1.0, point.error[0] ** 2), point.cost, jnp.maximum(freedom, 0)]
         return {"sums": jnp.where(mask, jnp.stack(left), 0)}
     if shared is None:
-        return _layers(texels, best.fit, texels.seen, counts, mask, normal, rounding)
+        found = some.at(best.found.log_n)._replace(rival=best.found.rival)
+        return _layers(texels, found, texels.seen, counts, mask, normal, rounding)
     log_n, error = shared.T
     found = fit(log_n=log_n, n_known=True)
     return _layers(texels, found, texels.seen, counts, mask, normal, rounding, error)
