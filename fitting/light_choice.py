@@ -72,6 +72,11 @@ class LightChoice:
         """Of the first light where it is directional: the unit vector towards it."""
         return direction_of(self.lights[0])
 
+    @property
+    def _what(self) -> str:
+        """What is told of."""
+        return "number of undetermined texels" if self.of == "undetermined" else f"error of {self.of}"
+
     def __str__(self) -> str:
         """In words, a line a light."""
         lines, befores = [], (self.before, *self.after)
@@ -79,7 +84,7 @@ class LightChoice:
             shown = repr(light)
             if isinstance(light, brdf.DirectionalLight):
                 shown = f"a light from ({', '.join(f'{value:.3f}' for value in direction_of(light))})"
-            lines.append(f"{shown} brings the error of {self.of} from {before:.3g} to {after:.3g}")
+            lines.append(f"{shown} brings the {self._what} from {before:.3g} to {after:.3g}")
         return "\n".join(lines)
 
     def plot(self) -> Any:
@@ -100,11 +105,9 @@ class LightChoice:
         for lights, marker, label in ((self.known, "x", "there already"), (self.lights, "*", "chosen")):
             places = [direction_of(light)[:2] for light in lights if isinstance(light, brdf.DirectionalLight)]
             axes.scatter(*np.reshape(places, (-1, 2)).T, marker=marker, s=90, color="#D55E00", label=label)
-        axes.set(
-            title=f"error of {self.of} with one more light", xlabel="x towards the light", ylabel="y", aspect="equal"
-        )
+        axes.set(title=f"{self._what} with one more light", xlabel="x towards the light", ylabel="y", aspect="equal")
         axes.legend(loc="lower right", fontsize=7)
-        figure.colorbar(colours, label=f"standard error of {self.of}")
+        figure.colorbar(colours, label=self._what)
         return figure
 
 

@@ -42,8 +42,12 @@ def write_maps(maps: "Maps", folder: str | Path, *, plot: bool = False) -> None:
     gloss = np.log2(np.maximum(maps.fitted_n, 1)) / OCTAVES
     half_n, f_0 = _as_facets(maps)
     roughness = np.asarray(brdf.roughness_from_exponent(half_n))
+    # Of a glTF material no part is above 1 and what shines is taken from what is diffuse: both are made darker alike.
+    whole = np.percentile(np.max(k_d, axis=-1) + np.max(f_0, axis=-1), 99.9)
+    scale["material"] = max(1.0, float(whole))
+    f_0 = np.minimum(f_0 / scale["material"], MOST_REFLECTANCE)
     strongest = float(np.percentile(f_0, 99.9)) or 1.0
-    base = k_d / (1 - np.max(f_0, axis=-1, keepdims=True))  # what glTF's mixing takes from the diffuse part
+    base = k_d / scale["material"] / (1 - np.max(f_0, axis=-1, keepdims=True))
     inside = np.any(maps.normal != 0, axis=-1)
     normals = np.where(inside[..., None], 0.5 * maps.normal + 0.5, 0.5)
     images = {
@@ -51,7 +55,7 @@ def write_maps(maps: "Maps", folder: str | Path, *, plot: bool = False) -> None:
         "k_s": (k_s / scale["k_s"], "linear"),
         "normals": (normals, "linear"),
         "gloss": (gloss, "linear"),
-        "base_color": (base / max(1.0, scale["k_d"]), "srgb"),
+        "base_color": (base, "srgb"),
         "metallic_roughness": (np.stack([0 * gloss, roughness, 0 * gloss], axis=-1), "linear"),
         "specular_color": (f_0 / strongest, "srgb"),
         "residual": (np.nan_to_num(maps.residual), "linear"),
@@ -61,6 +65,7 @@ def write_maps(maps: "Maps", folder: str | Path, *, plot: bool = False) -> None:
         "models": maps.models,
         "to_view": maps.to_view.tolist(),
         "to_light": None if maps.to_light is None else maps.to_light.tolist(),
+        "intensity": None if maps.intensity is None else maps.intensity.tolist(),
         "notes": maps.notes,
         "layers": {name: str(values.dtype) for name, values in layers.items()},
         "scale": scale,
@@ -92,7 +97,7 @@ def _as_facets(maps: "Maps") -> tuple[np.ndarray, np.ndarray]:
             half_n[own] *= 4 if model.log_cosine is mirror_log_cosine else 1
             height[own] = model.scale(maps.fitted_n[own])
     # facets of slope alpha show F_0 / (4 alpha²) where the classic highlight shows k_s, and alpha² is 2 / (n+2)
-    return half_n, np.minimum(maps.fitted_k_s * (8 * height / (half_n + 2))[..., None], MOST_REFLECTANCE)
+    return half_n, maps.fitted_k_s * (8 * height / (half_n + 2))[..., None]
 
 
 def _openlime(width: int, height: int, scale: dict[str, float]) -> dict[str, Any]:

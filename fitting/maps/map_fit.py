@@ -26,6 +26,11 @@ LOSSY = (
     "times too small, and a faint highlight may be the codec's"
 )
 
+MOST_APART = 1.0
+"""Degrees by which directions towards a camera that is far away differ."""
+
+NEAR = "the camera is near: maps are rendered as seen from its mean direction, which is up to {:.0f} degrees off"
+
 COPLANAR = 1e-3
 """Singular value of the directions towards lights: in a plane the least is 0."""
 
@@ -120,17 +125,23 @@ def fit_maps(
     given = map_inputs.photographs(pictures, lights, intensities, exposures, encoding)
     with working_precision(precision):
         surface = _surface(given, normals, mask, precision, flip_y)
-    to_view = np.asarray(direction_value("to_view", to_view))
+    to_view, near = np.asarray(direction_value("to_view", to_view)), ()
     if surface.points is not None:
-        to_view = np.sum(np.asarray(surface.points.to_view, float)[np.asarray(surface.mask)], axis=0)
+        each = np.asarray(surface.points.to_view, float)[np.asarray(surface.mask)]
+        to_view = np.sum(each, axis=0)
+        apart = np.degrees(np.arccos(min(1.0, np.min(each @ to_view, initial=np.inf) / np.linalg.norm(to_view))))
+        near = (NEAR.format(apart),) if apart > MOST_APART else ()
     else:
+        if surface.normal is None and np.linalg.svd(given.to_light, compute_uv=False)[2:].sum() < COPLANAR:
+            what = "lie in a plane with the texel, of which normals are not found"
+            raise InputError("lights", what, "Give normals, or lights from all sides")
         _refuse_behind(surface, given, to_view, str(normals) if isinstance(normals, str | Path) else "normals")
     problem = MapProblem(given, surface, models, specular == "grey", _ambient(ambient, given), to_view, precision)
     labels = None if labels is None else label_map(labels, problem)
     problem, unit, clipping = with_levels(problem, saturation)
     problem, notes = likelier(problem)
     problem = with_prices(problem)
-    notes += clipping
+    notes += clipping + near
     if lossy := [one.name for one in given.each if one.lossy]:
         notes += (LOSSY.format(lossy[0]),)
     if guessed := [one for one in given.each if one.layer is not None]:
@@ -140,14 +151,12 @@ def fit_maps(
             problem = with_shared_n(problem, labels)
         layers = in_unit(fit_bands(problem, None if keep is None else Path(keep)), unit)
     if np.all(np.isnan(layers["k_d"])):
-        to_light = given.to_light if surface.normal is None else None
-        if to_light is not None and np.linalg.svd(to_light, compute_uv=False)[-1] < COPLANAR:
-            what = "lie in a plane with the texel, of which normals are not found"
-            raise InputError("lights", what, "Give normals, or lights from all sides")
         raise InputError("pictures", "show no texel that counts", "Check mask, normals and clipping")
     notes += upside_down(problem, layers["residual"])
     names = tuple(one.name for one in models)
-    return Maps(models=names, to_view=to_view, notes=notes, to_light=given.to_light, **layers)
+    to_view /= np.linalg.norm(to_view)
+    lights = {"to_light": given.to_light, "intensity": np.mean(given.unit, axis=1)}
+    return Maps(models=names, to_view=to_view, notes=notes, **lights, **layers)
 
 
 def _refuse_behind(surface: Surface, given: Photographs, to_view: np.ndarray, name: str) -> None:
@@ -172,7 +181,7 @@ def _ambient(ambient: Any, given: Photographs) -> np.ndarray | None:
         if values.size not in (1, given.size[2]) or not np.all((values > 0) & np.isfinite(values)):
             what = f"must be 1 or {given.size[2]} numbers above 0, got {ambient!r:.60}"
             raise InputError("ambient", what, "Give the intensity of the ambient light")
-    columns = values / given.unit
+    columns = values * given.exposure / given.unit
     return columns[:, :1] if np.all(columns == columns[:, :1]) else columns
 
 

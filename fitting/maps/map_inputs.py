@@ -70,6 +70,7 @@ class Photographs:
     Attributes:
         each: of one size.
         unit: what each is divided by, (P, C).
+        exposure: what of that ambient light is seen with, too, (P, C).
         to_light: unit, (P, 3); None where ``scenes`` tell.
         scenes: of each photograph with its one light, of intensity 1; None where all lights are distant.
         ambient: what the scenes say of ambient light, (P, C); None where they say nothing.
@@ -77,6 +78,7 @@ class Photographs:
 
     each: tuple[Photograph, ...]
     unit: Float[np.ndarray, "P C"]
+    exposure: Float[np.ndarray, "P C"]
     to_light: Float[np.ndarray, "P 3"] | None = None
     scenes: tuple[brdf.Scene, ...] | None = None
     ambient: Float[np.ndarray, "P C"] | None = None
@@ -269,9 +271,10 @@ def normal_map(given: Any, *, flip_y: bool = False) -> Float[np.ndarray, "H W 3"
     if coded:
         empty, normal = np.all(normal == 0, axis=-1), 2 * normal - 1
         normal[empty | (np.sum(normal * normal, axis=-1) < NO_SURFACE)] = 0
-    elif _looks_coded(normal):
-        what = "hold n·0.5 + 0.5, as images do: 2 n - 1 is of length 1, and nothing is below 0"
-        raise InputError(name, what, "Give 2 n - 1, or the codes of the image")
+    elif white := next((white for white in (1, 255, 65535) if _looks_coded(normal / white)), None):
+        decoded = "2 n - 1" if white == 1 else f"2 n / {white} - 1"
+        what = f"hold n·0.5 + 0.5, as images do: {decoded} is of length 1, and nothing is below 0"
+        raise InputError(name, what, f"Give {decoded}, or the codes of the image as unsigned integers")
     return normal * np.array([1, -1 if flip_y else 1, 1], np.float32)
 
 
@@ -325,9 +328,9 @@ def photographs(
     if len(lights) != len(each):
         raise InputError("lights", f"are {len(lights)} for {len(each)} photographs", "Give a light for each photograph")
     factors = functools.partial(_factors, len(each), first.shape[2])
-    unit = np.ones((len(each), first.shape[2]))
-    for name, values in (("intensities", intensities), ("exposures", exposures)):
-        unit = unit if values is None else unit * factors(name, values)
+    one = np.ones(len(each))
+    exposure = factors("exposures", one if exposures is None else exposures)
+    unit = exposure * factors("intensities", one if intensities is None else intensities)
     if all(isinstance(light, brdf.Scene) for light in lights):
         if other := next((i for i, scene in enumerate(lights) if _view(scene) != _view(lights[0])), 0):
             what = "has another camera, or other shapes or points, than lights[0]"
@@ -336,11 +339,12 @@ def photographs(
             *(_of_scene(f"lights[{i}]", scene, first.shape[2]) for i, scene in enumerate(lights)), strict=True
         )
         unit = unit * factors("lights", colours)
-        return Photographs(tuple(each), unit, None, scenes, np.array(ambient) if np.any(ambient) else None)
+        ambient = np.array(ambient) if np.any(ambient) else None
+        return Photographs(tuple(each), unit, exposure, scenes=scenes, ambient=ambient)
     if all(isinstance(light, brdf.DirectionalLight) for light in lights):
         colours = [np.broadcast_to(np.asarray(light.intensity), first.shape[2:]) for light in lights]
         unit, lights = unit * factors("lights", colours), [light.direction for light in lights]
-    return Photographs(tuple(each), unit, _directions(lights))
+    return Photographs(tuple(each), unit, exposure, _directions(lights))
 
 
 def _opened(name: str, picture: Any, encoding: Any) -> Photograph:

@@ -55,7 +55,8 @@ def next_light(maps: "Maps", candidates: Any, count: int, of: str) -> LightChoic
         return jnp.stack([a * b for i, a in enumerate(columns) for b in columns[i:]])
 
     def information_by(light: Any) -> np.ndarray:
-        return np.asarray(products(direction_of(light)), np.float64)
+        shining = np.mean(np.asarray(light.emittance, np.float64))
+        return shining**2 * np.asarray(products(direction_of(light)), np.float64)
 
     def left_by(information: np.ndarray) -> np.ndarray:
         """Of the information on ln n, what k_d and k_s leave."""
@@ -72,7 +73,8 @@ def next_light(maps: "Maps", candidates: Any, count: int, of: str) -> LightChoic
     def divided(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         return np.divide(a, b, out=np.zeros_like(a), where=b > 0)
 
-    known = tuple(brdf.DirectionalLight(light, 1.0) for light in maps.to_light)
+    shining = np.ones(len(maps.to_light)) if maps.intensity is None else maps.intensity
+    known = tuple(map(brdf.DirectionalLight, maps.to_light, shining))
     information = np.sum([information_by(light) for light in known], axis=0)
     strength = np.sum(maps.fitted_k_s.reshape(-1, maps.fitted_k_s.shape[-1])[texel] ** 2.0, axis=1)
     strength /= maps.noise.ravel()[texel] ** 2.0

@@ -46,11 +46,12 @@ class Maps:
         fitted_k_s: the specular coefficient to it; 0 where no highlight is seen.
         chosen: which of ``models`` each texel has.
         models: names.
-        to_view: towards the camera.
+        to_view: unit vector towards the camera, of one that is near the mean.
         notes: what was found out about the photographs.
         k_a: ambient coefficient, where there was ambient light.
         k_a_error: standard error.
         to_light: unit vectors towards the lights, where all are distant.
+        intensity: of these, times exposures: what each photograph was divided by, its channels' mean.
         noise: of a value, its standard deviation.
         left_out: share of a texel's values that were left out as cast shadows or other outliers.
 
@@ -80,6 +81,7 @@ class Maps:
     k_a: Float[np.ndarray, "H W C"] | None = None
     k_a_error: Float[np.ndarray, "H W C"] | None = None
     to_light: Float[np.ndarray, "P 3"] | None = None
+    intensity: Float[np.ndarray, " P"] | None = None
     noise: Float[np.ndarray, "H W"] | None = None
     left_out: Float[np.ndarray, "H W"] | None = None
 
@@ -114,23 +116,32 @@ class Maps:
             lines.append(f"  cast shadows and other outliers: {left_out:.1f} % of the values left out")
         return "\n".join([*lines, *(f"  note: {note}" for note in self.notes)])
 
-    def render(self, light: Any) -> Float[np.ndarray, "H W C"]:
-        """The picture under another distant light.
+    def render(self, light: Any, *, ambient: Any = 0.0) -> Float[np.ndarray, "H W C"]:
+        """The picture under another distant light, seen from afar.
 
         Args:
             light: direction towards it, (3,), or a `brdf.DirectionalLight`.
+            ambient: intensity of ambient light, a number or (C,), where the maps have k_a.
 
         Returns:
             Linear values; 0 outside.
 
         Raises:
-            InputError: where it is no direction.
+            InputError: where it is no direction, or has other channels than the maps.
 
         Example:
             >>> fitting.load_maps("maps").render([0.3, 0.0, 1.0]).shape
             (4, 4, 3)
         """
         light = light if isinstance(light, brdf.DirectionalLight) else brdf.DirectionalLight(light, 1.0)
+        intensity, ambient = (np.atleast_1d(np.asarray(one, float)) for one in (light.intensity, ambient))
+        channels = self.k_d.shape[2]
+        for name, values in (("light", intensity), ("ambient", ambient)):
+            if values.shape not in ((1,), (channels,)):
+                what = f"is of {values.size} channels, the maps of {channels}"
+                raise InputError(name, what, "Give a number, or one for each channel")
+        if self.k_a is None and np.any(ambient):
+            raise InputError("ambient", "lights maps without k_a", "Fit them with their ambient light")
         to_light = np.asarray(light.direction) / np.linalg.norm(light.direction)
         to_view = self.to_view / np.linalg.norm(self.to_view)
         normal = jnp.asarray(self.normal)
@@ -142,7 +153,9 @@ class Maps:
                 each = eqx.tree_at(lambda one: one.n, model(k_d=0.0, k_s=1.0, n=1.0), jnp.asarray(self.fitted_n))
                 lobe = np.asarray(each.specular(normal, jnp.asarray(to_light), jnp.asarray(to_view)))
                 picture += np.where((self.chosen == index)[..., None], self.fitted_k_s * lobe[..., None], 0)
-        return (picture * np.asarray(light.intensity)).astype(np.float32)
+        picture *= intensity
+        picture += 0 if self.k_a is None else np.nan_to_num(self.k_a) * ambient
+        return picture.astype(np.float32)
 
     def next_light(self, candidates: Any = None, count: int = 1, *, of: str = "n") -> Any:
         """The light under which one more photograph would tell most of the exponents.
@@ -249,6 +262,7 @@ def load_maps(folder: str | Path) -> Maps:
         unknown = [name for name in models if name not in brdf.MODELS]
         to_view = np.array(about["to_view"], float).reshape(3)
         to_light = np.array(about["to_light"], float).reshape(-1, 3) if about.get("to_light") else None
+        intensity = np.array(about["intensity"], float).reshape(-1) if about.get("intensity") else None
     except (ValueError, KeyError, TypeError, AttributeError):
         raise InputError(path, "does not describe maps", remedy) from None
     if unknown or not models:
@@ -267,4 +281,5 @@ def load_maps(folder: str | Path) -> Maps:
             else found[name][..., 0]
         )
         layers[name] = values.astype(kind)
-    return Maps(models=tuple(models), to_view=to_view, notes=tuple(notes), to_light=to_light, **layers)
+    given = {"to_view": to_view, "to_light": to_light, "intensity": intensity}
+    return Maps(models=tuple(models), notes=tuple(notes), **given, **layers)

@@ -13,8 +13,9 @@ from brdf.errors import InputError
 from brdf.models.base import SpecularMaterial
 from brdf.precision import working_precision
 from fitting.maps.map_bands import fit_bands
-from fitting.maps.texels import STEPS, grid, narrowed, peaks, rivals, share_of_rival
+from fitting.maps.texels import STEPS, grid, narrowed, peaks, per_deviation, rivals
 from fitting.maps.tiles import MapProblem
+from fitting.uncertainty.intervals import NORMAL_95, student_95
 
 
 def label_map(labels: Any, problem: MapProblem) -> Int[np.ndarray, "H W"]:
@@ -62,24 +63,30 @@ def with_shared_n(problem: MapProblem, labels: Int[np.ndarray, "H W"]) -> MapPro
         there = surface._replace(shared=np.stack([np.asarray(log_n)[index], np.zeros(size)], axis=-1))
         found = fit_bands(dataclasses.replace(problem, surface=there, seek=seek))["sums"]
         rows = found.reshape(-1, found.shape[2]).T.astype(float)
-        return np.stack([np.bincount(index.ravel(), row, names.size) for row in rows])
+        every, shown = np.split(np.stack([np.bincount(index.ravel(), row, names.size) for row in rows]), 2)
+        # Noise looks like a lobe that meets some lights: many texels that show none outweigh the few that do.
+        return np.where(shown[-1] > 0.5 * every[-1], shown, every)[:-1]
 
     def climbed(bracket: Any) -> np.ndarray:
-        """Log n of a bracket, and the sums there: the curvature, the cost and the degrees of freedom."""
+        """Log n of a bracket, and the sums there: curvature, cost, degrees of freedom and squares of what is shown."""
         for _ in range(STEPS):
-            slope, curvature, _, _ = sums("slope", bracket[0])
+            slope, curvature, *_ = sums("slope", bracket[0])
             bracket = narrowed(bracket, slope, np.divide(slope, curvature, out=0 * slope, where=curvature > 0))
         return np.stack([bracket[0], *sums("slope", bracket[0])[1:]])
 
     with working_precision("float64"):
-        gains, brackets = peaks(jnp.asarray(sums("gains", np.zeros(names.size))), grid(problem.finer))
-        best = other = climbed(brackets[0])
-        if np.any(rivals(gains, best[2])):
+        gains = jnp.asarray(sums("gains", np.zeros(names.size)))
+        heights, brackets = peaks(gains, grid(problem.finer))
+        best = climbed(brackets[0])
+        if np.any(rivals(heights, best[2])):
             other = climbed(brackets[1])
-        (log_n, curvature, cost, freedom), rival = np.where(other[2] < best[2], [other, best], [best, other])
-    noise = cost / np.maximum(freedom, 1)
-    error = np.sqrt(np.divide(noise, curvature, out=np.full_like(noise, np.inf), where=curvature > 0))
-    share = share_of_rival(rival[2] - cost, np.maximum(noise, np.finfo(float).tiny))
-    error = np.hypot(error, share * np.abs(rival[0] - log_n))
+            best = np.where(other[2] < best[2], other, best)
+        log_n, curvature, cost, freedom, square = best
+        freedom = np.maximum(freedom, 1)
+        variance = np.maximum(cost / freedom, np.finfo(float).tiny) * (student_95(freedom) / NORMAL_95) ** 2
+        error = np.sqrt(np.divide(variance, curvature, out=np.full_like(variance, np.inf), where=curvature > 0))
+        share = per_deviation(square - cost - 2 * gains, variance)
+        apart = np.log(grid(problem.finer))[:, None] - log_n
+        error = np.maximum(error, np.max(share * np.abs(apart), axis=0))
     shared = np.stack([log_n[index], error[index]], axis=-1)
     return dataclasses.replace(problem, surface=surface._replace(shared=shared))

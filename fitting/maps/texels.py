@@ -28,6 +28,7 @@ from brdf.models.base import SpecularMaterial
 from brdf.precision import apart, at_a_time
 from brdf.vectors import Components, divide, dot, largest, mirror_log_cosine, normalize, perpendicular, square_root
 from fitting.solver.normal_equations import totals
+from fitting.uncertainty.intervals import NORMAL_95
 
 OCTAVES = 16
 """The exponent is sought from 1 to 2^16: beyond, a lobe is narrower than the step between any two lights."""
@@ -43,6 +44,9 @@ the cost has minima on either side that are narrower than an octave."""
 
 RIVAL = 1.0
 """The second peak is climbed too where its cost exceeds the first one's by at most so much of what that leads to."""
+
+ALLOWED = 3.0
+"""By so many deviations a fit may be worse than the best one and still count: the grid may miss what is within 1.96."""
 
 FEW = 32
 """Texels that are fitted anew at a time, from the second peak or without what lies in cast shadows."""
@@ -173,7 +177,6 @@ class TexelFit(NamedTuple):
         error: of each.
         cost: sum of squared residuals, (T,).
         gain: by how much the last column lowers it, (T,).
-        rival: how far k, log n and cost of another minimum are; 0 where none was climbed.
     """
 
     k: list[Array]
@@ -184,7 +187,6 @@ class TexelFit(NamedTuple):
     error: list[Array]
     cost: Array
     gain: Array
-    rival: list[Array]
 
 
 class Texels(eqx.Module):
@@ -281,19 +283,22 @@ class Texels(eqx.Module):
 
     # -- normals given -------------------------------------------------------------------------------------------------
 
-    def peaks(self) -> tuple[Array, Array]:
-        """Of each texel the two highest peaks of what the grid of n gains, (2, T), and their brackets, (2, 3, T)."""
+    def start(self) -> "Start":
+        """Where the search of each texel starts."""
         if not self.glossy:
             nothing = jnp.zeros_like(self.cap)
-            return jnp.stack([nothing, nothing - jnp.inf]), jnp.zeros((2, 3, nothing.size), nothing.dtype)
-        return peaks(self.gains(), grid(self.finer))
+            brackets = jnp.zeros((2, 3, nothing.size), nothing.dtype)
+            return Start(nothing[None], [], jnp.stack([nothing, nothing - jnp.inf]), brackets)
+        gains, k = self.profile()
+        return Start(gains, k, *peaks(gains, grid(self.finer)))
 
-    def minima(self, heights: Array, brackets: Array) -> "Minimum":
+    def minima(self, start: "Start") -> "Minimum":
         """The best material of each texel, from both peaks side by side: of a few texels, for it takes twice."""
-        lanes = jnp.arange(heights.shape[1])
-        both = self.some(jnp.tile(lanes, 2)).climbed(jnp.concatenate(tuple(brackets), axis=-1))
+        lanes = jnp.arange(start.gains.shape[1])
+        both = self.some(jnp.tile(lanes, 2)).climbed(jnp.concatenate(tuple(start.brackets), axis=-1))
         first, second = of_lanes(both, lanes), of_lanes(both, lanes.size + lanes)
-        return first.beside(second, rivals(heights, first.cost))
+        better = rivals(start.heights, first.cost) & (second.cost < first.cost)
+        return jax.tree.map(lambda a, b: jnp.where(better, b, a), first, second)
 
     def climbed(self, bracket: Array) -> "Minimum":
         """Where Gauss-Newton ends in brackets of log n, (3, T)."""
@@ -312,8 +317,11 @@ class Texels(eqx.Module):
         """The derivative of the lobe's column, if there is one."""
         return [jax.jvp(lambda x: self.columns(x)[-1], (log_n,), (jnp.ones_like(log_n),))[1]] * self.glossy
 
-    def gains(self) -> Array:
-        """By how much the best material lowers the cost, at each n of the grid, (G, T)."""
+    def profile(self) -> tuple[Array, list[Array]]:
+        """By how much the best material lowers half the cost at each n of the grid, (G, T), and its k, (G, C, T) each.
+
+        A k that the channels share is (G, 1, T).
+        """
         dtype, size = self.shown.dtype, len(self.linear) + 2
 
         def sums_at(powers):
@@ -335,7 +343,7 @@ class Texels(eqx.Module):
         cap = self.cap * self.model.scale(jnp.asarray(exponents, dtype))[:, None]
         k = nonnegative(rows, cap, self.grey, steps=2)
         lowered = (x * (b - 0.5 * sum(map(operator.mul, row, k))) for x, (*row, b) in zip(k, rows, strict=True))
-        return jnp.sum(functools.reduce(operator.add, lowered), axis=-2)
+        return jnp.sum(functools.reduce(operator.add, lowered), axis=-2), k
 
     def unshadowed(self) -> "Trial":
         """The best material of each texel, where some values may lie in cast shadows.
@@ -345,9 +353,9 @@ class Texels(eqx.Module):
         """
         seen, diffuse = self.seen, self.linear[-1]
         dark = seen * shadowed(*(over_channels(self.unweighted(one)) for one in (self.values, diffuse)))
-        known = heights, brackets = self.peaks()
-        found = self.climbed(brackets[0])
-        first = Trial.of(self, found, seen)
+        start = self.start()
+        found = self.climbed(start.brackets[0])
+        first = Trial.of(self, start, found, seen)
         # a k_d of their own, by its score: how far below the other one, in standard errors
         terms = sums(self.residual(found) * diffuse * dark, diffuse * diffuse * dark, diffuse * diffuse)
         score, square, whole = (jnp.sum(jnp.broadcast_to(one, self.shown.shape[:2]), axis=0) for one in terms)
@@ -360,8 +368,8 @@ class Texels(eqx.Module):
             def again(i, state):
                 counts, best = state
                 part = some.where(counts)
-                start = jax.lax.cond(i == 0, lambda _: of_lanes(known, lanes), Texels.peaks, part)
-                trial = Trial.of(some, part.minima(*start), counts)
+                own = jax.lax.cond(i == 0, lambda _: of_lanes(start, lanes), Texels.start, part)
+                trial = Trial.of(some, own, part.minima(own), counts)
                 better = (i == 0) | (tried & (trial.cost < best.cost))
                 best = jax.tree.map(lambda a, b: jnp.where(better, b, a), best, trial)
                 left = inliers(some.residual(trial.found), every, counts)
@@ -369,7 +377,7 @@ class Texels(eqx.Module):
 
             return jax.lax.fori_loop(0, jnp.where(jnp.any(tried), 3, 1), again, (every, old))[1]
 
-        return of_few(rivals(heights, found.cost) | worth, first, anew)
+        return of_few(rivals(start.heights, found.cost) | worth, first, anew)
 
     # -- least squares -------------------------------------------------------------------------------------------------
 
@@ -423,10 +431,45 @@ class Texels(eqx.Module):
         of_channels = k, [one.error for one in solved[:count]]
         k, k_error = ([jnp.broadcast_to(x, self.shown.shape[:2]) for x in some] for some in of_channels)
         slope, step, error = ([getattr(one, name)[0] for one in solved[count:]] for name in ("left", "step", "error"))
-        rival = [jnp.zeros_like(one) for one in (*k, log_n, gain)]
-        fit = TexelFit(k, k_error, log_n, slope, step, error, gain, gain, rival)
+        fit = TexelFit(k, k_error, log_n, slope, step, error, gain, gain)
         left = self.residual(fit)
         return fit._replace(cost=jnp.sum(*sums(left * left), axis=0))
+
+
+class Start(NamedTuple):
+    """Where a search starts.
+
+    Attributes:
+        gains: see `Texels.profile`.
+        k: likewise; of a model without a lobe nothing.
+        heights: the two highest peaks, (2, T).
+        brackets: of log n about them, (2, 3, T).
+    """
+
+    gains: Array
+    k: list[Array]
+    heights: Array
+    brackets: Array
+
+    def errors(self, fit: TexelFit, square: Array, variance: Array, finer: int) -> list[Array]:
+        """Standard errors of k and log n by the profile of their likelihood: how far from a fit all lie that it allows.
+
+        Where what is explained is linear in log n they are the fit's own; where many n serve alike, as of a highlight
+        whose top no light shows, far larger.
+
+        Args:
+            fit: the fit.
+            square: of what is shown, summed, (T,).
+            variance: of the noise, above 0.
+            finer: of the grid.
+        """
+        log_n = jnp.log(jnp.asarray(grid(finer), square.dtype))[:, None]
+        share = per_deviation(square - fit.cost - 2 * self.gains, variance)
+        apart = [jnp.abs(one - best) for one, best in zip(self.k, fit.k, strict=True)]
+        return [
+            *(jnp.max(share[:, None] * one, axis=0) for one in apart),
+            jnp.max(share * jnp.abs(log_n - fit.log_n), axis=0),
+        ]
 
 
 class Minimum(NamedTuple):
@@ -436,32 +479,24 @@ class Minimum(NamedTuple):
         k: as of `TexelFit`.
         log_n: (T,).
         cost: sum of squared residuals, (T,).
-        rival: how far k, log n and cost of another minimum are; 0 where there may be none.
     """
 
     k: list[Array]
     log_n: Array
     cost: Array
-    rival: list[Array]
 
     @classmethod
     def at(cls, texels: Texels, log_n: Array) -> "Minimum":
         """With the best coefficients for a given n."""
         fit = texels.at(log_n, errors=False, n_known=True)
-        return cls(fit.k, log_n, fit.cost, fit.rival)
-
-    def beside(self, other: "Minimum", unsure: Array) -> "Minimum":
-        """The lower one of two, where the other may be that."""
-        ends = ([*one.k, one.log_n, one.cost] for one in (self, other))
-        rival = [jnp.where(unsure, jnp.abs(b - a), 0) for a, b in zip(*ends, strict=True)]
-        better = unsure & (other.cost < self.cost)
-        return jax.tree.map(lambda a, b: jnp.where(better, b, a), self, other)._replace(rival=rival)
+        return cls(fit.k, log_n, fit.cost)
 
 
 class Trial(NamedTuple):
     """A fit of some of the values, and what it is judged by.
 
     Attributes:
+        start: of its search.
         found: the minimum.
         counts: 1 where a value counts, (P, T).
         cost: of it and of what it leaves out, which counts as outliers with the least residual of such, (T,).
@@ -469,6 +504,7 @@ class Trial(NamedTuple):
         normal: that it is for; None where normals are given.
     """
 
+    start: Start
     found: Minimum
     counts: Array
     cost: Array
@@ -476,12 +512,12 @@ class Trial(NamedTuple):
     normal: Components | None = None
 
     @classmethod
-    def of(cls, texels: Texels, found: Minimum, counts: Array, normal: Any = None) -> "Trial":
+    def of(cls, texels: Texels, start: Start, found: Minimum, counts: Array, normal: Any = None) -> "Trial":
         """Where some of the values that are seen count."""
         many, left_out = sums_of(counts, texels.seen - counts)
         freedom = len(texels.shown) * (many - len(found.k) + texels.glossy) - texels.of_lobe
         cost = found.cost * (1 + OUTLIER**2 * left_out / jnp.maximum(freedom, 1))
-        return cls(found, counts.T, jnp.where(freedom < 3, jnp.inf, cost), freedom, normal)
+        return cls(start, found, counts.T, jnp.where(freedom < 3, jnp.inf, cost), freedom, normal)
 
 
 def of_lanes(tree: Any, lanes: Array) -> Any:
@@ -539,14 +575,17 @@ def rivals(heights: Array, cost: Array) -> Array:
     return heights[0] - heights[1] < 0.5 * RIVAL * cost
 
 
-def share_of_rival(worse: Array, variance: Array) -> Array:
-    """Of two minima either may be that of the truth: the root of the other one's share, by its likelihood.
+def per_deviation(worse: Array, variance: Array) -> Array:
+    """What part of the distance to a worse fit is a standard error; 0 where the values do not allow for that fit.
+
+    Of what a 95 % interval just holds it is 1 / 1.96.
 
     Args:
         worse: by how much its cost is larger.
         variance: of the noise, above 0.
     """
-    return jnp.sqrt(jax.nn.sigmoid(-0.5 * worse / variance))
+    deviations = jnp.sqrt(jnp.maximum(worse / variance, NORMAL_95**2))
+    return jnp.maximum((ALLOWED - deviations) / (ALLOWED - NORMAL_95), 0) / NORMAL_95
 
 
 def narrowed(bracket: Array, slope: Array, step: Array) -> Array:
@@ -596,7 +635,7 @@ def inliers(residual: Components, seen: Array, counts: Array) -> Array:
 # -- normals sought ----------------------------------------------------------------------------------------------------
 
 
-def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Components, Array, Array]:
+def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Start, Components, Array, Array]:
     """The best material and normal of each texel.
 
     A highlight alone, as of metals, gives a normal, and Lambert's law, fitted to what is neither highlight nor shadow,
@@ -609,8 +648,8 @@ def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Components,
         lights: which are distant.
 
     Returns:
-        The fit, whose last two errors are those of the normal; the normals, (T,); what is lit and what of it is no
-        outlier, (T, P), before the last steps: neither counts in the fit otherwise.
+        The fit, whose last two errors are those of the normal, and where its search started; the normals, (T,); what is
+        lit and what of it is no outlier, (T, P), before the last steps: neither counts in the fit otherwise.
     """
     seen, shown = texels.seen, over_channels(texels.unweighted(texels.values))
     if lights.ambient is not None:
@@ -643,13 +682,13 @@ def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Components,
         used = before * counts
         some = texels.where(used)
         there = some.facing(normal, lights)
-        known = heights, brackets = there.peaks()
-        found = there.climbed(brackets[0])
-        unsure = rivals(heights, found.cost)
-        found = of_few(unsure, found, lambda lanes, _: there.some(lanes).minima(*of_lanes(known, lanes)))
-        start = found.log_n, normal, found.cost
+        start = there.start()
+        found = there.climbed(start.brackets[0])
+        few = rivals(start.heights, found.cost)
+        found = of_few(few, found, lambda lanes, _: there.some(lanes).minima(of_lanes(start, lanes)))
+        before_steps = found.log_n, normal, found.cost
         log_n, normal, least = jax.lax.cond(
-            i < count, lambda *same: same, lambda log_n, normal, _: jointly(some, lights, log_n, normal), *start
+            i < count, lambda *same: same, lambda log_n, normal, _: jointly(some, lights, log_n, normal), *before_steps
         )
         there, facing = texels.facing(normal, lights), lit(normal)
         fit = Minimum.at(there.where(facing * counts), log_n)
@@ -661,7 +700,7 @@ def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Components,
         # What is dark where no light falls is explained, too.
         counts = jnp.where(facing > 0, inliers(residual, facing, half), seen - bright)
         cost = jnp.sum(*sums(counts * residual * residual), axis=0)
-        trial = Trial.of(texels, fit._replace(cost=cost, rival=found.rival), counts, normal)
+        trial = Trial.of(texels, start, fit._replace(cost=cost), counts, normal)
         return trial, before.T, used.T, least
 
     def step(i, found):
@@ -676,12 +715,11 @@ def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Components,
     nothing, *values = jax.tree.map(jnp.zeros_like, jax.eval_shape(tried, 0, *first))
     nothing = nothing._replace(cost=jnp.full_like(nothing.cost, jnp.inf)), *values
     best, before, used, cost = jax.lax.fori_loop(0, count + TURNS, step, nothing)
-    some, log_n, normal, rival = texels.where(used.T), best.found.log_n, best.normal, best.found.rival
+    some, log_n, normal = texels.where(used.T), best.found.log_n, best.normal
     if texels.glossy:
-        log_n, normal, least = restarted(some, lights, (log_n, normal, cost))
-        rival = [jnp.where(least < cost, 0, one) for one in rival]
+        log_n, normal, _ = restarted(some, lights, (log_n, normal, cost))
     fit = joint_fit(some.facing(normal, lights), lights, log_n, normal)
-    return fit._replace(rival=rival), normal, before.T, used.T
+    return fit, best.start, normal, before.T, used.T
 
 
 def restarted(texels: Texels, lights: Distant, found: tuple[Array, Components, Array]) -> Any:

@@ -25,17 +25,19 @@ from fitting.maps.map_result import REASONS
 from fitting.maps.texels import (
     OUTLIER,
     Distant,
+    Minimum,
+    Start,
     TexelFit,
     Texels,
     joint_fit,
     jointly,
-    share_of_rival,
     sums,
     sums_of,
     with_normals,
 )
 from fitting.solver.devices import placed
 from fitting.solver.normal_equations import COMPILER_OPTIONS
+from fitting.uncertainty.intervals import NORMAL_95, student_95
 
 TILE = 432
 """Texels that go through the program in step: what they need stays in the processor's cache."""
@@ -224,8 +226,8 @@ def _program(
         for index, model in enumerate(models):
             texels = Texels(model, grey and issubclass(model, SpecularMaterial), finer, shown, root)
             if normal is None:
-                fit, normals, lit, counts = with_normals(texels, lights)
-                layers = _layers(texels.facing(normals, lights), fit, lit, counts, mask, normals, rounding)
+                fit, start, normals, lit, counts = with_normals(texels, lights)
+                layers = _layers(texels.facing(normals, lights), fit, lit, counts, mask, normals, rounding, start)
             else:
                 if points is None:
                     texels = texels.facing(normal, lights)
@@ -310,8 +312,16 @@ def _of_normals(
     best = texels.unshadowed()
     counts = best.counts.T
     some = texels.where(counts)
+
+    def summed(rows: Any, some: Texels = some) -> dict[str, Array]:
+        """Of all texels, and of those that show a highlight; with the evidence of it, in deviations squared."""
+        matt = Minimum.at(dataclasses.replace(some, model=brdf.Lambert, grey=False), best.found.log_n)
+        evidence = divide((matt.cost - best.found.cost) * best.freedom, best.found.cost)
+        rows = jnp.stack([*rows, evidence])
+        return {"sums": jnp.where(mask, jnp.concatenate([rows, rows * (evidence > OUTLIER**2)]), 0)}
+
     if seek == "gains":
-        return {"sums": jnp.where(mask, some.gains(), 0)}
+        return summed(some.profile()[0])
     if lights is not None:
         normal = jointly(some, lights, shared[:, 0], normal, n_known=True)[1]
         texels = texels.facing(normal, lights)
@@ -320,14 +330,13 @@ def _of_normals(
     if seek == "slope":
         point = fit(log_n=shared[:, 0], errors=False)
         freedom = best.freedom - len(point.error[1:])  # of angles
-        left = [point.slope[0], divide(1.0, point.error[0] ** 2), point.cost, jnp.maximum(freedom, 0)]
-        return {"sums": jnp.where(mask, jnp.stack(left), 0)}
+        square = jnp.sum(*sums(some.values * some.values), axis=0)
+        return summed([point.slope[0], divide(1.0, point.error[0] ** 2), point.cost, jnp.maximum(freedom, 0), square])
     if shared is None:
-        found = some.at(best.found.log_n)._replace(rival=best.found.rival)
-        return _layers(texels, found, texels.seen, counts, mask, normal, rounding)
+        return _layers(texels, some.at(best.found.log_n), texels.seen, counts, mask, normal, rounding, best.start)
     log_n, error = shared.T
-    found = fit(log_n=log_n, n_known=True)
-    return _layers(texels, found, texels.seen, counts, mask, normal, rounding, error)
+    found, change = jax.jvp(lambda x: fit(log_n=x, n_known=True), (log_n,), (error,))
+    return _layers(texels, found, texels.seen, counts, mask, normal, rounding, None, (error, change.k))
 
 
 def _layers(
@@ -338,9 +347,12 @@ def _layers(
     mask: Array,
     normal: Components,
     rounding: Array,
-    shared: Array | None = None,
+    start: Start | None,
+    shared: tuple[Array, list[Array]] | None = None,
 ) -> dict[str, Array]:
     """The layers of a model's maps, texels last.
+
+    Errors are such that 1.96 of them reach as far as Student's distribution has it.
 
     Models are compared by the information criterion of Schwarz as McQuarrie corrects it for few values ("A small-sample
     correction for the Schwarz SIC model selection criterion", Statistics & Probability Letters 44, 1999). What a model
@@ -360,18 +372,21 @@ def _layers(
 
     freedom = values - unknowns
     # Codes that are explained exactly, as where all are 0, were rounded all the same.
-    noise = jnp.maximum(jnp.sqrt(fit.cost / jnp.maximum(freedom, 1)), rounding)
-    noise = jnp.where(freedom < 1, jnp.nan, noise)
+    deviation = jnp.where(freedom < 1, jnp.nan, jnp.sqrt(fit.cost / jnp.maximum(freedom, 1)))
+    noise = jnp.maximum(deviation, rounding)
+    reach = jnp.maximum(deviation * student_95(jnp.maximum(freedom, 1)) / NORMAL_95, rounding)
     n = jnp.exp(fit.log_n)
-    # Errors are those of the mixture of both minima.
-    *rival, worse = fit.rival
-    share = share_of_rival(worse, jnp.maximum(noise**2, tiny))
-    k_error = [jnp.hypot(noise * own, share * apart) for own, apart in zip(fit.k_error, rival, strict=False)]
-    error = jnp.full_like(n, jnp.inf) if shared is None else shared
-    if glossy and shared is None:
-        error = jnp.hypot(noise * fit.error[0], share * rival[-1])
+    square = jnp.sum(*sums(some.values * some.values), axis=0)
+    k_error, error = [reach * own for own in fit.k_error], jnp.full_like(n, jnp.inf)
+    if shared is not None:
+        error, change = shared
+        k_error = list(map(jnp.hypot, k_error, change))
+    elif glossy and start is not None:
+        error = reach * fit.error[0]
+        allowed = start.errors(fit, square, jnp.maximum(reach**2, tiny), some.finer)
+        *k_error, error = map(jnp.maximum, [*k_error, error], allowed)
     gain = values * jnp.log1p(fit.gain / jnp.maximum(fit.cost, tiny))
-    shows = jnp.any(k_s > LEAST_HIGHLIGHT * noise * k_s_error, axis=0)
+    shows = jnp.any(k_s > LEAST_HIGHLIGHT * reach * k_s_error, axis=0)
     shows &= gain > price(unknowns) - price(unknowns - of_lobe)
     capped = jnp.any(k_s >= some.cap, axis=0)
     moved = [jnp.zeros_like(k) for k in linear]
@@ -390,14 +405,14 @@ def _layers(
         reason = jnp.where(test, jnp.uint8(number), reason)
     known, inside = reason == 0, reason != REASONS.index("outside")
     names = ("k_a", "k_d")[-len(linear) :]
-    layers = {name: jnp.where(inside & (values > 0), k, jnp.nan) for name, k in zip(names, linear, strict=True)}
+    tilt = square_root(sum((angle**2 for angle in angles), start=jnp.zeros_like(n)))
+    there = inside & (values > 0) & (tilt < jnp.inf)
+    layers = {name: jnp.where(there, k, jnp.nan) for name, k in zip(names, linear, strict=True)}
     # Errors allow for what was dropped.
     errors = map(jnp.hypot, k_error, moved)
     layers |= {f"{name}_error": one for name, one in zip(names, errors, strict=True)}
-    square = jnp.sum(*sums(some.values * some.values), axis=0)
     every = values + unlit + outliers
     whole = jnp.maximum(fit.cost + (unlit + OUTLIER**2 * outliers) * noise**2, tiny)
-    tilt = square_root(sum((angle**2 for angle in angles), start=jnp.zeros_like(n)))
     return layers | {
         "n": jnp.where(known, n, jnp.nan),
         "k_s": jnp.where(known, k_s, jnp.nan),
@@ -406,7 +421,7 @@ def _layers(
         "fitted_n": n,
         "fitted_k_s": jnp.where(inside & shows, k_s, 0),
         "normal": jnp.where(inside, jnp.stack(normal.parts), 0),
-        "normal_error": jnp.degrees(jnp.where(inside, noise * tilt, jnp.nan)) if angles else jnp.zeros_like(n),
+        "normal_error": jnp.degrees(jnp.where(inside, reach * tilt, jnp.nan)) if angles else jnp.zeros_like(n),
         "noise": jnp.where(inside, noise, jnp.nan),
         "left_out": outliers / jnp.maximum(every, 1),
         "determined": known,

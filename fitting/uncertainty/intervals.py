@@ -3,6 +3,7 @@
 import functools
 import math
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import numpy as np
@@ -42,14 +43,14 @@ def _acceptance() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return truths, np.append(-np.inf, lower), np.append(ONE_SIDED_95, high)
 
 
-def student_95(degrees: float) -> float:
+def student_95(degrees: Any) -> Any:
     """By how many standard errors a 95 % interval reaches where these are known from so many degrees of freedom.
 
     Source: M. Abramowitz and I. A. Stegun, Handbook of Mathematical Functions, 26.7.5; a tenth short for one degree, a
     hundredth for two.
 
     Args:
-        degrees: values less unknowns, above 0.
+        degrees: values less unknowns, above 0; a number or an array.
     """
     z = NORMAL_95
     terms = (

@@ -246,10 +246,10 @@ def test_errors_hold_the_other_minimum_of_what_lies_flat(normals):
     known = maps.determined
     off = np.abs(np.log(maps.n / 8) * maps.n / maps.n_error)[known]
     beside = (np.abs(maps.k_d - (k_d * np.array([1.0, 0.6, 0.4]))[None]) / maps.k_d_error)[known]
-    assert known.mean() > 0.6
-    assert np.mean(off > 4) < 0.04  # 7 %, before
-    for one in (off, beside):
-        assert np.mean(one < 1.96) > 0.82  # 77 %
+    assert known.mean() > 0.45
+    assert np.mean(off > 4) < 0.02  # 7 % by the curvature of the lower minimum alone
+    assert np.mean(off < 1.96) > 0.93  # 77 %, and 88 % where only the other minimum was asked
+    assert np.mean(beside < 1.96) > 0.87
 
 
 def test_an_n_that_a_texel_shares_with_none_errs_as_its_own():
@@ -262,7 +262,9 @@ def test_an_n_that_a_texel_shares_with_none_errs_as_its_own():
     shared = fitting.fit_maps(pictures, lights, normal[None], labels=np.arange(300)[None], **options)
     known = own.determined & np.all(own.k_d > 0, axis=-1)
     np.testing.assert_allclose(shared.n[known], own.n[known], rtol=1e-6)
-    np.testing.assert_allclose(shared.n_error[known], own.n_error[known], rtol=0.03)
+    np.testing.assert_allclose(shared.n_error[known], own.n_error[known], rtol=0.08)
+    # which k_d's hold: 22 % without
+    assert np.mean((np.abs(shared.k_d - k_d * [1.0, 0.6, 0.4]) < 1.96 * shared.k_d_error)[known]) > 0.7
 
 
 def test_a_texel_is_the_fit_of_one_material():
@@ -369,7 +371,7 @@ def test_a_k_d_at_its_bound_does_not_make_n_certain():
     shown = jnp.asarray(np.moveaxis(pictures[:, 0], 0, -1).swapaxes(0, 1).reshape(3, 500, 32))
     some = Texels(brdf.BlinnPhong, True, 2, shown, Components((jnp.ones((500, 32)),)))
     some = some.facing(axes, Distant(lights, view, None))
-    fit = some.at(some.minima(*some.peaks()).log_n)
+    fit = some.at(some.minima(some.start()).log_n)
     at_bound = np.any(np.asarray(fit.k[0]) == 0, axis=0)
     assert np.mean(at_bound) > 0.2
     assert np.all(0.01 * np.asarray(fit.error[0])[at_bound] > 0.25)  # with k_d held 0.028
@@ -602,11 +604,14 @@ def test_what_is_no_maps_is_told_in_one_line(folder, tmp_path):
             fitting.load_maps(given)
 
 
-@pytest.mark.parametrize("model", ["phong", "blinn-phong"])
-def test_gltf_shows_the_highlights_of_maps(folder, tmp_path, model):
+@pytest.mark.parametrize(("model", "unit"), [("phong", 1.0), ("blinn-phong", 1.0), ("blinn-phong", 6.0)])
+def test_gltf_shows_the_highlights_of_maps(folder, tmp_path, model, unit):
+    """In any unit of light: all of the material is made so much darker that none of it is above 1."""
     path, _ = folder
     maps = fitting.fit_maps(path, model=model)
+    maps = dataclasses.replace(maps, k_d=unit * maps.k_d, fitted_k_s=unit * maps.fitted_k_s)
     maps.save(tmp_path / "out")
+    darker = json.loads((tmp_path / "out" / "maps.json").read_text())["scale"]["material"]
     (written,) = json.loads((tmp_path / "out" / "material.gltf").read_text())["materials"]
     images = {
         name: brdf.read_image(tmp_path / "out" / f"{name}.png") for name in ("specular_color", "metallic_roughness")
@@ -615,9 +620,13 @@ def test_gltf_shows_the_highlights_of_maps(folder, tmp_path, model):
     square = images["metallic_roughness"][..., 1:2] ** 4  # of the slope
     n = maps.fitted_n[..., None] * (4 if model == "phong" else 1)
     np.testing.assert_allclose(2 / square - 2, n, rtol=5e-3)
-    shown = 0.04 * factor * images["specular_color"] / (4 * square)  # appendix B.3 of the specification
+    f_0 = 0.04 * factor * images["specular_color"]
+    shown = f_0 / (4 * square)  # appendix B.3 of the specification
     common = maps.determined & (maps.fitted_k_s[..., 0] < np.percentile(maps.fitted_k_s, 90))
-    np.testing.assert_allclose(shown[common], maps.fitted_k_s[common], rtol=1e-2)
+    np.testing.assert_allclose(darker * shown[common], maps.fitted_k_s[common], rtol=1e-2)
+    base = brdf.read_picture(tmp_path / "out" / "base_color.png").pixels * (1 - np.max(f_0, axis=-1, keepdims=True))
+    np.testing.assert_allclose(darker * base[common], maps.k_d[common], rtol=1e-2, atol=1e-3)
+    assert (darker > 1) == (unit > 1)
 
 
 def test_texels_that_show_less_than_nothing_are_black():
@@ -721,10 +730,13 @@ def test_the_unit_of_values_is_any(noisy, unit):
     pictures, truth, maps = noisy
     found = fitting.fit_maps(unit * pictures, dome(32), truth["normal"][None])
     np.testing.assert_array_equal(found.determined, maps.determined)
-    for name in ("n", "n_error"):
-        np.testing.assert_allclose(getattr(found, name), getattr(maps, name), rtol=1e-2)
-    for name in ("k_d", "k_s", "k_d_error", "k_s_error", "fitted_k_s", "noise"):
+    # Where another n is nearly allowed rounding tells by how much it is.
+    np.testing.assert_allclose(found.n, maps.n, rtol=1e-2)
+    np.testing.assert_allclose(found.n_error, maps.n_error, rtol=0.1)
+    for name in ("k_d", "k_s", "fitted_k_s", "noise"):
         np.testing.assert_allclose(getattr(found, name) / unit, getattr(maps, name), rtol=1e-2, atol=1e-4)
+    for name in ("k_d_error", "k_s_error"):
+        np.testing.assert_allclose(getattr(found, name) / unit, getattr(maps, name), rtol=0.1, atol=1e-4)
     with pytest.raises(brdf.InputError, match="out of reach of float32"):
         fitting.fit_maps(1e-31 * pictures, dome(32), truth["normal"][None])
 
@@ -871,6 +883,11 @@ def test_a_broken_folder_is_told_in_one_line(folder, what, words):
         ({"pictures": np.full((6, 2, 2, 3), 255, np.uint8)}, "pictures"),
         ({"pictures": np.ones((6, 2, 2, 3), int)}, "pictures[0]"),
         ({"normals": np.ones((3, 2, 3))}, "normals"),
+        (
+            {"normals": np.broadcast_to([128, 128, 255], (2, 2, 3))},
+            "normals: hold n·0.5 + 0.5, as images do: 2 n / 255",
+        ),
+        ({"lights": np.repeat(dome(6)[:2], 3, axis=0), "normals": "fit"}, "lights: lie in a plane"),
         ({"mask": np.ones((3, 2))}, "mask"),
         ({"intensities": np.ones(5)}, "intensities"),
         ({"intensities": np.zeros(6)}, "intensities"),
@@ -1021,6 +1038,66 @@ def test_the_light_that_is_added_is_where_it_tells_most():
         fitting.next_light(maps, of="k_d")
     with pytest.raises(brdf.InputError, match="candidates: hold a PointLight"):
         fitting.next_light(maps, [brdf.PointLight([0, 0, 3], 9.0)])
+
+
+def test_a_candidate_tells_as_much_as_it_shines(noisy):
+    pictures, truth, maps = noisy
+    dim, bright = (brdf.DirectionalLight([0.1, 0.0, 1.0], shining) for shining in (0.01, 1.0))
+    choice = fitting.next_light(maps, [dim, bright])
+    assert choice.lights == (bright,)
+    assert choice.foretold[0] > 0.999 * choice.before
+    of_dim = fitting.fit_maps(0.01 * pictures, dome(32), truth["normal"][None], intensities=np.full(32, 0.01))
+    np.testing.assert_allclose(fitting.next_light(of_dim, [dim]).after, choice.after, rtol=1e-3)
+    assert "brings the number of undetermined texels from" in str(fitting.next_light(maps, [bright], of="undetermined"))
+
+
+def test_what_a_light_shows_of_k_a_and_of_channels(noisy, tmp_path):
+    _, _, maps = noisy
+    known = dataclasses.replace(maps, k_a=0.5 * maps.k_d)
+    direct = known.render([0.0, 0.0, 1.0])
+    added = np.array([0.1, 0.2, 0.0]) * np.nan_to_num(known.k_a)
+    np.testing.assert_allclose(known.render([0.0, 0.0, 1.0], ambient=[0.1, 0.2, 0.0]), direct + added, atol=1e-6)
+    for given, words in (
+        (lambda: known.render(brdf.DirectionalLight([0, 0, 1], [1.0, 0.5])), "light: is of 2 channels, the maps of 3"),
+        (lambda: known.render([0, 0, 1], ambient=[1.0, 0.5]), "ambient: is of 2 channels"),
+        (lambda: maps.render([0, 0, 1], ambient=0.1), "ambient: lights maps without k_a"),
+    ):
+        with pytest.raises(brdf.InputError, match=words):
+            given()
+    maps.save(tmp_path / "out")
+    np.testing.assert_array_equal(fitting.load_maps(tmp_path / "out").intensity, maps.intensity)
+
+
+def test_exposures_are_those_of_ambient_light_too():
+    lights, exposures = dome(16), np.where(np.arange(16) % 2, 1.0, 4.0)
+    pictures, truth = texels(40, 0.0, lights)
+    k_a = np.random.default_rng(1).uniform(0.05, 0.3, (1, 40, 3))
+    pictures = exposures[:, None, None, None] * (pictures + 0.5 * k_a)
+    maps = fitting.fit_maps(pictures, lights, truth["normal"][None], exposures=exposures, ambient=0.5)
+    np.testing.assert_allclose(maps.k_a, k_a, rtol=1e-3)
+
+
+def test_what_few_lights_tell_of_sharp_highlights():
+    """One light in a lobe tells its height and width together; and few lights tell little of the noise."""
+    lights, random, count = dome(12), np.random.default_rng(1), 1200
+    tilt, turn = np.abs(random.normal(0, 0.3, count)), random.uniform(0, 2 * np.pi, count)
+    normal = np.stack([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)], axis=1)
+    k_d, k_s = random.uniform(0.05, 0.6, (count, 1)), random.uniform(0.1, 0.6, (count, 1))
+    noise = 0.005 * random.normal(size=(12, 1, count, 3))
+    pictures = seen_by_equation(lights, normal, k_d, k_s, 300.0) + noise
+    maps = fitting.fit_maps(pictures, lights, normal[None])
+    wrong = maps.determined & (np.abs(np.log(maps.n / 300)) > 1.96 * maps.n_error / maps.n)
+    assert np.mean(wrong) < 0.015  # 5.5 % by the curvature alone
+    pictures = seen_by_equation(dome(8), normal, k_d, k_s, 300.0) + noise[:8]
+    shared = fitting.fit_maps(pictures, dome(8), normal[None], labels=0)
+    # Noise that looks like broader lobes where no highlight shows took it 25 errors away.
+    assert np.abs(shared.n[shared.determined][0] - 300) < 10 * shared.n_error[shared.determined][0]
+    # of grey photographs, broad highlights
+    few = dome(6)
+    pictures = seen_by_equation(few, normal, k_d, k_s, 12.0)[..., :1] + 0.01 * random.normal(size=(6, 1, count, 1))
+    maps = fitting.fit_maps(pictures, few, normal[None])
+    covered = np.abs(maps.k_d[..., 0] - k_d[:, 0]) < 1.96 * maps.k_d_error[..., 0]
+    assert np.mean(covered) > 0.9
 
 
 def test_the_error_that_a_light_shrinks_is_the_maps_own_whatever_the_encoding():
