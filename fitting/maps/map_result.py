@@ -87,10 +87,8 @@ class Maps:
 
     def layers(self) -> dict[str, np.ndarray]:
         """Every map by name."""
-        size = self.n.shape
-        return {
-            k: value for k, value in vars(self).items() if isinstance(value, np.ndarray) and value.shape[:2] == size
-        }
+        texels = {k: v for k, v in vars(self).items() if isinstance(v, np.ndarray) and k != "to_light"}
+        return {k: v for k, v in texels.items() if v.shape[:2] == self.n.shape}
 
     def __str__(self) -> str:
         """How many texels are determined, why the others are not, their models, and the middle of what was found."""

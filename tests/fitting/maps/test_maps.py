@@ -579,6 +579,12 @@ def test_a_folder_is_fitted_saved_and_loaded(folder, tmp_path):
     assert brdf.read_picture(tmp_path / "out" / "normals.png").bits == 16
 
 
+def test_as_many_rows_as_lights_and_three_columns_are_no_lights(tmp_path):
+    maps = fitting.fit_maps(np.ones((6, 6, 3, 3)), dome(6), np.broadcast_to(VIEW, (6, 3, 3)), model="lambert")
+    maps.save(tmp_path / "out")
+    np.testing.assert_array_equal(fitting.load_maps(tmp_path / "out").to_light, maps.to_light)
+
+
 def test_what_is_no_maps_is_told_in_one_line(folder, tmp_path):
     path, _ = folder
     fitting.fit_maps(path).save(tmp_path / "out")
