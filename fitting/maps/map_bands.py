@@ -19,7 +19,7 @@ from fitting.solver.devices import core_count, device_count, gathered, own
 BAND = 10 * CHUNK * TILE - 1
 """Texels that are read and laid out at a time; a lane is left over."""
 
-FORM = 2
+FORM = 3
 """Of what is kept of a band: another number where its layers change."""
 
 SPARSE = 16
@@ -108,7 +108,7 @@ def _key(problem: MapProblem) -> str:
             sources += one.name, status.st_size, status.st_mtime_ns
         else:
             sources.append(one.rows(0, one.shape[0]))
-    named = {**vars(problem), **vars(problem.photographs), "each": sources, "photographs": None, "form": FORM}
+    named = {**vars(problem), "photographs": {**vars(problem.photographs), "each": sources}, "form": FORM}
     return fingerprint(named)
 
 

@@ -132,7 +132,8 @@ def fit_maps(
         apart = np.degrees(np.arccos(min(1.0, np.min(each @ to_view, initial=np.inf) / np.linalg.norm(to_view))))
         near = (NEAR.format(apart),) if apart > MOST_APART else ()
     else:
-        if surface.normal is None and np.linalg.svd(given.to_light, compute_uv=False)[2:].sum() < COPLANAR:
+        to_light = given.to_light if surface.normal is None else None
+        if to_light is not None and np.linalg.svd(to_light, compute_uv=False)[2:].sum() < COPLANAR:
             what = "lie in a plane with the texel, of which normals are not found"
             raise InputError("lights", what, "Give normals, or lights from all sides")
         _refuse_behind(surface, given, to_view, str(normals) if isinstance(normals, str | Path) else "normals")

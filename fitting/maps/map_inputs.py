@@ -271,17 +271,17 @@ def normal_map(given: Any, *, flip_y: bool = False) -> Float[np.ndarray, "H W 3"
     if coded:
         empty, normal = np.all(normal == 0, axis=-1), 2 * normal - 1
         normal[empty | (np.sum(normal * normal, axis=-1) < NO_SURFACE)] = 0
-    elif white := next((white for white in (1, 255, 65535) if _looks_coded(normal / white)), None):
+    elif white := next((white for white in (1, 255, 65535) if _looks_coded(normal, white)), None):
         decoded = "2 n - 1" if white == 1 else f"2 n / {white} - 1"
         what = f"hold n·0.5 + 0.5, as images do: {decoded} is of length 1, and nothing is below 0"
         raise InputError(name, what, f"Give {decoded}, or the codes of the image as unsigned integers")
     return normal * np.array([1, -1 if flip_y else 1, 1], np.float32)
 
 
-def _looks_coded(normal: np.ndarray) -> bool:
+def _looks_coded(normal: np.ndarray, white: int) -> bool:
     if np.any(normal < 0):
         return False
-    there = normal[np.all(np.isfinite(normal), axis=-1) & np.any(normal != 0, axis=-1)].astype(float)
+    there = normal[np.all(np.isfinite(normal), axis=-1) & np.any(normal != 0, axis=-1)].astype(float) / white
     plain, decoded = (np.median(np.abs(np.sum(n * n, axis=-1) - 1)) if n.size else 0.0 for n in (there, 2 * there - 1))
     return bool(decoded < 0.05 < plain)
 

@@ -55,8 +55,11 @@ def next_light(maps: "Maps", candidates: Any, count: int, of: str) -> LightChoic
         return jnp.stack([a * b for i, a in enumerate(columns) for b in columns[i:]])
 
     def information_by(light: Any) -> np.ndarray:
-        shining = np.mean(np.asarray(light.emittance, np.float64))
-        return shining**2 * np.asarray(products(direction_of(light)), np.float64)
+        emitted = np.asarray(light.emittance, np.float64)
+        if emitted.size not in (1, maps.k_d.shape[2]):
+            what = f"have {emitted.size} channels, the maps {maps.k_d.shape[2]}"
+            raise InputError("candidates", what, "Give both the same number, or light of one")
+        return np.mean(emitted**2) / np.mean(shining**2) * np.asarray(products(direction_of(light)), np.float64)
 
     def left_by(information: np.ndarray) -> np.ndarray:
         """Of the information on ln n, what k_d and k_s leave."""

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 import brdf
-from brdf.errors import InputError, what_came
+from brdf.errors import InputError, as_numbers, what_came
 from brdf.files import as_path, read_text
 from brdf.models.base import SpecularMaterial
 
@@ -51,7 +51,7 @@ class Maps:
         k_a: ambient coefficient, where there was ambient light.
         k_a_error: standard error.
         to_light: unit vectors towards the lights, where all are distant.
-        intensity: of these, times exposures: what each photograph was divided by, its channels' mean.
+        intensity: what each photograph was divided by: of its light, times exposure; the channels' mean.
         noise: of a value, its standard deviation.
         left_out: share of a texel's values that were left out as cast shadows or other outliers.
 
@@ -132,12 +132,14 @@ class Maps:
             (4, 4, 3)
         """
         light = light if isinstance(light, brdf.DirectionalLight) else brdf.DirectionalLight(light, 1.0)
-        intensity, ambient = (np.atleast_1d(np.asarray(one, float)) for one in (light.intensity, ambient))
-        channels = self.k_d.shape[2]
+        ambient = as_numbers("ambient", ambient, remedy="Give the intensity of the ambient light")
+        intensity, ambient, channels = np.atleast_1d(light.intensity), np.atleast_1d(ambient), self.k_d.shape[2]
         for name, values in (("light", intensity), ("ambient", ambient)):
             if values.shape not in ((1,), (channels,)):
-                what = f"is of {values.size} channels, the maps of {channels}"
+                what = f"is of shape {values.shape}, the maps of {channels} channels"
                 raise InputError(name, what, "Give a number, or one for each channel")
+        if not np.all((ambient >= 0) & (ambient < np.inf)):
+            raise InputError("ambient", f"must be 0 or more, got {ambient!r:.60}", "Give its intensity")
         if self.k_a is None and np.any(ambient):
             raise InputError("ambient", "lights maps without k_a", "Fit them with their ambient light")
         to_light = np.asarray(light.direction) / np.linalg.norm(light.direction)
@@ -159,7 +161,8 @@ class Maps:
         """The light under which one more photograph would tell most of the exponents.
 
         Args:
-            candidates: directions towards lights, (K, 3); None for any of the hemisphere.
+            candidates: directions towards lights, (K, 3), which shine like the brightest of the maps' own, exposure and
+                all; or directional lights; None for any direction of the hemisphere.
             count: how many lights, one chosen after the other.
             of: "n" for the median standard error of ln n over texels with a highlight, or "undetermined" for how many
                 of these have one above 0.25.
@@ -260,7 +263,11 @@ def load_maps(folder: str | Path) -> Maps:
         unknown = [name for name in models if name not in brdf.MODELS]
         to_view = np.array(about["to_view"], float).reshape(3)
         to_light = np.array(about["to_light"], float).reshape(-1, 3) if about.get("to_light") else None
-        intensity = np.array(about["intensity"], float).reshape(-1) if about.get("intensity") else None
+        intensity = np.array(about["intensity"], float) if about.get("intensity") else None
+        if intensity is not None and not (intensity.ndim == 1 and np.all((intensity > 0) & (intensity < np.inf))):
+            raise ValueError
+        if to_light is not None and intensity is not None and len(to_light) != len(intensity):
+            raise ValueError
     except (ValueError, KeyError, TypeError, AttributeError):
         raise InputError(path, "does not describe maps", remedy) from None
     if unknown or not models:

@@ -63,9 +63,7 @@ def with_shared_n(problem: MapProblem, labels: Int[np.ndarray, "H W"]) -> MapPro
         there = surface._replace(shared=np.stack([np.asarray(log_n)[index], np.zeros(size)], axis=-1))
         found = fit_bands(dataclasses.replace(problem, surface=there, seek=seek))["sums"]
         rows = found.reshape(-1, found.shape[2]).T.astype(float)
-        every, shown = np.split(np.stack([np.bincount(index.ravel(), row, names.size) for row in rows]), 2)
-        # Noise looks like a lobe that meets some lights: many texels that show none outweigh the few that do.
-        return np.where(shown[-1] > 0.5 * every[-1], shown, every)[:-1]
+        return np.stack([np.bincount(index.ravel(), row, names.size) for row in rows])
 
     def climbed(bracket: Any) -> np.ndarray:
         """Log n of a bracket, and the sums there: curvature, cost, degrees of freedom and squares of what is shown."""

@@ -343,7 +343,8 @@ class Texels(eqx.Module):
         cap = self.cap * self.model.scale(jnp.asarray(exponents, dtype))[:, None]
         k = nonnegative(rows, cap, self.grey, steps=2)
         lowered = (x * (b - 0.5 * sum(map(operator.mul, row, k))) for x, (*row, b) in zip(k, rows, strict=True))
-        return jnp.sum(functools.reduce(operator.add, lowered), axis=-2), k
+        gains = jnp.sum(functools.reduce(operator.add, lowered), axis=-2)
+        return gains, [*k[:-1], k[-1] / self.model.scale(jnp.asarray(exponents, dtype))[:, None, None]]
 
     def unshadowed(self) -> "Trial":
         """The best material of each texel, where some values may lie in cast shadows.
@@ -464,6 +465,7 @@ class Start(NamedTuple):
             finer: of the grid.
         """
         log_n = jnp.log(jnp.asarray(grid(finer), square.dtype))[:, None]
+        variance = jnp.maximum(variance, jnp.finfo(square.dtype).eps * square)  # what is below is rounding
         share = per_deviation(square - fit.cost - 2 * self.gains, variance)
         apart = [jnp.abs(one - best) for one, best in zip(self.k, fit.k, strict=True)]
         return [

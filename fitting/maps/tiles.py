@@ -25,7 +25,6 @@ from fitting.maps.map_result import REASONS
 from fitting.maps.texels import (
     OUTLIER,
     Distant,
-    Minimum,
     Start,
     TexelFit,
     Texels,
@@ -312,16 +311,8 @@ def _of_normals(
     best = texels.unshadowed()
     counts = best.counts.T
     some = texels.where(counts)
-
-    def summed(rows: Any, some: Texels = some) -> dict[str, Array]:
-        """Of all texels, and of those that show a highlight; with the evidence of it, in deviations squared."""
-        matt = Minimum.at(dataclasses.replace(some, model=brdf.Lambert, grey=False), best.found.log_n)
-        evidence = divide((matt.cost - best.found.cost) * best.freedom, best.found.cost)
-        rows = jnp.stack([*rows, evidence])
-        return {"sums": jnp.where(mask, jnp.concatenate([rows, rows * (evidence > OUTLIER**2)]), 0)}
-
     if seek == "gains":
-        return summed(some.profile()[0])
+        return {"sums": jnp.where(mask, some.profile()[0], 0)}
     if lights is not None:
         normal = jointly(some, lights, shared[:, 0], normal, n_known=True)[1]
         texels = texels.facing(normal, lights)
@@ -331,11 +322,13 @@ def _of_normals(
         point = fit(log_n=shared[:, 0], errors=False)
         freedom = best.freedom - len(point.error[1:])  # of angles
         square = jnp.sum(*sums(some.values * some.values), axis=0)
-        return summed([point.slope[0], divide(1.0, point.error[0] ** 2), point.cost, jnp.maximum(freedom, 0), square])
+        left = [point.slope[0], divide(1.0, point.error[0] ** 2), point.cost, jnp.maximum(freedom, 0), square]
+        return {"sums": jnp.where(mask, jnp.stack(left), 0)}
     if shared is None:
         return _layers(texels, some.at(best.found.log_n), texels.seen, counts, mask, normal, rounding, best.start)
     log_n, error = shared.T
-    found, change = jax.jvp(lambda x: fit(log_n=x, n_known=True), (log_n,), (error,))
+    known = jnp.where(error < jnp.inf, error, 0)
+    found, change = jax.jvp(lambda x: fit(log_n=x, n_known=True), (log_n,), (known,))
     return _layers(texels, found, texels.seen, counts, mask, normal, rounding, None, (error, change.k))
 
 
@@ -395,11 +388,12 @@ def _layers(
         matt = dataclasses.replace(some, model=brdf.Lambert, grey=False).at(fit.log_n, errors=False)
         moved = [jnp.where(shows, 0, plain - k) for k, plain in zip(linear, matt.k, strict=True)]
         linear = list(map(operator.add, linear, moved))
+    loose = ~(error <= MOST_ERROR) | ~jnp.any(k_s > LEAST_HIGHLIGHT * k_error[-1], axis=0)
     # the first that holds
     reason = jnp.zeros(mask.shape, jnp.uint8)
     for number, test in zip(
         range(len(REASONS) - 1, 0, -1),
-        (~(error <= MOST_ERROR), capped, ~shows | (not glossy), freedom < 1, ~mask),
+        (loose, capped, ~shows | (not glossy), freedom < 1, ~mask),
         strict=True,
     ):
         reason = jnp.where(test, jnp.uint8(number), reason)

@@ -246,7 +246,7 @@ def test_errors_hold_the_other_minimum_of_what_lies_flat(normals):
     known = maps.determined
     off = np.abs(np.log(maps.n / 8) * maps.n / maps.n_error)[known]
     beside = (np.abs(maps.k_d - (k_d * np.array([1.0, 0.6, 0.4]))[None]) / maps.k_d_error)[known]
-    assert known.mean() > 0.45
+    assert known.mean() > 0.45  # 64 % by one minimum at a time
     assert np.mean(off > 4) < 0.02  # 7 % by the curvature of the lower minimum alone
     assert np.mean(off < 1.96) > 0.93  # 77 %, and 88 % where only the other minimum was asked
     assert np.mean(beside < 1.96) > 0.87
@@ -260,7 +260,8 @@ def test_an_n_that_a_texel_shares_with_none_errs_as_its_own():
     options = {"specular": "grey", "precision": "float64"}
     own = fitting.fit_maps(pictures, lights, normal[None], **options)
     shared = fitting.fit_maps(pictures, lights, normal[None], labels=np.arange(300)[None], **options)
-    known = own.determined & np.all(own.k_d > 0, axis=-1)
+    assert np.mean(own.determined == shared.determined) > 0.95
+    known = own.determined & shared.determined & np.all(own.k_d > 0, axis=-1)
     np.testing.assert_allclose(shared.n[known], own.n[known], rtol=1e-6)
     np.testing.assert_allclose(shared.n_error[known], own.n_error[known], rtol=0.08)
     # which k_d's hold: 22 % without
@@ -596,6 +597,7 @@ def test_what_is_no_maps_is_told_in_one_line(folder, tmp_path):
         ({"models": 3}, "does not describe maps"),
         ({"to_view": [1, 2]}, "does not describe maps"),
         ({"to_light": [[1, 2]]}, "does not describe maps"),
+        ({"intensity": [1.0]}, "does not describe maps"),
         ({"notes": None}, "does not describe maps"),
         ({"layers": []}, "does not describe maps"),
         ({"layers": some}, "names no layer k_d"),
@@ -1054,6 +1056,13 @@ def test_a_candidate_tells_as_much_as_it_shines(noisy):
     assert choice.foretold[0] > 0.999 * choice.before
     of_dim = fitting.fit_maps(0.01 * pictures, dome(32), truth["normal"][None], intensities=np.full(32, 0.01))
     np.testing.assert_allclose(fitting.next_light(of_dim, [dim]).after, choice.after, rtol=1e-3)
+    unsure = [dataclasses.replace(one, n_error=np.full_like(one.n_error, np.nan)) for one in (maps, of_dim)]
+    of_bright, of_dim = (
+        fitting.next_light(one, [light]).after for one, light in zip(unsure, (bright, dim), strict=True)
+    )
+    np.testing.assert_allclose(of_dim, of_bright, rtol=1e-2)
+    with pytest.raises(brdf.InputError, match="candidates: have 2 channels, the maps 3"):
+        fitting.next_light(maps, [brdf.DirectionalLight([0, 0, 1], [1.0, 0.5])])
     assert "brings the number of undetermined texels from" in str(fitting.next_light(maps, [bright], of="undetermined"))
 
 
@@ -1064,14 +1073,47 @@ def test_what_a_light_shows_of_k_a_and_of_channels(noisy, tmp_path):
     added = np.array([0.1, 0.2, 0.0]) * np.nan_to_num(known.k_a)
     np.testing.assert_allclose(known.render([0.0, 0.0, 1.0], ambient=[0.1, 0.2, 0.0]), direct + added, atol=1e-6)
     for given, words in (
-        (lambda: known.render(brdf.DirectionalLight([0, 0, 1], [1.0, 0.5])), "light: is of 2 channels, the maps of 3"),
-        (lambda: known.render([0, 0, 1], ambient=[1.0, 0.5]), "ambient: is of 2 channels"),
+        (lambda: known.render(brdf.DirectionalLight([0, 0, 1], [1.0, 0.5])), "light: is of shape .2,., the maps of 3"),
+        (lambda: known.render([0, 0, 1], ambient=[1.0, 0.5]), "ambient: is of shape"),
+        (lambda: known.render([0, 0, 1], ambient="dim"), "ambient"),
+        (lambda: known.render([0, 0, 1], ambient=np.nan), "ambient: must be 0 or more"),
         (lambda: maps.render([0, 0, 1], ambient=0.1), "ambient: lights maps without k_a"),
     ):
         with pytest.raises(brdf.InputError, match=words):
             given()
     maps.save(tmp_path / "out")
     np.testing.assert_array_equal(fitting.load_maps(tmp_path / "out").intensity, maps.intensity)
+
+
+@pytest.mark.parametrize("model", ["normalized-phong", "normalized-blinn-phong"])
+def test_errors_of_normalised_lobes_are_those_of_their_coefficients(model):
+    lights, normal = dome(16), np.broadcast_to(VIEW, (1, 400, 3))
+    points = brdf.SurfacePoints.from_normals(normal)
+    scenes = [brdf.Scene(points=points, lights=[brdf.DirectionalLight(light, 1.0)]) for light in lights]
+    truth = brdf.MODELS[model](k_d=[0.3, 0.2, 0.1], k_s=0.3, n=40.0)
+    pictures = np.stack([np.asarray(brdf.render(truth, scene)) for scene in scenes])
+    pictures = pictures + 0.01 * np.random.default_rng(0).normal(size=pictures.shape)
+    maps = fitting.fit_maps(pictures, lights, normal, model=model)
+    assert np.mean(maps.determined) > 0.9
+    # The lobe is some ten times as high as k_s: errors of it as of that were twice k_s in one texel of four.
+    assert np.mean((maps.k_s_error < 0.4 * maps.k_s)[maps.determined]) > 0.95
+    assert 0.9 < np.mean((np.abs(maps.k_s - 0.3) < 1.96 * maps.k_s_error)[maps.determined]) < 1
+
+
+def test_another_ambient_light_is_another_problem(tmp_path):
+    lights = dome(16)
+    pictures, truth = texels(40, 0.0, lights)
+    one, other = (
+        fitting.fit_maps(pictures + 0.1, lights, truth["normal"][None], ambient=ambient, keep=tmp_path)
+        for ambient in (0.5, 1.0)
+    )
+    np.testing.assert_allclose(other.k_a, 0.5 * one.k_a, rtol=1e-4)
+
+
+def test_labels_of_what_is_black(tmp_path):
+    maps = fitting.fit_maps(np.zeros((16, 1, 40, 3)), dome(16), np.broadcast_to(VIEW, (1, 40, 3)), labels=0)
+    assert not maps.k_d.any()
+    assert np.all(np.isfinite(maps.k_d_error))
 
 
 def test_exposures_are_those_of_ambient_light_too():
@@ -1094,10 +1136,6 @@ def test_what_few_lights_tell_of_sharp_highlights():
     maps = fitting.fit_maps(pictures, lights, normal[None])
     wrong = maps.determined & (np.abs(np.log(maps.n / 300)) > 1.96 * maps.n_error / maps.n)
     assert np.mean(wrong) < 0.015  # 5.5 % by the curvature alone
-    pictures = seen_by_equation(dome(8), normal, k_d, k_s, 300.0) + noise[:8]
-    shared = fitting.fit_maps(pictures, dome(8), normal[None], labels=0)
-    # Noise that looks like broader lobes where no highlight shows took it 25 errors away.
-    assert np.abs(shared.n[shared.determined][0] - 300) < 10 * shared.n_error[shared.determined][0]
     # of grey photographs, broad highlights
     few = dome(6)
     pictures = seen_by_equation(few, normal, k_d, k_s, 12.0)[..., :1] + 0.01 * random.normal(size=(6, 1, count, 1))
