@@ -1087,17 +1087,18 @@ def test_what_a_light_shows_of_k_a_and_of_channels(noisy, tmp_path):
 
 @pytest.mark.parametrize("model", ["normalized-phong", "normalized-blinn-phong"])
 def test_errors_of_normalised_lobes_are_those_of_their_coefficients(model):
-    lights, normal = dome(16), np.broadcast_to(VIEW, (1, 400, 3))
-    points = brdf.SurfacePoints.from_normals(normal)
+    lights, random = dome(16), np.random.default_rng(0)
+    normal = np.concatenate([0.3 * random.normal(size=(1, 400, 2)), np.ones((1, 400, 1))], axis=-1)
+    points = brdf.SurfacePoints.from_normals(normal / np.linalg.norm(normal, axis=-1, keepdims=True))
     scenes = [brdf.Scene(points=points, lights=[brdf.DirectionalLight(light, 1.0)]) for light in lights]
-    truth = brdf.MODELS[model](k_d=[0.3, 0.2, 0.1], k_s=0.3, n=40.0)
+    truth = brdf.MODELS[model](k_d=[0.3, 0.2, 0.1], k_s=0.03, n=40.0)
     pictures = np.stack([np.asarray(brdf.render(truth, scene)) for scene in scenes])
-    pictures = pictures + 0.01 * np.random.default_rng(0).normal(size=pictures.shape)
+    pictures = pictures + 0.01 * random.normal(size=pictures.shape)
     maps = fitting.fit_maps(pictures, lights, normal, model=model)
-    assert np.mean(maps.determined) > 0.9
-    # The lobe is some ten times as high as k_s: errors of it as of that were twice k_s in one texel of four.
+    # The lobe is some seven times as high as k_s: with errors of the one taken for those of the other 9 %.
+    assert np.mean(maps.determined) > 0.4
     assert np.mean((maps.k_s_error < 0.4 * maps.k_s)[maps.determined]) > 0.95
-    assert 0.9 < np.mean((np.abs(maps.k_s - 0.3) < 1.96 * maps.k_s_error)[maps.determined]) < 1
+    assert 0.9 < np.mean((np.abs(maps.k_s - 0.03) < 1.96 * maps.k_s_error)[maps.determined]) < 1
 
 
 def test_another_ambient_light_is_another_problem(tmp_path):
