@@ -105,7 +105,7 @@ class LightChoice:
         for lights, marker, label in ((self.known, "x", "there already"), (self.lights, "*", "chosen")):
             places = [direction_of(light)[:2] for light in lights if isinstance(light, brdf.DirectionalLight)]
             axes.scatter(*np.reshape(places, (-1, 2)).T, marker=marker, s=90, color="#D55E00", label=label)
-        axes.set(title=f"{self._what} with one more light", xlabel="x towards the light", ylabel="y", aspect="equal")
+        axes.set(title="with one more light", xlabel="x towards the light", ylabel="y", aspect="equal")
         axes.legend(loc="lower right", fontsize=7)
         figure.colorbar(colours, label=self._what)
         return figure

@@ -71,7 +71,8 @@ def fit_bands(problem: MapProblem, keep: Path | None = None) -> dict[str, np.nda
     with waiting("fitting maps") as say, ThreadPoolExecutor(core_count()) as pool:
         for done, (index, (found, path)) in enumerate(zip(mine, pool.map(band, mine), strict=True), start=1):
             place(index, found)
-            if path is not None:
+            # Of input in which nothing counts nothing is left, unless other processes wait for it.
+            if path is not None and (others or np.any(np.isfinite(found["k_d"][: bands[index].size]))):
                 write_band(path, found)
             say(f"fitting maps, {100 * done // len(mine)} % done")
     if others:

@@ -283,21 +283,12 @@ class Texels(eqx.Module):
 
     # -- normals given -------------------------------------------------------------------------------------------------
 
-    def start(self) -> "Start":
-        """Where the search of each texel starts."""
-        if not self.glossy:
-            nothing = jnp.zeros_like(self.cap)
-            brackets = jnp.zeros((2, 3, nothing.size), nothing.dtype)
-            return Start(nothing[None], [], jnp.stack([nothing, nothing - jnp.inf]), brackets)
-        gains, k = self.profile()
-        return Start(gains, k, *peaks(gains, grid(self.finer)))
-
-    def minima(self, start: "Start") -> "Minimum":
+    def minima(self, profile: "Profile") -> "Minimum":
         """The best material of each texel, from both peaks side by side: of a few texels, for it takes twice."""
-        lanes = jnp.arange(start.gains.shape[1])
-        both = self.some(jnp.tile(lanes, 2)).climbed(jnp.concatenate(tuple(start.brackets), axis=-1))
+        lanes = jnp.arange(profile.gains.shape[1])
+        both = self.some(jnp.tile(lanes, 2)).climbed(jnp.concatenate(tuple(profile.brackets), axis=-1))
         first, second = of_lanes(both, lanes), of_lanes(both, lanes.size + lanes)
-        better = rivals(start.heights, first.cost) & (second.cost < first.cost)
+        better = rivals(profile.heights, first.cost) & (second.cost < first.cost)
         return jax.tree.map(lambda a, b: jnp.where(better, b, a), first, second)
 
     def climbed(self, bracket: Array) -> "Minimum":
@@ -317,11 +308,12 @@ class Texels(eqx.Module):
         """The derivative of the lobe's column, if there is one."""
         return [jax.jvp(lambda x: self.columns(x)[-1], (log_n,), (jnp.ones_like(log_n),))[1]] * self.glossy
 
-    def profile(self) -> tuple[Array, list[Array]]:
-        """By how much the best material lowers half the cost at each n of the grid, (G, T), and its k, (G, C, T) each.
-
-        A k that the channels share is (G, 1, T).
-        """
+    def profile(self) -> "Profile":
+        """The best material of each texel at each n of the grid."""
+        if not self.glossy:
+            nothing = jnp.zeros_like(self.cap)
+            brackets = jnp.zeros((2, 3, nothing.size), nothing.dtype)
+            return Profile(nothing[None], [], jnp.stack([nothing, nothing - jnp.inf]), brackets)
         dtype, size = self.shown.dtype, len(self.linear) + 2
 
         def sums_at(powers):
@@ -344,7 +336,8 @@ class Texels(eqx.Module):
         k = nonnegative(rows, cap, self.grey, steps=2)
         lowered = (x * (b - 0.5 * sum(map(operator.mul, row, k))) for x, (*row, b) in zip(k, rows, strict=True))
         gains = jnp.sum(functools.reduce(operator.add, lowered), axis=-2)
-        return gains, [*k[:-1], k[-1] / self.model.scale(jnp.asarray(exponents, dtype))[:, None, None]]
+        k[-1] /= self.model.scale(jnp.asarray(exponents, dtype))[:, None, None]
+        return Profile(gains, k, *peaks(gains, exponents))
 
     def unshadowed(self) -> "Trial":
         """The best material of each texel, where some values may lie in cast shadows.
@@ -354,9 +347,9 @@ class Texels(eqx.Module):
         """
         seen, diffuse = self.seen, self.linear[-1]
         dark = seen * shadowed(*(over_channels(self.unweighted(one)) for one in (self.values, diffuse)))
-        start = self.start()
-        found = self.climbed(start.brackets[0])
-        first = Trial.of(self, start, found, seen)
+        profile = self.profile()
+        found = self.climbed(profile.brackets[0])
+        first = Trial.of(self, profile, found, seen)
         # a k_d of their own, by its score: how far below the other one, in standard errors
         terms = sums(self.residual(found) * diffuse * dark, diffuse * diffuse * dark, diffuse * diffuse)
         score, square, whole = (jnp.sum(jnp.broadcast_to(one, self.shown.shape[:2]), axis=0) for one in terms)
@@ -369,7 +362,7 @@ class Texels(eqx.Module):
             def again(i, state):
                 counts, best = state
                 part = some.where(counts)
-                own = jax.lax.cond(i == 0, lambda _: of_lanes(start, lanes), Texels.start, part)
+                own = jax.lax.cond(i == 0, lambda _: of_lanes(profile, lanes), Texels.profile, part)
                 trial = Trial.of(some, own, part.minima(own), counts)
                 better = (i == 0) | (tried & (trial.cost < best.cost))
                 best = jax.tree.map(lambda a, b: jnp.where(better, b, a), best, trial)
@@ -378,7 +371,7 @@ class Texels(eqx.Module):
 
             return jax.lax.fori_loop(0, jnp.where(jnp.any(tried), 3, 1), again, (every, old))[1]
 
-        return of_few(rivals(start.heights, found.cost) | worth, first, anew)
+        return of_few(rivals(profile.heights, found.cost) | worth, first, anew)
 
     # -- least squares -------------------------------------------------------------------------------------------------
 
@@ -437,13 +430,13 @@ class Texels(eqx.Module):
         return fit._replace(cost=jnp.sum(*sums(left * left), axis=0))
 
 
-class Start(NamedTuple):
-    """Where a search starts.
+class Profile(NamedTuple):
+    """The best fits at each n of the grid, where a search starts.
 
     Attributes:
-        gains: see `Texels.profile`.
-        k: likewise; of a model without a lobe nothing.
-        heights: the two highest peaks, (2, T).
+        gains: by how much they lower half the cost, (G, T).
+        k: as of `TexelFit`, (G, C, T) each, (G, 1, T) where channels share it; of a model without a lobe nothing.
+        heights: the two highest peaks of the gains, (2, T).
         brackets: of log n about them, (2, 3, T).
     """
 
@@ -498,7 +491,7 @@ class Trial(NamedTuple):
     """A fit of some of the values, and what it is judged by.
 
     Attributes:
-        start: of its search.
+        profile: where its search started.
         found: the minimum.
         counts: 1 where a value counts, (P, T).
         cost: of it and of what it leaves out, which counts as outliers with the least residual of such, (T,).
@@ -506,7 +499,7 @@ class Trial(NamedTuple):
         normal: that it is for; None where normals are given.
     """
 
-    start: Start
+    profile: Profile
     found: Minimum
     counts: Array
     cost: Array
@@ -514,12 +507,12 @@ class Trial(NamedTuple):
     normal: Components | None = None
 
     @classmethod
-    def of(cls, texels: Texels, start: Start, found: Minimum, counts: Array, normal: Any = None) -> "Trial":
+    def of(cls, texels: Texels, profile: Profile, found: Minimum, counts: Array, normal: Any = None) -> "Trial":
         """Where some of the values that are seen count."""
         many, left_out = sums_of(counts, texels.seen - counts)
         freedom = len(texels.shown) * (many - len(found.k) + texels.glossy) - texels.of_lobe
         cost = found.cost * (1 + OUTLIER**2 * left_out / jnp.maximum(freedom, 1))
-        return cls(start, found, counts.T, jnp.where(freedom < 3, jnp.inf, cost), freedom, normal)
+        return cls(profile, found, counts.T, jnp.where(freedom < 3, jnp.inf, cost), freedom, normal)
 
 
 def of_lanes(tree: Any, lanes: Array) -> Any:
@@ -637,7 +630,7 @@ def inliers(residual: Components, seen: Array, counts: Array) -> Array:
 # -- normals sought ----------------------------------------------------------------------------------------------------
 
 
-def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Start, Components, Array, Array]:
+def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Profile, Components, Array, Array]:
     """The best material and normal of each texel.
 
     A highlight alone, as of metals, gives a normal, and Lambert's law, fitted to what is neither highlight nor shadow,
@@ -684,13 +677,13 @@ def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Start, Comp
         used = before * counts
         some = texels.where(used)
         there = some.facing(normal, lights)
-        start = there.start()
-        found = there.climbed(start.brackets[0])
-        few = rivals(start.heights, found.cost)
-        found = of_few(few, found, lambda lanes, _: there.some(lanes).minima(of_lanes(start, lanes)))
-        before_steps = found.log_n, normal, found.cost
+        profile = there.profile()
+        found = there.climbed(profile.brackets[0])
+        few = rivals(profile.heights, found.cost)
+        found = of_few(few, found, lambda lanes, _: there.some(lanes).minima(of_lanes(profile, lanes)))
+        start = found.log_n, normal, found.cost
         log_n, normal, least = jax.lax.cond(
-            i < count, lambda *same: same, lambda log_n, normal, _: jointly(some, lights, log_n, normal), *before_steps
+            i < count, lambda *same: same, lambda log_n, normal, _: jointly(some, lights, log_n, normal), *start
         )
         there, facing = texels.facing(normal, lights), lit(normal)
         fit = Minimum.at(there.where(facing * counts), log_n)
@@ -702,7 +695,7 @@ def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Start, Comp
         # What is dark where no light falls is explained, too.
         counts = jnp.where(facing > 0, inliers(residual, facing, half), seen - bright)
         cost = jnp.sum(*sums(counts * residual * residual), axis=0)
-        trial = Trial.of(texels, start, fit._replace(cost=cost), counts, normal)
+        trial = Trial.of(texels, profile, fit._replace(cost=cost), counts, normal)
         return trial, before.T, used.T, least
 
     def step(i, found):
@@ -721,7 +714,7 @@ def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Start, Comp
     if texels.glossy:
         log_n, normal, _ = restarted(some, lights, (log_n, normal, cost))
     fit = joint_fit(some.facing(normal, lights), lights, log_n, normal)
-    return fit, best.start, normal, before.T, used.T
+    return fit, best.profile, normal, before.T, used.T
 
 
 def restarted(texels: Texels, lights: Distant, found: tuple[Array, Components, Array]) -> Any:

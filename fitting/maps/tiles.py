@@ -25,7 +25,7 @@ from fitting.maps.map_result import REASONS
 from fitting.maps.texels import (
     OUTLIER,
     Distant,
-    Start,
+    Profile,
     TexelFit,
     Texels,
     joint_fit,
@@ -225,8 +225,8 @@ def _program(
         for index, model in enumerate(models):
             texels = Texels(model, grey and issubclass(model, SpecularMaterial), finer, shown, root)
             if normal is None:
-                fit, start, normals, lit, counts = with_normals(texels, lights)
-                layers = _layers(texels.facing(normals, lights), fit, lit, counts, mask, normals, rounding, start)
+                fit, profile, normals, lit, counts = with_normals(texels, lights)
+                layers = _layers(texels.facing(normals, lights), fit, lit, counts, mask, normals, rounding, profile)
             else:
                 if points is None:
                     texels = texels.facing(normal, lights)
@@ -312,7 +312,7 @@ def _of_normals(
     counts = best.counts.T
     some = texels.where(counts)
     if seek == "gains":
-        return {"sums": jnp.where(mask, some.profile()[0], 0)}
+        return {"sums": jnp.where(mask, some.profile().gains, 0)}
     if lights is not None:
         normal = jointly(some, lights, shared[:, 0], normal, n_known=True)[1]
         texels = texels.facing(normal, lights)
@@ -325,7 +325,7 @@ def _of_normals(
         left = [point.slope[0], divide(1.0, point.error[0] ** 2), point.cost, jnp.maximum(freedom, 0), square]
         return {"sums": jnp.where(mask, jnp.stack(left), 0)}
     if shared is None:
-        return _layers(texels, some.at(best.found.log_n), texels.seen, counts, mask, normal, rounding, best.start)
+        return _layers(texels, some.at(best.found.log_n), texels.seen, counts, mask, normal, rounding, best.profile)
     log_n, error = shared.T
     known = jnp.where(error < jnp.inf, error, 0)
     found, change = jax.jvp(lambda x: fit(log_n=x, n_known=True), (log_n,), (known,))
@@ -340,7 +340,7 @@ def _layers(
     mask: Array,
     normal: Components,
     rounding: Array,
-    start: Start | None,
+    profile: Profile | None,
     shared: tuple[Array, list[Array]] | None = None,
 ) -> dict[str, Array]:
     """The layers of a model's maps, texels last.
@@ -374,9 +374,9 @@ def _layers(
     if shared is not None:
         error, change = shared
         k_error = list(map(jnp.hypot, k_error, change))
-    elif glossy and start is not None:
+    elif glossy and profile is not None:
         error = reach * fit.error[0]
-        allowed = start.errors(fit, square, jnp.maximum(reach**2, tiny), some.finer)
+        allowed = profile.errors(fit, square, jnp.maximum(reach**2, tiny), some.finer)
         *k_error, error = map(jnp.maximum, [*k_error, error], allowed)
     gain = values * jnp.log1p(fit.gain / jnp.maximum(fit.cost, tiny))
     shows = jnp.any(k_s > LEAST_HIGHLIGHT * reach * k_s_error, axis=0)

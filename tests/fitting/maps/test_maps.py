@@ -372,7 +372,7 @@ def test_a_k_d_at_its_bound_does_not_make_n_certain():
     shown = jnp.asarray(np.moveaxis(pictures[:, 0], 0, -1).swapaxes(0, 1).reshape(3, 500, 32))
     some = Texels(brdf.BlinnPhong, True, 2, shown, Components((jnp.ones((500, 32)),)))
     some = some.facing(axes, Distant(lights, view, None))
-    fit = some.at(some.minima(some.start()).log_n)
+    fit = some.at(some.minima(some.profile()).log_n)
     at_bound = np.any(np.asarray(fit.k[0]) == 0, axis=0)
     assert np.mean(at_bound) > 0.2
     assert np.all(0.01 * np.asarray(fit.error[0])[at_bound] > 0.25)  # with k_d held 0.028
@@ -1099,6 +1099,30 @@ def test_errors_of_normalised_lobes_are_those_of_their_coefficients(model):
     assert np.mean(maps.determined) > 0.4
     assert np.mean((maps.k_s_error < 0.4 * maps.k_s)[maps.determined]) > 0.95
     assert 0.9 < np.mean((np.abs(maps.k_s - 0.03) < 1.96 * maps.k_s_error)[maps.determined]) < 1
+
+
+def test_nothing_is_kept_of_what_shows_nothing(tmp_path):
+    with pytest.raises(brdf.InputError, match="show no texel that counts"):
+        fitting.fit_maps(np.full((6, 2, 2, 3), np.nan), dome(6), np.ones((2, 2, 3)), keep=tmp_path / "keep")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("fov", "told"), [(40.0, 1), (0.5, 0)])
+def test_a_near_camera_is_told(fov, told):
+    view = {"position": [0, 0, 4], "target": [0, 0, 0], "up": [0, 1, 0], "resolution": (6, 6)}
+    shape = brdf.Rectangle(center=[0, 0, 0], edge_u=[3, 0, 0], edge_v=[0, 3, 0])
+    lit = [[brdf.DirectionalLight(light, 1.0)] for light in dome(8)]
+    scenes = [brdf.Scene(camera=brdf.PerspectiveCamera(fov=fov, **view), shapes=[shape], lights=one) for one in lit]
+    pictures = [np.asarray(brdf.render(brdf.Lambert(k_d=[0.3, 0.2, 0.1]), scene)) for scene in scenes]
+    maps = fitting.fit_maps(pictures, scenes, model="lambert")
+    assert [note for note in maps.notes if "the camera is near" in note][:1] == list(maps.notes)[:told]
+    np.testing.assert_allclose(maps.to_view, [0, 0, 1], atol=1e-6)
+
+
+def test_half_floats_are_normals():
+    normals = np.full((1, 2, 3), [0, 0, 1], np.float16)
+    maps = fitting.fit_maps(np.ones((6, 1, 2, 3)), dome(6), normals, model="lambert")
+    np.testing.assert_array_equal(maps.normal, normals)
 
 
 def test_another_ambient_light_is_another_problem(tmp_path):
