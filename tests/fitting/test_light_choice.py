@@ -54,7 +54,7 @@ def test_no_direction_is_better_than_the_one_it_finds(result):
     assert choice.after[0] <= 1.002 * fitting.next_light(result, others).foretold.min()
     assert choice.after[0] < choice.foretold.max() < np.inf
     assert "brings the error of n" in str(choice)
-    assert choice.plot().axes[0].get_title() == "error of n with one more light"
+    assert choice.plot().axes[0].get_title() == "with one more light"
 
 
 def test_several_are_chosen_one_after_the_other(result):
