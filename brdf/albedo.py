@@ -70,15 +70,9 @@ def _albedo(material: Material, theta: Array) -> Array:
 
 @functools.partial(jax.jit, static_argnums=0)
 def lobe_albedo(model: type[SpecularMaterial], n: Numbers, theta: Numbers) -> Scalars:
-    """Albedo of the specular part for k_s = 1, without the division by N.L of the classic forms.
+    """Albedo of the specular part for k_s = 1 and n >= 0, (...), at angles of incidence in radians, 0 to pi/2, (...).
 
-    Args:
-        model: one of the four models with a lobe.
-        n: exponent, at least 0, (...).
-        theta: angle of incidence in radians, 0 to pi/2, (...).
-
-    Returns:
-        (...), the integral over all V of S (N.V) / pi (classic forms) or of S (N.V) / (pi N.L) (normalised forms).
+    The integral over all V of S (N.V) / pi (classic forms, not divided by N.L) or of S (N.V) / (pi N.L) (normalised).
     """
     normalised = normalized_form(model)
     formula = _phong_albedo if normalised is NormalizedPhong else _blinn_phong_albedo

@@ -42,15 +42,7 @@ class Table:
             raise InputError(self.where, f"must be a table, got {self.values!r}", "Write it as a [table]")
 
     def choose(self, key: str, choices: dict[str, Any]) -> Any:
-        """What a value names, which is taken out.
-
-        Args:
-            key: of the value.
-            choices: by name.
-
-        Raises:
-            InputError: where it names none of them.
-        """
+        """What a value names, which is taken out; refused where it names none of the choices."""
         known = ", ".join(choices)
         if key not in self.values:
             raise InputError(self.where, f"has no {key}", f"Add {key} = one of {known}")
@@ -60,14 +52,7 @@ class Table:
         return choices[value]
 
     def make(self, maker: Callable[..., Any]) -> Any:
-        """What a class or function makes of the values.
-
-        Args:
-            maker: its parameters are the keys.
-
-        Raises:
-            InputError: for a key that is unknown or missing, and for values that are refused.
-        """
+        """What a class or function makes of the values: its parameters are the keys, of which no other may be given."""
         parameters, values = inspect.signature(maker).parameters, {}
         try:
             for key, value in self.values.items():

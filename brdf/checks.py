@@ -81,17 +81,7 @@ def shown(value: Any) -> str:
 
 
 def instance(name: str, value: Any, kind: type, remedy: str) -> None:
-    """Refuse what is of another kind.
-
-    Args:
-        name: of the argument.
-        value: what came.
-        kind: what it must be an instance of.
-        remedy: what to write.
-
-    Raises:
-        InputError: naming the argument.
-    """
+    """Refuse what is of another kind; the remedy says what to write."""
     if not isinstance(value, kind):
         what = f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
         raise InputError(name, f"must be a {kind.__name__}, got {what}", remedy)
@@ -201,14 +191,7 @@ def sample_number(value: Any, most: int = MAX_SAMPLES) -> int:
 
 
 def coefficients(**given: Any) -> list[Array | np.ndarray]:
-    """The coefficients of a material at one common number of channels, (C,) each.
-
-    Args:
-        given: numbers or sequences, by name.
-
-    Raises:
-        InputError: naming the one that is not finite, is negative, or does not go with the others.
-    """
+    """The coefficients of a material at one common number of channels, (C,) each: finite and at least 0."""
     arrays: dict[str, Array | np.ndarray] = {}
     for name, value in given.items():
         arrays[name] = spectrum(name, _known(name, value), np.inf)
@@ -222,14 +205,7 @@ def coefficients(**given: Any) -> list[Array | np.ndarray]:
 
 
 def exponent(given: Any) -> Array | np.ndarray:
-    """The exponent of a material.
-
-    Args:
-        given: one number.
-
-    Raises:
-        InputError: where it is not finite, negative or beyond `LARGEST`.
-    """
+    """The exponent of a material: one number from 0 to `LARGEST`."""
     value = _known("n", given)
     if value.size != 1:
         raise InputError("n", f"must be one number, got shape {value.shape}", "All channels share one exponent")

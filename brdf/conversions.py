@@ -204,10 +204,7 @@ def nearest_equations(
 ) -> tuple[Float[np.ndarray, "2 2"], Float[np.ndarray, " 2"]]:
     """The normal equations of the nearest k_d and k_s: gram x = gram[:, 0] k_d + cross k_s.
 
-    Args:
-        given: the form that k_d and k_s are of.
-        model: the form that is wanted.
-        n: the exponent, which both have.
+    ``given`` is the form that k_d and k_s are of, ``model`` the one that is wanted; both have the exponent n.
     """
     # Light is uniform over the hemisphere, the view in proportion to N.V, as a sphere shows it to a far camera. Then
     # every entry of the normal equations is an integral over the light's angle of an albedo of exponent n or 2 n.

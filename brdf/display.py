@@ -63,11 +63,7 @@ def lit_sphere(material: Material | Callable[[Any, Any], Any], size: int = 128) 
 
 
 def png_address(picture: Float[np.ndarray, "H W 3"]) -> str:
-    """A picture as a ``data:`` address that an ``<img>`` can show.
-
-    Args:
-        picture: values for a screen, 0 to 1.
-    """
+    """Values for a screen, 0 to 1, as a ``data:`` address that an ``<img>`` can show."""
     import matplotlib.image  # only where something is shown
 
     file = io.BytesIO()
@@ -78,9 +74,7 @@ def png_address(picture: Float[np.ndarray, "H W 3"]) -> str:
 def material_html(material: Material, undetermined: Container[str] = ()) -> str:
     """A material as HTML: a lit sphere and its numbers.
 
-    Args:
-        material: any of the models, of known numbers.
-        undetermined: those that are 0 for want of a value: "k_a[0]", "n".
+    Undetermined ones, such as "k_a[0]" or "n", are not shown where they are 0 for want of a value.
     """
     cell = f'<td style="{_CELL}">{{}}</td>'.format
     head = f'<th style="{_CELL}">{{}}</th>'.format
@@ -101,11 +95,7 @@ def material_html(material: Material, undetermined: Container[str] = ()) -> str:
 
 
 def report_html(report: Report) -> str:
-    """A plausibility report as HTML.
-
-    Args:
-        report: of `brdf.check`.
-    """
+    """A plausibility report as HTML."""
     rows = "".join(
         f'<tr><th style="{_CELL}">{name}</th><td style="{_CELL}">{_MARKS[finding.verdict]}</td>'
         f'<td style="padding:0.15em 0.8em;text-align:left">{html.escape(finding.sentence)}</td></tr>'

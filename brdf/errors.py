@@ -53,17 +53,7 @@ class InputError(ValueError):
 
 
 def as_numbers(name: str, value: Any, what: str = "numbers", remedy: str = "Give plain numbers") -> Any:
-    """What a person gives for numbers, a float64 array of any shape.
-
-    Args:
-        name: of the argument.
-        value: what came.
-        what: it must be.
-        remedy: what to do.
-
-    Raises:
-        InputError: where it is none.
-    """
+    """What a person gives for numbers, a float64 array of any shape; refused, by the words for it, where it is none."""
     import numpy as np
 
     try:
@@ -73,10 +63,6 @@ def as_numbers(name: str, value: Any, what: str = "numbers", remedy: str = "Give
 
 
 def what_came(value: Any) -> str:
-    """A value in so many letters as a line has room for.
-
-    Args:
-        value: any.
-    """
+    """A value in so many letters as a line has room for."""
     text = repr(value.tolist() if hasattr(value, "tolist") else value)
     return text if len(text) <= 60 else text[:57] + "..."

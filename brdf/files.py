@@ -52,14 +52,7 @@ def _told(path: AnyPath) -> Iterator[None]:
 
 
 def as_path(path: Any) -> Path:
-    """What a person gives as a path.
-
-    Args:
-        path: text or a `Path`.
-
-    Raises:
-        InputError: where it is something else.
-    """
+    """The path that a person gives as text or a `Path`; anything else is refused."""
     if not isinstance(path, str | os.PathLike) or not isinstance(os.fspath(path), str):
         raise InputError("path", f"must be text, got {type(path).__name__}", "Give the path of a file")
     text = os.fspath(path)
@@ -70,14 +63,7 @@ def as_path(path: Any) -> Path:
 
 
 def utf8_name(path: AnyPath) -> str:
-    """A path as text, for libraries that know names in UTF-8 alone.
-
-    Args:
-        path: a file that may bear any name that the system allows.
-
-    Raises:
-        InputError: where the name is other bytes.
-    """
+    """A path as text, for libraries that know names in UTF-8 alone; refused where the name is other bytes."""
     try:
         os.fspath(path).encode()
     except UnicodeEncodeError:
@@ -86,14 +72,7 @@ def utf8_name(path: AnyPath) -> str:
 
 
 def input_file(path: AnyPath) -> Path:
-    """The path of an ordinary, readable file that is not empty.
-
-    Args:
-        path: the file.
-
-    Raises:
-        InputError: if the file is missing, a folder, a device or a pipe, unreadable or empty.
-    """
+    """The path of a file, refused where it is missing, unreadable, empty, or a folder, a device or a pipe."""
     file = as_path(path)
     with _told(path):
         if _ordinary(path, file).st_size == 0:
@@ -115,17 +94,9 @@ def _ordinary(path, file):
 def atomic_path(path: AnyPath) -> Iterator[Path]:
     """A temporary name near ``path``, with the same suffix, that becomes ``path`` when the block ends well.
 
-    On any exception, Ctrl-C among them, the temporary file is deleted and ``path`` stays as it was. An existing file
-    is replaced and keeps its permissions; a link keeps pointing at the file that is replaced.
-
-    Args:
-        path: the file to write.
-
-    Yields:
-        The name to write to; an empty file of that name exists.
-
-    Raises:
-        InputError: if the folder is missing or not writable, the disk is full, or ``path`` is no ordinary file.
+    An empty file of that name exists. On any exception, Ctrl-C among them, it is deleted and ``path`` stays as it was.
+    An existing file is replaced and keeps its permissions; a link keeps pointing at the file that is replaced. Refused
+    is what is no ordinary file, and a folder that is missing, full or not writable.
     """
     target = Path(os.path.realpath(as_path(path)))
     with _told(path):
@@ -161,15 +132,7 @@ def _staging(folder: Path) -> Iterator[Path]:
 
 
 def write_text(path: AnyPath, text: str) -> None:
-    """Write a text file, whole or not at all, as UTF-8 with newlines as they are.
-
-    Args:
-        path: the file; an existing one is replaced.
-        text: the content.
-
-    Raises:
-        InputError: if the file cannot be written.
-    """
+    """Write a text file, whole or not at all, as UTF-8 with newlines as they are."""
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="")
 
@@ -178,17 +141,10 @@ def write_text(path: AnyPath, text: str) -> None:
 def atomic_folder(path: AnyPath) -> Iterator[Path]:
     """A folder to write a set of files into, which appear together in ``path`` when the block ends well.
 
-    On any exception nothing has changed: no file of the set appears, files that were there keep their content, and
-    folders made on the way are gone. Other files in an existing folder are left alone.
-
-    Args:
-        path: the folder of results; made, with its parents, where missing, and gone again where nothing is written.
-
-    Yields:
-        An empty folder on the same file system; it takes files, not folders.
-
-    Raises:
-        InputError: if the folder cannot be made or written, or a folder stands where a file of the set belongs.
+    It is empty, on the same file system, and takes files, not folders; ``path`` is made, with its parents, where
+    missing. On any exception nothing has changed: no file of the set appears, files that were there keep their content,
+    and folders made on the way are gone. Other files in an existing folder are left alone. Refused is a folder that
+    cannot be made or written, or in which a folder stands where a file of the set belongs.
     """
     folder = Path(os.path.realpath(as_path(path)))
     missing = [parent for parent in (folder, *folder.parents) if not os.path.exists(parent)]
@@ -231,15 +187,7 @@ def _move_together(new: Path, old: Path, folder: Path) -> None:
 
 
 def read_text(path: AnyPath, most: int = MAX_TEXT_BYTES) -> str:
-    """Read a text file.
-
-    Args:
-        path: the file, UTF-8, with or without a byte-order mark.
-        most: how many bytes it may have.
-
-    Raises:
-        InputError: if the file cannot be read, is too large or is not text.
-    """
+    """The text of a file of up to so many bytes, UTF-8 with or without a byte-order mark; refused where it is none."""
     with input_file(path).open("rb") as file:
         content = file.read(most + 1)
     remedy = "Give a text file, saved as UTF-8"
@@ -256,11 +204,7 @@ def read_text(path: AnyPath, most: int = MAX_TEXT_BYTES) -> str:
 
 
 def continued_lines(text: str) -> Iterator[tuple[int, str]]:
-    """Lines, each with those that a backslash at its end goes on with, and the number of its first; no remark goes on.
-
-    Args:
-        text: what a file holds.
-    """
+    """Lines with those that a backslash at their end goes on with, and the number of the first; no remark goes on."""
     start, begun = 0, ""
     for number, line in enumerate([*text.splitlines(), ""], start=1):  # which ends a line that would go on
         start = start if begun else number
@@ -271,15 +215,7 @@ def continued_lines(text: str) -> Iterator[tuple[int, str]]:
 
 
 def read_toml(path: AnyPath, most: int = MAX_TEXT_BYTES) -> dict[str, Any]:
-    """Read a TOML file.
-
-    Args:
-        path: the file.
-        most: how many bytes it may have.
-
-    Raises:
-        InputError: if the file cannot be read, is too large or is not TOML.
-    """
+    """The tables of a TOML file of at most so many bytes; refused where it is none."""
     text = read_text(path, most)
     try:
         tables = tomllib.loads(text)
@@ -290,14 +226,7 @@ def read_toml(path: AnyPath, most: int = MAX_TEXT_BYTES) -> dict[str, Any]:
 
 
 def parse_number(word: str) -> float:
-    """A number as text files hold it; Python's own reading would take 1_0 and the digits of other scripts.
-
-    Args:
-        word: without white space.
-
-    Raises:
-        ValueError: if it is none.
-    """
+    """A number as text files hold it; ValueError also for 1_0 and other scripts' digits, which Python would read."""
     if "_" in word or not word.isascii():
         raise ValueError(word)
     return float(word)

@@ -104,15 +104,10 @@ class LightTerms(NamedTuple):
 def light_terms(
     model: OneOf, lighting: Lighting, point: SurfacePoints, kind: type[Light], samples: tuple[Any, Any, Array]
 ) -> LightTerms:
-    """The terms of samples of a light.
+    """The terms of samples of a kind of light at points, (P,).
 
-    Args:
-        model: the class of the material.
-        lighting: with the shapes that cast shadows.
-        point: (P,).
-        kind: of light.
-        samples: numbers of the light, (...) each; nodes of its samples, (S, ...) each; which of the scene's lights each
-            of them is, (S,).
+    The samples are the light's numbers, (...) each; nodes, (S, ...) each; and which of the scene's lights each of them
+    is, (S,).
     """
     numbers, nodes, light = samples
     row = [values[:, None] for values in (*(one[None] for one in numbers), *nodes)]
@@ -146,14 +141,8 @@ def over_samples(model: OneOf, points: SurfacePoints, lighting: Lighting, of_ter
     Of many samples all is done for a tile of pixels and a chunk of samples at a time, which the processor's cache
     holds; what a chunk's samples emit is multiplied with that as a matrix.
 
-    Args:
-        model: the class of the material.
-        points: one or several a pixel.
-        lighting: with at least one light.
-        of_terms: gives (S, P) values, in any structure.
-
     Returns:
-        The sums in that structure, (P, C) each, and the peak of the lobe, (P,).
+        The sums, (P, C) each, in the structure in which ``of_terms`` gives (S, P) values; and the lobe's peak, (P,).
     """
 
     def added(times: Any, emitted: Array, terms: LightTerms) -> tuple[Any, Array]:

@@ -29,11 +29,7 @@ WIDE = 80
 
 
 def warn_of_unsound(version: str) -> None:
-    """Warn where a version of jaxlib is known to compute wrongly.
-
-    Args:
-        version: of jaxlib.
-    """
+    """Warn where a version of jaxlib is known to compute wrongly."""
     if version in UNSOUND:
         message = f"jaxlib {version} {UNSOUND[version]}: install another version, such as 0.10.1"
         warnings.warn(message, RuntimeWarning, stacklevel=2)
@@ -43,14 +39,7 @@ warn_of_unsound(importlib.metadata.version("jaxlib"))
 
 
 def working_precision(precision: Precision | None) -> contextlib.AbstractContextManager[Any]:
-    """A context in which JAX computes in the given precision; None leaves JAX as it is.
-
-    Args:
-        precision: "float32", "float64" or None.
-
-    Raises:
-        InputError: where it is none of these.
-    """
+    """A context in which JAX computes in "float32" or "float64"; None leaves JAX as it is, all else is refused."""
     if precision not in (None, "float32", "float64"):
         raise InputError("precision", f"is unknown, got {precision!r}", "Use float32 or float64")
     if precision is None:
@@ -89,11 +78,7 @@ def on_accelerator() -> bool:
 
 
 def at_a_time(count: int) -> int:
-    """How many values a program takes at a time: what a processor's cache holds, or `WIDE` times as many.
-
-    Args:
-        count: of a processor.
-    """
+    """How many values a program takes at a time: what a processor's cache holds, or `WIDE` times as many."""
     return WIDE * count if on_accelerator() else count
 
 
@@ -108,11 +93,7 @@ def apart(function: Callable[..., Any], *arguments: Any) -> Any:
 
     XLA merges geometry into every loop that reads it and repeats it there; inside a user's own `jax.jit` a rendering
     took 10 times as long, its gradient 6 times. The branch of a conditional is not merged, and this condition always
-    holds without the compiler knowing.
-
-    Args:
-        function: from pytrees of arrays to a pytree of arrays.
-        arguments: with at least one floating-point leaf.
+    holds without the compiler knowing. It asks an argument's floating-point leaf, of which there must be one.
     """
     leaf = next(leaf for leaf in jax.tree.leaves(arguments) if jnp.issubdtype(jnp.result_type(leaf), jnp.floating))
     holds = ~(jnp.ravel(leaf)[0] < -jnp.inf)

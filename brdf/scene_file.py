@@ -37,19 +37,7 @@ MOST_BYTES = 1 << 22
 
 
 def read_parts(path: Path, within: str | Path | None, tables: dict[str, Any] | None) -> dict[str, Any]:
-    """Read a scene file; see `brdf.Scene.load`.
-
-    Args:
-        path: the file.
-        within: a folder that the paths in it may not leave; None takes the file's own.
-        tables: what is in it, where it has been parsed already.
-
-    Returns:
-        The arguments of `brdf.Scene`.
-
-    Raises:
-        InputError: naming file, table and key.
-    """
+    """The arguments of `brdf.Scene` that a file says; see `brdf.Scene.load`."""
     folders = path.parent, path.parent if within is None else Path(within)
     parts: dict[str, Any] = {}
     for name, value in (read_toml(path, MOST_BYTES) if tables is None else tables).items():
@@ -137,16 +125,7 @@ _READERS: dict[str, Callable[[Table], Any]] = {
 
 
 def write_scene(path: str | Path, scene: Any, aov: str | None = None) -> None:
-    """Write a scene file; see `brdf.Scene.save`.
-
-    Args:
-        path: the file.
-        scene: a `brdf.Scene`.
-        aov: the file beside it that holds the points already; None writes one.
-
-    Raises:
-        InputError: where the file cannot be written.
-    """
+    """Write the file of a `brdf.Scene`; see `brdf.Scene.save`."""
     path, sections = Path(path), []
 
     def beside(ending, write, content):

@@ -74,11 +74,9 @@ class Camera(Checked):
 
     @abc.abstractmethod
     def rays(self, column: Any, row: Any) -> tuple[Components, Components]:
-        """Origin and unit direction of the rays through places of the picture; what all of them share is a number.
+        """Origin and unit direction of the rays through places, in pixels from the picture's left and upper edge.
 
-        Args:
-            column: from 0 at the picture's left edge, in pixels.
-            row: from 0 at its upper edge, in pixels.
+        What all of them share is a number.
         """
 
     @property

@@ -28,15 +28,9 @@ from brdf.vectors import Components, largest
 
 @jax.jit
 def trace(camera: Camera, shapes: tuple[Shape, ...], column: Any, row: Any) -> SurfacePoints:
-    """What the rays through places of the picture meet first.
+    """What the rays through places, in pixels from the picture's left and upper edge, meet first of the shapes.
 
     A program of its own also inside others: what it does is found out once for all of them.
-
-    Args:
-        camera: where the rays begin.
-        shapes: one or more.
-        column: in pixels from the picture's left edge.
-        row: in pixels from its upper edge.
     """
     origin, direction = camera.rays(column, row)
     far = jnp.full(jnp.broadcast_shapes(jnp.shape(column), jnp.shape(row)), jnp.inf)
@@ -59,16 +53,10 @@ OFFSET = 300
 def share_seen(
     occluders: tuple[Shape, ...], point: SurfacePoints, to_light: Components, distance: Array, radius: Array | None
 ) -> Array:
-    """The share of a light sample that points see between the shapes: 0 or 1 for a sample without a radius.
+    """The share of a light sample that points, in components, see between the shapes: 0 or 1 without a radius.
 
-    All shapes of the scene are given, in its order: a point knows by that which of them it lies on.
-
-    Args:
-        occluders: the shapes.
-        point: in components.
-        to_light: unit direction of the sample.
-        distance: of the sample.
-        radius: the angle of the patch of light that the sample stands for, or None.
+    All shapes of the scene are given, in its order: a point knows by that which of them it lies on. The radius is the
+    angle of the patch of light that the sample stands for.
     """
     position, normal = point.position, point.normal if point.facet is None else point.facet
     size = jnp.maximum(largest(position), largest(-position))

@@ -55,11 +55,7 @@ class Shape(Checked):
     def cover(self, origin: Components, direction: Components, distance: Any, radius: Any) -> Array:
         """The share of a patch of light that the shape hides; without a radius, or of a mesh, that of its middle.
 
-        Args:
-            origin: where the light is seen from.
-            direction: towards the light.
-            distance: of the light.
-            radius: of the patch, as an angle; None for a point.
+        The light stands in a direction from the origin, at a distance; the patch's radius is an angle.
         """
         hit = self.intersect(origin, direction)
         return jnp.where(hit.hit & (hit.distance < distance), 1.0, 0.0)

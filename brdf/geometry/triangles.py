@@ -47,13 +47,7 @@ class Mesh:
     """
 
     def __init__(self, vertices: Any, faces: Any, name: str = "", *, normals: Any = None):
-        """Check the numbers.
-
-        Args:
-            vertices: (V, 3).
-            faces: (F, 3).
-            name: of the file it came from.
-            normals: (F, 3, 3), of any length, at the corners of each face; None for flat faces.
+        """Check the numbers; normals may have any length.
 
         Raises:
             InputError: where there is no triangle, a vertex is not finite or an index leads nowhere, or where the
@@ -122,12 +116,7 @@ class Mesh:
         return _trimesh().Trimesh(self.vertices - self.middle, self.faces, process=False)
 
     def first_hit(self, origins: Any, directions: Any) -> Int[np.ndarray, "..."]:
-        """The first triangle that each ray meets, -1 for none.
-
-        Args:
-            origins: (..., 3).
-            directions: (..., 3).
-        """
+        """The first triangle that rays of given origins and directions, (..., 3), meet, -1 for none."""
         # About the mesh, or single precision would hold its place in the world instead of its shape.
         rays = np.asarray(origins, np.float64) - self.middle, np.asarray(directions, np.float64)
         found = np.asarray(self._tree.ray.intersects_first(*(part.reshape(-1, 3) for part in rays)), np.int32)
@@ -209,13 +198,10 @@ def _corner(word: str, vertices: int, normals: int) -> tuple[int, int]:
 
 
 def rounded(mesh: Mesh) -> Float[np.ndarray, "F 3 3"]:
-    """Normals at the corners of the faces, as if the mesh were round but for its creases.
+    """Normals at the corners of the faces, as if the mesh were round but for its creases; its own are not looked at.
 
     Around a vertex two faces belong together where the edge between them is no crease, and where others join them. The
     normal is the mean of those that belong together, weighted by their angles at the vertex.
-
-    Args:
-        mesh: its own normals are not looked at.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components

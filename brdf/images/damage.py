@@ -38,14 +38,7 @@ _CHANNEL = re.compile(rb"[^\0]+\0.{16}", re.DOTALL)
 
 
 def check_content(path: Path) -> None:
-    """Refuse what libraries would take long for, or tell on standard error.
-
-    Args:
-        path: an ordinary file of any format, not empty.
-
-    Raises:
-        InputError: naming the file, what there is too much of, and the most that is read; or where a PNG is damaged.
-    """
+    """Refuse what libraries would take long for, or tell on standard error, of an ordinary file that is not empty."""
     checks = {b"v/1\x01": _check_openexr, b"\xff\xd8\xff": _check_jpeg, b"\x89PNG": _check_png}
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
         for magic, check in checks.items():
@@ -96,15 +89,7 @@ def _check_count(path: Path, what: str, count: int, most: int) -> None:
 
 
 def check_header(path: Path, spec: oiio.ImageSpec) -> None:
-    """Refuse what no picture is.
-
-    Args:
-        path: the file, for its size and the message.
-        spec: the header of one of its parts.
-
-    Raises:
-        InputError: for deep and volume data, and for sizes that the file cannot hold.
-    """
+    """Refuse deep and volume data, and sizes that the file cannot hold, by the header of one of its parts."""
     if spec.deep:
         raise InputError(path, "holds deep samples, not pixels", "Flatten it first")
     if spec.depth > 1:
@@ -119,15 +104,7 @@ def check_header(path: Path, spec: oiio.ImageSpec) -> None:
 
 
 def check_memory(path: Path, values: int) -> None:
-    """Refuse a picture that does not fit into memory as float32.
-
-    Args:
-        path: the file, for the message.
-        values: height × width × channels.
-
-    Raises:
-        InputError: if there are more than `MAX_VALUES`, or more bytes than the machine has.
-    """
+    """Refuse a picture of more values than `MAX_VALUES`, or than fit into memory as float32."""
     most = MAX_VALUES
     if hasattr(os, "sysconf"):
         most = min(most, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 4)

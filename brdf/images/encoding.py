@@ -40,15 +40,7 @@ _CICP_UNSPECIFIED = 2
 
 
 def parse_encoding(where: object, value: Any) -> Encoding | None:
-    """An encoding as the user says it.
-
-    Args:
-        where: the argument or key, for the message.
-        value: "linear", "srgb", a gamma (also as text) such as 2.2, or None for what the file says.
-
-    Raises:
-        InputError: if it is none of these.
-    """
+    """An encoding as the user says it: "linear", "srgb" or a gamma such as 2.2, also as text; None stays None."""
     if value is None:
         return None
     text = str(value).strip().lower()
@@ -104,20 +96,10 @@ def largest_step(encoding: Encoding, bits: int) -> float:
 def find_encoding(
     given: Encoding | None, path: Path, format_name: str, spec: Any, bits: int
 ) -> tuple[Encoding, EncodingSource]:
-    """What the user says, what a file says of its encoding, or what its format or its kind makes likely.
+    """The given encoding, that which a file says, or that which its format or its kind makes likely; and who says so.
 
-    Args:
-        given: by the user, or None.
-        path: the file.
-        format_name: OpenImageIO's name of the format.
-        spec: the header, an `OpenImageIO.ImageSpec`, which who only computes with encodings need not import.
-        bits: bits per value as stored.
-
-    Returns:
-        The encoding and where it comes from.
-
-    Raises:
-        InputError: if the file states an encoding that is neither linear, sRGB nor a power.
+    The header is an `OpenImageIO.ImageSpec`, which who only computes with encodings need not import. Refused is an
+    encoding that is neither linear, sRGB nor a power.
     """
     if given is not None:
         return given, "given"

@@ -22,11 +22,7 @@ class Jpeg(NamedTuple):
 
     @classmethod
     def of(cls, path: Path) -> "Jpeg | None":
-        """Read how a JPEG was written; None where it does not keep brightness and colours apart, as inks.
-
-        Args:
-            path: of the file.
-        """
+        """Read how a JPEG was written; None where it does not keep brightness and colours apart, as inks."""
         from PIL import JpegImagePlugin  # late: few files are JPEGs
 
         try:
@@ -38,11 +34,7 @@ class Jpeg(NamedTuple):
             return None
 
     def through(self, codes: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
-        """Codes as they come back from such a file.
-
-        Args:
-            codes: that go into it.
-        """
+        """Codes as they come back from such a file."""
         from PIL import Image, JpegImagePlugin
 
         file = io.BytesIO()

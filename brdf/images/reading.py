@@ -292,9 +292,8 @@ def _is_double_tiff(image: oiio.ImageInput) -> bool:
 def said(source: Any, path: AnyPath) -> str:
     """What OpenImageIO says went wrong, the first line of it, and forgets then.
 
-    Args:
-        source: the image input or output, or the module itself for a file that did not open.
-        path: a name to leave out, the message having it already.
+    The source is an image input or output, or the module itself for a file that did not open. The path is left out,
+    the message having it already.
     """
     try:
         message = source.geterror()

@@ -88,12 +88,7 @@ def write_image(
 def write_layers(path: AnyPath, layers: Mapping[str, Any]) -> None:
     """Write layers of one size into an OpenEXR file of floats, whole or not at all.
 
-    Args:
-        path: the file, .exr.
-        layers: layer name to (H, W) or (H, W, C) values; the layer "" is the picture.
-
-    Raises:
-        InputError: if sizes differ, there is no layer, or the file cannot be written.
+    They are (H, W) or (H, W, C) values by name; the layer "" is the picture.
     """
     arrays = {layer: _pixels(path, array) for layer, array in layers.items()}
     if _format(path)[0] != ".exr" or len({array.shape[:2] for array in arrays.values()}) != 1:

@@ -77,15 +77,9 @@ def _foot(start: Components, edge: Components) -> tuple[Array, Array]:
 def _evenly_seen(low: Array, high: Array, foot: Array, distance: Array, u: Array) -> tuple[Array, Array]:
     """A point of an interval, and how fast it moves with u, of which the tangent of half an angle is a linear function.
 
-    The angle is that to the foot of the interval's line, from the given distance of it. What a point receives of a line
-    of light is nearly a polynomial of that tangent however near it is, as it is not of the place on the line.
-
-    Args:
-        low: end of the interval.
-        high: the other end.
-        foot: on its line.
-        distance: of the line.
-        u: from 0 to 1.
+    The angle is that to the foot of the interval's line, from the given distance of it; u goes from 0 to 1. What a
+    point receives of a line of light is nearly a polynomial of that tangent however near it is, as it is not of the
+    place on the line.
     """
     a, b, size = (low - foot) / distance, (high - foot) / distance, (high - low) / distance
     root = jnp.sqrt(1.0 + a * a)

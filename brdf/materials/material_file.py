@@ -44,15 +44,7 @@ def load_material(path: str | Path, name: str | None = None) -> Material:
 
 
 def read_material(path: str | Path, name: str | None = None) -> tuple[Material, str]:
-    """One material, and what its file says that it leaves open; empty where it says nothing.
-
-    Args:
-        path: as for `load_material`.
-        name: likewise.
-
-    Raises:
-        InputError: likewise.
-    """
+    """One material, as for `load_material`, and what its file says that it leaves open; empty where it says nothing."""
     entries = _entries(path)
     names = ", ".join(known[:SHOWN] for known in list(entries)[:10]) + " or another" * (len(entries) > 10)
     if name is None and len(entries) > 1:
@@ -81,14 +73,7 @@ def load_materials(path: str | Path) -> dict[str, Material]:
 
 
 def read_materials(path: str | Path) -> dict[str, tuple[Material, str]]:
-    """All materials of a file, by name, each with what the file says that it leaves open.
-
-    Args:
-        path: as for `load_material`.
-
-    Raises:
-        InputError: naming file and key.
-    """
+    """All materials of a file, by name, each with what the file says that it leaves open."""
     return {name: _material(path, name, entry) for name, entry in _entries(path).items()}
 
 
@@ -121,9 +106,7 @@ def save_material(material: Material, path: str | Path, *, undetermined: Mapping
 def material_to_dict(material: Material, *, undetermined: Mapping[str, str] = _NOTHING) -> dict[str, Any]:
     """The material as JSON holds it; numbers that are not 0 although no picture determined them are told in a note.
 
-    Args:
-        material: any of the models.
-        undetermined: see `save_material`.
+    What is undetermined: see `save_material`.
     """
     values: dict[str, Any] = {"model": material.name}
     names_by_reason: dict[str, dict[str, None]] = {}
@@ -144,15 +127,7 @@ def material_to_dict(material: Material, *, undetermined: Mapping[str, str] = _N
 
 
 def material_from_dict(values: Any, where: object = "material") -> Material:
-    """The material that JSON holds.
-
-    Args:
-        values: what `material_to_dict` gives.
-        where: where it stands, for messages.
-
-    Raises:
-        InputError: naming the key.
-    """
+    """The material that JSON holds, see `material_to_dict`; an error names the key and where it stands."""
     if not isinstance(values, dict):
         raise InputError(where, "must be a JSON object", 'Write {"model": ..., "k_d": ...}')
     given = {key: value for key, value in values.items() if key != "note"}

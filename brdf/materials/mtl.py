@@ -34,13 +34,9 @@ def height(material: SpecularMaterial) -> float:
 
 
 def to_mtl(material: Material, *, name: str = "fitted", undetermined: Collection[str] = (), note: str = "") -> str:
-    """The material as MTL holds it.
+    """The material, of 1 or 3 channels, as MTL holds it.
 
-    Args:
-        material: any of the models, with 1 or 3 channels.
-        name: what ``newmtl`` calls it.
-        undetermined: what a picture could not determine, told in a comment.
-        note: what else a comment is to tell, a line.
+    Comments tell what a picture could not determine, and the note, which is a line.
     """
     lines = ["# Wavefront material, linear values"]
     if type(material) is not BlinnPhong:
@@ -61,15 +57,7 @@ def to_mtl(material: Material, *, name: str = "fitted", undetermined: Collection
 
 
 def read_mtl(path: Any, text: str) -> dict[str, dict[str, Any]]:
-    """What the lines of each material say, for `material_from_mtl`, by name; what is not read is told in its note.
-
-    Args:
-        path: where the text stands, for messages.
-        text: what the file holds.
-
-    Raises:
-        InputError: naming the line.
-    """
+    """What the lines of each material say, for `material_from_mtl`, by name; what is not read is told in its note."""
     entries: dict[str, dict[str, Any]] = {}
     name, comments = None, {}
     for number, line in continued_lines(text):
@@ -120,11 +108,7 @@ def _numbers(where: str, word, given) -> list[float]:
 
 
 def material_from_mtl(entry: dict[str, Any]) -> Material:
-    """The material of which an entry of `read_mtl` tells.
-
-    Raises:
-        InputError: naming the key.
-    """
+    """The material of which an entry of `read_mtl` tells; an error names the key."""
     if _TEXTURE in entry and "kd" not in entry:
         what = f"is missing beside the texture {''.join(entry[_TEXTURE])[:SHOWN]}, which is not read"
         raise InputError("Kd", what, "Add the mean colour as Kd")

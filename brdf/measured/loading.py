@@ -54,9 +54,5 @@ def load_measured(path: str | os.PathLike[str]) -> MeasuredBRDF:
 
 
 def is_measured(path: str | os.PathLike[str]) -> bool:
-    """Whether a file's name says that it is a measured BRDF rather than a picture or a material.
-
-    Args:
-        path: the file.
-    """
+    """Whether a file's name says that it is a measured BRDF rather than a picture or a material."""
     return Path(path).suffix.lower() in (".binary", ".bsdf", ".brdf", ".alta", ".dat")

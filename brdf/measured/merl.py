@@ -33,14 +33,7 @@ def grid() -> Grid:
 
 
 def load(path: Path) -> MeasuredBRDF:
-    """Read a file.
-
-    Args:
-        path: an ordinary file.
-
-    Raises:
-        InputError: where size and header do not fit.
-    """
+    """Read an ordinary file; refused where size and header do not fit."""
     content, size = np.fromfile(path, "u1", SIZE), path.stat().st_size
     if size < len(HEADER):
         raise InputError(path, "ends within its header", "The file is damaged; get it again")

@@ -34,17 +34,10 @@ _GRID = (90, 30, 36)
 
 
 def read_fields(content: bytes, where: object) -> dict[str, tuple[int, np.ndarray]]:
-    """The arrays that a tensor file says it holds, each found to lie within it.
-
-    Args:
-        content: of the file.
-        where: the file, for messages.
+    """The arrays that a tensor file says it holds, each found to lie within it; refused where the file is damaged.
 
     Returns:
         By name, the code of its type and the array.
-
-    Raises:
-        InputError: where the file is damaged.
     """
     stream, fields = io.BytesIO(content), {}
     stream.seek(len(MAGIC))
@@ -100,14 +93,7 @@ def _check(content, where):
 
 
 def load(path: Path) -> MeasuredBRDF:
-    """Read a file and evaluate it on a grid of half and difference angles.
-
-    Args:
-        path: an ordinary file.
-
-    Raises:
-        InputError: where the file is damaged or Mitsuba is not installed.
-    """
+    """Read a file, evaluated on a grid of half and difference angles; refused if damaged or without Mitsuba."""
     if path.stat().st_size > _MOST_BYTES:
         raise InputError(path, f"is larger than {_MOST_BYTES >> 30} GiB", "Give a .bsdf file of the RGL database")
     channels = _check(path.read_bytes(), path)

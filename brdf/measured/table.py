@@ -186,10 +186,7 @@ def half_angle_grid(shape: tuple[int, int, int], turn: float) -> Grid:
 def sampled(grid: Grid, f_r: Evaluation, **options: Any) -> MeasuredBRDF:
     """The table of a BRDF at those pairs of directions of a grid that are above the horizon.
 
-    Args:
-        grid: light, view and solid angle.
-        f_r: from light and view directions to values in 1/sr.
-        options: further arguments of `MeasuredBRDF.from_samples`.
+    Options are further arguments of `MeasuredBRDF.from_samples`.
     """
     above = (grid[0][:, 2] > 0) & (grid[1][:, 2] > 0)
     light, view, share = (each[above] for each in grid)

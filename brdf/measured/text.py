@@ -53,14 +53,7 @@ _HEADER = {
 
 
 def load(path: Path) -> MeasuredBRDF:
-    """Read either format.
-
-    Args:
-        path: an ordinary file.
-
-    Raises:
-        InputError: naming file and line.
-    """
+    """Read an ordinary file of either format; an error names file and line."""
     lines = read_text(path).splitlines()
     # Lines that hold something, each with its place.
     rows = [(f"{path}: line {number}", line.partition("#")[0].split()) for number, line in enumerate(lines, start=1)]

@@ -111,24 +111,11 @@ class SpecularMaterial(Material):
     @staticmethod
     @abstractmethod
     def log_cosine(normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
-        """Logarithm of the cosine that is raised to n; ``vectors.BELOW_HORIZON`` where it is not positive.
-
-        Args:
-            normal: unit vectors, (..., 3).
-            to_light: unit vectors, (..., 3).
-            to_view: unit vectors, (..., 3).
-
-        Returns:
-            (...), at most 0.
-        """
+        """Logarithm of the cosine that is raised to n; ``vectors.BELOW_HORIZON`` where it is not positive."""
 
     @staticmethod
     def scale(n: Numbers) -> Scalars | Float[np.ndarray, "*batch"]:
-        """The constant in front of the lobe: 1 in the classic forms, at least 1 in the normalised ones.
-
-        Args:
-            n: exponent, at least 0, (...).
-        """
+        """The constant in front of the lobe, n at least 0: 1 in the classic forms, no less in the normalised ones."""
         return jnp.ones_like(n) if isinstance(n, jax.Array) else np.ones_like(n, float)
 
     def specular(self, normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
@@ -154,27 +141,14 @@ class SpecularMaterial(Material):
 def check_single(
     material: Any, usage: str, remedy: str = "Give one: jax.tree.map(lambda leaf: leaf[0], materials)"
 ) -> None:
-    """Refuse what is no material, and several in one.
-
-    Args:
-        material: what came.
-        usage: what to write instead of what is none.
-        remedy: what to do with several.
-
-    Raises:
-        InputError: where it is no material or such a stack.
-    """
+    """Refuse what is no material, saying what to write, and several in one, saying what to do with them."""
     instance("material", material, Material, usage)
     if jnp.ndim(material.k_d) != 1:
         raise InputError("material", f"is a stack of {jnp.shape(material.k_d)[0]} materials", remedy)
 
 
 def check_model(model: Any) -> None:
-    """Refuse what is not the class of a material.
-
-    Raises:
-        InputError: where it is a material, a name or anything else.
-    """
+    """Refuse what is not the class of a material."""
     if not (isinstance(model, type) and issubclass(model, Material)):
         what = model if isinstance(model, str) else type(model).__name__
         raise InputError("model", f"must be the class of a material, got {what}", "Write for example brdf.BlinnPhong")

@@ -39,12 +39,7 @@ _ROUNDING = 1e-13  # relative; float64 at n = 1e6 reaches 1e-14
 
 
 def check_material(material: Material, subject: str) -> Report:
-    """Test one of the five models.
-
-    Args:
-        material: of known numbers.
-        subject: what to call it in the report.
-    """
+    """Test one of the five models, of known numbers."""
     with working_precision("float64"):
         double = cast(material, "float64")
         # A lobe that is not multiplied by N.L.

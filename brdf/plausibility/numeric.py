@@ -68,14 +68,8 @@ def check_black_box(f_r: BRDF, subject: str) -> Report:
 
     Args:
         f_r: f_r(to_light, to_view) -> (C,), in 1/sr, of unit vectors in the local frame whose +z axis is the normal.
-            It is traced by JAX and evaluated in float64 where it lets itself be.
+            It is traced by JAX, or refused, and evaluated in float64 where it lets itself be.
         subject: what to call it in the report.
-
-    Returns:
-        The report.
-
-    Raises:
-        InputError: f_r cannot be traced or does not return one number per channel.
     """
     scan = _Scan(f_r)
     findings = _positivity(scan), _reciprocity(scan), _energy(scan)
@@ -88,15 +82,7 @@ def check_black_box(f_r: BRDF, subject: str) -> Report:
 
 
 def albedo_of(f_r: BRDF, polar: Float[np.ndarray, " K"]) -> Float[np.ndarray, "K C"]:
-    """Albedo of any BRDF for lights in the plane of azimuth 0, to about 1e-4.
-
-    Args:
-        f_r: f_r(to_light, to_view) -> (C,), as for ``check_black_box``.
-        polar: angles of the light in degrees, (K,).
-
-    Returns:
-        (K, C).
-    """
+    """Albedo of any BRDF, (K, C), for lights at angles in degrees, (K,), in the plane of azimuth 0, to about 1e-4."""
     return _albedos(_Scan(f_r), from_angles(np.radians(polar), 0.0))[0]
 
 
@@ -130,10 +116,7 @@ class Sampler:
     """
 
     def __init__(self, f_r: BRDF):
-        """Find out how many channels there are.
-
-        Args:
-            f_r: f_r(to_light, to_view) -> (C,) or a scalar, of two vectors (3,).
+        """Find out how many channels f_r(to_light, to_view) has: of two vectors (3,) it gives (C,) or a scalar.
 
         Raises:
             InputError: it cannot be traced by JAX, or returns something else.

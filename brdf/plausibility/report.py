@@ -155,14 +155,8 @@ def judged(
 ) -> Finding:
     """A finding, its verdict read off its numbers.
 
-    Args:
-        value: the worst value found.
-        limit: the largest that passes, or the least.
-        bound: on the error of the value.
-        where: light, view and channel.
-        passed: the finding in words.
-        failed: that of one that fails, where it is another.
-        least: whether the limit is one from below.
+    The value may be ``limit`` at most, or with ``least`` at least; ``bound`` is on its error, ``where`` are light, view
+    and channel. What failed is said in words of its own where there are such.
     """
     margin = value - limit if least else limit - value
     verdict: Verdict = "pass" if margin >= bound else "fail" if -margin > bound else "cannot tell"

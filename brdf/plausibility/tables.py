@@ -31,12 +31,7 @@ _BY_LAYOUT = 1e-5
 def check_table(table: MeasuredBRDF, subject: str | None = None) -> Report:
     """Test a measured BRDF for positivity, reciprocity and energy conservation.
 
-    Args:
-        table: what `load_measured` reads.
-        subject: what to call it.
-
-    Returns:
-        The report. For reciprocity the value is the typical relative error over the typical noise where that is known.
+    For reciprocity the value is the typical relative error over the typical noise where that is known.
     """
     samples = table
     if table.evaluate is not None:

@@ -75,12 +75,7 @@ class Run(NamedTuple):
 
 
 def run(problem: FitProblem, configuration: Configuration) -> Run:
-    """Run a fit in a configuration of the separable solver; of all pixels where so few as asked for would not do.
-
-    Args:
-        problem: pictures in memory.
-        configuration: how.
-    """
+    """Run a fit in a configuration of the separable solver; of all pixels where so few as asked for would not do."""
     how, shown = configuration, problem.shown or problem.scenes
     problem = dataclasses.replace(problem, model=how.model, precision=how.precision)
     if how.samples is not None:

@@ -43,15 +43,9 @@ REASON_EMPTY = "so few would not tell enough"
 
 
 def fit_within(problem: FitProblem, accuracy: float | None, seconds: float | None) -> FitResult:
-    """Fit to an accuracy, or within a time.
+    """Fit to a relative accuracy, or within a time in seconds, both above 0; None for as good, or as long, as it gets.
 
-    Args:
-        problem: pictures in memory; its precision is the least that is used.
-        accuracy: relative error, above 0; None for as small as the time allows.
-        seconds: time to spend, above 0; None for as long as it takes. The first attempt is always made.
-
-    Raises:
-        InputError: where one of them cannot be used.
+    The problem's pictures are in memory, and its precision is the least that is used. The first attempt is always made.
     """
     start = time.perf_counter()
     limits = {"accuracy": accuracy, "seconds": seconds}

@@ -37,12 +37,7 @@ def sample_counts(scene: brdf.Scene) -> list[int]:
 
 
 def with_samples(scene: brdf.Scene, samples: int) -> brdf.Scene:
-    """The scene with so many samples in each of its lights with an extent.
-
-    Args:
-        scene: any.
-        samples: at most so many.
-    """
+    """The scene with at most so many samples in each of its lights with an extent."""
     return dataclasses.replace(scene, lights=tuple(_with_samples(light, samples) for light in scene.lights))
 
 
@@ -81,15 +76,10 @@ class PixelSample(NamedTuple):
 
 
 def sample_pixels(scene: brdf.Scene, model: type[brdf.Material], size: float) -> PixelSample | None:
-    """Choose about ``size`` pixels of a scene's picture.
+    """Choose about ``size`` pixels of a scene's picture; None where all of them are hardly more.
 
-    Args:
-        scene: what the picture shows.
-        model: the class of the material, which tells where its highlights are.
-        size: how many; up to 2.5 times as many where the picture is large and has highlights.
-
-    Returns:
-        The pixels; None where all of them are hardly more.
+    The class of the material tells where highlights are; where the picture is large and has some, up to 2.5 times as
+    many are chosen.
     """
     width, height = scene.resolution
     rows, columns = 1, 1

@@ -64,10 +64,6 @@ def add_command(app: typer.Typer, function: Callable[..., Any]) -> None:
 
     Before ``*`` stand arguments, behind it options; in place of ``pictures`` there is an option for each field of
     `PictureOptions`. An error names the file or option that was typed, not the argument of the function behind.
-
-    Args:
-        app: takes the command.
-        function: what it does.
     """
     own = inspect.signature(function).parameters
     fields = inspect.signature(PictureOptions).parameters if "pictures" in own else {}
@@ -111,11 +107,7 @@ def _flag(name):
 
 @contextlib.contextmanager
 def named_as(typed: dict[str, Any]) -> Iterator[None]:
-    """Let an error name the file or option that a person typed.
-
-    Args:
-        typed: by the argument that the error would name.
-    """
+    """Let an error name the file or option that a person typed, by the argument that it would name."""
     try:
         yield
     except InputError as error:
@@ -123,14 +115,9 @@ def named_as(typed: dict[str, Any]) -> Iterator[None]:
 
 
 def find_material(text: str, name: str | None = None) -> tuple["brdf.Material", str]:
-    """One material, and what its file says that it leaves open.
+    """One material, of a file or else of the classic table, and what its file says that it leaves open.
 
-    Args:
-        text: a file, or a name of the classic table such as emerald; a file goes before a name.
-        name: which one, where an MTL file holds several.
-
-    Raises:
-        InputError: naming the file or the option.
+    The name says which one, where an MTL file holds several.
     """
     key = table_name(text)
     if key is None:
@@ -143,14 +130,7 @@ def find_material(text: str, name: str | None = None) -> tuple["brdf.Material", 
 
 
 def table_name(text: str) -> str | None:
-    """The name in the classic table; None where a file is meant.
-
-    Args:
-        text: as it is typed.
-
-    Raises:
-        InputError: where it is neither.
-    """
+    """The name in the classic table that is typed; None where a file is meant, and refused where it is neither."""
     if not text.strip():
         raise InputError("MATERIAL", "is empty", "Give a .json or .mtl file, or a name such as emerald")
     path, key = Path(text), text.strip().lower().replace(" ", "_").replace("-", "_")
@@ -166,11 +146,7 @@ def table_name(text: str) -> str | None:
 def all_devices(devices: str | None) -> Any:
     """The mesh of every core or accelerator, and every process that a scheduler has started; None where not asked for.
 
-    Args:
-        devices: "all", or None.
-
-    Raises:
-        InputError: where it is something else.
+    Refused is what is not "all".
     """
     if devices is None:
         return None
@@ -197,11 +173,7 @@ def all_devices(devices: str | None) -> Any:
 
 
 def is_first_process(mesh: Any) -> bool:
-    """Whether this process is the one that writes and prints.
-
-    Args:
-        mesh: of `all_devices`.
-    """
+    """Whether this process is the one that writes and prints; the mesh is that of `all_devices`."""
     return mesh is None or mesh.local_devices[0].process_index == 0
 
 
@@ -212,13 +184,7 @@ class _TrialError(Exception):
 def check_outputs(out: Path | None, plot: bool = False, page: Path | None = None) -> None:
     """Refuse before the work what could not be written after it.
 
-    Args:
-        out: the folder of results.
-        plot: whether a picture is to be drawn into it.
-        page: of a report.
-
-    Raises:
-        InputError: naming the file or option.
+    That is a folder of results, the picture that is drawn into it, and the page of a report.
     """
     if plot and out is None:
         raise InputError("--plot", "needs a folder to draw into", "Add --out DIR")
@@ -234,23 +200,12 @@ def check_outputs(out: Path | None, plot: bool = False, page: Path | None = None
 
 
 def show(content: Any) -> None:
-    """Print the command's output.
-
-    Args:
-        content: text; or what JSON holds.
-    """
+    """Print the command's output: text, or what JSON holds."""
     print(content if isinstance(content, str) else json.dumps(content, indent=2), flush=True)  # noqa: T201  # the one place
 
 
 def show_result(result: Any, notes: Sequence[str], as_json: bool, *lines: str) -> None:
-    """Print a result, with what was found out on the way.
-
-    Args:
-        result: with ``str`` and ``to_dict``.
-        notes: what was found out.
-        as_json: print JSON, and no further line.
-        lines: below the result.
-    """
+    """Print a result, with what was found out on the way, and further lines below it where it is not JSON."""
     if as_json:
         show(result.to_dict() | ({"notes": notes} if notes else {}))
     else:

@@ -31,16 +31,11 @@ NAMES: dict[Any, str] = {"linear": "linear", "srgb": "sRGB"}
 def fit_either(read: Callable[..., FitInputs], say: Callable[[str], None], **how: Any) -> tuple["FitResult", FitInputs]:
     """Read and fit, where a file does not say how it is encoded under both interpretations.
 
-    Args:
-        read: the inputs; with other encodings, by file.
-        say: what is being done.
-        how: further arguments of `fitting.fit`; seconds are shared by the two fits.
+    ``read`` gives the inputs, also with other encodings by file, ``say`` tells what is being done, and ``how`` are
+    further arguments of `fitting.fit`; seconds are shared by the two fits.
 
     Returns:
         The fit to keep, with a warning where the encoding is a guess or was changed; and what was fitted.
-
-    Raises:
-        InputError: naming the file or option.
     """
     inputs = read()
     count = len(inputs.pictures)
@@ -93,10 +88,7 @@ def _unexplained(result, inputs, counted):
 def judge(assumed: str, left: float, left_other: float) -> tuple[bool, str]:
     """Whether to keep the other encoding; and what to say, nothing where the pictures speak clearly for the assumed.
 
-    Args:
-        assumed: encoding.
-        left: share of the squares that it leaves.
-        left_other: that the other one leaves.
+    ``left`` is the share of the squares that the assumed encoding leaves, ``left_other`` that of the other one.
     """
     if left < CLEARLY * left_other:
         return False, ""

@@ -64,18 +64,11 @@ def _require(fine: Any, where: object, what, remedy: str) -> None:
 
 
 def read_inputs(targets: list[Path], options: PictureOptions, encodings: dict[Path, Any] | None = None) -> FitInputs:
-    """Read what the command was given, ready to fit.
+    """Read what the command was given, pictures, a folder or an archive, ready to fit.
 
     Photographs come as under light of intensity 1, so that each counts alike however bright its light was. Ambient
-    light is taken to be the same in all of them, and its intensity, which nobody knows, as 1.
-
-    Args:
-        targets: pictures, a folder or an archive.
-        options: what they show.
-        encodings: as what to read some files that do not say it; None for what is assumed of them.
-
-    Raises:
-        InputError: naming the file or option.
+    light is taken to be the same in all of them, and its intensity, which nobody knows, as 1. Files that do not say how
+    they are encoded are read by ``encodings``, else as it is assumed of them.
     """
     kind = "scene" if options.sphere is None and options.normals is None else "photographs"
     kind = "archive" if len(targets) == 1 and targets[0].suffix.lower() == ".npz" else kind
@@ -202,15 +195,7 @@ def _exposed(pictures: list[brdf.Picture], options) -> list[brdf.Picture]:
 
 
 def masks_of(pictures: list[brdf.Picture], mask: Any) -> list[Any]:
-    """The mask of each picture.
-
-    Args:
-        pictures: to fit.
-        mask: (H, W), or None.
-
-    Raises:
-        InputError: where it is not of their size.
-    """
+    """The mask, (H, W) or None, of each picture; refused where it is not of their size."""
     if mask is not None:
         for shape in (picture.pixels.shape[:2] for picture in pictures):
             what = f"is of shape {mask.shape}, the target {shape}"
@@ -219,15 +204,7 @@ def masks_of(pictures: list[brdf.Picture], mask: Any) -> list[Any]:
 
 
 def ball_in(sphere: str, mask: Any) -> tuple[Circle, tuple[str, ...]]:
-    """The ball that --sphere names, and what to tell where it was found in a mask.
-
-    Args:
-        sphere: "x,y,radius" or "mask".
-        mask: true on the ball.
-
-    Raises:
-        InputError: where there is no mask, or no ball in it.
-    """
+    """The ball that --sphere names, "x,y,radius" or "mask", and what to tell where it was found in a mask."""
     if sphere != "mask":
         return Circle(*parse_numbers(sphere, "--sphere", 3, "x,y,radius in pixels")), ()
     _require(mask is not None, "--sphere", "is to be found in the mask, but there is none", "Add --mask MASK.png")

@@ -50,11 +50,7 @@ for function in (fit.fit, maps.maps, lights.lights, render.render, check.check, 
 
 
 def main(arguments: list[str] | None = None) -> Any:
-    """Run the command; every failure of the user's making is one line on standard error and exit status 2.
-
-    Args:
-        arguments: the words after ``brdf``; None takes those of the process.
-    """
+    """Run the command; every failure of the user's making is one line on standard error and exit status 2."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # ± on a terminal that knows ASCII alone

@@ -21,25 +21,15 @@ from fitting.result import NOT_DETERMINED, FitResult
 
 
 def result_html(result: FitResult) -> str:
-    """What Jupyter shows of a fit: the material, value, error and 95 % interval of each number, and the warnings.
-
-    Args:
-        result: of a fit.
-    """
+    """What Jupyter shows of a fit: the material, value, error and 95 % interval of each number, and the warnings."""
     summary = f"residual {100 * result.residual:.3g} % of the picture, {result.pixels} pixels, {result.seconds:.2g} s"
     return f"{_material(result)}<p>{summary}, {result.precision}</p>{_numbers(result)}{_warnings(result)}"
 
 
 def report_page(result: FitResult, *, source: str = "", command: str = "") -> str:
-    """One self-contained HTML page about a fit.
+    """One self-contained HTML page about a fit; of several pictures the one that is explained worst is shown.
 
-    Args:
-        result: of a fit; of several pictures the one that is explained worst is shown.
-        source: what was fitted, for the title.
-        command: how it was made.
-
-    Returns:
-        The page's text; it loads nothing and runs no program but the viewer's.
+    It loads nothing and runs no program but the viewer's. Its title names the source, its end the command.
     """
     from fitting.report.material_plots import overview  # Matplotlib takes long to load
 

@@ -169,12 +169,7 @@ def _sampler(brdf):
 def plot_table(table: MeasuredBRDF, material: Material, counted: np.ndarray) -> Figure:
     """A measured BRDF and the material fitted to it: f_r cos θ of the light over the angle of the half vector.
 
-    Lines are medians; shaded is what the middle four fifths of the table's samples at that angle show.
-
-    Args:
-        table: what was fitted.
-        material: to it.
-        counted: which samples, (P,).
+    Lines are medians; shaded is what the middle four fifths of the table's counted samples, (P,), at that angle show.
     """
     light, view, values = table.to_light[counted], table.to_view[counted], table.values[counted]
     half = light + view

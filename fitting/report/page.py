@@ -45,24 +45,14 @@ class Page:
         return f'<iframe style="{frame}" sandbox="allow-scripts" srcdoc="{html.escape(self.text)}"></iframe>'
 
     def save(self, path: str | Path) -> None:
-        """Write the page.
-
-        Args:
-            path: an ``.html`` file.
-
-        Raises:
-            InputError: where it cannot be written.
-        """
+        """Write the page, whole or not at all."""
         write_text(path, self.text)
 
 
 def secure_page(title: str, body: str, script: str) -> str:
     """A whole page. It loads nothing, and runs no program but its own.
 
-    Args:
-        title: as text.
-        body: as HTML, with a `stage`.
-        script: asset that draws on it.
+    The title is text, the body HTML with a `stage`, and the script an asset, which draws on that.
     """
     style, script = asset("viewer.css"), asset("page.js") + asset(script)
 
@@ -82,12 +72,9 @@ def secure_page(title: str, body: str, script: str) -> str:
 
 
 def stage(words: str, data: Mapping[str, Any], picture: Float[np.ndarray, "H W 3"]) -> str:
-    """What is drawn on and the controls below it, as HTML.
+    """What is drawn on and the controls below it, as HTML; the picture is shown where there is no WebGL2.
 
-    Args:
-        words: asset with what is this page's own, by headings.
-        data: for the script.
-        picture: shown where there is no WebGL2, values for a screen.
+    An asset holds what is this page's own, by headings; the data are for the script.
     """
     own = dict(re.findall(r"<!-- (\w+) -->\n(.*?)\n(?=<!-- |\Z)", asset(words), re.DOTALL))
     # In a script element nothing but </script and <!-- has a meaning to HTML.
@@ -97,20 +84,12 @@ def stage(words: str, data: Mapping[str, Any], picture: Float[np.ndarray, "H W 3
 
 @functools.cache
 def asset(name: str) -> str:
-    """The text of a file of `viewer_assets`.
-
-    Args:
-        name: of the file.
-    """
+    """The text of a file of `viewer_assets`."""
     return (resources.files("fitting.report") / "viewer_assets" / name).read_text(encoding="utf-8")
 
 
 def packed(values: np.ndarray) -> str:
-    """Numbers as text: gzip, base64.
-
-    Args:
-        values: any.
-    """
+    """Numbers as text: gzip, base64."""
     return base64.b64encode(gzip.compress(np.ascontiguousarray(values).tobytes(), mtime=0)).decode()
 
 
@@ -118,15 +97,7 @@ def packed(values: np.ndarray) -> str:
 
 
 def shown_picture(result: FitResult, picture: int | None) -> int:
-    """Which of a fit's pictures is shown.
-
-    Args:
-        result: of a fit.
-        picture: from 0; None takes the one that is explained worst.
-
-    Raises:
-        InputError: where there is no such picture.
-    """
+    """Which of a fit's pictures is shown, from 0: None takes the one that is explained worst."""
     count = len(result.targets)
     if picture is None:
         return 0 if count == 1 else int(np.argmax([_unexplained(result, index) for index in range(count)]))
@@ -142,11 +113,7 @@ def _unexplained(result, picture):
 
 
 def window(counted: np.ndarray) -> tuple[slice, slice]:
-    """Rows and columns that show what counts, and a margin around it: a thing may be small in its picture.
-
-    Args:
-        counted: (H, W).
-    """
+    """Rows and columns that show what counts, (H, W), and a margin around it: a thing may be small in its picture."""
     if not counted.any():
         counted = ~counted
     ends = [np.flatnonzero(counted.any(axis=axis))[[0, -1]] for axis in (1, 0)]
@@ -173,13 +140,7 @@ class Shown(NamedTuple):
 
     @classmethod
     def of(cls, counted: Bool[np.ndarray, "H W"], channels: int, largest: int) -> "Shown":
-        """What counts of them, of many pixels every second, third, ...
-
-        Args:
-            counted: which pixels do.
-            channels: how many there are.
-            largest: how many pixels on a side to hold.
-        """
+        """What counts of pictures of so many channels; above the largest size every second, third, ... pixel."""
         names, notes = channel_names(channels), []
         chosen = [0, channels // 2, channels - 1] if channels > 3 else [min(i, channels - 1) for i in range(3)]
         rows, columns = window(counted)
@@ -195,19 +156,11 @@ class Shown(NamedTuple):
         return cls(rows, columns, data, notes)
 
     def pixels(self, image: np.ndarray) -> np.ndarray:
-        """Those of an image, (H, W, ...), in three colours.
-
-        Args:
-            image: of the whole; of all channels, or of one.
-        """
+        """Those of a whole image, (H, W, ...), of all channels or of one, in three colours."""
         image = np.asarray(image)[self.rows, self.columns]
         return image[..., np.minimum(self.data["shown"], image.shape[-1] - 1)]
 
 
 def white(image: Float[np.ndarray, "..."]) -> float:
-    """What is shown as white: nothing that only a few pixels of a highlight reach, and none clipped for no reason.
-
-    Args:
-        image: values that count.
-    """
+    """What is shown as white: nothing that only a few pixels of a highlight reach, and none clipped for no reason."""
     return max(float(min(4 * np.quantile(image, 0.999), np.max(image))), 1e-12) if image.size else 1.0

@@ -21,13 +21,9 @@ from fitting.solver.profile import Optimum
 
 
 def write_report(stage: Path, result: Any, plot: bool, **further: Any) -> None:
-    """Write material.json, material.mtl (of 1 or 3 channels) and fit.json.
+    """Write material.json, material.mtl (of 1 or 3 channels), fit.json and, where it is wanted, comparison.png.
 
-    Args:
-        stage: a folder that is there.
-        result: with ``material``, ``undetermined``, ``to_dict()`` and ``plot()``.
-        plot: also comparison.png.
-        further: what else fit.json is to hold.
+    The result has ``material``, ``undetermined``, ``to_dict()`` and ``plot()``; ``further`` is held by fit.json, too.
     """
     for suffix in ("json", "mtl") if result.material.k_d.size in (1, 3) else ("json",):
         brdf.save_material(result.material, stage / f"material.{suffix}", undetermined=result.undetermined)
@@ -37,16 +33,7 @@ def write_report(stage: Path, result: Any, plot: bool, **further: Any) -> None:
 
 
 def save(result: FitResult, folder: str | Path, plot: bool) -> None:
-    """Write what `FitResult.save` promises: all of it or nothing.
-
-    Args:
-        result: of a fit.
-        folder: made where missing.
-        plot: also comparison.png.
-
-    Raises:
-        InputError: where the folder cannot be written.
-    """
+    """Write what `FitResult.save` promises: all of it or nothing."""
     with atomic_folder(folder) as stage:
         pictures = [_write_picture(stage, result, index) for index in range(len(result.scenes))]
         write_report(stage, result, plot, pictures=pictures)

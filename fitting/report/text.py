@@ -12,11 +12,7 @@ STRONG, MOST_CORRELATIONS = 0.9, 3
 
 
 def report(result: FitResult) -> str:
-    """The text that a person reads.
-
-    Args:
-        result: of a fit.
-    """
+    """The text that a person reads."""
     channels = len(result.noise)
     labels = channel_names(channels)
     count = f"{len(result.targets)} pictures, " if len(result.targets) > 1 else ""

@@ -21,13 +21,9 @@ MARGIN, AT_LEAST = 0.12, 0.3
 
 @matplotlib.rc_context(PRINT)
 def error_against_time(tradeoff: "Tradeoff") -> Figure:
-    """Draw it: one mark for each fit, a ring about default and recommendation; the fits of the front have numbers.
+    """Draw it, as wide as a column of a paper or two.
 
-    Args:
-        tradeoff: what was measured.
-
-    Returns:
-        A matplotlib figure, as wide as a column of a paper or two.
+    There is one mark for each fit, a ring about default and recommendation; the fits of the front have numbers.
     """
     figure = Figure(figsize=(6.4, 4.0))
     axes = figure.add_subplot()

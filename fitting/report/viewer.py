@@ -32,22 +32,12 @@ _DEGREES = np.array([*range(0, 80, 2), *range(80, 89), 88.5, 89, 89.3, 89.6, 89.
 
 
 def view(result: FitResult, picture: int | None) -> Page:
-    """The page of `FitResult.view`.
-
-    Args:
-        result: of a fit.
-        picture: which of its pictures, from 0; None takes the one that is explained worst.
-    """
+    """The page of `FitResult.view`."""
     return Page(secure_page(f"{result.surface}, fitted", viewer(result, picture), "viewer.js"))
 
 
 def viewer(result: FitResult, picture: int | None = None) -> str:
-    """The viewer as HTML, for the body of a `secure_page`.
-
-    Args:
-        result: of a fit.
-        picture: which of its pictures, from 0; None takes the one that is explained worst.
-    """
+    """The viewer as HTML, for the body of a `secure_page`; None takes the picture that is explained worst."""
     picture = shown_picture(result, picture)
     material, counted = result.material, np.asarray(result.counted[picture])
     shown = Shown.of(counted, max(material.k_d.size, result.targets[picture].shape[-1]), LARGEST)
