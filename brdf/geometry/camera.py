@@ -65,9 +65,8 @@ class Camera(Checked):
         forward = self.target - self.position
         length = np.linalg.norm(forward)
         if length == 0:
-            raise InputError(
-                "target", f"must differ from position, got {self.target.tolist()} for both", "Move one of them"
-            )
+            what = f"must differ from position, got {self.target.tolist()} for both"
+            raise InputError("target", what, "Move one of them")
         if np.linalg.norm(np.cross(forward, self.up)) <= 1e-9 * length * np.linalg.norm(self.up):
             what = f"must not be parallel to the view, got {self.up.tolist()}"
             raise InputError("up", what, "Give a direction that points up in the picture")

@@ -35,12 +35,7 @@ _SPACES = {"linear": "lin_rec709_scene", "srgb": "srgb_rec709_scene"}
 
 
 def write_image(
-    path: AnyPath,
-    array: Any,
-    *,
-    dtype: DataType | None = None,
-    encoding: Encoding | None = None,
-    alpha: Any = None,
+    path: AnyPath, array: Any, *, dtype: DataType | None = None, encoding: Encoding | None = None, alpha: Any = None
 ) -> None:
     """Write linear values as a picture, whole or not at all.
 

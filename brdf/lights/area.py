@@ -26,17 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from brdf.checks import (
-    Scalar,
-    Spectrum,
-    Vector,
-    checked,
-    positive,
-    sample_number,
-    spectrum,
-    vector,
-    vertex_list,
-)
+from brdf.checks import Scalar, Spectrum, Vector, checked, positive, sample_number, spectrum, vector, vertex_list
 from brdf.errors import InputError
 from brdf.geometry.shapes import Parallelogram
 from brdf.geometry.surface_points import SurfacePoints

@@ -34,11 +34,8 @@ def check(material: str, *, json: bool = False, plot: Path | None = None) -> int
         found: dict[str, tuple[Any, str]]
         if is_measured(material):
             if plot is not None:
-                raise InputError(
-                    "--plot",
-                    f"draws materials, and {material} is a measured table",
-                    f"Fit a material to it with brdf fit {material} --out DIR, and check DIR/material.json",
-                )
+                remedy = f"Fit a material to it with brdf fit {material} --out DIR, and check DIR/material.json"
+                raise InputError("--plot", f"draws materials, and {material} is a measured table", remedy)
             found = {Path(material).stem: (brdf.load_measured(material), "")}
         elif key := table_name(material):
             found = {key: (brdf.preset(key), "")}

@@ -67,22 +67,16 @@ def fit(
 
     apart = {"--noise": noise, "--plausible": plausible, "--loss": loss, "--accuracy": accuracy, "--seconds": seconds}
     if free and any(apart.values()):
-        raise InputError(
-            "--free",
-            f"knows nothing of {' and '.join(option for option, given in apart.items() if given)}",
-            "Leave one of them out",
-        )
+        what = f"knows nothing of {' and '.join(option for option, given in apart.items() if given)}"
+        raise InputError("--free", what, "Leave one of them out")
     check_outputs(out, plot, report)
     notes: tuple[str, ...] = ()
     mesh = all_devices(devices)
     with waiting("reading") as say:
         if len(target) == 1 and is_measured(target[0]):
             if any([*pictures, dark, noise, plausible, accuracy, seconds, free, report, mesh, precision != "float32"]):
-                raise InputError(
-                    target[0],
-                    "is a measured BRDF; of the options only --model, --loss, --out, --plot and --json concern it",
-                    "Leave the others out",
-                )
+                what = "is a measured BRDF; of the options only --model, --loss, --out, --plot and --json concern it"
+                raise InputError(target[0], what, "Leave the others out")
             table = brdf.load_measured(target[0])
             import fitting
 

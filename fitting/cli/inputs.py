@@ -120,26 +120,15 @@ def _check_options(kind, targets: list[Path], options: PictureOptions) -> None:
         remedy = "Give x,y,z, fit, or a file of directions"
         _require(options.light or options.lights, "--light", "or --lights has to say where the light is", remedy)
     if kind == "scene":
-        _require(
-            not options.ambient,
-            "--ambient",
-            "is what the scene file says",
-            "Leave it out, or add [ambient] to the scene",
-        )
+        count, remedy = len(targets), "Leave it out, or add [ambient] to the scene"
+        _require(not options.ambient, "--ambient", "is what the scene file says", remedy)
         for path in targets[1:]:
             _require(path.suffix != ".toml", path, "is a scene, no picture", f"Write --scene {path}")
-        _require(
-            options.scene is None or len(targets) == 1,
-            "--scene",
-            f"tells what one picture shows, {len(targets)} are given",
-            "Give one; in Python fitting.fit takes lists of pictures and of scenes",
-        )
-        _require(
-            len(targets) == 1,
-            "--sphere",
-            f"{len(targets)} pictures come without their geometry",
-            "Several pictures are fitted with --sphere or --normals, and --lights",
-        )
+        what = f"tells what one picture shows, {count} are given"
+        remedy = "Give one; in Python fitting.fit takes lists of pictures and of scenes"
+        _require(options.scene is None or count == 1, "--scene", what, remedy)
+        remedy = "Several pictures are fitted with --sphere or --normals, and --lights"
+        _require(count == 1, "--sphere", f"{count} pictures come without their geometry", remedy)
 
 
 def _read_pictures(kind, targets, options, encodings, mask):
@@ -156,12 +145,9 @@ def _read_pictures(kind, targets, options, encodings, mask):
     sizes = ", ".join(f"{shape[1]} x {shape[0]} x {shape[2]}" for shape in shapes)
     _require(len(shapes) == 1, targets[0], f"and the others differ in size ({sizes})", "Give pictures of one camera")
     if isinstance(resolution, list):
-        _require(
-            resolution == [width, height],
-            targets[0],
-            f"is {width} x {height}, the scene's camera {' x '.join(map(str, resolution))}",
-            "Give a picture and a camera of the same resolution",
-        )
+        what = f"is {width} x {height}, the scene's camera {' x '.join(map(str, resolution))}"
+        remedy = "Give a picture and a camera of the same resolution"
+        _require(resolution == [width, height], targets[0], what, remedy)
     pictures = _exposed(pictures, options)
     return FitInputs(targets, pictures, [], masks_of(pictures, mask)), file, tables
 
@@ -171,12 +157,8 @@ def _target_and_scene(target, scene):
     if target.is_dir():
         found = sorted(path for path in target.glob("target.*") if path.is_file())
         _require(found, target, "has no file target.*", "Give the picture, or a folder that holds it")
-        _require(
-            len(found) == 1,
-            target,
-            f"has several targets, {', '.join(path.name for path in found)}",
-            "Name the picture instead of the folder",
-        )
+        what = f"has several targets, {', '.join(path.name for path in found)}"
+        _require(len(found) == 1, target, what, "Name the picture instead of the folder")
         return found[0], scene or target / "scene.toml"
     input_file(target)
     _require(scene, target, "comes without a scene", "Add --scene SCENE.toml, or --sphere for a photo of a ball")
@@ -221,12 +203,8 @@ def _seen(shape, options, mask):
 
     points = brdf.SurfacePoints.from_normals(normal_map(options.normals))
     height, width = points.mask.shape
-    _require(
-        points.mask.shape == shape,
-        options.normals,
-        f"is {width} x {height}, the pictures {shape[1]} x {shape[0]}",
-        "Give a normal for each pixel",
-    )
+    what = f"is {width} x {height}, the pictures {shape[1]} x {shape[0]}"
+    _require(points.mask.shape == shape, options.normals, what, "Give a normal for each pixel")
     return points, brdf.Scene(points=points), ()
 
 
@@ -263,12 +241,8 @@ def _intensities(path, pictures):
     if path is None:
         return np.ones((len(pictures), 1))
     intensities, channels = read_intensities(path, len(pictures)), pictures[0].pixels.shape[2]
-    _require(
-        intensities.shape[1] in (1, channels),
-        path,
-        f"has {intensities.shape[1]} numbers a line, the pictures {channels} channels",
-        "Give one intensity per channel",
-    )
+    what = f"has {intensities.shape[1]} numbers a line, the pictures {channels} channels"
+    _require(intensities.shape[1] in (1, channels), path, what, "Give one intensity per channel")
     return intensities
 
 
@@ -280,19 +254,12 @@ def _archived(path):
     """
     arrays = read_archive(path)
     images = arrays["images"]
-    _require(
-        images.dtype.kind not in "bi",
-        f"{path}: images",
-        f"holds {images.dtype}, of which it is not clear what is white",
-        "Save unsigned integers, which span their type, or floats",
-    )
+    what = f"holds {images.dtype}, of which it is not clear what is white"
+    remedy = "Save unsigned integers, which span their type, or floats"
+    _require(images.dtype.kind not in "bi", f"{path}: images", what, remedy)
     images = images[..., None] if images.ndim == 3 else images
-    _require(
-        images.ndim == 4 and images.size > 0,
-        f"{path}: images",
-        f"is of shape {images.shape}",
-        "Give (pictures, height, width, channels)",
-    )
+    what, remedy = f"is of shape {images.shape}", "Give (pictures, height, width, channels)"
+    _require(images.ndim == 4 and images.size > 0, f"{path}: images", what, remedy)
     count, height, width, channels = images.shape
     arrays = {"mask": np.ones((height, width)), "light_intensities": np.ones(count)} | arrays
     intensities = arrays["light_intensities"]

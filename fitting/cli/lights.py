@@ -47,12 +47,7 @@ def lights(
         circle, notes = ball_in(sphere, inside)
         lines = [f"# {note}" for note in notes]
         from fitting.photographs.ball import ball_points
-        from fitting.photographs.distant_light import (
-            FAR_BEHIND,
-            FROM_OUTLINE,
-            light_from_highlight,
-            light_from_shading,
-        )
+        from fitting.photographs.distant_light import FAR_BEHIND, FROM_OUTLINE, light_from_highlight, light_from_shading
 
         for path, picture, counts in zip(target, pictures, masks_of(pictures, inside), strict=True):
             with named_as({"picture": path}):

@@ -54,9 +54,8 @@ def maps(
     """
     check_outputs(out, plot, report)
     if out is not None and out.resolve() == target.resolve():
-        raise InputError(
-            "--out", "is the folder of the photographs, whose normals.* and mask.* are read", "Give another folder"
-        )
+        what = "is the folder of the photographs, whose normals.* and mask.* are read"
+        raise InputError("--out", what, "Give another folder")
     mesh = all_devices(devices)
     import fitting
 

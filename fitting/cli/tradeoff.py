@@ -38,11 +38,8 @@ def tradeoff(
     check_outputs(out)
     inputs = read_inputs([target], pictures)
     if len(inputs.pictures) > 1:
-        raise InputError(
-            target,
-            f"holds {len(inputs.pictures)} pictures, and one is measured",
-            "Give one picture with its scene or its light",
-        )
+        what = f"holds {len(inputs.pictures)} pictures, and one is measured"
+        raise InputError(target, what, "Give one picture with its scene or its light")
     import fitting
 
     with named_as({"target": inputs.targets[0]}):
