@@ -168,7 +168,7 @@ def nearest_normalized(material: Material) -> Material:
     check_single(material, "Write brdf.nearest_normalized(material)")
     if not isinstance(material, SpecularMaterial):
         return Lambert(k_a=material.k_a, k_d=np.clip(np.asarray(material.k_d), 0.0, 1.0))
-    return _nearest(material, normalized_form(type(material)), bounded=True)
+    return _nearest(material, normalized_form(type(material)))
 
 
 def nearest_classic(material: Material) -> Material:
@@ -187,15 +187,19 @@ def nearest_classic(material: Material) -> Material:
     check_single(material, "Write brdf.nearest_classic(material)")
     if not isinstance(material, SpecularMaterial):
         return material
-    model = Phong if normalized_form(type(material)) is NormalizedPhong else BlinnPhong
-    return _nearest(material, model, bounded=False)
+    return _nearest(material, _classic_form(type(material)))
 
 
-def _nearest(material: SpecularMaterial, model: type[SpecularMaterial], *, bounded: bool) -> SpecularMaterial:
+def _classic_form(model: type[SpecularMaterial]) -> type[SpecularMaterial]:
+    return Phong if normalized_form(model) is NormalizedPhong else BlinnPhong
+
+
+def _nearest(material: SpecularMaterial, model: type[SpecularMaterial]) -> SpecularMaterial:
     n = float(np.asarray(material.n))
     gram, cross = nearest_equations(type(material), model, n)
     k_d, k_s = np.asarray(material.k_d, np.float64), np.asarray(material.k_s, np.float64)
-    pairs = np.array([_constrained(gram, gram[:, 0] * d + cross * s, bounded) for d, s in zip(k_d, k_s, strict=True)])
+    right = np.outer(k_d, gram[:, 0]) + np.outer(k_s, cross)
+    pairs = np.array([_constrained(gram, each, model.cosine_weighted) for each in right])
     return model(k_a=material.k_a, k_d=pairs[:, 0], k_s=pairs[:, 1], n=n)
 
 
@@ -211,9 +215,8 @@ def nearest_equations(
     nodes, weights = gauss_legendre(_NODES)
     theta = 0.5 * np.pi * nodes
     weights, cosine = weights * np.sin(theta), np.cos(theta)
-    plain = Phong if normalized_form(model) is NormalizedPhong else BlinnPhong
     with working_precision("float64"):
-        single, double = (np.asarray(lobe_albedo(plain, jnp.asarray(m), jnp.asarray(theta))) for m in (n, 2 * n))
+        single, double = np.asarray(lobe_albedo(_classic_form(model), np.array([[n], [2 * n]]), theta))
         to, of = (float(m.scale(n)) * (cosine if m.cosine_weighted else 1.0) for m in (model, given))
     mixed, pure = np.sum(weights * cosine * to * single), np.sum(weights * to * to * double)
     gram = np.array([[np.sum(weights * cosine**2), mixed], [mixed, pure]])

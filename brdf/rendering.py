@@ -187,12 +187,8 @@ def _shade(material: Material, points: Sight, ambient: Any, lighting: Lighting) 
     """The picture k_a B_a + k_d B_d + k_s B_s of surface points; None where there is no light at all."""
     n = jnp.asarray(getattr(material, "n", 1.0))
     images = _basis_images(OneOf((type(material),)), points, ambient, lighting, n)
-    terms = (
-        (material.k_a, images.ambient),
-        (material.k_d, images.diffuse),
-        (getattr(material, "k_s", 0), images.specular),
-    )
-    parts = [k * image for k, image in terms if image is not None]
+    terms = zip(("k_a", "k_d", "k_s"), (images.ambient, images.diffuse, images.specular), strict=True)
+    parts = [getattr(material, name) * image for name, image in terms if image is not None]
     return functools.reduce(operator.add, parts) if parts else None
 
 

@@ -177,15 +177,15 @@ class PolygonLight(FlatLight):
         64
     """
 
-    vertices: Float[Array, "V 3"] = checked(vertex_list, "vertices")
+    vertices: Float[Array, "V 3"]
     radiance: Spectrum = checked(spectrum, "radiance")
-    samples: int = eqx.field(static=True, converter=sample_number, default=SAMPLES)
+    samples: int = eqx.field(static=True, default=SAMPLES)
     triangles: tuple[tuple[int, int, int], ...] = eqx.field(static=True, init=False)
     type_name = "polygon"
 
     def __post_init__(self):
-        """Cut it into triangles, once."""
-        self.vertices = vertex_list("vertices", self.vertices)  # a field's converter would run after this
+        """Check it, which converters of fields would do after this, and cut it into triangles, once."""
+        self.vertices = vertex_list("vertices", self.vertices)
         self.samples = sample_number(self.samples)
         self.triangles = triangulate(self.vertices)
         if self.samples < len(self.triangles):

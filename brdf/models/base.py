@@ -53,8 +53,6 @@ class Material(Checked):
         given = {name: value for name, value in vars(self).items() if name != "n"}
         for name, value in zip(given, coefficients(**given), strict=True):
             setattr(self, name, value)
-        if isinstance(self, SpecularMaterial):
-            self.n = exponent(self.n)
 
     def specular(self, normal: Directions, to_light: Directions, to_view: Directions) -> Scalars:
         """The specular term S of the shading equation, without k_s; 0 everywhere for a model that has none.
@@ -105,7 +103,7 @@ class SpecularMaterial(Material):
     """
 
     k_s: Float[Parameter, " C"] = eqx.field(kw_only=True)
-    n: Float[Parameter, ""] = eqx.field(kw_only=True)
+    n: Float[Parameter, ""] = eqx.field(converter=exponent, kw_only=True)
     cosine_weighted: ClassVar[bool] = False
 
     @staticmethod
