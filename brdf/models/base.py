@@ -95,8 +95,6 @@ class SpecularMaterial(Material):
     """What the four models with a lobe share. The lobe is ``scale(n) (N.L)+^w exp(n log_cosine)``; see the module.
 
     Attributes:
-        k_a: ambient coefficient, (C,), at least 0.
-        k_d: diffuse coefficient, (C,), at least 0.
         k_s: specular coefficient, (C,), at least 0.
         n: exponent, a scalar, at least 0.
         cosine_weighted: whether the lobe is multiplied by N.L (class variable).
