@@ -26,6 +26,8 @@ from brdf.precision import working_precision
 CUT = 1 / 12
 # Which a picture of no more pixels than this is not worth.
 FEWEST = 256
+# So many pixels and fewer go through one program.
+PADDED = 2048
 
 # By identity of a light, as long as there is one, and number of samples: to cut up a map takes up to seconds.
 _made: dict[tuple[int, int], Light] = {}
@@ -56,6 +58,15 @@ def _with_samples(light: Light, samples: int) -> Light:
         _made[key] = made
         weakref.finalize(light, _made.pop, key)
     return _made[key]
+
+
+def _middle(light: Light) -> Light:
+    """A point in the middle of a light with an extent, about which its highlight lies."""
+    if isinstance(light, brdf.RectangleLight | brdf.SphereLight):
+        return brdf.PointLight(light.center, light.radiance)
+    if isinstance(light, brdf.PolygonLight):
+        return brdf.PointLight(light.vertices.mean(axis=0), light.radiance)
+    return light
 
 
 class PixelSample(NamedTuple):
@@ -90,7 +101,7 @@ def sample_pixels(scene: brdf.Scene, model: type[brdf.Material], size: float) ->
         return None
     random = np.random.default_rng(0)
     corner = side * np.indices((-(-end // side)).ravel().tolist()).reshape(2, -1)
-    lights = tuple(light for light in with_samples(scene, 1).lights if light.type_name != "environment")
+    lights = tuple(_middle(light) for light in scene.lights if light.type_name != "environment")
     has_peaks = bool(lights) and issubclass(model, SpecularMaterial)
     most = max(16, 4 * round(size * CUT / 4))
     pixels, areas = [], []
@@ -100,8 +111,8 @@ def sample_pixels(scene: brdf.Scene, model: type[brdf.Material], size: float) ->
         pixel, area = row * width + column, np.prod(extent, axis=0).astype(np.float64)
         cut = np.zeros(pixel.size, bool)
         if has_peaks and side.max() > 1 and pixel.size > most:
-            # One shape for few sizes, so that few programs are compiled.
-            padded = np.resize(pixel, 1 << int(pixel.size - 1).bit_length())
+            # One shape for most sizes, so that few programs are compiled.
+            padded = np.resize(pixel, 1 << int(max(pixel.size, PADDED) - 1).bit_length())
             points = dataclasses.replace(brdf.some_pixels(scene, padded).surface_points(), area=None)
             with working_precision("float32"):
                 lighting = Lighting(stacked(lights, points.position.dtype))
