@@ -71,7 +71,8 @@ class Solution(NamedTuple):
         n: exponent; of Lambert 1. Without a highlight, k_s being 0, it has no meaning.
         cost: least sum of weighted squared residuals, (C,).
         errors: standard errors of the four under noise that is independent and alike in all pixels of a channel; of
-            what is at its bound 0, infinite where the pixels do not determine it.
+            what is at its bound 0, infinite where the pixels do not determine it. Over the model's scale that of k_s
+            is the error of the material's.
     """
 
     k_a: Float[Array, " C"]
@@ -191,7 +192,8 @@ def fit(
     points = scene.sight()
     seen = jnp.ravel(points.mask)
     weight = seen if weight is None else seen * jnp.ravel(jnp.asarray(weight))
-    solution = fit_basis(target, basis(model, scene, points=points), weight, scene.ambient, n_range)
+    scale = model.scale if issubclass(model, SpecularMaterial) else None
+    solution = fit_basis(target, basis(model, scene, points=points), weight, scene.ambient, n_range, scale)
     k: dict[str, Any] = {"k_a": solution.k_a, "k_d": solution.k_d}
     if issubclass(model, SpecularMaterial):
         k |= {"k_s": solution.k_s / model.scale(solution.n), "n": solution.n}
@@ -200,7 +202,12 @@ def fit(
 
 @eqx.filter_jit
 def fit_basis(
-    target: Array, images: Basis, weight: Array, ambient: Array | None, n_range: tuple[float, float]
+    target: Array,
+    images: Basis,
+    weight: Array,
+    ambient: Array | None,
+    n_range: tuple[float, float],
+    scale: Callable[[Array], Any] | None = None,
 ) -> Solution:
     """What `fit` does once the basis images of a scene are known.
 
@@ -210,6 +217,7 @@ def fit_basis(
         weight: of each pixel, (P,).
         ambient: intensity of the ambient light, or None.
         n_range: bounds of the exponent.
+        scale: of the lobe, see `solve`.
     """
     diffuse = jnp.zeros((weight.size, 1), target.dtype) if images.diffuse is None else images.diffuse
     lobe, peak = images.lobe, jnp.zeros(())
@@ -218,7 +226,7 @@ def fit_basis(
         lobe = eqx.Partial(lambda lobe, n: lobe(n)[0], lobe)
     ambient = jnp.zeros(1) if ambient is None else ambient
     target = target.reshape(weight.size, -1)
-    return solve(target, diffuse, lobe, ambient=ambient, weight=weight, n_range=n_range, peak=peak)
+    return solve(target, diffuse, lobe, ambient=ambient, weight=weight, n_range=n_range, peak=peak, scale=scale)
 
 
 @eqx.filter_jit
@@ -231,6 +239,7 @@ def solve(
     weight: Float[ArrayLike, " P"] | None = None,
     n_range: tuple[float, float] = (0.1, 1e6),
     peak: Float[ArrayLike, ""] = 0.0,
+    scale: Callable[[Float[Array, ""]], Float[Array, ""]] | None = None,
 ) -> Solution:
     """The optimum of ``target ~ k_a ambient + k_d diffuse + k_s lobe(n)``, all k at least 0.
 
@@ -243,6 +252,8 @@ def solve(
         n_range: bounds of the exponent, numbers.
         peak: the largest logarithm of the lobe's cosine in any pixel, so that exponents that no pixel sees are left
             out; 0 for a highlight whose centre is seen.
+        scale: from the exponent to what k_s is divided by to give the coefficient whose error is asked for, such as
+            `brdf.NormalizedPhong.scale`; None for 1.
 
     Returns:
         The optimum; differentiable in all arrays, those that ``lobe`` closes over too.
@@ -299,9 +310,12 @@ def solve(
     log_n, x = jax.lax.custom_root(optimality, (jnp.zeros((), dtype), matt), search, tangent)
     n, least = jnp.exp(log_n), cost(log_n, x)
     value, slope = _with_slope(relative, log_n)
-    # With k_s itself held, and not k_s relative to the peak.
+    # With k_s itself held, by its scale, and not k_s relative to the peak.
     held = (log_n <= low) | (log_n >= high)
-    error, n_error = _errors(pixels, (value, slope + n * nearest * value), x, least, held)
+    growth = n * nearest
+    if scale is not None:
+        growth += jax.grad(lambda log_n: jnp.log(scale(jnp.exp(log_n))))(log_n)
+    error, n_error = _errors(pixels, (value, slope + growth * value), x, least, held)
     units = jnp.stack(jnp.broadcast_arrays(1 / jnp.where(ambient > 0, ambient, 1), 1, jnp.exp(-n * nearest)))
     k_a, k_d, k_s = x.T * units
     return Solution(k_a, k_d, k_s, n, least, (*(error.T * units), n * n_error))

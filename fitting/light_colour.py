@@ -8,6 +8,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -60,3 +61,12 @@ def coefficient_factors(
         with jax.enable_x64(True):
             scale = np.asarray(model.scale(np.float64(n)))
     return np.stack(np.broadcast_arrays(1.0, colour, colour * scale))
+
+
+def scale_growth(model: type[brdf.Material], n: float) -> float:
+    """The derivative by n of the logarithm of a lobe's scale: 0 of the classic forms."""
+    if not issubclass(model, SpecularMaterial):
+        return 0.0
+    with jax.enable_x64(True):
+        scale, growth = jax.jvp(model.scale, (jnp.float64(n),), (jnp.float64(1.0),))
+        return float(growth / scale)

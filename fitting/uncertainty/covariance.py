@@ -64,8 +64,9 @@ class Uncertainty(NamedTuple):
     """Errors, and what is not determined.
 
     Attributes:
-        x_error: of the engine's coefficients x_a, x_d, x_s, (3, C); for one at its bound, that which it would have if
-            the bound were not there. Infinite where the picture does not determine it.
+        x_error: of the engine's coefficients x_a, x_d, x_s, (3, C), of the last as it is at the scale of the lobe at
+            the optimum; for one at its bound, that which it would have if the bound were not there. Infinite where the
+            picture does not determine it.
         x_interval: 95 % interval of each, lower and upper end, (3, C, 2).
         n_error: of n; infinite where the picture does not determine it.
         correlation: of x_a, x_d, x_s (channel after channel each) and n, (3C + 1, 3C + 1); 0 for what is at its bound
@@ -116,6 +117,7 @@ def uncertainty(
     scatter: Float[np.ndarray, "U U"] | None = None,
     channels: Float[np.ndarray, "C C"] | None = None,
     columns: Float[np.ndarray, "3 C"] | None = None,
+    growth: float = 0.0,
     gain: float = 0.0,
     resolution: float = 0.0,
     missed: SampleError | None = None,
@@ -135,6 +137,7 @@ def uncertainty(
         scatter: what takes the place of the Hessian times the noise, over all unknowns, where pixels err together.
         channels: correlation of the channels' errors; None where they err alone.
         columns: root mean square over pixels of what each term shows at 1; None where no pixel weighs more.
+        growth: by how much k_s is less than x_s when n is more, relative: see `fitting.light_colour.scale_growth`.
         resolution: relative error of a number that is left by the arithmetic of the basis images.
         gain: see `specular_gain`, where more pixels tell of it than those of the optimum's sums.
         missed: what light samples leave out; None where there are none.
@@ -198,6 +201,10 @@ def uncertainty(
     beside = [np.sqrt(np.maximum(off**2 - np.sum(offs**2, axis=0), 0.0)) * np.sign(off) for off in fit.moved]
     offs = np.vstack([offs, *beside])
     covariance = covariance + offs.T @ offs
+    # From here on x_s is k_s times the scale at the optimum, whatever n is.
+    held = np.eye(size)
+    held[2 * noise.size : -1, -1] = -growth * x[2]
+    covariance = held @ covariance @ held.T
     variance = np.maximum(np.diag(covariance), 0.0)
     # What errs together makes errors larger, but not the numbers less determined.
     deviations = np.sqrt(np.maximum([variance, own if scatter is None else np.diag(independent)], 0.0))

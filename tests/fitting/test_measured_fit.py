@@ -117,14 +117,15 @@ def test_a_retro_reflector_fits_no_model():
 
 
 @pytest.mark.parametrize("together", [False, True])
-def test_errors_cover_the_truth(together):
+@pytest.mark.parametrize("model", ["blinn-phong", "normalized-blinn-phong"])
+def test_errors_cover_the_truth(model, together):
     light, view = directions()
-    truth = f_r("blinn-phong", [0.3] * 8, [0.8] * 8, 50.0, light, view)
+    truth = f_r(model, [0.3] * 8, [0.8] * 8, 50.0, light, view)
     pulls = []
     for seed in range(24):
         random = np.random.default_rng(seed).standard_normal(truth.shape)
         noise = 0.05 * (truth * random[:, :1] if together else random / light[:, 2:])
-        fit = fitting.fit_brdf(brdf.MeasuredBRDF.from_samples(light, view, truth + noise), "blinn-phong")
+        fit = fitting.fit_brdf(brdf.MeasuredBRDF.from_samples(light, view, truth + noise), model)
         for parameter in fit.parameters:
             expected = {"k_d": 0.3, "k_s": 0.8, "n": 50.0}[parameter.name]
             pulls.append(((parameter.value - expected) / parameter.error) ** 2)

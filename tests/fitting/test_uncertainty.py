@@ -42,18 +42,28 @@ def noisy(material: brdf.Material, noise, seed: int, scene: brdf.Scene = SCENE) 
 GLOSS = brdf.BlinnPhong(k_a=0.5, k_d=0.5, k_s=0.6, n=30.0)
 
 
-def test_errors_and_correlations_are_those_of_dense_least_squares():
-    result = fitting.fit(noisy(GLOSS, 0.01, 0), SCENE, model="blinn-phong", **OPTIONS)
+@pytest.mark.parametrize("kind", [brdf.BlinnPhong, brdf.NormalizedBlinnPhong])
+def test_errors_and_correlations_are_those_of_dense_least_squares(kind: type[brdf.BlinnPhong]):
+    n = 30.0 if kind is brdf.BlinnPhong else 8.0
+    picture = noisy(kind(k_a=0.5, k_d=0.5, k_s=0.6, n=n), 0.01, 0)
+    result = fitting.fit(picture, SCENE, model=kind, **OPTIONS)
     k_a, k_d, k_s, n = (parameter.value for parameter in result.parameters)
     basis, mask = columns(n)
+    if kind is brdf.NormalizedBlinnPhong:
+        # By how much more k_s is what n takes: of the scale that n has the lobe is a part.
+        low, scale, high = ((m + 2) * (m + 4) / (8 * (2 ** (-m / 2) + m)) for m in (n - 1e-4, n, n + 1e-4))
+        lobe, slope = basis[2:] * basis[1]
+        basis[2:] = scale * lobe, scale * slope + (high - low) / 2e-4 * lobe
     jacobian = basis * np.array([1, 1, 1, k_s])[:, None]
-    residual = noisy(GLOSS, 0.01, 0)[mask][:, 0] - np.array([k_a, k_d, k_s]) @ basis[:3]
+    residual = picture[mask][:, 0] - np.array([k_a, k_d, k_s]) @ basis[:3]
     variance = residual @ residual / (residual.size - 4)
     covariance = variance * np.linalg.inv(jacobian @ jacobian.T)
     error = np.sqrt(np.diag(covariance))
     # Geometry in float64 on both sides; the sums of the engine reorder additions.
     assert [parameter.error for parameter in result.parameters] == pytest.approx(error, rel=1e-5)
     assert result.correlation == pytest.approx(covariance / np.outer(error, error), abs=1e-5)
+    many = fitting.fit_many(picture[None], SCENE, model=kind.name, precision="float64")
+    assert np.hstack([many.errors[name][0] for name in ("k_a", "k_d", "k_s", "n")]) == pytest.approx(error, rel=1e-5)
 
 
 def test_the_interval_of_n_ends_where_the_cost_of_scipy_rises_by_chi_squared():
