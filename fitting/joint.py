@@ -34,6 +34,7 @@ from fitting.codes import Rounding
 from fitting.core import fit_pictures
 from fitting.joint_likelihood import Information, by_least_squares, most_likely_numbers
 from fitting.joint_problem import JointProblem, Leaf, degrees_between, joint_problem, linearised, named_leaves
+from fitting.model_fit import N_RANGE
 from fitting.pixels import Observed, observe
 from fitting.problem import CLASSIC, FitProblem, model_name, state_problem
 from fitting.progress import waiting
@@ -43,6 +44,7 @@ from fitting.solver.nnls import nonnegative_minimum
 from fitting.uncertainty.intervals import NORMAL_95, above_zero
 from fitting.uncertainty.noise_model import value_variance
 from fitting.uncertainty.residual import NEGLIGIBLE, Neighbours, neighbours_of, structure_warning
+from fitting.uneven_noise import EVENINGS, Left, NoiseOfEach, evened, noise_left
 
 SOLVERS: dict[str, Any] = {"lm": optx.LevenbergMarquardt, "bfgs": optx.BFGS}
 LARGEST_JACOBIAN = 1 << 27
@@ -55,6 +57,10 @@ TINY = np.finfo(float).tiny
 OPEN = "only a combination with other freed numbers is determined"
 # A combination of which pictures tell so little stays as it is, or as rounding errors tell.
 DAMPED = 1e-9
+# A lobe is not linear in log n beyond.
+FARTHEST = 1.0
+# Of a lobe that went to nothing other exponents are tried once.
+OTHERS = (1.0, 4.0, 16.0, 64.0, 256.0, 1024.0)
 # A minimum is met where no more than this part of their errors parts the numbers from it.
 MET = 0.1
 
@@ -152,14 +158,21 @@ def fit_jointly(
     with working_precision(precision), waiting("fitting jointly"):
         whole = observe(stated, at_once=True)
 
-        def solve(start: brdf.Material, scenes: Sequence[brdf.Scene], rounds: int = ROUNDS) -> JointResult:
+        def solve(
+            start: brdf.Material, scenes: Sequence[brdf.Scene], rounds: int = ROUNDS, *noises: NoiseOfEach
+        ) -> JointResult:
             problem = joint_problem(brdf.cast((start, list(scenes)), precision), free)
             moves = any("camera." in leaf.words or "shapes[" in leaf.words for leaf in problem.freed)
             observed = _away_from_outlines(whole, scenes) if moves else whole
+            observed = evened(observed, noises[-1]) if noises else observed
             pictures = [(tile.target, tile.weight) for tile in observed.tiles]
             result = _solve(dataclasses.replace(problem, pictures=pictures), observed, solver, tolerance, max_steps)
+            if len(observed.tiles) > 1 and len(noises) < EVENINGS:
+                noise = _noise_of_each(result, observed)
+                if not noise.even:
+                    return solve(result.material, result.scenes, rounds, *noises, noise)
             if rounds > 1 and moves and not _inside(result.scenes, observed.counted):
-                return solve(result.material, result.scenes, rounds - 1)
+                return solve(result.material, result.scenes, rounds - 1, *noises)
             return result
 
         if isinstance(material, brdf.Material):
@@ -175,6 +188,17 @@ def _away_from_outlines(whole: Observed, scenes: Sequence[brdf.Scene]) -> Observ
     observed = observe(dataclasses.replace(whole.problem, masks=inner), at_once=True)
     lost = int(sum(map(np.count_nonzero, whole.counted)) - sum(map(np.count_nonzero, observed.counted)))
     return observed._replace(left_out=whole.left_out | {"near an outline that moves": lost})
+
+
+def _noise_of_each(result: JointResult, observed: Observed) -> NoiseOfEach:
+    """What is left of each picture."""
+    left = []
+    for tile, scene in zip(observed.tiles, result.scenes, strict=True):
+        predicted = np.asarray(brdf.render(result.material, scene)).reshape(tile.target.shape)
+        weight = np.ones(1) if tile.weight is None else np.asarray(tile.weight)
+        counts = np.broadcast_to(weight.reshape(len(weight), -1) > 0, predicted.shape)
+        left.append(Left(counts, np.where(counts, np.asarray(tile.target) - predicted, 0), predicted, tile.bounds))
+    return noise_left(left, np.asarray(observed.owner), observed.rounding)
 
 
 def _inside(scenes: Sequence[brdf.Scene], counted: Sequence[np.ndarray]) -> bool:
@@ -210,6 +234,23 @@ def _residuals(free: Array, given: tuple[JointProblem, Array, Array]) -> Array:
     return problem.residuals(jnp.where(held, vector, free))
 
 
+def _step(
+    vector: Array, linear: tuple[Any, Any], bounded: Bool[np.ndarray, " U"]
+) -> tuple[Float[np.ndarray, " U"], Float[np.ndarray, " U"], float]:
+    """Gauss and Newton's step under the bounds, however little it gains: from where, the step, and its square.
+
+    Args:
+        vector: the numbers.
+        linear: residuals at these, and their derivatives.
+        bounded: which may not be negative.
+    """
+    (residual, columns), epsilon = (np.asarray(a, np.float64) for a in linear), float(jnp.finfo(vector.dtype).eps)
+    gram, base = columns @ columns.T, np.where(bounded, np.asarray(vector, np.float64), 0.0)
+    gram[np.diag_indices_from(gram)] *= 1 + max(DAMPED, 10 * epsilon)
+    step = nonnegative_minimum(gram, gram @ base - columns @ residual, ~bounded) - base
+    return base, step, float(step @ gram @ step)
+
+
 def _solve(
     problem: JointProblem, observed: Observed, solver: str | None, tolerance: float, max_steps: int
 ) -> JointResult:
@@ -225,38 +266,64 @@ def _solve(
     # Steps that rounding hides the gains of are tried for ever: it is asked several times.
     each = max(FEWEST_STEPS, -(-max_steps // ROUNDS)) if solver == "lm" else max_steps
     bounded, held = problem.each(lambda leaf: leaf.bounded), np.zeros(vector.shape, bool)
-    steps, converged, near, residual, columns = 0, False, whole, np.zeros(0), np.zeros((0, 0))
-    least, best = np.inf, vector
-    for trial in range(ROUNDS * (1 + whole)):
+    of_n, ends = problem.each(lambda leaf: leaf.name == "n"), np.log(N_RANGE)
+    steps, converged, near, least, best = 0, False, whole, np.inf, problem
+    of_k_s = problem.each(lambda leaf: leaf.name == "k_s")
+    lobes = bool(of_n.any() and of_k_s.any())
+    # Whether the last move was a step of Gauss and Newton's, and whether one has led astray.
+    stepped, astray = whole, False
+    for trial in range(ROUNDS * (2 + whole)):
         whole = whole and trial < ROUNDS
-        if not whole:
-            given, most = (problem, vector, jnp.asarray(held)), min(each, max_steps - steps)
-            solution = optx.least_squares(_residuals, method, vector, given, max_steps=most, throw=False)
-            steps, near = steps + int(solution.stats["num_steps"]), solution.result == optx.RESULTS.successful
-            vector = jnp.where(held, vector, solution.value)
-            vector = jnp.where(bounded & (vector < 0), 0, vector)
+        vector = jnp.where(of_n, jnp.clip(vector, *ends), jnp.where(bounded & (vector < 0), 0, vector))
+        # Turns from here on are those of what was found.
+        problem = problem.at(vector)
+        vector = problem.start()
         residual, columns = (np.asarray(a, np.float64) for a in linearised(problem, vector))
-        if whole:
-            cost = float(residual @ residual)
-            if not cost <= least * (1 + epsilon**0.5):
-                vector, near, whole, held = best, False, False, bounded & np.asarray(best == 0)
-                continue
-            least, best, steps = cost, vector, steps + 1
-        # Gauss and Newton's step under the bounds goes to the minimum, however little that gains.
-        gram, base = columns @ columns.T, np.where(bounded, np.asarray(vector, np.float64), 0.0)
-        gram[np.diag_indices_from(gram)] *= 1 + max(DAMPED, 10 * epsilon)
-        step = nonnegative_minimum(gram, gram @ base - columns @ residual, ~bounded) - base
-        met = step @ gram @ step <= MET**2 * np.mean(residual**2) + residual.size * unseen**2
-        if met or near:
-            vector, before = vector + step, held
-            held = bounded & np.asarray(vector == 0)
-            if converged := bool(met) and np.array_equal(held, before):
-                break
-        if steps >= max_steps:
+        cost = float(residual @ residual)
+        enough = MET**2 * np.mean(residual**2)
+        # At a bend, as where a pixel sees a light set, such a step gains nothing, and what a solver says holds.
+        if converged := bool(astray and near and abs(least - cost) <= enough):
             break
-    # Turns from here on are those of what was found.
-    problem = problem.at(vector)
+        better = cost <= least * (1 + epsilon**0.5)
+        # What a solver leaves below a bound costs more at it, until the rest is fitted again.
+        if better or (cost < np.inf and not stepped):
+            steps += whole
+            if better:
+                least, best = min(cost, least), problem
+            base, step, gain = _step(vector, (residual, columns), bounded)
+            step /= max(1.0, float(np.max(np.abs(step), where=of_n, initial=0.0)) / FARTHEST)
+            met = gain <= enough + residual.size * unseen**2
+            if met and lobes and not np.any(base[of_k_s]):
+                # Of a lobe that is not there n says nothing: it may be that of another one.
+                others = [jnp.where(of_n, log_n, vector) for log_n in np.log(OTHERS)]
+                gains = [_step(one, linearised(problem, one), bounded)[2] for one in others]
+                lobes, met = False, max(gains) <= enough
+                if not met:
+                    vector, near = others[int(np.argmax(gains))], whole
+                    continue
+            if steps >= max_steps and not met:
+                break
+            if met or (near and not astray):
+                before, held, near, stepped = held, bounded & (base + step == 0), whole, True
+                vector = vector + step
+                if converged := bool(met and better) and np.array_equal(held, before):
+                    best = problem.at(vector)
+                    break
+                continue
+        else:
+            vector, problem, whole, near, stepped, astray = best.start(), best, False, False, False, not whole
+            continue
+        # What a solver knows nothing of: a number at its bound stays there but where the cost falls inwards.
+        held = bounded & np.asarray(vector == 0) & (columns @ residual >= 0)
+        given, most = (problem, vector, jnp.asarray(held)), min(each, max_steps - steps)
+        solution = optx.least_squares(_residuals, method, vector, given, max_steps=most, throw=False)
+        steps += int(solution.stats["num_steps"])
+        near, stepped = solution.result == optx.RESULTS.successful, False
+        vector = jnp.where(held, vector, solution.value)
+    problem = best
     vector = np.asarray(problem.start(), np.float64)
+    held = bounded & (vector == 0)
+    residual, columns = (np.asarray(a, np.float64) for a in linearised(problem, problem.start()))
     information = most_likely_numbers(problem, observed, vector)
     if information is not None:
         problem, held = problem.at(jnp.asarray(information.vector)), bounded & (information.vector == 0)
@@ -277,7 +344,8 @@ def _solve(
     parameters, correlation = _parameters(problem, given, information, held)
     errors = [[one.error for one in parameters if one.name == leaf.words] for leaf in problem.freed]
     shapes = [() if leaf.is_direction else problem.leaves[leaf.position].shape for leaf in problem.freed]
-    warnings = () if converged else (f"the solver stopped after {steps} steps without an end: raise max_steps",)
+    remedy = "raise max_steps" if steps >= max_steps else "start nearer, or free fewer numbers"
+    warnings = () if converged else (f"the solver stopped after {steps} steps without an end: {remedy}",)
     return JointResult(
         **observed.result_fields() | {"scenes": scenes},
         material=material,

@@ -148,7 +148,8 @@ class Parameter:
             return "0 (at its bound" + (f"; below {self.interval[1]:.2g} with 95 %)" if self.interval else ")")
         if not self.error:
             return f"{self.value:.6g}"
-        text = f"{_rounded(self.value, self.error)} ± {self.error:.2g} ({_percent(abs(self.error / self.value))})"
+        text = f"{_rounded(self.value, self.error)} ± {self.error:.2g}"
+        text += f" ({_percent(abs(self.error / self.value))})" if self.value else ""
         if self.interval and self.channel is None and self.error > LOPSIDED * self.value:
             text += f", 95 %: {self.interval[0]:.4g} to {self.interval[1]:.4g}"
         return text

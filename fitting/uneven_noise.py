@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from fitting.channel_errors import residuals
 from fitting.codes import all_between
-from fitting.likelihood import residual_deviation
+from fitting.likelihood import Bounds, residual_deviation
 from fitting.model_fit import ModelFit
 from fitting.pixels import Observed, Tile
 from fitting.solver.normal_equations import Picture
@@ -21,7 +21,7 @@ from fitting.solver.streams import each
 # The noise of one picture is this factor of another's, and more than chance would make it by so many deviations.
 UNEVEN, DEVIATIONS = 1.2, 5.0
 # All alike, noisy pictures lead the others astray, whose noise then seems larger: so many rounds.
-ROUNDS = 2
+EVENINGS = 2
 # In codes: less noise before rounding than this is not told from none.
 ROUNDING_HIDES = 0.05
 # Steps of single precision, as a share of the brightest value.
@@ -94,7 +94,7 @@ def noise_of_each(
         least_squares: the fit to these.
     """
     found = _left(pictures, owner, rounding, least_squares(pictures).optimum)
-    for _ in range(0 if found.even else ROUNDS):
+    for _ in range(0 if found.even else EVENINGS):
         now = [
             replace(picture, weight=picture.weights * np.full((len(picture.target), 1), 1 / found.variance[one]))
             for picture, one in zip(pictures, owner, strict=True)
@@ -103,24 +103,54 @@ def noise_of_each(
     return found
 
 
+class Left(NamedTuple):
+    """What predictions leave of some pixels.
+
+    Attributes:
+        counts: which values count.
+        residual: of these, whatever they weigh.
+        predicted: radiance.
+        bounds: of the values; None where they are no codes.
+    """
+
+    counts: Bool[np.ndarray, "P C"]
+    residual: Float[np.ndarray, "P C"]
+    predicted: Float[np.ndarray, "P C"]
+    bounds: Bounds | None
+
+
 def _left(
     pictures: Sequence[Picture], owner: Int[np.ndarray, " T"], rounding: Float[np.ndarray, " C"], optimum: Optimum
 ) -> NoiseOfEach:
-    counted = [np.sum(np.broadcast_to(picture.weights > 0, picture.target.shape), axis=0) for picture in pictures]
-    squares = [np.sum(residuals(picture, optimum) ** 2, axis=0) for picture in pictures]
+    left = []
+    for picture in pictures:
+        counts = np.broadcast_to(picture.weights > 0, picture.target.shape)
+        predicted = np.asarray(picture.predict(optimum.n, optimum.x))
+        left.append(Left(counts, residuals(picture, optimum), predicted, picture.bounds))
+    return noise_left(left, owner, rounding)
+
+
+def noise_left(left: Sequence[Left], owner: Int[np.ndarray, " T"], rounding: Float[np.ndarray, " C"]) -> NoiseOfEach:
+    """What is left of each picture.
+
+    Args:
+        left: of each tile.
+        owner: of which picture it is.
+        rounding: standard deviation of a value's rounding, (C,): no picture has less noise.
+    """
+    counted = [np.sum(one.counts, axis=0) for one in left]
+    squares = [np.sum(one.residual**2, axis=0) for one in left]
     of_picture = np.equal.outer(owner, np.arange(np.max(owner) + 1))
     count = np.transpose(counted) @ of_picture
     variance = np.maximum(np.transpose(squares) @ of_picture / np.maximum(count, 1), rounding[:, None] ** 2)
     cost = float(np.sum(count * np.log(variance)))
     variance = np.mean(variance / np.mean(variance, axis=1, keepdims=True), axis=0)
     spread, kinds = np.sqrt(variance), {()}
-    for one in range(variance.size) if all(picture.bounds for picture in pictures) else ():
-        own = [picture for picture, of in zip(pictures, owner, strict=True) if of == one]
-        bounds = [picture.bounds for picture in own if picture.bounds is not None]
+    for one in range(variance.size) if all(some.bounds for some in left) else ():
+        own = [some for some, of in zip(left, owner, strict=True) if of == one]
+        bounds = [some.bounds for some in own if some.bounds is not None]
         kinds |= {(*np.ravel(some.scale / some.unit), some.encoding) for some in bounds}
-        codes = [
-            some.codes(picture.predict(optimum.n, optimum.x))[0] for some, picture in zip(bounds, own, strict=True)
-        ]
+        codes = [some.codes(part.predicted)[0] for some, part in zip(bounds, own, strict=True)]
         step = float(np.mean(np.concatenate([np.zeros(1), *(some.widths for some in bounds)])))
         noise = residual_deviation(bounds, codes) ** 2 - step**2 / 12
         spread[one] = math.sqrt(max(noise, (ROUNDING_HIDES * step) ** 2))

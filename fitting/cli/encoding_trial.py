@@ -44,7 +44,7 @@ def fit_either(read: Callable[..., FitInputs], say: Callable[[str], None], **how
         say(what)
         return _fit(inputs, how), inputs
     path, assumed = next(iter(inputs.silent.items()))
-    if how["seconds"] is not None:
+    if how["seconds"] is not None and how["seconds"] > 0:  # or the fit says what is wrong with it
         how["seconds"] /= 2
     say(f"{what} as {NAMES[assumed]}")
     result = _fit(inputs, how)

@@ -288,3 +288,45 @@ def test_where_one_channel_is_clipped_the_others_tell_the_light_and_the_highligh
         for parameter, value in zip(result[name], getattr(material, name), strict=True):
             assert abs(float(parameter) - value) < 4 * np.array(parameter.error), parameter
     assert abs(float(result["n"]) - 60) < 4 * np.array(result["n"].error) < 4
+
+
+@pytest.mark.parametrize("off", [-75, -45, 10, 45, 84])
+def test_a_light_is_found_from_wherever_it_was_thought_and_its_error_does_not_know_from_where(off):
+    across = np.cross(TRUE_DIRECTION, [0.0, 1.0, 0.0])
+    across /= np.linalg.norm(across)
+    turned = TRUE_DIRECTION * np.cos(np.radians(off)) + across * np.sin(np.radians(off))
+    true, thought = (
+        brdf.Scene(camera=CAMERA, shapes=[BALL], lights=[brdf.DirectionalLight(direction=one, intensity=[1.0])])
+        for one in (TRUE_DIRECTION, turned)
+    )
+    shiny = brdf.BlinnPhong(k_d=[0.5, 0.3, 0.2], k_s=[0.3, 0.3, 0.3], n=30)
+    clean = np.asarray(brdf.render(shiny, true, precision="float64"))
+    picture = clean + 0.01 * np.random.default_rng(0).standard_normal(clean.shape)
+    result = fitting.fit_jointly(picture, thought, "blinn-phong", "light")
+    best = fitting.fit_jointly(picture, true, "blinn-phong", "light")
+    assert result.converged
+    assert angle(result.scenes[0].lights[0].direction, best.scenes[0].lights[0].direction) < 1e-3
+    assert result["lights[0].direction"].error == pytest.approx(best["lights[0].direction"].error, rel=1e-3)
+    assert "±" in str(result)
+
+
+@pytest.mark.parametrize("n", [0.3, 5.0, 500.0, 5000.0])
+def test_an_exponent_is_found_from_far_away(target: np.ndarray, n: float):
+    start = brdf.BlinnPhong(k_a=MATERIAL.k_a, k_d=[0.4, 0.4, 0.4], k_s=[0.1, 0.1, 0.1], n=n)
+    known = scene(TRUE_DIRECTION, [1.0, 0.9, 0.8])
+    result = fitting.fit_jointly(target, known, start, lambda m, _: (m.k_d, m.k_s, m.n))
+    np.testing.assert_allclose(result.material.n, 25, rtol=1e-6)
+
+
+def test_pictures_count_by_their_own_noise_as_in_a_fit():
+    directions = [0.6, 0.3, 0.7], [-0.5, 0.4, 0.6]
+    scenes = [brdf.Scene(CAMERA, [BALL], lights=[brdf.DirectionalLight(one, [1.0])]) for one in directions]
+    random, grey = np.random.default_rng(0), brdf.BlinnPhong(k_d=[0.5], k_s=[0.3], n=30)
+    pictures = [
+        np.asarray(brdf.render(grey, one, precision="float64")) + noise * random.standard_normal((40, 40, 1))
+        for one, noise in zip(scenes, (0.002, 0.05), strict=True)
+    ]
+    alone = fitting.fit(pictures, scenes, model="blinn-phong", precision="float64")
+    result = fitting.fit_jointly(pictures, scenes, "blinn-phong")
+    np.testing.assert_allclose(result.material.n, alone.material.n, rtol=1e-4)
+    assert result["n"].error == pytest.approx(alone["n"].error, rel=0.05)
