@@ -18,7 +18,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -251,9 +251,25 @@ def _step(
     return base, step, float(step @ gram @ step)
 
 
-def _solve(
-    problem: JointProblem, observed: Observed, solver: str | None, tolerance: float, max_steps: int
-) -> JointResult:
+class _Minimum(NamedTuple):
+    """Where a search ended: the problem there, after how many steps, whether it converged, and by which solver."""
+
+    problem: JointProblem
+    steps: int
+    converged: bool
+    solver: str
+
+
+def _minimum(problem: JointProblem, brightest: float, solver: str | None, tolerance: float, max_steps: int) -> _Minimum:
+    """The least sum of squares that is found from a start; never more than there.
+
+    Args:
+        problem: what is freed, where it starts, and the pictures.
+        brightest: largest value of these.
+        solver: see `fit_jointly`.
+        tolerance: likewise.
+        max_steps: likewise.
+    """
     vector = problem.start()
     # Gauss and Newton's steps lead to the minimum from most starts, and compile half as much as a solver.
     whole = solver is None or all(leaf.name in EMITTANCES for leaf in problem.freed)
@@ -261,7 +277,7 @@ def _solve(
     solver = solver or ("lm" if jacobian <= LARGEST_JACOBIAN else "bfgs")
     epsilon = float(jnp.finfo(vector.dtype).eps)
     # Of a smaller step rounding hides what it gains.
-    close, unseen = max(tolerance, epsilon**0.5), max(tolerance, epsilon) * float(np.max(observed.brightest))
+    close, unseen = max(tolerance, epsilon**0.5), max(tolerance, epsilon) * brightest
     method = SOLVERS[solver](rtol=close, atol=close)
     # Steps that rounding hides the gains of are tried for ever: it is asked several times.
     each = max(FEWEST_STEPS, -(-max_steps // ROUNDS)) if solver == "lm" else max_steps
@@ -320,7 +336,14 @@ def _solve(
         steps += int(solution.stats["num_steps"])
         near, stepped = solution.result == optx.RESULTS.successful, False
         vector = jnp.where(held, vector, solution.value)
-    problem = best
+    return _Minimum(best, steps, converged, "gauss-newton" if whole else solver)
+
+
+def _solve(
+    problem: JointProblem, observed: Observed, solver: str | None, tolerance: float, max_steps: int
+) -> JointResult:
+    found = _minimum(problem, float(np.max(observed.brightest)), solver, tolerance, max_steps)
+    problem, bounded = found.problem, problem.each(lambda leaf: leaf.bounded)
     vector = np.asarray(problem.start(), np.float64)
     held = bounded & (vector == 0)
     residual, columns = (np.asarray(a, np.float64) for a in linearised(problem, problem.start()))
@@ -344,8 +367,8 @@ def _solve(
     parameters, correlation = _parameters(problem, given, information, held)
     errors = [[one.error for one in parameters if one.name == leaf.words] for leaf in problem.freed]
     shapes = [() if leaf.is_direction else problem.leaves[leaf.position].shape for leaf in problem.freed]
-    remedy = "raise max_steps" if steps >= max_steps else "start nearer, or free fewer numbers"
-    warnings = () if converged else (f"the solver stopped after {steps} steps without an end: {remedy}",)
+    remedy = "raise max_steps" if found.steps >= max_steps else "start nearer, or free fewer numbers"
+    warnings = () if found.converged else (f"the solver stopped after {found.steps} steps without an end: {remedy}",)
     return JointResult(
         **observed.result_fields() | {"scenes": scenes},
         material=material,
@@ -358,9 +381,9 @@ def _solve(
         warnings=(*warnings, *structure_warning(neighbours)),
         values=tuple(np.asarray(problem.leaves[leaf.position]) for leaf in problem.freed),
         errors=tuple(np.array(own, float).reshape(shape) for own, shape in zip(errors, shapes, strict=True)),
-        steps=steps,
-        converged=converged,
-        solver="gauss-newton" if whole else solver,
+        steps=found.steps,
+        converged=found.converged,
+        solver=found.solver,
     )
 
 
