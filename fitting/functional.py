@@ -192,8 +192,7 @@ def fit(
     points = scene.sight()
     seen = jnp.ravel(points.mask)
     weight = seen if weight is None else seen * jnp.ravel(jnp.asarray(weight))
-    scale = model.scale if issubclass(model, SpecularMaterial) else None
-    solution = fit_basis(target, basis(model, scene, points=points), weight, scene.ambient, n_range, scale)
+    solution = fit_basis(model, target, basis(model, scene, points=points), weight, scene.ambient, n_range)
     k: dict[str, Any] = {"k_a": solution.k_a, "k_d": solution.k_d}
     if issubclass(model, SpecularMaterial):
         k |= {"k_s": solution.k_s / model.scale(solution.n), "n": solution.n}
@@ -202,23 +201,24 @@ def fit(
 
 @eqx.filter_jit
 def fit_basis(
+    model: type[brdf.Material],
     target: Array,
     images: Basis,
     weight: Array,
     ambient: Array | None,
     n_range: tuple[float, float],
-    scale: Callable[[Array], Any] | None = None,
 ) -> Solution:
     """What `fit` does once the basis images of a scene are known.
 
     Args:
+        model: the class of the material.
         target: (..., C), as many pixels as there are.
         images: of the scene.
         weight: of each pixel, (P,).
         ambient: intensity of the ambient light, or None.
         n_range: bounds of the exponent.
-        scale: of the lobe, see `solve`.
     """
+    scale = model.scale if issubclass(model, SpecularMaterial) else None
     diffuse = jnp.zeros((weight.size, 1), target.dtype) if images.diffuse is None else images.diffuse
     lobe, peak = images.lobe, jnp.zeros(())
     if lobe is not None:
@@ -239,7 +239,7 @@ def solve(
     weight: Float[ArrayLike, " P"] | None = None,
     n_range: tuple[float, float] = (0.1, 1e6),
     peak: Float[ArrayLike, ""] = 0.0,
-    scale: Callable[[Float[Array, ""]], Float[Array, ""]] | None = None,
+    scale: Callable[..., Any] | None = None,
 ) -> Solution:
     """The optimum of ``target ~ k_a ambient + k_d diffuse + k_s lobe(n)``, all k at least 0.
 

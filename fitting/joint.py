@@ -60,7 +60,7 @@ DAMPED = 1e-9
 # A lobe is not linear in log n beyond.
 FARTHEST = 1.0
 # Of a lobe that went to nothing other exponents are tried once.
-OTHERS = (1.0, 4.0, 16.0, 64.0, 256.0, 1024.0)
+RESTARTS = (1.0, 4.0, 16.0, 64.0, 256.0, 1024.0)
 # A minimum is met where no more than this part of their errors parts the numbers from it.
 MET = 0.1
 
@@ -163,12 +163,12 @@ def fit_jointly(
         ) -> JointResult:
             problem = joint_problem(brdf.cast((start, list(scenes)), precision), free)
             moves = any("camera." in leaf.words or "shapes[" in leaf.words for leaf in problem.freed)
-            observed = _away_from_outlines(whole, scenes) if moves else whole
-            observed = evened(observed, noises[-1]) if noises else observed
+            plain = _away_from_outlines(whole, scenes) if moves else whole
+            observed = evened(plain, noises[-1]) if noises else plain
             pictures = [(tile.target, tile.weight) for tile in observed.tiles]
             result = _solve(dataclasses.replace(problem, pictures=pictures), observed, solver, tolerance, max_steps)
             if len(observed.tiles) > 1 and len(noises) < EVENINGS:
-                noise = _noise_of_each(result, observed)
+                noise = _noise_of_each(result, plain)
                 if not noise.even:
                     return solve(result.material, result.scenes, rounds, *noises, noise)
             if rounds > 1 and moves and not _inside(result.scenes, observed.counted):
@@ -302,32 +302,31 @@ def _minimum(problem: JointProblem, brightest: float, solver: str | None, tolera
             break
         better = cost <= least * (1 + epsilon**0.5)
         # What a solver leaves below a bound costs more at it, until the rest is fitted again.
-        if better or (cost < np.inf and not stepped):
-            steps += whole
-            if better:
-                least, best = min(cost, least), problem
-            base, step, gain = _step(vector, (residual, columns), bounded)
-            step /= max(1.0, float(np.max(np.abs(step), where=of_n, initial=0.0)) / FARTHEST)
-            met = gain <= enough + residual.size * unseen**2
-            if met and lobes and not np.any(base[of_k_s]):
-                # Of a lobe that is not there n says nothing: it may be that of another one.
-                others = [jnp.where(of_n, log_n, vector) for log_n in np.log(OTHERS)]
-                gains = [_step(one, linearised(problem, one), bounded)[2] for one in others]
-                lobes, met = False, max(gains) <= enough
-                if not met:
-                    vector, near = others[int(np.argmax(gains))], whole
-                    continue
-            if steps >= max_steps and not met:
-                break
-            if met or (near and not astray):
-                before, held, near, stepped = held, bounded & (base + step == 0), whole, True
-                vector = vector + step
-                if converged := bool(met and better) and np.array_equal(held, before):
-                    best = problem.at(vector)
-                    break
-                continue
-        else:
+        if not (better or (cost < np.inf and not stepped)):
             vector, problem, whole, near, stepped, astray = best.start(), best, False, False, False, not whole
+            continue
+        steps += whole
+        if better:
+            least, best = min(cost, least), problem
+        base, step, gain = _step(vector, (residual, columns), bounded)
+        step /= max(1.0, float(np.max(np.abs(step), where=of_n, initial=0.0)) / FARTHEST)
+        met = gain <= enough + residual.size * unseen**2
+        if met and lobes and not np.any(base[of_k_s]):
+            # Of a lobe that is not there n says nothing: it may be that of another one.
+            starts = [jnp.where(of_n, log_n, vector) for log_n in np.log(RESTARTS)]
+            gains = [_step(one, linearised(problem, one), bounded)[2] for one in starts]
+            lobes, met = False, max(gains) <= enough
+            if not met:
+                vector, near = starts[int(np.argmax(gains))], whole
+                continue
+        if steps >= max_steps and not met:
+            break
+        if met or (near and not astray):
+            before, held, near, stepped = held, bounded & (base + step == 0), whole, True
+            vector = vector + step
+            if converged := bool(met and better) and np.array_equal(held, before):
+                best = problem.at(vector)
+                break
             continue
         # What a solver knows nothing of: a number at its bound stays there but where the cost falls inwards.
         held = bounded & np.asarray(vector == 0) & (columns @ residual >= 0)

@@ -12,7 +12,7 @@ import dataclasses
 import functools
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -25,7 +25,6 @@ from jaxtyping import Array, Bool, Float
 
 import brdf
 from brdf.errors import InputError
-from brdf.models.base import SpecularMaterial
 from brdf.precision import Precision, working_precision
 from brdf.rendering import Basis, basis
 from fitting import functional
@@ -226,7 +225,6 @@ def _fit_together(problem: FitProblem) -> tuple[Bool[np.ndarray, " N"], dict[str
         weight = seen.reshape(count, -1).astype(targets.dtype)
         pictures = {"target": targets, "images": _bases(model, stack), "weight": weight, "ambient": stack.ambient}
         shared = {}
-    scale = model.scale if issubclass(model, SpecularMaterial) else None
     lanes, cores = device_count(), core_count()
     # Equal parts, or each size would be compiled.
     lanes = cores if lanes == 1 and count % (cores * BATCH) == 0 else min(lanes, count)
@@ -235,7 +233,7 @@ def _fit_together(problem: FitProblem) -> tuple[Bool[np.ndarray, " N"], dict[str
 
     def solve(part: Any) -> Float[np.ndarray, "N K"]:
         with working_precision(problem.precision):  # each thread has its own
-            return np.asarray(_solved(*part, problem.n_range, scale), np.float64)
+            return np.asarray(_solved(model, *part, problem.n_range), np.float64)
 
     rows = {}
     with ThreadPoolExecutor(len(mine) or 1) as pool:
@@ -270,24 +268,24 @@ def _bases(model: type[brdf.Material], scenes: brdf.Scene) -> Basis:
     return jax.lax.map(functools.partial(basis, model), scenes)
 
 
-@functools.partial(jax.jit, static_argnums=(2, 3), compiler_options=COMPILER_OPTIONS)
+@functools.partial(jax.jit, static_argnums=(0, 3), compiler_options=COMPILER_OPTIONS)
 def _solved(
-    pictures: dict[str, Any], shared: dict[str, Any], n_range: tuple[float, float], scale: Callable[[Array], Any] | None
+    model: type[brdf.Material], pictures: dict[str, Any], shared: dict[str, Any], n_range: tuple[float, float]
 ) -> Float[Array, "N K"]:
     """The numbers of the solution of each picture, and the sum of its squares.
 
     Args:
+        model: the class of the material.
         pictures: what `fitting.functional.fit_basis` takes, of each picture.
         shared: what of that is the same for all.
         n_range: bounds of the exponent.
-        scale: of the lobe.
     """
 
     def fit(picture: dict[str, Any]) -> Array:
         given = picture | shared
         counts = given["weight"][:, None] > 0
         values = jnp.where(counts, given["target"].reshape(len(counts), -1), 0)
-        return ravel_pytree((functional.fit_basis(**given, n_range=n_range, scale=scale), jnp.sum(values * values)))[0]
+        return ravel_pytree((functional.fit_basis(model, **given, n_range=n_range), jnp.sum(values * values)))[0]
 
     return jax.lax.map(fit, pictures, batch_size=BATCH)
 

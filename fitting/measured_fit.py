@@ -30,7 +30,6 @@ from brdf.lobes import Lobe
 from brdf.materials.material_file import material_to_dict
 from brdf.models.base import SpecularMaterial
 from fitting.joint_problem import degrees_between
-from fitting.light_colour import scale_growth
 from fitting.model_fit import N_RANGE, ModelFit
 from fitting.problem import check_choice, model_name
 from fitting.progress import waiting
@@ -411,8 +410,7 @@ def _fit_model(model, samples, loss, n_range):
     fit = ModelFit(model, [], optimum, free, n_range)
     # A lobe that hardly reaches a sample needs a k_s whose square is out of range; it is found to be undetermined.
     with np.errstate(over="ignore", invalid="ignore"):
-        growth = scale_growth(fit.model, fit.optimum.n)
-        errors = uncertainty(fit, free, noise, brightest, visible, spread=spread, growth=growth, channels=left.T @ left)
+        errors = uncertainty(fit, free, noise, brightest, visible, spread=spread, channels=left.T @ left)
     interval = None
     if specular and not errors.n_reason:
         interval = exponent_interval(fit, errors.n_error, errors.reach, errors.delta_cost, 0.0, parabolic=True)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from fitting.light_colour import scale_growth
 from fitting.model_fit import ModelFit
 from fitting.sample_error import SampleError
 from fitting.solver.nnls import scaled_inverse
@@ -117,7 +118,6 @@ def uncertainty(
     scatter: Float[np.ndarray, "U U"] | None = None,
     channels: Float[np.ndarray, "C C"] | None = None,
     columns: Float[np.ndarray, "3 C"] | None = None,
-    growth: float = 0.0,
     gain: float = 0.0,
     resolution: float = 0.0,
     missed: SampleError | None = None,
@@ -137,7 +137,6 @@ def uncertainty(
         scatter: what takes the place of the Hessian times the noise, over all unknowns, where pixels err together.
         channels: correlation of the channels' errors; None where they err alone.
         columns: root mean square over pixels of what each term shows at 1; None where no pixel weighs more.
-        growth: by how much k_s is less than x_s when n is more, relative: see `fitting.light_colour.scale_growth`.
         resolution: relative error of a number that is left by the arithmetic of the basis images.
         gain: see `specular_gain`, where more pixels tell of it than those of the optimum's sums.
         missed: what light samples leave out; None where there are none.
@@ -203,7 +202,7 @@ def uncertainty(
     covariance = covariance + offs.T @ offs
     # From here on x_s is k_s times the scale at the optimum, whatever n is.
     held = np.eye(size)
-    held[2 * noise.size : -1, -1] = -growth * x[2]
+    held[2 * noise.size : -1, -1] = -scale_growth(fit.model, optimum.n) * x[2]
     covariance = held @ covariance @ held.T
     variance = np.maximum(np.diag(covariance), 0.0)
     # What errs together makes errors larger, but not the numbers less determined.

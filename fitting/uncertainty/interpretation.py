@@ -10,7 +10,7 @@ import brdf
 from brdf.channels import channel_names
 from brdf.models.base import SpecularMaterial
 from fitting.channel_errors import residuals
-from fitting.light_colour import coefficient_factors, scale_growth
+from fitting.light_colour import coefficient_factors
 from fitting.model_fit import N_RANGE, Evidence, ModelFit
 from fitting.pixels import Observed
 from fitting.result import HELD_PLAUSIBLE, FitResult, Parameter
@@ -133,7 +133,6 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: R
         spread=spread,
         scatter=shared,
         columns=columns,
-        growth=scale_growth(fit.model, optimum.n),
         channels=channels,
         gain=gain,
         missed=sampled,

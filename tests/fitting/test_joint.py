@@ -318,7 +318,8 @@ def test_an_exponent_is_found_from_far_away(target: np.ndarray, n: float):
     np.testing.assert_allclose(result.material.n, 25, rtol=1e-6)
 
 
-def test_pictures_count_by_their_own_noise_as_in_a_fit():
+@pytest.mark.parametrize("codes", [False, True])
+def test_pictures_count_by_their_own_noise_as_in_a_fit(codes: bool):
     directions = [0.6, 0.3, 0.7], [-0.5, 0.4, 0.6]
     scenes = [brdf.Scene(CAMERA, [BALL], lights=[brdf.DirectionalLight(one, [1.0])]) for one in directions]
     random, grey = np.random.default_rng(0), brdf.BlinnPhong(k_d=[0.5], k_s=[0.3], n=30)
@@ -326,7 +327,9 @@ def test_pictures_count_by_their_own_noise_as_in_a_fit():
         np.asarray(brdf.render(grey, one, precision="float64")) + noise * random.standard_normal((40, 40, 1))
         for one, noise in zip(scenes, (0.002, 0.05), strict=True)
     ]
-    alone = fitting.fit(pictures, scenes, model="blinn-phong", precision="float64")
-    result = fitting.fit_jointly(pictures, scenes, "blinn-phong")
+    if codes:
+        pictures = [np.clip(np.round(255 * one), 0, 255).astype(np.uint8) for one in pictures]
+    alone = fitting.fit(pictures, scenes, model="blinn-phong", precision="float64", encoding="linear")
+    result = fitting.fit_jointly(pictures, scenes, "blinn-phong", encoding="linear")
     np.testing.assert_allclose(result.material.n, alone.material.n, rtol=1e-4)
     assert result["n"].error == pytest.approx(alone["n"].error, rel=0.05)
