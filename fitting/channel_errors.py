@@ -48,12 +48,7 @@ class Coupled(NamedTuple):
     score: Float[np.ndarray, "C 4"]
 
     def joined(self, x: Float[np.ndarray, "3 C"], by: float = 1.0) -> NormalEquations:
-        """Normal equations in x_a, x_d, x_s, channel after channel, and log n; about 0.
-
-        Args:
-            x: coefficients, at which the residual was taken.
-            by: what the last unknown is times log n.
-        """
+        """Normal equations about 0 in x_a, x_d, x_s, channel after channel, and ``by`` times log n, taken at ``x``."""
         whole, score, _ = join_channels(self.gram, self.score, np.zeros(1), x[2] / by)
         return NormalEquations(whole, score + whole @ np.append(x.ravel(), 0.0), 0.0)
 
@@ -65,12 +60,7 @@ def can_be_coupled(pictures: Sequence[Picture]) -> bool:
 
 
 def residuals(picture: Picture, optimum: Optimum) -> Float[np.ndarray, "P C"]:
-    """What a fit leaves, times the root of the weight.
-
-    Args:
-        picture: with working targets.
-        optimum: of the fit.
-    """
+    """What a fit leaves of working targets, times the root of the weight."""
     weight = np.asarray(picture.weights, np.float64)
     left = np.asarray(picture.target, np.float64) - picture.predict(optimum.n, optimum.x)
     return np.where(weight > 0, left, 0.0) * np.sqrt(weight)
@@ -81,11 +71,8 @@ def precision_of(
 ) -> Float[np.ndarray, "C C"]:
     """W: the inverse of the covariance of the channels' errors, of a pixel whose neighbours err alike.
 
-    Args:
-        left: residuals of each picture, in codes.
-        places: index of the pixels in their picture, and its width.
-        count: of pixels.
-        rounding: variance that each value has at least.
+    Residuals are in codes, ``places`` the index of the pixels in their picture and its width; each value has at least
+    the variance ``rounding``.
     """
     small, large = (rounding * np.eye(left[0].shape[1]) for _ in range(2))
     for values, (pixel, width) in zip(left, places, strict=True):
@@ -101,13 +88,9 @@ def precision_of(
 def coupled(
     pictures: Sequence[Picture], precision: Float[np.ndarray, "C C"], x: Float[np.ndarray, "3 C"], log_n: np.ndarray
 ) -> list[Coupled]:
-    """One pass: what the pixels say at each of some exponents.
+    """One pass: what pixels with working targets say at some exponents, residuals being those of ``x``.
 
-    Args:
-        pictures: with working targets and weights, the noise of each value being that of its picture.
-        precision: W.
-        x: coefficients, about which residuals are taken.
-        log_n: logarithms of the exponents.
+    The noise of each value is that of its picture.
     """
     channels = len(precision)
     one, other = np.divmod(np.arange(channels**2), channels)
@@ -138,15 +121,7 @@ def _paired(picture: Picture, one: np.ndarray, other: np.ndarray) -> Picture:
 def improved(
     pictures: Sequence[Picture], precision: Float[np.ndarray, "C C"], optimum: Optimum, fit: ModelFit, *, anew: bool
 ) -> Optimum:
-    """The optimum nearer to where the channels together put it.
-
-    Args:
-        pictures: with working targets.
-        precision: W.
-        optimum: so far.
-        fit: what is free, and between which exponents.
-        anew: look among all exponents; else a Gauss-Newton step from the last.
-    """
+    """The optimum nearer to where the channels together put it: anew among all exponents, or a Gauss-Newton step."""
     design, x, log_n = design_of(fit.free, fit.tied), optimum.x, np.array([math.log(optimum.n)])
     anew = anew and bool(fit.free[2].any())
     if anew:
@@ -171,14 +146,7 @@ def improved(
 
 
 def replaced(optimum: Optimum, parts: Coupled, x: Float[np.ndarray, "3 C"], n: float) -> Optimum:
-    """An optimum with the sums of each channel for itself; each of its values has the noise 1.
-
-    Args:
-        optimum: whose profile and pixels stay.
-        parts: the sums.
-        x: coefficients.
-        n: exponent.
-    """
+    """An optimum with the sums of each channel for itself, all else as it was; each value has the noise 1."""
     scale = np.array([1.0, 1.0, 1.0, 1 / n])
     gram = np.einsum("ccij->cij", parts.gram) * np.outer(scale, scale)
     product = parts.score * scale + (gram[..., :3] @ x.T[..., None])[..., 0]
@@ -190,11 +158,7 @@ def each_alone(
 ) -> Picture:
     """Targets and weights whose score, channel by channel, is that of all channels together.
 
-    Args:
-        picture: with targets of its own.
-        left: its residuals, times the root of the weight.
-        precision: W.
-        optimum: of the fit.
+    ``left`` are the picture's residuals times the root of the weight.
     """
     weight = np.broadcast_to(np.asarray(picture.weights, np.float64), left.shape)
     own = weight * np.diag(precision)

@@ -91,11 +91,7 @@ class Codes(NamedTuple):
         return float(np.median(np.subtract(*ends) * unit)) if some.any() else 0.0
 
     def middle(self, pixels: Float[np.ndarray, "H W C"]) -> Float[np.ndarray, "H W C"]:
-        """Linear values where they most likely lay: those of a writer that truncated half a step above their codes.
-
-        Args:
-            pixels: as the codes say.
-        """
+        """Linear values where they most likely lay: those of a writer that truncated half a step above their codes."""
         if np.ndim(self.below) or self.below > 0:
             return pixels
         inside = (self.values > self.ends[0]) & (self.values < self.ends[1])
@@ -105,13 +101,10 @@ class Codes(NamedTuple):
     def bounds(
         self, rows: slice, valid: Bool[np.ndarray, " P"], level: float | None, spread: np.ndarray | float
     ) -> Bounds:
-        """Between which codes the values of some rows lay.
+        """Between which codes the values of some rows lay; those of pixels that are not valid may have lain anywhere.
 
-        Args:
-            rows: of the picture.
-            valid: pixels that say something; others may have lain anywhere.
-            level: radiance from which on values are clipped; None for the largest code.
-            spread: noise of each pixel over that of the picture, a number or (P, 1).
+        From the radiance ``level`` on, or the largest code, values are clipped; ``spread`` is the noise of each pixel
+        over that of the picture, a number or (P, 1).
         """
         channels = self.values.shape[2]
 
@@ -190,13 +183,8 @@ def open_ends(
 ) -> Bounds | None:
     """Which values of a float picture say no more than that they were below or above; None where none does.
 
-    Args:
-        values: linear.
-        valid: pixels that say something.
-        floor: the least value of the picture: noise was cut off there where several values share it.
-        level: radiance from which on values are clipped; None where none are.
-        spread: noise of each pixel over that of the picture, a number or (P, 1).
-        width: of the picture.
+    At ``floor``, the picture's least value, noise was cut off where several values share it; the rest is that of
+    `Codes.bounds`.
     """
     low, high = values <= floor, level is not None and values >= level
     if np.count_nonzero(low) < _FEWEST_ENDS and not np.any(high):
@@ -217,14 +205,8 @@ def all_between(
 ) -> Bounds:
     """Bounds of all pixels, row by row, in the precision of the fit.
 
-    Args:
-        lower: ends in codes.
-        upper: likewise.
-        width: of the picture.
-        spread: noise of each pixel over that of the picture, a number or (P, 1).
-        scale: codes where the encoding is 1.
-        unit: radiance where the encoding is 1, a number or (C,).
-        how: the other attributes of `fitting.likelihood.Bounds`.
+    Ends are in codes, of which ``scale`` are where the encoding is 1, and the radiance ``unit``, a number or (C,);
+    ``how`` are other attributes of `fitting.likelihood.Bounds`.
     """
     lower, upper = (end.astype(jnp.result_type(float), copy=False) for end in (lower, upper))
     scale, unit, spread = (np.asarray(part, np.float64) for part in (scale, unit, spread))
@@ -236,10 +218,7 @@ def single_values_at_end(
 ) -> Bool[AnyArray, ""]:
     """Whether single pixels stand at the lower end among larger ones: what is dark without noise is so in one piece.
 
-    Args:
-        value: of one channel, on the host or traced.
-        counted: which pixels count.
-        least: value of the picture.
+    Of one channel, on the host or traced; ``least`` is the value of the picture.
     """
     at_end, above = counted & (value <= least), counted & (value > least)
     single = above[:, :-2] & at_end[:, 1:-1] & above[:, 2:]

@@ -230,11 +230,8 @@ def maximise(
 ) -> tuple[Estimate, list[Precision], Score]:
     """The most likely unknowns and noise, what was known of the unknowns with more noise, and what the values say.
 
-    Args:
-        problem: values and their model.
-        start: from which to go; its noise is not much too small.
-        enough: the noise is known well enough where its step is no larger than this factor.
-        least: noise of which fewer values than this tell of a number is not gone below.
+    The noise of the start is not much too small. It is known well enough where its step is no larger than the factor
+    ``enough``; that of which fewer values than ``least`` tell of a number is not gone below.
     """
     at, precisions, before, low, high = start, [], None, -math.inf, math.inf
     while True:
@@ -324,12 +321,9 @@ def precision(problem: Problem, at: Estimate, score: Score) -> Precision:
 
 
 def most_informative(precisions: Sequence[Precision]) -> Precision:
-    """Where the values say most of all unknowns together, and enough of them of each.
+    """Where, from much noise to little, the values say most of all unknowns together, and enough of them of each.
 
     With less noise all pixels of a small highlight may lie well inside their codes, and the Hessian there says nothing.
-
-    Args:
-        precisions: from much noise to little.
     """
     enough = [
         entry for entry in precisions[1:] if np.all((entry.values >= FEWEST_VALUES) | (precisions[0].variance == 0))
@@ -347,23 +341,16 @@ def _variances(precisions: Sequence[Precision]) -> Float[np.ndarray, "N U"]:
 
 
 def least_variance(precisions: Sequence[Precision]) -> Float[np.ndarray, " U"]:
-    """Variance of each unknown where it is known best by enough values; infinite where it is not known at all.
-
-    Args:
-        precisions: from much noise to little.
-    """
+    """Variance of each unknown where it is known best by enough values; infinite where it is not known at all."""
     return np.min(_variances(precisions), axis=0)
 
 
 def most_informative_score(
     at: Estimate, rounds: Sequence[tuple[Problem, list[Precision]]]
 ) -> tuple[Score, Float[np.ndarray, " U"]]:
-    """What the values say of an estimate at the noise of which errors are, and what to multiply these by.
+    """What the values say of the most likely unknowns at the noise of which errors are, and what to multiply these by.
 
-    Args:
-        at: the most likely unknowns.
-        rounds: values and their model, and what was known of the unknowns on the way; several where the noise of one
-            picture beside another's was found in between.
+    The rounds are several where the noise of one picture beside another's was found in between.
     """
     precisions = [entry for _, some in rounds for entry in some]
     problems = [problem for problem, some in rounds for _ in some]

@@ -67,14 +67,7 @@ ROUNDING = 1e-12
 
 
 def fit_pictures(problem: FitProblem) -> FitResult:
-    """Fit a material: the global optimum over all pixels that count.
-
-    Args:
-        problem: the pictures and how to fit them.
-
-    Raises:
-        InputError: where nothing is left to fit.
-    """
+    """Fit a material: the global optimum over all pixels that count; refused where nothing is left to fit."""
     # Over the largest of them all, so that single precision holds them.
     largest = max((float(np.max(weight)) for weight in problem.weights if weight is not None), default=1.0)
     weights = [None if weight is None else weight / largest for weight in problem.weights]
@@ -110,13 +103,7 @@ def fit_pictures(problem: FitProblem) -> FitResult:
 
 
 def picture_of(model: type[brdf.Material], tile: Tile, near: Near | None = None) -> Picture:
-    """A tile as the solver takes it.
-
-    Args:
-        model: whose basis images it has.
-        tile: of a picture.
-        near: see `brdf.rendering.basis`.
-    """
+    """A tile as the solver takes it; ``near`` is that of `brdf.rendering.basis`."""
     ambient = np.zeros(1) if tile.scene.ambient is None else np.asarray(tile.scene.ambient, np.float64)
     # What a file's largest code stands for has no weight, but a say.
     counts = None if tile.weight is None or tile.bounds is not None else np.asarray(tile.weight) > 0
@@ -365,11 +352,8 @@ def _coloured(fit: ModelFit, observed: Observed) -> bool:
 def _likely_sums(fits: Mapping[str, ModelFit]) -> dict[str, NormalEquations]:
     """Sums whose cost is minus twice the logarithm of the likelihood, beside that of the likeliest, and so above 0.
 
-    Of a fit whose likelihood was not asked for, those of least squares over the noise of the best; nothing where least
-    squares is the whole answer for that.
-
-    Args:
-        fits: the best by least squares first.
+    Of fits, the best by least squares first. Of one whose likelihood was not asked for, those of least squares over the
+    noise of the best; nothing where least squares is the whole answer for that.
     """
     best, found = next(iter(fits.values())), {}
     if best.evidence is None:
@@ -429,11 +413,6 @@ def _explains_structure(fit: ModelFit, observed: Observed, after: Residual | Non
     rounding: normals that are a little off would do as well. Where the scene is not what it is said to be, or a codec
     has smoothed, a highlight however significant mends some of that: in trials up to a third of it, where true
     highlights of 1 % explained more.
-
-    Args:
-        fit: with the highlight.
-        observed: what was fitted.
-        after: what it leaves, where that has been gone over.
     """
     optimum = fit.optimum
     if highlight_in_codes(fit.pictures, optimum) < HIDDEN:

@@ -80,11 +80,7 @@ class _Test(NamedTuple):
 
 
 def diagnose(result: FitResult) -> tuple[Cause, ...]:
-    """Causes of the structure in a residual, likeliest first; none where none explains a good part of it.
-
-    Args:
-        result: of a fit.
-    """
+    """Causes of the structure in a residual, likeliest first; none where none explains a good part of it."""
     with working_precision("float64"):
         residual = Residual(result)
         if residual.rounded and not any("structure" in words for words in result.warnings):

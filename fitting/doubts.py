@@ -29,15 +29,7 @@ FEW = 64
 def doubts(
     fit: ModelFit, material: brdf.Material, observed: Observed, refit: Callable[..., ModelFit], *, structure: bool
 ) -> Iterator[str]:
-    """Warnings, each with the remedy.
-
-    Args:
-        fit: of one model.
-        material: that it found.
-        observed: what was fitted.
-        refit: fits a model to what was seen.
-        structure: whether the residual has some.
-    """
+    """Warnings, each with the remedy; ``refit`` fits a model to what was seen."""
     floats = [one for one in observed.problem.targets if one.file is None and not one.streamed]
     brightest = float(np.max(observed.brightest))
     if floats and 2 < brightest <= 65535 and _all(observed, lambda values: values == np.rint(values)):

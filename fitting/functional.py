@@ -208,16 +208,7 @@ def fit_basis(
     ambient: Array | None,
     n_range: tuple[float, float],
 ) -> Solution:
-    """What `fit` does once the basis images of a scene are known.
-
-    Args:
-        model: the class of the material.
-        target: (..., C), as many pixels as there are.
-        images: of the scene.
-        weight: of each pixel, (P,).
-        ambient: intensity of the ambient light, or None.
-        n_range: bounds of the exponent.
-    """
+    """What `fit` does once the basis images of a scene are known: of a target (..., C) of P pixels and weights (P,)."""
     scale = model.scale if issubclass(model, SpecularMaterial) else None
     diffuse = jnp.zeros((weight.size, 1), target.dtype) if images.diffuse is None else images.diffuse
     lobe, peak = images.lobe, jnp.zeros(())
@@ -383,13 +374,7 @@ def _totals_jvp(terms: Any, changes: Any) -> Any:
 
 
 def _sums(pixels: _Pixels, lobes: Sequence[Array], residual: Array) -> _Sums:
-    """Of the columns ambient, diffuse, and a lobe with its derivative by log n, (B, P) each.
-
-    Args:
-        pixels: what is fitted.
-        lobes: the lobe and its derivative.
-        residual: of some coefficients, (C, P).
-    """
+    """Of the columns ambient, diffuse, and a lobe with its derivative by log n, (B, P) each; the residual is (C, P)."""
     columns = [jnp.ones_like(pixels.diffuse), pixels.diffuse, *lobes]
     weighted, size = [column * pixels.weight for column in columns], range(len(columns))
     pairs = [(i, j) for i in size for j in size if i <= j]
@@ -402,10 +387,7 @@ def _sums(pixels: _Pixels, lobes: Sequence[Array], residual: Array) -> _Sums:
 def _point(free: Array, sums: _Sums, x: Array) -> _Point:
     """The best coefficients.
 
-    Args:
-        free: which may be above 0, (C, 3).
-        sums: over pixels.
-        x: whose residual they tell of, (C, 3), so that rounding scales with what is left and not with the picture.
+    The sums tell of the residual of ``x``, (C, 3), so that rounding scales with what is left and not with the picture.
     """
     gram, product, square = sums
     tolerance = 2e-6 if gram.dtype == jnp.float32 else 1e-14

@@ -126,12 +126,8 @@ def _curvature(
 ) -> tuple[Array, Array]:
     """The gradient of half the sum of squares by the unknowns, (U,), and how it changes along all numbers, (V, U).
 
-    Args:
-        content: material and scenes.
-        unknowns: what each moves of the material's numbers, (U, S).
-        pictures: what is fitted.
-        vector: of the unknowns, then the numbers of some leaves of the scenes.
-        places: of these among all leaves of the scenes.
+    The unknowns are what each moves of the material's numbers, (U, S); the vector holds them, then the numbers of the
+    leaves of the scenes at ``places``.
     """
     count, (numbers, of_numbers) = len(unknowns), ravel_pytree(content[0])
     leaves, shape = jax.tree.flatten(content[1])
@@ -172,12 +168,8 @@ def _inverse(hessian: Float[np.ndarray, "U U"]) -> Float[np.ndarray, "U U"]:
 def with_light_errors(result: FitResult, degrees: Sequence[float]) -> FitResult:
     """A fit whose errors hold those of its lights, to first order and as if they were independent of the picture's.
 
-    Args:
-        result: of pictures under one distant light each.
-        degrees: standard error of each light's direction, root mean square of the angle.
-
-    Raises:
-        InputError: where the fit does not determine how its numbers move.
+    Of pictures under one distant light each, whose direction has a standard error in degrees, the root mean square of
+    the angle; refused where the fit does not determine how its numbers move.
     """
     found = sensitivity(result, lambda scenes: [scene.lights[0].direction for scene in scenes])
     variance = np.zeros(len(result.parameters))

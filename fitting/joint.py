@@ -239,10 +239,7 @@ def _step(
 ) -> tuple[Float[np.ndarray, " U"], Float[np.ndarray, " U"], float]:
     """Gauss and Newton's step under the bounds, however little it gains: from where, the step, and its square.
 
-    Args:
-        vector: the numbers.
-        linear: residuals at these, and their derivatives.
-        bounded: which may not be negative.
+    ``linear`` are the residuals and their derivatives; what is bounded may not be negative.
     """
     (residual, columns), epsilon = (np.asarray(a, np.float64) for a in linear), float(jnp.finfo(vector.dtype).eps)
     gram, base = columns @ columns.T, np.where(bounded, np.asarray(vector, np.float64), 0.0)
@@ -261,15 +258,7 @@ class _Minimum(NamedTuple):
 
 
 def _minimum(problem: JointProblem, brightest: float, solver: str | None, tolerance: float, max_steps: int) -> _Minimum:
-    """The least sum of squares that is found from a start; never more than there.
-
-    Args:
-        problem: what is freed, where it starts, and the pictures.
-        brightest: largest value of these.
-        solver: see `fit_jointly`.
-        tolerance: likewise.
-        max_steps: likewise.
-    """
+    """The least sum of squares that is found from a start; ``brightest`` is the pictures' largest value."""
     vector = problem.start()
     # Gauss and Newton's steps lead to the minimum from most starts, and compile half as much as a solver.
     whole = solver is None or all(leaf.name in EMITTANCES for leaf in problem.freed)

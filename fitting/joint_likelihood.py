@@ -62,14 +62,9 @@ def by_least_squares(
     *,
     copies: bool,
 ) -> Information:
-    """What is known of numbers by least squares.
+    """What least squares knows of numbers, by the residuals' derivatives by them and the variance of what counts.
 
-    Args:
-        vector: the numbers.
-        columns: derivatives of the residuals by them.
-        counts: which pixels count.
-        variance: of the values of those that do.
-        copies: the channels are copies of each other, and err together.
+    Copies are channels that err together.
     """
     # Of pixels that do not count in every channel the usual one.
     every = np.tile(np.mean(variance, axis=0), (counts.size, 1))
@@ -84,13 +79,7 @@ def by_least_squares(
 def most_likely_numbers(
     problem: JointProblem, observed: Observed, vector: Float[np.ndarray, " U"]
 ) -> Information | None:
-    """What rounded values say, from least squares on; None where there are others.
-
-    Args:
-        problem: what is freed, and the pictures.
-        observed: what is fitted.
-        vector: the freed numbers by least squares.
-    """
+    """What rounded values say, from the freed numbers of least squares on; None where there are others."""
     bounds = [tile.bounds for tile in observed.tiles if tile.bounds is not None and not tile.bounds.exact]
     if len(bounds) < len(observed.tiles):
         return None

@@ -87,11 +87,7 @@ class JointProblem(eqx.Module):
     pictures: Sequence[Picture] = ()
 
     def by_picture(self, values: Float[Any, "*B N"]) -> list[Float[np.ndarray, "*B P C"]]:
-        """What the residuals of each picture are, or their derivatives.
-
-        Args:
-            values: of all pictures, one after the other.
-        """
+        """What the residuals of each picture are, or their derivatives, from those of all, one after the other."""
         values, shapes = np.asarray(values, np.float64), [target.shape for target, _ in self.pictures]
         parts = np.split(values, np.cumsum(list(map(math.prod, shapes)))[:-1], axis=-1)
         return [part.reshape(*values.shape[:-1], *shape) for part, shape in zip(parts, shapes, strict=True)]
@@ -149,16 +145,7 @@ def degrees_between(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]) -> flo
 
 
 def joint_problem(start: Any, free: Callable[..., Any] | None, pictures: Sequence[Picture] = ()) -> JointProblem:
-    """Find the freed leaves among those of the start, each an array of its own.
-
-    Args:
-        start: material and list of scenes.
-        free: from both to the leaves.
-        pictures: see `JointProblem`.
-
-    Raises:
-        InputError: where ``free`` does not name distinct leaves.
-    """
+    """Find the freed leaves, which must be distinct, among those of material and scenes, each an array of its own."""
     start = jax.tree.map(jnp.array, start)
     given = {"material": start[0], "scenes": start[1]}
     asked = map(id, chosen_leaves("free", free, given, "(material.n, scenes[0].lights[0].direction)"))
@@ -173,16 +160,9 @@ def joint_problem(start: Any, free: Callable[..., Any] | None, pictures: Sequenc
 
 
 def chosen_leaves(name: str, choose: Callable[..., Any] | None, given: Mapping[str, Any], example: str) -> list[Array]:
-    """The leaves that a function of a user's gives.
+    """The leaves that a function of a user's gives of trees by what they are called, each leaf an array of its own.
 
-    Args:
-        name: of the argument.
-        choose: from all that is given to one of its leaves, or several.
-        given: trees by what they are called, each leaf an array of its own.
-        example: of what the function may return.
-
-    Raises:
-        InputError: where it gives no distinct leaves of numbers.
+    It gives one or several, of numbers and distinct, or is refused with an example of what it may return.
     """
     remedy = f"Return a tuple of leaves, such as {example}"
     try:

@@ -42,22 +42,13 @@ LARGEST_CODE = 255.0
 
 
 def codec_of(target: Target) -> Jpeg | None:
-    """How a picture in colour was compressed; None where it was not, or nobody knows how.
-
-    Args:
-        target: any.
-    """
+    """How a picture in colour was compressed; None where it was not, or nobody knows how."""
     codes = target.codes
     return None if codes is None or codes.values.shape[2] != 3 else codes.jpeg
 
 
 def without_codec_errors(observed: Observed, fit: ModelFit) -> tuple[ModelFit, Observed]:
-    """The most likely fit to the pixels of a problem, less what compression does to look-alikes; and these pixels.
-
-    Args:
-        observed: the pixels.
-        fit: a first fit to them.
-    """
+    """The most likely fit to the pixels of a problem, less what compression does to look-alikes; and these pixels."""
     pictures, compressed = list(fit.pictures), list(map(_Compressed.of, observed.problem.targets))
     fit, most, count = fit._replace(pictures=pictures), MOST_FITS, LOOK_ALIKES
     if sum(len(one.shows) for one in compressed) > MANY and not any(picture.is_sampled for picture in pictures):
@@ -164,9 +155,7 @@ class _Compressed:
     def errors(self, shown: Float[np.ndarray, "P C"], count: int) -> tuple[Float[np.ndarray, "P C"], float]:
         """What compression does to each code that is predicted, and the squares of what else the picture shows.
 
-        Args:
-            shown: predictions in codes; NaN where there is none.
-            count: of look-alikes.
+        Predictions are in codes, NaN where there is none; ``count`` is of look-alikes.
         """
         if self.codec is None:
             return np.zeros_like(shown), 0.0

@@ -193,18 +193,8 @@ def choose_lights(
 ) -> LightChoice:
     """Choose lights one after the other, each where it leaves the least error.
 
-    Args:
-        candidates: see `next_light`.
-        count: how many.
-        of: the number that errs.
-        known: the lights that there are.
-        to_view: where a hemisphere of candidates lies around.
-        information: what is told by the known lights, which adds up.
-        information_by: what one more would tell.
-        error: that some information leaves.
-
-    Raises:
-        InputError: naming the argument.
+    The information of the known lights, which adds up, tells with that of one more the error of the number ``of``; a
+    hemisphere of candidates lies around ``to_view``.
     """
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
         raise InputError("count", f"must be 1 or more, got {count}", "Say how many lights to add")
@@ -245,14 +235,7 @@ def _light(given: Any, shining: np.ndarray) -> Light:
 
 
 def direction_of(light: Light) -> np.ndarray:
-    """The unit vector towards a light.
-
-    Args:
-        light: a distant one.
-
-    Raises:
-        InputError: where it is none.
-    """
+    """The unit vector towards a light; refused where it is not distant."""
     if not isinstance(light, brdf.DirectionalLight):
         what = f"hold a {type(light).__name__}, which has no one direction"
         raise InputError("candidates", what, "Give directional lights, or look at foretold")

@@ -17,15 +17,9 @@ from brdf.models.base import SpecularMaterial
 
 
 def take_colour_out(scenes: Sequence[brdf.Scene], channels: int) -> tuple[Float[np.ndarray, " C"], list[brdf.Scene]]:
-    """Split lights of one chromaticity into grey lights and a colour.
+    """Split lights of one chromaticity into grey lights and a colour, what to multiply the grey light by.
 
-    Args:
-        scenes: any number.
-        channels: of the picture.
-
-    Returns:
-        The colour, what to multiply the grey light by, and the scenes with lights of one channel; 1 and the scenes as
-        they were where the lights differ in colour.
+    1 and the scenes as they were where the lights differ in colour.
     """
     emittances = [np.asarray(emittance, np.float64) for emittance in _emittances(scenes)]
     unchanged = np.ones(channels), list(scenes)
@@ -49,13 +43,7 @@ def _emittances(scenes: Sequence[brdf.Scene]) -> list[Any]:
 def coefficient_factors(
     model: type[brdf.Material], n: float | Float[np.ndarray, "N 1"], colour: Float[np.ndarray, " C"]
 ) -> Float[np.ndarray, "3 *N C"]:
-    """What the solver's coefficients are divided by to give k_a, k_d, k_s.
-
-    Args:
-        model: the class of the material.
-        n: exponent, or those of some fits.
-        colour: what was taken out of the lights, (C,).
-    """
+    """What the solver's coefficients are divided by to give k_a, k_d, k_s; the colour was taken out of the lights."""
     colour, scale = np.where(colour > 0, colour, 1.0), 1.0
     if issubclass(model, SpecularMaterial):
         with jax.enable_x64(True):

@@ -63,10 +63,7 @@ AnyArray: TypeAlias = jax.Array | np.ndarray
 def encoded_and_slope(light: AnyArray, encoding: Encoding, steps: Any) -> tuple[Any, Any]:
     """Linear light as it is encoded, and the derivative of that; on the host where the light is.
 
-    Args:
-        light: 1 where the encoding is 1.
-        encoding: "linear", "srgb" or a gamma.
-        steps: codes where the encoding is 1.
+    There are so many ``steps`` of codes where light and encoding are 1.
     """
     xp: Any = np if isinstance(light, np.ndarray) else jnp
     if encoding == "linear":
@@ -138,11 +135,7 @@ class Bounds:
         return np.isfinite(self.lower).astype(np.uint8) + np.isfinite(self.upper)
 
     def in_light(self, size: float = 1.0) -> "Bounds":
-        """The same ends in linear light.
-
-        Args:
-            size: the unit, as a share of white.
-        """
+        """The same ends in linear light, ``size`` being the unit, as a share of white."""
         steps = float(self.scale)
         lower, upper = (
             np.where(np.isfinite(end), decode(np.where(np.isfinite(end), end, 0.0) / steps, self.encoding) / size, end)
@@ -151,11 +144,9 @@ class Bounds:
         return dataclasses.replace(self, lower=lower, upper=upper, scale=np.asarray(1 / size), encoding="linear")
 
     def near(self, code: Float[np.ndarray, "P C"], distance: float) -> Bool[np.ndarray, " P"]:
-        """Which pixels have a value that is predicted beyond an end or near it.
+        """Which pixels have a value that is predicted, before rounding, beyond an end or near it.
 
-        Args:
-            code: predictions before rounding.
-            distance: from an end, where the noise is that of the picture.
+        The distance is that where the noise is that of the picture.
         """
         inside = np.minimum(code - self.lower, self.upper - code)
         return over_channels(np.logical_or, inside < distance * self.spread)
@@ -178,11 +169,9 @@ class Bounds:
 
 
 def over_channels(combine: Callable[[Any, Any], Any], values: AnyArray) -> Any:
-    """Of each pixel's values one; a reduction over so short an axis would take fifteen times as long.
+    """Of each pixel's values, (P, C), one, on the host or the device.
 
-    Args:
-        combine: two channels.
-        values: (P, C), on the host or the device.
+    A reduction over so short an axis would take fifteen times as long.
     """
     return functools.reduce(combine, [values[:, channel] for channel in range(values.shape[1])])
 
@@ -203,12 +192,7 @@ def in_light(bounds: Sequence[Bounds]) -> list[Bounds]:
 
 
 def residual_deviation(bounds: Iterable[Bounds], codes: Iterable[Float[np.ndarray, "P C"]]) -> float:
-    """Standard deviation of what predictions leave of values with both ends, in codes.
-
-    Args:
-        bounds: of each picture.
-        codes: that are predicted.
-    """
+    """Standard deviation of what predictions leave of values with both ends, in codes."""
     squares, count = 0.0, 0
     for own, code in zip(bounds, codes, strict=True):
         closed = own.ends == 2
@@ -297,13 +281,9 @@ def interval(
     predicted: Float[np.ndarray, "*shape"],
     s: Float[np.ndarray, "*shape"],
 ) -> LogLikelihood:
-    """The log-likelihood of values known to lie in an interval.
+    """The log-likelihood of values known to lie in an interval; infinite ends are open.
 
-    Args:
-        lower: its lower end, minus infinity for an open one.
-        upper: its upper end, above the lower one; infinity for an open one.
-        predicted: z, in the same units.
-        s: standard deviation of the noise before rounding, above 0.
+    ``s`` is the standard deviation of the noise before rounding, above 0, in the units of ends and predictions.
     """
     a, b = (np.clip((end - predicted) / s, -_FAR, _FAR) for end in (lower, upper))
     above = a + b >= 0
@@ -349,13 +329,9 @@ class Values:
     def __init__(
         self, which: Bool[np.ndarray, " P"], weight: Float[np.ndarray, "#P #C"], bounds: Bounds, picture: Any = None
     ):
-        """Sort the values by the width of their intervals.
+        """Sort the values of some pixels by the width of their intervals.
 
-        Args:
-            which: of the picture's pixels.
-            weight: how many each stands for.
-            bounds: between which codes they lay.
-            picture: these pixels alone, where predictions are made of them.
+        ``weight`` is how many each stands for, ``picture`` these pixels alone, where predictions are made of them.
         """
         self.which, self.weight, self.bounds, self.picture = which, weight, bounds, picture
         width = bounds.upper - bounds.lower
@@ -370,12 +346,7 @@ class Values:
         self._kind[closed] = 1 + power
 
     def likelihood(self, predicted: Float[np.ndarray, "P C"], noise: float) -> LogLikelihood:
-        """What they say of predictions.
-
-        Args:
-            predicted: z, in units of the ends.
-            noise: standard deviation of the noise before rounding.
-        """
+        """What they say of predictions in units of the ends; noise is that before rounding."""
         lower, upper, s = self.bounds.lower, self.bounds.upper, noise * self.bounds.spread
         # Of the nearer end; minus infinity where there is none.
         above, below = predicted - upper, lower - predicted
@@ -426,12 +397,8 @@ def _hermite(low: Any, high: Any, start: Any, end: Any, share: Any) -> np.ndarra
 def alike(bounds: Bounds, codes: Float[np.ndarray, "P C"], *, level: bool = False) -> Float[np.ndarray, "P C"]:
     """How many values are predicted as each is, as on an unlit side, and share its rounding error; 0 for few.
 
-    Times the square of the step between codes.
-
-    Args:
-        bounds: of the values.
-        codes: that are predicted.
-        level: only those that also show one code; where some do not, noise tells where between codes they lie.
+    Times the square of the step between codes. With ``level`` only those that also show one code; where some do not,
+    noise tells where between codes they lie.
     """
     code = np.rint(codes * ALIKE).astype(np.int64)
     tells, found, width = bounds.ends > 0, np.zeros(code.shape), bounds.upper - bounds.lower

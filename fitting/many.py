@@ -274,11 +274,7 @@ def _solved(
 ) -> Float[Array, "N K"]:
     """The numbers of the solution of each picture, and the sum of its squares.
 
-    Args:
-        model: the class of the material.
-        pictures: what `fitting.functional.fit_basis` takes, of each picture.
-        shared: what of that is the same for all.
-        n_range: bounds of the exponent.
+    ``shared`` is what of the arguments of `fitting.functional.fit_basis` is the same for all.
     """
 
     def fit(picture: dict[str, Any]) -> Array:

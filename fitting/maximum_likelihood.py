@@ -87,11 +87,8 @@ def most_likely(
 ) -> ModelFit:
     """A fit by what rounded values and open ends say, from least squares on; as it is where they say no more.
 
-    Args:
-        fit: by least squares.
-        grey: x_s of a grey k_s, which a highlight has where channels err together; None for any colour.
-        precision: see `Evidence`; None finds it out where channels err together.
-        rival: logarithm of the likelihood of another model; of a fit that is by far less likely a subsample tells.
+    ``grey`` is x_s of a grey k_s, which a highlight has where channels err together, None for any colour; ``precision``
+    that of `Evidence`. Of a fit that is by far less likely than its rival a subsample tells.
     """
     if fit.capped or any(picture.bounds is None for picture in fit.pictures):
         return fit
@@ -242,12 +239,8 @@ def _reweighted(
 ) -> Evidence:
     """Where rounding is little beside the noise: least squares in codes, and what an open end says in a value's place.
 
-    Args:
-        fit: by least squares in radiance.
-        noise: standard deviation of the residual in codes.
-        rounding: what its variance owes to rounding.
-        precision: of the channels' errors together, where it is known.
-        together: they err together.
+    Noise is the residual's standard deviation in codes, ``rounding`` what its variance owes to that; ``together``
+    channels err together, by a precision that is known or None.
     """
     pictures, optimum, places = fit.pictures, fit.optimum, [bounds_of(picture).place for picture in fit.pictures]
     is_given = precision is not None
@@ -318,12 +311,7 @@ def _together(
 
 
 def change(before: Optimum, after: Optimum) -> float:
-    """The largest change of a number, in standard errors that the others leave.
-
-    Args:
-        before: numbers.
-        after: others, with the sums of their pixels.
-    """
+    """The largest change of a number, in standard errors that the others leave by the sums after it."""
     noise = np.maximum(after.cost, np.finfo(float).tiny) / np.maximum(after.pixels, 1)
     # Sums of a column that no pixel shows may end a little below 0.
     information = np.maximum(np.diagonal(after.gram, axis1=1, axis2=2)[:, :3].T, 0.0)
@@ -408,11 +396,8 @@ class _Separable(Problem):
     ):
         """State what is fitted.
 
-        Args:
-            pixels: of each picture.
-            design: what each free number moves of x_a, x_d, x_s, channel after channel, and log n.
-            n_range: of the exponent.
-            copies: the channels are copies of each other, and tell of a number once.
+        ``design`` is what each free number moves of x_a, x_d, x_s, channel after channel, and log n. Channels that are
+        copies of each other tell of a number once.
         """
         self.pixels, self.design, self.copies, self.n_range = pixels, design, copies, n_range
         self.bounds, size = [part.bounds for part in pixels], len(design)
@@ -489,11 +474,7 @@ def _stratum(picture: Picture, size: int) -> Values:
 
 
 def bounds_of(picture: Picture) -> Bounds:
-    """Between which codes its values lay.
-
-    Args:
-        picture: with such.
-    """
+    """Between which codes the values of a picture that has such lay."""
     assert picture.bounds is not None
     return picture.bounds
 
@@ -510,12 +491,7 @@ def _open_ends_tell(picture: Picture, at: Optimum, noise: float) -> bool:
 
 
 def highlight_in_codes(pictures: Sequence[Picture], optimum: Optimum) -> float:
-    """By how many codes of its file a highlight changes a value at most; infinite where a picture is without codes.
-
-    Args:
-        pictures: of a fit.
-        optimum: its numbers.
-    """
+    """By how many codes of its file a highlight changes a value at most; infinite where a picture is without codes."""
     matt, most = Numbers(optimum.n, optimum.x * [[1], [1], [0]]), -math.inf
     for picture in pictures:
         if picture.bounds is None or picture.bounds.exact:
@@ -525,11 +501,6 @@ def highlight_in_codes(pictures: Sequence[Picture], optimum: Optimum) -> float:
 
 
 def unexplained(picture: Picture, optimum: Optimum) -> np.ndarray:
-    """By how much predictions miss the bounds between which the values lay.
-
-    Args:
-        picture: of a fit, with bounds.
-        optimum: its numbers.
-    """
+    """By how much predictions miss the bounds between which the values of a picture lay."""
     bounds, code = bounds_of(picture), _codes(picture, optimum)
     return np.maximum(bounds.lower - code, 0.0) - np.maximum(code - bounds.upper, 0.0)

@@ -121,11 +121,7 @@ class Observed(NamedTuple):
         }
 
     def reached(self, model: type[brdf.Material]) -> Bool[np.ndarray, "3 C"]:
-        """Which coefficients of a model the light reaches.
-
-        Args:
-            model: its class.
-        """
+        """Which coefficients of a model the light reaches."""
         reached = np.zeros((3, self.colour.size), bool)
         for scene in self.problem.scenes:
             if scene.ambient is not None:
@@ -165,15 +161,7 @@ class Statistics(NamedTuple):
 
 
 def observe(problem: FitProblem, *, at_once: bool = False) -> Observed:
-    """Decide which pixels of each picture count.
-
-    Args:
-        problem: the pictures.
-        at_once: make one tile of each picture, however large it is.
-
-    Raises:
-        InputError: where nothing is left to fit.
-    """
+    """Decide which pixels of each picture count, refused where none is left; in one tile where at once."""
     colour, grey = take_colour_out(problem.scenes, problem.targets[0].pixels.shape[-1])
     given = zip(problem.targets, problem.scenes, grey, problem.masks, problem.weights, strict=True)
     parts = []
@@ -436,12 +424,7 @@ def _thinned(target: Target, scene: brdf.Scene, precision: Precision, *of_pixels
 
 
 def in_memory(problem: FitProblem, rounding: Rounding) -> FitProblem:
-    """With some pixels, evenly spread, of the pictures that are read by bands.
-
-    Args:
-        problem: any.
-        rounding: of the values, see `fitting.codes.find_codes`.
-    """
+    """With some pixels, evenly spread, of the pictures that are read by bands."""
 
     def some(target: Target, scene: brdf.Scene, *of_pixels: Any) -> tuple[Any, ...]:
         if not target.streamed:
@@ -460,16 +443,9 @@ def in_memory(problem: FitProblem, rounding: Rounding) -> FitProblem:
 def _inverse_variance(
     values: Float[np.ndarray, "H W C"], good: Bool[np.ndarray, "H W"], read: float, shot: float, step: float
 ) -> Float[np.ndarray, " P"]:
-    """Inverse variances over their mean; a pixel's channels share the variance of their mean value.
+    """Inverse variances over their mean, 0 where not good; a pixel's channels share the variance of their mean value.
 
     The value is the mean of 5 x 5 pixels: taken from the pixel itself, weights would favour what noise made darker.
-
-    Args:
-        values: of each pixel.
-        good: which count; the others weigh 0.
-        read: standard deviation of the noise without light.
-        shot: variance over value.
-        step: distance of two codes.
     """
     from scipy.ndimage import uniform_filter  # it takes long to load
 

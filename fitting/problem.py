@@ -102,11 +102,7 @@ class FitProblem:
         return max((target.codes.usual_step for target in self.targets if target.codes is not None), default=0.0)
 
     def sample_error(self, model: str) -> SampleError | None:
-        """What the light samples leave out of a model, or of another one; None where nothing is known of it.
-
-        Args:
-            model: its name.
-        """
+        """What the light samples leave out of a model, or of another one; None where nothing is known of it."""
         errors = self.sample_errors or {}
         return errors.get(model, next(iter(errors.values()), None))
 
@@ -117,14 +113,7 @@ class FitProblem:
 
 
 def model_name(model: Any) -> str:
-    """The name of a model that a person gives: "blinn-phong" or "BlinnPhong", or the class itself; or "auto".
-
-    Args:
-        model: name or class.
-
-    Raises:
-        InputError: where it is neither.
-    """
+    """The name of a model that a person gives: "blinn-phong" or "BlinnPhong", or the class itself; or "auto"."""
     if isinstance(model, type) and issubclass(model, brdf.Material):
         model = model.name
     names = {_letters(name): name for name in ("auto", *brdf.MODELS)}
@@ -140,14 +129,7 @@ def _letters(name: str) -> str:
 
 
 def refuse_traced(*given: Any) -> None:
-    """Refuse what a transformation of JAX traces: a search over all pixels is a program of its own.
-
-    Args:
-        given: arguments of a fit.
-
-    Raises:
-        InputError: pointing to what can be transformed.
-    """
+    """Refuse what a transformation of JAX traces: a search over all pixels is a program of its own."""
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(given)):
         words = "Use fitting.sensitivity for derivatives, fitting.fit_many for batches, fitting.functional inside jax"
         raise InputError("fit", "cannot run inside jax.grad, jax.vmap or jax.jit", words)
@@ -328,41 +310,21 @@ def _check_picture(target: Target, scene: brdf.Scene, resolution: tuple[int, int
 
 
 def has_pixel_areas(scene: brdf.Scene) -> bool:
-    """Whether a pixel of a scene is more than its centre.
-
-    Args:
-        scene: any.
-    """
+    """Whether a pixel of a scene is more than its centre."""
     if scene.camera is not None and scene.camera.samples > 1:
         return True
     return scene.points is not None and scene.points.area is not None
 
 
 def check_choice(loss: str, losses: Iterable[str], n_range: tuple[float, float]) -> None:
-    """Refuse what is no loss and no range of exponents.
-
-    Args:
-        loss: its name.
-        losses: the names that there are.
-        n_range: bounds of the exponent.
-
-    Raises:
-        InputError: naming the argument.
-    """
+    """Refuse what is no loss and no range of exponents."""
     if loss not in losses:
         raise InputError("loss", f"is unknown, got {loss!r}", f"Use one of {', '.join(losses)}")
     check_exponents(n_range)
 
 
 def check_exponents(n_range: tuple[float, float]) -> None:
-    """Refuse what is no range of exponents.
-
-    Args:
-        n_range: bounds of the exponent.
-
-    Raises:
-        InputError: naming the argument.
-    """
+    """Refuse what is no range of exponents."""
     try:
         low, high = (float(bound) for bound in n_range)
     except (TypeError, ValueError):

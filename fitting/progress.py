@@ -19,14 +19,7 @@ _line = threading.Lock()
 
 @contextlib.contextmanager
 def waiting(what: str) -> Iterator[Callable[[str], None]]:
-    """Tell what is being done while the block runs; nobody is told where output goes to a file or a pipe.
-
-    Args:
-        what: is being done.
-
-    Yields:
-        To say what is done next.
-    """
+    """Tell what is being done while the block runs, which can say what is next; nobody is told in a file or a pipe."""
     write = _terminal() or _notebook()
     if write is None or not _line.acquire(blocking=False):
         yield lambda what: None

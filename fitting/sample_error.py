@@ -44,23 +44,15 @@ class SampleError(NamedTuple):
 
 
 def near_exponent(n: float, reach: float, peak: float) -> Near:
-    """Where to tabulate lobes about an exponent.
+    """Where to tabulate lobes about an exponent: as far as its logarithm reaches to either side.
 
-    Args:
-        n: exponent.
-        reach: of its logarithm, to either side.
-        peak: logarithm of the lobe's cosine in the pixel nearest to its centre.
+    ``peak`` is the logarithm of the lobe's cosine in the pixel nearest to its centre.
     """
     return Near.between(math.log(n) - reach, math.log(n) + reach, peak if n * peak < FAINT else 0.0)
 
 
 def between(near: Near | None, n_range: tuple[float, float]) -> tuple[float, float]:
-    """Which of some exponents are tabulated; all of them where nothing is.
-
-    Args:
-        near: where lobes are tabulated.
-        n_range: bounds of the exponent.
-    """
+    """Which of some exponents are tabulated; all of them where nothing is."""
     if near is None:
         return n_range
     low, high = np.clip(np.exp(near.ends), *n_range).tolist()
@@ -68,15 +60,7 @@ def between(near: Near | None, n_range: tuple[float, float]) -> tuple[float, flo
 
 
 def nearer(near: Near, n: float, n_range: tuple[float, float], peak: float, *, last: bool) -> Near | None:
-    """Where to tabulate anew, after an exponent was found; None where it is well inside.
-
-    Args:
-        near: where it was looked for.
-        n: what was found.
-        n_range: bounds of the exponent.
-        peak: logarithm of the lobe's cosine in the pixel nearest to its centre.
-        last: whether nothing else is tried after that.
-    """
+    """Where to tabulate anew, after an exponent was found; None where it is well inside, or nothing else is tried."""
     low, high = near.ends
     edge = CLOSE * (high - low)
     below = math.log(n) < low + edge and math.log(n_range[0]) < low

@@ -91,12 +91,7 @@ class Choice(NamedTuple):
     dropped: Float[np.ndarray, " U"]
 
     def coloured(self, model: str, free: Bool[np.ndarray, "3 C"]) -> "Choice":
-        """The same terms with a coloured highlight.
-
-        Args:
-            model: its name.
-            free: its coefficients.
-        """
+        """The same terms with a coloured highlight."""
         wanted = model, bool(free[0].any()), "coloured"
         candidates = tuple(
             replace(one, chosen=(one.model, one.ambient, one.highlight) == wanted) for one in self.candidates
@@ -106,12 +101,7 @@ class Choice(NamedTuple):
 
 
 def is_better(gain: float, unknowns: int) -> bool:
-    """Whether so many further unknowns earn what they gain: more than a standard error, where held out.
-
-    Args:
-        gain: by how much they lower the cost, in noise variances.
-        unknowns: how many.
-    """
+    """Whether so many further unknowns earn what they gain, in noise variances: a standard error, held out."""
     return gain - 2 * unknowns > 2 * np.sqrt(max(gain, 0.0))
 
 
@@ -176,15 +166,10 @@ def choose(
 ) -> Choice:
     """Choose the simplest adequate model.
 
-    Args:
-        fits: the optimum of each model with a highlight; or that of Lambert alone.
-        free: which coefficients the light reaches, (3, C).
-        grey: for each model, the solver's x_s of a grey k_s, up to a factor; (C,).
-        noise: standard deviation of the residual of the best fit, (C,).
-        inflation: by what factor the structure of its residual makes errors larger; at least 1.
-        whitened: for each model the normal equations at its optimum with each pixel divided by its variance; empty
-            where the variance is the same in all.
-        colour_inflation: by what further factor it makes errors of a highlight's colour larger than of its brightness.
+    Of the optimum of each model with a highlight, or that of Lambert alone. ``grey`` are the x_s of a grey k_s, up to a
+    factor, ``noise`` that of the best fit; the structure of its residual makes errors larger by ``inflation``, and
+    those of a highlight's colour by ``colour_inflation`` more. ``whitened`` are the normal equations with each pixel
+    divided by its variance; empty where that is the same in all.
     """
     channels = free.shape[1]
     no, ambient = np.zeros(channels, bool), bool(free[0].any())
@@ -265,16 +250,11 @@ def _dropped(chosen: _Trial, trials: list[_Trial]) -> Float[np.ndarray, " U"]:
 
 
 def may_be_off(step: Float[np.ndarray, " U"], gain: float, unknowns: int) -> Float[np.ndarray, " U"]:
-    """By how much a term that was left out may have moved what stays.
+    """By how much a term of so many unknowns that was left out may have moved what stays.
 
-    Its estimate moves it by that much, with an error of its own; it is there as probably as Akaike's criterion says, by
-    which nothing has to stand out (Buckland, Burnham and Augustin, Biometrics 53 (1997) 603: the variance of an average
-    over models).
-
-    Args:
-        step: by which the term's estimate moves what stays.
-        gain: by how much it lowers the cost, in noise variances.
-        unknowns: how many more it has.
+    Its estimate moves it by the step, with an error of its own, and lowers the cost by the gain in noise variances; it
+    is there as probably as Akaike's criterion says, by which nothing has to stand out (Buckland, Burnham and Augustin,
+    Biometrics 53 (1997) 603: the variance of an average over models).
     """
     gain = max(gain, 1.0)
     odds = np.exp(np.clip(0.5 * gain - unknowns, -50.0, 50.0))

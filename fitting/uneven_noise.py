@@ -29,11 +29,7 @@ ROUNDED = 2.0**-22
 
 
 def in_codes(observed: Observed) -> Observed:
-    """The same, floats beside pictures of codes as codes too: those that single precision rounds them to.
-
-    Args:
-        observed: several pictures.
-    """
+    """The same, floats beside pictures of codes as codes too: those that single precision rounds them to."""
     targets = observed.problem.targets
     floats = [one.codes is None for one in targets]
     if all(floats) or not any(floats) or any(one.streamed or one.least_squares for one in targets):
@@ -87,11 +83,7 @@ def noise_of_each(
 ) -> NoiseOfEach:
     """What least squares leaves, with weights by what it leaves where that is not even.
 
-    Args:
-        pictures: some pixels of each tile, on the host.
-        owner: of which picture each tile is.
-        rounding: standard deviation of a value's rounding, (C,): no picture has less noise.
-        least_squares: the fit to these.
+    Of some pixels of each tile, on the host; no picture has less noise than the rounding of a value.
     """
     found = _left(pictures, owner, rounding, least_squares(pictures).optimum)
     for _ in range(0 if found.even else EVENINGS):
@@ -131,13 +123,7 @@ def _left(
 
 
 def noise_left(left: Sequence[Left], owner: Int[np.ndarray, " T"], rounding: Float[np.ndarray, " C"]) -> NoiseOfEach:
-    """What is left of each picture.
-
-    Args:
-        left: of each tile.
-        owner: of which picture it is.
-        rounding: standard deviation of a value's rounding, (C,): no picture has less noise.
-    """
+    """What is left of each picture, by the picture that each tile is of."""
     counted = [np.sum(one.counts, axis=0) for one in left]
     squares = [np.sum(one.residual**2, axis=0) for one in left]
     of_picture = np.equal.outer(owner, np.arange(np.max(owner) + 1))
@@ -158,12 +144,7 @@ def noise_left(left: Sequence[Left], owner: Int[np.ndarray, " T"], rounding: Flo
 
 
 def evened(observed: Observed, noise: NoiseOfEach) -> Observed:
-    """The same with weights by which each picture counts by what it knows; as it is where all have the same noise.
-
-    Args:
-        observed: several pictures.
-        noise: of each.
-    """
+    """The same with weights by which each picture counts by what it knows; as it is where all have the same noise."""
     if noise.even:
         return observed
     weight = 1 / (noise.variance * np.average(1 / noise.variance, weights=noise.pixels))

@@ -27,11 +27,7 @@ them leaves less than that share of the squares."""
 def likelier(problem: MapProblem) -> tuple[MapProblem, tuple[str, ...]]:
     """Silent photographs as sRGB or linear light: under distant lights as is left less of some texels' codes.
 
-    Args:
-        problem: with silent ones read as is usual for their bits.
-
-    Returns:
-        The problem, and what to tell of it.
+    Given as is usual for their bits; with the problem comes what to tell of it.
     """
     given = problem.photographs
     silent = next((one for one in given.each if one.silent), None)
@@ -57,9 +53,7 @@ def likelier(problem: MapProblem) -> tuple[MapProblem, tuple[str, ...]]:
 def upside_down(problem: MapProblem, residual: np.ndarray) -> tuple[str, ...]:
     """A note where some texels fit far better with y of the given normals turned: in many programs it goes down.
 
-    Args:
-        problem: whose normals are given; of others nothing is said.
-        residual: of its maps, over what photographs show.
+    The residual is that of the maps, over what photographs show; of normals that are not given nothing is said.
     """
     surface = problem.surface
     if surface.normal is None or surface.points is not None or not np.nanmedian(residual) > MISFIT:
@@ -77,10 +71,7 @@ def with_prices(problem: MapProblem) -> MapProblem:
 
     The price is minus twice the logarithm of the lobe's share over the largest, as criteria are of the likelihood. The
     shares among texels that show a lobe are found by expectation and maximisation (Dempster, Laird and Rubin, J. R.
-    Stat. Soc. B 39, 1977) from some of them.
-
-    Args:
-        problem: of one model, which is returned as it is, or of several.
+    Stat. Soc. B 39, 1977) from some of them. A problem of one model stays as it is.
     """
     glossy = np.array([issubclass(model, SpecularMaterial) for model in problem.models])
     if np.count_nonzero(glossy) < 2 or not problem.texels.size:

@@ -29,12 +29,8 @@ SPARSE = 16
 def fit_bands(problem: MapProblem, keep: Path | None = None) -> dict[str, np.ndarray]:
     """The layers, (H, W, ...), band after band from the top: one is read while others are fitted, each on a core.
 
-    Args:
-        problem: what is fitted.
-        keep: a folder for what is done: what an interrupted run goes on from, and what processes hand each other.
-
-    Raises:
-        InputError: where the folder cannot be used, or is missing and there are several processes.
+    What is done is kept in the folder ``keep``: what an interrupted run goes on from, and what processes hand each
+    other; refused where it cannot be used, or is missing and there are several processes.
     """
     (height, width, _), texels = problem.photographs.size, problem.texels
     if not texels.size:
@@ -125,11 +121,7 @@ def read_band(path: Path | None) -> dict[str, np.ndarray] | None:
 
 
 def write_band(path: Path, layers: dict[str, np.ndarray]) -> None:
-    """Keep them: whole, or not at all.
-
-    Raises:
-        InputError: where that cannot be.
-    """
+    """Keep them: whole, or not at all; refused where that cannot be."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:

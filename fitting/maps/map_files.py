@@ -25,16 +25,7 @@ MOST_REFLECTANCE = 0.98
 
 
 def write_maps(maps: "Maps", folder: str | Path, *, plot: bool = False) -> None:
-    """Write what `Maps.save` promises.
-
-    Args:
-        maps: any.
-        folder: made where missing.
-        plot: also maps.png.
-
-    Raises:
-        InputError: where it cannot be written.
-    """
+    """Write what `Maps.save` promises."""
     layers = maps.layers()
     k_d, k_s = np.nan_to_num(maps.k_d), maps.fitted_k_s
     # some outliers must not darken the rest
@@ -113,11 +104,7 @@ def _openlime(width: int, height: int, scale: dict[str, float]) -> dict[str, Any
 
 
 def draw_maps(maps: "Maps") -> Any:
-    """The figure of `Maps.plot`.
-
-    Args:
-        maps: any.
-    """
+    """The figure of `Maps.plot`."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12, 7), layout="constrained")

@@ -98,13 +98,9 @@ class Photographs:
     def tiles(
         self, texels: Int[np.ndarray, " K"], shape: tuple[int, int], lanes: int, precision: str
     ) -> Float[np.ndarray, "P N TILE C"]:
-        """What some texels show in all photographs, in tiles.
+        """What some texels show in all photographs, in tiles of a shape for as many as are given or more.
 
-        Args:
-            texels: indices, row by row, that rise.
-            shape: how many tiles of how many texels, as many as are given or more.
-            lanes: black photographs are added up to a multiple of this.
-            precision: of the result.
+        Texels are indices, row by row, that rise; black photographs are added up to a multiple of ``lanes``.
         """
         (_, width, channels), (count, size) = self.size, shape
         found = np.zeros((-(-len(self.each) // lanes) * lanes, count * size, channels), precision)
@@ -136,15 +132,11 @@ def fingerprint(*parts: Any) -> str:
 
 
 def read_lights(path: str | Path) -> tuple[list[Path], Float[np.ndarray, "P 3"]]:
-    """Photographs and their lights from a file as RTI programs write it.
+    """Photographs and their lights from an ``.lp`` file as RTI programs write it; refused with file and line.
 
-    Args:
-        path: an ``.lp`` file: a count, then a line ``name x y z`` a photograph. The last three words before a remark
-            are the numbers: a name may hold blanks, and folders, which are looked for beside the file and then left
-            out. A word that begins with ``#``, at the start of a line or after its numbers, begins a remark.
-
-    Raises:
-        InputError: naming file and line.
+    It holds a count, then a line ``name x y z`` a photograph. The last three words before a remark are the numbers: a
+    name may hold blanks, and folders, which are looked for beside the file and then left out. A word that begins with
+    ``#``, at the start of a line or after its numbers, begins a remark.
     """
     lines = [line.strip() for line in read_text(path, MOST_BYTES).replace("\\", "/").splitlines()]
     numbered = [(number, line) for number, line in enumerate(lines, start=1) if line.partition("#")[0]]
@@ -180,15 +172,7 @@ def _named_vector(line: str) -> tuple[str, list[float]]:
 
 
 def named_directions(path: str | Path, files: Sequence[str | Path]) -> Float[np.ndarray, "P 3"]:
-    """The lights of some photographs, by their names.
-
-    Args:
-        path: an ``.lp`` file, as for `read_lights`.
-        files: the photographs.
-
-    Raises:
-        InputError: where it does not name one of them, or names one twice.
-    """
+    """The lights of some photographs, by their names, in an ``.lp`` file, which must name each once."""
     listed, directions = read_lights(path)
     index, paths = [], [one.resolve() for one in listed]
     for file in map(Path, files):
@@ -212,12 +196,8 @@ def _by_number(path: Path) -> tuple[list[Any], str]:
 def read_folder(folder: Path) -> dict[str, Any]:
     """What a folder of photographs says: ``pictures`` and ``lights``, and ``intensities``, ``mask``, ``normals``.
 
-    Args:
-        folder: with one ``.lp`` file, or with ``filenames.txt`` and ``light_directions.txt`` as DiLiGenT has them;
-            without the names photographs are taken in the order of the numbers in theirs. Hidden files are left out.
-
-    Raises:
-        InputError: naming what is missing.
+    It holds one ``.lp`` file, or ``filenames.txt`` and ``light_directions.txt`` as DiLiGenT has them; without the names
+    photographs are taken in the order of the numbers in theirs. Hidden files are left out.
     """
     visible = sorted((path for path in folder.iterdir() if not path.name.startswith(".")), key=_by_number)
     tables, names = [path for path in visible if path.suffix.lower() == ".lp"], folder / "filenames.txt"
@@ -244,14 +224,9 @@ def read_folder(folder: Path) -> dict[str, Any]:
 
 
 def normal_map(given: Any, *, flip_y: bool = False) -> Float[np.ndarray, "H W 3"]:
-    """Normals from an array or a file: floats as they are, codes as n·0.5 + 0.5; 0 where there is no surface.
+    """Normals, (H, W, 3), from an array, .npy, .exr, or an image of 8 or 16 bits; 0 where there is no surface.
 
-    Args:
-        given: (H, W, 3); or .npy, .exr, or an image of 8 or 16 bits.
-        flip_y: whether y goes down there.
-
-    Raises:
-        InputError: naming the file or the argument.
+    Floats are taken as they are, codes as n·0.5 + 0.5; ``flip_y`` where y goes down there.
     """
     name, coded, normal = "normals", False, given
     if isinstance(given, str | Path):

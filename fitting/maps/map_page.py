@@ -29,11 +29,7 @@ _SCALES = {
 
 
 def maps_html(maps: "Maps") -> str:
-    """What Jupyter shows of maps: under a light, and the report.
-
-    Args:
-        maps: any.
-    """
+    """What Jupyter shows of maps: under a light, and the report."""
     _, picture = _relit(maps, 256)
     address = png_address(brdf.displayed(picture, _range(picture)[1]))
     return f'<img src="{address}"><pre>{html.escape(str(maps))}</pre>'
@@ -42,10 +38,7 @@ def maps_html(maps: "Maps") -> str:
 def maps_page(maps: "Maps", title: str, reasons: Sequence[str]) -> Page:
     """One self-contained HTML page that shows the maps, under a light that moves and one by one.
 
-    Args:
-        maps: any.
-        title: as text.
-        reasons: what ``reason`` of the maps means.
+    The title is text, ``reasons`` what ``reason`` of the maps means.
     """
     outside = reasons.index("outside")
     shown, picture = _relit(maps, LARGEST)

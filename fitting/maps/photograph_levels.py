@@ -36,15 +36,8 @@ SINGLE = 1e30
 def with_levels(problem: MapProblem, saturation: Any = None) -> tuple[MapProblem, float, tuple[str, ...]]:
     """Photographs clipped where many texels of the stack share its largest value, and in a unit in which that is of 1.
 
-    Args:
-        problem: in which photographs are clipped where they say so themselves.
-        saturation: linear value from which on all of them are; None finds out.
-
-    Returns:
-        The problem, the power of two by which its photographs are divided, and what to tell of it.
-
-    Raises:
-        InputError: where values are out of reach of the precision.
+    They are clipped where they say so themselves, and from ``saturation`` on. With the problem come the power of two by
+    which its photographs are divided and what to tell of it; values out of reach of the precision are refused.
     """
     given, texels = problem.photographs, places(problem.texels)
     each, notes = given.each, ()
@@ -74,12 +67,7 @@ def with_levels(problem: MapProblem, saturation: Any = None) -> tuple[MapProblem
 
 
 def in_unit(layers: dict[str, np.ndarray], unit: float) -> dict[str, np.ndarray]:
-    """Layers of photographs that were divided by a unit, as they are of those themselves.
-
-    Args:
-        layers: by name.
-        unit: a power of two.
-    """
+    """Layers of photographs that were divided by a unit, a power of two, as they are of those themselves."""
     of_light = ("k_", "fitted_k_s", "noise")
     return {
         name: layer * layer.dtype.type(unit) if name.startswith(of_light) else layer for name, layer in layers.items()

@@ -19,15 +19,7 @@ from fitting.uncertainty.intervals import NORMAL_95, student_95
 
 
 def label_map(labels: Any, problem: MapProblem) -> Int[np.ndarray, "H W"]:
-    """Which texels share n, as whole numbers.
-
-    Args:
-        labels: whole numbers, (H, W), one for all, or a file in which each colour is one.
-        problem: what is fitted.
-
-    Raises:
-        InputError: where these are none, or the model has no n.
-    """
+    """Which texels share n: whole numbers, (H, W), one for all, or a file in which each colour is one."""
     (model, *more), size = problem.models, problem.photographs.size[:2]
     if more or not issubclass(model, SpecularMaterial):
         raise InputError("labels", "need one model with an exponent", "Name the model, as blinn-phong")
@@ -46,12 +38,7 @@ def label_map(labels: Any, problem: MapProblem) -> Int[np.ndarray, "H W"]:
 
 
 def with_shared_n(problem: MapProblem, labels: Int[np.ndarray, "H W"]) -> MapProblem:
-    """The n that texels of one label share, and its error: the sums of its texels in place of those of one.
-
-    Args:
-        problem: what is fitted.
-        labels: see `label_map`.
-    """
+    """The n that texels of one label share, and its error: the sums of its texels in place of those of one."""
     surface, size = problem.surface, labels.shape
     if surface.normal is None:
         surface = surface._replace(normal=fit_bands(problem)["normal"])

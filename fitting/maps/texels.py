@@ -399,13 +399,10 @@ class Texels(eqx.Module):
     ) -> TexelFit:
         """The best coefficients, and the Gauss-Newton step of these and the nonlinear unknowns together.
 
-        Args:
-            log_n: where.
-            slopes: derivatives of what is explained by the nonlinear unknowns; by log n, the first of a model with a
-                lobe, of the lobe.
-            errors: whether what is at a bound is as unknown as others, as errors want it: what holds it there is noise,
-                and n would seem determined by light that the next draw gives to k_d. In a step it stays where it is.
-            n_known: whether no slope is by log n.
+        Slopes are derivatives of what is explained by the nonlinear unknowns: by log n, unless that is known, the first
+        of a model with a lobe, of the lobe. With ``errors`` what is at a bound is as unknown as others: what holds it
+        there is noise, and n would seem determined by light that the next draw gives to k_d. In a step it stays where
+        it is.
         """
         columns = self.columns(log_n)
         count = len(columns)
@@ -449,13 +446,7 @@ class Profile(NamedTuple):
         """Standard errors of k and log n by the profile of their likelihood: how far from a fit all lie that it allows.
 
         Where what is explained is linear in log n they are the fit's own; where many n serve alike, as of a highlight
-        whose top no light shows, far larger.
-
-        Args:
-            fit: the fit.
-            square: of what is shown, summed, (T,).
-            variance: of the noise, above 0.
-            finer: of the grid.
+        whose top no light shows, far larger. ``square`` is the sum of that of what is shown, (T,).
         """
         log_n = jnp.log(jnp.asarray(grid(finer), square.dtype))[:, None]
         variance = jnp.maximum(variance, jnp.finfo(square.dtype).eps * square)  # what is below is rounding
@@ -523,10 +514,7 @@ def of_lanes(tree: Any, lanes: Array) -> Any:
 def of_few(left: Array, best: Any, better: Callable[[Array, Any], Any]) -> Any:
     """Fit some texels anew, `FEW` at a time: what is rarely worth it costs little.
 
-    Args:
-        left: which, (T,).
-        best: what is known of all, texels last.
-        better: of the indices of a few and of what is known of these, what is known then.
+    Of what is known of all, texels last, ``better`` is given the indices of a few and what is known of these.
     """
 
     def step(state):
@@ -571,25 +559,18 @@ def rivals(heights: Array, cost: Array) -> Array:
 
 
 def per_deviation(worse: Array, variance: Array) -> Array:
-    """What part of the distance to a worse fit is a standard error; 0 where the values do not allow for that fit.
+    """What part of the distance to a fit of so much more cost is a standard error.
 
-    Of what a 95 % interval just holds it is 1 / 1.96.
-
-    Args:
-        worse: by how much its cost is larger.
-        variance: of the noise, above 0.
+    0 where the values do not allow for it. Of what a 95 % interval just holds it is 1 / 1.96.
     """
     deviations = jnp.sqrt(jnp.maximum(worse / variance, NORMAL_95**2))
     return jnp.maximum((ALLOWED - deviations) / (ALLOWED - NORMAL_95), 0) / NORMAL_95
 
 
 def narrowed(bracket: Array, slope: Array, step: Array) -> Array:
-    """A bracket after a step; one that leads out of it goes to its middle.
+    """A bracket, log n and between which it lies, (3, T), after a step; one that leads out of it goes to its middle.
 
-    Args:
-        bracket: log n, and between which it lies, (3, T).
-        slope: half the negative derivative of the cost.
-        step: Gauss and Newton's.
+    The slope is half the negative derivative of the cost.
     """
     log_n, low, high = bracket
     low, high = jnp.where(slope > 0, log_n, low), jnp.where(slope < 0, log_n, high)
@@ -600,12 +581,7 @@ def narrowed(bracket: Array, slope: Array, step: Array) -> Array:
 
 
 def shadowed(shown: Array, diffuse: Array) -> Array:
-    """Where values are less than half of what Lambert's law, fitted to all, tells, (T, P).
-
-    Args:
-        shown: values, 0 where they do not count.
-        diffuse: column of k_d, likewise.
-    """
+    """Where values are less than half of what Lambert's law, fitted to all, tells, (T, P); 0 is what does not count."""
     level = divide(*sums_of(shown * diffuse, diffuse * diffuse))
     return shown < 0.5 * level[:, None] * diffuse
 
@@ -613,10 +589,7 @@ def shadowed(shown: Array, diffuse: Array) -> Array:
 def inliers(residual: Components, seen: Array, counts: Array) -> Array:
     """1 where a residual is no outlier: within `OUTLIER` standard deviations of those that are none, (T, P).
 
-    Args:
-        residual: of all.
-        seen: 1 where it counts.
-        counts: 1 where none is expected.
+    0 where it is not seen; none is expected where it counts.
     """
     square = over_channels(residual) ** 2
 
@@ -631,20 +604,15 @@ def inliers(residual: Components, seen: Array, counts: Array) -> Array:
 
 
 def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Profile, Components, Array, Array]:
-    """The best material and normal of each texel.
+    """The best material and normal of each texel, under distant lights.
 
     A highlight alone, as of metals, gives a normal, and Lambert's law, fitted to what is neither highlight nor shadow,
     two others. The search over n gives each a material, and from the best one Gauss-Newton takes it and the normal
     together, `TURNS` times: each time without what the last one does not explain, or shows less than half as bright.
     One loop does all of it, for a second copy of the program would take as long to compile.
 
-    Args:
-        texels: without columns.
-        lights: which are distant.
-
-    Returns:
-        The fit, whose last two errors are those of the normal, and where its search started; the normals, (T,); what is
-        lit and what of it is no outlier, (T, P), before the last steps: neither counts in the fit otherwise.
+    Gives the fit, whose last two errors are those of the normal, and where its search started; the normals, (T,); what
+    is lit and what of it is no outlier, (T, P), before the last steps: neither counts in the fit otherwise.
     """
     seen, shown = texels.seen, over_channels(texels.unweighted(texels.values))
     if lights.ambient is not None:
@@ -720,12 +688,8 @@ def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Profile, Co
 def restarted(texels: Texels, lights: Distant, found: tuple[Array, Components, Array]) -> Any:
     """The minimum of material and normal together from other exponents, where a cost stands out of those of the tile.
 
-    A start whose normal is some degrees off favours a broad lobe, and Gauss-Newton may stay there.
-
-    Args:
-        texels: of what counts.
-        lights: which are distant.
-        found: log n, normal and cost.
+    A start whose normal is some degrees off favours a broad lobe, and Gauss-Newton may stay there. What was found is
+    log n, normal and cost.
     """
     cost = found[2]
 
@@ -832,14 +796,10 @@ Rows = list[list[Any]]
 
 
 def nonnegative(rows: Rows, high: Array, grey: bool, steps: int) -> list[Array]:
-    """Minimise x G x - 2 b x over 0 <= x, and x <= high for the last one, which channels may share.
+    """Minimise x G x - 2 b x over 0 <= x, and x <= high for the last one, which channels share where it is grey.
 
-    Args:
-        rows: of G, and b.
-        high: at least 0, (T,).
-        grey: whether the channels share the last unknown.
-        steps: of Newton's method for it. What is left of its moment is made of straight pieces, one for each set of the
-            others at 0: a few steps end.
+    That takes so many steps of Newton's method. What is left of its moment is made of straight pieces, one for each set
+    of the others at 0: a few steps end.
     """
     high = high[..., None, :]
     if not grey:
@@ -885,12 +845,9 @@ class Solved(NamedTuple):
 
 
 def solve(rows: Rows, active: list[Any], own: int) -> list[Solved]:
-    """Solve by elimination: first each channel's own unknowns, then those that the channels have in common.
+    """Solve by elimination: first each channel's ``own`` unknowns, then those that the channels have in common.
 
-    Args:
-        rows: of G, and b.
-        active: which may move; the error of what may not is that which it would have.
-        own: how many are a channel's own.
+    What is not active may not move, and its error is that which it would have.
     """
     eliminated = []
     for k in range(own):

@@ -137,12 +137,7 @@ class MapProblem:
     def fit(self, values: np.ndarray, surface: Surface, band: int = 0) -> dict[str, np.ndarray]:
         """The layers of some tiles, (N * TILE, ...); what a lane without a texel has comes after those with one.
 
-        Where there are several models the criterion of each is a layer, "criteria".
-
-        Args:
-            values: what they show.
-            surface: what they see.
-            band: whose they are, which has its device.
+        Where there are several models the criterion of each is a layer, "criteria"; the band has its device.
         """
         given, dtype = self.photographs, np.dtype(self.precision)
         curves = tuple(one.curve for one in given.each)

@@ -31,12 +31,7 @@ def _told(where, what, remedy):
 def read_array(file: Any, where: object) -> np.ndarray:
     """An array from NumPy's format; whatever a damaged one claims, no more memory is filled than there is to read.
 
-    Args:
-        file: open for reading bytes.
-        where: the file, for messages.
-
-    Raises:
-        InputError: where it holds no plain numbers or is damaged.
+    Refused where it holds no plain numbers or is damaged; ``where`` names it.
     """
     # NumPy reads the header as Python: a damaged one raises what its parser does, or warns.
     with _told(where, "is no array", "Save plain numbers with numpy.save"), warnings.catch_warnings(action="ignore"):

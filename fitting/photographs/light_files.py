@@ -13,17 +13,7 @@ MOST_BYTES = 1 << 22
 
 
 def parse_numbers(text: str, where: str, count: int, words: str) -> list[float]:
-    """Numbers with commas between them.
-
-    Args:
-        text: what was typed.
-        where: the option or line, for the message.
-        count: how many are wanted.
-        words: what they are.
-
-    Raises:
-        InputError: where they are not so many finite numbers.
-    """
+    """So many finite numbers with commas between them; ``where`` is the option or line and ``words`` what is wanted."""
     try:
         values = [parse_number(word) for word in text.replace(",", " ").split()]
     except ValueError:

@@ -52,11 +52,7 @@ def device_count() -> int:
 
 
 def own(count: int) -> list[int]:
-    """Which of so many tiles this process deals with.
-
-    Args:
-        count: how many there are.
-    """
+    """Which of so many tiles this process deals with."""
     mesh = _MESH.get()
     if mesh is None:
         return list(range(count))
@@ -65,27 +61,16 @@ def own(count: int) -> list[int]:
 
 
 def placed(index: int, tile: Any) -> Any:
-    """A tile on its device; as it is where that is another process's, or there is no mesh.
-
-    Args:
-        index: which one it is.
-        tile: a pytree.
-    """
+    """A tile, a pytree, on its device; as it is where that is another process's, or there is no mesh."""
     mesh = _MESH.get()
     device = None if mesh is None else mesh.devices.ravel()[index % mesh.size]
     return tile if device is None or device.process_index != jax.process_index() else jax.device_put(tile, device)
 
 
 def gathered(parts: dict[int, np.ndarray], count: int, shape: tuple[int, ...]) -> np.ndarray:
-    """What each tile gave, in the order of the tiles, from all processes, (count, ...).
+    """What each tile gave, in the order of the tiles, from all processes, (count, ...), of a shape each.
 
-    Args:
-        parts: of the tiles that this process has dealt with, in float64.
-        count: how many tiles there are.
-        shape: of a part.
-
-    Raises:
-        InputError: where another process is lost.
+    Given are the parts of those that this process has dealt with, in float64; refused where another process is lost.
     """
     whole = np.zeros((count, *shape))
     for index, part in parts.items():

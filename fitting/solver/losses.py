@@ -58,17 +58,9 @@ def reweight(
 ) -> tuple[Sequence[Picture], Optimum, float]:
     """Fit with a loss of any kind: squared fits, each with the weights of the last one's optimum, until it rests.
 
-    Args:
-        pictures: as for the search.
-        optimum: of the squared fit.
-        optimise: that fit.
-        loss: one of `LOSSES`.
-        rounding: standard deviation of a value's rounding, (C,); no scale is smaller.
-
-    Returns:
-        The pictures with the weights of the last round, its optimum, and what the weighted residual's standard
-        deviation is multiplied by to give that which the formula for standard errors needs: the weights know the
-        residuals.
+    No scale is below ``rounding``, the standard deviation of a value's. Gives the pictures with the weights of the last
+    round, its optimum, and what the weighted residual's standard deviation is multiplied by to give that which the
+    formula for standard errors needs: the weights know the residuals.
     """
     now, robust = pictures, loss in ("huber", "cauchy")
     if loss == "squared":
@@ -131,14 +123,9 @@ def weights(
     base: Float[np.ndarray, "P Cw"],
     scale: Float[np.ndarray, " C"],
 ) -> Float[np.ndarray, "P Cw"]:
-    """rho'(r) / r of each pixel, times its own weight.
+    """rho'(r) / r of each pixel, times its own weight under the squared loss.
 
-    Args:
-        loss: "huber", "cauchy", "relative" or "log".
-        target: the picture.
-        model: what it is compared with.
-        base: weight of each pixel under the squared loss; 0 where it does not count.
-        scale: standard deviation of good residuals; or the darkest value of a relative or log loss, (C,).
+    The scale is the standard deviation of good residuals, or the darkest value of a relative or log loss.
     """
     target = np.where(base > 0, target, model)
     bright = np.maximum(model, scale)

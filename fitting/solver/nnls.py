@@ -21,18 +21,11 @@ _OF_LOBE = np.array([0.0, 0.0, 1.0]), np.array([[1.0, 0.0, 0.0]])
 
 
 def above(gram: Any, product: Any, low: Any, free: Any, least: Any) -> Any:
-    """Minimise x G x - 2 b x over x at least ``low``, exactly, by NumPy or JAX.
+    """Minimise x G x - 2 b x over x at least ``low``, exactly, by NumPy or JAX; (..., U).
 
     The others are solved for with the first unknown eliminated. The problem is convex: where that puts the first below
-    its bound, the minimum lies on the bound, and the others are solved for there.
-
-    Args:
-        gram: G, (..., U, U).
-        product: b, (..., U).
-        low: the bounds, (..., U).
-        free: which unknowns may be above it, (..., U).
-        least: of each unknown, (..., U): what elimination leaves of its diagonal entry is above that, or the unknown
-            stays at its bound.
+    its bound, the minimum lies on the bound, and the others are solved for there. An unknown that is not free stays
+    there, and so does one of whose diagonal entry elimination does not leave more than ``least``.
     """
     xp: Any = np if isinstance(gram, np.ndarray) else jnp
     moves = free[..., :1] & (gram[..., :1, 0] > least[..., :1])
@@ -62,20 +55,11 @@ def nonnegative_minima(
 ) -> Any:
     """Minimise (x - s) G (x - s) - 2 b (x - s) over x at least 0, and w x at most 1 where there is a cap, exactly.
 
-    That has no iterations and no tolerance on the answer. The step from the start is what is solved for, so no digits
-    are lost near the optimum.
-
-    Args:
-        gram: G, of any number of problems; by NumPy, or by JAX where it is an array of that.
-        product: b.
-        start: s.
-        free: which unknowns may be above 0.
-        tolerance: share of a diagonal entry below which what elimination leaves of it counts as rounding: the column
-            then depends on the others, and a smaller active set does as well.
-        cap: w, of ambient, diffuse and lobe: 0, and two numbers above it; by NumPy alone.
-
-    Returns:
-        x, (..., U).
+    That has no iterations and no tolerance on the answer. The step from the start s is what is solved for, so no digits
+    are lost near the optimum. Of any number of problems; by NumPy, or without a cap by JAX where G is an array of that.
+    What elimination leaves of a diagonal entry counts as rounding below that share of it, the tolerance: the column
+    then depends on the others, and a smaller active set does as well. The cap is w of ambient, diffuse and lobe: 0, and
+    two numbers above it.
     """
     xp: Any = np if isinstance(gram, np.ndarray) else jnp
     start, square = xp.broadcast_to(start, product.shape), xp.diagonal(gram, axis1=-2, axis2=-1)
@@ -103,11 +87,6 @@ def nonnegative_minimum(
     gram: Float[np.ndarray, "U U"], product: Float[np.ndarray, " U"], signed: Bool[np.ndarray, " U"] | None = None
 ) -> Float[np.ndarray, " U"]:
     """Minimise x G x - 2 b x over x at least 0, except where ``signed``: the active set method.
-
-    Args:
-        gram: G, positive semidefinite.
-        product: b.
-        signed: which unknowns may be negative; None for none.
 
     Source: C. L. Lawson and R. J. Hanson, Solving Least Squares Problems, 1974, chapter 23.
     """
@@ -145,9 +124,7 @@ def nonnegative_minimum(
 def scaled_inverse(gram: Float[np.ndarray, "U U"], share: float = 1e-12) -> Float[np.ndarray, "U U"]:
     """The inverse of a positive semidefinite matrix whose unknowns are of any size; 0 along what it does not determine.
 
-    Args:
-        gram: the matrix; rows and columns of 0 for what is left out.
-        share: of the largest eigenvalue, unknowns in units of their own columns; a smaller one determines nothing.
+    That is eigenvalues below a share of the largest, unknowns in units of their own columns.
     """
     scale = np.sqrt(np.where(np.diag(gram) > 0, np.diag(gram), 1.0))
     unit = np.outer(scale, scale)
@@ -155,12 +132,7 @@ def scaled_inverse(gram: Float[np.ndarray, "U U"], share: float = 1e-12) -> Floa
 
 
 def inverse_diagonal(gram: Float[np.ndarray, "U U"], share: float = 1e-10) -> Float[np.ndarray, " U"]:
-    """The diagonal of the inverse; infinite for an unknown that takes part in an undetermined combination.
-
-    Args:
-        gram: positive semidefinite.
-        share: of the largest eigenvalue, unknowns in units of their own columns; a smaller one determines nothing.
-    """
+    """The diagonal of `scaled_inverse`; infinite for an unknown that takes part in what that leaves out."""
     scale = np.sqrt(np.where(np.diag(gram) > 0, np.diag(gram), 1.0))
     value, vector = np.linalg.eigh(gram / np.outer(scale, scale))
     known = value > max(share * value[-1], 0.0)

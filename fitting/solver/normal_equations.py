@@ -91,11 +91,7 @@ class Picture:
         return some
 
     def columns(self, n: float) -> Float[np.ndarray, "4 P C"]:
-        """What x_a, x_d, x_s multiply, and the derivative of the last by n, on the host.
-
-        Args:
-            n: the exponent.
-        """
+        """What x_a, x_d, x_s multiply, and the derivative of the last by n, on the host."""
         found = np.zeros((4, *self.target.shape), np.float64)
         found[0], found[1] = self.ambient, self.diffuse
         if self.lobe is not None:
@@ -121,12 +117,7 @@ class Picture:
         return xp.broadcast_to(radiance, self.target.shape)
 
     def predict(self, n: float, x: Float[np.ndarray, "3 C"]) -> Float[np.ndarray, "P C"]:
-        """What the model shows, on the host; by NumPy where that takes less time than to trace and load a program.
-
-        Args:
-            n: the exponent.
-            x: coefficients.
-        """
+        """What the model shows, on the host; by NumPy where that takes less time than to trace and load a program."""
         picture = self
         if self.target.size <= FEW_VALUES and device_count() == 1 and not self.is_sampled:
             picture = jax.tree.map(np.asarray, self)
@@ -214,8 +205,7 @@ class Sums(NamedTuple):
     def about(self, reference: np.ndarray) -> "Sums":
         """The same sums with the residual against the reference model replaced by the target, or by another residual.
 
-        Args:
-            reference: What to add to the residual, as coefficients of the first columns, (..., C, 3) or more.
+        The reference is what to add to the residual, as coefficients of the first columns, (..., C, 3) or more.
         """
         first = slice(reference.shape[-1])
         moved = (self.gram[..., first] @ reference[..., None])[..., 0]
@@ -229,12 +219,9 @@ class Sums(NamedTuple):
 
 
 def totals(terms: Sequence[Any], combine: Sequence[str], axes: tuple[int, ...]) -> list[Any]:
-    """The total of each array over some axes, under JAX in one loop.
+    """The total of each array of one shape over some axes, by "add" or "maximum"; under JAX in one loop.
 
-    Args:
-        terms: of one shape, in NumPy or JAX.
-        combine: "add" or "maximum", of each.
-        axes: to reduce; the last ones first where it matters, as in NumPy.
+    Axes are reduced the last ones first where it matters, as in NumPy.
     """
     if isinstance(terms[0], np.ndarray):
         # One axis after the other: sums over the first are as long as the others.
@@ -266,9 +253,8 @@ def _summed(columns: int, residuals: int) -> list[tuple[int, int]]:
 def _pass(picture: Picture, log_n: Array, count: Array, reference: Array, peak: Array) -> tuple[Array, Array]:
     """For the first exponents the sums of each block of pixels, and what was taken off its columns.
 
-    Returns:
-        (exponents, blocks, groups, products), the last product counting the pixels; a group is all the channels where
-        they share basis and weight, else one of them. And (exponents, blocks, 3, groups).
+    (exponents, blocks, groups, products), the last product counting the pixels; a group is all the channels where they
+    share basis and weight, else one of them. And (exponents, blocks, 3, groups).
     """
     pixels, channels = picture.target.shape
     dtype, blocks = picture.target.dtype, max(1, -(-pixels // at_a_time(BLOCK)))
@@ -343,20 +329,12 @@ def _unpack(packed: np.ndarray, mean: np.ndarray, ambient: AnyArray, channels: i
 def sums(
     pictures: Sequence[Picture], log_n: Float[np.ndarray, " N"], reference: Float[np.ndarray, "C 3"], peak: float = 0.0
 ) -> Sums:
-    """One pass over the pixels of one or many pictures, each let go before the next is asked for.
+    """One pass over the pixels of one or many pictures, or tiles, each let go before the next is asked for.
 
-    Under a mesh each process makes those of its own devices (`fitting.solver.devices`).
-
-    The columns are ambient, diffuse, lobe, and the derivative of that by log n; the last two are 0 without a lobe.
-
-    Args:
-        pictures: The pictures, or the tiles of one; at least one.
-        log_n: Natural logarithms of some exponents.
-        reference: Coefficients x_a, x_d, x_s of the reference model, whose lobe is that of the exponent.
-        peak: Take ``S exp(-n peak)`` for the lobe, its derivative and the reference; see :class:`brdf.lobes.Lobe`.
-
-    Returns:
-        The sums over all pixels, at each exponent, with a leading axis N.
+    Under a mesh each process makes those of its own devices (`fitting.solver.devices`). The columns are ambient,
+    diffuse, lobe, and the derivative of that by log n; the last two are 0 without a lobe. Gives the sums at each
+    exponent, residuals being those of a model with the reference's coefficients and the exponent's lobe. For the lobe,
+    its derivative and the reference ``S exp(-n peak)`` is taken; see :class:`brdf.lobes.Lobe`.
     """
     totals: list[Sums] = []
     for first in range(0, len(log_n), _MOST_EXPONENTS):

@@ -95,11 +95,7 @@ class Optimum:
         return self.gram * scale[:, :, None] * scale[:, None, :]
 
     def normal(self, variance: Float[np.ndarray, " C"] | float = 1.0) -> NormalEquations:
-        """Normal equations of all channels.
-
-        Args:
-            variance: of each channel's noise.
-        """
+        """Normal equations of all channels by the variance of each one's noise."""
         return join_channels(self.gram, self.product, self.square, self.x[2], variance)
 
 
@@ -111,18 +107,11 @@ def search(
 ) -> Optimum:
     """Find the global optimum over the exponent and the non-negative coefficients.
 
-    Args:
-        pictures: Pictures of one material, all of one dtype and number of channels, or the tiles of a picture. They are
-            gone through once per pass over the pixels (three or four times), so a stream that loads each when asked
-            for keeps one in memory.
-        free: Which of x_a, x_d, x_s may be above 0, per channel; all by default. If no x_s may be, or no picture has a
-            lobe, the problem is linear and n without meaning.
-        n_range: Smallest and largest exponent, above 0.
-        cap: From the exponent to what x_a, x_d, x_s of each channel count in a sum of at most 1, (3, C); None for no
-            such bound.
-
-    Returns:
-        The optimum.
+    Pictures of one material, or tiles of one, are of one dtype and number of channels. They are gone through once per
+    pass over the pixels (three or four times), so a stream that loads each when asked for keeps one in memory. All
+    coefficients that are free, or all by default, may be above 0; if no x_s may be, or no picture has a lobe, the
+    problem is linear and n without meaning. The cap is from the exponent to what x_a, x_d, x_s of each channel count in
+    a sum of at most 1, (3, C).
     """
     with jax.enable_x64(True):
         problem = problem_of(pictures, n_range, free)._replace(cap=cap)
@@ -178,14 +167,9 @@ def refit(
     n_range: tuple[float, float],
     tied: Float[np.ndarray, " C"] | None = None,
 ) -> Optimum:
-    """The optimum near another one: of other weights, or with one specular coefficient for all channels.
+    """The optimum near that of a search with the same ``free``: of other weights, or with one x_s for all channels.
 
-    Args:
-        pictures: as they were searched.
-        optimum: of the search with the same ``free``.
-        free: which coefficients may be above 0.
-        n_range: bounds of n.
-        tied: x_s is a common factor times this, (C,); None where the channels are independent.
+    It is then a common factor times ``tied``; None where the channels are independent.
     """
     x = optimum.x.copy()
     if tied is not None:
@@ -236,10 +220,7 @@ def _sampling_errors(profile: Point, sample: Subsample, lobes: Sequence[Lobes]) 
 def lowest_in_cells(log_n: Any, cost: Any, slope: Any) -> tuple[Any, Any]:
     """Where in each cell of a grid the cubic of Hermite through the samples is least, and how low.
 
-    Args:
-        log_n: of the samples, (G,), in NumPy or JAX.
-        cost: at each.
-        slope: its derivative by log n.
+    The slope is the derivative of the cost by log n, (G,); in NumPy or JAX.
     """
     xp: Any = np if isinstance(cost, np.ndarray) else jnp
     t, step = xp.linspace(0.0, 1.0, 33, dtype=log_n.dtype), xp.diff(log_n)
@@ -253,9 +234,7 @@ def lowest_in_cells(log_n: Any, cost: Any, slope: Any) -> tuple[Any, Any]:
 def _cells(profile: Point, error: Any = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The lowest place in each cell of the grid, how low, and whether it may be the best.
 
-    Args:
-        profile: On the grid.
-        error: Standard deviation of the cost at each sample relative to the best.
+    The error is the standard deviation of the cost at each sample relative to the best.
     """
     position, lowest = lowest_in_cells(profile.log_n, profile.cost.sum(axis=1), profile.slope)
     steeper, error = (np.maximum(a[:-1], a[1:]) for a in (np.abs(profile.slope), error + np.zeros(len(profile.log_n))))

@@ -74,13 +74,7 @@ class Point(NamedTuple):
 def problem_of(
     pictures: Sequence[Picture], n_range: tuple[float, float], free: Bool[np.ndarray, "3 C"] | None
 ) -> Problem:
-    """The problem of some pictures, all of one dtype.
-
-    Args:
-        pictures: of one material.
-        n_range: smallest and largest exponent.
-        free: which coefficients may be above 0; None for all.
-    """
+    """The problem of some pictures, all of one dtype, whose coefficients may be above 0 where free."""
     target = pictures[0].target
     free = np.ones((3, target.shape[1]), bool) if free is None else np.asarray(free)
     tolerance, accuracy = (TOLERANCE_SINGLE, 2e-6) if target.dtype == np.float32 else (TOLERANCE_DOUBLE, 1e-10)
@@ -88,16 +82,10 @@ def problem_of(
 
 
 def solve_linear(parts: Sums, log_n: Float[np.ndarray, " N"], reference: np.ndarray, problem: Problem) -> Point:
-    """The best coefficients at each of some exponents.
+    """The best coefficients at each of some exponents, of sums with a leading axis N.
 
     By the envelope theorem the coefficients may be held for the slope: -2 x_s <S', r>, r the best residual; and where
     the cap is reached, its multiplier times the change of the cap.
-
-    Args:
-        parts: Sums, columns ambient, diffuse, lobe and derivative by log n; with a leading axis N.
-        log_n: The exponents.
-        reference: The reference model of the sums, (C, 3).
-        problem: Bounds.
     """
 
     def caps(shift: float) -> np.ndarray:
@@ -130,13 +118,7 @@ def solve_linear(parts: Sums, log_n: Float[np.ndarray, " N"], reference: np.ndar
 
 
 def capped_minimum(problem: Problem, point: Point, reach: float) -> tuple[Point, Sums]:
-    """The minimum under a cap near an exponent: where the slope is 0, or at an end.
-
-    Args:
-        problem: What is searched.
-        point: Where to start.
-        reach: How far from there log n may go.
-    """
+    """The minimum under a cap near an exponent: where the slope is 0, or log n as far as it reaches."""
     from scipy.optimize import brentq  # late: few fits have a cap
 
     x, found = point.x, dict[float, tuple[Point, Sums]]()
@@ -160,16 +142,9 @@ def capped_minimum(problem: Problem, point: Point, reach: float) -> tuple[Point,
 
 
 def _correct(parts: Sums, point: Point, problem: Problem, bounds: tuple[float, float]) -> tuple[Point, float]:
-    """One joint Gauss-Newton step from a point; its active set is kept.
+    """One joint Gauss-Newton step from a point, whose active set is kept; and about how far off in log n it still is.
 
-    Args:
-        parts: Sums at the point, the reference being its own coefficients.
-        point: The point.
-        problem: What is searched.
-        bounds: Of log n.
-
-    Returns:
-        The new point, and about how far from the optimum in log n it still is.
+    The reference of the sums is the point's own coefficients.
     """
     x_s = point.x[:, 2]
     gram, product, _ = join_channels(*parts[:3], x_s)
@@ -199,20 +174,13 @@ def _correct(parts: Sums, point: Point, problem: Problem, bounds: tuple[float, f
 
 
 def gauss_newton(problem: Problem, point: Point, reach: float = math.inf) -> tuple[Point, Sums]:
-    """Residual passes with joint corrections until n stands still: exact cost, sums about the target.
+    """Residual passes with joint corrections until n stands still: the minimum, and the sums about the target.
 
     At each exponent the best coefficients are found anew, so that a coefficient may leave 0 or come to it. Where noise
     leaves n loosely determined a Gauss-Newton step may pass the minimum: a point that costs more than the last is
     brought back, to the minimum of the parabola through both. Nothing is returned on the word of the quadratic model
-    unless its step was negligible.
-
-    Args:
-        problem: What is searched.
-        point: Where to start; its cost is not looked at.
-        reach: How far from there log n may go.
-
-    Returns:
-        The minimum, and the sums at it or next to it, about the target.
+    unless its step was negligible. The cost of the start is not looked at; log n goes no farther from there than
+    ``reach``.
     """
     held, about, slope, last = point, None, 0.0, math.inf
     least, most = problem.bounds

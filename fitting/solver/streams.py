@@ -10,12 +10,7 @@ class Stream(Sequence[T]):
     """Elements made when asked for, again each time; only the last one is kept."""
 
     def __init__(self, make: Callable[[int], T], count: int):
-        """Make a sequence.
-
-        Args:
-            make: gives an element by its index.
-            count: how many there are.
-        """
+        """A sequence of so many elements, each made by its index."""
         self._make, self._count = make, count
         self._last: tuple[int, T] | None = None
 
@@ -34,23 +29,14 @@ class Stream(Sequence[T]):
 
 
 def each(function: Callable[..., T], *sequences: Sequence[Any]) -> Sequence[T]:
-    """A function of the elements of sequences of one length: a list, or a stream where one of them is one.
-
-    Args:
-        function: of as many elements as there are sequences.
-        sequences: any.
-    """
+    """A function of the elements of sequences of one length: a list, or a stream where one of them is one."""
     if any(isinstance(sequence, Stream) for sequence in sequences):
         return Stream(lambda i: function(*(sequence[i] for sequence in sequences)), len(sequences[0]))
     return list(map(function, *sequences))
 
 
 def joined(sequences: Sequence[Sequence[T]]) -> Sequence[T]:
-    """One sequence after the other: a list, or a stream where one of them is one.
-
-    Args:
-        sequences: any number.
-    """
+    """One sequence after the other: a list, or a stream where one of them is one."""
     places = [(sequence, i) for sequence in sequences for i in range(len(sequence))]
     if any(isinstance(sequence, Stream) for sequence in sequences):
         return Stream(lambda i: places[i][0][places[i][1]], len(places))

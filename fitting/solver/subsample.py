@@ -60,12 +60,7 @@ class Subsample(NamedTuple):
         return all(factor is None for factor in self.factor)
 
     def lobes(self, log_n: Float[np.ndarray, " N"], peak: float) -> list["Lobes"]:
-        """Of each picture the lobe at some exponents.
-
-        Args:
-            log_n: Natural logarithms of the exponents.
-            peak: See :class:`brdf.lobes.Lobe`.
-        """
+        """Of each picture the lobe at some exponents; ``peak`` as in :class:`brdf.lobes.Lobe`."""
         return [_lobes(part, log_n, peak) for part in self.parts]
 
     def sums(self, lobes: Sequence["Lobes"]) -> Sums:
@@ -74,16 +69,9 @@ class Subsample(NamedTuple):
         return Sums(*(np.sum(leaf, axis=0) for leaf in zip(*totals, strict=True)))
 
     def spread(self, lobes: Sequence["Lobes"], few: np.ndarray, x: Float[np.ndarray, "N C 3"], best: int) -> np.ndarray:
-        """How far the subsample's profile may be from that of all pixels.
+        """How far the subsample's profile may be from that of all pixels, at a few of the exponents.
 
-        Args:
-            lobes: At all exponents.
-            few: Which of these to look at.
-            x: Best coefficients at each of them.
-            best: Which to compare with.
-
-        Returns:
-            Horvitz-Thompson variances of the cost at each exponent minus that at the best.
+        Horvitz-Thompson variances of the cost at each minus that at the best; x are the best coefficients.
         """
         total = np.zeros(few.size)
         for part, factor, lobe in zip(self.parts, self.factor, lobes, strict=True):
@@ -156,14 +144,7 @@ def _sums(part: Picture, lobes: Lobes) -> Sums:
 
 
 def subsample(pictures: Sequence[Picture]) -> Subsample:
-    """Take some pixels of each picture.
-
-    Args:
-        pictures: all that are searched.
-
-    Returns:
-        The pixels kept: all of a small picture, and where there is no lobe.
-    """
+    """Take some pixels of each picture; all of a small one, and where there is no lobe."""
     size = max(SMALLEST_SAMPLE, SAMPLE_SIZE // len(pictures))
     parts, factors, nearest = [], [], math.inf
     for picture in pictures:
@@ -188,12 +169,9 @@ def _spread(count: int) -> np.ndarray:
 
 
 def stratified(log_cos: np.ndarray, counts: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Some pixels, and how many each stands for.
+    """About so many of the pixels that count, and how many each stands for.
 
-    Args:
-        log_cos: of each pixel, its size the distance from the peak.
-        counts: which may be taken.
-        size: about how many.
+    The size of ``log_cos`` is the distance from the peak.
     """
     # The octave of a number is its binary exponent, 0 at the peak itself.
     octave = ((log_cos.astype(np.float32, copy=False).view(np.int32) >> 23) & 0xFF).astype(np.uint8)

@@ -34,14 +34,9 @@ def join_channels(
     x_s: Float[np.ndarray, " C"],
     variance: Float[np.ndarray, " C"] | float = 1.0,
 ) -> NormalEquations:
-    """Gather the channels.
+    """Gather the channels' products of ambient, diffuse, lobe and derivative, which x_s multiplies, by their noise.
 
-    Args:
-        gram: of ambient, diffuse, lobe, derivative; or of those of any two channels, where these err together.
-        product: of these with the target.
-        square: of the target.
-        x_s: what multiplies the derivative.
-        variance: of each channel's noise.
+    They are those of a channel, or of any two where these err together.
     """
     channels = x_s.size
     variance = np.broadcast_to(variance, channels)
@@ -67,10 +62,7 @@ def places_of(channels: int) -> Int[np.ndarray, "C 4"]:
 def design_of(free: Bool[np.ndarray, "3 C"], tied: Float[np.ndarray, " C"] | None) -> Float[np.ndarray, "U V"]:
     """Columns: what each unknown of a smaller model moves; the last one moves n, if any x_s is free.
 
-    Args:
-        free: which coefficients it has.
-        tied: x_s is a common factor times this, (C,), and the factor the last but one; None where the channels are
-            independent.
+    Where x_s is a common factor times ``tied`` the factor is the last but one.
     """
     identity = np.eye(free.size + 1)
     if tied is None:

@@ -91,12 +91,7 @@ class Uncertainty(NamedTuple):
 
 
 def residual_noise(optimum: Optimum, rounding: Float[np.ndarray, " C"]) -> Float[np.ndarray, " C"]:
-    """Standard deviation of the residual, never below that of rounding: in a black channel that of the brightest one.
-
-    Args:
-        optimum: of the engine.
-        rounding: standard deviation of a value's rounding, (C,).
-    """
+    """Standard deviation of the residual, not below that of rounding: in a black channel that of the brightest one."""
     degrees = np.maximum(_degrees(optimum), 1)
     least = np.max(optimum.square / degrees) * np.finfo(float).eps ** 2 + np.finfo(float).tiny
     return np.sqrt(np.maximum(optimum.cost / degrees, np.maximum(rounding**2, least)))
@@ -264,9 +259,7 @@ def _adds_evenly(optimum: Optimum) -> bool:
 def specular_gain(gram: Float[np.ndarray, "U U"], x: Float[np.ndarray, "3 C"]) -> float:
     """By how many noise variances the cost rises without the specular term.
 
-    Args:
-        gram: of all channels, by x_a, x_d, x_s, channel after channel, and the exponent; the noise of each is 1.
-        x: coefficients.
+    The gram is of x_a, x_d, x_s, channel after channel, and the exponent; the noise of each is 1.
     """
     lobe = np.append(np.zeros(x[:2].size), x[2])
     others = np.flatnonzero(x[:2].ravel() > 0)
@@ -276,12 +269,7 @@ def specular_gain(gram: Float[np.ndarray, "U U"], x: Float[np.ndarray, "3 C"]) -
 
 
 def rms_columns(optimum: Optimum, weight: float = 1.0) -> Float[np.ndarray, "3 C"]:
-    """Root mean square over pixels of what each term shows at 1.
-
-    Args:
-        optimum: of the engine.
-        weight: root of the mean weight of its pixels.
-    """
+    """Root mean square over pixels of what each term shows at 1; ``weight`` is the root of the mean weight of these."""
     squares = np.diagonal(optimum.gram[:, :3, :3], axis1=1, axis2=2).T
     return np.sqrt(np.maximum(squares, 0.0) / np.maximum(optimum.pixels, 1)) / weight
 
@@ -359,10 +347,5 @@ def _inverted(
 
 
 def inverse_among(hessian: Float[np.ndarray, "U U"], basis: Float[np.ndarray, "U V"]) -> Float[np.ndarray, "U U"]:
-    """The inverse of a Hessian among the columns of a basis, 0 beside them.
-
-    Args:
-        hessian: positive semidefinite.
-        basis: any columns.
-    """
+    """The inverse of a positive semidefinite Hessian among the columns of a basis, 0 beside them."""
     return basis @ scaled_inverse(basis.T @ hessian @ basis, 1e-14) @ basis.T

@@ -37,10 +37,5 @@ class Highlight(NamedTuple):
         return self.pixels > 2 * FEW_PIXELS
 
     def share(self, x: Float[np.ndarray, "3 C"], brightest: Float[np.ndarray, " C"]) -> float:
-        """The largest value of the specular term over that of the picture.
-
-        Args:
-            x: coefficients.
-            brightest: value of each channel.
-        """
+        """The largest value of the specular term over that of the picture."""
         return float(np.max(x[2]) * self.largest / max(np.max(brightest), np.finfo(float).tiny))

@@ -61,11 +61,8 @@ WIDEST_INTERVAL = 100.0
 def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: Residual | None = None) -> FitResult:
     """Tell what a fit says.
 
-    Args:
-        fit: of one model.
-        observed: what was fitted.
-        hidden: why there is no highlight, where a fit with one has found that.
-        statistics: of what least squares leaves, in the unit of the picture, where that has been gone over.
+    ``hidden`` is why there is no highlight, where a fit with one has found that, ``statistics`` those of what least
+    squares leaves, in the unit of the picture, where that has been gone over.
     """
     optimum, pictures, residual = fit.optimum, fit.pictures, fit.residual
     about = observed.result_fields() | {"optimum": optimum, "pixels": int(np.min(optimum.pixels))}
@@ -187,9 +184,7 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: R
 def _clipped(optimum: Optimum, tied: np.ndarray | None) -> Bool[np.ndarray, "3 C"]:
     """Coefficients of channels that are clipped wherever another channel tells them: an open end gives no error.
 
-    Args:
-        optimum: of least squares, which leaves out what is clipped.
-        tied: see `fitting.model_fit.ModelFit`; what channels share one of them tells.
+    By least squares, which leave out what is clipped; what channels share by ``tied`` one of them tells.
     """
     squares = np.diagonal(optimum.gram, axis1=1, axis2=2)[:, :3].T
     lost = optimum.pixels < np.max(optimum.pixels)
@@ -204,14 +199,8 @@ def shared_errors(
     """What takes the place of the Hessian where neighbours share errors, None where they do not; and how much they do.
 
     Last how the channels' errors go together, where that is known of all values, and neighbours' are not looked at.
-
-    They do in a file that was compressed with losses, or where the residual shows it.
-
-    Args:
-        evidence: of a fit.
-        observed: of which its pictures were made.
-        covariance: see `fitting.uncertainty.structure.scatter`.
-        missed: what light samples leave out, root mean square.
+    They do in a file that was compressed with losses, or where the residual shows it. The covariance is that of
+    `fitting.uncertainty.structure.scatter`, ``missed`` the root mean square of what light samples leave out.
     """
     lossy = any(tile.bounds is not None and tile.bounds.lossy for tile in observed.tiles)
     channels, few = None, evidence.noise < ROUNDED
@@ -251,12 +240,7 @@ def _scores(score: np.ndarray, information: np.ndarray, place: tuple[np.ndarray,
 
 
 def alone_covariance(optimum: Optimum, tied: np.ndarray | None) -> Float[np.ndarray, "U U"]:
-    """Covariance of independent pixels whose weights are inverse variances.
-
-    Args:
-        optimum: with the sums of these.
-        tied: see `fitting.model_fit.ModelFit`.
-    """
+    """Covariance of independent pixels whose weights are inverse variances."""
     return inverse_among(optimum.normal().gram, design_of(optimum.x > 0, tied))
 
 
@@ -285,15 +269,10 @@ def _open_exponent(interval: tuple[float, float]) -> str:
 def material_and_parameters(
     fit: ModelFit, errors: Uncertainty, colour: Float[np.ndarray, " C"], interval: tuple[float, float] | None
 ) -> tuple[brdf.Material, tuple[Parameter, ...]]:
-    """The material that was found, and its numbers with their errors.
+    """The material that was found, and its numbers with their errors; ``interval`` is that of the exponent.
 
-    What is not determined is 0 in the material, unless it is part of a sum that is: that the material shows.
-
-    Args:
-        fit: of one model.
-        errors: its errors, in the units of the solver.
-        colour: what was taken out of the lights, (C,).
-        interval: of the exponent.
+    What is not determined is 0 in the material, unless it is part of a sum that is: that the material shows. Errors are
+    in the units of the solver; the colour was taken out of the lights.
     """
     found: list[Parameter] = []
     k: dict[str, Any] = {}

@@ -44,13 +44,10 @@ def _acceptance() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def student_95(degrees: Any) -> Any:
-    """By how many standard errors a 95 % interval reaches where these are known from so many degrees of freedom.
+    """By how many standard errors a 95 % interval reaches where these are known from some degrees of freedom, above 0.
 
     Source: M. Abramowitz and I. A. Stegun, Handbook of Mathematical Functions, 26.7.5; a tenth short for one degree, a
     hundredth for two.
-
-    Args:
-        degrees: values less unknowns, above 0; a number or an array.
     """
     z = NORMAL_95
     terms = (
@@ -63,18 +60,11 @@ def student_95(degrees: Any) -> Any:
 
 
 def above_zero(value: float, error: float) -> tuple[float, float]:
-    """The 95 % interval of a coefficient that cannot be negative.
+    """The 95 % interval of a coefficient that cannot be negative, from an estimate without that bound.
 
     It covers the truth in 95 % of draws wherever the truth lies, at 0 too, where it is one-sided; far from 0 it is
     value ± 1.96 errors. Source: G. J. Feldman and R. D. Cousins, "Unified approach to the classical statistical
     analysis of small signals", Phys. Rev. D 57 (1998) 3873-3889.
-
-    Args:
-        value: estimate without the bound; may be negative.
-        error: its standard error.
-
-    Returns:
-        Lower and upper end; 0 and infinity where the error is infinite.
     """
     if not math.isfinite(error):
         return 0.0, math.inf
@@ -90,21 +80,12 @@ def above_zero(value: float, error: float) -> tuple[float, float]:
 def exponent_interval(
     fit: ModelFit, n_error: float, reach: float, delta_cost: float, peak: float, *, parabolic: bool = False
 ) -> tuple[float, float]:
-    """The 95 % profile-likelihood interval of n: where the least cost rises by ``delta_cost``.
+    """The 95 % profile-likelihood interval of n: where the least cost rises by ``delta_cost``; else 0 or infinity.
 
-    A relative error below a hundredth needs no pixel: there the profile is a parabola in log n. Else the cost is
-    followed outwards from the optimum, a pass over the pixels at each exponent tried.
-
-    Args:
-        fit: of a model with a lobe.
-        n_error: standard error of n.
-        reach: see `fitting.uncertainty.covariance.Uncertainty`.
-        delta_cost: of the cost; likewise.
-        peak: logarithm of the lobe's cosine in the pixel nearest to its centre.
-        parabolic: the profile is taken for a parabola in any case.
-
-    Returns:
-        Lower and upper end; 0 and infinity where the cost does not rise before the bound of the search.
+    A relative error below a hundredth needs no pixel, nor does a profile that is taken for parabolic: there it is a
+    parabola in log n. Else the cost is followed outwards from the optimum, a pass over the pixels at each exponent
+    tried. ``reach`` and ``delta_cost`` are those of `fitting.uncertainty.covariance.Uncertainty`, ``peak`` the
+    logarithm of the lobe's cosine in the pixel nearest to its centre.
     """
     optimum = fit.optimum
     relative = n_error / optimum.n

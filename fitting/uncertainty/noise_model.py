@@ -42,15 +42,10 @@ POWERS = (0.0, 0.25, 0.5, 0.75)
 def noise_model(
     residual: Float[np.ndarray, "M C"], value: Float[np.ndarray, "M C"], least: Float[np.ndarray, " C"]
 ) -> Float[np.ndarray, "C 3"] | None:
-    """Find out whether noise grows with brightness.
+    """Whether noise grows with brightness: a, b, c of each channel's variance; None where a constant does as well.
 
-    Args:
-        residual: of some pixels that count, times the root of their weight.
-        value: what was fitted there.
-        least: standard deviation that rounding alone gives, (C,).
-
-    Returns:
-        a, b, c of each channel's variance, at least 0; None where a constant does as well.
+    Residuals of some pixels that count are times the root of their weight; ``least`` is the deviation of rounding
+    alone.
     """
     if len(residual) < 10 * ROUNDS:
         return None
@@ -73,13 +68,7 @@ def noise_model(
 def value_variance(
     residual: Float[np.ndarray, "M C"], value: Float[np.ndarray, "M C"], noise: Float[np.ndarray, " C"]
 ) -> Float[np.ndarray, "M C"]:
-    """The variance of each value: as it grows with brightness, or that of its channel where it does not.
-
-    Args:
-        residual: of the pixels that count.
-        value: what was fitted there.
-        noise: standard deviation of the residual, (C,).
-    """
+    """The variance of each value: as it grows with brightness, or that of its channel where it does not."""
     model = noise_model(residual, value, np.finfo(float).eps * np.max(np.abs(value), axis=0, initial=0.0))
     return np.broadcast_to(noise**2, value.shape) if model is None else _variance(model, np.maximum(value, 0.0))
 
@@ -118,14 +107,7 @@ def weighted_sums(
 ) -> Sums:
     """Sums at the optimum with each pixel's weight times its variance, or divided by it: one more pass.
 
-    Args:
-        pictures: as they were searched.
-        optimum: of the search.
-        coefficients: of the variance.
-        inverse: divide.
-
-    Returns:
-        The sums, columns ambient, diffuse, lobe, derivative by n, about the target.
+    Columns are ambient, diffuse, lobe, derivative by n, about the target; ``coefficients`` are those of the variance.
     """
     n, x = np.asarray(optimum.n), optimum.x
     return sums_at(pictures, optimum, lambda picture: _reweighted(picture, n, x, coefficients, inverse))
@@ -147,14 +129,7 @@ def misweighted_sums(pictures: Sequence[Picture], optimum: Optimum) -> Sums | No
 
     Weights of least squares are inverse variances, unless they say what is of interest: those of a soft mask, of a
     region. Then noise is what it is beside them, and errors are those of the sandwich. Some pixels tell which of both,
-    and how large noise is; the sums are of all.
-
-    Args:
-        pictures: as they were searched.
-        optimum: of the search.
-
-    Returns:
-        The sums as those of `weighted_sums`; None where inverse variances are as likely.
+    and how large noise is; the sums are of all. None where inverse variances are as likely.
     """
     stride = -(-sum(int(picture.counts.sum()) for picture in pictures) // MOST_PIXELS)
     parts = [_squared_and_weight(picture, optimum, stride) for picture in pictures]

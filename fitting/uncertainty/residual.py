@@ -68,11 +68,7 @@ class Residual(NamedTuple):
     highlight: Highlight
 
     def channels(self, tell: Bool[np.ndarray, " C"]) -> Float[np.ndarray, "C C"] | None:
-        """Correlation of the channels' errors; None where no two channels err together.
-
-        Args:
-            tell: channels whose noise is more than rounding.
-        """
+        """Correlation of the channels' errors; None where no two err together whose noise is more than rounding."""
         size = np.sqrt(np.maximum(np.sum(self.errors**2, axis=0), np.finfo(float).tiny))
         found, own = (self.errors.T @ self.errors) / np.outer(size, size), np.eye(size.size)
         least = max(CORRELATED, DEVIATIONS / max(len(self.errors), 1) ** 0.5)
@@ -94,8 +90,7 @@ class Residual(NamedTuple):
 def variance_inflation(channels: Float[np.ndarray, "C C"] | None) -> float:
     """By what factor errors of what all channels share are too small at most, where each counts as one of its own.
 
-    Args:
-        channels: correlation of their errors; None where they err alone.
+    By the correlation of their errors; None where they err alone.
     """
     return 1.0 if channels is None else float(np.sqrt(np.linalg.eigvalsh(channels)[-1]))
 
@@ -107,14 +102,9 @@ def residual_statistics(
     noise: Float[np.ndarray, " C"],
     rounding: Float[np.ndarray, " C"],
 ) -> Residual:
-    """Go over what a fit leaves, a picture at a time.
+    """Go over what a fit leaves, a picture at a time, its pixels row by row, and its whole width.
 
-    Args:
-        pictures: pixels row by row.
-        widths: of the whole of each.
-        optimum: what was fitted.
-        noise: standard deviation of the weighted residual, (C,).
-        rounding: that of a value's rounding, (C,): neighbours in a channel with no more noise are not looked at.
+    Noise is the weighted residual's; neighbours in a channel with no more than that of rounding are not looked at.
     """
     most = max(FEWEST_PIXELS, SOME_PIXELS // len(pictures))
     blocks, pairs, errors, values = [], [], [], []
@@ -152,11 +142,7 @@ def residual_statistics(
 
 
 def neighbours_of(images: Sequence[Float[np.ndarray, "H W C"]]) -> Neighbours:
-    """How errors of neighbours in some pictures go together.
-
-    Args:
-        images: 0 where a pixel does not count.
-    """
+    """How errors of neighbours in some pictures go together; 0 where a pixel does not count."""
     pairs = []
     for image in images:
         left = image.reshape(-1, image.shape[2])
@@ -166,11 +152,7 @@ def neighbours_of(images: Sequence[Float[np.ndarray, "H W C"]]) -> Neighbours:
 
 
 def structure_warning(neighbours: Neighbours) -> tuple[str, ...]:
-    """What to say where neighbours err alike; nothing where they do not.
-
-    Args:
-        neighbours: of the residual.
-    """
+    """What to say where neighbours err alike; nothing where they do not."""
     words = f"the residual has structure: neighbouring pixels err alike (correlation {neighbours.correlation:.2f})"
     words = f"{words}, so model or scene are not the whole truth and the errors are too small"
     return (words,) if neighbours.significant else ()
@@ -206,12 +188,7 @@ def _residual_and_values(
 ) -> tuple[list[Any], list[Any], Any]:
     """Of each channel, or of all together where they are many, errors and what is shown, (G, P); and the lobe, (P,).
 
-    Args:
-        picture: in NumPy or JAX.
-        n: the exponent.
-        peak: the logarithm of a cosine: lobe and x_s are relative to its power.
-        x: coefficients.
-        noise: of each channel.
+    In NumPy or JAX; lobe and x_s are relative to the power n of the cosine whose logarithm is ``peak``.
     """
     xp: Any = np if isinstance(picture.diffuse, np.ndarray) else jnp
     channels, dtype = picture.target.shape[1], picture.target.dtype

@@ -131,22 +131,13 @@ def structure(
 
 
 def of_coded_blocks(errors: Errors) -> Blocks:
-    """Sums over the blocks of a codec, which are what its errors are independent in, each over two on a side.
-
-    Args:
-        errors: of one picture.
-    """
+    """Sums over the blocks of a codec, which are what its errors are independent in, each over two on a side."""
     # Colours have half the resolution.
     return _added(over_blocks(errors, CODED_BLOCK if errors.values.shape[1] == 1 else 2 * CODED_BLOCK).sums, 2)
 
 
 def over_blocks(errors: Errors, size: int) -> Blocks:
-    """Sums over blocks.
-
-    Args:
-        errors: of one picture.
-        size: of a block, pixels on a side.
-    """
+    """Sums over blocks of so many pixels on a side."""
     values, width = errors.values, errors.width
     rows = int(np.max(errors.pixel, initial=0)) // width + 1
     if errors.pixel.size == rows * width:
@@ -175,11 +166,7 @@ def coarser(grid: Float[np.ndarray, "H W C"], factor: int) -> Float[np.ndarray, 
 
 
 def shared(grids: Sequence[Blocks]) -> tuple[float, float]:
-    """What errs together within blocks: squares of sums less sums of squares; and what chance makes of it.
-
-    Args:
-        grids: of each picture.
-    """
+    """What errs together within blocks: squares of sums less sums of squares; and what chance makes of it."""
     excess = sum(float(np.sum(grid.sums**2 - grid.squares)) for grid in grids)
     return excess, math.sqrt(sum(float(np.sum(2 * grid.squares**2)) for grid in grids))
 
@@ -192,15 +179,10 @@ def scatter(
 ) -> Float[np.ndarray, "U U"]:
     """Products of the scores by x_a, x_d, x_s, channel after channel, and n, summed over blocks of pixels first.
 
-    That is what the Hessian would be if pixels of a block err together.
-
-    Args:
-        pictures: whose weights are inverse variances.
-        optimum: of the fit.
-        errors: of the pixels of each.
-        covariance: of independent pixels, for the residuals that blocks would have beside a fit without them: a
-            highlight in few blocks is fitted to their errors, which leave little of themselves (the jackknife; R. M.
-            Bell and D. F. McCaffrey, Survey Methodology 28 (2002) 169). None for those that they have.
+    That is what the Hessian would be if pixels of a block err together; weights are inverse variances. The covariance
+    of independent pixels is for the residuals that blocks would have beside a fit without them: a highlight in few
+    blocks is fitted to their errors, which leave little of themselves (the jackknife; R. M. Bell and D. F. McCaffrey,
+    Survey Methodology 28 (2002) 169). None for those that they have.
     """
     total = 0.0
     for picture, own in zip(pictures, errors, strict=True):
@@ -218,11 +200,8 @@ def block_scatter(
 ) -> Float[np.ndarray, "U U"]:
     """Products of sums of scores over blocks of pixels, of the size that gives most.
 
-    Args:
-        scores: of each pixel by each unknown.
-        errors: which pixels these are.
-        fitted: derivatives by ambient, diffuse, lobe and n, (4, P, C), and the covariance of `scatter`; None where the
-            scores are to stay.
+    ``fitted`` are derivatives by ambient, diffuse, lobe and n, (4, P, C), and the covariance of `scatter`; None where
+    the scores are to stay.
     """
     scatters = []
     for size in SCATTER_SIZES:
