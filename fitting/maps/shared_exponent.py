@@ -46,21 +46,24 @@ def with_shared_n(problem: MapProblem, labels: Int[np.ndarray, "H W"]) -> MapPro
     names, index = np.unique(labels, return_inverse=True)
     index = index.reshape(size)
 
-    def sums(seek: str, log_n: Any) -> np.ndarray:
+    def of_each(seek: str, log_n: Any) -> np.ndarray:
         there = surface._replace(shared=np.stack([np.asarray(log_n)[index], np.zeros(size)], axis=-1))
         found = fit_bands(dataclasses.replace(problem, surface=there, seek=seek))["sums"]
-        rows = found.reshape(-1, found.shape[2]).T.astype(float)
-        return np.stack([np.bincount(index.ravel(), row, names.size) for row in rows])
+        return found.reshape(-1, found.shape[2]).T
+
+    def added(each: np.ndarray) -> np.ndarray:
+        return np.stack([np.bincount(index.ravel(), row, names.size) for row in each])
 
     def climbed(bracket: Any) -> np.ndarray:
         """Log n of a bracket, and the sums there: curvature, cost, degrees of freedom and squares of what is shown."""
         for _ in range(STEPS):
-            slope, curvature, *_ = sums("slope", bracket[0])
+            slope, curvature, *_ = added(of_each("slope", bracket[0]))
             bracket = narrowed(bracket, slope, np.divide(slope, curvature, out=0 * slope, where=curvature > 0))
-        return np.stack([bracket[0], *sums("slope", bracket[0])[1:]])
+        return np.stack([bracket[0], *added(of_each("slope", bracket[0]))[1:]])
 
     with working_precision("float64"):
-        gains = jnp.asarray(sums("gains", np.zeros(names.size)))
+        each = of_each("gains", np.zeros(names.size))
+        gains = jnp.asarray(added(each))
         heights, brackets = peaks(gains, grid(problem.finer))
         best = climbed(brackets[0])
         if np.any(rivals(heights, best[2])):
@@ -68,10 +71,16 @@ def with_shared_n(problem: MapProblem, labels: Int[np.ndarray, "H W"]) -> MapPro
             best = np.where(other[2] < best[2], other, best)
         log_n, curvature, cost, freedom, square = best
         freedom = np.maximum(freedom, 1)
-        variance = np.maximum(cost / freedom, np.finfo(float).tiny) * (student_95(freedom) / NORMAL_95) ** 2
+        tiny = np.finfo(float).tiny
+        variance = np.maximum(cost / freedom, tiny) * (student_95(freedom) / NORMAL_95) ** 2
         error = np.sqrt(np.divide(variance, curvature, out=np.full_like(variance, np.inf), where=curvature > 0))
-        share = per_deviation(square - cost - 2 * gains, variance)
-        apart = np.log(grid(problem.finer))[:, None] - log_n
+        apart, worse = np.log(grid(problem.finer))[:, None] - log_n, square - cost - 2 * gains
+        # Many texels that hardly tell add up to chance (Q. H. Vuong, Econometrica 57, 1989): what they differ by varies
+        # by its square; what those differ by that tell n, by twice itself.
+        nearest = np.argmin(np.abs(apart), axis=0)[index.ravel()]
+        differ = np.abs(each[nearest, np.arange(index.size)] - each)
+        chance = added(np.minimum(differ / variance[index.ravel()], 2) * differ)
+        share = per_deviation(worse * np.clip(worse / np.maximum(chance, tiny), 0, 1), variance)
         error = np.maximum(error, np.max(share * np.abs(apart), axis=0))
     shared = np.stack([log_n[index], error[index]], axis=-1)
     return dataclasses.replace(problem, surface=surface._replace(shared=shared))

@@ -12,6 +12,7 @@ all where these are alike. What is left of T texels are arrays whose last axis t
 it, C or 1 long. What would underflow is held above, for a processor takes a hundred times longer over such numbers.
 """
 
+import dataclasses
 import functools
 import math
 import operator
@@ -26,7 +27,17 @@ from jax import Array
 
 from brdf.models.base import SpecularMaterial
 from brdf.precision import apart, at_a_time
-from brdf.vectors import Components, divide, dot, largest, mirror_log_cosine, normalize, perpendicular, square_root
+from brdf.vectors import (
+    BELOW_HORIZON,
+    Components,
+    divide,
+    dot,
+    largest,
+    mirror_log_cosine,
+    normalize,
+    perpendicular,
+    square_root,
+)
 from fitting.solver.normal_equations import totals
 from fitting.uncertainty.intervals import NORMAL_95
 
@@ -203,6 +214,8 @@ class Texels(eqx.Module):
         linear: columns of k_a, where there is ambient light, and of k_d, I (N·L)+.
         weight: of the lobe of each of the S samples of a light, (S, T, P) a channel.
         log_cosine: of the lobe, (S, T, P); ``vectors.BELOW_HORIZON`` or anything finite where there is none.
+        relative: whether the lobe of a texel is relative to its largest value, and k_s held by no cap: where no more is
+            asked for than what is explained.
     """
 
     model: Any = eqx.field(static=True)
@@ -213,6 +226,7 @@ class Texels(eqx.Module):
     linear: Any = ()
     weight: Any = None
     log_cosine: Any = None
+    relative: bool = eqx.field(static=True, default=False)
 
     @property
     def glossy(self) -> bool:
@@ -237,7 +251,8 @@ class Texels(eqx.Module):
     @property
     def cap(self) -> Array:
         """What k_s may be at most, (T,)."""
-        return CAP * jnp.maximum(jnp.max(largest(self.unweighted(self.values)), axis=1), 0)
+        brightest = jnp.maximum(jnp.max(largest(self.unweighted(self.values)), axis=1), 0)
+        return jnp.full_like(brightest, jnp.inf) if self.relative else CAP * brightest
 
     def unweighted(self, values: Components) -> Components:
         """Values or a column without the roots of the weights."""
@@ -260,12 +275,17 @@ class Texels(eqx.Module):
 
         diffuse, *lobe = apart(columns, normal, self.root)
         ambient = [] if lights.ambient is None else [self.root * lights.ambient]
-        lobe = jax.tree.map(lambda one: one[None], lobe)
-        return Texels(self.model, self.grey, self.finer, self.shown, self.root, [*ambient, diffuse], *lobe)
+        weight, log_cosine = jax.tree.map(lambda one: one[None], lobe)
+        return dataclasses.replace(self, linear=[*ambient, diffuse], weight=weight, log_cosine=log_cosine)
 
     def power(self, n: Any) -> Array:
         """Of the lobe's cosine, (S, T, P)."""
-        return exponential(jnp.maximum(n * self.log_cosine, lowest(self.shown.dtype)))
+        log_cosine = self.log_cosine
+        if self.relative:
+            shines = functools.reduce(operator.or_, (weight > 0 for weight in self.weight))
+            top = jnp.max(jnp.where(shines, log_cosine, BELOW_HORIZON), axis=(0, -1), keepdims=True)
+            log_cosine = jnp.minimum(log_cosine - jax.lax.stop_gradient(top), 0)
+        return exponential(jnp.maximum(n * log_cosine, lowest(self.shown.dtype)))
 
     def lobe(self, power: Array) -> Components:
         """A power of the lobe's cosine, weighted and added up over the samples of each light."""

@@ -305,6 +305,8 @@ def _of_normals(
     """What is sought where normals are given, or are refined under lights."""
     best = texels.unshadowed()
     counts = best.counts.T
+    # With a k_s held by a cap, or lobes that underflow, texels without a highlight would tell the n that all share.
+    texels = dataclasses.replace(texels, relative=seek != "layers")
     some = texels.where(counts)
     if seek == "gains":
         return {"sums": jnp.where(mask, some.profile().gains, 0)}

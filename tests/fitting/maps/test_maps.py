@@ -1179,6 +1179,22 @@ def test_the_error_that_a_light_shrinks_is_the_maps_own_whatever_the_encoding():
     np.testing.assert_allclose(choice.after[0], np.nanmedian(all_of_them.n_error / all_of_them.n), rtol=0.05)
 
 
+@pytest.mark.parametrize("true", [100.0, 300.0])
+def test_an_n_that_texels_share_is_told_only_where_highlights_tell_it(true):
+    """Held by a cap those without one told n = 92 ± 5, for 300."""
+    lights, random = dome(8), np.random.default_rng(3)
+    normal = random.normal(size=(1600, 3)) * [0.3, 0.3, 0] + VIEW
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    k_d, k_s = random.uniform(0.1, 0.6, (2, 1600, 1))
+    pictures = seen_by_equation(lights, normal, k_d, k_s, true)
+    pictures += 0.01 * random.normal(size=pictures.shape)
+    maps = fitting.fit_maps(pictures[..., :1], lights, normal[None], labels=0)
+    if true == 100:
+        assert np.any(maps.determined)
+    for n, error in zip(maps.n[maps.determined], maps.n_error[maps.determined], strict=True):
+        assert abs(n - true) < 3 * error
+
+
 def test_normals_that_are_sought_go_along_with_an_n_that_texels_share():
     lights = dome(24)
     pictures, truth = texels(144, 0.01, lights, n=(25, 25))
