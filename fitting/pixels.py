@@ -229,24 +229,27 @@ def _observe(
     left_out = _left_out(total, height * width, level, dark, masked=mask is not None)
 
     def tile(band: _Band, counted: tuple[np.ndarray, Statistics]) -> Tile:
-        good, weight = counted[0], None
+        good, weight, spread = counted[0], None, 1.0
         if noise is not None:
-            values, (read, shot) = np.asarray(band.values).reshape(target.pixels.shape), map(float, noise)
-            weight = _inverse_variance(values, good.reshape(height, width), read, shot, target.step)
+            seen = np.asarray(band.allowed) & np.all(np.isfinite(np.asarray(band.values)), axis=-1)
+            values = np.where(seen[:, None], np.asarray(band.values), 0.0).reshape(target.pixels.shape)
+            variance = _variance(values, seen.reshape(height, width), *map(float, noise))
+            rounded = variance + target.step**2 / 12.0
+            weight = (good[:, None] / (rounded * np.mean(1 / rounded[good]))).astype(dtype)
+            weight = weight[:, 0] if weight.shape[1] == 1 else weight
+            # Of the values as they were before rounding, over that of the surest.
+            spread = np.sqrt(variance / np.min(variance[good]))
         elif total.counts[-1] < height * width:
             weight = good.astype(dtype)
         if given is not None:
             stated = given[band.rows].ravel().astype(dtype)
-            weight = stated if weight is None else stated * weight
+            weight = stated if weight is None else (stated * weight.T).T
+            spread = spread / np.sqrt(np.where(stated > 0, stated, 1.0))[:, None]
         bounds = None
         if plain:
             valid, (_, allowed, finite, *_) = np.asarray(band.allowed), counted[1].counts
             if finite < allowed:
                 valid = valid & np.all(np.isfinite(np.asarray(band.values)), axis=-1)
-            spread = 1.0
-            if weight is not None and (given is not None or noise is not None):
-                valid = valid & (weight > 0)
-                spread = 1.0 / np.sqrt(np.where(weight > 0, weight, 1.0))[:, None]
             if target.codes is not None:
                 bounds = target.codes.bounds(band.rows, valid, level, spread)
             else:
@@ -256,7 +259,7 @@ def _observe(
         if apart and level is not None:
             below = good[:, None] & (np.asarray(band.values) < level)
             if np.count_nonzero(below) < below.shape[1] * np.count_nonzero(good):
-                weight = below.astype(dtype) * (1 if weight is None else weight[:, None])
+                weight = below.astype(dtype) * (1 if weight is None else weight.reshape(len(weight), -1))
         return Tile(band.values, None if weight is None else jax.device_put(weight), band.points, grey, bounds)
 
     tiles = each(tile, bands, found)
@@ -440,22 +443,21 @@ def in_memory(problem: FitProblem, rounding: Rounding) -> FitProblem:
     return dataclasses.replace(problem, targets=targets, scenes=scenes, masks=masks, weights=weights, shown=None)
 
 
-def _inverse_variance(
-    values: Float[np.ndarray, "H W C"], good: Bool[np.ndarray, "H W"], read: float, shot: float, step: float
-) -> Float[np.ndarray, " P"]:
-    """Inverse variances over their mean, 0 where not good; a pixel's channels share the variance of their mean value.
+def _variance(
+    values: Float[np.ndarray, "H W C"], seen: Bool[np.ndarray, "H W"], read: float, shot: float
+) -> Float[np.ndarray, "P C"]:
+    """Of a camera's noise in each value.
 
     The value is the mean of 5 x 5 pixels: taken from the pixel itself, weights would favour what noise made darker.
     """
     from scipy.ndimage import uniform_filter  # it takes long to load
 
-    mean = np.asarray(np.mean(np.where(good[..., None], values, 0.0), axis=-1, dtype=np.float64))
-    total, known = (uniform_filter(image, 5, mode="constant") for image in (mean, good.astype(np.float64)))
-    # A pixel that counts is one of its 25.
+    total, known = (
+        uniform_filter(image.astype(np.float64), size=5, mode="constant", axes=(0, 1))
+        for image in (values, seen[..., None])
+    )
+    # A pixel that is seen is one of its 25.
     smooth = np.maximum(total / np.maximum(known, 1 / 25), 0.0)
-    # Without read noise a black pixel would weigh infinitely much: quantisation, or a millionth of the mean, stands in.
-    least = 1e-6 * shot * np.mean(mean[good]) + np.finfo(values.dtype).tiny
-    variance = np.maximum(read * read + shot * smooth + step * step / 12.0, least)[good]
-    weight = np.zeros(good.shape, values.dtype)
-    weight[good] = np.mean(1 / variance) ** -1 / variance
-    return weight.ravel()
+    # Without read noise a black pixel would weigh infinitely much: a millionth of the mean stands in.
+    least = 1e-6 * shot * np.mean(values[seen]) + np.finfo(values.dtype).tiny
+    return np.maximum(read * read + shot * smooth, least).reshape(-1, values.shape[-1])

@@ -78,7 +78,7 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: R
     spread = shared = growing = uneven = together = None
     deviation, gain, tell = noise, 0.0, noise > 2 * rounding
     channels = statistics.channels(tell)
-    weighed = any(one is not None for one in observed.problem.weights)
+    weighed = observed.problem.noise is not None or any(one is not None for one in observed.problem.weights)
     sampled = observed.problem.sample_error(fit.model.name)
     size = 0.0 if sampled is None else sampled.size
     clipped = _clipped(optimum, fit.tied)

@@ -112,7 +112,7 @@ def structure(
     for size in sizes:
         if size > sizes[0]:
             parts = [coarser(part, 2) for part in parts]
-        joined, alone, pixels = np.concatenate([part.reshape(-1, 3) for part in parts]).T
+        joined, alone, pixels = np.concatenate([part.reshape(-1, 3) for part in parts]).T.astype(float)
         # In a block with few pixels the ratio says little.
         usual = np.sum(alone) / max(np.sum(pixels), 1.0)
         seen = (pixels >= FULL * size**2 * even) & (alone > QUIET * usual * pixels * even)
