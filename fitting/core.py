@@ -397,7 +397,8 @@ def _inflation(fit: ModelFit, observed: Observed, grey: np.ndarray) -> tuple[flo
         design = design_of(evidence.optimum.x > 0, tied)
         inverse = np.linalg.pinv(design.T @ evidence.normal.gram @ design, hermitian=True)
         together = np.diag(inverse @ design.T @ scatter @ design @ inverse)[some]
-        return float(np.sqrt(max(np.max(together / np.maximum(np.diag(inverse)[some], np.finfo(float).tiny)), 1.0)))
+        ratio = together / np.maximum(np.diag(inverse)[some], np.finfo(float).tiny)
+        return float(np.sqrt(np.max(ratio, initial=1.0)))
 
     every = largest(None, slice(None))
     if evidence.precision is None:

@@ -321,28 +321,32 @@ def _glsl(material: Material, name: str) -> Written:
 
 
 def _three(material, name):
-    k_d, _, peak, n, losses = _normalised(material)
-    if isinstance(material, SpecularMaterial):
+    k_d, k_s, peak, n, losses = _normalised(material)
+    glossy = bool(np.any(k_s))
+    if glossy:
         losses.append(_FRESNEL.format("three.js"))
     losses.append("colours are 8-bit sRGB, as MaterialLoader reads them; userData.linear holds them in full")
     # three.js draws specular (n+2)/8 (N·H)^n N·L times Schlick's Fresnel term, which is 1 at normal incidence.
-    linear = {"color": k_d, "specular": peak * 8.0 / (n + 2.0)}
+    linear = {"color": k_d} | ({"specular": peak * 8.0 / (n + 2.0)} if glossy else {})
     losses += _cut(**linear)
     codes = {key: np.round(255 * encode(np.clip(colour, 0.0, 1.0), "srgb")) for key, colour in linear.items()}
-    color, specular = (decode(code / 255, "srgb") for code in codes.values())
+    color, *specular = (decode(code / 255, "srgb") for code in codes.values())
 
     def drawn(cosine: float) -> Colour:
+        if not specular:
+            return color * cosine
         fresnel = 2.0 ** ((-5.55473 * cosine - 6.98316) * cosine)
-        return (color + (specular * (1 - fresnel) + fresnel) * (n + 2.0) / 8.0) * cosine
+        return (color + (specular[0] * (1 - fresnel) + fresnel) * (n + 2.0) / 8.0) * cosine
 
     user_data = {"linear": {key: colour.tolist() for key, colour in linear.items()}}
     values = {
         "metadata": {"version": 4.7, "type": "Material", "generator": "brdf"},
         "uuid": "brdf-" + name,
-        "type": "MeshPhongMaterial",
+        # Where k_s is 0 a Fresnel term of three.js would shine all the same.
+        "type": "MeshPhongMaterial" if glossy else "MeshLambertMaterial",
         "name": name,
         **{key: int(code @ [1 << 16, 1 << 8, 1]) for key, code in codes.items()},  # 0xRRGGBB
-        "shininess": n if isinstance(material, SpecularMaterial) else 30.0,
+        **({"shininess": n} if glossy else {}),
         "userData": user_data,
     }
     return Written(values, losses, drawn, user_data)
@@ -353,8 +357,8 @@ def _three(material, name):
 
 def _gltf(material, name):
     k_d, f_0, _, n, losses = _normalised(material)
-    roughness = float(roughness_from_exponent(n))
-    if isinstance(material, SpecularMaterial):
+    roughness, glossy = float(roughness_from_exponent(n)), bool(np.any(f_0))
+    if glossy:
         losses += [
             "roughness is (2 / (n+2))^(1/4): GGX has nearly the lobe's curvature at its peak, but long tails",
             _FRESNEL.format("glTF"),
@@ -367,12 +371,13 @@ def _gltf(material, name):
 
     def drawn(cosine):  # appendix B.3 of the specification
         square = roughness**4  # of the slope alpha
-        fresnel = f_0 + (1.0 - f_0) * (1.0 - cosine) ** 5
+        fresnel = (f_0 + (1.0 - f_0) * (1.0 - cosine) ** 5) * glossy
         visible = 0.25 / (cosine * np.sqrt(cosine**2 * (1.0 - square) + square))
         return (base * (1.0 - fresnel.max()) + fresnel * visible / square) * cosine
 
     factors = {"baseColorFactor": [*base.tolist(), 1.0], "metallicFactor": 0.0, "roughnessFactor": roughness}
-    specular = {"specularColorFactor": (f_0 / 0.04).tolist()}  # times the reflectance of a dielectric
+    # Times the reflectance of a dielectric; of what has no highlight the Fresnel term would be one at grazing angles.
+    specular = {"specularColorFactor": (f_0 / 0.04).tolist()} if glossy else {"specularFactor": 0.0}
     entry: dict[str, Any] = {"name": name, "pbrMetallicRoughness": factors}
     entry |= {"extensions": {"KHR_materials_specular": specular}, "extras": {}}
     asset = {"version": "2.0", "generator": "brdf"}

@@ -162,3 +162,17 @@ def test_a_highlight_of_one_pixel_is_seen_among_codes_without_noise():
     assert result.surface != "lambert"
     assert not any("structure" in warning for warning in result.warnings)
     np.testing.assert_allclose([result.material.k_a[0], result.material.k_d[0]], [0.2, 0.4], atol=1e-4)
+
+
+def test_of_a_light_from_behind_codes_say_what_values_do():
+    """No number was free, and of none an error was asked for."""
+    camera = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=[32, 32])
+    front, behind = (
+        brdf.Scene(camera, [brdf.Sphere([0, 0, 0], 1)], [brdf.DirectionalLight(direction, [1.0])])
+        for direction in ([0.5, 0.6, 0.7], [0, 0, -1])
+    )
+    shown = np.asarray(brdf.render(brdf.BlinnPhong(k_d=[0.5], k_s=[0.3], n=20), front))
+    codes = np.rint(255 * shown).clip(0, 255).astype(np.uint8)
+    for picture in (codes, codes / np.float32(255)):
+        result = fitting.fit(picture, behind)
+        assert not np.any(np.asarray(result.material.k_d))

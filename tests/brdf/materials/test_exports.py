@@ -212,7 +212,7 @@ def test_three_draws_our_ball_where_the_models_agree(
 ):
     words = json.loads(brdf.export_material(material, "three").text)
     drawn, loaded = three(tmp_path, material=words, exact=exact)
-    assert loaded["material"]["type"] == "MeshPhongMaterial"
+    assert loaded["material"]["type"] == ("MeshLambertMaterial" if material is LAMBERT else "MeshPhongMaterial")
     expected = ours(material)
     assert (np.abs(drawn - expected)[inside(0.1)] / expected.max()).max() < tolerance
 
@@ -251,6 +251,25 @@ def test_three_loads_the_gltf(tmp_path: Path):
     error = np.abs(drawn - ours(material))[inside(0.3)] / ours(material).max()
     assert np.median(error) < 0.03
     assert error.max() < 0.1
+
+
+@needs_browser
+@pytest.mark.parametrize("format", ["three", "gltf"])
+@pytest.mark.parametrize(
+    "material", [LAMBERT, brdf.BlinnPhong(k_d=RGB["k_d"], k_s=[0, 0, 0], n=50.0)], ids=["Lambert", "k_s of 0"]
+)
+def test_what_has_no_highlight_gets_none_from_grazing_light(format: str, material: brdf.Material, tmp_path: Path):
+    """A Fresnel term made one, up to five times as bright as the ball, and with n = 50 a hundred times."""
+    direction = np.array([0.9, 0.3, -0.4])
+    words = json.loads(brdf.export_material(material, format).text)
+    job = {"material": words, "exact": True} if format == "three" else {"gltf": words}
+    drawn, _ = three(tmp_path, direction=direction.tolist(), **job)
+    place = (np.arange(SIZE) + 0.5) / SIZE * WIDTH - WIDTH / 2
+    x, y = np.meshgrid(place, -place)
+    normal = np.stack([x, y, np.sqrt(np.maximum(1 - x * x - y * y, 0))], -1)
+    cosine = np.maximum(normal @ direction / np.linalg.norm(direction), 0)[..., None]
+    expected = cosine * np.asarray(material.k_d)
+    assert (np.abs(drawn - expected)[inside(0.2)] / expected.max()).max() < 1e-2
 
 
 # -- Mitsuba -----------------------------------------------------------------------------------------------------------
