@@ -168,7 +168,7 @@ def test_of_a_light_from_behind_codes_say_what_values_do():
     """No number was free, and of none an error was asked for."""
     camera = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=[32, 32])
     front, behind = (
-        brdf.Scene(camera, [brdf.Sphere([0, 0, 0], 1)], [brdf.DirectionalLight(direction, [1.0])])
+        brdf.Scene(camera, shapes=[brdf.Sphere([0, 0, 0], 1)], lights=[brdf.DirectionalLight(direction, [1.0])])
         for direction in ([0.5, 0.6, 0.7], [0, 0, -1])
     )
     shown = np.asarray(brdf.render(brdf.BlinnPhong(k_d=[0.5], k_s=[0.3], n=20), front))
