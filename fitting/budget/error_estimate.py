@@ -6,6 +6,8 @@ of weight w, the normal matrix is H = Σ w JᵀJ, and what makes the fit cheap i
 * pixels left out: their scores w Jᵀr are missing. The variance V of that sum gives the covariance H⁻¹ V H⁻¹ of θ. V is
   that of Horvitz and Thompson 1952, J. Am. Stat. Assoc. 47, 663, for pixels taken each by itself: no less than that of
   one in each square of the picture. Where the model is exact and there is no noise, no pixel is missed.
+* least squares, which a sample is fitted by: where noise does not spread values over some codes, or is cut off, the
+  likelihood of all pixels says otherwise by up to half a code, or the noise.
 * light samples left out: told by `fitting.budget.light_samples`, which looks at the same pixels.
 * rounding: a few units in the last place. What it does where terms nearly add up to one another, or to the edges of
   hard shadows, is not estimated but avoided, in float64.
@@ -37,6 +39,10 @@ DRAWS = 512
 DEPENDENT = 1e-4
 # A kind of coefficient that is smaller than this share of the largest one counts as if it were so large.
 SMALLEST = 0.01
+# Noise of less than this share of a code leaves what is lit evenly in one of them.
+DITHERED = 0.5
+# So many pixels that are as dark as any, where more is predicted than this share of the noise, are cut off there.
+FEWEST_CUT, LIT = 3, 0.1
 # Of log n, for the difference that stands for the lobe's derivative: to 1e-6 of it.
 STEP = 1e-4
 
@@ -147,6 +153,28 @@ def estimate(run: Run) -> Attempt:
     value, vector = np.linalg.eigh(inverse @ (probes.left_out * scores.T) @ scores @ inverse)
     drawn = np.random.default_rng(0).standard_normal((DRAWS, value.size)) * np.sqrt(np.maximum(value, 0.0)) @ vector.T
     missed = np.zeros(value.size) if samples is None else samples.shifts(determined)[0]
-    error, bound = np.quantile(np.hypot(probes.error(drawn + missed), rounding), [0.5, 0.95])
-    pixels = np.quantile(probes.error(drawn), 0.95)
+    squares = _by_least_squares(run, probes)
+    error, bound = squares + np.quantile(np.hypot(probes.error(drawn + missed), rounding), [0.5, 0.95])
+    pixels = squares + np.quantile(probes.error(drawn), 0.95)
     return Attempt(float(error), float(bound), float(pixels), float(probes.error(missed)), rounding)
+
+
+def _by_least_squares(run: Run, probes: Probes) -> float:
+    """What a sample's least squares may say otherwise than the likelihood of all pixels."""
+    noise, channels, even = float(np.max(run.result.noise)), probes.shown.shape[1], 0.0
+    cut = bool(run.result.left_out.get("clipped"))
+    for target, sample in zip(run.problem.targets, run.samples, strict=True):
+        if sample is None or target.least_squares:
+            continue
+        step = 0.0 if target.codes is None else target.codes.usual_step
+        if noise**2 < (DITHERED**2 + 1 / 12) * step**2:
+            even = max(even, 0.5 * step)
+        else:
+            # The least of the picture, where there is light.
+            at_end = probes.shown + probes.residual <= np.nanmin(target.pixels)
+            cut |= np.count_nonzero(at_end & (probes.shown > LIT * noise)) >= FEWEST_CUT
+    every = cut * noise
+    # All that is lit evenly is ambient light.
+    off = np.maximum(every, even * (np.arange(len(probes.known)) < channels))
+    size = np.sqrt(np.diag(probes.hessian) / np.sum(probes.weight))
+    return float(probes.error(np.divide(off, size, out=np.zeros_like(size), where=size > 0)))

@@ -41,6 +41,22 @@ def test_the_accuracy_holds_and_is_foretold(share):
     assert (fine.choice.pixels == fine.choice.of_pixels) == (share > 0)
 
 
+@pytest.mark.parametrize(
+    ("noise", "gain", "accuracy"),
+    [(0.0, 0.9, 1e-3), (0.05, 1.2, 3e-2)],
+    ids=["without noise", "clipped"],
+)
+def test_the_accuracy_holds_of_codes(noise, gain, accuracy):
+    """By least squares of some pixels k_a of codes without noise was 9 times as far off as the bound that was told."""
+    scene = ball(SIZE)
+    shown = np.asarray(brdf.render(MATERIAL, scene, precision="float64"))
+    shown = shown * gain / shown.max() + noise * np.random.default_rng(0).normal(size=shown.shape)
+    codes = np.rint(255 * shown).clip(0, 255).astype(np.uint8)
+    result = fit(codes, scene, accuracy=accuracy)
+    assert result.choice.met
+    assert deviation(result, fit(codes, scene)) <= accuracy
+
+
 @pytest.mark.parametrize("kind", ["mask", "weight"])
 def test_the_accuracy_holds_where_only_some_pixels_count(kind):
     scene = ball(400)
