@@ -40,7 +40,7 @@ from fitting.uncertainty.interpretation import alone_covariance, interpret, shar
 from fitting.uncertainty.noise_model import weighted_sums
 from fitting.uncertainty.residual import SOME_PIXELS, Residual, residual_statistics, variance_inflation
 from fitting.uncertainty.structure import CHANCE, SIZES, Blocks, Errors, over_blocks, shared
-from fitting.uneven_noise import evened, in_codes, noise_of_each
+from fitting.uneven_noise import EVENINGS, as_it_grows, evened, in_codes, noise_of_each
 
 # A residual above this share of the picture: what the scene says is probably not what the picture shows.
 UNEXPLAINED = 0.5
@@ -74,12 +74,12 @@ def fit_pictures(problem: FitProblem) -> FitResult:
     problem = dataclasses.replace(problem, weights=weights)
 
     with working_precision(problem.precision):
-        observed = _evenly_noisy(observe(problem))
-        if problem.model == "auto":
-            fit, choice, statistics = _fit_simplest(observed)
-        else:
-            fit, choice, statistics = _fit_model(brdf.MODELS[problem.model], observed), None, None
-        fit, choice, observed = _less_codec_errors(fit, choice, observed)
+        seen = _evenly_noisy(observe(problem))
+        fit, choice, observed, statistics = _fitted(seen)
+        for _ in range(EVENINGS):
+            if (uneven := as_it_grows(seen, fit)) is None:
+                break
+            fit, choice, observed, statistics = _fitted(uneven)
         fit = _held_plausible(fit, observed)
         if fit.capped or problem.loss != "squared":
             statistics = None
@@ -100,6 +100,16 @@ def fit_pictures(problem: FitProblem) -> FitResult:
             result = _interpreted(fit, observed, choice, hidden)
     candidates = () if choice is None else choice.candidates
     return dataclasses.replace(result, candidates=candidates, optimum=optimum)
+
+
+def _fitted(observed: Observed) -> tuple[ModelFit, Choice | None, Observed, Residual | None]:
+    """The model that is named, or the simplest adequate one; the pixels less what a codec did, and what is left."""
+    choice = statistics = None
+    if observed.problem.model == "auto":
+        fit, choice, statistics = _fit_simplest(observed)
+    else:
+        fit = _fit_model(brdf.MODELS[observed.problem.model], observed)
+    return *_less_codec_errors(fit, choice, observed), statistics
 
 
 def picture_of(model: type[brdf.Material], tile: Tile, near: Near | None = None) -> Picture:

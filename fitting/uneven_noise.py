@@ -1,4 +1,4 @@
-"""Pictures of different noise, as of other exposures: each counts by what it knows."""
+"""Noise that is not the same everywhere: each picture, as of other exposures, and value counts by what it knows."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -17,13 +17,17 @@ from fitting.pixels import Observed, Tile
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
 from fitting.solver.streams import each
+from fitting.uncertainty.interpretation import shared_errors
+from fitting.uncertainty.noise_model import noise_model, variance_at
 
 # The noise of one picture is this factor of another's, and more than chance would make it by so many deviations.
 UNEVEN, DEVIATIONS = 1.2, 5.0
-# All alike, noisy pictures lead the others astray, whose noise then seems larger: so many rounds.
+# All alike, what is noisy leads the rest astray, whose noise then seems larger: so many rounds.
 EVENINGS = 2
 # In codes: less noise before rounding than this is not told from none.
 ROUNDING_HIDES = 0.05
+# So many deviations of the noise from where values are cut off nothing of it is.
+CLEAR = 3.0
 # Steps of single precision, as a share of the brightest value.
 ROUNDED = 2.0**-22
 
@@ -157,3 +161,54 @@ def evened(observed: Observed, noise: NoiseOfEach) -> Observed:
         return tile._replace(weight=own * float(weight[one]), bounds=bounds)
 
     return observed._replace(tiles=each(of_tile, observed.tiles, observed.owner))
+
+
+def as_it_grows(observed: Observed, fit: ModelFit) -> Observed | None:
+    """The same where noise grows with brightness, as a camera's does, beside rounded values or what is cut off.
+
+    None where it does not, the user says what it is, or something else is left. What least squares alone says of other
+    pictures has errors that allow for it.
+    """
+    problem, evidence = observed.problem, fit.evidence
+    bounds = [picture.bounds for picture in fit.pictures if picture.bounds is not None]
+    stated = problem.noise is not None or any(one is not None for one in problem.weights)
+    if evidence is None or stated or len(problem.targets) > 1 or len(bounds) < len(fit.pictures):
+        return None
+    if any(one.lossy or one.encoding != "linear" for one in bounds) or shared_errors(evidence, observed)[1].significant:
+        return None
+    parts = [_left_of_codes(picture, own, fit.optimum) for picture, own in zip(fit.pictures, bounds, strict=True)]
+    code, residual, clear = map(np.concatenate, zip(*parts, strict=True))
+    width = 0.0 if bounds[0].exact else float(np.median(np.concatenate([one.widths for one in bounds])))
+    rounding, found = width / math.sqrt(12), []
+    for channel in range(code.shape[1]):
+        own = clear[:, channel]
+        some = residual[own, channel, None], code[own, channel, None]
+        growing = noise_model(*some, np.array([rounding]))
+        even = np.array([[np.mean(np.square(some[0])) if own.any() else np.nan, 0.0, 0.0]])
+        found.append((even if growing is None else growing)[0])
+    coefficients = np.array(found)
+    if not coefficients[:, 1:].any() or not np.isfinite(coefficients).all():
+        return None
+    variance = [variance_at(coefficients, np.maximum(code, 0)) for code, *_ in parts]
+    before = [np.maximum(one - rounding**2, (ROUNDING_HIDES * width) ** 2) for one in variance]
+    least, typical = min(map(np.min, before)), np.median(np.concatenate(variance))
+
+    def of_tile(tile: Tile, variance: np.ndarray, before: np.ndarray, bounds: Bounds) -> Tile:
+        dtype = tile.target.dtype
+        counts = np.ones((len(tile.target), 1)) if tile.weight is None else np.asarray(tile.weight)
+        weight = jnp.asarray(counts.reshape(len(counts), -1) * typical / variance, dtype)
+        weight = weight[:, 0] if weight.shape[1] == 1 else weight
+        return tile._replace(weight=weight, bounds=replace(bounds, spread=np.sqrt(before / least)))
+
+    return observed._replace(tiles=each(of_tile, observed.tiles, variance, before, bounds))
+
+
+def _left_of_codes(picture: Picture, bounds: Bounds, optimum: Optimum) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Predictions in codes, what they leave, and where that is of noise alone, (P, C) each."""
+    code = bounds.codes(np.asarray(picture.predict(optimum.n, optimum.x), float))[0]
+    closed = bounds.ends == 2
+    residual = np.where(closed, 0.5 * (np.where(closed, bounds.lower, 0) + np.where(closed, bounds.upper, 0)) - code, 0)
+    reach = CLEAR * math.sqrt(float(np.mean(np.square(residual[closed])))) if closed.any() else 0.0
+    low = np.max(bounds.upper, where=np.isneginf(bounds.lower) & np.isfinite(bounds.upper), initial=-np.inf)
+    high = np.min(bounds.lower, where=np.isposinf(bounds.upper) & np.isfinite(bounds.lower), initial=np.inf)
+    return code, residual, closed & (code > low + reach) & (code < high - reach)

@@ -60,7 +60,7 @@ def noise_model(
     channels = range(value.shape[1])
     found = [_one_channel(squared[:, c], value[:, c], least[c] ** 2) for c in channels]
     coefficients = np.array([one for one, _ in found])
-    variance = _variance(coefficients, value)
+    variance = variance_at(coefficients, value)
     varied = np.max(variance, axis=0) > EVEN * np.mean(variance, axis=0)
     return coefficients if np.any(varied & (np.array([gain for _, gain in found]) > RISE)) else None
 
@@ -70,10 +70,11 @@ def value_variance(
 ) -> Float[np.ndarray, "M C"]:
     """The variance of each value: as it grows with brightness, or that of its channel where it does not."""
     model = noise_model(residual, value, np.finfo(float).eps * np.max(np.abs(value), axis=0, initial=0.0))
-    return np.broadcast_to(noise**2, value.shape) if model is None else _variance(model, np.maximum(value, 0.0))
+    return np.broadcast_to(noise**2, value.shape) if model is None else variance_at(model, np.maximum(value, 0.0))
 
 
-def _variance(coefficients: Any, value: Any) -> Any:
+def variance_at(coefficients: Any, value: Any) -> Any:
+    """Of noise at some values, (..., C), by the coefficients of each channel."""
     a, b, c = coefficients.T
     return a + value * (b + value * c)
 
@@ -98,7 +99,7 @@ def _one_channel(squared: np.ndarray, value: np.ndarray, least: float) -> tuple[
 @eqx.filter_jit
 def _reweighted(picture: Picture, n: AnyArray, x: AnyArray, coefficients: AnyArray, inverse: bool) -> Array:
     value = jnp.maximum(picture.predicted(n, x), 0.0)
-    variance = _variance(jnp.asarray(coefficients, value.dtype), value)
+    variance = variance_at(jnp.asarray(coefficients, value.dtype), value)
     return picture.weights / variance if inverse else picture.weights * variance
 
 
