@@ -64,8 +64,9 @@ def fit(
             scene does not know. See `fitting.solver.losses` for what to use when.
         dark: linear value up to which pixels are too dark to count. By the value itself: where noise is large that
             leaves out what noise made darker, and ``noise`` is the better way.
-        noise: of the camera, (read, shot): the variance of a value is read² + shot · value, and pixels weigh by its
-            inverse. None weighs all alike.
+        noise: of the camera, (read, shot): the variance of a value before it is rounded is read² + shot · value, and
+            values weigh by its inverse. None weighs all alike, or where values are rounded, clipped or cut off by what
+            the residual tells of it.
         weight: (H, W), how much each pixel counts beside that, at least 0; a list where there are several pictures.
             Inverse variances or not, as of a soft mask or a region of interest: errors are those of the noise.
         rounding: the full step between neighbouring values of the picture, in its linear unit, a number or per value;

@@ -252,7 +252,7 @@ class FitResult(Parameters):
         targets: the pictures, (H, W, C) each.
         scenes: their scenes.
         counted: which pixels counted, (H, W) each.
-        weights: how much they did, (H, W) each, or (H, W, C) where only some channels of a pixel are clipped; None
+        weights: how much they did, (H, W) each, or (H, W, C) where a pixel's channels count differently; None
             where all alike; () where no picture says.
         files: path, encoding and factor of each picture; None where it came without a file.
         levels: the files on whose levels all values of a float picture lie, in words: these are fitted as codes.

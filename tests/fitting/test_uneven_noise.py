@@ -1,4 +1,4 @@
-"""Several pictures of different noise, as of other exposures: each counts by what it knows."""
+"""Noise that differs between pictures, as of other exposures, or grows with brightness: what is noisy counts less."""
 
 import numpy as np
 import pytest
