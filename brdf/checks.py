@@ -194,7 +194,7 @@ def coefficients(**given: Any) -> list[Array | np.ndarray]:
     """The coefficients of a material at one common number of channels, (C,) each: finite and at least 0."""
     arrays: dict[str, Array | np.ndarray] = {}
     for name, value in given.items():
-        arrays[name] = spectrum(name, _known(name, value), np.inf)
+        arrays[name] = spectrum(name, known(name, value), np.inf)
     channels = max(array.size for array in arrays.values())
     for name, array in arrays.items():
         if array.size not in (1, channels):
@@ -206,13 +206,13 @@ def coefficients(**given: Any) -> list[Array | np.ndarray]:
 
 def exponent(given: Any) -> Array | np.ndarray:
     """The exponent of a material: one number from 0 to `LARGEST`."""
-    value = _known("n", given)
+    value = known("n", given)
     if value.size != 1:
         raise InputError("n", f"must be one number, got shape {value.shape}", "All channels share one exponent")
     return number("n", value.reshape(()), low=0.0)
 
 
-def _known(name, given):
+def known(name: str, given: Any) -> Any:
     """In float64 of NumPy, but for what JAX is tracing."""
     if isinstance(given, list | tuple) and any(isinstance(value, Tracer) for value in given):
         given = jnp.stack([jnp.asarray(value) for value in given])

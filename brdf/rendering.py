@@ -20,8 +20,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from brdf.checks import Scalar, instance
-from brdf.errors import InputError
+from brdf.checks import Scalar, instance, known
+from brdf.errors import InputError, as_numbers
 from brdf.geometry.rays import PrimaryRays, Sight
 from brdf.geometry.surface_points import SurfacePoints
 from brdf.lights.base import Lighting, stacked
@@ -265,23 +265,26 @@ def relight(images: Float[ArrayLike, "L H W C"], factors: ArrayLike) -> Float[Ar
         factors: what multiplies each light, (L,), or each of its channels, (L, C).
 
     Raises:
-        InputError: where the factors do not fit the pictures.
+        InputError: where these are no numbers, or the factors do not fit the pictures.
 
     Example:
         >>> images = brdf.render_lights(brdf.preset("gold"), brdf.Scene.load("scene.toml"))
         >>> brdf.relight(images, [0.5, 1.0]).shape  # the light halved
         (32, 32, 3)
     """
-    images, factors = jnp.asarray(images), jnp.asarray(factors)
-    if images.ndim != 4:
-        what = f"must be of shape (L, H, W, C), got {images.shape}"
+    by: Any = known("factors", factors)
+    given: Any = images if isinstance(images, jax.Array | np.ndarray) else as_numbers("images", images)
+    if given.ndim != 4:
+        what = f"must be of shape (L, H, W, C), got {given.shape}"
         raise InputError("images", what, "Give what brdf.render_lights returns")
-    lights, _, _, channels = images.shape
-    fits = factors.ndim in (1, 2) and factors.shape[0] == lights
-    if not fits or (factors.ndim == 2 and channels != 1 and factors.shape[1] not in (1, channels)):
+    lights, _, _, channels = given.shape
+    fits = by.ndim in (1, 2) and by.shape[0] == lights
+    if not fits or (by.ndim == 2 and channels != 1 and by.shape[1] not in (1, channels)):
         expected = f"({lights},) or ({lights}, {channels})"
-        raise InputError("factors", f"must be of shape {expected}, got {factors.shape}", "Give one per light")
-    return jnp.sum(images * factors.reshape(lights, 1, 1, -1), axis=0)
+        raise InputError("factors", f"must be of shape {expected}, got {by.shape}", "Give one per light")
+    with working_precision("float64" if given.dtype == np.float64 else None):
+        pictures = jnp.asarray(given)
+        return jnp.sum(pictures * jnp.asarray(by, pictures.dtype).reshape(lights, 1, 1, -1), axis=0)
 
 
 def _seen(scene: Scene, precision: Precision | None) -> tuple[Scene, Sight]:

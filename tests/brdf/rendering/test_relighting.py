@@ -1,5 +1,7 @@
 """Light is linear: recolouring pictures, and finding the lights in them."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -32,8 +34,13 @@ def test_recoloured_pictures_are_those_of_recoloured_lights():
     images = brdf.render_lights(MATERIAL, scene(INTENSITIES), precision="float32")
     recoloured = brdf.render(MATERIAL, scene(INTENSITIES * factors), precision="float32")
     np.testing.assert_allclose(brdf.relight(images, factors), recoloured, atol=2e-6)  # a few roundings of float32
-    with pytest.raises(brdf.InputError, match="factors: must be of shape"):
-        brdf.relight(images, [1.0, 2.0])
+    for wrong, words in (([1.0, 2.0], "must be of shape"), (["a", "b", "c"], "must be numbers"), (None, "must be")):
+        with pytest.raises(brdf.InputError, match=f"factors: {words}"):
+            brdf.relight(images, wrong)
+    exact = brdf.render_lights(MATERIAL, scene(INTENSITIES), precision="float64")
+    np.testing.assert_allclose(brdf.relight(exact, [1, 1, 1]), np.sum(np.asarray(exact), axis=0), rtol=1e-14)
+    by_factors = jax.grad(lambda factors: jnp.sum(brdf.relight(images, factors)))(jnp.ones((3, 3)))
+    np.testing.assert_allclose(by_factors, np.sum(np.asarray(images), axis=(1, 2)), rtol=1e-5)
 
 
 def test_lights_are_found_given_the_material():
