@@ -107,7 +107,7 @@ def most_likely(
     pictures = list(map(_with_weight, fit.pictures, weights))
     rounding = 0.0 if exact else 1 / 12
     # Of floats the distance of two ends grows with brightness.
-    widest = 1.0 if exact else max(float(np.max(bounds_of(_thinned(one)).widths, initial=0.0)) for one in pictures)
+    widest = 1.0 if exact else max(float(np.max(bounds_of(thinned(one)).widths, initial=0.0)) for one in pictures)
     if exact or lossy or noise**2 > (ENOUGH_NOISE**2 + rounding) * widest**2:
         linear = all(bounds.encoding == "linear" for bounds in map(bounds_of, pictures))
         if linear and not lossy and not any(_open_ends_tell(picture, optimum, noise) for picture in pictures):
@@ -126,11 +126,11 @@ def most_likely(
 
 def _deviation(pictures: Sequence[Picture], at: Optimum) -> float:
     """Standard deviation of what is left, in codes."""
-    some = list(map(_thinned, pictures))
+    some = list(map(thinned, pictures))
     return residual_deviation(map(bounds_of, some), map(partial(_codes, at=at), some))
 
 
-def _thinned(picture: Picture) -> Picture:
+def thinned(picture: Picture) -> Picture:
     """Every so many of the pixels that say something, which tell the noise as well."""
     bounds = bounds_of(picture)
     tell = np.flatnonzero(np.isfinite(bounds.lower[:, 0]) | np.isfinite(bounds.upper[:, 0]))
@@ -144,7 +144,7 @@ def _in_light(pictures: Sequence[Picture]) -> list[Picture]:
 
 def _where_noise_is_even(fit: ModelFit, noise: float) -> tuple[ModelFit, float]:
     """A fit and its noise in codes, or in light where noise of one size there is likelier and more than rounding."""
-    some = list(map(_thinned, fit.pictures))
+    some = list(map(thinned, fit.pictures))
     if not is_curved(list(map(bounds_of, some))):
         return fit, noise
     light = _in_light(some)

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from fitting.channel_errors import residuals
 from fitting.codes import all_between
 from fitting.likelihood import Bounds, residual_deviation
+from fitting.maximum_likelihood import bounds_of, thinned
 from fitting.model_fit import ModelFit
 from fitting.pixels import Observed, Tile
 from fitting.solver.normal_equations import Picture
@@ -28,6 +29,8 @@ EVENINGS = 2
 ROUNDING_HIDES = 0.05
 # So many deviations of the noise from where values are cut off nothing of it is.
 CLEAR = 3.0
+# Of a step: noise before rounding that shows how it grows, and by how much steps that are the same may differ.
+NOISY, SAME_STEP = 0.1, 1e-6
 # Steps of single precision, as a share of the brightest value.
 ROUNDED = 2.0**-22
 
@@ -174,41 +177,52 @@ def as_it_grows(observed: Observed, fit: ModelFit) -> Observed | None:
     stated = problem.noise is not None or any(one is not None for one in problem.weights)
     if evidence is None or stated or len(problem.targets) > 1 or len(bounds) < len(fit.pictures):
         return None
-    if any(one.lossy or one.encoding != "linear" for one in bounds) or shared_errors(evidence, observed)[1].significant:
+    if any(one.lossy or one.encoding != "linear" for one in bounds):
         return None
-    parts = [_left_of_codes(picture, own, fit.optimum) for picture, own in zip(fit.pictures, bounds, strict=True)]
-    code, residual, clear = map(np.concatenate, zip(*parts, strict=True))
-    width = 0.0 if bounds[0].exact else float(np.median(np.concatenate([one.widths for one in bounds])))
-    rounding, found = width / math.sqrt(12), []
-    for channel in range(code.shape[1]):
-        own = clear[:, channel]
-        some = residual[own, channel, None], code[own, channel, None]
-        growing = noise_model(*some, np.array([rounding]))
-        even = np.array([[np.mean(np.square(some[0])) if own.any() else np.nan, 0.0, 0.0]])
-        found.append((even if growing is None else growing)[0])
-    coefficients = np.array(found)
-    if not coefficients[:, 1:].any() or not np.isfinite(coefficients).all():
+    some = [_left_of_codes(thinned(picture), fit.optimum) for picture in fit.pictures]
+    code, residual, clear, width = (np.concatenate(part) for part in zip(*some, strict=True))
+    step = float(np.max(width, initial=0.0))
+    # What rounding leaves is no noise, and grows with brightness by itself where the steps of floats do.
+    if np.any(width < (1 - SAME_STEP) * step) or evidence.noise < NOISY * step:
         return None
-    variance = [variance_at(coefficients, np.maximum(code, 0)) for code, *_ in parts]
-    before = [np.maximum(one - rounding**2, (ROUNDING_HIDES * width) ** 2) for one in variance]
-    least, typical = min(map(np.min, before)), np.median(np.concatenate(variance))
+    channels = zip(residual.T, code.T, clear.T, strict=True)
+    coefficients = [_growth(*channel, step / math.sqrt(12)) for channel in channels]
+    if not any(one[1:].any() for one in coefficients) or shared_errors(evidence, observed)[1].significant:
+        return None
 
-    def of_tile(tile: Tile, variance: np.ndarray, before: np.ndarray, bounds: Bounds) -> Tile:
-        dtype = tile.target.dtype
-        counts = np.ones((len(tile.target), 1)) if tile.weight is None else np.asarray(tile.weight)
-        weight = jnp.asarray(counts.reshape(len(counts), -1) * typical / variance, dtype)
+    def variance(code: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of values, and of what they were before rounding."""
+        found = variance_at(np.array(coefficients), np.maximum(code, 0))
+        return found, np.maximum(found - step**2 / 12, (ROUNDING_HIDES * step) ** 2)
+
+    typical, least = np.median(variance(code)[0]), np.min(variance(code)[1])
+
+    def of_tile(tile: Tile, picture: Picture) -> Tile:
+        own = bounds_of(picture)
+        rounded, before = variance(own.codes(np.asarray(picture.predict(fit.optimum.n, fit.optimum.x), float))[0])
+        counts = 1.0 if tile.weight is None else np.asarray(tile.weight).reshape(len(rounded), -1)
+        weight = (counts * typical / rounded).astype(tile.target.dtype)
         weight = weight[:, 0] if weight.shape[1] == 1 else weight
-        return tile._replace(weight=weight, bounds=replace(bounds, spread=np.sqrt(before / least)))
+        return tile._replace(weight=jnp.asarray(weight), bounds=replace(own, spread=np.sqrt(before / least)))
 
-    return observed._replace(tiles=each(of_tile, observed.tiles, variance, before, bounds))
+    return observed._replace(tiles=each(of_tile, observed.tiles, fit.pictures))
 
 
-def _left_of_codes(picture: Picture, bounds: Bounds, optimum: Optimum) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Predictions in codes, what they leave, and where that is of noise alone, (P, C) each."""
+def _left_of_codes(picture: Picture, optimum: Optimum) -> tuple[np.ndarray, ...]:
+    """Predictions in codes, what they leave, where that is of noise alone, (P, C) each; and the codes' steps."""
+    bounds = bounds_of(picture)
     code = bounds.codes(np.asarray(picture.predict(optimum.n, optimum.x), float))[0]
     closed = bounds.ends == 2
-    residual = np.where(closed, 0.5 * (np.where(closed, bounds.lower, 0) + np.where(closed, bounds.upper, 0)) - code, 0)
-    reach = CLEAR * math.sqrt(float(np.mean(np.square(residual[closed])))) if closed.any() else 0.0
+    residual = 0.5 * np.add(bounds.lower, bounds.upper, out=np.zeros(code.shape), where=closed) - code * closed
+    reach = CLEAR * math.sqrt(np.sum(residual**2) / max(np.count_nonzero(closed), 1))
     low = np.max(bounds.upper, where=np.isneginf(bounds.lower) & np.isfinite(bounds.upper), initial=-np.inf)
     high = np.min(bounds.lower, where=np.isposinf(bounds.upper) & np.isfinite(bounds.lower), initial=np.inf)
-    return code, residual, closed & (code > low + reach) & (code < high - reach)
+    return code, residual, closed & (code > low + reach) & (code < high - reach), bounds.widths
+
+
+def _growth(residual: np.ndarray, code: np.ndarray, clear: np.ndarray, rounding: float) -> Float[np.ndarray, " 3"]:
+    """Coefficients of a channel's variance, the first alone where it is the same everywhere."""
+    if not clear.any():
+        return np.array([max(float(np.mean(residual**2)), np.finfo(float).tiny), 0.0, 0.0])
+    found = noise_model(residual[clear, None], code[clear, None], np.array([rounding]))
+    return np.array([np.mean(residual[clear] ** 2), 0.0, 0.0]) if found is None else found[0]

@@ -114,3 +114,11 @@ def test_noise_that_grows_beside_what_is_clipped_is_weighed_by_value(codes):
         result = fitting.fit(picture, scene, model="blinn-phong", saturation=None if codes else 1.0)
         off.append([(one.value - numbers[one.name]) / one.error for one in result.parameters])
     assert np.sqrt(np.mean(np.square(off))) < 1.15
+
+
+def test_rounding_of_half_floats_is_no_noise_that_grows():
+    """Taken for such, n was twice as far off and its error half as large again."""
+    scene = ball_scene(brdf.DirectionalLight(direction=[0.4, 0.5, 0.8], intensity=[1.0]), ambient=[0.5])
+    halves = pictured(brdf.BlinnPhong(k_a=0.1, k_d=0.5, k_s=0.3, n=30.0), scene).astype(np.float16)
+    n = fitting.fit(halves.astype(np.float32), scene, model="blinn-phong")["n"]
+    assert abs(n.value - 30) < 3 * n.error < 3 * 0.0017
