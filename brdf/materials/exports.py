@@ -327,25 +327,24 @@ def _three(material, name):
         losses.append(_FRESNEL.format("three.js"))
     losses.append("colours are 8-bit sRGB, as MaterialLoader reads them; userData.linear holds them in full")
     # three.js draws specular (n+2)/8 (N·H)^n N·L times Schlick's Fresnel term, which is 1 at normal incidence.
-    linear = {"color": k_d} | ({"specular": peak * 8.0 / (n + 2.0)} if glossy else {})
+    linear = {"color": k_d, "specular": peak * 8.0 / (n + 2.0)}
     losses += _cut(**linear)
     codes = {key: np.round(255 * encode(np.clip(colour, 0.0, 1.0), "srgb")) for key, colour in linear.items()}
-    color, *specular = (decode(code / 255, "srgb") for code in codes.values())
+    color, specular = (decode(code / 255, "srgb") for code in codes.values())
 
     def drawn(cosine: float) -> Colour:
-        if not specular:
-            return color * cosine
         fresnel = 2.0 ** ((-5.55473 * cosine - 6.98316) * cosine)
-        return (color + (specular[0] * (1 - fresnel) + fresnel) * (n + 2.0) / 8.0) * cosine
+        return (color + (specular * (1 - fresnel) + fresnel) * (n + 2.0) / 8.0) * cosine
 
-    user_data = {"linear": {key: colour.tolist() for key, colour in linear.items()}}
+    # Where k_s is 0 the Fresnel term would shine all the same.
+    kept, kind = (tuple(linear), "MeshPhongMaterial") if glossy else (("color",), "MeshLambertMaterial")
+    user_data = {"linear": {key: linear[key].tolist() for key in kept}}
     values = {
         "metadata": {"version": 4.7, "type": "Material", "generator": "brdf"},
         "uuid": "brdf-" + name,
-        # Where k_s is 0 a Fresnel term of three.js would shine all the same.
-        "type": "MeshPhongMaterial" if glossy else "MeshLambertMaterial",
+        "type": kind,
         "name": name,
-        **{key: int(code @ [1 << 16, 1 << 8, 1]) for key, code in codes.items()},  # 0xRRGGBB
+        **{key: int(codes[key] @ [1 << 16, 1 << 8, 1]) for key in kept},  # 0xRRGGBB
         **({"shininess": n} if glossy else {}),
         "userData": user_data,
     }
@@ -371,7 +370,7 @@ def _gltf(material, name):
 
     def drawn(cosine):  # appendix B.3 of the specification
         square = roughness**4  # of the slope alpha
-        fresnel = (f_0 + (1.0 - f_0) * (1.0 - cosine) ** 5) * glossy
+        fresnel = f_0 + (1.0 - f_0) * (1.0 - cosine) ** 5
         visible = 0.25 / (cosine * np.sqrt(cosine**2 * (1.0 - square) + square))
         return (base * (1.0 - fresnel.max()) + fresnel * visible / square) * cosine
 
