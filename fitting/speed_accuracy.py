@@ -189,7 +189,8 @@ class Tradeoff:
         """The table as text, its numbers and marks explained beneath."""
         table = Table(box=SIMPLE_HEAD, show_edge=False, pad_edge=False)
         for name in ("configuration", *COLUMNS, ""):
-            table.add_column(name, justify="right" if name in COLUMNS else "left", no_wrap=True)
+            # Too wide a table would lose digits, but for what can go on in a line below.
+            table.add_column(name, justify="right" if name in COLUMNS else "left", no_wrap=bool(name))
         for row in self.rows:
             name = row.name if row.axis == "default" else self.brief(row)
             taken = " ± ".join(map(_milliseconds, filter(None, (row.seconds, row.spread))))
