@@ -21,7 +21,7 @@ from fitting.doubts import doubts
 from fitting.jpeg_errors import codec_of, without_codec_errors
 from fitting.light_colour import coefficient_factors
 from fitting.maximum_likelihood import bounds_of, highlight_in_codes, most_likely, unexplained
-from fitting.model_fit import ModelFit
+from fitting.model_fit import Evidence, ModelFit
 from fitting.pixels import Observed, Tile, observe
 from fitting.problem import FitProblem
 from fitting.result import FitResult
@@ -37,10 +37,10 @@ from fitting.solver.streams import Stream, each
 from fitting.solver.tied import NormalEquations, design_of, join_channels, places_of
 from fitting.uncertainty.covariance import NO_TRACE, residual_noise, specular_gain
 from fitting.uncertainty.interpretation import alone_covariance, interpret, shared_errors
-from fitting.uncertainty.noise_model import weighted_sums
+from fitting.uncertainty.noise_model import RISE, weighted_sums
 from fitting.uncertainty.residual import SOME_PIXELS, Residual, residual_statistics, variance_inflation
 from fitting.uncertainty.structure import CHANCE, SIZES, Blocks, Errors, over_blocks, shared
-from fitting.uneven_noise import EVENINGS, as_it_grows, evened, in_codes, noise_of_each
+from fitting.uneven_noise import GROWINGS, as_it_grows, evened, in_codes, noise_of_each
 
 # A residual above this share of the picture: what the scene says is probably not what the picture shows.
 UNEXPLAINED = 0.5
@@ -74,12 +74,15 @@ def fit_pictures(problem: FitProblem) -> FitResult:
     problem = dataclasses.replace(problem, weights=weights)
 
     with working_precision(problem.precision):
-        seen = _evenly_noisy(observe(problem))
-        fit, choice, observed, statistics = _fitted(seen)
-        for _ in range(EVENINGS):
+        seen = observe(problem)
+        fit, choice, observed, statistics = _fitted(_evenly_noisy(seen))
+        for _ in range(GROWINGS):
             if (uneven := as_it_grows(seen, fit)) is None:
                 break
-            fit, choice, observed, statistics = _fitted(uneven)
+            again = _fitted(uneven)
+            if not _likelier(again[0].evidence, fit.evidence, seen):
+                break
+            fit, choice, observed, statistics = again
         fit = _held_plausible(fit, observed)
         if fit.capped or problem.loss != "squared":
             statistics = None
@@ -100,6 +103,13 @@ def fit_pictures(problem: FitProblem) -> FitResult:
             result = _interpreted(fit, observed, choice, hidden)
     candidates = () if choice is None else choice.candidates
     return dataclasses.replace(result, candidates=candidates, optimum=optimum)
+
+
+def _likelier(after: Evidence | None, before: Evidence | None, observed: Observed) -> bool:
+    """Whether noise that grows makes a picture likelier, and nothing else is left, which would be larger there, too."""
+    if after is None or before is None or after.value < before.value + RISE / 2:
+        return False
+    return not shared_errors(after, observed)[1].significant
 
 
 def _fitted(observed: Observed) -> tuple[ModelFit, Choice | None, Observed, Residual | None]:

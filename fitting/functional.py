@@ -337,9 +337,12 @@ def _search(pixels: _Pixels, relative: Callable[[Array], Array], grid: Array, ma
     _, best = jax.lax.top_k(-valleys, min(2, lowest.size))
     found = jax.lax.map(lambda start: at(*start), (position[best], profile.x[best]))
     slope, curvature, points = found
-    gain = slope**2 / jnp.where(curvature > 0, 2 * curvature, jnp.inf)
-    first = jnp.argmin(points.cost - gain)
-    log_n, width = position[best[first]], grid[1] - grid[0]
+    # No further than the next exponent of the grid: where the lobe is nearly one of the other columns the cost is all
+    # but straight.
+    width = grid[1] - grid[0]
+    moved = jnp.where(curvature > 0, jnp.minimum(jnp.abs(slope) / curvature, width), 0)
+    first = jnp.argmin(points.cost - moved * (jnp.abs(slope) - curvature * moved / 2))
+    log_n = position[best[first]]
     bracket = jnp.maximum(grid[0], log_n - width), jnp.minimum(grid[-1], log_n + width)
 
     def step(state: tuple[Any, ...], _: None) -> tuple[tuple[Any, ...], None]:

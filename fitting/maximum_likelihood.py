@@ -109,8 +109,8 @@ def most_likely(
     # Of floats the distance of two ends grows with brightness.
     widest = 1.0 if exact else max(float(np.max(bounds_of(thinned(one)).widths, initial=0.0)) for one in pictures)
     if exact or lossy or noise**2 > (ENOUGH_NOISE**2 + rounding) * widest**2:
-        linear = all(bounds.encoding == "linear" for bounds in map(bounds_of, pictures))
-        if linear and not lossy and not any(_open_ends_tell(picture, optimum, noise) for picture in pictures):
+        even = all(own.encoding == "linear" and not own.spread.ndim for own in map(bounds_of, pictures))
+        if even and not lossy and not any(_open_ends_tell(picture, optimum, noise) for picture in pictures):
             return fit
         together = lossy and not fit.copies and (grey is not None or fit.tied is not None) and can_be_coupled(pictures)
         if together and grey is not None:

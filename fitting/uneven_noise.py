@@ -11,26 +11,37 @@ from jaxtyping import Bool, Float, Int
 
 from fitting.channel_errors import residuals
 from fitting.codes import all_between
-from fitting.likelihood import Bounds, residual_deviation
-from fitting.maximum_likelihood import bounds_of, thinned
+from fitting.likelihood import Bounds, in_light, interval, is_curved, residual_deviation
+from fitting.maximum_likelihood import bounds_of
 from fitting.model_fit import ModelFit
 from fitting.pixels import Observed, Tile
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
 from fitting.solver.streams import each
-from fitting.uncertainty.interpretation import shared_errors
-from fitting.uncertainty.noise_model import noise_model, variance_at
+from fitting.uncertainty.noise_model import (
+    CHANCE,
+    EVEN,
+    MOST_VALUES,
+    RISE,
+    growth_of_channel,
+    variance_at,
+)
 
 # The noise of one picture is this factor of another's, and more than chance would make it by so many deviations.
 UNEVEN, DEVIATIONS = 1.2, 5.0
 # All alike, what is noisy leads the rest astray, whose noise then seems larger: so many rounds.
 EVENINGS = 2
+# How it grows moves numbers, and they how it does; so many rounds at most.
+GROWINGS = 4
 # In codes: less noise before rounding than this is not told from none.
 ROUNDING_HIDES = 0.05
-# So many deviations of the noise from where values are cut off nothing of it is.
-CLEAR = 3.0
+# So often it is asked what is to be expected of rounded values, by noise that is even and by noise that grows; until
+# one variance for all changes by less than this share, and twice the logarithm of the likelihood by less than this.
+FEW_EXPECTATIONS, EXPECTATIONS, SETTLED, ENOUGH_GAIN = 4, 50, 0.02, 0.5
 # Of a step: noise before rounding that shows how it grows, and by how much steps that are the same may differ.
 NOISY, SAME_STEP = 0.1, 1e-6
+# In deviations of the noise, half as far apart as the ends of a value that is not rounded are taken to be.
+EXACT = 1e-3
 # Steps of single precision, as a share of the brightest value.
 ROUNDED = 2.0**-22
 
@@ -167,62 +178,159 @@ def evened(observed: Observed, noise: NoiseOfEach) -> Observed:
 
 
 def as_it_grows(observed: Observed, fit: ModelFit) -> Observed | None:
-    """The same where noise grows with brightness, as a camera's does, beside rounded values or what is cut off.
+    """The same where noise seems to grow with brightness, as a camera's does, beside codes or what is cut off.
 
-    None where it does not, the user says what it is, or something else is left. What least squares alone says of other
-    pictures has errors that allow for it.
+    None where it does not or the user says what it is. What least squares alone says of other pictures has errors that
+    allow for it.
     """
     problem, evidence = observed.problem, fit.evidence
-    bounds = [picture.bounds for picture in fit.pictures if picture.bounds is not None]
+    bounds = [tile.bounds for tile in observed.tiles if tile.bounds is not None]
     stated = problem.noise is not None or any(one is not None for one in problem.weights)
-    if evidence is None or stated or len(problem.targets) > 1 or len(bounds) < len(fit.pictures):
+    if evidence is None or stated or len(bounds) < len(fit.pictures) or any(one.lossy for one in bounds):
         return None
-    if any(one.lossy or one.encoding != "linear" for one in bounds):
+    # Of one camera, which has taken all of them alike.
+    if len({(*np.ravel(one.scale / one.unit), one.encoding) for one in bounds}) > 1:
         return None
-    some = [_left_of_codes(thinned(picture), fit.optimum) for picture in fit.pictures]
-    code, residual, clear, width = (np.concatenate(part) for part in zip(*some, strict=True))
-    step = float(np.max(width, initial=0.0))
+    pictures = [replace(picture, bounds=one) for picture, one in zip(fit.pictures, bounds, strict=True)]
+    most = MOST_VALUES // (observed.colour.size * len(bounds))
+    some = [_some(picture, most) for picture in pictures]
+    widths, size = np.concatenate([bounds_of(picture).widths for picture in some]), 0.0
+    step = float(np.max(widths, initial=0.0))
     # What rounding leaves is no noise, and grows with brightness by itself where the steps of floats do.
-    if np.any(width < (1 - SAME_STEP) * step) or evidence.noise < NOISY * step:
+    if np.any(widths < (1 - SAME_STEP) * step) or evidence.noise < NOISY * step:
         return None
-    channels = zip(residual.T, code.T, clear.T, strict=True)
-    coefficients = [_growth(*channel, step / math.sqrt(12)) for channel in channels]
-    if not any(one[1:].any() for one in coefficients) or shared_errors(evidence, observed)[1].significant:
+    if is_curved(bounds):
+        # Noise grows before a curve.
+        light = in_light(list(map(bounds_of, some)))
+        some = [replace(picture, bounds=one) for picture, one in zip(some, light, strict=True)]
+        size = 1 / float(light[0].scale)
+    parts = zip(*(_said(picture, fit.optimum) for picture in some), strict=True)
+    channels = [_Said(*channel) for channel in zip(*map(np.hstack, parts), strict=True)]
+    now = (np.broadcast_to(bounds_of(picture).spread, picture.target.shape) for picture in fit.pictures)
+    spread = np.concatenate([_each(one, most) for one in now])
+    coefficients = _growth(channels, (evidence.noise * float(np.median(spread))) ** 2)
+    if coefficients is None:
         return None
 
-    def variance(code: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of values, and of what they were before rounding."""
-        found = variance_at(np.array(coefficients), np.maximum(code, 0))
-        return found, np.maximum(found - step**2 / 12, (ROUNDING_HIDES * step) ** 2)
+    def variance(picture: Picture) -> np.ndarray:
+        """Of values before rounding."""
+        value = bounds_of(picture).codes(np.asarray(picture.predict(fit.optimum.n, fit.optimum.x), float))[0]
+        return np.maximum(variance_at(coefficients, np.maximum(value, 0)), (ROUNDING_HIDES * step) ** 2)
 
-    typical, least = np.median(variance(code)[0]), np.min(variance(code)[1])
+    of_some = np.concatenate(list(map(variance, some)))
+    if np.ptp(np.log(of_some / spread**2)) < math.log(EVEN):
+        return None
+    typical, least = np.median(of_some), np.min(of_some)
 
     def of_tile(tile: Tile, picture: Picture) -> Tile:
-        own = bounds_of(picture)
-        rounded, before = variance(own.codes(np.asarray(picture.predict(fit.optimum.n, fit.optimum.x), float))[0])
-        counts = 1.0 if tile.weight is None else np.asarray(tile.weight).reshape(len(rounded), -1)
-        weight = (counts * typical / rounded).astype(tile.target.dtype)
+        own = bounds_of(picture).in_light(size) if size else bounds_of(picture)
+        before = variance(replace(picture, bounds=own))
+        counts = 1.0 if tile.weight is None else np.asarray(tile.weight).reshape(len(before), -1)
+        weight = (counts * typical / (before + _widths(own) ** 2 / 12)).astype(tile.target.dtype)
         weight = weight[:, 0] if weight.shape[1] == 1 else weight
         return tile._replace(weight=jnp.asarray(weight), bounds=replace(own, spread=np.sqrt(before / least)))
 
-    return observed._replace(tiles=each(of_tile, observed.tiles, fit.pictures))
+    return observed._replace(tiles=each(of_tile, observed.tiles, pictures))
 
 
-def _left_of_codes(picture: Picture, optimum: Optimum) -> tuple[np.ndarray, ...]:
-    """Predictions in codes, what they leave, where that is of noise alone, (P, C) each; and the codes' steps."""
+def _widths(bounds: Bounds) -> Float[np.ndarray, "P C"]:
+    """Distances of the ends of each code; that of the others where one is open."""
+    closed = bounds.ends == 2
+    width = np.subtract(bounds.upper, bounds.lower, out=np.zeros(closed.shape), where=closed)
+    return np.where(closed, width, np.median(width[closed]) if closed.any() else 1.0)
+
+
+class _Even(NamedTuple):
+    """A variance that does not know of the value.
+
+    Attributes:
+        size: how large.
+        tells: by how many deviations squares go with the value, all the same.
+        cost: minus twice the logarithm of the likelihood.
+    """
+
+    size: float
+    tells: float
+    cost: float
+
+
+class _Said(NamedTuple):
+    """Ends of some codes, what is predicted, and their distance, (C, P); or of a channel."""
+
+    lower: Float[np.ndarray, "*C P"]
+    upper: Float[np.ndarray, "*C P"]
+    value: Float[np.ndarray, "*C P"]
+    width: Float[np.ndarray, "*C P"]
+
+    @property
+    def known(self) -> "_Said":
+        """Those that have an end."""
+        says = np.isfinite(self.lower) | np.isfinite(self.upper)
+        return _Said(*(part[says] for part in self))
+
+    def expected(self, variance: Float[np.ndarray, " P"]) -> tuple[Float[np.ndarray, " P"], float]:
+        """Squares of the noise before rounding, and minus twice the logarithm of the likelihood.
+
+        What is rounded or cut off is as far off as is to be expected (Dempster, Laird and Rubin 1977).
+        """
+        deviation = np.sqrt(variance)
+        # A value that is not rounded lay about where it is.
+        beside = np.where(self.width > 0, 0.0, EXACT * deviation)
+        said = interval(self.lower - beside, self.upper + beside, self.value, deviation)
+        return variance * (1 + variance * (said.score**2 - said.weight)), -2 * float(np.sum(said.value))
+
+    def even(self, shape: Float[np.ndarray, " P"], start: float) -> _Even:
+        """A variance of such a shape."""
+        even, squared, cost = start, shape, 0.0
+        for _ in range(FEW_EXPECTATIONS):
+            squared, cost = self.expected(even * shape)
+            last, even = even, float(np.mean(squared / shape))
+            if abs(even - last) < SETTLED * last:
+                break
+        varies = self.value.size > 1 and np.ptp(self.value) > 0
+        tells = np.corrcoef(squared / shape, self.value)[0, 1] if varies else 0.0
+        return _Even(even, abs(float(tells)) * math.sqrt(self.value.size), cost)
+
+    def growing(self, start: float) -> tuple[Float[np.ndarray, " 3"], float]:
+        """Coefficients of a variance that grows with the value, and its cost."""
+        coefficients, cost, value = np.array([start, 0.0, 0.0]), math.inf, np.maximum(self.value, 0.0)
+        for _ in range(EXPECTATIONS):
+            last = cost
+            squared, cost = self.expected(variance_at(coefficients[None], value[:, None])[:, 0])
+            coefficients = growth_of_channel(squared, value, 0.0, coefficients)[0]
+            if cost > last - ENOUGH_GAIN:
+                break
+        return coefficients, cost
+
+
+def _some(picture: Picture, most: int) -> Picture:
+    """Some of the pixels."""
+    return picture.in_double(_each(np.arange(len(picture.target)), most))
+
+
+def _each(pixels: np.ndarray, most: int) -> np.ndarray:
+    """One of so many, about ``most`` of them."""
+    return pixels[:: max(len(pixels) // most, 1)]
+
+
+def _said(picture: Picture, optimum: Optimum) -> _Said:
     bounds = bounds_of(picture)
     code = bounds.codes(np.asarray(picture.predict(optimum.n, optimum.x), float))[0]
-    closed = bounds.ends == 2
-    residual = 0.5 * np.add(bounds.lower, bounds.upper, out=np.zeros(code.shape), where=closed) - code * closed
-    reach = CLEAR * math.sqrt(np.sum(residual**2) / max(np.count_nonzero(closed), 1))
-    low = np.max(bounds.upper, where=np.isneginf(bounds.lower) & np.isfinite(bounds.upper), initial=-np.inf)
-    high = np.min(bounds.lower, where=np.isposinf(bounds.upper) & np.isfinite(bounds.lower), initial=np.inf)
-    return code, residual, closed & (code > low + reach) & (code < high - reach), bounds.widths
+    return _Said(*(np.asarray(part, float).T for part in (bounds.lower, bounds.upper, code, _widths(bounds))))
 
 
-def _growth(residual: np.ndarray, code: np.ndarray, clear: np.ndarray, rounding: float) -> Float[np.ndarray, " 3"]:
-    """Coefficients of a channel's variance, the first alone where it is the same everywhere."""
-    if not clear.any():
-        return np.array([max(float(np.mean(residual**2)), np.finfo(float).tiny), 0.0, 0.0])
-    found = noise_model(residual[clear, None], code[clear, None], np.array([rounding]))
-    return np.array([np.mean(residual[clear] ** 2), 0.0, 0.0]) if found is None else found[0]
+def _growth(channels: Sequence[_Said], start: float) -> Float[np.ndarray, "C 3"] | None:
+    """Coefficients of the variance before rounding of each channel; None where one in codes, or in light, will do.
+
+    That one is about ``start``.
+    """
+    channels = [channel.known for channel in channels]
+    curved = any(np.ptp(channel.width) > SAME_STEP * np.max(channel.width) for channel in channels)
+    light = [channel.even(channel.width**0, start) for channel in channels]
+    codes = [channel.even(channel.width**2, start) for channel in channels] if curved else light
+    light_does, codes_do = (max(one.tells for one in both) < CHANCE for both in (light, codes))
+    if light_does:
+        return None
+    grows, cost = zip(*(channel.growing(even.size) for channel, even in zip(channels, codes, strict=True)), strict=True)
+    # Noise that grows in light is nearly even in codes of a curve.
+    return None if codes_do and sum(cost) > sum(one.cost for one in codes) - RISE else np.array(grows)

@@ -58,7 +58,7 @@ def noise_model(
     stride = -(-len(value) // MOST_VALUES)
     squared, value = squared[::stride], np.maximum(value[::stride], 0.0)
     channels = range(value.shape[1])
-    found = [_one_channel(squared[:, c], value[:, c], least[c] ** 2) for c in channels]
+    found = [growth_of_channel(squared[:, c], value[:, c], least[c] ** 2) for c in channels]
     coefficients = np.array([one for one, _ in found])
     variance = variance_at(coefficients, value)
     varied = np.max(variance, axis=0) > EVEN * np.mean(variance, axis=0)
@@ -79,21 +79,26 @@ def variance_at(coefficients: Any, value: Any) -> Any:
     return a + value * (b + value * c)
 
 
-def _one_channel(squared: np.ndarray, value: np.ndarray, least: float) -> tuple[np.ndarray, float]:
-    """Coefficients, and twice the rise of the logarithm of the likelihood over a constant variance."""
-    largest = max(float(np.max(value)), np.finfo(float).tiny)
-    columns = (value / largest) ** np.arange(3)[:, None]
+def growth_of_channel(
+    squared: np.ndarray, value: np.ndarray, least: float, start: np.ndarray | None = None
+) -> tuple[np.ndarray, float]:
+    """Coefficients, and twice the rise of the logarithm of the likelihood over a constant variance.
+
+    From coefficients that are nearly right one round leads on.
+    """
+    powers = max(float(np.max(value)), np.finfo(float).tiny) ** np.arange(3)
+    columns = value ** np.arange(3)[:, None] / powers[:, None]
     constant = max(float(np.mean(squared)), least, np.finfo(float).tiny)
-    coefficients = np.array([constant, 0.0, 0.0])
+    coefficients = np.array([constant, 0.0, 0.0]) if start is None else start * powers
     variance = coefficients @ columns
-    for _ in range(ROUNDS):
+    for _ in range(ROUNDS if start is None else 1):
         # The variance of a squared residual is twice its mean squared; scaled, so that no digit is lost.
         scaled = columns / variance
         coefficients = nonnegative_minimum(scaled @ scaled.T, scaled @ (squared / variance))
         coefficients[0] = max(coefficients[0], least, 1e-6 * constant)
         variance = coefficients @ columns
     gain = np.sum(np.log(constant / variance) + squared / constant - squared / variance)
-    return coefficients / largest ** np.arange(3), float(gain)
+    return coefficients / powers, float(gain)
 
 
 @eqx.filter_jit

@@ -6,6 +6,7 @@ from small_ball import SUN, ball_scene, pictured
 
 import brdf
 import fitting
+from brdf.images.encoding import encode
 
 OTHER = brdf.DirectionalLight(direction=[-0.5, 0.3, 0.8], intensity=[1.0, 0.8, 0.6])
 SCENES = [ball_scene(SUN), ball_scene(OTHER)]
@@ -101,19 +102,53 @@ def test_pictures_all_of_whose_pixels_count_differ_in_noise():
     assert both["k_d"][0].error == pytest.approx(alone["k_d"][0].error, rel=0.05)
 
 
-@pytest.mark.parametrize("codes", [True, False])
-def test_noise_that_grows_beside_what_is_clipped_is_weighed_by_value(codes):
-    """Of one size for all, k_s was 2.3 of its errors off in the mean of these."""
-    scene = ball_scene(brdf.DirectionalLight(direction=[0.4, 0.5, 0.8], intensity=[1.0]), ambient=[0.5])
-    numbers = {"k_a": 0.1, "k_d": 0.6, "k_s": 0.8, "n": 20.0}
-    clean, off = pictured(brdf.BlinnPhong(**numbers), scene), []
-    for seed in range(DRAWS):
-        noise = np.sqrt(0.002**2 + 4e-3 * clean)
-        picture = np.clip(pictured(brdf.BlinnPhong(**numbers), scene, noise, seed), 0, 1).astype(np.float32)
-        picture = np.rint(255 * picture).astype(np.uint8) if codes else picture
-        result = fitting.fit(picture, scene, model="blinn-phong", saturation=None if codes else 1.0)
+def off_by(numbers, shot, kind, lights=((0.4, 0.5, 0.8),)) -> np.ndarray:
+    """By how many of its errors each number is off, of balls whose noise grows with brightness."""
+    suns = [brdf.DirectionalLight(direction=direction, intensity=[1.0]) for direction in lights]
+    scenes, off = [ball_scene(sun, ambient=[0.5]) for sun in suns], []
+    for draw in range(DRAWS):
+        pictures = []
+        for seed, scene in enumerate(scenes, draw * len(scenes)):
+            clean = pictured(brdf.BlinnPhong(**numbers), scene)
+            noise = np.sqrt(0.002**2 + shot * clean)
+            picture = np.clip(pictured(brdf.BlinnPhong(**numbers), scene, noise, seed), 0, 1)
+            picture = encode(picture, "srgb") if kind == "srgb" else picture
+            floats = kind == "clipped"
+            pictures.append(picture.astype(np.float32) if floats else np.rint(255 * picture).astype(np.uint8))
+        how = {"clipped": {"saturation": 1.0}, "srgb": {"encoding": "srgb"}}.get(kind, {})
+        result = fitting.fit(pictures, scenes, model="blinn-phong", **how)
         off.append([(one.value - numbers[one.name]) / one.error for one in result.parameters])
-    assert np.sqrt(np.mean(np.square(off))) < 1.15
+    return np.sqrt(np.mean(np.square(off), axis=0))
+
+
+@pytest.mark.parametrize("kind", ["linear", "srgb", "clipped"])
+def test_noise_that_grows_beside_what_is_clipped_is_weighed_by_value(kind):
+    """Of one size for all, k_s was 2.3 of its errors off in the mean of these."""
+    off = off_by({"k_a": 0.1, "k_d": 0.6, "k_s": 0.8, "n": 20.0}, 4e-3, kind)
+    assert np.sqrt(np.mean(off**2)) < 1.15
+
+
+@pytest.mark.parametrize("kind", ["linear", "srgb"])
+def test_noise_that_grows_and_is_cut_off_is_known_by_what_is_to_be_expected(kind):
+    """Of one size for all, k_a was 4 of its errors off in the mean of these."""
+    assert np.all(off_by({"k_a": 0.005, "k_d": 0.5, "k_s": 0.2, "n": 20.0}, 1e-3, kind) < 1.6)
+
+
+def test_noise_that_grows_is_that_of_all_pictures():
+    both = (0.4, 0.5, 0.8), (-0.7, 0.2, 0.6)
+    off = off_by({"k_a": 0.1, "k_d": 0.5, "k_s": 0.3, "n": 20.0}, 1e-3, "linear", both)
+    assert np.sqrt(np.mean(off**2)) < 1.2
+
+
+def test_rounding_does_not_make_noise_grow():
+    """Of a fifth of a code: taken for such, k_a and k_d were 2.5 of their errors off in the mean."""
+    scene, off = ball_scene(brdf.DirectionalLight(direction=[0.4, 0.5, 0.8], intensity=[1.0])), []
+    numbers = {"k_a": 0.1, "k_d": 0.5, "k_s": 0.3, "n": 20.0}
+    for seed in range(DRAWS):
+        codes = np.rint(255 * pictured(brdf.BlinnPhong(**numbers), scene, 0.2 / 255, seed))
+        result = fitting.fit(codes.clip(0, 255).astype(np.uint8), scene, model="blinn-phong")
+        off.append([(one.value - numbers[one.name]) / one.error for one in result.parameters])
+    assert np.all(np.sqrt(np.mean(np.square(off), axis=0)) < 1.5)
 
 
 def test_rounding_of_half_floats_is_no_noise_that_grows():
