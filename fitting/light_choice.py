@@ -36,6 +36,8 @@ HEMISPHERE, AROUND = (np.pi / 2, 400), ((0.1, 16), (0.025, 16))
 MOST_PIXELS = 1 << 14
 # Of the largest eigenvalue of the information: a smaller one tells nothing.
 DEPENDENT = 1e-12
+# Weights are what brightness says where their mean at each of so many leaves no more than this share of their variance.
+LEVELS, UNEXPLAINED = 64, 0.1
 
 
 @dataclass(frozen=True)
@@ -165,6 +167,11 @@ def next_light(result: Any, candidates: Sequence[Any] | None = None, count: int 
 
         scenes = [_scene(result, index) for index in range(len(result.scenes))]
         first, weight = scenes[0]
+
+        def rendered(scene: brdf.Scene) -> np.ndarray:
+            return np.asarray(brdf.render(material, scene, precision="float64")).reshape(weight.shape[0], -1)
+
+        bright = _by_brightness(rendered(first), weight)
         to_view = np.asarray(first.surface_points().to_view, np.float64).reshape(-1, 3).mean(axis=0)
         information = np.sum([information_of(*scene) for scene in scenes], axis=0)
         # What is known is what the fit says, of codes by their edges: another picture is taken to tell as much a pixel.
@@ -176,7 +183,7 @@ def next_light(result: Any, candidates: Sequence[Any] | None = None, count: int 
             if lit.channels not in (1, channels):
                 what = f"have {lit.channels} channels, the pictures {channels}"
                 raise InputError("candidates", what, "Give both the same number, or light of one")
-            return unit * information_of(lit, weight)
+            return unit * information_of(lit, weight if bright is None else bright(rendered(lit)))
 
         return choose_lights(candidates, count, of, known, to_view, unit * information, information_by, error)
 
@@ -244,11 +251,28 @@ def direction_of(light: Light) -> np.ndarray:
 
 
 def _scene(result: FitResult, index: int) -> tuple[brdf.Scene, np.ndarray]:
-    """The pixels of a picture that counted, or some of them, and the weights of these, which stand for all."""
+    """The pixels of a picture that counted, or some of them, and their weights, (P, 1 or C), which stand for all."""
     pixel = np.flatnonzero(result.counted[index])
     some = pixel[:: -(-pixel.size // MOST_PIXELS)]
-    weight = result.weighed[index].reshape(result.counted[index].size, -1)[some].max(axis=1) * (pixel.size / some.size)
+    weight = result.weighed[index].reshape(result.counted[index].size, -1)[some] * (pixel.size / some.size)
     return brdf.some_pixels(result.scenes[index], some, precision="float64"), weight
+
+
+def _by_brightness(value: np.ndarray, weight: np.ndarray) -> Callable[[np.ndarray], np.ndarray] | None:
+    """Weights of other values, (P, C), where those of the values are what their brightness says; else None."""
+    if np.ptp(weight) == 0:
+        return None
+    known = []
+    for channel in range(value.shape[1]):
+        own = weight[:, channel % weight.shape[1]]
+        order = np.argsort(value[:, channel])
+        parts = [part for part in np.array_split(order, LEVELS) if part.size]
+        of_parts = np.array([[np.mean(value[part, channel]), np.mean(own[part])] for part in parts]).T
+        left = own[order] - np.interp(value[order, channel], *of_parts)
+        if np.var(left) > UNEXPLAINED * np.var(own):
+            return None
+        known.append((of_parts[0], of_parts[1]))
+    return lambda other: np.stack([np.interp(own, *of) for own, of in zip(other.T, known, strict=True)], axis=1)
 
 
 def _cap(middle: np.ndarray, size: float, count: int) -> list[np.ndarray]:
@@ -260,12 +284,13 @@ def _cap(middle: np.ndarray, size: float, count: int) -> list[np.ndarray]:
 
 
 @eqx.filter_jit
-def _gram(material: brdf.Material, scene: brdf.Scene, weight: Float[Any, " W"]) -> Float[Array, "C 4 4"]:
+def _gram(material: brdf.Material, scene: brdf.Scene, weight: Float[Any, "W 1|C"]) -> Float[Array, "C 4 4"]:
     """Weighted products of the columns of a picture: ambient, diffuse, lobe, and the lobe's derivative by n."""
     n = getattr(material, "n", jnp.ones(()))
     images, slopes = jax.jvp(partial(brdf.basis_images, type(material), scene), (n,), (jnp.ones_like(n),))
-    shown, shape = (images.ambient, images.diffuse, images.specular, slopes.specular), (weight.size, material.k_d.size)
-    columns = jnp.stack(
-        [jnp.broadcast_to(0.0 if one is None else one.reshape(weight.size, -1), shape) for one in shown]
+    shown, shape = (
+        (images.ambient, images.diffuse, images.specular, slopes.specular),
+        (weight.shape[0], material.k_d.size),
     )
-    return jnp.einsum("iwc,w,jwc->cij", columns, weight, columns)
+    columns = jnp.stack([jnp.broadcast_to(0.0 if one is None else one.reshape(shape[0], -1), shape) for one in shown])
+    return jnp.einsum("iwc,wc,jwc->cij", columns, jnp.broadcast_to(weight, shape), columns)

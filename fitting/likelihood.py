@@ -99,7 +99,7 @@ class Bounds:
         unit: radiance where the encoding is 1, a number or (C,).
         index: of each pixel in its picture, row by row.
         width: of the picture.
-        spread: noise of each pixel over that of the picture, a number or (P, 1).
+        spread: noise of each value over that of the picture, a number, (P, 1) or (P, C).
         encoding: "linear", "srgb" or a gamma.
         lossy: neighbours share errors.
         exact: no rounding: where both ends are there they are the same.
@@ -111,7 +111,7 @@ class Bounds:
     unit: Float[np.ndarray, "*C"]
     index: Int[np.ndarray, " P"]
     width: Int[np.ndarray, ""]
-    spread: Float[np.ndarray, "*P"]
+    spread: Float[np.ndarray, "*P_C"]
     encoding: Encoding = dataclasses.field(default="linear", metadata={"static": True})
     lossy: bool = dataclasses.field(default=False, metadata={"static": True})
     exact: bool = dataclasses.field(default=False, metadata={"static": True})

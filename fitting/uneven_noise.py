@@ -174,7 +174,11 @@ def evened(observed: Observed, noise: NoiseOfEach) -> Observed:
             bounds = replace(bounds, spread=bounds.spread * noise.spread[one])
         return tile._replace(weight=own * float(weight[one]), bounds=bounds)
 
-    return observed._replace(tiles=each(of_tile, observed.tiles, observed.owner))
+    weights = [
+        factor * np.asarray(counted if own is None else own)
+        for factor, counted, own in zip(weight, observed.counted, observed.weights, strict=True)
+    ]
+    return observed._replace(tiles=each(of_tile, observed.tiles, observed.owner), weights=weights)
 
 
 def as_it_grows(observed: Observed, fit: ModelFit) -> Observed | None:
@@ -230,7 +234,15 @@ def as_it_grows(observed: Observed, fit: ModelFit) -> Observed | None:
         weight = weight[:, 0] if weight.shape[1] == 1 else weight
         return tile._replace(weight=jnp.asarray(weight), bounds=replace(own, spread=np.sqrt(before / least)))
 
-    return observed._replace(tiles=each(of_tile, observed.tiles, pictures))
+    tiles, weights = each(of_tile, observed.tiles, pictures), observed.weights
+    if not problem.streamed:
+        parts = zip(tiles, observed.owner, strict=True)
+        of_values = [(np.broadcast_to(np.asarray(tile.weight).T, tile.target.T.shape).T, one) for tile, one in parts]
+        weights = [
+            np.concatenate([some for some, of in of_values if of == one]).reshape(picture.shape)
+            for one, picture in enumerate(observed.shown)
+        ]
+    return observed._replace(tiles=tiles, weights=weights)
 
 
 def _widths(bounds: Bounds) -> Float[np.ndarray, "P C"]:

@@ -265,7 +265,8 @@ $reflected
 # As in ``vectors``: pow(N·H, n) is off by 6 % at n = 1e6 in single precision.
 _SHADER_LOBE = Template("""\
 float brdf_log1p(float x) {  // log(1 + x) without losing x to the rounding of 1 + x
-    return x < 1e-3 ? x * (1.0 - x * (0.5 - x * 0.3333333)) : log(1.0 + x);
+    float s = x / (2.0 + x), q = s * s;
+    return x < 0.5 ? 2.0 * s * (1.0 + q * (1.0 / 3.0 + q * (0.2 + q * (1.0 / 7.0 + q / 9.0)))) : log(1.0 + x);
 }
 
 float brdf_lobe(vec3 normal, vec3 to_light, vec3 to_view) {

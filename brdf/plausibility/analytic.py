@@ -109,7 +109,9 @@ def _energy(material: Material, classic: bool) -> Finding:
         bound += ACCURACY["float64"] * material.k_s[channel] / divisor
     words = f"the largest albedo is {value:.7g}, for light at {light}"
     if classic and np.asarray(material.k_s)[channel] > 0:
-        words = f"the albedo exceeds 1 for light beyond {Angles(crossing)} and grows without bound"
+        first = int(np.argmax(directional_albedo(material, beyond)))
+        where = f" ({in_channel(first, albedo.size)[2:]})" if first != channel else ""
+        words = f"the albedo exceeds 1 for light beyond {Angles(crossing)}{where} and grows without bound"
         if value > ENERGY_LIMIT + bound:
             words += f", to {value:.3g} at {light}"
         else:  # a trace of k_s shows only closer to 90 degrees than numbers go

@@ -267,7 +267,7 @@ def _energy(scan: _Scan) -> Finding:
         score = albedo + bound
     row, channel = largest(score)
     value, light = float(albedo[row, channel]), Angles.of(lights[row])
-    words = f"the largest albedo is {value:.6g} for light {light}{in_channel(channel, scan.sample.channels)}"
+    words = f"the largest albedo is {value:.7g} for light {light}{in_channel(channel, scan.sample.channels)}"
     where, failed = (light, None, channel), f"does not conserve energy: {words}"
     return judged(value, ENERGY_LIMIT, float(bound[row, channel]), where, words, failed)
 

@@ -10,7 +10,7 @@ import inspect
 import json
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, get_args
 
@@ -25,6 +25,12 @@ PROCESSES = ("SLURM_NTASKS", "OMPI_COMM_WORLD_SIZE", "JAX_NUM_PROCESSES")
 
 # What help shows that an option takes, where that is no text.
 TAKES = {bool: "", Path: "PATH", float: "NUMBER"}
+
+
+# Files that a fit writes into its folder; a picture that came as a file stays where it is.
+_OF_A_FIT = re.compile(
+    r"(scene|mask)\d*\.(toml|png|aov\.exr)|fitted\.exr|fit\.(json|npz)|material\.(json|mtl)|comparison\.png"
+)
 
 
 class PictureOptions(NamedTuple):
@@ -181,11 +187,18 @@ class _TrialError(Exception):
     """Ends a trial of writing, of which nothing stays."""
 
 
-def check_outputs(out: Path | None, plot: bool = False, page: Path | None = None) -> None:
-    """Refuse before the work what could not be written after it.
+def check_outputs(
+    out: Path | None, plot: bool = False, page: Path | None = None, given: Iterable[Path | None] = ()
+) -> None:
+    """Refuse before the work what could not be written after it, or would replace what is ``given``.
 
     That is a folder of results, the picture that is drawn into it, and the page of a report.
     """
+    for path in filter(None, given):
+        read = path / "scene.toml" if path.is_dir() else path
+        own = out is not None and read.exists() and read.resolve().parent == out.resolve()
+        if own and _OF_A_FIT.fullmatch(read.name):
+            raise InputError("--out", f"would replace {read}, which is read here", "Choose another folder")
     if plot and out is None:
         raise InputError("--plot", "needs a folder to draw into", "Add --out DIR")
     if page is not None and page.suffix.lower() not in (".html", ".htm"):

@@ -69,7 +69,7 @@ def fit(
     if free and any(apart.values()):
         what = f"knows nothing of {' and '.join(option for option, given in apart.items() if given)}"
         raise InputError("--free", what, "Leave one of them out")
-    check_outputs(out, plot, report)
+    check_outputs(out, plot, report, [*target, *(one for one in pictures if isinstance(one, Path))])
     notes: tuple[str, ...] = ()
     mesh = all_devices(devices)
     with waiting("reading") as say:

@@ -107,3 +107,24 @@ def test_pixels_weigh_as_they_did_in_the_fit(result, tmp_path):
     weighed.save(tmp_path / "saved")
     again = fitting.load_result(tmp_path / "saved")
     assert fitting.next_light(again, [[0, 0, 1]]).before == pytest.approx(before, rel=1e-6)
+
+
+def test_another_picture_is_as_noisy_as_the_first_and_as_its_own_brightness_has_it():
+    """Of noise 0.01 and 0.04 the error of n was 15 % too large; of a camera's, 36 % too small."""
+    suns = [dataclasses.replace(SUN, direction=np.array(one)) for one in ([0.4, 0.5, 0.8], [-0.5, 0.3, 0.8])]
+    new = dataclasses.replace(SUN, direction=np.array([-0.2, -0.6, 0.7]))
+    scenes = list(map(ball_scene, suns))
+    pictures = [pictured(MATERIAL, *some) for some in zip(scenes, (0.01, 0.04), (0, 1), strict=True)]
+    foretold = fitting.next_light(fitting.fit(pictures, scenes, model="blinn-phong"), [new]).after[0]
+    more = [*pictures, pictured(MATERIAL, ball_scene(new), 0.01, 2)]
+    after = fitting.fit(more, [*scenes, ball_scene(new)], model="blinn-phong")
+    assert foretold == pytest.approx(after["n"].error, rel=0.05)
+
+    def shot(light, seed):
+        scene = ball_scene(light)
+        return pictured(MATERIAL, scene, np.sqrt(0.002**2 + 0.002 * pictured(MATERIAL, scene)), seed)
+
+    how = {"model": "blinn-phong", "noise": (0.002, 0.002)}
+    foretold = fitting.next_light(fitting.fit(shot(suns[0], 0), scenes[0], **how), [new]).after[0]
+    both = fitting.fit([shot(suns[0], 0), shot(new, 1)], [scenes[0], ball_scene(new)], **how)
+    assert foretold == pytest.approx(both["n"].error, rel=0.05)

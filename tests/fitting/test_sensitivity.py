@@ -80,6 +80,23 @@ def test_light_direction_moves_the_fit_as_fits_at_shifted_lights_say(case: str):
     np.testing.assert_allclose(found.n @ DIRECTION, 0, atol=1e-8 * np.abs(found.n).max())
 
 
+def test_pictures_of_different_noise_move_the_fit_by_what_they_know():
+    """Counted alike, n moved by 0.57 of what it does."""
+    other = scene(np.array([-0.5, 0.3, 0.8]))
+    material = brdf.BlinnPhong(k_a=[0.2, 0.1, 0.3], k_d=[0.5, 0.4, 0.1], k_s=[0.4, 0.3, 0.6], n=20.0)
+    clean = [np.asarray(brdf.render(material, one, precision="float64")) for one in (scene(), other)]
+    rng = np.random.default_rng(3)
+    pictures = [one + rng.normal(0, noise, one.shape) for one, noise in zip(clean, (0.01, 0.03), strict=True)]
+
+    def found(shift: np.ndarray) -> fitting.FitResult:
+        return fitting.fit(pictures, [scene(DIRECTION + shift), other], model="blinn-phong", precision="float64")
+
+    (moves,) = fitting.sensitivity(found(np.zeros(3)), lambda scenes: (scenes[0].lights[0].direction,))
+    for axis, shift in enumerate(1e-4 * np.eye(3)):
+        difference = (numbers(found(shift).material) - numbers(found(-shift).material)) / 2e-4
+        np.testing.assert_allclose(row(moves, axis), difference, rtol=0.02, atol=0.01)
+
+
 def test_several_leaves_and_a_fit_in_float32():
     target = picture("noise")
     result = fitting.fit(target.astype(np.float32), scene(), model="blinn-phong")

@@ -87,6 +87,17 @@ def test_fit_render_fit_comes_round(folder, capsys):
     np.testing.assert_allclose(brdf.read_image("again.exr"), brdf.read_image(folder / "target.exr"), atol=2e-6)
 
 
+def test_what_is_read_is_not_replaced(folder, capsys):
+    """The scene was written anew without its comments, a picture named fitted.exr became the fitted one."""
+    before = (folder / "scene.toml").read_bytes()
+    for words in ([folder], [folder / "target.exr", "--scene", folder / "scene.toml"]):
+        status, _, err = run(capsys, "fit", *words, "--model", "lambert", "--out", folder)
+        assert status == 2
+        said = f"would replace {folder / 'scene.toml'}, which is read here. Choose another folder.\n"
+        assert err == f"error: --out: {said}"
+    assert (folder / "scene.toml").read_bytes() == before
+
+
 def test_two_processes_that_are_told_of_each_other_fit_together(folder, monkeypatch):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
