@@ -151,6 +151,7 @@ class File:
         channels: of the ball.
         as_rgb: grey saved as RGB.
         light_noise: standard deviation, of white, of noise that comes before the encoding.
+        shot: variance of that noise over the value: it grows as a camera's.
     """
 
     noise: float = 0.0
@@ -163,6 +164,7 @@ class File:
     channels: int = 1
     as_rgb: bool = False
     light_noise: float = 0.0
+    shot: float = 0.0
 
     def picture(self, linear: np.ndarray, seed: int, folder: Path) -> Any:
         """What the fit is given: a `brdf.Picture` read back from a file, or an array."""
@@ -175,7 +177,8 @@ class File:
         else:
             white = np.iinfo(self.kind).max / self.step
             if self.light_noise:
-                linear = linear + self.light_noise * random.standard_normal(linear.shape)
+                spread = np.sqrt(self.light_noise**2 + self.shot * np.maximum(linear, 0))
+                linear = linear + spread * random.standard_normal(linear.shape)
             codes = encoded(linear, self.curve) * white + self.noise * random.standard_normal(linear.shape)
             codes = (np.clip(np.rint(codes), 0, self.top) * self.step).astype(self.kind)
         if self.as_rgb:
@@ -193,6 +196,7 @@ class File:
 
 
 FLOAT = File(0.01, top=0, suffix="", kind="float")
+CAMERA = {"light_noise": 0.002, "shot": 0.001}
 COVERAGE = {
     "float, noise 0.01": FLOAT,
     "linear 8 bit": File(),
@@ -208,6 +212,9 @@ COVERAGE = {
     "sRGB 8 bit, colour, noise 1": File(1.0, curve="srgb", channels=3),
     "sRGB 8 bit, light noise 0.0005": File(curve="srgb", light_noise=0.0005),
     "sRGB 8 bit, light noise 0.01": File(curve="srgb", light_noise=0.01),
+    "linear 8 bit, camera": File(**CAMERA),
+    "sRGB 8 bit, camera": File(curve="srgb", **CAMERA),
+    "sRGB 8 bit, colour, camera": File(curve="srgb", channels=3, **CAMERA),
     "12 in 16 bit": File(top=4095, kind="uint16", step=16),
     "12 in 16 bit, noise 1": File(1.0, top=4095, kind="uint16", step=16),
     "linear 16 bit": File(top=65535, kind="uint16"),
@@ -230,6 +237,8 @@ LAMBERT = {
     "linear, no ambient": File(),
     "colour": File(curve="srgb", channels=3),
     "dithered": File(0.5, curve="srgb"),
+    "linear, camera": File(**CAMERA),
+    "sRGB, camera": File(curve="srgb", **CAMERA),
     "colour JPEG q90": File(curve="srgb", suffix=".jpg", quality=90, channels=3),
     "colour JPEG q90, noise 1": File(1.0, curve="srgb", suffix=".jpg", quality=90, channels=3),
     "mesh of 24 rings": File(curve="srgb"),

@@ -5,6 +5,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +22,7 @@ from fitting.doubts import doubts
 from fitting.jpeg_errors import codec_of, without_codec_errors
 from fitting.light_colour import coefficient_factors
 from fitting.maximum_likelihood import bounds_of, highlight_in_codes, most_likely, unexplained
-from fitting.model_fit import Evidence, ModelFit
+from fitting.model_fit import ModelFit
 from fitting.pixels import Observed, Tile, observe
 from fitting.problem import FitProblem
 from fitting.result import FitResult
@@ -56,6 +57,8 @@ COLOURED = 4.0
 FEWEST_MEASUREMENTS = 30.0
 # A highlight that leaves so many times the squares of another one is not made likelier than it by rounding.
 HOPELESS = 3.0
+# By so much less pixels err alike where noise that grows is what was left.
+LESS_STRUCTURE = 0.25
 # So often lobes of many light samples are tabulated, nearer to where n was found each time.
 TRIALS = 4
 # An exponent up to this multiple of the lower bound is at the bound.
@@ -66,6 +69,9 @@ ROUNDED_AWAY = "a highlight as wide as the search allows changes no value by a c
 ROUNDING = 1e-12
 
 
+_Fitted: TypeAlias = tuple[ModelFit, Choice | None, Observed, Residual | None]
+
+
 def fit_pictures(problem: FitProblem) -> FitResult:
     """Fit a material: the global optimum over all pixels that count; refused where nothing is left to fit."""
     # Over the largest of them all, so that single precision holds them.
@@ -74,15 +80,7 @@ def fit_pictures(problem: FitProblem) -> FitResult:
     problem = dataclasses.replace(problem, weights=weights)
 
     with working_precision(problem.precision):
-        seen = observe(problem)
-        fit, choice, observed, statistics = _fitted(_evenly_noisy(seen))
-        for _ in range(GROWINGS):
-            if (uneven := as_it_grows(seen, fit)) is None:
-                break
-            again = _fitted(uneven)
-            if not _likelier(again[0].evidence, fit.evidence, seen):
-                break
-            fit, choice, observed, statistics = again
+        fit, choice, observed, statistics = _with_its_noise(observe(problem))
         fit = _held_plausible(fit, observed)
         if fit.capped or problem.loss != "squared":
             statistics = None
@@ -105,14 +103,26 @@ def fit_pictures(problem: FitProblem) -> FitResult:
     return dataclasses.replace(result, candidates=candidates, optimum=optimum)
 
 
-def _likelier(after: Evidence | None, before: Evidence | None, observed: Observed) -> bool:
-    """Whether noise that grows makes a picture likelier, and nothing else is left, which would be larger there, too."""
-    if after is None or before is None or after.value < before.value + RISE / 2:
-        return False
-    return not shared_errors(after, observed)[1].significant
+def _with_its_noise(seen: Observed) -> _Fitted:
+    """A fit, with noise that grows with brightness where that makes the picture likelier."""
+    first = last = _fitted(_evenly_noisy(seen))
+    for _ in range(GROWINGS):
+        if (uneven := as_it_grows(seen, last[0])) is None:
+            break
+        again = _fitted(uneven)
+        before, after = last[0].evidence, again[0].evidence
+        if before is None or after is None or after.value < before.value + RISE / 2:
+            break
+        last = again
+    even, grown = first[0].evidence, last[0].evidence
+    if last is first or even is None or grown is None:
+        return first
+    # Something else that is left is larger where it is brighter, too.
+    before, after = (shared_errors(one, seen)[1] for one in (even, grown))
+    return first if after.significant and after.excess > LESS_STRUCTURE * before.excess else last
 
 
-def _fitted(observed: Observed) -> tuple[ModelFit, Choice | None, Observed, Residual | None]:
+def _fitted(observed: Observed) -> _Fitted:
     """The model that is named, or the simplest adequate one; the pixels less what a codec did, and what is left."""
     choice = statistics = None
     if observed.problem.model == "auto":

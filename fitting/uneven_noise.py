@@ -32,9 +32,11 @@ UNEVEN, DEVIATIONS = 1.2, 5.0
 # All alike, what is noisy leads the rest astray, whose noise then seems larger: so many rounds.
 EVENINGS = 2
 # How it grows moves numbers, and they how it does; so many rounds at most.
-GROWINGS = 4
+GROWINGS = 6
 # In codes: less noise before rounding than this is not told from none.
 ROUNDING_HIDES = 0.05
+# One of so many values tells how noise grows.
+SHARE = 16
 # So often it is asked what is to be expected of rounded values, by noise that is even and by noise that grows; until
 # one variance for all changes by less than this share, and twice the logarithm of the likelihood by less than this.
 FEW_EXPECTATIONS, EXPECTATIONS, SETTLED, ENOUGH_GAIN = 4, 50, 0.02, 0.5
@@ -196,7 +198,10 @@ def as_it_grows(observed: Observed, fit: ModelFit) -> Observed | None:
     if len({(*np.ravel(one.scale / one.unit), one.encoding) for one in bounds}) > 1:
         return None
     pictures = [replace(picture, bounds=one) for picture, one in zip(fit.pictures, bounds, strict=True)]
-    most = MOST_VALUES // (observed.colour.size * len(bounds))
+    # Whether it grows some tell; how it does, what is cut off shows with more of them.
+    again = any(bounds_of(picture).spread.ndim for picture in fit.pictures)
+    values = sum(picture.target.size for picture in pictures)
+    most = max(MOST_VALUES, again * values // SHARE) // (observed.colour.size * len(bounds))
     some = [_some(picture, most) for picture in pictures]
     widths, size = np.concatenate([bounds_of(picture).widths for picture in some]), 0.0
     step = float(np.max(widths, initial=0.0))
@@ -222,7 +227,7 @@ def as_it_grows(observed: Observed, fit: ModelFit) -> Observed | None:
         return np.maximum(variance_at(coefficients, np.maximum(value, 0)), (ROUNDING_HIDES * step) ** 2)
 
     of_some = np.concatenate(list(map(variance, some)))
-    if np.ptp(np.log(of_some / spread**2)) < math.log(EVEN):
+    if np.ptp(np.log(of_some / spread**2)) < (SETTLED if again else math.log(EVEN)):
         return None
     typical, least = np.median(of_some), np.min(of_some)
 
