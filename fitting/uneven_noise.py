@@ -216,7 +216,8 @@ def as_it_grows(observed: Observed, fit: ModelFit) -> Observed | None:
     parts = zip(*(_said(picture, fit.optimum) for picture in some), strict=True)
     channels = [_Said(*channel) for channel in zip(*map(np.hstack, parts), strict=True)]
     now = (np.broadcast_to(bounds_of(picture).spread, picture.target.shape) for picture in fit.pictures)
-    spread = np.concatenate([_each(one, most) for one in now])
+    spreads = [_each(one, most) for one in now]
+    spread = np.concatenate(spreads)
     coefficients = _growth(channels, (evidence.noise * float(np.median(spread))) ** 2)
     if coefficients is None:
         return None
@@ -226,7 +227,8 @@ def as_it_grows(observed: Observed, fit: ModelFit) -> Observed | None:
         value = bounds_of(picture).codes(np.asarray(picture.predict(fit.optimum.n, fit.optimum.x), float))[0]
         return np.maximum(variance_at(coefficients, np.maximum(value, 0)), (ROUNDING_HIDES * step) ** 2)
 
-    of_some = np.concatenate(list(map(variance, some)))
+    # Behind them some of sampled lights are repeated.
+    of_some = np.concatenate([variance(picture)[: len(own)] for picture, own in zip(some, spreads, strict=True)])
     if np.ptp(np.log(of_some / spread**2)) < (SETTLED if again else math.log(EVEN)):
         return None
     typical, least = np.median(of_some), np.min(of_some)
