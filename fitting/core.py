@@ -19,6 +19,7 @@ from brdf.lobes import Near
 from brdf.precision import working_precision
 from brdf.rendering import basis
 from fitting.doubts import doubts
+from fitting.growing_noise import as_it_grows
 from fitting.jpeg_errors import codec_of, without_codec_errors
 from fitting.light_colour import coefficient_factors
 from fitting.maximum_likelihood import bounds_of, highlight_in_codes, most_likely, unexplained
@@ -41,7 +42,7 @@ from fitting.uncertainty.interpretation import alone_covariance, interpret, shar
 from fitting.uncertainty.noise_model import RISE, weighted_sums
 from fitting.uncertainty.residual import SOME_PIXELS, Residual, residual_statistics, variance_inflation
 from fitting.uncertainty.structure import CHANCE, SIZES, Blocks, Errors, over_blocks, shared
-from fitting.uneven_noise import GROWINGS, as_it_grows, evened, in_codes, noise_of_each
+from fitting.uneven_noise import evened, in_codes, noise_of_each
 
 # A residual above this share of the picture: what the scene says is probably not what the picture shows.
 UNEXPLAINED = 0.5
@@ -57,6 +58,8 @@ COLOURED = 4.0
 FEWEST_MEASUREMENTS = 30.0
 # A highlight that leaves so many times the squares of another one is not made likelier than it by rounding.
 HOPELESS = 3.0
+# How noise grows moves numbers, and they how it does: so many rounds at most.
+GROWINGS = 6
 # By so much less pixels err alike where noise that grows is what was left.
 LESS_STRUCTURE = 0.25
 # So often lobes of many light samples are tabulated, nearer to where n was found each time.

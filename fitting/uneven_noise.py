@@ -1,4 +1,4 @@
-"""Noise that is not the same everywhere: each picture, as of other exposures, and value counts by what it knows."""
+"""Pictures of different noise, as of other exposures: each counts by what it knows."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -11,39 +11,19 @@ from jaxtyping import Bool, Float, Int
 
 from fitting.channel_errors import residuals
 from fitting.codes import all_between
-from fitting.likelihood import Bounds, in_light, interval, is_curved, residual_deviation
-from fitting.maximum_likelihood import bounds_of
+from fitting.likelihood import Bounds, residual_deviation
 from fitting.model_fit import ModelFit
 from fitting.pixels import Observed, Tile
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
 from fitting.solver.streams import each
-from fitting.uncertainty.noise_model import (
-    CHANCE,
-    EVEN,
-    MOST_VALUES,
-    RISE,
-    growth_of_channel,
-    variance_at,
-)
 
 # The noise of one picture is this factor of another's, and more than chance would make it by so many deviations.
 UNEVEN, DEVIATIONS = 1.2, 5.0
 # All alike, what is noisy leads the rest astray, whose noise then seems larger: so many rounds.
 EVENINGS = 2
-# How it grows moves numbers, and they how it does; so many rounds at most.
-GROWINGS = 6
 # In codes: less noise before rounding than this is not told from none.
 ROUNDING_HIDES = 0.05
-# One of so many values tells how noise grows.
-SHARE = 16
-# So often it is asked what is to be expected of rounded values, by noise that is even and by noise that grows; until
-# one variance for all changes by less than this share, and twice the logarithm of the likelihood by less than this.
-FEW_EXPECTATIONS, EXPECTATIONS, SETTLED, ENOUGH_GAIN = 4, 50, 0.02, 0.5
-# Of a step: noise before rounding that shows how it grows, and by how much steps that are the same may differ.
-NOISY, SAME_STEP = 0.1, 1e-6
-# In deviations of the noise, half as far apart as the ends of a value that is not rounded are taken to be.
-EXACT = 1e-3
 # Steps of single precision, as a share of the brightest value.
 ROUNDED = 2.0**-22
 
@@ -181,175 +161,3 @@ def evened(observed: Observed, noise: NoiseOfEach) -> Observed:
         for factor, counted, own in zip(weight, observed.counted, observed.weights, strict=True)
     ]
     return observed._replace(tiles=each(of_tile, observed.tiles, observed.owner), weights=weights)
-
-
-def as_it_grows(observed: Observed, fit: ModelFit) -> Observed | None:
-    """The same where noise seems to grow with brightness, as a camera's does, beside codes or what is cut off.
-
-    None where it does not or the user says what it is. What least squares alone says of other pictures has errors that
-    allow for it.
-    """
-    problem, evidence = observed.problem, fit.evidence
-    bounds = [tile.bounds for tile in observed.tiles if tile.bounds is not None]
-    stated = problem.noise is not None or any(one is not None for one in problem.weights)
-    if evidence is None or stated or len(bounds) < len(fit.pictures) or any(one.lossy for one in bounds):
-        return None
-    # Of one camera, which has taken all of them alike.
-    if len({(*np.ravel(one.scale / one.unit), one.encoding) for one in bounds}) > 1:
-        return None
-    pictures = [replace(picture, bounds=one) for picture, one in zip(fit.pictures, bounds, strict=True)]
-    # Whether it grows some tell; how it does, what is cut off shows with more of them.
-    again = any(bounds_of(picture).spread.ndim for picture in fit.pictures)
-    values = sum(picture.target.size for picture in pictures)
-    most = max(MOST_VALUES, again * values // SHARE) // (observed.colour.size * len(bounds))
-    some = [_some(picture, most) for picture in pictures]
-    widths, size = np.concatenate([bounds_of(picture).widths for picture in some]), 0.0
-    step = float(np.max(widths, initial=0.0))
-    # What rounding leaves is no noise, and grows with brightness by itself where the steps of floats do.
-    if np.any(widths < (1 - SAME_STEP) * step) or evidence.noise < NOISY * step:
-        return None
-    if is_curved(bounds):
-        # Noise grows before a curve.
-        light = in_light(list(map(bounds_of, some)))
-        some = [replace(picture, bounds=one) for picture, one in zip(some, light, strict=True)]
-        size = 1 / float(light[0].scale)
-    parts = zip(*(_said(picture, fit.optimum) for picture in some), strict=True)
-    channels = [_Said(*channel) for channel in zip(*map(np.hstack, parts), strict=True)]
-    now = (np.broadcast_to(bounds_of(picture).spread, picture.target.shape) for picture in fit.pictures)
-    spreads = [_each(one, most) for one in now]
-    spread = np.concatenate(spreads)
-    coefficients = _growth(channels, (evidence.noise * float(np.median(spread))) ** 2)
-    if coefficients is None:
-        return None
-
-    def variance(picture: Picture) -> np.ndarray:
-        """Of values before rounding."""
-        value = bounds_of(picture).codes(np.asarray(picture.predict(fit.optimum.n, fit.optimum.x), float))[0]
-        return np.maximum(variance_at(coefficients, np.maximum(value, 0)), (ROUNDING_HIDES * step) ** 2)
-
-    # Behind them some of sampled lights are repeated.
-    of_some = np.concatenate([variance(picture)[: len(own)] for picture, own in zip(some, spreads, strict=True)])
-    if np.ptp(np.log(of_some / spread**2)) < (SETTLED if again else math.log(EVEN)):
-        return None
-    typical, least = np.median(of_some), np.min(of_some)
-
-    def of_tile(tile: Tile, picture: Picture) -> Tile:
-        own = bounds_of(picture).in_light(size) if size else bounds_of(picture)
-        before = variance(replace(picture, bounds=own))
-        counts = 1.0 if tile.weight is None else np.asarray(tile.weight).reshape(len(before), -1)
-        weight = (counts * typical / (before + _widths(own) ** 2 / 12)).astype(tile.target.dtype)
-        weight = weight[:, 0] if weight.shape[1] == 1 else weight
-        return tile._replace(weight=jnp.asarray(weight), bounds=replace(own, spread=np.sqrt(before / least)))
-
-    tiles, weights = each(of_tile, observed.tiles, pictures), observed.weights
-    if not problem.streamed:
-        parts = zip(tiles, observed.owner, strict=True)
-        of_values = [(np.broadcast_to(np.asarray(tile.weight).T, tile.target.T.shape).T, one) for tile, one in parts]
-        weights = [
-            np.concatenate([some for some, of in of_values if of == one]).reshape(picture.shape)
-            for one, picture in enumerate(observed.shown)
-        ]
-    return observed._replace(tiles=tiles, weights=weights)
-
-
-def _widths(bounds: Bounds) -> Float[np.ndarray, "P C"]:
-    """Distances of the ends of each code; that of the others where one is open."""
-    closed = bounds.ends == 2
-    width = np.subtract(bounds.upper, bounds.lower, out=np.zeros(closed.shape), where=closed)
-    return np.where(closed, width, np.median(width[closed]) if closed.any() else 1.0)
-
-
-class _Even(NamedTuple):
-    """A variance that does not know of the value.
-
-    Attributes:
-        size: how large.
-        tells: by how many deviations squares go with the value, all the same.
-        cost: minus twice the logarithm of the likelihood.
-    """
-
-    size: float
-    tells: float
-    cost: float
-
-
-class _Said(NamedTuple):
-    """Ends of some codes, what is predicted, and their distance, (C, P); or of a channel."""
-
-    lower: Float[np.ndarray, "*C P"]
-    upper: Float[np.ndarray, "*C P"]
-    value: Float[np.ndarray, "*C P"]
-    width: Float[np.ndarray, "*C P"]
-
-    @property
-    def known(self) -> "_Said":
-        """Those that have an end."""
-        says = np.isfinite(self.lower) | np.isfinite(self.upper)
-        return _Said(*(part[says] for part in self))
-
-    def expected(self, variance: Float[np.ndarray, " P"]) -> tuple[Float[np.ndarray, " P"], float]:
-        """Squares of the noise before rounding, and minus twice the logarithm of the likelihood.
-
-        What is rounded or cut off is as far off as is to be expected (Dempster, Laird and Rubin 1977).
-        """
-        deviation = np.sqrt(variance)
-        # A value that is not rounded lay about where it is.
-        beside = np.where(self.width > 0, 0.0, EXACT * deviation)
-        said = interval(self.lower - beside, self.upper + beside, self.value, deviation)
-        return variance * (1 + variance * (said.score**2 - said.weight)), -2 * float(np.sum(said.value))
-
-    def even(self, shape: Float[np.ndarray, " P"], start: float) -> _Even:
-        """A variance of such a shape."""
-        even, squared, cost = start, shape, 0.0
-        for _ in range(FEW_EXPECTATIONS):
-            squared, cost = self.expected(even * shape)
-            last, even = even, float(np.mean(squared / shape))
-            if abs(even - last) < SETTLED * last:
-                break
-        varies = self.value.size > 1 and np.ptp(self.value) > 0
-        tells = np.corrcoef(squared / shape, self.value)[0, 1] if varies else 0.0
-        return _Even(even, abs(float(tells)) * math.sqrt(self.value.size), cost)
-
-    def growing(self, start: float) -> tuple[Float[np.ndarray, " 3"], float]:
-        """Coefficients of a variance that grows with the value, and its cost."""
-        coefficients, cost, value = np.array([start, 0.0, 0.0]), math.inf, np.maximum(self.value, 0.0)
-        for _ in range(EXPECTATIONS):
-            last = cost
-            squared, cost = self.expected(variance_at(coefficients[None], value[:, None])[:, 0])
-            coefficients = growth_of_channel(squared, value, 0.0, coefficients)[0]
-            if cost > last - ENOUGH_GAIN:
-                break
-        return coefficients, cost
-
-
-def _some(picture: Picture, most: int) -> Picture:
-    """Some of the pixels."""
-    return picture.in_double(_each(np.arange(len(picture.target)), most))
-
-
-def _each(pixels: np.ndarray, most: int) -> np.ndarray:
-    """One of so many, about ``most`` of them."""
-    return pixels[:: max(len(pixels) // most, 1)]
-
-
-def _said(picture: Picture, optimum: Optimum) -> _Said:
-    bounds = bounds_of(picture)
-    code = bounds.codes(np.asarray(picture.predict(optimum.n, optimum.x), float))[0]
-    return _Said(*(np.asarray(part, float).T for part in (bounds.lower, bounds.upper, code, _widths(bounds))))
-
-
-def _growth(channels: Sequence[_Said], start: float) -> Float[np.ndarray, "C 3"] | None:
-    """Coefficients of the variance before rounding of each channel; None where one in codes, or in light, will do.
-
-    That one is about ``start``.
-    """
-    channels = [channel.known for channel in channels]
-    curved = any(np.ptp(channel.width) > SAME_STEP * np.max(channel.width) for channel in channels)
-    light = [channel.even(channel.width**0, start) for channel in channels]
-    codes = [channel.even(channel.width**2, start) for channel in channels] if curved else light
-    light_does, codes_do = (max(one.tells for one in both) < CHANCE for both in (light, codes))
-    if light_does:
-        return None
-    grows, cost = zip(*(channel.growing(even.size) for channel, even in zip(channels, codes, strict=True)), strict=True)
-    # Noise that grows in light is nearly even in codes of a curve.
-    return None if codes_do and sum(cost) > sum(one.cost for one in codes) - RISE else np.array(grows)

@@ -110,7 +110,7 @@ def _energy(material: Material, classic: bool) -> Finding:
     words = f"the largest albedo is {value:.7g}, for light at {light}"
     if classic and np.asarray(material.k_s)[channel] > 0:
         first = int(np.argmax(directional_albedo(material, beyond)))
-        where = f" ({in_channel(first, albedo.size)[2:]})" if first != channel else ""
+        where = "" if first == channel else f"{in_channel(first, albedo.size)},"
         words = f"the albedo exceeds 1 for light beyond {Angles(crossing)}{where} and grows without bound"
         if value > ENERGY_LIMIT + bound:
             words += f", to {value:.3g} at {light}"

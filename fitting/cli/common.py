@@ -28,7 +28,7 @@ TAKES = {bool: "", Path: "PATH", float: "NUMBER"}
 
 
 # Files that a fit writes into its folder; a picture that came as a file stays where it is.
-_OF_A_FIT = re.compile(
+OF_A_FIT = re.compile(
     r"(scene|mask)\d*\.(toml|png|aov\.exr)|fitted\.exr|fit\.(json|npz)|material\.(json|mtl)|comparison\.png"
 )
 
@@ -197,7 +197,7 @@ def check_outputs(
     for path in filter(None, given):
         read = path / "scene.toml" if path.is_dir() else path
         own = out is not None and read.exists() and read.resolve().parent == out.resolve()
-        if own and _OF_A_FIT.fullmatch(read.name):
+        if own and OF_A_FIT.fullmatch(read.name):
             raise InputError("--out", f"would replace {read}, which is read here", "Choose another folder")
     if plot and out is None:
         raise InputError("--plot", "needs a folder to draw into", "Add --out DIR")

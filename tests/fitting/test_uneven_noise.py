@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from small_ball import SUN, ball_scene, pictured
+from small_ball import SIZE, SUN, ball_scene, pictured
 
 import brdf
 import fitting
@@ -138,6 +138,23 @@ def test_noise_that_grows_is_that_of_all_pictures():
     both = (0.4, 0.5, 0.8), (-0.7, 0.2, 0.6)
     off = off_by({"k_a": 0.1, "k_d": 0.5, "k_s": 0.3, "n": 20.0}, 1e-3, "linear", both)
     assert np.sqrt(np.mean(off**2)) < 1.2
+
+
+def test_noise_that_grows_is_found_on_a_small_object_in_a_large_picture():
+    """Of pixels anywhere next to none were of the object: n was as uncertain as of noise that is even."""
+    sun = brdf.DirectionalLight(direction=[0.4, 0.5, 0.8], intensity=[1.0])
+    wide = brdf.OrthographicCamera(
+        position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=22.0, resolution=(10 * SIZE, 10 * SIZE)
+    )
+    near, far = ball_scene(sun, ambient=[0.5]), ball_scene(sun, ambient=[0.5], camera=wide)
+    material = brdf.BlinnPhong(k_a=0.1, k_d=0.6, k_s=0.8, n=20.0)
+    noise = np.sqrt(0.002**2 + 4e-3 * pictured(material, near))
+    codes = np.rint(255 * np.clip(pictured(material, near, noise, 0), 0, 1)).astype(np.uint8)
+    beside = 9 * SIZE // 2
+    padded = np.pad(codes, ((beside, beside), (beside, beside), (0, 0)))
+    one, other = (fitting.fit(*some, model="blinn-phong")["n"] for some in ((codes, near), (padded, far)))
+    assert other.value == pytest.approx(one.value, rel=2e-3)
+    assert other.error == pytest.approx(one.error, rel=0.02)
 
 
 def test_rounding_does_not_make_noise_grow():

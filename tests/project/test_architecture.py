@@ -25,7 +25,8 @@ brdf.materials brdf.measured brdf.plausibility brdf.display
 fitting.progress fitting.likelihood fitting.codes fitting.solver fitting.model_fit
 fitting.channel_errors fitting.continuation fitting.maximum_likelihood fitting.light_colour fitting.sample_error
 fitting.problem fitting.pixels fitting.selection fitting.budget.choice fitting.result
-fitting.uncertainty fitting.uneven_noise fitting.doubts fitting.jpeg_errors fitting.core fitting.joint_problem
+fitting.uncertainty fitting.uneven_noise fitting.growing_noise fitting.doubts fitting.jpeg_errors fitting.core
+fitting.joint_problem
 fitting.diagnosis fitting.report fitting.light_choice fitting.joint_likelihood fitting.joint
 fitting.implicit fitting.relighting fitting.measured_fit fitting.photographs fitting.budget fitting.speed_accuracy
 fitting.front_door fitting.functional fitting.many fitting.maps

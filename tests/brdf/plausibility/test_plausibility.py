@@ -97,7 +97,7 @@ def test_words_for_opengls_blinn_phong():
 def test_the_channel_that_exceeds_first_is_named_beside_the_worst():
     """Blue was said to cross where green does; by itself it does at 89.68 degrees."""
     text = check(brdf.Phong(k_d=[0.2, 0.9, 0.1], k_s=[0.0, 0.3, 0.6], n=20.0)).energy.sentence
-    assert "beyond 88.39° (channel green) and grows without bound, to 27.7 at 89.99°, channel blue" in text
+    assert "beyond 88.39°, channel green, and grows without bound, to 27.7 at 89.99°, channel blue" in text
 
 
 def test_light_that_is_nearly_grazing_is_not_said_to_be_at_90_degrees():

@@ -16,6 +16,7 @@ from sound_files import sound_files
 
 import brdf
 from benchmarks.fuzz_corpus import LIGHT
+from fitting.cli.common import OF_A_FIT
 from fitting.photographs.archives import read_archive
 
 SCENE = (ROOT / "data" / "gold-ball" / "scene.toml").read_text().replace("[256, 256]", "[48, 48]")
@@ -77,6 +78,7 @@ def test_fit_render_fit_comes_round(folder, capsys):
     saved = folder.parent / "a"
     names = sorted(path.name for path in saved.iterdir())
     assert set(names) >= {"comparison.png", "fit.json", "fitted.exr", "material.json", "material.mtl"}
+    assert all(map(OF_A_FIT.fullmatch, names)), names
     values = json.loads((saved / "material.json").read_text())
     assert values["model"] == "blinn-phong"
     # The target is stored in float32.
