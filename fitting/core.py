@@ -19,7 +19,7 @@ from brdf.lobes import Near
 from brdf.precision import working_precision
 from brdf.rendering import basis
 from fitting.doubts import doubts
-from fitting.growing_noise import as_it_grows
+from fitting.growing_noise import Shown, as_it_grows, likeliest
 from fitting.jpeg_errors import codec_of, without_codec_errors
 from fitting.light_colour import coefficient_factors
 from fitting.maximum_likelihood import bounds_of, highlight_in_codes, most_likely, unexplained
@@ -39,7 +39,7 @@ from fitting.solver.streams import Stream, each
 from fitting.solver.tied import NormalEquations, design_of, join_channels, places_of
 from fitting.uncertainty.covariance import NO_TRACE, residual_noise, specular_gain
 from fitting.uncertainty.interpretation import alone_covariance, interpret, shared_errors
-from fitting.uncertainty.noise_model import RISE, weighted_sums
+from fitting.uncertainty.noise_model import weighted_sums
 from fitting.uncertainty.residual import SOME_PIXELS, Residual, residual_statistics, variance_inflation
 from fitting.uncertainty.structure import CHANCE, SIZES, Blocks, Errors, over_blocks, shared
 from fitting.uneven_noise import evened, in_codes, noise_of_each
@@ -58,10 +58,6 @@ COLOURED = 4.0
 FEWEST_MEASUREMENTS = 30.0
 # A highlight that leaves so many times the squares of another one is not made likelier than it by rounding.
 HOPELESS = 3.0
-# How noise grows moves numbers, and they how it does: so many rounds at most.
-GROWINGS = 6
-# By so much less pixels err alike where noise that grows is what was left.
-LESS_STRUCTURE = 0.25
 # So often lobes of many light samples are tabulated, nearer to where n was found each time.
 TRIALS = 4
 # An exponent up to this multiple of the lower bound is at the bound.
@@ -108,21 +104,35 @@ def fit_pictures(problem: FitProblem) -> FitResult:
 
 def _with_its_noise(seen: Observed) -> _Fitted:
     """A fit, with noise that grows with brightness where that makes the picture likelier."""
-    first = last = _fitted(_evenly_noisy(seen))
-    for _ in range(GROWINGS):
-        if (uneven := as_it_grows(seen, last[0])) is None:
-            break
-        again = _fitted(uneven)
-        before, after = last[0].evidence, again[0].evidence
-        if before is None or after is None or after.value < before.value + RISE / 2:
-            break
-        last = again
-    even, grown = first[0].evidence, last[0].evidence
-    if last is first or even is None or grown is None:
-        return first
-    # Something else that is left is larger where it is brighter, too.
-    before, after = (shared_errors(one, seen)[1] for one in (even, grown))
-    return first if after.significant and after.excess > LESS_STRUCTURE * before.excess else last
+
+    def grown(last: _Fitted) -> _Fitted | None:
+        uneven = _growing(seen, last[0])
+        return None if uneven is None else _fitted(uneven)
+
+    def value(one: _Fitted) -> float:
+        return -math.inf if one[0].evidence is None else one[0].evidence.value
+
+    def alike(one: _Fitted) -> tuple[bool, float]:
+        assert one[0].evidence is not None
+        found = shared_errors(one[0].evidence, seen)[1]
+        return found.significant, found.excess
+
+    return likeliest(_fitted(_evenly_noisy(seen)), grown, value, alike)
+
+
+def _growing(seen: Observed, fit: ModelFit) -> Observed | None:
+    """Weighed by noise that seems to grow beside what the fit shows; None where it does not."""
+
+    def of(picture: Picture) -> Shown:
+        def predicted(pixel: np.ndarray | None) -> np.ndarray:
+            some = picture if pixel is None else picture.in_double(pixel)
+            # Behind them some of sampled lights are repeated.
+            shown = np.asarray(some.predict(fit.optimum.n, fit.optimum.x), float)
+            return shown if pixel is None else shown[: pixel.size]
+
+        return Shown(bounds_of(picture).spread, predicted)
+
+    return None if fit.evidence is None else as_it_grows(seen, list(map(of, fit.pictures)), fit.evidence.noise)
 
 
 def _fitted(observed: Observed) -> _Fitted:

@@ -6,23 +6,25 @@ encoding, these squares tell how the variance grows, and each value weighs by it
 """
 
 import math
-from collections.abc import Sequence
+import operator
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
 from fitting.likelihood import Bounds, in_light, interval, is_curved, over_channels
-from fitting.maximum_likelihood import bounds_of
-from fitting.model_fit import ModelFit
 from fitting.pixels import Observed, Tile
-from fitting.solver.normal_equations import Picture
-from fitting.solver.profile import Optimum
 from fitting.solver.streams import each
 from fitting.uncertainty.noise_model import CHANCE, EVEN, MOST_VALUES, RISE, growth_of_channel, variance_at
 
+_F = TypeVar("_F")
+# How noise grows moves numbers, and they how it does: so many rounds at most.
+GROWINGS = 6
+# By so much less pixels err alike where noise that grows is what was left.
+LESS_STRUCTURE = 0.25
 # One of so many values tells how noise grows.
 SHARE = 16
 # So often it is asked what is to be expected of rounded values, by noise that is even and by noise that grows; until
@@ -35,72 +37,102 @@ NOISY, LEAST, SAME_STEP = 0.1, 0.05, 1e-6
 EXACT = 1e-3
 
 
-def as_it_grows(observed: Observed, fit: ModelFit) -> Observed | None:
+def likeliest(
+    first: _F, grown: Callable[[_F], _F | None], value: Callable[[_F], float], alike: Callable[[_F], tuple[bool, float]]
+) -> _F:
+    """A fit with noise that grows with brightness where that makes the pictures likelier, from one without it.
+
+    ``grown`` makes the fit again with noise as it grows beside the last one, ``value`` is the logarithm of its
+    likelihood, and ``alike`` whether pixels err alike more than by chance, and how much.
+    """
+    last = first
+    for _ in range(GROWINGS):
+        again = grown(last)
+        if again is None or value(again) < value(last) + RISE / 2:
+            break
+        last = again
+    if last is first:
+        return first
+    # Something else that is left is larger where it is brighter, too.
+    significant, excess = alike(last)
+    return first if significant and excess > LESS_STRUCTURE * alike(first)[1] else last
+
+
+class Shown(NamedTuple):
+    """What a fit shows of a tile.
+
+    Attributes:
+        spread: that of its bounds, as the fit had them.
+        predicted: radiance of all pixels, or of some by their index.
+    """
+
+    spread: Float[np.ndarray, "*P_C"]
+    predicted: Callable[[Int[np.ndarray, " K"] | None], Float[np.ndarray, "P C"]]
+
+
+def as_it_grows(observed: Observed, shown: Sequence[Shown], noise: float) -> Observed | None:
     """The same where noise seems to grow with brightness, as a camera's does, beside codes or what is cut off.
 
     None where it does not or the user says what it is. What least squares alone says of other pictures has errors that
-    allow for it.
+    allow for it. ``noise`` is what the fit found, in codes before rounding.
     """
-    problem, evidence = observed.problem, fit.evidence
+    problem = observed.problem
     bounds = [tile.bounds for tile in observed.tiles if tile.bounds is not None]
     stated = problem.noise is not None or any(one is not None for one in problem.weights)
-    if evidence is None or stated or len(bounds) < len(fit.pictures) or any(one.lossy for one in bounds):
+    if stated or len(bounds) < len(shown) or any(one.lossy for one in bounds):
         return None
     # Of one camera, which has taken all of them alike.
     if len({(*np.ravel(one.scale / one.unit), one.encoding) for one in bounds}) > 1:
         return None
-    pictures = [replace(picture, bounds=one) for picture, one in zip(fit.pictures, bounds, strict=True)]
     # Whether it grows some tell; how it does, what is cut off shows with more of them.
-    again = any(bounds_of(picture).spread.ndim for picture in fit.pictures)
-    values = sum(picture.target.size for picture in pictures)
+    again = any(one.spread.ndim for one in shown)
+    values = sum(one.lower.size for one in bounds)
     most = max(MOST_VALUES, again * values // SHARE) // (observed.colour.size * len(bounds))
-    index = [_some(picture, most) for picture in pictures]
-    some = [picture.in_double(own) for picture, own in zip(pictures, index, strict=True)]
-    widths, size = np.concatenate([bounds_of(picture).widths for picture in some]), 0.0
+    index = [_some(one, most) for one in bounds]
+    some = [one.pixels(operator.itemgetter(own)) for one, own in zip(bounds, index, strict=True)]
+    widths, size = np.concatenate([one.widths for one in some]), 0.0
     step = float(np.max(widths, initial=0.0))
     # What rounding leaves is no noise, and grows with brightness by itself where the steps of floats do.
-    if np.any(widths < (1 - SAME_STEP) * step) or evidence.noise < NOISY * step:
+    if np.any(widths < (1 - SAME_STEP) * step) or noise < NOISY * step:
         return None
     if is_curved(bounds):
         # Noise grows before a curve.
-        light = in_light(list(map(bounds_of, some)))
-        some = [replace(picture, bounds=one) for picture, one in zip(some, light, strict=True)]
-        size = 1 / float(light[0].scale)
-    parts = zip(*(_ends(picture, fit.optimum) for picture in some), strict=True)
-    channels = [_Ends(*channel) for channel in zip(*map(np.hstack, parts), strict=True)]
-    now = [np.broadcast_to(bounds_of(picture).spread, picture.target.shape) for picture in fit.pictures]
+        some = in_light(some)
+        size = 1 / float(some[0].scale)
+    parts = zip(some, (one.predicted(own) for one, own in zip(shown, index, strict=True)), strict=True)
+    ends = [_ends(*part) for part in parts]
+    channels = [_Ends(*channel) for channel in zip(*map(np.hstack, zip(*ends, strict=True)), strict=True)]
+    now = [np.broadcast_to(one.spread, own.lower.shape) for one, own in zip(shown, bounds, strict=True)]
     spread = np.concatenate([one[own] for one, own in zip(now, index, strict=True)])
-    coefficients = _growth(channels, (evidence.noise * float(np.median(spread))) ** 2)
+    coefficients = _growth(channels, (noise * float(np.median(spread))) ** 2)
     if coefficients is None:
         return None
 
-    def variance(picture: Picture) -> np.ndarray:
-        """Of values before rounding."""
-        value = bounds_of(picture).codes(np.asarray(picture.predict(fit.optimum.n, fit.optimum.x), float))[0]
+    def variance(value: Float[np.ndarray, "P C"]) -> Float[np.ndarray, "P C"]:
+        """Of predictions before rounding."""
         return np.maximum(variance_at(coefficients, np.maximum(value, 0)), (LEAST * step) ** 2)
 
-    # Behind them some of sampled lights are repeated.
-    of_some = np.concatenate([variance(one)[: own.size] for one, own in zip(some, index, strict=True)])
+    of_some = np.concatenate([variance(one.value.T) for one in ends])
     if np.ptp(np.log(of_some / spread**2)) < (SETTLED if again else math.log(EVEN)):
         return None
     typical, least = np.median(of_some), np.min(of_some)
 
-    def of_tile(tile: Tile, picture: Picture) -> Tile:
-        own = bounds_of(picture).in_light(size) if size else bounds_of(picture)
-        before = variance(replace(picture, bounds=own))
+    def of_tile(tile: Tile, own: Bounds, one: Shown) -> Tile:
+        own = own.in_light(size) if size else own
+        before = variance(own.codes(one.predicted(None))[0])
         counts = 1.0 if tile.weight is None else np.asarray(tile.weight).reshape(len(before), -1)
         weight = (counts * typical / (before + _widths(own) ** 2 / 12)).astype(tile.target.dtype)
         weight = weight[:, 0] if weight.shape[1] == 1 else weight
         return tile._replace(weight=jnp.asarray(weight), bounds=replace(own, spread=np.sqrt(before / least)))
 
-    tiles = each(of_tile, observed.tiles, pictures)
+    tiles = each(of_tile, observed.tiles, bounds, shown)
     parts = zip(tiles, observed.owner, strict=True)
     weights = [(np.broadcast_to(np.asarray(tile.weight).T, tile.target.T.shape).T, owner) for tile, owner in parts]
-    shown = [
+    of_pictures = [
         np.concatenate([part for part, owner in weights if owner == one]).reshape(picture.shape)
         for one, picture in enumerate(observed.shown)
     ]
-    return observed._replace(tiles=tiles, weights=shown)
+    return observed._replace(tiles=tiles, weights=of_pictures)
 
 
 def _widths(bounds: Bounds) -> Float[np.ndarray, "P C"]:
@@ -173,15 +205,14 @@ class _Ends(NamedTuple):
         return coefficients, cost
 
 
-def _some(picture: Picture, most: int) -> Int[np.ndarray, " K"]:
+def _some(bounds: Bounds, most: int) -> Int[np.ndarray, " K"]:
     """About so many of the pixels that say something."""
-    tell = np.flatnonzero(over_channels(np.logical_or, bounds_of(picture).ends > 0))
+    tell = np.flatnonzero(over_channels(np.logical_or, bounds.ends > 0))
     return tell[:: max(tell.size // most, 1)]
 
 
-def _ends(picture: Picture, optimum: Optimum) -> _Ends:
-    bounds = bounds_of(picture)
-    code = bounds.codes(np.asarray(picture.predict(optimum.n, optimum.x), float))[0]
+def _ends(bounds: Bounds, predicted: Float[np.ndarray, "P C"]) -> _Ends:
+    code = bounds.codes(predicted)[0]
     return _Ends(*(np.asarray(part, float).T for part in (bounds.lower, bounds.upper, code, _widths(bounds))))
 
 

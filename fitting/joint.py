@@ -18,13 +18,14 @@ import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 import brdf
 from brdf.errors import InputError
@@ -32,6 +33,7 @@ from brdf.images.encoding import Encoding
 from brdf.precision import Precision, working_precision
 from fitting.codes import Rounding
 from fitting.core import fit_pictures
+from fitting.growing_noise import Shown, as_it_grows, likeliest
 from fitting.joint_likelihood import Information, by_least_squares, most_likely_numbers
 from fitting.joint_problem import JointProblem, Leaf, degrees_between, joint_problem, linearised, named_leaves
 from fitting.model_fit import N_RANGE
@@ -158,22 +160,34 @@ def fit_jointly(
     with working_precision(precision), waiting("fitting jointly"):
         whole = observe(stated, at_once=True)
 
+        def minimum(observed: Observed, start: brdf.Material, scenes: Sequence[brdf.Scene]) -> _Solved:
+            pictures = [(tile.target, tile.weight) for tile in observed.tiles]
+            problem = joint_problem(brdf.cast((start, list(scenes)), precision), free, pictures)
+            return _solve(problem, observed, solver, tolerance, max_steps)
+
         def solve(
             start: brdf.Material, scenes: Sequence[brdf.Scene], rounds: int = ROUNDS, *noises: NoiseOfEach
         ) -> JointResult:
-            problem = joint_problem(brdf.cast((start, list(scenes)), precision), free)
-            moves = any("camera." in leaf.words or "shapes[" in leaf.words for leaf in problem.freed)
+            freed = joint_problem((start, list(scenes)), free).freed
+            moves = any("camera." in leaf.words or "shapes[" in leaf.words for leaf in freed)
             plain = _away_from_outlines(whole, scenes) if moves else whole
-            observed = evened(plain, noises[-1]) if noises else plain
-            pictures = [(tile.target, tile.weight) for tile in observed.tiles]
-            result = _solve(dataclasses.replace(problem, pictures=pictures), observed, solver, tolerance, max_steps)
-            if len(observed.tiles) > 1 and len(noises) < EVENINGS:
+            solved = minimum(evened(plain, noises[-1]) if noises else plain, start, scenes)
+            result = solved.result
+            if len(plain.tiles) > 1 and len(noises) < EVENINGS:
                 noise = _noise_of_each(result, plain)
                 if not noise.even:
                     return solve(result.material, result.scenes, rounds, *noises, noise)
-            if rounds > 1 and moves and not _inside(result.scenes, observed.counted):
+            if rounds > 1 and moves and not _inside(result.scenes, plain.counted):
                 return solve(result.material, result.scenes, rounds - 1, *noises)
-            return result
+
+            def grown(last: _Solved) -> _Solved | None:
+                uneven = as_it_grows(plain, last.shown, last.information.noise) if last.shown else None
+                return None if uneven is None else minimum(uneven, last.result.material, last.result.scenes)
+
+            def alike(one: _Solved) -> tuple[bool, float]:
+                return one.neighbours.significant, one.neighbours.correlation
+
+            return likeliest(solved, grown, lambda one: one.information.value, alike).result
 
         if isinstance(material, brdf.Material):
             result = solve(material, stated.scenes)
@@ -327,9 +341,16 @@ def _minimum(problem: JointProblem, brightest: float, solver: str | None, tolera
     return _Minimum(best, steps, converged, "gauss-newton" if whole else solver)
 
 
-def _solve(
-    problem: JointProblem, observed: Observed, solver: str | None, tolerance: float, max_steps: int
-) -> JointResult:
+class _Solved(NamedTuple):
+    """A result, what is known of its numbers, what its pictures show, and how neighbours err alike."""
+
+    result: JointResult
+    information: Information
+    shown: Sequence[Shown]
+    neighbours: Neighbours
+
+
+def _solve(problem: JointProblem, observed: Observed, solver: str | None, tolerance: float, max_steps: int) -> _Solved:
     found = _minimum(problem, float(np.max(observed.brightest)), solver, tolerance, max_steps)
     problem, bounded = found.problem, problem.each(lambda leaf: leaf.bounded)
     vector = np.asarray(problem.start(), np.float64)
@@ -357,7 +378,7 @@ def _solve(
     shapes = [() if leaf.is_direction else problem.leaves[leaf.position].shape for leaf in problem.freed]
     remedy = "raise max_steps" if found.steps >= max_steps else "start nearer, or free fewer numbers"
     warnings = () if found.converged else (f"the solver stopped after {found.steps} steps without an end: {remedy}",)
-    return JointResult(
+    result = JointResult(
         **observed.result_fields() | {"scenes": scenes},
         material=material,
         parameters=parameters,
@@ -373,6 +394,13 @@ def _solve(
         converged=found.converged,
         solver=found.solver,
     )
+    bounds = (tile.bounds for tile in observed.tiles if tile.bounds is not None)
+    shown = [Shown(own.spread, partial(_some, one)) for own, one in zip(bounds, information.shown, strict=False)]
+    return _Solved(result, information, shown, neighbours)
+
+
+def _some(values: Float[np.ndarray, "P C"], pixel: Int[np.ndarray, " K"] | None) -> Float[np.ndarray, "K C"]:
+    return values if pixel is None else values[pixel]
 
 
 def _parameters(

@@ -35,12 +35,18 @@ class Information(NamedTuple):
         hessian: of minus the logarithm of the likelihood, or of half the sum of squares.
         scatter: covariance of the scores; None where that is the Hessian.
         widening: what to multiply the errors of each by.
+        noise: before rounding, standard deviation in codes; none where least squares is the whole answer.
+        value: logarithm of the likelihood.
+        shown: radiance that is predicted of each picture.
     """
 
     vector: Float[np.ndarray, " U"]
     hessian: Float[np.ndarray, "U U"]
     scatter: Float[np.ndarray, "U U"] | None = None
     widening: Float[np.ndarray, "*U"] = np.ones(1)
+    noise: float = 0.0
+    value: float = -np.inf
+    shown: Sequence[Float[np.ndarray, "P C"]] = ()
 
     def errors(self) -> tuple[Float[np.ndarray, "U U"], Float[np.ndarray, " U"]]:
         """Covariance of the numbers and their errors, infinite where nothing tells of one alone.
@@ -94,7 +100,9 @@ def most_likely_numbers(
     # Copies of a value tell no more of what all channels share.
     shared = problem.each(lambda leaf: not leaf.bounded) & observed.copies
     scatter = pictures.scatter(score) if pictures.lossy else None
-    return Information(at.unknowns, score.hessian, scatter, wider * np.sqrt(np.where(shared, observed.colour.size, 1)))
+    wider = wider * np.sqrt(np.where(shared, observed.colour.size, 1))
+    radiance = pictures.radiance(at.unknowns)
+    return Information(at.unknowns, score.hessian, scatter, wider, at.noise, at.value, radiance)
 
 
 def _maximised(pictures: "_RoundedPictures", start: Float[np.ndarray, " U"]) -> tuple[Estimate, list[Precision], Score]:
@@ -122,8 +130,11 @@ class _RoundedPictures(Problem):
 
     def codes(self, unknowns: Float[np.ndarray, " U"]) -> list[Float[np.ndarray, "P C"]]:
         """What is predicted, in codes."""
-        radiance = self._problem.by_picture(_residuals(self._problem, jnp.asarray(unknowns)))
-        return [own.codes(part)[0] for own, part in zip(self.bounds, radiance, strict=True)]
+        return [own.codes(part)[0] for own, part in zip(self.bounds, self.radiance(unknowns), strict=True)]
+
+    def radiance(self, unknowns: Float[np.ndarray, " U"]) -> list[Float[np.ndarray, "P C"]]:
+        """What is predicted."""
+        return self._problem.by_picture(_residuals(self._problem, jnp.asarray(unknowns)))
 
     def shown(self, unknowns: Float[np.ndarray, " U"], values: Sequence[Values]) -> Iterator[tuple[Any, Any]]:
         """What is predicted, and its derivatives by all numbers."""

@@ -5,17 +5,13 @@ import functools
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import brdf
 from brdf.errors import InputError
 from brdf.files import write_text
 from fitting.cli.common import PictureOptions, all_devices, check_outputs, is_first_process, named_as, show_result
 from fitting.progress import waiting
-
-if TYPE_CHECKING:
-    from fitting.cli.inputs import FitInputs
-    from fitting.result import FitResult
 
 
 def fit(
@@ -63,6 +59,7 @@ def fit(
         A photo of a ball: brdf fit ball.png --sphere 244.5,144.5,108 --light fit
         A measured BRDF: brdf fit gold.binary
     """
+    import fitting
     from brdf.measured.loading import is_measured
 
     apart = {"--noise": noise, "--plausible": plausible, "--loss": loss, "--accuracy": accuracy, "--seconds": seconds}
@@ -78,8 +75,6 @@ def fit(
                 what = "is a measured BRDF; of the options only --model, --loss, --out, --plot and --json concern it"
                 raise InputError(target[0], what, "Leave the others out")
             table = brdf.load_measured(target[0])
-            import fitting
-
             say("fitting")
             with named_as({table.name: target[0]}):
                 result: Any = fitting.fit_brdf(table, model, loss=loss or "cosine")
@@ -113,7 +108,12 @@ def fit(
                     notes += ("the errors of the numbers are those under this light: its own is not in them",)
             if free:
                 say("fitting jointly")
-                result = _freed(result, inputs, free)
+                # What is too dark a joint fit knows nothing of.
+                mask = inputs.masks if dark is None else result.counted
+                with named_as({"free": "--free"}):
+                    fitted = inputs.pictures, result.scenes, result.material, free
+                    freed = fitting.fit_jointly(*fitted, mask=mask, saturation=pictures.saturation)
+                result = dataclasses.replace(freed, candidates=result.candidates)
         if not is_first_process(mesh):
             return
         if out is not None:
@@ -128,12 +128,3 @@ def fit(
     saved = [] if out is None else [f"saved in {out}"]
     written = [] if report is None else [f"wrote {report}"]
     show_result(result, notes, json, *saved, *written)
-
-
-def _freed(result: "FitResult", inputs: "FitInputs", names: list[str]) -> "FitResult":
-    """The fit again, with what the names say of the scenes freed; where a command was told so, beside the material."""
-    import fitting
-
-    with named_as({"free": "--free"}):
-        found = fitting.fit_jointly(inputs.pictures, result.scenes, result.material, names, mask=result.counted)
-    return dataclasses.replace(found, candidates=result.candidates)

@@ -161,6 +161,24 @@ def test_a_circle_that_is_off_is_named_and_freed(tmp_path, capsys, monkeypatch):
     assert abs(n["value"] - 40) < 4 * n["error"] < 0.1
 
 
+def test_what_is_clipped_is_told_as_clipped_where_a_light_is_freed(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    true = brdf.BlinnPhong(k_d=[0.4, 0.3, 0.2], k_s=0.5, n=40)
+    scene = photograph_scene(ball_seen((120, 120), Circle(60, 59, 48)), (0.3, 0.4, 0.9))
+    brdf.write_image("ball.png", np.minimum(np.asarray(brdf.render(true, scene)), 0.6))
+    words = ["fit", "ball.png", "--sphere", "60,59,48", "--light", "0.31,0.4,0.9", "--model", "blinn-phong"]
+    found, left_out = {}, []
+    for more in ((), ("--free", "light")):
+        status, out, err = run(capsys, *words, "--saturation", "0.59", "--precision", "float64", "--json", *more)
+        assert status == 0, err
+        found = json.loads(out)
+        left_out.append(found["left_out"])
+    assert left_out[0] == left_out[1]
+    assert found["left_out"]["clipped"] > 0
+    n = next(one for one in found["parameters"] if one["name"] == "n")
+    assert abs(n["value"] - 40) < 4 * n["error"] < 0.4
+
+
 def test_what_a_mask_hides_does_not_pull_the_light(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     picture, mask = shaded((0.3, 0.4, 0.86)), np.ones((*SHAPE, 1), np.float32)
