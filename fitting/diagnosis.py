@@ -102,6 +102,7 @@ class _Picture:
     """Some pixels of a picture, evenly spread, which of them count, and what the fitted material shows there.
 
     Attributes:
+        noise: of single pixels in each channel, in codes.
         moves: by the name of a cause what a change of size 1 adds to freed numbers, which are called by their leaves,
             or to what is shown.
     """
@@ -135,7 +136,7 @@ class _Picture:
             for move in (*self.moves["ball"], *self.moves["radius"]):
                 for size in (RIM, -RIM):
                     self.counted &= np.asarray(self.moved(move, size)[1].surface_points().mask)
-        self.fitted = self.shown({}, 0.0)
+        self.fitted, self.noise = self.shown({}, 0.0), np.ones(target.shape[-1])
         logarithm = np.log(np.where(self.fitted > 0, self.fitted, 1.0))
         self.moves["gamma"] = [0.01 * self.fitted * logarithm]
         self.moves["black"] = [np.full(self.fitted.shape, 0.01)]
@@ -195,11 +196,12 @@ class Residual:
         side = max(MOST_PIXELS / math.sqrt(len(result.scenes)), FEWEST_PIXELS)
         self.pictures = [_Picture(result, index, side) for index in range(len(result.scenes))]
         raw = [picture.codes(picture.target) - picture.codes(picture.fitted) for picture in self.pictures]
-        self.noise = _white_noise(raw, [picture.counted for picture in self.pictures])
-        for picture in self.pictures:
+        self.channels = raw[0].shape[-1]
+        for picture, left in zip(self.pictures, raw, strict=True):
+            picture.noise = _white_noise(left, picture.counted)
             # Where noise was cut off at 0 dark pixels are too bright.
             if np.min(picture.target[picture.counted], initial=np.inf) == 0:
-                picture.counted &= np.all(picture.codes(picture.fitted) > DARK * self.noise, axis=-1)
+                picture.counted &= np.all(picture.codes(picture.fitted) > DARK * picture.noise, axis=-1)
         blocks = [
             np.insert(np.argwhere(picture.counted) // BLOCK, 0, index, axis=1)
             for index, picture in enumerate(self.pictures)
@@ -219,7 +221,7 @@ class Residual:
         """Whether rounding to codes is most of the noise: it has a shape of its own, as a wrong scene does."""
         for picture in self.pictures:
             used = np.unique(picture.codes(picture.target)[picture.counted].astype(np.float32))
-            if used.size > 1 and ROUNDED * float(np.median(np.diff(used))) > float(np.max(self.noise)):
+            if used.size > 1 and ROUNDED * float(np.median(np.diff(used))) > float(np.max(picture.noise)):
                 return True
         return False
 
@@ -240,7 +242,7 @@ class Residual:
             column, left = columns @ size / max(length, TINY), self.left - columns @ size
             # Channels of a pixel, and pixels of a block, may err together: squares of their sums, over those of each.
             scores = column * left
-            together = np.bincount(self._block, scores.reshape(self.noise.size, -1).sum(axis=0))
+            together = np.bincount(self._block, scores.reshape(self.channels, -1).sum(axis=0))
             inflation = max(float(np.sum(together**2)) / max(float(np.sum(scores**2)), TINY), 1.0)
             error = math.sqrt(inflation / max(float(column @ column), TINY))
             most *= min(self.pictures[0].scene.resolution) if unit == "pixels" else 1
@@ -256,7 +258,7 @@ class Residual:
         lit = [picture.lit() for picture in self.pictures]
         for name, axis in MIRRORED.items():
             good = [picture.counted & np.flip(picture.counted, axis) for picture in self.pictures]
-            size = sum(map(np.count_nonzero, good)) * self.noise.size
+            size = sum(map(np.count_nonzero, good)) * self.channels
             if 2 * size < self.left.size:
                 continue
             # Fitted alike: a picture that is its own mirror image gains nothing.
@@ -272,10 +274,10 @@ class Residual:
         solved = []
         for picture, basis, some in zip(self.pictures, lit, good, strict=True):
             target = np.flip(picture.target, axis)
-            weight = some[..., None] * picture.curve(target) ** 2
-            values, weight = (jnp.asarray(a.reshape(-1, self.noise.size)) for a in (target, weight))
+            weight = some[..., None] * (picture.curve(target) / picture.noise) ** 2
+            values, weight = (jnp.asarray(a.reshape(-1, self.channels)) for a in (target, weight))
             solved.append(dataclasses.replace(basis, target=values, weight=weight))
-        return float(np.sum(search(solved).cost / self.noise**2))
+        return float(np.sum(search(solved).cost))
 
     def alike(self, first: _Test, other: _Test) -> bool:
         """Whether the other cause would do as well: the first explains nothing beside it."""
@@ -292,8 +294,9 @@ class Residual:
 
     def _flat(self, images: Sequence[Float[np.ndarray, "*K H W C"]]) -> Float[np.ndarray, "*K C P"]:
         """Of the pixels that count, in units of the noise."""
-        parts = [image[..., picture.counted, :] for image, picture in zip(images, self.pictures, strict=True)]
-        return (np.concatenate(parts, axis=-2) / self.noise).swapaxes(-1, -2)
+        both = zip(images, self.pictures, strict=True)
+        parts = [image[..., picture.counted, :] / picture.noise for image, picture in both]
+        return np.concatenate(parts, axis=-2).swapaxes(-1, -2)
 
     def _unfollowed(self, values: Float[np.ndarray, "C P"]) -> Float[np.ndarray, " N"]:
         """What the material cannot follow; 0 where that is next to nothing."""
@@ -301,13 +304,10 @@ class Residual:
         return left.ravel() * (np.sum(left**2) > FOLLOWED * np.sum(values**2))
 
 
-def _white_noise(
-    residuals: list[Float[np.ndarray, "H W C"]], counted: list[Bool[np.ndarray, "H W"]]
-) -> Float[np.ndarray, " C"]:
+def _white_noise(residual: Float[np.ndarray, "H W C"], counted: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, " C"]:
     """Standard deviation of what single pixels err: from differences of neighbours, which know no wide structure."""
-    known = [np.where(some[..., None], image, np.nan) for image, some in zip(residuals, counted, strict=True)]
-    pairs = [np.diff(image, axis=axis).reshape(-1, image.shape[2]) for image in known for axis in (0, 1)]
-    differences = np.concatenate(pairs)
+    known = np.where(counted[..., None], residual, np.nan)
+    differences = np.concatenate([np.diff(known, axis=axis).reshape(-1, known.shape[2]) for axis in (0, 1)])
     differences = differences[np.isfinite(differences[:, 0])]
-    scale = max(float(np.max(np.abs(residual), initial=0.0)) for residual in residuals)
+    scale = float(np.max(np.abs(residual), initial=0.0))
     return np.sqrt(np.sum(differences**2, axis=0) / max(2 * len(differences), 1)) + 1e-7 * (scale or 1.0)

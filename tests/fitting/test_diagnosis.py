@@ -142,6 +142,16 @@ def test_of_several_pictures_the_one_is_named():
     assert fitted(targets, told).diagnosis[0].name == "light of picture 1"
 
 
+def test_a_noisy_picture_hides_nothing_of_the_others():
+    """By the noise of all of them together a light of half a degree was found in four of ten, to a tenth of it."""
+    scenes = [SCENE, with_light(40.0), with_light(-30.0), with_light(70.0)]
+    targets = [drawn(scene, noise) for scene, noise in zip(scenes, (0.002, 0.002, 0.002, 0.05), strict=True)]
+    cause = fitted(targets, [with_light(0.5), *scenes[1:]]).diagnosis[0]
+    assert cause.name == "light of picture 0"
+    assert cause.size == pytest.approx(0.5, abs=4 * cause.error)
+    assert cause.error < 0.03
+
+
 def test_what_was_named_is_freed():
     target, told, _ = WRONG["light"]
     result = fitting.fit_jointly(target, told, fitted(target, told), "light")
