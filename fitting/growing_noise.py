@@ -30,6 +30,8 @@ SHARE = 16
 # So often it is asked what is to be expected of rounded values, by noise that is even and by noise that grows; until
 # one variance for all changes by less than this share, and twice the logarithm of the likelihood by less than this.
 FEW_EXPECTATIONS, EXPECTATIONS, SETTLED, ENOUGH_GAIN = 4, 50, 0.02, 0.5
+# Where next to none is cut off weights that are off by less than this are as good.
+CUT, ABOUT = 0.01, 0.1
 # Of a step: noise before rounding that shows how it grows, less than any that does, and by how much steps that are the
 # same may differ.
 NOISY, LEAST, SAME_STEP = 0.1, 0.05, 1e-6
@@ -84,10 +86,12 @@ def as_it_grows(observed: Observed, shown: Sequence[Shown], noise: float) -> Obs
     # Of one camera, which has taken all of them alike.
     if len({(*np.ravel(one.scale / one.unit), one.encoding) for one in bounds}) > 1:
         return None
-    # Whether it grows some tell; how it does, what is cut off shows with more of them.
+    # Whether it grows some tell; how it does, what is cut off shows with more of them, and hangs on.
     again = any(one.spread.ndim for one in shown)
-    values = sum(one.lower.size for one in bounds)
-    most = max(MOST_VALUES, again * values // SHARE) // (observed.colour.size * len(bounds))
+    told = [np.bincount(one.ends.ravel(), minlength=3) for one in bounds]
+    _, open_, closed = np.sum(told, axis=0).tolist()
+    cut = open_ > CUT * closed
+    most = max(MOST_VALUES, again * cut * (open_ + closed) // SHARE) // (observed.colour.size * len(bounds))
     index = [_some(one, most) for one in bounds]
     some = [one.pixels(operator.itemgetter(own)) for one, own in zip(bounds, index, strict=True)]
     widths, size = np.concatenate([one.widths for one in some]), 0.0
@@ -113,7 +117,7 @@ def as_it_grows(observed: Observed, shown: Sequence[Shown], noise: float) -> Obs
         return np.maximum(variance_at(coefficients, np.maximum(value, 0)), (LEAST * step) ** 2)
 
     of_some = np.concatenate([variance(one.value.T) for one in ends])
-    if np.ptp(np.log(of_some / spread**2)) < (SETTLED if again else math.log(EVEN)):
+    if np.ptp(np.log(of_some / spread**2)) < (math.log(EVEN) if not again else SETTLED if cut else ABOUT):
         return None
     typical, least = np.median(of_some), np.min(of_some)
 

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.channel_errors import residuals
-from fitting.solver.nnls import nonnegative_minimum
+from fitting.solver.nnls import nonnegative_minima
 from fitting.solver.normal_equations import AnyArray, Picture, Sums, sums
 from fitting.solver.profile import Optimum
 from fitting.solver.streams import each
@@ -35,6 +35,8 @@ MOST_VALUES = 4096
 # Of so many pixels at most it is asked what noise knows of their weights.
 MOST_PIXELS = 1 << 15
 ROUNDS = 6
+# A power of the value depends on the others where they leave less of it.
+DEPENDENT = 1e-13
 # Of noise that does not know of the weights: its variance is one over this power of them.
 POWERS = (0.0, 0.25, 0.5, 0.75)
 
@@ -94,7 +96,8 @@ def growth_of_channel(
     for _ in range(ROUNDS if start is None else 1):
         # The variance of a squared residual is twice its mean squared; scaled, so that no digit is lost.
         scaled = columns / variance
-        coefficients = nonnegative_minimum(scaled @ scaled.T, scaled @ (squared / variance))
+        gram, product = scaled @ scaled.T, scaled @ (squared / variance)
+        coefficients = nonnegative_minima(gram, product, np.zeros(3), np.ones(3, bool), DEPENDENT)
         coefficients[0] = max(coefficients[0], least, 1e-6 * constant)
         variance = coefficients @ columns
     gain = np.sum(np.log(constant / variance) + squared / constant - squared / variance)

@@ -1,7 +1,5 @@
 """Noise that differs between pictures, as of other exposures, or grows with brightness: what is noisy counts less."""
 
-from functools import partial
-
 import numpy as np
 import pytest
 from small_ball import SIZE, SUN, ball_scene, pictured
@@ -104,7 +102,7 @@ def test_pictures_all_of_whose_pixels_count_differ_in_noise():
     assert both["k_d"][0].error == pytest.approx(alone["k_d"][0].error, rel=0.05)
 
 
-def off_by(numbers, shot, kind, lights=((0.4, 0.5, 0.8),), fit=fitting.fit) -> np.ndarray:
+def off_by(numbers, shot, kind, lights=((0.4, 0.5, 0.8),), **fit) -> np.ndarray:
     """By how many of its errors each number is off, of balls whose noise grows with brightness."""
     suns = [brdf.DirectionalLight(direction=direction, intensity=[1.0]) for direction in lights]
     scenes, off = [ball_scene(sun, ambient=[0.5]) for sun in suns], []
@@ -118,7 +116,11 @@ def off_by(numbers, shot, kind, lights=((0.4, 0.5, 0.8),), fit=fitting.fit) -> n
             floats = kind == "clipped"
             pictures.append(picture.astype(np.float32) if floats else np.rint(255 * picture).astype(np.uint8))
         how = {"clipped": {"saturation": 1.0}, "srgb": {"encoding": "srgb"}}.get(kind, {})
-        found = [one for one in fit(pictures, scenes, "blinn-phong", **how).parameters if one.name in numbers]
+        if fit:
+            result = fitting.fit_jointly(pictures, scenes, **fit, **how)
+        else:
+            result = fitting.fit(pictures, scenes, model="blinn-phong", **how)
+        found = [one for one in result.parameters if one.name in numbers]
         off.append([(one.value - numbers[one.name]) / one.error for one in found])
     return np.sqrt(np.mean(np.square(off), axis=0))
 
@@ -146,7 +148,7 @@ def test_noise_that_grows_is_that_of_all_pictures():
 def test_noise_that_grows_is_that_of_a_joint_fit(kind):
     """Of one size for all, k_s of linear codes was 2.4 of its errors off, k_d of those of a curve 1.8."""
     numbers = {"k_a": 0.1, "k_d": 0.6, "k_s": 0.8, "n": 20.0}
-    off = off_by(numbers, 4e-3, kind, fit=partial(fitting.fit_jointly, free="light"))
+    off = off_by(numbers, 4e-3, kind, material="blinn-phong", free="light")
     assert np.sqrt(np.mean(off**2)) < 1.15
 
 
