@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+from jaxtyping import Int
 
 from brdf.images.encoding import Encoding
 from brdf.models.base import SpecularMaterial
@@ -76,7 +77,7 @@ def with_prices(problem: MapProblem) -> MapProblem:
     glossy = np.array([issubclass(model, SpecularMaterial) for model in problem.models])
     if np.count_nonzero(glossy) < 2 or not problem.texels.size:
         return problem
-    criteria = _of_some(problem)["criteria"].astype(float)
+    criteria = some_layers(problem)[1]["criteria"].astype(float)
     shine = criteria[np.isfinite(criteria).all(axis=1) & glossy[np.argmin(criteria, axis=1)]][:, glossy]
     if not shine.size:
         return problem
@@ -96,13 +97,13 @@ def _left(problem: MapProblem) -> float:
     given = problem.photographs
     if given.to_light is None or not problem.texels.size:
         return np.nan
-    layers = _of_some(problem)
+    _, layers = some_layers(problem)
     codes = 255 * np.sqrt(np.mean(given.unit**2)) * layers["noise"] * np.sqrt(1 + OUTLIER**2 * layers["left_out"])
     return float(np.nanmedian(codes)) if np.any(np.isfinite(codes)) else np.nan
 
 
-def _of_some(problem: MapProblem) -> dict[str, np.ndarray]:
-    """The layers of some texels, of which there are any."""
+def some_layers(problem: MapProblem) -> tuple[Int[np.ndarray, " K"], dict[str, np.ndarray]]:
+    """Some texels, of which there are any, and their layers."""
     texels = problem.texels
     row = texels // problem.photographs.size[1]
     rows = np.unique(row)
@@ -110,4 +111,4 @@ def _of_some(problem: MapProblem) -> dict[str, np.ndarray]:
     texels = texels[np.isin(row, rows)]
     texels = texels[:: -(-texels.size // SOME)]
     with waiting("fitting some texels"):
-        return {name: layer[: texels.size] for name, layer in problem.fit(*problem.tiles(texels)).items()}
+        return texels, {name: layer[: texels.size] for name, layer in problem.fit(*problem.tiles(texels)).items()}

@@ -14,6 +14,7 @@ from fitting.maps import map_inputs
 from fitting.maps.input_guesses import likelier, upside_down, with_prices
 from fitting.maps.map_bands import fit_bands
 from fitting.maps.map_inputs import Photographs
+from fitting.maps.map_noise import with_noise
 from fitting.maps.map_result import Maps
 from fitting.maps.photograph_levels import in_unit, with_levels
 from fitting.maps.shared_exponent import label_map, with_shared_n
@@ -57,7 +58,9 @@ def fit_maps(
 ) -> Maps:
     """Fit a material to every texel of one view under many lights: the global optimum of each, with errors.
 
-    Values that are clipped, face away from their light or lie in a cast shadow do not count.
+    Values that are clipped, face away from their light or lie in a cast shadow do not count. Noise is even in codes, or
+    under distant lights grows with brightness, as that of a camera, where some texels say so. Exponents are sought from
+    1 to 65,536; at an end n is not determined.
 
     Args:
         pictures: photographs of one size, (P, H, W, C) linear values or a list of arrays, `brdf.Picture`,
@@ -141,7 +144,7 @@ def fit_maps(
     labels = None if labels is None else label_map(labels, problem)
     problem, unit, clipping = with_levels(problem, saturation)
     problem, notes = likelier(problem)
-    problem = with_prices(problem)
+    problem = with_prices(with_noise(problem))
     notes += clipping + near
     if lossy := [one.name for one in given.each if one.lossy]:
         notes += (LOSSY.format(lossy[0]),)

@@ -4,8 +4,8 @@ The photographs of a texel are ``y_p = k_a A_p + k_d D_p + k_s S_p(n)``. The coe
 the best non-negative ones are a closed form and the search is one-dimensional (variable projection, Golub and Pereyra
 1973). It is global: a grid of octaves of n, where the lobe's column is the square of the one before, then Gauss-Newton
 in the brackets about its two highest peaks. The same sums give the standard errors. Where the normal is sought too,
-Gauss-Newton takes it and the material together. Noise is even in codes: a value's weight is the square of the slope of
-its encoding.
+Gauss-Newton takes it and the material together. A value's weight is of its noise, which is even in codes or grows with
+brightness: see `fitting.maps.tiles`.
 
 The P photographs are the last axis of what is summed over them, (T, P), one array a channel in `Components`, or one for
 all where these are alike. What is left of T texels are arrays whose last axis these are; a channel axis stands before

@@ -23,11 +23,13 @@ from fitting.maps.map_inputs import Photographs, places
 from fitting.maps.map_light_choice import MOST_ERROR
 from fitting.maps.map_result import REASONS
 from fitting.maps.texels import (
+    MOST_LOG_N,
     OUTLIER,
     Distant,
     Profile,
     TexelFit,
     Texels,
+    Trial,
     joint_fit,
     jointly,
     sums,
@@ -49,6 +51,9 @@ LANES = 8
 
 RING = 0.15
 """Lights whose heights z spread by less than this are a ring: n shows less well, and the grid is finer."""
+
+APART = 1e-3
+"""Of light: values that differ less have the curve's own slope between them."""
 
 LEAST_HIGHLIGHT = 2.0
 """k_s is seen where it exceeds so many of its standard errors."""
@@ -90,6 +95,7 @@ class MapProblem:
         precision: float32 or float64.
         seek: "layers", or for an n that texels share the "gains" on the grid of n, or the "slope" by log n.
         refine: whether the normals are refined at an n that texels share.
+        growth: the variance of values is the first and so many times what they show; none where it is even in codes.
     """
 
     photographs: Photographs
@@ -102,6 +108,7 @@ class MapProblem:
     prices: tuple[float, ...] = ()
     seek: str = "layers"
     refine: bool = False
+    growth: tuple[float, ...] = ()
 
     @property
     def finer(self) -> int:
@@ -143,6 +150,7 @@ class MapProblem:
         curves = tuple(one.curve for one in given.each)
         black = -len(curves) % LANES  # photographs that are added
         static = self.models, self.grey, self.finer, self.seek, self.refine, (*curves, *curves[-1:] * black)
+        static += (bool(self.growth),)
         with working_precision(self.precision):
             stacks, occluders = (), ()
             if given.scenes is not None:
@@ -157,7 +165,8 @@ class MapProblem:
             view = self.to_view / np.linalg.norm(self.to_view)
             rounding = max(one.step for one in given.each) / np.sqrt(12 * np.mean(given.unit**2))
             prices = np.array(self.prices or [0.0] * len(self.models), dtype)
-            more = dtype.type(rounding), prices, view.astype(dtype), stacks, occluders
+            growth = np.array(self.growth or [1, 0], dtype)
+            more = dtype.type(rounding), prices, growth, view.astype(dtype), stacks, occluders
             # All tiles that hold a texel, and the first lane that holds none.
             _, count, tile, _ = values.shape
             used, found, size = np.arange(count) <= np.count_nonzero(surface.mask) // tile, [], tiles_of_program(tile)
@@ -171,7 +180,7 @@ class MapProblem:
 # Tiles are small: dealing parts of one out to threads would take ten times as long as the work.
 @functools.partial(
     jax.jit,
-    static_argnums=range(6),
+    static_argnums=range(7),
     compiler_options=COMPILER_OPTIONS | {"xla_disable_hlo_passes": "cpu-parallel-task-assigner"},
 )
 def _program(
@@ -181,12 +190,14 @@ def _program(
     seek: str,
     refine: bool,
     curves: tuple[Encoding, ...],
+    grows: bool,
     used: Array,
     values: Array,
     surface: Surface,
     of_photographs: list[Array],
     rounding: Array,
     prices: Array,
+    growth: Array,
     to_view: Array,
     stacks: tuple[LightStack, ...],
     occluders: tuple[Any, ...],
@@ -196,6 +207,7 @@ def _program(
     scale, weight = scale[:, None], weight[:, None]
     ambient = Components(tuple(ambient[0])) if ambient else None
     lights = Distant(Components(tuple(to_light)), Components(tuple(to_view)), ambient)
+    is_even = not grows and set(curves) == {"linear"}
 
     @functools.partial(jax.jit, inline=True)  # its shapes are asked for below: it is traced once
     def of_tile(tile):
@@ -212,22 +224,47 @@ def _program(
             if normal is not None and points is None and ambient is None:
                 counts &= lights.terms(brdf.Lambert, normal)[0] > 0
             shown = jnp.where(counts, shown, 0)
-            root = counts * (weight if set(curves) == {"linear"} else weight * _slopes(curves, shown))
-            return shown * scale * root, Components(tuple(root))
+            return shown * scale, Components(tuple(counts * rooted(shown, shown)))
 
-        shown, root = apart(decoded, values, number)
-        found = []
+        def rooted(shown, explained):
+            """Roots of the weights of what is shown, and explained as so bright."""
+            if grows:
+                return weight * jax.lax.rsqrt(growth[0] + growth[1] * jnp.maximum(explained, 0))
+            return weight if is_even else weight * _slopes(curves, shown, explained)
+
+        light, root = apart(decoded, values, number)
+        if is_even:
+            return fitted(light, root, normal, mask, points, shared)[0]
+
+        @functools.partial(jax.jit, inline=True)
+        def again(_, state):
+            """By what was explained: of values with noise of their own those that it made darker would weigh more."""
+            root = state[1]
+            layers, explained = fitted(light, root, normal, mask, points, shared)
+            explained = jnp.stack([divide(*both) for both in zip(explained, root, strict=True)]) / scale
+            return layers, Components(tuple((root.parts[0] > 0) * rooted(light / scale, explained)))
+
+        nothing = jax.tree.map(jnp.zeros_like, jax.eval_shape(again, 0, (None, root))[0])
+        return jax.lax.fori_loop(0, 2, again, (nothing, root))[0]
+
+    def fitted(light, root, normal, mask, points, shared):
+        """The layers of a tile, and what the last model explains of its values, times the roots of their weights."""
+        shown, found, explained = light * jnp.stack(root.parts), [], root
         for index, model in enumerate(models):
             texels = Texels(model, grey and issubclass(model, SpecularMaterial), finer, shown, root)
             if normal is None:
                 fit, profile, normals, lit, counts = with_normals(texels, lights)
-                layers = _layers(texels.facing(normals, lights), fit, lit, counts, mask, normals, rounding, profile)
+                texels = texels.facing(normals, lights)
+                layers = _layers(texels, fit, lit, counts, mask, normals, rounding, profile)
             else:
                 if points is None:
                     texels = texels.facing(normal, lights)
                 else:
                     texels = _near(texels, stacks, occluders, ambient, points)
-                layers = _of_normals(texels, mask, normal, rounding, shared, seek, lights if refine else None)
+                best = texels.unshadowed()
+                fit = best.found
+                layers = _of_normals(texels, best, mask, normal, rounding, shared, seek, lights if refine else None)
+            explained = texels.values - texels.residual(fit)
             layers["criterion"] = layers.get("criterion", 0.0) + prices[index]  # of sums there is none
             found.append(layers | {"chosen": jnp.full(mask.shape, index, jnp.uint8)})
         criteria = jnp.stack([one["criterion"] for one in found])
@@ -235,7 +272,7 @@ def _program(
             lambda a, b: {name: jnp.where(b["criterion"] < a["criterion"], b[name], a[name]) for name in a}, found
         )
         layers |= {"criteria": criteria} if len(models) > 1 else {}
-        return {name: layer.T for name, layer in layers.items() if name != "criterion"}
+        return {name: layer.T for name, layer in layers.items() if name != "criterion"}, explained
 
     def of_used(tile):
         empty = jax.tree.map(lambda layer: jnp.zeros(layer.shape, layer.dtype), jax.eval_shape(of_tile, tile[1:]))
@@ -251,11 +288,20 @@ def _weights(unit: np.ndarray) -> np.ndarray:
     return weight[:, :1] if np.allclose(weight, weight[:, :1], rtol=1e-6) else weight
 
 
-def _slopes(curves: tuple[Encoding, ...], light: Array) -> Array:
-    """How much codes change with light: what the roots of weights are, for noise is even in codes."""
+def _slopes(curves: tuple[Encoding, ...], shown: Array, explained: Array) -> Array:
+    """How much codes change with light: what the roots of weights are, for noise is even in codes.
+
+    The cost has the derivatives of squares of codes where these are the change between both times that at the latter.
+    """
     kinds = sorted(set(curves), key=str)
-    which = [np.resize([curve == kind for curve in curves], light.shape[-1]) for kind in kinds]
-    return jnp.select(which, [encoded_and_slope(light, kind, 255.0)[1] for kind in kinds])
+    which = [np.resize([curve == kind for curve in curves], shown.shape[-1]) for kind in kinds]
+    found = []
+    for kind in kinds:
+        (code, _), (other, slope) = (encoded_and_slope(light, kind, 255.0) for light in (shown, explained))
+        apart = jnp.abs(shown - explained) > APART * (jnp.abs(shown) + jnp.abs(explained))
+        between = jnp.where(apart, (code - other) / jnp.where(apart, shown - explained, 1), slope)
+        found.append(jnp.sqrt(slope * between))
+    return jnp.select(which, found)
 
 
 def _near(texels: Texels, stacks: Any, occluders: Any, ambient: Components | None, points: Any) -> Texels:
@@ -295,6 +341,7 @@ def _near(texels: Texels, stacks: Any, occluders: Any, ambient: Components | Non
 
 def _of_normals(
     texels: Texels,
+    best: Trial,
     mask: Array,
     normal: Components,
     rounding: Array,
@@ -303,7 +350,6 @@ def _of_normals(
     lights: Distant | None,
 ) -> dict[str, Array]:
     """What is sought where normals are given, or are refined under lights."""
-    best = texels.unshadowed()
     counts = best.counts.T
     # With a k_s held by a cap, or lobes that underflow, texels without a highlight would tell the n that all share.
     texels = dataclasses.replace(texels, relative=seek != "layers")
@@ -386,6 +432,8 @@ def _layers(
         moved = [jnp.where(shows, 0, plain - k) for k, plain in zip(linear, matt.k, strict=True)]
         linear = list(map(operator.add, linear, moved))
     loose = ~(error <= MOST_ERROR) | ~jnp.any(k_s > LEAST_HIGHLIGHT * k_error[-1], axis=0)
+    # At an end of what is sought it may be beyond.
+    loose |= (fit.log_n <= 0) | (fit.log_n >= MOST_LOG_N)
     # the first that holds
     reason = jnp.zeros(mask.shape, jnp.uint8)
     for number, test in zip(

@@ -82,22 +82,22 @@ def variance_at(coefficients: Any, value: Any) -> Any:
 
 
 def growth_of_channel(
-    squared: np.ndarray, value: np.ndarray, least: float, start: np.ndarray | None = None
+    squared: np.ndarray, value: np.ndarray, least: float, start: np.ndarray | None = None, terms: int = 3
 ) -> tuple[np.ndarray, float]:
-    """Coefficients, and twice the rise of the logarithm of the likelihood over a constant variance.
+    """Coefficients of so many powers, and twice the rise of the logarithm of the likelihood over a constant variance.
 
     From coefficients that are nearly right one round leads on.
     """
-    powers = max(float(np.max(value)), np.finfo(float).tiny) ** np.arange(3)
-    columns = value ** np.arange(3)[:, None] / powers[:, None]
+    powers = max(float(np.max(value)), np.finfo(float).tiny) ** np.arange(terms)
+    columns = value ** np.arange(terms)[:, None] / powers[:, None]
     constant = max(float(np.mean(squared)), least, np.finfo(float).tiny)
-    coefficients = np.array([constant, 0.0, 0.0]) if start is None else start * powers
+    coefficients = constant * np.eye(terms)[0] if start is None else start * powers
     variance = coefficients @ columns
     for _ in range(ROUNDS if start is None else 1):
         # The variance of a squared residual is twice its mean squared; scaled, so that no digit is lost.
         scaled = columns / variance
         gram, product = scaled @ scaled.T, scaled @ (squared / variance)
-        coefficients = nonnegative_minima(gram, product, np.zeros(3), np.ones(3, bool), DEPENDENT)
+        coefficients = nonnegative_minima(gram, product, np.zeros(terms), np.ones(terms, bool), DEPENDENT)
         coefficients[0] = max(coefficients[0], least, 1e-6 * constant)
         variance = coefficients @ columns
     gain = np.sum(np.log(constant / variance) + squared / constant - squared / variance)
