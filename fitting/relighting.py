@@ -8,6 +8,7 @@ many times as bright as in the scene each is, is 1, and the result says so.
 """
 
 import dataclasses
+import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,6 +29,7 @@ FACTOR = "one factor per channel between material and lights"
 ALIKE = "another light or none would look the same"
 # Of the brightest light: no light starts darker, for one without light would be held so.
 FAINT = 0.01
+NO_LOBE = "the picture has no highlight"
 KEPT = "no picture determines it; the mean of the lights' factors, over the scene's own intensities, was made 1"
 
 
@@ -138,7 +140,7 @@ def fit_lights_and_material(
         >>> round(float(found.material.n), 1), len(found.undetermined)
         (51.2, 1)
     """
-    name = model_name(model)
+    begun, name = time.perf_counter(), model_name(model)
     if name == "auto":
         raise InputError("model", "is unknown, got 'auto'", f"Use one of {', '.join(brdf.MODELS)}")
     targets = state_problem([target], [scene], [mask]).targets
@@ -161,8 +163,11 @@ def fit_lights_and_material(
     k = {key: value * scale if key in ("k_d", "k_s") else value for key, value in vars(joint.material).items()}
     material = dataclasses.replace(joint.material, **k)
     found = fit_lights(targets[0], scene, material, precision=precision, mask=mask)
+    lobe = np.any(k.get("k_s", 0))
     parameters = [
         Parameter(key, channel if value.ndim else None, float(one), None)
+        if lobe or key != "n"
+        else Parameter(key, None, None, None, reason=NO_LOBE)
         for key, value in k.items()
         for channel, one in enumerate(np.ravel(value))
     ]
@@ -173,6 +178,7 @@ def fit_lights_and_material(
         parameters=(*found.parameters, *parameters),
         correlation=correlation,
         warnings=tuple(dict.fromkeys((f"{FACTOR}: {KEPT}", *joint.warnings, *found.warnings))),
+        seconds=time.perf_counter() - begun,
     )
 
 

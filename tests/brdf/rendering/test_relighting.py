@@ -149,6 +149,13 @@ def test_lights_and_material_are_found_from_any_start(n: float, start: tuple[flo
     np.testing.assert_allclose(found.material.n, n, rtol=1e-4)
 
 
+def test_without_a_highlight_n_is_not_determined():
+    matt = brdf.Lambert(k_a=MATERIAL.k_a, k_d=MATERIAL.k_d)
+    found = fitting.fit_lights_and_material(np.asarray(brdf.render(matt, scene(INTENSITIES))), scene(INTENSITIES))
+    assert found["n"].value is None
+    assert "no highlight" in found.undetermined["n"]
+
+
 def test_a_light_that_is_stated_to_be_dark_in_a_channel_stays_dark():
     directions = [0.4, 0.5, 0.8], [-0.6, 0.1, 0.7]
     lights = [
