@@ -144,8 +144,9 @@ def fit_maps(
     labels = None if labels is None else label_map(labels, problem)
     problem, unit, clipping = with_levels(problem, saturation)
     problem, notes = likelier(problem)
-    problem = with_prices(with_noise(problem))
-    notes += clipping + near
+    problem, of_lights = with_noise(problem)
+    problem = with_prices(problem)
+    notes += clipping + near + of_lights
     if lossy := [one.name for one in given.each if one.lossy]:
         notes += (LOSSY.format(lossy[0]),)
     if guessed := [one for one in given.each if one.layer is not None]:

@@ -2,7 +2,8 @@
 
 Some texels are fitted as if noise were even in codes. What they leave tells, all together, how the variance goes with
 what they show; that is kept where it is likelier than even noise, and no less likely than a noise of its own for each
-texel, as where models do not hold: then nothing is known of a camera.
+texel, as where models do not hold: then nothing is known of a camera. They also tell of a light that is not as bright
+as it is said to be.
 """
 
 import dataclasses
@@ -32,16 +33,23 @@ DIGITS = 3
 ARITHMETIC = 2.0**-15
 """So little of the brightest value is the arithmetic of the program that drew it."""
 
+BRIGHT, FEWEST, APART, APART_DEVIATIONS, MOST_APART = 0.1, 16, 1.1, 8.0, 0.1
+"""A photograph stands apart where the median of its values of this share of its brightest, at least so many, is this
+factor off, which is so many times the usual distance; if no more than this share of the photographs do."""
+
 NEEDLESS = 2.0
 """So much twice the logarithm of the likelihood rises, with room for chance, by a noise of its own for each texel where
 there is none."""
 
 
-def with_noise(problem: MapProblem) -> MapProblem:
-    """The problem with noise that grows with brightness where that is likelier, under distant lights."""
+def with_noise(problem: MapProblem) -> tuple[MapProblem, tuple[str, ...]]:
+    """The problem with noise that grows with brightness where that is likelier, under distant lights; what to tell.
+
+    That is of photographs whose lights are probably brighter or darker than they are said to be.
+    """
     given = problem.photographs
     if given.to_light is None or not problem.texels.size:
-        return problem
+        return problem, ()
     texels, layers = some_layers(problem)
     stride = -(-texels.size * len(given.each) * given.size[2] // MOST)
     texels, layers = texels[::stride], {name: layer[::stride] for name, layer in layers.items()}
@@ -59,18 +67,40 @@ def with_noise(problem: MapProblem) -> MapProblem:
     noise = layers["noise"][:, None] * np.sqrt(np.mean(given.unit**2, axis=0))
     squared = (values - shown) ** 2
     with np.errstate(invalid="ignore"):
-        counts = (values < top) & (shown > 0) & (squared * slope**2 <= (OUTLIER * noise) ** 2)
+        counts = (values < top) & (shown > 0)
+        notes = _of_lights(np.where(counts, values, np.nan), shown, [one.name for one in given.each])
+        counts &= squared * slope**2 <= (OUTLIER * noise) ** 2
     channels, glossy = given.size[2], np.any(layers["fitted_k_s"] > 0, axis=1)
     unknowns = channels + glossy * (1 + (1 if problem.grey else channels)) + 2 * (problem.surface.normal is None)
     many = np.sum(counts, axis=(0, 2))
     counts &= (many > 2 * unknowns)[:, None]
     least = (ARITHMETIC * np.max(shown, initial=0.0, where=counts)) ** 2
     if not np.sum(squared, where=counts) > least * np.count_nonzero(counts):
-        return problem
+        return problem, notes
     squared = squared * (many / np.maximum(many - unknowns, 1))[:, None]
     rounding = max(one.step for one in given.each) / float(np.max(slope)) / np.sqrt(12)
     growth = _growth(squared, shown, slope, counts, rounding)
-    return dataclasses.replace(problem, growth=growth)
+    return dataclasses.replace(problem, growth=growth), notes
+
+
+def _of_lights(values: np.ndarray, shown: np.ndarray, names: Sequence[str]) -> tuple[str, ...]:
+    """Photographs that stand apart from the others: all of it is brighter, or darker, than what is explained."""
+    bright = shown > BRIGHT * np.max(shown, axis=(1, 2), keepdims=True)
+    ratios = [
+        one[some & np.isfinite(one)] / part[some & np.isfinite(one)]
+        for one, part, some in zip(values, shown, bright, strict=True)
+    ]
+    factor = np.array([np.median(one) if one.size >= FEWEST else np.nan for one in ratios])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        off = np.abs(np.log(factor / np.nanmedian(factor)))
+        apart = off > max(np.log(APART), APART_DEVIATIONS * float(np.nanmedian(off)))
+    count = int(np.count_nonzero(apart))
+    if not 0 < count <= MOST_APART * len(names):
+        return ()
+    worst = int(np.nanargmax(np.where(apart, off, -1)))
+    others = f", and {count - 1} more stand apart" if count > 1 else ""
+    what = f"{names[worst]} is {factor[worst]:.3g} times as bright as the others explain it{others}"
+    return (f"{what}: check intensities, exposures and directions of the lights",)
 
 
 def _growth(

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -87,6 +88,17 @@ def test_noise_of_a_camera_and_of_a_curve_moves_nothing_and_is_in_the_errors(kin
     for name, own in off.items():
         assert np.sqrt(np.mean(own[0][known] ** 2)) < 1.12, name
         assert abs(np.mean(own[0][known])) < 0.2, name
+
+
+@pytest.mark.parametrize(
+    ("factor", "told"), [(1.0, ""), (1.2, "is 1.18 times"), (0.5, "is 0.50[0-9]* times"), (0.0, "is 0 times")]
+)
+def test_a_photograph_whose_light_is_not_so_bright_is_named(factor: float, told: str):
+    lights = dome(32)
+    pictures, truth = texels(256, 0.004, lights)
+    pictures[10] *= factor
+    notes = " ".join(fitting.fit_maps(pictures, lights, truth["normal"][None]).notes)
+    assert re.search(rf"^pictures\[10\] {told} as bright", notes) if told else not notes
 
 
 def test_an_exponent_at_the_end_of_what_is_sought_is_not_determined():
