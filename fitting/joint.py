@@ -395,11 +395,12 @@ def _solve(problem: JointProblem, observed: Observed, solver: str | None, tolera
         solver=found.solver,
     )
     bounds = (tile.bounds for tile in observed.tiles if tile.bounds is not None)
-    shown = [Shown(own.spread, partial(_some, one)) for own, one in zip(bounds, information.shown, strict=False)]
+    shown = [Shown(own.spread, partial(_of_pixels, one)) for own, one in zip(bounds, information.shown, strict=False)]
     return _Solved(result, information, shown, neighbours)
 
 
-def _some(values: Float[np.ndarray, "P C"], pixel: Int[np.ndarray, " K"] | None) -> Float[np.ndarray, "K C"]:
+def _of_pixels(values: Float[np.ndarray, "P C"], pixel: Int[np.ndarray, " K"] | None) -> Float[np.ndarray, "K C"]:
+    """Those of some pixels, or all."""
     return values if pixel is None else values[pixel]
 
 

@@ -60,7 +60,7 @@ class NoiseOfEach(NamedTuple):
         spread: the noise over that of the others, in codes before rounding where there are such.
         pixels: how many.
         alike: codes of all stand for the same, or there are none.
-        chance: by how many deviations that makes them likelier than chance would.
+        deviations: by how many that makes them likelier than chance would.
     """
 
     cost: float
@@ -68,13 +68,13 @@ class NoiseOfEach(NamedTuple):
     spread: Float[np.ndarray, " K"]
     pixels: Float[np.ndarray, " K"]
     alike: bool
-    chance: float
+    deviations: float
 
     @property
     def even(self) -> bool:
         """Whether all have the same, but for chance."""
         near = np.max(self.variance) < UNEVEN**2 * np.min(self.variance)
-        return self.alike and bool(near or self.chance < DEVIATIONS)
+        return self.alike and bool(near or self.deviations < DEVIATIONS)
 
 
 def noise_of_each(
@@ -131,12 +131,13 @@ def noise_left(left: Sequence[Left], owner: Int[np.ndarray, " T"], rounding: Flo
     of_picture = np.equal.outer(owner, np.arange(np.max(owner) + 1))
     count = np.transpose(counted) @ of_picture
     variance = np.maximum(np.transpose(squares) @ of_picture / np.maximum(count, 1), rounding[:, None] ** 2)
-    cost = float(np.sum(count * np.log(variance)))
+    cost = float(np.sum(count * np.log(np.where(variance > 0, variance, 1))))
     # What a noise of its own gains each of them where all have the same (Bartlett, Proc. R. Soc. A 160 (1937) 268).
     many, together = np.sum(count, axis=1), np.sum(count * variance, axis=1)
-    alike = float(np.sum(many * np.log(together / np.maximum(many, 1))))
-    few = np.divide(1, count, out=np.zeros(count.shape), where=count > 0)
-    chance = (alike - cost - np.sum(1 + few / 3)) / math.sqrt(np.sum(2 + few * 4 / 3))
+    alike = float(np.sum(many * np.log(np.where(together > 0, together, 1) / np.maximum(many, 1))))
+    own = count[count > 0]
+    gain = alike - cost - np.sum(1 + 1 / (3 * own))
+    deviations = float(gain / math.sqrt(max(np.sum(2 + 4 / (3 * own)), 1)))
     variance = np.mean(variance / np.mean(variance, axis=1, keepdims=True), axis=0)
     spread, kinds = np.sqrt(variance), {()}
     for one in range(variance.size) if all(some.bounds for some in left) else ():
@@ -147,7 +148,7 @@ def noise_left(left: Sequence[Left], owner: Int[np.ndarray, " T"], rounding: Flo
         step = float(np.mean(np.concatenate([np.zeros(1), *(some.widths for some in bounds)])))
         noise = residual_deviation(bounds, codes) ** 2 - step**2 / 12
         spread[one] = math.sqrt(max(noise, (ROUNDING_HIDES * step) ** 2))
-    return NoiseOfEach(cost, variance, spread / np.min(spread), np.max(count, axis=0), len(kinds) <= 2, chance)
+    return NoiseOfEach(cost, variance, spread / np.min(spread), np.max(count, axis=0), len(kinds) <= 2, deviations)
 
 
 def evened(observed: Observed, noise: NoiseOfEach) -> Observed:

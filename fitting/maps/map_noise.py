@@ -24,8 +24,8 @@ from fitting.maps.texels import OUTLIER, Distant, Texels
 from fitting.maps.tiles import MapProblem
 from fitting.uncertainty.noise_model import RISE, growth_of_channel
 
-MOST = 1 << 17
-"""Values that tell."""
+MOST_VALUES = 1 << 17
+"""So many at most tell."""
 
 DIGITS = 3
 """Of coefficients: what is kept of bands is named by them, also where processes on unlike machines look for them."""
@@ -33,9 +33,14 @@ DIGITS = 3
 ARITHMETIC = 2.0**-15
 """So little of the brightest value is the arithmetic of the program that drew it."""
 
-BRIGHT, FEWEST, APART, APART_DEVIATIONS, MOST_APART = 0.1, 16, 1.1, 8.0, 0.1
-"""A photograph stands apart where the median of its values of this share of its brightest, at least so many, is this
-factor off, which is so many times the usual distance; if no more than this share of the photographs do."""
+BRIGHT, FEWEST = 0.1, 16
+"""Values that tell of a light: of this share of the brightest of a photograph, and at least so many."""
+
+OTHER, DEVIATIONS = 1.1, 8.0
+"""A photograph stands apart that is this factor off, and so many times as far as is usual."""
+
+MOST_OTHERS = 0.1
+"""Where more than this share of the photographs stand apart it is not their lights."""
 
 NEEDLESS = 2.0
 """So much twice the logarithm of the likelihood rises, with room for chance, by a noise of its own for each texel where
@@ -51,7 +56,7 @@ def with_noise(problem: MapProblem) -> tuple[MapProblem, tuple[str, ...]]:
     if given.to_light is None or not problem.texels.size:
         return problem, ()
     texels, layers = some_layers(problem)
-    stride = -(-texels.size * len(given.each) * given.size[2] // MOST)
+    stride = -(-texels.size * len(given.each) * given.size[2] // MOST_VALUES)
     texels, layers = texels[::stride], {name: layer[::stride] for name, layer in layers.items()}
     values = problem.tiles(texels)[0]
     values = values[: len(given.each)].reshape(len(given.each), -1, given.size[2])[:, : texels.size]
@@ -71,35 +76,41 @@ def with_noise(problem: MapProblem) -> tuple[MapProblem, tuple[str, ...]]:
         notes = _of_lights(np.where(counts, values, np.nan), shown, [one.name for one in given.each])
         counts &= squared * slope**2 <= (OUTLIER * noise) ** 2
     channels, glossy = given.size[2], np.any(layers["fitted_k_s"] > 0, axis=1)
-    unknowns = channels + glossy * (1 + (1 if problem.grey else channels)) + 2 * (problem.surface.normal is None)
+    unknowns = (
+        channels * (1 + (problem.ambient is not None))
+        + glossy * (1 + (1 if problem.grey else channels))
+        + 2 * (problem.surface.normal is None)
+    )
     many = np.sum(counts, axis=(0, 2))
     counts &= (many > 2 * unknowns)[:, None]
     least = (ARITHMETIC * np.max(shown, initial=0.0, where=counts)) ** 2
     if not np.sum(squared, where=counts) > least * np.count_nonzero(counts):
         return problem, notes
     squared = squared * (many / np.maximum(many - unknowns, 1))[:, None]
-    rounding = max(one.step for one in given.each) / float(np.max(slope)) / np.sqrt(12)
-    growth = _growth(squared, shown, slope, counts, rounding)
+    growth = _growth(squared, shown, slope, counts, max(one.step for one in given.each) / np.sqrt(12))
     return dataclasses.replace(problem, growth=growth), notes
 
 
 def _of_lights(values: np.ndarray, shown: np.ndarray, names: Sequence[str]) -> tuple[str, ...]:
-    """Photographs that stand apart from the others: all of it is brighter, or darker, than what is explained."""
-    bright = shown > BRIGHT * np.max(shown, axis=(1, 2), keepdims=True)
-    ratios = [
-        one[some & np.isfinite(one)] / part[some & np.isfinite(one)]
-        for one, part, some in zip(values, shown, bright, strict=True)
-    ]
-    factor = np.array([np.median(one) if one.size >= FEWEST else np.nan for one in ratios])
-    with np.errstate(invalid="ignore", divide="ignore"):
-        off = np.abs(np.log(factor / np.nanmedian(factor)))
-        apart = off > max(np.log(APART), APART_DEVIATIONS * float(np.nanmedian(off)))
+    """Photographs that stand apart from the others: most of it is brighter, or darker, than what is explained.
+
+    Of one that lies in shadow a part is as bright as that.
+    """
+    known = np.isfinite(values) & np.isfinite(shown)
+    shown = np.where(known, shown, 0)
+    bright = known & (shown > BRIGHT * np.max(shown, axis=(1, 2), keepdims=True))
+    factor = np.ones(len(names))
+    for index, some in enumerate(bright):
+        if np.count_nonzero(some) >= FEWEST:
+            factor[index] = np.clip(1, *np.quantile(values[index][some] / shown[index][some], (0.25, 0.75)))
+    off = np.abs(np.log(np.maximum(factor, np.finfo(float).tiny)))
+    apart = off > max(np.log(OTHER), DEVIATIONS * float(np.median(off)))
     count = int(np.count_nonzero(apart))
-    if not 0 < count <= MOST_APART * len(names):
+    if not 0 < count <= MOST_OTHERS * len(names):
         return ()
-    worst = int(np.nanargmax(np.where(apart, off, -1)))
+    worst = int(np.argmax(off))
     others = f", and {count - 1} more stand apart" if count > 1 else ""
-    what = f"{names[worst]} is {factor[worst]:.3g} times as bright as the others explain it{others}"
+    what = f"{names[worst]} is {max(factor[worst], 0):.2g} times as bright as the others explain it{others}"
     return (f"{what}: check intensities, exposures and directions of the lights",)
 
 
@@ -108,13 +119,13 @@ def _growth(
 ) -> tuple[float, ...]:
     """Of a camera that counts photons: the variance is a constant and so many times the value; about 1.
 
-    None where it is even in codes, or each texel has its own. What models leave that do not hold goes with the square
-    of the value.
+    None of them where it is even in codes, or each texel has its own. What models leave that do not hold goes with the
+    square of the value. ``rounding`` is what codes leave in any case.
     """
     many = np.sum(counts, axis=(0, 2))
     some = np.sum(np.where(counts, squared * slope**2, 0), axis=(0, 2))[many > 0]
     many, square, value, codes = many[many > 0], squared[counts], shown[counts], slope[counts]
-    least = max(np.finfo(float).eps * float(np.max(value)), rounding) ** 2
+    least = max(np.finfo(float).eps * float(np.max(value)), rounding / float(np.max(codes))) ** 2
     coefficients, _ = growth_of_channel(square, value, least, terms=2)
     variance = coefficients[0] + coefficients[1] * value
     growing = float(np.sum(np.log(variance) + square / variance))

@@ -55,6 +55,10 @@ RING = 0.15
 APART = 1e-3
 """Of light: values that differ less have the curve's own slope between them."""
 
+WEIGHINGS = 2
+"""Fits of values whose weights hang on brightness: by what is shown, then by what the last model explains, as near as
+any for that."""
+
 LEAST_HIGHLIGHT = 2.0
 """k_s is seen where it exceeds so many of its standard errors."""
 
@@ -238,14 +242,14 @@ def _program(
 
         @functools.partial(jax.jit, inline=True)
         def again(_, state):
-            """By what was explained: of values with noise of their own those that it made darker would weigh more."""
+            """The layers, and weights by what is explained: by the values those would count that noise made darker."""
             root = state[1]
             layers, explained = fitted(light, root, normal, mask, points, shared)
             explained = jnp.stack([divide(*both) for both in zip(explained, root, strict=True)]) / scale
             return layers, Components(tuple((root.parts[0] > 0) * rooted(light / scale, explained)))
 
         nothing = jax.tree.map(jnp.zeros_like, jax.eval_shape(again, 0, (None, root))[0])
-        return jax.lax.fori_loop(0, 2, again, (nothing, root))[0]
+        return jax.lax.fori_loop(0, WEIGHINGS, again, (nothing, root))[0]
 
     def fitted(light, root, normal, mask, points, shared):
         """The layers of a tile, and what the last model explains of its values, times the roots of their weights."""

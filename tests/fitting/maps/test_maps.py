@@ -91,7 +91,7 @@ def test_noise_of_a_camera_and_of_a_curve_moves_nothing_and_is_in_the_errors(kin
 
 
 @pytest.mark.parametrize(
-    ("factor", "told"), [(1.0, ""), (1.2, "is 1.18 times"), (0.5, "is 0.50[0-9]* times"), (0.0, "is 0 times")]
+    ("factor", "told"), [(1.0, ""), (1.2, "is 1.2 times"), (0.5, "is 0.5[01]? times"), (0.0, "is 0 times")]
 )
 def test_a_photograph_whose_light_is_not_so_bright_is_named(factor: float, told: str):
     lights = dome(32)
@@ -99,6 +99,17 @@ def test_a_photograph_whose_light_is_not_so_bright_is_named(factor: float, told:
     pictures[10] *= factor
     notes = " ".join(fitting.fit_maps(pictures, lights, truth["normal"][None]).notes)
     assert re.search(rf"^pictures\[10\] {told} as bright", notes) if told else not notes
+
+
+def test_a_photograph_in_shadow_and_texels_without_values_tell_of_no_light():
+    lights = dome(32)
+    pictures, truth = texels(256, 0.004, lights)
+    dark = np.random.default_rng(1).random(256) < 0.6
+    pictures[10, 0, dark] *= 0.05
+    pictures[:, 0, 5] = np.nan
+    assert not fitting.fit_maps(pictures, lights, truth["normal"][None]).notes
+    pictures[20] = 0.004 * np.random.default_rng(0).normal(size=pictures[20].shape)
+    assert fitting.fit_maps(pictures, lights, truth["normal"][None]).notes[0].startswith("pictures[20] is 0")
 
 
 def test_an_exponent_at_the_end_of_what_is_sought_is_not_determined():
