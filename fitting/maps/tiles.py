@@ -246,7 +246,8 @@ def _program(
             root = state[1]
             layers, explained = fitted(light, root, normal, mask, points, shared)
             explained = jnp.stack([divide(*both) for both in zip(explained, root, strict=True)]) / scale
-            return layers, Components(tuple((root.parts[0] > 0) * rooted(light / scale, explained)))
+            # Photographs that were added have no scale.
+            return layers, Components(tuple(jnp.where(root.parts[0] > 0, rooted(light / scale, explained), 0)))
 
         nothing = jax.tree.map(jnp.zeros_like, jax.eval_shape(again, 0, (None, root))[0])
         return jax.lax.fori_loop(0, WEIGHINGS, again, (nothing, root))[0]

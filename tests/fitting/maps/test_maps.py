@@ -68,7 +68,7 @@ def noisy():
 @pytest.mark.parametrize("kind", ["linear", "srgb, in light", "srgb"])
 def test_noise_of_a_camera_and_of_a_curve_moves_nothing_and_is_in_the_errors(kind):
     """As if even in codes: errors of ln n of linear values were 1.3 times too small, k_d of sRGB 2.5 % too dark."""
-    lights = dome(32)
+    lights = dome(36)
     pictures, truth = texels(432, 0.0, lights, n=(20, 150))
     random, size = np.random.default_rng(5), 1 / 1.6
     pictures *= size
