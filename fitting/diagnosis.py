@@ -102,6 +102,7 @@ class _Picture:
     """Some pixels of a picture, evenly spread, which of them count, and what the fitted material shows there.
 
     Attributes:
+        left: what is left of its codes.
         noise: of single pixels in each channel, in codes.
         moves: by the name of a cause what a change of size 1 adds to freed numbers, which are called by their leaves,
             or to what is shown.
@@ -136,7 +137,13 @@ class _Picture:
             for move in (*self.moves["ball"], *self.moves["radius"]):
                 for size in (RIM, -RIM):
                     self.counted &= np.asarray(self.moved(move, size)[1].surface_points().mask)
-        self.fitted, self.noise = self.shown({}, 0.0), np.ones(target.shape[-1])
+        self.fitted = self.shown({}, 0.0)
+        codes = self.codes(self.fitted)
+        self.left = self.codes(self.target) - codes
+        self.noise = _white_noise(self.left, self.counted)
+        # Where noise was cut off at 0 dark pixels are too bright.
+        if np.min(self.target[self.counted], initial=np.inf) == 0:
+            self.counted &= np.all(codes > DARK * self.noise, axis=-1)
         logarithm = np.log(np.where(self.fitted > 0, self.fitted, 1.0))
         self.moves["gamma"] = [0.01 * self.fitted * logarithm]
         self.moves["black"] = [np.full(self.fitted.shape, 0.01)]
@@ -195,13 +202,7 @@ class Residual:
         """Look at some of the pixels."""
         side = max(MOST_PIXELS / math.sqrt(len(result.scenes)), FEWEST_PIXELS)
         self.pictures = [_Picture(result, index, side) for index in range(len(result.scenes))]
-        raw = [picture.codes(picture.target) - picture.codes(picture.fitted) for picture in self.pictures]
-        self.channels = raw[0].shape[-1]
-        for picture, left in zip(self.pictures, raw, strict=True):
-            picture.noise = _white_noise(left, picture.counted)
-            # Where noise was cut off at 0 dark pixels are too bright.
-            if np.min(picture.target[picture.counted], initial=np.inf) == 0:
-                picture.counted &= np.all(picture.codes(picture.fitted) > DARK * picture.noise, axis=-1)
+        self.channels = self.pictures[0].noise.size
         blocks = [
             np.insert(np.argwhere(picture.counted) // BLOCK, 0, index, axis=1)
             for index, picture in enumerate(self.pictures)
@@ -213,7 +214,7 @@ class Residual:
         size = np.linalg.norm(material, axis=1, keepdims=True)
         self._material = material / np.where(size > 0, size, 1.0)
         self._inverse = np.linalg.pinv(self._material, rcond=1e-6)
-        self.left = self._unfollowed(self._flat(raw))
+        self.left = self._unfollowed(self._flat([picture.left for picture in self.pictures]))
         self.excess = float(np.sum(self.left**2)) - self.left.size
 
     @property

@@ -163,14 +163,14 @@ def fit_lights_and_material(
     k = {key: value * scale if key in ("k_d", "k_s") else value for key, value in vars(joint.material).items()}
     material = dataclasses.replace(joint.material, **k)
     found = fit_lights(targets[0], scene, material, precision=precision, mask=mask)
-    lobe = np.any(k.get("k_s", 0))
+    matt = not np.any(k.get("k_s", 0))
     parameters = [
         Parameter(key, channel if value.ndim else None, float(one), None)
-        if lobe or key != "n"
-        else Parameter(key, None, None, None, reason=NO_LOBE)
         for key, value in k.items()
         for channel, one in enumerate(np.ravel(value))
+        if not (matt and key == "n")
     ]
+    parameters += [Parameter("n", None, None, None, reason=NO_LOBE)] if matt and "n" in k else []
     correlation = np.eye(len(found.correlation) + len(parameters))
     correlation[: -len(parameters), : -len(parameters)] = found.correlation
     return dataclasses.replace(

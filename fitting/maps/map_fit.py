@@ -14,7 +14,7 @@ from fitting.maps import map_inputs
 from fitting.maps.input_guesses import likelier, upside_down, with_prices
 from fitting.maps.map_bands import fit_bands
 from fitting.maps.map_inputs import Photographs
-from fitting.maps.map_noise import with_noise
+from fitting.maps.map_residual import left_by_some, lights_apart, with_noise
 from fitting.maps.map_result import Maps
 from fitting.maps.photograph_levels import in_unit, with_levels
 from fitting.maps.shared_exponent import label_map, with_shared_n
@@ -144,9 +144,11 @@ def fit_maps(
     labels = None if labels is None else label_map(labels, problem)
     problem, unit, clipping = with_levels(problem, saturation)
     problem, notes = likelier(problem)
-    problem, of_lights = with_noise(problem)
+    if (left := left_by_some(problem)) is not None:
+        problem = with_noise(problem, left)
+        notes += lights_apart(left, [one.name for one in given.each])
     problem = with_prices(problem)
-    notes += clipping + near + of_lights
+    notes += clipping + near
     if lossy := [one.name for one in given.each if one.lossy]:
         notes += (LOSSY.format(lossy[0]),)
     if guessed := [one for one in given.each if one.layer is not None]:

@@ -11,7 +11,7 @@ from brdf.errors import InputError
 from brdf.models.base import SpecularMaterial
 from brdf.vectors import Components
 from fitting.light_choice import LightChoice, choose_lights, direction_of
-from fitting.maps.texels import Distant, Texels
+from fitting.maps.texels import Distant, columns_of
 
 if TYPE_CHECKING:
     from fitting.maps.map_result import Maps
@@ -44,14 +44,7 @@ def next_light(maps: "Maps", candidates: Any, count: int, of: str) -> LightChoic
     def products(to_light):
         """Of the columns of k_d and k_s and the derivative by ln n: the upper triangle of their Gram matrix, (6, T)."""
         lights = Distant(Components(tuple(to_light[:, None])), Components(tuple(to_view)), None)
-        one, columns = jnp.ones((1, len(log_n), 1)), [jnp.zeros(len(log_n))] * 3
-        for index, model in enumerate(models):
-            if issubclass(model, SpecularMaterial):
-                texels = Texels(model, False, 1, one, Components(tuple(one))).facing(normal, lights)
-                found = *texels.columns(log_n), *texels.by_log_n(log_n)
-                columns = [
-                    jnp.where(chosen == index, new.parts[0][:, 0], old) for new, old in zip(found, columns, strict=True)
-                ]
+        columns = [one[:, 0] for one in columns_of(models, chosen, log_n, normal, lights)]
         return jnp.stack([a * b for i, a in enumerate(columns) for b in columns[i:]])
 
     def information_by(light: Any) -> np.ndarray:

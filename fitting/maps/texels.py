@@ -14,9 +14,10 @@ it, C or 1 long. What would underflow is held above, for a processor takes a hun
 
 import dataclasses
 import functools
+import itertools
 import math
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -445,6 +446,21 @@ class Texels(eqx.Module):
         fit = TexelFit(k, k_error, log_n, slope, step, error, gain, gain)
         left = self.residual(fit)
         return fit._replace(cost=jnp.sum(*sums(left * left), axis=0))
+
+
+def columns_of(models: Sequence[Any], chosen: Any, log_n: Array, normal: Components, lights: Distant) -> list[Array]:
+    """The columns of k_d and k_s, and the derivative of the latter by log n, (T, P) each; texels have chosen models.
+
+    The lights are of intensity 1; of a model without a lobe the last two are 0.
+    """
+    one = jnp.ones((1, log_n.size, lights.to_light.parts[0].size), log_n.dtype)
+    found = [jnp.zeros_like(one[0])] * 3
+    for index, model in enumerate(models):
+        texels = Texels(model, False, 1, one, Components(tuple(one))).facing(normal, lights)
+        own = *texels.columns(log_n), *texels.by_log_n(log_n)
+        mine = (chosen == index)[:, None]
+        found = [jnp.where(mine, new.parts[0] if new else 0, old) for new, old in itertools.zip_longest(own, found)]
+    return found
 
 
 class Profile(NamedTuple):

@@ -52,12 +52,12 @@ LANES = 8
 RING = 0.15
 """Lights whose heights z spread by less than this are a ring: n shows less well, and the grid is finer."""
 
-APART = 1e-3
+ALIKE = 1e-3
 """Of light: values that differ less have the curve's own slope between them."""
 
 WEIGHINGS = 2
-"""Fits of values whose weights hang on brightness: by what is shown, then by what the last model explains, as near as
-any for that."""
+"""Fits of values whose weights hang on brightness: by what is shown, then by what is explained, by the last model:
+of weights it tells as well as another one would."""
 
 LEAST_HIGHLIGHT = 2.0
 """k_s is seen where it exceeds so many of its standard errors."""
@@ -153,8 +153,8 @@ class MapProblem:
         given, dtype = self.photographs, np.dtype(self.precision)
         curves = tuple(one.curve for one in given.each)
         black = -len(curves) % LANES  # photographs that are added
-        static = self.models, self.grey, self.finer, self.seek, self.refine, (*curves, *curves[-1:] * black)
-        static += (bool(self.growth),)
+        kind = self.models, self.grey, self.finer, self.seek, self.refine
+        static = *kind, (*curves, *curves[-1:] * black), bool(self.growth)
         with working_precision(self.precision):
             stacks, occluders = (), ()
             if given.scenes is not None:
@@ -296,15 +296,16 @@ def _weights(unit: np.ndarray) -> np.ndarray:
 def _slopes(curves: tuple[Encoding, ...], shown: Array, explained: Array) -> Array:
     """How much codes change with light: what the roots of weights are, for noise is even in codes.
 
-    The cost has the derivatives of squares of codes where these are the change between both times that at the latter.
+    Squares have the derivatives of those of codes where their weight is the slope at what is explained, times that
+    between it and what is shown.
     """
     kinds = sorted(set(curves), key=str)
     which = [np.resize([curve == kind for curve in curves], shown.shape[-1]) for kind in kinds]
     found = []
     for kind in kinds:
         (code, _), (other, slope) = (encoded_and_slope(light, kind, 255.0) for light in (shown, explained))
-        apart = jnp.abs(shown - explained) > APART * (jnp.abs(shown) + jnp.abs(explained))
-        between = jnp.where(apart, (code - other) / jnp.where(apart, shown - explained, 1), slope)
+        differ = jnp.abs(shown - explained) > ALIKE * (jnp.abs(shown) + jnp.abs(explained))
+        between = jnp.where(differ, (code - other) / jnp.where(differ, shown - explained, 1), slope)
         found.append(jnp.sqrt(slope * between))
     return jnp.select(which, found)
 
