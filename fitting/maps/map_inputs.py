@@ -92,7 +92,8 @@ class Photographs:
         """Pixels that no photograph has as fully transparent."""
         found = np.ones(self.size[:2], bool)
         for opaque in (one.opaque() for one in self.each):
-            found &= True if opaque is None else opaque
+            if opaque is not None:
+                found &= opaque
         return found
 
     def tiles(

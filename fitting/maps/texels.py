@@ -304,13 +304,16 @@ class Texels(eqx.Module):
 
     # -- normals given -------------------------------------------------------------------------------------------------
 
-    def minima(self, profile: "Profile") -> "Minimum":
-        """The best material of each texel, from both peaks side by side: of a few texels, for it takes twice."""
-        lanes = jnp.arange(profile.gains.shape[1])
-        both = self.some(jnp.tile(lanes, 2)).climbed(jnp.concatenate(tuple(profile.brackets), axis=-1))
-        first, second = of_lanes(both, lanes), of_lanes(both, lanes.size + lanes)
-        better = rivals(profile.heights, first.cost) & (second.cost < first.cost)
-        return jax.tree.map(lambda a, b: jnp.where(better, b, a), first, second)
+    def searched(self) -> tuple["Profile", "Minimum"]:
+        """The grid of n, and the best material of each texel: from its highest peak, of a few from the second too."""
+        profile = self.profile()
+        found = self.climbed(profile.brackets[0])
+
+        def better(lanes, first):
+            second = self.some(lanes).climbed(profile.brackets[1][:, lanes])
+            return jax.tree.map(lambda a, b: jnp.where(second.cost < first.cost, b, a), first, second)
+
+        return profile, of_few(rivals(profile.heights, found.cost), found, better)
 
     def climbed(self, bracket: Array) -> "Minimum":
         """Where Gauss-Newton ends in brackets of log n, (3, T)."""
@@ -368,8 +371,7 @@ class Texels(eqx.Module):
         """
         seen, diffuse = self.seen, self.linear[-1]
         dark = seen * shadowed(*(over_channels(self.unweighted(one)) for one in (self.values, diffuse)))
-        profile = self.profile()
-        found = self.climbed(profile.brackets[0])
+        profile, found = self.searched()
         first = Trial.of(self, profile, found, seen)
         # a k_d of their own, by its score: how far below the other one, in standard errors
         terms = sums(self.residual(found) * diffuse * dark, diffuse * diffuse * dark, diffuse * diffuse)
@@ -378,21 +380,18 @@ class Texels(eqx.Module):
         worth = (score < 0) & (score**2 > jnp.minimum(OUTLIER**2, 0.25 * first.freedom) * variance)
 
         def anew(lanes, old):
-            some, tried, every = self.some(lanes), worth[lanes], seen[lanes]
+            some, every = self.some(lanes), seen[lanes]
 
-            def again(i, state):
+            def again(_, state):
                 counts, best = state
                 part = some.where(counts)
-                own = jax.lax.cond(i == 0, lambda _: of_lanes(profile, lanes), Texels.profile, part)
-                trial = Trial.of(some, own, part.minima(own), counts)
-                better = (i == 0) | (tried & (trial.cost < best.cost))
-                best = jax.tree.map(lambda a, b: jnp.where(better, b, a), best, trial)
-                left = inliers(some.residual(trial.found), every, counts)
-                return jnp.where(i == 0, every - dark[lanes], left), best
+                trial = Trial.of(some, *part.searched(), counts)
+                best = jax.tree.map(lambda a, b: jnp.where(trial.cost < best.cost, b, a), best, trial)
+                return inliers(some.residual(trial.found), every, counts), best
 
-            return jax.lax.fori_loop(0, jnp.where(jnp.any(tried), 3, 1), again, (every, old))[1]
+            return jax.lax.fori_loop(0, 2, again, (every - dark[lanes], old))[1]
 
-        return of_few(rivals(profile.heights, found.cost) | worth, first, anew)
+        return of_few(worth, first, anew)
 
     # -- least squares -------------------------------------------------------------------------------------------------
 
@@ -488,10 +487,8 @@ class Profile(NamedTuple):
         variance = jnp.maximum(variance, jnp.finfo(square.dtype).eps * square)  # what is below is rounding
         share = per_deviation(square - fit.cost - 2 * self.gains, variance)
         apart = [jnp.abs(one - best) for one, best in zip(self.k, fit.k, strict=True)]
-        return [
-            *(jnp.max(share[:, None] * one, axis=0) for one in apart),
-            jnp.max(share * jnp.abs(log_n - fit.log_n), axis=0),
-        ]
+        apart = [*(share[:, None] * one for one in apart), share * jnp.abs(log_n - fit.log_n)]
+        return [functools.reduce(jnp.maximum, one) for one in apart]
 
 
 class Minimum(NamedTuple):
@@ -681,10 +678,7 @@ def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Profile, Co
         used = before * counts
         some = texels.where(used)
         there = some.facing(normal, lights)
-        profile = there.profile()
-        found = there.climbed(profile.brackets[0])
-        few = rivals(profile.heights, found.cost)
-        found = of_few(few, found, lambda lanes, _: there.some(lanes).minima(of_lanes(profile, lanes)))
+        profile, found = there.searched()
         start = found.log_n, normal, found.cost
         log_n, normal, least = jax.lax.cond(
             i < count, lambda *same: same, lambda log_n, normal, _: jointly(some, lights, log_n, normal), *start
