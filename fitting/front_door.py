@@ -124,7 +124,7 @@ def fit(
                     # Beside a picture that is read by bands no codes are fitted as such, and none err together.
                     some = in_memory(problem, rounding)
                     lossy = any(one.codes is not None and one.codes.lossy for one in some.targets)
-                    if lossy or np.min(result.noise) < some.usual_step:
+                    if lossy or np.min(result.noise) < some.widest_step:
                         result = fit_pictures(with_enough_samples(some))
             return dataclasses.replace(result, seconds=time.perf_counter() - start)
     if mesh is not None:

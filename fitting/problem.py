@@ -54,6 +54,11 @@ class Target(NamedTuple):
         """Whether the picture is read by bands of rows."""
         return isinstance(self.pixels, brdf.ImageReader)
 
+    @property
+    def widest_step(self) -> float:
+        """Distance of two codes where it is largest: no noise is told that is less than it leaves; 0 without codes."""
+        return 0.0 if self.codes is None else max(self.step, self.codes.usual_step)
+
 
 @dataclasses.dataclass(frozen=True)
 class FitProblem:
@@ -97,9 +102,9 @@ class FitProblem:
         return any(target.streamed for target in self.targets)
 
     @property
-    def usual_step(self) -> float:
-        """Largest of the pictures' usual distances of two codes; 0 where there are none."""
-        return max((target.codes.usual_step for target in self.targets if target.codes is not None), default=0.0)
+    def widest_step(self) -> float:
+        """That of the pictures."""
+        return max(target.widest_step for target in self.targets)
 
     def sample_error(self, model: str) -> SampleError | None:
         """What the light samples leave out of a model, or of another one; None where nothing is known of it."""

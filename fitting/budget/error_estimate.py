@@ -159,6 +159,11 @@ def estimate(run: Run) -> Attempt:
     return Attempt(float(error), float(bound), float(pixels), float(probes.error(missed)), rounding)
 
 
+def is_dithered(noise: float, step: float) -> bool:
+    """Whether noise spreads what is lit evenly over some codes: least squares tells all then, and far less without."""
+    return noise**2 >= (DITHERED**2 + 1 / 12) * step**2
+
+
 def _by_least_squares(run: Run, probes: Probes) -> float:
     """What a sample's least squares may say otherwise than the likelihood of all pixels."""
     noise, channels, even = float(np.max(run.result.noise)), probes.shown.shape[1], 0.0
@@ -166,9 +171,8 @@ def _by_least_squares(run: Run, probes: Probes) -> float:
     for target, sample in zip(run.problem.targets, run.samples, strict=True):
         if sample is None or target.least_squares:
             continue
-        step = 0.0 if target.codes is None else target.codes.usual_step
-        if noise**2 < (DITHERED**2 + 1 / 12) * step**2:
-            even = max(even, 0.5 * step)
+        if target.codes is not None and not is_dithered(noise, target.widest_step):
+            even = max(even, 0.5 * target.codes.usual_step)
         else:
             # The least of the picture, where there is light.
             at_end = probes.shown + probes.residual <= np.nanmin(target.pixels)

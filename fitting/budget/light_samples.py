@@ -4,8 +4,8 @@ Some thousand pixels are fitted first, with a few samples of each light with an 
 16, 64, 256 ... samples at some pixels. What the next count changes is the error of a count; with the scores it makes,
 J'(fine - coarse), the Hessian H tells how far that puts each number off. Taken is the least count whose error is below
 a third of what noise leaves of all pixels, or below a thousandth of the number, and which leaves no structure in the
-residual that noise would not hide, noise being what the best model leaves; fewer than the lights themselves say only
-where noise allows it. Where the residual shows that the picture was drawn with the samples that its lights say, these
+residual that noise would not hide, noise being what the best model leaves, or a tenth of it where it is all rounding;
+fewer than the lights themselves say only where noise allows it. Where the residual shows that the picture was drawn with the samples that its lights say, these
 are taken. Where an accuracy is asked for, the error is to be a small part of that instead, told by the largest count.
 What remains is told in the errors, as is what more samples than the lights' own change where the residual shows
 neither.
@@ -21,7 +21,7 @@ import numpy as np
 from brdf.errors import InputError
 from brdf.lobes import STACKED_VALUES, STORED_SAMPLES, Near
 from fitting.budget.configurations import Configuration, run
-from fitting.budget.error_estimate import Probes
+from fitting.budget.error_estimate import Probes, is_dithered
 from fitting.budget.sampling import sample_counts, with_samples
 from fitting.core import UNSEEN
 from fitting.problem import FitProblem, has_pixel_areas
@@ -40,6 +40,8 @@ AS_GOOD = 1.1
 APART = 1.5
 # Of the noise, root mean square over pixels: less shows in no sum over blocks of them; more than the other is no noise.
 HIDDEN, NO_NOISE = 0.02, 0.3
+# Of the noise of codes that least squares sees, where there is hardly any before rounding: their likelihood sees less.
+OF_CODES = 0.1
 # A residual holds what one of two counts leaves out, or nothing of it: a share of 1 or 0, whose standard error is to be
 # below this.
 SHARE_ERROR = 0.2
@@ -153,9 +155,11 @@ class _Ladder:
         off = self.inverse @ score
         if self.accuracy is not None:
             return bool(self.probes.error(off) <= OF_ACCURACY * self.accuracy)
-        given = samples >= self.own
-        rest, value = noise * np.sqrt(np.diag(self.inverse)), np.append(self.x.ravel(), 1.0) * given
-        hidden = size <= HIDDEN * noise or (given and size > NO_NOISE * noise)
+        given, felt = samples >= self.own, noise
+        if not is_dithered(noise, self.problem.widest_step):
+            felt *= OF_CODES
+        rest, value = felt * np.sqrt(np.diag(self.inverse)), np.append(self.x.ravel(), 1.0) * given
+        hidden = size <= HIDDEN * felt or (given and size > NO_NOISE * noise)
         return hidden and bool(np.all(np.abs(off) <= np.maximum(OF_NOISE * rest, OF_VALUE * value)))
 
     def shows(self, samples: int, rival: int) -> bool:
