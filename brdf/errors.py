@@ -32,6 +32,10 @@ class InputError(ValueError):
         printable = "".join(letter if letter.isprintable() else " " for letter in message)
         super().__init__(" ".join(printable.split()))
 
+    def __reduce__(self):
+        """As it was made: an error that a process cannot hand to another one takes its whole pool along."""
+        return type(self), (Path(self.where) if self.of_file else self.where, self.what, self.remedy)
+
     def inside(self, where: object) -> "InputError":
         """The same error, with the file or table that the value stood in.
 

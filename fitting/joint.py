@@ -67,7 +67,7 @@ RESTARTS = (1.0, 4.0, 16.0, 64.0, 256.0, 1024.0)
 MET = 0.1
 
 
-@dataclass(frozen=True, kw_only=True, repr=False)
+@dataclass(frozen=True, kw_only=True, repr=False, eq=False)
 class JointResult(FitResult):
     """The outcome of a joint fit: a `FitResult` whose parameters are the freed numbers, and what the solver says.
 
@@ -147,7 +147,7 @@ def fit_jointly(
         what = f"must be a function or names, got {type(free).__name__}"
         raise InputError("free", what, "Write lambda material, scenes: (material.n,), or light")
     if not callable(free):
-        free = named_leaves([free] if isinstance(free, str) else free or ())
+        free = named_leaves([free] if isinstance(free, str) else list(dict.fromkeys(map(str, free or ()))))
     material = material.material if isinstance(material, FitResult) else material
     stated = state_problem(
         target, scene, mask, rounding=rounding, encoding=encoding, precision=precision, saturation=saturation

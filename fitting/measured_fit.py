@@ -105,7 +105,7 @@ class BrdfCandidate:
         return self.material.name
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class BrdfFitResult(Parameters):
     """The outcome of `fit_brdf`.
 

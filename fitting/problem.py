@@ -360,4 +360,5 @@ def _check_options(problem: FitProblem) -> None:
     except (TypeError, ValueError):
         raise InputError("noise", f"must be two numbers, got {problem.noise!r}", words) from None
     if not (0 <= read and read * read < math.inf and 0 <= shot < math.inf and read + shot > 0):
-        raise InputError("noise", f"must be two numbers of 0 or more, not both 0, got {problem.noise!r}", words)
+        what = f"must be two numbers of 0 or more, not both 0, whose squares are finite, got {problem.noise!r}"
+        raise InputError("noise", what, words)

@@ -2,7 +2,7 @@
 
 import contextlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -189,6 +189,10 @@ class Parameters:
             raise InputError("result", f"has no number {name!r}", f"It has {known}")
         return exact[0] if exact else found
 
+    def __iter__(self) -> Iterator[str]:
+        """The names of the numbers."""
+        return iter(dict.fromkeys(one.name for one in self.parameters))
+
     @property
     def undetermined(self) -> dict[str, str]:
         """What is not determined, and why: "n", or "k_s[2]" for one channel."""
@@ -227,7 +231,7 @@ class Parameters:
         return tuple(one for one in self.parameters if one.value is not None and not one.at_bound)
 
 
-@dataclass(frozen=True, repr=False, kw_only=True)
+@dataclass(frozen=True, repr=False, eq=False, kw_only=True)
 class FitResult(Parameters):
     """The outcome of a fit.
 

@@ -105,6 +105,7 @@ def export_material(material: Material, to: str, *, name: str = "fitted", note: 
     channels = np.asarray(material.k_d).size
     if to != "json" and channels not in (1, 3):
         raise InputError("material", f"has {channels} channels, {to} knows RGB alone", "Use the format json")
+    name, note = (" ".join(text.split()) for text in (name, note))  # a line, whatever came
     content, losses, drawn, extras = EXPORTS[to](material, name)
     if to != "json" and isinstance(material, SpecularMaterial) and not isinstance(material, WRITTEN):
         losses = [f"the format has no word for the lobe of {material.name}: it is written as Blinn-Phong's", *losses]
@@ -335,7 +336,7 @@ def _three(material, name):
 
     def drawn(cosine: float) -> Colour:
         fresnel = 2.0 ** ((-5.55473 * cosine - 6.98316) * cosine)
-        return (color + (specular * (1 - fresnel) + fresnel) * (n + 2.0) / 8.0) * cosine
+        return (color + glossy * (specular * (1 - fresnel) + fresnel) * (n + 2.0) / 8.0) * cosine
 
     # Where k_s is 0 the Fresnel term would shine all the same.
     kept, kind = (tuple(linear), "MeshPhongMaterial") if glossy else (("color",), "MeshLambertMaterial")
@@ -365,11 +366,13 @@ def _gltf(material, name):
             "the diffuse part is k_d / (1 - F0), as the specification mixes; where a viewer adds, it is brighter",
             "without KHR_materials_specular a viewer shows a colourless highlight of reflectance 0.04",
         ]
+    losses += _cut(F0=f_0)
+    f_0 = np.minimum(f_0, 1.0)  # as viewers do
     base = k_d / np.maximum(1.0 - f_0.max(), 1e-6)  # what the Fresnel layer takes from the diffuse part
     losses += _cut(baseColorFactor=base)
     base = np.minimum(base, 1.0)
 
-    def drawn(cosine):  # appendix B.3 of the specification
+    def drawn(cosine):  # appendix B.3 of the specification, with the height-correlated masking of viewers
         square = roughness**4  # of the slope alpha
         fresnel = f_0 + (1.0 - f_0) * (1.0 - cosine) ** 5
         visible = 0.25 / (cosine * np.sqrt(cosine**2 * (1.0 - square) + square))
@@ -421,7 +424,8 @@ def _mitsuba(material, name):
 
     k_d, k_s, _, n, losses = _normalised(material)
     if not np.any(k_s):
-        return Written({"type": "diffuse", "reflectance": reflecting(k_d)}, losses + _cut(reflectance=k_d))
+        losses += _cut(reflectance=k_d)
+        return Written({"type": "diffuse", "reflectance": reflecting(k_d)}, losses, lambda cosine: k_d * cosine)
     alpha, weight = float(slope_from_exponent(n)), float(k_s.max() / (k_s.max() + k_d.max()))
     diffuse, specular = k_d / max(1.0 - weight, 1e-12), k_s / weight
     losses.append("the lobe is that of microfacets (Beckmann, slope sqrt(2 / (n+2))), narrower and brighter if grazing")

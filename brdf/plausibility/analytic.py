@@ -35,6 +35,7 @@ KNOWN = (Lambert, Phong, BlinnPhong, NormalizedPhong, NormalizedBlinnPhong)
 
 _LIGHTS = np.array([*np.arange(90.0), 89.5, 89.9, GRAZING])
 _VIEWS = np.concatenate([_LIGHTS, -_LIGHTS])  # below 0 on the other side of the normal
+_UNDERFLOWS = 1e-250  # less than this of f_r has lost digits
 _ROUNDING = 1e-13  # relative; float64 at n = 1e6 reaches 1e-14
 
 
@@ -76,13 +77,13 @@ def _reciprocity(material: Material, classic: bool) -> Finding:
     # normal, and the light as low as can be.
     lights, views = np.array([GRAZING]), np.geomspace(GRAZING - 90.0, -90.0, 100_001) + 90.0
     there, back = _in_plane(material, lights, -views)[0], _in_plane(material, views, -lights)[:, 0]
-    # A black channel is reciprocal.
-    difference = np.divide(there - back, there, out=np.zeros_like(there), where=there > 0)
-    row, channel = largest(difference)
-    forth, other, value = (float(one[row, channel]) for one in (there, back, difference))
+    # A black channel is reciprocal, and so is what underflows.
+    ratio = np.divide(there, back, out=np.ones_like(there), where=back > _UNDERFLOWS)
+    row, channel = largest(ratio)
+    value = 1.0 - 1.0 / float(ratio[row, channel])
     light, view = Angles(GRAZING), Angles(float(views[row]), 180.0)
     a, b = f"{light.polar:.4g}°", f"{view.polar:.4g}°"
-    compared = f"f_r({a}→{b}) is {times(forth / max(other, 1e-300))} f_r({b}→{a})"
+    compared = f"f_r({a}→{b}) is {times(float(ratio[row, channel]))} f_r({b}→{a})"
     if value < 2 * RECIPROCITY_LIMIT:  # a trace of k_s shows only closer to 90 degrees than the angles go
         value, light, compared = 1.0, Angles(90.0), "towards grazing light the ratio grows without bound"
     sentence = f"not reciprocal: the specular term is not multiplied by N·L; {compared}"

@@ -5,10 +5,10 @@ Some thousand pixels are fitted first, with a few samples of each light with an 
 J'(fine - coarse), the Hessian H tells how far that puts each number off. Taken is the least count whose error is below
 a third of what noise leaves of all pixels, or below a thousandth of the number, and which leaves no structure in the
 residual that noise would not hide, noise being what the best model leaves, or a tenth of it where it is all rounding;
-fewer than the lights themselves say only where noise allows it. Where the residual shows that the picture was drawn with the samples that its lights say, these
-are taken. Where an accuracy is asked for, the error is to be a small part of that instead, told by the largest count.
-What remains is told in the errors, as is what more samples than the lights' own change where the residual shows
-neither.
+fewer than the lights themselves say only where noise allows it. Where the residual shows that the picture was drawn
+with the samples that its lights say, these are taken. Where an accuracy is asked for, the error is to be a small part
+of that instead, told by the largest count. What remains is told in the errors, as is what more samples than the lights'
+own change where the residual shows neither.
 
 The first fit also says where n is, so that all pixels see their light samples in one pass (`brdf.lobes.Near`).
 """

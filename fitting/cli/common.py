@@ -27,9 +27,13 @@ PROCESSES = ("SLURM_NTASKS", "OMPI_COMM_WORLD_SIZE", "JAX_NUM_PROCESSES")
 TAKES = {bool: "", Path: "PATH", float: "NUMBER"}
 
 
-# Files that a fit writes into its folder; a picture that came as a file stays where it is.
+# Files that a fit, or maps, write into their folder; a picture that came as a file stays where it is.
 OF_A_FIT = re.compile(
     r"(scene|mask)\d*\.(toml|png|aov\.exr)|fitted\.exr|fit\.(json|npz)|material\.(json|mtl)|comparison\.png"
+)
+OF_MAPS = re.compile(
+    r"(maps|info)\.json|maps\.exr|material\.gltf|"
+    r"(maps|k_d|k_s|normals|gloss|base_color|metallic_roughness|specular_color|residual)\.png"
 )
 
 
@@ -187,8 +191,19 @@ class _TrialError(Exception):
     """Ends a trial of writing, of which nothing stays."""
 
 
+def refuse_replacing(given: Iterable[Path | None], out: Path, kind: str = "file") -> None:
+    """Refuse to write over what is read."""
+    for read in filter(None, given):
+        if read.exists() and read.resolve() == out.resolve():
+            raise InputError("--out", f"would replace {read}, which is read here", f"Choose another {kind}")
+
+
 def check_outputs(
-    out: Path | None, plot: bool = False, page: Path | None = None, given: Iterable[Path | None] = ()
+    out: Path | None,
+    plot: bool = False,
+    page: Path | None = None,
+    given: Iterable[Path | None] = (),
+    written: re.Pattern[str] = OF_A_FIT,
 ) -> None:
     """Refuse before the work what could not be written after it, or would replace what is ``given``.
 
@@ -196,15 +211,14 @@ def check_outputs(
     """
     for path in filter(None, given):
         read = path / "scene.toml" if path.is_dir() else path
-        own = out is not None and read.exists() and read.resolve().parent == out.resolve()
-        if own and OF_A_FIT.fullmatch(read.name):
-            raise InputError("--out", f"would replace {read}, which is read here", "Choose another folder")
+        if out is not None and written.fullmatch(read.name):
+            refuse_replacing([read], out / read.name, "folder")
     if plot and out is None:
         raise InputError("--plot", "needs a folder to draw into", "Add --out DIR")
     if page is not None and page.suffix.lower() not in (".html", ".htm"):
         raise InputError(page, "is no name of a page", "Name it .html")
     # Refused before there are any results; nothing of the trial stays.
-    if page is not None:
+    if page is not None and (out is None or page.resolve().parent != out.resolve()):
         with contextlib.suppress(_TrialError), atomic_path(page):
             raise _TrialError
     if out is not None:

@@ -5,7 +5,7 @@ from pathlib import Path
 import typer
 
 import brdf
-from fitting.cli.common import find_material, show, table_name
+from fitting.cli.common import find_material, refuse_replacing, show, table_name
 
 
 def convert(material: str, out: Path, *, to: str | None = None, name: str | None = None) -> None:
@@ -29,6 +29,7 @@ def convert(material: str, out: Path, *, to: str | None = None, name: str | None
         export = brdf.export_material(loaded, to or "json", **named)
         show(export.text.rstrip("\n"))
     else:
+        refuse_replacing([Path(material), Path(material, "material.json")], out)
         export = brdf.save_export(loaded, out, to=to, **named)
         show(f"wrote {out}")
     notes = [f"note: {note}"] if note else []

@@ -6,7 +6,7 @@ from typing import Any
 import brdf
 from brdf.errors import InputError
 from brdf.files import write_text
-from fitting.cli.common import named_as, show
+from fitting.cli.common import named_as, refuse_replacing, show
 from fitting.progress import waiting
 
 
@@ -39,6 +39,8 @@ def lights(
     for name, given in (("--ambient", ambient), ("--saturation", saturation is not None)):
         if given and not matt:
             raise InputError(name, "says nothing of a mirror ball's highlight", "Leave it out, or add --matt")
+    if out is not None:
+        refuse_replacing([*target, mask], out)
     with waiting("finding the lights"):
         from fitting.cli.inputs import ball_in, masks_of
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from brdf.errors import InputError
-from fitting.cli.common import all_devices, check_outputs, is_first_process, named_as, show
+from fitting.cli.common import OF_MAPS, all_devices, check_outputs, is_first_process, named_as, show
 from fitting.progress import waiting
 
 # Below --out, while the maps are being fitted: what is done, from which the same command goes on after an interruption.
@@ -52,7 +52,8 @@ def maps(
     Example:
         brdf maps photographs/ --normals fit --out maps/
     """
-    check_outputs(out, plot, report)
+    named = (Path(one) for one in (normals, labels, mask) if one not in (None, "fit", "all"))
+    check_outputs(out, plot, report, named, OF_MAPS)
     if out is not None and out.resolve() == target.resolve():
         what = "is the folder of the photographs, whose normals.* and mask.* are read"
         raise InputError("--out", what, "Give another folder")

@@ -1,7 +1,9 @@
 """Files appear whole or not at all."""
 
+import copy
 import errno
 import os
+import pickle
 import signal
 import stat
 import subprocess
@@ -276,3 +278,11 @@ def test_input_files(tmp_path):
             input_file(tmp_path / name)
     with pytest.raises(InputError, match="not an ordinary file"):
         input_file("/dev/zero")
+
+
+def test_an_error_comes_out_of_another_process_as_it_was(tmp_path):
+    """It broke the whole pool."""
+    for where in ("k_d", tmp_path / "a.png"):
+        error = InputError(where, "is empty", "Give a file with content")
+        for same in (pickle.loads(pickle.dumps(error)), copy.deepcopy(error)):
+            assert (str(same), same.of_file) == (str(error), error.of_file)

@@ -107,6 +107,21 @@ def test_classic_formats_show_what_is_told(material: brdf.Material, to: str, tmp
         np.testing.assert_allclose(theirs.sum() / shown(material, degrees).sum(), ratio, rtol=0.006, atol=0.0051)
 
 
+def test_f_0_is_cut_as_viewers_cut_it():
+    export = brdf.export_material(brdf.NormalizedBlinnPhong(k_d=[1.5, 0.2, 0.1], k_s=2.0, n=30.0), "gltf")
+    specular = json.loads(export.text)["materials"][0]["extensions"]["KHR_materials_specular"]
+    assert specular["specularColorFactor"] == [25.0] * 3
+    assert "F0 is cut at 1, it would be 2 2 2" in export.losses
+
+
+@pytest.mark.parametrize("to", ["mtl", "glsl", "pytorch3d"])
+def test_name_and_note_are_a_line_each(to: str):
+    given = {"name": "a\nKd 9 9 9", "note": "first\r\nnewmtl evil\u2028Kd 7 7 7"}
+    plain = {"name": "a", "note": ""}
+    text, usual = (brdf.export_material(brdf.preset("gold"), to, **some).text for some in (given, plain))
+    assert len(text.splitlines()) == 1 + len(usual.splitlines())
+
+
 def test_a_classic_form_is_told_what_to_do_about_it():
     losses = " ".join(brdf.export_material(brdf.preset("emerald"), "three").losses)
     assert "--model normalized-blinn-phong" in losses

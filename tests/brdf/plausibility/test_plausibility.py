@@ -203,6 +203,16 @@ def test_a_registered_model_that_nobody_knows_on_paper_is_measured(monkeypatch):
     assert brdf.check(Bright(k_d=0.9)).energy.verdict == "fail"
 
 
+@pytest.mark.parametrize("n", [100.0, 2000.0, 1e4])
+def test_of_a_sharp_lobe_alone_the_ratio_is_that_of_the_cosines(n: float):
+    """Where f_r underflows it was anything from 1e-4 to 100."""
+    finding = check(BlinnPhong(k_d=0.0, k_s=0.5, n=n)).reciprocity
+    assert finding.to_view is not None
+    ratio = float(finding.sentence.rpartition(" is ")[2].partition(" times")[0])
+    cosines = [math.cos(math.radians(one.polar)) for one in (finding.to_view, finding.to_light)]
+    assert ratio == pytest.approx(cosines[0] / cosines[1], rel=1e-3)
+
+
 def test_a_black_channel_is_reciprocal():
     report = check(Phong(k_d=[0, 0.2, 0.3], k_s=[0, 0.1, 0.1], n=5))
     assert report.reciprocity.verdict == "fail"

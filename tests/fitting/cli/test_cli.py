@@ -100,6 +100,20 @@ def test_what_is_read_is_not_replaced(folder, capsys):
     assert (folder / "scene.toml").read_bytes() == before
 
 
+def test_a_photograph_or_a_material_is_not_replaced(tmp_path, capsys):
+    brdf.write_image(tmp_path / "ball.png", np.ones((8, 8, 1)), dtype="uint8")
+    brdf.save_material(brdf.preset("gold"), tmp_path / "material.json")
+    for words in (
+        ["lights", tmp_path / "ball.png", "--sphere", "4,4,3", "--out", tmp_path / "ball.png"],
+        ["convert", tmp_path, tmp_path / "material.json"],
+    ):
+        before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+        status, _, err = run(capsys, *words)
+        assert status == 2
+        assert err == f"error: --out: would replace {words[-1]}, which is read here. Choose another file.\n"
+        assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
 def test_two_processes_that_are_told_of_each_other_fit_together(folder, monkeypatch):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

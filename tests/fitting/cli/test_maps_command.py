@@ -59,6 +59,16 @@ def test_diligent_text_files_are_read_and_maps_written(photographs, capsys):
     assert np.isnan(maps.k_d[np.eye(3, 4) == 0]).all()
 
 
+def test_normals_that_are_read_are_not_replaced_and_a_page_lies_in_a_new_folder(photographs, capsys):
+    out = photographs / "out"
+    assert run("maps", photographs, "--model", "lambert", "--out", out, "--report", out / "page.html") == 0
+    before = (out / "normals.png").read_bytes()
+    assert (out / "page.html").is_file()
+    assert run("maps", photographs, "--normals", out / "normals.png", "--out", out) == 2
+    assert f"--out: would replace {out / 'normals.png'}, which is read here" in capsys.readouterr().err
+    assert (out / "normals.png").read_bytes() == before
+
+
 def test_who_waits_is_told_how_much_is_done(photographs, monkeypatch: pytest.MonkeyPatch):
     terminal, bands = Terminal(), []
 
