@@ -42,7 +42,7 @@ from fitting.uncertainty.interpretation import alone_covariance, interpret, shar
 from fitting.uncertainty.noise_model import weighted_sums
 from fitting.uncertainty.residual import SOME_PIXELS, Residual, residual_statistics, variance_inflation
 from fitting.uncertainty.structure import CHANCE, SIZES, Blocks, Errors, over_blocks, shared
-from fitting.uneven_noise import evened, in_codes, noise_of_each
+from fitting.uneven_noise import evened, noise_of_each, with_bounds
 
 # A residual above this share of the picture: what the scene says is probably not what the picture shows.
 UNEXPLAINED = 0.5
@@ -206,9 +206,11 @@ def _evenly_noisy(observed: Observed) -> Observed:
     """Pictures of different noise count by what they know, where the user does not say how."""
     problem = observed.problem
     weighed = problem.loss != "squared" or problem.noise is not None or any(w is not None for w in problem.weights)
-    if len(problem.targets) == 1 or weighed:
+    if weighed:
         return observed
-    observed, noises = in_codes(observed), []
+    observed, noises = with_bounds(observed), []
+    if len(problem.targets) == 1:
+        return observed
     for name in problem.families if problem.model == "auto" else (problem.model,):
         model, some = brdf.MODELS[name], []
         for tile, owner in zip(observed.tiles, observed.owner, strict=True):

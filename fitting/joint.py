@@ -46,7 +46,7 @@ from fitting.solver.nnls import nonnegative_minimum
 from fitting.uncertainty.intervals import NORMAL_95, above_zero
 from fitting.uncertainty.noise_model import value_variance
 from fitting.uncertainty.residual import NEGLIGIBLE, Neighbours, neighbours_of, structure_warning
-from fitting.uneven_noise import EVENINGS, Left, NoiseOfEach, evened, noise_left
+from fitting.uneven_noise import EVENINGS, Left, NoiseOfEach, evened, noise_left, with_bounds
 
 SOLVERS: dict[str, Any] = {"lm": optx.LevenbergMarquardt, "bfgs": optx.BFGS}
 LARGEST_JACOBIAN = 1 << 27
@@ -158,7 +158,7 @@ def fit_jointly(
             "material", f"has {own} channels, the picture {shown}", "Give both the same number of channels"
         )
     with working_precision(precision), waiting("fitting jointly"):
-        whole = observe(stated, at_once=True)
+        whole = _observed(stated)
 
         def minimum(observed: Observed, start: brdf.Material, scenes: Sequence[brdf.Scene]) -> _Solved:
             pictures = [(tile.target, tile.weight) for tile in observed.tiles]
@@ -196,10 +196,15 @@ def fit_jointly(
     return dataclasses.replace(result, seconds=time.perf_counter() - begun)
 
 
+def _observed(problem: FitProblem) -> Observed:
+    """What pixels say: floats that are clipped, cut off or beside codes as codes, for these have one likelihood."""
+    return with_bounds(observe(problem, at_once=True), in_codes=True)
+
+
 def _away_from_outlines(whole: Observed, scenes: Sequence[brdf.Scene]) -> Observed:
     """What is fitted where outlines move: a pixel that comes to see another shape, or none, is no small change."""
     inner = [_alike(scene, AWAY) & counted for scene, counted in zip(scenes, whole.counted, strict=True)]
-    observed = observe(dataclasses.replace(whole.problem, masks=inner), at_once=True)
+    observed = _observed(dataclasses.replace(whole.problem, masks=inner))
     lost = int(sum(map(np.count_nonzero, whole.counted)) - sum(map(np.count_nonzero, observed.counted)))
     return observed._replace(left_out=whole.left_out | {"near an outline that moves": lost})
 

@@ -16,7 +16,7 @@ from fitting.model_fit import ModelFit
 from fitting.pixels import Observed, Tile
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
-from fitting.solver.streams import each
+from fitting.solver.streams import Stream, each
 
 # The noise of one picture is this factor of another's, and it is likelier so by more than chance by so many deviations.
 UNEVEN, DEVIATIONS = 1.2, 5.0
@@ -28,13 +28,19 @@ ROUNDING_HIDES = 0.05
 ROUNDED = 2.0**-22
 
 
-def in_codes(observed: Observed) -> Observed:
-    """The same, floats beside pictures of codes as codes too: those that single precision rounds them to."""
-    targets = observed.problem.targets
+def with_bounds(observed: Observed, *, in_codes: bool = False) -> Observed:
+    """The same with bounds of all values, where some have such.
+
+    Floats beside pictures of codes, or ``in_codes``, are codes too: those that single precision rounds them to. Beside
+    others that are clipped or cut off they are exact.
+    """
+    targets, tiles = observed.problem.targets, observed.tiles
     floats = [one.codes is None for one in targets]
-    if all(floats) or not any(floats) or any(one.streamed or one.least_squares for one in targets):
+    if not any(floats) or any(one.streamed or one.least_squares for one in targets):
         return observed
-    step = ROUNDED * float(np.max(observed.brightest))
+    if all(floats) and (isinstance(tiles, Stream) or all(tile.bounds is None for tile in tiles)):
+        return observed
+    exact, step = all(floats) and not in_codes, ROUNDED * float(np.max(observed.brightest))
 
     def of_tile(tile: Tile, one: int) -> Tile:
         if not floats[one]:
@@ -44,11 +50,13 @@ def in_codes(observed: Observed) -> Observed:
             says = np.ones(1) if tile.weight is None else np.asarray(tile.weight)
             says = says.reshape(len(says), -1) > 0
             lower, upper = np.where(says, values, -np.inf), np.where(says, values, np.inf)
-            bounds = all_between(lower, upper, targets[one].pixels.shape[1], 1.0)
+            bounds = all_between(lower, upper, targets[one].pixels.shape[1], 1.0, exact=True)
+        if exact:
+            return tile._replace(bounds=bounds)
         lower, upper = bounds.lower / step - 0.5, bounds.upper / step + 0.5
         return tile._replace(bounds=replace(bounds, lower=lower, upper=upper, scale=np.array(1 / step), exact=False))
 
-    return observed._replace(tiles=each(of_tile, observed.tiles, observed.owner))
+    return observed._replace(tiles=each(of_tile, tiles, observed.owner))
 
 
 class NoiseOfEach(NamedTuple):
