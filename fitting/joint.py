@@ -15,6 +15,7 @@ Of rounded values that is the start: `fitting.joint_likelihood` goes on to what 
 
 import contextlib
 import dataclasses
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -36,8 +37,9 @@ from fitting.core import fit_pictures
 from fitting.growing_noise import Shown, as_it_grows, likeliest
 from fitting.joint_likelihood import Information, by_least_squares, most_likely_numbers
 from fitting.joint_problem import JointProblem, Leaf, degrees_between, joint_problem, linearised, named_leaves
+from fitting.jpeg_errors import APPROACH, ENOUGH_CHANGE, MOST_FITS, LookAlikes
 from fitting.model_fit import N_RANGE
-from fitting.pixels import Observed, observe
+from fitting.pixels import Observed, Tile, observe
 from fitting.problem import CLASSIC, FitProblem, model_name, state_problem
 from fitting.progress import waiting
 from fitting.report import FitResult
@@ -159,18 +161,19 @@ def fit_jointly(
         )
     with working_precision(precision), waiting("fitting jointly"):
         whole = _observed(stated)
+        look_alikes = LookAlikes(whole)
 
         def minimum(observed: Observed, start: brdf.Material, scenes: Sequence[brdf.Scene]) -> _Solved:
             pictures = [(tile.target, tile.weight) for tile in observed.tiles]
             problem = joint_problem(brdf.cast((start, list(scenes)), precision), free, pictures)
-            return _solve(problem, observed, solver, tolerance, max_steps)
+            return _solve(problem, observed, solver, tolerance, max_steps, look_alikes.widening)
 
         def solve(
             start: brdf.Material, scenes: Sequence[brdf.Scene], rounds: int = ROUNDS, *noises: NoiseOfEach
         ) -> JointResult:
             freed = joint_problem((start, list(scenes)), free).freed
             moves = any("camera." in leaf.words or "shapes[" in leaf.words for leaf in freed)
-            plain = _away_from_outlines(whole, scenes) if moves else whole
+            plain = look_alikes.taken_off(_away_from_outlines(whole, scenes) if moves else whole)
             solved = minimum(evened(plain, noises[-1]) if noises else plain, start, scenes)
             result = solved.result
             if len(plain.tiles) > 1 and len(noises) < EVENINGS:
@@ -193,7 +196,22 @@ def fit_jointly(
             result = solve(material, stated.scenes)
         else:
             result = _of_model(stated, model_name(material), solve)
+        moved = np.zeros(len(result.parameters))
+        for _ in range(MOST_FITS if look_alikes.known else 0):
+            if not look_alikes.are_nearer(whole, _radiance(result, whole)):
+                break
+            last, result = result, solve(result.material, result.scenes)
+            moved = _changes(last, result)
+            change = np.nanmax(moved / [one.error or math.nan for one in result.parameters])
+            if change < ENOUGH_CHANGE or look_alikes.enough:
+                break
+        if look_alikes.known:
+            result = _wider(result, APPROACH * moved)
     return dataclasses.replace(result, seconds=time.perf_counter() - begun)
+
+
+def _is_lossy(tile: Tile) -> bool:
+    return tile.bounds is not None and tile.bounds.lossy
 
 
 def _observed(problem: FitProblem) -> Observed:
@@ -209,11 +227,37 @@ def _away_from_outlines(whole: Observed, scenes: Sequence[brdf.Scene]) -> Observ
     return observed._replace(left_out=whole.left_out | {"near an outline that moves": lost})
 
 
+def _radiance(result: JointResult, observed: Observed) -> list[Float[np.ndarray, "P C"]]:
+    """What is predicted of each picture."""
+    shown = zip(observed.tiles, result.scenes, strict=True)
+    return [np.asarray(brdf.render(result.material, scene)).reshape(tile.target.shape) for tile, scene in shown]
+
+
+def _changes(last: JointResult, result: JointResult) -> Float[np.ndarray, " F"]:
+    """By how much each number has changed; 0 where it is not determined."""
+    both = zip(last.parameters, result.parameters, strict=True)
+    return np.array([abs((a.value or 0) - b.value) if b.value is not None else 0.0 for a, b in both])
+
+
+def _wider(result: JointResult, moved: Float[np.ndarray, " F"]) -> JointResult:
+    """A result whose numbers may each be off by so much beside their errors."""
+    parameters = []
+    for one, off in zip(result.parameters, moved.tolist(), strict=True):
+        if one.value is not None and one.error:
+            error = math.hypot(one.error, off)
+            low, high = (one.value + (end - one.value) * error / one.error for end in one.interval or (one.value,) * 2)
+            ends = None if one.interval is None else (max(low, 0.0) if one.interval[0] >= 0 else low, high)
+            one = dataclasses.replace(one, error=error, interval=ends)
+        parameters.append(one)
+    of_leaves = [[one.error for one in parameters if one.name == name] for name in dict.fromkeys(result)]
+    errors = [np.array(own, float).reshape(old.shape) for own, old in zip(of_leaves, result.errors, strict=True)]
+    return dataclasses.replace(result, parameters=tuple(parameters), errors=tuple(errors))
+
+
 def _noise_of_each(result: JointResult, observed: Observed) -> NoiseOfEach:
     """What is left of each picture."""
     left = []
-    for tile, scene in zip(observed.tiles, result.scenes, strict=True):
-        predicted = np.asarray(brdf.render(result.material, scene)).reshape(tile.target.shape)
+    for tile, predicted in zip(observed.tiles, _radiance(result, observed), strict=True):
         weight = np.ones(1) if tile.weight is None else np.asarray(tile.weight)
         counts = np.broadcast_to(weight.reshape(len(weight), -1) > 0, predicted.shape)
         left.append(Left(counts, np.where(counts, np.asarray(tile.target) - predicted, 0), predicted, tile.bounds))
@@ -355,7 +399,14 @@ class _Solved(NamedTuple):
     neighbours: Neighbours
 
 
-def _solve(problem: JointProblem, observed: Observed, solver: str | None, tolerance: float, max_steps: int) -> _Solved:
+def _solve(
+    problem: JointProblem,
+    observed: Observed,
+    solver: str | None,
+    tolerance: float,
+    max_steps: int,
+    widening: float,
+) -> _Solved:
     found = _minimum(problem, float(np.max(observed.brightest)), solver, tolerance, max_steps)
     problem, bounded = found.problem, problem.each(lambda leaf: leaf.bounded)
     vector = np.asarray(problem.start(), np.float64)
@@ -363,6 +414,7 @@ def _solve(problem: JointProblem, observed: Observed, solver: str | None, tolera
     residual, columns = (np.asarray(a, np.float64) for a in linearised(problem, problem.start()))
     information = most_likely_numbers(problem, observed, vector)
     if information is not None:
+        information = information._replace(widening=information.widening * widening)
         problem, held = problem.at(jnp.asarray(information.vector)), bounded & (information.vector == 0)
         residual = np.asarray(problem.residuals(problem.start()), np.float64)
     counts = np.concatenate([counted.ravel() for counted in observed.counted])
@@ -392,7 +444,8 @@ def _solve(problem: JointProblem, observed: Observed, solver: str | None, tolera
         structure=neighbours.correlation,
         residual=share,
         pixels=len(left),
-        warnings=(*warnings, *structure_warning(neighbours)),
+        # Pixels of a file that was compressed err together, and their errors say so.
+        warnings=warnings if any(map(_is_lossy, observed.tiles)) else (*warnings, *structure_warning(neighbours)),
         values=tuple(np.asarray(problem.leaves[leaf.position]) for leaf in problem.freed),
         errors=tuple(np.array(own, float).reshape(shape) for own, shape in zip(errors, shapes, strict=True)),
         steps=found.steps,

@@ -149,8 +149,9 @@ class _RoundedPictures(Problem):
 
     def scatter(self, score: Score) -> Float[np.ndarray, "U U"]:
         """What takes the place of the Hessian in a file that was compressed: the pixels of a block err together."""
-        parts = []
+        parts, covariance = [], scaled_inverse(score.hessian, DEPENDENT)
         for one in score.pictures:
             scores = np.einsum("upc,pc->up", one.columns, one.score)
-            parts.append(block_scatter(scores, Errors(one.score, *one.values.bounds.place)))
+            fitted = one.columns * np.sqrt(np.maximum(one.weight, 0)), covariance, self.places
+            parts.append(block_scatter(scores, Errors(one.score, *one.values.bounds.place), fitted))
         return np.sum(parts, axis=0)

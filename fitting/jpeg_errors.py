@@ -13,12 +13,14 @@ D. McFadden, "A method of simulated moments", Econometrica 57 (1989) 995.
 import dataclasses
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from brdf.images.encoding import decode
 from brdf.images.jpeg import Jpeg
+from fitting.likelihood import Bounds
 from fitting.maximum_likelihood import bounds_of, change, most_likely
 from fitting.model_fit import ModelFit
 from fitting.pixels import Observed
@@ -89,7 +91,11 @@ def _nearest(fit: ModelFit, compressed: Sequence["_Compressed"], most: int, coun
             # The steps of the codec bend what look-alikes show: nearer by it may be better.
             at = dataclasses.replace(at, x=(at.x + best.x) / 2, n=(at.n + best.n) / 2)
             continue
-        pictures = list(map(_less, fit.pictures, shown, errors))
+        both = map(_less, [one.target for one in fit.pictures], map(bounds_of, fit.pictures), shown, errors)
+        pictures = [
+            dataclasses.replace(picture, target=target, bounds=bounds)
+            for picture, (target, bounds) in zip(fit.pictures, both, strict=True)
+        ]
         found = fit._replace(pictures=pictures, optimum=refit(pictures, at, fit.free, fit.n_range, fit.tied))
         nearer, best, least, found = least - left, at, left, most_likely(found)
         at = found.optimum
@@ -101,6 +107,46 @@ def _nearest(fit: ModelFit, compressed: Sequence["_Compressed"], most: int, coun
     # Their mean has a share of what each errs by, which is no more than what the picture errs by.
     evidence = evidence._replace(widening=evidence.widening * math.sqrt(1 + 1 / count))
     return found._replace(evidence=evidence, moved=(APPROACH * (_unknowns(found.optimum) - _unknowns(best)),))
+
+
+class LookAlikes:
+    """What codecs do to predictions of whole pictures, each in one tile.
+
+    Attributes:
+        known: whether a codec is, and the channels are no copies of each other, of which it takes nothing away.
+        left: squares of what else the pictures show.
+        enough: whether that hardly falls any more.
+        widening: what to multiply errors by, for the share that the look-alikes' mean has of theirs.
+    """
+
+    def __init__(self, observed: Observed):
+        """Of the pictures of a problem."""
+        self._compressed = list(map(_Compressed.of, observed.problem.targets))
+        self.known = not observed.copies and any(one.codec is not None for one in self._compressed)
+        self.left, self.enough, self.widening, self._parts = math.inf, False, 1.0, ()
+
+    def are_nearer(self, observed: Observed, radiance: Sequence[Float[np.ndarray, "P C"]]) -> bool:
+        """Whether a prediction's look-alikes are nearer to the pictures than the last ones: then they are the ones."""
+        shown = [_in_codes(bounds_of(tile), one) for tile, one in zip(observed.tiles, radiance, strict=True)]
+        errors, left = _codec_errors(shown, self._compressed, LOOK_ALIKES)
+        if left > self.left:
+            return False
+        self.enough, self.left = self.left - left < ENOUGH_NEARER * left, left
+        self.widening, self._parts = math.sqrt(1 + 1 / LOOK_ALIKES), tuple(zip(shown, errors, strict=True))
+        return True
+
+    def taken_off(self, observed: Observed) -> Observed:
+        """The pictures less that."""
+        if not self._parts:
+            return observed
+        both = [
+            _less(tile.target, bounds_of(tile), *part) for tile, part in zip(observed.tiles, self._parts, strict=True)
+        ]
+        tiles = [
+            tile._replace(target=target, bounds=bounds)
+            for tile, (target, bounds) in zip(observed.tiles, both, strict=True)
+        ]
+        return observed._replace(tiles=tiles)
 
 
 def _unknowns(at: Optimum) -> Float[np.ndarray, " U"]:
@@ -118,8 +164,11 @@ def _codec_errors(
 
 def _predicted(picture: Picture, at: Optimum) -> Float[np.ndarray, "P C"]:
     """In codes; NaN where a value says nothing."""
-    bounds = bounds_of(picture)
-    code, _ = bounds.codes(picture.predict(at.n, at.x).astype(np.float32))
+    return _in_codes(bounds_of(picture), picture.predict(at.n, at.x))
+
+
+def _in_codes(bounds: Bounds, radiance: Float[np.ndarray, "P C"]) -> Float[np.ndarray, "P C"]:
+    code, _ = bounds.codes(radiance.astype(np.float32))
     return np.where(bounds.ends > 0, code, np.float32(np.nan))
 
 
@@ -190,14 +239,16 @@ class _Compressed:
         return np.where(counts, mean, np.float32(0)), (together - squares) / (count * (count - 1))
 
 
-def _less(picture: Picture, shown: Float[np.ndarray, "P C"], errors: Float[np.ndarray, "P C"]) -> Picture:
-    """A picture less what compression does where so much is predicted.
+def _less(
+    target: Any, bounds: Bounds, shown: Float[np.ndarray, "P C"], errors: Float[np.ndarray, "P C"]
+) -> tuple[Any, Bounds]:
+    """A picture and its bounds less what compression does where so much is predicted.
 
     Look-alikes are clipped as the picture is: of its values near an end only those are open that lie beyond it.
     """
     if not errors.any():
-        return picture
-    bounds, target = bounds_of(picture), np.asarray(picture.target)
+        return target, bounds
+    target = np.asarray(target)
     code, half = bounds.codes(target)[0], 0.5 * np.median(bounds.widths)
     open_end = bounds.ends == 1
     beyond = open_end & np.where(np.isinf(bounds.upper), shown >= bounds.scale, shown <= 0)
@@ -207,5 +258,5 @@ def _less(picture: Picture, shown: Float[np.ndarray, "P C"], errors: Float[np.nd
         np.where(open_end & ~beyond, code + sign * half, end) - errors.astype(end.dtype)
         for sign, end in ((-1, bounds.lower), (1, bounds.upper))
     )
-    bounds, moved = dataclasses.replace(bounds, lower=lower, upper=upper), np.where(errors != 0, moved, target)
-    return dataclasses.replace(picture, target=moved.astype(target.dtype), bounds=bounds)
+    moved = np.where(errors != 0, moved, target).astype(target.dtype)
+    return moved, dataclasses.replace(bounds, lower=lower, upper=upper)

@@ -473,8 +473,8 @@ def _stratum(picture: Picture, size: int) -> Values:
     return _values(dataclasses.replace(some, weight=weight))
 
 
-def bounds_of(picture: Picture) -> Bounds:
-    """Between which codes the values of a picture that has such lay."""
+def bounds_of(picture: Any) -> Bounds:
+    """Between which codes the values of a picture, or of a tile of pixels, that has such lay."""
     assert picture.bounds is not None
     return picture.bounds
 

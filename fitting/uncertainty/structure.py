@@ -191,17 +191,18 @@ def scatter(
         terms = slopes * own.values
         by_x = np.moveaxis(terms[:3], -1, 1).reshape(-1, terms.shape[1])
         scores = np.concatenate([by_x, terms[3].sum(axis=1)[None]])
-        total = total + block_scatter(scores, own, None if covariance is None else (slopes, covariance))
+        fitted = None if covariance is None else (slopes, covariance, places_of(slopes.shape[2]))
+        total = total + block_scatter(scores, own, fitted)
     return np.asarray(total)
 
 
 def block_scatter(
-    scores: Float[np.ndarray, "U P"], errors: Errors, fitted: tuple[np.ndarray, np.ndarray] | None = None
+    scores: Float[np.ndarray, "U P"], errors: Errors, fitted: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 ) -> Float[np.ndarray, "U U"]:
     """Products of sums of scores over blocks of pixels, of the size that gives most.
 
-    ``fitted`` are derivatives by ambient, diffuse, lobe and n, (4, P, C), and the covariance of `scatter`; None where
-    the scores are to stay.
+    ``fitted`` are derivatives by the unknowns that move a channel, (V, P, C), times the roots of weights, the
+    covariance of `scatter`, and which unknowns these are, (C, V); None where the scores are to stay.
     """
     scatters = []
     for size in SCATTER_SIZES:
@@ -219,11 +220,11 @@ def block_scatter(
 def _left_out(
     together: Float[np.ndarray, "U B"],
     blocks: Int[np.ndarray, " P"],
-    slopes: Float[np.ndarray, "4 P C"],
+    slopes: Float[np.ndarray, "V P C"],
     covariance: Float[np.ndarray, "U U"],
+    index: Int[np.ndarray, "C V"],
 ) -> Float[np.ndarray, "U B"]:
     """Scores of blocks, each about the fit without it."""
-    index = places_of(slopes.shape[2])
     own = np.array([covariance[np.ix_(some, some)] for some in index])
     held = np.einsum("ipc,cij,jpc->p", slopes, own, slopes, optimize=True)
     root = np.linalg.svd(covariance, hermitian=True)
