@@ -423,7 +423,10 @@ def _solve(
     squares = np.sum(left**2, axis=0)
     noise = np.sqrt(squares / max(len(left) - vector.size / squares.size, 1))
     share = float(np.sum(squares) / max(np.sum(values**2), TINY)) ** 0.5
-    images = map(np.reshape, problem.by_picture(residual), (shown.shape for shown in observed.shown))
+    parts = problem.by_picture(residual)
+    if information is not None:
+        parts = map(_at_ends, parts, observed.tiles, information.at_ends)
+    images = map(np.reshape, parts, (shown.shape for shown in observed.shown))
     neighbours = neighbours_of(list(images)) if share > NEGLIGIBLE else Neighbours()
     if information is None:
         variance = value_variance(left, values + left, noise)
@@ -455,6 +458,14 @@ def _solve(
     bounds = (tile.bounds for tile in observed.tiles if tile.bounds is not None)
     shown = [Shown(own.spread, partial(_of_pixels, one)) for own, one in zip(bounds, information.shown, strict=False)]
     return _Solved(result, information, shown, neighbours)
+
+
+def _at_ends(
+    residual: Float[np.ndarray, "P C"], tile: Tile, expected: Float[np.ndarray, "P C"]
+) -> Float[np.ndarray, "P C"]:
+    """Weighted residuals, with what is to be expected in the place of those of values of which one end is known."""
+    weight = np.ones((1, 1)) if tile.weight is None else np.asarray(tile.weight).reshape(len(residual), -1)
+    return np.where(np.isnan(expected), residual, expected * np.sqrt(weight))
 
 
 def _of_pixels(values: Float[np.ndarray, "P C"], pixel: Int[np.ndarray, " K"] | None) -> Float[np.ndarray, "K C"]:

@@ -38,6 +38,8 @@ class Information(NamedTuple):
         noise: before rounding, standard deviation in codes; none where least squares is the whole answer.
         value: logarithm of the likelihood.
         shown: radiance that is predicted of each picture.
+        at_ends: of each picture by how much more is predicted than is to be expected of values of which one end is
+            known, in light; NaN of the others.
     """
 
     vector: Float[np.ndarray, " U"]
@@ -47,6 +49,7 @@ class Information(NamedTuple):
     noise: float = 0.0
     value: float = -np.inf
     shown: Sequence[Float[np.ndarray, "P C"]] = ()
+    at_ends: Sequence[Float[np.ndarray, "P C"]] = ()
 
     def errors(self) -> tuple[Float[np.ndarray, "U U"], Float[np.ndarray, " U"]]:
         """Covariance of the numbers and their errors, infinite where nothing tells of one alone.
@@ -102,7 +105,8 @@ def most_likely_numbers(
     scatter = pictures.scatter(score) if pictures.lossy else None
     wider = wider * np.sqrt(np.where(shared, observed.colour.size, 1))
     radiance = pictures.radiance(at.unknowns)
-    return Information(at.unknowns, score.hessian, scatter, wider, at.noise, at.value, radiance)
+    ends = pictures.at_ends(radiance, at.noise)
+    return Information(at.unknowns, score.hessian, scatter, wider, at.noise, at.value, radiance, ends)
 
 
 def _maximised(pictures: "_RoundedPictures", start: Float[np.ndarray, " U"]) -> tuple[Estimate, list[Precision], Score]:
@@ -146,6 +150,20 @@ class _RoundedPictures(Problem):
         """Some pixels of a picture."""
         some = self.bounds[picture].pixels(operator.itemgetter(which))
         return Values(which, self.weights[picture][which], some)
+
+    def at_ends(self, radiance: Sequence[Float[np.ndarray, "P C"]], noise: float) -> list[Float[np.ndarray, "P C"]]:
+        """That of `Information`: minus generalised residuals, see `fitting.model_fit.Evidence`."""
+        found = []
+        for index, (own, shown) in enumerate(zip(self.bounds, radiance, strict=True)):
+            left, some = np.full(shown.shape, np.nan), own.half_open
+            if some.any():
+                values = self.taken(index, some)
+                code, slope = values.bounds.codes(np.asarray(shown, np.float64)[some])
+                _, score, _ = values.likelihood(code, noise)
+                expected = score * (noise * values.bounds.spread) ** 2 / slope
+                left[some] = np.where(values.bounds.ends == 1, -expected, np.nan)
+            found.append(left)
+        return found
 
     def scatter(self, score: Score) -> Float[np.ndarray, "U U"]:
         """What takes the place of the Hessian in a file that was compressed: the pixels of a block err together."""

@@ -11,6 +11,7 @@ import fitting
 from benchmarks.truth import COVERAGE, ball
 
 CAMERA = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=(40, 40))
+LARGER = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=(80, 80))
 BALL = brdf.Sphere(center=[0, 0, 0], radius=1)
 TRUE_DIRECTION = np.array([0.5, 0.6, 0.7]) / np.linalg.norm([0.5, 0.6, 0.7])
 MATERIAL = brdf.BlinnPhong(k_a=[0.1, 0.2, 0.0], k_d=[0.5, 0.4, 0.3], k_s=[0.3, 0.2, 0.0], n=25)
@@ -351,3 +352,12 @@ def test_clipped_floats_say_what_they_say_in_a_fit_whether_all_pictures_have_som
         assert abs(one.value - truth) < 3 * one.error
         assert other.value == pytest.approx(one.value, abs=0.1 * one.error)
         assert other.error == pytest.approx(one.error, rel=0.05)
+
+
+def test_a_dark_side_that_is_cut_off_at_0_is_no_structure():
+    """It was said to be in half of such pictures."""
+    lit = brdf.Scene(LARGER, [BALL], lights=[brdf.DirectionalLight([1, 0.2, -0.1], [1.0])])
+    shown = np.asarray(brdf.render(brdf.BlinnPhong(k_d=[0.4], k_s=[0.3], n=20), lit, precision="float64"))
+    for seed in range(2):
+        picture = np.maximum(shown + 0.02 * np.random.default_rng(seed).standard_normal(shown.shape), 0)
+        assert not fitting.fit_jointly(picture, lit, "blinn-phong").warnings
