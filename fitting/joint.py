@@ -196,17 +196,8 @@ def fit_jointly(
             result = solve(material, stated.scenes)
         else:
             result = _of_model(stated, model_name(material), solve)
-        moved = np.zeros(len(result.parameters))
-        for _ in range(MOST_FITS if look_alikes.known else 0):
-            if not look_alikes.are_nearer(whole, _radiance(result, whole)):
-                break
-            last, result = result, solve(result.material, result.scenes)
-            moved = _changes(last, result)
-            change = np.nanmax(moved / [one.error or math.nan for one in result.parameters])
-            if change < ENOUGH_CHANGE or look_alikes.enough:
-                break
         if look_alikes.known:
-            result = _wider(result, APPROACH * moved)
+            result = _without_codec_errors(result, look_alikes, whole, solve)
     return dataclasses.replace(result, seconds=time.perf_counter() - begun)
 
 
@@ -231,6 +222,25 @@ def _radiance(result: JointResult, observed: Observed) -> list[Float[np.ndarray,
     """What is predicted of each picture."""
     shown = zip(observed.tiles, result.scenes, strict=True)
     return [np.asarray(brdf.render(result.material, scene)).reshape(tile.target.shape) for tile, scene in shown]
+
+
+def _without_codec_errors(
+    result: JointResult, look_alikes: LookAlikes, whole: Observed, solve: Callable[..., JointResult]
+) -> JointResult:
+    """Less what codecs do to look-alikes of what is predicted, again until these come no nearer to the pictures."""
+    moved = np.zeros(len(result.parameters))
+    for _ in range(MOST_FITS):
+        if not look_alikes.are_nearer(whole, _radiance(result, whole)):
+            break
+        last, result = result, solve(result.material, result.scenes)
+        if len(last.parameters) != len(result.parameters):  # a highlight that went to nothing is freed no more
+            moved = np.zeros(len(result.parameters))
+            continue
+        moved = _changes(last, result)
+        errors = [one.error or math.inf for one in result.parameters]
+        if look_alikes.enough or np.all(moved < np.multiply(ENOUGH_CHANGE, errors)):
+            break
+    return _wider(result, APPROACH * moved)
 
 
 def _changes(last: JointResult, result: JointResult) -> Float[np.ndarray, " F"]:
