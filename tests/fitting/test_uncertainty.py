@@ -11,6 +11,7 @@ import brdf
 import fitting
 from brdf.images.encoding import encode
 from brdf.materials.material_file import material_from_dict, material_to_dict, read_material
+from fitting.solver.tied import places_of
 from fitting.uncertainty.intervals import above_zero, student_95
 from fitting.uncertainty.structure import LEAST_HELD, MOST_HELD, Errors, block_scatter
 
@@ -307,7 +308,8 @@ def test_blocks_that_hold_much_count_as_a_fit_without_them_leaves_them():
         expected += np.outer(score, score)
     scores = np.einsum("pcu,pc->up", design, residual)
     errors = Errors(residual, np.arange(size * size), size)
-    told, before = block_scatter(scores, errors, (slopes, covariance)), block_scatter(scores, errors)
+    fitted = slopes, covariance, places_of(channels)
+    told, before = block_scatter(scores, errors, fitted), block_scatter(scores, errors)
     np.testing.assert_allclose(told, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
     assert np.all(np.diag(told)[4:] > 1.2 * np.diag(before)[4:])
 
