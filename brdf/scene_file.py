@@ -39,6 +39,8 @@ MOST_BYTES = 1 << 22
 def read_parts(path: Path, within: str | Path | None, tables: dict[str, Any] | None) -> dict[str, Any]:
     """The arguments of `brdf.Scene` that a file says; see `brdf.Scene.load`."""
     folders = path.parent, path.parent if within is None else Path(within)
+    if not folders[1].is_dir():
+        raise InputError("within", f"is no folder, got {folders[1]}", "Give the folder that paths may not leave")
     parts: dict[str, Any] = {}
     for name, value in (read_toml(path, MOST_BYTES) if tables is None else tables).items():
         if name not in _READERS:

@@ -48,6 +48,7 @@ from fitting.solver.nnls import nonnegative_minimum
 from fitting.uncertainty.intervals import NORMAL_95, above_zero
 from fitting.uncertainty.noise_model import value_variance
 from fitting.uncertainty.residual import NEGLIGIBLE, Neighbours, neighbours_of, structure_warning
+from fitting.uncertainty.structure import CODED_SIZES, Errors, of_coded_blocks, structure
 from fitting.uneven_noise import EVENINGS, Left, NoiseOfEach, evened, noise_left, with_bounds
 
 SOLVERS: dict[str, Any] = {"lm": optx.LevenbergMarquardt, "bfgs": optx.BFGS}
@@ -199,10 +200,6 @@ def fit_jointly(
         if look_alikes.known:
             result = _without_codec_errors(result, look_alikes, whole, solve)
     return dataclasses.replace(result, seconds=time.perf_counter() - begun)
-
-
-def _is_lossy(tile: Tile) -> bool:
-    return tile.bounds is not None and tile.bounds.lossy
 
 
 def _observed(problem: FitProblem) -> Observed:
@@ -435,9 +432,11 @@ def _solve(
     share = float(np.sum(squares) / max(np.sum(values**2), TINY)) ** 0.5
     parts = problem.by_picture(residual)
     if information is not None:
-        parts = map(_at_ends, parts, observed.tiles, information.at_ends)
+        parts = list(map(_at_ends, parts, observed.tiles, information.at_ends))
     images = map(np.reshape, parts, (shown.shape for shown in observed.shown))
     neighbours = neighbours_of(list(images)) if share > NEGLIGIBLE else Neighbours()
+    if any(tile.bounds is not None and tile.bounds.lossy for tile in observed.tiles):
+        neighbours = neighbours._replace(significant=_err_beyond_blocks(parts, observed))
     if information is None:
         variance = value_variance(left, values + left, noise)
         information = by_least_squares(vector, columns, counts, variance, copies=observed.copies)
@@ -457,8 +456,7 @@ def _solve(
         structure=neighbours.correlation,
         residual=share,
         pixels=len(left),
-        # Pixels of a file that was compressed err together, and their errors say so.
-        warnings=warnings if any(map(_is_lossy, observed.tiles)) else (*warnings, *structure_warning(neighbours)),
+        warnings=(*warnings, *structure_warning(neighbours)),
         values=tuple(np.asarray(problem.leaves[leaf.position]) for leaf in problem.freed),
         errors=tuple(np.array(own, float).reshape(shape) for own, shape in zip(errors, shapes, strict=True)),
         steps=found.steps,
@@ -476,6 +474,16 @@ def _at_ends(
     """Weighted residuals, with what is to be expected in the place of those of values of which one end is known."""
     weight = np.ones((1, 1)) if tile.weight is None else np.asarray(tile.weight).reshape(len(residual), -1)
     return np.where(np.isnan(expected), residual, expected * np.sqrt(weight))
+
+
+def _err_beyond_blocks(residual: Sequence[Float[np.ndarray, "P C"]], observed: Observed) -> bool:
+    """Whether pixels of compressed files err together beyond the blocks of these, where their errors know of it."""
+    some, grids = slice(1 if observed.copies else None), []
+    for tile, width, own in zip(observed.tiles, observed.widths, residual, strict=True):
+        # Blocks that an outline crosses say nothing.
+        left = own if tile.bounds is None else np.where(tile.bounds.ends > 0, own, 0)
+        grids.append(of_coded_blocks(Errors(left[:, some], np.arange(len(left)), width)))
+    return structure(grids, CODED_SIZES).significant
 
 
 def _of_pixels(values: Float[np.ndarray, "P C"], pixel: Int[np.ndarray, " K"] | None) -> Float[np.ndarray, "K C"]:

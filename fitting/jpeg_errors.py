@@ -91,10 +91,9 @@ def _nearest(fit: ModelFit, compressed: Sequence["_Compressed"], most: int, coun
             # The steps of the codec bend what look-alikes show: nearer by it may be better.
             at = dataclasses.replace(at, x=(at.x + best.x) / 2, n=(at.n + best.n) / 2)
             continue
-        both = map(_less, [one.target for one in fit.pictures], map(bounds_of, fit.pictures), shown, errors)
         pictures = [
-            dataclasses.replace(picture, target=target, bounds=bounds)
-            for picture, (target, bounds) in zip(fit.pictures, both, strict=True)
+            dataclasses.replace(picture, **_less(picture, *part))
+            for picture, *part in zip(fit.pictures, shown, errors, strict=True)
         ]
         found = fit._replace(pictures=pictures, optimum=refit(pictures, at, fit.free, fit.n_range, fit.tied))
         nearer, best, least, found = least - left, at, left, most_likely(found)
@@ -139,14 +138,8 @@ class LookAlikes:
         """The pictures less that."""
         if not self._parts:
             return observed
-        both = [
-            _less(tile.target, bounds_of(tile), *part) for tile, part in zip(observed.tiles, self._parts, strict=True)
-        ]
-        tiles = [
-            tile._replace(target=target, bounds=bounds)
-            for tile, (target, bounds) in zip(observed.tiles, both, strict=True)
-        ]
-        return observed._replace(tiles=tiles)
+        both = zip(observed.tiles, self._parts, strict=True)
+        return observed._replace(tiles=[tile._replace(**_less(tile, *part)) for tile, part in both])
 
 
 def _unknowns(at: Optimum) -> Float[np.ndarray, " U"]:
@@ -239,16 +232,14 @@ class _Compressed:
         return np.where(counts, mean, np.float32(0)), (together - squares) / (count * (count - 1))
 
 
-def _less(
-    target: Any, bounds: Bounds, shown: Float[np.ndarray, "P C"], errors: Float[np.ndarray, "P C"]
-) -> tuple[Any, Bounds]:
-    """A picture and its bounds less what compression does where so much is predicted.
+def _less(picture: Any, shown: Float[np.ndarray, "P C"], errors: Float[np.ndarray, "P C"]) -> dict[str, Any]:
+    """Target and bounds of a picture, or a tile, less what compression does where so much is predicted.
 
     Look-alikes are clipped as the picture is: of its values near an end only those are open that lie beyond it.
     """
     if not errors.any():
-        return target, bounds
-    target = np.asarray(target)
+        return {}
+    bounds, target = bounds_of(picture), np.asarray(picture.target)
     code, half = bounds.codes(target)[0], 0.5 * np.median(bounds.widths)
     open_end = bounds.ends == 1
     beyond = open_end & np.where(np.isinf(bounds.upper), shown >= bounds.scale, shown <= 0)
@@ -259,4 +250,4 @@ def _less(
         for sign, end in ((-1, bounds.lower), (1, bounds.upper))
     )
     moved = np.where(errors != 0, moved, target).astype(target.dtype)
-    return moved, dataclasses.replace(bounds, lower=lower, upper=upper)
+    return {"target": moved, "bounds": dataclasses.replace(bounds, lower=lower, upper=upper)}

@@ -103,7 +103,7 @@ class FitProblem:
 
     @property
     def widest_step(self) -> float:
-        """That of the pictures."""
+        """Largest of the pictures'."""
         return max(target.widest_step for target in self.targets)
 
     def sample_error(self, model: str) -> SampleError | None:

@@ -73,8 +73,6 @@ def read_inputs(targets: list[Path], options: PictureOptions, encodings: dict[Pa
     kind = "scene" if options.sphere is None and options.normals is None else "photographs"
     kind = "archive" if len(targets) == 1 and targets[0].suffix.lower() == ".npz" else kind
     _check_options(kind, targets, options)
-    if options.within is not None and not options.within.is_dir():
-        raise InputError("--within", f"is no folder, got {options.within}", "Give the folder that paths may not leave")
     for beside in (options.normals, options.lights, options.intensities):
         if beside is not None:
             input_file(beside)

@@ -5,7 +5,8 @@ from typing import Any
 
 import brdf
 from brdf.errors import InputError
-from fitting.cli.common import find_material, named_as, show
+from brdf.files import read_toml
+from fitting.cli.common import find_material, named_as, refuse_replacing, show
 from fitting.progress import waiting
 
 
@@ -29,5 +30,10 @@ def render(material: str, *, out: Path, scene: Path | None = None, precision: An
             scene = (Path(material) if Path(material).is_dir() else Path(material).parent) / "scene.toml"
             if Path(material).suffix == ".mtl" or not (Path(material).exists() and scene.is_file()):
                 raise InputError("--scene", "is missing", "Add --scene SCENE.toml")
-        brdf.write_image(out, brdf.render(loaded, brdf.Scene.load(scene), precision=precision))
+        import jax
+
+        tables = read_toml(scene)
+        shown = brdf.Scene.load(scene, tables=tables)
+        refuse_replacing([scene.parent / word for word in jax.tree.leaves(tables) if isinstance(word, str)], out)
+        brdf.write_image(out, brdf.render(loaded, shown, precision=precision))
     show(f"wrote {out}")

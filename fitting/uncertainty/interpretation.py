@@ -34,6 +34,7 @@ from fitting.uncertainty.intervals import exponent_interval
 from fitting.uncertainty.noise_model import misweighted_sums, weighted_sums
 from fitting.uncertainty.residual import Neighbours, Residual, residual_statistics
 from fitting.uncertainty.structure import (
+    CODED_SIZES,
     SIZES,
     Blocks,
     Errors,
@@ -209,7 +210,7 @@ def shared_errors(
     if lossy:
         # The pixels of a block err together in any case.
         errors, some = list(errors), slice(1 if observed.copies else None)
-        together = structure([of_coded_blocks(one._replace(values=one.values[:, some])) for one in errors], (2, 4))
+        together = structure([of_coded_blocks(one._replace(values=one.values[:, some])) for one in errors], CODED_SIZES)
     else:
         # With little noise few values say much.
         if evidence.scores:

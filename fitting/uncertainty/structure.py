@@ -18,6 +18,8 @@ from fitting.solver.tied import places_of
 SIZES = (8, 16, 32)
 # Pixels on a side of the blocks of JPEG, whose errors go together by themselves.
 CODED_BLOCK = 8
+# Of sums over these, two on a side, how many on a side are looked at.
+CODED_SIZES = (2, 4)
 # Of those whose sums of scores tell how much errs together: the blocks of JPEG, and larger ones where there are many.
 SCATTER_SIZES, FEWEST_BLOCKS = (8, 16, 32), 30
 # So many standard deviations above what chance gives: in blocks of 8 x 8, and at any of the sizes.

@@ -66,6 +66,11 @@ def test_a_joint_fit_takes_off_what_the_codec_does_and_tells_what_is_left(tmp_pa
         for name, truth in zip(("k_a", "k_d", "k_s"), one.k, strict=True):
             off += [(own.value - true) / own.error for own, true in zip(result[name], truth, strict=True)]
         assert not any("structure" in one for one in result.warnings)
+    # Of a light that is off by a degree.
+    across = np.cross(one.to_light, [0, 0, 1])
+    wrong = one.scene(one.to_light + 0.0175 * across / np.linalg.norm(across))
+    result = fitting.fit_jointly(noisy.picture(one.drawn(), seed, tmp_path), wrong, one.model)
+    assert any("structure" in one for one in result.warnings)
     assert np.sqrt(np.mean(np.square(off))) < 1.5
 
 

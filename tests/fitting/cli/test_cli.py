@@ -100,12 +100,17 @@ def test_what_is_read_is_not_replaced(folder, capsys):
     assert (folder / "scene.toml").read_bytes() == before
 
 
-def test_a_photograph_or_a_material_is_not_replaced(tmp_path, capsys):
+def test_a_photograph_a_material_or_a_sky_is_not_replaced(tmp_path, capsys):
     brdf.write_image(tmp_path / "ball.png", np.ones((8, 8, 1)), dtype="uint8")
     brdf.save_material(brdf.preset("gold"), tmp_path / "material.json")
+    camera = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], resolution=[8, 8], width=2.2)
+    sky = brdf.EnvironmentMap(np.ones((8, 16, 3)))
+    brdf.Scene(camera, [brdf.Sphere([0, 0, 0], 1)], lights=[sky]).save(tmp_path / "scene.toml")
+    (drawn,) = tmp_path.glob("*.exr")
     for words in (
         ["lights", tmp_path / "ball.png", "--sphere", "4,4,3", "--out", tmp_path / "ball.png"],
         ["convert", tmp_path, tmp_path / "material.json"],
+        ["render", tmp_path, "-o", drawn],
     ):
         before = {path: path.read_bytes() for path in tmp_path.iterdir()}
         status, _, err = run(capsys, *words)
@@ -169,6 +174,7 @@ def test_a_scene_may_be_allowed_to_reach_further(tmp_path, capsys):
     words = "fit", tmp_path / "target.exr", "--scene", file
     refused(capsys, tmp_path, "or allow more with within", *words)
     refused(capsys, tmp_path, "has no layer of normals", *words, "--within", tmp_path)  # it was opened
+    refused(capsys, tmp_path, "--within: is no folder", *words, "--within", tmp_path / "nosuch")
 
 
 def test_nothing_else_of_an_archive_is_read(tmp_path):

@@ -28,6 +28,9 @@ def folder(tmp_path_factory):
 def test_numbers_are_had_by_name(folder):
     result = folder[1]
     assert result["n"] is result.parameters[-1]
+    assert list(result) == list(dict.fromkeys(one.name for one in result.parameters))
+    assert "n" in result
+    assert result in {result}
     assert result["k_d"][1] is result["k_d[1]"]
     assert float(result["n"]) == result.material.n
     np.testing.assert_array_equal(np.asarray(result["k_d"], float), result.material.k_d)
