@@ -40,7 +40,7 @@ def read_parts(path: Path, within: str | Path | None, tables: dict[str, Any] | N
     """The arguments of `brdf.Scene` that a file says; see `brdf.Scene.load`."""
     folders = path.parent, path.parent if within is None else Path(within)
     if not folders[1].is_dir():
-        raise InputError("within", f"is no folder, got {folders[1]}", "Give the folder that paths may not leave")
+        raise InputError(folders[1], "is no folder", "Give as within the folder that paths may not leave")
     parts: dict[str, Any] = {}
     for name, value in (read_toml(path, MOST_BYTES) if tables is None else tables).items():
         if name not in _READERS:

@@ -174,7 +174,7 @@ def test_a_scene_may_be_allowed_to_reach_further(tmp_path, capsys):
     words = "fit", tmp_path / "target.exr", "--scene", file
     refused(capsys, tmp_path, "or allow more with within", *words)
     refused(capsys, tmp_path, "has no layer of normals", *words, "--within", tmp_path)  # it was opened
-    refused(capsys, tmp_path, "--within: is no folder", *words, "--within", tmp_path / "nosuch")
+    refused(capsys, tmp_path, "nosuch: is no folder", *words, "--within", tmp_path / "nosuch")
 
 
 def test_nothing_else_of_an_archive_is_read(tmp_path):
