@@ -435,7 +435,7 @@ def _solve(
         parts = list(map(_at_ends, parts, observed.tiles, information.at_ends))
     images = map(np.reshape, parts, (shown.shape for shown in observed.shown))
     neighbours = neighbours_of(list(images)) if share > NEGLIGIBLE else Neighbours()
-    if any(tile.bounds is not None and tile.bounds.lossy for tile in observed.tiles):
+    if share > NEGLIGIBLE and any(tile.bounds is not None and tile.bounds.lossy for tile in observed.tiles):
         neighbours = neighbours._replace(significant=_err_beyond_blocks(parts, observed))
     if information is None:
         variance = value_variance(left, values + left, noise)
@@ -445,7 +445,7 @@ def _solve(
     parameters, correlation = _parameters(problem, given, information, held)
     errors = [[one.error for one in parameters if one.name == leaf.words] for leaf in problem.freed]
     shapes = [() if leaf.is_direction else problem.leaves[leaf.position].shape for leaf in problem.freed]
-    remedy = "raise max_steps" if found.steps >= max_steps else "start nearer, or free fewer numbers"
+    remedy = "raise max_steps of fit_jointly" if found.steps >= max_steps else "start nearer, or free fewer numbers"
     warnings = () if found.converged else (f"the solver stopped after {found.steps} steps without an end: {remedy}",)
     result = JointResult(
         **observed.result_fields() | {"scenes": scenes},
