@@ -48,7 +48,7 @@ from fitting.solver.nnls import nonnegative_minimum
 from fitting.uncertainty.intervals import NORMAL_95, above_zero
 from fitting.uncertainty.noise_model import value_variance
 from fitting.uncertainty.residual import NEGLIGIBLE, Neighbours, neighbours_of, structure_warning
-from fitting.uncertainty.structure import CODED_SIZES, Errors, of_coded_blocks, structure
+from fitting.uncertainty.structure import CODED_SIZES, SIZES, Errors, of_coded_blocks, over_blocks, structure
 from fitting.uneven_noise import EVENINGS, Left, NoiseOfEach, evened, noise_left, with_bounds
 
 SOLVERS: dict[str, Any] = {"lm": optx.LevenbergMarquardt, "bfgs": optx.BFGS}
@@ -435,8 +435,9 @@ def _solve(
         parts = list(map(_at_ends, parts, observed.tiles, information.at_ends))
     images = map(np.reshape, parts, (shown.shape for shown in observed.shown))
     neighbours = neighbours_of(list(images)) if share > NEGLIGIBLE else Neighbours()
-    if share > NEGLIGIBLE and any(tile.bounds is not None and tile.bounds.lossy for tile in observed.tiles):
-        neighbours = neighbours._replace(significant=_err_beyond_blocks(parts, observed))
+    if share > NEGLIGIBLE:
+        together = neighbours.significant, noise > 2 * observed.rounding
+        neighbours = neighbours._replace(significant=_err_together(parts, observed, *together))
     if information is None:
         variance = value_variance(left, values + left, noise)
         information = by_least_squares(vector, columns, counts, variance, copies=observed.copies)
@@ -476,14 +477,24 @@ def _at_ends(
     return np.where(np.isnan(expected), residual, expected * np.sqrt(weight))
 
 
-def _err_beyond_blocks(residual: Sequence[Float[np.ndarray, "P C"]], observed: Observed) -> bool:
-    """Whether pixels of compressed files err together beyond the blocks of these, where their errors know of it."""
+def _err_together(
+    residual: Sequence[Float[np.ndarray, "P C"]], observed: Observed, neighbours: bool, tell: Bool[np.ndarray, " C"]
+) -> bool:
+    """Whether pixels err together; those of compressed files beyond the blocks of these, whose errors know of it.
+
+    In others neighbours may, or blocks of pixels in the channels whose noise is more than rounding.
+    """
+    lossy = any(tile.bounds is not None and tile.bounds.lossy for tile in observed.tiles)
     some, grids = slice(1 if observed.copies else None), []
     for tile, width, own in zip(observed.tiles, observed.widths, residual, strict=True):
         # Blocks that an outline crosses say nothing.
         left = own if tile.bounds is None else np.where(tile.bounds.ends > 0, own, 0)
-        grids.append(of_coded_blocks(Errors(left[:, some], np.arange(len(left)), width)))
-    return structure(grids, CODED_SIZES).significant
+        # The noise may be the same in all channels.
+        left = left[:, some] if lossy else np.sum(left, axis=1, keepdims=True, where=tell)
+        errors = Errors(left, np.arange(len(left)), width)
+        grids.append(of_coded_blocks(errors) if lossy else over_blocks(errors, SIZES[0]))
+    beyond = structure(grids, CODED_SIZES if lossy else SIZES).significant
+    return beyond or (neighbours and not lossy)
 
 
 def _of_pixels(values: Float[np.ndarray, "P C"], pixel: Int[np.ndarray, " K"] | None) -> Float[np.ndarray, "K C"]:

@@ -361,3 +361,13 @@ def test_a_dark_side_that_is_cut_off_at_0_is_no_structure():
     for seed in range(2):
         picture = np.maximum(shown + 0.02 * np.random.default_rng(seed).standard_normal(shown.shape), 0)
         assert not fitting.fit_jointly(picture, lit, "blinn-phong").warnings
+
+
+def test_a_light_a_degree_off_is_structure():
+    """Which neighbours alone do not tell under such noise."""
+    directions = [0.5, 0.6, 0.7], [0.5, 0.588, 0.71]
+    true, told = (brdf.Scene(LARGER, [BALL], lights=[brdf.DirectionalLight(one, [1.0])]) for one in directions)
+    shown = np.asarray(brdf.render(brdf.BlinnPhong(k_d=[0.4], k_s=[0.3], n=20), true, precision="float64"))
+    picture = shown + 0.015 * np.random.default_rng(0).standard_normal(shown.shape)
+    assert any("structure" in words for words in fitting.fit_jointly(picture, told, "blinn-phong").warnings)
+    assert not fitting.fit_jointly(picture, true, "blinn-phong").warnings
