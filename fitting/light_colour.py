@@ -8,7 +8,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -55,6 +54,7 @@ def scale_growth(model: type[brdf.Material], n: float) -> float:
     """The derivative by n of the logarithm of a lobe's scale: 0 of the classic forms."""
     if not issubclass(model, SpecularMaterial):
         return 0.0
+    # By differences: JAX takes milliseconds to differentiate one number.
+    about = np.maximum(n + 1e-5 * (1 + n) * np.array([-1.0, 1.0]), 0.0)
     with jax.enable_x64(True):
-        scale, growth = jax.jvp(model.scale, (jnp.float64(n),), (jnp.float64(1.0),))
-        return float(growth / scale)
+        return float(np.diff(np.log(model.scale(about)))[0] / np.diff(about)[0])
