@@ -38,7 +38,7 @@ from fitting.result import Parameter, Parameters
 from fitting.solver.losses import weights
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import search
-from fitting.uncertainty.covariance import residual_noise, uncertainty
+from fitting.uncertainty.covariance import PixelErrors, residual_noise, uncertainty
 from fitting.uncertainty.interpretation import material_and_parameters
 from fitting.uncertainty.intervals import exponent_interval
 from fitting.uncertainty.noise_model import sums_at
@@ -410,7 +410,8 @@ def _fit_model(model, samples, loss, n_range):
     fit = ModelFit(model, [], optimum, free, n_range)
     # A lobe that hardly reaches a sample needs a k_s whose square is out of range; it is found to be undetermined.
     with np.errstate(over="ignore", invalid="ignore"):
-        errors = uncertainty(fit, free, noise, brightest, visible, spread=spread, channels=left.T @ left)
+        pixels = PixelErrors(noise, spread, channels=left.T @ left)
+        errors = uncertainty(fit, pixels, free, brightest, visible)
     interval = None
     if specular and not errors.n_reason:
         interval = exponent_interval(fit, errors.n_error, errors.reach, errors.delta_cost, 0.0, parabolic=True)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -61,6 +62,24 @@ class Sum(NamedTuple):
         return shares
 
 
+class PixelErrors(NamedTuple):
+    """How pixels err.
+
+    Attributes:
+        noise: standard deviation of the residual, (C,).
+        spread: sums of the columns' products times the variance of each pixel, where it is not the same in all.
+        scatter: what takes the place of the Hessian times the noise, over all unknowns, where pixels err together.
+        channels: correlation of the channels' errors; None where they err alone.
+        missed: what light samples leave out; None where there are none.
+    """
+
+    noise: Float[np.ndarray, " C"]
+    spread: Float[np.ndarray, "C 4 4"] | None = None
+    scatter: Float[np.ndarray, "U U"] | None = None
+    channels: Float[np.ndarray, "C C"] | None = None
+    missed: SampleError | None = None
+
+
 class Uncertainty(NamedTuple):
     """Errors, and what is not determined.
 
@@ -104,18 +123,14 @@ def _degrees(optimum: Optimum) -> Float[np.ndarray, " C"]:
 
 def uncertainty(
     fit: ModelFit,
+    pixels: PixelErrors,
     reached: Bool[np.ndarray, "3 C"],
-    noise: Float[np.ndarray, " C"],
     brightest: Float[np.ndarray, " C"],
     visible: float,
     *,
-    spread: Float[np.ndarray, "C 4 4"] | None = None,
-    scatter: Float[np.ndarray, "U U"] | None = None,
-    channels: Float[np.ndarray, "C C"] | None = None,
     columns: Float[np.ndarray, "3 C"] | None = None,
     gain: float = 0.0,
     resolution: float = 0.0,
-    missed: SampleError | None = None,
 ) -> Uncertainty:
     """Errors of a fit.
 
@@ -124,38 +139,27 @@ def uncertainty(
 
     Args:
         fit: of one model; where rounded values say more, with the pictures and the optimum of these.
+        pixels: how they err.
         reached: which coefficients the light reaches, (3, C).
-        noise: standard deviation of the residual, (C,).
         brightest: largest value of the picture, (C,).
         visible: largest value of the specular term in the picture, over that of the picture.
-        spread: sums of the columns' products times the variance of each pixel, where it is not the same in all.
-        scatter: what takes the place of the Hessian times the noise, over all unknowns, where pixels err together.
-        channels: correlation of the channels' errors; None where they err alone.
         columns: root mean square over pixels of what each term shows at 1; None where no pixel weighs more.
-        resolution: relative error of a number that is left by the arithmetic of the basis images.
         gain: see `specular_gain`, where more pixels tell of it than those of the optimum's sums.
-        missed: what light samples leave out; None where there are none.
+        resolution: relative error of a number that is left by the arithmetic of the basis images.
     """
-    optimum, tied, evidence = fit.optimum, fit.tied, fit.evidence
-    # The Hessian of all channels where these err together: the noise of each is 1.
-    joined = None if evidence is None or evidence.together is None else evidence.together.gram
-    for gram in (optimum.normal(noise**2).gram, joined):
-        gain = gain if gram is None else max(gain, specular_gain(gram, optimum.x))
-    columns = rms_columns(optimum) if columns is None else columns
+    optimum, channels = fit.optimum, pixels.noise.size
     dependent = DEPENDENT_SINGLE if fit.single else DEPENDENT_DOUBLE
-    reasons = np.full(reached.shape, "", object)
-    n_reason = reasons[2, :] = _without_trace(optimum, gain, visible, grey=tied is not None)
+    joined = _joined(fit)
+    for gram in (optimum.normal(pixels.noise**2).gram, joined):
+        gain = gain if gram is None else max(gain, specular_gain(gram, optimum.x))
+    reasons, degrees = np.full(reached.shape, "", object), _degrees(optimum)
+    n_reason = reasons[2, :] = _without_trace(optimum, gain, visible, grey=fit.tied is not None)
     for term, channel in np.argwhere(~reached & (reasons == "")):
         where = "this channel" if reached[term].any() else "the scene"
         reasons[term, channel] = f"{LIGHT[term]} in {where}"
-    degrees = _degrees(optimum)
-    apart = degrees.size if channels is None else 1
-    reaches = [student_95(max(one, FEWEST_DEGREES)) for one in degrees.tolist()]
     reasons[(reasons == "") & (degrees < FEWEST_DEGREES)] = FEW_PIXELS
     n_reason = n_reason or FEW_PIXELS * bool(np.all(degrees < FEWEST_DEGREES))
-    # Of n the channels tell together, where they err alone.
-    reach = student_95(max(apart * float(np.mean(degrees)), FEWEST_DEGREES))
-    sums = _dependent(optimum, reasons, dependent, columns)
+    sums = _dependent(optimum, reasons, dependent, rms_columns(optimum) if columns is None else columns)
     known, stand_in = reasons == "", optimum.x.copy()
     determined = known.copy()
     for channel, some in sums.items():
@@ -164,54 +168,30 @@ def uncertainty(
         stand_in[some.terms, channel] = 0.0
         stand_in[first, channel], determined[first, channel] = some.value / some.columns[0], True
     optimum = dataclasses.replace(optimum, x=stand_in)
-    x, size, active = optimum.x, 3 * noise.size + 1, determined & (optimum.x > 0)
-    hessian = optimum.normal().gram if joined is None else joined
-    middle = _of_scores(optimum, noise, spread, channels) if joined is None else joined
-    inverse, along, with_n = _inverted(hessian, active, tied, dependent)
-    widening = np.ones(size) if evidence is None else evidence.widening * np.ones(size)
-    independent = inverse @ middle @ inverse * np.outer(widening, widening)
-    covariance, middles = independent, np.stack([middle, middle])
-    if scatter is not None:
-        # What is left may be the dust of arithmetic, which errs together and says nothing.
-        middles[0] = scatter + LEAST_SCATTER * middle
-        covariance = inverse @ middles[0] @ inverse * np.outer(widening, widening)
-        # Of a few blocks the scatter alone says too little.
-        more = max(np.trace(inverse @ scatter) / max(np.trace(inverse @ middle), np.finfo(float).tiny), 1.0)
-        variance, least = np.diag(covariance), np.diag(independent) * more
-        ratio = np.divide(least, variance, out=np.ones(size), where=variance > 0)
-        wider = np.sqrt(np.maximum(ratio, 1.0))
-        covariance = covariance * np.outer(wider, wider)
-    if missed is not None:
-        off = missed.shifts(np.append(active.ravel(), with_n)) * np.append(np.ones(size - 1), optimum.n)
-        covariance = covariance + off.T @ off
-    # Where this is larger than the picture a number is not determined, whatever others at their bound may be.
-    own = np.diag(covariance) + np.sum(np.square([np.zeros(size), *fit.moved]), axis=0)
-    bounded = {
-        (term, channel): _without_bound(term, channel, optimum, inverse, hessian, middles, dependent)
+    x, active = optimum.x, determined & (optimum.x > 0)
+    inner = _covariance(fit, optimum, pixels, active, dependent)
+    at_bound = {
+        (term, channel): _without_bound(term, channel, optimum, inner, dependent)
         for term, channel in np.argwhere(determined & ~(x > 0)).tolist()
     }
-    offs = np.array([np.zeros(size), *(off for *_, off in bounded.values())])
-    # What was dropped is at its bound too, and counts once.
-    beside = [np.sqrt(np.maximum(off**2 - np.sum(offs**2, axis=0), 0.0)) * np.sign(off) for off in fit.moved]
-    offs = np.vstack([offs, *beside])
-    covariance = covariance + offs.T @ offs
-    # From here on x_s is k_s times the scale at the optimum, whatever n is.
-    held = np.eye(size)
-    held[2 * noise.size : -1, -1] = -scale_growth(fit.model, optimum.n) * x[2]
-    covariance = held @ covariance @ held.T
+    covariance = _with_bounds(fit, optimum, inner, [off for *_, off in at_bound.values()])
     variance = np.maximum(np.diag(covariance), 0.0)
-    # What errs together makes errors larger, but not the numbers less determined.
-    deviations = np.sqrt(np.maximum([variance, own if scatter is None else np.diag(independent)], 0.0))
+    # Where this is larger than the picture a number is not determined, whatever others at their bound may be. What errs
+    # together makes errors larger, but not the numbers less determined.
+    dropped = np.sum(np.square([np.zeros(variance.size), *fit.moved]), axis=0)
+    own = np.diag(inner.covariance) + dropped if pixels.scatter is None else np.diag(inner.independent)
+    deviations = np.sqrt(np.maximum([variance, own], 0.0))
+    reaches = [student_95(max(one, FEWEST_DEGREES)) for one in degrees.tolist()]
     x_error, x_interval = np.full(x.shape, np.inf), np.zeros((*x.shape, 2))
     x_interval[..., 1] = np.inf
     for term, channel in np.argwhere(determined):
-        index = term * noise.size + channel
+        index = term * channels + channel
         value, deviation, alone = float(x[term, channel]), *deviations[:, index].tolist()
         # Where n is open, what moves along with it is open too.
-        if value > 0 and active[2].any() and not with_n and abs(along[index]) * optimum.n > deviation:
+        if value > 0 and active[2].any() and not inner.with_n and abs(inner.along[index]) * optimum.n > deviation:
             deviation = alone = math.inf
-        if (term, channel) in bounded:
-            value, deviation, alone, _ = bounded[term, channel]
+        if (term, channel) in at_bound:
+            value, deviation, alone, _ = at_bound[term, channel]
         largest = max(optimum.square[channel], brightest[channel] ** 2)
         deviation = math.hypot(deviation, resolution * value)
         wide = deviation * reaches[channel] / NORMAL_95
@@ -222,18 +202,89 @@ def uncertainty(
             reasons[term, channel] = "its error is larger than the whole picture"
             x_error[term, channel] = np.inf
     sums = {c: some._replace(error=some.columns[0] * x_error[some.terms[0], c]) for c, some in sums.items()}
-    scale = np.divide(1.0, deviations[0], out=np.zeros(size), where=variance > 0)
+    scale = np.divide(1.0, deviations[0], out=np.zeros(variance.size), where=variance > 0)
+    # Of n the channels tell together, where they err alone.
+    apart = channels if pixels.channels is None else 1
+    reach = student_95(max(apart * float(np.mean(degrees)), FEWEST_DEGREES))
     n_error, delta_cost = math.inf, 0.0
-    if with_n:
+    if inner.with_n:
         # The noise variance, averaged over channels as n feels it, times the square of that reach.
-        delta_cost = float(reach**2 * covariance[-1, -1] / inverse[-1, -1])
-        n_error = math.hypot(deviations[0, -1], resolution * optimum.n)
+        delta_cost = float(reach**2 * covariance[-1, -1] / inner.inverse[-1, -1])
+        n_error = math.inf if n_reason else math.hypot(deviations[0, -1], resolution * optimum.n)
     elif not n_reason:
         n_reason = "the highlight fits as well with other exponents and another k_s"
-    if n_reason:
-        n_error = math.inf
     correlation = covariance * np.outer(scale, scale)
     return Uncertainty(x_error, x_interval, n_error, correlation, reach, delta_cost, reasons, n_reason, sums)
+
+
+def _joined(fit: ModelFit) -> Float[np.ndarray, "U U"] | None:
+    """The Hessian of all channels where these err together, the noise of each being 1; None where they do not."""
+    return None if fit.evidence is None or fit.evidence.together is None else fit.evidence.together.gram
+
+
+class _Covariance(NamedTuple):
+    """Of what is active, the rest held; all over x_a, x_d, x_s, channel after channel, and n.
+
+    Attributes:
+        hessian: the Hessian, of noise 1.
+        inverse: its inverse.
+        along: what n moves along.
+        with_n: whether n is determined.
+        middles: covariances of the scores, with what errs together, and as if pixels erred alone.
+        covariance: of the numbers.
+        independent: the same as if pixels erred alone.
+    """
+
+    hessian: Float[np.ndarray, "U U"]
+    inverse: Float[np.ndarray, "U U"]
+    along: Float[np.ndarray, " U"]
+    with_n: bool
+    middles: Float[np.ndarray, "2 U U"]
+    covariance: Float[np.ndarray, "U U"]
+    independent: Float[np.ndarray, "U U"]
+
+
+def _covariance(
+    fit: ModelFit, optimum: Optimum, pixels: PixelErrors, active: Bool[np.ndarray, "3 C"], dependent: float
+) -> _Covariance:
+    joined, scatter, missed = _joined(fit), pixels.scatter, pixels.missed
+    hessian = optimum.normal().gram if joined is None else joined
+    middle = _of_scores(optimum, pixels) if joined is None else joined
+    inverse, along, with_n = _inverted(hessian, active, fit.tied, dependent)
+    widening = np.ones(len(inverse)) * (1.0 if fit.evidence is None else fit.evidence.widening)
+    independent = inverse @ middle @ inverse * np.outer(widening, widening)
+    covariance, middles = independent, np.stack([middle, middle])
+    if scatter is not None:
+        # What is left may be the dust of arithmetic, which errs together and says nothing.
+        middles[0] = scatter + LEAST_SCATTER * middle
+        covariance = inverse @ middles[0] @ inverse * np.outer(widening, widening)
+        # Of a few blocks the scatter alone says too little.
+        more = max(np.trace(inverse @ scatter) / max(np.trace(inverse @ middle), np.finfo(float).tiny), 1.0)
+        variance, least = np.diag(covariance), np.diag(independent) * more
+        ratio = np.divide(least, variance, out=np.ones(len(inverse)), where=variance > 0)
+        wider = np.sqrt(np.maximum(ratio, 1.0))
+        covariance = covariance * np.outer(wider, wider)
+    if missed is not None:
+        off = missed.shifts(np.append(active.ravel(), with_n)) * np.append(np.ones(active.size), optimum.n)
+        covariance = covariance + off.T @ off
+    return _Covariance(hessian, inverse, along, with_n, middles, covariance, independent)
+
+
+def _with_bounds(
+    fit: ModelFit, optimum: Optimum, inner: _Covariance, offs: Sequence[Float[np.ndarray, " U"]]
+) -> Float[np.ndarray, "U U"]:
+    """The covariance with what numbers at their bound may be: ``offs`` is how far off others are where one is not.
+
+    Of x_s as it is at the scale of the lobe at the optimum, whatever n is.
+    """
+    size = len(inner.covariance)
+    off = np.array([np.zeros(size), *offs])
+    # What was dropped is at its bound too, and counts once.
+    beside = [np.sqrt(np.maximum(one**2 - np.sum(off**2, axis=0), 0.0)) * np.sign(one) for one in fit.moved]
+    off = np.vstack([off, *beside])
+    held = np.eye(size)
+    held[2 * optimum.x.shape[1] : -1, -1] = -scale_growth(fit.model, optimum.n) * optimum.x[2]
+    return held @ (inner.covariance + off.T @ off) @ held.T
 
 
 def _without_trace(optimum: Optimum, gain: float, visible: float, *, grey: bool) -> str:
@@ -295,42 +346,31 @@ def _dependent(optimum: Optimum, reasons: np.ndarray, dependent: float, columns:
     return sums
 
 
-def _of_scores(
-    optimum: Optimum,
-    noise: Float[np.ndarray, " C"],
-    spread: Float[np.ndarray, "C 4 4"] | None,
-    channels: Float[np.ndarray, "C C"] | None,
-) -> Float[np.ndarray, "U U"]:
+def _of_scores(optimum: Optimum, pixels: PixelErrors) -> Float[np.ndarray, "U U"]:
     """The covariance of the scores by x_a, x_d, x_s, channel after channel, and n, where pixels err alone."""
-    scores = noise[:, None, None] ** 2 * optimum.gram if spread is None else spread
-    if channels is not None:
+    scores = pixels.noise[:, None, None] ** 2 * optimum.gram if pixels.spread is None else pixels.spread
+    if pixels.channels is not None:
         # The columns of two channels are alike but for their sizes, or nearly so: by the root of each one's products
         # what they share is never more than either has.
         size = np.sqrt(np.maximum(np.diagonal(scores, axis1=1, axis2=2), np.finfo(float).tiny))
         values, vectors = np.linalg.eigh(scores / (size[:, :, None] * size[:, None]))
         roots = (vectors * np.sqrt(np.maximum(values, 0.0))[:, None]) @ np.swapaxes(vectors, 1, 2) * size[..., None]
-        scores = (roots[:, None] @ np.swapaxes(roots, 1, 2)) * channels[..., None, None]
+        scores = (roots[:, None] @ np.swapaxes(roots, 1, 2)) * pixels.channels[..., None, None]
     return join_channels(scores, optimum.product, optimum.square, optimum.x[2]).gram
 
 
 def _without_bound(
-    term: int,
-    channel: int,
-    optimum: Optimum,
-    inverse: Float[np.ndarray, "U U"],
-    hessian: Float[np.ndarray, "U U"],
-    middles: Float[np.ndarray, "2 U U"],
-    dependent: float,
+    term: int, channel: int, optimum: Optimum, inner: _Covariance, dependent: float
 ) -> tuple[float, float, float, Float[np.ndarray, " U"]]:
     """Value and errors that a coefficient would have without its bound; how far off others are if it is not at it."""
-    size = len(inverse)
+    hessian, size = inner.hessian, len(inner.hessian)
     own = np.eye(size)[term * optimum.x.shape[1] + channel]
-    direction = own - inverse @ hessian @ own
+    direction = own - inner.inverse @ hessian @ own
     left = direction @ hessian @ direction
     if left <= dependent * (own @ hessian @ own):
         return 0.0, math.inf, math.inf, np.zeros(size)
     score = optimum.product[channel, term] - optimum.gram[channel, term, :3] @ optimum.x[:, channel]
-    value, (deviation, alone) = float(score / left), (np.sqrt(direction @ middles @ direction) / left).tolist()
+    value, (deviation, alone) = float(score / left), (np.sqrt(direction @ inner.middles @ direction) / left).tolist()
     return value, deviation, alone, (direction - own) * above_zero(value, deviation)[1] / NORMAL_95
 
 

@@ -13,6 +13,7 @@ from fitting.channel_errors import residuals
 from fitting.light_colour import coefficient_factors
 from fitting.model_fit import N_RANGE, Evidence, ModelFit
 from fitting.pixels import Observed
+from fitting.problem import FitProblem
 from fitting.result import HELD_PLAUSIBLE, FitResult, Parameter
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
@@ -21,6 +22,7 @@ from fitting.uncertainty.covariance import (
     AMBIENT_SHARE,
     RESOLUTION,
     TERMS,
+    PixelErrors,
     Sum,
     Uncertainty,
     inverse_among,
@@ -65,7 +67,7 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: R
     ``hidden`` is why there is no highlight, where a fit with one has found that, ``statistics`` those of what least
     squares leaves, in the unit of the picture, where that has been gone over.
     """
-    optimum, pictures, residual = fit.optimum, fit.pictures, fit.residual
+    optimum, pictures, evidence = fit.optimum, fit.pictures, fit.evidence
     about = observed.result_fields() | {"optimum": optimum, "pixels": int(np.min(optimum.pixels))}
     weight = _typical_weight(pictures)
     rounding, columns = observed.rounding * weight, rms_columns(optimum, weight)
@@ -76,66 +78,23 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: R
     visible = 0.0 if lobe is None else lobe.share(optimum.x, observed.brightest)
     # Also of what rounded values say, whose sums are in double precision.
     resolution = RESOLUTION if fit.single else 0.0
-    spread = shared = growing = uneven = together = None
-    deviation, gain, tell = noise, 0.0, noise > 2 * rounding
-    channels = statistics.channels(tell)
-    weighed = observed.problem.noise is not None or any(one is not None for one in observed.problem.weights)
+    channels = np.ones((noise.size,) * 2) if observed.copies else statistics.channels(noise > 2 * rounding)
     sampled = observed.problem.sample_error(fit.model.name)
-    size = 0.0 if sampled is None else sampled.size
-    clipped = _clipped(optimum, fit.tied)
-    if fit.evidence is not None:
-        # Each working target has the noise 1; what least squares leaves is rounding, which goes together.
-        evidence = fit.evidence
+    clipped, gain, growing = _clipped(optimum, fit.tied), 0.0, None
+    if evidence is None:
+        pixels = PixelErrors(noise, channels=channels, missed=sampled)
+        pixels, together, growing = _of_values(fit, observed, statistics, pixels, rounding)
+    else:
+        # What least squares leaves is rounding, which goes together.
         statistics = statistics._replace(neighbours=statistics.neighbours._replace(significant=False))
         # Of a small highlight the pixels near an edge may tell next to nothing.
         gain = specular_gain(optimum.normal(noise**2).gram, optimum.x)
-        optimum, deviation = evidence.optimum, noise**0
-        fit = fit._replace(pictures=evidence.pictures, optimum=optimum)
-        shared, together, of_codes = shared_errors(
-            evidence, observed, alone_covariance(optimum, fit.tied) if evidence.together is None else None, size
-        )
-        channels = channels if evidence.scores else of_codes
-        together = None if evidence.light < ARITHMETIC * np.max(observed.brightest) else together
-    else:
-        # Where weights are no inverse variances nothing is told of what else makes noise uneven.
-        asked = weighed and observed.problem.loss == "squared"
-        uneven = misweighted_sums(pictures, optimum) if asked else None
-        growing = statistics.growing_noise(noise, rounding) if uneven is None else None
-        # It cannot be told where rounding is most of the noise, or weights are part of what is fitted.
-        if observed.problem.loss == "squared" and tell.any():
-            # Channels that err together count once.
-            some = np.flatnonzero(tell)[: 1 if observed.copies or channels is not None else None]
-            missed = size * weight / float(np.sqrt(np.mean(noise[some] ** 2)))
-            grids = [grid.channels(some) for grid in statistics.blocks]
-            together = structure(grids, even=growing is None and uneven is None, missed=missed)
-        # What a bound of the material leaves is no error of the pixels.
-        if together is not None and together.significant and not fit.capped:
-            errors = (
-                Errors(residuals(picture, optimum), np.arange(len(picture.target)), width)
-                for picture, width in zip(pictures, observed.widths, strict=True)
-            )
-            shared = scatter(pictures, optimum, errors, alone_covariance(optimum, fit.tied))
-    channels = np.ones((noise.size,) * 2) if observed.copies else channels
-    if shared is None and growing is not None:
-        uneven = weighted_sums(pictures, optimum, growing, inverse=False)
-    if shared is None and uneven is not None:
-        spread = fit.noise_factor**2 * uneven.gram
+        fit = fit._replace(pictures=evidence.pictures, optimum=evidence.optimum)
+        pixels = PixelErrors(np.ones(noise.size), channels=channels, missed=sampled)
+        pixels, together = _of_codes(fit, evidence, observed, pixels)
     # What the light reaches but the simplest model does without is 0, with the error that it would have.
-    reached = observed.reached(fit.model)
-    errors = uncertainty(
-        fit,
-        reached,
-        deviation,
-        observed.brightest,
-        visible,
-        spread=spread,
-        scatter=shared,
-        columns=columns,
-        channels=channels,
-        gain=gain,
-        missed=sampled,
-        resolution=resolution,
-    )
+    about_light = observed.reached(fit.model), observed.brightest, visible
+    errors = uncertainty(fit, pixels, *about_light, columns=columns, gain=gain, resolution=resolution)
     errors.reasons[clipped & (errors.reasons == "")] = CLIPPED
     interval = None
     # At k_d + k_s = 1 the cost still falls across the bound: a profile that does not know it has its least elsewhere.
@@ -146,7 +105,7 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: R
             errors.reach,
             errors.delta_cost,
             lobe.peak,
-            parabolic=fit.evidence is not None and fit.evidence.together is not None,
+            parabolic=evidence is not None and evidence.together is not None,
         )
         # Whoever bounds n knows that it is not beyond.
         least, most = observed.problem.n_range
@@ -156,15 +115,16 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: R
     if hidden:
         errors.reasons[2], errors = hidden, errors._replace(n_reason=hidden)
     material, parameters = material_and_parameters(fit, errors, observed.colour, interval)
-    channels = material.k_d.shape[0]
-    index = [one.place(channels) for one in parameters if one.value is not None and not one.at_bound]
+    index = [one.place(material.k_d.size) for one in parameters if one.value is not None and not one.at_bound]
     correlation = errors.correlation[np.ix_(index, index)]
     warnings = [_capped(material)] if fit.capped else []
     warnings += _warnings(statistics.neighbours, together, None if all(errors.reasons[2]) else lobe)
     # What the camera says of a pixel's brightness may be off in a channel of strong colour.
     noise_is_given = observed.problem.noise is not None
     if growing is not None and not noise_is_given and not any("structure" in text for text in warnings):
-        warnings.append(GROWING.format("the weights do not" if weighed else "pixels are weighed alike"))
+        warnings.append(
+            GROWING.format("the weights do not" if _is_weighed(observed.problem) else "pixels are weighed alike")
+        )
     if errors.sums:
         words = "no more than a sum of several numbers is determined, see there: the material shows it with "
         words += f"{100 * AMBIENT_SHARE:g} % of it as ambient light, if there is any, and the rest as k_d. "
@@ -175,11 +135,61 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: R
         noise=noise,
         structure=statistics.neighbours.correlation,
         highlight_pixels=None if lobe is None else lobe.pixels,
-        residual=residual,
+        residual=fit.residual,
         warnings=tuple(warnings),
         correlation=correlation,
         **about,
     )
+
+
+def _of_values(
+    fit: ModelFit, observed: Observed, statistics: Residual, pixels: PixelErrors, rounding: Float[np.ndarray, " C"]
+) -> tuple[PixelErrors, Structure | None, Float[np.ndarray, "C 3"] | None]:
+    """How pixels err that least squares fit: beside their noise what errs together, and how their noise grows."""
+    optimum, pictures, problem = fit.optimum, fit.pictures, observed.problem
+    tell, squared, together = pixels.noise > 2 * rounding, problem.loss == "squared", None
+    # Where weights are no inverse variances nothing is told of what else makes noise uneven.
+    uneven = misweighted_sums(pictures, optimum) if squared and _is_weighed(problem) else None
+    growing = statistics.growing_noise(pixels.noise, rounding) if uneven is None else None
+    # It cannot be told where rounding is most of the noise, or weights are part of what is fitted.
+    if squared and tell.any():
+        # Channels that err together count once.
+        some = np.flatnonzero(tell)[: 1 if pixels.channels is not None else None]
+        size = 0.0 if pixels.missed is None else pixels.missed.size
+        missed = size * _typical_weight(pictures) / float(np.sqrt(np.mean(pixels.noise[some] ** 2)))
+        grids = [grid.channels(some) for grid in statistics.blocks]
+        together = structure(grids, even=growing is None and uneven is None, missed=missed)
+    # What a bound of the material leaves is no error of the pixels.
+    if together is not None and together.significant and not fit.capped:
+        errors = (
+            Errors(residuals(picture, optimum), np.arange(len(picture.target)), width)
+            for picture, width in zip(pictures, observed.widths, strict=True)
+        )
+        pixels = pixels._replace(scatter=scatter(pictures, optimum, errors, alone_covariance(optimum, fit.tied)))
+        return pixels, together, growing
+    if growing is not None:
+        uneven = weighted_sums(pictures, optimum, growing, inverse=False)
+    if uneven is not None:
+        pixels = pixels._replace(spread=fit.noise_factor**2 * uneven.gram)
+    return pixels, together, growing
+
+
+def _of_codes(
+    fit: ModelFit, evidence: Evidence, observed: Observed, pixels: PixelErrors
+) -> tuple[PixelErrors, Structure | None]:
+    """How pixels err whose codes are fitted: beside the noise of their working targets, 1, what errs together."""
+    alone = alone_covariance(fit.optimum, fit.tied) if evidence.together is None else None
+    missed = 0.0 if pixels.missed is None else pixels.missed.size
+    shared, together, channels = shared_errors(evidence, observed, alone, missed)
+    if not (evidence.scores or observed.copies):
+        pixels = pixels._replace(channels=channels)
+    arithmetic = evidence.light < ARITHMETIC * np.max(observed.brightest)
+    return pixels._replace(scatter=shared), None if arithmetic else together
+
+
+def _is_weighed(problem: FitProblem) -> bool:
+    """Whether noise or weights were given."""
+    return problem.noise is not None or any(one is not None for one in problem.weights)
 
 
 def _clipped(optimum: Optimum, tied: np.ndarray | None) -> Bool[np.ndarray, "3 C"]:
