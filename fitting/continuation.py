@@ -369,7 +369,9 @@ def most_informative_score(
         codes, counts = shown(problem)
         values = list(map(copy.copy, problem.near(codes, REACH * there.noise)))
         for some, count in zip(values, counts, strict=True):
-            some.weight = some.weight * weight_of_alike(count[some.which], there.noise * some.bounds.spread)
+            weight = weight_of_alike(count[some.which], there.noise * some.bounds.spread)
+            # What fills up the pixels of a compiled program weighs nothing.
+            some.weight = some.weight * np.pad(weight, np.array([(0, len(some.bounds.lower) - len(weight)), (0, 0)]))
         score = problem.score(there, values)
         return score, precision(problem, there, score)
 

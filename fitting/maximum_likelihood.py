@@ -39,7 +39,7 @@ from fitting.likelihood import AnyArray, Bounds, Values, alike, in_light, is_cur
 from fitting.model_fit import Evidence, ModelFit
 from fitting.solver.normal_equations import COMPILER_OPTIONS, Picture, Sums
 from fitting.solver.profile import Optimum, refit, search
-from fitting.solver.subsample import Subsample, stratified
+from fitting.solver.subsample import Lobes, Subsample, stratified
 from fitting.solver.tied import design_of, places_of
 
 SUBSAMPLE = 8192
@@ -227,7 +227,8 @@ def _optimum(working: Sequence[Picture], fit: ModelFit, at: Numbers) -> Optimum:
     """The optimum of the least squares that takes Newton's step, at which it rests."""
     lobe = bool(fit.free[2].any())
     whole = Subsample(list(working), [None] * len(working), 0.0)
-    parts = whole.sums(whole.lobes(np.log([at.n]), 0.0))
+    columns = (picture.columns(at.n)[2:].swapaxes(1, 2) for picture in working)
+    parts = whole.sums([Lobes(value[None], at.n * slope[None]) for value, slope in columns])
     # By n, not by its logarithm.
     about = Sums(*(leaf[0] for leaf in parts)).columns(np.diag([1.0, 1.0, lobe, lobe / at.n]))
     cost = np.maximum(about.about(-at.x.T).square, 0.0)

@@ -158,3 +158,16 @@ def test_an_exponent_that_is_given_is_kept():
     material = fitting.fit(picture, scene, model="blinn-phong", n_range=(60.0, 60.0001)).material
     assert isinstance(material, brdf.BlinnPhong)
     np.testing.assert_allclose(material.k_s, MATERIAL.k_s, rtol=1e-3)
+
+
+def test_codes_of_pixels_that_are_averaged_over_their_area(monkeypatch: pytest.MonkeyPatch):
+    """Their light samples are made anew, by programs for a few numbers of pixels, which are filled up."""
+    monkeypatch.setattr("brdf.rendering.STACKED_VALUES", 0)
+    scene = ball(dataclasses.replace(WINDOW, samples=9), 64)
+    scene = dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, samples=2))
+    shown = np.asarray(brdf.render(brdf.BlinnPhong(k_a=0.1, k_d=0.5, k_s=0.3, n=30.0), scene, precision="float64"))
+    white = 1.03 * shown.max()
+    found = fitting.fit(np.round(255 * shown / white).astype(np.uint8), scene, model="blinn-phong").material
+    assert isinstance(found, brdf.BlinnPhong)
+    np.testing.assert_allclose(np.concatenate([found.k_d, found.k_s]) * white, [0.5, 0.3], rtol=3e-3)
+    np.testing.assert_allclose(found.n, 30.0, rtol=3e-3)
