@@ -260,7 +260,7 @@ def _program(
             if normal is None:
                 fit, profile, normals, lit, counts = with_normals(texels, lights)
                 texels = texels.facing(normals, lights)
-                layers = _layers(texels, fit, lit, counts, mask, normals, rounding, profile)
+                layers = _layers(texels, fit, lit, counts, mask, normals, rounding, profile, lights=lights)
             else:
                 if points is None:
                     texels = texels.facing(normal, lights)
@@ -378,7 +378,8 @@ def _of_normals(
     log_n, error = shared.T
     known = jnp.where(error < jnp.inf, error, 0)
     found, change = jax.jvp(lambda x: fit(log_n=x, n_known=True), (log_n,), (known,))
-    return _layers(texels, found, texels.seen, counts, mask, normal, rounding, None, (error, change.k))
+    lit = texels.seen
+    return _layers(texels, found, lit, counts, mask, normal, rounding, None, (error, change.k), lights=lights)
 
 
 def _layers(
@@ -391,8 +392,10 @@ def _layers(
     rounding: Array,
     profile: Profile | None,
     shared: tuple[Array, list[Array]] | None = None,
+    *,
+    lights: Distant | None = None,
 ) -> dict[str, Array]:
-    """The layers of a model's maps, texels last.
+    """The layers of a model's maps, texels last; ``lights`` where normals are sought.
 
     Errors are such that 1.96 of them reach as far as Student's distribution has it.
 
@@ -405,7 +408,7 @@ def _layers(
     channels, glossy, tiny = len(texels.shown), texels.glossy, jnp.finfo(texels.shown.dtype).tiny
     values, unlit, outliers = (channels * one for one in sums_of(counts, texels.seen - lit, lit - counts))
     *linear, k_s = fit.k if glossy else [*fit.k, jnp.zeros_like(fit.k[0])]
-    k_s_error, angles = fit.k_error[-1] if glossy else k_s, fit.error[glossy and shared is None :]
+    angles = fit.error[glossy and shared is None :]
     of_lobe = texels.of_lobe + glossy * (shared is None)
     unknowns = len(linear) * channels + of_lobe + len(angles)
 
@@ -427,17 +430,28 @@ def _layers(
         error = reach * fit.error[0]
         allowed = profile.errors(fit, square, jnp.maximum(reach**2, tiny), some.finer)
         *k_error, error = map(jnp.maximum, [*k_error, error], allowed)
-    gain = values * jnp.log1p(fit.gain / jnp.maximum(fit.cost, tiny))
-    shows = jnp.any(k_s > LEAST_HIGHLIGHT * reach * k_s_error, axis=0)
-    shows &= gain > price(unknowns) - price(unknowns - of_lobe)
     capped = jnp.any(k_s >= some.cap, axis=0)
-    moved = [jnp.zeros_like(k) for k in linear]
+    shows, moved, gain = jnp.zeros(mask.shape, bool), [jnp.zeros_like(k) for k in linear], fit.gain
     if glossy:
         # Where none is seen noise has put one between the lights, where it could be anything: k_d is that without it.
-        matt = dataclasses.replace(some, model=brdf.Lambert, grey=False).at(fit.log_n, errors=False)
-        moved = [jnp.where(shows, 0, plain - k) for k, plain in zip(linear, matt.k, strict=True)]
+        matt = dataclasses.replace(some, model=brdf.Lambert, grey=False)
+        if lights is None:
+            plain, own = matt.at(fit.log_n, errors=False), normal
+        else:  # with a normal of its own
+            own, cost = jointly(matt, lights, fit.log_n, normal)[1:]
+            plain, gain = joint_fit(matt.facing(own, lights), lights, fit.log_n, own), cost - fit.cost
+        gain = values * jnp.log1p(jnp.maximum(gain, 0) / jnp.maximum(fit.cost, tiny))
+        shows = gain > price(unknowns) - price(unknowns - of_lobe)
+        moved = [jnp.where(shows, 0, two - one) for one, two in zip(linear, plain.k, strict=True)]
         linear = list(map(operator.add, linear, moved))
+        normal = Components(tuple(jnp.where(shows, *both) for both in zip(normal.parts, own.parts, strict=True)))
+        if lights is not None:
+            of_own = [reach * one for one in plain.k_error]
+            k_error[:-1] = [jnp.where(shows, *both) for both in zip(k_error[:-1], of_own, strict=True)]
+            angles = [jnp.where(shows, *both) for both in zip(angles, plain.error, strict=True)]
     loose = ~(error <= MOST_ERROR) | ~jnp.any(k_s > LEAST_HIGHLIGHT * k_error[-1], axis=0)
+    tilt = square_root(sum((angle**2 for angle in angles), start=jnp.zeros_like(n)))
+    loose |= ~(tilt < jnp.inf)
     # At an end of what is sought it may be beyond.
     loose |= (fit.log_n <= 0) | (fit.log_n >= MOST_LOG_N)
     # the first that holds
@@ -450,8 +464,7 @@ def _layers(
         reason = jnp.where(test, jnp.uint8(number), reason)
     known, inside = reason == 0, reason != REASONS.index("outside")
     names = ("k_a", "k_d")[-len(linear) :]
-    tilt = square_root(sum((angle**2 for angle in angles), start=jnp.zeros_like(n)))
-    there = inside & (values > 0) & (tilt < jnp.inf)
+    there = inside & (values > 0) & (shows | (tilt < jnp.inf))
     layers = {name: jnp.where(there, k, jnp.nan) for name, k in zip(names, linear, strict=True)}
     # Errors allow for what was dropped.
     errors = map(jnp.hypot, k_error, moved)

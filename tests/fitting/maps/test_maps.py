@@ -413,6 +413,18 @@ def test_normals_of_what_shows_little_but_a_highlight(n):
     assert np.mean(angle < 1) > 0.98
 
 
+@pytest.mark.parametrize("normals", ["given", "fit"])
+def test_what_is_told_explains_the_photographs_where_few_lights_tell_little(normals):
+    """A highlight whose size is open is one all the same: k_d without it left up to 300 times the noise."""
+    turn = 2 * np.pi * (np.arange(8) + 0.5) / 8
+    ring = np.column_stack([0.866 * np.cos(turn), 0.866 * np.sin(turn), np.full(8, 0.5)])
+    pictures, truth = texels(432, 0.001, ring, seed=3, n=(4, 40))
+    maps = fitting.fit_maps(pictures, ring, truth["normal"][None] if normals == "given" else "fit", specular="grey")
+    left = np.stack([maps.render(light) for light in ring]) - pictures
+    assert np.max(np.sqrt(np.mean(left**2, axis=(0, 3)))) < 3 * 0.001
+    assert np.all(maps.normal_error[maps.determined] < 90)
+
+
 def test_a_k_d_at_its_bound_does_not_make_n_certain():
     turn = 2 * np.pi * np.arange(32) / 32
     ring = np.column_stack([0.6 * np.cos(turn), 0.6 * np.sin(turn), np.full(32, 0.8)])
