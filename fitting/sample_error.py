@@ -26,8 +26,8 @@ class SampleError(NamedTuple):
     Attributes:
         near: where to tabulate its lobe; None where its terms are kept.
         hessian: of x_a, x_d, x_s, channel after channel each, and log n, (U, U).
-        scores: of what more samples would change, and where the picture may show the lights' own count instead, of what
-            that would, (K, U).
+        scores: of what more samples would change, by each of two steps, and where the picture may show the lights' own
+            count instead, of what that would, (K, U).
         profile: exponents, and the least cost at each by the first fit, (2, G).
         size: of both together, root mean square over pixels.
     """

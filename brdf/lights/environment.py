@@ -221,14 +221,6 @@ def _solid_angles(height: int, width: int) -> np.ndarray:
     return (-np.diff(edges) * 2 * np.pi / width)[:, None]
 
 
-def map_directions(height: int, width: int) -> Float[np.ndarray, "H W 3"]:
-    """The direction in which each texel's centre is seen, unit vectors."""
-    turn = 2 * np.pi * (np.arange(width) + 0.5) / width
-    down = np.pi * (np.arange(height)[:, None] + 0.5) / height
-    x, z = np.sin(down) * np.sin(turn), -np.sin(down) * np.cos(turn)
-    return np.stack([x, np.broadcast_to(np.cos(down), x.shape), z], axis=-1)
-
-
 def cut(pixels: Float[np.ndarray, "H W C"], samples: int) -> Patches:
     """Cut a map into rectangles, see the module."""
     for axis, fewest in enumerate((FEWEST_ROWS, 2 * FEWEST_ROWS)):
@@ -262,11 +254,22 @@ def cut(pixels: Float[np.ndarray, "H W C"], samples: int) -> Patches:
 
 
 def _texel_moments(energy: np.ndarray) -> np.ndarray:
-    """Per texel: energy, its products with the direction (3) and with pairs of its axes (9), energy of each channel."""
-    directions = map_directions(*energy.shape[:2])
-    pairs = (directions[..., :, None] * directions[..., None, :]).reshape(*energy.shape[:2], 9)
-    weight = energy.sum(axis=-1, keepdims=True)
-    return np.concatenate([weight, weight * directions, weight * pairs, energy], axis=-1)
+    """Per texel: energy, its products with the direction (3) and with pairs of its axes (9), energy of each channel.
+
+    Means over the texel's solid angle, by integrals of sines and cosines of the angles down and about.
+    """
+    height, width = energy.shape[:2]
+    step, down = 2 * np.pi / width, np.linspace(0.0, np.pi, height + 1)[:, None]
+    cos, sin, middle = np.cos(down), np.sin(down), step * (np.arange(width) + 0.5)
+    solid, pair = -np.diff(cos, axis=0), (cos[1:] ** 2 + cos[1:] * cos[:-1] + cos[:-1] ** 2) / 3
+    across, slant = np.diff(0.5 * (down - sin * cos), axis=0) / solid, np.diff(sin**3, axis=0) / (3 * solid)
+    x, z = (np.sin(step / 2) / (step / 2) * one for one in (np.sin(middle), -np.cos(middle)))
+    double_x, double_z = (np.sin(step) / step * one for one in (np.cos(2 * middle), -np.sin(2 * middle)))
+    xx, zz, xz = (1 - pair) * (1 - double_x) / 2, (1 - pair) * (1 + double_x) / 2, (1 - pair) * double_z / 2
+    xy, yz, y = slant * x, slant * z, (cos[1:] + cos[:-1]) / 2
+    means = [across * x, y, across * z, xx, xy, xz, xy, pair, yz, xz, yz, zz]
+    weight = energy.sum(axis=-1)
+    return np.concatenate([np.stack([weight, *(weight * one for one in means)], axis=-1), energy], axis=-1)
 
 
 def _halves(weight: np.ndarray, box: Any) -> list[Any] | None:
@@ -290,8 +293,4 @@ def _halves(weight: np.ndarray, box: Any) -> list[Any] | None:
 def _patches(sums: np.ndarray, channels: int) -> Patches:
     mean = sums[:, 1:4] / sums[:, :1]
     covariance = (sums[:, 4:13] / sums[:, :1]).reshape(-1, 3, 3) - mean[:, :, None] * mean[:, None, :]
-    # a single texel is a direction, exactly: what rounding leaves of its spread would blur the horizon
-    single = np.trace(covariance, axis1=1, axis2=2) <= 1e-12
-    covariance[single] = 0.0
-    mean[single] /= np.linalg.norm(mean[single], axis=1, keepdims=True)
     return Patches(sums[:, -channels:] / np.pi, mean, covariance)

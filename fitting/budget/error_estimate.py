@@ -16,6 +16,7 @@ The first is random, and is told as the median and the 95 % quantile of what it 
 """
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -152,11 +153,11 @@ def estimate(run: Run) -> Attempt:
     scores = probes.scores(probes.residual)
     value, vector = np.linalg.eigh(inverse @ (probes.left_out * scores.T) @ scores @ inverse)
     drawn = np.random.default_rng(0).standard_normal((DRAWS, value.size)) * np.sqrt(np.maximum(value, 0.0)) @ vector.T
-    missed = np.zeros(value.size) if samples is None else samples.shifts(determined)[0]
+    light = 0.0 if samples is None else float(np.linalg.norm(probes.error(samples.shifts(determined))))
     squares = _by_least_squares(run, probes)
-    error, bound = squares + np.quantile(np.hypot(probes.error(drawn + missed), rounding), [0.5, 0.95])
+    error, bound = squares + np.quantile(np.hypot(probes.error(drawn), math.hypot(light, rounding)), [0.5, 0.95])
     pixels = squares + np.quantile(probes.error(drawn), 0.95)
-    return Attempt(float(error), float(bound), float(pixels), float(probes.error(missed)), rounding)
+    return Attempt(float(error), float(bound), float(pixels), light, rounding)
 
 
 def is_dithered(noise: float, step: float) -> bool:

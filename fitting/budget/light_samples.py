@@ -45,8 +45,9 @@ OF_CODES = 0.1
 # A residual holds what one of two counts leaves out, or nothing of it: a share of 1 or 0, whose standard error is to be
 # below this.
 SHARE_ERROR = 0.2
-# Each count changes at most so much of what the one before changed.
-SLOWEST = 0.7
+# Each count changes at most so much of what the one before changed; those beyond the last one are taken to change so
+# much at least.
+SLOWEST, UNTRIED = 0.7, 0.5
 # Where more samples move log n so far the first fit is made again, of more of them, but no more than so many.
 FAR, MOST_FIRST = 0.1, 1024
 # Up to so many values are kept rather than tabulated: exact, for every exponent.
@@ -133,34 +134,43 @@ class _Ladder:
         return self.probes.scores(change).sum(axis=0), float(np.sqrt(square))
 
     def missed(self, samples: int) -> tuple[np.ndarray, float]:
-        """The same for all samples beyond so many: of the next count, and of those after it as changes fall off.
+        """Scores of what all samples beyond so many change, (K, U), and its root mean square over pixels.
 
-        Beside an accuracy, of those up to `MOST_SAMPLES`, which is dearer and surer.
+        Beside an accuracy, of those up to `MOST_SAMPLES`, which is dearer and surer, and of those beyond.
         """
-        if self.accuracy is not None:
-            return self._change(samples, self.counts[-1])
+        if self.accuracy is None:
+            return self._beyond(samples)
+        (score, size), (more, beyond) = self._change(samples, self.counts[-1]), self._beyond(self.counts[-1])
+        return np.vstack([score, more]), math.hypot(size, beyond)
+
+    def _beyond(self, samples: int) -> tuple[np.ndarray, float]:
+        """By the change to the next count, and those after it as changes fall off.
+
+        Of a number that change may be next to nothing by chance: the one before, made as small, is as likely.
+        """
         index, last = self.counts.index(samples), len(self.counts) - 2
         step = min(index, last)
         coarse, fine = self.counts[step : step + 2]
         score, size = self._change(coarse, fine)
-        fall = coarse / fine
+        scores, fall = [score], coarse / fine
         if step:
-            before = self._change(self.counts[step - 1], coarse)[1]
-            fall = min(size / max(before, np.finfo(float).tiny), SLOWEST)
-        more = (fall if index > last else 1.0) / (1.0 - fall)
-        return more * score, more * size
+            before, larger = self._change(self.counts[step - 1], coarse)
+            fall = min(size / max(larger, np.finfo(float).tiny), SLOWEST)
+            scores.append(fall * before)
+        more = max(fall, UNTRIED) / (1.0 - max(fall, UNTRIED)) if index > last else 1.0 / (1.0 - fall)
+        return more * np.stack(scores), more * size
 
     def _is_enough(self, samples: int, noise: float) -> bool:
-        score, size = self.missed(samples)
-        off = self.inverse @ score
+        scores, size = self.missed(samples)
         if self.accuracy is not None:
-            return bool(self.probes.error(off) <= OF_ACCURACY * self.accuracy)
+            return bool(np.linalg.norm(self.probes.error(scores @ self.inverse)) <= OF_ACCURACY * self.accuracy)
+        off = np.linalg.norm(scores @ self.inverse, axis=0)
         given, felt = samples >= self.own, noise
         if not is_dithered(noise, self.problem.widest_step):
             felt *= OF_CODES
         rest, value = felt * np.sqrt(np.diag(self.inverse)), np.append(self.x.ravel(), 1.0) * given
         hidden = size <= HIDDEN * felt or (given and size > NO_NOISE * noise)
-        return hidden and bool(np.all(np.abs(off) <= np.maximum(OF_NOISE * rest, OF_VALUE * value)))
+        return hidden and bool(np.all(off <= np.maximum(OF_NOISE * rest, OF_VALUE * value)))
 
     def shows(self, samples: int, rival: int) -> bool:
         """Whether the residual tells that the picture was drawn with so many samples, and not with a rival number."""
@@ -211,8 +221,8 @@ class _Ladder:
     def error(self, samples: int) -> SampleError:
         """What so many samples leave out."""
         profile = np.stack([self.optimum.grid, self.optimum.profile])
-        missed = [self.missed(samples)]
+        scores, size = self.missed(samples)
         if self.own < samples and not self.shows(samples, self.own):
-            missed.append(self._change(samples, self.own))
-        scores, sizes = zip(*missed, strict=True)
-        return SampleError(self.near(samples), self.probes.hessian, np.stack(scores), profile, math.hypot(*sizes))
+            score, of_own = self._change(samples, self.own)
+            scores, size = np.vstack([scores, score]), math.hypot(size, of_own)
+        return SampleError(self.near(samples), self.probes.hessian, scores, profile, size)

@@ -12,7 +12,6 @@ from project_paths import ROOT
 import brdf
 import fitting
 from brdf.lights.base import Light
-from brdf.lights.environment import map_directions
 
 pytest.importorskip("mitsuba", reason="Mitsuba 3 renders the reference")
 sys.path.insert(0, str(ROOT / "data"))
@@ -64,7 +63,8 @@ CASES += [(kind, "blinn-phong") for kind in ("directional", "point", "spot", "re
 
 def light_of(kind: str, values: dict[str, Any], folder: Path) -> tuple[dict[str, Any], Light]:
     if kind == "map":
-        directions = map_directions(256, 512) @ np.array([0.5, 0.5, 0.707])
+        turn, down = 2 * np.pi * (np.arange(512) + 0.5) / 512, np.pi * (np.arange(256)[:, None] + 0.5) / 256
+        directions = 0.5 * np.sin(down) * np.sin(turn) + 0.5 * np.cos(down) - 0.707 * np.sin(down) * np.cos(turn)
         pixels = np.exp(4 * (directions - 1))[..., None] * np.array(RADIANCE) + 0.2
         path = folder / "sky.exr"
         brdf.write_image(path, pixels.astype(np.float32))

@@ -86,7 +86,7 @@ def test_a_picture_tells_by_how_many_samples_it_was_drawn(drawn: int):
     assert isinstance(light, brdf.RectangleLight)
     assert (light.samples == 16) == (drawn == 16)
     assert problem.sample_errors is not None
-    assert len(problem.sample_errors["blinn-phong"].scores) == 1
+    assert len(problem.sample_errors["blinn-phong"].scores) == (1 if drawn == 16 else 2)  # of two steps at most
 
 
 def test_where_a_picture_does_not_tell_errors_hold_what_the_lights_own_samples_would_change():
@@ -96,8 +96,8 @@ def test_where_a_picture_does_not_tell_errors_hold_what_the_lights_own_samples_w
     problem = with_enough_samples(state_problem(codes, scene, model="blinn-phong"))
     assert problem.sample_errors is not None
     found = problem.sample_errors["blinn-phong"]
-    more, own = found.shifts(np.ones(7, bool))
-    assert 0 < abs(more[-1]) < abs(own[-1])
+    *more, own = found.shifts(np.ones(7, bool))
+    assert 0 < np.linalg.norm(more, axis=0)[-1] < abs(own[-1])
 
 
 def test_codes_without_noise_are_fitted_with_samples_that_their_likelihood_does_not_see():
