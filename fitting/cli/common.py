@@ -33,7 +33,7 @@ OF_A_FIT = re.compile(
 )
 OF_MAPS = re.compile(
     r"(maps|info)\.json|maps\.exr|material\.gltf|"
-    r"(maps|k_d|k_s|normals|gloss|base_color|metallic_roughness|specular_color|residual)\.png"
+    r"(maps|k_d|k_s|normals|(openlime_)?gloss|openlime_k[ds]|base_color|metallic_roughness|specular_color|residual)\.png"
 )
 
 

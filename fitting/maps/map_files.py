@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 DIELECTRIC = 0.04
 """Reflectance at normal incidence that glTF takes for granted; KHR_materials_specular multiplies it."""
 
+OPENLIME_LEAST = 0.004
+"""The shader draws no highlight of a slope below 0.0032."""
+
 MOST_REFLECTANCE = 0.98
 """The diffuse part is what facets let through: some has to be left."""
 
@@ -32,6 +35,8 @@ def write_maps(maps: "Maps", folder: str | Path, *, plot: bool = False) -> None:
     scale = {name: float(np.percentile(k, 99.9)) or 1.0 for name, k in (("k_d", k_d), ("k_s", k_s))}
     gloss = np.log2(np.maximum(maps.fitted_n, 1)) / OCTAVES
     half_n, f_0 = _as_facets(maps)
+    scale["openlime"] = float(np.percentile(np.maximum(k_d, f_0), 99.9)) or 1.0
+    of_openlime, limits = _of_openlime(k_d / scale["openlime"], f_0 / scale["openlime"], half_n)
     roughness = np.asarray(brdf.roughness_from_exponent(half_n))
     # Of a glTF material no part is above 1 and what shines is taken from what is diffuse: both are made darker alike.
     whole = np.percentile(np.max(k_d, axis=-1) + np.max(f_0, axis=-1), 99.9)
@@ -50,6 +55,7 @@ def write_maps(maps: "Maps", folder: str | Path, *, plot: bool = False) -> None:
         "metallic_roughness": (np.stack([0 * gloss, roughness, 0 * gloss], axis=-1), "linear"),
         "specular_color": (f_0 / strongest, "srgb"),
         "residual": (np.nan_to_num(maps.residual), "linear"),
+        **{name: (values, "linear") for name, values in of_openlime.items()},
     }
     height, width = maps.n.shape
     about = {
@@ -76,7 +82,7 @@ def write_maps(maps: "Maps", folder: str | Path, *, plot: bool = False) -> None:
         write_text(stage / "maps.json", json.dumps(about, indent=2) + "\n")
         gltf = asset("maps.gltf").replace("ASPECT", str(width / height))
         write_text(stage / "material.gltf", gltf.replace("SPECULAR", str(strongest / DIELECTRIC)))
-        write_text(stage / "info.json", json.dumps(_openlime(width, height, scale), indent=2) + "\n")
+        write_text(stage / "info.json", json.dumps(_openlime(width, height, limits), indent=2) + "\n")
 
 
 def _as_facets(maps: "Maps") -> tuple[np.ndarray, np.ndarray]:
@@ -91,15 +97,30 @@ def _as_facets(maps: "Maps") -> tuple[np.ndarray, np.ndarray]:
     return half_n, maps.fitted_k_s * (8 * height / (half_n + 2))[..., None]
 
 
-def _openlime(width: int, height: int, scale: dict[str, float]) -> dict[str, Any]:
-    """What OpenLIME's LayerBRDF is given: where its four channels are, and their ranges."""
+def _of_openlime(
+    k_d: np.ndarray, f_0: np.ndarray, half_n: np.ndarray
+) -> tuple[dict[str, np.ndarray], tuple[float, float]]:
+    """What OpenLIME's shader draws as we do but for a factor, and between which slopes its gloss lies.
+
+    (kd / π + ks exp(-tan²θ / α²) / (4 π α² √(N·L N·V))) N·L with α = (1 - glossiness)⁴ spread over these, θ between N
+    and H; it is Ward's lobe, whose width and height at N = H = L are ours.
+    """
+    slope = np.maximum(brdf.slope_from_exponent(half_n), OPENLIME_LEAST)
+    limits = min(0.01, float(np.min(slope))), max(0.5, float(np.max(slope)))
+    least, most, own = (1 - np.asarray(one) ** 0.25 for one in (limits[1], limits[0], slope))
+    return {"openlime_kd": k_d, "openlime_ks": f_0, "openlime_gloss": (own - least) / (most - least)}, limits
+
+
+def _openlime(width: int, height: int, limits: tuple[float, float]) -> dict[str, Any]:
+    """What OpenLIME's LayerBRDF is given: where its four channels are, and the range of one."""
+    channels = {name: f"openlime_{name}.png" for name in ("kd", "ks", "gloss")} | {"normals": "normals.png"}
     return {
         "type": "brdf",
         "width": width,
         "height": height,
-        "channels": {"kd": "k_d.png", "ks": "k_s.png", "normals": "normals.png", "gloss": "gloss.png"},
+        "channels": channels,
         "colorspaces": {"kd": "linear", "ks": "linear"},
-        "scale": {"kd": scale["k_d"], "ks": scale["k_s"]},
+        "alphaLimits": limits,
     }
 
 

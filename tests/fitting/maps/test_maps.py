@@ -703,6 +703,25 @@ def test_gltf_shows_the_highlights_of_maps(folder, tmp_path, model, unit):
     assert (darker > 1) == (unit > 1)
 
 
+@pytest.mark.parametrize("model", ["phong", "blinn-phong"])
+def test_openlime_shows_the_highlights_of_maps(folder, tmp_path, model):
+    """As its shader computes them, where light and view are along the normal: from all but a factor 2 to 87 off."""
+    path, _ = folder
+    maps = fitting.fit_maps(path, model=model)
+    maps.save(tmp_path / "out")
+    about = json.loads((tmp_path / "out" / "info.json").read_text())
+    image = {name: brdf.read_image(tmp_path / "out" / file) for name, file in about["channels"].items()}
+    low, high = (1 - limit**0.25 for limit in reversed(about["alphaLimits"]))
+    alpha = (1 - image["gloss"] * (high - low) - low) ** 4
+    half = (1 if model == "blinn-phong" else 4) * maps.fitted_n
+    np.testing.assert_allclose(2 / alpha[..., 0] ** 2 - 2, half, rtol=5e-3)
+    shown = image["kd"] / np.pi + image["ks"] / (4 * np.pi * alpha**2)
+    scale = json.loads((tmp_path / "out" / "maps.json").read_text())["scale"]["openlime"]
+    common = maps.determined & (np.max(image["kd"], axis=-1) < 0.99) & (np.max(image["ks"], axis=-1) < 0.99)
+    assert common.mean() > 0.5
+    np.testing.assert_allclose(np.pi * scale * shown[common], (maps.k_d + maps.fitted_k_s)[common], rtol=1e-2)
+
+
 def test_texels_that_show_less_than_nothing_are_black():
     pictures = -np.abs(np.random.default_rng(0).normal(size=(5, 2, 8, 3)))  # a dark frame was taken off
     maps = fitting.fit_maps(pictures, dome(5), np.broadcast_to(VIEW, (2, 8, 3)))
