@@ -1,6 +1,7 @@
 """An n that texels share: sought as that of one, with the sums of all in place of its own."""
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,9 @@ from fitting.maps.map_bands import fit_bands
 from fitting.maps.texels import STEPS, grid, narrowed, peaks, per_deviation, rivals
 from fitting.maps.tiles import MapProblem
 from fitting.uncertainty.intervals import NORMAL_95, student_95
+
+BEYOND = 2 * math.log(2.0)
+"""Of log n: so far from what normals of their own say may lie what is found with them."""
 
 
 def label_map(labels: Any, problem: MapProblem) -> Int[np.ndarray, "H W"]:
@@ -65,6 +69,8 @@ def with_shared_n(problem: MapProblem, labels: Int[np.ndarray, "H W"]) -> MapPro
         each = of_each("gains", np.zeros(names.size))
         gains = jnp.asarray(added(each))
         heights, brackets = peaks(gains, grid(problem.finer))
+        if problem.refine:  # the gains are those of normals that are each for another n
+            brackets = brackets + np.array([[0.0], [-BEYOND], [BEYOND]])
         best = climbed(brackets[0])
         if np.any(rivals(heights, best[2])):
             other = climbed(brackets[1])

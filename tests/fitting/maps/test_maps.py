@@ -425,6 +425,15 @@ def test_what_is_told_explains_the_photographs_where_few_lights_tell_little(norm
     assert np.all(maps.normal_error[maps.determined] < 90)
 
 
+def test_an_n_that_is_shared_is_sought_beyond_what_normals_of_their_own_say():
+    """Normals that were found each with its own n had the best of it at 8: it ended at 5.72 ± 0.10."""
+    turn = 2 * np.pi * (np.arange(8) + 0.5) / 8
+    ring = np.column_stack([0.643 * np.cos(turn), 0.643 * np.sin(turn), np.full(8, 0.766)])
+    pictures, _ = texels(256, 0.005, ring, n=(5, 5.0001))
+    maps = fitting.fit_maps(pictures, ring, "fit", labels=0, specular="grey")
+    assert abs(maps.fitted_n[0, 0] - 5) < 3 * np.nanmedian(maps.n_error)
+
+
 def test_a_k_d_at_its_bound_does_not_make_n_certain():
     turn = 2 * np.pi * np.arange(32) / 32
     ring = np.column_stack([0.6 * np.cos(turn), 0.6 * np.sin(turn), np.full(32, 0.8)])
