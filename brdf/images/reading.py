@@ -86,6 +86,10 @@ class Picture:
     jpeg: Jpeg | None = None
     layer: str | None = None
 
+    def __repr__(self) -> str:
+        """In a line: size, encoding, bits and file."""
+        return _in_a_line(self, self.pixels.shape)
+
     def scaled(self, factor: float | np.ndarray) -> "Picture":
         """The picture in another unit: of another exposure, or under light of another intensity.
 
@@ -111,6 +115,11 @@ class Picture:
     def code_step(self) -> float | None:
         """The distance of two codes before decoding, full scale 1; None for floats."""
         return None if self.saturation is None else 1.0 / ((1 << self.bits) - 1)
+
+
+def _in_a_line(one: "Picture | ImageReader", shape: tuple[int, ...]) -> str:
+    size, name = " x ".join(map(str, shape)), "" if one.path is None else f", {one.path}"
+    return f"{type(one).__name__}({size}, {one.encoding}, {one.bits} bits{name})"
 
 
 class ImageReader(contextlib.AbstractContextManager):
@@ -181,6 +190,10 @@ class ImageReader(contextlib.AbstractContextManager):
             return None, 0.0
         top = decode(np.array(LOSSY_TOP if self.lossy else 1.0), self.encoding)
         return float(top), largest_step(self.encoding, self.bits)
+
+    def __repr__(self) -> str:
+        """In a line: size, encoding, bits and file."""
+        return _in_a_line(self, self.shape)
 
     def __exit__(self, *raised: object) -> None:
         """Close the file."""

@@ -50,6 +50,8 @@ def fit_within(problem: FitProblem, accuracy: float | None, seconds: float | Non
     start = time.perf_counter()
     limits = {"accuracy": accuracy, "seconds": seconds}
     accuracy, seconds = (None if value is None else float(positive(name, value)) for name, value in limits.items())
+    if accuracy is not None and accuracy >= 1:
+        raise InputError("accuracy", f"must be below 1, an error of all, got {accuracy:g}", "Give for example 1e-3")
     beside = {"loss": problem.loss != "squared", "noise": problem.noise is not None, "plausible": problem.plausible}
     for name, given in beside.items():
         if given:

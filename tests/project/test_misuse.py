@@ -96,6 +96,7 @@ MISUSES = {
     "fitting.fit(target, scene, n_range=5)": r"n_range: must be 0 < lower < upper, got 5\.",
     "fitting.fit(target, scene, mask='mask.png')": r"mask\.png: there is no such file or folder\.",
     "fitting.fit(target, scene, noise=0.1)": r"noise: must be two numbers, got 0\.1\.",
+    "fitting.fit(target, scene, accuracy=5)": r"accuracy: must be below 1, an error of all, got 5\.",
     "fitting.fit(target, scene, accuracy='high')": r"accuracy: must be a number, got 'high'\.",
     "jax.grad(lambda t: fitting.fit(t, scene).material.n)(traced)": r"fit: cannot run inside jax\.grad.*sensitivity",
     "jax.vmap(lambda t: fitting.fit(t, scene).material.n)(traced[None])": r"fit: cannot run inside .*fit_many",

@@ -313,3 +313,11 @@ def test_layers_of_a_cropped_file_lie_on_its_picture(tmp_path):
     assert np.isnan(layers["normal"]).sum() == 3 * (6 * 8 - 4 * 5)
     beside = raw(tmp_path / "b.exr", values, names, data_at=(12, 1), display=(0, 0, 8, 6))
     assert np.isnan(read_layers(beside)["normal"]).all()
+
+
+def test_a_picture_shows_in_a_line(tmp_path):
+    path = tmp_path / "a.png"
+    path.write_bytes(png(codes(6, 5, 3)))
+    with ImageReader(path, encoding="srgb") as reader:
+        assert repr(reader) == f"ImageReader(6 x 5 x 3, srgb, 8 bits, {path})"
+    assert repr(read_picture(path, encoding="srgb")) == f"Picture(6 x 5 x 3, srgb, 8 bits, {path})"
