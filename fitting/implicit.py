@@ -32,7 +32,6 @@ from fitting.joint_problem import QUICKLY_COMPILED, Picture, chosen_leaves, resi
 from fitting.progress import waiting
 from fitting.result import FitResult, Parameter, of_material_alone
 from fitting.solver.nnls import inverse_diagonal, scaled_inverse
-from fitting.uncertainty.intervals import above_zero
 
 NEWTON_STEPS = 3
 # Of the largest eigenvalue of the Hessian: a smaller one determines nothing.
@@ -180,17 +179,6 @@ def with_light_errors(result: FitResult, degrees: Sequence[float]) -> FitResult:
         for index, one in enumerate(result.parameters):
             slope = getattr(moves, one.name)
             variance[index] += np.sum((turns @ (slope if one.channel is None else slope[one.channel])) ** 2)
-    return dataclasses.replace(result, parameters=tuple(map(_widened, result.parameters, np.sqrt(variance))))
-
-
-def _widened(one: Parameter, by: float) -> Parameter:
-    if one.value is None or one.error is None or one.at_bound or one.interval is None:
-        return one
-    error = math.hypot(one.error, by)
-    if one.name == "n":
-        # Its interval need not be even about it: each end moves out by the same factor.
-        ends = np.log(np.array(one.interval) / one.value) * error / one.error if one.error else np.zeros(2)
-        interval = tuple((one.value * np.exp(ends)).tolist())
-    else:
-        interval = above_zero(one.value, error)
-    return dataclasses.replace(one, error=error, interval=interval)
+    return dataclasses.replace(
+        result, parameters=tuple(map(Parameter.widened, result.parameters, np.sqrt(variance).tolist()))
+    )

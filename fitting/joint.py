@@ -248,14 +248,7 @@ def _changes(last: JointResult, result: JointResult) -> Float[np.ndarray, " F"]:
 
 def _wider(result: JointResult, moved: Float[np.ndarray, " F"]) -> JointResult:
     """A result whose numbers may each be off by so much beside their errors."""
-    parameters = []
-    for one, off in zip(result.parameters, moved.tolist(), strict=True):
-        if one.value is not None and one.error:
-            error = math.hypot(one.error, off)
-            low, high = (one.value + (end - one.value) * error / one.error for end in one.interval or (one.value,) * 2)
-            ends = None if one.interval is None else (max(low, 0.0) if one.interval[0] >= 0 else low, high)
-            one = dataclasses.replace(one, error=error, interval=ends)
-        parameters.append(one)
+    parameters = list(map(Parameter.widened, result.parameters, moved.tolist()))
     of_leaves = [[one.error for one in parameters if one.name == name] for name in dict.fromkeys(result)]
     errors = [np.array(own, float).reshape(old.shape) for own, old in zip(of_leaves, result.errors, strict=True)]
     return dataclasses.replace(result, parameters=tuple(parameters), errors=tuple(errors))

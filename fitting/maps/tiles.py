@@ -60,7 +60,7 @@ WEIGHINGS = 2
 of weights it tells as well as another one would."""
 
 LEAST_HIGHLIGHT = 2.0
-"""k_s is seen where it exceeds so many of its standard errors."""
+"""k_s is determined where it exceeds so many of its standard errors."""
 
 
 def tiles_of_program(tile: int) -> int:
