@@ -30,8 +30,9 @@ from brdf.checks import instance
 from brdf.precision import working_precision
 from fitting.joint_problem import QUICKLY_COMPILED, Picture, chosen_leaves, residuals
 from fitting.progress import waiting
-from fitting.result import FitResult, Parameter, of_material_alone
+from fitting.result import FitResult, of_material_alone
 from fitting.solver.nnls import inverse_diagonal, scaled_inverse
+from fitting.uncertainty.intervals import widened
 
 NEWTON_STEPS = 3
 # Of the largest eigenvalue of the Hessian: a smaller one determines nothing.
@@ -179,6 +180,4 @@ def with_light_errors(result: FitResult, degrees: Sequence[float]) -> FitResult:
         for index, one in enumerate(result.parameters):
             slope = getattr(moves, one.name)
             variance[index] += np.sum((turns @ (slope if one.channel is None else slope[one.channel])) ** 2)
-    return dataclasses.replace(
-        result, parameters=tuple(map(Parameter.widened, result.parameters, np.sqrt(variance).tolist()))
-    )
+    return dataclasses.replace(result, parameters=tuple(map(widened, result.parameters, np.sqrt(variance).tolist())))

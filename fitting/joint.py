@@ -45,7 +45,7 @@ from fitting.progress import waiting
 from fitting.report import FitResult
 from fitting.result import Parameter
 from fitting.solver.nnls import nonnegative_minimum
-from fitting.uncertainty.intervals import NORMAL_95, above_zero
+from fitting.uncertainty.intervals import NORMAL_95, above_zero, widened
 from fitting.uncertainty.noise_model import value_variance
 from fitting.uncertainty.residual import NEGLIGIBLE, Neighbours, neighbours_of, structure_warning
 from fitting.uncertainty.structure import CODED_SIZES, SIZES, Errors, of_coded_blocks, over_blocks, structure
@@ -248,7 +248,7 @@ def _changes(last: JointResult, result: JointResult) -> Float[np.ndarray, " F"]:
 
 def _wider(result: JointResult, moved: Float[np.ndarray, " F"]) -> JointResult:
     """A result whose numbers may each be off by so much beside their errors."""
-    parameters = list(map(Parameter.widened, result.parameters, moved.tolist()))
+    parameters = list(map(widened, result.parameters, moved.tolist()))
     of_leaves = [[one.error for one in parameters if one.name == name] for name in dict.fromkeys(result)]
     errors = [np.array(own, float).reshape(old.shape) for own, old in zip(of_leaves, result.errors, strict=True)]
     return dataclasses.replace(result, parameters=tuple(parameters), errors=tuple(errors))
@@ -427,8 +427,9 @@ def _solve(
     if information is not None:
         parts = list(map(_at_ends, parts, observed.tiles, information.at_ends))
     images = map(np.reshape, parts, (shown.shape for shown in observed.shown))
-    neighbours = neighbours_of(list(images)) if share > NEGLIGIBLE else Neighbours()
+    neighbours = Neighbours()
     if share > NEGLIGIBLE:
+        neighbours = neighbours_of(list(images))
         together = neighbours.significant, noise > 2 * observed.rounding
         neighbours = neighbours._replace(significant=_err_together(parts, observed, *together))
     if information is None:

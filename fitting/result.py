@@ -3,7 +3,7 @@
 import contextlib
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -112,23 +112,6 @@ class Parameter:
         return (
             3 * channels if self.channel is None else ("k_a", "k_d", "k_s").index(self.name) * channels + self.channel
         )
-
-    def widened(self, by: float) -> "Parameter":
-        """The same with an error that something else adds to; the ends of its interval move out as that grows.
-
-        Args:
-            by: standard error of what is added.
-        """
-        if self.value is None or not self.error:
-            return self
-        error, value, interval = math.hypot(self.error, by), self.value, self.interval
-        if interval is not None and self.name == "n":  # it need not be even about it: each end by the same factor
-            low, high = (value * (end / value) ** (error / self.error) for end in interval)
-            interval = low, high
-        elif interval is not None:
-            low, high = (value + (end - value) * error / self.error for end in interval)
-            interval = max(low, 0.0) if interval[0] >= 0 else low, high
-        return replace(self, error=error, interval=interval)
 
     def label(self, channels: int) -> str:
         """The channel in words: its colour, or of a position its axis.

@@ -36,7 +36,7 @@ def write_maps(maps: "Maps", folder: str | Path, *, plot: bool = False) -> None:
     gloss = np.log2(np.maximum(maps.fitted_n, 1)) / OCTAVES
     half_n, f_0 = _as_facets(maps)
     scale["openlime"] = float(np.percentile(np.maximum(k_d, f_0), 99.9)) or 1.0
-    of_openlime, limits = _of_openlime(k_d / scale["openlime"], f_0 / scale["openlime"], half_n)
+    of_openlime, limits = _openlime_images(k_d / scale["openlime"], f_0 / scale["openlime"], half_n)
     roughness = np.asarray(brdf.roughness_from_exponent(half_n))
     # Of a glTF material no part is above 1 and what shines is taken from what is diffuse: both are made darker alike.
     whole = np.percentile(np.max(k_d, axis=-1) + np.max(f_0, axis=-1), 99.9)
@@ -82,7 +82,7 @@ def write_maps(maps: "Maps", folder: str | Path, *, plot: bool = False) -> None:
         write_text(stage / "maps.json", json.dumps(about, indent=2) + "\n")
         gltf = asset("maps.gltf").replace("ASPECT", str(width / height))
         write_text(stage / "material.gltf", gltf.replace("SPECULAR", str(strongest / DIELECTRIC)))
-        write_text(stage / "info.json", json.dumps(_openlime(width, height, limits), indent=2) + "\n")
+        write_text(stage / "info.json", json.dumps(_openlime_info(width, height, limits), indent=2) + "\n")
 
 
 def _as_facets(maps: "Maps") -> tuple[np.ndarray, np.ndarray]:
@@ -97,7 +97,7 @@ def _as_facets(maps: "Maps") -> tuple[np.ndarray, np.ndarray]:
     return half_n, maps.fitted_k_s * (8 * height / (half_n + 2))[..., None]
 
 
-def _of_openlime(
+def _openlime_images(
     k_d: np.ndarray, f_0: np.ndarray, half_n: np.ndarray
 ) -> tuple[dict[str, np.ndarray], tuple[float, float]]:
     """What OpenLIME's shader draws as we do but for a factor, and between which slopes its gloss lies.
@@ -111,7 +111,7 @@ def _of_openlime(
     return {"openlime_kd": k_d, "openlime_ks": f_0, "openlime_gloss": (own - least) / (most - least)}, limits
 
 
-def _openlime(width: int, height: int, limits: tuple[float, float]) -> dict[str, Any]:
+def _openlime_info(width: int, height: int, limits: tuple[float, float]) -> dict[str, Any]:
     """What OpenLIME's LayerBRDF is given: where its four channels are, and the range of one."""
     channels = {name: f"openlime_{name}.png" for name in ("kd", "ks", "gloss")} | {"normals": "normals.png"}
     return {

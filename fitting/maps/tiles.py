@@ -382,6 +382,17 @@ def _of_normals(
     return _layers(texels, found, lit, counts, mask, normal, rounding, None, (error, change.k), lights=lights)
 
 
+def _without_lobe(
+    texels: Texels, fit: TexelFit, normal: Components, lights: Distant | None
+) -> tuple[TexelFit, Components, Array]:
+    """The fit of a matt surface, under lights with a normal of its own; that; and by how much more it costs."""
+    matt = dataclasses.replace(texels, model=brdf.Lambert, grey=False)
+    if lights is None:
+        return matt.at(fit.log_n, errors=False), normal, fit.gain
+    own, cost = jointly(matt, lights, fit.log_n, normal)[1:]
+    return joint_fit(matt.facing(own, lights), lights, fit.log_n, own), own, cost - fit.cost
+
+
 def _layers(
     texels: Texels,
     fit: TexelFit,
@@ -431,15 +442,10 @@ def _layers(
         allowed = profile.errors(fit, square, jnp.maximum(reach**2, tiny), some.finer)
         *k_error, error = map(jnp.maximum, [*k_error, error], allowed)
     capped = jnp.any(k_s >= some.cap, axis=0)
-    shows, moved, gain = jnp.zeros(mask.shape, bool), [jnp.zeros_like(k) for k in linear], fit.gain
+    shows, moved = jnp.zeros(mask.shape, bool), [jnp.zeros_like(k) for k in linear]
     if glossy:
         # Where none is seen noise has put one between the lights, where it could be anything: k_d is that without it.
-        matt = dataclasses.replace(some, model=brdf.Lambert, grey=False)
-        if lights is None:
-            plain, own = matt.at(fit.log_n, errors=False), normal
-        else:  # with a normal of its own
-            own, cost = jointly(matt, lights, fit.log_n, normal)[1:]
-            plain, gain = joint_fit(matt.facing(own, lights), lights, fit.log_n, own), cost - fit.cost
+        plain, own, gain = _without_lobe(some, fit, normal, lights)
         gain = values * jnp.log1p(jnp.maximum(gain, 0) / jnp.maximum(fit.cost, tiny))
         shows = gain > price(unknowns) - price(unknowns - of_lobe)
         moved = [jnp.where(shows, 0, two - one) for one, two in zip(linear, plain.k, strict=True)]

@@ -1,5 +1,6 @@
 """95 % intervals: of a coefficient that cannot be negative, and of the exponent from its profile likelihood."""
 
+import dataclasses
 import functools
 import math
 from collections.abc import Callable
@@ -9,6 +10,7 @@ import jax
 import numpy as np
 
 from fitting.model_fit import ModelFit
+from fitting.result import Parameter
 from fitting.solver.normal_equations import sums
 from fitting.solver.refinement import problem_of, solve_linear
 
@@ -138,3 +140,19 @@ def _end(rise_at: Callable[[float], float], start: float, sign: int, bound: floa
             else:
                 inside, below = middle, max(delta_cost, 0.0)
     return sign * math.inf
+
+
+def widened(one: Parameter, by: float) -> Parameter:
+    """A number to whose error something adds that has this standard error; the ends of its interval move out."""
+    if one.value is None or one.error is None or by == 0:
+        return one
+    error, value, interval = math.hypot(one.error, by), one.value, one.interval
+    if interval is not None and not one.error:
+        interval = above_zero(value, error)
+    elif interval is not None and one.name == "n":  # it need not be even about it: each end by the same factor
+        low, high = (value * (end / value) ** (error / one.error) for end in interval)
+        interval = low, high
+    elif interval is not None:
+        low, high = (value + (end - value) * error / one.error for end in interval)
+        interval = max(low, 0.0) if interval[0] >= 0 else low, high
+    return dataclasses.replace(one, error=error, interval=interval)
