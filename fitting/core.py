@@ -28,7 +28,7 @@ from fitting.pixels import Observed, Tile, observe
 from fitting.problem import FitProblem
 from fitting.result import FitResult
 from fitting.sample_error import MOST, between, near_exponent, nearer
-from fitting.selection import FAMILIES, Choice, choose, is_better, may_be_off
+from fitting.selection import FAMILIES, Choice, PixelNoise, choose, is_better, may_be_off
 from fitting.solver.devices import placed
 from fitting.solver.losses import reweight
 from fitting.solver.nnls import nonnegative_minima
@@ -79,7 +79,8 @@ def fit_pictures(problem: FitProblem) -> FitResult:
     problem = dataclasses.replace(problem, weights=weights)
 
     with working_precision(problem.precision):
-        fit, choice, observed, statistics = _with_its_noise(observe(problem))
+        seen = observe(problem)
+        fit, choice, observed, statistics = _with_growing_noise(_fitted(_evenly_noisy(seen)), seen)
         fit = _held_plausible(fit, observed)
         if fit.capped or problem.loss != "squared":
             statistics = None
@@ -102,8 +103,8 @@ def fit_pictures(problem: FitProblem) -> FitResult:
     return dataclasses.replace(result, candidates=candidates, optimum=optimum)
 
 
-def _with_its_noise(seen: Observed) -> _Fitted:
-    """A fit, with noise that grows with brightness where that makes the picture likelier."""
+def _with_growing_noise(first: _Fitted, seen: Observed) -> _Fitted:
+    """A fit again, with noise that grows with brightness, where that makes the picture likelier."""
 
     def grown(last: _Fitted) -> _Fitted | None:
         uneven = _growing(seen, last[0])
@@ -117,7 +118,7 @@ def _with_its_noise(seen: Observed) -> _Fitted:
         found = shared_errors(one[0].evidence, seen)[1]
         return found.significant, found.excess
 
-    return likeliest(_fitted(_evenly_noisy(seen)), grown, value, alike)
+    return likeliest(first, grown, value, alike)
 
 
 def _growing(seen: Observed, fit: ModelFit) -> Observed | None:
@@ -137,11 +138,28 @@ def _growing(seen: Observed, fit: ModelFit) -> Observed | None:
 
 def _fitted(observed: Observed) -> _Fitted:
     """The model that is named, or the simplest adequate one; the pixels less what a codec did, and what is left."""
-    choice = statistics = None
-    if observed.problem.model == "auto":
-        fit, choice, statistics = _fit_simplest(observed)
-    else:
-        fit = _fit_model(brdf.MODELS[observed.problem.model], observed)
+    problem, fits = observed.problem, {}
+    if problem.model != "auto":
+        fit = _fit_model(brdf.MODELS[problem.model], observed)
+        return *_less_codec_errors(fit, None, observed), None
+    for name in problem.families if observed.reached(brdf.Lambert)[1].any() else ("lambert",):
+        if isinstance(observed.tiles, Stream) and problem.loss == "squared":
+            # The pictures of one model at a time are in memory; those of the others are made anew where asked for.
+            fits = {
+                done: fit._replace(pictures=each(partial(picture_of, fit.model), observed.tiles))
+                for done, fit in fits.items()
+            }
+        fits[name] = _fit_model(brdf.MODELS[name], observed)
+    by_squares = _best_first(fits)
+    fits, least, precision, likeliest = dict(by_squares), next(iter(by_squares.values())).cost, None, -math.inf
+    for name, fit in by_squares.items():
+        if fit.cost <= HOPELESS * least:
+            grey = coefficient_factors(fit.model, fit.optimum.n, observed.colour)[2]
+            fits[name] = fit = most_likely(fit, grey=grey, precision=precision, rival=likeliest)
+            precision = None if fit.evidence is None else fit.evidence.precision
+            if fit.evidence is not None and not _too_wide(fit, problem):
+                likeliest = max(likeliest, fit.evidence.value)
+    fit, choice, statistics = _simplest(_comparable(fits, observed), by_squares, observed)
     return *_less_codec_errors(fit, choice, observed), statistics
 
 
@@ -247,28 +265,54 @@ def _fit_about(
     return ModelFit(model, pictures, optimum, free, n_range, noise_factor=factor, **about)
 
 
-def _fit_simplest(observed: Observed) -> tuple[ModelFit, Choice, Residual | None]:
-    """Every family first, then the simplest adequate candidate on its own; what it leaves, where that is known."""
-    problem, colour = observed.problem, observed.colour
-    fits: dict[str, ModelFit] = {}
-    for name in problem.families if observed.reached(brdf.Lambert)[1].any() else ("lambert",):
-        if isinstance(observed.tiles, Stream) and problem.loss == "squared":
-            # The pictures of one model at a time are in memory; those of the others are made anew where asked for.
-            fits = {
-                done: fit._replace(pictures=each(partial(picture_of, fit.model), observed.tiles))
-                for done, fit in fits.items()
-            }
-        fits[name] = _fit_model(brdf.MODELS[name], observed)
-    fits = _best_first(fits)
-    least = next(iter(fits.values())).cost
-    by_squares, precision, likeliest = dict(fits), None, -math.inf
-    for name, fit in fits.items():
-        if fit.cost <= HOPELESS * least:
-            grey = coefficient_factors(fit.model, fit.optimum.n, colour)[2]
-            fits[name] = fit = most_likely(fit, grey=grey, precision=precision, rival=likeliest)
-            precision = None if fit.evidence is None else fit.evidence.precision
-            if fit.evidence is not None and not _too_wide(fit, problem):
-                likeliest = max(likeliest, fit.evidence.value)
+def _simplest(
+    fits: Mapping[str, ModelFit], by_squares: Mapping[str, ModelFit], observed: Observed
+) -> tuple[ModelFit, Choice, Residual | None]:
+    """Of fits of the families, the best first, the simplest adequate one on its own; what it leaves, where known."""
+    best = next(iter(fits.values()))
+    grey = {name: coefficient_factors(fit.model, fit.optimum.n, observed.colour)[2] for name, fit in fits.items()}
+    errors, likely, statistics = _told_apart_by(fits, observed, grey[best.model.name])
+    free = np.logical_or.reduce([fit.free for fit in fits.values()])
+    choice = choose({name: fit.optimum for name, fit in fits.items()}, free, grey, errors, likely)
+    statistics = statistics if choice.model == best.model.name else None
+    if choice.model not in FAMILIES and not _explains_structure(fits[choice.model], observed, statistics):
+        shown = fits[choice.model].optimum.x
+        best = most_likely(_fit_model(brdf.Lambert, observed))
+        fits = {"lambert": best}
+        errors = errors._replace(colour_inflation=1.0)
+        choice = choose({"lambert": best.optimum}, best.free, grey, errors, _likely_sums(fits))
+        # It may be one after all.
+        moved = np.where(best.optimum.x > 0, shown - best.optimum.x, 0.0)
+        choice = choice._replace(dropped=np.append(moved.ravel(), 0.0))
+    if choice.model in FAMILIES:
+        chosen = list(fits.values())[-1]
+        matt = each(lambda picture: dataclasses.replace(picture, lobe=None), chosen.pictures)
+        chosen = chosen._replace(model=brdf.Lambert, pictures=matt if observed.problem.streamed else list(matt))
+    else:
+        chosen = fits[choice.model]
+        if chosen.tied is not None and not choice.grey:
+            # Where channels err together a highlight is looked for in brightness; its colour is each channel's own.
+            chosen = by_squares[choice.model]
+        elif np.array_equal(choice.free, chosen.free) and not choice.grey:
+            return chosen, choice, statistics
+    tied = grey[choice.model] if choice.grey else None
+    del fits, best  # what is known of the others fills memory
+    return _as_chosen(chosen, choice, tied), choice, None
+
+
+def _as_chosen(fit: ModelFit, choice: Choice, tied: Float[np.ndarray, " C"] | None) -> ModelFit:
+    """A fit again with the terms of a choice alone."""
+    pictures, optimum = fit.pictures, fit.optimum
+    if choice.model in FAMILIES or not np.array_equal(choice.free, fit.free):
+        optimum = search(pictures, choice.free, fit.n_range)
+    if tied is not None:
+        optimum = refit(pictures, optimum, choice.free, fit.n_range, tied)
+    return most_likely(fit._replace(optimum=optimum, free=choice.free, tied=tied))
+
+
+def _comparable(fits: Mapping[str, ModelFit], observed: Observed) -> dict[str, ModelFit]:
+    """By weights that are the same for all, the best first; none whose lobe is too wide."""
+    problem = observed.problem
     fits = {name: fit for name, fit in fits.items() if not _too_wide(fit, problem)}
     fits = fits or {"lambert": most_likely(_fit_model(brdf.Lambert, observed))}
     if problem.loss != "squared":
@@ -277,14 +321,21 @@ def _fit_simplest(observed: Observed) -> tuple[ModelFit, Choice, Residual | None
         for name, fit in fits.items():
             pictures = each(lambda a, b: dataclasses.replace(a, weight=b.weight), fit.pictures, best.pictures)
             fits[name] = fit._replace(pictures=pictures, optimum=search(pictures, fit.free, fit.n_range))
-    grey = {name: coefficient_factors(fit.model, fit.optimum.n, colour)[2] for name, fit in fits.items()}
-    # The best comes first: what is judged without a highlight is judged by its sums.
-    fits = _best_first(fits)
+    return _best_first(fits)
+
+
+def _told_apart_by(
+    fits: Mapping[str, ModelFit], observed: Observed, grey: Float[np.ndarray, " C"]
+) -> tuple[PixelNoise, dict[str, NormalEquations], Residual | None]:
+    """How pixels err, by the best fit, the first; the sums of a likelihood, where that is not of squares alone.
+
+    Last what the best leaves, where it was asked for.
+    """
     best = next(iter(fits.values()))
-    noise, whitened, colour_inflation = residual_noise(best.optimum, observed.rounding), _likely_sums(fits), 1.0
+    noise, likely, colour_inflation = residual_noise(best.optimum, observed.rounding), _likely_sums(fits), 1.0
     statistics = None
-    if whitened:
-        inflation, colour_inflation = _inflation(best, observed, grey[best.model.name])
+    if likely:
+        inflation, colour_inflation = _inflation(best, observed, grey)
     else:
         statistics = residual_statistics(best.pictures, observed.widths, best.optimum, noise, observed.rounding)
         inflation = statistics.neighbours.inflation
@@ -295,43 +346,12 @@ def _fit_simplest(observed: Observed) -> tuple[ModelFit, Choice, Residual | None
             # Each pixel by its own variance, or noise in bright pixels would pass for a highlight.
             for name, fit in fits.items():
                 parts = weighted_sums(fit.pictures, fit.optimum, growing, inverse=True)
-                whitened[name] = join_channels(parts.gram, parts.product, parts.square, fit.optimum.x[2])
+                likely[name] = join_channels(parts.gram, parts.product, parts.square, fit.optimum.x[2])
     if observed.copies:
         inflation *= np.sqrt(observed.colour.size)
     # However much errs together, the picture is not less than a few measurements.
     inflation = min(inflation, max(float(np.sqrt(np.sum(best.optimum.pixels) / FEWEST_MEASUREMENTS)), 1.0))
-    free = np.logical_or.reduce([fit.free for fit in fits.values()])
-    optima = {name: fit.optimum for name, fit in fits.items()}
-    choice = choose(optima, free, grey, noise, inflation, whitened, colour_inflation)
-    statistics = statistics if choice.model == best.model.name else None
-    if choice.model not in FAMILIES and not _explains_structure(fits[choice.model], observed, statistics):
-        shown = fits[choice.model].optimum.x
-        fits = {"lambert": most_likely(_fit_model(brdf.Lambert, observed))}
-        best = fits["lambert"]
-        choice = choose({"lambert": best.optimum}, best.free, grey, noise, inflation, _likely_sums(fits))
-        # It may be one after all.
-        moved = np.where(best.optimum.x > 0, shown - best.optimum.x, 0.0)
-        choice = choice._replace(dropped=np.append(moved.ravel(), 0.0))
-    matt = choice.model in FAMILIES
-    chosen = list(fits.values())[-1] if matt else fits[choice.model]
-    del fits, best
-    pictures = chosen.pictures if problem.streamed else list(chosen.pictures)
-    if matt:
-        pictures = each(lambda picture: dataclasses.replace(picture, lobe=None), pictures)
-        chosen = chosen._replace(model=brdf.Lambert)
-    optimum = chosen.optimum
-    if not (matt or choice.grey) and chosen.tied is not None:
-        # Where channels err together a highlight is looked for in brightness; its colour is each channel's own.
-        chosen, optimum = by_squares[choice.model], by_squares[choice.model].optimum
-    elif not (matt or choice.grey) and np.array_equal(choice.free, chosen.free):
-        return chosen, choice, statistics
-    if matt or not np.array_equal(choice.free, chosen.free):
-        optimum = search(pictures, choice.free, chosen.n_range)
-    tied = grey[choice.model] if choice.grey else None
-    if tied is not None:
-        optimum = refit(pictures, optimum, choice.free, chosen.n_range, tied)
-    chosen = chosen._replace(pictures=pictures, optimum=optimum, free=choice.free, tied=tied)
-    return most_likely(chosen), choice, None
+    return PixelNoise(noise, inflation, colour_inflation), likely, statistics
 
 
 def _best_first(fits: Mapping[str, ModelFit]) -> dict[str, ModelFit]:

@@ -155,28 +155,39 @@ def _try(
     return _Trial(model, free, tied is not None, unknowns, effective, solution, cost, squares)
 
 
+class PixelNoise(NamedTuple):
+    """How pixels err, as far as it tells candidates apart.
+
+    Attributes:
+        noise: that of the best fit.
+        inflation: by so much the structure of its residual makes errors larger.
+        colour_inflation: by so much more those of a highlight's colour.
+    """
+
+    noise: Float[np.ndarray, " C"]
+    inflation: float
+    colour_inflation: float = 1.0
+
+
 def choose(
     fits: Mapping[str, Optimum],
     free: Bool[np.ndarray, "3 C"],
     grey: Mapping[str, Float[np.ndarray, " C"]],
-    noise: Float[np.ndarray, " C"],
-    inflation: float,
-    whitened: Mapping[str, NormalEquations],
-    colour_inflation: float = 1.0,
+    errors: PixelNoise,
+    likely: Mapping[str, NormalEquations],
 ) -> Choice:
     """Choose the simplest adequate model.
 
     Of the optimum of each model with a highlight, or that of Lambert alone. ``grey`` are the x_s of a grey k_s, up to a
-    factor, ``noise`` that of the best fit; the structure of its residual makes errors larger by ``inflation``, and
-    those of a highlight's colour by ``colour_inflation`` more. ``whitened`` are the normal equations with each pixel
-    divided by its variance; empty where that is the same in all.
+    factor, ``errors`` how pixels err by the best fit. ``likely`` are the sums of a likelihood, as with each pixel
+    divided by its variance; empty where squares are all that counts.
     """
     channels = free.shape[1]
     no, ambient = np.zeros(channels, bool), bool(free[0].any())
-    variance = (noise * inflation) ** 2
+    variance, inflation = (errors.noise * errors.inflation) ** 2, errors.inflation
     plain = {name: fit.normal() for name, fit in fits.items()}
     normals = {name: fit.normal(variance) for name, fit in fits.items()}
-    for name, one in whitened.items():
+    for name, one in likely.items():
         normals[name] = NormalEquations(one.gram / inflation**2, one.product / inflation**2, one.square / inflation**2)
     first = next(iter(fits))
     terms = [("none", no, no), ("lambert", no, free[1])]
@@ -193,7 +204,7 @@ def choose(
                 if tied is not None:
                     cost = trial.cost
                 elif cost > trial.cost and np.isfinite(cost):
-                    trial = trial._replace(cost=cost - (cost - trial.cost) / colour_inflation**2)
+                    trial = trial._replace(cost=cost - (cost - trial.cost) / errors.colour_inflation**2)
                 # A highlight that comes out as nothing is Lambert's surface again.
                 if np.any(trial.solution[2 * channels : -1] > 0):
                     trials.append(trial)

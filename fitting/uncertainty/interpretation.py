@@ -1,6 +1,7 @@
 """From the solver's numbers to a material, its errors, and what a user should know of them."""
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -215,8 +216,8 @@ def shared_errors(
     """
     lossy = any(tile.bounds is not None and tile.bounds.lossy for tile in observed.tiles)
     channels, few = None, evidence.noise < ROUNDED
-    both = zip(evidence.pictures, evidence.places, strict=True)
-    errors = (Errors(residuals(picture, evidence.optimum), *place) for picture, place in both)
+    left = map(partial(residuals, optimum=evidence.optimum), evidence.pictures)
+    errors = map(lambda values, place: Errors(values, *place), left, evidence.places)
     if lossy:
         # The pixels of a block err together in any case.
         errors, some = list(errors), slice(1 if observed.copies else None)
@@ -246,7 +247,8 @@ def _scores(score: np.ndarray, information: np.ndarray, place: tuple[np.ndarray,
 
     Each of many values may say that it is not beyond an edge, which one in a thousand would be.
     """
-    sums, of_information = (over_blocks(Errors(part, *place), SIZES[0]) for part in (score, np.sqrt(information)))
+    sums = over_blocks(Errors(score, *place), SIZES[0])
+    of_information = over_blocks(Errors(np.sqrt(information), *place), SIZES[0])
     return sums._replace(squares=np.maximum(sums.squares, of_information.squares))
 
 
