@@ -25,6 +25,7 @@ from brdf.images.encoding import encode
 from brdf.precision import working_precision
 from fitting.core import picture_of
 from fitting.joint_problem import JointProblem, joint_problem, scene_leaves
+from fitting.likelihood import how_many_alike, weight_of_alike
 from fitting.pixels import Tile
 from fitting.result import Cause, FitResult
 from fitting.solver.normal_equations import Picture
@@ -83,7 +84,9 @@ def diagnose(result: FitResult) -> tuple[Cause, ...]:
     """Causes of the structure in a residual, likeliest first; none where none explains a good part of it."""
     with working_precision("float64"):
         residual = Residual(result)
-        if residual.rounded and not any("structure" in words for words in result.warnings):
+        # What a codec leaves has a shape of its own, as a wrong scene does.
+        unspoilt = all(file is not None and not file.get("lossy", True) for file in result.files or [None])
+        if residual.rounded and not unspoilt and not any("structure" in words for words in result.warnings):
             return ()
         found = [
             test
@@ -140,13 +143,30 @@ class _Picture:
         self.fitted = self.shown({}, 0.0)
         codes = self.codes(self.fitted)
         self.left = self.codes(self.target) - codes
-        self.noise = _white_noise(self.left, self.counted)
+        self.noise, self.step = _white_noise(self.left, self.counted[..., None]), self._step()
+        self.weight = np.ones(self.target.shape)
+        if self.rounded:
+            # Values that are predicted alike, as on an unlit side, share a rounding error: together they are one.
+            alike = np.zeros(self.target.shape)
+            alike[self.counted] = np.stack([how_many_alike(c / self.step) for c in codes[self.counted].T], axis=-1)
+            self.noise = _white_noise(self.left, self.counted[..., None] & (alike == 0))
+            self.weight = weight_of_alike(alike, self.noise / self.step)
         # Where noise was cut off at 0 dark pixels are too bright.
         if np.min(self.target[self.counted], initial=np.inf) == 0:
             self.counted &= np.all(codes > DARK * self.noise, axis=-1)
         logarithm = np.log(np.where(self.fitted > 0, self.fitted, 1.0))
         self.moves["gamma"] = [0.01 * self.fitted * logarithm]
         self.moves["black"] = [np.full(self.fitted.shape, 0.01)]
+
+    def _step(self) -> float:
+        """Between the codes that are used; 0 where there is only one."""
+        used = np.unique(self.codes(self.target)[self.counted].astype(np.float32))
+        return float(np.median(np.diff(used))) if used.size > 1 else 0.0
+
+    @property
+    def rounded(self) -> bool:
+        """Whether rounding to codes is most of the noise."""
+        return ROUNDED * self.step > float(np.max(self.noise))
 
     def moved(self, move: dict[str, Any], size: float) -> tuple[brdf.Material, brdf.Scene]:
         """The material, and these pixels of the scene, with some numbers moved."""
@@ -215,16 +235,12 @@ class Residual:
         self._material = material / np.where(size > 0, size, 1.0)
         self._inverse = np.linalg.pinv(self._material, rcond=1e-6)
         self.left = self._unfollowed(self._flat([picture.left for picture in self.pictures]))
-        self.excess = float(np.sum(self.left**2)) - self.left.size
+        self.excess = float(np.sum(self.left**2) - sum(np.sum(one.weight[one.counted]) for one in self.pictures))
 
     @property
     def rounded(self) -> bool:
-        """Whether rounding to codes is most of the noise: it has a shape of its own, as a wrong scene does."""
-        for picture in self.pictures:
-            used = np.unique(picture.codes(picture.target)[picture.counted].astype(np.float32))
-            if used.size > 1 and ROUNDED * float(np.median(np.diff(used))) > float(np.max(picture.noise)):
-                return True
-        return False
+        """Whether rounding to codes is most of the noise of some picture."""
+        return any(picture.rounded for picture in self.pictures)
 
     def tests(self) -> Iterator[_Test]:
         """Each cause that the scenes determine, as large as it explains most."""
@@ -275,7 +291,7 @@ class Residual:
         solved = []
         for picture, basis, some in zip(self.pictures, lit, good, strict=True):
             target = np.flip(picture.target, axis)
-            weight = some[..., None] * (picture.curve(target) / picture.noise) ** 2
+            weight = some[..., None] * np.flip(picture.weight, axis) * (picture.curve(target) / picture.noise) ** 2
             values, weight = (jnp.asarray(a.reshape(-1, self.channels)) for a in (target, weight))
             solved.append(dataclasses.replace(basis, target=values, weight=weight))
         return float(np.sum(search(solved).cost))
@@ -296,7 +312,7 @@ class Residual:
     def _flat(self, images: Sequence[Float[np.ndarray, "*K H W C"]]) -> Float[np.ndarray, "*K C P"]:
         """Of the pixels that count, in units of the noise."""
         both = zip(images, self.pictures, strict=True)
-        parts = [image[..., picture.counted, :] / picture.noise for image, picture in both]
+        parts = [(image * np.sqrt(picture.weight))[..., picture.counted, :] / picture.noise for image, picture in both]
         return np.concatenate(parts, axis=-2).swapaxes(-1, -2)
 
     def _unfollowed(self, values: Float[np.ndarray, "C P"]) -> Float[np.ndarray, " N"]:
@@ -305,10 +321,10 @@ class Residual:
         return left.ravel() * (np.sum(left**2) > FOLLOWED * np.sum(values**2))
 
 
-def _white_noise(residual: Float[np.ndarray, "H W C"], counted: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, " C"]:
+def _white_noise(residual: Float[np.ndarray, "H W C"], some: Bool[np.ndarray, "H W #C"]) -> Float[np.ndarray, " C"]:
     """Standard deviation of what single pixels err: from differences of neighbours, which know no wide structure."""
-    known = np.where(counted[..., None], residual, np.nan)
-    differences = np.concatenate([np.diff(known, axis=axis).reshape(-1, known.shape[2]) for axis in (0, 1)])
-    differences = differences[np.isfinite(differences[:, 0])]
-    scale = float(np.max(np.abs(residual), initial=0.0))
-    return np.sqrt(np.sum(differences**2, axis=0) / max(2 * len(differences), 1)) + 1e-7 * (scale or 1.0)
+    known = np.where(some, residual, np.nan)
+    both = [np.diff(known, axis=axis).reshape(-1, known.shape[2]) for axis in (0, 1)]
+    squares = np.concatenate(both) ** 2
+    scale, count = float(np.max(np.abs(residual), initial=0.0)), np.count_nonzero(np.isfinite(squares), axis=0)
+    return np.sqrt(np.nansum(squares, axis=0) / np.maximum(2 * count, 1)) + 1e-7 * (scale or 1.0)

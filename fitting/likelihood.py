@@ -391,16 +391,12 @@ def alike(bounds: Bounds, codes: Float[np.ndarray, "P C"], *, level: bool = Fals
     Times the square of the step between codes. With ``level`` only those that also show one code; where some do not,
     noise tells where between codes they lie.
     """
-    code = np.rint(codes * ALIKE).astype(np.int64)
-    tells, found, width = bounds.ends > 0, np.zeros(code.shape), bounds.upper - bounds.lower
+    tells, found, width = bounds.ends > 0, np.zeros(codes.shape), bounds.upper - bounds.lower
     width = np.where(np.isfinite(width), width, np.min(width, initial=1.0, where=width > 0))
-    for channel, (one, some) in enumerate(zip(code.T, tells.T, strict=True)):
+    for channel, (one, some) in enumerate(zip(codes.T, tells.T, strict=True)):
         if not some.any():
             continue
-        kind, count = _kinds(one[some])
-        planes = level and np.count_nonzero(count) < MOST_LEVELS
-        usual = 0 if planes else np.median(count[count > 0])
-        many = count > max(FEWEST_LEVEL if level else FEWEST_ALIKE, MORE_ALIKE * usual)
+        kind, count, many = _of_kinds(one[some], FEWEST_LEVEL if level else FEWEST_ALIKE, planes=level)
         if level:
             shown, one_of = bounds.lower[some, channel] + bounds.upper[some, channel], np.zeros(count.size)
             one_of[kind] = shown
@@ -409,15 +405,29 @@ def alike(bounds: Bounds, codes: Float[np.ndarray, "P C"], *, level: bool = Fals
     return found
 
 
+def how_many_alike(codes: Float[np.ndarray, " P"]) -> Float[np.ndarray, " P"]:
+    """How many values are predicted as each is, in steps between codes; 0 for few."""
+    kind, count, many = _of_kinds(codes, FEWEST_ALIKE)
+    return np.where(many, count, 0.0)[kind]
+
+
 def weight_of_alike(count: Float[np.ndarray, "P C"], noise: Any) -> Float[np.ndarray, "P C"]:
     """Of each of N values of noise s that share a rounding error: their mean has a variance of 1 / 12 + s² / N."""
     return 1 / (1 + count / (12 * noise**2))
 
 
-def _kinds(code: Int[np.ndarray, " P"]) -> tuple[Int[np.ndarray, " P"], Int[np.ndarray, " K"]]:
-    """Which kind each code is, and how many are of each; few are counted, which is quicker than sorting."""
+def _of_kinds(
+    codes: Float[np.ndarray, " P"], fewest: int, *, planes: bool = False
+) -> tuple[Int[np.ndarray, " P"], Int[np.ndarray, " K"], Bool[np.ndarray, " K"]]:
+    """Which kind each prediction is, how many are of each, and whether that is many; few are counted, not sorted.
+
+    With ``planes`` a picture of few kinds is one of planes, whose kinds are all of many.
+    """
+    code = np.rint(codes * ALIKE).astype(np.int64)
     least = np.min(code)
     if np.max(code) - least < MOST_COUNTED:
-        return code - least, np.bincount(code - least)
-    _, kind, count = np.unique(code, return_inverse=True, return_counts=True)
-    return kind, count
+        kind, count = code - least, np.bincount(code - least)
+    else:
+        _, kind, count = np.unique(code, return_inverse=True, return_counts=True)
+    usual = 0 if planes and np.count_nonzero(count) < MOST_LEVELS else np.median(count[count > 0])
+    return kind, count, count > max(fewest, MORE_ALIKE * usual)

@@ -36,8 +36,8 @@ class Target(NamedTuple):
         step: the distance of two codes; 0 where there are none.
         codes: behind the values; None where no rounding touched these.
         least_squares: is asked for, whatever the values are.
-        file: path, encoding, its source, layer and factor of the `brdf.Picture` that it was; None where no file holds
-            it.
+        file: path, encoding, its source, whether it has losses, layer and factor of the `brdf.Picture` that it was;
+            None where no file holds it.
         opaque: pixels that are not fully transparent, (H, W); None for all.
     """
 
@@ -265,7 +265,7 @@ def _of_picture(picture: brdf.Picture, rounding: Rounding, stored: np.ndarray | 
     least, file = rounding is not None and codes is None, None
     if picture.path is not None:
         file = {"path": str(picture.path), "encoding": picture.encoding, "source": picture.source}
-        file |= {"factor": np.asarray(picture.factor).tolist(), "layer": picture.layer}
+        file |= {"lossy": picture.lossy, "factor": np.asarray(picture.factor).tolist(), "layer": picture.layer}
     return Target(pixels, top, step, codes, least, file, picture.opaque)
 
 

@@ -107,6 +107,26 @@ def test_a_small_error_of_the_scene_is_seen_behind_rounding_and_rounding_is_none
     assert abs(result.diagnosis[0].size - 0.15) < 0.05
 
 
+def test_an_unlit_side_counts_as_one_value_where_rounding_is_the_noise(tmp_path: Path):
+    def read(values: np.ndarray) -> brdf.Picture:
+        brdf.write_image(tmp_path / "ball.png", values.astype(np.float32))
+        return brdf.read_picture(tmp_path / "ball.png", encoding="srgb")
+
+    camera = dataclasses.replace(CAMERA, resolution=(128, 128))
+    light = dataclasses.replace(LIGHT, direction=[0.9, 0.3, 0.3])
+    scene = brdf.Scene(camera=camera, shapes=[BALL], lights=[light])
+    shown = 1.5 * np.asarray(brdf.render(MATERIAL, scene, precision="float64"))
+    assert fitted(read(shown), scene).diagnosis == ()
+    # Less than half a code: the dark side of thousands of pixels shows 0 all the same.
+    cause = fitted(read(shown + 1.4e-4), scene).diagnosis[0]
+    assert cause.name.startswith("black")
+    assert abs(cause.size - 0.014) < 0.005
+    moved = dataclasses.replace(scene, shapes=(dataclasses.replace(BALL, center=[0.02 * 2.2 / 128, 0.0, 0.0]),))
+    cause = fitted(read(shown), moved).diagnosis[0]
+    assert cause.name.startswith("ball")
+    assert abs(cause.size - 0.02) < 4 * cause.error < 0.01
+
+
 def test_what_errs_together_in_a_clipped_float_picture_is_told():
     target = np.minimum(drawn(noise=0.002), 0.6)
     assert not any("structure" in words for words in fitted(target).warnings)
