@@ -27,6 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from brdf.precision import cast
 from fitting.solver.normal_equations import Picture, Sums, sums
 from fitting.solver.refinement import (
     GRID_STEP,
@@ -130,7 +131,7 @@ def search(
         rough = _without_lobe(few)
         if problem.tolerance == TOLERANCE_SINGLE and not _resolved(profile, few, rough):
             # Sums in double precision over all pixels, one picture at a time: slow, and rarely needed.
-            exact = Stream(lambda i: jax.tree.map(lambda leaf: leaf.astype(np.float64), pictures[i]), len(pictures))
+            exact = Stream(lambda i: cast(pictures[i], "float64"), len(pictures))
             problem = problem._replace(pictures=exact, tolerance=TOLERANCE_DOUBLE)
         minimum = gauss_newton if cap is None else capped_minimum
         if not sample.whole:

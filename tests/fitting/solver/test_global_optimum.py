@@ -122,10 +122,16 @@ def test_where_noise_leaves_n_loose_the_cost_is_that_of_the_answer_and_the_least
     assert np.sum(found.cost) <= min(map(least, np.geomspace(0.1, 1e6, 300))) * (1 + 1e-6)
 
 
-def test_basis_images_that_nearly_add_up_to_one_another_are_told_apart_in_double_precision():
+@pytest.mark.parametrize("samples", [1, 2])
+def test_basis_images_that_nearly_add_up_to_one_another_are_told_apart_in_double_precision(samples: int):
     """Under light from all around, products in single precision seem to fit exactly with several exponents."""
     camera = brdf.OrthographicCamera(
-        position=[0.0, 0.0, 4.0], target=[0.0, 0.0, 0.0], up=[0.0, 1.0, 0.0], width=2.2, resolution=(48, 48)
+        position=[0.0, 0.0, 4.0],
+        target=[0.0, 0.0, 0.0],
+        up=[0.0, 1.0, 0.0],
+        width=2.2,
+        resolution=(48, 48),
+        samples=samples,
     )
     scene = brdf.Scene(
         camera=camera,
