@@ -67,8 +67,8 @@ STEPS = 4
 """Gauss-Newton steps in a bracket of two steps of the grid: they converge to single precision."""
 
 CAP = 32.0
-"""k_s is at most so many times the brightest value of its texel: where no light comes near the mirror direction, k_s
-and n would go up together without end."""
+"""The peak of a lobe shows at most so many times the brightest value of its texel: where no light comes near the mirror
+direction k_s and n would go up together without end."""
 
 JOINT_STEPS = 5
 """Gauss-Newton steps of material and normal together."""
@@ -232,9 +232,13 @@ class Texels(eqx.Module):
 
     @property
     def cap(self) -> Array:
-        """What k_s may be at most, (T,)."""
-        brightest = jnp.maximum(jnp.max(largest(self.unweighted(self.values)), axis=1), 0)
-        return jnp.full_like(brightest, jnp.inf) if self.relative else CAP * brightest
+        """What k_s may be at most, (T,), by the light that arrives; of a matt surface k_d may be anything."""
+        if self.relative or not self.glossy:
+            return jnp.full_like(self.shown[0, :, 0], jnp.inf)
+        brightest, light = (
+            jnp.max(largest(self.unweighted(one)), axis=1) for one in (self.values, self.lobe(jnp.ones(())))
+        )
+        return CAP * divide(jnp.maximum(brightest, 0), light)
 
     def unweighted(self, values: Components) -> Components:
         """Values or a column without the roots of the weights."""

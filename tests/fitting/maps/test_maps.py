@@ -504,6 +504,24 @@ def test_lights_of_several_kinds_light_one_view():
     assert np.median(np.abs(maps.n[maps.determined] / 15 - 1)) < 1e-3
 
 
+@pytest.mark.parametrize("model", [brdf.BlinnPhong(k_d=0.4, k_s=0.3, n=15.0), brdf.Lambert(k_d=0.4)])
+def test_lengths_have_no_unit(model: brdf.Material):
+    """Light that falls off with the distance: k_s, without a lobe k_d, was held below what the unit allowed."""
+    spots, across = 4 * dome(16), np.stack(np.meshgrid(*2 * [np.linspace(-1, 1, 5)]), axis=-1)
+    position, up = np.append(across, np.zeros((5, 5, 1)), axis=-1), np.broadcast_to([0.0, 0.0, 1.0], (5, 5, 3))
+    found = []
+    for unit in (1.0, 50.0):
+        points = brdf.SurfacePoints.from_normals(up, position=unit * position)
+        lights = [brdf.PointLight(unit * spot, 15.0 * unit**2) for spot in spots]
+        scenes = [brdf.Scene(points=points, lights=[light]) for light in lights]
+        pictures = [np.asarray(brdf.render(model, scene)) for scene in scenes]
+        found.append(fitting.fit_maps(pictures, scenes, model=model.name))
+    for maps in found:
+        np.testing.assert_allclose(maps.k_d, 0.4, rtol=1e-3)
+    np.testing.assert_array_equal(found[0].reason, found[1].reason)
+    np.testing.assert_allclose(found[0].n, found[1].n, rtol=1e-3)
+
+
 def test_scenes_tell_ambient_light_shadow_masks_and_the_view():
     camera = brdf.OrthographicCamera(position=[3, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=(12, 12))
     ball, lights, random = brdf.Sphere([0, 0, 0], 1), dome(20), np.random.default_rng(1)
