@@ -7,7 +7,7 @@ from its whole solid angle, (cos θ₁ - cos θ₂) Δφ.
 
 Where the samples go. The map is cut along rows and columns into as many rectangles as there are samples, always the one
 next whose light is spread most (energy times variance of its directions), through its centre of mass. So samples crowd
-where the light is; a map with one bright texel costs one sample, unless the texels are wide and are cut up themselves.
+where the light is. Wide texels are cut up themselves; one bright texel of a fine map costs one sample.
 A sample keeps energy, mean and covariance of the directions in its rectangle: the irradiance of rectangles above the
 horizon is exact however few there are, and those that the horizon crosses fade in as their spread says. What is sampled
 is the shape of shadows and of highlights: a lobe needs the rectangles in its reach to be narrower than itself.
@@ -40,8 +40,8 @@ LARGEST_MAP = 1 << 21
 SAME = 1e-3
 """By how much variances must differ, relatively, and by how many texels a centre of mass may fall short of a whole
 number and yet count as it: rounding of pixels must not decide ties, or a map that was saved would be cut otherwise."""
-FEWEST_ROWS = 128
-"""A map of fewer has wide texels, which are cut up too: in so many rows, and twice as many columns, at least."""
+FINEST, FINER = 1024, 8
+"""Texels of a map of fewer rows are cut up too, in so many rows and columns each, and these again."""
 
 
 class ConstantEnvironment(Light):
@@ -221,46 +221,86 @@ def _solid_angles(height: int, width: int) -> np.ndarray:
     return (-np.diff(edges) * 2 * np.pi / width)[:, None]
 
 
+class _Grid(NamedTuple):
+    """Cells of one size: the texels of a map, or what one of them is cut up into.
+
+    Attributes:
+        moments: of each cell, see `_moments`.
+        corner: row and column, in texels of the map, where the first cell begins.
+        step: texels along a cell.
+    """
+
+    moments: Float[np.ndarray, "R K M"]
+    corner: tuple[float, float] = (0.0, 0.0)
+    step: float = 1.0
+
+    @property
+    def all_cells(self) -> Any:
+        """The box of all of them: the first row and that after the last, and such columns."""
+        return [[0, count] for count in self.moments.shape[:2]]
+
+
 def cut(pixels: Float[np.ndarray, "H W C"], samples: int) -> Patches:
     """Cut a map into rectangles, see the module."""
-    for axis, fewest in enumerate((FEWEST_ROWS, 2 * FEWEST_ROWS)):
-        pixels = np.repeat(pixels, -(-fewest // pixels.shape[axis]), axis)
-    moments = _texel_moments(pixels * _solid_angles(*pixels.shape[:2])[..., None])
+    height, width, channels = pixels.shape
+    moments = _moments(pixels, np.linspace(0, np.pi, height + 1), np.linspace(0, 2 * np.pi, width + 1))
     while moments.shape[0] * moments.shape[1] > LARGEST_MAP:
         for axis in (0, 1):
             moments = np.add.reduceat(moments, np.arange(0, moments.shape[axis], 2), axis=axis)
 
-    def entry(*box: tuple[int, int]) -> tuple[float, Any]:
+    def entry(grid: _Grid, box: Any) -> tuple[float, Any, _Grid, Any]:
         """Largest spread first: energy times variance of the directions, which is what is left of their length 1.
 
         Four digits of it: of rectangles that are alike the first comes first, whatever rounding makes of them.
         """
-        energy, *first = moments[slice(*box[0]), slice(*box[1]), :4].sum(axis=(0, 1))
+        energy, *first = grid.moments[slice(*box[0]), slice(*box[1]), :4].sum(axis=(0, 1))
         variance = 1.0 - np.sum((np.array(first) / energy) ** 2) if energy > 0 else 0.0
         spread = energy * variance if variance > 1e-12 else 0.0  # rounding aside
-        return -float(f"{spread:.4g}"), box
+        place = [[corner + grid.step * end for end in ends] for corner, ends in zip(grid.corner, box, strict=True)]
+        return -float(f"{spread:.4g}"), place, grid, box
 
-    heap, done = [entry((0, moments.shape[0]), (0, moments.shape[1]))], []
+    def finer(grid: _Grid, box: Any) -> _Grid:
+        """The one cell of a box that is not dark, cut up."""
+        some = grid.moments[slice(*box[0]), slice(*box[1]), 0]
+        cell = np.unravel_index(np.argmax(some), some.shape)
+        row, column = (
+            corner + grid.step * (ends[0] + int(offset))
+            for corner, ends, offset in zip(grid.corner, box, cell, strict=True)
+        )
+        step = grid.step
+        down, about = (np.linspace(first, first + step, FINER + 1) for first in (row, column))
+        radiance = np.broadcast_to(pixels[int(row), int(column)], (FINER, FINER, channels))
+        return _Grid(_moments(radiance, np.pi * down / height, 2 * np.pi * about / width), (row, column), step / FINER)
+
+    whole = _Grid(moments)
+    heap, done = [entry(whole, whole.all_cells)], []
     while heap and len(heap) + len(done) < samples:
-        negative_spread, box = heapq.heappop(heap)
-        halves = _halves(moments[..., 0], box) if negative_spread else None
-        if halves is None:
-            done.append(box)
-        for half in halves or ():
-            heapq.heappush(heap, entry(*half))
-    boxes = sorted(done + [box for _, box in heap])
-    sums = np.stack([moments[slice(*rows), slice(*columns)].sum(axis=(0, 1)) for rows, columns in boxes])
-    return _patches(sums[sums[:, 0] > 0], pixels.shape[2])
+        best = heapq.heappop(heap)
+        negative_spread, _, grid, box = best
+        halves = _halves(grid, box, height, width) if negative_spread else []
+        if negative_spread and not halves and height < FINEST * grid.step and len(moments) == height:
+            grid = finer(grid, box)
+            halves = _halves(grid, grid.all_cells, height, width)
+        if not halves:
+            done.append(best)
+        for half in halves:
+            heapq.heappush(heap, entry(grid, half))
+    patches = sorted(done + heap, key=lambda one: one[1])
+    sums = [grid.moments[slice(*rows), slice(*columns)].sum(axis=(0, 1)) for *_, grid, (rows, columns) in patches]
+    sums = np.stack(sums)
+    return _patches(sums[sums[:, 0] > 0], channels)
 
 
-def _texel_moments(energy: np.ndarray) -> np.ndarray:
-    """Per texel: energy, its products with the direction (3) and with pairs of its axes (9), energy of each channel.
+def _moments(
+    radiance: Float[np.ndarray, "R K C"], down: Float[np.ndarray, " R+1"], about: Float[np.ndarray, " K+1"]
+) -> Float[np.ndarray, "R K 13+C"]:
+    """Per cell: energy, its products with the direction (3) and with pairs of its axes (9), energy of each channel.
 
-    Means over the texel's solid angle, by integrals of sines and cosines of the angles down and about.
+    Means over the cell's solid angle, by integrals of sines and cosines of the angles of its edges, down and about,
+    which are equally far apart.
     """
-    height, width = energy.shape[:2]
-    step, down = 2 * np.pi / width, np.linspace(0.0, np.pi, height + 1)[:, None]
-    cos, sin, middle = np.cos(down), np.sin(down), step * (np.arange(width) + 0.5)
+    step, middle, down = about[1] - about[0], 0.5 * (about[1:] + about[:-1]), down[:, None]
+    cos, sin = np.cos(down), np.sin(down)
     solid, pair = -np.diff(cos, axis=0), (cos[1:] ** 2 + cos[1:] * cos[:-1] + cos[:-1] ** 2) / 3
     across, slant = np.diff(0.5 * (down - sin * cos), axis=0) / solid, np.diff(sin**3, axis=0) / (3 * solid)
     x, z = (np.sin(step / 2) / (step / 2) * one for one in (np.sin(middle), -np.cos(middle)))
@@ -268,23 +308,25 @@ def _texel_moments(energy: np.ndarray) -> np.ndarray:
     xx, zz, xz = (1 - pair) * (1 - double_x) / 2, (1 - pair) * (1 + double_x) / 2, (1 - pair) * double_z / 2
     xy, yz, y = slant * x, slant * z, (cos[1:] + cos[:-1]) / 2
     means = [across * x, y, across * z, xx, xy, xz, xy, pair, yz, xz, yz, zz]
+    energy = radiance * (step * solid)[..., None]
     weight = energy.sum(axis=-1)
     return np.concatenate([np.stack([weight, *(weight * one for one in means)], axis=-1), energy], axis=-1)
 
 
-def _halves(weight: np.ndarray, box: Any) -> list[Any] | None:
-    """Two rectangles, cut across the longer side at the centre of mass; None for a single texel."""
-    height, width = weight.shape
+def _halves(grid: _Grid, box: Any, height: int, width: int) -> list[Any]:
+    """Two rectangles, cut across the longer side at the centre of mass; none where light is in a single cell."""
+    weight = grid.moments[..., 0]
     some, means, variances = weight[slice(*box[0]), slice(*box[1])], [], []
     for axis in (0, 1):
         along, index = some.sum(axis=1 - axis), np.arange(some.shape[axis])
         means.append(np.sum(index * along) / np.sum(along))
         variances.append(np.sum((index - means[-1]) ** 2 * along))
-    shrink = np.sin(np.pi * (box[0][0] + means[0] + 0.5) / height) * 2 * height / width
+    row = grid.corner[0] + grid.step * (box[0][0] + means[0] + 0.5)
+    shrink = np.sin(np.pi * row / height) * 2 * height / width
     axis = int(variances[0] < variances[1] * shrink**2 * (1 - SAME))
     axis = axis if variances[axis] else 1 - axis
     if not variances[axis]:
-        return None
+        return []
     first, last = box[axis]
     middle = first + int(np.clip(np.floor(means[axis] + SAME) + 1, 1, last - first - 1))
     return [[*box[:axis], part, *box[axis + 1 :]] for part in ((first, middle), (middle, last))]
