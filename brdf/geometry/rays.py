@@ -47,7 +47,7 @@ def trace(camera: Camera, shapes: tuple[Shape, ...], column: Any, row: Any) -> S
 
 
 OFFSET = 300
-"""Shadow rays start this many rounding errors above the surface: 4e-5 of the coordinates in float32."""
+"""What lies less than this many rounding errors above the surface, 4e-5 of the coordinates in float32, hides nothing."""
 
 
 def share_seen(
@@ -62,11 +62,17 @@ def share_seen(
     size = jnp.maximum(largest(position), largest(-position))
     rounding = float(jnp.finfo(size.dtype).eps)
     before = distance * (1 - 4 * OFFSET * rounding)
-    seen = jnp.ones_like(size) if point.facet is None else jnp.where(normal @ to_light > 0, 1.0, 0.0)
+    facing = normal @ to_light
+    seen = jnp.ones_like(size) if point.facet is None else jnp.where(facing > 0, 1.0, 0.0)
     for index, shape in enumerate(occluders):
-        moved = jnp.maximum(rounding * size, max(rounding, shape.rounding) * shape.extent())
-        start = position + normal * (OFFSET * jax.lax.stop_gradient(moved))
-        covered = shape.cover(start, to_light, before, radius)
+        least = jnp.maximum(rounding * size, max(rounding, shape.rounding) * shape.extent())
+        least = OFFSET * jax.lax.stop_gradient(least)
+        if radius is None and shape.convex:
+            # From where it is: from above the surface the edge of a hard shadow would lie elsewhere.
+            hit = shape.intersect(position, to_light)
+            covered = jnp.where(hit.hit & (hit.distance < before) & (hit.distance * facing > least), 1.0, 0.0)
+        else:
+            covered = shape.cover(position + normal * least, to_light, before, radius)
         if shape.convex and point.shape is not None:
             covered = jnp.where(point.shape == index, 0.0, covered)  # the horizon has dealt with that
         seen *= 1.0 - covered

@@ -53,7 +53,7 @@ class Shape(Checked):
         """The nearest hit in front of ``origin``."""
 
     def cover(self, origin: Components, direction: Components, distance: Any, radius: Any) -> Array:
-        """The share of a patch of light that the shape hides; without a radius, or of a mesh, that of its middle.
+        """The share of a patch of light that the shape hides, of a mesh that of its middle.
 
         The light stands in a direction from the origin, at a distance; the patch's radius is an angle.
         """
@@ -109,8 +109,6 @@ class Sphere(Shape):
 
     def cover(self, origin: Components, direction: Components, distance: Any, radius: Any) -> Array:
         """The share of the patch within the cone that the sphere fills; see `Shape.cover`."""
-        if radius is None:
-            return Shape.cover(self, origin, direction, distance, radius)
         to_center = Components.of(self.center) - origin
         along, square = to_center @ direction, to_center @ to_center
         miss = norm(to_center - direction * along)
@@ -167,8 +165,6 @@ class Rectangle(Shape, Parallelogram):
 
     def cover(self, origin: Components, direction: Components, distance: Any, radius: Any) -> Array:
         """The share of the patch within the pyramid over the rectangle; see `Shape.cover`."""
-        if radius is None:
-            return Shape.cover(self, origin, direction, distance, radius)
         center, *edges = map(Components.of, (self.center, self.edge_u, self.edge_v))
         to_center, normal = center - origin, normalize(edges[0].cross(edges[1]))
         height = to_center @ normal
