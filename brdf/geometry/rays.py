@@ -47,7 +47,7 @@ def trace(camera: Camera, shapes: tuple[Shape, ...], column: Any, row: Any) -> S
 
 
 OFFSET = 300
-"""What lies less than this many rounding errors above the surface, 4e-5 of the coordinates in float32, hides nothing."""
+"""What lies less than so many rounding errors above the surface hides nothing: 4e-5 of the coordinates in float32."""
 
 
 def share_seen(
