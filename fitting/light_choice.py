@@ -19,7 +19,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 import brdf
 from brdf.errors import InputError
@@ -165,13 +165,14 @@ def next_light(result: Any, candidates: Sequence[Any] | None = None, count: int 
             """Root mean square of the standard errors of what is wanted; infinite where one is not determined."""
             return float(np.sqrt(np.mean(inverse_diagonal(information, DEPENDENT)[wanted])))
 
-        scenes = [_scene(result, index) for index in range(len(result.scenes))]
-        first, weight = scenes[0]
+        scenes = [_scene(result, index, counted)[:2] for index, counted in enumerate(result.counted)]
+        clipped, ceiling = _clipped(result)
+        first, weight, counted = _scene(result, 0, result.counted[0] | clipped)
 
         def rendered(scene: brdf.Scene) -> np.ndarray:
             return np.asarray(brdf.render(material, scene, precision="float64")).reshape(weight.shape[0], -1)
 
-        bright = _by_brightness(rendered(first), weight)
+        bright = _by_brightness(rendered(first)[counted], weight[counted])
         to_view = np.asarray(first.surface_points().to_view, np.float64).reshape(-1, 3).mean(axis=0)
         information = np.sum([information_of(*scene) for scene in scenes], axis=0)
         # What is known is what the fit says, of codes by their edges: another picture is taken to tell as much a pixel.
@@ -183,7 +184,8 @@ def next_light(result: Any, candidates: Sequence[Any] | None = None, count: int 
             if lit.channels not in (1, channels):
                 what = f"have {lit.channels} channels, the pictures {channels}"
                 raise InputError("candidates", what, "Give both the same number, or light of one")
-            return unit * information_of(lit, weight if bright is None else bright(rendered(lit)))
+            shown = rendered(lit)
+            return unit * information_of(lit, (weight if bright is None else bright(shown)) * (shown < ceiling))
 
         return choose_lights(candidates, count, of, known, to_view, unit * information, information_by, error)
 
@@ -250,12 +252,27 @@ def direction_of(light: Light) -> np.ndarray:
     return direction / np.linalg.norm(direction)
 
 
-def _scene(result: FitResult, index: int) -> tuple[brdf.Scene, np.ndarray]:
-    """The pixels of a picture that counted, or some of them, and their weights, (P, 1 or C), which stand for all."""
-    pixel = np.flatnonzero(result.counted[index])
+def _clipped(result: FitResult) -> tuple[Bool[np.ndarray, "H W"], float]:
+    """Which pixels of the first picture are clipped, and from which value on; infinite where none is."""
+    target, counted = np.asarray(result.targets[0], np.float64), np.asarray(result.counted[0])
+    brightest = np.where(np.asarray(result.scenes[0].sight().mask).reshape(counted.shape), target.max(axis=-1), -np.inf)
+    clipped = ~counted & np.isfinite(brightest) & (brightest >= np.max(target[counted]))
+    clipped &= result.left_out.get("clipped", 0) > 0
+    return clipped, float(np.min(brightest, where=clipped, initial=np.inf))
+
+
+def _scene(
+    result: FitResult, index: int, which: Bool[np.ndarray, "H W"]
+) -> tuple[brdf.Scene, Float[np.ndarray, "P 1|C"], Bool[np.ndarray, " P"]]:
+    """Some pixels of a picture, at most so many, their weights, which stand for all of them, and which of them counted.
+
+    Those that did not weigh as much as the others do.
+    """
+    pixel, counted = np.flatnonzero(which), np.ravel(result.counted[index])
     some = pixel[:: -(-pixel.size // MOST_PIXELS)]
-    weight = result.weighed[index].reshape(result.counted[index].size, -1)[some] * (pixel.size / some.size)
-    return brdf.some_pixels(result.scenes[index], some, precision="float64"), weight
+    weight = result.weighed[index].reshape(counted.size, -1)
+    weight = np.where(counted[:, None], weight, np.mean(weight[counted], axis=0))[some] * (pixel.size / some.size)
+    return brdf.some_pixels(result.scenes[index], some, precision="float64"), weight, counted[some]
 
 
 def _by_brightness(value: np.ndarray, weight: np.ndarray) -> Callable[[np.ndarray], np.ndarray] | None:

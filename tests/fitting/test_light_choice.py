@@ -46,6 +46,18 @@ def test_what_codes_tell_is_foretold_as_it_comes():
     np.testing.assert_allclose(choice.after[0], both["n"].error, rtol=0.3)
 
 
+def test_what_will_be_clipped_tells_nothing_and_what_was_may_tell():
+    """Values of 8 bits with a code of noise; the highlight's top is clipped under either light, at its own place."""
+    material = dataclasses.replace(MATERIAL, k_d=[0.7] * 3, k_s=[1.0] * 3)
+    lights = [brdf.DirectionalLight(direction, [0.9] * 3) for direction in ([0.4, 0.5, 0.8], [-0.5, 0.2, 0.8])]
+    scenes, random = [ball_scene(light) for light in lights], np.random.default_rng(2)
+    shown = [255 * pictured(material, scene, 0.0) for scene in scenes]
+    codes = [np.clip(np.rint(one + random.normal(0, 1, one.shape)), 0, 255).astype(np.uint8) for one in shown]
+    assert all(20 < np.count_nonzero(one[..., 0] == 255) < 200 for one in codes)
+    one, both = (fitting.fit(*some, model="blinn-phong") for some in ((codes[0], scenes[0]), (codes, scenes)))
+    np.testing.assert_allclose(fitting.next_light(one, lights[1:]).after[0], both["n"].error, rtol=0.1)
+
+
 def test_no_direction_is_better_than_the_one_it_finds(result):
     choice = fitting.next_light(result)
     rng = np.random.default_rng(3)
