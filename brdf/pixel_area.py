@@ -36,8 +36,8 @@ from brdf.models import BlinnPhong
 from brdf.precision import apart
 from brdf.vectors import dot
 
-NARROW = 0.2
-"""Pixel size over distance from a lobe's centre from which on a pixel is averaged: 0.2 % of the lobe's peak."""
+NARROW = 0.05
+"""Pixel size over distance from a lobe's centre from which on a pixel is averaged: 0.01 % of the lobe's peak."""
 
 BENT = 0.9
 """Cosine between neighbouring normals of a mesh below which there is an edge between them."""

@@ -56,11 +56,22 @@ def test_a_pixel_is_an_area(n: float):
     assert np.max(np.abs(centres - expected)) > 0.1 * expected.max()
 
 
+@pytest.mark.parametrize("n", [15.0, 60.0, 400.0])
+def test_what_centres_leave_out_of_wider_highlights_is_next_to_nothing(n: float):
+    """Where no edge passes: with 2e-3 of the peak left out n of a picture without noise was 10 errors off."""
+    expected = pixel_averages(n)
+    got = np.asarray(brdf.render(glossy(n), ball(4, ambient=0.2), precision="float32"))[..., 0]
+    x, y = (np.arange(SIZE) + 0.5) / SIZE * 2.2 - 1.1, 1.1 - (np.arange(SIZE)[:, None] + 0.5) / SIZE * 2.2
+    lit = x * TO_LIGHT[0] + y * TO_LIGHT[1] + np.sqrt(np.maximum(1 - x * x - y * y, 0)) * TO_LIGHT[2]
+    inside = (x * x + y * y < 0.9) & (lit > 0.05)
+    assert np.max(np.abs(got - expected)[inside]) < 1.5e-4 * expected.max()
+
+
 def test_few_pixels_cost_more_than_one_sample():
-    area = ball(4).surface_points().area
+    area = ball(4, size=256).surface_points().area
     assert area is not None
     assert area.points.mask.shape[1] == 16
-    assert np.count_nonzero(np.asarray(area.slot) >= 0) < 0.08 * SIZE * SIZE
+    assert np.count_nonzero(np.asarray(area.slot) >= 0) < 0.08 * 256 * 256
 
 
 def test_a_fit_to_pixel_averages_needs_them():
