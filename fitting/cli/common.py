@@ -102,13 +102,21 @@ def _typed(one, documented, panel):
     kind = str if one.annotation is Any else one.annotation
     said = re.search(rf"^    {one.name}: (.+(\n     .+)*)", inspect.getdoc(documented) or "", re.MULTILINE)
     words = " ".join(said[1].split()) if said else ""
+    parser = _path if Path in (kind, *get_args(kind)) else None
     if panel is None and one.kind is not one.KEYWORD_ONLY:
-        about = typer.Argument(help=words)
+        about = typer.Argument(help=words, parser=parser)
     else:
         names = [_flag(one.name), *(["-o"] if one.name == "out" else [])]
         takes = next((word for known, word in TAKES.items() if known in (kind, *get_args(kind))), "TEXT")
-        about = typer.Option(*names, help=words, metavar=takes, rich_help_panel=panel)
+        about = typer.Option(*names, help=words, metavar=takes, rich_help_panel=panel, parser=parser)
     return one.replace(kind=one.KEYWORD_ONLY, annotation=Annotated[kind, about])
+
+
+def _path(text: str) -> Path:
+    """What was typed; what an empty shell variable leaves is none, or it would be the current folder."""
+    if not text:
+        raise typer.BadParameter("it is empty")
+    return Path(text)
 
 
 def _flag(name):

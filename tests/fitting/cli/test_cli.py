@@ -57,6 +57,12 @@ def test_what_cannot_be_fitted_is_told_before_jax_is_imported(tmp_path, name):
     assert err.startswith("error: ")
 
 
+@pytest.mark.parametrize("words", ["fit example --out", "fit", "convert gold", "check gold --plot"])
+def test_what_an_empty_variable_leaves_is_no_path(folder: Path, capsys, words: str):
+    """It was the current folder, and what lay there was replaced."""
+    refused(capsys, folder.parent, "it is empty", *words.split(), "")
+
+
 @pytest.mark.parametrize("name", ["fit", "lights", "render", "check", "convert", "tradeoff"])
 def test_each_help_text_shows_an_example(capsys, name):
     assert "Example: brdf" in run(capsys, name, "--help")[1]
