@@ -159,8 +159,11 @@ def _fitted(observed: Observed) -> _Fitted:
             precision = None if fit.evidence is None else fit.evidence.precision
             if fit.evidence is not None and not _too_wide(fit, problem):
                 likeliest = max(likeliest, fit.evidence.value)
-    fit, choice, statistics = _simplest(_comparable(fits, observed), by_squares, observed)
-    return *_less_codec_errors(fit, choice, observed), statistics
+    fits = _comparable(fits, observed)
+    fit, choice, tied, statistics = _simplest(fits, by_squares, observed)
+    del fits, by_squares  # what is known of the others fills memory
+    chosen = _as_chosen(fit, choice, tied)
+    return *_less_codec_errors(chosen, choice, observed), statistics if chosen is fit else None
 
 
 def picture_of(model: type[brdf.Material], tile: Tile, near: Near | None = None) -> Picture:
@@ -267,8 +270,8 @@ def _fit_about(
 
 def _simplest(
     fits: Mapping[str, ModelFit], by_squares: Mapping[str, ModelFit], observed: Observed
-) -> tuple[ModelFit, Choice, Residual | None]:
-    """Of fits of the families, the best first, the simplest adequate one on its own; what it leaves, where known."""
+) -> tuple[ModelFit, Choice, Float[np.ndarray, " C"] | None, Residual | None]:
+    """Of fits of the families, the best first, the simplest adequate one; what its x_s are tied to; what it leaves."""
     best = next(iter(fits.values()))
     grey = {name: coefficient_factors(fit.model, fit.optimum.n, observed.colour)[2] for name, fit in fits.items()}
     errors, likely, statistics = _told_apart_by(fits, observed, grey[best.model.name])
@@ -293,17 +296,18 @@ def _simplest(
         if chosen.tied is not None and not choice.grey:
             # Where channels err together a highlight is looked for in brightness; its colour is each channel's own.
             chosen = by_squares[choice.model]
-        elif np.array_equal(choice.free, chosen.free) and not choice.grey:
-            return chosen, choice, statistics
-    tied = grey[choice.model] if choice.grey else None
-    del fits, best  # what is known of the others fills memory
-    return _as_chosen(chosen, choice, tied), choice, None
+            if np.array_equal(choice.free, chosen.free):
+                chosen = most_likely(chosen)
+    return chosen, choice, grey[choice.model] if choice.grey else None, statistics
 
 
 def _as_chosen(fit: ModelFit, choice: Choice, tied: Float[np.ndarray, " C"] | None) -> ModelFit:
-    """A fit again with the terms of a choice alone."""
+    """A fit with the terms of a choice alone: again, unless it has no others."""
     pictures, optimum = fit.pictures, fit.optimum
-    if choice.model in FAMILIES or not np.array_equal(choice.free, fit.free):
+    others = choice.model in FAMILIES or not np.array_equal(choice.free, fit.free)
+    if not others and tied is None:
+        return fit
+    if others:
         optimum = search(pictures, choice.free, fit.n_range)
     if tied is not None:
         optimum = refit(pictures, optimum, choice.free, fit.n_range, tied)

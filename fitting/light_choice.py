@@ -165,7 +165,7 @@ def next_light(result: Any, candidates: Sequence[Any] | None = None, count: int 
             """Root mean square of the standard errors of what is wanted; infinite where one is not determined."""
             return float(np.sqrt(np.mean(inverse_diagonal(information, DEPENDENT)[wanted])))
 
-        scenes = [_scene(result, index, counted)[:2] for index, counted in enumerate(result.counted)]
+        scenes = [_scene(result, index, counted) for index, counted in enumerate(result.counted)]
         clipped, ceiling = _clipped(result)
         first, weight, counted = _scene(result, 0, result.counted[0] | clipped)
 
@@ -174,7 +174,7 @@ def next_light(result: Any, candidates: Sequence[Any] | None = None, count: int 
 
         bright = _by_brightness(rendered(first)[counted], weight[counted])
         to_view = np.asarray(first.surface_points().to_view, np.float64).reshape(-1, 3).mean(axis=0)
-        information = np.sum([information_of(*scene) for scene in scenes], axis=0)
+        information = np.sum([information_of(scene, weight) for scene, weight, _ in scenes], axis=0)
         # What is known is what the fit says, of codes by their edges: another picture is taken to tell as much a pixel.
         own = math.sqrt(np.mean([one.error**2 for one in asked]))
         unit = (error(information) / own) ** 2 if own > 0 else 1.0

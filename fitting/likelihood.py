@@ -220,14 +220,33 @@ class LogLikelihood(NamedTuple):
 _each_erfc = np.frompyfunc(math.erfc, 1, 1)
 
 
+def _tail(x: np.ndarray) -> np.ndarray:
+    """Of the normal distribution beyond x."""
+    return 0.5 * np.asarray(_each_erfc(x * math.sqrt(0.5)), np.float64)
+
+
+def _density(x: np.ndarray) -> np.ndarray:
+    return np.exp(-0.5 * x * x - _LOG_ROOT_TWO_PI)
+
+
+def _mills(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mills' ratio R = Q(x) / phi(x), and 1 - x R, for x > 0."""
+    small, large = np.minimum(x, _SERIES), np.maximum(x, _SERIES)
+    # 1 / R = x + 1 / (x + 2 / (x + 3 / ...)); what follows the first x is (1 - x R) / R.
+    tail = large
+    for term in range(_TERMS, 1, -1):
+        tail = large + term / tail
+    complement = np.asarray(_each_erfc(small * math.sqrt(0.5)), np.float64)
+    near, far = math.sqrt(0.5 * math.pi) * np.exp(0.5 * small * small) * complement, 1.0 / (large + 1.0 / tail)
+    return np.where(x > _SERIES, far, near), np.where(x > _SERIES, far / tail, 1.0 - small * near)
+
+
 def _around(near: np.ndarray, far: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Logarithm of P, mean, 1 - variance, for x1 <= 0 <= x2."""
-    below, beyond = np.asarray(_each_erfc(np.stack([-near, far]) * math.sqrt(0.5)), np.float64)
-    outside = 0.5 * (below + beyond)
+    outside = _tail(-near) + _tail(far)
     mass = 1.0 - outside
-    at_near, at_far = np.exp(-0.5 * np.stack([near, far]) ** 2 - _LOG_ROOT_TWO_PI)
-    mean = -at_near / mass * np.expm1(-0.5 * width * (near + far))
-    return np.log1p(-outside), mean, mean * mean + (far * at_far - near * at_near) / mass
+    mean = -_density(near) / mass * np.expm1(-0.5 * width * (near + far))
+    return np.log1p(-outside), mean, mean * mean + (far * _density(far) - near * _density(near)) / mass
 
 
 def _narrow(near: np.ndarray, far: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -247,17 +266,7 @@ def _narrow(near: np.ndarray, far: np.ndarray, width: np.ndarray) -> tuple[np.nd
 
 def _beyond(near: np.ndarray, far: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The same where the far end counts less."""
-    # Mills' ratio R = Q(x) / phi(x) of both, and 1 - x R: where x is large by 1 / R = x + 1 / (x + 2 / (x + 3 / ...));
-    # what follows the first x is (1 - x R) / R.
-    x = np.stack([near, far])
-    small, large = np.minimum(x, _SERIES), np.maximum(x, _SERIES)
-    tail = large
-    for term in range(_TERMS, 1, -1):
-        tail = large + term / tail
-    complement = np.asarray(_each_erfc(small * math.sqrt(0.5)), np.float64)
-    closed, series = math.sqrt(0.5 * math.pi) * np.exp(0.5 * small * small) * complement, 1.0 / (large + 1.0 / tail)
-    mills1, mills2 = np.where(x > _SERIES, series, closed)
-    rest1, rest2 = np.where(x > _SERIES, series / tail, 1.0 - small * closed)
+    (mills1, rest1), (mills2, rest2) = _mills(near), _mills(far)
     # Of the density at the near end.
     left = np.exp(-0.5 * width * (near + far))
     mass = mills1 - mills2 * left

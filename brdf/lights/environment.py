@@ -267,10 +267,10 @@ def cut(pixels: Float[np.ndarray, "H W C"], samples: int) -> Patches:
             corner + grid.step * (ends[0] + int(offset))
             for corner, ends, offset in zip(grid.corner, box, cell, strict=True)
         )
-        step = grid.step
-        down, about = (np.linspace(first, first + step, FINER + 1) for first in (row, column))
+        down, about = (np.linspace(first, first + grid.step, FINER + 1) for first in (row, column))
         radiance = np.broadcast_to(pixels[int(row), int(column)], (FINER, FINER, channels))
-        return _Grid(_moments(radiance, np.pi * down / height, 2 * np.pi * about / width), (row, column), step / FINER)
+        within = _moments(radiance, np.pi * down / height, 2 * np.pi * about / width)
+        return _Grid(within, (row, column), grid.step / FINER)
 
     whole = _Grid(moments)
     heap, done = [entry(whole, whole.all_cells)], []

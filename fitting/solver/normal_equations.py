@@ -95,14 +95,17 @@ class Picture:
         found = np.zeros((4, *self.target.shape), np.float64)
         found[0], found[1] = self.ambient, self.diffuse
         if self.lobe is not None:
-            on_host = isinstance(self.diffuse, np.ndarray) and not self.is_sampled
-            found[2], found[3] = self.lobe(cast(Any, n)) if on_host else _lobe(self.lobe, np.asarray(n))
+            found[2], found[3] = self.lobe(cast(Any, n)) if self._all_on_host else _lobe(self.lobe, np.asarray(n))
         return found
 
     @property
     def is_sampled(self) -> bool:
         """Whether the lobe is made anew from its light samples at each evaluation."""
         return self.lobe is not None and self.lobe.source is not None
+
+    @property
+    def _all_on_host(self) -> bool:
+        return isinstance(self.diffuse, np.ndarray) and not self.is_sampled
 
     def predicted(self, n: Any, x: Float[AnyArray, "3 C"]) -> Float[AnyArray, "P C"]:
         """What the model shows, in the dtype of the target, as a part of a program or by NumPy."""
@@ -115,13 +118,10 @@ class Picture:
 
     def predict(self, n: float, x: Float[np.ndarray, "3 C"]) -> Float[np.ndarray, "P C"]:
         """What the model shows, on the host; by NumPy where that takes less time than to trace and load a program."""
-        on_host = not self.is_sampled
-        if isinstance(self.diffuse, np.ndarray):
-            picture = self
-        else:
-            on_host &= self.target.size <= FEW_VALUES and device_count() == 1
-            picture = jax.tree.map(np.asarray, self) if on_host else self
-        return np.asarray((Picture.predicted if on_host else _predicted)(picture, np.asarray(n), x))
+        picture = self
+        if self.target.size <= FEW_VALUES and device_count() == 1 and not self.is_sampled:
+            picture = jax.tree.map(np.asarray, self)
+        return np.asarray((Picture.predicted if picture._all_on_host else _predicted)(picture, np.asarray(n), x))
 
     @property
     def counts(self) -> Bool[np.ndarray, " P"]:
