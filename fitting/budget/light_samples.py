@@ -20,13 +20,14 @@ import numpy as np
 
 from brdf.errors import InputError
 from brdf.lobes import STACKED_VALUES, STORED_SAMPLES, Near
-from fitting.budget.configurations import Configuration, run
+from fitting.budget.configurations import Configuration, Run, run
 from fitting.budget.error_estimate import Probes, is_dithered
 from fitting.budget.sampling import sample_counts, with_samples
 from fitting.core import UNSEEN
 from fitting.problem import FitProblem, has_pixel_areas
 from fitting.sample_error import MOST, SampleError, near_exponent
 from fitting.solver.nnls import scaled_inverse
+from fitting.uncertainty.covariance import LOST_IN_NOISE
 
 # Pixels of the first fit, its samples, and those that are tried.
 PIXELS, FIRST_SAMPLES = 1024, 64
@@ -99,21 +100,29 @@ def _refined(found: "_Ladder", noise: float) -> "_Ladder":
         found = _Ladder(found.problem, found.model, own, first, found.accuracy)
 
 
+def _matt(done: Run) -> Run:
+    """Less a highlight that noise has put there: it may be narrower than any, and ask for no end of samples."""
+    optimum = dataclasses.replace(done.optimum, x=done.optimum.x * [[1], [1], [0]])
+    return done._replace(result=dataclasses.replace(done.result, optimum=optimum))
+
+
 class _Ladder:
     """A model of more and more light samples at some pixels."""
 
     def __init__(self, problem: FitProblem, model: str, own: int, first: int, accuracy: float | None):
         """Fit some pixels under a first number of samples."""
         self.problem, self.model, self.own, self.first, self.accuracy = problem, model, own, first, accuracy
-        done = run(problem, Configuration(model, problem.precision, PIXELS, first))
-        self.done, self.optimum, self.x = done, done.optimum, done.optimum.x
-        self.probes = Probes(done)
+        self.done = run(problem, Configuration(model, problem.precision, PIXELS, first))
+        if any(one.reason == LOST_IN_NOISE for one in self.done.result.parameters):
+            self.done = _matt(self.done)
+        self.optimum, self.x = self.done.optimum, self.done.optimum.x
+        self.probes = Probes(self.done)
         # The search went up to the exponent that the nearest pixel sees a trace of.
         highest = np.max(self.optimum.grid, initial=0.0)
         self.peak = -UNSEEN / highest if 0 < highest < 0.999 * problem.n_range[1] else 0.0
         active = np.append((self.x > 0).ravel(), bool((self.x[2] > 0).any()))
         self.inverse = scaled_inverse(self.probes.hessian * np.outer(active, active))
-        self.shown, self.noise = {first: self.probes.shown}, float(np.sqrt(np.mean(done.result.noise**2)))
+        self.shown, self.noise = {first: self.probes.shown}, float(np.sqrt(np.mean(self.done.result.noise**2)))
         # What a count hardly larger than another one changes tells nothing of what both leave out.
         self.counts = sorted({own, *(some for some in LADDER if max(some / own, own / some) >= APART)})
 

@@ -25,6 +25,7 @@ RESOLUTION = 5e-7
 LEAST_SCATTER = 1e-6
 # A term that moves no pixel by more than this share of the brightest one leaves no trace.
 NO_TRACE = 1e-6
+LOST_IN_NOISE = "the highlight does not stand out of the noise"
 # A specular term counts when leaving it out raises the cost by so many noise variances for each of its unknowns.
 SIGNIFICANT = 10.0
 
@@ -294,7 +295,7 @@ def _without_trace(optimum: Optimum, gain: float, visible: float, *, grey: bool)
     if visible < NO_TRACE:
         return f"the highlight is below {NO_TRACE:g} of the picture"
     unknowns = 2 if grey else 1 + np.count_nonzero(optimum.x[2] > 0)
-    return "" if gain > SIGNIFICANT * unknowns else "the highlight does not stand out of the noise"
+    return "" if gain > SIGNIFICANT * unknowns else LOST_IN_NOISE
 
 
 def _adds_evenly(optimum: Optimum) -> bool:
