@@ -162,7 +162,7 @@ class Problem(ABC):
 
         The latter themselves where there are no others.
         """
-        which = [bounds.near(code, distance) for bounds, code in zip(self.bounds, codes, strict=True)]
+        which = [at_least_one(bounds.near(code, distance)) for bounds, code in zip(self.bounds, codes, strict=True)]
         if beside is not None:
             if not any(np.any(some & ~other.which) for some, other in zip(which, beside, strict=True)):
                 return beside
@@ -207,6 +207,12 @@ class Problem(ABC):
             for share in [sum(shares)] if self.copies else shares:
                 squares += np.einsum("up,up->u", share, share)
         return squares
+
+
+def at_least_one(which: Bool[np.ndarray, " P"]) -> Bool[np.ndarray, " P"]:
+    """With one pixel of a picture whose values are all sure: arrays of no pixels are no pictures."""
+    which[:1] |= not which.any()
+    return which
 
 
 class Precision(NamedTuple):

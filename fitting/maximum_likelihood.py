@@ -31,6 +31,7 @@ from fitting.continuation import (
     PictureScore,
     Problem,
     Score,
+    at_least_one,
     maximise,
     most_informative,
     most_informative_score,
@@ -159,13 +160,16 @@ def _where_noise_is_even(fit: ModelFit, noise: float) -> tuple[ModelFit, float]:
     return fit, _deviation(fit.pictures, fit.optimum)
 
 
-def _evener_in_light(problem: "_Separable", at: Estimate) -> Estimate | None:
-    """The most likely numbers with noise of one size in light, where they are likelier than any with it in codes."""
+def _evener_in_light(problem: "_Separable", at: Estimate, least: float) -> Estimate | None:
+    """The most likely numbers with noise of one size in light, where they are likelier than any with it in codes.
+
+    ``least`` is that of `maximise`, the same for both: with less noise any would be likelier.
+    """
     if at.noise < FAINT or not is_curved(problem.bounds):
         return None
     light = list(map(_values, _in_light([values.picture for values in problem.pixels])))
     start = Estimate(at.unknowns, max(at.noise, FIRST_NOISE))
-    even, *_ = maximise(_Separable(light, problem.design, problem.n_range, problem.copies), start, ROUGHLY_KNOWN)
+    even, *_ = maximise(_Separable(light, problem.design, problem.n_range, problem.copies), start, ROUGHLY_KNOWN, least)
     return even if even.value > at.value + LIKELIER else None
 
 
@@ -180,8 +184,9 @@ def _near_edges(fit: ModelFit, at: Estimate, rival: float = -math.inf) -> Eviden
     large = sum(picture.target.shape[0] for picture in pictures) > 2 * SUBSAMPLE
     some = [_stratum(picture, SUBSAMPLE // len(pictures)) for picture in pictures] if large else _gathered(pictures, at)
     problem = separable(some)
-    at, precisions, score = maximise(problem, at, ROUGHLY_KNOWN, FEWEST_VALUES) if large else maximise(problem, at)
-    if (even := _evener_in_light(problem, at)) is not None:
+    least = FEWEST_VALUES if large else 0.0
+    at, precisions, score = maximise(problem, at, ROUGHLY_KNOWN if large else ENOUGH_KNOWN, least)
+    if (even := _evener_in_light(problem, at, least)) is not None:
         return _near_edges(fit._replace(pictures=_in_light(pictures)), even, rival)
     if large and rival - at.value < max(FAR_BELOW, FAR_BELOW_SHARE * abs(at.value)):
         # The whole picture has the pixels near an edge that a part of it lacks.
@@ -456,7 +461,7 @@ def _gathered(pictures: Sequence[Picture], at: Estimate) -> list[Values]:
     """Those of whole pictures."""
     found = []
     for picture in pictures:
-        some = np.flatnonzero(_near(picture, Numbers.of(at.unknowns), REACH * at.noise))
+        some = np.flatnonzero(at_least_one(_near(picture, Numbers.of(at.unknowns), REACH * at.noise)))
         found.append(_values(picture.in_double(some)))
     return found
 

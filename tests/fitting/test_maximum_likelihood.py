@@ -44,6 +44,35 @@ def test_files_without_noise_are_read_within_their_errors(row: str, tmp_path: Pa
             assert abs(found["k_d[0]"][0]) < 3e-5, (seed, found)
 
 
+@pytest.mark.parametrize(
+    ("pictures", "size", "seed"),
+    [(2, 96, 5050), (5, 64, 6062)],
+    ids=["a highlight was lost", "a picture of which all values are sure"],
+)
+def test_several_files_without_noise_are_read_as_one_is(pictures: int, size: int, seed: int):
+    """A part of them ended at more noise in codes than in light, where it was taken to be: few pixels were left."""
+    random = np.random.default_rng(seed)
+    model = [brdf.Phong, brdf.BlinnPhong][seed % 2]
+    k_a, k_d, k_s = (random.uniform(low, high) for low, high in ((0.1, 0.6), (0.1, 0.5), (0.1, 0.5)))
+    n, ambient = np.exp(random.uniform(np.log(4), np.log(150))), random.uniform(0.1, 0.3)
+    camera = brdf.OrthographicCamera(
+        position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=[size, size]
+    )
+    towards = [[*random.uniform(-0.8, 0.8, 2), 1.0] for _ in range(pictures)]
+    scenes = [
+        brdf.Scene(camera, [brdf.Sphere([0, 0, 0], 1)], ambient=[ambient], lights=[light])
+        for light in (brdf.DirectionalLight(one, intensity=[random.uniform(0.5, 1.2)]) for one in towards)
+    ]
+    material = model(k_a=k_a, k_d=k_d, k_s=k_s, n=n)
+    drawn = [np.asarray(brdf.render(material, scene, precision="float64")) for scene in scenes]
+    white = np.max(drawn) / 0.95
+    files = [np.rint(255 * encode(one / white, "srgb")).astype(np.uint8) for one in drawn]
+    found = fitting.fit(files, scenes, model=model, encoding="srgb")
+    for name, true in (("k_a", k_a), ("k_d", k_d), ("k_s", k_s)):
+        assert found[name][0].value == pytest.approx(true / white, rel=3e-3), name
+    assert found["n"].value == pytest.approx(n, rel=3e-3)
+
+
 def test_whole_numbers_in_floats_are_codes_that_were_rounded():
     """They lie on the levels of RGBE too, which truncates: half a code of bias."""
     one = ball(1, size=48)
