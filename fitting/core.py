@@ -80,7 +80,8 @@ def fit_pictures(problem: FitProblem) -> FitResult:
 
     with working_precision(problem.precision):
         seen = observe(problem)
-        fit, choice, observed, statistics = _with_growing_noise(_fitted(_evenly_noisy(seen)), seen)
+        even = _fitted(_evenly_noisy(seen))
+        fit, choice, observed, statistics = grown = _with_growing_noise(even, seen)
         fit = _held_plausible(fit, observed)
         if fit.capped or problem.loss != "squared":
             statistics = None
@@ -99,6 +100,9 @@ def fit_pictures(problem: FitProblem) -> FitResult:
             rest = _held_plausible(most_likely(_fit_model(fit.model, observed, free, pictures)), observed)
             fit = rest._replace(moved=(_by_highlight(fit, rest, observed),))
             result = _interpreted(fit, observed, choice, hidden)
+    if grown is not even:
+        # Of the picture as it is, not as noise weighs it.
+        result = dataclasses.replace(result, residual=even[0].residual)
     candidates = () if choice is None else choice.candidates
     return dataclasses.replace(result, candidates=candidates, optimum=optimum)
 

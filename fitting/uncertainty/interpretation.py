@@ -70,6 +70,7 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: R
     """
     optimum, pictures, evidence = fit.optimum, fit.pictures, fit.evidence
     about = observed.result_fields() | {"optimum": optimum, "pixels": int(np.min(optimum.pixels))}
+    about["residual"] = fit.residual
     weight = _typical_weight(pictures)
     rounding, columns = observed.rounding * weight, rms_columns(optimum, weight)
     noise = np.maximum(residual_noise(optimum, rounding) * fit.noise_factor, rounding)
@@ -136,7 +137,6 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: R
         noise=noise,
         structure=statistics.neighbours.correlation,
         highlight_pixels=None if lobe is None else lobe.pixels,
-        residual=fit.residual,
         warnings=tuple(warnings),
         correlation=correlation,
         **about,

@@ -44,6 +44,17 @@ def test_files_without_noise_are_read_within_their_errors(row: str, tmp_path: Pa
             assert abs(found["k_d[0]"][0]) < 3e-5, (seed, found)
 
 
+@pytest.mark.parametrize("row", ["sRGB 8 bit", "half", "sRGB 8 bit, camera"])
+def test_the_residual_told_is_that_of_the_picture(row: str, tmp_path: Path):
+    """Behind codes it was that of the values near an edge, with noise that grows a weighted one: a fifth of it."""
+    file = COVERAGE[row]
+    one = ball(3, channels=file.channels)
+    result = fitting.fit(file.picture(one.drawn(), 3, tmp_path), one.scene(), model=one.model)
+    (target,), (counted,) = result.targets, result.counted
+    left = (target - np.asarray(brdf.render(result.material, one.scene())))[counted]
+    assert result.residual == pytest.approx(np.linalg.norm(left) / np.linalg.norm(target[counted]), rel=5e-3)
+
+
 @pytest.mark.parametrize(
     ("pictures", "size", "seed"),
     [(2, 96, 5050), (5, 64, 6062)],
