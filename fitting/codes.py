@@ -11,6 +11,7 @@ The largest code of an integer picture has no upper bound and 0 no lower one: th
 A float array whose values all lie on the levels of one of these, or are whole numbers, is taken as such.
 """
 
+import math
 from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
@@ -39,6 +40,8 @@ FINE = 8192
 # Pixels on a side of what a codec for photographs transforms together; twice that where colours have half the
 # resolution.
 BLOCK = 8
+# So many values tell the usual step.
+SOME_VALUES = 1 << 16
 # Bits of a half float.
 HALF = 16
 
@@ -83,11 +86,13 @@ class Codes(NamedTuple):
 
     @property
     def usual_step(self) -> float:
-        """Distance of the two ends of a linear value: the median of those above 0."""
-        some = np.isfinite(self.values) & (self.values > 0)
-        code, below, above = (np.broadcast_to(x, some.shape)[some] for x in (self.values, self.below, self.above))
+        """Distance of the two ends of a linear value: the median of those above 0, of every so many pixels."""
+        shape, stride = self.values.shape, 1 + math.isqrt(self.values.size // SOME_VALUES)
+        arrays = (self.values, self.below, self.above, self.unit)
+        parts = [np.broadcast_to(part, shape)[::stride, ::stride] for part in arrays]
+        some = np.isfinite(parts[0]) & (parts[0] > 0)
+        code, below, above, unit = (part[some] for part in parts)
         ends = (decode(np.maximum(end, 0) / self.scale, self.encoding) for end in (code + above, code - below))
-        unit = np.broadcast_to(self.unit, some.shape)[some]
         return float(np.median(np.subtract(*ends) * unit)) if some.any() else 0.0
 
     def middle(self, pixels: Float[np.ndarray, "H W C"]) -> Float[np.ndarray, "H W C"]:

@@ -30,7 +30,7 @@ _WRITABLE: dict[str, Mapping[str, tuple[Any, ...]]] = {
     ".jpg": _JPEG,
     ".jpeg": _JPEG,
 }
-_LARGEST_HALF = 65504.0
+_LARGEST = {"half": 65504.0, "RGBE": 255 / 256 * 2.0**127}
 _SPACES = {"linear": "lin_rec709_scene", "srgb": "srgb_rec709_scene"}
 
 
@@ -41,7 +41,8 @@ def write_image(
 
     Args:
         path: the file; its suffix chooses the format: .exr, .hdr, .png, .tif, .tiff, .jpg, .jpeg.
-        array: linear values, (H, W) or (H, W, C). In integer formats values are clipped to [0, 1] and NaN becomes 0.
+        array: linear values, (H, W) or (H, W, C). In integer formats values are clipped to [0, 1] and NaN becomes 0;
+            in HDR, which has no sign, values below 0 and NaN do.
         dtype: "float" or "half" (EXR, TIFF), "uint8" or "uint16" (PNG, TIFF); None for float, or uint8
             in PNG and JPEG.
         encoding: integers only: "srgb" (the default), "linear" or a gamma. The file says which; where the format has no
@@ -64,15 +65,17 @@ def write_image(
         what = f"a {suffix} file holds 1 or 3 channels, got {pixels.shape[2]}"
         raise InputError(path, what, "Write .exr or .tif instead")
     if suffix == ".hdr":
-        pixels = np.broadcast_to(pixels, (*pixels.shape[:2], 3))
+        pixels = np.fmax(np.broadcast_to(pixels, (*pixels.shape[:2], 3)), 0.0)
     encoded = parse_encoding("encoding", encoding) or sayable[0]
     if encoded not in sayable:
         words = f"Use {', '.join(map(str, sayable))}"
         raise InputError(path, f"a {suffix} of {kind} cannot say that it is encoded as {encoded}", words)
     if kind.startswith("uint"):
         pixels = encode(np.clip(np.nan_to_num(pixels, nan=0.0), 0.0, 1.0), encoded)
-    elif kind == "half" and np.any(np.abs(pixels[np.isfinite(pixels)]) > _LARGEST_HALF):
-        raise InputError(path, f"half floats end at {_LARGEST_HALF:.0f}", 'Write dtype "float" instead')
+    elif kind == "half" and np.any(np.abs(pixels[np.isfinite(pixels)]) > _LARGEST["half"]):
+        raise InputError(path, f"half floats end at {_LARGEST['half']:.0f}", 'Write dtype "float" instead')
+    elif suffix == ".hdr" and np.any(pixels > _LARGEST["RGBE"]):
+        raise InputError(path, f"values in HDR end at {_LARGEST['RGBE']:.3g}", "Write .exr instead")
     coverage = [] if alpha is None else [np.clip(_pixels(path, alpha), 0.0, 1.0)]
     if coverage and (suffix in (".hdr", ".jpg", ".jpeg") or coverage[0].shape != (*pixels.shape[:2], 1)):
         what = f"alpha of shape {coverage[0].shape[:2]} cannot go with a {suffix} of shape {pixels.shape[:2]}"
@@ -124,6 +127,7 @@ def _write(path, layers, kind, encoding, coverage=()):
     spec.channelnames = tuple(names)
     spec.alpha_channel = names.index("A") if coverage else -1
     spec.attribute("oiio:UnassociatedAlpha", 1)
+    spec.attribute("DateTime", "")  # or the same picture would be another file a second later
     if as_path(path).suffix.lower().startswith(".jp"):
         spec.attribute("CompressionQuality", 95)
         spec.attribute("jpeg:subsampling", "4:4:4")

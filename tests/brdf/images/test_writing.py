@@ -3,6 +3,7 @@
 import struct
 import subprocess
 import sys
+import time
 
 import numpy as np
 import OpenImageIO as oiio
@@ -109,6 +110,28 @@ def test_what_cannot_be_written(tmp_path, name, array, options, said):
     with pytest.raises(InputError, match=said):
         write_image(tmp_path / name, array, **options)
     assert not list(tmp_path.iterdir())
+
+
+def test_hdr_has_no_sign(tmp_path):
+    """It held 3 for -1, and 0 0 0 where a value was beyond the format's."""
+    path = tmp_path / "a.hdr"
+    write_image(path, [[[-1.0, 2.0, 0.5], [np.nan, 0.25, 1e38]]])
+    np.testing.assert_allclose(read_image(path), [[[0, 2, 0.5], [0, 0, 1e38]]], rtol=2**-7)
+    for beyond in (2e38, np.inf):
+        with pytest.raises(InputError, match="values in HDR end at"):
+            write_image(path, [[[beyond]]])
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".tif", ".hdr", ".png", ".jpg"])
+def test_a_file_does_not_hang_on_the_time_of_day(tmp_path, suffix, monkeypatch):
+    files = []
+    for seconds in ("UTC+0", "UTC+1"):
+        monkeypatch.setenv("TZ", seconds)
+        time.tzset()
+        path = tmp_path / f"{seconds}{suffix}"
+        write_image(path, np.full((4, 4, 3), 0.5))
+        files.append(path.read_bytes())
+    assert files[0] == files[1]
 
 
 @pytest.mark.parametrize(
