@@ -16,6 +16,7 @@ class Attempt:
         rounding: the part of rounding.
         configuration: in words.
         seconds: that fit and estimate took.
+        squares: the part of that of the pixels which least squares has beside codes, however many are taken.
     """
 
     error: float
@@ -25,6 +26,7 @@ class Attempt:
     rounding: float
     configuration: str = ""
     seconds: float = 0.0
+    squares: float = 0.0
 
 
 @dataclass(frozen=True)

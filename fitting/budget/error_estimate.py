@@ -157,7 +157,7 @@ def estimate(run: Run) -> Attempt:
     squares = _by_least_squares(run, probes)
     error, bound = squares + np.quantile(np.hypot(probes.error(drawn), math.hypot(light, rounding)), [0.5, 0.95])
     pixels = squares + np.quantile(probes.error(drawn), 0.95)
-    return Attempt(float(error), float(bound), float(pixels), light, rounding)
+    return Attempt(float(error), float(bound), float(pixels), light, rounding, squares=squares)
 
 
 def is_dithered(noise: float, step: float) -> bool:

@@ -98,6 +98,10 @@ def _better(now: Configuration, estimated: Attempt, accuracy: float | None, most
     aim = LESS * estimated.pixels if accuracy is None else (AIM if estimated.light else AIM_OF_PIXELS) * accuracy
     if now.pixels is None or estimated.pixels <= aim:
         return None
+    # What least squares itself has no more pixels lessen, but the likelihood of all.
+    drawn, aim = estimated.pixels - estimated.squares, aim - estimated.squares
+    if aim <= 0:
+        return dataclasses.replace(now, pixels=None)
     # A power of two, so that programs are compiled for few sizes.
-    pixels = now.pixels << math.ceil(2 * math.log2(estimated.pixels / aim))
+    pixels = now.pixels << max(math.ceil(2 * math.log2(drawn / aim)), 1)
     return dataclasses.replace(now, pixels=pixels if pixels <= most else None)
