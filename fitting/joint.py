@@ -476,7 +476,7 @@ def _err_together(
 ) -> bool:
     """Whether pixels err together; those of compressed files beyond the blocks of these, whose errors know of it.
 
-    In others neighbours may, or blocks of pixels in the channels whose noise is more than rounding.
+    In others neighbours may, or blocks of pixels in the channels whose noise is more than rounding: that errs together.
     """
     lossy = any(tile.bounds is not None and tile.bounds.lossy for tile in observed.tiles)
     some, grids = slice(1 if observed.copies else None), []
@@ -488,7 +488,7 @@ def _err_together(
         errors = Errors(left, np.arange(len(left)), width)
         grids.append(of_coded_blocks(errors) if lossy else over_blocks(errors, SIZES[0]))
     beyond = structure(grids, CODED_SIZES if lossy else SIZES).significant
-    return beyond or (neighbours and not lossy)
+    return beyond or bool(neighbours and not lossy and np.any(tell))
 
 
 def _of_pixels(values: Float[np.ndarray, "P C"], pixel: Int[np.ndarray, " K"] | None) -> Float[np.ndarray, "K C"]:

@@ -114,22 +114,36 @@ def structure(
     for size in sizes:
         if size > sizes[0]:
             parts = [coarser(part, 2) for part in parts]
+        if not even:
+            excess = np.maximum(excess, _by_noise(parts, missed))
+            continue
         joined, alone, pixels = np.concatenate([part.reshape(-1, 3) for part in parts]).T.astype(float)
         # In a block with few pixels the ratio says little.
         usual = np.sum(alone) / max(np.sum(pixels), 1.0)
-        seen = (pixels >= FULL * size**2 * even) & (alone > QUIET * usual * pixels * even)
+        seen = (pixels >= FULL * size**2) & (alone > QUIET * usual * pixels)
         joined, alone, pixels = joined[seen], alone[seen], pixels[seen]
-        if not joined.size:
-            continue
-        squares = joined**2 - np.array([[0.0], [missed]]) ** 2 * alone**2
-        if even:
+        if joined.size:
+            squares = joined**2 - np.array([[0.0], [missed]]) ** 2 * alone**2
             # Wilson and Hilferty (1931): the cube root of chi squared is nearly normal.
             spread = np.sum(2 * (pixels - 1) / (pixels + 2)) / (9 * joined.size**2)
             found = (np.cbrt(np.mean(squares / alone, axis=1)) - (1 - spread)) / math.sqrt(spread)
-        else:
-            found = SIGNIFICANT / CHANCE * np.sum(squares - alone, axis=1) / math.sqrt(np.sum(2 * alone**2))
-        excess = np.maximum(excess, found)
+            excess = np.maximum(excess, found)
     return Structure(*excess.tolist())
+
+
+def _by_noise(parts: Sequence[np.ndarray], missed: float) -> Float[np.ndarray, "2"]:
+    """The excess where blocks count by their noise; each picture in deviations of its own.
+
+    One of more noise, as a picture has whose scene is not as stated, would be lost in what the others say.
+    """
+    deviations = []
+    for part in parts:
+        joined, alone, _ = part.reshape(-1, 3).T.astype(float)
+        deviation = math.sqrt(np.sum(2 * alone**2))
+        if deviation > 0:
+            squares = joined**2 - np.array([[0.0], [missed]]) ** 2 * alone**2
+            deviations.append(np.sum(squares - alone, axis=1) / deviation)
+    return SIGNIFICANT / CHANCE * np.sum(deviations, axis=0) / math.sqrt(max(len(deviations), 1))
 
 
 def of_coded_blocks(errors: Errors) -> Blocks:

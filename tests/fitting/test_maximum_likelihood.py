@@ -62,6 +62,37 @@ def test_the_residual_told_is_that_of_the_picture(row: str, tmp_path: Path):
 )
 def test_several_files_without_noise_are_read_as_one_is(pictures: int, size: int, seed: int):
     """A part of them ended at more noise in codes than in light, where it was taken to be: few pixels were left."""
+    files, scenes, material, white = several(pictures, size, seed, "srgb")
+    found = fitting.fit(files, scenes, model=type(material), encoding="srgb")
+    for name in ("k_a", "k_d", "k_s"):
+        assert found[name][0].value == pytest.approx(float(getattr(material, name)[0]) / white, rel=3e-3), name
+    assert found["n"].value == pytest.approx(float(material.n), rel=3e-3)
+
+
+@pytest.mark.parametrize("seed", [8000, 8001])
+def test_one_wrong_light_of_several_is_told_from_files_without_noise(seed: int):
+    """The picture under it was taken to be noisy, and was lost beside what the others say."""
+    files, scenes, material, _ = several(3, 48, seed, "linear")
+    assert not fitting.fit(files, scenes, model=type(material)).warnings
+    (light,) = scenes[1].lights
+    assert isinstance(light, brdf.DirectionalLight)
+    turned = dataclasses.replace(light, direction=np.asarray(light.direction) + 0.05 * np.eye(3)[0])
+    scenes[1] = dataclasses.replace(scenes[1], lights=(turned,))
+    result = fitting.fit(files, scenes, model=type(material))
+    assert any("structure" in text for text in result.warnings)
+    assert result.diagnosis[0].name.startswith("light")
+
+
+@pytest.mark.parametrize("seed", range(5001, 5015, 2))
+def test_rounding_is_no_structure_of_a_joint_fit(seed: int):
+    files, scenes, material, _ = several(3, 48, seed, "linear")
+    assert not fitting.fit_jointly(files, scenes, type(material)).warnings
+
+
+def several(
+    pictures: int, size: int, seed: int, encoding: Encoding
+) -> tuple[list[np.ndarray], list[brdf.Scene], brdf.Phong | brdf.BlinnPhong, float]:
+    """Files of a ball without noise, each under a light of its own, its material, and what is white in them."""
     random = np.random.default_rng(seed)
     model = [brdf.Phong, brdf.BlinnPhong][seed % 2]
     k_a, k_d, k_s = (random.uniform(low, high) for low, high in ((0.1, 0.6), (0.1, 0.5), (0.1, 0.5)))
@@ -76,12 +107,8 @@ def test_several_files_without_noise_are_read_as_one_is(pictures: int, size: int
     ]
     material = model(k_a=k_a, k_d=k_d, k_s=k_s, n=n)
     drawn = [np.asarray(brdf.render(material, scene, precision="float64")) for scene in scenes]
-    white = np.max(drawn) / 0.95
-    files = [np.rint(255 * encode(one / white, "srgb")).astype(np.uint8) for one in drawn]
-    found = fitting.fit(files, scenes, model=model, encoding="srgb")
-    for name, true in (("k_a", k_a), ("k_d", k_d), ("k_s", k_s)):
-        assert found[name][0].value == pytest.approx(true / white, rel=3e-3), name
-    assert found["n"].value == pytest.approx(n, rel=3e-3)
+    white = float(np.max(drawn)) / 0.95
+    return [np.rint(255 * encode(one / white, encoding)).astype(np.uint8) for one in drawn], scenes, material, white
 
 
 def test_whole_numbers_in_floats_are_codes_that_were_rounded():
