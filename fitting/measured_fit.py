@@ -417,6 +417,12 @@ def _fit_model(model, samples, loss, n_range):
         interval = exponent_interval(fit, errors.n_error, errors.reach, errors.delta_cost, 0.0, parabolic=True)
         errors = errors._replace(n_reason=fit.held)
     material, parameters = material_and_parameters(fit, errors, np.ones(channels), interval)
+    lobe, reasons = parameters[2 * channels :], {one.reason for one in parameters[2 * channels :]}
+    if specular and len(reasons) == 1 and all(one.value is None for one in lobe):
+        # Or k_d would be the one that goes with a highlight which the material does not have.
+        matt = _fit_model(brdf.Lambert, samples, loss, n_range)
+        material = dataclasses.replace(material, k_d=matt.material.k_d)
+        return BrdfCandidate(material, (*matt.parameters, *lobe), matt.losses)
     return BrdfCandidate(material, tuple(one for one in parameters if one.name != "k_a"), least)
 
 
