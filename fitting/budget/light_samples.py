@@ -112,17 +112,17 @@ class _Ladder:
     def __init__(self, problem: FitProblem, model: str, own: int, first: int, accuracy: float | None):
         """Fit some pixels under a first number of samples."""
         self.problem, self.model, self.own, self.first, self.accuracy = problem, model, own, first, accuracy
-        self.done = run(problem, Configuration(model, problem.precision, PIXELS, first))
-        if any(one.reason == LOST_IN_NOISE for one in self.done.result.parameters):
-            self.done = _matt(self.done)
-        self.optimum, self.x = self.done.optimum, self.done.optimum.x
-        self.probes = Probes(self.done)
+        done = run(problem, Configuration(model, problem.precision, PIXELS, first))
+        if any(one.reason == LOST_IN_NOISE for one in done.result.parameters):
+            done = _matt(done)
+        self.done, self.optimum, self.x = done, done.optimum, done.optimum.x
+        self.probes = Probes(done)
         # The search went up to the exponent that the nearest pixel sees a trace of.
         highest = np.max(self.optimum.grid, initial=0.0)
         self.peak = -UNSEEN / highest if 0 < highest < 0.999 * problem.n_range[1] else 0.0
         active = np.append((self.x > 0).ravel(), bool((self.x[2] > 0).any()))
         self.inverse = scaled_inverse(self.probes.hessian * np.outer(active, active))
-        self.shown, self.noise = {first: self.probes.shown}, float(np.sqrt(np.mean(self.done.result.noise**2)))
+        self.shown, self.noise = {first: self.probes.shown}, float(np.sqrt(np.mean(done.result.noise**2)))
         # What a count hardly larger than another one changes tells nothing of what both leave out.
         self.counts = sorted({own, *(some for some in LADDER if max(some / own, own / some) >= APART)})
 
