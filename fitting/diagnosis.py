@@ -10,6 +10,7 @@ Pictures are compared in the codes of their file where it has a curve, since noi
 """
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
@@ -24,7 +25,7 @@ import brdf
 from brdf.images.encoding import encode
 from brdf.precision import working_precision
 from fitting.core import picture_of
-from fitting.joint_problem import JointProblem, joint_problem, scene_leaves
+from fitting.joint_problem import JointProblem, joint_problem, place_of, scene_leaves, turns
 from fitting.likelihood import how_many_alike, weight_of_alike
 from fitting.pixels import Tile
 from fitting.result import Cause, FitResult
@@ -37,7 +38,8 @@ BLACK = (
 )
 # Of each kind of cause the unit, what to do, and what size or error is no small change, of pixels the share of a side.
 KINDS = {
-    "light": ("degrees", "free its direction: fit_jointly, --free light", 30.0),
+    "light": ("degrees", "free it: fit_jointly, --free light", 30.0),
+    "distance": ("%", "free its position: fit_jointly, --free distance", 50.0),
     "intensity": ("%", "free it: fit_jointly or fit_lights, --free intensity", 100.0),
     "ball": ("pixels", "find its circle again, or free it: fit_jointly, --free ball", 0.1),
     "radius": ("pixels", "find its circle again, or free it: fit_jointly, --free radius", 0.1),
@@ -121,14 +123,22 @@ class _Picture:
         several = max(len(scene.lights) for scene in result.scenes) > 1
         one_of = f" of picture {index}" if len(result.scenes) > 1 else ""
         self.moves: dict[str, Sequence[Any]] = {}
-        for place, light in enumerate(self.scene.lights):
-            which, leaf = (f" {place}" if several else "") + one_of, f"lights[{place}]"
-            if isinstance(light, brdf.DirectionalLight):
+        camera, shapes = self.scene.camera, self.scene.shapes
+        is_ball = len(shapes) == 1 and isinstance(shapes[0], brdf.Sphere)
+        middle = shapes[0].center if is_ball else self._middle()
+        for at, light in enumerate(self.scene.lights):
+            which, leaf = (f" {at}" if several else "") + one_of, f"lights[{at}]"
+            place = place_of(light)
+            if place == "direction":
                 self.moves[f"light{which}"] = [{f"{leaf}.direction": turn} for turn in math.radians(1) * np.eye(2)]
+            elif place is not None:
+                away = np.asarray(getattr(light, place), np.float64) - middle
+                across = math.radians(1) * np.asarray(turns(jnp.asarray(away)))
+                self.moves[f"light{which}"] = [{f"{leaf}.{place}": turn} for turn in across]
+                self.moves[f"distance{which}"] = [{f"{leaf}.{place}": away / 100}]
             field = "intensity" if "intensity" in vars(light) else "radiance"
             self.moves[f"intensity{which}"] = [{f"{leaf}.{field}": np.asarray(light.emittance) / 100}]
-        camera, shapes = self.scene.camera, self.scene.shapes
-        if camera is not None and len(shapes) == 1 and isinstance(shapes[0], brdf.Sphere):
+        if camera is not None and is_ball:
             width, height = camera.resolution
             rays = camera.rays(np.array([0.0, 1.0, 0.0]) + width / 2, np.array([0.0, 0.0, 1.0]) + height / 2)
             origin, direction = (np.asarray(part.stacked(), np.float64) for part in rays)
@@ -157,6 +167,11 @@ class _Picture:
         logarithm = np.log(np.where(self.fitted > 0, self.fitted, 1.0))
         self.moves["gamma"] = [0.01 * self.fitted * logarithm]
         self.moves["black"] = [np.full(self.fitted.shape, 0.01)]
+
+    def _middle(self) -> Float[np.ndarray, "3"]:
+        """Of the surface that counts."""
+        points = brdf.some_pixels(self.scene, self._pixel, precision="float64").surface_points()
+        return np.asarray(points.position)[self.counted].sum(axis=0) / max(np.count_nonzero(self.counted), 1)
 
     def _step(self) -> float:
         """Between the codes that are used; 0 where there is only one."""
@@ -269,27 +284,31 @@ class Residual:
                 yield _Test(Cause(name, size, error, unit, share, remedy), columns, gain, inflation)
 
     def mirrored(self) -> Iterator[_Test]:
-        """Whether the pictures show the scenes mirrored."""
+        """Whether the pictures, or one of several, show the scenes mirrored."""
         if self.excess <= LEAST_SIZE**2:
             return
         lit = [picture.lit() for picture in self.pictures]
-        for name, axis in MIRRORED.items():
-            good = [picture.counted & np.flip(picture.counted, axis) for picture in self.pictures]
+        several = range(len(lit)) if len(lit) > 1 else ()
+        for (name, axis), one in itertools.product(MIRRORED.items(), (None, *several)):
+            axes = [axis if one in (None, index) else () for index in range(len(lit))]
+            both = list(zip(self.pictures, axes, strict=True))
+            good = [picture.counted & np.flip(picture.counted, axis) for picture, axis in both]
             size = sum(map(np.count_nonzero, good)) * self.channels
             if 2 * size < self.left.size:
                 continue
             # Fitted alike: a picture that is its own mirror image gains nothing.
-            before = self._least(lit, good, ())
-            gain = before - self._least(lit, good, axis)
+            before = self._least(lit, good, [()] * len(lit))
+            gain = before - self._least(lit, good, axes)
             share = min(gain / max(before - size, gain, 1.0), 1.0)
             if share > LEAST_MIRRORED and gain > LEAST_SIZE**2:
-                cause = Cause(name, 1.0, 0.0, "", share, "flip the picture, or the lights and the shape")
+                words = name if one is None else f"{name} of picture {one}"
+                cause = Cause(words, 1.0, 0.0, "", share, "flip the picture, or the lights and the shape")
                 yield _Test(cause, np.zeros((self.left.size, 0)), gain)
 
-    def _least(self, lit: list[Picture], good: list[Bool[np.ndarray, "H W"]], axis: Any) -> float:
+    def _least(self, lit: list[Picture], good: list[Bool[np.ndarray, "H W"]], axes: list[Any]) -> float:
         """Squares that the model leaves of some pixels of the pictures, flipped, in units of the noise."""
         solved = []
-        for picture, basis, some in zip(self.pictures, lit, good, strict=True):
+        for picture, basis, some, axis in zip(self.pictures, lit, good, axes, strict=True):
             target = np.flip(picture.target, axis)
             weight = some[..., None] * np.flip(picture.weight, axis) * (picture.curve(target) / picture.noise) ** 2
             values, weight = (jnp.asarray(a.reshape(-1, self.channels)) for a in (target, weight))

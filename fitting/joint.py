@@ -114,8 +114,8 @@ def fit_jointly(
             for the simplest adequate model under the scenes that were found.
         free: from material and list of scenes to the leaf or leaves to fit, for example
             ``lambda m, s: (m.k_d, m.n, s[0].lights[0].direction)``; all others are held. Or what `FitResult.diagnosis`
-            names beside the whole material: "light", "intensity", "ball" or "radius", also "light 1 of picture 0"; None
-            for the material alone.
+            names beside the whole material: "light" or "distance" (of a near light its place), "intensity", "ball" or
+            "radius", also "light 1 of picture 0"; None for the material alone.
             Where camera or shapes are freed, pixels near an outline do not count.
         solver: "lm", "bfgs", or None for Gauss and Newton's steps, and where they do not gain one of these by size.
         precision: "float32" or "float64".

@@ -21,7 +21,7 @@ from brdf.errors import InputError
 from brdf.vectors import norm, normalize, perpendicular
 
 # What a diagnosis names that is a number of a scene.
-NAMED = re.compile(r"(light|intensity|ball|radius)(?: (\d+))?(?: of picture (\d+))?")
+NAMED = re.compile(r"(light|distance|intensity|ball|radius)(?: (\d+))?(?: of picture (\d+))?")
 # What freed leaves may not go below 0.
 NOT_NEGATIVE = ("k_a", "k_d", "k_s", "intensity", "radiance", "ambient", "attenuation")
 # Derivatives of the renderer are as fast without, and compiled in half the time. From 0.11 on XLA has no such option.
@@ -192,7 +192,7 @@ def named_leaves(names: Sequence[str]) -> Callable[[Any, list[brdf.Scene]], list
     """The leaves of causes that a diagnosis names, after those of the material."""
     asked = [NAMED.fullmatch(str(name)) for name in names]
     if None in asked:
-        words = "Name light, intensity, ball or radius, or one of them as the diagnosis does"
+        words = "Name light, distance, intensity, ball or radius, or one of them as the diagnosis does"
         raise InputError("free", f"names {names[asked.index(None)]!r}, which is no number of a scene", words)
 
     def leaves(material: Any, scenes: list[brdf.Scene]) -> list[Any]:
@@ -207,11 +207,9 @@ def named_leaves(names: Sequence[str]) -> Callable[[Any, list[brdf.Scene]], list
             is_unit = match[1] == "intensity" and index is None and not picture
             if not own[is_unit:]:
                 remedy = "Free what they have; the first light's intensity is the unit of the material"
-                raise InputError(
-                    "free", f"names {match[0]!r}, which is not in the scenes: light is a direction", remedy
-                )
+                raise InputError("free", f"names {match[0]!r}, which is not in the scenes", remedy)
             found += own[is_unit:]
-        return found
+        return list({id(leaf): leaf for leaf in found}.values())
 
     return leaves
 
@@ -219,10 +217,17 @@ def named_leaves(names: Sequence[str]) -> Callable[[Any, list[brdf.Scene]], list
 def scene_leaves(kind: str, scene: brdf.Scene, index: int | None = None) -> list[Any]:
     """Those of a kind of cause; of one light or of all."""
     lights: list[Any] = [light for place, light in enumerate(scene.lights) if index in (None, place)]
+    placed = [(light, place) for light in lights if (place := place_of(light))]
     spheres: list[Any] = [shape for shape in scene.shapes if isinstance(shape, brdf.Sphere) and shape.fitted]
     return {
-        "light": [light.direction for light in lights if isinstance(light, brdf.DirectionalLight)],
+        "light": [getattr(light, place) for light, place in placed],
+        "distance": [getattr(light, place) for light, place in placed if place != "direction"],
         "intensity": [light.emittance for light in lights],
         "ball": [sphere.center for sphere in spheres],
         "radius": [sphere.radius for sphere in spheres],
     }[kind]
+
+
+def place_of(light: Any) -> str | None:
+    """What says where a light stands: its direction, if it is far; None for what has no one place."""
+    return next((field for field in ("position", "center", "direction") if field in vars(light)), None)

@@ -36,9 +36,9 @@ class Cause:
     """What may be wrong with a scene or a picture, and would explain what the fit leaves.
 
     Attributes:
-        name: "light", "intensity", "ball" (its centre), "radius", "gamma", "black", "mirrored left-right" or "mirrored
-            upside down"; a light of several with its index, of one picture with that. "light or ball" where the
-            picture does not tell them apart.
+        name: "light" (its direction, or as seen from the ball), "distance" (of a near light), "intensity", "ball" (its
+            centre), "radius", "gamma", "black", "mirrored left-right" or "mirrored upside down"; a light of several
+            with its index, of one picture with that. "light or ball" where the picture does not tell them apart.
         size: how far off, in the first order; a length where there are several directions.
         error: standard error of the size.
         unit: of both; "" for a mirrored picture.

@@ -172,6 +172,47 @@ def test_a_noisy_picture_hides_nothing_of_the_others():
     assert cause.error < 0.03
 
 
+def near(kind: str, place: Any) -> brdf.Scene:
+    """A light that looks at the ball, a little above its middle."""
+    place = np.asarray(place, float)
+    lights = {
+        "point": lambda: brdf.PointLight(place, 9.0),
+        "spot": lambda: brdf.SpotLight(place, -place, 9.0, cutoff_angle=60, exponent=2),
+        "sphere": lambda: brdf.SphereLight(place, 0.4, radiance=18.0, samples=16),
+    }
+    return dataclasses.replace(SCENE, lights=(lights[kind](),))
+
+
+@pytest.mark.parametrize("kind", ["point", "spot", "sphere"])
+def test_a_near_light_stands_elsewhere(kind: str):
+    place, angle = np.array([1.2, 1.5, 2.4]), np.radians(1.5)
+    target = drawn(near(kind, place))
+    assert fitted(target, near(kind, place)).diagnosis == ()
+    turned = dataclasses.replace(near(kind, place).lights[0])
+    field = "center" if hasattr(turned, "center") else "position"
+    for name, size, moved in (
+        ("light", 1.5, np.cos(angle) * place + np.sin(angle) * np.linalg.norm(place) * ACROSS),
+        ("distance", -5.0, place * 1.05),
+    ):
+        told = dataclasses.replace(SCENE, lights=(dataclasses.replace(turned, **{field: moved}),))
+        result = fitted(target, told)
+        cause = result.diagnosis[0]
+        assert name in cause.name
+        assert abs(cause.size - size) < max(4 * cause.error, 0.1 * abs(size))
+        if kind == "point":
+            freed = fitting.fit_jointly(target, told, result, ["light", "distance"])
+            np.testing.assert_allclose(freed.values[-1], place, atol=0.05)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_one_mirrored_picture_of_several_is_named(axis: int):
+    scenes = [SCENE, with_light(40.0), with_light(-30.0)]
+    targets = [drawn(scene) for scene in scenes]
+    targets[1] = np.flip(targets[1], axis)
+    name = ["mirrored upside down", "mirrored left-right"][axis]
+    assert fitted(targets, scenes).diagnosis[0].name == f"{name} of picture 1"
+
+
 def test_what_was_named_is_freed():
     target, told, _ = WRONG["light"]
     result = fitting.fit_jointly(target, told, fitted(target, told), "light")
