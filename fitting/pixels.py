@@ -42,8 +42,8 @@ SINGLE, DOUBLE = 1e12, 1e48
 CONVERGED = 1e-10
 # A file is shown by no more pixels than this along each side.
 SHOWN_PIXELS = 1024
-# A plateau of exactly equal largest values has to be larger than symmetry makes it before it counts as clipping.
-SYMMETRIC_PIXELS = 8
+# So many equal largest values symmetry may make; then others of the largest come in pairs, too: so many are looked at.
+SYMMETRIC_PIXELS, OTHERS = 8, 32
 # Where the diffuse basis varies by less than this over the plateau, the surface is flat there and nothing is clipped.
 FLAT = 1e-3
 
@@ -222,8 +222,8 @@ def _observe(
         raise InputError("target", what, "Bring it nearer to 1 (another exposure), or fit in float64")
     # Where all of a single picture share one value nothing is below it: it is a constant, not a level.
     constant = total.top == total.counts[2] and len(problem.targets) == 1
-    if level is None and total.largest > 0 and total.top > SYMMETRIC_PIXELS and not constant and scene.lights:
-        level = _plateau(bands, found, float(total.largest), grey)
+    if level is None and total.largest > 0 and total.top > 1 and not constant and scene.lights:
+        level = _plateau(bands, found, total, grey)
         if level is not None:
             found, total = _statistics(bands, level, dark, apart=apart, keep=not target.streamed)
     left_out = _left_out(total, height * width, level, dark, masked=mask is not None)
@@ -369,10 +369,20 @@ _count_many = jax.jit(partial(_count, xp=jnp), static_argnames="apart", compiler
 
 
 def _plateau(
-    bands: Sequence[_Band], found: Sequence[tuple[np.ndarray, Statistics]], largest: float, scene: brdf.Scene
+    bands: Sequence[_Band], found: Sequence[tuple[np.ndarray, Statistics]], total: Statistics, scene: brdf.Scene
 ) -> float | None:
-    """The level at which a picture is clipped: many pixels at exactly the largest value, on a surface lit unevenly."""
-    low, high = np.inf, -np.inf
+    """The level at which a picture is clipped.
+
+    Many pixels show exactly the largest value, on a surface lit unevenly; or a few, and of the next no two are alike.
+    """
+    largest, low, high = float(total.largest), np.inf, -np.inf
+    if total.top <= SYMMETRIC_PIXELS:
+        bright = np.full(OTHERS + int(total.top), -np.inf)
+        for band, (good, _) in zip(bands, found, strict=True):
+            both = np.append(bright, np.max(np.asarray(band.values)[good], axis=-1))
+            bright = np.partition(both, -bright.size)[-bright.size :]
+        others = np.sort(bright)[:OTHERS]
+        return largest * TOP if np.all(others[:-1] < others[1:] * TOP) else None
     for band, (good, _) in zip(bands, found, strict=True):
         top = good & (np.max(np.asarray(band.values), axis=-1) >= largest * TOP)
         if top.any():

@@ -63,6 +63,20 @@ def test_clipped_and_missing_pixels_are_left_out_and_counted():
     assert float(result.material.n) == pytest.approx(20.0, rel=1e-6)
 
 
+@pytest.mark.parametrize("few", [2, 5])
+def test_a_few_clipped_pixels_are_known_by_their_one_value(few: int):
+    truth = brdf.BlinnPhong(k_a=0.3, k_d=[0.5, 0.4, 0.3], k_s=0.8, n=20.0)
+    clean = pictured(truth, SCENE)
+    assert not fitting.fit(clean, SCENE, model="blinn-phong").left_out.get("clipped")
+    noisy = (clean + np.random.default_rng(1).normal(0, 0.003, clean.shape)).astype(np.float32)
+    level = np.sort(noisy.max(axis=-1), axis=None)[-few]
+    result = fitting.fit(np.minimum(noisy, level), SCENE, model="blinn-phong")
+    assert result.left_out["clipped"] == few
+    told = fitting.fit(np.minimum(noisy, level), SCENE, model="blinn-phong", saturation=level)
+    np.testing.assert_allclose(result.material.k_s, told.material.k_s, rtol=1e-4)
+    np.testing.assert_allclose(result.material.n, told.material.n, rtol=1e-4)
+
+
 def test_the_result_as_json_is_standard_json():
     matt = pictured(brdf.BlinnPhong(k_a=0.3, k_d=[0.5, 0.4, 0.3], k_s=0.0, n=20.0), SCENE)
     result = fitting.fit(matt, SCENE, model="blinn-phong")
