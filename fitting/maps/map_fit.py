@@ -195,12 +195,13 @@ def _ambient(ambient: Any, given: Photographs) -> np.ndarray | None:
 def _surface(given: Photographs, normals: Any, mask: Any, precision: Precision, flip_y: bool) -> Surface:
     """What the texels see."""
     height, width, _ = given.size
+    name = str(mask) if isinstance(mask, str | Path) else "mask"
     if mask is None:
         mask = np.ones((height, width), bool)
     mask = brdf.read_mask(mask) if isinstance(mask, str | Path) else np.asarray(mask, bool)
     if mask.shape != (height, width):
         what = f"is of shape {mask.shape}, the photographs of {(height, width)}"
-        raise InputError("mask", what, "Give a value for each pixel")
+        raise InputError(name, what, "Give a value for each pixel")
     mask = mask & given.opaque()
     sought = normals is None or (isinstance(normals, str) and normals == "fit")
     if flip_y and (sought or given.scenes is not None):

@@ -964,8 +964,8 @@ def _break(path, what):
         write_image(path / "photo 3.png", np.ones((5, 8, 3)) / 2, dtype="uint16")
     elif what == "damaged":
         (path / "photo 3.png").write_bytes((path / "photo 3.png").read_bytes()[:60])
-    elif what == "normals":
-        write_image(path / "normals.png", np.ones((5, 8, 3)) / 2, dtype="uint16")
+    elif what in ("normals", "mask"):
+        write_image(path / f"{what}.png", np.ones((5, 8, 3)) / 2, dtype="uint16")
     elif what == "no lights":
         (path / "lights.lp").unlink()
     else:
@@ -987,6 +987,7 @@ def _break(path, what):
         ("size", "photo 3.png"),
         ("damaged", "photo 3.png"),
         ("normals", "normals.png"),
+        ("mask", "mask.png"),
         ("no lights", "file of lights"),
         ("count", "lights.lp"),
         ("zero", "line 13"),
