@@ -10,6 +10,7 @@ import dataclasses
 import functools
 import math
 import operator
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -81,7 +82,7 @@ def basis(
     """
     points = scene.sight() if points is None else points
     lighting, area = _lighting(scene, points), points.area
-    if not lighting.stacks:
+    if not scene.lights:
         return Basis(None, None)
     if near is not None and area is None and is_sampled(lighting):
         return Basis(*_tabulated(model, points.stored().pixels(), lighting, near, counts))
@@ -119,8 +120,16 @@ def _tabulated(
     return spread(diffuse), None if table is None else Lobe(spread(peak, NO_LOBE), table=spread(table), near=near)
 
 
-def _lighting(scene: Scene, points: Sight, fill_above: float = math.inf) -> Lighting:
-    return Lighting(stacked(scene.lights, _dtype(points), fill_above), scene.occluders)
+def _lighting(
+    scene: Scene, points: Sight, fill_above: float = math.inf, chosen: Sequence[int] | None = None
+) -> Lighting:
+    """Of all lights, or of some by their index."""
+    index = range(len(scene.lights)) if chosen is None else chosen
+    even = [place for place in index if scene.sees_whole(scene.lights[place])]
+    rest = [place for place in index if place not in even]
+    stacks = stacked([scene.lights[place] for place in rest], _dtype(points), fill_above, index=rest)
+    sky = sum((jnp.asarray(scene.lights[place].emittance) for place in even), jnp.zeros(1))
+    return Lighting(stacks, scene.occluders, jnp.asarray(sky, _dtype(points)) if even else None)
 
 
 def _dtype(points: Sight) -> np.dtype:
@@ -176,7 +185,8 @@ def _basis_images(model: OneOf, points: Sight, ambient: Any, lighting: Lighting,
     for seen in (centres, *([] if area is None else [area.points.in_components()])):
         share = seen.mask if seen.share is None else seen.mask * seen.share
         ambience = None if ambient is None else seen.per_pixel(share.reshape(-1, 1) * ambient)
-        lit = over_samples(model, seen, lighting, of_terms)[0] if lighting.stacks else (None, None)
+        dark = not lighting.stacks and lighting.sky is None
+        lit = (None, None) if dark else over_samples(model, seen, lighting, of_terms)[0]
         made.append((ambience, *lit))
     images = made[0] if area is None else jax.tree.map(partial(averaged, area.slot.ravel()), *made)
     return BasisImages(*jax.tree.map(lambda image: image.reshape(*centres.mask.shape, -1), images))
@@ -249,9 +259,9 @@ def render_lights(material: Material, scene: Scene, *, precision: Precision | No
         scene, points = _seen(scene, precision)
         material = cast(material, precision)
         images = []
-        for index, light in enumerate(scene.lights):
-            own = stacked((light,), _dtype(points), index=(index,))  # with its own mask, where masks are given
-            images.append(_shade(material, points, None, Lighting(own, scene.occluders)))
+        for index in range(len(scene.lights)):
+            own = _lighting(scene, points, chosen=[index])  # with its own mask, where masks are given
+            images.append(_shade(material, points, None, own))
         if scene.ambient is not None:
             images.append(_shade(material, points, scene.ambient, Lighting(())))
         return jnp.stack([jnp.broadcast_to(image, shape) for image in images]) if images else jnp.zeros((0, *shape))

@@ -21,6 +21,7 @@ from brdf.geometry.rays import PrimaryRays, Sight, surface_points
 from brdf.geometry.shapes import Shape
 from brdf.geometry.surface_points import PixelArea, SurfacePoints
 from brdf.lights.base import Light
+from brdf.lights.environment import ConstantEnvironment
 from brdf.pixel_area import with_area
 from brdf.precision import Precision, cast, working_precision
 
@@ -128,6 +129,10 @@ class Scene(Checked):
         """All shapes; none where they cannot cast a shadow on what is seen."""
         alone = self.camera is not None and len(self.shapes) == 1 and self.shapes[0].convex
         return () if alone else self.shapes
+
+    def sees_whole(self, light: Light) -> bool:
+        """Whether a light is a sky of one brightness that every point sees all of, above its horizon."""
+        return isinstance(light, ConstantEnvironment) and not self.occluders and not self.visibility
 
     def surface_points(self) -> SurfacePoints:
         """What each pixel sees, (H, W): traced by the camera, or as given."""

@@ -414,7 +414,7 @@ def _fit_model(model, samples, loss, n_range):
         errors = uncertainty(fit, pixels, free, brightest, visible)
     interval = None
     if specular and not errors.n_reason:
-        interval = exponent_interval(fit, errors.n_error, errors.reach, errors.delta_cost, 0.0, parabolic=True)
+        interval, _ = exponent_interval(fit, errors.n_error, errors.reach, errors.delta_cost, 0.0, parabolic=True)
         errors = errors._replace(n_reason=fit.held)
     material, parameters = material_and_parameters(fit, errors, np.ones(channels), interval)
     lobe, reasons = parameters[2 * channels :], {one.reason for one in parameters[2 * channels :]}

@@ -139,20 +139,23 @@ class Lighting:
     Attributes:
         stacks: the lights, kind by kind.
         occluders: the scene's shapes in its order; none where they cannot shadow anything that is seen.
+        sky: what comes from everywhere alike to every point, (C,), apart from the stacks; None for nothing.
     """
 
     stacks: tuple[LightStack, ...]
     occluders: tuple[Shape, ...] = ()
+    sky: Float[AnyArray, " C"] | None = None
 
     @property
     def samples(self) -> int:
-        """Of all lights together."""
+        """Of all lights together, less the sky."""
         return sum(math.prod(stack.light.shape) for stack in self.stacks)
 
     @property
     def channels(self) -> int:
         """Of what is emitted."""
-        return max(stack.emitted.shape[-1] for stack in self.stacks)
+        own = [] if self.sky is None else [self.sky.shape[-1]]
+        return max([stack.emitted.shape[-1] for stack in self.stacks] + own)
 
 
 def stacked(

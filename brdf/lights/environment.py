@@ -47,6 +47,9 @@ FINEST, FINER = 1024, 8
 class ConstantEnvironment(Light):
     """The same radiance from everywhere.
 
+    Where nothing stands in its way the picture of a lobe depends on the angle of view alone: it is summed up over 4,096
+    samples for 96 of these, whatever ``samples`` says. Else it has samples at each point.
+
     Half of the samples serve the diffuse term, by a rule over the hemisphere above each point that is exact for
     it. The others serve the lobe: they lie around the mirror direction, at all distances from it up to the horizon,
     most of them near it, so that they meet a lobe of any exponent from 0 to 1e5. Their half vector H turns about the
@@ -59,7 +62,7 @@ class ConstantEnvironment(Light):
 
     Args:
         radiance: (C,).
-        samples: how many light samples at most, at least 2.
+        samples: how many light samples at most, at least 2, where shapes or masks hide some of it.
 
     Raises:
         InputError: where a radiance is negative or not finite, or the samples are too few.

@@ -34,8 +34,8 @@ _made: dict[tuple[int, int], Light] = {}
 
 
 def sample_counts(scene: brdf.Scene) -> list[int]:
-    """The number of samples of each light, 1 of one without an extent."""
-    return [getattr(light, "samples", 1) for light in scene.lights]
+    """The number of samples of each light, 1 of one without an extent and of a sky that needs none."""
+    return [1 if scene.sees_whole(light) else getattr(light, "samples", 1) for light in scene.lights]
 
 
 def with_samples(scene: brdf.Scene, samples: int) -> brdf.Scene:

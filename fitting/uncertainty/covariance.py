@@ -109,6 +109,12 @@ class Uncertainty(NamedTuple):
     n_reason: str
     sums: dict[int, Sum]
 
+    def holding(self, x: Float[np.ndarray, "N 3 C"]) -> "Uncertainty":
+        """With intervals that hold coefficients which are as likely beside other exponents."""
+        low, high = np.moveaxis(self.x_interval, -1, 0)
+        ends = np.minimum(low, x.min(axis=0)), np.maximum(high, x.max(axis=0))
+        return self._replace(x_interval=np.stack(ends, axis=-1))
+
 
 def residual_noise(optimum: Optimum, rounding: Float[np.ndarray, " C"]) -> Float[np.ndarray, " C"]:
     """Standard deviation of the residual, not below that of rounding: in a black channel that of the brightest one."""

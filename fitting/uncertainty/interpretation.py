@@ -101,7 +101,7 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: R
     interval = None
     # At k_d + k_s = 1 the cost still falls across the bound: a profile that does not know it has its least elsewhere.
     if lobe is not None and not errors.n_reason and not fit.capped:
-        interval = exponent_interval(
+        interval, likely = exponent_interval(
             fit,
             errors.n_error,
             errors.reach,
@@ -113,7 +113,7 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: R
         least, most = observed.problem.n_range
         low = max(interval[0], least if least != N_RANGE[0] else 0.0)
         interval = low, min(interval[1], most if most != N_RANGE[1] else np.inf)
-        errors = errors._replace(n_reason=fit.held or _open_exponent(interval))
+        errors = errors.holding(likely)._replace(n_reason=fit.held or _open_exponent(interval))
     if hidden:
         errors.reasons[2], errors = hidden, errors._replace(n_reason=hidden)
     material, parameters = material_and_parameters(fit, errors, observed.colour, interval)

@@ -8,7 +8,9 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
+from fitting.light_colour import coefficient_factors
 from fitting.model_fit import ModelFit
 from fitting.result import Parameter
 from fitting.solver.normal_equations import sums
@@ -81,8 +83,10 @@ def above_zero(value: float, error: float) -> tuple[float, float]:
 
 def exponent_interval(
     fit: ModelFit, n_error: float, reach: float, delta_cost: float, peak: float, *, parabolic: bool = False
-) -> tuple[float, float]:
+) -> tuple[tuple[float, float], Float[np.ndarray, "N 3 C"]]:
     """The 95 % profile-likelihood interval of n: where the least cost rises by ``delta_cost``; else 0 or infinity.
+
+    And the coefficients that explain most at exponents inside, at the scale of the lobe at the optimum.
 
     A relative error below a hundredth needs no pixel, nor does a profile that is taken for parabolic: there it is a
     parabola in log n. Else the cost is followed outwards from the optimum, a pass over the pixels at each exponent
@@ -96,16 +100,21 @@ def exponent_interval(
     inside = bounds[0] < centre - 3 * relative and centre + 3 * relative < bounds[1]
     if parabolic or (relative < PARABOLIC and inside):
         factor = math.exp(min(reach * relative, UNKNOWN))
-        return optimum.n / factor, optimum.n * factor
+        return (optimum.n / factor, optimum.n * factor), optimum.x[None]
     first = min(max(1.1 * reach * relative, 1e-3), WIDEST)
     problem = problem_of(fit.pictures, fit.n_range, fit.free)._replace(peak=peak, tied=fit.tied)
     # Relative to the nearest pixel the lobe keeps its size where no pixel sees the centre.
     reference = optimum.x.T * [1.0, 1.0, math.exp(optimum.n * peak)]
 
+    tried: list[tuple[float, float, np.ndarray]] = []
+    ones = np.ones(optimum.x.shape[1])
+
     def cost(log_n: float) -> float:
         with jax.enable_x64(True):
             parts = sums(problem.pictures, np.array([log_n]), reference, peak)
-            return float(np.sum(solve_linear(parts, np.array([log_n]), reference, problem).cost))
+            point = solve_linear(parts, np.array([log_n]), reference, problem)
+        tried.append((log_n, float(np.sum(point.cost)), point.x[0].T))
+        return tried[-1][1]
 
     # By the same sums: those of an optimum may be scaled to the noise.
     least = cost(centre)
@@ -116,7 +125,13 @@ def exponent_interval(
     low, high = (
         _end(rise_at, centre, sign, bound, first, delta_cost) for sign, bound in zip((-1, 1), bounds, strict=True)
     )
-    return math.exp(low), math.exp(high)
+    inside = [(math.exp(log_n), x) for log_n, value, x in tried if value - least <= delta_cost]
+    scale = coefficient_factors(fit.model, optimum.n, ones)
+    coefficients = [
+        x * scale / coefficient_factors(fit.model, n, ones) * [[1.0], [1.0], [math.exp(min(-n * peak, UNKNOWN))]]
+        for n, x in inside
+    ]
+    return (math.exp(low), math.exp(high)), np.stack(coefficients)
 
 
 def _end(rise_at: Callable[[float], float], start: float, sign: int, bound: float, step: float, limit: float) -> float:

@@ -289,3 +289,24 @@ def test_what_is_no_light_is_refused(make, words: str):
     with pytest.raises(brdf.InputError) as caught:
         make()
     assert words in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", [brdf.BlinnPhong, brdf.Phong])
+@pytest.mark.parametrize("n", [1.0, 2000.0])
+def test_a_sky_that_is_seen_whole_is_that_of_samples_above_each_point(kind: type, n: float):
+    """Of which more are taken, and which adds to other lights; from behind a surface has no highlight."""
+    camera = brdf.OrthographicCamera(position=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0], width=2.2, resolution=(16, 16))
+    sky, sun = brdf.ConstantEnvironment([1.0, 0.5], samples=4096), brdf.DirectionalLight([1, 1, 1], [0.5])
+    ball, material = brdf.Sphere([0, 0, 0], 1), kind(k_d=0.3, k_s=0.5, n=n)
+    both = brdf.Scene(camera=camera, shapes=[ball], lights=[sky, sun])
+    picture = np.asarray(brdf.render(material, both, precision="float64"))
+    sampled = dataclasses.replace(both, visibility=[np.ones((16, 16)), None])
+    assert both.sees_whole(sky)
+    assert not sampled.sees_whole(sky)
+    expected = np.asarray(brdf.render(material, sampled, precision="float64"))
+    np.testing.assert_allclose(picture, expected, atol=2e-3 * expected.max())
+    each = np.asarray(brdf.render_lights(material, both, precision="float64"))
+    np.testing.assert_allclose(each.sum(axis=0), picture, atol=1e-12)
+    behind = brdf.SurfacePoints.from_normals(np.array([[[0.0, 0.6, -0.8]]]))
+    shown = brdf.render(material, brdf.Scene(points=behind, lights=[sky]), precision="float64")
+    np.testing.assert_allclose(shown, 0.3 * np.array([[[1.0, 0.5]]]), atol=1e-6)

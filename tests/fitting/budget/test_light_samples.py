@@ -65,6 +65,31 @@ def test_under_an_even_sky_n_is_within_its_error(
     assert abs(found.value - material.n) < 3.5 * found.error
 
 
+def test_under_an_even_sky_no_number_of_samples_decides():
+    """Few of them made a valley at n = 900,000, and k_s was 5,700 ± 20."""
+    scene, truth = ball(brdf.ConstantEnvironment([1.0]), 128), brdf.BlinnPhong(k_a=0.2, k_d=0.4, k_s=0.2, n=30)
+    clean = np.asarray(brdf.render(truth, scene))
+    assert with_enough_samples(state_problem(clean, scene, model="blinn-phong")).scenes[0] is scene
+    result = fitting.fit(
+        clean + 0.003 * np.random.default_rng(0).standard_normal(clean.shape), scene, model=type(truth)
+    )
+    for name in ("k_s", "n"):
+        low, high = next(one.interval for one in result.parameters if one.name == name)
+        assert low <= np.max(getattr(truth, name)) <= high
+        assert high < 1.5 * low
+
+
+def test_an_exponent_that_is_open_leaves_k_s_open():
+    scene, truth = ball(brdf.ConstantEnvironment([1.0]), 96), brdf.BlinnPhong(k_a=0.2, k_d=0.4, k_s=0.02, n=50)
+    clean = np.asarray(brdf.render(truth, scene))
+    result = fitting.fit(
+        clean + 0.004 * np.random.default_rng(1).standard_normal(clean.shape), scene, model=type(truth)
+    )
+    low, high = next(one.interval for one in result.parameters if one.name == "k_s")
+    assert "n is" in result["n"].reason or "any exponent" in result["n"].reason
+    assert low <= 0.02 <= high
+
+
 def test_without_noise_the_samples_that_a_picture_was_drawn_with_are_taken_and_told_of():
     scene = ball(WINDOW)
     picture = np.asarray(brdf.render(MATERIAL, scene, precision="float64"))
