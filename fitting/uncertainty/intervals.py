@@ -26,6 +26,8 @@ PARABOLIC = 0.01
 UNKNOWN = 700.0
 # The widest step outwards in log n, and the share of a step to which an end is found.
 WIDEST, CLOSE = 0.35, 1e-3
+# So many exponents of other valleys are tried.
+OTHERS = 8
 
 
 @functools.cache
@@ -125,6 +127,15 @@ def exponent_interval(
     low, high = (
         _end(rise_at, centre, sign, bound, first, delta_cost) for sign, bound in zip((-1, 1), bounds, strict=True)
     )
+    # Other valleys, where the search has seen as little, however high what lies between.
+    likely = np.log(optimum.grid[optimum.profile - np.min(optimum.profile, initial=np.inf) <= delta_cost])
+    others = likely[(likely < low) | (likely > high)]
+    some = np.unique(np.linspace(0, max(others.size - 1, 0), OTHERS).round().astype(int))[: others.size]
+    others = [one for one in others[some].tolist() if rise_at(one) <= delta_cost]
+    if others and others[0] < low:
+        low = _end(rise_at, others[0], -1, bounds[0], WIDEST, delta_cost)
+    if others and others[-1] > high:
+        high = _end(rise_at, others[-1], 1, bounds[1], WIDEST, delta_cost)
     inside = [(math.exp(log_n), x) for log_n, value, x in tried if value - least <= delta_cost]
     scale = coefficient_factors(fit.model, optimum.n, ones)
     coefficients = [
