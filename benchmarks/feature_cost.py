@@ -29,7 +29,7 @@ LIGHTS = {
     ),
     "sphere light, 64 samples": brdf.SphereLight(center=(2, 2, 3), radius=0.6, radiance=6.0, samples=SAMPLES),
     "environment map, 64 samples": brdf.EnvironmentMap(sky(3), samples=SAMPLES),
-    "constant environment, 64 samples": brdf.ConstantEnvironment(radiance=0.8, samples=SAMPLES),
+    "constant environment": brdf.ConstantEnvironment(radiance=0.8),
 }
 
 

@@ -24,7 +24,6 @@ LIGHTS = {
         vertices=[[0.5, 0.5, 2.5], [0.5, 1.5, 2.5], [1.5, 1.5, 2.5], [1.5, 0.5, 2.5]], radiance=1, samples=samples
     ),
     "sphere": lambda samples: brdf.SphereLight(center=[1, 1, 2.5], radius=0.5, radiance=1, samples=samples),
-    "constant": lambda samples: brdf.ConstantEnvironment(radiance=1, samples=samples),
 }
 SAMPLES = (4, 16, 36, 64, 144, 256, 576, 1024)
 

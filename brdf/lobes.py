@@ -21,8 +21,8 @@ from numpy.polynomial import chebyshev
 from brdf.checks import Scalar
 from brdf.geometry.rays import Sight, share_seen
 from brdf.geometry.surface_points import SurfacePoints
-from brdf.lights.base import Light, Lighting, stacked
-from brdf.lights.environment import ConstantEnvironment
+from brdf.lights.base import Light, Lighting
+from brdf.lights.even_sky import Views, seen_under
 from brdf.models import MODELS, Material, SpecularMaterial
 from brdf.precision import pytree
 from brdf.vectors import BELOW_HORIZON, Components
@@ -40,10 +40,6 @@ STACKED_VALUES = 1 << 26
 NODES, STEP, NARROWEST, WIDEST = 5, 0.35, 0.04, 1.0
 """A polynomial through so many exponents stands for a lobe over a range of log n: of 0.7 to 1e-5, of 0.04 to 1e-11. One
 through nodes so far apart, where the range is wider than `WIDEST`, to 1e-3, which serves to find where to look."""
-
-VIEWS, VIEW_SAMPLES = 96, 4096
-"""Under a sky of one brightness a lobe depends on the angle of view alone: it is summed up over so many samples for so
-many angles, of cosines like squares of evenly spaced numbers, and is cubic between these, to 1e-5."""
 
 NO_LOBE = -1e9
 """The peak of a pixel without a lobe: exp(n * this) = 0 for every n that a fit visits."""
@@ -179,9 +175,8 @@ def over_samples(model: OneOf, points: SurfacePoints, lighting: Lighting, of_ter
         for emitted, program, samples in _programs(model, flat, lighting):
             parts.append(added(_times_emitted, emitted, _joined(jax.lax.map(program, samples))))
     if lighting.sky is not None:
-        views = _Views.of(flat)
-        of_views, peaks = over_samples(model, *views.under(lighting.sky), of_terms)
-        parts.append((jax.tree.map(views.taken, of_views), views.nearest(peaks)))
+        views, (of_views, peaks) = Views.of(flat), over_samples(model, *seen_under(lighting.sky), of_terms)
+        parts.append((jax.tree.map(views.taken, of_views), views.largest(peaks, NO_LOBE)))
     sums, peak = functools.reduce(together, parts)
     return jax.tree.map(points.per_pixel, sums), jnp.max(peak.reshape(-1, points.each), axis=1)
 
@@ -198,67 +193,6 @@ def _programs(
 def _joined(terms: LightTerms) -> LightTerms:
     """Of the samples of all chunks, (S, P)."""
     return jax.tree.map(lambda one: one.reshape(-1, one.shape[-1]), terms)
-
-
-class _Views(NamedTuple):
-    """How each of (P,) points is seen, between angles of view: four of these, and their weights, (P, 4) each."""
-
-    index: Int[Any, "P 4"]
-    weight: Float[Any, "P 4"]
-
-    @classmethod
-    def of(cls, points: SurfacePoints) -> "_Views":
-        """Of flat points; those that are not seen, or whose view is from behind, have no lobe."""
-        cosine = jnp.broadcast_to(points.normal @ points.to_view, points.mask.shape)
-        place = jnp.sqrt(jnp.clip(cosine, 1e-12, 1.0)) * (VIEWS - 1)
-        first = jnp.clip(jnp.floor(jax.lax.stop_gradient(place)) - 1, 0, VIEWS - 4)
-        t, ahead = place - first, cosine > 0
-        # The polynomials of Lagrange.
-        weights = (
-            (t - 1) * (t - 2) * (3 - t) / 6,
-            t * (t - 2) * (t - 3) / 2,
-            t * (t - 1) * (3 - t) / 2,
-            t * (t - 1) * (t - 2) / 6,
-        )
-        index = jnp.where(ahead[:, None], first[:, None].astype(np.int32) + np.arange(4, dtype=np.int32), VIEWS)
-        weight = jnp.where(ahead[:, None], jnp.stack(weights, axis=1), jnp.asarray([1.0, 0.0, 0.0, 0.0], t.dtype))
-        arrives = points.mask if points.share is None else points.mask * points.share
-        return cls(index, weight * arrives[:, None])
-
-    @staticmethod
-    def under(sky: Any) -> tuple[SurfacePoints, Lighting]:
-        """Points that are seen at these angles, and last from behind, and the sky above them."""
-        cosine = np.append(np.maximum(np.linspace(0, 1, VIEWS) ** 2, 1e-12), -1.0)
-        zero, one = np.zeros(VIEWS + 1), np.ones(VIEWS + 1)
-        to_view = np.sqrt(1 - cosine**2), zero, cosine
-        position, normal, to_view = (
-            Components(tuple(jnp.asarray(part, sky.dtype) for part in vector))
-            for vector in ((zero, zero, zero), (zero, zero, one), to_view)
-        )
-        light = ConstantEnvironment(np.ones(1), samples=VIEW_SAMPLES)
-        (stack,) = stacked([light], sky.dtype)
-        stack = dataclasses.replace(stack, emitted=jnp.asarray(stack.emitted) * sky)
-        return SurfacePoints(position, normal, to_view, jnp.ones(VIEWS + 1, bool)), Lighting((stack,))
-
-    def taken(self, values: Any) -> Any:
-        """Between values at the angles, (..., V, C), those of the points, (..., P, C)."""
-        return taken((self.index, self.weight), values)
-
-    def nearest(self, peaks: Array) -> Array:
-        """The lobe's peak."""
-        return jnp.where(self.weight.any(axis=1), peaks[self.index[:, 1]], NO_LOBE)
-
-
-def taken(views: tuple[Any, Any], values: Any) -> Any:
-    """Of values at angles of view, (..., V, C), sums of some, (P, T) each, times weights: (..., P, C)."""
-    xp = values.__array_namespace__()
-    return functools.reduce(
-        operator.add,
-        (
-            xp.take(values, index, axis=-2) * weight[:, None].astype(values.dtype)
-            for index, weight in zip(views[0].T, views[1].T, strict=True)
-        ),
-    )
 
 
 def over_chunks(add: Callable[..., Any], lighting: Lighting, size: int, total: Any) -> Any:
@@ -369,8 +303,8 @@ class Lobe:
         near: what they are tabulated at.
         fine: of those pixels that are averaged; None where no pixel is.
         slot: for every pixel its place in ``fine``, or -1, (P,).
-        sky: of angles of view under a sky of one brightness, beside the terms that are kept.
-        views: which of them a pixel is between, and their weights, (P, T) each.
+        sky: of the angles of view of `brdf.lights.even_sky`, beside the terms that are kept; None without such a sky.
+        views: between which of these the pixels are seen.
     """
 
     peak: Float[Array, " P"]
@@ -382,7 +316,7 @@ class Lobe:
     fine: "Lobe | None" = None
     slot: Int[Array, " P"] | None = None
     sky: "Lobe | None" = None
-    views: tuple[Int[Array, "P T"], Float[Array, "P T"]] | None = None
+    views: Views | None = None
 
     @classmethod
     def of_terms(cls, kept: tuple[tuple[Array, Array], ...]) -> "Lobe":
@@ -412,7 +346,7 @@ class Lobe:
                 slopes.append(_over_samples(weight, change))
             if self.sky is not None and self.views is not None:
                 for total, part in zip((values, slopes), self.sky(n, peak), strict=True):
-                    total.append(taken(self.views, part))
+                    total.append(self.views.taken(part))
             value, slope = functools.reduce(operator.add, values), functools.reduce(operator.add, slopes)
         if self.fine is None:
             return value, slope
@@ -431,7 +365,7 @@ class Lobe:
         """How many light samples add up at a point."""
         if self.source is not None:
             return self.source[1].samples
-        between = 0 if self.views is None else self.views[0].shape[1]
+        between = 0 if self.views is None else self.views.index.shape[1]
         return NODES if self.table is not None else between + sum(log_cosine.shape[1] for _, log_cosine in self.kept)
 
     def on_host(self, pixel: Int[np.ndarray, " K"]) -> "Lobe":
@@ -443,7 +377,8 @@ class Lobe:
         lobe = lobe.pixels(partial(np.take, indices=filled, axis=0))
         if lobe.source is not None and lobe.model is not None:
             made = diffuse_and_kept(OneOf.of(lobe.model), *lobe.source)[1]
-            lobe = jax.tree.map(np.asarray, made and dataclasses.replace(made, slot=lobe.slot))
+            assert made is not None
+            lobe = jax.tree.map(np.asarray, dataclasses.replace(made, slot=lobe.slot))
         lobe = lobe.pixels(operator.itemgetter(slice(pixel.size)))
         if self.fine is None:
             return lobe
@@ -522,14 +457,13 @@ def diffuse_and_kept(model: OneOf, sight: Sight, lighting: Lighting) -> tuple[Ar
             kept.append((weight, terms.log_cosine[some].T.reshape(weight.shape[:2])))
     lobe = Lobe.of_terms(tuple(kept)) if model.lobes and kept else None
     if lighting.sky is not None:
-        views = _Views.of(points.flat())
-        of_views, sky = diffuse_and_kept(model, *views.under(lighting.sky))
+        views, (of_views, sky) = Views.of(points.flat()), diffuse_and_kept(model, *seen_under(lighting.sky))
         diffuse = diffuse + views.taken(of_views)
         if sky is not None:
-            peak = jnp.max(views.nearest(sky.peak).reshape(-1, points.each), axis=1)
-            lobe = Lobe(jnp.full_like(peak, NO_LOBE)) if lobe is None else lobe
-            index, weight = (leaf.reshape(len(peak), -1) for leaf in views)
-            lobe = dataclasses.replace(lobe, peak=jnp.maximum(lobe.peak, peak), sky=sky, views=(index, weight))
+            views = views.per_pixel(points.each)
+            peak = views.largest(sky.peak, NO_LOBE)
+            peak = peak if lobe is None else jnp.maximum(lobe.peak, peak)
+            lobe = dataclasses.replace(lobe or Lobe(peak), peak=peak, sky=sky, views=views)
     return points.per_pixel(diffuse), lobe
 
 

@@ -128,8 +128,8 @@ def _lighting(
     even = [place for place in index if scene.sees_whole(scene.lights[place])]
     rest = [place for place in index if place not in even]
     stacks = stacked([scene.lights[place] for place in rest], _dtype(points), fill_above, index=rest)
-    sky = sum((jnp.asarray(scene.lights[place].emittance) for place in even), jnp.zeros(1))
-    return Lighting(stacks, scene.occluders, jnp.asarray(sky, _dtype(points)) if even else None)
+    sky = [jnp.asarray(scene.lights[place].emittance, _dtype(points)) for place in even]
+    return Lighting(stacks, scene.occluders, functools.reduce(operator.add, sky) if sky else None)
 
 
 def _dtype(points: Sight) -> np.dtype:

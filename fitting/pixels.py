@@ -6,6 +6,7 @@ what the solver needs of that a third of it. A picture in a file is not even kep
 
 import dataclasses
 import functools
+import itertools
 from collections import Counter
 from collections.abc import Sequence
 from functools import partial
@@ -223,7 +224,10 @@ def _observe(
     # Where all of a single picture share one value nothing is below it: it is a constant, not a level.
     constant = total.top == total.counts[2] and len(problem.targets) == 1
     if level is None and total.largest > 0 and total.top > 1 and not constant and scene.lights:
-        level = _plateau(bands, found, total, grey)
+        many = total.top > SYMMETRIC_PIXELS
+        level = (
+            _plateau(bands, found, float(total.largest), grey) if many else _few_at_top(bands, found, int(total.top))
+        )
         if level is not None:
             found, total = _statistics(bands, level, dark, apart=apart, keep=not target.streamed)
     left_out = _left_out(total, height * width, level, dark, masked=mask is not None)
@@ -369,20 +373,10 @@ _count_many = jax.jit(partial(_count, xp=jnp), static_argnames="apart", compiler
 
 
 def _plateau(
-    bands: Sequence[_Band], found: Sequence[tuple[np.ndarray, Statistics]], total: Statistics, scene: brdf.Scene
+    bands: Sequence[_Band], found: Sequence[tuple[np.ndarray, Statistics]], largest: float, scene: brdf.Scene
 ) -> float | None:
-    """The level at which a picture is clipped.
-
-    Many pixels show exactly the largest value, on a surface lit unevenly; or a few, and of the next no two are alike.
-    """
-    largest, low, high = float(total.largest), np.inf, -np.inf
-    if total.top <= SYMMETRIC_PIXELS:
-        bright = np.full(OTHERS + int(total.top), -np.inf)
-        for band, (good, _) in zip(bands, found, strict=True):
-            both = np.append(bright, np.max(np.asarray(band.values)[good], axis=-1))
-            bright = np.partition(both, -bright.size)[-bright.size :]
-        others = np.sort(bright)[:OTHERS]
-        return largest * TOP if np.all(others[:-1] < others[1:] * TOP) else None
+    """The level at which a picture is clipped: many pixels at exactly the largest value, on a surface lit unevenly."""
+    low, high = np.inf, -np.inf
     for band, (good, _) in zip(bands, found, strict=True):
         top = good & (np.max(np.asarray(band.values), axis=-1) >= largest * TOP)
         if top.any():
@@ -390,6 +384,16 @@ def _plateau(
             light = np.max(np.asarray(diffuse).reshape(top.size, -1), axis=-1)[top]
             low, high = min(low, float(np.min(light))), max(high, float(np.max(light)))
     return None if high - low <= FLAT * high else largest * TOP
+
+
+def _few_at_top(bands: Sequence[_Band], found: Sequence[tuple[np.ndarray, Statistics]], top: int) -> float | None:
+    """The level at which so few pixels are clipped: they show the largest value, and of the next no two are alike."""
+    brightest = np.full(OTHERS + top, -np.inf)
+    for band, (good, _) in zip(bands, found, strict=True):
+        both = np.append(brightest, np.max(np.asarray(band.values)[good], axis=-1))
+        brightest = np.partition(both, -brightest.size)[-brightest.size :]
+    *others, largest = np.sort(brightest)[: OTHERS + 1].tolist()
+    return largest * TOP if all(one < other * TOP for one, other in itertools.pairwise(others)) else None
 
 
 def _left_out(

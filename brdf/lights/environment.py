@@ -47,8 +47,8 @@ FINEST, FINER = 1024, 8
 class ConstantEnvironment(Light):
     """The same radiance from everywhere.
 
-    Where nothing stands in its way the picture of a lobe depends on the angle of view alone: it is summed up over 4,096
-    samples for 96 of these, whatever ``samples`` says. Else it has samples at each point.
+    Where no shape and no mask hides any of it a lobe is summed up by angles of view, whatever ``samples`` says: see
+    `brdf.lights.even_sky`. Elsewhere there are samples at each point.
 
     Half of the samples serve the diffuse term, by a rule over the hemisphere above each point that is exact for
     it. The others serve the lobe: they lie around the mirror direction, at all distances from it up to the horizon,

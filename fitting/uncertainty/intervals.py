@@ -103,46 +103,52 @@ def exponent_interval(
     if parabolic or (relative < PARABOLIC and inside):
         factor = math.exp(min(reach * relative, UNKNOWN))
         return (optimum.n / factor, optimum.n * factor), optimum.x[None]
+    profile = _Profile(fit, peak)
     first = min(max(1.1 * reach * relative, 1e-3), WIDEST)
-    problem = problem_of(fit.pictures, fit.n_range, fit.free)._replace(peak=peak, tied=fit.tied)
-    # Relative to the nearest pixel the lobe keeps its size where no pixel sees the centre.
-    reference = optimum.x.T * [1.0, 1.0, math.exp(optimum.n * peak)]
-
-    tried: list[tuple[float, float, np.ndarray]] = []
-    ones = np.ones(optimum.x.shape[1])
-
-    def cost(log_n: float) -> float:
-        with jax.enable_x64(True):
-            parts = sums(problem.pictures, np.array([log_n]), reference, peak)
-            point = solve_linear(parts, np.array([log_n]), reference, problem)
-        tried.append((log_n, float(np.sum(point.cost)), point.x[0].T))
-        return tried[-1][1]
-
-    # By the same sums: those of an optimum may be scaled to the noise.
-    least = cost(centre)
-
-    def rise_at(log_n: float) -> float:
-        return cost(log_n) - least
-
     low, high = (
-        _end(rise_at, centre, sign, bound, first, delta_cost) for sign, bound in zip((-1, 1), bounds, strict=True)
+        _end(profile.rise, centre, sign, bound, first, delta_cost) for sign, bound in zip((-1, 1), bounds, strict=True)
     )
-    # Other valleys, where the search has seen as little, however high what lies between.
-    likely = np.log(optimum.grid[optimum.profile - np.min(optimum.profile, initial=np.inf) <= delta_cost])
+    # Other valleys, where the search has seen no more, however high what lies between.
+    share = 1 + delta_cost / max(profile.least, np.finfo(float).tiny)
+    likely = np.log(optimum.grid[optimum.profile <= share * np.min(optimum.profile, initial=np.inf)])
     others = likely[(likely < low) | (likely > high)]
     some = np.unique(np.linspace(0, max(others.size - 1, 0), OTHERS).round().astype(int))[: others.size]
-    others = [one for one in others[some].tolist() if rise_at(one) <= delta_cost]
+    others = [one for one in others[some].tolist() if profile.rise(one) <= delta_cost]
     if others and others[0] < low:
-        low = _end(rise_at, others[0], -1, bounds[0], WIDEST, delta_cost)
+        low = _end(profile.rise, others[0], -1, bounds[0], WIDEST, delta_cost)
     if others and others[-1] > high:
-        high = _end(rise_at, others[-1], 1, bounds[1], WIDEST, delta_cost)
-    inside = [(math.exp(log_n), x) for log_n, value, x in tried if value - least <= delta_cost]
-    scale = coefficient_factors(fit.model, optimum.n, ones)
-    coefficients = [
-        x * scale / coefficient_factors(fit.model, n, ones) * [[1.0], [1.0], [math.exp(min(-n * peak, UNKNOWN))]]
-        for n, x in inside
-    ]
-    return (math.exp(low), math.exp(high)), np.stack(coefficients)
+        high = _end(profile.rise, others[-1], 1, bounds[1], WIDEST, delta_cost)
+    return (math.exp(low), math.exp(high)), profile.coefficients(delta_cost)
+
+
+class _Profile:
+    """By how much the least cost rises from the optimum to other exponents, and the coefficients that have it there."""
+
+    def __init__(self, fit: ModelFit, peak: float):
+        """Start at the optimum of a fit."""
+        self.fit, self.peak = fit, peak
+        self.problem = problem_of(fit.pictures, fit.n_range, fit.free)._replace(peak=peak, tied=fit.tied)
+        # Relative to the nearest pixel the lobe keeps its size where no pixel sees the centre.
+        self.reference = fit.optimum.x.T * [1.0, 1.0, math.exp(fit.optimum.n * peak)]
+        # By the same sums: those of an optimum may be scaled to the noise.
+        self.tried, self.least = [], 0.0
+        self.least = self.rise(math.log(fit.optimum.n))
+        self.tried = [(0.0, fit.optimum.x)]
+
+    def rise(self, log_n: float) -> float:
+        """From the optimum to an exponent."""
+        with jax.enable_x64(True):
+            parts = sums(self.problem.pictures, np.array([log_n]), self.reference, self.peak)
+            point = solve_linear(parts, np.array([log_n]), self.reference, self.problem)
+        n, rise = math.exp(log_n), float(np.sum(point.cost)) - self.least
+        scales = [coefficient_factors(self.fit.model, one, np.ones(1)) for one in (self.fit.optimum.n, n)]
+        lobe = [[1.0], [1.0], [math.exp(min(-n * self.peak, UNKNOWN))]]
+        self.tried.append((rise, point.x[0].T * lobe * scales[0] / scales[1]))
+        return rise
+
+    def coefficients(self, limit: float) -> Float[np.ndarray, "N 3 C"]:
+        """Where it has risen by no more than a limit, at the scale of the lobe at the optimum."""
+        return np.stack([x for rise, x in self.tried if rise <= limit])
 
 
 def _end(rise_at: Callable[[float], float], start: float, sign: int, bound: float, step: float, limit: float) -> float:
