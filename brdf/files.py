@@ -12,7 +12,7 @@ import shutil
 import stat
 import tempfile
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -138,13 +138,14 @@ def write_text(path: AnyPath, text: str) -> None:
 
 
 @contextmanager
-def atomic_folder(path: AnyPath) -> Iterator[Path]:
+def atomic_folder(path: AnyPath, outdated: Collection[str] = ()) -> Iterator[Path]:
     """A folder to write a set of files into, which appear together in ``path`` when the block ends well.
 
     It is empty, on the same file system, and takes files, not folders; ``path`` is made, with its parents, where
     missing. On any exception nothing has changed: no file of the set appears, files that were there keep their content,
-    and folders made on the way are gone. Other files in an existing folder are left alone. Refused is a folder that
-    cannot be made or written, or in which a folder stands where a file of the set belongs.
+    and folders made on the way are gone. Of other files in an existing folder those named ``outdated`` go, as a set
+    before this one left them; the rest is left alone. Refused is a folder that cannot be made or written, or in which a
+    folder stands where a file of the set belongs.
     """
     folder = Path(os.path.realpath(as_path(path)))
     missing = [parent for parent in (folder, *folder.parents) if not os.path.exists(parent)]
@@ -157,7 +158,7 @@ def atomic_folder(path: AnyPath) -> Iterator[Path]:
                 new.mkdir()
                 old.mkdir()
                 yield new
-                _move_together(new, old, folder)
+                _move_together(new, old, folder, outdated)
     except InputError as error:
         # Named as it would have been in its place: where it was written is gone by now.
         staged = Path(error.where)
@@ -170,9 +171,13 @@ def atomic_folder(path: AnyPath) -> Iterator[Path]:
                 parent.rmdir()  # refused where there is something in it
 
 
-def _move_together(new: Path, old: Path, folder: Path) -> None:
-    """Move the new files into place; if one fails, put back the old ones."""
+def _move_together(new: Path, old: Path, folder: Path, outdated: Collection[str]) -> None:
+    """Move the new files into place and what is outdated away; if one fails, put back the old ones."""
     with ExitStack() as undo:
+        for place in (folder / name for name in outdated):
+            if place.is_file() and not (new / place.name).exists():
+                undo.callback((old / place.name).replace, place)
+                place.rename(old / place.name)
         for file in list(new.iterdir()):
             place = folder / file.name
             if place.is_dir():

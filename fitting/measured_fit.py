@@ -33,7 +33,7 @@ from fitting.joint_problem import degrees_between
 from fitting.model_fit import N_RANGE, ModelFit
 from fitting.problem import check_choice, model_name
 from fitting.progress import waiting
-from fitting.report.saving import write_report
+from fitting.report.saving import outdated, write_report
 from fitting.result import Parameter, Parameters
 from fitting.solver.losses import weights
 from fitting.solver.normal_equations import Picture
@@ -272,7 +272,7 @@ class BrdfFitResult(Parameters):
         Raises:
             InputError: where the folder cannot be written.
         """
-        with atomic_folder(folder) as stage:
+        with atomic_folder(folder, outdated(folder)) as stage:
             write_report(stage, self, plot)
 
 

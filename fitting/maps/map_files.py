@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import brdf
-from brdf.files import atomic_folder, write_text
+from brdf.files import as_path, atomic_folder, write_text
 from brdf.images.writing import write_layers
 from brdf.models.base import SpecularMaterial
 from brdf.vectors import mirror_log_cosine
@@ -68,7 +68,8 @@ def write_maps(maps: "Maps", folder: str | Path, *, plot: bool = False) -> None:
         "scale": scale,
         "gloss": f"log2(n) / {OCTAVES}",
     }
-    with atomic_folder(folder) as stage:
+    outdated = ["maps.png"] if (as_path(folder) / "maps.json").is_file() else []
+    with atomic_folder(folder, outdated) as stage:
         write_layers(stage / "maps.exr", {name: np.asarray(values, np.float32) for name, values in layers.items()})
         for name, (values, encoding) in images.items():
             values = (

@@ -23,25 +23,37 @@ from fitting.solver.profile import Optimum
 def write_report(stage: Path, result: Any, plot: bool, **further: Any) -> None:
     """Write material.json, material.mtl (of 1 or 3 channels), fit.json and, where it is wanted, comparison.png.
 
-    The result has ``material``, ``undetermined``, ``to_dict()`` and ``plot()``; ``further`` is held by fit.json, too.
+    The result has ``material``, ``undetermined``, ``to_dict()`` and ``plot()``; ``further`` is held by fit.json, too,
+    and the names of all files of the set, of which this is the last.
     """
     for suffix in ("json", "mtl") if result.material.k_d.size in (1, 3) else ("json",):
         brdf.save_material(result.material, stage / f"material.{suffix}", undetermined=result.undetermined)
-    write_text(stage / "fit.json", json.dumps(result.to_dict() | further, indent=2) + "\n")
     if plot:
         result.plot().savefig(stage / "comparison.png", dpi=150)
+    further["written"] = sorted(["fit.json", *(file.name for file in stage.iterdir())])
+    write_text(stage / "fit.json", json.dumps(result.to_dict() | further, indent=2) + "\n")
+
+
+def outdated(folder: str | Path, files: Sequence[Any] = ()) -> set[str]:
+    """What the fit that was saved in a folder has written there, but for pictures that the next one was fitted to."""
+    try:
+        written = json.loads((as_path(folder) / "fit.json").read_bytes())["written"]
+        read = {Path(file["path"]).resolve() for file in files if file}
+        return {name for name in written if name == Path(name).name and (Path(folder) / name).resolve() not in read}
+    except (OSError, ValueError, KeyError, TypeError):
+        return set()  # there is none, or of another version
 
 
 def save(result: FitResult, folder: str | Path, plot: bool) -> None:
     """Write what `FitResult.save` promises: all of it or nothing."""
-    with atomic_folder(folder) as stage:
+    with atomic_folder(folder, outdated(folder, result.files)) as stage:
         pictures = [_write_picture(stage, result, index) for index in range(len(result.scenes))]
-        write_report(stage, result, plot, pictures=pictures)
         arrays = dict(vars(result.optimum)) if result.optimum else {}
         for name, images in (("counted", result.counted), ("weights", result.weights)):
             arrays |= {f"{name}{index}": image for index, image in enumerate(images) if image is not None}
         np.savez_compressed(stage / "fit.npz", **arrays)
         brdf.write_image(stage / "fitted.exr", result.fitted())
+        write_report(stage, result, plot, pictures=pictures)
 
 
 def _write_picture(stage: Path, result: FitResult, index: int) -> dict[str, Any]:

@@ -200,6 +200,23 @@ def test_a_set_that_fails_half_way_into_place_is_taken_back(tmp_path):
     assert (tmp_path / "a.txt").read_text() == "old"
 
 
+def test_what_is_outdated_goes_with_a_set_that_comes(tmp_path):
+    def save(*names):
+        with atomic_folder(tmp_path, ["old.txt", "a.txt", "folder", "never.txt"]) as stage:
+            for name in names:
+                (stage / name).write_text("new")
+
+    (tmp_path / "folder").mkdir()
+    for name in ("old.txt", "mine.txt"):
+        (tmp_path / name).write_text("old")
+    with pytest.raises(InputError, match="folder: is a folder"):
+        save("a.txt", "folder")
+    assert everything(tmp_path) == ["folder", "mine.txt", "old.txt"]
+    save("a.txt")
+    assert everything(tmp_path) == ["a.txt", "folder", "mine.txt"]
+    assert (tmp_path / "a.txt").read_text() == "new"
+
+
 def test_a_folder_that_cannot_be_made(tmp_path):
     (tmp_path / "file").write_text("x")
     for place in ("file", "file/out"):

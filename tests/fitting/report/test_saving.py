@@ -138,6 +138,25 @@ def test_a_loaded_fit_is_saved_again_with_the_picture_that_was_fitted(folder, tm
         loaded.save("changed")
 
 
+def test_a_folder_that_is_saved_into_again_holds_the_last_fit_alone(folder, tmp_path, capsys):
+    _, result = folder
+    out, photo, target = tmp_path / "out", tmp_path / "photo.exr", np.asarray(result.targets[0])
+    brdf.write_image(photo, 0.5 * target)
+    first = fitting.fit([target, target], [result.scenes[0]] * 2, model="lambert", mask=target[..., 0] > 0.1)
+    first.save(out, plot=True)
+    (out / "mine.png").write_bytes(b"mine")
+    earlier = {"target.exr", "target1.exr", "scene1.toml", "mask.png", "mask1.png", "comparison.png", "mine.png"}
+    assert earlier <= {path.name for path in out.iterdir()}
+    fitting.fit(brdf.read_picture(photo), result.scenes[0], model="lambert").save(out)
+    assert {path.name for path in out.iterdir()} & earlier == {"mine.png"}
+    assert run(capsys, "fit", out, "--model", "lambert")[0] == 2  # no target.*: the picture lies elsewhere
+    # What the next fit reads stays, though an earlier one has written it.
+    first.save(out)
+    fitting.fit(brdf.read_picture(out / "target.exr"), result.scenes[0], model="lambert").save(out)
+    assert {path.name for path in out.iterdir()} & earlier == {"target.exr", "mine.png"}
+    np.testing.assert_array_equal(fitting.load_result(out).targets[0], target)
+
+
 def test_what_is_no_saved_fit_is_refused(folder, tmp_path):
     with pytest.raises(brdf.InputError, match=r"fit.json: there is no such file"):
         fitting.load_result(tmp_path)
