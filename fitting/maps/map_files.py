@@ -31,20 +31,26 @@ def write_maps(maps: "Maps", folder: str | Path, *, plot: bool = False) -> None:
     """Write what `Maps.save` promises."""
     layers = maps.layers()
     k_d, k_s = np.nan_to_num(maps.k_d), maps.fitted_k_s
-    # some outliers must not darken the rest
-    scale = {name: float(np.percentile(k, 99.9)) or 1.0 for name, k in (("k_d", k_d), ("k_s", k_s))}
+    inside = np.any(maps.normal != 0, axis=-1)
+    sure = maps.determined if maps.determined.any() else inside if inside.any() else ~inside
+
+    def brightest(values):
+        """Without some outliers, and highlights that may be anything, which must not darken the rest."""
+        return float(np.percentile(values[sure], 99.9)) or 1.0
+
+    scale = {"k_d": brightest(k_d), "k_s": brightest(k_s)}
     gloss = np.log2(np.maximum(maps.fitted_n, 1)) / OCTAVES
     half_n, f_0 = _as_facets(maps)
-    scale["openlime"] = float(np.percentile(np.maximum(k_d, f_0), 99.9)) or 1.0
+    scale["openlime"] = brightest(np.maximum(k_d, f_0))
     of_openlime, limits = _openlime_images(k_d / scale["openlime"], f_0 / scale["openlime"], half_n)
     roughness = np.asarray(brdf.roughness_from_exponent(half_n))
     # Of a glTF material no part is above 1 and what shines is taken from what is diffuse: both are made darker alike.
-    whole = np.percentile(np.max(k_d, axis=-1) + np.max(f_0, axis=-1), 99.9)
-    scale["material"] = max(1.0, float(whole))
-    f_0 = np.minimum(f_0 / scale["material"], MOST_REFLECTANCE)
-    strongest = float(np.percentile(f_0, 99.9)) or 1.0
-    base = k_d / scale["material"] / (1 - np.max(f_0, axis=-1, keepdims=True))
-    inside = np.any(maps.normal != 0, axis=-1)
+    scale["material"] = max(1.0, brightest(np.max(k_d, axis=-1) + np.max(f_0, axis=-1)))
+    base = k_d / scale["material"]
+    f_0 = np.minimum(f_0 / scale["material"], np.clip(1 - np.max(base, axis=-1, keepdims=True), 0, MOST_REFLECTANCE))
+    strongest = brightest(f_0)
+    f_0 = np.minimum(f_0, strongest)
+    base /= 1 - np.max(f_0, axis=-1, keepdims=True)
     normals = np.where(inside[..., None], 0.5 * maps.normal + 0.5, 0.5)
     images = {
         "k_d": (k_d / scale["k_d"], "linear"),

@@ -730,6 +730,25 @@ def test_gltf_shows_the_highlights_of_maps(folder, tmp_path, model, unit):
     assert (darker > 1) == (unit > 1)
 
 
+def test_highlights_that_are_not_determined_darken_nothing(folder, tmp_path):
+    path, _ = folder
+    maps = fitting.fit_maps(path)
+    row = np.arange(len(maps.k_d))[:, None, None] == 0
+    strong = {"fitted_k_s": np.where(row, 40.0, maps.fitted_k_s), "determined": maps.determined & ~row[..., 0]}
+    scales = {}
+    for name, one in (("all", maps), ("some", dataclasses.replace(maps, **strong))):
+        one.save(tmp_path / name)
+        scales[name] = json.loads((tmp_path / name / "maps.json").read_text())["scale"]
+        base = brdf.read_picture(tmp_path / name / "base_color.png").pixels
+        factor = json.loads((tmp_path / name / "material.gltf").read_text())["materials"][0]
+        f_0 = 0.04 * factor["extensions"]["KHR_materials_specular"]["specularColorFactor"][0]
+        f_0 *= brdf.read_image(tmp_path / name / "specular_color.png")
+        diffuse = base * (1 - np.max(f_0, axis=-1, keepdims=True))
+        np.testing.assert_allclose(diffuse[0], maps.k_d[0] / scales[name]["material"], rtol=2e-2)
+    for name, value in scales["some"].items():
+        assert value == pytest.approx(scales["all"][name], rel=0.25), name
+
+
 @pytest.mark.parametrize("model", ["phong", "blinn-phong"])
 def test_openlime_shows_the_highlights_of_maps(folder, tmp_path, model):
     """As its shader computes them, where light and view are along the normal: from all but a factor 2 to 87 off."""
