@@ -88,10 +88,10 @@ HIGHLIGHTS = (4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0)
 GEMAN_MCCLURE = 2.0
 """Where the weight of a residual starts to fall, in deviations."""
 
-RESTARTS = (8.0, 32.0, 128.0)
+RESTARTS = (3.0, 8.0, 32.0, 128.0)
 """Exponents from which minima are sought once more."""
 
-STANDS_OUT = 4.0
+STANDS_OUT = 1.5
 """Of its tile's median: a cost that tells of a minimum that is not the least."""
 
 OUTLIER = 4.0
