@@ -45,6 +45,7 @@ from fitting.progress import waiting
 from fitting.report import FitResult
 from fitting.result import Parameter
 from fitting.solver.nnls import nonnegative_minimum
+from fitting.uncertainty.covariance import RESOLUTION
 from fitting.uncertainty.intervals import NORMAL_95, above_zero, widened
 from fitting.uncertainty.noise_model import value_variance
 from fitting.uncertainty.residual import NEGLIGIBLE, Neighbours, neighbours_of, structure_warning
@@ -507,7 +508,11 @@ def _parameters(
     found: list[Parameter] = []
     places: list[int] = []
     for leaf in problem.freed:
-        value, own = np.asarray(problem.leaves[leaf.position], np.float64), deviation[leaf.numbers]
+        stored = np.asarray(problem.leaves[leaf.position])
+        value, own = stored.astype(np.float64), deviation[leaf.numbers]
+        if stored.dtype == np.float32:
+            # Unknowns are turns of a direction, and of n its logarithm.
+            own = np.hypot(own, RESOLUTION * (1 if leaf.is_direction or leaf.name == "n" else np.max(np.abs(value))))
         if leaf.is_direction:
             turned, size = degrees_between(np.asarray(given[leaf.position], np.float64), value), np.linalg.norm(own)
             towards = tuple((value / np.linalg.norm(value)).tolist())

@@ -169,6 +169,15 @@ def test_the_solver_ends_where_rounding_hides_the_rest(precision, seed):
     assert result.steps < 60
 
 
+def test_errors_hold_what_single_precision_leaves_of_a_picture_without_noise(target: np.ndarray):
+    known = scene(TRUE_DIRECTION, [1.0, 0.9, 0.8])
+    given = brdf.BlinnPhong(k_a=MATERIAL.k_a, k_d=[0.4] * 3, k_s=[0.2] * 3, n=20)
+    result = fitting.fit_jointly(target, known, given, lambda m, s: (m.k_d, m.k_s, m.n), precision="float32")
+    for one in result.parameters:
+        truth = np.resize(getattr(MATERIAL, one.name), 3)[one.channel or 0]
+        assert abs(one.value - truth) < 1.96 * one.error < max(4e-6 * truth, 1e-6)
+
+
 @pytest.mark.parametrize("kind", ["by channel", "by brightness", "copies"])
 def test_noise_that_is_not_even_is_in_the_errors_as_in_those_of_a_fit(target: np.ndarray, kind):
     known, noise = scene(TRUE_DIRECTION, [1.0, 0.9, 0.8]), np.random.default_rng(3).standard_normal(target.shape)
