@@ -20,7 +20,7 @@ CELL = math.radians(0.5)
 PASSES, FAILS = 1.5, 3.0
 # Where the noise is not known, a larger typical error than this is none that instruments make.
 LARGEST_NOISE = 0.1
-# Angles of light, in degrees, at which the albedo is taken.
+# Angles of light, in degrees, at which the albedo is taken: beyond, instruments see little, and tables are filled in.
 LIGHTS = (5.0, 20.0, 35.0, 50.0, 65.0, 75.0)
 # Tolerance of the quadrature, and how many values it may take for each of them.
 _QUADRATURE = 1e-3, 10_000
@@ -36,7 +36,7 @@ def check_table(table: MeasuredBRDF, subject: str | None = None) -> Report:
     samples = table
     if table.evaluate is not None:
         random = np.random.default_rng(20)
-        polar = np.arccos(random.uniform(math.cos(math.radians(75)), 1, (2, 4000)))
+        polar = np.arccos(random.uniform(math.cos(math.radians(LIGHTS[-1])), 1, (2, 4000)))
         light, view = from_angles(polar, random.uniform(0, 2 * np.pi, (2, 4000)))
         samples = dataclasses.replace(table, to_light=light, to_view=view, values=table.evaluate(light, view))
     _, repeats = _pairs(samples, exchanged=False)
@@ -126,6 +126,7 @@ def _energy(table: MeasuredBRDF) -> Finding:
     )
     row, channel = largest(albedo)
     value, bound, light = float(albedo[row, channel]), float(bounds[row, channel]), Angles(LIGHTS[row])
-    said = f"the largest albedo is {value:.4g} for light {light}, channel {table.channels[channel]}"
+    said = f"the largest albedo of light up to {LIGHTS[-1]:g}° is {value:.4g}, for light {light}"
+    said += f", channel {table.channels[channel]}"
     failed = f"does not conserve energy: {said}"
     return judged(value, ENERGY_LIMIT, bound, (light, None, channel), said, failed)

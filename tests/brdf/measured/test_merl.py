@@ -102,6 +102,7 @@ def test_energy_of_a_white_merl_table(tmp_path):
     # A Lambertian 0.9 exactly; the quadrature's own bound says how exactly.
     assert report.energy.value == pytest.approx(0.9, abs=max(report.energy.error_bound, 2e-3))
     assert report.energy.verdict == "pass"
+    assert "of light up to 75°" in report.energy.sentence
     assert report.reciprocity.verdict == "pass"
 
 
