@@ -6,7 +6,7 @@ floating-point operations are the compiler's own count for the basis images of t
 over light samples counts once.
 """
 
-import sys
+import argparse
 
 import jax
 import numpy as np
@@ -63,7 +63,7 @@ def operations(model, place):
     return cost["flops"] / small.resolution[0]
 
 
-def main(size=512):
+def main(size):
     """Measure and print."""
     material = brdf.BlinnPhong(k_a=[0.2, 0.3, 0.1], k_d=[0.5, 0.3, 0.2], k_s=[0.4, 0.4, 0.3], n=50.0)
     print("| scene | to compile (s) | to run (ms) | operations per pixel |\n| --- | --- | --- | --- |")
@@ -79,4 +79,6 @@ def main(size=512):
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("size", type=int, nargs="?", default=512)
+    main(parser.parse_args().size)

@@ -5,6 +5,8 @@
 Largest error over a ball of 64 × 64 pixels, relative to the brightest pixel; diffuse alone, and lobes alone.
 """
 
+import argparse
+
 import numpy as np
 
 import brdf
@@ -36,6 +38,7 @@ def picture(light: Light, material: brdf.Material) -> np.ndarray:
 
 def main() -> None:
     """Prints a table."""
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     print(f"{'':22}" + "".join(f"{samples:>9}" for samples in SAMPLES))
     for kind, light in LIGHTS.items():
         for name, material in MATERIALS.items():

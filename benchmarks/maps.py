@@ -5,6 +5,7 @@
 Real data lie where the environment variable ``BRDF_REAL_DATA`` says (default: ../shared/data).
 """
 
+import argparse
 import os
 import subprocess
 import sys
@@ -394,5 +395,7 @@ def rbf(centres):
 if __name__ == "__main__":
     every = (speed, files, errors, photographs, ball, rti)
     parts = {part.__name__: part for part in every}
-    for part in sys.argv[1:] or parts:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", choices=[*parts, []], metavar="PART")
+    for part in parser.parse_args().parts or parts:
         parts[part]()

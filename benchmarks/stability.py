@@ -3,8 +3,8 @@
 python -m benchmarks.stability stability.png
 """
 
+import argparse
 import dataclasses
-import sys
 from pathlib import Path
 
 import jax
@@ -132,4 +132,6 @@ def main(path: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1] if len(sys.argv) > 1 else "stability.png"))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("path", type=Path, nargs="?", default=Path("stability.png"))
+    main(parser.parse_args().path)

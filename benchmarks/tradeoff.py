@@ -5,8 +5,8 @@
 ``python -m benchmarks.tradeoff unlike`` does the same for a dozen scenes of other kinds.
 """
 
+import argparse
 import dataclasses
-import sys
 import tempfile
 import zlib
 from pathlib import Path
@@ -221,4 +221,6 @@ def main(names):
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="*")
+    main(parser.parse_args().scenes)

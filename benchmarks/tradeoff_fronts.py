@@ -8,6 +8,7 @@ each time in a new process, the first of each pair with an empty cache of compil
 and how many pairs named the same recommendation.
 """
 
+import argparse
 import json
 import os
 import subprocess
@@ -132,4 +133,8 @@ def main(folder, *rest):
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder")
+    parser.add_argument("scenes", nargs="*")
+    given = parser.parse_args()
+    main(given.folder, *given.scenes)
