@@ -3,8 +3,8 @@
 Noise has no shape. Where the residual has one, something that the scene says is not so: a light that stands elsewhere,
 a ball whose circle is off, a curve that was not undone. The renderer tells how the picture changes with each of them;
 what of that change the material cannot follow is compared with the residual. That is a score test (Rao 1948, Proc.
-Camb. Phil. Soc. 44, 50): one linear least squares for each cause, and nothing is fitted again. A mirrored picture is no
-small change: it is fitted.
+Camb. Phil. Soc. 44, 50): one linear least squares for each cause, and nothing is fitted again. A mirrored picture and
+another model are no small changes: they are fitted.
 
 Pictures are compared in the codes of their file where it has a curve, since noise and rounding are even there.
 """
@@ -49,8 +49,9 @@ KINDS = {
 MIRRORED = {"mirrored left-right": 1, "mirrored upside down": 0}
 # A cause is named where it explains this share of the structure, and is this many times its error.
 LEAST_SHARE, LEAST_SIZE = 0.3, 5.0
-# A mirrored picture explains more than this share.
-LEAST_MIRRORED = 0.5
+FLIP = "flip the picture, or the lights and the shape"
+# A mirrored picture, or another model, explains more than this share.
+LEAST_REFITTED = 0.5
 # Two causes are not told apart where beside one the other explains no more than 2 standard errors would: chi squared,
 # by how many numbers it has.
 ALIKE = {0: 4.0, 1: 4.0, 2: 6.18}
@@ -95,7 +96,7 @@ def diagnose(result: FitResult) -> tuple[Cause, ...]:
             for test in residual.tests()
             if test.cause.share > LEAST_SHARE and abs(test.cause.size) > LEAST_SIZE * test.cause.error
         ]
-        tests = sorted([*found, *residual.mirrored()], key=lambda test: -test.gain)
+        tests = sorted([*found, *residual.refitted()], key=lambda test: -test.gain)
         alike = [test.cause.name for test in tests[1:] if residual.alike(tests[0], test)]
     causes = [test.cause for test in tests]
     if causes:
@@ -195,11 +196,11 @@ class _Picture:
         """The picture with some numbers moved."""
         return np.asarray(brdf.render(*self.moved(move, size)))
 
-    def lit(self) -> Picture:
+    def lit(self, model: type[brdf.Material]) -> Picture:
         """As the solver takes them."""
-        material, scene = self.moved({}, 0.0)
+        scene = self.moved({}, 0.0)[1]
         target = jnp.asarray(self.target.reshape(-1, self.target.shape[-1]))
-        return picture_of(type(material), Tile(target, None, scene.surface_points(), scene))
+        return picture_of(model, Tile(target, None, scene.surface_points(), scene))
 
     def slopes(self, moves: Sequence[Any]) -> Float[np.ndarray, "K H W C"]:
         """The derivatives of the codes by the sizes of moves."""
@@ -235,7 +236,7 @@ class Residual:
 
     def __init__(self, result: FitResult):
         """Look at some of the pixels."""
-        side = max(MOST_PIXELS / math.sqrt(len(result.scenes)), FEWEST_PIXELS)
+        side, self.model = max(MOST_PIXELS / math.sqrt(len(result.scenes)), FEWEST_PIXELS), type(result.material)
         self.pictures = [_Picture(result, index, side) for index in range(len(result.scenes))]
         self.channels = self.pictures[0].noise.size
         blocks = [
@@ -283,27 +284,35 @@ class Residual:
                 share = min(gain / max(self.excess, gain, TINY), 1.0)
                 yield _Test(Cause(name, size, error, unit, share, remedy), columns, gain, inflation)
 
-    def mirrored(self) -> Iterator[_Test]:
-        """Whether the pictures, or one of several, show the scenes mirrored."""
+    def refitted(self) -> Iterator[_Test]:
+        """Whether the pictures, or one of several, show the scenes mirrored, or all show another model."""
         if self.excess <= LEAST_SIZE**2:
             return
-        lit = [picture.lit() for picture in self.pictures]
-        several = range(len(lit)) if len(lit) > 1 else ()
+        own = [picture.lit(self.model) for picture in self.pictures]
+        several = range(len(own)) if len(own) > 1 else ()
         for (name, axis), one in itertools.product(MIRRORED.items(), (None, *several)):
-            axes = [axis if one in (None, index) else () for index in range(len(lit))]
-            both = list(zip(self.pictures, axes, strict=True))
-            good = [picture.counted & np.flip(picture.counted, axis) for picture, axis in both]
-            size = sum(map(np.count_nonzero, good)) * self.channels
-            if 2 * size < self.left.size:
-                continue
-            # Fitted alike: a picture that is its own mirror image gains nothing.
-            before = self._least(lit, good, [()] * len(lit))
-            gain = before - self._least(lit, good, axes)
-            share = min(gain / max(before - size, gain, 1.0), 1.0)
-            if share > LEAST_MIRRORED and gain > LEAST_SIZE**2:
-                words = name if one is None else f"{name} of picture {one}"
-                cause = Cause(words, 1.0, 0.0, "", share, "flip the picture, or the lights and the shape")
-                yield _Test(cause, np.zeros((self.left.size, 0)), gain)
+            axes = [axis if one in (None, index) else () for index in range(len(own))]
+            yield from self._refitted(name if one is None else f"{name} of picture {one}", FLIP, own, own, axes)
+        for name, model in brdf.MODELS.items():
+            # One without a highlight explains no more than one with.
+            if model not in (self.model, brdf.Lambert):
+                other = [picture.lit(model) for picture in self.pictures]
+                yield from self._refitted(f"model {name}", f"fit that: --model {name}", own, other, [()] * len(own))
+
+    def _refitted(
+        self, name: str, remedy: str, own: list[Picture], other: list[Picture], axes: list[Any]
+    ) -> Iterator[_Test]:
+        both = list(zip(self.pictures, axes, strict=True))
+        good = [picture.counted & np.flip(picture.counted, axis) for picture, axis in both]
+        size = sum(map(np.count_nonzero, good)) * self.channels
+        if 2 * size < self.left.size:
+            return
+        # Fitted alike: a picture that is its own mirror image gains nothing.
+        before = self._least(own, good, [()] * len(own))
+        gain = before - self._least(other, good, axes)
+        share = float(min(gain / max(before - size, gain, 1.0), 1.0))
+        if share > LEAST_REFITTED and gain > LEAST_SIZE**2:
+            yield _Test(Cause(name, 1.0, 0.0, "", share, remedy), np.zeros((self.left.size, 0)), gain)
 
     def _least(self, lit: list[Picture], good: list[Bool[np.ndarray, "H W"]], axes: list[Any]) -> float:
         """Squares that the model leaves of some pixels of the pictures, flipped, in units of the noise."""

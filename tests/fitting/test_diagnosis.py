@@ -63,6 +63,23 @@ def test_what_is_wrong_is_named(name: str):
     assert result.to_dict()["diagnosis"][0]["name"] == name
 
 
+@pytest.mark.parametrize("true", ["phong", "normalized-blinn-phong"])
+@pytest.mark.parametrize("codes", [False, True])
+def test_another_model_is_named_and_no_ball_or_light_that_is_sound(true: str, codes: bool, tmp_path: Path):
+    material = brdf.MODELS[true](k_a=[0.05], k_d=[0.35], k_s=[0.5], n=12)  # pyright: ignore[reportCallIssue]
+    target = np.asarray(brdf.render(material, SCENE, precision="float64")) + NOISE
+    if codes:
+        brdf.write_image(tmp_path / "ball.png", target.astype(np.float32))
+        target = brdf.read_picture(tmp_path / "ball.png", encoding="srgb")
+    result = fitted(target)
+    cause = result.diagnosis[0]
+    assert cause.name == f"model {true}"
+    assert cause.share > 0.9
+    assert f"model {true} would explain" in str(result)
+    assert f"--model {true}" in cause.remedy
+    assert fitting.fit(target, SCENE, model=true).diagnosis == ()
+
+
 def test_a_black_level_and_one_of_two_lights_are_named():
     beside = brdf.DirectionalLight(direction=[-0.5, -0.3, 0.8], intensity=[0.6])
     scene = dataclasses.replace(SCENE, ambient=None, lights=(LIGHT, beside))
