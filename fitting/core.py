@@ -50,6 +50,8 @@ UNEXPLAINED = 0.5
 UNSEEN = 60.0
 # A highlight that explains less than this share of what errs together without it is none.
 EXPLAINED = 0.35
+# One that explains this share of all squares is one: sums over few blocks, as of a small picture, say little.
+PLAIN = 0.9
 # A highlight that changes no value by this share of a code is none: rounding hides it.
 HIDDEN = 0.5
 # A highlight in a colour JPEG has a colour where that is so many deviations of what the codec leaves.
@@ -503,6 +505,10 @@ def _explains_structure(fit: ModelFit, observed: Observed, after: Residual | Non
     x = nonnegative_minima(
         optimum.gram[:, :2, :2], optimum.product[:, :2], np.zeros((1, 2)), fit.free[:2].T, TOLERANCE_DOUBLE
     )
+    matt_cost = optimum.square + np.einsum("cij,ci,cj->c", optimum.gram[:, :2, :2], x, x)
+    matt_cost -= 2 * np.sum(x * optimum.product[:, :2], axis=1)
+    if np.sum(optimum.cost) < (1 - PLAIN) * np.sum(matt_cost):
+        return True
     matt = dataclasses.replace(optimum, x=np.vstack([x.T, np.zeros((1, len(x)))]))
     before = residual_statistics(fit.pictures, observed.widths, matt, noise, observed.rounding)
     explained = shared(_unexplained(fit.pictures, matt, observed, before))[0] - left
