@@ -31,7 +31,7 @@ from fitting.sample_error import MOST, between, near_exponent, nearer
 from fitting.selection import FAMILIES, Choice, PixelNoise, choose, is_better, may_be_off
 from fitting.solver.devices import placed
 from fitting.solver.losses import reweight
-from fitting.solver.nnls import nonnegative_minima
+from fitting.solver.nnls import inverse_diagonal, nonnegative_minima
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum, refit, search
 from fitting.solver.refinement import TOLERANCE_DOUBLE
@@ -219,7 +219,8 @@ def _fit_model(
         if near is not None or anew:
             n, peak = fit.optimum.n, max(picture.nearest_peak for picture in pictures)
             last = trial + 1 >= TRIALS
-            near = near_exponent(n, MOST, peak) if near is None else nearer(near, n, problem.n_range, peak, last=last)
+            found = n, _error_of_log_n(fit, observed), problem.n_range, peak
+            near = near_exponent(n, MOST, peak) if near is None else nearer(near, *found, last=last)
         if near is None:
             break
     if error is None or model.name not in (problem.sample_errors or {}) or not error.profile.size:
@@ -227,6 +228,14 @@ def _fit_model(
     # All pixels were looked at near one exponent; the first fit's profile is over all.
     grid, profile = error.profile
     return fit._replace(optimum=dataclasses.replace(fit.optimum, grid=grid, profile=profile))
+
+
+def _error_of_log_n(fit: ModelFit, observed: Observed) -> float:
+    """Standard error under independent noise."""
+    optimum = fit.optimum
+    free = np.append((optimum.x > 0).ravel(), True)
+    hessian = optimum.normal(residual_noise(optimum, observed.rounding) ** 2).gram * np.outer(free, free)
+    return math.sqrt(inverse_diagonal(hessian)[-1]) / optimum.n
 
 
 def _evenly_noisy(observed: Observed) -> Observed:

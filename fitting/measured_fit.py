@@ -415,7 +415,7 @@ def _fit_model(model, samples, loss, n_range):
     interval = None
     if specular and not errors.n_reason:
         interval, _ = exponent_interval(fit, errors.n_error, errors.reach, errors.delta_cost, 0.0, parabolic=True)
-        errors = errors._replace(n_reason=fit.held)
+        errors = errors._replace(n_reason=fit.held(n_range))
     material, parameters = material_and_parameters(fit, errors, np.ones(channels), interval)
     lobe, reasons = parameters[2 * channels :], {one.reason for one in parameters[2 * channels :]}
     if specular and len(reasons) == 1 and all(one.value is None for one in lobe):

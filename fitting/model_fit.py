@@ -89,10 +89,9 @@ class ModelFit(NamedTuple):
     moved: Sequence[Float[np.ndarray, " U"]] = ()
     copies: bool = False
 
-    @property
-    def held(self) -> str:
+    def held(self, n_range: tuple[float, float]) -> str:
         """Why n is none of the pixels': a bound that the user set holds it; empty where none does."""
-        bounds = [one for one in self.n_range if one not in N_RANGE and abs(np.log(self.optimum.n / one)) < HELD]
+        bounds = [one for one in n_range if one not in N_RANGE and abs(np.log(self.optimum.n / one)) < HELD]
         return f"it is held at {bounds[0]:g}, a bound of n_range" if bounds else ""
 
     @property

@@ -16,8 +16,9 @@ from fitting.solver.nnls import scaled_inverse
 MOST = 0.35
 # Of a lobe's peak the nearest pixel shows the exponential of this, or the lobe is tabulated relative to that.
 FAINT = -20.0
-# Nearer to an end of what is tabulated than this share of it an exponent may lie beyond.
-CLOSE = 0.05
+# Nearer to an end of what is tabulated than this share of it, or so many errors, an exponent or its interval may lie
+# beyond; of log n it is not followed farther.
+CLOSE, ERRORS, FARTHEST = 0.05, 3.0, 2.0
 
 
 class SampleError(NamedTuple):
@@ -59,14 +60,18 @@ def between(near: Near | None, n_range: tuple[float, float]) -> tuple[float, flo
     return low, high
 
 
-def nearer(near: Near, n: float, n_range: tuple[float, float], peak: float, *, last: bool) -> Near | None:
-    """Where to tabulate anew, after an exponent was found; None where it is well inside, or nothing else is tried."""
-    low, high = near.ends
-    edge = CLOSE * (high - low)
-    below = math.log(n) < low + edge and math.log(n_range[0]) < low
-    above = math.log(n) > high - edge and math.log(n_range[1]) > high
-    if near.narrow and not (below or above):
+def nearer(near: Near, n: float, error: float, n_range: tuple[float, float], peak: float, *, last: bool) -> Near | None:
+    """Where to tabulate anew, after an exponent was found; None where it is well inside, or nothing else is tried.
+
+    ``error`` is that of its logarithm, several of which are to lie inside too, for its interval.
+    """
+    (low, high), log_n, (least, most) = near.ends, math.log(n), map(math.log, n_range)
+    reach = min(ERRORS * error, FARTHEST)
+    edge = max(CLOSE * (high - low), reach)
+    below = log_n < low + edge and least < low
+    above = log_n > high - edge and most > high
+    if not (below or above) and (near.narrow or reach > MOST):
         return None
-    if last and near.narrow:
-        return Near.between(math.log(n_range[0]), math.log(n_range[1]), peak)
-    return None if last else near_exponent(n, MOST, peak)
+    if last:
+        return Near.between(least, most, peak) if near.narrow else None
+    return near_exponent(n, max(reach / (1 - CLOSE), MOST), peak)

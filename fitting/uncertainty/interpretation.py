@@ -113,7 +113,8 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: R
         least, most = observed.problem.n_range
         low = max(interval[0], least if least != N_RANGE[0] else 0.0)
         interval = low, min(interval[1], most if most != N_RANGE[1] else np.inf)
-        errors = errors.holding(likely)._replace(n_reason=fit.held or _open_exponent(interval))
+        reason = fit.held(observed.problem.n_range) or _open_exponent(interval)
+        errors = errors.holding(likely)._replace(n_reason=reason)
     if hidden:
         errors.reasons[2], errors = hidden, errors._replace(n_reason=hidden)
     material, parameters = material_and_parameters(fit, errors, observed.colour, interval)

@@ -92,6 +92,20 @@ def test_where_n_is_open_so_is_k_s(k_s: float, n: float, seed: int):
         assert low <= value <= high
 
 
+def test_the_interval_of_n_goes_on_beyond_what_was_tabulated_first():
+    """Of a weak highlight that a wide sun makes: every second was said to fit as well with any exponent."""
+    polar, azimuth = np.meshgrid(np.pi * (np.arange(32) + 0.5) / 32, np.pi * (np.arange(64) + 0.5) / 32, indexing="ij")
+    sun = np.exp(-((polar - 0.9) ** 2 + (azimuth - 3.6) ** 2) / 0.08)
+    sky = brdf.EnvironmentMap((0.3 + 8 * sun)[..., None], samples=1024)
+    scene, truth = ball(sky, 48), brdf.NormalizedPhong(k_d=0.3, k_s=0.01, n=200)
+    clean, random = np.asarray(brdf.render(truth, scene)), np.random.default_rng(0)
+    for _ in range(6):
+        n = fitting.fit(clean + 0.003 * random.standard_normal(clean.shape), scene, model="normalized-phong")["n"]
+        assert n.interval is not None
+        assert 20 < n.interval[0] < n.interval[1]
+        assert "any exponent" not in n.reason
+
+
 def test_without_noise_the_samples_that_a_picture_was_drawn_with_are_taken_and_told_of():
     scene = ball(WINDOW)
     picture = np.asarray(brdf.render(MATERIAL, scene, precision="float64"))
