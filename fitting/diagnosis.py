@@ -24,6 +24,7 @@ from jaxtyping import Bool, Float
 import brdf
 from brdf.images.encoding import encode
 from brdf.precision import working_precision
+from fitting.budget.sampling import sample_counts, with_samples
 from fitting.core import picture_of
 from fitting.joint_problem import JointProblem, joint_problem, place_of, scene_leaves, turns
 from fitting.likelihood import how_many_alike, weight_of_alike
@@ -65,6 +66,8 @@ BLOCK = 16
 MOST_PIXELS, FEWEST_PIXELS = 256, 48
 # So many pixels from the outline a small step of the circle makes no small change.
 RIM = 1.5
+# Light samples, unless fewer, as the scene says, leave less: what these leave out has a shape too.
+SAMPLES = 1024
 # What is darker than so many standard deviations is left out where noise was cut off at 0.
 DARK = 3.0
 # Of a step between codes: noise below that is mostly rounding.
@@ -87,6 +90,9 @@ def diagnose(result: FitResult) -> tuple[Cause, ...]:
     """Causes of the structure in a residual, likeliest first; none where none explains a good part of it."""
     with working_precision("float64"):
         residual = Residual(result)
+        if 1 < max(count for scene in result.scenes for count in (1, *sample_counts(scene))) < SAMPLES:
+            finer = [with_samples(scene, SAMPLES) for scene in result.scenes]
+            residual = min(residual, Residual(dataclasses.replace(result, scenes=finer)), key=lambda one: one.square)
         # What a codec leaves has a shape of its own, as a wrong scene does.
         unspoilt = all(file is not None and not file.get("lossy", True) for file in result.files or [None])
         if residual.rounded and not unspoilt and not any("structure" in words for words in result.warnings):
@@ -257,6 +263,11 @@ class Residual:
     def rounded(self) -> bool:
         """Whether rounding to codes is most of the noise of some picture."""
         return any(picture.rounded for picture in self.pictures)
+
+    @property
+    def square(self) -> float:
+        """Of what is left of the codes."""
+        return sum(float(np.sum(picture.left[picture.counted] ** 2)) for picture in self.pictures)
 
     def tests(self) -> Iterator[_Test]:
         """Each cause that the scenes determine, as large as it explains most."""
