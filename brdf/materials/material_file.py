@@ -131,9 +131,8 @@ def material_from_dict(values: Any, where: object = "material") -> Material:
     if not isinstance(values, dict):
         raise InputError(where, "must be a JSON object", 'Write {"model": ..., "k_d": ...}')
     given = {key: value for key, value in values.items() if key != "note"}
-    table = Table(
-        str(where), jax.tree.map(lambda leaf: 0.0 if leaf is None else leaf, given, is_leaf=lambda leaf: leaf is None)
-    )
+    numbers = jax.tree.map(lambda leaf: 0.0 if leaf is None else leaf, given, is_leaf=lambda leaf: leaf is None)
+    table = Table(str(where), numbers | ({"model": values["model"]} if "model" in values else {}))
     material = table.make(table.choose("model", MODELS))
     if values.get("n", 0) is None and np.any(material.k_s):
         raise InputError(f"{where}: n", "is null (not determined) although k_s is not 0", "Give n, or k_s = 0")

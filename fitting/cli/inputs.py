@@ -18,6 +18,8 @@ from fitting.photographs.ball import Circle, ball_points, ball_seen, find_circle
 from fitting.photographs.light_files import parse_numbers, read_directions, read_intensities
 
 # Of each kind of input: the options that say what it says itself or nothing of it, why, and what to do.
+# Beyond these single precision has no numbers for the pixels.
+EXPOSURES = 1e-12, 1e12
 REFUSED = {
     "archive": (
         ("light", "lights", "intensities", "scene", "sphere", "normals", "encoding"),
@@ -172,7 +174,9 @@ def _exposed(pictures: list[brdf.Picture], options) -> list[brdf.Picture]:
         return pictures
     wanted = count if len(typed.replace(",", " ").split()) == count else 1
     factors = parse_numbers(typed, "--exposure", wanted, "one number, or one each")
-    _require(min(factors) > 0, "--exposure", f"must be above 0, got {typed[:60]!r}", "Give a relative exposure time")
+    least, most = EXPOSURES
+    what = f"must be above 0, between {least:g} and {most:g}, got {typed[:60]!r}"
+    _require(least <= min(factors) and max(factors) <= most, "--exposure", what, "Give a relative exposure time")
     return [picture.scaled(1.0 / factor) for picture, factor in zip(pictures, np.resize(factors, count), strict=True)]
 
 

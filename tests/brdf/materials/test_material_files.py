@@ -142,6 +142,7 @@ MALFORMED = {
     "number of 5,000 digits": (".json", '{"model": "lambert", "k_d": %s}' % ("9" * 5000), "is not JSON"),
     "no model": (".json", "{}", "a.json: has no model. Add model = one of lambert, phong"),
     "unknown model": (".json", '{"model": "ward"}', "model: is unknown, got 'ward'"),
+    "a model of null": (".json", '{"model": null}', "model: is unknown, got None"),
     "unknown key": (
         ".json",
         '{"model": "lambert", "k_d": [1], "gloss": 1}',

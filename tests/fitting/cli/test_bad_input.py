@@ -250,6 +250,7 @@ CASES: list[tuple[dict[str, Any], str, str]] = [
     ({"i.txt": "-1"}, f"{LIT} --intensities i.txt", "i.txt: line 1: must be 1 numbers of 0 or more"),
     ({"i.txt": "0 0 0"}, f"{LIT} --intensities i.txt", "i.txt: line 1: must be 3 numbers of 0 or more, not all 0"),
     ({}, f"{LIT} --exposure 0", "--exposure: must be above 0"),
+    ({}, f"{LIT} --exposure 1e-300", "--exposure: must be above 0, between 1e-12 and"),
     ({}, f"{LIT} --exposure 1,2,3", "--exposure: must be 1 finite"),
     ({}, f"{LIT} --normals 0.png", "--normals: says what --sphere says too"),
     ({}, f"{LIT} --scene a.toml", "--scene: says what --sphere or --normals says too"),
