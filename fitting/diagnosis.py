@@ -23,11 +23,13 @@ from jaxtyping import Bool, Float
 
 import brdf
 from brdf.images.encoding import encode
+from brdf.lobes import Near
 from brdf.precision import working_precision
 from fitting.budget.sampling import sample_counts, with_samples
 from fitting.core import picture_of
 from fitting.joint_problem import JointProblem, joint_problem, place_of, scene_leaves, turns
 from fitting.likelihood import how_many_alike, weight_of_alike
+from fitting.model_fit import N_RANGE
 from fitting.pixels import Tile
 from fitting.result import Cause, FitResult
 from fitting.solver.normal_equations import Picture
@@ -62,8 +64,9 @@ FOLLOWED = 1e-6
 STEP = 0.05
 # Pixels on a side of the blocks within which errors go together.
 BLOCK = 16
-# Pixels on a side that are looked at, if it were one picture, and at least of each.
-MOST_PIXELS, FEWEST_PIXELS = 256, 48
+# Pixels on a side that are looked at, if it were one picture, the same under lights of many samples, and at least of
+# each picture.
+MOST_PIXELS, MOST_SAMPLED, FEWEST_PIXELS = 256, 96, 48
 # So many pixels from the outline a small step of the circle makes no small change.
 RIM = 1.5
 # Light samples, unless fewer, as the scene says, leave less: what these leave out has a shape too.
@@ -90,7 +93,7 @@ def diagnose(result: FitResult) -> tuple[Cause, ...]:
     """Causes of the structure in a residual, likeliest first; none where none explains a good part of it."""
     with working_precision("float64"):
         residual = Residual(result)
-        if 1 < max(count for scene in result.scenes for count in (1, *sample_counts(scene))) < SAMPLES:
+        if 1 < _most_samples(result) < SAMPLES:
             finer = [with_samples(scene, SAMPLES) for scene in result.scenes]
             residual = min(residual, Residual(dataclasses.replace(result, scenes=finer)), key=lambda one: one.square)
         # What a codec leaves has a shape of its own, as a wrong scene does.
@@ -206,7 +209,8 @@ class _Picture:
         """As the solver takes them."""
         scene = self.moved({}, 0.0)[1]
         target = jnp.asarray(self.target.reshape(-1, self.target.shape[-1]))
-        return picture_of(model, Tile(target, None, scene.surface_points(), scene))
+        every = Near.between(math.log(N_RANGE[0]), math.log(N_RANGE[1]), 0.0)
+        return picture_of(model, Tile(target, None, scene.surface_points(), scene), every)
 
     def slopes(self, moves: Sequence[Any]) -> Float[np.ndarray, "K H W C"]:
         """The derivatives of the codes by the sizes of moves."""
@@ -232,6 +236,10 @@ def _content(problem: JointProblem, vector: Any) -> Any:
     return problem.at(vector).content()
 
 
+def _most_samples(result: FitResult) -> int:
+    return max(count for scene in result.scenes for count in (1, *sample_counts(scene)))
+
+
 def _leaves(material: brdf.Material, scenes: Sequence[brdf.Scene]) -> list[Any]:
     kinds = "light", "intensity", "ball", "radius"
     return [*jax.tree.leaves(material), *(leaf for kind in kinds for leaf in scene_leaves(kind, scenes[0]))]
@@ -242,7 +250,8 @@ class Residual:
 
     def __init__(self, result: FitResult):
         """Look at some of the pixels."""
-        side, self.model = max(MOST_PIXELS / math.sqrt(len(result.scenes)), FEWEST_PIXELS), type(result.material)
+        most, self.model = MOST_PIXELS if _most_samples(result) == 1 else MOST_SAMPLED, type(result.material)
+        side = max(most / math.sqrt(len(result.scenes)), FEWEST_PIXELS)
         self.pictures = [_Picture(result, index, side) for index in range(len(result.scenes))]
         self.channels = self.pictures[0].noise.size
         blocks = [
