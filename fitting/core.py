@@ -508,15 +508,15 @@ def _explains_structure(fit: ModelFit, observed: Observed, after: Residual | Non
         return False
     if fit.evidence is not None and fit.evidence.precision is not None:
         return True  # what errs together has been weighed by the channels' covariance
-    left, chance = shared(_unexplained(fit.pictures, optimum, observed, after))
-    if left <= CHANCE * chance:  # both 0 where predictions lie within all the codes
-        return True
     x = nonnegative_minima(
         optimum.gram[:, :2, :2], optimum.product[:, :2], np.zeros((1, 2)), fit.free[:2].T, TOLERANCE_DOUBLE
     )
     matt_cost = optimum.square + np.einsum("cij,ci,cj->c", optimum.gram[:, :2, :2], x, x)
     matt_cost -= 2 * np.sum(x * optimum.product[:, :2], axis=1)
     if np.sum(optimum.cost) < (1 - PLAIN) * np.sum(matt_cost):
+        return True
+    left, chance = shared(_unexplained(fit.pictures, optimum, observed, after))
+    if left <= CHANCE * chance:  # both 0 where predictions lie within all the codes
         return True
     matt = dataclasses.replace(optimum, x=np.vstack([x.T, np.zeros((1, len(x)))]))
     before = residual_statistics(fit.pictures, observed.widths, matt, noise, observed.rounding)

@@ -309,30 +309,28 @@ class Residual:
         if self.excess <= LEAST_SIZE**2:
             return
         own = [picture.lit(self.model) for picture in self.pictures]
-        several = range(len(own)) if len(own) > 1 else ()
+        several, as_they_are = range(len(own)) if len(own) > 1 else (), [()] * len(own)
+        trials = []
         for (name, axis), one in itertools.product(MIRRORED.items(), (None, *several)):
             axes = [axis if one in (None, index) else () for index in range(len(own))]
-            yield from self._refitted(name if one is None else f"{name} of picture {one}", FLIP, own, own, axes)
+            trials.append((name if one is None else f"{name} of picture {one}", FLIP, own, axes))
         for name, model in brdf.MODELS.items():
             # One without a highlight explains no more than one with.
             if model not in (self.model, brdf.Lambert):
                 other = [picture.lit(model) for picture in self.pictures]
-                yield from self._refitted(f"model {name}", f"fit that: --model {name}", own, other, [()] * len(own))
-
-    def _refitted(
-        self, name: str, remedy: str, own: list[Picture], other: list[Picture], axes: list[Any]
-    ) -> Iterator[_Test]:
-        both = list(zip(self.pictures, axes, strict=True))
-        good = [picture.counted & np.flip(picture.counted, axis) for picture, axis in both]
-        size = sum(map(np.count_nonzero, good)) * self.channels
-        if 2 * size < self.left.size:
-            return
-        # Fitted alike: a picture that is its own mirror image gains nothing.
-        before = self._least(own, good, [()] * len(own))
-        gain = before - self._least(other, good, axes)
-        share = float(min(gain / max(before - size, gain, 1.0), 1.0))
-        if share > LEAST_REFITTED and gain > LEAST_SIZE**2:
-            yield _Test(Cause(name, 1.0, 0.0, "", share, remedy), np.zeros((self.left.size, 0)), gain)
+                trials.append((f"model {name}", f"fit that: --model {name}", other, as_they_are))
+        for name, remedy, lit, axes in trials:
+            both = list(zip(self.pictures, axes, strict=True))
+            good = [picture.counted & np.flip(picture.counted, axis) for picture, axis in both]
+            size = sum(map(np.count_nonzero, good)) * self.channels
+            if 2 * size < self.left.size:
+                continue
+            # Fitted alike: a picture that is its own mirror image gains nothing.
+            before = self._least(own, good, as_they_are)
+            gain = before - self._least(lit, good, axes)
+            share = float(min(gain / max(before - size, gain, 1.0), 1.0))
+            if share > LEAST_REFITTED and gain > LEAST_SIZE**2:
+                yield _Test(Cause(name, 1.0, 0.0, "", share, remedy), np.zeros((self.left.size, 0)), gain)
 
     def _least(self, lit: list[Picture], good: list[Bool[np.ndarray, "H W"]], axes: list[Any]) -> float:
         """Squares that the model leaves of some pixels of the pictures, flipped, in units of the noise."""

@@ -130,9 +130,9 @@ def material_from_dict(values: Any, where: object = "material") -> Material:
     """The material that JSON holds, see `material_to_dict`; an error names the key and where it stands."""
     if not isinstance(values, dict):
         raise InputError(where, "must be a JSON object", 'Write {"model": ..., "k_d": ...}')
-    given = {key: value for key, value in values.items() if key != "note"}
-    numbers = jax.tree.map(lambda leaf: 0.0 if leaf is None else leaf, given, is_leaf=lambda leaf: leaf is None)
-    table = Table(str(where), numbers | ({"model": values["model"]} if "model" in values else {}))
+    given = {key: value for key, value in values.items() if key not in ("note", "model")}
+    given = jax.tree.map(lambda leaf: 0.0 if leaf is None else leaf, given, is_leaf=lambda leaf: leaf is None)
+    table = Table(str(where), {key: given.get(key, value) for key, value in values.items() if key != "note"})
     material = table.make(table.choose("model", MODELS))
     if values.get("n", 0) is None and np.any(material.k_s):
         raise InputError(f"{where}: n", "is null (not determined) although k_s is not 0", "Give n, or k_s = 0")

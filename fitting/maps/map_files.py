@@ -31,26 +31,27 @@ def write_maps(maps: "Maps", folder: str | Path, *, plot: bool = False) -> None:
     """Write what `Maps.save` promises."""
     layers = maps.layers()
     k_d, k_s = np.nan_to_num(maps.k_d), maps.fitted_k_s
-    inside = np.any(maps.normal != 0, axis=-1)
-    sure = maps.determined if maps.determined.any() else inside if inside.any() else ~inside
+    # Highlights that are not determined may be anything, and some outliers: neither must darken the rest.
+    sure = maps.determined if maps.determined.any() else np.ones_like(maps.determined)
 
     def brightest(values):
-        """Without some outliers, and highlights that may be anything, which must not darken the rest."""
-        return float(np.percentile(values[sure], 99.9)) or 1.0
+        return float(np.percentile(values, 99.9)) or 1.0
 
-    scale = {"k_d": brightest(k_d), "k_s": brightest(k_s)}
+    scale = {"k_d": brightest(k_d), "k_s": brightest(k_s[sure])}
     gloss = np.log2(np.maximum(maps.fitted_n, 1)) / OCTAVES
     half_n, f_0 = _as_facets(maps)
-    scale["openlime"] = brightest(np.maximum(k_d, f_0))
+    known = sure[..., None] * f_0
+    scale["openlime"] = brightest(np.maximum(k_d, known))
     of_openlime, limits = _openlime_images(k_d / scale["openlime"], f_0 / scale["openlime"], half_n)
     roughness = np.asarray(brdf.roughness_from_exponent(half_n))
     # Of a glTF material no part is above 1 and what shines is taken from what is diffuse: both are made darker alike.
-    scale["material"] = max(1.0, brightest(np.max(k_d, axis=-1) + np.max(f_0, axis=-1)))
+    scale["material"] = max(1.0, brightest(np.max(k_d, axis=-1) + np.max(known, axis=-1)))
     base = k_d / scale["material"]
     f_0 = np.minimum(f_0 / scale["material"], np.clip(1 - np.max(base, axis=-1, keepdims=True), 0, MOST_REFLECTANCE))
-    strongest = brightest(f_0)
+    strongest = brightest(f_0[sure])
     f_0 = np.minimum(f_0, strongest)
     base /= 1 - np.max(f_0, axis=-1, keepdims=True)
+    inside = np.any(maps.normal != 0, axis=-1)
     normals = np.where(inside[..., None], 0.5 * maps.normal + 0.5, 0.5)
     images = {
         "k_d": (k_d / scale["k_d"], "linear"),

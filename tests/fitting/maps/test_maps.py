@@ -747,6 +747,8 @@ def test_highlights_that_are_not_determined_darken_nothing(folder, tmp_path):
     path, _ = folder
     maps = fitting.fit_maps(path)
     row = np.arange(len(maps.k_d))[:, None, None] == 0
+    # Its k_d is known, and may be the brightest.
+    maps = dataclasses.replace(maps, k_d=np.where(row, np.maximum(maps.k_d, 0.7), 0.5 * maps.k_d))
     strong = {"fitted_k_s": np.where(row, 40.0, maps.fitted_k_s), "determined": maps.determined & ~row[..., 0]}
     scales = {}
     for name, one in (("all", maps), ("some", dataclasses.replace(maps, **strong))):
@@ -758,6 +760,8 @@ def test_highlights_that_are_not_determined_darken_nothing(folder, tmp_path):
         f_0 *= brdf.read_image(tmp_path / name / "specular_color.png")
         diffuse = base * (1 - np.max(f_0, axis=-1, keepdims=True))
         np.testing.assert_allclose(diffuse[0], maps.k_d[0] / scales[name]["material"], rtol=2e-2)
+        shown = scales[name]["k_d"] * brdf.read_image(tmp_path / name / "k_d.png")
+        np.testing.assert_allclose(shown, maps.k_d, rtol=1e-2, atol=1e-3)
     for name, value in scales["some"].items():
         assert value == pytest.approx(scales["all"][name], rel=0.25), name
 
