@@ -120,8 +120,8 @@ def next_light(result: Any, candidates: Sequence[Any] | None = None, count: int 
 
     Args:
         result: of `fitting.fit`, of one picture or several; or maps, see `Maps.next_light`.
-        candidates: lights, or directions towards them, (K, 3), which shine like the brightest of the result's lights;
-            None for any direction of the hemisphere on the camera's side.
+        candidates: lights, or directions towards them, (K, 3), which shine as bright on what the picture shows as the
+            brightest of the result's lights; None for any direction of the hemisphere on the camera's side.
         count: how many, one chosen after the other.
         of: "n", "k_s", "k_d", "k_a", or one channel, as "k_s[0]".
 
@@ -187,7 +187,8 @@ def next_light(result: Any, candidates: Sequence[Any] | None = None, count: int 
             shown = rendered(lit)
             return unit * information_of(lit, (weight if bright is None else bright(shown)) * (shown < ceiling))
 
-        return choose_lights(candidates, count, of, known, to_view, unit * information, information_by, error)
+        arriving = [_arriving(light, scene) for scene, *_ in scenes for light in scene.lights]
+        return choose_lights(candidates, count, of, known, arriving, to_view, unit * information, information_by, error)
 
 
 def choose_lights(
@@ -195,6 +196,7 @@ def choose_lights(
     count: int,
     of: str,
     known: tuple[Light, ...],
+    arriving: Sequence[np.ndarray],
     to_view: np.ndarray,
     information: np.ndarray,
     information_by: Callable[[Light], np.ndarray],
@@ -203,11 +205,11 @@ def choose_lights(
     """Choose lights one after the other, each where it leaves the least error.
 
     The information of the known lights, which adds up, tells with that of one more the error of the number ``of``; a
-    hemisphere of candidates lies around ``to_view``.
+    hemisphere of candidates lies around ``to_view``, as bright as the most that is arriving of a known light.
     """
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
         raise InputError("count", f"must be 1 or more, got {count}", "Say how many lights to add")
-    shining = max((np.asarray(light.emittance) for light in known), key=np.sum, default=np.ones(1))
+    shining = max(arriving, key=np.mean, default=np.ones(1))
     listed = isinstance(candidates, Sequence | np.ndarray | jax.Array)
     given = [_light(one, shining) for one in candidates] if listed else []
     if candidates is not None and not given:
@@ -241,6 +243,15 @@ def _light(given: Any, shining: np.ndarray) -> Light:
     except InputError:
         what = f"must hold lights or directions of 3 numbers, got {given!r:.60}"
         raise InputError("candidates", what, "Give brdf lights, or (K, 3) directions towards the light") from None
+
+
+def _arriving(light: Light, scene: brdf.Scene) -> np.ndarray:
+    """What a white matt surface shows of a light at most, facing it, (C,); of one that is near or wide, in a scene."""
+    if isinstance(light, brdf.DirectionalLight):
+        return np.asarray(light.emittance)
+    alone = dataclasses.replace(scene, lights=(light,), ambient=None, visibility=())
+    image = brdf.render(brdf.Lambert(k_d=np.ones(alone.channels)), alone, precision="float64")
+    return np.max(np.asarray(image).reshape(-1, alone.channels), axis=0)
 
 
 def direction_of(light: Light) -> np.ndarray:

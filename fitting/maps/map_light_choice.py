@@ -79,4 +79,5 @@ def next_light(maps: "Maps", candidates: Any, count: int, of: str) -> LightChoic
     unit = 1 / (own**2 * strength * left_by(information))
     has_own = np.isfinite(unit)
     strength *= np.where(has_own, unit, np.median(unit[has_own]) if np.any(has_own) else 1)
-    return choose_lights(candidates, count, of, known, to_view, information, information_by, error)
+    arriving = [np.asarray(light.emittance) for light in known]
+    return choose_lights(candidates, count, of, known, arriving, to_view, information, information_by, error)

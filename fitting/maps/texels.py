@@ -420,9 +420,11 @@ class Texels(eqx.Module):
             [*(a * x * b for x, b in zip(row, factors, strict=True)), a * (moment - sum(map(operator.mul, row, k)))]
             for a, (*row, moment) in zip(factors, rows, strict=True)
         ]
-        active = [(x > 0) | errors for x in k]
-        active[-1] &= (k[-1] < self.cap) | errors
-        solved = solve(rows, [*active, *[True] * len(slopes)], count - self.grey)
+        active = None
+        if not errors:
+            active = [*(x > 0 for x in k), *[True] * len(slopes)]
+            active[count - 1] &= k[-1] < self.cap
+        solved = solve(rows, active, count - self.grey)
         gain = jnp.sum(divide(k[-1] ** 2, solved[count - 1].inverse), axis=0)
         of_channels = k, [one.error for one in solved[:count]]
         k, k_error = ([jnp.broadcast_to(x, self.shown.shape[:2]) for x in some] for some in of_channels)
@@ -859,28 +861,38 @@ class Solved(NamedTuple):
     error: Array
 
 
-def solve(rows: Rows, active: list[Any], own: int) -> list[Solved]:
+def solve(rows: Rows, active: list[Any] | None, own: int) -> list[Solved]:
     """Solve by elimination: first each channel's ``own`` unknowns, then those that the channels have in common.
 
-    What is not active may not move, and its error is that which it would have.
+    What is not active may not move, and its error is that which it would have. None is for errors: what depends on
+    others leaves these as unknown as rounding allows, and no step is to be taken.
     """
-    eliminated = []
+    rows = [list(map(functools.partial(jnp.broadcast_to, shape=rows[0][-1].shape), row)) for row in rows]
+    eliminated, squares = [], [row[i] for i, row in enumerate(rows)]
+
+    def without(rows: Rows, k: int, square: Array) -> Rows:
+        """The rows less an unknown, the next of all; the square of its column."""
+        pivot, index = rows[k][k], len(eliminated)
+        eliminated.append((rows[k][-1], divide(1.0, pivot)))
+        if active is None:
+            return swept(rows, k, divide(1.0, jnp.maximum(pivot, rounding_of(square))))
+        return swept(rows, k, jnp.where(active[index], eliminated[index][1], 0))
+
     for k in range(own):
-        eliminated.append((rows[k][-1], divide(1.0, rows[k][k])))
-        rows = swept(rows, k, jnp.where(active[k], eliminated[-1][1], 0))
+        rows = without(rows, k, squares[k])
     common = [[jnp.sum(x, axis=0, keepdims=True) for x in row[own:]] for row in rows[own:]]
     for k in range(len(common)):
-        eliminated.append((common[k][-1], divide(1.0, common[k][k])))
-        common = swept(common, k, jnp.where(active[own + k], eliminated[-1][1], 0))
+        common = without(common, k, jnp.sum(squares[own + k], axis=0, keepdims=True))
     steps, variances = [row[-1] for row in common], [row[i] for i, row in enumerate(common)]
     for i, row in reversed(list(enumerate(rows[:own]))):
         across = row[own:-1]
         beside = [sum(map(operator.mul, line, across)) for line in common]
         steps.insert(0, row[-1] - sum(x * line[-1] for x, line in zip(across, common, strict=True)))
         variances.insert(0, row[i] + sum(map(operator.mul, across, beside)))
+    moves = active or [True] * len(rows)
     return [
-        Solved(left, inverse, step, jnp.where(inverse > 0, square_root(jnp.where(moves, variance, inverse)), jnp.inf))
-        for (left, inverse), step, variance, moves in zip(eliminated, steps, variances, active, strict=True)
+        Solved(left, inverse, step, jnp.where(inverse > 0, square_root(jnp.where(move, variance, inverse)), jnp.inf))
+        for (left, inverse), step, variance, move in zip(eliminated, steps, variances, moves, strict=True)
     ]
 
 
@@ -902,4 +914,9 @@ def swept(rows: Rows, k: int, inverse: Array) -> Rows:
 
 def unless_rounding(left: Array, square: Array) -> Array:
     """What elimination leaves of a column's square; 0 where that is rounding."""
-    return jnp.where(left > DEPENDENT * jnp.finfo(left.dtype).eps * square, left, 0)
+    return jnp.where(left > rounding_of(square), left, 0)
+
+
+def rounding_of(square: Array) -> Array:
+    """What elimination may leave of a square though nothing is left."""
+    return DEPENDENT * jnp.finfo(square.dtype).eps * square

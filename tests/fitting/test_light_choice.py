@@ -87,6 +87,14 @@ def test_a_lamp_that_is_near_can_be_chosen_and_told(result):
     assert choice.after[0] < choice.before
 
 
+def test_directions_shine_as_bright_as_a_near_light_does_where_it_falls():
+    lamp = brdf.PointLight(3 * np.array([0.8, 0.3, 0.5]) / np.linalg.norm([0.8, 0.3, 0.5]), 7.2)
+    near = fitting.fit(pictured(MATERIAL, ball_scene(lamp), NOISE), ball_scene(lamp), model="blinn-phong")
+    (light,) = fitting.next_light(near, [[0, 0, 1]]).lights
+    # 7.2 over the square of the distance to the nearest point of a ball of radius 1; 7.2 was taken itself
+    np.testing.assert_allclose(np.asarray(light.intensity), 7.2 / 4, rtol=0.02)
+
+
 def test_directions_may_be_an_array_of_any_kind(result):
     given = [[-0.3, 0.2, 0.8], [0.5, 0.2, 0.8]]
     one, other, another = (fitting.next_light(result, kind(given)).foretold for kind in (list, np.array, jnp.array))

@@ -1406,6 +1406,21 @@ def test_errors_of_k_d_hold_what_a_highlight_at_its_bound_may_take():
     assert inside[none].mean() > 0.85
 
 
+@pytest.mark.parametrize("specular", ["grey", "coloured"])
+def test_a_single_light_tells_no_k_d_beside_a_highlight_however_many_photographs_show_ambient_light(specular):
+    turn = np.arange(7)
+    behind = np.stack([np.cos(turn), np.sin(turn), np.full(7, -0.3)], axis=1)
+    lights = np.concatenate([[[0.3, 0.1, 0.95]], behind])
+    lights /= np.linalg.norm(lights, axis=1, keepdims=True)
+    shown = 0.2 * np.ones((8, 1, 40, 3))  # k_a 0.4 under 0.5
+    shown[0] += 0.5 * lights[0, 2] + 0.3 * (lights[0] + VIEW)[2] ** 20 / np.linalg.norm(lights[0] + VIEW) ** 20
+    pictures = shown + 0.003 * np.random.default_rng(2).normal(size=shown.shape)
+    maps = fitting.fit_maps(pictures, lights, np.tile(VIEW, (1, 40, 1)), ambient=0.5, specular=specular)
+    assert np.all(np.abs(maps.k_d - 0.5) < 1.96 * maps.k_d_error)  # it may be highlight; 25 errors off
+    assert np.all(maps.k_a_error < 0.01)
+    assert np.mean(np.abs(maps.k_a - 0.4) < 1.96 * maps.k_a_error) > 0.85
+
+
 def test_lights_of_one_name_in_several_folders_are_those_of_the_folders(tmp_path: Path):
     files = [tmp_path / f"l{i}" / "img.png" for i in range(3)]
     for file in files:
