@@ -1,4 +1,4 @@
-"""Do the 95 % intervals cover the truth in 95 % of draws? Pictures of three materials with fresh noise each time.
+"""Do the 95 % intervals cover the truth in 95 % of draws? Pictures of four materials with fresh noise each time.
 
 Usage: python -m benchmarks.calibration [--draws 1000] [--size 64] [--json FILE]
 

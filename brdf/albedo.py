@@ -16,12 +16,16 @@ from jaxtyping import Array, Float
 
 from brdf import vectors
 from brdf.checks import instance
-from brdf.models import Material, NormalizedBlinnPhong, NormalizedPhong, Phong, SpecularMaterial
+from brdf.errors import InputError
+from brdf.models import BlinnPhong, Material, NormalizedBlinnPhong, NormalizedPhong, Phong, SpecularMaterial
 from brdf.precision import Precision, cast, working_precision
 from brdf.vectors import Numbers, Scalars
 
 ACCURACY = {"float64": 1e-10, "float32": 1e-5}
 """Bound on the error of the albedo of a normalised lobe (k_s = 1), tested against mpmath and adaptive quadrature."""
+
+LOBES = (Phong, BlinnPhong, NormalizedPhong, NormalizedBlinnPhong)
+"""Models whose lobes have a form here; other programs, and the pages, draw that of any other as Blinn-Phong's."""
 
 _NODES = 64
 _REACH = 9.0  # cos^n x < exp(-n x^2 / 2): beyond 9 / sqrt(n) it is below 3e-18
@@ -42,11 +46,17 @@ def directional_albedo(
     Returns:
         (..., C), at least 0, accurate to ``ACCURACY`` times k_s (classic forms: times k_s / (scale(n) cos theta)).
 
+    Raises:
+        InputError: where the material is of another model.
+
     Example:
         >>> brdf.directional_albedo(brdf.NormalizedPhong(k_d=0.0, k_s=1.0, n=1), np.radians([0, 60])).round(3)
         Array([[1.   ], [0.609]], dtype=float32)
     """
     instance("material", material, Material, "Write brdf.directional_albedo(material, theta)")
+    if isinstance(material, SpecularMaterial) and type(material) not in LOBES:
+        remedy = "Use brdf.check, which integrates any"
+        raise InputError("material", f"is of the model {material.name}, whose albedo has no closed form here", remedy)
     with working_precision(precision):
         result = _albedo(cast(material, precision), jnp.asarray(theta, jnp.result_type(float)))
     # a float64 array of JAX would be cut to float32, with a warning, by the first thing done to it outside the context
@@ -81,7 +91,7 @@ def lobe_albedo(model: type[SpecularMaterial], n: Numbers, theta: Numbers) -> Sc
 
 
 def normalized_form(model: type[SpecularMaterial]) -> type[SpecularMaterial]:
-    """The normalised model of the same lobe."""
+    """The normalised model of the same lobe; of one that is not among `LOBES` Blinn-Phong's."""
     return NormalizedPhong if issubclass(model, Phong | NormalizedPhong) else NormalizedBlinnPhong
 
 

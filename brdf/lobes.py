@@ -71,12 +71,13 @@ class OneOf:
         """The models that have a lobe."""
         return tuple(model for model in self.models if issubclass(model, SpecularMaterial))
 
-    @property
-    def log_cosine(self) -> Callable[..., Array]:
-        """See `SpecularMaterial.log_cosine`."""
+    def log_cosine(self, *directions: Components) -> Array:
+        """See `SpecularMaterial.log_cosine`; of all shapes together, also where a lobe does not ask for all of them."""
         kinds = list(dict.fromkeys(model.log_cosine for model in self.lobes))
         kind = jnp.array([kinds.index(model.log_cosine) for model in self.lobes])[self.index]
-        return partial(jax.lax.switch, kind, kinds)
+        shape = jnp.broadcast_shapes(*(leaf.shape for leaf in jax.tree.leaves(directions)))
+        shaped = [lambda *given, of=of: jnp.broadcast_to(of(*given), shape) for of in kinds]
+        return jax.lax.switch(kind, shaped, *directions)
 
     def scale(self, n: Array) -> Array:
         """See `SpecularMaterial.scale`."""

@@ -256,7 +256,7 @@ def _evenly_noisy(observed: Observed) -> Observed:
         pictures, owner = zip(*some, strict=True)
         with jax.enable_x64(True):
             fitted = partial(_fit_about, model, observed, observed.reached(model))
-            noises.append(noise_of_each(pictures, np.array(owner), observed.rounding, fitted))
+            noises.append(noise_of_each(pictures, np.array(owner), observed.roundings, fitted))
     return evened(observed, min(noises, key=lambda noise: noise.cost))
 
 

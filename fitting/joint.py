@@ -262,7 +262,7 @@ def _noise_of_each(result: JointResult, observed: Observed) -> NoiseOfEach:
         weight = np.ones(1) if tile.weight is None else np.asarray(tile.weight)
         counts = np.broadcast_to(weight.reshape(len(weight), -1) > 0, predicted.shape)
         left.append(Left(counts, np.where(counts, np.asarray(tile.target) - predicted, 0), predicted, tile.bounds))
-    return noise_left(left, np.asarray(observed.owner), observed.rounding)
+    return noise_left(left, np.asarray(observed.owner), observed.roundings)
 
 
 def _inside(scenes: Sequence[brdf.Scene], counted: Sequence[np.ndarray]) -> bool:
@@ -538,5 +538,6 @@ def _parameters(
 
 def _interval(leaf: Leaf, value: float, error: float) -> tuple[float, float]:
     if leaf.name == "n":
-        return value * np.exp(-NORMAL_95 * error / value), value * np.exp(NORMAL_95 * error / value)
+        with np.errstate(over="ignore"):  # open above
+            return value * np.exp(-NORMAL_95 * error / value), value * np.exp(NORMAL_95 * error / value)
     return above_zero(value, error) if leaf.bounded else (value - NORMAL_95 * error, value + NORMAL_95 * error)

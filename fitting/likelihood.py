@@ -432,10 +432,11 @@ def _of_kinds(
 
     With ``planes`` a picture of few kinds is one of planes, whose kinds are all of many.
     """
-    code = np.rint(codes * ALIKE).astype(np.int64)
+    code = np.rint(codes * ALIKE)
     least = np.min(code)
     if np.max(code) - least < MOST_COUNTED:
-        kind, count = code - least, np.bincount(code - least)
+        kind = (code - least).astype(np.int64)
+        count = np.bincount(kind)
     else:
         _, kind, count = np.unique(code, return_inverse=True, return_counts=True)
     usual = 0 if planes and np.count_nonzero(count) < MOST_LEVELS else np.median(count[count > 0])

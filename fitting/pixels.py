@@ -75,7 +75,8 @@ class Observed(NamedTuple):
         colour: what all lights share, taken out of the tiles' scenes, (C,).
         tiles: of all pictures, made when asked for; a stream where one of them is.
         owner: of which picture each tile is.
-        rounding: standard deviation of the error that rounding, or the search, puts into a value, (C,).
+        roundings: standard deviation of the error that rounding, or the search, puts into a value of each picture,
+            times the root of the picture's weight, (K, C).
         brightest: largest size of a value that counts, (C,).
         left_out: how many pixels were left out, by reason.
         shown: the pictures for people, (H, W, C) each: of a large file every so many pixels.
@@ -88,7 +89,7 @@ class Observed(NamedTuple):
     colour: Float[np.ndarray, " C"]
     tiles: Sequence[Tile]
     owner: Sequence[int]
-    rounding: Float[np.ndarray, " C"]
+    roundings: Float[np.ndarray, "K C"]
     brightest: Float[np.ndarray, " C"]
     left_out: dict[str, int]
     shown: list[np.ndarray]
@@ -100,6 +101,11 @@ class Observed(NamedTuple):
     def widths(self) -> list[int]:
         """Of the picture of each tile."""
         return [self.problem.targets[picture].pixels.shape[1] for picture in self.owner]
+
+    @property
+    def rounding(self) -> Float[np.ndarray, " C"]:
+        """The largest of any picture."""
+        return np.max(self.roundings, axis=0)
 
     @property
     def copies(self) -> bool:
@@ -181,7 +187,7 @@ def observe(problem: FitProblem, *, at_once: bool = False) -> Observed:
         colour,
         joined(tiles),
         [picture for picture, some in enumerate(tiles) for _ in range(len(some))],
-        np.max(rounding, axis=0),
+        np.stack(rounding),
         np.max(brightest, axis=0),
         dict(left_out),
         shown,

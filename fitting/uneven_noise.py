@@ -88,20 +88,20 @@ class NoiseOfEach(NamedTuple):
 def noise_of_each(
     pictures: Sequence[Picture],
     owner: Int[np.ndarray, " T"],
-    rounding: Float[np.ndarray, " C"],
+    roundings: Float[np.ndarray, "K C"],
     least_squares: Callable[[Sequence[Picture]], ModelFit],
 ) -> NoiseOfEach:
     """What least squares leaves, with weights by what it leaves where that is not even.
 
-    Of some pixels of each tile, on the host; no picture has less noise than the rounding of a value.
+    Of some pixels of each tile, on the host.
     """
-    found = _left(pictures, owner, rounding, least_squares(pictures).optimum)
+    found = _left(pictures, owner, roundings, least_squares(pictures).optimum)
     for _ in range(0 if found.even else EVENINGS):
         now = [
             replace(picture, weight=picture.weights * np.full((len(picture.target), 1), 1 / found.variance[one]))
             for picture, one in zip(pictures, owner, strict=True)
         ]
-        found = _left(pictures, owner, rounding, least_squares(now).optimum)
+        found = _left(pictures, owner, roundings, least_squares(now).optimum)
     return found
 
 
@@ -122,23 +122,23 @@ class Left(NamedTuple):
 
 
 def _left(
-    pictures: Sequence[Picture], owner: Int[np.ndarray, " T"], rounding: Float[np.ndarray, " C"], optimum: Optimum
+    pictures: Sequence[Picture], owner: Int[np.ndarray, " T"], roundings: Float[np.ndarray, "K C"], optimum: Optimum
 ) -> NoiseOfEach:
     left = []
     for picture in pictures:
         counts = np.broadcast_to(picture.weights > 0, picture.target.shape)
         predicted = np.asarray(picture.predict(optimum.n, optimum.x))
         left.append(Left(counts, residuals(picture, optimum), predicted, picture.bounds))
-    return noise_left(left, owner, rounding)
+    return noise_left(left, owner, roundings)
 
 
-def noise_left(left: Sequence[Left], owner: Int[np.ndarray, " T"], rounding: Float[np.ndarray, " C"]) -> NoiseOfEach:
-    """What is left of each picture, by the picture that each tile is of."""
+def noise_left(left: Sequence[Left], owner: Int[np.ndarray, " T"], roundings: Float[np.ndarray, "K C"]) -> NoiseOfEach:
+    """What is left of each picture, by the picture that each tile is of; no less than its values are rounded by."""
     counted = [np.sum(one.counts, axis=0) for one in left]
     squares = [np.sum(one.residual**2, axis=0) for one in left]
     of_picture = np.equal.outer(owner, np.arange(np.max(owner) + 1))
     count = np.transpose(counted) @ of_picture
-    variance = np.maximum(np.transpose(squares) @ of_picture / np.maximum(count, 1), rounding[:, None] ** 2)
+    variance = np.maximum(np.transpose(squares) @ of_picture / np.maximum(count, 1), roundings.T**2)
     cost = float(np.sum(count * np.log(np.where(variance > 0, variance, 1))))
     # What a noise of its own gains each of them where all have the same (Bartlett, Proc. R. Soc. A 160 (1937) 268).
     many, together = np.sum(count, axis=1), np.sum(count * variance, axis=1)
@@ -176,4 +176,5 @@ def evened(observed: Observed, noise: NoiseOfEach) -> Observed:
         factor * np.asarray(counted if own is None else own)
         for factor, counted, own in zip(weight, observed.counted, observed.weights, strict=True)
     ]
-    return observed._replace(tiles=each(of_tile, observed.tiles, observed.owner), weights=weights)
+    roundings = observed.roundings * np.sqrt(weight)[:, None]
+    return observed._replace(tiles=each(of_tile, observed.tiles, observed.owner), weights=weights, roundings=roundings)

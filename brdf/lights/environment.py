@@ -3,7 +3,8 @@
 Axes of a map, those of Mitsuba's ``envmap``: y is up, so the first row is seen along +y; left and right edge of the map
 are seen along -z, a quarter of the width from the left along +x, the middle along +z, three quarters along -x. With
 u to the right and v down, both from 0 to 1, the direction is (sin 2πu sin πv, cos πv, -cos 2πu sin πv). A texel shines
-from its whole solid angle, (cos θ₁ - cos θ₂) Δφ.
+from its whole solid angle, (cos θ₁ - cos θ₂) Δφ; Mitsuba 3.9 has row i of H at v = i / (H - 1) and interpolates, which
+is up to half a texel elsewhere.
 
 Where the samples go. The map is cut along rows and columns into as many rectangles as there are samples, always the one
 next whose light is spread most (energy times variance of its directions), through its centre of mass. So samples crowd

@@ -28,6 +28,7 @@ from xml.etree import ElementTree
 import numpy as np
 from jaxtyping import Float
 
+from brdf.albedo import LOBES
 from brdf.conversions import (
     mirror_from_half,
     nearest_classic,
@@ -40,11 +41,9 @@ from brdf.files import as_path, write_text
 from brdf.images.encoding import decode, encode
 from brdf.materials.material_file import material_to_dict
 from brdf.materials.mtl import half_exponent, height, to_mtl
-from brdf.models import BlinnPhong, Material, NormalizedBlinnPhong, NormalizedPhong, Phong, SpecularMaterial
+from brdf.models import BlinnPhong, Material, NormalizedPhong, Phong, SpecularMaterial
 from brdf.models.base import check_single
 
-# The lobes that are written as they are; those of other models as Blinn-Phong's.
-WRITTEN = (Phong, BlinnPhong, NormalizedPhong, NormalizedBlinnPhong)
 Colour = Float[np.ndarray, "3"]
 
 _GRAZING = 60.0  # degrees from the normal: far out, and still seen on a tenth of a ball
@@ -107,7 +106,7 @@ def export_material(material: Material, to: str, *, name: str = "fitted", note: 
         raise InputError("material", f"has {channels} channels, {to} knows RGB alone", "Use the format json")
     name, note = (" ".join(text.split()) for text in (name, note))  # a line, whatever came
     content, losses, drawn, extras = EXPORTS[to](material, name)
-    if to != "json" and isinstance(material, SpecularMaterial) and not isinstance(material, WRITTEN):
+    if to != "json" and isinstance(material, SpecularMaterial) and type(material) not in LOBES:
         losses = [f"the format has no word for the lobe of {material.name}: it is written as Blinn-Phong's", *losses]
     if drawn is not None:
         losses += _brightness(material, drawn)
@@ -162,7 +161,7 @@ def _rgb(values: Any) -> Colour:
 
 
 def _brightness(material: Material, drawn: Callable[[float], Colour]) -> list[str]:
-    """How bright another program draws the peak of the highlight, in words; nothing where it draws it as it is."""
+    """How bright another program draws the surface where the highlight peaks, in words; nothing where as it is."""
     if not isinstance(material, SpecularMaterial) or not np.any(material.k_s):
         return []
     ratios = []
@@ -173,8 +172,8 @@ def _brightness(material: Material, drawn: Callable[[float], Colour]) -> list[st
         return []
     facing, grazing = (f"{ratio:.2f}" if ratio < 10 else f"{ratio:.0f}" for ratio in ratios)
     return [
-        f"at its peak the highlight comes out {facing} times as bright where light and view stand along the normal, "
-        f"{grazing} times where they stand {_GRAZING:g}° from it"
+        f"at the highlight's peak the surface comes out {facing} times as bright where light and view stand along the "
+        f"normal, {grazing} times where they stand {_GRAZING:g}° from it"
     ]
 
 
@@ -361,7 +360,7 @@ def _gltf(material, name):
     roughness, glossy = float(roughness_from_exponent(n)), bool(np.any(f_0))
     if glossy:
         losses += [
-            "roughness is (2 / (n+2))^(1/4): GGX has nearly the lobe's curvature at its peak, but long tails",
+            "roughness is (2 / (n+2))^(1/4), as is usual: GGX has twice the curvature at its peak, and long tails",
             _FRESNEL.format("glTF"),
             "the diffuse part is k_d / (1 - F0), as the specification mixes; where a viewer adds, it is brighter",
             "without KHR_materials_specular a viewer shows a colourless highlight of reflectance 0.04",

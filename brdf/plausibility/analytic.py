@@ -12,11 +12,11 @@ import dataclasses
 import jax
 import numpy as np
 
-from brdf.albedo import ACCURACY, directional_albedo, normalized_form
+from brdf.albedo import ACCURACY, LOBES, directional_albedo, normalized_form
 from brdf.channels import in_channel
 from brdf.conversions import nearest_normalized
 from brdf.measured.table import from_angles
-from brdf.models import BlinnPhong, Lambert, Material, NormalizedBlinnPhong, NormalizedPhong, Phong, SpecularMaterial
+from brdf.models import Lambert, Material, SpecularMaterial
 from brdf.plausibility.report import (
     ENERGY_LIMIT,
     GRAZING,
@@ -31,7 +31,7 @@ from brdf.plausibility.report import (
 from brdf.precision import cast, working_precision
 
 # What is known on paper holds for these alone; a subclass or a new model is looked at like any function.
-KNOWN = (Lambert, Phong, BlinnPhong, NormalizedPhong, NormalizedBlinnPhong)
+KNOWN = (Lambert, *LOBES)
 
 _LIGHTS = np.array([*np.arange(90.0), 89.5, 89.9, GRAZING])
 _VIEWS = np.concatenate([_LIGHTS, -_LIGHTS])  # below 0 on the other side of the normal

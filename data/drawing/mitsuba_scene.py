@@ -15,7 +15,8 @@ spot (an emitter written here)      pi I cos^exponent inside the cutoff; inverse
 ==================================  ====================================================================
 
 ``envmap`` axes: y is up (the first row is seen along +y), the left and right edges of the map along -z, a quarter of
-the width from the left along +x, the middle along +z, three quarters along -x.
+the width from the left along +x, the middle along +z, three quarters along -x. Mitsuba has row i of H at the angle
+pi i / (H - 1) and interpolates, the toolkit's texels shine evenly, from pi i / H to pi (i + 1) / H: it is given those.
 
 Every ray goes through the centre of its pixel, or of one of the k x k equal squares of it where ``camera.samples`` is
 k, so that pixels compare with the toolkit's to rounding under lights without extent. Light samples are the only noise.
@@ -246,7 +247,7 @@ def _light(light: Mapping[str, Any], mesh: Path) -> dict[str, Any]:
         }
     if kind == "environment":
         if "file" in light:
-            return {"type": "envmap", "filename": str(light["file"])}
+            return {"type": "envmap", "bitmap": _sky(str(light["file"]))}
         return {"type": "constant", "radiance": _rgb(light["radiance"])}
     if kind == "polygon":
         vertices = "".join("v {} {} {}\n".format(*vertex) for vertex in light["vertices"])
@@ -254,6 +255,15 @@ def _light(light: Mapping[str, Any], mesh: Path) -> dict[str, Any]:
         mesh.write_text(vertices + fan)
         light = {"type": "triangles", "file": mesh, "radiance": light["radiance"]}
     return _shape(light) | {"emitter": {"type": "area", "radiance": _rgb(light["radiance"])}}
+
+
+def _sky(file: str, fine: int = 4) -> mi.Bitmap:
+    """A map whose texels shine evenly, for an ``envmap``, which interpolates, its first and last row at the poles."""
+    texels = np.array(mi.Bitmap(file).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32))
+    height = len(texels)
+    # Where a row lies between two texels it is the mean of both.
+    row = np.clip(np.arange(fine * height + 1)[:, None] / fine + [-1e-6, 1e-6], 0, height - 1e-6).astype(int)
+    return mi.Bitmap(np.repeat(texels[row].mean(axis=1), fine, axis=1))
 
 
 def _rgb(values: Sequence[float] | np.ndarray, factor: float = 1.0) -> dict[str, Any]:

@@ -47,7 +47,7 @@ class PictureOptions(NamedTuple):
         normals: normals of the pixels: an image or .npy; x right, y up, z to the camera.
         light: towards the light: x,y,z (right, up, to the camera), or fit: from the shading.
         lights: a text file with such a direction for each picture, or an .lp file that names them.
-        intensities: a text file with the light's intensity for each picture.
+        intensities: a text file, a line for each picture, a number or one per channel, to divide it by.
         ambient: a photograph is lit from all around too: find k_a for that light as 1.
         encoding: linear, srgb or a gamma; default: what the file says.
         exposure: relative exposure to divide by, one or one each.

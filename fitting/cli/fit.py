@@ -47,7 +47,7 @@ def fit(
         loss: squared, relative, log, huber or cauchy; for a measured BRDF cosine (its default), squared or log.
         accuracy: relative error that is good enough: as few pixels and samples as keep it.
         seconds: time to spend: the most accurate fit that it buys.
-        free: light, distance (a near light's), intensity, ball or radius: fitted as well, from where the scene says.
+        free: light, distance (of a near one), intensity, ball, radius: fitted too, from the scene's; again for more.
         devices: all: spread the pixels over all cores or accelerators, and processes.
         plot: also draw comparison.png into --out.
         report: one .html page with everything, to keep or to send.

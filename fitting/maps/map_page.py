@@ -3,15 +3,17 @@
 import html
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 import brdf
+from brdf.albedo import normalized_form
 from brdf.display import png_address
 from brdf.materials.exports import shader
 from fitting.maps.texels import OCTAVES
 from fitting.report.page import Page, Shown, asset, packed, secure_page, stage
+from fitting.report.viewer import other_lobes
 
 if TYPE_CHECKING:
     from fitting.maps.map_result import Maps
@@ -71,7 +73,7 @@ def maps_page(maps: "Maps", title: str, reasons: Sequence[str]) -> Page:
         "k_d": packed(_halves(k_d, residual)),
         "k_s": packed(_halves(k_s, error)),
         "text": str(maps),
-        "notes": shown.notes,
+        "notes": [*other_lobes(*(brdf.MODELS[name] for name in maps.models)), *shown.notes],
         "drawable": True,
         "shader": {
             "defined": [f"REASONS {len(reasons)}", f"OUTSIDE {outside}", f"OCTAVES {OCTAVES}.0"],
@@ -112,5 +114,8 @@ def _halves(colours, number):
 
 def _fragment(name):
     numbers = "vec3 BRDF_K_A, BRDF_K_D, BRDF_K_S;\nfloat BRDF_N, BRDF_SCALE;\n"
-    scale = f"float brdf_scale(float n) {{ return {_SCALES.get(name, '1.0')}; }}"
-    return shader(brdf.MODELS[name], numbers + scale) + asset("display.frag") + asset("maps.frag")
+    model: Any = brdf.MODELS[name]
+    weighted = getattr(model, "cosine_weighted", False)
+    scale = _SCALES[normalized_form(model).name] if weighted else "1.0"
+    numbers += f"float brdf_scale(float n) {{ return {scale}; }}"
+    return shader(model, numbers) + asset("display.frag") + asset("maps.frag")

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from brdf.albedo import directional_albedo
+from brdf.albedo import LOBES, directional_albedo
 from brdf.channels import channel_names, in_channel
 from brdf.display import lit_sphere
 from brdf.measured.table import MeasuredBRDF, from_angles
@@ -67,10 +67,13 @@ def plot_albedo(brdf: Brdf, report: Report | None = None, figure: Any = None) ->
     Example:
         >>> fitting.plot_albedo(brdf.preset("gold")).savefig("albedo.png")
     """
-    known = isinstance(brdf, Material)
-    degrees = np.append(np.arange(0.0, 89.0, 0.5 if known else 2.0), [89.0, 89.5, 89.7, 89.8, 89.9, 89.95, 89.99])
-    exact = directional_albedo(brdf, np.radians(degrees), precision="float64") if known else albedo_of(brdf, degrees)
-    albedo = np.asarray(exact)
+    last = [89.0, 89.5, 89.7, 89.8, 89.9, 89.95, 89.99]
+    if isinstance(brdf, Material) and (type(brdf) in LOBES or not isinstance(brdf, SpecularMaterial)):
+        degrees = np.array([*np.arange(0.0, 89.0, 0.5), *last])
+        albedo = np.asarray(directional_albedo(brdf, np.radians(degrees), precision="float64"))
+    else:
+        degrees = np.array([*np.arange(0.0, 89.0, 2.0), *last])
+        albedo = albedo_of(_f_r(brdf), degrees)
     count, shown = albedo.shape[1], shown_channels(albedo.shape[1])
     figure, axes = _axes(figure, (6, 4))
     axes.axhspan(1, 2, color="0.92", zorder=0)
@@ -162,7 +165,11 @@ def _axes(figure, size, **how):
 
 
 def _sampler(brdf):
-    return Sampler(brdf.reflectance if isinstance(brdf, Material) else brdf)
+    return Sampler(_f_r(brdf))
+
+
+def _f_r(brdf):
+    return brdf.reflectance if isinstance(brdf, Material) else brdf
 
 
 @matplotlib.rc_context(PRINT)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 import brdf
-from brdf.albedo import lobe_albedo, normalized_form
+from brdf.albedo import LOBES, lobe_albedo, normalized_form
 from brdf.conversions import nearest_equations
 from brdf.errors import InputError
 from brdf.materials.exports import shader
@@ -43,7 +43,7 @@ def viewer(result: FitResult, picture: int | None = None) -> str:
     shown = Shown.of(counted, max(material.k_d.size, result.targets[picture].shape[-1]), LARGEST)
     target, fitted = (shown.pixels(image) for image in (result.targets[picture], result.fitted(picture)))
     target, counted = target.astype(np.float32), counted[shown.rows, shown.columns]
-    drawn, notes = _scene(result.scenes[picture])
+    drawn, notes = _scene(result.scenes[picture], other_lobes(type(material)))
     difference = np.abs(fitted - np.nan_to_num(target)).max(axis=-1)[counted]
     brightest = white(target[counted])
     still = [np.concatenate([np.nan_to_num(image), counted[..., None]], axis=-1) for image in (target, fitted)]
@@ -68,8 +68,14 @@ def viewer(result: FitResult, picture: int | None = None) -> str:
     return stage("surface.html", shown.data | drawn | data | _tables(material.name), beside)
 
 
-def _scene(scene):
-    """Camera, shapes and lights as a scene file has them, and what the page cannot draw of them."""
+def other_lobes(*models: type[brdf.Material]) -> list[str]:
+    """What a page says of models whose lobes it draws as another one's."""
+    others = (model.name for model in models if issubclass(model, SpecularMaterial) and model not in LOBES)
+    return [f"The lobe of {name} is drawn as Blinn-Phong's, as is its albedo." for name in others]
+
+
+def _scene(scene, notes):
+    """Camera, shapes and lights as a scene file has them, and what the page cannot draw of them beside such notes."""
     traced, shapes = scene.camera is not None, []
     pivot, unit = _extent([shape for shape in scene.shapes if traced and shape.fitted])
     for shape in scene.shapes if traced else ():
@@ -82,7 +88,7 @@ def _scene(scene):
             shapes.append(_fields(shape))
     lights = [light for light in scene.lights if light.type_name in KINDS]
     missing = sorted({light.type_name for light in scene.lights} - {*KINDS})
-    notes = [f"A light of the type {kind} is not drawn: it has an extent." for kind in missing]
+    notes = [*notes, *(f"A light of the type {kind} is not drawn: it has an extent." for kind in missing)]
     if scene.occluders and scene.lights:
         notes.append("Shadows are not drawn.")
     if scene.visibility:

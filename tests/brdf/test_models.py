@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 from extra_model import Retroreflector
 
+from brdf import check
 from brdf.errors import InputError
 from brdf.models import MODELS, BlinnPhong, Lambert, NormalizedBlinnPhong, NormalizedPhong, Phong, SpecularMaterial
 
 UP = np.array([0.0, 0.0, 1.0])
 # With one that only the tests have: what is said of a model holds for any that is added.
-LOBES = [Phong, BlinnPhong, NormalizedPhong, NormalizedBlinnPhong, Retroreflector]
+LOBES = [*(model for model in MODELS.values() if issubclass(model, SpecularMaterial)), Retroreflector]
 ALL = [Lambert, *LOBES]
+NORMALISED = [model for model in LOBES if model.cosine_weighted]
 
 
 def make(model, n=20.0, k_s=(0.5, 0.4, 0.3)):
@@ -90,7 +92,7 @@ def test_exponent_zero_is_a_constant_lobe():
     np.testing.assert_allclose(make(NormalizedBlinnPhong, 0.0).specular(UP, light, view), light[:, 2], rtol=1e-6)
 
 
-@pytest.mark.parametrize("model", [Lambert, NormalizedPhong, NormalizedBlinnPhong])
+@pytest.mark.parametrize("model", [Lambert, *NORMALISED])
 @pytest.mark.parametrize("n", [0.0, 3.0, 1e4])
 def test_reciprocal_where_promised(model, n):
     with jax.enable_x64(True):
@@ -98,6 +100,13 @@ def test_reciprocal_where_promised(model, n):
         reflectance = jax.jit(model.reflectance)
         there, back = (reflectance(make(model, n), *pair) for pair in ((light, view), (view, light)))
         np.testing.assert_allclose(there, back, rtol=1e-9)
+
+
+@pytest.mark.parametrize("model", NORMALISED)
+@pytest.mark.parametrize("n", [0.5, 6.0, 100.0])
+def test_what_is_normalised_conserves_energy(model, n):
+    report = check(model(k_d=0.0, k_s=1.0, n=n))
+    assert report.energy.verdict == "pass", report.energy
 
 
 # -- derivatives -------------------------------------------------------------------------------------------------------
@@ -173,7 +182,7 @@ def test_derivatives_agree_with_differences_and_with_each_other(model, n):
 
 
 def test_models_are_named():
-    assert list(MODELS) == ["lambert", "phong", "blinn-phong", "normalized-phong", "normalized-blinn-phong"]
+    assert list(MODELS)[:5] == ["lambert", "phong", "blinn-phong", "normalized-phong", "normalized-blinn-phong"]
     assert all(MODELS[name].name == name for name in MODELS)
 
 

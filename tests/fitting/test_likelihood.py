@@ -3,7 +3,7 @@
 import mpmath
 import numpy as np
 
-from fitting.likelihood import interval
+from fitting.likelihood import how_many_alike, interval
 
 TOLERANCE = 1e-10
 
@@ -93,3 +93,9 @@ def test_score_and_weight_are_derivatives():
                 slopes = [float(mpmath.diff(value, predicted, order)) for order in (1, 2)]
                 _, score, weight = exact(*case)
                 np.testing.assert_allclose([score, weight], [slopes[0], -slopes[1]], rtol=1e-9)
+
+
+def test_predictions_beyond_all_codes_are_counted():
+    """Of a highlight whose top is clipped Newton's method may try a k_s without bounds; integers overflowed."""
+    shown = np.append(np.full(500, 0.25), np.geomspace(1, 1e30, 50))
+    np.testing.assert_array_equal(how_many_alike(shown), np.repeat([500, 0], [500, 50]))

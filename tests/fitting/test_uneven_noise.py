@@ -66,6 +66,19 @@ def test_pictures_of_any_kind_stand_beside_each_other(kind, noise):
     assert np.max(np.abs(found)) < 5
 
 
+@pytest.mark.parametrize("fine", [np.uint16, np.float32])
+def test_a_coarse_picture_takes_nothing_from_a_fine_one(fine):
+    """All were said to have the rounding of the coarsest: errors were fifty times those of the fine picture alone."""
+    coarse, sharp = drawn((1 / 255, 1 / 65535), 0, codes=False)
+    sharp = np.rint(np.clip(65535 * sharp, 0, 65535)).astype(fine) if fine == np.uint16 else sharp
+    pictures = [np.clip(np.rint(255 * coarse), 0, 255).astype(np.uint8), sharp]
+    both = fitting.fit(pictures, SCENES, model="blinn-phong")
+    alone = fitting.fit(pictures[1], SCENES[1], model="blinn-phong")
+    for one, other in zip(both.parameters, alone.parameters, strict=True):
+        assert one.error < 1.2 * other.error
+    assert np.max(np.abs(deviations(both))) < 4
+
+
 @pytest.mark.parametrize("codes", [False, True])
 def test_bands_of_a_picture_have_its_noise_and_some_see_nothing(codes, monkeypatch):
     pictures = drawn((0.001, 0.02), 0, codes=codes)

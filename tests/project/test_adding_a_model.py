@@ -12,6 +12,7 @@ from small_ball import ball_scene, pictured
 import brdf
 import fitting
 from benchmarks.stability import stability_map
+from brdf.plausibility.numeric import albedo_of
 
 MATERIAL = Retroreflector(k_a=[0.1, 0.1, 0.1], k_d=[0.3, 0.2, 0.1], k_s=[0.4, 0.3, 0.2], n=20.0)
 SCENE = ball_scene()
@@ -58,5 +59,20 @@ def test_it_is_checked_drawn_and_exported():
     assert stable.finite.all()
     assert stable.error.max() < 1e-5
     assert "retroreflector" in brdf.export_material(MATERIAL, "json").text
+    with pytest.raises(brdf.InputError, match="model retroreflector, whose albedo has no closed form"):
+        brdf.directional_albedo(MATERIAL, 0.5)
+    curve = fitting.plot_albedo(MATERIAL).axes[0].lines[1]
+    angles = np.array([0.0, 40.0])
+    np.testing.assert_allclose(np.interp(angles, *curve.get_data()), albedo_of(MATERIAL.reflectance, angles)[:, 0])
+
+
+def test_pages_say_that_they_draw_another_lobe():
+    words = "The lobe of retroreflector is drawn as Blinn-Phong's"
+    result = fitting.fit(pictured(MATERIAL, SCENE), SCENE, model=Retroreflector)
+    assert words in result.view().text
+    normals = np.tile([0.0, 0.0, 1.0], (2, 2, 1))
+    lights = [[0, 0, 1], [0.4, 0, 1], [0, 0.4, 1], [-0.4, 0, 1], [0, -0.4, 1], [0.3, 0.3, 1]]
+    maps = fitting.fit_maps(np.full((6, 2, 2, 3), 0.5), lights, normals, model="retroreflector")
+    assert words in maps.view().text
     for form in ("mtl", "three", "gltf", "mitsuba", "mitsuba-dict", "pytorch3d", "glsl"):
         assert "no word for the lobe of retroreflector" in brdf.export_material(MATERIAL, form).losses[0]

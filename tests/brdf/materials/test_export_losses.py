@@ -17,7 +17,7 @@ WITH_HIGHLIGHT = [
 
 def told(material: brdf.Material, to: str) -> np.ndarray:
     """The two ratios that the export states; 1 and 1 where it states none."""
-    pattern = r"highlight comes out ([\d.]+) times .* normal, ([\d.]+) times where they stand 60° from it"
+    pattern = r"surface comes out ([\d.]+) times .* normal, ([\d.]+) times where they stand 60° from it"
     found = [re.search(pattern, loss) for loss in brdf.export_material(material, to).losses]
     numbers = [match.groups() for match in found if match]
     assert len(numbers) <= 1
