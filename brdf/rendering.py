@@ -174,6 +174,16 @@ def basis_images(
     return _basis_images(lobe, points, scene.ambient, lighting, jnp.asarray(n))
 
 
+@eqx.filter_jit
+def basis_columns(material: Material, scene: Scene) -> Float[Array, "4 *pixels C"]:
+    """The basis images of a material's model at its exponent, and the derivative of the last by that; 0 for none."""
+    n = jnp.asarray(getattr(material, "n", 1.0))
+    images, slopes = jax.jvp(partial(basis_images, type(material), scene), (n,), (jnp.ones_like(n),))
+    shown = images.ambient, images.diffuse, images.specular, slopes.specular
+    shape = (*scene.resolution[::-1], material.k_d.size)
+    return jnp.stack([jnp.broadcast_to(0.0 if one is None else one, shape) for one in shown])
+
+
 @jax.jit
 def _basis_images(model: OneOf, points: Sight, ambient: Any, lighting: Lighting, n: Scalar) -> BasisImages:
     def of_terms(terms: LightTerms) -> tuple[Array, Array | None]:

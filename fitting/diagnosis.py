@@ -10,6 +10,7 @@ Pictures are compared in the codes of their file where it has a curve, since noi
 """
 
 import dataclasses
+import functools
 import itertools
 import math
 from collections.abc import Iterator, Sequence
@@ -25,6 +26,7 @@ import brdf
 from brdf.images.encoding import encode
 from brdf.lobes import Near
 from brdf.precision import working_precision
+from brdf.rendering import basis_columns
 from fitting.budget.sampling import sample_counts, with_samples
 from fitting.core import picture_of
 from fitting.joint_problem import JointProblem, joint_problem, place_of, scene_leaves, turns
@@ -71,6 +73,10 @@ MOST_PIXELS, MOST_SAMPLED, FEWEST_PIXELS = 256, 96, 48
 RIM = 1.5
 # Light samples, unless fewer, as the scene says, leave less: what these leave out has a shape too.
 SAMPLES = 1024
+# At most, where slopes are made of the difference of two pictures, which have the same.
+SLOPE_SAMPLES = 256
+# What these leave out of the pictures hides no other model where it is below this share of the structure.
+HIDDEN = 0.1
 # What is darker than so many standard deviations is left out where noise was cut off at 0.
 DARK = 3.0
 # Of a step between codes: noise below that is mostly rounding.
@@ -125,7 +131,11 @@ class _Picture:
 
     def __init__(self, result: FitResult, index: int, side: float):
         self.scene, self.file = result.scenes[index], result.files[index] if result.files else None
-        self._problem = joint_problem(brdf.cast((result.material, [self.scene]), "float64"), _leaves)
+        many = max(sample_counts(self.scene), default=1) > SLOPE_SAMPLES
+        coarse = with_samples(self.scene, SLOPE_SAMPLES) if many else self.scene
+        self._problem, self._coarse = (
+            joint_problem(brdf.cast((result.material, [scene]), "float64"), _leaves) for scene in (self.scene, coarse)
+        )
         counted, target = result.counted[index], np.asarray(result.targets[index], np.float64)
         some = (slice(None, None, math.ceil(max(counted.shape) / side)),) * 2
         self._pixel, finite = np.arange(counted.size).reshape(counted.shape)[some], np.isfinite(target[some])
@@ -193,32 +203,47 @@ class _Picture:
         """Whether rounding to codes is most of the noise."""
         return ROUNDED * self.step > float(np.max(self.noise))
 
-    def moved(self, move: dict[str, Any], size: float) -> tuple[brdf.Material, brdf.Scene]:
-        """The material, and these pixels of the scene, with some numbers moved."""
-        vector = np.array(self._problem.start())
-        for leaf in self._problem.freed:
+    @functools.cached_property
+    def missed(self) -> float:
+        """Squares of what the light samples of slopes leave out, in units of the noise."""
+        left = self.codes(np.asarray(brdf.render(*self.moved({}, 0.0, coarse=True)))) - self.codes(self.fitted)
+        return float(np.sum((self.weight * (left / self.noise) ** 2)[self.counted]))
+
+    def moved(self, move: dict[str, Any], size: float, *, coarse: bool = False) -> tuple[brdf.Material, brdf.Scene]:
+        """The material, and these pixels of the scene, some numbers moved, or coarse, with the samples of slopes."""
+        problem = self._coarse if move or coarse else self._problem
+        vector = np.array(problem.start())
+        for leaf in problem.freed:
             vector[leaf.numbers] += size * move.get(leaf.words, 0.0)
-        material, (scene,) = _content(self._problem, vector)
+        material, (scene,) = _content(problem, vector)
         return material, brdf.some_pixels(scene, self._pixel, precision="float64")
 
     def shown(self, move: dict[str, Any], size: float) -> Float[np.ndarray, "H W C"]:
         """The picture with some numbers moved."""
         return np.asarray(brdf.render(*self.moved(move, size)))
 
-    def lit(self, model: type[brdf.Material]) -> Picture:
-        """As the solver takes them."""
-        scene = self.moved({}, 0.0)[1]
+    def lit(self, model: type[brdf.Material], coarse: bool) -> Picture:
+        """As the solver takes them, with the light samples of slopes where coarse."""
+        scene = self.moved({}, 0.0, coarse=coarse)[1]
         target = jnp.asarray(self.target.reshape(-1, self.target.shape[-1]))
         every = Near.between(math.log(N_RANGE[0]), math.log(N_RANGE[1]), 0.0)
         return picture_of(model, Tile(target, None, scene.surface_points(), scene), every)
 
     def slopes(self, moves: Sequence[Any]) -> Float[np.ndarray, "K H W C"]:
         """The derivatives of the codes by the sizes of moves."""
-        found = [
-            (self.shown(move, STEP) - self.shown(move, -STEP)) / (2 * STEP) if isinstance(move, dict) else move
-            for move in moves
-        ]
-        return self.curve(self.fitted) * np.stack(found)
+        return self.curve(self.fitted) * np.stack(list(map(self._slope, moves)))
+
+    def _slope(self, move: Any) -> Float[np.ndarray, "H W C"]:
+        if not isinstance(move, dict):
+            return move
+        return (self.shown(move, STEP) - self.shown(move, -STEP)) / (2 * STEP)
+
+    def material_slopes(self) -> Float[np.ndarray, "4 H W C"]:
+        """Those by k_a, k_d, k_s and, but for a factor, n."""
+        material, scene = self.moved({}, 0.0)
+        found = np.array(basis_columns(material, scene))
+        found[3] *= getattr(material, "k_s", 0.0)
+        return self.curve(self.fitted) * found
 
     def codes(self, values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
         """As the file holds them, full scale 1."""
@@ -259,14 +284,24 @@ class Residual:
             for index, picture in enumerate(self.pictures)
         ]
         self._block = np.unique(np.concatenate(blocks), axis=0, return_inverse=True)[1]
-        # What the coefficients of each channel, and the exponent, move.
-        moves = [{name: 1.0} for name in ("k_a", "k_d", "k_s")] + [{"n": 1e-4 / STEP}]
-        material = np.moveaxis(self._flat([picture.slopes(moves) for picture in self.pictures]), 0, -1)
-        size = np.linalg.norm(material, axis=1, keepdims=True)
-        self._material = material / np.where(size > 0, size, 1.0)
-        self._inverse = np.linalg.pinv(self._material, rcond=1e-6)
-        self.left = self._unfollowed(self._flat([picture.left for picture in self.pictures]))
-        self.excess = float(np.sum(self.left**2) - sum(np.sum(one.weight[one.counted]) for one in self.pictures))
+
+    @functools.cached_property
+    def left(self) -> Float[np.ndarray, " N"]:
+        """What the material cannot follow."""
+        return self._unfollowed(self._flat([picture.left for picture in self.pictures]))
+
+    @functools.cached_property
+    def excess(self) -> float:
+        """The squares that are no noise."""
+        return float(np.sum(self.left**2) - sum(np.sum(one.weight[one.counted]) for one in self.pictures))
+
+    @functools.cached_property
+    def _material(self) -> tuple[Float[np.ndarray, "C P 4"], Float[np.ndarray, "C 4 P"]]:
+        """What the coefficients of each channel, and the exponent, move; and the inverse of that."""
+        moved = np.moveaxis(self._flat([picture.material_slopes() for picture in self.pictures]), 0, -1)
+        size = np.linalg.norm(moved, axis=1, keepdims=True)
+        moved /= np.where(size > 0, size, 1.0)
+        return moved, np.linalg.pinv(moved, rcond=1e-6)
 
     @property
     def rounded(self) -> bool:
@@ -308,7 +343,8 @@ class Residual:
         """Whether the pictures, or one of several, show the scenes mirrored, or all show another model."""
         if self.excess <= LEAST_SIZE**2:
             return
-        own = [picture.lit(self.model) for picture in self.pictures]
+        coarse = sum(picture.missed for picture in self.pictures) < HIDDEN * self.excess
+        own = [picture.lit(self.model, coarse) for picture in self.pictures]
         several, as_they_are = range(len(own)) if len(own) > 1 else (), [()] * len(own)
         trials = []
         for (name, axis), one in itertools.product(MIRRORED.items(), (None, *several)):
@@ -317,7 +353,7 @@ class Residual:
         for name, model in brdf.MODELS.items():
             # One without a highlight explains no more than one with.
             if model not in (self.model, brdf.Lambert):
-                other = [picture.lit(model) for picture in self.pictures]
+                other = [picture.lit(model, coarse) for picture in self.pictures]
                 trials.append((f"model {name}", f"fit that: --model {name}", other, as_they_are))
         for name, remedy, lit, axes in trials:
             both = list(zip(self.pictures, axes, strict=True))
@@ -363,7 +399,8 @@ class Residual:
 
     def _unfollowed(self, values: Float[np.ndarray, "C P"]) -> Float[np.ndarray, " N"]:
         """What the material cannot follow; 0 where that is next to nothing."""
-        left = values - (self._material @ (self._inverse @ values[..., None]))[..., 0]
+        moved, inverse = self._material
+        left = values - (moved @ (inverse @ values[..., None]))[..., 0]
         return left.ravel() * (np.sum(left**2) > FOLLOWED * np.sum(values**2))
 
 

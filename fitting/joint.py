@@ -48,7 +48,7 @@ from fitting.solver.nnls import nonnegative_minimum
 from fitting.uncertainty.covariance import RESOLUTION
 from fitting.uncertainty.intervals import NORMAL_95, above_zero, widened
 from fitting.uncertainty.noise_model import value_variance
-from fitting.uncertainty.residual import NEGLIGIBLE, Neighbours, neighbours_of, structure_warning
+from fitting.uncertainty.residual import NEGLIGIBLE, Neighbours, neighbours_of, structure_words
 from fitting.uncertainty.structure import CODED_SIZES, SIZES, Errors, of_coded_blocks, over_blocks, structure
 from fitting.uneven_noise import EVENINGS, Left, NoiseOfEach, evened, noise_left, with_bounds
 
@@ -443,6 +443,8 @@ def _solve(
     shapes = [() if leaf.is_direction else problem.leaves[leaf.position].shape for leaf in problem.freed]
     remedy = "raise max_steps of fit_jointly" if found.steps >= max_steps else "start nearer, or free fewer numbers"
     warnings = () if found.converged else (f"the solver stopped after {found.steps} steps without an end: {remedy}",)
+    if neighbours.significant:
+        warnings += (f"{structure_words(neighbours.correlation)}: the errors are too small",)
     result = JointResult(
         **observed.result_fields() | {"scenes": scenes},
         material=material,
@@ -452,7 +454,7 @@ def _solve(
         structure=neighbours.correlation,
         residual=share,
         pixels=len(left),
-        warnings=(*warnings, *structure_warning(neighbours)),
+        warnings=warnings,
         values=tuple(np.asarray(problem.leaves[leaf.position]) for leaf in problem.freed),
         errors=tuple(np.array(own, float).reshape(shape) for own, shape in zip(errors, shapes, strict=True)),
         steps=found.steps,

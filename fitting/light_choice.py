@@ -12,7 +12,6 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -25,6 +24,7 @@ import brdf
 from brdf.errors import InputError
 from brdf.lights.base import Light
 from brdf.precision import working_precision
+from brdf.rendering import basis_columns
 from fitting.progress import waiting
 from fitting.result import FitResult, of_material_alone
 from fitting.solver.nnls import inverse_diagonal
@@ -314,11 +314,5 @@ def _cap(middle: np.ndarray, size: float, count: int) -> list[np.ndarray]:
 @eqx.filter_jit
 def _gram(material: brdf.Material, scene: brdf.Scene, weight: Float[Any, "W 1|C"]) -> Float[Array, "C 4 4"]:
     """Weighted products of the columns of a picture: ambient, diffuse, lobe, and the lobe's derivative by n."""
-    n = getattr(material, "n", jnp.ones(()))
-    images, slopes = jax.jvp(partial(brdf.basis_images, type(material), scene), (n,), (jnp.ones_like(n),))
-    shown, shape = (
-        (images.ambient, images.diffuse, images.specular, slopes.specular),
-        (weight.shape[0], material.k_d.size),
-    )
-    columns = jnp.stack([jnp.broadcast_to(0.0 if one is None else one.reshape(shape[0], -1), shape) for one in shown])
-    return jnp.einsum("iwc,wc,jwc->cij", columns, jnp.broadcast_to(weight, shape), columns)
+    columns = basis_columns(material, scene).reshape(4, *weight.shape[:1], -1)
+    return jnp.einsum("iwc,wc,jwc->cij", columns, jnp.broadcast_to(weight, columns.shape[1:]), columns)

@@ -1,6 +1,5 @@
 """``brdf fit``: pictures, photographs of a ball, archives and measured BRDFs."""
 
-import dataclasses
 import functools
 import shlex
 import sys
@@ -112,8 +111,9 @@ def fit(
                 mask = inputs.masks if dark is None else result.counted
                 with named_as({"free": "--free"}):
                     fitted = inputs.pictures, result.scenes, result.material, free
-                    freed = fitting.fit_jointly(*fitted, mask=mask, saturation=pictures.saturation)
-                result = dataclasses.replace(freed, candidates=result.candidates)
+                    result = fitting.fit_jointly(*fitted, mask=mask, saturation=pictures.saturation)
+                if model == "auto":
+                    notes += ("the model is the simplest adequate one for the scene as it was before",)
         if not is_first_process(mesh):
             return
         if out is not None:

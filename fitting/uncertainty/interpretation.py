@@ -35,7 +35,7 @@ from fitting.uncertainty.covariance import (
 from fitting.uncertainty.highlight import OFF_CENTRE, Highlight
 from fitting.uncertainty.intervals import exponent_interval
 from fitting.uncertainty.noise_model import misweighted_sums, weighted_sums
-from fitting.uncertainty.residual import Neighbours, Residual, residual_statistics
+from fitting.uncertainty.residual import Neighbours, Residual, residual_statistics, structure_words
 from fitting.uncertainty.structure import (
     CODED_SIZES,
     SIZES,
@@ -334,10 +334,7 @@ def _capped(material: brdf.Material) -> str:
 def _warnings(neighbours: Neighbours, together: Structure | None, lobe: Highlight | None) -> Iterator[str]:
     shared = together is not None and together.significant
     if (neighbours.significant or shared) and not (together is not None and together.known):
-        words = "the residual has structure: neighbouring pixels err alike"
-        if neighbours.correlation > 0.05:
-            words += f" (correlation {neighbours.correlation:.2f})"
-        words += ", so the model or the scene is not the whole truth, or the picture was smoothed. "
+        words = f"{structure_words(neighbours.correlation)}, or the picture was smoothed. "
         if shared:
             words += "The errors allow for that among neighbours, not for what it does to the numbers: "
             words += "they may be too small"

@@ -25,6 +25,8 @@ SOME_PIXELS, FEWEST_PIXELS = 4096, 128
 GOLDEN = 0.6180339887498949
 # A correlation above this, and above so many of its own standard errors, is structure.
 CORRELATED, DEVIATIONS = 0.1, 5.0
+# A correlation above this is told.
+TOLD = 0.05
 # Up to this share of the picture a residual shows where a solver stopped.
 NEGLIGIBLE = 1e-6
 
@@ -151,11 +153,11 @@ def neighbours_of(images: Sequence[Float[np.ndarray, "H W C"]]) -> Neighbours:
     return _correlation(pairs, np.ones(images[0].shape[2], bool))
 
 
-def structure_warning(neighbours: Neighbours) -> tuple[str, ...]:
-    """What to say where neighbours err alike; nothing where they do not."""
-    words = f"the residual has structure: neighbouring pixels err alike (correlation {neighbours.correlation:.2f})"
-    words = f"{words}, so model or scene are not the whole truth and the errors are too small"
-    return (words,) if neighbours.significant else ()
+def structure_words(correlation: float) -> str:
+    """What to say where pixels err alike; sums over blocks of them may tell more than what neighbours correlate by."""
+    words = "the residual has structure: neighbouring pixels err alike"
+    words += f" (correlation {correlation:.2f})" if correlation > TOLD else ""
+    return f"{words}, so the model or the scene is not the whole truth"
 
 
 def _correlation(pairs: Sequence[np.ndarray], channels: Bool[np.ndarray, " C"]) -> Neighbours:
