@@ -44,8 +44,8 @@ from fitting.problem import CLASSIC, FitProblem, model_name, state_problem
 from fitting.progress import waiting
 from fitting.report import FitResult
 from fitting.result import Parameter
-from fitting.solver.nnls import nonnegative_minimum
-from fitting.uncertainty.covariance import RESOLUTION
+from fitting.solver.nnls import nonnegative_minimum, scaled_inverse
+from fitting.uncertainty.covariance import LOST_IN_NOISE, RESOLUTION, SIGNIFICANT
 from fitting.uncertainty.intervals import NORMAL_95, above_zero, widened
 from fitting.uncertainty.noise_model import value_variance
 from fitting.uncertainty.residual import NEGLIGIBLE, Neighbours, neighbours_of, structure_words
@@ -507,6 +507,7 @@ def _parameters(
     Of a direction the length is no unknown: its error is that of two small turns across it.
     """
     covariance, deviation = information.errors()
+    lost = _lost_in_noise(problem, information.vector, covariance, deviation)
     found: list[Parameter] = []
     places: list[int] = []
     for leaf in problem.freed:
@@ -526,8 +527,9 @@ def _parameters(
                 ends, at_bound = _interval(leaf, one, error), bool(held[place])
                 rows.append((place, Parameter(leaf.words, channel, one, error, ends, at_bound)))
         for place, one in rows:
-            known = one.error is not None and np.isfinite(one.error)
-            found.append(one if known else Parameter(leaf.words, one.channel, None, one.error, reason=OPEN))
+            reason = LOST_IN_NOISE if lost and leaf.name in ("k_s", "n") else OPEN
+            known = one.error is not None and np.isfinite(one.error) and reason == OPEN
+            found.append(one if known else Parameter(leaf.words, one.channel, None, one.error, reason=reason))
             if known and not one.at_bound:
                 places.append(place)
     error = np.sqrt(np.diag(covariance)[places])
@@ -536,6 +538,27 @@ def _parameters(
     correlation = np.divide(covariance[np.ix_(at, at)], unit, out=np.zeros_like(unit), where=both & (unit > 0))
     np.fill_diagonal(correlation, 1.0)
     return tuple(found), correlation
+
+
+def _lost_in_noise(
+    problem: JointProblem,
+    vector: Float[np.ndarray, " U"],
+    covariance: Float[np.ndarray, "U U"],
+    deviation: Float[np.ndarray, " U"],
+) -> bool:
+    """Whether a highlight whose k_s and n are freed does not stand out: its exponent is the best of many, as in `fit`.
+
+    By how much the cost would rise without it tells the covariance of k_s at a given n.
+    """
+    leaves = {leaf.name: leaf.numbers for leaf in problem.freed if leaf.name in ("k_s", "n")}
+    if len(leaves) < 2:
+        return False
+    k_s, n = vector[leaves["k_s"]], leaves["n"].start
+    if not np.any(k_s) or not np.all(np.isfinite([*deviation[leaves["k_s"]], deviation[n]])):
+        return False
+    with_n = covariance[leaves["k_s"], n]
+    left = covariance[leaves["k_s"], leaves["k_s"]] - np.outer(with_n, with_n) / max(covariance[n, n], TINY)
+    return float(k_s @ scaled_inverse(left) @ k_s) <= SIGNIFICANT * (1 + np.count_nonzero(k_s))
 
 
 def _interval(leaf: Leaf, value: float, error: float) -> tuple[float, float]:

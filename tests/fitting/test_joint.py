@@ -380,3 +380,19 @@ def test_a_light_a_degree_off_is_structure():
     picture = shown + 0.015 * np.random.default_rng(0).standard_normal(shown.shape)
     assert any("structure" in words for words in fitting.fit_jointly(picture, told, "blinn-phong").warnings)
     assert not fitting.fit_jointly(picture, true, "blinn-phong").warnings
+
+
+@pytest.mark.parametrize("k_s", [0.0, 0.3])
+def test_a_highlight_that_noise_may_have_made_is_not_determined_as_in_a_fit(k_s: float):
+    material = brdf.BlinnPhong(k_a=0.2, k_d=0.5, k_s=k_s, n=25)
+    shown = brdf.Scene(CAMERA, [BALL], ambient=[0.2], lights=[brdf.DirectionalLight(TRUE_DIRECTION, [1.0])])
+    told = brdf.Scene(CAMERA, [BALL], ambient=[0.2], lights=[brdf.DirectionalLight([0.5, 0.62, 0.7], [1.0])])
+    clean, start = np.asarray(brdf.render(material, shown)), brdf.BlinnPhong(k_a=0.2, k_d=0.5, k_s=0.1, n=20)
+    for seed in range(6):
+        target = clean + 0.01 * np.random.default_rng(seed).normal(size=clean.shape)
+        numbers = fitting.fit_jointly(
+            target, told, start, lambda m, s: (m.k_a, m.k_d, m.k_s, m.n, s[0].lights[0].direction)
+        )
+        known = numbers["n"].value is not None and numbers["k_s"][0].value is not None
+        assert known == (k_s > 0)
+        assert known or numbers["k_s"][0].at_bound or "does not stand out" in numbers["n"].reason
