@@ -67,6 +67,8 @@ DAMPED = 1e-9
 FARTHEST = 1.0
 # Of a lobe that went to nothing other exponents are tried once.
 RESTARTS = (1.0, 4.0, 16.0, 64.0, 256.0, 1024.0)
+# Logarithms of exponents that far apart, and so many errors, are of different minima.
+ELSEWHERE, ELSEWHERE_ERRORS = 0.1, 3.0
 # A minimum is met where no more than this part of their errors parts the numbers from it.
 MET = 0.1
 
@@ -150,6 +152,7 @@ def fit_jointly(
     if not (callable(free) or free is None or isinstance(free, Sequence)):
         what = f"must be a function or names, got {type(free).__name__}"
         raise InputError("free", what, "Write lambda material, scenes: (material.n,), or light")
+    by_name = not callable(free)
     if not callable(free):
         free = named_leaves([free] if isinstance(free, str) else list(dict.fromkeys(map(str, free or ()))))
     material = material.material if isinstance(material, FitResult) else material
@@ -172,7 +175,7 @@ def fit_jointly(
 
         def solve(
             start: brdf.Material, scenes: Sequence[brdf.Scene], rounds: int = ROUNDS, *noises: NoiseOfEach
-        ) -> JointResult:
+        ) -> _Solved:
             freed = joint_problem((start, list(scenes)), free).freed
             moves = any("camera." in leaf.words or "shapes[" in leaf.words for leaf in freed)
             plain = look_alikes.taken_off(_away_from_outlines(whole, scenes) if moves else whole)
@@ -192,12 +195,15 @@ def fit_jointly(
             def alike(one: _Solved) -> tuple[bool, float]:
                 return one.neighbours.significant, one.neighbours.correlation
 
-            return likeliest(solved, grown, lambda one: one.information.value, alike).result
+            return likeliest(solved, grown, lambda one: one.information.value, alike)
 
         if isinstance(material, brdf.Material):
-            result = solve(material, stated.scenes)
+            solved = solve(material, stated.scenes)
         else:
-            result = _of_model(stated, model_name(material), solve)
+            solved = _of_model(stated, model_name(material), solve)
+        if by_name or {"k_d", "k_s", "n"} <= set(solved.result):
+            solved = _sought_again(stated, solved, solve)
+        result = solved.result
         if look_alikes.known:
             result = _without_codec_errors(result, look_alikes, whole, solve)
     return dataclasses.replace(result, seconds=time.perf_counter() - begun)
@@ -223,14 +229,14 @@ def _radiance(result: JointResult, observed: Observed) -> list[Float[np.ndarray,
 
 
 def _without_codec_errors(
-    result: JointResult, look_alikes: LookAlikes, whole: Observed, solve: Callable[..., JointResult]
+    result: JointResult, look_alikes: LookAlikes, whole: Observed, solve: "Callable[..., _Solved]"
 ) -> JointResult:
     """Less what codecs do to look-alikes of what is predicted, again until these come no nearer to the pictures."""
     moved = np.zeros(len(result.parameters))
     for _ in range(MOST_FITS):
         if not look_alikes.are_nearer(whole, _radiance(result, whole)):
             break
-        last, result = result, solve(result.material, result.scenes)
+        last, result = result, solve(result.material, result.scenes).result
         if len(last.parameters) != len(result.parameters):  # a highlight that went to nothing is freed no more
             moved = np.zeros(len(result.parameters))
             continue
@@ -278,19 +284,40 @@ def _alike(scene: brdf.Scene, reach: int) -> Bool[np.ndarray, "H W"]:
     return minimum_filter(met, 2 * reach + 1, mode="nearest") == maximum_filter(met, 2 * reach + 1, mode="nearest")
 
 
-def _of_model(stated: FitProblem, model: str, solve: Callable[..., JointResult]) -> JointResult:
+def _of_model(stated: FitProblem, model: str, solve: "Callable[..., _Solved]") -> "_Solved":
     """From the separable optimum of a model; of "auto" the simplest adequate one under the scenes of the best lobe."""
-
-    def separable(model: str, scenes: Sequence[brdf.Scene] = stated.scenes) -> FitResult:
-        return fit_pictures(dataclasses.replace(stated, model=model, scenes=list(scenes)))
-
+    separable = partial(_separable, stated)
     if model != "auto":
-        return solve(separable(model).material, stated.scenes)
-    best = min((solve(separable(name).material, stated.scenes) for name in CLASSIC), key=lambda one: one.residual)
-    simplest = separable("auto", best.scenes)
+        return solve(separable(model, stated.scenes).material, stated.scenes)
+    tried = (solve(separable(name, stated.scenes).material, stated.scenes) for name in CLASSIC)
+    best = min(tried, key=lambda one: one.cost)
+    simplest = separable("auto", best.result.scenes)
     with contextlib.suppress(InputError):  # of a number that the simplest model has not
-        return dataclasses.replace(solve(simplest.material, best.scenes), candidates=simplest.candidates)
+        solved = solve(simplest.material, best.result.scenes)
+        return solved._replace(result=dataclasses.replace(solved.result, candidates=simplest.candidates))
     return best
+
+
+def _separable(stated: FitProblem, model: str, scenes: Sequence[brdf.Scene]) -> FitResult:
+    return fit_pictures(dataclasses.replace(stated, model=model, scenes=list(scenes)))
+
+
+def _sought_again(stated: FitProblem, solved: "_Solved", solve: "Callable[..., _Solved]") -> "_Solved":
+    """What was found, or what is found from the best of all exponents under its scenes, where that is elsewhere.
+
+    Under the scenes that were told a clipped highlight may lead to another minimum, or seem to be none.
+    """
+    result = solved.result
+    with contextlib.suppress(InputError):
+        best = _separable(stated, result.material.name, result.scenes).material
+        n, found = (max(float(getattr(one, "n", 0.0)), TINY) for one in (best, result.material))
+        known = result["n"] if "n" in set(result) else None
+        spread = float(known.error) / float(known.value) if known and known.value else 0.0
+        if n > TINY and abs(math.log(n) - math.log(found)) > max(ELSEWHERE, ELSEWHERE_ERRORS * spread):
+            other = solve(best, result.scenes)
+            if other.cost < solved.cost:
+                return other._replace(result=dataclasses.replace(other.result, candidates=result.candidates))
+    return solved
 
 
 def _residuals(free: Array, given: tuple[JointProblem, Array, Array]) -> Array:
@@ -398,6 +425,12 @@ class _Solved(NamedTuple):
     information: Information
     shown: Sequence[Shown]
     neighbours: Neighbours
+
+    @property
+    def cost(self) -> float:
+        """By which results of the same pictures are compared: the likelihood's, or what is left where it has no say."""
+        value = self.information.value
+        return -value if math.isfinite(value) else self.result.residual
 
 
 def _solve(
@@ -554,7 +587,9 @@ def _lost_in_noise(
     if len(leaves) < 2:
         return False
     k_s, n = vector[leaves["k_s"]], leaves["n"].start
-    if not np.any(k_s) or not np.all(np.isfinite([*deviation[leaves["k_s"]], deviation[n]])):
+    if not np.any(k_s):
+        return True
+    if not np.all(np.isfinite([*deviation[leaves["k_s"]], deviation[n]])):
         return False
     with_n = covariance[leaves["k_s"], n]
     left = covariance[leaves["k_s"], leaves["k_s"]] - np.outer(with_n, with_n) / max(covariance[n, n], TINY)
