@@ -201,7 +201,7 @@ def fit_jointly(
             solved = solve(material, stated.scenes)
         else:
             solved = _of_model(stated, model_name(material), solve)
-        if by_name or {"k_d", "k_s", "n"} <= set(solved.result):
+        if solved.result.left_out.get("clipped") and (by_name or {"k_d", "k_s", "n"} <= set(solved.result)):
             solved = _sought_again(stated, solved, solve)
         result = solved.result
         if look_alikes.known:
