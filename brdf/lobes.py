@@ -25,7 +25,7 @@ from brdf.lights.base import Light, Lighting
 from brdf.lights.even_sky import Views, seen_under
 from brdf.models import MODELS, Material, SpecularMaterial
 from brdf.precision import pytree
-from brdf.vectors import BELOW_HORIZON, Components
+from brdf.vectors import BELOW_HORIZON, Components, half_log_cosine, mirror_log_cosine
 
 STORED_SAMPLES = 4
 """Up to so many light samples the fit keeps their terms as arrays of their own, of all pixels at once."""
@@ -40,6 +40,9 @@ STACKED_VALUES = 1 << 26
 NODES, STEP, NARROWEST, WIDEST = 5, 0.35, 0.04, 1.0
 """A polynomial through so many exponents stands for a lobe over a range of log n: of 0.7 to 1e-5, of 0.04 to 1e-11. One
 through nodes so far apart, where the range is wider than `WIDEST`, to 1e-3, which serves to find where to look."""
+
+LOBES = half_log_cosine, mirror_log_cosine
+"""Of the models that one program serves."""
 
 NO_LOBE = -1e9
 """The peak of a pixel without a lobe: exp(n * this) = 0 for every n that a fit visits."""
@@ -62,8 +65,8 @@ class OneOf:
 
     @classmethod
     def of(cls, model: type[Material]) -> "OneOf":
-        """Of all models that have a name; the model alone where it is none of them or has no lobe."""
-        models = cls(tuple(MODELS.values())).lobes
+        """Of all models that have a name and one of these lobes; the model alone where it is none of them."""
+        models = tuple(one for one in cls(tuple(MODELS.values())).lobes if one.log_cosine in LOBES)
         return cls(models, np.int32(models.index(model))) if model in models else cls((model,))
 
     @property
@@ -71,13 +74,12 @@ class OneOf:
         """The models that have a lobe."""
         return tuple(model for model in self.models if issubclass(model, SpecularMaterial))
 
-    def log_cosine(self, *directions: Components) -> Array:
-        """See `SpecularMaterial.log_cosine`; of all shapes together, also where a lobe does not ask for all of them."""
+    @property
+    def log_cosine(self) -> Callable[..., Array]:
+        """See `SpecularMaterial.log_cosine`."""
         kinds = list(dict.fromkeys(model.log_cosine for model in self.lobes))
         kind = jnp.array([kinds.index(model.log_cosine) for model in self.lobes])[self.index]
-        shape = jnp.broadcast_shapes(*(leaf.shape for leaf in jax.tree.leaves(directions)))
-        shaped = [lambda *given, of=of: jnp.broadcast_to(of(*given), shape) for of in kinds]
-        return jax.lax.switch(kind, shaped, *directions)
+        return partial(jax.lax.switch, kind, kinds)
 
     def scale(self, n: Array) -> Array:
         """See `SpecularMaterial.scale`."""
@@ -123,7 +125,8 @@ def light_terms(
     diffuse = sample.intensity * (arrives * jnp.where(lit, cosine, 0))
     weight, log_cosine = jnp.zeros_like(diffuse), jnp.zeros_like(diffuse)
     if model.lobes:
-        log_cosine = model.log_cosine(point.normal, sample.to_light, point.to_view)
+        # Of each point, also where a lobe does not ask for the normal.
+        log_cosine = jnp.broadcast_to(model.log_cosine(point.normal, sample.to_light, point.to_view), log_cosine.shape)
         shines = lit & (point.normal @ point.to_view > 0) & (log_cosine > 0.5 * BELOW_HORIZON)
         weight = jnp.where(shines, jnp.where(model.cosine_weighted, cosine, sample.above), 0) * arrives
         weight *= sample.intensity if sample.lobe_intensity is None else sample.lobe_intensity
