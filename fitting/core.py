@@ -554,7 +554,7 @@ def _held_plausible(fit: ModelFit, observed: Observed) -> ModelFit:
     optimum = search(fit.pictures, fit.free, fit.n_range, cap)
     # What the bound adds to the residual is no noise: that of the fit without it says what stands out.
     noise = fit.noise_factor * float(np.sqrt(fit.cost / np.sum(optimum.cost)))
-    return fit._replace(optimum=optimum, tied=None, capped=True, noise_factor=noise)
+    return fit._replace(optimum=optimum, tied=None, capped=True, noise_factor=noise, evidence=None)
 
 
 def _by_highlight(fit: ModelFit, rest: ModelFit, observed: Observed) -> Float[np.ndarray, " U"]:

@@ -130,3 +130,18 @@ def test_what_moves_along_the_bound_is_not_differentiated_as_if_it_were_free():
     ):
         with pytest.raises(brdf.InputError, match=r"result: has a bound: k_d \+ k_s is held at 1"):
             ask()
+
+
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+def test_what_codes_say_breaks_no_bound(noise: float):
+    """What the likelihood of rounded values found without the bound was told in its place."""
+    light = brdf.DirectionalLight([0.3, 0.4, 0.8], 0.3)
+    scene = brdf.Scene(camera=CAMERA, shapes=[BALL], lights=[light])
+    shown = 255 * np.asarray(brdf.render(brdf.NormalizedBlinnPhong(k_d=0.6, k_s=0.5, n=12), scene, precision="float64"))
+    codes = np.clip(np.rint(shown + noise * np.random.default_rng(0).normal(size=shown.shape)), 0, 255).astype(np.uint8)
+    result = fitting.fit(codes, scene, model="normalized-blinn-phong", plausible=True)
+    material = result.material
+    assert isinstance(material, SpecularMaterial)
+    np.testing.assert_allclose(np.add(material.k_d, material.k_s), 1.0, atol=1e-9)
+    assert brdf.check(material).plausible
+    assert any("held at 1" in words for words in result.warnings)
