@@ -31,7 +31,6 @@ from fitting import functional
 from fitting.codes import single_values_at_end
 from fitting.core import fit_pictures
 from fitting.light_colour import coefficient_factors, take_colour_out
-from fitting.pixels import SYMMETRIC_PIXELS
 from fitting.problem import TOP, FitProblem, state_problem
 from fitting.progress import waiting
 from fitting.report import FitResult
@@ -296,4 +295,4 @@ def _plain(target: Float[Array, "N H W C"], seen: Bool[Array, "N H W"]) -> Bool[
     least = jnp.min(target, where=jnp.isfinite(target), initial=jnp.inf)
     cut = jax.vmap(single_values_at_end, (-1, None, None))(target, seen, least)
     finite = jnp.all(jnp.isfinite(target) | ~seen[..., None])
-    return finite & (largest > 0) & (top <= SYMMETRIC_PIXELS) & ~jnp.any(cut)
+    return finite & (largest > 0) & (top <= 1) & ~jnp.any(cut)
