@@ -99,3 +99,11 @@ LIT = brdf.Scene(
 def test_what_is_sound_is_not_doubted(picture: Callable[[], np.ndarray], place: brdf.Scene, options: dict[str, Any]):
     words = told(picture(), place, **options)
     assert not [doubt for doubt in DOUBTS if doubt in words]
+
+
+@pytest.mark.parametrize("loss", ["relative", "log"])
+def test_dark_codes_that_shares_weigh_are_no_curve(loss: Any):
+    where = scene(ambient=None)
+    codes = np.clip(np.rint(255 * shown(GLOSSY, 0.004, where)), 0, 255).astype(np.uint8)
+    said = fitting.fit(codes, where, model="blinn-phong", loss=loss).warnings
+    assert not any("sRGB-encoded" in words for words in said)
