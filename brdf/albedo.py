@@ -24,8 +24,8 @@ from brdf.vectors import Numbers, Scalars
 ACCURACY = {"float64": 1e-10, "float32": 1e-5}
 """Bound on the error of the albedo of a normalised lobe (k_s = 1), tested against mpmath and adaptive quadrature."""
 
-LOBES = (Phong, BlinnPhong, NormalizedPhong, NormalizedBlinnPhong)
-"""Models whose lobes have a form here; other programs, and the pages, draw that of any other as Blinn-Phong's."""
+WITH_CLOSED_FORM = (Phong, BlinnPhong, NormalizedPhong, NormalizedBlinnPhong)
+"""The models whose lobes have a closed form."""
 
 _NODES = 64
 _REACH = 9.0  # cos^n x < exp(-n x^2 / 2): beyond 9 / sqrt(n) it is below 3e-18
@@ -54,7 +54,7 @@ def directional_albedo(
         Array([[1.   ], [0.609]], dtype=float32)
     """
     instance("material", material, Material, "Write brdf.directional_albedo(material, theta)")
-    if isinstance(material, SpecularMaterial) and type(material) not in LOBES:
+    if has_other_lobe(type(material)):
         remedy = "Use brdf.check, which integrates any"
         raise InputError("material", f"is of the model {material.name}, whose albedo has no closed form here", remedy)
     with working_precision(precision):
@@ -62,6 +62,11 @@ def directional_albedo(
     # a float64 array of JAX would be cut to float32, with a warning, by the first thing done to it outside the context
     kept = isinstance(result, Tracer) or result.dtype == jnp.result_type(float)
     return result if kept else np.asarray(result)
+
+
+def has_other_lobe(model: type[Material]) -> bool:
+    """Whether the lobe is none of the four that have a closed form; other programs, and pages, draw Blinn-Phong's."""
+    return issubclass(model, SpecularMaterial) and model not in WITH_CLOSED_FORM
 
 
 @jax.jit
@@ -91,7 +96,7 @@ def lobe_albedo(model: type[SpecularMaterial], n: Numbers, theta: Numbers) -> Sc
 
 
 def normalized_form(model: type[SpecularMaterial]) -> type[SpecularMaterial]:
-    """The normalised model of the same lobe; of one that is not among `LOBES` Blinn-Phong's."""
+    """The normalised model of the same lobe; of any other Blinn-Phong's."""
     return NormalizedPhong if issubclass(model, Phong | NormalizedPhong) else NormalizedBlinnPhong
 
 

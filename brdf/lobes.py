@@ -41,8 +41,8 @@ NODES, STEP, NARROWEST, WIDEST = 5, 0.35, 0.04, 1.0
 """A polynomial through so many exponents stands for a lobe over a range of log n: of 0.7 to 1e-5, of 0.04 to 1e-11. One
 through nodes so far apart, where the range is wider than `WIDEST`, to 1e-3, which serves to find where to look."""
 
-LOBES = half_log_cosine, mirror_log_cosine
-"""Of the models that one program serves."""
+SHARED = half_log_cosine, mirror_log_cosine
+"""Lobes of the models that one program serves."""
 
 NO_LOBE = -1e9
 """The peak of a pixel without a lobe: exp(n * this) = 0 for every n that a fit visits."""
@@ -65,8 +65,8 @@ class OneOf:
 
     @classmethod
     def of(cls, model: type[Material]) -> "OneOf":
-        """Of all models that have a name and one of these lobes; the model alone where it is none of them."""
-        models = tuple(one for one in cls(tuple(MODELS.values())).lobes if one.log_cosine in LOBES)
+        """Of all models that have a name and a shared lobe; the model alone where it is none of them."""
+        models = tuple(one for one in cls(tuple(MODELS.values())).lobes if one.log_cosine in SHARED)
         return cls(models, np.int32(models.index(model))) if model in models else cls((model,))
 
     @property

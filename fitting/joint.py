@@ -93,6 +93,21 @@ class JointResult(FitResult):
     solver: str
 
 
+class _Solved(NamedTuple):
+    """A result, what is known of its numbers, what its pictures show, and how neighbours err alike."""
+
+    result: JointResult
+    information: Information
+    shown: Sequence[Shown]
+    neighbours: Neighbours
+
+    @property
+    def cost(self) -> float:
+        """By which results of the same pictures are compared: the likelihood's, or what is left where it has no say."""
+        value = self.information.value
+        return -value if math.isfinite(value) else self.result.residual
+
+
 def fit_jointly(
     target: Any,
     scene: brdf.Scene | Sequence[brdf.Scene],
@@ -229,7 +244,7 @@ def _radiance(result: JointResult, observed: Observed) -> list[Float[np.ndarray,
 
 
 def _without_codec_errors(
-    result: JointResult, look_alikes: LookAlikes, whole: Observed, solve: "Callable[..., _Solved]"
+    result: JointResult, look_alikes: LookAlikes, whole: Observed, solve: Callable[..., _Solved]
 ) -> JointResult:
     """Less what codecs do to look-alikes of what is predicted, again until these come no nearer to the pictures."""
     moved = np.zeros(len(result.parameters))
@@ -284,7 +299,7 @@ def _alike(scene: brdf.Scene, reach: int) -> Bool[np.ndarray, "H W"]:
     return minimum_filter(met, 2 * reach + 1, mode="nearest") == maximum_filter(met, 2 * reach + 1, mode="nearest")
 
 
-def _of_model(stated: FitProblem, model: str, solve: "Callable[..., _Solved]") -> "_Solved":
+def _of_model(stated: FitProblem, model: str, solve: Callable[..., _Solved]) -> _Solved:
     """From the separable optimum of a model; of "auto" the simplest adequate one under the scenes of the best lobe."""
     separable = partial(_separable, stated)
     if model != "auto":
@@ -302,7 +317,7 @@ def _separable(stated: FitProblem, model: str, scenes: Sequence[brdf.Scene]) -> 
     return fit_pictures(dataclasses.replace(stated, model=model, scenes=list(scenes)))
 
 
-def _sought_again(stated: FitProblem, solved: "_Solved", solve: "Callable[..., _Solved]") -> "_Solved":
+def _sought_again(stated: FitProblem, solved: _Solved, solve: Callable[..., _Solved]) -> _Solved:
     """What was found, or what is found from the best of all exponents under its scenes, where that is elsewhere.
 
     Under the scenes that were told a clipped highlight may lead to another minimum, or seem to be none.
@@ -416,21 +431,6 @@ def _minimum(problem: JointProblem, brightest: float, solver: str | None, tolera
         near, stepped = solution.result == optx.RESULTS.successful, False
         vector = jnp.where(held, vector, solution.value)
     return _Minimum(best, steps, converged, "gauss-newton" if whole else solver)
-
-
-class _Solved(NamedTuple):
-    """A result, what is known of its numbers, what its pictures show, and how neighbours err alike."""
-
-    result: JointResult
-    information: Information
-    shown: Sequence[Shown]
-    neighbours: Neighbours
-
-    @property
-    def cost(self) -> float:
-        """By which results of the same pictures are compared: the likelihood's, or what is left where it has no say."""
-        value = self.information.value
-        return -value if math.isfinite(value) else self.result.residual
 
 
 def _solve(

@@ -28,7 +28,7 @@ from xml.etree import ElementTree
 import numpy as np
 from jaxtyping import Float
 
-from brdf.albedo import LOBES
+from brdf.albedo import has_other_lobe
 from brdf.conversions import (
     mirror_from_half,
     nearest_classic,
@@ -106,7 +106,7 @@ def export_material(material: Material, to: str, *, name: str = "fitted", note: 
         raise InputError("material", f"has {channels} channels, {to} knows RGB alone", "Use the format json")
     name, note = (" ".join(text.split()) for text in (name, note))  # a line, whatever came
     content, losses, drawn, extras = EXPORTS[to](material, name)
-    if to != "json" and isinstance(material, SpecularMaterial) and type(material) not in LOBES:
+    if to != "json" and has_other_lobe(type(material)):
         losses = [f"the format has no word for the lobe of {material.name}: it is written as Blinn-Phong's", *losses]
     if drawn is not None:
         losses += _brightness(material, drawn)

@@ -12,7 +12,7 @@ import dataclasses
 import jax
 import numpy as np
 
-from brdf.albedo import ACCURACY, LOBES, directional_albedo, normalized_form
+from brdf.albedo import ACCURACY, WITH_CLOSED_FORM, directional_albedo, normalized_form
 from brdf.channels import in_channel
 from brdf.conversions import nearest_normalized
 from brdf.measured.table import from_angles
@@ -31,7 +31,7 @@ from brdf.plausibility.report import (
 from brdf.precision import cast, working_precision
 
 # What is known on paper holds for these alone; a subclass or a new model is looked at like any function.
-KNOWN = (Lambert, *LOBES)
+KNOWN = (Lambert, *WITH_CLOSED_FORM)
 
 _LIGHTS = np.array([*np.arange(90.0), 89.5, 89.9, GRAZING])
 _VIEWS = np.concatenate([_LIGHTS, -_LIGHTS])  # below 0 on the other side of the normal

@@ -17,9 +17,9 @@ from fitting.photographs.archives import read_archive
 from fitting.photographs.ball import Circle, ball_points, ball_seen, find_circle
 from fitting.photographs.light_files import parse_numbers, read_directions, read_intensities
 
-# Of each kind of input: the options that say what it says itself or nothing of it, why, and what to do.
 # Beyond these single precision has no numbers for the pixels.
 EXPOSURES = 1e-12, 1e12
+# Of each kind of input: the options that say what it says itself or nothing of it, why, and what to do.
 REFUSED = {
     "archive": (
         ("light", "lights", "intensities", "scene", "sphere", "normals", "encoding"),

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from brdf.albedo import LOBES, directional_albedo
+from brdf.albedo import directional_albedo, has_other_lobe
 from brdf.channels import channel_names, in_channel
 from brdf.display import lit_sphere
 from brdf.measured.table import MeasuredBRDF, from_angles
@@ -68,7 +68,7 @@ def plot_albedo(brdf: Brdf, report: Report | None = None, figure: Any = None) ->
         >>> fitting.plot_albedo(brdf.preset("gold")).savefig("albedo.png")
     """
     last = [89.0, 89.5, 89.7, 89.8, 89.9, 89.95, 89.99]
-    if isinstance(brdf, Material) and (type(brdf) in LOBES or not isinstance(brdf, SpecularMaterial)):
+    if isinstance(brdf, Material) and not has_other_lobe(type(brdf)):
         degrees = np.array([*np.arange(0.0, 89.0, 0.5), *last])
         albedo = np.asarray(directional_albedo(brdf, np.radians(degrees), precision="float64"))
     else:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 import brdf
-from brdf.albedo import LOBES, lobe_albedo, normalized_form
+from brdf.albedo import has_other_lobe, lobe_albedo, normalized_form
 from brdf.conversions import nearest_equations
 from brdf.errors import InputError
 from brdf.materials.exports import shader
@@ -70,8 +70,8 @@ def viewer(result: FitResult, picture: int | None = None) -> str:
 
 def other_lobes(*models: type[brdf.Material]) -> list[str]:
     """What a page says of models whose lobes it draws as another one's."""
-    others = (model.name for model in models if issubclass(model, SpecularMaterial) and model not in LOBES)
-    return [f"The lobe of {name} is drawn as Blinn-Phong's, as is its albedo." for name in others]
+    others = filter(has_other_lobe, models)
+    return [f"The lobe of {model.name} is drawn as Blinn-Phong's, as is its albedo." for model in others]
 
 
 def _scene(scene, notes):
