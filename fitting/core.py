@@ -10,7 +10,7 @@ from typing import TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 import brdf
 from brdf.channels import channel_names
@@ -195,9 +195,10 @@ def _fit_model(
     All that the light reaches is free where nothing else is said.
     """
     free, problem = observed.reached(model) if free is None else free, observed.problem
+    limits = [observed.limits[picture] for picture in observed.owner]
     if pictures is not None:
         near = next((picture.lobe.near for picture in pictures if picture.lobe is not None), None)
-        return _fit_about(model, observed, free, pictures, near)
+        return _fit_about(model, observed, free, pictures, near, limits)
     error = problem.sample_error(model.name)
     near, trial = None if error is None else error.near, 0
     while True:
@@ -207,7 +208,7 @@ def _fit_model(
             pictures = each(made, observed.tiles)
         else:
             pictures = list(map(placed, itertools.count(), map(made, observed.tiles)))
-        fit = _fit_about(model, observed, free, pictures, near)
+        fit = _fit_about(model, observed, free, pictures, near, limits)
         if (empty := np.flatnonzero(fit.optimum.pixels == 0)).size:
             clipped = ", ".join(channel_names(fit.optimum.pixels.size)[channel] for channel in empty)
             what = f"is clipped in channel {clipped} wherever it sees the object"
@@ -266,6 +267,7 @@ def _fit_about(
     free: np.ndarray,
     pictures: Sequence[Picture],
     near: Near | None = None,
+    limits: Sequence[tuple[float, float]] = (),
 ) -> ModelFit:
     """One model, whose lobe may be tabulated near some exponents."""
     n_range = between(near, observed.problem.n_range)
@@ -279,7 +281,7 @@ def _fit_about(
             free = free & [[True], [True], [False]]
     optimise = partial(search, free=free, n_range=n_range)
     loss, about = observed.problem.loss, {"owner": observed.owner, "copies": observed.copies}
-    pictures, optimum, factor = reweight(pictures, optimise(pictures), optimise, loss, observed.rounding)
+    pictures, optimum, factor = reweight(pictures, optimise(pictures), optimise, loss, observed.rounding, limits)
     return ModelFit(model, pictures, optimum, free, n_range, noise_factor=factor, **about)
 
 
@@ -334,13 +336,21 @@ def _comparable(fits: Mapping[str, ModelFit], observed: Observed) -> dict[str, M
     problem = observed.problem
     fits = {name: fit for name, fit in fits.items() if not _too_wide(fit, problem)}
     fits = fits or {"lambert": most_likely(_fit_model(brdf.Lambert, observed))}
-    if problem.loss != "squared":
-        # Weights are part of what is minimised: those of the better family serve all, or costs could not be compared.
+    if problem.loss != "squared" or np.isfinite(np.asarray(observed.limits)).any():
+        # Weights are part of what is minimised: those of the better family serve all, or costs could not be compared;
+        # so do pixels that no family says to be near a limit.
         best = min(fits.values(), key=lambda fit: float(np.sum(residual_noise(fit.optimum, observed.rounding))))
+        weights = each(_weight_of_all, best.pictures, *(fit.pictures for fit in fits.values()))
         for name, fit in fits.items():
-            pictures = each(lambda a, b: dataclasses.replace(a, weight=b.weight), fit.pictures, best.pictures)
+            pictures = each(lambda one, weight: dataclasses.replace(one, weight=weight), fit.pictures, weights)
             fits[name] = fit._replace(pictures=pictures, optimum=search(pictures, fit.free, fit.n_range))
     return _best_first(fits)
+
+
+def _weight_of_all(picture: Picture, *others: Picture) -> Array | None:
+    """That of a picture, 0 where that of another one is."""
+    count = np.logical_and.reduce([np.asarray(other.weights) > 0 for other in others])
+    return None if picture.weight is None else jnp.where(count, picture.weights, 0)
 
 
 def _told_apart_by(

@@ -78,6 +78,7 @@ class Observed(NamedTuple):
         roundings: standard deviation of the error that rounding, or the search, puts into a value of each picture,
             times the root of the picture's weight, (K, C).
         brightest: largest size of a value that counts, (C,).
+        limits: beyond which pixels of each picture were left out by what they show, as dark or clipped.
         left_out: how many pixels were left out, by reason.
         shown: the pictures for people, (H, W, C) each: of a large file every so many pixels.
         scenes: what these show.
@@ -91,6 +92,7 @@ class Observed(NamedTuple):
     owner: Sequence[int]
     roundings: Float[np.ndarray, "K C"]
     brightest: Float[np.ndarray, " C"]
+    limits: list[tuple[float, float]]
     left_out: dict[str, int]
     shown: list[np.ndarray]
     scenes: list[brdf.Scene]
@@ -178,7 +180,7 @@ def observe(problem: FitProblem, *, at_once: bool = False) -> Observed:
         except InputError as error:
             names = {name: f"{name}[{index}]" for name in ("target", "mask")} if len(problem.targets) > 1 else {}
             raise error.renamed(names) from None
-    tiles, rounding, brightest, counts, shown, scenes, counted, weights = map(list, zip(*parts, strict=True))
+    tiles, rounding, brightest, limits, counts, shown, scenes, counted, weights = map(list, zip(*parts, strict=True))
     left_out: Counter[str] = Counter()
     for some in counts:
         left_out.update(some)
@@ -189,6 +191,7 @@ def observe(problem: FitProblem, *, at_once: bool = False) -> Observed:
         [picture for picture, some in enumerate(tiles) for _ in range(len(some))],
         np.stack(rounding),
         np.max(brightest, axis=0),
+        limits,
         dict(left_out),
         shown,
         scenes,
@@ -211,7 +214,7 @@ def _grey(picture: np.ndarray) -> bool:
 def _observe(
     problem: FitProblem, at_once: bool, target: Target, scene: brdf.Scene, grey: brdf.Scene, mask: Any, given: Any
 ) -> tuple[Any, ...]:
-    """Tiles, rounding, brightest value, pixels left out, and what is shown: see `Observed`."""
+    """Tiles, rounding, brightest value, limits, pixels left out, and what is shown: see `Observed`."""
     dtype, noise, dark = np.dtype(problem.precision), problem.noise, problem.dark
     height, width = target.pixels.shape[:2]
     grey = brdf.cast(grey, problem.precision)
@@ -299,7 +302,9 @@ def _observe(
             if weighed or several:
                 weights = np.concatenate(own).reshape(target.pixels.shape if several else (height, width))
     rounding = np.maximum(brightest * resolution, target.step / np.sqrt(12.0))
-    return tiles, rounding, brightest, left_out, *shown, weights
+    # Of others an end says what it says.
+    limits = (dark if left_out.get("dark") else -np.inf), (level if left_out.get("clipped") and not plain else np.inf)
+    return tiles, rounding, brightest, limits, left_out, *shown, weights
 
 
 def _bands(

@@ -45,6 +45,10 @@ _QUANTILE = 0.918
 _MEDIAN = 0.6744897501960817
 # So many values are enough for a median to 1 %.
 _MEDIAN_VALUES = 16384
+# Within so many deviations of a limit noise decides whether a value is beyond it.
+REACH = 3.0
+# So often it is asked which pixels these are: then two sets of them may take turns.
+LIMITING_ROUNDS = 8
 MOST_ROUNDS = 50
 ENOUGH = 1e-4
 
@@ -55,16 +59,21 @@ def reweight(
     optimise: Callable[[Sequence[Picture]], Optimum],
     loss: Loss,
     rounding: Float[np.ndarray, " C"],
+    limits: Sequence[tuple[float, float]],
 ) -> tuple[Sequence[Picture], Optimum, float]:
     """Fit with a loss of any kind: squared fits, each with the weights of the last one's optimum, until it rests.
 
+    Pixels beyond ``limits``, of each picture, were left out by what they show; so are, by what is predicted, those that
+    noise keeps within them or not: of these the ones that are left err to one side.
     No scale is below ``rounding``, the standard deviation of a value's. Gives the pictures with the weights of the last
     round, its optimum, and what the weighted residual's standard deviation is multiplied by to give that which the
     formula for standard errors needs: the weights know the residuals.
     """
     now, robust = pictures, loss in ("huber", "cauchy")
-    if loss == "squared":
+    limited = bool(np.isfinite(np.asarray(limits)).any())
+    if loss == "squared" and not limited:
         return pictures, optimum, 1.0
+    at = optimum
     scale = rounding if robust else DARKEST * _mean(pictures)
     for round_ in range(MOST_ROUNDS):
         # Huber's loss is convex in the coefficients; the first rounds lead Cauchy's to the right one of its minima.
@@ -72,7 +81,15 @@ def reweight(
         if robust:
             scale = _scale(pictures, optimum, rounding)
         before, now = optimum, each(partial(_with_weight, optimum=optimum, scale=scale, loss=rule), pictures)
+        if limited:
+            at = optimum if round_ < LIMITING_ROUNDS else at
+            noise = np.sqrt(at.cost / np.maximum(at.pixels, 1)) if loss == "squared" else _scale(pictures, at, rounding)
+            now = each(partial(_within, optimum=at, noise=noise), now, pictures, limits)
         optimum = optimise(now)
+        if limited and np.any(optimum.pixels == 0):
+            # Noise reaches from one limit to the other.
+            optimum, limited = before, False
+            continue
         if rule == loss and _change(before, optimum) < ENOUGH:
             break
     return now, optimum, _noise_factor(now, pictures, optimum, loss) if robust else 1.0
@@ -116,6 +133,16 @@ def _with_weight(picture: Picture, optimum: Optimum, scale: np.ndarray, loss: st
     return replace(picture, weight=jnp.asarray(weight, picture.target.dtype))
 
 
+def _within(
+    picture: Picture, other: Picture, limits: tuple[float, float], optimum: Optimum, noise: Float[np.ndarray, " C"]
+) -> Picture:
+    """Without pixels that are predicted near a limit; ``noise`` is that of the other one's weight of 1."""
+    predicted, weight = picture.predict(optimum.n, optimum.x), np.asarray(picture.weights)
+    margin = REACH * noise / np.sqrt(np.maximum(np.asarray(other.weights), np.finfo(np.float32).tiny))
+    inside = np.all((predicted > limits[0] + margin) & (predicted < limits[1] - margin), axis=1, keepdims=True)
+    return replace(picture, weight=jnp.asarray(weight * inside, picture.target.dtype))
+
+
 def weights(
     loss: str,
     target: Float[np.ndarray, "P C"],
@@ -129,6 +156,8 @@ def weights(
     """
     target = np.where(base > 0, target, model)
     bright = np.maximum(model, scale)
+    if loss == "squared":
+        return base
     if loss == "relative":
         return base / bright**2
     if loss == "log":

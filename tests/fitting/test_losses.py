@@ -99,6 +99,23 @@ def test_a_relative_loss_keeps_the_diffuse_part_that_a_bright_highlight_drowns()
     assert np.median(off["relative"]) < 0.3 * np.median(off["squared"])
 
 
+@pytest.mark.parametrize("options", [{"loss": "huber"}, {"loss": "relative"}, {"dark": 0.01}], ids=str)
+def test_a_clipped_highlight_is_left_out_by_what_is_predicted(options: dict):
+    random, clean, off = np.random.default_rng(4), rendered(GLOSS), []
+    for _ in range(8):
+        picture = np.minimum(clean * (1 + 0.04 * random.standard_normal(clean.shape)), 0.75 * clean.max())
+        k_s = fitting.fit(picture, SCENE, model="blinn-phong", **options)["k_s"][0]
+        off.append((k_s.value - 0.6) / k_s.error)
+    # Of pixels below the level those that noise brought there are too dark: -3 in the mean.
+    assert abs(np.mean(off)) < 1.0
+
+
+def test_noise_that_reaches_from_limit_to_limit_leaves_pixels():
+    picture = rendered(GLOSS) + 0.5 * np.random.default_rng(5).standard_normal((48, 48, 1))
+    result = fitting.fit(np.clip(picture, 0, 1), SCENE, model="lambert", dark=0.01)
+    assert result["k_d"][0].value > 0
+
+
 def test_an_unknown_loss_is_refused():
     with pytest.raises(brdf.InputError, match="loss: is unknown, got 'absolute'"):
         fitting.fit(rendered(GLOSS), SCENE, loss="absolute")

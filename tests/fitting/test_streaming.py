@@ -48,6 +48,17 @@ def small_bands(monkeypatch):
     monkeypatch.setattr(pixels, "ALIGNED_ROWS", 12)
 
 
+def test_a_clipped_highlight_is_left_out_by_what_is_predicted(tmp_path: Path):
+    clean, off = np.asarray(brdf.render(MATERIAL, scene())), []
+    for seed in range(4):
+        noise = 0.02 * np.random.default_rng(seed).standard_normal(clean.shape)
+        brdf.write_image(tmp_path / "clipped.exr", np.minimum(clean + noise, 0.5).astype(np.float32))
+        with brdf.ImageReader(tmp_path / "clipped.exr") as reader:
+            k_s = fitting.fit(reader, scene(), model="blinn-phong")["k_s"][0]
+        off.append((k_s.value - MATERIAL.k_s[0]) / k_s.error)
+    assert abs(np.mean(off)) < 1.0
+
+
 def same(streamed: fitting.FitResult, whole: fitting.FitResult, tolerance: float = 2e-5):
     assert type(streamed.material) is type(whole.material)
     for mine, its in zip(streamed.parameters, whole.parameters, strict=True):
