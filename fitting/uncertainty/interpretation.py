@@ -150,9 +150,8 @@ def _of_values(
     """How pixels err that least squares fit: beside their noise what errs together, and how their noise grows."""
     optimum, pictures, problem = fit.optimum, fit.pictures, observed.problem
     tell, squared, together = pixels.noise > 2 * rounding, problem.loss == "squared", None
-    # Where weights are no inverse variances nothing is told of what else makes noise uneven.
-    uneven = misweighted_sums(pictures, optimum) if squared and _is_weighed(problem) else None
-    growing = statistics.growing_noise(pixels.noise, rounding) if uneven is None else None
+    misweighted = misweighted_sums(pictures, optimum, rounding) if squared and _is_weighed(problem) else None
+    uneven, growing = misweighted or (None, statistics.growing_noise(pixels.noise, rounding))
     # It cannot be told where rounding is most of the noise, or weights are part of what is fitted.
     if squared and tell.any():
         # Channels that err together count once.
@@ -169,7 +168,7 @@ def _of_values(
         )
         pixels = pixels._replace(scatter=scatter(pictures, optimum, errors, alone_covariance(optimum, fit.tied)))
         return pixels, together, growing
-    if growing is not None:
+    if growing is not None and uneven is None:
         uneven = weighted_sums(pictures, optimum, growing, inverse=False)
     if uneven is not None:
         pixels = pixels._replace(spread=fit.noise_factor**2 * uneven.gram)

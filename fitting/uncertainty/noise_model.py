@@ -133,18 +133,22 @@ def sums_at(pictures: Sequence[Picture], optimum: Optimum, weight: Callable[[Pic
     return Sums(*(leaf[0] for leaf in parts)).about(optimum.x.T).columns(np.diag([1.0, 1.0, 1.0, 1.0 / optimum.n]))
 
 
-def misweighted_sums(pictures: Sequence[Picture], optimum: Optimum) -> Sums | None:
+def misweighted_sums(
+    pictures: Sequence[Picture], optimum: Optimum, least: Float[np.ndarray, " C"]
+) -> tuple[Sums, Float[np.ndarray, "C 3"] | None] | None:
     """Sums at the optimum with each pixel's weight times the variance of its weighted residual, where weights vary it.
 
     Weights of least squares are inverse variances, unless they say what is of interest: those of a soft mask, of a
     region. Then noise is what it is beside them, and errors are those of the sandwich. Some pixels tell which of both,
-    and how large noise is; the sums are of all. None where inverse variances are as likely.
+    how large noise is, and how it grows with brightness, if it does: `noise_model`. The sums are of all. None where
+    inverse variances are as likely.
     """
     stride = -(-sum(int(picture.counts.sum()) for picture in pictures) // MOST_PIXELS)
-    parts = [_squared_and_weight(picture, optimum, stride) for picture in pictures]
-    of_channels = max(weight.shape[0] for _, weight in parts)
-    squared = np.concatenate([one for one, _ in parts], axis=1)
-    weight = np.concatenate([np.broadcast_to(one, (of_channels, one.shape[1])) for _, one in parts], axis=1)
+    parts = [_residual_value_weight(picture, optimum, stride) for picture in pictures]
+    of_channels = max(weight.shape[0] for *_, weight in parts)
+    residual, value = (np.concatenate([part[i] for part in parts], axis=1) for i in range(2))
+    weight = np.concatenate([np.broadcast_to(one, (of_channels, one.shape[1])) for *_, one in parts], axis=1)
+    squared = residual**2
     if not squared.any(axis=1).all():
         return None
     counts = weight > 0
@@ -158,21 +162,29 @@ def misweighted_sums(pictures: Sequence[Picture], optimum: Optimum) -> Sums | No
     if likely[power] < likely[1.0] + RISE:
         return None
 
+    whole = counts.all(axis=0)
+    even = (residual * np.exp((power - 1) / 2 * log_weight))[:, whole].T
+    growing = noise_model(even, value[:, whole].T, least)
+
     def beside(picture: Picture) -> AnyArray:
-        weight = np.asarray(picture.weights, float) ** (2 - power) * variance[power]
+        spread = variance[power]
+        if growing is not None:
+            spread = variance_at(growing, np.maximum(picture.predict(optimum.n, optimum.x), 0.0))
+        weight = np.asarray(picture.weights, float) ** (2 - power) * spread
         return np.broadcast_to(weight, picture.target.shape)
 
-    return sums_at(pictures, optimum, beside)
+    return sums_at(pictures, optimum, beside), growing
 
 
-def _squared_and_weight(
+def _residual_value_weight(
     picture: Picture, optimum: Optimum, stride: int
-) -> tuple[Float[np.ndarray, "C K"], Float[np.ndarray, "Cw K"]]:
-    """Squares of the weighted residuals of some pixels that count, and their weights, which channels may share."""
+) -> tuple[Float[np.ndarray, "C K"], Float[np.ndarray, "C K"], Float[np.ndarray, "Cw K"]]:
+    """Weighted residuals of some pixels that count, what is predicted, and their weights, which channels may share."""
     pixel = np.flatnonzero(picture.counts)
     # One at random of each so many: a fixed step could meet no more than some columns of a picture.
     first = np.arange(0, pixel.size, stride)
     pixel = pixel[np.minimum(first + np.random.default_rng(0).integers(stride, size=first.size), pixel.size - 1)]
     some = picture.in_double(pixel)
     weight = np.broadcast_to(some.weights, (len(some.target), some.weights.shape[1]))[: pixel.size]
-    return residuals(some, optimum)[: pixel.size].T ** 2, np.asarray(weight, float).T
+    shown = np.asarray(some.predict(optimum.n, optimum.x), float)
+    return residuals(some, optimum)[: pixel.size].T, shown[: pixel.size].T, np.asarray(weight, float).T

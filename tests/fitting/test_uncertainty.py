@@ -453,3 +453,16 @@ def test_weights_that_are_no_inverse_variances_make_nothing_surer(kind: str):
         ]
     # As inverse variances they would hold half.
     assert np.mean(inside) > 0.88
+
+
+def test_noise_that_grows_beside_weights_that_are_a_mask_is_allowed_for():
+    clean = pictured(GLOSS, SCENE)
+    picture = pictured(GLOSS, SCENE, np.sqrt(0.002**2 + 0.001 * clean), 7)
+    mask = np.random.default_rng(8).uniform(size=picture.shape[:2]) < 0.5
+    hard, soft = (
+        fitting.fit(picture, SCENE, model="blinn-phong", **options, **OPTIONS)
+        for options in ({"mask": mask}, {"weight": np.where(mask, 1.0, 1e-3)})
+    )
+    for one, other in zip(hard.parameters, soft.parameters, strict=True):
+        # By one variance for all values k_a would have half as much again. What lies outside tells of noise, too.
+        assert other.error == pytest.approx(one.error, rel=0.1)
