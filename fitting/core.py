@@ -10,7 +10,7 @@ from typing import TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 import brdf
 from brdf.channels import channel_names
@@ -270,19 +270,22 @@ def _fit_about(
     limits: Sequence[tuple[float, float]] = (),
 ) -> ModelFit:
     """One model, whose lobe may be tabulated near some exponents."""
-    n_range = between(near, observed.problem.n_range)
-    if free[2].any():
-        # Exponents of which some pixel sees at least a trace: with larger ones k_s could be anything.
-        peak = max(picture.nearest_peak for picture in pictures)
-        upper = min(n_range[1], UNSEEN / max(-peak, UNSEEN / n_range[1]))
-        if upper >= n_range[0]:
-            n_range = n_range[0], upper
-        else:
-            free = free & [[True], [True], [False]]
+    free, n_range = within_sight(pictures, free, between(near, observed.problem.n_range))
     optimise = partial(search, free=free, n_range=n_range)
     loss, about = observed.problem.loss, {"owner": observed.owner, "copies": observed.copies}
     pictures, optimum, factor = reweight(pictures, optimise(pictures), optimise, loss, observed.rounding, limits)
     return ModelFit(model, pictures, optimum, free, n_range, noise_factor=factor, **about)
+
+
+def within_sight(
+    pictures: Sequence[Picture], free: Bool[np.ndarray, "3 C"], n_range: tuple[float, float]
+) -> tuple[Bool[np.ndarray, "3 C"], tuple[float, float]]:
+    """What may be above 0, and exponents of which some pixel sees a trace: with larger ones k_s could be anything."""
+    if not free[2].any():
+        return free, n_range
+    peak = max(picture.nearest_peak for picture in pictures)
+    upper = min(n_range[1], UNSEEN / max(-peak, UNSEEN / n_range[1]))
+    return (free, (n_range[0], upper)) if upper >= n_range[0] else (free & [[True], [True], [False]], n_range)
 
 
 def _simplest(

@@ -3,8 +3,8 @@
 Noise has no shape. Where the residual has one, something that the scene says is not so: a light that stands elsewhere,
 a ball whose circle is off, a curve that was not undone. The renderer tells how the picture changes with each of them;
 what of that change the material cannot follow is compared with the residual. That is a score test (Rao 1948, Proc.
-Camb. Phil. Soc. 44, 50): one linear least squares for each cause, and nothing is fitted again. A mirrored picture and
-another model are no small changes: they are fitted.
+Camb. Phil. Soc. 44, 50): one linear least squares for each cause. Beside the likeliest the material is fitted again,
+which tells its size; a mirrored picture and another model are no small changes, and are fitted, too.
 
 Pictures are compared in the codes of their file where it has a curve, since noise and rounding are even there.
 """
@@ -28,7 +28,7 @@ from brdf.lobes import Near
 from brdf.precision import working_precision
 from brdf.rendering import basis_columns
 from fitting.budget.sampling import sample_counts, with_samples
-from fitting.core import picture_of
+from fitting.core import picture_of, within_sight
 from fitting.joint_problem import JointProblem, joint_problem, place_of, scene_leaves, turns
 from fitting.likelihood import how_many_alike, weight_of_alike
 from fitting.model_fit import N_RANGE
@@ -64,6 +64,8 @@ ALIKE = {0: 4.0, 1: 4.0, 2: 6.18}
 FOLLOWED = 1e-6
 # Half the difference of the pictures that make a derivative, in units of the cause: degrees, pixels, per cent.
 STEP = 0.05
+# Of a size found by slopes the parts that are tried, how often, and how far each time leads at most.
+ABOUT, REFINEMENTS, NEAR = np.array([0.9, 1.0, 1.1]), 2, np.array([0.5, 2.0])
 # Pixels on a side of the blocks within which errors go together.
 BLOCK = 16
 # Pixels on a side that are looked at, if it were one picture, the same under lights of many samples, and at least of
@@ -87,12 +89,21 @@ TINY = np.finfo(float).tiny
 
 
 class _Test(NamedTuple):
-    """A cause; what of its change the material cannot follow, in units of noise; the squares that it explains."""
+    """A cause, and what tells it.
+
+    Attributes:
+        cause: as it is told.
+        columns: what of its change the material cannot follow, in units of noise.
+        gain: the squares that it explains.
+        inflation: of its error's square, by what errs together.
+        sizes: of its moves.
+    """
 
     cause: Cause
     columns: Float[np.ndarray, "P K"]
     gain: float
     inflation: float = 1.0
+    sizes: Float[np.ndarray, " K"] = np.zeros(0)
 
 
 def diagnose(result: FitResult) -> tuple[Cause, ...]:
@@ -113,7 +124,7 @@ def diagnose(result: FitResult) -> tuple[Cause, ...]:
         ]
         tests = sorted([*found, *residual.refitted()], key=lambda test: -test.gain)
         alike = [test.cause.name for test in tests[1:] if residual.alike(tests[0], test)]
-    causes = [test.cause for test in tests]
+        causes = [*map(residual.refined, tests[:1]), *(test.cause for test in tests[1:])]
     if causes:
         causes[0] = dataclasses.replace(causes[0], name=" or ".join([causes[0].name, *alike]))
     return tuple(causes)
@@ -222,9 +233,9 @@ class _Picture:
         """The picture with some numbers moved."""
         return np.asarray(brdf.render(*self.moved(move, size)))
 
-    def lit(self, model: type[brdf.Material], coarse: bool) -> Picture:
-        """As the solver takes them, with the light samples of slopes where coarse."""
-        scene = self.moved({}, 0.0, coarse=coarse)[1]
+    def lit(self, model: type[brdf.Material], coarse: bool, move: dict[str, Any] | None = None) -> Picture:
+        """As the solver takes them, some numbers moved, with the light samples of slopes where coarse."""
+        scene = self.moved(move or {}, 1.0, coarse=coarse)[1]
         target = jnp.asarray(self.target.reshape(-1, self.target.shape[-1]))
         every = Near.between(math.log(N_RANGE[0]), math.log(N_RANGE[1]), 0.0)
         return picture_of(model, Tile(target, None, scene.surface_points(), scene), every)
@@ -325,9 +336,9 @@ class Residual:
             columns = np.array([left for left in map(self._unfollowed, self._flat(slopes)) if np.any(left)]).T
             if not columns.size:
                 continue
-            size, gain = self._explained(columns)
-            length = float(np.linalg.norm(size))
-            column, left = columns @ size / max(length, TINY), self.left - columns @ size
+            sizes, gain = self._explained(columns)
+            length = float(np.linalg.norm(sizes))
+            column, left = columns @ sizes / max(length, TINY), self.left - columns @ sizes
             # Channels of a pixel, and pixels of a block, may err together: squares of their sums, over those of each.
             scores = column * left
             together = np.bincount(self._block, scores.reshape(self.channels, -1).sum(axis=0))
@@ -335,9 +346,39 @@ class Residual:
             error = math.sqrt(inflation / max(float(column @ column), TINY))
             most *= min(self.pictures[0].scene.resolution) if unit == "pixels" else 1
             if max(length, error) < most:
-                size = float(size[0]) if len(size) == 1 else length
+                size = float(sizes[0]) if len(sizes) == 1 else length
                 share = min(gain / max(self.excess, gain, TINY), 1.0)
-                yield _Test(Cause(name, size, error, unit, share, remedy), columns, gain, inflation)
+                yield _Test(Cause(name, size, error, unit, share, remedy), columns, gain, inflation, sizes)
+
+    def refined(self, test: _Test) -> Cause:
+        """A cause as large as pictures are nearest to it, the material fitted beside; by slopes it is a first step."""
+        cause, counted = test.cause, [picture.counted for picture in self.pictures]
+        moves = [picture.moves.get(cause.name, ()) for picture in self.pictures]
+        if not test.sizes.size or not all(isinstance(move, dict) for some in moves for move in some):
+            return cause
+
+        def left(times: float) -> float:
+            lit = []
+            for picture, some in zip(self.pictures, moves, strict=True):
+                parts = zip(test.sizes, some, strict=True) if some else ()
+                steps = [{leaf: times * size * step for leaf, step in move.items()} for size, move in parts]
+                together = {leaf: sum(step[leaf] for step in steps) for leaf in {*itertools.chain(*steps)}}
+                lit.append(picture.lit(self.model, coarse=True, move=together))
+            return self._least(lit, counted, [()] * len(lit))
+
+        at = 1.0
+        for _ in range(REFINEMENTS):
+            times = at * ABOUT
+            square, slope, _ = np.polyfit(times, list(map(left, times)), 2)
+            if not square > 0:
+                break
+            last, at = at, float(np.clip(-slope / (2 * square), *(at * NEAR)))
+            if abs((at - last) * cause.size) < cause.error:
+                break
+        size = at * cause.size
+        # Directions move along a tangent.
+        size = math.degrees(math.atan(math.radians(size))) if cause.unit == "degrees" else size
+        return dataclasses.replace(cause, size=size)
 
     def refitted(self) -> Iterator[_Test]:
         """Whether the pictures, or one of several, show the scenes mirrored, or all show another model."""
@@ -376,7 +417,8 @@ class Residual:
             weight = some[..., None] * np.flip(picture.weight, axis) * (picture.curve(target) / picture.noise) ** 2
             values, weight = (jnp.asarray(a.reshape(-1, self.channels)) for a in (target, weight))
             solved.append(dataclasses.replace(basis, target=values, weight=weight))
-        return float(np.sum(search(solved).cost))
+        every = np.ones((3, self.channels), bool)
+        return float(np.sum(search(solved, *within_sight(solved, every, N_RANGE)).cost))
 
     def alike(self, first: _Test, other: _Test) -> bool:
         """Whether the other cause would do as well: the first explains nothing beside it."""

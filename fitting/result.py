@@ -40,7 +40,8 @@ class Cause:
             centre), "radius", "gamma", "black", "mirrored left-right" or "mirrored upside down", "model phong" or
             another than was fitted; a light of several with its index, of one picture with that. "light or ball" where
             the picture does not tell them apart.
-        size: how far off, in the first order; a length where there are several directions.
+        size: how far off; of the first cause, if it is one of the scene, with the material fitted beside, of others in
+            the first order; a length where there are several directions.
         error: standard error of the size.
         unit: of both; "" for a mirrored picture and a model.
         share: of the structure in the residual that it would explain, from 0 to 1.

@@ -63,6 +63,25 @@ def test_what_is_wrong_is_named(name: str):
     assert result.to_dict()["diagnosis"][0]["name"] == name
 
 
+def test_a_large_one_is_as_large_as_it_is():
+    beside = brdf.DirectionalLight(direction=[-0.5, -0.3, 0.8], intensity=[0.6])
+    brighter = dataclasses.replace(beside, intensity=np.array([0.75]))
+    true, told = (dataclasses.replace(SCENE, ambient=None, lights=(LIGHT, light)) for light in (brighter, beside))
+    intensity = fitted(drawn(true), told).diagnosis[0]
+    assert "intensity 1" in intensity.name
+    turned = fitted(drawn(), with_light(8.0)).diagnosis[0]
+    assert turned.name == "light"
+    # By slopes alone these were told as 23.3 +- 0.1 or -23.3, and as 7.7 +- 0.1.
+    assert min(abs(intensity.size - size) for size in (25.0, -20.0)) < 3 * intensity.error
+    assert abs(turned.size - 8.0) < 2.5 * turned.error
+
+
+def test_a_plane_that_faces_away_from_its_light_ends_no_diagnosis():
+    light = brdf.RectangleLight([1.2, 1.5, 2.4], [0.8, 0, 0], [0, 0.8, 0], [12.0])  # shines away from the ball
+    told = dataclasses.replace(SCENE, lights=(light,))
+    assert fitted(drawn(), told).diagnosis is not None
+
+
 @pytest.mark.parametrize("true", ["phong", "normalized-blinn-phong"])
 @pytest.mark.parametrize("codes", [False, True])
 def test_another_model_is_named_and_no_ball_or_light_that_is_sound(true: str, codes: bool, tmp_path: Path):
