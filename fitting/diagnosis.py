@@ -23,16 +23,18 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 import brdf
+from brdf.errors import InputError
 from brdf.images.encoding import encode
 from brdf.lobes import Near
 from brdf.precision import working_precision
 from brdf.rendering import basis_columns
 from fitting.budget.sampling import sample_counts, with_samples
-from fitting.core import picture_of, within_sight
+from fitting.core import fit_pictures, picture_of, within_sight
 from fitting.joint_problem import JointProblem, joint_problem, place_of, scene_leaves, turns
 from fitting.likelihood import how_many_alike, weight_of_alike
 from fitting.model_fit import N_RANGE
 from fitting.pixels import Tile
+from fitting.problem import state_problem
 from fitting.result import Cause, FitResult
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import search
@@ -71,6 +73,8 @@ BLOCK = 16
 # Pixels on a side that are looked at, if it were one picture, the same under lights of many samples, and at least of
 # each picture.
 MOST_PIXELS, MOST_SAMPLED, FEWEST_PIXELS = 256, 96, 48
+# Of a ball's radius what is looked at where its circle may be far off, and the share that such a cause explains.
+INNER, LEAST_INNER = 0.8, 0.6
 # So many pixels from the outline a small step of the circle makes no small change.
 RIM = 1.5
 # Light samples, unless fewer, as the scene says, leave less: what these leave out has a shape too.
@@ -108,6 +112,28 @@ class _Test(NamedTuple):
 
 def diagnose(result: FitResult) -> tuple[Cause, ...]:
     """Causes of the structure in a residual, likeliest first; none where none explains a good part of it."""
+    found, balls = _causes(result), [_ball(scene) for scene in result.scenes]
+    if found or None in balls or not any("structure" in words for words in result.warnings):
+        return found
+    # Pixels beside a ball whose circle is far off lead the fit astray: without what is near its outline.
+    masks = []
+    for ball, scene, counted in zip(balls, result.scenes, result.counted, strict=True):
+        smaller = dataclasses.replace(ball, radius=ball.radius * INNER)
+        masks.append(counted & np.asarray(dataclasses.replace(scene, shapes=(smaller,)).surface_points().mask))
+    problem = state_problem(list(result.targets), list(result.scenes), masks, model=type(result.material).name)
+    try:
+        found = _causes(dataclasses.replace(fit_pictures(problem), files=result.files))
+    except InputError:  # next to nothing is left
+        return ()
+    return tuple(cause for cause in found if cause.share > LEAST_INNER)
+
+
+def _ball(scene: brdf.Scene) -> Any:
+    """The sphere that is all of a scene's shapes; None where it is not."""
+    return scene.shapes[0] if len(scene.shapes) == 1 and isinstance(scene.shapes[0], brdf.Sphere) else None
+
+
+def _causes(result: FitResult) -> tuple[Cause, ...]:
     with working_precision("float64"):
         residual = Residual(result)
         if 1 < _most_samples(result) < SAMPLES:
@@ -154,9 +180,8 @@ class _Picture:
         several = max(len(scene.lights) for scene in result.scenes) > 1
         one_of = f" of picture {index}" if len(result.scenes) > 1 else ""
         self.moves: dict[str, Sequence[Any]] = {}
-        camera, shapes = self.scene.camera, self.scene.shapes
-        is_ball = len(shapes) == 1 and isinstance(shapes[0], brdf.Sphere)
-        middle = shapes[0].center if is_ball else self._middle()
+        camera, ball = self.scene.camera, _ball(self.scene)
+        middle = self._middle() if ball is None else ball.center
         for at, light in enumerate(self.scene.lights):
             which, leaf = (f" {at}" if several else "") + one_of, f"lights[{at}]"
             place = place_of(light)
@@ -169,11 +194,11 @@ class _Picture:
                 self.moves[f"distance{which}"] = [{f"{leaf}.{place}": away / 100}]
             field = "intensity" if "intensity" in vars(light) else "radiance"
             self.moves[f"intensity{which}"] = [{f"{leaf}.{field}": np.asarray(light.emittance) / 100}]
-        if camera is not None and is_ball:
+        if camera is not None and ball is not None:
             width, height = camera.resolution
             rays = camera.rays(np.array([0.0, 1.0, 0.0]) + width / 2, np.array([0.0, 0.0, 1.0]) + height / 2)
             origin, direction = (np.asarray(part.stacked(), np.float64) for part in rays)
-            far = origin + direction * np.linalg.norm(np.asarray(shapes[0].center) - np.asarray(camera.position))
+            far = origin + direction * np.linalg.norm(np.asarray(ball.center) - np.asarray(camera.position))
             pixels = far[1:] - far[0]
             self.moves["ball"] = [{"shapes[0].center": pixel} for pixel in pixels]
             self.moves["radius"] = [{"shapes[0].radius": np.linalg.norm(pixels[0])}]
