@@ -5,7 +5,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -131,11 +131,11 @@ def _growing(seen: Observed, fit: ModelFit) -> Observed | None:
     """Weighed by noise that seems to grow beside what the fit shows; None where it does not."""
 
     def of(picture: Picture) -> Shown:
-        def predicted(pixel: np.ndarray | None) -> np.ndarray:
-            some = picture if pixel is None else picture.in_double(pixel)
+        def predicted(pixel: Any) -> np.ndarray:
+            some = picture if pixel is ... else picture.in_double(pixel)
             # Behind them some of sampled lights are repeated.
             shown = np.asarray(some.predict(fit.optimum.n, fit.optimum.x), float)
-            return shown if pixel is None else shown[: pixel.size]
+            return shown if pixel is ... else shown[: pixel.size]
 
         return Shown(bounds_of(picture).spread, predicted)
 

@@ -9,7 +9,7 @@ import math
 import operator
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -65,11 +65,11 @@ class Shown(NamedTuple):
 
     Attributes:
         spread: that of its bounds, as the fit had them.
-        predicted: radiance of all pixels, or of some by their index.
+        predicted: radiance of some pixels by their index, which is ... for all.
     """
 
     spread: Float[np.ndarray, "*P_C"]
-    predicted: Callable[[Int[np.ndarray, " K"] | None], Float[np.ndarray, "P C"]]
+    predicted: Callable[[Any], Float[np.ndarray, "P C"]]
 
 
 def as_it_grows(observed: Observed, shown: Sequence[Shown], noise: float) -> Observed | None:
@@ -123,7 +123,7 @@ def as_it_grows(observed: Observed, shown: Sequence[Shown], noise: float) -> Obs
 
     def of_tile(tile: Tile, own: Bounds, one: Shown) -> Tile:
         own = own.in_light(size) if size else own
-        before = variance(own.codes(one.predicted(None))[0])
+        before = variance(own.codes(one.predicted(...))[0])
         counts = 1.0 if tile.weight is None else np.asarray(tile.weight).reshape(len(before), -1)
         weight = (counts * typical / (before + _widths(own) ** 2 / 12)).astype(tile.target.dtype)
         weight = weight[:, 0] if weight.shape[1] == 1 else weight
@@ -144,20 +144,6 @@ def _widths(bounds: Bounds) -> Float[np.ndarray, "P C"]:
     closed = bounds.ends == 2
     width = np.subtract(bounds.upper, bounds.lower, out=np.zeros(closed.shape), where=closed)
     return np.where(closed, width, np.median(width[closed]) if closed.any() else 1.0)
-
-
-class _Even(NamedTuple):
-    """A variance that does not know of the value.
-
-    Attributes:
-        size: how large.
-        tells: by how many deviations squares go with the value, all the same.
-        cost: minus twice the logarithm of the likelihood.
-    """
-
-    size: float
-    tells: float
-    cost: float
 
 
 class _Ends(NamedTuple):
@@ -185,8 +171,11 @@ class _Ends(NamedTuple):
         said = interval(self.lower - beside, self.upper + beside, self.value, deviation)
         return variance * (1 + variance * (said.score**2 - said.weight)), -2 * float(np.sum(said.value))
 
-    def even(self, shape: Float[np.ndarray, " P"], start: float) -> _Even:
-        """A variance of such a shape."""
+    def even(self, shape: Float[np.ndarray, " P"], start: float) -> tuple[float, float, float]:
+        """How large a variance of such a shape is that does not know of the value, and its cost.
+
+        Between them by how many deviations squares go with the value, all the same.
+        """
         even, squared, cost = start, shape, 0.0
         for _ in range(FEW_EXPECTATIONS):
             squared, cost = self.expected(even * shape)
@@ -195,7 +184,7 @@ class _Ends(NamedTuple):
                 break
         varies = self.value.size > 1 and np.ptp(self.value) > 0
         tells = np.corrcoef(squared / shape, self.value)[0, 1] if varies else 0.0
-        return _Even(even, abs(float(tells)) * math.sqrt(self.value.size), cost)
+        return even, abs(float(tells)) * math.sqrt(self.value.size), cost
 
     def growing(self, start: float) -> tuple[Float[np.ndarray, " 3"], float]:
         """Coefficients of a variance that grows with the value, and its cost."""
@@ -229,9 +218,10 @@ def _growth(channels: Sequence[_Ends], start: float) -> Float[np.ndarray, "C 3"]
     curved = any(np.ptp(channel.width) > SAME_STEP * np.max(channel.width) for channel in channels)
     light = [channel.even(channel.width**0, start) for channel in channels]
     codes = [channel.even(channel.width**2, start) for channel in channels] if curved else light
-    light_does, codes_do = (max(one.tells for one in both) < CHANCE for both in (light, codes))
+    light_does, codes_do = (max(tells for _, tells, _ in both) < CHANCE for both in (light, codes))
     if light_does:
         return None
-    grows, cost = zip(*(channel.growing(even.size) for channel, even in zip(channels, codes, strict=True)), strict=True)
+    starts = [size for size, *_ in codes]
+    grows, cost = zip(*map(_Ends.growing, channels, starts), strict=True)
     # Noise that grows in light is nearly even in codes of a curve.
-    return None if codes_do and sum(cost) > sum(one.cost for one in codes) - RISE else np.array(grows)
+    return None if codes_do and sum(cost) > sum(even for *_, even in codes) - RISE else np.array(grows)

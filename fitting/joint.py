@@ -26,7 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 import brdf
 from brdf.errors import InputError
@@ -354,17 +354,13 @@ def _step(
     return base, step, float(step @ gram @ step)
 
 
-class _Minimum(NamedTuple):
-    """Where a search ended: the problem there, after how many steps, whether it converged, and by which solver."""
+def _minimum(
+    problem: JointProblem, brightest: float, solver: str | None, tolerance: float, max_steps: int
+) -> tuple[JointProblem, dict[str, Any]]:
+    """The least sum of squares that is found from a start: the problem there, and what a result says of the search.
 
-    problem: JointProblem
-    steps: int
-    converged: bool
-    solver: str
-
-
-def _minimum(problem: JointProblem, brightest: float, solver: str | None, tolerance: float, max_steps: int) -> _Minimum:
-    """The least sum of squares that is found from a start; ``brightest`` is the pictures' largest value."""
+    ``brightest`` is the pictures' largest value.
+    """
     vector = problem.start()
     # Gauss and Newton's steps lead to the minimum from most starts, and compile half as much as a solver.
     whole = solver is None or all(leaf.name in EMITTANCES for leaf in problem.freed)
@@ -430,7 +426,7 @@ def _minimum(problem: JointProblem, brightest: float, solver: str | None, tolera
         steps += int(solution.stats["num_steps"])
         near, stepped = solution.result == optx.RESULTS.successful, False
         vector = jnp.where(held, vector, solution.value)
-    return _Minimum(best, steps, converged, "gauss-newton" if whole else solver)
+    return best, {"steps": steps, "converged": converged, "solver": "gauss-newton" if whole else solver}
 
 
 def _solve(
@@ -441,8 +437,8 @@ def _solve(
     max_steps: int,
     widening: float,
 ) -> _Solved:
-    found = _minimum(problem, float(np.max(observed.brightest)), solver, tolerance, max_steps)
-    problem, bounded = found.problem, problem.each(lambda leaf: leaf.bounded)
+    problem, search = _minimum(problem, float(np.max(observed.brightest)), solver, tolerance, max_steps)
+    bounded = problem.each(lambda leaf: leaf.bounded)
     vector = np.asarray(problem.start(), np.float64)
     held = bounded & (vector == 0)
     residual, columns = (np.asarray(a, np.float64) for a in linearised(problem, problem.start()))
@@ -474,12 +470,13 @@ def _solve(
     parameters, correlation = _parameters(problem, given, information, held)
     errors = [[one.error for one in parameters if one.name == leaf.words] for leaf in problem.freed]
     shapes = [() if leaf.is_direction else problem.leaves[leaf.position].shape for leaf in problem.freed]
-    remedy = "raise max_steps of fit_jointly" if found.steps >= max_steps else "start nearer, or free fewer numbers"
-    warnings = () if found.converged else (f"the solver stopped after {found.steps} steps without an end: {remedy}",)
+    steps = search["steps"]
+    remedy = "raise max_steps of fit_jointly" if steps >= max_steps else "start nearer, or free fewer numbers"
+    warnings = () if search["converged"] else (f"the solver stopped after {steps} steps without an end: {remedy}",)
     if neighbours.significant:
         warnings += (f"{structure_words(neighbours.correlation)}: the errors are too small",)
     result = JointResult(
-        **observed.result_fields() | {"scenes": scenes},
+        **observed.result_fields() | {"scenes": scenes} | search,
         material=material,
         parameters=parameters,
         correlation=correlation,
@@ -490,12 +487,9 @@ def _solve(
         warnings=warnings,
         values=tuple(np.asarray(problem.leaves[leaf.position]) for leaf in problem.freed),
         errors=tuple(np.array(own, float).reshape(shape) for own, shape in zip(errors, shapes, strict=True)),
-        steps=found.steps,
-        converged=found.converged,
-        solver=found.solver,
     )
     bounds = (tile.bounds for tile in observed.tiles if tile.bounds is not None)
-    shown = [Shown(own.spread, partial(_of_pixels, one)) for own, one in zip(bounds, information.shown, strict=False)]
+    shown = [Shown(own.spread, one.__getitem__) for own, one in zip(bounds, information.shown, strict=False)]
     return _Solved(result, information, shown, neighbours)
 
 
@@ -525,11 +519,6 @@ def _err_together(
         grids.append(of_coded_blocks(errors) if lossy else over_blocks(errors, SIZES[0]))
     beyond = structure(grids, CODED_SIZES if lossy else SIZES).significant
     return beyond or bool(neighbours and not lossy and np.any(tell))
-
-
-def _of_pixels(values: Float[np.ndarray, "P C"], pixel: Int[np.ndarray, " K"] | None) -> Float[np.ndarray, "K C"]:
-    """Those of some pixels, or all."""
-    return values if pixel is None else values[pixel]
 
 
 def _parameters(
