@@ -179,7 +179,7 @@ class TexelFit(NamedTuple):
     step: list[Array]
     error: list[Array]
     cost: Array
-    gain: Array
+    gain: Any
 
 
 class Texels(eqx.Module):
@@ -282,14 +282,14 @@ class Texels(eqx.Module):
         n = jnp.exp(log_n)[:, None]
         return [*self.linear, *([self.lobe(self.model.scale(n) * self.power(n))] if self.glossy else [])]
 
-    def residual(self, fit: "TexelFit | Minimum") -> Components:
+    def residual(self, fit: TexelFit) -> Components:
         """What a fit leaves of the photographs."""
         explained = (column * beside(x) for x, column in zip(fit.k, self.columns(fit.log_n), strict=True))
         return functools.reduce(operator.sub, explained, self.values)
 
     # -- normals given -------------------------------------------------------------------------------------------------
 
-    def searched(self) -> tuple["Profile", "Minimum"]:
+    def searched(self) -> tuple["Profile", TexelFit]:
         """The grid of n, and the best material of each texel: from its highest peak, of a few from the second too."""
         profile = self.profile()
         found = self.climbed(profile.brackets[0])
@@ -300,14 +300,18 @@ class Texels(eqx.Module):
 
         return profile, of_few(rivals(profile.heights, found.cost), found, better)
 
-    def climbed(self, bracket: Array) -> "Minimum":
+    def climbed(self, bracket: Array) -> TexelFit:
         """Where Gauss-Newton ends in brackets of log n, (3, T)."""
 
         def step(_, bracket):
             point = self.evaluated(bracket[0], self.by_log_n(bracket[0]), errors=False)
             return narrowed(bracket, point.slope[0], point.step[0])
 
-        return Minimum.at(self, jax.lax.fori_loop(0, STEPS, step, bracket)[0] if self.glossy else bracket[0])
+        return self.minimum(jax.lax.fori_loop(0, STEPS, step, bracket)[0] if self.glossy else bracket[0])
+
+    def minimum(self, log_n: Array) -> TexelFit:
+        """The best coefficients for a given n and their cost; of the others nothing."""
+        return self.at(log_n, errors=False, n_known=True)._replace(k_error=[], gain=None)
 
     def at(self, log_n: Array, *, errors: bool = True, n_known: bool = False) -> TexelFit:
         """The best coefficients for a given n; their errors allow for that of n, unless n is sure."""
@@ -478,32 +482,12 @@ class Profile(NamedTuple):
         return [functools.reduce(jnp.maximum, one) for one in apart]
 
 
-class Minimum(NamedTuple):
-    """What a search ends at.
-
-    Attributes:
-        k: as of `TexelFit`.
-        log_n: (T,).
-        cost: sum of squared residuals, (T,).
-    """
-
-    k: list[Array]
-    log_n: Array
-    cost: Array
-
-    @classmethod
-    def at(cls, texels: Texels, log_n: Array) -> "Minimum":
-        """With the best coefficients for a given n."""
-        fit = texels.at(log_n, errors=False, n_known=True)
-        return cls(fit.k, log_n, fit.cost)
-
-
 class Trial(NamedTuple):
     """A fit of some of the values, and what it is judged by.
 
     Attributes:
         profile: where its search started.
-        found: the minimum.
+        found: the minimum, see `Texels.minimum`.
         counts: 1 where a value counts, (P, T).
         cost: of it and of what it leaves out, which counts as outliers with the least residual of such, (T,).
         freedom: of it, (T,).
@@ -511,14 +495,14 @@ class Trial(NamedTuple):
     """
 
     profile: Profile
-    found: Minimum
+    found: TexelFit
     counts: Array
     cost: Array
     freedom: Array
     normal: Components | None = None
 
     @classmethod
-    def of(cls, texels: Texels, profile: Profile, found: Minimum, counts: Array, normal: Any = None) -> "Trial":
+    def of(cls, texels: Texels, profile: Profile, found: TexelFit, counts: Array, normal: Any = None) -> "Trial":
         """Where some of the values that are seen count."""
         many, left_out = sums_of(counts, texels.seen - counts)
         freedom = len(texels.shown) * (many - len(found.k) + texels.glossy) - texels.of_lobe
@@ -671,7 +655,7 @@ def with_normals(texels: Texels, lights: Distant) -> tuple[TexelFit, Profile, Co
             i < count, lambda *same: same, lambda log_n, normal, _: jointly(some, lights, log_n, normal), *start
         )
         there, facing = texels.facing(normal, lights), lit(normal)
-        fit = Minimum.at(there.where(facing * counts), log_n)
+        fit = there.where(facing * counts).minimum(log_n)
         residual = there.residual(fit)
         direct = over_channels(there.values - residual)
         if lights.ambient is not None:
