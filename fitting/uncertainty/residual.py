@@ -215,18 +215,12 @@ def _over_blocks(residual: list[Any], lobe: Any, width: int) -> list[Any]:
     xp: Any = np if isinstance(lobe, np.ndarray) else jnp
     terms = [term for error in residual for term in (error, error * error, (error != 0).astype(error.dtype))]
     terms += [xp.broadcast_to(one, residual[0].shape) for one in (lobe * lobe, lobe)]
-    size, (step, pixels) = SIZES[0], residual[0].shape
-    rows = pixels // width
-    down, across = -(-rows // size), -(-width // size)
+    size, step = SIZES[0], len(residual[0])
 
     def blocked(term: Any) -> Any:
-        image = term.reshape(step, rows, width)
-        if xp is jnp:
-            whole = jnp.pad(image, [(0, 0), (0, down * size - rows), (0, across * size - width)])
-        else:  # np.pad takes three times as long
-            whole = np.zeros((step, down * size, across * size), term.dtype)
-            whole[:, :rows, :width] = image
-        return whole.reshape(step, down, size, across, size)
+        image = term.reshape(step, -1, width)
+        whole = xp.pad(image, [(0, 0), (0, -image.shape[1] % size), (0, -width % size)])
+        return whole.reshape(step, whole.shape[1] // size, size, -1, size)
 
     return totals(list(map(blocked, terms)), [*["add"] * (len(terms) - 1), "maximum"], (2, 4))
 
