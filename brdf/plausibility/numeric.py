@@ -29,6 +29,7 @@ from brdf.albedo import gauss_legendre
 from brdf.channels import in_channel
 from brdf.errors import InputError
 from brdf.measured.table import from_angles
+from brdf.models import Material
 from brdf.plausibility.report import (
     ENERGY_LIMIT,
     GRAZING,
@@ -63,15 +64,16 @@ _NODES = 5
 _QUARTERS = np.array([(0, 0), (0, 1), (1, 0), (1, 1)])
 
 
-def check_black_box(f_r: BRDF, subject: str) -> Report:
+def check_black_box(brdf: BRDF | Material, subject: str) -> Report:
     """Test positivity, reciprocity and energy conservation of any BRDF; see the module for how.
 
     Args:
-        f_r: f_r(to_light, to_view) -> (C,), in 1/sr, of unit vectors in the local frame whose +z axis is the normal.
-            It is traced by JAX, or refused, and evaluated in float64 where it lets itself be.
+        brdf: f_r(to_light, to_view) -> (C,), in 1/sr, of unit vectors in the local frame whose +z axis is the normal;
+            or a material, which has such. It is traced by JAX, or refused, and evaluated in float64 where it lets
+            itself be.
         subject: what to call it in the report.
     """
-    scan = _Scan(f_r)
+    scan = _Scan(brdf)
     findings = _positivity(scan), _reciprocity(scan), _energy(scan)
     if scan.sample.not_finite is not None:
         light, view = map(Angles.of, scan.sample.not_finite)
@@ -81,9 +83,9 @@ def check_black_box(f_r: BRDF, subject: str) -> Report:
     return Report(subject, *findings, nearest=None)
 
 
-def albedo_of(f_r: BRDF, polar: Float[np.ndarray, " K"]) -> Float[np.ndarray, "K C"]:
+def albedo_of(brdf: BRDF | Material, polar: Float[np.ndarray, " K"]) -> Float[np.ndarray, "K C"]:
     """Albedo of any BRDF, (K, C), for lights at angles in degrees, (K,), in the plane of azimuth 0, to about 1e-4."""
-    return _albedos(_Scan(f_r), from_angles(np.radians(polar), 0.0))[0]
+    return _albedos(_Scan(brdf), from_angles(np.radians(polar), 0.0))[0]
 
 
 # -- values of f_r, and a first look at them everywhere ----------------------------------------------------------------
@@ -115,12 +117,13 @@ class Sampler:
         not_finite: light and view for which a value was not finite, once there was one.
     """
 
-    def __init__(self, f_r: BRDF):
+    def __init__(self, brdf: BRDF | Material):
         """Find out how many channels f_r(to_light, to_view) has: of two vectors (3,) it gives (C,) or a scalar.
 
         Raises:
             InputError: it cannot be traced by JAX, or returns something else.
         """
+        f_r: Any = getattr(brdf, "reflectance", brdf)
         self._batch = jax.jit(jax.vmap(lambda pair: jnp.atleast_1d(f_r(*pair))))
         with jax.enable_x64(True):
             try:
@@ -163,8 +166,8 @@ class _Scan:
         bright: the brightest pairs, moved to where it is brightest around them.
     """
 
-    def __init__(self, f_r: BRDF):
-        self.sample, self.random = Sampler(f_r), np.random.default_rng(20)
+    def __init__(self, brdf: BRDF | Material):
+        self.sample, self.random = Sampler(brdf), np.random.default_rng(20)
         light, view = (self.random.permutation(_fibonacci(2**16)) for _ in range(2))
         self.scale = float(np.mean(np.abs(self.seen(light, view))))
         fixed, grid = from_angles(_FIXED, _TURN * np.arange(len(_FIXED))), _fibonacci(_GRID)

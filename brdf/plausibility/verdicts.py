@@ -38,7 +38,7 @@ def check(brdf: Material | MeasuredBRDF | Callable[[Any, Any], Any], *, name: st
         check_single(brdf, "Write brdf.check(material)")
         if type(brdf) in KNOWN:
             return check_material(brdf, name or repr(brdf))
-        return check_black_box(brdf.reflectance, name or repr(brdf))
+        return check_black_box(brdf, name or repr(brdf))
     if isinstance(brdf, MeasuredBRDF):
         return check_table(brdf, name)
     if isinstance(brdf, type) or not callable(brdf):

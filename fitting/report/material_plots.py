@@ -73,7 +73,7 @@ def plot_albedo(brdf: Brdf, report: Report | None = None, figure: Any = None) ->
         albedo = np.asarray(directional_albedo(brdf, np.radians(degrees), precision="float64"))
     else:
         degrees = np.array([*np.arange(0.0, 89.0, 2.0), *last])
-        albedo = albedo_of(_f_r(brdf), degrees)
+        albedo = albedo_of(brdf, degrees)
     count, shown = albedo.shape[1], shown_channels(albedo.shape[1])
     figure, axes = _axes(figure, (6, 4))
     axes.axhspan(1, 2, color="0.92", zorder=0)
@@ -108,7 +108,7 @@ def plot_lobe(brdf: Brdf, angles: tuple[float, ...] = (0.0, 30.0, 60.0), channel
     Example:
         >>> fitting.plot_lobe(brdf.preset("gold"), angles=(0, 45)).savefig("lobe.png")
     """
-    sample = _sampler(brdf)
+    sample = Sampler(brdf)
     figure, axes = _axes(figure, (6, 4), projection="polar")
     axes.set_prop_cycle(OTHERS)
     apart = np.geomspace(1e-3, 60, 400)  # denser near the mirror direction, where narrow lobes are
@@ -142,7 +142,7 @@ def plot_reciprocity(brdf: Brdf, channel: int = 0, figure: Any = None) -> Any:
     Example:
         >>> fitting.plot_reciprocity(brdf.preset("gold")).savefig("reciprocity.png")
     """
-    sample = _sampler(brdf)
+    sample = Sampler(brdf)
     angles = np.linspace(0, 89.5, 180)
     to_light, to_view = from_angles(np.radians(np.meshgrid(angles, -angles, indexing="ij")).reshape(2, -1), 0.0)
     there, back = sample(to_light, to_view)[:, channel], sample(to_view, to_light)[:, channel]
@@ -162,14 +162,6 @@ def _axes(figure, size, **how):
     """A figure, of some size where there is none yet, and axes that fill it."""
     figure = figure or Figure(figsize=size, layout="constrained")
     return figure, figure.add_subplot(**how)
-
-
-def _sampler(brdf):
-    return Sampler(_f_r(brdf))
-
-
-def _f_r(brdf):
-    return brdf.reflectance if isinstance(brdf, Material) else brdf
 
 
 @matplotlib.rc_context(PRINT)
