@@ -101,11 +101,12 @@ def most_likely(
     if not lossy:
         fit, noise = _where_noise_is_even(fit, noise)
     # Weights of least squares leave out what is clipped, which says something here.
-    weights = [
-        weight_of_alike(alike(bounds_of(picture), _codes(picture, optimum)), noise) if lossy else None
-        for picture in fit.pictures
-    ]
-    pictures = list(map(_with_weight, fit.pictures, weights))
+    pictures = [dataclasses.replace(picture, weight=None) for picture in fit.pictures]
+    if lossy:
+        pictures = [
+            dataclasses.replace(one, weight=weight_of_alike(alike(bounds_of(one), _codes(one, optimum)), noise))
+            for one in pictures
+        ]
     rounding = 0.0 if exact else 1 / 12
     # Of floats the distance of two ends grows with brightness.
     widest = 1.0 if exact else max(float(np.max(bounds_of(thinned(one)).widths, initial=0.0)) for one in pictures)
@@ -171,10 +172,6 @@ def _evener_in_light(problem: "_Separable", at: Estimate, least: float) -> Estim
     start = Estimate(at.unknowns, max(at.noise, FIRST_NOISE))
     even, *_ = maximise(_Separable(light, problem.design, problem.n_range, problem.copies), start, ROUGHLY_KNOWN, least)
     return even if even.value > at.value + LIKELIER else None
-
-
-def _with_weight(picture: Picture, weight: AnyArray | None) -> Picture:
-    return dataclasses.replace(picture, weight=weight)
 
 
 def _near_edges(fit: ModelFit, at: Estimate, rival: float = -math.inf) -> Evidence:
@@ -282,7 +279,7 @@ def _reweighted(
             return _together([part.picture for part in parts], optimum, noise, places, precision)
     scale = 1 / noise**2
     working, completed = (
-        [_with_weight(picture, picture.weights * scale) for picture in both]
+        [dataclasses.replace(picture, weight=picture.weights * scale) for picture in both]
         for both in zip(*((part.picture, part.completed) for part in parts), strict=True)
     )
     sums = {name: getattr(optimum, name) * scale for name in ("cost", "gram", "product", "square")}

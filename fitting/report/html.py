@@ -23,7 +23,8 @@ from fitting.result import NOT_DETERMINED, FitResult
 def result_html(result: FitResult) -> str:
     """What Jupyter shows of a fit: the material, value, error and 95 % interval of each number, and the warnings."""
     summary = f"residual {100 * result.residual:.3g} % of the picture, {result.pixels} pixels, {result.seconds:.2g} s"
-    return f"{_material(result)}<p>{summary}, {result.precision}</p>{_numbers(result)}{_warnings(result)}"
+    material = material_html(result.material, result.undetermined)
+    return f"{material}<p>{summary}, {result.precision}</p>{_numbers(result)}{_warnings(result)}"
 
 
 def report_page(result: FitResult, *, source: str = "", command: str = "") -> str:
@@ -49,7 +50,7 @@ def report_page(result: FitResult, *, source: str = "", command: str = "") -> st
     made = "".join(f"<dt>{name}</dt><dd>{escape(words)}</dd>" for name, words in made.items() if words)
     alternative = "target, fit, residual, the highlight enlarged, a scanline through it, and the profile of n"
     body = f"""<h1>{escape(title)}</h1>
-{_material(result)}
+{material_html(result.material, result.undetermined)}
 <p>{escape(summary)}</p>
 {_warnings(result)}
 <h2>The surface, to turn</h2>
@@ -65,10 +66,6 @@ def report_page(result: FitResult, *, source: str = "", command: str = "") -> st
 <dl>{made}</dl>
 <pre class="wide">{escape(str(result))}</pre>"""
     return secure_page(title, body, "viewer.js")
-
-
-def _material(result):
-    return material_html(result.material, result.undetermined)
 
 
 def _numbers(result):
