@@ -167,6 +167,12 @@ def divide(numerator: ArrayLike, denominator: ArrayLike) -> Array:
     return jnp.where(positive, jnp.asarray(numerator) / jnp.where(positive, denominator, 1.0), 0.0)
 
 
+def quotient(numerator: Any, denominator: Any, otherwise: float = 0.0) -> Any:
+    """In NumPy numerator / denominator where that is positive, else another number."""
+    shape = np.broadcast_shapes(np.shape(numerator), np.shape(denominator))
+    return np.divide(numerator, denominator, out=np.full(shape, otherwise), where=denominator > 0)
+
+
 def square_root(x: ArrayLike) -> Array:
     """Square root where x is positive (above 1e-18 in float32, 1e-153 in float64), else 0."""
     x = _floating(x)

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from brdf.vectors import quotient
 from fitting.model_fit import ModelFit
 from fitting.solver.nnls import nonnegative_minimum
 from fitting.solver.normal_equations import Picture, sums
@@ -162,5 +163,5 @@ def each_alone(
     """
     weight = np.broadcast_to(np.asarray(picture.weights, np.float64), left.shape)
     own = weight * np.diag(precision)
-    step = np.divide(np.sqrt(weight) * (left @ precision), own, out=np.zeros_like(own), where=own > 0)
+    step = quotient(np.sqrt(weight) * (left @ precision), own)
     return dataclasses.replace(picture, target=picture.predict(optimum.n, optimum.x) + step, weight=own)

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from brdf.vectors import quotient
 from fitting.likelihood import Bounds, LogLikelihood, Values, alike, weight_of_alike
 from fitting.solver.nnls import nonnegative_minimum
 
@@ -319,11 +320,10 @@ def precision(problem: Problem, at: Estimate, score: Score) -> Precision:
     influence, information = root @ root.T, float(np.sum(np.log(value)) + 2 * np.sum(np.log(scale)))
     # In units of its own error, or squares overflow where next to nothing tells.
     own = np.sqrt(np.diag(influence))
-    relative = influence / np.where(own > 0, own, 1.0)[:, None]
+    relative = quotient(influence, own[:, None])
     total = np.einsum("uv,vw,uw->u", relative, score.hessian, relative)
     squares = problem.squared_shares(score, relative)
-    count = np.divide(total**2, squares, out=np.zeros_like(total), where=squares > 0)
-    return Precision(at.noise, information, np.diag(influence), count)
+    return Precision(at.noise, information, np.diag(influence), quotient(total**2, squares))
 
 
 def most_informative(precisions: Sequence[Precision]) -> Precision:

@@ -28,6 +28,7 @@ from brdf.images.encoding import encode
 from brdf.lobes import Near
 from brdf.precision import working_precision
 from brdf.rendering import basis_columns
+from brdf.vectors import quotient
 from fitting.budget.sampling import sample_counts, with_samples
 from fitting.core import fit_pictures, picture_of, within_sight
 from fitting.joint_problem import JointProblem, joint_problem, place_of, scene_leaves, turns
@@ -335,8 +336,7 @@ class Residual:
     def _material(self) -> tuple[Float[np.ndarray, "C P 4"], Float[np.ndarray, "C 4 P"]]:
         """What the coefficients of each channel, and the exponent, move; and the inverse of that."""
         moved = np.moveaxis(self._flat([picture.material_slopes() for picture in self.pictures]), 0, -1)
-        size = np.linalg.norm(moved, axis=1, keepdims=True)
-        moved /= np.where(size > 0, size, 1.0)
+        moved = quotient(moved, np.linalg.norm(moved, axis=1, keepdims=True))
         return moved, np.linalg.pinv(moved, rcond=1e-6)
 
     @property

@@ -32,6 +32,7 @@ import brdf
 from brdf.errors import InputError
 from brdf.images.encoding import Encoding
 from brdf.precision import Precision, working_precision
+from brdf.vectors import quotient
 from fitting.codes import Rounding
 from fitting.core import fit_pictures
 from fitting.growing_noise import Shown, as_it_grows, likeliest
@@ -557,7 +558,7 @@ def _parameters(
     error = np.sqrt(np.diag(covariance)[places])
     at = np.array(places, int)
     both, unit = (at >= 0)[:, None] & (at >= 0), np.outer(error, error)
-    correlation = np.divide(covariance[np.ix_(at, at)], unit, out=np.zeros_like(unit), where=both & (unit > 0))
+    correlation = np.where(both, quotient(covariance[np.ix_(at, at)], unit), 0.0)
     np.fill_diagonal(correlation, 1.0)
     return tuple(found), correlation
 

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from brdf.vectors import quotient
 from fitting.channel_errors import can_be_coupled, coupled, each_alone, improved, precision_of, replaced, residuals
 from fitting.continuation import (
     ENOUGH_KNOWN,
@@ -362,8 +363,7 @@ def _working_picture(
         target, weight, expected, full = (np.array(part) for part in (target, weight) * 2)
         pixel, channel = np.nonzero(at_end)
         place, own, information = (index[pixel], channel), s * spread, curvature * slope**2
-        step = np.divide(score * slope, information, out=np.zeros_like(information), where=information > 0)
-        target[place], weight[place] = radiance + step, weighs * information * noise**2
+        target[place], weight[place] = radiance + quotient(score * slope, information), weighs * information * noise**2
         expected[place], full[place] = radiance + score * own**2 / slope, weighs * (slope / spread) ** 2
         # Mean square of what the value may have been, about the prediction.
         square = ((score * own) ** 2 + 1 - curvature * own**2) * noise**2
@@ -445,8 +445,8 @@ def _values(picture: Picture, which: Bool[np.ndarray, " P"] | None = None) -> Va
 
 def _newton_picture(score: PictureScore) -> Picture:
     """Targets and weights with which least squares takes Newton's step."""
-    step = np.divide(score.score, score.weight, out=np.zeros_like(score.radiance), where=score.weight > 0)
-    return dataclasses.replace(score.values.picture, target=score.radiance + step, weight=score.weight, bounds=None)
+    target = score.radiance + quotient(score.score, score.weight)
+    return dataclasses.replace(score.values.picture, target=target, weight=score.weight, bounds=None)
 
 
 def _near(picture: Picture, at: Numbers | Optimum, distance: float) -> Bool[np.ndarray, " P"]:

@@ -20,6 +20,7 @@ import brdf
 from brdf.checks import instance
 from brdf.errors import InputError
 from brdf.precision import Precision
+from brdf.vectors import quotient
 from fitting.joint import fit_jointly
 from fitting.problem import model_name, state_problem
 from fitting.report import FitResult
@@ -157,8 +158,7 @@ def fit_lights_and_material(
     free = ["intensity"][: count - 1]
     joint = fit_jointly(targets, _with_emittances(scene, start), name, free, mask=mask)
     lit, now = before[:count] > 0, _emittances(joint.scenes[0], channels)[:count]
-    factors = np.divide(now, before[:count], out=np.zeros_like(now), where=lit)
-    mean = factors.sum(axis=0) / np.maximum(lit.sum(axis=0), 1)
+    mean = quotient(now, before[:count]).sum(axis=0) / np.maximum(lit.sum(axis=0), 1)
     scale = np.where(mean > 0, mean, 1.0)
     k = {key: value * scale if key in ("k_d", "k_s") else value for key, value in vars(joint.material).items()}
     material = dataclasses.replace(joint.material, **k)

@@ -30,7 +30,7 @@ from brdf.checks import LARGEST, Scalar, instance
 from brdf.errors import InputError
 from brdf.files import continued_lines, parse_number, read_text
 from brdf.geometry.shapes import Hit, Shape, meet_plane
-from brdf.vectors import Components, normalize
+from brdf.vectors import Components, normalize, quotient
 
 CREASE = np.radians(30.0)
 """Faces that meet at this angle or more meet in an edge, not in a rounding."""
@@ -74,7 +74,7 @@ class Mesh:
             raise InputError("normals", what, "Give one for each corner of each face")
         length = np.linalg.norm(normals, axis=-1, keepdims=True)
         front = self.front[:, None, :]
-        normals = np.where(length > 0, normals / np.where(length > 0, length, 1.0), front)
+        normals = np.where(length > 0, quotient(normals, length), front)
         towards = np.sum(normals * front, axis=-1)
         if not np.all(np.isfinite(towards)):
             raise InputError("normals", "must be finite", "Export the mesh again, or load it with smooth = false")
@@ -89,7 +89,7 @@ class Mesh:
         a, b, c = np.moveaxis(self.vertices[self.faces], 1, 0)
         area = np.cross(b - a, c - a)
         length = np.linalg.norm(area, axis=-1, keepdims=True)
-        return np.divide(area, length, out=np.zeros_like(area), where=length > 0)
+        return quotient(area, length)
 
     def __repr__(self) -> str:
         """Its name, size and place."""

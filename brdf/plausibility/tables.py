@@ -13,6 +13,7 @@ import numpy as np
 from brdf.measured.table import MeasuredBRDF, from_angles, to_angles
 from brdf.plausibility.numeric import MIRRORED, integrate
 from brdf.plausibility.report import ENERGY_LIMIT, Angles, Finding, Report, judged, largest
+from brdf.vectors import quotient
 
 # Samples whose angles agree within this many radians are one direction: half a degree.
 CELL = math.radians(0.5)
@@ -68,8 +69,7 @@ def _pairs(samples: MeasuredBRDF, *, exchanged: bool) -> tuple[np.ndarray, np.nd
         apart = np.abs(a - b if exchanged else turn) > CELL
         first = np.flatnonzero(apart & (partner >= 0) & (partner != np.arange(len(partner))))
         values, repeated = values[first], values[partner[first]]
-    size = 0.5 * (np.abs(values) + np.abs(repeated))
-    return first, np.abs(values - repeated) / np.where(size > 0, size, 1.0)
+    return first, quotient(np.abs(values - repeated), 0.5 * (np.abs(values) + np.abs(repeated)))
 
 
 def _positivity(table: MeasuredBRDF, noise: float) -> Finding:

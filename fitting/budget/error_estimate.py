@@ -24,6 +24,7 @@ from jaxtyping import Float
 
 import brdf
 from brdf.precision import working_precision
+from brdf.vectors import quotient
 from fitting.budget.choice import Attempt
 from fitting.budget.configurations import Run
 from fitting.budget.sampling import PixelSample, sample_pixels
@@ -182,4 +183,4 @@ def _by_least_squares(run: Run, probes: Probes) -> float:
     # All that is lit evenly is ambient light.
     off = np.maximum(every, even * (np.arange(len(probes.known)) < channels))
     size = np.sqrt(np.diag(probes.hessian) / np.sum(probes.weight))
-    return float(probes.error(np.divide(off, size, out=np.zeros_like(size), where=size > 0)))
+    return float(probes.error(quotient(off, size)))

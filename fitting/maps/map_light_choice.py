@@ -9,7 +9,7 @@ import numpy as np
 import brdf
 from brdf.errors import InputError
 from brdf.models.base import SpecularMaterial
-from brdf.vectors import Components
+from brdf.vectors import Components, quotient
 from fitting.light_choice import LightChoice, choose_lights, direction_of
 from fitting.maps.texels import Distant, columns_of
 
@@ -57,17 +57,14 @@ def next_light(maps: "Maps", candidates: Any, count: int, of: str) -> LightChoic
     def left_by(information: np.ndarray) -> np.ndarray:
         """Of the information on ln n, what k_d and k_s leave."""
         dd, ds, dx, ss, sx, xx = information
-        ss, sx, xx = ss - divided(ds * ds, dd), sx - divided(ds * dx, dd), xx - divided(dx * dx, dd)
-        return np.maximum(xx - divided(sx * sx, ss), np.finfo(float).tiny)
+        ss, sx, xx = ss - quotient(ds * ds, dd), sx - quotient(ds * dx, dd), xx - quotient(dx * dx, dd)
+        return np.maximum(xx - quotient(sx * sx, ss), np.finfo(float).tiny)
 
     def error(information: np.ndarray) -> float:
         errors = 1 / np.sqrt(strength * left_by(information))
         return float(
             np.median(errors) if of == "n" else np.count_nonzero(errors > MOST_ERROR) * shows.sum() / texel.size
         )
-
-    def divided(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return np.divide(a, b, out=np.zeros_like(a), where=b > 0)
 
     shining = np.ones(len(maps.to_light)) if maps.intensity is None else maps.intensity
     known = tuple(map(brdf.DirectionalLight, maps.to_light, shining))

@@ -13,6 +13,7 @@ import brdf
 from brdf.errors import InputError
 from brdf.models.base import SpecularMaterial
 from brdf.precision import working_precision
+from brdf.vectors import quotient
 from fitting.maps.map_bands import fit_bands
 from fitting.maps.texels import STEPS, grid, narrowed, peaks, per_deviation, rivals
 from fitting.maps.tiles import MapProblem
@@ -62,7 +63,7 @@ def with_shared_n(problem: MapProblem, labels: Int[np.ndarray, "H W"]) -> MapPro
         """Log n of a bracket, and the sums there: curvature, cost, degrees of freedom and squares of what is shown."""
         for _ in range(STEPS):
             slope, curvature, *_ = added(of_each("slope", bracket[0]))
-            bracket = narrowed(bracket, slope, np.divide(slope, curvature, out=0 * slope, where=curvature > 0))
+            bracket = narrowed(bracket, slope, quotient(slope, curvature))
         return np.stack([bracket[0], *added(of_each("slope", bracket[0]))[1:]])
 
     with working_precision("float64"):
@@ -79,7 +80,7 @@ def with_shared_n(problem: MapProblem, labels: Int[np.ndarray, "H W"]) -> MapPro
         freedom = np.maximum(freedom, 1)
         tiny = np.finfo(float).tiny
         variance = np.maximum(cost / freedom, tiny) * (student_95(freedom) / NORMAL_95) ** 2
-        error = np.sqrt(np.divide(variance, curvature, out=np.full_like(variance, np.inf), where=curvature > 0))
+        error = np.sqrt(quotient(variance, curvature, np.inf))
         apart, worse = np.log(grid(problem.finer))[:, None] - log_n, square - cost - 2 * gains
         # Many texels that hardly tell add up to chance (Q. H. Vuong, Econometrica 57, 1989): what they differ by varies
         # by its square; what those differ by that tell n, by twice itself.

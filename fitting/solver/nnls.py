@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from brdf.vectors import quotient
 from fitting.likelihood import AnyArray
 
 # Points where diffuse and lobe have a cap to themselves, in units of that: one, and how ambient and lobe move it; then
@@ -68,7 +69,7 @@ def nonnegative_minima(
         return x
     # Where the minimum is beyond the cap, that below it lies on it. In units in which each counts 1, or rounding would
     # lift a small one that counts much over the cap.
-    unit = np.where(cap > 0, 1 / np.where(cap > 0, cap, 1.0), 1.0)
+    unit = quotient(1.0, cap, 1.0)
     gram, product, start = gram * unit[..., :, None] * unit[..., None, :], product * unit, start / unit
     shared, of_lobe = (_on_face(gram, product, start, free, tolerance, *face) for face in (_SHARED, _OF_LOBE))
     return np.where(over, unit * np.where(free[..., 1:2] & (shared[..., 1:2] >= 0), shared, of_lobe), x)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from brdf.vectors import quotient
 from fitting.light_colour import scale_growth
 from fitting.model_fit import ModelFit
 from fitting.sample_error import SampleError
@@ -209,7 +210,7 @@ def uncertainty(
             reasons[term, channel] = "its error is larger than the whole picture"
             x_error[term, channel] = np.inf
     sums = {c: some._replace(error=some.columns[0] * x_error[some.terms[0], c]) for c, some in sums.items()}
-    scale = np.divide(1.0, deviations[0], out=np.zeros(variance.size), where=variance > 0)
+    scale = quotient(1.0, deviations[0])
     # Of n the channels tell together, where they err alone.
     apart = channels if pixels.channels is None else 1
     reach = student_95(max(apart * float(np.mean(degrees)), FEWEST_DEGREES))
@@ -268,8 +269,7 @@ def _covariance(
         # Of a few blocks the scatter alone says too little.
         more = max(np.trace(inverse @ scatter) / max(np.trace(inverse @ middle), np.finfo(float).tiny), 1.0)
         variance, least = np.diag(covariance), np.diag(independent) * more
-        ratio = np.divide(least, variance, out=np.ones(len(inverse)), where=variance > 0)
-        wider = np.sqrt(np.maximum(ratio, 1.0))
+        wider = np.sqrt(np.maximum(quotient(least, variance), 1.0))
         covariance = covariance * np.outer(wider, wider)
     if missed is not None:
         off = missed.shifts(np.append(active.ravel(), with_n)) * np.append(np.ones(active.size), optimum.n)

@@ -156,3 +156,9 @@ def test_mixed_precision_and_integers_are_accepted():
         a, b = np.float32([0.6, 0, 0.8]), np.float64([0.6, 0, 0.8])
         for log_cosine in (vectors.half_log_cosine, vectors.mirror_log_cosine):
             np.testing.assert_allclose(log_cosine([0, 0, 1], a, b), log_cosine([0, 0, 1.0], b, b), atol=1e-6)
+
+
+def test_a_quotient_has_a_number_of_its_own_where_nothing_divides():
+    found = vectors.quotient([[1.0, -2.0, 3.0]], np.array([[2.0], [0.0], [-1.0], [np.nan]]))
+    np.testing.assert_array_equal(found, [[0.5, -1.0, 1.5], [0, 0, 0], [0, 0, 0], [0, 0, 0]])
+    assert vectors.quotient(1.0, np.zeros(()), np.inf) == np.inf
