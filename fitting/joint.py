@@ -38,7 +38,7 @@ from fitting.core import fit_pictures
 from fitting.growing_noise import Shown, as_it_grows, likeliest
 from fitting.joint_likelihood import Information, by_least_squares, most_likely_numbers
 from fitting.joint_problem import JointProblem, Leaf, degrees_between, joint_problem, linearised, named_leaves
-from fitting.jpeg_errors import APPROACH, ENOUGH_CHANGE, MOST_FITS, LookAlikes
+from fitting.jpeg_errors import APPROACH, ENOUGH_CHANGE, MOST_FITS, LookAlikes, codec_of
 from fitting.model_fit import N_RANGE
 from fitting.pixels import Observed, Tile, observe
 from fitting.problem import CLASSIC, FitProblem, model_name, state_problem
@@ -182,7 +182,7 @@ def fit_jointly(
         )
     with working_precision(precision), waiting("fitting jointly"):
         whole = _observed(stated)
-        look_alikes = LookAlikes(whole)
+        look_alikes = LookAlikes.of(whole)
 
         def minimum(observed: Observed, start: brdf.Material, scenes: Sequence[brdf.Scene]) -> _Solved:
             pictures = [(tile.target, tile.weight) for tile in observed.tiles]
@@ -194,7 +194,8 @@ def fit_jointly(
         ) -> _Solved:
             freed = joint_problem((start, list(scenes)), free).freed
             moves = any("camera." in leaf.words or "shapes[" in leaf.words for leaf in freed)
-            plain = look_alikes.taken_off(_away_from_outlines(whole, scenes) if moves else whole)
+            plain = _away_from_outlines(whole, scenes) if moves else whole
+            plain = plain._replace(tiles=look_alikes.taken_off(plain.tiles))
             solved = minimum(evened(plain, noises[-1]) if noises else plain, start, scenes)
             result = solved.result
             if len(plain.tiles) > 1 and len(noises) < EVENINGS:
@@ -220,7 +221,8 @@ def fit_jointly(
         if solved.result.left_out.get("clipped") and (by_name or {"k_d", "k_s", "n"} <= set(solved.result)):
             solved = _sought_again(stated, solved, solve)
         result = solved.result
-        if look_alikes.known:
+        # Of channels that are copies of each other a codec takes nothing away.
+        if not whole.copies and any(map(codec_of, whole.problem.targets)):
             result = _without_codec_errors(result, look_alikes, whole, solve)
     return dataclasses.replace(result, seconds=time.perf_counter() - begun)
 
@@ -250,7 +252,7 @@ def _without_codec_errors(
     """Less what codecs do to look-alikes of what is predicted, again until these come no nearer to the pictures."""
     moved = np.zeros(len(result.parameters))
     for _ in range(MOST_FITS):
-        if not look_alikes.are_nearer(whole, _radiance(result, whole)):
+        if not look_alikes.are_nearer(whole.tiles, _radiance(result, whole)):
             break
         last, result = result, solve(result.material, result.scenes).result
         if len(last.parameters) != len(result.parameters):  # a highlight that went to nothing is freed no more

@@ -83,84 +83,69 @@ def _parted(parts: Sequence[np.ndarray], like: Sequence[np.ndarray]) -> list[np.
 
 def _nearest(fit: ModelFit, compressed: Sequence["_Compressed"], most: int, count: int) -> ModelFit:
     """The fit whose look-alikes are nearest to the pictures, these less what compression does to those."""
-    at, best, least, found = fit.optimum, fit.optimum, math.inf, fit
+    look_alikes, at, best, found = LookAlikes(compressed, count), fit.optimum, fit.optimum, fit
     for _ in range(most):
-        shown = [_predicted(picture, at) for picture in fit.pictures]
-        errors, left = _codec_errors(shown, compressed, count)
-        if left > least:
+        if not look_alikes.are_nearer(fit.pictures, [picture.predict(at.n, at.x) for picture in fit.pictures]):
             # The steps of the codec bend what look-alikes show: nearer by it may be better.
             at = dataclasses.replace(at, x=(at.x + best.x) / 2, n=(at.n + best.n) / 2)
             continue
-        pictures = [
-            dataclasses.replace(picture, **_less(picture, *part))
-            for picture, *part in zip(fit.pictures, shown, errors, strict=True)
-        ]
+        pictures = look_alikes.taken_off(fit.pictures)
         found = fit._replace(pictures=pictures, optimum=refit(pictures, at, fit.free, fit.n_range, fit.tied))
-        nearer, best, least, found = least - left, at, left, most_likely(found)
+        best, found = at, most_likely(found)
         at = found.optimum
         assert found.evidence is not None
-        if change(best, found.evidence.optimum) < ENOUGH_CHANGE or nearer < ENOUGH_NEARER * left:
+        if change(best, found.evidence.optimum) < ENOUGH_CHANGE or look_alikes.enough:
             break
     evidence = found.evidence
     assert evidence is not None
-    # Their mean has a share of what each errs by, which is no more than what the picture errs by.
-    evidence = evidence._replace(widening=evidence.widening * math.sqrt(1 + 1 / count))
+    evidence = evidence._replace(widening=evidence.widening * look_alikes.widening)
     return found._replace(evidence=evidence, moved=(APPROACH * (_unknowns(found.optimum) - _unknowns(best)),))
 
 
 class LookAlikes:
-    """What codecs do to predictions of whole pictures, each in one tile.
+    """What codecs do to predictions of pictures, or of bands or tiles of such.
 
     Attributes:
-        known: whether a codec is, and the channels are no copies of each other, of which it takes nothing away.
         left: squares of what else the pictures show.
         enough: whether that hardly falls any more.
-        widening: what to multiply errors by, for the share that the look-alikes' mean has of theirs.
+        widening: what to multiply errors by: the look-alikes' mean has a share of what each errs by, which is no more
+            than what the picture errs by.
     """
 
-    def __init__(self, observed: Observed):
-        """Of the pictures of a problem."""
-        self._compressed = list(map(_Compressed.of, observed.problem.targets))
-        self.known = not observed.copies and any(one.codec is not None for one in self._compressed)
-        self.left, self.enough, self.widening, self._parts = math.inf, False, 1.0, ()
+    def __init__(self, compressed: Sequence["_Compressed"], count: int = LOOK_ALIKES):
+        """So many of each picture."""
+        self._compressed, self._count, self._parts = compressed, count, ()
+        self.left, self.enough, self.widening = math.inf, False, 1.0
 
-    def are_nearer(self, observed: Observed, radiance: Sequence[Float[np.ndarray, "P C"]]) -> bool:
+    @classmethod
+    def of(cls, observed: Observed) -> "LookAlikes":
+        """Of the whole pictures of a problem."""
+        return cls(list(map(_Compressed.of, observed.problem.targets)))
+
+    def are_nearer(self, pictures: Sequence[Any], radiance: Sequence[Float[np.ndarray, "P C"]]) -> bool:
         """Whether a prediction's look-alikes are nearer to the pictures than the last ones: then they are the ones."""
-        shown = [_in_codes(bounds_of(tile), one) for tile, one in zip(observed.tiles, radiance, strict=True)]
-        errors, left = _codec_errors(shown, self._compressed, LOOK_ALIKES)
+        shown = list(map(_in_codes, map(bounds_of, pictures), radiance))
+        whole = _parted(shown, [one.shows for one in self._compressed])
+        both = zip(self._compressed, whole, strict=True)
+        errors, squares = zip(*(one.errors(some, self._count) for one, some in both), strict=True)
+        left = math.fsum(squares)
         if left > self.left:
             return False
         self.enough, self.left = self.left - left < ENOUGH_NEARER * left, left
-        self.widening, self._parts = math.sqrt(1 + 1 / LOOK_ALIKES), tuple(zip(shown, errors, strict=True))
+        self.widening, self._parts = math.sqrt(1 + 1 / self._count), (shown, _parted(errors, shown))
         return True
 
-    def taken_off(self, observed: Observed) -> Observed:
-        """The pictures less that."""
-        if not self._parts:
-            return observed
-        both = zip(observed.tiles, self._parts, strict=True)
-        return observed._replace(tiles=[tile._replace(**_less(tile, *part)) for tile, part in both])
+    def taken_off(self, pictures: Sequence[Any]) -> Sequence[Any]:
+        """The pictures less what compression does to them."""
+        return list(map(_less, pictures, *self._parts)) if self._parts else pictures
 
 
 def _unknowns(at: Optimum) -> Float[np.ndarray, " U"]:
     return np.append(at.x.ravel(), at.n)
 
 
-def _codec_errors(
-    shown: Sequence[Float[np.ndarray, "P C"]], compressed: Sequence["_Compressed"], count: int
-) -> tuple[list[Float[np.ndarray, "P C"]], float]:
-    """What compression does to each code, and the squares of what else the pictures show."""
-    whole = _parted(shown, [one.shows for one in compressed])
-    errors, left = zip(*(one.errors(some, count) for one, some in zip(compressed, whole, strict=True)), strict=True)
-    return _parted(errors, shown), math.fsum(left)
-
-
-def _predicted(picture: Picture, at: Optimum) -> Float[np.ndarray, "P C"]:
-    """In codes; NaN where a value says nothing."""
-    return _in_codes(bounds_of(picture), picture.predict(at.n, at.x))
-
-
 def _in_codes(bounds: Bounds, radiance: Float[np.ndarray, "P C"]) -> Float[np.ndarray, "P C"]:
+    """What is predicted; NaN where a value says nothing."""
     code, _ = bounds.codes(radiance.astype(np.float32))
     return np.where(bounds.ends > 0, code, np.float32(np.nan))
 
@@ -232,13 +217,13 @@ class _Compressed:
         return np.where(counts, mean, np.float32(0)), (together - squares) / (count * (count - 1))
 
 
-def _less(picture: Any, shown: Float[np.ndarray, "P C"], errors: Float[np.ndarray, "P C"]) -> dict[str, Any]:
-    """Target and bounds of a picture, or a tile, less what compression does where so much is predicted.
+def _less(picture: Any, shown: Float[np.ndarray, "P C"], errors: Float[np.ndarray, "P C"]) -> Any:
+    """A picture, or a tile, whose target and bounds are less what compression does where so much is predicted.
 
     Look-alikes are clipped as the picture is: of its values near an end only those are open that lie beyond it.
     """
     if not errors.any():
-        return {}
+        return picture
     bounds, target = bounds_of(picture), np.asarray(picture.target)
     code, half = bounds.codes(target)[0], 0.5 * np.median(bounds.widths)
     open_end = bounds.ends == 1
@@ -250,4 +235,5 @@ def _less(picture: Any, shown: Float[np.ndarray, "P C"], errors: Float[np.ndarra
         for sign, end in ((-1, bounds.lower), (1, bounds.upper))
     )
     moved = np.where(errors != 0, moved, target).astype(target.dtype)
-    return {"target": moved, "bounds": dataclasses.replace(bounds, lower=lower, upper=upper)}
+    less = {"target": moved, "bounds": dataclasses.replace(bounds, lower=lower, upper=upper)}
+    return dataclasses.replace(picture, **less) if isinstance(picture, Picture) else picture._replace(**less)
