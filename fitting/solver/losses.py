@@ -34,6 +34,8 @@ from fitting.solver.streams import each
 
 Loss = Literal["squared", "huber", "cauchy", "relative", "log"]
 LOSSES: tuple[Loss, ...] = ("squared", "huber", "cauchy", "relative", "log")
+# Those whose weights fall with brightness.
+RELATIVE = "relative", "log"
 
 # Of the mean value; darker pixels count as if they were that bright in a relative or log loss.
 DARKEST = 0.01

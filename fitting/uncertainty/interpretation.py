@@ -16,6 +16,7 @@ from fitting.model_fit import N_RANGE, Evidence, ModelFit
 from fitting.pixels import Observed
 from fitting.problem import FitProblem
 from fitting.result import HELD_PLAUSIBLE, FitResult, Parameter
+from fitting.solver.losses import RELATIVE
 from fitting.solver.normal_equations import Picture
 from fitting.solver.profile import Optimum
 from fitting.solver.tied import design_of
@@ -122,9 +123,9 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: R
     correlation = errors.correlation[np.ix_(index, index)]
     warnings = [_capped(material)] if fit.capped else []
     warnings += _warnings(statistics.neighbours, together, None if all(errors.reasons[2]) else lobe)
-    # What the camera says of a pixel's brightness may be off in a channel of strong colour.
-    noise_is_given = observed.problem.noise is not None
-    if growing is not None and not noise_is_given and not any("structure" in text for text in warnings):
+    # What the camera says of a pixel's brightness may be off in a channel of strong colour, and no loss knows all.
+    told = observed.problem.noise is not None or observed.problem.loss in RELATIVE
+    if growing is not None and not told and not any("structure" in text for text in warnings):
         warnings.append(
             GROWING.format("the weights do not" if _is_weighed(observed.problem) else "pixels are weighed alike")
         )
@@ -150,7 +151,9 @@ def _of_values(
     """How pixels err that least squares fit: beside their noise what errs together, and how their noise grows."""
     optimum, pictures, problem = fit.optimum, fit.pictures, observed.problem
     tell, squared, together = pixels.noise > 2 * rounding, problem.loss == "squared", None
-    misweighted = misweighted_sums(pictures, optimum, rounding) if squared and _is_weighed(problem) else None
+    # Those of a robust loss know the residuals.
+    weighed = problem.loss in RELATIVE or (squared and _is_weighed(problem))
+    misweighted = misweighted_sums(pictures, optimum, rounding) if weighed else None
     uneven, growing = misweighted or (None, statistics.growing_noise(pixels.noise, rounding))
     # It cannot be told where rounding is most of the noise, or weights are part of what is fitted.
     if squared and tell.any():

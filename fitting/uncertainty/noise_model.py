@@ -10,6 +10,8 @@ highlight of three pixels).
 """
 
 import dataclasses
+import math
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -148,32 +150,30 @@ def misweighted_sums(
     of_channels = max(weight.shape[0] for *_, weight in parts)
     residual, value = (np.concatenate([part[i] for part in parts], axis=1) for i in range(2))
     weight = np.concatenate([np.broadcast_to(one, (of_channels, one.shape[1])) for *_, one in parts], axis=1)
-    squared = residual**2
-    if not squared.any(axis=1).all():
+    if not residual.any(axis=1).all():
         return None
-    counts = weight > 0
-    log_weight, count = np.log(np.where(counts, weight, 1.0)), np.count_nonzero(counts, axis=1)
-    powers = (*POWERS, 1.0)
-    variance = {power: np.vecdot(squared, np.exp((power - 1) * log_weight)) / count for power in powers}
-    # Twice the logarithm of the likelihood, but for a constant; a weight that channels share is that of each.
-    of_weights = np.sum(log_weight) * len(squared) / of_channels
-    likely = {power: float(power * of_weights - np.sum(count * np.log(one))) for power, one in variance.items()}
-    power = max(likely, key=lambda one: likely[one])
-    if likely[power] < likely[1.0] + RISE:
+    counts = np.broadcast_to(weight > 0, residual.shape)
+    log_weight, whole = np.log(np.where(weight > 0, weight, 1.0)), counts.all(axis=0)
+    least, best = least / math.exp(np.mean(log_weight) / 2), []
+    for power in (*POWERS, 1.0):
+        even = residual * np.exp((power - 1) / 2 * log_weight)
+        growing = noise_model(even[:, whole].T, value[:, whole].T, least * math.exp(power * np.mean(log_weight) / 2))
+        variance = np.mean(even**2, axis=1, where=counts)
+        if growing is None:
+            growing = variance[:, None] * [1.0, 0.0, 0.0]
+        spread = variance_at(growing, np.maximum(value, 0.0).T).T
+        # Twice the logarithm of the likelihood, but for a constant; a weight that channels share is that of each.
+        likely = np.sum(power * log_weight - np.log(spread) - even**2 / spread, where=counts)
+        best.append((float(likely), power, growing))
+    likely, power, growing = max(best, key=operator.itemgetter(0))
+    if likely < best[-1][0] + RISE:
         return None
-
-    whole = counts.all(axis=0)
-    even = (residual * np.exp((power - 1) / 2 * log_weight))[:, whole].T
-    growing = noise_model(even, value[:, whole].T, least)
 
     def beside(picture: Picture) -> AnyArray:
-        spread = variance[power]
-        if growing is not None:
-            spread = variance_at(growing, np.maximum(picture.predict(optimum.n, optimum.x), 0.0))
-        weight = np.asarray(picture.weights, float) ** (2 - power) * spread
-        return np.broadcast_to(weight, picture.target.shape)
+        spread = variance_at(growing, np.maximum(picture.predict(optimum.n, optimum.x), 0.0))
+        return np.asarray(picture.weights, float) ** (2 - power) * spread
 
-    return sums_at(pictures, optimum, beside), growing
+    return sums_at(pictures, optimum, beside), growing if growing[:, 1:].any() else None
 
 
 def _residual_value_weight(
