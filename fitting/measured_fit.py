@@ -404,7 +404,7 @@ def _fit_model(model, samples, loss, n_range):
     # Instruments err by a share of the value, and alike in all channels: what is left of each sample says so (White
     # 1980), not below rounding, as much larger as the fit has drawn it to itself (MacKinnon and White 1985).
     left = left / (1 - _leverage(log_cos, reach * np.exp(optimum.n * log_cos), weight))
-    spread = sums_at([picture], optimum, lambda _: weight * np.maximum(left**2, rounding**2)).gram
+    spread = sums_at([picture], optimum, [weight * np.maximum(left**2, rounding**2)]).gram
     left = left / np.maximum(np.linalg.norm(left, axis=0), 1 / FAR)
     visible = float(np.max(highlight) / np.max(brightest))
     fit = ModelFit(model, [], optimum, free, n_range)

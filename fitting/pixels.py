@@ -302,8 +302,9 @@ def _observe(
             if weighed or several:
                 weights = np.concatenate(own).reshape(target.pixels.shape if several else (height, width))
     rounding = np.maximum(brightest * resolution, target.step / np.sqrt(12.0))
-    # Of others an end says what it says.
-    limits = (dark if left_out.get("dark") else -np.inf), (level if left_out.get("clipped") and not plain else np.inf)
+    # Where pixels tell by likelihood an end says what it says, and plain least squares is what it is.
+    by_value = left_out.get("clipped") and not (plain or target.least_squares)
+    limits = (dark if left_out.get("dark") else -np.inf), (level if by_value else np.inf)
     return tiles, rounding, brightest, limits, left_out, *shown, weights
 
 

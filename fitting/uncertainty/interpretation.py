@@ -12,6 +12,7 @@ from brdf.channels import channel_names
 from brdf.models.base import SpecularMaterial
 from fitting.channel_errors import residuals
 from fitting.light_colour import coefficient_factors
+from fitting.maximum_likelihood import bounds_of
 from fitting.model_fit import N_RANGE, Evidence, ModelFit
 from fitting.pixels import Observed
 from fitting.problem import FitProblem
@@ -92,9 +93,10 @@ def interpret(fit: ModelFit, observed: Observed, hidden: str = "", statistics: R
         statistics = statistics._replace(neighbours=statistics.neighbours._replace(significant=False))
         # Of a small highlight the pixels near an edge may tell next to nothing.
         gain = specular_gain(optimum.normal(noise**2).gram, optimum.x)
+        rounded = fit.pictures
         fit = fit._replace(pictures=evidence.pictures, optimum=evidence.optimum)
         pixels = PixelErrors(np.ones(noise.size), channels=channels, missed=sampled)
-        pixels, together = _of_codes(fit, evidence, observed, pixels)
+        pixels, together = _of_codes(fit, evidence, observed, pixels, rounded)
     # What the light reaches but the simplest model does without is 0, with the error that it would have.
     about_light = observed.reached(fit.model), observed.brightest, visible
     errors = uncertainty(fit, pixels, *about_light, columns=columns, gain=gain, resolution=resolution)
@@ -179,9 +181,15 @@ def _of_values(
 
 
 def _of_codes(
-    fit: ModelFit, evidence: Evidence, observed: Observed, pixels: PixelErrors
+    fit: ModelFit, evidence: Evidence, observed: Observed, pixels: PixelErrors, rounded: Sequence[Picture]
 ) -> tuple[PixelErrors, Structure | None]:
     """How pixels err whose codes are fitted: beside the noise of their working targets, 1, what errs together."""
+    if any(one is not None for one in observed.problem.weights) and evidence.together is None:
+        # Of weights the bounds know as of inverse variances.
+        known = [1 / np.atleast_2d(bounds_of(one).spread) ** 2 for one in rounded]
+        given = [one[pixel] if len(one) > 1 else one for one, (pixel, _) in zip(known, evidence.places, strict=True)]
+        if (misweighted := misweighted_sums(fit.pictures, fit.optimum, 0 * pixels.noise, given)) is not None:
+            pixels = pixels._replace(spread=misweighted[0].gram)
     alone = alone_covariance(fit.optimum, fit.tied) if evidence.together is None else None
     missed = 0.0 if pixels.missed is None else pixels.missed.size
     shared, together, channels = shared_errors(evidence, observed, alone, missed)

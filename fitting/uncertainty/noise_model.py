@@ -12,7 +12,7 @@ highlight of three pixels).
 import dataclasses
 import math
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -121,22 +121,25 @@ def weighted_sums(
     Columns are ambient, diffuse, lobe, derivative by n, about the target; ``coefficients`` are those of the variance.
     """
     n, x = np.asarray(optimum.n), optimum.x
-    return sums_at(pictures, optimum, lambda picture: _reweighted(picture, n, x, coefficients, inverse))
+    return sums_at(pictures, optimum, each(lambda one: _reweighted(one, n, x, coefficients, inverse), pictures))
 
 
-def sums_at(pictures: Sequence[Picture], optimum: Optimum, weight: Callable[[Picture], AnyArray]) -> Sums:
+def sums_at(pictures: Sequence[Picture], optimum: Optimum, weights: Sequence[AnyArray]) -> Sums:
     """Sums at the optimum with other weights."""
 
-    def again(picture: Picture) -> Picture:
-        return dataclasses.replace(picture, weight=jnp.asarray(weight(picture), picture.target.dtype))
+    def again(picture: Picture, weight: AnyArray) -> Picture:
+        return dataclasses.replace(picture, weight=jnp.asarray(weight, picture.target.dtype))
 
     with jax.enable_x64(True):
-        parts = sums(each(again, pictures), np.log([optimum.n]), optimum.x.T)
+        parts = sums(each(again, pictures, weights), np.log([optimum.n]), optimum.x.T)
     return Sums(*(leaf[0] for leaf in parts)).about(optimum.x.T).columns(np.diag([1.0, 1.0, 1.0, 1.0 / optimum.n]))
 
 
 def misweighted_sums(
-    pictures: Sequence[Picture], optimum: Optimum, least: Float[np.ndarray, " C"]
+    pictures: Sequence[Picture],
+    optimum: Optimum,
+    least: Float[np.ndarray, " C"],
+    given: Sequence[AnyArray] | None = None,
 ) -> tuple[Sums, Float[np.ndarray, "C 3"] | None] | None:
     """Sums at the optimum with each pixel's weight times the variance of its weighted residual, where weights vary it.
 
@@ -144,9 +147,12 @@ def misweighted_sums(
     region. Then noise is what it is beside them, and errors are those of the sandwich. Some pixels tell which of both,
     how large noise is, and how it grows with brightness, if it does: `noise_model`. The sums are of all. None where
     inverse variances are as likely.
+
+    ``given`` are the weights of each picture that are asked about, a part of its own or, by default, these.
     """
+    given = each(lambda picture: picture.weights, pictures) if given is None else given
     stride = -(-sum(int(picture.counts.sum()) for picture in pictures) // MOST_PIXELS)
-    parts = [_residual_value_weight(picture, optimum, stride) for picture in pictures]
+    parts = [_residual_value_weight(*one, optimum, stride) for one in zip(pictures, given, strict=True)]
     of_channels = max(weight.shape[0] for *_, weight in parts)
     residual, value = (np.concatenate([part[i] for part in parts], axis=1) for i in range(2))
     weight = np.concatenate([np.broadcast_to(one, (of_channels, one.shape[1])) for *_, one in parts], axis=1)
@@ -169,22 +175,22 @@ def misweighted_sums(
     if likely < best[-1][0] + RISE:
         return None
 
-    def beside(picture: Picture) -> AnyArray:
+    def beside(picture: Picture, weight: AnyArray) -> AnyArray:
         spread = variance_at(growing, np.maximum(picture.predict(optimum.n, optimum.x), 0.0))
-        return np.asarray(picture.weights, float) ** (2 - power) * spread
+        return np.asarray(picture.weights, float) * np.asarray(weight, float) ** (1 - power) * spread
 
-    return sums_at(pictures, optimum, beside), growing if growing[:, 1:].any() else None
+    return sums_at(pictures, optimum, each(beside, pictures, given)), growing if growing[:, 1:].any() else None
 
 
 def _residual_value_weight(
-    picture: Picture, optimum: Optimum, stride: int
+    picture: Picture, weight: AnyArray, optimum: Optimum, stride: int
 ) -> tuple[Float[np.ndarray, "C K"], Float[np.ndarray, "C K"], Float[np.ndarray, "Cw K"]]:
-    """Weighted residuals of some pixels that count, what is predicted, and their weights, which channels may share."""
+    """Weighted residuals of some pixels that count, what is predicted, and such weights, which channels may share."""
     pixel = np.flatnonzero(picture.counts)
     # One at random of each so many: a fixed step could meet no more than some columns of a picture.
     first = np.arange(0, pixel.size, stride)
     pixel = pixel[np.minimum(first + np.random.default_rng(0).integers(stride, size=first.size), pixel.size - 1)]
     some = picture.in_double(pixel)
-    weight = np.broadcast_to(some.weights, (len(some.target), some.weights.shape[1]))[: pixel.size]
+    weight = np.broadcast_to(weight, (len(picture.target), weight.shape[1]))[pixel] * (some.weights > 0)[: pixel.size]
     shown = np.asarray(some.predict(optimum.n, optimum.x), float)
     return residuals(some, optimum)[: pixel.size].T, shown[: pixel.size].T, np.asarray(weight, float).T

@@ -466,3 +466,15 @@ def test_noise_that_grows_beside_weights_that_are_a_mask_is_allowed_for():
     for one, other in zip(hard.parameters, soft.parameters, strict=True):
         # By one variance for all values k_a would have half as much again. What lies outside tells of noise, too.
         assert other.error == pytest.approx(one.error, rel=0.1)
+
+
+def test_weights_that_codes_are_no_inverse_variances_of_make_nothing_surer():
+    clean, off = 255 * pictured(GLOSS, SCENE), []
+    for seed in range(16):
+        random = np.random.default_rng(seed)
+        codes = np.clip(np.rint(clean + 3 * random.standard_normal(clean.shape)), 0, 255).astype(np.uint8)
+        weight = np.exp(random.standard_normal(codes.shape[:2]))
+        result = fitting.fit(codes, SCENE, model="blinn-phong", weight=weight)
+        off += [(p.value - getattr(GLOSS, p.name).item()) / p.error for p in result.parameters]
+    # As inverse variances they leave squares of 2.5.
+    assert 0.5 < np.mean(np.square(off)) < 1.6
