@@ -20,8 +20,9 @@ from fitting.uncertainty.intervals import NORMAL_95, above_zero, student_95
 # A squared column keeps less than this of itself when the others are taken out: the two tell the same story.
 # Float32 sums leave some 1e-7 of a column that depends on the others.
 DEPENDENT_SINGLE, DEPENDENT_DOUBLE = 1e-6, 1e-10
-# What the arithmetic of single precision leaves of a number, relative: a few of its rounding errors.
-RESOLUTION = 5e-7
+# What the arithmetic of single precision leaves of a number, over that which alone would show the picture: a few of its
+# rounding errors; and how much of these all pixels share.
+RESOLUTION, SHARED = 5e-7, 0.4
 # As much of the scatter of independent pixels is there in any case.
 LEAST_SCATTER = 1e-6
 # A term that moves no pixel by more than this share of the brightest one leaves no trace.
@@ -153,7 +154,7 @@ def uncertainty(
         visible: largest value of the specular term in the picture, over that of the picture.
         columns: root mean square over pixels of what each term shows at 1; None where no pixel weighs more.
         gain: see `specular_gain`, where more pixels tell of it than those of the optimum's sums.
-        resolution: relative error of a number that is left by the arithmetic of the basis images.
+        resolution: error that is left by the arithmetic of the basis images, over the picture.
     """
     optimum, channels = fit.optimum, pixels.noise.size
     dependent = DEPENDENT_SINGLE if fit.single else DEPENDENT_DOUBLE
@@ -191,6 +192,10 @@ def uncertainty(
     deviations = np.sqrt(np.maximum([variance, own], 0.0))
     reaches = [student_95(max(one, FEWEST_DEGREES)) for one in degrees.tolist()]
     x_error, x_interval = np.full(x.shape, np.inf), np.zeros((*x.shape, 2))
+    # As much of each coefficient as an error of all pixels alike, as large as the picture, may make; of a highlight as
+    # much as its brightest place may.
+    picture = SHARED * np.sqrt(np.diag(inner.inverse)[:-1].reshape(x.shape) * optimum.square)
+    of_lobe = resolution / max(visible, resolution, np.finfo(float).tiny)
     x_interval[..., 1] = np.inf
     for term, channel in np.argwhere(determined):
         index = term * channels + channel
@@ -201,7 +206,8 @@ def uncertainty(
         if (term, channel) in at_bound:
             value, deviation, alone, _ = at_bound[term, channel]
         largest = max(optimum.square[channel], brightest[channel] ** 2)
-        deviation = math.hypot(deviation, resolution * value)
+        rounding = SHARED * value * of_lobe if term == 2 else resolution * max(value, picture[term, channel])
+        deviation = math.hypot(deviation, rounding)
         wide = deviation * reaches[channel] / NORMAL_95
         x_interval[term, channel], x_error[term, channel] = above_zero(value, wide), deviation
         # What is at its bound may be there, whatever the slope of a likelihood that is nearly flat.
@@ -218,7 +224,7 @@ def uncertainty(
     if inner.with_n:
         # The noise variance, averaged over channels as n feels it, times the square of that reach.
         delta_cost = float(reach**2 * covariance[-1, -1] / inner.inverse[-1, -1])
-        n_error = math.inf if n_reason else math.hypot(deviations[0, -1], resolution * optimum.n)
+        n_error = math.inf if n_reason else math.hypot(deviations[0, -1], of_lobe * optimum.n)
     elif not n_reason:
         n_reason = "the highlight fits as well with other exponents and another k_s"
     correlation = covariance * np.outer(scale, scale)
