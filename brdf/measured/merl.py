@@ -22,7 +22,7 @@ SCALES = np.array([1.0 / 1500.0, 1.15 / 1500.0, 1.66 / 1500.0])
 HEADER = np.array(SHAPE, "<i4").tobytes()
 SIZE = len(HEADER) + 3 * 8 * math.prod(SHAPE)
 
-# What the file holds where nothing was measured, before scaling.
+# What the file holds where nothing was measured, before scaling, as a rule in all channels; no measurement hits it.
 _MISSING = -1.0
 
 
@@ -45,9 +45,11 @@ def load(path: Path) -> MeasuredBRDF:
         raise InputError(path, f"has {size} bytes instead of {SIZE}", "The file is damaged; get it again")
     stored = content[len(HEADER) :].view("<f8").reshape(3, -1)
     light, view, share = grid()
-    kept = np.any(stored != _MISSING, axis=0) | (light[:, 2] <= 0) | (view[:, 2] <= 0)
+    missing = np.any(stored == _MISSING, axis=0)
+    kept = ~missing | (light[:, 2] <= 0) | (view[:, 2] <= 0)
     with np.errstate(over="ignore", invalid="ignore"):
         values = stored.T * SCALES
+    values[missing] = np.nan
     return MeasuredBRDF.from_samples(
         light[kept],
         view[kept],

@@ -33,7 +33,8 @@ class MeasuredBRDF:
         solid_angle: what share of all pairs of directions each sample stands for, up to a constant, (P,); ones where
             the samples are scattered.
         left_out: how many entries of the file are no samples, by reason.
-        evaluate: f_r at any pairs of directions, where the file determines it; None for scattered samples.
+        evaluate: f_r at any pairs of directions, where the file determines it, NaN where it was not measured; None for
+            scattered samples.
         below_zero: why values are below 0, where that is known; else it is noise of the measurement.
 
     Example:

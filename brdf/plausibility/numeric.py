@@ -91,7 +91,7 @@ def albedo_of(brdf: BRDF | Material, polar: Float[np.ndarray, " K"]) -> Float[np
 # -- values of f_r, and a first look at them everywhere ----------------------------------------------------------------
 
 
-def _fibonacci(count: int) -> np.ndarray:
+def fibonacci(count: int) -> np.ndarray:
     """A grid over the hemisphere."""
     index = np.arange(count)
     return from_angles(np.arccos(np.maximum((index + 0.5) / count, _LOWEST)), _TURN * index)
@@ -168,10 +168,10 @@ class _Scan:
 
     def __init__(self, brdf: BRDF | Material):
         self.sample, self.random = Sampler(brdf), np.random.default_rng(20)
-        light, view = (self.random.permutation(_fibonacci(2**16)) for _ in range(2))
+        light, view = (self.random.permutation(fibonacci(2**16)) for _ in range(2))
         self.scale = float(np.mean(np.abs(self.seen(light, view))))
-        fixed, grid = from_angles(_FIXED, _TURN * np.arange(len(_FIXED))), _fibonacci(_GRID)
-        lights = np.concatenate([fixed, _fibonacci(64)])
+        fixed, grid = from_angles(_FIXED, _TURN * np.arange(len(_FIXED))), fibonacci(_GRID)
+        lights = np.concatenate([fixed, fibonacci(64)])
         looks = [(light, view), *((one, grid) for one in fixed)]
         looks += [(lights, peaks) for peaks in (lights * MIRRORED, lights, np.array([0.0, 0.0, 1.0]))]
         self.negative, self.unequal, bright = np.concatenate([self._look(*look) for look in looks], axis=2)
@@ -290,7 +290,7 @@ def _albedos_together(scan: _Scan, lights: np.ndarray, tolerance: float, budget:
     # A narrow lobe may sit where it is bright for other lights, too: about the same view or the same half vector.
     halves = _lifted(scan.bright.sum(axis=0))
     same_half = _lifted(2 * (lights @ halves.T)[..., None] * halves - lights[:, None])
-    others = np.concatenate([scan.bright[1], _fibonacci(3500)])
+    others = np.concatenate([scan.bright[1], fibonacci(3500)])
     views = np.concatenate([same_half, np.broadcast_to(others, (len(lights), *others.shape))], axis=1)
     seen = scan.seen(np.repeat(lights, views.shape[1], axis=0), views.reshape(-1, 3))
     brightest = np.argsort(seen.max(axis=1).reshape(len(lights), -1))[:, -5:, None]

@@ -10,8 +10,8 @@ import math
 
 import numpy as np
 
-from brdf.measured.table import MeasuredBRDF, from_angles, to_angles
-from brdf.plausibility.numeric import MIRRORED, integrate
+from brdf.measured.table import Evaluation, MeasuredBRDF, from_angles, to_angles
+from brdf.plausibility.numeric import MIRRORED, fibonacci, integrate
 from brdf.plausibility.report import ENERGY_LIMIT, Angles, Finding, Report, judged, largest
 from brdf.vectors import quotient
 
@@ -25,6 +25,9 @@ LARGEST_NOISE = 0.1
 LIGHTS = (5.0, 20.0, 35.0, 50.0, 65.0, 75.0)
 # Tolerance of the quadrature, and how many values it may take for each of them.
 _QUADRATURE = 1e-3, 10_000
+# Where views that were not measured are looked for, and how many times as bright as what was measured next to them they
+# may be.
+_VIEWS, _BRIGHTER = 2**13, 3.0
 # Below this the two sides of a pair agree by construction, not by measurement.
 _BY_LAYOUT = 1e-5
 
@@ -69,6 +72,8 @@ def _pairs(samples: MeasuredBRDF, *, exchanged: bool) -> tuple[np.ndarray, np.nd
         apart = np.abs(a - b if exchanged else turn) > CELL
         first = np.flatnonzero(apart & (partner >= 0) & (partner != np.arange(len(partner))))
         values, repeated = values[first], values[partner[first]]
+    known = np.all(np.isfinite(values + repeated), axis=1)
+    first, values, repeated = first[known], values[known], repeated[known]
     return first, quotient(np.abs(values - repeated), 0.5 * (np.abs(values) + np.abs(repeated)))
 
 
@@ -116,17 +121,52 @@ def _cannot_tell(limit: float, sentence: str) -> Finding:
 
 
 def _energy(table: MeasuredBRDF) -> Finding:
+    """What was measured reflects this much at least; the error bound holds what the rest may add."""
     if table.evaluate is None:
         return _cannot_tell(ENERGY_LIMIT, "scattered samples do not say how much light they stand for")
     lights = from_angles(np.radians(LIGHTS), 0.0)
     evaluate, centres = table.evaluate, np.stack([lights * MIRRORED, lights], axis=1)
-    # Of f_r (N.V).
-    albedo, bounds = integrate(
-        lambda which, views: evaluate(lights[which], views) * views[:, 2:], centres, *_QUADRATURE
-    )
+
+    def measured(which, views):
+        """Of f_r (N.V)."""
+        values = evaluate(lights[which], views)
+        return np.where(np.isfinite(values), values, 0.0) * views[:, 2:]
+
+    albedo, bounds = integrate(measured, centres, *_QUADRATURE)
+    rest = [_not_measured(evaluate, *each) for each in zip(lights, centres, strict=True)]
+    reach = bounds + np.array([most for most, _ in rest])
     row, channel = largest(albedo)
-    value, bound, light = float(albedo[row, channel]), float(bounds[row, channel]), Angles(LIGHTS[row])
-    said = f"the largest albedo of light up to {LIGHTS[-1]:g}° is {value:.4g}, for light {light}"
-    said += f", channel {table.channels[channel]}"
-    failed = f"does not conserve energy: {said}"
-    return judged(value, ENERGY_LIMIT, bound, (light, None, channel), said, failed)
+    failed = albedo[row, channel] - bounds[row, channel] > ENERGY_LIMIT
+    unsure = not failed and np.any(albedo + reach > ENERGY_LIMIT)
+    if failed:
+        reach = bounds
+    elif unsure:
+        row, channel = largest(albedo + reach)
+    value, bound, light = float(albedo[row, channel]), float(reach[row, channel]), Angles(LIGHTS[row])
+    where = f"light {light}, channel {table.channels[channel]}"
+    said = f"the largest albedo of light up to {LIGHTS[-1]:g}° is {value:.4g}, for {where}"
+    if unsure and rest[row][1]:
+        said = f"the albedo for {where}, is at least {value:.4g}; {rest[row][1]}"
+    return judged(value, ENERGY_LIMIT, bound, (light, None, channel), said, f"does not conserve energy: {said}")
+
+
+def _not_measured(evaluate: Evaluation, light: np.ndarray, peaks: np.ndarray) -> tuple[np.ndarray, str]:
+    """What albedo the views of a light that were not measured may add, (C,), and in words which share they are.
+
+    They are up to ``_BRIGHTER`` times as bright as the nearest that was measured; where a peak would be they may
+    reflect all the light.
+    """
+    from scipy.spatial import KDTree  # it takes long to load
+
+    views = np.concatenate([peaks, fibonacci(_VIEWS)])
+    values = evaluate(np.broadcast_to(light, views.shape), views)
+    known = np.all(np.isfinite(values), axis=1)
+    if known.all():
+        return np.zeros(values.shape[1]), ""
+    gone, solid_angle = views[~known], 2 * np.pi / _VIEWS
+    share = np.sum(gone[:, 2]) * solid_angle / np.pi
+    words = f"{100 * share:.2g} % of its views, by their cosine, are not measured"
+    if not known[: len(peaks)].all():
+        return np.ones(values.shape[1]), words + ", among them one that may show a peak"
+    beside = np.maximum(values[known][KDTree(views[known]).query(gone)[1]], 0.0)
+    return _BRIGHTER * solid_angle * gone[:, 2] @ beside, words

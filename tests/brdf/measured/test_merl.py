@@ -1,5 +1,6 @@
 """MERL tables: synthetic files in the published layout read back, and what is damaged is said in one line."""
 
+import re
 import struct
 
 import numpy as np
@@ -67,9 +68,12 @@ def test_merl_directions_and_lookup_agree_with_the_published_reader(merl):
 def test_merl_entries_that_were_not_measured_are_left_out(tmp_path):
     stored = np.ones((3, 90 * 90 * 180))
     stored[:, 90] = -1.0
+    stored[1, 91] = -1.0  # in one channel alone, as no measurement is by chance
     table = brdf.load_measured(write_merl(tmp_path / "a.binary", stored))
-    assert table.left_out["not measured"] == 1
+    assert table.left_out["not measured"] == 2
     assert table.negative == 0
+    light, view, _ = measured_merl.grid()
+    assert np.array_equal(np.isnan(table.evaluate(light[89:93], view[89:93])).all(axis=1), [False, True, True, False])
 
 
 def test_a_merl_file_of_the_right_size_with_a_wrong_header(tmp_path):
@@ -115,3 +119,57 @@ def test_a_table_of_ones_own_is_checked_between_its_entries():
 
     report = brdf.check(brdf.merl_table(lobe))
     assert {report.positivity.verdict, report.reciprocity.verdict, report.energy.verdict} == {"pass"}
+
+
+def _normalized_blinn_phong(k_d, k_s, n, missing):
+    """On MERL's grid, NaN where ``missing``, a function of light, view and half vector, says so."""
+
+    def f_r(light, view):
+        half = (light + view) / np.linalg.norm(light + view, axis=1, keepdims=True)
+        size = (n + 2) * (n + 4) / (8 * np.pi * (2 ** (-n / 2) + n))
+        return np.where(missing(light, view, half), np.nan, k_d / np.pi + k_s * size * half[:, 2] ** n)
+
+    return brdf.merl_table(f_r)
+
+
+@pytest.mark.parametrize(
+    ("k_s", "degrees", "verdict"),
+    [
+        pytest.param(0.7, 3, "fail", id="above 1 in what is measured"),
+        pytest.param(0.7, 8, "cannot tell", id="above 1 with the peak"),
+        pytest.param(0.0, 5, "cannot tell", id="a mirror may hide there"),
+    ],
+)
+def test_a_peak_that_was_not_measured_leaves_the_energy_open(k_s, degrees, verdict):
+    """It was taken for black: of an albedo of 1.2 the check said that it passes."""
+    lowest = np.cos(np.radians(degrees))
+    report = brdf.check(_normalized_blinn_phong(0.5, k_s, 40, lambda _light, _view, half: half[:, 2] > lowest))
+    assert report.energy.verdict == verdict
+    if verdict == "cannot tell":
+        told = re.search("; (.*) % of its views, .* not measured, among them one that may", report.energy.sentence)
+        assert told
+        # A cap of views of twice the angle about the mirror direction; narrower across the plane of incidence.
+        cap = np.sin(np.radians(2 * degrees)) ** 2 * np.cos(np.radians(report.energy.to_light.polar)) ** 2
+        assert float(told[1]) / 100 == pytest.approx(cap, rel=0.2)
+    # The pairs that are left are reciprocal.
+    assert report.reciprocity.verdict == "pass"
+
+
+@pytest.mark.parametrize(("k_d", "verdict"), [(0.4, "pass"), (0.85, "cannot tell")])
+def test_grazing_views_that_were_not_measured_may_be_as_bright_as_those_beside_them(k_d, verdict):
+    def grazing(light, view, _half):
+        return np.minimum(light[:, 2], view[:, 2]) < np.sin(np.radians(15))
+
+    energy = brdf.check(_normalized_blinn_phong(k_d, 0.1, 40, grazing)).energy
+    assert energy.verdict == verdict
+    # Of the largest albedo, within which light up to 75 degrees and no view beyond takes part.
+    assert energy.value < k_d + 0.1 < energy.value + energy.error_bound
+
+
+def test_no_pair_is_made_of_what_was_not_measured():
+    """Such pairs counted as agreeing: where they are most of all, a table that is not reciprocal passed."""
+
+    def f_r(light, view):
+        return np.where(light[:, 2] + view[:, 2] > 1, np.nan, 0.1 + 0.3 * light[:, 2])
+
+    assert brdf.check(brdf.merl_table(f_r)).reciprocity.verdict == "fail"
