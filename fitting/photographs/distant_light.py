@@ -5,6 +5,7 @@ the half vector or the mirror direction is fitted with it: left to robust weight
 several degrees. Only where the light comes in at an angle is looked at, so that shadows say nothing.
 """
 
+import contextlib
 import functools
 from typing import Any, NamedTuple
 
@@ -14,6 +15,7 @@ from jaxtyping import Float
 import brdf
 from brdf.errors import InputError
 from fitting.photographs.ball import Circle, ball_normals
+from fitting.solver.losses import LIMITING_ROUNDS, REACH
 
 # What belongs to a highlight: its core is looked for above one share of the brightest pixel; it reaches down to half of
 # the brightest, within a share of the radius around it.
@@ -22,8 +24,9 @@ CORE, HIGHLIGHT, HIGHLIGHT_RADIUS = 0.9, 0.5, 0.12
 ALIKE = 0.25
 # Lambert's law is fitted where the light's cosine exceeds this, at first on pixels above this share of the brightest.
 LIT, BRIGHT = 0.15, 0.05
-# Huber's tuning constant, which keeps 95 % efficiency on Gaussian noise, times the ratio of deviation and median.
-HUBER = 1.345 * 1.4826
+# A Gaussian's deviation over the median of its size; Huber's tuning constant, which keeps 95 % efficiency on it.
+DEVIATION = 1.4826
+HUBER = 1.345 * DEVIATION
 FEWEST = 10
 # More pixels than these tell the light no better than the model is true.
 MOST_PIXELS = 1 << 14
@@ -170,7 +173,8 @@ def light_from_shading(
     Args:
         picture: linear values, (H, W, C) or (H, W), or a `brdf.Picture`.
         points: what each pixel sees, the viewer being far away along z.
-        saturation: linear value from which on pixels are clipped; None takes the largest code of an integer file.
+        saturation: linear value from which on pixels are clipped; None takes the largest code of an integer file. What
+            is predicted so near it that noise decides does not count either.
         mask: (H, W), pixels that count; None for all.
         ambient: whether the surface is lit from all around as well.
 
@@ -186,9 +190,10 @@ def light_from_shading(
     elif not saturation > 0:
         raise InputError("saturation", f"must be a linear value above 0, got {saturation!r}", "Give a number")
     values = _values(picture)
-    grey, clipped = values.mean(axis=-1), values.max(axis=-1) >= (saturation or np.inf)
-    counts = np.asarray(points.mask) & np.isfinite(grey) & ~clipped & (True if mask is None else mask)
-    pixel = np.argwhere(counts)
+    grey, level = values.mean(axis=-1), saturation or np.inf
+    counts = np.asarray(points.mask) & np.isfinite(grey) & (True if mask is None else mask)
+    clipped = counts & (values.max(axis=-1) >= level)
+    pixel = np.argwhere(counts & ~clipped)
     pixel = pixel[:: max(1, -(-len(pixel) // MOST_PIXELS))]
     row, column = pixel.T
     normal, value = np.asarray(points.normal, np.float64)[row, column].T.copy(), grey[row, column]
@@ -196,27 +201,23 @@ def light_from_shading(
     lit = value > BRIGHT * unit
     if np.count_nonzero(lit) < FEWEST:
         raise InputError("picture", "has fewer than ten lit pixels on the surface", "Give a brighter picture")
-    value = residual = value / unit
-    # By Lambert's law alone, which tells which pixels the light reaches, and how far they are off.
-    numbers, cost, scale, mirror = np.zeros(4 if ambient else 3), 0.0, 0.0, False
-    for _ in range(100):
-        before, scale = numbers, _bound(residual[lit])
-        numbers, cost = _refine(numbers, mirror, scale, value[lit], normal[:, lit])
-        residual = value - _shown(numbers, mirror, normal)[0]
-        if np.allclose(before, numbers, rtol=0, atol=CHANGE):
-            break
-        lit = _reached(normal, numbers)
-    found = []
-    for about_mirror in (False, True):
-        for n in STARTS:
-            start = np.array([*numbers[:3], *([0.02] if ambient else []), 0.1, np.log(n - LOWEST_N)])
-            found.append((*_refine(start, about_mirror, scale, value[lit], normal[:, lit]), about_mirror))
-    shiny, left, about_mirror = min(found, key=lambda one: one[1])
-    if np.count_nonzero(lit) * np.log(max(cost, 1e-300) / max(left, 1e-300)) > 2 * RISE:
-        # Lambert's law alone may have looked at pixels that the light does not reach.
-        lit, mirror = _reached(normal, shiny), about_mirror
-        scale = _bound((value - _shown(shiny, mirror, normal)[0])[lit])
-        numbers, _ = _refine(shiny, mirror, scale, value[lit], normal[:, lit])
+    value = value / unit
+    numbers, mirror, lit, scale = _fitted(value, normal, ambient)
+    if clipped.any():
+        # Of pixels near the level those are left that noise made darker: out goes what is predicted there.
+        channels, within = values[row, column].T / unit, np.ones(len(value), bool)
+        channel = max(channels, key=np.mean)
+        for _ in range(LIMITING_ROUNDS):
+            shown, among = _shown(numbers, mirror, normal)[0], np.flatnonzero(within)[lit]
+            shown *= np.mean(channel[among]) / np.mean(value[among])
+            noise = DEVIATION * np.median(np.abs(channel - shown)[among])
+            before, within = within, shown < level / unit - REACH * noise
+            # Else noise reaches from the level into the dark.
+            if np.array_equal(before, within) or np.count_nonzero(within & (value > BRIGHT)) < FEWEST:
+                within = before
+                break
+            numbers, mirror, lit, scale = _fitted(value[within], normal[:, within], ambient)
+        value, normal, pixel = value[within], normal[:, within], pixel[within]
     pixel -= pixel.min(axis=0)
     block = (pixel // -(-(pixel.max() + 1) // BLOCKS) @ [BLOCKS, 1])[lit]
     shown, slopes = _shown(numbers, mirror, normal[:, lit])
@@ -234,9 +235,38 @@ def light_from_shading(
     away = (numbers[:3] @ normal < -LIT * length) & (normal[2] > INSIDE)
     count, elsewhere = np.count_nonzero(away), 0.0
     if count >= FEWEST:
-        noise = (CUT_NOISE + 3 / count**0.5) * 1.4826 * np.median(np.abs(residual))
+        noise = (CUT_NOISE + 3 / count**0.5) * DEVIATION * np.median(np.abs(residual))
         elsewhere = max(np.mean(value[away]) - (numbers[3] if ambient else 0.0) - noise, 0.0) / length
     return ShadingLight(numbers[:3] / length, length * unit, error, unexplained, float(elsewhere))
+
+
+def _fitted(value, normal, ambient) -> tuple[np.ndarray, bool, np.ndarray, float]:
+    """The numbers of `_shown`, whether the lobe is about the mirror direction, the pixels reached and Huber's bound.
+
+    Lambert's law alone tells which pixels the light reaches, and how far they are off.
+    """
+    lit, residual = value > BRIGHT, value
+    numbers, cost, scale, mirror = np.zeros(4 if ambient else 3), 0.0, 0.0, False
+    for _ in range(100):
+        before, scale = numbers, _bound(residual[lit])
+        numbers, cost = _refine(numbers, mirror, scale, value[lit], normal[:, lit])
+        residual = value - _shown(numbers, mirror, normal)[0]
+        if np.allclose(before, numbers, rtol=0, atol=CHANGE):
+            break
+        lit = _reached(normal, numbers)
+    found = [(numbers, cost, False)]
+    for about_mirror in (False, True):
+        for n in STARTS:
+            start = np.array([*numbers[:3], *([0.02] if ambient else []), 0.1, np.log(n - LOWEST_N)])
+            with contextlib.suppress(InputError):  # of a lobe that no pixel shows
+                found.append((*_refine(start, about_mirror, scale, value[lit], normal[:, lit]), about_mirror))
+    shiny, left, about_mirror = min(found, key=lambda one: one[1])
+    if np.count_nonzero(lit) * np.log(max(cost, 1e-300) / max(left, 1e-300)) > 2 * RISE:
+        # Lambert's law alone may have looked at pixels that the light does not reach.
+        lit, mirror = _reached(normal, shiny), about_mirror
+        scale = _bound((value - _shown(shiny, mirror, normal)[0])[lit])
+        numbers, _ = _refine(shiny, mirror, scale, value[lit], normal[:, lit])
+    return numbers, mirror, lit, scale
 
 
 def _bound(residual) -> float:

@@ -41,6 +41,13 @@ def light_of(value, *, ambient=False, mask=True) -> ShadingLight:
     return light_from_shading(picture, POINTS, ambient=ambient, mask=mask)
 
 
+def over_exposed_light_of(clean, level, rng) -> ShadingLight:
+    """The light that noisy pixels on the ball tell, (P, C), which end at a level."""
+    picture = np.zeros((SIDE, SIDE, clean.shape[1]))
+    picture[ON_BALL] = np.minimum(clean + 0.02 * rng.standard_normal(clean.shape), level)
+    return light_from_shading(picture, POINTS, saturation=level)
+
+
 @pytest.mark.parametrize("light", [FRONT, ASIDE, BEHIND])
 def test_the_error_is_that_of_theory_for_gaussian_noise(light):
     """Huber's estimate keeps 95 % efficiency: its variance is that of least squares over 0.95."""
@@ -72,6 +79,27 @@ def test_the_light_is_as_far_off_as_the_error_says(surface):
             shares.append(angle(found.direction, light) / found.error)
     # 15 angles in two directions know their mean square to 30 % or so, its root to 15 %.
     assert 0.65 < np.sqrt(np.mean(np.square(shares))) < 1.4
+
+
+@pytest.mark.parametrize(
+    ("colour", "level"),
+    [pytest.param([1.0], 0.5, id="grey"), pytest.param([0.6, 1.0, 0.2], 0.4, id="green clips first")],
+)
+def test_what_is_over_exposed_is_left_out_whatever_noise_made_of_it(colour, level):
+    """Left out by what they show, pixels near the level err to one side: the light was 1.5 to 2 errors off."""
+    rng, shares = np.random.default_rng(8), []
+    for light in (FRONT, ASIDE):
+        for _ in range(10):
+            found = over_exposed_light_of(np.outer(shown(light), colour), level, rng)
+            shares.append(angle(found.direction, light) / found.error)
+    # 20 angles in two directions know their mean square to 25 %, its root to 12 %.
+    assert 0.65 < np.sqrt(np.mean(np.square(shares))) < 1.4
+
+
+def test_a_highlight_where_every_pixel_is_left_out_does_not_hinder():
+    """No pixel that counted bent the cost of the sharp lobe that was tried there, and the picture was refused."""
+    found = over_exposed_light_of(shown(FRONT)[:, None], 0.5, np.random.default_rng(18))
+    assert angle(found.direction, FRONT) < 2 * found.error
 
 
 def test_residuals_that_go_together_over_a_block_count_as_one():
