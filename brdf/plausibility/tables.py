@@ -156,8 +156,6 @@ def _not_measured(evaluate: Evaluation, light: np.ndarray, peaks: np.ndarray) ->
     They are up to ``_BRIGHTER`` times as bright as the nearest that was measured; where a peak would be they may
     reflect all the light.
     """
-    from scipy.spatial import KDTree  # it takes long to load
-
     views = np.concatenate([peaks, fibonacci(_VIEWS)])
     values = evaluate(np.broadcast_to(light, views.shape), views)
     known = np.all(np.isfinite(values), axis=1)
@@ -168,5 +166,7 @@ def _not_measured(evaluate: Evaluation, light: np.ndarray, peaks: np.ndarray) ->
     words = f"{100 * share:.2g} % of its views, by their cosine, are not measured"
     if not known[: len(peaks)].all():
         return np.ones(values.shape[1]), words + ", among them one that may show a peak"
+    from scipy.spatial import KDTree  # it takes long to load
+
     beside = np.maximum(values[known][KDTree(views[known]).query(gone)[1]], 0.0)
     return _BRIGHTER * solid_angle * gone[:, 2] @ beside, words
