@@ -17,7 +17,6 @@ import numpy as np
 from brdf.errors import InputError
 from brdf.files import utf8_name
 from brdf.measured.table import MeasuredBRDF, half_angle_grid, sampled
-from brdf.vectors import quotient
 
 MAGIC = b"tensor_file\0"
 
@@ -135,6 +134,7 @@ def _evaluation(path, channels):
                 # The files hold views for directions of light; Mitsuba's "wi" is the one, its "wo" the other.
                 interaction.wi = vector(*light)
                 row[:] = list(plugin.eval(context, interaction, vector(*view)))[: len(row)]
-        return np.where(to_light[:, 2:] > 0, quotient(values, to_view[:, 2:]), 0.0)
+        cosine = to_view[:, 2:]
+        return np.where((cosine > 0) & (to_light[:, 2:] > 0), values / np.where(cosine > 0, cosine, 1.0), 0.0)
 
     return evaluate
